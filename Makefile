@@ -1,0 +1,49 @@
+# Two commands do it all on a machine with Python 3.11 or newer: `make run` and `make test`.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+SCENARIO ?= scenarios/step.yaml
+WORKERS ?= 2
+
+.PHONY: run test setup lint soak bench clean help
+
+help:            ## list the commands
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+
+run: setup       ## fly Test 1 of the paper as real processes and report it
+	$(BIN)/zsim run $(SCENARIO)
+
+test: $(VENV)/.dev ## run the tests
+	$(BIN)/pytest -n $(WORKERS) --dist loadgroup -m "not soak"
+
+setup: $(VENV)/.run ## make the environment in .venv
+
+lint: $(VENV)/.dev ## style, types, and who may import whom
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/pyright
+
+soak: $(VENV)/.dev ## repetitions and long runs
+	$(BIN)/pytest -m soak -p no:xdist
+
+bench: $(VENV)/.dev ## measure; see docs/performance.md
+	$(BIN)/python benchmarks/lockstep.py
+
+clean:           ## remove the environment and what tools leave behind
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "zsim needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) --version 2>&1). Say PYTHON=/path/to/python3.11"; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || \
+		{ echo "Python's venv module is missing; on Debian: apt-get install python3-venv"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.run: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/pip install --disable-pip-version-check -q -e '.[all]'
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/pip install --disable-pip-version-check -q -e '.[dev]'
+	@touch $@ $(VENV)/.run

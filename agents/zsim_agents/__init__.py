@@ -1,0 +1,1 @@
+"""Agents: estimator, cluster controller and recorder, and the pure mathematics they use."""

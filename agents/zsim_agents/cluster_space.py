@@ -1,0 +1,174 @@
+"""Cluster space: a formation of n robots described as one articulated body.
+
+Robot space is r = (x_i, y_i, z_i, theta_i), i = 1..n, positions in W [m], headings about z of W [rad];
+cluster space c holds as many variables: where the formation is, how it is turned, how each robot is turned
+against it, and its shape. Velocities are related by c_dot = J(r) r_dot (Mas, Curi, Sanchez Pena, eqs. 1, 2).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+TAU = 2 * math.pi
+CONDITION_LENGTH_M = 4.0  # p and q of the paper's formation, equation (3)
+ROBOTS_MAX = 64  # beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
+
+
+class SingularClusterError(ValueError):
+    """The formation is so degenerate that its cluster frame does not exist."""
+
+
+class ClusterSpace(ABC):
+    """One convention of cluster variables for n robots; every method is a pure function.
+
+    Attributes:
+        n: number of robots.
+        size: number of cluster variables, 4 n.
+        names: their names in the order of c; lengths in metres, angles in radians.
+        angular: (4n,) bool, true for the angles that wrap (roll, yaw, phi_i, azimuth_k).
+        in_radians: (4n,) bool, true for all angles, also those that do not wrap (pitch, beta, elevation_k).
+        lower, upper: (4n,) open bounds of the values that `forward` can give, infinite where there is none.
+        spread_text: what `spread` measures, in words for messages.
+    """
+
+    def __init__(self, n: int, names: Sequence[str], spread_text: str) -> None:
+        self.n = n
+        self.size = 4 * n
+        self.names = tuple(names)
+        self.spread_text = spread_text
+        self.angular = np.array([_stem(name) in {"roll", "yaw", "phi", "azimuth"} for name in names])
+        self.in_radians = self.angular | np.array([_stem(name) in _BOUNDED_ANGLES for name in names])
+        self._period = np.where(self.angular, TAU, 0.0)
+        bounds = [_BOUNDS.get(_stem(name), (-math.inf, math.inf)) for name in names]
+        self.lower, self.upper = (np.array(column) for column in zip(*bounds, strict=True))
+        self._lengths = [i for i, name in enumerate(names) if _stem(name) in {"p", "q", "rho"}]
+        self._pitch = self.names.index("pitch")
+
+    @abstractmethod
+    def forward(self, p_W: Array, yaw: Array) -> Array:
+        """Return c (4n,) of robots at p_W (n, 3) [m] with headings yaw (n,) [rad].
+
+        Raises:
+            SingularClusterError: robots coincide or stand in line, so that there is no frame.
+        """
+
+    @abstractmethod
+    def inverse(self, c: Array) -> tuple[Array, Array]:
+        """Return positions p_W (n, 3) [m] and headings yaw (n,) [rad, wrapped] of the robots of c (4n,).
+
+        Raises:
+            SingularClusterError: the shape has no extent (h = 0), so that robots have no place.
+        """
+
+    @abstractmethod
+    def jacobian(self, p_W: Array, yaw: Array) -> Array:
+        """Return J (4n, 4n) with c_dot = J r_dot; r_dot ordered (vx, vy, vz, yaw rate) robot by robot, W.
+
+        Raises:
+            SingularClusterError: as in `forward`.
+        """
+
+    @abstractmethod
+    def inverse_jacobian(self, c: Array) -> Array:
+        """Return J^-1 (4n, 4n) with r_dot = J^-1 c_dot, in closed form.
+
+        Raises:
+            SingularClusterError: as in `inverse`.
+        """
+
+    @abstractmethod
+    def spread(self, c: Array) -> float:
+        """Return the smallest height of the shape [m] (see `spread_text`); 0 where the shape is singular."""
+
+    def margin(self, c: Array) -> float:
+        """Return the distance to singularity [m]: spread(c) cos(pitch).
+
+        It is zero exactly where J^-1 is singular (robots 1, 2, 3 in line or two of them in one place, a
+        further robot on the z axis through robot 1, or pitch at 90 degrees), and a length: how far one
+        robot may move before a level formation becomes singular.
+        """
+        return self.spread(c) * math.cos(c[self._pitch])
+
+    def condition(self, c: Array) -> float:
+        """Return the condition number of J^-1 (2-norm, metres and radians as they are).
+
+        It grows with the unit of length, so a formation larger than 4 m is judged scaled down to 4 m: a
+        large formation is not nearer to singularity than a small one of the same shape.
+        """
+        lengths = np.abs(c[self._lengths])
+        scaled = c.copy()
+        scaled[self._lengths] *= min(1.0, CONDITION_LENGTH_M / max(float(lengths.max()), CONDITION_LENGTH_M))
+        return float(np.linalg.cond(self.inverse_jacobian(scaled)))
+
+    def difference(self, c_to: Array, c_from: Array) -> Array:
+        """Return c_to - c_from (4n,), angles that wrap the short way."""
+        return self.wrapped(c_to - c_from)
+
+    def wrapped(self, c: Array) -> Array:
+        """Return c (4n,) with the angles that wrap taken to [-pi, pi]."""
+        return c - self._period * np.round(c / TAU)
+
+    def index(self, name: str) -> int:
+        """Return the place of a variable in c.
+
+        Raises:
+            ValueError: there is no such variable.
+        """
+        if name not in self.names:
+            raise ValueError(f"variable {name[:40]!r} is unknown; allowed: {', '.join(self.names)}")
+        return self.names.index(name)
+
+
+def cluster_space(n: int) -> ClusterSpace:
+    """Return the cluster space of n robots: the paper's at n = 3, its triad generalisation elsewhere.
+
+    Raises:
+        ValueError: n is not from 2 to 64.
+    """
+    # Imported here because both build on the class above.
+    from zsim_agents.pair_cluster import PairCluster
+    from zsim_agents.triad_cluster import TriadCluster
+
+    if not 2 <= n <= ROBOTS_MAX:
+        raise ValueError(f"a cluster of {n} robots is not possible; allowed: 2 to {ROBOTS_MAX}")
+    return PairCluster() if n == 2 else TriadCluster(n)
+
+
+def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Array]:
+    """Return velocities (n, 3) [m/s, W] and yaw rates (n,) [rad/s] of the robots of c moving at c_dot."""
+    r_dot = (space.inverse_jacobian(c) @ c_dot).reshape(space.n, 4)
+    return r_dot[:, :3], r_dot[:, 3]
+
+
+def closest_pair(p_W: Array) -> tuple[float, int, int]:
+    """Return the least distance [m] between two of the positions (n, 3), and the indices of that pair."""
+    points = p_W.tolist()
+    pairs = ((math.dist(points[i], points[j]), i, j) for j in range(len(points)) for i in range(j))
+    return min(pairs)
+
+
+def numbered(stem: str, robots: Iterable[int]) -> list[str]:
+    """Return the names of a variable that every robot has, robots counted from 1."""
+    return [f"{stem}_{k}" for k in robots]
+
+
+_BOUNDED_ANGLES = {"pitch", "beta", "elevation"}
+_BOUNDS = {
+    "pitch": (-math.pi / 2, math.pi / 2),
+    "elevation": (-math.pi / 2, math.pi / 2),
+    "beta": (0.0, math.pi),
+    "p": (0.0, math.inf),
+    "q": (0.0, math.inf),
+    "rho": (0.0, math.inf),
+}
+
+
+def _stem(name: str) -> str:
+    return name.rstrip("0123456789").rstrip("_")

@@ -1,0 +1,212 @@
+"""The cluster controller as an agent: estimates and states in, velocity commands and cluster state out.
+
+Order of this file: the agent, `receive`, `step`, requests, warm start, pure parts.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from zsim import keys, messages
+from zsim.agent import Agent, Output
+from zsim.errors import RunError
+from zsim.messages import ControlAnswer, ControlRequest
+from zsim.scenario import Cluster, Gains, Scenario
+from zsim_agents.cluster_space import cluster_space
+from zsim_agents.engagement import Engagement
+from zsim_agents.flight_data import GateInput, GateOutput
+from zsim_agents.flight_plan import Scheduled
+from zsim_agents.flight_request import Engage, Follow, Land, RequestError, TakeOff, Target, read_request
+from zsim_agents.formation import FormationGains
+
+SIGMA_AT = (0, 7, 14)  # places of the position's variances in the 6 x 6 covariance, row-major
+
+
+class Controller(Agent):
+    """Flies one cluster.
+
+    Args:
+        info: of the run.
+        scenario: the resolved one that the info carries.
+        cluster: name.
+
+    Raises:
+        RunError: the scenario has no such cluster, or its plan can never be flown.
+    """
+
+    def __init__(self, info: messages.Info, scenario: Scenario, cluster: str) -> None:
+        super().__init__()
+        if cluster not in {c.name for c in scenario.clusters}:
+            known = ", ".join(c.name for c in scenario.clusters) or "none"
+            raise RunError(f"controller: cluster is {cluster!r}; must be one of {known}")
+        spec = scenario.cluster(cluster)
+        self.name = f"controller.{cluster}"
+        self.period_ns = info.gate_ns
+        self.drones = tuple(spec.drones)
+        everybody = len(spec.drones) == len(scenario.drones)
+        estimates = tuple(keys.estimate(drone) for drone in spec.drones)
+        states = tuple(keys.status(drone) for drone in spec.drones)
+        self.gate_keys = states + estimates
+        self.reads = (keys.status("*"), keys.estimate("*")) if everybody else self.gate_keys
+        self._state_key = keys.cluster_state(cluster)
+        self._view_key = f"view/cluster/{cluster}"
+        self._control_key = keys.cluster_control(cluster)
+        self._place = {drone: i for i, drone in enumerate(spec.drones)}
+        self._velocity_keys = [keys.command(drone, "velocity") for drone in spec.drones]
+        self._estimates: list[messages.Estimate | None] = [None] * len(spec.drones)
+        self._states: list[str] = ["landed"] * len(spec.drones)
+        self._engagement = engagement_of(spec)
+
+    def receive(self, key: str, message: Any) -> None:
+        place = self._place[keys.thing(key)]
+        if type(message) is messages.Estimate:
+            self._estimates[place] = message
+        else:
+            self._states[place] = message.state
+
+    def step(self, t_ns: int) -> list[Output]:
+        output = self._engagement.step(self._gate(t_ns))
+        return [*self._modes(t_ns, output), *self._velocities(t_ns, output), *self._state(t_ns, output)]
+
+    def _gate(self, t_ns: int) -> GateInput:
+        known = [e if e is not None else _UNKNOWN for e in self._estimates]
+        return GateInput(
+            t_s=t_ns * 1e-9,
+            p_W=np.array([e.position_m for e in known]),
+            yaw=np.array([e.yaw_rad for e in known]),
+            v_W=np.array([e.velocity_m_s for e in known]),
+            sigma_m=np.sqrt(np.array([[e.covariance[i] for i in SIGMA_AT] for e in known])),
+            age_s=np.array([(t_ns - e.t_ns) * 1e-9 if e is not _UNKNOWN else math.inf for e in known]),
+            states=tuple(self._states),
+        )
+
+    def _modes(self, t_ns: int, output: GateOutput) -> list[Output]:
+        outputs = []
+        for drone, mode in output.modes:
+            key = keys.command(drone, "mode")
+            outputs.append(Output(key, messages.Mode(t_ns, self.next_seq(key), self.name, mode)))  # type: ignore[arg-type]
+        return outputs
+
+    def _velocities(self, t_ns: int, output: GateOutput) -> list[Output]:
+        outputs = []
+        for place, setpoint in enumerate(output.setpoints):
+            estimate = self._estimates[place]
+            if setpoint is None or estimate is None:
+                continue
+            key = self._velocity_keys[place]
+            velocity = in_heading(setpoint.v_W.tolist(), estimate.yaw_rad)
+            message = messages.Velocity(t_ns, self.next_seq(key), self.name, velocity, setpoint.yaw_rate)
+            outputs.append(Output(key, message))
+        return outputs
+
+    def _state(self, t_ns: int, output: GateOutput) -> list[Output]:
+        names = self._engagement.space.names
+        value, desired = _finite(output.value), _finite(output.desired)
+        state = messages.ClusterState(
+            t_ns=t_ns,
+            seq=self.next_seq(self._state_key),
+            phase=output.phase,  # type: ignore[arg-type]
+            drones=self.drones,
+            names=names,
+            value=value,
+            desired=desired,
+            desired_rate=_finite(output.desired_rate),
+            trajectory_t_s=output.trajectory_t_s,
+            margin=output.margin if math.isfinite(output.margin) else 0.0,
+            reason=output.reason,
+            source=self.name,
+        )
+        seq = self.next_seq(self._view_key)
+        view = messages.ViewCluster(t_ns, seq, state.phase, names, value, desired, output.reason)
+        return [Output(self._state_key, state), Output(self._view_key, view)]
+
+    def control_keys(self) -> tuple[str, ...]:
+        return (self._control_key,)
+
+    def control(self, key: str, request: ControlRequest) -> ControlAnswer:
+        try:
+            refusal = self._engagement.request(read_request(request.op, request.args))
+        except RequestError as error:
+            refusal = str(error)
+        return ControlAnswer(ok=refusal is None, error=refusal or "")
+
+    def warm_start_keys(self) -> tuple[str, ...]:
+        return (self._state_key,)
+
+    def warm_start(self, key: str, message: messages.ClusterState) -> None:
+        self._engagement.warm_start(message.phase, np.array(message.desired), message.t_ns * 1e-9)
+
+
+_UNKNOWN = messages.Estimate(
+    0,
+    0,
+    (math.nan,) * 3,
+    (math.nan,) * 3,
+    (1.0, 0.0, 0.0, 0.0),
+    math.nan,
+    (math.inf,) * 36,
+    math.inf,
+    (0.0,) * 3,
+    {},
+)
+
+
+def engagement_of(cluster: Cluster) -> Engagement:
+    """Return the phase machine that a scenario's cluster asks for.
+
+    Raises:
+        RunError: the plan can never be flown; the text says why.
+    """
+    try:
+        return Engagement(
+            cluster_space(len(cluster.drones)), cluster.drones, gains_of(cluster.gains), plan=plan_of(cluster)
+        )
+    except ValueError as error:
+        raise RunError(f"cluster {cluster.name!r}: {error}") from error
+
+
+def gains_of(gains: Gains) -> FormationGains:
+    """Return the control law's gains in SI units."""
+    return FormationGains(
+        k_1_s=gains.proportional_1_s,
+        integral_1_s2=gains.integral_1_s2,
+        speed_max_m_s=gains.horizontal_speed_m_s,
+        climb_max_m_s=gains.vertical_speed_m_s,
+        yaw_rate_max_rad_s=math.radians(gains.yaw_rate_deg_s),
+        separation_min_m=gains.separation_min_m,
+        separation_alarm_m=gains.separation_alarm_m,
+    )
+
+
+def plan_of(cluster: Cluster) -> list[Scheduled]:
+    """Return the steps of a cluster's plan in their order."""
+    plan, steps = cluster.plan, []
+    if plan.takeoff_s is not None:
+        steps += [Scheduled(plan.takeoff_s, TakeOff()), Scheduled(plan.takeoff_s, Engage())]
+        if plan.target:
+            steps.append(Scheduled(plan.takeoff_s, Target(plan.target, plan.target_over_s)))
+        if plan.trajectory is not None:
+            trajectory = plan.trajectory
+            waypoints = [{"at_s": w.at_s, "values": w.values} for w in trajectory.waypoints]
+            follow = Follow(
+                expressions=trajectory.expressions,
+                constants=trajectory.constants,
+                waypoints=waypoints,
+                start_s=trajectory.start_s,
+            )
+            steps.append(Scheduled(plan.takeoff_s, follow))
+    if plan.land_s is not None:
+        steps.append(Scheduled(plan.land_s, Land()))
+    return steps
+
+
+def in_heading(v_W: list[float], yaw: float) -> tuple[float, float, float]:
+    """Return a velocity of W in the heading frame: x forward, y left, z up."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return (c * v_W[0] + s * v_W[1], -s * v_W[0] + c * v_W[1], v_W[2])
+
+
+def _finite(values: np.ndarray) -> tuple[float, ...]:
+    """Return values for the wire, where nothing unknown may travel: zeros in its place."""
+    return tuple(value if math.isfinite(value) else 0.0 for value in values.tolist())

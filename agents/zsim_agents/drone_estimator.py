@@ -1,0 +1,336 @@
+"""The estimator of one drone: Madgwick attitude, strapdown dead reckoning, and an error-state EKF over both.
+
+Every IMU sample moves the nominal state. At the end of a gate the covariance follows, the gate's other
+measurements are judged and used in one stacked update, and the error found goes back into position, velocity,
+Madgwick's quaternion and the biases.
+
+Madgwick's accelerometer step assumes that a drone does not accelerate. A quadrotor's specific force lies along
+its thrust, so the step pulls the tilt towards level whatever the true tilt. Hence two guards: the gain is chosen
+so small that the pull takes `LEVELLING_S`, and the filter knows the pull as a first-order loss of its tilt error
+driven by the drone's accelerations, and puts the tilt right from what position and velocity say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from zsim.scenario import Drone, Environment, Estimation
+from zsim_agents.aiding import Aid, Measurement, aids
+from zsim_agents.aiding_models import write_baro, write_flow, write_gps, write_mag, write_sonar
+from zsim_agents.dead_reckoning import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY, heading_and_sigma, plus
+from zsim_agents.estimator_prior import HEADING_SIGMA_RAD, bias_priors, madgwick_beta, process_noise, set_start
+from zsim_agents.madgwick import (
+    Quaternion,
+    Vector,
+    compose,
+    heading,
+    normalised,
+    product,
+    rotation,
+    rotation_vector_quaternion,
+    turn,
+)
+from zsim_agents.navigation_filter import NavigationFilter, Stack
+from zsim_agents.state_history import Moment, StateHistory
+from zsim_agents.strapdown import Strapdown
+
+SET_DOWN_SIGMA_RAD = 0.05  # rad: how well a drone is set down by eye, where there is no magnetometer
+HEADING_WAIT_S = 1.0  # s without a magnetometer's reading, after which the heading of the scenario is taken
+SQUARE_MAX = 1e8  # of an innovation, in its unit; more would cost the covariance its digits
+YAW = slice(ATTITUDE + 2, ATTITUDE + 3)
+
+
+class Estimate(NamedTuple):
+    """What is published at every gate; see the contract."""
+
+    position_m: Vector
+    velocity_m_s: Vector
+    orientation_wxyz: Quaternion
+    yaw_rad: float
+    covariance: tuple[float, ...]
+    """Of position and velocity, 6 x 6, row-major."""
+    yaw_sigma_rad: float
+    gyro_bias_rad_s: Vector
+    """In the body frame."""
+    sensors: dict[str, tuple[int, int]]
+    """Readings (used, refused) since the start."""
+
+
+class DroneEstimator:
+    """Fuse the sensors of one drone.
+
+    Sensors may come in any order between two gates. Duplicates are ignored; readings that are older than the
+    sensor's last one, not finite, or outside of their gate are refused and counted.
+
+    Args:
+        drone: its mounts and error models are what the estimator believes.
+        environment: gravity and magnetic field.
+        estimation: settings.
+        gate_s: interval of the gates [s].
+    """
+
+    def __init__(self, drone: Drone, environment: Environment, estimation: Estimation, gate_s: float) -> None:
+        imu, gravity = drone.sensors.imu, environment.gravity_m_s2
+        self._field = environment.magnetic_field_ut
+        self._set_down_yaw = math.radians(drone.yaw_deg)
+        self._aids = aids(drone.sensors)
+        self._magnetometer, self._flow = estimation.magnetometer, estimation.flow
+        wanted = [aid for name, aid in self._aids.items() if self._wanted(name)]
+        beta = madgwick_beta(estimation, imu, gravity)
+        self._filter = NavigationFilter(
+            process_noise(imu, beta, gravity), bias_priors(imu, wanted), estimation.gate_probability
+        )
+        set_start(self._filter)
+        self._strapdown = Strapdown(imu, self._filter.with_accel_bias, beta, gravity, gate_s)
+        self._stack = Stack(self._filter.dim_x)
+        self._bias = [0.0] * self._filter.dim_x  # by index in the error state; those of the IMU are the strapdown's
+        latency_s = max(getattr(drone.sensors, name).latency_ms for name in ("imu", *self._aids)) * 1e-3
+        self._age_max_s = 2.0 * latency_s + 5.0 * gate_s
+        self._history = StateHistory(self._age_max_s, gate_s)
+        self._waiting: list[Measurement] = []
+        self._start_s = math.nan
+        self._heading_known = False
+
+    @property
+    def innovations(self) -> list[float]:
+        """Squared normalised innovations of the last update, in the order in which its sensors came."""
+        return self._filter.distances
+
+    def imu(self, t_sample_s: float, accel_m_s2: Vector, gyro_rad_s: Vector) -> None:
+        """Move the nominal state to the sample's instant."""
+        self._strapdown.imu(t_sample_s, accel_m_s2, gyro_rad_s)
+
+    def gps(
+        self,
+        t_s: float,
+        t_sample_s: float,
+        position_m: Sequence[float],
+        velocity_m_s: Sequence[float],
+        sigma_m: float,
+        fix: int,
+    ) -> None:
+        """Take a fix; `sigma_m` per axis counts where it is worse than what the scenario says."""
+        aid = self._aids["gps"]
+        if not fix or not math.isfinite(sigma_m):
+            aid.refused += 1
+            return
+        variance = max(sigma_m * sigma_m, aid.variance[0])
+        self._wait(aid, t_s, t_sample_s, (*position_m, *velocity_m_s), (variance,) * 3 + aid.variance[3:])
+
+    def mag(self, t_s: float, t_sample_s: float, field_ut: Sequence[float]) -> None:
+        """Take the field in the sensor's axes."""
+        if self._magnetometer:
+            aid = self._aids["mag"]
+            self._wait(aid, t_s, t_sample_s, field_ut, aid.variance)
+
+    def baro(self, t_s: float, t_sample_s: float, altitude_m: float) -> None:
+        """Take a barometric height over the world's origin."""
+        aid = self._aids["baro"]
+        self._wait(aid, t_s, t_sample_s, (altitude_m,), aid.variance)
+
+    def sonar(self, t_s: float, t_sample_s: float, range_m: float, valid: bool) -> None:
+        """Take a range to the ground; one marked as invalid says nothing and is not counted."""
+        if valid:
+            aid = self._aids["sonar"]
+            self._wait(aid, t_s, t_sample_s, (range_m,), aid.variance)
+
+    def flow(self, t_s: float, t_sample_s: float, velocity_m_s: Sequence[float], quality: float) -> None:
+        """Take a velocity in the heading frame; one of no quality, or before any heading is known, is refused."""
+        if not self._flow:
+            return
+        aid = self._aids["flow"]
+        if quality > 0.0:
+            self._wait(aid, t_s, t_sample_s, velocity_m_s, aid.variance)
+        else:
+            aid.refused += 1
+
+    def close(self, t_s: float) -> Estimate:
+        """Use what has come since the last gate and return the estimate for `t_s`."""
+        strapdown = self._strapdown
+        if not strapdown.running:
+            strapdown.start(t_s)
+        strapdown.coast(t_s)
+        interval = strapdown.take_interval()
+        if interval.dt > 0.0:
+            self._filter.advance(strapdown, interval)
+        if not self._heading_known:
+            self._settle_heading(t_s)
+        if self._waiting:
+            self._use_waiting()
+        self._history.append(strapdown.moment())
+        return self._estimate(t_s)
+
+    def warm_start(
+        self,
+        position_m: Sequence[float],
+        velocity_m_s: Sequence[float],
+        orientation_wxyz: Sequence[float],
+        covariance: Sequence[float],
+        yaw_sigma_rad: float,
+        gyro_bias_rad_s: Sequence[float],
+    ) -> None:
+        """Continue from a published estimate; call before the first reading.
+
+        Tilt and biases, of which the estimate has no covariance, start as uncertain as in a cold start.
+        """
+        w, x, y, z = (float(part) for part in orientation_wxyz)
+        self._strapdown.place(_vector(position_m), _vector(velocity_m_s), normalised((w, x, y, z)))
+        self._strapdown.gyro_bias = _vector(gyro_bias_rad_s)
+        for i in range(6):
+            self._filter.P[i, :6] = covariance[6 * i : 6 * i + 6]
+        self._filter.set_variance(YAW, yaw_sigma_rad**2)
+        self._heading_known = yaw_sigma_rad < HEADING_SIGMA_RAD
+
+    def _wanted(self, name: str) -> bool:
+        return {"mag": self._magnetometer, "flow": self._flow}.get(name, True)
+
+    def _wait(
+        self, aid: Aid, t_s: float, t_sample_s: float, values: Sequence[float], variance: Sequence[float]
+    ) -> None:
+        """Keep a reading for the end of the gate, unless it cannot be used."""
+        if aid.accept(t_s, t_sample_s, values, self._age_max_s):
+            self._waiting.append(Measurement(aid, t_sample_s, values, variance))
+
+    def _settle_heading(self, t_s: float) -> None:
+        """Give the attitude its first heading: the magnetometer's, or the scenario's where there is none."""
+        if math.isnan(self._start_s):
+            self._start_s = t_s
+        for measurement in self._waiting:
+            if measurement.aid.name == "mag":
+                self._turn_heading(self._angle_to_field(measurement))  # its certainty comes from the update
+                return
+        if not self._magnetometer or t_s - self._start_s > HEADING_WAIT_S:
+            self._turn_heading(self._set_down_yaw - heading(self._strapdown.state[2]))
+            self._filter.set_variance(YAW, SET_DOWN_SIGMA_RAD**2)
+
+    def _angle_to_field(self, measurement: Measurement) -> float:
+        """Return by how much the present heading is short of the one that the magnetometer sees."""
+        field_B = turn(measurement.aid.R_BS, _vector(measurement.values))
+        seen = turn(rotation(self._strapdown.state[2]), field_B)
+        return math.atan2(self._field[1], self._field[0]) - math.atan2(seen[1], seen[0])
+
+    def _turn_heading(self, angle: float) -> None:
+        self._strapdown.turn_heading((math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle)))
+        self._history.clear()
+        self._heading_known = True
+
+    def _use_waiting(self) -> None:
+        """Judge and use the gate's measurements, in one stacked update unless they are very many."""
+        now = self._strapdown.moment()
+        past = now
+        stacked: list[Aid] = []
+        for aid, t_sample_s, values, variance in self._waiting:
+            if aid.name == "flow" and not self._heading_known:
+                aid.refused += 1
+                continue
+            if not self._stack.has_room(len(values)):
+                self._correct(stacked)
+                past = now = self._strapdown.moment()
+            if past.t_s != t_sample_s:
+                past = self._history.at(t_sample_s, now)
+            self._add(aid, past, now.t_s - past.t_s, values, variance)
+            stacked.append(aid)
+        self._waiting.clear()
+        self._correct(stacked)
+
+    def _correct(self, stacked: list[Aid]) -> None:
+        if not stacked:
+            return
+        passed = self._filter.correct(self._stack)
+        for aid, good in zip(stacked, passed, strict=True):
+            aid.judge(good, self._strapdown.t_s)
+        if any(passed):
+            error = self._filter.take_error()
+            self._strapdown.correct(error)
+            if self._filter.aiding_biases:
+                self._bias = [bias + more for bias, more in zip(self._bias, error.tolist(), strict=True)]
+        stacked.clear()
+        self._stack.clear()
+
+    def _add(
+        self, aid: Aid, past: Moment, lag: float, values: Sequence[float], variance: Sequence[float]
+    ) -> None:
+        """Add a measurement to the stack, compared with the state of its own instant."""
+        predicted = self._predicted(aid, past, lag)
+        if aid.bias_rows:
+            predicted = self._with_biases(aid, predicted)
+        if aid.out_of_patience(self._strapdown.t_s):
+            self._believe_again(aid, [z - h for z, h in zip(values, predicted, strict=True)])
+        self._stack.add(values, predicted, variance)
+
+    def _predicted(self, aid: Aid, past: Moment, lag: float) -> Sequence[float]:
+        """Return what the sensor should read and write its rows of H."""
+        H, i, R = self._stack.H, self._stack.rows, rotation(past.q)
+        if aid.name == "mag":
+            return write_mag(H, i, compose(R, aid.R_BS), self._field)
+        if aid.name == "baro":
+            return (write_baro(H, i, past.p, R, aid.arm, lag),)
+        if aid.name == "flow":
+            return write_flow(H, i, past.v, R, past.w, aid.arm)
+        if aid.name == "gps":
+            return write_gps(H, i, past.p, past.v, R, past.w, aid.arm, lag)
+        return (write_sonar(H, i, past.p, R, aid.arm, aid.down_B, lag),)
+
+    def _with_biases(self, aid: Aid, predicted: Sequence[float]) -> list[float]:
+        """Return the prediction with the sensor's biases on it, their columns of H written."""
+        values = list(predicted)
+        for name, row in aid.bias_rows:
+            first = self._filter.bias_index[name]
+            for k in range(aid.biases[name].size):
+                self._stack.H[self._stack.rows + row + k, first + k] = 1.0
+                values[row + k] += self._bias[first + k]
+        return values
+
+    def _believe_again(self, aid: Aid, innovation: Sequence[float]) -> None:
+        """Make the states that a long refused sensor sees as uncertain as its innovation."""
+        squares = [min(y * y, SQUARE_MAX) for y in innovation]
+        if aid.name == "gps":
+            self._filter.add_variance(slice(POSITION, VELOCITY + 3), squares)
+        elif aid.name == "flow":
+            self._filter.add_variance(slice(VELOCITY, VELOCITY + 3), sum(squares))
+        elif aid.name == "baro":
+            self._filter.add_variance(slice(POSITION + 2, POSITION + 3), squares[0])
+        elif aid.name == "mag":
+            self._filter.add_variance(YAW, HEADING_SIGMA_RAD**2)
+        aid.refused_since_s = self._strapdown.t_s
+
+    def _estimate(self, t_s: float) -> Estimate:
+        """Return the estimate for an instant that the IMU may not have reached yet."""
+        strapdown, P = self._strapdown, self._filter.P
+        p, v, q, a_W, w, _ = strapdown.state
+        ahead = t_s - strapdown.t_s
+        if ahead > 1e-9:
+            p, v = plus(p, v, ahead), plus(v, a_W, ahead)
+            turned = rotation_vector_quaternion((w[0] * ahead, w[1] * ahead, w[2] * ahead))
+            q = normalised(product(q, turned))
+            P = P.copy()
+            P[:3] += ahead * P[3:6]
+            P[:, :3] += ahead * P[:, 3:6]
+        yaw, yaw_sigma = heading_and_sigma(q, P)
+        return Estimate(p, v, q, yaw, _upper(P), yaw_sigma, strapdown.gyro_bias, self._counts())
+
+    def _counts(self) -> dict[str, tuple[int, int]]:
+        counts = {name: (aid.used, aid.refused) for name, aid in self._aids.items()}
+        counts["imu"] = (self._strapdown.used, self._strapdown.refused)
+        return counts
+
+
+def _upper(P: np.ndarray) -> tuple[float, ...]:
+    """Return the first 6 x 6 of a covariance row by row, symmetric to the last bit."""
+    a, b, c, d, e, f = P[:6, :6].tolist()
+    return (
+        a[0], a[1], a[2], a[3], a[4], a[5],
+        a[1], b[1], b[2], b[3], b[4], b[5],
+        a[2], b[2], c[2], c[3], c[4], c[5],
+        a[3], b[3], c[3], d[3], d[4], d[5],
+        a[4], b[4], c[4], d[4], e[4], e[5],
+        a[5], b[5], c[5], d[5], e[5], f[5],
+    )  # fmt: skip
+
+
+def _vector(values: Sequence[float]) -> Vector:
+    return float(values[0]), float(values[1]), float(values[2])

@@ -1,0 +1,315 @@
+"""The phases of a formation flight: take-off, assembly, engaged flight on references, hold, landing.
+
+A plain object: estimates in, commands out, once per gate; requests in between. Nothing is engaged, resumed or
+followed that was not checked, every refusal has a reason, and every reference starts where the formation is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from zsim_agents.cluster_space import Array, ClusterSpace
+from zsim_agents.flight_data import (
+    AIRBORNE,
+    DOWN,
+    EngagementLimits,
+    GateInput,
+    GateOutput,
+    ModeCommand,
+    Setpoint,
+)
+from zsim_agents.flight_judge import FlightJudge
+from zsim_agents.flight_plan import FlightPlan, Scheduled
+from zsim_agents.flight_request import (
+    REFUSALS,
+    Engage,
+    FlightRequest,
+    Land,
+    Pause,
+    RefusalError,
+    TakeOff,
+    Target,
+    refuse,
+)
+from zsim_agents.formation import FormationGains, FormationLaw, Pairs, guard
+from zsim_agents.guidance import Guidance
+from zsim_agents.reference_check import place_fault
+
+DT_MAX_S = 0.1  # longest step of the integral, after a gap
+CLIMB_GAIN_1_S = 0.8  # of the climb to the assembly height
+HOLD_APART_M = 0.1  # a held formation is kept this much farther apart than the minimum
+
+
+class Engagement:
+    """The phase machine of one formation.
+
+    Args:
+        space: cluster space of n robots.
+        drones: their names in the order of the robots, for commands and reasons.
+        plan: what the scenario asks for by itself; a Land by request drops the rest of it.
+
+    Raises:
+        ValueError: a request of the plan can never be granted, or the number of names is not n.
+    """
+
+    def __init__(
+        self,
+        space: ClusterSpace,
+        drones: Sequence[str],
+        gains: FormationGains | None = None,
+        limits: EngagementLimits | None = None,
+        plan: Sequence[Scheduled] = (),
+    ) -> None:
+        if len(drones) != space.n:
+            raise ValueError(
+                f"cluster: {len(drones)} drones; allowed: {space.n}, the robots of its cluster space"
+            )
+        self.space = space
+        self.drones = tuple(drones)
+        self.gains = gains or FormationGains()
+        self.limits = limits or EngagementLimits()
+        self.law = FormationLaw(space, self.gains)
+        self.guidance = Guidance(space, self.gains, self.limits.shape)
+        self.plan = FlightPlan(space, plan)
+        self._apart = dataclasses.replace(
+            self.gains, separation_min_m=self.gains.separation_min_m + HOLD_APART_M
+        )
+        self.judge = FlightJudge(space, self.drones, self.gains, self.limits)
+        self._phase = "idle"
+        self._gate: GateInput | None = None
+        self._dt_s = 0.0
+        self._mode_sent_s: dict[str, float] = {}
+        self._landing_s = -math.inf
+        self._fault = ""  # why an engaged formation does not close its loop
+        self._well_since_s = math.inf
+
+    @property
+    def phase(self) -> str:
+        """Return idle, taking_off, assembling, engaged, landing or held."""
+        return "held" if self._phase == "engaged" and (self._fault or self.guidance.paused) else self._phase
+
+    def step(self, gate: GateInput) -> GateOutput:
+        """Advance to this gate and return its commands and state."""
+        last_s = self._gate.t_s if self._gate else gate.t_s
+        self._dt_s = min(max(gate.t_s - last_s, 0.0), DT_MAX_S)
+        self._gate = gate
+        self.judge.observe(gate)
+        self.plan.run(gate.t_s, self._try)
+        if self._phase in ("assembling", "engaged") and _down(gate):
+            self._phase = "idle"
+        return _PHASES[self._phase](self, gate)
+
+    def request(self, request: FlightRequest) -> str | None:
+        """Grant a request and return None, or return why it is refused; then nothing has changed."""
+        refusal = self._try(request)
+        if refusal is None and isinstance(request, Land):
+            self.plan.clear()
+        return refusal
+
+    # Requests
+
+    def _try(self, request: FlightRequest) -> str | None:
+        if self._gate is None:
+            return "no gate was seen yet; ask again when the simulation runs"
+        try:
+            self._grant(request, self._gate)
+        except REFUSALS as refusal:
+            return str(refusal)
+        return None
+
+    def _grant(self, request: FlightRequest, gate: GateInput) -> None:
+        if isinstance(request, TakeOff):
+            self._grant_take_off(gate)
+        elif isinstance(request, Engage):
+            self._grant_engage(gate)
+        elif isinstance(request, Land):
+            self._grant_land(gate)
+        elif self._phase != "engaged":
+            raise RefusalError(f"phase is {self.phase}; possible when engaged")
+        elif self._fault:
+            raise RefusalError(self._fault)
+        elif isinstance(request, Pause):
+            self.guidance.pause(gate.t_s)
+        elif isinstance(request, Target):
+            self.guidance.target(request, gate.t_s)
+        else:
+            self.guidance.follow(request, gate.t_s)
+
+    def _grant_take_off(self, gate: GateInput) -> None:
+        if self._phase != "idle":
+            raise RefusalError(f"phase is {self.phase}; take-off is possible when idle")
+        refuse(self.judge.take_off_fault(gate))
+        self._phase = "taking_off"
+        self._mode_sent_s.clear()
+
+    def _grant_engage(self, gate: GateInput) -> None:
+        if self._phase == "engaged" and self.guidance.paused and not self._fault:
+            self.guidance.resume(gate.t_s)
+            return
+        if self._phase != "assembling":
+            raise RefusalError(
+                f"phase is {self.phase}; engagement is possible when assembling, or held on request"
+            )
+        refuse(self.judge.engagement_fault(gate))
+        self.guidance.engage(self.judge.value)
+        self.law.reset()
+        self._fault = ""
+        self._phase = "engaged"
+
+    def _grant_land(self, gate: GateInput) -> None:
+        if self._phase == "idle" and _down(gate):
+            raise RefusalError("all drones are on the ground")
+        self._phase, self._landing_s = "landing", gate.t_s
+        self._mode_sent_s.clear()
+
+    # Phases
+
+    def _idle(self, gate: GateInput) -> GateOutput:
+        return self._output(gate, "")
+
+    def _taking_off(self, gate: GateInput) -> GateOutput:
+        waiting = self.judge.state_fault(gate, AIRBORNE)
+        if waiting is None:
+            self._phase = "assembling"
+            return self._assembling(gate)
+        return self._climb(gate, waiting, self._modes(gate, "takeoff", frozenset({"landed"})))
+
+    def _assembling(self, gate: GateInput) -> GateOutput:
+        return self._climb(gate, self.judge.engagement_fault(gate) or "ready to engage")
+
+    def _climb(self, gate: GateInput, reason: str, modes: tuple[ModeCommand, ...] = ()) -> GateOutput:
+        """Lead the drones that fly straight up to the assembly height, each by its own velocity loop."""
+        v_W = np.zeros((self.space.n, 3))
+        alarmed: Pairs = ()
+        if self.judge.estimate_fault(gate) is None:
+            below_m = self.limits.assembly_height_m - gate.p_W[:, 2]
+            v_W[:, 2] = np.clip(CLIMB_GAIN_1_S * below_m, 0.0, self.limits.assembly_climb_m_s)
+            v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, self.gains)
+        return self._output(gate, reason, modes=modes, v_W=v_W, alarmed=alarmed)
+
+    def _engaged(self, gate: GateInput) -> GateOutput:
+        self._judge(gate)
+        return self._held(gate) if self._fault else self._fly(gate)
+
+    def _fly(self, gate: GateInput) -> GateOutput:
+        c_des, c_dot_des = self.guidance.value(gate.t_s)
+        command = self.law.command(self.judge.value, gate.p_W, gate.v_W, c_des, c_dot_des, self._dt_s)
+        reason = "held on request" if self.guidance.paused else ""
+        if command.guarded:
+            reason = f"the guard parts {self._pairs(command.guarded)}"
+        output = self._output(
+            gate, reason, v_W=command.v_W, yaw_rate=command.yaw_rate, alarmed=command.alarmed
+        )
+        return dataclasses.replace(
+            output, desired=self.space.wrapped(c_des), desired_rate=c_dot_des, factor=command.factor
+        )
+
+    def _held(self, gate: GateInput) -> GateOutput:
+        v_W = np.zeros((self.space.n, 3))
+        alarmed: Pairs = ()
+        if self.judge.estimate_fault(gate) is None:
+            v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, self._apart)
+        return self._output(gate, self._fault, v_W=v_W, alarmed=alarmed)
+
+    def _landing(self, gate: GateInput) -> GateOutput:
+        # A take-off sent just before may still be on its way: idle only after a while on the ground.
+        if _down(gate) and gate.t_s - self._landing_s >= self.limits.resend_s:
+            self._phase = "idle"
+        modes = self._modes(gate, "land", AIRBORNE | {"taking_off"})
+        return self._output(gate, self.judge.state_fault(gate, DOWN) or "", modes=modes)
+
+    # Judging
+
+    def _judge(self, gate: GateInput) -> None:
+        """Set the fault of an engaged formation, or heal it when all has been well for a while."""
+        fault = self.judge.flight_fault(gate) or (None if self._fault else self._reference_fault(gate.t_s))
+        if fault:
+            self._fault, self._well_since_s = fault, math.inf
+        elif self._fault:
+            self._well_since_s = min(self._well_since_s, gate.t_s)
+            if gate.t_s - self._well_since_s >= self.limits.heal_s:
+                self._heal(gate)
+
+    def _heal(self, gate: GateInput) -> None:
+        try:
+            refuse(self.judge.formation_fault(gate))
+            self.guidance.rejoin(self.judge.value, gate.t_s)
+        except REFUSALS as refusal:
+            self._fault, self._well_since_s = f"cannot go on: {refusal}", gate.t_s
+        else:
+            self._fault = ""
+            self.law.reset()
+
+    def _reference_fault(self, t_s: float) -> str | None:
+        """Return why the reference may not be flown now: checks before the flight end after a while."""
+        try:
+            fault = place_fault(self.space, self.guidance.value(t_s)[0], self.gains, self.limits.shape)
+        except REFUSALS as error:
+            fault = str(error)
+        return f"reference: {fault}" if fault else None
+
+    # Output
+
+    def _modes(self, gate: GateInput, mode: str, states: frozenset[str]) -> tuple[ModeCommand, ...]:
+        """Return the mode command for drones in one of the states, again where it was sent long ago."""
+        commands = []
+        for drone, state in zip(self.drones, gate.states, strict=True):
+            since_s = gate.t_s - self._mode_sent_s.get(drone, -math.inf)
+            if state in states and since_s >= self.limits.resend_s:
+                self._mode_sent_s[drone] = gate.t_s
+                commands.append(ModeCommand(drone, mode))
+        return tuple(commands)
+
+    def _output(
+        self,
+        gate: GateInput,
+        reason: str,
+        *,
+        modes: tuple[ModeCommand, ...] = (),
+        v_W: Array | None = None,
+        yaw_rate: Array | None = None,
+        alarmed: Pairs = (),
+    ) -> GateOutput:
+        setpoints: list[Setpoint | None] = [None] * self.space.n
+        if v_W is not None:
+            rates = np.zeros(self.space.n) if yaw_rate is None else yaw_rate
+            for i, state in enumerate(gate.states):
+                if state in AIRBORNE:
+                    setpoints[i] = Setpoint(v_W[i], float(rates[i]))
+        if alarmed:
+            reason = (
+                f"ALARM, nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(alarmed)}; {reason}"
+            )
+        return GateOutput(
+            modes=modes,
+            setpoints=tuple(setpoints),
+            phase=self.phase,
+            value=self.judge.value,
+            desired=self.judge.value,
+            desired_rate=np.zeros(self.space.size),
+            trajectory_t_s=self.guidance.trajectory_t_s(gate.t_s) if self._phase == "engaged" else None,
+            margin=self.judge.margin,
+            reason="; ".join(text for text in (reason, self.plan.note) if text),
+            factor=1.0,
+            alarmed=alarmed,
+        )
+
+    def _pairs(self, pairs: Pairs) -> str:
+        return ", ".join(f"{self.drones[i]} and {self.drones[j]}" for i, j in pairs)
+
+
+_PHASES = {
+    "idle": Engagement._idle,
+    "taking_off": Engagement._taking_off,
+    "assembling": Engagement._assembling,
+    "engaged": Engagement._engaged,
+    "landing": Engagement._landing,
+}
+
+
+def _down(gate: GateInput) -> bool:
+    return all(state in DOWN for state in gate.states)

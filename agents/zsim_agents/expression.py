@@ -1,0 +1,284 @@
+"""An expression of t as text, with its exact derivative.
+
+The text is parsed by Python's own grammar, only whitelisted nodes are taken over into a tree of closures,
+and the tree is evaluated on dual numbers (value, rate): nothing of the text is ever executed.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+Dual = tuple[float, float]
+
+TEXT_MAX = 1000  # characters
+DEPTH_MAX = 100  # nested operations
+CONSTANTS = {"pi": math.pi, "e": math.e}
+
+
+class ExpressionError(ValueError):
+    """An expression is not allowed or has no finite value; the message names variable, finding and remedy."""
+
+
+class _Node(NamedTuple):
+    evaluate: Callable[[float], Dual]
+    constant: bool
+
+
+class Expression:
+    """A function of t with its exact first derivative.
+
+    Args:
+        name: the variable that it describes, for messages.
+        text: for example "5*cos(2*pi*f*t)".
+        constants: user constants by name, such as {"f": 0.01}.
+
+    Raises:
+        ExpressionError: the text is not an expression of t in numbers, + - * / **, constants and functions.
+    """
+
+    def __init__(self, name: str, text: str, constants: Mapping[str, float] | None = None) -> None:
+        self.name = name
+        self.text = text
+        self._constants = {**CONSTANTS, **checked_constants(constants or {})}
+        node = self._build(self._parse(), 0)
+        self._evaluate, self.constant = node
+
+    def __call__(self, t_s: float) -> Dual:
+        """Return value and rate per second at t_s.
+
+        Raises:
+            ExpressionError: one of them is not finite there.
+        """
+        try:
+            value, rate = self._evaluate(t_s)
+        except (ArithmeticError, ValueError) as error:
+            raise self._error(f"has no value at t = {t_s:g} s ({error})") from None
+        if not (math.isfinite(value) and math.isfinite(rate)):
+            raise self._error(f"has value {value} and rate {rate} at t = {t_s:g} s; both must be finite")
+        return value, rate
+
+    def _parse(self) -> ast.expr:
+        if not isinstance(self.text, str):
+            raise self._error(f"is of type {type(self.text).__name__}; allowed: text or a number")
+        if len(self.text) > TEXT_MAX:
+            raise self._error(f"has {len(self.text)} characters; allowed: {TEXT_MAX}")
+        try:
+            return ast.parse(self.text.strip(), mode="eval").body
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+            reason = error.msg if isinstance(error, SyntaxError) else error
+            raise self._error(f"cannot be read ({reason})") from None
+
+    def _build(self, tree: ast.expr, depth: int) -> _Node:
+        if depth > DEPTH_MAX:
+            raise self._error(f"is nested deeper than {DEPTH_MAX}; allowed: {DEPTH_MAX}")
+        if isinstance(tree, ast.Constant):
+            return _constant(self._finite(tree.value))
+        if isinstance(tree, ast.Name):
+            return self._named(tree.id)
+        if isinstance(tree, ast.BinOp) and type(tree.op) in _BINARY:
+            return self._apply(_BINARY[type(tree.op)], [tree.left, tree.right], depth)
+        if isinstance(tree, ast.UnaryOp) and type(tree.op) in _UNARY:
+            return self._apply(_UNARY[type(tree.op)], [tree.operand], depth)
+        if isinstance(tree, ast.Call):
+            return self._call(tree, depth)
+        raise self._error(f"contains {self._source(tree)!r}; allowed: {self._allowed()}")
+
+    def _named(self, name: str) -> _Node:
+        if name == "t":
+            return _Node(lambda t: (t, 1.0), False)
+        if name not in self._constants:
+            raise self._error(f"uses {name[:40]!r}; allowed: {self._allowed()}")
+        return _constant(self._constants[name])
+
+    def _finite(self, value: object) -> float:
+        number = finite_number(value)
+        if number is None:
+            raise self._error(f"contains {str(value)[:40]!r}; allowed: {self._allowed()}")
+        return number
+
+    def _call(self, tree: ast.Call, depth: int) -> _Node:
+        name = self._source(tree.func)
+        if name not in _FUNCTIONS or tree.keywords:
+            raise self._error(f"calls {name!r}; allowed: {self._allowed()}")
+        function, least, most = _FUNCTIONS[name]
+        if not least <= len(tree.args) <= most:
+            count = f"{least}" if least == most else f"{least} to {most}"
+            raise self._error(f"calls {name} with {len(tree.args)} arguments; allowed: {count}")
+        return self._apply(function, tree.args, depth)
+
+    def _apply(self, function: Callable[..., Dual], trees: list[ast.expr], depth: int) -> _Node:
+        nodes = [self._build(tree, depth + 1) for tree in trees]
+        parts = [node.evaluate for node in nodes]
+        if all(node.constant for node in nodes):
+            return self._folded(function, [part(0.0) for part in parts])
+        if len(parts) == 1:
+            (only,) = parts
+            return _Node(lambda t: function(only(t)), False)
+        return _Node(lambda t: function(*[part(t) for part in parts]), False)
+
+    def _folded(self, function: Callable[..., Dual], arguments: list[Dual]) -> _Node:
+        try:
+            value, _ = function(*arguments)
+        except (ArithmeticError, ValueError) as error:
+            raise self._error(f"has a constant part without a value ({error})") from None
+        if not math.isfinite(value):
+            raise self._error(f"has a constant part of value {value}; allowed: finite values")
+        return _constant(value)
+
+    def _source(self, tree: ast.expr) -> str:
+        return (ast.get_source_segment(self.text.strip(), tree) or "")[:40]
+
+    def _error(self, finding: str) -> ExpressionError:
+        return ExpressionError(f"{self.name}: expression {str(self.text)[:60]!r} {finding}")
+
+    def _allowed(self) -> str:
+        return f"t, numbers, + - * / **, {', '.join(self._constants)}, {', '.join(_FUNCTIONS)}"
+
+
+def checked_constants(constants: Mapping[str, float]) -> dict[str, float]:
+    """Return the constants as floats.
+
+    Raises:
+        ExpressionError: a name is taken or no identifier, or a value is not a finite number.
+    """
+    for name, value in constants.items():
+        if not (isinstance(name, str) and name.isidentifier()) or name in {"t", *CONSTANTS, *_FUNCTIONS}:
+            taken = ", ".join(["t", *CONSTANTS, *_FUNCTIONS])
+            raise ExpressionError(
+                f"constant {str(name)[:40]!r}: not a free name; allowed: an identifier except {taken}"
+            )
+        if finite_number(value) is None:
+            raise ExpressionError(f"constant {name}: found {str(value)[:40]!r}; allowed: a finite number")
+    return {name: float(value) for name, value in constants.items()}
+
+
+def finite_number(value: object) -> float | None:
+    """Return the value as a float, or None where it is no finite number (bool is none)."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value) if math.isfinite(value) else None
+    except OverflowError:
+        return None
+
+
+def _constant(value: float) -> _Node:
+    return _Node(lambda t: (value, 0.0), True)
+
+
+def _add(a: Dual, b: Dual) -> Dual:
+    return a[0] + b[0], a[1] + b[1]
+
+
+def _subtract(a: Dual, b: Dual) -> Dual:
+    return a[0] - b[0], a[1] - b[1]
+
+
+def _multiply(a: Dual, b: Dual) -> Dual:
+    return a[0] * b[0], a[1] * b[0] + a[0] * b[1]
+
+
+def _divide(a: Dual, b: Dual) -> Dual:
+    value = a[0] / b[0]
+    return value, (a[1] - value * b[1]) / b[0]
+
+
+def _power(a: Dual, b: Dual) -> Dual:
+    base, exponent = a[0], b[0]
+    value = math.pow(base, exponent)
+    rate = exponent * math.pow(base, exponent - 1) * a[1] if exponent and a[1] else 0.0
+    return value, rate + value * math.log(base) * b[1] if b[1] else rate
+
+
+def _minus(a: Dual) -> Dual:
+    return -a[0], -a[1]
+
+
+def _plus(a: Dual) -> Dual:
+    return a
+
+
+def _sin(a: Dual) -> Dual:
+    return math.sin(a[0]), math.cos(a[0]) * a[1]
+
+
+def _cos(a: Dual) -> Dual:
+    return math.cos(a[0]), -math.sin(a[0]) * a[1]
+
+
+def _tan(a: Dual) -> Dual:
+    value = math.tan(a[0])
+    return value, (1 + value * value) * a[1]
+
+
+def _asin(a: Dual) -> Dual:
+    return math.asin(a[0]), _slope(a[1], math.sqrt(1 - a[0] * a[0]))
+
+
+def _acos(a: Dual) -> Dual:
+    return math.acos(a[0]), -_slope(a[1], math.sqrt(1 - a[0] * a[0]))
+
+
+def _atan(a: Dual) -> Dual:
+    return math.atan(a[0]), a[1] / (1 + a[0] * a[0])
+
+
+def _sqrt(a: Dual) -> Dual:
+    value = math.sqrt(a[0])
+    return value, _slope(a[1], 2 * value)
+
+
+def _exp(a: Dual) -> Dual:
+    value = math.exp(a[0])
+    return value, value * a[1]
+
+
+def _log(a: Dual) -> Dual:
+    return math.log(a[0]), a[1] / a[0]
+
+
+def _abs(a: Dual) -> Dual:
+    return abs(a[0]), (math.copysign(1.0, a[0]) if a[0] else 0.0) * a[1]
+
+
+def _min(*parts: Dual) -> Dual:
+    return min(parts, key=_value)
+
+
+def _max(*parts: Dual) -> Dual:
+    return max(parts, key=_value)
+
+
+def _value(a: Dual) -> float:
+    return a[0]
+
+
+def _slope(rate: float, divisor: float) -> float:
+    return rate / divisor if rate else 0.0
+
+
+_BINARY: dict[type[ast.operator], Callable[[Dual, Dual], Dual]] = {
+    ast.Add: _add,
+    ast.Sub: _subtract,
+    ast.Mult: _multiply,
+    ast.Div: _divide,
+    ast.Pow: _power,
+}
+_UNARY: dict[type[ast.unaryop], Callable[[Dual], Dual]] = {ast.USub: _minus, ast.UAdd: _plus}
+_FUNCTIONS: dict[str, tuple[Callable[..., Dual], int, int]] = {
+    "sin": (_sin, 1, 1),
+    "cos": (_cos, 1, 1),
+    "tan": (_tan, 1, 1),
+    "asin": (_asin, 1, 1),
+    "acos": (_acos, 1, 1),
+    "atan": (_atan, 1, 1),
+    "sqrt": (_sqrt, 1, 1),
+    "exp": (_exp, 1, 1),
+    "log": (_log, 1, 1),
+    "abs": (_abs, 1, 1),
+    "min": (_min, 2, 16),
+    "max": (_max, 2, 16),
+}

@@ -1,0 +1,102 @@
+"""What the phase machine of a formation reads and gives at every gate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from zsim_agents.cluster_space import Array
+from zsim_agents.reference_check import ShapeLimits
+
+AIRBORNE = frozenset({"hovering", "flying"})  # states of a drone that follows velocity commands
+DOWN = frozenset({"landed", "emergency"})  # states of a drone that is on the ground, or falls to it
+
+
+@dataclass(frozen=True)
+class EngagementLimits:
+    """Limits and heights of the phase machine.
+
+    Attributes:
+        shape: where a formation may be engaged and led.
+        flight_slack: in flight the spread may fall to its limit over this, the tilt grow to its limit times
+            this.
+        assembly_height_m: height to which drones climb straight up before engagement, within
+            assembly_within_m.
+        assembly_climb_m_s: greatest speed of that climb.
+        age_max_s: oldest estimate that is flown on.
+        sigma_max_m: greatest sigma of position for take-off and engagement; sigma_lost_m: in flight.
+        heal_s: how long everything must be well before a held formation goes on.
+        resend_s: after it a mode command without effect is sent again.
+    """
+
+    shape: ShapeLimits = field(default_factory=ShapeLimits)
+    flight_slack: float = 1.5
+    assembly_height_m: float = 1.5
+    assembly_within_m: float = 0.3
+    assembly_climb_m_s: float = 0.5
+    age_max_s: float = 0.5
+    sigma_max_m: float = 1.0
+    sigma_lost_m: float = 2.0
+    heal_s: float = 0.5
+    resend_s: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class GateInput:
+    """The newest estimates of n drones at a gate.
+
+    Attributes:
+        t_s: simulated time.
+        p_W, v_W: (n, 3) [m, m/s]; yaw: (n,) [rad]; non-finite where nothing is known.
+        sigma_m: (n, 3) standard deviations of position.
+        age_s: (n,) ages of the estimates; infinite where there is none.
+        states: (n,) `state` of each drone's sensor/status.
+    """
+
+    t_s: float
+    p_W: Array
+    yaw: Array
+    v_W: Array
+    sigma_m: Array
+    age_s: Array
+    states: tuple[str, ...]
+
+
+class ModeCommand(NamedTuple):
+    """A mode command for one drone: takeoff or land."""
+
+    drone: str
+    mode: str
+
+
+class Setpoint(NamedTuple):
+    """A velocity command for one drone."""
+
+    v_W: Array
+    yaw_rate: float
+
+
+@dataclass(frozen=True, eq=False)
+class GateOutput:
+    """Commands of a gate, and the fields of the cluster's state message.
+
+    Attributes:
+        modes: mode commands to send.
+        setpoints: (n,) what each drone is to do, None for no command.
+        phase, value, desired, desired_rate, trajectory_t_s, margin, reason: as in the message; value and
+            desired with wrapped angles.
+        factor: common factor of the saturation, 1 where nothing is saturated.
+        alarmed: pairs of drone indices that are nearer than the alarm threshold.
+    """
+
+    modes: tuple[ModeCommand, ...]
+    setpoints: tuple[Setpoint | None, ...]
+    phase: str
+    value: Array
+    desired: Array
+    desired_rate: Array
+    trajectory_t_s: float | None
+    margin: float
+    reason: str
+    factor: float
+    alarmed: tuple[tuple[int, int], ...]

@@ -1,0 +1,112 @@
+"""Whether a formation may take off, be engaged, and be flown on: every fault in words."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from zsim_agents.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
+from zsim_agents.flight_data import AIRBORNE, EngagementLimits, GateInput
+from zsim_agents.formation import FormationGains
+from zsim_agents.reference_check import shape_fault
+
+
+class FlightJudge:
+    """Judges the estimates and states of a gate; each judgement is the fault, or None where all is well.
+
+    Attributes:
+        value: (4n,) cluster of the newest estimates that had a frame, zero before any.
+        margin: its distance to singularity [m] (`ClusterSpace.margin`), 0 while the estimates have no frame.
+    """
+
+    def __init__(
+        self,
+        space: ClusterSpace,
+        drones: tuple[str, ...],
+        gains: FormationGains,
+        limits: EngagementLimits,
+    ) -> None:
+        self.space = space
+        self.drones = drones
+        self.gains = gains
+        self.limits = limits
+        slack, shape = limits.flight_slack, limits.shape
+        self._shape_in_flight = dataclasses.replace(
+            shape,
+            spread_min_m=shape.spread_min_m / slack,
+            tilt_max_rad=shape.tilt_max_rad * slack,
+            condition_max=math.inf,
+        )
+        self.value: Array = np.zeros(space.size)
+        self.margin = 0.0
+        self._no_frame: str | None = "nothing was observed yet"
+
+    def observe(self, gate: GateInput) -> None:
+        """Take over the estimates of a gate."""
+        self.margin, self._no_frame = 0.0, "an estimate is not finite"
+        if not np.isfinite(gate.p_W.sum() + gate.yaw.sum()):
+            return
+        try:
+            self.value = self.space.forward(gate.p_W, gate.yaw)
+            self.margin, self._no_frame = self.space.margin(self.value), None
+        except SingularClusterError as error:
+            self._no_frame = str(error)
+
+    def take_off_fault(self, gate: GateInput) -> str | None:
+        """Return why the drones may not take off; drones that fly already need not stand well."""
+        fault = self.state_fault(gate, AIRBORNE | {"landed"}) or self._estimate_fault(
+            gate, self.limits.sigma_max_m
+        )
+        return fault or (self.formation_fault(gate) if "landed" in gate.states else None)
+
+    def engagement_fault(self, gate: GateInput) -> str | None:
+        """Return why the formation cannot be engaged."""
+        fault = self.state_fault(gate, AIRBORNE) or self._estimate_fault(gate, self.limits.sigma_max_m)
+        if fault:
+            return fault
+        low = int(np.argmin(gate.p_W[:, 2]))
+        least_m = self.limits.assembly_height_m - self.limits.assembly_within_m
+        if gate.p_W[low, 2] < least_m:
+            return f"{self.drones[low]} is at z = {gate.p_W[low, 2]:.2f} m; allowed: {least_m:.2f} m or more"
+        return self.formation_fault(gate)
+
+    def flight_fault(self, gate: GateInput) -> str | None:
+        """Return why the loop of an engaged formation cannot be closed."""
+        fault = self.state_fault(gate, AIRBORNE) or self.estimate_fault(gate) or self._no_frame
+        return fault or shape_fault(self.space, self.value, self._shape_in_flight)
+
+    def formation_fault(self, gate: GateInput) -> str | None:
+        """Return why the robots, where they are, make no formation to start from."""
+        fault = self._no_frame or shape_fault(self.space, self.value, self.limits.shape)
+        if fault:
+            return fault
+        distance, i, j = closest_pair(gate.p_W)
+        if distance >= self.gains.separation_min_m:
+            return None
+        pair = f"{self.drones[i]} and {self.drones[j]}"
+        return f"{pair} are {distance:.2f} m apart; allowed: {self.gains.separation_min_m:g} m or more"
+
+    def estimate_fault(self, gate: GateInput) -> str | None:
+        """Return why the estimates of drones in flight cannot be flown on."""
+        return self._estimate_fault(gate, self.limits.sigma_lost_m)
+
+    def state_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
+        """Return which drone is in another state than those allowed."""
+        for drone, state in zip(self.drones, gate.states, strict=True):
+            if state not in allowed:
+                return f"{drone} is in state {state}; allowed: {', '.join(sorted(allowed))}"
+        return None
+
+    def _estimate_fault(self, gate: GateInput, sigma_max_m: float) -> str | None:
+        ages, sigmas = gate.age_s.tolist(), gate.sigma_m.max(axis=1).tolist()
+        finite = (gate.p_W.sum(axis=1) + gate.v_W.sum(axis=1) + gate.yaw).tolist()
+        for drone, age_s, sigma_m, known in zip(self.drones, ages, sigmas, finite, strict=True):
+            if not age_s <= self.limits.age_max_s:
+                return f"the estimate of {drone} is {age_s:.2f} s old; allowed: {self.limits.age_max_s:g} s"
+            if not math.isfinite(known):
+                return f"the estimate of {drone} is not finite"
+            if not sigma_m <= sigma_max_m:
+                return f"the position of {drone} has a sigma of {sigma_m:.2f} m; allowed: {sigma_max_m:g} m"
+        return None

@@ -1,0 +1,184 @@
+"""The recorder as a process: every message of every key into `run.mcap`; not gating, but never skipping either.
+
+Order of this file: `record`, the process, what arrives.
+"""
+
+import os
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from zsim import __version__, keys, messages
+from zsim.errors import RecordError
+from zsim.health import HealthMeter
+from zsim.record import RecordWriter
+from zsim.session import Sample, Session
+
+NAME = "recorder"
+TICK_S = 0.1  # how often the open chunk's age and a stop are looked at
+REPLAY_S = 5.0  # a hub answers within milliseconds
+DRAIN_S = 1.0  # after `stopped`, how long the byes of the others are waited for
+KNOWN_MAX = 100_000  # replayed messages remembered, so that none is written twice
+
+
+class _Head(msgspec.Struct):
+    t_ns: int
+
+
+def record(
+    link: Session,
+    info: messages.Info,
+    path: Path,
+    name: str = NAME,
+    stopped: Callable[[], bool] = lambda: False,
+) -> str:
+    """Record a run until it ends; return why it ended.
+
+    Raises:
+        RecordError: the disk is full or the file cannot be written; what was written before is readable.
+    """
+    return Recorder(link, info, path, name, stopped).run()
+
+
+class Recorder:
+    """Writes what passes on `**`."""
+
+    def __init__(
+        self, link: Session, info: messages.Info, path: Path, name: str, stopped: Callable[[], bool]
+    ) -> None:
+        self._link = link
+        self._info = info
+        self._name = name
+        self._stopped = stopped
+        self._writer = RecordWriter(path)
+        self._head = msgspec.msgpack.Decoder(_Head)
+        self._clock = msgspec.msgpack.Decoder(messages.Clock)
+        self._known: set[tuple[str, bytes]] = set()
+        self._over = threading.Event()
+        self._ended_s: float | None = None
+        self._now_ns = 0
+        self._seq = {"join": 0, "bye": 0, "health": 0}
+        self._leavers: set[str] = set()
+        self._joined: set[str] = set()
+        self.health = HealthMeter(NAME)
+
+    def run(self) -> str:
+        self._box = self._link.subscribe("**")
+        self._link.declare_token(keys.token(self._name))
+        self._link.on_link(lambda up: self._box.wake())
+        self._catch_up()
+        self._join()
+        ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
+        ticker.start()
+        try:
+            reason = self._loop()
+            self._writer.close()
+        except RecordError as error:
+            self._bye(str(error))
+            raise
+        finally:
+            self._over.set()
+            ticker.join()
+        self._bye(reason)
+        return reason
+
+    def _loop(self) -> str:
+        while True:
+            sample = self._box.receive()
+            if sample is not None:
+                self._write(sample)
+            for sample in self._box.drain():
+                self._write(sample)
+            self._writer.tick(time.monotonic_ns())
+            if self._stopped():
+                return "stopped"
+            if self._ended_s is not None and self._all_left():
+                return "the run ended"
+
+    def _all_left(self) -> bool:
+        """Tell whether everybody has said bye, or has had the time to."""
+        late = time.monotonic() - (self._ended_s or 0.0) > DRAIN_S
+        return late or self._joined <= self._leavers
+
+    def _catch_up(self) -> None:
+        """Write what was said before this process came: the world keeps it for those who ask."""
+        answer = self._link.request(
+            keys.CONTROL, "replay", self._name, timeout_s=REPLAY_S, from_ns=-1, keys=["**"]
+        )
+        for key, payload in answer.result or ():
+            self._write(Sample(key, payload, messages.encoding(key)))
+            if len(self._known) < KNOWN_MAX:
+                self._known.add((key, payload))
+
+    def _write(self, sample: Sample) -> None:
+        key, payload = sample.key, sample.payload
+        if self._known and (key, payload) in self._known:
+            return
+        self.health.received += 1
+        t_ns = self._stamp(key, payload)
+        self._writer.add(key, payload, sample.encoding, t_ns, time.time_ns())
+        if key == keys.CLOCK:
+            self._on_clock(payload)
+        elif key.startswith("process/"):
+            self._on_process(key)
+
+    def _stamp(self, key: str, payload: bytes) -> int:
+        """Return the message's own time; garbage is recorded at the time of its neighbours."""
+        try:
+            self._now_ns = max(0, min(self._head.decode(payload).t_ns, 2**62))
+        except (msgspec.MsgspecError, UnicodeDecodeError):
+            self.health.refused += 1
+        return self._now_ns
+
+    def _on_clock(self, payload: bytes) -> None:
+        try:
+            clock = self._clock.decode(payload)
+        except msgspec.MsgspecError:
+            return  # garbage by somebody else on `clock`; recorded as it came
+        if clock.state == "stopped" and clock.run_id == self._info.run_id and self._ended_s is None:
+            self._ended_s = time.monotonic()
+        elif clock.step > 1:
+            self._known.clear()
+
+    def _on_process(self, key: str) -> None:
+        name, what = keys.thing(key), keys.leaf(key)
+        if what == "join" and name != self._name:
+            self._joined.add(name)
+            self._leavers.discard(name)
+        elif what == "bye":
+            self._leavers.add(name)
+
+    def _join(self) -> None:
+        join = messages.Join(
+            t_ns=0,
+            seq=self._next("join"),
+            run_id=self._info.run_id,
+            incarnation=secrets.randbits(62),
+            role=NAME,
+            host=socket.gethostname(),
+            pid=os.getpid(),
+            period_ns=0,
+            version=__version__,
+        )
+        self._say("join", join)
+
+    def _bye(self, reason: str) -> None:
+        self._say("bye", messages.Bye(self._now_ns, self._next("bye"), reason))
+
+    def _say(self, what: str, message: messages.Message) -> None:
+        self._link.put(keys.process(self._name, what), message)
+
+    def _next(self, what: str) -> int:
+        self._seq[what] += 1
+        return self._seq[what] - 1
+
+    def _tick(self) -> None:
+        while not self._over.wait(TICK_S):
+            self._box.wake()
+            if self.health.due():
+                self._say("health", self.health.message(self._now_ns, self._next("health")))

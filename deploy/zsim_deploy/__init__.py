@@ -1,0 +1,1 @@
+"""The command line, and launching processes here and on other hosts."""

@@ -1,0 +1,99 @@
+"""`zsim run --in-process`: world, agents and record in one process on an in-memory bus."""
+
+import gc
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from msgspec import Struct
+
+from zsim import keys, messages
+from zsim.agent import Agent
+from zsim.in_process import Bus
+from zsim.record import RecordWriter
+from zsim.scenario import Scenario
+from zsim_agents.controller import Controller
+from zsim_agents.estimator import Estimator
+from zsim_deploy.progress import Screen, Throttle
+from zsim_world.world import World, expected
+
+
+def agents(world: World) -> list[Agent]:
+    """Return the agents that a scenario expects, built from `world/info` as any process would."""
+    info, scenario = world.info(), world.scenario
+    made: list[Agent] = []
+    for name in expected(scenario):
+        role, _, thing = name.partition(".")
+        if role == "estimator":
+            made.append(Estimator(info, scenario, thing))
+        elif role == "controller":
+            made.append(Controller(info, scenario, thing))
+    return made
+
+
+def fly(
+    scenario: Scenario,
+    record: Path | None,
+    stopped: Callable[[], str | None] = lambda: None,
+    screen: Screen | None = None,
+    run_id: str | None = None,
+) -> str:
+    """Fly a scenario and record it; return why it ended.
+
+    Args:
+        scenario: resolved.
+        record: path of the record, None for no record.
+        stopped: asked at every gate; a text ends the run.
+        screen: shows progress.
+        run_id: given only by tests that compare records.
+    """
+    world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id)
+    writer = RecordWriter(record) if record else None
+    show = _Show(world, writer, screen)
+    bus = Bus(world, agents(world), time.monotonic_ns, show.sink)
+    try:
+        show.sink(keys.INFO, world.info())
+        bus.join()
+        gc.collect()
+        gc.freeze()
+        while bus.turn():
+            reason = stopped()
+            if reason:
+                world.stop(reason)
+        bus.end()
+    finally:
+        if writer:
+            writer.close()
+    return world.ended or "ended"
+
+
+class _Show:
+    """Takes every message: into the record, and now and then onto the screen."""
+
+    def __init__(self, world: World, writer: RecordWriter | None, screen: Screen | None) -> None:
+        self._world = world
+        self._writer = writer
+        self._screen = screen
+        self._throttle = Throttle()
+        self._phase = ""
+
+    def sink(self, key: str, message: Struct) -> None:
+        if self._writer is not None:
+            t_ns = message.t_ns  # type: ignore[attr-defined]
+            self._writer.add(key, messages.encode(message), messages.encoding(key), t_ns, time.time_ns())
+        if self._screen is not None:
+            self._show(key, message, self._screen)
+
+    def _show(self, key: str, message: Struct, screen: Screen) -> None:
+        if isinstance(message, messages.ClusterState):
+            self._phase = message.phase
+        elif isinstance(message, messages.Event):
+            screen.event({"t_s": message.t_ns / 1e9, "kind": message.kind, "text": message.text})
+        elif isinstance(message, messages.Clock) and self._throttle.passes():
+            line = {
+                "t_s": message.t_ns / 1e9,
+                "rate": message.rate,
+                "state": message.state,
+                "phase": self._phase,
+            }
+            screen.clock({**line, "waiting_for": []})

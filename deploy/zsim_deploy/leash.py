@@ -1,0 +1,57 @@
+"""How a process learns that it is to stop: a signal, a word from its launcher, or the launcher's death.
+
+A launched process has a pipe from its launcher as standard input. The launcher writes "stop REASON"; when it dies,
+the pipe ends. So nothing outlives its launcher, on any system, also after kill -9.
+"""
+
+import os
+import signal
+import sys
+import threading
+import time
+
+GRACE_S = (
+    4.0  # a role that was told to stop and hangs is ended; the world waits 5 s for byes only if unstopped
+)
+
+
+class Leash:
+    """The reason to stop, once there is one.
+
+    Args:
+        launched: whether standard input is a launcher's pipe; then Ctrl-C is the launcher's business.
+    """
+
+    def __init__(self, launched: bool) -> None:
+        self._reason: str | None = None
+        signal.signal(signal.SIGTERM, lambda *_: self._stop("terminated"))
+        if launched:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            threading.Thread(target=self._listen, name="leash", daemon=True).start()
+        else:
+            signal.signal(signal.SIGINT, self._on_interrupt)
+
+    def reason(self) -> str | None:
+        """Return why to stop, None to go on."""
+        return self._reason
+
+    def pulled(self) -> bool:
+        """Tell whether to stop."""
+        return self._reason is not None
+
+    def _stop(self, reason: str) -> None:
+        self._reason = self._reason or reason
+
+    def _on_interrupt(self, *_: object) -> None:
+        if self._reason is not None:
+            os._exit(130)  # asked twice: do not wait for anybody
+        self._stop("interrupted by Ctrl-C")
+
+    def _listen(self) -> None:
+        for line in sys.stdin:
+            word, _, reason = line.strip().partition(" ")
+            if word == "stop":
+                self._stop(reason or "stopped by the launcher")
+        self._stop("the launcher is gone")
+        time.sleep(GRACE_S)
+        os._exit(1)

@@ -1,0 +1,134 @@
+"""The roles as processes: what `zsim world`, `zsim estimator`, `zsim controller` and `zsim record` do."""
+
+import gc
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from zsim import messages, scenario_file
+from zsim.agent import Agent
+from zsim.connection import find_world
+from zsim.runner import Runner
+from zsim.scenario import Scenario
+from zsim_deploy.leash import Leash
+from zsim_deploy.progress import Screen, Show, Teller, Throttle
+
+SHOWN_EVENTS = 2000  # events told to a launcher per run; all of them are in the record
+
+
+def world(
+    scenario: Scenario, mode: str, rate: float, endpoints: list[str], launched: bool, expect: list[str] | None
+) -> None:
+    """Run the world of a scenario on the endpoints until the scenario ends or somebody stops it."""
+    from zsim_world.process import run
+    from zsim_world.world import World
+
+    leash = Leash(launched)
+    run_world = World(scenario, mode, rate, time.monotonic_ns)
+    for name in expect or ():
+        run_world.barrier.expect(name)
+    gc.collect()
+    gc.freeze()
+    if launched:
+        run(run_world, endpoints, leash.reason, _told(Teller()))
+        return
+    with Screen(scenario.duration_s) as screen:
+        screen.say(f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run")
+        run(run_world, endpoints, leash.reason, _told(screen))
+        screen.say(f"ended: {run_world.ended}")
+
+
+def _told(show: Show) -> Callable[[str, Any, str], None]:
+    """Return what the world calls with its clocks and events."""
+    throttle = Throttle()
+    told = [0]
+
+    def tell(kind: str, message: Any, phase: str) -> None:
+        if kind == "clock" and (throttle.passes() or message.state == "stopped"):
+            show.clock(_clock_line(message, phase))
+        elif kind == "event" and told[0] < SHOWN_EVENTS:
+            told[0] += 1
+            show.event(_event_line(message))
+
+    return tell
+
+
+def _clock_line(clock: messages.Clock, phase: str) -> dict[str, Any]:
+    waiting = [
+        {"name": w.name, "host": w.host, "since_wall_s": round(w.since_wall_s, 1)} for w in clock.waiting_for
+    ]
+    return {
+        "t_s": clock.t_ns / 1e9,
+        "rate": clock.rate,
+        "state": clock.state,
+        "phase": phase,
+        "waiting_for": waiting,
+    }
+
+
+def _event_line(event: messages.Event) -> dict[str, Any]:
+    data = event.data if event.kind == "end" else {}
+    return {
+        "t_s": event.t_ns / 1e9,
+        "kind": event.kind,
+        "subject": event.subject,
+        "text": event.text,
+        "data": data,
+    }
+
+
+def agent(
+    build: Callable[[messages.Info, Scenario], Agent],
+    endpoint: str,
+    federation: str,
+    wait_s: float | None,
+    launched: bool,
+) -> None:
+    """Run one agent against the world on an endpoint."""
+    leash = Leash(launched)
+    say = _speaker(launched)
+    with find_world(endpoint, federation, wait_s, say, leash.pulled) as (link, info):
+        made = build(info, scenario_file.from_text(info.scenario))
+        say(f"{made.name}: in run {info.run_id}")
+        gc.collect()
+        gc.freeze()
+        reason = Runner(link, info, made, leash.pulled, say).run()
+    say(f"{made.name}: left, {reason}")
+
+
+def estimator(drone: str) -> Callable[[messages.Info, Scenario], Agent]:
+    from zsim_agents.estimator import Estimator
+
+    return lambda info, scenario: Estimator(info, scenario, drone)
+
+
+def controller(cluster: str) -> Callable[[messages.Info, Scenario], Agent]:
+    from zsim_agents.controller import Controller
+
+    return lambda info, scenario: Controller(info, scenario, cluster)
+
+
+def recorder(path: Path, endpoint: str, federation: str, wait_s: float | None, launched: bool) -> None:
+    """Record the run of the world on an endpoint into a file."""
+    from zsim_agents.recorder import record
+
+    leash = Leash(launched)
+    say = _speaker(launched)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with find_world(endpoint, federation, wait_s, say, leash.pulled) as (link, info):
+        say(f"recorder: run {info.run_id} into {path}")
+        reason = record(link, info, path, stopped=leash.pulled)
+    say(f"recorder: {path} is complete, {reason}")
+
+
+def _speaker(launched: bool) -> Callable[[str], None]:
+    """Return how a role speaks to a person: plain lines on standard error, which a launcher keeps as its log."""
+
+    def say(text: str) -> None:
+        if launched:
+            text = f"{time.strftime('%H:%M:%S')} {text}"
+        print(text, file=sys.stderr, flush=True)
+
+    return say

@@ -1,0 +1,573 @@
+"""The phase machine flown on ideal drones: phases, refusals, faults in flight, plans."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from zsim_agents import reference_check
+from zsim_agents.cluster_space import closest_pair, cluster_space
+from zsim_agents.engagement import Engagement
+from zsim_agents.flight_data import EngagementLimits, GateInput
+from zsim_agents.flight_plan import Scheduled
+from zsim_agents.flight_request import Engage, Follow, Land, Pause, RequestError, TakeOff, Target, read_request
+
+SPACE = cluster_space(3)
+DRONES = ("drone1", "drone2", "drone3")
+GROUND = np.array([(0.0, 1.5, 0.0), (-1.5, -1.5, 0.0), (1.5, -1.5, 0.0)])  # facts: where the drones start
+GATE_S = 0.02
+PAPER_3 = {
+    "x_c": 5, "y_c": -5, "z_c": 15, "roll": 0, "pitch": 0, "yaw": math.pi / 2,
+    "phi_1": 0, "phi_2": 0, "phi_3": 0, "p": 4, "q": 4, "beta": math.pi / 4,
+}  # fmt: skip
+PAPER_4 = {
+    "x_c": "5*cos(2*pi*f*t)", "y_c": "-5*(1 + 1/2*sin(4*pi*f*t))", "z_c": "15 + 5/2*(1 - cos(3*pi*f*t))",
+    "yaw": "0.1*t", "p": "4", "q": "4", "beta": "pi/4",
+}  # fmt: skip
+
+
+class Fleet:
+    """Drones that follow velocity commands one gate late, take off in 2 s and land at 1 m/s."""
+
+    def __init__(self, engagement, noise_m=0.0, p_W=GROUND):
+        self.engagement = engagement
+        self.rng = np.random.default_rng(7)
+        self.noise_m = noise_m
+        self.p_W, self.yaw = p_W.copy(), np.zeros(len(p_W))
+        self.v_W, self.yaw_rate = np.zeros_like(p_W), np.zeros(len(p_W))
+        self.states = ["landed"] * len(p_W)
+        self.gate = 0
+        self.spoil = {}  # fields of the next inputs, for faults
+        self.modes, self.closest_m, self.output = [], math.inf, None
+
+    @property
+    def t_s(self):
+        return self.gate * GATE_S
+
+    def fly(self, seconds):
+        """Advance and return the outputs of all gates."""
+        return [self.step() for _ in range(round(seconds / GATE_S))]
+
+    def fly_until(self, phase, limit_s=60.0):
+        for _ in range(round(limit_s / GATE_S)):
+            if self.step().phase == phase:
+                return self.output
+        raise AssertionError(f"phase {phase} not reached: {self.output.phase}, {self.output.reason}")
+
+    def step(self):
+        output = self.output = self.engagement.step(self._input())
+        self._move()
+        for drone, mode in output.modes:
+            self.modes.append((self.t_s, drone, mode))
+            self.states[self.engagement.drones.index(drone)] = "taking_off" if mode == "takeoff" else "landing"
+        for i, setpoint in enumerate(output.setpoints):
+            self.v_W[i], self.yaw_rate[i] = setpoint or (np.zeros(3), 0.0)
+        self.gate += 1
+        return output
+
+    def _input(self):
+        n = len(self.p_W)
+        gate = GateInput(
+            t_s=self.t_s,
+            p_W=self.p_W + self.rng.normal(scale=self.noise_m, size=(n, 3)) if self.noise_m else self.p_W.copy(),
+            yaw=self.yaw.copy(),
+            v_W=self.v_W.copy(),
+            sigma_m=np.full((n, 3), 0.2),
+            age_s=np.zeros(n),
+            states=tuple(self.states),
+        )
+        return dataclasses.replace(gate, **self.spoil)
+
+    def _move(self):
+        for i, state in enumerate(self.states):
+            if state == "taking_off":
+                self.p_W[i, 2] += 0.4 * GATE_S
+                if self.p_W[i, 2] >= 0.8:
+                    self.states[i] = "hovering"
+            elif state == "landing":
+                self.p_W[i, 2] = max(self.p_W[i, 2] - GATE_S, 0.0)
+                if self.p_W[i, 2] == 0.0:
+                    self.states[i] = "landed"
+            elif state in ("hovering", "flying"):
+                self.p_W[i] += self.v_W[i] * GATE_S
+                self.yaw[i] += self.yaw_rate[i] * GATE_S
+        if "landed" not in self.states:
+            self.closest_m = min(self.closest_m, closest_pair(self.p_W)[0])
+
+
+def engaged_fleet(noise_m=0.0):
+    fleet = Fleet(Engagement(SPACE, DRONES), noise_m)
+    fleet.fly(0.1)
+    assert fleet.engagement.request(TakeOff()) is None
+    fleet.fly_until("assembling")
+    while fleet.engagement.request(Engage()):
+        fleet.fly(0.1)
+        assert fleet.t_s < 20.0, fleet.output.reason
+    fleet.fly(0.1)
+    assert fleet.output.phase == "engaged"
+    return fleet
+
+
+def request_is_refused(fleet, request, *parts):
+    """Assert the refusal and that nothing changes by it."""
+    before = fleet.engagement.guidance.value(fleet.t_s)
+    reason = fleet.engagement.request(request)
+    assert reason is not None
+    assert all(part in reason for part in parts), reason
+    assert "\n" not in reason
+    after = fleet.engagement.guidance.value(fleet.t_s)
+    assert np.array_equal(before, after)
+
+
+# The flight from the ground to the paper's formation
+
+
+def test_the_paper_s_first_test_is_flown_from_the_ground_triangle():
+    plan = [Scheduled(20.0, TakeOff()), Scheduled(20.0, Engage()), Scheduled(20.0, Target(PAPER_3))]
+    fleet = Fleet(Engagement(SPACE, DRONES, plan=plan))
+    outputs = fleet.fly(120.0)
+    phases = list(dict.fromkeys(output.phase for output in outputs))
+    assert phases == ["idle", "taking_off", "assembling", "engaged"]
+    assert fleet.modes[0][0] == 20.0
+    assert [drone for _, drone, mode in fleet.modes if mode == "takeoff"] == list(DRONES)
+    assert fleet.closest_m > 2.0
+    expected = [(5.0, -2.536, 15.0), (3.469, -6.232, 15.0), (6.531, -6.232, 15.0)]
+    assert fleet.p_W == pytest.approx(np.array(expected), abs=2e-3)
+    assert fleet.yaw == pytest.approx(np.full(3, math.pi / 2), abs=1e-3)
+    assert fleet.output.desired == pytest.approx(list(PAPER_3.values()), abs=1e-9)
+    assert fleet.output.margin == pytest.approx(4 * math.sin(math.pi / 4), abs=0.01)
+    assert fleet.output.reason == ""
+
+
+def test_drones_climb_straight_up_until_they_are_engaged():
+    fleet = Fleet(Engagement(SPACE, DRONES))
+    fleet.fly(0.1)
+    assert fleet.engagement.request(TakeOff()) is None
+    fleet.fly_until("assembling")
+    fleet.fly(10.0)
+    assert fleet.output.phase == "assembling"
+    assert fleet.output.reason == "ready to engage"
+    assert np.array_equal(fleet.p_W[:, :2], GROUND[:, :2])
+    assert fleet.p_W[:, 2] == pytest.approx(np.full(3, 1.5), abs=0.01)
+
+
+def test_no_setpoint_is_sent_to_a_drone_on_the_ground():
+    fleet = Fleet(Engagement(SPACE, DRONES))
+    fleet.fly(0.1)
+    fleet.engagement.request(TakeOff())
+    for _ in range(200):
+        states = tuple(fleet.states)
+        for state, setpoint in zip(states, fleet.step().setpoints, strict=True):
+            assert (setpoint is None) == (state in ("landed", "taking_off"))
+
+
+def test_engagement_and_every_request_in_flight_start_without_a_bump():
+    fleet = engaged_fleet()
+    outputs = [fleet.output]
+    plan = (
+        Target({"z_c": 6.0, "yaw": 2.0}), Target({"x_c": 4.0}), Follow(PAPER_4, {"f": 0.01}), Pause(), Engage(),
+        Target({"z_c": 9.0}),
+    )  # fmt: skip
+    for request in plan:
+        assert fleet.engagement.request(request) is None
+        outputs += fleet.fly(7.0)
+    desired = np.array([output.desired for output in outputs])
+    rates = np.array([output.desired_rate for output in outputs])
+    steps = SPACE.wrapped(np.diff(desired, axis=0)) if desired.shape[1] == 12 else None
+    assert steps is not None
+    assert np.abs(steps - (rates[1:] + rates[:-1]) / 2 * GATE_S).max() < 1e-3
+    assert np.abs(np.diff(rates, axis=0)).max() < 0.05
+    assert fleet.closest_m > 2.0
+
+
+def test_reference_starts_at_the_estimate_when_engaged():
+    fleet = engaged_fleet()
+    assert np.abs(SPACE.difference(fleet.output.desired, fleet.output.value)).max() < 1e-9
+    assert fleet.output.value == pytest.approx(
+        SPACE.forward(GROUND + (0.0, 0.0, fleet.p_W[0, 2]), np.zeros(3)), abs=0.02
+    )
+
+
+def test_a_trajectory_is_reached_before_its_start_and_then_followed():
+    fleet = engaged_fleet()
+    start_s = fleet.t_s + 60.0
+    assert fleet.engagement.request(Follow(PAPER_4, {"f": 0.01}, start_s=start_s)) is None
+    outputs = fleet.fly(59.0)
+    assert all(output.trajectory_t_s is None for output in outputs)
+    at_start = [5, -5, 15, 0, 0, 0, 0, 0, 0, 4, 4, math.pi / 4]
+    assert fleet.output.value == pytest.approx(at_start, abs=0.02)
+    fleet.fly(2.0)
+    assert fleet.output.trajectory_t_s == pytest.approx(fleet.t_s - GATE_S - start_s)
+    outputs = fleet.fly(100.0)
+    assert max(np.abs(SPACE.difference(o.desired, o.value)).max() for o in outputs[500:]) < 0.05
+
+
+def test_a_trajectory_that_has_begun_is_joined_in_motion():
+    fleet = engaged_fleet()
+    start_s = fleet.t_s - 30.0
+    assert fleet.engagement.request(Follow(PAPER_4, {"f": 0.01}, start_s=start_s)) is None
+    fleet.fly(60.0)
+    t = fleet.output.trajectory_t_s
+    assert t == pytest.approx(fleet.t_s - GATE_S - start_s)
+    assert fleet.output.desired[0] == pytest.approx(5 * math.cos(0.02 * math.pi * t))
+    assert fleet.closest_m > 2.0
+
+
+def test_waypoints_end_and_the_formation_stays():
+    fleet = engaged_fleet()
+    points = [{"at_s": 0.0, "values": {"z_c": 3.0}}, {"at_s": 10.0, "values": {"z_c": 6.0}}]
+    assert fleet.engagement.request(Follow(waypoints=points)) is None
+    outputs = fleet.fly(40.0)
+    assert max(output.trajectory_t_s or 0.0 for output in outputs) == pytest.approx(10.0, abs=GATE_S)
+    assert fleet.output.trajectory_t_s is None
+    assert fleet.output.value[2] == pytest.approx(6.0, abs=0.02)
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("request_", "parts"),
+    [
+        (Target({"x": 3.0}), ("'x' is unknown", "x_c, y_c")),
+        (Target({}), ("no values",)),
+        (Target({"x_c": math.nan}), ("x_c is nan", "finite")),
+        (Target({"beta": 0.05}), ("sin(beta) min(p, q) is 0.1", "above 1 m")),
+        (Target({"p": 2.0, "q": 2.0, "beta": 0.9}), ("robots 2 and 3 are 1.74 m apart", "2 m or more")),
+        (Target({"pitch": 1.0}), ("pitch of the formation is 57.3 deg", "below 30 deg")),
+        (Target({"z_c": -2.0}), ("at z = -2.00 m",)),
+        (Target({"z_c": 10.0}, over_s=1.0), ("over_s is 1 s", "allowed")),
+        (Target({"x_c": 1e7}), ("not reached",)),
+        (Follow({"x_c": "foo(t)"}), ("calls 'foo'", "sin")),
+        (Follow({"x_c": "1/t"}), ("no value at t = 0 s",)),
+        (Follow({"x_c": "30*sin(t)"}), ("of its limits",)),
+        (Follow({"beta": "0.9 - 0.01*t"}), ("apart",)),
+        (Follow({"x_c": "t/10"}, start_s=math.inf), ("start_s is inf",)),
+        (Follow(), ("neither",)),
+        (Follow({"x_c": "t"}, waypoints=[{"at_s": 0, "values": {}}]), ("both",)),
+        (Follow(waypoints=[{"at_s": 0, "values": {"u": 1}}]), ("'u' is unknown",)),
+        (TakeOff(), ("phase is engaged",)),
+        (Engage(), ("phase is engaged",)),
+    ],
+)
+def test_bad_requests_are_refused_with_a_reason_and_change_nothing(request_, parts):
+    request_is_refused(engaged_fleet(), request_, *parts)
+
+
+def test_requests_that_do_not_fit_the_phase_are_refused():
+    fleet = Fleet(Engagement(SPACE, DRONES))
+    assert "no gate" in fleet.engagement.request(TakeOff())
+    fleet.fly(0.1)
+    request_is_refused(fleet, Engage(), "phase is idle")
+    request_is_refused(fleet, Target({"z_c": 5.0}), "phase is idle", "engaged")
+    request_is_refused(fleet, Pause(), "phase is idle")
+    request_is_refused(fleet, Land(), "on the ground")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "parts"),
+    [
+        ({"sigma_m": np.full((3, 3), 1.5)}, ("drone1", "sigma of 1.50 m", "1 m")),
+        ({"age_s": np.array([0.0, 0.6, 0.0])}, ("drone2", "0.60 s old", "0.5 s")),
+        ({"age_s": np.array([0.0, 0.0, math.inf])}, ("drone3", "inf s old")),
+        ({"p_W": np.full((3, 3), math.nan)}, ("drone1", "not finite")),
+        ({"states": ("landed", "landed", "emergency")}, ("drone3", "emergency")),
+        ({"p_W": GROUND[[0, 2, 1]]}, ("roll of the formation is", "180.0 deg")),
+        ({"p_W": GROUND * (1.0, 0.0, 1.0)}, ("in line",)),
+        ({"p_W": GROUND * 0.6}, ("1.80 m apart",)),
+        ({"p_W": GROUND * (0.2, 1.0, 1.0)}, ("sin(beta) min(p, q) is 0.60 m", "above 1 m")),
+    ],
+    ids=["sigma", "old", "none", "nan", "emergency", "mirrored", "line", "near", "narrow"],
+)
+def test_take_off_is_refused_from_a_bad_start(spoil, parts):
+    fleet = Fleet(Engagement(SPACE, DRONES))
+    fleet.spoil = spoil
+    fleet.fly(0.1)
+    request_is_refused(fleet, TakeOff(), *parts)
+    fleet.spoil = {}
+    fleet.fly(0.1)
+    assert fleet.engagement.request(TakeOff()) is None
+
+
+def test_engagement_waits_for_height_and_says_so():
+    fleet = Fleet(Engagement(SPACE, DRONES))
+    fleet.fly(0.1)
+    fleet.engagement.request(TakeOff())
+    output = fleet.fly_until("assembling")
+    assert "drone1 is at z = 0.8" in output.reason
+    request_is_refused(fleet, Engage(), "at z = 0.8", "1.20 m or more")
+
+
+def test_a_take_off_command_that_was_lost_is_sent_again():
+    fleet = Fleet(Engagement(SPACE, DRONES))
+    fleet.fly(0.1)
+    fleet.engagement.request(TakeOff())
+    fleet.spoil = {"states": ("landed",) * 3}
+    fleet.fly(2.5)
+    assert [(drone, mode) for _, drone, mode in fleet.modes] == [(d, "takeoff") for d in DRONES] * 3
+
+
+# Faults in flight
+
+
+@pytest.mark.parametrize(
+    ("spoil", "part"),
+    [
+        ({"age_s": np.array([0.0, 0.0, 0.52])}, "drone3 is 0.52 s old"),
+        ({"p_W": np.full((3, 3), math.nan)}, "not finite"),
+        ({"yaw": np.array([0.0, math.inf, 0.0])}, "estimate of drone2 is not finite"),
+        ({"sigma_m": np.full((3, 3), 2.5)}, "sigma of 2.50 m"),
+        ({"states": ("flying", "emergency", "flying")}, "drone2 is in state emergency"),
+        ({"p_W": GROUND * (1.0, 0.0, 1.0) + (0, 0, 5.0)}, "in line"),
+        ({"p_W": GROUND * (0.2, 1.0, 1.0) + (0, 0, 5.0)}, "sin(beta) min(p, q) is 0.60 m"),
+    ],
+    ids=["old", "nan", "inf", "sigma", "emergency", "line", "narrow"],
+)
+def test_a_fault_in_flight_holds_the_formation_and_it_goes_on_without_a_bump(spoil, part):
+    fleet = engaged_fleet()
+    assert fleet.engagement.request(Target({"z_c": 12.0, "x_c": 5.0})) is None
+    fleet.fly(8.0)
+    fleet.spoil = spoil
+    held = fleet.fly(3.0)
+    for output in held:
+        assert output.phase == "held"
+        assert part in output.reason
+        moving = [s for s in output.setpoints if s is not None and np.linalg.norm(s.v_W) > 0.9]
+        assert not moving
+        assert np.isfinite(output.value).all()
+        assert np.isfinite(output.desired).all()
+    if "p_W" not in spoil:
+        assert all(not s.v_W.any() and s.yaw_rate == 0.0 for s in held[-1].setpoints if s is not None)
+    fleet.spoil = {}
+    fleet.fly(0.4)
+    assert fleet.output.phase == "held"
+    resumed = fleet.fly_until("engaged", limit_s=1.0)
+    assert np.abs(SPACE.difference(resumed.desired, resumed.value)).max() < 1e-9
+    assert all(np.linalg.norm(s.v_W) < 1e-6 for s in resumed.setpoints if s is not None)
+    fleet.fly(60.0)
+    assert fleet.output.value[[0, 2]] == pytest.approx([5.0, 12.0], abs=0.02)
+
+
+def test_requests_are_refused_while_a_fault_holds_the_formation():
+    fleet = engaged_fleet()
+    fleet.spoil = {"age_s": np.full(3, 2.0)}
+    fleet.fly(0.1)
+    request_is_refused(fleet, Target({"z_c": 5.0}), "2.00 s old")
+    request_is_refused(fleet, Engage(), "phase is held")
+    assert fleet.engagement.request(Land()) is None
+
+
+def test_a_trajectory_is_rejoined_in_motion_after_a_fault():
+    fleet = engaged_fleet()
+    assert fleet.engagement.request(Follow(PAPER_4, {"f": 0.01})) is None
+    fleet.fly(60.0)
+    start_s = fleet.t_s - GATE_S - fleet.output.trajectory_t_s
+    fleet.spoil = {"age_s": np.full(3, 9.0)}
+    fleet.fly(5.0)
+    fleet.spoil = {}
+    fleet.fly(40.0)
+    assert fleet.output.phase == "engaged"
+    assert fleet.output.trajectory_t_s == pytest.approx(fleet.t_s - GATE_S - start_s)
+    assert np.abs(SPACE.difference(fleet.output.desired, fleet.output.value)).max() < 0.05
+    assert fleet.closest_m > 2.0
+
+
+def test_robots_that_are_driven_together_are_parted_and_reported():
+    fleet = engaged_fleet()
+    fleet.fly(1.0)
+    fleet.p_W[2] = fleet.p_W[1] + (1.3, 0.0, 0.0)
+    output = fleet.step()
+    assert output.alarmed == ((1, 2),)
+    assert "ALARM" in output.reason
+    assert "drone2 and drone3" in output.reason
+    fleet.fly(8.0)
+    assert closest_pair(fleet.p_W)[0] > 2.0
+    assert fleet.output.phase == "engaged"
+
+
+def test_a_reference_that_fails_after_its_check_holds_the_formation(monkeypatch):
+    """Endless trajectories are checked for a while only; this one closes in later."""
+    monkeypatch.setattr(reference_check, "HORIZON_S", 30.0)
+    fleet = engaged_fleet()
+    shape = {"z_c": "5", "beta": "0.93 - max(0, t - 40)/50"}
+    assert fleet.engagement.request(Follow(shape)) is None
+    fleet.fly(40.0)
+    assert fleet.output.phase == "engaged"
+    assert "reference: robots 2 and 3 are 1.99 m apart" in fleet.fly_until("held").reason
+    fleet.fly(20.0)
+    assert "cannot go on: the reference is not allowed" in fleet.output.reason
+    assert fleet.closest_m > 1.9
+
+
+# Hold, resume, land
+
+
+def test_hold_stops_the_formation_where_it_is_and_engage_resumes():
+    fleet = engaged_fleet()
+    assert fleet.engagement.request(Target({"z_c": 12.0})) is None
+    fleet.fly(8.0)
+    assert fleet.engagement.request(Pause()) is None
+    fleet.fly(6.0)
+    height = fleet.p_W[0, 2]
+    assert fleet.output.phase == "held"
+    assert fleet.output.reason == "held on request"
+    fleet.p_W += (0.5, 0.0, 0.0)  # a push: held formations keep their place
+    fleet.fly(15.0)
+    assert fleet.p_W[:, 0].mean() == pytest.approx(0.0, abs=0.05)
+    assert fleet.p_W[0, 2] == pytest.approx(height, abs=0.02)
+    assert height < 11.0
+    assert fleet.engagement.request(Engage()) is None
+    fleet.fly(40.0)
+    assert fleet.output.phase == "engaged"
+    assert fleet.output.value[2] == pytest.approx(12.0, abs=0.02)
+
+
+def test_a_hold_is_kept_through_a_fault():
+    fleet = engaged_fleet()
+    fleet.engagement.request(Target({"z_c": 12.0}))
+    fleet.fly(8.0)
+    fleet.engagement.request(Pause())
+    fleet.fly(6.0)
+    height = fleet.p_W[0, 2]
+    fleet.spoil = {"age_s": np.full(3, 2.0)}
+    fleet.fly(2.0)
+    fleet.spoil = {}
+    fleet.fly(20.0)
+    assert (fleet.output.phase, fleet.output.reason) == ("held", "held on request")
+    assert fleet.p_W[0, 2] == pytest.approx(height, abs=0.02)
+
+
+def test_landing_ends_idle_and_a_second_flight_is_possible():
+    fleet = engaged_fleet()
+    assert fleet.engagement.request(Land()) is None
+    assert fleet.step().phase == "landing"
+    assert all(setpoint is None for setpoint in fleet.output.setpoints)
+    fleet.fly_until("idle")
+    assert fleet.states == ["landed"] * 3
+    fleet.modes.clear()
+    assert fleet.engagement.request(TakeOff()) is None
+    fleet.fly_until("assembling")
+    assert len(fleet.modes) == 3
+
+
+def test_a_take_off_can_be_called_off():
+    fleet = Fleet(Engagement(SPACE, DRONES))
+    fleet.fly(0.1)
+    fleet.engagement.request(TakeOff())
+    fleet.fly(1.0)
+    assert fleet.engagement.request(Land()) is None
+    fleet.fly_until("idle")
+    assert fleet.states == ["landed"] * 3
+
+
+# Plans
+
+
+def test_a_land_of_the_plan_drops_what_still_waits():
+    plan = [Scheduled(1.0, TakeOff()), Scheduled(1.0, Engage()), Scheduled(2.0, Target({"beta": 0.1})),
+            Scheduled(15.0, Land())]  # fmt: skip
+    fleet = Fleet(Engagement(SPACE, DRONES, plan=plan))
+    fleet.fly(14.0)
+    assert fleet.output.phase == "engaged"
+    assert "Target of the plan waits" in fleet.output.reason
+    assert "sin(beta)" in fleet.output.reason
+    fleet.fly(2.0)
+    assert fleet.output.phase == "landing"
+    fleet.fly_until("idle")
+
+
+def test_a_land_by_request_drops_the_plan():
+    fleet = Fleet(Engagement(SPACE, DRONES, plan=[Scheduled(1.0, TakeOff()), Scheduled(30.0, TakeOff())]))
+    fleet.fly(5.0)
+    assert fleet.engagement.request(Land()) is None
+    fleet.fly(40.0)
+    assert fleet.output.phase == "idle"
+
+
+def test_a_controller_that_restarts_in_flight_takes_the_formation_over():
+    plan = [Scheduled(1.0, TakeOff()), Scheduled(1.0, Engage()), Scheduled(1.0, Target({"z_c": 8.0}))]
+    fleet = Fleet(Engagement(SPACE, DRONES, plan=plan))
+    fleet.fly(20.0)
+    modes = len(fleet.modes)
+    fleet.engagement = Engagement(SPACE, DRONES, plan=plan)
+    fleet.fly(40.0)
+    assert len(fleet.modes) == modes
+    assert fleet.output.phase == "engaged"
+    assert fleet.output.value[2] == pytest.approx(8.0, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("plan", "finding"),
+    [
+        ([Scheduled(1.0, Target({"u": 1.0}))], "plan step 1: .*'u'"),
+        ([Scheduled(1.0, TakeOff()), Scheduled(1.0, Follow({"x_c": "u"}))], "plan step 2: .*'u'"),
+        ([Scheduled(2.0, TakeOff()), Scheduled(1.0, Engage())], "plan step 2: at_s is 1; allowed: 2 s or later"),
+        ([Scheduled(math.nan, TakeOff())], "plan step 1: at_s is nan"),
+    ],
+)
+def test_plans_that_can_never_be_flown_are_refused_at_once(plan, finding):
+    with pytest.raises(ValueError, match=finding):
+        Engagement(SPACE, DRONES, plan=plan)
+
+
+def test_names_must_fit_the_cluster():
+    with pytest.raises(ValueError, match="2 drones; allowed: 3"):
+        Engagement(SPACE, DRONES[:2])
+
+
+# Two and four drones
+
+
+@pytest.mark.parametrize("n", [2, 4])
+def test_other_numbers_of_drones_fly_too(n):
+    p_W = np.array([(0.0, 1.5, 0), (-1.5, -1.5, 0), (1.5, -1.5, 0), (0.0, -4.5, 0)])[:n]
+    if n == 2:
+        p_W = np.array([(0.0, 1.5, 0), (0.0, -1.5, 0)])
+    plan = [Scheduled(1.0, TakeOff()), Scheduled(1.0, Engage()), Scheduled(1.0, Target({"z_c": 6.0, "p": 4.0}))]
+    space = cluster_space(n)
+    fleet = Fleet(Engagement(space, [f"d{i}" for i in range(n)], plan=plan), p_W=p_W)
+    fleet.fly(60.0)
+    assert fleet.output.phase == "engaged"
+    assert fleet.output.value[[2, space.index("p")]] == pytest.approx([6.0, 4.0], abs=0.02)
+    assert fleet.closest_m > 2.0
+
+
+# Requests on the wire
+
+
+def test_requests_are_read_from_the_wire():
+    assert read_request("takeoff") == TakeOff()
+    assert read_request("hold", {}) == Pause()
+    assert read_request("target", {"values": {"z_c": 3}, "over_s": 5}) == Target({"z_c": 3}, 5)
+    assert read_request("target", {"values": {"z_c": 3}, "over_s": None}) == Target({"z_c": 3})
+    follow = read_request("trajectory", {"expressions": {"x_c": "f*t"}, "constants": {"f": 0.1}, "start_s": 9.0})
+    assert follow == Follow({"x_c": "f*t"}, {"f": 0.1}, start_s=9.0)
+
+
+@pytest.mark.parametrize(
+    ("op", "args", "finding"),
+    [
+        ("fly", {}, "op 'fly' is unknown; allowed: takeoff, engage"),
+        (["land"], {}, r"op .* is unknown"),
+        (None, {}, "op 'None' is unknown"),
+        ("land", {"now": True}, "land: field 'now' is unknown; allowed: none"),
+        ("land", [1], "land: args is list"),
+        ("target", {"values": [1]}, "target: values is"),
+        ("target", {"values": {}, "over_s": "5"}, "target: over_s is '5'; allowed: a number of seconds"),
+        ("trajectory", {"waypoints": "x"}, "trajectory: waypoints is 'x'"),
+        ("trajectory", {"duration_s": math.inf}, "trajectory: duration_s is 'inf'"),
+    ],
+)
+def test_requests_that_cannot_be_read_are_refused(op, args, finding):
+    with pytest.raises(RequestError, match=finding):
+        read_request(op, args)
+
+
+def test_limits_are_those_of_the_scenario():
+    limits = EngagementLimits(assembly_height_m=2.0)
+    fleet = Fleet(Engagement(SPACE, DRONES, limits=limits))
+    fleet.fly(0.1)
+    fleet.engagement.request(TakeOff())
+    fleet.fly(12.0)
+    assert fleet.p_W[:, 2] == pytest.approx(np.full(3, 2.0), abs=0.01)

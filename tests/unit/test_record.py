@@ -1,0 +1,301 @@
+"""The record: what goes in comes out, whatever is cut off the file, and other MCAP tools agree."""
+
+import random
+import subprocess
+import sys
+import textwrap
+import tracemalloc
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
+from zsim import keys, messages
+from zsim.errors import RecordError
+from zsim.messages import Clock, Imu
+from zsim.record import Recorded, RecordReader, RecordWriter, repair
+
+GATE_NS = 20_000_000
+CHUNK_MESSAGES = 40  # per chunk of the records below
+
+
+def imu(t_ns: int, seq: int, rng: random.Random) -> bytes:
+    a, b, c, d, e, f = (rng.gauss(0, 1) for _ in range(6))
+    return messages.encode(Imu(t_ns, seq, t_ns, (a, b, c), (d, e, f)))
+
+
+def flight(count: int) -> list[Recorded]:
+    rng = random.Random(1)
+    drones = [keys.sensor(f"drone{n}", "imu") for n in (1, 2, 3)]
+    recorded = []
+    for i in range(count):
+        key, t_ns = drones[i % 3], i // 3 * GATE_NS
+        recorded.append(Recorded(key, imu(t_ns, i // 3, rng), t_ns, 7 * i))
+    return recorded
+
+
+def write(path: Path, recorded: list[Recorded]) -> list[int]:
+    """Write a record with a chunk every CHUNK_MESSAGES; return the size of the file after each message."""
+    sizes = []
+    with RecordWriter(path) as writer:
+        for i, message in enumerate(recorded, start=1):
+            writer.add(
+                message.key, message.payload, messages.encoding(message.key), message.t_ns, message.wall_ns
+            )
+            if i % CHUNK_MESSAGES == 0:
+                writer.flush()
+            sizes.append(path.stat().st_size)
+    return sizes
+
+
+def read(path: Path, **options) -> list[Recorded]:
+    with RecordReader(path) as reader:
+        return list(reader.messages(**options))
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["clock", "drone/a/truth", "world/event", "user/own"]),
+            st.binary(max_size=2000),
+            st.integers(0, 2**64 - 1),
+            st.booleans(),
+        )
+    )
+)
+@settings(max_examples=60, deadline=None)
+def test_what_is_written_is_read(tmp_path_factory, script):
+    path = tmp_path_factory.mktemp("record") / "run.mcap"
+    written = [Recorded(key, payload, t_ns, i) for i, (key, payload, t_ns, _) in enumerate(script)]
+    with RecordWriter(path) as writer:
+        for message, (_, _, _, flush) in zip(written, script, strict=True):
+            writer.add(message.key, message.payload, "application/msgpack", message.t_ns, message.wall_ns)
+            if flush:
+                writer.flush()
+    assert read(path, by_time=False) == written
+    assert read(path) == sorted(written, key=lambda message: (message.t_ns, message.wall_ns))
+    with RecordReader(path) as reader:
+        assert reader.complete
+        assert sum(reader.topics().values()) == len(written)
+        for key in {message.key for message in written}:
+            assert reader.last(key) == [message for message in written if message.key == key][-1]
+        assert reader.last("never/seen") is None
+    with open(path, "rb") as file:
+        foreign = [
+            (c.topic, m.data, m.log_time, m.publish_time) for _, c, m in make_reader(file).iter_messages()
+        ]
+    assert foreign == read(path)
+
+
+def test_messages_of_some_keys_only(tmp_path):
+    recorded = flight(500)
+    write(tmp_path / "run.mcap", recorded)
+    wanted = {recorded[1].key}
+    assert read(tmp_path / "run.mcap", keys=wanted) == [m for m in recorded if m.key in wanted]
+    assert read(tmp_path / "run.mcap", keys=()) == []
+
+
+def test_other_tools_find_encoding_schema_and_sequence(tmp_path):
+    path = tmp_path / "run.mcap"
+    with RecordWriter(path) as writer:
+        for i in range(3):
+            writer.add(
+                "clock",
+                messages.encode(Clock(i, i, "r", i, "running", 1.0)),
+                messages.encoding("clock"),
+                i,
+                i,
+            )
+        writer.add("own/pose", b"\x80", "application/msgpack;Pose", 3, 3)
+        writer.add("own/text", b"{}", "application/json", 4, 4)
+    with open(path, "rb") as file:
+        found = list(make_reader(file).iter_messages())
+    assert [message.sequence for _, _, message in found[:3]] == [0, 1, 2]
+    assert [
+        (schema.name if schema else None, channel.message_encoding) for schema, channel, _ in found[2:]
+    ] == [
+        ("Clock", "msgpack"),
+        ("Pose", "msgpack"),
+        (None, "json"),
+    ]
+    schema = found[0][0]
+    assert schema is not None
+    assert schema.encoding == "jsonschema"
+    assert b"waiting_for" in schema.data
+
+
+def test_cut_at_any_byte_is_readable_up_to_the_cut(tmp_path):
+    path, cut_path = tmp_path / "run.mcap", tmp_path / "cut.mcap"
+    recorded = flight(1000)
+    sizes = write(path, recorded)
+    data, rng = path.read_bytes(), random.Random(2)
+    cuts = [0, 5, 8, 20, *(rng.randrange(len(data)) for _ in range(100)), len(data) - 1]
+    for cut in cuts:
+        cut_path.write_bytes(data[:cut])
+        whole = sum(size <= cut for size in sizes) // CHUNK_MESSAGES * CHUNK_MESSAGES
+        with RecordReader(cut_path) as reader:
+            assert not reader.complete
+            found = list(reader.messages(by_time=False))
+            assert sum(reader.topics().values()) == len(found)
+        assert len(found) - whole in (0, CHUNK_MESSAGES)  # the cut may have taken a chunk's indexes only
+        assert found == recorded[: len(found)]
+
+
+def test_repair_makes_a_cut_record_one_that_other_tools_seek_in(tmp_path):
+    path, cut_path = tmp_path / "run.mcap", tmp_path / "cut.mcap"
+    write(path, flight(400))
+    data, rng = path.read_bytes(), random.Random(3)
+    for cut in [0, 6, 8, 30, *(rng.randrange(len(data)) for _ in range(60)), len(data) - 1]:
+        cut_path.write_bytes(data[:cut])
+        before = read(cut_path)
+        assert repair(cut_path)
+        assert not repair(cut_path)
+        assert read(cut_path) == before
+        with open(cut_path, "rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            summary = reader.get_summary()
+            assert summary is not None
+            assert summary.statistics is not None
+            assert summary.statistics.message_count == len(before)
+            foreign = list(reader.iter_messages(topics=[keys.sensor("drone2", "imu")]))
+        assert len(foreign) == sum("drone2" in message.key for message in before)
+        with open(cut_path, "rb") as file:
+            assert sum(1 for _ in StreamReader(file, validate_crcs=True).records) > len(before)
+
+
+def test_a_finished_record_is_not_touched_by_repair(tmp_path):
+    path = tmp_path / "run.mcap"
+    write(path, flight(100))
+    data = path.read_bytes()
+    assert not repair(path)
+    assert path.read_bytes() == data
+
+
+def test_a_damaged_chunk_is_passed_over_and_counted(tmp_path):
+    path = tmp_path / "run.mcap"
+    sizes = write(path, recorded := flight(200))
+    data = bytearray(path.read_bytes())
+    data[sizes[CHUNK_MESSAGES - 1] - 3000] ^= 0xFF  # inside the first chunk's compressed content
+    path.write_bytes(data)
+    with RecordReader(path) as reader:
+        assert list(reader.messages(by_time=False)) == recorded[CHUNK_MESSAGES:]
+        assert reader.damaged == 1
+
+
+def test_what_is_no_record_is_refused_in_one_line(tmp_path):
+    path = tmp_path / "run.mcap"
+    for read_or_repair in (RecordReader, repair):
+        with pytest.raises(RecordError, match=r"run\.mcap: cannot be .*No such file"):
+            read_or_repair(path)
+    path.write_text("name: step\n")
+    for read_or_repair in (RecordReader, repair):
+        with pytest.raises(RecordError, match=r"begins with b'name: st'; is no MCAP record"):
+            read_or_repair(path)
+
+
+def test_a_record_is_never_overwritten(tmp_path):
+    (tmp_path / "run.mcap").write_bytes(b"precious")
+    with pytest.raises(RecordError, match="exists; a record is never overwritten"):
+        RecordWriter(tmp_path / "run.mcap")
+    with pytest.raises(RecordError, match="cannot be written"):
+        RecordWriter(tmp_path / "nowhere" / "run.mcap")
+
+
+def test_messages_reach_the_disk_within_half_a_second(tmp_path):
+    path, tick_ns = tmp_path / "run.mcap", 100_000_000
+    with RecordWriter(path) as writer:
+        for i, start_ns in enumerate([0, 10**9], start=1):  # a second time after a silence
+            for wall_ns in range(start_ns, start_ns + 10**9, tick_ns):
+                if wall_ns == start_ns + 2 * tick_ns:
+                    writer.add("clock", b"\x80", "", 0, 1_700_000_000_000_000_000 + wall_ns)
+                writer.tick(wall_ns)
+                assert len(read(path)) == i - (wall_ns < start_ns + 5 * tick_ns)
+
+
+def test_a_steady_trickle_reaches_the_disk_without_ticks(tmp_path):
+    path = tmp_path / "run.mcap"
+    with RecordWriter(path) as writer:
+        for i in range(20):
+            writer.add("clock", b"\x80", "", i, i * 50_000_000)
+            assert len(read(path)) >= i - 5
+
+
+def test_closing_twice_does_nothing(tmp_path):
+    writer = RecordWriter(tmp_path / "run.mcap")
+    writer.close()
+    writer.close()
+    assert read(tmp_path / "run.mcap") == []
+
+
+def test_no_more_than_a_chunk_is_held_back(tmp_path):
+    path, payload = tmp_path / "run.mcap", random.Random(4).randbytes(1000)
+    writer = RecordWriter(path)
+    for i in range(2000):
+        writer.add("clock", payload, "", i, 0)
+        if i % 100 == 0:
+            assert (i - len(read(path))) * len(payload) <= 256 * 1024
+    writer.close()
+
+
+def test_times_and_keys_beyond_the_format_are_held_in_bounds(tmp_path, monkeypatch):
+    monkeypatch.setattr("zsim.record.writer.CHANNELS_MAX", 2)
+    path = tmp_path / "run.mcap"
+    with RecordWriter(path) as writer:
+        writer.add("a", b"1", "", -5, 1)
+        writer.add("b", b"2", "", 2**70, 2)
+        writer.add("c", b"3", "", 3, 3)
+        writer.add("a", b"4", "", 4, 4)
+    assert [(message.key, message.t_ns) for message in read(path)] == [("a", 0), ("a", 4), ("b", 2**64 - 1)]
+    assert (writer.messages, writer.refused) == (3, 1)
+
+
+def test_writer_keeps_nothing_of_what_is_on_disk(tmp_path):
+    payload, held = random.Random(5).randbytes(150), []
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        tracemalloc.start()
+        for i in range(60_000):
+            writer.add(f"drone/drone{i % 40}/sensor/imu", payload, "", i, 0)
+            if i % 20_000 == 19_999:
+                writer.flush()
+                held.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+    assert held[2] - held[0] < 10_000  # bytes; what was written between them is 7 MB in 28 chunks
+
+
+FILL = """
+    import random, resource, sys
+    from zsim.errors import RecordError
+    from zsim.record import RecordWriter
+    path, limit = sys.argv[1], int(sys.argv[2])
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    rng = random.Random(6)
+    try:
+        writer = RecordWriter(path)
+        for i in range(100_000):
+            writer.add("clock", rng.randbytes(100), "application/msgpack;Clock", i, i)
+    except RecordError as error:
+        print(error)
+        sys.exit(3)
+"""
+
+
+@pytest.mark.parametrize("limit", [10, 100, 1_000, 900_000, 1_000_000, 1_234_567])
+def test_a_full_disk_is_one_line_and_leaves_a_readable_record(tmp_path, limit):
+    path = tmp_path / "run.mcap"
+    command = [sys.executable, "-c", textwrap.dedent(FILL), str(path), str(limit)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 3, done.stderr
+    assert done.stdout.count("\n") == 1
+    assert "run.mcap: cannot be written any further (File too large)" in done.stdout
+    assert path.stat().st_size <= limit
+    with RecordReader(path) as reader:
+        found = [message.t_ns for message in reader]
+        assert reader.complete or limit < 1_000
+    assert found == list(range(len(found)))
+    assert len(found) * 145 > limit - 350_000  # all but the chunk that did not fit, 145 bytes a message
+    if limit > 100_000:
+        with open(path, "rb") as file:
+            assert sum(1 for _ in make_reader(file).iter_messages()) == len(found) > 0

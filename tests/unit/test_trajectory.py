@@ -1,0 +1,351 @@
+"""References: expressions with exact rates, waypoints, ramps, and what is refused."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from zsim_agents.cluster_space import cluster_space
+from zsim_agents.expression import Expression, ExpressionError
+from zsim_agents.formation import FormationGains
+from zsim_agents.reference_check import ShapeLimits, plan_ramp, reference_fault
+from zsim_agents.trajectory import (
+    ExpressionTrajectory,
+    Hold,
+    Shifted,
+    TrajectoryError,
+    WaypointTrajectory,
+    ramp_onto,
+)
+
+SPACE = cluster_space(3)
+ZERO = np.zeros(12)
+GOAL = np.array([5, -5, 15, 0, 0, math.pi / 2, 0, 0, 0, 4, 4, math.pi / 4])  # paper, equation (3)
+PAPER_4 = {
+    "x_c": "5*cos(2*pi*f*t)",
+    "y_c": "-5*(1 + 1/2*sin(4*pi*f*t))",
+    "z_c": "15 + 5/2*(1 - cos(3*pi*f*t))",
+    "yaw": "0.1*t",
+    "p": 4,
+    "q": 4,
+    "beta": "pi/4",
+}
+
+
+def numeric_rate(reference, t_s, step=1e-5):
+    return (reference.value(t_s + step)[0] - reference.value(t_s - step)[0]) / (2 * step)
+
+
+# Expressions
+
+
+@pytest.mark.parametrize(
+    ("text", "value", "rate"),
+    [
+        ("3", 3, 0),
+        ("t", 2, 1),
+        ("-t + +1", -1, -1),
+        ("t**3", 8, 12),
+        ("2**t", 4, 4 * math.log(2)),
+        ("t**t", 4, 4 * (math.log(2) + 1)),
+        ("1/t", 0.5, -0.25),
+        ("t*(t - 5)", -6, -1),
+        ("sin(w*t)", math.sin(6), 3 * math.cos(6)),
+        ("cos(w*t)", math.cos(6), -3 * math.sin(6)),
+        ("tan(t)", math.tan(2), 1 / math.cos(2) ** 2),
+        ("asin(t/4)", math.asin(0.5), 0.25 / math.sqrt(0.75)),
+        ("acos(t/4)", math.acos(0.5), -0.25 / math.sqrt(0.75)),
+        ("atan(t)", math.atan(2), 0.2),
+        ("sqrt(t)", math.sqrt(2), 0.5 / math.sqrt(2)),
+        ("exp(-t)", math.exp(-2), -math.exp(-2)),
+        ("log(t)", math.log(2), 0.5),
+        ("abs(1 - t)", 1, 1),
+        ("min(t, 3, t**2)", 2, 1),
+        ("max(t, 3*t, 1)", 6, 3),
+        ("2*pi*e", 2 * math.pi * math.e, 0),
+        ("sqrt(0)*t", 0, 0),
+        ("0**2*t", 0, 0),
+    ],
+)
+def test_expressions_have_their_value_and_exact_rate_at_2_s(text, value, rate):
+    found = Expression("x_c", text, {"w": 3.0})(2.0)
+    assert found == pytest.approx((value, rate), abs=1e-15, rel=1e-14)
+
+
+@settings(deadline=None, max_examples=200, derandomize=True)
+@given(st.floats(0.1, 50.0), st.floats(0.05, 3.0))
+def test_rates_of_nested_expressions_agree_with_finite_differences(t, w):
+    expression = Expression("x", "exp(-t/20)*sin(w*t)**2/(1 + t**1.5) + log(2 + cos(t))*atan(w*t)", {"w": w})
+    step = 1e-5
+    numeric = (expression(t + step)[0] - expression(t - step)[0]) / (2 * step)
+    assert expression(t)[1] == pytest.approx(numeric, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("text", "finding"),
+    [
+        ("5*foo(t)", "calls 'foo'"),
+        ("2*g", "uses 'g'"),
+        ("__import__('os').system('true')", "calls"),
+        ("t.real", "contains 't.real'"),
+        ("(lambda: 1)()", "calls"),
+        ("[t]", r"contains '\[t\]'"),
+        ("t if t else 1", "contains"),
+        ("t > 1", "contains 't > 1'"),
+        ("2^t", r"contains '2\^t'.*\*\*"),
+        ("'a'", "contains 'a'"),
+        ("True", "contains 'True'"),
+        ("1j", "contains '1j'"),
+        ("t = 3", "cannot be read"),
+        ("", "cannot be read"),
+        ("sin(t", "cannot be read"),
+        ("sin()", "0 arguments; allowed: 1"),
+        ("min(t)", "1 arguments; allowed: 2 to 16"),
+        ("sin(x=t)", "calls 'sin'"),
+        ("sin(*t)", "contains"),
+        ("1/0", "constant part without a value"),
+        ("sqrt(-1)*t", "constant part without a value"),
+        ("9**9**9**9", "constant part without a value"),
+        ("1e400", "contains 'inf'"),
+        ("1e308*10", "constant part of value inf"),
+        ("9" * 400, "contains '999"),
+        ("t+" * 600 + "t", "1201 characters; allowed: 1000"),
+        ("-" * 990 + "t", "nested deeper than 100|cannot be read"),
+        ("(" * 300 + "t" + ")" * 300, "cannot be read"),
+        ("not " * 240 + "t", "contains"),
+        ("t\0", "cannot be read"),
+    ],
+)
+def test_what_is_no_allowed_expression_is_refused_in_one_line(text, finding):
+    with pytest.raises(ExpressionError, match=finding) as caught:
+        Expression("x_c", text)
+    assert str(caught.value).startswith("x_c: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_long_sum_is_still_allowed():
+    assert Expression("x", "+".join(["t"] * 90))(1.0) == (90.0, 90.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "t"), [("1/(t - 1)", 1.0), ("log(5 - t)", 6.0), ("exp(t)", 1e4), ("sqrt(t)", 0.0), ("t*1e308", 100)]
+)
+def test_an_expression_without_a_finite_value_says_when(text, t):
+    with pytest.raises(ExpressionError, match=rf"x_c: .* at t = {t:g} s"):
+        Expression("x_c", text)(t)
+
+
+@pytest.mark.parametrize(
+    ("constants", "finding"),
+    [
+        ({"t": 1.0}, "constant 't'"),
+        ({"pi": 3.0}, "constant 'pi'"),
+        ({"sin": 3.0}, "constant 'sin'"),
+        ({"a b": 3.0}, "constant 'a b'"),
+        ({"f": math.nan}, "constant f: found 'nan'"),
+        ({"f": "0.01"}, "constant f: found '0.01'"),
+        ({"f": True}, "constant f"),
+        ({"f": 10**400}, "constant f"),
+    ],
+)
+def test_bad_constants_are_refused(constants, finding):
+    with pytest.raises(ExpressionError, match=finding):
+        Expression("x_c", "t", constants)
+
+
+def test_the_paper_s_trajectory_is_written_as_in_the_paper():
+    f, w = 0.01, 0.02 * math.pi
+    trajectory = ExpressionTrajectory(SPACE, PAPER_4, ZERO, {"f": f})
+    assert trajectory.duration_s is None
+    for t in np.linspace(0.1, 400.0, 50).tolist():
+        c, c_dot = trajectory.value(t)
+        y, z = -5 * (1 + 0.5 * math.sin(2 * w * t)), 15 + 2.5 * (1 - math.cos(1.5 * w * t))
+        assert c == pytest.approx(
+            [5 * math.cos(w * t), y, z, 0, 0, 0.1 * t, 0, 0, 0, 4, 4, math.pi / 4], abs=1e-12
+        )
+        assert c_dot == pytest.approx(numeric_rate(trajectory, t), abs=1e-7)
+
+
+def test_an_expression_trajectory_stands_still_outside_its_time():
+    trajectory = ExpressionTrajectory(SPACE, {"x_c": "2*t"}, GOAL, duration_s=10.0)
+    for t, x in ((-5.0, 0.0), (4.0, 8.0), (50.0, 20.0)):
+        c, c_dot = trajectory.value(t)
+        assert (c[0], c_dot[0]) == (x, 2.0 if t == 4.0 else 0.0)
+        assert (c[1:] == GOAL[1:]).all()
+
+
+@pytest.mark.parametrize(
+    ("expressions", "finding"),
+    [({"x": "t"}, "expressions: variable 'x' is unknown.*x_c"), ({"p": math.inf}, "p: found"), ({"p": [1]}, "p: found")],
+)
+def test_bad_expression_trajectories_are_refused(expressions, finding):
+    with pytest.raises(ValueError, match=finding):
+        ExpressionTrajectory(SPACE, expressions, ZERO)
+
+
+@pytest.mark.parametrize("duration_s", [0.0, -1.0, math.nan, math.inf])
+def test_bad_durations_are_refused(duration_s):
+    with pytest.raises(TrajectoryError, match="duration_s"):
+        ExpressionTrajectory(SPACE, {}, ZERO, duration_s=duration_s)
+
+
+# Waypoints
+
+
+def waypoints(*pairs):
+    return [{"at_s": at_s, "values": values} for at_s, values in pairs]
+
+
+def test_waypoints_are_met_and_joined_smoothly():
+    trajectory = WaypointTrajectory(
+        SPACE,
+        waypoints((2.0, {"x_c": 1.0}), (5.0, {"x_c": 4.0, "z_c": 10.0}), (9.0, {"x_c": 12.0}), (12.0, {"z_c": 8.0})),
+        GOAL,
+    )
+    assert trajectory.duration_s == 12.0
+    met = [trajectory.value(t)[0][[0, 2]].tolist() for t in (2.0, 5.0, 9.0, 12.0)]
+    assert met == [[1.0, 15.0], [4.0, 10.0], [12.0, 10.0], [12.0, 8.0]]
+    for t in np.linspace(0.0, 14.0, 141).tolist():
+        assert trajectory.value(t)[1] == pytest.approx(numeric_rate(trajectory, t), abs=2e-4)
+    for knot in (2.0, 5.0, 9.0, 12.0):
+        left, right = trajectory.value(knot - 1e-9)[1], trajectory.value(knot + 1e-9)[1]
+        assert left == pytest.approx(right, abs=1e-7)
+    assert trajectory.value(5.0)[1][0] > 0.5  # it does not stop at a waypoint in passing
+
+
+def test_waypoints_do_not_overshoot():
+    trajectory = WaypointTrajectory(SPACE, waypoints((0, {"x_c": 0}), (1, {"x_c": 10}), (9, {"x_c": 10.1})), ZERO)
+    x = [trajectory.value(t)[0][0] for t in np.linspace(0, 9, 200)]
+    assert min(x) >= 0.0
+    assert max(x) <= 10.1
+    assert (np.diff(x) > -1e-12).all()
+
+
+def test_waypoints_turn_the_short_way_and_hold_at_the_ends():
+    trajectory = WaypointTrajectory(SPACE, waypoints((0, {"yaw": 3.0}), (10, {"yaw": -3.0})), ZERO)
+    assert trajectory.value(5.0)[0][5] == pytest.approx(math.pi)
+    assert trajectory.value(20.0)[0][5] == pytest.approx(2 * math.pi - 3.0)
+    assert trajectory.value(-1.0)[0][5] == 3.0
+    for t in (-1.0, 20.0):
+        assert not trajectory.value(t)[1].any()
+
+
+def test_one_waypoint_is_a_place():
+    c, c_dot = WaypointTrajectory(SPACE, waypoints((3.0, {"x_c": 1.0})), GOAL).value(100.0)
+    assert c[:2].tolist() == [1.0, -5.0]
+    assert not c_dot.any()
+
+
+@pytest.mark.parametrize(
+    ("points", "finding"),
+    [
+        ([], "0 waypoints"),
+        (waypoints((0, {"x_c": 0})) * 10_001, "10001 waypoints"),
+        (waypoints((1, {"x_c": 0}), (1, {"x_c": 1})), "waypoint 2: at_s is 1; allowed: .* above 1"),
+        (waypoints((-1, {})), "waypoint 1: at_s is -1"),
+        (waypoints((math.nan, {})), "waypoint 1: at_s is nan"),
+        (waypoints((0, {"u": 0})), "waypoint 1: variable 'u' is unknown"),
+        (waypoints((0, {"x_c": math.nan})), "waypoint 1: x_c is nan"),
+        (waypoints((0, {"x_c": "1"})), "waypoint 1: x_c is 1"),
+        (waypoints((0, 5)), "waypoint 1: found '5'"),
+        ([{"values": {}}], "waypoint 1: at_s is None"),
+        ([{"at_s": 0, "x_c": 1}], "waypoint 1: field 'x_c' is unknown"),
+        ([7], "waypoint 1: at_s is 7"),
+    ],
+)
+def test_bad_waypoints_are_refused(points, finding):
+    with pytest.raises(TrajectoryError, match=finding):
+        WaypointTrajectory(SPACE, points, ZERO)
+
+
+# Ramps
+
+
+def test_a_ramp_from_rest_is_the_minimum_jerk_move():
+    start = GOAL - 3.0
+    ramp = ramp_onto(SPACE, start, ZERO, Hold(GOAL), 10.0, 8.0)
+    for t, share in ((0.0, 0.0), (10.0, 0.0), (14.0, 0.5), (18.0, 1.0), (30.0, 1.0)):
+        assert ramp.value(t)[0] == pytest.approx(start + 3.0 * share)
+    assert ramp.value(14.0)[1] == pytest.approx(np.full(12, 3.0 / 8.0 * 15 / 8))
+    assert ramp.duration_s == 18.0
+
+
+def test_a_ramp_onto_a_moving_reference_starts_and_ends_without_a_bump():
+    onto = Shifted(ExpressionTrajectory(SPACE, PAPER_4, ZERO, {"f": 0.01}), 5.0)
+    c, c_dot = GOAL + 0.5, np.linspace(-0.2, 0.2, 12)
+    ramp = ramp_onto(SPACE, c, c_dot, onto, 20.0, 10.0)
+    assert SPACE.wrapped(ramp.value(20.0)[0] - c) == pytest.approx(ZERO, abs=1e-12)
+    assert ramp.value(20.0)[1] == pytest.approx(c_dot)
+    for part in (0, 1):
+        assert ramp.value(30.0)[part] == pytest.approx(onto.value(30.0)[part])
+    for t in np.linspace(20.1, 31.0, 60).tolist():
+        assert ramp.value(t)[1] == pytest.approx(numeric_rate(ramp, t), abs=1e-7)
+    before, after = ramp.value(30.0 - 1e-6)[1], ramp.value(30.0 + 1e-6)[1]
+    assert before == pytest.approx(after, abs=1e-5)
+
+
+def test_a_ramp_turns_the_short_way():
+    start = GOAL.copy()
+    start[5] = -3.0
+    goal = GOAL.copy()
+    goal[5] = 3.0
+    yaw = [ramp_onto(SPACE, start, ZERO, Hold(goal), 0.0, 5.0).value(t)[0][5] for t in np.linspace(0, 5, 20)]
+    assert max(yaw) - min(yaw) == pytest.approx(2 * math.pi - 6.0)
+
+
+def test_a_planned_ramp_uses_the_speed_that_it_may_and_no_more():
+    gains, limits = FormationGains(), ShapeLimits()
+    start = GOAL.copy()
+    start[2] = 5.0
+    ramp = plan_ramp(SPACE, (start, ZERO), Hold(GOAL), 0.0, gains, limits)
+    climb = max(ramp.value(t)[1][2] for t in np.linspace(0, ramp.over_s, 400))
+    allowed = limits.share * gains.climb_max_m_s
+    assert 0.9 * allowed < climb <= 1.03 * allowed
+
+
+@pytest.mark.parametrize(
+    ("changes", "over_s", "finding"),
+    [
+        ({}, 1.0, "over_s is 1 s; allowed.*: 2"),
+        ({}, math.nan, "over_s is nan s"),
+        ({}, 1e9, "over_s is 1e\\+09 s"),
+        ({"x_c": 5e5}, None, "not reached within 3600 s"),
+        ({"x_c": 1e300}, None, "not reached|x_c is 1e"),
+        ({"beta": 0.1}, None, r"sin\(beta\) min\(p, q\) is 0"),
+        ({"beta": -0.8}, None, "beta is"),
+        ({"p": 0.0}, None, "p is 0; allowed: between 0 and inf"),
+        ({"p": 2.2, "q": 2.2}, None, "robots 2 and 3 are 1.* m apart; allowed: 2 m or more"),
+        ({"roll": 0.7}, None, "roll of the formation is 40.1 deg; allowed: below 30 deg"),
+        ({"pitch": -0.7}, None, "pitch of the formation is -40.1 deg"),
+        ({"z_c": -3.0}, None, "robot . is at z = .* m; allowed: 0.5 m"),
+    ],
+)
+def test_ramps_that_lead_to_a_bad_place_are_refused(changes, over_s, finding):
+    start = GOAL.copy()
+    start[2] = 5.0
+    goal = GOAL.copy()
+    for name, value in changes.items():
+        goal[SPACE.index(name)] = value
+    with pytest.raises(TrajectoryError, match=finding):
+        plan_ramp(SPACE, (start, ZERO), Hold(goal), 0.0, FormationGains(), ShapeLimits(), over_s)
+
+
+def test_a_way_that_passes_a_bad_place_is_refused_although_its_end_is_good():
+    """Robot 4 swings round robot 1, through the place of robot 2."""
+    space = cluster_space(4)
+    start = np.array([0, 0, 10, 0, 0, 0, 0, 0, 0, 0, 5, 5, math.pi / 2, 5.0, 1.2, 0.0])
+    goal = start.copy()
+    goal[14] = math.pi
+    for end in (start, goal):
+        assert reference_fault(space, Hold(end), 0.0, 1.0, FormationGains(), ShapeLimits()) is None
+    with pytest.raises(TrajectoryError, match=r"the way .* robots 2 and 4 are .* m apart"):
+        plan_ramp(space, (start, np.zeros(16)), Hold(goal), 0.0, FormationGains(), ShapeLimits())
+
+
+def test_a_trajectory_faster_than_the_robots_is_refused():
+    onto = ExpressionTrajectory(SPACE, {"x_c": "5*sin(t)"}, GOAL)
+    fault = reference_fault(SPACE, onto, 0.0, 60.0, FormationGains(), ShapeLimits())
+    assert fault is not None
+    assert "of its limits; allowed: 0.8" in fault

@@ -1,0 +1,1 @@
+"""The world: vehicles, their firmware, sensors, wind and contacts, and the process that owns simulated time."""

@@ -1,0 +1,157 @@
+"""Who takes part in the lockstep, how far each has come, and whom the world waits for.
+
+Pure bookkeeping: no session, no clock; wall times are passed in. To integrate from t on, the world needs every
+gating participant's done for t minus the command delay. That is the only wait there is.
+"""
+
+from dataclasses import dataclass
+
+from zsim.messages import Done, Join, Waiting
+
+
+@dataclass
+class Participant:
+    """One process that has joined, by its newest incarnation."""
+
+    name: str
+    incarnation: int
+    role: str
+    host: str
+    pid: int
+    period_ns: int
+    fingerprint: str
+    from_ns: int
+    done_ns: int = -1
+    received: int = 0
+    missing: int = 0
+    alive: bool = True
+    since_wall_ns: int = 0
+    deadline_misses: int = 0
+
+    @property
+    def gating(self) -> bool:
+        return self.period_ns > 0
+
+    def required_ns(self, need_ns: int) -> int | None:
+        """Return the done that it owes for `need_ns`, None if it owes none yet."""
+        if not self.gating:
+            return None
+        required = need_ns // self.period_ns * self.period_ns
+        return required if required >= self.from_ns else None
+
+    def owes(self, need_ns: int) -> bool:
+        """Tell whether its done (or an output that it counted) is not in yet."""
+        required = self.required_ns(need_ns)
+        return required is not None and (self.done_ns < required or self.missing > 0)
+
+
+class Barrier:
+    """The participants of a run.
+
+    Args:
+        run_id: joins and dones of other runs are refused.
+        gate_ns: every period is a multiple of it.
+        expected: names without which the run does not start.
+    """
+
+    def __init__(self, run_id: str, gate_ns: int, expected: list[str]) -> None:
+        self._run_id = run_id
+        self._gate_ns = gate_ns
+        self._expected = dict.fromkeys(expected, 0)
+        self.participants: dict[str, Participant] = {}
+
+    def expect(self, name: str) -> None:
+        """Do not start without this one either."""
+        self._expected[name] = 0
+
+    def join(self, name: str, message: Join, next_gate_ns: int, wall_ns: int) -> str | None:
+        """Take a participant in; return the reason if it is refused.
+
+        A known name keeps what it has done: the new incarnation goes on from there.
+        """
+        reason = self._join_fault(message)
+        if reason:
+            return reason
+        former = self.participants.get(name)
+        self.participants[name] = Participant(
+            name=name,
+            incarnation=message.incarnation,
+            role=message.role,
+            host=message.host,
+            pid=message.pid,
+            period_ns=message.period_ns,
+            fingerprint=message.fingerprint,
+            from_ns=former.from_ns if former and former.gating else next_gate_ns,
+            done_ns=former.done_ns if former else -1,
+            since_wall_ns=wall_ns,
+            deadline_misses=former.deadline_misses if former else 0,
+        )
+        return None
+
+    def _join_fault(self, message: Join) -> str | None:
+        if message.run_id != self._run_id:
+            return f"run_id is {message.run_id!r}; must be {self._run_id!r} (read world/info)"
+        if message.period_ns < 0 or message.period_ns % self._gate_ns:
+            return f"period_ns is {message.period_ns}; must be 0 or a multiple of {self._gate_ns}"
+        return None
+
+    def done(self, name: str, message: Done, now_ns: int, wall_ns: int) -> str | None:
+        """Note that a participant is through with `done_ns`; return the reason if it is refused."""
+        participant = self.participants.get(name)
+        if participant is None:
+            return "has not joined; must publish process/{name}/join first"
+        if message.run_id != self._run_id or message.incarnation != participant.incarnation:
+            return "is of another run or incarnation"
+        if message.done_ns > now_ns:
+            return f"done_ns is {message.done_ns}; must be <= {now_ns}, the newest gate"
+        if message.done_ns > participant.done_ns:
+            participant.done_ns = message.done_ns
+            participant.since_wall_ns = wall_ns
+        participant.missing = max(0, message.sent - participant.received)
+        participant.received = 0
+        return None
+
+    def received(self, name: str) -> None:
+        """Count one output of a participant that has come in."""
+        participant = self.participants.get(name)
+        if participant is not None:
+            if participant.missing:
+                participant.missing -= 1
+            else:
+                participant.received += 1
+
+    def is_gating(self, name: str) -> bool:
+        participant = self.participants.get(name)
+        return participant is not None and participant.gating and participant.alive
+
+    def died(self, name: str, wall_ns: int) -> Participant | None:
+        """Mark a participant as dead; it stays in the barrier until it is dropped or rejoins."""
+        participant = self.participants.get(name)
+        if participant is None or not participant.alive:
+            return None
+        participant.alive = False
+        participant.since_wall_ns = wall_ns
+        return participant
+
+    def remove(self, name: str) -> Participant | None:
+        """Take a participant out: it said bye or is dropped."""
+        self._expected.pop(name, None)
+        return self.participants.pop(name, None)
+
+    def absent(self) -> list[str]:
+        """Return the expected names that have not joined yet."""
+        return [name for name in self._expected if name not in self.participants]
+
+    def blocking(self, need_ns: int) -> list[Participant]:
+        """Return who owes a done for `need_ns`."""
+        return [p for p in self.participants.values() if p.owes(need_ns)]
+
+    def short(self) -> list[Participant]:
+        """Return who counted more outputs in its done than have come in."""
+        return [p for p in self.participants.values() if p.missing]
+
+    def waiting_for(self, need_ns: int, wall_ns: int, start_wall_ns: int) -> tuple[Waiting, ...]:
+        """Return whom the world waits for, as `clock` names them."""
+        absent = [Waiting(name, "", (wall_ns - start_wall_ns) / 1e9) for name in self.absent()]
+        late = [Waiting(p.name, p.host, (wall_ns - p.since_wall_ns) / 1e9) for p in self.blocking(need_ns)]
+        return tuple(absent + late)

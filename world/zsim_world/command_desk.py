@@ -1,0 +1,93 @@
+"""Commands on their way to the firmware: stamped, ordered, judged, applied, and told where it matters."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from zsim import keys, messages
+from zsim_world.commander import Due
+
+if TYPE_CHECKING:
+    from zsim_world.world import World
+
+
+class CommandDesk:
+    """Takes commands as they come, and hands them to the fleet at their instants."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def take(self, drone: str, kind: str, message: Any) -> None:
+        """Keep a command until its instant, or refuse it."""
+        world = self._world
+        index = world.index.get(drone)
+        reason = "no such drone; see world/info" if index is None else self._age_refusal(message)
+        if index is None or reason:
+            world.refuse(message.source[:40], f"drone/{drone[:40]}/cmd/{kind}", reason or "")
+            return
+        world.commanders.push(index, kind, message, self._apply_ns(drone, kind, message))
+
+    def _age_refusal(self, message: Any) -> str | None:
+        world = self._world
+        age_ms = (world.now_ns - message.t_ns) / 1e6
+        limit_ms = world.scenario.time.max_command_age_ms
+        if world.mode == "realtime" and age_ms > limit_ms:
+            return f"age is {age_ms:.0f} ms; must be <= {limit_ms:g} ms"
+        if message.t_ns > world.now_ns and world.barrier.is_gating(message.source):
+            return f"t_ns is {message.t_ns}; must be <= {world.now_ns}, the newest gate"
+        return None
+
+    def _apply_ns(self, drone: str, kind: str, message: Any) -> int:
+        """Return when a command takes effect; say so for senders that are not in the lockstep."""
+        world, source = self._world, message.source
+        if world.barrier.is_gating(source):
+            return message.t_ns + world.delay_ns
+        apply_ns = world.next_ns + world.delay_ns
+        fields = {name: getattr(message, name) for name in messages.fields(type(message))}
+        text = f"{source} sends {kind} to {drone}"
+        world.event("command", drone, text, source=source, command=kind, apply_t_ns=apply_ns, message=fields)
+        return apply_ns
+
+    def apply(self, t_ns: int) -> None:
+        """Hand the commands that are due at t_ns to the firmware."""
+        for due in self._world.commanders.pop(t_ns):
+            refusal = self._world.commanders.refusal(due) or self._hand_over(due)
+            if refusal:
+                subject = keys.command(self._world.fleet.names[due.drone], due.kind)
+                self._world.refuse(due.source, subject, refusal)
+
+    def _hand_over(self, due: Due) -> str | None:
+        """Hand a command to the firmware; return why it is refused."""
+        if due.kind == "mode":
+            return self._mode(due)
+        refusal = self._setpoint(due)
+        if refusal is None and self._world.commanders.take(due.drone, due.source):
+            name = self._world.fleet.names[due.drone]
+            self._world.event("commander", name, f"{due.source} flies {name}", source=due.source)
+        return refusal
+
+    def _setpoint(self, due: Due) -> str | None:
+        m, i, fleet = due.message, due.drone, self._world.fleet
+        if due.kind == "velocity":
+            return fleet.set_velocity(i, m.velocity_m_s, m.yaw_rate_rad_s, m.frame)
+        if due.kind == "ardrone":
+            return fleet.set_ardrone(i, m.forward, m.left, m.up, m.yaw_left, m.hover)
+        if due.kind == "attitude":
+            return fleet.set_attitude(i, m.orientation_wxyz, m.thrust_n, m.yaw_rate_rad_s)
+        return fleet.set_rotors(i, m.speed_rad_s)
+
+    def _mode(self, due: Due) -> str | None:
+        fleet, mode = self._world.fleet, due.message.mode
+        act = {
+            "takeoff": fleet.takeoff,
+            "land": fleet.land,
+            "emergency": fleet.emergency,
+            "reset": fleet.reset,
+        }
+        refusal = act[mode](due.drone)
+        if refusal is None:
+            name = fleet.names[due.drone]
+            self._world.event(
+                "mode", name, f"{due.source} asks {name} to {mode}", source=due.source, mode=mode
+            )
+        return refusal

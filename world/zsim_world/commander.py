@@ -1,0 +1,109 @@
+"""Who flies which drone, and which command takes effect when.
+
+The first source that sends a setpoint to a drone that nobody flies is its commander, until it releases it, says
+bye or dies. Commands of one instant are ordered by (priority of the source, source, seq): the last wins.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+PROGRAM = 0  # priority of a program, contract
+OPERATOR = 10  # priority of an operator, contract
+
+
+class Due(NamedTuple):
+    """A command waiting for its instant."""
+
+    apply_ns: int
+    priority: int
+    source: str
+    seq: int
+    drone: int
+    kind: str
+    message: Any
+
+
+@dataclass
+class Holder:
+    """Who holds a drone."""
+
+    source: str
+    priority: int
+
+
+class Commanders:
+    """Commands on their way and the holder of each drone.
+
+    Args:
+        drones: names in scenario order.
+    """
+
+    def __init__(self, drones: list[str]) -> None:
+        self._names = drones
+        self._holders: list[Holder | None] = [None] * len(drones)
+        self._priorities: dict[tuple[int, str], int] = {}
+        self._due: list[Due] = []
+
+    def holder(self, drone: int) -> str | None:
+        """Return the name of the commander."""
+        holder = self._holders[drone]
+        return holder.source if holder else None
+
+    def push(self, drone: int, kind: str, message: Any, apply_ns: int) -> None:
+        """Keep a command until its instant."""
+        priority = self._priorities.get((drone, message.source), PROGRAM)
+        self._due.append(Due(apply_ns, priority, message.source, message.seq, drone, kind, message))
+
+    def pop(self, t_ns: int) -> list[Due]:
+        """Return the commands that take effect up to t_ns, in the order in which they do."""
+        if not self._due:
+            return []
+        ready = sorted((due for due in self._due if due.apply_ns <= t_ns), key=lambda due: due[:4])
+        self._due = [due for due in self._due if due.apply_ns > t_ns]
+        return ready
+
+    def refusal(self, due: Due) -> str | None:
+        """Return why the source may not command the drone now, None if it may."""
+        holder = self._holders[due.drone]
+        if holder is None or holder.source == due.source:
+            return None
+        if due.kind == "mode" and due.priority >= holder.priority:
+            return None
+        return (
+            f"{self._names[due.drone]} is flown by {holder.source!r} (priority {holder.priority}); "
+            f"acquire it with a higher priority through world/control"
+        )
+
+    def take(self, drone: int, source: str) -> bool:
+        """Make the source the commander if nobody is; return whether it is new."""
+        if self._holders[drone] is not None:
+            return False
+        self._holders[drone] = Holder(source, self._priorities.get((drone, source), PROGRAM))
+        return True
+
+    def acquire(self, drone: int, source: str, priority: int) -> str | None:
+        """Give the drone to the source; return the reason if somebody of the same or higher priority has it."""
+        holder = self._holders[drone]
+        if holder is not None and holder.source != source and priority <= holder.priority:
+            return f"{self._names[drone]} is flown by {holder.source!r} with priority {holder.priority}"
+        self._priorities[drone, source] = priority
+        self._holders[drone] = Holder(source, priority)
+        return None
+
+    def release(self, drone: int, source: str) -> str | None:
+        """Take the drone from its commander; return the reason if the source is not the commander."""
+        holder = self._holders[drone]
+        if holder is None or holder.source != source:
+            who = f"{holder.source!r}" if holder else "nobody"
+            return f"{self._names[drone]} is flown by {who}, not by {source!r}"
+        self._holders[drone] = None
+        self._priorities.pop((drone, source), None)
+        return None
+
+    def gone(self, source: str) -> list[int]:
+        """Take all drones from a source that left; return which."""
+        held = [i for i, holder in enumerate(self._holders) if holder and holder.source == source]
+        for drone in held:
+            self.release(drone, source)
+        self._due = [due for due in self._due if due.source != source or due.kind == "mode"]
+        return held

@@ -1,0 +1,112 @@
+"""What drones do to each other: hulls that touch, and the downwash on those that fly below."""
+
+import math
+
+from zsim_world.compiled import compiled
+from numpy.typing import NDArray
+
+from zsim_world.rigid_body import ATTITUDE, POSITION, ROTOR, VELOCITY, four
+from zsim_world.rotation import z_axis
+from zsim_world.rotors import Four
+from zsim_world.vehicle import AIR_DENSITY, HULL_DAMPING, HULL_RADIUS_M, HULL_STIFFNESS, ROTOR_RADIUS_M, THRUST
+
+DISC_M2 = 4.0 * math.pi * ROTOR_RADIUS_M**2  # m^2, area of the four rotors together
+JET_START_M = math.sqrt(DISC_M2 / math.pi)  # m, width at which a Gaussian jet of speed 2 v_h carries the thrust
+JET_SPREAD = 0.107  # growth of a round jet's 1/e width (Fischer et al., Mixing in Inland and Coastal Waters, 1979)
+JET_WIDTHS = 3.0  # beyond three widths the jet is 1e-4 of its core
+
+
+@compiled
+def downwash(thrust_n: float, density: float, below_m: float, aside_m: float) -> float:
+    """Return the downward speed [m/s] of the air below a hovering drone.
+
+    The far wake of momentum theory, 2 v_h = 2 sqrt(T / (2 rho A)), as a turbulent round jet that keeps its momentum:
+    w = 2 v_h (b0 / b) exp(-(r / b)^2), b = b0 + 0.107 z.
+
+    Args:
+        thrust_n: of the drone above; density: of the air [kg/m^3].
+        below_m, aside_m: where, from the drone above, both >= 0.
+    """
+    width = JET_START_M + JET_SPREAD * below_m
+    if aside_m > JET_WIDTHS * width or thrust_n <= 0.0:
+        return 0.0
+    core = 2.0 * math.sqrt(thrust_n / (2.0 * density * DISC_M2)) * JET_START_M / width
+    ratio = aside_m / width
+    return core * math.exp(-ratio * ratio)
+
+
+@compiled
+def hull_force(stiffness: float, damping: float, distance_m: float, closing_m_s: float) -> float:
+    """Return the force [N] that parts two hulls whose centres are `distance_m` apart; never an attraction."""
+    depth = 2.0 * HULL_RADIUS_M - distance_m
+    if depth <= 0.0:
+        return 0.0
+    return max(stiffness * depth + damping * closing_m_s, 0.0)
+
+
+@compiled
+def _free_thrust(row: NDArray, speed: Four) -> float:
+    s = 0.0
+    for k in range(4):
+        s += speed[k] * speed[k]
+    return row[THRUST] * s
+
+
+@compiled
+def _blow(vehicle: NDArray, state: NDArray, above: int, below: int, aside: float, drop: float, air: NDArray) -> None:
+    thrust = _free_thrust(vehicle[above], four(state[above], ROTOR)) * z_axis(four(state[above], ATTITUDE))[2]
+    air[below, 2] -= downwash(thrust, vehicle[above, AIR_DENSITY], drop, aside)
+
+
+@compiled
+def _touch(
+    vehicle: NDArray, state: NDArray, i: int, j: int, d: tuple[float, float, float], distance: float, push: NDArray
+) -> None:
+    """Push drones i and j apart along d = p_j - p_i."""
+    closing = 0.0
+    for k in range(3):
+        closing -= (state[j, VELOCITY + k] - state[i, VELOCITY + k]) * d[k] / distance
+    # the softer of the two, so that a light drone stays within what its step can follow
+    stiffness = min(vehicle[i, HULL_STIFFNESS], vehicle[j, HULL_STIFFNESS])
+    damping = min(vehicle[i, HULL_DAMPING], vehicle[j, HULL_DAMPING])
+    force = hull_force(stiffness, damping, distance, closing) / distance
+    for k in range(3):
+        push[i, k] -= force * d[k]
+        push[j, k] += force * d[k]
+
+
+@compiled
+def encounters(
+    vehicle: NDArray, state: NDArray, air: NDArray, push: NDArray, touching: NDArray, touched: NDArray
+) -> float:
+    """Add downwash to `air`, write the forces between hulls to `push`, and return the least distance [m].
+
+    Args:
+        vehicle, state: parameters and state, a row per drone.
+        air: (N, 3) velocity of the air [m/s], added to.
+        push: (N, 3) force [N], overwritten.
+        touching: (N, N) 1 where i < j are in contact now, updated; touched: (N, N) set to 1 where contact begins.
+    """
+    least = math.inf
+    push[:, :] = 0.0
+    for i in range(state.shape[0]):
+        for j in range(i + 1, state.shape[0]):
+            dx = state[j, POSITION] - state[i, POSITION]
+            dy = state[j, POSITION + 1] - state[i, POSITION + 1]
+            dz = state[j, POSITION + 2] - state[i, POSITION + 2]
+            aside2 = dx * dx + dy * dy
+            distance = max(math.sqrt(aside2 + dz * dz), 1e-9)
+            least = min(least, distance)
+            contact = distance < 2.0 * HULL_RADIUS_M
+            if contact:
+                _touch(vehicle, state, i, j, (dx, dy, dz), distance, push)
+                if touching[i, j] == 0:
+                    touched[i, j] = 1
+            touching[i, j] = 1 if contact else 0
+            reach = JET_WIDTHS * (JET_START_M + JET_SPREAD * abs(dz))
+            if aside2 < reach * reach:
+                if dz > 0.0:
+                    _blow(vehicle, state, j, i, math.sqrt(aside2), dz, air)
+                else:
+                    _blow(vehicle, state, i, j, math.sqrt(aside2), -dz, air)
+    return least

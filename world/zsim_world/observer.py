@@ -1,0 +1,209 @@
+"""What the firmware believes: attitude, velocity, height, disturbance, from its own noisy sensors with fixed gains.
+
+The velocity is in the heading frame (x forward, y left, z up). Tilt is corrected by the velocity, not by taking the
+accelerometer for gravity: in flight a multirotor's specific force lies along its thrust whatever its tilt.
+"""
+
+import math
+
+from zsim_world.compiled import compiled
+from numpy.typing import NDArray
+
+from zsim_world import gains as g
+from zsim_world import rotation as rot
+from zsim_world.rigid_body import four, put, put_four, vector
+from zsim_world.rotation import Quaternion, Vector, axpy, cross
+from zsim_world.rotors import lagged
+from zsim_world.vehicle import DRAG, GRAVITY, MASS, ROTOR_LAG, STAND_HEIGHT_M, THRUST
+
+STEP_S = 0.005  # s, 200 Hz, the rate of the navigation board
+
+# Columns of the belief, one row per drone
+ATTITUDE, GYRO_BIAS, VELOCITY, DISTURBANCE = 0, 4, 7, 10  # B to W; rad/s in B; m/s; m/s^2
+HEIGHT, BARO_ZERO, ODOMETRY = 13, 14, 15  # m over the ground; m; m in W from power-up (2)
+BODY_RATE, ROTOR = 17, 20  # rad/s in B; rad/s, modelled (4)
+STILL_STEPS, BARO_SAMPLES, MAG_SAMPLES, SONAR_AGE = 24, 25, 26, 27  # counts; steps since the last good echo
+COLUMNS = 28
+
+# Columns of the device registers: the newest sample of each sensor and whether it is new
+ACCEL, GYRO, FLOW, FLOW_QUALITY, MAG, BARO, SONAR, SONAR_VALID = 0, 3, 6, 9, 10, 13, 14, 15
+NEW_FLOW, NEW_MAG, NEW_BARO, NEW_SONAR = 16, 17, 18, 19
+REGISTERS = 20
+
+# Columns of the board's calibration: what it knows of its own mounts and of the place
+IMU_TURN, MAG_TURN, MAG_BEARING, SONAR_MIN = 0, 4, 8, 9  # q_BS, q_BS, heading of the horizontal field [rad], m
+CALIBRATION = 10
+
+STILL_STEPS_MIN = 50.0  # what it is worth to know that a floor is level to 0.05 rad, at an accelerometer noise of 0.35 g
+STILL_STEPS_MAX = 4000.0  # 20 s: the bias walks on, so older samples tell less
+FLOW_QUALITY_MIN = 0.3  # below, the picture shows more horizon than ground
+SONAR_AGE_MAX = 100.0  # steps, 0.5 s without echo: heights come from the barometer
+MAG_MIN_UT = 1.0  # uT, a horizontal field that still gives a heading
+
+
+@compiled
+def level(q_WB: Quaternion) -> Quaternion:
+    """Return q_HB, the attitude over the heading frame: tilt without heading."""
+    return rot.multiply(rot.about_z(-rot.heading(q_WB)), q_WB)
+
+
+@compiled
+def turn_by(belief: NDArray, r_H: Vector) -> None:
+    """Turn the believed attitude by a small rotation vector [rad] given in the heading frame."""
+    q = four(belief, ATTITUDE)
+    r_W = rot.rotate(rot.about_z(rot.heading(q)), r_H)
+    put_four(belief, ATTITUDE, rot.normalised(rot.multiply(rot.from_rotation_vector(r_W), q)))
+
+
+@compiled
+def _take_bias(belief: NDArray, r_H: Vector) -> None:
+    """Take a rate error [rad/s], given in the heading frame, out of the gyro's bias."""
+    q_HB = level(four(belief, ATTITUDE))
+    put(belief, GYRO_BIAS, axpy(vector(belief, GYRO_BIAS), -1.0, rot.rotate_back(q_HB, r_H)))
+
+
+@compiled
+def observe(belief: NDArray, row: NDArray, gain: NDArray, device: NDArray, board: NDArray, on_ground: bool) -> None:
+    """Advance the belief by one step of 5 ms and take in what the devices have sampled since the last.
+
+    Args:
+        belief: (COLUMNS,) in place.
+        row: the aircraft's nominal parameters (vehicle.py); gain: gains.py.
+        device: (REGISTERS,) newest samples; the marks of new ones are cleared.
+        board: (CALIBRATION,).
+        on_ground: standing with the rotors off: velocity zero, gravity is all that the accelerometer feels.
+    """
+    before = rot.heading(four(belief, ATTITUDE))
+    w = axpy(rot.rotate(four(board, IMU_TURN), vector(device, GYRO)), -1.0, vector(belief, GYRO_BIAS))
+    put(belief, BODY_RATE, w)
+    turn = rot.from_rotation_vector((w[0] * STEP_S, w[1] * STEP_S, w[2] * STEP_S))
+    put_four(belief, ATTITUDE, rot.normalised(rot.multiply(four(belief, ATTITUDE), turn)))
+    f_B = rot.rotate(four(board, IMU_TURN), vector(device, ACCEL))
+    if on_ground:
+        _stand(belief, row, f_B, w)
+    else:
+        _fly(belief, row, gain, f_B, rot.heading(four(belief, ATTITUDE)) - before)
+        if device[NEW_FLOW] > 0.0 and device[FLOW_QUALITY] >= FLOW_QUALITY_MIN:
+            _see_flow(belief, gain, vector(device, FLOW))
+        _measure_height(belief, gain, device, board[SONAR_MIN])
+    if device[NEW_BARO] > 0.0:
+        _see_baro(belief, gain, device[BARO], on_ground)
+    if device[NEW_MAG] > 0.0:
+        _see_mag(belief, gain, rot.rotate(four(board, MAG_TURN), vector(device, MAG)), board[MAG_BEARING])
+    for k in range(NEW_FLOW, NEW_SONAR + 1):
+        device[k] = 0.0
+
+
+@compiled
+def _stand(belief: NDArray, row: NDArray, f_B: Vector, w: Vector) -> None:
+    """Average gravity and the gyro's bias while standing; the first 20 s weigh alike."""
+    n = min(belief[STILL_STEPS] + 1.0, STILL_STEPS_MAX)
+    belief[STILL_STEPS] = n
+    q_HB = level(four(belief, ATTITUDE))
+    f_H = rot.rotate(q_HB, f_B)
+    s = 1.0 / (n * row[GRAVITY])
+    turn_by(belief, (f_H[1] * s, -f_H[0] * s, 0.0))
+    put(belief, GYRO_BIAS, axpy(vector(belief, GYRO_BIAS), 1.0 / n, w))
+    put(belief, VELOCITY, (0.0, 0.0, 0.0))
+    put(belief, DISTURBANCE, (0.0, 0.0, 0.0))
+    belief[HEIGHT] = STAND_HEIGHT_M
+
+
+@compiled
+def _fly(belief: NDArray, row: NDArray, gain: NDArray, f_B: Vector, turned: float) -> None:
+    """Predict velocity, height and odometry by one step and take in the accelerometer."""
+    q = four(belief, ATTITUDE)
+    q_HB = level(q)
+    up = lift(belief, row)
+    c = row[DRAG] / row[MASS]
+    v, u = vector(belief, VELOCITY), vector(belief, DISTURBANCE)
+    a = axpy(axpy(u, -c, v), up, rot.z_axis(q_HB))
+    a = (a[0], a[1], a[2] - row[GRAVITY])
+    east = rot.rotate(rot.about_z(rot.heading(q)), axpy(v, 0.5 * STEP_S, a))
+    belief[ODOMETRY] += STEP_S * east[0]
+    belief[ODOMETRY + 1] += STEP_S * east[1]
+    belief[HEIGHT] += STEP_S * east[2]
+    back = rot.about_z(-turned)
+    v, u = rot.rotate(back, axpy(v, STEP_S, a)), rot.rotate(back, u)
+
+    e = axpy(rot.rotate(q_HB, (f_B[0], f_B[1], f_B[2] - up)), -1.0, axpy(u, -c, v))
+    belief[HEIGHT] += gain[g.LIFT_Z] * e[2]
+    _correct(belief, gain, g.ACCEL_V, v, u, e, gain[g.LIFT_V], gain[g.LIFT_U])
+
+
+@compiled
+def lift(belief: NDArray, row: NDArray) -> float:
+    """Return the modelled thrust over mass [m/s^2]."""
+    s = 0.0
+    for k in range(4):
+        s += belief[ROTOR + k] * belief[ROTOR + k]
+    return row[THRUST] * s / row[MASS]
+
+
+@compiled
+def _correct(
+    belief: NDArray, gain: NDArray, at: int, v: Vector, u: Vector, e: Vector, climb: float, rise: float
+) -> None:
+    """Correct velocity, disturbance, tilt and bias by an innovation e; the four horizontal gains stand at `at`."""
+    kv, kt, kr, ku = gain[at], gain[at + 1], gain[at + 2], gain[at + 3]
+    put(belief, VELOCITY, (v[0] + kv * e[0], v[1] + kv * e[1], v[2] + climb * e[2]))
+    put(belief, DISTURBANCE, (u[0] + ku * e[0], u[1] + ku * e[1], u[2] + rise * e[2]))
+    turn_by(belief, (-kt * e[1], kt * e[0], 0.0))  # a forward velocity is missed by too little nose-down pitch
+    _take_bias(belief, (-kr * e[1], kr * e[0], 0.0))
+
+
+@compiled
+def _see_flow(belief: NDArray, gain: NDArray, flow_H: Vector) -> None:
+    v = vector(belief, VELOCITY)
+    e = axpy(flow_H, -1.0, v)
+    belief[HEIGHT] += gain[g.CLIMB_Z] * e[2]
+    _correct(belief, gain, g.FLOW_V, v, vector(belief, DISTURBANCE), e, gain[g.CLIMB_V], gain[g.CLIMB_U])
+
+
+@compiled
+def _measure_height(belief: NDArray, gain: NDArray, device: NDArray, sonar_min: float) -> None:
+    """Take the height from the sonar where it has an echo, else from the barometer."""
+    belief[SONAR_AGE] += 1.0
+    if device[NEW_SONAR] > 0.0 and device[SONAR_VALID] > 0.0 and device[SONAR] >= sonar_min:
+        belief[SONAR_AGE] = 0.0
+        e = device[SONAR] * rot.z_axis(four(belief, ATTITUDE))[2] - belief[HEIGHT]
+        _lift_by(belief, gain, g.SONAR_Z, e)
+    if device[NEW_BARO] > 0.0 and belief[SONAR_AGE] > SONAR_AGE_MAX:
+        _lift_by(belief, gain, g.BARO_Z, device[BARO] - belief[BARO_ZERO] - belief[HEIGHT])
+
+
+@compiled
+def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
+    belief[HEIGHT] += gain[at] * e
+    belief[VELOCITY + 2] += gain[at + 1] * e
+    belief[DISTURBANCE + 2] += gain[at + 2] * e
+
+
+@compiled
+def _see_baro(belief: NDArray, gain: NDArray, altitude: float, on_ground: bool) -> None:
+    """Learn what the barometer shows at height zero: on the ground, and in the air while the sonar gives the height."""
+    if on_ground or belief[SONAR_AGE] <= SONAR_AGE_MAX:
+        n = belief[BARO_SAMPLES] + 1.0
+        belief[BARO_SAMPLES] = n
+        belief[BARO_ZERO] += max(1.0 / n, gain[g.BARO_ZERO]) * (altitude - belief[HEIGHT] - belief[BARO_ZERO])
+
+
+@compiled
+def _see_mag(belief: NDArray, gain: NDArray, field_B: Vector, bearing: float) -> None:
+    """Correct heading and the gyro's bias about the vertical; the first samples are averaged."""
+    q = four(belief, ATTITUDE)
+    field_H = rot.rotate(level(q), field_B)
+    if field_H[0] * field_H[0] + field_H[1] * field_H[1] < MAG_MIN_UT * MAG_MIN_UT:
+        return
+    n = belief[MAG_SAMPLES] + 1.0
+    belief[MAG_SAMPLES] = n
+    e = rot.wrapped(bearing - math.atan2(field_H[1], field_H[0]) - rot.heading(q))
+    turn_by(belief, (0.0, 0.0, max(1.0 / n, gain[g.MAG_PSI]) * e))
+    if 1.0 / n < gain[g.MAG_PSI]:
+        _take_bias(belief, (0.0, 0.0, gain[g.MAG_RATE] * e))
+
+
+@compiled
+def model_rotors(belief: NDArray, row: NDArray, command: tuple[float, float, float, float]) -> None:
+    """Advance the modelled rotors by one step under a command [rad/s]."""
+    put_four(belief, ROTOR, lagged(four(belief, ROTOR), command, math.exp(-STEP_S / row[ROTOR_LAG])))

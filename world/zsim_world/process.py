@@ -1,0 +1,379 @@
+"""The world as a process: the hub of the federation, one loop with two switches, gating and pacing.
+
+Order of this file: `run`, the loop, what arrives, what rarely arrives, publication.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import msgspec
+
+from zsim import keys, messages, session
+from zsim.agent import Output
+from zsim.errors import DecodeError
+from zsim.health import HealthMeter
+from zsim.messages import ControlAnswer
+from zsim.session import Mailbox, Query, Sample, Session, TimedMailbox
+from zsim_world.history import History
+from zsim_world.world import World
+
+TICK_S = 0.1  # how often a standing world looks at the wall clock
+CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
+VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
+BYE_S = 5.0  # contract: the world waits 5 s at most for byes
+RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
+WORLD = "world"
+PHASE_EVERY = 10  # cluster states between two looks at the phase that progress shows
+Tell = Callable[[str, Any, str], None]
+# Outputs first, dones last: whoever says done has sent its outputs before, on the same link.
+INPUTS = ("drone/*/cmd/*", "drone/*/estimate", "cluster/*/state", "process/**")
+
+
+class _Head(msgspec.Struct):
+    """What the hub reads of messages that it only passes on."""
+
+    t_ns: int
+    seq: int
+    source: str = ""
+
+
+class WorldProcess:
+    """One world on one session.
+
+    Args:
+        link: a listening session.
+        world: what to run.
+        stopped: asked every TICK_S; a text ends the run with it as the reason.
+        tell: told every ("clock" or "event", message, phase of the clusters); shows progress.
+    """
+
+    def __init__(
+        self,
+        link: Session,
+        world: World,
+        stopped: Callable[[], str | None] = lambda: None,
+        tell: Tell = lambda kind, message, phase: None,
+    ) -> None:
+        self._link = link
+        self._world = world
+        self._stopped = stopped
+        self._tell = tell
+        self._state_decoder = msgspec.msgpack.Decoder(messages.ClusterState)
+        self._history = History()
+        self._head = msgspec.msgpack.Decoder(_Head)
+        self._queries: deque[Query] = deque()
+        self._tokens: deque[tuple[str, bool]] = deque()
+        self._over = threading.Event()
+        self._clock_wall_ns = 0
+        self._view_wall_ns = 0
+        self._view_seq = 0
+        self._health_seq = 0
+        self._states_seen = 0
+        self._phase = ""
+        self._start_wall_ns = 0
+        self._start_sim_ns = 0
+        self._paced_rate = 0.0
+        self.health = HealthMeter(WORLD)
+
+    def run(self) -> None:
+        """Run to the end: wait for the participants, integrate, say goodbye."""
+        boxes = [self._link.subscribe(expression) for expression in INPUTS]
+        self._inputs: _Inputs = _Timed(boxes) if self._world.mode == "realtime" else _Direct(boxes)
+        self._announce()
+        ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
+        ticker.start()
+        try:
+            while self._world.ended is None:
+                self._turn()
+            self._say_goodbye()
+        finally:
+            self._over.set()
+            ticker.join()
+            self._inputs.close()
+
+    def _announce(self) -> None:
+        info = self._world.info()
+        self._publish(Output(keys.INFO, info))
+        for expression in (
+            keys.INFO,
+            keys.CLOCK,
+            keys.CONTROL,
+            "drone/*/sensor/status",
+            "drone/*/truth",
+            "drone/*/estimate",
+            "cluster/*/state",
+        ):
+            self._link.answer(expression, self._on_query)
+        self._link.on_token("process/*", self._on_token)
+        self._link.declare_token(keys.token(WORLD))
+
+    # The loop
+
+    def _turn(self) -> None:
+        self._take_in_all()
+        self._serve_rare()
+        self._recover_short()
+        wall_ns = time.monotonic_ns()
+        if self._world.ended is None and self._world.may_advance():
+            left_ns = self._due_ns(wall_ns) - wall_ns
+            if left_ns <= 0:
+                self._advance(wall_ns, -left_ns)
+            else:
+                self._inputs.wait(left_ns / 1e9)
+        else:
+            self._stand_still(wall_ns)
+
+    def _advance(self, wall_ns: int, late_ns: int) -> None:
+        if self._world.mode == "realtime" and late_ns > self._world.gate_ns / self._world.rate:
+            self._world.missed_own_deadline()
+        self._world.advance(wall_ns)
+        self._flush()
+        self._publish_view(wall_ns)
+        self.health.step(time.monotonic_ns() - wall_ns)
+
+    def _due_ns(self, wall_ns: int) -> int:
+        """Return the wall time of the next gate; the pace starts anew when the rate changes or time stood still."""
+        world = self._world
+        if world.rate <= 0 or world.state != "running":
+            self._paced_rate = 0.0
+            return wall_ns
+        if self._paced_rate != world.rate:
+            self._paced_rate = world.rate
+            self._start_wall_ns, self._start_sim_ns = wall_ns, world.next_ns
+        due_ns = self._start_wall_ns + round((world.next_ns - self._start_sim_ns) / world.rate)
+        if world.mode == "lockstep" and wall_ns - due_ns > CLOCK_STANDING_NS:
+            self._paced_rate = 0.0
+        return due_ns
+
+    def _stand_still(self, wall_ns: int) -> None:
+        """Time stands still: say so once a second, and wait for whatever comes."""
+        self._flush()
+        if wall_ns - self._clock_wall_ns >= CLOCK_STANDING_NS:
+            self._world.tell_clock(wall_ns)
+            self._flush()
+        self._inputs.wait(None)
+
+    def _say_goodbye(self) -> None:
+        """Publish the end, then wait until every participant that lives has said bye."""
+        self._world.tell_end(time.monotonic_ns())
+        self._flush()
+        until_s = time.monotonic() + BYE_S
+        while time.monotonic() < until_s and any(p.alive for p in self._world.barrier.participants.values()):
+            self._inputs.wait(TICK_S)
+            self._take_in_all()
+            self._serve_rare()
+        self._flush()
+
+    # What arrives
+
+    def _take_in_all(self) -> None:
+        for wall_ns, sample in self._inputs.drain():
+            self.health.received += 1
+            self._take_in(wall_ns, sample)
+
+    def _take_in(self, wall_ns: int, sample: Sample) -> None:
+        key = sample.key
+        try:
+            if key.endswith(("/estimate", "/state")):
+                self._pass_on(key, sample.payload)
+            elif key.startswith("process/") or "/cmd/" in key:
+                message = messages.decode(key, sample.payload)
+                self._history.add(key, sample.payload, message.t_ns)
+                self._world.handle(key, message, wall_ns)
+            elif not key.startswith("view/"):
+                raise DecodeError(f"{key}: only the world publishes here, or the key is not of the contract")
+        except (DecodeError, msgspec.MsgspecError) as error:
+            self.health.refused += 1
+            self._world.refuse("somebody", key[:80], str(error))
+
+    def _pass_on(self, key: str, payload: bytes) -> None:
+        """Keep an output that the hub only relays, and count it for the done of who sent it."""
+        head = self._head.decode(payload)
+        self._history.add(key, payload, head.t_ns)
+        role = "estimator" if key.startswith("drone/") else "controller"
+        if role == "controller":
+            self._look_at_phase(payload)
+        self._world.output_of(head.source or f"{role}.{keys.thing(key)}")
+
+    def _look_at_phase(self, payload: bytes) -> None:
+        if self._states_seen % PHASE_EVERY == 0:
+            self._phase = self._state_decoder.decode(payload).phase
+        self._states_seen += 1
+
+    def _recover_short(self) -> None:
+        """Ask a participant again for outputs that it counted and that did not come, as after a cut link."""
+        if self._world.mode == "realtime":
+            return
+        for participant in self._world.barrier.short():
+            for sample in self._link.get(keys.process(participant.name, "outputs"), RECOVERY_S):
+                self._take_in(time.monotonic_ns(), sample)
+            if participant.missing:
+                text = f"{participant.name}: {participant.missing} of its outputs did not come"
+                self._world.event("outputs_missing", participant.name, text, missing=participant.missing)
+                participant.missing = 0
+
+    # What arrives rarely, from other threads
+
+    def _on_query(self, query: Query) -> None:
+        self._queries.append(query)
+        self._inputs.wake()
+
+    def _on_token(self, key: str, alive: bool) -> None:
+        self._tokens.append((keys.thing(key), alive))
+        self._inputs.wake()
+
+    def _tick(self) -> None:
+        while not self._over.wait(TICK_S):
+            self._inputs.wake()
+
+    def _serve_rare(self) -> None:
+        reason = self._stopped()
+        if reason:
+            self._world.stop(reason)
+        while self._queries:
+            self._serve_query(self._queries.popleft())
+        while self._tokens:
+            self._serve_token(*self._tokens.popleft())
+        if self.health.due():
+            seq, self._health_seq = self._health_seq, self._health_seq + 1
+            self._publish(Output(keys.process(WORLD, "health"), self.health.message(self._world.now_ns, seq)))
+
+    def _serve_token(self, name: str, alive: bool) -> None:
+        if not alive and keys.token(name) not in self._link.tokens(keys.token(name), timeout_s=RECOVERY_S):
+            self._take_in_all()
+            self._world.died(name, time.monotonic_ns())
+            self._flush()
+
+    def _serve_query(self, query: Query) -> None:
+        if query.expression != keys.CONTROL:
+            for key, payload in self._history.last(query.expression):
+                query.reply(key, payload)
+            query.end()
+            return
+        try:
+            request = query.request()
+            answer = self._replay(request) if request.op == "replay" else self._world.control(request)
+        except DecodeError as error:
+            answer = ControlAnswer(ok=False, error=str(error))
+        query.answer(answer)
+        self._flush()
+
+    def _replay(self, request: messages.ControlRequest) -> ControlAnswer:
+        from_ns, expressions = request.args.get("from_ns"), request.args.get("keys")
+        if not isinstance(from_ns, int) or not isinstance(expressions, list) or len(expressions) > 1000:
+            return ControlAnswer(
+                ok=False, error="replay: needs from_ns (whole number) and keys (list of texts)"
+            )
+        found = self._history.since(from_ns, [str(expression) for expression in expressions])
+        return ControlAnswer(ok=True, result=[[key, payload] for key, payload in found])
+
+    # Publication
+
+    def _flush(self) -> None:
+        for output in self._world.take_outbox():
+            self._publish(output)
+
+    def _publish(self, output: Output) -> None:
+        key, message = output
+        payload = messages.encode(message)
+        self._history.add(key, payload, self._world.now_ns)
+        self._link.put_raw(key, payload)
+        if key == keys.CLOCK:
+            self._clock_wall_ns = time.monotonic_ns()
+            self._tell("clock", message, self._phase)
+        elif key == keys.EVENT:
+            self._tell("event", message, self._phase)
+
+    def _publish_view(self, wall_ns: int) -> None:
+        if wall_ns - self._view_wall_ns < VIEW_PERIOD_NS:
+            return
+        self._view_wall_ns = wall_ns
+        view = self._world.view(self._view_seq)
+        self._view_seq += 1
+        self._link.put(keys.VIEW_DRONES, view)
+
+
+class _Inputs:
+    """What others publish: waited for with a limit or without, drained with the wall time of arrival."""
+
+    def wait(self, timeout_s: float | None) -> None:
+        raise NotImplementedError
+
+    def drain(self) -> Iterator[tuple[int, Sample]]:
+        raise NotImplementedError
+
+    def wake(self) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        return
+
+
+class _Direct(_Inputs):
+    """Reads on the loop's own thread, waiting for the last box: fastest where nothing hangs on the wall clock."""
+
+    def __init__(self, boxes: Sequence[Mailbox]) -> None:
+        self._boxes = boxes
+        self._first: list[Sample] = []
+
+    def wait(self, timeout_s: float | None) -> None:
+        if timeout_s is not None and timeout_s < TICK_S:
+            time.sleep(timeout_s)
+            return
+        sample = self._boxes[-1].receive()
+        if sample is not None:
+            self._first.append(sample)
+
+    def drain(self) -> Iterator[tuple[int, Sample]]:
+        last, self._first = [*self._first, *self._boxes[-1].drain()], []
+        wall_ns = time.monotonic_ns()
+        for box in self._boxes[:-1]:
+            for sample in box.drain():
+                yield wall_ns, sample
+        for sample in last:
+            yield wall_ns, sample
+
+    def wake(self) -> None:
+        self._boxes[-1].wake()
+
+
+class _Timed(_Inputs):
+    """Reads on threads of their own, so that arrivals are stamped while the loop waits for its next gate."""
+
+    def __init__(self, boxes: Sequence[Mailbox]) -> None:
+        self._fresh = threading.Event()
+        self._boxes = [TimedMailbox(box, self._fresh) for box in boxes]
+
+    def wait(self, timeout_s: float | None) -> None:
+        self._fresh.wait(TICK_S if timeout_s is None else timeout_s)
+        self._fresh.clear()
+
+    def drain(self) -> Iterator[tuple[int, Sample]]:
+        for box in self._boxes:
+            yield from box.drain()
+
+    def wake(self) -> None:
+        self._fresh.set()
+
+    def close(self) -> None:
+        for box in self._boxes:
+            box.close()
+
+
+def run(
+    world: World,
+    endpoints: Sequence[str],
+    stopped: Callable[[], str | None] = lambda: None,
+    tell: Tell = lambda kind, message, phase: None,
+) -> None:
+    """Listen on the endpoints and run the world to its end.
+
+    Raises:
+        SessionError: an endpoint is taken.
+    """
+    mode: session.Mode = "lockstep" if world.mode == "lockstep" else "realtime"
+    with session.listen(endpoints, world.scenario.federation, mode) as link:
+        WorldProcess(link, world, stopped, tell).run()

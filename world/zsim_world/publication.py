@@ -1,0 +1,101 @@
+"""From the fleet's arrays to the messages of a gate, in the contract's order.
+
+Per drone: its samples in time order, truth, and status last, which counts them.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from zsim import keys, messages
+from zsim.agent import Output
+from zsim.scenario import Scenario
+from zsim_world.fleet import Fleet, Sample
+
+GPS_FIX_3D = 3  # NMEA: 3 = three-dimensional fix
+GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone
+
+
+class Publication:
+    """Builds the messages of each gate and counts them per key."""
+
+    def __init__(self, fleet: Fleet, scenario: Scenario) -> None:
+        self._fleet = fleet
+        self._sigma_m = [drone.sensors.gps.position_m.noise for drone in scenario.drones]
+        names = fleet.names
+        self._sensor_keys = [{kind: keys.sensor(name, kind) for kind in keys.SENSORS} for name in names]
+        self._status_keys = [keys.status(name) for name in names]
+        self._truth_keys = [keys.truth(name) for name in names]
+        self._seq = [dict.fromkeys(keys.SENSORS, 0) for _ in names]
+        self._gate = 0
+        self._build: dict[str, Callable[[Sample, int], Any]] = {
+            "imu": _imu,
+            "gps": self._gps,
+            "mag": _mag,
+            "baro": _baro,
+            "sonar": _sonar,
+            "flow": _flow,
+        }
+
+    def gate(self, truth: Any, holder: Callable[[int], str | None]) -> Iterator[Output]:
+        """Yield the messages of the gate that the fleet stands at."""
+        by_drone: list[list[Output]] = [[] for _ in self._status_keys]
+        for sample in self._fleet.samples():
+            by_drone[sample.drone].append(self._sample(sample))
+        truths = self._truths(truth)
+        for drone, outputs in enumerate(by_drone):
+            yield from outputs
+            yield Output(self._truth_keys[drone], truths[drone])
+            yield Output(self._status_keys[drone], self._status(drone, len(outputs) + 1, holder(drone)))
+        self._gate += 1
+
+    def _sample(self, sample: Sample) -> Output:
+        counts = self._seq[sample.drone]
+        seq = counts[sample.sensor]
+        counts[sample.sensor] = seq + 1
+        return Output(self._sensor_keys[sample.drone][sample.sensor], self._build[sample.sensor](sample, seq))
+
+    def _gps(self, s: Sample, seq: int) -> messages.Gps:
+        v = s.values
+        return messages.Gps(
+            s.t_ns, seq, s.t_sample_ns, v[0], v[1], v[2], v[3:6], v[6:9],
+            self._sigma_m[s.drone], GPS_FIX_3D, GPS_SATELLITES,
+        )  # fmt: skip
+
+    def _status(self, drone: int, count: int, commander: str | None) -> messages.Status:
+        state, battery_percent, collision = self._fleet.status(drone)
+        return messages.Status(
+            self._fleet.t_ns, self._gate, state, battery_percent, collision, commander, count
+        )  # type: ignore[arg-type]
+
+    def _truths(self, truth: Any) -> list[messages.Truth]:
+        t_ns, seq = self._fleet.t_ns, self._gate
+        columns = zip(
+            truth.position_m.tolist(),
+            truth.velocity_m_s.tolist(),
+            truth.orientation_wxyz.tolist(),
+            truth.angular_velocity_rad_s.tolist(),
+            truth.accel_m_s2.tolist(),
+            truth.rotor_rad_s.tolist(),
+            strict=True,
+        )
+        return [messages.Truth(t_ns, seq, *map(tuple, row)) for row in columns]  # type: ignore[arg-type]
+
+
+def _imu(s: Sample, seq: int) -> messages.Imu:
+    return messages.Imu(s.t_ns, seq, s.t_sample_ns, s.values[0:3], s.values[3:6])
+
+
+def _mag(s: Sample, seq: int) -> messages.Mag:
+    return messages.Mag(s.t_ns, seq, s.t_sample_ns, s.values)
+
+
+def _baro(s: Sample, seq: int) -> messages.Baro:
+    return messages.Baro(s.t_ns, seq, s.t_sample_ns, *s.values)
+
+
+def _sonar(s: Sample, seq: int) -> messages.Sonar:
+    return messages.Sonar(s.t_ns, seq, s.t_sample_ns, s.values[0], bool(s.values[1]))
+
+
+def _flow(s: Sample, seq: int) -> messages.Flow:
+    return messages.Flow(s.t_ns, seq, s.t_sample_ns, s.values[0:3], s.values[3])

@@ -1,0 +1,144 @@
+"""One drone as a rigid body under rotors, drag, ground and pushes; one step of fourth-order Runge-Kutta."""
+
+import math
+
+from zsim_world.compiled import compiled
+from numpy.typing import NDArray
+
+from zsim_world import rotation as rot
+from zsim_world.ground import contact
+from zsim_world.rotation import Quaternion, Vector, add, axpy, cross
+from zsim_world.rotors import Four, lagged, wrench
+from zsim_world.vehicle import DRAG, GRAVITY, INERTIA_X, INERTIA_Y, INERTIA_Z, MASS, ROTOR_LAG
+
+# Columns of the state, one row per drone
+POSITION, VELOCITY, ATTITUDE, RATE, ROTOR = 0, 3, 6, 10, 13  # m, m/s, quaternion, rad/s in B, rad/s
+COLUMNS = 17
+
+
+@compiled
+def vector(row: NDArray, at: int) -> Vector:
+    """Return three numbers of a row."""
+    return (row[at], row[at + 1], row[at + 2])
+
+
+@compiled
+def four(row: NDArray, at: int) -> Four:
+    """Return four numbers of a row."""
+    return (row[at], row[at + 1], row[at + 2], row[at + 3])
+
+
+@compiled
+def put(row: NDArray, at: int, a: Vector) -> None:
+    """Write three numbers into a row."""
+    row[at], row[at + 1], row[at + 2] = a
+
+
+@compiled
+def put_four(row: NDArray, at: int, a: Four) -> None:
+    """Write four numbers into a row."""
+    row[at], row[at + 1], row[at + 2], row[at + 3] = a
+
+
+@compiled
+def slew(row: NDArray, speed: Four, command: Four) -> Four:
+    """Return the rotors' accelerations [rad/s^2] under their first-order lag."""
+    s = 1.0 / row[ROTOR_LAG]
+    return (
+        (command[0] - speed[0]) * s,
+        (command[1] - speed[1]) * s,
+        (command[2] - speed[2]) * s,
+        (command[3] - speed[3]) * s,
+    )
+
+
+@compiled
+def accelerations(
+    row: NDArray,
+    anchor: NDArray,
+    p_WB: Vector,
+    v_WB: Vector,
+    q_WB: Quaternion,
+    w_WB_B: Vector,
+    speed: Four,
+    command: Four,
+    air_W: Vector,
+    push_W: Vector,
+) -> tuple[Vector, Vector]:
+    """Return a_WB in W [m/s^2] and the angular acceleration in B [rad/s^2].
+
+    m a = R z_B T - D (v - air) + ground + push - m g z_W
+    I dw/dt = M - w × (I w)
+
+    Args:
+        row: parameters (vehicle.py); anchor: of its contact points (ground.py).
+        p_WB, v_WB, q_WB, w_WB_B, speed: state; command: rotor speeds wanted [rad/s].
+        air_W: velocity of the air at the drone [m/s]; push_W: force of other drones [N].
+    """
+    ix, iy, iz = row[INERTIA_X], row[INERTIA_Y], row[INERTIA_Z]
+    thrust, moment = wrench(row, q_WB, p_WB[2], w_WB_B, speed, slew(row, speed, command))
+    ground, ground_moment = contact(row, anchor, p_WB, v_WB, q_WB, w_WB_B)
+    moment = add(moment, ground_moment)
+    force = add(add(ground, push_W), rot.rotate(q_WB, (0.0, 0.0, thrust)))
+    force = axpy(force, -row[DRAG], axpy(v_WB, -1.0, air_W))
+    inv = 1.0 / row[MASS]
+    wx, wy, wz = w_WB_B
+    return (
+        (force[0] * inv, force[1] * inv, force[2] * inv - row[GRAVITY]),
+        (
+            (moment[0] - (iz - iy) * wy * wz) / ix,
+            (moment[1] - (ix - iz) * wz * wx) / iy,
+            (moment[2] - (iy - ix) * wx * wy) / iz,
+        ),
+    )
+
+
+@compiled
+def _turned(q: Quaternion, s: float, dq: Quaternion) -> Quaternion:
+    return (q[0] + s * dq[0], q[1] + s * dq[1], q[2] + s * dq[2], q[3] + s * dq[3])
+
+
+@compiled
+def _mean(a: Vector, b: Vector, c: Vector, d: Vector) -> Vector:
+    """Return the Runge-Kutta mean (a + 2b + 2c + d) / 6."""
+    s = 1.0 / 6.0
+    return (
+        (a[0] + 2.0 * (b[0] + c[0]) + d[0]) * s,
+        (a[1] + 2.0 * (b[1] + c[1]) + d[1]) * s,
+        (a[2] + 2.0 * (b[2] + c[2]) + d[2]) * s,
+    )
+
+
+@compiled
+def step(
+    row: NDArray, anchor: NDArray, state: NDArray, command: Four, air_W: Vector, push_W: Vector, dt: float
+) -> None:
+    """Advance one drone's state (COLUMNS,) by dt [s] in place.
+
+    The rotors' lag is integrated exactly, also inside the step; air and pushes of others are held over it.
+    """
+    p, v, q, w = vector(state, POSITION), vector(state, VELOCITY), four(state, ATTITUDE), vector(state, RATE)
+    r0, h = four(state, ROTOR), 0.5 * dt
+    decay = math.exp(-h / row[ROTOR_LAG])
+    r1 = lagged(r0, command, decay)
+    r2 = lagged(r0, command, decay * decay)
+
+    a1, b1 = accelerations(row, anchor, p, v, q, w, r0, command, air_W, push_W)
+    d1 = rot.rate(q, w)
+    v2, w2, q2 = axpy(v, h, a1), axpy(w, h, b1), _turned(q, h, d1)
+    a2, b2 = accelerations(row, anchor, axpy(p, h, v), v2, q2, w2, r1, command, air_W, push_W)
+    d2 = rot.rate(q2, w2)
+    v3, w3, q3 = axpy(v, h, a2), axpy(w, h, b2), _turned(q, h, d2)
+    a3, b3 = accelerations(row, anchor, axpy(p, h, v2), v3, q3, w3, r1, command, air_W, push_W)
+    d3 = rot.rate(q3, w3)
+    v4, w4, q4 = axpy(v, dt, a3), axpy(w, dt, b3), _turned(q, dt, d3)
+    a4, b4 = accelerations(row, anchor, axpy(p, dt, v3), v4, q4, w4, r2, command, air_W, push_W)
+    d4 = rot.rate(q4, w4)
+
+    put(state, POSITION, axpy(p, dt, _mean(v, v2, v3, v4)))
+    put(state, VELOCITY, axpy(v, dt, _mean(a1, a2, a3, a4)))
+    put(state, RATE, axpy(w, dt, _mean(b1, b2, b3, b4)))
+    s = dt / 6.0
+    q = _turned(_turned(_turned(_turned(q, s, d1), 2.0 * s, d2), 2.0 * s, d3), s, d4)
+    put_four(state, ATTITUDE, rot.normalised(q))
+    put_four(state, ROTOR, r2)

@@ -1,0 +1,371 @@
+"""The world of a run: integrates all drones, owns simulated time, judges commands. No session, no clock.
+
+A runner hands it what arrives (`handle`, `died`, `control`), asks whether it may go on (`may_advance`), lets it
+go on (`advance`), and publishes what it puts into the outbox. Wall times are passed in.
+"""
+
+import uuid
+from collections.abc import Callable
+from typing import Any
+
+from zsim import CONTRACT, __version__, keys, messages, scenario_file
+from zsim.agent import Output
+from zsim.fingerprint import fingerprint
+from zsim.scenario import OnDeath, Scenario
+from zsim_world.barrier import Barrier
+from zsim_world.command_desk import CommandDesk
+from zsim_world.commander import Commanders
+from zsim_world.fleet import Fleet
+from zsim_world.publication import Publication
+from zsim_world.requests import Requests, brief
+from zsim_world.statistics import Ages, Rate
+from zsim_world.truth_hash import TruthHash
+
+ON_DEATH: dict[str, OnDeath] = {
+    "world": "end",
+    "recorder": "end",
+    "estimator": "restart",
+    "controller": "restart",
+}
+REFUSALS_TOLD = 20  # events per source and reason; what follows is counted only
+
+
+class World:
+    """One run.
+
+    Args:
+        scenario: resolved.
+        mode: "lockstep" or "realtime".
+        rate: simulated per wall seconds to pace at; 0 = as fast as possible.
+        wall_ns: monotonic wall time.
+        run_id: given only by tests that compare records.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        mode: str = "lockstep",
+        rate: float = 0.0,
+        wall_ns: Callable[[], int] = lambda: 0,
+        run_id: str | None = None,
+    ) -> None:
+        self.scenario = scenario
+        self.mode = mode
+        self.rate = rate
+        self.run_id = run_id or uuid.uuid4().hex[:12]
+        self.gate_ns = round(scenario.time.gate_ms * 1e6)
+        self.delay_ns = scenario.time.command_delay_gates * self.gate_ns
+        self.last_ns = round(scenario.duration_s * 1e9) // self.gate_ns * self.gate_ns
+        self.outbox: list[Output] = []
+        self.state = "waiting"
+        self.ended: str | None = None
+        self.refused = 0
+        self.dropped: set[str] = set()
+        self._wall_ns = wall_ns
+        self._start_wall_ns = wall_ns()
+        self.fleet = Fleet(scenario)
+        self._publication = Publication(self.fleet, scenario)
+        self.index = {name: i for i, name in enumerate(self.fleet.names)}
+        self.barrier = Barrier(self.run_id, self.gate_ns, expected(scenario))
+        self.commanders = Commanders(self.fleet.names)
+        self._desk = CommandDesk(self)
+        self._requests = Requests(self)
+        self._hash = TruthHash(self.fleet.count)
+        self._ages = Ages()
+        self._clock_rate = Rate()
+        self.steps_allowed = 0
+        self._min_separation_m = float("inf")
+        self._told: dict[tuple[str, str], int] = {}
+        self._deadlines = 0
+        self._world_misses = 0
+        self._seq: dict[str, int] = {}
+
+    @property
+    def now_ns(self) -> int:
+        """Return the newest gate; 0 before the start too."""
+        return self.fleet.t_ns
+
+    @property
+    def next_ns(self) -> int:
+        """Return the gate that a newcomer is first waited for."""
+        return 0 if self.state == "waiting" else self.now_ns + self.gate_ns
+
+    def info(self) -> messages.Info:
+        """Return the message of `world/info`."""
+        s, env = self.scenario, self.scenario.environment
+        return messages.Info(
+            t_ns=0,
+            seq=0,
+            contract=CONTRACT,
+            run_id=self.run_id,
+            federation=s.federation,
+            mode="lockstep" if self.mode == "lockstep" else "realtime",
+            rate=self.rate,
+            gate_ns=self.gate_ns,
+            physics_dt_ns=round(s.time.physics_dt_ms * 1e6),
+            command_delay_ns=self.delay_ns,
+            seed=s.seed,
+            origin=messages.Origin(env.latitude_deg, env.longitude_deg, env.height_m),
+            drones=tuple(messages.DroneInfo(d.name, d.model) for d in s.drones),
+            clusters=tuple(messages.ClusterInfo(c.name, tuple(c.drones)) for c in s.clusters),
+            scenario=scenario_file.to_text(s),
+            scenario_sha256=scenario_file.sha256(s),
+            version=__version__,
+            fingerprint=fingerprint(),
+        )
+
+    # What arrives
+
+    def handle(self, key: str, message: Any, wall_ns: int) -> None:
+        """Take one message that a participant or anyone else published."""
+        kind, name, *rest = key.split("/", 2)
+        what = rest[0] if rest else ""
+        if kind == "process" and what == "done":
+            self._on_done(name, message, wall_ns)
+        elif kind == "drone" and what.startswith("cmd/"):
+            self.barrier.received(message.source)
+            self._ages.arrived(message.t_ns, wall_ns)
+            self._desk.take(name, what[4:], message)
+        elif kind == "process" and what == "join":
+            self._on_join(name, message, wall_ns)
+        elif kind == "process" and what == "bye":
+            self._on_bye(name, message)
+
+    def output_of(self, source: str) -> None:
+        """Count an output (estimate, cluster state) of a participant."""
+        self.barrier.received(source)
+
+    def _on_done(self, name: str, message: messages.Done, wall_ns: int) -> None:
+        reason = self.barrier.done(name, message, self.now_ns, wall_ns)
+        if reason:
+            self.refuse(name, f"process/{name}/done", reason)
+
+    def _on_join(self, name: str, message: messages.Join, wall_ns: int) -> None:
+        former = self.barrier.participants.get(name)
+        reason = self.barrier.join(name, message, self.next_ns, wall_ns)
+        if reason:
+            self.refuse(name, f"process/{name}/join", reason)
+            return
+        again = former is not None and former.incarnation != message.incarnation
+        kind = ("superseded" if former.alive else "restart") if former and again else "join"
+        data = {
+            "incarnation": message.incarnation,
+            "host": message.host,
+            "pid": message.pid,
+            "from_ns": self.next_ns,
+        }
+        if former is not None and again:
+            data["former_pid"] = former.pid
+        self.event(kind, name, f"{name} on {message.host} (pid {message.pid})", source=name, **data)
+        self._warn_fingerprint(name, message)
+
+    def _warn_fingerprint(self, name: str, message: messages.Join) -> None:
+        if message.fingerprint and message.fingerprint != fingerprint():
+            text = f"{name} on {message.host} computes with another numeric fingerprint; the same bits are not promised"
+            self.event("fingerprint", name, text, found=message.fingerprint, expected=fingerprint())
+
+    def _on_bye(self, name: str, message: messages.Bye) -> None:
+        participant = self.barrier.remove(name)
+        if participant is not None:
+            self.event("leave", name, f"{name} left: {message.reason}", source=name, reason=message.reason)
+            self._leave_drones(name)
+            self.dropped.add(name)
+            if participant.role == "recorder" and not self.ended:
+                self.stop(f"the recorder left: {message.reason}")
+
+    def died(self, name: str, wall_ns: int) -> None:
+        """Take the death of a process: its token is gone without a bye."""
+        participant = self.barrier.died(name, wall_ns)
+        if participant is None:
+            return
+        what = self.on_death(participant.role, name)
+        text = f"{name} on {participant.host} (pid {participant.pid}) died; on_death: {what}"
+        self.event("death", name, text, host=participant.host, pid=participant.pid, on_death=what)
+        if self.mode == "realtime" or what == "drop":
+            self._leave_drones(name)
+        if what == "drop":
+            self.barrier.remove(name)
+            self.dropped.add(name)
+            self.event("drop", name, f"{name} is waited for no longer", from_ns=self.now_ns)
+        elif what == "end":
+            self.stop(f"{name} died")
+
+    def on_death(self, role: str, name: str) -> OnDeath:
+        """Return what the death of a process means, by its name or its role."""
+        given = self.scenario.processes.on_death
+        return given.get(name) or given.get(role) or ON_DEATH.get(role, "drop")
+
+    def _leave_drones(self, name: str) -> None:
+        for drone in self.commanders.gone(name):
+            self.fleet.release(drone)
+            self.event("release", self.fleet.names[drone], f"{name} flies it no longer", source=name)
+
+    def refuse(self, source: str, subject: str, reason: str) -> None:
+        """Count a refusal, and tell it while it is not told too often."""
+        self.refused += 1
+        told = self._told.get((source, subject), 0)
+        self._told[source, subject] = told + 1
+        if told < REFUSALS_TOLD:
+            last = " (further ones are counted only)" if told == REFUSALS_TOLD - 1 else ""
+            self.event("refused", subject, f"{subject}: {reason}{last}", source=source, reason=reason)
+        if len(self._told) > 10_000:
+            self._told.clear()
+
+    # Requests
+
+    def control(self, request: messages.ControlRequest) -> messages.ControlAnswer:
+        """Answer a request on `world/control`; every one is an event."""
+        answer = self._requests.answer(request)
+        op, source = request.op[:40], request.source[:40]
+        text = f"{source or 'somebody'} asks {op}: {'done' if answer.ok else answer.error}"
+        self.event("control", op, text, source=source, args=brief(request.args), ok=answer.ok)
+        return answer
+
+    def stop(self, reason: str) -> None:
+        """End the run after the present gate."""
+        if self.ended is None:
+            self.ended = reason
+
+    # Time
+
+    def may_advance(self) -> bool:
+        """Tell whether nothing but pacing keeps the world from the next gate."""
+        if self.ended is not None:
+            return False
+        if self.state == "waiting":
+            return not self.barrier.absent()
+        if self.state == "paused" and self.steps_allowed == 0:
+            return False
+        return self.mode == "realtime" or not self.barrier.blocking(self.now_ns - self.delay_ns)
+
+    def waiting_for(self, wall_ns: int) -> tuple[messages.Waiting, ...]:
+        """Return whom the world waits for now."""
+        if self.mode == "realtime" and self.state != "waiting":
+            return tuple(
+                messages.Waiting(p.name, p.host, (wall_ns - p.since_wall_ns) / 1e9)
+                for p in self.barrier.participants.values()
+                if not p.alive
+            )
+        return self.barrier.waiting_for(self.now_ns - self.delay_ns, wall_ns, self._start_wall_ns)
+
+    def advance(self, wall_ns: int) -> None:
+        """Go to the next gate (or publish gate 0) and put all its messages into the outbox."""
+        if self.state == "waiting":
+            self.state = "running"
+        else:
+            self._count_deadlines()
+            self._desk.apply(self.now_ns)
+            self.fleet.advance()
+            self.steps_allowed = max(0, self.steps_allowed - 1)
+            self._tell_collisions()
+        self._publish_gate(wall_ns)
+        if self.now_ns >= self.last_ns:
+            self.stop("the scenario's duration is over")
+
+    def _count_deadlines(self) -> None:
+        if self.mode != "realtime":
+            return
+        need_ns = self.now_ns - self.delay_ns
+        for participant in self.barrier.participants.values():
+            if participant.required_ns(need_ns) is not None:
+                self._deadlines += 1
+                participant.deadline_misses += participant.owes(need_ns)
+
+    def missed_own_deadline(self) -> None:
+        """Count a gate that the world itself published more than a gate late."""
+        self._world_misses += 1
+
+    def _tell_collisions(self) -> None:
+        self._min_separation_m = min(self._min_separation_m, self.fleet.min_separation_m())
+        for i, j in self.fleet.collisions():
+            pair = f"{self.fleet.names[i]} and {self.fleet.names[j]}"
+            self.event("collision", self.fleet.names[i], f"{pair} collide", other=self.fleet.names[j])
+
+    def _publish_gate(self, wall_ns: int) -> None:
+        truth = self.fleet.truth()
+        self._hash.add(
+            self.now_ns,
+            truth.position_m,
+            truth.velocity_m_s,
+            truth.orientation_wxyz,
+            truth.angular_velocity_rad_s,
+        )
+        self.outbox.extend(self._publication.gate(truth, self.commanders.holder))
+        self._ages.published(self.now_ns, wall_ns)
+        self._clock_rate.gate(self.now_ns, wall_ns)
+        self.tell_clock(wall_ns)
+
+    def tell_clock(self, wall_ns: int, state: Any = None) -> None:
+        """Put a `clock` into the outbox."""
+        clock = messages.Clock(
+            t_ns=self.now_ns,
+            seq=self._next_seq(keys.CLOCK),
+            run_id=self.run_id,
+            step=self.now_ns // self.gate_ns,
+            state=state or self.state,
+            rate=round(self._clock_rate.now(), 3),
+            waiting_for=self.waiting_for(wall_ns),
+        )
+        self.outbox.append(Output(keys.CLOCK, clock))
+
+    def tell_end(self, wall_ns: int) -> None:
+        """Put the last words of the run into the outbox: event `end`, clock `stopped`."""
+        self.ended = self.ended or "ended"
+        self.event("end", "world", self.ended, **self.result())
+        self.state = "stopped"
+        self.tell_clock(wall_ns)
+
+    def result(self) -> dict[str, Any]:
+        """Return what the run measured of itself."""
+        by_name = {p.name: p.deadline_misses for p in self.barrier.participants.values() if p.gating}
+        sim_s = self.now_ns / 1e9
+        wall_s = self._clock_rate.wall_s
+        return {
+            "reason": self.ended,
+            "last_ns": self.now_ns,
+            "sim_s": sim_s,
+            "wall_s": wall_s,
+            "real_time_factor": sim_s / wall_s if wall_s > 0 else 0.0,
+            "deadlines": self._deadlines,
+            "deadline_misses": sum(by_name.values()) + self._world_misses,
+            "deadline_misses_by": {**by_name, "world": self._world_misses},
+            "command_age_ms": self._ages.summary_ms(),
+            "min_separation_m": self._min_separation_m if self._min_separation_m < 1e9 else None,
+            "refused": self.refused,
+            "truth_sha256": self._hash.hexdigest(),
+        }
+
+    def view(self, seq: int) -> messages.ViewDrones:
+        """Return the compact state for eyes."""
+        truth = self.fleet.truth()
+        drones = []
+        for i, name in enumerate(self.fleet.names):
+            state, battery_percent, _ = self.fleet.status(i)
+            pose = (tuple(truth.position_m[i].tolist()), tuple(truth.orientation_wxyz[i].tolist()))
+            rotors = tuple(truth.rotor_rad_s[i].tolist())
+            drones.append(messages.DroneView(name, *pose, rotors, state, battery_percent))
+        wind = tuple(tuple(row) for row in self.fleet.wind_m_s.tolist())
+        return messages.ViewDrones(self.now_ns, seq, tuple(drones), wind)
+
+    def event(self, kind: str, subject: str, text: str, source: str = "world", **data: Any) -> None:
+        """Put an event into the outbox."""
+        message = messages.Event(self.now_ns, self._next_seq(keys.EVENT), kind, source, subject, text, data)
+        self.outbox.append(Output(keys.EVENT, message))
+
+    def take_outbox(self) -> list[Output]:
+        """Return what is to be published, in order, and forget it."""
+        outbox, self.outbox = self.outbox, []
+        return outbox
+
+    def _next_seq(self, key: str) -> int:
+        count = self._seq.get(key, 0)
+        self._seq[key] = count + 1
+        return count
+
+
+def expected(scenario: Scenario) -> list[str]:
+    """Return the names of the processes without which a run does not start."""
+    if scenario.processes.expect is not None:
+        return list(scenario.processes.expect)
+    estimators = [f"estimator.{drone.name}" for drone in scenario.drones]
+    return estimators + [f"controller.{cluster.name}" for cluster in scenario.clusters]

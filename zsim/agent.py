@@ -1,0 +1,82 @@
+"""An agent: a plain object, inputs in, outputs out, that knows neither Zenoh nor the wall clock.
+
+    runner ──receive(key, message)──▶ agent          every input of a gate, in canonical order
+    runner ──step(t_ns)────────────▶ agent ──▶ [(key, message), …]
+
+Two runners drive it: `zsim.runner` as a process on Zenoh, `zsim.in_process` on an in-memory bus. Both hand over
+the same inputs in the same order, so that the outputs are the same to the bit.
+"""
+
+from abc import ABC, abstractmethod
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from msgspec import Struct
+
+from zsim.messages import ControlAnswer, ControlRequest
+
+
+class Output(NamedTuple):
+    """A message on its way out; the key is without the federation's prefix."""
+
+    key: str
+    message: Struct
+
+
+class Agent(ABC):
+    """Base of everything that takes part in the lockstep.
+
+    Attributes:
+        name: process name `role.thing`, e.g. `estimator.drone1`.
+        period_ns: how often it says done; a multiple of the gate.
+        reads: key expressions it subscribes to.
+        gate_keys: keys of which one message stamped t closes the gate t, e.g. the drone's sensor/status.
+        counted: drones of which it reads all sensors, so that what their status counts is waited for.
+    """
+
+    name: str
+    period_ns: int
+    reads: tuple[str, ...]
+    gate_keys: tuple[str, ...]
+    counted: tuple[str, ...] = ()
+
+    def __init__(self) -> None:
+        self._seq: defaultdict[str, int] = defaultdict(int)
+
+    @property
+    def role(self) -> str:
+        return self.name.split(".", 1)[0]
+
+    @abstractmethod
+    def receive(self, key: str, message: Any) -> None:
+        """Take one input; called in order of (t_ns, key, seq) just before `step`."""
+
+    @abstractmethod
+    def step(self, t_ns: int) -> Sequence[Output]:
+        """Return the outputs of the gate t_ns."""
+
+    def control_keys(self) -> tuple[str, ...]:
+        """Return the keys on which it answers requests."""
+        return ()
+
+    def control(self, key: str, request: ControlRequest) -> ControlAnswer:
+        """Answer a request; called between gates."""
+        return ControlAnswer(ok=False, error=f"{key}: {self.name} answers no requests")
+
+    def warm_start_keys(self) -> tuple[str, ...]:
+        """Return the keys whose last values a restarted incarnation wants before anything else."""
+        return ()
+
+    def warm_start(self, key: str, message: Any) -> None:
+        """Take over the last value that the former incarnation published."""
+
+    def next_seq(self, key: str) -> int:
+        """Return the next sequence number of one of its keys, from 0."""
+        count = self._seq[key]
+        self._seq[key] = count + 1
+        return count
+
+    def resume_seq(self, key: str, last: int) -> None:
+        """Go on counting after `last`, so that a restart leaves no doubt about what is new."""
+        self._seq[key] = last + 1

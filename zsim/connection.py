@@ -1,0 +1,86 @@
+"""Finding the world: connect, read `world/info`, wait with progress when there is none yet."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+
+from zsim import keys, messages, session
+from zsim.errors import DecodeError, NoWorldError, SessionError
+from zsim.session import Session
+
+ATTEMPT_S = 1.0  # one try to connect, so that waiting can be shown and interrupted
+ANSWER_S = 1.0  # a hub that is there answers within milliseconds, unless it still compiles
+
+
+@contextmanager
+def find_world(
+    endpoint: str,
+    federation: str,
+    wait_s: float | None = None,
+    say: Callable[[str], None] = lambda text: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Iterator[tuple[Session, messages.Info]]:
+    """Yield a session and the `world/info` of the run that it belongs to.
+
+    Args:
+        endpoint: where the world (or a router) listens.
+        federation: its name.
+        wait_s: how long to wait for a world; None waits for ever.
+        say: told once a second whom it waits for.
+        stopped: asked while waiting.
+
+    Raises:
+        NoWorldError: no world answered within `wait_s`, or `stopped` said so.
+    """
+    with ExitStack() as stack:
+        link, info = _search(stack, endpoint, federation, wait_s, say, stopped)
+        if info.mode == "realtime":
+            stack.pop_all().close()
+            link = stack.enter_context(session.connect(endpoint, federation, "realtime", wait_s=5.0))
+        link.use(info.mode)
+        yield link, info
+
+
+def _search(
+    stack: ExitStack,
+    endpoint: str,
+    federation: str,
+    wait_s: float | None,
+    say: Callable[[str], None],
+    stopped: Callable[[], bool],
+) -> tuple[Session, messages.Info]:
+    start_s = time.monotonic()
+    link: Session | None = None
+    while not stopped():
+        waited_s = time.monotonic() - start_s
+        left_s = float("inf") if wait_s is None else wait_s - waited_s
+        try:
+            if link is None:
+                attempt_s = max(0.05, min(ATTEMPT_S, left_s))
+                link = stack.enter_context(session.connect(endpoint, federation, wait_s=attempt_s))
+            info = read_info(link)
+            if info is not None:
+                return link, info
+        except SessionError as error:
+            _refuse_malformed(error)
+        if waited_s >= (wait_s if wait_s is not None else float("inf")):
+            raise NoWorldError(
+                f"no world of federation {federation!r} on {endpoint} within {wait_s:g} s; start one with `zsim world`"
+            )
+        say(f"waiting for a world of {federation!r} on {endpoint} ({waited_s:.0f} s)")
+    raise NoWorldError(f"stopped while waiting for a world on {endpoint}")
+
+
+def _refuse_malformed(error: SessionError) -> None:
+    if "nobody listens" not in str(error) or "not supported" in str(error):
+        raise error
+
+
+def read_info(link: Session) -> messages.Info | None:
+    """Return the `world/info` that the hub answers, None if nobody does."""
+    for sample in link.get(keys.INFO, timeout_s=ANSWER_S):
+        try:
+            return messages.decode(keys.INFO, sample.payload)
+        except DecodeError as error:
+            raise NoWorldError(f"{error}; is the world of another version?") from error
+    return None

@@ -1,0 +1,52 @@
+"""The errors of zsim, all one line: where, what was found, what is allowed, what to do.
+
+    ZsimError
+    ├── ScenarioError      a scenario file or an override; carries every fault found, a line each
+    ├── DecodeError        a payload that is not the message it claims to be
+    ├── BadNameError       a name of a federation, drone, cluster or process outside the contract
+    ├── SessionError       no session: port in use, nobody listens, wrong endpoint
+    │   └── NoWorldError   the session is open, but no world answers
+    ├── RunError           a run that could not start or did not end well
+    ├── RecordError        a record that cannot be written or read: disk full, no MCAP file
+    └── ReportError        a report that cannot be made or written
+"""
+
+
+class ZsimError(Exception):
+    """Base of everything that a user can cause; the command line prints it without a traceback."""
+
+
+class ScenarioError(ZsimError):
+    """A scenario with faults; `faults` holds a line for each."""
+
+    def __init__(self, faults: list[str]) -> None:
+        super().__init__("\n".join(faults))
+        self.faults = faults
+
+
+class DecodeError(ZsimError):
+    """A payload refused on decode; the text names key, field, found and allowed."""
+
+
+class BadNameError(ZsimError):
+    """A name outside `[a-z0-9_.-]{1,32}`."""
+
+
+class SessionError(ZsimError):
+    """No Zenoh session to be had."""
+
+
+class NoWorldError(SessionError):
+    """Nobody answers `world/info` within the time allowed."""
+
+
+class RunError(ZsimError):
+    """A run that could not start or did not end well."""
+
+
+class RecordError(ZsimError):
+    """A record that cannot be written or read."""
+
+
+class ReportError(ZsimError):
+    """A report that cannot be made or written."""

@@ -1,0 +1,48 @@
+"""What the last bit of a number depends on: CPU feature level, libm, BLAS and the versions of numeric packages."""
+
+import hashlib
+import importlib.metadata
+import platform
+from functools import cache
+
+from zsim import __version__
+
+PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "filterpy")
+
+
+@cache
+def parts() -> dict[str, str]:
+    """Return what the fingerprint is made of, in words."""
+    found = {package: _version(package) for package in PACKAGES}
+    return {
+        "zsim": __version__,
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "cpu": _cpu_features(),
+        "libc": "-".join(platform.libc_ver()) or platform.system(),
+        **{package: version for package, version in found.items() if version},
+    }
+
+
+@cache
+def fingerprint() -> str:
+    """Return 16 hex digits: equal fingerprints promise equal bits."""
+    text = ";".join(f"{name}={value}" for name, value in sorted(parts().items()))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+def _cpu_features() -> str:
+    """Return a hash of the CPU's feature flags, which decide what libm, BLAS and the compiled kernel use."""
+    try:
+        with open("/proc/cpuinfo", encoding="ascii", errors="replace") as lines:
+            flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    except OSError:
+        flags = platform.processor()
+    return hashlib.sha256(" ".join(sorted(flags.split())).encode()).hexdigest()[:8]

@@ -1,0 +1,153 @@
+"""Frames: the world's tangent plane on the Earth, and attitude as quaternion, matrix, heading and Euler angles.
+
+World W is ENU (x east, y north, z up) at an origin given in WGS 84; body B is FLU. Quaternions are Hamilton,
+w first, and turn body components into world components. All functions take arrays with any leading shape.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+WGS84_A_M = 6_378_137.0  # m, semi-major axis, WGS 84 (NIMA TR8350.2, table 3.1)
+WGS84_F = 1.0 / 298.257223563  # flattening, WGS 84 (NIMA TR8350.2, table 3.1)
+_A2 = WGS84_A_M**2
+_B_M = WGS84_A_M * (1.0 - WGS84_F)
+_E2 = WGS84_F * (2.0 - WGS84_F)
+_LATITUDE_STEPS = 4  # each step gains a factor of about 300: 1e-15 rad after four for heights below 1000 km
+
+
+def enu_to_geodetic(position_m: ArrayLike, origin: tuple[float, float, float]) -> Array:
+    """Return WGS 84 latitude [deg], longitude [deg] and ellipsoidal height [m] of points in W.
+
+    Args:
+        position_m: p_W, shape (..., 3).
+        origin: latitude_deg, longitude_deg, height_m of W's origin.
+    """
+    rows = _enu_rows(origin[0], origin[1])
+    ecef = geodetic_to_ecef(origin) + np.asarray(position_m, dtype=float) @ rows
+    return ecef_to_geodetic(ecef)
+
+
+def geodetic_to_enu(geodetic: ArrayLike, origin: tuple[float, float, float]) -> Array:
+    """Return p_W [m] of points given as latitude_deg, longitude_deg, height_m, shape (..., 3)."""
+    rows = _enu_rows(origin[0], origin[1])
+    return (geodetic_to_ecef(geodetic) - geodetic_to_ecef(origin)) @ rows.T
+
+
+def geodetic_to_ecef(geodetic: ArrayLike) -> Array:
+    """Return Earth-centred, Earth-fixed coordinates [m] of (latitude_deg, longitude_deg, height_m)."""
+    g = np.asarray(geodetic, dtype=float)
+    lat, lon, height = np.radians(g[..., 0]), np.radians(g[..., 1]), g[..., 2]
+    normal = WGS84_A_M / np.sqrt(1.0 - _E2 * np.sin(lat) ** 2)
+    level = (normal + height) * np.cos(lat)
+    up = (normal * (1.0 - _E2) + height) * np.sin(lat)
+    return np.stack([level * np.cos(lon), level * np.sin(lon), up], axis=-1)
+
+
+def ecef_to_geodetic(ecef_m: ArrayLike) -> Array:
+    """Return latitude_deg, longitude_deg, height_m; Bowring's iteration on the parametric latitude.
+
+    Exact to 1e-9 m for heights between -10 km and 1000 km (Bowring, Survey Review 23 (1976) 323-327).
+    """
+    e = np.asarray(ecef_m, dtype=float)
+    level = np.hypot(e[..., 0], e[..., 1])
+    parametric = np.arctan2(e[..., 2] * WGS84_A_M, level * _B_M)
+    for _ in range(_LATITUDE_STEPS):
+        lat = np.arctan2(
+            e[..., 2] + (_A2 - _B_M**2) / _B_M * np.sin(parametric) ** 3,
+            level - _E2 * WGS84_A_M * np.cos(parametric) ** 3,
+        )
+        parametric = np.arctan2((1.0 - WGS84_F) * np.sin(lat), np.cos(lat))
+    sin, cos = np.sin(lat), np.cos(lat)
+    height = level * cos + e[..., 2] * sin - WGS84_A_M * np.sqrt(1.0 - _E2 * sin**2)
+    return np.stack([np.degrees(lat), np.degrees(np.arctan2(e[..., 1], e[..., 0])), height], axis=-1)
+
+
+def _enu_rows(latitude_deg: float, longitude_deg: float) -> Array:
+    """Return the unit vectors east, north, up as rows in Earth-fixed components."""
+    lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
+    return np.array(
+        [
+            [-np.sin(lon), np.cos(lon), 0.0],
+            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
+            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
+        ]
+    )
+
+
+def wrap_angle(angle_rad: ArrayLike) -> Array:
+    """Return the angle in [-pi, pi)."""
+    return (np.asarray(angle_rad, dtype=float) + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
+    """Return the Hamilton product p q (first q, then p), shape (..., 4)."""
+    pw, px, py, pz = np.moveaxis(np.asarray(p, dtype=float), -1, 0)
+    qw, qx, qy, qz = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+    return np.stack(
+        [
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ],
+        axis=-1,
+    )
+
+
+def quaternion_conjugate(q: ArrayLike) -> Array:
+    """Return the inverse of unit quaternions."""
+    return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def rotation_matrix(q: ArrayLike) -> Array:
+    """Return R of unit quaternions, shape (..., 3, 3): v_W = R v_B."""
+    w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotate(q: ArrayLike, v: ArrayLike) -> Array:
+    """Return R(q) v: body components to world components."""
+    return np.einsum("...ij,...j->...i", rotation_matrix(q), np.asarray(v, dtype=float))
+
+
+def quaternion_from_rpy(rpy_rad: ArrayLike) -> Array:
+    """Return the quaternion of R = Rz(yaw) Ry(pitch) Rx(roll) for angles (..., 3) in the order roll, pitch, yaw."""
+    half = 0.5 * np.asarray(rpy_rad, dtype=float)
+    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(half), -1, 0), np.moveaxis(np.sin(half), -1, 0)
+    return np.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ],
+        axis=-1,
+    )
+
+
+def rpy_from_quaternion(q: ArrayLike) -> Array:
+    """Return roll, pitch, yaw [rad] of R = Rz(yaw) Ry(pitch) Rx(roll); pitch in [-pi/2, pi/2]."""
+    w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
+    return np.stack([roll, pitch, heading(q)], axis=-1)
+
+
+def heading(q: ArrayLike) -> Array:
+    """Return the heading [rad]: the angle of the body's x axis from east, counter-clockwise seen from above."""
+    w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def quaternion_from_heading(heading_rad: ArrayLike) -> Array:
+    """Return the quaternion of a level body with that heading."""
+    half = 0.5 * np.asarray(heading_rad, dtype=float)
+    zero = np.zeros_like(half)
+    return np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1)

@@ -1,0 +1,128 @@
+"""Runs a world and its agents in one process on an in-memory bus: the same inputs in the same order, the same bits."""
+
+import os
+import socket
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from msgspec import Struct
+
+from zsim import __version__, keys, messages
+from zsim.agent import Agent, Output
+from zsim.fingerprint import fingerprint
+from zsim.inbox import Inbox
+
+
+class Hub(Protocol):
+    """What the bus needs of a world."""
+
+    run_id: str
+
+    def handle(self, key: str, message: Any, wall_ns: int) -> None: ...
+    def output_of(self, source: str) -> None: ...
+    def may_advance(self) -> bool: ...
+    def advance(self, wall_ns: int) -> None: ...
+    def tell_end(self, wall_ns: int) -> None: ...
+    def take_outbox(self) -> list[Output]: ...
+    @property
+    def ended(self) -> str | None: ...
+
+
+Sink = Callable[[str, Struct], None]
+
+
+class Bus:
+    """The keys of one process: every message goes to the sink, the world and the inboxes that read it.
+
+    Args:
+        hub: the world.
+        agents: in the order in which they are asked.
+        wall_ns: monotonic wall time.
+        sink: takes every message in order of publication: the recorder.
+    """
+
+    def __init__(
+        self,
+        hub: Hub,
+        agents: Sequence[Agent],
+        wall_ns: Callable[[], int],
+        sink: Sink = lambda key, message: None,
+    ) -> None:
+        self._hub = hub
+        self._wall_ns = wall_ns
+        self._sink = sink
+        self._agents = [(agent, Inbox(agent.gate_keys, agent.counted)) for agent in agents]
+        self._routes: dict[str, list[Inbox]] = {}
+
+    def join(self) -> None:
+        """Let every agent join the run."""
+        for agent, _ in self._agents:
+            join = messages.Join(
+                t_ns=0,
+                seq=agent.next_seq("join"),
+                run_id=self._hub.run_id,
+                incarnation=0,
+                role=agent.role,
+                host=socket.gethostname(),
+                pid=os.getpid(),
+                period_ns=agent.period_ns,
+                version=__version__,
+                fingerprint=fingerprint(),
+            )
+            self._to_hub(keys.process(agent.name, "join"), join)
+
+    def turn(self) -> bool:
+        """Let the world go one gate further and every agent answer it; return whether the run goes on."""
+        if not self._hub.may_advance():
+            return False
+        self._hub.advance(self._wall_ns())
+        self._spread()
+        while any([self._step(agent, inbox) for agent, inbox in self._agents]):
+            pass
+        return True
+
+    def end(self) -> None:
+        """Let every agent leave, and the world say its last words."""
+        self._hub.tell_end(self._wall_ns())
+        self._spread()
+        for agent, _ in self._agents:
+            self._to_hub(keys.process(agent.name, "bye"), messages.Bye(0, 0, "the run ended"))
+        self._spread()
+
+    def _spread(self) -> None:
+        for key, message in self._hub.take_outbox():
+            self._sink(key, message)
+            for inbox in self._route(key):
+                inbox.put(key, message)
+
+    def _step(self, agent: Agent, inbox: Inbox) -> bool:
+        t_ns = inbox.next_gate_ns()
+        if t_ns is None or inbox.missing(t_ns) is not None:
+            return False
+        for key, message in inbox.take(t_ns):
+            agent.receive(key, message)
+        if t_ns % agent.period_ns == 0:
+            self._publish(agent, t_ns, agent.step(t_ns))
+        return True
+
+    def _publish(self, agent: Agent, t_ns: int, outputs: Sequence[Output]) -> None:
+        counted = [output for output in outputs if not output.key.startswith("view/")]
+        for key, message in counted:
+            for inbox in self._route(key):
+                inbox.put(key, message)
+            self._to_hub(key, message)
+            if key.endswith(("/estimate", "/state")):
+                self._hub.output_of(agent.name)
+        done = messages.Done(t_ns, agent.next_seq("done"), self._hub.run_id, 0, t_ns, len(counted))
+        self._to_hub(keys.process(agent.name, "done"), done)
+
+    def _to_hub(self, key: str, message: Struct) -> None:
+        self._sink(key, message)
+        self._hub.handle(key, message, self._wall_ns())
+
+    def _route(self, key: str) -> list[Inbox]:
+        if key not in self._routes:
+            self._routes[key] = [
+                inbox for agent, inbox in self._agents if any(keys.matches(e, key) for e in agent.reads)
+            ]
+        return self._routes[key]

@@ -1,0 +1,15 @@
+"""The record of a run: every message of every key, in one MCAP file. Plain I/O, no session.
+
+    RecordWriter(path).add(key, payload, encoding, t_ns, wall_ns)   tick(wall_ns)   close()
+    RecordReader(path).messages()   topics()   last(key)
+    repair(path)                    finishes a file whose writer died
+
+Topic = key without the federation's prefix, message encoding `msgpack`, log time = simulated time, publish
+time = wall clock of the recorder. Other MCAP tools open it.
+"""
+
+from zsim.record.finish import repair
+from zsim.record.reader import Recorded, RecordReader
+from zsim.record.writer import RecordWriter
+
+__all__ = ["RecordReader", "RecordWriter", "Recorded", "repair"]

@@ -1,0 +1,200 @@
+"""How a record lies in its file, as bytes: https://mcap.dev/spec.
+
+    magic  header  { schemas and channels new in the next chunk   chunk   its message indexes }*
+    data end  summary  footer  magic                             (absent where the writer died)
+
+The mcap library packs and unpacks every record but messages and chunks, of which there are too many for it.
+"""
+
+import struct
+import zlib
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from io import BytesIO
+from mmap import mmap
+from typing import NamedTuple, TypeVar
+
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Header, McapRecord, Schema
+from mcap.writer import MCAP0_MAGIC as MAGIC
+
+from zsim import __version__
+from zsim.errors import RecordError
+
+HEAD = struct.Struct("<BQ")  # opcode, length of what follows
+MESSAGE = struct.Struct("<BQHIQQ")  # head, channel, sequence, log time, publish time; then the payload
+MESSAGE_FIXED = MESSAGE.size - HEAD.size  # bytes that a message's length counts beside its payload
+CHUNK_HEAD = struct.Struct("<QQQII")  # first, last log time, plain size, plain CRC, bytes of name
+INDEX_HEAD = struct.Struct("<HI")  # channel, bytes of its entries
+INDEX_ENTRY = 16  # bytes: log time, place in the chunk
+FOOTER_SIZE = HEAD.size + 20
+
+Source = bytes | mmap
+Known = TypeVar("Known", Schema, Channel)
+
+_compressor = zstandard.ZstdCompressor(level=1)
+_decompressor = zstandard.ZstdDecompressor()
+_STANDARD = frozenset(range(Opcode.HEADER, Opcode.DATA_END + 1))
+
+
+class Place(NamedTuple):
+    """Where a whole record stands in the file, its head included."""
+
+    opcode: int
+    start: int
+    end: int
+
+    @property
+    def body(self) -> int:
+        return self.start + HEAD.size
+
+
+class ChunkHead(NamedTuple):
+    """What a chunk says about itself before its content."""
+
+    first_ns: int
+    last_ns: int
+    size: int
+    crc: int
+    compression: str
+    content: int  # where the compressed content starts in the file
+
+
+class Index(NamedTuple):
+    """One channel's part in a chunk."""
+
+    channel: int
+    messages: int
+    start: int  # of the message index record in the file
+
+
+class Group(NamedTuple):
+    """A record of the data section that matters, a chunk together with its message indexes."""
+
+    place: Place
+    indexes: tuple[Index, ...]
+    end: int
+
+
+def opening() -> bytes:
+    """Return the bytes with which every record begins."""
+    return MAGIC + packed(Header(profile="", library=f"zsim {__version__}"))
+
+
+def packed(record: McapRecord) -> bytes:
+    """Return a record as it stands in the file."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
+
+
+def unpacked(kind: type[Known], source: Source, place: Place) -> Known:
+    """Return the schema or channel at a place."""
+    return kind.read(ReadDataStream(BytesIO(source[place.body : place.end])))
+
+
+def places(source: Source) -> Iterator[Place]:
+    """Yield the whole records of a file up to its footer or its cut."""
+    at, size = len(MAGIC), len(source)
+    while at + HEAD.size <= size:
+        opcode, length = HEAD.unpack_from(source, at)
+        end = at + HEAD.size + length
+        if end > size or opcode not in _STANDARD:
+            return
+        yield Place(opcode, at, end)
+        if opcode == Opcode.FOOTER:
+            return
+        at = end
+
+
+def groups(source: Source) -> Iterator[Group]:
+    """Yield schemas, channels and chunks of the data section in order."""
+    pending: list[Place] = []
+    for place in places(source):
+        if place.opcode == Opcode.DATA_END:
+            break
+        if place.opcode == Opcode.MESSAGE_INDEX:
+            pending.append(place)
+            continue
+        yield from _group(source, pending)
+        pending = [place] if place.opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK) else []
+    yield from _group(source, pending)
+
+
+def _group(source: Source, pending: list[Place]) -> Iterator[Group]:
+    if pending:
+        place, *rest = pending
+        indexes = tuple(_index(source, index) for index in rest)
+        yield Group(place, indexes, pending[-1].end)
+
+
+def _index(source: Source, place: Place) -> Index:
+    channel, size = INDEX_HEAD.unpack_from(source, place.body)
+    return Index(channel, size // INDEX_ENTRY, place.start)
+
+
+def is_complete(source: Source) -> bool:
+    """Tell whether a file has its footer."""
+    foot = len(source) - len(MAGIC) - FOOTER_SIZE
+    return foot >= len(MAGIC) and source[foot] == Opcode.FOOTER and source[-len(MAGIC) :] == MAGIC
+
+
+def chunk(content: bytes) -> list[bytes]:
+    """Return a run of message records as a chunk record and its message index records."""
+    indexes = indexes_of(content)
+    record = Chunk(
+        compression="zstd",
+        data=_compressor.compress(content),
+        message_start_time=min(min(entries[::2]) for entries in indexes.values()),
+        message_end_time=max(max(entries[::2]) for entries in indexes.values()),
+        uncompressed_crc=zlib.crc32(content),
+        uncompressed_size=len(content),
+    )
+    return [packed(record), *packed_indexes(indexes)]
+
+
+def chunk_head(source: Source, place: Place) -> ChunkHead:
+    """Return the head of the chunk at a place."""
+    first, last, size, crc, name = CHUNK_HEAD.unpack_from(source, place.body)
+    at = place.body + CHUNK_HEAD.size
+    return ChunkHead(first, last, size, crc, source[at : at + name].decode("utf-8", "replace"), at + name + 8)
+
+
+def content_of(source: Source, place: Place) -> bytes | None:
+    """Return the message records inside the chunk at a place, None if it is damaged.
+
+    Raises:
+        RecordError: compressed in a way that is not ours.
+    """
+    head = chunk_head(source, place)
+    if head.compression not in ("zstd", ""):
+        raise RecordError(f"a chunk is compressed with {head.compression[:20]!r}; allowed: zstd or none")
+    content = source[head.content : place.end]
+    if head.compression:
+        try:
+            content = _decompressor.decompress(content, max_output_size=head.size)
+        except zstandard.ZstdError:
+            return None
+    return content if head.crc in (0, zlib.crc32(content)) else None
+
+
+def indexes_of(content: bytes) -> dict[int, list[int]]:
+    """Return for every channel of a chunk the log times and places of its messages, one after the other."""
+    indexes: dict[int, list[int]] = defaultdict(list)
+    at, end, unpack = 0, len(content) - MESSAGE.size, MESSAGE.unpack_from
+    while at <= end:
+        opcode, length, channel, _, log_time, _ = unpack(content, at)
+        if opcode == Opcode.MESSAGE:
+            indexes[channel] += (log_time, at)
+        at += HEAD.size + length
+    return indexes
+
+
+def packed_indexes(indexes: dict[int, list[int]]) -> Iterable[bytes]:
+    """Yield the message index records of a chunk."""
+    for channel, entries in indexes.items():
+        size = 8 * len(entries)
+        yield HEAD.pack(Opcode.MESSAGE_INDEX, INDEX_HEAD.size + size) + INDEX_HEAD.pack(channel, size)
+        yield struct.pack(f"<{len(entries)}Q", *entries)

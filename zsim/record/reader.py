@@ -1,0 +1,176 @@
+"""Reads a record, whole or cut at any byte."""
+
+from collections import Counter
+from collections.abc import Collection, Iterator
+from mmap import ACCESS_READ, mmap
+from operator import itemgetter
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import Channel
+
+from zsim.errors import RecordError
+from zsim.record.finish import check_magic
+from zsim.record.layout import (
+    HEAD,
+    MESSAGE,
+    Group,
+    Place,
+    Source,
+    chunk_head,
+    content_of,
+    groups,
+    indexes_of,
+    is_complete,
+    places,
+    unpacked,
+)
+
+
+class Recorded(NamedTuple):
+    """One message of a record, not decoded."""
+
+    key: str
+    payload: bytes
+    t_ns: int
+    wall_ns: int
+
+
+class _Chunk(NamedTuple):
+    place: Place
+    first_ns: int
+    channels: frozenset[int]
+
+
+class RecordReader:
+    """A record as it stands on disk when it is opened; a writer may go on appending to it.
+
+    Attributes:
+        complete: the record was closed, not cut.
+        damaged: chunks met so far whose check sum differs; they are passed over.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Open a record and look through its chunks, without decompressing them.
+
+        Raises:
+            RecordError: no such file, or no MCAP file.
+        """
+        self.path = Path(path)
+        self.damaged = 0
+        self._counts: Counter[int] = Counter()
+        self._source = _mapped(self.path)
+        check_magic(self._source, self.path)
+        self.complete = is_complete(self._source)
+        self._keys = {channel.id: channel.topic for channel in _channels(self._source)}
+        self._chunks = list(self._scan())
+
+    def topics(self) -> dict[str, int]:
+        """Return the keys on record with the number of their messages, in the order of their first one."""
+        return {key: self._counts[number] for number, key in self._keys.items() if self._counts[number]}
+
+    def messages(self, keys: Collection[str] | None = None, by_time: bool = True) -> Iterator[Recorded]:
+        """Yield the messages of some keys (None: of all).
+
+        Args:
+            keys: exact keys; chunks without any of them are not decompressed.
+            by_time: in order of simulated time, messages of one time as they were written; otherwise all as
+                they were written.
+
+        Raises:
+            RecordError: compressed by another tool in a way that is not ours.
+        """
+        wanted = {number: key for number, key in self._keys.items() if keys is None or key in keys}
+        chunks = [chunk for chunk in self._chunks if not chunk.channels.isdisjoint(wanted)]
+        return self._by_time(chunks, wanted) if by_time else self._as_written(chunks, wanted)
+
+    def __iter__(self) -> Iterator[Recorded]:
+        return self.messages()
+
+    def last(self, key: str) -> Recorded | None:
+        """Return the message of a key that was written last, None if there is none."""
+        for number in (number for number, name in self._keys.items() if name == key):
+            for chunk in reversed(self._chunks):
+                if number in chunk.channels and (found := list(self._as_written([chunk], {number: key}))):
+                    return found[-1]
+        return None
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if isinstance(self._source, mmap):
+            self._source.close()
+
+    def __enter__(self) -> "RecordReader":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _scan(self) -> Iterator[_Chunk]:
+        known: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
+        found = [group for group in groups(self._source) if group.place.opcode == Opcode.CHUNK]
+        for group in found:
+            cut = group is found[-1] and not self.complete
+            counts = (
+                self._counted(group) if cut else {index.channel: index.messages for index in group.indexes}
+            )
+            self._counts.update(counts)
+            channels = frozenset(counts)
+            first_ns = chunk_head(self._source, group.place).first_ns
+            yield _Chunk(group.place, first_ns, known.setdefault(channels, channels))
+
+    def _counted(self, group: Group) -> dict[int, int]:
+        """Return the messages per channel of a chunk whose message indexes may have been cut."""
+        content = content_of(self._source, group.place) or b""
+        return {channel: len(entries) // 2 for channel, entries in indexes_of(content).items()}
+
+    def _as_written(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
+        for chunk in chunks:
+            content = content_of(self._source, chunk.place)
+            if content is None:
+                self.damaged += 1
+                continue
+            yield from _recorded(content, wanted)
+
+    def _by_time(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
+        """Yield by time, holding no more chunks in memory than overlap in time."""
+        held: list[tuple[int, int, Recorded]] = []
+        order = sorted(range(len(chunks)), key=lambda number: chunks[number].first_ns)
+        for number in order:
+            first_ns = chunks[number].first_ns
+            held.sort(key=itemgetter(0, 1))
+            ready = next((i for i, (t_ns, _, _) in enumerate(held) if t_ns >= first_ns), len(held))
+            yield from (message for _, _, message in held[:ready])
+            del held[:ready]
+            held += [(m.t_ns, number, m) for m in self._as_written([chunks[number]], wanted)]
+        held.sort(key=itemgetter(0, 1))
+        yield from (message for _, _, message in held)
+
+
+def _recorded(content: bytes, wanted: dict[int, str]) -> Iterator[Recorded]:
+    """Yield the messages of a chunk's content."""
+    at, end = 0, len(content) - MESSAGE.size
+    unpack, payload, head = MESSAGE.unpack_from, MESSAGE.size, HEAD.size
+    while at <= end:
+        opcode, length, channel, _, t_ns, wall_ns = unpack(content, at)
+        after = at + head + length
+        if channel in wanted and opcode == Opcode.MESSAGE:
+            yield Recorded(wanted[channel], content[at + payload : after], t_ns, wall_ns)
+        at = after
+
+
+def _channels(source: Source) -> Iterator[Channel]:
+    """Yield the channels of a file, also those that other tools have put into its summary only."""
+    for place in places(source):
+        if place.opcode == Opcode.CHANNEL:
+            yield unpacked(Channel, source, place)
+
+
+def _mapped(path: Path) -> Source:
+    """Return the bytes of a file without reading them yet."""
+    try:
+        with open(path, "rb") as file:
+            return mmap(file.fileno(), 0, access=ACCESS_READ) if path.stat().st_size else b""
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read ({error.strerror})") from error

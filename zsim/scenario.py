@@ -1,0 +1,257 @@
+"""What a scenario says: typed, immutable, every quantity with its unit in its name.
+
+A file is read by `scenario_file.load`; the limits written here are the ones that its faults quote.
+"""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct, field
+
+from zsim.presets import G_M_S2
+
+Name = Annotated[str, Meta(pattern=r"^[a-z0-9_.-]{1,32}$")]
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+Fraction = Annotated[float, Meta(ge=0, le=1)]
+Vector3 = tuple[float, float, float]
+
+
+class Spec(Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of every section: unknown keys are faults, not surprises."""
+
+
+class ErrorModel(Spec, kw_only=True):
+    """Error of one channel, in the channel's unit."""
+
+    noise: NonNegative = 0.0
+    """White, standard deviation per sample."""
+    density: NonNegative = 0.0
+    """White, per sqrt(Hz): adds density * sqrt(rate) in quadrature to `noise`."""
+    bias: NonNegative = 0.0
+    """Constant over a run, standard deviation over runs, per axis."""
+    bias_walk: NonNegative = 0.0
+    """Random walk of the bias, per sqrt(s)."""
+    quantum: NonNegative = 0.0
+    """Step of the converter; 0 = none."""
+
+
+class Mount(Spec, kw_only=True):
+    """Pose of the sensor in the body, X_BS."""
+
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    rpy_deg: Vector3 = (0.0, 0.0, 0.0)
+
+
+class Sensor(Spec, kw_only=True):
+    """What all sensors share."""
+
+    rate_hz: Annotated[float, Meta(gt=0, le=1000)]
+    latency_ms: Annotated[float, Meta(ge=0, le=10_000)] = 0.0
+    dropout: Fraction = 0.0
+    """Probability that a sample is lost, independent per sample."""
+    mount: Mount = Mount()
+
+
+class Imu(Sensor, kw_only=True):
+    accel_m_s2: ErrorModel = ErrorModel()
+    gyro_deg_s: ErrorModel = ErrorModel()
+
+
+class Gps(Sensor, kw_only=True):
+    position_m: ErrorModel = ErrorModel()
+    velocity_m_s: ErrorModel = ErrorModel()
+
+
+class Mag(Sensor, kw_only=True):
+    field_ut: ErrorModel = ErrorModel()
+
+
+class Baro(Sensor, kw_only=True):
+    altitude_m: ErrorModel = ErrorModel()
+
+
+class Sonar(Sensor, kw_only=True):
+    range_m: ErrorModel = ErrorModel()
+    min_m: NonNegative = 0.03
+    max_m: Positive = 6.0
+
+
+class Flow(Sensor, kw_only=True):
+    velocity_m_s: ErrorModel = ErrorModel()
+
+
+class Sensors(Spec, kw_only=True):
+    """The sensors of one drone, after preset and overrides."""
+
+    preset: Literal["ardrone2", "paper"]
+    as_printed: bool = False
+    """With `paper`: accelerometer 0.35 g as the paper prints it, instead of 0.35 m/s^2."""
+    imu: Imu
+    gps: Gps
+    mag: Mag
+    baro: Baro
+    sonar: Sonar
+    flow: Flow
+
+
+class Limits(Spec, kw_only=True):
+    """What the firmware allows a commander (defaults: the SDK's outdoor set, no altitude limit)."""
+
+    tilt_deg: Annotated[float, Meta(gt=0, le=30)] = 20.0
+    horizontal_speed_m_s: Annotated[float, Meta(gt=0, le=10)] = 5.0
+    vertical_speed_m_s: Annotated[float, Meta(ge=0.2, le=2)] = 1.0
+    yaw_rate_deg_s: Annotated[float, Meta(gt=0, le=350)] = 200.0
+    altitude_m: Positive = 100.0
+
+
+class Drone(Spec, kw_only=True):
+    """One aircraft; the defaults are the AR.Drone 2.0 (Li 2014 through AuRoRA; see world/zsim_world/vehicle.py)."""
+
+    name: Name
+    model: Literal["ardrone2"] = "ardrone2"
+    position_m: Vector3
+    yaw_deg: float = 0.0
+    mass_kg: Annotated[float, Meta(gt=0, le=100)] = 0.429
+    inertia_kg_m2: tuple[Positive, Positive, Positive] = (2.237568e-3, 2.985236e-3, 4.80374e-3)
+    arm_m: Annotated[float, Meta(gt=0, le=10)] = 0.1785
+    thrust_n_s2: Positive = 8.048e-6
+    torque_nm_s2: Positive = 2.423e-7
+    rotor_time_constant_s: Annotated[float, Meta(ge=0.005, le=1)] = 0.030
+    rotor_min_rad_s: NonNegative = 126.0
+    rotor_max_rad_s: Positive = 503.0
+    drag_n_s_m: NonNegative = 0.249
+    battery_mah: Positive = 1000.0
+    battery_percent: Annotated[float, Meta(ge=0, le=100)] = 100.0
+    takeoff_height_m: Annotated[float, Meta(ge=0.3, le=5)] = 1.0
+    limits: Limits = Limits()
+    sensors: Sensors
+
+
+class Wind(Spec, kw_only=True):
+    """Steady wind and Dryden gusts, `gust_m_s` being the standard deviation per axis."""
+
+    steady_m_s: Vector3 = (0.0, 0.0, 0.0)
+    gust_m_s: NonNegative = 0.0
+    gust_length_m: Positive = 10.0
+    gust_speed_min_m_s: Positive = 2.0
+    gust_correlation: Fraction = 0.5
+
+
+class Environment(Spec, kw_only=True):
+    """The field of the flight: default Buenos Aires, where the paper comes from."""
+
+    latitude_deg: Annotated[float, Meta(ge=-90, le=90)] = -34.603
+    longitude_deg: Annotated[float, Meta(ge=-180, le=180)] = -58.368
+    height_m: float = 25.0
+    gravity_m_s2: Positive = G_M_S2
+    magnetic_field_ut: Vector3 = (-2.8, 17.8, 14.0)  # ENU; 18 uT horizontal, declination -9 deg, upwards
+    air_density_kg_m3: Positive = 1.225
+    wind: Wind = Wind()
+
+
+class Silence(Spec, kw_only=True):
+    """What the firmware does when the commander falls silent, in simulated time."""
+
+    hover_s: Positive = 0.5
+    land_s: Positive = 2.0
+
+
+class Gains(Spec, kw_only=True):
+    """Of the cluster controller; see zsim_agents/formation.py."""
+
+    proportional_1_s: Annotated[float, Meta(gt=0, le=2)] = 0.6
+    integral_1_s2: Annotated[float, Meta(ge=0, le=0.5)] = 0.05
+    horizontal_speed_m_s: Positive = 1.5
+    vertical_speed_m_s: Positive = 0.8
+    yaw_rate_deg_s: Positive = 60.0
+    separation_min_m: Annotated[float, Meta(ge=0)] = 2.0
+    separation_alarm_m: Annotated[float, Meta(ge=0)] = 1.5
+
+
+class Waypoint(Spec, kw_only=True):
+    at_s: NonNegative
+    values: dict[str, float]
+
+
+class Trajectory(Spec, kw_only=True):
+    """A reference as expressions of t (seconds since `start_s`) or as waypoints."""
+
+    start_s: NonNegative = 0.0
+    constants: dict[str, float] = {}
+    expressions: dict[str, str] = {}
+    waypoints: list[Waypoint] = []
+
+
+class Plan(Spec, kw_only=True):
+    """What the controller does by itself."""
+
+    takeoff_s: NonNegative | None = None
+    target: dict[str, float] = {}
+    target_over_s: Positive | None = None
+    trajectory: Trajectory | None = None
+    land_s: NonNegative | None = None
+
+
+class Cluster(Spec, kw_only=True):
+    name: Name
+    drones: Annotated[list[Name], Meta(min_length=2)]
+    gains: Gains = Gains()
+    plan: Plan = Plan()
+
+
+class Estimation(Spec, kw_only=True):
+    """Settings of the estimators; noise figures come from the drone's own sensors."""
+
+    madgwick_beta: Annotated[float, Meta(ge=0, le=1)] | None = None
+    """rad/s; None: chosen from the accelerometer's noise."""
+    gate_probability: Annotated[float, Meta(gt=0.5, lt=1)] = 0.9999
+    magnetometer: bool = True
+    flow: bool = True
+
+
+OnDeath = Literal["wait", "restart", "drop", "end"]
+
+
+class Processes(Spec, kw_only=True):
+    """Who takes part. `expect: null` means an estimator per drone and a controller per cluster."""
+
+    expect: list[Name] | None = None
+    on_death: dict[str, OnDeath] = {}
+
+
+class Time(Spec, kw_only=True):
+    gate_ms: Annotated[float, Meta(gt=0, le=1000)] = 20.0
+    physics_dt_ms: Annotated[float, Meta(gt=0, le=20)] = 2.5
+    command_delay_gates: Annotated[int, Meta(ge=1, le=50)] = 1
+    max_command_age_ms: Positive = 500.0
+
+
+class Figures(Spec, kw_only=True):
+    """Windows of the statistics, in simulated seconds; None: the last two thirds of the run."""
+
+    window_s: tuple[float, float] | None = None
+
+
+class Scenario(Spec, kw_only=True):
+    """A whole run."""
+
+    name: Name
+    federation: Name = "zsim"
+    seed: Annotated[int, Meta(ge=0, le=2**62)] = 1
+    duration_s: Annotated[float, Meta(gt=0, le=1e6)]
+    time: Time = Time()
+    environment: Environment = Environment()
+    silence: Silence = Silence()
+    drones: Annotated[list[Drone], Meta(min_length=1, max_length=1000)]
+    clusters: list[Cluster] = []
+    estimation: Estimation = Estimation()
+    processes: Processes = Processes()
+    report: Figures = field(default_factory=Figures)
+
+    def drone(self, name: str) -> Drone:
+        """Return the drone of that name; KeyError if there is none."""
+        return {drone.name: drone for drone in self.drones}[name]
+
+    def cluster(self, name: str) -> Cluster:
+        """Return the cluster of that name; KeyError if there is none."""
+        return {cluster.name: cluster for cluster in self.clusters}[name]

@@ -1,0 +1,335 @@
+"""The only file that touches Zenoh: endpoints, settings, subscriptions, requests, liveliness.
+
+Settings and their reasons are in docs/decisions/0002-zenoh-settings.md. Keys are given without the
+federation's prefix; the session adds and removes it.
+"""
+
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal, NamedTuple
+
+os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1))")
+os.environ.setdefault("RUST_LOG", "error")
+
+import zenoh
+from msgspec import Struct
+
+from zsim import messages
+from zsim.errors import DecodeError, SessionError
+from zsim.messages import ControlAnswer, ControlRequest
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+QUEUE = 1_000_000  # messages; an unread queue that is full blocks the whole link
+LEASE_LOCKSTEP_MS = 3_600_000  # a stopped or debugged process must not lose its link in lockstep
+LEASE_REALTIME_MS = 1_000
+CLOSE_AFTER_US = 3_600_000_000  # -1 means for ever and panics in 1.10.2
+CONNECT_RETRY_MS = 100
+
+Mode = Literal["lockstep", "realtime"]
+
+
+class Sample(NamedTuple):
+    """One message off the wire, not decoded."""
+
+    key: str
+    payload: bytes
+    encoding: str
+
+
+class Session:
+    """One process's access to a federation."""
+
+    def __init__(self, raw: zenoh.Session, federation: str) -> None:
+        self._raw = raw
+        self.federation = federation
+        self._prefix = f"{federation}/"
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._kept: list[Any] = []
+        self._realtime = False
+
+    def use(self, mode: Mode) -> None:
+        """Choose what a full link does to sensors: BLOCK in lockstep, DROP in realtime."""
+        self._realtime = mode == "realtime"
+
+    def put(self, key: str, message: Struct) -> None:
+        """Publish a message on its key."""
+        self.put_raw(key, messages.encode(message))
+
+    def put_raw(self, key: str, payload: bytes) -> None:
+        """Publish an encoded payload; the encoding follows from the key."""
+        publisher = self._publishers.get(key) or self._declare(key)
+        publisher.put(payload)
+
+    def _declare(self, key: str) -> zenoh.Publisher:
+        drop = key.startswith("view/") or (self._realtime and "/sensor/" in key)
+        control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
+        publisher = self._raw.declare_publisher(
+            self._prefix + key, encoding=zenoh.Encoding(messages.encoding(key)), congestion_control=control
+        )
+        self._publishers[key] = publisher
+        return publisher
+
+    def subscribe(self, expression: str) -> "Mailbox":
+        """Return a mailbox that takes everything that others publish on an expression, in order."""
+        return Mailbox(self._raw, self._prefix, expression)
+
+    def on_message(self, expression: str, callback: Callable[[Sample], None]) -> None:
+        """Call back, in a thread of Zenoh's, for the rare messages on an expression."""
+        subscriber = self._raw.declare_subscriber(
+            self._prefix + expression, lambda sample: callback(_sample(sample, self._prefix))
+        )
+        self._kept.append(subscriber)
+
+    def declare_token(self, key: str) -> None:
+        """Show that this process lives; the token goes with it."""
+        self._kept.append(self._raw.liveliness().declare_token(self._prefix + key))
+
+    def on_token(self, expression: str, callback: Callable[[str, bool], None]) -> None:
+        """Call back with (key, alive) whenever a token appears or goes, and for those that are there."""
+
+        def forward(sample: zenoh.Sample) -> None:
+            alive = sample.kind == zenoh.SampleKind.PUT
+            callback(str(sample.key_expr).removeprefix(self._prefix), alive)
+
+        subscriber = self._raw.liveliness().declare_subscriber(
+            self._prefix + expression, forward, history=True
+        )
+        self._kept.append(subscriber)
+
+    def tokens(self, expression: str, timeout_s: float = 1.0) -> list[str]:
+        """Return the keys of the tokens that are there now."""
+        replies = self._raw.liveliness().get(self._prefix + expression, timeout=timeout_s)
+        return [str(r.ok.key_expr).removeprefix(self._prefix) for r in replies if r.ok is not None]
+
+    def get(self, expression: str, timeout_s: float = 2.0) -> list[Sample]:
+        """Return the last values that are answered on an expression."""
+        replies = self._raw.get(self._prefix + expression, timeout=timeout_s)
+        return [_sample(reply.ok, self._prefix) for reply in replies if reply.ok is not None]
+
+    def request(self, key: str, op: str, source: str, timeout_s: float = 5.0, **args: Any) -> ControlAnswer:
+        """Ask `key` to do something; an answer that never comes is an answer that says so."""
+        payload = messages.encode(ControlRequest(op=op, args=args, source=source))
+        replies = self._raw.get(self._prefix + key, payload=payload, timeout=timeout_s)
+        for reply in replies:
+            if reply.ok is not None:
+                return messages.decode_as(ControlAnswer, reply.ok.payload.to_bytes(), key)
+        return ControlAnswer(ok=False, error=f"{key}: nobody answered within {timeout_s:g} s; is it running?")
+
+    def answer(self, expression: str, callback: Callable[["Query"], None]) -> None:
+        """Call back, in a thread of Zenoh's, for every get on an expression."""
+        queryable = self._raw.declare_queryable(
+            self._prefix + expression, lambda query: callback(Query(query, self._prefix))
+        )
+        self._kept.append(queryable)
+
+    def on_link(self, callback: Callable[[bool], None]) -> None:
+        """Call back with True when a transport to another process opens and False when one closes."""
+
+        def forward(event: zenoh.TransportEvent) -> None:
+            callback(event.kind == zenoh.SampleKind.PUT)
+
+        self._kept.append(self._raw.info.declare_transport_events_listener(forward, history=True))
+
+    def links(self) -> int:
+        """Return how many other processes this one has a transport to."""
+        return len(self._raw.info.peers_zid()) + len(self._raw.info.routers_zid())
+
+
+class Query:
+    """A request to be answered once."""
+
+    def __init__(self, raw: zenoh.Query, prefix: str) -> None:
+        self._raw: zenoh.Query | None = raw
+        self._prefix = prefix
+        self.expression = str(raw.key_expr).removeprefix(prefix)
+        self.payload = raw.payload.to_bytes() if raw.payload is not None else b""
+
+    def request(self) -> ControlRequest:
+        """Return the request in it; DecodeError if it is none."""
+        return messages.decode_as(ControlRequest, self.payload, self.expression)
+
+    def takes(self, key: str) -> bool:
+        """Tell whether the query's expression takes a key."""
+        return zenoh.KeyExpr(self.expression).intersects(zenoh.KeyExpr(key))
+
+    def reply(self, key: str, payload: bytes) -> None:
+        """Add one reply."""
+        if self._raw is not None:
+            self._raw.reply(self._prefix + key, payload, encoding=zenoh.Encoding(messages.encoding(key)))
+
+    def answer(self, answer: ControlAnswer) -> None:
+        """Reply to a request and end it."""
+        if self._raw is not None:
+            encoding = zenoh.Encoding("application/msgpack;ControlAnswer")
+            self._raw.reply(self._prefix + self.expression, messages.encode(answer), encoding=encoding)
+        self.end()
+
+    def end(self) -> None:
+        """End the query; Zenoh tells the asker when the last reference goes."""
+        if self._raw is not None:
+            self._raw.drop()
+            self._raw = None
+
+
+class Mailbox:
+    """Everything that others publish on one expression, in the order of its arrival on this session."""
+
+    def __init__(self, raw: zenoh.Session, prefix: str, expression: str) -> None:
+        self._raw = raw
+        self._prefix = prefix
+        self._cut = len(prefix)
+        self.expression = expression
+        self._wake_key = prefix + expression.replace("**", "wake").replace("*", "wake")
+        self._handler_owner = raw.declare_subscriber(prefix + expression, zenoh.handlers.FifoChannel(QUEUE))
+        self._handler = self._handler_owner.handler
+
+    def receive(self) -> Sample | None:
+        """Wait for one message; None when woken by `wake`.
+
+        Raises:
+            SessionError: the session was closed meanwhile.
+        """
+        try:
+            return self._take(self._handler.recv())
+        except zenoh.ZError as error:
+            raise SessionError(f"{self.expression}: the session is closed") from error
+
+    def drain(self) -> Iterator[Sample]:
+        """Yield what has arrived, without waiting."""
+        while (raw := self._handler.try_recv()) is not None:
+            sample = self._take(raw)
+            if sample is not None:
+                yield sample
+
+    def wake(self) -> None:
+        """Let a waiting `receive` return None; callable from any thread."""
+        try:
+            self._raw.put(self._wake_key, b"", allowed_destination=zenoh.Locality.SESSION_LOCAL)
+        except zenoh.ZError:
+            return  # closed: nobody waits any more
+
+    def _take(self, raw: zenoh.Sample) -> Sample | None:
+        key = str(raw.key_expr)
+        if key == self._wake_key or raw.kind != zenoh.SampleKind.PUT:
+            return None
+        return Sample(key[self._cut :], raw.payload.to_bytes(), str(raw.encoding))
+
+
+class TimedMailbox:
+    """A mailbox read by a thread that stamps every message with the wall time of its arrival.
+
+    Args:
+        mailbox: what to read.
+        fresh: set whenever something has arrived.
+    """
+
+    def __init__(self, mailbox: Mailbox, fresh: threading.Event) -> None:
+        self._mailbox = mailbox
+        self._fresh = fresh
+        self._arrived: deque[tuple[int, Sample]] = deque()
+        self._open = True
+        self._thread = threading.Thread(target=self._pump, name="mailbox", daemon=True)
+        self._thread.start()
+
+    def _pump(self) -> None:
+        while self._open:
+            try:
+                sample = self._mailbox.receive()
+            except SessionError:
+                return
+            if sample is not None:
+                self._arrived.append((time.monotonic_ns(), sample))
+                self._fresh.set()
+
+    def drain(self) -> Iterator[tuple[int, Sample]]:
+        """Yield (wall_ns of arrival, sample) of what has arrived."""
+        while self._arrived:
+            yield self._arrived.popleft()
+
+    def close(self) -> None:
+        """Stop the reading thread."""
+        self._open = False
+        self._mailbox.wake()
+        self._thread.join(timeout=2.0)
+
+
+def _sample(raw: zenoh.Sample, prefix: str) -> Sample:
+    return Sample(str(raw.key_expr).removeprefix(prefix), raw.payload.to_bytes(), str(raw.encoding))
+
+
+@contextmanager
+def listen(endpoints: Sequence[str], federation: str, mode: Mode) -> Iterator[Session]:
+    """Open the hub: a peer that listens, to which every other role is a client.
+
+    Raises:
+        SessionError: an endpoint is taken or malformed.
+    """
+    config = _config("peer", mode)
+    config.insert_json5("listen/endpoints", _json(endpoints))
+    config.insert_json5("listen/exit_on_failure", "true")
+    with _opened(config, federation, f"cannot listen on {', '.join(endpoints)}") as session:
+        session.use(mode)
+        yield session
+
+
+@contextmanager
+def connect(
+    endpoint: str, federation: str, mode: Mode = "lockstep", wait_s: float | None = None
+) -> Iterator[Session]:
+    """Open a client of the hub (or of a router).
+
+    Args:
+        endpoint: e.g. "tcp/192.168.1.2:7447".
+        federation: prefix of all keys.
+        mode: of the run, where it is known already.
+        wait_s: how long to try; None tries once.
+
+    Raises:
+        SessionError: nobody listens there within `wait_s`.
+    """
+    config = _config("client", mode)
+    config.insert_json5("connect/endpoints", _json([endpoint]))
+    config.insert_json5("connect/timeout_ms", str(int(1000 * (wait_s or 0)) or 500))
+    with _opened(config, federation, f"nobody listens on {endpoint}; start a world there") as session:
+        yield session
+
+
+@contextmanager
+def _opened(config: zenoh.Config, federation: str, fault: str) -> Iterator[Session]:
+    try:
+        raw = zenoh.open(config)
+    except zenoh.ZError as error:
+        raise SessionError(f"{fault} ({_brief(error)})") from error
+    try:
+        yield Session(raw, federation)
+    finally:
+        raw.close()
+
+
+def _config(mode: str, timing: Mode) -> zenoh.Config:
+    lease = LEASE_LOCKSTEP_MS if timing == "lockstep" else LEASE_REALTIME_MS
+    config = zenoh.Config()
+    for path, value in {
+        "mode": f'"{mode}"',
+        "scouting/multicast/enabled": "false",
+        "scouting/gossip/enabled": "false",
+        "connect/retry": f"{{period_init_ms: {CONNECT_RETRY_MS}, period_max_ms: {2 * CONNECT_RETRY_MS}}}",
+        "transport/link/tx/lease": str(lease),
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": str(CLOSE_AFTER_US),
+    }.items():
+        config.insert_json5(path, value)
+    return config
+
+
+def _json(endpoints: Sequence[str]) -> str:
+    quoted = ", ".join('"' + endpoint.replace('"', "") + '"' for endpoint in endpoints)
+    return f"[{quoted}]"
+
+
+def _brief(error: Exception) -> str:
+    """Return the first sentence of a Zenoh error without its source location."""
+    return str(error).split(" at ", 1)[0].split("\n", 1)[0][:160]
