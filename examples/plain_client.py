@@ -1,4 +1,4 @@
-"""Reads the IMU of drone1, takes it over with velocity commands, and keeps the lockstep: zenoh and msgpack only."""
+"""Reads drone1's IMU, flies it by velocity commands, and keeps the lockstep: with zenoh and msgpack alone."""
 
 import os
 import sys
@@ -6,38 +6,35 @@ import sys
 import msgpack
 import zenoh
 
-ME, SECONDS = "plain.client", float(sys.argv[2]) if len(sys.argv) > 2 else 10.0
+ENDPOINT, SECONDS = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447", 10.0
+ME, DRONE = "plain.client", "zsim/drone/drone1"
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
-config.insert_json5("connect/endpoints", f'["{sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"}"]')
+config.insert_json5("connect/endpoints", f'["{ENDPOINT}"]')
 config.insert_json5("scouting/multicast/enabled", "false")
-seq = {}
+seq, last, t_ns = {}, {}, 0
 
 with zenoh.open(config) as session:
 
     def put(key, **fields):
         seq[key] = seq.get(key, -1) + 1
-        session.put(f"zsim/{key}", msgpack.packb({"seq": seq[key], **fields}))
+        session.put(key, msgpack.packb({"seq": seq[key], **fields}))
 
-    info = next(msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in session.get("zsim/world/info") if reply.ok)
-    sensors = session.declare_subscriber("zsim/drone/drone1/sensor/*", zenoh.handlers.FifoChannel(10000))
+    info = next(msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in session.get("zsim/world/info"))
+    run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
+    sensors = session.declare_subscriber(f"{DRONE}/sensor/*", zenoh.handlers.FifoChannel(10_000))
     token = session.liveliness().declare_token(f"zsim/process/{ME}")
-    run = {"run_id": info["run_id"], "incarnation": 1}
-    put(f"process/{ME}/join", t_ns=0, **run, role="example", host="here", pid=os.getpid(), period_ns=info["gate_ns"])
-
-    while True:
+    about = {"role": "example", "host": "here", "pid": os.getpid(), "period_ns": info["gate_ns"]}
+    put(f"zsim/process/{ME}/join", t_ns=0, **run, **about)
+    while t_ns < SECONDS * 1e9:
         sample = sensors.recv()
-        message, kind = msgpack.unpackb(sample.payload.to_bytes()), str(sample.key_expr).rsplit("/", 1)[1]
-        if kind == "imu":
-            imu = message
-        elif kind == "status":  # the last of a gate: everything of drone1 stamped up to t_ns is here
-            t_ns = message["t_ns"]
-            if message["state"] == "landed":
-                put("drone/drone1/cmd/mode", t_ns=t_ns, source=ME, mode="takeoff")
-            elif message["state"] in ("hovering", "flying"):
-                put("drone/drone1/cmd/velocity", t_ns=t_ns, source=ME, velocity_m_s=[0.5, 0, 0], yaw_rate_rad_s=0.0)
-            put(f"process/{ME}/done", t_ns=t_ns, **run, done_ns=t_ns, sent=int(message["state"] != "taking_off"))
-            if t_ns >= SECONDS * 1e9:
-                break
-    print(f"t = {t_ns / 1e9:.2f} s, {message['state']}, flown by {message['commander']}, accel {imu['accel_m_s2']}")
-    put(f"process/{ME}/bye", t_ns=t_ns, reason="shown")
+        last[str(sample.key_expr).rsplit("/", 1)[1]] = msgpack.unpackb(sample.payload.to_bytes())
+        if str(sample.key_expr).endswith("/status"):  # the gate is complete: answer it, then say done
+            t_ns, flying = last["status"]["t_ns"], last["status"]["state"] in ("hovering", "flying")
+            if flying:
+                put(f"{DRONE}/cmd/velocity", t_ns=t_ns, source=ME, velocity_m_s=[0.5, 0, 0], yaw_rate_rad_s=0)
+            else:
+                put(f"{DRONE}/cmd/mode", t_ns=t_ns, source=ME, mode="takeoff")
+            put(f"zsim/process/{ME}/done", t_ns=t_ns, **run, done_ns=t_ns, sent=1)
+    print(f"t = {t_ns / 1e9:.2f} s, {last['status']['state']}, accelerometer {last['imu']['accel_m_s2']}")
+    put(f"zsim/process/{ME}/bye", t_ns=t_ns, reason="shown")

@@ -26,7 +26,7 @@ def find_world(
         endpoint: where the world (or a router) listens.
         federation: its name.
         wait_s: how long to wait for a world; None waits for ever.
-        say: told once a second whom it waits for.
+        say: told at growing intervals whom it waits for.
         stopped: asked while waiting.
 
     Raises:
@@ -49,7 +49,7 @@ def _search(
     say: Callable[[str], None],
     stopped: Callable[[], bool],
 ) -> tuple[Session, messages.Info]:
-    start_s = time.monotonic()
+    start_s, next_say_s = time.monotonic(), 0.0
     link: Session | None = None
     while not stopped():
         waited_s = time.monotonic() - start_s
@@ -67,7 +67,9 @@ def _search(
             raise NoWorldError(
                 f"no world of federation {federation!r} on {endpoint} within {wait_s:g} s; start one with `zsim world`"
             )
-        say(f"waiting for a world of {federation!r} on {endpoint} ({waited_s:.0f} s)")
+        if waited_s >= next_say_s:
+            next_say_s = max(2 * next_say_s, 1.0)
+            say(f"waiting for a world of {federation!r} on {endpoint} ({waited_s:.0f} s)")
     raise NoWorldError(f"stopped while waiting for a world on {endpoint}")
 
 

@@ -68,6 +68,14 @@ class Inbox:
                 return key
         return None
 
+    def lost(self, t_ns: int) -> str | None:
+        """Return a missing key whose message will not come any more: its publisher has gone on without it."""
+        key = self.missing(t_ns)
+        if key is None:
+            return None
+        closed = self._closed[key]
+        return key if t_ns in closed or any(at > t_ns for at in closed) else None
+
     def _short(self, key: str, t_ns: int) -> bool:
         prefix = self._counted[key]
         have = sum(1 for at, name, _, _ in self._waiting if at <= t_ns and name.startswith(prefix))

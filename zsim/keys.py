@@ -4,6 +4,8 @@ Keys inside a process are without the federation's prefix ("drone/drone1/truth")
 """
 
 import re
+from functools import lru_cache
+from itertools import groupby
 
 from zsim.errors import BadNameError
 
@@ -81,16 +83,42 @@ def leaf(key: str) -> str:
 
 
 def matches(expression: str, key: str) -> bool:
-    """Tell whether a key expression with `*` and `**` takes a key (the in-process bus; Zenoh has its own)."""
-    return _compiled(expression).fullmatch(key) is not None
+    """Tell whether a key expression takes a key, as Zenoh does (the in-process bus and the history ask here).
+
+    `*` stands for one chunk, `**` for any number of them, `$*` for a part of one; a chunk that begins with `@` is
+    taken only by itself.
+    """
+    return expression == key or _compiled(expression).fullmatch(f"{key}/") is not None
 
 
-_cache: dict[str, re.Pattern[str]] = {}
+_CHUNK = "[^/@][^/]*/"
+_PART = "[^/]*"
 
 
+@lru_cache(maxsize=4096)  # expressions come from other processes too, in requests
 def _compiled(expression: str) -> re.Pattern[str]:
-    if expression not in _cache:
-        pattern = re.escape(expression).replace(r"\*\*/", "(?:.*/)?").replace(r"/\*\*", "(?:/.*)?")
-        pattern = pattern.replace(r"\*\*", ".*").replace(r"\*", "[^/]*")
-        _cache[expression] = re.compile(pattern)
-    return _cache[expression]
+    """Return the pattern of an expression, for keys with "/" at their end.
+
+    What stands between two wildcards is matched at its first place and kept (atomic groups), so that no
+    expression, however contrived, takes more than linear time per wildcard.
+    """
+    runs = [list(run) for wild, run in groupby(expression.split("/"), lambda chunk: chunk == "**") if not wild]
+    texts = ["".join(map(_chunk, run)) for run in runs]
+    head = "" if expression.startswith("**") else texts.pop(0)
+    if not texts and not expression.endswith("**"):
+        return re.compile(head)
+    tail = "" if expression.endswith("**") else texts.pop()
+    middle = "".join(f"(?>(?:{_CHUNK})*?{text})" for text in texts)
+    return re.compile(f"{head}{middle}(?:{_CHUNK})*{tail}")
+
+
+def _chunk(chunk: str) -> str:
+    """Return the pattern of one chunk of an expression, "/" included."""
+    if chunk == "*":
+        return _CHUNK
+    first, *others = map(re.escape, chunk.split("$*"))
+    if not others:
+        return f"{first}/"
+    last = others.pop()
+    middle = "".join(f"(?>{_PART}?{text})" for text in others)
+    return f"{'' if first else '(?!@)'}{first}{middle}{_PART}{last}/"

@@ -147,16 +147,21 @@ class Runner:
         t_ns = self._inbox.next_gate_ns()
         if t_ns is None:
             return None
-        missing = self._inbox.missing(t_ns)
-        if missing is None:
+        if self._inbox.missing(t_ns) is None:
             return t_ns
-        newer = self._inbox.latest_gate_ns() != t_ns
-        if newer and self._info.mode == "realtime":
-            self.health.dropped += 1
-            return t_ns
-        if newer:
-            self._ask_replay(t_ns, missing)
+        if self._info.mode == "realtime":
+            return self._give_up(t_ns)
+        lost = self._inbox.lost(t_ns)
+        if lost is not None:
+            self._ask_replay(t_ns, lost)
         return None
+
+    def _give_up(self, t_ns: int) -> int | None:
+        """In realtime an incomplete gate is stepped with what there is once the next one is there."""
+        if self._inbox.latest_gate_ns() == t_ns:
+            return None
+        self.health.dropped += 1
+        return t_ns
 
     def _step(self, t_ns: int) -> None:
         start_ns = time.perf_counter_ns()
@@ -350,10 +355,8 @@ class Runner:
 
     def _serve_query(self, query: Query) -> None:
         if query.expression == keys.process(self._agent.name, "outputs"):
-            for _, outputs in self._kept:
-                for key, message in outputs:
-                    query.reply(key, messages.encode(message))
-            query.end()
+            kept = [[key, messages.encode(message)] for _, outputs in self._kept for key, message in outputs]
+            query.answer(ControlAnswer(ok=True, result=kept))
             return
         try:
             answer = self._agent.control(query.expression, query.request())

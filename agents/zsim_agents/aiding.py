@@ -1,4 +1,4 @@
-"""One aiding sensor of a drone as its filter knows it: mount, noise, bias states, counts; and its measurements."""
+"""One aiding sensor of a drone as its filter knows it: mount, noise, bias states and counts."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ SIGMA_MIN = {
     "sonar": (0.003,),  # m
     "flow": (0.005,),  # m/s
 }
-# A sensor refused for this long without a break is believed again, its states having lost their certainty [s].
-# A jump of the height or velocity is soon cheaper to follow than to fight; a field disturbed in passing is not.
+# A sensor refused for this long without a break is believed again, its states losing their certainty [s].
+# Height and velocity are lost quickly where they are wrong; a field may be disturbed in passing.
 PATIENCE_S = {"gps": 10.0, "mag": 10.0, "baro": 5.0, "sonar": math.inf, "flow": 1.0}
 
 

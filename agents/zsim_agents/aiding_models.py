@@ -19,7 +19,7 @@ from zsim_agents.dead_reckoning import (
     heading_gradient,
     write_minus_cross,
 )
-from zsim_agents.madgwick import Rotation, Vector, cross, turn, turn_back
+from zsim_agents.madgwick import Rotation, Vector, compose, cross, turn, turn_back
 
 SIX = tuple[float, float, float, float, float, float]
 DOF_MAX = 6  # rows of the largest block, GPS with position and velocity
@@ -27,7 +27,9 @@ COSINE_MIN = 0.1  # of the sonar's ray to the vertical; flatter than 84 deg it d
 
 
 @compiled
-def write_gps(H: np.ndarray, i: int, p: Vector, v: Vector, R: Rotation, w: Vector, arm: Vector, lag: float) -> SIX:
+def write_gps(
+    H: np.ndarray, i: int, p: Vector, v: Vector, R: Rotation, w: Vector, arm: Vector, lag: float
+) -> SIX:
     """Antenna at p_BS = `arm`: position p + R r [m], velocity v + R (w x r) [m/s]; six rows from `i`."""
     offset = turn(R, arm)
     swing = turn(R, cross(w, arm))
@@ -48,8 +50,9 @@ def write_gps(H: np.ndarray, i: int, p: Vector, v: Vector, R: Rotation, w: Vecto
 
 
 @compiled
-def write_mag(H: np.ndarray, i: int, R_WS: Rotation, field_W: Vector) -> Vector:
-    """Magnetometer with attitude R_WS = R_WB R_BS in a known field: R_WS^T m [uT]; three rows from `i`."""
+def write_mag(H: np.ndarray, i: int, R: Rotation, R_BS: Rotation, field_W: Vector) -> Vector:
+    """Magnetometer turned by R_BS in a known field: (R R_BS)^T m [uT]; three rows from `i`."""
+    R_WS = compose(R, R_BS)
     for k in range(3):
         row = cross((R_WS[k], R_WS[3 + k], R_WS[6 + k]), field_W)
         H[i + k, ATTITUDE] = row[0]
@@ -93,7 +96,7 @@ def write_sonar(
 
 @compiled
 def write_flow(H: np.ndarray, i: int, v: Vector, R: Rotation, w: Vector, arm: Vector) -> Vector:
-    """Velocity of the camera at p_BS = `arm` in the heading frame, Rz(yaw)^T (v + R (w x r)) [m/s]; three rows."""
+    """Velocity of the camera at p_BS = `arm` in the heading frame, Rz(yaw)^T (v + R (w x r)); three rows."""
     swing = turn(R, cross(w, arm))
     length = math.sqrt(max(R[0] * R[0] + R[3] * R[3], HORIZONTAL_MIN))
     c, s = R[0] / length, R[3] / length
@@ -114,19 +117,23 @@ def write_flow(H: np.ndarray, i: int, v: Vector, R: Rotation, w: Vector, arm: Ve
 
 
 @compiled
-def write_squared_distances(S: np.ndarray, y: np.ndarray, blocks: np.ndarray, distances: np.ndarray) -> None:
-    """Write y^T S^-1 y of every block of innovations by itself, by its Cholesky factor.
+def within_gates(
+    S: np.ndarray, y: np.ndarray, blocks: np.ndarray, limits: np.ndarray, distances: np.ndarray
+) -> bool:
+    """Write y^T S^-1 y of every block of innovations by itself, and say whether all are within their limits.
 
-    Infinite where the block is not positive definite or the innovation not a number.
+    By the block's Cholesky factor; infinite where it is not positive definite or the innovation not a number.
 
     Args:
         S: covariance of all innovations, (m, m).
         y: all innovations, (m,).
         blocks: first row and number of rows of each block, (k, 2).
-        distances: the result, (k,).
+        limits: by number of rows, (DOF_MAX + 1,).
+        distances: the result, (k,) or longer.
     """
     L = np.zeros((DOF_MAX, DOF_MAX))
     u = np.zeros(DOF_MAX)
+    good = True
     for block in range(blocks.shape[0]):
         first, size = blocks[block]
         total = 0.0
@@ -146,3 +153,5 @@ def write_squared_distances(S: np.ndarray, y: np.ndarray, blocks: np.ndarray, di
             u[i] = part / L[i, i]
             total += u[i] * u[i]
         distances[block] = total if total == total else math.inf
+        good = good and distances[block] <= limits[size]
+    return good

@@ -34,7 +34,7 @@ class ClusterSpace(ABC):
         names: their names in the order of c; lengths in metres, angles in radians.
         angular: (4n,) bool, true for the angles that wrap (roll, yaw, phi_i, azimuth_k).
         in_radians: (4n,) bool, true for all angles, also those that do not wrap (pitch, beta, elevation_k).
-        lower, upper: (4n,) open bounds of the values that `forward` can give, infinite where there is none.
+        bounds: (4n,) pairs, open bounds of the values that `forward` can give, infinite where there is none.
         spread_text: what `spread` measures, in words for messages.
     """
 
@@ -46,8 +46,7 @@ class ClusterSpace(ABC):
         self.angular = np.array([_stem(name) in {"roll", "yaw", "phi", "azimuth"} for name in names])
         self.in_radians = self.angular | np.array([_stem(name) in _BOUNDED_ANGLES for name in names])
         self._period = np.where(self.angular, TAU, 0.0)
-        bounds = [_BOUNDS.get(_stem(name), (-math.inf, math.inf)) for name in names]
-        self.lower, self.upper = (np.array(column) for column in zip(*bounds, strict=True))
+        self.bounds = tuple(_BOUNDS.get(_stem(name), (-math.inf, math.inf)) for name in names)
         self._lengths = [i for i, name in enumerate(names) if _stem(name) in {"p", "q", "rho"}]
         self._pitch = self.names.index("pitch")
 

@@ -1,10 +1,10 @@
-"""Compile plain-float mathematics with numba where it is installed; the same source runs as Python where it is not.
+"""Compile plain-float mathematics with numba where it is installed; elsewhere the same source runs as Python.
 
 Numba is asked for neither fast mathematics nor fused operations, so both ways give the same bits.
 """
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -19,6 +19,6 @@ def compiled(function: Function) -> Function:
     if numba is None:
         return function
     try:
-        return numba.njit(cache=True)(function)
+        return cast(Function, numba.njit(cache=True)(function))
     except RuntimeError:  # numba's answer when neither the package's folder nor the home can be written
-        return numba.njit(function)
+        return cast(Function, numba.njit(function))

@@ -29,7 +29,7 @@ POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCEL_BIAS = 0, 3, 6, 9, 12  # first in
 HORIZONTAL_MIN = 1e-6  # of a squared unit vector; nearer to the zenith a heading is not defined
 
 Reckoning = tuple[Vector, Vector, Quaternion, Vector, Vector, Vector]
-"""p_WB [m], v_WB [m/s], q_WB, a_WB [m/s^2; W], bias-free body rate [rad/s; B], bias-free specific force [m/s^2; B]."""
+"""p_WB [m], v_WB [m/s], q_WB, a_WB [m/s^2; W]; rate [rad/s] and specific force [m/s^2] in B, bias-free."""
 
 
 @compiled
@@ -56,7 +56,7 @@ def reckon(
     gravity: float,
     dt: float,
 ) -> Reckoning:
-    """Return the state after one IMU sample: Madgwick's step, then position and velocity by the trapezoidal rule.
+    """Return the state after one IMU sample: Madgwick's step, then velocity and position by trapezoids.
 
     Args:
         state: at the previous sample.
@@ -81,7 +81,7 @@ def reckon(
 
 @compiled
 def corrected(state: Reckoning, error: np.ndarray, with_accel_bias: bool, gravity: float) -> Reckoning:
-    """Return the state with an error of the filter put into it, the biases' part into what they were taken off.
+    """Return the state with an error of the filter put into it, biases into what they were taken off.
 
     Args:
         state: nominal state.
@@ -101,7 +101,7 @@ def corrected(state: Reckoning, error: np.ndarray, with_accel_bias: bool, gravit
 
 @compiled
 def arm_acceleration(w: Vector, w_before: Vector, arm: Vector, dt: float) -> Vector:
-    """Return what a sensor at p_BS = `arm` feels beyond the centre of mass: alpha x r + w x (w x r) [m/s^2; B]."""
+    """Return alpha x r + w x (w x r) [m/s^2; B], which a sensor at p_BS = `arm` feels beyond the centre."""
     alpha = ((w[0] - w_before[0]) / dt, (w[1] - w_before[1]) / dt, (w[2] - w_before[2]) / dt)
     tangential = cross(alpha, arm)
     centripetal = cross(w, cross(w, arm))

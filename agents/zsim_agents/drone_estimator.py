@@ -4,10 +4,11 @@ Every IMU sample moves the nominal state. At the end of a gate the covariance fo
 measurements are judged and used in one stacked update, and the error found goes back into position, velocity,
 Madgwick's quaternion and the biases.
 
-Madgwick's accelerometer step assumes that a drone does not accelerate. A quadrotor's specific force lies along
-its thrust, so the step pulls the tilt towards level whatever the true tilt. Hence two guards: the gain is chosen
-so small that the pull takes `LEVELLING_S`, and the filter knows the pull as a first-order loss of its tilt error
-driven by the drone's accelerations, and puts the tilt right from what position and velocity say.
+Madgwick's accelerometer step assumes that a drone does not accelerate. A quadrotor's specific force lies
+along its thrust, so the step pulls the tilt towards level whatever the true tilt. Hence two guards: the gain
+is so small that the pull takes `estimator_prior.LEVELLING_S`, and the filter knows the pull as a first-order
+loss of its tilt error, driven by the drone's accelerations, and puts the tilt right from what position and
+velocity say.
 """
 
 from __future__ import annotations
@@ -21,12 +22,17 @@ import numpy as np
 from zsim.scenario import Drone, Environment, Estimation
 from zsim_agents.aiding import Aid, Measurement, aids
 from zsim_agents.aiding_models import write_baro, write_flow, write_gps, write_mag, write_sonar
-from zsim_agents.dead_reckoning import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY, heading_and_sigma, plus
-from zsim_agents.estimator_prior import HEADING_SIGMA_RAD, bias_priors, madgwick_beta, process_noise, set_start
+from zsim_agents.dead_reckoning import ATTITUDE, POSITION, VELOCITY, heading_and_sigma, plus
+from zsim_agents.estimator_prior import (
+    HEADING_SIGMA_RAD,
+    bias_priors,
+    madgwick_beta,
+    process_noise,
+    set_start,
+)
 from zsim_agents.madgwick import (
     Quaternion,
     Vector,
-    compose,
     heading,
     normalised,
     product,
@@ -81,24 +87,20 @@ class DroneEstimator:
         self._magnetometer, self._flow = estimation.magnetometer, estimation.flow
         wanted = [aid for name, aid in self._aids.items() if self._wanted(name)]
         beta = madgwick_beta(estimation, imu, gravity)
-        self._filter = NavigationFilter(
+        self.filter = NavigationFilter(
             process_noise(imu, beta, gravity), bias_priors(imu, wanted), estimation.gate_probability
         )
-        set_start(self._filter)
-        self._strapdown = Strapdown(imu, self._filter.with_accel_bias, beta, gravity, gate_s)
-        self._stack = Stack(self._filter.dim_x)
-        self._bias = [0.0] * self._filter.dim_x  # by index in the error state; those of the IMU are the strapdown's
+        """Read only; `y` and `S` are the innovations of its last update."""
+        set_start(self.filter)
+        self._strapdown = Strapdown(imu, self.filter.with_accel_bias, beta, gravity, gate_s)
+        self._stack = Stack(self.filter.dim_x)
+        self._bias = [0.0] * self.filter.dim_x  # by index in the error state, for the aiding sensors
         latency_s = max(getattr(drone.sensors, name).latency_ms for name in ("imu", *self._aids)) * 1e-3
         self._age_max_s = 2.0 * latency_s + 5.0 * gate_s
         self._history = StateHistory(self._age_max_s, gate_s)
         self._waiting: list[Measurement] = []
         self._start_s = math.nan
         self._heading_known = False
-
-    @property
-    def innovations(self) -> list[float]:
-        """Squared normalised innovations of the last update, in the order in which its sensors came."""
-        return self._filter.distances
 
     def imu(self, t_sample_s: float, accel_m_s2: Vector, gyro_rad_s: Vector) -> None:
         """Move the nominal state to the sample's instant."""
@@ -139,7 +141,7 @@ class DroneEstimator:
             self._wait(aid, t_s, t_sample_s, (range_m,), aid.variance)
 
     def flow(self, t_s: float, t_sample_s: float, velocity_m_s: Sequence[float], quality: float) -> None:
-        """Take a velocity in the heading frame; one of no quality, or before any heading is known, is refused."""
+        """Take a velocity in the heading frame; without quality, or before a heading is known, refuse it."""
         if not self._flow:
             return
         aid = self._aids["flow"]
@@ -156,7 +158,7 @@ class DroneEstimator:
         strapdown.coast(t_s)
         interval = strapdown.take_interval()
         if interval.dt > 0.0:
-            self._filter.advance(strapdown, interval)
+            self.filter.advance(strapdown, interval)
         if not self._heading_known:
             self._settle_heading(t_s)
         if self._waiting:
@@ -181,8 +183,8 @@ class DroneEstimator:
         self._strapdown.place(_vector(position_m), _vector(velocity_m_s), normalised((w, x, y, z)))
         self._strapdown.gyro_bias = _vector(gyro_bias_rad_s)
         for i in range(6):
-            self._filter.P[i, :6] = covariance[6 * i : 6 * i + 6]
-        self._filter.set_variance(YAW, yaw_sigma_rad**2)
+            self.filter.P[i, :6] = covariance[6 * i : 6 * i + 6]
+        self.filter.set_variance(YAW, yaw_sigma_rad**2)
         self._heading_known = yaw_sigma_rad < HEADING_SIGMA_RAD
 
     def _wanted(self, name: str) -> bool:
@@ -205,7 +207,7 @@ class DroneEstimator:
                 return
         if not self._magnetometer or t_s - self._start_s > HEADING_WAIT_S:
             self._turn_heading(self._set_down_yaw - heading(self._strapdown.state[2]))
-            self._filter.set_variance(YAW, SET_DOWN_SIGMA_RAD**2)
+            self.filter.set_variance(YAW, SET_DOWN_SIGMA_RAD**2)
 
     def _angle_to_field(self, measurement: Measurement) -> float:
         """Return by how much the present heading is short of the one that the magnetometer sees."""
@@ -240,13 +242,13 @@ class DroneEstimator:
     def _correct(self, stacked: list[Aid]) -> None:
         if not stacked:
             return
-        passed = self._filter.correct(self._stack)
+        passed = self.filter.correct(self._stack)
         for aid, good in zip(stacked, passed, strict=True):
             aid.judge(good, self._strapdown.t_s)
         if any(passed):
-            error = self._filter.take_error()
+            error = self.filter.take_error()
             self._strapdown.correct(error)
-            if self._filter.aiding_biases:
+            if self.filter.aiding_biases:
                 self._bias = [bias + more for bias, more in zip(self._bias, error.tolist(), strict=True)]
         stacked.clear()
         self._stack.clear()
@@ -266,7 +268,7 @@ class DroneEstimator:
         """Return what the sensor should read and write its rows of H."""
         H, i, R = self._stack.H, self._stack.rows, rotation(past.q)
         if aid.name == "mag":
-            return write_mag(H, i, compose(R, aid.R_BS), self._field)
+            return write_mag(H, i, R, aid.R_BS, self._field)
         if aid.name == "baro":
             return (write_baro(H, i, past.p, R, aid.arm, lag),)
         if aid.name == "flow":
@@ -279,7 +281,7 @@ class DroneEstimator:
         """Return the prediction with the sensor's biases on it, their columns of H written."""
         values = list(predicted)
         for name, row in aid.bias_rows:
-            first = self._filter.bias_index[name]
+            first = self.filter.bias_index[name]
             for k in range(aid.biases[name].size):
                 self._stack.H[self._stack.rows + row + k, first + k] = 1.0
                 values[row + k] += self._bias[first + k]
@@ -289,18 +291,18 @@ class DroneEstimator:
         """Make the states that a long refused sensor sees as uncertain as its innovation."""
         squares = [min(y * y, SQUARE_MAX) for y in innovation]
         if aid.name == "gps":
-            self._filter.add_variance(slice(POSITION, VELOCITY + 3), squares)
+            self.filter.add_variance(slice(POSITION, VELOCITY + 3), squares)
         elif aid.name == "flow":
-            self._filter.add_variance(slice(VELOCITY, VELOCITY + 3), sum(squares))
+            self.filter.add_variance(slice(VELOCITY, VELOCITY + 3), sum(squares))
         elif aid.name == "baro":
-            self._filter.add_variance(slice(POSITION + 2, POSITION + 3), squares[0])
+            self.filter.add_variance(slice(POSITION + 2, POSITION + 3), squares[0])
         elif aid.name == "mag":
-            self._filter.add_variance(YAW, HEADING_SIGMA_RAD**2)
+            self.filter.add_variance(YAW, HEADING_SIGMA_RAD**2)
         aid.refused_since_s = self._strapdown.t_s
 
     def _estimate(self, t_s: float) -> Estimate:
         """Return the estimate for an instant that the IMU may not have reached yet."""
-        strapdown, P = self._strapdown, self._filter.P
+        strapdown, P = self._strapdown, self.filter.P
         p, v, q, a_W, w, _ = strapdown.state
         ahead = t_s - strapdown.t_s
         if ahead > 1e-9:

@@ -53,7 +53,7 @@ class Engagement:
         plan: what the scenario asks for by itself; a Land by request drops the rest of it.
 
     Raises:
-        ValueError: a request of the plan can never be granted, or the number of names is not n.
+        ValueError: the plan can never be flown (see `FlightPlan`), or the number of names is not n.
     """
 
     def __init__(
@@ -65,9 +65,7 @@ class Engagement:
         plan: Sequence[Scheduled] = (),
     ) -> None:
         if len(drones) != space.n:
-            raise ValueError(
-                f"cluster: {len(drones)} drones; allowed: {space.n}, the robots of its cluster space"
-            )
+            raise ValueError(f"cluster: {len(drones)} drones; allowed: {space.n}, as its cluster space has")
         self.space = space
         self.drones = tuple(drones)
         self.gains = gains or FormationGains()
@@ -75,9 +73,8 @@ class Engagement:
         self.law = FormationLaw(space, self.gains)
         self.guidance = Guidance(space, self.gains, self.limits.shape)
         self.plan = FlightPlan(space, plan)
-        self._apart = dataclasses.replace(
-            self.gains, separation_min_m=self.gains.separation_min_m + HOLD_APART_M
-        )
+        held_apart_m = self.gains.separation_min_m + HOLD_APART_M
+        self._apart = dataclasses.replace(self.gains, separation_min_m=held_apart_m)
         self.judge = FlightJudge(space, self.drones, self.gains, self.limits)
         self._phase = "idle"
         self._gate: GateInput | None = None
@@ -109,8 +106,6 @@ class Engagement:
         if refusal is None and isinstance(request, Land):
             self.plan.clear()
         return refusal
-
-    # Requests
 
     def _try(self, request: FlightRequest) -> str | None:
         if self._gate is None:
@@ -151,9 +146,7 @@ class Engagement:
             self.guidance.resume(gate.t_s)
             return
         if self._phase != "assembling":
-            raise RefusalError(
-                f"phase is {self.phase}; engagement is possible when assembling, or held on request"
-            )
+            raise RefusalError(f"phase is {self.phase}; possible when assembling, or when held on request")
         refuse(self.judge.engagement_fault(gate))
         self.guidance.engage(self.judge.value)
         self.law.reset()
@@ -165,11 +158,6 @@ class Engagement:
             raise RefusalError("all drones are on the ground")
         self._phase, self._landing_s = "landing", gate.t_s
         self._mode_sent_s.clear()
-
-    # Phases
-
-    def _idle(self, gate: GateInput) -> GateOutput:
-        return self._output(gate, "")
 
     def _taking_off(self, gate: GateInput) -> GateOutput:
         waiting = self.judge.state_fault(gate, AIRBORNE)
@@ -201,11 +189,11 @@ class Engagement:
         reason = "held on request" if self.guidance.paused else ""
         if command.guarded:
             reason = f"the guard parts {self._pairs(command.guarded)}"
-        output = self._output(
-            gate, reason, v_W=command.v_W, yaw_rate=command.yaw_rate, alarmed=command.alarmed
-        )
         return dataclasses.replace(
-            output, desired=self.space.wrapped(c_des), desired_rate=c_dot_des, factor=command.factor
+            self._output(gate, reason, v_W=command.v_W, yaw_rate=command.yaw_rate, alarmed=command.alarmed),
+            desired=self.space.wrapped(c_des),
+            desired_rate=c_dot_des,
+            factor=command.factor,
         )
 
     def _held(self, gate: GateInput) -> GateOutput:
@@ -221,8 +209,6 @@ class Engagement:
             self._phase = "idle"
         modes = self._modes(gate, "land", AIRBORNE | {"taking_off"})
         return self._output(gate, self.judge.state_fault(gate, DOWN) or "", modes=modes)
-
-    # Judging
 
     def _judge(self, gate: GateInput) -> None:
         """Set the fault of an engaged formation, or heal it when all has been well for a while."""
@@ -252,8 +238,6 @@ class Engagement:
             fault = str(error)
         return f"reference: {fault}" if fault else None
 
-    # Output
-
     def _modes(self, gate: GateInput, mode: str, states: frozenset[str]) -> tuple[ModeCommand, ...]:
         """Return the mode command for drones in one of the states, again where it was sent long ago."""
         commands = []
@@ -281,9 +265,8 @@ class Engagement:
                 if state in AIRBORNE:
                     setpoints[i] = Setpoint(v_W[i], float(rates[i]))
         if alarmed:
-            reason = (
-                f"ALARM, nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(alarmed)}; {reason}"
-            )
+            limit_m = self.gains.separation_alarm_m
+            reason = f"ALARM, nearer than {limit_m:g} m: {self._pairs(alarmed)}; {reason}"
         return GateOutput(
             modes=modes,
             setpoints=tuple(setpoints),
@@ -303,7 +286,7 @@ class Engagement:
 
 
 _PHASES = {
-    "idle": Engagement._idle,
+    "idle": lambda engagement, gate: engagement._output(gate, ""),
     "taking_off": Engagement._taking_off,
     "assembling": Engagement._assembling,
     "engaged": Engagement._engaged,

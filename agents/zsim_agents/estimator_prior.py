@@ -32,7 +32,7 @@ def accel_sigma(imu: Imu) -> float:
 
 
 def madgwick_beta(estimation: Estimation, imu: Imu, gravity: float) -> float:
-    """Return the gain [rad/s]: the scenario's, or the one that levels in `LEVELLING_S` under the IMU's noise."""
+    """Return the gain [rad/s]: the scenario's, or what levels in `LEVELLING_S` under the IMU's noise."""
     if estimation.madgwick_beta is not None:
         return estimation.madgwick_beta
     return beta_for(LEVELLING_S, accel_sigma(imu) / gravity)

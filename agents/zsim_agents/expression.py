@@ -117,6 +117,9 @@ class Expression:
         if len(parts) == 1:
             (only,) = parts
             return _Node(lambda t: function(only(t)), False)
+        if len(parts) == 2:
+            left, right = parts
+            return _Node(lambda t: function(left(t), right(t)), False)
         return _Node(lambda t: function(*[part(t) for part in parts]), False)
 
     def _folded(self, function: Callable[..., Dual], arguments: list[Dual]) -> _Node:

@@ -10,7 +10,7 @@ import numpy as np
 from zsim_agents.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
 from zsim_agents.flight_data import AIRBORNE, EngagementLimits, GateInput
 from zsim_agents.formation import FormationGains
-from zsim_agents.reference_check import shape_fault
+from zsim_agents.reference_check import FAR, shape_fault
 
 
 class FlightJudge:
@@ -46,7 +46,7 @@ class FlightJudge:
     def observe(self, gate: GateInput) -> None:
         """Take over the estimates of a gate."""
         self.margin, self._no_frame = 0.0, "an estimate is not finite"
-        if not np.isfinite(gate.p_W.sum() + gate.yaw.sum()):
+        if not ((np.abs(gate.p_W) < FAR).all() and (np.abs(gate.yaw) < FAR).all()):  # also true for NaN
             return
         try:
             self.value = self.space.forward(gate.p_W, gate.yaw)
@@ -100,13 +100,15 @@ class FlightJudge:
         return None
 
     def _estimate_fault(self, gate: GateInput, sigma_max_m: float) -> str | None:
-        ages, sigmas = gate.age_s.tolist(), gate.sigma_m.max(axis=1).tolist()
-        finite = (gate.p_W.sum(axis=1) + gate.v_W.sum(axis=1) + gate.yaw).tolist()
-        for drone, age_s, sigma_m, known in zip(self.drones, ages, sigmas, finite, strict=True):
+        rows = (gate.age_s, gate.p_W, gate.v_W, gate.yaw, gate.sigma_m)
+        for drone, age_s, p_W, v_W, yaw, sigmas in zip(
+            self.drones, *map(np.ndarray.tolist, rows), strict=True
+        ):
             if not age_s <= self.limits.age_max_s:
                 return f"the estimate of {drone} is {age_s:.2f} s old; allowed: {self.limits.age_max_s:g} s"
-            if not math.isfinite(known):
-                return f"the estimate of {drone} is not finite"
-            if not sigma_m <= sigma_max_m:
-                return f"the position of {drone} has a sigma of {sigma_m:.2f} m; allowed: {sigma_max_m:g} m"
+            if not all(abs(value) < FAR for value in (*p_W, *v_W, yaw)):  # also true for NaN
+                return f"the estimate of {drone} is not finite; allowed: up to {FAR:g} m, m/s or rad"
+            if not all(sigma_m <= sigma_max_m for sigma_m in sigmas):
+                worst_m = max(sigmas)
+                return f"the position of {drone} has a sigma of {worst_m:.2f} m; allowed: {sigma_max_m:g} m"
         return None

@@ -7,7 +7,7 @@ import numpy as np
 from zsim_agents.cluster_space import Array, ClusterSpace
 from zsim_agents.flight_request import Follow, Target
 from zsim_agents.formation import FormationGains
-from zsim_agents.reference_check import ShapeLimits, plan_ramp
+from zsim_agents.reference_check import ShapeLimits, fastest_ramp, plan_ramp
 from zsim_agents.trajectory import Hold, Ramp, Reference, Shifted, TrajectoryError
 
 
@@ -33,10 +33,13 @@ class Guidance:
         self._home: Reference = Hold(np.zeros(space.size))
         self._flown: Reference = self._home
         self._goal = np.zeros(space.size)
+        self._known: tuple[Reference, float, tuple[Array, Array]] | None = None  # the last answer of value
 
     def value(self, t_s: float) -> tuple[Array, Array]:
-        """Return c_des and its rate, each (4n,)."""
-        return self._flown.value(t_s)
+        """Return c_des and its rate, each (4n,); asked twice in a gate, computed once."""
+        if self._known is None or self._known[0] is not self._flown or self._known[1] != t_s:
+            self._known = (self._flown, t_s, self._flown.value(t_s))
+        return self._known[2]
 
     def trajectory_t_s(self, t_s: float) -> float | None:
         """Return the trajectory's own time, or None where none runs."""
@@ -64,7 +67,9 @@ class Guidance:
         trajectory = request.trajectory(self.space, self._base(t_s))
         start_s = request.start_s
         if start_s is None:
-            start_s = t_s + self._ramp(self.value(t_s), Hold(trajectory.value(0.0)[0]), t_s).over_s
+            begin = Hold(trajectory.value(0.0)[0])
+            ramp = fastest_ramp(self.space, self.value(t_s), begin, t_s, self._gains, self._shape)
+            start_s = t_s + ramp.over_s
         home = Shifted(trajectory, start_s)
         self._flown = self._ramp(self.value(t_s), home, t_s)
         self._home, self.paused = home, False

@@ -14,7 +14,8 @@ Quaternion = tuple[float, float, float, float]
 Rotation = tuple[float, float, float, float, float, float, float, float, float]
 
 LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)
-UNIT_VECTOR_SLOPE = math.sqrt(math.pi / 8)  # mean of a unit 2-vector along a small offset e under noise s: slope * e/s
+# Mean of a unit vector in the plane along a small offset e under noise s per axis: slope * e/s.
+UNIT_VECTOR_SLOPE = math.sqrt(math.pi / 8)
 
 
 @compiled
@@ -115,7 +116,7 @@ def heading(q: Quaternion) -> float:
 
 @compiled
 def gravity_gradient(q: Quaternion, f_B: Vector) -> Quaternion:
-    """Return J^T f, the gradient of |R_BW z_W - f_B/|f_B||^2 / 2 over the quaternion [Madgwick (25), (26), (34)].
+    """Return J^T f, the gradient of |R_BW z_W - f_B/|f_B||^2 / 2 over q [Madgwick (25), (26), (34)].
 
     Args:
         q: attitude, B to W.
@@ -153,9 +154,8 @@ def madgwick_step(q: Quaternion, w_WB_B: Vector, f_B: Vector, beta: float, dt: f
     if length == 0.0:
         return normalised(turned)
     scale = beta * dt / length
-    return normalised(
-        (turned[0] - scale * g[0], turned[1] - scale * g[1], turned[2] - scale * g[2], turned[3] - scale * g[3])
-    )
+    w, x, y, z = turned
+    return normalised((w - scale * g[0], x - scale * g[1], y - scale * g[2], z - scale * g[3]))
 
 
 def levelling_time_s(beta: float, direction_sigma_rad: float) -> float:

@@ -1,8 +1,8 @@
 """The error-state EKF of one drone, on filterpy's ExtendedKalmanFilter.
 
 Error state: position (3), velocity (3), small rotation of the attitude (3), all in the world frame, gyroscope
-bias (3) in the body frame, accelerometer bias (3) where the drone has one, then the bias of every other channel
-that has one. Its mean is zero outside of `correct`: the caller moves what an update found into the nominal state.
+bias (3) in the body frame, accelerometer bias (3) where the drone has one, then the bias of every other
+channel that has one. Its mean is zero between gates: what an update finds is moved into the nominal state.
 """
 
 from __future__ import annotations
@@ -12,13 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
+from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from zsim_agents.aiding_models import DOF_MAX, write_squared_distances
+from zsim_agents.aiding_models import DOF_MAX, within_gates
 from zsim_agents.dead_reckoning import GYRO_BIAS, write_prediction
 from zsim_agents.strapdown import Interval, Strapdown
 
+Array = NDArray[np.float64]
+
 ROWS_MAX = 32  # of one stacked update; more measurements of a gate go into a second one
+_INDEX = np.arange(ROWS_MAX)
 
 
 @dataclass(frozen=True)
@@ -47,20 +51,27 @@ class ProcessNoise:
 
 
 class Stack:
-    """Measurements of one instant, to be judged and used together; filled from outside, row by row."""
+    """Measurements of one gate, to be judged and used together; H is filled from outside, row by row.
+
+    Args:
+        size: of the error state.
+    """
 
     def __init__(self, size: int) -> None:
         self.H = np.zeros((ROWS_MAX, size))
-        self.z = np.zeros(ROWS_MAX)
-        self.predicted = np.zeros(ROWS_MAX)
         self.R = np.zeros((ROWS_MAX, ROWS_MAX))
+        self.z: list[float] = []
+        self.predicted: list[float] = []
+        self.variance: list[float] = []
         self.blocks: list[tuple[int, int]] = []
+        """First row and number of rows of each measurement."""
         self.rows = 0
 
     def clear(self) -> None:
         """Forget all measurements."""
         self.H[: self.rows] = 0.0
-        self.blocks.clear()
+        for part in (self.z, self.predicted, self.variance, self.blocks):
+            part.clear()
         self.rows = 0
 
     def has_room(self, rows: int) -> bool:
@@ -68,21 +79,25 @@ class Stack:
         return self.rows + rows <= ROWS_MAX
 
     def add(self, z: Sequence[float], predicted: Sequence[float], variance: Sequence[float]) -> None:
-        """Close a block whose rows of H from `rows` on have been written.
+        """Add a measurement whose rows of H, from `rows` on, have been written.
 
         Args:
-            z: the measurement.
+            z: what was measured.
             predicted: what the nominal state predicts.
-            variance: white noise of each row, squared.
+            variance: of the white noise of each row.
         """
-        first = self.rows
-        last = first + len(z)
-        self.z[first:last] = z
-        self.predicted[first:last] = predicted
-        for row, value in zip(range(first, last), variance, strict=True):
-            self.R[row, row] = value
-        self.blocks.append((first, last - first))
-        self.rows = last
+        self.z += z
+        self.predicted += predicted
+        self.variance += variance
+        self.blocks.append((self.rows, len(z)))
+        self.rows += len(z)
+
+    def arrays(self) -> tuple[Array, Array, Array, Array]:
+        """Return z (m,), the predictions (m,), H (m, n) and R (m, m)."""
+        m = self.rows
+        every = _INDEX[:m]
+        self.R[every, every] = self.variance
+        return np.array(self.z), np.array(self.predicted), self.H[:m], self.R[:m, :m]
 
 
 class NavigationFilter(ExtendedKalmanFilter):
@@ -90,7 +105,7 @@ class NavigationFilter(ExtendedKalmanFilter):
 
     Args:
         noise: process noise.
-        biases: the channels with a bias, in the order of the state; `gyro` comes first, `accel` next if present.
+        biases: the channels with a bias, in the order of the state: `gyro` first, `accel` next if present.
         gate_probability: probability with which a good measurement passes, per sensor and sample.
     """
 
@@ -110,9 +125,9 @@ class NavigationFilter(ExtendedKalmanFilter):
         self._all = np.arange(size)
         self.with_accel_bias = "accel" in biases
         self.aiding_biases = bool(set(biases) - {"gyro", "accel"})
-        self.distances: list[float] = []
-        """Squared normalised innovation of each block of the last update."""
-        self._thresholds = [0.0] + [float(chdtri(dof, 1.0 - gate_probability)) for dof in range(1, DOF_MAX + 1)]
+        self._distances = np.zeros(ROWS_MAX)
+        self._blocks: dict[tuple[tuple[int, int], ...], NDArray[np.int64]] = {}
+        self._limits = np.append(0.0, chdtri(np.arange(1, DOF_MAX + 1), 1.0 - gate_probability))
         for name, prior in biases.items():
             span = slice(self.bias_index[name], self.bias_index[name] + prior.size)
             self._walk[span] = prior.walk**2
@@ -159,29 +174,29 @@ class NavigationFilter(ExtendedKalmanFilter):
             For each block whether it was used.
         """
         before = self.P
-        self._update(stack, slice(0, stack.rows))
-        blocks = stack.blocks
-        distances = np.empty(len(blocks))
-        write_squared_distances(self.S, self.y, np.array(blocks), distances)
-        self.distances = distances.tolist()
+        z, predicted, H, R = stack.arrays()
+        self.update(z, lambda x: H, lambda x: predicted, R)
+        if within_gates(self.S, self.y, self._block_array(stack), self._limits, self._distances):
+            return [True] * len(stack.blocks)
+        self.x, self.P = self._zero, before
         passed = [
-            distance <= self._thresholds[size] for distance, (_, size) in zip(self.distances, blocks, strict=True)
+            bool(distance <= self._limits[size])
+            for distance, (_, size) in zip(self._distances, stack.blocks, strict=False)
         ]
-        if not all(passed):
-            self.x, self.P = self._zero, before
-            used = [block for block, good in zip(blocks, passed, strict=True) if good]
-            kept = [row for first, size in used for row in range(first, first + size)]
-            if kept:
-                self._update(stack, kept)
+        used = [block for block, good in zip(stack.blocks, passed, strict=True) if good]
+        kept = [row for first, size in used for row in range(first, first + size)]
+        if kept:
+            self.update(z[kept], lambda x: H[kept], lambda x: predicted[kept], R[np.ix_(kept, kept)])
         return passed
 
-    def _update(self, stack: Stack, rows: slice | list[int]) -> None:
-        H = stack.H[rows]
-        predicted = stack.predicted[rows]
-        R = stack.R[rows, rows] if isinstance(rows, slice) else stack.R[np.ix_(rows, rows)]
-        self.update(stack.z[rows], lambda x: H, lambda x: predicted, R)
+    def _block_array(self, stack: Stack) -> NDArray[np.int64]:
+        """Return the stack's blocks as an array; few patterns occur, so each is made once."""
+        pattern = tuple(stack.blocks)
+        if pattern not in self._blocks:
+            self._blocks[pattern] = np.array(pattern)
+        return self._blocks[pattern]
 
-    def take_error(self) -> np.ndarray:
-        """Return the mean of the error state and set it to zero, for the caller to put into the nominal state."""
+    def take_error(self) -> Array:
+        """Return the mean of the error state, for the nominal state, and set it to zero."""
         error, self.x = self.x, self._zero
         return error

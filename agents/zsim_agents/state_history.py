@@ -44,8 +44,8 @@ class StateHistory:
     def at(self, t_s: float, now: Moment) -> Moment:
         """Return the state at `t_s` as `now` sees it, later corrections included.
 
-        Between the entries and `now` it is interpolated; before all of them it is the oldest; after `now` it is
-        reached with constant velocity and rate.
+        Between the entries and `now` it is interpolated, before all of them it is the oldest, and after `now`
+        it is reached with constant velocity and rate.
         """
         if t_s >= now.t_s:
             return now if t_s == now.t_s else _ahead(now, t_s - now.t_s)

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from zsim.scenario import Imu
-from zsim_agents.dead_reckoning import ACCEL_BIAS, GYRO_BIAS, Reckoning, acceleration, arm_acceleration, corrected
-from zsim_agents.dead_reckoning import plus, reckon
+from zsim_agents.dead_reckoning import (
+    ACCEL_BIAS,
+    GYRO_BIAS,
+    Reckoning,
+    acceleration,
+    arm_acceleration,
+    corrected,
+    plus,
+    reckon,
+)
 from zsim_agents.madgwick import LEVEL, Quaternion, Vector, product, turn
 from zsim_agents.mount import mount_rotation
 from zsim_agents.state_history import Moment
@@ -72,14 +79,24 @@ class Strapdown:
         self._interval_from(t_s)
 
     def imu(self, t_sample_s: float, accel: Vector, gyro: Vector) -> None:
-        """Move to the sample's instant; duplicates are ignored, late and impossible samples refused and counted.
+        """Move to the sample's instant; ignore a duplicate, refuse and count a late or impossible sample.
 
         Args:
             t_sample_s: instant of the sample [s].
             accel: specific force [m/s^2; S].
             gyro: body rate [rad/s; S].
         """
-        if not (_within(accel, ACCEL_MAX_M_S2) and _within(gyro, GYRO_MAX_RAD_S)):
+        ax, ay, az = accel
+        wx, wy, wz = gyro
+        # Written out, because it runs at every sample; NaN fails each comparison.
+        if not (
+            -ACCEL_MAX_M_S2 < ax < ACCEL_MAX_M_S2
+            and -ACCEL_MAX_M_S2 < ay < ACCEL_MAX_M_S2
+            and -ACCEL_MAX_M_S2 < az < ACCEL_MAX_M_S2
+            and -GYRO_MAX_RAD_S < wx < GYRO_MAX_RAD_S
+            and -GYRO_MAX_RAD_S < wy < GYRO_MAX_RAD_S
+            and -GYRO_MAX_RAD_S < wz < GYRO_MAX_RAD_S
+        ):
             self.refused += 1
             return
         if not self.running:
@@ -160,11 +177,6 @@ class Strapdown:
         accel, gyro = turn(self._R_BS, accel), turn(self._R_BS, gyro)
         w = plus(gyro, self.gyro_bias, -1.0)
         return plus(accel, arm_acceleration(w, self.state[4], self._arm, dt), -1.0), gyro
-
-
-def _within(values: Sequence[float], limit: float) -> bool:
-    """Whether three values are numbers below the limit; NaN is not."""
-    return -limit < values[0] < limit and -limit < values[1] < limit and -limit < values[2] < limit
 
 
 def _plus_three(a: Vector, values: list[float], first: int) -> Vector:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
 from zsim_agents.cluster_space import (
     ROBOTS_MAX,
     SingularClusterError,
@@ -43,7 +42,7 @@ def test_names_are_unique_and_as_many_as_robot_variables(n):
 
 
 def test_three_robots_have_the_variables_of_the_paper_in_its_order():
-    names = "x_c y_c z_c roll pitch yaw phi_1 phi_2 phi_3 p q beta".split()
+    names = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", "phi_1", "phi_2", "phi_3", "p", "q", "beta"]
     assert list(cluster_space(3).names) == names
     wrapping = [name for name, wraps in zip(names, cluster_space(3).angular, strict=True) if wraps]
     assert wrapping == ["roll", "yaw", "phi_1", "phi_2", "phi_3"]
@@ -68,9 +67,10 @@ def test_forward_then_inverse_returns_the_robots(n):
 @given(st.data(), st.sampled_from(SIZES))
 def test_inverse_then_forward_returns_the_cluster(data, n):
     space = cluster_space(n)
-    lower = np.where(np.isfinite(space.lower), space.lower + 0.05, -100.0)
-    upper = np.where(np.isfinite(space.upper), space.upper - 0.05, 100.0)
-    lower[space.lower == 0.0], upper[space.upper == math.inf] = 0.05, 100.0
+    low, high = np.array(space.bounds).T
+    lower = np.where(np.isfinite(low), low + 0.05, -100.0)
+    upper = np.where(np.isfinite(high), high - 0.05, 100.0)
+    lower[low == 0.0], upper[high == math.inf] = 0.05, 100.0
     lower[space.angular], upper[space.angular] = -math.pi, math.pi
     c = np.array([data.draw(st.floats(a, b)) for a, b in zip(lower, upper, strict=True)])
     back = space.forward(*space.inverse(c))
@@ -108,9 +108,7 @@ def test_the_cluster_moves_and_turns_as_one_body(n):
     space = cluster_space(n)
     p_W, yaw = random_robots(n, np.random.default_rng(30 + n))
     turn, shift = 0.7, np.array([3.0, -4.0, 5.0])
-    R = np.array(
-        [(math.cos(turn), -math.sin(turn), 0), (math.sin(turn), math.cos(turn), 0), (0, 0, 1)]
-    )
+    R = np.array([(math.cos(turn), -math.sin(turn), 0), (math.sin(turn), math.cos(turn), 0), (0, 0, 1)])
     centre = p_W.mean(axis=0)
     moved = space.forward((p_W - centre) @ R.T + centre + shift, yaw + turn)
     expected = np.zeros(4 * n)

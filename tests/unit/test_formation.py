@@ -1,4 +1,4 @@
-"""The control law: its formula, its saturation, its integral, and the guard of the distance between robots."""
+"""The control law: its formula, saturation and integral, and the guard of the distance between robots."""
 
 import dataclasses
 import math
@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
 from zsim_agents.cluster_space import cluster_space
 from zsim_agents.formation import FormationGains, FormationLaw, guard, load
 
@@ -57,7 +56,9 @@ def test_yaw_errors_are_taken_the_short_way():
 @settings(deadline=None, max_examples=200, derandomize=True)
 @given(st.lists(st.floats(-30.0, 30.0), min_size=12, max_size=12))
 def test_saturation_keeps_the_limits_and_the_direction_in_cluster_space(errors):
-    gains = dataclasses.replace(GAINS, separation_min_m=0.0, separation_alarm_m=0.0)  # the law without its guard
+    gains = dataclasses.replace(
+        GAINS, separation_min_m=0.0, separation_alarm_m=0.0
+    )  # the law without its guard
     law = FormationLaw(SPACE, gains)
     error = np.array(errors) * np.where(SPACE.in_radians, 0.1, 1.0)
     p_W, _ = SPACE.inverse(GOAL)
@@ -121,7 +122,11 @@ def pair(distance, v_1=(0, 0, 0), v_2=(0, 0, 0)):
 
 
 def test_the_guard_leaves_robots_alone_that_are_far_or_part():
-    for distance, v_1, v_2 in ((20.0, (2, 0, 0), (-2, 0, 0)), (2.5, (-1, 0, 0), (1, 0, 0)), (2.5, (0, 2, 0), (0, 2, 0))):
+    for distance, v_1, v_2 in (
+        (20.0, (2, 0, 0), (-2, 0, 0)),
+        (2.5, (-1, 0, 0), (1, 0, 0)),
+        (2.5, (0, 2, 0), (0, 2, 0)),
+    ):
         v_W, guarded, alarmed = pair(distance, v_1, v_2)
         assert v_W.tolist() == [list(v_1), list(v_2)]
         assert (guarded, alarmed) == ((), ())
@@ -168,7 +173,7 @@ def test_guarded_robots_never_meet_whatever_is_commanded(seed, n):
     p_W = np.zeros((n, 3))
     p_W[:, 0] = 3.0 * np.arange(n)
     v_W = np.zeros((n, 3))
-    least = math.inf
+    wanted, least = np.zeros((n, 3)), math.inf
     for step in range(400):
         if step % 40 == 0:
             wanted = rng.uniform(-1.5, 1.5, (n, 3)) - 0.3 * (p_W - p_W.mean(axis=0))

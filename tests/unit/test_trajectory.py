@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
 from zsim_agents.cluster_space import cluster_space
 from zsim_agents.expression import Expression, ExpressionError
 from zsim_agents.formation import FormationGains
@@ -130,7 +129,8 @@ def test_a_long_sum_is_still_allowed():
 
 
 @pytest.mark.parametrize(
-    ("text", "t"), [("1/(t - 1)", 1.0), ("log(5 - t)", 6.0), ("exp(t)", 1e4), ("sqrt(t)", 0.0), ("t*1e308", 100)]
+    ("text", "t"),
+    [("1/(t - 1)", 1.0), ("log(5 - t)", 6.0), ("exp(t)", 1e4), ("sqrt(t)", 0.0), ("t*1e308", 100)],
 )
 def test_an_expression_without_a_finite_value_says_when(text, t):
     with pytest.raises(ExpressionError, match=rf"x_c: .* at t = {t:g} s"):
@@ -178,7 +178,11 @@ def test_an_expression_trajectory_stands_still_outside_its_time():
 
 @pytest.mark.parametrize(
     ("expressions", "finding"),
-    [({"x": "t"}, "expressions: variable 'x' is unknown.*x_c"), ({"p": math.inf}, "p: found"), ({"p": [1]}, "p: found")],
+    [
+        ({"x": "t"}, "expressions: variable 'x' is unknown.*x_c"),
+        ({"p": math.inf}, "p: found"),
+        ({"p": [1]}, "p: found"),
+    ],
 )
 def test_bad_expression_trajectories_are_refused(expressions, finding):
     with pytest.raises(ValueError, match=finding):
@@ -201,7 +205,9 @@ def waypoints(*pairs):
 def test_waypoints_are_met_and_joined_smoothly():
     trajectory = WaypointTrajectory(
         SPACE,
-        waypoints((2.0, {"x_c": 1.0}), (5.0, {"x_c": 4.0, "z_c": 10.0}), (9.0, {"x_c": 12.0}), (12.0, {"z_c": 8.0})),
+        waypoints(
+            (2.0, {"x_c": 1.0}), (5.0, {"x_c": 4.0, "z_c": 10.0}), (9.0, {"x_c": 12.0}), (12.0, {"z_c": 8.0})
+        ),
         GOAL,
     )
     assert trajectory.duration_s == 12.0
@@ -216,7 +222,9 @@ def test_waypoints_are_met_and_joined_smoothly():
 
 
 def test_waypoints_do_not_overshoot():
-    trajectory = WaypointTrajectory(SPACE, waypoints((0, {"x_c": 0}), (1, {"x_c": 10}), (9, {"x_c": 10.1})), ZERO)
+    trajectory = WaypointTrajectory(
+        SPACE, waypoints((0, {"x_c": 0}), (1, {"x_c": 10}), (9, {"x_c": 10.1})), ZERO
+    )
     x = [trajectory.value(t)[0][0] for t in np.linspace(0, 9, 200)]
     assert min(x) >= 0.0
     assert max(x) <= 10.1

@@ -107,8 +107,8 @@ class Barrier:
         if message.done_ns > participant.done_ns:
             participant.done_ns = message.done_ns
             participant.since_wall_ns = wall_ns
-        participant.missing = max(0, message.sent - participant.received)
-        participant.received = 0
+        balance = participant.received - message.sent
+        participant.received, participant.missing = max(0, balance), max(0, -balance)
         return None
 
     def received(self, name: str) -> None:

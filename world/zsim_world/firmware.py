@@ -60,7 +60,6 @@ RATE_PER_LAG = 0.42  # rate gain times the overdriven lag: damping 0.77 of rate 
 LAG_MIN_S = 0.015  # s, three control steps: faster rotors do not make a faster loop
 LOOP_RATIO = 3.1  # of a loop's gain to that of the loop around it
 K_YAW = 8.0  # 1/s; the rotors' own inertia makes it quicker: 0.04 s as fitted by tum_ardrone
-K_VELOCITY = 3.0  # 1/s, a third of the tilt loop
 K_CLIMB = 4.0  # 1/s, thrust needs no tilt first
 K_HOLD = 0.8  # 1/s, position on the own odometry
 K_HEIGHT = 1.5  # 1/s
@@ -125,6 +124,13 @@ def control(
 
 
 @compiled
+def stands(memory: NDArray) -> bool:
+    """Return whether the firmware knows that it stands on the ground: landed, or spinning up."""
+    spinning_up = memory[MODE] == TAKING_OFF and memory[STEPS] * STEP_S < SPIN_UP_S
+    return memory[MODE] == LANDED or spinning_up
+
+
+@compiled
 def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
     """Change the mode and forget the holds."""
     memory[MODE], memory[STEPS], memory[TOUCH] = mode, 0.0, 0.0
@@ -185,7 +191,7 @@ def _fly(mode: int, memory: NDArray, belief: NDArray, row: NDArray, setting: NDA
     kind = int(setpoint[KIND])
     if mode == FLYING and kind == ROTORS:
         return _clipped(row, four(setpoint, VALUE))
-    if mode == TAKING_OFF and memory[STEPS] * STEP_S < SPIN_UP_S:
+    if stands(memory):
         low = row[ROTOR_MIN]
         return (low, low, low, low)
     if mode == FLYING and kind == ATTITUDE:

@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.errors import RunError
-from zsim.frames import enu_to_geodetic, quaternion_from_heading
-from zsim.scenario import Scenario
-from zsim.streams import NormalBlock, stream
-from zsim_world import firmware, gains, gate, observer, rigid_body, sensor_set, vehicle
-from zsim_world import wind as wind_model
-from zsim_world.battery import percent
+from zsim.frames import enu_to_geodetic
+from zsim.scenario import Gps, Scenario
+from zsim_world import firmware, gate, observer, sensor_set, vehicle, wind
+from zsim_world.noise import NoiseTable
+from zsim_world.sensor_set import SENSORS, VALUES
+from zsim_world.start import arrays
 
 GPS_FIX, GPS_SATELLITES = 3, 9  # a three-dimensional fix; satellites of a real navdata packet
-LAND_BEFORE_TAKEOFF_PERCENT = 2.0 * firmware.LOW_BATTERY_PERCENT  # %, below which it does not take off
+TAKEOFF_PERCENT_MIN = 2.0 * firmware.LOW_BATTERY_PERCENT  # %, below which it does not take off
 UPRIGHT_COSINE = 0.87  # 30 deg, beyond which it does not take off
+QUATERNION_SQUARE_MIN = 1e-6  # shorter, a quaternion has no direction
 NOISE_GATES = 64  # gates between two refills of the noise
-OFF_GROUND = (firmware.HOVERING, firmware.FLYING)
 
 
 class DivergedError(RunError):
@@ -55,3 +55,217 @@ class Truth(NamedTuple):
     angular_velocity_rad_s: NDArray[np.float64]  # (N, 3), B
     accel_m_s2: NDArray[np.float64]  # (N, 3), W
     rotor_rad_s: NDArray[np.float64]  # (N, 4)
+
+
+class Fleet:
+    """All drones of a scenario, stepped together gate by gate from t = 0, standing on the ground."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Place the drones and take the samples of t = 0.
+
+        Raises:
+            DivergedError: the scenario's numbers cannot be integrated.
+        """
+        self.names = [drone.name for drone in scenario.drones]
+        self.count = len(self.names)
+        self.gps_sigma_m = [_gps_sigma(drone.sensors.gps) for drone in scenario.drones]
+        place = scenario.environment
+        self._origin = (place.latitude_deg, place.longitude_deg, place.height_m)
+        self._tick_ns = round(scenario.time.physics_dt_ms * 1_000_000)
+        self._ticks = round(scenario.time.gate_ms / scenario.time.physics_dt_ms)
+        self._tick = 0
+        self._gates = 0
+        self._latency_ns = _latencies(scenario)
+        self._delayed = any(any(row) for row in self._latency_ns)
+        self._later: list[Sample] = []
+        self._noise = NoiseTable(scenario, NOISE_GATES)
+        self._w = arrays(scenario, self._noise)
+        self._integrate(0)
+
+    @property
+    def t_ns(self) -> int:
+        """Simulated time of the present state."""
+        return self._tick * self._tick_ns
+
+    @property
+    def wind_m_s(self) -> NDArray[np.float64]:
+        """Wind at each drone in W, steady and gusts, without the downwash of others; (N, 3)."""
+        return self._w.gust + self._w.wind[wind.STEADY : wind.STEADY + 3]
+
+    def advance(self) -> None:
+        """Integrate one gate with the present setpoints.
+
+        Raises:
+            DivergedError: the state of a drone is no longer finite.
+        """
+        if self._gates % NOISE_GATES == 0:
+            self._noise.refill()
+        self._gates += 1
+        self._integrate(self._ticks)
+
+    def samples(self) -> list[Sample]:
+        """Return what fell due for publication in the last gate, in the order of (t_ns, drone, sensor)."""
+        return self._samples
+
+    def truth(self) -> Truth:
+        """Return the true state now."""
+        s = self._w.state.copy()
+        return Truth(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], self._w.accel[:, 0:3].copy(), s[:, 13:17])
+
+    def status(self, i: int) -> tuple[str, float, bool]:
+        """Return the firmware's mode, the charge [%], and whether the hull touched another in the last gate."""
+        charge = 100.0 * self._w.energy.item(i) / self._w.vehicle.item(i, vehicle.CAPACITY)
+        return firmware.MODES[self._mode(i)], charge, i in self._touching
+
+    def min_separation_m(self) -> float:
+        """Return the least distance between two drones over the last gate; inf for a single one."""
+        return self._least
+
+    def collisions(self) -> list[tuple[int, int]]:
+        """Return the pairs whose hulls began to touch in the last gate."""
+        return self._began
+
+    def takeoff(self, i: int) -> str | None:
+        """Start a take-off; return None, or why not."""
+        charge = self.status(i)[1]
+        if self._mode(i) != firmware.LANDED:
+            return self._not_while(i, "a take-off needs it landed")
+        if charge < TAKEOFF_PERCENT_MIN:
+            return f"{self.names[i]} has {charge:.1f} % of charge; a take-off needs {TAKEOFF_PERCENT_MIN:g} %"
+        x, y = self._w.belief[i, observer.ATTITUDE + 1 : observer.ATTITUDE + 3]
+        if 1.0 - 2.0 * (x * x + y * y) < UPRIGHT_COSINE:
+            return f"{self.names[i]} does not stand upright; a take-off needs it within 30 deg of level"
+        self._enter(i, firmware.TAKING_OFF)
+        return None
+
+    def land(self, i: int) -> str | None:
+        """Start a landing; return None, or why not."""
+        if self._mode(i) in (firmware.LANDED, firmware.EMERGENCY):
+            return self._not_while(i, "a landing needs it in the air")
+        if self._mode(i) != firmware.LANDING:
+            self._enter(i, firmware.LANDING)
+        return None
+
+    def emergency(self, i: int) -> str | None:
+        """Stop the rotors at once; always accepted."""
+        self._enter(i, firmware.EMERGENCY)
+        return None
+
+    def reset(self, i: int) -> str | None:
+        """Leave the emergency; return None, or why not."""
+        if self._mode(i) != firmware.EMERGENCY:
+            return self._not_while(i, "a reset needs an emergency")
+        self._enter(i, firmware.LANDED)
+        return None
+
+    def set_velocity(
+        self,
+        i: int,
+        velocity_m_s: Sequence[float],
+        yaw_rate_rad_s: float = 0.0,
+        frame: Literal["heading", "world"] = "heading",
+    ) -> str | None:
+        """Fly a velocity in the heading frame, or in W turned by the firmware's own heading; return None, or why not."""
+        kind = firmware.VELOCITY if frame == "heading" else firmware.VELOCITY_WORLD
+        return self._set(i, kind, (*velocity_m_s, yaw_rate_rad_s))
+
+    def set_ardrone(
+        self, i: int, forward: float, left: float, up: float, yaw_left: float, hover: bool = False
+    ) -> str | None:
+        """Fly by tilt, climb and yaw rate, each in [-1, 1] of its limit, or hover; return None, or why not."""
+        return self._set(i, firmware.HOVER if hover else firmware.ARDRONE, (forward, left, up, yaw_left))
+
+    def set_attitude(
+        self, i: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float = 0.0
+    ) -> str | None:
+        """Fly a tilt (of q_WB, w first; its heading is not used), thrust [N] and yaw rate; return None, or why not."""
+        if sum(x * x for x in q_WB) < QUATERNION_SQUARE_MIN:
+            return f"{self.names[i]} was sent the orientation {list(q_WB)}; must be a quaternion of length 1"
+        return self._set(i, firmware.ATTITUDE, (*q_WB, thrust_n, yaw_rate_rad_s))
+
+    def set_rotors(self, i: int, speed_rad_s: Sequence[float]) -> str | None:
+        """Command four rotor speeds within the rotors' limits; return None, or why not."""
+        return self._set(i, firmware.ROTORS, tuple(speed_rad_s))
+
+    def release(self, i: int) -> None:
+        """Let nobody fly the drone any more: it hovers."""
+        self._w.setpoint[i, firmware.KIND] = firmware.NONE
+
+    def _set(self, i: int, kind: int, values: tuple[float, ...]) -> str | None:
+        if self._mode(i) not in (firmware.HOVERING, firmware.FLYING):
+            return self._not_while(i, "a setpoint needs it hovering or flying")
+        if not math.isfinite(sum(values)):
+            return f"{self.names[i]} was sent a setpoint with {list(values)}; must be finite"
+        row = self._w.setpoint[i]
+        row[firmware.KIND] = kind
+        row[firmware.VALUE : firmware.VALUE + len(values)] = values
+        self._w.set_tick[i] = self._tick
+        return None
+
+    def _mode(self, i: int) -> int:
+        return int(self._w.memory.item(i, firmware.MODE))
+
+    def _not_while(self, i: int, need: str) -> str:
+        return f"{self.names[i]} is {firmware.MODES[self._mode(i)]}; {need}"
+
+    def _enter(self, i: int, mode: int) -> None:
+        firmware.enter(self._w.memory[i], self._w.belief[i], mode)
+
+    def _integrate(self, ticks: int) -> None:
+        logged, least, diverged = gate.advance(self._w, ticks)
+        self._tick += ticks
+        if diverged >= 0:
+            where = f"{self.names[diverged]} at {self.t_ns / 1e9:.3f} s"
+            raise DivergedError(f"{where}: the state is no longer finite; check its mass, inertia, rotors and dt")
+        self._least = least
+        self._meet(least)
+        fresh = self._fresh(logged)
+        self._samples = self._due(fresh) if self._delayed else fresh
+
+    def _meet(self, least: float) -> None:
+        self._began: list[tuple[int, int]] = []
+        self._touching: set[int] = set()
+        if least < 2.0 * vehicle.HULL_RADIUS_M:
+            self._began = [(int(i), int(j)) for i, j in np.argwhere(self._w.touched)]
+            self._touching = {int(k) for k in np.argwhere(self._w.touched | self._w.touching).ravel()}
+
+    def _fresh(self, logged: int) -> list[Sample]:
+        """Return the samples that the kernel took, in the order of (time, drone, sensor)."""
+        out, tick_ns = [], self._tick_ns
+        fixes: list[int] = []
+        index, values = self._w.log_index[:logged].tolist(), self._w.log_value[:logged].tolist()
+        for (s, i, tick), value in zip(index, values, strict=True):
+            t = tick * tick_ns
+            if s == sensor_set.GPS:
+                fixes.append(len(out))
+            out.append(Sample(SENSORS[s], i, t + self._latency_ns[i][s], t, tuple(value[: VALUES[s]])))
+        if fixes:
+            self._locate(out, fixes)
+        return out
+
+    def _locate(self, out: list[Sample], fixes: list[int]) -> None:
+        """Put latitude, longitude and height in front of the values of GPS samples."""
+        places = enu_to_geodetic([out[k].values[:3] for k in fixes], self._origin).tolist()
+        for k, place in zip(fixes, places, strict=True):
+            out[k] = out[k]._replace(values=(*place, *out[k].values))
+
+    def _due(self, fresh: list[Sample]) -> list[Sample]:
+        """Return what is due by now of the fresh and the delayed samples, and keep the rest."""
+        now, waiting = self.t_ns, self._later + fresh
+        self._later = [sample for sample in waiting if sample.t_ns > now]
+        return sorted((sample for sample in waiting if sample.t_ns <= now), key=_order)
+
+
+def _order(sample: Sample) -> tuple[int, int, int]:
+    return sample.t_ns, sample.drone, SENSORS.index(sample.sensor)
+
+
+def _latencies(scenario: Scenario) -> list[list[int]]:
+    """Return t_ns - t_sample_ns of each drone and sensor [ns]."""
+    return [
+        [round(getattr(drone.sensors, name).latency_ms * 1_000_000) for name in SENSORS] for drone in scenario.drones
+    ]
+
+
+def _gps_sigma(gps: Gps) -> float:
+    return sensor_set.white_sigma(gps.position_m, gps.rate_hz)

@@ -5,7 +5,8 @@ The design model of one horizontal axis (heading frame), driven by white noise:
     dtilt/dt = rate + noise        rate: error of the gyro's bias
     drate/dt = noise, du/dt = noise
 measured by the accelerometer (u - c v: a multirotor's specific force across its thrust is its drag and disturbance)
-and by the optical flow (v). Vertical: dz/dt = v, dv/dt = -c v + u, with a height besides. Heading: psi and rate.
+and by the optical flow (v). Vertical: dz/dt = v, dv/dt = -c v + u, with a height and the accelerometer's bias besides
+(u - c v + bias; across, a bias is one with a tilt). Heading: psi and rate.
 """
 
 import math
@@ -24,18 +25,19 @@ DISTURBANCE_WALK = 0.2  # m/s^2/sqrt(s): gusts of 0.5 m/s over 5 s on a drag of 
 LIFT_WALK = 0.4  # m/s^2/sqrt(s): ground effect and downwash come faster than gusts
 TILT_WALK = 3e-4  # rad/sqrt(s), least: vibration and rounding
 BIAS_WALK = 2e-5  # rad/s/sqrt(s), least: a bias of 0.1 deg/s is found within a minute
+LIFT_BIAS_WALK = 3e-3  # m/s^2/sqrt(s), least: what the board's temperature does to its accelerometer
 FLOORS = {"accel": 0.02, "gyro": 1e-4, "flow": 0.02, "baro": 0.02, "sonar": 0.01, "mag": 0.01}  # m/s^2 rad/s m/s m m rad
 
 # Columns of the gain row: innovation -> state
 ACCEL_V, ACCEL_TILT, ACCEL_RATE, ACCEL_U = 0, 1, 2, 3
 FLOW_V, FLOW_TILT, FLOW_RATE, FLOW_U = 4, 5, 6, 7
-LIFT_Z, LIFT_V, LIFT_U = 8, 9, 10  # accelerometer, vertical
-CLIMB_Z, CLIMB_V, CLIMB_U = 11, 12, 13  # flow, vertical
-BARO_Z, BARO_V, BARO_U = 14, 15, 16
-SONAR_Z, SONAR_V, SONAR_U = 17, 18, 19
-BARO_ZERO = 20
-MAG_PSI, MAG_RATE = 21, 22
-COLUMNS = 23
+LIFT_Z, LIFT_V, LIFT_U, LIFT_BIAS = 8, 9, 10, 11  # accelerometer, vertical
+CLIMB_Z, CLIMB_V, CLIMB_U, CLIMB_BIAS = 12, 13, 14, 15  # flow, vertical
+BARO_Z = 16  # and three more, as above
+SONAR_Z = 20  # and three more
+BARO_ZERO = 24
+MAG_PSI, MAG_RATE = 25, 26
+COLUMNS = 27
 
 
 def gain_row(drone: Drone, environment: Environment) -> Array:
@@ -46,6 +48,7 @@ def gain_row(drone: Drone, environment: Environment) -> Array:
         drag_1_s=drone.drag_n_s_m * environment.air_density_kg_m3 / 1.225 / drone.mass_kg,
         gravity=environment.gravity_m_s2,
         accel=(_sigma(s.imu.accel_m_s2, DEVICE_RATE_HZ, "accel"), DEVICE_RATE_HZ),
+        accel_walk=max(s.imu.accel_m_s2.bias_walk, LIFT_BIAS_WALK),
         gyro=_sigma(radians(s.imu.gyro_deg_s), DEVICE_RATE_HZ, "gyro"),
         gyro_walk=max(radians(s.imu.gyro_deg_s).bias_walk, BIAS_WALK),
         flow=(_sigma(s.flow.velocity_m_s, s.flow.rate_hz, "flow"), heard(s.flow)),
@@ -72,6 +75,7 @@ def _gains(
     drag_1_s: float,
     gravity: float,
     accel: Meter,
+    accel_walk: float,
     gyro: float,
     gyro_walk: float,
     flow: Meter,
@@ -86,11 +90,11 @@ def _gains(
     gain = steady_gains(across, walks, [([-c, 0, 0, 1], *accel), ([1, 0, 0, 0], *flow)])
     row[ACCEL_V : FLOW_U + 1] = gain.ravel()
 
-    up = np.array([[0, 1, 0], [0, -c, 1], [0, 0, 0]], dtype=float)
-    walks = np.array([0.0, 0.0, LIFT_WALK])
-    moving = [([0, -c, 1], *accel), ([0, 1, 0], *flow)]
-    row[LIFT_Z : BARO_U + 1] = steady_gains(up, walks, [*moving, ([1, 0, 0], *baro)]).ravel()
-    row[SONAR_Z : SONAR_U + 1] = steady_gains(up, walks, [*moving, ([1, 0, 0], *sonar)])[2]
+    up = np.array([[0, 1, 0, 0], [0, -c, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
+    walks = np.array([0.0, 0.0, LIFT_WALK, accel_walk])
+    moving = [([0, -c, 1, 1], *accel), ([0, 1, 0, 0], *flow)]
+    row[LIFT_Z:SONAR_Z] = steady_gains(up, walks, [*moving, ([1, 0, 0, 0], *baro)]).ravel()
+    row[SONAR_Z:BARO_ZERO] = steady_gains(up, walks, [*moving, ([1, 0, 0, 0], *sonar)])[2]
     row[BARO_ZERO] = 1.0 / (10.0 * baro[1])  # ten seconds
 
     turn = np.array([[0, 1], [0, 0]], dtype=float)

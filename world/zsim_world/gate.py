@@ -69,35 +69,27 @@ class Arrays(NamedTuple):
 
 
 @compiled
-def _steer(w: Arrays, i: int) -> None:
-    """Let the firmware of drone i see and act."""
-    mode, row = w.memory[i, firmware.MODE], w.vehicle[i]
-    spinning_up = w.memory[i, firmware.STEPS] * observer.STEP_S < firmware.SPIN_UP_S
-    on_ground = mode == firmware.LANDED or (mode == firmware.TAKING_OFF and spinning_up)
-    observer.observe(w.belief[i], row, w.gain[i], w.device[i], w.board[i], on_ground)
-    silence = (w.clock[TICK] - w.set_tick[i]) * w.times[DT]
-    charge = percent(row, w.energy[i])
-    u = firmware.control(
-        w.memory[i],
-        w.belief[i],
-        row,
-        w.setting[i],
-        w.setpoint[i],
-        silence,
-        w.times[SILENCE_HOVER],
-        w.times[SILENCE_LAND],
-        charge,
-    )
-    put_four(w.command[i], 0, u if charge > 0.0 else (0.0, 0.0, 0.0, 0.0))
+def _steer(w: Arrays) -> None:
+    """Let the firmware of every drone see and act."""
+    for i in range(w.state.shape[0]):
+        memory, belief, row = w.memory[i], w.belief[i], w.vehicle[i]
+        on_ground = firmware.stands(memory)
+        observer.observe(belief, row, w.gain[i], w.device[i], w.board[i], on_ground)
+        silence = (w.clock[TICK] - w.set_tick[i]) * w.times[DT]
+        hover_s, land_s = w.times[SILENCE_HOVER], w.times[SILENCE_LAND]
+        charge = percent(row, w.energy[i])
+        u = firmware.control(memory, belief, row, w.setting[i], w.setpoint[i], silence, hover_s, land_s, charge)
+        put_four(w.command[i], 0, u if charge > 0.0 else (0.0, 0.0, 0.0, 0.0))
 
 
 @compiled
-def _move(w: Arrays, i: int) -> None:
-    """Integrate drone i over one tick."""
-    air, push, command = vector(w.air[i], 0), vector(w.push[i], 0), four(w.command[i], 0)
-    row, state = w.vehicle[i], w.state[i]
-    body.step(row, w.anchor[i], state, command, air, push, w.times[DT])
-    drag_anchors(row, w.anchor[i], vector(state, body.POSITION), four(state, body.ATTITUDE))
+def _move(w: Arrays) -> None:
+    """Integrate every drone over one tick."""
+    for i in range(w.state.shape[0]):
+        air, push, command = vector(w.air[i], 0), vector(w.push[i], 0), four(w.command[i], 0)
+        row, state, anchor = w.vehicle[i], w.state[i], w.anchor[i]
+        body.step(row, anchor, state, command, air, push, w.times[DT])
+        drag_anchors(row, anchor, vector(state, body.POSITION), four(state, body.ATTITUDE))
 
 
 @compiled
@@ -111,6 +103,12 @@ def _gusts(w: Arrays) -> None:
 
 
 @compiled
+def _drain(w: Arrays) -> None:
+    for i in range(w.state.shape[0]):
+        w.energy[i] = drained(w.vehicle[i], w.energy[i], four(w.state[i], body.ROTOR), observer.STEP_S)
+
+
+@compiled
 def _meet(w: Arrays) -> float:
     """Set air and pushes for the next tick; return the least distance of two drones [m]."""
     for i in range(w.air.shape[0]):
@@ -120,31 +118,22 @@ def _meet(w: Arrays) -> float:
 
 
 @compiled
-def _accelerate(w: Arrays, i: int) -> None:
-    """Note the accelerations of drone i in its present state."""
-    s = w.state[i]
-    a, alpha = body.accelerations(
-        w.vehicle[i],
-        w.anchor[i],
-        vector(s, body.POSITION),
-        vector(s, body.VELOCITY),
-        four(s, body.ATTITUDE),
-        vector(s, body.RATE),
-        four(s, body.ROTOR),
-        four(w.command[i], 0),
-        vector(w.air[i], 0),
-        vector(w.push[i], 0),
-    )
-    put(w.accel[i], 0, a)
-    put(w.accel[i], 3, alpha)
+def _accelerate(w: Arrays) -> None:
+    """Note the accelerations of every drone in its present state."""
+    for i in range(w.state.shape[0]):
+        s, air, push = w.state[i], vector(w.air[i], 0), vector(w.push[i], 0)
+        p, v, q, rate = body.pose(s)
+        speed, command = four(s, body.ROTOR), four(w.command[i], 0)
+        a, alpha = body.accelerations(w.vehicle[i], w.anchor[i], p, v, q, rate, speed, command, air, push)
+        put(w.accel[i], 0, a)
+        put(w.accel[i], 3, alpha)
 
 
 @compiled
 def _ideal(w: Arrays, i: int, s: int) -> tuple[Vector, Vector]:
     """Return the errorless values of sensor s of drone i; unused places are zero."""
-    state, config = w.state[i], w.config[i, s]
-    p, v = vector(state, body.POSITION), vector(state, body.VELOCITY)
-    q, rate = four(state, body.ATTITUDE), vector(state, body.RATE)
+    config = w.config[i, s]
+    p, v, q, rate = body.pose(w.state[i])
     p_BS, q_BS = vector(config, ss.MOUNT), four(config, ss.TURN)
     none = (0.0, 0.0, 0.0)
     if s == ss.IMU:
@@ -206,31 +195,37 @@ def _register(device: NDArray, s: int, value: NDArray) -> None:
 
 
 @compiled
-def _sense(w: Arrays, i: int, step: bool, logged: int) -> int:
-    """Let the sensors of drone i sample what is due at this tick; return the length of the log.
+def _sense(w: Arrays, step: bool, logged: int) -> int:
+    """Let all sensors sample what is due at this tick; return the length of the log.
 
     The IMU samples in every step of the board, and what is due of it is published.
     """
     tick = w.clock[TICK]
     if step:
-        _accelerate(w, i)
-    for s in range(len(ss.CHANNELS)):
-        plan = w.schedule[i, s]
-        while step if s == ss.IMU else plan[ss.DUE] <= tick:
-            value = w.log_value[logged]
-            kept = _sample(w, i, s, value)
-            if kept:
-                _register(w.device[i], s, value)
-            if plan[ss.DUE] <= tick:
-                plan[ss.COUNT] += 1
-                ticks = plan[ss.COUNT] * plan[ss.NUMERATOR]
-                plan[ss.DUE] = (ticks + plan[ss.DENOMINATOR] - 1) // plan[ss.DENOMINATOR]
+        _accelerate(w)
+    for i in range(w.state.shape[0]):
+        for s in range(len(ss.CHANNELS)):
+            while step if s == ss.IMU else w.schedule[i, s, ss.DUE] <= tick:
+                value = w.log_value[logged]
+                kept = _sample(w, i, s, value)
                 if kept:
+                    _register(w.device[i], s, value)
+                if _due(w.schedule[i, s], tick) and kept:
                     w.log_index[logged, 0], w.log_index[logged, 1], w.log_index[logged, 2] = s, i, tick
                     logged += 1
-            if s == ss.IMU:
-                break
+                if s == ss.IMU:
+                    break
     return logged
+
+
+@compiled
+def _due(plan: NDArray, tick: int) -> bool:
+    """Return whether a sample is due, and plan the next one if so."""
+    if plan[ss.DUE] > tick:
+        return False
+    plan[ss.COUNT] += 1
+    plan[ss.DUE] = (plan[ss.COUNT] * plan[ss.NUMERATOR] + plan[ss.DENOMINATOR] - 1) // plan[ss.DENOMINATOR]
+    return True
 
 
 @compiled
@@ -265,29 +260,22 @@ def _build(sources: int) -> Any:
         Returns:
             number of samples logged, least distance of two drones [m], diverged drone or -1.
         """
-        count = w.state.shape[0]
         logged, least = 0, math.inf if sources >= 0 else 0.0
         w.touched[:, :] = 0
         if ticks == 0:
             least = _meet(w)
-            for i in range(count):
-                logged = _sense(w, i, True, logged)
+            logged = _sense(w, True, logged)
         for _ in range(ticks):
             if w.clock[TICK] % w.clock[TICKS_PER_STEP] == 0:
-                for i in range(count):
-                    _steer(w, i)
-            for i in range(count):
-                _move(w, i)
+                _steer(w)
+            _move(w)
             w.clock[TICK] += 1
             step = w.clock[TICK] % w.clock[TICKS_PER_STEP] == 0
             if step:
                 _gusts(w)
+                _drain(w)
             least = min(least, _meet(w))
-            for i in range(count):
-                logged = _sense(w, i, step, logged)
-                if step:
-                    speed = four(w.state[i], body.ROTOR)
-                    w.energy[i] = drained(w.vehicle[i], w.energy[i], speed, observer.STEP_S)
+            logged = _sense(w, step, logged)
         return logged, least, _diverged(w)
 
     return advance

@@ -23,7 +23,8 @@ ATTITUDE, GYRO_BIAS, VELOCITY, DISTURBANCE = 0, 4, 7, 10  # B to W; rad/s in B; 
 HEIGHT, BARO_ZERO, ODOMETRY = 13, 14, 15  # m over the ground; m; m in W from power-up (2)
 BODY_RATE, ROTOR = 17, 20  # rad/s in B; rad/s, modelled (4)
 STILL_STEPS, BARO_SAMPLES, MAG_SAMPLES, SONAR_AGE = 24, 25, 26, 27  # counts; steps since the last good echo
-COLUMNS = 28
+LIFT_BIAS = 28  # m/s^2, of the accelerometer along the vertical
+COLUMNS = 29
 
 # Columns of the device registers: the newest sample of each sensor and whether it is new
 ACCEL, GYRO, FLOW, FLOW_QUALITY, MAG, BARO, SONAR, SONAR_VALID = 0, 3, 6, 9, 10, 13, 14, 15
@@ -106,6 +107,7 @@ def _stand(belief: NDArray, row: NDArray, f_B: Vector, w: Vector) -> None:
     put(belief, GYRO_BIAS, axpy(vector(belief, GYRO_BIAS), 1.0 / n, w))
     put(belief, VELOCITY, (0.0, 0.0, 0.0))
     put(belief, DISTURBANCE, (0.0, 0.0, 0.0))
+    belief[LIFT_BIAS] += (f_H[2] - row[GRAVITY] - belief[LIFT_BIAS]) / n
     belief[HEIGHT] = STAND_HEIGHT_M
 
 
@@ -127,8 +129,10 @@ def _fly(belief: NDArray, row: NDArray, gain: NDArray, f_B: Vector, turned: floa
     v, u = rot.rotate(back, axpy(v, STEP_S, a)), rot.rotate(back, u)
 
     e = axpy(rot.rotate(q_HB, (f_B[0], f_B[1], f_B[2] - up)), -1.0, axpy(u, -c, v))
-    belief[HEIGHT] += gain[g.LIFT_Z] * e[2]
-    _correct(belief, gain, g.ACCEL_V, v, u, e, gain[g.LIFT_V], gain[g.LIFT_U])
+    put(belief, VELOCITY, v)
+    put(belief, DISTURBANCE, u)
+    _correct(belief, gain, g.ACCEL_V, e)
+    _lift_by(belief, gain, g.LIFT_Z, e[2] - belief[LIFT_BIAS])
 
 
 @compiled
@@ -141,23 +145,30 @@ def lift(belief: NDArray, row: NDArray) -> float:
 
 
 @compiled
-def _correct(
-    belief: NDArray, gain: NDArray, at: int, v: Vector, u: Vector, e: Vector, climb: float, rise: float
-) -> None:
-    """Correct velocity, disturbance, tilt and bias by an innovation e; the four horizontal gains stand at `at`."""
-    kv, kt, kr, ku = gain[at], gain[at + 1], gain[at + 2], gain[at + 3]
-    put(belief, VELOCITY, (v[0] + kv * e[0], v[1] + kv * e[1], v[2] + climb * e[2]))
-    put(belief, DISTURBANCE, (u[0] + ku * e[0], u[1] + ku * e[1], u[2] + rise * e[2]))
-    turn_by(belief, (-kt * e[1], kt * e[0], 0.0))  # a forward velocity is missed by too little nose-down pitch
-    _take_bias(belief, (-kr * e[1], kr * e[0], 0.0))
+def _correct(belief: NDArray, gain: NDArray, at: int, e: Vector) -> None:
+    """Correct horizontal velocity, disturbance, tilt and gyro bias by an innovation; the gains stand at `at`."""
+    for k in range(2):
+        belief[VELOCITY + k] += gain[at] * e[k]
+        belief[DISTURBANCE + k] += gain[at + 3] * e[k]
+    tilt, rate = gain[at + 1], gain[at + 2]
+    turn_by(belief, (-tilt * e[1], tilt * e[0], 0.0))  # faster forward than believed: pitched farther forward
+    _take_bias(belief, (-rate * e[1], rate * e[0], 0.0))
+
+
+@compiled
+def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
+    """Correct height, climb, vertical disturbance and accelerometer bias by an innovation; the gains stand at `at`."""
+    belief[HEIGHT] += gain[at] * e
+    belief[VELOCITY + 2] += gain[at + 1] * e
+    belief[DISTURBANCE + 2] += gain[at + 2] * e
+    belief[LIFT_BIAS] += gain[at + 3] * e
 
 
 @compiled
 def _see_flow(belief: NDArray, gain: NDArray, flow_H: Vector) -> None:
-    v = vector(belief, VELOCITY)
-    e = axpy(flow_H, -1.0, v)
-    belief[HEIGHT] += gain[g.CLIMB_Z] * e[2]
-    _correct(belief, gain, g.FLOW_V, v, vector(belief, DISTURBANCE), e, gain[g.CLIMB_V], gain[g.CLIMB_U])
+    e = axpy(flow_H, -1.0, vector(belief, VELOCITY))
+    _correct(belief, gain, g.FLOW_V, e)
+    _lift_by(belief, gain, g.CLIMB_Z, e[2])
 
 
 @compiled
@@ -170,13 +181,6 @@ def _measure_height(belief: NDArray, gain: NDArray, device: NDArray, sonar_min: 
         _lift_by(belief, gain, g.SONAR_Z, e)
     if device[NEW_BARO] > 0.0 and belief[SONAR_AGE] > SONAR_AGE_MAX:
         _lift_by(belief, gain, g.BARO_Z, device[BARO] - belief[BARO_ZERO] - belief[HEIGHT])
-
-
-@compiled
-def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
-    belief[HEIGHT] += gain[at] * e
-    belief[VELOCITY + 2] += gain[at + 1] * e
-    belief[DISTURBANCE + 2] += gain[at + 2] * e
 
 
 @compiled

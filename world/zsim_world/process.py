@@ -152,7 +152,7 @@ class WorldProcess:
         """Time stands still: say so once a second, and wait for whatever comes."""
         self._flush()
         if wall_ns - self._clock_wall_ns >= CLOCK_STANDING_NS:
-            self._world.tell_clock(wall_ns)
+            self._world.tell_clock(self._world.waiting_for(wall_ns))
             self._flush()
         self._inputs.wait(None)
 
@@ -208,8 +208,9 @@ class WorldProcess:
         if self._world.mode == "realtime":
             return
         for participant in self._world.barrier.short():
-            for sample in self._link.get(keys.process(participant.name, "outputs"), RECOVERY_S):
-                self._take_in(time.monotonic_ns(), sample)
+            answer = self._link.request(keys.process(participant.name, "outputs"), "outputs", WORLD, RECOVERY_S)
+            for key, payload in answer.result or ():
+                self._take_in(time.monotonic_ns(), Sample(key, payload, ""))
             if participant.missing:
                 text = f"{participant.name}: {participant.missing} of its outputs did not come"
                 self._world.event("outputs_missing", participant.name, text, missing=participant.missing)

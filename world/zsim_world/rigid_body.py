@@ -41,6 +41,12 @@ def put_four(row: NDArray, at: int, a: Four) -> None:
 
 
 @compiled
+def pose(state: NDArray) -> tuple[Vector, Vector, Quaternion, Vector]:
+    """Return p_WB, v_WB, q_WB, w_WB_B of one drone's state."""
+    return vector(state, POSITION), vector(state, VELOCITY), four(state, ATTITUDE), vector(state, RATE)
+
+
+@compiled
 def slew(row: NDArray, speed: Four, command: Four) -> Four:
     """Return the rotors' accelerations [rad/s^2] under their first-order lag."""
     s = 1.0 / row[ROTOR_LAG]
@@ -117,7 +123,7 @@ def step(
 
     The rotors' lag is integrated exactly, also inside the step; air and pushes of others are held over it.
     """
-    p, v, q, w = vector(state, POSITION), vector(state, VELOCITY), four(state, ATTITUDE), vector(state, RATE)
+    p, v, q, w = pose(state)
     r0, h = four(state, ROTOR), 0.5 * dt
     decay = math.exp(-h / row[ROTOR_LAG])
     r1 = lagged(r0, command, decay)

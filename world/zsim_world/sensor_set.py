@@ -13,7 +13,7 @@ from zsim.scenario import ErrorModel, Mag, Scenario, Sensor, Sensors
 SENSORS = ("imu", "gps", "mag", "baro", "sonar", "flow")  # the contract's order
 IMU, GPS, MAG, BARO, SONAR, FLOW = range(6)
 CHANNELS = (6, 6, 3, 1, 1, 3)  # numbers with an error of their own
-VALUES = (6, 6, 3, 1, 2, 4)  # numbers of a sample as the kernel gives it (validity and quality have no error)
+VALUES = (6, 6, 3, 2, 2, 4)  # numbers of a sample as the kernel gives it (pressure, validity, quality added)
 CHANNELS_MAX = 6
 NOISE_WIDTH = tuple(2 * n + 1 for n in CHANNELS)  # per sample: white, walk of the bias, and one for drop-out
 DEVICE_RATE_HZ = 200.0  # Hz, the navigation board's IMU and the firmware (AR.Drone 2.0)

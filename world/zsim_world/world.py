@@ -293,18 +293,18 @@ class World:
         self.outbox.extend(self._publication.gate(truth, self.commanders.holder))
         self._ages.published(self.now_ns, wall_ns)
         self._clock_rate.gate(self.now_ns, wall_ns)
-        self.tell_clock(wall_ns)
+        self.tell_clock()
 
-    def tell_clock(self, wall_ns: int, state: Any = None) -> None:
+    def tell_clock(self, waiting_for: tuple[messages.Waiting, ...] = ()) -> None:
         """Put a `clock` into the outbox."""
         clock = messages.Clock(
             t_ns=self.now_ns,
             seq=self._next_seq(keys.CLOCK),
             run_id=self.run_id,
             step=self.now_ns // self.gate_ns,
-            state=state or self.state,
+            state=self.state,  # type: ignore[arg-type]
             rate=round(self._clock_rate.now(), 3),
-            waiting_for=self.waiting_for(wall_ns),
+            waiting_for=waiting_for,
         )
         self.outbox.append(Output(keys.CLOCK, clock))
 
@@ -313,7 +313,7 @@ class World:
         self.ended = self.ended or "ended"
         self.event("end", "world", self.ended, **self.result())
         self.state = "stopped"
-        self.tell_clock(wall_ns)
+        self.tell_clock()
 
     def result(self) -> dict[str, Any]:
         """Return what the run measured of itself."""

@@ -204,7 +204,8 @@ class _Reading:
             self._undecoded += 1
             return
         if isinstance(decoded, _Truth):
-            self._first_wall_ns = self._first_wall_ns or message.wall_ns
+            if self._first_wall_ns is None:
+                self._first_wall_ns = message.wall_ns
             self._last_wall_ns = message.wall_ns
         take(message.key.split("/")[1] if "/" in message.key else "", decoded)
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-
 from zsim_agents.cluster_space import ClusterSpace, SingularClusterError, cluster_space
+
 from zsim_deploy.report.flight import Array, States, Times, Track
 from zsim_deploy.report.statistics import Errors, common_instants, errors
 
@@ -42,7 +42,8 @@ class Formation:
         """Return the statistics of every parameter over a window."""
         rows = self.within(window_s)
         return {
-            name: errors(self.est_error[rows, i], self.true_error[rows, i]) for i, name in enumerate(self.names)
+            name: errors(self.est_error[rows, i], self.true_error[rows, i])
+            for i, name in enumerate(self.names)
         }
 
 

@@ -5,12 +5,27 @@ from pathlib import Path
 
 from zsim.errors import ReportError
 from zsim_deploy.report.figures import figures
-from zsim_deploy.report.flight import read_flight
-from zsim_deploy.report.formation import formation
+from zsim_deploy.report.flight import Flight, read_flight
+from zsim_deploy.report.formation import Formation, formation
 from zsim_deploy.report.page import page
 from zsim_deploy.report.summary import Summary, summarise
 
 RECORD = "run.mcap"
+
+
+def judge(
+    record: Path, progress: Callable[[str], None] = lambda _: None
+) -> tuple[Flight, list[Formation], Summary]:
+    """Return what a record says, and what that amounts to; nothing is written.
+
+    Raises:
+        RecordError: there is no record.
+    """
+    progress("reading the record")
+    flight = read_flight(record)
+    progress("computing the formation's errors")
+    formations = [found for states in flight.clusters if (found := formation(states, flight.tracks))]
+    return flight, formations, summarise(flight, formations, record)
 
 
 def make_report(directory: Path, progress: Callable[[str], None] = lambda _: None) -> Summary:
@@ -24,12 +39,7 @@ def make_report(directory: Path, progress: Callable[[str], None] = lambda _: Non
         RecordError: there is no record.
         ReportError: the directory cannot be written.
     """
-    record = directory / RECORD
-    progress("reading the record")
-    flight = read_flight(record)
-    progress("computing the formation's errors")
-    formations = [found for states in flight.clusters if (found := formation(states, flight.tracks))]
-    summary = summarise(flight, formations, record)
+    flight, formations, summary = judge(directory / RECORD, progress)
     try:
         (directory / "summary.json").write_bytes(summary.json())
         (directory / "figures").mkdir(exist_ok=True)

@@ -15,10 +15,16 @@ from zsim_deploy.report.table import COLUMNS, cells
 def page(summary: Summary, figures: Sequence[Named], directory: Path) -> str:
     """Return the page; `directory` holds the figures' files."""
     environment = Environment(
-        loader=PackageLoader("zsim_deploy.report", "."), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+        loader=PackageLoader("zsim_deploy.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
     )
     tables = {
-        name: [cells(parameter, errors, paper.TABLE_1.get(parameter)) for parameter, errors in cluster.errors.items()]
+        name: [
+            cells(parameter, errors, paper.TABLE_1.get(parameter))
+            for parameter, errors in cluster.errors.items()
+        ]
         for name, cluster in summary.clusters.items()
     }
     return environment.get_template("page.html.j2").render(
@@ -34,13 +40,21 @@ def page(summary: Summary, figures: Sequence[Named], directory: Path) -> str:
 def facts(summary: Summary) -> list[tuple[str, str]]:
     """Return what the head of the page says, as pairs of a word and its value."""
     age = summary.command_age_ms
-    ages = f"p50 {age['p50']:.2f} ms, p99 {age['p99']:.2f} ms, max {age['max']:.2f} ms" if age else "not known"
+    ages = (
+        f"p50 {age['p50']:.2f} ms, p99 {age['p99']:.2f} ms, max {age['max']:.2f} ms" if age else "not known"
+    )
     factor = "not known" if summary.real_time_factor is None else f"{summary.real_time_factor:.1f}"
     return [
-        ("Scenario", f"{summary.scenario or 'not known'}, seed {'–' if summary.seed is None else summary.seed}"),
+        (
+            "Scenario",
+            f"{summary.scenario or 'not known'}, seed {'–' if summary.seed is None else summary.seed}",
+        ),
         ("Mode", summary.mode or "not known"),
         ("Ended", summary.ended),
-        ("Simulated", f"{summary.sim_s:.2f} s in {summary.wall_s:.2f} s of wall time, real-time factor {factor}"),
+        (
+            "Simulated",
+            f"{summary.sim_s:.2f} s in {summary.wall_s:.2f} s of wall time, real-time factor {factor}",
+        ),
         ("Deadlines missed", _misses(summary)),
         ("Command age", ages),
         ("Least separation", _metres(summary.min_separation_m)),

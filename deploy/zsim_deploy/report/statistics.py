@@ -6,15 +6,14 @@ from numpy.typing import NDArray
 
 from zsim_deploy.report.flight import Array, Times, Track
 
-SHARE = 2 / 3  # of the run, its last part: the window of the statistics when the scenario names none
 BLOCK = 512  # instants whose distances are held at once
 
 
 class Errors(Struct, frozen=True):
     """Deviations of one cluster parameter from its desired value, in its own unit (m or rad).
 
-    `est` is what the controller saw (estimate − desired), `true` what the drones did (truth − desired), at the
-    same instants. std² + mean² = rms². None: no such instant.
+    `est` is what the controller saw (estimate − desired), `true` what the drones did (truth − desired), at
+    the same instants. std² + mean² = rms². None: no such instant.
     """
 
     est_std: float | None
@@ -39,15 +38,21 @@ def _moments(error: Array) -> tuple[float | None, float | None, float | None]:
 
 
 def window(asked: tuple[float, float] | None, length_s: float) -> tuple[tuple[float, float], str]:
-    """Return the window of the statistics [s] for a run of some length, and a note where it is not as asked."""
-    default = ((1 - SHARE) * length_s, length_s)
+    """Return the window of the statistics [s] of a run, and a note where it is not the one asked for.
+
+    Without one asked for: the last two thirds of the run.
+    """
+    default = (length_s / 3, length_s)
     if asked is None:
         return default, ""
     start, end = asked
     if end <= length_s:
         return asked, ""
     if start < length_s:
-        return (start, length_s), f"The run ended at {length_s:.2f} s, inside the window {start:g} to {end:g} s."
+        return (
+            start,
+            length_s,
+        ), f"The run ended at {length_s:.2f} s, inside the window {start:g} to {end:g} s."
     return default, (
         f"The run ended at {length_s:.2f} s, before the window {start:g} to {end:g} s; "
         "the last two thirds of what there is are used."

@@ -1,0 +1,102 @@
+"""A fleet at t = 0: every drone on its feet, rotors still, batteries as the scenario says."""
+
+import math
+
+import numpy as np
+
+from zsim.frames import quaternion_from_heading, quaternion_from_rpy
+from zsim.scenario import Drone, Scenario
+from zsim_world import firmware, gains, observer, rigid_body, sensor_set, vehicle
+from zsim_world import wind as wind_model
+from zsim_world.gate import Arrays
+from zsim_world.noise import NoiseTable, samples_per_gate
+
+
+def arrays(scenario: Scenario, noise: NoiseTable) -> Arrays:
+    """Return the arrays of the kernel for a scenario."""
+    drones, field = scenario.drones, scenario.environment
+    n, log = len(drones), samples_per_gate(scenario) + 1
+    row = np.array([vehicle.parameters(drone, field) for drone in drones])
+    state = np.array([_standing(drone) for drone in drones])
+    dt = scenario.time.physics_dt_ms / 1000.0
+    return Arrays(
+        clock=np.array([0, round(observer.STEP_S / dt)], dtype=np.int64),
+        times=np.array([dt, scenario.silence.hover_s, scenario.silence.land_s]),
+        place=np.array([*field.magnetic_field_ut, field.height_m]),
+        wind=_wind(scenario),
+        vehicle=row,
+        setting=np.array([firmware.settings(drone) for drone in drones]),
+        gain=np.array([gains.gain_row(drone, field) for drone in drones]),
+        board=np.array([_calibration(drone, scenario) for drone in drones]),
+        config=sensor_set.config(scenario),
+        schedule=sensor_set.schedule(scenario),
+        setpoint=np.zeros((n, firmware.SETPOINT_COLUMNS)),
+        set_tick=np.zeros(n, dtype=np.int64),
+        state=state,
+        accel=np.zeros((n, 6)),
+        anchor=np.array([_anchors(drone) for drone in drones]),
+        command=np.zeros((n, 4)),
+        energy=row[:, vehicle.CAPACITY] * [drone.battery_percent / 100.0 for drone in drones],
+        memory=np.zeros((n, firmware.MEMORY_COLUMNS)),
+        belief=np.array([_first_belief() for _ in drones]),
+        device=np.zeros((n, observer.REGISTERS)),
+        bias=noise.bias,
+        gust=noise.gust,
+        air=np.zeros((n, 3)),
+        push=np.zeros((n, 3)),
+        touching=np.zeros((n, n), dtype=np.int8),
+        touched=np.zeros((n, n), dtype=np.int8),
+        noise=noise.table,
+        noise_at=noise.at,
+        cursor=noise.cursor,
+        log_index=np.zeros((log, 3), dtype=np.int64),
+        log_value=np.zeros((log, 6)),
+    )
+
+
+def _standing(drone: Drone) -> np.ndarray:
+    """Return the state of a drone whose feet carry its weight; a place above the ground is one that it falls from."""
+    state = np.zeros(rigid_body.COLUMNS)
+    state[rigid_body.POSITION : rigid_body.POSITION + 3] = drone.position_m
+    state[rigid_body.POSITION + 2] += vehicle.STAND_HEIGHT_M
+    state[rigid_body.ATTITUDE : rigid_body.ATTITUDE + 4] = quaternion_from_heading(math.radians(drone.yaw_deg))
+    return state
+
+
+def _anchors(drone: Drone) -> np.ndarray:
+    yaw = math.radians(drone.yaw_deg)
+    turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+    return np.array(drone.position_m[:2]) + vehicle.CONTACT_POINTS_B[:, :2] @ turn.T
+
+
+def _first_belief() -> np.ndarray:
+    """Return the belief at power-up: level, heading unknown until the first magnetometer sample."""
+    belief = np.zeros(observer.COLUMNS)
+    belief[observer.ATTITUDE] = 1.0
+    belief[observer.HEIGHT] = vehicle.STAND_HEIGHT_M
+    belief[observer.STILL_STEPS] = observer.STILL_STEPS_MIN
+    return belief
+
+
+def _calibration(drone: Drone, scenario: Scenario) -> np.ndarray:
+    """Return what the board knows of its mounts, and the bearing of the magnetic field at the place."""
+    board = np.zeros(observer.CALIBRATION)
+    field = scenario.environment.magnetic_field_ut
+    board[observer.IMU_TURN : observer.IMU_TURN + 4] = _turn(drone.sensors.imu.mount.rpy_deg)
+    board[observer.MAG_TURN : observer.MAG_TURN + 4] = _turn(drone.sensors.mag.mount.rpy_deg)
+    board[observer.MAG_BEARING] = math.atan2(field[1], field[0])
+    board[observer.SONAR_MIN] = drone.sensors.sonar.min_m
+    return board
+
+
+def _turn(rpy_deg: tuple[float, float, float]) -> np.ndarray:
+    return quaternion_from_rpy(np.radians(rpy_deg))
+
+
+def _wind(scenario: Scenario) -> np.ndarray:
+    wind = scenario.environment.wind
+    row = np.empty(wind_model.COLUMNS)
+    row[wind_model.STEADY : wind_model.STEADY + 3] = wind.steady_m_s
+    row[wind_model.GUST], row[wind_model.CORRELATION] = wind.gust_m_s, wind.gust_correlation
+    row[wind_model.LENGTH], row[wind_model.SPEED_MIN] = wind.gust_length_m, wind.gust_speed_min_m_s
+    return row
