@@ -3,8 +3,8 @@
     runner ──receive(key, message)──▶ agent          every input of a gate, in canonical order
     runner ──step(t_ns)────────────▶ agent ──▶ [(key, message), …]
 
-Two runners drive it: `zsim.runner` as a process on Zenoh, `zsim.in_process` on an in-memory bus. Both hand over
-the same inputs in the same order, so that the outputs are the same to the bit.
+Two runners drive it: `zsim.runner` as a process on Zenoh, `zsim.in_process` on an in-memory bus. Both hand
+over the same inputs in the same order, so that the outputs are the same to the bit.
 """
 
 from abc import ABC, abstractmethod
@@ -68,7 +68,7 @@ class Agent(ABC):
         """Return the keys whose last values a restarted incarnation wants before anything else."""
         return ()
 
-    def warm_start(self, key: str, message: Any) -> None:
+    def warm_start(self, key: str, message: Any) -> None:  # noqa: B027 - taking over nothing is a choice
         """Take over the last value that the former incarnation published."""
 
     def next_seq(self, key: str) -> int:

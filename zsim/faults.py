@@ -5,26 +5,54 @@ msgspec stops at the first fault; a user who mends a scenario wants them all at 
 
 import math
 import re
+import sys
 from collections.abc import Iterator
+from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 from msgspec import inspect as types
 
+SHOWN_MAX = 60  # characters of what was found that fit into a line
+NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # limits of the representation only
 
-def faults(value: Any, description: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """Yield (path, "is …; must be …") for every place where `value` does not fit the type `description`."""
-    yield from _check(value, types.type_info(description), path)
+Fault = tuple[str, str]
+"""(path, "is …; must be …"); the path of the document itself is empty."""
 
 
-def _check(value: Any, info: types.Type, path: str) -> Iterator[tuple[str, str]]:
+def faults(value: Any, description: Any, path: str = "") -> Iterator[Fault]:
+    """Yield the path and the fault of every place where `value` does not fit the type `description`."""
+    yield from _check(value, _type_info(description), path)
+
+
+def first_fault(value: Any, description: Any) -> Fault | None:
+    """Return the first place where `value` does not fit, None if it does."""
+    return next(faults(value, description), None)
+
+
+def sound(value: Any, description: Any) -> Any:
+    """Return what can be relied on of a faulty document.
+
+    Structs become namespaces with a field for each of theirs: as given, by default, or None where it is missing or
+    faulty. Lists keep their length. What fits is returned as it is.
+    """
+    return _sound(value, _type_info(description))
+
+
+@lru_cache(maxsize=256)
+def _type_info(description: Any) -> types.Type:
+    return types.type_info(description)
+
+
+def _check(value: Any, info: types.Type, path: str) -> Iterator[Fault]:
     if isinstance(info, types.Metadata):
         yield from _check(value, info.type, path)
     elif isinstance(info, types.UnionType):
         yield from _check_union(value, info, path)
     elif isinstance(info, types.StructType):
         yield from _check_struct(value, info, path)
-    elif isinstance(info, types.ListType):
+    elif isinstance(info, types.ListType | types.VarTupleType):
         yield from _check_list(value, info, path)
     elif isinstance(info, types.TupleType):
         yield from _check_tuple(value, info, path)
@@ -36,10 +64,8 @@ def _check(value: Any, info: types.Type, path: str) -> Iterator[tuple[str, str]]
             yield path, fault
 
 
-def _check_union(value: Any, info: types.UnionType, path: str) -> Iterator[tuple[str, str]]:
-    if value is None:
-        if not info.includes_none:
-            yield path, "is empty; must be given"
+def _check_union(value: Any, info: types.UnionType, path: str) -> Iterator[Fault]:
+    if value is None and info.includes_none:
         return
     others = [option for option in info.types if not isinstance(option, types.NoneType)]
     found = [list(_check(value, option, path)) for option in others]
@@ -47,14 +73,15 @@ def _check_union(value: Any, info: types.UnionType, path: str) -> Iterator[tuple
         yield from min(found, key=len)
 
 
-def _check_struct(value: Any, info: types.StructType, path: str) -> Iterator[tuple[str, str]]:
+def _check_struct(value: Any, info: types.StructType, path: str) -> Iterator[Fault]:
     if not isinstance(value, dict):
-        yield path or "the document", f"is {_show(value)}; must be a map"
+        yield path, f"is {show(value)}; must be a map"
         return
     names = {entry.encode_name: entry for entry in info.fields}
-    for key in value:
-        if key not in names:
-            yield _join(path, str(key)), f"is not known; allowed: {', '.join(sorted(names))}"
+    if info.forbid_unknown_fields:
+        for key in value:
+            if key not in names:
+                yield _join(path, key), f"is not known; allowed: {', '.join(sorted(names))}"
     for name, entry in names.items():
         if name in value:
             yield from _check(value[name], entry.type, _join(path, name))
@@ -62,45 +89,50 @@ def _check_struct(value: Any, info: types.StructType, path: str) -> Iterator[tup
             yield _join(path, name), f"is missing; must be {_expected(entry.type)}"
 
 
-def _check_list(value: Any, info: types.ListType, path: str) -> Iterator[tuple[str, str]]:
+def _check_list(value: Any, info: types.ListType | types.VarTupleType, path: str) -> Iterator[Fault]:
     if not isinstance(value, list | tuple):
-        yield path, f"is {_show(value)}; must be a list"
+        yield path, f"is {show(value)}; must be a list"
         return
-    if info.min_length and len(value) < info.min_length:
-        yield path, f"has {len(value)} entries; must have at least {info.min_length}"
-    if info.max_length and len(value) > info.max_length:
-        yield path, f"has {len(value)} entries; must have at most {info.max_length}"
+    least, most = info.min_length or 0, info.max_length
+    if len(value) < least or (most is not None and len(value) > most):
+        yield path, f"has {len(value)} entries; must have {_length(least, most)}"
+    if most is not None and len(value) > most:
         return
     for index, item in enumerate(value):
         yield from _check(item, info.item_type, f"{path}[{index}]")
 
 
-def _check_tuple(value: Any, info: types.TupleType, path: str) -> Iterator[tuple[str, str]]:
+def _length(least: int, most: int | None) -> str:
+    if most is None:
+        return f"at least {least}"
+    return f"{most}" if least == most else f"{least} to {most}"
+
+
+def _check_tuple(value: Any, info: types.TupleType, path: str) -> Iterator[Fault]:
     if not isinstance(value, list | tuple) or len(value) != len(info.item_types):
-        yield path, f"is {_show(value)}; must be a list of {len(info.item_types)} entries"
+        yield path, f"is {show(value)}; must be a list of {len(info.item_types)} entries"
         return
     for index, (item, item_type) in enumerate(zip(value, info.item_types, strict=True)):
         yield from _check(item, item_type, f"{path}[{index}]")
 
 
-def _check_dict(value: Any, info: types.DictType, path: str) -> Iterator[tuple[str, str]]:
+def _check_dict(value: Any, info: types.DictType, path: str) -> Iterator[Fault]:
     if not isinstance(value, dict):
-        yield path, f"is {_show(value)}; must be a map"
+        yield path, f"is {show(value)}; must be a map"
         return
     for key, item in value.items():
-        if not isinstance(key, str):
-            yield _join(path, str(key)), "is a key that is not text; must be text"
-        yield from _check(item, info.value_type, _join(path, str(key)))
+        yield from ((where, f"as a key {text}") for where, text in _check(key, info.key_type, _join(path, key)))
+        yield from _check(item, info.value_type, _join(path, key))
 
 
 def _scalar_fault(value: Any, info: types.Type) -> str | None:
     if isinstance(info, types.FloatType | types.IntType):
         return _number_fault(value, info)
     if isinstance(info, types.BoolType):
-        return None if isinstance(value, bool) else f"is {_show(value)}; must be true or false"
+        return None if isinstance(value, bool) else f"is {show(value)}; must be true or false"
     if isinstance(info, types.LiteralType):
         allowed = ", ".join(str(option) for option in info.values)
-        return None if value in info.values else f"is {_show(value)}; must be one of {allowed}"
+        return None if value in info.values else f"is {show(value)}; must be one of {allowed}"
     if isinstance(info, types.StrType):
         return _text_fault(value, info)
     return None
@@ -108,12 +140,16 @@ def _scalar_fault(value: Any, info: types.Type) -> str | None:
 
 def _number_fault(value: Any, info: types.FloatType | types.IntType) -> str | None:
     whole = isinstance(info, types.IntType)
-    wanted = _expected(info)
-    if isinstance(value, bool) or not isinstance(value, int if whole else int | float):
-        return f"is {_show(value)}; must be {wanted}"
-    if not math.isfinite(value) or not _within(value, info):
-        return f"is {_show(value)}; must be {wanted}"
+    if isinstance(value, bool) or not isinstance(value, int if whole else int | float) or not _finite(value):
+        return f"is {show(value)}; must be {_expected(info)}"
+    if not _within(value, info):
+        wide = whole and not -(2**63) <= value < 2**63
+        return f"is {show(value)}; must be {'a whole number of 63 bits and sign' if wide else _limits(info)}"
     return None
+
+
+def _finite(value: float) -> bool:
+    return not isinstance(value, float) or math.isfinite(value)
 
 
 def _within(value: float, info: types.FloatType | types.IntType) -> bool:
@@ -127,9 +163,9 @@ def _within(value: float, info: types.FloatType | types.IntType) -> bool:
 
 def _text_fault(value: Any, info: types.StrType) -> str | None:
     if not isinstance(value, str):
-        return f"is {_show(value)}; must be text"
+        return f"is {show(value)}; must be text"
     if info.pattern and not re.search(info.pattern, value):
-        return f"is {_show(value)}; must match {info.pattern.strip('^$')}"
+        return f"is {show(value)}; must match {info.pattern.removeprefix('^').removesuffix('$')}"
     return None
 
 
@@ -137,24 +173,84 @@ def _expected(info: types.Type) -> str:
     """Say in words what is allowed."""
     if isinstance(info, types.Metadata):
         return _expected(info.type)
-    if not isinstance(info, types.FloatType | types.IntType):
-        return {types.StrType: "text", types.ListType: "a list", types.StructType: "a map"}.get(
-            type(info), "given"
-        )
-    signs = (("> ", info.gt), (">= ", info.ge), ("< ", info.lt), ("<= ", info.le))
-    limits = [f"{sign}{limit:g}" for sign, limit in signs if limit is not None]
-    kind = "a whole number" if isinstance(info, types.IntType) else "a finite number"
-    return " and ".join(limits) if limits else kind
+    if isinstance(info, types.FloatType | types.IntType):
+        kind = "a whole number" if isinstance(info, types.IntType) else "a finite number"
+        return f"{kind} {_limits(info)}".rstrip()
+    if isinstance(info, types.TupleType):
+        return f"a list of {len(info.item_types)} entries"
+    if isinstance(info, types.LiteralType):
+        return f"one of {', '.join(str(option) for option in info.values)}"
+    words = {
+        types.StrType: "text",
+        types.BoolType: "true or false",
+        types.ListType: "a list",
+        types.VarTupleType: "a list",
+        types.StructType: "a map",
+        types.DictType: "a map",
+    }
+    return words.get(type(info), "given")
 
 
-def _join(path: str, name: str) -> str:
-    return f"{path}.{name}" if path else name
+def _limits(info: types.FloatType | types.IntType) -> str:
+    signs = ((">", info.gt), (">=", info.ge), ("<", info.lt), ("<=", info.le))
+    limits = [f"{sign} {_plain(limit)}" for sign, limit in signs if limit is not None and limit not in NO_LIMITS]
+    return " and ".join(limits)
 
 
-def _show(value: Any) -> str:
-    """Show what was found, short enough for one line."""
-    text = value if isinstance(value, str) else msgspec.json.encode(value, enc_hook=repr).decode()
-    if isinstance(value, float):
-        text = repr(value)
-    text = repr(text) if isinstance(value, str) else text
-    return text if len(text) <= 60 else text[:57] + "..."
+def _plain(limit: float) -> str:
+    return str(limit) if isinstance(limit, int) else f"{limit:g}"
+
+
+def _sound(value: Any, info: types.Type) -> Any:
+    if isinstance(info, types.Metadata):
+        return _sound(value, info.type)
+    if isinstance(info, types.UnionType) and value is not None:
+        return _sound(value, next(option for option in info.types if not isinstance(option, types.NoneType)))
+    if isinstance(info, types.StructType):
+        return _sound_struct(value, info)
+    if isinstance(info, types.ListType):
+        fits = isinstance(value, list | tuple) and len(value) <= (info.max_length or len(value))
+        return [_sound(item, info.item_type) for item in value] if fits else None
+    return None if any(_check(value, info, "")) else value
+
+
+def _sound_struct(value: Any, info: types.StructType) -> SimpleNamespace | None:
+    if not isinstance(value, dict):
+        return None
+    return SimpleNamespace(**{entry.name: _sound_field(value, entry) for entry in info.fields})
+
+
+def _sound_field(value: dict[str, Any], entry: types.Field) -> Any:
+    if entry.encode_name in value:
+        return _sound(value[entry.encode_name], entry.type)
+    if entry.default_factory is not msgspec.NODEFAULT:
+        return entry.default_factory()
+    return None if entry.default is msgspec.NODEFAULT else entry.default
+
+
+def _join(path: str, name: Any) -> str:
+    text = str(name)
+    text = text if text.isprintable() and len(text) <= SHOWN_MAX else show(text)
+    return f"{path}.{text}" if path else text
+
+
+def show(value: Any) -> str:
+    """Return what was found, short enough for one line."""
+    if isinstance(value, dict | list | tuple | set) and len(value) > SHOWN_MAX:
+        return f"{'a map' if isinstance(value, dict) else 'a list'} of {len(value)} entries"
+    try:
+        text = repr(value) if isinstance(value, str | bytes | float) else _as_json(value)
+    except (ValueError, TypeError, OverflowError, RecursionError):
+        text = f"a {type(value).__name__} that is too large to show"
+    return text if len(text) <= SHOWN_MAX else f"{text[: SHOWN_MAX - 3]}..."
+
+
+def _as_json(value: Any) -> str:
+    """Return maps and lists as they would stand in a file; NaN and infinities by their names."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_as_json(key)}: {_as_json(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_as_json, value)) + "]"
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return repr(value)

@@ -1,4 +1,7 @@
-"""What the last bit of a number depends on: CPU feature level, libm, BLAS and the versions of numeric packages."""
+"""What the last bit of a number depends on: CPU feature level, libm, and the versions of the numeric packages.
+
+BLAS comes with numpy and scipy, so their versions stand for it.
+"""
 
 import hashlib
 import importlib.metadata
@@ -19,7 +22,7 @@ def parts() -> dict[str, str]:
         "python": platform.python_version(),
         "machine": platform.machine(),
         "cpu": _cpu_features(),
-        "libc": "-".join(platform.libc_ver()) or platform.system(),
+        "libc": "-".join(filter(None, platform.libc_ver())) or platform.system(),
         **{package: version for package, version in found.items() if version},
     }
 

@@ -5,6 +5,7 @@ import socket
 import sys
 import time
 from collections import deque
+from collections.abc import Callable
 
 from zsim.messages import Health
 
@@ -15,16 +16,21 @@ STEPS_KEPT = 1000
 class HealthMeter:
     """Counters of one process.
 
+    Args:
+        role: of the process.
+        wall_s: monotonic wall time.
+
     Attributes:
         received, refused, dropped: messages taken in, not decodable, and gates given up.
         lag_ns: how far the newest gate is ahead of the one just handled.
         link_lost: whether the world cannot be reached now.
     """
 
-    def __init__(self, role: str) -> None:
+    def __init__(self, role: str, wall_s: Callable[[], float] = time.monotonic) -> None:
         self._role = role
+        self._wall_s = wall_s
         self._steps_us: deque[float] = deque(maxlen=STEPS_KEPT)
-        self._last_s = time.monotonic()
+        self._last_s = wall_s()
         self.received = 0
         self.refused = 0
         self.dropped = 0
@@ -37,7 +43,7 @@ class HealthMeter:
 
     def due(self) -> bool:
         """Tell, once a wall second, that it is time to publish."""
-        now_s = time.monotonic()
+        now_s = self._wall_s()
         if now_s - self._last_s < PERIOD_S:
             return False
         self._last_s = now_s

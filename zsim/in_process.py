@@ -1,4 +1,7 @@
-"""Runs a world and its agents in one process on an in-memory bus: the same inputs in the same order, the same bits."""
+"""Runs a world and its agents in one process on an in-memory bus.
+
+The agents get the same inputs in the same order as on Zenoh, and so give the same bits.
+"""
 
 import os
 import socket
@@ -9,6 +12,7 @@ from msgspec import Struct
 
 from zsim import __version__, keys, messages
 from zsim.agent import Agent, Output
+from zsim.errors import RunError
 from zsim.fingerprint import fingerprint
 from zsim.inbox import Inbox
 
@@ -24,6 +28,7 @@ class Hub(Protocol):
     def advance(self, wall_ns: int) -> None: ...
     def tell_end(self, wall_ns: int) -> None: ...
     def take_outbox(self) -> list[Output]: ...
+    def waiting_for(self, wall_ns: int) -> Sequence[messages.Waiting]: ...
     @property
     def ended(self) -> str | None: ...
 
@@ -53,6 +58,7 @@ class Bus:
         self._sink = sink
         self._agents = [(agent, Inbox(agent.gate_keys, agent.counted)) for agent in agents]
         self._routes: dict[str, list[Inbox]] = {}
+        self._t_ns = 0
 
     def join(self) -> None:
         """Let every agent join the run."""
@@ -72,21 +78,37 @@ class Bus:
             self._to_hub(keys.process(agent.name, "join"), join)
 
     def turn(self) -> bool:
-        """Let the world go one gate further and every agent answer it; return whether the run goes on."""
+        """Let the world go one gate further and every agent answer it; return whether the run goes on.
+
+        Raises:
+            RunError: the world waits for somebody who is not on this bus.
+        """
         if not self._hub.may_advance():
+            self._refuse_to_wait()
             return False
         self._hub.advance(self._wall_ns())
         self._spread()
-        while any([self._step(agent, inbox) for agent, inbox in self._agents]):
+        while self._round():
             pass
         return True
+
+    def _refuse_to_wait(self) -> None:
+        names = ", ".join(waiting.name for waiting in self._hub.waiting_for(self._wall_ns()))
+        if self._hub.ended is None and names:
+            raise RunError(f"the world waits for {names}, not run in-process; see `processes.expect`")
+
+    def _round(self) -> bool:
+        """Let every agent take its next complete gate; return whether any had one."""
+        stepped = [self._step(agent, inbox) for agent, inbox in self._agents]
+        return any(stepped)
 
     def end(self) -> None:
         """Let every agent leave, and the world say its last words."""
         self._hub.tell_end(self._wall_ns())
         self._spread()
         for agent, _ in self._agents:
-            self._to_hub(keys.process(agent.name, "bye"), messages.Bye(0, 0, "the run ended"))
+            bye = messages.Bye(self._t_ns, agent.next_seq("bye"), "the run ended")
+            self._to_hub(keys.process(agent.name, "bye"), bye)
         self._spread()
 
     def _spread(self) -> None:
@@ -99,6 +121,7 @@ class Bus:
         t_ns = inbox.next_gate_ns()
         if t_ns is None or inbox.missing(t_ns) is not None:
             return False
+        self._t_ns = t_ns
         for key, message in inbox.take(t_ns):
             agent.receive(key, message)
         if t_ns % agent.period_ns == 0:

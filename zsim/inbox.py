@@ -4,11 +4,15 @@ Arrival order is never trusted: a gate is complete when each of its closing keys
 and every counted sensor message is there.
 """
 
-from collections import defaultdict
+from bisect import bisect_right, insort
 from collections.abc import Sequence
+from operator import itemgetter
 from typing import Any
 
 from zsim import keys
+
+ALWAYS_NS = -1  # before every gate
+NEVER_NS = 2**63 - 1  # after every gate
 
 
 class Inbox:
@@ -18,90 +22,165 @@ class Inbox:
         gate_keys: keys of which one message with t_ns == t closes the gate t. For a drone's sensor/status its
             `count` is checked too, when `counted` says that all of that drone's sensors are read.
         counted: drones of which all `sensor/*` keys are read.
+
+    Attributes:
+        duplicates: messages that came again before their gate was taken.
+        late: messages that came when their gate had been taken.
     """
 
     def __init__(self, gate_keys: Sequence[str], counted: Sequence[str] = ()) -> None:
-        self._gate_keys = frozenset(gate_keys)
-        self._counted = {keys.status(drone): f"drone/{drone}/sensor/" for drone in counted}
-        self._waiting: list[tuple[int, str, int, Any]] = []
-        self._closed: dict[str, dict[int, int | None]] = {key: {} for key in gate_keys}
-        self._seen: defaultdict[str, set[tuple[int, int]]] = defaultdict(set)
+        self._closing = dict.fromkeys(gate_keys)
+        self._meters = {keys.status(drone): _Meter() for drone in counted}
+        self._came_of: dict[str, list[int] | None] = {}
+        self._waiting: dict[int, dict[tuple[str, int], tuple[str, Any]]] = {}
+        self._stamps: list[int] = []
+        self._lacking: dict[int, dict[str, None]] = {}
+        self._gates: list[int] = []
+        self._expected_from_ns: dict[str, int] = {}
         self._taken_ns = -1
-        self._ignored: set[str] = set()
-        self._partial: set[str] = set(self._counted)
         self.duplicates = 0
         self.late = 0
 
     def put(self, key: str, message: Any) -> bool:
         """Keep one message; return False for a duplicate or one of a gate that has been taken."""
-        mark = (message.t_ns, message.seq)
-        if mark in self._seen[key]:
-            self.duplicates += 1
-            return False
-        if message.t_ns <= self._taken_ns:
+        t_ns = message.t_ns
+        if t_ns <= self._taken_ns:
             self.late += 1
             return False
-        self._seen[key].add(mark)
-        self._waiting.append((message.t_ns, key, message.seq, message))
-        if key in self._gate_keys:
-            self._closed[key][message.t_ns] = message.count if key in self._counted else None
+        stamped = self._waiting.get(t_ns)
+        if stamped is None:
+            stamped = self._waiting[t_ns] = {}
+            _insert(self._stamps, t_ns)
+        mark = (key, message.seq)
+        if mark in stamped:
+            self.duplicates += 1
+            return False
+        stamped[mark] = (key, message)
+        came = self._came_of[key] if key in self._came_of else self._find_came(key)
+        if came is not None:
+            _insert(came, t_ns)
+        if key in self._closing:
+            self._close(key, message)
         return True
+
+    def _find_came(self, key: str) -> list[int] | None:
+        """Return the list of what has come of the counted drone that a sensor key belongs to."""
+        parent, _, _ = key.rpartition("/")
+        meter = self._meters.get(f"{parent}/status")
+        self._came_of[key] = came = meter.came if meter else None
+        return came
+
+    def _close(self, key: str, message: Any) -> None:
+        lacking = self._lacking.get(message.t_ns)
+        if lacking is None:
+            lacking = self._lacking[message.t_ns] = self._closing.copy()
+            _insert(self._gates, message.t_ns)
+        lacking.pop(key, None)
+        if key in self._meters:
+            self._meters[key].count(message)
 
     def next_gate_ns(self) -> int | None:
         """Return the earliest gate for which a closing message has come."""
-        gates = [t_ns for closed in self._closed.values() for t_ns in closed if t_ns > self._taken_ns]
-        return min(gates, default=None)
+        return self._gates[0] if self._gates else None
 
     def latest_gate_ns(self) -> int | None:
         """Return the latest gate for which a closing message has come."""
-        gates = [t_ns for closed in self._closed.values() for t_ns in closed if t_ns > self._taken_ns]
-        return max(gates, default=None)
+        return self._gates[-1] if self._gates else None
 
     def missing(self, t_ns: int) -> str | None:
         """Return a key that the gate still lacks, None when it is complete."""
-        for key, closed in self._closed.items():
-            if key in self._ignored:
-                continue
-            if t_ns not in closed:
+        for key in self._lacking.get(t_ns, self._closing):
+            if self._expects(key, t_ns):
                 return key
-            if key in self._counted and key not in self._partial and self._short(key, t_ns):
+        for key, meter in self._meters.items():
+            if meter.short(t_ns) and self._expects(key, t_ns):
                 return key
         return None
 
     def lost(self, t_ns: int) -> str | None:
         """Return a missing key whose message will not come any more: its publisher has gone on without it."""
         key = self.missing(t_ns)
-        if key is None:
-            return None
-        closed = self._closed[key]
-        return key if t_ns in closed or any(at > t_ns for at in closed) else None
+        if key is None or key not in self._lacking.get(t_ns, self._closing):
+            return key
+        return key if any(key not in self._lacking[gate] for gate in self._gates if gate > t_ns) else None
 
-    def _short(self, key: str, t_ns: int) -> bool:
-        prefix = self._counted[key]
-        have = sum(1 for at, name, _, _ in self._waiting if at <= t_ns and name.startswith(prefix))
-        return have < sum(count or 0 for at, count in self._closed[key].items() if at <= t_ns)
+    def _expects(self, key: str, t_ns: int) -> bool:
+        return t_ns >= self._expected_from_ns.get(key, ALWAYS_NS)
 
     def take(self, t_ns: int) -> list[tuple[str, Any]]:
         """Return all inputs stamped up to t_ns in order of (t_ns, key, seq), and forget them."""
-        ready = sorted((entry for entry in self._waiting if entry[0] <= t_ns), key=lambda entry: entry[:3])
-        self._waiting = [entry for entry in self._waiting if entry[0] > t_ns]
+        ready: list[tuple[str, Any]] = []
+        for stamp in _cut(self._stamps, t_ns):
+            stamped = self._waiting.pop(stamp)
+            ready += stamped.values() if len(stamped) == 1 else map(stamped.__getitem__, sorted(stamped))
+        for gate in _cut(self._gates, t_ns):
+            del self._lacking[gate]
+        for meter in self._meters.values():
+            meter.forget(t_ns)
         self._taken_ns = t_ns
-        self._partial.clear()
-        for closed in self._closed.values():
-            for old in [at for at in closed if at <= t_ns]:
-                del closed[old]
-        for seen in self._seen.values():
-            seen.difference_update([mark for mark in seen if mark[0] <= t_ns])
-        return [(key, message) for _, key, _, message in ready]
+        return ready
 
     def ignore(self, key: str) -> None:
         """Wait for a key no longer: its publisher is dropped from the run."""
-        self._ignored.add(key)
+        self._expected_from_ns[key] = NEVER_NS
 
-    def expect(self, key: str) -> None:
-        """Wait for a key again."""
-        self._ignored.discard(key)
+    def expect(self, key: str, from_ns: int = ALWAYS_NS) -> None:
+        """Wait for a key again, from the gate `from_ns` on."""
+        self._expected_from_ns[key] = from_ns
 
     def start_after(self, t_ns: int) -> None:
         """Ignore everything up to and including t_ns; the next gate is counted in full."""
         self.take(t_ns)
+
+
+class _Meter:
+    """Compares what has come of a drone's sensors with what its status counts.
+
+    The first gate of a late joiner is not compared, since it began before the joiner was there; a status with
+    seq 0 counts from the beginning.
+
+    Attributes:
+        came: stamps of the drone's messages that wait, sorted.
+    """
+
+    def __init__(self) -> None:
+        self.came: list[int] = []
+        self._counts: list[tuple[int, int]] = []
+        self._partial = True
+
+    def count(self, status: Any) -> None:
+        insort(self._counts, (status.t_ns, status.count))
+        if status.seq == 0:
+            self._partial = False
+
+    def short(self, t_ns: int) -> bool:
+        """Tell whether sensor messages of the gates up to t_ns are still to come."""
+        if self._partial:
+            return False
+        due = sum(count for _, count in self._counts[: self._until(t_ns)])
+        return bisect_right(self.came, t_ns) < due
+
+    def forget(self, t_ns: int) -> None:
+        _cut(self.came, t_ns)
+        del self._counts[: self._until(t_ns)]
+        self._partial = False
+
+    def _until(self, t_ns: int) -> int:
+        """Return how many of the counts are of gates up to t_ns."""
+        return bisect_right(self._counts, t_ns, key=itemgetter(0))
+
+
+def _insert(stamps: list[int], t_ns: int) -> None:
+    """Put a stamp into a sorted list; nearly always it is the latest."""
+    if not stamps or t_ns >= stamps[-1]:
+        stamps.append(t_ns)
+    else:
+        insort(stamps, t_ns)
+
+
+def _cut(stamps: list[int], t_ns: int) -> list[int]:
+    """Take the stamps up to t_ns off a sorted list and return them."""
+    place = bisect_right(stamps, t_ns)
+    taken = stamps[:place]
+    del stamps[:place]
+    return taken

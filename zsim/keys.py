@@ -10,6 +10,7 @@ from itertools import groupby
 from zsim.errors import BadNameError
 
 NAME = re.compile(r"[a-z0-9_.-]{1,32}")
+PROCESS_NAME = re.compile(r"[a-z0-9_.-]{1,48}")  # a role, a dot, and a thing of up to 32
 SENSORS = ("imu", "gps", "mag", "baro", "sonar", "flow")
 COMMANDS = ("velocity", "ardrone", "attitude", "rotors", "mode")
 
@@ -85,8 +86,8 @@ def leaf(key: str) -> str:
 def matches(expression: str, key: str) -> bool:
     """Tell whether a key expression takes a key, as Zenoh does (the in-process bus and the history ask here).
 
-    `*` stands for one chunk, `**` for any number of them, `$*` for a part of one; a chunk that begins with `@` is
-    taken only by itself.
+    `*` stands for one chunk, `**` for any number of them, `$*` for a part of one; a chunk that begins with `@`
+    is taken only by itself.
     """
     return expression == key or _compiled(expression).fullmatch(f"{key}/") is not None
 
@@ -102,12 +103,13 @@ def _compiled(expression: str) -> re.Pattern[str]:
     What stands between two wildcards is matched at its first place and kept (atomic groups), so that no
     expression, however contrived, takes more than linear time per wildcard.
     """
-    runs = [list(run) for wild, run in groupby(expression.split("/"), lambda chunk: chunk == "**") if not wild]
+    chunks = expression.split("/")
+    runs = [list(run) for wild, run in groupby(chunks, lambda chunk: chunk == "**") if not wild]
     texts = ["".join(map(_chunk, run)) for run in runs]
-    head = "" if expression.startswith("**") else texts.pop(0)
-    if not texts and not expression.endswith("**"):
-        return re.compile(head)
-    tail = "" if expression.endswith("**") else texts.pop()
+    if "**" not in chunks:
+        return re.compile(texts[0])
+    head = "" if chunks[0] == "**" else texts.pop(0)
+    tail = "" if chunks[-1] == "**" else texts.pop()
     middle = "".join(f"(?>(?:{_CHUNK})*?{text})" for text in texts)
     return re.compile(f"{head}{middle}(?:{_CHUNK})*{tail}")
 
@@ -116,9 +118,9 @@ def _chunk(chunk: str) -> str:
     """Return the pattern of one chunk of an expression, "/" included."""
     if chunk == "*":
         return _CHUNK
+    if chunk.startswith("@") or "$*" not in chunk:
+        return re.escape(f"{chunk}/")
     first, *others = map(re.escape, chunk.split("$*"))
-    if not others:
-        return f"{first}/"
     last = others.pop()
     middle = "".join(f"(?>{_PART}?{text})" for text in others)
     return f"{'' if first else '(?!@)'}{first}{middle}{_PART}{last}/"

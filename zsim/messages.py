@@ -5,17 +5,25 @@ Every message is a msgpack map with exactly these field names, SI units and radi
 """
 
 import math
-from collections.abc import Iterable
-from typing import Any, Literal
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
+from typing import Annotated, Any, Literal, NoReturn
 
 import msgspec
-from msgspec import Struct, structs
+from msgspec import Meta, Struct
 
 from zsim.errors import DecodeError
+from zsim.faults import first_fault
 
-Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-Rotors = tuple[float, float, float, float]
+# Limits that every finite number keeps and that NaN and infinities break: msgspec compares while it decodes.
+Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
+Whole = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Vector3 = tuple[Number, Number, Number]
+Quaternion = tuple[Number, Number, Number, Number]
+Rotors = tuple[Number, Number, Number, Number]
+Covariance = Annotated[tuple[Number, ...], Meta(min_length=36, max_length=36)]
 DroneState = Literal["landed", "taking_off", "hovering", "flying", "landing", "emergency"]
 Phase = Literal["idle", "taking_off", "assembling", "engaged", "landing", "held"]
 PAYLOAD_MAX = 16_000_000  # bytes; a scenario of 1000 drones in world/info is below this
@@ -24,14 +32,14 @@ PAYLOAD_MAX = 16_000_000  # bytes; a scenario of 1000 drones in world/info is be
 class Message(Struct, frozen=True, gc=False):
     """What every message starts with: simulated time of publication, and a count per key from 0."""
 
-    t_ns: int
-    seq: int
+    t_ns: Count
+    seq: Count
 
 
 class Origin(Struct, frozen=True):
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
+    latitude_deg: Number
+    longitude_deg: Number
+    height_m: Number
 
 
 class DroneInfo(Struct, frozen=True):
@@ -45,15 +53,15 @@ class ClusterInfo(Struct, frozen=True):
 
 
 class Info(Message, frozen=True):
-    contract: int
+    contract: Count
     run_id: str
     federation: str
     mode: Literal["lockstep", "realtime"]
-    rate: float
-    gate_ns: int
-    physics_dt_ns: int
-    command_delay_ns: int
-    seed: int
+    rate: Number
+    gate_ns: Count
+    physics_dt_ns: Count
+    command_delay_ns: Count
+    seed: Count
     origin: Origin
     drones: tuple[DroneInfo, ...]
     clusters: tuple[ClusterInfo, ...]
@@ -66,14 +74,14 @@ class Info(Message, frozen=True):
 class Waiting(Struct, frozen=True):
     name: str
     host: str
-    since_wall_s: float
+    since_wall_s: Number
 
 
 class Clock(Message, frozen=True):
     run_id: str
-    step: int
+    step: Count
     state: Literal["waiting", "running", "paused", "stopped"]
-    rate: float
+    rate: Number
     waiting_for: tuple[Waiting, ...] = ()
 
 
@@ -86,52 +94,52 @@ class Event(Message, frozen=True):
 
 
 class Imu(Message, frozen=True):
-    t_sample_ns: int
+    t_sample_ns: Whole
     accel_m_s2: Vector3
     gyro_rad_s: Vector3
 
 
 class Gps(Message, frozen=True):
-    t_sample_ns: int
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
+    t_sample_ns: Whole
+    latitude_deg: Number
+    longitude_deg: Number
+    altitude_m: Number
     position_m: Vector3
     velocity_m_s: Vector3
-    sigma_m: float
-    fix: int
-    satellites: int
+    sigma_m: Number
+    fix: Count
+    satellites: Count
 
 
 class Mag(Message, frozen=True):
-    t_sample_ns: int
+    t_sample_ns: Whole
     field_ut: Vector3
 
 
 class Baro(Message, frozen=True):
-    t_sample_ns: int
-    pressure_pa: float
-    altitude_m: float
+    t_sample_ns: Whole
+    pressure_pa: Number
+    altitude_m: Number
 
 
 class Sonar(Message, frozen=True):
-    t_sample_ns: int
-    range_m: float
+    t_sample_ns: Whole
+    range_m: Number
     valid: bool
 
 
 class Flow(Message, frozen=True):
-    t_sample_ns: int
+    t_sample_ns: Whole
     velocity_m_s: Vector3
-    quality: float
+    quality: Number
 
 
 class Status(Message, frozen=True):
     state: DroneState
-    battery_percent: float
+    battery_percent: Number
     collision: bool
     commander: str | None
-    count: int
+    count: Count
 
 
 class Truth(Message, frozen=True):
@@ -151,22 +159,22 @@ class Command(Message, frozen=True):
 
 class Velocity(Command, frozen=True):
     velocity_m_s: Vector3
-    yaw_rate_rad_s: float
+    yaw_rate_rad_s: Number
     frame: Literal["heading", "world"] = "heading"
 
 
 class Ardrone(Command, frozen=True):
-    forward: float
-    left: float
-    up: float
-    yaw_left: float
+    forward: Number
+    left: Number
+    up: Number
+    yaw_left: Number
     hover: bool = False
 
 
 class Attitude(Command, frozen=True):
     orientation_wxyz: Quaternion
-    thrust_n: float
-    yaw_rate_rad_s: float
+    thrust_n: Number
+    yaw_rate_rad_s: Number
 
 
 class RotorSpeeds(Command, frozen=True):
@@ -181,11 +189,11 @@ class Estimate(Message, frozen=True):
     position_m: Vector3
     velocity_m_s: Vector3
     orientation_wxyz: Quaternion
-    yaw_rad: float
-    covariance: tuple[float, ...]
-    yaw_sigma_rad: float
+    yaw_rad: Number
+    covariance: Covariance
+    yaw_sigma_rad: Number
     gyro_bias_rad_s: Vector3
-    sensors: dict[str, tuple[int, int]]
+    sensors: dict[str, tuple[Count, Count]]
     source: str = ""
 
 
@@ -193,11 +201,11 @@ class ClusterState(Message, frozen=True):
     phase: Phase
     drones: tuple[str, ...]
     names: tuple[str, ...]
-    value: tuple[float, ...]
-    desired: tuple[float, ...]
-    desired_rate: tuple[float, ...]
-    trajectory_t_s: float | None
-    margin: float
+    value: tuple[Number, ...]
+    desired: tuple[Number, ...]
+    desired_rate: tuple[Number, ...]
+    trajectory_t_s: Number | None
+    margin: Number
     reason: str
     source: str = ""
 
@@ -208,7 +216,7 @@ class Join(Message, frozen=True):
     role: str
     host: str
     pid: int
-    period_ns: int
+    period_ns: Whole
     version: str = ""
     fingerprint: str = ""
 
@@ -216,8 +224,8 @@ class Join(Message, frozen=True):
 class Done(Message, frozen=True):
     run_id: str
     incarnation: int
-    done_ns: int
-    sent: int
+    done_ns: Whole
+    sent: Count
 
 
 class Bye(Message, frozen=True):
@@ -228,11 +236,11 @@ class Health(Message, frozen=True):
     role: str
     host: str
     pid: int
-    step_us: dict[str, float]
-    lag_ns: int
-    dropped: int
-    refused: int
-    rss_bytes: int
+    step_us: dict[str, Number]
+    lag_ns: Whole
+    dropped: Count
+    refused: Count
+    rss_bytes: Count
 
 
 class DroneView(Struct, frozen=True):
@@ -241,7 +249,7 @@ class DroneView(Struct, frozen=True):
     orientation_wxyz: Quaternion
     rotor_rad_s: Rotors
     state: str
-    battery_percent: float
+    battery_percent: Number
 
 
 class ViewDrones(Message, frozen=True):
@@ -252,8 +260,8 @@ class ViewDrones(Message, frozen=True):
 class ViewCluster(Message, frozen=True):
     phase: Phase
     names: tuple[str, ...]
-    value: tuple[float, ...]
-    desired: tuple[float, ...]
+    value: tuple[Number, ...]
+    desired: tuple[Number, ...]
     reason: str
 
 
@@ -299,19 +307,11 @@ _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
     ("process", "health"): Health,
 }
 _VIEW_CLUSTER = "view/cluster/"
-_types: dict[str, type[Struct] | None] = {}
-_decoders: dict[type[Struct], msgspec.msgpack.Decoder[Any]] = {}
 _encoder = msgspec.msgpack.Encoder()
 
 
 def type_of(key: str) -> type[Struct] | None:
     """Return the message type that the contract puts on a key, None for a key that it does not know."""
-    if key not in _types:
-        _types[key] = _find_type(key)
-    return _types[key]
-
-
-def _find_type(key: str) -> type[Struct] | None:
     if key.startswith(_VIEW_CLUSTER):
         return ViewCluster
     parts = key.split("/", 2)
@@ -322,6 +322,11 @@ def types_by_shape() -> dict[str, type[Struct]]:
     """Return all message types with the shape of their key, for documentation and for tests over every message."""
     shapes = {f"{kind}/*/{rest}": message for (kind, rest), message in _BY_SHAPE.items()}
     return {**_FIXED, **shapes, "view/cluster/*": ViewCluster}
+
+
+def fields(kind: type[Struct]) -> Iterable[str]:
+    """Return the names of a message's fields in order."""
+    return kind.__struct_fields__
 
 
 def encode(message: Struct) -> bytes:
@@ -341,61 +346,124 @@ def decode(key: str, payload: bytes) -> Any:
     Raises:
         DecodeError: names key, field, found and allowed.
     """
-    kind = type_of(key)
+    kind, read = _reader_of(key)
     if kind is None:
-        raise DecodeError(f"{key}: is no key of the contract; see docs/protocol.md")
-    return decode_as(kind, payload, key)
+        raise DecodeError(f"{key:.80}: is no key of the contract; see docs/protocol.md")
+    try:
+        return read(payload) if len(payload) <= PAYLOAD_MAX else _too_long(payload)
+    except _REFUSALS as error:
+        raise _refusal(kind, payload, key, error) from error
 
 
 def decode_as(kind: type[Struct], payload: bytes, where: str) -> Any:
     """Return `payload` as a `kind`; `where` opens the text of the DecodeError."""
-    if len(payload) > PAYLOAD_MAX:
-        raise DecodeError(f"{where}: payload has {len(payload)} bytes; at most {PAYLOAD_MAX}")
     try:
-        message = _decoder(kind).decode(payload)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, OverflowError) as error:
-        raise DecodeError(f"{where}: {_reason(error)}; must be a {kind.__name__}") from error
-    if isinstance(message, Message):
-        _check_stamp(message, where)
-    _check_finite(message, where)
-    return message
+        return _reader(kind)(payload) if len(payload) <= PAYLOAD_MAX else _too_long(payload)
+    except _REFUSALS as error:
+        raise _refusal(kind, payload, where, error) from error
 
 
-def _decoder(kind: type[Struct]) -> msgspec.msgpack.Decoder[Any]:
-    if kind not in _decoders:
-        _decoders[kind] = msgspec.msgpack.Decoder(kind)
-    return _decoders[kind]
+_REFUSALS = (ValueError, TypeError, RecursionError, OverflowError, MemoryError, msgspec.MsgspecError)
+_Reader = Callable[[bytes], Any]
 
 
-def _reason(error: Exception) -> str:
-    """Return msgspec's text with the path first: "velocity_m_s[2]: Expected `float`, got `str`"."""
-    text, _, path = str(error).partition(" - at `$")
-    return f"{path.strip('`').lstrip('.')}: {text}" if path else text
+@lru_cache(maxsize=65_536)  # keys come from other processes too
+def _reader_of(key: str) -> tuple[type[Struct] | None, _Reader]:
+    kind = type_of(key)
+    return kind, _reader(kind or Struct)
 
 
-def _check_stamp(message: Message, where: str) -> None:
-    if message.t_ns < 0 or message.seq < 0:
-        raise DecodeError(f"{where}: t_ns is {message.t_ns} and seq {message.seq}; both must be >= 0")
+@lru_cache(maxsize=None)
+def _reader(kind: type[Struct]) -> _Reader:
+    """Return what turns a payload into a checked `kind`: the bare decoder where its types say everything."""
+    decode_bare = msgspec.msgpack.Decoder(kind).decode
+    fault_of = _RELATIONS.get(kind)
+    if fault_of is None:
+        return decode_bare
+
+    def read(payload: bytes) -> Any:
+        message = decode_bare(payload)
+        fault = fault_of(message)
+        if fault:
+            raise ValueError(fault)
+        return message
+
+    return read
 
 
-def _check_finite(message: Struct, where: str) -> None:
-    for name in message.__struct_fields__:
-        if not _finite(getattr(message, name)):
-            found = getattr(message, name)
-            raise DecodeError(f"{where}: {name} is {found!r:.80}; must be finite numbers")
+def _too_long(payload: bytes) -> NoReturn:
+    raise ValueError(f"the payload has {len(payload)} bytes; must have at most {PAYLOAD_MAX}")
 
 
-def _finite(value: Any) -> bool:
-    kind = type(value)
-    if kind is float:
-        return math.isfinite(value)
-    if kind is tuple or kind is list:
-        return all(map(_finite, value))
-    if kind is dict:
-        return all(map(_finite, value.values()))
-    return not isinstance(value, Struct) or all(_finite(part) for part in structs.astuple(value))
+def _refusal(kind: type[Struct], payload: bytes, where: str, error: Exception) -> DecodeError:
+    """Return the refusal in the contract's words: key, field, what was found, what is allowed."""
+    where = where if len(where) <= 80 else f"{where[:77]}..."
+    if not isinstance(error, msgspec.MsgspecError):
+        return DecodeError(f"{where}: {str(error) or type(error).__name__}")
+    try:
+        found = first_fault(msgspec.msgpack.decode(payload), kind)
+    except _REFUSALS as fault:
+        return DecodeError(
+            f"{where}: the payload ({len(payload)} bytes) is not msgpack ({fault}); must be a map, the {kind.__name__}"
+        )
+    path, text = found or ("", f"is refused ({error})")
+    return DecodeError(f"{where}: {path or 'the payload'} {text}")
 
 
-def fields(kind: type[Struct]) -> Iterable[str]:
-    """Return the names of a message's fields in order."""
-    return kind.__struct_fields__
+# What the types alone do not say
+
+
+def _event_fault(event: Event) -> str | None:
+    return _free_fault("data", event.data)
+
+
+def _request_fault(request: ControlRequest) -> str | None:
+    return _free_fault("args", request.args)
+
+
+def _answer_fault(answer: ControlAnswer) -> str | None:
+    return _free_fault("result", answer.result)
+
+
+def _free_fault(field: str, value: Any) -> str | None:
+    """Return the fault of a field whose content is free: only its numbers must be finite."""
+    found = next((number for number in _numbers(value) if not math.isfinite(number)), None)
+    return None if found is None else f"{field} holds {found}; must be finite numbers"
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from _numbers(key)
+            yield from _numbers(item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _numbers(item)
+
+
+def _state_fault(state: ClusterState) -> str | None:
+    wanted = 4 * len(state.drones)
+    return _length_fault(state, ("names", "value", "desired", "desired_rate"), wanted)
+
+
+def _view_fault(view: ViewCluster) -> str | None:
+    return _length_fault(view, ("value", "desired"), len(view.names))
+
+
+def _length_fault(message: Struct, names: tuple[str, ...], wanted: int) -> str | None:
+    for name in names:
+        found = len(getattr(message, name))
+        if found != wanted:
+            return f"{name} has {found} entries; must have {wanted}"
+    return None
+
+
+_RELATIONS: dict[type[Struct], Callable[[Any], str | None]] = {
+    Event: _event_fault,
+    ControlRequest: _request_fault,
+    ControlAnswer: _answer_fault,
+    ClusterState: _state_fault,
+    ViewCluster: _view_fault,
+}

@@ -330,14 +330,16 @@ class Runner:
             self._inbox.ignore(keys.estimate(event.subject.split(".", 1)[1]))
         elif event.kind == "join" and event.subject.startswith("estimator."):
             self._inbox.expect(keys.estimate(event.subject.split(".", 1)[1]))
-        elif event.subject == self._agent.name:
+        elif event.subject == self._agent.name and event.kind in ("superseded", "restart"):
             self._serve_own_event(event)
 
     def _serve_own_event(self, event: messages.Event) -> None:
+        """This process was taken in for a former one of its name, or is itself the former one."""
         data: dict[str, Any] = event.data
-        if event.kind in ("superseded", "restart") and data.get("incarnation") != self._incarnation:
-            if data.get("former_pid") != os.getpid() or data.get("pid") == os.getpid():
-                return
+        if data.get("incarnation") == self._incarnation:
+            if self._done_ns < 0:
+                self._replay(max(int(data["from_ns"]) - 1, int(data["done_ns"])))
+        elif data.get("former_pid") == os.getpid() and data.get("pid") != os.getpid():
             self._leave = "superseded"
             self._failure = (
                 f"{self._agent.name}: another process of this name joined from {data.get('host')} "

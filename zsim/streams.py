@@ -20,7 +20,7 @@ def stream(seed: int, name: str) -> np.random.Generator:
 
 
 class NormalBlock:
-    """Standard normal numbers of one stream, drawn in blocks because a call per sample costs more than the number.
+    """Standard normal numbers of one stream, drawn in blocks: a call per sample costs more than the number.
 
     The sequence does not depend on the block's size.
     """

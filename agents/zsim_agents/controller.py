@@ -135,7 +135,7 @@ class Controller(Agent):
         return (self._state_key,)
 
     def warm_start(self, key: str, message: messages.ClusterState) -> None:
-        self._engagement.warm_start(message.phase, np.array(message.desired), message.t_ns * 1e-9)
+        self._engagement.warm_start(message.phase, np.array(message.desired))
 
 
 _UNKNOWN = messages.Estimate(

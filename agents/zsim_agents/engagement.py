@@ -107,6 +107,22 @@ class Engagement:
             self.plan.clear()
         return refusal
 
+    def warm_start(self, phase: str, desired: Array) -> None:
+        """Go on where a former process of this formation was: in its phase, at its reference (4n,).
+
+        What its plan leads to (a target, a trajectory) is asked for again, from that reference.
+        """
+        if phase in ("engaged", "held"):
+            self._phase = "engaged"
+            self.guidance.engage(desired)
+            self.plan.skip((TakeOff, Engage))
+        elif phase in ("taking_off", "assembling"):
+            self._phase = phase
+            self.plan.skip((TakeOff,))
+        elif phase == "landing":
+            self._phase = phase
+            self.plan.clear()
+
     def _try(self, request: FlightRequest) -> str | None:
         if self._gate is None:
             return "no gate was seen yet; ask again when the simulation runs"
@@ -222,8 +238,7 @@ class Engagement:
 
     def _heal(self, gate: GateInput) -> None:
         try:
-            refuse(self.judge.formation_fault(gate))
-            self.guidance.rejoin(self.judge.value, gate.t_s)
+            self.guidance.rejoin(self.judge.value, gate.t_s, self.limits.shape_in_flight)
         except REFUSALS as refusal:
             self._fault, self._well_since_s = f"cannot go on: {refusal}", gate.t_s
         else:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -39,6 +41,16 @@ class EngagementLimits:
     sigma_lost_m: float = 2.0
     heal_s: float = 0.5
     resend_s: float = 1.0
+
+    @property
+    def shape_in_flight(self) -> ShapeLimits:
+        """Return the wider limits beyond which a formation in flight is held."""
+        return dataclasses.replace(
+            self.shape,
+            spread_min_m=self.shape.spread_min_m / self.flight_slack,
+            tilt_max_rad=self.shape.tilt_max_rad * self.flight_slack,
+            condition_max=math.inf,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
-
 import numpy as np
 
 from zsim_agents.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
@@ -32,13 +29,7 @@ class FlightJudge:
         self.drones = drones
         self.gains = gains
         self.limits = limits
-        slack, shape = limits.flight_slack, limits.shape
-        self._shape_in_flight = dataclasses.replace(
-            shape,
-            spread_min_m=shape.spread_min_m / slack,
-            tilt_max_rad=shape.tilt_max_rad * slack,
-            condition_max=math.inf,
-        )
+        self._shape_in_flight = limits.shape_in_flight
         self.value: Array = np.zeros(space.size)
         self.margin = 0.0
         self._no_frame: str | None = "nothing was observed yet"

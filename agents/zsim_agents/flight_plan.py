@@ -51,6 +51,11 @@ class FlightPlan:
             self._steps.popleft()
             self._try_s, self.note = -math.inf, ""
 
+    def skip(self, kinds: tuple[type, ...]) -> None:
+        """Drop the leading requests of these kinds: they were granted before a restart."""
+        while self._steps and isinstance(self._steps[0].request, kinds):
+            self._steps.popleft()
+
     def clear(self) -> None:
         """Drop everything that is not done."""
         self._steps.clear()

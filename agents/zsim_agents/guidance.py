@@ -88,10 +88,14 @@ class Guidance:
         self._flown = self._ramp(self.value(t_s), self._home, t_s)
         self.paused = False
 
-    def rejoin(self, c: Array, t_s: float) -> None:
-        """Go on after a fault from the estimate c (4n,), at rest; a paused formation stays there."""
+    def rejoin(self, c: Array, t_s: float, shape: ShapeLimits) -> None:
+        """Go on after a fault from the estimate c (4n,), at rest; a paused formation stays there.
+
+        The way back keeps the limits of shape: a formation recovers from where it may just be flown.
+        """
         home = Hold(c) if self.paused else self._home
-        self._flown = self._ramp((c, np.zeros_like(c)), home, t_s)
+        start = (c, np.zeros_like(c))
+        self._flown = plan_ramp(self.space, start, home, t_s, self._gains, shape)
 
     def _base(self, t_s: float) -> Array:
         return self._home.value(t_s)[0] if isinstance(self._home, Shifted) else self._goal

@@ -81,7 +81,7 @@ def reference_fault(
     gains: FormationGains,
     limits: ShapeLimits,
 ) -> str | None:
-    """Return why a reference may not be flown in [from_s, to_s], or None; every 0.5 s, or 301 times in a longer span."""
+    """Return why a reference may not be flown from from_s to to_s, or None; sampled 41 to 301 times."""
     count = min(max(math.ceil((to_s - from_s) / SAMPLE_S) + 1, SAMPLES_MIN), SAMPLES_MAX)
     count = count if to_s > from_s else 1
     for t_s in np.linspace(from_s, to_s, count).tolist():

@@ -120,7 +120,7 @@ def _report(directory: Path) -> None:
     console = Console(stderr=True)
     with console.status("reading the record …") as status:
         summary = make_report(directory, lambda text: status.update(text))
-    print(table(summary))
+    Console().print(table(summary))
     print(f"report: {directory / 'report.html'}")
 
 

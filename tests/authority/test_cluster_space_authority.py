@@ -199,7 +199,7 @@ def test_equation_3_is_reached_from_the_ground_triangle_far_apart_all_the_way():
 
 
 def test_equation_3_is_reached_with_noisy_estimates():
-    flight = from_the_ground_triangle(noise_m=0.15)  # facts: 0.152 m per axis with velocity at 15 Hz
+    flight = from_the_ground_triangle(noise_m=0.15)  # the Kalman bound with GPS and velocity at 15 Hz: 0.152 m per axis
     assert flight.closest_m > 2.0
     rms = flight.rms(60.0, 100.0)
     # k / (k + 1/tau) of the estimate's variance is followed: rms about 0.15 sqrt(0.6/1.6)/sqrt(3) = 0.053 m
@@ -218,7 +218,7 @@ def test_the_integral_takes_out_wind_and_without_it_the_offset_is_wind_over_gain
     assert max(from_the_ground_triangle(wind_W=wind_W).rms(80.0, 100.0).values()) < 0.001
 
 
-def test_equation_4_is_tracked_as_well_as_the_facts_say_is_possible():
+def test_equation_4_is_tracked_as_well_as_by_another_implementation():
     flight = on_equation_4()
     rms = flight.rms(50.0, 150.0)
     for name, most in {
@@ -252,7 +252,7 @@ def test_saturated_robots_keep_their_shape_on_a_step_across_the_field():
     flight = fly(Hold(C_DES), 60.0, start=start)
     speed = np.hypot(*np.diff(flight.c[:, :2], axis=0).T) / GATE_S
     assert speed.max() > 0.85 * FormationGains().speed_max_m_s  # the step does saturate
-    # facts: 0.07 m of shape error in transit with one factor, 1.25 m with clipping per axis
+    # elsewhere: 0.07 m of shape error in transit with one factor, 1.25 m with clipping per axis
     assert np.abs(flight.c[:, 9:11] - 4.0).max() < 0.15
     assert flight.closest_m > 2.5
     assert np.abs(SPACE.difference(flight.c[-1], C_DES)).max() < 0.05

@@ -16,7 +16,7 @@ from zsim_agents.cluster_space import (
 )
 
 SIZES = (2, 3, 4, 5, 8)
-TRIANGLE = np.array([(0.0, 1.5, 1.0), (-1.5, -1.5, 1.0), (1.5, -1.5, 1.0)])  # facts: where the drones start
+TRIANGLE = np.array([(0.0, 1.5, 1.0), (-1.5, -1.5, 1.0), (1.5, -1.5, 1.0)])  # where the drones take off
 
 
 def random_robots(n, rng, margin_min_m=0.2):

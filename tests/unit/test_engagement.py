@@ -25,7 +25,7 @@ from zsim_agents.flight_request import (
 
 SPACE = cluster_space(3)
 DRONES = ("drone1", "drone2", "drone3")
-GROUND = np.array([(0.0, 1.5, 0.0), (-1.5, -1.5, 0.0), (1.5, -1.5, 0.0)])  # facts: where the drones start
+GROUND = np.array([(0.0, 1.5, 0.0), (-1.5, -1.5, 0.0), (1.5, -1.5, 0.0)])  # where the drones take off
 GATE_S = 0.02
 PAPER_3 = {
     "x_c": 5, "y_c": -5, "z_c": 15, "roll": 0, "pitch": 0, "yaw": math.pi / 2,
@@ -258,6 +258,7 @@ def test_waypoints_end_and_the_formation_stays():
         (Target({"x_c": math.nan}), ("x_c is nan", "finite")),
         (Target({"beta": 0.05}), ("sin(beta) min(p, q) is 0.1", "above 1 m")),
         (Target({"p": 2.0, "q": 2.0, "beta": 0.9}), ("robots 2 and 3 are 1.740 m apart", "2 m or more")),
+        (Target({"p": 20.0, "q": 20.0, "beta": 3.0}), ("condition number of J^-1 is 1", "below 20")),
         (Target({"pitch": 1.0}), ("pitch of the formation is 57.3 deg", "below 30 deg")),
         (Target({"z_c": -2.0}), ("at z = -2.00 m",)),
         (Target({"z_c": 10.0}, over_s=1.0), ("over_s is 1 s", "allowed")),
@@ -373,6 +374,23 @@ def test_a_fault_in_flight_holds_the_formation_and_it_goes_on_without_a_bump(spo
     assert fleet.output.value[[0, 2]] == pytest.approx([5.0, 12.0], abs=0.02)
 
 
+def test_a_formation_recovers_from_a_shape_in_which_it_could_not_be_engaged():
+    fleet = engaged_fleet()
+    fleet.p_W[1:, 0] *= 0.7 / 3.354  # robots 2 and 3 far too near to each other, held and parted by the guard
+    fleet.fly(1.0)
+    assert fleet.output.phase == "held"
+    fleet.fly(40.0)
+    assert fleet.output.phase == "engaged"
+    assert closest_pair(fleet.p_W)[0] == pytest.approx(3.0, abs=0.05)
+    fleet.spoil = {"age_s": np.full(3, 1.0)}
+    fleet.p_W[0] -= (0.0, 2.2, 0.0)  # flat: spread 0.78 m, between the limit in flight and that of engagement
+    fleet.fly(1.0)
+    fleet.spoil = {}
+    fleet.fly(40.0)
+    assert fleet.output.phase == "engaged"
+    assert fleet.output.margin > 2.5
+
+
 def test_requests_are_refused_while_a_fault_holds_the_formation():
     fleet = engaged_fleet()
     fleet.spoil = {"age_s": np.full(3, 2.0)}
@@ -473,6 +491,35 @@ def test_landing_ends_idle_and_a_second_flight_is_possible():
     assert fleet.engagement.request(TakeOff()) is None
     fleet.fly_until("assembling")
     assert len(fleet.modes) == 3
+
+
+def test_a_new_engagement_forgets_the_integral_of_the_last():
+    fleet = engaged_fleet()
+    fleet.p_W += (1.0, 0.0, 0.0)
+    fleet.fly(3.0)
+    assert np.abs(fleet.engagement.law.integral).max() > 0.01
+    fleet.engagement.request(Land())
+    fleet.fly_until("idle")
+    fleet.engagement.request(TakeOff())
+    fleet.fly_until("assembling")
+    fleet.fly(5.0)
+    assert fleet.engagement.request(Engage()) is None
+    assert not fleet.engagement.law.integral.any()
+
+
+def test_a_drone_that_takes_off_after_it_was_called_off_is_landed():
+    fleet = Fleet(Engagement(SPACE, DRONES))
+    fleet.fly(0.1)
+    fleet.engagement.request(TakeOff())
+    fleet.spoil = {"states": ("landed",) * 3}  # the command is on its way
+    fleet.step()
+    assert fleet.engagement.request(Land()) is None
+    fleet.fly(0.2)
+    assert fleet.output.phase == "landing"
+    fleet.spoil = {}
+    fleet.fly(0.1)
+    assert [mode for _, _, mode in fleet.modes] == ["takeoff"] * 3 + ["land"] * 3
+    fleet.fly_until("idle")
 
 
 def test_a_take_off_can_be_called_off():

@@ -6,12 +6,24 @@ gating participant's done for t minus the command delay. That is the only wait t
 
 from dataclasses import dataclass
 
+from zsim import keys
 from zsim.messages import Done, Join, Waiting
+
+
+WORLD = "world"  # the one process that does not join
 
 
 @dataclass
 class Participant:
-    """One process that has joined, by its newest incarnation."""
+    """One process that has joined, by its newest incarnation.
+
+    Attributes:
+        from_ns: first gate that it is waited for.
+        done_ns: newest gate that it is through with.
+        received: outputs that came in since its last done.
+        missing: outputs that it counted in its dones and that have not come in.
+        since_wall_ns: when it was last heard of: join, done or death.
+    """
 
     name: str
     incarnation: int
@@ -38,6 +50,11 @@ class Participant:
             return None
         required = need_ns // self.period_ns * self.period_ns
         return required if required >= self.from_ns else None
+
+    def settle(self, sent: int) -> None:
+        """Set what a done counts against what came in; a surplus belongs to the next done, already on its way."""
+        balance = self.received - self.missing - sent
+        self.received, self.missing = max(0, balance), max(0, -balance)
 
     def owes(self, need_ns: int) -> bool:
         """Tell whether its done (or an output that it counted) is not in yet."""
@@ -67,12 +84,15 @@ class Barrier:
     def join(self, name: str, message: Join, next_gate_ns: int, wall_ns: int) -> str | None:
         """Take a participant in; return the reason if it is refused.
 
-        A known name keeps what it has done: the new incarnation goes on from there.
+        A known name keeps what it has done: the new incarnation goes on from there. The same join again changes
+        nothing.
         """
-        reason = self._join_fault(message)
+        reason = self._join_fault(name, message)
         if reason:
             return reason
         former = self.participants.get(name)
+        if former is not None and former.alive and former.incarnation == message.incarnation:
+            return None
         self.participants[name] = Participant(
             name=name,
             incarnation=message.incarnation,
@@ -88,9 +108,11 @@ class Barrier:
         )
         return None
 
-    def _join_fault(self, message: Join) -> str | None:
+    def _join_fault(self, name: str, message: Join) -> str | None:
+        if name == WORLD or not keys.PROCESS_NAME.fullmatch(name):
+            return f"name is {name[:60]!r}; must be a role, a dot and a name of a-z 0-9 _ . -, not {WORLD!r}"
         if message.run_id != self._run_id:
-            return f"run_id is {message.run_id!r}; must be {self._run_id!r} (read world/info)"
+            return f"run_id is {message.run_id[:40]!r}; must be {self._run_id!r} (read world/info)"
         if message.period_ns < 0 or message.period_ns % self._gate_ns:
             return f"period_ns is {message.period_ns}; must be 0 or a multiple of {self._gate_ns}"
         return None
@@ -99,9 +121,11 @@ class Barrier:
         """Note that a participant is through with `done_ns`; return the reason if it is refused."""
         participant = self.participants.get(name)
         if participant is None:
-            return "has not joined; must publish process/{name}/join first"
-        if message.run_id != self._run_id or message.incarnation != participant.incarnation:
-            return "is of another run or incarnation"
+            return f"has not joined; must publish process/{name}/join first"
+        if message.run_id != self._run_id:
+            return f"run_id is {message.run_id[:40]!r}; must be {self._run_id!r} (read world/info)"
+        if message.incarnation != participant.incarnation:
+            return f"incarnation is {message.incarnation}; must be {participant.incarnation}, the newest to join"
         if message.done_ns > now_ns:
             return f"done_ns is {message.done_ns}; must be <= {now_ns}, the newest gate"
         if message.done_ns > participant.done_ns:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 PROGRAM = 0  # priority of a program, contract
 OPERATOR = 10  # priority of an operator, contract
+SEEN_PER_DRONE = 256  # commands remembered to know them again; a rejoin repeats those of two gates
 
 
 class Due(NamedTuple):
@@ -43,22 +44,33 @@ class Commanders:
         self._holders: list[Holder | None] = [None] * len(drones)
         self._priorities: dict[tuple[int, str], int] = {}
         self._due: list[Due] = []
+        self._seen: dict[tuple[int, str, int, Any], None] = {}
 
     def holder(self, drone: int) -> str | None:
         """Return the name of the commander."""
         holder = self._holders[drone]
         return holder.source if holder else None
 
-    def push(self, drone: int, kind: str, message: Any, apply_ns: int) -> None:
-        """Keep a command until its instant."""
+    def push(self, drone: int, kind: str, message: Any, apply_ns: int) -> bool:
+        """Keep a command until its instant; return False for one that has come before."""
+        mark = (drone, kind, apply_ns, message)
+        if mark in self._seen:
+            return False
+        self._seen[mark] = None
+        if len(self._seen) > SEEN_PER_DRONE * len(self._names):
+            del self._seen[next(iter(self._seen))]
         priority = self._priorities.get((drone, message.source), PROGRAM)
         self._due.append(Due(apply_ns, priority, message.source, message.seq, drone, kind, message))
+        return True
 
     def pop(self, t_ns: int) -> list[Due]:
-        """Return the commands that take effect up to t_ns, in the order in which they do."""
+        """Return the commands that take effect up to t_ns, in the order in which they do.
+
+        Drone and kind stand last in the order only to make it independent of arrival.
+        """
         if not self._due:
             return []
-        ready = sorted((due for due in self._due if due.apply_ns <= t_ns), key=lambda due: due[:4])
+        ready = sorted((due for due in self._due if due.apply_ns <= t_ns), key=lambda due: due[:6])
         self._due = [due for due in self._due if due.apply_ns > t_ns]
         return ready
 
@@ -98,12 +110,16 @@ class Commanders:
             return f"{self._names[drone]} is flown by {who}, not by {source!r}"
         self._holders[drone] = None
         self._priorities.pop((drone, source), None)
+        # A setpoint still on its way would make the source the commander again.
+        self._due = [d for d in self._due if (d.drone, d.source) != (drone, source) or d.kind == "mode"]
         return None
 
     def gone(self, source: str) -> list[int]:
-        """Take all drones from a source that left; return which."""
+        """Take all drones and priorities from a source that left; return which drones it held."""
         held = [i for i, holder in enumerate(self._holders) if holder and holder.source == source]
         for drone in held:
-            self.release(drone, source)
+            self._holders[drone] = None
+        for drone in range(len(self._names)):
+            self._priorities.pop((drone, source), None)
         self._due = [due for due in self._due if due.source != source or due.kind == "mode"]
         return held

@@ -79,16 +79,15 @@ def _touch(
 def encounters(
     vehicle: NDArray, state: NDArray, air: NDArray, push: NDArray, touching: NDArray, touched: NDArray
 ) -> float:
-    """Add downwash to `air`, write the forces between hulls to `push`, and return the least distance [m].
+    """Add downwash to `air`, the forces between hulls to `push`, and return the least distance [m].
 
     Args:
         vehicle, state: parameters and state, a row per drone.
         air: (N, 3) velocity of the air [m/s], added to.
-        push: (N, 3) force [N], overwritten.
+        push: (N, 3) force [N], added to.
         touching: (N, N) 1 where i < j are in contact now, updated; touched: (N, N) set to 1 where contact begins.
     """
     least = math.inf
-    push[:, :] = 0.0
     for i in range(state.shape[0]):
         for j in range(i + 1, state.shape[0]):
             dx = state[j, POSITION] - state[i, POSITION]

@@ -80,6 +80,7 @@ class Fleet:
         self._later: list[Sample] = []
         self._noise = NoiseTable(scenario, NOISE_GATES)
         self._w = arrays(scenario, self._noise)
+        self._bodies, self._boards, self._senses = self._w.bodies, self._w.boards, self._w.senses
         self._integrate(0)
 
     @property
@@ -109,12 +110,12 @@ class Fleet:
 
     def truth(self) -> Truth:
         """Return the true state now."""
-        s = self._w.state.copy()
-        return Truth(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], self._w.accel[:, 0:3].copy(), s[:, 13:17])
+        s = self._bodies.state.copy()
+        return Truth(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], self._bodies.accel[:, 0:3].copy(), s[:, 13:17])
 
     def status(self, i: int) -> tuple[str, float, bool]:
         """Return the firmware's mode, the charge [%], and whether the hull touched another in the last gate."""
-        charge = 100.0 * self._w.energy.item(i) / self._w.vehicle.item(i, vehicle.CAPACITY)
+        charge = 100.0 * self._bodies.energy.item(i) / self._bodies.vehicle.item(i, vehicle.CAPACITY)
         return firmware.MODES[self._mode(i)], charge, i in self._touching
 
     def min_separation_m(self) -> float:
@@ -132,7 +133,7 @@ class Fleet:
             return self._not_while(i, "a take-off needs it landed")
         if charge < TAKEOFF_PERCENT_MIN:
             return f"{self.names[i]} has {charge:.1f} % of charge; a take-off needs {TAKEOFF_PERCENT_MIN:g} %"
-        x, y = self._w.belief[i, observer.ATTITUDE + 1 : observer.ATTITUDE + 3]
+        x, y = self._boards.belief[i, observer.ATTITUDE + 1 : observer.ATTITUDE + 3]
         if 1.0 - 2.0 * (x * x + y * y) < UPRIGHT_COSINE:
             return f"{self.names[i]} does not stand upright; a take-off needs it within 30 deg of level"
         self._enter(i, firmware.TAKING_OFF)
@@ -189,27 +190,27 @@ class Fleet:
 
     def release(self, i: int) -> None:
         """Let nobody fly the drone any more: it hovers."""
-        self._w.setpoint[i, firmware.KIND] = firmware.NONE
+        self._boards.setpoint[i, firmware.KIND] = firmware.NONE
 
     def _set(self, i: int, kind: int, values: tuple[float, ...]) -> str | None:
         if self._mode(i) not in (firmware.HOVERING, firmware.FLYING):
             return self._not_while(i, "a setpoint needs it hovering or flying")
         if not math.isfinite(sum(values)):
             return f"{self.names[i]} was sent a setpoint with {list(values)}; must be finite"
-        row = self._w.setpoint[i]
+        row = self._boards.setpoint[i]
         row[firmware.KIND] = kind
         row[firmware.VALUE : firmware.VALUE + len(values)] = values
-        self._w.set_tick[i] = self._tick
+        self._boards.set_tick[i] = self._tick
         return None
 
     def _mode(self, i: int) -> int:
-        return int(self._w.memory.item(i, firmware.MODE))
+        return int(self._boards.memory.item(i, firmware.MODE))
 
     def _not_while(self, i: int, need: str) -> str:
         return f"{self.names[i]} is {firmware.MODES[self._mode(i)]}; {need}"
 
     def _enter(self, i: int, mode: int) -> None:
-        firmware.enter(self._w.memory[i], self._w.belief[i], mode)
+        firmware.enter(self._boards.memory[i], self._boards.belief[i], mode)
 
     def _integrate(self, ticks: int) -> None:
         logged, least, diverged = gate.advance(self._w, ticks)
@@ -226,14 +227,14 @@ class Fleet:
         self._began: list[tuple[int, int]] = []
         self._touching: set[int] = set()
         if least < 2.0 * vehicle.HULL_RADIUS_M:
-            self._began = [(int(i), int(j)) for i, j in np.argwhere(self._w.touched)]
-            self._touching = {int(k) for k in np.argwhere(self._w.touched | self._w.touching).ravel()}
+            self._began = [(int(i), int(j)) for i, j in np.argwhere(self._bodies.touched)]
+            self._touching = {int(k) for k in np.argwhere(self._bodies.touched | self._bodies.touching).ravel()}
 
     def _fresh(self, logged: int) -> list[Sample]:
         """Return the samples that the kernel took, in the order of (time, drone, sensor)."""
         out, tick_ns = [], self._tick_ns
         fixes: list[int] = []
-        index, values = self._w.log_index[:logged].tolist(), self._w.log_value[:logged].tolist()
+        index, values = self._senses.index[:logged].tolist(), self._senses.value[:logged].tolist()
         for (s, i, tick), value in zip(index, values, strict=True):
             t = tick * tick_ns
             if s == sensor_set.GPS:

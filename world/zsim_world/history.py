@@ -10,21 +10,37 @@ from collections.abc import Iterator
 from zsim import keys
 
 KEEP_NS = 5_000_000_000  # simulated time that a replay reaches back
+KEEP_BYTES = 500_000_000  # payloads kept at most: 1000 drones say about 300 MB in KEEP_NS
+LAST_MAX = 200_000  # keys of which the last value is kept: 1000 drones have about 12 000
 
 
 class History:
-    """Payloads as on the wire, by key."""
+    """Payloads as on the wire, by key.
 
-    def __init__(self) -> None:
+    Args:
+        keep_bytes: of the payloads that a replay may bring again.
+    """
+
+    def __init__(self, keep_bytes: int = KEEP_BYTES) -> None:
         self._last: dict[str, bytes] = {}
-        self._recent: deque[tuple[int, str, bytes]] = deque()
+        self._recent: deque[tuple[int, int, str, bytes]] = deque()
+        self._now_ns = 0
+        self._bytes = 0
+        self._keep_bytes = keep_bytes
 
     def add(self, key: str, payload: bytes, t_ns: int) -> None:
-        """Remember a message; t_ns is its stamp."""
-        self._last[key] = payload
-        self._recent.append((t_ns, key, payload))
-        while self._recent[0][0] < t_ns - KEEP_NS:
-            self._recent.popleft()
+        """Remember a message; t_ns is its stamp.
+
+        How old it is follows from the world's clock at its arrival: a sender's stamp may be anything.
+        """
+        if key == keys.CLOCK:
+            self._now_ns = t_ns
+        if key in self._last or len(self._last) < LAST_MAX:
+            self._last[key] = payload
+        self._recent.append((self._now_ns, t_ns, key, payload))
+        self._bytes += len(payload)
+        while self._bytes > self._keep_bytes or self._recent[0][0] < self._now_ns - KEEP_NS:
+            self._bytes -= len(self._recent.popleft()[3])
 
     def last(self, expression: str) -> list[tuple[str, bytes]]:
         """Return the last value of every key that an expression takes."""
@@ -34,6 +50,11 @@ class History:
 
     def since(self, from_ns: int, expressions: list[str]) -> Iterator[tuple[str, bytes]]:
         """Yield, in order of arrival, the messages stamped after from_ns on any of the expressions."""
-        for t_ns, key, payload in list(self._recent):
-            if t_ns > from_ns and any(keys.matches(expression, key) for expression in expressions):
+        wanted: dict[str, bool] = {}
+        for _, t_ns, key, payload in list(self._recent):
+            if t_ns <= from_ns:
+                continue
+            if key not in wanted:
+                wanted[key] = any(keys.matches(expression, key) for expression in expressions)
+            if wanted[key]:
                 yield key, payload

@@ -8,7 +8,7 @@ from zsim.frames import quaternion_from_heading, quaternion_from_rpy
 from zsim.scenario import Drone, Scenario
 from zsim_world import firmware, gains, observer, rigid_body, sensor_set, vehicle
 from zsim_world import wind as wind_model
-from zsim_world.gate import Arrays
+from zsim_world.gate import Arrays, Boards, Bodies, Noise, Senses, Time
 from zsim_world.noise import NoiseTable, samples_per_gate
 
 
@@ -17,41 +17,43 @@ def arrays(scenario: Scenario, noise: NoiseTable) -> Arrays:
     drones, field = scenario.drones, scenario.environment
     n, log = len(drones), samples_per_gate(scenario) + 1
     row = np.array([vehicle.parameters(drone, field) for drone in drones])
-    state = np.array([_standing(drone) for drone in drones])
     dt = scenario.time.physics_dt_ms / 1000.0
-    return Arrays(
-        clock=np.array([0, round(observer.STEP_S / dt)], dtype=np.int64),
-        times=np.array([dt, scenario.silence.hover_s, scenario.silence.land_s]),
-        place=np.array([*field.magnetic_field_ut, field.height_m]),
-        wind=_wind(scenario),
+    bodies = Bodies(
         vehicle=row,
-        setting=np.array([firmware.settings(drone) for drone in drones]),
-        gain=np.array([gains.gain_row(drone, field) for drone in drones]),
-        board=np.array([_calibration(drone, scenario) for drone in drones]),
-        config=sensor_set.config(scenario),
-        schedule=sensor_set.schedule(scenario),
-        setpoint=np.zeros((n, firmware.SETPOINT_COLUMNS)),
-        set_tick=np.zeros(n, dtype=np.int64),
-        state=state,
+        state=np.array([_standing(drone) for drone in drones]),
         accel=np.zeros((n, 6)),
         anchor=np.array([_anchors(drone) for drone in drones]),
         command=np.zeros((n, 4)),
         energy=row[:, vehicle.CAPACITY] * [drone.battery_percent / 100.0 for drone in drones],
-        memory=np.zeros((n, firmware.MEMORY_COLUMNS)),
-        belief=np.array([_first_belief() for _ in drones]),
-        device=np.zeros((n, observer.REGISTERS)),
-        bias=noise.bias,
-        gust=noise.gust,
         air=np.zeros((n, 3)),
         push=np.zeros((n, 3)),
         touching=np.zeros((n, n), dtype=np.int8),
         touched=np.zeros((n, n), dtype=np.int8),
-        noise=noise.table,
-        noise_at=noise.at,
-        cursor=noise.cursor,
-        log_index=np.zeros((log, 3), dtype=np.int64),
-        log_value=np.zeros((log, 6)),
     )
+    boards = Boards(
+        setting=np.array([firmware.settings(drone) for drone in drones]),
+        gain=np.array([gains.gain_row(drone, field) for drone in drones]),
+        calibration=np.array([_calibration(drone, scenario) for drone in drones]),
+        setpoint=np.zeros((n, firmware.SETPOINT_COLUMNS)),
+        set_tick=np.zeros(n, dtype=np.int64),
+        memory=np.zeros((n, firmware.MEMORY_COLUMNS)),
+        belief=np.array([_first_belief() for _ in drones]),
+        device=np.zeros((n, observer.REGISTERS)),
+    )
+    senses = Senses(
+        place=np.array([*field.magnetic_field_ut, field.height_m]),
+        config=sensor_set.config(scenario),
+        schedule=sensor_set.schedule(scenario),
+        bias=noise.bias,
+        index=np.zeros((log, 3), dtype=np.int64),
+        value=np.zeros((log, 6)),
+    )
+    time = Time(
+        clock=np.array([0, round(observer.STEP_S / dt)], dtype=np.int64),
+        spans=np.array([dt, scenario.silence.hover_s, scenario.silence.land_s]),
+    )
+    numbers = Noise(table=noise.table, at=noise.at, cursor=noise.cursor)
+    return Arrays(time, bodies, boards, numbers, senses, _wind(scenario), noise.gust)
 
 
 def _standing(drone: Drone) -> np.ndarray:

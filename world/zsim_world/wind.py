@@ -5,7 +5,7 @@ import math
 from zsim_world.compiled import compiled
 from numpy.typing import NDArray
 
-from zsim_world.rigid_body import VELOCITY
+from zsim_world.rotation import Vector
 
 # Columns of the one row of wind parameters
 STEADY, GUST, LENGTH, SPEED_MIN, CORRELATION = 0, 3, 4, 5, 6  # m/s (3), m/s, m, m/s, -
@@ -23,25 +23,24 @@ def gust_decay(length_m: float, airspeed_m_s: float, speed_min_m_s: float, dt: f
 
 @compiled
 def gust_noise(correlation: float, common: float, own: float) -> float:
-    """Return a standard normal number that two drones share to the given correlation."""
+    """Return a standard normal number that drones share to the given correlation."""
     return math.sqrt(correlation) * common + math.sqrt(1.0 - correlation) * own
 
 
 @compiled
-def blow(wind: NDArray, state: NDArray, gust: NDArray, common: NDArray, own: NDArray, dt: float) -> None:
-    """Advance the gusts (N, 3) [m/s] by dt in place, by the exact discretisation of the filter.
+def blow(wind: NDArray, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt: float) -> None:
+    """Advance the gust (3,) [m/s] at one drone by dt in place, by the exact discretisation of the filter.
 
     Args:
         wind: the wind's parameters (COLUMNS,).
-        state: the drones' states.
-        common: (3,) standard normal numbers for all; own: (N, 3) for each drone.
+        v_WB: the drone's velocity [m/s].
+        common: standard normal numbers that all drones share; own: of this drone.
     """
-    for i in range(gust.shape[0]):
-        square = 0.0
-        for k in range(3):
-            relative = state[i, VELOCITY + k] - wind[STEADY + k] - gust[i, k]
-            square += relative * relative
-        decay = gust_decay(wind[LENGTH], math.sqrt(square), wind[SPEED_MIN], dt)
-        fresh = wind[GUST] * math.sqrt(1.0 - decay * decay)
-        for k in range(3):
-            gust[i, k] = decay * gust[i, k] + fresh * gust_noise(wind[CORRELATION], common[k], own[i, k])
+    square = 0.0
+    for k in range(3):
+        relative = v_WB[k] - wind[STEADY + k] - gust[k]
+        square += relative * relative
+    decay = gust_decay(wind[LENGTH], math.sqrt(square), wind[SPEED_MIN], dt)
+    fresh = wind[GUST] * math.sqrt(1.0 - decay * decay)
+    for k in range(3):
+        gust[k] = decay * gust[k] + fresh * gust_noise(wind[CORRELATION], common[k], own[k])

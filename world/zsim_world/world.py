@@ -148,11 +148,13 @@ class World:
             return
         again = former is not None and former.incarnation != message.incarnation
         kind = ("superseded" if former.alive else "restart") if former and again else "join"
-        data = {
+        joined = self.barrier.participants[name]
+        data: dict[str, Any] = {
             "incarnation": message.incarnation,
             "host": message.host,
             "pid": message.pid,
-            "from_ns": self.next_ns,
+            "from_ns": joined.from_ns,
+            "done_ns": joined.done_ns,
         }
         if former is not None and again:
             data["former_pid"] = former.pid

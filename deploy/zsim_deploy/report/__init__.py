@@ -4,8 +4,8 @@
     judge(PATH)      the same without writing anything: flight, formations, summary
     table(summary)   the formation's errors beside the paper's Table I, for the terminal
 
-Order of the files: `flight` reads, `formation`, `statistics` and `truth_hash` compute, `summary` gathers,
-`figures`, `page` and `table` show.
+Order of the files: `reading` fills a `flight`; `formation`, `statistics` and `truth_hash` compute; `summary`
+gathers; `figures`, `page` and `table` show.
 """
 
 from zsim_deploy.report.make import judge, make_report

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from zsim_agents.cluster_space import ClusterSpace, SingularClusterError, cluster_space
+from zsim_agents.cluster_space import ROBOTS_MAX, ClusterSpace, SingularClusterError, cluster_space
 
 from zsim_deploy.report.flight import Array, States, Times, Track
 from zsim_deploy.report.statistics import Errors, common_instants, errors
@@ -53,11 +53,16 @@ def unit(name: str) -> str:
 
 
 def formation(states: States, tracks: list[Track]) -> Formation | None:
-    """Return a cluster's formation, None if its controller published nothing that can be judged."""
+    """Return a cluster's formation.
+
+    None if its controller published nothing, or variables of another convention than `cluster_space`.
+    """
     by_name = {track.name: track for track in tracks}
-    if not len(states.t_ns) or len(states.names) != 4 * len(states.drones):
+    if not len(states.t_ns) or not 2 <= len(states.drones) <= ROBOTS_MAX:
         return None
     space = cluster_space(len(states.drones))
+    if states.names != space.names:
+        return None
     value, desired = _known(states.value), _known(states.desired)
     members = [by_name[name] for name in states.drones if name in by_name]
     true = _true(space, members, states.t_ns)

@@ -5,9 +5,10 @@ from pathlib import Path
 
 from zsim.errors import ReportError
 from zsim_deploy.report.figures import figures
-from zsim_deploy.report.flight import Flight, read_flight
+from zsim_deploy.report.flight import Flight
 from zsim_deploy.report.formation import Formation, formation
 from zsim_deploy.report.page import page
+from zsim_deploy.report.reading import read_flight
 from zsim_deploy.report.summary import Summary, summarise
 
 RECORD = "run.mcap"

@@ -74,6 +74,7 @@ def min_separation_m(tracks: list[Track]) -> float | None:
 
     Where no status tells who is in the air, all instants count; None when there are no two drones.
     """
+    tracks = [track for track in tracks if len(track.t_ns)]
     t_ns, places = common_instants(tracks)
     if len(tracks) < 2 or not len(t_ns):
         return None

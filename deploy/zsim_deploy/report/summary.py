@@ -216,11 +216,13 @@ def _formation_notes(flight: Flight, formations: list[Formation], window_s: tupl
     judged = {formation.name for formation in formations}
     for cluster in flight.clusters:
         if cluster.name not in judged:
-            notes.append(f"Cluster {cluster.name} published no state: it has no table and no figures.")
+            notes.append(f"Cluster {cluster.name} published no state that can be judged: no table of it.")
     for formation in formations:
         rows = formation.within(window_s)
         engaged = sum(phase == "engaged" for phase, row in zip(formation.phases, rows, strict=True) if row)
-        if engaged < rows.sum():
+        if not rows.any():
+            notes.append(f"Cluster {formation.name} published no state inside the window.")
+        elif engaged < rows.sum():
             notes.append(
                 f"Cluster {formation.name} was engaged in {engaged} of {rows.sum()} instants of the window."
             )

@@ -1,0 +1,104 @@
+"""Hulls that touch, and downwash."""
+
+import math
+
+import numpy as np
+import pytest
+
+from zsim.scenario_file import resolve
+from zsim_world import rigid_body as body
+from zsim_world import vehicle
+from zsim_world.encounter import DISC_M2, JET_WIDTHS, downwash, encounters, hull_force
+
+RADIUS = vehicle.HULL_RADIUS_M
+
+
+@pytest.fixture(scope="module")
+def rows():
+    drones = [{"name": f"d{k}", "position_m": [2 * k, 0, 0]} for k in range(3)]
+    scenario = resolve({"name": "t", "duration_s": 1, "drones": drones})
+    return np.array([vehicle.parameters(drone, scenario.environment) for drone in scenario.drones])
+
+
+def meet(rows, positions, velocities=None, rotor=0.0):
+    n = len(positions)
+    state = np.zeros((n, body.COLUMNS))
+    state[:, :3], state[:, body.ATTITUDE], state[:, body.ROTOR :] = positions, 1.0, rotor
+    if velocities is not None:
+        state[:, 3:6] = velocities
+    air, push = np.zeros((n, 3)), np.zeros((n, 3))
+    touching, touched = np.zeros((n, n), np.int8), np.zeros((n, n), np.int8)
+    least = encounters(rows[:n], state, air, push, touching, touched)
+    return least, air, push, touching, touched
+
+
+def test_least_distance_of_all_pairs(rows):
+    least, _, push, touching, _ = meet(rows, [(0, 0, 5), (3, 4, 5), (3, 4, 6)])
+    assert least == 1.0
+    assert not push.any()
+    assert not touching.any()
+
+
+def test_touching_hulls_push_each_other_apart_and_keep_momentum(rows):
+    _, _, push, touching, touched = meet(rows, [(0, 0, 5), (2 * RADIUS - 0.02, 0, 5), (9, 9, 9)])
+    np.testing.assert_allclose(push.sum(0), 0.0, atol=1e-12)
+    assert math.isclose(push[1, 0], rows[0, vehicle.HULL_STIFFNESS] * 0.02, rel_tol=1e-9)
+    assert push[0, 0] < 0
+    assert touching[0, 1] == touched[0, 1] == 1
+    assert touching.sum() == 1
+
+
+def test_hull_resists_closing_and_never_attracts():
+    assert hull_force(1000.0, 10.0, 0.5, 1.0) == pytest.approx(1000.0 * 0.02 + 10.0)
+    assert hull_force(1000.0, 10.0, 0.51, -5.0) == 0.0
+    assert hull_force(1000.0, 10.0, 2 * RADIUS, 5.0) == 0.0
+
+
+def test_head_on_collision_rebounds_and_loses_energy(rows):
+    """Two free bodies at 3 m/s towards each other; drag and gravity off."""
+    rows = rows.copy()
+    rows[:, vehicle.DRAG] = rows[:, vehicle.GRAVITY] = 0.0
+    state = np.zeros((2, body.COLUMNS))
+    state[:, body.ATTITUDE] = 1.0
+    state[:, :3] = [(0.0, 0.0, 50.0), (0.6, 0.0, 50.0)]
+    state[:, 3] = (1.5, -1.5)
+    air, push = np.zeros((2, 3)), np.zeros((2, 3))
+    touching, touched = np.zeros((2, 2), np.int8), np.zeros((2, 2), np.int8)
+    anchor, least = np.zeros((8, 2)), 9.0
+    for _ in range(400):
+        push[:] = 0.0
+        least = min(least, encounters(rows[:2], state, air, push, touching, touched))
+        for i in range(2):
+            body.step(rows[i], anchor, state[i], (0.0,) * 4, (0.0,) * 3, tuple(push[i]), 0.0025)
+    assert abs(state[:, 3].sum()) < 1e-9
+    assert 0.3 < (state[1, 3] - state[0, 3]) / 3.0 < 0.7
+    assert 2 * RADIUS - 0.06 < least < 2 * RADIUS
+
+
+def test_two_drones_in_one_place_give_no_nan(rows):
+    _, air, push, _, _ = meet(rows, [(0, 0, 5), (0, 0, 5), (9, 9, 9)], rotor=360.0)
+    assert np.isfinite(push).all()
+    assert np.isfinite(air).all()
+
+
+@pytest.mark.parametrize("below", [0.0, 0.5, 3.0])
+def test_downwash_carries_the_thrust(below):
+    """The momentum of the jet, integrated over a plane below, is the thrust at every depth."""
+    radii = np.linspace(0.0, 4.0, 20001)
+    speed = np.array([downwash(4.2, 1.225, below, r) for r in radii])
+    flux = np.trapezoid(1.225 * speed**2 * 2 * np.pi * radii, radii)
+    assert math.isclose(flux, 4.2, rel_tol=1e-3)
+
+
+def test_downwash_at_the_disc_is_twice_the_induced_speed():
+    assert math.isclose(downwash(4.2, 1.225, 0.0, 0.0), 2 * math.sqrt(4.2 / (2 * 1.225 * DISC_M2)), rel_tol=1e-12)
+
+
+def test_downwash_blows_on_the_lower_drone_only(rows):
+    _, air, _, _, _ = meet(rows, [(0, 0, 6), (0.1, 0, 4), (8, 0, 4)], rotor=361.6)
+    assert air[1, 2] < -2.0
+    assert air[0, 2] == air[2, 2] == 0.0
+
+
+def test_downwash_ends_beside_the_jet():
+    assert downwash(4.2, 1.225, 2.0, JET_WIDTHS * 0.43) == 0.0

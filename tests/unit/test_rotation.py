@@ -1,0 +1,90 @@
+"""Quaternion algebra of the compiled code against scipy."""
+
+import math
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from zsim_world import rotation as rot
+
+number = st.floats(-5.0, 5.0)
+vectors = st.tuples(number, number, number)
+quaternions = st.tuples(number, number, number, number).filter(lambda q: sum(x * x for x in q) > 1e-2)
+few = settings(max_examples=50, deadline=None)
+
+
+def unit(q):
+    return tuple(float(x) for x in np.array(q) / np.linalg.norm(q))
+
+
+def scipy_rotation(q):
+    return Rotation.from_quat(q, scalar_first=True)
+
+
+@few
+@given(quaternions, vectors)
+def test_rotate_agrees_with_scipy_and_back_undoes_it(q, v):
+    q = unit(q)
+    turned = rot.rotate(q, v)
+    np.testing.assert_allclose(turned, scipy_rotation(q).apply(v), atol=1e-12)
+    np.testing.assert_allclose(rot.rotate_back(q, turned), v, atol=1e-12)
+
+
+@few
+@given(quaternions, quaternions, vectors)
+def test_product_turns_first_by_the_right_factor(p, q, v):
+    p, q = unit(p), unit(q)
+    np.testing.assert_allclose(rot.rotate(rot.multiply(p, q), v), rot.rotate(p, rot.rotate(q, v)), atol=1e-12)
+
+
+@few
+@given(vectors)
+def test_rotation_vector_agrees_with_scipy(r):
+    expected = Rotation.from_rotvec(r).as_matrix()
+    got = scipy_rotation(rot.from_rotation_vector(r)).as_matrix()
+    np.testing.assert_allclose(got, expected, atol=1e-12)
+
+
+def test_rotation_vector_is_smooth_at_zero():
+    tiny = rot.from_rotation_vector((3e-9, 0.0, 0.0))
+    assert tiny[0] == 1.0
+    assert math.isclose(tiny[1], 1.5e-9, rel_tol=1e-12)
+
+
+@few
+@given(quaternions, vectors)
+def test_rate_is_the_derivative_of_the_attitude(q, w):
+    q, h = unit(q), 1e-6
+    ahead = rot.multiply(q, rot.from_rotation_vector((w[0] * h, w[1] * h, w[2] * h)))
+    behind = rot.multiply(q, rot.from_rotation_vector((-w[0] * h, -w[1] * h, -w[2] * h)))
+    difference = (np.array(ahead) - np.array(behind)) / (2 * h)
+    np.testing.assert_allclose(rot.rate(q, w), difference, atol=1e-8)
+
+
+@few
+@given(quaternions)
+def test_axes_and_heading_are_those_of_the_matrix(q):
+    q = unit(q)
+    matrix = scipy_rotation(q).as_matrix()
+    np.testing.assert_allclose(rot.z_axis(q), matrix[:, 2], atol=1e-12)
+    if math.hypot(matrix[0, 0], matrix[1, 0]) > 1e-3:
+        assert abs(rot.wrapped(rot.heading(q) - math.atan2(matrix[1, 0], matrix[0, 0]))) < 1e-9
+
+
+@few
+@given(st.floats(-100.0, 100.0))
+def test_wrapped_is_the_same_angle_in_range(angle):
+    wrapped = rot.wrapped(angle)
+    assert -math.pi <= wrapped < math.pi
+    assert math.isclose(math.cos(wrapped), math.cos(angle), abs_tol=1e-9)
+    assert math.isclose(math.sin(wrapped), math.sin(angle), abs_tol=1e-9)
+
+
+def test_cross_and_norm():
+    a, b = (1.0, 2.0, 3.0), (-4.0, 5.0, 0.5)
+    np.testing.assert_allclose(rot.cross(a, b), np.cross(a, b))
+    assert rot.norm(a) == math.sqrt(14.0)
+    assert rot.axpy(a, 2.0, b) == (-7.0, 12.0, 4.0)
+    np.testing.assert_allclose(rot.normalised((2.0, 0.0, 0.0, 0.0)), (1.0, 0.0, 0.0, 0.0))
