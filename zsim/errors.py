@@ -1,14 +1,14 @@
 """The errors of zsim, all one line: where, what was found, what is allowed, what to do.
 
-    ZsimError
-    ├── ScenarioError      a scenario file or an override; carries every fault found, a line each
-    ├── DecodeError        a payload that is not the message it claims to be
-    ├── BadNameError       a name of a federation, drone, cluster or process outside the contract
-    ├── SessionError       no session: port in use, nobody listens, wrong endpoint
-    │   └── NoWorldError   the session is open, but no world answers
-    ├── RunError           a run that could not start or did not end well
-    ├── RecordError        a record that cannot be written or read: disk full, no MCAP file
-    └── ReportError        a report that cannot be made or written
+ZsimError
+├── ScenarioError      a scenario file or an override; carries every fault found, a line each
+├── DecodeError        a payload that is not the message it claims to be
+├── BadNameError       a name of a federation, drone, cluster or process outside the contract
+├── SessionError       no session: port in use, nobody listens, wrong endpoint
+│   └── NoWorldError   the session is open, but no world answers
+├── RunError           a run that could not start or did not end well
+├── RecordError        a record that cannot be written or read: disk full, no MCAP file
+└── ReportError        a report that cannot be made or written
 """
 
 

@@ -15,7 +15,7 @@ import msgspec
 from msgspec import inspect as types
 
 SHOWN_MAX = 60  # characters of what was found that fit into a line
-NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # limits of the representation only
+NO_LIMITS = (sys.float_info.max, -sys.float_info.max, 2**63 - 1, -(2**63))  # of the representation only
 
 Fault = tuple[str, str]
 """(path, "is …; must be …"); the path of the document itself is empty."""
@@ -34,8 +34,8 @@ def first_fault(value: Any, description: Any) -> Fault | None:
 def sound(value: Any, description: Any) -> Any:
     """Return what can be relied on of a faulty document.
 
-    Structs become namespaces with a field for each of theirs: as given, by default, or None where it is missing or
-    faulty. Lists keep their length. What fits is returned as it is.
+    Structs become namespaces with a field for each of theirs: as given, by default, or None where it is
+    missing or faulty. Lists keep their length. What fits is returned as it is.
     """
     return _sound(value, _type_info(description))
 
@@ -121,8 +121,9 @@ def _check_dict(value: Any, info: types.DictType, path: str) -> Iterator[Fault]:
         yield path, f"is {show(value)}; must be a map"
         return
     for key, item in value.items():
-        yield from ((where, f"as a key {text}") for where, text in _check(key, info.key_type, _join(path, key)))
-        yield from _check(item, info.value_type, _join(path, key))
+        where = _join(path, key)
+        yield from ((at, f"as a key {text}") for at, text in _check(key, info.key_type, where))
+        yield from _check(item, info.value_type, where)
 
 
 def _scalar_fault(value: Any, info: types.Type) -> str | None:
@@ -165,7 +166,7 @@ def _text_fault(value: Any, info: types.StrType) -> str | None:
     if not isinstance(value, str):
         return f"is {show(value)}; must be text"
     if info.pattern and not re.search(info.pattern, value):
-        return f"is {show(value)}; must match {info.pattern.removeprefix('^').removesuffix('$')}"
+        return f"is {show(value)}; must match {info.pattern.strip('^$').removesuffix(chr(92) + 'Z')}"
     return None
 
 
@@ -193,7 +194,8 @@ def _expected(info: types.Type) -> str:
 
 def _limits(info: types.FloatType | types.IntType) -> str:
     signs = ((">", info.gt), (">=", info.ge), ("<", info.lt), ("<=", info.le))
-    limits = [f"{sign} {_plain(limit)}" for sign, limit in signs if limit is not None and limit not in NO_LIMITS]
+    given = [(sign, limit) for sign, limit in signs if limit is not None and limit not in NO_LIMITS]
+    limits = [f"{sign} {_plain(limit)}" for sign, limit in given]
     return " and ".join(limits)
 
 
@@ -209,8 +211,9 @@ def _sound(value: Any, info: types.Type) -> Any:
     if isinstance(info, types.StructType):
         return _sound_struct(value, info)
     if isinstance(info, types.ListType):
-        fits = isinstance(value, list | tuple) and len(value) <= (info.max_length or len(value))
-        return [_sound(item, info.item_type) for item in value] if fits else None
+        if not isinstance(value, list | tuple) or len(value) > (info.max_length or len(value)):
+            return None
+        return [_sound(item, info.item_type) for item in value]
     return None if any(_check(value, info, "")) else value
 
 
@@ -251,6 +254,5 @@ def _as_json(value: Any) -> str:
         return "{" + ", ".join(f"{_as_json(key)}: {_as_json(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_as_json, value)) + "]"
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    return repr(value)
+    names = {None: "null", True: "true", False: "false"}
+    return names[value] if value is None or isinstance(value, bool) else repr(value)

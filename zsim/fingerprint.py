@@ -1,4 +1,4 @@
-"""What the last bit of a number depends on: CPU feature level, libm, and the versions of the numeric packages.
+"""What the last bit of a number depends on: CPU feature level, libm, versions of the numeric packages.
 
 BLAS comes with numpy and scipy, so their versions stand for it.
 """

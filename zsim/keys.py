@@ -86,8 +86,8 @@ def leaf(key: str) -> str:
 def matches(expression: str, key: str) -> bool:
     """Tell whether a key expression takes a key, as Zenoh does (the in-process bus and the history ask here).
 
-    `*` stands for one chunk, `**` for any number of them, `$*` for a part of one; a chunk that begins with `@`
-    is taken only by itself.
+    `*` stands for one chunk, `**` for any number of them, `$*` for a part of one; a chunk that begins
+    with `@` is taken only by itself.
     """
     return expression == key or _compiled(expression).fullmatch(f"{key}/") is not None
 

@@ -7,7 +7,7 @@ Every message is a msgpack map with exactly these field names, SI units and radi
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Annotated, Any, Literal, NoReturn
 
 import msgspec
@@ -307,9 +307,11 @@ _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
     ("process", "health"): Health,
 }
 _VIEW_CLUSTER = "view/cluster/"
+KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
 _encoder = msgspec.msgpack.Encoder()
 
 
+@lru_cache(maxsize=KEYS_KEPT)
 def type_of(key: str) -> type[Struct] | None:
     """Return the message type that the contract puts on a key, None for a key that it does not know."""
     if key.startswith(_VIEW_CLUSTER):
@@ -319,7 +321,7 @@ def type_of(key: str) -> type[Struct] | None:
 
 
 def types_by_shape() -> dict[str, type[Struct]]:
-    """Return all message types with the shape of their key, for documentation and for tests over every message."""
+    """Return all message types by the shape of their key, for documentation and for tests."""
     shapes = {f"{kind}/*/{rest}": message for (kind, rest), message in _BY_SHAPE.items()}
     return {**_FIXED, **shapes, "view/cluster/*": ViewCluster}
 
@@ -334,6 +336,7 @@ def encode(message: Struct) -> bytes:
     return _encoder.encode(message)
 
 
+@lru_cache(maxsize=KEYS_KEPT)
 def encoding(key: str) -> str:
     """Return the Zenoh encoding of a key's messages."""
     kind = type_of(key)
@@ -373,7 +376,7 @@ def _reader_of(key: str) -> tuple[type[Struct] | None, _Reader]:
     return kind, _reader(kind or Struct)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _reader(kind: type[Struct]) -> _Reader:
     """Return what turns a payload into a checked `kind`: the bare decoder where its types say everything."""
     decode_bare = msgspec.msgpack.Decoder(kind).decode
@@ -403,10 +406,8 @@ def _refusal(kind: type[Struct], payload: bytes, where: str, error: Exception) -
     try:
         found = first_fault(msgspec.msgpack.decode(payload), kind)
     except _REFUSALS as fault:
-        return DecodeError(
-            f"{where}: the payload ({len(payload)} bytes) is not msgpack ({fault}); must be a map, the {kind.__name__}"
-        )
-    path, text = found or ("", f"is refused ({error})")
+        found = ("", f"({len(payload)} bytes) is not msgpack ({fault}); must be a map, the {kind.__name__}")
+    path, text = found or ("", f"is refused ({error}); must be the {kind.__name__}")
     return DecodeError(f"{where}: {path or 'the payload'} {text}")
 
 

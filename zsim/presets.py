@@ -54,4 +54,4 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
-AS_PRINTED = {"imu": {"accel_m_s2": {"noise": 0.35 * G_M_S2}}}  # section VI: "accelerometers std errors 0.35 g"
+AS_PRINTED = {"imu": {"accel_m_s2": {"noise": 0.35 * G_M_S2}}}  # m/s^2, section VI: "std errors 0.35 g"

@@ -259,7 +259,7 @@ class Runner:
             keys=list(self._agent.reads),
         )
         for key, payload in answer.result or ():
-            self._take_in(Sample(key, payload, ""))
+            self._take_in(Sample(key, payload))
 
     def _rejoin(self) -> None:
         """After a lost link: a new incarnation, what was missed, and once more what may have been lost."""

@@ -9,18 +9,25 @@ from msgspec import Meta, Struct, field
 
 from zsim.presets import G_M_S2
 
-Name = Annotated[str, Meta(pattern=r"^[a-z0-9_.-]{1,32}$")]
-Positive = Annotated[float, Meta(gt=0)]
-NonNegative = Annotated[float, Meta(ge=0)]
+DRONES_MAX = 1000  # one world integrates them all
+
+# LARGE keeps squares and products of what is given finite; it is beyond any quantity of a flight in SI units.
+LARGE = 1e9
+Name = Annotated[str, Meta(pattern=r"^[a-z0-9_.-]{1,32}\Z")]
+Real = Annotated[float, Meta(ge=-LARGE, le=LARGE)]
+Positive = Annotated[float, Meta(gt=0, le=LARGE)]
+NonNegative = Annotated[float, Meta(ge=0, le=LARGE)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
-Vector3 = tuple[float, float, float]
+Coordinate = Annotated[float, Meta(ge=-100_000, le=100_000)]  # m; beyond it a tangent plane is no map
+Vector3 = tuple[Real, Real, Real]
+Position = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class Spec(Struct, frozen=True, forbid_unknown_fields=True):
     """Base of every section: unknown keys are faults, not surprises."""
 
 
-class ErrorModel(Spec, kw_only=True):
+class ErrorModel(Spec, frozen=True, kw_only=True):
     """Error of one channel, in the channel's unit."""
 
     noise: NonNegative = 0.0
@@ -35,14 +42,14 @@ class ErrorModel(Spec, kw_only=True):
     """Step of the converter; 0 = none."""
 
 
-class Mount(Spec, kw_only=True):
+class Mount(Spec, frozen=True, kw_only=True):
     """Pose of the sensor in the body, X_BS."""
 
     position_m: Vector3 = (0.0, 0.0, 0.0)
     rpy_deg: Vector3 = (0.0, 0.0, 0.0)
 
 
-class Sensor(Spec, kw_only=True):
+class Sensor(Spec, frozen=True, kw_only=True):
     """What all sensors share."""
 
     rate_hz: Annotated[float, Meta(gt=0, le=1000)]
@@ -52,35 +59,35 @@ class Sensor(Spec, kw_only=True):
     mount: Mount = Mount()
 
 
-class Imu(Sensor, kw_only=True):
+class Imu(Sensor, frozen=True, kw_only=True):
     accel_m_s2: ErrorModel = ErrorModel()
     gyro_deg_s: ErrorModel = ErrorModel()
 
 
-class Gps(Sensor, kw_only=True):
+class Gps(Sensor, frozen=True, kw_only=True):
     position_m: ErrorModel = ErrorModel()
     velocity_m_s: ErrorModel = ErrorModel()
 
 
-class Mag(Sensor, kw_only=True):
+class Mag(Sensor, frozen=True, kw_only=True):
     field_ut: ErrorModel = ErrorModel()
 
 
-class Baro(Sensor, kw_only=True):
+class Baro(Sensor, frozen=True, kw_only=True):
     altitude_m: ErrorModel = ErrorModel()
 
 
-class Sonar(Sensor, kw_only=True):
+class Sonar(Sensor, frozen=True, kw_only=True):
     range_m: ErrorModel = ErrorModel()
     min_m: NonNegative = 0.03
     max_m: Positive = 6.0
 
 
-class Flow(Sensor, kw_only=True):
+class Flow(Sensor, frozen=True, kw_only=True):
     velocity_m_s: ErrorModel = ErrorModel()
 
 
-class Sensors(Spec, kw_only=True):
+class Sensors(Spec, frozen=True, kw_only=True):
     """The sensors of one drone, after preset and overrides."""
 
     preset: Literal["ardrone2", "paper"]
@@ -94,7 +101,7 @@ class Sensors(Spec, kw_only=True):
     flow: Flow
 
 
-class Limits(Spec, kw_only=True):
+class Limits(Spec, frozen=True, kw_only=True):
     """What the firmware allows a commander (defaults: the SDK's outdoor set, no altitude limit)."""
 
     tilt_deg: Annotated[float, Meta(gt=0, le=30)] = 20.0
@@ -104,13 +111,13 @@ class Limits(Spec, kw_only=True):
     altitude_m: Positive = 100.0
 
 
-class Drone(Spec, kw_only=True):
-    """One aircraft; the defaults are the AR.Drone 2.0 (Li 2014 through AuRoRA; see world/zsim_world/vehicle.py)."""
+class Drone(Spec, frozen=True, kw_only=True):
+    """One aircraft; the defaults are the AR.Drone 2.0 (Li 2014 through AuRoRA, zsim_world/vehicle.py)."""
 
     name: Name
     model: Literal["ardrone2"] = "ardrone2"
-    position_m: Vector3
-    yaw_deg: float = 0.0
+    position_m: Position
+    yaw_deg: Real = 0.0
     mass_kg: Annotated[float, Meta(gt=0, le=100)] = 0.429
     inertia_kg_m2: tuple[Positive, Positive, Positive] = (2.237568e-3, 2.985236e-3, 4.80374e-3)
     arm_m: Annotated[float, Meta(gt=0, le=10)] = 0.1785
@@ -127,7 +134,7 @@ class Drone(Spec, kw_only=True):
     sensors: Sensors
 
 
-class Wind(Spec, kw_only=True):
+class Wind(Spec, frozen=True, kw_only=True):
     """Steady wind and Dryden gusts, `gust_m_s` being the standard deviation per axis."""
 
     steady_m_s: Vector3 = (0.0, 0.0, 0.0)
@@ -137,26 +144,26 @@ class Wind(Spec, kw_only=True):
     gust_correlation: Fraction = 0.5
 
 
-class Environment(Spec, kw_only=True):
+class Environment(Spec, frozen=True, kw_only=True):
     """The field of the flight: default Buenos Aires, where the paper comes from."""
 
     latitude_deg: Annotated[float, Meta(ge=-90, le=90)] = -34.603
     longitude_deg: Annotated[float, Meta(ge=-180, le=180)] = -58.368
-    height_m: float = 25.0
+    height_m: Coordinate = 25.0
     gravity_m_s2: Positive = G_M_S2
     magnetic_field_ut: Vector3 = (-2.8, 17.8, 14.0)  # ENU; 18 uT horizontal, declination -9 deg, upwards
     air_density_kg_m3: Positive = 1.225
     wind: Wind = Wind()
 
 
-class Silence(Spec, kw_only=True):
+class Silence(Spec, frozen=True, kw_only=True):
     """What the firmware does when the commander falls silent, in simulated time."""
 
     hover_s: Positive = 0.5
     land_s: Positive = 2.0
 
 
-class Gains(Spec, kw_only=True):
+class Gains(Spec, frozen=True, kw_only=True):
     """Of the cluster controller; see zsim_agents/formation.py."""
 
     proportional_1_s: Annotated[float, Meta(gt=0, le=2)] = 0.6
@@ -164,42 +171,42 @@ class Gains(Spec, kw_only=True):
     horizontal_speed_m_s: Positive = 1.5
     vertical_speed_m_s: Positive = 0.8
     yaw_rate_deg_s: Positive = 60.0
-    separation_min_m: Annotated[float, Meta(ge=0)] = 2.0
-    separation_alarm_m: Annotated[float, Meta(ge=0)] = 1.5
+    separation_min_m: NonNegative = 2.0
+    separation_alarm_m: NonNegative = 1.5
 
 
-class Waypoint(Spec, kw_only=True):
+class Waypoint(Spec, frozen=True, kw_only=True):
     at_s: NonNegative
-    values: dict[str, float]
+    values: dict[str, Real]
 
 
-class Trajectory(Spec, kw_only=True):
+class Trajectory(Spec, frozen=True, kw_only=True):
     """A reference as expressions of t (seconds since `start_s`) or as waypoints."""
 
     start_s: NonNegative = 0.0
-    constants: dict[str, float] = {}
+    constants: dict[str, Real] = {}
     expressions: dict[str, str] = {}
     waypoints: list[Waypoint] = []
 
 
-class Plan(Spec, kw_only=True):
+class Plan(Spec, frozen=True, kw_only=True):
     """What the controller does by itself."""
 
     takeoff_s: NonNegative | None = None
-    target: dict[str, float] = {}
+    target: dict[str, Real] = {}
     target_over_s: Positive | None = None
     trajectory: Trajectory | None = None
     land_s: NonNegative | None = None
 
 
-class Cluster(Spec, kw_only=True):
+class Cluster(Spec, frozen=True, kw_only=True):
     name: Name
     drones: Annotated[list[Name], Meta(min_length=2)]
     gains: Gains = Gains()
     plan: Plan = Plan()
 
 
-class Estimation(Spec, kw_only=True):
+class Estimation(Spec, frozen=True, kw_only=True):
     """Settings of the estimators; noise figures come from the drone's own sensors."""
 
     madgwick_beta: Annotated[float, Meta(ge=0, le=1)] | None = None
@@ -212,27 +219,27 @@ class Estimation(Spec, kw_only=True):
 OnDeath = Literal["wait", "restart", "drop", "end"]
 
 
-class Processes(Spec, kw_only=True):
+class Processes(Spec, frozen=True, kw_only=True):
     """Who takes part. `expect: null` means an estimator per drone and a controller per cluster."""
 
     expect: list[Name] | None = None
     on_death: dict[str, OnDeath] = {}
 
 
-class Time(Spec, kw_only=True):
+class Time(Spec, frozen=True, kw_only=True):
     gate_ms: Annotated[float, Meta(gt=0, le=1000)] = 20.0
     physics_dt_ms: Annotated[float, Meta(gt=0, le=20)] = 2.5
     command_delay_gates: Annotated[int, Meta(ge=1, le=50)] = 1
     max_command_age_ms: Positive = 500.0
 
 
-class Figures(Spec, kw_only=True):
+class Figures(Spec, frozen=True, kw_only=True):
     """Windows of the statistics, in simulated seconds; None: the last two thirds of the run."""
 
-    window_s: tuple[float, float] | None = None
+    window_s: tuple[Real, Real] | None = None
 
 
-class Scenario(Spec, kw_only=True):
+class Scenario(Spec, frozen=True, kw_only=True):
     """A whole run."""
 
     name: Name
@@ -242,7 +249,7 @@ class Scenario(Spec, kw_only=True):
     time: Time = Time()
     environment: Environment = Environment()
     silence: Silence = Silence()
-    drones: Annotated[list[Drone], Meta(min_length=1, max_length=1000)]
+    drones: Annotated[list[Drone], Meta(min_length=1, max_length=DRONES_MAX)]
     clusters: list[Cluster] = []
     estimation: Estimation = Estimation()
     processes: Processes = Processes()
@@ -255,3 +262,9 @@ class Scenario(Spec, kw_only=True):
     def cluster(self, name: str) -> Cluster:
         """Return the cluster of that name; KeyError if there is none."""
         return {cluster.name: cluster for cluster in self.clusters}[name]
+
+
+class Document(Scenario, frozen=True, kw_only=True):
+    """What a file may say: a scenario, and what all its drones share."""
+
+    sensors: Sensors | None = None

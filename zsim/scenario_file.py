@@ -1,23 +1,25 @@
-"""Scenario files: read, override, resolve, check, and write out again as the text that `world/info` carries."""
+"""Scenario files: read, override, resolve, check, and write out again as the text of `world/info`."""
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 import yaml
+from yaml.composer import ComposerError
+from yaml.constructor import ConstructorError
 
+from zsim import overrides as override
+from zsim.cross_faults import cross_faults
 from zsim.errors import ScenarioError
-from zsim.faults import faults
+from zsim.faults import faults, show, sound
 from zsim.presets import AS_PRINTED, PRESETS
-from zsim.scenario import Scenario
+from zsim.scenario import DRONES_MAX, Document, Scenario, Sensors
 
 FILE_SIZE_MAX = 1_000_000  # bytes; a scenario of 1000 drones with every field given is below this
-START_SEPARATION_MIN_M = 0.6  # m, two hulls of 0.515 m side by side (OpenMAS, weighed and measured)
-OVERRIDE_SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
+FAULTS_MAX = 100  # lines; what follows is counted
 
 
 def load(path: str | Path, overrides: Iterable[str] = (), **values: Any) -> Scenario:
@@ -34,10 +36,8 @@ def load(path: str | Path, overrides: Iterable[str] = (), **values: Any) -> Scen
     path = Path(path)
     document = _read(path)
     document.update({key: value for key, value in values.items() if value is not None})
-    problems = [problem for text in overrides for problem in _override(document, text)]
-    if problems:
-        raise ScenarioError(problems)
-    return resolve(document, source=path.name)
+    applied = [override.apply(document, text, _value) for text in overrides]
+    return _resolve(document, path.name, [fault for fault in applied if fault])
 
 
 def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:
@@ -46,14 +46,22 @@ def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:
     Raises:
         ScenarioError: with every fault found, a line each.
     """
+    return _resolve(document, source, [])
+
+
+def _resolve(document: dict[str, Any], source: str, lines: list[str]) -> Scenario:
     document = _expand_presets(document)
-    found = list(faults(document, Scenario))
-    if not found:
-        scenario = msgspec.convert(document, Scenario, strict=False)
-        found = list(_cross_faults(scenario))
-        if not found:
-            return scenario
-    raise ScenarioError([f"{source}: {path} {text}{_whose(document, path)}" for path, text in found])
+    found = [*faults(document, Document), *cross_faults(sound(document, Scenario))]
+    lines += [f"{source}: {path} {text}{_whose(document, path)}" for path, text in found]
+    if lines:
+        raise ScenarioError(_shortened(lines))
+    del document["sensors"]
+    return msgspec.convert(document, Scenario)
+
+
+def _shortened(lines: list[str]) -> list[str]:
+    more = len(lines) - FAULTS_MAX
+    return [*lines[:FAULTS_MAX], f"… and {more} more faults"] if more > 0 else lines
 
 
 def from_text(text: str) -> Scenario:
@@ -63,7 +71,8 @@ def from_text(text: str) -> Scenario:
 
 def to_text(scenario: Scenario) -> str:
     """Return the resolved scenario as YAML text; the same scenario gives the same text."""
-    return yaml.safe_dump(msgspec.to_builtins(scenario), sort_keys=True, default_flow_style=None, width=120)
+    plain = msgspec.to_builtins(scenario)
+    return yaml.dump(plain, Dumper=_Dumper, sort_keys=True, default_flow_style=None, width=120)
 
 
 def sha256(scenario: Scenario) -> str:
@@ -73,27 +82,42 @@ def sha256(scenario: Scenario) -> str:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > FILE_SIZE_MAX:
-            raise ScenarioError([f"{path}: has {path.stat().st_size} bytes; at most {FILE_SIZE_MAX}"])
-        text = path.read_text(encoding="utf-8")
+        with path.open("rb") as file:
+            content = file.read(FILE_SIZE_MAX + 1)
+        text = content.decode("utf-8-sig")
     except OSError as error:
-        raise ScenarioError([f"{path}: cannot be read ({error.strerror}); give the path of a YAML file"]) from error
+        reason = error.strerror or str(error)
+        raise ScenarioError([f"{path}: cannot be read ({reason}); give the path of a YAML file"]) from error
     except UnicodeDecodeError as error:
         raise ScenarioError([f"{path}: is not text (byte {error.start}); must be YAML in UTF-8"]) from error
+    except ValueError as error:
+        raise ScenarioError([f"{show(str(path))}: is no path ({error}); give that of a YAML file"]) from error
+    if len(content) > FILE_SIZE_MAX:
+        raise ScenarioError([f"{path}: is larger than {FILE_SIZE_MAX} bytes; must be at most that"])
     return _parse(text, path.name)
 
 
 def _parse(text: str, source: str) -> dict[str, Any]:
     try:
-        document = yaml.load(text, Loader=_Loader)
-    except (yaml.YAMLError, RecursionError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"line {mark.line + 1}" if mark else "the text"
-        problem = getattr(error, "problem", None) or "nested too deep or malformed"
-        raise ScenarioError([f"{source}: {where} is not YAML ({problem}); see scenarios/step.yaml"]) from error
+        document = _value(text)
+    except ValueError as error:
+        raise ScenarioError([f"{source}: {error}; see scenarios/step.yaml"]) from error
     if not isinstance(document, dict):
-        raise ScenarioError([f"{source}: holds no map; must be a map as in scenarios/step.yaml"])
+        raise ScenarioError([f"{source}: holds {show(document)}; must be a map as in scenarios/step.yaml"])
     return document
+
+
+def _value(text: str) -> Any:
+    """Return what a YAML text says; ValueError, a line long, if it says nothing."""
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except RecursionError:
+        raise ValueError("is nested too deep") from None
+    except (yaml.YAMLError, ValueError, OverflowError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"line {mark.line + 1} " if mark else ""
+        problem = getattr(error, "problem", None) or " ".join(str(error).split())
+        raise ValueError(f"{where}is not YAML ({problem[:100]})") from error
 
 
 class _Loader(yaml.SafeLoader):
@@ -102,7 +126,7 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             event = self.peek_event()
-            raise yaml.composer.ComposerError(None, None, "aliases are not allowed", event.start_mark)
+            raise ComposerError(None, None, "aliases are not allowed", event.start_mark)
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
@@ -110,82 +134,54 @@ class _Loader(yaml.SafeLoader):
         for key_node, _ in node.value:
             key = getattr(key_node, "value", None)
             if isinstance(key, str) and key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key!r} is given twice", key_node.start_mark
-                )
+                raise ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
             seen.add(key if isinstance(key, str) else None)
         return super().construct_mapping(node, deep)
 
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|^[-+]?\.(inf|Inf)$|^\.(nan|NaN)$"),
-    list("-+0123456789."),
-)
+class _Dumper(yaml.SafeDumper):
+    """Puts into quotes the texts that `_Loader` would read as numbers."""
 
 
-def _override(document: dict[str, Any], text: str) -> Iterator[str]:
-    """Apply one `a.b.c=value` to the raw document; yield the fault if there is one."""
-    path, equals, value = text.partition("=")
-    if not equals or not path:
-        yield f"--set {text}: is no assignment; must be {OVERRIDE_SYNTAX}"
-        return
-    parts = [part for part in re.split(r"\.|\[|\]", path) if part]
-    place: Any = document
-    for depth, part in enumerate(parts):
-        last = depth == len(parts) - 1
-        if isinstance(place, list):
-            index = _index(place, part)
-            if index is None:
-                yield f"--set {text}: {part} is not in {'.'.join(parts[:depth])}; {_allowed(place)}"
-                return
-            place, part = (place, index)
-        elif not isinstance(place, dict):
-            yield f"--set {text}: {'.'.join(parts[:depth])} is {place!r}; must be a map or a list"
-            return
-        if last:
-            place[part] = yaml.load(value, Loader=_Loader)
-        elif isinstance(place, dict):
-            place = place.setdefault(part, {})
-        else:
-            place = place[part]
-
-
-def _index(place: list[Any], part: str) -> int | None:
-    if part.isdigit() and int(part) < len(place):
-        return int(part)
-    names = [item.get("name") if isinstance(item, dict) else None for item in place]
-    return names.index(part) if part in names else None
-
-
-def _allowed(place: list[Any]) -> str:
-    names = [str(item.get("name")) for item in place if isinstance(item, dict)]
-    return f"allowed: 0 to {len(place) - 1}" + (f" or {', '.join(names)}" if names else "")
+for _yaml in (_Loader, _Dumper):
+    _yaml.add_implicit_resolver(
+        "tag:yaml.org,2002:float",
+        re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|^[-+]?\.(inf|Inf)$|^\.(nan|NaN)$"),
+        list("-+0123456789."),
+    )
 
 
 def _expand_presets(document: dict[str, Any]) -> dict[str, Any]:
-    """Put preset, the scenario's `sensors:` and the drone's `sensors:` together, the later ones winning."""
-    document = dict(document)
-    shared = document.pop("sensors", {})
+    """Put preset, the scenario's `sensors:` and the drone's `sensors:` together, the later ones winning.
+
+    A faulty section of the scenario is not handed on to the drones: its faults are told once.
+    """
+    shared = document.get("sensors") or {}
+    document = {**document, "sensors": _expanded(shared)}
+    usable = {} if any(faults(document["sensors"], Sensors)) else shared
     drones = document.get("drones")
-    if not isinstance(drones, list) or not isinstance(shared, dict):
-        if not isinstance(shared, dict):
-            document["sensors"] = shared
-        return document
-    document["drones"] = [_expand_drone(drone, shared) if isinstance(drone, dict) else drone for drone in drones]
+    if isinstance(drones, list) and len(drones) <= DRONES_MAX:
+        document["drones"] = [_expand_drone(drone, usable) for drone in drones]
     return document
 
 
-def _expand_drone(drone: dict[str, Any], shared: dict[str, Any]) -> dict[str, Any]:
-    own = drone.get("sensors", {})
-    if not isinstance(own, dict):
+def _expand_drone(drone: Any, shared: dict[str, Any]) -> Any:
+    if not isinstance(drone, dict):
         return drone
-    given = _merge(shared, own)
+    own = drone.get("sensors")
+    given = _merge(shared, own) if isinstance(own, dict) else shared if own is None else own
+    return {**drone, "sensors": _expanded(given)}
+
+
+def _expanded(given: Any) -> Any:
+    """Return a `sensors:` section upon its preset."""
+    if not isinstance(given, dict):
+        return given
     name = given.get("preset", "ardrone2")
-    preset = PRESETS.get(name, PRESETS["ardrone2"]) if isinstance(name, str) else {}
-    if given.get("as_printed") is True:
+    preset = PRESETS.get(name, PRESETS["ardrone2"]) if isinstance(name, str) else PRESETS["ardrone2"]
+    if given.get("as_printed") is True and name == "paper":
         preset = _merge(preset, AS_PRINTED)
-    return {**drone, "sensors": _merge({"preset": name, **preset}, given)}
+    return _merge({"preset": name, **preset}, given)
 
 
 def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
@@ -196,93 +192,12 @@ def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _cross_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
-    """Yield what no single field can know."""
-    yield from _name_faults("drones", [drone.name for drone in scenario.drones])
-    yield from _name_faults("clusters", [cluster.name for cluster in scenario.clusters])
-    yield from _time_faults(scenario)
-    yield from _start_faults(scenario)
-    yield from _drone_faults(scenario)
-    yield from _cluster_faults(scenario)
-    window = scenario.report.window_s
-    if window is not None and not 0 <= window[0] < window[1]:
-        yield "report.window_s", f"is {list(window)}; must be [start, end] with 0 <= start < end"
-
-
-def _name_faults(path: str, names: list[str]) -> Iterator[tuple[str, str]]:
-    for index, name in enumerate(names):
-        if name in names[:index]:
-            yield f"{path}[{index}].name", f"is {name!r}, as {path}[{names.index(name)}]; must be unique"
-
-
-def _time_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
-    gate_us, dt_us = scenario.time.gate_ms * 1000, scenario.time.physics_dt_ms * 1000
-    firmware_us = 5000  # the firmware's own step, 200 Hz
-    if gate_us % firmware_us or gate_us % 1:
-        yield "time.gate_ms", f"is {scenario.time.gate_ms:g}; must be a multiple of 5 (the firmware's step)"
-    elif dt_us % 1 or firmware_us % dt_us:
-        yield "time.physics_dt_ms", f"is {scenario.time.physics_dt_ms:g}; must divide 5 (the firmware's step)"
-
-
-def _start_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
-    positions = np.array([drone.position_m for drone in scenario.drones])
-    for index, position in enumerate(positions):
-        distances = np.linalg.norm(positions[:index] - position, axis=1)
-        if position[2] < 0:
-            yield f"drones[{index}].position_m[2]", f"is {position[2]:g}; must be >= 0 (the ground)"
-        if len(distances) and distances.min() < START_SEPARATION_MIN_M:
-            other = scenario.drones[int(distances.argmin())].name
-            yield (
-                f"drones[{index}].position_m",
-                f"is {distances.min():.2f} m from {other!r}; must be >= {START_SEPARATION_MIN_M} m",
-            )
-
-
-def _drone_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
-    for index, drone in enumerate(scenario.drones):
-        if drone.rotor_min_rad_s >= drone.rotor_max_rad_s:
-            yield (
-                f"drones[{index}].rotor_min_rad_s",
-                f"is {drone.rotor_min_rad_s:g}; must be < rotor_max_rad_s ({drone.rotor_max_rad_s:g})",
-            )
-        lift = 4 * drone.thrust_n_s2 * drone.rotor_max_rad_s**2 / scenario.environment.gravity_m_s2
-        if drone.mass_kg >= 0.9 * lift:
-            yield (
-                f"drones[{index}].mass_kg",
-                f"is {drone.mass_kg:g}; must be < {0.9 * lift:.3f}, nine tenths of what its rotors lift",
-            )
-        if drone.sensors.imu.rate_hz > 200:
-            yield (
-                f"drones[{index}].sensors.imu.rate_hz",
-                f"is {drone.sensors.imu.rate_hz:g}; must be <= 200, the rate of the navigation board",
-            )
-
-
-def _cluster_faults(scenario: Scenario) -> Iterator[tuple[str, str]]:
-    known = {drone.name for drone in scenario.drones}
-    owner: dict[str, str] = {}
-    for index, cluster in enumerate(scenario.clusters):
-        for place, name in enumerate(cluster.drones):
-            path = f"clusters[{index}].drones[{place}]"
-            if name not in known:
-                yield path, f"is {name!r}; must be one of the drones {', '.join(sorted(known))}"
-            elif name in owner:
-                yield path, f"is {name!r}, which {owner[name]!r} flies already; a drone is in one cluster"
-            owner.setdefault(name, cluster.name)
-        trajectory = cluster.plan.trajectory
-        if trajectory and bool(trajectory.expressions) == bool(trajectory.waypoints):
-            yield (
-                f"clusters[{index}].plan.trajectory",
-                "has both or neither of expressions and waypoints; must have one of them",
-            )
-
-
 def _whose(document: dict[str, Any], path: str) -> str:
-    """Return " (drone 'drone3')" for a path inside a drone's entry."""
-    match = re.match(r"drones\[(\d+)\]", path)
-    drones = document.get("drones")
-    if not match or not isinstance(drones, list):
+    """Return " (drone 'drone3')" for a path inside a drone's entry, the like for a cluster's."""
+    match = re.match(r"(drone|cluster)s\[(\d+)\]", path)
+    entries = document.get(f"{match[1]}s") if match else None
+    if not match or not isinstance(entries, Sequence):
         return ""
-    entry = drones[int(match[1])]
+    entry = entries[int(match[2])]
     name = entry.get("name") if isinstance(entry, dict) else None
-    return f" (drone {name!r})" if isinstance(name, str) else ""
+    return f" ({match[1]} {name!r})" if isinstance(name, str) and len(name) <= 40 else ""

@@ -37,7 +37,6 @@ class Sample(NamedTuple):
 
     key: str
     payload: bytes
-    encoding: str
 
 
 class Session:
@@ -216,7 +215,7 @@ class Mailbox:
         key = str(raw.key_expr)
         if key == self._wake_key or raw.kind != zenoh.SampleKind.PUT:
             return None
-        return Sample(key[self._cut :], raw.payload.to_bytes(), str(raw.encoding))
+        return Sample(key[self._cut :], raw.payload.to_bytes())
 
 
 class TimedMailbox:
@@ -258,7 +257,7 @@ class TimedMailbox:
 
 
 def _sample(raw: zenoh.Sample, prefix: str) -> Sample:
-    return Sample(str(raw.key_expr).removeprefix(prefix), raw.payload.to_bytes(), str(raw.encoding))
+    return Sample(str(raw.key_expr).removeprefix(prefix), raw.payload.to_bytes())
 
 
 @contextmanager

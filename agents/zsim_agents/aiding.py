@@ -20,6 +20,7 @@ SIGMA_MIN = {
     "sonar": (0.003,),  # m
     "flow": (0.005,),  # m/s
 }
+VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and squares of more would drown the rest
 # A sensor refused for this long without a break is believed again, its states losing their certainty [s].
 # Height and velocity are lost quickly where they are wrong; a field may be disturbed in passing.
 PATIENCE_S = {"gps": 10.0, "mag": 10.0, "baro": 5.0, "sonar": math.inf, "flow": 1.0}
@@ -65,7 +66,7 @@ class Aid:
             self.variance += (max(white_sigma(error, rate_hz), floor) ** 2,) * axes
 
     def accept(self, t_s: float, t_sample_s: float, values: Sequence[float], age_max_s: float) -> bool:
-        """Whether a reading is new, in order, of a usable age and finite; counted as refused if not.
+        """Whether a reading is new, in order, of a usable age and a number; counted as refused if not.
 
         A duplicate is not counted at all.
 
@@ -79,7 +80,7 @@ class Aid:
         if (
             t_sample_s > self.t_sample_s
             and 0.0 <= t_s - t_sample_s <= age_max_s
-            and all(map(math.isfinite, values))
+            and sum(map(abs, values)) < VALUE_MAX  # false if one is NaN
         ):
             self.t_sample_s = t_sample_s
             return True

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zsim.scenario import Drone, Environment, Estimation
-from zsim_agents.aiding import Aid, Measurement, aids
+from zsim_agents.aiding import VALUE_MAX, Aid, Measurement, aids
 from zsim_agents.aiding_models import write_baro, write_flow, write_gps, write_mag, write_sonar
 from zsim_agents.dead_reckoning import ATTITUDE, POSITION, VELOCITY, heading_and_sigma, plus
 from zsim_agents.estimator_prior import (
@@ -117,7 +117,7 @@ class DroneEstimator:
     ) -> None:
         """Take a fix; `sigma_m` per axis counts where it is worse than what the scenario says."""
         aid = self._aids["gps"]
-        if not fix or not math.isfinite(sigma_m):
+        if not fix or not abs(sigma_m) < VALUE_MAX:
             aid.refused += 1
             return
         variance = max(sigma_m * sigma_m, aid.variance[0])

@@ -37,6 +37,7 @@ from zsim_agents.flight_request import (
 )
 from zsim_agents.formation import FormationGains, FormationLaw, Pairs, guard
 from zsim_agents.guidance import Guidance
+from zsim_agents.mode_sender import ModeSender
 from zsim_agents.reference_check import place_fault
 
 DT_MAX_S = 0.1  # longest step of the integral, after a gap
@@ -79,7 +80,7 @@ class Engagement:
         self._phase = "idle"
         self._gate: GateInput | None = None
         self._dt_s = 0.0
-        self._mode_sent_s: dict[str, float] = {}
+        self._modes = ModeSender(self.drones, self.limits.resend_s)
         self._landing_s = -math.inf
         self._fault = ""  # why an engaged formation does not close its loop
         self._well_since_s = math.inf
@@ -96,7 +97,7 @@ class Engagement:
         self._gate = gate
         self.judge.observe(gate)
         self.plan.run(gate.t_s, self._try)
-        if self._phase in ("assembling", "engaged") and _down(gate):
+        if self._phase in ("assembling", "engaged") and gate.down:
             self._phase = "idle"
         return _PHASES[self._phase](self, gate)
 
@@ -155,7 +156,7 @@ class Engagement:
             raise RefusalError(f"phase is {self.phase}; take-off is possible when idle")
         refuse(self.judge.take_off_fault(gate))
         self._phase = "taking_off"
-        self._mode_sent_s.clear()
+        self._modes.restart()
 
     def _grant_engage(self, gate: GateInput) -> None:
         if self._phase == "engaged" and self.guidance.paused and not self._fault:
@@ -170,17 +171,17 @@ class Engagement:
         self._phase = "engaged"
 
     def _grant_land(self, gate: GateInput) -> None:
-        if self._phase == "idle" and _down(gate):
+        if self._phase == "idle" and gate.down:
             raise RefusalError("all drones are on the ground")
         self._phase, self._landing_s = "landing", gate.t_s
-        self._mode_sent_s.clear()
+        self._modes.restart()
 
     def _taking_off(self, gate: GateInput) -> GateOutput:
         waiting = self.judge.state_fault(gate, AIRBORNE)
         if waiting is None:
             self._phase = "assembling"
             return self._assembling(gate)
-        return self._climb(gate, waiting, self._modes(gate, "takeoff", frozenset({"landed"})))
+        return self._climb(gate, waiting, self._modes.commands(gate, "takeoff", frozenset({"landed"})))
 
     def _assembling(self, gate: GateInput) -> GateOutput:
         return self._climb(gate, self.judge.engagement_fault(gate) or "ready to engage")
@@ -221,9 +222,9 @@ class Engagement:
 
     def _landing(self, gate: GateInput) -> GateOutput:
         # A take-off sent just before may still be on its way: idle only after a while on the ground.
-        if _down(gate) and gate.t_s - self._landing_s >= self.limits.resend_s:
+        if gate.down and gate.t_s - self._landing_s >= self.limits.resend_s:
             self._phase = "idle"
-        modes = self._modes(gate, "land", AIRBORNE | {"taking_off"})
+        modes = self._modes.commands(gate, "land", AIRBORNE | {"taking_off"})
         return self._output(gate, self.judge.state_fault(gate, DOWN) or "", modes=modes)
 
     def _judge(self, gate: GateInput) -> None:
@@ -252,16 +253,6 @@ class Engagement:
         except REFUSALS as error:
             fault = str(error)
         return f"reference: {fault}" if fault else None
-
-    def _modes(self, gate: GateInput, mode: str, states: frozenset[str]) -> tuple[ModeCommand, ...]:
-        """Return the mode command for drones in one of the states, again where it was sent long ago."""
-        commands = []
-        for drone, state in zip(self.drones, gate.states, strict=True):
-            since_s = gate.t_s - self._mode_sent_s.get(drone, -math.inf)
-            if state in states and since_s >= self.limits.resend_s:
-                self._mode_sent_s[drone] = gate.t_s
-                commands.append(ModeCommand(drone, mode))
-        return tuple(commands)
 
     def _output(
         self,
@@ -307,7 +298,3 @@ _PHASES = {
     "engaged": Engagement._engaged,
     "landing": Engagement._landing,
 }
-
-
-def _down(gate: GateInput) -> bool:
-    return all(state in DOWN for state in gate.states)

@@ -73,6 +73,11 @@ class GateInput:
     age_s: Array
     states: tuple[str, ...]
 
+    @property
+    def down(self) -> bool:
+        """Return whether no drone is in the air."""
+        return all(state in DOWN for state in self.states)
+
 
 class ModeCommand(NamedTuple):
     """A mode command for one drone: takeoff or land."""

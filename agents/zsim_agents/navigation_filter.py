@@ -86,9 +86,9 @@ class Stack:
             predicted: what the nominal state predicts.
             variance: of the white noise of each row.
         """
-        self.z += z
-        self.predicted += predicted
-        self.variance += variance
+        self.z.extend(z)
+        self.predicted.extend(predicted)
+        self.variance.extend(variance)
         self.blocks.append((self.rows, len(z)))
         self.rows += len(z)
 

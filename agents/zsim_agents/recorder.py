@@ -111,7 +111,7 @@ class Recorder:
             keys.CONTROL, "replay", self._name, timeout_s=REPLAY_S, from_ns=-1, keys=["**"]
         )
         for key, payload in answer.result or ():
-            self._write(Sample(key, payload, messages.encoding(key)))
+            self._write(Sample(key, payload))
             if len(self._known) < KNOWN_MAX:
                 self._known.add((key, payload))
 
@@ -121,7 +121,7 @@ class Recorder:
             return
         self.health.received += 1
         t_ns = self._stamp(key, payload)
-        self._writer.add(key, payload, sample.encoding, t_ns, time.time_ns())
+        self._writer.add(key, payload, messages.encoding(key), t_ns, time.time_ns())
         if key == keys.CLOCK:
             self._on_clock(payload)
         elif key.startswith("process/"):

@@ -24,7 +24,9 @@ from zsim_agents.state_history import Moment
 ZERO: Vector = (0.0, 0.0, 0.0)
 ACCEL_MAX_M_S2 = 500.0  # m/s^2, 50 g: no MEMS accelerometer of a drone reads more
 GYRO_MAX_RAD_S = 100.0  # rad/s, 5700 deg/s: likewise
-MANOEUVRE_M_S2 = 0.3  # m/s^2, standard deviation of the acceleration in gusts of 0.5 m/s (0.16) and in transit
+MANOEUVRE_M_S2 = (
+    0.3  # m/s^2, standard deviation of the acceleration in gusts of 0.5 m/s (0.16) and in transit
+)
 MANOEUVRE_S = 0.5  # s, its correlation time
 LOST_TURN_RAD_S = 0.5  # rad/s, standard deviation of the rate that a missing gyroscope sample hides
 COAST_TURN_DENSITY = LOST_TURN_RAD_S**2 * 2.0 * MANOEUVRE_S  # rad^2/s

@@ -47,6 +47,9 @@ class Teller:
     def event(self, line: dict[str, Any]) -> None:
         self._write({"event": line})
 
+    def say(self, text: str) -> None:
+        self._write({"say": text})
+
     def _write(self, line: dict[str, Any]) -> None:
         try:
             sys.stdout.write(json.dumps(line) + "\n")

@@ -2,8 +2,10 @@
 
 import gc
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from zsim.scenario import Scenario
 from zsim_deploy.leash import Leash
 from zsim_deploy.progress import Screen, Show, Teller, Throttle
 
+PATIENCE_S = 2.0  # a compiled kernel is loaded within a second
 SHOWN_EVENTS = 2000  # events told to a launcher per run; all of them are in the record
 
 
@@ -26,7 +29,8 @@ def world(
     from zsim_world.world import World
 
     leash = Leash(launched)
-    run_world = World(scenario, mode, rate, time.monotonic_ns)
+    with _patience(Teller() if launched else None):
+        run_world = World(scenario, mode, rate, time.monotonic_ns)
     for name in expect or ():
         run_world.barrier.expect(name)
     gc.collect()
@@ -38,6 +42,18 @@ def world(
         screen.say(f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run")
         run(run_world, endpoints, leash.reason, _told(screen))
         screen.say(f"ended: {run_world.ended}")
+
+
+@contextmanager
+def _patience(teller: Teller | None) -> Iterator[None]:
+    """Say what takes so long the first time that a machine runs the world."""
+    text = "compiling the world's kernel; later runs on this machine find it compiled"
+    timer = threading.Timer(PATIENCE_S, teller.say if teller else print, args=(text,))
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _told(show: Show) -> Callable[[str, Any, str], None]:

@@ -126,6 +126,8 @@ class Run:
             self._screen.clock(line["clock"])
         elif "event" in line:
             self._on_event(line["event"])
+        elif "say" in line:
+            self._screen.say(line["say"])
 
     def _on_event(self, event: dict[str, Any]) -> None:
         self._screen.event(event)

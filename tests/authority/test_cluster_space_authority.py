@@ -199,7 +199,7 @@ def test_equation_3_is_reached_from_the_ground_triangle_far_apart_all_the_way():
 
 
 def test_equation_3_is_reached_with_noisy_estimates():
-    flight = from_the_ground_triangle(noise_m=0.15)  # the Kalman bound with GPS and velocity at 15 Hz: 0.152 m per axis
+    flight = from_the_ground_triangle(noise_m=0.15)  # a Kalman filter on GPS and flow leaves 0.152 m
     assert flight.closest_m > 2.0
     rms = flight.rms(60.0, 100.0)
     # k / (k + 1/tau) of the estimate's variance is followed: rms about 0.15 sqrt(0.6/1.6)/sqrt(3) = 0.053 m

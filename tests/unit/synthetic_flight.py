@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from zsim_agents.drone_estimator import DroneEstimator, Estimate
 
 from zsim import scenario_file
 from zsim.scenario import ErrorModel, Scenario, Sensor
 from zsim.streams import stream
-from zsim_agents.drone_estimator import DroneEstimator, Estimate
 
 Array = NDArray[np.float64]
 
@@ -57,13 +57,15 @@ class Flight:
         self._phase = rng.uniform(0.0, 2.0 * math.pi, (3, 8))
         self._size = accel * math.sqrt(2.0 / 8.0) / self._w**2 * np.array([[1.0], [1.0], [0.3]])
         self._wind = rng.standard_normal(3) * (0.5, 0.5, 0.2)
-        self._yaw = rng.uniform(-math.pi, math.pi)
+        self.yaw_start = rng.uniform(-math.pi, math.pi)
 
     def position(self, t: Array) -> Array:
         """p_WB (n, 3)."""
         begun, climbed = self._ramp(t, GUST_S), self._ramp(t, CLIMB_S)
         waves = (self._size * np.sin(self._w * t[:, None, None] + self._phase)).sum(2)
-        return np.array([1.0, 2.0, 0.0]) + begun[:, None] * waves + HEIGHT_M * climbed[:, None] * (0.0, 0.0, 1.0)
+        return (
+            np.array([1.0, 2.0, 0.0]) + begun[:, None] * waves + HEIGHT_M * climbed[:, None] * (0.0, 0.0, 1.0)
+        )
 
     def velocity(self, t: Array) -> Array:
         """v_WB (n, 3)."""
@@ -79,7 +81,7 @@ class Flight:
         begun = self._ramp(t, GUST_S)[:, None]
         thrust = self.acceleration(t) + (0.0, 0.0, G) + begun * DRAG * (self.velocity(t) - self._wind)
         z = thrust / np.linalg.norm(thrust, axis=1)[:, None]
-        yaw = self._yaw + self.yaw_rate * np.clip(t - self.start_s, 0.0, None) * self._ramp(t, GUST_S)
+        yaw = self.yaw_start + self.yaw_rate * np.clip(t - self.start_s, 0.0, None) * self._ramp(t, GUST_S)
         y = np.cross(z, np.stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw], 1))
         y /= np.linalg.norm(y, axis=1)[:, None]
         return np.stack([np.cross(y, z), y, z], 2)

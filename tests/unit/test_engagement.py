@@ -383,7 +383,8 @@ def test_a_formation_recovers_from_a_shape_in_which_it_could_not_be_engaged():
     assert fleet.output.phase == "engaged"
     assert closest_pair(fleet.p_W)[0] == pytest.approx(3.0, abs=0.05)
     fleet.spoil = {"age_s": np.full(3, 1.0)}
-    fleet.p_W[0] -= (0.0, 2.2, 0.0)  # flat: spread 0.78 m, between the limit in flight and that of engagement
+    # almost in line: spread 0.8 m, between the limit in flight and that of engagement
+    fleet.p_W[:, :2] = (0.0, 0.4), (-2.47, 0.0), (2.47, 0.0)
     fleet.fly(1.0)
     fleet.spoil = {}
     fleet.fly(40.0)

@@ -8,7 +8,6 @@ import sys
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-
 from zsim_agents import madgwick
 
 G = 9.80665  # m/s^2
@@ -54,7 +53,9 @@ def test_body_rates_multiply_on_the_right():
 
 def test_rotations_and_products_agree_with_scipy():
     rng = np.random.default_rng(1)
-    for a, b, v in zip(Rotation.random(50, rng), Rotation.random(50, rng), rng.normal(size=(50, 3)), strict=True):
+    for a, b, v in zip(
+        Rotation.random(50, rng), Rotation.random(50, rng), rng.normal(size=(50, 3)), strict=True
+    ):
         R = madgwick.rotation(quaternion(a))
         assert np.array(R).reshape(3, 3) == pytest.approx(a.as_matrix(), abs=1e-12)
         assert madgwick.turn(R, tuple(v)) == pytest.approx(a.apply(v), abs=1e-12)

@@ -1,14 +1,13 @@
 """Who takes part in the lockstep, how far each has come, and whom the world waits for.
 
-Pure bookkeeping: no session, no clock; wall times are passed in. To integrate from t on, the world needs every
-gating participant's done for t minus the command delay. That is the only wait there is.
+Pure bookkeeping: no session, no clock; wall times are passed in. To integrate from t on, the world needs
+every gating participant's done for t minus the command delay. That is the only wait there is.
 """
 
 from dataclasses import dataclass
 
 from zsim import keys
 from zsim.messages import Done, Join, Waiting
-
 
 WORLD = "world"  # the one process that does not join
 
@@ -52,7 +51,7 @@ class Participant:
         return required if required >= self.from_ns else None
 
     def settle(self, sent: int) -> None:
-        """Set what a done counts against what came in; a surplus belongs to the next done, already on its way."""
+        """Set what a done counts against what came in; a surplus belongs to the next done."""
         balance = self.received - self.missing - sent
         self.received, self.missing = max(0, balance), max(0, -balance)
 
@@ -84,8 +83,8 @@ class Barrier:
     def join(self, name: str, message: Join, next_gate_ns: int, wall_ns: int) -> str | None:
         """Take a participant in; return the reason if it is refused.
 
-        A known name keeps what it has done: the new incarnation goes on from there. The same join again changes
-        nothing.
+        A known name keeps what it has done: the new incarnation goes on from there. The same join again
+        changes nothing.
         """
         reason = self._join_fault(name, message)
         if reason:
@@ -125,7 +124,9 @@ class Barrier:
         if message.run_id != self._run_id:
             return f"run_id is {message.run_id[:40]!r}; must be {self._run_id!r} (read world/info)"
         if message.incarnation != participant.incarnation:
-            return f"incarnation is {message.incarnation}; must be {participant.incarnation}, the newest to join"
+            return (
+                f"incarnation is {message.incarnation}; must be {participant.incarnation}, the newest to join"
+            )
         if message.done_ns > now_ns:
             return f"done_ns is {message.done_ns}; must be <= {now_ns}, the newest gate"
         if message.done_ns > participant.done_ns:

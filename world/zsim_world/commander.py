@@ -1,7 +1,7 @@
 """Who flies which drone, and which command takes effect when.
 
-The first source that sends a setpoint to a drone that nobody flies is its commander, until it releases it, says
-bye or dies. Commands of one instant are ordered by (priority of the source, source, seq): the last wins.
+The first source that sends a setpoint to a drone that nobody flies is its commander, until it releases it,
+says bye or dies. Commands of one instant are ordered by (priority of the source, source, seq): the last wins.
 """
 
 from dataclasses import dataclass
@@ -94,7 +94,7 @@ class Commanders:
         return True
 
     def acquire(self, drone: int, source: str, priority: int) -> str | None:
-        """Give the drone to the source; return the reason if somebody of the same or higher priority has it."""
+        """Give the drone to the source; return the reason if somebody of no lower priority has it."""
         holder = self._holders[drone]
         if holder is not None and holder.source != source and priority <= holder.priority:
             return f"{self._names[drone]} is flown by {holder.source!r} with priority {holder.priority}"

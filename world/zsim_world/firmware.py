@@ -6,6 +6,7 @@ Loops from inside out, each about three times slower than the one it contains:
     tilt     w_des = 9 (z_B × z_des): closed loop about 0.12 s, inside the 0.143 s that tum_ardrone fitted
     velocity a_des = 3 (v_des - v), disturbance and drag of the belief cancelled
     hold     v_des = 0.8 (p_hold - p), height 1.5
+A velocity in the heading frame is held towards its own instant: while the drone yaws at r, it lags by r v / 3 across.
 The inner gains follow from the rotors' lag, so that another aircraft flies too.
 """
 

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 DISTURBANCE_WALK = 0.2  # m/s^2/sqrt(s): gusts of 0.5 m/s over 5 s on a drag of 0.58 1/s give 0.18
 LIFT_WALK = 0.4  # m/s^2/sqrt(s): ground effect and downwash come faster than gusts
-TILT_WALK = 3e-4  # rad/sqrt(s), least: vibration and rounding
+TILT_WALK = 6e-4  # rad/sqrt(s), least: vibration, rounding, and what a turn leaves
 BIAS_WALK = 2e-5  # rad/s/sqrt(s), least: a bias of 0.1 deg/s is found within a minute
 LIFT_BIAS_WALK = 3e-3  # m/s^2/sqrt(s), least: what the board's temperature does to its accelerometer
 FLOORS = {"accel": 0.02, "gyro": 1e-4, "flow": 0.02, "baro": 0.02, "sonar": 0.01, "mag": 0.01}  # m/s^2 rad/s m/s m m rad

@@ -1,7 +1,7 @@
 """What has been said: last values for who asks, and the last seconds for who must catch up.
 
-The world is the hub, so everything passes here, its own messages and those of the participants; it answers for
-dead publishers too.
+The world is the hub, so everything passes here, its own messages and those of the participants; it answers
+for dead publishers too.
 """
 
 from collections import deque

@@ -36,6 +36,7 @@ IMU_TURN, MAG_TURN, MAG_BEARING, SONAR_MIN = 0, 4, 8, 9  # q_BS, q_BS, heading o
 CALIBRATION = 10
 
 STILL_STEPS_MIN = 50.0  # what it is worth to know that a floor is level to 0.05 rad, at an accelerometer noise of 0.35 g
+STILL_STEPS_SWAY = 400.0  # the gyro's bias is averaged slower: in a wind a standing drone sways on its feet
 STILL_STEPS_MAX = 4000.0  # 20 s: the bias walks on, so older samples tell less
 FLOW_QUALITY_MIN = 0.3  # below, the picture shows more horizon than ground
 SONAR_AGE_MAX = 100.0  # steps, 0.5 s without echo: heights come from the barometer
@@ -72,7 +73,7 @@ def observe(belief: NDArray, row: NDArray, gain: NDArray, device: NDArray, board
         row: the aircraft's nominal parameters (vehicle.py); gain: gains.py.
         device: (REGISTERS,) newest samples; the marks of new ones are cleared.
         board: (CALIBRATION,).
-        on_ground: standing with the rotors off: velocity zero, gravity is all that the accelerometer feels.
+        on_ground: standing: velocity zero, gravity is all that the accelerometer feels.
     """
     before = rot.heading(four(belief, ATTITUDE))
     w = axpy(rot.rotate(four(board, IMU_TURN), vector(device, GYRO)), -1.0, vector(belief, GYRO_BIAS))
@@ -104,7 +105,7 @@ def _stand(belief: NDArray, row: NDArray, f_B: Vector, w: Vector) -> None:
     f_H = rot.rotate(q_HB, f_B)
     s = 1.0 / (n * row[GRAVITY])
     turn_by(belief, (f_H[1] * s, -f_H[0] * s, 0.0))
-    put(belief, GYRO_BIAS, axpy(vector(belief, GYRO_BIAS), 1.0 / n, w))
+    put(belief, GYRO_BIAS, axpy(vector(belief, GYRO_BIAS), 1.0 / (n + STILL_STEPS_SWAY), w))
     put(belief, VELOCITY, (0.0, 0.0, 0.0))
     put(belief, DISTURBANCE, (0.0, 0.0, 0.0))
     belief[LIFT_BIAS] += (f_H[2] - row[GRAVITY] - belief[LIFT_BIAS]) / n
@@ -146,11 +147,16 @@ def lift(belief: NDArray, row: NDArray) -> float:
 
 @compiled
 def _correct(belief: NDArray, gain: NDArray, at: int, e: Vector) -> None:
-    """Correct horizontal velocity, disturbance, tilt and gyro bias by an innovation; the gains stand at `at`."""
+    """Correct horizontal velocity and disturbance by an innovation; the gains stand at `at`."""
     for k in range(2):
         belief[VELOCITY + k] += gain[at] * e[k]
         belief[DISTURBANCE + k] += gain[at + 3] * e[k]
-    tilt, rate = gain[at + 1], gain[at + 2]
+
+
+@compiled
+def _correct_tilt(belief: NDArray, gain: NDArray, e: Vector) -> None:
+    """Correct tilt and gyro bias by an innovation of the flow (the accelerometer's share of it is nothing)."""
+    tilt, rate = gain[g.FLOW_TILT], gain[g.FLOW_RATE]
     turn_by(belief, (-tilt * e[1], tilt * e[0], 0.0))  # faster forward than believed: pitched farther forward
     _take_bias(belief, (-rate * e[1], rate * e[0], 0.0))
 
@@ -168,6 +174,7 @@ def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
 def _see_flow(belief: NDArray, gain: NDArray, flow_H: Vector) -> None:
     e = axpy(flow_H, -1.0, vector(belief, VELOCITY))
     _correct(belief, gain, g.FLOW_V, e)
+    _correct_tilt(belief, gain, e)
     _lift_by(belief, gain, g.CLIMB_Z, e[2])
 
 

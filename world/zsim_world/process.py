@@ -210,7 +210,7 @@ class WorldProcess:
         for participant in self._world.barrier.short():
             answer = self._link.request(keys.process(participant.name, "outputs"), "outputs", WORLD, RECOVERY_S)
             for key, payload in answer.result or ():
-                self._take_in(time.monotonic_ns(), Sample(key, payload, ""))
+                self._take_in(time.monotonic_ns(), Sample(key, payload))
             if participant.missing:
                 text = f"{participant.name}: {participant.missing} of its outputs did not come"
                 self._world.event("outputs_missing", participant.name, text, missing=participant.missing)

@@ -6,8 +6,10 @@ import numpy as np
 
 
 class TruthHash:
-    """SHA-256 over t_ns (int64), then position, velocity, orientation and angular velocity (float64), little-endian,
-    drone by drone in scenario order, instants in time order (contract, "Same bits")."""
+    """SHA-256 over t_ns (int64), then position, velocity, orientation and angular velocity (float64).
+
+    Little-endian, drone by drone in scenario order, instants in time order (contract, "Same bits").
+    """
 
     def __init__(self, drones: int) -> None:
         self._hash = hashlib.sha256()

@@ -1,0 +1,374 @@
+"""The firmware in flight: modes, loops and watchdogs, on noisy sensors."""
+
+import math
+
+import numpy as np
+import pytest
+
+from zsim.frames import heading, quaternion_from_rpy
+from zsim.scenario_file import resolve
+from zsim_world import gains, observer
+from zsim_world.fleet import Fleet
+
+PRESETS = [
+    {"preset": "paper"},
+    {"preset": "paper", "as_printed": True},
+    {"preset": "ardrone2"},
+]
+NAMES = ["paper", "as_printed", "ardrone2"]
+GATE_S = 0.02
+
+
+def fleet(count=1, sensors=None, gust=0.5, steady=(0.0, 0.0, 0.0), seed=1, **drone):
+    drones = [{"name": f"d{k}", "position_m": [3.0 * k, 0, 0], "yaw_deg": 60.0 * k, **drone} for k in range(count)]
+    wind = {"gust_m_s": gust, "steady_m_s": list(steady)}
+    document = {"name": "t", "duration_s": 1, "seed": seed, "environment": {"wind": wind}, "drones": drones}
+    return Fleet(resolve({**document, "sensors": sensors or {"preset": "paper"}}))
+
+
+def run(flight, seconds, steer=None):
+    """Advance; return the truth of every gate."""
+    track = []
+    for _ in range(round(seconds / GATE_S)):
+        if steer:
+            steer()
+        flight.advance()
+        track.append(flight.truth())
+    return track
+
+
+def states(flight):
+    return [flight.status(i)[0] for i in range(flight.count)]
+
+
+def airborne(*args, climb_to=None, **kwargs):
+    """Return a fleet that hovers at 1 m, or higher."""
+    flight = fleet(*args, **kwargs)
+    for i in range(flight.count):
+        assert flight.takeoff(i) is None
+    run(flight, 8.0)
+    assert states(flight) == ["hovering"] * flight.count
+    if climb_to:
+        run(flight, climb_to - 1.0, every(flight, (0.0, 0.0, 1.0)))
+    return flight
+
+
+def every(flight, velocity, yaw_rate=0.0, frame="heading"):
+    def steer():
+        for i in range(flight.count):
+            assert flight.set_velocity(i, velocity, yaw_rate, frame) is None
+
+    return steer
+
+
+def in_heading_frame(truth, i=0):
+    psi = heading(truth.orientation_wxyz[i])
+    c, s = math.cos(psi), math.sin(psi)
+    vx, vy, vz = truth.velocity_m_s[i]
+    return np.array([c * vx + s * vy, c * vy - s * vx, vz])
+
+
+@pytest.mark.parametrize("sensors", PRESETS, ids=NAMES)
+def test_every_preset_takes_off_flies_a_pattern_at_15_m_and_lands(sensors):
+    flight = fleet(3, sensors)
+    for i in range(3):
+        assert flight.takeoff(i) is None
+    assert states(flight) == ["taking_off"] * 3
+    track = run(flight, 8.0)
+    assert states(flight) == ["hovering"] * 3
+    np.testing.assert_allclose(track[-1].position_m[:, 2], 1.0, atol=0.15)
+    run(flight, 14.0, every(flight, (0.0, 0.0, 1.0)))
+    assert states(flight) == ["flying"] * 3
+    np.testing.assert_allclose(flight.truth().position_m[:, 2], 15.0, atol=1.0)
+    for velocity in ((1.5, 0.0, 0.0), (0.0, 1.5, 0.0), (-1.5, 0.0, 0.0), (0.0, -1.5, 0.5)):
+        end = run(flight, 4.0, every(flight, velocity))[-50:]
+        mean = np.mean([in_heading_frame(truth, i) for truth in end for i in range(3)], axis=0)
+        np.testing.assert_allclose(mean, velocity, atol=0.12)
+    for i in range(3):
+        flight.release(i)
+    run(flight, 1.0)
+    assert states(flight) == ["hovering"] * 3
+    for i in range(3):
+        assert flight.land(i) is None
+    run(flight, 40.0)
+    assert states(flight) == ["landed"] * 3
+    assert np.abs(flight.truth().velocity_m_s).max() < 0.01
+    np.testing.assert_allclose(flight.truth().position_m[:, 2], 0.058, atol=0.003)
+    assert not flight.truth().rotor_rad_s.any() or flight.truth().rotor_rad_s.max() < 1e-3
+
+
+def test_takeoff_rises_evenly_and_without_a_leap():
+    flight = fleet(gust=0.0)
+    flight.takeoff(0)
+    track = run(flight, 8.0)
+    height = np.array([truth.position_m[0, 2] for truth in track])
+    climb = np.array([truth.velocity_m_s[0, 2] for truth in track])
+    assert height.max() < 1.25
+    assert climb.max() < 1.2
+    assert np.abs([truth.position_m[0, :2] for truth in track]).max() < 0.25
+
+
+def test_landing_is_gentle():
+    flight = airborne()
+    flight.land(0)
+    track = run(flight, 8.0)
+    touch = next(k for k, truth in enumerate(track) if truth.position_m[0, 2] < 0.07)
+    assert -0.7 < track[touch - 1].velocity_m_s[0, 2] < -0.15
+    assert states(flight) == ["landed"]
+
+
+def test_hover_in_gusts_stays_within_the_walk_of_its_own_flow():
+    """Flow of 0.1 m/s at 15 Hz integrates to 0.1 / sqrt(15) sqrt(60 s) = 0.2 m per axis: five of these, and the
+    0.1 m that gusts leave."""
+    for seed in (1, 2, 3):
+        flight = airborne(seed=seed)
+        start = flight.truth().position_m[0]
+        away = np.array([truth.position_m[0] - start for truth in run(flight, 60.0)])
+        assert np.abs(away[:, :2]).max() < 1.1
+        assert np.abs(away[:, 2]).max() < 0.2
+        assert states(flight) == ["hovering"]
+
+
+def test_hover_holds_against_a_steady_wind():
+    flight = airborne(steady=(4.0, -3.0, 0.0), gust=0.0)
+    start = flight.truth().position_m[0]
+    end = run(flight, 30.0)[-1]
+    assert np.linalg.norm((end.position_m[0] - start)[:2]) < 1.5
+    assert np.linalg.norm(end.velocity_m_s[0]) < 0.2
+
+
+@pytest.mark.parametrize("sensors", PRESETS, ids=NAMES)
+def test_velocity_step(sensors):
+    flight = airborne(1, sensors, gust=0.0, climb_to=8.0)
+    track = run(flight, 6.0, every(flight, (2.0, 0.0, 0.0)))
+    ahead = np.array([in_heading_frame(truth)[0] for truth in track])
+    reached = GATE_S * int(np.argmax(ahead > 0.63 * 2.0))
+    assert reached < 0.8
+    assert ahead.max() < 2.0 * 1.2
+    assert abs(ahead[150:].mean() - 2.0) < 0.1
+
+
+def test_yaw_rate_and_world_frame():
+    flight = airborne(gust=0.0)
+    track = run(flight, 3.0, every(flight, (0.0, 0.0, 0.0), 1.0))
+    rates = np.array([truth.angular_velocity_rad_s[0, 2] for truth in track])
+    assert GATE_S * int(np.argmax(rates > 0.63)) < 0.3
+    assert abs(rates[-50:].mean() - 1.0) < 0.02
+    track = run(flight, 4.0, every(flight, (1.0, 0.5, 0.0), frame="world"))
+    np.testing.assert_allclose(track[-1].velocity_m_s[0], (1.0, 0.5, 0.0), atol=0.12)
+
+
+def test_velocity_limits():
+    flight = airborne(limits={"horizontal_speed_m_s": 1.0, "vertical_speed_m_s": 0.3, "yaw_rate_deg_s": 30.0})
+    end = run(flight, 6.0, every(flight, (9.0, 9.0, 9.0), 9.0))[-1]
+    assert np.hypot(*end.velocity_m_s[0, :2]) == pytest.approx(1.0, abs=0.15)
+    assert end.velocity_m_s[0, 2] == pytest.approx(0.3, abs=0.1)
+    assert end.angular_velocity_rad_s[0, 2] == pytest.approx(math.radians(30.0), abs=0.03)
+
+
+def test_altitude_limit():
+    flight = airborne(limits={"altitude_m": 3.0})
+    track = run(flight, 8.0, every(flight, (0.0, 0.0, 1.0)))
+    assert max(truth.position_m[0, 2] for truth in track) < 3.3
+    assert track[-1].position_m[0, 2] == pytest.approx(3.0, abs=0.3)
+
+
+def test_tilt_limit_is_kept_in_a_violent_command():
+    flight = airborne(gust=0.0, climb_to=8.0, limits={"tilt_deg": 10.0})
+    track = run(flight, 3.0, every(flight, (5.0, 0.0, 0.0)))
+    q = np.array([truth.orientation_wxyz[0] for truth in track])
+    tilt = np.arccos(1 - 2 * (q[:, 1] ** 2 + q[:, 2] ** 2))
+    assert math.radians(8.0) < tilt.max() < math.radians(12.5)
+
+
+def test_ardrone_commands_are_tilts():
+    flight = airborne(gust=0.0, climb_to=8.0)
+    track = run(flight, 1.5, lambda: flight.set_ardrone(0, 0.5, 0.0, 0.0, 0.0, False))
+    q = track[-1].orientation_wxyz[0]
+    assert 2 * math.asin(q[2]) == pytest.approx(math.radians(20.0) * 0.5, abs=0.03)  # half of 20 deg: nearly
+    assert in_heading_frame(track[-1])[0] > 1.5
+    run(flight, 4.0, lambda: flight.set_ardrone(0, 0.0, 0.0, 0.0, 0.0, True))
+    assert states(flight) == ["hovering"]
+    assert np.linalg.norm(flight.truth().velocity_m_s[0]) < 0.2
+    track = run(flight, 2.0, lambda: flight.set_ardrone(0, 0.0, 0.5, 0.5, 0.5, False))
+    assert in_heading_frame(track[-1])[1] > 1.0
+    assert track[-1].velocity_m_s[0, 2] == pytest.approx(0.5, abs=0.1)
+    assert track[-1].angular_velocity_rad_s[0, 2] == pytest.approx(math.radians(100.0), abs=0.1)
+
+
+def test_attitude_setpoint():
+    flight = airborne(gust=0.0, climb_to=8.0)
+    q = quaternion_from_rpy((0.0, 0.15, 1.0)).tolist()
+    track = run(flight, 1.0, lambda: flight.set_attitude(0, q, 4.3, 0.0))
+    axis = np.array(track[-1].orientation_wxyz[0])
+    z = (2 * (axis[1] * axis[3] + axis[0] * axis[2]), 2 * (axis[2] * axis[3] - axis[0] * axis[1]))
+    np.testing.assert_allclose(z, math.sin(0.15) * np.array([math.cos(1.0), math.sin(1.0)]), atol=0.03)
+
+
+def test_rotor_setpoint_goes_to_the_rotors_within_their_limits():
+    flight = airborne(gust=0.0)
+    run(flight, 0.3, lambda: flight.set_rotors(0, (370.0, 360.0, 370.0, 9999.0)))
+    np.testing.assert_allclose(flight.truth().rotor_rad_s[0], (370.0, 360.0, 370.0, 503.0), rtol=1e-3)
+
+
+def test_silence_of_the_commander_hovers_then_lands():
+    flight = airborne()
+    assert flight.set_velocity(0, (0.3, 0.0, 0.0), 0.0) is None
+    run(flight, 0.46)
+    assert states(flight) == ["flying"]
+    run(flight, 0.06)
+    assert states(flight) == ["hovering"]
+    run(flight, 1.92)
+    assert states(flight) == ["hovering"]
+    run(flight, 0.1)
+    assert states(flight) == ["landing"]
+    run(flight, 8.0)
+    assert states(flight) == ["landed"]
+
+
+def test_a_new_setpoint_ends_the_silence_and_a_release_never_lands():
+    flight = airborne()
+    flight.set_velocity(0, (0.3, 0.0, 0.0), 0.0)
+    run(flight, 1.5)
+    flight.set_velocity(0, (0.0, 0.0, 0.0), 0.0)
+    run(flight, 0.1)
+    assert states(flight) == ["flying"]
+    flight.release(0)
+    run(flight, 6.0)
+    assert states(flight) == ["hovering"]
+
+
+def test_emergency_stops_the_rotors_and_reset_allows_a_new_takeoff():
+    flight = airborne()
+    assert flight.emergency(0) is None
+    run(flight, 0.3)
+    assert states(flight) == ["emergency"]
+    assert flight.truth().rotor_rad_s.max() < 1.0
+    assert "emergency" in flight.takeoff(0)
+    run(flight, 3.0)
+    assert flight.reset(0) is None
+    run(flight, 1.0)
+    assert states(flight) == ["landed"]
+    assert flight.takeoff(0) is None
+    run(flight, 8.0)
+    assert states(flight) == ["hovering"]
+
+
+def test_an_overturned_drone_cuts_its_motors_and_does_not_take_off_again():
+    flight = airborne(gust=0.0)
+    run(flight, 0.7, lambda: flight.set_rotors(0, (503.0, 126.0, 126.0, 503.0)))
+    assert states(flight) == ["emergency"]
+    run(flight, 3.0)
+    flight.reset(0)
+    run(flight, 0.1)
+    if flight.truth().orientation_wxyz[0] @ flight.truth().orientation_wxyz[0] and _upside(flight) < 0.8:
+        assert "upright" in flight.takeoff(0)
+
+
+def _upside(flight):
+    _, x, y, _ = flight.truth().orientation_wxyz[0]
+    return 1 - 2 * (x * x + y * y)
+
+
+def test_low_battery_lands_and_forbids_a_takeoff():
+    flight = airborne(battery_percent=12.0)
+    run(flight, 60.0)
+    assert states(flight) == ["landed"]
+    assert 3.0 < flight.status(0)[1] < 5.0
+    assert "%" in flight.takeoff(0)
+
+
+def test_an_empty_battery_stops_the_rotors():
+    flight = fleet(battery_percent=0.0)
+    run(flight, 1.0)
+    assert flight.status(0)[1] == 0.0
+    assert flight.takeoff(0) is not None
+
+
+def test_it_flies_on_its_flow_and_not_on_truth():
+    """A flow sensor that shows 0.3 m/s too much makes the drone drift by as much the other way."""
+    flight = airborne(gust=0.0)
+    flight._senses.bias[0, 5, 0] += 0.3
+    track = run(flight, 10.0, every(flight, (0.0, 0.0, 0.0)))
+    drift = np.mean([in_heading_frame(truth) for truth in track[-200:]], axis=0)
+    np.testing.assert_allclose(drift, (-0.3, 0.0, 0.0), atol=0.1)
+
+
+def test_another_aircraft_flies_too():
+    heavy = {
+        "mass_kg": 1.5,
+        "inertia_kg_m2": [0.015, 0.016, 0.03],
+        "arm_m": 0.25,
+        "thrust_n_s2": 1.6e-5,
+        "torque_nm_s2": 3.0e-7,
+        "rotor_time_constant_s": 0.06,
+        "rotor_min_rad_s": 150.0,
+        "rotor_max_rad_s": 800.0,
+        "drag_n_s_m": 0.4,
+        "battery_mah": 5000.0,
+    }
+    flight = airborne(2, **heavy)
+    track = run(flight, 6.0, every(flight, (1.0, 0.0, 0.2)))
+    mean = np.mean([in_heading_frame(truth) for truth in track[-100:]], axis=0)
+    np.testing.assert_allclose(mean, (1.0, 0.0, 0.2), atol=0.15)
+
+
+def test_it_flies_with_a_turned_and_shifted_board():
+    mount = {"position_m": [0.03, -0.02, 0.01], "rpy_deg": [5.0, -8.0, 90.0]}
+    sensors = {"preset": "ardrone2", "imu": {"mount": mount}, "mag": {"mount": mount}}
+    flight = airborne(2, sensors)
+    track = run(flight, 6.0, every(flight, (1.0, -0.5, 0.0)))
+    mean = np.mean([in_heading_frame(truth) for truth in track[-100:]], axis=0)
+    np.testing.assert_allclose(mean, (1.0, -0.5, 0.0), atol=0.12)
+
+
+def test_it_flies_with_lost_samples():
+    sensors = {"preset": "paper", "imu": {"dropout": 0.05}, "flow": {"dropout": 0.3}, "sonar": {"dropout": 0.3}}
+    flight = airborne(2, sensors)
+    run(flight, 10.0, every(flight, (0.5, 0.0, 0.0)))
+    assert states(flight) == ["flying"] * 2
+
+
+@pytest.mark.parametrize("sensors", PRESETS, ids=NAMES)
+def test_belief_agrees_with_truth(sensors):
+    """Tilt within a degree, heading within three, velocity and height as the sensors allow."""
+    flight = airborne(3, sensors, climb_to=12.0)
+    run(flight, 30.0, every(flight, (0.3, 0.0, 0.0), 0.1))
+    truth = flight.truth()
+    for i in range(3):
+        belief = flight._boards.belief[i]
+        q = truth.orientation_wxyz[i]
+        own = belief[observer.ATTITUDE : observer.ATTITUDE + 4]
+        z, z_own = (np.array([2 * (a[1] * a[3] + a[0] * a[2]), 2 * (a[2] * a[3] - a[0] * a[1])]) for a in (q, own))
+        turn = heading(own) - heading(q)  # tilt is compared in each one's own heading
+        rotated = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ z
+        assert np.linalg.norm(rotated - z_own) < math.radians(1.5)
+        assert abs((turn + math.pi) % (2 * math.pi) - math.pi) < math.radians(3.0)
+        believed = belief[observer.VELOCITY : observer.VELOCITY + 3]
+        np.testing.assert_allclose(believed, in_heading_frame(truth, i), atol=0.3)
+        assert abs(belief[observer.HEIGHT] - truth.position_m[i, 2]) < 0.3
+
+
+@pytest.mark.parametrize("sensors", PRESETS, ids=NAMES)
+def test_observer_gains_make_a_stable_filter_over_its_true_schedule(sensors):
+    """Errors of the horizontal design model shrink over one second of 200 accelerometer and 15 flow samples."""
+    flight = fleet(1, sensors)
+    row = flight._boards.gain[0]
+    c, g = 0.249 / 0.429, 9.80665
+    step = np.eye(4) + 0.005 * np.array([[-c, g, 0, 1], [0, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]])
+    accel = np.eye(4) - np.outer(row[gains.ACCEL_V : gains.ACCEL_U + 1], [-c, 0, 0, 1])
+    flow = np.eye(4) - np.outer(row[gains.FLOW_V : gains.FLOW_U + 1], [1, 0, 0, 0])
+    second = np.eye(4)
+    for k in range(200):
+        second = accel @ step @ second
+        if (15 * k) // 200 != (15 * (k + 1)) // 200:
+            second = flow @ second
+    assert np.abs(np.linalg.eigvals(second)).max() < 0.999
+
+
+def test_steady_gain_of_a_scalar_filter_is_the_closed_form():
+    """A random walk of q per sqrt(s) seen at 200 Hz with sigma: p = (q' + sqrt(q'^2 + 4 q' r)) / 2."""
+    q, r = 0.3**2 / 200, 0.5**2
+    p = (q + math.sqrt(q * q + 4 * q * r)) / 2
+    gain = gains.steady_gains(np.zeros((1, 1)), np.array([0.3]), [([1.0], 0.5, 200.0)])
+    assert gain[0, 0] == pytest.approx(p / (p + r), rel=1e-9)

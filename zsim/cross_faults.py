@@ -1,0 +1,153 @@
+"""What no single field of a scenario can know: names that must agree, distances, times that must divide.
+
+Works on what is sound of a document (`faults.sound`): a check whose fields are missing or faulty is left out.
+"""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from zsim.faults import Fault, show
+
+START_SEPARATION_MIN_M = 0.6  # m, two hulls of 0.515 m side by side (OpenMAS, weighed and measured)
+FIRMWARE_STEP_US = 5000  # us, the firmware's own step: 200 Hz, navigation board of the AR.Drone 2.0
+IMU_RATE_MAX_HZ = 200.0  # Hz, the rate of the navigation board
+LIFT_SHARE_MAX = 0.9  # of what the rotors lift; the rest is left for control
+
+
+def cross_faults(scenario: Any) -> Iterator[Fault]:
+    """Yield every fault between fields of a scenario, or of the sound parts of one."""
+    drones, clusters = _entries(scenario.drones), _entries(scenario.clusters)
+    yield from _name_faults("drones", drones)
+    yield from _name_faults("clusters", clusters)
+    yield from _time_faults(scenario.time)
+    yield from _start_faults(drones)
+    for index, drone in drones:
+        yield from ((f"drones[{index}].{path}", text) for path, text in _drone_faults(drone, scenario))
+    yield from _membership_faults(drones, clusters)
+    for index, cluster in clusters:
+        yield from ((f"clusters[{index}].{path}", text) for path, text in _plan_faults(cluster))
+    yield from _process_faults(scenario.processes)
+    yield from _window_faults(scenario.report)
+
+
+_Entries = list[tuple[int, Any]]
+
+
+def _entries(items: list[Any] | None) -> _Entries:
+    return [(index, item) for index, item in enumerate(items or ()) if item is not None]
+
+
+def _names(entries: _Entries) -> list[str]:
+    return [item.name for _, item in entries if item.name is not None]
+
+
+def _known(*values: Any) -> bool:
+    return all(value is not None for value in values)
+
+
+def _name_faults(path: str, entries: _Entries) -> Iterator[Fault]:
+    first: dict[str, int] = {}
+    for index, item in entries:
+        if item.name is not None and first.setdefault(item.name, index) != index:
+            yield f"{path}[{index}].name", f"is {item.name!r}, as {path}[{first[item.name]}]; must be unique"
+
+
+def _time_faults(time: Any) -> Iterator[Fault]:
+    if time is None:
+        return
+    gate_us = time.gate_ms * 1000 if _known(time.gate_ms) else 0.0
+    dt_us = time.physics_dt_ms * 1000 if _known(time.physics_dt_ms) else FIRMWARE_STEP_US
+    if gate_us % FIRMWARE_STEP_US:
+        yield "time.gate_ms", f"is {time.gate_ms:g}; must be a multiple of 5 (the firmware's step)"
+    if dt_us % 1 or FIRMWARE_STEP_US % dt_us:
+        yield "time.physics_dt_ms", f"is {time.physics_dt_ms:g}; must divide 5 (the firmware's step)"
+
+
+def _start_faults(drones: _Entries) -> Iterator[Fault]:
+    placed = [(index, drone) for index, drone in drones if drone.position_m is not None]
+    positions = np.array([drone.position_m for _, drone in placed], dtype=float).reshape(-1, 3)
+    for place, (index, _) in enumerate(placed):
+        if positions[place, 2] < 0:
+            yield f"drones[{index}].position_m[2]", f"is {positions[place, 2]:g}; must be >= 0 (the ground)"
+        distances = np.linalg.norm(positions[:place] - positions[place], axis=1)
+        if place and distances.min() < START_SEPARATION_MIN_M:
+            nearest, other = placed[int(distances.argmin())]
+            yield (
+                f"drones[{index}].position_m",
+                f"is {distances.min():.2f} m from {other.name or f'drones[{nearest}]'!r}; "
+                f"must be >= {START_SEPARATION_MIN_M} m",
+            )
+
+
+def _drone_faults(drone: Any, scenario: Any) -> Iterator[Fault]:
+    low, high = drone.rotor_min_rad_s, drone.rotor_max_rad_s
+    if _known(low, high) and low >= high:
+        yield "rotor_min_rad_s", f"is {low:g}; must be < rotor_max_rad_s ({high:g})"
+    gravity = scenario.environment and scenario.environment.gravity_m_s2
+    if _known(drone.mass_kg, drone.thrust_n_s2, high, gravity):
+        most = LIFT_SHARE_MAX * 4 * drone.thrust_n_s2 * high**2 / gravity
+        if drone.mass_kg >= most:
+            yield (
+                "mass_kg",
+                f"is {drone.mass_kg:g}; must be < {most:.3f}, nine tenths of what its rotors lift",
+            )
+    if drone.sensors is not None:
+        yield from ((f"sensors.{path}", text) for path, text in _sensor_faults(drone.sensors))
+
+
+def _sensor_faults(sensors: Any) -> Iterator[Fault]:
+    if sensors.as_printed and sensors.preset == "ardrone2":
+        yield "as_printed", "is true; must be false unless preset is paper"
+    if sensors.imu and _known(sensors.imu.rate_hz) and sensors.imu.rate_hz > IMU_RATE_MAX_HZ:
+        yield "imu.rate_hz", f"is {sensors.imu.rate_hz:g}; must be <= 200, the rate of the navigation board"
+    sonar = sensors.sonar
+    if sonar and _known(sonar.min_m, sonar.max_m) and sonar.min_m >= sonar.max_m:
+        yield "sonar.min_m", f"is {sonar.min_m:g}; must be < max_m ({sonar.max_m:g})"
+
+
+def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
+    known = _names(drones)
+    judged = len(known) == len(drones) and bool(drones)
+    owner: dict[str, str] = {}
+    for index, cluster in clusters:
+        called = cluster.name or f"clusters[{index}]"
+        for place, name in _entries(cluster.drones):
+            path = f"clusters[{index}].drones[{place}]"
+            if name in owner:
+                yield path, f"is {name!r}, which {owner[name]!r} flies already; a drone is in one cluster"
+            elif judged and name not in known:
+                yield path, f"is {name!r}; must be one of the drones {_listed(list(dict.fromkeys(known)))}"
+            owner.setdefault(name, called)
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:20]) + (f", … ({len(names)})" if len(names) > 20 else "")
+
+
+def _plan_faults(cluster: Any) -> Iterator[Fault]:
+    trajectory = cluster.plan and cluster.plan.trajectory
+    if not trajectory:
+        return
+    expressions, waypoints = trajectory.expressions, trajectory.waypoints
+    if _known(expressions, waypoints) and bool(expressions) == bool(waypoints):
+        yield "plan.trajectory", "has both or neither of expressions and waypoints; must have one of them"
+    for (_, before), (index, after) in pairwise(_entries(waypoints)):
+        if _known(before.at_s, after.at_s) and after.at_s <= before.at_s:
+            path = f"plan.trajectory.waypoints[{index}].at_s"
+            yield path, f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
+
+
+def _process_faults(processes: Any) -> Iterator[Fault]:
+    first: dict[str, int] = {}
+    for index, name in _entries(processes and processes.expect):
+        if first.setdefault(name, index) != index:
+            yield f"processes.expect[{index}]", f"is {name!r}, as expect[{first[name]}]; must be unique"
+
+
+def _window_faults(report: Any) -> Iterator[Fault]:
+    window = report and report.window_s
+    if window is not None and not 0 <= window[0] < window[1]:
+        yield "report.window_s", f"is {show(list(window))}; must be [start, end] with 0 <= start < end"
