@@ -28,7 +28,7 @@ soak: $(VENV)/.dev ## repetitions and long runs
 	$(BIN)/pytest -m soak -p no:xdist
 
 bench: $(VENV)/.dev ## measure; see docs/performance.md
-	$(BIN)/python benchmarks/lockstep.py
+	$(BIN)/python benchmarks/real_time_factor.py
 
 clean:           ## remove the environment and what tools leave behind
 	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -243,8 +243,10 @@ def show(value: Any) -> str:
         return f"{'a map' if isinstance(value, dict) else 'a list'} of {len(value)} entries"
     try:
         text = repr(value) if isinstance(value, str | bytes | float) else _as_json(value)
-    except (ValueError, TypeError, OverflowError, RecursionError):
-        text = f"a {type(value).__name__} that is too large to show"
+    except ValueError:
+        text = "a number of more than 4300 digits"  # CPython refuses to write it
+    except RecursionError:
+        text = f"a {'map' if isinstance(value, dict) else 'list'} nested too deep"
     return text if len(text) <= SHOWN_MAX else f"{text[: SHOWN_MAX - 3]}..."
 
 

@@ -52,13 +52,13 @@ def ecef_to_geodetic(ecef_m: ArrayLike) -> Array:
     """
     e = np.asarray(ecef_m, dtype=float)
     level = np.hypot(e[..., 0], e[..., 1])
-    parametric = np.arctan2(e[..., 2] * WGS84_A_M, level * _B_M)
+    lat = np.arctan2(e[..., 2], level * (1.0 - _E2))
     for _ in range(_LATITUDE_STEPS):
+        parametric = np.arctan2((1.0 - WGS84_F) * np.sin(lat), np.cos(lat))
         lat = np.arctan2(
             e[..., 2] + (_A2 - _B_M**2) / _B_M * np.sin(parametric) ** 3,
             level - _E2 * WGS84_A_M * np.cos(parametric) ** 3,
         )
-        parametric = np.arctan2((1.0 - WGS84_F) * np.sin(lat), np.cos(lat))
     sin, cos = np.sin(lat), np.cos(lat)
     height = level * cos + e[..., 2] * sin - WGS84_A_M * np.sqrt(1.0 - _E2 * sin**2)
     return np.stack([np.degrees(lat), np.degrees(np.arctan2(e[..., 1], e[..., 0])), height], axis=-1)

@@ -1,7 +1,8 @@
 """The inputs of an agent, sorted by gate: what has come, what is missing, what came twice.
 
 Arrival order is never trusted: a gate is complete when each of its closing keys has a message stamped with it
-and every counted sensor message is there.
+and every counted sensor message is there. A gate of which nothing has come is known by the gap that it leaves in
+the numbers of a status.
 """
 
 from bisect import bisect_right, insort
@@ -11,6 +12,7 @@ from typing import Any
 
 from zsim import keys
 
+GAP_MAX = 10  # gates lost in a row that are asked for again; the world runs ahead of nobody by more
 ALWAYS_NS = -1  # before every gate
 NEVER_NS = 2**63 - 1  # after every gate
 
@@ -37,6 +39,9 @@ class Inbox:
         self._lacking: dict[int, dict[str, None]] = {}
         self._gates: list[int] = []
         self._expected_from_ns: dict[str, int] = {}
+        self._pulse = next((key for key in gate_keys if key.endswith("/sensor/status")), None)
+        self._beats: dict[int, int] = {}
+        self._last_beat: tuple[int, int] | None = None
         self._taken_ns = -1
         self.duplicates = 0
         self.late = 0
@@ -76,12 +81,26 @@ class Inbox:
             lacking = self._lacking[message.t_ns] = self._closing.copy()
             _insert(self._gates, message.t_ns)
         lacking.pop(key, None)
+        if key == self._pulse:
+            self._beats[message.t_ns] = message.seq
         if key in self._meters:
             self._meters[key].count(message)
 
     def next_gate_ns(self) -> int | None:
-        """Return the earliest gate for which a closing message has come."""
-        return self._gates[0] if self._gates else None
+        """Return the earliest gate that is not taken, as far as closing messages tell."""
+        if not self._gates:
+            return None
+        skipped_ns = self._skipped_ns(self._gates[0])
+        return self._gates[0] if skipped_ns is None else skipped_ns
+
+    def _skipped_ns(self, t_ns: int) -> int | None:
+        """Return the gate after the last one taken if t_ns is not that gate but a later one."""
+        if t_ns not in self._beats or self._last_beat is None:
+            return None
+        last_ns, last_seq = self._last_beat
+        gates = self._beats[t_ns] - last_seq
+        next_ns = last_ns + (t_ns - last_ns) // gates if 1 < gates <= GAP_MAX + 1 else -1
+        return next_ns if next_ns > self._taken_ns else None
 
     def latest_gate_ns(self) -> int | None:
         """Return the latest gate for which a closing message has come."""
@@ -96,6 +115,13 @@ class Inbox:
             if meter.short(t_ns) and self._expects(key, t_ns):
                 return key
         return None
+
+    def missing_last(self, t_ns: int) -> str | None:
+        """Return the missing key that stands last among the closing keys: whoever sleeps until it comes wakes once."""
+        for key in reversed(self._lacking.get(t_ns, self._closing)):
+            if self._expects(key, t_ns):
+                return key
+        return self.missing(t_ns)
 
     def lost(self, t_ns: int) -> str | None:
         """Return a missing key whose message will not come any more: its publisher has gone on without it."""
@@ -113,8 +139,10 @@ class Inbox:
         for stamp in _cut(self._stamps, t_ns):
             stamped = self._waiting.pop(stamp)
             ready += stamped.values() if len(stamped) == 1 else map(stamped.__getitem__, sorted(stamped))
-        for gate in _cut(self._gates, t_ns):
-            del self._lacking[gate]
+        for gate_ns in _cut(self._gates, t_ns):
+            del self._lacking[gate_ns]
+            if gate_ns in self._beats:
+                self._last_beat = (gate_ns, self._beats.pop(gate_ns))
         for meter in self._meters.values():
             meter.forget(t_ns)
         self._taken_ns = t_ns

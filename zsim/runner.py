@@ -61,6 +61,7 @@ class Runner:
         self._queries: deque[Query] = deque()
         self._links: deque[bool] = deque()
         self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT)
+        self._done_key = keys.process(agent.name, "done")
         self._done_ns = -1
         self._view_wall_s = 0.0
         self._end_ns: int | None = None
@@ -97,13 +98,16 @@ class Runner:
     # One turn
 
     def _turn(self) -> None:
-        """Wait for something to arrive, take it in, and step through every gate that is complete."""
+        """Take in what has arrived, step through every gate that is complete, and wait if there was none."""
         self._serve_rare()
+        self._take_in_all()
+        stepped = False
         while (t_ns := self._ready_gate()) is not None:
             self._step(t_ns)
+            stepped = True
         if self._leave is None:
             self._look_for_end()
-        if self._leave is None and not self._take_in_all():
+        if self._leave is None and not stepped:
             self._wait()
 
     def _wait(self) -> None:
@@ -116,13 +120,11 @@ class Runner:
         if sample is not None:
             self._take_in(sample)
 
-    def _take_in_all(self) -> bool:
-        """Take in what has arrived without waiting; return whether there was anything."""
-        before = self.health.received
+    def _take_in_all(self) -> None:
+        """Take in what has arrived: first what closes a gate, so that what came before it is found too."""
         for box in self._boxes.values():
             for sample in box.drain():
                 self._take_in(sample)
-        return self.health.received != before
 
     def _take_in(self, sample: Sample) -> None:
         self.health.received += 1
@@ -138,7 +140,7 @@ class Runner:
     def _blocking_expression(self) -> str:
         """Return the subscription from which the next missing message comes."""
         t_ns = self._inbox.next_gate_ns()
-        missing = self._inbox.missing(t_ns) if t_ns is not None else None
+        missing = self._inbox.missing_last(t_ns) if t_ns is not None else None
         wanted = missing or self._agent.gate_keys[-1]
         return next(e for e in self._agent.reads if keys.matches(e, wanted))
 
@@ -176,11 +178,12 @@ class Runner:
         self.health.lag_ns = newest_ns - t_ns if newest_ns is not None else 0
 
     def _publish(self, t_ns: int, outputs: Sequence[Output]) -> None:
+        """Publish the outputs of a gate and the done that counts them, encoded first and put in one go."""
         counted = [output for output in outputs if not output.key.startswith("view/")]
         self._kept.append((t_ns, counted))
-        for key, message in counted:
-            self._link.put(key, message)
-        self._say_done(t_ns, len(counted))
+        encoded = [(key, messages.encode(message)) for key, message in counted]
+        encoded.append((self._done_key, messages.encode(self._done(t_ns, len(counted)))))
+        self._link.put_all(encoded)
         if len(counted) < len(outputs):
             self._publish_views(outputs)
 
@@ -192,15 +195,19 @@ class Runner:
                 if key.startswith("view/"):
                     self._link.put(key, message)
 
-    def _say_done(self, t_ns: int, sent: int) -> None:
+    def _done(self, t_ns: int, sent: int) -> messages.Done:
         self._done_ns = t_ns
         seq = self._agent.next_seq("done")
-        self._put_process("done", messages.Done(t_ns, seq, self._info.run_id, self._incarnation, t_ns, sent))
+        return messages.Done(t_ns, seq, self._info.run_id, self._incarnation, t_ns, sent)
+
+    def _say_done(self, t_ns: int, sent: int) -> None:
+        self._link.put(self._done_key, self._done(t_ns, sent))
 
     # Joining, catching up, leaving
 
     def _subscribe(self) -> None:
-        for expression in self._agent.reads:
+        closing = [e for e in self._agent.reads if any(keys.matches(e, key) for key in self._agent.gate_keys)]
+        for expression in dict.fromkeys([*closing, *self._agent.reads]):
             self._boxes[expression] = self._link.subscribe(expression)
         self._link.on_message(keys.EVENT, self._on_event)
         self._link.on_link(self._on_link)

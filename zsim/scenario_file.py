@@ -121,20 +121,22 @@ def _value(text: str) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.2 floats (1e3 is a number), no aliases: a scenario is small, an alias bomb is not."""
+    """YAML 1.2 floats (1e3 is a number); no aliases, for a bomb is made of them, and no tags."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            event = self.peek_event()
+        event = self.peek_event()
+        if isinstance(event, yaml.AliasEvent):
             raise ComposerError(None, None, "aliases are not allowed", event.start_mark)
+        if getattr(event, "tag", None) is not None:
+            raise ComposerError(None, None, "tags are not allowed", event.start_mark)
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         seen = set()
         for key_node, _ in node.value:
-            key = getattr(key_node, "value", None)
+            key = key_node.value
             if isinstance(key, str) and key in seen:
-                raise ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
+                raise ConstructorError(None, None, f"key {show(key)} is given twice", key_node.start_mark)
             seen.add(key if isinstance(key, str) else None)
         return super().construct_mapping(node, deep)
 

@@ -19,7 +19,7 @@ import zenoh
 from msgspec import Struct
 
 from zsim import messages
-from zsim.errors import DecodeError, SessionError
+from zsim.errors import SessionError
 from zsim.messages import ControlAnswer, ControlRequest
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -57,6 +57,12 @@ class Session:
     def put(self, key: str, message: Struct) -> None:
         """Publish a message on its key."""
         self.put_raw(key, messages.encode(message))
+
+    def put_all(self, encoded: Sequence[tuple[str, bytes]]) -> None:
+        """Publish many encoded payloads in one go."""
+        for key, payload in encoded:
+            publisher = self._publishers.get(key) or self._declare(key)
+            publisher.put(payload)
 
     def put_raw(self, key: str, payload: bytes) -> None:
         """Publish an encoded payload; the encoding follows from the key."""
@@ -181,6 +187,7 @@ class Mailbox:
         self._raw = raw
         self._prefix = prefix
         self._cut = len(prefix)
+        self._key = None if "*" in expression else expression
         self.expression = expression
         self._wake_key = prefix + expression.replace("**", "wake").replace("*", "wake")
         self._handler_owner = raw.declare_subscriber(prefix + expression, zenoh.handlers.FifoChannel(QUEUE))
@@ -212,10 +219,10 @@ class Mailbox:
             return  # closed: nobody waits any more
 
     def _take(self, raw: zenoh.Sample) -> Sample | None:
-        key = str(raw.key_expr)
-        if key == self._wake_key or raw.kind != zenoh.SampleKind.PUT:
+        payload = raw.payload.to_bytes()
+        if not payload:  # a wake, or a deletion; no message of the contract is empty
             return None
-        return Sample(key[self._cut :], raw.payload.to_bytes())
+        return Sample(self._key or str(raw.key_expr)[self._cut :], payload)
 
 
 class TimedMailbox:

@@ -27,9 +27,7 @@ COSINE_MIN = 0.1  # of the sonar's ray to the vertical; flatter than 84 deg it d
 
 
 @compiled
-def write_gps(
-    H: np.ndarray, i: int, p: Vector, v: Vector, R: Rotation, w: Vector, arm: Vector, lag: float
-) -> SIX:
+def write_gps(H: np.ndarray, i: int, p: Vector, v: Vector, R: Rotation, w: Vector, arm: Vector, lag: float) -> SIX:
     """Antenna at p_BS = `arm`: position p + R r [m], velocity v + R (w x r) [m/s]; six rows from `i`."""
     offset = turn(R, arm)
     swing = turn(R, cross(w, arm))
@@ -73,9 +71,7 @@ def write_baro(H: np.ndarray, i: int, p: Vector, R: Rotation, arm: Vector, lag: 
 
 
 @compiled
-def write_sonar(
-    H: np.ndarray, i: int, p: Vector, R: Rotation, arm: Vector, down_B: Vector, lag: float
-) -> float:
+def write_sonar(H: np.ndarray, i: int, p: Vector, R: Rotation, arm: Vector, down_B: Vector, lag: float) -> float:
     """Sonar at p_BS = `arm` that looks along `down_B` at the ground z_W = 0: height / cosine [m]; one row.
 
     Returns 0 with an empty row if the sonar does not look down.
@@ -117,9 +113,7 @@ def write_flow(H: np.ndarray, i: int, v: Vector, R: Rotation, w: Vector, arm: Ve
 
 
 @compiled
-def within_gates(
-    S: np.ndarray, y: np.ndarray, blocks: np.ndarray, limits: np.ndarray, distances: np.ndarray
-) -> bool:
+def within_gates(S: np.ndarray, y: np.ndarray, blocks: np.ndarray, limits: np.ndarray, distances: np.ndarray) -> bool:
     """Write y^T S^-1 y of every block of innovations by itself, and say whether all are within their limits.
 
     By the block's Cholesky factor; infinite where it is not positive definite or the innovation not a number.

@@ -1,24 +1,50 @@
 """Compile plain-float mathematics with numba where it is installed; elsewhere the same source runs as Python.
 
-Numba is asked for neither fast mathematics nor fused operations, so both ways give the same bits.
+Numba is asked for neither fast mathematics nor fused operations, so both ways give the same bits. What it compiles
+is kept on disk between runs. Its own cache looks only at the file of a function, although what the function calls
+is compiled into it, so the key here covers all files with compiled functions.
 """
 
+import contextlib
+import hashlib
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from pathlib import Path
+from typing import Any, TypeVar
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+SOURCES = ("madgwick.py", "dead_reckoning.py", "aiding_models.py")  # every file that uses `compiled`
+
 try:
     import numba
+    from numba.core.caching import FunctionCache
 except ImportError:
-    numba = None
+    numba = FunctionCache = None
+
+
+def sources_digest(folder: Path = Path(__file__).parent) -> str:
+    """Return the SHA-256 of the files with compiled functions."""
+    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in SOURCES)).hexdigest()
+
+
+_DIGEST = sources_digest()
 
 
 def compiled(function: Function) -> Function:
-    """Return `function` compiled, kept in numba's cache between runs if there is a place for it."""
+    """Return `function` compiled, cached on disk if there is a place for it."""
     if numba is None:
         return function
-    try:
-        return cast(Function, numba.njit(cache=True)(function))
-    except RuntimeError:  # numba's answer when neither the package's folder nor the home can be written
-        return cast(Function, numba.njit(function))
+    dispatcher: Any = numba.njit(function)
+    if dispatcher is not function:  # it is under NUMBA_DISABLE_JIT=1
+        with contextlib.suppress(RuntimeError):  # neither package nor home can be written: compile at each start
+            dispatcher._cache = _cache(function)
+    return dispatcher
+
+
+def _cache(function: Callable[..., Any]) -> Any:
+    """Return numba's cache of a function with the digest of all sources in its key."""
+    assert FunctionCache is not None
+    cache: Any = FunctionCache(function)
+    key = cache._index_key
+    cache._index_key = lambda signature, codegen: (*key(signature, codegen), _DIGEST)
+    return cache

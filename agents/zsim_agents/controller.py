@@ -44,11 +44,10 @@ class Controller(Agent):
         self.name = f"controller.{cluster}"
         self.period_ns = info.gate_ns
         self.drones = tuple(spec.drones)
-        everybody = len(spec.drones) == len(scenario.drones)
         estimates = tuple(keys.estimate(drone) for drone in spec.drones)
         states = tuple(keys.status(drone) for drone in spec.drones)
         self.gate_keys = states + estimates
-        self.reads = (keys.status("*"), keys.estimate("*")) if everybody else self.gate_keys
+        self.reads = self.gate_keys
         self._state_key = keys.cluster_state(cluster)
         self._view_key = f"view/cluster/{cluster}"
         self._control_key = keys.cluster_control(cluster)

@@ -21,8 +21,7 @@ import numpy as np
 
 from zsim.scenario import Drone, Environment, Estimation
 from zsim_agents.aiding import VALUE_MAX, Aid, Measurement, aids
-from zsim_agents.aiding_models import write_baro, write_flow, write_gps, write_mag, write_sonar
-from zsim_agents.dead_reckoning import ATTITUDE, POSITION, VELOCITY, heading_and_sigma, plus
+from zsim_agents.dead_reckoning import ATTITUDE, heading_and_sigma, plus
 from zsim_agents.estimator_prior import (
     HEADING_SIGMA_RAD,
     bias_priors,
@@ -30,6 +29,7 @@ from zsim_agents.estimator_prior import (
     process_noise,
     set_start,
 )
+from zsim_agents.fusion import Fusion
 from zsim_agents.madgwick import (
     Quaternion,
     Vector,
@@ -40,13 +40,12 @@ from zsim_agents.madgwick import (
     rotation_vector_quaternion,
     turn,
 )
-from zsim_agents.navigation_filter import NavigationFilter, Stack
-from zsim_agents.state_history import Moment, StateHistory
+from zsim_agents.navigation_filter import NavigationFilter
+from zsim_agents.state_history import StateHistory
 from zsim_agents.strapdown import Strapdown
 
 SET_DOWN_SIGMA_RAD = 0.05  # rad: how well a drone is set down by eye, where there is no magnetometer
 HEADING_WAIT_S = 1.0  # s without a magnetometer's reading, after which the heading of the scenario is taken
-SQUARE_MAX = 1e8  # of an innovation, in its unit; more would cost the covariance its digits
 YAW = slice(ATTITUDE + 2, ATTITUDE + 3)
 
 
@@ -87,17 +86,15 @@ class DroneEstimator:
         self._magnetometer, self._flow = estimation.magnetometer, estimation.flow
         wanted = [aid for name, aid in self._aids.items() if self._wanted(name)]
         beta = madgwick_beta(estimation, imu, gravity)
-        self.filter = NavigationFilter(
-            process_noise(imu, beta, gravity), bias_priors(imu, wanted), estimation.gate_probability
-        )
+        noise = process_noise(imu, beta, gravity)
+        self.filter = NavigationFilter(noise, bias_priors(imu, wanted), estimation.gate_probability)
         """Read only; `y` and `S` are the innovations of its last update."""
         set_start(self.filter)
-        self._strapdown = Strapdown(imu, self.filter.with_accel_bias, beta, gravity, gate_s)
-        self._stack = Stack(self.filter.dim_x)
-        self._bias = [0.0] * self.filter.dim_x  # by index in the error state, for the aiding sensors
+        self._strapdown = Strapdown(imu, self.filter.with_accel_bias, noise.accel_sigma, beta, gravity, gate_s)
         latency_s = max(getattr(drone.sensors, name).latency_ms for name in ("imu", *self._aids)) * 1e-3
         self._age_max_s = 2.0 * latency_s + 5.0 * gate_s
-        self._history = StateHistory(self._age_max_s, gate_s)
+        history = StateHistory(self._age_max_s, gate_s)
+        self._fusion = Fusion(self.filter, self._strapdown, history, self._field)
         self._waiting: list[Measurement] = []
         self._start_s = math.nan
         self._heading_known = False
@@ -161,9 +158,8 @@ class DroneEstimator:
             self.filter.advance(strapdown, interval)
         if not self._heading_known:
             self._settle_heading(t_s)
-        if self._waiting:
-            self._use_waiting()
-        self._history.append(strapdown.moment())
+        self._fusion.use(self._waiting, self._heading_known)
+        self._waiting.clear()
         return self._estimate(t_s)
 
     def warm_start(
@@ -217,88 +213,8 @@ class DroneEstimator:
 
     def _turn_heading(self, angle: float) -> None:
         self._strapdown.turn_heading((math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle)))
-        self._history.clear()
+        self._fusion.forget_past()
         self._heading_known = True
-
-    def _use_waiting(self) -> None:
-        """Judge and use the gate's measurements, in one stacked update unless they are very many."""
-        now = self._strapdown.moment()
-        past = now
-        stacked: list[Aid] = []
-        for aid, t_sample_s, values, variance in self._waiting:
-            if aid.name == "flow" and not self._heading_known:
-                aid.refused += 1
-                continue
-            if not self._stack.has_room(len(values)):
-                self._correct(stacked)
-                past = now = self._strapdown.moment()
-            if past.t_s != t_sample_s:
-                past = self._history.at(t_sample_s, now)
-            self._add(aid, past, now.t_s - past.t_s, values, variance)
-            stacked.append(aid)
-        self._waiting.clear()
-        self._correct(stacked)
-
-    def _correct(self, stacked: list[Aid]) -> None:
-        if not stacked:
-            return
-        passed = self.filter.correct(self._stack)
-        for aid, good in zip(stacked, passed, strict=True):
-            aid.judge(good, self._strapdown.t_s)
-        if any(passed):
-            error = self.filter.take_error()
-            self._strapdown.correct(error)
-            if self.filter.aiding_biases:
-                self._bias = [bias + more for bias, more in zip(self._bias, error.tolist(), strict=True)]
-        stacked.clear()
-        self._stack.clear()
-
-    def _add(
-        self, aid: Aid, past: Moment, lag: float, values: Sequence[float], variance: Sequence[float]
-    ) -> None:
-        """Add a measurement to the stack, compared with the state of its own instant."""
-        predicted = self._predicted(aid, past, lag)
-        if aid.bias_rows:
-            predicted = self._with_biases(aid, predicted)
-        if aid.out_of_patience(self._strapdown.t_s):
-            self._believe_again(aid, [z - h for z, h in zip(values, predicted, strict=True)])
-        self._stack.add(values, predicted, variance)
-
-    def _predicted(self, aid: Aid, past: Moment, lag: float) -> Sequence[float]:
-        """Return what the sensor should read and write its rows of H."""
-        H, i, R = self._stack.H, self._stack.rows, rotation(past.q)
-        if aid.name == "mag":
-            return write_mag(H, i, R, aid.R_BS, self._field)
-        if aid.name == "baro":
-            return (write_baro(H, i, past.p, R, aid.arm, lag),)
-        if aid.name == "flow":
-            return write_flow(H, i, past.v, R, past.w, aid.arm)
-        if aid.name == "gps":
-            return write_gps(H, i, past.p, past.v, R, past.w, aid.arm, lag)
-        return (write_sonar(H, i, past.p, R, aid.arm, aid.down_B, lag),)
-
-    def _with_biases(self, aid: Aid, predicted: Sequence[float]) -> list[float]:
-        """Return the prediction with the sensor's biases on it, their columns of H written."""
-        values = list(predicted)
-        for name, row in aid.bias_rows:
-            first = self.filter.bias_index[name]
-            for k in range(aid.biases[name].size):
-                self._stack.H[self._stack.rows + row + k, first + k] = 1.0
-                values[row + k] += self._bias[first + k]
-        return values
-
-    def _believe_again(self, aid: Aid, innovation: Sequence[float]) -> None:
-        """Make the states that a long refused sensor sees as uncertain as its innovation."""
-        squares = [min(y * y, SQUARE_MAX) for y in innovation]
-        if aid.name == "gps":
-            self.filter.add_variance(slice(POSITION, VELOCITY + 3), squares)
-        elif aid.name == "flow":
-            self.filter.add_variance(slice(VELOCITY, VELOCITY + 3), sum(squares))
-        elif aid.name == "baro":
-            self.filter.add_variance(slice(POSITION + 2, POSITION + 3), squares[0])
-        elif aid.name == "mag":
-            self.filter.add_variance(YAW, HEADING_SIGMA_RAD**2)
-        aid.refused_since_s = self._strapdown.t_s
 
     def _estimate(self, t_s: float) -> Estimate:
         """Return the estimate for an instant that the IMU may not have reached yet."""

@@ -32,7 +32,8 @@ class Estimator(Agent):
             raise RunError(f"estimator: drone is {drone!r}; must be one of {known}")
         self.name = f"estimator.{drone}"
         self.period_ns = info.gate_ns
-        self.reads = (keys.sensors(drone),)
+        # One subscription per sensor: the process sleeps until status, the last of a gate, and wakes once.
+        self.reads = (*(keys.sensor(drone, kind) for kind in keys.SENSORS), keys.status(drone))
         self.gate_keys = (keys.status(drone),)
         self.counted = (drone,)
         self._key = keys.estimate(drone)

@@ -38,7 +38,7 @@ class BiasPrior:
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """What drives the error state between measurements; all are spectral densities but the first two."""
+    """What drives the error state between measurements."""
 
     accel_sigma: float
     """White noise of the accelerometer per sample [m/s^2]."""

@@ -20,6 +20,7 @@ from zsim.record import RecordWriter
 from zsim.session import Sample, Session
 
 NAME = "recorder"
+PAUSE_S = 0.01  # between two looks into the queue: nobody waits for the recorder, and waking up is what costs
 TICK_S = 0.1  # how often the open chunk's age and a stop are looked at
 REPLAY_S = 5.0  # a hub answers within milliseconds
 DRAIN_S = 1.0  # after `stopped`, how long the byes of the others are waited for
@@ -92,6 +93,7 @@ class Recorder:
             sample = self._box.receive()
             if sample is not None:
                 self._write(sample)
+            time.sleep(PAUSE_S)
             for sample in self._box.drain():
                 self._write(sample)
             self._writer.tick(time.monotonic_ns())

@@ -24,12 +24,12 @@ from zsim_agents.state_history import Moment
 ZERO: Vector = (0.0, 0.0, 0.0)
 ACCEL_MAX_M_S2 = 500.0  # m/s^2, 50 g: no MEMS accelerometer of a drone reads more
 GYRO_MAX_RAD_S = 100.0  # rad/s, 5700 deg/s: likewise
-MANOEUVRE_M_S2 = (
-    0.3  # m/s^2, standard deviation of the acceleration in gusts of 0.5 m/s (0.16) and in transit
-)
+MANOEUVRE_M_S2 = 0.3  # m/s^2, standard deviation of the acceleration in gusts of 0.5 m/s (0.16) and in transit
 MANOEUVRE_S = 0.5  # s, its correlation time
 LOST_TURN_RAD_S = 0.5  # rad/s, standard deviation of the rate that a missing gyroscope sample hides
 COAST_TURN_DENSITY = LOST_TURN_RAD_S**2 * 2.0 * MANOEUVRE_S  # rad^2/s
+JOLT_SIGMAS = 10.0  # of the accelerometer; the sum of three changes of pure noise is 3.4 on average, 1.5 in spread
+JOLT_MIN_M_S2 = 1.0  # m/s^2 from one sample to the next, beyond the rotors in flight; touching the ground has tens
 COAST_VELOCITY_DENSITY = 1.0  # m^2/s^3: 1 m/s after 1 s without an IMU
 
 
@@ -54,12 +54,15 @@ class Strapdown:
     Args:
         imu: its rate, mount and latency.
         with_accel_bias: whether the filter estimates one.
+        accel_sigma: white noise of the accelerometer per sample [m/s^2].
         beta: Madgwick's gain [rad/s].
         gravity: [m/s^2].
         gate_s: interval of the gates [s].
     """
 
-    def __init__(self, imu: Imu, with_accel_bias: bool, beta: float, gravity: float, gate_s: float) -> None:
+    def __init__(
+        self, imu: Imu, with_accel_bias: bool, accel_sigma: float, beta: float, gravity: float, gate_s: float
+    ) -> None:
         self.t_s = 0.0
         self.state: Reckoning = (ZERO, ZERO, LEVEL, ZERO, ZERO, (0.0, 0.0, gravity))
         self.gyro_bias, self.accel_bias = ZERO, ZERO
@@ -72,6 +75,7 @@ class Strapdown:
         self._coast_after_s = imu.latency_ms * 1e-3 + gate_s + 5.0 * self._period_s
         self._R_BS, self._arm = mount_rotation(imu.mount), imu.mount.position_m
         self._mounted_aside = imu.mount.rpy_deg != ZERO or self._arm != ZERO
+        self._jolt_m_s2 = max(JOLT_SIGMAS * accel_sigma, JOLT_MIN_M_S2)
         self._interval_from(0.0)
 
     def start(self, t_s: float) -> None:
@@ -111,9 +115,12 @@ class Strapdown:
             self._lose(dt - self._period_s)
         if self._mounted_aside:
             accel, gyro = self._of_body(accel, gyro, dt)
-        self.state = reckon(
-            self.state, accel, gyro, self.accel_bias, self.gyro_bias, self._beta, self.gravity, dt
-        )
+        bx, by, bz = self.state[5]
+        self.state = reckon(self.state, accel, gyro, self.accel_bias, self.gyro_bias, self._beta, self.gravity, dt)
+        fx, fy, fz = self.state[5]
+        jolt = abs(fx - bx) + abs(fy - by) + abs(fz - bz)
+        if jolt > self._jolt_m_s2:
+            self._lost_velocity += (0.5 * jolt * dt) ** 2  # what a step anywhere between two samples hides
         self.t_s = t_sample_s
         self._square_s2 += dt * dt
         self.used += 1
@@ -131,9 +138,7 @@ class Strapdown:
 
     def take_interval(self) -> Interval:
         """Return what has happened since the last call."""
-        taken = Interval(
-            self.t_s - self._from_s, self._v_before, self._square_s2, self._lost_velocity, self._lost_turn
-        )
+        taken = Interval(self.t_s - self._from_s, self._v_before, self._square_s2, self._lost_velocity, self._lost_turn)
         self._interval_from(self.t_s)
         return taken
 

@@ -1,15 +1,11 @@
-"""The command line. Commands are thin: they read options, call one function, and print one line for a fault."""
+"""The command line: thin commands that read options, call one function, and print one line for a fault."""
 
 import json
 import math
-import os
 import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any
-
-for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")  # matrices of a dozen rows: threads only cost
 
 import typer
 

@@ -1,8 +1,9 @@
 """The estimator's covariance against its errors, over 20 seeds of the simulated world with gusts.
 
-The normalised estimation error squared e^T P^-1 e of position and velocity has a chi-square distribution with 6
-degrees of freedom if the covariance is right. Its mean over runs must lie in the 95 % band of that distribution
-(Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", section 5.4.2).
+The normalised estimation error squared e^T P^-1 e of position and velocity has a chi-square distribution
+with 6 degrees of freedom if the covariance is right. Its mean over runs must lie in the 95 % band of that
+distribution (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation",
+section 5.4.2).
 """
 
 import math
@@ -13,16 +14,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
-from zsim_agents.drone_estimator import DroneEstimator, Estimate
-from zsim_world.fleet import GPS_FIX, Fleet, Sample
 
 from zsim import scenario_file
 from zsim.frames import heading, wrap_angle
 from zsim.scenario import Scenario
+from zsim_agents.drone_estimator import DroneEstimator, Estimate
+from zsim_world.fleet import GPS_FIX, Fleet, Sample
 
-SCENARIO = (
-    Path(__file__).parents[2] / "scenarios" / "step.yaml"
-)  # three drones, preset paper, gusts of 0.5 m/s
+SCENARIO = Path(__file__).parents[2] / "scenarios" / "step.yaml"  # three drones, preset paper, gusts of 0.5 m/s
 SEEDS = range(1, 21)
 TAKEOFF_S, FLYING_S, END_S = 2.0, 8.0, 32.0  # s
 CONVERGED_S = 14.0  # s
@@ -159,3 +158,28 @@ class TestConsistency:
         rms = math.sqrt((runs.heading_error**2).mean())
         assert rms < 0.01  # rad
         assert rms == pytest.approx(math.sqrt((runs.heading_sigma**2).mean()), rel=0.3)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_fall_to_the_ground_is_owned_up_to(case: str):
+    """Stopped rotors at 1 m: the blow falls between two IMU samples, and the covariance must say so."""
+    scenario = scenario_file.load(SCENARIO, CASES[case], seed=1)
+    fleet = Fleet(scenario)
+    gate_s = scenario.time.gate_ms / 1000.0
+    cores = [DroneEstimator(d, scenario.environment, scenario.estimation, gate_s) for d in scenario.drones]
+    nees, heights = [], []
+    for gate in range(round(12.0 / gate_s)):
+        fleet.advance()
+        for sample in fleet.samples():
+            feed(cores[sample.drone], sample, fleet.gps_sigma_m[sample.drone])
+        error, P, _, _ = compare(fleet, [core.close(fleet.t_ns * 1e-9) for core in cores])
+        if gate == round(1.0 / gate_s):
+            assert [fleet.takeoff(i) for i in range(3)] == [None] * 3
+        if gate == round(8.0 / gate_s):
+            assert [fleet.emergency(i) for i in range(3)] == [None] * 3
+        if gate > round(8.0 / gate_s):
+            nees.append(np.einsum("ri,ri->r", error, np.linalg.solve(P, error[..., None])[..., 0]))
+        heights.append(fleet.truth().position_m[0, 2])
+    assert max(heights) > 0.9
+    assert heights[-1] < 0.1
+    assert np.max(nees) < chi2.ppf(1.0 - 1e-7, 6)

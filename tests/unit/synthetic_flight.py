@@ -1,4 +1,4 @@
-"""A flight with known truth and its sensors, written without the simulator's world: for tests of estimators."""
+"""A flight with known truth and its sensors, independent of the simulator's world: to test estimators."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from zsim_agents.drone_estimator import DroneEstimator, Estimate
 
 from zsim import scenario_file
 from zsim.scenario import ErrorModel, Scenario, Sensor
 from zsim.streams import stream
+from zsim_agents.drone_estimator import DroneEstimator, Estimate
 
 Array = NDArray[np.float64]
 
 GATE_S = 0.02  # s
-G = 9.80665  # m/s^2
+GRAVITY = np.array([0.0, 0.0, 9.80665])  # m/s^2, what a body at rest feels
 DRAG = 0.58  # 1/s, 0.249 N/(m/s) on 0.429 kg
 STEP_S = 1e-3  # s, of central differences
 GUST_S = 8.0  # s, over which the drone begins to move
@@ -41,7 +41,7 @@ def estimator(of: Scenario) -> DroneEstimator:
 
 
 class Flight:
-    """Stand at (1, 2, 0) m until `start_s`, then climb to 15 m and drift in sums of sines; thrust lies along z_B.
+    """Stand at (1, 2, 0) m until `start_s`, then climb to 15 m and drift in sums of sines.
 
     Args:
         seed: of the drift and the steady wind.
@@ -63,9 +63,7 @@ class Flight:
         """p_WB (n, 3)."""
         begun, climbed = self._ramp(t, GUST_S), self._ramp(t, CLIMB_S)
         waves = (self._size * np.sin(self._w * t[:, None, None] + self._phase)).sum(2)
-        return (
-            np.array([1.0, 2.0, 0.0]) + begun[:, None] * waves + HEIGHT_M * climbed[:, None] * (0.0, 0.0, 1.0)
-        )
+        return np.array([1.0, 2.0, 0.0]) + begun[:, None] * waves + HEIGHT_M * climbed[:, None] * (0.0, 0.0, 1.0)
 
     def velocity(self, t: Array) -> Array:
         """v_WB (n, 3)."""
@@ -79,7 +77,7 @@ class Flight:
     def attitude(self, t: Array) -> Array:
         """R_WB (n, 3, 3): what is not thrust is gravity and drag in the wind."""
         begun = self._ramp(t, GUST_S)[:, None]
-        thrust = self.acceleration(t) + (0.0, 0.0, G) + begun * DRAG * (self.velocity(t) - self._wind)
+        thrust = self.acceleration(t) + GRAVITY + begun * DRAG * (self.velocity(t) - self._wind)
         z = thrust / np.linalg.norm(thrust, axis=1)[:, None]
         yaw = self.yaw_start + self.yaw_rate * np.clip(t - self.start_s, 0.0, None) * self._ramp(t, GUST_S)
         y = np.cross(z, np.stack([np.cos(yaw), np.sin(yaw), 0.0 * yaw], 1))
@@ -106,7 +104,7 @@ class Flight:
         """What an accelerometer at p_BS feels, in B (n, 3)."""
         w = self.rate(t)
         alpha = (self.rate(t + STEP_S) - self.rate(t - STEP_S)) / (2.0 * STEP_S)
-        f = np.einsum("nji,nj->ni", self.attitude(t), self.acceleration(t) + (0.0, 0.0, G))
+        f = np.einsum("nji,nj->ni", self.attitude(t), self.acceleration(t) + GRAVITY)
         return f + np.cross(alpha, p_BS) + np.cross(w, np.cross(w, p_BS))
 
     def _ramp(self, t: Array, span_s: float) -> Array:

@@ -16,7 +16,8 @@ def row():
 
 
 def hover(row):
-    return (math.sqrt(row[vehicle.MASS] * row[vehicle.GRAVITY] / (4 * row[vehicle.THRUST])),) * 4
+    speed = math.sqrt(row[vehicle.MASS] * row[vehicle.GRAVITY] / (4 * row[vehicle.THRUST]))
+    return (speed, speed, speed, speed)
 
 
 def test_a_full_battery_hovers_for_twelve_minutes(row):
@@ -33,7 +34,7 @@ def test_power_is_torque_times_speed_over_efficiency_and_the_board(row):
 def test_energy_is_drained_and_ends_at_zero(row):
     full = row[vehicle.CAPACITY]
     assert math.isclose(full, 1.0 * 3600 * 11.1, rel_tol=1e-12)  # 1 Ah at 11.1 V
-    left = battery.drained(row, full, (0.0,) * 4, 100.0)
+    left = battery.drained(row, full, (0.0, 0.0, 0.0, 0.0), 100.0)
     assert math.isclose(left, full - 100.0 * vehicle.BOARD_W, rel_tol=1e-12)
     assert battery.drained(row, 1.0, hover(row), 1.0) == 0.0
     np.testing.assert_allclose(battery.percent(row, full / 4), 25.0)

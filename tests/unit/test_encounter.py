@@ -69,7 +69,7 @@ def test_head_on_collision_rebounds_and_loses_energy(rows):
         push[:] = 0.0
         least = min(least, encounters(rows[:2], state, air, push, touching, touched))
         for i in range(2):
-            body.step(rows[i], anchor, state[i], (0.0,) * 4, (0.0,) * 3, tuple(push[i]), 0.0025)
+            body.step(rows[i], anchor, state[i], (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), body.vector(push[i], 0), 0.0025)
     assert abs(state[:, 3].sum()) < 1e-9
     assert 0.3 < (state[1, 3] - state[0, 3]) / 3.0 < 0.7
     assert 2 * RADIUS - 0.06 < least < 2 * RADIUS

@@ -7,7 +7,7 @@ import pytest
 
 from zsim.frames import heading, quaternion_from_rpy
 from zsim.scenario_file import resolve
-from zsim_world import gains, observer
+from zsim_world import observer
 from zsim_world.fleet import Fleet
 
 PRESETS = [
@@ -190,8 +190,9 @@ def test_ardrone_commands_are_tilts():
     run(flight, 4.0, lambda: flight.set_ardrone(0, 0.0, 0.0, 0.0, 0.0, True))
     assert states(flight) == ["hovering"]
     assert np.linalg.norm(flight.truth().velocity_m_s[0]) < 0.2
-    track = run(flight, 2.0, lambda: flight.set_ardrone(0, 0.0, 0.5, 0.5, 0.5, False))
-    assert in_heading_frame(track[-1])[1] > 1.0
+    track = run(flight, 1.5, lambda: flight.set_ardrone(0, 0.0, 0.5, 0.0, 0.0, False))
+    assert in_heading_frame(track[-1])[1] > 1.5
+    track = run(flight, 2.0, lambda: flight.set_ardrone(0, 0.0, 0.0, 0.5, 0.5, False))
     assert track[-1].velocity_m_s[0, 2] == pytest.approx(0.5, abs=0.1)
     assert track[-1].angular_velocity_rad_s[0, 2] == pytest.approx(math.radians(100.0), abs=0.1)
 
@@ -206,9 +207,12 @@ def test_attitude_setpoint():
 
 
 def test_rotor_setpoint_goes_to_the_rotors_within_their_limits():
-    flight = airborne(gust=0.0)
-    run(flight, 0.3, lambda: flight.set_rotors(0, (370.0, 360.0, 370.0, 9999.0)))
-    np.testing.assert_allclose(flight.truth().rotor_rad_s[0], (370.0, 360.0, 370.0, 503.0), rtol=1e-3)
+    flight = airborne(gust=0.0, climb_to=4.0)
+    run(flight, 0.2, lambda: flight.set_rotors(0, (9999.0, 503.0, 470.0, 470.0)))
+    np.testing.assert_allclose(flight.truth().rotor_rad_s[0], (503.0, 503.0, 470.0, 470.0), rtol=2e-3)
+    flight = airborne(gust=0.0, climb_to=4.0)
+    run(flight, 0.3, lambda: flight.set_rotors(0, (0.0,) * 4))
+    np.testing.assert_allclose(flight.truth().rotor_rad_s[0], 126.0, rtol=2e-3)
 
 
 def test_silence_of_the_commander_hovers_then_lands():
@@ -244,7 +248,7 @@ def test_emergency_stops_the_rotors_and_reset_allows_a_new_takeoff():
     run(flight, 0.3)
     assert states(flight) == ["emergency"]
     assert flight.truth().rotor_rad_s.max() < 1.0
-    assert "emergency" in flight.takeoff(0)
+    assert "emergency" in str(flight.takeoff(0))
     run(flight, 3.0)
     assert flight.reset(0) is None
     run(flight, 1.0)
@@ -254,20 +258,19 @@ def test_emergency_stops_the_rotors_and_reset_allows_a_new_takeoff():
     assert states(flight) == ["hovering"]
 
 
-def test_an_overturned_drone_cuts_its_motors_and_does_not_take_off_again():
-    flight = airborne(gust=0.0)
+def test_an_overturned_drone_cuts_its_motors():
+    flight = airborne(gust=0.0, climb_to=4.0)
     run(flight, 0.7, lambda: flight.set_rotors(0, (503.0, 126.0, 126.0, 503.0)))
     assert states(flight) == ["emergency"]
-    run(flight, 3.0)
-    flight.reset(0)
-    run(flight, 0.1)
-    if flight.truth().orientation_wxyz[0] @ flight.truth().orientation_wxyz[0] and _upside(flight) < 0.8:
-        assert "upright" in flight.takeoff(0)
+    run(flight, 4.0)
+    assert flight.truth().rotor_rad_s.max() < 1e-3
+    assert np.linalg.norm(flight.truth().velocity_m_s[0]) < 0.05
 
 
-def _upside(flight):
-    _, x, y, _ = flight.truth().orientation_wxyz[0]
-    return 1 - 2 * (x * x + y * y)
+def test_a_drone_on_its_back_does_not_take_off():
+    flight = fleet(gust=0.0)
+    flight._bodies.state[0, 6:10] = flight._boards.belief[0, :4] = quaternion_from_rpy((3.0, 0.0, 0.0))
+    assert "upright" in str(flight.takeoff(0))
 
 
 def test_low_battery_lands_and_forbids_a_takeoff():
@@ -275,7 +278,7 @@ def test_low_battery_lands_and_forbids_a_takeoff():
     run(flight, 60.0)
     assert states(flight) == ["landed"]
     assert 3.0 < flight.status(0)[1] < 5.0
-    assert "%" in flight.takeoff(0)
+    assert "%" in str(flight.takeoff(0))
 
 
 def test_an_empty_battery_stops_the_rotors():
@@ -347,28 +350,3 @@ def test_belief_agrees_with_truth(sensors):
         believed = belief[observer.VELOCITY : observer.VELOCITY + 3]
         np.testing.assert_allclose(believed, in_heading_frame(truth, i), atol=0.3)
         assert abs(belief[observer.HEIGHT] - truth.position_m[i, 2]) < 0.3
-
-
-@pytest.mark.parametrize("sensors", PRESETS, ids=NAMES)
-def test_observer_gains_make_a_stable_filter_over_its_true_schedule(sensors):
-    """Errors of the horizontal design model shrink over one second of 200 accelerometer and 15 flow samples."""
-    flight = fleet(1, sensors)
-    row = flight._boards.gain[0]
-    c, g = 0.249 / 0.429, 9.80665
-    step = np.eye(4) + 0.005 * np.array([[-c, g, 0, 1], [0, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]])
-    accel = np.eye(4) - np.outer(row[gains.ACCEL_V : gains.ACCEL_U + 1], [-c, 0, 0, 1])
-    flow = np.eye(4) - np.outer(row[gains.FLOW_V : gains.FLOW_U + 1], [1, 0, 0, 0])
-    second = np.eye(4)
-    for k in range(200):
-        second = accel @ step @ second
-        if (15 * k) // 200 != (15 * (k + 1)) // 200:
-            second = flow @ second
-    assert np.abs(np.linalg.eigvals(second)).max() < 0.999
-
-
-def test_steady_gain_of_a_scalar_filter_is_the_closed_form():
-    """A random walk of q per sqrt(s) seen at 200 Hz with sigma: p = (q' + sqrt(q'^2 + 4 q' r)) / 2."""
-    q, r = 0.3**2 / 200, 0.5**2
-    p = (q + math.sqrt(q * q + 4 * q * r)) / 2
-    gain = gains.steady_gains(np.zeros((1, 1)), np.array([0.3]), [([1.0], 0.5, 200.0)])
-    assert gain[0, 0] == pytest.approx(p / (p + r), rel=1e-9)

@@ -99,4 +99,5 @@ def test_heading_is_counter_clockwise_from_east():
 
 
 def test_wrap_angle():
-    np.testing.assert_allclose(frames.wrap_angle([math.pi, -math.pi, 3 * math.pi / 2]), [-math.pi, -math.pi, -math.pi / 2])
+    wrapped = frames.wrap_angle([math.pi, -math.pi, 3 * math.pi / 2])
+    np.testing.assert_allclose(wrapped, [-math.pi, -math.pi, -math.pi / 2])

@@ -11,7 +11,7 @@ from zsim_world import rigid_body as body
 from zsim_world import vehicle
 from zsim_world.ground import contact, drag_anchors
 
-OFF, CALM = (0.0,) * 4, (0.0,) * 3
+OFF, CALM = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 DT = 0.0025
 
 

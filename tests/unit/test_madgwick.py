@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+
 from zsim_agents import madgwick
 
 G = 9.80665  # m/s^2
@@ -53,9 +54,7 @@ def test_body_rates_multiply_on_the_right():
 
 def test_rotations_and_products_agree_with_scipy():
     rng = np.random.default_rng(1)
-    for a, b, v in zip(
-        Rotation.random(50, rng), Rotation.random(50, rng), rng.normal(size=(50, 3)), strict=True
-    ):
+    for a, b, v in zip(Rotation.random(50, rng), Rotation.random(50, rng), rng.normal(size=(50, 3)), strict=True):
         R = madgwick.rotation(quaternion(a))
         assert np.array(R).reshape(3, 3) == pytest.approx(a.as_matrix(), abs=1e-12)
         assert madgwick.turn(R, tuple(v)) == pytest.approx(a.apply(v), abs=1e-12)
@@ -104,7 +103,7 @@ def test_under_noise_the_tilt_decays_with_the_levelling_time():
     for _ in range(40):
         q = quaternion(Rotation.from_rotvec([0.02, 0.0, 0.0]))  # rad, within the noise
         for noise in rng.normal(scale=0.35, size=(round(levelling / DT), 3)):
-            q = madgwick.madgwick_step(q, (0.0, 0.0, 0.0), tuple(noise + (0.0, 0.0, G)), beta, DT)
+            q = madgwick.madgwick_step(q, (0.0, 0.0, 0.0), (noise[0], noise[1], noise[2] + G), beta, DT)
         left.append(as_rotation(q).as_rotvec()[0])
     assert np.mean(left) == pytest.approx(0.02 * math.exp(-1.0), rel=0.15)
 

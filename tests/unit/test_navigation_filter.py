@@ -1,4 +1,4 @@
-"""The error-state filter: growth and Jacobians against finite differences of the nominal state, and its gates."""
+"""The error-state filter: its growth and Jacobians against finite differences, its updates, its gates."""
 
 import math
 from collections.abc import Callable
@@ -8,12 +8,12 @@ import pytest
 from filterpy.kalman import ExtendedKalmanFilter
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+
+from zsim.scenario import ErrorModel, Imu
 from zsim_agents import aiding_models, dead_reckoning
 from zsim_agents.madgwick import LEVEL, rotation
 from zsim_agents.navigation_filter import BiasPrior, NavigationFilter, ProcessNoise, Stack
 from zsim_agents.strapdown import Interval, Strapdown
-
-from zsim.scenario import ErrorModel, Imu
 
 G = 9.80665  # m/s^2
 GATE_S = 0.02  # s
@@ -47,7 +47,7 @@ def filter_of(biases: dict[str, BiasPrior] = GYRO) -> NavigationFilter:
 
 def level_at_rest(with_accel_bias: bool = False) -> Strapdown:
     imu = Imu(rate_hz=200.0, accel_m_s2=ErrorModel(noise=0.35))
-    return Strapdown(imu, with_accel_bias, 0.0, G, GATE_S)
+    return Strapdown(imu, with_accel_bias, 0.35, 0.0, G, GATE_S)
 
 
 def gps(H, p, v, R):
@@ -126,9 +126,7 @@ def test_the_transition_is_the_derivative_of_dead_reckoning():
 
     def off(error) -> np.ndarray:
         p, v, q, *_ = reckoned(error)
-        turned = (
-            Rotation.from_quat(q, scalar_first=True) * Rotation.from_quat(nominal[2], scalar_first=True).inv()
-        )
+        turned = Rotation.from_quat(q, scalar_first=True) * Rotation.from_quat(nominal[2], scalar_first=True).inv()
         return np.concatenate([np.subtract(p, nominal[0]), np.subtract(v, nominal[1]), turned.as_rotvec()])
 
     h = 1e-5
@@ -165,21 +163,19 @@ def test_an_update_agrees_with_plain_filterpy():
     navigation, stack = filter_of(), Stack(12)
     plain = ExtendedKalmanFilter(12, 4)
     plain.x, plain.P = np.zeros(12), navigation.P.copy()
-    z, H, R = np.array([0.3, -0.2, 0.1, 0.5]), np.zeros((4, 12)), np.diag([0.04, 0.09, 0.01, 0.25])
+    z, H, R = [0.3, -0.2, 0.1, 0.5], np.zeros((4, 12)), np.diag([0.04, 0.09, 0.01, 0.25])
     H[:3, 3:6], H[3, 2] = np.eye(3), 1.0
     stack.H[:4] = H
     stack.add(z[:3], ZERO, (0.04, 0.09, 0.01))
     stack.add(z[3:], (0.0,), (0.25,))
     assert navigation.correct(stack) == [True, True]
-    plain.update(z, lambda x: H, lambda x: np.zeros(4), R)
+    plain.update(np.array(z), lambda x: H, lambda x: np.zeros(4), R)
     assert navigation.take_error() == pytest.approx(plain.x)
     assert pytest.approx(plain.P) == navigation.P
     assert not navigation.x.any()
 
 
-@pytest.mark.parametrize(
-    ("size", "inside"), [(1, True), (1, False), (3, True), (3, False), (6, True), (6, False)]
-)
+@pytest.mark.parametrize(("size", "inside"), [(1, True), (1, False), (3, True), (3, False), (6, True), (6, False)])
 def test_a_gate_is_the_quantile_of_chi_square(size: int, inside: bool):
     navigation, stack = filter_of(), Stack(12)
     stack.H[:size, :size] = np.eye(size)

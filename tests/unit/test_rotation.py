@@ -15,8 +15,9 @@ quaternions = st.tuples(number, number, number, number).filter(lambda q: sum(x *
 few = settings(max_examples=50, deadline=None)
 
 
-def unit(q):
-    return tuple(float(x) for x in np.array(q) / np.linalg.norm(q))
+def unit(q) -> rot.Quaternion:
+    w, x, y, z = (np.array(q) / np.linalg.norm(q)).tolist()
+    return w, x, y, z
 
 
 def scipy_rotation(q):

@@ -81,13 +81,13 @@ def test_reaction_and_gyroscopic_moments(row):
 
 
 def test_ground_effect_tilts_a_drone_away_from_the_nearer_rotor(row):
-    speeds = (360.0,) * 4
+    speeds = (360.0, 360.0, 360.0, 360.0)
     rolled = (math.cos(0.1), math.sin(0.1), 0.0, 0.0)  # right side down
     moment = wrench(row, rolled, 0.15, STILL, speeds, NO_SLEW)[1]
     assert moment[0] < -1e-4
 
 
-@pytest.mark.parametrize(("height", "factor"), [(0.1, 16 / 15), (0.05, 4 / 3), (0.0, 4 / 3), (1.0, 1.0 / (1 - 0.025**2))])
+@pytest.mark.parametrize(("height", "factor"), [(0.1, 16 / 15), (0.05, 4 / 3), (0.0, 4 / 3), (1.0, 1 / (1 - 0.025**2))])
 def test_ground_effect_values(height, factor):
     assert math.isclose(ground_effect(height), factor, rel_tol=1e-12)
 

@@ -124,16 +124,13 @@ class Barrier:
         if message.run_id != self._run_id:
             return f"run_id is {message.run_id[:40]!r}; must be {self._run_id!r} (read world/info)"
         if message.incarnation != participant.incarnation:
-            return (
-                f"incarnation is {message.incarnation}; must be {participant.incarnation}, the newest to join"
-            )
+            return f"incarnation is {message.incarnation}; must be {participant.incarnation}, the newest to join"
         if message.done_ns > now_ns:
             return f"done_ns is {message.done_ns}; must be <= {now_ns}, the newest gate"
         if message.done_ns > participant.done_ns:
             participant.done_ns = message.done_ns
             participant.since_wall_ns = wall_ns
-        balance = participant.received - message.sent
-        participant.received, participant.missing = max(0, balance), max(0, -balance)
+        participant.settle(message.sent)
         return None
 
     def received(self, name: str) -> None:

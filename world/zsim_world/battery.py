@@ -1,8 +1,8 @@
 """The battery: energy drawn by rotors and board; a full 1000 mAh hovers for twelve minutes."""
 
-from zsim_world.compiled import compiled
 from numpy.typing import NDArray
 
+from zsim_world.compiled import compiled
 from zsim_world.rotors import Four, shaft_power
 from zsim_world.vehicle import BOARD_W, CAPACITY, EFFICIENCY
 

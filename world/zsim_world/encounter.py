@@ -2,9 +2,9 @@
 
 import math
 
-from zsim_world.compiled import compiled
 from numpy.typing import NDArray
 
+from zsim_world.compiled import compiled
 from zsim_world.rigid_body import ATTITUDE, POSITION, ROTOR, VELOCITY, four
 from zsim_world.rotation import z_axis
 from zsim_world.rotors import Four

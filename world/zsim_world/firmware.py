@@ -4,7 +4,7 @@ Loops from inside out, each about three times slower than the one it contains:
     rotors   overdriven so that their lag halves (15 ms for the AR.Drone)
     rate     dw/dt = 28 (w_des - w)
     tilt     w_des = 9 (z_B × z_des): closed loop about 0.12 s, inside the 0.143 s that tum_ardrone fitted
-    velocity a_des = 3 (v_des - v), disturbance and drag of the belief cancelled
+    velocity a_des = 3 (v_des - v), vertically 4, disturbance and drag of the belief cancelled
     hold     v_des = 0.8 (p_hold - p), height 1.5
 A velocity in the heading frame is held towards its own instant: while the drone yaws at r, it lags by r v / 3 across.
 The inner gains follow from the rotors' lag, so that another aircraft flies too.
@@ -13,32 +13,22 @@ The inner gains follow from the rotors' lag, so that another aircraft flies too.
 import math
 
 import numpy as np
-from zsim_world.compiled import compiled
 from numpy.typing import NDArray
 
+from zsim.messages import DroneState
 from zsim.scenario import Drone
 from zsim_world import observer as ob
 from zsim_world import rotation as rot
+from zsim_world.compiled import compiled
+from zsim_world.drive import K_RATE, K_TILT, clipped, drive, limited_tilt, loop_gains
 from zsim_world.observer import STEP_S
-from zsim_world.rigid_body import four, put_four, vector
+from zsim_world.rigid_body import four, vector
 from zsim_world.rotation import Vector, axpy
-from zsim_world.rotors import Four, mix
-from zsim_world.vehicle import (
-    DRAG,
-    DRIVE_LAG_LEAD,
-    GRAVITY,
-    INERTIA_X,
-    INERTIA_Y,
-    INERTIA_Z,
-    MASS,
-    ROTOR_LAG,
-    ROTOR_MAX,
-    ROTOR_MIN,
-    STAND_HEIGHT_M,
-)
+from zsim_world.rotors import Four
+from zsim_world.vehicle import DRAG, GRAVITY, MASS, ROTOR_MIN, STAND_HEIGHT_M
 
 LANDED, TAKING_OFF, HOVERING, FLYING, LANDING, EMERGENCY = range(6)
-MODES = ("landed", "taking_off", "hovering", "flying", "landing", "emergency")  # names of the contract
+MODES: tuple[DroneState, ...] = ("landed", "taking_off", "hovering", "flying", "landing", "emergency")
 
 NONE, VELOCITY, VELOCITY_WORLD, ARDRONE, HOVER, ATTITUDE, ROTORS = range(7)  # kinds of setpoint
 # Columns of the setpoint: kind, then
@@ -54,17 +44,12 @@ RISING, HOLDING = 1.0, 2.0  # values of HOLDS_Z: the height held rises to that o
 
 # Columns of the settings: limits of what a commander may ask, and the loop gains
 TILT, SPEED, CLIMB, YAW_RATE, ALTITUDE, TAKEOFF_HEIGHT = 0, 1, 2, 3, 4, 5  # rad, m/s, m/s, rad/s, m, m
-K_RATE, K_TILT, K_VELOCITY = 6, 7, 8  # 1/s
-SETTING_COLUMNS = 9
+K_VELOCITY, K_CLIMB = 8, 9  # 1/s; drive.py has the two before them
+SETTING_COLUMNS = 10
 
-RATE_PER_LAG = 0.42  # rate gain times the overdriven lag: damping 0.77 of rate loop and rotors together
-LAG_MIN_S = 0.015  # s, three control steps: faster rotors do not make a faster loop
-LOOP_RATIO = 3.1  # of a loop's gain to that of the loop around it
-K_YAW = 8.0  # 1/s; the rotors' own inertia makes it quicker: 0.04 s as fitted by tum_ardrone
-K_CLIMB = 4.0  # 1/s, thrust needs no tilt first
+CLIMB_SHARE = 1 / 7  # of the rate gain, 4 1/s: thrust needs no tilt first
 K_HOLD = 0.8  # 1/s, position on the own odometry
 K_HEIGHT = 1.5  # 1/s
-BODY_RATE_MAX = 5.0  # rad/s, wanted of the tilt loop
 BRAKE_S = 0.6  # s, where a hold begins: about the stopping distance over speed
 TILT_CUT_COSINE = 0.25  # beyond 75 deg the motors are cut, as the aircraft does when it is overturned
 LIFT_SHARE_MIN = 0.15  # of the weight: thrust never asked below
@@ -88,9 +73,8 @@ def settings(drone: Drone) -> NDArray[np.float64]:
     row[TILT], row[YAW_RATE] = math.radians(limits.tilt_deg), math.radians(limits.yaw_rate_deg_s)
     row[SPEED], row[CLIMB] = limits.horizontal_speed_m_s, limits.vertical_speed_m_s
     row[ALTITUDE], row[TAKEOFF_HEIGHT] = limits.altitude_m, min(drone.takeoff_height_m, limits.altitude_m)
-    row[K_RATE] = RATE_PER_LAG / max(DRIVE_LAG_LEAD * drone.rotor_time_constant_s, LAG_MIN_S)
-    row[K_TILT] = row[K_RATE] / LOOP_RATIO
-    row[K_VELOCITY] = row[K_TILT] / LOOP_RATIO
+    row[K_RATE], row[K_TILT], row[K_VELOCITY] = loop_gains(drone.rotor_time_constant_s)
+    row[K_CLIMB] = CLIMB_SHARE * row[K_RATE]
     return row
 
 
@@ -191,7 +175,7 @@ def _fly(mode: int, memory: NDArray, belief: NDArray, row: NDArray, setting: NDA
     """Return rotor commands in the air, or on the way there."""
     kind = int(setpoint[KIND])
     if mode == FLYING and kind == ROTORS:
-        return _clipped(row, four(setpoint, VALUE))
+        return clipped(row, four(setpoint, VALUE))
     if stands(memory):
         low = row[ROTOR_MIN]
         return (low, low, low, low)
@@ -199,7 +183,7 @@ def _fly(mode: int, memory: NDArray, belief: NDArray, row: NDArray, setting: NDA
         z_des, lift, yaw_rate = _attitude_wish(belief, row, setting, setpoint)
     else:
         z_des, lift, yaw_rate = _velocity_wish(mode, kind, memory, belief, row, setting, setpoint)
-    return _drive(belief, row, setting, z_des, lift, yaw_rate)
+    return drive(belief, row, setting, z_des, lift, yaw_rate)
 
 
 @compiled
@@ -207,7 +191,7 @@ def _attitude_wish(belief: NDArray, row: NDArray, setting: NDArray, setpoint: ND
     """Return wanted z_B in the heading frame, thrust [N] and yaw rate of an attitude setpoint."""
     q = rot.normalised(four(setpoint, VALUE))
     own = rot.about_z(rot.heading(four(belief, ob.ATTITUDE)))
-    z_des = _limited_tilt(rot.rotate_back(own, rot.z_axis(q)), setting[TILT])
+    z_des = limited_tilt(rot.rotate_back(own, rot.z_axis(q)), setting[TILT])
     yaw_rate = _clip(setpoint[VALUE + 5], setting[YAW_RATE])
     return z_des, setpoint[VALUE + 4], yaw_rate
 
@@ -226,13 +210,13 @@ def _velocity_wish(
     wish = (wish[0], wish[1], _climb(mode, wish[2], memory, belief, row, setting))
     # what the thrust must give: the acceleration wanted, less disturbance and drag, plus the weight
     f = axpy(vector(belief, ob.DISTURBANCE), -row[DRAG] / row[MASS], v)
-    up = max(K_CLIMB * (wish[2] - v[2]) - f[2] + row[GRAVITY], LIFT_SHARE_MIN * row[GRAVITY])
+    up = max(setting[K_CLIMB] * (wish[2] - v[2]) - f[2] + row[GRAVITY], LIFT_SHARE_MIN * row[GRAVITY])
     if mode == FLYING and kind == ARDRONE:
         across = math.tan(setting[TILT])
         z = (across * _clip(setpoint[VALUE], 1.0), across * _clip(setpoint[VALUE + 1], 1.0), 1.0)
     else:
         z = (setting[K_VELOCITY] * (wish[0] - v[0]) - f[0], setting[K_VELOCITY] * (wish[1] - v[1]) - f[1], up)
-    z = _limited_tilt(z, setting[TILT])
+    z = limited_tilt(z, setting[TILT])
     true_z = rot.z_axis(four(belief, ob.ATTITUDE))[2]
     return z, row[MASS] * up / max(true_z, 0.5), yaw_rate
 
@@ -267,9 +251,7 @@ def _held(memory: NDArray, belief: NDArray, wish: Vector) -> Vector:
 
 
 @compiled
-def _climb(
-    mode: int, asked: float, memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray
-) -> float:
+def _climb(mode: int, asked: float, memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) -> float:
     """Return the wanted vertical velocity [m/s]: take-off, landing, height hold, or what is asked."""
     height = belief[ob.HEIGHT]
     if mode == LANDING:
@@ -280,7 +262,7 @@ def _climb(
         memory[HOLDS_Z] = 0.0
         return min(asked, K_HEIGHT * (setting[ALTITUDE] - height))
     if memory[HOLDS_Z] != HOLDING:
-        ahead = height + belief[ob.VELOCITY + 2] / K_CLIMB
+        ahead = height + belief[ob.VELOCITY + 2] / setting[K_CLIMB]
         memory[HOLD_Z], memory[HOLDS_Z] = max(ahead, 2.0 * STAND_HEIGHT_M), HOLDING
     return _clip(K_HEIGHT * (memory[HOLD_Z] - height), setting[CLIMB])
 
@@ -306,63 +288,6 @@ def _descent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) -
     memory[TOUCH] = memory[TOUCH] + 1.0 if borne else 0.0
     faster = DESCENT_FAR_1_S * max(belief[ob.HEIGHT] - FLARE_M, 0.0)
     return min(DESCENT_M_S + faster, max(setting[CLIMB], DESCENT_M_S))
-
-
-@compiled
-def _drive(belief: NDArray, row: NDArray, setting: NDArray, z_des: Vector, thrust_n: float, yaw_rate: float) -> Four:
-    """Return rotor commands for a wanted z_B (heading frame), thrust [N] and yaw rate [rad/s]."""
-    q_HB = ob.level(four(belief, ob.ATTITUDE))
-    z_B = rot.rotate_back(q_HB, z_des)
-    up_B = rot.rotate_back(q_HB, (0.0, 0.0, yaw_rate))
-    w = vector(belief, ob.BODY_RATE)
-    wx, wy = -setting[K_TILT] * z_B[1], setting[K_TILT] * z_B[0]
-    size = math.sqrt(wx * wx + wy * wy)
-    s = 1.0 if size <= BODY_RATE_MAX else BODY_RATE_MAX / size
-    ix, iy, iz = row[INERTIA_X], row[INERTIA_Y], row[INERTIA_Z]
-    moment = (
-        ix * setting[K_RATE] * (s * wx + up_B[0] - w[0]) + (iz - iy) * w[1] * w[2],
-        iy * setting[K_RATE] * (s * wy + up_B[1] - w[1]) + (ix - iz) * w[2] * w[0],
-        iz * K_YAW * (up_B[2] - w[2]) + (iy - ix) * w[0] * w[1],
-    )
-    return _overdriven(belief, row, mix(row, thrust_n, moment))
-
-
-@compiled
-def _overdriven(belief: NDArray, row: NDArray, wanted: Four) -> Four:
-    """Return commands under which the rotors move to `wanted` with a part of their lag only."""
-    lag = row[ROTOR_LAG]
-    s = (1.0 - math.exp(-STEP_S / (DRIVE_LAG_LEAD * lag))) / (1.0 - math.exp(-STEP_S / lag))
-    r = four(belief, ob.ROTOR)
-    return _clipped(
-        row,
-        (
-            r[0] + s * (wanted[0] - r[0]),
-            r[1] + s * (wanted[1] - r[1]),
-            r[2] + s * (wanted[2] - r[2]),
-            r[3] + s * (wanted[3] - r[3]),
-        ),
-    )
-
-
-@compiled
-def _clipped(row: NDArray, speed: Four) -> Four:
-    low, high = row[ROTOR_MIN], row[ROTOR_MAX]
-    return (
-        min(max(speed[0], low), high),
-        min(max(speed[1], low), high),
-        min(max(speed[2], low), high),
-        min(max(speed[3], low), high),
-    )
-
-
-@compiled
-def _limited_tilt(z: Vector, tilt: float) -> Vector:
-    """Return the unit vector along z, no farther from the vertical than `tilt`."""
-    across = math.sqrt(z[0] * z[0] + z[1] * z[1])
-    most = max(z[2], 1e-3) * math.tan(tilt)
-    s = 1.0 if across <= most else most / across
-    z = (s * z[0], s * z[1], max(z[2], 1e-3))
-    return axpy((0.0, 0.0, 0.0), 1.0 / rot.norm(z), z)
 
 
 @compiled

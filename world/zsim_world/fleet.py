@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from zsim.errors import RunError
 from zsim.frames import enu_to_geodetic
+from zsim.messages import DroneState
 from zsim.scenario import Gps, Scenario
 from zsim_world import firmware, gate, observer, sensor_set, vehicle, wind
 from zsim_world.noise import NoiseTable
-from zsim_world.sensor_set import SENSORS, VALUES
+from zsim_world.sensor_set import SENSORS, VALUES, SensorName
 from zsim_world.start import arrays
 
 GPS_FIX, GPS_SATELLITES = 3, 9  # a three-dimensional fix; satellites of a real navdata packet
@@ -39,7 +40,7 @@ class Sample(NamedTuple):
     altitude [m]; sonar: range [m], valid 0 or 1; flow: forward, left, up [m/s], quality.
     """
 
-    sensor: str
+    sensor: SensorName
     drone: int
     t_ns: int
     t_sample_ns: int
@@ -113,7 +114,7 @@ class Fleet:
         s = self._bodies.state.copy()
         return Truth(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], self._bodies.accel[:, 0:3].copy(), s[:, 13:17])
 
-    def status(self, i: int) -> tuple[str, float, bool]:
+    def status(self, i: int) -> tuple[DroneState, float, bool]:
         """Return the firmware's mode, the charge [%], and whether the hull touched another in the last gate."""
         charge = 100.0 * self._bodies.energy.item(i) / self._bodies.vehicle.item(i, vehicle.CAPACITY)
         return firmware.MODES[self._mode(i)], charge, i in self._touching
@@ -166,7 +167,7 @@ class Fleet:
         yaw_rate_rad_s: float = 0.0,
         frame: Literal["heading", "world"] = "heading",
     ) -> str | None:
-        """Fly a velocity in the heading frame, or in W turned by the firmware's own heading; return None, or why not."""
+        """Fly a velocity in the heading frame, or in W by the firmware's own heading; return None, or why not."""
         kind = firmware.VELOCITY if frame == "heading" else firmware.VELOCITY_WORLD
         return self._set(i, kind, (*velocity_m_s, yaw_rate_rad_s))
 
@@ -176,9 +177,7 @@ class Fleet:
         """Fly by tilt, climb and yaw rate, each in [-1, 1] of its limit, or hover; return None, or why not."""
         return self._set(i, firmware.HOVER if hover else firmware.ARDRONE, (forward, left, up, yaw_left))
 
-    def set_attitude(
-        self, i: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float = 0.0
-    ) -> str | None:
+    def set_attitude(self, i: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float = 0.0) -> str | None:
         """Fly a tilt (of q_WB, w first; its heading is not used), thrust [N] and yaw rate; return None, or why not."""
         if sum(x * x for x in q_WB) < QUATERNION_SQUARE_MIN:
             return f"{self.names[i]} was sent the orientation {list(q_WB)}; must be a quaternion of length 1"
@@ -234,7 +233,7 @@ class Fleet:
         """Return the samples that the kernel took, in the order of (time, drone, sensor)."""
         out, tick_ns = [], self._tick_ns
         fixes: list[int] = []
-        index, values = self._senses.index[:logged].tolist(), self._senses.value[:logged].tolist()
+        index, values = self._senses.whose[:logged].tolist(), self._senses.value[:logged].tolist()
         for (s, i, tick), value in zip(index, values, strict=True):
             t = tick * tick_ns
             if s == sensor_set.GPS:

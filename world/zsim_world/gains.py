@@ -14,9 +14,9 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm, solve_discrete_are
+from scipy.linalg import expm
 
-from zsim.scenario import Drone, Environment, ErrorModel, Sensor, Sensors
+from zsim.scenario import Drone, Environment, ErrorModel, Sensor
 from zsim_world.sensor_set import DEVICE_RATE_HZ, heading_sigma, radians, white_sigma
 
 Array = NDArray[np.float64]
@@ -26,7 +26,18 @@ LIFT_WALK = 0.4  # m/s^2/sqrt(s): ground effect and downwash come faster than gu
 TILT_WALK = 6e-4  # rad/sqrt(s), least: vibration, rounding, and what a turn leaves
 BIAS_WALK = 2e-5  # rad/s/sqrt(s), least: a bias of 0.1 deg/s is found within a minute
 LIFT_BIAS_WALK = 3e-3  # m/s^2/sqrt(s), least: what the board's temperature does to its accelerometer
-FLOORS = {"accel": 0.02, "gyro": 1e-4, "flow": 0.02, "baro": 0.02, "sonar": 0.01, "mag": 0.01}  # m/s^2 rad/s m/s m m rad
+# Least and largest standard deviation of a sample that the design counts with: none is trusted blindly, and beyond the
+# largest a meter is as good as none
+SIGMAS = {
+    "accel": (0.02, 50.0),  # m/s^2
+    "gyro": (1e-4, 1.0),  # rad/s
+    "flow": (0.02, 10.0),  # m/s
+    "baro": (0.02, 100.0),  # m
+    "sonar": (0.01, 10.0),  # m
+    "mag": (0.01, 3.0),  # rad
+}
+DOUBLINGS = 24  # 2^24 steps of 5 ms are a day
+HEARD_MIN_HZ = 0.1  # Hz, a meter is not counted with less often
 
 # Columns of the gain row: innovation -> state
 ACCEL_V, ACCEL_TILT, ACCEL_RATE, ACCEL_U = 0, 1, 2, 3
@@ -54,17 +65,22 @@ def gain_row(drone: Drone, environment: Environment) -> Array:
         flow=(_sigma(s.flow.velocity_m_s, s.flow.rate_hz, "flow"), heard(s.flow)),
         baro=(_sigma(s.baro.altitude_m, s.baro.rate_hz, "baro"), heard(s.baro)),
         sonar=(_sigma(s.sonar.range_m, s.sonar.rate_hz, "sonar"), heard(s.sonar)),
-        mag=(max(heading_sigma(s.mag, field), FLOORS["mag"]), heard(s.mag)),
+        mag=(_within(heading_sigma(s.mag, field), "mag"), heard(s.mag)),
     )
 
 
 def heard(sensor: Sensor) -> float:
-    """Return the rate [Hz] at which samples really come, at least one in a hundred."""
-    return sensor.rate_hz * max(1.0 - sensor.dropout, 0.01)
+    """Return the rate [Hz] at which samples really come."""
+    return max(sensor.rate_hz * (1.0 - sensor.dropout), HEARD_MIN_HZ)
 
 
 def _sigma(model: ErrorModel, rate_hz: float, name: str) -> float:
-    return max(math.hypot(white_sigma(model, rate_hz), model.quantum / math.sqrt(12.0)), FLOORS[name])
+    return _within(math.hypot(white_sigma(model, rate_hz), model.quantum / math.sqrt(12.0)), name)
+
+
+def _within(sigma: float, name: str) -> float:
+    least, most = SIGMAS[name]
+    return min(max(sigma, least), most)
 
 
 Meter = tuple[float, float]  # standard deviation of a sample, samples per second
@@ -125,6 +141,20 @@ def covariance(a: Array, walks: Array, meters: list[tuple[list[float], float, fl
     r = np.diag([sigma**2 * DEVICE_RATE_HZ / rate for _, sigma, rate in meters])
     # process noise over one step by Simpson's rule: exact to dt^5 for these chains
     q = np.diag(walks**2)
-    half, full = expm(a * dt / 2), expm(a * dt)
+    half, full = (np.asarray(expm(a * s), dtype=np.float64) for s in (dt / 2, dt))
     noise = dt / 6.0 * (q + 4.0 * half @ q @ half.T + full @ q @ full.T)
-    return solve_discrete_are(full.T, h.T, noise, r)
+    return _riccati(full, h.T @ np.linalg.solve(r, h), noise)
+
+
+def _riccati(f: Array, information: Array, noise: Array) -> Array:
+    """Return the steady prior covariance of x' = f x + noise, seen with `information` = H^T R^-1 H in every step.
+
+    Structure-preserving doubling, 2^k steps after k rounds (Chu, Fan, Lin and Wang, Int. J. Control 77 (2004) 767-788):
+    scipy's solver fails on chains whose meters differ by ten decades.
+    """
+    a, g, p = f.T, information, noise
+    for _ in range(DOUBLINGS):
+        back = np.linalg.solve(np.eye(len(a)) + g @ p, np.hstack([a, g]))
+        turned, spread = back[:, : len(a)], back[:, len(a) :]
+        g, p, a = g + a @ spread @ a.T, p + a.T @ p @ turned, a @ turned
+    return 0.5 * (p + p.T)

@@ -7,7 +7,7 @@ drones are integrated; gusts move on (every 5 ms); drones meet; sensors that are
 import hashlib
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from numba import njit
 from numpy.typing import NDArray
@@ -15,6 +15,21 @@ from numpy.typing import NDArray
 from zsim_world import firmware, observer, sensors
 from zsim_world import rigid_body as body
 from zsim_world import sensor_set as ss
+from zsim_world.arrays import (
+    DT,
+    FIELD,
+    ORIGIN_HEIGHT,
+    SILENCE_HOVER,
+    SILENCE_LAND,
+    TICK,
+    TICKS_PER_STEP,
+    Arrays,
+    Boards,
+    Bodies,
+    Noise,
+    Senses,
+    Time,
+)
 from zsim_world.battery import drained, percent
 from zsim_world.compiled import compiled
 from zsim_world.encounter import encounters
@@ -24,12 +39,12 @@ from zsim_world.rotation import Vector, norm
 from zsim_world.vehicle import GRAVITY
 from zsim_world.wind import STEADY, blow
 
-TICK, TICKS_PER_STEP = 0, 1  # of `clock`: present physics tick, ticks per 5 ms
-DT, SILENCE_HOVER, SILENCE_LAND = 0, 1, 2  # of `spans`: physics tick, firmware's patience [s]
 # Every file with compiled code; the name of a kernel in numba's cache depends on their text
 KERNEL_FILES = (
+    "arrays.py",
     "battery.py",
     "compiled.py",
+    "drive.py",
     "encounter.py",
     "firmware.py",
     "gains.py",
@@ -44,75 +59,10 @@ KERNEL_FILES = (
     "vehicle.py",
     "wind.py",
 )
-FIELD, ORIGIN_HEIGHT = 0, 3  # columns of `place`: magnetic field in W [uT] (3), height above sea level [m]
 WIND_STREAM = 6  # after the six sensors
 POSITION_MAX_M, RATE_MAX_RAD_S = 1e6, 1e4  # beyond, the integration has diverged
 
 Pair = tuple[Vector, Vector]
-
-
-class Time(NamedTuple):
-    clock: NDArray  # int64 (2,), as above
-    spans: NDArray  # (3,), s, as above
-
-
-class Bodies(NamedTuple):
-    """N aircraft, as physics has them."""
-
-    vehicle: NDArray  # (N, vehicle.COLUMNS)
-    state: NDArray  # (N, rigid_body.COLUMNS)
-    accel: NDArray  # (N, 6), acceleration in W and angular acceleration in B
-    anchor: NDArray  # (N, 8, 2), m
-    command: NDArray  # (N, 4), rad/s
-    energy: NDArray  # (N,), J
-    air: NDArray  # (N, 3), m/s
-    push: NDArray  # (N, 3), N
-    touching: NDArray  # int8 (N, N)
-    touched: NDArray  # int8 (N, N), contacts that began in this gate
-
-
-class Boards(NamedTuple):
-    """N navigation boards with their firmware."""
-
-    setting: NDArray  # (N, firmware.SETTING_COLUMNS)
-    gain: NDArray  # (N, gains.COLUMNS)
-    calibration: NDArray  # (N, observer.CALIBRATION)
-    setpoint: NDArray  # (N, firmware.SETPOINT_COLUMNS)
-    set_tick: NDArray  # int64 (N,), when the setpoint was sent
-    memory: NDArray  # (N, firmware.MEMORY_COLUMNS)
-    belief: NDArray  # (N, observer.COLUMNS)
-    device: NDArray  # (N, observer.REGISTERS)
-
-
-class Noise(NamedTuple):
-    """Standard normal numbers, a row per drone; the last row holds the wind that all share."""
-
-    table: NDArray  # (N + 1, all streams)
-    at: NDArray  # int64 (7,), where each stream begins in a row
-    cursor: NDArray  # int64 (N + 1, 7), how much of each stream is used
-
-
-class Senses(NamedTuple):
-    """N sets of six sensors, and the log of what they sampled in a gate."""
-
-    place: NDArray  # (4,), as above
-    config: NDArray  # (N, 6, sensor_set.COLUMNS)
-    schedule: NDArray  # int64 (N, 6, 4)
-    bias: NDArray  # (N, 6, 6)
-    index: NDArray  # int64 (samples, 3): sensor, drone, tick
-    value: NDArray  # (samples, 6)
-
-
-class Arrays(NamedTuple):
-    """All that a fleet is."""
-
-    time: Time
-    bodies: Bodies
-    boards: Boards
-    noise: Noise
-    senses: Senses
-    wind: NDArray  # (wind.COLUMNS,)
-    gust: NDArray  # (N, 3), m/s
 
 
 @compiled
@@ -276,7 +226,7 @@ def _sense(tick: int, step: bool, logged: int, bodies: Bodies, device: NDArray, 
                 if kept:
                     _register(device[i], s, value)
                 if _due(senses.schedule[i, s], tick) and kept:
-                    put_index(senses.index[logged], s, i, tick)
+                    _note(senses.whose[logged], s, i, tick)
                     logged += 1
                 if s == ss.IMU:
                     break
@@ -284,7 +234,7 @@ def _sense(tick: int, step: bool, logged: int, bodies: Bodies, device: NDArray, 
 
 
 @compiled
-def put_index(row: NDArray, s: int, i: int, tick: int) -> None:
+def _note(row: NDArray, s: int, i: int, tick: int) -> None:
     """Note whose sample it is."""
     row[0], row[1], row[2] = s, i, tick
 

@@ -6,11 +6,13 @@ The anchor stays still within a step and moves after it, so that a step is a smo
 
 import math
 
-from zsim_world.compiled import compiled
 from numpy.typing import NDArray
 
+from zsim_world.compiled import compiled
 from zsim_world.rotation import Quaternion, Vector, add, cross, rotate, rotate_back
 from zsim_world.vehicle import CONTACT_POINTS_B, CONTACT_REACH_M, FOOT_DAMPING, FOOT_STIFFNESS, FRICTION
+
+Pair = tuple[float, float]
 
 
 @compiled
@@ -19,7 +21,7 @@ def _point(k: int) -> Vector:
 
 
 @compiled
-def _tangential(row: NDArray, normal: float, gap: tuple[float, float], speed: tuple[float, float]) -> tuple[float, float]:
+def _tangential(row: NDArray, normal: float, gap: Pair, speed: Pair) -> Pair:
     """Return the friction force [N] of one point, within the cone."""
     fx = -row[FOOT_STIFFNESS] * gap[0] - row[FOOT_DAMPING] * speed[0]
     fy = -row[FOOT_STIFFNESS] * gap[1] - row[FOOT_DAMPING] * speed[1]

@@ -76,4 +76,3 @@ def samples_per_gate(scenario: Scenario) -> int:
         for drone in scenario.drones
         for name in SENSORS
     )
-

@@ -6,13 +6,13 @@ accelerometer for gravity: in flight a multirotor's specific force lies along it
 
 import math
 
-from zsim_world.compiled import compiled
 from numpy.typing import NDArray
 
 from zsim_world import gains as g
 from zsim_world import rotation as rot
+from zsim_world.compiled import compiled
 from zsim_world.rigid_body import four, put, put_four, vector
-from zsim_world.rotation import Quaternion, Vector, axpy, cross
+from zsim_world.rotation import Quaternion, Vector, axpy
 from zsim_world.rotors import lagged
 from zsim_world.vehicle import DRAG, GRAVITY, MASS, ROTOR_LAG, STAND_HEIGHT_M, THRUST
 
@@ -35,7 +35,7 @@ REGISTERS = 20
 IMU_TURN, MAG_TURN, MAG_BEARING, SONAR_MIN = 0, 4, 8, 9  # q_BS, q_BS, heading of the horizontal field [rad], m
 CALIBRATION = 10
 
-STILL_STEPS_MIN = 50.0  # what it is worth to know that a floor is level to 0.05 rad, at an accelerometer noise of 0.35 g
+STILL_STEPS_MIN = 50.0  # what knowing a floor to be level to 0.05 rad is worth, at an accelerometer noise of 0.35 g
 STILL_STEPS_SWAY = 400.0  # the gyro's bias is averaged slower: in a wind a standing drone sways on its feet
 STILL_STEPS_MAX = 4000.0  # 20 s: the bias walks on, so older samples tell less
 FLOW_QUALITY_MIN = 0.3  # below, the picture shows more horizon than ground

@@ -154,7 +154,13 @@ class WorldProcess:
         if wall_ns - self._clock_wall_ns >= CLOCK_STANDING_NS:
             self._world.tell_clock(self._world.waiting_for(wall_ns))
             self._flush()
-        self._inputs.wait(None)
+        self._inputs.wait_for(self._owed_dones())
+
+    def _owed_dones(self) -> set[str]:
+        """Return the keys of the dones without which the world cannot go on."""
+        if self._world.state != "running" or self._world.mode == "realtime":
+            return set()
+        return {keys.process(p.name, "done") for p in self._world.owing()}
 
     def _say_goodbye(self) -> None:
         """Publish the end, then wait until every participant that lives has said bye."""
@@ -274,19 +280,26 @@ class WorldProcess:
     # Publication
 
     def _flush(self) -> None:
-        for output in self._world.take_outbox():
-            self._publish(output)
+        """Publish the outbox: encoded first and put in one go, so that the transport sends it in few packets."""
+        outbox = self._world.take_outbox()
+        if not outbox:
+            return
+        encoded = [(key, messages.encode(message)) for key, message in outbox]
+        self._link.put_all(encoded)
+        for key, payload in encoded:
+            self._history.add(key, payload, self._world.now_ns)
+        for key, message in outbox:
+            if key == keys.CLOCK:
+                self._clock_wall_ns = time.monotonic_ns()
+                self._tell("clock", message, self._phase)
+            elif key == keys.EVENT:
+                self._tell("event", message, self._phase)
 
     def _publish(self, output: Output) -> None:
-        key, message = output
-        payload = messages.encode(message)
-        self._history.add(key, payload, self._world.now_ns)
-        self._link.put_raw(key, payload)
-        if key == keys.CLOCK:
-            self._clock_wall_ns = time.monotonic_ns()
-            self._tell("clock", message, self._phase)
-        elif key == keys.EVENT:
-            self._tell("event", message, self._phase)
+        """Publish one message beside the outbox."""
+        payload = messages.encode(output.message)
+        self._history.add(output.key, payload, self._world.now_ns)
+        self._link.put_raw(output.key, payload)
 
     def _publish_view(self, wall_ns: int) -> None:
         if wall_ns - self._view_wall_ns < VIEW_PERIOD_NS:
@@ -302,6 +315,10 @@ class _Inputs:
 
     def wait(self, timeout_s: float | None) -> None:
         raise NotImplementedError
+
+    def wait_for(self, wanted: set[str]) -> None:
+        """Wait until something has come on each of the wanted keys, or anything that is not a done."""
+        self.wait(None)
 
     def drain(self) -> Iterator[tuple[int, Sample]]:
         raise NotImplementedError
@@ -327,6 +344,16 @@ class _Direct(_Inputs):
         sample = self._boxes[-1].receive()
         if sample is not None:
             self._first.append(sample)
+
+    def wait_for(self, wanted: set[str]) -> None:
+        while True:
+            sample = self._boxes[-1].receive()
+            if sample is None:
+                return
+            self._first.append(sample)
+            wanted.discard(sample.key)
+            if not wanted or not sample.key.endswith("/done"):
+                return
 
     def drain(self) -> Iterator[tuple[int, Sample]]:
         last, self._first = [*self._first, *self._boxes[-1].drain()], []

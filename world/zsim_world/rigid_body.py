@@ -2,12 +2,12 @@
 
 import math
 
-from zsim_world.compiled import compiled
 from numpy.typing import NDArray
 
 from zsim_world import rotation as rot
+from zsim_world.compiled import compiled
 from zsim_world.ground import contact
-from zsim_world.rotation import Quaternion, Vector, add, axpy, cross
+from zsim_world.rotation import Quaternion, Vector, add, axpy
 from zsim_world.rotors import Four, lagged, wrench
 from zsim_world.vehicle import DRAG, GRAVITY, INERTIA_X, INERTIA_Y, INERTIA_Z, MASS, ROTOR_LAG
 

@@ -2,9 +2,9 @@
 
 import math
 
-from zsim_world.compiled import compiled
 from numpy.typing import NDArray
 
+from zsim_world.compiled import compiled
 from zsim_world.rotation import Quaternion, Vector, rotate
 from zsim_world.vehicle import (
     ROTOR_INERTIA_KG_M2,

@@ -2,6 +2,7 @@
 
 import math
 from fractions import Fraction
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,8 @@ from scipy.special import ndtri
 from zsim.frames import quaternion_from_rpy
 from zsim.scenario import ErrorModel, Mag, Scenario, Sensor, Sensors
 
-SENSORS = ("imu", "gps", "mag", "baro", "sonar", "flow")  # the contract's order
+SensorName = Literal["imu", "gps", "mag", "baro", "sonar", "flow"]
+SENSORS: tuple[SensorName, ...] = ("imu", "gps", "mag", "baro", "sonar", "flow")  # the contract's order
 IMU, GPS, MAG, BARO, SONAR, FLOW = range(6)
 CHANNELS = (6, 6, 3, 1, 1, 3)  # numbers with an error of their own
 VALUES = (6, 6, 3, 2, 2, 4)  # numbers of a sample as the kernel gives it (pressure, validity, quality added)

@@ -6,7 +6,6 @@ A sensor stands at p_BS in the body and is turned by R_BS (q_BS: sensor componen
 import math
 
 from zsim_world.compiled import compiled
-
 from zsim_world.rotation import Quaternion, Vector, add, cross, heading, rotate, rotate_back, z_axis
 
 SEA_LEVEL_PA = 101_325.0  # Pa, ISO 2533
@@ -38,9 +37,7 @@ def imu(
 
 
 @compiled
-def gps(
-    p_WB: Vector, v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector, p_BS: Vector
-) -> tuple[Vector, Vector]:
+def gps(p_WB: Vector, v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector, p_BS: Vector) -> tuple[Vector, Vector]:
     """Return position [m] and velocity [m/s] of the antenna in W."""
     return add(p_WB, rotate(q_WB, p_BS)), point_velocity(v_WB, q_WB, w_WB_B, p_BS)
 
@@ -64,9 +61,7 @@ def pressure(altitude_m: float) -> float:
 
 
 @compiled
-def sonar(
-    p_WB: Vector, q_WB: Quaternion, p_BS: Vector, q_BS: Quaternion, range_max: float
-) -> tuple[float, bool]:
+def sonar(p_WB: Vector, q_WB: Quaternion, p_BS: Vector, q_BS: Quaternion, range_max: float) -> tuple[float, bool]:
     """Return the distance [m] to the ground along -z of the sensor, and whether there is an echo.
 
     Without an echo (beyond range_max, or the beam too far from the vertical) the distance is range_max.

@@ -8,7 +8,7 @@ from zsim.frames import quaternion_from_heading, quaternion_from_rpy
 from zsim.scenario import Drone, Scenario
 from zsim_world import firmware, gains, observer, rigid_body, sensor_set, vehicle
 from zsim_world import wind as wind_model
-from zsim_world.gate import Arrays, Boards, Bodies, Noise, Senses, Time
+from zsim_world.arrays import Arrays, Boards, Bodies, Noise, Senses, Time
 from zsim_world.noise import NoiseTable, samples_per_gate
 
 
@@ -45,7 +45,7 @@ def arrays(scenario: Scenario, noise: NoiseTable) -> Arrays:
         config=sensor_set.config(scenario),
         schedule=sensor_set.schedule(scenario),
         bias=noise.bias,
-        index=np.zeros((log, 3), dtype=np.int64),
+        whose=np.zeros((log, 3), dtype=np.int64),
         value=np.zeros((log, 6)),
     )
     time = Time(

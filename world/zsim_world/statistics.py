@@ -13,14 +13,12 @@ class Ages:
 
     def __init__(self) -> None:
         self._published: dict[int, int] = {}
-        self._order: deque[int] = deque()
         self._ages_ns: deque[int] = deque(maxlen=AGES_KEPT)
 
     def published(self, t_ns: int, wall_ns: int) -> None:
         self._published[t_ns] = wall_ns
-        self._order.append(t_ns)
-        if len(self._order) > GATES_KEPT:
-            del self._published[self._order.popleft()]
+        if len(self._published) > GATES_KEPT:
+            del self._published[next(iter(self._published))]
 
     def arrived(self, t_ns: int, wall_ns: int) -> None:
         published = self._published.get(t_ns)

@@ -2,9 +2,9 @@
 
 import math
 
-from zsim_world.compiled import compiled
 from numpy.typing import NDArray
 
+from zsim_world.compiled import compiled
 from zsim_world.rotation import Vector
 
 # Columns of the one row of wind parameters

@@ -12,7 +12,7 @@ from zsim import CONTRACT, __version__, keys, messages, scenario_file
 from zsim.agent import Output
 from zsim.fingerprint import fingerprint
 from zsim.scenario import OnDeath, Scenario
-from zsim_world.barrier import Barrier
+from zsim_world.barrier import Barrier, Participant
 from zsim_world.command_desk import CommandDesk
 from zsim_world.commander import Commanders
 from zsim_world.fleet import Fleet
@@ -239,6 +239,10 @@ class World:
         if self.state == "paused" and self.steps_allowed == 0:
             return False
         return self.mode == "realtime" or not self.barrier.blocking(self.now_ns - self.delay_ns)
+
+    def owing(self) -> list[Participant]:
+        """Return who owes a done without which the world cannot go on."""
+        return self.barrier.blocking(self.now_ns - self.delay_ns)
 
     def waiting_for(self, wall_ns: int) -> tuple[messages.Waiting, ...]:
         """Return whom the world waits for now."""

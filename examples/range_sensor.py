@@ -1,0 +1,96 @@
+"""A sensor of one's own beside the world: ranges between two drones from their truth, with noise, in lockstep.
+
+    zsim run scenarios/step.yaml --set 'processes.expect=[range.drone1]' --duration 60
+    python examples/range_sensor.py tcp/127.0.0.1:7447
+
+Publishes `drone/drone1/range/drone2` five times a simulated second. The key is none of the contract's: nothing of zsim
+reads it besides `zsim echo` and the recorder, and `sent` counts only commands, estimates and cluster states.
+"""
+
+import math
+import os
+import random
+import sys
+import time
+from queue import SimpleQueue
+from typing import Any
+
+import msgpack
+import zenoh
+
+ENDPOINT = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"
+ME, PAIR = "range.drone1", ("drone1", "drone2")
+PERIOD_NS, SIGMA_M = 200_000_000, 0.1
+
+
+def measure(truths: dict[str, dict[str, Any]], rng: random.Random) -> float:
+    """Return the distance of the pair with white noise [m]."""
+    here, there = (truths[drone]["position_m"] for drone in PAIR)
+    return math.dist(here, there) + rng.gauss(0.0, SIGMA_M)
+
+
+class RangeSensor:
+    """Reads the truth of a pair, and says done for every gate once the range of that gate is out."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._seq: dict[str, int] = {}
+        info = world_info(session)
+        self._rng = random.Random(f"{info['seed']}/{ME}")  # a stream of its own: same seed, same noise
+        self._run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
+        self._inbox: SimpleQueue[zenoh.Sample] = SimpleQueue()
+        expressions = [*(f"zsim/drone/{drone}/truth" for drone in PAIR), "zsim/clock"]
+        self._kept = [session.declare_subscriber(e, self._inbox.put) for e in expressions]
+        self._token = session.liveliness().declare_token(f"zsim/process/{ME}")
+        about = {"role": "range", "host": "here", "pid": os.getpid(), "period_ns": info["gate_ns"]}
+        self._put(f"zsim/process/{ME}/join", t_ns=0, **self._run, **about)
+
+    def _put(self, key: str, **fields: Any) -> None:
+        self._seq[key] = self._seq.get(key, -1) + 1
+        self._session.put(key, msgpack.packb({"seq": self._seq[key], **fields}))
+
+    def run(self) -> int:
+        """Return how many ranges it measured."""
+        truths: dict[str, dict[str, Any]] = {}
+        while True:
+            sample = self._inbox.get()
+            key, m = str(sample.key_expr), msgpack.unpackb(sample.payload.to_bytes())
+            if key.endswith("/truth"):
+                truths[key.split("/")[2]] = m
+                if len(truths) == len(PAIR):
+                    self._answer(m["t_ns"], truths)
+                    truths = {}
+            elif m["state"] == "stopped":
+                self._put(f"zsim/process/{ME}/bye", t_ns=m["t_ns"], reason="the run ended")
+                return self._seq.get(self._key(), -1) + 1
+
+    def _answer(self, t_ns: int, truths: dict[str, dict[str, Any]]) -> None:
+        if t_ns % PERIOD_NS == 0:
+            self._put(self._key(), t_ns=t_ns, t_sample_ns=t_ns, range_m=measure(truths, self._rng))
+        self._put(f"zsim/process/{ME}/done", t_ns=t_ns, **self._run, done_ns=t_ns, sent=0)
+
+    @staticmethod
+    def _key() -> str:
+        return f"zsim/drone/{PAIR[0]}/range/{PAIR[1]}"
+
+
+def world_info(session: zenoh.Session) -> dict[str, Any]:
+    """Return `world/info`; wait for a world that listens already but does not answer yet."""
+    while True:
+        for reply in session.get("zsim/world/info", timeout=1.0):
+            if reply.ok is not None:
+                return msgpack.unpackb(reply.ok.payload.to_bytes())
+        time.sleep(0.1)
+
+
+def main() -> None:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", f'["{ENDPOINT}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as session:
+        print(f"measured {RangeSensor(session).run()} ranges")
+
+
+if __name__ == "__main__":
+    main()

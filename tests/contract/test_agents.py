@@ -1,0 +1,455 @@
+"""The same rules for every agent: an agent is tested by adding it to AGENTS.
+
+The inputs are synthetic: drones that stand, take off when they are asked to, and hover, seen by noisy sensors.
+"""
+
+import random
+from collections import defaultdict
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from msgspec import Struct
+
+from zsim import keys, messages, scenario_file
+from zsim.agent import Agent, Output
+from zsim.errors import RunError
+from zsim.inbox import Inbox
+from zsim.messages import ControlAnswer, ControlRequest, Info
+from zsim.scenario import Scenario
+from zsim_agents.controller import Controller
+from zsim_agents.estimator import Estimator
+
+STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
+GATE_NS = 20_000_000
+IMU_NS = 5_000_000  # 200 Hz
+GATES = 150
+TAKEOFF_S = 0.5
+AIRBORNE_S = 1.0  # in the synthetic flight, when the drones have got to their height
+HEIGHT_M = 2.0
+GRAVITY_M_S2 = 9.80665
+
+Said = list[tuple[str, Any]]
+Make = Callable[[Info, Scenario], Agent]
+
+AGENTS: dict[str, Make] = {
+    "estimator.drone1": lambda info, scenario: Estimator(info, scenario, "drone1"),
+    "estimator.drone3": lambda info, scenario: Estimator(info, scenario, "drone3"),
+    "controller.main": lambda info, scenario: Controller(info, scenario, "main"),
+}
+MAY_WRITE = {
+    "estimator": ("drone/{thing}/estimate",),
+    "controller": (
+        "cluster/{thing}/state",
+        "view/cluster/{thing}",
+        "drone/{drone}/cmd/velocity",
+        "drone/{drone}/cmd/mode",
+    ),
+}
+every_agent = pytest.mark.parametrize("name", sorted(AGENTS))
+
+
+@cache
+def scenario() -> Scenario:
+    return scenario_file.load(STEP, [f"clusters.main.plan.takeoff_s={TAKEOFF_S}"])
+
+
+def info() -> Info:
+    """Return what a world would say of itself, its text included."""
+    it = scenario()
+    return Info(
+        t_ns=0,
+        seq=0,
+        contract=1,
+        run_id="run1",
+        federation=it.federation,
+        mode="lockstep",
+        rate=0.0,
+        gate_ns=GATE_NS,
+        physics_dt_ns=2_500_000,
+        command_delay_ns=GATE_NS,
+        seed=1,
+        origin=messages.Origin(-34.603, -58.368, 25.0),
+        drones=tuple(messages.DroneInfo(drone.name, drone.model) for drone in it.drones),
+        clusters=tuple(messages.ClusterInfo(cluster.name, tuple(cluster.drones)) for cluster in it.clusters),
+        scenario=scenario_file.to_text(it),
+        scenario_sha256=scenario_file.sha256(it),
+        version="0.1.0",
+        fingerprint="f00d",
+    )
+
+
+def make(name: str) -> Agent:
+    agent = AGENTS[name](info(), scenario_file.from_text(info().scenario))
+    assert agent.name == name
+    return agent
+
+
+# The synthetic flight
+
+
+class Flight:
+    """Says, gate by gate, what a world and the estimators say."""
+
+    def __init__(self) -> None:
+        self._rng = np.random.default_rng(1)
+        self._seq: defaultdict[str, int] = defaultdict(int)
+
+    def gate(self, gate: int) -> Said:
+        said: Said = []
+        for drone in scenario().drones:
+            mine = list(self._sensors(drone.name, gate, drone.position_m))
+            mine.append(self._status(drone.name, gate, len(mine) + 1))
+            said += [*mine, self._estimate(drone.name, gate, drone.position_m)]
+        return said
+
+    def _next(self, key: str) -> int:
+        self._seq[key] += 1
+        return self._seq[key] - 1
+
+    def _noise(self, sigma: float) -> tuple[float, float, float]:
+        x, y, z = self._rng.normal(0.0, sigma, 3).tolist()
+        return (x, y, z)
+
+    def _sensors(self, drone: str, gate: int, start_m: tuple[float, float, float]) -> Said:
+        t_ns = gate * GATE_NS
+        said = [self._imu(drone, at) for at in range(t_ns - GATE_NS + IMU_NS, t_ns + 1, IMU_NS) if at >= 0]
+        z = self._height_m(t_ns)
+        if gate % 2 == 0:
+            said += [self._mag(drone, t_ns), self._baro(drone, t_ns, z), self._sonar(drone, t_ns, z)]
+        if gate % 3 == 0:
+            said.append(self._flow(drone, t_ns))
+        if gate % 10 == 0:
+            said.append(self._gps(drone, t_ns, (start_m[0], start_m[1], z)))
+        return said
+
+    def _height_m(self, t_ns: int) -> float:
+        return HEIGHT_M * min(1.0, max(0.0, (t_ns * 1e-9 - TAKEOFF_S) / (AIRBORNE_S - TAKEOFF_S)))
+
+    def _imu(self, drone: str, t_ns: int) -> tuple[str, Any]:
+        key = keys.sensor(drone, "imu")
+        x, y, z = self._noise(0.1)
+        return key, messages.Imu(t_ns, self._next(key), t_ns, (x, y, z + GRAVITY_M_S2), self._noise(0.001))
+
+    def _mag(self, drone: str, t_ns: int) -> tuple[str, Any]:
+        key = keys.sensor(drone, "mag")
+        x, y, z = self._noise(0.3)
+        return key, messages.Mag(t_ns, self._next(key), t_ns, (17.8 + x, 2.8 + y, 14.0 + z))
+
+    def _baro(self, drone: str, t_ns: int, z_m: float) -> tuple[str, Any]:
+        key = keys.sensor(drone, "baro")
+        return key, messages.Baro(t_ns, self._next(key), t_ns, 101_000.0, z_m + self._noise(0.1)[0])
+
+    def _sonar(self, drone: str, t_ns: int, z_m: float) -> tuple[str, Any]:
+        key = keys.sensor(drone, "sonar")
+        return key, messages.Sonar(t_ns, self._next(key), t_ns, z_m, z_m > 0.03)
+
+    def _flow(self, drone: str, t_ns: int) -> tuple[str, Any]:
+        key = keys.sensor(drone, "flow")
+        return key, messages.Flow(t_ns, self._next(key), t_ns, self._noise(0.1), 1.0)
+
+    def _gps(self, drone: str, t_ns: int, p_m: tuple[float, float, float]) -> tuple[str, Any]:
+        key = keys.sensor(drone, "gps")
+        x, y, z = self._noise(0.5)
+        found = (p_m[0] + x, p_m[1] + y, p_m[2] + z)
+        velocity = self._noise(0.1)
+        seq = self._next(key)
+        return key, messages.Gps(t_ns, seq, t_ns, -34.603, -58.368, 25.0 + found[2], found, velocity, 0.5, 3, 9)
+
+    def _status(self, drone: str, gate: int, count: int) -> tuple[str, Any]:
+        t_s = gate * GATE_NS * 1e-9
+        state = "landed" if t_s < TAKEOFF_S else "taking_off" if t_s < AIRBORNE_S else "flying"
+        key = keys.status(drone)
+        return key, messages.Status(gate * GATE_NS, self._next(key), state, 90.0, False, None, count)
+
+    def _estimate(self, drone: str, gate: int, start_m: tuple[float, float, float]) -> tuple[str, Any]:
+        t_ns, key = gate * GATE_NS, keys.estimate(drone)
+        x, y, z = self._noise(0.02)
+        position = (start_m[0] + x, start_m[1] + y, self._height_m(t_ns) + z)
+        yaw = float(np.pi / 2 + self._noise(0.01)[0])
+        turn = (float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2)))
+        covariance = tuple((0.01 * np.eye(6)).ravel().tolist())
+        seq = self._next(key)
+        return key, messages.Estimate(
+            t_ns,
+            seq,
+            position,
+            self._noise(0.02),
+            turn,
+            yaw,
+            covariance,
+            0.02,
+            (0.0, 0.0, 0.0),
+            {"gps": (1, 0)},
+        )
+
+
+@cache
+def flight() -> tuple[tuple[tuple[str, Any], ...], ...]:
+    said = Flight()
+    return tuple(tuple(said.gate(gate)) for gate in range(GATES))
+
+
+def inputs(agent: Agent) -> list[Said]:
+    """Return, by gate, what the agent reads of the flight."""
+    return [[(key, m) for key, m in gate if any(keys.matches(e, key) for e in agent.reads)] for gate in flight()]
+
+
+def run(agent: Agent, gates: list[Said]) -> list[tuple[int, list[Output]]]:
+    """Drive an agent as the runners do; return its outputs by gate."""
+    inbox = Inbox(agent.gate_keys, agent.counted)
+    outputs = []
+    for said in gates:
+        for key, message in said:
+            assert inbox.put(key, message)
+        while (t_ns := inbox.next_gate_ns()) is not None and inbox.missing(t_ns) is None:
+            for key, message in inbox.take(t_ns):
+                agent.receive(key, message)
+            if t_ns % agent.period_ns == 0:
+                outputs.append((t_ns, list(agent.step(t_ns))))
+    return outputs
+
+
+@cache
+def flown(name: str) -> list[tuple[int, list[Output]]]:
+    agent = make(name)
+    return run(agent, inputs(agent))
+
+
+def wire(outputs: list[tuple[int, list[Output]]]) -> list[tuple[int, str, bytes]]:
+    return [(t_ns, key, messages.encode(message)) for t_ns, gate in outputs for key, message in gate]
+
+
+# What it says of itself
+
+
+@every_agent
+def test_its_name_is_role_and_thing(name: str):
+    agent = make(name)
+    role, dot, thing = agent.name.partition(".")
+    assert (dot, agent.role) == (".", role)
+    assert keys.name(agent.name) == name
+    assert thing in {drone.name for drone in scenario().drones} | {cluster.name for cluster in scenario().clusters}
+
+
+@every_agent
+def test_its_period_is_a_multiple_of_the_gate(name: str):
+    period_ns = make(name).period_ns
+    assert period_ns > 0
+    assert period_ns % GATE_NS == 0
+
+
+@every_agent
+def test_it_reads_what_closes_its_gates(name: str):
+    agent = make(name)
+    assert agent.gate_keys
+    for key in agent.gate_keys:
+        assert any(keys.matches(expression, key) for expression in agent.reads)
+
+
+@every_agent
+def test_it_reads_all_that_is_counted_for_it(name: str):
+    agent = make(name)
+    for drone in agent.counted:
+        assert keys.status(drone) in agent.gate_keys
+        for kind in keys.SENSORS:
+            assert any(keys.matches(expression, keys.sensor(drone, kind)) for expression in agent.reads)
+
+
+@every_agent
+def test_it_never_reads_the_truth(name: str):
+    agent = make(name)
+    truths = [keys.truth(drone.name) for drone in scenario().drones]
+    assert not [e for e in agent.reads for key in [*truths, keys.VIEW_DRONES] if keys.matches(e, key)]
+
+
+# What it does
+
+
+@every_agent
+def test_it_answers_every_gate_of_its_period(name: str):
+    assert [t_ns for t_ns, _ in flown(name)] == list(range(0, GATES * GATE_NS, make(name).period_ns))
+
+
+@every_agent
+def test_it_writes_only_where_it_may(name: str):
+    role, _, thing = name.partition(".")
+    drones = [thing] if role == "estimator" else scenario().cluster(thing).drones
+    allowed = {key.format(thing=thing, drone=drone) for key in MAY_WRITE[role] for drone in drones}
+    written = {key for _, gate in flown(name) for key, _ in gate}
+    assert written <= allowed
+    assert written
+
+
+def test_the_flight_makes_the_controller_say_all_that_it_can():
+    """Else the rules above would hold of messages that never came."""
+    written = {keys.leaf(key) for _, gate in flown("controller.main") for key, _ in gate}
+    assert written == {"state", "velocity", "mode", "main"}
+
+
+@every_agent
+def test_its_outputs_bear_the_time_of_the_gate(name: str):
+    for t_ns, gate in flown(name):
+        assert {message.t_ns for _, message in gate} == {t_ns}  # type: ignore[attr-defined]
+
+
+@every_agent
+def test_its_numbers_have_no_gaps(name: str):
+    numbers: defaultdict[str, list[int]] = defaultdict(list)
+    for _, gate in flown(name):
+        for key, message in gate:
+            numbers[key].append(message.seq)  # type: ignore[attr-defined]
+    for found in numbers.values():
+        assert found == list(range(len(found)))
+
+
+@every_agent
+def test_its_outputs_are_what_their_keys_say_and_survive_the_wire(name: str):
+    for _, gate in flown(name):
+        for key, message in gate:
+            assert type(message) is messages.type_of(key)
+            assert messages.decode(key, messages.encode(message)) == message
+
+
+@every_agent
+def test_its_outputs_name_it_as_their_source(name: str):
+    for _, gate in flown(name):
+        assert {getattr(message, "source", name) for _, message in gate} == {name}
+
+
+# The same bits
+
+
+@every_agent
+def test_the_same_inputs_give_the_same_bits(name: str):
+    agent = make(name)
+    assert wire(run(agent, inputs(agent))) == wire(flown(name))
+
+
+@every_agent
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_order_of_arrival_changes_no_bit(name: str, seed: int):
+    """Shuffled within each gate; the inbox puts it right."""
+    agent, rng = make(name), random.Random(seed)
+    gates = inputs(agent)
+    for said in gates:
+        rng.shuffle(said)
+    assert wire(run(agent, gates)) == wire(flown(name))
+
+
+@every_agent
+def test_inputs_off_the_wire_give_the_same_bits(name: str):
+    agent = make(name)
+    gates = [[(key, _again(key, message)) for key, message in said] for said in inputs(agent)]
+    assert wire(run(agent, gates)) == wire(flown(name))
+
+
+def _again(key: str, message: Struct) -> Any:
+    return messages.decode(key, messages.encode(message))
+
+
+@every_agent
+def test_two_agents_of_one_process_do_not_touch_each_other(name: str):
+    first, second = make(name), make(name)
+    gates = inputs(first)
+    both: list[list[tuple[int, list[Output]]]] = [[], []]
+    inboxes = [Inbox(agent.gate_keys, agent.counted) for agent in (first, second)]
+    for said in gates:
+        for agent, inbox, outputs in zip((first, second), inboxes, both, strict=True):
+            for key, message in said:
+                inbox.put(key, message)
+            t_ns = said[-1][1].t_ns
+            for key, message in inbox.take(t_ns):
+                agent.receive(key, message)
+            outputs.append((t_ns, list(agent.step(t_ns))))
+    assert wire(both[0]) == wire(both[1])
+
+
+# Restart
+
+
+@every_agent
+def test_a_new_incarnation_goes_on_from_what_was_said_last(name: str):
+    """As the runner does it: last values, then what was missed; numbers go on, and so does the estimate or phase."""
+    former, agent = make(name), make(name)
+    gates = inputs(former)
+    before = run(former, gates[: GATES - 20])
+    last = {key: message for _, gate in before for key, message in gate}
+    assert agent.warm_start_keys()
+    for key in agent.warm_start_keys():
+        agent.warm_start(key, last[key])
+        agent.resume_seq(key, last[key].seq)  # type: ignore[attr-defined]
+    after = run(agent, gates[GATES - 20 :])
+    assert len(after) == 20
+    for key in agent.warm_start_keys():
+        numbers = [m.seq for _, gate in after for k, m in gate if k == key]  # type: ignore[attr-defined]
+        first = last[key].seq + 1  # type: ignore[attr-defined]
+        assert numbers == list(range(first, first + len(numbers)))
+    for _, gate in after:
+        for key, message in gate:
+            assert messages.decode(key, messages.encode(message)) == message
+
+
+def test_a_restarted_estimator_stays_where_it_was():
+    former, agent = make("estimator.drone1"), make("estimator.drone1")
+    gates = inputs(former)
+    ((_, ((key, last),)),) = run(former, gates)[-21:-20]
+    agent.warm_start(key, last)
+    ((_, ((_, first),)), *_) = run(agent, gates[GATES - 20 :])
+    jump = np.subtract(first.position_m, last.position_m)  # type: ignore[attr-defined]
+    assert np.abs(jump).max() < 0.1  # m, what a gate of sensors moves an estimate by
+
+
+# Requests
+
+
+@every_agent
+@pytest.mark.parametrize(
+    "request_",
+    [
+        ControlRequest("no-such-thing"),
+        ControlRequest(""),
+        ControlRequest("target", {"values": 5}),
+        ControlRequest("target", {"values": {"z_c": "high"}}),
+        ControlRequest("trajectory", {"expressions": {"z_c": "__import__('os')"}}),
+        ControlRequest("takeoff", {"unknown": 1}),
+        ControlRequest("x" * 10_000, {"y" * 10_000: [[]]}),
+    ],
+    ids=lambda request: request.op[:12] or "empty",
+)
+def test_a_request_that_makes_no_sense_is_refused_in_a_line(name: str, request_: ControlRequest):
+    agent = make(name)
+    for key in agent.control_keys() or ("nothing",):
+        answer = agent.control(key, request_)
+        assert isinstance(answer, ControlAnswer)
+        assert not answer.ok
+        assert answer.error.isprintable()
+        assert 0 < len(answer.error) < 500
+        assert messages.decode_as(ControlAnswer, messages.encode(answer), key) == answer
+
+
+@every_agent
+def test_a_refused_request_changes_no_bit(name: str):
+    agent = make(name)
+    gates = inputs(agent)
+    outputs = []
+    inbox = Inbox(agent.gate_keys, agent.counted)
+    for said in gates:
+        for key in agent.control_keys():
+            agent.control(key, ControlRequest("target", {"values": {"no_such_variable": 1.0}}))
+        for key, message in said:
+            inbox.put(key, message)
+        t_ns = said[-1][1].t_ns
+        for key, message in inbox.take(t_ns):
+            agent.receive(key, message)
+        outputs.append((t_ns, list(agent.step(t_ns))))
+    assert wire(outputs) == wire(flown(name))
+
+
+@pytest.mark.parametrize("kind", [Estimator, Controller])
+def test_a_thing_that_is_not_in_the_scenario_is_refused(kind: Callable[..., Agent]):
+    with pytest.raises(RunError, match=r"is 'nobody'; must be one of"):
+        kind(info(), scenario(), "nobody")

@@ -1,0 +1,555 @@
+"""The same rules for every message: names, identity, and the refusal of whatever is not the message.
+
+The table CONTRACT is the contract's own, written down here a second time: a field that is renamed or dropped in the
+code fails against it.
+"""
+
+import copy
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import msgpack
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec import inspect as types
+
+from zsim import messages
+from zsim.errors import DecodeError
+
+# Fields besides t_ns and seq, in the contract's order.
+SENSOR = "t_sample_ns "
+CONTRACT = {
+    "world/info": "contract run_id federation mode rate gate_ns physics_dt_ns command_delay_ns seed origin drones "
+    "clusters scenario scenario_sha256 version fingerprint",
+    "clock": "run_id step state rate waiting_for",
+    "world/event": "kind source subject text data",
+    "drone/*/sensor/imu": SENSOR + "accel_m_s2 gyro_rad_s",
+    "drone/*/sensor/gps": SENSOR
+    + "latitude_deg longitude_deg altitude_m position_m velocity_m_s sigma_m fix satellites",
+    "drone/*/sensor/mag": SENSOR + "field_ut",
+    "drone/*/sensor/baro": SENSOR + "pressure_pa altitude_m",
+    "drone/*/sensor/sonar": SENSOR + "range_m valid",
+    "drone/*/sensor/flow": SENSOR + "velocity_m_s quality",
+    "drone/*/sensor/status": "state battery_percent collision commander count",
+    "drone/*/truth": "position_m velocity_m_s orientation_wxyz angular_velocity_rad_s accel_m_s2 rotor_rad_s",
+    "drone/*/cmd/velocity": "source velocity_m_s yaw_rate_rad_s frame",
+    "drone/*/cmd/ardrone": "source forward left up yaw_left hover",
+    "drone/*/cmd/attitude": "source orientation_wxyz thrust_n yaw_rate_rad_s",
+    "drone/*/cmd/rotors": "source speed_rad_s",
+    "drone/*/cmd/mode": "source mode",
+    "drone/*/estimate": "position_m velocity_m_s orientation_wxyz yaw_rad covariance yaw_sigma_rad gyro_bias_rad_s "
+    "sensors",
+    "cluster/*/state": "phase drones names value desired desired_rate trajectory_t_s margin reason",
+    "process/*/join": "run_id incarnation role host pid period_ns version fingerprint",
+    "process/*/done": "run_id incarnation done_ns sent",
+    "process/*/bye": "reason",
+    "process/*/health": "role host pid step_us lag_ns dropped refused rss_bytes",
+    "view/drones": "",
+    "view/cluster/*": "",
+}
+NAMES = {
+    "world/info": "Info",
+    "clock": "Clock",
+    "drone/*/sensor/imu": "Imu",
+    "drone/*/cmd/velocity": "Velocity",
+    "drone/*/cmd/mode": "Mode",
+    "process/*/done": "Done",
+}
+LENGTHS = {"covariance": 36, "accel_m_s2": 3, "gyro_rad_s": 3, "orientation_wxyz": 4, "rotor_rad_s": 4}
+SHAPES = sorted(CONTRACT)
+FREE = {"data"}  # fields of free content
+
+every_message = pytest.mark.parametrize("shape", SHAPES)
+
+
+def key_of(shape: str) -> str:
+    return shape.replace("*", "drone1")
+
+
+def kind_of(shape: str) -> type[msgspec.Struct]:
+    kind = messages.type_of(key_of(shape))
+    assert kind is not None
+    return kind
+
+
+# Valid messages of every type, from the types themselves
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+text = st.text(max_size=12)
+free = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | finite | text | st.binary(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(text, inner, max_size=3),
+    max_leaves=8,
+)
+
+
+def values(info: Any) -> st.SearchStrategy[Any]:
+    """Return plain values (as msgpack gives them) that fit a type."""
+    if isinstance(info, types.Metadata):
+        return values(info.type)
+    if isinstance(info, types.StructType):
+        return maps(info)
+    if isinstance(info, types.UnionType):
+        return st.one_of([values(option) for option in info.types])
+    if isinstance(info, types.VarTupleType):
+        return st.lists(values(info.item_type), min_size=info.min_length or 0, max_size=info.max_length or 4)
+    if isinstance(info, types.TupleType):
+        return st.tuples(*[values(item) for item in info.item_types]).map(list)
+    if isinstance(info, types.DictType):
+        return st.dictionaries(values(info.key_type), values(info.value_type), max_size=3)
+    if isinstance(info, types.LiteralType):
+        return st.sampled_from(info.values)
+    if isinstance(info, types.IntType):
+        return st.integers(info.ge if info.ge is not None else -(2**63), 2**63 - 1)
+    return {
+        types.FloatType: finite,
+        types.StrType: text,
+        types.BoolType: st.booleans(),
+        types.NoneType: st.none(),
+        types.AnyType: free,
+    }[type(info)]
+
+
+def maps(info: types.StructType) -> st.SearchStrategy[dict[str, Any]]:
+    plain = st.fixed_dictionaries({field.encode_name: values(field.type) for field in info.fields})
+    return plain.map(_matched)
+
+
+def _matched(plain: dict[str, Any]) -> dict[str, Any]:
+    """Give lists that belong together the same length."""
+    if "desired_rate" in plain:
+        plain["drones"] = plain["drones"][:2]
+        for name in ("names", "value", "desired", "desired_rate"):
+            filler = ["x"] if name == "names" else [2.0]
+            plain[name] = (plain[name] + filler * 8)[: 4 * len(plain["drones"])]
+    elif "names" in plain:
+        count = min(len(plain[name]) for name in ("names", "value", "desired"))
+        for name in ("names", "value", "desired"):
+            plain[name] = plain[name][:count]
+    return plain
+
+
+def plain_messages(shape: str) -> st.SearchStrategy[dict[str, Any]]:
+    return values(types.type_info(kind_of(shape)))
+
+
+def example(shape: str) -> dict[str, Any]:
+    """Return one full message with no empty lists or maps."""
+    return _matched(_filled(types.type_info(kind_of(shape))))
+
+
+def _filled(info: Any) -> Any:
+    if isinstance(info, types.Metadata):
+        return _filled(info.type)
+    if isinstance(info, types.StructType):
+        return {field.encode_name: _filled(field.type) for field in info.fields}
+    if isinstance(info, types.UnionType):
+        return _filled(next(option for option in info.types if not isinstance(option, types.NoneType)))
+    if isinstance(info, types.VarTupleType):
+        return [_filled(info.item_type) for _ in range(info.min_length or 2)]
+    if isinstance(info, types.TupleType):
+        return [_filled(item) for item in info.item_types]
+    if isinstance(info, types.DictType):
+        return {"gps": _filled(info.value_type)}
+    if isinstance(info, types.LiteralType):
+        return info.values[0]
+    return {types.IntType: 7, types.FloatType: 2.0, types.StrType: "abc", types.BoolType: True}.get(type(info), 1)
+
+
+Path = tuple[Any, ...]
+
+
+def leaves(value: Any, path: Path = ()) -> Iterator[tuple[Path, Any]]:
+    """Yield the path and the value of every scalar of a plain message, free content left out."""
+    if path and path[0] in FREE:
+        return
+    if isinstance(value, dict | list):
+        for step, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from leaves(item, (*path, step))
+    else:
+        yield path, value
+
+
+def branches(value: Any, path: Path = ()) -> Iterator[tuple[Path, list[Any]]]:
+    """Yield the path and the value of every list of a plain message."""
+    if isinstance(value, list):
+        yield path, value
+    if isinstance(value, dict | list):
+        for step, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from branches(item, (*path, step))
+
+
+def replaced(plain: dict[str, Any], path: Path, value: Any) -> dict[str, Any]:
+    changed = copy.deepcopy(plain)
+    place: Any = changed
+    for step in path[:-1]:
+        place = place[step]
+    place[path[-1]] = value
+    return changed
+
+
+def refusal(shape: str, payload: bytes) -> str:
+    with pytest.raises(DecodeError) as caught:
+        messages.decode(key_of(shape), payload)
+    return str(caught.value)
+
+
+def assert_names(said: str, shape: str, field: str) -> None:
+    """Check that a refusal is one line that names key, field, found and allowed."""
+    assert said.startswith(f"{key_of(shape)}: "), said
+    assert field in said, said
+    assert "must" in said, said
+    assert said.isprintable(), said
+
+
+# The names
+
+
+def test_every_message_of_the_contract_is_there_and_no_other():
+    assert sorted(messages.types_by_shape()) == SHAPES
+
+
+@every_message
+def test_fields_are_the_contract_s_in_its_order(shape: str):
+    wanted = ["t_ns", "seq", *CONTRACT[shape].split()]
+    names = list(messages.fields(kind_of(shape)))
+    assert names[: len(wanted)] == wanted
+
+
+@every_message
+def test_what_goes_beyond_the_contract_is_optional(shape: str):
+    info = types.type_info(kind_of(shape))
+    assert isinstance(info, types.StructType)
+    if CONTRACT[shape]:
+        beyond = info.fields[2 + len(CONTRACT[shape].split()) :]
+        assert not [field.name for field in beyond if field.required]
+
+
+@every_message
+def test_the_wire_carries_every_field_of_the_contract(shape: str):
+    message = messages.decode(key_of(shape), msgpack.packb(example(shape)))
+    plain = msgpack.unpackb(messages.encode(message))
+    assert list(plain)[:2] == ["t_ns", "seq"]
+    assert set(CONTRACT[shape].split()) <= set(plain)
+
+
+@every_message
+def test_vectors_have_the_contract_s_lengths(shape: str):
+    for name, length in LENGTHS.items():
+        if name in CONTRACT[shape].split():
+            assert len(example(shape)[name]) == length
+
+
+@every_message
+def test_encoding_names_the_message(shape: str):
+    name = kind_of(shape).__name__
+    assert messages.encoding(key_of(shape)) == f"application/msgpack;{name}"
+    assert NAMES.get(shape, name) == name
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["", "drone", "drone/d", "drone/d/sensor", "drone/d/sensor/lidar", "drone/d/cmd/velocity/x", "worlds/info"]
+    + ["process/p", "process/p/outputs", "cluster/c/control", "world/control", "x" * 500, "drone//truth/"],
+)
+def test_other_keys_have_no_message(key: str):
+    assert messages.type_of(key) is None
+    assert messages.encoding(key) == "application/msgpack"
+    with pytest.raises(DecodeError, match="is no key of the contract") as caught:
+        messages.decode(key, b"\x80")
+    assert len(str(caught.value)) < 200
+
+
+# Identity
+
+
+@every_message
+@settings(max_examples=25, deadline=None)
+@given(data=st.data())
+def test_decode_undoes_encode(shape: str, data: st.DataObject):
+    kind = kind_of(shape)
+    message = msgspec.convert(data.draw(plain_messages(shape)), kind)
+    again = messages.decode(key_of(shape), messages.encode(message))
+    assert type(again) is kind
+    assert again == message
+
+
+@every_message
+@settings(max_examples=25, deadline=None)
+@given(data=st.data())
+def test_any_msgpack_reads_and_writes_it(shape: str, data: st.DataObject):
+    """What the plain `msgpack` package reads and packs again, keys in any order, is the same message."""
+    message = msgspec.convert(data.draw(plain_messages(shape)), kind_of(shape))
+    plain = msgpack.unpackb(messages.encode(message), strict_map_key=False)
+    assert isinstance(plain, dict)
+    shuffled = dict(data.draw(st.permutations(list(plain.items()))))
+    assert messages.decode(key_of(shape), msgpack.packb(shuffled)) == message
+
+
+@every_message
+def test_whole_numbers_are_taken_for_floats(shape: str):
+    plain = example(shape)
+    floats = [path for path, value in leaves(plain) if isinstance(value, float)]
+    whole = plain
+    for path in floats:
+        whole = replaced(whole, path, 2)
+    key = key_of(shape)
+    assert messages.decode(key, msgpack.packb(whole)) == messages.decode(key, msgpack.packb(plain))
+
+
+@every_message
+def test_floats_of_32_bits_are_taken(shape: str):
+    payload = msgpack.packb(example(shape), use_single_float=True)
+    assert messages.decode(key_of(shape), payload) == messages.decode(key_of(shape), msgpack.packb(example(shape)))
+
+
+@every_message
+@pytest.mark.parametrize("extra", [1, None, "x", [1, [2]], {"a": {"b": math.nan}}, b"\xff", 1e300])
+def test_unknown_fields_are_ignored(shape: str, extra: Any):
+    plain = example(shape)
+    key = key_of(shape)
+    with_more = {"aa_new": extra, **plain, "zz_new": extra}
+    assert messages.decode(key, msgpack.packb(with_more)) == messages.decode(key, msgpack.packb(plain))
+
+
+def test_the_frame_of_a_velocity_is_heading_by_default():
+    plain = example("drone/*/cmd/velocity")
+    del plain["frame"]
+    assert messages.decode("drone/d/cmd/velocity", msgpack.packb(plain)).frame == "heading"
+
+
+# Refusals
+
+
+@every_message
+def test_a_missing_field_is_refused(shape: str):
+    info = types.type_info(kind_of(shape))
+    assert isinstance(info, types.StructType)
+    for field in info.fields:
+        plain = example(shape)
+        del plain[field.name]
+        if field.required:
+            assert_names(refusal(shape, msgpack.packb(plain)), shape, f"{field.name} is missing")
+        else:
+            messages.decode(key_of(shape), msgpack.packb(plain))
+
+
+WRONG = [None, True, 3, 1.5, "text", [1.0, 2.0], {"a": 1}, b"\x00"]
+
+
+def fits(value: Any, wrong: Any) -> bool:
+    """Tell whether `wrong` could stand where `value` does, by type alone."""
+    if isinstance(value, float):
+        return isinstance(wrong, int | float) and not isinstance(wrong, bool)
+    return type(wrong) is type(value)
+
+
+@every_message
+@pytest.mark.parametrize("wrong", WRONG, ids=repr)
+def test_a_wrong_type_is_refused(shape: str, wrong: Any):
+    plain = example(shape)
+    for path, value in leaves(plain):
+        empty_allowed = path[0] in ("commander", "trajectory_t_s") and wrong is None
+        if fits(value, wrong) or empty_allowed:
+            continue
+        said = refusal(shape, msgpack.packb(replaced(plain, path, wrong)))
+        assert_names(said, shape, str(path[0]))
+
+
+@every_message
+def test_a_word_outside_the_list_is_refused(shape: str):
+    plain = example(shape)
+    info = types.type_info(kind_of(shape))
+    assert isinstance(info, types.StructType)
+    for field in info.fields:
+        if isinstance(field.type, types.LiteralType):
+            said = refusal(shape, msgpack.packb({**plain, field.name: "sideways"}))
+            assert_names(said, shape, f"{field.name} is 'sideways'")
+            assert all(str(word) in said for word in field.type.values)
+
+
+@every_message
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf], ids=repr)
+@pytest.mark.parametrize("single", [False, True])
+def test_a_number_that_is_not_finite_is_refused(shape: str, number: float, single: bool):
+    plain = example(shape)
+    for path, value in leaves(plain):
+        if isinstance(value, float):
+            said = refusal(shape, msgpack.packb(replaced(plain, path, number), use_single_float=single))
+            assert_names(said, shape, str(path[0]))
+            assert repr(number) in said
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf], ids=repr)
+@pytest.mark.parametrize("wrap", [lambda x: x, lambda x: [1, [x]], lambda x: {"a": {"b": x}}, lambda x: {x: 1}])
+def test_a_number_that_is_not_finite_is_refused_in_free_content(number: float, wrap: Any):
+    plain = {**example("world/event"), "data": {"some": wrap(number)}}
+    assert_names(refusal("world/event", msgpack.packb(plain)), "world/event", "data")
+    request = msgpack.packb({"op": "acquire", "args": {"some": wrap(number)}})
+    with pytest.raises(DecodeError, match=r"^here: args holds .*; must be finite numbers$"):
+        messages.decode_as(messages.ControlRequest, request, "here")
+
+
+@every_message
+def test_a_wrong_shape_is_refused(shape: str):
+    plain = example(shape)
+    for path, value in branches(plain):
+        info = types.type_info(kind_of(shape))
+        assert isinstance(info, types.StructType)
+        field = next(field for field in info.fields if field.name == path[0])
+        fixed = isinstance(field.type, types.TupleType) or path[0] in ("covariance", "sensors", "value", "desired")
+        if not fixed or path[0] in FREE:
+            continue
+        for wrong in (value[:-1], [*value, value[-1]], []):
+            said = refusal(shape, msgpack.packb(replaced(plain, path, wrong)))
+            assert_names(said, shape, str(path[0]))
+
+
+@pytest.mark.parametrize("name", ["names", "value", "desired", "desired_rate"])
+def test_a_cluster_state_has_four_values_per_drone(name: str):
+    plain = example("cluster/*/state")
+    assert len(plain["drones"]) == 2
+    said = refusal("cluster/*/state", msgpack.packb({**plain, name: plain[name][:-1]}))
+    assert said == f"cluster/drone1/state: {name} has 7 entries; must have 8"
+
+
+@every_message
+@pytest.mark.parametrize("name", ["t_ns", "seq"])
+@pytest.mark.parametrize("wrong", [-1, -(2**63), 2**63, 2**64 - 1, 0.0])
+def test_stamps_are_whole_and_not_negative(shape: str, name: str, wrong: Any):
+    said = refusal(shape, msgpack.packb({**example(shape), name: wrong}))
+    assert_names(said, shape, f"{name} is {wrong}")
+
+
+@every_message
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xc1",
+        b"\x80",
+        b"\x90",
+        b"\xc0",
+        b"hello",
+        b"\x82\xa4t_ns",
+        b"\xdd\xff\xff\xff\xff",
+        b"\xdf\xff\xff\xff\xff",
+        b"\xc6\xff\xff\xff\xff",
+        b"\xdb\xff\xff\xff\xff",
+        b"\x81\xa4t_ns\xdd\xff\xff\xff\xff",
+        b"\x91" * 100_000,
+        b"\x81\xa1x" * 100_000,
+        b"\x81\xa4\xff\xff\xff\xff\x01",
+        b"\x81\x90\x01",
+    ],
+    ids=lambda payload: payload[:8].hex() or "empty",
+)
+def test_garbage_is_refused(shape: str, payload: bytes):
+    said = refusal(shape, payload)
+    assert said.startswith(f"{key_of(shape)}: ")
+    assert len(said) < 400
+
+
+@every_message
+@pytest.mark.parametrize("header", [b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xdc\xff\xff", b"\xc6\xff\xff\xff\xff"])
+def test_a_promise_of_four_billion_entries_is_refused(shape: str, header: bytes):
+    plain = example(shape)
+    packed = msgpack.packb(plain)
+    for name in plain:
+        marker = msgpack.packb(name)
+        place = packed.index(marker) + len(marker)
+        refusal(shape, packed[:place] + header)
+
+
+def test_a_payload_beyond_the_limit_is_refused_unread():
+    payload = b"\x80" * (messages.PAYLOAD_MAX + 1)
+    assert "must have at most 16000000" in refusal("clock", payload)
+
+
+def test_nesting_without_end_in_free_content_is_refused():
+    payload = msgpack.packb({**example("world/event"), "data": {}})
+    cut = payload.index(b"\xa4data") + 5
+    for item in (b"\x91", b"\x81\xa1x"):
+        refusal("world/event", payload[:cut] + b"\x81\xa1x" + item * 50_000 + b"\xc0")
+
+
+@every_message
+@settings(max_examples=60, deadline=None)
+@given(payload=st.binary(max_size=80))
+def test_random_bytes_are_a_message_or_refused(shape: str, payload: bytes):
+    judge(shape, payload)
+
+
+@every_message
+@settings(max_examples=80, deadline=None)
+@given(data=st.data())
+def test_a_damaged_message_is_a_message_or_refused(shape: str, data: st.DataObject):
+    damaged = bytearray(msgpack.packb(example(shape)))
+    for _ in range(data.draw(st.integers(1, 4))):
+        place = data.draw(st.integers(0, max(0, len(damaged) - 1)))
+        how = data.draw(st.sampled_from(["set", "cut", "insert", "drop"]))
+        if how == "cut":
+            del damaged[place:]
+        elif how == "insert":
+            damaged[place:place] = data.draw(st.binary(max_size=6))
+        elif how == "drop":
+            del damaged[place : place + data.draw(st.integers(1, 6))]
+        elif damaged:
+            damaged[place] = data.draw(st.integers(0, 255))
+    judge(shape, bytes(damaged))
+
+
+def judge(shape: str, payload: bytes) -> None:
+    """Check that a payload is refused in the contract's words or is a message that survives a round trip."""
+    key = key_of(shape)
+    try:
+        message = messages.decode(key, payload)
+    except DecodeError as error:
+        assert str(error).startswith(f"{key}: ")
+        return
+    again = messages.decode(key, messages.encode(message))
+    assert again == message
+    plain = msgspec.to_builtins(message)
+    assert all(math.isfinite(value) for _, value in leaves(plain) if isinstance(value, float))
+
+
+# Requests and answers
+
+
+@settings(max_examples=50, deadline=None)
+@given(op=text, args=st.dictionaries(text, free, max_size=3), source=text)
+def test_requests_survive_the_wire(op: str, args: dict[str, Any], source: str):
+    request = messages.ControlRequest(op, args, source)
+    assert messages.decode_as(messages.ControlRequest, messages.encode(request), "k") == request
+
+
+@settings(max_examples=50, deadline=None)
+@given(ok=st.booleans(), error=text, result=free)
+def test_answers_survive_the_wire(ok: bool, error: str, result: Any):
+    answer = messages.ControlAnswer(ok, error, result)
+    assert messages.decode_as(messages.ControlAnswer, messages.encode(answer), "k") == answer
+
+
+def test_a_request_needs_no_more_than_its_op():
+    request = messages.decode_as(messages.ControlRequest, msgpack.packb({"op": "pause"}), "world/control")
+    assert (request.op, request.args, request.source) == ("pause", {}, "")
+
+
+@pytest.mark.parametrize("plain", [{}, {"op": 1}, {"op": "x", "args": []}, {"op": "x", "source": None}, [], "pause"])
+def test_a_malformed_request_is_refused(plain: Any):
+    with pytest.raises(DecodeError, match=r"^world/control: .*must be"):
+        messages.decode_as(messages.ControlRequest, msgpack.packb(plain), "world/control")
+
+
+@settings(max_examples=300, deadline=None)
+@given(payload=st.binary(max_size=60))
+def test_a_random_request_is_a_request_or_refused(payload: bytes):
+    try:
+        request = messages.decode_as(messages.ControlRequest, payload, "world/control")
+    except DecodeError as error:
+        assert str(error).startswith("world/control: ")
+    else:
+        assert isinstance(request, messages.ControlRequest)

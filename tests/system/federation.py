@@ -1,0 +1,357 @@
+"""A federation under test: its roles as real processes, watched from outside as a user would.
+
+    def test_...(federation):
+        run = federation.run(PAIR, "--rate", "5")             `zsim run`, or
+        world = federation.start("world", federation.write(ONE), "--listen", federation.endpoint)
+        run.line("engaged")                                   waits for a line of its terminal
+        run.ends(with_code=0)
+
+Nothing sleeps: every wait is for a line, a message or an end. When the test is over every process is killed, and
+the fixture fails the test if one that should have been gone was still there (`nobody_left`).
+"""
+
+import fcntl
+import hashlib
+import os
+import re
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgpack
+import numpy as np
+import pytest
+from wire import PATIENCE_S, Client
+
+from zsim.record import RecordReader, repair
+
+ROOT = Path(__file__).parents[2]
+ZSIM = (sys.executable, "-m", "zsim_deploy.cli")
+PORTS = range(20_000, 30_000)  # below the range from which systems take ports for outgoing connections
+LEFT_WITHIN_S = 3.0  # after the end of a run, until nobody may be left
+
+ONE = """
+name: one
+seed: 3
+duration_s: 10
+sensors: {preset: paper}
+environment: {wind: {gust_m_s: 0.3}}
+drones:
+  - {name: drone1, position_m: [0, 0, 0], yaw_deg: 90}
+processes: {expect: []}
+"""
+"""One drone that stands on the ground until somebody flies it."""
+
+PAIR = """
+name: pair
+seed: 3
+duration_s: 12
+sensors: {preset: paper}
+environment: {wind: {gust_m_s: 0.3}}
+drones:
+  - {name: drone1, position_m: [2, 0, 0], yaw_deg: 90}
+  - {name: drone2, position_m: [-2, 0, 0], yaw_deg: 90}
+clusters:
+  - {name: main, drones: [drone1, drone2], plan: {takeoff_s: 0.5}}
+"""
+"""Two drones that take off at 1 s, hover at 4 s and hold their formation from 5 s on."""
+
+PAIR_ROLES = ("estimator.drone1", "estimator.drone2", "controller.main")
+
+
+class Line(NamedTuple):
+    """A line of a terminal and the wall time (monotonic) at which it came."""
+
+    wall_s: float
+    text: str
+
+
+class Role:
+    """A started command; its output is read all the time.
+
+    Args:
+        arguments: of `zsim`.
+        prefix: a command that starts it, such as `ip netns exec NAME`.
+        env: variables that differ from those of the tests.
+    """
+
+    def __init__(self, arguments: list[str], prefix: tuple[str, ...] = (), env: dict[str, str] | None = None) -> None:
+        self.arguments = arguments
+        self.lines: list[Line] = []
+        self._news = threading.Condition()
+        self._closed = False
+        self.process = subprocess.Popen(
+            [*prefix, *ZSIM, *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            cwd=ROOT,
+            env={**os.environ, "COLUMNS": "200", **(env or {})},
+            start_new_session=True,
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for text in self.process.stdout:
+            self._note(Line(time.monotonic(), text.rstrip("\n")))
+        self._closed = True
+        self._note(None)
+
+    def _note(self, line: Line | None) -> None:
+        with self._news:
+            if line is not None:
+                self.lines.append(line)
+            self._news.notify_all()
+
+    def line(self, pattern: str, within_s: float = PATIENCE_S) -> Line:
+        """Return the first line in which a pattern is found, waiting for it."""
+        until_s = time.monotonic() + within_s
+        seen = 0
+        with self._news:
+            while True:
+                for line in self.lines[seen:]:
+                    if re.search(pattern, line.text):
+                        return line
+                seen = len(self.lines)
+                left_s = until_s - time.monotonic()
+                if self._closed or left_s <= 0:
+                    break
+                self._news.wait(left_s)
+        return pytest.fail(f"{self}: no line with {pattern!r} within {within_s:g} s:\n{self.text()}")
+
+    def ends(self, with_code: int, within_s: float = PATIENCE_S) -> float:
+        """Wait for its end; return the wall time of it."""
+        try:
+            code = self.process.wait(within_s)
+        except subprocess.TimeoutExpired:
+            pytest.fail(f"{self}: has not ended within {within_s:g} s:\n{self.text()}")
+        end_s = time.monotonic()
+        self._reader.join(PATIENCE_S)
+        assert code == with_code, f"{self} ended with {code}:\n{self.text()}"
+        return end_s
+
+    def text(self) -> str:
+        """Return all that it has said so far."""
+        with self._news:
+            return "\n".join(line.text for line in self.lines)
+
+    def signal(self, number: int) -> float:
+        """Send it a signal; return the wall time."""
+        self.process.send_signal(number)
+        return time.monotonic()
+
+    def close(self) -> None:
+        """Kill it, if it lives, and give its pipe back."""
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        self._reader.join(PATIENCE_S)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+    def __repr__(self) -> str:
+        return f"zsim {' '.join(self.arguments)}"
+
+
+class Federation:
+    """Everything that one test starts, on an endpoint and in a folder of its own."""
+
+    def __init__(self, folder: Path, host: str = "127.0.0.1") -> None:
+        self.folder = folder
+        self.endpoint = f"tcp/{host}:{free_port(host)}"
+        self.out = folder / "run"
+        self._roles: list[Role] = []
+        self._stack = ExitStack()
+
+    def write(self, scenario: str, name: str = "scenario.yaml") -> str:
+        """Write a scenario into the folder; return its path."""
+        path = self.folder / name
+        path.write_text(scenario)
+        return str(path)
+
+    def run(self, scenario: str, *options: str) -> Role:
+        """Start `zsim run` on this endpoint, without report."""
+        where = ["--out", str(self.out), "--listen", self.endpoint]
+        return self.start("run", self.write(scenario), *where, "--no-report", *options)
+
+    def world(self, scenario: str, *options: str) -> Role:
+        """Start a world by hand."""
+        return self.start("world", self.write(scenario), "--listen", self.endpoint, *options)
+
+    def role(self, role: str, *arguments: str, prefix: tuple[str, ...] = ()) -> Role:
+        """Start another role by hand, as a client of this endpoint."""
+        return self.start(role, *arguments, "--connect", self.endpoint, prefix=prefix)
+
+    def start(self, *arguments: str, prefix: tuple[str, ...] = ()) -> Role:
+        """Start a `zsim` command."""
+        role = Role(list(arguments), prefix)
+        self._roles.append(role)
+        return role
+
+    def client(self, federation: str = "zsim") -> Client:
+        """Return a client of this endpoint; it is closed with the federation."""
+        return self._stack.enter_context(Client(self.endpoint, federation))
+
+    def record(self) -> "Record":
+        """Return what has been recorded of the run; a record that was cut is mended first."""
+        path = self.out / "run.mcap"
+        repair(path)
+        return Record(self._stack.enter_context(RecordReader(path)))
+
+    def pid(self, name: str) -> int:
+        """Return the process id of a role of `zsim run`, by the arguments that it was started with."""
+        role, _, thing = name.partition(".")
+        role = "record" if role == "recorder" else role
+        for pid, command in self._processes():
+            if command[2:4] == ["zsim_deploy.cli", role] and (not thing or command[4] == thing):
+                if "--launched" in command:
+                    return pid
+        return pytest.fail(f"{name} does not run")
+
+    def kill(self, name: str, number: int = signal.SIGKILL) -> float:
+        """Send a role of `zsim run` a signal; return the wall time."""
+        os.kill(self.pid(name), number)
+        return time.monotonic()
+
+    def left(self) -> list[str]:
+        """Return the commands of this federation's processes that are there now."""
+        return [" ".join(command) for _, command in self._processes()]
+
+    def nobody_left(self, within_s: float = LEFT_WITHIN_S) -> None:
+        """Fail if any process of this federation is still there after a while."""
+        pids = [pid for pid, _ in self._processes()]
+        until_s = time.monotonic() + within_s
+        for pid in pids:
+            wait_gone(pid, until_s - time.monotonic())
+        assert self.left() == []
+
+    def _processes(self) -> Iterator[tuple[int, list[str]]]:
+        """Yield id and command of the processes that were started with this endpoint or folder."""
+        marks = (self.endpoint.encode(), str(self.folder).encode())
+        for entry in Path("/proc").iterdir():
+            if not entry.name.isdigit() or int(entry.name) == os.getpid():
+                continue
+            try:
+                line = (entry / "cmdline").read_bytes()
+            except OSError:
+                continue  # it has just ended
+            if b"zsim_deploy.cli" in line and any(mark in line for mark in marks):
+                yield int(entry.name), line.decode(errors="replace").rstrip("\0").split("\0")
+
+    def __enter__(self) -> "Federation":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Kill what is left, the launcher's children too."""
+        self._stack.close()
+        for role in self._roles:
+            role.close()
+        for pid, _ in list(self._processes()):
+            os.kill(pid, signal.SIGKILL)
+
+
+def wait_gone(pid: int, within_s: float) -> bool:
+    """Wait for the end of a process that is not a child; return whether it has ended."""
+    try:
+        descriptor = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return True
+    try:
+        poller = select.poll()
+        poller.register(descriptor)
+        return bool(poller.poll(max(0.0, 1000 * within_s)))
+    finally:
+        os.close(descriptor)
+
+
+def free_port(host: str = "127.0.0.1") -> int:
+    """Return a port that nobody listens on; workers that run side by side begin at different places."""
+    span = len(PORTS)
+    start = os.getpid() * 37 + next(_counter)
+    for offset in range(span):
+        port = PORTS[(start + offset) % span]
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((host, port))
+            except OSError:
+                continue
+            return port
+    raise OSError(f"no port free in {PORTS}")
+
+
+_counter = iter(range(len(PORTS)))
+
+
+class Record:
+    """What stands in a record, read with the reader of zsim and msgpack."""
+
+    def __init__(self, reader: RecordReader) -> None:
+        self._reader = reader
+        self.complete = reader.complete
+
+    def all(self, *keys: str) -> list[dict[str, Any]]:
+        """Return the messages of some keys in order of time."""
+        return [msgpack.unpackb(message.payload) for message in self._reader.messages(keys)]
+
+    def keys(self) -> dict[str, int]:
+        """Return the keys and how many messages each has."""
+        return self._reader.topics()
+
+    def events(self, *kinds: str) -> list[dict[str, Any]]:
+        """Return the events of some kinds."""
+        return [event for event in self.all("world/event") if event["kind"] in kinds]
+
+    def end(self) -> dict[str, Any]:
+        """Return what the world said of its run at the end."""
+        return self.events("end")[-1]["data"]
+
+    def sha256(self) -> str:
+        return self.end()["truth_sha256"]
+
+    def recomputed_sha256(self, drones: list[str]) -> str:
+        """Return the hash of the truth as docs/protocol.md defines it, from the messages on record."""
+        said = hashlib.sha256()
+        for instant in zip(*(self.all(f"drone/{drone}/truth") for drone in drones), strict=True):
+            for truth in instant:
+                said.update(struct.pack("<q", truth["t_ns"]))
+                parts = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")
+                numbers = [number for part in parts for number in truth[part]]
+                said.update(struct.pack("<13d", *numbers))
+        return said.hexdigest()
+
+    def positions(self, drone: str) -> np.ndarray:
+        """Return the true positions [m; W; (gates, 3)] of a drone."""
+        return np.array([truth["position_m"] for truth in self.all(f"drone/{drone}/truth")])
+
+
+@pytest.fixture(scope="session")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Let the kernels be compiled before anything is timed; workers side by side do not compile twice."""
+    folder = tmp_path_factory.mktemp("compiled")
+    scenario = folder / "pair.yaml"
+    scenario.write_text(PAIR)
+    flight = ["run", str(scenario), "--in-process", "--duration", "8", "--no-report", "--out", str(folder / "run")]
+    with open(Path(tempfile.gettempdir()) / "zsim-tests-compile.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        subprocess.run([*ZSIM, *flight], cwd=ROOT, check=True, timeout=600, capture_output=True)
+
+
+@pytest.fixture
+def federation(tmp_path: Path, compiled: None) -> Iterator[Federation]:
+    """A federation of the test's own; nobody of it outlives the test."""
+    with Federation(tmp_path) as made:
+        yield made

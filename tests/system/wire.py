@@ -1,0 +1,178 @@
+"""A program beside zsim: zenoh and msgpack alone, by docs/protocol.md.
+
+    with Client(endpoint) as client:
+        clock = client.watch("clock")
+        clock.until(lambda m: m["t_ns"] >= 2e9)          waits for a message, never for a time
+        me = client.join("tester.one", period_ns=20_000_000)
+"""
+
+import itertools
+import os
+import queue
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import msgpack
+import pytest
+import zenoh
+
+PATIENCE_S = 60.0  # how long anything may take on a loaded machine before the test gives up
+SHOWN = 6  # messages told when a wait was in vain
+
+
+class Heard(NamedTuple):
+    """One message as it came: wall time (monotonic), key without the federation, content."""
+
+    wall_s: float
+    key: str
+    message: dict[str, Any]
+
+
+Wanted = Callable[[dict[str, Any]], Any]
+
+
+class Watch:
+    """What comes on one expression, in order."""
+
+    def __init__(self) -> None:
+        self._queue: queue.SimpleQueue[Heard] = queue.SimpleQueue()
+        self.heard: list[Heard] = []
+
+    def take(self, sample: zenoh.Sample, prefix: str) -> None:
+        """Keep a message; called by Zenoh."""
+        key = str(sample.key_expr).removeprefix(prefix)
+        self._queue.put(Heard(time.monotonic(), key, read(sample.payload.to_bytes())))
+
+    def until(self, wanted: Wanted, within_s: float = PATIENCE_S) -> Heard:
+        """Return the next message that is wanted; fail when none comes."""
+        until_s = time.monotonic() + within_s
+        while (left_s := until_s - time.monotonic()) > 0:
+            try:
+                heard = self._queue.get(timeout=left_s)
+            except queue.Empty:
+                break
+            self.heard.append(heard)
+            if wanted(heard.message):
+                return heard
+        last = "\n".join(str(heard)[:300] for heard in self.heard[-SHOWN:])
+        return pytest.fail(f"no such message within {within_s:g} s; the last ones were\n{last}")
+
+    def now(self) -> list[Heard]:
+        """Return everything heard so far."""
+        while not self._queue.empty():
+            self.heard.append(self._queue.get())
+        return self.heard
+
+
+class Client:
+    """A session of a foreign program."""
+
+    def __init__(self, endpoint: str, federation: str = "zsim") -> None:
+        self.endpoint = endpoint
+        self._prefix = f"{federation}/"
+        self._kept: list[Any] = []
+        self._seq: dict[str, int] = {}
+
+    def __enter__(self) -> "Client":
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", f'["{self.endpoint}"]')
+        config.insert_json5("connect/timeout_ms", str(int(1000 * PATIENCE_S)))
+        config.insert_json5("connect/retry", "{period_init_ms: 50, period_max_ms: 100}")
+        config.insert_json5("scouting/multicast/enabled", "false")
+        self.session = zenoh.open(config)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.session.close()
+
+    def watch(self, expression: str) -> Watch:
+        """Listen on an expression."""
+        watch = Watch()
+        subscriber = self.session.declare_subscriber(
+            self._prefix + expression, lambda sample: watch.take(sample, self._prefix)
+        )
+        self._kept.append(subscriber)
+        return watch
+
+    def get(self, expression: str, payload: bytes | None = None, within_s: float = 5.0) -> dict[str, Any]:
+        """Return the last values that are answered on an expression, by key."""
+        replies = self.session.get(self._prefix + expression, payload=payload, timeout=within_s)
+        good = [reply.ok for reply in replies if reply.ok is not None]
+        return {str(ok.key_expr).removeprefix(self._prefix): read(ok.payload.to_bytes()) for ok in good}
+
+    def info(self) -> dict[str, Any]:
+        """Return `world/info`, of a world that may still be on its way up."""
+        clock = self.watch("clock")
+        found = self.get("world/info")
+        if not found:
+            clock.until(lambda _: True)  # a world that stands tells its clock once a second
+            found = self.get("world/info")
+        return found["world/info"]
+
+    def ask(self, key: str, op: str, source: str = "tester", **args: Any) -> dict[str, Any]:
+        """Send a request and return its answer."""
+        request = msgpack.packb({"op": op, "args": args, "source": source})
+        return self.get(key, payload=request, within_s=PATIENCE_S)[key]
+
+    def put(self, key: str, **fields: Any) -> None:
+        """Publish a message; `seq` is counted here."""
+        seq = self._seq.get(key, 0)
+        self._seq[key] = seq + 1
+        self.put_raw(key, msgpack.packb({"seq": seq, **fields}))
+
+    def put_raw(self, key: str, payload: bytes) -> None:
+        """Publish any bytes."""
+        self.session.put(self._prefix + key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def token(self, name: str) -> Any:
+        """Declare the liveliness token of a process; `undeclare` it to play its death."""
+        return self.session.liveliness().declare_token(f"{self._prefix}process/{name}")
+
+    def join(self, name: str, info: dict[str, Any], period_ns: int, **others: Any) -> "Participant":
+        """Take part in the run under a name."""
+        participant = Participant(self, name, info, period_ns)
+        participant.join(**others)
+        return participant
+
+
+class Participant:
+    """A process of the run, as docs/protocol.md says a program of any language can be one."""
+
+    _incarnations = itertools.count(int.from_bytes(os.urandom(5), "big"))
+
+    def __init__(self, client: Client, name: str, info: dict[str, Any], period_ns: int) -> None:
+        self.client = client
+        self.name = name
+        self.period_ns = period_ns
+        self.run = {"run_id": info["run_id"], "incarnation": next(self._incarnations)}
+        self.token = client.token(name)
+
+    def join(self, **others: Any) -> None:
+        role = self.name.split(".")[0]
+        about = {"role": role, "host": "elsewhere", "pid": os.getpid(), "period_ns": self.period_ns}
+        self.client.put(f"process/{self.name}/join", **{"t_ns": 0, **self.run, **about, **others})
+
+    def done(self, t_ns: int, sent: int = 0) -> None:
+        self.client.put(f"process/{self.name}/done", t_ns=t_ns, **self.run, done_ns=t_ns, sent=sent)
+
+    def bye(self, t_ns: int, reason: str = "shown") -> None:
+        self.client.put(f"process/{self.name}/bye", t_ns=t_ns, reason=reason)
+
+    def die(self) -> None:
+        """Let the token go without a bye, as a process does that is killed."""
+        self.token.undeclare()
+
+
+def read(payload: bytes) -> dict[str, Any]:
+    """Return what a payload says; what says nothing is told as such."""
+    try:
+        return msgpack.unpackb(payload)
+    except ValueError:
+        return {"unreadable": payload}
+
+
+def kinds(heard: list[Heard]) -> Iterator[str]:
+    """Yield the kinds of the events heard."""
+    return (event.message["kind"] for event in heard)

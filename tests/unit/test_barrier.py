@@ -1,0 +1,319 @@
+"""The barrier: who is waited for, since when, and what a join, a done, a death or a bye changes."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from zsim.messages import Done, Join, Waiting
+from zsim_world.barrier import Barrier, Participant
+
+RUN = "run1"
+GATE_NS = 20_000_000
+WALL_NS = 5_000_000_000
+
+
+def join(incarnation: int = 1, period_ns: int = GATE_NS, run_id: str = RUN, host: str = "laptop") -> Join:
+    return Join(0, 0, run_id, incarnation, "estimator", host, 42, period_ns, "0.1.0", "f00d")
+
+
+def done(gate: int, sent: int = 0, incarnation: int = 1, run_id: str = RUN) -> Done:
+    return Done(gate * GATE_NS, gate, run_id, incarnation, gate * GATE_NS, sent)
+
+
+def barrier(*names: str, expected: list[str] | None = None, period_ns: int = GATE_NS) -> Barrier:
+    made = Barrier(RUN, GATE_NS, expected if expected is not None else list(names))
+    for name in names:
+        assert made.join(name, join(period_ns=period_ns), 0, 0) is None
+    return made
+
+
+def names(participants: list[Participant]) -> list[str]:
+    return [participant.name for participant in participants]
+
+
+def blocked(made: Barrier, gate: int) -> list[str]:
+    return names(made.blocking(gate * GATE_NS))
+
+
+# Who takes part
+
+
+def test_the_run_waits_for_everybody_expected():
+    made = Barrier(RUN, GATE_NS, ["estimator.d1", "controller.main"])
+    assert made.absent() == ["estimator.d1", "controller.main"]
+    made.join("controller.main", join(), 0, 0)
+    assert made.absent() == ["estimator.d1"]
+    made.expect("console.1")
+    assert made.absent() == ["estimator.d1", "console.1"]
+    made.join("estimator.d1", join(), 0, 0)
+    made.join("console.1", join(period_ns=0), 0, 0)
+    assert made.absent() == []
+
+
+def test_before_the_first_gate_nobody_owes_anything():
+    assert blocked(barrier("a", "b"), -1) == []
+
+
+def test_everybody_owes_a_done_for_the_instant_that_commands_come_from():
+    made = barrier("a", "b")
+    assert blocked(made, 0) == ["a", "b"]
+    assert made.done("a", done(0), 0, WALL_NS) is None
+    assert blocked(made, 0) == ["b"]
+    made.done("b", done(0), 0, WALL_NS)
+    assert blocked(made, 0) == []
+    assert blocked(made, 1) == ["a", "b"]
+
+
+def test_a_participant_that_does_not_gate_is_never_waited_for():
+    made = barrier("recorder", period_ns=0)
+    assert blocked(made, 1000) == []
+    assert not made.is_gating("recorder")
+
+
+@pytest.mark.parametrize(("period", "need", "owed"), [(5, 4, 0), (5, 5, 5), (5, 9, 5), (2, 7, 6), (1, 7, 7)])
+def test_a_longer_period_owes_only_its_own_instants(period: int, need: int, owed: int):
+    made = barrier("a", period_ns=period * GATE_NS)
+    if owed:
+        made.done("a", done(owed - period), need * GATE_NS, 0)
+        assert blocked(made, need) == ["a"]
+    made.done("a", done(owed), need * GATE_NS, 0)
+    assert blocked(made, need) == []
+
+
+def test_a_late_joiner_is_waited_for_from_the_next_gate_on():
+    made = barrier("a")
+    made.join("late", join(), 10 * GATE_NS, 0)
+    made.done("a", done(9), 9 * GATE_NS, 0)
+    assert blocked(made, 9) == []
+    made.done("a", done(10), 10 * GATE_NS, 0)
+    assert blocked(made, 10) == ["late"]
+
+
+def test_a_late_joiner_of_a_longer_period_is_waited_for_from_its_own_first_instant():
+    made = barrier(expected=[])
+    made.join("late", join(period_ns=5 * GATE_NS), 7 * GATE_NS, 0)
+    assert [gate for gate in range(13) if blocked(made, gate)] == [10, 11, 12]
+
+
+@pytest.mark.parametrize(
+    ("name", "message", "said"),
+    [
+        ("a", join(run_id="run0"), "run_id is 'run0'; must be 'run1' (read world/info)"),
+        ("a", join(period_ns=-GATE_NS), "period_ns is -20000000; must be 0 or a multiple of 20000000"),
+        ("a", join(period_ns=GATE_NS + 1), "period_ns is 20000001; must be 0 or a multiple of 20000000"),
+        ("world", join(), "name is 'world'; must be"),
+        ("A", join(), "name is 'A'; must be"),
+        ("", join(), "name is ''; must be"),
+        ("x" * 49, join(), "must be"),
+        ("a\nb", join(), "name is 'a\\nb'; must be"),
+    ],
+)
+def test_a_join_that_breaks_a_rule_is_refused_with_the_reason(name: str, message: Join, said: str):
+    made = barrier("b")
+    reason = made.join(name, message, 0, 0)
+    assert reason is not None
+    assert said in reason
+    assert "\n" not in reason
+    assert list(made.participants) == ["b"]
+
+
+# Incarnations
+
+
+def test_a_new_incarnation_goes_on_where_the_former_was():
+    made = barrier("a")
+    made.done("a", done(3), 3 * GATE_NS, 0)
+    made.died("a", WALL_NS)
+    assert made.join("a", join(2, host="other"), 50 * GATE_NS, WALL_NS) is None
+    assert made.participants["a"].alive
+    assert made.participants["a"].host == "other"
+    assert blocked(made, 3) == []
+    assert blocked(made, 4) == ["a"]
+    assert made.done("a", done(4, incarnation=2), 5 * GATE_NS, 0) is None
+    assert blocked(made, 4) == []
+
+
+def test_the_done_of_a_former_incarnation_is_refused():
+    made = barrier("a")
+    made.join("a", join(2), 0, 0)
+    reason = made.done("a", done(0), 0, 0)
+    assert reason == "incarnation is 1; must be 2, the newest to join"
+    assert blocked(made, 0) == ["a"]
+
+
+def test_the_same_join_again_changes_nothing():
+    made = barrier("a")
+    made.received("a")
+    made.join("a", join(1), 9 * GATE_NS, WALL_NS)
+    made.done("a", done(0, sent=1), 0, 0)
+    assert blocked(made, 0) == []
+    assert made.participants["a"].from_ns == 0
+
+
+def test_a_dead_process_lives_again_with_the_same_incarnation():
+    made = barrier("a")
+    made.died("a", WALL_NS)
+    made.join("a", join(1), GATE_NS, WALL_NS)
+    assert made.is_gating("a")
+
+
+def test_a_watcher_that_begins_to_gate_is_waited_for_from_then_on():
+    made = barrier("a", period_ns=0)
+    made.join("a", join(2), 8 * GATE_NS, 0)
+    assert blocked(made, 7) == []
+    assert blocked(made, 8) == ["a"]
+
+
+def test_a_rejoin_forgets_the_account_of_the_former():
+    made = barrier("a")
+    made.done("a", done(0, sent=3), 0, 0)
+    assert names(made.short()) == ["a"]
+    made.join("a", join(2), GATE_NS, 0)
+    assert made.short() == []
+
+
+def test_deadline_misses_are_the_name_s_not_the_incarnation_s():
+    made = barrier("a")
+    made.participants["a"].deadline_misses = 7
+    made.join("a", join(2), 0, 0)
+    assert made.participants["a"].deadline_misses == 7
+
+
+# Dones
+
+
+def test_dones_out_of_order_never_go_back():
+    made = barrier("a")
+    made.done("a", done(5), 9 * GATE_NS, WALL_NS)
+    assert made.done("a", done(3), 9 * GATE_NS, 2 * WALL_NS) is None
+    assert blocked(made, 5) == []
+    assert made.participants["a"].since_wall_ns == WALL_NS
+
+
+@pytest.mark.parametrize(
+    ("name", "message", "said"),
+    [
+        ("nobody", done(0), "has not joined; must publish process/nobody/join first"),
+        ("a", done(0, run_id="run0"), "run_id is 'run0'; must be 'run1' (read world/info)"),
+        ("a", done(0, incarnation=9), "incarnation is 9; must be 1, the newest to join"),
+        ("a", done(2), "done_ns is 40000000; must be <= 20000000, the newest gate"),
+    ],
+)
+def test_a_done_that_cannot_be_is_refused_with_the_reason(name: str, message: Done, said: str):
+    made = barrier("a")
+    assert made.done(name, message, GATE_NS, 0) == said
+    assert blocked(made, 0) == ["a"]
+
+
+# Outputs that a done counts
+
+
+def test_a_done_counts_only_with_all_its_outputs():
+    made = barrier("a")
+    made.received("a")
+    made.done("a", done(0, sent=3), 0, 0)
+    assert blocked(made, 0) == ["a"]
+    assert names(made.short()) == ["a"]
+    made.received("a")
+    assert blocked(made, 0) == ["a"]
+    made.received("a")
+    assert blocked(made, 0) == []
+    assert made.short() == []
+
+
+def test_outputs_of_the_next_instant_that_are_in_already_count_for_its_done():
+    made = barrier("a")
+    for _ in range(6):
+        made.received("a")
+    made.done("a", done(0, sent=3), GATE_NS, 0)
+    made.done("a", done(1, sent=3), GATE_NS, 0)
+    assert made.short() == []
+    assert blocked(made, 1) == []
+
+
+def test_what_is_short_of_two_dones_adds_up():
+    made = barrier("a")
+    made.done("a", done(0, sent=2), GATE_NS, 0)
+    made.done("a", done(1, sent=2), GATE_NS, 0)
+    for _ in range(3):
+        made.received("a")
+        assert names(made.short()) == ["a"]
+    made.received("a")
+    assert made.short() == []
+
+
+def test_outputs_of_strangers_are_nobody_s():
+    made = barrier("a")
+    made.received("stranger")
+    assert list(made.participants) == ["a"]
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    sents=st.lists(st.integers(0, 4), min_size=1, max_size=8),
+    order=st.randoms(use_true_random=False),
+)
+def test_when_all_is_in_nothing_is_missing_whatever_came_first(sents: list[int], order):
+    """Outputs and dones come on different subscriptions: only the dones among themselves keep their order."""
+    made = barrier("a")
+    last = len(sents) - 1
+    arrivals = ["output"] * sum(sents) + ["done"] * len(sents)
+    order.shuffle(arrivals)
+    waiting = iter(enumerate(sents))
+    for arrival in arrivals:
+        if arrival == "output":
+            made.received("a")
+        else:
+            gate, sent = next(waiting)
+            made.done("a", done(gate, sent), last * GATE_NS, 0)
+    assert made.short() == []
+    assert blocked(made, last) == []
+
+
+# Death, drop, bye
+
+
+def test_the_dead_are_waited_for_until_they_are_dropped():
+    made = barrier("a", "b")
+    made.done("b", done(0), 0, 0)
+    assert made.died("a", WALL_NS) is made.participants["a"]
+    assert not made.is_gating("a")
+    assert blocked(made, 0) == ["a"]
+    assert made.remove("a") is not None
+    assert blocked(made, 0) == []
+    assert made.absent() == []
+
+
+def test_a_death_is_told_once():
+    made = barrier("a")
+    assert made.died("a", 0) is not None
+    assert made.died("a", 0) is None
+    assert made.died("nobody", 0) is None
+
+
+def test_who_is_gone_can_come_back_as_a_newcomer():
+    made = barrier("a")
+    made.remove("a")
+    assert made.remove("a") is None
+    assert made.done("a", done(0), 0, 0) is not None
+    made.join("a", join(2), 6 * GATE_NS, 0)
+    assert blocked(made, 5) == []
+    assert blocked(made, 6) == ["a"]
+
+
+# What `clock` says
+
+
+def test_waiting_for_names_who_where_and_since_when():
+    made = Barrier(RUN, GATE_NS, ["estimator.d1", "controller.main"])
+    made.join("controller.main", join(host="ground"), 0, 3 * WALL_NS)
+    said = made.waiting_for(0, 4 * WALL_NS, start_wall_ns=2 * WALL_NS)
+    assert said == (Waiting("estimator.d1", "", 10.0), Waiting("controller.main", "ground", 5.0))
+    made.done("controller.main", done(0), 0, 4 * WALL_NS)
+    assert [waiting.name for waiting in made.waiting_for(0, 4 * WALL_NS, 0)] == ["estimator.d1"]
+
+
+def test_waiting_for_counts_from_the_death_of_the_dead():
+    made = barrier("a")
+    made.died("a", WALL_NS)
+    assert made.waiting_for(0, 3 * WALL_NS, 0) == (Waiting("a", "laptop", 10.0),)

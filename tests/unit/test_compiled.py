@@ -1,0 +1,55 @@
+"""The compiled mathematics: every file that is compiled counts for the cache, and a change of one renews it."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import zsim_agents
+from zsim_agents.compiled import SOURCES, sources_digest
+
+PACKAGE = Path(zsim_agents.__file__).parent
+
+
+def test_every_file_with_compiled_functions_is_listed():
+    users = {path.name for path in PACKAGE.glob("*.py") if "\n@compiled\n" in path.read_text()}
+    assert users == set(SOURCES)
+
+
+def test_the_digest_changes_with_each_file(tmp_path: Path):
+    digests = set()
+    for changed in (None, *SOURCES):
+        for name in SOURCES:
+            shutil.copy(PACKAGE / name, tmp_path)
+        if changed:
+            with (tmp_path / changed).open("a") as file:
+                file.write("# another line\n")
+        digests.add(sources_digest(tmp_path))
+    assert len(digests) == len(SOURCES) + 1
+
+
+ASK = """
+from zsim_agents.dead_reckoning import acceleration
+print(acceleration((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 9.0))
+"""
+
+
+def test_a_change_of_what_is_called_reaches_the_caller(tmp_path: Path):
+    """`dead_reckoning.acceleration` calls `madgwick.turn`: numba's own cache would go on with the old one."""
+    pytest.importorskip("numba")
+    shutil.copytree(PACKAGE, tmp_path / "zsim_agents", ignore=shutil.ignore_patterns("__pycache__"))
+
+    def ask() -> str:
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+        run = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r}){ASK}"]
+        return subprocess.run(run, env=environment, capture_output=True, text=True, check=True).stdout.strip()
+
+    assert ask() == "(0.0, 0.0, -9.0)"
+    madgwick = tmp_path / "zsim_agents" / "madgwick.py"
+    text = madgwick.read_text()
+    assert text.count("        R[0] * v[0] + R[1] * v[1] + R[2] * v[2],") == 1
+    madgwick.write_text(text.replace("        R[0] * v[0] + R[1]", "        1.0 + R[0] * v[0] + R[1]"))
+    assert ask() == "(1.0, 0.0, -9.0)"

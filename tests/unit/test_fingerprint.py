@@ -1,0 +1,65 @@
+"""The numeric fingerprint: the same in every process of a machine, another when anything of it changes."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+from zsim import fingerprint as module
+from zsim.fingerprint import PACKAGES, fingerprint, parts
+
+
+@pytest.fixture(autouse=True)
+def _asked_anew():
+    parts.cache_clear()
+    fingerprint.cache_clear()
+    yield
+    parts.cache_clear()
+    fingerprint.cache_clear()
+
+
+def test_it_is_sixteen_hex_digits():
+    assert re.fullmatch(r"[0-9a-f]{16}", fingerprint())
+
+
+def test_another_process_has_the_same():
+    command = [sys.executable, "-c", "from zsim.fingerprint import fingerprint; print(fingerprint())"]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == fingerprint()
+
+
+def test_it_is_made_of_what_the_last_bit_depends_on():
+    found = parts()
+    assert {"zsim", "python", "machine", "cpu", "libc", "numpy"} <= set(found)
+    assert all(found.values())
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_another_version_of_a_package_is_another_fingerprint(package: str, monkeypatch: pytest.MonkeyPatch):
+    here = fingerprint()
+    known = module._version
+    monkeypatch.setattr(module, "_version", lambda name: "0.0.0" if name == package else known(name))
+    parts.cache_clear()
+    fingerprint.cache_clear()
+    assert fingerprint() != here
+
+
+def test_another_processor_is_another_fingerprint(monkeypatch: pytest.MonkeyPatch):
+    here = fingerprint()
+    monkeypatch.setattr(module, "_cpu_features", lambda: "00000000")
+    parts.cache_clear()
+    fingerprint.cache_clear()
+    assert fingerprint() != here
+
+
+def test_where_the_c_library_is_unknown_the_system_stands_for_it(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module.platform, "libc_ver", lambda: ("", ""))
+    monkeypatch.setattr(module.platform, "system", lambda: "Darwin")
+    parts.cache_clear()
+    assert parts()["libc"] == "Darwin"
+
+
+def test_a_package_that_is_not_there_is_left_out(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module, "PACKAGES", ("numpy", "no-such-package"))
+    parts.cache_clear()
+    assert "no-such-package" not in parts()

@@ -1,0 +1,248 @@
+"""The fleet's interface: samples and their times, refusals, same bits, contacts."""
+
+import hashlib
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsim.frames import geodetic_to_enu
+from zsim.scenario_file import resolve
+from zsim_world import gate
+from zsim_world.fleet import DivergedError, Fleet
+from zsim_world.sensor_set import SENSORS
+
+GATE_NS = 20_000_000
+WIDTH = {"imu": 6, "gps": 9, "mag": 3, "baro": 2, "sonar": 2, "flow": 4}
+
+
+def scenario(count: int = 2, seed: int = 1, gust=0.5, spacing=3.0, sensors: Any = None, drone: Any = None, **top: Any):
+    drones = [{"name": f"d{k}", "position_m": [spacing * k, 0, 0], **(drone or {})} for k in range(count)]
+    document = {"name": "t", "duration_s": 1, "seed": seed, "drones": drones, "sensors": sensors or {"preset": "paper"}}
+    environment = {"wind": {"gust_m_s": gust}, **top.pop("environment", {})}
+    return resolve({**document, "environment": environment, **top})
+
+
+def gates(fleet, count):
+    """Advance; return all samples."""
+    out = []
+    for _ in range(count):
+        fleet.advance()
+        out += fleet.samples()
+    return out
+
+
+def flown(fleet, count=500):
+    """Return a digest of a flight with take-off and a turn."""
+    digest = hashlib.sha256()
+    for i in range(fleet.count):
+        fleet.takeoff(i)
+    for k in range(count):
+        if k > 200:
+            for i in range(fleet.count):
+                fleet.set_velocity(i, (0.5, 0.1 * i, 0.2), 0.2)
+        fleet.advance()
+        digest.update(b"".join(np.ascontiguousarray(x).tobytes() for x in fleet.truth()))
+        digest.update(repr(fleet.samples()).encode())
+    return digest.hexdigest()
+
+
+def test_at_the_start_everybody_stands_and_has_sampled_once():
+    fleet = Fleet(scenario())
+    assert fleet.t_ns == 0
+    assert fleet.names == ["d0", "d1"]
+    assert [fleet.status(i) for i in range(2)] == [("landed", 100.0, False)] * 2
+    assert [(s.drone, s.sensor) for s in fleet.samples()] == [(i, name) for i in range(2) for name in SENSORS]
+    assert {s.t_ns for s in fleet.samples()} == {0}
+    np.testing.assert_allclose(fleet.truth().position_m, [(0, 0, 0.058), (3, 0, 0.058)], atol=1e-12)
+
+
+def test_samples_are_plain_floats_of_the_right_number_in_order():
+    fleet = Fleet(scenario())
+    for sample in gates(fleet, 25):
+        assert len(sample.values) == WIDTH[sample.sensor]
+        assert all(type(x) is float for x in sample.values)
+        assert type(sample.t_ns) is int
+    fleet.advance()
+    keys = [(s.t_ns, s.drone, SENSORS.index(s.sensor)) for s in fleet.samples()]
+    assert keys == sorted(keys)
+    assert all(fleet.t_ns - GATE_NS < s.t_ns <= fleet.t_ns for s in fleet.samples())
+
+
+@pytest.mark.parametrize(("sensor", "rate"), [("imu", 200), ("gps", 5), ("mag", 25), ("flow", 15), ("sonar", 25)])
+def test_samples_fall_due_at_the_first_tick_and_never_drift(sensor, rate):
+    times = [s.t_ns for s in gates(Fleet(scenario(1)), 1000) if s.sensor == sensor]
+    tick = 2_500_000
+    due = [math.ceil(n * 1_000_000_000 / rate / tick - 1e-9) * tick for n in range(1, 20 * rate + 1)]
+    assert times == due
+
+
+def test_imu_of_a_lower_rate_shows_samples_of_the_board():
+    """At 60 Hz every third or fourth board sample is published, the very ones that 200 Hz would show."""
+    full = {s.t_ns: s.values for s in gates(Fleet(scenario(1)), 50) if s.sensor == "imu"}
+    slow = scenario(1, sensors={"preset": "paper", "imu": {"rate_hz": 60}})
+    shown = [s for s in gates(Fleet(slow), 50) if s.sensor == "imu"]
+    assert len(shown) == 60
+    assert all(full[s.t_ns] == s.values for s in shown)
+
+
+def test_a_sensor_faster_than_the_ticks_gives_several_samples_at_one():
+    fast = scenario(1, sensors={"preset": "paper", "baro": {"rate_hz": 1000}})
+    times = [s.t_ns for s in gates(Fleet(fast), 50) if s.sensor == "baro"]
+    assert len(times) == 1000
+    assert all(t % 2_500_000 == 0 for t in times)
+
+
+def test_latency_delays_publication_and_loses_nothing():
+    late = scenario(2, sensors={"preset": "paper", "gps": {"latency_ms": 211.0}, "imu": {"latency_ms": 7.0}})
+    fleet = Fleet(late)
+    out = [*fleet.samples(), *gates(fleet, 200)]
+    gps = [s for s in out if s.sensor == "gps" and s.drone == 0]
+    assert [s.t_ns - s.t_sample_ns for s in gps] == [211_000_000] * len(gps)
+    assert [s.t_sample_ns for s in gps] == [200_000_000 * n for n in range(len(gps))]
+    assert len(gps) == 19  # of 21 sampled up to 4 s, the last two are on their way
+    keys = [(s.t_ns, s.drone, SENSORS.index(s.sensor)) for s in out]
+    assert keys == sorted(keys)
+
+
+def test_latency_changes_no_value():
+    late = scenario(1, sensors={"preset": "paper", "gps": {"latency_ms": 100.0}})
+    plain = [s.values for s in gates(Fleet(scenario(1)), 100) if s.sensor == "gps"]
+    delayed = [s.values for s in gates(Fleet(late), 105) if s.sensor == "gps"]
+    assert delayed[1 : len(plain) + 1] == plain
+
+
+def test_gps_place_is_its_position_on_the_earth():
+    fleet = Fleet(scenario())
+    for sample in (s for s in gates(fleet, 30) if s.sensor == "gps"):
+        position = geodetic_to_enu(sample.values[:3], (-34.603, -58.368, 25.0))
+        np.testing.assert_allclose(position, sample.values[3:6], atol=1e-7)
+    assert fleet.gps_sigma_m == [2.0, 2.0]
+
+
+def test_barometer_is_zero_at_the_origin_and_its_pressure_that_of_the_field():
+    quiet = scenario(1, sensors={"preset": "paper", "baro": {"altitude_m": {"noise": 0.0}}})
+    pressure, altitude = next(s.values for s in Fleet(quiet).samples() if s.sensor == "baro")
+    assert altitude == pytest.approx(0.058)
+    assert pressure == pytest.approx(101325.0 * (1 - 2.25577e-5 * 25.058) ** 5.25588)
+
+
+def test_same_seed_same_bits_other_seed_other_bits():
+    assert flown(Fleet(scenario())) == flown(Fleet(scenario()))
+    assert flown(Fleet(scenario(seed=2))) != flown(Fleet(scenario(seed=1)))
+
+
+def test_gates_of_another_length_give_the_same_physics():
+    def end(gate_ms, count):
+        fleet = Fleet(scenario(time={"gate_ms": gate_ms}))
+        fleet.takeoff(0)
+        samples = gates(fleet, count)
+        return fleet.truth(), samples
+
+    (short, one), (long, other) = end(5.0, 800), end(50.0, 80)
+    for a, b in zip(short, long, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert one == other
+
+
+def test_adding_a_drone_or_a_sensor_changes_no_other_stream():
+    """Far apart nothing but random streams could couple them."""
+    apart: Any = {"spacing": 200.0}
+    alone, pair = Fleet(scenario(1, **apart)), Fleet(scenario(2, **apart))
+    alone.takeoff(0)
+    pair.takeoff(0)
+    first = gates(alone, 300)
+    assert first == [s for s in gates(pair, 300) if s.drone == 0]
+    for a, b in zip(alone.truth(), pair.truth(), strict=True):
+        np.testing.assert_array_equal(a[0], b[0])
+    other = Fleet(scenario(1, sensors={"preset": "paper", "mag": {"rate_hz": 50}}, **apart))
+    other_first = [s for s in gates(other, 1) if s.sensor == "gps" or s.sensor == "imu"]
+    assert other_first == [s for s in gates(Fleet(scenario(1, **apart)), 1) if s.sensor in ("gps", "imu")]
+
+
+def test_refusals_say_who_what_and_what_is_needed():
+    fleet = Fleet(scenario())
+    for refusal in (
+        fleet.set_velocity(0, (1, 0, 0)),
+        fleet.set_ardrone(0, 0.1, 0, 0, 0),
+        fleet.set_attitude(0, (1, 0, 0, 0), 4.0),
+        fleet.set_rotors(0, (300.0,) * 4),
+    ):
+        assert refusal == "d0 is landed; a setpoint needs it hovering or flying"
+    assert fleet.land(0) == "d0 is landed; a landing needs it in the air"
+    assert fleet.reset(0) == "d0 is landed; a reset needs an emergency"
+    assert fleet.takeoff(1) is None
+    assert fleet.takeoff(1) == "d1 is taking_off; a take-off needs it landed"
+    gates(fleet, 10)
+    assert fleet.set_velocity(1, (1, 0, 0)) == "d1 is taking_off; a setpoint needs it hovering or flying"
+    gates(fleet, 200)
+    assert "finite" in str(fleet.set_velocity(1, (math.nan, 0, 0)))
+    assert "quaternion" in str(fleet.set_attitude(1, (0, 0, 0, 0), 4.0))
+    assert fleet.land(1) is None
+    gates(fleet, 1)
+    assert fleet.land(1) is None
+    assert "landing" in str(fleet.set_velocity(1, (1, 0, 0)))
+
+
+def test_a_collision_is_told_once_when_it_begins():
+    fleet = Fleet(scenario(2, gust=0.0, spacing=2.0))
+    fleet.takeoff(0)
+    fleet.takeoff(1)
+    gates(fleet, 250)
+    assert 1.5 < fleet.min_separation_m() < 2.5
+    began, closest = [], math.inf
+    for _ in range(150):
+        fleet.set_velocity(0, (1.0, 0.0, 0.0))
+        fleet.advance()
+        closest = min(closest, fleet.min_separation_m())
+        if fleet.collisions():
+            began.append(fleet.collisions())
+            assert fleet.status(0)[2]
+            assert fleet.status(1)[2]
+    assert began[0] == [(0, 1)]
+    assert len(began) < 12
+    assert 0.42 < closest < 0.52
+    gates(fleet, 200)
+    assert not fleet.status(0)[2]
+    assert fleet.collisions() == []
+
+
+def test_a_single_drone_is_separated_from_nobody():
+    assert Fleet(scenario(1)).min_separation_m() == math.inf
+
+
+def test_wind_is_told():
+    windy = scenario(gust=0.0, environment={"wind": {"steady_m_s": [1.0, 2.0, 0.0], "gust_m_s": 0.0}})
+    np.testing.assert_array_equal(Fleet(windy).wind_m_s, [(1.0, 2.0, 0.0)] * 2)
+
+
+def test_a_diverged_state_names_drone_and_time():
+    fleet = Fleet(scenario(drone={"inertia_kg_m2": [1e-9, 1e-9, 1e-9]}, gust=0.0))
+    fleet.takeoff(1)
+    with pytest.raises(DivergedError, match=r"^d1 at \d\.\d{3} s: the state is no longer finite"):
+        gates(fleet, 500)
+
+
+def test_truth_is_a_copy():
+    fleet = Fleet(scenario())
+    before = fleet.truth()
+    kept = before.position_m.copy()
+    fleet.takeoff(0)
+    gates(fleet, 100)
+    np.testing.assert_array_equal(before.position_m, kept)
+
+
+def test_the_kernel_is_named_after_every_file_with_compiled_code():
+    folder = Path(gate.__file__).parent
+    compiled = {p.name for p in folder.glob("*.py") if "\n@compiled" in p.read_text() or p.name == "compiled.py"}
+    assert compiled <= set(gate.KERNEL_FILES)
+    assert all((folder / name).exists() for name in gate.KERNEL_FILES)
+
+
+def test_a_drone_placed_above_the_ground_falls_onto_it():
+    document = {"name": "t", "duration_s": 1, "drones": [{"name": "a", "position_m": [0, 0, 0.3]}]}
+    fleet = Fleet(resolve(document))
+    gates(fleet, 100)
+    assert fleet.truth().position_m[0, 2] == pytest.approx(0.058, abs=2e-3)

@@ -1,0 +1,277 @@
+"""The inbox: whatever the order of arrival, an agent gets the same gates with the same inputs in the same order."""
+
+import random
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from zsim import keys
+from zsim.inbox import GAP_MAX, Inbox
+from zsim.messages import Baro, Estimate, Imu, Status
+
+GATE_NS = 20_000_000
+STEP_NS = 5_000_000
+STATUS = keys.status("d1")
+IMU = keys.sensor("d1", "imu")
+
+Sent = tuple[str, Any]
+
+
+def imu(t_ns: int, seq: int) -> Imu:
+    return Imu(t_ns, seq, t_ns, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0))
+
+
+def status(t_ns: int, seq: int, count: int) -> Status:
+    return Status(t_ns, seq, "flying", 80.0, False, None, count)
+
+
+def estimate(t_ns: int, seq: int) -> Estimate:
+    return Estimate(
+        t_ns, seq, (0.0,) * 3, (0.0,) * 3, (1.0, 0.0, 0.0, 0.0), 0.0, (0.0,) * 36, 0.1, (0.0,) * 3, {}
+    )
+
+
+def gate_of(drone: str, gate: int) -> list[Sent]:
+    """Return what a drone says in a gate: four IMU samples, now and then a barometer's, and the status."""
+    t_ns = gate * GATE_NS
+    said: list[Sent] = []
+    if gate:
+        stamps = [t_ns - GATE_NS + STEP_NS * i for i in (1, 2, 3, 4)]
+        said = [(keys.sensor(drone, "imu"), imu(at, 4 * (gate - 1) + i)) for i, at in enumerate(stamps)]
+    if gate % 2:
+        said.append((keys.sensor(drone, "baro"), Baro(t_ns - STEP_NS, gate // 2, t_ns - STEP_NS, 101325.0, 1.0)))
+    return [*said, (keys.status(drone), status(t_ns, gate, len(said) + 1))]
+
+
+def flight(drones: list[str], gates: int) -> list[list[Sent]]:
+    return [[sent for drone in drones for sent in gate_of(drone, gate)] for gate in range(gates)]
+
+
+def canonical(said: list[Sent]) -> list[Sent]:
+    return sorted(said, key=lambda sent: (sent[1].t_ns, sent[0], sent[1].seq))
+
+
+def ready(inbox: Inbox) -> list[tuple[int, list[Sent]]]:
+    """Take every gate that is complete."""
+    taken = []
+    while (t_ns := inbox.next_gate_ns()) is not None and inbox.missing(t_ns) is None:
+        taken.append((t_ns, inbox.take(t_ns)))
+    return taken
+
+
+def feed(inbox: Inbox, arrivals: list[Sent]) -> list[tuple[int, list[Sent]]]:
+    """Put messages one by one, taking every gate as soon as it is complete."""
+    taken = []
+    for key, message in arrivals:
+        inbox.put(key, message)
+        taken += ready(inbox)
+    return taken
+
+
+def expected(gates: list[list[Sent]]) -> list[tuple[int, list[Sent]]]:
+    return [(gate * GATE_NS, canonical(said)) for gate, said in enumerate(gates)]
+
+
+def test_a_gate_is_handed_over_when_its_status_has_come():
+    inbox = Inbox([STATUS], ["d1"])
+    *samples, last = gate_of("d1", 1)
+    for key, message in samples:
+        assert inbox.put(key, message)
+        assert inbox.next_gate_ns() is None
+    assert inbox.put(*last)
+    assert inbox.next_gate_ns() == inbox.latest_gate_ns() == GATE_NS
+    assert inbox.missing(GATE_NS) is None
+    assert inbox.take(GATE_NS) == canonical([*samples, last])
+    assert inbox.next_gate_ns() is None
+
+
+@settings(max_examples=150, deadline=None)
+@given(seed=st.integers(0, 2**32), gates=st.integers(2, GAP_MAX), again=st.integers(0, 20))
+def test_any_order_of_arrival_gives_the_canonical_sequence(seed: int, gates: int, again: int):
+    """Gate 0 in order, then everything else shuffled, some of it twice."""
+    said = flight(["d1", "d2"], gates)
+    rest = [sent for gate in said[1:] for sent in gate]
+    rng = random.Random(seed)
+    arrivals = rest + rng.choices(rest, k=again)
+    rng.shuffle(arrivals)
+    inbox = Inbox([keys.status("d1"), keys.status("d2")], ["d1", "d2"])
+    assert feed(inbox, [*said[0], *arrivals]) == expected(said)
+    assert inbox.duplicates + inbox.late == again
+
+
+@settings(max_examples=100, deadline=None)
+@given(seed=st.integers(0, 2**32), gates=st.integers(2, GAP_MAX))
+def test_estimates_and_states_may_come_in_any_order(seed: int, gates: int):
+    """A controller reads states and estimates of three drones; nothing of its inputs is counted."""
+    drones = ["d1", "d2", "d3"]
+    closing = [keys.status(d) for d in drones] + [keys.estimate(d) for d in drones]
+    said = [
+        [(keys.status(d), status(t, gate, 9)) for d in drones] + [(keys.estimate(d), estimate(t, gate)) for d in drones]
+        for gate, t in ((gate, gate * GATE_NS) for gate in range(gates))
+    ]
+    arrivals = [sent for gate in said[1:] for sent in gate]
+    random.Random(seed).shuffle(arrivals)
+    assert feed(Inbox(closing), [*said[0], *arrivals]) == expected(said)
+
+
+def test_a_sample_that_the_status_counts_is_waited_for():
+    inbox = Inbox([STATUS], ["d1"])
+    feed(inbox, gate_of("d1", 0))
+    first, second, *rest = gate_of("d1", 1)
+    assert feed(inbox, [first, *rest]) == []
+    assert inbox.missing(GATE_NS) == STATUS
+    assert feed(inbox, [second]) == [(GATE_NS, canonical([first, second, *rest]))]
+
+
+def test_samples_of_the_next_gate_do_not_stand_in_for_missing_ones():
+    inbox = Inbox([STATUS], ["d1"])
+    feed(inbox, gate_of("d1", 0))
+    lost, *rest = gate_of("d1", 1)
+    assert feed(inbox, [*rest, *gate_of("d1", 2)]) == []
+    assert [t_ns for t_ns, _ in feed(inbox, [lost])] == [GATE_NS, 2 * GATE_NS]
+
+
+def test_without_counting_the_status_alone_closes_the_gate():
+    inbox = Inbox([STATUS])
+    *_, last = gate_of("d1", 1)
+    assert feed(inbox, [last]) == [(GATE_NS, [last])]
+
+
+def test_a_late_joiner_s_first_gate_is_not_counted():
+    inbox = Inbox([STATUS], ["d1"])
+    *_, sample, last = gate_of("d1", 7)
+    assert feed(inbox, [sample, last]) == [(7 * GATE_NS, [sample, last])]
+    lost, *rest = gate_of("d1", 8)
+    assert feed(inbox, rest) == []
+    assert [t_ns for t_ns, _ in feed(inbox, [lost])] == [8 * GATE_NS]
+
+
+def test_the_very_first_gate_is_counted_in_full():
+    inbox = Inbox([STATUS], ["d1"])
+    first = (IMU, imu(0, 0))
+    assert feed(inbox, [(STATUS, status(0, 0, 2))]) == []
+    assert feed(inbox, [first]) == [(0, [first, (STATUS, status(0, 0, 2))])]
+
+
+def test_a_warm_start_counts_its_next_gate_in_full():
+    inbox = Inbox([STATUS], ["d1"])
+    inbox.start_after(7 * GATE_NS)
+    assert not inbox.put(*gate_of("d1", 7)[-1])
+    lost, *rest = gate_of("d1", 8)
+    assert feed(inbox, rest) == []
+    assert [t_ns for t_ns, _ in feed(inbox, [lost])] == [8 * GATE_NS]
+
+
+def test_a_replay_fills_the_hole_and_brings_nothing_twice():
+    inbox = Inbox([STATUS], ["d1"])
+    said = flight(["d1"], 6)
+    taken = feed(inbox, [*said[0], *said[1]])
+    taken += feed(inbox, [*said[2][:2], *said[5]])
+    assert inbox.next_gate_ns() == 2 * GATE_NS
+    taken += feed(inbox, [sent for gate in said[1:] for sent in gate])
+    assert taken == expected(said)
+    assert inbox.late == len(said[1]) + len(said[5])
+    assert inbox.duplicates == 2
+
+
+def test_a_gate_of_which_nothing_came_is_known_by_its_gap():
+    inbox = Inbox([STATUS], ["d1"])
+    said = flight(["d1"], 4)
+    feed(inbox, said[0])
+    assert feed(inbox, said[3]) == []
+    assert inbox.next_gate_ns() == GATE_NS
+    assert inbox.latest_gate_ns() == 3 * GATE_NS
+    assert inbox.missing(GATE_NS) == STATUS
+    assert inbox.lost(GATE_NS) == STATUS
+    assert [t_ns for t_ns, _ in feed(inbox, [*said[2], *said[1]])] == [GATE_NS, 2 * GATE_NS, 3 * GATE_NS]
+
+
+def test_a_gap_that_is_given_up_is_passed_over():
+    inbox = Inbox([STATUS], ["d1"])
+    said = flight(["d1"], 4)
+    feed(inbox, [*said[0], *said[3]])
+    assert inbox.take(GATE_NS) == []
+    assert inbox.next_gate_ns() == 3 * GATE_NS
+
+
+def test_a_gap_that_no_replay_can_fill_is_a_jump():
+    inbox = Inbox([STATUS])
+    feed(inbox, gate_of("d1", 0)[-1:])
+    far = GAP_MAX + 2
+    assert [t_ns for t_ns, _ in feed(inbox, gate_of("d1", far)[-1:])] == [far * GATE_NS]
+
+
+def test_lost_names_only_what_will_not_come():
+    estimates = keys.estimate("d1")
+    inbox = Inbox([STATUS, estimates])
+    inbox.put(STATUS, status(0, 0, 1))
+    assert inbox.missing(0) == estimates
+    assert inbox.lost(0) is None
+    inbox.put(STATUS, status(GATE_NS, 1, 1))
+    assert inbox.lost(0) is None
+    inbox.put(estimates, estimate(GATE_NS, 1))
+    assert inbox.lost(0) == estimates
+
+
+def test_a_dropped_publisher_is_not_waited_for_until_it_is_back():
+    other = keys.estimate("d2")
+    inbox = Inbox([STATUS, other])
+    assert feed(inbox, [(STATUS, status(0, 0, 1))]) == []
+    inbox.ignore(other)
+    assert [t_ns for t_ns, _ in ready(inbox)] == [0]
+    inbox.expect(other, from_ns=2 * GATE_NS)
+    assert [t_ns for t_ns, _ in feed(inbox, [(STATUS, status(GATE_NS, 1, 1))])] == [GATE_NS]
+    assert feed(inbox, [(STATUS, status(2 * GATE_NS, 2, 1))]) == []
+    assert inbox.missing(2 * GATE_NS) == other
+    inbox.ignore(other)
+    inbox.expect(other)
+    assert inbox.missing(2 * GATE_NS) == other
+
+
+def test_a_dropped_drone_s_samples_are_not_waited_for():
+    inbox = Inbox([STATUS], ["d1"])
+    feed(inbox, gate_of("d1", 0))
+    _, *rest = gate_of("d1", 1)
+    assert feed(inbox, rest) == []
+    inbox.ignore(STATUS)
+    assert [t_ns for t_ns, _ in ready(inbox)] == [GATE_NS]
+
+
+def test_duplicates_and_latecomers_are_counted_and_refused():
+    inbox = Inbox([STATUS], ["d1"])
+    said = gate_of("d1", 0)
+    assert inbox.put(*said[0])
+    assert not inbox.put(*said[0])
+    assert inbox.duplicates == 1
+    inbox.take(0)
+    assert not inbox.put(*said[0])
+    assert inbox.late == 1
+    assert inbox.next_gate_ns() is None
+
+
+def test_the_same_number_at_another_time_is_another_message():
+    inbox = Inbox([STATUS])
+    assert inbox.put(IMU, imu(5, 0))
+    assert inbox.put(IMU, imu(6, 0))
+    assert inbox.put(IMU, imu(5, 1))
+    assert [message for _, message in inbox.take(10)] == [imu(5, 0), imu(5, 1), imu(6, 0)]
+
+
+def test_messages_of_gates_to_come_stay():
+    inbox = Inbox([STATUS])
+    for t_ns in (5, 30, 10, 20):
+        inbox.put(IMU, imu(t_ns, t_ns))
+    assert [message.t_ns for _, message in inbox.take(20)] == [5, 10, 20]
+    assert [message.t_ns for _, message in inbox.take(99)] == [30]
+    assert inbox.take(99) == []
+
+
+def test_a_long_backlog_is_worked_off_in_order():
+    said = flight(["d1"], 300)
+    inbox = Inbox([STATUS], ["d1"])
+    for gate in said:
+        for key, message in gate:
+            inbox.put(key, message)
+    assert inbox.latest_gate_ns() == 299 * GATE_NS
+    assert ready(inbox) == expected(said)

@@ -1,0 +1,68 @@
+"""Random streams: named, reproducible, and ignorant of each other."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from zsim.streams import NormalBlock, stream
+
+NAMES = [f"drone{n}/{sensor}" for n in (1, 2, 3) for sensor in ("imu", "gps", "mag", "wind")]
+
+
+def draws(seed: int, name: str, count: int = 8) -> list[float]:
+    return stream(seed, name).standard_normal(count).tolist()
+
+
+def test_a_stream_is_the_same_whenever_it_is_made():
+    assert draws(1, "drone1/imu") == draws(1, "drone1/imu")
+
+
+def test_the_key_of_a_stream_is_the_hash_of_its_name():
+    """First 16 bytes of `printf drone1/imu | sha256sum`, as four little-endian words."""
+    digest = "047952e0fcbae3f73afb993fb46be5c8"
+    words = [int.from_bytes(bytes.fromhex(digest[i : i + 8]), "little") for i in range(0, 32, 8)]
+    wanted = np.random.Generator(np.random.PCG64(np.random.SeedSequence(7, spawn_key=tuple(words))))
+    assert draws(7, "drone1/imu") == wanted.standard_normal(8).tolist()
+
+
+def test_names_and_seeds_give_different_streams():
+    firsts = {draws(seed, name)[0] for seed in (0, 1, 2**62) for name in NAMES}
+    assert len(firsts) == 3 * len(NAMES)
+
+
+def test_streams_are_not_correlated():
+    columns = np.array([stream(1, name).standard_normal(4000) for name in NAMES])
+    correlation = np.corrcoef(columns) - np.eye(len(NAMES))
+    assert np.abs(correlation).max() < 5 / np.sqrt(4000)
+
+
+def test_drawing_from_one_stream_changes_no_other():
+    wanted = draws(1, "drone2/gps")
+    other = stream(1, "drone1/imu")
+    other.standard_normal(1000)
+    assert draws(1, "drone2/gps") == wanted
+
+
+@settings(max_examples=100, deadline=None)
+@given(rows=st.integers(1, 20), counts=st.lists(st.integers(0, 50), max_size=12), width=st.integers(1, 5))
+def test_a_block_s_size_changes_nothing(rows: int, counts: list[int], width: int):
+    block = NormalBlock(stream(1, "x"), width, rows)
+    taken = [block.take(count) for count in counts]
+    assert [part.shape for part in taken] == [(count, width) for count in counts]
+    wanted = stream(1, "x").standard_normal((sum(counts), width))
+    assert np.concatenate([np.empty((0, width)), *taken]).tolist() == wanted.tolist()
+
+
+def test_rows_that_were_taken_do_not_change_later():
+    block = NormalBlock(stream(1, "x"), 2, rows=4)
+    first = block.take(3)
+    kept = first.copy()
+    block.take(100)
+    assert first.tolist() == kept.tolist()
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5])
+def test_a_seed_is_a_whole_number_not_below_zero(seed):
+    with pytest.raises((ValueError, TypeError)):
+        stream(seed, "x")

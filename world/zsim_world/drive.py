@@ -1,0 +1,93 @@
+"""From a wanted thrust direction to rotor commands: tilt loop, rate loop, and motors driven ahead of their lag."""
+
+import math
+
+from numpy.typing import NDArray
+
+from zsim_world import observer as ob
+from zsim_world import rotation as rot
+from zsim_world.compiled import compiled
+from zsim_world.observer import STEP_S
+from zsim_world.rigid_body import four, vector
+from zsim_world.rotation import Vector, axpy
+from zsim_world.rotors import Four, mix
+from zsim_world.vehicle import (
+    DRIVE_LAG_LEAD,
+    INERTIA_X,
+    INERTIA_Y,
+    INERTIA_Z,
+    ROTOR_LAG,
+    ROTOR_MAX,
+    ROTOR_MIN,
+)
+
+K_RATE, K_TILT = 6, 7  # columns of the firmware's settings, 1/s
+RATE_PER_LAG = 0.42  # rate gain times the overdriven lag: damping 0.77 of rate loop and rotors together
+LAG_MIN_S = 0.015  # s, three control steps: faster rotors do not make a faster loop
+LOOP_RATIO = 3.1  # of a loop's gain to that of the loop around it
+YAW_SHARE = 1 / 3.5  # of the rate gain; the rotors' own inertia makes yaw quicker: 0.04 s as tum_ardrone fitted
+BODY_RATE_MAX = 5.0  # rad/s, wanted of the tilt loop
+
+
+def loop_gains(rotor_lag_s: float) -> tuple[float, float, float]:
+    """Return the gains of rate, tilt and velocity loop [1/s] for a lag of the rotors."""
+    rate = RATE_PER_LAG / max(DRIVE_LAG_LEAD * rotor_lag_s, LAG_MIN_S)
+    return rate, rate / LOOP_RATIO, rate / LOOP_RATIO**2
+
+
+@compiled
+def drive(belief: NDArray, row: NDArray, setting: NDArray, z_des: Vector, thrust_n: float, yaw_rate: float) -> Four:
+    """Return rotor commands for a wanted z_B (heading frame), thrust [N] and yaw rate [rad/s]."""
+    q_HB = ob.level(four(belief, ob.ATTITUDE))
+    z_B = rot.rotate_back(q_HB, z_des)
+    up_B = rot.rotate_back(q_HB, (0.0, 0.0, yaw_rate))
+    w = vector(belief, ob.BODY_RATE)
+    wx, wy = -setting[K_TILT] * z_B[1], setting[K_TILT] * z_B[0]
+    size = math.sqrt(wx * wx + wy * wy)
+    s = 1.0 if size <= BODY_RATE_MAX else BODY_RATE_MAX / size
+    ix, iy, iz = row[INERTIA_X], row[INERTIA_Y], row[INERTIA_Z]
+    moment = (
+        ix * setting[K_RATE] * (s * wx + up_B[0] - w[0]) + (iz - iy) * w[1] * w[2],
+        iy * setting[K_RATE] * (s * wy + up_B[1] - w[1]) + (ix - iz) * w[2] * w[0],
+        iz * setting[K_RATE] * YAW_SHARE * (up_B[2] - w[2]) + (iy - ix) * w[0] * w[1],
+    )
+    return _overdriven(belief, row, mix(row, thrust_n, moment))
+
+
+@compiled
+def _overdriven(belief: NDArray, row: NDArray, wanted: Four) -> Four:
+    """Return commands under which the rotors move to `wanted` with a part of their lag only."""
+    lag = row[ROTOR_LAG]
+    s = (1.0 - math.exp(-STEP_S / (DRIVE_LAG_LEAD * lag))) / (1.0 - math.exp(-STEP_S / lag))
+    r = four(belief, ob.ROTOR)
+    return clipped(
+        row,
+        (
+            r[0] + s * (wanted[0] - r[0]),
+            r[1] + s * (wanted[1] - r[1]),
+            r[2] + s * (wanted[2] - r[2]),
+            r[3] + s * (wanted[3] - r[3]),
+        ),
+    )
+
+
+@compiled
+def clipped(row: NDArray, speed: Four) -> Four:
+    """Return rotor speeds [rad/s] within the rotors' limits."""
+    low, high = row[ROTOR_MIN], row[ROTOR_MAX]
+    return (
+        min(max(speed[0], low), high),
+        min(max(speed[1], low), high),
+        min(max(speed[2], low), high),
+        min(max(speed[3], low), high),
+    )
+
+
+@compiled
+def limited_tilt(z: Vector, tilt: float) -> Vector:
+    """Return the unit vector along z, no farther from the vertical than `tilt`."""
+    across = math.sqrt(z[0] * z[0] + z[1] * z[1])
+    most = max(z[2], 1e-3) * math.tan(tilt)
+    s = 1.0 if across <= most else most / across
+    z = (s * z[0], s * z[1], max(z[2], 1e-3))
+    return axpy((0.0, 0.0, 0.0), 1.0 / rot.norm(z), z)
