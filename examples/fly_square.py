@@ -17,14 +17,21 @@ from zsim.session import Mailbox, Session
 CLUSTER = "main"
 ME = "square.main"
 SIDE_M, LEG_S, HEIGHT_M = 4.0, 6.0, 3.0
+PATIENCE_S = 30
 CORNERS = ((0.0, 0.0), (SIDE_M, 0.0), (SIDE_M, SIDE_M), (0.0, SIDE_M), (0.0, 0.0))
 
 
-def ask(link: Session, op: str, **args: Any) -> None:
-    """Send a request to the controller; end with its reason where it refuses."""
-    answer = link.request(keys.cluster_control(CLUSTER), op, ME, **args)
-    if not answer.ok:
-        raise SystemExit(f"{op}: {answer.error}")
+def ask(link: Session, box: Mailbox, op: str, **args: Any) -> None:
+    """Send a request until the controller grants it; end with its reason after PATIENCE_S of simulated time."""
+    until_ns = None
+    while True:
+        answer = link.request(keys.cluster_control(CLUSTER), op, ME, **args)
+        if answer.ok:
+            return
+        t_ns = newest(box).t_ns
+        until_ns = until_ns or t_ns + PATIENCE_S * 10**9
+        if t_ns > until_ns:
+            raise SystemExit(f"{op}: {answer.error}")
 
 
 def waypoints() -> list[dict[str, Any]]:
@@ -40,34 +47,39 @@ def states(box: Mailbox) -> Iterator[messages.ClusterState]:
             yield messages.decode(sample.key, sample.payload)
 
 
-def until(box: Mailbox, phase: str, reason: str = "") -> messages.ClusterState:
-    """Return the first state in a phase, for a reason if one is given."""
-    return next(s for s in states(box) if s.phase == phase and s.reason.startswith(reason))
+def newest(box: Mailbox) -> messages.ClusterState:
+    """Return a state that has not come yet, and forget those before."""
+    for _ in box.drain():
+        pass
+    return next(states(box))
+
+
+def until(box: Mailbox, phase: str) -> messages.ClusterState:
+    """Return the first state in a phase."""
+    return next(state for state in states(box) if state.phase == phase)
 
 
 def fly(link: Session) -> None:
     box = link.subscribe(keys.cluster_state(CLUSTER))
-    until(box, "idle")
-    ask(link, "takeoff")
-    until(box, "assembling", "ready to engage")
-    ask(link, "engage")
-    until(box, "engaged")
-    ask(link, "trajectory", waypoints=waypoints())
+    ask(link, box, "takeoff")  # granted once the estimates are good enough
+    ask(link, box, "engage")  # granted once all drones have climbed to 1.5 m
+    ask(link, box, "trajectory", waypoints=waypoints())
     show(box)
-    ask(link, "land")
+    ask(link, box, "land")
     print(f"landed at t = {until(box, 'idle').t_ns / 1e9:.1f} s")
 
 
 def show(box: Mailbox) -> None:
-    """Print where the formation is at every corner, until the last."""
+    """Print where the formation is at every corner; return at the last, when the trajectory ends."""
     due_s = 0.0
     for state in states(box):
         t_s = state.trajectory_t_s
-        if t_s is not None and t_s >= due_s - 1e-6:
+        at_end = t_s is None and due_s > 0.0
+        if at_end or (t_s is not None and t_s >= due_s):
             x, y, z = state.value[:3]
             print(f"t = {state.t_ns / 1e9:6.2f} s  centroid {x:5.2f} {y:5.2f} {z:5.2f} m", flush=True)
             due_s += LEG_S
-        if due_s > LEG_S * (len(CORNERS) - 1):
+        if at_end:
             return
 
 

@@ -70,9 +70,11 @@ class Participant:
         self._gate_ns = info["gate_ns"]
         self._run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
         self._inbox: SimpleQueue[zenoh.Sample] = SimpleQueue()
+        # by default each subscriber has a thread of its own, and two of them no common order
+        in_order = zenoh.handlers.Callback(self._inbox.put, indirect=False)
         self._kept = [
-            session.declare_subscriber(f"{DRONE}/sensor/*", self._inbox.put),
-            session.declare_subscriber("zsim/clock", self._inbox.put),
+            session.declare_subscriber(f"{DRONE}/sensor/*", in_order),
+            session.declare_subscriber("zsim/clock", in_order),
             session.liveliness().declare_token(f"zsim/process/{ME}"),
         ]
         about = {"role": "foreign", "host": "here", "pid": os.getpid(), "period_ns": self._gate_ns}
@@ -80,7 +82,8 @@ class Participant:
 
     def _put(self, key: str, **fields: Any) -> None:
         self._seq[key] = self._seq.get(key, -1) + 1
-        self._session.put(key, msgpack.packb({"seq": self._seq[key], **fields}))
+        payload = msgpack.packb({"seq": self._seq[key], **fields})
+        self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def run(self) -> int:
         """Return how many gates it answered."""
@@ -111,6 +114,7 @@ def main() -> None:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", f'["{ENDPOINT}"]')
+    config.insert_json5("connect/timeout_ms", "60000")  # a world that is still starting
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config) as session:
         print(f"answered {Participant(session).run()} gates")

@@ -39,15 +39,18 @@ class RangeSensor:
         self._rng = random.Random(f"{info['seed']}/{ME}")  # a stream of its own: same seed, same noise
         self._run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
         self._inbox: SimpleQueue[zenoh.Sample] = SimpleQueue()
+        # by default each subscriber has a thread of its own, and two of them no common order
+        in_order = zenoh.handlers.Callback(self._inbox.put, indirect=False)
         expressions = [*(f"zsim/drone/{drone}/truth" for drone in PAIR), "zsim/clock"]
-        self._kept = [session.declare_subscriber(e, self._inbox.put) for e in expressions]
+        self._kept = [session.declare_subscriber(e, in_order) for e in expressions]
         self._token = session.liveliness().declare_token(f"zsim/process/{ME}")
         about = {"role": "range", "host": "here", "pid": os.getpid(), "period_ns": info["gate_ns"]}
         self._put(f"zsim/process/{ME}/join", t_ns=0, **self._run, **about)
 
     def _put(self, key: str, **fields: Any) -> None:
         self._seq[key] = self._seq.get(key, -1) + 1
-        self._session.put(key, msgpack.packb({"seq": self._seq[key], **fields}))
+        payload = msgpack.packb({"seq": self._seq[key], **fields})
+        self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
     def run(self) -> int:
         """Return how many ranges it measured."""
@@ -87,6 +90,7 @@ def main() -> None:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", f'["{ENDPOINT}"]')
+    config.insert_json5("connect/timeout_ms", "60000")  # a world that is still starting
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config) as session:
         print(f"measured {RangeSensor(session).run()} ranges")

@@ -7,6 +7,7 @@ ZsimError
 ├── SessionError       no session: port in use, nobody listens, wrong endpoint
 │   └── NoWorldError   the session is open, but no world answers
 ├── RunError           a run that could not start or did not end well
+│   └── SupersededError   another process of the same name has taken over
 ├── RecordError        a record that cannot be written or read: disk full, no MCAP file
 └── ReportError        a report that cannot be made or written
 """
@@ -42,6 +43,10 @@ class NoWorldError(SessionError):
 
 class RunError(ZsimError):
     """A run that could not start or did not end well."""
+
+
+class SupersededError(RunError):
+    """Another process of the same name has taken over."""
 
 
 class RecordError(ZsimError):

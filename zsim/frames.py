@@ -24,15 +24,15 @@ def enu_to_geodetic(position_m: ArrayLike, origin: tuple[float, float, float]) -
         position_m: p_W, shape (..., 3).
         origin: latitude_deg, longitude_deg, height_m of W's origin.
     """
-    rows = _enu_rows(origin[0], origin[1])
-    ecef = geodetic_to_ecef(origin) + np.asarray(position_m, dtype=float) @ rows
-    return ecef_to_geodetic(ecef)
+    p = np.asarray(position_m, dtype=float)[..., :, None]
+    turned = (p * _enu_rows(origin[0], origin[1])).sum(axis=-2)  # not matmul, whose bits depend on how many points
+    return ecef_to_geodetic(geodetic_to_ecef(origin) + turned)
 
 
 def geodetic_to_enu(geodetic: ArrayLike, origin: tuple[float, float, float]) -> Array:
     """Return p_W [m] of points given as latitude_deg, longitude_deg, height_m, shape (..., 3)."""
-    rows = _enu_rows(origin[0], origin[1])
-    return (geodetic_to_ecef(geodetic) - geodetic_to_ecef(origin)) @ rows.T
+    d = (geodetic_to_ecef(geodetic) - geodetic_to_ecef(origin))[..., None, :]
+    return (d * _enu_rows(origin[0], origin[1])).sum(axis=-1)
 
 
 def geodetic_to_ecef(geodetic: ArrayLike) -> Array:

@@ -16,7 +16,7 @@ from typing import Any
 from zsim import __version__, keys, messages
 from zsim.agent import Agent, Output
 from zsim.connection import read_info
-from zsim.errors import DecodeError, RunError, SessionError
+from zsim.errors import DecodeError, RunError, SessionError, SupersededError
 from zsim.fingerprint import fingerprint
 from zsim.health import HealthMeter
 from zsim.inbox import Inbox
@@ -75,7 +75,8 @@ class Runner:
         """Take part until the run ends; return why it left.
 
         Raises:
-            RunError: another process of the same name has taken over.
+            SupersededError: another process of the same name has taken over.
+            RunError: the world has begun another run.
         """
         self._subscribe()
         self._catch_up_with_former()
@@ -89,7 +90,7 @@ class Runner:
             self._over.set()
             ticker.join()
         if self._failure:
-            raise RunError(self._failure)
+            raise (SupersededError if self._leave == "superseded" else RunError)(self._failure)
         self._put_process(
             "bye", messages.Bye(max(0, self._done_ns), self._agent.next_seq("bye"), self._leave)
         )

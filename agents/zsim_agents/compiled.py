@@ -13,13 +13,16 @@ from typing import Any, TypeVar
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-SOURCES = ("madgwick.py", "dead_reckoning.py", "aiding_models.py")  # every file that uses `compiled`
+SOURCES = ("madgwick.py", "dead_reckoning.py", "aiding_models.py", "kalman_update.py")  # every file that uses `compiled`
 
 try:
     import numba
     from numba.core.caching import FunctionCache
 except ImportError:
     numba = FunctionCache = None
+
+
+COMPILES = numba is not None  # whether `compiled` compiles here
 
 
 def sources_digest(folder: Path = Path(__file__).parent) -> str:

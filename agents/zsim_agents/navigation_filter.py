@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from zsim_agents.aiding_models import DOF_MAX, within_gates
+from zsim_agents.compiled import COMPILES
 from zsim_agents.dead_reckoning import GYRO_BIAS, write_prediction
+from zsim_agents.kalman_update import stacked_update
 from zsim_agents.strapdown import Interval, Strapdown
 
 Array = NDArray[np.float64]
 
 ROWS_MAX = 32  # of one stacked update; more measurements of a gate go into a second one
-_INDEX = np.arange(ROWS_MAX)
+_NO_BLOCKS = np.zeros((0, 2), dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,6 @@ class Stack:
 
     def __init__(self, size: int) -> None:
         self.H = np.zeros((ROWS_MAX, size))
-        self.R = np.zeros((ROWS_MAX, ROWS_MAX))
         self.z: list[float] = []
         self.predicted: list[float] = []
         self.variance: list[float] = []
@@ -92,12 +93,9 @@ class Stack:
         self.blocks.append((self.rows, len(z)))
         self.rows += len(z)
 
-    def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """Return z (m,), the predictions (m,), H (m, n) and R (m, m)."""
-        m = self.rows
-        every = _INDEX[:m]
-        self.R[every, every] = self.variance
-        return np.array(self.z), np.array(self.predicted), self.H[:m], self.R[:m, :m]
+    def arrays(self) -> tuple[Array, Array, Array]:
+        """Return the innovations (m,), H (m, n) and the variances (m,)."""
+        return np.array(self.z) - self.predicted, self.H[: self.rows], np.array(self.variance)
 
 
 class NavigationFilter(ExtendedKalmanFilter):
@@ -168,17 +166,14 @@ class NavigationFilter(ExtendedKalmanFilter):
     def correct(self, stack: Stack) -> list[bool]:
         """Use the measurements of a stack; the error found is in `x` until `take_error`.
 
-        All are tried together; those whose own innovation lies outside of its gate are then taken back.
+        All are tried together; those whose own innovation lies outside of its gate are then left out.
 
         Returns:
             For each block whether it was used.
         """
-        before = self.P
-        z, predicted, H, R = stack.arrays()
-        self.update(z, lambda x: H, lambda x: predicted, R)
-        if within_gates(self.S, self.y, self._block_array(stack), self._limits, self._distances):
+        y, H, variance = stack.arrays()
+        if self._use(y, H, variance, self._block_array(stack), self._limits):
             return [True] * len(stack.blocks)
-        self.x, self.P = self._zero, before
         passed = [
             bool(distance <= self._limits[size])
             for distance, (_, size) in zip(self._distances, stack.blocks, strict=False)
@@ -186,8 +181,23 @@ class NavigationFilter(ExtendedKalmanFilter):
         used = [block for block, good in zip(stack.blocks, passed, strict=True) if good]
         kept = [row for first, size in used for row in range(first, first + size)]
         if kept:
-            self.update(z[kept], lambda x: H[kept], lambda x: predicted[kept], R[np.ix_(kept, kept)])
+            self._use(y[kept], H[kept], variance[kept], _NO_BLOCKS, self._limits)
         return passed
+
+    def _use(self, y: Array, H: Array, variance: Array, blocks: NDArray[np.int64], limits: Array) -> bool:
+        """Judge and use innovations: compiled, or by filterpy's own update where nothing can be compiled."""
+        if COMPILES:
+            used, x, P, S = stacked_update(self.P, H, variance, y, blocks, limits, self._distances)
+            self.y, self.S = y, S
+            if used:
+                self.x, self.P = x, P
+            return used
+        before = self.P
+        self.update(y, lambda x: H, lambda x: 0.0, np.diag(variance))
+        if within_gates(self.S, self.y, blocks, limits, self._distances):
+            return True
+        self.x, self.P = self._zero, before
+        return False
 
     def _block_array(self, stack: Stack) -> NDArray[np.int64]:
         """Return the stack's blocks as an array; few patterns occur, so each is made once."""

@@ -24,6 +24,7 @@ PAUSE_S = 0.01  # between two looks into the queue: nobody waits for the recorde
 TICK_S = 0.1  # how often the open chunk's age and a stop are looked at
 REPLAY_S = 5.0  # a hub answers within milliseconds
 DRAIN_S = 1.0  # after `stopped`, how long the byes of the others are waited for
+STOP_DRAIN_S = 0.5  # after it is told to stop, how long the end of the run is waited for: both may be stopped at once
 KNOWN_MAX = 100_000  # replayed messages remembered, so that none is written twice
 
 
@@ -62,6 +63,7 @@ class Recorder:
         self._known: set[tuple[str, bytes]] = set()
         self._over = threading.Event()
         self._ended_s: float | None = None
+        self._stopped_s: float | None = None
         self._now_ns = 0
         self._seq = {"join": 0, "bye": 0, "health": 0}
         self._leavers: set[str] = set()
@@ -97,10 +99,17 @@ class Recorder:
             for sample in self._box.drain():
                 self._write(sample)
             self._writer.tick(time.monotonic_ns())
-            if self._stopped():
+            if self._may_stop():
                 return "stopped"
             if self._ended_s is not None and self._all_left():
                 return "the run ended"
+
+    def _may_stop(self) -> bool:
+        """Tell whether it was told to stop and the run does not end meanwhile."""
+        if not self._stopped() or self._ended_s is not None:
+            return False
+        self._stopped_s = self._stopped_s or time.monotonic()
+        return time.monotonic() - self._stopped_s > STOP_DRAIN_S
 
     def _all_left(self) -> bool:
         """Tell whether everybody has said bye, or has had the time to."""

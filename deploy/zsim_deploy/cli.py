@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from zsim import __version__
-from zsim.errors import ZsimError
+from zsim.errors import SupersededError, ZsimError
 
 app = typer.Typer(
     name="zsim",
@@ -328,7 +328,7 @@ def main() -> None:
         app()
     except ZsimError as error:
         print(error, file=sys.stderr)
-        sys.exit(2)
+        sys.exit(3 if isinstance(error, SupersededError) else 2)
     except KeyboardInterrupt:
         sys.exit(130)
 

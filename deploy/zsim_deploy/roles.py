@@ -1,6 +1,7 @@
 """The roles as processes: what `zsim world`, `zsim estimator`, `zsim controller` and `zsim record` do."""
 
 import gc
+import os
 import sys
 import threading
 import time
@@ -130,6 +131,7 @@ def recorder(path: Path, endpoint: str, federation: str, wait_s: float | None, l
     """Record the run of the world on an endpoint into a file."""
     from zsim_agents.recorder import record
 
+    os.nice(5) if hasattr(os, "nice") else None
     leash = Leash(launched)
     say = _speaker(launched)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -23,10 +23,12 @@ POLL_S = 0.05  # how often the children are looked at
 END_S = (
     8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for
 )
-INTERRUPT_S = 2.0  # after Ctrl-C, how long anybody may take
+WORLD_FIRST_S = 1.0  # after Ctrl-C, how long the world has to end the run for everybody
+INTERRUPT_S = 2.5  # after Ctrl-C, how long anybody may take; the whole is promised within 3 s
 RESTARTS_MAX = 5  # of one role within RESTART_WINDOW_S; more is a fault that a restart does not heal
 RESTART_WINDOW_S = 20.0
 USER_FAULT = 2  # exit code of a role that refuses its arguments or cannot run at all
+SUPERSEDED = 3  # exit code of a role whose place another process of its name has taken
 
 
 @dataclass
@@ -63,7 +65,8 @@ class Run:
         self._file.write_text(scenario_file.to_text(options.scenario))
         self._reason = ""
         self._failed = False
-        self._interrupted = threading.Event()
+        self._interrupted: str | None = None
+        self._until_s: float | None = None
         self._dead: set[str] = set()
         self._children = self._make_children()
 
@@ -74,11 +77,11 @@ class Run:
                 for child in self._children:
                     child.start()
                 self._watch()
-                self._finish(INTERRUPT_S if self._interrupted.is_set() else END_S)
+                self._finish()
             finally:
                 for child in self._children:
                     child.close()
-        return Outcome(self._reason or "ended", self._failed, self._interrupted.is_set())
+        return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
 
     def _make_children(self) -> list[Child]:
         scenario, federation = self._options.scenario, self._options.scenario.federation
@@ -105,9 +108,9 @@ class Run:
         """Take Ctrl-C and SIGTERM as a wish to end the run well; a second Ctrl-C does not wait."""
 
         def on_signal(number: int, _: object) -> None:
-            if self._interrupted.is_set():
+            if self._interrupted:
                 raise KeyboardInterrupt
-            self._interrupted.set()
+            self._interrupted = "interrupted by Ctrl-C" if number == signal.SIGINT else "terminated"
 
         former = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
@@ -140,10 +143,10 @@ class Run:
         """Return when the world has ended, or when it has to."""
         world = next(child for child in self._children if child.role == "world")
         while world.code is None:
-            if self._interrupted.is_set():
-                self._reason = "interrupted by Ctrl-C"
+            if self._interrupted:
+                self._reason = self._interrupted
                 world.tell_stop(self._reason)
-                world.wait(INTERRUPT_S)
+                world.wait(min(WORLD_FIRST_S, self._left_s()))
                 return
             for child in self._children:
                 if child is not world and child.code is not None and child.name not in self._dead:
@@ -154,8 +157,10 @@ class Run:
 
     def _on_exit(self, child: Child, world: Child) -> None:
         """Do what on_death says of a role that ended while the world runs."""
-        if child.code == 0:
+        if child.code in (0, SUPERSEDED):
             self._dead.add(child.name)
+            if child.code == SUPERSEDED:
+                self._screen.say(child.last_words())
             return
         what = self._on_death(child)
         if child.code == USER_FAULT or (what == "restart" and self._too_often(child)):
@@ -182,17 +187,25 @@ class Run:
     def _fail(self, reason: str) -> None:
         self._reason, self._failed = self._reason or reason, True
 
-    def _finish(self, within_s: float) -> None:
+    def _finish(self) -> None:
         """Let everybody leave; the recorder leaves last, by itself."""
-        until_s = time.monotonic() + within_s
         for child in self._children:
-            if self._failed or self._interrupted.is_set() or child.role != "recorder":
+            if self._failed or self._interrupted or child.role != "recorder":
                 child.tell_stop(self._reason)
         for child in self._children:
-            child.wait(until_s - time.monotonic())
+            while not child.wait(min(POLL_S, self._left_s())) and self._left_s() > 0:
+                continue
         recorder = next(child for child in self._children if child.role == "recorder")
         if recorder.code not in (0, None) and recorder.name not in self._dead:
             self._fail(f"the recorder ended: {recorder.outcome()}")
+
+
+    def _left_s(self) -> float:
+        """Return how long the others may still take, now that the run is to end; Ctrl-C makes it shorter."""
+        now_s = time.monotonic()
+        latest_s = now_s + (INTERRUPT_S if self._interrupted else END_S)
+        self._until_s = latest_s if self._until_s is None else min(self._until_s, latest_s)
+        return max(0.0, self._until_s - now_s)
 
 
 def free_port(screen: Screen) -> int:

@@ -28,7 +28,8 @@ GATE_NS = 20_000_000
 IMU_NS = 5_000_000  # 200 Hz
 GATES = 150
 TAKEOFF_S = 0.5
-AIRBORNE_S = 1.0  # in the synthetic flight, when the drones have got to their height
+LIFTOFF_S = 0.6  # in the synthetic flight, when the drones leave the ground
+AIRBORNE_S = 1.0  # and when they have got to their height
 HEIGHT_M = 2.0
 GRAVITY_M_S2 = 9.80665
 
@@ -127,7 +128,7 @@ class Flight:
         return said
 
     def _height_m(self, t_ns: int) -> float:
-        return HEIGHT_M * min(1.0, max(0.0, (t_ns * 1e-9 - TAKEOFF_S) / (AIRBORNE_S - TAKEOFF_S)))
+        return HEIGHT_M * min(1.0, max(0.0, (t_ns * 1e-9 - LIFTOFF_S) / (AIRBORNE_S - LIFTOFF_S)))
 
     def _imu(self, drone: str, t_ns: int) -> tuple[str, Any]:
         key = keys.sensor(drone, "imu")
@@ -161,7 +162,7 @@ class Flight:
 
     def _status(self, drone: str, gate: int, count: int) -> tuple[str, Any]:
         t_s = gate * GATE_NS * 1e-9
-        state = "landed" if t_s < TAKEOFF_S else "taking_off" if t_s < AIRBORNE_S else "flying"
+        state = "landed" if t_s < LIFTOFF_S else "taking_off" if t_s < AIRBORNE_S else "flying"
         key = keys.status(drone)
         return key, messages.Status(gate * GATE_NS, self._next(key), state, 90.0, False, None, count)
 

@@ -1,24 +1,17 @@
 """The same scenario and seed give the same bits, wherever and in whatever order the processes run."""
 
+import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from federation import PAIR, PAIR_ROLES, Federation
+from wire import Heard, Watch
 
 DRONES = ["drone1", "drone2"]
-
-
-@pytest.fixture(scope="module")
-def sha256(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> str:
-    """The hash of PAIR flown in one process, checked against the truth on record."""
-    with Federation(tmp_path_factory.mktemp("reference")) as federation:
-        federation.run(PAIR, "--in-process").ends(with_code=0)
-        record = federation.record()
-        assert record.recomputed_sha256(DRONES) == record.sha256()
-        assert record.positions("drone1")[-1][2] > 1.0  # it flies
-        return record.sha256()
 
 
 @pytest.fixture
@@ -31,7 +24,7 @@ def busy_cores() -> Iterator[None]:
         process.wait()
 
 
-def test_as_processes(federation: Federation, sha256: str) -> None:
+def test_as_processes(federation: Federation, pair_sha256: str) -> None:
     """Every role is a process.
 
         world ──sensors──▶ estimator.drone1, .drone2 ──estimate──▶ controller.main ──velocity──▶ world
@@ -44,21 +37,21 @@ def test_as_processes(federation: Federation, sha256: str) -> None:
     federation.nobody_left()
     record = federation.record()
     assert record.complete
-    assert record.sha256() == sha256 == record.recomputed_sha256(DRONES)
+    assert record.sha256() == pair_sha256 == record.recomputed_sha256(DRONES)
     assert record.end()["last_ns"] == 12_000_000_000
 
 
 @pytest.mark.usefixtures("busy_cores")
-def test_with_loaded_cores(federation: Federation, sha256: str) -> None:
+def test_with_loaded_cores(federation: Federation, pair_sha256: str) -> None:
     """As before, while two other processes take all they can get of the machine.
 
     Expected: slower, and the same hash.
     """
     federation.run(PAIR).ends(with_code=0, within_s=180)
-    assert federation.record().sha256() == sha256
+    assert federation.record().sha256() == pair_sha256
 
 
-def test_started_by_hand_world_last(federation: Federation, sha256: str) -> None:
+def test_started_by_hand_world_last(federation: Federation, pair_sha256: str) -> None:
     """The roles are started one by one, the world when all others wait for it.
 
         controller.main │ recorder │ estimator.drone2 │ estimator.drone1 │ … │ world
@@ -76,25 +69,56 @@ def test_started_by_hand_world_last(federation: Federation, sha256: str) -> None
     world = federation.world(PAIR, "--expect", "recorder")
     for role in (world, *others):
         role.ends(with_code=0)
-    assert federation.record().sha256() == sha256
+    assert federation.record().sha256() == pair_sha256
 
 
-def test_another_seed(federation: Federation, sha256: str) -> None:
+def test_a_stopped_estimator(federation: Federation, pair_sha256: str) -> None:
+    """An estimator is stopped in flight, as in a debugger, and goes on after a while.
+
+        estimator.drone1 ──────┤ SIGSTOP        SIGCONT ├──────▶
+        clock            ──────┤ waiting_for …          ├──────▶ 12 s
+
+    Expected: time stands, `clock` names the estimator, its host, and since when; then the same hash.
+    """
+    run = federation.run(PAIR, "--rate", "10")
+    clock = federation.client().watch("clock")
+    clock.until(lambda m: m["t_ns"] > 6e9)
+    federation.kill("estimator.drone1", signal.SIGSTOP)
+    first, later = (named(clock, "estimator.drone1") for _ in range(2))
+    assert first.message["t_ns"] == later.message["t_ns"]
+    assert waited_for(first)["host"] == socket.gethostname()
+    assert waited_for(later)["since_wall_s"] - waited_for(first)["since_wall_s"] > 0.9  # told once a wall second
+    run.line(r"waiting for estimator.drone1 on .* \(\d+\.\d s\)")
+    federation.kill("estimator.drone1", signal.SIGCONT)
+    run.ends(with_code=0)
+    assert federation.record().sha256() == pair_sha256
+
+
+def named(clock: Watch, name: str) -> Heard:
+    """Return the next clock that waits for one process only, that of the name."""
+    return clock.until(lambda m: [w["name"] for w in m["waiting_for"]] == [name])
+
+
+def waited_for(heard: Heard) -> dict[str, Any]:
+    return heard.message["waiting_for"][0]
+
+
+def test_another_seed(federation: Federation, pair_sha256: str) -> None:
     """PAIR with seed 4 instead of 3.
 
     Expected: another hash.
     """
     federation.run(PAIR, "--in-process", "--seed", "4").ends(with_code=0)
-    assert federation.record().sha256() != sha256
+    assert federation.record().sha256() != pair_sha256
 
 
-def test_paced(federation: Federation, sha256: str) -> None:
+def test_paced(federation: Federation, pair_sha256: str) -> None:
     """PAIR at ten times real time: pacing is a switch of its own.
 
     Expected: no faster than asked for, and the same hash.
     """
     federation.run(PAIR, "--rate", "10").ends(with_code=0)
     record = federation.record()
-    assert record.sha256() == sha256
+    assert record.sha256() == pair_sha256
     assert record.end()["real_time_factor"] <= 10.1
     assert {event["subject"] for event in record.events("join")} == {"recorder", *PAIR_ROLES}

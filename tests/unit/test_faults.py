@@ -67,7 +67,7 @@ def test_a_sound_document_has_no_faults():
             {"parts": [{"name": "a", "mass_kg": math.nan}]},
             "parts[0].mass_kg is nan; must be a finite number > 0 and <= 100",
         ),
-        ({"parts": [{"name": "a", "mass_kg": 10**400}]}, "parts[0].mass_kg is 1000"),
+        ({"parts": [{"name": "a", "mass_kg": 10**400}]}, "parts[0].mass_kg is 1000…"),
         ({"parts": [{"name": "a", "place": [1]}]}, "parts[0].place is [1]; must be a list of 2 entries"),
         ({"parts": [{"name": "a", "place": [1, "x"]}]}, "parts[0].place[1] is 'x'; must be a finite number"),
         ({"parts": [{"name": "a", "place": [1, -math.inf]}]}, "parts[0].place[1] is -inf; must be a finite number"),
@@ -82,24 +82,20 @@ def test_a_sound_document_has_no_faults():
         ({"table": [1]}, "table is [1]; must be a map"),
         ({"series": [1]}, "series has 1 entries; must have 2"),
         ({"series": [1, 2.5]}, "series[1] is 2.5; must be a whole number"),
-        ({7: 1}, "7 is not known; allowed: count, free"),
+        ({7: 1}, "7 is not known; allowed: count, free…"),
     ],
 )
 def test_a_fault_says_where_what_and_what_is_allowed(changes: dict[str, Any], said: str):
     (only,) = [f"{path} {text}" for path, text in faults({**GOOD, **changes}, Whole)]
-    assert only.startswith(said)
-    if "1000" not in said:
-        assert only == said or said.endswith("free")
+    assert only.startswith(said[:-1]) if said.endswith("…") else only == said
     assert first_fault({**GOOD, **changes}, Whole) is not None
 
 
 def test_every_fault_is_found():
     parts = [{"name": "A", "mass_kg": -1}, {"kind": 3, "colour": 1}, 5]
     paths = [path for path, _ in faults({"parts": parts, "on": "x", "what": 1}, Whole)]
-    assert sorted(paths) == sorted(
-        ["what", "count", "parts[0].name", "parts[0].mass_kg", "parts[1].colour", "parts[1].name"]
-        + ["parts[1].kind", "parts[2]", "on"]
-    )
+    wanted = """what count on parts[0].name parts[0].mass_kg parts[1].colour parts[1].name parts[1].kind parts[2]"""
+    assert sorted(paths) == sorted(wanted.split())
 
 
 @pytest.mark.parametrize("document", [None, [], "x", 3, [{}]])
@@ -131,8 +127,10 @@ def test_limits_of_the_representation_are_not_shown():
 
 plain = st.recursive(
     st.none() | st.booleans() | st.integers(-5, 5) | st.floats(-3, 3) | st.sampled_from(["a", "big", "x" * 9]),
-    lambda inner: st.lists(inner, max_size=3)
-    | st.dictionaries(st.sampled_from(["name", "mass_kg", "place", "kind", "a"]), inner, max_size=4),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.sampled_from(["name", "mass_kg", "place", "kind", "a"]), inner, max_size=4)
+    ),
     max_leaves=6,
 )
 fields = st.sampled_from([*Whole.__struct_fields__, "other"])

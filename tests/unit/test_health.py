@@ -53,5 +53,5 @@ def test_percentiles_are_of_the_newest_steps():
 def test_memory_is_that_of_this_process():
     before = resident_bytes()
     held = bytearray(64 << 20)
-    held[:: 4096] = b"x" * len(held[:: 4096])
+    held[::4096] = b"x" * len(held[::4096])
     assert resident_bytes() - before > 32 << 20

@@ -1,4 +1,4 @@
-"""The in-memory bus: agents get each gate once, whole and in order, and the world gets their outputs, then their dones."""
+"""The in-memory bus: agents get each gate once and whole, the world their outputs and then their dones."""
 
 import os
 from collections.abc import Sequence

@@ -27,9 +27,8 @@ def status(t_ns: int, seq: int, count: int) -> Status:
 
 
 def estimate(t_ns: int, seq: int) -> Estimate:
-    return Estimate(
-        t_ns, seq, (0.0,) * 3, (0.0,) * 3, (1.0, 0.0, 0.0, 0.0), 0.0, (0.0,) * 36, 0.1, (0.0,) * 3, {}
-    )
+    zeros = (0.0, 0.0, 0.0)
+    return Estimate(t_ns, seq, zeros, zeros, (1.0, *zeros), 0.0, (0.0,) * 36, 0.1, zeros, {})
 
 
 def gate_of(drone: str, gate: int) -> list[Sent]:

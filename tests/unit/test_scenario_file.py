@@ -350,8 +350,7 @@ def test_faults_of_overrides_and_of_the_file_are_told_together():
 
 
 @settings(max_examples=100, deadline=None)
-@given(
-    text=st.text(max_size=30) | st.from_regex(r"[a-d.\[\]0-9]{1,12}=[\[\]{}a*&!1:,-]{0,8}", fullmatch=True))
+@given(text=st.text(max_size=30) | st.from_regex(r"[a-d.\[\]0-9]{1,12}=[\[\]{}a*&!1:,-]{0,8}", fullmatch=True))
 def test_any_override_is_applied_or_told(text: str):
     try:
         scenario_file.load(STEP, [text])
@@ -376,8 +375,16 @@ def test_the_fault_of_a_cluster_in_full():
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf], ids=repr)
 @pytest.mark.parametrize(
     "path",
-    ["duration_s", "environment.height_m", "environment.wind.gust_m_s", "drones.drone1.yaw_deg"]
-    + ["drones.drone1.mass_kg", "clusters.main.plan.takeoff_s", "sensors.imu.rate_hz", "time.gate_ms"],
+    [
+        "duration_s",
+        "environment.height_m",
+        "environment.wind.gust_m_s",
+        "drones.drone1.yaw_deg",
+        "drones.drone1.mass_kg",
+        "clusters.main.plan.takeoff_s",
+        "sensors.imu.rate_hz",
+        "time.gate_ms",
+    ],
 )
 def test_numbers_that_are_not_finite_are_refused(path: str, number: float):
     text = {"nan": ".nan", "inf": ".inf", "-inf": "-.inf"}[repr(number)]
@@ -456,7 +463,7 @@ def test_huge_whole_numbers_are_a_fault_and_no_crash(digits: int):
     ],
 )
 def test_a_wrong_shape_is_told(fields: dict[Any, Any], said: str):
-    assert said in only(faults_of(document(**{"clusters": []}) | fields))
+    assert said in only(faults_of(document(clusters=[]) | fields))
 
 
 def test_a_scenario_without_anything_says_all_that_is_missing():
@@ -480,25 +487,52 @@ def test_a_fault_that_all_drones_share_is_told_once():
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
-        ({"drones": [drone("a"), drone("b", 2.0), drone("a", 4.0)]}, "drones[2].name is 'a', as drones[0]; must be unique"),
-        ({"drones": [drone("a"), drone("b", 0.5)]}, "drones[1].position_m is 0.50 m from 'a'; must be >= 0.6 m (drone 'b')"),
+        (
+            {"drones": [drone("a"), drone("b", 2.0), drone("a", 4.0)]},
+            "drones[2].name is 'a', as drones[0]; must be unique",
+        ),
+        (
+            {"drones": [drone("a"), drone("b", 0.5)]},
+            "drones[1].position_m is 0.50 m from 'a'; must be >= 0.6 m (drone 'b')",
+        ),
         ({"drones": [drone("a", position_m=[0, 0, -1])]}, "drones[0].position_m[2] is -1; must be >= 0 (the ground)"),
-        ({"drones": [drone("a", mass_kg=2)]}, "drones[0].mass_kg is 2; must be < 0.747, nine tenths of what its rotors lift"),
-        ({"drones": [drone("a", rotor_min_rad_s=600)]}, "drones[0].rotor_min_rad_s is 600; must be < rotor_max_rad_s (503)"),
-        ({"sensors": {"imu": {"rate_hz": 500}}, "drones": [drone("a")]}, "drones[0].sensors.imu.rate_hz is 500; must be <= 200"),
-        ({"sensors": {"sonar": {"min_m": 7}}, "drones": [drone("a")]}, "drones[0].sensors.sonar.min_m is 7; must be < max_m (6)"),
-        ({"sensors": {"as_printed": True}, "drones": [drone("a")]}, "drones[0].sensors.as_printed is true; must be false unless"),
+        (
+            {"drones": [drone("a", mass_kg=2)]},
+            "drones[0].mass_kg is 2; must be < 0.747, nine tenths of what its rotors lift",
+        ),
+        (
+            {"drones": [drone("a", rotor_min_rad_s=600)]},
+            "drones[0].rotor_min_rad_s is 600; must be < rotor_max_rad_s (503)",
+        ),
+        (
+            {"sensors": {"imu": {"rate_hz": 500}}, "drones": [drone("a")]},
+            "drones[0].sensors.imu.rate_hz is 500; must be <= 200",
+        ),
+        (
+            {"sensors": {"sonar": {"min_m": 7}}, "drones": [drone("a")]},
+            "drones[0].sensors.sonar.min_m is 7; must be < max_m (6)",
+        ),
+        (
+            {"sensors": {"as_printed": True}, "drones": [drone("a")]},
+            "drones[0].sensors.as_printed is true; must be false unless",
+        ),
         ({"time": {"gate_ms": 7}}, "time.gate_ms is 7; must be a multiple of 5"),
         ({"time": {"physics_dt_ms": 3}}, "time.physics_dt_ms is 3; must divide 5"),
         ({"time": {"physics_dt_ms": 1e-9}}, "time.physics_dt_ms is 1e-09; must divide 5"),
         ({"report": {"window_s": [5, 5]}}, "report.window_s is [5, 5]; must be [start, end] with 0 <= start < end"),
         ({"report": {"window_s": [-1, 5]}}, "report.window_s is [-1, 5]; must be"),
         ({"processes": {"expect": ["a", "b", "a"]}}, "processes.expect[2] is 'a', as expect[0]; must be unique"),
-        ({"clusters": [{"name": "c", "drones": ["drone1", "drone9"]}]}, "clusters[0].drones[1] is 'drone9'; must be one of the drones"),
-        ({"clusters": [{"name": "c", "drones": ["drone1", "drone1"]}]}, "clusters[0].drones[1] is 'drone1', which 'c' flies already"),
+        (
+            {"clusters": [{"name": "c", "drones": ["drone1", "drone9"]}]},
+            "clusters[0].drones[1] is 'drone9'; must be one of the drones",
+        ),
+        (
+            {"clusters": [{"name": "c", "drones": ["drone1", "drone1"]}]},
+            "clusters[0].drones[1] is 'drone1', which 'c' flies already",
+        ),
         ({"clusters": [{"name": "c", "drones": ["drone1"]}]}, "clusters[0].drones has 1 entries; must have at least 2"),
     ],
-)  # fmt: skip
+)
 def test_fields_that_do_not_agree_are_told(fields: dict[str, Any], said: str):
     assert said in only(faults_of(document(**fields)))
 
@@ -527,10 +561,9 @@ def test_waypoints_go_forward_in_time():
     waypoints = [{"at_s": at, "values": {"x_c": 1}} for at in (0, 5, 5, 4, 9)]
     clusters = [{"name": "c", "drones": ["drone1", "drone2"], "plan": {"trajectory": {"waypoints": waypoints}}}]
     lines = faults_of(document(clusters=clusters))
-    assert ["waypoints[2].at_s is 5; must be > 5" in lines[0], "waypoints[3].at_s is 4; must be > 5" in lines[1]] == [
-        True,
-        True,
-    ]
+    assert len(lines) == 2
+    assert "waypoints[2].at_s is 5; must be > 5" in lines[0]
+    assert "waypoints[3].at_s is 4; must be > 5" in lines[1]
 
 
 def test_all_faults_at_once_those_between_fields_too():

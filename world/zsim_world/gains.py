@@ -115,6 +115,7 @@ def _gains(
 
     turn = np.array([[0, 1], [0, 0]], dtype=float)
     row[MAG_PSI : MAG_RATE + 1] = steady_gains(turn, np.array([tilt_walk, gyro_walk]), [([1, 0], *mag)])[0]
+    row = np.array([float(f"{x:.9g}") for x in row])  # nine digits: the same bits whatever the BLAS
     row.setflags(write=False)
     return row
 

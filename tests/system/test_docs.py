@@ -1,0 +1,508 @@
+"""The documentation is run: every command, scenario, example, link and table in README.md and docs/*.md.
+
+How a fenced block is marked, in the line that opens it:
+
+    bash run            executed as it stands, line after line; must succeed
+    bash terminals      each line is a process of its own, as in a terminal of its own, until the next heading
+    bash elsewhere      not for this machine (installs, other hosts); every `zsim` line must be one that the
+                        command line takes, and the others must be among ELSEWHERE
+    yaml, yaml part     a whole scenario; top-level sections to be put into scenarios/step.yaml
+    python              must compile
+    text, json          output and drawings, not checked
+
+A block of any other kind is a fault, so nothing is left out without a word. What `adapted` changes is all that
+differs from what is printed: endpoints, shorter durations, and no report where nobody asks for its folder.
+"""
+
+import os
+import re
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+import msgspec
+import pytest
+import typer
+import yaml
+from msgspec import inspect as types
+
+from zsim import presets, scenario, scenario_file
+from zsim_deploy.cli import app
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+RUN_S = 4.0  # simulated seconds of a run that has no other process to serve
+PATIENCE_S = 120  # wall seconds for one line on a machine that does other work as well
+KINDS = ("bash run", "bash terminals", "bash elsewhere", "yaml", "yaml part", "python", "text", "json")
+ELSEWHERE = ("apt-get install ", "git clone ", "cd ", "python3 -m venv ", ".venv/bin/pip install ", "ssh ", "scp ",
+             "rsync ", "sudo ", "zenohd ", "ufw ", "chrt ", "kill ")  # fmt: skip
+
+
+class Block(NamedTuple):
+    """A fenced block; `chapter` counts the headings before it."""
+
+    kind: str
+    text: str
+    line: int
+    chapter: int
+
+
+def blocks(page: Path) -> Iterator[Block]:
+    """Yield the fenced blocks of a page in their order."""
+    kind, first, chapter, inside = "", 0, 0, []
+    for number, line in enumerate(page.read_text().splitlines(), start=1):
+        if line.startswith("```"):
+            if kind:
+                yield Block(kind, "\n".join(inside), first, chapter)
+                kind, inside = "", []
+            else:
+                kind, first = line[3:].strip() or "without a kind", number
+        elif kind:
+            inside.append(line)
+        elif line.startswith("#"):
+            chapter += 1
+
+
+def pages_with(*kinds: str) -> list[Any]:
+    """Return the pages that hold a block of one of the kinds."""
+    return [pytest.param(p, id=p.name) for p in PAGES if any(b.kind in kinds for b in blocks(p))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_block_is_of_a_known_kind(page: Path) -> None:
+    unknown = [f"{page.name}:{b.line}: {b.kind}" for b in blocks(page) if b.kind not in KINDS]
+    assert unknown == []
+
+
+# Commands
+
+
+@pytest.mark.parametrize("page", pages_with("bash run", "bash terminals"))
+def test_commands_run(page: Path, tmp_path: Path) -> None:
+    with Desk(tmp_path) as desk:
+        chapter = 0
+        for block in blocks(page):
+            if block.chapter != chapter:
+                desk.close_terminals()
+                chapter = block.chapter
+            if block.kind == "bash run":
+                desk.run(block, page)
+            elif block.kind == "bash terminals":
+                desk.open_terminals(block, page)
+
+
+class Desk:
+    """A folder like a fresh checkout, two free ports, and the terminals that are open."""
+
+    def __init__(self, folder: Path) -> None:
+        for name in ("scenarios", "examples", "docs", "agents", "world", "zsim"):
+            (folder / name).symlink_to(ROOT / name)
+        (folder / ".venv").symlink_to(sys.prefix)
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        self._environment = {**os.environ, "PATH": path, "COLUMNS": "100"}
+        self._folder = folder
+        self._ports = free_ports(2)
+        self._terminals: list[tuple[str, Path, subprocess.Popen[bytes]]] = []
+
+    def __enter__(self) -> "Desk":
+        return self
+
+    def __exit__(self, failed: object, *_: object) -> None:
+        try:
+            if not failed:
+                self.close_terminals()
+        finally:
+            for _, _, process in self._terminals:
+                process.kill()
+                process.wait()
+
+    def run(self, block: Block, page: Path) -> None:
+        """Run a block as one script."""
+        text = "\n".join(adapted(line, self._ports, RUN_S) for line in lines(block))
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", text],
+            cwd=self._folder,
+            env=self._environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            timeout=PATIENCE_S,
+            text=True,
+        )
+        where = f"{page.name}:{block.line}"
+        assert done.returncode == 0, f"{where}: {text}\n{done.stdout}\n{self._said()}"
+
+    def open_terminals(self, block: Block, page: Path) -> None:
+        """Start every line of a block as a process; a world listens when this returns."""
+        for line in lines(block):
+            text = adapted(line, self._ports, None)
+            log = self._folder / f"terminal-{len(self._terminals)}-{time.monotonic_ns()}.log"
+            with log.open("w") as out:
+                process = subprocess.Popen(
+                    ["bash", "-c", f"exec {text}"],
+                    cwd=self._folder,
+                    env=self._environment,
+                    stdin=subprocess.DEVNULL,
+                    stdout=out,
+                    stderr=out,
+                    start_new_session=True,
+                )
+            self._terminals.append((f"{page.name}:{block.line}: {text}", log, process))
+        if re.search(r"\bzsim (run|world) ", block.text):
+            self._wait_for_port()
+
+    def _wait_for_port(self) -> None:
+        until_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until_s:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", self._ports[0])) == 0:
+                    return
+            time.sleep(0.05)
+        raise AssertionError(f"nobody listens\n{self._said()}")
+
+    def close_terminals(self) -> None:
+        """Press Ctrl-C in every terminal; each process must leave well."""
+        for _, _, process in self._terminals:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        for text, _, process in self._terminals:
+            code = process.wait(timeout=PATIENCE_S)
+            assert code in (0, 130), f"{text}: exit code {code}\n{self._said()}"
+        self._terminals.clear()
+
+    def _said(self) -> str:
+        return "\n".join(f"--- {text}\n{log.read_text()}" for text, log, _ in self._terminals)
+
+
+def lines(block: Block) -> list[str]:
+    """Return the commands of a block: comments away, continued lines joined."""
+    joined = re.sub(r"\\\n\s*", "", block.text)
+    stripped = [re.sub(r"(^|\s)#.*$", "", line).rstrip() for line in joined.splitlines()]
+    return [line for line in stripped if line]
+
+
+ANSWERED = ("estimator", "controller", "record", "keys", "echo", "hz", "pub", "ask")
+FOREIGN = ("plain_client.py", "foreign_estimator.py", "range_sensor.py")  # take the endpoint as an argument
+OURS = ("my_estimator.py", "fly_square.py")
+
+
+def adapted(line: str, ports: tuple[int, int], longest_s: float | None) -> str:
+    """Return a command with this test's endpoints, no longer than longest_s where that is given."""
+    endpoint = f"tcp/127.0.0.1:{ports[0]}"
+    own = "7447" in line
+    line = line.replace("0.0.0.0", "127.0.0.1").replace("7447", str(ports[0])).replace("7448", str(ports[1]))
+    line = re.sub(r"\bmake (\w+)", rf"make -n -C {ROOT} \1 >/dev/null", line)
+    line = re.sub(r"\bzsim (run)\b(?!.*--in-process)", rf"zsim \1 --listen {endpoint}", line)
+    if longest_s is not None and re.search(r"\bzsim run\b", line):
+        line = re.sub(r"--duration \S+", "", line) + f" --duration {longest_s:g}"
+    if " --out " not in line:
+        line = re.sub(r"\bzsim run\b", "zsim run --no-report", line)
+    if not own:
+        line = re.sub(r"\bzsim world\b", f"zsim world --listen {endpoint}", line)
+        line = re.sub(rf"\bzsim ({'|'.join(ANSWERED)})\b", rf"zsim \1 --connect {endpoint}", line)
+        line = re.sub(rf"({'|'.join(map(re.escape, FOREIGN))})", rf"\1 {endpoint}", line)
+        line = re.sub(rf"({'|'.join(map(re.escape, OURS))})", rf"\1 --connect {endpoint}", line)
+    return re.sub(r"\bzsim (keys|echo|hz|pub|ask)\b", rf"zsim \1 --wait {PATIENCE_S}", line)
+
+
+def free_ports(count: int) -> tuple[int, ...]:
+    """Return ports that nobody listens on now."""
+    probes = [socket.socket() for _ in range(count)]
+    for probe in probes:
+        probe.bind(("127.0.0.1", 0))
+    ports = tuple(probe.getsockname()[1] for probe in probes)
+    for probe in probes:
+        probe.close()
+    return ports
+
+
+@pytest.mark.parametrize("page", pages_with("bash elsewhere"))
+def test_commands_for_other_machines_are_ones_that_exist(page: Path) -> None:
+    for block in blocks(page):
+        if block.kind == "bash elsewhere":
+            for line in lines(block):
+                where = f"{page.name}:{block.line}: {line}"
+                if re.match(r"(\S*/)?zsim ", line):
+                    assert parses(shlex.split(line)[1:]), where
+                else:
+                    assert line.startswith(ELSEWHERE), f"{where}: add its command to ELSEWHERE"
+
+
+def parses(arguments: list[str]) -> bool:
+    """Tell whether the command line takes the arguments; nothing is run."""
+    group = typer.main.get_command(app)
+    assert isinstance(group, click.Group)
+    command = group.commands[arguments[0]]
+    with command.make_context(arguments[0], arguments[1:]):
+        return True
+
+
+def test_every_example_is_run_by_a_page() -> None:
+    run = "\n".join(b.text for p in PAGES for b in blocks(p) if b.kind in ("bash run", "bash terminals"))
+    left_out = [e.name for e in sorted((ROOT / "examples").glob("*.*")) if f"examples/{e.name}" not in run]
+    assert left_out == []
+
+
+def test_every_command_of_the_command_line_is_shown() -> None:
+    group = typer.main.get_command(app)
+    assert isinstance(group, click.Group)
+    shown = "\n".join(b.text for p in PAGES for b in blocks(p) if b.kind.startswith("bash"))
+    assert [name for name in group.commands if f"zsim {name}" not in shown] == []
+
+
+# Scenarios
+
+
+def scenario_blocks() -> list[Any]:
+    return [
+        pytest.param(block, id=f"{page.name}:{block.line}")
+        for page in PAGES
+        for block in blocks(page)
+        if block.kind in ("yaml", "yaml part")
+    ]
+
+
+@pytest.mark.parametrize("block", scenario_blocks())
+def test_scenarios_are_valid(block: Block) -> None:
+    from zsim.messages import Info
+    from zsim_agents.controller import Controller
+
+    given = yaml.safe_load(block.text)
+    base = yaml.safe_load((ROOT / "scenarios/step.yaml").read_text()) if block.kind == "yaml part" else {}
+    resolved = scenario_file.resolve({**base, **given})
+    info = msgspec.convert({**_INFO, "seed": resolved.seed}, Info)
+    for cluster in resolved.clusters:
+        Controller(info, resolved, cluster.name)  # checks the names and expressions of the plan
+
+
+_INFO: dict[str, Any] = {
+    "t_ns": 0,
+    "seq": 0,
+    "contract": 1,
+    "run_id": "docs",
+    "federation": "zsim",
+    "mode": "lockstep",
+    "rate": 0.0,
+    "gate_ns": 20_000_000,
+    "physics_dt_ns": 2_500_000,
+    "command_delay_ns": 20_000_000,
+    "origin": {"latitude_deg": 0.0, "longitude_deg": 0.0, "height_m": 0.0},
+    "drones": [],
+    "clusters": [],
+    "scenario": "",
+    "scenario_sha256": "",
+    "version": "",
+    "fingerprint": "",
+}
+
+
+# The reference of fields: a table after `<!-- fields: Name -->` for each section of zsim/scenario.py
+
+SECTIONS = {
+    name: section
+    for name, section in vars(scenario).items()
+    if isinstance(section, type) and issubclass(section, scenario.Spec) and section is not scenario.Spec
+}
+UNITS = {
+    "_kg_m2": "kg m²", "_kg_m3": "kg/m³", "_n_s_m": "N s/m", "_nm_s2": "N m s²", "_n_s2": "N s²", "_1_s2": "1/s²",
+    "_1_s": "1/s", "_rad_s": "rad/s", "_deg_s": "deg/s", "_m_s2": "m/s²", "_m_s": "m/s", "_deg": "deg", "_mah": "mAh",
+    "_percent": "%", "_kg": "kg", "_hz": "Hz", "_ms": "ms", "_ut": "µT", "_m": "m", "_s": "s",
+}  # fmt: skip
+OWN_UNITS = {
+    "noise": "channel's", "density": "channel's/√Hz", "bias": "channel's", "bias_walk": "channel's/√s",
+    "quantum": "channel's", "madgwick_beta": "rad/s", "values": "m, rad", "target": "m, rad",
+}  # fmt: skip
+BY_PRESET = {"rate_hz", "imu", "gps", "mag", "baro", "sonar", "flow"}  # required once the preset is applied
+
+
+def reference() -> dict[str, list[list[str]]]:
+    """Return the rows of every table of fields in docs/scenario.md, by section."""
+    text = (ROOT / "docs/scenario.md").read_text()
+    tables = re.findall(r"<!-- fields: (\w+) -->\n\n?((?:\|.*\n)+)", text)
+    return {
+        name: [[cell.strip() for cell in row.strip("|").split("|")] for row in body.splitlines()[2:]]
+        for name, body in tables
+    }
+
+
+def test_every_section_of_a_scenario_has_its_table() -> None:
+    assert sorted(reference()) == sorted(set(SECTIONS) - {"Document"})
+
+
+@pytest.mark.parametrize("name", sorted(set(SECTIONS) - {"Document"}))
+def test_the_table_of_a_section_says_what_the_code_says(name: str) -> None:
+    written = [row[:4] for row in reference()[name]]
+    assert written == list(rows(name))
+    assert all(row[4] for row in reference()[name]), "a field without a word about it"
+
+
+def rows(name: str) -> Iterator[list[str]]:
+    """Yield field, unit, default and limits of a section, as the reference is to show them."""
+    section = SECTIONS[name]
+    inherited = {f.name for f in msgspec.structs.fields(scenario.Sensor)} if name in _SENSORS else set()
+    infos = types.type_info(section)
+    assert isinstance(infos, types.StructType)
+    by_name = {f.name: f.type for f in infos.fields}
+    for entry in msgspec.structs.fields(section):
+        if entry.name not in inherited:
+            yield [f"`{entry.name}`", unit(entry.name), default(name, entry), allowed(by_name[entry.name])]
+
+
+_SENSORS = ("Imu", "Gps", "Mag", "Baro", "Sonar", "Flow")
+
+
+def unit(name: str) -> str:
+    found = [text for suffix, text in UNITS.items() if name.endswith(suffix)]
+    return OWN_UNITS.get(name) or (found[0] if found else "–")
+
+
+def default(section: str, entry: Any) -> str:
+    if entry.default is msgspec.NODEFAULT and entry.default_factory is msgspec.NODEFAULT:
+        return _required(section, entry.name)
+    value = entry.default_factory() if entry.default is msgspec.NODEFAULT else entry.default
+    return "see there" if isinstance(value, msgspec.Struct) else f"`{shown(value)}`"
+
+
+def _required(section: str, name: str) -> str:
+    if section == "Sensors" and name == "preset":
+        return "`ardrone2`"
+    if section in ("Sensor", "Sensors") and name in BY_PRESET:
+        return "of the preset"
+    return "of the scenario" if (section, name) == ("Drone", "sensors") else "required"
+
+
+def shown(value: Any) -> str:
+    """Return a value as YAML writes it in one line."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(shown, value))}]"
+    if isinstance(value, bool) or value is None or isinstance(value, dict):
+        return {None: "null", True: "true", False: "false"}.get(value) if not isinstance(value, dict) else "{}"  # type: ignore[return-value]
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+def allowed(info: types.Type) -> str:
+    """Return the limits of a type in words."""
+    if isinstance(info, types.UnionType):
+        options = [t for t in info.types if not isinstance(t, types.NoneType)]
+        return ", ".join([*map(allowed, options), "`null`"])
+    if isinstance(info, types.FloatType | types.IntType):
+        return _number(info)
+    if isinstance(info, types.TupleType):
+        return f"{len(info.item_types)} of: {allowed(info.item_types[0])}"
+    if isinstance(info, types.ListType):
+        return f"list of: {allowed(info.item_type)}{_length(info)}"
+    if isinstance(info, types.DictType):
+        return f"map of: {allowed(info.value_type)}"
+    if isinstance(info, types.StructType):
+        return f"[{info.cls.__name__}](#{info.cls.__name__.lower()})"
+    if isinstance(info, types.LiteralType):
+        return ", ".join(f"`{value}`" for value in info.values)
+    if isinstance(info, types.StrType):
+        return "name" if info.pattern else "text"
+    assert isinstance(info, types.BoolType)
+    return "`true`, `false`"
+
+
+def _number(info: types.FloatType | types.IntType) -> str:
+    low = info.gt if info.ge is None else info.ge
+    high = info.lt if info.le is None else info.le
+    parts = ["whole number" if isinstance(info, types.IntType) else "number"]
+    if low is not None and abs(low) < scenario.LARGE:
+        parts.append(f"{'>' if info.ge is None else '≥'} {low:g}")
+    if high is not None and high == 2**62:
+        parts.append("≤ 2^62")
+    elif high is not None and abs(high) < scenario.LARGE:
+        parts.append(f"{'<' if info.le is None else '≤'} {high:,.0f}" if high >= 1e4 else f"{'<' if info.le is None else '≤'} {high:g}")
+    return " ".join(parts[:2]) + "".join(f", {part}" for part in parts[2:])
+
+
+def _length(info: types.ListType) -> str:
+    least = f", at least {info.min_length}" if info.min_length else ""
+    return least + (f", at most {info.max_length}" if info.max_length else "")
+
+
+def test_the_presets_are_written_as_they_are() -> None:
+    text = (ROOT / "docs/scenario.md").read_text()
+    table = re.search(r"<!-- presets -->\n\n?((?:\|.*\n)+)", text)
+    assert table
+    written = [[cell.strip() for cell in row.strip("|").split("|")] for row in table[1].splitlines()[2:]]
+    assert written == list(preset_rows())
+
+
+def preset_rows() -> Iterator[list[str]]:
+    """Yield every value that a preset sets: path, then the value in each preset, – where it keeps the default."""
+    flat = {name: dict(_flat(preset)) for name, preset in presets.PRESETS.items()}
+    printed = dict(_flat(presets.AS_PRINTED))
+    paths = list(dict.fromkeys(path for values in flat.values() for path in values))
+    for path in paths:
+        cells = [f"{flat[name][path]:g}" if path in flat[name] else "–" for name in ("ardrone2", "paper")]
+        if path in printed:
+            cells[1] += f" (`as_printed`: {printed[path]:.4g})"
+        yield [f"`{path}`", *cells]
+
+
+def _flat(value: dict[str, Any], path: str = "") -> Iterator[tuple[str, float]]:
+    for name, item in value.items():
+        if isinstance(item, dict):
+            yield from _flat(item, f"{path}{name}.")
+        else:
+            yield f"{path}{name}", item
+
+
+# Links, files and names
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    """Links to files and headings exist; a link whose text is a name in code leads to a file that defines it."""
+    prose = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    faults = []
+    for text, link in re.findall(r"!?\[([^\]]*)\]\(([^)\s]+)\)", prose):
+        if re.match(r"[a-z]+:", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        if not target.exists():
+            faults.append(f"{link}: no such file")
+        elif anchor and anchor not in anchors(target):
+            faults.append(f"{link}: no such heading")
+        elif target.suffix == ".py" and text.startswith("`") and not defines(target, text.strip("`")):
+            faults.append(f"{link}: does not define {text}")
+    assert faults == []
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of the headings of a page, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def defines(file: Path, name: str) -> bool:
+    """Tell whether a file defines the last part of a dotted name; a path to the file itself counts."""
+    last = name.removesuffix("()").rsplit(".", 1)[-1]
+    code = file.read_text()
+    return str(file).endswith(name) or re.search(rf"^\s*(class|def) {last}\b|^{last}\b.*=", code, re.MULTILINE) is not None
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_that_are_named_exist(page: Path) -> None:
+    named = re.findall(r"`((?:zsim|world|agents|deploy|examples|scenarios|docs|tests|benchmarks)/[\w/.-]+\.\w+)`", page.read_text())
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+@pytest.mark.parametrize("page", pages_with("python"))
+def test_python_compiles(page: Path) -> None:
+    for block in blocks(page):
+        if block.kind == "python":
+            compile(block.text, f"{page.name}:{block.line}", "exec")
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 150

@@ -1,0 +1,155 @@
+"""kill -9 of every process of a run: the rest says so in time, does what on_death says, and leaves nothing behind."""
+
+import signal
+
+import numpy as np
+import pytest
+from federation import PAIR, Federation, Record, Role
+from wire import Client, Heard, Watch
+
+SAID_WITHIN_S = 2.0  # wall time from the kill until the rest says so
+INTERRUPTED_WITHIN_S = 3.0  # wall time from Ctrl-C until the whole run has ended
+JUMP_MAX_M = 0.5  # truth of a run with a restart against the run without
+ENGAGED_NS = 6_000_000_000
+
+pytestmark = pytest.mark.xdist_group("serial")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> dict[str, np.ndarray]:
+    """True positions of PAIR when nobody is killed."""
+    with Federation(tmp_path_factory.mktemp("undisturbed")) as federation:
+        federation.run(PAIR, "--in-process").ends(with_code=0)
+        record = federation.record()
+        return {drone: record.positions(drone) for drone in ("drone1", "drone2")}
+
+
+class Flight:
+    """PAIR under way at four times real time, formation engaged, with a foreign program that listens."""
+
+    def __init__(self, federation: Federation, *options: str) -> None:
+        self.run: Role = federation.run(PAIR, "--rate", "4", *options)
+        self.client: Client = federation.client()
+        self.clock: Watch = self.client.watch("clock")
+        self.events: Watch = self.client.watch("world/event")
+        self.clock.until(lambda m: m["t_ns"] >= ENGAGED_NS)
+
+    def event(self, kind: str, subject: str) -> Heard:
+        return self.events.until(lambda m: (m["kind"], m["subject"]) == (kind, subject))
+
+    def stands_for(self, name: str) -> Heard:
+        return self.clock.until(lambda m: name in [w["name"] for w in m["waiting_for"]])
+
+
+def check_end(federation: Federation, whole: bool) -> Record:
+    """Check that nobody is left and that the record can be read; return it."""
+    federation.nobody_left()
+    record = federation.record()
+    assert record.all("drone/drone1/truth")[-1]["t_ns"] >= ENGAGED_NS - 1_000_000_000
+    if whole:
+        assert record.end()["last_ns"] == 12_000_000_000
+    return record
+
+
+@pytest.mark.parametrize("name", ["estimator.drone1", "controller.main"])
+def test_restart(federation: Federation, undisturbed: dict[str, np.ndarray], name: str) -> None:
+    flight = Flight(federation)
+    killed_s = federation.kill(name)
+    death = flight.event("death", name)
+    assert death.wall_s - killed_s < SAID_WITHIN_S
+    assert death.message["data"]["on_death"] == "restart"
+    assert flight.run.line(f"{name} .*(died|ended: killed by signal 9).*restart").wall_s - killed_s < SAID_WITHIN_S
+    flight.run.ends(with_code=0)
+    record = check_end(federation, whole=True)
+    assert [event["subject"] for event in record.events("restart")] == [name]
+    for drone, wanted in undisturbed.items():
+        found = record.positions(drone)
+        assert np.max(np.linalg.norm(found - wanted, axis=1)) < JUMP_MAX_M
+    log = (federation.out / "logs" / f"{name}.log").read_text()
+    assert "warm start from t = " in log
+
+
+@pytest.mark.parametrize("name", ["estimator.drone1", "controller.main"])
+def test_wait(federation: Federation, name: str) -> None:
+    flight = Flight(federation, "--set", f"processes.on_death={{{name}: wait}}")
+    killed_s = federation.kill(name)
+    standing = flight.stands_for(name)
+    assert standing.wall_s - killed_s < SAID_WITHIN_S
+    entry = next(w for w in standing.message["waiting_for"] if w["name"] == name)
+    assert entry["host"]
+    later = flight.stands_for(name)
+    assert later.message["t_ns"] == standing.message["t_ns"]
+    assert next(w for w in later.message["waiting_for"] if w["name"] == name)["since_wall_s"] > entry["since_wall_s"]
+    role, thing = name.split(".")
+    again = federation.role(role, thing)
+    flight.run.ends(with_code=0)
+    again.ends(with_code=0)
+    assert [event["subject"] for event in check_end(federation, whole=True).events("restart")] == [name]
+
+
+@pytest.mark.parametrize("name", ["estimator.drone1", "controller.main"])
+def test_drop(federation: Federation, name: str) -> None:
+    flight = Flight(federation, "--set", f"processes.on_death={{{name}: drop}}")
+    killed_s = federation.kill(name)
+    assert flight.event("drop", name).wall_s - killed_s < SAID_WITHIN_S
+    flight.run.ends(with_code=0)
+    record = check_end(federation, whole=True)
+    assert record.events("restart") == []
+
+
+@pytest.mark.parametrize("name", ["estimator.drone1", "controller.main", "recorder"])
+def test_end(federation: Federation, name: str) -> None:
+    own = [] if name == "recorder" else ["--set", f"processes.on_death={{{name}: end}}"]  # a recorder's death ends it
+    flight = Flight(federation, *own)
+    killed_s = federation.kill(name)
+    assert flight.event("death", name).wall_s - killed_s < SAID_WITHIN_S
+    assert flight.run.line(f"{name}.*(died|ended)").wall_s - killed_s < SAID_WITHIN_S
+    flight.run.ends(with_code=1)
+    assert f"ended: {name} " in flight.run.text()
+    check_end(federation, whole=False)
+
+
+def test_world(federation: Federation) -> None:
+    flight = Flight(federation)
+    killed_s = federation.kill("world")
+    assert flight.run.line("the world died: killed by signal 9").wall_s - killed_s < SAID_WITHIN_S
+    flight.run.ends(with_code=1)
+    check_end(federation, whole=False)
+
+
+def test_launcher(federation: Federation) -> None:
+    flight = Flight(federation)
+    flight.run.signal(signal.SIGKILL)
+    end = flight.events.until(lambda m: m["kind"] == "end")
+    assert end.message["data"]["reason"] == "the launcher is gone"
+    record = check_end(federation, whole=False)
+    assert record.complete
+    assert record.end()["reason"] == "the launcher is gone"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt(federation: Federation, number: signal.Signals) -> None:
+    flight = Flight(federation)
+    asked_s = flight.run.signal(number)
+    assert flight.run.ends(with_code=130) - asked_s < INTERRUPTED_WITHIN_S
+    record = check_end(federation, whole=False)
+    assert record.complete
+    assert record.end()["reason"] == {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}[number]
+
+
+def test_interrupt_while_time_stands(federation: Federation) -> None:
+    flight = Flight(federation)
+    federation.kill("estimator.drone2", signal.SIGSTOP)
+    flight.stands_for("estimator.drone2")
+    asked_s = flight.run.signal(signal.SIGINT)
+    assert flight.run.ends(with_code=130) - asked_s < INTERRUPTED_WITHIN_S
+    check_end(federation, whole=False)
+
+
+def test_two_interrupts(federation: Federation) -> None:
+    flight = Flight(federation)
+    federation.kill("world", signal.SIGSTOP)
+    asked_s = flight.run.signal(signal.SIGINT)
+    flight.run.signal(signal.SIGINT)
+    assert flight.run.ends(with_code=130) - asked_s < INTERRUPTED_WITHIN_S
+    check_end(federation, whole=False)

@@ -1,0 +1,46 @@
+"""The compiled update against filterpy's own."""
+
+import numpy as np
+import pytest
+from filterpy.kalman import ExtendedKalmanFilter
+
+from zsim_agents.kalman_update import stacked_update
+
+LIMITS = np.full(7, 1e9)  # gates that nothing misses
+
+
+def problem(seed: int, n: int, m: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(n, n))
+    H = rng.normal(size=(m, n)) * (rng.random((m, n)) < 0.4)
+    return root @ root.T + 0.1 * np.eye(n), H, rng.uniform(0.01, 4.0, m), rng.normal(size=m)
+
+
+@pytest.mark.parametrize(("n", "m"), [(12, 1), (12, 3), (12, 11), (15, 6), (15, 17)])
+@pytest.mark.parametrize("seed", range(5))
+def test_it_is_filterpys_update(seed: int, n: int, m: int):
+    P, H, variance, y = problem(seed, n, m)
+    reference = ExtendedKalmanFilter(n, m)
+    reference.x, reference.P = np.zeros(n), P.copy()
+    reference.update(y, lambda x: H, lambda x: 0.0, np.diag(variance))
+    blocks = np.array([(i, 1) for i in range(m)])
+    used, x, updated, S = stacked_update(P, H, variance, y, blocks, LIMITS, np.zeros(m))
+    assert used
+    scale = np.abs(P).max()
+    assert x == pytest.approx(reference.x, rel=1e-9, abs=1e-12)
+    assert updated == pytest.approx(reference.P, rel=1e-9, abs=1e-11 * scale)
+    assert pytest.approx(reference.S, rel=1e-12, abs=1e-12) == S
+
+
+def test_an_innovation_outside_of_its_gate_changes_nothing():
+    P, H, variance, y = problem(1, 12, 4)
+    before = P.copy()
+    y[2] = 1e3
+    distances = np.zeros(4)
+    blocks = np.array([(0, 2), (2, 2)])
+    limits = np.array([0.0, 15.0, 18.0, 21.0, 23.0, 25.0, 27.0])
+    used, x, after, _ = stacked_update(P, H, variance, y, blocks, limits, distances)
+    assert not used
+    assert distances[1] > 18.0
+    assert not x.any()
+    assert np.array_equal(after, before)
