@@ -14,6 +14,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim_agents.compiled import compiled
+
 Array = NDArray[np.float64]
 
 TAU = 2 * math.pi
@@ -34,7 +36,8 @@ class ClusterSpace(ABC):
         names: their names in the order of c; lengths in metres, angles in radians.
         angular: (4n,) bool, true for the angles that wrap (roll, yaw, phi_i, azimuth_k).
         in_radians: (4n,) bool, true for all angles, also those that do not wrap (pitch, beta, elevation_k).
-        bounds: (4n,) pairs, open bounds of the values that `forward` can give, infinite where there is none.
+        bounds: (4n, 2) open bounds of the values that `forward` can give, infinite where there is none.
+        tilts: places of roll and pitch in c.
         spread_text: what `spread` measures, in words for messages.
     """
 
@@ -46,7 +49,8 @@ class ClusterSpace(ABC):
         self.angular = np.array([_stem(name) in {"roll", "yaw", "phi", "azimuth"} for name in names])
         self.in_radians = self.angular | np.array([_stem(name) in _BOUNDED_ANGLES for name in names])
         self._period = np.where(self.angular, TAU, 0.0)
-        self.bounds = tuple(_BOUNDS.get(_stem(name), (-math.inf, math.inf)) for name in names)
+        self.bounds = np.array([_BOUNDS.get(_stem(name), (-math.inf, math.inf)) for name in names])
+        self.tilts = tuple(i for i, name in enumerate(names) if name in {"roll", "pitch"})
         self._lengths = [i for i, name in enumerate(names) if _stem(name) in {"p", "q", "rho"}]
         self._pitch = self.names.index("pitch")
 
@@ -112,7 +116,7 @@ class ClusterSpace(ABC):
 
     def wrapped(self, c: Array) -> Array:
         """Return c (4n,) with the angles that wrap taken to [-pi, pi]."""
-        return c - self._period * np.round(c / TAU)
+        return wrapped(c, self._period)
 
     def index(self, name: str) -> int:
         """Return the place of a variable in c.
@@ -143,14 +147,29 @@ def cluster_space(n: int) -> ClusterSpace:
 def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Array]:
     """Return velocities (n, 3) [m/s, W] and yaw rates (n,) [rad/s] of the robots of c moving at c_dot."""
     r_dot = (space.inverse_jacobian(c) @ c_dot).reshape(space.n, 4)
-    return r_dot[:, :3], r_dot[:, 3]
+    return r_dot[:, :3].copy(), r_dot[:, 3].copy()
 
 
+@compiled
+def wrapped(c: Array, period: Array) -> Array:
+    """Return c with each variable taken to half a period about zero; period is 2 pi or, for none, 0."""
+    taken = np.empty(c.size)
+    for k in range(c.size):
+        taken[k] = c[k] - period[k] * np.rint(c[k] / TAU)
+    return taken
+
+
+@compiled
 def closest_pair(p_W: Array) -> tuple[float, int, int]:
     """Return the least distance [m] between two of the positions (n, 3), and the indices of that pair."""
-    points = p_W.tolist()
-    pairs = ((math.dist(points[i], points[j]), i, j) for j in range(len(points)) for i in range(j))
-    return min(pairs)
+    least, first, second = math.inf, 0, 1
+    for i in range(p_W.shape[0]):
+        for j in range(i + 1, p_W.shape[0]):
+            x, y, z = p_W[j, 0] - p_W[i, 0], p_W[j, 1] - p_W[i, 1], p_W[j, 2] - p_W[i, 2]
+            distance = math.sqrt(x * x + y * y + z * z)
+            if distance < least:
+                least, first, second = distance, i, j
+    return least, first, second
 
 
 def numbered(stem: str, robots: Iterable[int]) -> list[str]:

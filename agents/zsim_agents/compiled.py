@@ -13,7 +13,20 @@ from typing import Any, TypeVar
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-SOURCES = ("madgwick.py", "dead_reckoning.py", "aiding_models.py", "kalman_update.py")  # every file that uses `compiled`
+SOURCES = (  # every file that uses `compiled`
+    "aiding_models.py",
+    "cluster_frame.py",
+    "cluster_space.py",
+    "dead_reckoning.py",
+    "flight_judge.py",
+    "formation.py",
+    "kalman_update.py",
+    "madgwick.py",
+    "pair_cluster.py",
+    "reference_check.py",
+    "trajectory.py",
+    "triad_cluster.py",
+)
 
 try:
     import numba

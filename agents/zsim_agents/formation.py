@@ -10,14 +10,36 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from zsim_agents.cluster_frame import Vector, between, length
 from zsim_agents.cluster_space import Array, ClusterSpace
+from zsim_agents.compiled import compiled
 
 Pairs = tuple[tuple[int, int], ...]
 
+Order = NDArray[np.int64]
+
+NEAR_M = 1e-6  # robots that are nearer have no direction from one to the other
+SETTLED_M_S = 1e-9  # a rate that lacks less is reached
+LOAD_MIN = 1e-9  # against division by zero
 GUARD_SWEEPS = 4  # passes over all pairs; one settles two robots, three robots in a corner need a few
+
+
+class Limits(NamedTuple):
+    """What the saturation and the guard keep, of the gains below, for compiled code."""
+
+    speed_max_m_s: float
+    climb_max_m_s: float
+    yaw_rate_max_rad_s: float
+    separation_min_m: float
+    separation_alarm_m: float
+    guard_horizon_s: float
+    response_s: float
 
 
 @dataclass(frozen=True)
@@ -46,6 +68,11 @@ class FormationGains:
     separation_alarm_m: float = 1.5
     guard_horizon_s: float = 1.0
     response_s: float = 0.3
+
+    @cached_property
+    def limits(self) -> Limits:
+        """Return what the saturation and the guard keep."""
+        return Limits(*(float(getattr(self, name)) for name in Limits._fields))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,30 +118,20 @@ class FormationLaw:
         """
         error = self.space.difference(c_des, c)
         c_dot = c_dot_des + self.gains.k_1_s * error + self.integral
-        r_dot = (self.space.inverse_jacobian(c) @ c_dot).reshape(self.space.n, 4)
-        factor = min(1.0, 1.0 / max(load(r_dot[:, :3], r_dot[:, 3], self.gains), 1e-9))
-        r_dot *= factor
-        v_cmd_W, guarded, alarmed = guard(p_W, v_W, r_dot[:, :3], self.gains)
-        yaw_rate = r_dot[:, 3]
-        if guarded:
-            over = max(load(v_cmd_W, yaw_rate, self.gains), 1.0)
-            v_cmd_W, yaw_rate = v_cmd_W / over, yaw_rate / over
-        if factor == 1.0 and not guarded:
+        r_dot = self.space.inverse_jacobian(c) @ c_dot
+        v_cmd_W, yaw_rate, factor, acts = limited(r_dot, p_W, v_W, self.gains.limits)
+        if factor == 1.0 and not acts.guards:
             self._integrate(error, dt_s)
-        return FormationCommand(v_cmd_W, yaw_rate, factor, guarded, alarmed)
+        return FormationCommand(v_cmd_W, yaw_rate, factor, *acts.pairs())
 
     def _integrate(self, error: Array, dt_s: float) -> None:
         """Advance the integral; it runs only while the robots follow the law, and never past its clamp."""
-        grown = self.integral + self.gains.integral_1_s2 * dt_s * error
-        self.integral = np.minimum(np.maximum(grown, -self._clamp), self._clamp)
+        self.integral = grown(self.integral, error, self.gains.integral_1_s2 * dt_s, self._clamp)
 
 
 def load(v_W: Array, yaw_rate: Array, gains: FormationGains) -> float:
     """Return the greatest ratio of a robot's speed, climb or yaw rate to its limit; 1 is at the limit."""
-    most = 0.0
-    for vx, vy, vz in v_W.tolist():
-        most = max(most, math.hypot(vx, vy) / gains.speed_max_m_s, abs(vz) / gains.climb_max_m_s)
-    return max(most, max(map(abs, yaw_rate.tolist())) / gains.yaw_rate_max_rad_s)
+    return float(greatest_load(v_W, yaw_rate, gains.limits))
 
 
 def guard(p_W: Array, v_W: Array, v_cmd_W: Array, gains: FormationGains) -> tuple[Array, Pairs, Pairs]:
@@ -126,54 +143,152 @@ def guard(p_W: Array, v_W: Array, v_cmd_W: Array, gains: FormationGains) -> tupl
     which last for their response time. Each robot of a pair takes half of the change;
     a few sweeps settle several pairs.
     """
-    points, velocities = p_W.tolist(), v_W.tolist()
-    n = len(points)
-    risky = []
-    alarmed = []
-    fastest = 2 * math.hypot(gains.speed_max_m_s, gains.climb_max_m_s)
-    reach = gains.separation_min_m + fastest * (gains.guard_horizon_s + gains.response_s)
-    for j in range(1, n):
-        for i in range(j):
-            distance = math.dist(points[i], points[j])
-            if distance >= reach:
-                continue
-            along = _direction(points[i], points[j], distance)
-            approach = min(_along(along, velocities[i], velocities[j]), 0.0)
-            near = distance + approach * gains.response_s
-            risky.append((i, j, along, (gains.separation_min_m - near) / gains.guard_horizon_s))
-            if distance < gains.separation_alarm_m:
-                alarmed.append((i, j))
-    commands = v_cmd_W.tolist()
-    guarded = _part(commands, risky)
-    return (np.array(commands) if guarded else v_cmd_W), guarded, tuple(alarmed)
+    parted_W = v_cmd_W.copy()
+    return parted_W, *held_apart(p_W, v_W, parted_W, gains.limits).pairs()
 
 
-def _part(commands: list[list[float]], risky: list[tuple[int, int, list[float], float]]) -> Pairs:
-    """Change the commands in place until every pair separates at its least rate; return the pairs changed."""
-    guarded: dict[tuple[int, int], None] = {}
+class Guarding(NamedTuple):
+    """What the guard did.
+
+    Attributes:
+        guards, alarms: how many pairs it holds apart, and how many are nearer than the alarm threshold.
+        order: (n, n); above the diagonal the numbers of the former pairs from 1 on, below it of the latter.
+    """
+
+    guards: int
+    alarms: int
+    order: Order
+
+    def pairs(self) -> tuple[Pairs, Pairs]:
+        """Return the pairs that are held apart, and those in alarm."""
+        return _pairs(self.guards, self.order), _pairs(self.alarms, self.order.T)
+
+
+def _pairs(count: int, order: Order) -> Pairs:
+    if not count:
+        return ()
+    places = ((order[i, j], i, j) for j in range(len(order)) for i in range(j) if order[i, j])
+    return tuple((i, j) for _, i, j in sorted(places))
+
+
+@compiled
+def limited(
+    r_dot: Array, p_W: Array, v_W: Array, limits: Limits
+) -> tuple[Array, Array, float, Guarding]:
+    """Return velocities (n, 3) and yaw rates (n,) of r_dot (4n,) saturated and guarded, and the factor of it."""
+    n = r_dot.size // 4
+    v_cmd_W, yaw_rate = np.empty((n, 3)), np.empty(n)
+    for i in range(n):
+        v_cmd_W[i, 0], v_cmd_W[i, 1], v_cmd_W[i, 2] = r_dot[4 * i], r_dot[4 * i + 1], r_dot[4 * i + 2]
+        yaw_rate[i] = r_dot[4 * i + 3]
+    factor = min(1.0, 1.0 / max(greatest_load(v_cmd_W, yaw_rate, limits), LOAD_MIN))
+    scale(v_cmd_W, yaw_rate, factor)
+    guarding = held_apart(p_W, v_W, v_cmd_W, limits)
+    if guarding.guards:
+        scale(v_cmd_W, yaw_rate, 1.0 / max(greatest_load(v_cmd_W, yaw_rate, limits), 1.0))
+    return v_cmd_W, yaw_rate, factor, guarding
+
+
+@compiled
+def greatest_load(v_W: Array, yaw_rate: Array, limits: Limits) -> float:
+    """Return the greatest ratio of a robot's speed, climb or yaw rate to its limit."""
+    most = 0.0
+    for i in range(yaw_rate.size):
+        speed = math.sqrt(v_W[i, 0] * v_W[i, 0] + v_W[i, 1] * v_W[i, 1])
+        most = max(most, speed / limits.speed_max_m_s)
+        most = max(most, abs(v_W[i, 2]) / limits.climb_max_m_s)
+        most = max(most, abs(yaw_rate[i]) / limits.yaw_rate_max_rad_s)
+    return most
+
+
+@compiled
+def scale(v_W: Array, yaw_rate: Array, factor: float) -> None:
+    """Multiply velocities and yaw rates in place."""
+    for i in range(yaw_rate.size):
+        for k in range(3):
+            v_W[i, k] *= factor
+        yaw_rate[i] *= factor
+
+
+@compiled
+def grown(integral: Array, error: Array, rate: float, clamp: Array) -> Array:
+    """Return integral + rate error within its clamp."""
+    after = np.empty(integral.size)
+    for k in range(integral.size):
+        after[k] = min(max(integral[k] + rate * error[k], -clamp[k]), clamp[k])
+    return after
+
+
+@compiled
+def held_apart(p_W: Array, v_W: Array, v_cmd_W: Array, limits: Limits) -> Guarding:
+    """Change commands in place until every pair separates at its least rate (see `guard`)."""
+    n = p_W.shape[0]
+    order = np.zeros((n, n), np.int64)
+    alarms = note_alarms(p_W, limits.separation_alarm_m, order)
+    guards = 0
     for _ in range(GUARD_SWEEPS):
         settled = True
-        for i, j, along, least in risky:
-            lacking = least - _along(along, commands[i], commands[j])
-            if lacking <= 1e-9:
-                continue
-            settled = False
-            guarded[i, j] = None
-            for axis in range(3):
-                commands[i][axis] -= along[axis] * lacking / 2
-                commands[j][axis] += along[axis] * lacking / 2
+        for j in range(1, n):
+            for i in range(j):
+                if part(p_W, v_W, v_cmd_W, i, j, limits):
+                    settled = False
+                    if order[i, j] == 0:
+                        guards += 1
+                        order[i, j] = guards
         if settled:
             break
-    return tuple(guarded)
+    return Guarding(guards, alarms, order)
 
 
-def _along(along: list[float], v_i: list[float], v_j: list[float]) -> float:
+@compiled
+def note_alarms(p_W: Array, separation_alarm_m: float, order: Order) -> int:
+    """Number the pairs that are nearer than the alarm threshold, below the diagonal; return how many."""
+    alarms = 0
+    for j in range(1, p_W.shape[0]):
+        for i in range(j):
+            if length(between(p_W, i, j)) < separation_alarm_m:
+                alarms += 1
+                order[j, i] = alarms
+    return alarms
+
+
+@compiled
+def part(p_W: Array, v_W: Array, v_cmd_W: Array, i: int, j: int, limits: Limits) -> bool:
+    """Let robots i and j separate at their least rate, half of the change each; return whether they did not."""
+    line_W = between(p_W, i, j)
+    distance = length(line_W)
+    if distance >= reach(limits):
+        return False
+    u_W = direction(line_W, distance)
+    near = distance + min(along(u_W, v_W, i, j), 0.0) * limits.response_s
+    least = (limits.separation_min_m - near) / limits.guard_horizon_s
+    lacking = least - along(u_W, v_cmd_W, i, j)
+    if lacking <= SETTLED_M_S:
+        return False
+    for k in range(3):
+        v_cmd_W[i, k] -= u_W[k] * lacking / 2
+        v_cmd_W[j, k] += u_W[k] * lacking / 2
+    return True
+
+
+@compiled
+def reach(limits: Limits) -> float:
+    """Return the distance beyond which no two robots come too near within the horizon."""
+    climb, speed = limits.climb_max_m_s, limits.speed_max_m_s
+    fastest = 2.0 * math.sqrt(speed * speed + climb * climb)
+    return limits.separation_min_m + fastest * (limits.guard_horizon_s + limits.response_s)
+
+
+@compiled
+def along(u_W: Vector, v_W: Array, i: int, j: int) -> float:
     """Return the rate at which j leaves i along their line [m/s]."""
-    return along[0] * (v_j[0] - v_i[0]) + along[1] * (v_j[1] - v_i[1]) + along[2] * (v_j[2] - v_i[2])
+    d_W = between(v_W, i, j)
+    return u_W[0] * d_W[0] + u_W[1] * d_W[1] + u_W[2] * d_W[2]
 
 
-def _direction(a: list[float], b: list[float], distance: float) -> list[float]:
-    """Return the unit vector from a to b; east where they coincide, so that they part at all."""
-    if distance < 1e-6:
-        return [1.0, 0.0, 0.0]
-    return [(b[axis] - a[axis]) / distance for axis in range(3)]
+@compiled
+def direction(line_W: Vector, distance: float) -> Vector:
+    """Return the unit vector of a line; east where robots coincide, so that they part at all."""
+    if distance < NEAR_M:
+        return 1.0, 0.0, 0.0
+    return line_W[0] / distance, line_W[1] / distance, line_W[2] / distance

@@ -6,8 +6,20 @@ import math
 
 import numpy as np
 
-from zsim_agents.cluster_frame import LENGTH_MIN_M, pitch_yaw, rotation_WC, wrap_angle
+from zsim_agents.cluster_frame import (
+    LENGTH_MIN_M,
+    Vector,
+    between,
+    centroid,
+    length,
+    pitch_yaw,
+    put,
+    rotation_WC,
+    scaled,
+    wrap_angle,
+)
 from zsim_agents.cluster_space import Array, ClusterSpace, SingularClusterError
+from zsim_agents.compiled import compiled
 
 
 class PairCluster(ClusterSpace):
@@ -17,25 +29,19 @@ class PairCluster(ClusterSpace):
         super().__init__(2, ("x_c", "y_c", "z_c", "pitch", "yaw", "phi_1", "phi_2", "p"), "p")
 
     def forward(self, p_W: Array, yaw: Array) -> Array:
-        d_W = p_W[0] - p_W[1]
-        p = _length(d_W)
-        pitch, psi = pitch_yaw(d_W.tolist())
-        phi = [wrap_angle(heading - psi) for heading in yaw.tolist()]
-        return np.array([*((p_W[0] + p_W[1]) / 2), pitch, psi, *phi, p])
+        c = pair_forward(p_W, yaw)
+        if not c[7] > LENGTH_MIN_M:  # also true for NaN
+            raise SingularClusterError("robots 1 and 2 are in one place: the formation has no direction")
+        return c
 
     def inverse(self, c: Array) -> tuple[Array, Array]:
-        half_W = rotation_WC(0.0, c[3], c[4])[:, 0] * (c[7] / 2)
-        return np.array([c[:3] + half_W, c[:3] - half_W]), np.array(
-            [wrap_angle(c[4] + phi) for phi in c[5:7]]
-        )
+        return pair_inverse(c)
 
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
-        d_W = p_W[0] - p_W[1]
-        p = _length(d_W)
-        pitch, psi = pitch_yaw(d_W.tolist())
+        _, _, _, pitch, psi, _, _, p = self.forward(p_W, yaw).tolist()
         if math.cos(pitch) < LENGTH_MIN_M:
             raise SingularClusterError("the two robots are above each other: the formation has no yaw")
-        x, y, z = rotation_WC(0.0, pitch, psi).T
+        x, y, z = np.array(rotation_WC(0.0, pitch, psi)).T
         J = np.zeros((8, 2, 4))
         J[:3, :, :3] = np.eye(3)[:, None] / 2
         for row, axis in ((3, -z / p), (4, y / (p * math.cos(pitch))), (7, x)):
@@ -45,23 +51,53 @@ class PairCluster(ClusterSpace):
         return J.reshape(8, 8)
 
     def inverse_jacobian(self, c: Array) -> Array:
-        x, y, z = rotation_WC(0.0, c[3], c[4]).T
-        half = c[7] / 2
-        J_inv = np.zeros((2, 4, 8))
-        for robot, side in enumerate((1.0, -1.0)):
-            J_inv[robot, :3, :3] = np.eye(3)
-            J_inv[robot, :3, 3] = -side * half * z
-            J_inv[robot, :3, 4] = side * half * math.cos(c[3]) * y
-            J_inv[robot, :3, 7] = side * x / 2
-            J_inv[robot, 3, [4, 5 + robot]] = 1.0
-        return J_inv.reshape(8, 8)
+        return pair_inverse_jacobian(c)
 
     def spread(self, c: Array) -> float:
         return float(c[7])
 
 
-def _length(d_W: Array) -> float:
-    p = math.hypot(*d_W.tolist())
-    if not p > LENGTH_MIN_M:  # also true for NaN
-        raise SingularClusterError("robots 1 and 2 are in one place: the formation has no direction")
-    return p
+@compiled
+def pair_forward(p_W: Array, yaw: Array) -> Array:
+    """Return c (8,); only its length p is right where that is zero."""
+    d_W = between(p_W, 1, 0)
+    c = np.empty(8)
+    c[0], c[1], c[2] = centroid(p_W)
+    c[3], c[4] = pitch_yaw(d_W)
+    c[5], c[6] = wrap_angle(yaw[0] - c[4]), wrap_angle(yaw[1] - c[4])
+    c[7] = length(d_W)
+    return c
+
+
+@compiled
+def pair_inverse(c: Array) -> tuple[Array, Array]:
+    """Return positions (2, 3) and headings (2,)."""
+    half_W = scaled(axis_W(rotation_WC(0.0, c[3], c[4]), 0), c[7] / 2)
+    p_W, yaw = np.empty((2, 3)), np.empty(2)
+    for k in range(3):
+        p_W[0, k], p_W[1, k] = c[k] + half_W[k], c[k] - half_W[k]
+    yaw[0], yaw[1] = wrap_angle(c[4] + c[5]), wrap_angle(c[4] + c[6])
+    return p_W, yaw
+
+
+@compiled
+def pair_inverse_jacobian(c: Array) -> Array:
+    """Return J^-1 (8, 8)."""
+    R_WC = rotation_WC(0.0, c[3], c[4])
+    x, y, z = axis_W(R_WC, 0), axis_W(R_WC, 1), axis_W(R_WC, 2)
+    J_inv = np.zeros((8, 8))
+    for robot in range(2):
+        first, half = 4 * robot, (0.5 - robot) * c[7]  # robot 1 is ahead, robot 2 behind
+        for k in range(3):
+            J_inv[first + k, k] = 1.0
+        put(J_inv, first, 3, scaled(z, -half))
+        put(J_inv, first, 4, scaled(y, half * math.cos(c[3])))
+        put(J_inv, first, 7, scaled(x, 0.5 - robot))
+        J_inv[first + 3, 4] = J_inv[first + 3, 5 + robot] = 1.0
+    return J_inv
+
+
+@compiled
+def axis_W(R_WC: tuple[Vector, Vector, Vector], k: int) -> Vector:
+    """Return an axis of C in W: column k of R_WC."""
+    return R_WC[0][k], R_WC[1][k], R_WC[2][k]

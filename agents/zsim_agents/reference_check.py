@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from zsim_agents.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair, robot_rates
+from zsim_agents.compiled import compiled
 from zsim_agents.formation import FormationGains, load
 from zsim_agents.trajectory import Ramp, Reference, Shifted, TrajectoryError, ramp_onto
 
@@ -42,22 +43,36 @@ class ShapeLimits:
 
 def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits) -> str | None:
     """Return why c is no formation to engage or to lead to, or None; names quantity, value and limit."""
-    for name, value, (low, high) in zip(space.names, c.tolist(), space.bounds, strict=True):
-        if not abs(value) < FAR:  # also true for NaN
-            return f"{name} is {value:g}; allowed: up to {FAR:g}"
-        if not low < value < high:
-            return f"{name} is {value:.3g}; allowed: between {low:.3g} and {high:.3g}"
+    outside = first_outside(c, space.bounds)
+    if outside >= 0:
+        return _value_fault(space, c, outside)
     spread = space.spread(c)
     if spread <= limits.spread_min_m:
         return f"{space.spread_text} is {spread:.2f} m; allowed: above {limits.spread_min_m:g} m"
-    for name in ("roll", "pitch"):
-        if name in space.names and abs(c[space.index(name)]) >= limits.tilt_max_rad:
-            found, most = math.degrees(c[space.index(name)]), math.degrees(limits.tilt_max_rad)
-            return f"{name} of the formation is {found:.1f} deg; allowed: below {most:g} deg either way"
+    for k in space.tilts:
+        if abs(c[k]) >= limits.tilt_max_rad:
+            found, most = math.degrees(c[k]), math.degrees(limits.tilt_max_rad)
+            return f"{space.names[k]} of the formation is {found:.1f} deg; allowed: below {most:g} deg either way"
     condition = space.condition(c) if math.isfinite(limits.condition_max) else 0.0
     if not condition < limits.condition_max:
         return f"condition number of J^-1 is {condition:.1f}; allowed: below {limits.condition_max:g}"
     return None
+
+
+@compiled
+def first_outside(c: Array, bounds: Array) -> int:
+    """Return the place of the first variable of c that is beyond FAR or its open bounds (4n, 2), or -1."""
+    for k in range(c.size):
+        if not (abs(c[k]) < FAR and bounds[k, 0] < c[k] < bounds[k, 1]):  # also true for NaN
+            return k
+    return -1
+
+
+def _value_fault(space: ClusterSpace, c: Array, k: int) -> str:
+    name, value, (low, high) = space.names[k], float(c[k]), space.bounds[k].tolist()
+    if not abs(value) < FAR:
+        return f"{name} is {value:g}; allowed: up to {FAR:g}"
+    return f"{name} is {value:.3g}; allowed: between {low:.3g} and {high:.3g}"
 
 
 def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
@@ -67,9 +82,11 @@ def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: Sh
     if distance < gains.separation_min_m:
         pair = f"robots {i + 1} and {j + 1}"
         return f"{pair} are {distance:.3f} m apart; allowed: {gains.separation_min_m:g} m or more"
-    low = int(np.argmin(p_W[:, 2]))
-    if p_W[low, 2] < limits.height_min_m:
-        return f"robot {low + 1} is at z = {p_W[low, 2]:.2f} m; allowed: {limits.height_min_m:g} m or more"
+    heights = p_W[:, 2].tolist()
+    lowest = min(heights)
+    if lowest < limits.height_min_m:
+        low = heights.index(lowest)
+        return f"robot {low + 1} is at z = {lowest:.2f} m; allowed: {limits.height_min_m:g} m or more"
     return None
 
 

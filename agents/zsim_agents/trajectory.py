@@ -16,6 +16,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from zsim_agents.cluster_space import Array, ClusterSpace
+from zsim_agents.compiled import compiled
 from zsim_agents.expression import Expression, ExpressionError, finite_number
 
 WAYPOINTS_MAX = 10_000
@@ -186,13 +187,23 @@ class Ramp:
         s = max((t_s - self.start_s) / self.over_s, 0.0)
         if s >= 1.0:
             return c, c_dot
-        left = 1 - s * s * s * (10 - s * (15 - 6 * s))
-        left_rate = -30 * s * s * (1 - s) ** 2
-        swing = s * (1 - s * s * (6 - s * (8 - 3 * s)))
-        swing_rate = 1 - s * s * (18 - s * (32 - 15 * s))
-        c = c + left * self.offset + (swing * self.over_s) * self.offset_rate
-        c_dot = c_dot + (left_rate / self.over_s) * self.offset + swing_rate * self.offset_rate
-        return c, c_dot
+        return ramped(c, c_dot, self.offset, self.offset_rate, s, self.over_s)
+
+
+@compiled
+def ramped(
+    c: Array, c_dot: Array, offset: Array, offset_rate: Array, s: float, over_s: float
+) -> tuple[Array, Array]:
+    """Return c and c_dot with what is left of an offset and its rate at share s of a ramp over over_s."""
+    left = 1.0 - s * s * s * (10.0 - s * (15.0 - 6.0 * s))
+    left_rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / over_s
+    swing = s * (1.0 - s * s * (6.0 - s * (8.0 - 3.0 * s))) * over_s
+    swing_rate = 1.0 - s * s * (18.0 - s * (32.0 - 15.0 * s))
+    value, rate = np.empty(c.size), np.empty(c.size)
+    for k in range(c.size):
+        value[k] = c[k] + left * offset[k] + swing * offset_rate[k]
+        rate[k] = c_dot[k] + left_rate * offset[k] + swing_rate * offset_rate[k]
+    return value, rate
 
 
 def ramp_onto(

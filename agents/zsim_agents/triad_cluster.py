@@ -2,6 +2,8 @@
 
 Robots 1, 2, 3 give the frame C and the triangle (p, q, beta); each further robot k adds its distance rho,
 azimuth and elevation, seen from robot 1 in C. The origin is the centroid of all robots.
+
+Order of this file: the space, the compiled mathematics from robots to c and back and of J^-1, the rows of J.
 """
 
 from __future__ import annotations
@@ -13,15 +15,27 @@ import numpy as np
 
 from zsim_agents.cluster_frame import (
     LENGTH_MIN_M,
+    Rows,
+    Vector,
+    between,
+    centroid,
     cross,
+    dot,
     euler_axes_C,
     euler_rates,
+    length,
     pitch_yaw,
+    put,
     rotation_WC,
+    row,
     triad_axes,
+    turned,
     wrap_angle,
 )
 from zsim_agents.cluster_space import Array, ClusterSpace, SingularClusterError, numbered
+from zsim_agents.compiled import compiled
+
+NO_FRAME = "robots 1, 2 and 3 are in line or in one place: the formation has no frame"
 
 
 class TriadCluster(ClusterSpace):
@@ -38,32 +52,24 @@ class TriadCluster(ClusterSpace):
         )
         super().__init__(n, [*names, "p", "q", "beta", *others], spread_text)
         self._shape = 6 + n  # place of p in c
-        self._constant = np.zeros((n, 4, 4 * n))  # the part of J^-1 that holds everywhere
-        self._constant[:, :3, :3] = np.eye(3)
-        self._constant[:, 3, 5] = 1.0
-        self._constant[range(n), 3, range(6, 6 + n)] = 1.0
 
     def forward(self, p_W: Array, yaw: Array) -> Array:
-        d2, d3, *others = (p_W[1:] - p_W[0]).tolist()
-        x, y, z, _, area = triad_axes(d2, d3)
-        roll = math.atan2(y[2], z[2])
-        pitch, psi = pitch_yaw(x)
-        phi = [wrap_angle(heading - psi) for heading in yaw.tolist()]
-        beta = math.atan2(area, d2[0] * d3[0] + d2[1] * d3[1] + d2[2] * d3[2])
-        shape = [math.hypot(*d2), math.hypot(*d3), beta]
-        for d in others:
-            shape += _spherical((_dot(x, d), _dot(y, d), _dot(z, d)))
-        return np.array([*(p_W.sum(axis=0) / self.n).tolist(), roll, pitch, psi, *phi, *shape])
+        found, c = triad_forward(p_W, yaw)
+        if not found:
+            raise SingularClusterError(NO_FRAME)
+        return c
 
     def inverse(self, c: Array) -> tuple[Array, Array]:
-        roll, pitch, psi, *rest = c[3:].tolist()
-        p_C = np.array(self._places_C(rest[self.n :]))
-        yaw = np.array([wrap_angle(psi + phi) for phi in rest[: self.n]])
-        return c[:3] + p_C @ rotation_WC(roll, pitch, psi).T, yaw
+        found, p_W, yaw = triad_inverse(c)
+        if not found:
+            raise self._no_direction(c)
+        return p_W, yaw
 
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
         d_W = p_W - p_W[0]
-        x, y, z, h, area = triad_axes(d_W[1].tolist(), d_W[2].tolist())
+        x, y, z, h, area = triad_axes(row(d_W, 1), row(d_W, 2))
+        if h == 0.0:
+            raise SingularClusterError(NO_FRAME)
         R_WC = np.array([x, y, z]).T
         d_C = d_W @ R_WC
         rate = np.zeros((3, self.n, 3))  # w_WC_C = sum over robots of rate[:, i] v_i
@@ -79,79 +85,202 @@ class TriadCluster(ClusterSpace):
         J[6 : 6 + self.n] -= J[5]
         J[self._shape : self._shape + 3, :3, :3] = _triangle_rows(d_W[1], d_W[2], np.array(z))
         for k in range(3, self.n):
-            row = self._shape + 3 * (k - 2)
-            J[row : row + 3, :, :3] = _spherical_rows(k, d_C[k], R_WC, rate)
+            first = self._shape + 3 * (k - 2)
+            J[first : first + 3, :, :3] = _spherical_rows(k, d_C[k], R_WC, rate)
         return J.reshape(self.size, self.size)
 
     def inverse_jacobian(self, c: Array) -> Array:
-        roll, pitch, psi, *rest = c[3:].tolist()
-        shape = rest[self.n :]
-        axes_C = euler_axes_C(roll, pitch)
-        turning = [[cross(axis, place) for axis in axes_C] for place in self._places_C(shape)]
-        R_WC = rotation_WC(roll, pitch, psi)
-        J_inv = self._constant.copy()
-        J_inv[:, :3, 3:6] = R_WC @ np.array(turning).transpose(0, 2, 1)
-        J_inv[:, :3, self._shape :] = R_WC @ self._shape_rates_C(shape)
-        return J_inv.reshape(self.size, self.size)
+        found, J_inv = triad_inverse_jacobian(c)
+        if not found:
+            raise self._no_direction(c)
+        return J_inv
 
     def spread(self, c: Array) -> float:
-        p, q, beta, *others = c[self._shape :].tolist()
-        heights = [
-            rho * math.cos(elevation) for rho, elevation in zip(others[::3], others[2::3], strict=True)
-        ]
-        return min(math.sin(beta) * min(p, q), *heights) if heights else math.sin(beta) * min(p, q)
+        return float(triad_spread(c))
 
-    def _places_C(self, shape: Sequence[float]) -> list[list[float]]:
-        """Return the places of the robots from the centroid, in C [m]."""
-        p, q, beta, *others = shape
-        ca2, sa2, ca3, sa3, _ = _split_beta(p, q, beta)
-        from_1 = [(0.0, 0.0, 0.0), (-p * ca2, p * sa2, 0.0), (-q * ca3, -q * sa3, 0.0)]
-        for k in range(0, len(others), 3):
-            rho, azimuth, elevation = others[k : k + 3]
-            flat = rho * math.cos(elevation)
-            from_1.append((flat * math.cos(azimuth), flat * math.sin(azimuth), rho * math.sin(elevation)))
-        centre = [sum(column) / self.n for column in zip(*from_1, strict=True)]
-        return [[a - b for a, b in zip(place, centre, strict=True)] for place in from_1]
-
-    def _shape_rates_C(self, shape: Sequence[float]) -> Array:
-        """Return the derivatives of `_places_C` by the shape variables, (n, 3, 3n - 6)."""
-        rates = np.zeros((self.n, 3, len(shape)))
-        rates[1:3, :2, :3] = _triangle_rates(*shape[:3])
-        for k in range(3, self.n):
-            at = 3 * (k - 2)
-            rates[k, :, at : at + 3] = _spherical_rates(*shape[at : at + 3])
-        return rates - rates.sum(axis=0) / self.n
+    def _no_direction(self, c: Array) -> SingularClusterError:
+        p, q, beta = c[self._shape : self._shape + 3].tolist()
+        return SingularClusterError(
+            f"p {p:.3g} m, q {q:.3g} m, beta {beta:.3g} rad: the formation has no direction"
+        )
 
 
-def _dot(a: Sequence[float], b: Sequence[float]) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+@compiled
+def triad_forward(p_W: Array, yaw: Array) -> tuple[bool, Array]:
+    """Return whether the robots have a frame, and c (4n,)."""
+    n = yaw.size
+    at = 6 + n  # place of p in c
+    c = np.zeros(4 * n)
+    d2, d3 = between(p_W, 0, 1), between(p_W, 0, 2)
+    x, y, z, h, area = triad_axes(d2, d3)
+    if h == 0.0:
+        return False, c
+    c[0], c[1], c[2] = centroid(p_W)
+    c[3] = math.atan2(y[2], z[2])
+    c[4], c[5] = pitch_yaw(x)
+    for i in range(n):
+        c[6 + i] = wrap_angle(yaw[i] - c[5])
+    c[at], c[at + 1], c[at + 2] = length(d2), length(d3), math.atan2(area, dot(d2, d3))
+    for k in range(3, n):
+        first = at + 3 * (k - 2)
+        c[first], c[first + 1], c[first + 2] = spherical(turned((x, y, z), between(p_W, 0, k)))
+    return True, c
 
 
-def _split_beta(p: float, q: float, beta: float) -> tuple[float, float, float, float, float]:
-    """Return cos and sin of the angle at robot 1 from -x_C to robot 2, the same to robot 3, and h [m]."""
+@compiled
+def triad_inverse(c: Array) -> tuple[bool, Array, Array]:
+    """Return whether the shape has an extent, positions (n, 3) and headings (n,)."""
+    n = c.size // 4
+    p_W, yaw = places_C(c), np.empty(n)
+    R_WC = rotation_WC(c[3], c[4], c[5])
+    for i in range(n):
+        d_W = turned(R_WC, row(p_W, i))
+        for k in range(3):
+            p_W[i, k] = c[k] + d_W[k]
+        yaw[i] = wrap_angle(c[5] + c[6 + i])
+    return has_direction(c), p_W, yaw
+
+
+@compiled
+def triad_inverse_jacobian(c: Array) -> tuple[bool, Array]:
+    """Return whether the shape has an extent, and J^-1 (4n, 4n).
+
+    Robot i moves at v_c + R_WC (w_WC_C x place_i + its place's derivatives by the shape times their rates),
+    and turns at yaw' + phi_i'.
+    """
+    n = c.size // 4
+    J_inv = np.zeros((4 * n, 4 * n))
+    if not has_direction(c):
+        return False, J_inv
+    R_WC, axes_C, place_C = rotation_WC(c[3], c[4], c[5]), euler_axes_C(c[3], c[4]), places_C(c)
+    for i in range(n):
+        first = 4 * i
+        for k in range(3):
+            J_inv[first + k, k] = 1.0
+            put(J_inv, first, 3 + k, turned(R_WC, cross(axes_C[k], row(place_C, i))))
+        J_inv[first + 3, 5] = J_inv[first + 3, 6 + i] = 1.0
+    put_shape_rates(J_inv, c, R_WC)
+    return True, J_inv
+
+
+@compiled
+def put_shape_rates(J_inv: Array, c: Array, R_WC: Rows) -> None:
+    """Write the columns of the shape variables into J^-1."""
+    n = c.size // 4
+    at = 6 + n
+    of_2, of_3 = triangle_rates(c[at], c[at + 1], c[at + 2])
+    for k in range(3):
+        add_rate(J_inv, 1, at + k, turned(R_WC, of_2[k]))
+        add_rate(J_inv, 2, at + k, turned(R_WC, of_3[k]))
+    for robot in range(3, n):
+        first = at + 3 * (robot - 2)
+        rates_C = spherical_rates(c[first], c[first + 1], c[first + 2])
+        for k in range(3):
+            add_rate(J_inv, robot, first + k, turned(R_WC, rates_C[k]))
+
+
+@compiled
+def add_rate(J_inv: Array, robot: int, column: int, rate_W: Vector) -> None:
+    """Let one robot move with a variable; the centroid stays, so that all move back by the mean."""
+    n = J_inv.shape[0] // 4
+    for k in range(3):
+        back = rate_W[k] / n
+        for i in range(n):
+            J_inv[4 * i + k, column] -= back
+        J_inv[4 * robot + k, column] += rate_W[k]
+
+
+@compiled
+def triad_spread(c: Array) -> float:
+    """Return the least of sin(beta) min(p, q) and rho_k cos(elevation_k)."""
+    at = 6 + c.size // 4
+    least = math.sin(c[at + 2]) * min(c[at], c[at + 1])
+    for first in range(at + 3, c.size, 3):
+        least = min(least, c[first] * math.cos(c[first + 2]))
+    return least
+
+
+@compiled
+def places_C(c: Array) -> Array:
+    """Return the places of the robots from the centroid, in C (n, 3) [m]."""
+    n = c.size // 4
+    at = 6 + n
+    p, q = c[at], c[at + 1]
+    ca2, sa2, ca3, sa3, _ = split_beta(p, q, c[at + 2])
+    place = np.zeros((n, 3))  # from robot 1
+    place[1, 0], place[1, 1] = -p * ca2, p * sa2
+    place[2, 0], place[2, 1] = -q * ca3, -q * sa3
+    for k in range(3, n):
+        first = at + 3 * (k - 2)
+        place[k, 0], place[k, 1], place[k, 2] = spherical_place(c[first], c[first + 1], c[first + 2])
+    centre = centroid(place)
+    for i in range(n):
+        for k in range(3):
+            place[i, k] -= centre[k]
+    return place
+
+
+@compiled
+def has_direction(c: Array) -> bool:
+    """Return whether the middle of robots 2 and 3 is apart from robot 1."""
+    at = 6 + c.size // 4
+    return split_beta(c[at], c[at + 1], c[at + 2])[4] > 0.0
+
+
+@compiled
+def split_beta(p: float, q: float, beta: float) -> tuple[float, float, float, float, float]:
+    """Return cos and sin of the angle at robot 1 from -x_C to robot 2, the same to robot 3, and h [m].
+
+    All is zero where there is no such axis.
+    """
     along2, along3 = p + q * math.cos(beta), q + p * math.cos(beta)
     h = math.sqrt(max(p * along2 + q * along3, 0.0))
     if not h > LENGTH_MIN_M:  # also true for NaN
-        raise SingularClusterError(
-            f"p {p:.3g} m, q {q:.3g} m, beta {beta:.3g} rad: the formation has no direction"
-        )
+        return 0.0, 0.0, 0.0, 0.0, 0.0
     return along2 / h, q * math.sin(beta) / h, along3 / h, p * math.sin(beta) / h, h
 
 
-def _triangle_rates(p: float, q: float, beta: float) -> list[list[list[float]]]:
-    """Return the derivatives of (x, y) of robots 2 and 3 from robot 1, in C, by p, q and beta: (2, 2, 3)."""
-    ca2, sa2, ca3, sa3, h = _split_beta(p, q, beta)
+@compiled
+def triangle_rates(p: float, q: float, beta: float) -> tuple[Rows, Rows]:
+    """Return the derivatives of robot 2 from robot 1, in C, by p, by q and by beta, and those of robot 3."""
+    ca2, sa2, ca3, sa3, h = split_beta(p, q, beta)
     by_p, by_q = -sa2 / h, sa3 / h  # of the angle of robot 2; that of robot 3 turns the other way
-    return [
-        [
-            [-ca2 + p * sa2 * by_p, p * sa2 * by_q, p * sa2 * q * ca3 / h],
-            [sa2 + p * ca2 * by_p, p * ca2 * by_q, p * ca2 * q * ca3 / h],
-        ],
-        [
-            [-q * sa3 * by_p, -ca3 - q * sa3 * by_q, q * sa3 * p * ca2 / h],
-            [q * ca3 * by_p, -sa3 + q * ca3 * by_q, -q * ca3 * p * ca2 / h],
-        ],
-    ]
+    of_2 = (
+        (-ca2 + p * sa2 * by_p, sa2 + p * ca2 * by_p, 0.0),
+        (p * sa2 * by_q, p * ca2 * by_q, 0.0),
+        (p * sa2 * q * ca3 / h, p * ca2 * q * ca3 / h, 0.0),
+    )
+    of_3 = (
+        (-q * sa3 * by_p, q * ca3 * by_p, 0.0),
+        (-ca3 - q * sa3 * by_q, -sa3 + q * ca3 * by_q, 0.0),
+        (q * sa3 * p * ca2 / h, -q * ca3 * p * ca2 / h, 0.0),
+    )
+    return of_2, of_3
+
+
+@compiled
+def spherical(d_C: Vector) -> Vector:
+    """Return distance, azimuth and elevation of a vector."""
+    flat = math.sqrt(d_C[0] * d_C[0] + d_C[1] * d_C[1])
+    return length(d_C), math.atan2(d_C[1], d_C[0]), math.atan2(d_C[2], flat)
+
+
+@compiled
+def spherical_place(rho: float, azimuth: float, elevation: float) -> Vector:
+    """Return (x, y, z) of distance, azimuth and elevation."""
+    flat = rho * math.cos(elevation)
+    return flat * math.cos(azimuth), flat * math.sin(azimuth), rho * math.sin(elevation)
+
+
+@compiled
+def spherical_rates(rho: float, azimuth: float, elevation: float) -> Rows:
+    """Return the derivatives of (x, y, z) by distance, by azimuth and by elevation."""
+    sa, ca, se, ce = math.sin(azimuth), math.cos(azimuth), math.sin(elevation), math.cos(elevation)
+    return (
+        (ce * ca, ce * sa, se),
+        (-rho * ce * sa, rho * ce * ca, 0.0),
+        (-rho * se * ca, -rho * se * sa, rho * ce),
+    )
 
 
 def _triangle_rows(d2_W: Array, d3_W: Array, z_W: Array) -> Array:
@@ -161,21 +290,6 @@ def _triangle_rows(d2_W: Array, d3_W: Array, z_W: Array) -> Array:
     t2, t3 = np.cross(z_W, u2) / p, np.cross(z_W, u3) / q
     none = np.zeros(3)
     return np.array([[-u2, u2, none], [-u3, none, u3], [t2 - t3, -t2, t3]])
-
-
-def _spherical(d_C: Sequence[float]) -> tuple[float, float, float]:
-    flat = math.hypot(d_C[0], d_C[1])
-    return math.hypot(flat, d_C[2]), math.atan2(d_C[1], d_C[0]), math.atan2(d_C[2], flat)
-
-
-def _spherical_rates(rho: float, azimuth: float, elevation: float) -> list[list[float]]:
-    """Return the derivatives of (x, y, z) by rho, azimuth and elevation, (3, 3)."""
-    sa, ca, se, ce = math.sin(azimuth), math.cos(azimuth), math.sin(elevation), math.cos(elevation)
-    return [
-        [ce * ca, -rho * ce * sa, -rho * se * ca],
-        [ce * sa, rho * ce * ca, -rho * se * sa],
-        [se, 0.0, rho * ce],
-    ]
 
 
 def _spherical_rows(k: int, d_C: Array, R_WC: Array, rate: Array) -> Array:

@@ -4,12 +4,14 @@ import gc
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from msgspec import Struct
 
 from zsim import keys, messages
 from zsim.agent import Agent
 from zsim.in_process import Bus
+from zsim.messages import encode, encoding
 from zsim.record import RecordWriter
 from zsim.scenario import Scenario
 from zsim_agents.controller import Controller
@@ -77,11 +79,10 @@ class _Show:
         self._throttle = Throttle()
         self._phase = ""
 
-    def sink(self, key: str, message: Struct) -> None:
+    def sink(self, key: str, message: Any) -> None:
         if self._writer is not None:
-            t_ns = message.t_ns  # type: ignore[attr-defined]
-            self._writer.add(key, messages.encode(message), messages.encoding(key), t_ns, time.time_ns())
-        if self._screen is not None:
+            self._writer.add(key, encode(message), encoding(key), message.t_ns, time.time_ns())
+        if self._screen is not None and not key.startswith(("drone/", "process/")):
             self._show(key, message, self._screen)
 
     def _show(self, key: str, message: Struct, screen: Screen) -> None:

@@ -117,11 +117,11 @@ def test_endurance_in_hover_is_that_of_the_published_battery():
 
 def test_ground_effect_saves_power():
     """One rotor radius up, Cheeseman and Bennett give 16/15; hovering low needs slower rotors by its root."""
-    assert ground_effect(vehicle.ROTOR_RADIUS_M) == pytest.approx(16 / 15)
+    assert ground_effect(vehicle.ROTOR_RADIUS_M, vehicle.ROTOR_RADIUS_M) == pytest.approx(16 / 15)
     fleet = hovering(calm(takeoff_height_m=0.3))
     speeds = []
     for _ in range(200):
         fleet.advance()
-        factor = ground_effect(fleet.truth().position_m[0, 2])
+        factor = ground_effect(fleet.truth().position_m[0, 2], vehicle.ROTOR_RADIUS_M)
         speeds.append(np.sqrt((fleet.truth().rotor_rad_s[0] ** 2).mean() * factor))
     assert np.mean(speeds) == pytest.approx(361.6, abs=1.0)

@@ -1,6 +1,5 @@
 """Foreign programs in the lockstep, by zenoh and msgpack alone: who is waited for, from when, and until when."""
 
-import msgpack
 from federation import ONE, Federation, Role
 from wire import Client, Heard, Participant, Watch
 
@@ -19,22 +18,35 @@ class Lockstep:
         self.events: Watch = self.client.watch("world/event")
         self.info = self.client.info()
         self.me: Participant = self.client.join(ME, self.info, period_ns)
+        self.now_ns = -1
+
+    def answer(self, until_ns: int) -> None:
+        """Say done for every gate up to until_ns, each when it is there."""
+        for gate_ns in range(self.me.done_ns + self.me.period_ns, until_ns + 1, self.me.period_ns):
+            self.see(gate_ns)
+            self.me.done(gate_ns)
+
+    def see(self, gate_ns: int) -> None:
+        """Wait for a gate."""
+        while self.now_ns < gate_ns:
+            heard = self.clock.until(lambda m: m["state"] == "running")
+            self.now_ns = heard.message["t_ns"]
 
     def stands_at(self, t_ns: int, *names: str) -> Heard:
-        """Wait until time stands at t_ns and the processes of these names are waited for."""
-        heard = self.clock.until(lambda m: m["waiting_for"] and m["t_ns"] >= t_ns)
+        """Wait until time stands; check that it does at t_ns and that these processes are waited for."""
+        heard = self.clock.until(lambda m: m["state"] == "running" and m["waiting_for"])
         assert heard.message["t_ns"] == t_ns
         assert {w["name"] for w in heard.message["waiting_for"]} == (set(names) or {ME})
+        self.now_ns = t_ns
         return heard
-
-    def go_to(self, t_ns: int) -> None:
-        """Let the world publish every gate up to t_ns."""
-        for gate_ns in range(0, t_ns - DELAY_NS, GATE_NS):
-            self.me.done(gate_ns)
-        self.clock.until(lambda m: m["t_ns"] >= t_ns)
 
     def event(self, kind: str, subject: str) -> Heard:
         return self.events.until(lambda m: (m["kind"], m["subject"]) == (kind, subject))
+
+    def leave(self) -> None:
+        """Let the run go on to its end."""
+        self.me.bye(self.now_ns)
+        self.world.ends(with_code=0)
 
 
 def test_no_gate_without_its_done(federation: Federation) -> None:
@@ -48,10 +60,22 @@ def test_no_gate_without_its_done(federation: Federation) -> None:
     step = Lockstep(federation)
     step.stands_at(DELAY_NS)
     for done_ns in (0, 3 * GATE_NS, 50 * GATE_NS):
-        for gate_ns in range(0, done_ns + GATE_NS, GATE_NS):
-            step.me.done(gate_ns)
+        step.answer(done_ns)
         entry = step.stands_at(done_ns + DELAY_NS + GATE_NS).message["waiting_for"][0]
         assert entry["host"] == "elsewhere"
+    step.leave()
+
+
+def test_a_longer_command_delay(federation: Federation) -> None:
+    """A link of three gates' delay allows the world to be three gates ahead.
+
+    Expected: after done t, time stands at t + 3 gates + one gate.
+    """
+    step = Lockstep(federation, "--set", "time.command_delay_gates=3")
+    step.stands_at(3 * GATE_NS)
+    step.answer(10 * GATE_NS)
+    step.stands_at(14 * GATE_NS)
+    step.leave()
 
 
 def test_a_period_of_several_gates(federation: Federation) -> None:
@@ -66,8 +90,9 @@ def test_a_period_of_several_gates(federation: Federation) -> None:
     step = Lockstep(federation, period_ns=period_ns)
     step.stands_at(DELAY_NS)
     for done_ns in (0, period_ns, 2 * period_ns):
-        step.me.done(done_ns)
+        step.answer(done_ns)
         step.stands_at(done_ns + period_ns + DELAY_NS)
+    step.leave()
 
 
 def test_a_program_that_does_not_gate(federation: Federation) -> None:
@@ -77,28 +102,179 @@ def test_a_program_that_does_not_gate(federation: Federation) -> None:
     """
     step = Lockstep(federation, "--duration", "1", period_ns=0)
     assert step.event("join", ME).message["data"]["from_ns"] == 0
-    step.me.bye(0)
-    step.world.ends(with_code=0)
+    assert step.event("end", "world").message["data"]["last_ns"] == 1_000_000_000
+    step.leave()
 
 
 def test_a_late_joiner(federation: Federation) -> None:
-    """A second program joins while time runs, then dies without a word.
+    """A second program joins while time runs, is waited for, then dies without a word.
 
-        tester.one  ──┬──────────────────────────────────▶ end
-        tester.late   └─ join ── (stands) ── done … ── dies
+        tester.one   ──50──┬─────────53────────────────60──▶ bye ──▶ end
+        tester.late        └ join (from 53) ──53── dies
+        newest gate       52         54        55      62
 
     Expected: it is waited for from the gate after its join on, and no longer once it is dead (on_death: drop).
     """
-    step = Lockstep(federation, "--duration", "4", "--set", "processes.on_death={tester: drop}")
-    step.go_to(50 * GATE_NS)
+    step = Lockstep(federation, "--duration", "4")
+    step.answer(50 * GATE_NS)
+    step.stands_at(52 * GATE_NS)
     late = step.client.join("tester.late", step.info, GATE_NS)
-    from_ns = step.event("join", "tester.late").message["data"]["from_ns"]
-    assert from_ns == 51 * GATE_NS
-    for gate_ns in range(0, 5_000_000_000, GATE_NS):
-        step.me.done(gate_ns)
-        if gate_ns == 49 * GATE_NS:
-            break
-    step.me.done(51 * GATE_NS)
-    for gate_ns in range(50 * GATE_NS, 5_000_000_000, GATE_NS):
-        step.me.done(gate_ns)
-    step.world.ends(with_code=0)
+    assert step.event("join", "tester.late").message["data"]["from_ns"] == 53 * GATE_NS
+    step.answer(53 * GATE_NS)
+    step.stands_at(54 * GATE_NS, "tester.late")
+    late.done(53 * GATE_NS)
+    step.stands_at(55 * GATE_NS, ME, "tester.late")
+    late.die()
+    assert step.event("death", "tester.late").message["data"]["on_death"] == "drop"
+    step.event("drop", "tester.late")
+    step.answer(60 * GATE_NS)
+    step.stands_at(62 * GATE_NS)
+    step.leave()
+
+
+def test_a_newer_incarnation_takes_over(federation: Federation) -> None:
+    """A program of the same name joins; the older one is still there and goes on talking.
+
+        tester.one #1  ──5──┐ superseded   done 6 (refused)
+        tester.one #2       └─ join (done 5) ── done 6 ──▶
+
+    Expected: the newer one goes on where the older was; what the older says is refused with the reason.
+    """
+    step = Lockstep(federation)
+    step.answer(5 * GATE_NS)
+    step.stands_at(7 * GATE_NS)
+    older = step.me
+    step.me = step.client.join(ME, step.info, GATE_NS)
+    data = step.event("superseded", ME).message["data"]
+    assert (data["incarnation"], data["done_ns"]) == (step.me.run["incarnation"], 5 * GATE_NS)
+    older.done(6 * GATE_NS)
+    reason = step.event("refused", f"process/{ME}/done").message["data"]["reason"]
+    assert f"incarnation is {older.run['incarnation']}; must be {step.me.run['incarnation']}" in reason
+    step.stands_at(7 * GATE_NS)
+    step.me.done_ns = 5 * GATE_NS
+    step.answer(6 * GATE_NS)
+    step.stands_at(8 * GATE_NS)
+    step.leave()
+
+
+def test_a_restart_after_death(federation: Federation) -> None:
+    """A program dies, time stands (on_death: wait), and it comes back by a new incarnation.
+
+        tester.one #1  ──5── dies          #2 join ──6──▶
+
+    Expected: `clock` names it while it is away; an event `restart` says from where it goes on.
+    """
+    step = Lockstep(federation, "--set", "processes.on_death={tester.one: wait}")
+    step.answer(5 * GATE_NS)
+    step.stands_at(7 * GATE_NS)
+    step.me.die()
+    assert step.event("death", ME).message["data"]["on_death"] == "wait"
+    step.stands_at(7 * GATE_NS)
+    step.me = step.client.join(ME, step.info, GATE_NS)
+    assert step.event("restart", ME).message["data"]["done_ns"] == 5 * GATE_NS
+    step.me.done_ns = 5 * GATE_NS
+    step.answer(6 * GATE_NS)
+    step.stands_at(8 * GATE_NS)
+    step.leave()
+
+
+def test_joins_and_dones_that_are_refused(federation: Federation) -> None:
+    """What does not fit the run is refused with the reason, and moves nothing.
+
+    Expected: an event each; time stands where it stood.
+    """
+    step = Lockstep(federation)
+    step.stands_at(DELAY_NS)
+    cases = [
+        ({"period_ns": GATE_NS + 1}, f"period_ns is {GATE_NS + 1}; must be 0 or a multiple of {GATE_NS}"),
+        ({"run_id": "another"}, "run_id is 'another'; must be "),
+    ]
+    for number, (fields, reason) in enumerate(cases):
+        name = f"stranger.{number}"
+        step.client.join(name, step.info, GATE_NS, **fields)
+        assert reason in step.event("refused", f"process/{name}/join").message["data"]["reason"]
+    for done_ns, reason in ((3600 * 10**9, "must be <= 20000000, the newest gate"), (0, "")):
+        step.me.done(done_ns)
+        if reason:
+            assert reason in step.event("refused", f"process/{ME}/done").message["data"]["reason"]
+    step.client.put("process/nobody.there/done", t_ns=0, **step.me.run, done_ns=0, sent=0)
+    assert "has not joined" in step.event("refused", "process/nobody.there/done").message["data"]["reason"]
+    step.stands_at(DELAY_NS + GATE_NS)
+    step.leave()
+
+
+def test_outputs_that_were_lost(federation: Federation) -> None:
+    """A done counts two commands of which one was lost on the way.
+
+        tester.one ── takeoff ─✗   takeoff ──▶ world
+                   ── done 0 (sent 2) ────────▶ world ── get process/tester.one/outputs ──▶ tester.one
+
+    Expected: the world asks for the outputs once; what it gets takes effect at its instant.
+    """
+    step = Lockstep(federation)
+    mode = {"source": ME, "mode": "takeoff"}
+    key = "drone/drone1/cmd/mode"
+    lost = step.client.pack({"t_ns": 0, "seq": 0, **mode})
+    asked = step.client.answer(f"process/{ME}/outputs", {"ok": True, "error": "", "result": [[key, lost]]})
+    step.me.done(0, sent=1)
+    step.stands_at(2 * GATE_NS)
+    assert len(asked) == 1
+    step.answer(GATE_NS)
+    assert step.event("mode", "drone1").message["t_ns"] == DELAY_NS
+    step.leave()
+
+
+def test_outputs_that_nobody_has(federation: Federation) -> None:
+    """As before, but the program does not answer for what it lost.
+
+    Expected: an event says how many are missing, and time goes on.
+    """
+    step = Lockstep(federation)
+    step.me.done(0, sent=2)
+    assert step.event("outputs_missing", ME).message["data"]["missing"] == 2
+    step.stands_at(2 * GATE_NS)
+    step.leave()
+
+
+def test_pause_step_resume(federation: Federation) -> None:
+    """An operator stops time, takes three steps, and lets it run; a program gates all the while.
+
+    Expected: `clock` says paused and shows exactly three more gates; every call is an event.
+    """
+    step = Lockstep(federation)
+    step.answer(5 * GATE_NS)
+    step.stands_at(7 * GATE_NS)
+    assert step.client.ask("world/control", "pause")["ok"]
+    refused = step.client.ask("world/control", "pause")
+    assert refused["error"] == "the run is paused; pause needs a running one"
+    for gate in (6, 7):
+        step.me.done(gate * GATE_NS)
+    paused = step.clock.until(lambda m: m["state"] == "paused")
+    assert paused.message["t_ns"] == 7 * GATE_NS
+    assert step.client.ask("world/control", "step", gates=2)["ok"]
+    standing = step.clock.until(lambda m: m["state"] == "paused" and m["t_ns"] == 9 * GATE_NS)
+    again = step.clock.until(lambda m: m["state"] == "paused" and m["step"] >= 9)
+    assert again.message["t_ns"] == standing.message["t_ns"] == 9 * GATE_NS
+    assert step.client.ask("world/control", "resume")["ok"]
+    step.me.done_ns = 7 * GATE_NS
+    step.answer(8 * GATE_NS)
+    step.stands_at(10 * GATE_NS)
+    ops = [e.message["subject"] for e in step.events.now() if e.message["kind"] == "control"]
+    assert ops == ["pause", "pause", "step", "resume"]
+    step.leave()
+
+
+def test_nobody_expected_and_a_stop(federation: Federation) -> None:
+    """A world that expects nobody starts by itself; an operator stops it.
+
+    Expected: it ends with the operator's reason, its clock says stopped.
+    """
+    world = federation.world(ONE, "--rate", "1", "--duration", "1000")
+    client = federation.client()
+    clock, events = client.watch("clock"), client.watch("world/event")
+    clock.until(lambda m: m["t_ns"] > 0)
+    assert client.ask("world/control", "stop", source="operator.1", reason="lunch")["ok"]
+    assert events.until(lambda m: m["kind"] == "end").message["data"]["reason"] == "stopped by operator.1: lunch"
+    assert clock.until(lambda m: m["state"] == "stopped")
+    world.ends(with_code=0)
+    world.line("ended: stopped by operator.1: lunch")

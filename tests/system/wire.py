@@ -126,6 +126,22 @@ class Client:
         """Publish any bytes."""
         self.session.put(self._prefix + key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
+    def answer(self, key: str, answer: dict[str, Any]) -> list[bytes]:
+        """Answer every get on a key; return the list that its payloads are put into."""
+        asked: list[bytes] = []
+
+        def reply(query: zenoh.Query) -> None:
+            asked.append(query.payload.to_bytes() if query.payload is not None else b"")
+            query.reply(self._prefix + key, msgpack.packb(answer))
+
+        self._kept.append(self.session.declare_queryable(self._prefix + key, reply))
+        return asked
+
+    @staticmethod
+    def pack(fields: dict[str, Any]) -> bytes:
+        """Return a message as it goes on the wire."""
+        return msgpack.packb(fields)
+
     def token(self, name: str) -> Any:
         """Declare the liveliness token of a process; `undeclare` it to play its death."""
         return self.session.liveliness().declare_token(f"{self._prefix}process/{name}")
@@ -147,6 +163,7 @@ class Participant:
         self.name = name
         self.period_ns = period_ns
         self.run = {"run_id": info["run_id"], "incarnation": next(self._incarnations)}
+        self.done_ns = -period_ns
         self.token = client.token(name)
 
     def join(self, **others: Any) -> None:
@@ -155,6 +172,7 @@ class Participant:
         self.client.put(f"process/{self.name}/join", **{"t_ns": 0, **self.run, **about, **others})
 
     def done(self, t_ns: int, sent: int = 0) -> None:
+        self.done_ns = t_ns
         self.client.put(f"process/{self.name}/done", t_ns=t_ns, **self.run, done_ns=t_ns, sent=sent)
 
     def bye(self, t_ns: int, reason: str = "shown") -> None:

@@ -8,7 +8,7 @@ import pytest
 from zsim.scenario_file import resolve
 from zsim_world import rigid_body as body
 from zsim_world import vehicle
-from zsim_world.encounter import DISC_M2, JET_WIDTHS, downwash, encounters, hull_force
+from zsim_world.encounter import JET_WIDTHS, downwash, encounters, hull_force
 
 RADIUS = vehicle.HULL_RADIUS_M
 
@@ -85,13 +85,15 @@ def test_two_drones_in_one_place_give_no_nan(rows):
 def test_downwash_carries_the_thrust(below):
     """The momentum of the jet, integrated over a plane below, is the thrust at every depth."""
     radii = np.linspace(0.0, 4.0, 20001)
-    speed = np.array([downwash(4.2, 1.225, below, r) for r in radii])
+    speed = np.array([downwash(4.2, 1.225, 0.1, below, r) for r in radii])
     flux = np.trapezoid(1.225 * speed**2 * 2 * np.pi * radii, radii)
     assert math.isclose(flux, 4.2, rel_tol=1e-3)
 
 
 def test_downwash_at_the_disc_is_twice_the_induced_speed():
-    assert math.isclose(downwash(4.2, 1.225, 0.0, 0.0), 2 * math.sqrt(4.2 / (2 * 1.225 * DISC_M2)), rel_tol=1e-12)
+    assert math.isclose(
+        downwash(4.2, 1.225, 0.1, 0.0, 0.0), 2 * math.sqrt(4.2 / (2 * 1.225 * 0.04 * math.pi)), rel_tol=1e-12
+    )
 
 
 def test_downwash_blows_on_the_lower_drone_only(rows):
@@ -101,4 +103,4 @@ def test_downwash_blows_on_the_lower_drone_only(rows):
 
 
 def test_downwash_ends_beside_the_jet():
-    assert downwash(4.2, 1.225, 2.0, JET_WIDTHS * 0.43) == 0.0
+    assert downwash(4.2, 1.225, 0.1, 2.0, JET_WIDTHS * 0.43) == 0.0

@@ -297,23 +297,41 @@ def test_it_flies_on_its_flow_and_not_on_truth():
     np.testing.assert_allclose(drift, (-0.3, 0.0, 0.0), atol=0.1)
 
 
-def test_another_aircraft_flies_too():
-    heavy = {
-        "mass_kg": 1.5,
-        "inertia_kg_m2": [0.015, 0.016, 0.03],
-        "arm_m": 0.25,
-        "thrust_n_s2": 1.6e-5,
-        "torque_nm_s2": 3.0e-7,
-        "rotor_time_constant_s": 0.06,
-        "rotor_min_rad_s": 150.0,
-        "rotor_max_rad_s": 800.0,
-        "drag_n_s_m": 0.4,
-        "battery_mah": 5000.0,
-    }
-    flight = airborne(2, **heavy)
+HEAVY = {
+    "mass_kg": 1.5,
+    "inertia_kg_m2": [0.015, 0.016, 0.03],
+    "arm_m": 0.25,
+    "thrust_n_s2": 1.6e-5,
+    "torque_nm_s2": 3.0e-7,
+    "rotor_time_constant_s": 0.06,
+    "rotor_min_rad_s": 150.0,
+    "rotor_max_rad_s": 800.0,
+    "drag_n_s_m": 0.4,
+    "battery_mah": 5000.0,
+}
+LIGHT = {
+    "mass_kg": 0.05,
+    "inertia_kg_m2": [3e-5, 3e-5, 5e-5],
+    "arm_m": 0.06,
+    "thrust_n_s2": 4.0e-8,
+    "torque_nm_s2": 2.4e-10,
+    "rotor_time_constant_s": 0.02,
+    "rotor_min_rad_s": 300.0,
+    "rotor_max_rad_s": 2600.0,
+    "drag_n_s_m": 0.02,
+}
+
+
+@pytest.mark.parametrize("aircraft", [HEAVY, LIGHT], ids=["heavy", "light"])
+def test_another_aircraft_flies_too(aircraft):
+    flight = airborne(2, **aircraft)
     track = run(flight, 6.0, every(flight, (1.0, 0.0, 0.2)))
     mean = np.mean([in_heading_frame(truth) for truth in track[-100:]], axis=0)
     np.testing.assert_allclose(mean, (1.0, 0.0, 0.2), atol=0.15)
+    for i in range(2):
+        flight.land(i)
+    run(flight, 12.0)
+    assert states(flight) == ["landed"] * 2
 
 
 def test_it_flies_with_a_turned_and_shifted_board():

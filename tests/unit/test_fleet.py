@@ -246,3 +246,34 @@ def test_a_drone_placed_above_the_ground_falls_onto_it():
     fleet = Fleet(resolve(document))
     gates(fleet, 100)
     assert fleet.truth().position_m[0, 2] == pytest.approx(0.058, abs=2e-3)
+
+
+@pytest.mark.parametrize("dt_ms", [0.5, 1.0, 5.0])
+def test_other_physics_steps_fly_the_same_flight_nearly(dt_ms):
+    def end(dt):
+        fleet = Fleet(scenario(2, time={"physics_dt_ms": dt}))
+        for i in range(2):
+            fleet.takeoff(i)
+        gates(fleet, 400)
+        for _ in range(200):
+            fleet.set_velocity(0, (0.5, 0.0, 0.1))
+            fleet.advance()
+        assert fleet.status(1)[0] == "hovering"
+        return fleet.truth().position_m
+
+    np.testing.assert_allclose(end(dt_ms), end(2.5), atol=0.3)
+
+
+def test_a_hundred_drones_in_a_crowd_collide_and_stay_finite():
+    drones = [{"name": f"d{k}", "position_m": [0.61 * (k % 10), 0.61 * (k // 10), 0]} for k in range(100)]
+    crowd = {"name": "t", "duration_s": 1, "environment": {"wind": {"gust_m_s": 1.0}}, "drones": drones}
+    fleet = Fleet(resolve(crowd))
+    for i in range(100):
+        fleet.takeoff(i)
+    touched = 0
+    for _ in range(500):
+        fleet.advance()
+        touched += len(fleet.collisions())
+    assert touched > 0
+    assert np.isfinite(fleet.truth().position_m).all()
+    assert fleet.min_separation_m() > 0.3

@@ -89,7 +89,7 @@ def test_ground_effect_tilts_a_drone_away_from_the_nearer_rotor(row):
 
 @pytest.mark.parametrize(("height", "factor"), [(0.1, 16 / 15), (0.05, 4 / 3), (0.0, 4 / 3), (1.0, 1 / (1 - 0.025**2))])
 def test_ground_effect_values(height, factor):
-    assert math.isclose(ground_effect(height), factor, rel_tol=1e-12)
+    assert math.isclose(ground_effect(height, 0.1), factor, rel_tol=1e-12)
 
 
 def test_lag_is_exponential():

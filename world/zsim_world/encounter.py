@@ -8,29 +8,30 @@ from zsim_world.compiled import compiled
 from zsim_world.rigid_body import ATTITUDE, POSITION, ROTOR, VELOCITY, four
 from zsim_world.rotation import z_axis
 from zsim_world.rotors import Four
-from zsim_world.vehicle import AIR_DENSITY, HULL_DAMPING, HULL_RADIUS_M, HULL_STIFFNESS, ROTOR_RADIUS_M, THRUST
+from zsim_world.vehicle import AIR_DENSITY, HULL_DAMPING, HULL_RADIUS_M, HULL_STIFFNESS, ROTOR_RADIUS, THRUST
 
-DISC_M2 = 4.0 * math.pi * ROTOR_RADIUS_M**2  # m^2, area of the four rotors together
-JET_START_M = math.sqrt(DISC_M2 / math.pi)  # m, width at which a Gaussian jet of speed 2 v_h carries the thrust
+JET_START = 2.0  # rotor radii, width at which a Gaussian jet of speed 2 v_h carries the thrust of four rotors
 JET_SPREAD = 0.107  # growth of a round jet's 1/e width (Fischer et al., Mixing in Inland and Coastal Waters, 1979)
 JET_WIDTHS = 3.0  # beyond three widths the jet is 1e-4 of its core
 
 
 @compiled
-def downwash(thrust_n: float, density: float, below_m: float, aside_m: float) -> float:
+def downwash(thrust_n: float, density: float, radius_m: float, below_m: float, aside_m: float) -> float:
     """Return the downward speed [m/s] of the air below a hovering drone.
 
     The far wake of momentum theory, 2 v_h = 2 sqrt(T / (2 rho A)), as a turbulent round jet that keeps its momentum:
-    w = 2 v_h (b0 / b) exp(-(r / b)^2), b = b0 + 0.107 z.
+    w = 2 v_h (b0 / b) exp(-(r / b)^2), b = b0 + 0.107 z, b0 = 2 R.
 
     Args:
-        thrust_n: of the drone above; density: of the air [kg/m^3].
+        thrust_n: of the drone above; density: of the air [kg/m^3]; radius_m: of each of its four rotors.
         below_m, aside_m: where, from the drone above, both >= 0.
     """
-    width = JET_START_M + JET_SPREAD * below_m
+    start = JET_START * radius_m
+    width = start + JET_SPREAD * below_m
     if aside_m > JET_WIDTHS * width or thrust_n <= 0.0:
         return 0.0
-    core = 2.0 * math.sqrt(thrust_n / (2.0 * density * DISC_M2)) * JET_START_M / width
+    disc = 4.0 * math.pi * radius_m * radius_m
+    core = 2.0 * math.sqrt(thrust_n / (2.0 * density * disc)) * start / width
     ratio = aside_m / width
     return core * math.exp(-ratio * ratio)
 
@@ -55,7 +56,7 @@ def _free_thrust(row: NDArray, speed: Four) -> float:
 @compiled
 def _blow(vehicle: NDArray, state: NDArray, above: int, below: int, aside: float, drop: float, air: NDArray) -> None:
     thrust = _free_thrust(vehicle[above], four(state[above], ROTOR)) * z_axis(four(state[above], ATTITUDE))[2]
-    air[below, 2] -= downwash(thrust, vehicle[above, AIR_DENSITY], drop, aside)
+    air[below, 2] -= downwash(thrust, vehicle[above, AIR_DENSITY], vehicle[above, ROTOR_RADIUS], drop, aside)
 
 
 @compiled
@@ -102,10 +103,8 @@ def encounters(
                 if touching[i, j] == 0:
                     touched[i, j] = 1
             touching[i, j] = 1 if contact else 0
-            reach = JET_WIDTHS * (JET_START_M + JET_SPREAD * abs(dz))
+            above = j if dz > 0.0 else i
+            reach = JET_WIDTHS * (JET_START * vehicle[above, ROTOR_RADIUS] + JET_SPREAD * abs(dz))
             if aside2 < reach * reach:
-                if dz > 0.0:
-                    _blow(vehicle, state, j, i, math.sqrt(aside2), dz, air)
-                else:
-                    _blow(vehicle, state, i, j, math.sqrt(aside2), -dz, air)
+                _blow(vehicle, state, above, i + j - above, math.sqrt(aside2), abs(dz), air)
     return least

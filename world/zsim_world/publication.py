@@ -15,6 +15,15 @@ GPS_FIX_3D = 3  # NMEA: 3 = three-dimensional fix
 GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone
 
 
+class _Slot:
+    """A sensor of a drone: its key, its message, how many there were."""
+
+    __slots__ = ("build", "key", "seq")
+
+    def __init__(self, key: str, build: Callable[[Sample, int], Any]) -> None:
+        self.key, self.build, self.seq = key, build, 0
+
+
 class Publication:
     """Builds the messages of each gate and counts them per key."""
 
@@ -22,37 +31,25 @@ class Publication:
         self._fleet = fleet
         self._sigma_m = [drone.sensors.gps.position_m.noise for drone in scenario.drones]
         names = fleet.names
-        self._sensor_keys = [{kind: keys.sensor(name, kind) for kind in keys.SENSORS} for name in names]
         self._status_keys = [keys.status(name) for name in names]
         self._truth_keys = [keys.truth(name) for name in names]
-        self._seq = [dict.fromkeys(keys.SENSORS, 0) for _ in names]
         self._gate = 0
-        self._build: dict[str, Callable[[Sample, int], Any]] = {
-            "imu": _imu,
-            "gps": self._gps,
-            "mag": _mag,
-            "baro": _baro,
-            "sonar": _sonar,
-            "flow": _flow,
-        }
+        build = {"imu": _imu, "gps": self._gps, "mag": _mag, "baro": _baro, "sonar": _sonar, "flow": _flow}
+        self._slots = [{kind: _Slot(keys.sensor(name, kind), build[kind]) for kind in keys.SENSORS} for name in names]
 
     def gate(self, truth: Any, holder: Callable[[int], str | None]) -> Iterator[Output]:
         """Yield the messages of the gate that the fleet stands at."""
         by_drone: list[list[Output]] = [[] for _ in self._status_keys]
         for sample in self._fleet.samples():
-            by_drone[sample.drone].append(self._sample(sample))
+            slot = self._slots[sample.drone][sample.sensor]
+            by_drone[sample.drone].append(Output(slot.key, slot.build(sample, slot.seq)))
+            slot.seq += 1
         truths = self._truths(truth)
         for drone, outputs in enumerate(by_drone):
             yield from outputs
             yield Output(self._truth_keys[drone], truths[drone])
             yield Output(self._status_keys[drone], self._status(drone, len(outputs) + 1, holder(drone)))
         self._gate += 1
-
-    def _sample(self, sample: Sample) -> Output:
-        counts = self._seq[sample.drone]
-        seq = counts[sample.sensor]
-        counts[sample.sensor] = seq + 1
-        return Output(self._sensor_keys[sample.drone][sample.sensor], self._build[sample.sensor](sample, seq))
 
     def _gps(self, s: Sample, seq: int) -> messages.Gps:
         v = s.values
@@ -63,9 +60,7 @@ class Publication:
 
     def _status(self, drone: int, count: int, commander: str | None) -> messages.Status:
         state, battery_percent, collision = self._fleet.status(drone)
-        return messages.Status(
-            self._fleet.t_ns, self._gate, state, battery_percent, collision, commander, count
-        )  # type: ignore[arg-type]
+        return messages.Status(self._fleet.t_ns, self._gate, state, battery_percent, collision, commander, count)  # type: ignore[arg-type]
 
     def _truths(self, truth: Any) -> list[messages.Truth]:
         t_ns, seq = self._fleet.t_ns, self._gate

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from zsim_world.compiled import compiled
 from zsim_world.rotation import Quaternion, Vector, rotate
 from zsim_world.vehicle import (
-    ROTOR_INERTIA_KG_M2,
+    ROTOR_INERTIA,
     ROTOR_MAX,
     ROTOR_MIN,
-    ROTOR_RADIUS_M,
+    ROTOR_RADIUS,
     ROTOR_XY,
     THRUST,
     TORQUE,
@@ -21,7 +21,7 @@ Four = tuple[float, float, float, float]
 SIDE_X = (1.0, 1.0, -1.0, -1.0)
 SIDE_Y = (1.0, -1.0, -1.0, 1.0)
 TURN = (1.0, -1.0, 1.0, -1.0)
-GROUND_CLEARANCE_MIN_M = 0.5 * ROTOR_RADIUS_M  # m, the formula below is not meant for less
+GROUND_CLEARANCE_MIN = 0.5  # radii, the formula below is not meant for less
 
 
 @compiled
@@ -36,13 +36,13 @@ def lagged(speed: Four, command: Four, decay: float) -> Four:
 
 
 @compiled
-def ground_effect(height_m: float) -> float:
+def ground_effect(height_m: float, radius_m: float) -> float:
     """Return the thrust near the ground over that in free air: 1 / (1 - (R / 4z)^2).
 
     Cheeseman and Bennett, ARC R&M 3021 (1955); z is the rotor's height, not taken below R/2 (factor 4/3).
     """
-    z = max(height_m, GROUND_CLEARANCE_MIN_M)
-    ratio = ROTOR_RADIUS_M / (4.0 * z)
+    z = max(height_m, GROUND_CLEARANCE_MIN * radius_m)
+    ratio = radius_m / (4.0 * z)
     return 1.0 / (1.0 - ratio * ratio)
 
 
@@ -61,17 +61,17 @@ def wrench(
         w_WB_B: body rate [rad/s].
         speed, slew: rotor speeds [rad/s] and their derivatives [rad/s^2].
     """
-    arm = row[ROTOR_XY]
+    arm, radius, inertia = row[ROTOR_XY], row[ROTOR_RADIUS], row[ROTOR_INERTIA]
     ex, ey = rotate(q_WB, (arm, 0.0, 0.0))[2], rotate(q_WB, (0.0, arm, 0.0))[2]
     total, mx, my, mz, spin = 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(4):
         square = speed[k] * speed[k]
-        force = row[THRUST] * square * ground_effect(height_m + SIDE_X[k] * ex + SIDE_Y[k] * ey)
+        force = row[THRUST] * square * ground_effect(height_m + SIDE_X[k] * ex + SIDE_Y[k] * ey, radius)
         total += force
         mx += SIDE_Y[k] * arm * force
         my -= SIDE_X[k] * arm * force
-        mz += TURN[k] * (row[TORQUE] * square + ROTOR_INERTIA_KG_M2 * slew[k])
-        spin += TURN[k] * ROTOR_INERTIA_KG_M2 * speed[k]
+        mz += TURN[k] * (row[TORQUE] * square + inertia * slew[k])
+        spin += TURN[k] * inertia * speed[k]
     return total, (mx + w_WB_B[1] * spin, my - w_WB_B[0] * spin, mz)
 
 

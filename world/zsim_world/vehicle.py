@@ -20,11 +20,14 @@ GRAVITY, AIR_DENSITY = 11, 12  # m/s^2, kg/m^3
 FOOT_STIFFNESS, FOOT_DAMPING = 13, 14  # N/m, N s/m per contact point
 HULL_STIFFNESS, HULL_DAMPING = 15, 16  # N/m, N s/m between two hulls, of this drone's mass
 CAPACITY = 17  # J, of a full battery
-COLUMNS = 18
+ROTOR_RADIUS, ROTOR_INERTIA = 18, 19  # m, kg m^2
+COLUMNS = 20
 
 REFERENCE_DENSITY_KG_M3 = 1.225  # kg/m^3, ISA sea level: k_F, k_M and the drag of a scenario hold there
-ROTOR_INERTIA_KG_M2 = 2.029585e-5  # kg m^2, rotor and gear (Li, MSc thesis, TU Delft 2014, through AuRoRA)
-ROTOR_RADIUS_M = 0.1  # m, 0.2 m propeller of the AR.Drone
+# The AR.Drone's rotor; another aircraft's is taken as similar in shape: k_F grows as R^4, k_M and the inertia as R^5
+REFERENCE_THRUST_N_S2, REFERENCE_TORQUE_NM_S2 = 8.048e-6, 2.423e-7  # Li, MSc thesis, TU Delft 2014, through AuRoRA
+ROTOR_INERTIA_KG_M2 = 2.029585e-5  # kg m^2, rotor and gear (Li 2014, as above)
+ROTOR_RADIUS_M = 0.1  # m, 0.2 m propeller
 HULL_RADIUS_M = 0.26  # m, half of the indoor hull's 0.515 m (OpenMAS, measured)
 FOOT_DEPTH_M = 0.060  # m, feet below the centre of mass: half of the aircraft's 0.127 m height, rounded down
 FOOT_XY_M = 0.10  # m, a foot's |x| and |y|: under the hub of the central cross
@@ -70,4 +73,6 @@ def parameters(drone: Drone, environment: Environment) -> NDArray[np.float64]:
     row[HULL_STIFFNESS] = reduced * HULL_FREQUENCY_RAD_S**2
     row[HULL_DAMPING] = 2.0 * HULL_DAMPING_RATIO * reduced * HULL_FREQUENCY_RAD_S
     row[CAPACITY] = drone.battery_mah * 3.6 * BATTERY_V  # 1 mAh is 3.6 C
+    row[ROTOR_RADIUS] = ROTOR_RADIUS_M * (drone.thrust_n_s2 / REFERENCE_THRUST_N_S2) ** 0.25
+    row[ROTOR_INERTIA] = ROTOR_INERTIA_KG_M2 * drone.torque_nm_s2 / REFERENCE_TORQUE_NM_S2
     return row
