@@ -64,6 +64,11 @@ class Session:
             publisher = self._publishers.get(key) or self._declare(key)
             publisher.put(payload)
 
+    def heard(self, key: str) -> bool:
+        """Tell whether anybody subscribes to a key of ours."""
+        publisher = self._publishers.get(key) or self._declare(key)
+        return publisher.matching_status.matching
+
     def put_raw(self, key: str, payload: bytes) -> None:
         """Publish an encoded payload; the encoding follows from the key."""
         publisher = self._publishers.get(key) or self._declare(key)

@@ -1,4 +1,4 @@
-"""The recorder as a process: every message of every key into `run.mcap`; not gating, but never skipping either.
+"""The recorder as a process: every message of every key into `run.mcap`; not gating, but never skipping.
 
 Order of this file: `record`, the process, what arrives.
 """
@@ -13,8 +13,8 @@ from pathlib import Path
 
 import msgspec
 
-from zsim import __version__, keys, messages
-from zsim.errors import RecordError
+from zsim import __version__, batch, keys, messages
+from zsim.errors import DecodeError, RecordError
 from zsim.health import HealthMeter
 from zsim.record import RecordWriter
 from zsim.session import Sample, Session
@@ -71,7 +71,8 @@ class Recorder:
         self.health = HealthMeter(NAME)
 
     def run(self) -> str:
-        self._box = self._link.subscribe("**")
+        self._box = self._link.subscribe(batch.KEY)
+        self._views = self._link.subscribe("view/**")
         self._link.declare_token(keys.token(self._name))
         self._link.on_link(lambda up: self._box.wake())
         self._catch_up()
@@ -94,10 +95,12 @@ class Recorder:
         while True:
             sample = self._box.receive()
             if sample is not None:
-                self._write(sample)
+                self._write_batch(sample)
             time.sleep(PAUSE_S)
             for sample in self._box.drain():
-                self._write(sample)
+                self._write_batch(sample)
+            for sample in self._views.drain():
+                self._write(sample.key, sample.payload)
             self._writer.tick(time.monotonic_ns())
             if self._may_stop():
                 return "stopped"
@@ -122,12 +125,18 @@ class Recorder:
             keys.CONTROL, "replay", self._name, timeout_s=REPLAY_S, from_ns=-1, keys=["**"]
         )
         for key, payload in answer.result or ():
-            self._write(Sample(key, payload))
+            self._write(key, payload)
             if len(self._known) < KNOWN_MAX:
                 self._known.add((key, payload))
 
-    def _write(self, sample: Sample) -> None:
-        key, payload = sample.key, sample.payload
+    def _write_batch(self, sample: Sample) -> None:
+        try:
+            for key, payload in batch.decode(sample.payload):
+                self._write(key, payload)
+        except DecodeError:
+            self.health.refused += 1
+
+    def _write(self, key: str, payload: bytes) -> None:
         if self._known and (key, payload) in self._known:
             return
         self.health.received += 1

@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from zsim import keys, messages, session
+from zsim import batch, keys, messages, session
 from zsim.agent import Output
 from zsim.errors import DecodeError
 from zsim.health import HealthMeter
@@ -63,6 +63,7 @@ class WorldProcess:
         self._tell = tell
         self._state_decoder = msgspec.msgpack.Decoder(messages.ClusterState)
         self._history = History()
+        self._passed: batch.Batch = []
         self._head = msgspec.msgpack.Decoder(_Head)
         self._queries: deque[Query] = deque()
         self._tokens: deque[tuple[str, bool]] = deque()
@@ -171,6 +172,7 @@ class WorldProcess:
             self._inputs.wait(TICK_S)
             self._take_in_all()
             self._serve_rare()
+            self._put_batch()
         self._flush()
 
     # What arrives
@@ -178,6 +180,7 @@ class WorldProcess:
     def _take_in_all(self) -> None:
         for wall_ns, sample in self._inputs.drain():
             self.health.received += 1
+            self._passed.append((sample.key, sample.payload))
             self._take_in(wall_ns, sample)
 
     def _take_in(self, wall_ns: int, sample: Sample) -> None:
@@ -286,6 +289,8 @@ class WorldProcess:
             return
         encoded = [(key, messages.encode(message)) for key, message in outbox]
         self._link.put_all(encoded)
+        self._passed += encoded
+        self._put_batch()
         for key, payload in encoded:
             self._history.add(key, payload, self._world.now_ns)
         for key, message in outbox:
@@ -295,9 +300,17 @@ class WorldProcess:
             elif key == keys.EVENT:
                 self._tell("event", message, self._phase)
 
+    def _put_batch(self) -> None:
+        """Hand what has passed to the recorders, if there are any."""
+        passed, self._passed = self._passed, []
+        if self._link.heard(batch.KEY):
+            for first in range(0, len(passed), batch.MESSAGES_MAX):
+                self._link.put_raw(batch.KEY, batch.encode(passed[first : first + batch.MESSAGES_MAX]))
+
     def _publish(self, output: Output) -> None:
         """Publish one message beside the outbox."""
         payload = messages.encode(output.message)
+        self._passed.append((output.key, payload))
         self._history.add(output.key, payload, self._world.now_ns)
         self._link.put_raw(output.key, payload)
 

@@ -1,0 +1,34 @@
+"""Everything that passed the hub since its last gate, in one message: what recorders read.
+
+Relayed one by one, the messages of a gate cost the recorder and the hub a packet and a wake-up each. The key is
+outside of the contract and begins with `@`, which no wildcard of Zenoh matches: whoever subscribes to `**` hears the
+messages themselves, and does not hear this.
+"""
+
+import msgspec
+
+from zsim.errors import DecodeError
+
+KEY = "@batch"
+Batch = list[tuple[str, bytes]]
+MESSAGES_MAX = 5_000  # of one batch; a flood of somebody's messages goes into several
+
+_encoder = msgspec.msgpack.Encoder()
+_decoder = msgspec.msgpack.Decoder(Batch)
+
+
+def encode(passed: Batch) -> bytes:
+    """Return the payload that carries (key, payload) in the order in which they passed."""
+    return _encoder.encode(passed)
+
+
+def decode(payload: bytes) -> Batch:
+    """Return what passed.
+
+    Raises:
+        DecodeError: it is no batch.
+    """
+    try:
+        return _decoder.decode(payload)
+    except msgspec.MsgspecError as error:
+        raise DecodeError(f"{KEY}: {error}; must be a list of [key, payload]") from error
