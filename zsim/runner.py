@@ -27,7 +27,7 @@ TICK_S = 0.1  # how often a stop is looked for while nothing arrives
 DRAIN_S = 1.0  # how long the last gates are waited for once the run has ended
 REPLAY_S = 2.0  # a hub answers a replay within milliseconds; a lost link does not
 VIEW_PERIOD_S = 1 / 30  # contract: at most 30 Hz wall
-GATES_KEPT = 2  # gates of which the outputs are kept to answer a get, contract
+GATES_KEPT = 2  # gates of which the outputs are kept to answer a get, contract; more where the world runs ahead
 
 
 class Runner:
@@ -60,7 +60,8 @@ class Runner:
         self._events: deque[messages.Event] = deque()
         self._queries: deque[Query] = deque()
         self._links: deque[bool] = deque()
-        self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT)
+        ahead = info.command_delay_ns // info.gate_ns
+        self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
         self._done_key = keys.process(agent.name, "done")
         self._done_ns = -1
         self._view_wall_s = 0.0

@@ -153,10 +153,7 @@ def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Arr
 @compiled
 def wrapped(c: Array, period: Array) -> Array:
     """Return c with each variable taken to half a period about zero; period is 2 pi or, for none, 0."""
-    taken = np.empty(c.size)
-    for k in range(c.size):
-        taken[k] = c[k] - period[k] * np.rint(c[k] / TAU)
-    return taken
+    return c - period * np.rint(c / TAU)
 
 
 @compiled

@@ -70,12 +70,13 @@ class Controller(Agent):
 
     def _gate(self, t_ns: int) -> GateInput:
         known = [e if e is not None else _UNKNOWN for e in self._estimates]
+        variances = [[e.covariance[i] for i in SIGMA_AT] for e in known]
         return GateInput(
             t_s=t_ns * 1e-9,
             p_W=np.array([e.position_m for e in known]),
             yaw=np.array([e.yaw_rad for e in known]),
             v_W=np.array([e.velocity_m_s for e in known]),
-            sigma_m=np.sqrt(np.array([[e.covariance[i] for i in SIGMA_AT] for e in known])),
+            sigma_m=np.sqrt(np.array(variances)),
             age_s=np.array([(t_ns - e.t_ns) * 1e-9 if e is not _UNKNOWN else math.inf for e in known]),
             states=tuple(self._states),
         )
@@ -208,4 +209,7 @@ def in_heading(v_W: list[float], yaw: float) -> tuple[float, float, float]:
 
 def _finite(values: np.ndarray) -> tuple[float, ...]:
     """Return values for the wire, where nothing unknown may travel: zeros in its place."""
-    return tuple(value if math.isfinite(value) else 0.0 for value in values.tolist())
+    known = values.tolist()
+    if not math.isfinite(sum(known)):  # one of them is not, or they are too large for a sum
+        known = [value if math.isfinite(value) else 0.0 for value in known]
+    return tuple(known)

@@ -35,7 +35,7 @@ from zsim_agents.flight_request import (
     Target,
     refuse,
 )
-from zsim_agents.formation import FormationGains, FormationLaw, Pairs, guard
+from zsim_agents.formation import FormationCommand, FormationGains, FormationLaw, Pairs, guard
 from zsim_agents.guidance import Guidance
 from zsim_agents.mode_sender import ModeSender
 from zsim_agents.reference_check import place_fault
@@ -194,7 +194,7 @@ class Engagement:
             below_m = self.limits.assembly_height_m - gate.p_W[:, 2]
             v_W[:, 2] = np.clip(CLIMB_GAIN_1_S * below_m, 0.0, self.limits.assembly_climb_m_s)
             v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, self.gains)
-        return self._output(gate, reason, modes=modes, v_W=v_W, alarmed=alarmed)
+        return self._output(gate, reason, modes=modes, command=self._upright(v_W, alarmed))
 
     def _engaged(self, gate: GateInput) -> GateOutput:
         self._judge(gate)
@@ -206,19 +206,18 @@ class Engagement:
         reason = "held on request" if self.guidance.paused else ""
         if command.guarded:
             reason = f"the guard parts {self._pairs(command.guarded)}"
-        return dataclasses.replace(
-            self._output(gate, reason, v_W=command.v_W, yaw_rate=command.yaw_rate, alarmed=command.alarmed),
-            desired=self.space.wrapped(c_des),
-            desired_rate=c_dot_des,
-            factor=command.factor,
-        )
+        return self._output(gate, reason, command=command, reference=(self.space.wrapped(c_des), c_dot_des))
 
     def _held(self, gate: GateInput) -> GateOutput:
         v_W = np.zeros((self.space.n, 3))
         alarmed: Pairs = ()
         if self.judge.estimate_fault(gate) is None:
             v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, self._apart)
-        return self._output(gate, self._fault, v_W=v_W, alarmed=alarmed)
+        return self._output(gate, self._fault, command=self._upright(v_W, alarmed))
+
+    def _upright(self, v_W: Array, alarmed: Pairs) -> FormationCommand:
+        """Return velocities (n, 3) without turning."""
+        return FormationCommand(v_W, np.zeros(self.space.n), 1.0, (), alarmed)
 
     def _landing(self, gate: GateInput) -> GateOutput:
         # A take-off sent just before may still be on its way: idle only after a while on the ground.
@@ -260,31 +259,40 @@ class Engagement:
         reason: str,
         *,
         modes: tuple[ModeCommand, ...] = (),
-        v_W: Array | None = None,
-        yaw_rate: Array | None = None,
-        alarmed: Pairs = (),
+        command: FormationCommand | None = None,
+        reference: tuple[Array, Array] | None = None,
     ) -> GateOutput:
-        setpoints: list[Setpoint | None] = [None] * self.space.n
-        if v_W is not None:
-            rates = np.zeros(self.space.n) if yaw_rate is None else yaw_rate
-            for i, state in enumerate(gate.states):
-                if state in AIRBORNE:
-                    setpoints[i] = Setpoint(v_W[i], float(rates[i]))
+        """Return the output of a gate; without a reference the formation is said to be where it wants to be."""
+        alarmed = command.alarmed if command else ()
         if alarmed:
             limit_m = self.gains.separation_alarm_m
             reason = f"ALARM, nearer than {limit_m:g} m: {self._pairs(alarmed)}; {reason}"
+        if self.plan.note:
+            reason = f"{reason}; {self.plan.note}" if reason else self.plan.note
+        desired, desired_rate = reference or (self.judge.value, np.zeros(self.space.size))
         return GateOutput(
             modes=modes,
-            setpoints=tuple(setpoints),
+            setpoints=self._setpoints(gate, command) if command else (None,) * self.space.n,
             phase=self.phase,
             value=self.judge.value,
-            desired=self.judge.value,
-            desired_rate=np.zeros(self.space.size),
+            desired=desired,
+            desired_rate=desired_rate,
             trajectory_t_s=self.guidance.trajectory_t_s(gate.t_s) if self._phase == "engaged" else None,
             margin=self.judge.margin,
-            reason="; ".join(text for text in (reason, self.plan.note) if text),
-            factor=1.0,
+            reason=reason,
+            factor=command.factor if command else 1.0,
             alarmed=alarmed,
+        )
+
+    @staticmethod
+    def _setpoints(gate: GateInput, command: FormationCommand) -> tuple[Setpoint | None, ...]:
+        """Return the setpoints of the drones that follow one."""
+        rates = command.yaw_rate.tolist()
+        return tuple(
+            [
+                Setpoint(command.v_W[i], rates[i]) if state in AIRBORNE else None
+                for i, state in enumerate(gate.states)
+            ]
         )
 
     def _pairs(self, pairs: Pairs) -> str:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from zsim_agents.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
+from zsim_agents.compiled import compiled
 from zsim_agents.flight_data import AIRBORNE, EngagementLimits, GateInput
 from zsim_agents.formation import FormationGains
 from zsim_agents.reference_check import FAR, shape_fault
+
+WELL, OLD, WILD, VAGUE = range(4)  # what an estimate is: fit, too old, not finite, too uncertain
 
 
 class FlightJudge:
@@ -37,7 +40,7 @@ class FlightJudge:
     def observe(self, gate: GateInput) -> None:
         """Take over the estimates of a gate."""
         self.margin, self._no_frame = 0.0, "an estimate is not finite"
-        if not ((np.abs(gate.p_W) < FAR).all() and (np.abs(gate.yaw) < FAR).all()):  # also true for NaN
+        if not all_near(gate.p_W, gate.yaw):
             return
         try:
             self.value = self.space.forward(gate.p_W, gate.yaw)
@@ -91,15 +94,45 @@ class FlightJudge:
         return None
 
     def _estimate_fault(self, gate: GateInput, sigma_max_m: float) -> str | None:
-        rows = (gate.age_s, gate.p_W, gate.v_W, gate.yaw, gate.sigma_m)
-        for drone, age_s, p_W, v_W, yaw, sigmas in zip(
-            self.drones, *map(np.ndarray.tolist, rows), strict=True
-        ):
-            if not age_s <= self.limits.age_max_s:
-                return f"the estimate of {drone} is {age_s:.2f} s old; allowed: {self.limits.age_max_s:g} s"
-            if not all(abs(value) < FAR for value in (*p_W, *v_W, yaw)):  # also true for NaN
-                return f"the estimate of {drone} is not finite; allowed: up to {FAR:g} m, m/s or rad"
-            if not all(sigma_m <= sigma_max_m for sigma_m in sigmas):
-                worst_m = max(sigmas)
-                return f"the position of {drone} has a sigma of {worst_m:.2f} m; allowed: {sigma_max_m:g} m"
-        return None
+        age_max_s = self.limits.age_max_s
+        kind, i = estimate_flaw(gate.age_s, gate.p_W, gate.v_W, gate.yaw, gate.sigma_m, age_max_s, sigma_max_m)
+        if kind == WELL:
+            return None
+        drone = self.drones[i]
+        if kind == OLD:
+            return f"the estimate of {drone} is {gate.age_s[i]:.2f} s old; allowed: {age_max_s:g} s"
+        if kind == WILD:
+            return f"the estimate of {drone} is not finite; allowed: up to {FAR:g} m, m/s or rad"
+        worst_m = max(gate.sigma_m[i].tolist())
+        return f"the position of {drone} has a sigma of {worst_m:.2f} m; allowed: {sigma_max_m:g} m"
+
+
+@compiled
+def all_near(p_W: Array, yaw: Array) -> bool:
+    """Return whether all positions (n, 3) and headings (n,) are finite and below FAR."""
+    fit = True
+    for i in range(yaw.size):
+        fit = fit and near(p_W, i) and abs(yaw[i]) < FAR
+    return fit
+
+
+@compiled
+def near(vectors: Array, i: int) -> bool:
+    """Return whether row i of (n, 3) is finite and below FAR; false for NaN."""
+    return abs(vectors[i, 0]) < FAR and abs(vectors[i, 1]) < FAR and abs(vectors[i, 2]) < FAR
+
+
+@compiled
+def estimate_flaw(
+    age_s: Array, p_W: Array, v_W: Array, yaw: Array, sigma_m: Array, age_max_s: float, sigma_max_m: float
+) -> tuple[int, int]:
+    """Return what the first estimate that is not well is (OLD, WILD or VAGUE), and whose; else WELL."""
+    for i in range(yaw.size):
+        if not age_s[i] <= age_max_s:
+            return OLD, i
+        if not (near(p_W, i) and near(v_W, i) and abs(yaw[i]) < FAR):
+            return WILD, i
+        for k in range(3):
+            if not sigma_m[i, k] <= sigma_max_m:
+                return VAGUE, i
+    return WELL, 0

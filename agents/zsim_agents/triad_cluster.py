@@ -9,7 +9,6 @@ Order of this file: the space, the compiled mathematics from robots to c and bac
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 

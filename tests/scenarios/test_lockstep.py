@@ -191,7 +191,7 @@ def test_joins_and_dones_that_are_refused(federation: Federation) -> None:
     ]
     for number, (fields, reason) in enumerate(cases):
         name = f"stranger.{number}"
-        step.client.join(name, step.info, GATE_NS, **fields)
+        step.client.join(name, step.info, **{"period_ns": GATE_NS, **fields})
         assert reason in step.event("refused", f"process/{name}/join").message["data"]["reason"]
     for done_ns, reason in ((3600 * 10**9, "must be <= 20000000, the newest gate"), (0, "")):
         step.me.done(done_ns)

@@ -88,6 +88,7 @@ def test_a_stopped_estimator(federation: Federation, pair_sha256: str) -> None:
     assert first.message["t_ns"] == later.message["t_ns"]
     assert waited_for(first)["host"] == socket.gethostname()
     assert waited_for(later)["since_wall_s"] - waited_for(first)["since_wall_s"] > 0.9  # told once a wall second
+    assert first.message["waiting_for"][1]["name"] == "controller.main"  # it waits for the estimate
     run.line(r"waiting for estimator.drone1 on .* \(\d+\.\d s\)")
     federation.kill("estimator.drone1", signal.SIGCONT)
     run.ends(with_code=0)
@@ -95,8 +96,8 @@ def test_a_stopped_estimator(federation: Federation, pair_sha256: str) -> None:
 
 
 def named(clock: Watch, name: str) -> Heard:
-    """Return the next clock that waits for one process only, that of the name."""
-    return clock.until(lambda m: [w["name"] for w in m["waiting_for"]] == [name])
+    """Return the next clock that waits for that name before all others."""
+    return clock.until(lambda m: m["waiting_for"] and m["waiting_for"][0]["name"] == name)
 
 
 def waited_for(heard: Heard) -> dict[str, Any]:

@@ -26,14 +26,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import click
 import msgspec
 import pytest
 import typer
 import yaml
 from msgspec import inspect as types
 
-from zsim import presets, scenario, scenario_file
+from zsim import messages, presets, scenario, scenario_file
 from zsim_deploy.cli import app
 
 ROOT = Path(__file__).parents[2]
@@ -237,11 +236,14 @@ def test_commands_for_other_machines_are_ones_that_exist(page: Path) -> None:
 
 def parses(arguments: list[str]) -> bool:
     """Tell whether the command line takes the arguments; nothing is run."""
-    group = typer.main.get_command(app)
-    assert isinstance(group, click.Group)
-    command = group.commands[arguments[0]]
+    command = commands()[arguments[0]]
     with command.make_context(arguments[0], arguments[1:]):
         return True
+
+
+def commands() -> dict[str, Any]:
+    """Return the commands of `zsim` by name."""
+    return typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
 
 def test_every_example_is_run_by_a_page() -> None:
@@ -251,10 +253,8 @@ def test_every_example_is_run_by_a_page() -> None:
 
 
 def test_every_command_of_the_command_line_is_shown() -> None:
-    group = typer.main.get_command(app)
-    assert isinstance(group, click.Group)
     shown = "\n".join(b.text for p in PAGES for b in blocks(p) if b.kind.startswith("bash"))
-    assert [name for name in group.commands if f"zsim {name}" not in shown] == []
+    assert [name for name in commands() if f"zsim {name}" not in shown] == []
 
 
 # Scenarios
@@ -411,16 +411,13 @@ def allowed(info: types.Type) -> str:
 
 
 def _number(info: types.FloatType | types.IntType) -> str:
-    low = info.gt if info.ge is None else info.ge
-    high = info.lt if info.le is None else info.le
-    parts = ["whole number" if isinstance(info, types.IntType) else "number"]
-    if low is not None and abs(low) < scenario.LARGE:
-        parts.append(f"{'>' if info.ge is None else '≥'} {low:g}")
-    if high is not None and high == 2**62:
-        parts.append("≤ 2^62")
-    elif high is not None and abs(high) < scenario.LARGE:
-        parts.append(f"{'<' if info.le is None else '≤'} {high:,.0f}" if high >= 1e4 else f"{'<' if info.le is None else '≤'} {high:g}")
-    return " ".join(parts[:2]) + "".join(f", {part}" for part in parts[2:])
+    whole, large = isinstance(info, types.IntType), scenario.LARGE
+    low, least = (info.gt, ">") if info.ge is None else (info.ge, "≥")
+    high, most = (info.lt, "<") if info.le is None else (info.le, "≤")
+    limits = [f"{least} {low:g}"] if low is not None and abs(low) < large else []
+    if high is not None and (abs(high) < large or whole):
+        limits.append(f"{most} {'2^62' if high == 2**62 else f'{high:.0f}' if high >= 1e4 else f'{high:g}'}")
+    return f"{'whole number' if whole else 'number'} {', '.join(limits)}".rstrip()
 
 
 def _length(info: types.ListType) -> str:
@@ -456,6 +453,27 @@ def _flat(value: dict[str, Any], path: str = "") -> Iterator[tuple[str, float]]:
             yield f"{path}{name}", item
 
 
+# The protocol
+
+
+@pytest.mark.parametrize("shape", sorted(messages.types_by_shape()))
+def test_the_protocol_names_every_message_and_field(shape: str) -> None:
+    """The row of a key holds the message's name and those of all its fields, nested ones too."""
+    kind = messages.types_by_shape()[shape]
+    key = shape.replace("drone/*", "drone/{d}").replace("cluster/*", "cluster/{c}").replace("process/*", "process/{p}")
+    text = (ROOT / "docs/protocol.md").read_text()
+    row = next(line for line in text.splitlines() if line.startswith(f"| `{key}` |"))
+    wanted = [kind.__name__, *(f for f in messages.fields(kind) if f not in ("t_ns", "seq"))]
+    assert [word for word in wanted if not re.search(rf"\b{word}\b", row)] == []
+
+
+def test_the_protocol_names_every_event() -> None:
+    code = "".join(path.read_text() for path in sorted((ROOT / "world/zsim_world").glob("*.py")))
+    kinds = set(re.findall(r"\bevent\(\s*\"(\w+)\"", code)) | {"join", "restart", "superseded"}
+    text = (ROOT / "docs/protocol.md").read_text()
+    assert sorted(kind for kind in kinds if f"`{kind}`" not in text) == []
+
+
 # Links, files and names
 
 
@@ -487,13 +505,16 @@ def anchors(page: Path) -> set[str]:
 def defines(file: Path, name: str) -> bool:
     """Tell whether a file defines the last part of a dotted name; a path to the file itself counts."""
     last = name.removesuffix("()").rsplit(".", 1)[-1]
-    code = file.read_text()
-    return str(file).endswith(name) or re.search(rf"^\s*(class|def) {last}\b|^{last}\b.*=", code, re.MULTILINE) is not None
+    definition = re.compile(rf"^\s*(class|def) {last}\b|^{last}\b.*=", re.MULTILINE)
+    return str(file).endswith(name) or definition.search(file.read_text()) is not None
+
+
+FOLDERS = "zsim|world|agents|deploy|examples|scenarios|docs|tests|benchmarks"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_files_that_are_named_exist(page: Path) -> None:
-    named = re.findall(r"`((?:zsim|world|agents|deploy|examples|scenarios|docs|tests|benchmarks)/[\w/.-]+\.\w+)`", page.read_text())
+    named = re.findall(rf"`((?:{FOLDERS})/[\w/.-]+\.\w+)`", page.read_text())
     assert [name for name in named if not (ROOT / name).exists()] == []
 
 

@@ -148,8 +148,8 @@ class Client:
 
     def join(self, name: str, info: dict[str, Any], period_ns: int, **others: Any) -> "Participant":
         """Take part in the run under a name."""
-        participant = Participant(self, name, info, period_ns)
-        participant.join(**others)
+        participant = Participant(self, name, {**info, **others}, period_ns)
+        participant.join()
         return participant
 
 
@@ -166,10 +166,10 @@ class Participant:
         self.done_ns = -period_ns
         self.token = client.token(name)
 
-    def join(self, **others: Any) -> None:
+    def join(self) -> None:
         role = self.name.split(".")[0]
         about = {"role": role, "host": "elsewhere", "pid": os.getpid(), "period_ns": self.period_ns}
-        self.client.put(f"process/{self.name}/join", **{"t_ns": 0, **self.run, **about, **others})
+        self.client.put(f"process/{self.name}/join", **{"t_ns": 0, **self.run, **about})
 
     def done(self, t_ns: int, sent: int = 0) -> None:
         self.done_ns = t_ns

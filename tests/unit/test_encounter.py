@@ -49,9 +49,9 @@ def test_touching_hulls_push_each_other_apart_and_keep_momentum(rows):
 
 
 def test_hull_resists_closing_and_never_attracts():
-    assert hull_force(1000.0, 10.0, 0.5, 1.0) == pytest.approx(1000.0 * 0.02 + 10.0)
-    assert hull_force(1000.0, 10.0, 0.51, -5.0) == 0.0
-    assert hull_force(1000.0, 10.0, 2 * RADIUS, 5.0) == 0.0
+    assert hull_force(1000.0, 10.0, 0.02, 1.0) == pytest.approx(1000.0 * 0.02 + 10.0)
+    assert hull_force(1000.0, 10.0, 0.01, -5.0) == 0.0
+    assert hull_force(1000.0, 10.0, 0.0, 5.0) == 0.0
 
 
 def test_head_on_collision_rebounds_and_loses_energy(rows):
@@ -91,9 +91,8 @@ def test_downwash_carries_the_thrust(below):
 
 
 def test_downwash_at_the_disc_is_twice_the_induced_speed():
-    assert math.isclose(
-        downwash(4.2, 1.225, 0.1, 0.0, 0.0), 2 * math.sqrt(4.2 / (2 * 1.225 * 0.04 * math.pi)), rel_tol=1e-12
-    )
+    induced = math.sqrt(4.2 / (2 * 1.225 * 4 * math.pi * 0.1**2))
+    assert math.isclose(downwash(4.2, 1.225, 0.1, 0.0, 0.0), 2 * induced, rel_tol=1e-12)
 
 
 def test_downwash_blows_on_the_lower_drone_only(rows):

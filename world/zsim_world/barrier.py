@@ -173,7 +173,14 @@ class Barrier:
         return [p for p in self.participants.values() if p.missing]
 
     def waiting_for(self, need_ns: int, wall_ns: int, start_wall_ns: int) -> tuple[Waiting, ...]:
-        """Return whom the world waits for, as `clock` names them."""
+        """Return whom the world waits for, as `clock` names them: first the dead, then who is silent for longest.
+
+        Who only waits for another's outputs spoke after that one, and is expected after it.
+        """
         absent = [Waiting(name, "", (wall_ns - start_wall_ns) / 1e9) for name in self.absent()]
-        late = [Waiting(p.name, p.host, (wall_ns - p.since_wall_ns) / 1e9) for p in self.blocking(need_ns)]
-        return tuple(absent + late)
+        rank = {name: place for place, name in enumerate(self._expected)}
+        owing = sorted(
+            self.blocking(need_ns), key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank)))
+        )
+        late = [Waiting(p.name, p.host, (wall_ns - p.since_wall_ns) / 1e9) for p in owing]
+        return (*absent, *late)

@@ -8,7 +8,7 @@ from zsim_world.compiled import compiled
 from zsim_world.rigid_body import ATTITUDE, POSITION, ROTOR, VELOCITY, four
 from zsim_world.rotation import z_axis
 from zsim_world.rotors import Four
-from zsim_world.vehicle import AIR_DENSITY, HULL_DAMPING, HULL_RADIUS_M, HULL_STIFFNESS, ROTOR_RADIUS, THRUST
+from zsim_world.vehicle import AIR_DENSITY, HULL_DAMPING, HULL_RADIUS, HULL_STIFFNESS, ROTOR_RADIUS, THRUST
 
 JET_START = 2.0  # rotor radii, width at which a Gaussian jet of speed 2 v_h carries the thrust of four rotors
 JET_SPREAD = 0.107  # growth of a round jet's 1/e width (Fischer et al., Mixing in Inland and Coastal Waters, 1979)
@@ -37,12 +37,11 @@ def downwash(thrust_n: float, density: float, radius_m: float, below_m: float, a
 
 
 @compiled
-def hull_force(stiffness: float, damping: float, distance_m: float, closing_m_s: float) -> float:
-    """Return the force [N] that parts two hulls whose centres are `distance_m` apart; never an attraction."""
-    depth = 2.0 * HULL_RADIUS_M - distance_m
-    if depth <= 0.0:
+def hull_force(stiffness: float, damping: float, depth_m: float, closing_m_s: float) -> float:
+    """Return the force [N] that parts two hulls dented by `depth_m`; never an attraction."""
+    if depth_m <= 0.0:
         return 0.0
-    return max(stiffness * depth + damping * closing_m_s, 0.0)
+    return max(stiffness * depth_m + damping * closing_m_s, 0.0)
 
 
 @compiled
@@ -70,7 +69,8 @@ def _touch(
     # the softer of the two, so that a light drone stays within what its step can follow
     stiffness = min(vehicle[i, HULL_STIFFNESS], vehicle[j, HULL_STIFFNESS])
     damping = min(vehicle[i, HULL_DAMPING], vehicle[j, HULL_DAMPING])
-    force = hull_force(stiffness, damping, distance, closing) / distance
+    depth = vehicle[i, HULL_RADIUS] + vehicle[j, HULL_RADIUS] - distance
+    force = hull_force(stiffness, damping, depth, closing) / distance
     for k in range(3):
         push[i, k] -= force * d[k]
         push[j, k] += force * d[k]
@@ -97,7 +97,7 @@ def encounters(
             aside2 = dx * dx + dy * dy
             distance = max(math.sqrt(aside2 + dz * dz), 1e-9)
             least = min(least, distance)
-            contact = distance < 2.0 * HULL_RADIUS_M
+            contact = distance < vehicle[i, HULL_RADIUS] + vehicle[j, HULL_RADIUS]
             if contact:
                 _touch(vehicle, state, i, j, (dx, dy, dz), distance, push)
                 if touching[i, j] == 0:

@@ -25,7 +25,7 @@ from zsim_world.observer import STEP_S
 from zsim_world.rigid_body import four, vector
 from zsim_world.rotation import Vector, axpy
 from zsim_world.rotors import Four
-from zsim_world.vehicle import DRAG, GRAVITY, MASS, ROTOR_MIN, STAND_HEIGHT_M
+from zsim_world.vehicle import DRAG, GRAVITY, MASS, ROTOR_MIN, STAND_HEIGHT
 
 LANDED, TAKING_OFF, HOVERING, FLYING, LANDING, EMERGENCY = range(6)
 MODES: tuple[DroneState, ...] = ("landed", "taking_off", "hovering", "flying", "landing", "emergency")
@@ -257,21 +257,21 @@ def _climb(mode: int, asked: float, memory: NDArray, belief: NDArray, row: NDArr
     if mode == LANDING:
         return -_descent(memory, belief, row, setting)
     if mode == TAKING_OFF:
-        return _ascent(memory, setting, height)
+        return _ascent(memory, row, setting, height)
     if asked != 0.0:
         memory[HOLDS_Z] = 0.0
         return min(asked, K_HEIGHT * (setting[ALTITUDE] - height))
     if memory[HOLDS_Z] != HOLDING:
         ahead = height + belief[ob.VELOCITY + 2] / setting[K_CLIMB]
-        memory[HOLD_Z], memory[HOLDS_Z] = max(ahead, 2.0 * STAND_HEIGHT_M), HOLDING
+        memory[HOLD_Z], memory[HOLDS_Z] = max(ahead, 2.0 * row[STAND_HEIGHT]), HOLDING
     return _clip(K_HEIGHT * (memory[HOLD_Z] - height), setting[CLIMB])
 
 
 @compiled
-def _ascent(memory: NDArray, setting: NDArray, height: float) -> float:
+def _ascent(memory: NDArray, row: NDArray, setting: NDArray, height: float) -> float:
     """Return the vertical velocity of a take-off [m/s]: along a height that rises evenly."""
     if memory[HOLDS_Z] == 0.0:
-        memory[HOLD_Z], memory[HOLDS_Z] = STAND_HEIGHT_M, RISING
+        memory[HOLD_Z], memory[HOLDS_Z] = row[STAND_HEIGHT], RISING
     rising = 0.0
     if memory[HOLDS_Z] == RISING:
         rising = CLIMB_M_S

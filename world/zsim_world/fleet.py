@@ -82,6 +82,7 @@ class Fleet:
         self._noise = NoiseTable(scenario, NOISE_GATES)
         self._w = arrays(scenario, self._noise)
         self._bodies, self._boards, self._senses = self._w.bodies, self._w.boards, self._w.senses
+        self._hull_m = float(self._bodies.vehicle[:, vehicle.HULL_RADIUS].max())
         self._integrate(0)
 
     @property
@@ -225,7 +226,7 @@ class Fleet:
     def _meet(self, least: float) -> None:
         self._began: list[tuple[int, int]] = []
         self._touching: set[int] = set()
-        if least < 2.0 * vehicle.HULL_RADIUS_M:
+        if least < 2.0 * self._hull_m:
             self._began = [(int(i), int(j)) for i, j in np.argwhere(self._bodies.touched)]
             self._touching = {int(k) for k in np.argwhere(self._bodies.touched | self._bodies.touching).ravel()}
 

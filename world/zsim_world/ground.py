@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 
 from zsim_world.compiled import compiled
 from zsim_world.rotation import Quaternion, Vector, add, cross, rotate, rotate_back
-from zsim_world.vehicle import CONTACT_POINTS_B, CONTACT_REACH_M, FOOT_DAMPING, FOOT_STIFFNESS, FRICTION
+from zsim_world.vehicle import CONTACT_POINTS_B, CONTACT_REACH_M, FOOT_DAMPING, FOOT_STIFFNESS, FRICTION, SIZE
 
 Pair = tuple[float, float]
 
 
 @compiled
-def _point(k: int) -> Vector:
-    return (CONTACT_POINTS_B[k, 0], CONTACT_POINTS_B[k, 1], CONTACT_POINTS_B[k, 2])
+def _point(row: NDArray, k: int) -> Vector:
+    s = row[SIZE]
+    return (s * CONTACT_POINTS_B[k, 0], s * CONTACT_POINTS_B[k, 1], s * CONTACT_POINTS_B[k, 2])
 
 
 @compiled
@@ -44,19 +45,20 @@ def contact(
         p_WB, v_WB, q_WB, w_WB_B: state of the drone [m, m/s, -, rad/s].
     """
     force, moment = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    if p_WB[2] > CONTACT_REACH_M:
+    if p_WB[2] > CONTACT_REACH_M * row[SIZE]:
         return force, moment
     for k in range(CONTACT_POINTS_B.shape[0]):
-        r_W = rotate(q_WB, _point(k))
+        r_B = _point(row, k)
+        r_W = rotate(q_WB, r_B)
         depth = -(p_WB[2] + r_W[2])
         if depth > 0.0:
-            v = add(v_WB, rotate(q_WB, cross(w_WB_B, _point(k))))
+            v = add(v_WB, rotate(q_WB, cross(w_WB_B, r_B)))
             normal = max(row[FOOT_STIFFNESS] * depth - row[FOOT_DAMPING] * v[2], 0.0)
             gap = (p_WB[0] + r_W[0] - anchor[k, 0], p_WB[1] + r_W[1] - anchor[k, 1])
             fx, fy = _tangential(row, normal, gap, (v[0], v[1]))
             f_W = (fx, fy, normal)
             force = add(force, f_W)
-            moment = add(moment, cross(_point(k), rotate_back(q_WB, f_W)))
+            moment = add(moment, cross(r_B, rotate_back(q_WB, f_W)))
     return force, moment
 
 
@@ -64,7 +66,7 @@ def contact(
 def drag_anchors(row: NDArray, anchor: NDArray, p_WB: Vector, q_WB: Quaternion) -> None:
     """Move the anchors after a step: to the point itself in the air, along with it where it slides."""
     for k in range(CONTACT_POINTS_B.shape[0]):
-        r_W = rotate(q_WB, _point(k))
+        r_W = rotate(q_WB, _point(row, k))
         x, y = p_WB[0] + r_W[0], p_WB[1] + r_W[1]
         depth = -(p_WB[2] + r_W[2])
         gx, gy = x - anchor[k, 0], y - anchor[k, 1]

@@ -14,7 +14,7 @@ from zsim_world.compiled import compiled
 from zsim_world.rigid_body import four, put, put_four, vector
 from zsim_world.rotation import Quaternion, Vector, axpy
 from zsim_world.rotors import lagged
-from zsim_world.vehicle import DRAG, GRAVITY, MASS, ROTOR_LAG, STAND_HEIGHT_M, THRUST
+from zsim_world.vehicle import DRAG, GRAVITY, MASS, ROTOR_LAG, STAND_HEIGHT, THRUST
 
 STEP_S = 0.005  # s, 200 Hz, the rate of the navigation board
 
@@ -109,7 +109,7 @@ def _stand(belief: NDArray, row: NDArray, f_B: Vector, w: Vector) -> None:
     put(belief, VELOCITY, (0.0, 0.0, 0.0))
     put(belief, DISTURBANCE, (0.0, 0.0, 0.0))
     belief[LIFT_BIAS] += (f_H[2] - row[GRAVITY] - belief[LIFT_BIAS]) / n
-    belief[HEIGHT] = STAND_HEIGHT_M
+    belief[HEIGHT] = row[STAND_HEIGHT]
 
 
 @compiled

@@ -20,9 +20,9 @@ def arrays(scenario: Scenario, noise: NoiseTable) -> Arrays:
     dt = scenario.time.physics_dt_ms / 1000.0
     bodies = Bodies(
         vehicle=row,
-        state=np.array([_standing(drone) for drone in drones]),
+        state=np.array([_standing(*each) for each in zip(drones, row, strict=True)]),
         accel=np.zeros((n, 6)),
-        anchor=np.array([_anchors(drone) for drone in drones]),
+        anchor=np.array([_anchors(*each) for each in zip(drones, row, strict=True)]),
         command=np.zeros((n, 4)),
         energy=row[:, vehicle.CAPACITY] * [drone.battery_percent / 100.0 for drone in drones],
         air=np.zeros((n, 3)),
@@ -37,7 +37,7 @@ def arrays(scenario: Scenario, noise: NoiseTable) -> Arrays:
         setpoint=np.zeros((n, firmware.SETPOINT_COLUMNS)),
         set_tick=np.zeros(n, dtype=np.int64),
         memory=np.zeros((n, firmware.MEMORY_COLUMNS)),
-        belief=np.array([_first_belief() for _ in drones]),
+        belief=np.array([_first_belief(height) for height in row[:, vehicle.STAND_HEIGHT]]),
         device=np.zeros((n, observer.REGISTERS)),
     )
     senses = Senses(
@@ -56,26 +56,26 @@ def arrays(scenario: Scenario, noise: NoiseTable) -> Arrays:
     return Arrays(time, bodies, boards, numbers, senses, _wind(scenario), noise.gust)
 
 
-def _standing(drone: Drone) -> np.ndarray:
+def _standing(drone: Drone, row: np.ndarray) -> np.ndarray:
     """Return the state of a drone whose feet carry its weight; a place above the ground is one that it falls from."""
     state = np.zeros(rigid_body.COLUMNS)
     state[rigid_body.POSITION : rigid_body.POSITION + 3] = drone.position_m
-    state[rigid_body.POSITION + 2] += vehicle.STAND_HEIGHT_M
+    state[rigid_body.POSITION + 2] += row[vehicle.STAND_HEIGHT]
     state[rigid_body.ATTITUDE : rigid_body.ATTITUDE + 4] = quaternion_from_heading(math.radians(drone.yaw_deg))
     return state
 
 
-def _anchors(drone: Drone) -> np.ndarray:
+def _anchors(drone: Drone, row: np.ndarray) -> np.ndarray:
     yaw = math.radians(drone.yaw_deg)
     turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-    return np.array(drone.position_m[:2]) + vehicle.CONTACT_POINTS_B[:, :2] @ turn.T
+    return np.array(drone.position_m[:2]) + row[vehicle.SIZE] * vehicle.CONTACT_POINTS_B[:, :2] @ turn.T
 
 
-def _first_belief() -> np.ndarray:
+def _first_belief(height: float) -> np.ndarray:
     """Return the belief at power-up: level, heading unknown until the first magnetometer sample."""
     belief = np.zeros(observer.COLUMNS)
     belief[observer.ATTITUDE] = 1.0
-    belief[observer.HEIGHT] = vehicle.STAND_HEIGHT_M
+    belief[observer.HEIGHT] = height
     belief[observer.STILL_STEPS] = observer.STILL_STEPS_MIN
     return belief
 

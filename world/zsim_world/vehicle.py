@@ -21,13 +21,16 @@ FOOT_STIFFNESS, FOOT_DAMPING = 13, 14  # N/m, N s/m per contact point
 HULL_STIFFNESS, HULL_DAMPING = 15, 16  # N/m, N s/m between two hulls, of this drone's mass
 CAPACITY = 17  # J, of a full battery
 ROTOR_RADIUS, ROTOR_INERTIA = 18, 19  # m, kg m^2
-COLUMNS = 20
+SIZE, HULL_RADIUS, STAND_HEIGHT = 20, 21, 22  # of the AR.Drone's, m, m
+COLUMNS = 23
 
 REFERENCE_DENSITY_KG_M3 = 1.225  # kg/m^3, ISA sea level: k_F, k_M and the drag of a scenario hold there
 # The AR.Drone's rotor; another aircraft's is taken as similar in shape: k_F grows as R^4, k_M and the inertia as R^5
 REFERENCE_THRUST_N_S2, REFERENCE_TORQUE_NM_S2 = 8.048e-6, 2.423e-7  # Li, MSc thesis, TU Delft 2014, through AuRoRA
 ROTOR_INERTIA_KG_M2 = 2.029585e-5  # kg m^2, rotor and gear (Li 2014, as above)
 ROTOR_RADIUS_M = 0.1  # m, 0.2 m propeller
+# The AR.Drone's airframe; another aircraft's is taken as similar in shape, in proportion to its arm
+REFERENCE_ARM_M = 0.1785  # m, centre to rotor (Li 2014, as above)
 HULL_RADIUS_M = 0.26  # m, half of the indoor hull's 0.515 m (OpenMAS, measured)
 FOOT_DEPTH_M = 0.060  # m, feet below the centre of mass: half of the aircraft's 0.127 m height, rounded down
 FOOT_XY_M = 0.10  # m, a foot's |x| and |y|: under the hub of the central cross
@@ -66,7 +69,9 @@ def parameters(drone: Drone, environment: Environment) -> NDArray[np.float64]:
     row[ROTOR_MIN], row[ROTOR_MAX] = drone.rotor_min_rad_s, drone.rotor_max_rad_s
     row[DRAG] = drone.drag_n_s_m * density
     row[GRAVITY], row[AIR_DENSITY] = environment.gravity_m_s2, environment.air_density_kg_m3
-    stiffness = drone.mass_kg * environment.gravity_m_s2 / (4.0 * FOOT_SAG_M)
+    size = drone.arm_m / REFERENCE_ARM_M
+    row[SIZE], row[HULL_RADIUS], row[STAND_HEIGHT] = size, size * HULL_RADIUS_M, size * STAND_HEIGHT_M
+    stiffness = drone.mass_kg * environment.gravity_m_s2 / (4.0 * size * FOOT_SAG_M)
     row[FOOT_STIFFNESS] = stiffness
     row[FOOT_DAMPING] = 2.0 * FOOT_DAMPING_RATIO * math.sqrt(stiffness * drone.mass_kg / 4.0)
     reduced = drone.mass_kg / 2.0

@@ -7,6 +7,7 @@ The mcap library packs and unpacks every record but messages and chunks, of whic
 """
 
 import struct
+import threading
 import zlib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -34,9 +35,20 @@ FOOTER_SIZE = HEAD.size + 20
 Source = bytes | mmap
 Known = TypeVar("Known", Schema, Channel)
 
-_compressor = zstandard.ZstdCompressor(level=1)
-_decompressor = zstandard.ZstdDecompressor()
+_own = threading.local()  # zstandard's objects crash when two threads use one at a time
 _STANDARD = frozenset(range(Opcode.HEADER, Opcode.DATA_END + 1))
+
+
+def _compressor() -> zstandard.ZstdCompressor:
+    if not hasattr(_own, "compressor"):
+        _own.compressor = zstandard.ZstdCompressor(level=1)
+    return _own.compressor
+
+
+def _decompressor() -> zstandard.ZstdDecompressor:
+    if not hasattr(_own, "decompressor"):
+        _own.decompressor = zstandard.ZstdDecompressor()
+    return _own.decompressor
 
 
 class Place(NamedTuple):
@@ -146,7 +158,7 @@ def chunk(content: bytes) -> list[bytes]:
     indexes = indexes_of(content)
     record = Chunk(
         compression="zstd",
-        data=_compressor.compress(content),
+        data=_compressor().compress(content),
         message_start_time=min(min(entries[::2]) for entries in indexes.values()),
         message_end_time=max(max(entries[::2]) for entries in indexes.values()),
         uncompressed_crc=zlib.crc32(content),
@@ -174,7 +186,7 @@ def content_of(source: Source, place: Place) -> bytes | None:
     content = source[head.content : place.end]
     if head.compression:
         try:
-            content = _decompressor.decompress(content, max_output_size=head.size)
+            content = _decompressor().decompress(content, max_output_size=head.size)
         except zstandard.ZstdError:
             return None
     return content if head.crc in (0, zlib.crc32(content)) else None
