@@ -238,7 +238,11 @@ class Runner:
         last_ns = -1
         for key in self._agent.warm_start_keys():
             for sample in self._link.get(key):
-                message = messages.decode(key, sample.payload)
+                try:
+                    message = messages.decode(key, sample.payload)
+                except DecodeError as error:
+                    self._say(f"{self._agent.name}: cold start, the last value is of no use: {error}")
+                    continue
                 self._agent.warm_start(key, message)
                 self._agent.resume_seq(key, message.seq)
                 last_ns = max(last_ns, message.t_ns)
@@ -338,7 +342,7 @@ class Runner:
         elif event.kind in ("drop", "leave") and event.subject.startswith("estimator."):
             self._inbox.ignore(keys.estimate(event.subject.split(".", 1)[1]))
         elif event.kind == "join" and event.subject.startswith("estimator."):
-            self._inbox.expect(keys.estimate(event.subject.split(".", 1)[1]))
+            self._inbox.expect(keys.estimate(event.subject.split(".", 1)[1]), int(event.data.get("from_ns", 0)))
         elif event.subject == self._agent.name and event.kind in ("superseded", "restart"):
             self._serve_own_event(event)
 

@@ -13,12 +13,13 @@ from zsim.agent import Agent, Output
 from zsim.errors import RunError
 from zsim.messages import ControlAnswer, ControlRequest
 from zsim.scenario import Cluster, Gains, Scenario
-from zsim_agents.cluster_space import cluster_space
+from zsim_agents.cluster_space import ClusterSpace, cluster_space, robot_rates
 from zsim_agents.engagement import Engagement
 from zsim_agents.flight_data import GateInput, GateOutput
 from zsim_agents.flight_plan import Scheduled
 from zsim_agents.flight_request import Engage, Follow, Land, RequestError, TakeOff, Target, read_request
-from zsim_agents.formation import FormationGains
+from zsim_agents.formation import FormationGains, guard, load
+from zsim_agents.trajectory import Hold, ramp_onto
 
 SIGMA_AT = (0, 7, 14)  # places of the position's variances in the 6 x 6 covariance, row-major
 
@@ -159,11 +160,27 @@ def engagement_of(cluster: Cluster) -> Engagement:
         RunError: the plan can never be flown; the text says why.
     """
     try:
-        return Engagement(
-            cluster_space(len(cluster.drones)), cluster.drones, gains_of(cluster.gains), plan=plan_of(cluster)
-        )
+        space, gains = cluster_space(len(cluster.drones)), gains_of(cluster.gains)
+        rehearse(space, gains)
+        return Engagement(space, cluster.drones, gains, plan=plan_of(cluster))
     except ValueError as error:
         raise RunError(f"cluster {cluster.name!r}: {error}") from error
+
+
+def rehearse(space: ClusterSpace, gains: FormationGains) -> None:
+    """Fly a gate of a ring of robots that nobody sees: code is compiled, or loaded, here and not in flight."""
+    robots = range(space.n)
+    radius = space.n * gains.separation_min_m
+    turns = [2 * math.pi * i / space.n for i in robots]
+    p_W = np.array([(radius * math.cos(turn), radius * math.sin(turn), radius) for turn in turns])
+    none = np.zeros((space.n, 3))
+    c = space.forward(p_W, np.zeros(space.n))
+    ring = Engagement(space, [str(i) for i in robots], gains)
+    ring.warm_start("engaged", c)
+    ring.step(GateInput(0.0, p_W, np.zeros(space.n), none, none, np.zeros(space.n), ("flying",) * space.n))
+    ramp_onto(space, c, c, Hold(c), 0.0, 2.0).value(1.0)
+    guard(p_W, none, none, gains)
+    load(*robot_rates(space, c, c), gains)
 
 
 def gains_of(gains: Gains) -> FormationGains:

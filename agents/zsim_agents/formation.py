@@ -23,6 +23,7 @@ from zsim_agents.compiled import compiled
 Pairs = tuple[tuple[int, int], ...]
 
 Order = NDArray[np.int64]
+Guarding = tuple[int, int, Order]
 
 NEAR_M = 1e-6  # robots that are nearer have no direction from one to the other
 SETTLED_M_S = 1e-9  # a rate that lacks less is reached
@@ -117,12 +118,13 @@ class FormationLaw:
             dt_s: time since the last command, for the integral.
         """
         error = self.space.difference(c_des, c)
-        c_dot = c_dot_des + self.gains.k_1_s * error + self.integral
+        c_dot = cluster_rate(c_dot_des, error, self.integral, self.gains.k_1_s)
         r_dot = self.space.inverse_jacobian(c) @ c_dot
         v_cmd_W, yaw_rate, factor, acts = limited(r_dot, p_W, v_W, self.gains.limits)
-        if factor == 1.0 and not acts.guards:
+        guarded, alarmed = pairs_of(*acts)
+        if factor == 1.0 and not guarded:
             self._integrate(error, dt_s)
-        return FormationCommand(v_cmd_W, yaw_rate, factor, *acts.pairs())
+        return FormationCommand(v_cmd_W, yaw_rate, factor, guarded, alarmed)
 
     def _integrate(self, error: Array, dt_s: float) -> None:
         """Advance the integral; it runs only while the robots follow the law, and never past its clamp."""
@@ -144,38 +146,36 @@ def guard(p_W: Array, v_W: Array, v_cmd_W: Array, gains: FormationGains) -> tupl
     a few sweeps settle several pairs.
     """
     parted_W = v_cmd_W.copy()
-    return parted_W, *held_apart(p_W, v_W, parted_W, gains.limits).pairs()
+    return parted_W, *pairs_of(*held_apart(p_W, v_W, parted_W, gains.limits))
 
 
-class Guarding(NamedTuple):
-    """What the guard did.
-
-    Attributes:
-        guards, alarms: how many pairs it holds apart, and how many are nearer than the alarm threshold.
-        order: (n, n); above the diagonal the numbers of the former pairs from 1 on, below it of the latter.
-    """
-
-    guards: int
-    alarms: int
-    order: Order
-
-    def pairs(self) -> tuple[Pairs, Pairs]:
-        """Return the pairs that are held apart, and those in alarm."""
-        return _pairs(self.guards, self.order), _pairs(self.alarms, self.order.T)
+def pairs_of(guards: int, alarms: int, order: Order) -> tuple[Pairs, Pairs]:
+    """Return the pairs that `held_apart` has held apart, and those in alarm."""
+    return _numbered(order) if guards else (), _numbered(order.T) if alarms else ()
 
 
-def _pairs(count: int, order: Order) -> Pairs:
-    if not count:
-        return ()
-    places = ((order[i, j], i, j) for j in range(len(order)) for i in range(j) if order[i, j])
+def _numbered(order: Order) -> Pairs:
+    """Return the pairs with a number above the diagonal, in the order of their numbers."""
+    numbers = order.tolist()
+    places = [(numbers[i][j], i, j) for j in range(len(numbers)) for i in range(j) if numbers[i][j]]
     return tuple((i, j) for _, i, j in sorted(places))
 
 
 @compiled
-def limited(
-    r_dot: Array, p_W: Array, v_W: Array, limits: Limits
-) -> tuple[Array, Array, float, Guarding]:
-    """Return velocities (n, 3) and yaw rates (n,) of r_dot (4n,) saturated and guarded, and the factor of it."""
+def cluster_rate(c_dot_des: Array, error: Array, integral: Array, k: float) -> Array:
+    """Return c_dot_des + k error + integral."""
+    c_dot = np.empty(error.size)
+    for i in range(error.size):
+        c_dot[i] = c_dot_des[i] + k * error[i] + integral[i]
+    return c_dot
+
+
+@compiled
+def limited(r_dot: Array, p_W: Array, v_W: Array, limits: Limits) -> tuple[Array, Array, float, Guarding]:
+    """Return velocities (n, 3) and yaw rates (n,) of r_dot (4n,), saturated and guarded.
+
+    Third comes the factor of the saturation, then what `held_apart` returns.
+    """
     n = r_dot.size // 4
     v_cmd_W, yaw_rate = np.empty((n, 3)), np.empty(n)
     for i in range(n):
@@ -183,10 +183,10 @@ def limited(
         yaw_rate[i] = r_dot[4 * i + 3]
     factor = min(1.0, 1.0 / max(greatest_load(v_cmd_W, yaw_rate, limits), LOAD_MIN))
     scale(v_cmd_W, yaw_rate, factor)
-    guarding = held_apart(p_W, v_W, v_cmd_W, limits)
-    if guarding.guards:
+    acts = held_apart(p_W, v_W, v_cmd_W, limits)
+    if acts[0]:
         scale(v_cmd_W, yaw_rate, 1.0 / max(greatest_load(v_cmd_W, yaw_rate, limits), 1.0))
-    return v_cmd_W, yaw_rate, factor, guarding
+    return v_cmd_W, yaw_rate, factor, acts
 
 
 @compiled
@@ -221,7 +221,11 @@ def grown(integral: Array, error: Array, rate: float, clamp: Array) -> Array:
 
 @compiled
 def held_apart(p_W: Array, v_W: Array, v_cmd_W: Array, limits: Limits) -> Guarding:
-    """Change commands in place until every pair separates at its least rate (see `guard`)."""
+    """Change commands in place until every pair separates at its least rate (see `guard`).
+
+    Returns how many pairs were changed, how many are nearer than the alarm threshold, and (n, n) with the
+    numbers of the former, from 1 on, above the diagonal and of the latter below it.
+    """
     n = p_W.shape[0]
     order = np.zeros((n, n), np.int64)
     alarms = note_alarms(p_W, limits.separation_alarm_m, order)
@@ -237,7 +241,7 @@ def held_apart(p_W: Array, v_W: Array, v_cmd_W: Array, limits: Limits) -> Guardi
                         order[i, j] = guards
         if settled:
             break
-    return Guarding(guards, alarms, order)
+    return guards, alarms, order
 
 
 @compiled

@@ -47,7 +47,7 @@ class Hold:
     duration_s: float | None = 0.0
 
     def value(self, t_s: float) -> tuple[Array, Array]:
-        return self.c, np.zeros_like(self.c)
+        return self.c, np.zeros(self.c.size)
 
 
 @dataclass(frozen=True, eq=False)

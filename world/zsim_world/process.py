@@ -24,6 +24,7 @@ TICK_S = 0.1  # how often a standing world looks at the wall clock
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
+REPLAY_BYTES_MAX = 8_000_000  # of one answer, oldest first; who lacks more asks again
 RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
 WORLD = "world"
 PHASE_EVERY = 10  # cluster states between two looks at the phase that progress shows
@@ -197,6 +198,14 @@ class WorldProcess:
         except (DecodeError, msgspec.MsgspecError) as error:
             self.health.refused += 1
             self._world.refuse("somebody", key[:80], str(error))
+            self._count_unread(sample)
+
+    def _count_unread(self, sample: Sample) -> None:
+        """Count an output that was refused, so that its sender's done is not taken to be short of it."""
+        try:
+            self._world.output_of(self._head.decode(sample.payload).source)
+        except msgspec.MsgspecError:
+            return  # nobody can be named
 
     def _pass_on(self, key: str, payload: bytes) -> None:
         """Keep an output that the hub only relays, and count it for the done of who sent it."""
@@ -277,8 +286,13 @@ class WorldProcess:
             return ControlAnswer(
                 ok=False, error="replay: needs from_ns (whole number) and keys (list of texts)"
             )
-        found = self._history.since(from_ns, [str(expression) for expression in expressions])
-        return ControlAnswer(ok=True, result=[[key, payload] for key, payload in found])
+        result, size = [], 0
+        for key, payload in self._history.since(from_ns, [str(expression) for expression in expressions]):
+            size += len(payload)
+            if size > REPLAY_BYTES_MAX:
+                break
+            result.append([key, payload])
+        return ControlAnswer(ok=True, result=result)
 
     # Publication
 

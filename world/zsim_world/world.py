@@ -172,6 +172,8 @@ class World:
             self.event("leave", name, f"{name} left: {message.reason}", source=name, reason=message.reason)
             self._leave_drones(name)
             self.dropped.add(name)
+            if self.state == "waiting" and name in expected(self.scenario):
+                self.barrier.expect(name)
             if participant.role == "recorder" and not self.ended:
                 self.stop(f"the recorder left: {message.reason}")
 
