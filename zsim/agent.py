@@ -56,6 +56,10 @@ class Agent(ABC):
     def step(self, t_ns: int) -> Sequence[Output]:
         """Return the outputs of the gate t_ns."""
 
+    def rehearse(self) -> None:
+        """Load and compile whatever the first step would; called before joining, so that no gate waits for it."""
+        return
+
     def control_keys(self) -> tuple[str, ...]:
         """Return the keys on which it answers requests."""
         return ()

@@ -79,6 +79,7 @@ class Runner:
             SupersededError: another process of the same name has taken over.
             RunError: the world has begun another run.
         """
+        self._agent.rehearse()
         self._subscribe()
         self._catch_up_with_former()
         self._join()

@@ -52,9 +52,8 @@ def row(table: Array, i: int) -> Vector:
 
 
 @compiled
-def between(p_W: Array, i: int, j: int) -> Vector:
-    """Return the vector from robot i to robot j, of positions (n, 3)."""
-    a, b = row(p_W, i), row(p_W, j)
+def between(a: Vector, b: Vector) -> Vector:
+    """Return the vector from a to b."""
     return b[0] - a[0], b[1] - a[1], b[2] - a[2]
 
 

@@ -71,16 +71,16 @@ class Controller(Agent):
 
     def _gate(self, t_ns: int) -> GateInput:
         known = [e if e is not None else _UNKNOWN for e in self._estimates]
-        variances = [[e.covariance[i] for i in SIGMA_AT] for e in known]
-        return GateInput(
-            t_s=t_ns * 1e-9,
-            p_W=np.array([e.position_m for e in known]),
-            yaw=np.array([e.yaw_rad for e in known]),
-            v_W=np.array([e.velocity_m_s for e in known]),
-            sigma_m=np.sqrt(np.array(variances)),
-            age_s=np.array([(t_ns - e.t_ns) * 1e-9 if e is not _UNKNOWN else math.inf for e in known]),
-            states=tuple(self._states),
-        )
+        positions, velocities, variances, yaws, ages_s = [], [], [], [], []
+        for e in known:
+            positions += e.position_m
+            velocities += e.velocity_m_s
+            variances += [e.covariance[i] for i in SIGMA_AT]
+            yaws.append(e.yaw_rad)
+            ages_s.append((t_ns - e.t_ns) * 1e-9 if e is not _UNKNOWN else math.inf)
+        p_W, v_W, variance = np.array((positions, velocities, variances)).reshape(3, len(known), 3)
+        yaw, age_s = np.array((yaws, ages_s))
+        return GateInput(t_ns * 1e-9, p_W, yaw, v_W, np.sqrt(variance), age_s, tuple(self._states))
 
     def _modes(self, t_ns: int, output: GateOutput) -> list[Output]:
         outputs = []
@@ -142,13 +142,13 @@ class Controller(Agent):
 _UNKNOWN = messages.Estimate(
     0,
     0,
-    (math.nan,) * 3,
-    (math.nan,) * 3,
+    (math.nan, math.nan, math.nan),
+    (math.nan, math.nan, math.nan),
     (1.0, 0.0, 0.0, 0.0),
     math.nan,
     (math.inf,) * 36,
     math.inf,
-    (0.0,) * 3,
+    (0.0, 0.0, 0.0),
     {},
 )
 

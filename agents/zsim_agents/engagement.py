@@ -289,10 +289,7 @@ class Engagement:
         """Return the setpoints of the drones that follow one."""
         rates = command.yaw_rate.tolist()
         return tuple(
-            [
-                Setpoint(command.v_W[i], rates[i]) if state in AIRBORNE else None
-                for i, state in enumerate(gate.states)
-            ]
+            [Setpoint(command.v_W[i], rates[i]) if state in AIRBORNE else None for i, state in enumerate(gate.states)]
         )
 
     def _pairs(self, pairs: Pairs) -> str:

@@ -37,9 +37,8 @@ class Estimator(Agent):
         self.gate_keys = (keys.status(drone),)
         self.counted = (drone,)
         self._key = keys.estimate(drone)
-        self._core = DroneEstimator(
-            scenario.drone(drone), scenario.environment, scenario.estimation, info.gate_ns / 1e9
-        )
+        self._settings = (scenario.drone(drone), scenario.environment, scenario.estimation, info.gate_ns / 1e9)
+        self._core = DroneEstimator(*self._settings)
         self._take: dict[type, Callable[[Any], None]] = {
             messages.Imu: self._on_imu,
             messages.Gps: self._on_gps,
@@ -75,6 +74,18 @@ class Estimator(Agent):
         estimate = self._core.close(t_ns * 1e-9)
         message = messages.Estimate(t_ns, self.next_seq(self._key), *estimate, source=self.name)
         return [Output(self._key, message)]
+
+    def rehearse(self) -> None:
+        twin = DroneEstimator(*self._settings)
+        for gate in range(1, 4):
+            t_s = gate * 0.02
+            twin.imu(t_s, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0))
+            twin.mag(t_s, t_s, self._settings[1].magnetic_field_ut)
+            twin.gps(t_s, t_s, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 2.0, 3)
+            twin.baro(t_s, t_s, 0.0)
+            twin.sonar(t_s, t_s, 0.06, True)
+            twin.flow(t_s, t_s, (0.0, 0.0, 0.0), 1.0)
+            twin.close(t_s)
 
     def warm_start_keys(self) -> tuple[str, ...]:
         return (self._key,)

@@ -76,7 +76,7 @@ class GateInput:
     @property
     def down(self) -> bool:
         """Return whether no drone is in the air."""
-        return all(state in DOWN for state in self.states)
+        return DOWN.issuperset(self.states)
 
 
 class ModeCommand(NamedTuple):
@@ -93,8 +93,7 @@ class Setpoint(NamedTuple):
     yaw_rate: float
 
 
-@dataclass(frozen=True, eq=False)
-class GateOutput:
+class GateOutput(NamedTuple):
     """Commands of a gate, and the fields of the cluster's state message.
 
     Attributes:

@@ -50,9 +50,7 @@ class FlightJudge:
 
     def take_off_fault(self, gate: GateInput) -> str | None:
         """Return why the drones may not take off; drones that fly already need not stand well."""
-        fault = self.state_fault(gate, AIRBORNE | {"landed"}) or self._estimate_fault(
-            gate, self.limits.sigma_max_m
-        )
+        fault = self.state_fault(gate, AIRBORNE | {"landed"}) or self._estimate_fault(gate, self.limits.sigma_max_m)
         return fault or (self.formation_fault(gate) if "landed" in gate.states else None)
 
     def engagement_fault(self, gate: GateInput) -> str | None:
@@ -88,10 +86,10 @@ class FlightJudge:
 
     def state_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
         """Return which drone is in another state than those allowed."""
-        for drone, state in zip(self.drones, gate.states, strict=True):
-            if state not in allowed:
-                return f"{drone} is in state {state}; allowed: {', '.join(sorted(allowed))}"
-        return None
+        if allowed.issuperset(gate.states):
+            return None
+        drone, state = next(pair for pair in zip(self.drones, gate.states, strict=True) if pair[1] not in allowed)
+        return f"{drone} is in state {state}; allowed: {', '.join(sorted(allowed))}"
 
     def _estimate_fault(self, gate: GateInput, sigma_max_m: float) -> str | None:
         age_max_s = self.limits.age_max_s

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim_agents.cluster_frame import Vector, between, length
+from zsim_agents.cluster_frame import Vector, between, dot, length, row
 from zsim_agents.cluster_space import Array, ClusterSpace
 from zsim_agents.compiled import compiled
 
@@ -76,8 +76,7 @@ class FormationGains:
         return Limits(*(float(getattr(self, name)) for name in Limits._fields))
 
 
-@dataclass(frozen=True, eq=False)
-class FormationCommand:
+class FormationCommand(NamedTuple):
     """What the law asks of the robots.
 
     Attributes:
@@ -250,7 +249,7 @@ def note_alarms(p_W: Array, separation_alarm_m: float, order: Order) -> int:
     alarms = 0
     for j in range(1, p_W.shape[0]):
         for i in range(j):
-            if length(between(p_W, i, j)) < separation_alarm_m:
+            if length(between(row(p_W, i), row(p_W, j))) < separation_alarm_m:
                 alarms += 1
                 order[j, i] = alarms
     return alarms
@@ -259,7 +258,7 @@ def note_alarms(p_W: Array, separation_alarm_m: float, order: Order) -> int:
 @compiled
 def part(p_W: Array, v_W: Array, v_cmd_W: Array, i: int, j: int, limits: Limits) -> bool:
     """Let robots i and j separate at their least rate, half of the change each; return whether they did not."""
-    line_W = between(p_W, i, j)
+    line_W = between(row(p_W, i), row(p_W, j))
     distance = length(line_W)
     if distance >= reach(limits):
         return False
@@ -286,8 +285,7 @@ def reach(limits: Limits) -> float:
 @compiled
 def along(u_W: Vector, v_W: Array, i: int, j: int) -> float:
     """Return the rate at which j leaves i along their line [m/s]."""
-    d_W = between(v_W, i, j)
-    return u_W[0] * d_W[0] + u_W[1] * d_W[1] + u_W[2] * d_W[2]
+    return dot(u_W, between(row(v_W, i), row(v_W, j)))
 
 
 @compiled

@@ -100,7 +100,5 @@ class Guidance:
     def _base(self, t_s: float) -> Array:
         return self._home.value(t_s)[0] if isinstance(self._home, Shifted) else self._goal
 
-    def _ramp(
-        self, start: tuple[Array, Array], onto: Reference, t_s: float, over_s: float | None = None
-    ) -> Ramp:
+    def _ramp(self, start: tuple[Array, Array], onto: Reference, t_s: float, over_s: float | None = None) -> Ramp:
         return plan_ramp(self.space, start, onto, t_s, self._gains, self._shape, over_s)

@@ -8,6 +8,7 @@ import numpy as np
 
 from zsim_agents.cluster_frame import (
     LENGTH_MIN_M,
+    Rows,
     Vector,
     between,
     centroid,
@@ -15,6 +16,7 @@ from zsim_agents.cluster_frame import (
     pitch_yaw,
     put,
     rotation_WC,
+    row,
     scaled,
     wrap_angle,
 )
@@ -44,8 +46,8 @@ class PairCluster(ClusterSpace):
         x, y, z = np.array(rotation_WC(0.0, pitch, psi)).T
         J = np.zeros((8, 2, 4))
         J[:3, :, :3] = np.eye(3)[:, None] / 2
-        for row, axis in ((3, -z / p), (4, y / (p * math.cos(pitch))), (7, x)):
-            J[row, 0, :3], J[row, 1, :3] = axis, -axis
+        for k, axis in ((3, -z / p), (4, y / (p * math.cos(pitch))), (7, x)):
+            J[k, 0, :3], J[k, 1, :3] = axis, -axis
         J[5:7, :, 3] = np.eye(2)
         J[5:7] -= J[4]
         return J.reshape(8, 8)
@@ -60,7 +62,7 @@ class PairCluster(ClusterSpace):
 @compiled
 def pair_forward(p_W: Array, yaw: Array) -> Array:
     """Return c (8,); only its length p is right where that is zero."""
-    d_W = between(p_W, 1, 0)
+    d_W = between(row(p_W, 1), row(p_W, 0))
     c = np.empty(8)
     c[0], c[1], c[2] = centroid(p_W)
     c[3], c[4] = pitch_yaw(d_W)
@@ -98,6 +100,6 @@ def pair_inverse_jacobian(c: Array) -> Array:
 
 
 @compiled
-def axis_W(R_WC: tuple[Vector, Vector, Vector], k: int) -> Vector:
+def axis_W(R_WC: Rows, k: int) -> Vector:
     """Return an axis of C in W: column k of R_WC."""
     return R_WC[0][k], R_WC[1][k], R_WC[2][k]

@@ -161,9 +161,7 @@ def fastest_ramp(
         if excess <= LOAD_TOLERANCE:
             return ramp
         over_s *= max(min(excess, 10.0), RAMP_GROWTH)
-    raise TrajectoryError(
-        f"not reached within {RAMP_MAX_S:g} s at the robots' limits: too far, or it moves too fast"
-    )
+    raise TrajectoryError(f"not reached within {RAMP_MAX_S:g} s at the robots' limits: too far, or it moves too fast")
 
 
 def _ramp_over(
@@ -180,9 +178,7 @@ def _ramp_over(
         ramp = ramp_onto(space, *start, onto, start_s, over_s)
         if _peak_load(space, ramp, gains) <= limits.share * LOAD_TOLERANCE:
             return ramp
-    raise TrajectoryError(
-        f"over_s is {over_s:g} s; allowed at the robots' limits: {least_s:.1f} s to {RAMP_MAX_S:g} s"
-    )
+    raise TrajectoryError(f"over_s is {over_s:g} s; allowed at the robots' limits: {least_s:.1f} s to {RAMP_MAX_S:g} s")
 
 
 def _peak_load(space: ClusterSpace, ramp: Ramp, gains: FormationGains) -> float:
@@ -190,9 +186,7 @@ def _peak_load(space: ClusterSpace, ramp: Ramp, gains: FormationGains) -> float:
     return max(load(*robot_rates(space, *ramp.value(t_s)), gains) for t_s in times)
 
 
-def _fault_at(
-    space: ClusterSpace, c: Array, c_dot: Array, gains: FormationGains, limits: ShapeLimits
-) -> str | None:
+def _fault_at(space: ClusterSpace, c: Array, c_dot: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
     fault = shape_fault(space, c, limits) or place_fault(space, c, gains, limits)
     if fault:
         return fault

@@ -191,9 +191,7 @@ class Ramp:
 
 
 @compiled
-def ramped(
-    c: Array, c_dot: Array, offset: Array, offset_rate: Array, s: float, over_s: float
-) -> tuple[Array, Array]:
+def ramped(c: Array, c_dot: Array, offset: Array, offset_rate: Array, s: float, over_s: float) -> tuple[Array, Array]:
     """Return c and c_dot with what is left of an offset and its rate at share s of a ramp over over_s."""
     left = 1.0 - s * s * s * (10.0 - s * (15.0 - 6.0 * s))
     left_rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / over_s
@@ -206,9 +204,7 @@ def ramped(
     return value, rate
 
 
-def ramp_onto(
-    space: ClusterSpace, c: Array, c_dot: Array, onto: Reference, start_s: float, over_s: float
-) -> Ramp:
+def ramp_onto(space: ClusterSpace, c: Array, c_dot: Array, onto: Reference, start_s: float, over_s: float) -> Ramp:
     """Return the ramp from c, moving at c_dot, at start_s onto a reference after over_s; angles short."""
     c_onto, c_dot_onto = onto.value(start_s)
     return Ramp(onto, start_s, over_s, space.difference(c, c_onto), c_dot - c_dot_onto)

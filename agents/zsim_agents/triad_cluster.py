@@ -46,9 +46,7 @@ class TriadCluster(ClusterSpace):
     def __init__(self, n: int) -> None:
         others = [name for k in range(4, n + 1) for name in (f"rho_{k}", f"azimuth_{k}", f"elevation_{k}")]
         names = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", *numbered("phi", range(1, n + 1))]
-        spread_text = (
-            "sin(beta) min(p, q)" if n == 3 else "least of sin(beta) min(p, q) and rho_k cos(elevation_k)"
-        )
+        spread_text = "sin(beta) min(p, q)" if n == 3 else "least of sin(beta) min(p, q) and rho_k cos(elevation_k)"
         super().__init__(n, [*names, "p", "q", "beta", *others], spread_text)
         self._shape = 6 + n  # place of p in c
 
@@ -99,9 +97,7 @@ class TriadCluster(ClusterSpace):
 
     def _no_direction(self, c: Array) -> SingularClusterError:
         p, q, beta = c[self._shape : self._shape + 3].tolist()
-        return SingularClusterError(
-            f"p {p:.3g} m, q {q:.3g} m, beta {beta:.3g} rad: the formation has no direction"
-        )
+        return SingularClusterError(f"p {p:.3g} m, q {q:.3g} m, beta {beta:.3g} rad: the formation has no direction")
 
 
 @compiled
@@ -110,7 +106,8 @@ def triad_forward(p_W: Array, yaw: Array) -> tuple[bool, Array]:
     n = yaw.size
     at = 6 + n  # place of p in c
     c = np.zeros(4 * n)
-    d2, d3 = between(p_W, 0, 1), between(p_W, 0, 2)
+    p_1 = row(p_W, 0)
+    d2, d3 = between(p_1, row(p_W, 1)), between(p_1, row(p_W, 2))
     x, y, z, h, area = triad_axes(d2, d3)
     if h == 0.0:
         return False, c
@@ -122,7 +119,7 @@ def triad_forward(p_W: Array, yaw: Array) -> tuple[bool, Array]:
     c[at], c[at + 1], c[at + 2] = length(d2), length(d3), math.atan2(area, dot(d2, d3))
     for k in range(3, n):
         first = at + 3 * (k - 2)
-        c[first], c[first + 1], c[first + 2] = spherical(turned((x, y, z), between(p_W, 0, k)))
+        c[first], c[first + 1], c[first + 2] = spherical(turned((x, y, z), between(p_1, row(p_W, k))))
     return True, c
 
 
@@ -167,10 +164,10 @@ def put_shape_rates(J_inv: Array, c: Array, R_WC: Rows) -> None:
     """Write the columns of the shape variables into J^-1."""
     n = c.size // 4
     at = 6 + n
-    of_2, of_3 = triangle_rates(c[at], c[at + 1], c[at + 2])
-    for k in range(3):
-        add_rate(J_inv, 1, at + k, turned(R_WC, of_2[k]))
-        add_rate(J_inv, 2, at + k, turned(R_WC, of_3[k]))
+    triangle_C = triangle_rates(c[at], c[at + 1], c[at + 2])
+    for robot in range(1, 3):
+        for k in range(3):
+            add_rate(J_inv, robot, at + k, turned(R_WC, triangle_C[robot - 1][k]))
     for robot in range(3, n):
         first = at + 3 * (robot - 2)
         rates_C = spherical_rates(c[first], c[first + 1], c[first + 2])

@@ -1,53 +1,7 @@
 """Foreign programs in the lockstep, by zenoh and msgpack alone: who is waited for, from when, and until when."""
 
-from federation import ONE, Federation, Role
-from wire import Client, Heard, Participant, Watch
-
-GATE_NS = 20_000_000
-DELAY_NS = GATE_NS  # command delay of the scenarios here, one gate
-ME = "tester.one"
-
-
-class Lockstep:
-    """A world with one drone that waits for this program and tells it everything rare."""
-
-    def __init__(self, federation: Federation, *options: str, scenario: str = ONE, period_ns: int = GATE_NS) -> None:
-        self.world: Role = federation.world(scenario, "--expect", ME, *options)
-        self.client: Client = federation.client()
-        self.clock: Watch = self.client.watch("clock")
-        self.events: Watch = self.client.watch("world/event")
-        self.info = self.client.info()
-        self.me: Participant = self.client.join(ME, self.info, period_ns)
-        self.now_ns = -1
-
-    def answer(self, until_ns: int) -> None:
-        """Say done for every gate up to until_ns, each when it is there."""
-        for gate_ns in range(self.me.done_ns + self.me.period_ns, until_ns + 1, self.me.period_ns):
-            self.see(gate_ns)
-            self.me.done(gate_ns)
-
-    def see(self, gate_ns: int) -> None:
-        """Wait for a gate."""
-        while self.now_ns < gate_ns:
-            heard = self.clock.until(lambda m: m["state"] == "running")
-            self.now_ns = heard.message["t_ns"]
-
-    def stands_at(self, t_ns: int, *names: str) -> Heard:
-        """Wait until time stands; check that it does at t_ns and that these processes are waited for."""
-        heard = self.clock.until(lambda m: m["state"] == "running" and m["waiting_for"])
-        assert heard.message["t_ns"] == t_ns
-        assert {w["name"] for w in heard.message["waiting_for"]} == (set(names) or {ME})
-        self.now_ns = t_ns
-        return heard
-
-    def event(self, kind: str, subject: str) -> Heard:
-        return self.events.until(lambda m: (m["kind"], m["subject"]) == (kind, subject))
-
-    def leave(self) -> None:
-        """Let the run go on to its end."""
-        self.me.bye(self.now_ns)
-        self.world.ends(with_code=0)
-
+from federation import ONE, Federation
+from lockstep import DELAY_NS, GATE_NS, ME, Lockstep
 
 def test_no_gate_without_its_done(federation: Federation) -> None:
     """The only wait there is.

@@ -167,9 +167,9 @@ class Desk:
         raise AssertionError(f"nobody listens\n{self._said()}")
 
     def close_terminals(self) -> None:
-        """Press Ctrl-C in every terminal; each process must leave well."""
-        for _, _, process in self._terminals:
-            if process.poll() is None:
+        """Press Ctrl-C where a run is led or routed; every process must leave well, the others by themselves."""
+        for text, _, process in self._terminals:
+            if process.poll() is None and re.search(LEADERS, text):
                 process.send_signal(signal.SIGINT)
         for text, _, process in self._terminals:
             code = process.wait(timeout=PATIENCE_S)
@@ -187,6 +187,7 @@ def lines(block: Block) -> list[str]:
     return [line for line in stripped if line]
 
 
+LEADERS = r"zsim (run|world) |router\.py"
 ANSWERED = ("estimator", "controller", "record", "keys", "echo", "hz", "pub", "ask")
 FOREIGN = ("plain_client.py", "foreign_estimator.py", "range_sensor.py")  # take the endpoint as an argument
 OURS = ("my_estimator.py", "fly_square.py")
@@ -200,7 +201,7 @@ def adapted(line: str, ports: tuple[int, int], longest_s: float | None) -> str:
     line = re.sub(r"\bmake (\w+)", rf"make -n -C {ROOT} \1 >/dev/null", line)
     line = re.sub(r"\bzsim (run)\b(?!.*--in-process)", rf"zsim \1 --listen {endpoint}", line)
     if longest_s is not None and re.search(r"\bzsim run\b", line):
-        line = re.sub(r"--duration \S+", "", line) + f" --duration {longest_s:g}"
+        line = re.sub(r"--duration \S+", "", line).replace("zsim run", f"zsim run --duration {longest_s:g}")
     if " --out " not in line:
         line = re.sub(r"\bzsim run\b", "zsim run --no-report", line)
     if not own:

@@ -164,6 +164,7 @@ class Participant:
         self.period_ns = period_ns
         self.run = {"run_id": info["run_id"], "incarnation": next(self._incarnations)}
         self.done_ns = -period_ns
+        self.sent = 0
         self.token = client.token(name)
 
     def join(self) -> None:
@@ -171,8 +172,9 @@ class Participant:
         about = {"role": role, "host": "elsewhere", "pid": os.getpid(), "period_ns": self.period_ns}
         self.client.put(f"process/{self.name}/join", **{"t_ns": 0, **self.run, **about})
 
-    def done(self, t_ns: int, sent: int = 0) -> None:
-        self.done_ns = t_ns
+    def done(self, t_ns: int, sent: int | None = None) -> None:
+        """Say done for a gate; `sent` is counted by who publishes, unless given."""
+        sent, self.sent, self.done_ns = self.sent if sent is None else sent, 0, t_ns
         self.client.put(f"process/{self.name}/done", t_ns=t_ns, **self.run, done_ns=t_ns, sent=sent)
 
     def bye(self, t_ns: int, reason: str = "shown") -> None:

@@ -1,0 +1,212 @@
+"""Who flies a drone: commanders, refusals with reasons, instants, silence."""
+
+import math
+
+import pytest
+from federation import ONE, Federation
+from lockstep import DELAY_NS, GATE_NS, ME, Lockstep
+from wire import Heard
+
+VELOCITY = "drone/drone1/cmd/velocity"
+MODE = "drone/drone1/cmd/mode"
+FORWARD = {"velocity_m_s": [0.5, 0.0, 0.0], "yaw_rate_rad_s": 0.0}
+BACK = {"velocity_m_s": [-0.5, 0.0, 0.0], "yaw_rate_rad_s": 0.0}
+
+
+def refusal(step: Lockstep, key: str) -> str:
+    return step.event("refused", key).message["data"]["reason"]
+
+
+def velocity(step: Lockstep) -> list[float]:
+    """Return the true velocity in W; the drone looks north, so forward is y."""
+    return step.client.get("drone/drone1/truth")["drone/drone1/truth"]["velocity_m_s"]
+
+
+def test_the_first_who_sends_flies(federation: Federation) -> None:
+    """One drone, two programs; the second does not gate.
+
+        tester.one ── takeoff ── forward ───────────────────────────────── release
+        tester.two                        back ✗    acquire 10, back ✓                back ✓
+
+    Expected: the commander is named in status; the second is refused with the commander's name until it acquires the
+    drone with a higher priority, then the first is refused; a drone that was released is anybody's.
+    """
+    step = Lockstep(federation, "--duration", "60")
+    step.fly()
+    assert step.status()["commander"] is None
+    step.put(VELOCITY, **FORWARD)
+    step.answer(step.me.done_ns + GATE_NS)
+    assert step.event("commander", "drone1").message["source"] == ME
+    step.answer(step.me.done_ns + 100 * GATE_NS)
+    step.put(VELOCITY, **FORWARD)
+    step.answer(step.me.done_ns + 20 * GATE_NS)
+    assert step.status()["commander"] == ME
+
+    step.client.put(VELOCITY, t_ns=0, source="tester.two", **BACK)
+    step.event("command", "drone1")
+    step.answer(step.me.done_ns + 3 * GATE_NS)
+    assert f"drone1 is flown by '{ME}' (priority 0); acquire it" in refusal(step, VELOCITY)
+
+    answer = step.client.ask("world/control", "acquire", source="tester.two", drone="drone1", priority=10)
+    assert answer["ok"]
+    step.client.put(VELOCITY, t_ns=0, source="tester.two", **BACK)
+    step.event("command", "drone1")
+    step.put(VELOCITY, **FORWARD)
+    step.answer(step.me.done_ns + 3 * GATE_NS)
+    assert "drone1 is flown by 'tester.two' (priority 10)" in refusal(step, VELOCITY)
+    assert step.status()["commander"] == "tester.two"
+    no = step.client.ask("world/control", "acquire", source=ME, drone="drone1", priority=10)
+    assert "drone1 is flown by 'tester.two' with priority 10" in no["error"]
+    no = step.client.ask("world/control", "release", source=ME, drone="drone1")
+    assert "drone1 is flown by 'tester.two', not by 'tester.one'" in no["error"]
+
+    assert step.client.ask("world/control", "release", source="tester.two", drone="drone1")["ok"]
+    step.answer(step.me.done_ns + 3 * GATE_NS)
+    assert step.status()["commander"] is None
+    step.put(VELOCITY, **FORWARD)
+    step.answer(step.me.done_ns + 3 * GATE_NS)
+    assert step.status()["commander"] == ME
+    step.leave()
+
+
+def test_the_instant_of_a_command(federation: Federation) -> None:
+    """A command of the lockstep takes effect at its stamp plus the delay, one from outside when the event says.
+
+        tester.one  ── takeoff stamped 10 ──▶ effect at 10 + delay
+        tester.two  ── takeoff ──▶ event `command` with apply_t_ns ──▶ effect at apply_t_ns
+
+    Expected: `mode` events at these instants; the outside one is told with its apply_t_ns, the other is not.
+    """
+    step = Lockstep(federation)
+    step.answer(9 * GATE_NS)
+    step.put(MODE, mode="takeoff")
+    step.answer(12 * GATE_NS)
+    assert step.event("mode", "drone1").message["t_ns"] == 10 * GATE_NS + DELAY_NS
+    assert "command" not in [heard.message["kind"] for heard in step.events.now()]
+    step.stands_at(14 * GATE_NS)
+    step.client.put(MODE, t_ns=0, source="tester.two", mode="emergency")
+    apply_ns = step.event("command", "drone1").message["data"]["apply_t_ns"]
+    assert apply_ns == 15 * GATE_NS + DELAY_NS
+    step.answer(20 * GATE_NS)
+    assert step.event("mode", "drone1").message["t_ns"] == apply_ns
+    step.leave()
+
+
+def test_the_commander_leaves(federation: Federation) -> None:
+    """The commander dies; nobody flies the drone.
+
+        tester.one ── gates
+        tester.two ── forward ── dies
+
+    Expected: an event `release`; the drone hovers.
+    """
+    step = Lockstep(federation, "--duration", "60")
+    step.fly()
+    other = step.client.join("tester.two", step.info, 0)
+    step.client.put(VELOCITY, t_ns=0, source="tester.two", **FORWARD)
+    step.event("command", "drone1")
+    step.answer(step.me.done_ns + 10 * GATE_NS)
+    assert step.status()["commander"] == "tester.two"
+    other.die()
+    step.event("release", "drone1")
+    step.answer(step.me.done_ns + 100 * GATE_NS)
+    assert step.status()["commander"] is None
+    assert step.status()["state"] == "hovering"
+    assert math.hypot(*velocity(step)) < 0.5
+    step.leave()
+
+
+def test_silence(federation: Federation) -> None:
+    """The commander says one thing and then nothing.
+
+        t          0.0 s      0.5 s      2.5 s
+        drone   flying ──▶ hovering ──▶ landing ──▶ landed
+
+    Expected: hover after 0.5 s of simulated time, landing 2 s later, whatever the wall clock does.
+    """
+    step = Lockstep(federation, "--duration", "60")
+    states = step.client.watch("drone/drone1/sensor/status")
+    step.fly()
+    step.put(VELOCITY, **FORWARD)
+    said_ns = step.me.done_ns + GATE_NS
+    step.answer(said_ns + 400 * GATE_NS)
+    step.leave()
+    changes = changes_of(states.now())
+    flying_ns, hovering_ns, landing_ns = changes["flying"], changes["hovering"], changes["landing"]
+    assert flying_ns == said_ns + DELAY_NS + GATE_NS
+    assert hovering_ns - flying_ns == pytest.approx(500_000_000, abs=GATE_NS)
+    assert landing_ns - hovering_ns == pytest.approx(2_000_000_000, abs=GATE_NS)
+    assert "landed" in changes
+
+
+def changes_of(heard: list[Heard]) -> dict[str, int]:
+    """Return when each state was entered last."""
+    changes, former = {}, ""
+    for _, _, status in heard:
+        if status["state"] != former:
+            former = status["state"]
+            changes[former] = status["t_ns"]
+    return changes
+
+
+REFUSED = {
+    "landed": (VELOCITY, {**FORWARD}, "drone1 is landed; a setpoint needs it hovering or flying"),
+    "no such drone": ("drone/drone9/cmd/mode", {"mode": "takeoff"}, "no such drone; see world/info"),
+    "nan": (VELOCITY, {**FORWARD, "yaw_rate_rad_s": math.nan}, "yaw_rate_rad_s is nan; must be a finite number"),
+    "infinite": (VELOCITY, {**FORWARD, "velocity_m_s": [0, math.inf, 0]}, "velocity_m_s[1] is inf; must be a finite"),
+    "two numbers": (VELOCITY, {**FORWARD, "velocity_m_s": [0, 0]}, "velocity_m_s is [0, 0]; must be a list of 3"),
+    "no source": (VELOCITY, {**FORWARD, "source": None}, "source is null; must be text"),
+    "no field": (VELOCITY, {"velocity_m_s": [0, 0, 0]}, "yaw_rate_rad_s is missing; must be a finite number"),
+    "no mode": (MODE, {"mode": "jump"}, "mode is 'jump'; must be one of emergency, land, reset, takeoff"),
+    "no frame": (VELOCITY, {**FORWARD, "frame": "moon"}, "frame is 'moon'; must be one of heading, world"),
+    "stamp below 0": (VELOCITY, {**FORWARD, "t_ns": -1}, "t_ns is -1; must be >= 0"),
+    "stamp of 70 bits": (VELOCITY, {**FORWARD, "t_ns": 2**63}, "must be a whole number of 63 bits and sign"),
+    "stamp in the future": (VELOCITY, {**FORWARD, "t_ns": 10**15}, f"t_ns is {10**15}; must be <= "),
+    "zero quaternion": (
+        "drone/drone1/cmd/attitude",
+        {"orientation_wxyz": [0, 0, 0, 0], "thrust_n": 4, "yaw_rate_rad_s": 0},
+        "must be a quaternion of length 1",
+    ),
+}
+
+
+def test_commands_that_are_refused(federation: Federation) -> None:
+    """Every fault of a command, from a program in the lockstep.
+
+    Expected: each is an event with the reason; time and drone go on as if it had not come.
+    """
+    step = Lockstep(federation)
+    step.answer(3 * GATE_NS)
+    step.see(4 * GATE_NS)
+    for key, fields, _ in (case for name, case in REFUSED.items() if name != "zero quaternion"):
+        step.client.put(key, **{"t_ns": 4 * GATE_NS, "source": ME, **fields})
+        step.me.done(step.me.done_ns + GATE_NS, sent=0)
+        step.see(step.me.done_ns + DELAY_NS)
+    step.answer(40 * GATE_NS)
+    step.stands_at(42 * GATE_NS)
+    reasons = [e.message["data"]["reason"] for e in step.events.now() if e.message["kind"] == "refused"]
+    for name, (_, _, reason) in REFUSED.items():
+        assert name == "zero quaternion" or any(reason in found for found in reasons), (name, reason, reasons)
+    assert step.status()["state"] == "landed"
+    step.leave()
+    assert step.event("end", "world").message["data"]["refused"] >= len(REFUSED) - 1
+
+
+def test_setpoints_beyond_all_limits(federation: Federation) -> None:
+    """Finite, and absurd: 1e300 m/s, 1e12 rad/s, 1e308 N.
+
+    Expected: the firmware flies what its limits allow, and refuses an orientation without direction.
+    """
+    step = Lockstep(federation, "--duration", "60", scenario=ONE)
+    step.fly()
+    step.put(VELOCITY, velocity_m_s=[1e300, -1e300, 0], yaw_rate_rad_s=1e12)
+    step.answer(step.me.done_ns + 20 * GATE_NS)
+    assert math.hypot(*velocity(step)) < 10
+    key, fields, reason = REFUSED["zero quaternion"]
+    step.put(key, **fields)
+    step.answer(step.me.done_ns + 5 * GATE_NS)
+    assert reason in refusal(step, key)
+    step.put("drone/drone1/cmd/attitude", orientation_wxyz=[1, 0, 0, 0], thrust_n=1e308, yaw_rate_rad_s=0)
+    step.put("drone/drone1/cmd/rotors", speed_rad_s=[1e308] * 4)
+    step.answer(step.me.done_ns + 10 * GATE_NS)
+    step.leave()

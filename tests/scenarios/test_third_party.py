@@ -1,0 +1,214 @@
+"""Programs of others in the place of ours, and what the world answers to anyone who asks."""
+
+import math
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import msgpack
+import pytest
+from federation import PAIR, PAIR_ROLES, Federation
+from lockstep import DELAY_NS, GATE_NS, ME, Lockstep
+from wire import Client, Participant, Watch
+PAIR_DURATION_S = 12
+
+
+class ForeignEstimator:
+    """Stands in for estimator.drone2 by zenoh and msgpack alone: what it estimates is the truth that it hears."""
+
+    def __init__(self, client: Client, name: str = "estimator.drone2") -> None:
+        self._client = client
+        info = client.info()
+        self._truth: Watch = client.watch("drone/drone2/truth")
+        self._status: Watch = client.watch("drone/drone2/sensor/status")
+        self.participant = client.join(name, info, info["gate_ns"])
+        self.last_ns = round(PAIR_DURATION_S * 1e9)
+
+    def fly(self) -> None:
+        """Answer every gate to the end."""
+        for t_ns in range(0, self.last_ns + 1, GATE_NS):
+            truth = self._truth.until(lambda m, t_ns=t_ns: m["t_ns"] == t_ns).message
+            self._status.until(lambda m, t_ns=t_ns: m["t_ns"] == t_ns)  # the gate is complete
+            self._client.put("drone/drone2/estimate", **estimate_of(truth), source=self.participant.name)
+            self.participant.done(t_ns, sent=1)
+        self.participant.bye(self.last_ns)
+
+
+def estimate_of(truth: dict[str, Any]) -> dict[str, Any]:
+    """Return an estimate that says the truth."""
+    w, x, y, z = truth["orientation_wxyz"]
+    pose = {name: truth[name] for name in ("t_ns", "position_m", "velocity_m_s", "orientation_wxyz")}
+    covariance = [0.01 if i % 7 == 0 else 0.0 for i in range(36)]
+    others = {"covariance": covariance, "yaw_sigma_rad": 0.01, "gyro_bias_rad_s": [0, 0, 0], "sensors": {}}
+    return {**pose, "yaw_rad": math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), **others}
+
+
+def test_a_foreign_estimator(federation: Federation) -> None:
+    """One of the two estimators is somebody else's program.
+
+        world ──sensors──▶ estimator.drone1 ─────────────┐
+              ──truth────▶ estimator.drone2 (foreign) ───┴──▶ controller.main
+
+    Scenario: PAIR; ours of drone2 is not started.
+    Expected: the world waits for the foreign one as for ours; the formation engages and holds to the end.
+    """
+    roles = [federation.world(PAIR), federation.role("estimator", "drone1"), federation.role("controller", "main")]
+    client = federation.client()
+    phases = client.watch("cluster/main/state")
+    ForeignEstimator(client).fly()
+    for role in roles:
+        role.ends(with_code=0)
+    last = phases.now()[-1].message
+    assert last["phase"] == "engaged"
+    assert max(abs(a - b) for a, b in zip(last["value"][:3], last["desired"][:3], strict=True)) < 0.5
+
+
+def test_a_foreign_estimator_takes_over_in_flight(federation: Federation) -> None:
+    """The estimator of drone2 is replaced while it flies.
+
+        estimator.drone2 (ours)    ──────┐ superseded: one line, and it ends
+        estimator.drone2 (foreign)       └ join ──▶ 12 s
+
+    Expected: the launcher does not start ours again; the run ends well.
+    """
+    run = federation.run(PAIR, "--rate", "10")
+    client = federation.client()
+    clock, events = client.watch("clock"), client.watch("world/event")
+    clock.until(lambda m: m["t_ns"] > 6e9)
+    truth = client.watch("drone/drone2/truth")
+    foreign = client.join("estimator.drone2", client.info(), GATE_NS)
+    taken = events.until(lambda m: m["kind"] == "superseded").message["data"]
+    assert taken["former_pid"] == federation.pid("estimator.drone2")
+    run.line("estimator.drone2: another process of this name joined from elsewhere")
+    answer_from(client, foreign, truth, taken["done_ns"] + GATE_NS)
+    run.ends(with_code=0)
+    record = federation.record()
+    assert record.end()["last_ns"] == PAIR_DURATION_S * 10**9
+    assert record.events("restart") == []
+    assert record.all("cluster/main/state")[-1]["phase"] == "engaged"
+
+
+def answer_from(client: Client, participant: Participant, truth: Watch, from_ns: int) -> None:
+    """Catch up by replay, then answer every gate to the end."""
+    replayed = client.ask("world/control", "replay", from_ns=from_ns - 1, keys=["drone/drone2/truth"])["result"]
+    known = {m["t_ns"]: m for m in (msgpack.unpackb(payload) for _, payload in replayed)}
+    for t_ns in range(from_ns, PAIR_DURATION_S * 10**9 + 1, GATE_NS):
+        while t_ns not in known:
+            known.update({h.message["t_ns"]: h.message for h in [truth.until(lambda _: True)]})
+        client.put("drone/drone2/estimate", **estimate_of(known[t_ns]), source="estimator.drone2")
+        participant.done(t_ns, sent=1)
+    participant.bye(PAIR_DURATION_S * 10**9)
+
+
+def test_what_the_world_answers(federation: Federation) -> None:
+    """Last values and what has been said, to whoever asks, also for publishers that are dead.
+
+        tester.one ── estimate, state ── dies          somebody ── get ──▶ world
+
+    Expected: gets answer `world/info`, `clock`, status, truth, estimate and state; wildcards too; a replay brings
+    what is stamped after a time in the order in which it was said.
+    """
+    step = Lockstep(federation, "--set", "processes.on_death={tester: wait}")
+    step.answer(10 * GATE_NS)
+    truth = step.client.get("drone/drone1/truth")["drone/drone1/truth"]
+    step.put("drone/drone1/estimate", **{**estimate_of(truth), "t_ns": 11 * GATE_NS})
+    state = {"names": [], "value": [], "desired": [], "desired_rate": [], "trajectory_t_s": None}
+    step.put("cluster/main/state", phase="idle", drones=[], margin=0.0, reason="", **state)
+    step.answer(11 * GATE_NS)
+    step.stands_at(13 * GATE_NS)
+    step.me.die()
+    step.event("death", ME)
+
+    with Client(federation.endpoint) as other:
+        for expression in ("world/info", "clock", "drone/*/sensor/status", "drone/*/truth", "cluster/*/state"):
+            assert other.get(expression), expression
+        assert other.get("drone/drone1/estimate")["drone/drone1/estimate"]["position_m"] == truth["position_m"]
+        found = other.ask("world/control", "replay", from_ns=3 * GATE_NS, keys=["drone/*/truth", "clock"])
+    said = [(key, msgpack.unpackb(payload)["t_ns"]) for key, payload in found["result"]]
+    assert [t for key, t in said if key == "drone/drone1/truth"][:3] == [4 * GATE_NS, 5 * GATE_NS, 6 * GATE_NS]
+    assert said[:2] == [("drone/drone1/truth", 4 * GATE_NS), ("clock", 4 * GATE_NS)]
+    step.client.ask("world/control", "stop")
+    step.world.ends(with_code=0)
+
+
+BAD_REQUESTS = [
+    ("replay", {}, "needs from_ns (whole number) and keys (list of texts)"),
+    ("replay", {"from_ns": "x", "keys": []}, "needs from_ns"),
+    ("step", {"gates": 0}, "gates is 0; must be a whole number from 1 to"),
+    ("step", {"gates": math.nan}, "must be finite numbers"),
+    ("rate", {"value": -1}, "value is -1; must be from 0"),
+    ("rate", {}, "value is None; must be from 0"),
+    ("acquire", {"drone": "drone9"}, "drone is 'drone9'; must be one of drone1"),
+    ("acquire", {"drone": "drone1", "priority": 1000}, "priority is 1000; must be from 0 to 100"),
+    ("release", {"drone": "drone1"}, "drone1 is flown by nobody, not by 'tester'"),
+    ("jump", {}, "op is 'jump'; must be one of pause, resume"),
+]
+
+
+def test_requests_that_are_refused(federation: Federation) -> None:
+    """Every fault of a request to the world.
+
+    Expected: an answer with the reason; garbage too is answered; time goes on afterwards.
+    """
+    step = Lockstep(federation)
+    step.answer(2 * GATE_NS)
+    for op, args, reason in BAD_REQUESTS:
+        answer = step.client.ask("world/control", op, **args)
+        assert answer["ok"] is False
+        assert reason in answer["error"], (op, args, answer)
+    for payload in (b"", b"\xc1garbage", msgpack.packb(["list"]), msgpack.packb({"op": 7})):
+        answer = step.client.get("world/control", payload=payload)["world/control"]
+        assert answer["ok"] is False
+        assert "world/control" in answer["error"]
+    step.answer(5 * GATE_NS)
+    step.leave()
+
+
+def test_the_outputs_of_a_role(federation: Federation) -> None:
+    """Every gating process of ours keeps the outputs of its last two gates to answer a get.
+
+    Expected: the commands, estimates and state of the gates that it has said done for last.
+    """
+    run = federation.run(PAIR, "--rate", "10")
+    client = federation.client()
+    client.watch("clock").until(lambda m: m["t_ns"] > 6e9)
+    assert client.ask("world/control", "pause")["ok"]
+    for name in PAIR_ROLES:
+        answer = client.ask(f"process/{name}/outputs", "outputs")
+        assert answer["ok"]
+        outputs = [(key, msgpack.unpackb(payload)["t_ns"]) for key, payload in answer["result"]]
+        stamps = sorted({t_ns for _, t_ns in outputs})
+        assert len(stamps) >= 2
+        assert {b - a for a, b in pairwise(stamps)} == {GATE_NS}
+        assert ("cluster/main/state" if name == "controller.main" else "estimate") in " ".join(k for k, _ in outputs)
+    client.ask("world/control", "stop")
+    run.ends(with_code=0)
+
+
+@pytest.fixture
+def twice(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[list[dict[str, Any]]]:
+    """What the world says at the end of two runs that the same foreign program flies."""
+    hashes = []
+    for number in range(2):
+        with Federation(tmp_path_factory.mktemp(f"run{number}")) as federation:
+            step = Lockstep(federation, "--duration", "60")
+            step.fly()
+            for gate in range(40):
+                step.put("drone/drone1/cmd/velocity", velocity_m_s=[math.sin(gate), 0.3, 0.1], yaw_rate_rad_s=0.2)
+                step.answer(step.me.done_ns + GATE_NS)
+            step.stands_at(step.me.done_ns + DELAY_NS + GATE_NS)
+            step.client.ask("world/control", "stop")
+            hashes.append(step.event("end", "world").message["data"])
+            step.me.bye(step.now_ns)
+            step.world.ends(with_code=0)
+    yield hashes
+
+
+def test_a_foreign_program_gives_the_same_bits(twice: list[dict[str, Any]]) -> None:
+    """A program by zenoh and msgpack flies a drone in the lockstep, twice.
+
+    Expected: the same last gate and the same hash, though nothing else was the same.
+    """
+    first, second = twice
+    assert first["last_ns"] == second["last_ns"]
+    assert first["truth_sha256"] == second["truth_sha256"]

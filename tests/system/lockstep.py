@@ -1,0 +1,70 @@
+"""A world that waits for one foreign program, gate by gate: nothing moves unless the test says done."""
+
+from typing import Any
+
+from federation import ONE, Federation, Role
+from wire import Client, Heard, Participant, Watch
+
+GATE_NS = 20_000_000
+DELAY_NS = GATE_NS  # command delay of the scenarios here, one gate
+TAKEOFF_GATES = 300  # more than a take-off takes
+ME = "tester.one"
+
+
+class Lockstep:
+    """A world with one drone that waits for this program and tells it everything rare."""
+
+    def __init__(self, federation: Federation, *options: str, scenario: str = ONE, period_ns: int = GATE_NS) -> None:
+        self.world: Role = federation.world(scenario, "--expect", ME, *options)
+        self.client: Client = federation.client()
+        self.clock: Watch = self.client.watch("clock")
+        self.events: Watch = self.client.watch("world/event")
+        self.info = self.client.info()
+        self.me: Participant = self.client.join(ME, self.info, period_ns)
+        self.now_ns = -1
+
+    def answer(self, until_ns: int) -> None:
+        """Say done for every gate up to until_ns, each when it is there."""
+        for gate_ns in range(self.me.done_ns + self.me.period_ns, until_ns + 1, self.me.period_ns):
+            self.see(gate_ns)
+            self.me.done(gate_ns)
+
+    def see(self, gate_ns: int) -> None:
+        """Wait for a gate."""
+        while self.now_ns < gate_ns:
+            heard = self.clock.until(lambda m: m["state"] == "running")
+            self.now_ns = heard.message["t_ns"]
+
+    def stands_at(self, t_ns: int, *names: str) -> Heard:
+        """Wait until time stands; check that it does at t_ns and that these processes are waited for."""
+        heard = self.clock.until(lambda m: m["state"] == "running" and m["waiting_for"])
+        assert heard.message["t_ns"] == t_ns
+        assert {w["name"] for w in heard.message["waiting_for"]} == (set(names) or {ME})
+        self.now_ns = t_ns
+        return heard
+
+    def event(self, kind: str, subject: str) -> Heard:
+        return self.events.until(lambda m: (m["kind"], m["subject"]) == (kind, subject))
+
+    def leave(self) -> None:
+        """Let the run go on to its end."""
+        self.me.bye(self.now_ns)
+        self.world.ends(with_code=0)
+
+    def put(self, key: str, **fields: Any) -> None:
+        """Publish an output of the gate to be answered next, when it is there, and count it for the next done."""
+        gate_ns = self.me.done_ns + self.me.period_ns
+        self.see(gate_ns)
+        self.client.put(key, **{"t_ns": gate_ns, "source": ME, **fields})
+        self.me.sent += 1
+
+    def status(self) -> dict[str, Any]:
+        """Return the last status of the drone."""
+        return self.client.get("drone/drone1/sensor/status")["drone/drone1/sensor/status"]
+
+    def fly(self) -> None:
+        """Take off, and stand when the drone hovers."""
+        self.put("drone/drone1/cmd/mode", mode="takeoff")
+        self.answer(self.me.done_ns + TAKEOFF_GATES * GATE_NS)
+        self.stands_at(self.me.done_ns + DELAY_NS + GATE_NS)
+        assert self.status()["state"] == "hovering"

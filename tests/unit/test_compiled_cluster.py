@@ -1,0 +1,200 @@
+"""The compiled mathematics of the controller: the numbers of plain Python, and nothing left to compile in flight."""
+
+import importlib
+import math
+import subprocess
+import sys
+from types import SimpleNamespace
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+MODULES = (
+    "cluster_space",
+    "flight_judge",
+    "formation",
+    "pair_cluster",
+    "reference_check",
+    "trajectory",
+    "triad_cluster",
+)
+SIZES = (2, 3, 5)
+SAME = 1e-12  # relative; both ways should give the same bits where they call the same libm
+DT_S = 0.02
+
+pytest.importorskip("numba")
+
+
+def package() -> SimpleNamespace:
+    return SimpleNamespace(**{name: importlib.import_module(f"zsim_agents.{name}") for name in MODULES})
+
+
+@pytest.fixture(scope="module")
+def both() -> tuple[SimpleNamespace, SimpleNamespace]:
+    """Return the modules as they are, and a copy of them imported where numba is missing."""
+    compiled = package()
+    with patch.dict(sys.modules, {"numba": None}):
+        for name in [name for name in sys.modules if name.partition(".")[0] == "zsim_agents"]:
+            del sys.modules[name]
+        return compiled, package()
+
+
+def space_of(way: SimpleNamespace, n: int):
+    """Return a cluster space of these modules; `cluster_space` would import the classes anew, compiled."""
+    return way.pair_cluster.PairCluster() if n == 2 else way.triad_cluster.TriadCluster(n)
+
+
+def same(a, b) -> bool:
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    return a.shape == b.shape and bool((np.abs(a - b) <= SAME * np.maximum(1.0, np.abs(a))).all())
+
+
+def robots(n: int, rng: np.random.Generator, scale_m: float = 4.0) -> tuple[np.ndarray, np.ndarray]:
+    return rng.normal(scale=scale_m, size=(n, 3)), rng.uniform(-4.0, 4.0, n)
+
+
+def test_one_way_is_compiled_and_the_other_is_not(both):
+    compiled, plain = both
+    for module, name in (("triad_cluster", "triad_forward"), ("formation", "limited"), ("trajectory", "ramped")):
+        assert hasattr(getattr(getattr(compiled, module), name), "py_func")
+        assert not hasattr(getattr(getattr(plain, module), name), "py_func")
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_the_kinematics_are_the_same(both, n):
+    spaces = [space_of(way, n) for way in both]
+    rng = np.random.default_rng(n)
+    for _ in range(50):
+        p_W, yaw = robots(n, rng)
+        c = spaces[0].forward(p_W, yaw)
+        assert same(c, spaces[1].forward(p_W, yaw))
+        for a, b in zip(*(space.inverse(c) for space in spaces), strict=True):
+            assert same(a, b)
+        assert same(*(space.inverse_jacobian(c) for space in spaces))
+        assert same(*(space.margin(c) for space in spaces))
+        assert same(*(space.wrapped(c * 3.0) for space in spaces))
+        assert same(*(way.cluster_space.closest_pair(p_W) for way in both))
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_singular_shapes_are_refused_in_the_same_words(both, n):
+    words = []
+    for way in both:
+        space = space_of(way, n)
+        with pytest.raises(way.cluster_space.SingularClusterError) as refusal:
+            space.forward(np.ones((n, 3)), np.zeros(n))
+        words.append(str(refusal.value))
+        if n > 2:
+            with pytest.raises(way.cluster_space.SingularClusterError) as refusal:
+                space.inverse(np.zeros(4 * n))
+            words[-1] += str(refusal.value)
+    assert words[0] == words[1]
+
+
+@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("scale_m", [1.0, 4.0], ids=["crowded", "apart"])
+def test_the_law_is_the_same_with_saturation_guard_and_integral(both, n, scale_m):
+    laws = [way.formation.FormationLaw(space_of(way, n)) for way in both]
+    rng = np.random.default_rng(10 + n)
+    seen = {"saturated": 0, "free": 0, "guarded": 0, "alarmed": 0}
+    for _ in range(100):
+        p_W, yaw = robots(n, rng, scale_m)
+        c = laws[0].space.forward(p_W, yaw)
+        reach = rng.choice([0.01, 1.0])
+        gate = (c, p_W, rng.normal(size=(n, 3)), c + rng.normal(scale=reach, size=4 * n), np.zeros(4 * n), DT_S)
+        a, b = (law.command(*gate) for law in laws)
+        assert same(a.v_W, b.v_W)
+        assert same(a.yaw_rate, b.yaw_rate)
+        assert same(a.factor, b.factor)
+        assert (a.guarded, a.alarmed) == (b.guarded, b.alarmed)
+        assert same(*(law.integral for law in laws))
+        seen["saturated" if a.factor < 1.0 else "free"] += 1
+        seen["guarded"] += bool(a.guarded)
+        seen["alarmed"] += bool(a.alarmed)
+    assert seen["saturated"]
+    assert seen["free"]
+    assert seen["guarded"]
+    assert seen["alarmed"] or scale_m > 1.0
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_ramps_are_the_same(both, n):
+    rng = np.random.default_rng(20 + n)
+    offsets = [rng.normal(size=4 * n) for _ in range(4)]
+    for s in np.linspace(0.0, 1.0, 11).tolist():
+        for a, b in zip(*(way.trajectory.ramped(*offsets, s, 7.0) for way in both), strict=True):
+            assert same(a, b)
+
+
+BAD = (math.nan, math.inf, -math.inf, 1e7, 0.0, 1.7)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_judgements_are_the_same(both, n):
+    rng = np.random.default_rng(30 + n)
+    bounds = space_of(both[0], n).bounds
+    found = set()
+    for _ in range(300):
+        p_W, yaw = robots(n, rng)
+        values = [np.full(n, 0.1), p_W, rng.normal(size=(n, 3)), yaw, np.full((n, 3), 0.2)]
+        spoiled = values[rng.integers(5)].reshape(-1)
+        spoiled[rng.integers(spoiled.size)] = rng.choice(BAD)
+        flaws = [way.flight_judge.estimate_flaw(*values, 0.5, 1.0) for way in both]
+        assert flaws[0] == flaws[1]
+        found.add(flaws[0][0])
+        near = [way.flight_judge.all_near(p_W, yaw) for way in both]
+        assert near[0] == near[1] == bool((np.abs(p_W) < 1e6).all() and (np.abs(yaw) < 1e6).all())
+        c = rng.uniform(0.1, 1.5, 4 * n)
+        c[rng.integers(4 * n)] = rng.choice(BAD)
+        outside = [way.reference_check.first_outside(c, bounds) for way in both]
+        assert outside[0] == outside[1]
+        out = ~((np.abs(c) < 1e6) & (bounds[:, 0] < c) & (c < bounds[:, 1]))
+        assert outside[0] == (int(np.argmax(out)) if out.any() else -1)
+    judge = both[0].flight_judge
+    assert found == {judge.WELL, judge.OLD, judge.WILD, judge.VAGUE}
+
+
+FLIGHT = """
+import sys
+import numpy as np
+from zsim_agents.cluster_space import cluster_space
+from zsim_agents.controller import rehearse
+from zsim_agents.engagement import Engagement
+from zsim_agents.flight_data import GateInput
+from zsim_agents.flight_request import Target
+from zsim_agents.formation import FormationGains
+
+def compiled():
+    modules = [module for name, module in sys.modules.items() if name.startswith("zsim_agents.")]
+    functions = {id(f): f for module in modules for f in vars(module).values() if hasattr(f, "signatures")}
+    return sum(len(f.signatures) for f in functions.values())
+
+n = int(sys.argv[1])
+space, gains = cluster_space(n), FormationGains()
+rehearse(space, gains)
+before = compiled()
+turn = 2 * np.pi * np.arange(n) / n
+p_W, yaw = np.column_stack((9 * np.cos(turn), 9 * np.sin(turn), np.full(n, 9.0))), np.zeros(n)
+formation = Engagement(space, [str(i) for i in range(n)], gains)
+for gate in range(20):
+    still = np.zeros((n, 3))
+    at = (gate * 0.02, p_W.copy(), yaw.copy(), still, still + 0.1, np.zeros(n), ("flying",) * n)
+    if gate == 1:
+        formation.warm_start("assembling", np.zeros(4 * n))
+    elif gate == 5:
+        formation.warm_start("engaged", space.forward(p_W, yaw))
+    elif gate == 10:
+        assert formation.request(Target({"z_c": 10.0})) is None
+    output = formation.step(GateInput(*at))
+print(output.phase, before, compiled())
+"""
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_after_the_rehearsal_nothing_is_compiled_in_flight(n):
+    run = [sys.executable, "-c", FLIGHT, str(n)]
+    phase, before, after = subprocess.run(run, capture_output=True, text=True, check=True).stdout.split()
+    assert phase == "engaged"
+    assert int(before) > 10
+    assert after == before
