@@ -133,9 +133,11 @@ class Bus:
         for key, message in counted:
             for inbox in self._route(key):
                 inbox.put(key, message)
-            self._to_hub(key, message)
             if key.endswith(("/estimate", "/state")):
+                self._sink(key, message)
                 self._hub.output_of(agent.name)
+            else:
+                self._to_hub(key, message)
         done = messages.Done(t_ns, agent.next_seq("done"), self._hub.run_id, 0, t_ns, len(counted))
         self._to_hub(keys.process(agent.name, "done"), done)
 

@@ -1,6 +1,6 @@
-"""The update of a Kalman filter with a stack of independent measurements, compiled.
+"""Prediction of a covariance, and its update with a stack of independent measurements, compiled.
 
-The equations are those of filterpy's ExtendedKalmanFilter.update (Joseph form), which stays the reference and is
+The equations are those of filterpy's ExtendedKalmanFilter (Joseph form), which stays the reference and is
 what runs where numba is missing; a test holds both together.
 """
 
@@ -10,6 +10,33 @@ import numpy as np
 
 from zsim_agents.aiding_models import within_gates
 from zsim_agents.compiled import compiled
+
+
+@compiled
+def predicted_covariance(P: np.ndarray, F: np.ndarray, Q: np.ndarray) -> np.ndarray:
+    """Return F P F^T + Q, (n, n); F is the unit matrix but for few entries.
+
+    Args:
+        P: covariance, (n, n).
+        F: transition, (n, n).
+        Q: process noise, (n, n).
+    """
+    n = P.shape[0]
+    FP = np.zeros((n, n))
+    for i in range(n):
+        for k in range(n):
+            f = F[i, k]
+            if f != 0.0:
+                for j in range(n):
+                    FP[i, j] += f * P[k, j]
+    grown = Q.copy()
+    for j in range(n):
+        for k in range(n):
+            f = F[j, k]
+            if f != 0.0:
+                for i in range(n):
+                    grown[i, j] += FP[i, k] * f
+    return grown
 
 
 @compiled

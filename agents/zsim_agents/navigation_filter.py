@@ -18,7 +18,7 @@ from scipy.special import chdtri
 from zsim_agents.aiding_models import DOF_MAX, within_gates
 from zsim_agents.compiled import COMPILES
 from zsim_agents.dead_reckoning import GYRO_BIAS, write_prediction
-from zsim_agents.kalman_update import stacked_update
+from zsim_agents.kalman_update import predicted_covariance, stacked_update
 from zsim_agents.strapdown import Interval, Strapdown
 
 Array = NDArray[np.float64]
@@ -161,7 +161,10 @@ class NavigationFilter(ExtendedKalmanFilter):
             (velocity, turn + noise.tilt_density * dt, turn),
             dt,
         )
-        self.predict()
+        if COMPILES:
+            self.P = predicted_covariance(self.P, self.F, self.Q)
+        else:
+            self.predict()
 
     def correct(self, stack: Stack) -> list[bool]:
         """Use the measurements of a stack; the error found is in `x` until `take_error`.

@@ -4,6 +4,7 @@ import gc
 import time
 from collections.abc import Callable
 from pathlib import Path
+from time import time_ns
 from typing import Any
 
 from msgspec import Struct
@@ -74,14 +75,14 @@ class _Show:
 
     def __init__(self, world: World, writer: RecordWriter | None, screen: Screen | None) -> None:
         self._world = world
-        self._writer = writer
+        self._add = writer.add if writer else None
         self._screen = screen
         self._throttle = Throttle()
         self._phase = ""
 
     def sink(self, key: str, message: Any) -> None:
-        if self._writer is not None:
-            self._writer.add(key, encode(message), encoding(key), message.t_ns, time.time_ns())
+        if self._add is not None:
+            self._add(key, encode(message), encoding(key), message.t_ns, time_ns())
         if self._screen is not None and not key.startswith(("drone/", "process/")):
             self._show(key, message, self._screen)
 

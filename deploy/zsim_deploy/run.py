@@ -4,7 +4,6 @@ import contextlib
 import json
 import signal
 import socket
-import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path

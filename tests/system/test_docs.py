@@ -187,6 +187,7 @@ def lines(block: Block) -> list[str]:
     return [line for line in stripped if line]
 
 
+EXAMPLE_S = 25.0  # simulated seconds of an example: past the take-off at 20 s
 LEADERS = r"zsim (run|world) |router\.py"
 ANSWERED = ("estimator", "controller", "record", "keys", "echo", "hz", "pub", "ask")
 FOREIGN = ("plain_client.py", "foreign_estimator.py", "range_sensor.py")  # take the endpoint as an argument
@@ -202,6 +203,7 @@ def adapted(line: str, ports: tuple[int, int], longest_s: float | None) -> str:
     line = re.sub(r"\bzsim (run)\b(?!.*--in-process)", rf"zsim \1 --listen {endpoint}", line)
     if longest_s is not None and re.search(r"\bzsim run\b", line):
         line = re.sub(r"--duration \S+", "", line).replace("zsim run", f"zsim run --duration {longest_s:g}")
+    line = re.sub(r"(examples/.* --duration) \S+", rf"\1 {EXAMPLE_S:g}", line)
     if " --out " not in line:
         line = re.sub(r"\bzsim run\b", "zsim run --no-report", line)
     if not own:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter
 
-from zsim_agents.kalman_update import stacked_update
+from zsim_agents.kalman_update import predicted_covariance, stacked_update
 
 LIMITS = np.full(7, 1e9)  # gates that nothing misses
 
@@ -30,6 +30,18 @@ def test_it_is_filterpys_update(seed: int, n: int, m: int):
     assert x == pytest.approx(reference.x, rel=1e-9, abs=1e-12)
     assert updated == pytest.approx(reference.P, rel=1e-9, abs=1e-11 * scale)
     assert pytest.approx(reference.S, rel=1e-12, abs=1e-12) == S
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_it_is_filterpys_prediction(seed: int):
+    P, _, _, _ = problem(seed, 12, 3)
+    rng = np.random.default_rng(seed)
+    F = np.eye(12) + 0.02 * rng.normal(size=(12, 12)) * (rng.random((12, 12)) < 0.2)
+    Q = np.diag(rng.uniform(0.0, 1e-3, 12))
+    reference = ExtendedKalmanFilter(12, 3)
+    reference.x, reference.P, reference.F, reference.Q = np.zeros(12), P, F, Q
+    reference.predict()
+    assert predicted_covariance(P, F, Q) == pytest.approx(reference.P, rel=1e-12, abs=1e-12)
 
 
 def test_an_innovation_outside_of_its_gate_changes_nothing():

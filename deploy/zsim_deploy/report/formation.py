@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from zsim_agents.cluster_space import ROBOTS_MAX, ClusterSpace, SingularClusterError, cluster_space
 
+from zsim_agents.cluster_space import ROBOTS_MAX, ClusterSpace, SingularClusterError, cluster_space
 from zsim_deploy.report.flight import Array, States, Times, Track
 from zsim_deploy.report.statistics import Errors, common_instants, errors
 

@@ -1,0 +1,115 @@
+"""Realtime: paced by the wall clock, nobody is waited for, everything late is counted."""
+
+import signal
+
+import pytest
+from federation import ONE, PAIR, PAIR_ROLES, Federation
+
+pytestmark = pytest.mark.xdist_group("serial")
+
+NOBODY_FLIES = "processes.on_death={controller: drop}"
+GATE_NS = 20_000_000
+
+
+@pytest.mark.parametrize("rate", [1, 5])
+def test_it_keeps_pace(federation: Federation, rate: int) -> None:
+    duration_s = 6 * rate
+    run = federation.run(PAIR, "--realtime", "--rate", str(rate), "--duration", str(duration_s))
+    run.ends(with_code=0)
+    record = federation.record()
+    end = record.end()
+    assert end["last_ns"] == duration_s * 10**9
+    assert end["wall_s"] == pytest.approx(duration_s / rate, rel=0.05)
+    # What a loaded machine may miss is no matter here; that it is measured and reported is.
+    assert end["deadlines"] >= 3 * (duration_s * 50 - 3)
+    assert 0 <= end["deadline_misses"] <= end["deadlines"] + duration_s * 50
+    assert end["deadline_misses"] == sum(end["deadline_misses_by"].values())
+    assert set(end["deadline_misses_by"]) == {*PAIR_ROLES, "world"}
+    if rate == 5:  # it flies from 4 s on
+        age = end["command_age_ms"]
+        assert 0 < age["p50"] <= age["p99"] <= age["max"]
+    assert all(clock["waiting_for"] == [] for clock in record.all("clock") if clock["state"] == "running")
+
+
+def test_nobody_is_waited_for(federation: Federation) -> None:
+    """A stopped estimator does not hold time; it is a deadline missed at every gate."""
+    run = federation.run(PAIR, "--realtime", "--rate", "2")
+    clock = federation.client().watch("clock")
+    clock.until(lambda m: m["t_ns"] > 2e9)
+    federation.kill("estimator.drone1", signal.SIGSTOP)
+    clock.until(lambda m: m["t_ns"] > 8e9)
+    federation.kill("estimator.drone1", signal.SIGCONT)
+    run.ends(with_code=0)
+    end = federation.record().end()
+    assert end["last_ns"] == 12 * 10**9
+    assert end["deadline_misses_by"]["estimator.drone1"] > 200  # of the 300 gates that it slept through
+
+
+def test_a_dead_controller_means_hover_then_land(federation: Federation) -> None:
+    run = federation.run(PAIR, "--realtime", "--rate", "3", "--duration", "16", "--set", NOBODY_FLIES)
+    client = federation.client()
+    clock, events = client.watch("clock"), client.watch("world/event")
+    states = client.watch("drone/drone1/sensor/status")
+    clock.until(lambda m: m["t_ns"] > 6e9)
+    federation.kill("controller.main")
+    events.until(lambda m: (m["kind"], m["subject"]) == ("drop", "controller.main"))
+    events.until(lambda m: (m["kind"], m["subject"]) == ("release", "drone1"))
+    run.ends(with_code=0)
+    seen = [heard.message["state"] for heard in states.now() if heard.message["t_ns"] > 6e9]
+    assert list(dict.fromkeys(seen))[:2] == ["flying", "hovering"]
+    assert federation.record().end()["last_ns"] == 16 * 10**9
+
+
+def test_a_silent_commander_means_hover_then_land(federation: Federation) -> None:
+    """A controller that hangs still holds its drones: the firmware's watchdog lands them."""
+    run = federation.run(PAIR, "--realtime", "--rate", "3", "--duration", "18")
+    client = federation.client()
+    states, clock = client.watch("drone/drone1/sensor/status"), client.watch("clock")
+    clock.until(lambda m: m["t_ns"] > 6e9)
+    federation.kill("controller.main", signal.SIGSTOP)
+    states.until(lambda m: m["state"] == "hovering" and m["t_ns"] > 6e9)
+    landing = states.until(lambda m: m["state"] == "landing")
+    states.until(lambda m: m["state"] == "landed")
+    federation.kill("controller.main", signal.SIGCONT)
+    run.ends(with_code=0)
+    hovering_ns = next(h.message["t_ns"] for h in states.heard if h.message["state"] == "hovering" and h.message["t_ns"] > 6e9)
+    assert landing.message["t_ns"] - hovering_ns == pytest.approx(2e9, abs=GATE_NS)
+
+
+def test_old_commands_are_refused_by_age(federation: Federation) -> None:
+    world = federation.world(ONE, "--realtime", "--duration", "30")
+    client = federation.client()
+    clock, events = client.watch("clock"), client.watch("world/event")
+    clock.until(lambda m: m["t_ns"] > 1e9)
+    client.put("drone/drone1/cmd/mode", t_ns=0, source="tester.old", mode="takeoff")
+    refused = events.until(lambda m: m["kind"] == "refused")
+    assert refused.message["source"] == "tester.old"
+    assert "must be <= 500 ms" in refused.message["data"]["reason"]
+    now_ns = client.get("clock")["clock"]["t_ns"]
+    client.put("drone/drone1/cmd/mode", t_ns=now_ns, source="tester.new", mode="takeoff")
+    assert events.until(lambda m: m["kind"] == "mode").message["source"] == "tester.new"
+    client.ask("world/control", "stop")
+    world.ends(with_code=0)
+
+
+def test_pause_and_resume(federation: Federation) -> None:
+    world = federation.world(ONE, "--realtime", "--rate", "5", "--duration", "1000")
+    client = federation.client()
+    clock = client.watch("clock")
+    clock.until(lambda m: m["t_ns"] > 1e9)
+    assert client.ask("world/control", "pause")["ok"]
+    first = clock.until(lambda m: m["state"] == "paused")
+    later = clock.until(lambda m: m["state"] == "paused")
+    assert later.wall_s - first.wall_s > 0.9
+    assert later.message["t_ns"] == first.message["t_ns"]
+    assert client.ask("world/control", "step", gates=3)["ok"]
+    clock.until(lambda m: m["state"] == "paused" and m["t_ns"] == first.message["t_ns"] + 3 * GATE_NS)
+    assert client.ask("world/control", "resume")["ok"]
+    resumed = clock.until(lambda m: m["state"] == "running")
+    second = clock.until(lambda m: m["t_ns"] >= resumed.message["t_ns"] + 5e9)
+    assert second.wall_s - resumed.wall_s == pytest.approx(1.0, abs=0.3)  # no burst makes up for the pause
+    assert client.ask("world/control", "rate", value=0)["error"].startswith("value is 0; must be from 0 (")
+    assert client.ask("world/control", "rate", value=50)["ok"]
+    clock.until(lambda m: m["t_ns"] >= second.message["t_ns"] + 20e9)
+    client.ask("world/control", "stop")
+    world.ends(with_code=0)
