@@ -78,12 +78,14 @@ class _Show:
         self._add = writer.add if writer else None
         self._screen = screen
         self._throttle = Throttle()
+        states = (keys.cluster_state(cluster.name) for cluster in world.scenario.clusters)
+        self._watched = {keys.CLOCK, keys.EVENT, *states}
         self._phase = ""
 
     def sink(self, key: str, message: Any) -> None:
         if self._add is not None:
             self._add(key, encode(message), encoding(key), message.t_ns, time_ns())
-        if self._screen is not None and not key.startswith(("drone/", "process/")):
+        if self._screen is not None and key in self._watched:
             self._show(key, message, self._screen)
 
     def _show(self, key: str, message: Struct, screen: Screen) -> None:

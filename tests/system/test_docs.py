@@ -173,7 +173,8 @@ class Desk:
                 process.send_signal(signal.SIGINT)
         for text, _, process in self._terminals:
             code = process.wait(timeout=PATIENCE_S)
-            assert code in (0, 130), f"{text}: exit code {code}\n{self._said()}"
+            # −2: Ctrl-C met Python on its way out
+            assert code in (0, 130, -signal.SIGINT), f"{text}: exit code {code}\n{self._said()}"
         self._terminals.clear()
 
     def _said(self) -> str:

@@ -153,9 +153,13 @@ def is_complete(source: Source) -> bool:
     return foot >= len(MAGIC) and source[foot] == Opcode.FOOTER and source[-len(MAGIC) :] == MAGIC
 
 
-def chunk(content: bytes) -> list[bytes]:
-    """Return a run of message records as a chunk record and its message index records."""
-    indexes = indexes_of(content)
+def chunk(content: bytes, indexes: dict[int, list[int]]) -> list[bytes]:
+    """Return a run of message records as a chunk record and its message index records.
+
+    Args:
+        content: message records.
+        indexes: what `indexes_of(content)` returns.
+    """
     record = Chunk(
         compression="zstd",
         data=_compressor().compress(content),

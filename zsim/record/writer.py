@@ -13,7 +13,7 @@ from mcap.records import Channel, Schema
 from zsim import messages
 from zsim.errors import RecordError
 from zsim.record.finish import finish, finish_bare, write_all
-from zsim.record.layout import MESSAGE, MESSAGE_FIXED, chunk, opening, packed
+from zsim.record.layout import HEAD, MESSAGE, MESSAGE_FIXED, chunk, opening, packed
 
 CHUNK_BYTES = 256 * 1024  # not yet on disk at most, besides the last message
 CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s nothing waits longer than 0.5 s
@@ -25,11 +25,12 @@ _TIME_MAX = 2**64 - 1
 class _Channel:
     """A key on record: its number in the file, and how many messages it has had."""
 
-    __slots__ = ("count", "number")
+    __slots__ = ("count", "entries", "number")
 
     def __init__(self, number: int) -> None:
         self.number = number
         self.count = 0
+        self.entries: list[int] = []  # log times and places of its messages in the open chunk, by turns
 
 
 class RecordWriter:
@@ -85,13 +86,15 @@ class RecordWriter:
         try:
             head = MESSAGE.pack(Opcode.MESSAGE, size, channel.number, sequence, t_ns, wall_ns)
         except struct.error:
-            head = MESSAGE.pack(Opcode.MESSAGE, size, channel.number, sequence, _time(t_ns), _time(wall_ns))
+            t_ns, wall_ns = _time(t_ns), _time(wall_ns)
+            head = MESSAGE.pack(Opcode.MESSAGE, size, channel.number, sequence, t_ns, wall_ns)
         if not self._open:
             self._since_ns = wall_ns
         self._open += (head, payload)
+        channel.entries += (t_ns, self._size)
         channel.count += 1
         self.messages += 1
-        self._size += size
+        self._size += HEAD.size + size
         if self._size >= CHUNK_BYTES or wall_ns - self._since_ns >= CHUNK_AGE_NS:
             self._end_chunk()
 
@@ -163,8 +166,16 @@ class RecordWriter:
         self._size = 0
         if self._error:
             raise RecordError(self._error)
-        self._append(b"".join([*self._ahead, *chunk(content)]))
+        self._append(b"".join([*self._ahead, *chunk(content, self._take_indexes())]))
         self._ahead.clear()
+
+    def _take_indexes(self) -> dict[int, list[int]]:
+        """Return the indexes of the open chunk by channel; the next chunk begins with none."""
+        indexes = {}
+        for channel in self._channels.values():
+            if channel.entries:
+                indexes[channel.number], channel.entries = channel.entries, []
+        return indexes
 
     def _append(self, data: bytes) -> None:
         self._guarded(lambda: write_all(self._file, data))
