@@ -54,7 +54,9 @@ def cpu_by_role(launcher: int) -> dict[str, float]:
         parent = psutil.Process(launcher)
         for process in [parent, *parent.children()]:
             words = process.cmdline()[3:5]
-            name = "launcher" if process.pid == launcher else ".".join(w for w in words if "/" not in w and w[:2] != "--")
+            name = (
+                "launcher" if process.pid == launcher else ".".join(w for w in words if "/" not in w and w[:2] != "--")
+            )
             times = process.cpu_times()
             found[name] = times.user + times.system
     except psutil.NoSuchProcess:

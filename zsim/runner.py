@@ -93,9 +93,7 @@ class Runner:
             ticker.join()
         if self._failure:
             raise (SupersededError if self._leave == "superseded" else RunError)(self._failure)
-        self._put_process(
-            "bye", messages.Bye(max(0, self._done_ns), self._agent.next_seq("bye"), self._leave)
-        )
+        self._put_process("bye", messages.Bye(max(0, self._done_ns), self._agent.next_seq("bye"), self._leave))
         return self._leave
 
     # One turn
@@ -258,9 +256,7 @@ class Runner:
 
     def _ask_replay(self, t_ns: int, missing: str) -> None:
         """Fetch a gate of which messages did not come, as after a link that was cut."""
-        self._say(
-            f"{self._agent.name}: {missing} of t = {t_ns / 1e9:.2f} s did not come; asking for it again"
-        )
+        self._say(f"{self._agent.name}: {missing} of t = {t_ns / 1e9:.2f} s did not come; asking for it again")
         self._replay(t_ns - self._info.gate_ns)
 
     def _replay(self, from_ns: int) -> None:

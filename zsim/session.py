@@ -67,7 +67,8 @@ class Session:
     def heard(self, key: str) -> bool:
         """Tell whether anybody subscribes to a key of ours."""
         publisher = self._publishers.get(key) or self._declare(key)
-        return publisher.matching_status.matching
+        status: Any = publisher.matching_status  # the stub says bool; it is an object that has one
+        return status.matching
 
     def put_raw(self, key: str, payload: bytes) -> None:
         """Publish an encoded payload; the encoding follows from the key."""
@@ -105,9 +106,7 @@ class Session:
             alive = sample.kind == zenoh.SampleKind.PUT
             callback(str(sample.key_expr).removeprefix(self._prefix), alive)
 
-        subscriber = self._raw.liveliness().declare_subscriber(
-            self._prefix + expression, forward, history=True
-        )
+        subscriber = self._raw.liveliness().declare_subscriber(self._prefix + expression, forward, history=True)
         self._kept.append(subscriber)
 
     def tokens(self, expression: str, timeout_s: float = 1.0) -> list[str]:
@@ -288,9 +287,7 @@ def listen(endpoints: Sequence[str], federation: str, mode: Mode) -> Iterator[Se
 
 
 @contextmanager
-def connect(
-    endpoint: str, federation: str, mode: Mode = "lockstep", wait_s: float | None = None
-) -> Iterator[Session]:
+def connect(endpoint: str, federation: str, mode: Mode = "lockstep", wait_s: float | None = None) -> Iterator[Session]:
     """Open a client of the hub (or of a router).
 
     Args:

@@ -62,9 +62,7 @@ class FlightPlan:
         self.note = ""
 
     def _drop_before_land(self, t_s: float) -> None:
-        lands = [
-            i for i, step in enumerate(self._steps) if step.at_s <= t_s and isinstance(step.request, Land)
-        ]
+        lands = [i for i, step in enumerate(self._steps) if step.at_s <= t_s and isinstance(step.request, Land)]
         for _ in range(lands[-1] if lands else 0):
             self._steps.popleft()
             self._try_s, self.note = -math.inf, ""

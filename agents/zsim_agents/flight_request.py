@@ -108,9 +108,7 @@ def read_request(op: object, args: object = None) -> FlightRequest:
     build, fields = _READERS[op]
     given = {} if args is None else args
     if not isinstance(given, Mapping):
-        raise RequestError(
-            f"{op}: args is {type(args).__name__}; allowed: a map of {', '.join(fields) or 'nothing'}"
-        )
+        raise RequestError(f"{op}: args is {type(args).__name__}; allowed: a map of {', '.join(fields) or 'nothing'}")
     for name, value in given.items():
         if name not in fields:
             allowed = ", ".join(fields) or "none"

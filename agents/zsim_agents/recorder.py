@@ -50,9 +50,7 @@ def record(
 class Recorder:
     """Writes what passes on `**`."""
 
-    def __init__(
-        self, link: Session, info: messages.Info, path: Path, name: str, stopped: Callable[[], bool]
-    ) -> None:
+    def __init__(self, link: Session, info: messages.Info, path: Path, name: str, stopped: Callable[[], bool]) -> None:
         self._link = link
         self._info = info
         self._name = name
@@ -121,9 +119,7 @@ class Recorder:
 
     def _catch_up(self) -> None:
         """Write what was said before this process came: the world keeps it for those who ask."""
-        answer = self._link.request(
-            keys.CONTROL, "replay", self._name, timeout_s=REPLAY_S, from_ns=-1, keys=["**"]
-        )
+        answer = self._link.request(keys.CONTROL, "replay", self._name, timeout_s=REPLAY_S, from_ns=-1, keys=["**"])
         for key, payload in answer.result or ():
             self._write(key, payload)
             if len(self._known) < KNOWN_MAX:

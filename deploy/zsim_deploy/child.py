@@ -54,9 +54,7 @@ class Child:
             )
         self.started_s = time.monotonic()
         if self._on_line:
-            self._reader = threading.Thread(
-                target=self._read, args=(self._process, self._on_line), daemon=True
-            )
+            self._reader = threading.Thread(target=self._read, args=(self._process, self._on_line), daemon=True)
             self._reader.start()
 
     @staticmethod

@@ -29,9 +29,7 @@ Set = Annotated[list[str] | None, typer.Option("--set", help="Override a field: 
 Seed = Annotated[int | None, typer.Option(help="Seed instead of the scenario's.")]
 Duration = Annotated[float | None, typer.Option(help="Simulated seconds instead of the scenario's.")]
 Realtime = Annotated[bool, typer.Option("--realtime", help="Pace by the wall clock and wait for nobody.")]
-RateOption = Annotated[
-    float | None, typer.Option(help="Simulated per wall second (realtime 1, lockstep unpaced).")
-]
+RateOption = Annotated[float | None, typer.Option(help="Simulated per wall second (realtime 1, lockstep unpaced).")]
 Connect = Annotated[str, typer.Option(help="Where the world (or a router) listens.")]
 Federation = Annotated[str, typer.Option(help="Name of the federation: the prefix of its keys.")]
 Wait = Annotated[float | None, typer.Option(help="Seconds to wait for a world; for ever if not given.")]
@@ -46,9 +44,7 @@ def run(
     ] = None,
     seed: Seed = None,
     duration: Duration = None,
-    in_process: Annotated[
-        bool, typer.Option("--in-process", help="Everything in this process, no Zenoh.")
-    ] = False,
+    in_process: Annotated[bool, typer.Option("--in-process", help="Everything in this process, no Zenoh.")] = False,
     realtime: Realtime = False,
     rate: RateOption = None,
     set_: Set = None,
@@ -63,14 +59,10 @@ def run(
     from zsim_deploy.run import Options, make_directory, run_in_process, run_processes
 
     if in_process and realtime:
-        raise typer.BadParameter(
-            "--in-process runs in lockstep; leave out one of --in-process and --realtime"
-        )
+        raise typer.BadParameter("--in-process runs in lockstep; leave out one of --in-process and --realtime")
     loaded = _load(scenario, set_, seed, duration)
     mode, pace = _mode(realtime, rate)
-    options = Options(
-        loaded, make_directory(out, loaded), mode, pace, listen, [n for n in order.split(",") if n]
-    )
+    options = Options(loaded, make_directory(out, loaded), mode, pace, listen, [n for n in order.split(",") if n])
     with Screen(loaded.duration_s) as screen:
         outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)
     _end(outcome, options.out, report)
@@ -80,9 +72,7 @@ def _end(outcome: Any, out: Path, report: bool) -> None:
     if outcome.failed or outcome.interrupted:
         print(f"ended: {outcome.reason}", file=sys.stderr)
     if outcome.interrupted:
-        print(
-            f"the record so far is {out / 'run.mcap'}; `zsim report {out}` makes its report", file=sys.stderr
-        )
+        print(f"the record so far is {out / 'run.mcap'}; `zsim report {out}` makes its report", file=sys.stderr)
         raise typer.Exit(130)
     if report and (out / "run.mcap").exists():
         _report(out)
@@ -131,9 +121,7 @@ def world(
     realtime: Realtime = False,
     rate: RateOption = None,
     set_: Set = None,
-    expect: Annotated[
-        list[str] | None, typer.Option(help="Wait for this process too, e.g. recorder.")
-    ] = None,
+    expect: Annotated[list[str] | None, typer.Option(help="Wait for this process too, e.g. recorder.")] = None,
     launched: Launched = False,
 ) -> None:
     """Run the world: integrates all drones and owns simulated time."""
@@ -198,9 +186,7 @@ def keys(connect: Connect = DEFAULT_ENDPOINT, federation: Federation = "zsim", w
 
 @app.command(rich_help_panel=LOOK)
 def echo(
-    key: Annotated[
-        str, typer.Argument(help="Key or expression, e.g. drone/drone1/sensor/imu or 'drone/*/truth'.")
-    ],
+    key: Annotated[str, typer.Argument(help="Key or expression, e.g. drone/drone1/sensor/imu or 'drone/*/truth'.")],
     count: Annotated[int | None, typer.Option("--count", "-n", help="Stop after so many messages.")] = None,
     raw: Annotated[bool, typer.Option("--raw", help="Payload as hexadecimal digits.")] = False,
     connect: Connect = DEFAULT_ENDPOINT,
@@ -237,9 +223,7 @@ def hz(
 @app.command(rich_help_panel=LOOK)
 def pub(
     key: Annotated[str, typer.Argument(help="Key, e.g. drone/drone1/cmd/velocity.")],
-    message: Annotated[
-        str, typer.Argument(help='JSON, e.g. \'{"velocity_m_s": [1, 0, 0], "yaw_rate_rad_s": 0}\'.')
-    ],
+    message: Annotated[str, typer.Argument(help='JSON, e.g. \'{"velocity_m_s": [1, 0, 0], "yaw_rate_rad_s": 0}\'.')],
     count: Annotated[int, typer.Option("--count", "-n", min=1, help="How many times.")] = 1,
     rate_hz: Annotated[float, typer.Option(min=0.01, max=1000, help="How often per wall second.")] = 10.0,
     connect: Connect = DEFAULT_ENDPOINT,
@@ -279,9 +263,7 @@ def ask(
     print("ok" if answer.result is None else json.dumps(answer.result, default=repr))
 
 
-def _load(
-    path: Path, overrides: list[str] | None, seed: int | None = None, duration: float | None = None
-) -> Any:
+def _load(path: Path, overrides: list[str] | None, seed: int | None = None, duration: float | None = None) -> Any:
     from zsim import scenario_file
 
     return scenario_file.load(path, overrides or (), seed=seed, duration_s=duration)
@@ -315,9 +297,7 @@ def _version(asked: bool) -> None:
 
 @app.callback()
 def options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")
-    ] = False,
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")] = False,
 ) -> None:
     """Co-simulate drone formations: one world, estimators and controllers as processes on Zenoh, in lockstep."""
 

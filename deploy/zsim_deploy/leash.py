@@ -10,9 +10,7 @@ import sys
 import threading
 import time
 
-GRACE_S = (
-    4.0  # a role that was told to stop and hangs is ended; the world waits 5 s for byes only if unstopped
-)
+GRACE_S = 4.0  # a role that was told to stop and hangs is ended; the world waits 5 s for byes only if unstopped
 
 
 class Leash:

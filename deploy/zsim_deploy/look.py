@@ -14,9 +14,7 @@ from zsim import keys, messages
 from zsim.errors import DecodeError, RunError
 from zsim.session import Mailbox, Sample, Session
 
-LISTEN_S = (
-    1.0  # wall time that `keys` listens: every key of the contract that lives speaks at least once a second
-)
+LISTEN_S = 1.0  # wall time that `keys` listens: every key of the contract that lives speaks at least once a second
 PACKET_S = 0.05  # wait between two looks into an empty mailbox
 CLIENT = "zsim.pub"
 
@@ -32,9 +30,7 @@ def list_keys(link: Session, listen_s: float = LISTEN_S) -> list[tuple[str, str,
     return [(key, _kind(key), count) for key, count in sorted(heard.items())]
 
 
-def echo(
-    link: Session, expression: str, count: int | None, emit: Callable[[str, Any], None], raw: bool
-) -> None:
+def echo(link: Session, expression: str, count: int | None, emit: Callable[[str, Any], None], raw: bool) -> None:
     """Hand every message on an expression to `emit` until `count` have come."""
     box = link.subscribe(expression)
     for number, sample in enumerate(_samples(box, math.inf), start=1):
@@ -90,11 +86,7 @@ def hz(link: Session, expression: str, window: int, until_s: float, emit: Callab
             rate.add(time.monotonic(), _stamp(head, sample.payload))
         if time.monotonic() >= next_s:
             next_s += 1.0
-            emit(
-                rate.line()
-                if rate.total
-                else f"no message on {expression} yet; `zsim keys` lists what speaks"
-            )
+            emit(rate.line() if rate.total else f"no message on {expression} yet; `zsim keys` lists what speaks")
             if time.monotonic() > next_s:
                 next_s = time.monotonic() + 1.0
 
@@ -133,15 +125,11 @@ def publish(link: Session, key: str, text: str, count: int, rate_hz: float) -> i
 def _fields(key: str, text: str) -> dict[str, Any]:
     kind = messages.type_of(key)
     if kind is None:
-        raise RunError(
-            f"{key}: is no key of the contract; `zsim keys` lists what speaks, docs/protocol.md all of them"
-        )
+        raise RunError(f"{key}: is no key of the contract; `zsim keys` lists what speaks, docs/protocol.md all of them")
     try:
         fields = json.loads(text)
     except ValueError as error:
-        raise RunError(
-            f"{key}: the message is no JSON ({error}); must be a map such as '{_example(kind)}'"
-        ) from error
+        raise RunError(f"{key}: the message is no JSON ({error}); must be a map such as '{_example(kind)}'") from error
     if not isinstance(fields, dict):
         raise RunError(f"{key}: the message is {text[:40]!r}; must be a map such as '{_example(kind)}'")
     return {"source": CLIENT, **fields} if "source" in kind.__struct_fields__ else fields

@@ -19,9 +19,7 @@ from zsim_deploy.progress import Screen
 
 DEFAULT_PORT = 7447  # Zenoh's own
 POLL_S = 0.05  # how often the children are looked at
-END_S = (
-    8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for
-)
+END_S = 8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for
 WORLD_FIRST_S = 1.0  # after Ctrl-C, how long the world has to end the run for everybody
 INTERRUPT_S = 2.5  # after Ctrl-C, how long anybody may take; the whole is promised within 3 s
 RESTARTS_MAX = 5  # of one role within RESTART_WINDOW_S; more is a fault that a restart does not heal
@@ -93,9 +91,7 @@ class Run:
         for drone in scenario.drones:
             children.append(Child(f"estimator.{drone.name}", ["estimator", drone.name, *reach], self._logs))
         for cluster in scenario.clusters:
-            children.append(
-                Child(f"controller.{cluster.name}", ["controller", cluster.name, *reach], self._logs)
-            )
+            children.append(Child(f"controller.{cluster.name}", ["controller", cluster.name, *reach], self._logs))
         wanted = scenario.processes.expect
         if wanted is not None:
             children = [c for c in children if c.role in ("world", "recorder") or c.name in wanted]
@@ -198,7 +194,6 @@ class Run:
         if recorder.code not in (0, None) and recorder.name not in self._dead:
             self._fail(f"the recorder ended: {recorder.outcome()}")
 
-
     def _left_s(self) -> float:
         """Return how long the others may still take, now that the run is to end; Ctrl-C makes it shorter."""
         now_s = time.monotonic()
@@ -219,9 +214,7 @@ def free_port(screen: Screen) -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    screen.say(
-        f"port {DEFAULT_PORT} is in use; this run is on tcp/127.0.0.1:{port} (--connect for other commands)"
-    )
+    screen.say(f"port {DEFAULT_PORT} is in use; this run is on tcp/127.0.0.1:{port} (--connect for other commands)")
     return port
 
 
@@ -250,9 +243,7 @@ def _fresh(folder: Path) -> Path:
 def run_processes(options: Options, screen: Screen) -> Outcome:
     """Run a scenario as real processes; the record is finished whatever happens."""
     scenario = options.scenario
-    screen.say(
-        f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}"
-    )
+    screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
     outcome = Run(options, screen).go()
     with contextlib.suppress(RecordError):
         repair(options.out / "run.mcap")

@@ -10,6 +10,7 @@ import math
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+
 from zsim_agents.cluster_space import Array, closest_pair, cluster_space
 from zsim_agents.formation import FormationGains, FormationLaw
 from zsim_agents.reference_check import ShapeLimits, plan_ramp
@@ -57,9 +58,7 @@ def test_the_frame_is_z_y_x_euler_by_scipy():
         flat = np.array([(0.0, 0.0), (p, 0.0), (q * math.cos(beta), q * math.sin(beta))])
         flat -= flat.mean(axis=0)
         to_robot_1 = math.atan2(flat[0, 1], flat[0, 0])
-        turn = np.array(
-            [(math.cos(to_robot_1), -math.sin(to_robot_1)), (math.sin(to_robot_1), math.cos(to_robot_1))]
-        )
+        turn = np.array([(math.cos(to_robot_1), -math.sin(to_robot_1)), (math.sin(to_robot_1), math.cos(to_robot_1))])
         places_C = np.column_stack([flat @ turn, np.zeros(3)])
         centre = rng.normal(scale=20.0, size=3)
         p_W = Rotation.from_euler("ZYX", [yaw, pitch, roll]).apply(places_C) + centre
@@ -209,12 +208,8 @@ def test_equation_3_is_reached_with_noisy_estimates():
 
 def test_the_integral_takes_out_wind_and_without_it_the_offset_is_wind_over_gain():
     wind_W = (0.4, -0.3, 0.1)
-    without = from_the_ground_triangle(wind_W=wind_W, gains=FormationGains(integral_1_s2=0.0)).rms(
-        80.0, 100.0
-    )
-    assert [without[name] for name in ("x_c", "y_c", "z_c")] == pytest.approx(
-        [0.4 / 0.6, 0.5, 0.1 / 0.6], rel=0.01
-    )
+    without = from_the_ground_triangle(wind_W=wind_W, gains=FormationGains(integral_1_s2=0.0)).rms(80.0, 100.0)
+    assert [without[name] for name in ("x_c", "y_c", "z_c")] == pytest.approx([0.4 / 0.6, 0.5, 0.1 / 0.6], rel=0.01)
     assert max(from_the_ground_triangle(wind_W=wind_W).rms(80.0, 100.0).values()) < 0.001
 
 

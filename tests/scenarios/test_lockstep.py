@@ -3,6 +3,7 @@
 from federation import ONE, Federation
 from lockstep import DELAY_NS, GATE_NS, ME, Lockstep
 
+
 def test_no_gate_without_its_done(federation: Federation) -> None:
     """The only wait there is.
 

@@ -10,6 +10,7 @@ import pytest
 from federation import PAIR, PAIR_ROLES, Federation
 from lockstep import DELAY_NS, GATE_NS, ME, Lockstep
 from wire import Client, Participant, Watch
+
 PAIR_DURATION_S = 12
 
 

@@ -9,12 +9,27 @@ import pytest
 from federation import ONE, PAIR, ROOT, ZSIM, Federation, Role
 from wire import PATIENCE_S
 
-COMMANDS = ("run", "validate", "report", "world", "estimator", "controller", "record", "keys", "echo", "hz", "pub", "ask")
+COMMANDS = (
+    "run",
+    "validate",
+    "report",
+    "world",
+    "estimator",
+    "controller",
+    "record",
+    "keys",
+    "echo",
+    "hz",
+    "pub",
+    "ask",
+)
 
 
 def zsim(*arguments: str, code: int = 0) -> "subprocess.CompletedProcess[str]":
     """Run a command to its end."""
-    done = subprocess.run([*ZSIM, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    done = subprocess.run(
+        [*ZSIM, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert done.returncode == code, done.stderr
     return done
 
@@ -41,14 +56,20 @@ def flying(federation: Federation) -> Role:
 def test_looking_at_a_run(federation: Federation, flying: Role) -> None:
     terminal = Terminal(federation)
     keys = terminal("keys")
-    for key, message in (("clock", "Clock"), ("drone/drone1/sensor/imu", "Imu"), ("cluster/main/state", "ClusterState")):
+    for key, message in (
+        ("clock", "Clock"),
+        ("drone/drone1/sensor/imu", "Imu"),
+        ("cluster/main/state", "ClusterState"),
+    ):
         assert re.search(rf"^{key} +{message} +\d+$", keys, re.MULTILINE), keys
     echoed = [json.loads(line) for line in terminal("echo", "drone/*/truth", "-n", "4").splitlines()]
     assert {line["key"] for line in echoed} == {"drone/drone1/truth", "drone/drone2/truth"}
     assert all(len(line["message"]["position_m"]) == 3 for line in echoed)
     (raw,) = terminal("echo", "clock", "-n", "1", "--raw").splitlines()
     assert bytes.fromhex(json.loads(raw)["message"]).startswith(b"\x87")  # a msgpack map of seven fields
-    assert re.search(r"[\d.]+ Hz wall \(gap .*\), 50\.0 Hz simulated, \d+ messages", terminal("hz", "clock", "--seconds", "2.5"))
+    assert re.search(
+        r"[\d.]+ Hz wall \(gap .*\), 50\.0 Hz simulated, \d+ messages", terminal("hz", "clock", "--seconds", "2.5")
+    )
     assert "no message on nothing/here yet" in terminal("hz", "nothing/here", "--seconds", "1.5")
     assert terminal("ask", "world/control", "stop") == "ok\n"
     flying.ends(with_code=0)

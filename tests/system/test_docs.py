@@ -486,7 +486,8 @@ def test_links_lead_somewhere(page: Path) -> None:
     """Links to files and headings exist; a link whose text is a name in code leads to a file that defines it."""
     prose = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     faults = []
-    for text, link in re.findall(r"!?\[([^\]]*)\]\(([^)\s]+)\)", prose):
+    pictures = [("", source) for source in re.findall(r'<img src="([^"]+)"', prose)]
+    for text, link in [*re.findall(r"!?\[([^\]]*)\]\(([^)\s]+)\)", prose), *pictures]:
         if re.match(r"[a-z]+:", link):
             continue
         path, _, anchor = link.partition("#")

@@ -73,7 +73,9 @@ def test_a_silent_commander_means_hover_then_land(federation: Federation) -> Non
     states.until(lambda m: m["state"] == "landed")
     federation.kill("controller.main", signal.SIGCONT)
     run.ends(with_code=0)
-    hovering_ns = next(h.message["t_ns"] for h in states.heard if h.message["state"] == "hovering" and h.message["t_ns"] > 6e9)
+    hovering_ns = next(
+        h.message["t_ns"] for h in states.heard if h.message["state"] == "hovering" and h.message["t_ns"] > 6e9
+    )
     assert landing.message["t_ns"] - hovering_ns == pytest.approx(2e9, abs=GATE_NS)
 
 

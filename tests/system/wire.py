@@ -1,9 +1,9 @@
 """A program beside zsim: zenoh and msgpack alone, by docs/protocol.md.
 
-    with Client(endpoint) as client:
-        clock = client.watch("clock")
-        clock.until(lambda m: m["t_ns"] >= 2e9)          waits for a message, never for a time
-        me = client.join("tester.one", period_ns=20_000_000)
+with Client(endpoint) as client:
+    clock = client.watch("clock")
+    clock.until(lambda m: m["t_ns"] >= 2e9)          waits for a message, never for a time
+    me = client.join("tester.one", period_ns=20_000_000)
 """
 
 import itertools

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from zsim_agents.cluster_space import cluster_space
 
 from zsim import keys, messages, scenario_file
 from zsim.record import RecordWriter
+from zsim_agents.cluster_space import cluster_space
 
 GATE_NS = 20_000_000
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -56,9 +56,7 @@ def traffic(flown: Flown) -> Iterator[tuple[str, messages.Message, int]]:
     scenario = scenario_file.load(SCENARIOS / f"{flown.scenario}.yaml", flown.overrides)
     yield keys.INFO, info(scenario), 0
     for seq, name in enumerate(["estimator.drone1", "controller.main"]):
-        join = messages.Join(
-            0, seq, "run", 7, name.split(".")[0], "host-a", 100 + seq, GATE_NS, "0.1.0", "f" * 16
-        )
+        join = messages.Join(0, seq, "run", 7, name.split(".")[0], "host-a", 100 + seq, GATE_NS, "0.1.0", "f" * 16)
         yield keys.process(name, "join"), join, 0
     rng = np.random.default_rng(1)
     last = round(flown.duration_s * 1e9) // GATE_NS
@@ -121,9 +119,7 @@ def _gate(flown: Flown, scenario, k: int, rng: np.random.Generator) -> Iterator[
         if flown.other_traffic:
             yield from _sensors(drone.name, t_ns, k, rng)
         yield keys.truth(drone.name), _truth(t_ns, k, p_W[i], yaw[i])
-        state = (
-            "landed" if t_s < 0.1 * flown.climb_s else "taking_off" if t_s < 0.2 * flown.climb_s else "flying"
-        )
+        state = "landed" if t_s < 0.1 * flown.climb_s else "taking_off" if t_s < 0.2 * flown.climb_s else "flying"
         yield keys.status(drone.name), messages.Status(t_ns, k, state, 100 - t_s / 20 - i, False, None, 5)
         if flown.other_traffic:
             yield from _answers(drone.name, t_ns, k, p_W[i].tolist(), rng)
@@ -154,9 +150,7 @@ def _truth(t_ns: int, seq: int, p_W: np.ndarray, yaw: float) -> messages.Truth:
     )
 
 
-def _sensors(
-    name: str, t_ns: int, k: int, rng: np.random.Generator
-) -> Iterator[tuple[str, messages.Message]]:
+def _sensors(name: str, t_ns: int, k: int, rng: np.random.Generator) -> Iterator[tuple[str, messages.Message]]:
     """Yield 200 Hz of IMU and 25 Hz of the slow sensors, about as many messages as a real run has."""
     for part in range(4):
         a, b, c, d, e, f = rng.standard_normal(6).tolist()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from zsim_agents import reference_check
 from zsim_agents.cluster_space import closest_pair, cluster_space
 from zsim_agents.engagement import Engagement
@@ -75,9 +76,7 @@ class Fleet:
         self._move()
         for drone, mode in output.modes:
             self.modes.append((self.t_s, drone, mode))
-            self.states[self.engagement.drones.index(drone)] = (
-                "taking_off" if mode == "takeoff" else "landing"
-            )
+            self.states[self.engagement.drones.index(drone)] = "taking_off" if mode == "takeoff" else "landing"
         for i, setpoint in enumerate(output.setpoints):
             self.v_W[i], self.yaw_rate[i] = setpoint or (np.zeros(3), 0.0)
         self.gate += 1
@@ -87,9 +86,7 @@ class Fleet:
         n = len(self.p_W)
         gate = GateInput(
             t_s=self.t_s,
-            p_W=self.p_W + self.rng.normal(scale=self.noise_m, size=(n, 3))
-            if self.noise_m
-            else self.p_W.copy(),
+            p_W=self.p_W + self.rng.normal(scale=self.noise_m, size=(n, 3)) if self.noise_m else self.p_W.copy(),
             yaw=self.yaw.copy(),
             v_W=self.v_W.copy(),
             sigma_m=np.full((n, 3), 0.2),
@@ -620,9 +617,7 @@ def test_requests_are_read_from_the_wire():
     assert read_request("hold", {}) == Pause()
     assert read_request("target", {"values": {"z_c": 3}, "over_s": 5}) == Target({"z_c": 3}, 5)
     assert read_request("target", {"values": {"z_c": 3}, "over_s": None}) == Target({"z_c": 3})
-    follow = read_request(
-        "trajectory", {"expressions": {"x_c": "f*t"}, "constants": {"f": 0.1}, "start_s": 9.0}
-    )
+    follow = read_request("trajectory", {"expressions": {"x_c": "f*t"}, "constants": {"f": 0.1}, "start_s": 9.0})
     assert follow == Follow({"x_c": "f*t"}, {"f": 0.1}, start_s=9.0)
 
 

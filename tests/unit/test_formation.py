@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from zsim_agents.cluster_space import cluster_space
 from zsim_agents.formation import FormationGains, FormationLaw, guard, load
 
@@ -56,9 +57,7 @@ def test_yaw_errors_are_taken_the_short_way():
 @settings(deadline=None, max_examples=200, derandomize=True)
 @given(st.lists(st.floats(-30.0, 30.0), min_size=12, max_size=12))
 def test_saturation_keeps_the_limits_and_the_direction_in_cluster_space(errors):
-    gains = dataclasses.replace(
-        GAINS, separation_min_m=0.0, separation_alarm_m=0.0
-    )  # the law without its guard
+    gains = dataclasses.replace(GAINS, separation_min_m=0.0, separation_alarm_m=0.0)  # the law without its guard
     law = FormationLaw(SPACE, gains)
     error = np.array(errors) * np.where(SPACE.in_radians, 0.1, 1.0)
     p_W, _ = SPACE.inverse(GOAL)

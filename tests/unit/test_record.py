@@ -42,9 +42,7 @@ def write(path: Path, recorded: list[Recorded]) -> list[int]:
     sizes = []
     with RecordWriter(path) as writer:
         for i, message in enumerate(recorded, start=1):
-            writer.add(
-                message.key, message.payload, messages.encoding(message.key), message.t_ns, message.wall_ns
-            )
+            writer.add(message.key, message.payload, messages.encoding(message.key), message.t_ns, message.wall_ns)
             if i % CHUNK_MESSAGES == 0:
                 writer.flush()
             sizes.append(path.stat().st_size)
@@ -84,9 +82,7 @@ def test_what_is_written_is_read(tmp_path_factory, script):
             assert reader.last(key) == [message for message in written if message.key == key][-1]
         assert reader.last("never/seen") is None
     with open(path, "rb") as file:
-        foreign = [
-            (c.topic, m.data, m.log_time, m.publish_time) for _, c, m in make_reader(file).iter_messages()
-        ]
+        foreign = [(c.topic, m.data, m.log_time, m.publish_time) for _, c, m in make_reader(file).iter_messages()]
     assert foreign == read(path)
 
 
@@ -114,9 +110,7 @@ def test_other_tools_find_encoding_schema_and_sequence(tmp_path):
     with open(path, "rb") as file:
         found = list(make_reader(file).iter_messages())
     assert [message.sequence for _, _, message in found[:3]] == [0, 1, 2]
-    assert [
-        (schema.name if schema else None, channel.message_encoding) for schema, channel, _ in found[2:]
-    ] == [
+    assert [(schema.name if schema else None, channel.message_encoding) for schema, channel, _ in found[2:]] == [
         ("Clock", "msgpack"),
         ("Pose", "msgpack"),
         (None, "json"),

@@ -15,14 +15,14 @@ import msgspec
 import numpy as np
 import pytest
 from rich.console import Console
-from zsim_deploy.report import judge, make_report, table
-from zsim_deploy.report.canvas import thinned
-from zsim_deploy.report.page import page
-from zsim_deploy.report.statistics import window
 
 from zsim import keys, messages, scenario_file
 from zsim.errors import RecordError, ReportError
 from zsim.record import RecordReader, RecordWriter
+from zsim_deploy.report import judge, make_report, table
+from zsim_deploy.report.canvas import thinned
+from zsim_deploy.report.page import page
+from zsim_deploy.report.statistics import window
 
 sys.path.insert(0, str(Path(__file__).parent))
 import synthetic_record
@@ -163,9 +163,7 @@ def test_truth_that_is_not_on_record_is_told(tmp_path):
         for message in reader.messages(by_time=False):
             if message.key == keys.truth("drone2") and 3_000_000_000 <= message.t_ns < 4_000_000_000:
                 continue
-            writer.add(
-                message.key, message.payload, messages.encoding(message.key), message.t_ns, message.wall_ns
-            )
+            writer.add(message.key, message.payload, messages.encoding(message.key), message.t_ns, message.wall_ns)
     summary = judge(tmp_path / "run.mcap")[-1]
     assert summary.record.truth_missing == 50
     assert any("50 of 1803 truth messages are not on record" in note for note in summary.notes)
@@ -183,9 +181,7 @@ def test_separation_counts_in_the_air_only(tmp_path):
     away[9:11], grow[9:11] = -3.0, 3.0
     growing = Flown(duration_s=8.0, climb_s=10.0, offset=away, amplitude=grow, period_s=40.0)
     at_lift_off = 1 + 3 * math.sin(2 * math.pi / 40)
-    assert report_of(tmp_path, growing).min_separation_m == pytest.approx(
-        2 * at_lift_off * math.sin(math.pi / 8)
-    )
+    assert report_of(tmp_path, growing).min_separation_m == pytest.approx(2 * at_lift_off * math.sin(math.pi / 8))
     (tmp_path / "run.mcap").unlink()
     nobody_flies = replace(growing, duration_s=0.9)
     assert report_of(tmp_path, nobody_flies).min_separation_m == pytest.approx(2 * math.sin(math.pi / 8))
@@ -276,9 +272,7 @@ class Links(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.scripts += tag == "script"
-        self.found += [
-            value or "" for name, value in attrs if name in ("src", "href", "srcset", "action", "data")
-        ]
+        self.found += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "action", "data")]
 
 
 def test_the_page_asks_nothing_of_the_network_and_runs_nothing(run):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from zsim_agents.cluster_space import cluster_space
 from zsim_agents.expression import Expression, ExpressionError
 from zsim_agents.formation import FormationGains
@@ -162,9 +163,7 @@ def test_the_paper_s_trajectory_is_written_as_in_the_paper():
     for t in np.linspace(0.1, 400.0, 50).tolist():
         c, c_dot = trajectory.value(t)
         y, z = -5 * (1 + 0.5 * math.sin(2 * w * t)), 15 + 2.5 * (1 - math.cos(1.5 * w * t))
-        assert c == pytest.approx(
-            [5 * math.cos(w * t), y, z, 0, 0, 0.1 * t, 0, 0, 0, 4, 4, math.pi / 4], abs=1e-12
-        )
+        assert c == pytest.approx([5 * math.cos(w * t), y, z, 0, 0, 0.1 * t, 0, 0, 0, 4, 4, math.pi / 4], abs=1e-12)
         assert c_dot == pytest.approx(numeric_rate(trajectory, t), abs=1e-7)
 
 
@@ -205,9 +204,7 @@ def waypoints(*pairs):
 def test_waypoints_are_met_and_joined_smoothly():
     trajectory = WaypointTrajectory(
         SPACE,
-        waypoints(
-            (2.0, {"x_c": 1.0}), (5.0, {"x_c": 4.0, "z_c": 10.0}), (9.0, {"x_c": 12.0}), (12.0, {"z_c": 8.0})
-        ),
+        waypoints((2.0, {"x_c": 1.0}), (5.0, {"x_c": 4.0, "z_c": 10.0}), (9.0, {"x_c": 12.0}), (12.0, {"z_c": 8.0})),
         GOAL,
     )
     assert trajectory.duration_s == 12.0
@@ -222,9 +219,7 @@ def test_waypoints_are_met_and_joined_smoothly():
 
 
 def test_waypoints_do_not_overshoot():
-    trajectory = WaypointTrajectory(
-        SPACE, waypoints((0, {"x_c": 0}), (1, {"x_c": 10}), (9, {"x_c": 10.1})), ZERO
-    )
+    trajectory = WaypointTrajectory(SPACE, waypoints((0, {"x_c": 0}), (1, {"x_c": 10}), (9, {"x_c": 10.1})), ZERO)
     x = [trajectory.value(t)[0][0] for t in np.linspace(0, 9, 200)]
     assert min(x) >= 0.0
     assert max(x) <= 10.1

@@ -179,8 +179,6 @@ class Barrier:
         """
         absent = [Waiting(name, "", (wall_ns - start_wall_ns) / 1e9) for name in self.absent()]
         rank = {name: place for place, name in enumerate(self._expected)}
-        owing = sorted(
-            self.blocking(need_ns), key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank)))
-        )
+        owing = sorted(self.blocking(need_ns), key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank))))
         late = [Waiting(p.name, p.host, (wall_ns - p.since_wall_ns) / 1e9) for p in owing]
         return (*absent, *late)

@@ -87,7 +87,5 @@ class CommandDesk:
         refusal = act[mode](due.drone)
         if refusal is None:
             name = fleet.names[due.drone]
-            self._world.event(
-                "mode", name, f"{due.source} asks {name} to {mode}", source=due.source, mode=mode
-            )
+            self._world.event("mode", name, f"{due.source} asks {name} to {mode}", source=due.source, mode=mode)
         return refusal

@@ -283,9 +283,7 @@ class WorldProcess:
     def _replay(self, request: messages.ControlRequest) -> ControlAnswer:
         from_ns, expressions = request.args.get("from_ns"), request.args.get("keys")
         if not isinstance(from_ns, int) or not isinstance(expressions, list) or len(expressions) > 1000:
-            return ControlAnswer(
-                ok=False, error="replay: needs from_ns (whole number) and keys (list of texts)"
-            )
+            return ControlAnswer(ok=False, error="replay: needs from_ns (whole number) and keys (list of texts)")
         result, size = [], 0
         for key, payload in self._history.since(from_ns, [str(expression) for expression in expressions]):
             size += len(payload)

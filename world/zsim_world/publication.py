@@ -52,7 +52,7 @@ class Publication:
         self._gate += 1
 
     def _gps(self, s: Sample, seq: int) -> messages.Gps:
-        v = s.values
+        v: Any = s.values
         return messages.Gps(
             s.t_ns, seq, s.t_sample_ns, v[0], v[1], v[2], v[3:6], v[6:9],
             self._sigma_m[s.drone], GPS_FIX_3D, GPS_SATELLITES,
@@ -77,20 +77,25 @@ class Publication:
 
 
 def _imu(s: Sample, seq: int) -> messages.Imu:
-    return messages.Imu(s.t_ns, seq, s.t_sample_ns, s.values[0:3], s.values[3:6])
+    v: Any = s.values
+    return messages.Imu(s.t_ns, seq, s.t_sample_ns, v[0:3], v[3:6])
 
 
 def _mag(s: Sample, seq: int) -> messages.Mag:
-    return messages.Mag(s.t_ns, seq, s.t_sample_ns, s.values)
+    v: Any = s.values
+    return messages.Mag(s.t_ns, seq, s.t_sample_ns, v)
 
 
 def _baro(s: Sample, seq: int) -> messages.Baro:
-    return messages.Baro(s.t_ns, seq, s.t_sample_ns, *s.values)
+    v: Any = s.values
+    return messages.Baro(s.t_ns, seq, s.t_sample_ns, *v)
 
 
 def _sonar(s: Sample, seq: int) -> messages.Sonar:
-    return messages.Sonar(s.t_ns, seq, s.t_sample_ns, s.values[0], bool(s.values[1]))
+    v: Any = s.values
+    return messages.Sonar(s.t_ns, seq, s.t_sample_ns, v[0], bool(v[1]))
 
 
 def _flow(s: Sample, seq: int) -> messages.Flow:
-    return messages.Flow(s.t_ns, seq, s.t_sample_ns, s.values[0:3], s.values[3])
+    v: Any = s.values
+    return messages.Flow(s.t_ns, seq, s.t_sample_ns, v[0:3], v[3])

@@ -112,9 +112,7 @@ class RecordReader:
         found = [group for group in groups(self._source) if group.place.opcode == Opcode.CHUNK]
         for group in found:
             cut = group is found[-1] and not self.complete
-            counts = (
-                self._counted(group) if cut else {index.channel: index.messages for index in group.indexes}
-            )
+            counts = self._counted(group) if cut else {index.channel: index.messages for index in group.indexes}
             self._counts.update(counts)
             channels = frozenset(counts)
             first_ns = chunk_head(self._source, group.place).first_ns

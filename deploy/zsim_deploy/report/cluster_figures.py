@@ -67,9 +67,7 @@ def _write_statistics(axes: Axes, formation: Formation, name: str, rows: np.ndar
     for y, error, style in ((0.68, formation.est_error, MEASURED), (0.32, formation.true_error, TRUE)):
         known = error[rows, i][np.isfinite(error[rows, i])]
         text = f"std {known.std():.4f}\nmean {known.mean():+.4f}" if len(known) else "no data"
-        axes.text(
-            1.02, y, text, transform=axes.transAxes, fontsize=8.5, color=_darker(style["color"]), va="center"
-        )
+        axes.text(1.02, y, text, transform=axes.transAxes, fontsize=8.5, color=_darker(style["color"]), va="center")
 
 
 def _darker(colour: str) -> str:

@@ -23,9 +23,7 @@ class Named(Struct, frozen=True):
     drawing: Figure
 
 
-def figures(
-    flight: Flight, formations: Sequence[Formation], window_s: tuple[float, float]
-) -> Iterator[Named]:
+def figures(flight: Flight, formations: Sequence[Formation], window_s: tuple[float, float]) -> Iterator[Named]:
     """Yield the figures that the record has data for, the first cluster's under the plain names."""
     for i, formation in enumerate(formations):
         yield from _of_cluster(formation, window_s, f"_{formation.name}" if i else "")
@@ -53,9 +51,7 @@ def _of_cluster(formation: Formation, window_s: tuple[float, float], suffix: str
         "Until the formation is engaged, the controller takes its own estimate as the desired value.",
         draw_errors(formation, window_s),
     )
-    shape = tuple(
-        name for name in formation.names if name not in POSITION + ORIENTATION and "phi" not in name
-    )
+    shape = tuple(name for name in formation.names if name not in POSITION + ORIENTATION and "phi" not in name)
     for file, number, what, names in (
         ("figure_6_position", 6, "Position of the formation", POSITION),
         ("figure_7_orientation", 7, "Orientation of the formation", ORIENTATION),

@@ -73,9 +73,7 @@ def _draw_desired(axes: Axes, formation: Formation) -> None:
         desired = np.where(engaged[:, None], formation.desired, np.nan)
         x, y = (desired[:, formation.column(name)] for name in ("x_c", "y_c"))
         step = max(1, len(x) // 4000)
-        axes.plot(
-            x[::step], y[::step], color=BLACK, lw=1.3, zorder=3, label=f"desired centroid of {formation.name}"
-        )
+        axes.plot(x[::step], y[::step], color=BLACK, lw=1.3, zorder=3, label=f"desired centroid of {formation.name}")
 
 
 def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) -> None:
@@ -149,10 +147,6 @@ def _draw_states(axes: Axes, track: Track, lane: int) -> None:
 def _name_states(axes: Axes, tracks: Sequence[Track]) -> None:
     """Put the names of the states that occur beside the axes."""
     occur = [name for name in STATES if any(name in track.states for track in tracks)]
-    handles: list[Patch | Line2D] = [
-        Patch(color=STATES[name], label=name.replace("_", " ")) for name in occur
-    ]
+    handles: list[Patch | Line2D] = [Patch(color=STATES[name], label=name.replace("_", " ")) for name in occur]
     if handles:
-        axes.legend(
-            handles=handles, loc="center left", bbox_to_anchor=(1.005, 0.5), frameon=False, fontsize=9
-        )
+        axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.005, 0.5), frameon=False, fontsize=9)

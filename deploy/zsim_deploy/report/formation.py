@@ -41,10 +41,7 @@ class Formation:
     def errors(self, window_s: tuple[float, float]) -> dict[str, Errors]:
         """Return the statistics of every parameter over a window."""
         rows = self.within(window_s)
-        return {
-            name: errors(self.est_error[rows, i], self.true_error[rows, i])
-            for i, name in enumerate(self.names)
-        }
+        return {name: errors(self.est_error[rows, i], self.true_error[rows, i]) for i, name in enumerate(self.names)}
 
 
 def unit(name: str) -> str:

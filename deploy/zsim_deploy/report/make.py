@@ -14,9 +14,7 @@ from zsim_deploy.report.summary import Summary, summarise
 RECORD = "run.mcap"
 
 
-def judge(
-    record: Path, progress: Callable[[str], None] = lambda _: None
-) -> tuple[Flight, list[Formation], Summary]:
+def judge(record: Path, progress: Callable[[str], None] = lambda _: None) -> tuple[Flight, list[Formation], Summary]:
     """Return what a record says, and what that amounts to; nothing is written.
 
     Raises:

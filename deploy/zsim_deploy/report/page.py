@@ -21,10 +21,7 @@ def page(summary: Summary, figures: Sequence[Named], directory: Path) -> str:
         trim_blocks=True,
     )
     tables = {
-        name: [
-            cells(parameter, errors, paper.TABLE_1.get(parameter))
-            for parameter, errors in cluster.errors.items()
-        ]
+        name: [cells(parameter, errors, paper.TABLE_1.get(parameter)) for parameter, errors in cluster.errors.items()]
         for name, cluster in summary.clusters.items()
     }
     return environment.get_template("page.html.j2").render(
@@ -40,9 +37,7 @@ def page(summary: Summary, figures: Sequence[Named], directory: Path) -> str:
 def facts(summary: Summary) -> list[tuple[str, str]]:
     """Return what the head of the page says, as pairs of a word and its value."""
     age = summary.command_age_ms
-    ages = (
-        f"p50 {age['p50']:.2f} ms, p99 {age['p99']:.2f} ms, max {age['max']:.2f} ms" if age else "not known"
-    )
+    ages = f"p50 {age['p50']:.2f} ms, p99 {age['p99']:.2f} ms, max {age['max']:.2f} ms" if age else "not known"
     factor = "not known" if summary.real_time_factor is None else f"{summary.real_time_factor:.1f}"
     return [
         (

@@ -184,17 +184,13 @@ def _participant(process: Participant) -> dict[str, Any]:
 def _record_notes(flight: Flight) -> list[str]:
     notes = []
     if flight.end is None:
-        notes.append(
-            "The world did not report the run's end; times and command age are worked out from the record."
-        )
+        notes.append("The world did not report the run's end; times and command age are worked out from the record.")
     if not flight.complete:
         notes.append("The record was cut: its writer did not close it. Everything up to the cut was read.")
     if flight.damaged:
         notes.append(f"{flight.damaged} chunks of the record are damaged and were passed over.")
     if flight.undecoded:
-        notes.append(
-            f"{flight.undecoded} messages on record are not what their key promises and were passed over."
-        )
+        notes.append(f"{flight.undecoded} messages on record are not what their key promises and were passed over.")
     if flight.info is None:
         notes.append("world/info is not on record: scenario, seed and the order of the drones are not known.")
     elif flight.scenario is None:
@@ -223,9 +219,7 @@ def _formation_notes(flight: Flight, formations: list[Formation], window_s: tupl
         if not rows.any():
             notes.append(f"Cluster {formation.name} published no state inside the window.")
         elif engaged < rows.sum():
-            notes.append(
-                f"Cluster {formation.name} was engaged in {engaged} of {rows.sum()} instants of the window."
-            )
+            notes.append(f"Cluster {formation.name} was engaged in {engaged} of {rows.sum()} instants of the window.")
     if not flight.clusters:
         notes.append("The scenario has no cluster: there is no table of errors.")
     return notes

@@ -15,9 +15,7 @@ def table(summary: Summary, cluster: str | None = None) -> Table:
     start, end = summary.window_s
     whose = f" of {name}" if name else ""
     title = f"Formation errors{whose} from {start:g} to {end:g} s, beside Table I of the paper"
-    shown = Table(
-        title=title, caption="est. = estimate − desired, true = truth − desired", title_justify="left"
-    )
+    shown = Table(title=title, caption="est. = estimate − desired, true = truth − desired", title_justify="left")
     for column in COLUMNS:
         shown.add_column(column, justify="left" if column == "parameter" else "right")
     for parameter, errors in (summary.clusters[name].errors if name else {}).items():

@@ -36,9 +36,7 @@ def truth_hash(tracks: list[Track], gate_ns: int | None, last_ns: int) -> TruthH
     rows = np.concatenate([_rows(track) for track in tracks] or [np.zeros(0, _ROW)])
     drone = np.repeat(np.arange(len(tracks)), [len(track.t_ns) for track in tracks])
     ordered = rows[np.lexsort((drone, rows["t"]))]
-    return TruthHash(
-        hashlib.sha256(ordered.tobytes()).hexdigest(), len(rows), _missing(tracks, gate_ns, last_ns)
-    )
+    return TruthHash(hashlib.sha256(ordered.tobytes()).hexdigest(), len(rows), _missing(tracks, gate_ns, last_ns))
 
 
 def _rows(track: Track) -> np.ndarray:
