@@ -6,7 +6,7 @@ Order of this file: `run`, the loop, what arrives, what rarely arrives, publicat
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -16,11 +16,11 @@ from zsim.agent import Output
 from zsim.errors import DecodeError
 from zsim.health import HealthMeter
 from zsim.messages import ControlAnswer
-from zsim.session import Mailbox, Query, Sample, Session, TimedMailbox
+from zsim.session import Query, Sample, Session
 from zsim_world.history import History
+from zsim_world.inputs import TICK_S, Direct, Inputs, Timed
 from zsim_world.world import World
 
-TICK_S = 0.1  # how often a standing world looks at the wall clock
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
@@ -83,7 +83,7 @@ class WorldProcess:
     def run(self) -> None:
         """Run to the end: wait for the participants, integrate, say goodbye."""
         boxes = [self._link.subscribe(expression) for expression in INPUTS]
-        self._inputs: _Inputs = _Timed(boxes) if self._world.mode == "realtime" else _Direct(boxes)
+        self._inputs: Inputs = Timed(boxes) if self._world.mode == "realtime" else Direct(boxes)
         self._announce()
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         ticker.start()
@@ -333,87 +333,6 @@ class WorldProcess:
         view = self._world.view(self._view_seq)
         self._view_seq += 1
         self._link.put(keys.VIEW_DRONES, view)
-
-
-class _Inputs:
-    """What others publish: waited for with a limit or without, drained with the wall time of arrival."""
-
-    def wait(self, timeout_s: float | None) -> None:
-        raise NotImplementedError
-
-    def wait_for(self, wanted: set[str]) -> None:
-        """Wait until something has come on each of the wanted keys, or anything that is not a done."""
-        self.wait(None)
-
-    def drain(self) -> Iterator[tuple[int, Sample]]:
-        raise NotImplementedError
-
-    def wake(self) -> None:
-        raise NotImplementedError
-
-    def close(self) -> None:
-        return
-
-
-class _Direct(_Inputs):
-    """Reads on the loop's own thread, waiting for the last box: fastest where nothing hangs on the wall clock."""
-
-    def __init__(self, boxes: Sequence[Mailbox]) -> None:
-        self._boxes = boxes
-        self._first: list[Sample] = []
-
-    def wait(self, timeout_s: float | None) -> None:
-        if timeout_s is not None and timeout_s < TICK_S:
-            time.sleep(timeout_s)
-            return
-        sample = self._boxes[-1].receive()
-        if sample is not None:
-            self._first.append(sample)
-
-    def wait_for(self, wanted: set[str]) -> None:
-        while True:
-            sample = self._boxes[-1].receive()
-            if sample is None:
-                return
-            self._first.append(sample)
-            wanted.discard(sample.key)
-            if not wanted or not sample.key.endswith("/done"):
-                return
-
-    def drain(self) -> Iterator[tuple[int, Sample]]:
-        last, self._first = [*self._first, *self._boxes[-1].drain()], []
-        wall_ns = time.monotonic_ns()
-        for box in self._boxes[:-1]:
-            for sample in box.drain():
-                yield wall_ns, sample
-        for sample in last:
-            yield wall_ns, sample
-
-    def wake(self) -> None:
-        self._boxes[-1].wake()
-
-
-class _Timed(_Inputs):
-    """Reads on threads of their own, so that arrivals are stamped while the loop waits for its next gate."""
-
-    def __init__(self, boxes: Sequence[Mailbox]) -> None:
-        self._fresh = threading.Event()
-        self._boxes = [TimedMailbox(box, self._fresh) for box in boxes]
-
-    def wait(self, timeout_s: float | None) -> None:
-        self._fresh.wait(TICK_S if timeout_s is None else timeout_s)
-        self._fresh.clear()
-
-    def drain(self) -> Iterator[tuple[int, Sample]]:
-        for box in self._boxes:
-            yield from box.drain()
-
-    def wake(self) -> None:
-        self._fresh.set()
-
-    def close(self) -> None:
-        for box in self._boxes:
-            box.close()
 
 
 def run(
