@@ -16,7 +16,7 @@ from zsim.session import Mailbox, Session
 
 CLUSTER = "main"
 ME = "square.main"
-SIDE_M, LEG_S, HEIGHT_M = 3.0, 5.0, 2.5
+SIDE_M, LEG_S, HEIGHT_M = 2.5, 4.0, 2.5
 PATIENCE_S = 30
 CORNERS = ((0.0, 0.0), (SIDE_M, 0.0), (SIDE_M, SIDE_M), (0.0, SIDE_M), (0.0, 0.0))
 

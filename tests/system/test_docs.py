@@ -113,7 +113,7 @@ class Desk:
     def __enter__(self) -> "Desk":
         return self
 
-    def __exit__(self, failed: object, *_: object) -> None:
+    def __exit__(self, failed: object, *rest: object) -> None:
         try:
             if not failed:
                 self.close_terminals()
@@ -125,18 +125,23 @@ class Desk:
     def run(self, block: Block, page: Path) -> None:
         """Run a block as one script."""
         text = "\n".join(adapted(line, self._ports, RUN_S) for line in lines(block))
-        done = subprocess.run(
+        script = subprocess.Popen(
             ["bash", "-euo", "pipefail", "-c", text],
             cwd=self._folder,
             env=self._environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            timeout=PATIENCE_S,
+            start_new_session=True,
             text=True,
         )
+        try:
+            said, _ = script.communicate(timeout=PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(script.pid, signal.SIGKILL)
+            said = f"{script.communicate()[0]}\nnot done after {PATIENCE_S} s"
         where = f"{page.name}:{block.line}"
-        assert done.returncode == 0, f"{where}: {text}\n{done.stdout}\n{self._said()}"
+        assert script.returncode == 0, f"{where}: {text}\n{said}\n{self._said()}"
 
     def open_terminals(self, block: Block, page: Path) -> None:
         """Start every line of a block as a process; a world listens when this returns."""
@@ -195,7 +200,7 @@ FOREIGN = ("plain_client.py", "foreign_estimator.py", "range_sensor.py")  # take
 OURS = ("my_estimator.py", "fly_square.py")
 
 
-def adapted(line: str, ports: tuple[int, int], longest_s: float | None) -> str:
+def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
     """Return a command with this test's endpoints, no longer than longest_s where that is given."""
     endpoint = f"tcp/127.0.0.1:{ports[0]}"
     own = "7447" in line
@@ -204,7 +209,7 @@ def adapted(line: str, ports: tuple[int, int], longest_s: float | None) -> str:
     line = re.sub(r"\bzsim (run)\b(?!.*--in-process)", rf"zsim \1 --listen {endpoint}", line)
     if longest_s is not None and re.search(r"\bzsim run\b", line):
         line = re.sub(r"--duration \S+", "", line).replace("zsim run", f"zsim run --duration {longest_s:g}")
-    line = re.sub(r"(examples/.* --duration) \S+", rf"\1 {EXAMPLE_S:g}", line)
+    line = re.sub(r"(examples/.* --duration) (\S+)", lambda m: f"{m[1]} {min(float(m[2]), EXAMPLE_S):g}", line)
     if " --out " not in line:
         line = re.sub(r"\bzsim run\b", "zsim run --no-report", line)
     if not own:
