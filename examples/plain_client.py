@@ -20,7 +20,7 @@ with zenoh.open(config) as session:
         seq[key] = seq.get(key, -1) + 1
         session.put(key, msgpack.packb({"seq": seq[key], **fields}))
 
-    info = next(msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in session.get("zsim/world/info"))
+    info = next(msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in session.get("zsim/world/info") if reply.ok)
     run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
     sensors = session.declare_subscriber(f"{DRONE}/sensor/*", zenoh.handlers.FifoChannel(10_000))
     token = session.liveliness().declare_token(f"zsim/process/{ME}")

@@ -84,7 +84,7 @@ def _clock_line(clock: messages.Clock, phase: str) -> dict[str, Any]:
 
 
 def _event_line(event: messages.Event) -> dict[str, Any]:
-    data = event.data if event.kind == "end" else {}
+    data = event.data if event.kind in ("end", "death") else {}
     return {
         "t_s": event.t_ns / 1e9,
         "kind": event.kind,
@@ -133,7 +133,7 @@ def recorder(path: Path, endpoint: str, federation: str, wait_s: float | None, l
     leash = Leash(launched)
     say = _speaker(launched)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with find_world(endpoint, federation, wait_s, say, leash.pulled, reader=True) as (link, info):
+    with find_world(endpoint, federation, wait_s, say, leash.pulled) as (link, info):
         say(f"recorder: run {info.run_id} into {path}")
         reason = record(link, info, path, stopped=leash.pulled)
     say(f"recorder: {path} is complete, {reason}")

@@ -131,6 +131,8 @@ class Run:
         self._screen.event(event)
         if event["kind"] == "end":
             self._reason = self._reason or event["text"]
+        elif event["kind"] == "death" and event["data"].get("on_death") == "end":
+            self._fail(f"{event['subject']} died")
 
     # Watching
 

@@ -1,7 +1,6 @@
 """Programs of others in the place of ours, and what the world answers to anyone who asks."""
 
 import math
-from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -187,7 +186,7 @@ def test_the_outputs_of_a_role(federation: Federation) -> None:
 
 
 @pytest.fixture
-def twice(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[list[dict[str, Any]]]:
+def twice(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> list[dict[str, Any]]:
     """What the world says at the end of two runs that the same foreign program flies."""
     hashes = []
     for number in range(2):
@@ -202,7 +201,7 @@ def twice(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Iterator[
             hashes.append(step.event("end", "world").message["data"])
             step.me.bye(step.now_ns)
             step.world.ends(with_code=0)
-    yield hashes
+    return hashes
 
 
 def test_a_foreign_program_gives_the_same_bits(twice: list[dict[str, Any]]) -> None:

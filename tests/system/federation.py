@@ -216,9 +216,9 @@ class Federation:
         role, _, thing = name.partition(".")
         role = "record" if role == "recorder" else role
         for pid, command in self._processes():
-            if command[2:4] == ["zsim_deploy.cli", role] and (not thing or command[4] == thing):
-                if "--launched" in command:
-                    return pid
+            named = command[2:4] == ["zsim_deploy.cli", role] and (not thing or command[4] == thing)
+            if named and "--launched" in command:
+                return pid
         return pytest.fail(f"{name} does not run")
 
     def kill(self, name: str, number: int = signal.SIGKILL) -> float:

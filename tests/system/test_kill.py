@@ -109,6 +109,30 @@ def test_end(federation: Federation, name: str) -> None:
     check_end(federation, whole=False)
 
 
+def test_a_stopped_reader(federation: Federation) -> None:
+    """Whoever only listens and takes nothing loses its link; the terminal says meanwhile why nothing moves."""
+    run = federation.run(PAIR, "--duration", "100000")
+    clock = federation.client().watch("clock")
+    reader = federation.role("echo", "**")
+    reader.line("clock")
+    reader.signal(signal.SIGSTOP)
+    stuck = run.line("stuck: nothing can be published for .*; one of recorder, a program that only listens")
+    clock.until(lambda _: clock.heard[-1].wall_s > stuck.wall_s + 1.0)
+    run.signal(signal.SIGINT)
+    run.ends(with_code=130)
+
+
+def test_a_stopped_recorder(federation: Federation) -> None:
+    """A recorder that takes nothing for long is as good as dead."""
+    flight = Flight(federation, "--rate", "1000", "--duration", "100000")
+    federation.kill("recorder", signal.SIGSTOP)
+    flight.run.line("stuck: nothing can be published for .*; one of recorder,")
+    flight.run.line("death: recorder .*; on_death: end")
+    flight.run.ends(with_code=1)
+    assert "ended: recorder died" in flight.run.text()
+    check_end(federation, whole=False)
+
+
 def test_world(federation: Federation) -> None:
     flight = Flight(federation)
     killed_s = federation.kill("world")

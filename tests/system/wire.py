@@ -120,7 +120,7 @@ class Client:
         """Publish a message; `seq` is counted here."""
         seq = self._seq.get(key, 0)
         self._seq[key] = seq + 1
-        self.put_raw(key, msgpack.packb({"seq": seq, **fields}))
+        self.put_raw(key, self.pack({"seq": seq, **fields}))
 
     def put_raw(self, key: str, payload: bytes) -> None:
         """Publish any bytes."""
@@ -140,7 +140,7 @@ class Client:
     @staticmethod
     def pack(fields: dict[str, Any]) -> bytes:
         """Return a message as it goes on the wire."""
-        return msgpack.packb(fields)
+        return bytes(msgpack.packb(fields) or b"")
 
     def token(self, name: str) -> Any:
         """Declare the liveliness token of a process; `undeclare` it to play its death."""

@@ -21,6 +21,7 @@ from zsim_world.history import History
 from zsim_world.inputs import TICK_S, Direct, Inputs, Timed
 from zsim_world.world import World
 
+STUCK_NS = 2_000_000_000  # wall time in one turn from which on a person is told; a turn takes milliseconds
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
@@ -70,6 +71,7 @@ class WorldProcess:
         self._tokens: deque[tuple[str, bool]] = deque()
         self._over = threading.Event()
         self._clock_wall_ns = 0
+        self._turn_wall_ns = 0  # when the present turn began; 0 when there is none
         self._view_wall_ns = 0
         self._view_seq = 0
         self._health_seq = 0
@@ -115,6 +117,7 @@ class WorldProcess:
     # The loop
 
     def _turn(self) -> None:
+        self._turn_wall_ns = time.monotonic_ns()
         self._take_in_all()
         self._serve_rare()
         self._recover_short()
@@ -166,6 +169,7 @@ class WorldProcess:
 
     def _say_goodbye(self) -> None:
         """Publish the end, then wait until every participant that lives has said bye."""
+        self._turn_wall_ns = 0
         self._world.tell_end(time.monotonic_ns())
         self._flush()
         until_s = time.monotonic() + BYE_S
@@ -245,8 +249,21 @@ class WorldProcess:
         self._inputs.wake()
 
     def _tick(self) -> None:
+        told_ns = 0
         while not self._over.wait(TICK_S):
             self._inputs.wake()
+            now_ns = time.monotonic_ns()
+            if self._turn_wall_ns and now_ns - max(self._turn_wall_ns, told_ns) > STUCK_NS:
+                told_ns = now_ns
+                self._tell_stuck((now_ns - self._turn_wall_ns) / 1e9)
+
+    def _tell_stuck(self, since_s: float) -> None:
+        """Say that a put does not come back; `clock` cannot, since it would have to go the same way."""
+        readers = [p.name for p in list(self._world.barrier.participants.values()) if not p.gating]
+        who = ", ".join([*readers, "a program that only listens"])
+        text = f"nothing can be published for {since_s:.1f} s: a reader takes nothing; one of {who}"
+        event = messages.Event(self._world.now_ns, 0, "stuck", WORLD, WORLD, text)
+        self._tell("event", event, self._phase)
 
     def _serve_rare(self) -> None:
         reason = self._stopped()
