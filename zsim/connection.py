@@ -20,6 +20,7 @@ def find_world(
     wait_s: float | None = None,
     say: Callable[[str], None] = lambda text: None,
     stopped: Callable[[], bool] = lambda: False,
+    reader: bool = False,
 ) -> Iterator[tuple[Session, messages.Info]]:
     """Yield a session and the `world/info` of the run that it belongs to.
 
@@ -29,12 +30,13 @@ def find_world(
         wait_s: how long to wait for a world; None waits for ever.
         say: told at growing intervals whom it waits for.
         stopped: asked while waiting.
+        reader: it does not gate; see `session.connect`.
 
     Raises:
         NoWorldError: no world answered within `wait_s`, or `stopped` said so.
     """
     with ExitStack() as stack:
-        link, info = _search(stack, endpoint, federation, wait_s, say, stopped)
+        link, info = _search(stack, endpoint, federation, wait_s, say, stopped, reader)
         if info.mode == "realtime":
             stack.pop_all().close()
             link = stack.enter_context(session.connect(endpoint, federation, "realtime", wait_s=5.0))
@@ -49,6 +51,7 @@ def _search(
     wait_s: float | None,
     say: Callable[[str], None],
     stopped: Callable[[], bool],
+    reader: bool,
 ) -> tuple[Session, messages.Info]:
     start_s, next_say_s = time.monotonic(), 0.0
     link: Session | None = None
@@ -58,7 +61,7 @@ def _search(
         try:
             if link is None:
                 attempt_s = max(0.05, min(ATTEMPT_S, left_s))
-                link = stack.enter_context(session.connect(endpoint, federation, wait_s=attempt_s))
+                link = stack.enter_context(session.connect(endpoint, federation, wait_s=attempt_s, reader=reader))
             info = read_info(link)
             if info is not None:
                 return link, info

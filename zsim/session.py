@@ -26,6 +26,7 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 QUEUE = 1_000_000  # messages; an unread queue that is full blocks the whole link
 LEASE_LOCKSTEP_MS = 3_600_000  # a stopped or debugged process must not lose its link in lockstep
 LEASE_REALTIME_MS = 1_000
+LEASE_READER_MS = 10_000  # nobody waits for one that only reads, so nobody would name it when it is stopped
 CLOSE_AFTER_US = 3_600_000_000  # -1 means for ever and panics in 1.10.2
 # A stopped reader (a recorder, `zsim echo`) fills its link and then holds up the hub and everybody; it loses its link.
 # A stopped participant does not: time stands before its link is full.
@@ -293,7 +294,9 @@ def listen(endpoints: Sequence[str], federation: str, mode: Mode) -> Iterator[Se
 
 
 @contextmanager
-def connect(endpoint: str, federation: str, mode: Mode = "lockstep", wait_s: float | None = None) -> Iterator[Session]:
+def connect(
+    endpoint: str, federation: str, mode: Mode = "lockstep", wait_s: float | None = None, reader: bool = False
+) -> Iterator[Session]:
     """Open a client of the hub (or of a router).
 
     Args:
@@ -301,11 +304,12 @@ def connect(endpoint: str, federation: str, mode: Mode = "lockstep", wait_s: flo
         federation: prefix of all keys.
         mode: of the run, where it is known already.
         wait_s: how long to try; None tries once.
+        reader: it does not gate; in lockstep too, a silence of LEASE_READER_MS is its death.
 
     Raises:
         SessionError: nobody listens there within `wait_s`.
     """
-    config = _config("client", mode)
+    config = _config("client", mode, reader)
     config.insert_json5("connect/endpoints", _json([endpoint]))
     config.insert_json5("connect/timeout_ms", str(int(1000 * (wait_s or 0)) or 500))
     with _opened(config, federation, f"nobody listens on {endpoint}; start a world there") as session:
@@ -324,8 +328,8 @@ def _opened(config: zenoh.Config, federation: str, fault: str) -> Iterator[Sessi
         raw.close()
 
 
-def _config(mode: str, timing: Mode) -> zenoh.Config:
-    lease = LEASE_LOCKSTEP_MS if timing == "lockstep" else LEASE_REALTIME_MS
+def _config(mode: str, timing: Mode, reader: bool = False) -> zenoh.Config:
+    lease = LEASE_REALTIME_MS if timing == "realtime" else LEASE_READER_MS if reader else LEASE_LOCKSTEP_MS
     config = zenoh.Config()
     for path, value in {
         "mode": f'"{mode}"',

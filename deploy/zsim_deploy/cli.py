@@ -278,12 +278,14 @@ def _mode(realtime: bool, rate: float | None) -> tuple[str, float]:
 def _link(endpoint: str, federation: str, wait_s: float | None) -> Any:
     """Return a context manager with a session to the federation's hub."""
     from contextlib import contextmanager
+    from functools import partial
 
     from zsim.connection import find_world
 
     @contextmanager
     def opened() -> Any:
-        with find_world(endpoint, federation, wait_s, lambda text: print(text, file=sys.stderr)) as (link, _):
+        say = partial(print, file=sys.stderr)
+        with find_world(endpoint, federation, wait_s, say, reader=True) as (link, _):
             yield link
 
     return opened()

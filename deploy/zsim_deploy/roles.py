@@ -133,7 +133,7 @@ def recorder(path: Path, endpoint: str, federation: str, wait_s: float | None, l
     leash = Leash(launched)
     say = _speaker(launched)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with find_world(endpoint, federation, wait_s, say, leash.pulled) as (link, info):
+    with find_world(endpoint, federation, wait_s, say, leash.pulled, reader=True) as (link, info):
         say(f"recorder: run {info.run_id} into {path}")
         reason = record(link, info, path, stopped=leash.pulled)
     say(f"recorder: {path} is complete, {reason}")

@@ -259,7 +259,7 @@ class Federation:
         self._stack.close()
         for role in self._roles:
             role.close()
-        for pid, _ in list(self._processes()):
+        for pid, _command in list(self._processes()):
             os.kill(pid, signal.SIGKILL)
 
 

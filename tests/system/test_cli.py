@@ -110,7 +110,7 @@ def test_asking_a_controller(federation: Federation, flying: Role) -> None:
     state.until(lambda m: m["phase"] == "held")
     assert terminal("ask", "cluster/main/control", "engage") == "ok\n"
     before = state.until(lambda m: m["phase"] == "engaged").message
-    target = {"values": {"z_c": 2.5}, "over_s": 2}
+    target = {"values": {"z_c": 2.5}, "over_s": 6}
     assert terminal("ask", "cluster/main/control", "target", json.dumps(target)) == "ok\n"
     place = before["names"].index("z_c")
     state.until(lambda m: m["desired"][place] == pytest.approx(2.5))

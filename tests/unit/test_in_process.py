@@ -165,14 +165,14 @@ def test_the_order_of_the_agents_does_not_matter(order: tuple[int, int, int]):
 
 
 def test_a_done_follows_its_outputs_and_counts_them_without_views():
-    hub, _ = fly(2, team())
-    mine = [message for key, message in hub.handled if isinstance(message, Velocity | ClusterState | ViewCluster)]
+    hub, said = fly(2, team())
+    mine = [message for _, message in said if isinstance(message, Velocity | ClusterState | ViewCluster)]
     assert [type(message) for message in mine] == [Velocity, ClusterState] * 2
     dones = [m for key, m in hub.handled if isinstance(m, Done) and keys.thing(key) == "controller.main"]
     assert [(done.done_ns, done.sent, done.seq) for done in dones] == [(0, 2, 0), (GATE_NS, 2, 1)]
     for done in dones:
-        place = hub.handled.index(("process/controller.main/done", done))
-        assert [type(message) for _, message in hub.handled[place - 2 : place]] == [Velocity, ClusterState]
+        place = said.index(("process/controller.main/done", done))
+        assert [type(message) for _, message in said[place - 2 : place]] == [Velocity, ClusterState]
 
 
 def test_outputs_that_the_world_only_relays_are_counted_for_it():
