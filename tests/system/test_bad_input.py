@@ -16,7 +16,9 @@ SUPERSEDED = 3
 
 def refused(*arguments: str, code: int = USER_FAULT) -> str:
     """Run a command that must be refused; return its lines."""
-    done = subprocess.run([*ZSIM, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    done = subprocess.run(
+        [*ZSIM, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
@@ -31,7 +33,10 @@ SCENARIOS: dict[str, tuple[Callable[[str], str], str]] = {
     "a list for a map": (lambda s: s.replace("{expect: []}", "[]"), "processes is []; must be a map"),
     "nan": (lambda s: s.replace("gust_m_s: 0.3", "gust_m_s: .nan"), "gust_m_s is nan; must be a finite number >= 0"),
     "infinite": (lambda s: s.replace("duration_s: 10", "duration_s: .inf"), "duration_s is inf; must be a finite"),
-    "absurd duration": (lambda s: s.replace("duration_s: 10", "duration_s: 1e9"), "duration_s is 1000000000.0; must be"),
+    "absurd duration": (
+        lambda s: s.replace("duration_s: 10", "duration_s: 1e9"),
+        "duration_s is 1000000000.0; must be",
+    ),
     "absurd place": (lambda s: s.replace("[0, 0, 0]", "[1e9, 0, 0]"), "position_m[0] is 1000000000.0; must be"),
     "under the ground": (lambda s: s.replace("[0, 0, 0]", "[0, 0, -1]"), "position_m[2] is -1; must be >= 0"),
     "negative mass": (lambda s: s.replace("yaw_deg: 90", "mass_kg: -1"), "mass_kg is -1; must be > 0 and <= 100"),
@@ -46,13 +51,19 @@ SCENARIOS: dict[str, tuple[Callable[[str], str], str]] = {
     "a name with a slash": (lambda s: s.replace("name: drone1", "name: a/b"), "drones[0].name is 'a/b'; must match"),
     "two of one name": (lambda s: PAIR.replace("drone2, pos", "drone1, pos"), "drones[1].name is 'drone1'"),
     "two in one place": (lambda s: PAIR.replace("[-2, 0, 0]", "[2, 0, 0]"), "is 0.00 m from 'drone1'; must be >="),
-    "a cluster of strangers": (lambda s: PAIR.replace("drones: [drone1,", "drones: [drone7,"), "is 'drone7'; must be one"),
+    "a cluster of strangers": (
+        lambda s: PAIR.replace("drones: [drone1,", "drones: [drone7,"),
+        "is 'drone7'; must be one",
+    ),
     "no yaml": (lambda s: "name: [", "is not YAML ("),
     "no map": (lambda s: "- 1\n", "holds [1]; must be a map"),
     "empty": (lambda s: "", "holds null; must be a map"),
     "a key twice": (lambda s: s + "seed: 4\n", "key 'seed' is given twice"),
     "an alias bomb": (lambda s: "a: &a [1]\nb: [*a, *a]\n", "aliases are not allowed"),
-    "on_death of another kind": (lambda s: s.replace("{expect: []}", "{on_death: {world: sing}}"), "is 'sing'; must be one"),
+    "on_death of another kind": (
+        lambda s: s.replace("{expect: []}", "{on_death: {world: sing}}"),
+        "is 'sing'; must be one",
+    ),
 }
 
 
@@ -83,7 +94,10 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "set of an unknown drone": (("run", "{one}", "--set", "drones.drone9.mass_kg=1"), "drone9 is not in drones"),
     "set of a bad value": (("run", "{one}", "--set", "seed=[1"), "is not YAML"),
     "negative duration": (("run", "{one}", "--duration", "-1"), "duration_s is -1.0; must be > 0"),
-    "no world": (("estimator", "drone1", "--connect", "tcp/127.0.0.1:{free}", "--wait", "0.5"), "no world of federation"),
+    "no world": (
+        ("estimator", "drone1", "--connect", "tcp/127.0.0.1:{free}", "--wait", "0.5"),
+        "no world of federation",
+    ),
     "no world to look at": (("keys", "--connect", "tcp/127.0.0.1:{free}", "--wait", "0.5"), "no world of federation"),
     "no world to record": (("record", "--connect", "tcp/127.0.0.1:{free}", "--wait", "0.5"), "no world of federation"),
     "malformed endpoint": (("world", "{one}", "--listen", "nonsense"), "cannot listen on nonsense"),
@@ -166,7 +180,10 @@ def slow_world(federation: Federation) -> Iterator[Client]:
 
 
 ROLES = {
-    "wrong federation": (("estimator", "drone1", "--federation", "other", "--wait", "1"), "no world of federation 'other'"),
+    "wrong federation": (
+        ("estimator", "drone1", "--federation", "other", "--wait", "1"),
+        "no world of federation 'other'",
+    ),
     "federation of no name": (("estimator", "drone1", "--federation", "a/b", "--wait", "1"), "'a/b'; must be 1 to 32"),
     "unknown drone": (("estimator", "drone9"), "drone is 'drone9'; must be one of drone1, drone2"),
     "unknown cluster": (("controller", "other"), "cluster is 'other'; must be one of main"),
@@ -262,7 +279,8 @@ def test_garbage(federation: Federation, tmp_path_factory: pytest.TempPathFactor
     client = federation.client()
     clock = client.watch("clock")
     clock.until(lambda m: m.get("t_ns", 0) > 1e9)
-    payloads = (b"", b"\xc1", b"\xff" * 100, client.pack({"t_ns": 1}), client.pack([1, 2]), os.urandom(64), b"\x81" * 5000)
+    lists = b"\x92\x01\x02"
+    payloads = (b"", b"\xc1", b"\xff" * 100, client.pack({"t_ns": 1}), lists, os.urandom(64), b"\x81" * 5000)
     for number in range(GARBAGE):
         client.put_raw(GARBAGE_KEYS[number % len(GARBAGE_KEYS)], payloads[number // 7 % len(payloads)])
     for payload in payloads:
