@@ -21,6 +21,7 @@ def find_world(
     say: Callable[[str], None] = lambda text: None,
     stopped: Callable[[], bool] = lambda: False,
     reader: bool = False,
+    run_id: str | None = None,
 ) -> Iterator[tuple[Session, messages.Info]]:
     """Yield a session and the `world/info` of the run that it belongs to.
 
@@ -31,12 +32,15 @@ def find_world(
         say: told at growing intervals whom it waits for.
         stopped: asked while waiting.
         reader: it does not gate; see `session.connect`.
+        run_id: of the only run to take part in; None takes any.
 
     Raises:
         NoWorldError: no world answered within `wait_s`, or `stopped` said so.
+        BadNameError: the federation's name is outside the contract.
     """
+    keys.name(federation, "federation")
     with ExitStack() as stack:
-        link, info = _search(stack, endpoint, federation, wait_s, say, stopped, reader)
+        link, info = _search(stack, endpoint, federation, wait_s, say, stopped, reader, run_id)
         if info.mode == "realtime":
             stack.pop_all().close()
             link = stack.enter_context(session.connect(endpoint, federation, "realtime", wait_s=5.0))
@@ -52,6 +56,7 @@ def _search(
     say: Callable[[str], None],
     stopped: Callable[[], bool],
     reader: bool,
+    run_id: str | None,
 ) -> tuple[Session, messages.Info]:
     start_s, next_say_s = time.monotonic(), 0.0
     link: Session | None = None
@@ -63,7 +68,7 @@ def _search(
                 attempt_s = max(0.05, min(ATTEMPT_S, left_s))
                 link = stack.enter_context(session.connect(endpoint, federation, wait_s=attempt_s, reader=reader))
             info = read_info(link)
-            if info is not None:
+            if info is not None and run_id in (None, info.run_id):
                 return link, info
             time.sleep(PAUSE_S)
         except SessionError as error:

@@ -4,6 +4,7 @@ Settings and their reasons are in docs/decisions/0002-zenoh-settings.md. Keys ar
 federation's prefix; the session adds and removes it.
 """
 
+import json
 import os
 import threading
 import time
@@ -284,8 +285,10 @@ def listen(endpoints: Sequence[str], federation: str, mode: Mode) -> Iterator[Se
     Raises:
         SessionError: an endpoint is taken or malformed.
     """
+    if any(endpoint.endswith(":0") for endpoint in endpoints):
+        raise SessionError(f"cannot listen on {', '.join(endpoints)}: port 0 is no port that others could be told")
     config = _config("peer", mode)
-    config.insert_json5("listen/endpoints", _json(endpoints))
+    _use_endpoints(config, "listen/endpoints", endpoints)
     config.insert_json5("listen/exit_on_failure", "true")
     config.insert_json5(_CLOSE_AFTER, str(HUB_CLOSE_AFTER_US))
     with _opened(config, federation, f"cannot listen on {', '.join(endpoints)}") as session:
@@ -310,7 +313,7 @@ def connect(
         SessionError: nobody listens there within `wait_s`.
     """
     config = _config("client", mode, reader)
-    config.insert_json5("connect/endpoints", _json([endpoint]))
+    _use_endpoints(config, "connect/endpoints", [endpoint])
     config.insert_json5("connect/timeout_ms", str(int(1000 * (wait_s or 0)) or 500))
     with _opened(config, federation, f"nobody listens on {endpoint}; start a world there") as session:
         yield session
@@ -343,9 +346,12 @@ def _config(mode: str, timing: Mode, reader: bool = False) -> zenoh.Config:
     return config
 
 
-def _json(endpoints: Sequence[str]) -> str:
-    quoted = ", ".join('"' + endpoint.replace('"', "") + '"' for endpoint in endpoints)
-    return f"[{quoted}]"
+def _use_endpoints(config: zenoh.Config, place: str, endpoints: Sequence[str]) -> None:
+    try:
+        config.insert_json5(place, json.dumps(list(endpoints)))
+    except zenoh.ZError as error:
+        found = ", ".join(map(repr, endpoints))
+        raise SessionError(f"endpoint is {found}; must be PROTOCOL/ADDRESS such as tcp/127.0.0.1:7447") from error
 
 
 def _brief(error: Exception) -> str:

@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 
 from zsim import __version__, batch, keys, messages
-from zsim.errors import DecodeError, RecordError
+from zsim.errors import DecodeError, RecordError, SupersededError
 from zsim.health import HealthMeter
 from zsim.record import RecordWriter
 from zsim.session import Sample, Session
@@ -43,6 +43,7 @@ def record(
 
     Raises:
         RecordError: the disk is full or the file cannot be written; what was written before is readable.
+        SupersededError: another recorder of this name has taken over.
     """
     return Recorder(link, info, path, name, stopped).run()
 
@@ -60,6 +61,7 @@ class Recorder:
         self._clock = msgspec.msgpack.Decoder(messages.Clock)
         self._known: set[tuple[str, bytes]] = set()
         self._over = threading.Event()
+        self._successor: str | None = None
         self._ended_s: float | None = None
         self._stopped_s: float | None = None
         self._now_ns = 0
@@ -86,6 +88,11 @@ class Recorder:
         finally:
             self._over.set()
             ticker.join()
+        if self._successor:
+            raise SupersededError(
+                f"{self._name}: another process of this name joined from {self._successor}; this one ends, its record "
+                f"is {self._writer.path}"
+            )
         self._bye(reason)
         return reason
 
@@ -100,6 +107,8 @@ class Recorder:
             for sample in self._views.drain():
                 self._write(sample.key, sample.payload)
             self._writer.tick(time.monotonic_ns())
+            if self._successor:
+                return "superseded"
             if self._may_stop():
                 return "stopped"
             if self._ended_s is not None and self._all_left():
@@ -140,6 +149,8 @@ class Recorder:
         self._writer.add(key, payload, messages.encoding(key), t_ns, time.time_ns())
         if key == keys.CLOCK:
             self._on_clock(payload)
+        elif key == keys.EVENT:
+            self._on_event(payload)
         elif key.startswith("process/"):
             self._on_process(key)
 
@@ -160,6 +171,17 @@ class Recorder:
             self._ended_s = time.monotonic()
         elif clock.step > 1:
             self._known.clear()
+
+    def _on_event(self, payload: bytes) -> None:
+        try:
+            event = messages.decode(keys.EVENT, payload)
+        except DecodeError:
+            return  # garbage by somebody else; recorded as it came
+        data = event.data
+        if event.subject != self._name or event.kind != "superseded" or data.get("pid") == os.getpid():
+            return
+        if data.get("former_pid") == os.getpid():
+            self._successor = f"{data.get('host')} (pid {data.get('pid')})"
 
     def _on_process(self, key: str) -> None:
         name, what = keys.thing(key), keys.leaf(key)

@@ -21,7 +21,7 @@ class Child:
 
     Args:
         name: process name `role.thing`.
-        arguments: of the `zsim` command, without `--launched`.
+        arguments: of the `zsim` command.
         logs: folder for its standard error.
         on_line: told every line of its standard output; None sends that to the log too.
     """
@@ -41,7 +41,7 @@ class Child:
 
     def start(self) -> None:
         """Start it, or start it again."""
-        command = [sys.executable, "-m", "zsim_deploy.cli", *self._arguments, "--launched"]
+        command = [sys.executable, "-m", "zsim_deploy.cli", *self._arguments]
         with self._log.open("a") as log:
             self._process = subprocess.Popen(
                 command,

@@ -33,7 +33,7 @@ RateOption = Annotated[float | None, typer.Option(help="Simulated per wall secon
 Connect = Annotated[str, typer.Option(help="Where the world (or a router) listens.")]
 Federation = Annotated[str, typer.Option(help="Name of the federation: the prefix of its keys.")]
 Wait = Annotated[float | None, typer.Option(help="Seconds to wait for a world; for ever if not given.")]
-Launched = Annotated[bool, typer.Option("--launched", hidden=True)]
+Launched = Annotated[str | None, typer.Option("--launched", hidden=True)]  # by `zsim run`, for the run of this id
 
 
 @app.command(rich_help_panel=RUN)
@@ -122,7 +122,7 @@ def world(
     rate: RateOption = None,
     set_: Set = None,
     expect: Annotated[list[str] | None, typer.Option(help="Wait for this process too, e.g. recorder.")] = None,
-    launched: Launched = False,
+    launched: Launched = None,
 ) -> None:
     """Run the world: integrates all drones and owns simulated time."""
     from zsim_deploy import roles
@@ -138,7 +138,7 @@ def estimator(
     connect: Connect = DEFAULT_ENDPOINT,
     federation: Federation = "zsim",
     wait: Wait = None,
-    launched: Launched = False,
+    launched: Launched = None,
 ) -> None:
     """Run the estimator of one drone."""
     from zsim_deploy import roles
@@ -152,7 +152,7 @@ def controller(
     connect: Connect = DEFAULT_ENDPOINT,
     federation: Federation = "zsim",
     wait: Wait = None,
-    launched: Launched = False,
+    launched: Launched = None,
 ) -> None:
     """Run the cluster-space controller of one cluster."""
     from zsim_deploy import roles
@@ -166,7 +166,7 @@ def record(
     connect: Connect = DEFAULT_ENDPOINT,
     federation: Federation = "zsim",
     wait: Wait = None,
-    launched: Launched = False,
+    launched: Launched = None,
 ) -> None:
     """Record every message of a federation into run.mcap."""
     from zsim_deploy import roles

@@ -23,15 +23,20 @@ SHOWN_EVENTS = 2000  # events told to a launcher per run; all of them are in the
 
 
 def world(
-    scenario: Scenario, mode: str, rate: float, endpoints: list[str], launched: bool, expect: list[str] | None
+    scenario: Scenario,
+    mode: str,
+    rate: float,
+    endpoints: list[str],
+    launched: str | None,
+    expect: list[str] | None,
 ) -> None:
     """Run the world of a scenario on the endpoints until the scenario ends or somebody stops it."""
     from zsim_world.process import run
     from zsim_world.world import World
 
-    leash = Leash(launched)
+    leash = Leash(launched is not None)
     with _patience(Teller() if launched else None):
-        run_world = World(scenario, mode, rate, time.monotonic_ns)
+        run_world = World(scenario, mode, rate, time.monotonic_ns, launched)
     for name in expect or ():
         run_world.barrier.expect(name)
     gc.collect()
@@ -40,8 +45,8 @@ def world(
         run(run_world, endpoints, leash.reason, _told(Teller()))
         return
     with Screen(scenario.duration_s) as screen:
-        screen.say(f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run")
-        run(run_world, endpoints, leash.reason, _told(screen))
+        listening = f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run"
+        run(run_world, endpoints, leash.reason, _told(screen), lambda: screen.say(listening))
         screen.say(f"ended: {run_world.ended}")
 
 
@@ -99,12 +104,12 @@ def agent(
     endpoint: str,
     federation: str,
     wait_s: float | None,
-    launched: bool,
+    launched: str | None,
 ) -> None:
     """Run one agent against the world on an endpoint."""
-    leash = Leash(launched)
-    say = _speaker(launched)
-    with find_world(endpoint, federation, wait_s, say, leash.pulled) as (link, info):
+    leash = Leash(launched is not None)
+    say = _speaker(launched is not None)
+    with find_world(endpoint, federation, wait_s, say, leash.pulled, run_id=launched) as (link, info):
         made = build(info, scenario_file.from_text(info.scenario))
         say(f"{made.name}: in run {info.run_id}")
         gc.collect()
@@ -125,15 +130,15 @@ def controller(cluster: str) -> Callable[[messages.Info, Scenario], Agent]:
     return lambda info, scenario: Controller(info, scenario, cluster)
 
 
-def recorder(path: Path, endpoint: str, federation: str, wait_s: float | None, launched: bool) -> None:
+def recorder(path: Path, endpoint: str, federation: str, wait_s: float | None, launched: str | None) -> None:
     """Record the run of the world on an endpoint into a file."""
     from zsim_agents.recorder import record
 
     os.nice(5) if hasattr(os, "nice") else None
-    leash = Leash(launched)
-    say = _speaker(launched)
+    leash = Leash(launched is not None)
+    say = _speaker(launched is not None)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with find_world(endpoint, federation, wait_s, say, leash.pulled, reader=True) as (link, info):
+    with find_world(endpoint, federation, wait_s, say, leash.pulled, True, launched) as (link, info):
         say(f"recorder: run {info.run_id} into {path}")
         reason = record(link, info, path, stopped=leash.pulled)
     say(f"recorder: {path} is complete, {reason}")

@@ -5,6 +5,7 @@ import json
 import signal
 import socket
 import time
+import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -82,10 +83,12 @@ class Run:
 
     def _make_children(self) -> list[Child]:
         scenario, federation = self._options.scenario, self._options.scenario.federation
-        reach = ["--connect", self._endpoint, "--federation", federation]
+        # Another run's world may listen where ours could not: nobody of this run is to join that one.
+        launched = ["--launched", uuid.uuid4().hex[:12]]
+        reach = ["--connect", self._endpoint, "--federation", federation, *launched]
         pace = ["--realtime"] if self._options.mode == "realtime" else []
         pace += ["--rate", str(self._options.rate)] if self._options.rate else []
-        world = ["world", str(self._file), "--listen", self._endpoint, "--expect", "recorder", *pace]
+        world = ["world", str(self._file), "--listen", self._endpoint, "--expect", "recorder", *pace, *launched]
         record = ["record", "--out", str(self._options.out), *reach]
         children = [Child("world", world, self._logs, self._on_line), Child("recorder", record, self._logs)]
         for drone in scenario.drones:

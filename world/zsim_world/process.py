@@ -357,12 +357,14 @@ def run(
     endpoints: Sequence[str],
     stopped: Callable[[], str | None] = lambda: None,
     tell: Tell = lambda kind, message, phase: None,
+    ready: Callable[[], None] = lambda: None,
 ) -> None:
-    """Listen on the endpoints and run the world to its end.
+    """Listen on the endpoints, say that it is `ready`, and run the world to its end.
 
     Raises:
         SessionError: an endpoint is taken.
     """
     mode: session.Mode = "lockstep" if world.mode == "lockstep" else "realtime"
     with session.listen(endpoints, world.scenario.federation, mode) as link:
+        ready()
         WorldProcess(link, world, stopped, tell).run()

@@ -38,7 +38,7 @@ class World:
         mode: "lockstep" or "realtime".
         rate: simulated per wall seconds to pace at; 0 = as fast as possible.
         wall_ns: monotonic wall time.
-        run_id: given only by tests that compare records.
+        run_id: given by a launcher, and by tests that compare records.
     """
 
     def __init__(
