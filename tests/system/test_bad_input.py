@@ -34,7 +34,7 @@ COMMANDS = {
     "no file": (("validate", "nowhere.yaml"), "cannot be read"),
     "bad --set": (("validate", "scenarios/step.yaml", "--set", "drones.drone9.mass_kg=1"), "allowed: 0 to 2"),
     "port in use": (("world", "scenarios/step.yaml", "--listen", "{world}"), "Address already in use"),
-    "malformed endpoint": (("world", "scenarios/step.yaml", "--listen", "nonsense"), "cannot listen on nonsense"),
+    "malformed endpoint": (("world", "scenarios/step.yaml", "--listen", "nonsense"), "endpoint is 'nonsense'; must be"),
     "no world within --wait": (("estimator", "drone1", "--connect", "{free}", "--wait", "0.5"), "within 0.5 s"),
     "other federation": (
         ("estimator", "drone1", "--connect", "{world}", "--federation", "other", "--wait", "0.5"),
