@@ -59,7 +59,7 @@ def test_bad_commands_are_a_line_each(federation: Federation) -> None:
     federation.client().watch("clock").until(lambda m: m["t_ns"] > 0)
     places = {"{world}": federation.endpoint, "{free}": f"tcp/127.0.0.1:{free_port()}"}
     roles = {
-        name: federation.start(*[places[word] if word in places else word for word in arguments])
+        name: federation.start(*[str(places.get(word, word)) for word in arguments])
         for name, (arguments, _) in COMMANDS.items()
     }
     for name, role in roles.items():
