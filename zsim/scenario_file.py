@@ -124,7 +124,7 @@ class _Loader(yaml.SafeLoader):
     """YAML 1.2 floats (1e3 is a number); no aliases, for a bomb is made of them, and no tags."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        event = self.peek_event()
+        event: Any = self.peek_event()
         if isinstance(event, yaml.AliasEvent):
             raise ComposerError(None, None, "aliases are not allowed", event.start_mark)
         if getattr(event, "tag", None) is not None:

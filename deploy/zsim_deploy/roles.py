@@ -13,6 +13,7 @@ from typing import Any
 from zsim import messages, scenario_file
 from zsim.agent import Agent
 from zsim.connection import find_world
+from zsim.errors import RecordError
 from zsim.runner import Runner
 from zsim.scenario import Scenario
 from zsim_deploy.leash import Leash
@@ -137,7 +138,10 @@ def recorder(path: Path, endpoint: str, federation: str, wait_s: float | None, l
     os.nice(5) if hasattr(os, "nice") else None
     leash = Leash(launched is not None)
     say = _speaker(launched is not None)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordError(f"{path.parent}: cannot be made ({error.strerror}); give --out another folder") from error
     with find_world(endpoint, federation, wait_s, say, leash.pulled, True, launched) as (link, info):
         say(f"recorder: run {info.run_id} into {path}")
         reason = record(link, info, path, stopped=leash.pulled)
