@@ -58,7 +58,9 @@ def test_a_bad_scenario_is_a_line(tmp_path: Path, name: str) -> None:
 
 def refused(*arguments: str) -> str:
     """Run a command that must be refused; return its one line."""
-    done = subprocess.run([*ZSIM, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    done = subprocess.run(
+        [*ZSIM, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert done.returncode == USER_FAULT, done.stderr
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
@@ -139,7 +141,10 @@ def test_a_plan_that_can_never_be_flown_ends_the_run(federation: Federation, nam
 
 # name: (arguments of a role, what the line must say)
 ROLES = {
-    "wrong federation": (("estimator", "drone1", "--federation", "other", "--wait", "1"), "no world of federation 'other'"),
+    "wrong federation": (
+        ("estimator", "drone1", "--federation", "other", "--wait", "1"),
+        "no world of federation 'other'",
+    ),
     "unknown drone": (("estimator", "drone9"), "drone is 'drone9'; must be one of drone1"),
     "unknown cluster": (("controller", "nobody"), "cluster is 'nobody'; must be one of"),
     "unwritable record": (("record", "--out", "/proc/zsim"), "/proc/zsim"),
@@ -269,7 +274,15 @@ def test_garbage_is_counted_and_changes_nothing(federation: Federation) -> None:
     role = federation.run(PAIR, "--duration", "8", "--rate", "2")
     client = federation.client()
     client.watch("clock").until(lambda m: m.get("step", 0) > 5)
-    payloads = (b"\xc1", b"garbage", b"\x90", b"\x81\xa4t_ns\xc0", client.pack({"t_ns": 1}), os.urandom(64), b"\x81" * 5000)
+    payloads = (
+        b"\xc1",
+        b"garbage",
+        b"\x90",
+        b"\x81\xa4t_ns\xc0",
+        client.pack({"t_ns": 1}),
+        os.urandom(64),
+        b"\x81" * 5000,
+    )
     for number in range(GARBAGE):
         key = GARBAGE_KEYS[number % len(GARBAGE_KEYS)]
         client.put_raw(key, payloads[number // len(GARBAGE_KEYS) % len(payloads)])
