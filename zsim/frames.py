@@ -25,14 +25,14 @@ def enu_to_geodetic(position_m: ArrayLike, origin: tuple[float, float, float]) -
         origin: latitude_deg, longitude_deg, height_m of W's origin.
     """
     p = np.asarray(position_m, dtype=float)[..., :, None]
-    turned = (p * _enu_rows(origin[0], origin[1])).sum(axis=-2)  # not matmul, whose bits depend on how many points
+    turned = (p * enu_rows(origin[0], origin[1])).sum(axis=-2)  # not matmul, whose bits depend on how many points
     return ecef_to_geodetic(geodetic_to_ecef(origin) + turned)
 
 
 def geodetic_to_enu(geodetic: ArrayLike, origin: tuple[float, float, float]) -> Array:
     """Return p_W [m] of points given as latitude_deg, longitude_deg, height_m, shape (..., 3)."""
     d = (geodetic_to_ecef(geodetic) - geodetic_to_ecef(origin))[..., None, :]
-    return (d * _enu_rows(origin[0], origin[1])).sum(axis=-1)
+    return (d * enu_rows(origin[0], origin[1])).sum(axis=-1)
 
 
 def geodetic_to_ecef(geodetic: ArrayLike) -> Array:
@@ -64,7 +64,7 @@ def ecef_to_geodetic(ecef_m: ArrayLike) -> Array:
     return np.stack([np.degrees(lat), np.degrees(np.arctan2(e[..., 1], e[..., 0])), height], axis=-1)
 
 
-def _enu_rows(latitude_deg: float, longitude_deg: float) -> Array:
+def enu_rows(latitude_deg: float, longitude_deg: float) -> Array:
     """Return the unit vectors east, north, up as rows in Earth-fixed components."""
     lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
     return np.array(

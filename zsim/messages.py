@@ -308,7 +308,9 @@ _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
 }
 _VIEW_CLUSTER = "view/cluster/"
 KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
-_encoder = msgspec.msgpack.Encoder()
+
+encode: Callable[[Struct], bytes] = msgspec.msgpack.Encoder().encode
+"""Return the payload of a message."""
 
 
 @lru_cache(maxsize=KEYS_KEPT)
@@ -329,11 +331,6 @@ def types_by_shape() -> dict[str, type[Struct]]:
 def fields(kind: type[Struct]) -> Iterable[str]:
     """Return the names of a message's fields in order."""
     return kind.__struct_fields__
-
-
-def encode(message: Struct) -> bytes:
-    """Return the payload of a message."""
-    return _encoder.encode(message)
 
 
 @lru_cache(maxsize=KEYS_KEPT)

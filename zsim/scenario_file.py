@@ -4,7 +4,7 @@ import hashlib
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import yaml
@@ -124,9 +124,9 @@ class _Loader(yaml.SafeLoader):
     """YAML 1.2 floats (1e3 is a number); no aliases, for a bomb is made of them, and no tags."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        event: Any = self.peek_event()
+        event = self.peek_event()
         if isinstance(event, yaml.AliasEvent):
-            raise ComposerError(None, None, "aliases are not allowed", event.start_mark)
+            raise ComposerError(None, None, "aliases are not allowed", cast(Any, event.start_mark))
         if getattr(event, "tag", None) is not None:
             raise ComposerError(None, None, "tags are not allowed", event.start_mark)
         return super().compose_node(parent, index)

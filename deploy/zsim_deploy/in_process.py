@@ -12,7 +12,6 @@ from msgspec import Struct
 from zsim import keys, messages
 from zsim.agent import Agent
 from zsim.in_process import Bus
-from zsim.messages import encode, encoding
 from zsim.record import RecordWriter
 from zsim.scenario import Scenario
 from zsim_agents.controller import Controller
@@ -75,7 +74,7 @@ class _Show:
 
     def __init__(self, world: World, writer: RecordWriter | None, screen: Screen | None) -> None:
         self._world = world
-        self._add = writer.add if writer else None
+        self._add = writer.add_message if writer else None
         self._screen = screen
         self._throttle = Throttle()
         states = (keys.cluster_state(cluster.name) for cluster in world.scenario.clusters)
@@ -84,8 +83,8 @@ class _Show:
 
     def sink(self, key: str, message: Any) -> None:
         if self._add is not None:
-            self._add(key, encode(message), encoding(key), message.t_ns, time_ns())
-        if self._screen is not None and key in self._watched:
+            self._add(key, message, time_ns())
+        if key in self._watched and self._screen is not None:
             self._show(key, message, self._screen)
 
     def _show(self, key: str, message: Struct, screen: Screen) -> None:

@@ -4,7 +4,9 @@ The first source that sends a setpoint to a drone that nobody flies is its comma
 says bye or dies. Commands of one instant are ordered by (priority of the source, source, seq): the last wins.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 PROGRAM = 0  # priority of a program, contract
@@ -43,7 +45,7 @@ class Commanders:
         self._names = drones
         self._holders: list[Holder | None] = [None] * len(drones)
         self._priorities: dict[tuple[int, str], int] = {}
-        self._due: list[Due] = []
+        self._due: dict[int, list[Due]] = {}  # by the instant at which they take effect
         self._seen: dict[tuple[int, str, int, Any], None] = {}
 
     def holder(self, drone: int) -> str | None:
@@ -60,7 +62,8 @@ class Commanders:
         if len(self._seen) > SEEN_PER_DRONE * len(self._names):
             del self._seen[next(iter(self._seen))]
         priority = self._priorities.get((drone, message.source), PROGRAM)
-        self._due.append(Due(apply_ns, priority, message.source, message.seq, drone, kind, message))
+        due = Due(apply_ns, priority, message.source, message.seq, drone, kind, message)
+        self._due.setdefault(apply_ns, []).append(due)
         return True
 
     def pop(self, t_ns: int) -> list[Due]:
@@ -68,11 +71,8 @@ class Commanders:
 
         Drone and kind stand last in the order only to make it independent of arrival.
         """
-        if not self._due:
-            return []
-        ready = sorted((due for due in self._due if due.apply_ns <= t_ns), key=lambda due: due[:6])
-        self._due = [due for due in self._due if due.apply_ns > t_ns]
-        return ready
+        instants = sorted(instant for instant in self._due if instant <= t_ns)
+        return [due for instant in instants for due in sorted(self._due.pop(instant), key=_order)]
 
     def refusal(self, due: Due) -> str | None:
         """Return why the source may not command the drone now, None if it may."""
@@ -111,7 +111,7 @@ class Commanders:
         self._holders[drone] = None
         self._priorities.pop((drone, source), None)
         # A setpoint still on its way would make the source the commander again.
-        self._due = [d for d in self._due if (d.drone, d.source) != (drone, source) or d.kind == "mode"]
+        self._forget(lambda due: (due.drone, due.source) == (drone, source))
         return None
 
     def gone(self, source: str) -> list[int]:
@@ -121,5 +121,13 @@ class Commanders:
             self._holders[drone] = None
         for drone in range(len(self._names)):
             self._priorities.pop((drone, source), None)
-        self._due = [due for due in self._due if due.source != source or due.kind == "mode"]
+        self._forget(lambda due: due.source == source)
         return held
+
+    def _forget(self, unwanted: Callable[[Due], bool]) -> None:
+        """Drop waiting setpoints; a mode that was asked for is still entered."""
+        for instant, dues in self._due.items():
+            self._due[instant] = [due for due in dues if due.kind == "mode" or not unwanted(due)]
+
+
+_order = itemgetter(slice(6))  # all of a Due but the message

@@ -10,13 +10,15 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from zsim.errors import RunError
-from zsim.frames import enu_to_geodetic
 from zsim.messages import DroneState
 from zsim.scenario import Gps, Scenario
 from zsim_world import firmware, gate, observer, sensor_set, vehicle, wind
+from zsim_world.geodetic import anchor, geodetic
 from zsim_world.noise import NoiseTable
 from zsim_world.sensor_set import SENSORS, VALUES, SensorName
 from zsim_world.start import arrays
@@ -32,7 +34,7 @@ class DivergedError(RunError):
     """The state of a drone is no longer finite; the text names the drone and the time."""
 
 
-class Sample(NamedTuple):
+class Sample(Struct, frozen=True, gc=False):
     """One measurement; `values` in the contract's order of fields.
 
     imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude, longitude [deg], altitude [m], e, n, u [m],
@@ -71,13 +73,14 @@ class Fleet:
         self.count = len(self.names)
         self.gps_sigma_m = [_gps_sigma(drone.sensors.gps) for drone in scenario.drones]
         place = scenario.environment
-        self._origin = (place.latitude_deg, place.longitude_deg, place.height_m)
+        self._anchor = anchor(place.latitude_deg, place.longitude_deg, place.height_m)
         self._tick_ns = round(scenario.time.physics_dt_ms * 1_000_000)
         self._ticks = round(scenario.time.gate_ms / scenario.time.physics_dt_ms)
         self._tick = 0
         self._gates = 0
-        self._latency_ns = _latencies(scenario)
-        self._delayed = any(any(row) for row in self._latency_ns)
+        latency_ns = _latencies(scenario)
+        self._delayed = any(any(row) for row in latency_ns)
+        self._kinds = [list(zip(SENSORS, VALUES, row, strict=True)) for row in latency_ns]
         self._later: list[Sample] = []
         self._noise = NoiseTable(scenario, NOISE_GATES)
         self._w = arrays(scenario, self._noise)
@@ -236,19 +239,20 @@ class Fleet:
         fixes: list[int] = []
         index, values = self._senses.whose[:logged].tolist(), self._senses.value[:logged].tolist()
         for (s, i, tick), value in zip(index, values, strict=True):
-            t = tick * tick_ns
+            t_ns = tick * tick_ns
             if s == sensor_set.GPS:
                 fixes.append(len(out))
-            out.append(Sample(SENSORS[s], i, t + self._latency_ns[i][s], t, tuple(value[: VALUES[s]])))
+            name, size, latency_ns = self._kinds[i][s]
+            out.append(Sample(name, i, t_ns + latency_ns, t_ns, tuple(value[:size])))
         if fixes:
             self._locate(out, fixes)
         return out
 
     def _locate(self, out: list[Sample], fixes: list[int]) -> None:
         """Put latitude, longitude and height in front of the values of GPS samples."""
-        places = enu_to_geodetic([out[k].values[:3] for k in fixes], self._origin).tolist()
+        places = geodetic(np.array([out[k].values[:3] for k in fixes]), *self._anchor).tolist()
         for k, place in zip(fixes, places, strict=True):
-            out[k] = out[k]._replace(values=(*place, *out[k].values))
+            out[k] = replace(out[k], values=(*place, *out[k].values))
 
     def _due(self, fresh: list[Sample]) -> list[Sample]:
         """Return what is due by now of the fresh and the delayed samples, and keep the rest."""

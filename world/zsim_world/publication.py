@@ -7,12 +7,13 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from zsim import keys, messages
-from zsim.agent import Output
 from zsim.scenario import Scenario
 from zsim_world.fleet import Fleet, Sample
 
 GPS_FIX_3D = 3  # NMEA: 3 = three-dimensional fix
 GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone
+
+Passed = tuple[str, Any]  # key and message; a plain tuple, for a fleet has thousands of them a second
 
 
 class _Slot:
@@ -37,18 +38,18 @@ class Publication:
         build = {"imu": _imu, "gps": self._gps, "mag": _mag, "baro": _baro, "sonar": _sonar, "flow": _flow}
         self._slots = [{kind: _Slot(keys.sensor(name, kind), build[kind]) for kind in keys.SENSORS} for name in names]
 
-    def gate(self, truth: Any, holder: Callable[[int], str | None]) -> Iterator[Output]:
+    def gate(self, truth: Any, holder: Callable[[int], str | None]) -> Iterator[Passed]:
         """Yield the messages of the gate that the fleet stands at."""
-        by_drone: list[list[Output]] = [[] for _ in self._status_keys]
+        by_drone: list[list[Passed]] = [[] for _ in self._status_keys]
         for sample in self._fleet.samples():
             slot = self._slots[sample.drone][sample.sensor]
-            by_drone[sample.drone].append(Output(slot.key, slot.build(sample, slot.seq)))
+            by_drone[sample.drone].append((slot.key, slot.build(sample, slot.seq)))
             slot.seq += 1
         truths = self._truths(truth)
         for drone, outputs in enumerate(by_drone):
             yield from outputs
-            yield Output(self._truth_keys[drone], truths[drone])
-            yield Output(self._status_keys[drone], self._status(drone, len(outputs) + 1, holder(drone)))
+            yield self._truth_keys[drone], truths[drone]
+            yield self._status_keys[drone], self._status(drone, len(outputs) + 1, holder(drone))
         self._gate += 1
 
     def _gps(self, s: Sample, seq: int) -> messages.Gps:

@@ -9,14 +9,13 @@ from collections.abc import Callable
 from typing import Any
 
 from zsim import CONTRACT, __version__, keys, messages, scenario_file
-from zsim.agent import Output
 from zsim.fingerprint import fingerprint
 from zsim.scenario import OnDeath, Scenario
 from zsim_world.barrier import Barrier, Participant
 from zsim_world.command_desk import CommandDesk
 from zsim_world.commander import Commanders
 from zsim_world.fleet import Fleet
-from zsim_world.publication import Publication
+from zsim_world.publication import Passed, Publication
 from zsim_world.requests import Requests, brief
 from zsim_world.statistics import Ages, Rate
 from zsim_world.truth_hash import TruthHash
@@ -56,7 +55,7 @@ class World:
         self.gate_ns = round(scenario.time.gate_ms * 1e6)
         self.delay_ns = scenario.time.command_delay_gates * self.gate_ns
         self.last_ns = round(scenario.duration_s * 1e9) // self.gate_ns * self.gate_ns
-        self.outbox: list[Output] = []
+        self.outbox: list[Passed] = []
         self.state = "waiting"
         self.ended: str | None = None
         self.refused = 0
@@ -314,7 +313,7 @@ class World:
             rate=round(self._clock_rate.now(), 3),
             waiting_for=waiting_for,
         )
-        self.outbox.append(Output(keys.CLOCK, clock))
+        self.outbox.append((keys.CLOCK, clock))
 
     def tell_end(self, wall_ns: int) -> None:
         """Put the last words of the run into the outbox: event `end`, clock `stopped`."""
@@ -358,9 +357,9 @@ class World:
     def event(self, kind: str, subject: str, text: str, source: str = "world", **data: Any) -> None:
         """Put an event into the outbox."""
         message = messages.Event(self.now_ns, self._next_seq(keys.EVENT), kind, source, subject, text, data)
-        self.outbox.append(Output(keys.EVENT, message))
+        self.outbox.append((keys.EVENT, message))
 
-    def take_outbox(self) -> list[Output]:
+    def take_outbox(self) -> list[Passed]:
         """Return what is to be published, in order, and forget it."""
         outbox, self.outbox = self.outbox, []
         return outbox

@@ -4,7 +4,7 @@ import struct
 from collections.abc import Callable
 from io import FileIO
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import msgspec
 from mcap.opcode import Opcode
@@ -20,6 +20,9 @@ CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s nothing waits l
 CHANNELS_MAX = 65_535  # MCAP counts channels in 16 bits
 _SEQUENCE_MASK = 2**32 - 1  # MCAP counts messages of a channel in 32 bits
 _TIME_MAX = 2**64 - 1
+_MESSAGE = int(Opcode.MESSAGE)
+_pack = MESSAGE.pack
+_encode = messages.encode
 
 
 class _Channel:
@@ -82,20 +85,34 @@ class RecordWriter:
         if channel is None:
             self.refused += 1
             return
-        size, sequence = len(payload) + MESSAGE_FIXED, channel.count & _SEQUENCE_MASK
         try:
-            head = MESSAGE.pack(Opcode.MESSAGE, size, channel.number, sequence, t_ns, wall_ns)
+            self._take(channel, payload, t_ns, wall_ns)
         except struct.error:
-            t_ns, wall_ns = _time(t_ns), _time(wall_ns)
-            head = MESSAGE.pack(Opcode.MESSAGE, size, channel.number, sequence, t_ns, wall_ns)
-        if not self._open:
+            self._take(channel, payload, _time(t_ns), _time(wall_ns))
+
+    def add_message(self, key: str, message: Any, wall_ns: int) -> None:
+        """Take one message of this process, encoded as for the wire.
+
+        Raises:
+            RecordError: as `add`.
+        """
+        channel = self._channels.get(key) or self._register(key, messages.encoding(key))
+        if channel is None:
+            self.refused += 1
+            return
+        self._take(channel, _encode(message), message.t_ns, wall_ns)
+
+    def _take(self, channel: _Channel, payload: bytes, t_ns: int, wall_ns: int) -> None:
+        length, count, at = len(payload) + MESSAGE_FIXED, channel.count, self._size
+        head = _pack(_MESSAGE, length, channel.number, count & _SEQUENCE_MASK, t_ns, wall_ns)
+        if not at:
             self._since_ns = wall_ns
         self._open += (head, payload)
-        channel.entries += (t_ns, self._size)
-        channel.count += 1
+        channel.entries += (t_ns, at)
+        channel.count = count + 1
         self.messages += 1
-        self._size += HEAD.size + size
-        if self._size >= CHUNK_BYTES or wall_ns - self._since_ns >= CHUNK_AGE_NS:
+        self._size = size = at + HEAD.size + length
+        if size >= CHUNK_BYTES or wall_ns - self._since_ns >= CHUNK_AGE_NS:
             self._end_chunk()
 
     def tick(self, wall_ns: int) -> None:
