@@ -1,7 +1,9 @@
 """The errors of zsim, all one line: where, what was found, what is allowed, what to do.
 
 ZsimError
-├── ScenarioError      a scenario file or an override; carries every fault found, a line each
+├── DocumentError      a file that a person wrote; carries every fault found, a line each
+│   ├── ScenarioError     a scenario file or an override
+│   └── InventoryError    an inventory of hosts
 ├── DecodeError        a payload that is not the message it claims to be
 ├── BadNameError       a name of a federation, drone, cluster or process outside the contract
 ├── SessionError       no session: port in use, nobody listens, wrong endpoint
@@ -17,12 +19,20 @@ class ZsimError(Exception):
     """Base of everything that a user can cause; the command line prints it without a traceback."""
 
 
-class ScenarioError(ZsimError):
-    """A scenario with faults; `faults` holds a line for each."""
+class DocumentError(ZsimError):
+    """A document with faults; `faults` holds a line for each."""
 
     def __init__(self, faults: list[str]) -> None:
         super().__init__("\n".join(faults))
         self.faults = faults
+
+
+class ScenarioError(DocumentError):
+    """A scenario, or an override of one, with faults."""
+
+
+class InventoryError(DocumentError):
+    """An inventory of hosts with faults."""
 
 
 class DecodeError(ZsimError):

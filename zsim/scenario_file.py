@@ -4,21 +4,19 @@ import hashlib
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgspec
-import yaml
-from yaml.composer import ComposerError
-from yaml.constructor import ConstructorError
 
 from zsim import overrides as override
+from zsim import yaml_file
 from zsim.cross_faults import cross_faults
 from zsim.errors import ScenarioError
-from zsim.faults import faults, show, sound
+from zsim.faults import faults, sound
 from zsim.presets import AS_PRINTED, PRESETS
 from zsim.scenario import DRONES_MAX, Document, Scenario, Sensors
 
-FILE_SIZE_MAX = 1_000_000  # bytes; a scenario of 1000 drones with every field given is below this
+EXAMPLE = "scenarios/step.yaml"  # named to whoever gives no scenario
 FAULTS_MAX = 100  # lines; what follows is counted
 
 
@@ -34,9 +32,9 @@ def load(path: str | Path, overrides: Iterable[str] = (), **values: Any) -> Scen
         ScenarioError: with every fault found, a line each.
     """
     path = Path(path)
-    document = _read(path)
+    document = yaml_file.read(path, EXAMPLE, ScenarioError)
     document.update({key: value for key, value in values.items() if value is not None})
-    applied = [override.apply(document, text, _value) for text in overrides]
+    applied = [override.apply(document, text, yaml_file.value) for text in overrides]
     return _resolve(document, path.name, [fault for fault in applied if fault])
 
 
@@ -66,91 +64,17 @@ def _shortened(lines: list[str]) -> list[str]:
 
 def from_text(text: str) -> Scenario:
     """Return the scenario that `world/info` carries."""
-    return resolve(_parse(text, "world/info"), source="world/info")
+    return resolve(yaml_file.parse(text, "world/info", EXAMPLE, ScenarioError), source="world/info")
 
 
 def to_text(scenario: Scenario) -> str:
     """Return the resolved scenario as YAML text; the same scenario gives the same text."""
-    plain = msgspec.to_builtins(scenario)
-    return yaml.dump(plain, Dumper=_Dumper, sort_keys=True, default_flow_style=None, width=120)
+    return yaml_file.dump(msgspec.to_builtins(scenario))
 
 
 def sha256(scenario: Scenario) -> str:
     """Return the hash that names a resolved scenario."""
     return hashlib.sha256(to_text(scenario).encode()).hexdigest()
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        with path.open("rb") as file:
-            content = file.read(FILE_SIZE_MAX + 1)
-        text = content.decode("utf-8-sig")
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise ScenarioError([f"{path}: cannot be read ({reason}); give the path of a YAML file"]) from error
-    except UnicodeDecodeError as error:
-        raise ScenarioError([f"{path}: is not text (byte {error.start}); must be YAML in UTF-8"]) from error
-    except ValueError as error:
-        raise ScenarioError([f"{show(str(path))}: is no path ({error}); give that of a YAML file"]) from error
-    if len(content) > FILE_SIZE_MAX:
-        raise ScenarioError([f"{path}: is larger than {FILE_SIZE_MAX} bytes; must be at most that"])
-    return _parse(text, path.name)
-
-
-def _parse(text: str, source: str) -> dict[str, Any]:
-    try:
-        document = _value(text)
-    except ValueError as error:
-        raise ScenarioError([f"{source}: {error}; see scenarios/step.yaml"]) from error
-    if not isinstance(document, dict):
-        raise ScenarioError([f"{source}: holds {show(document)}; must be a map as in scenarios/step.yaml"])
-    return document
-
-
-def _value(text: str) -> Any:
-    """Return what a YAML text says; ValueError, a line long, if it says nothing."""
-    try:
-        return yaml.load(text, Loader=_Loader)
-    except RecursionError:
-        raise ValueError("is nested too deep") from None
-    except (yaml.YAMLError, ValueError, OverflowError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f"line {mark.line + 1} " if mark else ""
-        problem = getattr(error, "problem", None) or " ".join(str(error).split())
-        raise ValueError(f"{where}is not YAML ({problem[:100]})") from error
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML 1.2 floats (1e3 is a number); no aliases, for a bomb is made of them, and no tags."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        event = self.peek_event()
-        if isinstance(event, yaml.AliasEvent):
-            raise ComposerError(None, None, "aliases are not allowed", cast(Any, event.start_mark))
-        if getattr(event, "tag", None) is not None:
-            raise ComposerError(None, None, "tags are not allowed", event.start_mark)
-        return super().compose_node(parent, index)
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key_node, _ in node.value:
-            key = key_node.value
-            if isinstance(key, str) and key in seen:
-                raise ConstructorError(None, None, f"key {show(key)} is given twice", key_node.start_mark)
-            seen.add(key if isinstance(key, str) else None)
-        return super().construct_mapping(node, deep)
-
-
-class _Dumper(yaml.SafeDumper):
-    """Puts into quotes the texts that `_Loader` would read as numbers."""
-
-
-for _yaml in (_Loader, _Dumper):
-    _yaml.add_implicit_resolver(
-        "tag:yaml.org,2002:float",
-        re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|^[-+]?\.(inf|Inf)$|^\.(nan|NaN)$"),
-        list("-+0123456789."),
-    )
 
 
 def _expand_presets(document: dict[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,8 @@ from zsim import scenario_file
 from zsim.errors import ScenarioError
 from zsim.presets import G_M_S2, PRESETS
 from zsim.scenario import DRONES_MAX, Scenario
-from zsim.scenario_file import FAULTS_MAX, FILE_SIZE_MAX
+from zsim.scenario_file import FAULTS_MAX
+from zsim.yaml_file import FILE_SIZE_MAX
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 STEP = SCENARIOS / "step.yaml"
