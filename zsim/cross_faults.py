@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from zsim.faults import Fault, show
+from zsim.presets import BOARD_RATE_HZ
+from zsim.scenario import SEA_HEIGHT_MAX_M
 
 START_SEPARATION_MIN_M = 0.6  # m, two hulls of 0.515 m side by side (OpenMAS, weighed and measured)
-FIRMWARE_STEP_US = 5000  # us, the firmware's own step: 200 Hz, navigation board of the AR.Drone 2.0
-IMU_RATE_MAX_HZ = 200.0  # Hz, the rate of the navigation board
+FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
 LIFT_SHARE_MAX = 0.9  # of what the rotors lift; the rest is left for control
 
 
@@ -60,10 +61,11 @@ def _time_faults(time: Any) -> Iterator[Fault]:
         return
     gate_us = time.gate_ms * 1000 if _known(time.gate_ms) else 0.0
     dt_us = time.physics_dt_ms * 1000 if _known(time.physics_dt_ms) else FIRMWARE_STEP_US
+    step_ms = FIRMWARE_STEP_US / 1000
     if gate_us % FIRMWARE_STEP_US:
-        yield "time.gate_ms", f"is {time.gate_ms:g}; must be a multiple of 5 (the firmware's step)"
+        yield "time.gate_ms", f"is {time.gate_ms:g}; must be a multiple of {step_ms:g} (the firmware's step)"
     if dt_us % 1 or FIRMWARE_STEP_US % dt_us:
-        yield "time.physics_dt_ms", f"is {time.physics_dt_ms:g}; must divide 5 (the firmware's step)"
+        yield "time.physics_dt_ms", f"is {time.physics_dt_ms:g}; must divide {step_ms:g} (the firmware's step)"
 
 
 def _start_faults(drones: _Entries) -> Iterator[Fault]:
@@ -94,15 +96,28 @@ def _drone_faults(drone: Any, scenario: Any) -> Iterator[Fault]:
                 "mass_kg",
                 f"is {drone.mass_kg:g}; must be < {most:.3f}, nine tenths of what its rotors lift",
             )
+    yield from _height_faults(drone, scenario.environment and scenario.environment.height_m)
     if drone.sensors is not None:
         yield from ((f"sensors.{path}", text) for path, text in _sensor_faults(drone.sensors))
+
+
+def _height_faults(drone: Any, origin_m: float | None) -> Iterator[Fault]:
+    heights = {
+        "position_m[2]": drone.position_m and drone.position_m[2],
+        "limits.altitude_m": drone.limits and drone.limits.altitude_m,
+    }
+    for path, height_m in heights.items():
+        if _known(origin_m, height_m) and origin_m + height_m > SEA_HEIGHT_MAX_M:
+            limit = f"with environment.height_m ({origin_m:g}) it must be <= {SEA_HEIGHT_MAX_M} m above the sea"
+            yield path, f"is {height_m:g}; {limit}"
 
 
 def _sensor_faults(sensors: Any) -> Iterator[Fault]:
     if sensors.as_printed and sensors.preset == "ardrone2":
         yield "as_printed", "is true; must be false unless preset is paper"
-    if sensors.imu and _known(sensors.imu.rate_hz) and sensors.imu.rate_hz > IMU_RATE_MAX_HZ:
-        yield "imu.rate_hz", f"is {sensors.imu.rate_hz:g}; must be <= 200, the rate of the navigation board"
+    if sensors.imu and _known(sensors.imu.rate_hz) and sensors.imu.rate_hz > BOARD_RATE_HZ:
+        most = f"{BOARD_RATE_HZ:g}, the rate of the navigation board"
+        yield "imu.rate_hz", f"is {sensors.imu.rate_hz:g}; must be <= {most}"
     sonar = sensors.sonar
     if sonar and _known(sonar.min_m, sonar.max_m) and sonar.min_m >= sonar.max_m:
         yield "sonar.min_m", f"is {sonar.min_m:g}; must be < max_m ({sonar.max_m:g})"

@@ -7,11 +7,29 @@ Mas, Curi and Sánchez Peña, "Open-source Multi-UAV Simulator for the ROS Envir
 from typing import Any
 
 G_M_S2 = 9.80665  # m/s^2, standard gravity, ISO 80000-3
+SEA_LEVEL_KG_M3 = 1.225  # kg/m^3, density of the standard atmosphere at sea level and 15 deg C, ISO 2533
+BOARD_RATE_HZ = 200.0  # Hz, navigation board of the AR.Drone 2.0: its IMU samples and its firmware steps
+GPS_RATE_HZ = 5.0  # Hz, Paparazzi's model of the ardrone2
+SLOW_RATE_HZ = 25.0  # Hz, of magnetometer and barometer; chosen as the sonar's, the aircraft's magnetometer gives more
+
+# Of both presets, for the paper is silent about them
+BARO = {
+    "rate_hz": SLOW_RATE_HZ,
+    "altitude_m": {"noise": 0.1},  # m, chosen: twice Paparazzi's model of the ardrone2, for the wash of the rotors
+}
+SONAR = {
+    "rate_hz": 25.0,  # Hz, ultrasound_freq 8 of the AR.Drone's configuration
+    "range_m": {"noise": 0.01},  # m, chosen: what grass and tilt add to the 0.5 mm per LSB of the converter
+}
+FLOW = {
+    "rate_hz": 15.0,  # Hz, of the reduced navdata in which the drone tells its velocity
+    "velocity_m_s": {"noise": 0.1},  # m/s, chosen: nothing is published for the aircraft's flow
+}
 
 PRESETS: dict[str, dict[str, Any]] = {
     "ardrone2": {
         "imu": {
-            "rate_hz": 200.0,  # navigation board frames, AR.Drone 2.0
+            "rate_hz": BOARD_RATE_HZ,
             "accel_m_s2": {
                 "noise": 0.031,  # m/s^2, mean of three axes over 1200 s static
                 "bias": 0.05,  # m/s^2, left after six-position calibration: 2 to 3 LSB of 19 mm/s^2
@@ -26,31 +44,32 @@ PRESETS: dict[str, dict[str, Any]] = {
             },
         },
         "gps": {
-            "rate_hz": 5.0,
-            "latency_ms": 200.0,  # Paparazzi's model of the ardrone2
-            "position_m": {"noise": 2.0},
-            "velocity_m_s": {"noise": 0.43},  # ehve of a real navdata packet
+            "rate_hz": GPS_RATE_HZ,
+            "latency_ms": 200.0,  # ms, Paparazzi's model of the ardrone2
+            "position_m": {"noise": 2.0},  # m, likewise
+            "velocity_m_s": {"noise": 0.43},  # m/s, ehve of a real navdata packet
         },
-        "mag": {"rate_hz": 25.0, "field_ut": {"noise": 0.3, "quantum": 0.3}},  # AK8975: 0.3 uT per LSB
-        "baro": {"rate_hz": 25.0, "altitude_m": {"noise": 0.1}},
-        "sonar": {"rate_hz": 25.0, "range_m": {"noise": 0.01}},  # ultrasound_freq 8
-        "flow": {"rate_hz": 15.0, "velocity_m_s": {"noise": 0.1}},
+        "mag": {"rate_hz": SLOW_RATE_HZ, "field_ut": {"noise": 0.3, "quantum": 0.3}},  # AK8975: 0.3 uT per LSB
+        "baro": BARO,
+        "sonar": SONAR,
+        "flow": FLOW,
     },
     "paper": {
         "imu": {
-            "rate_hz": 200.0,
+            "rate_hz": BOARD_RATE_HZ,
             "accel_m_s2": {"noise": 0.35},  # m/s^2, default of the paper's base simulator (tum_simulator)
             "gyro_deg_s": {"noise": 0.01},  # deg/s, section VI
         },
         "gps": {
-            "rate_hz": 5.0,
+            "rate_hz": GPS_RATE_HZ,
             "position_m": {"noise": 2.0},  # m, section VI
-            "velocity_m_s": {"noise": 0.43},  # ehve of a real navdata packet; the paper is silent
+            "velocity_m_s": {"noise": 0.43},  # m/s, ehve of a real navdata packet; the paper is silent
         },
-        "mag": {"rate_hz": 25.0, "field_ut": {"noise": 0.94}},  # 3 deg of a horizontal field of 18 uT
-        "baro": {"rate_hz": 25.0, "altitude_m": {"noise": 0.1}},
-        "sonar": {"rate_hz": 25.0, "range_m": {"noise": 0.01}},
-        "flow": {"rate_hz": 15.0, "velocity_m_s": {"noise": 0.1}},
+        # 0.94 uT: 3 deg of a horizontal field of 18 uT; chosen, the paper is silent
+        "mag": {"rate_hz": SLOW_RATE_HZ, "field_ut": {"noise": 0.94}},
+        "baro": BARO,
+        "sonar": SONAR,
+        "flow": FLOW,
     },
 }
 

@@ -7,9 +7,10 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct, field
 
-from zsim.presets import G_M_S2
+from zsim.presets import G_M_S2, SEA_LEVEL_KG_M3
 
 DRONES_MAX = 1000  # one world integrates them all
+SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
 
 # LARGE keeps squares and products of what is given finite; it is beyond any quantity of a flight in SI units.
 LARGE = 1e9
@@ -52,7 +53,7 @@ class Mount(Spec, frozen=True, kw_only=True):
 class Sensor(Spec, frozen=True, kw_only=True):
     """What all sensors share."""
 
-    rate_hz: Annotated[float, Meta(gt=0, le=1000)]
+    rate_hz: Annotated[float, Meta(ge=0.01, le=1000)]
     latency_ms: Annotated[float, Meta(ge=0, le=10_000)] = 0.0
     dropout: Fraction = 0.0
     """Probability that a sample is lost, independent per sample."""
@@ -102,13 +103,13 @@ class Sensors(Spec, frozen=True, kw_only=True):
 
 
 class Limits(Spec, frozen=True, kw_only=True):
-    """What the firmware allows a commander (defaults: the SDK's outdoor set, no altitude limit)."""
+    """What the firmware allows a commander; defaults and ranges of the SDK's outdoor set where it has them."""
 
-    tilt_deg: Annotated[float, Meta(gt=0, le=30)] = 20.0
-    horizontal_speed_m_s: Annotated[float, Meta(gt=0, le=10)] = 5.0
-    vertical_speed_m_s: Annotated[float, Meta(ge=0.2, le=2)] = 1.0
-    yaw_rate_deg_s: Annotated[float, Meta(gt=0, le=350)] = 200.0
-    altitude_m: Positive = 100.0
+    tilt_deg: Annotated[float, Meta(gt=0, le=30)] = 20.0  # outdoor_euler_angle_max, 0.349 rad
+    horizontal_speed_m_s: Annotated[float, Meta(gt=0, le=10)] = 5.0  # chosen, the SDK has none; 20 deg hold 6 m/s
+    vertical_speed_m_s: Annotated[float, Meta(ge=0.2, le=2)] = 1.0  # outdoor_control_vz_max
+    yaw_rate_deg_s: Annotated[float, Meta(gt=0, le=350)] = 200.0  # outdoor_control_yaw, 3.49 rad/s
+    altitude_m: Positive = 100.0  # altitude_max: what it takes for no limit
 
 
 class Drone(Spec, frozen=True, kw_only=True):
@@ -135,13 +136,16 @@ class Drone(Spec, frozen=True, kw_only=True):
 
 
 class Wind(Spec, frozen=True, kw_only=True):
-    """Steady wind and Dryden gusts, `gust_m_s` being the standard deviation per axis."""
+    """Steady wind and Dryden gusts, `gust_m_s` being the standard deviation per axis.
+
+    The form is that of MIL-HDBK-1797; its lengths, for aeroplanes high above the ground, are not used.
+    """
 
     steady_m_s: Vector3 = (0.0, 0.0, 0.0)
     gust_m_s: NonNegative = 0.0
-    gust_length_m: Positive = 10.0
-    gust_speed_min_m_s: Positive = 2.0
-    gust_correlation: Fraction = 0.5
+    gust_length_m: Positive = 10.0  # chosen: eddies about as large as the flight is high
+    gust_speed_min_m_s: Positive = 2.0  # chosen: with 10 m, gusts on a hovering drone last 5 s
+    gust_correlation: Fraction = 0.5  # chosen: drones some metres apart share half of the variance
 
 
 class Environment(Spec, frozen=True, kw_only=True):
@@ -149,30 +153,33 @@ class Environment(Spec, frozen=True, kw_only=True):
 
     latitude_deg: Annotated[float, Meta(ge=-90, le=90)] = -34.603
     longitude_deg: Annotated[float, Meta(ge=-180, le=180)] = -58.368
-    height_m: Coordinate = 25.0
+    height_m: Annotated[float, Meta(ge=-100_000, le=SEA_HEIGHT_MAX_M)] = 25.0
     gravity_m_s2: Positive = G_M_S2
-    magnetic_field_ut: Vector3 = (-2.8, 17.8, 14.0)  # ENU; 18 uT horizontal, declination -9 deg, upwards
-    air_density_kg_m3: Positive = 1.225
+    magnetic_field_ut: Vector3 = (-2.8, 17.8, 14.0)  # ENU, within 0.4 uT of IGRF-14 there on 1 January 2013
+    air_density_kg_m3: Positive = SEA_LEVEL_KG_M3
     wind: Wind = Wind()
 
 
 class Silence(Spec, frozen=True, kw_only=True):
     """What the firmware does when the commander falls silent, in simulated time."""
 
-    hover_s: Positive = 0.5
-    land_s: Positive = 2.0
+    hover_s: Positive = 0.5  # chosen: 25 gates, long against any delay of a link, short against a collision
+    land_s: Positive = 2.0  # after that; the AR.Drone's com_watchdog
 
 
 class Gains(Spec, frozen=True, kw_only=True):
-    """Of the cluster controller; see zsim_agents/formation.py."""
+    """Of the cluster controller; see zsim_agents/formation.py.
+
+    All chosen. The loop is unstable from a proportional gain of about 2 1/s on, and answers well from 0.5 to 0.8.
+    """
 
     proportional_1_s: Annotated[float, Meta(gt=0, le=2)] = 0.6
-    integral_1_s2: Annotated[float, Meta(ge=0, le=0.5)] = 0.05
-    horizontal_speed_m_s: Positive = 1.5
-    vertical_speed_m_s: Positive = 0.8
-    yaw_rate_deg_s: Positive = 60.0
-    separation_min_m: NonNegative = 2.0
-    separation_alarm_m: NonNegative = 1.5
+    integral_1_s2: Annotated[float, Meta(ge=0, le=0.5)] = 0.05  # takes a steady wind's offset away within half a minute
+    horizontal_speed_m_s: Positive = 1.5  # a third of what the firmware allows: the rest is for the wind
+    vertical_speed_m_s: Positive = 0.8  # of the 1 m/s that the firmware allows
+    yaw_rate_deg_s: Positive = 60.0  # of 200 deg/s; a turning drone lags across its way
+    separation_min_m: NonNegative = 2.0  # about four hulls; estimates err by 0.2 m along a side
+    separation_alarm_m: NonNegative = 1.5  # about three hulls
 
 
 class Waypoint(Spec, frozen=True, kw_only=True):
@@ -227,10 +234,12 @@ class Processes(Spec, frozen=True, kw_only=True):
 
 
 class Time(Spec, frozen=True, kw_only=True):
-    gate_ms: Annotated[float, Meta(gt=0, le=1000)] = 20.0
-    physics_dt_ms: Annotated[float, Meta(gt=0, le=20)] = 2.5
-    command_delay_gates: Annotated[int, Meta(ge=1, le=50)] = 1
-    max_command_age_ms: Positive = 500.0
+    """Steps of simulated time; all chosen."""
+
+    gate_ms: Annotated[float, Meta(gt=0, le=1000)] = 20.0  # 50 Hz, against the formation loop's 1.7 s
+    physics_dt_ms: Annotated[float, Meta(gt=0, le=20)] = 2.5  # a twelfth of the rotors' lag, the fastest motion
+    command_delay_gates: Annotated[int, Meta(ge=1, le=50)] = 1  # the least with which world and agents work at once
+    max_command_age_ms: Positive = 500.0  # as silence.hover_s: an older command counts as silence
 
 
 class Figures(Spec, frozen=True, kw_only=True):

@@ -61,7 +61,9 @@ class Controller(Agent):
     def receive(self, key: str, message: Any) -> None:
         place = self._place[keys.thing(key)]
         if type(message) is messages.Estimate:
-            self._estimates[place] = message
+            former = self._estimates[place]
+            if former is None or message.t_ns >= former.t_ns:  # in realtime an older one may come later
+                self._estimates[place] = message
         else:
             self._states[place] = message.state
 
@@ -80,6 +82,8 @@ class Controller(Agent):
             ages_s.append((t_ns - e.t_ns) * 1e-9 if e is not _UNKNOWN else math.inf)
         p_W, v_W, variance = np.array((positions, velocities, variances)).reshape(3, len(known), 3)
         yaw, age_s = np.array((yaws, ages_s))
+        if age_s.any():
+            p_W = ahead(p_W, v_W, age_s)
         return GateInput(t_ns * 1e-9, p_W, yaw, v_W, np.sqrt(variance), age_s, tuple(self._states))
 
     def _modes(self, t_ns: int, output: GateOutput) -> list[Output]:
@@ -117,6 +121,7 @@ class Controller(Agent):
             margin=output.margin if math.isfinite(output.margin) else 0.0,
             reason=output.reason,
             source=self.name,
+            plan_step=output.plan_step,
         )
         seq = self.next_seq(self._view_key)
         view = messages.ViewCluster(t_ns, seq, state.phase, names, value, desired, output.reason)
@@ -136,7 +141,7 @@ class Controller(Agent):
         return (self._state_key,)
 
     def warm_start(self, key: str, message: messages.ClusterState) -> None:
-        self._engagement.warm_start(message.phase, np.array(message.desired))
+        self._engagement.warm_start(message.phase, np.array(message.desired), message.plan_step)
 
 
 _UNKNOWN = messages.Estimate(
@@ -230,3 +235,13 @@ def _finite(values: np.ndarray) -> tuple[float, ...]:
     if not math.isfinite(sum(known)):  # one of them is not, or they are too large for a sum
         known = [value if math.isfinite(value) else 0.0 for value in known]
     return tuple(known)
+
+
+def ahead(p_W: np.ndarray, v_W: np.ndarray, age_s: np.ndarray) -> np.ndarray:
+    """Return where drones are by now whose estimates are old, as behind a slow link: at constant velocity.
+
+    Args:
+        p_W, v_W: (n, 3) of the estimates.
+        age_s: (n,); infinite where there is none.
+    """
+    return p_W + v_W * np.where(np.isfinite(age_s), age_s, 0.0)[:, None]

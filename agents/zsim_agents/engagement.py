@@ -28,6 +28,7 @@ from zsim_agents.flight_request import (
     REFUSALS,
     Engage,
     FlightRequest,
+    Follow,
     Land,
     Pause,
     RefusalError,
@@ -106,23 +107,20 @@ class Engagement:
         refusal = self._try(request)
         if refusal is None and isinstance(request, Land):
             self.plan.clear()
+        elif refusal is None and isinstance(request, Target | Follow):
+            self.plan.overrule()
         return refusal
 
-    def warm_start(self, phase: str, desired: Array) -> None:
+    def warm_start(self, phase: str, desired: Array, plan_step: int = 0) -> None:
         """Go on where a former process of this formation was: in its phase, at its reference (4n,).
 
-        What its plan leads to (a target, a trajectory) is asked for again, from that reference.
+        Its plan goes on after the steps that the former one was through with, as `GateOutput.plan_step` said; what it
+        flew by the plan (a target, a trajectory) is asked for again, from that reference.
         """
-        if phase in ("engaged", "held"):
-            self._phase = "engaged"
+        self._phase = "engaged" if phase == "held" else phase
+        if self._phase == "engaged":
             self.guidance.engage(desired)
-            self.plan.skip((TakeOff, Engage))
-        elif phase in ("taking_off", "assembling"):
-            self._phase = phase
-            self.plan.skip((TakeOff,))
-        elif phase == "landing":
-            self._phase = phase
-            self.plan.clear()
+        self.plan.start_at(plan_step)
 
     def _try(self, request: FlightRequest) -> str | None:
         if self._gate is None:
@@ -166,6 +164,7 @@ class Engagement:
             raise RefusalError(f"phase is {self.phase}; possible when assembling, or when held on request")
         refuse(self.judge.engagement_fault(gate))
         self.guidance.engage(self.judge.value)
+        self.plan.overrule()
         self.law.reset()
         self._fault = ""
         self._phase = "engaged"
@@ -282,6 +281,7 @@ class Engagement:
             reason=reason,
             factor=command.factor if command else 1.0,
             alarmed=alarmed,
+            plan_step=self.plan.resume_at(engaged=self._phase == "engaged" and not self.guidance.paused),
         )
 
     @staticmethod

@@ -76,15 +76,16 @@ class Estimator(Agent):
         return [Output(self._key, message)]
 
     def rehearse(self) -> None:
-        twin = DroneEstimator(*self._settings)
+        drone, place, _, gate_s = self._settings
+        twin, still, sigma_m, fix = DroneEstimator(*self._settings), (0.0, 0.0, 0.0), 1.0, 3
         for gate in range(1, 4):
-            t_s = gate * 0.02
-            twin.imu(t_s, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0))
-            twin.mag(t_s, t_s, self._settings[1].magnetic_field_ut)
-            twin.gps(t_s, t_s, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 2.0, 3)
+            t_s = gate * gate_s
+            twin.imu(t_s, (0.0, 0.0, place.gravity_m_s2), still)
+            twin.mag(t_s, t_s, place.magnetic_field_ut)
+            twin.gps(t_s, t_s, still, still, sigma_m, fix)
             twin.baro(t_s, t_s, 0.0)
-            twin.sonar(t_s, t_s, 0.06, True)
-            twin.flow(t_s, t_s, (0.0, 0.0, 0.0), 1.0)
+            twin.sonar(t_s, t_s, drone.sensors.sonar.min_m, True)
+            twin.flow(t_s, t_s, still, 1.0)
             twin.close(t_s)
 
     def warm_start_keys(self) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from zsim.presets import BOARD_RATE_HZ
 from zsim.scenario import Estimation, Imu
 from zsim_agents.aiding import Aid
 from zsim_agents.dead_reckoning import ATTITUDE, POSITION, VELOCITY
@@ -13,7 +14,6 @@ from zsim_agents.navigation_filter import BiasPrior, NavigationFilter, ProcessNo
 from zsim_agents.sensor_noise import has_bias, white_sigma
 from zsim_agents.strapdown import MANOEUVRE_M_S2, MANOEUVRE_S
 
-IMU_DEVICE_HZ = 200.0  # Hz, at which the navigation board samples whatever it publishes; AR.Drone 2.0
 LEVELLING_S = 60.0  # s; long against manoeuvres of seconds, short against the gyroscope's drift
 
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
@@ -28,7 +28,7 @@ GYRO_SIGMA_MIN = 2e-4  # rad/s per sample, likewise
 
 def accel_sigma(imu: Imu) -> float:
     """Return the accelerometer's white noise per sample [m/s^2]."""
-    return max(white_sigma(imu.accel_m_s2, IMU_DEVICE_HZ), ACCEL_SIGMA_MIN)
+    return max(white_sigma(imu.accel_m_s2, BOARD_RATE_HZ), ACCEL_SIGMA_MIN)
 
 
 def madgwick_beta(estimation: Estimation, imu: Imu, gravity: float) -> float:
@@ -43,7 +43,7 @@ def process_noise(imu: Imu, beta: float, gravity: float) -> ProcessNoise:
     direction_sigma = accel_sigma(imu) / gravity
     return ProcessNoise(
         accel_sigma=accel_sigma(imu),
-        gyro_sigma=max(math.radians(white_sigma(imu.gyro_deg_s, IMU_DEVICE_HZ)), GYRO_SIGMA_MIN),
+        gyro_sigma=max(math.radians(white_sigma(imu.gyro_deg_s, BOARD_RATE_HZ)), GYRO_SIGMA_MIN),
         tilt_density=tilt_density(beta, direction_sigma, gravity, 1.0 / imu.rate_hz),
         levelling_s=levelling_time_s(beta, direction_sigma),
     )

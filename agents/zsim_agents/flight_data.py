@@ -16,7 +16,7 @@ DOWN = frozenset({"landed", "emergency"})  # states of a drone that is on the gr
 
 @dataclass(frozen=True)
 class EngagementLimits:
-    """Limits and heights of the phase machine.
+    """Limits and heights of the phase machine; all chosen, `shape` so that no formation comes near a singularity.
 
     Attributes:
         shape: where a formation may be engaged and led.
@@ -32,15 +32,15 @@ class EngagementLimits:
     """
 
     shape: ShapeLimits = field(default_factory=ShapeLimits)
-    flight_slack: float = 1.5
-    assembly_height_m: float = 1.5
-    assembly_within_m: float = 0.3
-    assembly_climb_m_s: float = 0.5
-    age_max_s: float = 0.5
-    sigma_max_m: float = 1.0
-    sigma_lost_m: float = 2.0
-    heal_s: float = 0.5
-    resend_s: float = 1.0
+    flight_slack: float = 1.5  # so that noise of the estimates at the limit holds nobody
+    assembly_height_m: float = 1.5  # many rotor radii over the ground, and a fall that the hull takes
+    assembly_within_m: float = 0.3  # three sigma of the barometer
+    assembly_climb_m_s: float = 0.5  # half of what the firmware allows: the drones climb alike
+    age_max_s: float = 0.5  # as the firmware's silence: 25 gates
+    sigma_max_m: float = 1.0  # half of the least separation of 2 m
+    sigma_lost_m: float = 2.0  # of a single GPS fix: nothing else helps any more
+    heal_s: float = 0.5  # 25 gates without a fault are no accident
+    resend_s: float = 1.0  # ten times the delay of commands in the paper's scenario, 100 ms
 
     @property
     def shape_in_flight(self) -> ShapeLimits:
@@ -103,6 +103,7 @@ class GateOutput(NamedTuple):
             desired with wrapped angles.
         factor: common factor of the saturation, 1 where nothing is saturated.
         alarmed: pairs of drone indices that are nearer than the alarm threshold.
+        plan_step: as in the message.
     """
 
     modes: tuple[ModeCommand, ...]
@@ -116,3 +117,4 @@ class GateOutput(NamedTuple):
     reason: str
     factor: float
     alarmed: tuple[tuple[int, int], ...]
+    plan_step: int

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -26,6 +25,8 @@ class Scheduled:
 class FlightPlan:
     """Requests in their order; each waits for those before it, except Land, which drops them.
 
+    A restarted controller begins it where `resume_at` of the former one says.
+
     Attributes:
         note: why the plan waits, empty where it does not.
 
@@ -35,37 +36,51 @@ class FlightPlan:
 
     def __init__(self, space: ClusterSpace, steps: Sequence[Scheduled] = ()) -> None:
         _check(space, steps)
-        self._steps = deque(steps)
+        self._steps = tuple(steps)
+        self._next = 0  # first step that is not done
+        self._flown = 0  # first step of those that make the reference flown now, _next where none does
         self._try_s = -math.inf
         self.note = ""
 
     def run(self, t_s: float, request: Callable[[FlightRequest], str | None]) -> None:
         """Make the requests that are due at t_s."""
         self._drop_before_land(t_s)
-        while self._steps and t_s >= max(self._steps[0].at_s, self._try_s):
-            refusal = request(self._steps[0].request)
+        while self._next < len(self._steps) and t_s >= max(self._steps[self._next].at_s, self._try_s):
+            step = self._steps[self._next].request
+            refusal = request(step)
             if refusal:
                 self._try_s = t_s + RETRY_S
-                self.note = f"{type(self._steps[0].request).__name__} of the plan waits: {refusal}"
+                self.note = f"{type(step).__name__} of the plan waits: {refusal}"
                 return
-            self._steps.popleft()
-            self._try_s, self.note = -math.inf, ""
+            flown = self._flown if isinstance(step, Target | Follow) else self._next + 1
+            self._go_to(self._next + 1, flown)
 
-    def skip(self, kinds: tuple[type, ...]) -> None:
-        """Drop the leading requests of these kinds: they were granted before a restart."""
-        while self._steps and isinstance(self._steps[0].request, kinds):
-            self._steps.popleft()
+    def resume_at(self, engaged: bool) -> int:
+        """Return how many steps a restart leaves out: all that are done, but in flight those flown now."""
+        return self._flown if engaged else self._next
+
+    def start_at(self, step: int) -> None:
+        """Leave out so many steps: they were done before a restart."""
+        self._go_to(min(step, len(self._steps)))
+
+    def overrule(self) -> None:
+        """Note that the reference flown from now on is not the plan's."""
+        self._flown = self._next
 
     def clear(self) -> None:
         """Drop everything that is not done."""
-        self._steps.clear()
-        self.note = ""
+        self._go_to(len(self._steps))
 
     def _drop_before_land(self, t_s: float) -> None:
-        lands = [i for i, step in enumerate(self._steps) if step.at_s <= t_s and isinstance(step.request, Land)]
-        for _ in range(lands[-1] if lands else 0):
-            self._steps.popleft()
-            self._try_s, self.note = -math.inf, ""
+        for place in range(len(self._steps) - 1, self._next, -1):
+            step = self._steps[place]
+            if step.at_s <= t_s and isinstance(step.request, Land):
+                self._go_to(place)
+                return
+
+    def _go_to(self, step: int, flown: int | None = None) -> None:
+        self._next, self._flown = step, step if flown is None else flown
+        self._try_s, self.note = -math.inf, ""
 
 
 def _check(space: ClusterSpace, steps: Sequence[Scheduled]) -> None:

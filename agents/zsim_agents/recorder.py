@@ -5,7 +5,6 @@ Order of this file: `record`, the process, what arrives.
 
 import os
 import secrets
-import socket
 import threading
 import time
 from collections.abc import Callable
@@ -14,9 +13,10 @@ from pathlib import Path
 import msgspec
 
 from zsim import __version__, batch, keys, messages
-from zsim.errors import DecodeError, RecordError, SupersededError
+from zsim.errors import DecodeError, NoWorldError, RecordError, SupersededError
 from zsim.health import HealthMeter
 from zsim.record import RecordWriter
+from zsim.replay import replay
 from zsim.session import Sample, Session
 
 NAME = "recorder"
@@ -25,7 +25,7 @@ TICK_S = 0.1  # how often the open chunk's age and a stop are looked at
 REPLAY_S = 5.0  # a hub answers within milliseconds
 DRAIN_S = 1.0  # after `stopped`, how long the byes of the others are waited for
 STOP_DRAIN_S = 0.5  # after it is told to stop, how long the end of the run is waited for: both may be stopped at once
-KNOWN_MAX = 100_000  # replayed messages remembered, so that none is written twice
+KNOWN_MAX = 1_000_000  # replayed messages remembered, so that none is written twice: 5 s of 1000 drones
 
 
 class _Head(msgspec.Struct):
@@ -59,7 +59,8 @@ class Recorder:
         self._writer = RecordWriter(path)
         self._head = msgspec.msgpack.Decoder(_Head)
         self._clock = msgspec.msgpack.Decoder(messages.Clock)
-        self._known: set[tuple[str, bytes]] = set()
+        self._known: dict[tuple[str, bytes], None] = {}
+        self._caught_up = False
         self._over = threading.Event()
         self._successor: str | None = None
         self._ended_s: float | None = None
@@ -68,7 +69,7 @@ class Recorder:
         self._seq = {"join": 0, "bye": 0, "health": 0}
         self._leavers: set[str] = set()
         self._joined: set[str] = set()
-        self.health = HealthMeter(NAME)
+        self.health = HealthMeter(NAME, host=link.host)
 
     def run(self) -> str:
         self._box = self._link.subscribe(batch.KEY)
@@ -128,11 +129,20 @@ class Recorder:
 
     def _catch_up(self) -> None:
         """Write what was said before this process came: the world keeps it for those who ask."""
-        answer = self._link.request(keys.CONTROL, "replay", self._name, timeout_s=REPLAY_S, from_ns=-1, keys=["**"])
-        for key, payload in answer.result or ():
-            self._write(key, payload)
-            if len(self._known) < KNOWN_MAX:
-                self._known.add((key, payload))
+        while not self._caught_up and not self._stopped():
+            try:
+                for key, payload in replay(self._link, self._name, -1, ["**"], REPLAY_S):
+                    self._write(key, payload)
+                    self._know(key, payload)
+                self._caught_up = True
+            except NoWorldError:
+                self._over.wait(TICK_S)
+
+    def _know(self, key: str, payload: bytes) -> None:
+        """Remember what the world has replayed: the newest of it comes in a batch too."""
+        self._known[key, payload] = None
+        if len(self._known) > KNOWN_MAX:
+            del self._known[next(iter(self._known))]
 
     def _write_batch(self, sample: Sample) -> None:
         try:
@@ -158,19 +168,19 @@ class Recorder:
         """Return the message's own time; garbage is recorded at the time of its neighbours."""
         try:
             self._now_ns = max(0, min(self._head.decode(payload).t_ns, 2**62))
-        except (msgspec.MsgspecError, UnicodeDecodeError):
+        except messages.REFUSALS:
             self.health.refused += 1
         return self._now_ns
 
     def _on_clock(self, payload: bytes) -> None:
         try:
             clock = self._clock.decode(payload)
-        except msgspec.MsgspecError:
+        except messages.REFUSALS:
             return  # garbage by somebody else on `clock`; recorded as it came
         if clock.state == "stopped" and clock.run_id == self._info.run_id and self._ended_s is None:
             self._ended_s = time.monotonic()
-        elif clock.step > 1:
-            self._known.clear()
+        elif self._caught_up:
+            self._known.clear()  # whatever passed after a clock that was not replayed was not replayed either
 
     def _on_event(self, payload: bytes) -> None:
         try:
@@ -198,7 +208,7 @@ class Recorder:
             run_id=self._info.run_id,
             incarnation=secrets.randbits(62),
             role=NAME,
-            host=socket.gethostname(),
+            host=self._link.host,
             pid=os.getpid(),
             period_ns=0,
             version=__version__,

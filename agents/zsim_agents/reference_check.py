@@ -34,11 +34,11 @@ class ShapeLimits:
         share: share of the robots' speed limits that a reference may use; the law keeps the rest.
     """
 
-    spread_min_m: float = 1.0
-    tilt_max_rad: float = math.radians(30.0)
-    condition_max: float = 20.0
-    height_min_m: float = 0.5
-    share: float = 0.8
+    spread_min_m: float = 1.0  # chosen: five sigma of a side's estimate keep robots out of one line
+    tilt_max_rad: float = math.radians(30.0)  # chosen: far from the 90 deg where Euler angles fail
+    condition_max: float = 20.0  # chosen: beyond it a small motion in cluster space is a large one of a robot
+    height_min_m: float = 0.5  # chosen: five rotor radii, above most of the ground effect
+    share: float = 0.8  # chosen
 
 
 def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits) -> str | None:

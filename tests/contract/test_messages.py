@@ -557,9 +557,9 @@ def test_requests_survive_the_wire(op: str, args: dict[str, Any], source: str):
 
 
 @settings(max_examples=50, deadline=None)
-@given(ok=st.booleans(), error=text, result=free)
-def test_answers_survive_the_wire(ok: bool, error: str, result: Any):
-    answer = messages.ControlAnswer(ok, error, result)
+@given(ok=st.booleans(), error=text, result=free, more=st.none() | st.integers(0, 2**63 - 1))
+def test_answers_survive_the_wire(ok: bool, error: str, result: Any, more: int | None):
+    answer = messages.ControlAnswer(ok, error, result, more)
     assert messages.decode_as(messages.ControlAnswer, messages.encode(answer), "k") == answer
 
 

@@ -55,6 +55,14 @@ class Participant:
         balance = self.received - self.missing - sent
         self.received, self.missing = max(0, balance), max(0, -balance)
 
+    def write_off(self) -> int:
+        """Close the account of outputs, once it was asked for them again; return how many are missing for good.
+
+        A surplus would hide the next loss: outputs that belong to the next done do not come while some are missing.
+        """
+        missing, self.missing, self.received = self.missing, 0, 0
+        return missing
+
     def owes(self, need_ns: int) -> bool:
         """Tell whether its done (or an output that it counted) is not in yet."""
         required = self.required_ns(need_ns)

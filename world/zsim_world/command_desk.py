@@ -17,15 +17,15 @@ class CommandDesk:
     def __init__(self, world: World) -> None:
         self._world = world
 
-    def take(self, drone: str, kind: str, message: Any) -> None:
-        """Keep a command until its instant, or refuse it."""
+    def take(self, drone: str, kind: str, message: Any) -> bool:
+        """Keep a command until its instant, or refuse it; return False for one that has come before."""
         world = self._world
         index = world.index.get(drone)
         reason = "no such drone; see world/info" if index is None else self._age_refusal(message)
         if index is None or reason:
             world.refuse(message.source[:40], f"drone/{drone[:40]}/cmd/{kind}", reason or "")
-            return
-        world.commanders.push(index, kind, message, self._apply_ns(drone, kind, message))
+            return True
+        return world.commanders.push(index, kind, message, self._apply_ns(drone, kind, message))
 
     def _age_refusal(self, message: Any) -> str | None:
         world = self._world

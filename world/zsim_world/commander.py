@@ -10,7 +10,6 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 PROGRAM = 0  # priority of a program, contract
-OPERATOR = 10  # priority of an operator, contract
 SEEN_PER_DRONE = 256  # commands remembered to know them again; a rejoin repeats those of two gates
 
 

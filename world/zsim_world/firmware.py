@@ -138,19 +138,14 @@ def _change_mode(
     if mode in (LANDED, EMERGENCY):
         setpoint[KIND] = NONE
         return
-    commanded = setpoint[KIND] != NONE
     if rot.z_axis(four(belief, ob.ATTITUDE))[2] < TILT_CUT_COSINE:
         enter(memory, belief, EMERGENCY)
     elif mode != LANDING and charge_percent < LOW_BATTERY_PERCENT:
         enter(memory, belief, LANDING)
     elif mode in (HOVERING, FLYING):
-        if commanded and silence_s >= hover_s + land_s:
-            enter(memory, belief, LANDING)
-        else:
-            steered = commanded and setpoint[KIND] != HOVER and silence_s < hover_s
-            wanted = FLYING if steered else HOVERING
-            if wanted != mode:
-                enter(memory, belief, wanted)
+        wanted = _wanted(int(setpoint[KIND]), silence_s, hover_s, land_s)
+        if wanted != mode:
+            enter(memory, belief, wanted)
     elif mode == TAKING_OFF:
         if _arrived(memory, belief):
             height = memory[HOLD_Z]
@@ -160,6 +155,16 @@ def _change_mode(
         enter(memory, belief, LANDED)
     if memory[MODE] not in (HOVERING, FLYING):
         setpoint[KIND] = NONE
+
+
+@compiled
+def _wanted(kind: int, silence_s: float, hover_s: float, land_s: float) -> int:
+    """Return the mode in the air that a setpoint of this kind and the commander's silence ask for."""
+    if kind == NONE:
+        return HOVERING
+    if silence_s >= hover_s + land_s:
+        return LANDING
+    return FLYING if kind != HOVER and silence_s < hover_s else HOVERING
 
 
 @compiled

@@ -23,7 +23,8 @@ from zsim_world.noise import NoiseTable
 from zsim_world.sensor_set import SENSORS, VALUES, SensorName
 from zsim_world.start import arrays
 
-GPS_FIX, GPS_SATELLITES = 3, 9  # a three-dimensional fix; satellites of a real navdata packet
+GPS_FIX = 3  # NMEA: a three-dimensional fix
+GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone
 TAKEOFF_PERCENT_MIN = 2.0 * firmware.LOW_BATTERY_PERCENT  # %, below which it does not take off
 UPRIGHT_COSINE = 0.87  # 30 deg, beyond which it does not take off
 QUATERNION_SQUARE_MIN = 1e-6  # shorter, a quaternion has no direction
@@ -32,6 +33,12 @@ NOISE_GATES = 64  # gates between two refills of the noise
 
 class DivergedError(RunError):
     """The state of a drone is no longer finite; the text names the drone and the time."""
+
+    def __init__(self, drone: str, t_s: float) -> None:
+        super().__init__(
+            f"{drone} at {t_s:.3f} s: the state is no longer finite; check its mass, inertia, rotors and dt"
+        )
+        self.drone = drone
 
 
 class Sample(Struct, frozen=True, gc=False):
@@ -123,7 +130,7 @@ class Fleet:
         charge = 100.0 * self._bodies.energy.item(i) / self._bodies.vehicle.item(i, vehicle.CAPACITY)
         return firmware.MODES[self._mode(i)], charge, i in self._touching
 
-    def min_separation_m(self) -> float:
+    def closest_m(self) -> float:
         """Return the least distance between two drones over the last gate; inf for a single one."""
         return self._least
 
@@ -217,10 +224,9 @@ class Fleet:
 
     def _integrate(self, ticks: int) -> None:
         logged, least, diverged = gate.advance(self._w, ticks)
-        self._tick += ticks
         if diverged >= 0:
-            where = f"{self.names[diverged]} at {self.t_ns / 1e9:.3f} s"
-            raise DivergedError(f"{where}: the state is no longer finite; check its mass, inertia, rotors and dt")
+            raise DivergedError(self.names[diverged], (self._tick + ticks) * self._tick_ns / 1e9)
+        self._tick += ticks
         self._least = least
         self._meet(least)
         fresh = self._fresh(logged)
@@ -273,4 +279,4 @@ def _latencies(scenario: Scenario) -> list[list[int]]:
 
 
 def _gps_sigma(gps: Gps) -> float:
-    return sensor_set.white_sigma(gps.position_m, gps.rate_hz)
+    return sensor_set.noise_sigma(gps.position_m, gps.rate_hz)

@@ -11,13 +11,16 @@ and by the optical flow (v). Vertical: dz/dt = v, dv/dt = -c v + u, with a heigh
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from zsim.presets import BOARD_RATE_HZ
 from zsim.scenario import Drone, Environment, ErrorModel, Sensor
-from zsim_world.sensor_set import DEVICE_RATE_HZ, heading_sigma, radians, white_sigma
+from zsim_world.sensor_set import heading_sigma, noise_sigma, radians
+from zsim_world.vehicle import REFERENCE_DENSITY_KG_M3
 
 Array = NDArray[np.float64]
 
@@ -51,22 +54,42 @@ MAG_PSI, MAG_RATE = 25, 26
 COLUMNS = 27
 
 
+Meter = tuple[float, float]  # standard deviation of a sample, samples per second
+
+
+class Design(NamedTuple):
+    """What the gains of one drone follow from."""
+
+    drag_1_s: float
+    gravity_m_s2: float
+    accel: Meter  # m/s^2
+    accel_walk: float  # m/s^2/sqrt(s)
+    tilt_walk: float  # rad/sqrt(s)
+    gyro_walk: float  # rad/s/sqrt(s)
+    flow: Meter  # m/s
+    baro: Meter  # m
+    sonar: Meter  # m
+    mag: Meter  # rad
+
+
 def gain_row(drone: Drone, environment: Environment) -> Array:
     """Return the gains of one drone, shape (COLUMNS,)."""
     s = drone.sensors
     field = math.hypot(*environment.magnetic_field_ut[:2])
-    return _gains(
-        drag_1_s=drone.drag_n_s_m * environment.air_density_kg_m3 / 1.225 / drone.mass_kg,
-        gravity=environment.gravity_m_s2,
-        accel=(_sigma(s.imu.accel_m_s2, DEVICE_RATE_HZ, "accel"), DEVICE_RATE_HZ),
+    gyro = _sigma(radians(s.imu.gyro_deg_s), BOARD_RATE_HZ, "gyro")
+    design = Design(
+        drag_1_s=drone.drag_n_s_m * environment.air_density_kg_m3 / REFERENCE_DENSITY_KG_M3 / drone.mass_kg,
+        gravity_m_s2=environment.gravity_m_s2,
+        accel=(_sigma(s.imu.accel_m_s2, BOARD_RATE_HZ, "accel"), BOARD_RATE_HZ),
         accel_walk=max(s.imu.accel_m_s2.bias_walk, LIFT_BIAS_WALK),
-        gyro=_sigma(radians(s.imu.gyro_deg_s), DEVICE_RATE_HZ, "gyro"),
+        tilt_walk=math.hypot(gyro / math.sqrt(BOARD_RATE_HZ), TILT_WALK),
         gyro_walk=max(radians(s.imu.gyro_deg_s).bias_walk, BIAS_WALK),
         flow=(_sigma(s.flow.velocity_m_s, s.flow.rate_hz, "flow"), heard(s.flow)),
         baro=(_sigma(s.baro.altitude_m, s.baro.rate_hz, "baro"), heard(s.baro)),
         sonar=(_sigma(s.sonar.range_m, s.sonar.rate_hz, "sonar"), heard(s.sonar)),
         mag=(_within(heading_sigma(s.mag, field), "mag"), heard(s.mag)),
     )
+    return _gains(design)
 
 
 def heard(sensor: Sensor) -> float:
@@ -75,7 +98,7 @@ def heard(sensor: Sensor) -> float:
 
 
 def _sigma(model: ErrorModel, rate_hz: float, name: str) -> float:
-    return _within(math.hypot(white_sigma(model, rate_hz), model.quantum / math.sqrt(12.0)), name)
+    return _within(math.hypot(noise_sigma(model, rate_hz), model.quantum / math.sqrt(12.0)), name)
 
 
 def _within(sigma: float, name: str) -> float:
@@ -83,41 +106,38 @@ def _within(sigma: float, name: str) -> float:
     return min(max(sigma, least), most)
 
 
-Meter = tuple[float, float]  # standard deviation of a sample, samples per second
-
-
 @lru_cache(maxsize=256)
-def _gains(
-    drag_1_s: float,
-    gravity: float,
-    accel: Meter,
-    accel_walk: float,
-    gyro: float,
-    gyro_walk: float,
-    flow: Meter,
-    baro: Meter,
-    sonar: Meter,
-    mag: Meter,
-) -> Array:
+def _gains(d: Design) -> Array:
     row = np.empty(COLUMNS)
-    c, tilt_walk = drag_1_s, math.hypot(gyro / math.sqrt(DEVICE_RATE_HZ), TILT_WALK)
-    across = np.array([[-c, gravity, 0, 1], [0, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
-    walks = np.array([0.0, tilt_walk, gyro_walk, DISTURBANCE_WALK])
-    gain = steady_gains(across, walks, [([-c, 0, 0, 1], *accel), ([1, 0, 0, 0], *flow)])
-    row[ACCEL_V : FLOW_U + 1] = gain.ravel()
-
-    up = np.array([[0, 1, 0, 0], [0, -c, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
-    walks = np.array([0.0, 0.0, LIFT_WALK, accel_walk])
-    moving = [([0, -c, 1, 1], *accel), ([0, 1, 0, 0], *flow)]
-    row[LIFT_Z:SONAR_Z] = steady_gains(up, walks, [*moving, ([1, 0, 0, 0], *baro)]).ravel()
-    row[SONAR_Z:BARO_ZERO] = steady_gains(up, walks, [*moving, ([1, 0, 0, 0], *sonar)])[2]
-    row[BARO_ZERO] = 1.0 / (10.0 * baro[1])  # ten seconds
-
-    turn = np.array([[0, 1], [0, 0]], dtype=float)
-    row[MAG_PSI : MAG_RATE + 1] = steady_gains(turn, np.array([tilt_walk, gyro_walk]), [([1, 0], *mag)])[0]
+    row[ACCEL_V : FLOW_U + 1] = _across(d).ravel()
+    row[LIFT_Z:SONAR_Z] = _upwards(d, d.baro).ravel()
+    row[SONAR_Z:BARO_ZERO] = _upwards(d, d.sonar)[2]
+    row[BARO_ZERO] = 1.0 / (10.0 * d.baro[1])  # ten seconds
+    row[MAG_PSI : MAG_RATE + 1] = _turning(d)[0]
     row = np.array([float(f"{x:.9g}") for x in row])  # nine digits: the same bits whatever the BLAS
     row.setflags(write=False)
     return row
+
+
+def _across(d: Design) -> Array:
+    c = d.drag_1_s
+    a = np.array([[-c, d.gravity_m_s2, 0, 1], [0, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
+    walks = np.array([0.0, d.tilt_walk, d.gyro_walk, DISTURBANCE_WALK])
+    return steady_gains(a, walks, [([-c, 0, 0, 1], *d.accel), ([1, 0, 0, 0], *d.flow)])
+
+
+def _upwards(d: Design, height: Meter) -> Array:
+    """Return the gains of accelerometer, flow and a meter of the height."""
+    c = d.drag_1_s
+    a = np.array([[0, 1, 0, 0], [0, -c, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
+    walks = np.array([0.0, 0.0, LIFT_WALK, d.accel_walk])
+    moving = [([0, -c, 1, 1], *d.accel), ([0, 1, 0, 0], *d.flow)]
+    return steady_gains(a, walks, [*moving, ([1, 0, 0, 0], *height)])
+
+
+def _turning(d: Design) -> Array:
+    a = np.array([[0, 1], [0, 0]], dtype=float)
+    return steady_gains(a, np.array([d.tilt_walk, d.gyro_walk]), [([1, 0], *d.mag)])
 
 
 def steady_gains(a: Array, walks: Array, meters: list[tuple[list[float], float, float]]) -> Array:
@@ -137,9 +157,9 @@ def steady_gains(a: Array, walks: Array, meters: list[tuple[list[float], float, 
 
 def covariance(a: Array, walks: Array, meters: list[tuple[list[float], float, float]]) -> Array:
     """Return the steady covariance before an update, for the meters of `steady_gains`."""
-    dt = 1.0 / DEVICE_RATE_HZ
+    dt = 1.0 / BOARD_RATE_HZ
     h = np.array([row for row, _, _ in meters], dtype=float)
-    r = np.diag([sigma**2 * DEVICE_RATE_HZ / rate for _, sigma, rate in meters])
+    r = np.diag([sigma**2 * BOARD_RATE_HZ / rate for _, sigma, rate in meters])
     # process noise over one step by Simpson's rule: exact to dt^5 for these chains
     q = np.diag(walks**2)
     half, full = (np.asarray(expm(a * s), dtype=np.float64) for s in (dt / 2, dt))

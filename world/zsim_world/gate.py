@@ -4,14 +4,12 @@ In every physics tick, in this order: the firmware (every 5 ms) reads the newest
 drones are integrated; gusts move on (every 5 ms); drones meet; sensors that are due sample the new state.
 """
 
-import hashlib
 import math
 from pathlib import Path
-from typing import Any
 
-from numba import njit
 from numpy.typing import NDArray
 
+from zsim import presets
 from zsim_world import firmware, observer, sensors
 from zsim_world import rigid_body as body
 from zsim_world import sensor_set as ss
@@ -31,7 +29,7 @@ from zsim_world.arrays import (
     Time,
 )
 from zsim_world.battery import drained, percent
-from zsim_world.compiled import compiled
+from zsim_world.compiled import compiled, kernel
 from zsim_world.encounter import encounters
 from zsim_world.ground import drag_anchors
 from zsim_world.rigid_body import four, put, put_four, vector
@@ -39,7 +37,7 @@ from zsim_world.rotation import Vector, norm
 from zsim_world.vehicle import GRAVITY
 from zsim_world.wind import STEADY, blow
 
-# Every file with compiled code; the name of a kernel in numba's cache depends on their text
+# Every file with compiled code or with constants that are compiled in
 KERNEL_FILES = (
     "arrays.py",
     "battery.py",
@@ -59,6 +57,7 @@ KERNEL_FILES = (
     "vehicle.py",
     "wind.py",
 )
+SOURCES = (*(Path(__file__).parent / name for name in KERNEL_FILES), Path(str(presets.__file__)))
 WIND_STREAM = 6  # after the six sensors
 POSITION_MAX_M, RATE_MAX_RAD_S = 1e6, 1e4  # beyond, the integration has diverged
 
@@ -252,51 +251,32 @@ def _diverged(state: NDArray) -> int:
     return -1
 
 
-def _sources_digest() -> int:
-    """Return a number that changes with the text of any file compiled into the kernel."""
-    digest = hashlib.sha256()
-    for name in KERNEL_FILES:
-        digest.update((Path(__file__).parent / name).read_bytes())
-    return int.from_bytes(digest.digest()[:6], "little")
+@kernel(SOURCES)
+def advance(w: Arrays, ticks: int) -> tuple[int, float, int]:
+    """Integrate so many physics ticks; 0 ticks: take the samples of the present instant.
 
-
-def _build(sources: int, cache: bool) -> Any:
-    """Return the compiled kernel. numba's cache knows this file only: `sources` ties it to the others as well."""
-
-    @njit(error_model="numpy", fastmath=False, cache=cache)
-    def advance(w: Arrays, ticks: int) -> tuple[int, float, int]:
-        """Integrate so many physics ticks; 0 ticks: take the samples of the present instant.
-
-        Returns:
-            number of samples logged, least distance of two drones [m], diverged drone or -1.
-        """
-        time, bodies, boards, noise, senses, wind, gust = w
-        clock, device = time.clock, boards.device
-        logged, least = 0, math.inf if sources >= 0 else 0.0
-        bodies.touched.fill(0)
-        if ticks == 0:
-            least = _meet(wind, gust, bodies)
+    Returns:
+        number of samples logged, least distance of two drones [m], diverged drone or -1.
+    """
+    time, bodies, boards, noise, senses, wind, gust = w
+    clock, device = time.clock, boards.device
+    logged, least = 0, math.inf
+    bodies.touched.fill(0)
+    if ticks == 0:
+        least = _meet(wind, gust, bodies)
+        _accelerate(bodies)
+        logged = _sense(clock[TICK], True, logged, bodies, device, noise, senses)
+    for _ in range(ticks):
+        if clock[TICK] % clock[TICKS_PER_STEP] == 0:
+            _steer(time, bodies, boards)
+        _move(bodies, time.spans[DT])
+        clock[TICK] += 1
+        step = clock[TICK] % clock[TICKS_PER_STEP] == 0
+        if step:
+            _gusts(wind, gust, bodies.state, noise)
+            _drain(bodies)
+        least = min(least, _meet(wind, gust, bodies))
+        if step:
             _accelerate(bodies)
-            logged = _sense(clock[TICK], True, logged, bodies, device, noise, senses)
-        for _ in range(ticks):
-            if clock[TICK] % clock[TICKS_PER_STEP] == 0:
-                _steer(time, bodies, boards)
-            _move(bodies, time.spans[DT])
-            clock[TICK] += 1
-            step = clock[TICK] % clock[TICKS_PER_STEP] == 0
-            if step:
-                _gusts(wind, gust, bodies.state, noise)
-                _drain(bodies)
-            least = min(least, _meet(wind, gust, bodies))
-            if step:
-                _accelerate(bodies)
-            logged = _sense(clock[TICK], step, logged, bodies, device, noise, senses)
-        return logged, least, _diverged(bodies.state)
-
-    return advance
-
-
-try:
-    advance = _build(_sources_digest(), cache=True)
-except RuntimeError:  # neither beside this file nor in the user's cache may anything be written
-    advance = _build(_sources_digest(), cache=False)
+        logged = _sense(clock[TICK], step, logged, bodies, device, noise, senses)
+    return logged, least, _diverged(bodies.state)

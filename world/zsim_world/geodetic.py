@@ -1,13 +1,17 @@
 """Where GPS fixes lie on the Earth, compiled: `zsim.frames.enu_to_geodetic` for the few rows of a gate."""
 
 import math
+from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from zsim import frames
 from zsim.frames import WGS84_A_M, WGS84_F, enu_rows, geodetic_to_ecef
+from zsim_world import compiled
+from zsim_world.compiled import kernel
 
+SOURCES = tuple(Path(str(file)) for file in (__file__, compiled.__file__, frames.__file__))
 _E2 = WGS84_F * (2.0 - WGS84_F)
 _B_M = WGS84_A_M * (1.0 - WGS84_F)
 _CURVATURE_M = (WGS84_A_M**2 - _B_M**2) / _B_M
@@ -21,7 +25,8 @@ def anchor(latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[
     return enu_rows(latitude_deg, longitude_deg), geodetic_to_ecef((latitude_deg, longitude_deg, height_m))
 
 
-def _geodetic(position_m: Array, rows: Array, place_m: Array) -> Array:
+@kernel(SOURCES)
+def geodetic(position_m: Array, rows: Array, place_m: Array) -> Array:
     """Return WGS 84 latitude [deg], longitude [deg] and ellipsoidal height [m] of points in W.
 
     Args:
@@ -45,9 +50,3 @@ def _geodetic(position_m: Array, rows: Array, place_m: Array) -> Array:
         found[i, 1] = math.degrees(math.atan2(y, x))
         found[i, 2] = level * math.cos(lat) + z * s - WGS84_A_M * math.sqrt(1.0 - _E2 * s * s)
     return found
-
-
-try:
-    geodetic = njit(error_model="numpy", fastmath=False, cache=True)(_geodetic)
-except RuntimeError:  # neither beside this file nor in the user's cache may anything be written
-    geodetic = njit(error_model="numpy", fastmath=False)(_geodetic)

@@ -4,7 +4,8 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 
-from zsim.session import Mailbox, Sample, TimedMailbox
+from zsim.session import Mailbox, Sample
+from zsim.timed_mailbox import TimedMailbox
 
 TICK_S = 0.1  # how often a standing world looks at the wall clock
 
@@ -13,6 +14,7 @@ class Inputs:
     """What others publish: waited for with a limit or without, drained with the wall time of arrival."""
 
     def wait(self, timeout_s: float | None) -> None:
+        """Return when something has come, or after timeout_s; without a limit, now and then to look at the clock."""
         raise NotImplementedError
 
     def wait_for(self, wanted: set[str]) -> None:
@@ -20,12 +22,15 @@ class Inputs:
         self.wait(None)
 
     def drain(self) -> Iterator[tuple[int, Sample]]:
+        """Yield what has come, with the monotonic wall time of its arrival [ns]."""
         raise NotImplementedError
 
     def wake(self) -> None:
+        """Let a `wait` of another thread return."""
         raise NotImplementedError
 
     def close(self) -> None:
+        """Stop reading."""
         return
 
 

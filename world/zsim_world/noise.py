@@ -8,9 +8,10 @@ import math
 
 import numpy as np
 
+from zsim.presets import BOARD_RATE_HZ
 from zsim.scenario import Scenario
 from zsim.streams import stream
-from zsim_world.sensor_set import CHANNELS, CHANNELS_MAX, DEVICE_RATE_HZ, NOISE_WIDTH, SENSORS, channels, rate_of
+from zsim_world.sensor_set import CHANNELS, CHANNELS_MAX, NOISE_WIDTH, SENSORS, channels, rate_of
 
 WIDTHS = (*NOISE_WIDTH, 3)  # numbers per row: of a sample, of a gust
 
@@ -65,7 +66,7 @@ def _rows(scenario: Scenario, gates: int) -> list[int]:
     """Return how many rows of each stream a table needs, the sample at t = 0 included."""
     span = gates * scenario.time.gate_ms / 1000.0
     rates = [max(rate_of(getattr(d.sensors, name), name) for d in scenario.drones) for name in SENSORS]
-    return [math.ceil(span * rate) + 2 for rate in (*rates, DEVICE_RATE_HZ)]
+    return [math.ceil(span * rate) + 2 for rate in (*rates, BOARD_RATE_HZ)]
 
 
 def samples_per_gate(scenario: Scenario) -> int:

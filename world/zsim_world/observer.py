@@ -8,6 +8,7 @@ import math
 
 from numpy.typing import NDArray
 
+from zsim.presets import BOARD_RATE_HZ
 from zsim_world import gains as g
 from zsim_world import rotation as rot
 from zsim_world.compiled import compiled
@@ -16,7 +17,7 @@ from zsim_world.rotation import Quaternion, Vector, axpy
 from zsim_world.rotors import lagged
 from zsim_world.vehicle import DRAG, GRAVITY, MASS, ROTOR_LAG, STAND_HEIGHT, THRUST
 
-STEP_S = 0.005  # s, 200 Hz, the rate of the navigation board
+STEP_S = 1.0 / BOARD_RATE_HZ  # s
 
 # Columns of the belief, one row per drone
 ATTITUDE, GYRO_BIAS, VELOCITY, DISTURBANCE = 0, 4, 7, 10  # B to W; rad/s in B; m/s; m/s^2

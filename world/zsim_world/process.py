@@ -3,6 +3,7 @@
 Order of this file: `run`, the loop, what arrives, what rarely arrives, publication.
 """
 
+import contextlib
 import threading
 import time
 from collections import deque
@@ -11,23 +12,25 @@ from typing import Any
 
 import msgspec
 
-from zsim import batch, keys, messages, session
+from zsim import batch, keys, messages, rights, session
 from zsim.agent import Output
 from zsim.errors import DecodeError
 from zsim.health import HealthMeter
+from zsim.identity import Identity
 from zsim.messages import ControlAnswer
 from zsim.session import Query, Sample, Session
+from zsim_world import replays
+from zsim_world.barrier import WORLD, Participant
 from zsim_world.history import History
 from zsim_world.inputs import TICK_S, Direct, Inputs, Timed
+from zsim_world.recovery import unheard
 from zsim_world.world import World
 
 STUCK_NS = 2_000_000_000  # wall time in one turn from which on a person is told; a turn takes milliseconds
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
-REPLAY_BYTES_MAX = 8_000_000  # of one answer, oldest first; who lacks more asks again
 RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
-WORLD = "world"
 PHASE_EVERY = 10  # cluster states between two looks at the phase that progress shows
 Tell = Callable[[str, Any, str], None]
 # Outputs first, dones last: whoever says done has sent its outputs before, on the same link.
@@ -49,7 +52,8 @@ class WorldProcess:
         link: a listening session.
         world: what to run.
         stopped: asked every TICK_S; a text ends the run with it as the reason.
-        tell: told every ("clock" or "event", message, phase of the clusters); shows progress.
+        tell: told every ("clock" or "event", message, phase of the clusters) and every ("health", message, process);
+            shows progress.
     """
 
     def __init__(
@@ -63,7 +67,6 @@ class WorldProcess:
         self._world = world
         self._stopped = stopped
         self._tell = tell
-        self._state_decoder = msgspec.msgpack.Decoder(messages.ClusterState)
         self._history = History()
         self._passed: batch.Batch = []
         self._head = msgspec.msgpack.Decoder(_Head)
@@ -80,10 +83,14 @@ class WorldProcess:
         self._start_wall_ns = 0
         self._start_sim_ns = 0
         self._paced_rate = 0.0
-        self.health = HealthMeter(WORLD)
+        self.health = HealthMeter(WORLD, host=link.host)
 
     def run(self) -> None:
-        """Run to the end: wait for the participants, integrate, say goodbye."""
+        """Run to the end: wait for the participants, integrate, say goodbye.
+
+        Raises:
+            DivergedError: the state of a drone was no longer finite; everybody has been told the end before.
+        """
         boxes = [self._link.subscribe(expression) for expression in INPUTS]
         self._inputs: Inputs = Timed(boxes) if self._world.mode == "realtime" else Direct(boxes)
         self._announce()
@@ -97,6 +104,8 @@ class WorldProcess:
             self._over.set()
             ticker.join()
             self._inputs.close()
+        if self._world.diverged:
+            raise self._world.diverged
 
     def _announce(self) -> None:
         info = self._world.info()
@@ -105,6 +114,7 @@ class WorldProcess:
             keys.INFO,
             keys.CLOCK,
             keys.CONTROL,
+            keys.replay("*"),
             "drone/*/sensor/status",
             "drone/*/truth",
             "drone/*/estimate",
@@ -136,7 +146,8 @@ class WorldProcess:
             self._world.missed_own_deadline()
         self._world.advance(wall_ns)
         self._flush()
-        self._publish_view(wall_ns)
+        if self._world.diverged is None:
+            self._publish_view(wall_ns)
         self.health.step(time.monotonic_ns() - wall_ns)
 
     def _due_ns(self, wall_ns: int) -> int:
@@ -184,12 +195,12 @@ class WorldProcess:
 
     def _take_in_all(self) -> None:
         for wall_ns, sample in self._inputs.drain():
-            self.health.received += 1
-            self._passed.append((sample.key, sample.payload))
             self._take_in(wall_ns, sample)
 
     def _take_in(self, wall_ns: int, sample: Sample) -> None:
         key = sample.key
+        self.health.received += 1
+        self._passed.append(sample)
         try:
             if key.endswith(("/estimate", "/state")):
                 self._pass_on(key, sample.payload)
@@ -197,32 +208,40 @@ class WorldProcess:
                 message = messages.decode(key, sample.payload)
                 self._history.add(key, sample.payload, message.t_ns)
                 self._world.handle(key, message, wall_ns)
+                if type(message) is messages.Health:
+                    self._tell("health", message, keys.thing(key))
             elif not key.startswith("view/"):
                 raise DecodeError(f"{key}: only the world publishes here, or the key is not of the contract")
-        except (DecodeError, msgspec.MsgspecError) as error:
+        except DecodeError as error:
             self.health.refused += 1
             self._world.refuse("somebody", key[:80], str(error))
             self._count_unread(sample)
 
     def _count_unread(self, sample: Sample) -> None:
         """Count an output that was refused, so that its sender's done is not taken to be short of it."""
-        try:
-            self._world.output_of(self._head.decode(sample.payload).source)
-        except msgspec.MsgspecError:
-            return  # nobody can be named
+        with contextlib.suppress(DecodeError):  # nobody can be named
+            self._world.output_of(self._head_of(sample.key, sample.payload).source)
 
     def _pass_on(self, key: str, payload: bytes) -> None:
         """Keep an output that the hub only relays, and count it for the done of who sent it."""
-        head = self._head.decode(payload)
+        head = self._head_of(key, payload)
+        if head.t_ns > self._world.now_ns:
+            raise DecodeError(f"{key}: t_ns is {head.t_ns}; must be <= {self._world.now_ns}, the newest gate")
         self._history.add(key, payload, head.t_ns)
         role = "estimator" if key.startswith("drone/") else "controller"
         if role == "controller":
-            self._look_at_phase(payload)
+            self._look_at_phase(key, payload)
         self._world.output_of(head.source or f"{role}.{keys.thing(key)}")
 
-    def _look_at_phase(self, payload: bytes) -> None:
+    def _head_of(self, key: str, payload: bytes) -> _Head:
+        try:
+            return self._head.decode(payload)
+        except messages.REFUSALS as error:
+            raise DecodeError(f"{key}: {error}; must be a map with t_ns and seq") from error
+
+    def _look_at_phase(self, key: str, payload: bytes) -> None:
         if self._states_seen % PHASE_EVERY == 0:
-            self._phase = self._state_decoder.decode(payload).phase
+            self._phase = messages.decode_as(messages.ClusterState, payload, key).phase
         self._states_seen += 1
 
     def _recover_short(self) -> None:
@@ -230,13 +249,23 @@ class WorldProcess:
         if self._world.mode == "realtime":
             return
         for participant in self._world.barrier.short():
-            answer = self._link.request(keys.process(participant.name, "outputs"), "outputs", WORLD, RECOVERY_S)
-            for key, payload in answer.result or ():
-                self._take_in(time.monotonic_ns(), Sample(key, payload))
-            if participant.missing:
-                text = f"{participant.name}: {participant.missing} of its outputs did not come"
-                self._world.event("outputs_missing", participant.name, text, missing=participant.missing)
-                participant.missing = 0
+            for sample in self._unheard(participant):
+                self._take_in(time.monotonic_ns(), sample)
+            missing = participant.write_off()
+            if missing:
+                text = f"{participant.name}: {missing} of its outputs did not come"
+                self._world.event("outputs_missing", participant.name, text, missing=missing)
+
+    def _unheard(self, participant: Participant) -> list[Sample]:
+        """Return what a participant has kept of its outputs and that has not come."""
+        key = keys.process(participant.name, "outputs")
+        try:
+            answer = self._link.request(key, "outputs", WORLD, timeout_s=RECOVERY_S)
+            return unheard(answer.result, participant.done_ns, self._history) if answer.ok else []
+        except DecodeError as error:
+            self.health.refused += 1
+            self._world.refuse(participant.name, key, str(error))
+            return []
 
     # What arrives rarely, from other threads
 
@@ -275,7 +304,9 @@ class WorldProcess:
             self._serve_token(*self._tokens.popleft())
         if self.health.due():
             seq, self._health_seq = self._health_seq, self._health_seq + 1
-            self._publish(Output(keys.process(WORLD, "health"), self.health.message(self._world.now_ns, seq)))
+            health = self.health.message(self._world.now_ns, seq)
+            self._publish(Output(keys.process(WORLD, "health"), health))
+            self._tell("health", health, WORLD)
 
     def _serve_token(self, name: str, alive: bool) -> None:
         if not alive and keys.token(name) not in self._link.tokens(keys.token(name), timeout_s=RECOVERY_S):
@@ -284,30 +315,31 @@ class WorldProcess:
             self._flush()
 
     def _serve_query(self, query: Query) -> None:
-        if query.expression != keys.CONTROL:
+        asker = keys.thing(query.expression) if keys.matches(keys.replay("*"), query.expression) else None
+        if query.expression != keys.CONTROL and asker is None:
             for key, payload in self._history.last(query.expression):
                 query.reply(key, payload)
             query.end()
             return
         try:
-            request = query.request()
-            answer = self._replay(request) if request.op == "replay" else self._world.control(request)
+            answer = self._do(query.request(), asker)
         except DecodeError as error:
             answer = ControlAnswer(ok=False, error=str(error))
         query.answer(answer)
         self._flush()
 
-    def _replay(self, request: messages.ControlRequest) -> ControlAnswer:
-        from_ns, expressions = request.args.get("from_ns"), request.args.get("keys")
-        if not isinstance(from_ns, int) or not isinstance(expressions, list) or len(expressions) > 1000:
-            return ControlAnswer(ok=False, error="replay: needs from_ns (whole number) and keys (list of texts)")
-        result, size = [], 0
-        for key, payload in self._history.since(from_ns, [str(expression) for expression in expressions]):
-            size += len(payload)
-            if size > REPLAY_BYTES_MAX:
-                break
-            result.append([key, payload])
-        return ControlAnswer(ok=True, result=result)
+    def _do(self, request: messages.ControlRequest, asker: str | None) -> ControlAnswer:
+        """Do what is asked on `world/control`, or, by a process of which access control knows the name, on its own."""
+        if request.op == "replay":
+            return replays.answer(request, self._history, self._readable_by(asker))
+        if asker is not None:
+            return ControlAnswer(ok=False, error=f"op is {request.op[:40]!r}; must be replay")
+        return self._world.control(request)
+
+    def _readable_by(self, asker: str | None) -> tuple[str, ...]:
+        if asker is None or not self._link.guarded:
+            return ("**",)
+        return rights.of(asker, self._world.scenario).reads
 
     # Publication
 
@@ -358,13 +390,14 @@ def run(
     stopped: Callable[[], str | None] = lambda: None,
     tell: Tell = lambda kind, message, phase: None,
     ready: Callable[[], None] = lambda: None,
+    identity: Identity | None = None,
 ) -> None:
     """Listen on the endpoints, say that it is `ready`, and run the world to its end.
 
     Raises:
-        SessionError: an endpoint is taken.
+        SessionError: an endpoint is taken, or the identity is of no use.
     """
     mode: session.Mode = "lockstep" if world.mode == "lockstep" else "realtime"
-    with session.listen(endpoints, world.scenario.federation, mode) as link:
+    with session.listen(endpoints, world.scenario.federation, mode, identity) as link:
         ready()
         WorldProcess(link, world, stopped, tell).run()

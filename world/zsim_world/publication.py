@@ -7,13 +7,9 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from zsim import keys, messages
-from zsim.scenario import Scenario
-from zsim_world.fleet import Fleet, Sample
+from zsim_world.fleet import GPS_FIX, GPS_SATELLITES, Fleet, Sample
 
-GPS_FIX_3D = 3  # NMEA: 3 = three-dimensional fix
-GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone
-
-Passed = tuple[str, Any]  # key and message; a plain tuple, for a fleet has thousands of them a second
+Outgoing = tuple[str, Any]  # key and message; a plain tuple, for a fleet has thousands of them a second
 
 
 class _Slot:
@@ -28,9 +24,8 @@ class _Slot:
 class Publication:
     """Builds the messages of each gate and counts them per key."""
 
-    def __init__(self, fleet: Fleet, scenario: Scenario) -> None:
+    def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        self._sigma_m = [drone.sensors.gps.position_m.noise for drone in scenario.drones]
         names = fleet.names
         self._status_keys = [keys.status(name) for name in names]
         self._truth_keys = [keys.truth(name) for name in names]
@@ -38,9 +33,9 @@ class Publication:
         build = {"imu": _imu, "gps": self._gps, "mag": _mag, "baro": _baro, "sonar": _sonar, "flow": _flow}
         self._slots = [{kind: _Slot(keys.sensor(name, kind), build[kind]) for kind in keys.SENSORS} for name in names]
 
-    def gate(self, truth: Any, holder: Callable[[int], str | None]) -> Iterator[Passed]:
+    def gate(self, truth: Any, holder: Callable[[int], str | None]) -> Iterator[Outgoing]:
         """Yield the messages of the gate that the fleet stands at."""
-        by_drone: list[list[Passed]] = [[] for _ in self._status_keys]
+        by_drone: list[list[Outgoing]] = [[] for _ in self._status_keys]
         for sample in self._fleet.samples():
             slot = self._slots[sample.drone][sample.sensor]
             by_drone[sample.drone].append((slot.key, slot.build(sample, slot.seq)))
@@ -56,7 +51,7 @@ class Publication:
         v: Any = s.values
         return messages.Gps(
             s.t_ns, seq, s.t_sample_ns, v[0], v[1], v[2], v[3:6], v[6:9],
-            self._sigma_m[s.drone], GPS_FIX_3D, GPS_SATELLITES,
+            self._fleet.gps_sigma_m[s.drone], GPS_FIX, GPS_SATELLITES,
         )  # fmt: skip
 
     def _status(self, drone: int, count: int, commander: str | None) -> messages.Status:

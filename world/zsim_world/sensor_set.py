@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from zsim.frames import quaternion_from_rpy
+from zsim.presets import BOARD_RATE_HZ
 from zsim.scenario import ErrorModel, Mag, Scenario, Sensor, Sensors
 
 SensorName = Literal["imu", "gps", "mag", "baro", "sonar", "flow"]
@@ -18,7 +19,6 @@ CHANNELS = (6, 6, 3, 1, 1, 3)  # numbers with an error of their own
 VALUES = (6, 6, 3, 2, 2, 4)  # numbers of a sample as the kernel gives it (pressure, validity, quality added)
 CHANNELS_MAX = 6
 NOISE_WIDTH = tuple(2 * n + 1 for n in CHANNELS)  # per sample: white, walk of the bias, and one for drop-out
-DEVICE_RATE_HZ = 200.0  # Hz, the navigation board's IMU and the firmware (AR.Drone 2.0)
 
 # Columns of `config[drone, sensor]`
 WHITE, WALK, QUANTUM = 0, 6, 12  # per channel: std per sample, std of the bias's step per sample, step
@@ -29,11 +29,12 @@ COLUMNS = 28
 
 # Columns of `schedule[drone, sensor]`: sample n falls due at the first physics tick >= n * NUMERATOR / DENOMINATOR
 NUMERATOR, DENOMINATOR, COUNT, DUE = 0, 1, 2, 3
+DENOMINATOR_MAX = 1000  # of a rate in Hz: any is met within 0.05 %, and n * NUMERATOR stays below 2^63
 
 
 def rate_of(sensor: Sensor, name: str) -> float:
-    """Return the rate [Hz] at which the device samples: the IMU always at the board's 200 Hz."""
-    return DEVICE_RATE_HZ if name == "imu" else sensor.rate_hz
+    """Return the rate [Hz] at which the device samples: the IMU always at the board's."""
+    return BOARD_RATE_HZ if name == "imu" else sensor.rate_hz
 
 
 def channels(sensors: Sensors, name: str) -> list[ErrorModel]:
@@ -54,7 +55,7 @@ def radians(model: ErrorModel) -> ErrorModel:
     return ErrorModel(**{field: math.radians(getattr(model, field)) for field in ErrorModel.__struct_fields__})
 
 
-def white_sigma(model: ErrorModel, rate_hz: float) -> float:
+def noise_sigma(model: ErrorModel, rate_hz: float) -> float:
     """Return the standard deviation of a sample's white noise: noise, and density over the device's rate."""
     return math.hypot(model.noise, model.density * math.sqrt(rate_hz))
 
@@ -72,7 +73,7 @@ def _fill(row: NDArray[np.float64], sensors: Sensors, name: str) -> None:
     sensor: Sensor = getattr(sensors, name)
     rate = rate_of(sensor, name)
     for k, model in enumerate(channels(sensors, name)):
-        row[WHITE + k] = white_sigma(model, rate)
+        row[WHITE + k] = noise_sigma(model, rate)
         row[WALK + k] = model.bias_walk / math.sqrt(rate)
         row[QUANTUM + k] = model.quantum
     row[MOUNT : MOUNT + 3] = sensor.mount.position_m
@@ -88,7 +89,8 @@ def schedule(scenario: Scenario) -> NDArray[np.int64]:
     for i, drone in enumerate(scenario.drones):
         for s, name in enumerate(SENSORS):
             sensor: Sensor = getattr(drone.sensors, name)
-            period = 1_000_000 / Fraction(sensor.rate_hz).limit_denominator(1000) / tick_us  # in ticks
+            rate = Fraction(sensor.rate_hz).limit_denominator(DENOMINATOR_MAX)
+            period = 1_000_000 / rate / tick_us  # in ticks
             table[i, s, NUMERATOR], table[i, s, DENOMINATOR] = period.numerator, period.denominator
     return table
 
@@ -96,4 +98,4 @@ def schedule(scenario: Scenario) -> NDArray[np.int64]:
 def heading_sigma(mag: Mag, horizontal_ut: float) -> float:
     """Return the standard deviation [rad] of a heading from one magnetometer sample."""
     model = mag.field_ut
-    return math.hypot(white_sigma(model, mag.rate_hz), model.quantum / math.sqrt(12.0)) / max(horizontal_ut, 1.0)
+    return math.hypot(noise_sigma(model, mag.rate_hz), model.quantum / math.sqrt(12.0)) / max(horizontal_ut, 1.0)

@@ -56,8 +56,12 @@ def height(p_WB: Vector, q_WB: Quaternion, p_BS: Vector) -> float:
 
 @compiled
 def pressure(altitude_m: float) -> float:
-    """Return the static pressure [Pa] of the standard atmosphere at an altitude above sea level (ISO 2533)."""
-    return SEA_LEVEL_PA * math.pow(1.0 - LAPSE_1_M * altitude_m, PRESSURE_EXPONENT)
+    """Return the static pressure [Pa] of the standard atmosphere at an altitude above sea level (ISO 2533).
+
+    It holds to 11 km, which no scenario allows to exceed; a drone that a wind carries beyond finds the same law, and
+    where that ends, at 44 km, a vacuum.
+    """
+    return SEA_LEVEL_PA * math.pow(max(1.0 - LAPSE_1_M * altitude_m, 0.0), PRESSURE_EXPONENT)
 
 
 @compiled
@@ -66,10 +70,10 @@ def sonar(p_WB: Vector, q_WB: Quaternion, p_BS: Vector, q_BS: Quaternion, range_
 
     Without an echo (beyond range_max, or the beam too far from the vertical) the distance is range_max.
     """
-    down = -rotate(q_WB, z_axis(q_BS))[2]
-    if -down < SONAR_COSINE_MIN:
+    upright = rotate(q_WB, z_axis(q_BS))[2]  # cosine between beam and vertical
+    if upright < SONAR_COSINE_MIN:
         return range_max, False
-    distance = max(height(p_WB, q_WB, p_BS), 0.0) / -down
+    distance = max(height(p_WB, q_WB, p_BS), 0.0) / upright
     return min(distance, range_max), distance <= range_max
 
 

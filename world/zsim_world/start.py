@@ -14,11 +14,20 @@ from zsim_world.noise import NoiseTable, samples_per_gate
 
 def arrays(scenario: Scenario, noise: NoiseTable) -> Arrays:
     """Return the arrays of the kernel for a scenario."""
-    drones, field = scenario.drones, scenario.environment
-    n, log = len(drones), samples_per_gate(scenario) + 1
-    row = np.array([vehicle.parameters(drone, field) for drone in drones])
     dt = scenario.time.physics_dt_ms / 1000.0
-    bodies = Bodies(
+    row = np.array([vehicle.parameters(drone, scenario.environment) for drone in scenario.drones])
+    time = Time(
+        clock=np.array([0, round(observer.STEP_S / dt)], dtype=np.int64),
+        spans=np.array([dt, scenario.silence.hover_s, scenario.silence.land_s]),
+    )
+    numbers = Noise(table=noise.table, at=noise.at, cursor=noise.cursor)
+    boards, senses = _boards(scenario, row), _senses(scenario, noise)
+    return Arrays(time, _bodies(scenario, row), boards, numbers, senses, _wind(scenario), noise.gust)
+
+
+def _bodies(scenario: Scenario, row: np.ndarray) -> Bodies:
+    drones, n = scenario.drones, len(scenario.drones)
+    return Bodies(
         vehicle=row,
         state=np.array([_standing(*each) for each in zip(drones, row, strict=True)]),
         accel=np.zeros((n, 6)),
@@ -30,9 +39,13 @@ def arrays(scenario: Scenario, noise: NoiseTable) -> Arrays:
         touching=np.zeros((n, n), dtype=np.int8),
         touched=np.zeros((n, n), dtype=np.int8),
     )
-    boards = Boards(
+
+
+def _boards(scenario: Scenario, row: np.ndarray) -> Boards:
+    drones, n = scenario.drones, len(scenario.drones)
+    return Boards(
         setting=np.array([firmware.settings(drone) for drone in drones]),
-        gain=np.array([gains.gain_row(drone, field) for drone in drones]),
+        gain=np.array([gains.gain_row(drone, scenario.environment) for drone in drones]),
         calibration=np.array([_calibration(drone, scenario) for drone in drones]),
         setpoint=np.zeros((n, firmware.SETPOINT_COLUMNS)),
         set_tick=np.zeros(n, dtype=np.int64),
@@ -40,7 +53,11 @@ def arrays(scenario: Scenario, noise: NoiseTable) -> Arrays:
         belief=np.array([_first_belief(height) for height in row[:, vehicle.STAND_HEIGHT]]),
         device=np.zeros((n, observer.REGISTERS)),
     )
-    senses = Senses(
+
+
+def _senses(scenario: Scenario, noise: NoiseTable) -> Senses:
+    field, log = scenario.environment, samples_per_gate(scenario) + 1
+    return Senses(
         place=np.array([*field.magnetic_field_ut, field.height_m]),
         config=sensor_set.config(scenario),
         schedule=sensor_set.schedule(scenario),
@@ -48,12 +65,6 @@ def arrays(scenario: Scenario, noise: NoiseTable) -> Arrays:
         whose=np.zeros((log, 3), dtype=np.int64),
         value=np.zeros((log, 6)),
     )
-    time = Time(
-        clock=np.array([0, round(observer.STEP_S / dt)], dtype=np.int64),
-        spans=np.array([dt, scenario.silence.hover_s, scenario.silence.land_s]),
-    )
-    numbers = Noise(table=noise.table, at=noise.at, cursor=noise.cursor)
-    return Arrays(time, bodies, boards, numbers, senses, _wind(scenario), noise.gust)
 
 
 def _standing(drone: Drone, row: np.ndarray) -> np.ndarray:

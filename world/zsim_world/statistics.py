@@ -1,8 +1,13 @@
-"""What a run measures of itself: rate, lag, command age, deadline misses."""
+"""What a run measures of itself: rate, command age, deadline misses, how near drones came to each other."""
 
+import math
 from collections import deque
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
+
+from zsim_world.barrier import Participant
 
 GATES_KEPT = 1024  # gates whose publication time is remembered for the age of commands
 AGES_KEPT = 1_000_000  # ages kept for the percentiles; 8 MB
@@ -16,11 +21,13 @@ class Ages:
         self._ages_ns: deque[int] = deque(maxlen=AGES_KEPT)
 
     def published(self, t_ns: int, wall_ns: int) -> None:
+        """Note when the gate t_ns was published."""
         self._published[t_ns] = wall_ns
         if len(self._published) > GATES_KEPT:
             del self._published[next(iter(self._published))]
 
     def arrived(self, t_ns: int, wall_ns: int) -> None:
+        """Note when a command stamped t_ns arrived; its age is unknown where no gate of that stamp is remembered."""
         published = self._published.get(t_ns)
         if published is not None:
             self._ages_ns.append(wall_ns - published)
@@ -43,6 +50,7 @@ class Rate:
         self._last_wall_ns = 0
 
     def gate(self, t_ns: int, wall_ns: int) -> None:
+        """Note when the gate t_ns was published."""
         if self._start_wall_ns is None:
             self._start_wall_ns = wall_ns
         self._last_wall_ns = wall_ns
@@ -60,4 +68,51 @@ class Rate:
     @property
     def wall_s(self) -> float:
         """Return the wall time from the first gate to the last."""
-        return (self._last_wall_ns - (self._start_wall_ns or self._last_wall_ns)) / 1e9
+        return 0.0 if self._start_wall_ns is None else (self._last_wall_ns - self._start_wall_ns) / 1e9
+
+
+class Measurements:
+    """All that a run tells of itself at its end.
+
+    Attributes:
+        own_misses: gates that the world itself published too late.
+        closest_m: least distance between two drones so far, standing ones too [m]; inf for a single one.
+    """
+
+    def __init__(self, closest_m: float) -> None:
+        self.ages = Ages()
+        self.rate = Rate()
+        self.own_misses = 0
+        self.closest_m = closest_m
+        self._deadlines = 0
+
+    def gate(self, t_ns: int, wall_ns: int) -> None:
+        """Note when the gate t_ns was published."""
+        self.ages.published(t_ns, wall_ns)
+        self.rate.gate(t_ns, wall_ns)
+
+    def apart(self, closest_m: float) -> None:
+        """Note the least distance between two drones in a gate [m]."""
+        self.closest_m = min(self.closest_m, closest_m)
+
+    def deadlines_of(self, participants: Iterable[Participant], need_ns: int) -> None:
+        """Count whose done for need_ns was due, and whose is missing."""
+        for participant in participants:
+            if participant.required_ns(need_ns) is not None:
+                self._deadlines += 1
+                participant.deadline_misses += participant.owes(need_ns)
+
+    def result(self, t_ns: int, participants: Iterable[Participant]) -> dict[str, Any]:
+        """Return the figures of a run that got to t_ns."""
+        by_name = {p.name: p.deadline_misses for p in participants if p.gating}
+        sim_s, wall_s = t_ns / 1e9, self.rate.wall_s
+        return {
+            "sim_s": sim_s,
+            "wall_s": wall_s,
+            "real_time_factor": sim_s / wall_s if wall_s > 0 else 0.0,
+            "deadlines": self._deadlines,
+            "deadline_misses": sum(by_name.values()) + self.own_misses,
+            "deadline_misses_by": {**by_name, "world": self.own_misses},
+            "command_age_ms": self.ages.summary_ms(),
+            "closest_m": self.closest_m if math.isfinite(self.closest_m) else None,
+        }

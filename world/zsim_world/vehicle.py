@@ -9,6 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.presets import SEA_LEVEL_KG_M3
 from zsim.scenario import Drone, Environment
 
 MASS, INERTIA_X, INERTIA_Y, INERTIA_Z = 0, 1, 2, 3  # kg, kg m^2
@@ -24,7 +25,7 @@ ROTOR_RADIUS, ROTOR_INERTIA = 18, 19  # m, kg m^2
 SIZE, HULL_RADIUS, STAND_HEIGHT = 20, 21, 22  # of the AR.Drone's, m, m
 COLUMNS = 23
 
-REFERENCE_DENSITY_KG_M3 = 1.225  # kg/m^3, ISA sea level: k_F, k_M and the drag of a scenario hold there
+REFERENCE_DENSITY_KG_M3 = SEA_LEVEL_KG_M3  # k_F, k_M and the drag of a scenario hold there
 # The AR.Drone's rotor; another aircraft's is taken as similar in shape: k_F grows as R^4, k_M and the inertia as R^5
 REFERENCE_THRUST_N_S2, REFERENCE_TORQUE_NM_S2 = 8.048e-6, 2.423e-7  # Li, MSc thesis, TU Delft 2014, through AuRoRA
 ROTOR_INERTIA_KG_M2 = 2.029585e-5  # kg m^2, rotor and gear (Li 2014, as above)
@@ -41,6 +42,7 @@ FOOT_DAMPING_RATIO = 0.4  # of critical, of the aircraft bouncing on its four fe
 FRICTION = 0.6  # foam on a hard floor, typical
 HULL_FREQUENCY_RAD_S = 80.0  # rad/s, of two equal drones pressed together: 3 m/s dent 4 cm of foam
 HULL_DAMPING_RATIO = 0.3  # of critical: rebound at about 0.4 of the speed of approach
+COULOMB_PER_MAH = 3.6  # C per mAh: 3600 s to the hour
 BATTERY_V = 11.1  # V, three lithium-polymer cells, nominal
 EFFICIENCY = 0.9  # electric to shaft power, set so that a full 1000 mAh hovers for 12 min (10-12 min published)
 BOARD_W = 4.6  # W, main board, camera and radio; set with EFFICIENCY
@@ -77,7 +79,7 @@ def parameters(drone: Drone, environment: Environment) -> NDArray[np.float64]:
     reduced = drone.mass_kg / 2.0
     row[HULL_STIFFNESS] = reduced * HULL_FREQUENCY_RAD_S**2
     row[HULL_DAMPING] = 2.0 * HULL_DAMPING_RATIO * reduced * HULL_FREQUENCY_RAD_S
-    row[CAPACITY] = drone.battery_mah * 3.6 * BATTERY_V  # 1 mAh is 3.6 C
+    row[CAPACITY] = drone.battery_mah * COULOMB_PER_MAH * BATTERY_V
     row[ROTOR_RADIUS] = ROTOR_RADIUS_M * (drone.thrust_n_s2 / REFERENCE_THRUST_N_S2) ** 0.25
     row[ROTOR_INERTIA] = ROTOR_INERTIA_KG_M2 * drone.torque_nm_s2 / REFERENCE_TORQUE_NM_S2
     return row

@@ -14,10 +14,10 @@ from zsim.scenario import OnDeath, Scenario
 from zsim_world.barrier import Barrier, Participant
 from zsim_world.command_desk import CommandDesk
 from zsim_world.commander import Commanders
-from zsim_world.fleet import Fleet
-from zsim_world.publication import Passed, Publication
+from zsim_world.fleet import DivergedError, Fleet
+from zsim_world.publication import Outgoing, Publication
 from zsim_world.requests import Requests, brief
-from zsim_world.statistics import Ages, Rate
+from zsim_world.statistics import Measurements
 from zsim_world.truth_hash import TruthHash
 
 ON_DEATH: dict[str, OnDeath] = {
@@ -38,6 +38,10 @@ class World:
         rate: simulated per wall seconds to pace at; 0 = as fast as possible.
         wall_ns: monotonic wall time.
         run_id: given by a launcher, and by tests that compare records.
+
+    Attributes:
+        ended: why the run is over, None while it goes on.
+        diverged: what is to be raised once everybody has been told the end, None for a state that stayed finite.
     """
 
     def __init__(
@@ -55,28 +59,24 @@ class World:
         self.gate_ns = round(scenario.time.gate_ms * 1e6)
         self.delay_ns = scenario.time.command_delay_gates * self.gate_ns
         self.last_ns = round(scenario.duration_s * 1e9) // self.gate_ns * self.gate_ns
-        self.outbox: list[Passed] = []
+        self.outbox: list[Outgoing] = []
         self.state = "waiting"
         self.ended: str | None = None
+        self.diverged: DivergedError | None = None
         self.refused = 0
-        self.dropped: set[str] = set()
         self._wall_ns = wall_ns
         self._start_wall_ns = wall_ns()
         self.fleet = Fleet(scenario)
-        self._publication = Publication(self.fleet, scenario)
+        self._publication = Publication(self.fleet)
         self.index = {name: i for i, name in enumerate(self.fleet.names)}
         self.barrier = Barrier(self.run_id, self.gate_ns, expected(scenario))
         self.commanders = Commanders(self.fleet.names)
         self._desk = CommandDesk(self)
         self._requests = Requests(self)
         self._hash = TruthHash(self.fleet.count)
-        self._ages = Ages()
-        self._clock_rate = Rate()
+        self._measured = Measurements(self.fleet.closest_m())
         self.steps_allowed = 0
-        self._min_separation_m = float("inf")
         self._told: dict[tuple[str, str], int] = {}
-        self._deadlines = 0
-        self._world_misses = 0
         self._seq: dict[str, int] = {}
 
     @property
@@ -123,8 +123,8 @@ class World:
             self._on_done(name, message, wall_ns)
         elif kind == "drone" and what.startswith("cmd/"):
             self.barrier.received(message.source)
-            self._ages.arrived(message.t_ns, wall_ns)
-            self._desk.take(name, what[4:], message)
+            if self._desk.take(name, what[4:], message):
+                self._measured.ages.arrived(message.t_ns, wall_ns)
         elif kind == "process" and what == "join":
             self._on_join(name, message, wall_ns)
         elif kind == "process" and what == "bye":
@@ -170,7 +170,6 @@ class World:
         if participant is not None:
             self.event("leave", name, f"{name} left: {message.reason}", source=name, reason=message.reason)
             self._leave_drones(name)
-            self.dropped.add(name)
             if self.state == "waiting" and name in expected(self.scenario):
                 self.barrier.expect(name)
             if participant.role == "recorder" and not self.ended:
@@ -188,7 +187,6 @@ class World:
             self._leave_drones(name)
         if what == "drop":
             self.barrier.remove(name)
-            self.dropped.add(name)
             self.event("drop", name, f"{name} is waited for no longer", from_ns=self.now_ns)
         elif what == "end":
             self.stop(f"{name} died")
@@ -225,7 +223,7 @@ class World:
         return answer
 
     def stop(self, reason: str) -> None:
-        """End the run after the present gate."""
+        """End the run after the present gate; of several reasons the first is told."""
         if self.ended is None:
             self.ended = reason
 
@@ -256,34 +254,40 @@ class World:
         return self.barrier.waiting_for(self.now_ns - self.delay_ns, wall_ns, self._start_wall_ns)
 
     def advance(self, wall_ns: int) -> None:
-        """Go to the next gate (or publish gate 0) and put all its messages into the outbox."""
+        """Go to the next gate (or publish gate 0) and put all its messages into the outbox.
+
+        A state that is no longer finite ends the run at the gate before; see `diverged`.
+        """
         if self.state == "waiting":
             self.state = "running"
-        else:
-            self._count_deadlines()
-            self._desk.apply(self.now_ns)
-            self.fleet.advance()
-            self.steps_allowed = max(0, self.steps_allowed - 1)
-            self._tell_collisions()
+        elif not self._integrate():
+            return
         self._publish_gate(wall_ns)
         if self.now_ns >= self.last_ns:
             self.stop("the scenario's duration is over")
 
-    def _count_deadlines(self) -> None:
-        if self.mode != "realtime":
-            return
-        need_ns = self.now_ns - self.delay_ns
-        for participant in self.barrier.participants.values():
-            if participant.required_ns(need_ns) is not None:
-                self._deadlines += 1
-                participant.deadline_misses += participant.owes(need_ns)
+    def _integrate(self) -> bool:
+        """Integrate one gate; return whether the state is still finite."""
+        if self.mode == "realtime":
+            self._measured.deadlines_of(self.barrier.participants.values(), self.now_ns - self.delay_ns)
+        self._desk.apply(self.now_ns)
+        try:
+            self.fleet.advance()
+        except DivergedError as error:
+            self.diverged = error
+            self.event("diverged", error.drone, str(error))
+            self.stop(str(error))
+            return False
+        self.steps_allowed = max(0, self.steps_allowed - 1)
+        self._measured.apart(self.fleet.closest_m())
+        self._tell_collisions()
+        return True
 
     def missed_own_deadline(self) -> None:
         """Count a gate that the world itself published more than a gate late."""
-        self._world_misses += 1
+        self._measured.own_misses += 1
 
     def _tell_collisions(self) -> None:
-        self._min_separation_m = min(self._min_separation_m, self.fleet.min_separation_m())
         for i, j in self.fleet.collisions():
             pair = f"{self.fleet.names[i]} and {self.fleet.names[j]}"
             self.event("collision", self.fleet.names[i], f"{pair} collide", other=self.fleet.names[j])
@@ -298,8 +302,7 @@ class World:
             truth.angular_velocity_rad_s,
         )
         self.outbox.extend(self._publication.gate(truth, self.commanders.holder))
-        self._ages.published(self.now_ns, wall_ns)
-        self._clock_rate.gate(self.now_ns, wall_ns)
+        self._measured.gate(self.now_ns, wall_ns)
         self.tell_clock()
 
     def tell_clock(self, waiting_for: tuple[messages.Waiting, ...] = ()) -> None:
@@ -310,7 +313,7 @@ class World:
             run_id=self.run_id,
             step=self.now_ns // self.gate_ns,
             state=self.state,  # type: ignore[arg-type]
-            rate=round(self._clock_rate.now(), 3),
+            rate=round(self._measured.rate.now(), 3),
             waiting_for=waiting_for,
         )
         self.outbox.append((keys.CLOCK, clock))
@@ -324,20 +327,10 @@ class World:
 
     def result(self) -> dict[str, Any]:
         """Return what the run measured of itself."""
-        by_name = {p.name: p.deadline_misses for p in self.barrier.participants.values() if p.gating}
-        sim_s = self.now_ns / 1e9
-        wall_s = self._clock_rate.wall_s
         return {
             "reason": self.ended,
             "last_ns": self.now_ns,
-            "sim_s": sim_s,
-            "wall_s": wall_s,
-            "real_time_factor": sim_s / wall_s if wall_s > 0 else 0.0,
-            "deadlines": self._deadlines,
-            "deadline_misses": sum(by_name.values()) + self._world_misses,
-            "deadline_misses_by": {**by_name, "world": self._world_misses},
-            "command_age_ms": self._ages.summary_ms(),
-            "min_separation_m": self._min_separation_m if self._min_separation_m < 1e9 else None,
+            **self._measured.result(self.now_ns, self.barrier.participants.values()),
             "refused": self.refused,
             "truth_sha256": self._hash.hexdigest(),
         }
@@ -359,7 +352,7 @@ class World:
         message = messages.Event(self.now_ns, self._next_seq(keys.EVENT), kind, source, subject, text, data)
         self.outbox.append((keys.EVENT, message))
 
-    def take_outbox(self) -> list[Passed]:
+    def take_outbox(self) -> list[Outgoing]:
         """Return what is to be published, in order, and forget it."""
         outbox, self.outbox = self.outbox, []
         return outbox

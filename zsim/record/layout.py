@@ -17,6 +17,7 @@ from typing import NamedTuple, TypeVar
 
 import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Header, McapRecord, Schema
 from mcap.writer import MCAP0_MAGIC as MAGIC
@@ -31,6 +32,7 @@ CHUNK_HEAD = struct.Struct("<QQQII")  # first, last log time, plain size, plain 
 INDEX_HEAD = struct.Struct("<HI")  # channel, bytes of its entries
 INDEX_ENTRY = 16  # bytes: log time, place in the chunk
 FOOTER_SIZE = HEAD.size + 20
+LEAST = {Opcode.CHUNK: CHUNK_HEAD.size + 8, Opcode.MESSAGE_INDEX: INDEX_HEAD.size}  # bytes that are always read
 
 Source = bytes | mmap
 Known = TypeVar("Known", Schema, Channel)
@@ -103,17 +105,25 @@ def packed(record: McapRecord) -> bytes:
 
 
 def unpacked(kind: type[Known], source: Source, place: Place) -> Known:
-    """Return the schema or channel at a place."""
-    return kind.read(ReadDataStream(BytesIO(source[place.body : place.end])))
+    """Return the schema or channel at a place.
+
+    Raises:
+        RecordError: it is damaged.
+    """
+    try:
+        return kind.read(ReadDataStream(BytesIO(source[place.body : place.end])))
+    except (struct.error, McapError, UnicodeDecodeError) as error:
+        reason = f"the {kind.__name__.lower()} at byte {place.start} is damaged ({type(error).__name__})"
+        raise RecordError(f"{reason}; the record cannot be read") from error
 
 
 def places(source: Source) -> Iterator[Place]:
-    """Yield the whole records of a file up to its footer or its cut."""
+    """Yield the whole records of a file up to its footer, its cut, or a length that cannot be right."""
     at, size = len(MAGIC), len(source)
     while at + HEAD.size <= size:
         opcode, length = HEAD.unpack_from(source, at)
         end = at + HEAD.size + length
-        if end > size or opcode not in _STANDARD:
+        if end > size or opcode not in _STANDARD or length < LEAST.get(opcode, 0):
             return
         yield Place(opcode, at, end)
         if opcode == Opcode.FOOTER:
@@ -191,7 +201,7 @@ def content_of(source: Source, place: Place) -> bytes | None:
     if head.compression:
         try:
             content = _decompressor().decompress(content, max_output_size=head.size)
-        except zstandard.ZstdError:
+        except (zstandard.ZstdError, MemoryError, OverflowError):  # the latter two of a damaged size
             return None
     return content if head.crc in (0, zlib.crc32(content)) else None
 

@@ -48,22 +48,23 @@ class RecordReader:
 
     Attributes:
         complete: the record was closed, not cut.
-        damaged: chunks met so far whose check sum differs; they are passed over.
+        damaged: what was met so far and passed over: chunks whose check sum differs, and, as one, everything
+            behind a length that cannot be right.
     """
 
     def __init__(self, path: str | Path) -> None:
         """Open a record and look through its chunks, without decompressing them.
 
         Raises:
-            RecordError: no such file, or no MCAP file.
+            RecordError: no such file, no MCAP file, or the name of a channel is damaged.
         """
         self.path = Path(path)
-        self.damaged = 0
         self._counts: Counter[int] = Counter()
         self._source = _mapped(self.path)
         check_magic(self._source, self.path)
         self.complete = is_complete(self._source)
-        self._keys = {channel.id: channel.topic for channel in _channels(self._source)}
+        self._keys: dict[int, str] = {}
+        self.damaged = int(self._channels() != Opcode.FOOTER and self.complete)
         self._chunks = list(self._scan())
 
     def topics(self) -> dict[str, int]:
@@ -106,6 +107,16 @@ class RecordReader:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _channels(self) -> int:
+        """Note the channels, also those that other tools put into the summary only; return the last opcode met."""
+        opcode = 0
+        for place in places(self._source):
+            opcode = place.opcode
+            if opcode == Opcode.CHANNEL:
+                channel = unpacked(Channel, self._source, place)
+                self._keys[channel.id] = channel.topic
+        return opcode
 
     def _scan(self) -> Iterator[_Chunk]:
         known: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
@@ -156,13 +167,6 @@ def _recorded(content: bytes, wanted: dict[int, str]) -> Iterator[Recorded]:
         if channel in wanted and opcode == Opcode.MESSAGE:
             yield Recorded(wanted[channel], content[at + payload : after], t_ns, wall_ns)
         at = after
-
-
-def _channels(source: Source) -> Iterator[Channel]:
-    """Yield the channels of a file, also those that other tools have put into its summary only."""
-    for place in places(source):
-        if place.opcode == Opcode.CHANNEL:
-            yield unpacked(Channel, source, place)
 
 
 def _mapped(path: Path) -> Source:
