@@ -5,9 +5,12 @@ outside of the contract and begins with `@`, which no wildcard of Zenoh matches:
 messages themselves, and does not hear this.
 """
 
+from typing import Any
+
 import msgspec
 
 from zsim.errors import DecodeError
+from zsim.messages import REFUSALS
 
 KEY = "@batch"
 Batch = list[tuple[str, bytes]]
@@ -30,5 +33,17 @@ def decode(payload: bytes) -> Batch:
     """
     try:
         return _decoder.decode(payload)
-    except msgspec.MsgspecError as error:
+    except REFUSALS as error:
         raise DecodeError(f"{KEY}: {error}; must be a list of [key, payload]") from error
+
+
+def of(result: Any) -> Batch:
+    """Return the [key, payload] pairs in the result of an answer.
+
+    Raises:
+        DecodeError: it is anything else.
+    """
+    try:
+        return msgspec.convert(result, Batch, builtin_types=(bytes,))  # or texts would pass as base64
+    except REFUSALS as error:
+        raise DecodeError(f"result: {error}; must be a list of [key, payload]") from error

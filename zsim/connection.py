@@ -2,10 +2,12 @@
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from functools import partial
 
 from zsim import keys, messages, session
 from zsim.errors import DecodeError, NoWorldError, SessionError
+from zsim.identity import Identity
 from zsim.session import Session
 
 ATTEMPT_S = 1.0  # one try to connect, so that waiting can be shown and interrupted
@@ -22,6 +24,7 @@ def find_world(
     stopped: Callable[[], bool] = lambda: False,
     reader: bool = False,
     run_id: str | None = None,
+    identity: Identity | None = None,
 ) -> Iterator[tuple[Session, messages.Info]]:
     """Yield a session and the `world/info` of the run that it belongs to.
 
@@ -33,29 +36,32 @@ def find_world(
         stopped: asked while waiting.
         reader: it does not gate; see `session.connect`.
         run_id: of the only run to take part in; None takes any.
+        identity: see `session.connect`.
 
     Raises:
         NoWorldError: no world answered within `wait_s`, or `stopped` said so.
+        SessionError: what no waiting mends: a malformed endpoint, a certificate that is refused.
         BadNameError: the federation's name is outside the contract.
     """
     keys.name(federation, "federation")
     with ExitStack() as stack:
-        link, info = _search(stack, endpoint, federation, wait_s, say, stopped, reader, run_id)
+        dial = partial(session.connect, endpoint, federation, reader=reader, identity=identity)
+        link, info = _search(stack, dial, endpoint, federation, wait_s, say, stopped, run_id)
         if info.mode == "realtime":
             stack.pop_all().close()
-            link = stack.enter_context(session.connect(endpoint, federation, "realtime", wait_s=5.0))
+            link = stack.enter_context(dial(mode="realtime", wait_s=5.0))
         link.use(info.mode)
         yield link, info
 
 
 def _search(
     stack: ExitStack,
+    dial: Callable[..., AbstractContextManager[Session]],
     endpoint: str,
     federation: str,
     wait_s: float | None,
     say: Callable[[str], None],
     stopped: Callable[[], bool],
-    reader: bool,
     run_id: str | None,
 ) -> tuple[Session, messages.Info]:
     start_s, next_say_s = time.monotonic(), 0.0
@@ -66,13 +72,13 @@ def _search(
         try:
             if link is None:
                 attempt_s = max(0.05, min(ATTEMPT_S, left_s))
-                link = stack.enter_context(session.connect(endpoint, federation, wait_s=attempt_s, reader=reader))
+                link = stack.enter_context(dial(wait_s=attempt_s))
             info = read_info(link)
             if info is not None and run_id in (None, info.run_id):
                 return link, info
             time.sleep(PAUSE_S)
         except SessionError as error:
-            _refuse_malformed(error)
+            _refuse_lasting(error)
         if waited_s >= (wait_s if wait_s is not None else float("inf")):
             raise NoWorldError(
                 f"no world of federation {federation!r} on {endpoint} within {wait_s:g} s; start one with `zsim world`"
@@ -83,7 +89,8 @@ def _search(
     raise NoWorldError(f"stopped while waiting for a world on {endpoint}")
 
 
-def _refuse_malformed(error: SessionError) -> None:
+def _refuse_lasting(error: SessionError) -> None:
+    """Raise again what no waiting mends."""
     if "nobody listens" not in str(error) or "not supported" in str(error):
         raise error
 

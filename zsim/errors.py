@@ -10,6 +10,7 @@ ZsimError
 │   └── NoWorldError   the session is open, but no world answers
 ├── RunError           a run that could not start or did not end well
 │   └── SupersededError   another process of the same name has taken over
+├── HostsError         a host that cannot be reached, or lacks what it needs; a line per host
 ├── RecordError        a record that cannot be written or read: disk full, no MCAP file
 └── ReportError        a report that cannot be made or written
 """
@@ -57,6 +58,10 @@ class RunError(ZsimError):
 
 class SupersededError(RunError):
     """Another process of the same name has taken over."""
+
+
+class HostsError(ZsimError):
+    """A host that cannot be reached or lacks what it needs: host, what failed, what to do; a line per host."""
 
 
 class RecordError(ZsimError):

@@ -19,6 +19,7 @@ class HealthMeter:
     Args:
         role: of the process.
         wall_s: monotonic wall time.
+        host: the name of its host; None asks the system.
 
     Attributes:
         received, refused, dropped: messages taken in, not decodable, and gates given up.
@@ -26,8 +27,9 @@ class HealthMeter:
         link_lost: whether the world cannot be reached now.
     """
 
-    def __init__(self, role: str, wall_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, role: str, wall_s: Callable[[], float] = time.monotonic, host: str | None = None) -> None:
         self._role = role
+        self._host = host or socket.gethostname()
         self._wall_s = wall_s
         self._steps_us: deque[float] = deque(maxlen=STEPS_KEPT)
         self._last_s = wall_s()
@@ -56,13 +58,14 @@ class HealthMeter:
             t_ns=t_ns,
             seq=seq,
             role=self._role,
-            host=socket.gethostname(),
+            host=self._host,
             pid=os.getpid(),
             step_us={"p50": steps[len(steps) // 2], "p99": steps[int(len(steps) * 0.99)]},
             lag_ns=self.lag_ns,
             dropped=self.dropped,
             refused=self.refused,
             rss_bytes=resident_bytes(),
+            received=self.received,
         )
 
 

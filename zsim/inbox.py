@@ -24,13 +24,15 @@ class Inbox:
         gate_keys: keys of which one message with t_ns == t closes the gate t. For a drone's sensor/status its
             `count` is checked too, when `counted` says that all of that drone's sensors are read.
         counted: drones of which all `sensor/*` keys are read.
+        keep_late: hand out what comes after its gate was taken, once, with the next gate: in realtime an old input
+            is better than none.
 
     Attributes:
         duplicates: messages that came again before their gate was taken.
         late: messages that came when their gate had been taken.
     """
 
-    def __init__(self, gate_keys: Sequence[str], counted: Sequence[str] = ()) -> None:
+    def __init__(self, gate_keys: Sequence[str], counted: Sequence[str] = (), keep_late: bool = False) -> None:
         self._closing = dict.fromkeys(gate_keys)
         self._meters = {keys.status(drone): _Meter() for drone in counted}
         self._came_of: dict[str, list[int] | None] = {}
@@ -43,15 +45,18 @@ class Inbox:
         self._beats: dict[int, int] = {}
         self._last_beat: tuple[int, int] | None = None
         self._taken_ns = -1
+        self._keep_late = keep_late
+        self._belated: dict[tuple[str, int], tuple[str, Any]] = {}
+        self._newest: dict[str, int] = {}  # t_ns handed out per key, where late ones are kept
         self.duplicates = 0
         self.late = 0
 
     def put(self, key: str, message: Any) -> bool:
-        """Keep one message; return False for a duplicate or one of a gate that has been taken."""
+        """Keep one message; return False for a duplicate or one that is too late."""
         t_ns = message.t_ns
         if t_ns <= self._taken_ns:
             self.late += 1
-            return False
+            return self._put_late(key, message)
         stamped = self._waiting.get(t_ns)
         if stamped is None:
             stamped = self._waiting[t_ns] = {}
@@ -66,6 +71,13 @@ class Inbox:
             _insert(came, t_ns)
         if key in self._closing:
             self._close(key, message)
+        return True
+
+    def _put_late(self, key: str, message: Any) -> bool:
+        """Keep a late message unless a newer one of its key, or itself, has been handed out."""
+        if not self._keep_late or message.t_ns <= self._newest.get(key, ALWAYS_NS):
+            return False
+        self._belated[key, message.seq] = (key, message)
         return True
 
     def _find_came(self, key: str) -> list[int] | None:
@@ -139,6 +151,8 @@ class Inbox:
         for stamp in _cut(self._stamps, t_ns):
             stamped = self._waiting.pop(stamp)
             ready += stamped.values() if len(stamped) == 1 else map(stamped.__getitem__, sorted(stamped))
+        if self._keep_late:
+            ready = self._with_belated(ready)
         for gate_ns in _cut(self._gates, t_ns):
             del self._lacking[gate_ns]
             if gate_ns in self._beats:
@@ -147,6 +161,14 @@ class Inbox:
             meter.forget(t_ns)
         self._taken_ns = t_ns
         return ready
+
+    def _with_belated(self, ready: list[tuple[str, Any]]) -> list[tuple[str, Any]]:
+        """Put what came late in front, and note what is handed out."""
+        belated = sorted(self._belated.values(), key=lambda entry: (entry[1].t_ns, entry[0], entry[1].seq))
+        self._belated.clear()
+        for key, message in (*belated, *ready):
+            self._newest[key] = max(self._newest.get(key, ALWAYS_NS), message.t_ns)
+        return [*belated, *ready]
 
     def ignore(self, key: str) -> None:
         """Wait for a key no longer: its publisher is dropped from the run."""

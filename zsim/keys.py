@@ -12,7 +12,6 @@ from zsim.errors import BadNameError
 NAME = re.compile(r"[a-z0-9_.-]{1,32}")
 PROCESS_NAME = re.compile(r"[a-z0-9_.-]{1,48}")  # a role, a dot, and a thing of up to 32
 SENSORS = ("imu", "gps", "mag", "baro", "sonar", "flow")
-COMMANDS = ("velocity", "ardrone", "attitude", "rotors", "mode")
 
 INFO = "world/info"
 CLOCK = "clock"
@@ -64,6 +63,10 @@ def cluster_control(cluster: str) -> str:
     return f"cluster/{cluster}/control"
 
 
+def cluster_view(cluster: str) -> str:
+    return f"view/cluster/{cluster}"
+
+
 def token(process: str) -> str:
     return f"process/{process}"
 
@@ -71,6 +74,11 @@ def token(process: str) -> str:
 def process(process_name: str, what: str) -> str:
     """Return the key of `join`, `done`, `bye` or `health` of a process."""
     return f"process/{process_name}/{what}"
+
+
+def replay(process_name: str) -> str:
+    """Return the key on which the world answers a process for what it may read and missed."""
+    return process(process_name, "replay")
 
 
 def thing(key: str) -> str:

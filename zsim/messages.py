@@ -27,6 +27,8 @@ Covariance = Annotated[tuple[Number, ...], Meta(min_length=36, max_length=36)]
 DroneState = Literal["landed", "taking_off", "hovering", "flying", "landing", "emergency"]
 Phase = Literal["idle", "taking_off", "assembling", "engaged", "landing", "held"]
 PAYLOAD_MAX = 16_000_000  # bytes; a scenario of 1000 drones in world/info is below this
+REFUSALS = (ValueError, TypeError, RecursionError, OverflowError, MemoryError, msgspec.MsgspecError)
+"""Whatever a decoder raises for a payload that somebody else wrote: wrong types, bad UTF-8, maps without end."""
 
 
 class Message(Struct, frozen=True, gc=False):
@@ -37,22 +39,33 @@ class Message(Struct, frozen=True, gc=False):
 
 
 class Origin(Struct, frozen=True):
+    """The origin of W: WGS 84 latitude and longitude [deg], ellipsoidal height [m]."""
+
     latitude_deg: Number
     longitude_deg: Number
     height_m: Number
 
 
 class DroneInfo(Struct, frozen=True):
+    """A drone of the run and the model of its aircraft."""
+
     name: str
     model: str
 
 
 class ClusterInfo(Struct, frozen=True):
+    """A formation and its drones, in the order of its robots."""
+
     name: str
     drones: tuple[str, ...]
 
 
 class Info(Message, frozen=True):
+    """What a process needs to take part: the resolved scenario and how its time runs, `world/info`.
+
+    `rate` is simulated per wall seconds, 0 for as fast as possible; `scenario` is YAML text.
+    """
+
     contract: Count
     run_id: str
     federation: str
@@ -72,12 +85,16 @@ class Info(Message, frozen=True):
 
 
 class Waiting(Struct, frozen=True):
+    """A process that the world waits for, its host, and the wall time since when [s]."""
+
     name: str
     host: str
     since_wall_s: Number
 
 
 class Clock(Message, frozen=True):
+    """The gate that the world has published; its `rate` is measured. `waiting_for` is filled while time stands."""
+
     run_id: str
     step: Count
     state: Literal["waiting", "running", "paused", "stopped"]
@@ -86,6 +103,8 @@ class Clock(Message, frozen=True):
 
 
 class Event(Message, frozen=True):
+    """Something that happened once: what, by whom, about whom, in words, and in figures."""
+
     kind: str
     source: str
     subject: str
@@ -94,12 +113,19 @@ class Event(Message, frozen=True):
 
 
 class Imu(Message, frozen=True):
+    """Specific force [m/s^2] and body rate [rad/s] at the sensor, in its own axes; at rest and level (0, 0, +9.81)."""
+
     t_sample_ns: Whole
     accel_m_s2: Vector3
     gyro_rad_s: Vector3
 
 
 class Gps(Message, frozen=True):
+    """A fix of the antenna: WGS 84 (deg, m), the same in W [m], velocity in W [m/s].
+
+    `sigma_m` is the standard deviation of the position per axis; `fix` as in NMEA, 3 for three dimensions.
+    """
+
     t_sample_ns: Whole
     latitude_deg: Number
     longitude_deg: Number
@@ -112,29 +138,43 @@ class Gps(Message, frozen=True):
 
 
 class Mag(Message, frozen=True):
+    """The Earth's field in the axes of the sensor [uT]."""
+
     t_sample_ns: Whole
     field_ut: Vector3
 
 
 class Baro(Message, frozen=True):
+    """Static pressure [Pa], and the height over the origin of W that it stands for [m]."""
+
     t_sample_ns: Whole
     pressure_pa: Number
     altitude_m: Number
 
 
 class Sonar(Message, frozen=True):
+    """Distance to the ground along the beam [m]; without an echo it is not `valid`."""
+
     t_sample_ns: Whole
     range_m: Number
     valid: bool
 
 
 class Flow(Message, frozen=True):
+    """Velocity over the ground in the heading frame [m/s], and in [0, 1] how much of the picture is ground."""
+
     t_sample_ns: Whole
     velocity_m_s: Vector3
     quality: Number
 
 
 class Status(Message, frozen=True):
+    """What a drone tells of itself, last in every gate.
+
+    `commander` is who flies it; `count` is how many messages on its `sensor/*` have come since the last status, this
+    one included.
+    """
+
     state: DroneState
     battery_percent: Number
     collision: bool
@@ -143,6 +183,8 @@ class Status(Message, frozen=True):
 
 
 class Truth(Message, frozen=True):
+    """The true state of a drone: position, velocity, acceleration in W, attitude B to W, rate in B, rotor speeds."""
+
     position_m: Vector3
     velocity_m_s: Vector3
     orientation_wxyz: Quaternion
@@ -158,12 +200,19 @@ class Command(Message, frozen=True):
 
 
 class Velocity(Command, frozen=True):
+    """Fly a velocity [m/s] and turn at a rate [rad/s], counter-clockwise from above.
+
+    `frame`: "heading", x forward and y left by the sender's idea of the yaw; "world", W by the firmware's own.
+    """
+
     velocity_m_s: Vector3
     yaw_rate_rad_s: Number
     frame: Literal["heading", "world"] = "heading"
 
 
 class Ardrone(Command, frozen=True):
+    """Fly as the aircraft's own commands do: tilt forward and left, climb, yaw rate, each in [-1, 1] of its limit."""
+
     forward: Number
     left: Number
     up: Number
@@ -172,20 +221,32 @@ class Ardrone(Command, frozen=True):
 
 
 class Attitude(Command, frozen=True):
+    """Hold the tilt of an orientation B to W, whose heading is not used, with a thrust [N] and a yaw rate."""
+
     orientation_wxyz: Quaternion
     thrust_n: Number
     yaw_rate_rad_s: Number
 
 
 class RotorSpeeds(Command, frozen=True):
+    """Turn the rotors at these speeds: front left, front right, rear right, rear left."""
+
     speed_rad_s: Rotors
 
 
 class Mode(Command, frozen=True):
+    """Take off, land, stop the rotors at once, or leave the emergency; open to all with the commander's priority."""
+
     mode: Literal["takeoff", "land", "emergency", "reset"]
 
 
 class Estimate(Message, frozen=True):
+    """Where an estimator believes its drone to be: position and velocity in W, attitude B to W.
+
+    `covariance` is that of position and velocity, 6 x 6, row-major, SI units; `gyro_bias_rad_s` is in B; `sensors` has
+    by name how many readings were used and refused.
+    """
+
     position_m: Vector3
     velocity_m_s: Vector3
     orientation_wxyz: Quaternion
@@ -198,6 +259,14 @@ class Estimate(Message, frozen=True):
 
 
 class ClusterState(Message, frozen=True):
+    """Where a formation is, by the estimates, and where it is to be.
+
+    `names` are the 4n cluster variables of n drones, in the order of `value`, `desired` [m, rad] and `desired_rate`
+    [m/s, rad/s]. `trajectory_t_s` is the trajectory's own time, None where none runs; `margin` is the distance to a
+    singularity in the measure of the cluster space; `reason` is why it waits or is held. `plan_step` is how many steps
+    of the scenario's plan a restarted controller leaves out.
+    """
+
     phase: Phase
     drones: tuple[str, ...]
     names: tuple[str, ...]
@@ -208,9 +277,15 @@ class ClusterState(Message, frozen=True):
     margin: Number
     reason: str
     source: str = ""
+    plan_step: Count = 0
 
 
 class Join(Message, frozen=True):
+    """A process takes part from now on; the newest of several random incarnations counts.
+
+    `period_ns` is how often it says done: a multiple of the gate, 0 for never.
+    """
+
     run_id: str
     incarnation: int
     role: str
@@ -222,6 +297,8 @@ class Join(Message, frozen=True):
 
 
 class Done(Message, frozen=True):
+    """Everything stamped up to `done_ns` is handled and answered; `sent` outputs were sent since the last done."""
+
     run_id: str
     incarnation: int
     done_ns: Whole
@@ -229,6 +306,8 @@ class Done(Message, frozen=True):
 
 
 class Bye(Message, frozen=True):
+    """A process leaves of its own will."""
+
     reason: str
 
 
@@ -241,9 +320,12 @@ class Health(Message, frozen=True):
     dropped: Count
     refused: Count
     rss_bytes: Count
+    received: Count = 0
 
 
 class DroneView(Struct, frozen=True):
+    """A drone as eyes see it: position in W, attitude B to W."""
+
     name: str
     position_m: Vector3
     orientation_wxyz: Quaternion
@@ -253,11 +335,15 @@ class DroneView(Struct, frozen=True):
 
 
 class ViewDrones(Message, frozen=True):
+    """All drones at one instant, and the wind at each in W; never gates and may skip."""
+
     drones: tuple[DroneView, ...]
     wind_m_s: tuple[Vector3, ...] = ()
 
 
 class ViewCluster(Message, frozen=True):
+    """A formation as eyes see it; fields as in ClusterState; never gates and may skip."""
+
     phase: Phase
     names: tuple[str, ...]
     value: tuple[Number, ...]
@@ -274,9 +360,12 @@ class ControlRequest(Struct, frozen=True):
 
 
 class ControlAnswer(Struct, frozen=True):
+    """Whether a request was done; if not, why; and what it asked for."""
+
     ok: bool
     error: str = ""
     result: Any = None
+    more: Count | None = None
 
 
 _FIXED: dict[str, type[Struct]] = {
@@ -351,7 +440,7 @@ def decode(key: str, payload: bytes) -> Any:
         raise DecodeError(f"{key:.80}: is no key of the contract; see docs/protocol.md")
     try:
         return read(payload) if len(payload) <= PAYLOAD_MAX else _too_long(payload)
-    except _REFUSALS as error:
+    except REFUSALS as error:
         raise _refusal(kind, payload, key, error) from error
 
 
@@ -359,15 +448,14 @@ def decode_as(kind: type[Struct], payload: bytes, where: str) -> Any:
     """Return `payload` as a `kind`; `where` opens the text of the DecodeError."""
     try:
         return _reader(kind)(payload) if len(payload) <= PAYLOAD_MAX else _too_long(payload)
-    except _REFUSALS as error:
+    except REFUSALS as error:
         raise _refusal(kind, payload, where, error) from error
 
 
-_REFUSALS = (ValueError, TypeError, RecursionError, OverflowError, MemoryError, msgspec.MsgspecError)
 _Reader = Callable[[bytes], Any]
 
 
-@lru_cache(maxsize=65_536)  # keys come from other processes too
+@lru_cache(maxsize=KEYS_KEPT)  # keys come from other processes too
 def _reader_of(key: str) -> tuple[type[Struct] | None, _Reader]:
     kind = type_of(key)
     return kind, _reader(kind or Struct)
@@ -402,7 +490,7 @@ def _refusal(kind: type[Struct], payload: bytes, where: str, error: Exception) -
         return DecodeError(f"{where}: {str(error) or type(error).__name__}")
     try:
         found = first_fault(msgspec.msgpack.decode(payload), kind)
-    except _REFUSALS as fault:
+    except REFUSALS as fault:
         found = ("", f"({len(payload)} bytes) is not msgpack ({fault}); must be a map, the {kind.__name__}")
     path, text = found or ("", f"is refused ({error}); must be the {kind.__name__}")
     return DecodeError(f"{where}: {path or 'the payload'} {text}")

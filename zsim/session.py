@@ -4,14 +4,13 @@ Settings and their reasons are in docs/decisions/0002-zenoh-settings.md. Keys ar
 federation's prefix; the session adds and removes it.
 """
 
-import json
 import os
-import threading
+import re
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1))")
 os.environ.setdefault("RUST_LOG", "error")
@@ -19,24 +18,14 @@ os.environ.setdefault("RUST_LOG", "error")
 import zenoh
 from msgspec import Struct
 
-from zsim import messages
+from zsim import messages, settings, tls
 from zsim.errors import SessionError
+from zsim.identity import Identity
 from zsim.messages import ControlAnswer, ControlRequest
+from zsim.settings import Mode, Settings
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 QUEUE = 1_000_000  # messages; an unread queue that is full blocks the whole link
-LEASE_LOCKSTEP_MS = 3_600_000  # a stopped or debugged process must not lose its link in lockstep
-LEASE_REALTIME_MS = 1_000
-LEASE_READER_MS = 10_000  # nobody waits for one that only reads, so nobody would name it when it is stopped
-CLOSE_AFTER_US = 3_600_000_000  # -1 means for ever and panics in 1.10.2
-# A stopped reader (a recorder, `zsim echo`) fills its link and then holds up the hub and everybody; it loses its link.
-# A stopped participant does not: time stands before its link is full.
-HUB_CLOSE_AFTER_US = 10_000_000
-CONNECT_RETRY_MS = 100
-
-_CLOSE_AFTER = "transport/link/tx/queue/congestion_control/block/wait_before_close"
-
-Mode = Literal["lockstep", "realtime"]
 
 
 class Sample(NamedTuple):
@@ -47,11 +36,19 @@ class Sample(NamedTuple):
 
 
 class Session:
-    """One process's access to a federation."""
+    """One process's access to a federation.
 
-    def __init__(self, raw: zenoh.Session, federation: str) -> None:
+    Attributes:
+        federation: prefix of all keys.
+        host: the name of this process's host, as its messages give it.
+        guarded: whether access control decides here who may do what.
+    """
+
+    def __init__(self, raw: zenoh.Session, federation: str, identity: Identity) -> None:
         self._raw = raw
         self.federation = federation
+        self.host = identity.host
+        self.guarded = identity.access is not None
         self._prefix = f"{federation}/"
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._kept: list[Any] = []
@@ -85,15 +82,20 @@ class Session:
     def _declare(self, key: str) -> zenoh.Publisher:
         drop = key.startswith("view/") or (self._realtime and "/sensor/" in key)
         control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
-        publisher = self._raw.declare_publisher(
-            self._prefix + key, encoding=zenoh.Encoding(messages.encoding(key)), congestion_control=control
-        )
+        encoding = zenoh.Encoding(messages.encoding(key))
+        with _named(key):
+            publisher = self._raw.declare_publisher(self._prefix + key, encoding=encoding, congestion_control=control)
         self._publishers[key] = publisher
         return publisher
 
     def subscribe(self, expression: str) -> "Mailbox":
-        """Return a mailbox that takes everything that others publish on an expression, in order."""
-        return Mailbox(self._raw, self._prefix, expression)
+        """Return a mailbox that takes everything that others publish on an expression, in order.
+
+        Raises:
+            SessionError: it is no key expression.
+        """
+        with _named(expression):
+            return Mailbox(self._raw, self._prefix, expression)
 
     def on_message(self, expression: str, callback: Callable[[Sample], None]) -> None:
         """Call back, in a thread of Zenoh's, for the rare messages on an expression."""
@@ -122,18 +124,33 @@ class Session:
         return [str(r.ok.key_expr).removeprefix(self._prefix) for r in replies if r.ok is not None]
 
     def get(self, expression: str, timeout_s: float = 2.0) -> list[Sample]:
-        """Return the last values that are answered on an expression."""
-        replies = self._raw.get(self._prefix + expression, timeout=timeout_s)
+        """Return the last values that are answered on an expression.
+
+        Raises:
+            SessionError: it is no key expression.
+        """
+        with _named(expression):
+            replies = self._raw.get(self._prefix + expression, timeout=timeout_s)
         return [_sample(reply.ok, self._prefix) for reply in replies if reply.ok is not None]
 
-    def request(self, key: str, op: str, source: str, timeout_s: float = 5.0, **args: Any) -> ControlAnswer:
-        """Ask `key` to do something; an answer that never comes is an answer that says so."""
-        payload = messages.encode(ControlRequest(op=op, args=args, source=source))
-        replies = self._raw.get(self._prefix + key, payload=payload, timeout=timeout_s)
+    def request(
+        self, key: str, op: str, source: str, args: dict[str, Any] | None = None, timeout_s: float = 5.0
+    ) -> ControlAnswer:
+        """Ask `key` to do something; an answer that never comes is an answer that says so.
+
+        Raises:
+            SessionError: it is no key.
+        """
+        payload = messages.encode(ControlRequest(op=op, args=args or {}, source=source))
+        start_s = time.monotonic()
+        with _named(key):
+            replies = self._raw.get(self._prefix + key, payload=payload, timeout=timeout_s)
         for reply in replies:
             if reply.ok is not None:
                 return messages.decode_as(ControlAnswer, reply.ok.payload.to_bytes(), key)
-        return ControlAnswer(ok=False, error=f"{key}: nobody answered within {timeout_s:g} s; is it running?")
+        late = time.monotonic() - start_s >= timeout_s
+        what = f"no answer came within {timeout_s:g} s" if late else "nobody answers there"
+        return ControlAnswer(ok=False, error=f"{key}: {what}; is it running?")
 
     def answer(self, expression: str, callback: Callable[["Query"], None]) -> None:
         """Call back, in a thread of Zenoh's, for every get on an expression."""
@@ -236,69 +253,47 @@ class Mailbox:
         return Sample(self._key or str(raw.key_expr)[self._cut :], payload)
 
 
-class TimedMailbox:
-    """A mailbox read by a thread that stamps every message with the wall time of its arrival.
-
-    Args:
-        mailbox: what to read.
-        fresh: set whenever something has arrived.
-    """
-
-    def __init__(self, mailbox: Mailbox, fresh: threading.Event) -> None:
-        self._mailbox = mailbox
-        self._fresh = fresh
-        self._arrived: deque[tuple[int, Sample]] = deque()
-        self._open = True
-        self._thread = threading.Thread(target=self._pump, name="mailbox", daemon=True)
-        self._thread.start()
-
-    def _pump(self) -> None:
-        while self._open:
-            try:
-                sample = self._mailbox.receive()
-            except SessionError:
-                return
-            if sample is not None:
-                self._arrived.append((time.monotonic_ns(), sample))
-                self._fresh.set()
-
-    def drain(self) -> Iterator[tuple[int, Sample]]:
-        """Yield (wall_ns of arrival, sample) of what has arrived."""
-        while self._arrived:
-            yield self._arrived.popleft()
-
-    def close(self) -> None:
-        """Stop the reading thread."""
-        self._open = False
-        self._mailbox.wake()
-        self._thread.join(timeout=2.0)
-
-
 def _sample(raw: zenoh.Sample, prefix: str) -> Sample:
     return Sample(str(raw.key_expr).removeprefix(prefix), raw.payload.to_bytes())
 
 
 @contextmanager
-def listen(endpoints: Sequence[str], federation: str, mode: Mode) -> Iterator[Session]:
+def listen(
+    endpoints: Sequence[str], federation: str, mode: Mode, identity: Identity | None = None
+) -> Iterator[Session]:
     """Open the hub: a peer that listens, to which every other role is a client.
 
     Raises:
-        SessionError: an endpoint is taken or malformed.
+        SessionError: an endpoint is taken or malformed, or the identity is of no use.
     """
-    if any(endpoint.endswith(":0") for endpoint in endpoints):
-        raise SessionError(f"cannot listen on {', '.join(endpoints)}: port 0 is no port that others could be told")
-    config = _config("peer", mode)
-    _use_endpoints(config, "listen/endpoints", endpoints)
-    config.insert_json5("listen/exit_on_failure", "true")
-    config.insert_json5(_CLOSE_AFTER, str(HUB_CLOSE_AFTER_US))
-    with _opened(config, federation, f"cannot listen on {', '.join(endpoints)}") as session:
+    with _listening("peer", endpoints, federation, mode, identity or Identity(), {}) as session:
         session.use(mode)
         yield session
 
 
 @contextmanager
+def route(
+    endpoint: str, upstream: str, federation: str, mode: Mode = "lockstep", identity: Identity | None = None
+) -> Iterator[Session]:
+    """Open a router: it listens on an endpoint, and tries for ever to reach the world, or another router, upstream.
+
+    Raises:
+        SessionError: an endpoint is taken or malformed, or the identity is of no use.
+    """
+    identity = identity or Identity()
+    above = settings.upstream(upstream, identity)
+    with _listening("router", [endpoint], federation, mode, identity, above) as session:
+        yield session
+
+
+@contextmanager
 def connect(
-    endpoint: str, federation: str, mode: Mode = "lockstep", wait_s: float | None = None, reader: bool = False
+    endpoint: str,
+    federation: str,
+    mode: Mode = "lockstep",
+    wait_s: float | None = None,
+    reader: bool = False,
+    identity: Identity | None = None,
 ) -> Iterator[Session]:
     """Open a client of the hub (or of a router).
 
@@ -308,50 +303,73 @@ def connect(
         mode: of the run, where it is known already.
         wait_s: how long to try; None tries once.
         reader: it does not gate; in lockstep too, a silence of LEASE_READER_MS is its death.
+        identity: host and certificate; without, this host's name and no TLS.
 
     Raises:
-        SessionError: nobody listens there within `wait_s`.
+        SessionError: nobody listens there within `wait_s`, or a certificate, here or there, is refused.
     """
-    config = _config("client", mode, reader)
-    _use_endpoints(config, "connect/endpoints", [endpoint])
-    config.insert_json5("connect/timeout_ms", str(int(1000 * (wait_s or 0)) or 500))
-    with _opened(config, federation, f"nobody listens on {endpoint}; start a world there") as session:
+    identity = identity or Identity()
+    chosen = settings.common("client", mode, reader) | settings.connecting(endpoint, identity, wait_s or 0.5)
+    with _opened(chosen, federation, identity, partial(tls.no_link, identity, endpoint)) as session:
+        yield session
+
+
+def check_listening(endpoints: Sequence[str], identity: Identity | None = None) -> None:
+    """Refuse endpoints on which nobody can listen, without listening.
+
+    Raises:
+        SessionError: one is malformed, or identity and endpoints do not go together.
+    """
+    if any(endpoint.endswith(":0") for endpoint in endpoints):
+        raise SessionError(f"cannot listen on {', '.join(endpoints)}: port 0 is no port that others could be told")
+    identity = identity or Identity()
+    _config(settings.listening(endpoints, identity), identity)
+
+
+@contextmanager
+def _listening(
+    mode: str, endpoints: Sequence[str], federation: str, timing: Mode, identity: Identity, others: Settings
+) -> Iterator[Session]:
+    shown = ", ".join(endpoints)
+    check_listening(endpoints, identity)
+    chosen = settings.common(mode, timing) | settings.listening(endpoints, identity) | others
+    with _opened(chosen, federation, identity, lambda error: f"cannot listen on {shown} ({error})") as session:
         yield session
 
 
 @contextmanager
-def _opened(config: zenoh.Config, federation: str, fault: str) -> Iterator[Session]:
+def _opened(chosen: Settings, federation: str, identity: Identity, explain: Callable[[str], str]) -> Iterator[Session]:
+    config = _config(chosen, identity)
     try:
         raw = zenoh.open(config)
     except zenoh.ZError as error:
-        raise SessionError(f"{fault} ({_brief(error)})") from error
+        raise SessionError(explain(_brief(error))) from error
     try:
-        yield Session(raw, federation)
+        yield Session(raw, federation, identity)
     finally:
         raw.close()
 
 
-def _config(mode: str, timing: Mode, reader: bool = False) -> zenoh.Config:
-    lease = LEASE_REALTIME_MS if timing == "realtime" else LEASE_READER_MS if reader else LEASE_LOCKSTEP_MS
+def _config(chosen: Settings, identity: Identity) -> zenoh.Config:
     config = zenoh.Config()
-    for path, value in {
-        "mode": f'"{mode}"',
-        "scouting/multicast/enabled": "false",
-        "scouting/gossip/enabled": "false",
-        "connect/retry": f"{{period_init_ms: {CONNECT_RETRY_MS}, period_max_ms: {2 * CONNECT_RETRY_MS}}}",
-        "transport/link/tx/lease": str(lease),
-        _CLOSE_AFTER: str(CLOSE_AFTER_US),
-    }.items():
-        config.insert_json5(path, value)
+    for path, value in chosen.items():
+        try:
+            config.insert_json5(path, value)
+        except zenoh.ZError as error:
+            raise SessionError(settings.refusal(path, value, identity)) from error
     return config
 
 
-def _use_endpoints(config: zenoh.Config, place: str, endpoints: Sequence[str]) -> None:
+@contextmanager
+def _named(expression: str) -> Iterator[None]:
+    """Refuse a key that Zenoh refuses in words of the contract's."""
     try:
-        config.insert_json5(place, json.dumps(list(endpoints)))
+        yield
     except zenoh.ZError as error:
-        found = ", ".join(map(repr, endpoints))
-        raise SessionError(f"endpoint is {found}; must be PROTOCOL/ADDRESS such as tcp/127.0.0.1:7447") from error
+        bare = re.sub("//+", "/", expression.strip("/"))
+        hint = f"; keys have no / at their ends and one between names: {bare}" if bare != expression and bare else ""
+        allowed = "must be names with / between them, * for any name, ** for any number of them"
+        raise SessionError(f"key is {expression!r} ({_brief(error)}); {allowed}{hint}") from error
 
 
 def _brief(error: Exception) -> str:

@@ -242,6 +242,18 @@ def test_what_is_short_of_two_dones_adds_up():
     assert made.short() == []
 
 
+@pytest.mark.parametrize(("found", "gone"), [(0, 2), (1, 1), (2, 0), (3, 0)])
+def test_once_written_off_a_loss_hides_none_that_comes_after(found: int, gone: int):
+    made = barrier("a")
+    made.done("a", done(0, sent=2), GATE_NS, 0)
+    for _ in range(found):
+        made.received("a")
+    assert made.participants["a"].write_off() == gone
+    assert made.short() == []
+    made.done("a", done(1, sent=1), GATE_NS, 0)
+    assert names(made.short()) == ["a"]
+
+
 def test_outputs_of_strangers_are_nobody_s():
     made = barrier("a")
     made.received("stranger")

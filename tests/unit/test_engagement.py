@@ -566,6 +566,62 @@ def test_a_controller_that_restarts_in_flight_takes_the_formation_over():
     assert fleet.output.value[2] == pytest.approx(8.0, abs=0.02)
 
 
+def restarted(fleet, plan):
+    """Put a new engagement in the place of the fleet's, as a controller that restarts does."""
+    last = fleet.output
+    fleet.engagement = Engagement(SPACE, DRONES, plan=plan)
+    fleet.engagement.warm_start(last.phase, last.desired, last.plan_step)
+
+
+FLIGHT = [Scheduled(1.0, TakeOff()), Scheduled(1.0, Engage()), Scheduled(1.0, Target({"z_c": 8.0}))]
+
+
+@pytest.mark.parametrize("gate", [10, 100, 300, 400, 700])
+def test_a_restart_in_any_phase_goes_on_with_the_plan(gate):
+    fleet = Fleet(Engagement(SPACE, DRONES, plan=FLIGHT))
+    fleet.fly(gate * GATE_S)
+    restarted(fleet, FLIGHT)
+    fleet.fly(50.0)
+    assert fleet.output.phase == "engaged"
+    assert fleet.output.reason == ""
+    assert fleet.output.value[2] == pytest.approx(8.0, abs=0.02)
+
+
+def test_a_restart_after_a_landing_by_request_stays_on_the_ground():
+    fleet = Fleet(Engagement(SPACE, DRONES, plan=FLIGHT))
+    fleet.fly(5.0)
+    assert fleet.engagement.request(Land()) is None
+    fleet.fly_until("idle")
+    modes = len(fleet.modes)
+    restarted(fleet, FLIGHT)
+    fleet.fly(5.0)
+    assert (fleet.output.phase, fleet.output.reason) == ("idle", "")
+    assert len(fleet.modes) == modes
+
+
+def test_a_restart_after_the_plan_s_landing_has_nothing_left_to_ask():
+    plan = [*FLIGHT, Scheduled(15.0, Land())]
+    fleet = Fleet(Engagement(SPACE, DRONES, plan=plan))
+    fleet.fly(16.0)
+    fleet.fly_until("idle")
+    restarted(fleet, plan)
+    fleet.fly(5.0)
+    assert (fleet.output.phase, fleet.output.reason) == ("idle", "")
+
+
+@pytest.mark.parametrize(("request_", "height_m"), [(Target({"z_c": 4.0}), 4.0), (Pause(), None)])
+def test_a_restart_does_not_undo_what_was_asked_after_the_plan(request_, height_m):
+    fleet = Fleet(Engagement(SPACE, DRONES, plan=FLIGHT))
+    fleet.fly(12.0)
+    assert fleet.engagement.request(request_) is None
+    fleet.fly(20.0)
+    before = fleet.output.desired
+    restarted(fleet, FLIGHT)
+    fleet.fly(20.0)
+    assert np.array_equal(fleet.output.desired, before)
+    assert height_m is None or before[2] == height_m
+
+
 @pytest.mark.parametrize(
     ("plan", "finding"),
     [

@@ -2,17 +2,20 @@
 
 import hashlib
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from zsim import messages, presets
 from zsim.frames import geodetic_to_enu
 from zsim.scenario_file import resolve
 from zsim_world import gate
-from zsim_world.fleet import DivergedError, Fleet
-from zsim_world.sensor_set import SENSORS
+from zsim_world.fleet import GPS_FIX, GPS_SATELLITES, DivergedError, Fleet
+from zsim_world.publication import Publication
+from zsim_world.sensor_set import SENSORS, schedule
 
 GATE_NS = 20_000_000
 WIDTH = {"imu": 6, "gps": 9, "mag": 3, "baro": 2, "sonar": 2, "flow": 4}
@@ -122,6 +125,29 @@ def test_gps_place_is_its_position_on_the_earth():
     assert fleet.gps_sigma_m == [2.0, 2.0]
 
 
+def test_the_sigma_that_a_gps_tells_is_that_of_its_errors():
+    """noise 3 m and density 2 m/sqrt(Hz) at 4 Hz: 5 m."""
+    gps = {"rate_hz": 4, "position_m": {"noise": 3.0, "density": 2.0}}
+    fleet = Fleet(scenario(1, sensors={"preset": "paper", "gps": gps}))
+    told = [m for _, m in Publication(fleet).gate(fleet.truth(), lambda drone: None) if isinstance(m, messages.Gps)]
+    assert [(m.sigma_m, m.fix, m.satellites) for m in told] == [(5.0, GPS_FIX, GPS_SATELLITES)]
+
+
+@pytest.mark.parametrize("rate_hz", [0.01, 0.0137, 999.9])
+def test_rates_from_the_least_to_the_largest_are_kept(rate_hz):
+    numerator, denominator = schedule(scenario(1, sensors={"preset": "paper", "baro": {"rate_hz": rate_hz}}))[0, 3, :2]
+    tick_s = 0.0025
+    assert denominator / numerator / tick_s == pytest.approx(rate_hz, rel=5e-4)
+
+
+def test_pressure_is_a_number_however_high_a_drone_gets():
+    fleet = Fleet(scenario(1, environment={"height_m": 10_900}, sensors={"preset": "paper", "baro": {"rate_hz": 200}}))
+    fleet._bodies.state[0, 2] = 60_000.0
+    pressures = [s.values[0] for s in gates(fleet, 2) if s.sensor == "baro"]
+    assert pressures
+    assert set(pressures) == {0.0}
+
+
 def test_barometer_is_zero_at_the_origin_and_its_pressure_that_of_the_field():
     quiet = scenario(1, sensors={"preset": "paper", "baro": {"altitude_m": {"noise": 0.0}}})
     pressure, altitude = next(s.values for s in Fleet(quiet).samples() if s.sensor == "baro")
@@ -191,12 +217,12 @@ def test_a_collision_is_told_once_when_it_begins():
     fleet.takeoff(0)
     fleet.takeoff(1)
     gates(fleet, 250)
-    assert 1.5 < fleet.min_separation_m() < 2.5
+    assert 1.5 < fleet.closest_m() < 2.5
     began, closest = [], math.inf
     for _ in range(150):
         fleet.set_velocity(0, (1.0, 0.0, 0.0))
         fleet.advance()
-        closest = min(closest, fleet.min_separation_m())
+        closest = min(closest, fleet.closest_m())
         if fleet.collisions():
             began.append(fleet.collisions())
             assert fleet.status(0)[2]
@@ -210,7 +236,7 @@ def test_a_collision_is_told_once_when_it_begins():
 
 
 def test_a_single_drone_is_separated_from_nobody():
-    assert Fleet(scenario(1)).min_separation_m() == math.inf
+    assert Fleet(scenario(1)).closest_m() == math.inf
 
 
 def test_wind_is_told():
@@ -239,6 +265,13 @@ def test_the_kernel_is_named_after_every_file_with_compiled_code():
     compiled = {p.name for p in folder.glob("*.py") if "\n@compiled" in p.read_text() or p.name == "compiled.py"}
     assert compiled <= set(gate.KERNEL_FILES)
     assert all((folder / name).exists() for name in gate.KERNEL_FILES)
+    assert set(gate.SOURCES) == {*(folder / name for name in gate.KERNEL_FILES), Path(presets.__file__)}
+
+
+def test_constants_that_are_compiled_in_come_from_files_that_count():
+    for path in gate.SOURCES:
+        for module, names in re.findall(r"^from (zsim\.\w+) import (.*)$", path.read_text(), re.MULTILINE):
+            assert module == "zsim.presets" or not re.search(r"\b[A-Z][A-Z0-9_]+\b", names), (path, module)
 
 
 def test_a_drone_placed_above_the_ground_falls_onto_it():
@@ -276,4 +309,4 @@ def test_a_hundred_drones_in_a_crowd_collide_and_stay_finite():
         touched += len(fleet.collisions())
     assert touched > 0
     assert np.isfinite(fleet.truth().position_m).all()
-    assert fleet.min_separation_m() > 0.3
+    assert fleet.closest_m() > 0.3

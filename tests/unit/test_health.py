@@ -32,10 +32,10 @@ def test_it_is_due_once_a_wall_second():
 
 def test_it_says_who_and_how():
     meter = HealthMeter("estimator", WallClock())
-    meter.refused, meter.dropped, meter.lag_ns = 3, 2, 40
+    meter.received, meter.refused, meter.dropped, meter.lag_ns = 9, 3, 2, 40
     message = meter.message(7, 1)
     assert (message.t_ns, message.seq, message.role, message.pid) == (7, 1, "estimator", os.getpid())
-    assert (message.refused, message.dropped, message.lag_ns) == (3, 2, 40)
+    assert (message.received, message.refused, message.dropped, message.lag_ns) == (9, 3, 2, 40)
     assert message.step_us == {"p50": 0.0, "p99": 0.0}
 
 

@@ -7,6 +7,15 @@ SECOND_NS = 1_000_000_000
 IMU = keys.sensor("d1", "imu")
 
 
+def since(history: History, from_ns: int, expressions: list[str]) -> list[tuple[str, bytes]]:
+    """Return all pages of what is stamped later."""
+    found, start = [], 0
+    while start is not None:
+        passed, start = history.page(from_ns, lambda key: any(keys.matches(e, key) for e in expressions), start)
+        found += passed
+    return found
+
+
 def clock(history: History, t_ns: int) -> None:
     history.add(keys.CLOCK, b"tick", t_ns)
 
@@ -35,7 +44,7 @@ def test_the_last_value_outlives_what_a_replay_brings():
     history.add("drone/d1/truth", b"x", 0)
     clock(history, 100 * SECOND_NS)
     assert history.last("drone/d1/truth") == [("drone/d1/truth", b"x")]
-    assert list(history.since(-1, ["drone/**"])) == []
+    assert since(history, -1, ["drone/**"]) == []
 
 
 def test_a_replay_brings_what_was_stamped_later_in_order_of_arrival():
@@ -43,15 +52,15 @@ def test_a_replay_brings_what_was_stamped_later_in_order_of_arrival():
     for t_ns in (1, 3, 2, 4):
         history.add(IMU, b"%d" % t_ns, t_ns)
         history.add("drone/d2/truth", b"other", t_ns)
-    assert [payload for _, payload in history.since(1, ["drone/d1/**"])] == [b"3", b"2", b"4"]
-    assert list(history.since(4, ["**"])) == []
-    assert list(history.since(-1, [])) == []
+    assert [payload for _, payload in since(history, 1, ["drone/d1/**"])] == [b"3", b"2", b"4"]
+    assert since(history, 4, ["**"]) == []
+    assert since(history, -1, []) == []
 
 
 def test_a_message_that_several_expressions_take_comes_once():
     history = History()
     history.add(IMU, b"x", 5)
-    assert list(history.since(0, ["drone/**", "**", IMU])) == [(IMU, b"x")]
+    assert since(history, 0, ["drone/**", "**", IMU]) == [(IMU, b"x")]
 
 
 def test_what_is_older_than_the_window_is_forgotten():
@@ -59,7 +68,7 @@ def test_what_is_older_than_the_window_is_forgotten():
     for second in range(20):
         clock(history, second * SECOND_NS)
         history.add(IMU, b"%d" % second, second * SECOND_NS)
-    kept = [int(payload) for _, payload in history.since(-1, [IMU])]
+    kept = [int(payload) for _, payload in since(history, -1, [IMU])]
     assert kept == list(range(19 - KEEP_NS // SECOND_NS, 20))
 
 
@@ -69,18 +78,56 @@ def test_a_sender_s_stamp_does_not_push_out_what_others_said():
     history.add(IMU, b"mine", 10 * SECOND_NS)
     history.add("drone/d1/cmd/mode", b"from the future", 2**63 - 1)
     clock(history, 11 * SECOND_NS)
-    assert [payload for _, payload in history.since(0, [IMU])] == [b"mine"]
+    assert [payload for _, payload in since(history, 0, [IMU])] == [b"mine"]
 
 
 def test_a_sender_s_stamp_does_not_keep_its_message_for_ever():
     history = History()
     history.add("drone/d1/cmd/mode", b"from the future", 2**63 - 1)
     clock(history, 100 * SECOND_NS)
-    assert list(history.since(-1, ["drone/**"])) == []
+    assert since(history, -1, ["drone/**"]) == []
 
 
 def test_memory_is_bounded_while_time_stands_still():
     history = History(keep_bytes=1000)
     for number in range(100):
         history.add(IMU, b"%0100d" % number, 0)
-    assert [int(payload) for _, payload in history.since(-1, [IMU])] == list(range(90, 100))
+    assert [int(payload) for _, payload in since(history, -1, [IMU])] == list(range(90, 100))
+
+
+def test_pages_bring_everything_once_and_in_order():
+    history = History(page_bytes=10)
+    said = [(IMU, bytes([number]) * (number % 5 + 1)) for number in range(50)]
+    for number, (key, payload) in enumerate(said):
+        history.add(key, payload, number)
+        history.add("drone/d2/truth", b"another's", number)
+    assert since(history, -1, [IMU]) == said
+    first = history.page(-1, lambda key: key == IMU)
+    assert sum(len(payload) for _, payload in first.passed) <= 10
+    assert first.passed == said[: len(first.passed)]
+
+
+def test_a_page_brings_what_alone_is_longer_than_a_page():
+    history = History(page_bytes=10)
+    for payload in (b"x" * 30, b"y"):
+        history.add(IMU, payload, 0)
+    assert since(history, -1, [IMU]) == [(IMU, b"x" * 30), (IMU, b"y")]
+
+
+def test_a_page_goes_on_where_the_last_one_ended_when_the_oldest_is_forgotten_meanwhile():
+    history = History(keep_bytes=20, page_bytes=4)
+    for number in range(20):
+        history.add(IMU, bytes([number]), number)
+    passed, more = history.page(-1, lambda key: True)
+    for number in range(20, 22):
+        history.add(IMU, bytes([number]), number)
+    assert more is not None
+    assert [payload[0] for _, payload in (*passed, *history.page(-1, lambda key: True, more).passed)] == [*range(8)]
+
+
+def test_what_was_said_on_a_key_at_a_time_is_found():
+    history = History()
+    for t_ns, payload in ((1, b"a"), (2, b"b"), (2, b"c"), (3, b"d")):
+        history.add(IMU, payload, t_ns)
+        history.add("drone/d2/truth", b"x", t_ns)
+    assert history.said({(IMU, 2), (IMU, 3), (IMU, 4)}) == [(IMU, b"b"), (IMU, b"c"), (IMU, b"d")]

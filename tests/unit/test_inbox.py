@@ -274,3 +274,28 @@ def test_a_long_backlog_is_worked_off_in_order():
             inbox.put(key, message)
     assert inbox.latest_gate_ns() == 299 * GATE_NS
     assert ready(inbox) == expected(said)
+
+
+def test_in_realtime_a_late_message_comes_with_the_next_gate_once():
+    a, b = keys.estimate("d1"), keys.estimate("d2")
+    inbox = Inbox([a, b], keep_late=True)
+    for gate in (1, 2, 3, 4):
+        inbox.put(a, estimate(gate * GATE_NS, gate))
+    inbox.put(b, estimate(GATE_NS, 1))
+    assert [key for key, _ in inbox.take(GATE_NS)] == [a, b]
+    inbox.take(2 * GATE_NS)
+    assert inbox.put(b, estimate(2 * GATE_NS, 2))
+    assert inbox.put(b, estimate(2 * GATE_NS, 2))
+    assert [(key, message.seq) for key, message in inbox.take(3 * GATE_NS)] == [(b, 2), (a, 3)]
+    assert not inbox.put(b, estimate(2 * GATE_NS, 2))
+    assert not inbox.put(b, estimate(GATE_NS, 1))
+    assert [(key, message.seq) for key, message in inbox.take(4 * GATE_NS)] == [(a, 4)]
+    assert inbox.late == 4
+
+
+def test_in_lockstep_a_late_message_is_refused():
+    inbox = Inbox([STATUS])
+    inbox.put(STATUS, status(GATE_NS, 1, 1))
+    inbox.take(GATE_NS)
+    assert not inbox.put(STATUS, status(GATE_NS, 1, 1))
+    assert inbox.take(2 * GATE_NS) == []

@@ -42,7 +42,6 @@ def test_keys_are_the_contract_s():
     fixed = (keys.INFO, keys.CLOCK, keys.EVENT, keys.CONTROL, keys.VIEW_DRONES)
     assert fixed == ("world/info", "clock", "world/event", "world/control", "view/drones")
     assert keys.SENSORS == ("imu", "gps", "mag", "baro", "sonar", "flow")
-    assert keys.COMMANDS == ("velocity", "ardrone", "attitude", "rotors", "mode")
 
 
 def test_keys_are_taken_apart():

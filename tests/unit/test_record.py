@@ -5,11 +5,13 @@ import subprocess
 import sys
 import textwrap
 import tracemalloc
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
@@ -17,6 +19,7 @@ from zsim import keys, messages
 from zsim.errors import RecordError
 from zsim.messages import Clock, Imu
 from zsim.record import Recorded, RecordReader, RecordWriter, repair
+from zsim.record.layout import places
 
 GATE_NS = 20_000_000
 CHUNK_MESSAGES = 40  # per chunk of the records below
@@ -177,6 +180,48 @@ def test_a_damaged_chunk_is_passed_over_and_counted(tmp_path):
     with RecordReader(path) as reader:
         assert list(reader.messages(by_time=False)) == recorded[CHUNK_MESSAGES:]
         assert reader.damaged == 1
+
+
+def test_a_length_that_cannot_be_right_hides_what_follows_and_is_counted(tmp_path):
+    path = tmp_path / "run.mcap"
+    sizes = write(path, recorded := flight(200))
+    data = bytearray(path.read_bytes())
+    chunk = sizes[2 * CHUNK_MESSAGES - 1]  # the third chunk begins here
+    assert data[chunk] == Opcode.CHUNK
+    for length in (0, 3, 2**63):
+        data[chunk + 1 : chunk + 9] = length.to_bytes(8, "little")
+        path.write_bytes(data)
+        with RecordReader(path) as reader:
+            assert reader.complete
+            assert list(reader.messages(by_time=False)) == recorded[: 2 * CHUNK_MESSAGES]
+            assert reader.damaged == 1
+
+
+@pytest.mark.parametrize("opcode", [Opcode.SCHEMA, Opcode.CHANNEL])
+def test_a_damaged_schema_or_channel_is_one_line(tmp_path, opcode):
+    path = tmp_path / "run.mcap"
+    write(path, flight(100))
+    data = bytearray(path.read_bytes())
+    place = next(place for place in places(bytes(data)) if place.opcode == opcode)
+    at = place.body + (2 if opcode == Opcode.SCHEMA else 4)  # the length of its name
+    data[at : at + 4] = b"\xff\xff\xff\x7f"
+    path.write_bytes(data[:-1])  # cut, so that there is something to repair
+    with pytest.raises(RecordError, match=r"^.* at byte \d+ is damaged .*; the record cannot be read$"):
+        repair(path)
+
+
+@given(st.integers(0, 2**32))
+@settings(max_examples=150, deadline=None)
+def test_whatever_is_overwritten_it_is_read_or_refused(tmp_path_factory, seed):
+    path, rng = tmp_path_factory.mktemp("record") / "run.mcap", random.Random(seed)
+    write(path, flight(100))
+    data = bytearray(path.read_bytes())
+    for at in [rng.randrange(8, len(data)) for _ in range(rng.randrange(1, 20))]:
+        data[at] = rng.choice((0, 0xFF, rng.randrange(256)))
+    path.write_bytes(data)
+    for work in (read, repair):
+        with suppress(RecordError):
+            work(path)
 
 
 def test_what_is_no_record_is_refused_in_one_line(tmp_path):

@@ -189,7 +189,7 @@ def test_separation_counts_in_the_air_only(tmp_path):
 
 def test_a_world_that_died_leaves_all_that_can_be_known(tmp_path):
     summary = report_of(tmp_path, flown(end=None, other_traffic=True))
-    assert summary.ended == "the world died after 12.00 s: no end is on record"
+    assert summary.ended == "the record ends here at 12.00 s: no end is on record"
     assert summary.wall_s == pytest.approx(0.6)  # the synthetic recorder takes 1 ms a gate
     assert summary.real_time_factor == pytest.approx(20.0)
     assert summary.deadline_misses is None
@@ -205,7 +205,7 @@ def test_a_cut_record_is_reported_up_to_the_cut(tmp_path):
     (tmp_path / "run.mcap").write_bytes(data[: len(data) // 2])
     summary = judge(tmp_path / "run.mcap")[-1]
     assert 4 < summary.sim_s < 8
-    assert summary.ended == f"the record was cut after {summary.sim_s:.2f} s: the recorder died"
+    assert summary.ended == f"the record was cut after {summary.sim_s:.2f} s: no end is on record"
     assert any("The run ended at" in note for note in summary.notes)
     assert any("was cut" in note for note in summary.notes)
 
@@ -231,12 +231,22 @@ def test_a_cluster_that_said_nothing(tmp_path):
     assert any("Cluster main published no state" in note for note in summary.notes)
 
 
-def test_an_empty_record_still_gives_a_report(tmp_path):
-    RecordWriter(tmp_path / "run.mcap").close()
-    summary = make_report(tmp_path)
-    assert summary.ended == "nothing is on record"
-    assert summary.truth_sha256 == hashlib.sha256().hexdigest()
-    assert "nothing on record to draw" in (tmp_path / "report.html").read_text()
+@pytest.mark.parametrize("length", [0, 1, 100])
+def test_a_record_without_a_message_is_refused(tmp_path, length):
+    synthetic_record.write(tmp_path / "whole.mcap", flown(duration_s=0.1))
+    (tmp_path / "run.mcap").write_bytes((tmp_path / "whole.mcap").read_bytes()[:length])
+    with pytest.raises(RecordError, match=r"run\.mcap: holds no message; there is nothing to report"):
+        make_report(tmp_path)
+    assert [path.name for path in tmp_path.iterdir() if path.suffix != ".mcap"] == []
+
+
+def test_a_record_on_which_no_drone_moves_is_refused(tmp_path):
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        for key, message, wall_ns in synthetic_record.traffic(flown(duration_s=0.1)):
+            if not key.endswith("/truth"):
+                writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
+    with pytest.raises(RecordError, match=r"holds \d+ messages and no truth"):
+        make_report(tmp_path)
 
 
 def test_garbage_on_the_keys_is_counted_and_passed_over(tmp_path):
@@ -319,6 +329,7 @@ def test_nothing_to_report_on_is_one_line(tmp_path):
     (tmp_path / "figures").write_text("in the way")
     with pytest.raises(ReportError, match="the report cannot be written"):
         make_report(tmp_path)
+    assert not (tmp_path / "report.html").exists()
 
 
 @pytest.mark.parametrize(

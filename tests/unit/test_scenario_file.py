@@ -478,7 +478,7 @@ def test_a_scenario_without_anything_says_all_that_is_missing():
 
 def test_a_fault_that_all_drones_share_is_told_once():
     assert only(faults_of(document(sensors={"imu": {"rate_hz": -5}}))) == (
-        "step.yaml: sensors.imu.rate_hz is -5; must be > 0 and <= 1000"
+        "step.yaml: sensors.imu.rate_hz is -5; must be >= 0.01 and <= 1000"
     )
 
 
@@ -517,6 +517,16 @@ def test_a_fault_that_all_drones_share_is_told_once():
             {"sensors": {"as_printed": True}, "drones": [drone("a")]},
             "drones[0].sensors.as_printed is true; must be false unless",
         ),
+        (
+            {"environment": {"height_m": 10_500}, "drones": [drone("a", position_m=[0, 0, 600])]},
+            "drones[0].position_m[2] is 600; with environment.height_m (10500) it must be <= 11000 m above the sea",
+        ),
+        (
+            {"environment": {"height_m": 10_500}, "drones": [drone("a", limits={"altitude_m": 501})]},
+            "drones[0].limits.altitude_m is 501; with environment.height_m (10500)",
+        ),
+        ({"environment": {"height_m": 11_001}}, "environment.height_m is 11001; must be >= -100000 and <= 11000"),
+        ({"sensors": {"baro": {"rate_hz": 0.0004}}}, "sensors.baro.rate_hz is 0.0004; must be >= 0.01 and <= 1000"),
         ({"time": {"gate_ms": 7}}, "time.gate_ms is 7; must be a multiple of 5"),
         ({"time": {"physics_dt_ms": 3}}, "time.physics_dt_ms is 3; must divide 5"),
         ({"time": {"physics_dt_ms": 1e-9}}, "time.physics_dt_ms is 1e-09; must divide 5"),

@@ -67,6 +67,12 @@ def test_pressure_of_the_standard_atmosphere(altitude, pressure):
     assert sensors.pressure(altitude) == pytest.approx(pressure, rel=2e-4)
 
 
+def test_pressure_is_finite_at_any_height():
+    pressures = [sensors.pressure(z) for z in (-1e6, -1e4, 2e4, 44_330.0, 44_331.0, 1e6, 1e9)]
+    assert all(map(math.isfinite, pressures))
+    assert pressures == sorted(pressures, reverse=True)
+
+
 def test_sonar_measures_along_its_beam():
     level = sensors.sonar((0, 0, 2.0), STRAIGHT, (0, 0, -0.05), STRAIGHT, 6.0)
     assert level == (pytest.approx(1.95), True)

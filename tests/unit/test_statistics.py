@@ -1,8 +1,10 @@
 """What a run measures of itself: ages of commands, and the rate of its clock."""
 
+import math
+
 import pytest
 
-from zsim_world.statistics import AGES_KEPT, GATES_KEPT, Ages, Rate
+from zsim_world.statistics import AGES_KEPT, GATES_KEPT, Ages, Measurements, Rate
 
 MS = 1_000_000
 GATE_NS = 20 * MS
@@ -85,3 +87,34 @@ def test_a_wall_clock_that_stands_gives_no_rate():
     rate.gate(0, 5)
     rate.gate(GATE_NS, 5)
     assert rate.now() == 0.0
+
+
+class Owing:
+    """A participant that owes its dones up to a gate."""
+
+    def __init__(self, name: str, owes_until_ns: int) -> None:
+        self.name, self.gating, self.deadline_misses = name, True, 0
+        self._owes_until_ns = owes_until_ns
+
+    def required_ns(self, need_ns: int) -> int | None:
+        return need_ns if need_ns >= 0 else None
+
+    def owes(self, need_ns: int) -> bool:
+        return need_ns < self._owes_until_ns
+
+
+def test_the_result_counts_who_was_late_and_how_near_drones_came():
+    measured, late, quick = Measurements(3.0), Owing("late", 2), Owing("quick", 0)
+    for need_ns in (-1, 0, 1, 2):
+        measured.deadlines_of([late, quick], need_ns)  # type: ignore[list-item]
+        measured.apart(2.5 - need_ns)
+    measured.own_misses += 1
+    for t_ns, wall_ns in ((0, 0), (2_000_000_000, 500_000_000)):
+        measured.gate(t_ns, wall_ns)
+    result = measured.result(2_000_000_000, [late, quick])  # type: ignore[list-item]
+    assert result["real_time_factor"] == 4.0
+    assert result["deadlines"] == 6
+    assert result["deadline_misses_by"] == {"late": 2, "quick": 0, "world": 1}
+    assert result["deadline_misses"] == 3
+    assert result["closest_m"] == 0.5
+    assert Measurements(math.inf).result(0, [])["closest_m"] is None

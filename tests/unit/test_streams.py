@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from zsim.streams import NormalBlock, stream
+from zsim.streams import stream
 
 NAMES = [f"drone{n}/{sensor}" for n in (1, 2, 3) for sensor in ("imu", "gps", "mag", "wind")]
 
@@ -42,24 +40,6 @@ def test_drawing_from_one_stream_changes_no_other():
     other = stream(1, "drone1/imu")
     other.standard_normal(1000)
     assert draws(1, "drone2/gps") == wanted
-
-
-@settings(max_examples=100, deadline=None)
-@given(rows=st.integers(1, 20), counts=st.lists(st.integers(0, 50), max_size=12), width=st.integers(1, 5))
-def test_a_block_s_size_changes_nothing(rows: int, counts: list[int], width: int):
-    block = NormalBlock(stream(1, "x"), width, rows)
-    taken = [block.take(count) for count in counts]
-    assert [part.shape for part in taken] == [(count, width) for count in counts]
-    wanted = stream(1, "x").standard_normal((sum(counts), width))
-    assert np.concatenate([np.empty((0, width)), *taken]).tolist() == wanted.tolist()
-
-
-def test_rows_that_were_taken_do_not_change_later():
-    block = NormalBlock(stream(1, "x"), 2, rows=4)
-    first = block.take(3)
-    kept = first.copy()
-    block.take(100)
-    assert first.tolist() == kept.tolist()
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5])

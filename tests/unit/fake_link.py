@@ -1,0 +1,138 @@
+"""A session without Zenoh: mailboxes that a test fills, requests that a test answers, everything said kept."""
+
+import queue
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from msgspec import Struct
+
+from zsim import keys, messages
+from zsim.messages import ControlAnswer
+from zsim.session import Sample
+
+PATIENCE_S = 20.0  # after which a test that waits for ever fails
+UNANSWERED = ControlAnswer(False, "nobody answered")
+BAD_UTF8 = b"\x83\xa4t_ns\x00\xa3seq\x00\xa6source\xa1\xff"
+NESTED = b"\x83\xa4t_ns\x00\xa3seq\x00\xa1x" + b"\x91" * 5000 + b"\xc0"
+"""A map with t_ns, seq and a field that nobody knows, of 5000 lists in each other."""
+
+
+class FakeBox:
+    """A mailbox."""
+
+    def __init__(self, expression: str) -> None:
+        self.expression = expression
+        self._arrived: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
+
+    def put(self, sample: Sample | None) -> None:
+        self._arrived.put(sample)
+
+    def receive(self) -> Sample | None:
+        return self._arrived.get(timeout=PATIENCE_S)
+
+    def drain(self) -> Iterator[Sample]:
+        while not self._arrived.empty():
+            sample = self._arrived.get()
+            if sample is not None:
+                yield sample
+
+    def wake(self) -> None:
+        self._arrived.put(None)
+
+
+class FakeLink:
+    """A session.
+
+    Attributes:
+        said: (key, payload) of all that its process has published.
+        on_said: called with each of these as it is published; a test lets others answer here.
+        on_request: answers a request by its key and arguments.
+        requests: (key, arguments) of all requests.
+        last: what a get is answered, by key.
+    """
+
+    host = "laptop"
+    guarded = False
+
+    def __init__(self) -> None:
+        self.said: list[tuple[str, bytes]] = []
+        self.on_said: Callable[[str, bytes], None] = lambda key, payload: None
+        self.on_request: Callable[[str, dict[str, Any]], ControlAnswer] = lambda key, args: UNANSWERED
+        self.requests: list[tuple[str, dict[str, Any]]] = []
+        self.last: dict[str, bytes] = {}
+        self._boxes: list[FakeBox] = []
+        self._early: list[Sample] = []
+        self._callbacks: list[tuple[str, Callable[[Sample], None]]] = []
+        self._on_link: Callable[[bool], None] = lambda up: None
+
+    # What a test does
+
+    def deliver(self, key: str, message: Struct | bytes) -> None:
+        """Let something arrive, at subscribers to come as well."""
+        sample = Sample(key, message if isinstance(message, bytes) else messages.encode(message))
+        self._early.append(sample)
+        for box in self._boxes:
+            if keys.matches(box.expression, key):
+                box.put(sample)
+        for expression, callback in self._callbacks:
+            if keys.matches(expression, key):
+                callback(sample)
+
+    def cut(self, up: bool) -> None:
+        """Let the link come (True) or go."""
+        self._on_link(up)
+
+    def all(self, expression: str) -> list[Any]:
+        """Return the messages said on an expression."""
+        return [messages.decode(key, payload) for key, payload in self.said if keys.matches(expression, key)]
+
+    # What a session does
+
+    def subscribe(self, expression: str) -> FakeBox:
+        box = FakeBox(expression)
+        self._boxes.append(box)
+        for sample in self._early:
+            if keys.matches(expression, sample.key):
+                box.put(sample)
+        return box
+
+    def on_message(self, expression: str, callback: Callable[[Sample], None]) -> None:
+        self._callbacks.append((expression, callback))
+
+    def put(self, key: str, message: Struct) -> None:
+        self.put_raw(key, messages.encode(message))
+
+    def put_raw(self, key: str, payload: bytes) -> None:
+        self.said.append((key, payload))
+        self.on_said(key, payload)
+
+    def put_all(self, encoded: Sequence[tuple[str, bytes]]) -> None:
+        for key, payload in encoded:
+            self.put_raw(key, payload)
+
+    def request(
+        self, key: str, op: str, source: str, args: dict[str, Any] | None = None, timeout_s: float = 5.0
+    ) -> ControlAnswer:
+        self.requests.append((key, args or {}))
+        return self.on_request(key, args or {})
+
+    def get(self, expression: str, timeout_s: float = 2.0) -> list[Sample]:
+        return [Sample(key, payload) for key, payload in self.last.items() if keys.matches(expression, key)]
+
+    def heard(self, key: str) -> bool:
+        return True
+
+    def tokens(self, expression: str, timeout_s: float = 1.0) -> list[str]:
+        return []
+
+    def on_link(self, callback: Callable[[bool], None]) -> None:
+        self._on_link = callback
+
+    def on_token(self, expression: str, callback: Callable[[str, bool], None]) -> None:
+        return
+
+    def answer(self, expression: str, callback: Callable[[Any], None]) -> None:
+        return
+
+    def declare_token(self, key: str) -> None:
+        return

@@ -1,0 +1,132 @@
+"""The authority and what it issues: purposes, names, times, files, and when a certificate is made anew."""
+
+import shutil
+import stat
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from zsim.errors import RunError
+from zsim.identity import Identity
+from zsim.tls import own_fault
+from zsim_deploy import certificates
+from zsim_deploy.certificates import DAYS, due, issue
+from zsim_deploy.enrolment import Wanted
+
+NOW = datetime(2026, 11, 1, 12, tzinfo=UTC)
+ESTIMATOR = Wanted("h1", "estimator.drone1", ("10.0.0.1",))
+
+
+@pytest.fixture
+def signer(tmp_path: Path) -> certificates.Authority:
+    return certificates.authority(tmp_path, NOW)
+
+
+def read(path: Path) -> x509.Certificate:
+    return x509.load_pem_x509_certificate(path.read_bytes())
+
+
+def test_a_certificate_names_process_and_addresses_and_is_good_for_a_month(tmp_path: Path, signer) -> None:
+    made = read(issue(tmp_path, signer, Wanted("h1", "world", ("10.0.0.1", "lab.local")), NOW) / "certificate.pem")
+    names = made.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value == "world"
+    assert [str(name) for name in names.get_values_for_type(x509.IPAddress)] == ["10.0.0.1", "127.0.0.1", "::1"]
+    assert names.get_values_for_type(x509.DNSName) == ["lab.local", "localhost"]
+    assert made.not_valid_before_utc == NOW - timedelta(days=1)
+    assert made.not_valid_after_utc == NOW + timedelta(days=30)
+
+
+def test_a_certificate_serves_both_ends_of_a_link_and_signs_nothing(tmp_path: Path, signer) -> None:
+    made = read(issue(tmp_path, signer, ESTIMATOR, NOW) / "certificate.pem")
+    purposes = made.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    assert set(purposes) == {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
+    assert not made.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+    made.verify_directly_issued_by(signer.certificate)
+
+
+def test_keys_are_p256_their_owner_s_alone_and_never_shared(tmp_path: Path, signer) -> None:
+    places = [issue(tmp_path, signer, Wanted(host, "recorder"), NOW) for host in ("h1", "h2")]
+    keys = [serialization.load_pem_private_key((place / "key.pem").read_bytes(), None) for place in places]
+    for path in (tmp_path / "ca.key", *(place / "key.pem" for place in places)):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert all(isinstance(key, ec.EllipticCurvePrivateKey) and key.curve.name == "secp256r1" for key in keys)
+    assert len({(tmp_path / "ca.key").read_bytes(), *((place / "key.pem").read_bytes() for place in places)}) == 3
+    assert not list(tmp_path.rglob("*.new"))
+
+
+def test_an_authority_is_kept_until_another_is_forced(tmp_path: Path, signer) -> None:
+    issue(tmp_path, signer, ESTIMATOR, NOW)
+    again = certificates.authority(tmp_path, NOW)
+    assert again.certificate == signer.certificate
+    assert due(tmp_path, again, ESTIMATOR, NOW) is None
+    other = certificates.authority(tmp_path, NOW, force=True)
+    assert other.certificate != signer.certificate
+    assert due(tmp_path, other, ESTIMATOR, NOW) == "of another authority"
+
+
+@pytest.mark.parametrize("missing", ["ca.pem", "ca.key"])
+def test_half_an_authority_is_not_written_over(tmp_path: Path, signer, missing: str) -> None:
+    (tmp_path / missing).unlink()
+    left = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(RunError, match=rf"{missing}: is missing beside ca\.\w+; bring it here, or --force makes"):
+        certificates.authority(tmp_path, NOW)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == left
+
+
+def test_an_authority_of_no_use_is_a_line(tmp_path: Path, signer) -> None:
+    with pytest.raises(RunError, match=r"ca\.pem: the authority expired on 2031-10-31; --force makes a new one"):
+        certificates.authority(tmp_path, NOW + timedelta(days=1826))
+    (tmp_path / "ca.key").write_text("nothing")
+    with pytest.raises(RunError, match=r"ca\.key: is no private key; --force makes a new authority"):
+        certificates.authority(tmp_path, NOW)
+    other = tmp_path / "other"
+    certificates.authority(other, NOW)
+    shutil.copy(other / "ca.key", tmp_path / "ca.key")
+    with pytest.raises(RunError, match=r"ca\.key: is not the key of ca\.pem"):
+        certificates.authority(tmp_path, NOW)
+
+
+def test_a_certificate_is_made_anew_when_it_would_not_do(tmp_path: Path, signer) -> None:
+    assert due(tmp_path, signer, ESTIMATOR, NOW) == "new"
+    place = issue(tmp_path, signer, ESTIMATOR, NOW)
+    assert due(tmp_path, signer, ESTIMATOR, NOW) is None
+    assert due(tmp_path, signer, ESTIMATOR._replace(addresses=("10.0.0.2",)), NOW) == "other addresses"
+    assert due(tmp_path, signer, ESTIMATOR, NOW + timedelta(days=DAYS)) == "expired on 2026-12-01"
+    (place / "certificate.pem").write_text("nothing")
+    assert due(tmp_path, signer, ESTIMATOR, NOW) == "cannot be read"
+
+
+def test_what_is_there_is_shown(tmp_path: Path, signer) -> None:
+    issue(tmp_path, signer, ESTIMATOR, NOW)
+    issue(tmp_path, signer, Wanted("h1", "world"), NOW, days=-0.5)
+    shown = certificates.show(tmp_path, NOW)
+    assert [(each.process, each.fault) for each in shown] == [("estimator.drone1", ""), ("world", "expired")]
+    assert shown[0].addresses == ("10.0.0.1", "localhost", "127.0.0.1", "::1")
+
+
+def test_a_folder_that_cannot_be_written_is_a_line() -> None:
+    with pytest.raises(RunError, match=r"^/proc/certs/ca\.key: cannot be written"):
+        certificates.authority(Path("/proc/certs"), NOW)
+
+
+@pytest.mark.parametrize(
+    ("begin_days", "days", "says"),
+    [
+        (0.0, 30.0, None),
+        (0.0, -0.5, "the certificate of recorder expired on "),
+        (2.0, 30.0, "the certificate of recorder is valid from "),
+    ],
+)
+def test_a_process_judges_the_time_of_its_own_certificate(
+    tmp_path: Path, begin_days: float, days: float, says: str | None
+) -> None:
+    now = datetime.now(UTC)
+    signer = certificates.authority(tmp_path, now)
+    folder = issue(tmp_path, signer, Wanted("h1", "recorder"), now + timedelta(days=begin_days), days)
+    fault = own_fault(Identity("h1", folder))
+    assert fault is None if says is None else str(fault).startswith(says)

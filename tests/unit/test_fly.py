@@ -1,0 +1,56 @@
+"""A run in one process whose state is no longer finite: the record is whole, the run has failed."""
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from zsim import keys, messages, scenario_file
+from zsim.record import RecordReader
+from zsim_deploy import run
+from zsim_deploy.progress import Screen
+from zsim_world.fleet import DivergedError, Fleet
+
+GATE_NS = 20_000_000
+SCENARIO = """
+name: one
+seed: 3
+duration_s: 1
+drones: [{name: d1, position_m: [0, 0, 0]}]
+processes: {expect: []}
+"""
+
+
+class NoLeash:
+    """Leaves the signals to pytest."""
+
+    def __init__(self, launched: bool) -> None:
+        return
+
+    def reason(self) -> None:
+        return
+
+    def pulled(self) -> bool:
+        return False
+
+
+def test_a_diverged_run_in_one_process_has_failed_and_has_its_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    advance = Fleet.advance
+
+    def diverge(fleet: Fleet) -> None:
+        if fleet.t_ns == 5 * GATE_NS:
+            raise DivergedError("d1", 0.12)
+        advance(fleet)
+
+    monkeypatch.setattr(Fleet, "advance", diverge)
+    monkeypatch.setattr(run, "Leash", NoLeash)
+    options = run.Options(scenario_file.from_text(SCENARIO), tmp_path)
+    outcome = run.run_in_process(options, Screen(1.0, Console(file=io.StringIO())))
+    assert outcome.failed
+    assert outcome.reason.startswith("d1 at 0.120 s: the state is no longer finite")
+    with RecordReader(tmp_path / "run.mcap") as reader:
+        said = [(m.key, messages.decode(m.key, m.payload)) for m in reader.messages()]
+    assert [event.kind for key, event in said if key == keys.EVENT] == ["diverged", "end"]
+    clocks = [clock for key, clock in said if key == keys.CLOCK]
+    assert (clocks[-1].state, clocks[-1].t_ns) == ("stopped", 5 * GATE_NS)

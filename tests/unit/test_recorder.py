@@ -1,0 +1,103 @@
+"""The recorder: what was said before it came, once and without a gap, and garbage as it came."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from msgspec import Struct
+
+from zsim import batch, keys, messages
+from zsim.messages import Clock, ControlAnswer, Imu, Info, Origin
+from zsim.record import RecordReader
+from zsim_agents import recorder
+from zsim_agents.recorder import record
+
+sys.path.insert(0, str(Path(__file__).parent))
+from fake_link import BAD_UTF8, NESTED, UNANSWERED, FakeLink
+
+GATE_NS = 20_000_000
+INFO = Info(
+    0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(0.0, 0.0, 0.0), (), (), "", "", "", ""
+)
+IMU = keys.sensor("d1", "imu")
+Pair = tuple[str, bytes]
+
+
+def pair(key: str, message: Struct) -> Pair:
+    return key, messages.encode(message)
+
+
+def clock(gate: int, state: str = "running") -> Pair:
+    return pair(keys.CLOCK, Clock(gate * GATE_NS, gate, "r", gate, state, 1.0))  # type: ignore[arg-type]
+
+
+def imu(gate: int) -> Pair:
+    return pair(IMU, Imu(gate * GATE_NS, gate, gate * GATE_NS, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0)))
+
+
+def gates(*numbers: int) -> list[Pair]:
+    return [each for gate in numbers for each in (imu(gate), clock(gate))]
+
+
+def page(passed: list[Pair], more: int | None = None) -> ControlAnswer:
+    return ControlAnswer(True, result=[list(each) for each in passed], more=more)
+
+
+def recorded(path: Path, answers: list[ControlAnswer], *batches: list[Pair]) -> list[Pair]:
+    """Record a run that answers replays and sends batches; return what is in the record."""
+    link, left = FakeLink(), iter(answers)
+    link.on_request = lambda key, args: next(left)
+    for passed in (*batches, [clock(99, "stopped")]):
+        link.deliver(batch.KEY, batch.encode(passed))
+    assert record(link, INFO, path) == "the run ended"  # type: ignore[arg-type]
+    assert next(left, None) is None
+    with RecordReader(path) as reader:
+        return [(message.key, message.payload) for message in reader.messages()]
+
+
+def stamps(found: list[Pair], key: str) -> list[int]:
+    return [messages.decode(key, payload).t_ns // GATE_NS for name, payload in found if name == key]
+
+
+def test_a_late_recorder_writes_what_it_hears_twice_once(tmp_path: Path):
+    """The replay reaches gate 6; the batches since its subscription begin with gate 4."""
+    replayed = [page(gates(0, 1, 2, 3, 4, 5, 6))]
+    found = recorded(tmp_path / "run.mcap", replayed, gates(4), gates(5, 6), gates(7), gates(8))
+    assert stamps(found, IMU) == list(range(9))
+    assert stamps(found, keys.CLOCK) == [*range(9), 99]
+
+
+def test_the_newest_of_a_long_replay_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(recorder, "KNOWN_MAX", 6)
+    found = recorded(tmp_path / "run.mcap", [page(gates(*range(10)))], gates(8, 9, 10))
+    assert stamps(found, IMU) == list(range(11))
+
+
+def test_all_pages_of_a_replay_are_written(tmp_path: Path):
+    pages = [page(gates(0, 1), more=4), page(gates(2, 3), more=8), page(gates(4))]
+    assert stamps(recorded(tmp_path / "run.mcap", pages, gates(5)), IMU) == [0, 1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("first", [UNANSWERED, page(gates(0), more=2)], ids=["nothing", "a page"])
+def test_what_is_not_answered_is_asked_for_again(tmp_path: Path, first: ControlAnswer):
+    answers = [first, UNANSWERED, page(gates(0, 1))]
+    assert stamps(recorded(tmp_path / "run.mcap", answers, gates(2)), IMU) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("key", [keys.CLOCK, keys.EVENT, IMU, "process/x.y/join", "of/somebody"])
+@pytest.mark.parametrize("payload", [BAD_UTF8, NESTED, b"\xc1", b"\x91" * 5000], ids=["utf8", "nested", "no", "deep"])
+def test_garbage_is_recorded_as_it_came(tmp_path: Path, key: str, payload: bytes):
+    found = recorded(tmp_path / "run.mcap", [page([(key, payload)])], [(key, payload), clock(2), (key, payload)])
+    assert [each for each in found if each[1] == payload] == [(key, payload)] * 2
+
+
+@pytest.mark.parametrize("garbage", [b"\x91\x92\xa1\xff\xc4\x00", b"\x91" * 5000 + b"\xc0", b"\xc1"])
+def test_a_batch_of_a_stranger_ends_nothing(tmp_path: Path, garbage: bytes):
+    link = FakeLink()
+    link.on_request = lambda key, args: page([])
+    for payload in (garbage, batch.encode([clock(3, "stopped")])):
+        link.deliver(batch.KEY, payload)
+    made: Any = recorder.Recorder(link, INFO, tmp_path / "run.mcap", "recorder", lambda: False)  # type: ignore[arg-type]
+    assert made.run() == "the run ended"
+    assert made.health.refused == 1

@@ -1,0 +1,242 @@
+"""The runner: whose estimates a gate waits for, events that are no events, and a world that does not answer at once."""
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsim import keys, membership, messages
+from zsim.agent import Agent, Output
+from zsim.errors import RunError, SupersededError
+from zsim.messages import ControlAnswer, Done, Estimate, Event, Info, Origin, Status
+from zsim.runner import Runner
+
+sys.path.insert(0, str(Path(__file__).parent))
+from fake_link import UNANSWERED, FakeLink
+
+GATE_NS = 20_000_000
+END = 6  # last gate of the runs here
+ME = "judge.main"
+REPLAY = keys.replay(ME)
+
+
+class Judge(Agent):
+    """Closes a gate with the status and the estimate of one drone, and says nothing."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.name, self.period_ns = ME, GATE_NS
+        self.gate_keys = self.reads = (keys.status("d1"), keys.estimate("d1"))
+        self.heard: list[tuple[str, int]] = []
+
+    def receive(self, key: str, message: Any) -> None:
+        self.heard.append((keys.leaf(key), message.t_ns // GATE_NS))
+
+    def step(self, t_ns: int) -> list[Output]:
+        return []
+
+
+def info(run_id: str = "run1") -> Info:
+    origin = Origin(0.0, 0.0, 0.0)
+    return Info(0, 0, 1, run_id, "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, origin, (), (), "", "", "", "")
+
+
+def status(gate: int) -> Status:
+    return Status(gate * GATE_NS, gate, "flying", 50.0, False, None, 1)
+
+
+def estimate(gate: int, source: str = "my.d1") -> Estimate:
+    zeros, t_ns = (0.0, 0.0, 0.0), gate * GATE_NS
+    return Estimate(t_ns, gate, zeros, zeros, (1.0, *zeros), 0.0, (0.0,) * 36, 0.1, zeros, {}, source)
+
+
+def event(kind: str, subject: str, **data: Any) -> Event:
+    return Event(0, 0, kind, "world", subject, "", data)
+
+
+class World(FakeLink):
+    """Says a status per gate, the next one when the judge is done with the last, and the end.
+
+    Args:
+        at: what happens just before the status of a gate, by gate.
+    """
+
+    def __init__(self, at: dict[int, Callable[["World"], None]]) -> None:
+        super().__init__()
+        self.last = {keys.INFO: messages.encode(info())}
+        self.on_said = self._answer
+        self._at = at
+        self._next = 0
+        self._gate(0)
+
+    def _answer(self, key: str, payload: bytes) -> None:
+        if key == keys.process(ME, "done"):
+            gate = messages.decode(key, payload).done_ns // GATE_NS
+            if gate < self._next:
+                return
+            self._next = gate + 1
+            if gate == END:
+                self.deliver(keys.EVENT, event("end", "world", last_ns=END * GATE_NS))
+            else:
+                self._gate(gate + 1)
+
+    def _gate(self, gate: int) -> None:
+        self._at.get(gate, lambda world: None)(self)
+        self.deliver(keys.status("d1"), status(gate))
+
+    def gates_done(self) -> list[int]:
+        return [m.done_ns // GATE_NS for m in self.all(keys.process(ME, "done"))]
+
+
+def run(world: World, stopped: Callable[[], bool] = lambda: False) -> Judge:
+    judge = Judge()
+    said: list[str] = []
+    Runner(world, info(), judge, stopped, said.append).run()  # type: ignore[arg-type]
+    return judge
+
+
+def estimates(gates: range, source: str = "my.d1") -> dict[int, Callable[[World], None]]:
+    return {gate: lambda world, g=gate: world.deliver(keys.estimate("d1"), estimate(g, source)) for gate in gates}
+
+
+def tells(*said: Event | Estimate) -> Callable[[World], None]:
+    def tell(world: World) -> None:
+        for each in said:
+            world.deliver(keys.EVENT if isinstance(each, Event) else keys.estimate("d1"), each)
+
+    return tell
+
+
+@pytest.mark.parametrize("kind", ["drop", "leave"])
+@pytest.mark.parametrize("source", ["my.d1", "estimator.d1", ""])
+def test_whose_estimates_are_waited_for_no_longer_follows_from_their_source(kind: str, source: str):
+    world = World({**estimates(range(2), source), 2: tells(event(kind, source or "estimator.d1"))})
+    run(world)
+    assert world.gates_done() == list(range(END + 1))
+
+
+@pytest.mark.parametrize("subject", ["range.d1", "estimator.d1"])
+def test_the_loss_of_another_process_changes_nothing(subject: str):
+    world = World({**estimates(range(2)), 2: tells(event("drop", subject))})
+    ticks = iter(range(10))
+    run(world, stopped=lambda: next(ticks, None) is None)
+    assert world.gates_done() == [0, 1]
+
+
+@pytest.mark.parametrize("successor", ["my.d1", "estimator.d1"])
+def test_who_joins_in_its_place_is_waited_for_from_its_own_first_gate(successor: str):
+    joins = event("join", successor, incarnation=1, host="x", pid=1, from_ns=4 * GATE_NS)
+    world = World({**estimates(range(2)), 2: tells(event("drop", "my.d1")), 3: tells(joins)})
+    ticks = iter(range(10))
+    run(world, stopped=lambda: next(ticks, None) is None)
+    assert world.gates_done() == [0, 1, 2, 3]
+
+
+GARBAGE = [
+    event("end", "world", last_ns="soon"),
+    event("end", "world", last_ns=None),
+    event("end", "world"),
+    event("join", "my.d1", from_ns="soon"),
+    event("join", "my.d1"),
+    event("restart", ME),
+    event("superseded", ME, incarnation="mine", pid=None, host=3, from_ns=0.5),
+]
+
+
+def test_events_that_nobody_can_mean_are_refused_and_change_nothing():
+    world = World({**estimates(range(END + 1)), 2: tells(*GARBAGE, estimate(2))})
+    runner = Runner(world, info(), Judge())  # type: ignore[arg-type]
+    assert runner.run() == "the run ended"
+    assert world.gates_done() == list(range(END + 1))
+    assert runner.health.refused == len(GARBAGE)
+
+
+def test_who_is_superseded_ends():
+    entry = {"incarnation": 1, "host": "other", "pid": os.getpid() + 1, "from_ns": 0, "former_pid": os.getpid()}
+    world = World({**estimates(range(3)), 2: tells(event("superseded", ME, **entry))})
+    with pytest.raises(SupersededError, match=r"joined from other \(pid \d+\); this one ends"):
+        run(world)
+
+
+# A world that does not answer at once
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let what is owed be tried at every tick."""
+    monkeypatch.setattr(membership, "RETRY_S", 0.0)
+
+
+def answers(*given: ControlAnswer) -> Callable[[str, dict[str, Any]], ControlAnswer]:
+    """Answer requests in turn."""
+    left = iter(given)
+    return lambda key, args: next(left)
+
+
+def replayed(*gates: int) -> ControlAnswer:
+    pairs = [[keys.estimate("d1"), messages.encode(estimate(gate))] for gate in gates]
+    pairs += [[keys.status("d1"), messages.encode(status(gate))] for gate in gates]
+    return ControlAnswer(True, result=pairs)
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("before", [[], [UNANSWERED], [UNANSWERED, ControlAnswer(True, result=7), replayed()]])
+def test_a_gate_that_was_lost_is_asked_for_until_it_is_there(before: list[ControlAnswer]):
+    """The estimate of gate 2 is lost; that of gate 3 shows it; then nothing comes any more but answers."""
+
+    def loses(world: World) -> None:
+        world.deliver(keys.estimate("d1"), estimate(3))
+
+    rest = {gate: each for gate, each in estimates(range(END + 1)).items() if gate not in (2, 3)}
+    world = World({**rest, 2: loses})
+    world.on_request = answers(*before, replayed(2))
+    judge = run(world)
+    assert world.gates_done() == list(range(END + 1))
+    assert [gate for kind, gate in judge.heard if kind == "estimate"] == list(range(END + 1))
+    assert world.requests[0] == (REPLAY, {"from_ns": GATE_NS, "keys": list(judge.reads), "page": 0})
+
+
+@pytest.mark.usefixtures("quick")
+def test_after_a_lost_link_it_rejoins_as_soon_as_the_world_answers():
+    """The link goes and comes at gate 2, which is lost with it; the world takes its time to answer."""
+    asked = iter(range(3))
+
+    def cut(world: World) -> None:
+        world.last = {}
+        world.cut(False)
+        world.cut(True)
+
+    class Slow(World):
+        def get(self, expression: str, timeout_s: float = 2.0) -> list[Any]:
+            if expression == keys.INFO and next(asked, None) is None:
+                self.last = {keys.INFO: messages.encode(info())}
+            return super().get(expression, timeout_s)
+
+        def _gate(self, gate: int) -> None:
+            if gate == 2:
+                cut(self)
+            else:
+                super()._gate(gate)
+
+    world = Slow(estimates(range(END + 1)))
+    world.on_request = answers(UNANSWERED, UNANSWERED, replayed(2), *[replayed()] * 9)
+    run(world)
+    dones: list[Done] = world.all(keys.process(ME, "done"))
+    assert [done.done_ns // GATE_NS for done in dones] == [0, 1, 0, 1, 2, 3, 4, 5, 6]
+    joins = world.all(keys.process(ME, "join"))
+    assert len(joins) == 2
+    assert {done.incarnation for done in dones[2:]} == {joins[1].incarnation} != {joins[0].incarnation}
+
+
+@pytest.mark.usefixtures("quick")
+def test_after_a_lost_link_another_run_is_none_of_its_business():
+    def cut(world: World) -> None:
+        world.last = {keys.INFO: messages.encode(info("run2"))}
+        world.cut(False)
+        world.cut(True)
+
+    with pytest.raises(RunError, match="the world has begun another run"):
+        run(World({**estimates(range(END + 1)), 2: cut}))

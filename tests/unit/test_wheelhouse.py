@@ -1,0 +1,184 @@
+"""The wheelhouse: what it is keyed by, what pip is asked for, and that nothing is fetched or built twice."""
+
+import asyncio
+import importlib.metadata
+import json
+import platform
+import sys
+import sysconfig
+import tarfile
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from zsim.errors import HostsError
+from zsim_deploy import wheelhouse
+from zsim_deploy.target import Target, target
+from zsim_deploy.wheelhouse import House, PipError, Wheelhouse, gather, requirement
+
+BACKEND = """
+# A build backend without dependencies: a wheel with one module.
+import zipfile
+
+def build_wheel(folder, config_settings=None, metadata_directory=None):
+    with zipfile.ZipFile(f"{{folder}}/{name}-1.0-py3-none-any.whl", "w") as wheel:
+        wheel.writestr("{name}.py", "")
+        wheel.writestr("{name}-1.0.dist-info/METADATA", "Metadata-Version: 2.1\\nName: {name}\\nVersion: 1.0\\n{needs}")
+        wheel.writestr("{name}-1.0.dist-info/WHEEL", "Wheel-Version: 1.0\\nRoot-Is-Purelib: true\\nTag: py3-none-any\\n")
+        wheel.writestr("{name}-1.0.dist-info/RECORD", "{name}.py,,\\n")
+    return "{name}-1.0-py3-none-any.whl"
+"""
+PYPROJECT = """
+[build-system]
+requires = []
+build-backend = "backend"
+backend-path = ["."]
+[tool.hatch.build.targets.wheel]
+packages = ["source"]
+"""
+NEEDS = "Requires-Dist: gadget; extra == 'agents'\\nProvides-Extra: agents\\n"
+ELSEWHERE = Target((3, 12), "cp312", ("manylinux_2_31_aarch64", "linux_aarch64"))
+
+
+def here() -> Target:
+    said = {
+        "version": list(sys.version_info[:2]),
+        "implementation": "cpython",
+        "free_threaded": False,
+        "platform": sysconfig.get_platform(),
+        "libc": list(platform.libc_ver()),
+    }
+    return target("here", said)
+
+
+def write_project(folder: Path, name: str, needs: str = "") -> Path:
+    """Write a project that builds itself without an index."""
+    (folder / "source").mkdir(parents=True)
+    texts = {"pyproject.toml": PYPROJECT, "backend.py": BACKEND.format(name=name, needs=needs), "README.md": ""}
+    for file, text in {**texts, "PKG-INFO": f"Name: {name}\n", "source/flight.py": "height_m = 4\n"}.items():
+        (folder / file).write_text(text)
+    return folder
+
+
+def write_wheel(index: Path, name: str) -> None:
+    """Put a wheel of this name into an index."""
+    backend: dict[str, Any] = {}
+    exec(BACKEND.format(name=name, needs=""), backend)
+    backend["build_wheel"](index)
+
+
+@pytest.fixture
+def index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder that is all that pip knows; in it a wheel of pip 1.0, and gadget 1.0 as sources only."""
+    folder = tmp_path / "index"
+    gadget = write_project(folder / "gadget-1.0", "gadget")
+    with tarfile.open(folder / "gadget-1.0.tar.gz", "w:gz") as archive:
+        archive.add(gadget, gadget.name)
+    write_wheel(folder, "pip")
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(folder))
+    return folder
+
+
+@pytest.fixture
+def checkout(index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A checkout of a project that needs gadget with its extra agents; there is a wheel of gadget."""
+    write_wheel(index, "gadget")
+    folder = write_project(tmp_path / "checkout", "zsim", NEEDS)
+    monkeypatch.setattr(wheelhouse, "_checkout", lambda: folder)
+    return folder
+
+
+def test_a_wheel_that_does_not_exist_is_what_pip_says(index: Path, tmp_path: Path) -> None:
+    with pytest.raises(PipError, match="satisfies the requirement numpy"):
+        asyncio.run(gather(["numpy"], ELSEWHERE, tmp_path / "into", []))
+
+
+@pytest.mark.parametrize("aim", [here(), ELSEWHERE], ids=["here", "elsewhere"])
+def test_a_project_without_wheels_is_built_here_also_for_others(index: Path, tmp_path: Path, aim: Target) -> None:
+    into = tmp_path / "into"
+    assert not asyncio.run(gather(["gadget"], aim, into, []))
+    assert [path.name for path in into.iterdir()] == ["gadget-1.0-py3-none-any.whl"]
+
+
+def test_versions_are_those_of_here_and_others_only_where_there_are_none(index: Path, tmp_path: Path) -> None:
+    assert not asyncio.run(gather(["gadget"], ELSEWHERE, tmp_path / "same", ["gadget==1.0"]))
+    assert asyncio.run(gather(["gadget"], ELSEWHERE, tmp_path / "other", ["gadget==0.9"]))
+
+
+def house(folder: Path, extras: list[str], host: str = "h") -> tuple[House, list[str]]:
+    """Return a house of the wheelhouse in a folder, and what was said of it."""
+    told: list[str] = []
+    return asyncio.run(Wheelhouse(folder, told.append).house(host, ELSEWHERE, extras)), told
+
+
+def test_a_house_holds_what_a_host_needs_and_is_gathered_once(checkout: Path, tmp_path: Path) -> None:
+    first, told = house(tmp_path / "cache", ["agents"])
+    assert [wheel.path.name.partition("-")[0] for wheel in first.wheels()] == ["zsim", "pip", "gadget"]
+    assert first.extras == ("agents",)
+    assert told == ["building the wheel of zsim", f"gathering the wheels for {ELSEWHERE} with agents"]
+    again, told = house(tmp_path / "cache", ["agents"])
+    assert (again, told) == (first, [])
+
+
+def test_a_changed_file_builds_the_project_and_nothing_else(checkout: Path, tmp_path: Path) -> None:
+    first, _ = house(tmp_path / "cache", [])
+    (checkout / "source/flight.py").write_text("height_m = 5\n")
+    second, told = house(tmp_path / "cache", [])
+    assert told == ["building the wheel of zsim"]
+    assert second.project.path != first.project.path
+    assert second.pip == first.pip
+
+
+def test_a_wheel_that_was_lost_is_gathered_again(checkout: Path, tmp_path: Path) -> None:
+    first, _ = house(tmp_path / "cache", ["agents"])
+    first.others[0].path.unlink()
+    second, told = house(tmp_path / "cache", ["agents"])
+    assert told == [f"gathering the wheels for {ELSEWHERE} with agents"]
+    assert second.others[0].path.exists()
+
+
+def test_a_missing_wheel_is_a_line_with_host_package_and_system(index: Path, checkout: Path, tmp_path: Path) -> None:
+    (index / "gadget-1.0.tar.gz").unlink()
+    (index / "gadget-1.0-py3-none-any.whl").unlink()
+    with pytest.raises(HostsError) as caught:
+        house(tmp_path / "cache", ["agents"], "onboard1")
+    assert str(caught.value) == (
+        "onboard1: no wheel of gadget for Python 3.12 on manylinux_2_31_aarch64; "
+        "take another Python there, or build it there and give its folder to pip here (PIP_FIND_LINKS)"
+    )
+
+
+def test_a_project_that_cannot_be_built_is_a_line(checkout: Path, tmp_path: Path) -> None:
+    (checkout / "backend.py").write_text("raise ImportError('no backend')\n")
+    with pytest.raises(HostsError, match=rf"^launcher: no wheel of zsim from {checkout}: [^\n]+$"):
+        house(tmp_path / "cache", [])
+
+
+class Installed:
+    """A distribution as importlib.metadata returns it."""
+
+    version = "0.1.0"
+
+    def __init__(self, origin: dict[str, object] | None) -> None:
+        self._origin = origin
+
+    def read_text(self, name: str) -> str | None:
+        assert name == "direct_url.json"
+        return json.dumps(self._origin) if self._origin else None
+
+
+@pytest.mark.parametrize(
+    ("origin", "wanted"),
+    [
+        (None, "zsim==0.1.0"),
+        ({"url": "file:///tmp/zsim.whl", "archive_info": {}}, "zsim @ file:///tmp/zsim.whl"),
+        (
+            {"url": "https://host/zsim.git", "vcs_info": {"vcs": "git", "commit_id": "abc"}},
+            "zsim @ git+https://host/zsim.git@abc",
+        ),
+    ],
+)
+def test_an_installed_distribution_is_had_from_where_it_came(origin: dict[str, object] | None, wanted: str) -> None:
+    assert requirement(cast(importlib.metadata.Distribution, Installed(origin))) == wanted
