@@ -1,7 +1,8 @@
 """How a process learns that it is to stop: a signal, a word from its launcher, or the launcher's death.
 
 A launched process has a pipe from its launcher as standard input. The launcher writes "stop REASON"; when it dies,
-the pipe ends. So nothing outlives its launcher, on any system, also after kill -9.
+the pipe ends. So nothing outlives its launcher, on any system, also after kill -9. A launcher on another host writes
+"orphan-after SECONDS" and then a "beat" every second: a host that vanishes closes no pipe.
 """
 
 import os
@@ -22,6 +23,7 @@ class Leash:
 
     def __init__(self, launched: bool) -> None:
         self._reason: str | None = None
+        self._heard_s = time.monotonic()
         signal.signal(signal.SIGTERM, lambda *_: self._stop("terminated"))
         if launched:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -42,14 +44,27 @@ class Leash:
 
     def _on_interrupt(self, *_: object) -> None:
         if self._reason is not None:
-            os._exit(130)  # asked twice: do not wait for anybody
+            os.write(2, b"interrupted twice, nobody was waited for\n")
+            os._exit(130)
         self._stop("interrupted by Ctrl-C")
 
     def _listen(self) -> None:
         for line in sys.stdin:
-            word, _, reason = line.strip().partition(" ")
+            self._heard_s = time.monotonic()
+            word, _, rest = line.strip().partition(" ")
             if word == "stop":
-                self._stop(reason or "stopped by the launcher")
-        self._stop("the launcher is gone")
+                self._stop(rest or "stopped by the launcher")
+            elif word == "orphan-after":
+                threading.Thread(target=self._await_beats, args=(float(rest),), name="beats", daemon=True).start()
+        self._leave("the launcher is gone")
+
+    def _await_beats(self, limit_s: float) -> None:
+        """End this process when nothing has been heard for so long."""
+        while (left_s := self._heard_s + limit_s - time.monotonic()) > 0:
+            time.sleep(left_s)
+        self._leave(f"nothing heard from the launcher for {limit_s:g} s")
+
+    def _leave(self, reason: str) -> None:
+        self._stop(reason)
         time.sleep(GRACE_S)
         os._exit(1)

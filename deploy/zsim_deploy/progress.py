@@ -21,6 +21,8 @@ class Show(Protocol):
 
     def clock(self, line: dict[str, Any]) -> None: ...
     def event(self, line: dict[str, Any]) -> None: ...
+    def health(self, line: dict[str, Any]) -> None: ...
+    def say(self, text: str) -> None: ...
 
 
 class Throttle:
@@ -46,6 +48,9 @@ class Teller:
 
     def event(self, line: dict[str, Any]) -> None:
         self._write({"event": line})
+
+    def health(self, line: dict[str, Any]) -> None:
+        self._write({"health": line})
 
     def say(self, text: str) -> None:
         self._write({"say": text})
@@ -96,6 +101,9 @@ class Screen:
     def event(self, line: dict[str, Any]) -> None:
         if line["kind"] not in QUIET:
             self.say(f"  {line['t_s']:8.2f} s  {line['kind']}: {line['text']}")
+
+    def health(self, line: dict[str, Any]) -> None:
+        """One live line has no room for it; `zsim up` has a table."""
 
 
 def describe(line: dict[str, Any], duration_s: float) -> str:

@@ -1,26 +1,32 @@
-"""The roles as processes: what `zsim world`, `zsim estimator`, `zsim controller` and `zsim record` do."""
+"""The roles as processes: what `zsim world`, `estimator`, `controller`, `record` and `router` do."""
 
 import gc
 import os
 import sys
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from zsim import messages, scenario_file
+from zsim import messages, scenario_file, session, tls
 from zsim.agent import Agent
 from zsim.connection import find_world
-from zsim.errors import RecordError
+from zsim.errors import RecordError, SessionError
+from zsim.identity import Identity
 from zsim.runner import Runner
 from zsim.scenario import Scenario
 from zsim_deploy.leash import Leash
-from zsim_deploy.progress import Screen, Show, Teller, Throttle
+from zsim_deploy.progress import QUIET, Screen, Show, Teller, Throttle
 
+TICK_S = 0.1  # how often a router looks for a stop
+PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
 PATIENCE_S = 2.0  # a compiled kernel is loaded within a second
-SHOWN_EVENTS = 2000  # events told to a launcher per run; all of them are in the record
+SHOWN_EVENTS = 2000  # events told per run besides those below; all of them are in the record
+HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but anybody can publish more
+VITAL = frozenset({"death", "end"})  # how a run ends, and why
 
 
 def world(
@@ -30,6 +36,7 @@ def world(
     endpoints: list[str],
     launched: str | None,
     expect: list[str] | None,
+    identity: Identity,
 ) -> None:
     """Run the world of a scenario on the endpoints until the scenario ends or somebody stops it."""
     from zsim_world.process import run
@@ -43,11 +50,11 @@ def world(
     gc.collect()
     gc.freeze()
     if launched:
-        run(run_world, endpoints, leash.reason, _told(Teller()))
+        run(run_world, endpoints, leash.reason, _told(Teller()), identity=identity)
         return
     with Screen(scenario.duration_s) as screen:
         listening = f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run"
-        run(run_world, endpoints, leash.reason, _told(screen), lambda: screen.say(listening))
+        run(run_world, endpoints, leash.reason, _told(screen), lambda: screen.say(listening), identity)
         screen.say(f"ended: {run_world.ended}")
 
 
@@ -67,12 +74,15 @@ def _told(show: Show) -> Callable[[str, Any, str], None]:
     """Return what the world calls with its clocks and events."""
     throttle = Throttle()
     told = [0]
+    healths: defaultdict[str, Throttle] = defaultdict(lambda: Throttle(HEALTH_PERIOD_S))
 
-    def tell(kind: str, message: Any, phase: str) -> None:
+    def tell(kind: str, message: Any, about: str) -> None:
         if kind == "clock" and (throttle.passes() or message.state == "stopped"):
-            show.clock(_clock_line(message, phase))
-        elif kind == "event" and told[0] < SHOWN_EVENTS:
-            told[0] += 1
+            show.clock(_clock_line(message, about))
+        elif kind == "health" and healths[about].passes():
+            show.health({"name": about, "lag_ns": message.lag_ns, "received": message.received})
+        elif kind == "event" and (message.kind in VITAL or told[0] < SHOWN_EVENTS):
+            told[0] += message.kind not in QUIET
             show.event(_event_line(message))
 
     return tell
@@ -106,11 +116,13 @@ def agent(
     federation: str,
     wait_s: float | None,
     launched: str | None,
+    identity: Identity,
 ) -> None:
     """Run one agent against the world on an endpoint."""
     leash = Leash(launched is not None)
     say = _speaker(launched is not None)
-    with find_world(endpoint, federation, wait_s, say, leash.pulled, run_id=launched) as (link, info):
+    found = find_world(endpoint, federation, wait_s, say, leash.pulled, run_id=launched, identity=identity)
+    with found as (link, info):
         made = build(info, scenario_file.from_text(info.scenario))
         say(f"{made.name}: in run {info.run_id}")
         gc.collect()
@@ -131,7 +143,14 @@ def controller(cluster: str) -> Callable[[messages.Info, Scenario], Agent]:
     return lambda info, scenario: Controller(info, scenario, cluster)
 
 
-def recorder(path: Path, endpoint: str, federation: str, wait_s: float | None, launched: str | None) -> None:
+def recorder(
+    path: Path,
+    endpoint: str,
+    federation: str,
+    wait_s: float | None,
+    launched: str | None,
+    identity: Identity,
+) -> None:
     """Record the run of the world on an endpoint into a file."""
     from zsim_agents.recorder import record
 
@@ -142,10 +161,42 @@ def recorder(path: Path, endpoint: str, federation: str, wait_s: float | None, l
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RecordError(f"{path.parent}: cannot be made ({error.strerror}); give --out another folder") from error
-    with find_world(endpoint, federation, wait_s, say, leash.pulled, True, launched) as (link, info):
+    with find_world(endpoint, federation, wait_s, say, leash.pulled, True, launched, identity) as (link, info):
         say(f"recorder: run {info.run_id} into {path}")
         reason = record(link, info, path, stopped=leash.pulled)
     say(f"recorder: {path} is complete, {reason}")
+
+
+def router(
+    name: str,
+    endpoint: str,
+    upstream: str,
+    federation: str,
+    mode: session.Mode,
+    launched: str | None,
+    identity: Identity,
+) -> None:
+    """Run a router on an endpoint until it is told to stop.
+
+    Raises:
+        SessionError: the port is taken, or a certificate, here or upstream, is refused.
+    """
+    leash = Leash(launched is not None)
+    say = _speaker(launched is not None)
+    with session.route(endpoint, upstream, federation, mode, identity) as link:
+        say(f"router.{name}: {endpoint} leads to {upstream}")
+        probe_s = 0.0
+        while not leash.pulled():
+            if time.monotonic() >= probe_s and not link.links():
+                _refuse(tls.peer_fault(identity, upstream), upstream)
+                probe_s = time.monotonic() + PROBE_S
+            time.sleep(TICK_S)
+    say(f"router.{name}: left, {leash.reason()}")
+
+
+def _refuse(fault: str | None, upstream: str) -> None:
+    if fault:
+        raise SessionError(f"cannot connect to {upstream}: {fault}")
 
 
 def _speaker(launched: bool) -> Callable[[str], None]:

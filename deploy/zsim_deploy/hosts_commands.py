@@ -1,0 +1,144 @@
+"""The commands of a run on several hosts: up, down, ps, logs, restart, move, doctor."""
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from zsim_deploy.arguments import Duration, RateOption, Realtime, ScenarioPath, Seed, Set, load_scenario, mode_and_rate
+
+FOLLOW_S = 0.2  # between two looks at a log that is followed
+
+Hosts = Annotated[Path, typer.Option("--hosts", help="Inventory (YAML): which hosts, which role where.")]
+Federation = Annotated[str, typer.Option(help="Federation that is up.")]
+Role = Annotated[str, typer.Argument(help="Process name, e.g. estimator.drone2.", show_default=False)]
+
+
+def up(
+    scenario: ScenarioPath,
+    hosts: Hosts,
+    out: Annotated[Path | None, typer.Option(help="Folder of the run (default runs/NAME-TIME).")] = None,
+    seed: Seed = None,
+    duration: Duration = None,
+    realtime: Realtime = False,
+    rate: RateOption = None,
+    set_: Set = None,
+    report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
+) -> None:
+    """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything."""
+    from zsim_deploy import inventory
+    from zsim_deploy.board import Board
+    from zsim_deploy.cli import conclude
+    from zsim_deploy.run import make_directory
+    from zsim_deploy.up import Options, Up
+
+    loaded = load_scenario(scenario, set_, seed, duration)
+    placed = inventory.load(hosts)
+    inventory.placement(placed, loaded)
+    mode, pace = mode_and_rate(realtime, rate)
+    options = Options(loaded, placed, make_directory(out, loaded), mode, pace)
+    with Board(loaded.duration_s) as board:
+        outcome = Up(options, board).go()
+    conclude(outcome, options.out, report)
+
+
+def down(federation: Federation = "zsim") -> None:
+    """End the run that is up, on all hosts."""
+    from zsim_deploy import intercom
+
+    intercom.ask(federation, "down")
+
+
+def ps(
+    federation: Federation = "zsim",
+    as_json: Annotated[bool, typer.Option("--json", help="As a JSON line.")] = False,
+) -> None:
+    """Show the processes of the run that is up: role, host, pid, state, lag, messages/s, round trip, restarts."""
+    from rich.console import Console
+
+    from zsim_deploy import intercom
+    from zsim_deploy.board import table
+
+    found = intercom.ask(federation, "ps")
+    if as_json:
+        print(json.dumps(found))
+    else:
+        Console().print(table(found["rows"]))
+
+
+def logs(
+    role: Role,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what is written from now on.")] = False,
+    federation: Federation = "zsim",
+) -> None:
+    """Print what a process of the run that is up has said."""
+    from zsim.errors import RunError
+    from zsim_deploy import intercom
+
+    path = Path(intercom.ask(federation, "out")) / "logs" / f"{role}.log"
+    if not path.exists():
+        known = ", ".join(sorted(file.stem for file in path.parent.glob("*.log"))) or "nobody yet"
+        raise RunError(f"{role} has said nothing; {known} did")
+    with path.open(errors="replace") as log:
+        sys.stdout.write(log.read())
+        while follow:
+            sys.stdout.write(log.read())
+            sys.stdout.flush()
+            time.sleep(FOLLOW_S)
+
+
+def restart(role: Role, federation: Federation = "zsim") -> None:
+    """Start a process of the run anew where it is; it takes over from its former self."""
+    from zsim_deploy import intercom
+
+    print(f"restarting {intercom.ask(federation, 'restart', role=role)}")
+
+
+def move(
+    role: Role,
+    host: Annotated[str, typer.Argument(help="Host of the inventory.", show_default=False)],
+    federation: Federation = "zsim",
+) -> None:
+    """Let another host run a process of the run from now on."""
+    from zsim_deploy import intercom
+
+    print(f"moving {intercom.ask(federation, 'move', role=role, host=host)}")
+
+
+def doctor(
+    hosts: Hosts,
+    scenario: Annotated[Path | None, typer.Argument(help="Scenario whose roles are to be placed.")] = None,
+) -> None:
+    """Check every host: ssh, versions, clock, load, and how the hosts reach each other."""
+    from rich.console import Console
+
+    from zsim.errors import HostsError
+    from zsim_deploy import inventory
+    from zsim_deploy.check_up import check_up
+
+    placed = inventory.load(hosts)
+    result = check_up(placed, _placement(placed, scenario))
+    console = Console()
+    for shown in result.tables:
+        console.print(shown)
+    for warning in result.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    if result.faults:
+        raise HostsError("\n".join(result.faults))
+    print("all hosts are ready")
+
+
+def _placement(placed: Any, scenario: Path | None) -> dict[str, str] | None:
+    from zsim import scenario_file
+    from zsim_deploy import inventory
+
+    return inventory.placement(placed, scenario_file.load(scenario)) if scenario else None
+
+
+def register(app: typer.Typer, panel: str) -> None:
+    """Add the commands to the command line."""
+    for command in (up, down, ps, logs, restart, move, doctor):
+        app.command(rich_help_panel=panel)(command)
