@@ -25,7 +25,7 @@ def ask(link: Session, box: Mailbox, op: str, **args: Any) -> None:
     """Send a request until the controller grants it; end with its reason after PATIENCE_S of simulated time."""
     until_ns = None
     while True:
-        answer = link.request(keys.cluster_control(CLUSTER), op, ME, **args)
+        answer = link.request(keys.cluster_control(CLUSTER), op, ME, args)
         if answer.ok:
             return
         t_ns = newest(box).t_ns

@@ -16,9 +16,9 @@ seq, last, t_ns = {}, {}, 0
 
 with zenoh.open(config) as session:
 
-    def put(key, **fields):
+    def put(key, **fields):  # BLOCK: for a message that zenoh drops the world would wait
         seq[key] = seq.get(key, -1) + 1
-        session.put(key, msgpack.packb({"seq": seq[key], **fields}))
+        session.put(key, msgpack.packb({"seq": seq[key], **fields}), congestion_control=zenoh.CongestionControl.BLOCK)
 
     info = next(msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in session.get("zsim/world/info") if reply.ok)
     run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}

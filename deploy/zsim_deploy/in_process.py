@@ -48,11 +48,15 @@ def fly(
         stopped: asked at every gate; a text ends the run.
         screen: shows progress.
         run_id: given only by tests that compare records.
+
+    Raises:
+        DivergedError: the state of a drone was no longer finite; the record is complete to its end.
     """
     world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id)
+    team = agents(world)  # may refuse the scenario; a record that was begun could not be begun again
     writer = RecordWriter(record) if record else None
     show = _Show(world, writer, screen)
-    bus = Bus(world, agents(world), time.monotonic_ns, show.sink)
+    bus = Bus(world, team, time.monotonic_ns, show.sink)
     try:
         show.sink(keys.INFO, world.info())
         bus.join()
@@ -66,6 +70,8 @@ def fly(
     finally:
         if writer:
             writer.close()
+    if world.diverged:
+        raise world.diverged
     return world.ended or "ended"
 
 

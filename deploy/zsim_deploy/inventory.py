@@ -70,7 +70,7 @@ class Inventory(Spec, frozen=True, kw_only=True):
     hosts: dict[Name, Host]
     roles: dict[Text, Name | list[Name]]
     """Process name or pattern to a host, or to several over which what it matches is spread in order."""
-    routers: dict[Name, Router] = {}
+    routers: dict[Name, Router] = msgspec.field(default_factory=dict)
     port: Port = ZENOH_PORT
     """On which the world listens."""
     security: Security = Security()
@@ -99,7 +99,7 @@ def load(path: Path) -> Placed:
 
 def _cross_faults(inventory: Any, document: dict[str, Any]) -> Iterator[Fault]:
     """Yield the faults between fields: names that must be those of hosts and routers."""
-    hosts, routers = (list(document.get(name) or {}) for name in ("hosts", "routers"))
+    hosts, routers = ([key for key, _ in _map(document, name)] for name in ("hosts", "routers"))
     for key, wanted in _map(document, "roles"):
         for name in wanted if isinstance(wanted, list) else [wanted]:
             yield from _unknown(f"roles.{key}", name, hosts, "hosts")
@@ -110,6 +110,8 @@ def _cross_faults(inventory: Any, document: dict[str, Any]) -> Iterator[Fault]:
             yield from _unknown(f"routers.{key}.host", router.get("host"), hosts, "hosts")
             yield from _unknown(f"routers.{key}.upstream", router.get("upstream"), routers, "routers")
     for key, host in _map(document, "hosts"):
+        if key in (".", ".."):
+            yield f"hosts.{key}", "names a folder that is another's; must have a letter or a digit"
         if isinstance(host, dict):
             yield from _unknown(f"hosts.{key}.router", host.get("router"), routers, "routers")
     if isinstance(document.get("hosts"), dict) and not hosts:
@@ -129,7 +131,8 @@ def _unknown(path: str, name: Any, known: list[Any], what: str) -> Iterator[Faul
 
 def _circles(document: dict[str, Any]) -> Iterator[Fault]:
     """Yield routers whose way up never comes to the world."""
-    upstream = {key: router.get("upstream") for key, router in _map(document, "routers") if isinstance(router, dict)}
+    given = {key: router.get("upstream") for key, router in _map(document, "routers") if isinstance(router, dict)}
+    upstream = {key: above for key, above in given.items() if isinstance(above, str)}
     for start in upstream:
         seen, at = {start}, upstream[start]
         while at in upstream and at not in seen:
@@ -164,10 +167,22 @@ def placement(placed: Placed, scenario: Scenario) -> dict[str, str]:
     lines = [f"roles has no place for {name}; add {name!r}" for name, best in matches.items() if best is None]
     unused = [key for key in given if not any(fnmatch.fnmatchcase(name, key) for name in names)]
     lines += [f"roles.{key} matches no process of {scenario.name!r}; it has {', '.join(names)}" for key in unused]
+    world = matches[WORLD]
+    if world is not None:
+        lines += _port_faults(placed.inventory, _next_of(given, world, {}))
     if lines:
         raise InventoryError([f"{placed.source}: {line}" for line in lines])
     taken: dict[str, int] = {}
     return {name: _next_of(given, best, taken) for name, best in matches.items() if best is not None}
+
+
+def _port_faults(inventory: Inventory, world: str) -> Iterator[str]:
+    """Yield a line for each router whose port another process of its host has."""
+    first = {(world, inventory.port): WORLD}
+    for name, router in inventory.routers.items():
+        other = first.setdefault((router.host, router.port), f"router.{name}")
+        if other != f"router.{name}":
+            yield f"routers.{name}.port is {router.port}, on which {other} listens on {router.host}; give another"
 
 
 def _best(given: dict[str, Any], name: str) -> str | None:
@@ -223,3 +238,9 @@ def routers_in_order(inventory: Inventory) -> list[str]:
         return 0 if above is None else 1 + depth(above)
 
     return sorted(inventory.routers, key=lambda name: (depth(name), name))
+
+
+def python(host: Host) -> str:
+    """Return the interpreter of a host that has zsim: as given, or the one that `zsim push` installs."""
+    home = "" if host.folder.startswith(("/", "~/")) else "~/"
+    return host.python or f"{home}{host.folder}/venv/bin/python"

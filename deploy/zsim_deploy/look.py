@@ -1,6 +1,5 @@
-"""Looking at and poking a running federation, as users of `ros2 topic` expect."""
+"""Looking at a running federation, as users of `ros2 topic` expect."""
 
-import json
 import math
 import time
 from collections import Counter, deque
@@ -16,7 +15,7 @@ from zsim.session import Mailbox, Sample, Session
 
 LISTEN_S = 1.0  # wall time that `keys` listens: every key of the contract that lives speaks at least once a second
 PACKET_S = 0.05  # wait between two looks into an empty mailbox
-CLIENT = "zsim.pub"
+SILENCE_S = 1.0  # from which on a key that spoke is said to be silent; later where its own gaps are longer
 
 
 def list_keys(link: Session, listen_s: float = LISTEN_S) -> list[tuple[str, str, int]]:
@@ -46,7 +45,7 @@ def readable(sample: Sample) -> Any:
     except DecodeError as error:
         try:
             return msgspec.msgpack.decode(sample.payload)
-        except (msgspec.MsgspecError, UnicodeDecodeError):
+        except messages.REFUSALS:
             return {"refused": str(error), "bytes": len(sample.payload)}
 
 
@@ -64,11 +63,14 @@ class Rate:
         if t_ns is not None:
             self._stamps.append(t_ns)
 
-    def line(self) -> str:
-        """Return the rates in words."""
-        if len(self._walls) < 2:
-            return f"{self.total} messages"
+    def line(self, now_s: float) -> str:
+        """Return the rates in words, or since when nothing comes."""
         gaps = [b - a for a, b in zip(self._walls, list(self._walls)[1:], strict=False)]
+        silent_s = now_s - self._walls[-1]
+        if silent_s > max(SILENCE_S, 2 * max(gaps, default=0.0)):
+            return f"nothing for {silent_s:.1f} s, {self.total} messages before"
+        if not gaps:
+            return f"{self.total} message"
         wall_hz = len(gaps) / max(1e-9, sum(gaps))
         text = f"{wall_hz:.1f} Hz wall (gap {1e3 * min(gaps):.1f} to {1e3 * max(gaps):.1f} ms)"
         span_ns = self._stamps[-1] - self._stamps[0] if len(self._stamps) > 1 else 0
@@ -77,18 +79,16 @@ class Rate:
         return f"{text}, {self.total} messages"
 
 
-def hz(link: Session, expression: str, window: int, until_s: float, emit: Callable[[str], None]) -> None:
-    """Tell once a second how often messages come on an expression."""
-    box, rate, next_s = link.subscribe(expression), Rate(window), time.monotonic() + 1.0
+def hz(link: Session, expression: str, window: int, seconds: float, emit: Callable[[str], None]) -> None:
+    """Tell once a second, and at the end, how often messages come on an expression."""
+    box, rate = link.subscribe(expression), Rate(window)
     head = msgspec.msgpack.Decoder(_Stamp)
+    until_s = time.monotonic() + seconds
     while time.monotonic() < until_s:
-        for sample in _samples(box, min(next_s, until_s)):
+        for sample in _samples(box, min(time.monotonic() + 1.0, until_s)):
             rate.add(time.monotonic(), _stamp(head, sample.payload))
-        if time.monotonic() >= next_s:
-            next_s += 1.0
-            emit(rate.line() if rate.total else f"no message on {expression} yet; `zsim keys` lists what speaks")
-            if time.monotonic() > next_s:
-                next_s = time.monotonic() + 1.0
+        nothing = f"no message on {expression} yet; `zsim keys` lists what speaks"
+        emit(rate.line(time.monotonic()) if rate.total else nothing)
 
 
 class _Stamp(msgspec.Struct):
@@ -98,53 +98,8 @@ class _Stamp(msgspec.Struct):
 def _stamp(head: "msgspec.msgpack.Decoder[_Stamp]", payload: bytes) -> int | None:
     try:
         return head.decode(payload).t_ns
-    except (msgspec.MsgspecError, UnicodeDecodeError):
+    except messages.REFUSALS:
         return None
-
-
-def publish(link: Session, key: str, text: str, count: int, rate_hz: float) -> int:
-    """Publish a JSON text as the message of its key, `count` times; t_ns, seq and source are filled in.
-
-    Raises:
-        RunError: no JSON, or not the message of that key.
-    """
-    fields = _fields(key, text)
-    for seq in range(count):
-        stamped = {"t_ns": _now_ns(link), "seq": seq, **fields}
-        payload = msgspec.msgpack.encode(stamped)
-        try:
-            messages.decode(key, payload)
-        except DecodeError as error:
-            raise RunError(str(error)) from error
-        link.put_raw(key, payload)
-        if seq + 1 < count:
-            time.sleep(1.0 / rate_hz)
-    return count
-
-
-def _fields(key: str, text: str) -> dict[str, Any]:
-    kind = messages.type_of(key)
-    if kind is None:
-        raise RunError(f"{key}: is no key of the contract; `zsim keys` lists what speaks, docs/protocol.md all of them")
-    try:
-        fields = json.loads(text)
-    except ValueError as error:
-        raise RunError(f"{key}: the message is no JSON ({error}); must be a map such as '{_example(kind)}'") from error
-    if not isinstance(fields, dict):
-        raise RunError(f"{key}: the message is {text[:40]!r}; must be a map such as '{_example(kind)}'")
-    return {"source": CLIENT, **fields} if "source" in kind.__struct_fields__ else fields
-
-
-def _example(kind: type[msgspec.Struct]) -> str:
-    names = [name for name in messages.fields(kind) if name not in ("t_ns", "seq", "source")]
-    return "{" + ", ".join(f'"{name}": …' for name in names) + "}"
-
-
-def _now_ns(link: Session) -> int:
-    """Return the simulated time, 0 where no world answers."""
-    for sample in link.get(keys.CLOCK):
-        return messages.decode(keys.CLOCK, sample.payload).t_ns
-    return 0
 
 
 def _kind(key: str) -> str:
@@ -159,6 +114,8 @@ def _samples(box: Mailbox, until_s: float) -> Iterator[Sample]:
         for sample in box.drain():
             arrived = True
             yield sample
+            if time.monotonic() >= until_s:
+                return
         if not arrived:
             time.sleep(min(PACKET_S, max(0.0, until_s - time.monotonic())))
 

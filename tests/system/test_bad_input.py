@@ -282,6 +282,8 @@ def test_garbage_is_counted_and_changes_nothing(federation: Federation) -> None:
         client.pack({"t_ns": 1}),
         os.urandom(64),
         b"\x81" * 5000,
+        client.pack({"t_ns": 1, "seq": 0, "source": ""})[:-1] + b"\xa1\xff",  # no UTF-8
+        client.pack({"t_ns": 1, "seq": 0, "x": 0})[:-1] + b"\x91" * 5000 + b"\xc0",  # lists without end
     )
     for number in range(GARBAGE):
         key = GARBAGE_KEYS[number % len(GARBAGE_KEYS)]

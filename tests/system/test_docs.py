@@ -7,6 +7,7 @@ How a fenced block is marked, in the line that opens it:
     bash elsewhere      not for this machine (installs, other hosts); every `zsim` line must be one that the
                         command line takes, and the others must be among ELSEWHERE
     yaml, yaml part     a whole scenario; top-level sections to be put into scenarios/step.yaml
+    yaml inventory      a whole inventory, into which scenarios/step.yaml must fit
     python              must compile
     text, json          output and drawings, not checked
 
@@ -33,15 +34,27 @@ import yaml
 from msgspec import inspect as types
 
 from zsim import messages, presets, scenario, scenario_file
+from zsim_deploy import inventory
 from zsim_deploy.cli import app
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 RUN_S = 4.0  # simulated seconds of a run that has no other process to serve
 PATIENCE_S = 120  # wall seconds for one line on a machine that does other work as well
-KINDS = ("bash run", "bash terminals", "bash elsewhere", "yaml", "yaml part", "python", "text", "json")
+KINDS = (
+    "bash run",
+    "bash terminals",
+    "bash elsewhere",
+    "yaml",
+    "yaml part",
+    "yaml inventory",
+    "python",
+    "text",
+    "json",
+)
 ELSEWHERE = ("apt-get install ", "git clone ", "cd ", "python3 -m venv ", ".venv/bin/pip install ", "ssh ", "scp ",
-             "rsync ", "sudo ", "zenohd ", "ufw ", "chrt ", "kill ")  # fmt: skip
+             "rsync ", "sudo ", "zenohd ", "ufw ", "chrt ", "kill ", "docker ", "kubectl ", "sh ",
+             ".venv/bin/pip wheel ")  # fmt: skip
 
 
 class Block(NamedTuple):
@@ -194,7 +207,7 @@ def lines(block: Block) -> list[str]:
 
 
 EXAMPLE_S = 25.0  # simulated seconds of an example: past the take-off at 20 s
-LEADERS = r"zsim (run|world) |router\.py"
+LEADERS = r"zsim (run|world|router) "
 ANSWERED = ("estimator", "controller", "record", "keys", "echo", "hz", "pub", "ask")
 FOREIGN = ("plain_client.py", "foreign_estimator.py", "range_sensor.py")  # take the endpoint as an argument
 OURS = ("my_estimator.py", "fly_square.py")
@@ -245,8 +258,10 @@ def test_commands_for_other_machines_are_ones_that_exist(page: Path) -> None:
 
 def parses(arguments: list[str]) -> bool:
     """Tell whether the command line takes the arguments; nothing is run."""
-    command = commands()[arguments[0]]
-    with command.make_context(arguments[0], arguments[1:]):
+    command, name, rest = commands()[arguments[0]], arguments[0], arguments[1:]
+    while hasattr(command, "commands"):
+        command, name, rest = command.commands[rest[0]], rest[0], rest[1:]
+    with command.make_context(name, rest):
         return True
 
 
@@ -276,6 +291,15 @@ def scenario_blocks() -> list[Any]:
         for block in blocks(page)
         if block.kind in ("yaml", "yaml part")
     ]
+
+
+def test_inventories_are_valid(tmp_path: Path) -> None:
+    step = scenario_file.load(ROOT / "scenarios/step.yaml")
+    found = [block for page in PAGES for block in blocks(page) if block.kind == "yaml inventory"]
+    for block in found:
+        (tmp_path / "hosts.yaml").write_text(block.text)
+        assert inventory.placement(inventory.load(tmp_path / "hosts.yaml"), step)
+    assert found
 
 
 @pytest.mark.parametrize("block", scenario_blocks())

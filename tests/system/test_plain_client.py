@@ -32,6 +32,11 @@ def test_it_is_a_page_of_zenoh_and_msgpack() -> None:
     names = {alias.name for node in imported if isinstance(node, ast.Import) for alias in node.names}
     assert names <= {"os", "sys", "zenoh", "msgpack"}
     assert not [node for node in imported if isinstance(node, ast.ImportFrom)]
+    puts = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)]
+    puts = [node for node in puts if ast.unparse(node.func) == "session.put"]
+    assert puts
+    for put in puts:  # without it zenoh drops what does not fit, and the world waits for ever
+        assert "congestion_control=zenoh.CongestionControl.BLOCK" in ast.unparse(put)
 
 
 def test_it_flies_and_holds_time(federation: Federation, request: pytest.FixtureRequest) -> None:

@@ -124,30 +124,30 @@ def summarise(flight: Flight, formations: list[Formation], record: Path) -> Summ
             truth_missing=found.missing,
             truth_sha256=found.sha256,
         ),
-        notes=[
-            note
-            for note in [
-                *_record_notes(flight),
-                *_truth_notes(found, end.get("truth_sha256")),
-                window_note,
-                *_formation_notes(flight, formations, window_s),
-                *_fingerprint_notes(flight),
-            ]
-            if note
-        ],
+        notes=_notes(flight, found, formations, window_s, window_note),
     )
 
 
+def _notes(
+    flight: Flight, found: TruthHash, formations: list[Formation], window_s: tuple[float, float], window_note: str
+) -> list[str]:
+    """Return what a reader has to know of the figures."""
+    notes = [
+        *_record_notes(flight),
+        *_truth_notes(found, (flight.end or {}).get("truth_sha256")),
+        window_note,
+        *_formation_notes(flight, formations, window_s),
+        *_fingerprint_notes(flight),
+    ]
+    return [note for note in notes if note]
+
+
 def _ended(flight: Flight) -> str:
-    """Return why the run ended, from the record alone if need be."""
+    """Return why the run ended; who died is not told by a record without an end."""
     if flight.end:
         return str(flight.end.get("reason", "ended"))
     at = f"{flight.last_ns / 1e9:.2f} s"
-    if not flight.messages:
-        return "nothing is on record"
-    if not flight.complete:
-        return f"the record was cut after {at}: the recorder died"
-    return f"the world died after {at}: no end is on record"
+    return f"the record {'ends here at' if flight.complete else 'was cut after'} {at}: no end is on record"
 
 
 def _lines(events: list[Event]) -> tuple[list[EventLine], dict[str, int]]:

@@ -1,0 +1,105 @@
+"""Who needs a certificate, and whom each listening process lets in: from an inventory and a scenario. Pure."""
+
+import fnmatch
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+from zsim.errors import InventoryError
+from zsim.rights import OPERATOR, RECORDER, ROUTER, WORLD
+from zsim.scenario import Scenario
+from zsim_deploy import inventory as inv
+from zsim_deploy.access import access_control
+from zsim_deploy.inventory import Placed
+
+OPERATORS = "operators"  # folder of the operators that are at no host of the inventory
+
+
+class Wanted(NamedTuple):
+    """A certificate that is to be there.
+
+    Attributes:
+        host: name of the host in the inventory; a folder.
+        process: name of the process; the common name.
+        addresses: of the host, IP or DNS.
+    """
+
+    host: str
+    process: str
+    addresses: tuple[str, ...] = ()
+
+
+class Enrolment:
+    """What an inventory and a scenario ask for.
+
+    Args:
+        placed: the inventory.
+        scenario: whose processes run.
+        operators: people and programs that look and command, each NAME or NAME@HOST; at a host they come in as its
+            roles do, through its router if it has one, otherwise at the world.
+
+    Raises:
+        InventoryError: a process has no place, or an operator is at no host of the inventory.
+    """
+
+    def __init__(self, placed: Placed, scenario: Scenario, operators: Sequence[str] = ()) -> None:
+        self._inventory = placed.inventory
+        self._scenario = scenario
+        self._places = inv.placement(placed, scenario)
+        self._operators = dict(self._read_operator(text, placed.source) for text in operators)
+
+    def certificates(self) -> list[Wanted]:
+        """Return the certificates; a role has one for each host of its entry in `roles`, so that it can be moved."""
+        fixed = [(self._places[name], name) for name in (WORLD, RECORDER)]
+        fixed += [(router.host, f"{ROUTER}.{name}") for name, router in self._inventory.routers.items()]
+        movable = [(host, name) for name in self._movable() for host in self._hosts_of(name)]
+        operators = [(host or OPERATORS, name) for name, host in self._operators.items()]
+        return [Wanted(host, name, self._addresses(host)) for host, name in [*fixed, *movable, *operators]]
+
+    def access(self) -> Iterator[tuple[str, str, dict[str, Any]]]:
+        """Yield (host, process, access control) of every process that listens."""
+        everybody = [name for name in self._places if name != WORLD]
+        clients = [*everybody, *(name for name, host in self._operators.items() if self._router_of(host) is None)]
+        yield self._places[WORLD], WORLD, access_control(self._scenario, clients, self._below(None))
+        for name, router in self._inventory.routers.items():
+            above = f"{ROUTER}.{router.upstream}" if router.upstream else WORLD
+            rules = access_control(self._scenario, self._at(name), self._below(name), [above])
+            yield router.host, f"{ROUTER}.{name}", rules
+
+    def _read_operator(self, text: str, source: str) -> tuple[str, str | None]:
+        name, _, host = text.partition("@")
+        if host and host not in self._inventory.hosts:
+            known = ", ".join(self._inventory.hosts)
+            raise InventoryError([f"{source}: operator {name!r} is at {host!r}; must be one of hosts: {known}"])
+        return f"{OPERATOR}.{name.removeprefix(f'{OPERATOR}.')}", host or None
+
+    def _movable(self) -> list[str]:
+        return [name for name in self._places if name not in (WORLD, RECORDER)]
+
+    def _addresses(self, host: str) -> tuple[str, ...]:
+        return (self._inventory.hosts[host].address,) if host in self._inventory.hosts else ()
+
+    def _router_of(self, host: str | None) -> str | None:
+        return self._inventory.hosts[host].router if host is not None else None
+
+    def _below(self, router: str | None) -> dict[str, list[str]]:
+        """Return the routers that connect to a router, or to the world, with all processes behind each."""
+        direct = [name for name, below in self._inventory.routers.items() if below.upstream == router]
+        return {f"{ROUTER}.{name}": self._behind(name) for name in direct if self._behind(name)}
+
+    def _behind(self, router: str) -> list[str]:
+        lower = [name for name, below in self._inventory.routers.items() if below.upstream == router]
+        return [*self._at(router), *(process for name in lower for process in self._behind(name))]
+
+    def _at(self, router: str) -> list[str]:
+        """Return the processes that may come to a router: those whose entry in `roles` has one of its hosts."""
+        roles = [name for name in self._places if any(self._router_of(host) == router for host in self._hosts_of(name))]
+        return [*roles, *(name for name, host in self._operators.items() if self._router_of(host) == router)]
+
+    def _hosts_of(self, process: str) -> list[str]:
+        """Return the hosts on which a process may run, now or after a move."""
+        given = self._inventory.roles
+        matching = [key for key in given if fnmatch.fnmatchcase(process, key)]
+        if not matching:
+            return [self._places[process]]
+        hosts = given[max(matching, key=lambda key: (key == process, len(key)))]
+        return [hosts] if isinstance(hosts, str) else list(dict.fromkeys(hosts))

@@ -1,0 +1,183 @@
+"""`zsim push`: install zsim on the hosts of an inventory, over ssh alone; the hosts need no internet."""
+
+import asyncio
+import json
+import os
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import asyncssh
+
+from zsim import __version__
+from zsim.errors import HostsError, InventoryError
+from zsim_deploy import extras, on_host, shell, warm_up
+from zsim_deploy.host_link import HostLink
+from zsim_deploy.inventory import Host, Placed
+from zsim_deploy.target import chosen, interpreters, question, target
+from zsim_deploy.wheelhouse import House, Wheel, Wheelhouse
+
+LAUNCHER = "launcher"  # how this machine is called among the hosts, in what is told
+ASK_S = 30.0  # wall time for a host to start a few Pythons; a small computer takes seconds
+INSTALL_S = 900.0  # wall time to unpack 100 MB of wheels on a slow memory card
+COMPILE_S = 900.0  # wall time to compile what flies; half a minute on a laptop's core
+COPIES = 4  # files under way to one host at a time
+
+Told = Callable[[str, str], None]  # host, what is being done there
+
+
+async def push(placed: Placed, names: Sequence[str], more: Iterable[str], told: Told, cache: Path) -> dict[str, bool]:
+    """Install on hosts what their roles need.
+
+    Args:
+        names: of the hosts; all of the inventory if empty.
+        more: extras for each of them beside those of its roles.
+        told: hears what is being done.
+        cache: folder of the wheelhouse.
+
+    Returns:
+        For each host whether anything had to be done there.
+
+    Raises:
+        InventoryError: a host is not in the inventory.
+        HostsError: with a line for each host at which it failed; the others are done.
+    """
+    hosts = placed.inventory.hosts
+    unknown = [name for name in names if name not in hosts]
+    if unknown:
+        raise InventoryError([f"--host {name}: must be one of {', '.join(hosts)}" for name in unknown])
+    wanted = extras.needed(placed.inventory, more)
+    house = Wheelhouse(cache, lambda text: told(LAUNCHER, text))
+    chosen_names = list(dict.fromkeys(names)) or list(hosts)
+    work = [_one(name, hosts[name], placed.folder, wanted[name], house, told) for name in chosen_names]
+    results = await asyncio.gather(*work, return_exceptions=True)
+    _raise_all(results)
+    return {name: result is True for name, result in zip(chosen_names, results, strict=True)}
+
+
+def _raise_all(results: Sequence[Any]) -> None:
+    """Raise what failed, as lines of one error; anything that is no host's fault as it is."""
+    for result in results:
+        if isinstance(result, BaseException) and not isinstance(result, HostsError):
+            raise result
+    if lines := list(dict.fromkeys(str(result) for result in results if isinstance(result, HostsError))):
+        raise HostsError("\n".join(lines))
+
+
+async def _one(name: str, host: Host, base: Path, wanted: frozenset[str], house: Wheelhouse, told: Told) -> bool:
+    """Install on one host; return whether anything had to be done."""
+    if host.python:
+        told(name, f"has zsim of its own in {host.python}")
+        return False
+    link = HostLink(name, host, base)
+    try:
+        told(name, "looking what is there")
+        there = _There(link, host.folder)
+        await there.look()
+        needed = await house.house(name, target(name, there.found), wanted)
+        described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
+        if is_there(needed, there.found["installed"]):
+            told(name, f"{described} is there")
+            return False
+        await there.copy(missing(needed, there.found), told)
+        told(name, "installing")
+        await there.install(needed)
+        if any(wheel.path.name.startswith("numba-") for wheel in needed.others):
+            told(name, "compiling what flies")
+            await there.warm_up()
+        told(name, f"{described} installed")
+        return True
+    except HostsError as error:
+        told(name, f"failed: {error}")
+        raise
+    finally:
+        await link.close()
+
+
+def is_there(house: House, installed: dict[str, Any] | None) -> bool:
+    """Tell whether a host has what it needs, by the note of the last push: perhaps more, but nothing else."""
+    if installed is None or installed["project"] != house.project.sha256:
+        return False
+    return set(house.extras) <= set(installed["extras"]) and not _new(house, installed)
+
+
+def _new(house: House, installed: dict[str, Any] | None) -> list[Wheel]:
+    """Return the wheels of other projects that are not installed yet."""
+    known = installed["wheels"] if installed else {}
+    return [wheel for wheel in house.others if known.get(wheel.path.name) != wheel.sha256]
+
+
+def missing(house: House, found: dict[str, Any]) -> list[Wheel]:
+    """Return the wheels that must be copied to a host, small ones last so that progress is smooth."""
+    needed = [house.project, house.pip, *_new(house, found["installed"])]
+    lacking = [wheel for wheel in needed if found["wheels"].get(wheel.path.name) != wheel.sha256]
+    return sorted(lacking, key=lambda wheel: -wheel.size_bytes)
+
+
+class _There:
+    """What is on a host, and what is done to it."""
+
+    def __init__(self, link: HostLink, folder: str) -> None:
+        self._link, self._folder = link, folder
+        self._python = ""
+        self.found: dict[str, Any] = {}
+
+    async def look(self) -> None:
+        """Find the Python to install for, and what is installed."""
+        answer = await self._link.run(shell.line(["sh", "-c", question()]), timeout_s=ASK_S)
+        found = interpreters(answer.decode(errors="replace"))
+        self._python = chosen(self._link.name, found, sys.version_info[:2]).path
+        self.found = json.loads(await self._run("look", timeout_s=ASK_S))
+
+    async def install(self, house: House) -> None:
+        order = {
+            "project": house.project.path.name,
+            "pip": house.pip.path.name,
+            "wheels": [wheel.path.name for wheel in _new(house, self.found["installed"])],
+            "extras": house.extras,
+            "modules": [extras.MODULES[extra] for extra in ("", *house.extras) if extra in extras.MODULES],
+            "note": house.note(),
+        }
+        await self._run("install", json.dumps(order), timeout_s=INSTALL_S)
+
+    async def warm_up(self) -> None:
+        python = f"{self.found['folder']}/venv/bin/python"
+        await self._link.run(shell.line([python, "-P", "-m", warm_up.__name__]), timeout_s=COMPILE_S)
+
+    async def _run(self, act: str, *words: str, timeout_s: float) -> bytes:
+        command = shell.line([self._python, "-P", "-", act, self._folder, *words])
+        return await self._link.run(command, Path(on_host.__file__).read_bytes(), timeout_s)
+
+    async def copy(self, wheels: Sequence[Wheel], told: Told) -> None:
+        """Copy wheels to the host; what broke off is not mistaken for a wheel."""
+        folder = f"{self.found['folder']}/wheels"
+        name, total, done = self._link.name, sum(wheel.size_bytes for wheel in wheels), 0
+        gate = asyncio.Semaphore(COPIES)
+
+        async def one(sftp: asyncssh.SFTPClient, wheel: Wheel) -> None:
+            nonlocal done
+            part, seen = f"{folder}/{wheel.path.name}.part", 0
+
+            def progress(_source: bytes, _target: bytes, copied: int, _size: int) -> None:
+                nonlocal done, seen
+                done, seen = done + copied - seen, copied
+                told(name, f"copying {done / 1e6:.0f} of {total / 1e6:.0f} MB")
+
+            async with gate:
+                await sftp.put(str(wheel.path), part, progress_handler=progress)
+                await sftp.posix_rename(part, part.removesuffix(".part"))
+
+        try:
+            async with (await self._link.open()).start_sftp_client() as sftp:
+                await sftp.makedirs(folder, exist_ok=True)
+                await asyncio.gather(*(one(sftp, wheel) for wheel in wheels))
+        except (asyncssh.Error, OSError) as error:
+            raise HostsError(
+                f"{name}: copying to {folder} failed ({error}); is there space, is the link up?"
+            ) from error
+
+
+def default_cache() -> Path:
+    """Return the folder of the wheelhouse on this machine (XDG Base Directory Specification)."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zsim"

@@ -1,0 +1,5 @@
+"""An inventory and a scenario as files for launchers that people already have: systemd, Docker Compose, Kubernetes.
+
+Every target is a pure function from (Placed, Scenario) to {path inside the output folder: text}; the same input
+gives the same text.
+"""

@@ -1,0 +1,208 @@
+"""Kubernetes: `zsim.yaml` with a Job per role and a Deployment per router, and what it needs beside it.
+
+A run ends, so its roles are Jobs; a router does not. Zenoh's endpoints and the certificates name the hosts of the
+inventory, so Pods use the network of their node, and the names of the hosts are those of the nodes.
+"""
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from zsim import __version__, scenario_file
+from zsim.errors import InventoryError
+from zsim.rights import ROUTER, WORLD
+from zsim.scenario import Scenario
+from zsim_deploy.inventory import Placed
+from zsim_deploy.render import container, pod
+from zsim_deploy.render.container import RUNS
+from zsim_deploy.render.process import (
+    Process,
+    Rendered,
+    access_file,
+    extras,
+    own_programs,
+    processes,
+    used_hosts,
+)
+from zsim_deploy.render.yaml_text import document, documents
+from zsim_deploy.watch import RESTARTS_MAX, SUPERSEDED, USER_FAULT
+
+IMAGE = f"zsim:{__version__}"
+CONFIG_BYTES_MAX = 1_048_576  # of a ConfigMap; Kubernetes, "ConfigMaps"
+RECORD_GIB = 10  # 186 runs of 330 s with three drones, 58 MB each
+
+NAMESPACE_REMARKS = (
+    "What stays when a run is deleted. Pods use the network of their node, which the Pod Security Standards allow",
+    "under `privileged` alone; in everything else they keep to `restricted`.",
+)
+
+
+def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = (), image: str = IMAGE) -> Rendered:
+    """Return `namespace.yaml`, `secrets.sh`, `zsim.yaml`, `records.yaml` and a Dockerfile.
+
+    Args:
+        placed: the inventory.
+        scenario: what to fly.
+        pace: options of the world: `--realtime`, `--rate R`.
+        image: where the nodes find what the Dockerfile makes.
+
+    Raises:
+        InventoryError: a process has no place, a name is none that Kubernetes takes, or the scenario is too large.
+    """
+    found = processes(placed, scenario, pace)
+    text = scenario_file.to_text(scenario)
+    _refuse(placed, found, text)
+    space = pod.label(scenario.federation)
+    texts = {
+        "namespace.yaml": documents([_namespace(space), _records_claim(space)], NAMESPACE_REMARKS),
+        "zsim.yaml": documents(_run(space, scenario, text, found, image), _remarks(placed, scenario, found)),
+        "records.yaml": document(_records_pod(space, image), ["Mounts the records, for `kubectl cp`."]),
+        "Dockerfile": container.dockerfile(extras([process.name for process in found])),
+    }
+    if not placed.inventory.security.insecure:
+        texts["secrets.sh"] = _secrets(space, found)
+    return texts
+
+
+def _refuse(placed: Placed, found: Sequence[Process], text: str) -> None:
+    """Raise an error with a line for everything that Kubernetes cannot do."""
+    lines = [
+        f"hosts.{host} is no name of a node; must be letters, digits, - and ., as `kubectl get nodes` says"
+        for host in used_hosts(found)
+        if not re.fullmatch(r"[a-z0-9]([a-z0-9.-]*[a-z0-9])?", host)
+    ]
+    first: dict[str, str] = {}
+    for process in found:
+        other = first.setdefault(pod.label(process.name), process.name)
+        if other != process.name:
+            lines.append(f"{process.name} and {other} have the same name in Kubernetes; rename a drone or cluster")
+    if len(text.encode()) > CONFIG_BYTES_MAX:
+        lines.append(f"the scenario has {len(text.encode())} bytes; a ConfigMap takes {CONFIG_BYTES_MAX}")
+    if lines:
+        raise InventoryError([f"{placed.source}: {line}" for line in lines])
+
+
+def _remarks(placed: Placed, scenario: Scenario, found: Sequence[Process]) -> list[str]:
+    return [
+        "Rendered by `zsim render kubernetes`; render again instead of editing.",
+        "A Job starts a dead role again after 10 s, then after 20 s, and so on; `zsim run` does so at once.",
+        *_service_remark(placed, found),
+        *(line for host in used_hosts(found) for line in container.unused(placed, host)),
+        *own_programs(placed, scenario),
+    ]
+
+
+def _service_remark(placed: Placed, found: Sequence[Process]) -> list[str]:
+    world = next(process for process in found if process.name == WORLD)
+    address = placed.inventory.hosts[world.host].address
+    certified = f"The world's certificate is for {address}: over TLS that is its name, and not the Service's."
+    return [certified] if world.secure else []
+
+
+# What stays
+
+
+def _namespace(space: str) -> dict[str, Any]:
+    labels = {"pod-security.kubernetes.io/enforce": "privileged"}
+    return {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": space, "labels": labels}}
+
+
+def _records_claim(space: str) -> dict[str, Any]:
+    return {
+        "apiVersion": "v1",
+        "kind": "PersistentVolumeClaim",
+        "metadata": {"name": "records", "namespace": space},
+        "spec": {"accessModes": ["ReadWriteOnce"], "resources": {"requests": {"storage": f"{RECORD_GIB}Gi"}}},
+    }
+
+
+def _secrets(space: str, found: Sequence[Process]) -> str:
+    """Return a script that puts certificates from where `zsim certs init` left them into the cluster."""
+    lines = [
+        "#!/bin/sh",
+        "# sh secrets.sh CERTS: makes the Secrets from the folder of `zsim certs init`; none is in this file.",
+        "set -eu",
+        'certs=${1:?"usage: sh secrets.sh FOLDER, that of zsim certs init"}',
+        "put() {",
+        f'    kubectl -n {space} create secret generic "$@" --dry-run=client -o yaml | kubectl apply -f -',
+        "}",
+    ]
+    for process in found:
+        files = [f'--from-file="$certs/{process.host}/{process.name}"']
+        if process.port is not None:
+            files.append(f'--from-file=access.json="$certs/{process.host}/{access_file(process)}"')
+        lines.append(f"put {pod.secret(process)} {' '.join(files)}")
+    return "\n".join(lines) + "\n"
+
+
+def _records_pod(space: str, image: str) -> dict[str, Any]:
+    box = {
+        "name": "records",
+        "image": image,
+        "command": ["sleep", "infinity"],
+        "resources": {"requests": {"cpu": "10m", "memory": "16Mi"}, "limits": {"memory": "64Mi"}},
+        "securityContext": pod.locked(),
+        "volumeMounts": [{"name": "runs", "mountPath": RUNS, "readOnly": True}],
+    }
+    spec = {
+        "automountServiceAccountToken": False,
+        "securityContext": pod.user(),
+        "terminationGracePeriodSeconds": 1,
+        "containers": [box],
+        "volumes": [pod.runs_volume()],
+    }
+    return {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "records", "namespace": space}, "spec": spec}
+
+
+# A run
+
+
+def _run(space: str, scenario: Scenario, text: str, found: Sequence[Process], image: str) -> list[dict[str, Any]]:
+    return [
+        _config(space, text),
+        *(_service(space, process) for process in found if process.name == WORLD),
+        *((_deployment if p.role == ROUTER else _job)(space, p, image) for p in found),
+    ]
+
+
+def _config(space: str, text: str) -> dict[str, Any]:
+    meta = {"name": "scenario", "namespace": space}
+    return {"apiVersion": "v1", "kind": "ConfigMap", "metadata": meta, "data": {"scenario.yaml": text}}
+
+
+def _service(space: str, world: Process) -> dict[str, Any]:
+    """Return the world's name in the cluster, for `zsim echo` and programs in Pods of their own."""
+    port = {"name": "zenoh", "port": world.port, "targetPort": "zenoh", "protocol": "TCP"}
+    return {
+        "apiVersion": "v1",
+        "kind": "Service",
+        "metadata": {"name": WORLD, "namespace": space},
+        "spec": {"selector": pod.labels(world), "ports": [port]},
+    }
+
+
+def _job(space: str, process: Process, image: str) -> dict[str, Any]:
+    """Return a Job: a fault of the call, and a name that another has taken, are not healed by a new Pod."""
+    codes = {"operator": "In", "values": [USER_FAULT, SUPERSEDED]}
+    spec = {
+        "backoffLimit": RESTARTS_MAX if process.on_death == "restart" else 0,
+        "podFailurePolicy": {"rules": [{"action": "FailJob", "onExitCodes": codes}]},
+        "podReplacementPolicy": "Failed",
+        "template": pod.template(process, image, "Never"),
+    }
+    return {"apiVersion": "batch/v1", "kind": "Job", "metadata": _meta(space, process), "spec": spec}
+
+
+def _deployment(space: str, process: Process, image: str) -> dict[str, Any]:
+    """Return a Deployment; the old Pod goes before the new one comes, they have the same port."""
+    spec = {
+        "replicas": 1,
+        "strategy": {"type": "Recreate"},
+        "selector": {"matchLabels": pod.labels(process)},
+        "template": pod.template(process, image, "Always"),
+    }
+    return {"apiVersion": "apps/v1", "kind": "Deployment", "metadata": _meta(space, process), "spec": spec}
+
+
+def _meta(space: str, process: Process) -> dict[str, Any]:
+    return {"name": pod.label(process.name), "namespace": space, "labels": pod.labels(process)}

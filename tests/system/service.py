@@ -1,0 +1,52 @@
+"""A process in the background that says when it is ready; all that it says is kept in a file."""
+
+import subprocess
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+READY_S = 20.0  # wall time to come up on a loaded machine
+
+
+class Service:
+    """A started process, ready to serve.
+
+    Args:
+        ready: what it says when it is.
+        log: file for its output.
+
+    Raises:
+        OSError: it ended, or was not ready in time.
+    """
+
+    def __init__(self, command: Sequence[str], ready: str, log: Path, env: Mapping[str, str]) -> None:
+        self._process = subprocess.Popen(
+            command, text=True, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=env
+        )
+        self._ready, self._log = ready, log
+        self._settled = threading.Event()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+        if not self._settled.wait(READY_S) or self._process.poll() is not None:
+            self.kill()
+            raise OSError(f"{command[-1]}: no {ready!r} within {READY_S:g} s; it says {log.read_text()[-400:]!r}")
+
+    def kill(self) -> None:
+        """End the process; its children may live on, and write."""
+        self._process.kill()
+        self._process.wait()
+
+    def finish(self) -> None:
+        """Take in the rest of the output, once all who write it have ended."""
+        self._process.wait()
+        self._reader.join()
+
+    def _read(self) -> None:
+        assert self._process.stdout
+        with self._process.stdout as said, self._log.open("a") as kept:
+            for line in said:
+                kept.write(line)
+                kept.flush()
+                if self._ready in line:
+                    self._settled.set()
+        self._settled.set()

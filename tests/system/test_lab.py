@@ -1,0 +1,215 @@
+"""The lab itself: its hosts are reached over ssh, a cut is a cut, a slow link is as slow as said, nothing is left."""
+
+import asyncio
+import itertools
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import lab as lab_module
+import namespaces
+import pytest
+from federation import ZSIM
+from lab import LAUNCHER, Lab
+
+from zsim.errors import HostsError
+from zsim_deploy import inventory
+from zsim_deploy.host_link import HostLink
+
+PORT = 9000
+SOON_S, LATE_S = 10.0, 0.4  # an answer that must come, one that must not
+
+
+def over_ssh(lab: Lab, command: str) -> dict[str, str]:
+    """Return what a line of shell prints on each host, connected from the launcher."""
+    placed = inventory.load(lab.inventory({"world": lab.names[0]}))
+
+    async def one(name: str) -> str:
+        link = HostLink(name, placed.inventory.hosts[name], placed.folder)
+        try:
+            return (await link.run(command)).decode().strip()
+        finally:
+            await link.close()
+
+    async def everyone() -> list[str]:
+        return await asyncio.gather(*map(one, lab.names))
+
+    with lab.inside(LAUNCHER):
+        return dict(zip(lab.names, asyncio.run(everyone()), strict=True))
+
+
+def udp(lab: Lab, name: str) -> socket.socket:
+    """Return a socket in the network of a host."""
+    with lab.inside(name):
+        made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        made.bind((lab.address(name), PORT))
+    return made
+
+
+class Echo:
+    """Asks a host for answers from another."""
+
+    def __init__(self, here: socket.socket, address: str) -> None:
+        self._here, self._there = here, (address, PORT)
+        self._count = itertools.count()
+
+    def round_trip_s(self, within_s: float = SOON_S) -> float | None:
+        """Return how long an answer took; None if there was none."""
+        question = str(next(self._count)).encode()
+        self._here.settimeout(within_s)
+        start_s = time.monotonic()
+        self._here.sendto(question, self._there)
+        try:
+            while self._here.recv(100) != question:
+                continue  # the answer to an earlier question
+        except TimeoutError:
+            return None
+        return time.monotonic() - start_s
+
+
+@contextmanager
+def echo(lab: Lab, name: str, from_: str = LAUNCHER) -> Iterator[Echo]:
+    """Let a host answer another's datagrams."""
+
+    def answer() -> None:
+        while (came := there.recvfrom(100))[0] != b"end":
+            there.sendto(*came)
+
+    with udp(lab, name) as there, udp(lab, from_) as here:
+        thread = threading.Thread(target=answer)
+        thread.start()
+        try:
+            yield Echo(here, lab.address(name))
+        finally:
+            with udp_end(lab, name) as last:
+                last.sendto(b"end", (lab.address(name), PORT))
+            thread.join()
+
+
+def udp_end(lab: Lab, name: str) -> socket.socket:
+    """Return a socket on the host itself: its loopback is never cut."""
+    with lab.inside(name):
+        return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+
+def test_a_command_runs_on_each_host_over_ssh(lab: Lab) -> None:
+    assert over_ssh(lab, "echo $ZSIM_LAB_HOST") == {name: name for name in lab.names}
+    addresses = over_ssh(lab, "ip -brief -4 addr show dev eth0")
+    assert all(f" {lab.address(name)}/" in text for name, text in addresses.items())
+
+
+def test_a_failing_command_is_one_line_with_its_host(lab: Lab) -> None:
+    with pytest.raises(HostsError, match=r"^h[123]: nosuch failed \(127\): .*not found$"):
+        over_ssh(lab, "nosuch")
+
+
+def test_variables_reach_what_is_started_on_a_host_and_only_there(lab: Lab) -> None:
+    lab.environment("h2", ZSIM_WORD="two words")
+    assert over_ssh(lab, "echo $ZSIM_WORD") == {"h1": "", "h2": "two words", "h3": ""}
+    assert lab.run("h2", "printenv", "ZSIM_WORD").stdout == "two words\n"
+
+
+def test_a_cut_parts_a_host_from_all_others_until_it_is_healed(lab: Lab) -> None:
+    with echo(lab, "h1") as other, echo(lab, "h2", from_="h3") as cut:
+        assert cut.round_trip_s() is not None
+        lab.cut("h2")
+        assert cut.round_trip_s(LATE_S) is None
+        assert other.round_trip_s() is not None
+        lab.heal("h2")
+        assert cut.round_trip_s() is not None
+
+
+def test_a_slow_link_has_its_delay_both_ways(lab: Lab) -> None:
+    with echo(lab, "h3") as link:
+        direct_s = min(link.round_trip_s() or SOON_S for _ in range(5))
+        lab.slow("h3", 50, 10)
+        times_s = [link.round_trip_s() or SOON_S for _ in range(8)]
+        assert min(times_s) >= 0.080
+        assert sorted(times_s)[4] <= 0.120 + direct_s + 0.060  # what a busy machine may add
+        lab.slow("h3", 0)
+        assert min(link.round_trip_s() or SOON_S for _ in range(5)) < 0.080
+
+
+def test_a_slow_link_can_be_cut(lab: Lab) -> None:
+    lab.slow("h2", 5)
+    with echo(lab, "h2") as link:
+        assert link.round_trip_s() is not None
+        lab.cut("h2")
+        assert link.round_trip_s(LATE_S) is None
+        lab.heal("h2")
+        assert link.round_trip_s() is not None
+
+
+def test_a_slow_link_loses_its_share_and_keeps_the_order(lab: Lab) -> None:
+    sent, share = 2000, 0.1
+    lab.slow("h1", 20, 20, share)
+    with udp(lab, "h1") as there, udp(lab, LAUNCHER) as here:
+        there.settimeout(1.0)
+        for number in range(sent):
+            here.sendto(number.to_bytes(4, "big"), (lab.address("h1"), PORT))
+        came = list(_all(there))
+    assert came == sorted(came)
+    assert 0.06 * sent < sent - len(came) < 0.14 * sent  # six standard deviations
+
+
+def _all(there: socket.socket) -> Iterator[int]:
+    """Yield the numbers that come until a second brings none."""
+    try:
+        while True:
+            yield int.from_bytes(there.recv(4), "big")
+    except TimeoutError:
+        return
+
+
+def test_processes_of_zsim_are_seen_on_their_host_only(lab: Lab) -> None:
+    with lab.popen(
+        "h2", *ZSIM, "estimator", "drone1", "--connect", f"tcp/{lab.address('h1')}:7447", stderr=subprocess.PIPE
+    ) as role:
+        assert role.stderr
+        role.stderr.readline()  # it waits for a world, and says so
+        assert {name: list(lab.processes(name)) for name in lab.names} == {"h1": [], "h2": [role.pid], "h3": []}
+        role.kill()
+    assert not lab.processes("h2")
+
+
+def test_nothing_is_left_of_a_lab_when_a_test_fails(tmp_path: Path) -> None:
+    lab_module.demand()
+    made, running = Lab(tmp_path, ("a", "b")), []
+    with suppress(ZeroDivisionError), made:
+        made.slow("b", 10)
+        over_ssh(made, "nohup sleep 600 >/dev/null 2>&1 & echo started")
+        running = inhabitants(made)
+        assert len(running) >= 2 * 2 + 1  # an sshd and a sleep on each host, a link's process
+        raise ZeroDivisionError
+    assert not any(Path("/proc", str(pid)).exists() for pid in running)
+    assert not any((namespaces.FOLDER / namespace).exists() for namespace in made.namespaces())
+
+
+def inhabitants(lab: Lab) -> list[int]:
+    """Return the ids of all processes of a lab."""
+    return [pid for namespace in lab.namespaces() for pid, _ in namespaces.members(namespace)]
+
+
+def test_labs_side_by_side_do_not_meet(lab: Lab, tmp_path: Path) -> None:
+    with Lab(tmp_path / "other", ("h1",)) as other:
+        other.cut("h1")
+        with echo(lab, "h1") as link:
+            assert link.round_trip_s() is not None
+    assert over_ssh(lab, "true") == dict.fromkeys(lab.names, "")
+
+
+def test_a_machine_without_the_tools_skips_but_fails_in_ci(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lab_module, "TOOLS", {"no-such-tool": "no-such-package"})
+    monkeypatch.setattr(lab_module.os, "geteuid", lambda: 0)
+    wanted = "a lab of hosts needs no-such-package; apt-get install it"
+    monkeypatch.delenv("CI", raising=False)
+    with pytest.raises(pytest.skip.Exception, match=wanted):
+        lab_module.demand()
+    monkeypatch.setenv("CI", "true")
+    with pytest.raises(pytest.fail.Exception, match=wanted):
+        lab_module.demand()

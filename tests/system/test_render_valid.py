@@ -1,0 +1,288 @@
+"""What `zsim render` writes is what systemd, Compose and Kubernetes take, and what their command lines start flies.
+
+Validators: `systemd-analyze verify`, the schema of the Compose specification (in check-jsonschema), and the schemas
+of the Kubernetes API (in kubernetes-validate), strict: an unknown field is a fault.
+"""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import kubernetes_validate
+import pytest
+import yaml
+from federation import PAIR, ZSIM, free_port
+from wire import PATIENCE_S
+
+from zsim import scenario_file
+from zsim.record import RecordReader
+from zsim_deploy import inventory
+from zsim_deploy.render import compose, kubernetes, systemd
+
+ROOT = Path(__file__).parents[2]
+STEP = ROOT / "scenarios/step.yaml"
+OLDEST, NEWEST = "1.31", "1.37"  # podFailurePolicy is stable from 1.31 on; the newest that the validator knows
+
+HOSTS = f"""
+hosts:
+  lab: {{address: 192.168.1.10, user: lab, python: {sys.executable}}}
+  one: {{address: 192.168.1.21, user: pi, python: {sys.executable}, folder: "/srv/of drones/100%"}}
+  two: {{address: lab.example.org, user: root, python: {sys.executable}, router: yard}}
+roles: {{world: lab, "controller.*": two, "estimator.*": [one, two]}}
+routers: {{yard: {{host: one}}, site: {{host: two, upstream: yard, port: 7500}}}}
+"""
+
+needs_systemd = pytest.mark.skipif(
+    shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing; on Debian: apt-get install systemd"
+)
+SECURITY = pytest.mark.parametrize("insecure", [False, True], ids=["tls", "insecure"])
+
+
+def rendered(folder: Path, target: str, insecure: bool = False, text: str = HOSTS, scenario: Path = STEP) -> Path:
+    """Write what a target renders into a folder; return that."""
+    hosts = folder / "hosts.yaml"
+    hosts.write_text(text + f"security: {{insecure: {str(insecure).lower()}}}\n")
+    render = {"systemd": systemd.render, "compose": compose.render, "kubernetes": kubernetes.render}[target]
+    out = folder / target
+    for name, content in render(inventory.load(hosts), scenario_file.load(scenario)).items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(content)
+    return out
+
+
+# systemd
+
+
+def verify(folder: Path) -> str:
+    """Return what systemd-analyze has against the units of a host."""
+    units = [str(path) for path in sorted([*folder.glob("*.service"), *folder.glob("*.target")])]
+    done = subprocess.run(["systemd-analyze", "verify", *units], capture_output=True, text=True, timeout=PATIENCE_S)
+    return done.stderr + (f"exit code {done.returncode}" if done.returncode else "")
+
+
+@needs_systemd
+@SECURITY
+@pytest.mark.parametrize("host", ["lab", "one", "two"])
+def test_units_are_verified(tmp_path: Path, host: str, insecure: bool) -> None:
+    assert verify(rendered(tmp_path, "systemd", insecure) / host) == ""
+
+
+@needs_systemd
+@pytest.mark.parametrize(
+    ("right", "wrong", "told"),
+    [
+        ("ProtectSystem=strict", "ProtectSystem=strickt", "Failed to parse"),
+        ("Restart=on-failure", "Restrat=on-failure", "Unknown key"),
+        (f"ExecStart={sys.executable}", "ExecStart=python", "python"),
+    ],
+)
+def test_a_fault_in_a_unit_is_found(tmp_path: Path, right: str, wrong: str, told: str) -> None:
+    host = rendered(tmp_path, "systemd") / "two"
+    unit = host / "zsim-controller.main.service"
+    assert right in unit.read_text()
+    unit.write_text(unit.read_text().replace(right, wrong).replace("ExecStart=python ", "ExecStart=/no/such/python "))
+    assert told in verify(host)
+
+
+# Compose and Kubernetes
+
+
+def judged(path: Path) -> str:
+    """Return what the Compose specification has against a file."""
+    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
+    return "" if done.returncode == 0 else done.stdout + done.stderr
+
+
+@SECURITY
+def test_compose_files_fit_the_specification(tmp_path: Path, insecure: bool) -> None:
+    out = rendered(tmp_path, "compose", insecure)
+    assert {path.parent.name: judged(path) for path in out.glob("*/compose.yaml")} == {"lab": "", "one": "", "two": ""}
+
+
+def test_a_fault_in_a_compose_file_is_found(tmp_path: Path) -> None:
+    path = rendered(tmp_path, "compose") / "lab/compose.yaml"
+    path.write_text(path.read_text().replace("init: true", "initt: true"))
+    assert "initt" in judged(path)
+
+
+def documents(out: Path) -> list[dict]:
+    return [one for path in sorted(out.glob("*.yaml")) for one in yaml.safe_load_all(path.read_text())]
+
+
+@SECURITY
+@pytest.mark.parametrize("version", [OLDEST, NEWEST])
+def test_manifests_fit_the_api(tmp_path: Path, version: str, insecure: bool) -> None:
+    found = documents(rendered(tmp_path, "kubernetes", insecure))
+    assert len(found) == 4 + 1 + 6 + 2  # what stays, records and scenario; the Service; roles; routers
+    assert {kubernetes_validate.validate(one, version, strict=True) for one in found} == {version}
+
+
+def test_a_fault_in_a_manifest_is_found(tmp_path: Path) -> None:
+    job = next(one for one in documents(rendered(tmp_path, "kubernetes")) if one["kind"] == "Job")
+    job["spec"]["template"]["spec"]["hostNetwrok"] = True
+    with pytest.raises(kubernetes_validate.ValidationError, match="hostNetwrok"):
+        kubernetes_validate.validate(job, NEWEST, strict=True)
+
+
+def test_the_secrets_are_made_from_the_files_of_certs_init(tmp_path: Path) -> None:
+    """The script is run with a kubectl that looks whether the files are there and does what it is told of them."""
+    out = rendered(tmp_path, "kubernetes")
+    certs(tmp_path, STEP)
+    (tmp_path / "kubectl").write_text(f"""#!{sys.executable}
+import pathlib, sys
+files = [word.split("=")[-1] for word in sys.argv if word.startswith("--from-file")]
+assert files or sys.argv[1:] == ["apply", "-f", "-"], sys.argv
+for path in map(pathlib.Path, files):
+    sys.stderr.write(f"{{path}}: {{path.exists()}}\\n")
+""")
+    (tmp_path / "kubectl").chmod(0o755)
+    done = subprocess.run(
+        ["sh", str(out / "secrets.sh"), str(tmp_path / "certs")],
+        env={**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+    )
+    assert done.returncode == 0, done.stderr
+    looked = done.stderr.splitlines()
+    assert len(looked) == 8 + 3  # a certificate each, and access control of the world and two routers
+    assert all(line.endswith(": True") for line in looked)
+
+
+def certs(folder: Path, scenario: Path) -> None:
+    """Make the certificates of the inventory in a folder."""
+    made = [*ZSIM, "certs", "init", str(folder / "hosts.yaml"), "--scenario", str(scenario)]
+    subprocess.run(made, check=True, capture_output=True, timeout=PATIENCE_S)
+
+
+# What a unit starts
+
+
+class Unit(NamedTuple):
+    """The command of a rendered unit, as systemd would run it."""
+
+    name: str
+    words: list[str]
+
+    def __call__(self, *more: str) -> "subprocess.Popen[str]":
+        return subprocess.Popen(
+            [*self.words, *more],
+            text=True,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+
+
+def units(out: Path, state: Path) -> Iterator[Unit]:
+    """Yield the units of all hosts; `state` is in the place of StateDirectory=."""
+    for path in sorted(out.glob("*/*.service")):
+        (line,) = re.findall(r"^ExecStart=(.*)$", path.read_text(), re.MULTILINE)
+        line = line.replace("${INVOCATION_ID}", "f00d").replace(systemd.STATE, str(state))
+        words = [word.replace("%%", "%").replace("$$", "$") for word in shlex.split(line)]
+        yield Unit(path.stem.removeprefix("zsim-"), words)
+
+
+def here(folder: Path, ports: Sequence[int]) -> str:
+    """Return an inventory with three hosts, all of them this one, drone2's behind a router."""
+    world, router = ports
+    host = f"address: 127.0.0.1, user: me, python: {sys.executable}, folder: {folder}"
+    return f"""
+hosts: {{lab: {{{host}/lab}}, one: {{{host}/one}}, two: {{{host}/two, router: yard}}}}
+roles: {{world: lab, "controller.*": one, "estimator.*": [one, two]}}
+routers: {{yard: {{host: one, port: {router}}}}}
+port: {world}
+"""
+
+
+def laid_out(folder: Path, scenario: str, insecure: bool) -> dict[str, Unit]:
+    """Render units for this machine, bring every host's files to its folder, return the units by process."""
+    own = folder / "own.yaml"
+    own.write_text(scenario)
+    text = here(folder, [free_port(), free_port()])
+    out = rendered(folder, "systemd", insecure, text, own)
+    if not insecure:
+        certs(folder, own)
+    for host in ("lab", "one", "two"):
+        shutil.copytree(out / host, folder / host)
+        if not insecure:
+            shutil.copytree(folder / "certs" / host, folder / host / "certs")
+    return {unit.name: unit for unit in units(out, folder / "state")}
+
+
+@contextmanager
+def started(process: "subprocess.Popen[str]") -> Iterator["subprocess.Popen[str]"]:
+    with process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@SECURITY
+@pytest.mark.parametrize("name", ["estimator.drone1", "estimator.drone2", "controller.main", "recorder"])
+def test_a_unit_s_command_is_one_that_the_role_takes(tmp_path: Path, name: str, insecure: bool) -> None:
+    """Nobody listens there, and the role says so, which it does when it is content with its options."""
+    unit = laid_out(tmp_path, PAIR, insecure)[name]
+    with started(unit("--wait", "0.1")) as role:
+        said, _ = role.communicate(timeout=PATIENCE_S)
+    endpoint = unit.words[unit.words.index("--connect") + 1]
+    assert role.returncode == 2, said
+    expected = f"no world of federation 'zsim' on {endpoint} within 0.1 s; start one with `zsim world`"
+    assert said.splitlines()[-1] == expected
+
+
+def test_a_certificate_that_is_not_there_is_a_line(tmp_path: Path) -> None:
+    unit = laid_out(tmp_path, PAIR, insecure=False)["estimator.drone1"]
+    (tmp_path / "one/certs/estimator.drone1/key.pem").unlink()
+    with started(unit("--wait", "0.1")) as role:
+        said, _ = role.communicate(timeout=PATIENCE_S)
+    assert role.returncode == 2, said
+    assert "key.pem" in said
+    assert "Traceback" not in said
+
+
+@SECURITY
+@pytest.mark.usefixtures("compiled")
+def test_the_units_of_three_hosts_fly(tmp_path: Path, insecure: bool) -> None:
+    """All units at once, in whatever order they come up, until the world ends the run."""
+    found = laid_out(tmp_path, PAIR.replace("duration_s: 12", "duration_s: 6"), insecure)
+    assert set(found) == {
+        "world",
+        "recorder",
+        "estimator.drone1",
+        "estimator.drone2",
+        "controller.main",
+        "router.yard",
+    }
+    with ExitStack() as stack:
+        roles = {name: stack.enter_context(started(unit())) for name, unit in sorted(found.items())}
+        said = {name: role.communicate(timeout=PATIENCE_S)[0] for name, role in roles.items() if name != "router.yard"}
+        roles["router.yard"].terminate()
+        said["router.yard"] = roles["router.yard"].communicate(timeout=PATIENCE_S)[0]
+        assert {name: role.returncode for name, role in roles.items()} == dict.fromkeys(found, 0), said
+    with RecordReader(tmp_path / "state/runs/pair-f00d/run.mcap") as record:
+        assert record.complete
+        assert record.topics()["drone/drone2/estimate"] >= 300
+
+
+@pytest.mark.usefixtures("compiled")
+def test_a_world_ends_by_the_signal_of_its_unit(tmp_path: Path) -> None:
+    found = laid_out(tmp_path, PAIR, insecure=True)
+    text = (tmp_path / "systemd/lab/zsim-world.service").read_text()
+    assert "KillSignal=SIGTERM" in text
+    with started(found["world"]()) as world:
+        assert world.stdout is not None
+        assert any("world of 'zsim' on tcp/127.0.0.1:" in line for line in world.stdout)
+        world.terminate()
+        assert "ended: terminated" in world.stdout.read()
+        assert world.wait(systemd.STOP_S) == 0
