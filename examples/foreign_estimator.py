@@ -111,6 +111,8 @@ def world_info(session: zenoh.Session) -> dict[str, Any]:
 
 
 def main() -> None:
+    if "/" not in ENDPOINT:
+        raise SystemExit("usage: python examples/foreign_estimator.py [ENDPOINT]     e.g. tcp/127.0.0.1:7447")
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", f'["{ENDPOINT}"]')

@@ -8,6 +8,7 @@ import zenoh
 
 ENDPOINT, SECONDS = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447", 10.0
 ME, DRONE = "plain.client", "zsim/drone/drone1"
+"/" in ENDPOINT or sys.exit("usage: python examples/plain_client.py [ENDPOINT]     e.g. tcp/127.0.0.1:7447")
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", f'["{ENDPOINT}"]')
@@ -24,8 +25,7 @@ with zenoh.open(config) as session:
     run = {"run_id": info["run_id"], "incarnation": int.from_bytes(os.urandom(7), "big")}
     sensors = session.declare_subscriber(f"{DRONE}/sensor/*", zenoh.handlers.FifoChannel(10_000))
     token = session.liveliness().declare_token(f"zsim/process/{ME}")
-    about = {"role": "example", "host": "here", "pid": os.getpid(), "period_ns": info["gate_ns"]}
-    put(f"zsim/process/{ME}/join", t_ns=0, **run, **about)
+    put(f"zsim/process/{ME}/join", t_ns=0, **run, role="plain", host="here", pid=os.getpid(), period_ns=info["gate_ns"])
     while t_ns < SECONDS * 1e9:
         sample = sensors.recv()
         last[str(sample.key_expr).rsplit("/", 1)[1]] = msgpack.unpackb(sample.payload.to_bytes())

@@ -30,7 +30,7 @@ def cross_faults(scenario: Any) -> Iterator[Fault]:
     yield from _membership_faults(drones, clusters)
     for index, cluster in clusters:
         yield from ((f"clusters[{index}].{path}", text) for path, text in _plan_faults(cluster))
-    yield from _process_faults(scenario.processes)
+    yield from _process_faults(scenario.processes, drones, clusters)
     yield from _window_faults(scenario.report)
 
 
@@ -155,11 +155,19 @@ def _plan_faults(cluster: Any) -> Iterator[Fault]:
             yield path, f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
 
 
-def _process_faults(processes: Any) -> Iterator[Fault]:
+def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
     first: dict[str, int] = {}
+    things = {"estimator": ("drone", drones), "controller": ("cluster", clusters)}
     for index, name in _entries(processes and processes.expect):
         if first.setdefault(name, index) != index:
             yield f"processes.expect[{index}]", f"is {name!r}, as expect[{first[name]}]; must be unique"
+        role, _, thing = name.partition(".")
+        kind, entries = things.get(role, ("", []))
+        known = _names(entries)
+        if kind and thing not in known and len(known) == len(entries):
+            named = _listed(known) or f"a {kind}, and there is none"
+            allowed = f"must be {role}.NAME of {named}, or a name of your own"
+            yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
 
 
 def _window_faults(report: Any) -> Iterator[Fault]:

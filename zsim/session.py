@@ -367,9 +367,9 @@ def _named(expression: str) -> Iterator[None]:
         yield
     except zenoh.ZError as error:
         bare = re.sub("//+", "/", expression.strip("/"))
-        hint = f"; keys have no / at their ends and one between names: {bare}" if bare != expression and bare else ""
         allowed = "must be names with / between them, * for any name, ** for any number of them"
-        raise SessionError(f"key is {expression!r} ({_brief(error)}); {allowed}{hint}") from error
+        instead = f"must be {bare}, without / at its ends" if bare not in (expression, "") else allowed
+        raise SessionError(f"key is {expression!r} ({_brief(error).split('`: ')[-1]}); {instead}") from error
 
 
 def _brief(error: Exception) -> str:

@@ -45,7 +45,8 @@ def parse(text: str, source: str, example: str, refuse: type[DocumentError]) -> 
     except ValueError as error:
         raise refuse([f"{source}: {error}; see {example}"]) from error
     if not isinstance(document, dict):
-        raise refuse([f"{source}: holds {show(document)}; must be a map as in {example}"])
+        holds = f"holds {show(document)}" if text.strip() else "is empty"
+        raise refuse([f"{source}: {holds}; must be a map as in {example}"])
     return document
 
 

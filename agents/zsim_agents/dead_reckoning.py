@@ -90,12 +90,12 @@ def corrected(state: Reckoning, error: np.ndarray, with_accel_bias: bool, gravit
         gravity: [m/s^2].
     """
     p, v, q, _, w, f_B = state
-    p = (p[0] + error[0], p[1] + error[1], p[2] + error[2])
-    v = (v[0] + error[3], v[1] + error[4], v[2] + error[5])
-    q = normalised(product(rotation_vector_quaternion((error[6], error[7], error[8])), q))
-    w = (w[0] - error[9], w[1] - error[10], w[2] - error[11])
+    p = (p[0] + float(error[0]), p[1] + float(error[1]), p[2] + float(error[2]))
+    v = (v[0] + float(error[3]), v[1] + float(error[4]), v[2] + float(error[5]))
+    q = normalised(product(rotation_vector_quaternion((float(error[6]), float(error[7]), float(error[8]))), q))
+    w = (w[0] - float(error[9]), w[1] - float(error[10]), w[2] - float(error[11]))
     if with_accel_bias:
-        f_B = (f_B[0] - error[12], f_B[1] - error[13], f_B[2] - error[14])
+        f_B = (f_B[0] - float(error[12]), f_B[1] - float(error[13]), f_B[2] - float(error[14]))
     return p, v, q, acceleration(q, f_B, gravity), w, f_B
 
 

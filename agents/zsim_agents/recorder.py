@@ -7,19 +7,22 @@ import os
 import secrets
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 
 from zsim import __version__, batch, keys, messages
-from zsim.errors import DecodeError, NoWorldError, RecordError, SupersededError
+from zsim.connection import read_info
+from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, SupersededError
 from zsim.health import HealthMeter
 from zsim.record import RecordWriter
 from zsim.replay import replay
 from zsim.session import Sample, Session
 
 NAME = "recorder"
+ANOTHER_RUN = "the world has begun another run"
 PAUSE_S = 0.01  # between two looks into the queue: nobody waits for the recorder, and waking up is what costs
 TICK_S = 0.1  # how often the open chunk's age and a stop are looked at
 REPLAY_S = 5.0  # a hub answers within milliseconds
@@ -38,24 +41,38 @@ def record(
     path: Path,
     name: str = NAME,
     stopped: Callable[[], bool] = lambda: False,
+    say: Callable[[str], None] = lambda text: None,
 ) -> str:
     """Record a run until it ends; return why it ended.
 
     Raises:
+        RunError: the world has begun another run; the record is complete as far as it goes.
         RecordError: the disk is full or the file cannot be written; what was written before is readable.
         SupersededError: another recorder of this name has taken over.
     """
-    return Recorder(link, info, path, name, stopped).run()
+    return Recorder(link, info, path, name, stopped, say).run()
 
 
 class Recorder:
     """Writes what passes on `**`."""
 
-    def __init__(self, link: Session, info: messages.Info, path: Path, name: str, stopped: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        link: Session,
+        info: messages.Info,
+        path: Path,
+        name: str,
+        stopped: Callable[[], bool],
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
         self._link = link
         self._info = info
         self._name = name
         self._stopped = stopped
+        self._say_line = say
+        self._links: deque[bool] = deque()
+        self._link_lost = False
+        self._must_look = False
         self._writer = RecordWriter(path)
         self._head = msgspec.msgpack.Decoder(_Head)
         self._clock = msgspec.msgpack.Decoder(messages.Clock)
@@ -75,7 +92,7 @@ class Recorder:
         self._box = self._link.subscribe(batch.KEY)
         self._views = self._link.subscribe("view/**")
         self._link.declare_token(keys.token(self._name))
-        self._link.on_link(lambda up: self._box.wake())
+        self._link.on_link(self._on_link)
         self._catch_up()
         self._join()
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
@@ -94,8 +111,26 @@ class Recorder:
                 f"{self._name}: another process of this name joined from {self._successor}; this one ends, its record "
                 f"is {self._writer.path}"
             )
+        if reason == ANOTHER_RUN:
+            raise RunError(f"{self._name}: {reason}; the record {self._writer.path} is complete as far as it goes")
         self._bye(reason)
         return reason
+
+    def _on_link(self, up: bool) -> None:
+        self._links.append(up)
+        self._box.wake()
+
+    def _is_another_run(self) -> bool:
+        """Say what has become of the link; tell whether there is another run at its end when it is back."""
+        while self._links:
+            up = self._links.popleft()
+            if not up:
+                self._say_line(f"{self._name}: lost the link to the world; waiting for it to come back")
+            self._must_look = up and self._link_lost
+            self._link_lost = not up
+        info = read_info(self._link) if self._must_look else None
+        self._must_look = self._must_look and info is None
+        return info is not None and info.run_id != self._info.run_id
 
     def _loop(self) -> str:
         while True:
@@ -110,6 +145,8 @@ class Recorder:
             self._writer.tick(time.monotonic_ns())
             if self._successor:
                 return "superseded"
+            if self._is_another_run():
+                return ANOTHER_RUN
             if self._may_stop():
                 return "stopped"
             if self._ended_s is not None and self._all_left():

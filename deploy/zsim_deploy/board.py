@@ -13,6 +13,7 @@ from zsim_deploy.host_link import HostLink
 from zsim_deploy.progress import Screen, describe
 from zsim_deploy.remote import Remote
 
+FIRST_S = 1.0  # simulated; from then on it flies
 SILENT_S = 1.0  # a host that has not answered for so long is shown as silent; it is asked twice a second
 STALE_S = 3.0  # health comes once a second; older figures say nothing of now
 COLUMNS = ("role", "host", "pid", "state", "lag", "messages/s", "round trip", "restarts")
@@ -24,14 +25,17 @@ class Board:
     Attributes:
         members: the processes; to be given before it is shown.
         links: to the hosts.
-        events: of the run so far, for `zsim ps`.
+        stages_s: how long each step before the processes' start took.
     """
 
     def __init__(self, duration_s: float, console: Console | None = None) -> None:
         self.console = console or Console(stderr=True)
         self.members: Sequence[Any] = ()
         self.links: dict[str, HostLink] = {}
+        self.stages_s: dict[str, float] = {}
         self._duration_s = duration_s
+        self._begun_s = time.monotonic()
+        self._flies = False
         self._plain = Screen(duration_s, self.console)
         self._is_live = self.console.is_terminal
         self._health: dict[str, dict[str, Any]] = {}
@@ -54,8 +58,17 @@ class Board:
 
     def clock(self, line: dict[str, Any]) -> None:
         self._clock = {**line, "wall_s": time.monotonic()}
+        if line["t_s"] >= FIRST_S and not self._flies:
+            self._flies = True
+            self.say(self._start_up())
         if not self._is_live:
             self._plain.clock(line)
+
+    def _start_up(self) -> str:
+        """Return how long it took until simulated time went on, and where it went."""
+        took_s = time.monotonic() - self._begun_s
+        stages_s = {**self.stages_s, "processes": took_s - sum(self.stages_s.values())}
+        return f"flies after {took_s:.1f} s: " + ", ".join(f"{what} {s:.1f} s" for what, s in stages_s.items())
 
     def event(self, line: dict[str, Any]) -> None:
         self._plain.event(line)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from zsim import __version__
-from zsim.errors import RecordError, SupersededError, ZsimError
+from zsim.errors import SupersededError, ZsimError
 from zsim_deploy import certs_commands, hosts_commands, look_commands, render_commands
 from zsim_deploy.arguments import (
     DEFAULT_ENDPOINT,
@@ -39,6 +39,7 @@ app = typer.Typer(
 )
 
 UsageError: type[Any] = typer.BadParameter.__bases__[0]  # click's, or that of the click inside of newer typers
+INTERRUPTED = 130  # exit code of a shell for a program that Ctrl-C ended
 RUN, ROLES = "Run", "Roles, started by hand, on any machine, in any order"
 HOSTS = "On several machines"
 
@@ -69,7 +70,7 @@ def run(
     given = {"--realtime": realtime, "--rate": rate is not None, "--listen": listen is not None}
     if in_process and any(given.values()):
         useless = " and ".join(name for name, is_given in given.items() if is_given)
-        raise typer.BadParameter(f"--in-process is unpaced lockstep without Zenoh; leave out it or {useless}")
+        raise typer.BadParameter(f"--in-process is lockstep, unpaced, without Zenoh; leave out {useless}, or it")
     check_endpoint(listen)
     loaded = load_scenario(scenario, set_, seed, duration)
     mode, pace = mode_and_rate(realtime, rate)
@@ -90,9 +91,9 @@ def conclude(outcome: Any, out: Path, report: bool) -> None:
     if outcome.interrupted:
         if recorded:
             print(f"the record so far is {out / 'run.mcap'}; `zsim report {out}` makes its report", file=sys.stderr)
-        raise typer.Exit(130)
+        sys.exit(INTERRUPTED)
     if report and recorded:
-        _report_at_the_end(out)
+        _report_at_the_end(out, outcome.failed)
     if outcome.failed:
         print(f"logs are in {out / 'logs'}", file=sys.stderr)
         raise typer.Exit(1)
@@ -115,14 +116,16 @@ def report(directory: Annotated[Path, typer.Argument(help="Folder of a run.", sh
     _report(directory)
 
 
-def _report_at_the_end(out: Path) -> None:
+def _report_at_the_end(out: Path, failed: bool) -> None:
     try:
         _report(out)
-    except RecordError as error:  # a run that ended before anything flew has said why
+    except ZsimError as error:
+        if not failed:
+            raise
         print(error, file=sys.stderr)
     except KeyboardInterrupt:
         print(f"interrupted; the record is complete, `zsim report {out}` makes its report", file=sys.stderr)
-        raise typer.Exit(130) from None
+        sys.exit(INTERRUPTED)
 
 
 def _report(directory: Path) -> None:
@@ -251,7 +254,7 @@ def options(
 def main() -> None:
     """Run the command line; a user's fault is a line, not a traceback."""
     try:
-        sys.exit(app(standalone_mode=False, prog_name="zsim"))
+        code = app(standalone_mode=False, prog_name="zsim")
     except ZsimError as error:
         print(error, file=sys.stderr)
         sys.exit(3 if isinstance(error, SupersededError) else 2)
@@ -259,8 +262,10 @@ def main() -> None:
         _show_usage(error)
         sys.exit(2)
     except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
+    if code == INTERRUPTED:
         print("interrupted", file=sys.stderr)
-        sys.exit(130)
+    sys.exit(code)
 
 
 def _show_usage(error: Any) -> None:

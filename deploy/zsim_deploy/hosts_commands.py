@@ -1,4 +1,4 @@
-"""The commands of a run on several hosts: up, down, ps, logs, restart, move, doctor."""
+"""The commands of a run on several hosts."""
 
 import json
 import sys
@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from zsim_deploy.arguments import Duration, RateOption, Realtime, ScenarioPath, Seed, Set, load_scenario, mode_and_rate
+from zsim_deploy.push_command import push
 
 FOLLOW_S = 0.2  # between two looks at a log that is followed
 
@@ -140,5 +141,5 @@ def _placement(placed: Any, scenario: Path | None) -> dict[str, str] | None:
 
 def register(app: typer.Typer, panel: str) -> None:
     """Add the commands to the command line."""
-    for command in (up, down, ps, logs, restart, move, doctor):
+    for command in (push, doctor, up, ps, logs, restart, move, down):
         app.command(rich_help_panel=panel)(command)

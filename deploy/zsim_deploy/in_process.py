@@ -16,7 +16,7 @@ from zsim.record import RecordWriter
 from zsim.scenario import Scenario
 from zsim_agents.controller import Controller
 from zsim_agents.estimator import Estimator
-from zsim_deploy.progress import Screen, Throttle
+from zsim_deploy.progress import Reasons, Screen, Throttle
 from zsim_world.world import World, expected
 
 
@@ -83,6 +83,7 @@ class _Show:
         self._add = writer.add_message if writer else None
         self._screen = screen
         self._throttle = Throttle()
+        self._reasons = Reasons()
         states = (keys.cluster_state(cluster.name) for cluster in world.scenario.clusters)
         self._watched = {keys.CLOCK, keys.EVENT, *states}
         self._phase = ""
@@ -96,6 +97,8 @@ class _Show:
     def _show(self, key: str, message: Struct, screen: Screen) -> None:
         if isinstance(message, messages.ClusterState):
             self._phase = message.phase
+            if line := self._reasons.line(keys.thing(key), message):
+                screen.say(line)
         elif isinstance(message, messages.Event):
             screen.event({"t_s": message.t_ns / 1e9, "kind": message.kind, "text": message.text})
         elif isinstance(message, messages.Clock) and self._throttle.passes():

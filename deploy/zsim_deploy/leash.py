@@ -24,6 +24,7 @@ class Leash:
     def __init__(self, launched: bool) -> None:
         self._reason: str | None = None
         self._heard_s = time.monotonic()
+        self._former = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
         signal.signal(signal.SIGTERM, lambda *_: self._stop("terminated"))
         if launched:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -38,6 +39,11 @@ class Leash:
     def pulled(self) -> bool:
         """Tell whether to stop."""
         return self._reason is not None
+
+    def let_go(self) -> None:
+        """Take no signals any more: what is left to do may be interrupted as anything."""
+        for number, handler in self._former.items():
+            signal.signal(number, handler)
 
     def _stop(self, reason: str) -> None:
         self._reason = self._reason or reason

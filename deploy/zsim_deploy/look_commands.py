@@ -123,4 +123,7 @@ def _link(endpoint: str, federation: str, wait_s: float | None, who: "Identity")
 
     say = partial(print, file=sys.stderr)
     with find_world(endpoint, federation, wait_s, say, reader=True, identity=who) as found:
-        yield found
+        try:
+            yield found
+        except KeyboardInterrupt:  # the usual end of `zsim echo` and `zsim hz`
+            sys.exit(130)

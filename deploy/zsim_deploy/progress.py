@@ -4,6 +4,7 @@ The world tells it as JSON lines (`Teller`) when it is launched, or shows it its
 """
 
 import json
+import re
 import sys
 import time
 from typing import Any, Protocol
@@ -12,7 +13,11 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from zsim.messages import ClusterState
+
 PERIOD_S = 0.2  # wall time between two updates
+REASON_NS = 5_000_000_000  # simulated time; a take-off gives one reason for 3 s
+_NUMBER = re.compile(r"-?[0-9][0-9.]*")
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
 
 
@@ -38,6 +43,26 @@ class Throttle:
             return False
         self._last_s = now_s
         return True
+
+
+class Reasons:
+    """What keeps clusters from going on, told once when it lasts."""
+
+    def __init__(self) -> None:
+        self._since: dict[str, tuple[str, int]] = {}
+        self._told: set[tuple[str, str]] = set()
+
+    def line(self, cluster: str, state: ClusterState) -> str | None:
+        """Return what to say of a state: its reason if that has been the same, but for its numbers, for REASON_NS."""
+        shape = _NUMBER.sub("#", state.reason)
+        former, since_ns = self._since.get(cluster, ("", 0))
+        if shape != former:
+            self._since[cluster] = (shape, state.t_ns)
+            return None
+        if not shape or state.t_ns - since_ns < REASON_NS or (cluster, shape) in self._told:
+            return None
+        self._told.add((cluster, shape))
+        return f"  {state.t_ns / 1e9:8.2f} s  {cluster}, {state.phase}: {state.reason}"
 
 
 class Teller:
@@ -85,7 +110,7 @@ class Screen:
 
     def say(self, text: str) -> None:
         """Show a line that stays."""
-        self.console.print(text, highlight=False, markup=False)
+        self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def clock(self, line: dict[str, Any]) -> None:
         text = describe(line, self._duration_s)

@@ -19,11 +19,11 @@ from zsim.identity import Identity
 from zsim.runner import Runner
 from zsim.scenario import Scenario
 from zsim_deploy.leash import Leash
-from zsim_deploy.progress import QUIET, Screen, Show, Teller, Throttle
+from zsim_deploy.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
 
 TICK_S = 0.1  # how often a router looks for a stop
 PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
-PATIENCE_S = 2.0  # a compiled kernel is loaded within a second
+PATIENCE_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
 SHOWN_EVENTS = 2000  # events told per run besides those below; all of them are in the record
 HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but anybody can publish more
 VITAL = frozenset({"death", "end"})  # how a run ends, and why
@@ -61,7 +61,12 @@ def world(
 @contextmanager
 def _patience(teller: Teller | None) -> Iterator[None]:
     """Say what takes so long the first time that a machine runs the world."""
+    from zsim_world.compiled import is_kept
+    from zsim_world.gate import advance
+
     text = "compiling the world's kernel; later runs on this machine find it compiled"
+    if is_kept(advance):
+        text = "loading the world's kernel; this machine is busy"
     timer = threading.Timer(PATIENCE_S, teller.say if teller else print, args=(text,))
     timer.start()
     try:
@@ -71,14 +76,16 @@ def _patience(teller: Teller | None) -> Iterator[None]:
 
 
 def _told(show: Show) -> Callable[[str, Any, str], None]:
-    """Return what the world calls with its clocks and events."""
-    throttle = Throttle()
+    """Return what the world calls with its clocks, its events, and what passes it."""
+    throttle, reasons = Throttle(), Reasons()
     told = [0]
     healths: defaultdict[str, Throttle] = defaultdict(lambda: Throttle(HEALTH_PERIOD_S))
 
     def tell(kind: str, message: Any, about: str) -> None:
         if kind == "clock" and (throttle.passes() or message.state == "stopped"):
             show.clock(_clock_line(message, about))
+        elif kind == "state" and (line := reasons.line(about, message)):
+            show.say(line)
         elif kind == "health" and healths[about].passes():
             show.health({"name": about, "lag_ns": message.lag_ns, "received": message.received})
         elif kind == "event" and (message.kind in VITAL or told[0] < SHOWN_EVENTS):
@@ -163,7 +170,7 @@ def recorder(
         raise RecordError(f"{path.parent}: cannot be made ({error.strerror}); give --out another folder") from error
     with find_world(endpoint, federation, wait_s, say, leash.pulled, True, launched, identity) as (link, info):
         say(f"recorder: run {info.run_id} into {path}")
-        reason = record(link, info, path, stopped=leash.pulled)
+        reason = record(link, info, path, stopped=leash.pulled, say=say)
     say(f"recorder: {path} is complete, {reason}")
 
 

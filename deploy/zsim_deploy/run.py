@@ -1,6 +1,7 @@
 """A whole run: every process of a scenario started, watched, recorded, ended, and reported."""
 
 import contextlib
+import re
 import socket
 import time
 import uuid
@@ -8,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from zsim import scenario_file
-from zsim.errors import RecordError, RunError
+from zsim.errors import RecordError, RunError, SessionError
 from zsim.record import repair
 from zsim.scenario import Scenario
 from zsim_deploy.child import Child
@@ -61,10 +62,13 @@ def check_endpoint(endpoint: str | None) -> None:
     Raises:
         SessionError: it is malformed.
     """
-    if endpoint is not None:
-        from zsim.session import check_listening
+    if endpoint is None:
+        return
+    from zsim.session import check_listening
 
-        check_listening([endpoint])
+    check_listening([endpoint])
+    if endpoint.startswith("tcp/") and not re.fullmatch(r"tcp/.+:[0-9]{1,5}", endpoint):
+        raise SessionError(f"endpoint is {endpoint!r}; must be tcp/ADDRESS:PORT such as tcp/127.0.0.1:{DEFAULT_PORT}")
 
 
 def _is_free(port: int) -> bool:
@@ -113,8 +117,8 @@ def _fresh(folder: Path) -> Path:
 def run_processes(options: Options, screen: Screen) -> Outcome:
     """Run a scenario as real processes; the record is finished whatever happens."""
     scenario = options.scenario
-    screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
     _write_scenario(options, logs=True)
+    screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
     for _ in range(PORTS_TRIED):
         port = None if options.listen else free_port(screen)
         endpoint = options.listen or f"tcp/127.0.0.1:{port}"
@@ -152,10 +156,12 @@ def run_in_process(options: Options, screen: Screen) -> Outcome:
     from zsim_deploy.in_process import fly
     from zsim_world.fleet import DivergedError
 
-    leash = Leash(launched=False)
     _write_scenario(options, logs=False)
+    leash = Leash(launched=False)
     try:
         reason = fly(options.scenario, options.out / "run.mcap", leash.reason, screen)
     except DivergedError as error:
         return Outcome(str(error), failed=True)
+    finally:
+        leash.let_go()
     return Outcome(reason, interrupted=leash.pulled())

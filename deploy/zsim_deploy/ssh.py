@@ -68,7 +68,7 @@ def _reason(name: str, host: Host, base: Path, error: Exception) -> str:
             return f"the host key of {at} is not in {known}; check it and add it: {scan} >> {known}"
         case asyncssh.PermissionDenied():
             return f"ssh at {at} refuses user {user} with {key}; correct hosts.{name}.user or key, or run ssh-copy-id"
-        case asyncssh.KeyEncryptionError():
+        case asyncssh.KeyImportError() if "Passphrase" in str(error):
             return f"{key} has a passphrase; add it to the agent with ssh-add and leave hosts.{name}.key out"
         case asyncssh.KeyImportError():
             return f"{key} is no private key ({error}); correct hosts.{name}.key"

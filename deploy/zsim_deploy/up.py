@@ -66,7 +66,6 @@ class Up:
         routers = options.placed.inventory.routers.values()
         used = sorted({*self._places.values(), *(router.host for router in routers)})
         self._links = {name: HostLink(name, hosts[name], options.placed.folder) for name in used}
-        self.timings_s: dict[str, float] = {}
 
     def go(self) -> Outcome:
         """Run to the end; whatever happens, nothing of it is left on any host that can be reached.
@@ -88,7 +87,7 @@ class Up:
     def _timed(self, what: str, act: Callable[[], Any]) -> None:
         start_s = time.monotonic()
         act()
-        self.timings_s[what] = time.monotonic() - start_s
+        self._board.stages_s[what] = time.monotonic() - start_s
 
     def _on_all(self, work: Callable[[HostLink], Coroutine[Any, Any, Any]], within_s: float) -> dict[str, Any]:
         """Do the same on all hosts at once; all faults are told, a line each."""

@@ -184,7 +184,8 @@ class Federation:
 
     def run(self, scenario: str, *options: str) -> Role:
         """Start `zsim run` on this endpoint, without report."""
-        where = ["--out", str(self.out), "--listen", self.endpoint]
+        where = ["--out", str(self.out)]
+        where += [] if "--in-process" in options else ["--listen", self.endpoint]
         return self.start("run", self.write(scenario), *where, "--no-report", *options)
 
     def world(self, scenario: str, *options: str) -> Role:
@@ -216,7 +217,7 @@ class Federation:
         role, _, thing = name.partition(".")
         role = "record" if role == "recorder" else role
         for pid, command in self._processes():
-            named = command[2:4] == ["zsim_deploy.cli", role] and (not thing or command[4] == thing)
+            named = command[2:4] == ["zsim_deploy.cli", role] and (not thing or thing in command[4:])
             if named and "--launched" in command:
                 return pid
         return pytest.fail(f"{name} does not run")

@@ -125,7 +125,7 @@ class Lab:
 
     def prefix(self, name: str) -> tuple[str, ...]:
         """Return what starts a command on a host: `prefix(name) + command`."""
-        return ("ip", "netns", "exec", self._namespace(name))
+        return (shutil.which("ip", path=environment()["PATH"]) or "ip", "netns", "exec", self._namespace(name))
 
     def _inside(self, name: str, command: Sequence[str]) -> list[str]:
         return [*self.prefix(name), *command]
@@ -244,7 +244,7 @@ class Lab:
         self._sshd[name] = self._service(name, command, sshd.READY, folder / "sshd.log")
 
     def _service(self, name: str, command: Sequence[str], ready: str, log: Path) -> Service:
-        return Service(self._inside(name, command), ready, log, self._env(name, None))
+        return Service(self._inside(name, command), ready, log, environment())
 
     def _retire(self, service: Service) -> None:
         """End a service; what it started, such as the sessions of an sshd, lives on."""

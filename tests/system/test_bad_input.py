@@ -39,7 +39,7 @@ SCENARIOS = {
     "bad on_death": (ONE.replace("expect: []", "on_death: {world: sing}"), "is 'sing'; must be one of"),
     "not yaml": ("name: [\n", "is not YAML"),
     "no map": ("- 1\n", "must be a map as in"),
-    "empty": ("", "holds null; must be a map"),
+    "empty": ("", "is empty; must be a map"),
     "a key twice": (ONE + "seed: 4\n", "key 'seed' is given twice"),
     "an alias bomb": ("a: &a [1]\nb: [*a, *a]\n", "aliases are not allowed"),
 }
@@ -97,6 +97,24 @@ COMMANDS = {
     "port 0": (("world", "{one}", "--listen", "tcp/127.0.0.1:0"), "port 0 is no port that others could be told"),
     "no federation": (("keys", "--connect", "{free}", "--federation", "a/b"), "federation is 'a/b'; must be 1 to 32"),
     "no record": (("report", "{folder}"), "holds no run.mcap"),
+    "an empty record": (("report", "{folder}/cut"), "cut/run.mcap: holds no message; there is nothing to report"),
+    "no such option": (("estimator", "-._"), "zsim estimator: no such option: -; see `zsim estimator --help`"),
+    "no such command": (("fly",), "zsim: no such command 'fly'"),
+    "no scenario": (("run",), "zsim run: missing argument"),
+    "no number": (("run", "{one}", "--seed", "x"), "invalid value for '--seed'"),
+    "in-process at a pace": (("run", "{one}", "--in-process", "--rate", "3"), "--in-process is lockstep, unpaced"),
+    "in-process, listening": (("run", "{one}", "--in-process", "--listen", "tcp/[::1]:20000"), "leave out --listen"),
+    "a run on no endpoint": (("run", "{one}", "--listen", "bogus"), "endpoint is 'bogus'; must be"),
+    "a run on no port": (("run", "{one}", "--listen", "tcp/127.0.0.1"), "must be tcp/ADDRESS:PORT such as"),
+    "a run on port 0": (("run", "{one}", "--listen", "tcp/127.0.0.1:0"), "port 0 is no port"),
+    "a folder of no files": (("run", "{one}", "--out", "/proc"), "/proc: cannot be written"),
+    "such a folder, in-process": (("run", "{one}", "--in-process", "--out", "/proc"), "/proc: cannot be written"),
+    "negative wait": (("keys", "--wait", "-1"), "is -1; must be a finite number >= 0"),
+    "wait of no length": (("keys", "--wait", "nan"), "is nan; must be a finite number >= 0"),
+    "hz for no time": (("hz", "clock", "--seconds", "0"), "is 0; must be a finite number > 0"),
+    "echo of nothing": (("echo", "clock", "-n", "0"), "'--count'"),
+    "pub at no rate": (("pub", "clock", "{{}}", "--rate-hz", "nan"), "'--rate-hz'"),
+    "expecting a ghost": (("run", "{one}", "--set", "processes.expect=[estimator.ghost]"), "no drone is 'ghost'"),
     "unwritable out": (("run", "{one}", "--out", "/proc/zsim"), "/proc/zsim: cannot be made"),
     "out is a file": (("run", "{one}", "--out", "{one}"), "cannot be made"),
     "a bad plan": (("run", "{bad}", "--in-process", "--out", "{folder}/e"), "x_c"),
@@ -107,6 +125,8 @@ COMMANDS = {
 def test_a_bad_command_is_a_line(tmp_path: Path, name: str) -> None:
     (tmp_path / "one.yaml").write_text(ONE)
     (tmp_path / "bad.yaml").write_text(with_expression("sin("))
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "cut" / "run.mcap").write_bytes(b"")
     arguments, says = COMMANDS[name]
     places = {"one": tmp_path / "one.yaml", "bad": tmp_path / "bad.yaml", "folder": tmp_path}
     said = refused(*(argument.format(**places, free=f"tcp/127.0.0.1:{free_port()}") for argument in arguments))

@@ -129,7 +129,19 @@ BAD_COMMANDS = {
     "no op": (("ask", "world/control", "jump"), "op is 'jump'; must be one of pause"),
     "args no json": (("ask", "world/control", "step", "{x"), "args is no JSON"),
     "args no map": (("ask", "world/control", "step", "3"), "must be a map such as"),
-    "nobody answers": (("ask", "cluster/nobody/control", "land"), "nobody answered within"),
+    "nobody answers": (("ask", "cluster/nobody/control", "land"), "nobody answers there; is it running?"),
+    "ask of several": (("ask", "world/*", "pause"), "takes one key, without wildcards"),
+    "ask as in ros2": (("ask", "/world/control", "pause"), "must be world/control, without / at its ends"),
+    "ask of no key": (("ask", "world//control", "pause"), "key is 'world//control' (empty chunks are forbidden"),
+    "a huge argument": (("ask", "world/control", "step", f'{{"gates": {10**22}}}'), "args cannot be sent"),
+    "a word of ours": (("ask", "world/control", "rate", '{"source": "me"}'), "value is None; must be from 0"),
+    "echo as in ros2": (("echo", "/clock"), "must be clock, without / at its ends"),
+    "echo of nothing": (("echo", ""), "key is ''"),
+    "echo of no key": (("echo", "drone/#$?/x"), "key is 'drone/#$?/x'"),
+    "hz of no key": (("hz", "drone//x"), "must be drone/x"),
+    "pub to a ghost": (("pub", "drone/ghost/cmd/mode", '{"mode": "land"}'), "must be one of drone1"),
+    "pub to all": (("pub", "drone/*/cmd/mode", '{"mode": "land"}'), "takes one key, without wildcards"),
+    "pub for the world": (("pub", "clock", "{}"), "only the process that this is about speaks here"),
 }
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import lab as lab_module
 import namespaces
 import pytest
-from federation import ZSIM
+from federation import ZSIM, wait_gone
 from lab import LAUNCHER, Lab
 
 from zsim.errors import HostsError
@@ -186,7 +186,7 @@ def test_nothing_is_left_of_a_lab_when_a_test_fails(tmp_path: Path) -> None:
         running = inhabitants(made)
         assert len(running) >= 2 * 2 + 1  # an sshd and a sleep on each host, a link's process
         raise ZeroDivisionError
-    assert not any(Path("/proc", str(pid)).exists() for pid in running)
+    assert all(wait_gone(pid, 0.0) for pid in running)
     assert not any((namespaces.FOLDER / namespace).exists() for namespace in made.namespaces())
 
 

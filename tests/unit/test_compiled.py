@@ -53,3 +53,17 @@ def test_a_change_of_what_is_called_reaches_the_caller(tmp_path: Path):
     assert text.count("        R[0] * v[0] + R[1] * v[1] + R[2] * v[2],") == 1
     madgwick.write_text(text.replace("        R[0] * v[0] + R[1]", "        1.0 + R[0] * v[0] + R[1]"))
     assert ask() == "(1.0, 0.0, -9.0)"
+
+
+def test_a_kernel_is_known_to_be_kept_once_it_was_compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    pytest.importorskip("numba")
+    from zsim_world.compiled import is_kept, kernel
+
+    (tmp_path / "doubling.py").write_text("def doubled(x: float) -> float:\n    return 2.0 * x\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    import doubling  # type: ignore[import-not-found]
+
+    made = kernel([tmp_path / "doubling.py"])(doubling.doubled)
+    assert not is_kept(made)
+    assert made(2.0) == 4.0
+    assert is_kept(made)

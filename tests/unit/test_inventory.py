@@ -247,7 +247,7 @@ def test_two_cannot_listen_on_one_port(tmp_path: Path, step: Scenario) -> None:
     ("content", "told"),
     [
         (None, "cannot be read (No such file or directory); give the path of a YAML file"),
-        ("", "holds null; must be a map as in examples/hosts.yaml"),
+        ("", "is empty; must be a map as in examples/hosts.yaml"),
         ("hosts: {a: {address: x}", "is not YAML"),
         ("hosts: {a: {address: x}, a: {address: y}}\nroles: {}", "is given twice"),
     ],

@@ -534,6 +534,14 @@ def test_a_fault_that_all_drones_share_is_told_once():
         ({"report": {"window_s": [-1, 5]}}, "report.window_s is [-1, 5]; must be"),
         ({"processes": {"expect": ["a", "b", "a"]}}, "processes.expect[2] is 'a', as expect[0]; must be unique"),
         (
+            {"processes": {"expect": ["my.drone1", "estimator.ghost"]}},
+            "processes.expect[1] is 'estimator.ghost', and no drone is 'ghost'; must be estimator.NAME of drone1, ",
+        ),
+        (
+            {"processes": {"expect": ["controller.ghost"]}, "clusters": []},
+            "processes.expect[0] is 'controller.ghost', and no cluster is 'ghost'; must be controller.NAME of",
+        ),
+        (
             {"clusters": [{"name": "c", "drones": ["drone1", "drone9"]}]},
             "clusters[0].drones[1] is 'drone9'; must be one of the drones",
         ),
@@ -626,7 +634,7 @@ def test_a_cluster_s_drones_are_not_judged_while_a_drone_s_name_is_unknown():
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "holds null; must be a map"),
+        ("", "is empty; must be a map"),
         ("just words", "holds 'just words'; must be a map"),
         ("- 1\n- 2\n", "holds [1, 2]; must be a map"),
         ("a: [1", "is not YAML"),

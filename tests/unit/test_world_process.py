@@ -10,7 +10,7 @@ import pytest
 from zsim import batch, keys, messages, scenario_file
 from zsim.errors import DecodeError
 from zsim.health import HealthMeter
-from zsim.messages import ClusterState, ControlAnswer, Done, Estimate, Event, Health, Join, Velocity
+from zsim.messages import ClusterState, ControlAnswer, ControlRequest, Done, Estimate, Event, Health, Join, Velocity
 from zsim_world.fleet import DivergedError
 from zsim_world.process import WorldProcess
 from zsim_world.world import World
@@ -68,6 +68,32 @@ def test_an_estimate_of_the_future_is_refused():
     link.deliver(ESTIMATE, estimate(10**6))
     run(made, link)
     assert "t_ns is 20000000000000; must be <= 0, the newest gate" in events(link, "refused")[0].text
+
+
+@pytest.mark.parametrize("source", ["\x1b[2J", "Über", "a b", "x" * 49, ""])
+def test_a_sender_without_a_name_is_refused(source: str):
+    made, link = world(), FakeLink()
+    link.deliver(VELOCITY, Velocity(0, 0, source, ZEROS, 0.0))
+    run(made, link)
+    (event,) = events(link, "refused")
+    assert event.source == "somebody"
+    assert f"source is {source[:48]!r}; must be 1 to 48 of a-z 0-9 _ . -" in event.text
+    assert events(link, "commander") == []
+
+
+def test_a_request_of_somebody_without_a_name_is_refused():
+    made = world()
+    answer = made.control(ControlRequest("stop", {}, "\x1b[2J"))
+    assert answer.error == "source is '\\x1b[2J'; must be 1 to 48 of a-z 0-9 _ . -"
+    assert made.ended is None
+    assert made.control(ControlRequest("stop", {}, "")).ok
+
+
+def test_states_are_told_with_the_name_of_their_cluster():
+    made, link, told = world(), FakeLink(), []
+    link.deliver(STATE, state(0))
+    run(made, link, tell=lambda kind, message, about: told.append((kind, about)))
+    assert told.count(("state", "main")) == 1
 
 
 def test_healths_are_told_with_the_name_of_the_process():

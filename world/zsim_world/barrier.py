@@ -22,6 +22,7 @@ class Participant:
         received: outputs that came in since its last done.
         missing: outputs that it counted in its dones and that have not come in.
         since_wall_ns: when it was last heard of: join, done or death.
+        joined_wall_ns: when this incarnation joined.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Participant:
     missing: int = 0
     alive: bool = True
     since_wall_ns: int = 0
+    joined_wall_ns: int = 0
     deadline_misses: int = 0
 
     @property
@@ -111,6 +113,7 @@ class Barrier:
             from_ns=former.from_ns if former and former.gating else next_gate_ns,
             done_ns=former.done_ns if former else -1,
             since_wall_ns=wall_ns,
+            joined_wall_ns=wall_ns,
             deadline_misses=former.deadline_misses if former else 0,
         )
         return None

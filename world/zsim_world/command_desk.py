@@ -21,9 +21,13 @@ class CommandDesk:
         """Keep a command until its instant, or refuse it; return False for one that has come before."""
         world = self._world
         index = world.index.get(drone)
+        if not keys.PROCESS_NAME.fullmatch(message.source):
+            reason = f"source is {message.source[:48]!r}; must be 1 to 48 of a-z 0-9 _ . -"
+            world.refuse("somebody", f"drone/{drone[:40]}/cmd/{kind}", reason)
+            return True
         reason = "no such drone; see world/info" if index is None else self._age_refusal(message)
         if index is None or reason:
-            world.refuse(message.source[:40], f"drone/{drone[:40]}/cmd/{kind}", reason or "")
+            world.refuse(message.source, f"drone/{drone[:40]}/cmd/{kind}", reason or "")
             return True
         return world.commanders.push(index, kind, message, self._apply_ns(drone, kind, message))
 

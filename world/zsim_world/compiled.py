@@ -33,6 +33,13 @@ def kernel(sources: Iterable[Path]) -> Callable[[Callable[..., Any]], Any]:
     return compile_
 
 
+def is_kept(function: Callable[..., Any]) -> bool:
+    """Tell whether a compilation of this kernel, as its sources are now, is on disk; it is then only loaded."""
+    stats = getattr(function, "stats", None)  # of numba's dispatcher
+    folder = stats and stats.cache_path
+    return bool(folder) and any(Path(folder).glob(f"*{function.__qualname__}*.nbc"))
+
+
 def digest(sources: Iterable[Path]) -> str:
     """Return what changes with the text of any of the files."""
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]

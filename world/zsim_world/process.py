@@ -6,7 +6,7 @@ Order of this file: `run`, the loop, what arrives, what rarely arrives, publicat
 import contextlib
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -30,8 +30,9 @@ STUCK_NS = 2_000_000_000  # wall time in one turn from which on a person is told
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
+NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
 RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
-PHASE_EVERY = 10  # cluster states between two looks at the phase that progress shows
+PHASE_EVERY = 10  # states of a cluster between two looks at the phase that progress shows
 Tell = Callable[[str, Any, str], None]
 # Outputs first, dones last: whoever says done has sent its outputs before, on the same link.
 INPUTS = ("drone/*/cmd/*", "drone/*/estimate", "cluster/*/state", "process/**")
@@ -52,8 +53,8 @@ class WorldProcess:
         link: a listening session.
         world: what to run.
         stopped: asked every TICK_S; a text ends the run with it as the reason.
-        tell: told every ("clock" or "event", message, phase of the clusters) and every ("health", message, process);
-            shows progress.
+        tell: told every ("clock" or "event", message, phase of the clusters), every ("health", message, process) and
+            every tenth ("state", message, cluster); shows progress.
     """
 
     def __init__(
@@ -72,13 +73,14 @@ class WorldProcess:
         self._head = msgspec.msgpack.Decoder(_Head)
         self._queries: deque[Query] = deque()
         self._tokens: deque[tuple[str, bool]] = deque()
+        self._doubted: set[str] = set()
         self._over = threading.Event()
         self._clock_wall_ns = 0
         self._turn_wall_ns = 0  # when the present turn began; 0 when there is none
         self._view_wall_ns = 0
         self._view_seq = 0
         self._health_seq = 0
-        self._states_seen = 0
+        self._states_seen: Counter[str] = Counter()
         self._phase = ""
         self._start_wall_ns = 0
         self._start_sim_ns = 0
@@ -240,9 +242,11 @@ class WorldProcess:
             raise DecodeError(f"{key}: {error}; must be a map with t_ns and seq") from error
 
     def _look_at_phase(self, key: str, payload: bytes) -> None:
-        if self._states_seen % PHASE_EVERY == 0:
-            self._phase = messages.decode_as(messages.ClusterState, payload, key).phase
-        self._states_seen += 1
+        if self._states_seen[key] % PHASE_EVERY == 0:
+            state: messages.ClusterState = messages.decode_as(messages.ClusterState, payload, key)
+            self._phase = state.phase
+            self._tell("state", state, keys.thing(key))
+        self._states_seen[key] += 1
 
     def _recover_short(self) -> None:
         """Ask a participant again for outputs that it counted and that did not come, as after a cut link."""
@@ -302,6 +306,8 @@ class WorldProcess:
             self._serve_query(self._queries.popleft())
         while self._tokens:
             self._serve_token(*self._tokens.popleft())
+        if self._doubted:
+            self._serve_doubted()
         if self.health.due():
             seq, self._health_seq = self._health_seq, self._health_seq + 1
             health = self.health.message(self._world.now_ns, seq)
@@ -309,10 +315,23 @@ class WorldProcess:
             self._tell("health", health, WORLD)
 
     def _serve_token(self, name: str, alive: bool) -> None:
-        if not alive and keys.token(name) not in self._link.tokens(keys.token(name), timeout_s=RECOVERY_S):
+        if alive or keys.token(name) in self._link.tokens(keys.token(name), timeout_s=RECOVERY_S):
+            return
+        participant = self._world.barrier.participants.get(name)
+        if participant and time.monotonic_ns() - participant.joined_wall_ns < NEW_TOKEN_NS:
+            self._doubted.add(name)  # through a router a new token is not always found at once
+        else:
             self._take_in_all()
             self._world.died(name, time.monotonic_ns())
             self._flush()
+
+    def _serve_doubted(self) -> None:
+        """Look again at tokens that were not found just after their process had joined."""
+        participants, now_ns = self._world.barrier.participants, time.monotonic_ns()
+        for name in list(self._doubted):
+            if name not in participants or now_ns - participants[name].joined_wall_ns >= NEW_TOKEN_NS:
+                self._doubted.discard(name)
+                self._serve_token(name, alive=False)
 
     def _serve_query(self, query: Query) -> None:
         asker = keys.thing(query.expression) if keys.matches(keys.replay("*"), query.expression) else None

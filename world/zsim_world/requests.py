@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from zsim import keys
 from zsim.messages import ControlAnswer, ControlRequest
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ class Requests:
 
     def answer(self, request: ControlRequest) -> ControlAnswer:
         """Do what is asked, or say why not."""
+        if request.source and not keys.PROCESS_NAME.fullmatch(request.source):
+            return ControlAnswer(False, f"source is {request.source[:48]!r}; must be 1 to 48 of a-z 0-9 _ . -")
         operation = self._operations.get(request.op)
         if operation is None:
             allowed = ", ".join([*self._operations, "replay"])

@@ -217,7 +217,7 @@ class World:
     def control(self, request: messages.ControlRequest) -> messages.ControlAnswer:
         """Answer a request on `world/control`; every one is an event."""
         answer = self._requests.answer(request)
-        op, source = request.op[:40], request.source[:40]
+        op, source = request.op[:40], request.source if keys.PROCESS_NAME.fullmatch(request.source) else ""
         text = f"{source or 'somebody'} asks {op}: {'done' if answer.ok else answer.error}"
         self.event("control", op, text, source=source, args=brief(request.args), ok=answer.ok)
         return answer

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from zsim.errors import RecordError, ReportError
 from zsim_deploy.report.figures import figures
@@ -44,25 +45,25 @@ def make_report(directory: Path, progress: Callable[[str], None] = lambda _: Non
     """
     flight, formations, summary = judge(directory / RECORD, progress)
     try:
-        _write(directory / "summary.json", summary.json())
-        (directory / "figures").mkdir(exist_ok=True)
-        shown = []
-        for figure in figures(flight, formations, summary.window_s):
-            progress(f"drawing {figure.name}")
-            figure.drawing.savefig(directory / "figures" / figure.name)
-            shown.append(figure)
-        progress("writing the page")
-        _write(directory / "report.html", page(summary, shown, directory / "figures").encode())
+        with TemporaryDirectory(dir=directory, prefix=".report-") as new:
+            drawn = Path(new) / "figures"
+            drawn.mkdir()
+            shown = []
+            for figure in figures(flight, formations, summary.window_s):
+                progress(f"drawing {figure.name}")
+                figure.drawing.savefig(drawn / figure.name)
+                shown.append(figure)
+            progress("writing the page")
+            (Path(new) / "summary.json").write_bytes(summary.json())
+            (Path(new) / "report.html").write_text(page(summary, shown, drawn), encoding="utf-8")
+            _move(Path(new), directory)
     except OSError as error:
         raise ReportError(f"{directory}: the report cannot be written ({error.strerror})") from error
     return summary
 
 
-def _write(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all: a full disk leaves no half of it, nor harms a former one."""
-    new = path.with_name(f".{path.name}.new")
-    try:
-        new.write_bytes(content)
-        new.replace(path)
-    finally:
-        new.unlink(missing_ok=True)
+def _move(new: Path, directory: Path) -> None:
+    """Put a report in its place when all of it is made: a full disk or Ctrl-C leaves no half of one."""
+    (directory / "figures").mkdir(exist_ok=True)
+    for path in sorted(new.rglob("*.*")):
+        path.replace(directory / path.relative_to(new))

@@ -1,0 +1,152 @@
+"""`zsim push`: hosts without internet get zsim over ssh alone, each what its roles need, and only once."""
+
+import asyncio
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+import pytest
+from federation import ZSIM
+from lab import LAUNCHER, Lab
+
+from zsim import __version__
+from zsim_deploy import extras, inventory, on_host, shell
+from zsim_deploy.host_link import HostLink
+from zsim_deploy.target import chosen, interpreters, question, target
+from zsim_deploy.wheelhouse import House, Wheelhouse
+
+CACHE = Path(tempfile.gettempdir()) / "zsim-tests-cache"  # kept between runs, as a user's is
+PUSH_S = 180.0  # wall time for two installations on a loaded machine
+PUSH = (*ZSIM, "push")
+WHERE = "import zsim_deploy; print(zsim_deploy.__file__)"
+HAS = "from importlib.util import find_spec; print([n for n in ('filterpy', 'numba', 'mcap', 'scipy') if find_spec(n)])"
+ROLES: dict[str, str | list[str]] = {"estimator.*": "h1", "world": "h3"}
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("push")]
+
+
+@pytest.fixture
+def hosts(lab: Lab) -> Path:
+    """An inventory: h1 has estimators, h2 nothing that needs an extra."""
+    return lab.inventory(ROLES, python=None)
+
+
+def over_ssh(lab: Lab, hosts: Path, name: str, *command: str, given: str = "") -> str:
+    """Return what a command prints that the launcher runs on a host."""
+    placed = inventory.load(hosts)
+
+    async def work() -> bytes:
+        link = HostLink(name, placed.inventory.hosts[name], placed.folder)
+        try:
+            return await link.run(shell.line(command), given.encode(), timeout_s=60.0)
+        finally:
+            await link.close()
+
+    with lab.inside(LAUNCHER):
+        return asyncio.run(work()).decode()
+
+
+def gather(lab: Lab, hosts: Path, *names: str) -> dict[str, House]:
+    """Gather, outside of the lab where there is an index, what `zsim push` needs inside."""
+    wanted = extras.needed(inventory.load(hosts).inventory)
+    found = interpreters(over_ssh(lab, hosts, names[0], "sh", "-c", question()))
+    python = chosen(names[0], found, sys.version_info[:2]).path
+    script = Path(on_host.__file__).read_text()
+    said = json.loads(over_ssh(lab, hosts, names[0], python, "-", "look", str(lab.folder), given=script))
+    wheelhouse = Wheelhouse(CACHE / "zsim", print)
+
+    async def work() -> dict[str, House]:
+        return {name: await wheelhouse.house(name, target(name, said), wanted[name]) for name in names}
+
+    return asyncio.run(work())
+
+
+def push(lab: Lab, hosts: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """Run `zsim push` at the launcher of the lab."""
+    cache = {"XDG_CACHE_HOME": str(CACHE)}
+    return lab.run(LAUNCHER, *PUSH, "--hosts", str(hosts), *options, env=cache, timeout=PUSH_S)
+
+
+def test_hosts_without_internet_get_what_their_roles_need_once(lab: Lab, hosts: Path) -> None:
+    gather(lab, hosts, "h1", "h2")
+    first = push(lab, hosts, "--host", "h1", "--host", "h2")
+    assert first.returncode == 0, first.stderr
+    assert first.stdout == "installed on 2 of 2 hosts\n"
+    pythons = {name: str(lab.host_folder(name) / "venv/bin/python") for name in ("h1", "h2")}
+    for name, python in pythons.items():
+        assert over_ssh(lab, hosts, name, python, "-P", "-m", "zsim_deploy.cli", "--version") == f"zsim {__version__}\n"
+        assert "zsim_deploy/__init__.py" in over_ssh(lab, hosts, name, python, "-P", "-c", WHERE)
+    assert {name: over_ssh(lab, hosts, name, python, "-P", "-c", HAS) for name, python in pythons.items()} == {
+        "h1": "['filterpy', 'scipy']\n",
+        "h2": "[]\n",
+    }
+    notes = [lab.host_folder(name) / "venv" / on_host.NOTE for name in pythons]
+    before = [note.stat().st_mtime_ns for note in notes]
+    second = push(lab, hosts, "--host", "h1", "--host", "h2")
+    assert second.stdout == "nothing to do; all hosts have what they need\n"
+    assert "copying" not in second.stderr
+    assert [note.stat().st_mtime_ns for note in notes] == before
+
+
+def test_each_host_that_cannot_have_it_is_a_line(lab: Lab, hosts: Path, tmp_path: Path) -> None:
+    programs = tmp_path / "programs"
+    programs.mkdir()
+    (programs / "sh").symlink_to("/bin/sh")
+    (programs / "python3").write_text("#!/bin/sh\necho 3.9.2 /usr/bin/python3\n")
+    (programs / "python3").chmod(0o755)
+    lab.environment("h1", PATH=str(programs))
+    known = lab.folder / "keys/known_hosts"
+    known.write_text("".join(line for line in known.read_text().splitlines(True) if lab.address("h2") not in line))
+    done = push(lab, hosts, "--host", "h1", "--host", "h2")
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-2:] == [
+        "h1: python3 is 3.9.2; must be >= 3.11; install a newer one beside it",
+        f"h2: the host key of {lab.address('h2')} port 22 is not in {known}; check it and add it: "
+        f"ssh-keyscan -p 22 {lab.address('h2')} >> {known}",
+    ]
+
+
+def test_another_build_of_the_same_version_takes_the_place_of_the_first(lab: Lab, hosts: Path, tmp_path: Path) -> None:
+    pip = gather(lab, hosts, "h2")["h2"].pip.path
+    for text in ("BUILD = 1", "BUILD = 2"):
+        order = {"project": write_wheel(tmp_path / "wheels", text), "pip": pip.name, "wheels": [], "extras": []}
+        shutil.copy(pip, tmp_path / "wheels")
+        on_host.install(tmp_path, {**order, "modules": ["zsim"], "note": {"project": text}})
+        said = subprocess.run(
+            [tmp_path / "venv/bin/python", "-c", "import zsim; print(zsim.__file__, zsim.BUILD)"],
+            cwd=tmp_path, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        assert said.stdout.startswith(str(tmp_path / "venv"))
+        assert said.stdout.endswith(f"{text[-1]}\n")
+    found = on_host.look(tmp_path)
+    assert found["installed"]["project"] == "BUILD = 2"
+    assert found["wheels"] == {}
+
+
+def test_an_installation_that_broke_off_counts_as_none(tmp_path: Path) -> None:
+    assert on_host.look(tmp_path)["installed"] is None
+    (tmp_path / "venv/bin").mkdir(parents=True)
+    (tmp_path / "venv/bin/python").symlink_to(sys.executable)
+    assert on_host.look(tmp_path)["installed"] is None
+    note = tmp_path / "venv" / on_host.NOTE
+    note.write_text(json.dumps({"python": [3, 10]}))
+    assert on_host.look(tmp_path)["installed"] is None
+    note.write_text(json.dumps({"python": list(sys.version_info[:2])}))
+    assert on_host.look(tmp_path)["installed"] is not None
+
+
+def write_wheel(folder: Path, text: str) -> str:
+    """Write a wheel of a zsim that is one line of text into a folder and return its name."""
+    folder.mkdir(parents=True, exist_ok=True)
+    name = f"zsim-{__version__}-py3-none-any.whl"
+    with zipfile.ZipFile(folder / name, "w") as wheel:
+        wheel.writestr("zsim.py", text)
+        about = f"zsim-{__version__}.dist-info"
+        wheel.writestr(f"{about}/METADATA", f"Metadata-Version: 2.1\nName: zsim\nVersion: {__version__}\n")
+        wheel.writestr(f"{about}/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        wheel.writestr(f"{about}/RECORD", "zsim.py,,\n")
+    return name
