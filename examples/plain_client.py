@@ -8,7 +8,7 @@ import zenoh
 
 ENDPOINT, SECONDS = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447", 10.0
 ME, DRONE = "plain.client", "zsim/drone/drone1"
-"/" in ENDPOINT or sys.exit("usage: python examples/plain_client.py [ENDPOINT]     e.g. tcp/127.0.0.1:7447")
+_ = "/" in ENDPOINT or sys.exit("usage: python examples/plain_client.py [ENDPOINT]     e.g. tcp/127.0.0.1:7447")
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", f'["{ENDPOINT}"]')

@@ -38,7 +38,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 
-UsageError: type[Any] = typer.BadParameter.__bases__[0]  # click's, or that of the click inside of newer typers
+UsageError: Any = typer.BadParameter.__bases__[0]  # click's, or that of the click inside of newer typers
 INTERRUPTED = 130  # exit code of a shell for a program that Ctrl-C ended
 RUN, ROLES = "Run", "Roles, started by hand, on any machine, in any order"
 HOSTS = "On several machines"

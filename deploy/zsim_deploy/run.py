@@ -119,16 +119,24 @@ def run_processes(options: Options, screen: Screen) -> Outcome:
     scenario = options.scenario
     _write_scenario(options, logs=True)
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
-    for _ in range(PORTS_TRIED):
-        port = None if options.listen else free_port(screen)
-        endpoint = options.listen or f"tcp/127.0.0.1:{port}"
-        watch = Watch(scenario.processes.on_death, screen)
-        watch.members = [*_children(options, endpoint, watch)]
-        outcome = watch.go()
-        if port is None or not _was_too_late(outcome, endpoint, port):
-            break
+    outcome = _go(options, options.listen, screen) if options.listen else _go_on_a_free_port(options, screen)
     with contextlib.suppress(RecordError):
         repair(options.out / "run.mcap")
+    return outcome
+
+
+def _go(options: Options, endpoint: str, screen: Screen) -> Outcome:
+    watch = Watch(options.scenario.processes.on_death, screen)
+    watch.members = [*_children(options, endpoint, watch)]
+    return watch.go()
+
+
+def _go_on_a_free_port(options: Options, screen: Screen, tries: int = PORTS_TRIED) -> Outcome:
+    port = free_port(screen)
+    endpoint = f"tcp/127.0.0.1:{port}"
+    outcome = _go(options, endpoint, screen)
+    if tries > 1 and _was_too_late(outcome, endpoint, port):
+        return _go_on_a_free_port(options, screen, tries - 1)
     return outcome
 
 

@@ -95,7 +95,9 @@ process/operator.main/replay      -       -       r       rg
 elsewhere/else                    -       -       r       r
 """
 
-_ROWS: dict[str, dict[str, str]] = {row[0]: dict(zip(ROLES, row[1:], strict=True)) for row in (line.split() for line in TABLE.split("\n") if line)}
+_ROWS: dict[str, dict[str, str]] = {
+    row[0]: dict(zip(ROLES, row[1:], strict=True)) for row in (line.split() for line in TABLE.split("\n") if line)
+}
 KEYS = tuple(_ROWS)
 
 

@@ -7,6 +7,7 @@ something that is allowed (a fence), and what came before it came.
 import itertools
 import json
 import queue
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -154,6 +155,12 @@ class Tryer:
         """Return when the hub has answered a get: what was declared before on this link has arrived."""
         replies = [reply for reply in self.session.get(PREFIX + key, timeout=PATIENCE_S) if reply.ok is not None]
         assert replies, f"no answer on {key}"
+
+    def until_answered(self, key: str) -> None:
+        """Ask until somebody answers: through a router a new queryable is not always known at once."""
+        until_s = time.monotonic() + PATIENCE_S
+        while not any(reply.ok is not None for reply in self.session.get(PREFIX + key, timeout=1.0)):
+            assert time.monotonic() < until_s, f"nobody answers on {key}"
 
 
 class Heard:

@@ -15,8 +15,8 @@ from test_hosts import ROLES, START_S, Team, closing, in_flight, in_process
 pytestmark = pytest.mark.soak
 
 REPETITIONS = 6
-DURATION_S, RATE = 40.0, 8  # simulated
-LATEST_S = 30.0  # simulated, of a fault
+DURATION_S, RATE = 60.0, 8  # simulated
+LATEST_S = 30.0  # simulated, of a fault, after the first 10 s
 CUTS_S = {"cut 1 s": 1.0, "cut 5 s": 5.0, "cut 20 s": 20.0}
 LOSING = ("estimator.drone1", "estimator.drone3", "controller.main")  # a kill loses the process's state
 ENDING = ("world", "recorder")
@@ -37,6 +37,7 @@ def test_a_fault_at_a_random_time(lab: Lab, kind: str, repetition: int) -> None:
     with closing(Team(lab, ROLES, **(routed if kind == "router.field" else {}))) as team:
         run = team.up("--rate", str(RATE), "--duration", str(DURATION_S))
         in_flight(run)
+        rows = team.ps()
         threading.Event().wait(chance.uniform(0.0, LATEST_S) / RATE)
         if kind == "launcher":
             run.signal(signal.SIGKILL)
@@ -44,7 +45,7 @@ def test_a_fault_at_a_random_time(lab: Lab, kind: str, repetition: int) -> None:
         if kind in CUTS_S:
             cut_off(team, chance.choice(("h2", "h3")), CUTS_S[kind])
         else:
-            os.kill(team.ps()[kind]["pid"], signal.SIGKILL)
+            os.kill(rows[kind]["pid"], signal.SIGKILL)
         run.ends(with_code=1 if kind in ENDING else 0, within_s=START_S + CUTS_S.get(kind, 0.0))
         record = team.record()
         if kind in LOSING:

@@ -120,6 +120,8 @@ def test_what_a_role_may_get(made: Certificates, role: str, way: str) -> None:
 
         for expression in ("**", "@batch"):
             link.answer(expression, answer)
+        tryer.until_answered(fence)
+        asked = Heard()
         for key in KEYS:
             if key != fence:
                 tryer.ask(key, answered)

@@ -34,6 +34,8 @@ class NoLeash:
     def pulled(self) -> bool:
         return False
 
+    def let_go(self) -> None: ...
+
 
 def test_a_diverged_run_in_one_process_has_failed_and_has_its_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     advance = Fleet.advance

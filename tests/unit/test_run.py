@@ -1,16 +1,19 @@
 """`zsim run` before and around its processes: their command lines, the port, the folder."""
 
+import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
-from synthetic_record import SCENARIOS
 
 from zsim import scenario_file
 from zsim.errors import RunError, SessionError
 from zsim_deploy import run
 from zsim_deploy.run import Options
 from zsim_deploy.watch import Outcome
+
+sys.path.insert(0, str(Path(__file__).parent))
+from synthetic_record import SCENARIOS
 
 TAKEN = "the world died: exit code 2: cannot listen on tcp/127.0.0.1:{port} (Address already in use)"
 
@@ -24,8 +27,8 @@ class Say:
 class FakeWatch:
     """A watch whose runs end as told; notes on which port each world was to listen."""
 
-    outcomes: list[str] = []
-    ports: list[int] = []
+    outcomes: ClassVar[list[str]] = []
+    ports: ClassVar[list[int]] = []
 
     def __init__(self, *_: Any) -> None:
         self.members: list[Any] = []

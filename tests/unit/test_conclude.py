@@ -1,0 +1,58 @@
+"""What is said, and with which exit code, when a run is over."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from zsim.errors import RecordError
+from zsim_deploy import cli
+from zsim_deploy.watch import Outcome
+
+INTERRUPTED = Outcome("interrupted by Ctrl-C", interrupted=True)
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    (tmp_path / "run.mcap").touch()
+    return tmp_path
+
+
+def raising(error: BaseException) -> Any:
+    def report(_: Path) -> None:
+        raise error
+
+    return report
+
+
+def test_ctrl_c_before_there_is_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit, match="130"):
+        cli.conclude(INTERRUPTED, tmp_path, True)
+    assert capsys.readouterr().err == "ended: interrupted by Ctrl-C\n"
+
+
+def test_ctrl_c_in_flight(recorded: Path, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit, match="130"):
+        cli.conclude(INTERRUPTED, recorded, True)
+    assert f"the record so far is {recorded / 'run.mcap'}" in capsys.readouterr().err
+
+
+def test_ctrl_c_in_the_report(recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(cli, "_report", raising(KeyboardInterrupt()))
+    with pytest.raises(SystemExit, match="130"):
+        cli.conclude(Outcome("the scenario's duration is over"), recorded, True)
+    said = capsys.readouterr().err
+    assert said == f"interrupted; the record is complete, `zsim report {recorded}` makes its report\n"
+
+
+def test_a_failed_run_of_which_nothing_can_be_reported(
+    recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(cli, "_report", raising(RecordError("run.mcap: holds no message")))
+    with pytest.raises(typer.Exit) as ended:
+        cli.conclude(Outcome("the world died", failed=True), recorded, True)
+    assert ended.value.exit_code == 1
+    assert "ended: the world died\nrun.mcap: holds no message\n" in capsys.readouterr().err
+    with pytest.raises(RecordError):
+        cli.conclude(Outcome("ended"), recorded, True)
