@@ -189,31 +189,34 @@ class Up:
         return self._placed.inventory.routers[thing].host if role == ROUTER else self._places[name]
 
     def _remote(self, name: str, host: str) -> Remote:
-        arguments = [*self._arguments(name, host), "--launched", self._options.run_id, "--host", host]
+        command, named = self._arguments(name, host)
+        arguments = [*command, "--launched", self._options.run_id, "--host", host]
         if not self._placed.inventory.security.insecure:
             arguments += ["--tls", self._identity(host, name)]
             if self._listens(name):
                 arguments += ["--access", f"{self._identity(host, name)}/access.json"]
         on_line = self._watch.take_line if name == WORLD else None
+        arguments += ["--", named] if named else []  # a name may begin with a dash
         return Remote(name, arguments, self._links[host], self.python(host), self._loop, self._logs, on_line)
 
-    def _arguments(self, name: str, host: str) -> list[str]:
+    def _arguments(self, name: str, host: str) -> tuple[list[str], str]:
+        """Return the command of a process with its options, and the name that it is given."""
         role, _, thing = name.partition(".")
         inventory, federation = self._placed.inventory, self._options.scenario.federation
         if role == WORLD:
             pace = ["--realtime"] if self._options.mode == "realtime" else []
             pace += ["--rate", str(self._options.rate)] if self._options.rate else []
             listen = inv.listening(self._placed, host, inventory.port)
-            return [WORLD, f"{self._folder(host)}/scenario.yaml", "--listen", listen, "--expect", RECORDER, *pace]
+            return [WORLD, "--listen", listen, "--expect", RECORDER, *pace], f"{self._folder(host)}/scenario.yaml"
         if role == ROUTER:
             listen = inv.listening(self._placed, host, inventory.routers[thing].port)
             above = inv.upstream(self._placed, self._places, thing)
             mode = ["--realtime"] if self._options.mode == "realtime" else []
-            return [ROUTER, thing, "--listen", listen, "--connect", above, "--federation", federation, *mode]
+            return [ROUTER, "--listen", listen, "--connect", above, "--federation", federation, *mode], thing
         reach = ["--connect", inv.endpoint(self._placed, self._places, host), "--federation", federation]
         if role == RECORDER:
-            return ["record", "--out", self._folder(host), *reach]
-        return [role, thing, *reach]
+            return ["record", "--out", self._folder(host), *reach], ""
+        return [role, *reach], thing
 
     # What others ask of it
 
