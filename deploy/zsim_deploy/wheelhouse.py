@@ -194,7 +194,7 @@ async def pip(*arguments: str) -> None:
 
 def _lacking(error: PipError, target: Target) -> str:
     """Return in a line which wheel does not exist, from what pip says."""
-    found = re.search(r"satisfies the requirement ([^ ]+)", str(error))
+    found = re.search(r"satisfies the requirement ([\w.-]+)", str(error))
     if found is None:
         return f"no wheels for {target}: {error}"
     other = "take another Python there, or build it there and give its folder to pip here (PIP_FIND_LINKS)"

@@ -88,7 +88,8 @@ def test_a_stopped_estimator(federation: Federation, pair_sha256: str) -> None:
     assert first.message["t_ns"] == later.message["t_ns"]
     assert waited_for(first)["host"] == socket.gethostname()
     assert waited_for(later)["since_wall_s"] - waited_for(first)["since_wall_s"] > 0.9  # told once a wall second
-    assert first.message["waiting_for"][1]["name"] == "controller.main"  # it waits for the estimate
+    # the controller lacks the estimate, unless the estimator was stopped between its estimate and its done
+    assert [waiting["name"] for waiting in first.message["waiting_for"][1:]] in ([], ["controller.main"])
     run.line(r"waiting for estimator.drone1 on .* \(\d+\.\d s\)")
     federation.kill("estimator.drone1", signal.SIGCONT)
     run.ends(with_code=0)

@@ -30,6 +30,7 @@ from zsim_deploy.enrolment import Wanted
 HOST = "lab"
 SITE = "router.site"
 PREFIX = "zsim/"
+READY = b"ready"  # what is published to learn whether anybody hears it
 SHORT_S = 1.0  # for a link that is to be refused
 
 _numbers = itertools.count()
@@ -162,6 +163,13 @@ class Tryer:
         while not any(reply.ok is not None for reply in self.session.get(PREFIX + key, timeout=1.0)):
             assert time.monotonic() < until_s, f"nobody answers on {key}"
 
+    def until_heard(self, key: str, heard: "Heard") -> None:
+        """Publish until it is heard: through a router a new subscriber is not always known at once."""
+        until_s = time.monotonic() + PATIENCE_S
+        while not heard.something(within_s=0.1):
+            assert time.monotonic() < until_s, f"nobody hears {key}"
+            self.session.put(PREFIX + key, READY, congestion_control=zenoh.CongestionControl.BLOCK)
+
 
 class Heard:
     """Keys in the order in which they came.
@@ -184,6 +192,14 @@ class Heard:
     def reply(self, reply: zenoh.Reply) -> None:
         if reply.ok is not None:
             self.sample(reply.ok)
+
+    def something(self, within_s: float) -> bool:
+        """Take one key; tell whether one came in time."""
+        try:
+            self._queue.get(timeout=within_s)
+        except queue.Empty:
+            return False
+        return True
 
     def until(self, done: Callable[[set[str]], bool]) -> set[str]:
         """Return what has come once it is `done`; fail when that never happens."""

@@ -1,26 +1,68 @@
-"""Faults at random simulated times on three hosts, many of each kind: `make soak`."""
+"""Faults at random simulated times on three hosts, many of each kind: `make soak`; a table of them at the end."""
 
 import functools
-import os
 import random
 import signal
 import tempfile
 import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
+from federation import Role
 from lab import Lab
-from test_hosts import ROLES, START_S, Team, closing, in_flight, in_process
+from test_hosts import DISK_BYTES, FAKETIME, NAMED_AFTER_S, ROLES, START_S, Team, closing, in_flight, in_process
 
 pytestmark = pytest.mark.soak
 
-REPETITIONS = 6
+REPETITIONS = 5
 DURATION_S, RATE = 60.0, 8  # simulated
 LATEST_S = 30.0  # simulated, of a fault, after the first 10 s
 CUTS_S = {"cut 1 s": 1.0, "cut 5 s": 5.0, "cut 20 s": 20.0}
 LOSING = ("estimator.drone1", "estimator.drone3", "controller.main")  # a kill loses the process's state
 ENDING = ("world", "recorder")
-KINDS = (*LOSING, *ENDING, "router.field", "launcher", *CUTS_S)
+CLOCK, DISK, LAUNCHER, ROUTER = "clock an hour off", "disk full", "launcher", "router.field"
+KINDS = (*LOSING, *ENDING, ROUTER, LAUNCHER, *CUTS_S, CLOCK, DISK)
+
+
+class Outcome(NamedTuple):
+    kind: str
+    survived: bool
+    named_after_s: float | None
+    """Wall time from the fault to the line that names it; None where there is none to come."""
+
+
+class Tally:
+    """What became of every repetition."""
+
+    def __init__(self) -> None:
+        self.outcomes: list[Outcome] = []
+
+    def lines(self) -> Iterator[str]:
+        yield f"{'kind':20} {'repetitions':>11} {'survived':>8} {'lost':>5} {'named within':>12}"
+        for kind in KINDS:
+            yield from self._line(kind, [each for each in self.outcomes if each.kind == kind])
+        yield from self._line("all", self.outcomes)
+
+    @staticmethod
+    def _line(kind: str, outcomes: list[Outcome]) -> Iterator[str]:
+        if outcomes:
+            survived = sum(each.survived for each in outcomes)
+            named = [each.named_after_s for each in outcomes if each.named_after_s is not None]
+            within = f"{max(named):.2f} s" if named else "-"
+            yield f"{kind:20} {len(outcomes):11} {survived:8} {len(outcomes) - survived:5} {within:>12}"
+
+
+@pytest.fixture(scope="module")
+def tally(request: pytest.FixtureRequest) -> Iterator[Tally]:
+    made = Tally()
+    yield made
+    terminal: Any = request.config.pluginmanager.getplugin("terminalreporter")
+    terminal.ensure_newline()
+    for line in made.lines():
+        terminal.write_line(line)
 
 
 @functools.cache
@@ -31,32 +73,66 @@ def undisturbed() -> str:
 
 @pytest.mark.parametrize("repetition", range(REPETITIONS))
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_fault_at_a_random_time(lab: Lab, kind: str, repetition: int) -> None:
+def test_a_fault_at_a_random_time(
+    lab: Lab, small_disk: Callable[[Path, int], None], tally: Tally, kind: str, repetition: int
+) -> None:
     chance = random.Random(f"{kind} {repetition}")
-    routed = {"routers": {"field": {"host": "h2"}}, "through": {"h2": "field", "h3": "field"}}
-    with closing(Team(lab, ROLES, **(routed if kind == "router.field" else {}))) as team:
+    team = prepared(lab, kind, chance, small_disk)
+    tally.outcomes.append(Outcome(kind, False, None))
+    with closing(team):
         run = team.up("--rate", str(RATE), "--duration", str(DURATION_S))
         in_flight(run)
-        rows = team.ps()
         threading.Event().wait(chance.uniform(0.0, LATEST_S) / RATE)
-        if kind == "launcher":
-            run.signal(signal.SIGKILL)
-            return
-        if kind in CUTS_S:
-            cut_off(team, chance.choice(("h2", "h3")), CUTS_S[kind])
-        else:
-            os.kill(rows[kind]["pid"], signal.SIGKILL)
-        run.ends(with_code=1 if kind in ENDING else 0, within_s=START_S + CUTS_S.get(kind, 0.0))
-        record = team.record()
-        if kind in LOSING:
-            assert [event["subject"] for event in record.events("restart")] == [kind]
-        elif kind not in ENDING:
-            assert record.sha256() == undisturbed()
-        assert record.keys()["clock"] > 1
+        named_after_s = strike(team, run, kind, chance)
+        if kind != LAUNCHER:
+            judge(team, run, kind)
+    tally.outcomes[-1] = Outcome(kind, True, named_after_s)
 
 
-def cut_off(team: Team, host: str, for_s: float) -> None:
-    """Cut a host off for so long."""
-    team.cut(host)
-    threading.Event().wait(for_s)
+def prepared(lab: Lab, kind: str, chance: random.Random, small_disk: Callable[[Path, int], None]) -> Team:
+    """Return a lab in which a fault of this kind can come, or is there from the start."""
+    if kind == ROUTER:
+        return Team(lab, ROLES, routers={"field": {"host": "h2"}}, through={"h2": "field", "h3": "field"})
+    if kind == CLOCK:
+        offset = chance.choice(("-1h", "+1h"))
+        lab.environment("h3", LD_PRELOAD=FAKETIME, FAKETIME=offset, FAKETIME_DONT_FAKE_MONOTONIC="1")
+    if kind == DISK:
+        small_disk(lab.host_folder("h3"), round(DISK_BYTES * chance.uniform(1.0, 3.0)))
+        lab.environment("h3")  # a new sshd, which sees the new disk
+        return Team(lab, {**ROLES, "recorder": "h3"})
+    return Team(lab, ROLES)
+
+
+def strike(team: Team, run: Role, kind: str, chance: random.Random) -> float | None:
+    """Let a fault happen; return the wall time [s] until a line names it."""
+    if kind in (CLOCK, DISK):
+        return None
+    at_s = time.monotonic()
+    if kind in CUTS_S:
+        host = chance.choice(("h2", "h3"))
+        return cut_off(team, run, host, CUTS_S[kind])
+    if kind == LAUNCHER:
+        run.signal(signal.SIGKILL)
+        return None
+    team.kill(kind)
+    return run.line(rf"{kind} .*(killed by signal 9)", START_S).wall_s - at_s
+
+
+def cut_off(team: Team, run: Role, host: str, for_s: float) -> float | None:
+    """Cut a host off for so long; return the wall time [s] until its line."""
+    at_s = team.cut(host)
+    said = run.line(f"host {host} does not answer", START_S).wall_s - at_s if for_s > NAMED_AFTER_S else None
+    threading.Event().wait(at_s + for_s - time.monotonic())
     team.heal(host)
+    return said
+
+
+def judge(team: Team, run: Role, kind: str) -> None:
+    """Fail unless the run has ended as it must after a fault of this kind, with all that was recorded."""
+    run.ends(with_code=1 if kind in (*ENDING, DISK) else 0, within_s=START_S + CUTS_S.get(kind, 0.0))
+    record = team.record()
+    assert record.keys()["clock"] > 1
+    if kind in LOSING:
+        assert [event["subject"] for event in record.events("restart")] == [kind]
+    elif kind not in (*ENDING, DISK):
+        assert record.sha256() == undisturbed()

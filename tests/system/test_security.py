@@ -15,7 +15,7 @@ import pytest
 import zenoh
 from federation import ONE, PAIR, PAIR_ROLES, ROOT, ZSIM, Federation, Role
 from rights_table import KEYS, ROLES, SCENARIO, keys_of
-from secured import HOST, SHORT_S, SITE, Certificates, Heard, Tryer, hub, site, tls_endpoint
+from secured import HOST, READY, SHORT_S, SITE, Certificates, Heard, Tryer, hub, site, tls_endpoint
 from wire import PATIENCE_S
 
 from zsim import rights, scenario_file, session
@@ -61,9 +61,10 @@ def answer_once(query: Any, key: str) -> None:
 def test_what_a_role_may_publish(made: Certificates, role: str, way: str) -> None:
     fence = f"process/{role}/health"
     with reached(made, role, way) as (tryer, link):
-        heard = Heard()
-        for expression in ("**", "@batch"):
-            link.on_message(expression, lambda sample: heard.take(sample.key))
+        heard, ready = Heard(), Heard()
+        for expression in ("@batch", "**"):
+            link.on_message(expression, lambda sample: (ready if sample.payload == READY else heard).take(sample.key))
+        tryer.until_heard(fence, ready)
         for act in (tryer.put, tryer.publish):
             for key in KEYS:
                 if key != fence:
@@ -118,7 +119,7 @@ def test_what_a_role_may_get(made: Certificates, role: str, way: str) -> None:
             asked.take(query.expression)
             answer_once(query, query.expression)
 
-        for expression in ("**", "@batch"):
+        for expression in ("@batch", "**"):
             link.answer(expression, answer)
         tryer.until_answered(fence)
         asked = Heard()

@@ -3,6 +3,7 @@
 import asyncio
 import importlib.metadata
 import json
+import os
 import platform
 import sys
 import sysconfig
@@ -76,6 +77,9 @@ def index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     with tarfile.open(folder / "gadget-1.0.tar.gz", "w:gz") as archive:
         archive.add(gadget, gadget.name)
     write_wheel(folder, "pip")
+    for name in [name for name in os.environ if name.startswith("PIP_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(folder))
     return folder
