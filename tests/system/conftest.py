@@ -2,5 +2,6 @@
 
 from federation import compiled, federation
 from lab import lab
+from team import faketime, small_disk, team
 
-__all__ = ["compiled", "federation", "lab"]
+__all__ = ["compiled", "faketime", "federation", "lab", "small_disk", "team"]

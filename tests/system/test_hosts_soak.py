@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import pytest
 from federation import Role
 from lab import Lab
-from test_hosts import DISK_BYTES, FAKETIME, NAMED_AFTER_S, ROLES, START_S, Team, closing, in_flight, in_process
+from team import DISK_BYTES, NAMED_AFTER_S, ROLES, START_S, Team, closing, in_flight, in_process
 
 pytestmark = pytest.mark.soak
 
 REPETITIONS = 5
 DURATION_S, RATE = 60.0, 8  # simulated
-LATEST_S = 30.0  # simulated, of a fault, after the first 10 s
+LATEST_S = 30.0  # simulated, of a fault, after the start
 CUTS_S = {"cut 1 s": 1.0, "cut 5 s": 5.0, "cut 20 s": 20.0}
 LOSING = ("estimator.drone1", "estimator.drone3", "controller.main")  # a kill loses the process's state
 ENDING = ("world", "recorder")
@@ -74,10 +74,15 @@ def undisturbed() -> str:
 @pytest.mark.parametrize("repetition", range(REPETITIONS))
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_fault_at_a_random_time(
-    lab: Lab, small_disk: Callable[[Path, int], None], tally: Tally, kind: str, repetition: int
+    lab: Lab,
+    small_disk: Callable[[Path, int], None],
+    faketime: str,
+    tally: Tally,
+    kind: str,
+    repetition: int,
 ) -> None:
     chance = random.Random(f"{kind} {repetition}")
-    team = prepared(lab, kind, chance, small_disk)
+    team = prepared(lab, kind, chance, small_disk, faketime)
     tally.outcomes.append(Outcome(kind, False, None))
     with closing(team):
         run = team.up("--rate", str(RATE), "--duration", str(DURATION_S))
@@ -89,13 +94,15 @@ def test_a_fault_at_a_random_time(
     tally.outcomes[-1] = Outcome(kind, True, named_after_s)
 
 
-def prepared(lab: Lab, kind: str, chance: random.Random, small_disk: Callable[[Path, int], None]) -> Team:
+def prepared(
+    lab: Lab, kind: str, chance: random.Random, small_disk: Callable[[Path, int], None], faketime: str
+) -> Team:
     """Return a lab in which a fault of this kind can come, or is there from the start."""
     if kind == ROUTER:
         return Team(lab, ROLES, routers={"field": {"host": "h2"}}, through={"h2": "field", "h3": "field"})
     if kind == CLOCK:
         offset = chance.choice(("-1h", "+1h"))
-        lab.environment("h3", LD_PRELOAD=FAKETIME, FAKETIME=offset, FAKETIME_DONT_FAKE_MONOTONIC="1")
+        lab.environment("h3", LD_PRELOAD=faketime, FAKETIME=offset, FAKETIME_DONT_FAKE_MONOTONIC="1")
     if kind == DISK:
         small_disk(lab.host_folder("h3"), round(DISK_BYTES * chance.uniform(1.0, 3.0)))
         lab.environment("h3")  # a new sshd, which sees the new disk

@@ -1,0 +1,147 @@
+"""Three hosts, certificates for them, and the `zsim` commands of somebody who flies Test 1 on them."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from federation import ROOT, Record, Role
+from lab import LAUNCHER, Lab
+
+from zsim import scenario_file
+from zsim.record import RecordReader, repair
+from zsim_deploy.in_process import fly
+
+STEP = ROOT / "scenarios" / "step.yaml"
+ROLES = {"world": "h1", "controller.main": "h2", "estimator.*": ["h1", "h2", "h3"]}
+FAKETIME = next(map(str, Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1")), None)
+START_S = 60.0  # wall time until something of a run is seen on a machine that does other things too
+NAMED_AFTER_S = 2.0  # a host that is cut off for longer is named
+DISK_BYTES = 1_500_000  # room for what a host needs and a few seconds of a record
+GONE_S = 15.0  # wall time within which nobody may be left on any host after its launcher is gone
+
+
+class Team:
+    """One lab with certificates, and the `zsim` commands that run in its launcher's namespace."""
+
+    def __init__(self, lab: Lab, roles: dict[str, Any], secure: bool = True, **more: Any) -> None:
+        self.lab = lab
+        self.out = lab.folder / "out"
+        self.hosts = str(lab.inventory(roles, insecure=not secure, **more))
+        self._env = {"TMPDIR": str(lab.folder)}
+        self.cut_off: set[str] = set()
+        self._roles: list[Role] = []
+        self._stack = ExitStack()
+        if secure:
+            self.zsim("certs", "init", self.hosts, "--scenario", str(STEP)).ends(with_code=0)
+
+    def zsim(self, *arguments: str) -> Role:
+        """Start a command where the launcher is."""
+        role = Role(list(arguments), self.lab.prefix(LAUNCHER), self._env)
+        self._roles.append(role)
+        return role
+
+    def up(self, *options: str) -> Role:
+        """Start a run."""
+        return self.zsim("up", str(STEP), "--hosts", self.hosts, "--out", str(self.out), "--no-report", *options)
+
+    def cut(self, name: str) -> float:
+        """Cut a host off; return the wall time."""
+        self.lab.cut(name)
+        self.cut_off.add(name)
+        return time.monotonic()
+
+    def heal(self, name: str) -> None:
+        self.lab.heal(name)
+        self.cut_off.discard(name)
+
+    def ps(self) -> dict[str, dict[str, Any]]:
+        """Return the rows of `zsim ps` by role."""
+        role = self.zsim("ps", "--json")
+        role.ends(with_code=0)
+        return {row["role"]: row for row in json.loads(role.text().splitlines()[-1])["rows"]}
+
+    def kill(self, role: str) -> None:
+        """Send SIGKILL to a role."""
+        for host in self.lab.names:
+            for pid, line in self.lab.processes(host).items():
+                if re.match(rf"\S*python\S* .*/{re.escape(role)}( |$)", line):  # its certificate's folder
+                    os.kill(pid, signal.SIGKILL)
+                    return
+        pytest.fail(f"{role} runs on no host")
+
+    def record(self) -> Record:
+        """Return what was recorded; a record that was cut is mended first."""
+        path = self.out / "run.mcap"
+        repair(path)
+        return Record(self._stack.enter_context(RecordReader(path)))
+
+    def nobody_left(self) -> None:
+        """Wait until no process of zsim's is on any host; fail if one stays."""
+        until_s = time.monotonic() + GONE_S
+        while left := {name: found for name in self.lab.names if (found := self.lab.processes(name))}:
+            assert time.monotonic() < until_s, left
+            threading.Event().wait(0.05)  # nothing tells of the end of another's process
+
+    def close(self) -> None:
+        for role in self._roles:
+            role.close()
+        self._stack.close()
+
+
+@contextmanager
+def closing(team: Team) -> Iterator[Team]:
+    """End what a test has started, and fail if anything of it stays."""
+    try:
+        yield team
+    finally:
+        team.close()
+        for name in list(team.cut_off):
+            team.heal(name)
+    team.nobody_left()
+
+
+@pytest.fixture
+def team(lab: Lab) -> Iterator[Team]:
+    with closing(Team(lab, ROLES)) as made:
+        yield made
+
+
+@pytest.fixture
+def small_disk() -> Iterator[Callable[[Path, int], None]]:
+    """Give a folder a disk of its own with room for so many bytes."""
+    with ExitStack() as stack:
+
+        def mount(folder: Path, size_bytes: int) -> None:
+            folder.mkdir(parents=True, exist_ok=True)
+            subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size_bytes}", "none", str(folder)], check=True)
+            stack.callback(subprocess.run, ["umount", "-l", str(folder)], check=True)
+
+        yield mount
+
+
+@pytest.fixture
+def faketime() -> str:
+    """Return the library that shows a process another time."""
+    return FAKETIME or pytest.skip("needs libfaketime (apt-get install libfaketime)")
+
+
+def in_flight(run: Role) -> None:
+    """Wait until simulated time goes on."""
+    run.line(r"real time  (idle|taking_off|assembling|engaged)", START_S)
+
+
+def in_process(folder: Path, duration_s: float) -> str:
+    """Return the hash of the same flight in one process."""
+    path = folder / "alone.mcap"
+    fly(scenario_file.load(STEP, duration_s=duration_s), path)
+    with RecordReader(path) as reader:
+        return Record(reader).sha256()
