@@ -9,7 +9,8 @@ ZsimError
 ├── SessionError       no session: port in use, nobody listens, wrong endpoint
 │   └── NoWorldError   the session is open, but no world answers
 ├── RunError           a run that could not start or did not end well
-│   └── SupersededError   another process of the same name has taken over
+│   ├── SupersededError   another process of the same name has taken over
+│   └── BehindError       a participant that cannot catch up any more
 ├── HostsError         a host that cannot be reached, or lacks what it needs; a line per host
 ├── RecordError        a record that cannot be written or read: disk full, no MCAP file
 └── ReportError        a report that cannot be made or written
@@ -58,6 +59,10 @@ class RunError(ZsimError):
 
 class SupersededError(RunError):
     """Another process of the same name has taken over."""
+
+
+class BehindError(RunError):
+    """A participant lacks what nobody keeps any more; a new incarnation of it can go on."""
 
 
 class HostsError(ZsimError):

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from zsim import __version__, keys, messages
 from zsim.agent import Agent, Output
 from zsim.connection import read_info
-from zsim.errors import DecodeError, NoWorldError, RunError, SupersededError
+from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
 from zsim.fingerprint import fingerprint
 from zsim.notice import Entry
 from zsim.replay import replay
@@ -20,6 +20,7 @@ from zsim.session import Sample, Session
 
 REPLAY_S = 2.0  # a hub answers a replay within milliseconds; a lost link does not
 RETRY_S = 0.5  # wall time between two attempts at what is owed
+ASKED_MAX = 10  # answers to what is lost that may lack it; the world answers from what it has on the way, too
 GATES_KEPT = 2  # gates of which the outputs are kept to answer a get, contract; more where the world runs ahead
 
 
@@ -61,6 +62,7 @@ class Membership:
         self._must_rejoin = False
         self._missed_since_ns: int | None = None
         self._asked_ns = -1
+        self._asked = 0
         self._retry_s = 0.0
         self.done_ns = -1
         self.failure: RunError | None = None
@@ -151,8 +153,14 @@ class Membership:
     def ask_again(self, t_ns: int, missing: str) -> None:
         """Fetch the rest of a gate of which messages did not come, as after a link that was cut."""
         if t_ns != self._asked_ns:
-            self._asked_ns, self._retry_s = t_ns, 0.0
+            self._asked_ns, self._asked, self._retry_s = t_ns, 0, 0.0
             self._say(f"{self._agent.name}: {missing} of t = {t_ns / 1e9:.2f} s did not come; asking for it again")
+        if self._asked >= ASKED_MAX:
+            self.failure = BehindError(
+                f"{self._agent.name}: {missing} of t = {t_ns / 1e9:.2f} s is kept by nobody any more; this one ends, "
+                "start it again"
+            )
+            return
         self._missed_since_ns = t_ns - self._info.gate_ns
         self.settle()
 
@@ -202,3 +210,4 @@ class Membership:
         except NoWorldError:
             return
         self._missed_since_ns = None
+        self._asked += 1

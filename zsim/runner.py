@@ -33,6 +33,7 @@ class Runner:
         agent: what to run.
         stopped: asked every TICK_S; True ends the process with a bye.
         say: told what a person should know.
+        deserted: asked at the end; True leaves without a bye, as one that dies, so that the world waits for a new one.
     """
 
     def __init__(
@@ -42,12 +43,14 @@ class Runner:
         agent: Agent,
         stopped: Callable[[], bool] = lambda: False,
         say: Callable[[str], None] = lambda text: None,
+        deserted: Callable[[], bool] = lambda: False,
     ) -> None:
         self._link = link
         self._info = info
         self._agent = agent
         self._stopped = stopped
         self._say = say
+        self._deserted = deserted
         self._inbox = Inbox(agent.gate_keys, agent.counted, keep_late=info.mode == "realtime")
         self._member = Membership(link, info, agent, self._take_in, say)
         estimates = (key for key in agent.gate_keys if key.endswith("/estimate"))
@@ -71,6 +74,7 @@ class Runner:
         Raises:
             SupersededError: another process of the same name has taken over.
             RunError: the world has begun another run.
+            BehindError: it lacks what the world does not keep any more.
         """
         self._agent.rehearse()
         self._subscribe()
@@ -88,7 +92,8 @@ class Runner:
             ticker.join()
         if self._member.failure:
             raise self._member.failure
-        self._member.leave(self._leave)
+        if not self._deserted():
+            self._member.leave(self._leave)
         return self._leave
 
     # One turn

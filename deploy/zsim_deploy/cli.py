@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from zsim import __version__
-from zsim.errors import SupersededError, ZsimError
+from zsim.errors import BehindError, SupersededError, ZsimError
 from zsim_deploy import certs_commands, hosts_commands, look_commands, render_commands
 from zsim_deploy.arguments import (
     DEFAULT_ENDPOINT,
@@ -39,6 +39,8 @@ app = typer.Typer(
 )
 
 UsageError: Any = typer.BadParameter.__bases__[0]  # click's, or that of the click inside of newer typers
+USER_FAULT = 2  # exit code of whatever a person has to put right
+EXIT_CODES = {SupersededError: 3, BehindError: 1}  # of the faults after which somebody else goes on; see watch.py
 INTERRUPTED = 130  # exit code of a shell for a program that Ctrl-C ended
 RUN, ROLES = "Run", "Roles, started by hand, on any machine, in any order"
 HOSTS = "On several machines"
@@ -257,7 +259,7 @@ def main() -> None:
         code = app(standalone_mode=False, prog_name="zsim")
     except ZsimError as error:
         print(error, file=sys.stderr)
-        sys.exit(3 if isinstance(error, SupersededError) else 2)
+        sys.exit(EXIT_CODES.get(type(error), USER_FAULT))
     except UsageError as error:
         _show_usage(error)
         sys.exit(2)

@@ -23,6 +23,7 @@ class Leash:
 
     def __init__(self, launched: bool) -> None:
         self._reason: str | None = None
+        self._deserted = False
         self._heard_s = time.monotonic()
         self._former = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
         signal.signal(signal.SIGTERM, lambda *_: self._stop("terminated"))
@@ -39,6 +40,10 @@ class Leash:
     def pulled(self) -> bool:
         """Tell whether to stop."""
         return self._reason is not None
+
+    def deserted(self) -> bool:
+        """Tell whether the launcher is gone: for all others this process then dies, it does not leave."""
+        return self._deserted
 
     def let_go(self) -> None:
         """Take no signals any more: what is left to do may be interrupted as anything."""
@@ -71,6 +76,7 @@ class Leash:
         self._leave(f"nothing heard from the launcher for {limit_s:g} s")
 
     def _leave(self, reason: str) -> None:
+        self._deserted = True
         self._stop(reason)
         time.sleep(GRACE_S)
         os._exit(1)

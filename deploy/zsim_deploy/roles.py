@@ -134,7 +134,7 @@ def agent(
         say(f"{made.name}: in run {info.run_id}")
         gc.collect()
         gc.freeze()
-        reason = Runner(link, info, made, leash.pulled, say).run()
+        reason = Runner(link, info, made, leash.pulled, say, leash.deserted).run()
     say(f"{made.name}: left, {reason}")
 
 

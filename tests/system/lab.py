@@ -125,7 +125,7 @@ class Lab:
 
     def prefix(self, name: str) -> tuple[str, ...]:
         """Return what starts a command on a host: `prefix(name) + command`."""
-        return (shutil.which("ip", path=environment()["PATH"]) or "ip", "netns", "exec", self._namespace(name))
+        return (shutil.which("ip", path=environment()["PATH"]) or "ip", "netns", "exec", self.namespace(name))
 
     def _inside(self, name: str, command: Sequence[str]) -> list[str]:
         return [*self.prefix(name), *command]
@@ -135,7 +135,7 @@ class Lab:
 
     def inside(self, name: str) -> AbstractContextManager[None]:
         """Move the calling thread, and threads that it starts, into the network of a host."""
-        return namespaces.entered(self._namespace(name))
+        return namespaces.entered(self.namespace(name))
 
     def environment(self, name: str, **variables: str) -> None:
         """Give every process that is started on a host from now on some variables, over ssh too."""
@@ -176,7 +176,7 @@ class Lab:
 
     def processes(self, name: str) -> dict[int, str]:
         """Return id and command of the zsim processes on a host (or the launcher)."""
-        return {pid: line for pid, line in members(self._namespace(name)) if "zsim_deploy" in line or "/zsim " in line}
+        return {pid: line for pid, line in members(self.namespace(name)) if "zsim_deploy" in line or "/zsim " in line}
 
     def close(self) -> None:
         """End every process of the lab and take its namespaces away."""
@@ -193,9 +193,10 @@ class Lab:
 
     def namespaces(self) -> list[str]:
         """Return the names of the namespaces."""
-        return [self._namespace(name) for name in ("net", LAUNCHER, *self.names)]
+        return [self.namespace(name) for name in ("net", LAUNCHER, *self.names)]
 
-    def _namespace(self, name: str) -> str:
+    def namespace(self, name: str) -> str:
+        """Return the name of a host's network namespace."""
         return f"{self._prefix}-{name}"
 
     @staticmethod
@@ -206,7 +207,7 @@ class Lab:
     def _connect(self) -> None:
         """Make the namespaces, the bridge, and a cable from it to each host."""
         ends = (LAUNCHER, *self.names)
-        namespaces.ip(*(f"netns add {self._namespace(name)}" for name in ("net", *ends)))
+        namespaces.ip(*(f"netns add {self.namespace(name)}" for name in ("net", *ends)))
         self._ip("net", "link add name bridge type bridge forward_delay 0", "link set dev bridge up")
         self._ip("net", *(self._cable(name) for name in ends))
         self._ip(
@@ -219,10 +220,10 @@ class Lab:
         self._nft(CUTS)
 
     def _cable(self, name: str) -> str:
-        return f"link add name {name} type veth peer name eth0 netns {self._namespace(name)}"
+        return f"link add name {name} type veth peer name eth0 netns {self.namespace(name)}"
 
     def _ip(self, name: str, *lines: str) -> None:
-        namespaces.ip(*lines, within=self._namespace(name))
+        namespaces.ip(*lines, within=self.namespace(name))
 
     def _nft(self, text: str) -> None:
         checked(self._inside("net", ["nft", "-f", "-"]), text)

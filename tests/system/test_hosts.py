@@ -1,6 +1,7 @@
 """`zsim up` on three real hosts: the same bits as in one process, over TLS with access control, whatever fails."""
 
 import itertools
+import os
 import re
 import signal
 import threading
@@ -9,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import namespaces
 import pytest
 from lab import Lab
 from team import DISK_BYTES, NAMED_AFTER_S, ROLES, START_S, Team, closing, in_flight, in_process
@@ -68,6 +70,19 @@ def test_a_killed_role_is_started_again(team: Team, role: str) -> None:
     run.line(rf"{role} .* ended: killed by signal 9; on_death: restart", START_S)
     run.ends(with_code=0, within_s=START_S)
     assert [event["subject"] for event in team.record().events("restart")] == [role]
+
+
+def test_a_broken_ssh_session_is_the_death_of_its_roles(team: Team) -> None:
+    """They end, since their launcher is gone; time stands still until there are new ones."""
+    run = team.up("--rate", "8", "--duration", "30")
+    in_flight(run)
+    for pid, line in namespaces.members(team.lab.namespace("h2")):
+        if re.match(r"sshd(-session)?: \w+@notty", line):
+            os.kill(pid, signal.SIGKILL)
+    run.line(r"controller.main .* ended: .*connection to h2 broke.*; on_death: restart", START_S)
+    run.ends(with_code=0, within_s=START_S)
+    record = team.record()
+    assert {event["subject"] for event in record.events("death")} == {"controller.main", "estimator.drone2"}
 
 
 @pytest.mark.parametrize("role", ["world", "recorder"])

@@ -10,7 +10,7 @@ import pytest
 
 from zsim import keys, membership, messages
 from zsim.agent import Agent, Output
-from zsim.errors import RunError, SupersededError
+from zsim.errors import BehindError, RunError, SupersededError
 from zsim.messages import ControlAnswer, Done, Estimate, Event, Info, Origin, Status
 from zsim.runner import Runner
 
@@ -197,6 +197,27 @@ def test_a_gate_that_was_lost_is_asked_for_until_it_is_there(before: list[Contro
     assert world.gates_done() == list(range(END + 1))
     assert [gate for kind, gate in judge.heard if kind == "estimate"] == list(range(END + 1))
     assert world.requests[0] == (REPLAY, {"from_ns": GATE_NS, "keys": list(judge.reads), "page": 0})
+
+
+@pytest.mark.usefixtures("quick")
+def test_what_nobody_keeps_any_more_ends_it():
+    """Estimate 2 is lost, and the world, which went on without this process, has it no more."""
+    rest = {gate: each for gate, each in estimates(range(END + 1)).items() if gate not in (2, 3)}
+    world = World({**rest, 2: tells(estimate(3))})
+    world.on_request = lambda key, args: replayed()
+    with pytest.raises(
+        BehindError, match=r"drone/d1/estimate of t = 0\.04 s is kept by nobody any more; this one ends"
+    ):
+        run(world)
+    assert not world.all(keys.process(ME, "bye"))
+
+
+@pytest.mark.parametrize("deserted", [False, True])
+def test_who_lost_its_launcher_dies_and_does_not_leave(deserted: bool):
+    world = World(estimates(range(END + 1)))
+    reason = Runner(world, info(), Judge(), lambda: True, deserted=lambda: deserted).run()  # type: ignore[arg-type]
+    assert reason == "stopped"
+    assert len(world.all(keys.process(ME, "bye"))) == (not deserted)
 
 
 @pytest.mark.usefixtures("quick")
