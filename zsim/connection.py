@@ -1,5 +1,6 @@
 """Finding the world: connect, read `world/info`, wait with progress when there is none yet."""
 
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -46,7 +47,7 @@ def find_world(
     keys.name(federation, "federation")
     with ExitStack() as stack:
         dial = partial(session.connect, endpoint, federation, reader=reader, identity=identity)
-        link, info = _search(stack, dial, endpoint, federation, wait_s, say, stopped, run_id)
+        link, info = _search(stack, dial, endpoint, federation, wait_s, say, stopped, run_id, identity)
         if info.mode == "realtime":
             stack.pop_all().close()
             link = stack.enter_context(dial(mode="realtime", wait_s=5.0))
@@ -63,6 +64,7 @@ def _search(
     say: Callable[[str], None],
     stopped: Callable[[], bool],
     run_id: str | None,
+    identity: Identity | None,
 ) -> tuple[Session, messages.Info]:
     start_s, next_say_s = time.monotonic(), 0.0
     link: Session | None = None
@@ -80,9 +82,8 @@ def _search(
         except SessionError as error:
             _refuse_lasting(error)
         if waited_s >= (wait_s if wait_s is not None else float("inf")):
-            raise NoWorldError(
-                f"no world of federation {federation!r} on {endpoint} within {wait_s:g} s; start one with `zsim world`"
-            )
+            why = _no_answer(identity) if link is not None else _no_link(endpoint)
+            raise NoWorldError(f"no world of federation {federation!r} on {endpoint} within {wait_s:g} s{why}")
         if waited_s >= next_say_s:
             next_say_s = max(2 * next_say_s, 1.0)
             say(f"waiting for a world of {federation!r} on {endpoint} ({waited_s:.0f} s)")
@@ -93,6 +94,37 @@ def _refuse_lasting(error: SessionError) -> None:
     """Raise again what no waiting mends."""
     if "nobody listens" not in str(error) or "not supported" in str(error):
         raise error
+
+
+def _no_answer(identity: Identity | None) -> str:
+    """Return why a hub that is there may not answer; Zenoh does not tell those whom it lets do nothing."""
+    may_be = ", but somebody listens there: another federation, a world on its way up, a router without one"
+    if identity is None or identity.tls is None:
+        return f"{may_be}; correct --federation, or wait longer"
+    return (
+        f"{may_be}, or we are refused or not allowed here; correct --federation, wait longer, "
+        "or let us in with `zsim certs init --operator` and start the world again"
+    )
+
+
+def _no_link(endpoint: str) -> str:
+    """Return why there is no session; a port that opens nevertheless is one of somebody who speaks otherwise."""
+    if not _opens(endpoint):
+        return "; start one with `zsim world`"
+    return ", but who listens there refuses us; if it is a world with TLS, say tls/ and give --tls FOLDER"
+
+
+def _opens(endpoint: str) -> bool:
+    """Tell whether anybody takes a connection to an endpoint without TLS."""
+    protocol, _, place = endpoint.partition("/")
+    if protocol != "tcp":
+        return False
+    host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), ANSWER_S):
+            return True
+    except (OSError, OverflowError, ValueError):
+        return False
 
 
 def read_info(link: Session) -> messages.Info | None:

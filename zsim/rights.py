@@ -39,16 +39,18 @@ ALL = Rights(*[EVERYTHING] * len(Rights._fields))
 
 
 def of(process: str, scenario: Scenario) -> Rights:
-    """Return the rights of a process by its name, role.thing.
+    """Return the rights of a process by its name, role.thing; there is one world and one recorder, without a thing.
 
     A role that is not zsim's and is about a drone may do what the estimator of that drone may, one that is about a
     cluster what its controller may: it takes their place. One about neither takes part, and hears what all are told.
     """
     role, _, thing = process.partition(".")
-    if role == WORLD:
+    if process == WORLD:
         return ALL
-    if role in (OPERATOR, RECORDER):
-        return union([_own(process), _READER, _OPERATOR if role == OPERATOR else Rights()])
+    if process == RECORDER:
+        return union([_own(process), _READER])
+    if role == OPERATOR:
+        return union([_own(process), _READER, _OPERATOR])
     return union([_own(process), _estimator(thing, scenario, role), _controller(thing, scenario, role)])
 
 

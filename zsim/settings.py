@@ -117,6 +117,11 @@ def _agree(identity: Identity, endpoints: Sequence[str]) -> None:
             raise SessionError(f"{endpoint}: needs a certificate; give --tls the folder that zsim certs init made")
         if not secure and identity.tls is not None:
             raise SessionError(f"{endpoint}: is not encrypted; with --tls it must be tls/ADDRESS:PORT")
+        if not secure and not identity.insecure and tls.leaves_machine(endpoint):
+            raise SessionError(
+                f"{endpoint}: is not encrypted and leaves this machine; give --tls and a tls/ endpoint (zsim certs "
+                "init makes certificates), or --insecure on a network that is nobody else's"
+            )
     if identity.access is not None and identity.tls is None:
         raise SessionError(f"{identity.access}: access control goes by certificate; give --tls too")
 

@@ -5,6 +5,7 @@ a certificate whose time is over can still be read and named.
 """
 
 import contextlib
+import ipaddress
 import re
 import socket
 import ssl
@@ -16,6 +17,7 @@ from zsim.identity import CERTIFICATES, Identity
 PROBE_S = 2.0  # of one step of the handshake; a process that listens and is not frozen answers within milliseconds
 LATE_S = 1.0  # in TLS 1.3 a server judges the client's certificate after the client thinks that all is well
 NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME, openssl/x509_vfy.h
+NETWORKED = ("tcp", "udp", "ws")  # of what Zenoh's wheel has without encryption; the others stay on the machine
 MEND = "make new ones with zsim certs init"
 
 _ENDPOINT = re.compile(r"(?:tls|quic)/\[?(?P<host>[^\]]*?)\]?:(?P<port>\d+)(?:[?#].*)?")
@@ -26,6 +28,18 @@ _MISNAMED = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISM
 def is_tls(endpoint: str) -> bool:
     """Tell whether a link of an endpoint is encrypted."""
     return endpoint.startswith(("tls/", "quic/"))
+
+
+def leaves_machine(endpoint: str) -> bool:
+    """Tell whether a link of an endpoint goes over a network; what is no endpoint does not."""
+    protocol, _, place = endpoint.partition("/")
+    host = (place.rpartition(":")[0] or place).strip("[]")
+    if protocol not in NETWORKED or host == "localhost":
+        return False
+    try:
+        return not ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return True
 
 
 def own_fault(identity: Identity) -> str | None:

@@ -42,13 +42,15 @@ Launched = Annotated[str | None, typer.Option("--launched", hidden=True)]  # by 
 Tls = Annotated[Path | None, typer.Option("--tls", help="Folder of this process's certificate (zsim certs init).")]
 Access = Annotated[Path | None, typer.Option("--access", help="Zenoh's access control (zsim certs init).")]
 Host = Annotated[str | None, typer.Option("--host", help="Name of this host, as others are told.")]
+Insecure = Annotated[bool, typer.Option("--insecure", help="Without TLS, on a network that is nobody else's.")]
 
 
-def identity(host: str | None, tls: Path | None, access: Path | None = None) -> "Identity":
+def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | None = None) -> "Identity":
     """Return who this process is on the network."""
     from zsim.identity import Identity
 
-    return Identity(host, tls, access) if host else Identity(tls=tls, access=access)
+    found = Identity(tls=tls, access=access, insecure=insecure)
+    return found._replace(host=host) if host else found
 
 
 def load_scenario(

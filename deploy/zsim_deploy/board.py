@@ -14,7 +14,9 @@ from zsim_deploy.progress import Screen, describe
 from zsim_deploy.remote import Remote
 
 FIRST_S = 1.0  # simulated; from then on it flies
-SILENT_S = 1.0  # a host that has not answered for so long is shown as silent; it is asked twice a second
+SILENT_S = 1.0  # a host that has not answered for so long is shown as silent; it is asked twice a second …
+ROUND_TRIPS = 2.0  # … and so many of its round trips more: over a slow link every answer takes long
+WAITED_S = 0.5  # a process that is waited for longer is shown so; waiting for less is what lockstep is
 STALE_S = 3.0  # health comes once a second; older figures say nothing of now
 COLUMNS = ("role", "host", "pid", "state", "lag", "messages/s", "round trip", "restarts")
 
@@ -86,7 +88,7 @@ class Board:
         """Say once which host has fallen silent, and that it is back."""
         for name, link in self.links.items():
             silent_s = link.silent_s()
-            if silent_s > SILENT_S and name not in self._silent:
+            if _is_silent(link) and name not in self._silent:
                 self._silent.add(name)
                 roles = ", ".join(member.name for member in self.members if member.host == name)
                 self.say(f"host {name} does not answer (since {silent_s:.1f} s); on it: {roles or 'nothing'}")
@@ -105,23 +107,22 @@ class Board:
     def _row(self, member: Remote) -> dict[str, Any]:
         link, health = self.links[member.host], self._health.get(member.name)
         fresh = health is not None and time.monotonic() - health["wall_s"] < STALE_S
-        silent_s = link.silent_s()
         return {
             "role": member.name,
             "host": member.host,
             "pid": member.pid or None,
-            "state": self._state(member, silent_s),
+            "state": self._state(member, link),
             "lag_ms": health["lag_ns"] / 1e6 if health and fresh else None,
             "messages_per_s": health["per_s"] if health and fresh else None,
-            "round_trip_ms": 1e3 * link.round_trip_s if link.heard_s and silent_s < SILENT_S else None,
+            "round_trip_ms": 1e3 * link.round_trip_s if link.heard_s and not _is_silent(link) else None,
             "restarts": member.restarts,
         }
 
-    def _state(self, member: Remote, silent_s: float) -> str:
-        if member.state == "running" and silent_s > SILENT_S:
-            return f"host silent {silent_s:.0f} s"
+    def _state(self, member: Remote, link: HostLink) -> str:
+        if member.state == "running" and _is_silent(link):
+            return f"host silent {link.silent_s():.0f} s"
         waited = [w for w in (self._clock or {}).get("waiting_for", ()) if w["name"] == member.name]
-        if member.state == "running" and waited and waited[0]["since_wall_s"] > 0.5:
+        if member.state == "running" and waited and waited[0]["since_wall_s"] > WAITED_S:
             return f"waited for {waited[0]['since_wall_s']:.0f} s"
         return f"ended ({member.outcome()})" if member.state == "ended" and member.code else member.state
 
@@ -129,6 +130,10 @@ class Board:
         clock = self._clock
         head = Text(describe(clock, self._duration_s) if clock else "starting …")
         return Group(head, table(self.rows()))
+
+
+def _is_silent(link: HostLink) -> bool:
+    return link.silent_s() > SILENT_S + ROUND_TRIPS * link.round_trip_s
 
 
 def table(rows: Sequence[dict[str, Any]]) -> Table:
@@ -139,7 +144,7 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
             row["role"],
             row["host"],
             str(row["pid"] or "-"),
-            row["state"],
+            Text(row["state"]),  # it may hold what a process said, with brackets
             _figure(row["lag_ms"], "{:.0f} ms"),
             _figure(row["messages_per_s"], "{:.0f}"),
             _figure(row["round_trip_ms"], "{:.1f} ms"),

@@ -12,19 +12,24 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cryptography import x509
-from cryptography.exceptions import InvalidSignature
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from zsim.errors import RunError
-from zsim.identity import CERTIFICATES
-from zsim_deploy.enrolment import Wanted
+from zsim.identity import AUTHORITY, CERTIFICATE, CERTIFICATES, DAYS, KEY
+from zsim.rights import OPERATOR
+from zsim_deploy.enrolment import OPERATORS, Wanted
 
 AUTHORITY_DAYS = 1825  # 5 years; its key never leaves the machine that made it
-DAYS = 30  # of a process's certificate, which lies on its host
 BACK = timedelta(days=1)  # hosts in the field have clocks that are hours off
+EXPIRED = "expired on"  # a day
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
+
+
+Root = x509.Certificate
+"""The certificate of an authority."""
 
 
 class Shown(NamedTuple):
@@ -53,7 +58,7 @@ def authority(folder: Path, now: datetime, force: bool = False) -> Authority:
     Raises:
         RunError: half of it is there, its time is over, or it cannot be read or written.
     """
-    paths = (folder / "ca.pem", folder / "ca.key")
+    paths = (folder / AUTHORITY, folder / "ca.key")
     there = [path for path in paths if path.exists()]
     if force or not there:
         return _make_authority(folder, now)
@@ -85,23 +90,31 @@ def issue(folder: Path, signer: Authority, wanted: Wanted, now: datetime, days: 
     )
     place = folder / wanted.host / wanted.process
     for name, content in zip(CERTIFICATES, (_pem(signer.certificate), _pem(certificate), _key_pem(key)), strict=True):
-        _write(place / name, content)
+        write(place / name, content)
     return place
 
 
-def due(folder: Path, signer: Authority, wanted: Wanted, now: datetime) -> str | None:
-    """Return why a certificate has to be made, None if the one that is there will do."""
+def root(folder: Path) -> Root:
+    """Return the certificate of the authority in a folder; its key need not be there.
+
+    Raises:
+        RunError: there is none.
+    """
+    return _load(folder / AUTHORITY)
+
+
+def due(folder: Path, signer: Root, wanted: Wanted, now: datetime) -> str | None:
+    """Return why a certificate has to be made, None if the one that is there will do, with its key."""
     place = folder / wanted.host / wanted.process
     if not all((place / name).exists() for name in CERTIFICATES):
         return "new"
     try:
-        found = x509.load_pem_x509_certificate((place / CERTIFICATES[1]).read_bytes())
+        found = x509.load_pem_x509_certificate((place / CERTIFICATE).read_bytes())
     except (OSError, ValueError):
         return "cannot be read"
-    if not _signed_by(found, signer.certificate):
-        return "of another authority"
-    if now >= found.not_valid_after_utc:
-        return f"expired on {found.not_valid_after_utc.date()}"
+    fault = _fault(place, found, signer, now)
+    if fault:
+        return fault
     if set(_addresses(found)) != {str(name.value) for name in _names(wanted.addresses)}:
         return "other addresses"
     return None
@@ -109,17 +122,39 @@ def due(folder: Path, signer: Authority, wanted: Wanted, now: datetime) -> str |
 
 def show(folder: Path, now: datetime) -> list[Shown]:
     """Return every certificate in a folder, with what is wrong with it."""
-    shown = []
-    paths = sorted(folder.glob(f"*/*/{CERTIFICATES[1]}"))
-    root = _load(folder / "ca.pem") if paths else None
-    for path in paths:
-        found = _load(path)
-        fault = "" if root is not None and _signed_by(found, root) else "of another authority"
-        if now >= found.not_valid_after_utc:
-            fault = "expired"
-        place = path.parent
-        shown.append(Shown(place.parent.name, place.name, _addresses(found), found.not_valid_after_utc, fault))
-    return shown
+    paths = sorted(folder.glob(f"*/*/{CERTIFICATE}"))
+    if not paths:
+        return []
+    signer = root(folder)
+    return [_shown(path.parent, signer, now) for path in paths]
+
+
+def operators(folder: Path, hosts: Iterable[str]) -> Iterator[str]:
+    """Yield the operators who have a certificate in a folder, as NAME or, at one of the hosts, NAME@HOST."""
+    for host in (OPERATORS, *hosts):
+        for path in sorted((folder / host).glob(f"{OPERATOR}.*/{CERTIFICATE}")):
+            name = path.parent.name.removeprefix(f"{OPERATOR}.")
+            yield name if host == OPERATORS else f"{name}@{host}"
+
+
+def _shown(place: Path, signer: Root, now: datetime) -> Shown:
+    found = _load(place / CERTIFICATE)
+    fault = _fault(place, found, signer, now) or ""
+    return Shown(place.parent.name, place.name, _addresses(found), found.not_valid_after_utc, fault)
+
+
+def _fault(place: Path, found: x509.Certificate, signer: Root, now: datetime) -> str | None:
+    """Return what is wrong with a certificate and the files beside it; who writes them may be stopped in between."""
+    try:
+        authority_there, key = (place / AUTHORITY).read_bytes(), (place / KEY).read_bytes()
+        public = serialization.load_pem_private_key(key, password=None).public_key()
+    except (OSError, ValueError, TypeError, UnsupportedAlgorithm):
+        return "cannot be read"
+    if not _signed_by(found, signer) or authority_there != _pem(signer):
+        return "of another authority"
+    if public != found.public_key():
+        return "without its key"
+    return f"{EXPIRED} {found.not_valid_after_utc.date()}" if now >= found.not_valid_after_utc else None
 
 
 def _make_authority(folder: Path, now: datetime) -> Authority:
@@ -143,8 +178,8 @@ def _make_authority(folder: Path, now: datetime) -> Authority:
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
         .sign(key, hashes.SHA256())
     )
-    _write(folder / "ca.key", _key_pem(key))
-    _write(folder / "ca.pem", _pem(certificate))
+    write(folder / "ca.key", _key_pem(key))
+    write(folder / AUTHORITY, _pem(certificate))
     return Authority(certificate, key)
 
 
@@ -153,7 +188,7 @@ def _read_authority(certificate: Path, key: Path) -> Authority:
         read = serialization.load_pem_private_key(key.read_bytes(), password=None)
     except OSError as error:
         raise RunError(f"{key}: cannot be read ({error.strerror}); it belongs to who made it") from error
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
         raise RunError(f"{key}: is no private key; --force makes a new authority") from error
     found = Authority(_load(certificate), read) if isinstance(read, ec.EllipticCurvePrivateKey) else None
     if found is None or found.certificate.public_key() != found.key.public_key():
@@ -208,9 +243,9 @@ def _addresses(found: x509.Certificate) -> tuple[str, ...]:
     return tuple(str(name.value) for name in names)
 
 
-def _signed_by(found: x509.Certificate, root: x509.Certificate) -> bool:
+def _signed_by(found: x509.Certificate, signer: Root) -> bool:
     try:
-        found.verify_directly_issued_by(root)
+        found.verify_directly_issued_by(signer)
     except (InvalidSignature, ValueError, TypeError):
         return False
     return True
@@ -226,8 +261,12 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
     )
 
 
-def _write(path: Path, content: bytes) -> None:
-    """Put a file in its place at once and readable by its owner alone; half a key is no key."""
+def write(path: Path, content: bytes) -> None:
+    """Put a file in its place at once and readable by its owner alone; half a key is no key.
+
+    Raises:
+        RunError: it cannot be written.
+    """
     fresh = path.with_name(f".{path.name}.new")
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)

@@ -1,11 +1,15 @@
 """`zsim certs`: a small authority, a certificate for each process and host, and who may do what."""
 
 import json
+import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from zsim.identity import DAYS
+from zsim_deploy.arguments import Set, load_scenario
 
 if TYPE_CHECKING:
     from zsim_deploy.certificates import Shown
@@ -15,53 +19,72 @@ if TYPE_CHECKING:
 app = typer.Typer(name="certs", help="Make and show the certificates of a federation.", no_args_is_help=True)
 
 Hosts = Annotated[Path, typer.Argument(help="Inventory (YAML): hosts and which role runs where.", show_default=False)]
-OPERATOR = "main"
+FIRST_OPERATOR = "main"
+DAYS_MIN, DAYS_MAX = (
+    0.05,
+    825.0,
+)  # an hour, longer than a flight; what browsers took at most (CA/Browser Forum, ballot 193)
 WARN = timedelta(days=3)  # before a certificate ends, when `show` says so
+
+
+def _days(value: float) -> float:
+    if not DAYS_MIN <= value <= DAYS_MAX:
+        raise typer.BadParameter(f"is {value:g}; must be {DAYS_MIN:g} to {DAYS_MAX:g}")
+    return value
 
 
 @app.command()
 def init(
     hosts: Hosts,
     scenario: Annotated[Path, typer.Option(help="Scenario whose processes they are for.", show_default=False)],
-    set_: Annotated[list[str] | None, typer.Option("--set", help="Override a field of the scenario.")] = None,
+    set_: Set = None,
     operator: Annotated[
-        list[str] | None, typer.Option(help=f"NAME or NAME@HOST of who looks and commands (default {OPERATOR}).")
+        list[str] | None,
+        typer.Option(
+            help=f"NAME or NAME@HOST of who looks and commands, beside who is there ({FIRST_OPERATOR} at first)."
+        ),
     ] = None,
-    days: Annotated[float, typer.Option(min=0.0, max=825.0, help="How long they are good for.")] = 30.0,
+    days: Annotated[float, typer.Option(callback=_days, help="How long they are good for.")] = DAYS,
     renew: Annotated[bool, typer.Option("--renew", help="Make all of them anew, by the same authority.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Make a new authority; nothing made before is good.")] = False,
 ) -> None:
     """Make what is missing: authority, certificates, and access control for the world and the routers."""
-    from zsim import scenario_file
-    from zsim_deploy import inventory
-    from zsim_deploy.enrolment import Enrolment
+    from zsim_deploy import certificates, inventory
+    from zsim_deploy.enrolment import Enrolment, folder_of
 
     placed = inventory.load(hosts)
-    enrolment = Enrolment(placed, scenario_file.load(scenario, set_ or ()), operator or [OPERATOR])
     folder = folder_of(placed)
+    operators = [*(operator or ()), *certificates.operators(folder, placed.inventory.hosts)] or [FIRST_OPERATOR]
+    enrolment = Enrolment(placed, load_scenario(scenario, set_), operators)
     made, kept = _issue_all(folder, enrolment, days, renew, force)
     for host, process, rules in enrolment.access():
-        place = folder / host / f"{process}.access.json"
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_text(json.dumps(rules, indent=2) + "\n")
+        content = json.dumps(rules, indent=2) + "\n"
+        certificates.write(folder / host / f"{process}.access.json", content.encode())
+    _warn(placed)
     print(f"{folder}: {made} certificates made, {kept} kept; zsim certs show {hosts} lists them")
 
 
 @app.command()
 def show(hosts: Hosts) -> None:
     """List the certificates that are there: for whom, for which addresses, until when."""
+    from zsim.errors import RunError
     from zsim_deploy import certificates, inventory
+    from zsim_deploy.enrolment import folder_of, init_command
 
-    now = datetime.now(UTC)
-    for shown in certificates.show(folder_of(inventory.load(hosts)), now):
+    placed, now = inventory.load(hosts), datetime.now(UTC)
+    folder = folder_of(placed)
+    found = certificates.show(folder, now)
+    if not found:
+        raise RunError(f"{folder}: has no certificates; make them with `{init_command(placed)}`")
+    for shown in found:
         until = f"{shown.until:%Y-%m-%d %H:%M}Z"
         where = ", ".join(shown.addresses)
-        print(f"{shown.host:<16} {shown.process:<32} {until:<18} {where:<40} {_state(shown, now)}".rstrip())
-
-
-def folder_of(placed: "Placed") -> Path:
-    """Return the folder of an inventory's certificates."""
-    return placed.folder / Path(placed.inventory.security.certificates).expanduser()
+        state = shown.fault or _soon(shown, now)
+        print(f"{shown.host:<16} {shown.process:<32} {until:<18} {where:<40} {state}".rstrip())
+    over = any(_soon(shown, now) or certificates.EXPIRED in shown.fault for shown in found)
+    if over or any(shown.fault for shown in found):
+        print(f"make them anew with `{init_command(placed, renew=over)}`", file=sys.stderr)
+    _warn(placed)
 
 
 def _issue_all(folder: Path, enrolment: "Enrolment", days: float, renew: bool, force: bool) -> tuple[int, int]:
@@ -71,13 +94,19 @@ def _issue_all(folder: Path, enrolment: "Enrolment", days: float, renew: bool, f
     now = datetime.now(UTC)
     signer = certificates.authority(folder, now, force)
     wanted = enrolment.certificates()
-    lacking = [each for each in wanted if renew or certificates.due(folder, signer, each, now)]
+    lacking = [each for each in wanted if renew or certificates.due(folder, signer.certificate, each, now)]
     for each in lacking:
         certificates.issue(folder, signer, each, now, days)
     return len(lacking), len(wanted) - len(lacking)
 
 
-def _state(shown: "Shown", now: datetime) -> str:
-    if shown.fault:
-        return f"{shown.fault}; run zsim certs init"
-    return "ends soon; run zsim certs init --renew" if shown.until - now < WARN else ""
+def _soon(shown: "Shown", now: datetime) -> str:
+    return "ends soon" if shown.until - now < WARN else ""
+
+
+def _warn(placed: "Placed") -> None:
+    """Say which private keys others can read."""
+    from zsim_deploy.credentials import exposed
+
+    if warning := exposed(placed):
+        print(f"warning: {warning}", file=sys.stderr)

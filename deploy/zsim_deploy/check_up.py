@@ -1,15 +1,18 @@
 """A check-up of all hosts of an inventory at once: what each says, how each reaches the others, as tables."""
 
 import asyncio
+import shlex
+from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 from rich.table import Table
+from rich.text import Text
 
 from zsim.errors import ZsimError
-from zsim_deploy import doctor
+from zsim_deploy import credentials, doctor
 from zsim_deploy import inventory as inv
 from zsim_deploy.host_link import HostLink
-from zsim_deploy.inventory import WORLD, Placed
+from zsim_deploy.inventory import Placed
 
 
 class CheckUp(NamedTuple):
@@ -21,16 +24,20 @@ class CheckUp(NamedTuple):
 
 
 def check_up(placed: Placed, places: dict[str, str] | None) -> CheckUp:
-    """Check the hosts; with a placement also the paths to where the world and the routers listen."""
-    return asyncio.run(_check_up(placed, places))
+    """Check certificates and hosts; with a placement also the paths to where the world and the routers listen."""
+    found = asyncio.run(_check_up(placed, places))
+    lacks = credentials.lacks(placed, places, datetime.now(UTC))
+    warning = credentials.exposed(placed)
+    return found._replace(faults=[*lacks, *found.faults], warnings=[*found.warnings, *([warning] if warning else [])])
 
 
 async def _check_up(placed: Placed, places: dict[str, str] | None) -> CheckUp:
     links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
     pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
+    hosts = shlex.quote(str(placed.folder / placed.source))
     try:
         asked = await asyncio.gather(
-            *(doctor.about(link, pythons[name]) for name, link in links.items()), return_exceptions=True
+            *(doctor.about(link, pythons[name], hosts) for name, link in links.items()), return_exceptions=True
         )
         reports: dict[str, doctor.Report] = {}
         faults: list[str] = []
@@ -54,16 +61,9 @@ async def _check_up(placed: Placed, places: dict[str, str] | None) -> CheckUp:
 async def _paths(
     placed: Placed, places: dict[str, str], links: dict[str, HostLink], pythons: dict[str, str], there: set[str]
 ) -> list[doctor.Path]:
-    """Return how every host reaches what its roles connect to."""
-    wanted: dict[tuple[str, int], set[str]] = {}
-    for host in set(places.values()):
-        router = placed.inventory.hosts[host].router
-        via = placed.inventory.routers[router] if router else None
-        target = (via.host, via.port) if via else (places[WORLD], placed.inventory.port)
-        if target[0] != host:
-            wanted.setdefault(target, set()).add(host)
+    """Return how the hosts reach what their roles and routers connect to, one path after the other."""
     found: list[doctor.Path] = []
-    for (target, port), sources in wanted.items():
+    for (target, port), sources in inv.connections(placed, places).items():
         if target in there:
             chosen = [links[name] for name in sorted(sources & there)]
             found += await doctor.reached(chosen, links[target], pythons, port)
@@ -74,7 +74,7 @@ def _hosts_table(reports: dict[str, doctor.Report]) -> Table:
     shown = Table("host", "python", "zsim", "round trip", "clock", "load", "cores", "governor", "fingerprint", box=None)
     for name, report in reports.items():
         said = report.said
-        shown.add_row(
+        cells = (
             name,
             said["python"],
             said["zsim"],
@@ -85,13 +85,14 @@ def _hosts_table(reports: dict[str, doctor.Report]) -> Table:
             ", ".join(said["governors"]) or "-",
             said["fingerprint"][:8],
         )
+        shown.add_row(*map(Text, cells))  # what a host says may have brackets
     return shown
 
 
 def _paths_table(paths: list[doctor.Path]) -> Table:
     shown = Table("from", "to", "port", "round trip", "bandwidth", box=None)
     for path in paths:
-        shown.add_row(path.source, path.target, str(path.port), *_path_figures(path.found))
+        shown.add_row(*map(Text, (path.source, path.target, str(path.port), *_path_figures(path.found))))
     return shown
 
 

@@ -110,13 +110,17 @@ class Child:
             self._reader.join(timeout=1.0)
         return True
 
+    def kill(self) -> None:
+        """Send SIGKILL, as to one that hangs."""
+        if self._process is not None:
+            self._process.kill()
+
     def close(self) -> None:
         """End it whatever it does, and give its pipes back."""
         if self._process is None:
             return
-        if self._process.poll() is None:
-            self._process.kill()
-            self._process.wait()
+        self.kill()
+        self._process.wait()
         if self._reader is not None:
             self._reader.join(timeout=1.0)
         for pipe in (self._process.stdin, self._process.stdout):

@@ -16,6 +16,7 @@ from zsim_deploy.arguments import (
     Duration,
     Federation,
     Host,
+    Insecure,
     Launched,
     RateOption,
     Realtime,
@@ -61,6 +62,7 @@ def run(
     listen: Annotated[
         str | None, typer.Option(help="Endpoint of the world (default tcp/127.0.0.1:7447, or a free port).")
     ] = None,
+    insecure: Insecure = False,
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
     order: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
@@ -73,10 +75,11 @@ def run(
     if in_process and any(given.values()):
         useless = " and ".join(name for name, is_given in given.items() if is_given)
         raise typer.BadParameter(f"--in-process is lockstep, unpaced, without Zenoh; leave out {useless}, or it")
-    check_endpoint(listen)
+    check_endpoint(listen, insecure)
     loaded = load_scenario(scenario, set_, seed, duration)
     mode, pace = mode_and_rate(realtime, rate)
-    options = Options(loaded, make_directory(out, loaded), mode, pace, listen, [n for n in order.split(",") if n])
+    folder, first = make_directory(out, loaded), [name for name in order.split(",") if name]
+    options = Options(loaded, folder, mode, pace, listen, insecure, first)
     with Screen(loaded.duration_s) as screen:
         try:
             outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)
@@ -157,6 +160,7 @@ def world(
     launched: Launched = None,
     tls: Tls = None,
     access: Access = None,
+    insecure: Insecure = False,
     host: Host = None,
 ) -> None:
     """Run the world: integrates all drones and owns simulated time."""
@@ -164,7 +168,8 @@ def world(
 
     loaded = load_scenario(scenario, set_, seed, duration)
     mode, pace = mode_and_rate(realtime, rate)
-    roles.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, identity(host, tls, access))
+    who = identity(host, tls, insecure, access)
+    roles.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who)
 
 
 @app.command(rich_help_panel=ROLES)
@@ -175,12 +180,13 @@ def estimator(
     wait: Wait = None,
     launched: Launched = None,
     tls: Tls = None,
+    insecure: Insecure = False,
     host: Host = None,
 ) -> None:
     """Run the estimator of one drone."""
     from zsim_deploy import roles
 
-    roles.agent(roles.estimator(drone), connect, federation, wait, launched, identity(host, tls))
+    roles.agent(roles.estimator(drone), connect, federation, wait, launched, identity(host, tls, insecure))
 
 
 @app.command(rich_help_panel=ROLES)
@@ -191,12 +197,13 @@ def controller(
     wait: Wait = None,
     launched: Launched = None,
     tls: Tls = None,
+    insecure: Insecure = False,
     host: Host = None,
 ) -> None:
     """Run the cluster-space controller of one cluster."""
     from zsim_deploy import roles
 
-    roles.agent(roles.controller(cluster), connect, federation, wait, launched, identity(host, tls))
+    roles.agent(roles.controller(cluster), connect, federation, wait, launched, identity(host, tls, insecure))
 
 
 @app.command(rich_help_panel=ROLES)
@@ -207,12 +214,13 @@ def record(
     wait: Wait = None,
     launched: Launched = None,
     tls: Tls = None,
+    insecure: Insecure = False,
     host: Host = None,
 ) -> None:
     """Record every message of a federation into run.mcap."""
     from zsim_deploy import roles
 
-    roles.recorder(out / "run.mcap", connect, federation, wait, launched, identity(host, tls))
+    roles.recorder(out / "run.mcap", connect, federation, wait, launched, identity(host, tls, insecure))
 
 
 @app.command(rich_help_panel=ROLES)
@@ -225,13 +233,14 @@ def router(
     launched: Launched = None,
     tls: Tls = None,
     access: Access = None,
+    insecure: Insecure = False,
     host: Host = None,
 ) -> None:
     """Run a router: carries the clients of one network to a world, or a router, in another."""
     from zsim_deploy import roles
 
     mode = "realtime" if realtime else "lockstep"
-    roles.router(name, listen, connect, federation, mode, launched, identity(host, tls, access))
+    roles.router(name, listen, connect, federation, mode, launched, identity(host, tls, insecure, access))
 
 
 def _version(asked: bool) -> None:

@@ -1,17 +1,30 @@
 """Who needs a certificate, and whom each listening process lets in: from an inventory and a scenario. Pure."""
 
-import fnmatch
+import shlex
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from zsim import keys
 from zsim.errors import InventoryError
-from zsim.rights import OPERATOR, RECORDER, ROUTER, WORLD
+from zsim.rights import OPERATOR, ROUTER, WORLD
 from zsim.scenario import Scenario
 from zsim_deploy import inventory as inv
 from zsim_deploy.access import access_control
 from zsim_deploy.inventory import Placed
 
 OPERATORS = "operators"  # folder of the operators that are at no host of the inventory
+
+
+def folder_of(placed: Placed) -> Path:
+    """Return the folder of an inventory's certificates."""
+    return placed.folder / Path(placed.inventory.security.certificates).expanduser()
+
+
+def init_command(placed: Placed, renew: bool = False) -> str:
+    """Return the command that makes an inventory's certificates, as a person is told to type it."""
+    words = ["zsim", "certs", "init", str(placed.folder / placed.source)]
+    return " ".join([shlex.join(words), "--scenario FILE", *(["--renew"] if renew else [])])
 
 
 class Wanted(NamedTuple):
@@ -35,30 +48,30 @@ class Enrolment:
         placed: the inventory.
         scenario: whose processes run.
         operators: people and programs that look and command, each NAME or NAME@HOST; at a host they come in as its
-            roles do, through its router if it has one, otherwise at the world.
+            roles do, through its router if it has one, otherwise at the world. One may be at several places.
 
     Raises:
         InventoryError: a process has no place, or an operator is at no host of the inventory.
+        BadNameError: an operator's name is none of the contract.
     """
 
     def __init__(self, placed: Placed, scenario: Scenario, operators: Sequence[str] = ()) -> None:
         self._inventory = placed.inventory
         self._scenario = scenario
         self._places = inv.placement(placed, scenario)
-        self._operators = dict(self._read_operator(text, placed.source) for text in operators)
+        self._operators = list(dict.fromkeys(self._read_operator(text, placed.source) for text in operators))
 
     def certificates(self) -> list[Wanted]:
-        """Return the certificates; a role has one for each host of its entry in `roles`, so that it can be moved."""
-        fixed = [(self._places[name], name) for name in (WORLD, RECORDER)]
+        """Return the certificates; a role has one for every host, so that it can be moved there during a run."""
+        fixed = [(self._places[WORLD], WORLD)]
         fixed += [(router.host, f"{ROUTER}.{name}") for name, router in self._inventory.routers.items()]
-        movable = [(host, name) for name in self._movable() for host in self._hosts_of(name)]
-        operators = [(host or OPERATORS, name) for name, host in self._operators.items()]
+        movable = [(host, name) for name in self._movable() for host in self._inventory.hosts]
+        operators = [(host or OPERATORS, name) for name, host in self._operators]
         return [Wanted(host, name, self._addresses(host)) for host, name in [*fixed, *movable, *operators]]
 
     def access(self) -> Iterator[tuple[str, str, dict[str, Any]]]:
         """Yield (host, process, access control) of every process that listens."""
-        everybody = [name for name in self._places if name != WORLD]
-        clients = [*everybody, *(name for name, host in self._operators.items() if self._router_of(host) is None)]
+        clients = [*self._movable(), *self._operators_at(None)]
         yield self._places[WORLD], WORLD, access_control(self._scenario, clients, self._below(None))
         for name, router in self._inventory.routers.items():
             above = f"{ROUTER}.{router.upstream}" if router.upstream else WORLD
@@ -66,14 +79,15 @@ class Enrolment:
             yield router.host, f"{ROUTER}.{name}", rules
 
     def _read_operator(self, text: str, source: str) -> tuple[str, str | None]:
-        name, _, host = text.partition("@")
-        if host and host not in self._inventory.hosts:
+        name, at, host = text.partition("@")
+        name = keys.name(name.removeprefix(f"{OPERATOR}."), OPERATOR)
+        if at and host not in self._inventory.hosts:
             known = ", ".join(self._inventory.hosts)
             raise InventoryError([f"{source}: operator {name!r} is at {host!r}; must be one of hosts: {known}"])
-        return f"{OPERATOR}.{name.removeprefix(f'{OPERATOR}.')}", host or None
+        return f"{OPERATOR}.{name}", host or None
 
     def _movable(self) -> list[str]:
-        return [name for name in self._places if name not in (WORLD, RECORDER)]
+        return [name for name in self._places if name != WORLD]
 
     def _addresses(self, host: str) -> tuple[str, ...]:
         return (self._inventory.hosts[host].address,) if host in self._inventory.hosts else ()
@@ -91,15 +105,10 @@ class Enrolment:
         return [*self._at(router), *(process for name in lower for process in self._behind(name))]
 
     def _at(self, router: str) -> list[str]:
-        """Return the processes that may come to a router: those whose entry in `roles` has one of its hosts."""
-        roles = [name for name in self._places if any(self._router_of(host) == router for host in self._hosts_of(name))]
-        return [*roles, *(name for name, host in self._operators.items() if self._router_of(host) == router)]
+        """Return the processes that may come to a router: every role, as any may be moved to a host of it."""
+        has_hosts = any(host.router == router for host in self._inventory.hosts.values())
+        return [*(self._movable() if has_hosts else []), *self._operators_at(router)]
 
-    def _hosts_of(self, process: str) -> list[str]:
-        """Return the hosts on which a process may run, now or after a move."""
-        given = self._inventory.roles
-        matching = [key for key in given if fnmatch.fnmatchcase(process, key)]
-        if not matching:
-            return [self._places[process]]
-        hosts = given[max(matching, key=lambda key: (key == process, len(key)))]
-        return [hosts] if isinstance(hosts, str) else list(dict.fromkeys(hosts))
+    def _operators_at(self, router: str | None) -> list[str]:
+        """Return the operators that come in at a router, or at the world."""
+        return list(dict.fromkeys(name for name, host in self._operators if self._router_of(host) == router))

@@ -5,9 +5,13 @@ All connections live on one event loop in a thread of its own (`Loop`), so that 
 
 import asyncio
 import contextlib
+import io
+import tarfile
 import threading
 import time
-from collections.abc import Coroutine
+from collections.abc import AsyncIterator, Coroutine, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,6 +25,8 @@ from zsim_deploy.ssh import connect
 ECHO_S = 0.5  # how often a word goes to the host and back
 RETRY_S = 0.5  # between two attempts to connect again
 CLOSE_S = 1.0  # how long a connection may take to close; a cut one never does
+ANSWER_S = 10.0  # how long a short command may take; a host on a poor link answers within a few round trips
+CHANNELS = 8  # kept open on one connection; sshd allows 10 (MaxSessions of sshd_config(5)), and a closed one goes later
 
 Result = TypeVar("Result")
 
@@ -42,13 +48,13 @@ class Loop:
         future = asyncio.run_coroutine_threadsafe(work, self._loop)
         try:
             return future.result(timeout_s)
-        except TimeoutError:
-            future.cancel()
+        except BaseException:
+            future.cancel()  # Ctrl-C, too
             raise
 
-    def spawn(self, work: Coroutine[Any, Any, None]) -> None:
-        """Start a coroutine that nobody waits for."""
-        asyncio.run_coroutine_threadsafe(work, self._loop)
+    def spawn(self, work: Coroutine[Any, Any, None]) -> Future[None]:
+        """Start a coroutine that nobody waits for; it can be cancelled."""
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
 
     def tell(self, act: Any, *args: Any) -> None:
         """Call a plain function on the loop's thread."""
@@ -59,6 +65,8 @@ class Loop:
         self.call(self._cancel_all(), CLOSE_S)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(CLOSE_S)
+        if not self._thread.is_alive():
+            self._loop.close()
 
     @staticmethod
     async def _cancel_all() -> None:
@@ -68,8 +76,16 @@ class Loop:
         await asyncio.wait(others, timeout=CLOSE_S / 2) if others else None
 
 
+@dataclass
+class Line:
+    """A connection, and how many of its channels are in use."""
+
+    connection: asyncssh.SSHClientConnection
+    channels: int = 0
+
+
 class HostLink:
-    """One host.
+    """One host; more connections are opened to it as one has no room for another channel.
 
     Args:
         name: in the inventory.
@@ -87,59 +103,103 @@ class HostLink:
         self.round_trip_s = 0.0
         self.heard_s = 0.0
         self._base = base
-        self._connection: asyncssh.SSHClientConnection | None = None
+        self._lines: list[Line] = []
         self._lock = asyncio.Lock()
 
     async def open(self) -> asyncssh.SSHClientConnection:
-        """Return the connection, made anew where it is lost.
+        """Return a connection on which there is room for a short use, made anew where it is lost.
 
         Raises:
             HostsError: the host cannot be reached, or does not let us in.
         """
         async with self._lock:
-            if self._connection is None or self._connection.is_closed():
-                self._connection = await connect(self.name, self.host, self._base)
-            return self._connection
+            return (await self._with_room()).connection
 
-    async def insist(self) -> asyncssh.SSHClientConnection:
-        """Return the connection; try until the host is there."""
+    @contextlib.asynccontextmanager
+    async def channel(self, patient: bool = False) -> AsyncIterator[asyncssh.SSHClientConnection]:
+        """Lend a connection for one channel.
+
+        Args:
+            patient: try until the host is there.
+
+        Raises:
+            HostsError: as `open`, if not patient.
+        """
+        line = await self._reserved(patient)
+        try:
+            yield line.connection
+        finally:
+            line.channels -= 1
+
+    async def _reserved(self, patient: bool) -> Line:
         while True:
             try:
-                return await self.open()
+                async with self._lock:
+                    line = await self._with_room()
+                    line.channels += 1
+                    return line
             except HostsError:
-                await asyncio.sleep(RETRY_S)
+                if not patient:
+                    raise
+            await asyncio.sleep(RETRY_S)
 
-    async def run(self, command: str, given: bytes = b"", timeout_s: float = 10.0) -> bytes:
+    async def _with_room(self) -> Line:
+        self._lines = [line for line in self._lines if not line.connection.is_closed()]
+        for line in self._lines:
+            if line.channels < CHANNELS:
+                return line
+        self._lines.append(Line(await connect(self.name, self.host, self._base)))
+        return self._lines[-1]
+
+    async def run(self, command: str, given: bytes = b"", timeout_s: float = ANSWER_S, what: str = "") -> bytes:
         """Return what a command prints.
+
+        Args:
+            command: line of a POSIX shell.
+            given: its standard input.
+            timeout_s: how long it may take.
+            what: it does, for errors; its first word if not given.
 
         Raises:
             HostsError: it failed, or took too long; with the last line that it said.
         """
-        connection = await self.open()
-        try:
-            done = await asyncio.wait_for(connection.run(command, input=given, encoding=None), timeout_s)
-        except TimeoutError as error:
-            raise HostsError(f"{self.name}: no answer within {timeout_s:g} s to {command[:60]!r}") from error
-        except (asyncssh.Error, OSError) as error:
-            raise HostsError(f"{self.name}: the connection broke ({error}); is the host up?") from error
+        async with self.channel() as connection:
+            try:
+                done = await asyncio.wait_for(connection.run(command, input=given, encoding=None), timeout_s)
+            except TimeoutError as error:
+                said = what or repr(command[:60])
+                raise HostsError(f"{self.name}: no answer within {timeout_s:g} s to {said}") from error
+            except (asyncssh.Error, OSError) as error:
+                raise HostsError(f"{self.name}: the connection broke ({error}); is the host up?") from error
         if done.exit_status != 0:
             lines = _text(done.stderr).strip().splitlines() or ["it said nothing"]
-            raise HostsError(f"{self.name}: {command.split(' ', 1)[0]} failed ({done.exit_status}): {lines[-1][:200]}")
+            what = what or command.split(" ", 1)[0]
+            raise HostsError(f"{self.name}: {what} failed ({done.exit_status}): {lines[-1][:200]}")
         return done.stdout if isinstance(done.stdout, bytes) else b""
 
-    async def put_file(self, path: str, content: bytes, mode: int = 0o644) -> None:
-        """Write a file on the host; its folder is made, and a half-written file is never seen."""
-        folder, part = path.rpartition("/")[0], f"{path}.part"
-        into, new, old = shell.word(folder), shell.word(part), shell.word(path)
-        script = f"umask 077; mkdir -p {into} && cat > {new} && chmod {mode:o} {new} && mv {new} {old}"
-        await self.run(script, content)
+    async def put_files(self, folder: str, files: Mapping[str, bytes], timeout_s: float = ANSWER_S) -> None:
+        """Write files below a folder of the host, readable by their owner alone: all, or none where the link breaks.
+
+        Args:
+            folder: made if it is not there.
+            files: path below the folder to content.
+            timeout_s: how long it may take.
+
+        Raises:
+            HostsError: they could not be written.
+        """
+        content = archive(files)
+        into, part = shell.word(folder), shell.word(f"{folder}/.part")
+        is_whole = f"[ $(wc -c < {part}) -eq {len(content)} ] || {{ echo it came in part >&2; exit 1; }}"
+        unpack = f"{{ {is_whole}; }} && tar -xof {part} -C {into}"
+        script = f"umask 077; mkdir -p {into} && cat > {part} && {unpack} && rm {part}"
+        await self.run(script, content, timeout_s, f"writing into {folder}")
 
     async def echo(self) -> None:
         """Send a word there and back for ever, so that a lost host is noticed within a second."""
         while True:
             with contextlib.suppress(HostsError, asyncssh.Error, OSError):
-                connection = await self.open()
-                async with connection.create_process("cat", encoding="utf-8") as mirror:
+                async with self.channel() as connection, connection.create_process("cat", encoding="utf-8") as mirror:
                     await self._echo(mirror)
             await asyncio.sleep(RETRY_S)
 
@@ -158,11 +218,23 @@ class HostLink:
         return max(0.0, time.monotonic() - self.heard_s - ECHO_S) if self.heard_s else 0.0
 
     async def close(self) -> None:
-        """Close the connection; what still runs there on its pipes ends by itself."""
-        if self._connection is not None:
-            self._connection.close()
-            with contextlib.suppress(TimeoutError, asyncssh.Error, OSError):
-                await asyncio.wait_for(self._connection.wait_closed(), CLOSE_S)
+        """Close all connections; what still runs there on their pipes ends by itself."""
+        for line in self._lines:
+            line.connection.close()
+        closed = asyncio.gather(*(line.connection.wait_closed() for line in self._lines), return_exceptions=True)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(closed, CLOSE_S)
+
+
+def archive(files: Mapping[str, bytes]) -> bytes:
+    """Return a tar archive of files that their owner alone may read."""
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        for path, content in files.items():
+            entry = tarfile.TarInfo(path)
+            entry.size, entry.mode, entry.mtime = len(content), 0o600, int(time.time())
+            tar.addfile(entry, io.BytesIO(content))
+    return packed.getvalue()
 
 
 def _text(data: Any) -> str:

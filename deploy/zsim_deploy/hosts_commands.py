@@ -1,8 +1,10 @@
 """The commands of a run on several hosts."""
 
+import contextlib
 import json
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,17 +35,31 @@ def up(
     from zsim_deploy import inventory
     from zsim_deploy.board import Board
     from zsim_deploy.cli import conclude
-    from zsim_deploy.run import make_directory
     from zsim_deploy.up import Options, Up
 
     loaded = load_scenario(scenario, set_, seed, duration)
     placed = inventory.load(hosts)
     inventory.placement(placed, loaded)
     mode, pace = mode_and_rate(realtime, rate)
-    options = Options(loaded, placed, make_directory(out, loaded), mode, pace)
-    with Board(loaded.duration_s) as board:
-        outcome = Up(options, board).go()
-    conclude(outcome, options.out, report)
+    with _folder(out, loaded) as folder:
+        with Board(loaded.duration_s) as board:
+            outcome = Up(Options(loaded, placed, folder, mode, pace), board).go()
+        conclude(outcome, folder, report)
+
+
+@contextlib.contextmanager
+def _folder(out: Path | None, scenario: Any) -> Iterator[Path]:
+    """Lend a folder for a run, which is taken away again if the run was refused and nothing is in it."""
+    from zsim_deploy.run import make_directory
+
+    was_there = out is not None and out.exists()
+    folder = make_directory(out, scenario)
+    try:
+        yield folder
+    finally:
+        if not was_there:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
 
 
 def down(federation: Federation = "zsim") -> None:

@@ -4,7 +4,8 @@ Pure: reads a file and answers questions; nothing here opens a connection. docs/
 """
 
 import fnmatch
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -14,10 +15,10 @@ from msgspec import Meta
 from zsim import yaml_file
 from zsim.errors import InventoryError
 from zsim.faults import Fault, faults, sound
+from zsim.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario import Name, Scenario, Spec
 
 EXAMPLE = "examples/hosts.yaml"  # named to whoever gives no inventory
-WORLD, RECORDER = "world", "recorder"
 ZENOH_PORT = 7447  # Zenoh's own
 SSH_PORT = 22  # IANA
 ROUTER_PORT = 7448  # beside a world on the same host
@@ -152,71 +153,91 @@ def roles(scenario: Scenario) -> list[str]:
 
 
 def placement(placed: Placed, scenario: Scenario) -> dict[str, str]:
-    """Return the host of every process of a scenario; a name counts more than a pattern, a longer pattern more.
-
-    The recorder is at the world's host unless it is placed.
+    """Return the host of every process of a scenario, as `spread` says.
 
     Raises:
         InventoryError: a process has no place, or nothing matches a pattern.
     """
     given = placed.inventory.roles
     names = roles(scenario)
-    matches = {name: _best(given, name) for name in names}
-    if matches[RECORDER] is None and matches[WORLD] is not None:
-        matches[RECORDER] = matches[WORLD]
-    lines = [f"roles has no place for {name}; add {name!r}" for name, best in matches.items() if best is None]
+    places = spread(given, names)
+    lines = [f"roles has no place for {name}; add {name!r}" for name in names if name not in places]
     unused = [key for key in given if not any(fnmatch.fnmatchcase(name, key) for name in names)]
     lines += [f"roles.{key} matches no process of {scenario.name!r}; it has {', '.join(names)}" for key in unused]
-    world = matches[WORLD]
-    if world is not None:
-        lines += _port_faults(placed.inventory, _next_of(given, world, {}))
+    if WORLD in places:
+        lines += _port_faults(placed.inventory, places[WORLD])
     if lines:
         raise InventoryError([f"{placed.source}: {line}" for line in lines])
-    taken: dict[str, int] = {}
-    return {name: _next_of(given, best, taken) for name, best in matches.items() if best is not None}
+    return places
+
+
+def spread(given: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict[str, str]:
+    """Return the hosts of processes, without those that have no place; an entry's hosts take turns.
+
+    A name counts more than a pattern, a longer pattern more. The recorder is at the world's host unless it is placed.
+    """
+    found: dict[str, str] = {}
+    turns: Counter[str] = Counter()
+    for name in names:
+        key = entry(given, name)
+        if key is not None:
+            hosts = hosts_of(given, key)
+            found[name] = hosts[turns[key] % len(hosts)]
+            turns[key] += 1
+        elif name == RECORDER and WORLD in found:
+            found[name] = found[WORLD]
+    return found
+
+
+def entry(given: Mapping[str, Name | list[Name]], name: str) -> str | None:
+    """Return the entry that says where a process runs; None if there is none."""
+    matching = [key for key in given if fnmatch.fnmatchcase(name, key)]
+    return max(matching, key=lambda key: (key == name, len(key)), default=None)
+
+
+def hosts_of(given: Mapping[str, Name | list[Name]], key: str) -> list[str]:
+    """Return the hosts that an entry names."""
+    hosts = given[key]
+    return [hosts] if isinstance(hosts, str) else hosts
 
 
 def _port_faults(inventory: Inventory, world: str) -> Iterator[str]:
     """Yield a line for each router whose port another process of its host has."""
     first = {(world, inventory.port): WORLD}
     for name, router in inventory.routers.items():
-        other = first.setdefault((router.host, router.port), f"router.{name}")
-        if other != f"router.{name}":
+        other = first.setdefault((router.host, router.port), f"{ROUTER}.{name}")
+        if other != f"{ROUTER}.{name}":
             yield f"routers.{name}.port is {router.port}, on which {other} listens on {router.host}; give another"
-
-
-def _best(given: dict[str, Any], name: str) -> str | None:
-    """Return the entry that says where a process runs."""
-    matching = [key for key in given if fnmatch.fnmatchcase(name, key)]
-    return max(matching, key=lambda key: (key == name, len(key)), default=None)
-
-
-def _next_of(given: dict[str, Name | list[Name]], key: str, taken: dict[str, int]) -> str:
-    """Return the next host of an entry, in turn."""
-    hosts = given[key]
-    if isinstance(hosts, str):
-        return hosts
-    turn = taken.get(key, 0)
-    taken[key] = turn + 1
-    return hosts[turn % len(hosts)]
 
 
 def endpoint(placed: Placed, places: dict[str, str], host: str) -> str:
     """Return where the roles of a host find the federation: their router, or the world."""
-    inventory = placed.inventory
-    router = inventory.hosts[host].router
-    if router is None:
-        return _at(inventory, places[WORLD], inventory.port)
-    return _at(inventory, inventory.routers[router].host, inventory.routers[router].port)
+    return _at(placed.inventory, *_listener(placed.inventory, places, placed.inventory.hosts[host].router))
 
 
 def upstream(placed: Placed, places: dict[str, str], router: str) -> str:
     """Return what a router connects to."""
+    return _at(placed.inventory, *_listener(placed.inventory, places, placed.inventory.routers[router].upstream))
+
+
+def connections(placed: Placed, places: dict[str, str]) -> dict[tuple[str, int], set[str]]:
+    """Return host and port of what listens, with the other hosts whose roles and routers connect to it."""
     inventory = placed.inventory
-    above = inventory.routers[router].upstream
-    if above is None:
-        return _at(inventory, places[WORLD], inventory.port)
-    return _at(inventory, inventory.routers[above].host, inventory.routers[above].port)
+    ways = [(host, inventory.hosts[host].router) for name, host in places.items() if name != WORLD]
+    ways += [(router.host, router.upstream) for router in inventory.routers.values()]
+    found: dict[tuple[str, int], set[str]] = {}
+    for source, above in ways:
+        target = _listener(inventory, places, above)
+        if target[0] != source:
+            found.setdefault(target, set()).add(source)
+    return found
+
+
+def _listener(inventory: Inventory, places: dict[str, str], router: str | None) -> tuple[str, int]:
+    """Return host and port of a router, or of the world."""
+    if router is None:
+        return places[WORLD], inventory.port
+    return inventory.routers[router].host, inventory.routers[router].port
 
 
 def listening(placed: Placed, host: str, port: int) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from zsim_deploy.arguments import DEFAULT_ENDPOINT, Connect, Federation, Host, Tls, Wait, identity, positive
+from zsim_deploy.arguments import DEFAULT_ENDPOINT, Connect, Federation, Host, Insecure, Tls, Wait, identity, positive
 
 if TYPE_CHECKING:
     from zsim.identity import Identity
@@ -28,12 +28,13 @@ def keys(
     federation: Federation = "zsim",
     wait: Wait = 5.0,
     tls: Tls = None,
+    insecure: Insecure = False,
     host: Host = None,
 ) -> None:
     """List the keys that speak, with their message and how many came in a second."""
     from zsim_deploy import look
 
-    with _link(connect, federation, wait, identity(host, tls)) as (link, _):
+    with _link(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
         for key, kind, count in look.list_keys(link):
             print(f"{key:<36} {kind:<14} {count:>6}")
 
@@ -47,6 +48,7 @@ def echo(
     federation: Federation = "zsim",
     wait: Wait = 5.0,
     tls: Tls = None,
+    insecure: Insecure = False,
     host: Host = None,
 ) -> None:
     """Print the messages on a key as JSON lines."""
@@ -55,7 +57,7 @@ def echo(
     def emit(name: str, message: Any) -> None:
         print(json.dumps({"key": name, "message": message}), flush=True)
 
-    with _link(connect, federation, wait, identity(host, tls)) as (link, _):
+    with _link(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
         look.echo(link, key, count, emit, raw)
 
 
@@ -68,12 +70,13 @@ def hz(
     federation: Federation = "zsim",
     wait: Wait = 5.0,
     tls: Tls = None,
+    insecure: Insecure = False,
     host: Host = None,
 ) -> None:
     """Print how often messages come on a key, in wall and in simulated time."""
     from zsim_deploy import look
 
-    with _link(connect, federation, wait, identity(host, tls)) as (link, _):
+    with _link(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
         look.hz(link, key, window, seconds or math.inf, lambda line: print(line, flush=True))
 
 
@@ -87,12 +90,13 @@ def pub(
     federation: Federation = "zsim",
     wait: Wait = 5.0,
     tls: Tls = None,
+    insecure: Insecure = False,
     host: Host = None,
 ) -> None:
     """Send a command to a drone; t_ns, seq and source are filled in."""
     from zsim_deploy import poke
 
-    with _link(connect, federation, wait, identity(host, tls)) as (link, info):
+    with _link(connect, federation, wait, identity(host, tls, insecure)) as (link, info):
         sent = poke.publish(link, info, key, message, count, rate_hz)
     print(f"published {sent} on {key}")
 
@@ -106,12 +110,13 @@ def ask(
     federation: Federation = "zsim",
     wait: Wait = 5.0,
     tls: Tls = None,
+    insecure: Insecure = False,
     host: Host = None,
 ) -> None:
     """Send a request to the world or a controller and print the answer."""
     from zsim_deploy import poke
 
-    with _link(connect, federation, wait, identity(host, tls)) as (link, _):
+    with _link(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
         result = poke.ask(link, key, op, args)
     print("ok" if result is None else json.dumps(result))
 

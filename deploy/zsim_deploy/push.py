@@ -13,6 +13,7 @@ import asyncssh
 from zsim import __version__
 from zsim.errors import HostsError, InventoryError
 from zsim_deploy import extras, on_host, shell, warm_up
+from zsim_deploy.answer import answer
 from zsim_deploy.host_link import HostLink
 from zsim_deploy.inventory import Host, Placed
 from zsim_deploy.target import chosen, interpreters, question, target
@@ -73,7 +74,7 @@ async def _one(name: str, host: Host, base: Path, wanted: frozenset[str], house:
     link = HostLink(name, host, base)
     try:
         told(name, "looking what is there")
-        there = _There(link, host.folder)
+        there = There(link, host.folder)
         await there.look()
         needed = await house.house(name, target(name, there.found), wanted)
         described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
@@ -115,7 +116,7 @@ def missing(house: House, found: dict[str, Any]) -> list[Wheel]:
     return sorted(lacking, key=lambda wheel: -wheel.size_bytes)
 
 
-class _There:
+class There:
     """What is on a host, and what is done to it."""
 
     def __init__(self, link: HostLink, folder: str) -> None:
@@ -125,10 +126,13 @@ class _There:
 
     async def look(self) -> None:
         """Find the Python to install for, and what is installed."""
-        answer = await self._link.run(shell.line(["sh", "-c", question()]), timeout_s=ASK_S)
-        found = interpreters(answer.decode(errors="replace"))
+        pythons = await self._link.run(shell.line(["sh", "-c", question()]), timeout_s=ASK_S)
+        found = interpreters(pythons.decode(errors="replace"))
         self._python = chosen(self._link.name, found, sys.version_info[:2]).path
-        self.found = json.loads(await self._run("look", timeout_s=ASK_S))
+        said = answer((await self._run("look", timeout_s=ASK_S)).decode(errors="replace").splitlines())
+        if said is None:
+            raise HostsError(f"{self._link.name}: {self._python} says nothing; does it run there?")
+        self.found = said
 
     async def install(self, house: House) -> None:
         order = {

@@ -10,7 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
+from concurrent.futures import Future
 from typing import Any
 
 import asyncssh
@@ -19,11 +19,13 @@ from zsim.errors import HostsError
 from zsim_deploy import shell
 from zsim_deploy.child import SINGLE_THREADED
 from zsim_deploy.host_link import HostLink, Loop
+from zsim_deploy.log import Log
 
 BEAT_S = 1.0  # how often the launcher shows that it lives
 ORPHAN_S = 60.0  # without a beat a process ends itself; a link may be cut for shorter than that
-KILL_S = 2.0  # how long a kill may take to reach the host
+KILL_S = 5.0  # how long a kill may take to reach the host: a few round trips
 LOST = -1000  # code of a process of which nobody knows how it ended
+PID = "zsim-pid "  # begins the line with its process id; a login shell may say something before
 
 
 class Remote:
@@ -35,7 +37,7 @@ class Remote:
         link: to the host.
         python: interpreter there that has zsim.
         loop: on which the link lives.
-        logs: folder here for what it says.
+        log: for what it says.
         on_line: told every line of its standard output; None sends that to the log too.
     """
 
@@ -46,7 +48,7 @@ class Remote:
         link: HostLink,
         python: str,
         loop: Loop,
-        logs: Path,
+        log: Log,
         on_line: Callable[[str], None] | None = None,
     ) -> None:
         self.name = name
@@ -59,10 +61,12 @@ class Remote:
         self._link = link
         self._python = python
         self._loop = loop
-        self._log = logs / f"{name}.log"
+        self._log = log
         self._on_line = on_line
         self._process: asyncssh.SSHClientProcess[str] | None = None
+        self._life: Future[None] | None = None
         self._code: int | None = None
+        self._fault = ""
         self._ended = threading.Event()
         self._stop: str | None = None
 
@@ -79,30 +83,34 @@ class Remote:
 
     def start(self) -> None:
         """Start it, or start it again; returns at once."""
-        self.pid, self._code, self._process, self._stop = 0, None, None, None
+        self.pid, self._code, self._process, self._stop, self._fault = 0, None, None, None, ""
         self._ended.clear()
         self.started_s = time.monotonic()
-        self._loop.spawn(self._live())
+        self._life = self._loop.spawn(self._live())
 
     async def _live(self) -> None:
-        """Run the process to its end, whatever becomes of the link."""
+        """Run the process to its end, which is noticed whatever happens."""
+        code = LOST
         try:
             code = await self._run()
         except (asyncssh.Error, OSError, HostsError) as error:
-            self._write(f"the connection to {self.host} broke: {error}\n")
-            code = LOST
-        except asyncio.CancelledError:
-            self._code = LOST
+            self._lose(f"the connection to {self.host} broke ({error})")
+        except Exception as error:
+            self._lose(f"the launcher could not follow it ({error!r})")
+        finally:
+            self._code = code
             self._ended.set()
-            raise
-        self._code = code
-        self._ended.set()
+
+    def _lose(self, fault: str) -> None:
+        self._fault = fault
+        self._log.write(f"{fault}\n")
 
     async def _run(self) -> int:
-        connection = await self._link.insist()
-        async with connection.create_process(self._command(), encoding="utf-8", errors="replace") as process:
-            first = await process.stdout.readline()
-            self.pid = int(first) if first.strip().isdigit() else 0
+        async with (
+            self._link.channel(patient=True) as connection,
+            connection.create_process(self._command(), encoding="utf-8", errors="replace") as process,
+        ):
+            self.pid = await _pid(process.stdout)
             self._process = process
             process.stdin.write(f"orphan-after {ORPHAN_S:g}\n")
             if self._stop is not None:
@@ -118,18 +126,14 @@ class Remote:
     def _command(self) -> str:
         words = [self._python, "-m", "zsim_deploy.cli", *self._arguments]
         settings = " ".join(f"{name}={value}" for name, value in SINGLE_THREADED.items())
-        return f"echo $$; exec env {settings} {shell.line(words)}"
+        return f"echo {PID}$$; exec env {settings} {shell.line(words)}"
 
     async def _read_lines(self, stream: Any, on_line: Callable[[str], None] | None = None) -> None:
         async for line in stream:
             if on_line:
                 on_line(line)
             else:
-                self._write(line)
-
-    def _write(self, line: str) -> None:
-        with self._log.open("a", errors="replace") as log:
-            log.write(line)
+                self._log.write(line)
 
     @staticmethod
     async def _beat(process: "asyncssh.SSHClientProcess[str]") -> None:
@@ -142,7 +146,7 @@ class Remote:
         """Say in words how it ended."""
         code = self._code
         if code == LOST:
-            return f"the connection to {self.host} broke"
+            return self._fault or f"the connection to {self.host} broke"
         if code is not None and code < 0:
             return f"killed by signal {-code}"
         last = self.last_words()
@@ -150,11 +154,7 @@ class Remote:
 
     def last_words(self) -> str:
         """Return the last line that it wrote to its log."""
-        try:
-            lines = self._log.read_text(errors="replace").strip().splitlines()
-        except OSError:
-            return ""
-        return lines[-1] if lines else ""
+        return self._log.last
 
     def tell_stop(self, reason: str) -> None:
         """Ask it to leave; harmless when it is gone, remembered when it is still on its way."""
@@ -170,17 +170,32 @@ class Remote:
         """Wait until it has ended; return whether it has."""
         return self._ended.wait(max(0.0, timeout_s))
 
+    def kill(self) -> None:
+        """Send SIGKILL, as to one that hangs, or stop trying to start it; returns at once."""
+        if self._code is not None or self._life is None:
+            return
+        if self.pid:
+            self._loop.spawn(self._kill(self.pid))
+        else:
+            self._life.cancel()
+
+    async def _kill(self, pid: int) -> None:
+        with contextlib.suppress(HostsError):
+            await self._link.run(f"kill -9 {pid}", timeout_s=KILL_S)
+
     def close(self) -> None:
         """End it whatever it does; one that cannot be reached ends by itself."""
-        if self._code is None and self.pid:
-            with contextlib.suppress(TimeoutError, HostsError):
-                self._loop.call(self._link.run(f"kill -9 {self.pid}", timeout_s=KILL_S), KILL_S + 1.0)
+        if self._life is not None:
+            self.kill()
             self._ended.wait(KILL_S)
 
-    def kill(self) -> None:
-        """Send SIGKILL, as to one that hangs; what `on_death` says follows."""
-        if self.pid:
-            self._loop.call(self._link.run(f"kill -9 {self.pid}", timeout_s=KILL_S), KILL_S + 1.0)
+
+async def _pid(said: "asyncssh.SSHReader[str]") -> int:
+    """Return the process id that the shell says, 0 if it ends without."""
+    async for line in said:
+        if line.startswith(PID):
+            return int(line.removeprefix(PID))
+    return 0
 
 
 def _code(done: asyncssh.SSHCompletedProcess) -> int:

@@ -7,14 +7,14 @@ from typing import Annotated, Any
 
 import typer
 
-from zsim_deploy.arguments import Duration, RateOption, Realtime, ScenarioPath, Seed, Set
+from zsim_deploy.arguments import Duration, RateOption, Realtime, ScenarioPath, Seed, Set, load_scenario, mode_and_rate
 
 app = typer.Typer(
     name="render", help="Write systemd units, compose files or manifests for an inventory.", no_args_is_help=True
 )
 
 Hosts = Annotated[Path, typer.Option("--hosts", help="Inventory (YAML): which hosts, which role where.")]
-Out = Annotated[Path, typer.Option("--out", help="Folder to write into; files of the same name are replaced.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder to write into; what was rendered there before is replaced.")]
 
 
 @app.command()
@@ -31,7 +31,7 @@ def systemd(
     """Write HOST/zsim-PROCESS.service and HOST/zsim.target for every host."""
     from zsim_deploy.render.systemd import render
 
-    _write(out, render(*_read(hosts, scenario, set_, seed, duration), _pace(realtime, rate)))
+    _write(out, "systemd", render(*_read(hosts, scenario, set_, seed, duration), _pace(realtime, rate)))
 
 
 @app.command()
@@ -48,7 +48,7 @@ def compose(
     """Write HOST/compose.yaml and HOST/Dockerfile for every host."""
     from zsim_deploy.render.compose import render
 
-    _write(out, render(*_read(hosts, scenario, set_, seed, duration), _pace(realtime, rate)))
+    _write(out, "compose", render(*_read(hosts, scenario, set_, seed, duration), _pace(realtime, rate)))
 
 
 @app.command()
@@ -66,18 +66,19 @@ def kubernetes(
     """Write the manifests of a run, a Dockerfile, and a script that makes the Secrets from the certificates."""
     from zsim_deploy.render.kubernetes import IMAGE, render
 
-    _write(out, render(*_read(hosts, scenario, set_, seed, duration), _pace(realtime, rate), image or IMAGE))
+    _write(
+        out, "kubernetes", render(*_read(hosts, scenario, set_, seed, duration), _pace(realtime, rate), image or IMAGE)
+    )
 
 
 def _read(
     hosts: Path, scenario: Path, overrides: list[str] | None, seed: int | None, duration: float | None
 ) -> tuple[Any, Any]:
     """Return the inventory and the scenario; say what has no command in them."""
-    from zsim import scenario_file
     from zsim_deploy import inventory
     from zsim_deploy.render.process import own_programs
 
-    loaded = scenario_file.load(scenario, overrides or (), seed=seed, duration_s=duration)
+    loaded = load_scenario(scenario, overrides, seed, duration)
     placed = inventory.load(hosts)
     for remark in own_programs(placed, loaded):
         print(remark, file=sys.stderr)
@@ -88,23 +89,14 @@ def _pace(realtime: bool, rate: float | None) -> list[str]:
     """Return the world's options for that."""
     from zsim_deploy.render.process import REALTIME
 
-    if rate is not None and not 0 < rate <= 1000:
-        raise typer.BadParameter(f"--rate is {rate:g}; must be > 0 and <= 1000")
-    return [*([REALTIME] if realtime else []), *(["--rate", str(rate)] if rate else [])]
+    mode, pace = mode_and_rate(realtime, rate)
+    return [*([REALTIME] if mode == "realtime" else []), *(["--rate", str(pace)] if pace else [])]
 
 
-def _write(out: Path, texts: Mapping[str, str]) -> None:
-    """Write the texts into a folder; a host named `..` does not lead out of it."""
-    from zsim.errors import RunError
+def _write(out: Path, target: str, texts: Mapping[str, str]) -> None:
+    from zsim_deploy.render.folder import write
 
-    root = out.resolve()
-    for name, text in texts.items():
-        path = (root / name).resolve()
-        if path.parent != root and path.parent.parent != root:
-            raise RunError(f"{name}: leads out of {out}; rename that host in the inventory")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise RunError(f"{path}: cannot be written ({error.strerror}); give --out another folder") from error
-    print(f"{len(texts)} files in {out}")
+    removed = write(out, target, texts)
+    print(
+        f"{len(texts)} files in {out}" + (f"; removed of an earlier rendering: {', '.join(removed)}" if removed else "")
+    )

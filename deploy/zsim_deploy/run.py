@@ -10,6 +10,7 @@ from pathlib import Path
 
 from zsim import scenario_file
 from zsim.errors import RecordError, RunError, SessionError
+from zsim.identity import Identity
 from zsim.record import repair
 from zsim.scenario import Scenario
 from zsim_deploy.child import Child
@@ -30,6 +31,7 @@ class Options:
     mode: str = "lockstep"
     rate: float = 0.0
     listen: str | None = None
+    insecure: bool = False
     order: list[str] = field(default_factory=list)
 
 
@@ -38,7 +40,7 @@ def _children(options: Options, endpoint: str, watch: Watch) -> list[Child]:
     logs, file = options.out / "logs", options.out / "scenario.yaml"
     scenario, federation = options.scenario, options.scenario.federation
     # Another run's world may listen where ours could not: nobody of this run is to join that one.
-    launched = ["--launched", uuid.uuid4().hex[:12]]
+    launched = ["--launched", uuid.uuid4().hex[:12], *(["--insecure"] if options.insecure else [])]
     reach = ["--connect", endpoint, "--federation", federation, *launched]
     pace = ["--realtime"] if options.mode == "realtime" else []
     pace += ["--rate", str(options.rate)] if options.rate else []
@@ -56,17 +58,17 @@ def _children(options: Options, endpoint: str, watch: Watch) -> list[Child]:
     return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
 
 
-def check_endpoint(endpoint: str | None) -> None:
+def check_endpoint(endpoint: str | None, insecure: bool) -> None:
     """Refuse an endpoint on which no world can listen, before anything is started.
 
     Raises:
-        SessionError: it is malformed.
+        SessionError: it is malformed, or less secure than was asked for.
     """
     if endpoint is None:
         return
     from zsim.session import check_listening
 
-    check_listening([endpoint])
+    check_listening([endpoint], Identity(insecure=insecure))
     if endpoint.startswith("tcp/") and not re.fullmatch(r"tcp/.+:[0-9]{1,5}", endpoint):
         raise SessionError(f"endpoint is {endpoint!r}; must be tcp/ADDRESS:PORT such as tcp/127.0.0.1:{DEFAULT_PORT}")
 

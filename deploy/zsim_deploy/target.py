@@ -1,5 +1,6 @@
 """Which Python of a host zsim is installed for, and what pip is asked for then. Pure."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -8,6 +9,7 @@ from zsim.errors import HostsError
 OLDEST = (3, 11)  # pyproject.toml, requires-python
 NEWEST_MINOR = 14  # the last Python whose name is tried
 PLAIN = "python3"
+ANSWER = re.compile(r"(python3(?:\.\d+)?) (\d+)\.(\d+)\.(\d+) (/.*)")  # command, version, path
 MANYLINUX_OLDEST = 5  # glibc 2.5; PEP 600
 LEGACY = {
     17: "manylinux2014",
@@ -51,13 +53,9 @@ def question() -> str:
 
 
 def interpreters(answer: str) -> list[Interpreter]:
-    """Return what `question` printed."""
-    found = []
-    for line in answer.splitlines():
-        command, version, path = line.split(" ", 2)
-        major, minor, micro = map(int, version.split("."))
-        found.append(Interpreter(command, (major, minor, micro), path))
-    return found
+    """Return what `question` printed; a greeting of the login shell is passed over."""
+    found = filter(None, map(ANSWER.fullmatch, answer.splitlines()))
+    return [Interpreter(each[1], (int(each[2]), int(each[3]), int(each[4])), each[5]) for each in found]
 
 
 def chosen(name: str, found: Sequence[Interpreter], here: tuple[int, int]) -> Interpreter:

@@ -8,11 +8,13 @@ import json
 import signal
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import Any, Protocol
 
+from zsim.errors import RunError
 from zsim.scenario import OnDeath
 from zsim_deploy.progress import Show
 
@@ -20,6 +22,7 @@ POLL_S = 0.05  # how often the processes are looked at
 END_S = 8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for
 WORLD_FIRST_S = 1.0  # after Ctrl-C, how long the world has to end the run for everybody
 INTERRUPT_S = 2.5  # after Ctrl-C, how long anybody may take; the whole is promised within 3 s
+TAKE_OVER_S = 60.0  # how long a process may stay once another was started in its place; a slow one starts in half
 RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; more is a fault that a restart does not heal
 RESTART_WINDOW_S = 20.0
 USER_FAULT = 2  # exit code of a role that refuses its arguments or cannot run at all
@@ -44,6 +47,7 @@ class Member(Protocol):
     def last_words(self) -> str: ...
     def tell_stop(self, reason: str) -> None: ...
     def wait(self, timeout_s: float) -> bool: ...
+    def kill(self) -> None: ...
     def close(self) -> None: ...
 
 
@@ -77,8 +81,9 @@ class Watch:
         self._until_s: float | None = None
         self._dead: set[str] = set()
         self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
-        self._leaving: list[Member] = []  # their places are taken
-        self._orders: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._leaving: dict[str, tuple[Member, float]] = {}  # whose place was taken, and since when (monotonic, s)
+        self._gone: list[Member] = []  # nobody waits for them any more
+        self._orders: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
     def go(self, look: Callable[[], None] = lambda: None) -> Outcome:
         """Start everything, watch it to its end, leave nothing behind.
@@ -86,6 +91,8 @@ class Watch:
         Args:
             look: called at every look at the processes.
         """
+        if self._interrupted:
+            return Outcome(self._interrupted, interrupted=True)
         with self._interrupts():
             try:
                 for child in self.members:
@@ -93,8 +100,8 @@ class Watch:
                 self._watch(look)
                 self._finish()
             finally:
-                for child in [*self.members, *self._leaving]:
-                    child.close()
+                self._refuse_orders()
+                _close([*self.members, *(child for child, _ in self._leaving.values()), *self._gone])
         return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
 
     @contextlib.contextmanager
@@ -119,6 +126,8 @@ class Watch:
             line = json.loads(text)
         except ValueError:
             return  # not progress: something printed by a library
+        if not isinstance(line, dict):
+            return  # a number that was printed is JSON too
         if "clock" in line:
             self._show.clock(line["clock"])
         elif "event" in line:
@@ -150,33 +159,68 @@ class Watch:
                 if child is not world and child.code is not None and child.name not in self._dead:
                     self._on_exit(child, world)
             self._carry_out_orders()
+            self._see_off()
             look()
             world.wait(POLL_S)
         if world.code != 0:
             self._fail(f"the world died: {world.outcome()}")
 
-    def order(self, act: Callable[[], None]) -> None:
-        """Let the watch do something between two looks at the processes; callable from any thread."""
-        self._orders.put(act)
+    def order(self, act: Callable[[], Any]) -> Future[Any]:
+        """Let the watch do something between two looks at the processes; callable from any thread.
+
+        Returns:
+            what comes of it, also if it fails; cancelled when the run ends before.
+        """
+        outcome: Future[Any] = Future()
+        self._orders.put((act, outcome))
+        return outcome
 
     def interrupt(self, reason: str) -> None:
         """End the run for everybody, as Ctrl-C does."""
         self._interrupted = self._interrupted or reason
 
-    def replace(self, old: Member, new: Member) -> None:
-        """Start a process that takes the place, and the name, of another."""
+    def replace(self, new: Member) -> None:
+        """Start a process that takes the place of the one of its name, which then leaves or is killed.
+
+        Raises:
+            RunError: another one is taking that place at this moment; the last to come would not be the last to join.
+        """
+        self._see_off()
+        if self.is_taken_over(new.name):
+            raise RunError(f"{new.name} is being taken over already; try again when its former process has ended")
+        index = next(i for i, child in enumerate(self.members) if child.name == new.name)
+        old, self.members[index] = self.members[index], new
         new.restarts = old.restarts + 1
-        self.members[self.members.index(old)] = new
         self._dead.discard(new.name)
-        self._leaving.append(old)
+        self._leaving[new.name] = (old, time.monotonic())
+        if not old.pid:
+            old.kill()  # it waits for its host, and must not take the name back when that is there
         new.start()
 
+    def is_taken_over(self, name: str) -> bool:
+        """Tell whether a process is taking the place of another that has not left yet; callable from any thread."""
+        return name in self._leaving
+
+    def _see_off(self) -> None:
+        """Let go of those that have left their place; kill one that hangs there."""
+        for name, (child, since_s) in list(self._leaving.items()):
+            hangs = child.code is None and time.monotonic() - since_s > TAKE_OVER_S
+            if hangs:
+                self._show.say(f"{name} (pid {child.pid}) has not made way within {TAKE_OVER_S:g} s; it is killed")
+                child.kill()
+            if hangs or child.code is not None:
+                del self._leaving[name]
+                self._gone.append(child)
+
     def _carry_out_orders(self) -> None:
-        while True:
-            try:
-                self._orders.get_nowait()()
-            except Empty:
-                return
+        while not self._orders.empty():
+            act, outcome = self._orders.get()
+            if outcome.set_running_or_notify_cancel():
+                _settle(outcome, act)
+
+    def _refuse_orders(self) -> None:
+        while not self._orders.empty():
+            self._orders.get()[1].cancel()
 
     def _on_exit(self, child: Member, world: Member) -> None:
         """Do what on_death says of a role that ended while the world runs."""
@@ -185,7 +229,7 @@ class Watch:
             if child.code == SUPERSEDED:
                 self._show.say(child.last_words())
             return
-        what = self._on_death(child)
+        what = on_death(self._given, child.name)
         if child.code == USER_FAULT or (what == "restart" and self._too_often(child)):
             what = "end"
         self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; on_death: {what}")
@@ -197,9 +241,6 @@ class Watch:
         if what == "end":
             self._fail(f"{child.name} ended: {child.outcome()}")
             world.tell_stop(self._reason)
-
-    def _on_death(self, child: Member) -> str:
-        return self._given.get(child.name) or self._given.get(child.role) or ON_DEATH.get(child.role, "drop")
 
     def _too_often(self, child: Member) -> bool:
         """Note a death; tell whether there were more of them in a row than a restart heals."""
@@ -228,3 +269,24 @@ class Watch:
         latest_s = now_s + (INTERRUPT_S if self._interrupted else END_S)
         self._until_s = latest_s if self._until_s is None else min(self._until_s, latest_s)
         return max(0.0, self._until_s - now_s)
+
+
+def on_death(given: Mapping[str, OnDeath], name: str) -> OnDeath:
+    """Return what is to be done when a process dies: as the scenario says of it or its role, else as ON_DEATH does."""
+    role = name.partition(".")[0]
+    return given.get(name) or given.get(role) or ON_DEATH.get(role, "drop")
+
+
+def _settle(outcome: Future[Any], act: Callable[[], Any]) -> None:
+    """Carry out an order; whatever goes wrong is told to who gave it, and the run goes on."""
+    try:
+        outcome.set_result(act())
+    except Exception as error:
+        outcome.set_exception(error)
+
+
+def _close(members: Sequence[Member]) -> None:
+    """End all of them at once: one that cannot be reached keeps nobody waiting."""
+    with ThreadPoolExecutor(len(members)) as pool:
+        for closed in [pool.submit(member.close) for member in members]:
+            closed.result()

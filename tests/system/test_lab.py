@@ -3,17 +3,17 @@
 import asyncio
 import itertools
 import socket
-import subprocess
+import statistics
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import lab as lab_module
 import namespaces
 import pytest
-from federation import ZSIM, wait_gone
+from federation import Role, wait_gone
 from lab import LAUNCHER, Lab
 
 from zsim.errors import HostsError
@@ -22,6 +22,8 @@ from zsim_deploy.host_link import HostLink
 
 PORT = 9000
 SOON_S, LATE_S = 10.0, 0.4  # an answer that must come, one that must not
+BUSY_S = 0.5  # what a busy machine may add to half of the round trips
+BATCH = 50  # datagrams under way together; any socket's buffer has room for twice as many
 
 
 def over_ssh(lab: Lab, command: str) -> dict[str, str]:
@@ -125,14 +127,14 @@ def test_a_cut_parts_a_host_from_all_others_until_it_is_healed(lab: Lab) -> None
 
 
 def test_a_slow_link_has_its_delay_both_ways(lab: Lab) -> None:
+    least_s, most_s = 2 * 0.040, 2 * 0.060
     with echo(lab, "h3") as link:
-        direct_s = min(link.round_trip_s() or SOON_S for _ in range(5))
         lab.slow("h3", 50, 10)
-        times_s = [link.round_trip_s() or SOON_S for _ in range(8)]
-        assert min(times_s) >= 0.080
-        assert sorted(times_s)[4] <= 0.120 + direct_s + 0.060  # what a busy machine may add
+        times_s = [link.round_trip_s() or SOON_S for _ in range(9)]
+        assert min(times_s) >= least_s
+        assert statistics.median(times_s) <= most_s + BUSY_S
         lab.slow("h3", 0)
-        assert min(link.round_trip_s() or SOON_S for _ in range(5)) < 0.080
+        assert any((link.round_trip_s() or SOON_S) < least_s for _ in range(50))
 
 
 def test_a_slow_link_can_be_cut(lab: Lab) -> None:
@@ -149,31 +151,28 @@ def test_a_slow_link_loses_its_share_and_keeps_the_order(lab: Lab) -> None:
     sent, share = 2000, 0.1
     lab.slow("h1", 20, 20, share)
     with udp(lab, "h1") as there, udp(lab, LAUNCHER) as here:
-        there.settimeout(1.0)
-        for number in range(sent):
-            here.sendto(number.to_bytes(4, "big"), (lab.address("h1"), PORT))
-        came = list(_all(there))
+        came = [number for number in carried(here, there, sent + BATCH) if number < sent]
     assert came == sorted(came)
     assert 0.06 * sent < sent - len(came) < 0.14 * sent  # six standard deviations
 
 
-def _all(there: socket.socket) -> Iterator[int]:
-    """Yield the numbers that come until a second brings none."""
-    try:
-        while True:
-            yield int.from_bytes(there.recv(4), "big")
-    except TimeoutError:
-        return
+def carried(here: socket.socket, there: socket.socket, count: int) -> list[int]:
+    """Send numbers in batches, each when something of the one before is there, and return what comes."""
+    came: list[int] = []
+    there.settimeout(SOON_S)
+    for first in range(0, count, BATCH):
+        for number in range(first, first + BATCH):
+            here.sendto(number.to_bytes(4, "big"), there.getsockname())
+        while not came or came[-1] < first:
+            came.append(int.from_bytes(there.recv(4), "big"))
+    return came
 
 
 def test_processes_of_zsim_are_seen_on_their_host_only(lab: Lab) -> None:
-    with lab.popen(
-        "h2", *ZSIM, "estimator", "drone1", "--connect", f"tcp/{lab.address('h1')}:7447", stderr=subprocess.PIPE
-    ) as role:
-        assert role.stderr
-        role.stderr.readline()  # it waits for a world, and says so
-        assert {name: list(lab.processes(name)) for name in lab.names} == {"h1": [], "h2": [role.pid], "h3": []}
-        role.kill()
+    nowhere = f"tcp/{lab.address('h1')}:7447"
+    with closing(Role(["estimator", "drone1", "--connect", nowhere], lab.prefix("h2"))) as role:
+        role.line("waiting for a world")
+        assert {name: list(lab.processes(name)) for name in lab.names} == {"h1": [], "h2": [role.process.pid], "h3": []}
     assert not lab.processes("h2")
 
 

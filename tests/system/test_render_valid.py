@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -28,6 +29,7 @@ from zsim_deploy.render import compose, kubernetes, systemd
 
 ROOT = Path(__file__).parents[2]
 STEP = ROOT / "scenarios/step.yaml"
+HANGS_S = 300.0  # wall time after which nobody waits any more, on a loaded machine; a flight takes half a minute
 OLDEST, NEWEST = "1.31", "1.37"  # podFailurePolicy is stable from 1.31 on; the newest that the validator knows
 
 HOSTS = f"""
@@ -173,8 +175,10 @@ class Unit(NamedTuple):
     words: list[str]
 
     def __call__(self, *more: str) -> "subprocess.Popen[str]":
+        """Start it, with options before the name, which comes after a double dash."""
+        at = self.words.index("--") if "--" in self.words else len(self.words)
         return subprocess.Popen(
-            [*self.words, *more],
+            [*self.words[:at], *more, *self.words[at:]],
             text=True,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -221,10 +225,14 @@ def laid_out(folder: Path, scenario: str, insecure: bool) -> dict[str, Unit]:
 
 @contextmanager
 def started(process: "subprocess.Popen[str]") -> Iterator["subprocess.Popen[str]"]:
+    """Kill a process at the end of the block, or when that takes too long, so that nobody waits for its output."""
+    guard = threading.Timer(HANGS_S, process.kill)
+    guard.start()
     with process:
         try:
             yield process
         finally:
+            guard.cancel()
             process.kill()
 
 

@@ -37,6 +37,7 @@ def test_each_refusal_is_a_line(lab: Lab, tmp_path: Path) -> None:
             given(lab, key=str(tmp_path / "locked")),
         f"key {lab.folder}/keys/known_hosts is no private key (": given(lab, key="keys/known_hosts"),
         f"{lab.folder}/none cannot be read (No such file or directory); correct hosts.h1.key": given(lab, key="none"),
+        f"{lab.folder}/keys cannot be read (Is a directory); correct hosts.h1.key": given(lab, key="keys"),
         f"the host key of {at} is not in {lab.folder}/keys/client.pub; check it and add it: ssh-keyscan -p 22 ":
             given(lab, known_hosts="keys/client.pub"),
         f"ssh at {lab.address('h1')} port 23 cannot be reached (Connection refused); is sshd on there, the port open?":
@@ -57,3 +58,15 @@ def test_a_host_that_does_not_answer_is_a_line(lab: Lab, monkeypatch: pytest.Mon
         f"h1: ssh at {lab.address('h1')} port {inventory.SSH_PORT} did not answer within 0.5 s; "
         "is it on, is the address right, the port open?"
     )
+
+
+@pytest.mark.parametrize("kind", ["ed25519", "rsa"])
+def test_a_host_key_that_changed_is_not_called_unknown(lab: Lab, tmp_path: Path, kind: str) -> None:
+    at, known = lab.address("h1"), tmp_path / "known_hosts"
+    checked(["ssh-keygen", "-q", "-t", kind, "-N", "", "-C", "", "-f", str(tmp_path / "former")])
+    known.write_text(f"{at} {(tmp_path / 'former.pub').read_text()}")
+    said = refusal(lab, lab.folder, given(lab, known_hosts=str(known)))
+    assert said.startswith(f"h1: the host key of {at} port 22 is not the one in {known} (it shows ")
+    assert f"another machine may pose as h1; ask who runs it, and only if the key was changed there, remove the old one (ssh-keygen -f {known} -R {at})" in said
+    assert "ssh-keyscan" not in said
+    assert "\n" not in said

@@ -101,7 +101,9 @@ def test_a_process_that_takes_the_place_of_ours_has_its_rights(scenario: Any, pr
     assert all(of_others(process, act) == of_others(like, act) for act in ACTS)
 
 
-@pytest.mark.parametrize("process", ["fence.round", "console", "estimator.drone9", "controller.drone1"])
+@pytest.mark.parametrize(
+    "process", ["world.spare", "recorder.spare", "fence.round", "console", "estimator.drone9", "controller.drone1"]
+)
 def test_a_process_about_nothing_known_hears_what_all_are_told(scenario: Any, process: str) -> None:
     found = rights.of(process, scenario)
     assert found.reads == ("world/info", "clock", "world/event")

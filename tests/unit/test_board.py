@@ -75,6 +75,16 @@ def test_a_silent_host_is_named_once_with_its_roles_and_once_when_it_is_back(boa
     assert said(board).count("host h1 answers again") == 1
 
 
+def test_what_always_answers_late_is_not_silent(board):
+    board.links["h1"].round_trip_s, board.links["h1"].silent = 1.2, 1.2
+    board.look()
+    assert "does not answer" not in said(board)
+    assert board.rows()[0]["state"] == "running"
+    board.links["h1"].silent = 4.0
+    board.look()
+    assert "host h1 does not answer (since 4.0 s)" in said(board)
+
+
 def test_the_start_is_told_with_where_the_time_went(board):
     board.stages_s = {"connect": 0.25, "check": 0.5}
     board.clock(clock(0.0, state="waiting"))
@@ -91,3 +101,11 @@ def test_an_ended_process_says_how(board):
     console = Console(file=io.StringIO(), width=200)
     console.print(table(board.rows()))
     assert "ended (exit code 2)" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("said_last", ["cannot open [/tmp/x]", "[/]", "[red]no"])
+def test_what_a_process_said_is_shown_as_it_is(board, said_last):
+    board.members[0].state, board.members[0].code, board.members[0].outcome = "ended", 1, lambda: said_last
+    console = Console(file=io.StringIO(), width=200)
+    console.print(table(board.rows()))
+    assert f"ended ({said_last})" in console.file.getvalue()  # type: ignore[attr-defined]

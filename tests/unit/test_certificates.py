@@ -63,10 +63,10 @@ def test_an_authority_is_kept_until_another_is_forced(tmp_path: Path, signer) ->
     issue(tmp_path, signer, ESTIMATOR, NOW)
     again = certificates.authority(tmp_path, NOW)
     assert again.certificate == signer.certificate
-    assert due(tmp_path, again, ESTIMATOR, NOW) is None
+    assert due(tmp_path, again.certificate, ESTIMATOR, NOW) is None
     other = certificates.authority(tmp_path, NOW, force=True)
     assert other.certificate != signer.certificate
-    assert due(tmp_path, other, ESTIMATOR, NOW) == "of another authority"
+    assert due(tmp_path, other.certificate, ESTIMATOR, NOW) == "of another authority"
 
 
 @pytest.mark.parametrize("missing", ["ca.pem", "ca.key"])
@@ -92,20 +92,53 @@ def test_an_authority_of_no_use_is_a_line(tmp_path: Path, signer) -> None:
 
 
 def test_a_certificate_is_made_anew_when_it_would_not_do(tmp_path: Path, signer) -> None:
-    assert due(tmp_path, signer, ESTIMATOR, NOW) == "new"
+    assert due(tmp_path, signer.certificate, ESTIMATOR, NOW) == "new"
     place = issue(tmp_path, signer, ESTIMATOR, NOW)
-    assert due(tmp_path, signer, ESTIMATOR, NOW) is None
-    assert due(tmp_path, signer, ESTIMATOR._replace(addresses=("10.0.0.2",)), NOW) == "other addresses"
-    assert due(tmp_path, signer, ESTIMATOR, NOW + timedelta(days=DAYS)) == "expired on 2026-12-01"
+    assert due(tmp_path, signer.certificate, ESTIMATOR, NOW) is None
+    assert due(tmp_path, signer.certificate, ESTIMATOR._replace(addresses=("10.0.0.2",)), NOW) == "other addresses"
+    assert due(tmp_path, signer.certificate, ESTIMATOR, NOW + timedelta(days=DAYS)) == "expired on 2026-12-01"
     (place / "certificate.pem").write_text("nothing")
-    assert due(tmp_path, signer, ESTIMATOR, NOW) == "cannot be read"
+    assert due(tmp_path, signer.certificate, ESTIMATOR, NOW) == "cannot be read"
+
+
+@pytest.mark.parametrize("left", ["ca.pem", "certificate.pem", "key.pem"])
+def test_files_of_which_some_are_older_are_made_anew_and_shown(tmp_path: Path, signer, left: str) -> None:
+    """As whoever renewed them leaves them when it is stopped in between."""
+    older = (issue(tmp_path, signer, ESTIMATOR, NOW) / left).read_bytes()
+    other = certificates.authority(tmp_path, NOW, force=True)
+    place = issue(tmp_path, other, ESTIMATOR, NOW)
+    assert due(tmp_path, other.certificate, ESTIMATOR, NOW) is None
+    (place / left).write_bytes(older)
+    fault = "without its key" if left == "key.pem" else "of another authority"
+    assert due(tmp_path, other.certificate, ESTIMATOR, NOW) == fault
+    assert [each.fault for each in certificates.show(tmp_path, NOW)] == [fault]
+    issue(tmp_path, other, ESTIMATOR, NOW)
+    assert due(tmp_path, other.certificate, ESTIMATOR, NOW) is None
+
+
+def test_a_certificate_and_the_key_of_another_one_are_made_anew(tmp_path: Path, signer) -> None:
+    key = (issue(tmp_path, signer, ESTIMATOR, NOW) / "key.pem").read_bytes()
+    place = issue(tmp_path, signer, ESTIMATOR, NOW)
+    (place / "key.pem").write_bytes(key)
+    assert due(tmp_path, signer.certificate, ESTIMATOR, NOW) == "without its key"
+
+
+@pytest.mark.parametrize("content", ["", "nothing", "-----BEGIN PRIVATE KEY-----\n"])
+def test_a_key_that_is_none_is_made_anew(tmp_path: Path, signer, content: str) -> None:
+    place = issue(tmp_path, signer, ESTIMATOR, NOW)
+    (place / "key.pem").write_text(content)
+    assert due(tmp_path, signer.certificate, ESTIMATOR, NOW) == "cannot be read"
+    assert [each.fault for each in certificates.show(tmp_path, NOW)] == ["cannot be read"]
 
 
 def test_what_is_there_is_shown(tmp_path: Path, signer) -> None:
     issue(tmp_path, signer, ESTIMATOR, NOW)
     issue(tmp_path, signer, Wanted("h1", "world"), NOW, days=-0.5)
     shown = certificates.show(tmp_path, NOW)
-    assert [(each.process, each.fault) for each in shown] == [("estimator.drone1", ""), ("world", "expired")]
+    assert [(each.process, each.fault) for each in shown] == [
+        ("estimator.drone1", ""),
+        ("world", "expired on 2026-11-01"),
+    ]
     assert shown[0].addresses == ("10.0.0.1", "localhost", "127.0.0.1", "::1")
 
 

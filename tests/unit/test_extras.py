@@ -19,7 +19,8 @@ AGENTS, RECORD, WORLD = "agents", "record", "world"
         ({"world": "a", "*": "b"}, {WORLD}, {RECORD, AGENTS}),
         ({"world": "a", "my.drone1": "b"}, {WORLD, RECORD}, set()),
         ({"wor*": "a", "rec*": "b"}, {WORLD}, {RECORD}),
-        ({"*": ["a", "b"]}, {WORLD, RECORD, AGENTS}, {RECORD, AGENTS}),
+        ({"*": ["a", "b"]}, {WORLD, AGENTS}, {RECORD, AGENTS}),
+        ({"world": ["a", "b"]}, {WORLD, RECORD}, set()),
         ({"estimator.*": "a"}, {AGENTS}, set()),
     ],
 )

@@ -1,11 +1,12 @@
 """The socket on which `zsim ps`, `restart`, `move` and `down` reach the launcher."""
 
 import json
+import os
 import socket
 
 import pytest
 
-from zsim.errors import RunError
+from zsim.errors import HostsError, RunError
 from zsim_deploy import intercom
 from zsim_deploy.intercom import Intercom
 
@@ -13,6 +14,7 @@ from zsim_deploy.intercom import Intercom
 @pytest.fixture(autouse=True)
 def own_place(tmp_path, monkeypatch):
     monkeypatch.setattr(intercom.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
 
 
 @pytest.fixture
@@ -20,7 +22,14 @@ def line():
     def refuse() -> None:
         raise RunError("host is 'h9'; must be one of h1")
 
-    found = Intercom("zsim", {"add": lambda a, b: a + b, "refuse": refuse})
+    def lack() -> None:
+        raise HostsError("certs/h3/x/key.pem: cannot be read")
+
+    def hang() -> None:
+        raise TimeoutError
+
+    acts = {"add": lambda a, b: a + b, "refuse": refuse, "lack": lack, "hang": hang, "fail": lambda: [].index(1)}
+    found = Intercom("zsim", acts)
     yield found
     found.close()
 
@@ -35,6 +44,9 @@ def test_an_answer_comes_back():
     ("op", "args", "says"),
     [
         ("refuse", {}, "host is 'h9'"),
+        ("lack", {}, "^certs/h3/x/key.pem: cannot be read$"),
+        ("hang", {}, "it took too long"),
+        ("fail", {}, "it failed in a way that nobody thought of: ValueError"),
         ("dance", {}, "no request that is understood"),
         ("add", {"a": 1}, "no request that is understood"),
     ],
@@ -66,7 +78,7 @@ def test_nobody_is_up():
 
 def test_the_socket_of_a_killed_launcher_is_no_hindrance():
     place = intercom.place("zsim")
-    place.parent.mkdir(parents=True)
+    place.parent.mkdir(mode=0o700)
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(place))
     found = Intercom("zsim", {"add": lambda a, b: a + b})
@@ -77,3 +89,54 @@ def test_the_socket_of_a_killed_launcher_is_no_hindrance():
 
 def test_only_its_user_may_come_in(line):
     assert intercom.place("zsim").parent.stat().st_mode & 0o077 == 0
+
+
+def test_a_launcher_that_does_not_answer_is_not_taken_for_none(monkeypatch):
+    monkeypatch.setattr(intercom, "ANSWER_S", 0.05)
+    place = intercom.place("zsim")
+    place.parent.mkdir(mode=0o700)
+    with socket.socket(socket.AF_UNIX) as busy:
+        busy.bind(str(place))
+        busy.listen()
+        with pytest.raises(RunError, match="`zsim up` has not answered ps within"):
+            intercom.ask("zsim", "ps")
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o750])
+def test_a_folder_in_which_others_may_write_or_read_is_refused(mode):
+    folder = intercom.place("zsim").parent
+    folder.mkdir()
+    folder.chmod(mode)
+    with pytest.raises(RunError, match=f"is not a folder that is yours alone .* mode {mode:o}"):
+        Intercom("zsim", {})
+
+
+def test_a_link_to_somewhere_else_is_refused(tmp_path):
+    (tmp_path / "elsewhere").mkdir(mode=0o700)
+    intercom.place("zsim").parent.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(RunError, match="is not a folder that is yours alone"):
+        Intercom("zsim", {})
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
+def test_a_folder_of_another_user_is_refused():
+    folder = intercom.place("zsim").parent
+    folder.mkdir(mode=0o700)
+    os.chown(folder, 12345, 12345)
+    with pytest.raises(RunError, match="owner 12345"):
+        Intercom("zsim", {})
+
+
+def test_a_path_that_is_too_long_is_a_line(tmp_path, monkeypatch):
+    long = tmp_path / ("x" * 120)
+    long.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(long))
+    with pytest.raises(RunError, match="longer than 107 bytes; set XDG_RUNTIME_DIR or TMPDIR"):
+        Intercom("zsim", {})
+    with pytest.raises(RunError, match="no `zsim up` of federation"):
+        intercom.ask("zsim", "ps")
+
+
+def test_the_runtime_folder_is_preferred(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert intercom.place("zsim") == tmp_path / "zsim" / "zsim.sock"

@@ -95,6 +95,21 @@ def test_the_recorder_is_where_the_world_is_unless_placed(
     assert places(tmp_path, step, {**ROLES, **roles})["recorder"] == host
 
 
+@pytest.mark.parametrize(
+    ("roles", "host"),
+    [
+        ({"world": ["one", "two"]}, "one"),
+        ({"world": "lab", "*": ["one", "two"]}, "one"),
+        ({"*": ["one", "two"]}, "two"),
+    ],
+)
+def test_a_recorder_takes_a_turn_only_where_it_is_placed(
+    tmp_path: Path, step: Scenario, roles: dict[str, Any], host: str
+) -> None:
+    agents = {name: ROLES[name] for name in ("controller.*", "estimator.*")}
+    assert places(tmp_path, step, {**agents, **roles})["recorder"] == host
+
+
 def test_programs_of_the_user_s_own_are_placed_too(tmp_path: Path) -> None:
     expect = ["my.drone1", "recorder", "controller.main"]
     own = scenario_file.load(ROOT / "scenarios/step.yaml", [f"processes.expect=[{', '.join(expect)}]"])
@@ -135,6 +150,27 @@ def test_a_router_connects_to_the_one_above_or_to_the_world(sites: Placed, step:
     found = inventory.placement(sites, step)
     assert inventory.upstream(sites, found, "yard") == "tls/192.168.1.21:7448"
     assert inventory.upstream(sites, found, "site") == "tls/192.168.1.10:7447"
+
+
+def test_who_connects_to_whom_across_hosts(sites: Placed, step: Scenario) -> None:
+    """Estimators on one and two; two's go to the router on two, that to one's, that to the world."""
+    found = inventory.placement(sites, step)
+    assert inventory.connections(sites, found) == {("lab", 7447): {"one"}, ("one", 7448): {"two"}}
+
+
+def test_a_host_that_has_a_router_only_connects_too(tmp_path: Path, step: Scenario) -> None:
+    hosts = {**HOSTS, "one": {"address": "192.168.1.21", "router": "gate"}, "gate": {"address": "192.168.1.30"}}
+    found = placed(tmp_path, hosts=hosts, routers={"gate": {"host": "gate"}}, roles={**ROLES, "estimator.*": "one"})
+    ways = inventory.connections(found, inventory.placement(found, step))
+    assert ways == {("gate", 7448): {"one"}, ("lab", 7447): {"gate"}}
+
+
+def test_the_world_itself_connects_to_nobody(tmp_path: Path, step: Scenario) -> None:
+    hosts = {**HOSTS, "lab": {"address": "192.168.1.10", "router": "gate"}}
+    roles = {"world": "lab", "*": "one"}
+    found = placed(tmp_path, hosts=hosts, routers={"gate": {"host": "two"}}, roles=roles)
+    ways = inventory.connections(found, inventory.placement(found, step))
+    assert ways == {("lab", 7447): {"one", "two"}}
 
 
 def test_routers_come_after_those_that_they_connect_to(tmp_path: Path) -> None:

@@ -1,14 +1,18 @@
 """What a push leaves alone, what it copies, and how the failures of several hosts are told."""
 
 import asyncio
+import shutil
+import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from zsim.errors import HostsError, InventoryError
 from zsim_deploy import inventory
+from zsim_deploy.host_link import HostLink
 from zsim_deploy.inventory import Host, Inventory, Placed
-from zsim_deploy.push import is_there, missing, push
+from zsim_deploy.push import There, is_there, missing, push
 from zsim_deploy.wheelhouse import House, Wheel
 
 
@@ -48,6 +52,32 @@ def test_what_is_installed_or_was_copied_before_is_not_copied_again() -> None:
     assert names(missing(HOUSE, {"installed": NOTE, "wheels": {}})) == ["zsim-1", "pip-26"]
     copied = {"numpy-2.whl": "sha of numpy-2", "scipy-1.whl": "cut short"}
     assert names(missing(HOUSE, {"installed": None, "wheels": copied})) == ["scipy-1", "zsim-1", "pip-26"]
+
+
+class Greeting(HostLink):
+    """This machine, as a host whose login shell greets; what is asked of Pythons can be answered otherwise."""
+
+    def __init__(self, python: str | None = None) -> None:
+        super().__init__("h1", Host(address="192.0.2.1"), Path())
+        self._python = python
+
+    async def run(self, command: str, given: bytes = b"", *_: Any, **__: Any) -> bytes:
+        if self._python and not given:
+            return self._python.encode()
+        done = subprocess.run(["sh", "-c", command], input=given, capture_output=True, check=True)
+        return b"Welcome to lab\n17\n" + done.stdout
+
+
+def test_a_greeting_of_the_login_shell_is_passed_over(tmp_path: Path) -> None:
+    there = There(Greeting(), str(tmp_path))
+    asyncio.run(there.look())
+    assert there.found["folder"] == str(tmp_path)
+
+
+def test_a_python_that_says_nothing_is_a_line(tmp_path: Path) -> None:
+    silent = Greeting(f"python3 3.11.2 {shutil.which('true')}\n")
+    with pytest.raises(HostsError, match=r"^h1: /\S+/true says nothing; does it run there\?$"):
+        asyncio.run(There(silent, str(tmp_path)).look())
 
 
 def placed(**hosts: Host) -> Placed:

@@ -1,5 +1,6 @@
 """Rendered units, compose files and manifests: every process once, in its place, with what it needs and no more."""
 
+import hashlib
 import re
 import shlex
 import tomllib
@@ -8,15 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 import yaml
 from typer.testing import CliRunner
 
 from zsim import scenario_file
-from zsim.errors import InventoryError
+from zsim.errors import InventoryError, RunError
 from zsim.scenario import Scenario
 from zsim_deploy import inventory, render_commands
+from zsim_deploy.cli import app
 from zsim_deploy.inventory import Placed
 from zsim_deploy.render import compose, kubernetes, systemd
+from zsim_deploy.render.folder import write
 
 ROOT = Path(__file__).parents[2]
 STEP = ROOT / "scenarios/step.yaml"
@@ -83,8 +87,7 @@ def of_kubernetes(texts: dict[str, str]) -> Words:
     found = {}
     for one in pods(texts):
         words = cli_words(one["containers"][0]["args"])
-        thing = "" if words[0] in ("world", "record") else f".{words[1]}"
-        name = f"{'recorder' if words[0] == 'record' else words[0]}{thing}"
+        name = {"world": "world", "record": "recorder"}.get(words[0], f"{words[0]}.{words[-1]}")
         assert name not in found
         found[name] = (one["nodeSelector"]["kubernetes.io/hostname"], words)
     return found
@@ -148,6 +151,28 @@ def test_everybody_is_of_the_scenario_s_federation(target: str, hosts: Placed) -
 
 
 @ALL
+def test_names_that_begin_with_a_dash_are_names(target: str, tmp_path: Path) -> None:
+    """The commands are read as `zsim` itself reads them."""
+    text = STEP.read_text().replace("name: drone1", "name: -d1").replace("[drone1,", "[-d1,").replace("main", "-c")
+    (tmp_path / "dashes.yaml").write_text(text)
+    dashes = placed(tmp_path, HOSTS.replace("yard", "-r"))
+    found = READ[target](TARGETS[target](dashes, scenario_file.load(tmp_path / "dashes.yaml")))
+    assert {"estimator.-d1", "controller.-c", "router.-r"} <= set(found)
+    for name, (host, words) in found.items():
+        read = parameters(words)
+        assert read["host"] == host
+        thing = name.partition(".")[2]
+        assert not thing or thing in (read.get("drone"), read.get("cluster"), read.get("name"))
+
+
+def parameters(words: list[str]) -> dict[str, Any]:
+    """Return what a command of `zsim` takes from its words."""
+    group = typer.main.get_command(app)
+    command = group.commands[words[0]]  # type: ignore[attr-defined]
+    return command.make_context(words[0], words[1:]).params
+
+
+@ALL
 def test_certificates_are_for_who_has_tls_and_access_control_for_who_listens(
     target: str, hosts: Placed, tmp_path: Path, step: Scenario
 ) -> None:
@@ -174,7 +199,8 @@ def test_the_world_has_the_scenario_and_waits_for_the_recorder(target: str, host
     texts = TARGETS[target](hosts, step)
     words = READ[target](texts)["world"][1]
     assert words[0] == "world"
-    assert words[1].endswith("/scenario.yaml")
+    assert words[-2] == "--"
+    assert words[-1].endswith("/scenario.yaml")
     assert option(words, "--expect") == "recorder"
     given = next(
         (one["data"]["scenario.yaml"] for one in manifests(texts) if one.get("kind") == "ConfigMap"),
@@ -493,15 +519,83 @@ def test_the_command_writes_what_is_rendered(target: str, hosts: Placed, step: S
     assert done.exit_code == 0, done.output
     texts = TARGETS[target](hosts, step)
     out = tmp_path / "out"
-    assert {str(path.relative_to(out)): path.read_text() for path in out.rglob("*") if path.is_file()} == texts
+    assert files(out) == texts
     assert done.stdout == f"{len(texts)} files in {out}\n"
+
+
+def files(out: Path) -> dict[str, str]:
+    """Return the files of a folder that a person sees."""
+    found = [path for path in out.rglob("*") if path.is_file() and not path.name.startswith(".")]
+    return {str(path.relative_to(out)): path.read_text() for path in found}
+
+
+@pytest.mark.parametrize("target", ["systemd", "compose"])
+def test_nothing_of_an_earlier_rendering_is_left(target: str, hosts: Placed, step: Scenario, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    call(tmp_path, target)
+    former = set(files(out))
+    moved = placed(tmp_path, HOSTS.replace("world: lab", "world: one").replace("{host: one}", "{host: two}"))
+    done = call(tmp_path, target)
+    assert done.exit_code == 0, done.output
+    assert files(out) == TARGETS[target](moved, step)
+    assert {path.name for path in out.iterdir() if path.is_dir()} == {"one", "two"}
+    gone = done.stdout.strip().partition("; removed of an earlier rendering: ")[2].split(", ")
+    assert set(gone) == former - set(files(out))
+    assert any(name.startswith("lab/") for name in gone)
+
+
+def test_what_somebody_else_put_there_stays(hosts: Placed, step: Scenario, tmp_path: Path) -> None:
+    """A file beside the rendered ones, one that has a rendered one's text, and the files of another target."""
+    out = tmp_path / "out"
+    call(tmp_path, "systemd")
+    call(tmp_path, "kubernetes")
+    (out / "lab/notes.txt").write_text("mine")
+    (out / "copy").mkdir()
+    (out / "copy/zsim-world.service").write_text((out / "lab/zsim-world.service").read_text())
+    kept = {"lab/notes.txt", "copy/zsim-world.service", *kubernetes.render(hosts, step)}
+    moved = placed(tmp_path, HOSTS.replace("world: lab", "world: one"))
+    assert call(tmp_path, "systemd").exit_code == 0
+    assert set(files(out)) == kept | set(systemd.render(moved, step))
+
+
+def test_a_file_that_was_changed_is_not_removed(hosts: Placed, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    call(tmp_path, "systemd")
+    (out / "lab/zsim-world.service").write_text("mine now")
+    former = files(out)
+    placed(tmp_path, HOSTS.replace("world: lab", "world: one"))
+    done = call(tmp_path, "systemd")
+    assert isinstance(done.exception, RunError)
+    assert str(done.exception) == (
+        f"{out}/lab/zsim-world.service: an earlier rendering wrote it and it was changed since; "
+        "remove it, or give --out another folder"
+    )
+    assert files(out) == former
+    (out / "lab/zsim-world.service").unlink()
+    assert call(tmp_path, "systemd").exit_code == 0
+
+
+def test_a_list_that_leads_out_of_the_folder_removes_nothing(hosts: Placed, tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    call(tmp_path, "systemd")
+    (record,) = [path for path in (tmp_path / "out").iterdir() if path.is_file()]
+    digest = hashlib.sha256(b"mine").hexdigest()
+    record.write_text(f"{record.read_text()}{digest}  ../mine.txt\n{digest}  {tmp_path / 'mine.txt'}\nnonsense\n")
+    assert call(tmp_path, "systemd").exit_code == 0
+    assert (tmp_path / "mine.txt").exists()
+
+
+def test_a_text_that_leads_out_of_the_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"^\.\./two/compose\.yaml: leads out of .*; rename that host"):
+        write(tmp_path / "out", "compose", {"one/compose.yaml": "", "../two/compose.yaml": ""})
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_command_takes_the_options_of_a_run(hosts: Placed, tmp_path: Path) -> None:
     options = ["--realtime", "--rate", "0.5", "--seed", "7", "--duration", "30", "--set", "federation=lab2"]
     done = call(tmp_path, "kubernetes", *options, "--image", "registry.example.org/zsim:7")
     assert done.exit_code == 0, done.output
-    texts = {path.name: path.read_text() for path in (tmp_path / "out").iterdir()}
+    texts = files(tmp_path / "out")
     (config,) = [one for one in manifests(texts) if one["kind"] == "ConfigMap"]
     given = yaml.safe_load(config["data"]["scenario.yaml"])
     assert (given["seed"], given["duration_s"], given["federation"]) == (7, 30, "lab2")

@@ -96,12 +96,12 @@ def test_no_name_is_taken_for_an_option(tmp_path: Path):
 )
 def test_an_endpoint_is_checked_before_anything_starts(endpoint: str):
     with pytest.raises(SessionError):
-        run.check_endpoint(endpoint)
+        run.check_endpoint(endpoint, insecure=False)
 
 
 @pytest.mark.parametrize("endpoint", [None, "tcp/127.0.0.1:20001", "tcp/[::1]:20001", "tcp/localhost:20001"])
 def test_good_endpoints_pass(endpoint: str | None):
-    run.check_endpoint(endpoint)
+    run.check_endpoint(endpoint, insecure=False)
 
 
 def test_a_folder_that_takes_no_files_is_a_line(tmp_path: Path):

@@ -45,6 +45,11 @@ def test_the_question_finds_the_pythons_of_a_machine() -> None:
         assert version.strip() == f"Python {'.'.join(map(str, each.version))}"
 
 
+def test_a_greeting_of_the_login_shell_is_no_python() -> None:
+    said = "Welcome to lab\nlast login 3.11.2 today\n\npython3 3.11.2 /usr/bin/python3\npython3.12 is here\n"
+    assert interpreters(said) == [Interpreter("python3", (3, 11, 2), "/usr/bin/python3")]
+
+
 def test_linux_takes_the_wheels_of_its_glibc_and_of_older_ones() -> None:
     aim = target("h", SAID)
     assert (aim.version, aim.abi) == ((3, 12), "cp312")

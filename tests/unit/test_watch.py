@@ -1,10 +1,12 @@
 """The watch over a run's processes, with processes that only say how they end."""
 
 import signal
+import threading
 from typing import Any
 
 import pytest
 
+from zsim.errors import RunError
 from zsim_deploy.watch import RESTARTS_MAX, SUPERSEDED, USER_FAULT, Watch
 
 
@@ -53,6 +55,9 @@ class Member:
 
     def tell_stop(self, reason: str) -> None:
         self.stopped_for = reason
+
+    def kill(self) -> None:
+        self.code = -signal.SIGKILL
 
     def close(self) -> None:
         self.closed = True
@@ -145,9 +150,108 @@ def test_an_interrupt_ends_everybody():
 def test_a_process_takes_the_place_of_another():
     old, new = Member("estimator.d1", SUPERSEDED, lives_for=1000), Member("estimator.d1")
     team = Team(old)
-    team.watch.order(lambda: team.watch.replace(old, new))
+    team.watch.order(lambda: team.watch.replace(new))
     assert not team.go().failed
     assert new.restarts == 1
     assert old.closed
     assert new.closed
     assert new in team.watch.members
+
+
+def test_the_second_of_two_restarts_at_once_is_refused_and_the_run_goes_on():
+    first, second = Member("estimator.d1"), Member("estimator.d1")
+    team = Team(Member("estimator.d1", SUPERSEDED, lives_for=1000))
+    orders = [team.watch.order(lambda new=new: team.watch.replace(new)) for new in (first, second)]
+    assert not team.go().failed
+    assert orders[0].exception() is None
+    assert isinstance(orders[1].exception(), RunError)
+    assert "is being taken over already" in str(orders[1].exception())
+    assert (first.pid, second.pid) == (1, 0)
+
+
+def test_one_restart_after_another_takes_the_place_of_the_first():
+    first, second = Member("estimator.d1", SUPERSEDED, lives_for=2), Member("estimator.d1")
+    old = Member("estimator.d1", SUPERSEDED, lives_for=1)
+    team = Team(old, looks=40)
+    news = iter((first, second))
+
+    def look() -> None:
+        for member in (old, first):
+            if member.pid:
+                member.wait(0.0)
+        if team.watch.members[-1].code is not None or team.watch.members[-1] is old:
+            new = next(news, None)
+            team.watch.order(lambda: team.watch.replace(new)) if new else None
+
+    assert not team.go(look).failed
+    assert second in team.watch.members
+    assert second.restarts == 2
+
+
+def test_an_order_that_fails_is_told_to_who_gave_it_and_the_run_goes_on():
+    team = Team(Member("estimator.d1"))
+    outcome = team.watch.order(lambda: [].index(1))
+    assert not team.go().failed
+    assert isinstance(outcome.exception(), ValueError)
+
+
+def test_an_order_that_comes_too_late_is_not_carried_out():
+    team = Team(Member("estimator.d1"))
+    done = []
+    late = []
+    team.recorder.tell_stop = team.others[0].tell_stop = lambda reason: late.append(
+        team.watch.order(lambda: done.append(1))
+    )  # type: ignore[method-assign]
+    team.go(lambda: team.watch.interrupt("ended by zsim down"))
+    assert late
+    assert all(order.cancelled() for order in late)
+    assert not done
+
+
+def test_a_process_that_does_not_make_way_is_killed(monkeypatch):
+    monkeypatch.setattr("zsim_deploy.watch.TAKE_OVER_S", -1.0)
+    old, new = Member("estimator.d1", lives_for=1000), Member("estimator.d1")
+    team = Team(old)
+    team.watch.order(lambda: team.watch.replace(new))
+    assert not team.go().failed
+    assert old.code == -signal.SIGKILL
+    assert "estimator.d1 (pid 1) has not made way" in team.show.said[0]
+
+
+def test_a_process_that_waits_for_its_host_is_given_up_when_another_takes_its_place():
+    old, new = Member("estimator.d1"), Member("estimator.d1")
+    old.start = lambda: None  # type: ignore[method-assign]
+    old.wait = lambda timeout_s: False  # type: ignore[method-assign]
+    team = Team(old)
+    team.watch.order(lambda: team.watch.replace(new))
+    team.go()
+    assert old.code == -signal.SIGKILL
+
+
+def test_all_are_closed_at_once():
+    """Each close waits for the other's."""
+    together = threading.Barrier(4, timeout=20.0)
+
+    class Slow(Member):
+        def close(self) -> None:
+            together.wait()
+            super().close()
+
+    team = Team(Slow("estimator.d1"), Slow("estimator.d2"), Slow("estimator.d3"), Slow("estimator.d4"))
+    team.go()
+    assert all(member.closed for member in team.members)
+
+
+def test_a_run_that_is_ended_before_it_starts_starts_nobody():
+    team = Team(Member("estimator.d1"))
+    team.watch.interrupt("ended by zsim down")
+    outcome = team.go()
+    assert (outcome.reason, outcome.interrupted) == ("ended by zsim down", True)
+    assert {member.pid for member in team.members} == {0}
+
+
+@pytest.mark.parametrize("text", ["1234\n", "[1]\n", "null\n", "Welcome\n"])
+def test_what_is_no_progress_is_passed_over(text):
+    team = Team()
+    team.watch.take_line(text)
+    assert team.show.said == []

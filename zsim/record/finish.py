@@ -65,6 +65,8 @@ class Summary:
 
     def _chunk(self, source: Source, group: Group) -> None:
         place, head = group.place, chunk_head(source, group.place)
+        if head.content > place.end:
+            return  # readers of the summary would be sent to what they cannot read
         for index in group.indexes:
             self.counts[index.channel] += index.messages
         self.chunk_count += 1

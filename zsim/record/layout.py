@@ -73,7 +73,7 @@ class ChunkHead(NamedTuple):
     size: int
     crc: int
     compression: str
-    content: int  # where the compressed content starts in the file
+    content: int  # where the compressed content starts in the file; behind the chunk's end if the head is damaged
 
 
 class Index(NamedTuple):
@@ -195,6 +195,8 @@ def content_of(source: Source, place: Place) -> bytes | None:
         RecordError: compressed in a way that is not ours.
     """
     head = chunk_head(source, place)
+    if head.content > place.end:
+        return None
     if head.compression not in ("zstd", ""):
         raise RecordError(f"a chunk is compressed with {head.compression[:20]!r}; allowed: zstd or none")
     content = source[head.content : place.end]

@@ -13,6 +13,7 @@ from zsim_deploy.inventory import Placed
 from zsim_deploy.render import container
 from zsim_deploy.render.container import ACCESS, CACHE, CERTIFICATES, RUNS, SCENARIO, USER
 from zsim_deploy.render.process import (
+    STOP_S,
     Files,
     Process,
     Rendered,
@@ -88,7 +89,7 @@ def _service(scenario: Scenario, process: Process) -> dict[str, Any]:
         "volumes": _volumes(process),
         "restart": f"on-failure:{RESTARTS_MAX}" if process.on_death == "restart" else "no",
         "stop_signal": "SIGTERM",
-        "stop_grace_period": f"{container.STOP_S}s",
+        "stop_grace_period": f"{STOP_S}s",
         "logging": {"driver": "local"},  # the one that rotates
     }
 

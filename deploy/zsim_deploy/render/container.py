@@ -11,7 +11,6 @@ WHEEL = f"zsim-{__version__}-py3-none-any.whl"
 USER = 1000  # first ordinary user of Debian
 CACHE = "/var/cache/zsim"
 CERTIFICATES, ACCESS, SCENARIO, RUNS = "/certs", "/access/access.json", "/scenario/scenario.yaml", "/runs"
-STOP_S = 15  # a world that is stopped waits 5 s for byes, and a recorder may have a disk to wait for
 ENVIRONMENT = {**SINGLE_THREADED, "NUMBA_CACHE_DIR": CACHE}
 
 

@@ -6,9 +6,8 @@ from typing import Any
 
 from zsim.identity import CERTIFICATES as IDENTITY_FILES
 from zsim.rights import RECORDER, WORLD
-from zsim_deploy.render import container
 from zsim_deploy.render.container import ACCESS, CACHE, CERTIFICATES, ENVIRONMENT, RUNS, SCENARIO, USER
-from zsim_deploy.render.process import Files, Process, command
+from zsim_deploy.render.process import STOP_S, Files, Process, command
 
 NAME_MAX = 63  # RFC 1123 label
 CPU = "250m"  # to find a node by; in lockstep a role takes what there is
@@ -39,7 +38,7 @@ def template(process: Process, image: str, restart: str) -> dict[str, Any]:
         "hostNetwork": True,
         "dnsPolicy": "ClusterFirstWithHostNet",
         "restartPolicy": restart,
-        "terminationGracePeriodSeconds": container.STOP_S,
+        "terminationGracePeriodSeconds": STOP_S,
         "automountServiceAccountToken": False,
         "enableServiceLinks": False,
         "securityContext": user(),

@@ -8,10 +8,11 @@ from zsim.scenario import OnDeath, Scenario
 from zsim_deploy import inventory as inv
 from zsim_deploy.extras import KINDS, NAMED
 from zsim_deploy.inventory import Placed
-from zsim_deploy.watch import ON_DEATH
+from zsim_deploy.watch import on_death
 
 REALTIME = "--realtime"  # of the world and the routers, whose lease it shortens
 MODULE = ("-m", "zsim_deploy.cli")  # after the interpreter
+STOP_S = 15  # a world that is stopped waits 5 s for byes, and a recorder may have a disk to wait for
 
 Rendered = dict[str, str]
 """Path inside the output folder to text."""
@@ -23,7 +24,8 @@ class Process(NamedTuple):
     Attributes:
         name: `role.thing`.
         host: its host in the inventory.
-        words: of the command, without what depends on where its files are.
+        words: of the command, without what depends on where its files are, and without the name that it is given.
+        thing: that name, of a drone, a cluster or a router; None where the command takes none.
         port: on which it listens, None if it does not.
         secure: whether it has a certificate.
         on_death: what the scenario says.
@@ -32,6 +34,7 @@ class Process(NamedTuple):
     name: str
     host: str
     words: tuple[str, ...]
+    thing: str | None
     port: int | None
     secure: bool
     on_death: OnDeath
@@ -89,15 +92,13 @@ def own_programs(placed: Placed, scenario: Scenario, host: str | None = None) ->
 def command(process: Process, files: Files) -> list[str]:
     """Return the arguments of the interpreter that run a process."""
     words = [*MODULE, *process.words, "--host", process.host]
-    if process.role == WORLD:
-        words.insert(len(MODULE) + 1, files.scenario)
-    if process.role == RECORDER:
+    if process.name == RECORDER:
         words += ["--out", files.out]
-    if process.secure:
-        words += ["--tls", files.identity]
+    words += ["--tls", files.identity] if process.secure else ["--insecure"]
     if process.secure and process.port is not None:
         words += ["--access", files.access]
-    return words
+    given = files.scenario if process.name == WORLD else process.thing
+    return [*words, "--", given] if given is not None else words  # a name may begin with a dash
 
 
 def access_file(process: Process) -> str:
@@ -134,15 +135,16 @@ def _role(
     placed: Placed, scenario: Scenario, places: dict[str, str], name: str, host: str, pace: Sequence[str]
 ) -> Process:
     inventory = placed.inventory
+    role, _, thing = name.partition(".")
     port = inventory.port if name == WORLD else None
     if name == WORLD:
         listen = inv.listening(placed, host, inventory.port)
         words = (WORLD, "--listen", listen, "--expect", RECORDER, *pace)
     else:
-        role, _, thing = name.partition(".")
-        start = ("record",) if name == RECORDER else (role, thing)
-        words = (*start, "--connect", inv.endpoint(placed, places, host), "--federation", scenario.federation)
-    return Process(name, host, words, port, not inventory.security.insecure, _on_death(scenario, name))
+        start = "record" if name == RECORDER else role
+        words = (start, "--connect", inv.endpoint(placed, places, host), "--federation", scenario.federation)
+    secure = not inventory.security.insecure
+    return Process(name, host, words, thing or None, port, secure, on_death(scenario.processes.on_death, name))
 
 
 def _router(placed: Placed, scenario: Scenario, places: dict[str, str], name: str, pace: Sequence[str]) -> Process:
@@ -151,11 +153,6 @@ def _router(placed: Placed, scenario: Scenario, places: dict[str, str], name: st
     listen = inv.listening(placed, router.host, router.port)
     reach = ("--connect", inv.upstream(placed, places, name), "--federation", scenario.federation)
     realtime = (REALTIME,) if REALTIME in pace else ()
-    words = (ROUTER, name, "--listen", listen, *reach, *realtime)
+    words = (ROUTER, "--listen", listen, *reach, *realtime)
     called, secure = f"{ROUTER}.{name}", not inventory.security.insecure
-    return Process(called, router.host, words, router.port, secure, _on_death(scenario, called))
-
-
-def _on_death(scenario: Scenario, name: str) -> OnDeath:
-    given, role = scenario.processes.on_death, name.partition(".")[0]
-    return given.get(name) or given.get(role) or ON_DEATH.get(role, "drop")
+    return Process(called, router.host, words, name, router.port, secure, on_death(scenario.processes.on_death, called))

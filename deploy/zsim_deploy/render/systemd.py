@@ -16,6 +16,7 @@ from zsim_deploy import inventory as inv
 from zsim_deploy.child import SINGLE_THREADED
 from zsim_deploy.inventory import Host, Placed
 from zsim_deploy.render.process import (
+    STOP_S,
     Files,
     Process,
     Rendered,
@@ -31,7 +32,6 @@ from zsim_deploy.watch import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED, USER_F
 TARGET = "zsim.target"
 STATE = "/var/lib/zsim"  # StateDirectory=zsim
 CACHE = "/var/cache/zsim"  # CacheDirectory=zsim
-STOP_S = 15  # a world that is stopped waits 5 s for byes, and a recorder may have a disk to wait for
 
 # Not among them: MemoryDenyWriteExecute (numba compiles) and ProcSubset (the fingerprint reads /proc/cpuinfo).
 HARDENING = (

@@ -1,0 +1,59 @@
+"""`zsim doctor` on a lab: what it measures, through what greetings and how slow a link, and what it calls a fault."""
+
+import socket
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+from federation import ZSIM
+from lab import LAUNCHER, Lab
+
+ROOT = Path(__file__).parents[2]
+STEP = ROOT / "scenarios/step.yaml"
+DOCTOR_S = 180.0  # wall time on a loaded machine
+ROLES: dict[str, str | list[str]] = {"world": "h1", "controller.*": "h1", "estimator.*": "h2"}
+
+pytestmark = pytest.mark.slow
+
+
+def doctor(lab: Lab, hosts: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """Run `zsim doctor` for the step scenario at the launcher."""
+    return lab.run(LAUNCHER, *ZSIM, "doctor", str(STEP), "--hosts", str(hosts), *options, timeout=DOCTOR_S)
+
+
+def rows(text: str) -> dict[tuple[str, ...], list[str]]:
+    """Return what the table of paths says, by from, to and port."""
+    below = text.partition("bandwidth")[2].splitlines()[1:]
+    words = [line.split() for line in below if line.startswith(" ")]
+    return {tuple(row[:3]): row[3:] for row in words}
+
+
+def test_a_host_with_a_router_only_is_measured_and_a_greeting_is_passed_over(lab: Lab) -> None:
+    """h2's estimators go to the router on h3, that to the world on h1."""
+    for name in lab.names:
+        (lab.folder / name / ".bashrc").write_text("echo 'Welcome to lab'\necho '17'\n")
+    routers: dict[str, dict[str, Any]] = {"field": {"host": "h3"}}
+    done = doctor(lab, lab.inventory(ROLES, routers=routers, through={"h2": "field"}, insecure=True))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("all hosts are ready\n")
+    assert set(rows(done.stdout)) == {("h2", "h3", "7448"), ("h3", "h1", "7447")}
+
+
+def test_a_slow_link_is_measured(lab: Lab) -> None:
+    lab.slow("h2", 150)
+    done = doctor(lab, lab.inventory(ROLES, insecure=True))
+    assert done.returncode == 0, done.stderr
+    ((path, found),) = rows(done.stdout).items()
+    assert path == ("h2", "h1", "7447")
+    assert 300.0 <= float(found[0]) < 1000.0
+    assert found[1] == "ms"
+
+
+def test_a_port_that_is_taken_is_a_line(lab: Lab) -> None:
+    with lab.inside("h1"), socket.create_server((lab.address("h1"), 7447)):
+        done = doctor(lab, lab.inventory(ROLES, insecure=True))
+    assert done.returncode == 2
+    (line,) = [line for line in done.stderr.splitlines() if "7447" in line]
+    assert line.startswith("h1: port 7447 of h1 cannot be reached (h1: ")
+    assert "Address already in use" in line

@@ -1,0 +1,109 @@
+"""What is asked of a `zsim up` that runs, and what it leaves behind: on real hosts, over TLS."""
+
+import re
+import threading
+import time
+from pathlib import Path
+from shutil import rmtree
+
+import yaml
+from lab import Lab
+from team import START_S, Team, closing, in_flight
+
+ROLES = {"world": "h1", "recorder": "h1", "controller.main": "h2", "estimator.*": ["h1", "h2"]}
+SPARE = "h3"
+DRONES = 10  # their estimators, the world, the recorder and the link's own word are more than sshd's 10 channels
+
+
+def keys(team: Team) -> list[Path]:
+    """Return what of certificates and keys is on any host."""
+    return [path for name in team.lab.names for path in team.lab.host_folder(name).rglob("*.pem")]
+
+
+def goes_on(team: Team) -> None:
+    """Wait until every process runs and nobody is waited for."""
+    until_s = time.monotonic() + START_S
+    while {row["state"] for row in team.ps().values()} != {"running"}:
+        assert time.monotonic() < until_s, team.ps()
+        threading.Event().wait(0.05)  # nothing tells of a process that is waited for no longer
+
+
+def test_restarts_at_once_and_a_move_that_is_refused_leave_the_run_alone(lab: Lab) -> None:
+    with closing(Team(lab, ROLES)) as team:
+        rmtree(lab.folder / "certs" / SPARE / "estimator.drone1", ignore_errors=True)
+        run = team.up("--rate", "4", "--duration", "300")
+        in_flight(run)
+        both = [team.zsim("restart", "estimator.drone2") for _ in range(2)]
+        for command in both:
+            command.process.wait(START_S)
+            if command.process.returncode:
+                command.ends(with_code=2)
+                assert "estimator.drone2 is being taken over already" in command.text()
+        assert 0 in [command.process.returncode for command in both]
+        run.line("superseded: estimator.drone2 on h2", START_S)
+        refused = team.zsim("move", "estimator.drone1", SPARE)
+        refused.ends(with_code=2)
+        assert re.fullmatch(r"\S*/certs/h3/estimator.drone1/ca.pem: cannot be read .*certs init.*", refused.text())
+        goes_on(team)
+        team.zsim("down").ends(with_code=0)
+        run.ends(with_code=130, within_s=START_S)
+        assert "Traceback" not in run.text()
+
+
+def test_a_move_to_a_host_that_was_not_used_and_nothing_is_left_there(lab: Lab) -> None:
+    with closing(Team(lab, ROLES)) as team:
+        run = team.up("--rate", "4", "--duration", "300")
+        in_flight(run)
+        assert not lab.host_folder(SPARE).exists()
+        assert keys(team)
+        move = team.zsim("move", "controller.main", SPARE)
+        move.ends(with_code=0, within_s=START_S)
+        run.line(f"superseded: controller.main on {SPARE}", START_S)
+        assert team.ps()["controller.main"]["host"] == SPARE
+        goes_on(team)
+        team.zsim("down").ends(with_code=0)
+        run.ends(with_code=130, within_s=START_S)
+        assert team.record().end()["reason"] == "ended by zsim down"
+        assert keys(team) == []
+        assert [path for name in lab.names for path in lab.host_folder(name).glob("runs/*")] == []
+
+
+def test_nobody_waits_for_a_recorder_that_is_cut_off(lab: Lab) -> None:
+    """The record stays where it is, the keys are taken from the hosts that can be reached."""
+    with closing(Team(lab, {**ROLES, "recorder": SPARE})) as team:
+        run = team.up("--rate", "4", "--duration", "300")
+        in_flight(run)
+        team.cut(SPARE)
+        run.line(f"host {SPARE} does not answer", START_S)
+        team.zsim("down").ends(with_code=0)
+        run.line(f"fetching the record from {SPARE}:", START_S)
+        run.ends(with_code=130, within_s=START_S)
+        record = rf"the record could not be fetched \({SPARE}: .*\); what there is of it is at {SPARE}:(\S+)"
+        path = re.search(record, run.text())
+        assert path is not None
+        assert Path(path[1]).stat().st_size > 0
+        assert f"{SPARE}: " in run.text()
+        assert "keys of this run may be left there" in run.text()
+        assert {found.relative_to(lab.folder).parts[0] for found in keys(team)} == {SPARE}
+
+
+def test_a_record_that_cannot_be_fetched_fails_the_run(lab: Lab) -> None:
+    with closing(Team(lab, ROLES)) as team:
+        team.out.mkdir()
+        (team.out / "run.mcap.part").symlink_to(lab.folder / "not there" / "run.mcap")
+        run = team.up("--duration", "2")
+        run.ends(with_code=1, within_s=START_S)
+        assert re.search(r"ended: the record could not be fetched \(.*\); what there is of it is at h1:", run.text())
+        assert [path.name for path in lab.host_folder("h1").rglob("*.mcap")] == ["run.mcap"]
+        assert keys(team) == []
+
+
+def test_more_processes_on_a_host_than_sshd_has_channels_for(lab: Lab) -> None:
+    drones = [{"name": f"drone{i}", "position_m": [3.0 * i, 0.0, 0.0]} for i in range(DRONES)]
+    scenario = lab.folder / "many.yaml"
+    scenario.write_text(yaml.safe_dump({"name": "many", "duration_s": 1, "drones": drones}))
+    with closing(Team(lab, {"world": "h1", "estimator.*": "h1"}, secure=False)) as team:
+        run = team.zsim("up", str(scenario), "--hosts", team.hosts, "--out", str(team.out), "--no-report")
+        run.ends(with_code=0, within_s=2 * START_S)
+        assert {event["data"]["host"] for event in team.record().events("join")} == {"h1"}
+        assert len(team.record().events("join")) == DRONES + 1

@@ -1,0 +1,70 @@
+"""What is said when no world answers: nobody is there, or somebody is who does not let us in."""
+
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsim import session
+from zsim.connection import find_world
+from zsim.errors import NoWorldError, SessionError
+from zsim.identity import Identity
+
+
+class Silent:
+    """A session to a hub that answers nothing."""
+
+    def get(self, expression: str, timeout_s: float) -> list[Any]:
+        return []
+
+
+@contextmanager
+def silent(*_: Any, **__: Any) -> Iterator[Silent]:
+    yield Silent()
+
+
+def nobody(endpoint: str, *_: Any, **__: Any) -> Any:
+    raise SessionError(f"nobody listens on {endpoint}; start a world there (it did not answer)")
+
+
+def said(endpoint: str, identity: Identity | None = None) -> str:
+    with pytest.raises(NoWorldError) as caught, find_world(endpoint, "zsim", 0.0, identity=identity):
+        pass
+    start = f"no world of federation 'zsim' on {endpoint} within 0 s"
+    assert str(caught.value).startswith(start)
+    return str(caught.value).removeprefix(start)
+
+
+def test_who_is_not_let_in_is_told_that_it_may_be_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "connect", silent)
+    text = said("tls/127.0.0.1:7447", Identity("h1", Path("certs/h1/operator.eve")))
+    assert "but somebody listens there: another federation" in text
+    assert "or we are refused or not allowed here; correct --federation" in text
+    assert "start one" not in text
+
+
+def test_without_certificates_nobody_is_told_of_rights(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "connect", silent)
+    text = said("tcp/127.0.0.1:7447")
+    assert "but somebody listens there: another federation" in text
+    assert "allowed" not in text
+
+
+def test_a_port_that_opens_to_who_is_refused_may_be_one_with_tls(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "connect", nobody)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        text = said(f"tcp/127.0.0.1:{port}")
+    assert text == ", but who listens there refuses us; if it is a world with TLS, say tls/ and give --tls FOLDER"
+    assert said(f"tcp/127.0.0.1:{port}") == "; start one with `zsim world`"
+
+
+@pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:7447", "tcp/127.0.0.1:70000", "tcp/nowhere", "unixsock-stream/x"])
+def test_an_endpoint_that_cannot_be_tried_is_one_where_nobody_listens(
+    monkeypatch: pytest.MonkeyPatch, endpoint: str
+) -> None:
+    monkeypatch.setattr(session, "connect", nobody)
+    assert said(endpoint) == "; start one with `zsim world`"

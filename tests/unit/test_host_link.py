@@ -1,0 +1,132 @@
+"""The launcher's way to one host: how many channels a connection carries, and what is left of files cut short."""
+
+import asyncio
+import subprocess
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from zsim.errors import HostsError
+from zsim_deploy import host_link
+from zsim_deploy.host_link import CHANNELS, HostLink, Loop
+from zsim_deploy.inventory import Host, Inventory, Placed
+from zsim_deploy.links import Links
+
+FILES = {"identity/world/key.pem": b"secret\n", "scenario.yaml": b"name: one\n" * 5000}
+
+
+@pytest.fixture
+def connections(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Let every link have connections that do nothing; return those that were opened."""
+    opened: list[Any] = []
+
+    async def connect(*_: Any) -> Any:
+        opened.append(SimpleNamespace(closed=False))
+        opened[-1].is_closed = lambda made=opened[-1]: made.closed
+        return opened[-1]
+
+    monkeypatch.setattr(host_link, "connect", connect)
+    return opened
+
+
+def link() -> HostLink:
+    return HostLink("h1", Host(address="127.0.0.1"), Path())
+
+
+def test_more_channels_than_sshd_allows_are_spread_over_connections(connections: list[Any]) -> None:
+    async def lend(count: int) -> list[Any]:
+        async with AsyncExitStack() as stack:
+            host = link()
+            return [await stack.enter_async_context(host.channel()) for _ in range(count)]
+
+    used = asyncio.run(lend(2 * CHANNELS + 1))
+    assert [used.count(connection) for connection in connections] == [CHANNELS, CHANNELS, 1]
+
+
+def test_a_channel_that_was_given_back_is_used_again(connections: list[Any]) -> None:
+    async def lend() -> None:
+        host = link()
+        for _ in range(3 * CHANNELS):
+            async with host.channel():
+                pass
+
+    asyncio.run(lend())
+    assert len(connections) == 1
+
+
+def test_a_connection_that_is_lost_is_made_anew(connections: list[Any]) -> None:
+    async def lose() -> bool:
+        host = link()
+        async with host.channel() as lost:
+            connections[0].closed = True
+            async with host.channel() as other:
+                return other is lost
+
+    assert not asyncio.run(lose())
+
+
+class Local(HostLink):
+    """A host that is this machine, and takes so many bytes only."""
+
+    takes: int | None = None
+
+    async def run(self, command: str, given: bytes = b"", timeout_s: float = 10.0, what: str = "") -> bytes:
+        done = subprocess.run(["sh", "-c", command], input=given[: self.takes], capture_output=True, check=False)
+        if done.returncode:
+            raise HostsError(f"{what}: {done.stderr.decode()}")
+        return done.stdout
+
+
+def local(takes: int | None = None) -> Local:
+    made = Local("h1", Host(address="127.0.0.1"), Path())
+    made.takes = takes
+    return made
+
+
+def test_files_come_below_a_folder_and_are_their_owners_alone(tmp_path: Path) -> None:
+    asyncio.run(local().put_files(str(tmp_path / "a run"), FILES))
+    found = {str(path.relative_to(tmp_path / "a run")): path for path in (tmp_path / "a run").rglob("*.*")}
+    assert {name: path.read_bytes() for name, path in found.items() if path.is_file()} == FILES
+    assert all(path.stat().st_mode & 0o077 == 0 for path in (tmp_path / "a run").rglob("*"))
+
+
+@pytest.mark.parametrize("takes", [0, 600, 20_000])
+def test_of_files_that_come_in_part_none_is_seen(tmp_path: Path, takes: int) -> None:
+    with pytest.raises(HostsError, match=r"writing into .*: it came in part"):
+        asyncio.run(local(takes).put_files(str(tmp_path / "run"), FILES))
+    assert {path.name for path in tmp_path.rglob("*")} <= {"run", ".part"}
+
+
+@pytest.fixture
+def links() -> Any:
+    hosts = {name: Host(address="127.0.0.1") for name in ("h1", "h2", "h3")}
+    loop = Loop()
+    yield Links(Placed(Inventory(hosts=hosts, roles={}), Path(), "hosts.yaml"), hosts, loop)
+    loop.close()
+
+
+def test_every_host_that_is_late_or_fails_is_named(links: Links) -> None:
+    async def work(host: HostLink) -> None:
+        if host.name == "h1":
+            await asyncio.Event().wait()
+        if host.name == "h2":
+            raise HostsError("h2: no certificate")
+
+    with pytest.raises(HostsError) as error:
+        links.on_all(work, 0.05)
+    assert str(error.value).splitlines() == [
+        "h1: not done within 0.05 s; is the link slow, the host busy?",
+        "h2: no certificate",
+    ]
+
+
+def test_what_all_hosts_say_comes_back_by_name(links: Links) -> None:
+    async def name(host: HostLink) -> str:
+        return host.name
+
+    say: Callable[[HostLink], Any] = name
+    assert links.on_all(say, 5.0) == {"h1": "h1", "h2": "h2", "h3": "h3"}

@@ -1,0 +1,119 @@
+"""What a run puts on each host: processes, command lines, files."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from zsim import scenario_file
+from zsim.errors import HostsError, RunError
+from zsim_deploy import hosts_commands, inventory
+from zsim_deploy.intercom import Intercom
+from zsim_deploy.plan import Plan
+
+SCENARIO = """
+name: pair
+duration_s: 1
+drones: [{name: drone1, position_m: [0, 0, 0]}, {name: -d2, position_m: [3, 0, 0]}]
+processes: {expect: [estimator.drone1, estimator.-d2, my.drone1]}
+"""
+HOSTS = {
+    "hosts": {
+        "h1": {"address": "127.0.0.1", "port": 1, "folder": "/z"},
+        "h2": {"address": "10.0.0.2"},
+        "h3": {"address": "10.0.0.3"},
+    },
+    "roles": {"world": "h1", "estimator.*": "h1", "my.*": "h2"},
+    "routers": {"field": {"host": "h1"}},
+}
+
+
+@pytest.fixture
+def paths(tmp_path: Path) -> tuple[Path, Path]:
+    scenario, hosts = tmp_path / "pair.yaml", tmp_path / "hosts.yaml"
+    scenario.write_text(SCENARIO)
+    hosts.write_text(yaml.safe_dump(HOSTS))
+    return scenario, hosts
+
+
+@pytest.fixture
+def plan(paths: tuple[Path, Path]) -> Plan:
+    scenario, hosts = paths
+    return Plan(inventory.load(hosts), scenario_file.load(scenario), "abc", ["--rate", "4"])
+
+
+def test_a_program_of_the_users_own_is_left_to_the_user(plan: Plan) -> None:
+    assert list(plan.processes) == ["router.field", "world", "recorder", "estimator.drone1", "estimator.-d2"]
+    assert plan.hosts() == ["h1"]
+    assert [remark.split(":")[0] for remark in plan.remarks] == ["my.drone1 on h2 is a program of your own"]
+
+
+def test_the_command_line_of_a_process(plan: Plan) -> None:
+    reach = ["--connect", "tls/127.0.0.1:7447", "--federation", "zsim", "--host", "h1"]
+    tls = ["--tls", "/z/runs/abc/identity/estimator.-d2"]
+    assert plan.arguments("estimator.-d2") == ["estimator", "--launched", "abc", *reach, *tls, "--", "-d2"]
+    world = plan.arguments("world")
+    assert world[-2:] == ["--", "/z/runs/abc/scenario.yaml"]
+    assert world[world.index("--access") + 1] == "/z/runs/abc/identity/world/access.json"
+    assert world[world.index("--rate") + 1] == "4"
+
+
+def test_a_move_changes_one_place_and_keeps_the_others(plan: Plan) -> None:
+    moved = plan.moved("estimator.drone1", "h3").moved("estimator.-d2", "h2")
+    assert {name: moved.host(name) for name in moved.processes} == {
+        "router.field": "h1",
+        "world": "h1",
+        "recorder": "h1",
+        "estimator.drone1": "h3",
+        "estimator.-d2": "h2",
+    }
+    assert "~/.zsim/runs/abc/identity/estimator.drone1" in moved.arguments("estimator.drone1")
+    assert plan.host("estimator.drone1") == "h1"
+
+
+def test_the_files_of_a_host(plan: Plan, tmp_path: Path) -> None:
+    for name in plan.processes:
+        for file in ("ca.pem", "certificate.pem", "key.pem"):
+            path = tmp_path / "certs" / "h1" / name / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"{file} of {name}")
+    for name in ("world", "router.field"):
+        (tmp_path / "certs" / "h1" / f"{name}.access.json").write_text("{}")
+    found = plan.files("h1")
+    assert len(found) == 3 * len(plan.processes) + 2 + 1
+    assert found["identity/estimator.-d2/key.pem"] == b"key.pem of estimator.-d2"
+    assert b"name: pair" in found["scenario.yaml"]
+    assert plan.files("h3") == {}
+
+
+def test_a_certificate_that_is_not_there_is_a_line(plan: Plan) -> None:
+    with pytest.raises(
+        HostsError, match=r"certs/h3/estimator.drone1/ca.pem: cannot be read .* `zsim certs init hosts.yaml`"
+    ) as error:
+        plan.moved("estimator.drone1", "h3").identity("estimator.drone1")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("given", [None, "out", "there"])
+def test_a_start_that_is_refused_leaves_no_folder(
+    paths: tuple[Path, Path], given: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody listens on port 1; a folder that was there before stays."""
+    (tmp_path / "there").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    out: Any = Path(given) if given else None
+    with pytest.raises(HostsError, match=r"h1: ssh at 127\.0\.0\.1 port 1 cannot be reached"):
+        hosts_commands.up(*paths, out=out)
+    left = {path.name for path in (*tmp_path.glob("runs/*"), *tmp_path.glob("out"), *tmp_path.glob("there"))}
+    assert left == {"there"}
+
+
+def test_a_federation_that_is_up_already_is_refused_before_any_host_is_asked(
+    paths: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with Intercom("zsim", {}), pytest.raises(RunError, match="federation 'zsim' is up already on this machine"):
+        hosts_commands.up(*paths, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,141 @@
+"""A process on another host, over a link that a test makes: whatever happens, its end is noticed."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsim.errors import HostsError
+from zsim_deploy.host_link import Loop
+from zsim_deploy.log import Log
+from zsim_deploy.remote import LOST, Remote
+
+PATIENCE_S = 20.0  # after which a test that waits for ever fails
+
+
+class Stream:
+    """What a process says."""
+
+    def __init__(self, *lines: str) -> None:
+        self._lines = list(lines)
+
+    def __aiter__(self) -> "Stream":
+        return self
+
+    async def __anext__(self) -> str:
+        if not self._lines:
+            raise StopAsyncIteration
+        return self._lines.pop(0)
+
+    def write(self, _: str) -> None: ...
+
+
+class Process:
+    """A process that says some lines and ends."""
+
+    exit_signal, exit_status = None, 0
+
+    def __init__(self, *said: str, complains: tuple[str, ...] = ()) -> None:
+        self.stdin, self.stdout, self.stderr = Stream(), Stream(*said), Stream(*complains)
+
+    async def wait(self) -> "Process":
+        return self
+
+    async def __aenter__(self) -> "Process":
+        return self
+
+    async def __aexit__(self, *_: object) -> None: ...
+
+
+class Link:
+    """A link to a host on which every command is the process given, a fault, or never comes to be."""
+
+    name = "h1"
+
+    def __init__(self, then: Process | Exception | None) -> None:
+        self._then = then
+
+    @asynccontextmanager
+    async def channel(self, patient: bool = False) -> AsyncIterator["Link"]:
+        assert patient
+        yield self
+
+    def create_process(self, *_: Any, **__: Any) -> Process:
+        assert isinstance(self._then, Process)
+        return self._then
+
+
+class Absent(Link):
+    """A link to a host that is not there."""
+
+    @asynccontextmanager
+    async def channel(self, patient: bool = False) -> AsyncIterator[Link]:
+        if isinstance(self._then, Exception):
+            raise self._then
+        await asyncio.Event().wait()
+        yield self
+
+
+Start = Callable[..., Remote]
+
+
+@pytest.fixture
+def started(tmp_path: Path) -> Iterator[Start]:
+    loop = Loop()
+
+    def start(link: Any, on_line: Any = None, log: Log | None = None) -> Remote:
+        log = log or Log(tmp_path / "estimator.d1.log", lambda text: None)
+        remote = Remote("estimator.d1", ["estimator"], link, "python3", loop, log, on_line)
+        remote.start()
+        return remote
+
+    yield start
+    loop.close()
+
+
+def test_what_a_process_says_is_kept_and_a_greeting_of_the_shell_is_not_its_id(started: Start, tmp_path: Path) -> None:
+    said: list[str] = []
+    link = Link(Process("Welcome to h1\n", "zsim-pid 77\n", '{"say": 1}\n', complains=("here\n", "\n")))
+    remote = started(link, said.append)
+    assert remote.wait(PATIENCE_S)
+    assert (remote.pid, remote.code, said) == (77, 0, ['{"say": 1}\n'])
+    assert remote.last_words() == "here"
+    assert (tmp_path / "estimator.d1.log").read_text() == "here\n\n"
+
+
+def test_a_fault_of_whoever_takes_its_lines_ends_it(started: Start) -> None:
+    def fail(line: str) -> None:
+        raise TypeError("int is not iterable")
+
+    remote = started(Link(Process("zsim-pid 77\n", "1234\n")), fail)
+    assert remote.wait(PATIENCE_S)
+    assert remote.code == LOST
+    assert remote.outcome() == "the launcher could not follow it (TypeError('int is not iterable'))"
+
+
+def test_a_link_that_breaks_is_said(started: Start) -> None:
+    remote = started(Absent(HostsError("h1: gone")))
+    assert remote.wait(PATIENCE_S)
+    assert remote.outcome() == remote.last_words() == "the connection to h1 broke (h1: gone)"
+
+
+def test_a_log_that_cannot_be_written_is_said_once_and_the_process_goes_on(started: Start, tmp_path: Path) -> None:
+    said: list[str] = []
+    log = Log(tmp_path / "gone" / "estimator.d1.log", said.append)
+    remote = started(Link(Process("zsim-pid 77\n", complains=("one\n", "two\n"))), log=log)
+    assert remote.wait(PATIENCE_S)
+    assert (remote.code, remote.last_words()) == (0, "two")
+    assert [text.split(": ", 1)[1] for text in said] == [
+        "cannot be written (No such file or directory); what it would say there is lost"
+    ]
+
+
+def test_one_that_waits_for_its_host_can_be_given_up(started: Start) -> None:
+    remote = started(Absent(None))
+    assert remote.state == "starting"
+    remote.kill()
+    assert remote.wait(PATIENCE_S)
+    assert remote.code == LOST
