@@ -19,6 +19,7 @@ LATE_S = 1.0  # in TLS 1.3 a server judges the client's certificate after the cl
 NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME, openssl/x509_vfy.h
 NETWORKED = ("tcp", "udp", "ws")  # of what Zenoh's wheel has without encryption; the others stay on the machine
 MEND = "make new ones with zsim certs init"
+RENEW = f"{MEND} --renew"
 
 _ENDPOINT = re.compile(r"(?:tls|quic)/\[?(?P<host>[^\]]*?)\]?:(?P<port>\d+)(?:[?#].*)?")
 _UNRELATED = (18, 19, 20, 21)  # X509_V_ERR_ self-signed, self-signed in chain, no issuer here, signature unverified
@@ -115,7 +116,7 @@ def _words(error: ssl.SSLError, host: str, endpoint: str) -> str | None:
         return f"the certificate of who listens there is refused ({error.verify_message}); {MEND}"
     reason = error.reason or ""
     if "EXPIRED" in reason:
-        return f"our certificate has expired by the clock of who listens there; {MEND}"
+        return f"our certificate has expired by the clock of who listens there; {RENEW}"
     if "UNKNOWN_CA" in reason or "DECRYPT_ERROR" in reason:
         return f"our certificate is of another authority than that of who listens there; {MEND} and use one set"
     if "ALERT" in reason:
@@ -136,7 +137,7 @@ def _date_fault(found: dict[str, Any]) -> str | None:
         return None
     now_s = time.time()
     if now_s > ssl.cert_time_to_seconds(found["notAfter"]):
-        return f"the certificate of {_name(found)} expired on {_day(found['notAfter'])}; {MEND}"
+        return f"the certificate of {_name(found)} expired on {_day(found['notAfter'])}; {RENEW}"
     if now_s < ssl.cert_time_to_seconds(found["notBefore"]):
         return f"the certificate of {_name(found)} is valid from {_day(found['notBefore'])}; set the clock of this host"
     return None

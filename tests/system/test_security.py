@@ -256,7 +256,7 @@ def test_a_certificate_whose_time_is_over_says_so(made: Certificates) -> None:
         said = refused("estimator", "drone1", "--connect", endpoint, "--tls", str(folder))
     assert re.fullmatch(
         rf"cannot connect to {endpoint}: the certificate of estimator.drone1 expired on \d{{4}}-\d\d-\d\d; "
-        "make new ones with zsim certs init",
+        "make new ones with zsim certs init --renew",
         said,
     )
 
