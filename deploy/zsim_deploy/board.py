@@ -56,7 +56,15 @@ class Board:
 
     def say(self, text: str) -> None:
         """Show a line that stays."""
+        if self.console.quiet:
+            self._live.stop()
+            self.console.quiet = False
         self._plain.say(text)
+
+    def hang_up(self) -> None:
+        """Show lines only from now on, the terminal being gone; callable from a signal handler, which draws nothing."""
+        self._is_live = False
+        self.console.quiet = True
 
     def clock(self, line: dict[str, Any]) -> None:
         self._clock = {**line, "wall_s": time.monotonic()}

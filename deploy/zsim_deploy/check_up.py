@@ -11,6 +11,7 @@ from rich.text import Text
 from zsim.errors import ZsimError
 from zsim_deploy import credentials, doctor
 from zsim_deploy import inventory as inv
+from zsim_deploy.earlier import earlier
 from zsim_deploy.host_link import HostLink
 from zsim_deploy.inventory import Placed
 
@@ -51,8 +52,9 @@ async def _check_up(placed: Placed, places: dict[str, str] | None) -> CheckUp:
         wrong, warnings = doctor.compared(reports)
         paths = await _paths(placed, places, links, pythons, set(reports)) if places else []
         cut, slow = doctor.path_faults(paths)
+        left = await asyncio.gather(*(earlier(links[name], placed.folder) for name in reports))
         tables = [_hosts_table(reports), *([_paths_table(paths)] if paths else [])]
-        return CheckUp(tables, [*faults, *wrong, *cut], [*warnings, *slow])
+        return CheckUp(tables, [*faults, *wrong, *cut], [*warnings, *slow, *(line for lines in left for line in lines)])
     finally:
         for link in links.values():
             await link.close()

@@ -237,14 +237,13 @@ def path_faults(paths: Sequence[Path]) -> tuple[list[str], list[str]]:
 
 def _path_fault(path: Path) -> str:
     why = path.found["error"]
+    another = "give another port in the inventory"
     match path.found.get("taken"):
-        case None:
-            return (
-                f"{path.source}: port {path.port} of {path.target} cannot be reached ({why}); "
-                "is it open in the firewall?"
-            )
         case True:
-            what = f"port {path.port} is in use there, perhaps by another run; end that (`ss -ltnp` there tells who)"
+            what = f"in use there, perhaps by another run; end that (`ss -ltnp` there tells who), or {another}"
+            return f"{path.target}: port {path.port} is {what}"
+        case False:
+            return f"{path.target}: nothing may listen on port {path.port} there ({why}); {another}"
         case _:
-            what = f"nothing may listen on port {path.port} there ({why})"
-    return f"{path.target}: {what}, or give another port in the inventory"
+            what = f"cannot be reached ({why}); is it open in the firewall?"
+            return f"{path.source}: port {path.port} of {path.target} {what}"

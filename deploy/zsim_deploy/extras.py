@@ -1,10 +1,12 @@
-"""Which extras of the distribution a host needs for the roles that an inventory gives it. Pure."""
+"""Which extras of the distribution a host needs for the roles that an inventory gives it."""
 
+import importlib.metadata
 from collections.abc import Iterable
 
 from zsim.rights import RECORDER, WORLD
 from zsim_deploy.inventory import Inventory, hosts_of, spread
 
+PROJECT = "zsim"
 NAMED = {WORLD: "world", RECORDER: "record"}  # processes that there is one of; hosts are given out in this order
 KINDS = {"estimator.": "agents", "controller.": "agents"}  # by the beginning of the process name
 MODULES = {  # what proves that an extra is whole, the installation without extras first
@@ -13,6 +15,11 @@ MODULES = {  # what proves that an extra is whole, the installation without extr
     "record": "zsim_agents.recorder",
     "world": "zsim_world.process",
 }
+
+
+def known() -> list[str]:
+    """Return the extras of what is installed here."""
+    return sorted(importlib.metadata.metadata(PROJECT).get_all("Provides-Extra") or [])
 
 
 def needed(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, frozenset[str]]:

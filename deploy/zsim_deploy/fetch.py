@@ -13,8 +13,8 @@ STALL_S = 20.0  # without anything more the host is taken for lost; TCP repeats 
 BLOCK_BYTES = 32_768  # asked for at once; even at 100 kbit/s one comes within 3 s
 
 
-async def fetch(link: HostLink, source: str, into: Path) -> None:
-    """Copy a file from a host, under its name only when it is whole.
+async def fetch(link: HostLink, source: str, into: Path) -> bool:
+    """Copy a file from a host, under its name only when it is whole; return False if there is none.
 
     Args:
         link: to the host.
@@ -35,9 +35,12 @@ async def fetch(link: HostLink, source: str, into: Path) -> None:
                 sftp.exit()  # not waited for: a link that is cut does not say that it has closed
     except TimeoutError as error:
         raise HostsError(f"{link.name}: no answer within {OPEN_S:g} s") from error
+    except asyncssh.SFTPNoSuchFile:
+        return False
     except asyncssh.Error as error:
         raise HostsError(f"{link.name}: {error}") from error
     part.replace(into)
+    return True
 
 
 async def _copy(sftp: asyncssh.SFTPClient, source: str, into: Path) -> None:

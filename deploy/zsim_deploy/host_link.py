@@ -151,7 +151,9 @@ class HostLink:
         self._lines.append(Line(await connect(self.name, self.host, self._base)))
         return self._lines[-1]
 
-    async def run(self, command: str, given: bytes = b"", timeout_s: float = ANSWER_S, what: str = "") -> bytes:
+    async def run(
+        self, command: str, given: bytes = b"", timeout_s: float = ANSWER_S, what: str = "", patient: bool = False
+    ) -> bytes:
         """Return what a command prints.
 
         Args:
@@ -159,11 +161,12 @@ class HostLink:
             given: its standard input.
             timeout_s: how long it may take.
             what: it does, for errors; its first word if not given.
+            patient: try until the host is there; the time counts from then.
 
         Raises:
             HostsError: it failed, or took too long; with the last line that it said.
         """
-        async with self.channel() as connection:
+        async with self.channel(patient) as connection:
             try:
                 done = await asyncio.wait_for(connection.run(command, input=given, encoding=None), timeout_s)
             except TimeoutError as error:
@@ -177,13 +180,16 @@ class HostLink:
             raise HostsError(f"{self.name}: {what} failed ({done.exit_status}): {lines[-1][:200]}")
         return done.stdout if isinstance(done.stdout, bytes) else b""
 
-    async def put_files(self, folder: str, files: Mapping[str, bytes], timeout_s: float = ANSWER_S) -> None:
+    async def put_files(
+        self, folder: str, files: Mapping[str, bytes], timeout_s: float = ANSWER_S, patient: bool = False
+    ) -> None:
         """Write files below a folder of the host, readable by their owner alone: all, or none where the link breaks.
 
         Args:
             folder: made if it is not there.
             files: path below the folder to content.
             timeout_s: how long it may take.
+            patient: as `run`.
 
         Raises:
             HostsError: they could not be written.
@@ -193,7 +199,7 @@ class HostLink:
         is_whole = f"[ $(wc -c < {part}) -eq {len(content)} ] || {{ echo it came in part >&2; exit 1; }}"
         unpack = f"{{ {is_whole}; }} && tar -xof {part} -C {into}"
         script = f"umask 077; mkdir -p {into} && cat > {part} && {unpack} && rm {part}"
-        await self.run(script, content, timeout_s, f"writing into {folder}")
+        await self.run(script, content, timeout_s, what=f"writing into {folder}", patient=patient)
 
     async def echo(self) -> None:
         """Send a word there and back for ever, so that a lost host is noticed within a second."""

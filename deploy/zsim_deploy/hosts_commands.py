@@ -1,16 +1,27 @@
 """The commands of a run on several hosts."""
 
+import codecs
 import contextlib
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from zsim_deploy.arguments import Duration, RateOption, Realtime, ScenarioPath, Seed, Set, load_scenario, mode_and_rate
+from zsim_deploy.arguments import (
+    Duration,
+    Insecure,
+    RateOption,
+    Realtime,
+    ScenarioPath,
+    Seed,
+    Set,
+    load_scenario,
+    mode_and_rate,
+)
 from zsim_deploy.push_command import push
 
 FOLLOW_S = 0.2  # between two looks at a log that is followed
@@ -29,6 +40,7 @@ def up(
     realtime: Realtime = False,
     rate: RateOption = None,
     set_: Set = None,
+    insecure: Insecure = False,
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
 ) -> None:
     """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything."""
@@ -39,6 +51,7 @@ def up(
 
     loaded = load_scenario(scenario, set_, seed, duration)
     placed = inventory.load(hosts)
+    placed = inventory.insecure(placed) if insecure else placed
     inventory.placement(placed, loaded)
     mode, pace = mode_and_rate(realtime, rate)
     with _folder(out, loaded) as folder:
@@ -91,20 +104,56 @@ def logs(
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what is written from now on.")] = False,
     federation: Federation = "zsim",
 ) -> None:
-    """Print what a process of the run that is up has said."""
+    """Print what a process of the run that is up has said; what the world tells is shown by `zsim up` itself."""
     from zsim.errors import RunError
     from zsim_deploy import intercom
 
-    path = Path(intercom.ask(federation, "out")) / "logs" / f"{role}.log"
+    where = intercom.ask(federation, "where")
+    if role not in where["roles"]:
+        raise RunError(f"role is {role!r}; must be one of {', '.join(where['roles'])}")
+    path = Path(where["out"]) / "logs" / f"{role}.log"
     if not path.exists():
-        known = ", ".join(sorted(file.stem for file in path.parent.glob("*.log"))) or "nobody yet"
-        raise RunError(f"{role} has said nothing; {known} did")
-    with path.open(errors="replace") as log:
-        sys.stdout.write(log.read())
-        while follow:
-            sys.stdout.write(log.read())
-            sys.stdout.flush()
-            time.sleep(FOLLOW_S)
+        print(_silent(role), file=sys.stderr)
+    for text in _written(path, follow, lambda: _is_up(federation, where["out"])):
+        sys.stdout.write(text)
+        sys.stdout.flush()
+
+
+def _written(path: Path, follow: bool, goes_on: Callable[[], bool]) -> Iterator[str]:
+    """Yield what is in a file, and what is added to it for as long as something goes on; it may not be there yet."""
+    done, last = 0, not follow
+    decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
+    while True:
+        if path.exists():
+            with path.open("rb") as log:
+                log.seek(done)
+                new = log.read()
+            done += len(new)
+            yield decoder.decode(new)
+        if last:
+            return
+        time.sleep(FOLLOW_S)
+        last = not goes_on()
+
+
+def _silent(role: str) -> str:
+    """Return why there is nothing of a role."""
+    from zsim.rights import WORLD
+
+    if role == WORLD:
+        return "world has had no fault to tell; its progress and events are shown by `zsim up`, and are in the record"
+    return f"{role} has said nothing yet"
+
+
+def _is_up(federation: str, out: str) -> bool:
+    """Tell whether the launcher of a federation still has the run of this folder."""
+    from zsim.errors import RunError
+    from zsim_deploy import intercom
+
+    try:
+        return intercom.ask(federation, "where")["out"] == out
+    except RunError:
+        return False
 
 
 def restart(role: Role, federation: Federation = "zsim") -> None:

@@ -19,7 +19,7 @@ from typing import Any
 from zsim.errors import RunError, ZsimError
 
 REQUEST_S = 5.0  # from the same machine
-ANSWER_S = 120.0  # a move connects to a host, asks it about itself, and brings a certificate: 115 s at most (orders.py)
+ANSWER_S = 150.0  # a move connects to a host, asks it about itself, and brings a certificate: 135 s at most (orders.py)
 LINE_MAX = 1_000_000  # bytes
 PATH_MAX = 107  # bytes of a socket's path; unix(7), without the last zero. macOS has 103, and says so itself
 
@@ -147,7 +147,8 @@ def _lock(federation: str, path: Path) -> int:
     except OSError as error:
         os.close(lock)
         raise RunError(
-            f"federation {federation!r} is up already on this machine; end it with `zsim down`, or name another"
+            f"federation {federation!r} is up already on this machine; end it with "
+            f"`zsim down --federation {federation}`, or fly in another one: --set federation=NAME"
         ) from error
     return lock
 

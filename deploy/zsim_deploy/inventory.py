@@ -98,6 +98,12 @@ def load(path: Path) -> Placed:
     return Placed(msgspec.convert(document, Inventory), path.resolve().parent, path.name)
 
 
+def insecure(placed: Placed) -> Placed:
+    """Return an inventory as if it said `security: {insecure: true}`."""
+    security = msgspec.structs.replace(placed.inventory.security, insecure=True)
+    return placed._replace(inventory=msgspec.structs.replace(placed.inventory, security=security))
+
+
 def _cross_faults(inventory: Any, document: dict[str, Any]) -> Iterator[Fault]:
     """Yield the faults between fields: names that must be those of hosts and routers."""
     hosts, routers = ([key for key, _ in _map(document, name)] for name in ("hosts", "routers"))

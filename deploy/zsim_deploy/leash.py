@@ -11,6 +11,8 @@ import sys
 import threading
 import time
 
+from zsim_deploy.lent import Lent
+
 GRACE_S = 4.0  # a role that was told to stop and hangs is ended; the world waits 5 s for byes only if unstopped
 
 
@@ -19,9 +21,11 @@ class Leash:
 
     Args:
         launched: whether standard input is a launcher's pipe; then Ctrl-C is the launcher's business.
+        lent: key that goes back as soon as the launcher is gone.
     """
 
-    def __init__(self, launched: bool) -> None:
+    def __init__(self, launched: bool, lent: Lent | None = None) -> None:
+        self._lent = lent
         self._reason: str | None = None
         self._deserted = False
         self._heard_s = time.monotonic()
@@ -77,6 +81,8 @@ class Leash:
 
     def _leave(self, reason: str) -> None:
         self._deserted = True
+        if self._lent is not None:
+            self._lent.give_back()
         self._stop(reason)
         time.sleep(GRACE_S)
         os._exit(1)

@@ -1,21 +1,34 @@
 """What `zsim push` runs on a host, with the Python that is there and nothing else; it is sent as text.
 
-python - look FOLDER             print as JSON: Python, platform, what is installed, wheels that are there
-python - install FOLDER ORDER    make FOLDER/venv what the order (JSON) says
+Standard input is this text, and then an order a line, as JSON; each is answered by a line of JSON on standard output.
+When standard input ends, or nothing came for a while, not even an empty line, the push is over, or its launcher is
+gone: whatever is being done is ended.
+
+{"act": "look"}                      what decides which wheels fit, what is installed, wheels that are there
+{"act": "install", ...}              make FOLDER/venv what the order says
+{"act": "warm_up", "module": NAME}   run a module of what is installed
+
+Only one of it works in a folder at a time; another one says who does, and waits.
 """
 
 import contextlib
+import fcntl
 import hashlib
 import json
 import os
 import platform
+import queue
 import shutil
+import signal
 import subprocess
 import sys
 import sysconfig
+import threading
 import venv
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+LOCK = "push.lock"  # in the folder: locked by who works in it, with a word on who that is
 NOTE = "zsim-installed.json"  # in the environment: what was installed; missing while something is being changed
 
 
@@ -47,13 +60,55 @@ def _sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def install(folder: Path, order: dict) -> None:
+class Fault(Exception):  # noqa: N818
+    """What a command says is wrong."""
+
+
+class Children:
+    """Runs commands one after the other, until they are all ended."""
+
+    def __init__(self) -> None:
+        self._gate = threading.Lock()
+        self._child: subprocess.Popen | None = None
+
+    def run(self, command: list) -> None:
+        """Run a command to its end.
+
+        Raises:
+            Fault: it failed.
+        """
+        with self._gate:
+            self._child = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                start_new_session=True,
+            )  # fmt: skip
+        out, err = self._child.communicate()
+        if code := self._child.returncode:
+            lines = (err.strip() or out.strip() or f"it ended with {code}").splitlines()
+            errors = [line for line in lines if line.startswith("ERROR")] or lines
+            raise Fault(f"{' '.join(command[-2:])[-80:]}: {errors[-1]}")
+
+    def end(self) -> None:
+        """Kill the command that runs with all that it started; no other is started any more."""
+        self._gate.acquire()
+        if self._child and self._child.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._child.pid, signal.SIGKILL)
+            self._child.wait()
+
+
+def install(folder: Path, order: dict, children: Children) -> None:
     """Install wheels that lie in FOLDER/wheels, and nothing from anywhere else.
 
     Args:
         folder: of zsim on this host.
         order: project and pip (names of their wheels), wheels (names of the others that are new), extras, modules (to
             import for proof), note (to keep).
+        children: runs pip.
+
+    Raises:
+        Fault: pip failed, or the proof.
+        OSError: no room.
     """
     environment, wheels = folder / "venv", folder / "wheels"
     fresh = _installed(environment) is None
@@ -63,27 +118,101 @@ def install(folder: Path, order: dict) -> None:
     python = str(environment / "bin" / "python")
     pip = [python, str(wheels / order["pip"] / "pip"), "--isolated", "--disable-pip-version-check", "-q"]
     if not fresh:
-        _run([*pip, "uninstall", "-y", "zsim"])  # another build may have the same version
+        children.run([*pip, "uninstall", "-y", "zsim"])  # another build may have the same version
     project = str(wheels / order["project"]) + (f"[{','.join(order['extras'])}]" if order["extras"] else "")
     files = [str(wheels / name) for name in order["wheels"]]
-    _run([*pip, "install", "--no-index", "--no-compile", "--find-links", str(wheels), project, *files])
+    children.run([*pip, "install", "--no-index", "--no-compile", "--find-links", str(wheels), project, *files])
     # What the roles import is compiled by this proof; all the rest of the packages would take longer than to install.
-    _run([python, "-P", "-c", f"import {', '.join(order['modules'])}"])
+    children.run([python, "-P", "-c", f"import {', '.join(order['modules'])}"])
     (environment / NOTE).write_text(json.dumps({**order["note"], "python": list(sys.version_info[:2])}))
     shutil.rmtree(wheels)
 
 
-def _run(command: list) -> None:
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
-    if done.returncode:
-        lines = (done.stderr.strip() or done.stdout.strip() or f"it ended with {done.returncode}").splitlines()
-        errors = [line for line in lines if line.startswith("ERROR")] or lines
-        sys.exit(f"{' '.join(command[-2:])[-80:]}: {errors[-1]}")
+@contextlib.contextmanager
+def locked(folder: Path, who: str) -> Iterator[None]:
+    """Work in a folder alone; while another does, say who, and wait.
+
+    Raises:
+        OSError: the folder cannot be made or written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / LOCK, "a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            say({"waits": file.read() or "another"})
+            fcntl.flock(file, fcntl.LOCK_EX)
+        file.truncate(0)
+        file.write(f"{who} (process {os.getpid()} there)")
+        file.flush()
+        yield
+
+
+def say(answer: dict) -> None:
+    print(json.dumps(answer), flush=True)
+
+
+def obey(folder: Path, order: dict, children: Children) -> dict:
+    """Do what an order says and return the answer."""
+    try:
+        if order["act"] == "look":
+            return look(folder)
+        if order["act"] == "install":
+            install(folder, order, children)
+        else:
+            children.run([str(folder / "venv" / "bin" / "python"), "-P", "-m", order["module"]])
+        return {"done": True}
+    except Exception as error:
+        return {"error": str(error) if isinstance(error, (Fault, OSError)) else repr(error)}
+
+
+def listen(lines: Iterable, orders: queue.SimpleQueue, heard: threading.Event) -> None:
+    """Pass on the orders that come, and note that something came."""
+    for line in lines:
+        heard.set()
+        if line.strip():
+            orders.put(json.loads(line))
+
+
+def leave(children: Children) -> None:
+    """End everything at once; a thread that reads standard input does not end otherwise."""
+    children.end()
+    os._exit(0)
+
+
+def wait_for_silence(heard: threading.Event, silent_s: float) -> None:
+    """Return when nothing was heard for so long."""
+    while heard.wait(silent_s):
+        heard.clear()
+
+
+def main(folder: Path, who: str, silent_s: float) -> None:
+    """Obey until standard input ends, or nothing has come on it for some seconds."""
+    orders, children, heard = queue.SimpleQueue(), Children(), threading.Event()
+
+    def follow() -> None:
+        try:
+            listen(sys.stdin.buffer, orders, heard)
+        finally:
+            leave(children)
+
+    def watch() -> None:
+        wait_for_silence(heard, silent_s)
+        leave(children)
+
+    for each in (follow, watch):
+        threading.Thread(target=each, daemon=True).start()
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(locked(folder, who))
+        except OSError as error:
+            say({"unwritable": f"{error.filename or folder}: {error.strerror}"})
+            leave(children)
+        say({"locked": True})
+        while True:
+            say(obey(folder, orders.get(), children))
 
 
 if __name__ == "__main__":
-    act, where = sys.argv[1], Path(sys.argv[2]).expanduser().absolute()
-    if act == "look":
-        print(json.dumps(look(where)))
-    else:
-        install(where, json.loads(sys.argv[3]))
+    main(Path(sys.argv[1]).expanduser().absolute(), sys.argv[2], float(sys.argv[3]))

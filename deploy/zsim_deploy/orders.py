@@ -4,20 +4,25 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import CancelledError, wait
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from zsim.errors import HostsError, RunError
 from zsim.rights import RECORDER, ROUTER, WORLD
+from zsim_deploy import shell
 from zsim_deploy.board import Board
 from zsim_deploy.doctor import about, compared
+from zsim_deploy.extras import MODULES
 from zsim_deploy.host_link import HostLink, Loop
 from zsim_deploy.links import Links
 from zsim_deploy.plan import Plan
 from zsim_deploy.remote import Remote
+from zsim_deploy.render.process import extras
 from zsim_deploy.watch import Watch
 
 JOIN_S = 60.0  # until a host that was not used so far is connected and has said that it fits
+IMPORT_S = 20.0  # until a Python has shown that it can run a role; a small computer takes 5 s
 BRING_S = 30.0  # until a certificate is on a host
 LEAVE_S = 20.0  # until a process whose place was taken a moment ago has ended, which takes a second
 LOOK_S = 0.1  # between two looks whether it has
@@ -58,13 +63,14 @@ class Orders:
 
     def acts(self) -> dict[str, Callable[..., Any]]:
         """Return what can be asked, by name."""
-        return {"ps": self._ps, "out": self._say_out, "down": self._down, "restart": self._restart, "move": self._move}
+        looks = {"ps": self._ps, "where": self._say_where}
+        return {**looks, "down": self._down, "restart": self._restart, "move": self._move}
 
     def _ps(self) -> dict[str, Any]:
-        return {"rows": self._board.rows(), "clock": self._board.clock_now(), "out": str(self._out)}
+        return {"rows": self._board.rows(), "clock": self._board.clock_now(), **self._say_where()}
 
-    def _say_out(self) -> str:
-        return str(self._out)
+    def _say_where(self) -> dict[str, Any]:
+        return {"out": str(self._out.absolute()), "roles": list(self._plan.processes)}
 
     def _down(self) -> None:
         self._watch.interrupt("ended by zsim down")
@@ -74,6 +80,7 @@ class Orders:
         if role in (WORLD, RECORDER):
             raise RunError(f"{role} cannot be restarted: the run lives in it; end the run with `zsim down`")
         with self._one_at_a_time:
+            self._bring(self._plan, role)
             return self._take_over(self._plan, role)
 
     def _move(self, role: str, host: str) -> str:
@@ -84,11 +91,18 @@ class Orders:
             raise RunError(f"host is {host!r}; must be one of {', '.join(self._plan.known_hosts())}")
         with self._one_at_a_time:
             plan = self._plan.moved(role, host)
-            files = plan.identity(role)
+            if faults := plan.lacks(datetime.now(UTC)):
+                raise HostsError("\n".join(faults))
             link = self._links.by_name.get(host) or self._join(host)
-            if files:
-                self._loop.call(link.put_files(plan.folder(host), files, BRING_S))
+            self._loop.call(_refuse_unless_able(link, plan.python(host), role))
+            self._bring(plan, role)
             return self._take_over(plan, role)
+
+    def _bring(self, plan: Plan, role: str) -> None:
+        """Put the certificate of a process on its host."""
+        link = self._links.by_name[plan.host(role)]
+        if files := plan.identity(role):
+            self._loop.call(link.put_files(plan.folder(link.name), files, BRING_S))
 
     def _refuse_unless_runs(self, role: str) -> None:
         if not self._watch.members:
@@ -132,3 +146,19 @@ class Orders:
         except CancelledError as error:
             raise RunError("the run is ending; nothing is started any more") from error
         return f"{role} on {plan.host(role)}"
+
+
+async def _refuse_unless_able(link: HostLink, python: str, role: str) -> None:
+    """Refuse a host whose Python cannot import what a role is made of.
+
+    Raises:
+        HostsError: with what it lacks.
+    """
+    for extra in extras([role]):
+        code = f"import {MODULES[extra]}"
+        command = f"{shell.word(python)} -c {shell.word(code)}"
+        try:
+            await link.run(command, timeout_s=IMPORT_S, what=code)
+        except HostsError as error:
+            remedy = f"install zsim[{extra}] there, as `zsim push --extra {extra}` does"
+            raise HostsError(f"{error}; {role} cannot run on {link.name}; {remedy}") from error

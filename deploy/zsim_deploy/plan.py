@@ -1,6 +1,8 @@
 """What a run puts on each host: the processes with their command lines, and the files that they need there."""
 
+import shlex
 from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 
 import msgspec
@@ -10,9 +12,12 @@ from zsim.errors import HostsError
 from zsim.identity import CERTIFICATES
 from zsim.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario import Scenario
+from zsim_deploy import credentials
 from zsim_deploy import inventory as inv
-from zsim_deploy.enrolment import folder_of
+from zsim_deploy.earlier import RECORD, runs_folder, scp
+from zsim_deploy.enrolment import folder_of, init_command
 from zsim_deploy.inventory import Placed
+from zsim_deploy.lent import FOLDER
 from zsim_deploy.render.process import MODULE, Files, access_file, command, own_programs, processes
 
 ACCESS = "access.json"
@@ -64,17 +69,41 @@ class Plan:
 
     def folder(self, host: str) -> str:
         """Return the folder of this run on a host."""
-        folder = self._placed.inventory.hosts[host].folder
-        home = "" if folder.startswith(("/", "~/")) else "~/"
-        return f"{home}{folder}/runs/{self._run_id}"
+        return f"{runs_folder(self._placed.inventory.hosts[host])}/{self._run_id}"
 
     def keys(self, host: str) -> str:
         """Return the folder in which the keys of this run's processes are on a host."""
-        return f"{self.folder(host)}/identity"
+        return f"{self.folder(host)}/{FOLDER}"
 
     def record(self) -> str:
         """Return where the record is written, on the recorder's host."""
-        return f"{self.folder(self.host(RECORDER))}/run.mcap"
+        return f"{self.folder(self.host(RECORDER))}/{RECORD}"
+
+    def way_to_record(self) -> str:
+        """Return where the record is, and how it is fetched by hand, as a person is told."""
+        name = self.host(RECORDER)
+        command = scp(self._placed.inventory.hosts[name], self._placed.folder, self.record())
+        return f"{name}:{self.record()} (fetch it with `{command}`)"
+
+    def source(self) -> str:
+        """Return the inventory's file as a word of a command."""
+        return shlex.quote(str(self._placed.folder / self._placed.source))
+
+    def base(self) -> Path:
+        """Return the folder of the inventory."""
+        return self._placed.folder
+
+    def ports(self, host: str) -> list[int]:
+        """Return the ports of a host on which processes of the run will listen."""
+        return [process.port for process in self.processes.values() if process.host == host and process.port]
+
+    def lacks(self, now: datetime) -> list[str]:
+        """Return what of the certificates is missing or of no use at a time, a line for each fault."""
+        return credentials.lacks(self._placed, {name: self.host(name) for name in self.processes}, now)
+
+    def exposed(self) -> str | None:
+        """Return a warning of private keys here that others can read, if there are any."""
+        return credentials.exposed(self._placed)
 
     def python(self, host: str) -> str:
         """Return the interpreter of a host that has zsim."""
@@ -111,7 +140,7 @@ class Plan:
         paths = {file: source / name / file for file in CERTIFICATES}
         if process.port is not None:
             paths[ACCESS] = source / access_file(process)
-        return {f"identity/{name}/{file}": self._read(path) for file, path in paths.items()}
+        return {f"{FOLDER}/{name}/{file}": self._read(path) for file, path in paths.items()}
 
     def _read(self, path: Path) -> bytes:
         try:
@@ -119,5 +148,5 @@ class Plan:
         except OSError as error:
             raise HostsError(
                 f"{path}: cannot be read ({error.strerror}); make certificates with "
-                f"`zsim certs init {self._placed.source}`, or set security.insecure on a network of your own"
+                f"`{init_command(self._placed)}`, or set security.insecure on a network of your own"
             ) from error

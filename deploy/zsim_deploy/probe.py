@@ -85,7 +85,8 @@ def serve(port: int) -> None:
     try:
         server = listening(port)
     except OSError as error:
-        print(json.dumps({"error": os.strerror(error.errno) if error.errno else str(error), "taken": error.errno == errno.EADDRINUSE}))
+        why = os.strerror(error.errno) if error.errno else str(error)
+        print(json.dumps({"error": why, "taken": error.errno == errno.EADDRINUSE}))
         return
     with server:
         print(json.dumps({"ready": port}), flush=True)

@@ -1,10 +1,10 @@
 """`zsim push`: install zsim on the hosts of an inventory, over ssh alone; the hosts need no internet."""
 
 import asyncio
-import json
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,9 @@ import asyncssh
 
 from zsim import __version__
 from zsim.errors import HostsError, InventoryError
-from zsim_deploy import extras, on_host, shell, warm_up
-from zsim_deploy.answer import answer
+from zsim_deploy import extras, shell, warm_up
 from zsim_deploy.host_link import HostLink
+from zsim_deploy.installer import Installer, installer
 from zsim_deploy.inventory import Host, Placed
 from zsim_deploy.target import chosen, interpreters, question, target
 from zsim_deploy.wheelhouse import House, Wheel, Wheelhouse
@@ -41,13 +41,16 @@ async def push(placed: Placed, names: Sequence[str], more: Iterable[str], told: 
         For each host whether anything had to be done there.
 
     Raises:
-        InventoryError: a host is not in the inventory.
+        InventoryError: a host is not in the inventory, or there is no such extra.
         HostsError: with a line for each host at which it failed; the others are done.
     """
     hosts = placed.inventory.hosts
-    unknown = [name for name in names if name not in hosts]
+    more = list(more)
+    unknown = [f"--host {name}: must be one of {', '.join(hosts)}" for name in names if name not in hosts]
+    known = extras.known()
+    unknown += [f"--extra {name}: must be one of {', '.join(known)}" for name in more if name not in known]
     if unknown:
-        raise InventoryError([f"--host {name}: must be one of {', '.join(hosts)}" for name in unknown])
+        raise InventoryError(unknown)
     wanted = extras.needed(placed.inventory, more)
     house = Wheelhouse(cache, lambda text: told(LAUNCHER, text))
     chosen_names = list(dict.fromkeys(names)) or list(hosts)
@@ -74,26 +77,38 @@ async def _one(name: str, host: Host, base: Path, wanted: frozenset[str], house:
     link = HostLink(name, host, base)
     try:
         told(name, "looking what is there")
-        there = There(link, host.folder)
-        await there.look()
-        needed = await house.house(name, target(name, there.found), wanted)
-        described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
-        if is_there(needed, there.found["installed"]):
-            told(name, f"{described} is there")
-            return False
-        await there.copy(missing(needed, there.found), told)
-        told(name, "installing")
-        await there.install(needed)
-        if any(wheel.path.name.startswith("numba-") for wheel in needed.others):
-            told(name, "compiling what flies")
-            await there.warm_up()
-        told(name, f"{described} installed")
-        return True
-    except HostsError as error:
-        told(name, f"failed: {error}")
+        python = await _python(link)
+        async with installer(link, python, host.folder, partial(told, name)) as program:
+            return await _install(There(link, program), wanted, house, partial(told, name))
+    except HostsError:
+        told(name, "failed")
         raise
     finally:
         await link.close()
+
+
+async def _python(link: HostLink) -> str:
+    """Return the Python of a host to install for."""
+    said = await link.run(shell.line(["sh", "-c", question()]), timeout_s=ASK_S)
+    return chosen(link.name, interpreters(said.decode(errors="replace")), sys.version_info[:2]).path
+
+
+async def _install(there: "There", wanted: frozenset[str], house: Wheelhouse, told: Callable[[str], None]) -> bool:
+    """Install what is wanted; return whether anything had to be done."""
+    await there.look()
+    needed = await house.house(there.name, target(there.name, there.found), wanted)
+    described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
+    if is_there(needed, there.found["installed"]):
+        told(f"{described} is there")
+        return False
+    await there.copy(missing(needed, there.found), told)
+    told("installing")
+    await there.install(needed)
+    if any(wheel.path.name.startswith("numba-") for wheel in needed.others):
+        told("compiling what flies")
+        await there.warm_up()
+    told(f"{described} installed")
+    return True
 
 
 def is_there(house: House, installed: dict[str, Any] | None) -> bool:
@@ -119,20 +134,14 @@ def missing(house: House, found: dict[str, Any]) -> list[Wheel]:
 class There:
     """What is on a host, and what is done to it."""
 
-    def __init__(self, link: HostLink, folder: str) -> None:
-        self._link, self._folder = link, folder
-        self._python = ""
+    def __init__(self, link: HostLink, program: Installer) -> None:
+        self.name = link.name
+        self._link, self._program = link, program
         self.found: dict[str, Any] = {}
 
     async def look(self) -> None:
-        """Find the Python to install for, and what is installed."""
-        pythons = await self._link.run(shell.line(["sh", "-c", question()]), timeout_s=ASK_S)
-        found = interpreters(pythons.decode(errors="replace"))
-        self._python = chosen(self._link.name, found, sys.version_info[:2]).path
-        said = answer((await self._run("look", timeout_s=ASK_S)).decode(errors="replace").splitlines())
-        if said is None:
-            raise HostsError(f"{self._link.name}: {self._python} says nothing; does it run there?")
-        self.found = said
+        """Find what is installed."""
+        self.found = await self._program.ask("look", ASK_S)
 
     async def install(self, house: House) -> None:
         order = {
@@ -143,20 +152,15 @@ class There:
             "modules": [extras.MODULES[extra] for extra in ("", *house.extras) if extra in extras.MODULES],
             "note": house.note(),
         }
-        await self._run("install", json.dumps(order), timeout_s=INSTALL_S)
+        await self._program.ask("install", INSTALL_S, **order)
 
     async def warm_up(self) -> None:
-        python = f"{self.found['folder']}/venv/bin/python"
-        await self._link.run(shell.line([python, "-P", "-m", warm_up.__name__]), timeout_s=COMPILE_S)
+        await self._program.ask("warm_up", COMPILE_S, module=warm_up.__name__)
 
-    async def _run(self, act: str, *words: str, timeout_s: float) -> bytes:
-        command = shell.line([self._python, "-P", "-", act, self._folder, *words])
-        return await self._link.run(command, Path(on_host.__file__).read_bytes(), timeout_s)
-
-    async def copy(self, wheels: Sequence[Wheel], told: Told) -> None:
+    async def copy(self, wheels: Sequence[Wheel], told: Callable[[str], None]) -> None:
         """Copy wheels to the host; what broke off is not mistaken for a wheel."""
         folder = f"{self.found['folder']}/wheels"
-        name, total, done = self._link.name, sum(wheel.size_bytes for wheel in wheels), 0
+        total, done = sum(wheel.size_bytes for wheel in wheels), 0
         gate = asyncio.Semaphore(COPIES)
 
         async def one(sftp: asyncssh.SFTPClient, wheel: Wheel) -> None:
@@ -166,7 +170,7 @@ class There:
             def progress(_source: bytes, _target: bytes, copied: int, _size: int) -> None:
                 nonlocal done, seen
                 done, seen = done + copied - seen, copied
-                told(name, f"copying {done / 1e6:.0f} of {total / 1e6:.0f} MB")
+                told(f"copying {done / 1e6:.0f} of {total / 1e6:.0f} MB")
 
             async with gate:
                 await sftp.put(str(wheel.path), part, progress_handler=progress)
@@ -178,7 +182,7 @@ class There:
                 await asyncio.gather(*(one(sftp, wheel) for wheel in wheels))
         except (asyncssh.Error, OSError) as error:
             raise HostsError(
-                f"{name}: copying to {folder} failed ({error}); is there space, is the link up?"
+                f"{self.name}: copying to {folder} failed ({error}); is there space, is the link up?"
             ) from error
 
 

@@ -9,7 +9,7 @@ import contextlib
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any
 
@@ -23,6 +23,7 @@ from zsim_deploy.log import Log
 
 BEAT_S = 1.0  # how often the launcher shows that it lives
 ORPHAN_S = 60.0  # without a beat a process ends itself; a link may be cut for shorter than that
+LEND_S = 60.0  # how long its files may take to reach the host again; as long as a link may be cut
 KILL_S = 5.0  # how long a kill may take to reach the host: a few round trips
 LOST = -1000  # code of a process of which nobody knows how it ended
 PID = "zsim-pid "  # begins the line with its process id; a login shell may say something before
@@ -39,6 +40,8 @@ class Remote:
         loop: on which the link lives.
         log: for what it says.
         on_line: told every line of its standard output; None sends that to the log too.
+        folder: of the run there.
+        files: what it needs below that folder and takes away when it ends; brought again whenever it is started again.
     """
 
     def __init__(
@@ -50,6 +53,8 @@ class Remote:
         loop: Loop,
         log: Log,
         on_line: Callable[[str], None] | None = None,
+        folder: str = "",
+        files: Mapping[str, bytes] | None = None,
     ) -> None:
         self.name = name
         self.role = name.split(".", 1)[0]
@@ -63,6 +68,9 @@ class Remote:
         self._loop = loop
         self._log = log
         self._on_line = on_line
+        self._folder = folder
+        self._files = files or {}
+        self._starts = 0
         self._process: asyncssh.SSHClientProcess[str] | None = None
         self._life: Future[None] | None = None
         self._code: int | None = None
@@ -83,6 +91,7 @@ class Remote:
 
     def start(self) -> None:
         """Start it, or start it again; returns at once."""
+        self._starts += 1
         self.pid, self._code, self._process, self._stop, self._fault = 0, None, None, None, ""
         self._ended.clear()
         self.started_s = time.monotonic()
@@ -106,6 +115,8 @@ class Remote:
         self._log.write(f"{fault}\n")
 
     async def _run(self) -> int:
+        if self._starts > 1 and self._files:
+            await self._link.put_files(self._folder, self._files, LEND_S, patient=True)
         async with (
             self._link.channel(patient=True) as connection,
             connection.create_process(self._command(), encoding="utf-8", errors="replace") as process,

@@ -19,6 +19,7 @@ from zsim.identity import Identity
 from zsim.runner import Runner
 from zsim.scenario import Scenario
 from zsim_deploy.leash import Leash
+from zsim_deploy.lent import lent
 from zsim_deploy.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
 
 TICK_S = 0.1  # how often a router looks for a stop
@@ -42,7 +43,7 @@ def world(
     from zsim_world.process import run
     from zsim_world.world import World
 
-    leash = Leash(launched is not None)
+    leash = Leash(launched is not None, lent(identity, launched))
     with _patience(Teller() if launched else None):
         run_world = World(scenario, mode, rate, time.monotonic_ns, launched)
     for name in expect or ():
@@ -126,7 +127,7 @@ def agent(
     identity: Identity,
 ) -> None:
     """Run one agent against the world on an endpoint."""
-    leash = Leash(launched is not None)
+    leash = Leash(launched is not None, lent(identity, launched))
     say = _speaker(launched is not None)
     found = find_world(endpoint, federation, wait_s, say, leash.pulled, run_id=launched, identity=identity)
     with found as (link, info):
@@ -162,7 +163,7 @@ def recorder(
     from zsim_agents.recorder import record
 
     os.nice(5) if hasattr(os, "nice") else None
-    leash = Leash(launched is not None)
+    leash = Leash(launched is not None, lent(identity, launched))
     say = _speaker(launched is not None)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -188,7 +189,7 @@ def router(
     Raises:
         SessionError: the port is taken, or a certificate, here or upstream, is refused.
     """
-    leash = Leash(launched is not None)
+    leash = Leash(launched is not None, lent(identity, launched))
     say = _speaker(launched is not None)
     with session.route(endpoint, upstream, federation, mode, identity) as link:
         say(f"router.{name}: {endpoint} leads to {upstream}")

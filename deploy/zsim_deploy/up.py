@@ -5,16 +5,19 @@ import time
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from zsim import scenario_file
 from zsim.errors import HostsError, RunError, ZsimError
 from zsim.record import repair
 from zsim.rights import RECORDER, WORLD
 from zsim.scenario import Scenario
-from zsim_deploy import shell
+from zsim_deploy import ports, shell
 from zsim_deploy.board import Board
+from zsim_deploy.doctor import Report, about, compared
+from zsim_deploy.earlier import RECORD, earlier
 from zsim_deploy.fetch import fetch
 from zsim_deploy.host_link import HostLink, Loop
 from zsim_deploy.intercom import Intercom
@@ -25,6 +28,7 @@ from zsim_deploy.orders import Orders
 from zsim_deploy.plan import Plan
 from zsim_deploy.remote import Remote
 from zsim_deploy.render.process import REALTIME
+from zsim_deploy.signals import CLOSED, Signals
 from zsim_deploy.watch import Outcome, Watch
 
 CONNECT_S = 30.0  # how long all hosts together may take to let us in, …
@@ -48,6 +52,14 @@ class Options:
         """Return that as options of the world."""
         realtime = [REALTIME] if self.mode == "realtime" else []
         return [*realtime, *(["--rate", str(self.rate)] if self.rate else [])]
+
+
+class Look(NamedTuple):
+    """What a look at a host has found: what it says, ports that are taken, and what earlier runs have left."""
+
+    report: Report
+    taken: list[str]
+    left: list[str]
 
 
 class Up:
@@ -76,10 +88,11 @@ class Up:
 
         Raises:
             RunError: the federation is up already on this machine.
-            HostsError: with a line for every host that cannot take part.
+            HostsError: with a line for every certificate that is missing, or every host that cannot take part.
         """
         try:
-            with self._intercom():
+            with Signals(self._options.out / "up.log", self._hang_up), self._intercom():
+                self._refuse_unless_certified()
                 self._timed("connect", lambda: self._links.on_all(HostLink.open, CONNECT_S))
                 self._timed("check", self._check)
                 with self._cleaned():
@@ -89,6 +102,16 @@ class Up:
             with contextlib.suppress(HostsError):
                 self._links.close()
             self._loop.close()
+
+    def _hang_up(self) -> None:
+        self._board.hang_up()
+        self._watch.interrupt(CLOSED)
+
+    def _refuse_unless_certified(self) -> None:
+        if faults := self._plan.lacks(datetime.now(UTC)):
+            raise HostsError("\n".join(faults))
+        if warning := self._plan.exposed():
+            self._board.say(f"warning: {warning}")
 
     def _intercom(self) -> Intercom:
         orders = Orders(self._plan, self._links, self._loop, self._watch, self._board, self._options.out, self._remote)
@@ -100,14 +123,18 @@ class Up:
         self._board.stages_s[what] = time.monotonic() - start_s
 
     def _check(self) -> None:
-        from zsim_deploy.doctor import about, compared
-
-        reports = self._links.on_all(lambda link: about(link, self._plan.python(link.name)), CHECK_S)
-        faults, warnings = compared(reports)
-        for warning in warnings:
+        looks = self._links.on_all(self._look, CHECK_S)
+        faults, warnings = compared({name: look.report for name, look in looks.items()})
+        for warning in [*warnings, *(line for look in looks.values() for line in look.left)]:
             self._board.say(f"warning: {warning}")
-        if faults:
+        if faults := [*faults, *(line for look in looks.values() for line in look.taken)]:
             raise HostsError("\n".join(faults))
+
+    async def _look(self, link: HostLink) -> Look:
+        python = self._plan.python(link.name)
+        report = await about(link, python, self._plan.source())
+        taken = await ports.faults(link, python, self._plan.ports(link.name))
+        return Look(report, taken, await earlier(link, self._plan.base()))
 
     async def _prepare(self, link: HostLink) -> None:
         """Put the scenario, and the certificates where there are any, on a host."""
@@ -122,8 +149,13 @@ class Up:
         self._board.members, self._board.links = self._watch.members, self._links.by_name
         self._links.listen()
         self._record_stays = True
-        outcome = self._watch.go(self._board.look)
-        fault = self._fetch()
+        try:
+            outcome = self._watch.go(self._board.look)
+            fault = self._fetch()
+        except KeyboardInterrupt:
+            where = self._plan.way_to_record()
+            self._board.say(f"the record was not fetched; what there is of it is at {where}")
+            raise
         if fault and not outcome.failed and not outcome.interrupted:
             return replace(outcome, reason=fault, failed=True)
         if fault:
@@ -143,20 +175,22 @@ class Up:
         log = Log(self._logs / f"{name}.log", self._board.say)
         on_line = self._watch.take_line if name == WORLD else None
         link = self._links.by_name[host]
-        return Remote(name, plan.arguments(name), link, plan.python(host), self._loop, log, on_line)
+        more = (on_line, plan.folder(host), plan.identity(name))
+        return Remote(name, plan.arguments(name), link, plan.python(host), self._loop, log, *more)
 
     def _fetch(self) -> str:
         """Bring the record home; return why it is not here, empty if it is."""
-        host, into = self._plan.host(RECORDER), self._options.out / "run.mcap"
-        where = f"{host}:{self._plan.record()}"
-        self._board.say(f"fetching the record from {where} …")
+        host, into = self._plan.host(RECORDER), self._options.out / RECORD
+        self._board.say(f"fetching the record from {host}:{self._plan.record()} …")
         try:
-            self._loop.call(fetch(self._links.by_name[host], self._plan.record(), into))
-            repair(into)
+            found = self._loop.call(fetch(self._links.by_name[host], self._plan.record(), into))
+            if found:
+                repair(into)
         except (ZsimError, OSError) as error:
+            where = self._plan.way_to_record()
             return f"the record could not be fetched ({error}); what there is of it is at {where}"
         self._record_stays = False
-        return ""
+        return "" if found else "nothing was recorded"
 
     @contextlib.contextmanager
     def _cleaned(self) -> Any:
@@ -168,8 +202,13 @@ class Up:
                 self._links.on_all(self._clean, 2 * CLEAN_S)
             except HostsError as error:
                 self._board.say(f"{error}\nkeys of this run may be left there; remove its folder")
+            except KeyboardInterrupt:
+                self._board.say("keys of this run may be left on its hosts; the next `zsim up` or `zsim doctor` tells")
+                raise
 
     async def _clean(self, link: HostLink) -> None:
-        keeps = self._record_stays and link.name == self._plan.host(RECORDER)
-        folder = self._plan.keys(link.name) if keeps else self._plan.folder(link.name)
-        await link.run(f"rm -rf {shell.word(folder)}", timeout_s=CLEAN_S, what=f"removing {folder}")
+        folder, keys = shell.word(self._plan.folder(link.name)), shell.word(self._plan.keys(link.name))
+        command = f"rm -rf {folder}"
+        if self._record_stays and link.name == self._plan.host(RECORDER):
+            command = f"rm -rf {keys}; [ -e {shell.word(self._plan.record())} ] || {command}"
+        await link.run(command, timeout_s=CLEAN_S, what=f"removing {self._plan.folder(link.name)}")

@@ -12,11 +12,10 @@ import json
 import os
 import re
 import shutil
-import sys
 import tempfile
 import tomllib
 import zipfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +23,7 @@ from urllib.parse import urldefrag
 
 import zsim
 from zsim.errors import HostsError
+from zsim_deploy.package_index import PipError, Told, UnreachableError, gather, pip
 from zsim_deploy.target import Target
 
 PROJECT = "zsim"
@@ -54,10 +54,6 @@ class House(NamedTuple):
         return {"project": self.project.sha256, "extras": list(self.extras), "wheels": wheels}
 
 
-class PipError(Exception):
-    """What pip says is wrong."""
-
-
 class Wheelhouse:
     """Builds and downloads what is not there yet, one thing at a time.
 
@@ -66,8 +62,9 @@ class Wheelhouse:
         told: called with what is being done.
     """
 
-    def __init__(self, folder: Path, told: Callable[[str], None]) -> None:
+    def __init__(self, folder: Path, told: Told) -> None:
         self._folder, self._told = folder, told
+        self._unreachable = ""
         self._lock = asyncio.Lock()
         self._wheels = folder / "wheels"
         for made in (self._wheels, folder / "houses"):
@@ -80,13 +77,22 @@ class Wheelhouse:
             host: its name, for errors.
 
         Raises:
-            HostsError: the project cannot be built, or a wheel that fits the host does not exist.
+            HostsError: the project cannot be built, a wheel that fits the host does not exist, or pip has no index.
         """
         async with self._lock:
-            project = await self._project()
-            wanted = tuple(sorted(extras))
-            key = _key([requirements(project), wanted, target.options(), constraints()])
-            names = self._known(key) or await self._gather(host, key, project, wanted, target)
+            if self._unreachable:
+                raise HostsError(self._unreachable)  # for the next host it would take as long again
+            try:
+                project = await self._project()
+                wanted = tuple(sorted(extras))
+                key = _key([requirements(project), wanted, target.options(), constraints()])
+                names = self._known(key) or await self._gather(host, key, project, wanted, target)
+            except UnreachableError as error:
+                self._unreachable = (
+                    f"launcher: the package index cannot be reached ({error}); connect this machine to it for the "
+                    "first push, or give pip a folder with all wheels (PIP_NO_INDEX=1 PIP_FIND_LINKS=FOLDER)"
+                )
+                raise HostsError(self._unreachable) from error
         wheels = [_wheel(self._wheels / name) for name in names]
         pip = next(wheel for wheel in wheels if wheel.path.name.startswith(f"{PIP}-"))
         return House(_wheel(project), pip, tuple(wheel for wheel in wheels if wheel is not pip), wanted)
@@ -100,7 +106,9 @@ class Wheelhouse:
             self._told(f"building the wheel of {PROJECT}")
             with tempfile.TemporaryDirectory(dir=self._folder) as made:
                 try:
-                    await pip("wheel", "--no-deps", "--wheel-dir", f"{made}/wheel", source)
+                    await pip("wheel", "--no-deps", "--wheel-dir", f"{made}/wheel", source, told=self._told)
+                except UnreachableError:
+                    raise
                 except PipError as error:
                     raise HostsError(f"launcher: no wheel of {PROJECT} from {source}: {error}") from error
                 folder.parent.mkdir(exist_ok=True)
@@ -118,7 +126,9 @@ class Wheelhouse:
         wanted = f"{project}[{','.join(extras)}]" if extras else str(project)
         with tempfile.TemporaryDirectory(dir=self._folder) as made:
             try:
-                other_versions = await gather([wanted, PIP], target, Path(made), constraints())
+                other_versions = await gather([wanted, PIP], target, Path(made), constraints(), self._told)
+            except UnreachableError:
+                raise
             except PipError as error:
                 raise HostsError(f"{host}: {_lacking(error, target)}") from error
             names = sorted(path.name for path in Path(made).glob("*.whl") if path.name != project.name)
@@ -130,66 +140,6 @@ class Wheelhouse:
         note.with_suffix(".part").write_text(json.dumps(names))
         os.replace(note.with_suffix(".part"), note)
         return names
-
-
-async def gather(wanted: Sequence[str], target: Target, into: Path, held: Sequence[str]) -> bool:
-    """Download wheels for a target; where a project has only sources, build them here.
-
-    The versions are those of this machine where there are such wheels for the target, because equal versions are a
-    condition for equal bits.
-
-    Args:
-        wanted: requirements, as for pip.
-        into: folder, for the wheels only.
-        held: constraints, as for pip.
-
-    Returns:
-        Whether the versions had to differ from the held ones.
-
-    Raises:
-        PipError: there are no wheels for the target.
-    """
-    fit = ("download", "--only-binary=:all:", *target.options(), "--dest", str(into))
-    with tempfile.TemporaryDirectory() as aside:
-        limits = Path(aside, "constraints.txt")
-        limits.write_text("\n".join(held))
-        try:
-            await _fetch(fit, (*wanted, "--constraint", str(limits)), f"{aside}/same")
-            return False
-        except PipError:
-            await _fetch(fit, wanted, f"{aside}/other")
-            return True
-
-
-async def _fetch(fit: Sequence[str], wanted: Sequence[str], built: str) -> None:
-    """Download wheels; if that fails, build what has only sources into a folder, and take it from there."""
-    try:
-        await pip(*fit, *wanted)
-    except PipError:
-        await pip("wheel", "--wheel-dir", built, *wanted)
-        await pip(*fit, "--find-links", built, *wanted)
-
-
-async def pip(*arguments: str) -> None:
-    """Run pip of this Python, as the user has configured it.
-
-    Raises:
-        PipError: with its last word.
-    """
-    options = ("--disable-pip-version-check", "--no-input", "-q")
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "pip", *arguments, *options, stdin=asyncio.subprocess.DEVNULL,
-        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
-    )  # fmt: skip
-    try:
-        said, _ = await process.communicate()
-    finally:
-        if process.returncode is None:
-            process.kill()
-            await process.wait()
-    if process.returncode:
-        lines = said.decode(errors="replace").strip().splitlines() or ["it says nothing"]
-        raise PipError(next((line for line in lines if line.startswith("ERROR: ")), lines[-1]).removeprefix("ERROR: "))
 
 
 def _lacking(error: PipError, target: Target) -> str:

@@ -36,7 +36,7 @@ class Team:
         self.lab = lab
         self.out = lab.folder / "out"
         self.hosts = str(lab.inventory(roles, insecure=not secure, **more))
-        self._env = {"TMPDIR": str(lab.folder)}
+        self._env = {"TMPDIR": str(lab.folder), "XDG_RUNTIME_DIR": str(lab.folder)}
         self.cut_off: set[str] = set()
         self._roles: list[Role] = []
         self._stack = ExitStack()

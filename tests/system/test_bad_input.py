@@ -99,7 +99,10 @@ COMMANDS = {
     ),
     "open to a network": (("world", "{one}", "--listen", "tcp/0.0.0.0:7000"), "is not encrypted and leaves this"),
     "a run open to it": (("run", "{one}", "--listen", "tcp/[::]:7000"), "or --insecure on a network that is nobody"),
-    "in the clear": (("estimator", "drone1", "--connect", "tcp/192.0.2.1:7000"), "not encrypted and leaves this machine"),
+    "in the clear": (
+        ("estimator", "drone1", "--connect", "tcp/192.0.2.1:7000"),
+        "not encrypted and leaves this machine",
+    ),
     "port 0": (("world", "{one}", "--listen", "tcp/127.0.0.1:0"), "port 0 is no port that others could be told"),
     "no federation": (("keys", "--connect", "{free}", "--federation", "a/b"), "federation is 'a/b'; must be 1 to 32"),
     "no record": (("report", "{folder}"), "holds no run.mcap"),

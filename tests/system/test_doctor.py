@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from federation import ZSIM
 from lab import LAUNCHER, Lab
 
@@ -20,6 +21,11 @@ pytestmark = pytest.mark.slow
 def doctor(lab: Lab, hosts: Path, *options: str) -> subprocess.CompletedProcess[str]:
     """Run `zsim doctor` for the step scenario at the launcher."""
     return lab.run(LAUNCHER, *ZSIM, "doctor", str(STEP), "--hosts", str(hosts), *options, timeout=DOCTOR_S)
+
+
+def faults(done: subprocess.CompletedProcess[str]) -> list[str]:
+    """Return what keeps the hosts from flying."""
+    return [line for line in done.stderr.splitlines() if not line.startswith("warning: ")]
 
 
 def rows(text: str) -> dict[tuple[str, ...], list[str]]:
@@ -54,6 +60,42 @@ def test_a_port_that_is_taken_is_a_line(lab: Lab) -> None:
     with lab.inside("h1"), socket.create_server((lab.address("h1"), 7447)):
         done = doctor(lab, lab.inventory(ROLES, insecure=True))
     assert done.returncode == 2
-    (line,) = [line for line in done.stderr.splitlines() if "7447" in line]
-    assert line.startswith("h1: port 7447 of h1 cannot be reached (h1: ")
-    assert "Address already in use" in line
+    (line,) = faults(done)
+    assert line.startswith("h1: port 7447 is in use there, perhaps by another run; end that ")
+
+
+def test_what_a_host_lacks_is_a_line_with_what_to_do(lab: Lab) -> None:
+    (lab.folder / "h3" / "zsim").touch()  # where its folder should be
+    hosts = lab.inventory(ROLES, insecure=True)
+    document = yaml.safe_load(hosts.read_text())
+    del document["hosts"]["h1"]["python"]
+    document["hosts"]["h2"]["python"] = "/tmp"
+    hosts.write_text(yaml.safe_dump(document))
+    done = doctor(lab, hosts)
+    assert done.returncode == 2
+    h1, h2, h3 = faults(done)
+    assert h1 == f"h1: has no zsim in {lab.host_folder('h1')}; run `zsim push --hosts {hosts}`"
+    assert h2.startswith("h2: python /tmp is no program there (")
+    assert h2.endswith(
+        f"); correct hosts.h2.python, or install it there, or leave hosts.h2.python out and run `zsim push --hosts {hosts}`"
+    )
+    assert (
+        h3
+        == f"h3: its folder cannot be used ({lab.host_folder('h3')} is no folder); correct hosts.h3.folder, or make it there"
+    )
+
+
+def test_hosts_without_certificates_are_not_ready(lab: Lab) -> None:
+    hosts = lab.inventory(ROLES)
+    done = doctor(lab, hosts)
+    assert (done.returncode, faults(done)) == (
+        2,
+        [
+            f"{lab.folder}/certs: has no certificates; make them with `zsim certs init {hosts} --scenario FILE`, "
+            "or set security.insecure on a network of your own"
+        ],
+    )
+    assert "all hosts are ready" not in done.stdout
+    assert lab.run(LAUNCHER, *ZSIM, "certs", "init", str(hosts), "--scenario", str(STEP)).returncode == 0
+    done = doctor(lab, hosts)
+    assert done.returncode == 0, done.stderr

@@ -1,14 +1,17 @@
 """What is asked of a `zsim up` that runs, and what it leaves behind: on real hosts, over TLS."""
 
 import re
+import signal
 import threading
 import time
 from pathlib import Path
 from shutil import rmtree
 
 import yaml
-from lab import Lab
-from team import START_S, Team, closing, in_flight
+from lab import LAUNCHER, Lab
+from team import START_S, STEP, Team, closing, in_flight
+
+from zsim.identity import KEY
 
 ROLES = {"world": "h1", "recorder": "h1", "controller.main": "h2", "estimator.*": ["h1", "h2"]}
 SPARE = "h3"
@@ -20,6 +23,12 @@ def keys(team: Team) -> list[Path]:
     return [path for name in team.lab.names for path in team.lab.host_folder(name).rglob("*.pem")]
 
 
+def nothing_stays(team: Team) -> None:
+    """Fail if anything of a run is on any host."""
+    assert keys(team) == []
+    assert [path for name in team.lab.names for path in team.lab.host_folder(name).glob("runs/*")] == []
+
+
 def goes_on(team: Team) -> None:
     """Wait until every process runs and nobody is waited for."""
     until_s = time.monotonic() + START_S
@@ -28,7 +37,8 @@ def goes_on(team: Team) -> None:
         threading.Event().wait(0.05)  # nothing tells of a process that is waited for no longer
 
 
-def test_restarts_at_once_and_a_move_that_is_refused_leave_the_run_alone(lab: Lab) -> None:
+def test_restarts_at_once_and_moves_refused_and_carried_out(lab: Lab) -> None:
+    """One move has no certificate there, the other is to a host that was not used before."""
     with closing(Team(lab, ROLES)) as team:
         rmtree(lab.folder / "certs" / SPARE / "estimator.drone1", ignore_errors=True)
         run = team.up("--rate", "4", "--duration", "300")
@@ -43,17 +53,8 @@ def test_restarts_at_once_and_a_move_that_is_refused_leave_the_run_alone(lab: La
         run.line("superseded: estimator.drone2 on h2", START_S)
         refused = team.zsim("move", "estimator.drone1", SPARE)
         refused.ends(with_code=2)
-        assert re.fullmatch(r"\S*/certs/h3/estimator.drone1/ca.pem: cannot be read .*certs init.*", refused.text())
+        assert re.fullmatch(r"\S*/certs: certificate missing: estimator.drone1 on h3; .*certs init.*", refused.text())
         goes_on(team)
-        team.zsim("down").ends(with_code=0)
-        run.ends(with_code=130, within_s=START_S)
-        assert "Traceback" not in run.text()
-
-
-def test_a_move_to_a_host_that_was_not_used_and_nothing_is_left_there(lab: Lab) -> None:
-    with closing(Team(lab, ROLES)) as team:
-        run = team.up("--rate", "4", "--duration", "300")
-        in_flight(run)
         assert not lab.host_folder(SPARE).exists()
         assert keys(team)
         move = team.zsim("move", "controller.main", SPARE)
@@ -63,9 +64,63 @@ def test_a_move_to_a_host_that_was_not_used_and_nothing_is_left_there(lab: Lab) 
         goes_on(team)
         team.zsim("down").ends(with_code=0)
         run.ends(with_code=130, within_s=START_S)
+        assert "Traceback" not in run.text()
         assert team.record().end()["reason"] == "ended by zsim down"
-        assert keys(team) == []
-        assert [path for name in lab.names for path in lab.host_folder(name).glob("runs/*")] == []
+        nothing_stays(team)
+
+
+def test_a_closed_terminal_ends_the_run_as_ctrl_c_does(lab: Lab) -> None:
+    """Meanwhile others who want to fly there are refused before anything is started, and leave nothing."""
+    with closing(Team(lab, ROLES, secure=False)) as team:
+        run = team.up("--rate", "4", "--duration", "300")
+        in_flight(run)
+        follower = team.zsim("logs", "estimator.drone2", "--follow")
+        follower.line("estimator.drone2: in run")
+        others = {"is up already .* --set federation=NAME": (), "h1: port 7447 is in use there": ("other",)}
+        for says, federation in others.items():
+            options = [f"--set=federation={name}" for name in federation]
+            other = team.zsim("up", str(STEP), "--hosts", team.hosts, "--out", str(lab.folder / "other"), *options)
+            other.ends(with_code=2, within_s=START_S)
+            assert re.search(says, other.text())
+            assert not (lab.folder / "other").exists()
+        goes_on(team)
+        run.signal(signal.SIGHUP)
+        run.ends(with_code=130, within_s=START_S)
+        assert run.text().endswith(f"the terminal was closed; what there is still to say is in {team.out}/up.log")
+        assert "ended: the terminal was closed\n" in (team.out / "up.log").read_text()
+        assert team.record().end()["reason"] == "the terminal was closed"
+        nothing_stays(team)
+        follower.ends(with_code=0, within_s=START_S)
+
+
+def test_a_killed_launcher_leaves_a_record_and_no_key(lab: Lab) -> None:
+    """Whoever flies next is told of the record and how to fetch it; a second that cannot be fetched fails its run."""
+    with closing(Team(lab, ROLES)) as team:
+        run = team.up("--rate", "4", "--duration", "300")
+        in_flight(run)
+        run.signal(signal.SIGKILL)
+        team.nobody_left()
+        assert [path.name for path in keys(team) if path.name == KEY] == []
+        (path,) = lab.host_folder("h1").rglob("*.mcap")
+        doctor = team.zsim("doctor", "--hosts", team.hosts)
+        doctor.ends(with_code=0, within_s=START_S)
+        assert f"warning: h1: records of earlier runs were not fetched: h1:{path};" in doctor.text()
+        rmtree(team.out)
+        team.out.mkdir()
+        (team.out / "run.mcap.part").symlink_to(lab.folder / "not there" / "run.mcap")
+        second = team.up("--duration", "2")
+        second.ends(with_code=1, within_s=START_S)
+        told = re.search(rf"warning: h1: records of .* not fetched: h1:{path}; fetch with `(scp .*)`", second.text())
+        assert told
+        lab.run(LAUNCHER, "sh", "-c", told[1], cwd=lab.folder, check=True)
+        assert (lab.folder / "run.mcap").read_bytes() == path.read_bytes()
+        failed = (
+            r"ended: the record could not be fetched \(.*\); what there is of it is at h1:(\S+) \(fetch it with `scp "
+        )
+        found = re.search(failed, second.text())
+        assert found
+        assert set(lab.host_folder("h1").rglob("*.mcap")) == {path, Path(found[1])}
+        assert [path.name for path in keys(team) if path.name == KEY] == []
 
 
 def test_nobody_waits_for_a_recorder_that_is_cut_off(lab: Lab) -> None:
@@ -85,17 +140,6 @@ def test_nobody_waits_for_a_recorder_that_is_cut_off(lab: Lab) -> None:
         assert f"{SPARE}: " in run.text()
         assert "keys of this run may be left there" in run.text()
         assert {found.relative_to(lab.folder).parts[0] for found in keys(team)} == {SPARE}
-
-
-def test_a_record_that_cannot_be_fetched_fails_the_run(lab: Lab) -> None:
-    with closing(Team(lab, ROLES)) as team:
-        team.out.mkdir()
-        (team.out / "run.mcap.part").symlink_to(lab.folder / "not there" / "run.mcap")
-        run = team.up("--duration", "2")
-        run.ends(with_code=1, within_s=START_S)
-        assert re.search(r"ended: the record could not be fetched \(.*\); what there is of it is at h1:", run.text())
-        assert [path.name for path in lab.host_folder("h1").rglob("*.mcap")] == ["run.mcap"]
-        assert keys(team) == []
 
 
 def test_more_processes_on_a_host_than_sshd_has_channels_for(lab: Lab) -> None:

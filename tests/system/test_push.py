@@ -2,12 +2,15 @@
 
 import asyncio
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 from federation import ZSIM
@@ -16,6 +19,7 @@ from lab import LAUNCHER, Lab
 from zsim import __version__
 from zsim_deploy import extras, inventory, on_host, shell
 from zsim_deploy.host_link import HostLink
+from zsim_deploy.installer import installer
 from zsim_deploy.target import chosen, interpreters, question, target
 from zsim_deploy.wheelhouse import House, Wheelhouse
 
@@ -50,13 +54,28 @@ def over_ssh(lab: Lab, hosts: Path, name: str, *command: str, given: str = "") -
         return asyncio.run(work()).decode()
 
 
+def look(lab: Lab, hosts: Path, name: str, python: str) -> dict[str, Any]:
+    """Return what a host says of itself when it is to be installed on."""
+    placed = inventory.load(hosts)
+
+    async def work() -> dict[str, Any]:
+        link = HostLink(name, placed.inventory.hosts[name], placed.folder)
+        try:
+            async with installer(link, python, str(lab.folder / "aside"), print) as program:
+                return await program.ask("look", PUSH_S)
+        finally:
+            await link.close()
+
+    with lab.inside(LAUNCHER):
+        return asyncio.run(work())
+
+
 def gather(lab: Lab, hosts: Path, *names: str) -> dict[str, House]:
     """Gather, outside of the lab where there is an index, what `zsim push` needs inside."""
     wanted = extras.needed(inventory.load(hosts).inventory)
     found = interpreters(over_ssh(lab, hosts, names[0], "sh", "-c", question()))
     python = chosen(names[0], found, sys.version_info[:2]).path
-    script = Path(on_host.__file__).read_text()
-    said = json.loads(over_ssh(lab, hosts, names[0], python, "-", "look", str(lab.folder), given=script))
+    said = look(lab, hosts, names[0], python)
     wheelhouse = Wheelhouse(CACHE / "zsim", print)
 
     async def work() -> dict[str, House]:
@@ -110,12 +129,58 @@ def test_each_host_that_cannot_have_it_is_a_line(lab: Lab, hosts: Path, tmp_path
     ]
 
 
+def test_a_push_that_is_interrupted_does_not_disturb_the_next_one(lab: Lab, hosts: Path) -> None:
+    gather(lab, hosts, "h2")
+    command = (*PUSH, "--hosts", str(hosts), "--host", "h2")
+    pipe = subprocess.PIPE
+    with lab.popen(LAUNCHER, *command, env={"XDG_CACHE_HOME": str(CACHE)}, stdout=pipe, stderr=pipe) as first:
+        assert first.stderr is not None
+        assert any(line == "h2: installing\n" for line in first.stderr)
+        first.send_signal(signal.SIGINT)
+        said = first.communicate(timeout=PUSH_S)[1]
+    assert first.returncode == 130
+    assert "Traceback" not in said
+    second = push(lab, hosts, "--host", "h2")
+    assert (second.returncode, second.stdout) == (0, "installed on 1 of 1 hosts\n"), second.stderr
+
+
+def test_two_pushes_at_a_time_wait_for_each_other(lab: Lab, hosts: Path) -> None:
+    gather(lab, hosts, "h2")
+    command = (*PUSH, "--hosts", str(hosts), "--host", "h2")
+    options: dict[str, Any] = {
+        "env": {"XDG_CACHE_HOME": str(CACHE)},
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.PIPE,
+    }
+    pushes = [lab.popen(LAUNCHER, *command, **options) for _ in range(2)]
+    told = [each.communicate(timeout=PUSH_S) for each in pushes]
+    assert [each.returncode for each in pushes] == [0, 0], told
+    assert {out for out, _ in told} == {
+        "installed on 1 of 1 hosts\n",
+        "nothing to do; all hosts have what they need\n",
+    }
+
+
+def test_a_launcher_without_an_index_and_a_cache_is_said_to_be_so(lab: Lab, hosts: Path, tmp_path: Path) -> None:
+    nowhere = {
+        "XDG_CACHE_HOME": str(tmp_path),
+        "PIP_CONFIG_FILE": os.devnull,
+        "PIP_FIND_LINKS": "",
+        "PIP_INDEX_URL": "https://192.0.2.99/simple",
+    }
+    done = lab.run(LAUNCHER, *PUSH, "--hosts", str(hosts), env=nowhere, timeout=PUSH_S)
+    assert done.returncode == 2
+    assert "\nlauncher: the package index does not answer (" in done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if "first push" in line]
+    assert line.startswith("launcher: the package index cannot be reached (")
+
+
 def test_another_build_of_the_same_version_takes_the_place_of_the_first(lab: Lab, hosts: Path, tmp_path: Path) -> None:
     pip = gather(lab, hosts, "h2")["h2"].pip.path
     for text in ("BUILD = 1", "BUILD = 2"):
         order = {"project": write_wheel(tmp_path / "wheels", text), "pip": pip.name, "wheels": [], "extras": []}
         shutil.copy(pip, tmp_path / "wheels")
-        on_host.install(tmp_path, {**order, "modules": ["zsim"], "note": {"project": text}})
+        on_host.install(tmp_path, {**order, "modules": ["zsim"], "note": {"project": text}}, on_host.Children())
         said = subprocess.run(
             [tmp_path / "venv/bin/python", "-c", "import zsim; print(zsim.__file__, zsim.BUILD)"],
             cwd=tmp_path, capture_output=True, text=True, check=True,

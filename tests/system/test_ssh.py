@@ -67,6 +67,9 @@ def test_a_host_key_that_changed_is_not_called_unknown(lab: Lab, tmp_path: Path,
     known.write_text(f"{at} {(tmp_path / 'former.pub').read_text()}")
     said = refusal(lab, lab.folder, given(lab, known_hosts=str(known)))
     assert said.startswith(f"h1: the host key of {at} port 22 is not the one in {known} (it shows ")
-    assert f"another machine may pose as h1; ask who runs it, and only if the key was changed there, remove the old one (ssh-keygen -f {known} -R {at})" in said
+    assert (
+        f"another machine may pose as h1; ask who runs it, and only if the key was changed there, remove the old one (ssh-keygen -f {known} -R {at})"
+        in said
+    )
     assert "ssh-keyscan" not in said
     assert "\n" not in said

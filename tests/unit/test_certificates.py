@@ -1,5 +1,6 @@
 """The authority and what it issues: purposes, names, times, files, and when a certificate is made anew."""
 
+import base64
 import shutil
 import stat
 from datetime import UTC, datetime, timedelta
@@ -123,7 +124,16 @@ def test_a_certificate_and_the_key_of_another_one_are_made_anew(tmp_path: Path, 
     assert due(tmp_path, signer.certificate, ESTIMATOR, NOW) == "without its key"
 
 
-@pytest.mark.parametrize("content", ["", "nothing", "-----BEGIN PRIVATE KEY-----\n"])
+def of_no_curve() -> str:
+    """Return a private key on a curve that there is not."""
+    encodings = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    key = ec.generate_private_key(ec.SECP256R1()).private_bytes(serialization.Encoding.DER, *encodings)
+    p256 = bytes.fromhex("2a8648ce3d030107")  # 1.2.840.10045.3.1.7
+    body = base64.b64encode(key.replace(p256, p256[:-1] + b"\x70")).decode()
+    return f"-----BEGIN PRIVATE KEY-----\n{body}\n-----END PRIVATE KEY-----\n"
+
+
+@pytest.mark.parametrize("content", ["", "nothing", "-----BEGIN PRIVATE KEY-----\n", of_no_curve()], ids=range(4))
 def test_a_key_that_is_none_is_made_anew(tmp_path: Path, signer, content: str) -> None:
     place = issue(tmp_path, signer, ESTIMATOR, NOW)
     (place / "key.pem").write_text(content)

@@ -9,6 +9,7 @@ import platform
 import socket
 import threading
 from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,10 +17,12 @@ import pytest
 
 from zsim import __version__
 from zsim.errors import HostsError
-from zsim_deploy import doctor, probe
+from zsim_deploy import certificates, doctor, probe
+from zsim_deploy.check_up import CheckUp, check_up
 from zsim_deploy.doctor import Path, Report, compared, path_faults
+from zsim_deploy.enrolment import Wanted
 from zsim_deploy.host_link import HostLink
-from zsim_deploy.inventory import Host
+from zsim_deploy.inventory import Host, Inventory, Placed
 
 SOUND = {
     "python": platform.python_version(),
@@ -99,13 +102,39 @@ def test_a_path_that_is_not_there_is_a_fault_and_a_slow_one_a_warning():
         ),
         (
             {"error": "Permission denied", "taken": False},
-            "h1: nothing may listen on port 7447 there (Permission denied), or give another port in the inventory",
+            "h1: nothing may listen on port 7447 there (Permission denied); give another port in the inventory",
         ),
     ],
 )
 def test_a_port_on_which_nothing_can_listen_is_not_called_unreachable(found, line):
     (path,) = asyncio.run(doctor.reached([Silent()], Silent(json.dumps(found) + "\n"), {"h1": "python"}, 7447))
     assert path_faults([path]) == ([line], [])
+
+
+def checked_up(folder: pathlib.Path) -> CheckUp:
+    """Check up a host that does not answer, of an inventory in a folder."""
+    host = Host(address="127.0.0.1", port=1, user="nobody")  # tcpmux; nobody has it
+    return check_up(Placed(Inventory(hosts={"h1": host}, roles={"world": "h1"}), folder, "lab.yaml"), None)
+
+
+def test_certificates_that_are_missing_or_expired_are_faults_and_open_keys_a_warning(tmp_path):
+    (fault, _) = checked_up(tmp_path).faults
+    assert fault.startswith(
+        f"{tmp_path}/certs: has no certificates; make them with `zsim certs init {tmp_path}/lab.yaml "
+    )
+    then = datetime.now(UTC) - timedelta(days=60)
+    signer = certificates.authority(tmp_path / "certs", then)
+    place = certificates.issue(tmp_path / "certs", signer, Wanted("h1", "world", ("127.0.0.1",)), then)
+    (place.parent / "world.access.json").touch()
+    (place / "key.pem").chmod(0o644)
+    found = checked_up(tmp_path)
+    (fault, _) = found.faults
+    assert fault.startswith(f"{tmp_path}/certs: certificate expired on ")
+    assert fault.endswith(
+        f": world on h1; make them with `zsim certs init {tmp_path}/lab.yaml --scenario FILE --renew`"
+    )
+    (warning,) = found.warnings
+    assert warning.startswith(f"{place}/key.pem can be read by others on this machine; ")
 
 
 # Asking a host

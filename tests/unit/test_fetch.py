@@ -42,9 +42,9 @@ class Link:
     def exit(self) -> None: ...
 
 
-def fetched(get: Get | None, into: Path) -> Link:
+def fetched(get: Get | None, into: Path, there: bool = True) -> Link:
     link: Any = Link(get)
-    asyncio.run(fetch(link, "~/.zsim/runs/1/run.mcap", into))
+    assert asyncio.run(fetch(link, "~/.zsim/runs/1/run.mcap", into)) is there
     return link
 
 
@@ -66,6 +66,10 @@ async def slowly(into: Path, told: Callable[..., None]) -> None:
 
 async def none_there(into: Path, told: Callable[..., None]) -> None:
     raise asyncssh.SFTPNoSuchFile("No such file")
+
+
+async def not_readable(into: Path, told: Callable[..., None]) -> None:
+    raise asyncssh.SFTPPermissionDenied("Permission denied")
 
 
 def test_a_file_comes_under_its_name(tmp_path: Path) -> None:
@@ -93,6 +97,8 @@ def test_a_host_that_does_not_let_us_in_is_given_up(tmp_path: Path, monkeypatch:
         fetched(None, tmp_path / "run.mcap")
 
 
-def test_a_file_that_is_not_there_is_a_line(tmp_path: Path) -> None:
-    with pytest.raises(HostsError, match="h2: No such file"):
-        fetched(none_there, tmp_path / "run.mcap")
+def test_a_file_that_is_not_there_is_told_from_one_that_cannot_be_read(tmp_path: Path) -> None:
+    fetched(none_there, tmp_path / "run.mcap", there=False)
+    with pytest.raises(HostsError, match="h2: Permission denied"):
+        fetched(not_readable, tmp_path / "run.mcap")
+    assert list(tmp_path.iterdir()) == []

@@ -74,7 +74,7 @@ class Local(HostLink):
 
     takes: int | None = None
 
-    async def run(self, command: str, given: bytes = b"", timeout_s: float = 10.0, what: str = "") -> bytes:
+    async def run(self, command: str, given: bytes = b"", *_: Any, what: str = "", **__: Any) -> bytes:
         done = subprocess.run(["sh", "-c", command], input=given[: self.takes], capture_output=True, check=False)
         if done.returncode:
             raise HostsError(f"{what}: {done.stderr.decode()}")

@@ -1,5 +1,6 @@
 """What a run puts on each host: processes, command lines, files."""
 
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,8 @@ import yaml
 
 from zsim import scenario_file
 from zsim.errors import HostsError, RunError
-from zsim_deploy import hosts_commands, inventory
+from zsim_deploy import certificates, hosts_commands, inventory
+from zsim_deploy.enrolment import Enrolment
 from zsim_deploy.intercom import Intercom
 from zsim_deploy.plan import Plan
 
@@ -89,7 +91,8 @@ def test_the_files_of_a_host(plan: Plan, tmp_path: Path) -> None:
 
 def test_a_certificate_that_is_not_there_is_a_line(plan: Plan) -> None:
     with pytest.raises(
-        HostsError, match=r"certs/h3/estimator.drone1/ca.pem: cannot be read .* `zsim certs init hosts.yaml`"
+        HostsError,
+        match=r"certs/h3/estimator.drone1/ca.pem: cannot be read .* `zsim certs init \S*/hosts.yaml --scenario FILE`",
     ) as error:
         plan.moved("estimator.drone1", "h3").identity("estimator.drone1")
     assert "\n" not in str(error.value)
@@ -105,7 +108,7 @@ def test_a_start_that_is_refused_leaves_no_folder(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     out: Any = Path(given) if given else None
     with pytest.raises(HostsError, match=r"h1: ssh at 127\.0\.0\.1 port 1 cannot be reached"):
-        hosts_commands.up(*paths, out=out)
+        hosts_commands.up(*paths, out=out, insecure=True)
     left = {path.name for path in (*tmp_path.glob("runs/*"), *tmp_path.glob("out"), *tmp_path.glob("there"))}
     assert left == {"there"}
 
@@ -114,6 +117,46 @@ def test_a_federation_that_is_up_already_is_refused_before_any_host_is_asked(
     paths: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    with Intercom("zsim", {}), pytest.raises(RunError, match="federation 'zsim' is up already on this machine"):
+    with (
+        Intercom("zsim", {}),
+        pytest.raises(RunError, match=r"federation 'zsim' is up already .* --set federation=NAME"),
+    ):
         hosts_commands.up(*paths, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+    with Intercom("zsim", {}), pytest.raises(HostsError, match="cannot be reached"):
+        hosts_commands.up(*paths, out=tmp_path / "out", set_=["federation=other"], insecure=True)
+
+
+def test_certificates_that_are_missing_or_expired_are_told_before_any_host_is_asked(
+    paths: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with pytest.raises(HostsError, match=r"^\S*/certs: has no certificates; .*certs init"):
+        hosts_commands.up(*paths, out=tmp_path / "out")
+    certify(paths, datetime.now(UTC) - timedelta(days=10))
+    with pytest.raises(HostsError, match=r"expired on \S+: router\.field on h1, .*estimator.* --renew`$"):
+        hosts_commands.up(*paths, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def certify(paths: tuple[Path, Path], now: datetime) -> None:
+    """Make certificates that are good for a day, and the access control beside them."""
+    placed = inventory.load(paths[1])
+    signer, folder = certificates.authority(placed.folder / "certs", now), placed.folder / "certs"
+    enrolment = Enrolment(placed, scenario_file.load(paths[0]))
+    for wanted in enrolment.certificates():
+        certificates.issue(folder, signer, wanted, now, days=1.0)
+    for host, name, _ in enrolment.access():
+        (folder / host / f"{name}.access.json").write_text("{}")
+
+
+def test_without_tls_as_the_command_line_says_it(paths: tuple[Path, Path]) -> None:
+    placed = inventory.insecure(inventory.load(paths[1]))
+    plan = Plan(placed, scenario_file.load(paths[0]), "abc")
+    assert "--insecure" in plan.arguments("world")
+    assert "tcp/127.0.0.1:7447" in plan.arguments("estimator.drone1")
+    assert (plan.files("h1").keys(), plan.lacks(datetime.now(UTC))) == ({"scenario.yaml"}, [])
+
+
+def test_the_ports_of_a_host(plan: Plan) -> None:
+    assert (sorted(plan.ports("h1")), plan.ports("h3")) == ([7447, 7448], [])

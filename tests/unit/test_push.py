@@ -1,18 +1,25 @@
 """What a push leaves alone, what it copies, and how the failures of several hosts are told."""
 
 import asyncio
+import contextlib
+import getpass
+import os
 import shutil
+import socket
 import subprocess
+import sys
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from zsim.errors import HostsError, InventoryError
-from zsim_deploy import inventory
+from zsim_deploy import inventory, on_host
 from zsim_deploy.host_link import HostLink
+from zsim_deploy.installer import installer
 from zsim_deploy.inventory import Host, Inventory, Placed
-from zsim_deploy.push import There, is_there, missing, push
+from zsim_deploy.push import ASK_S, is_there, missing, push
 from zsim_deploy.wheelhouse import House, Wheel
 
 
@@ -54,30 +61,192 @@ def test_what_is_installed_or_was_copied_before_is_not_copied_again() -> None:
     assert names(missing(HOUSE, {"installed": None, "wheels": copied})) == ["scipy-1", "zsim-1", "pip-26"]
 
 
+class Local:
+    """A process of this machine, as asyncssh gives one of another."""
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        self.process = process
+        self.beaten = asyncio.Event()
+        self.stdin, self.stdout, self.stderr = self, Text(process.stdout), Text(process.stderr)
+
+    def write(self, text: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(text.encode())
+        if text == "\n":
+            self.beaten.set()
+
+    def close(self) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+
+
+class Text:
+    """The text of a stream of bytes."""
+
+    def __init__(self, stream: asyncio.StreamReader | None) -> None:
+        assert stream is not None
+        self._stream = stream
+
+    async def readline(self) -> str:
+        return (await self._stream.readline()).decode()
+
+    async def read(self) -> str:
+        return (await self._stream.read()).decode()
+
+
 class Greeting(HostLink):
-    """This machine, as a host whose login shell greets; what is asked of Pythons can be answered otherwise."""
+    """This machine, as a host whose login shell greets."""
 
-    def __init__(self, python: str | None = None) -> None:
+    def __init__(self) -> None:
         super().__init__("h1", Host(address="192.0.2.1"), Path())
-        self._python = python
+        self.processes: list[Local] = []
 
-    async def run(self, command: str, given: bytes = b"", *_: Any, **__: Any) -> bytes:
-        if self._python and not given:
-            return self._python.encode()
-        done = subprocess.run(["sh", "-c", command], input=given, capture_output=True, check=True)
-        return b"Welcome to lab\n17\n" + done.stdout
+    @contextlib.asynccontextmanager
+    async def channel(self, patient: bool = False) -> AsyncIterator[Any]:
+        try:
+            yield self
+        finally:
+            for each in self.processes:
+                each.close()
+                await each.process.wait()  # whoever is asked to end and does not, hangs the test
+
+    async def create_process(self, command: str, **_: Any) -> Local:
+        pipe = asyncio.subprocess.PIPE
+        greeting = f"echo Welcome to lab; echo 17; exec {command}"
+        started = await asyncio.create_subprocess_exec("sh", "-c", greeting, stdin=pipe, stdout=pipe, stderr=pipe)
+        self.processes.append(Local(started))
+        return self.processes[-1]
+
+
+def hush(_text: str) -> None:
+    """Hear what is being done."""
 
 
 def test_a_greeting_of_the_login_shell_is_passed_over(tmp_path: Path) -> None:
-    there = There(Greeting(), str(tmp_path))
-    asyncio.run(there.look())
-    assert there.found["folder"] == str(tmp_path)
+    async def work() -> dict[str, Any]:
+        async with installer(Greeting(), sys.executable, str(tmp_path), hush) as program:
+            return await program.ask("look", ASK_S)
+
+    assert asyncio.run(work())["folder"] == str(tmp_path)
+
+
+def refused(python: str, folder: Path) -> str:
+    """Return what keeps an installer from starting."""
+
+    async def work() -> None:
+        async with installer(Greeting(), python, str(folder), hush):
+            pass
+
+    with pytest.raises(HostsError) as caught:
+        asyncio.run(work())
+    return str(caught.value)
 
 
 def test_a_python_that_says_nothing_is_a_line(tmp_path: Path) -> None:
-    silent = Greeting(f"python3 3.11.2 {shutil.which('true')}\n")
-    with pytest.raises(HostsError, match=r"^h1: /\S+/true says nothing; does it run there\?$"):
-        asyncio.run(There(silent, str(tmp_path)).look())
+    silent = shutil.which("true") or ""
+    assert refused(silent, tmp_path) == f"h1: {silent} says nothing; does it run there?"
+
+
+def test_a_folder_that_cannot_be_used_is_a_line_that_says_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert refused(sys.executable, tmp_path / "file" / "zsim") == (
+        f"h1: its folder cannot be used ({tmp_path}/file/zsim: Not a directory); "
+        "correct hosts.h1.folder, or make it there"
+    )
+
+
+def write_pip(folder: Path, text: str) -> dict[str, Any]:
+    """Write what stands for pip, and return an order that runs it first."""
+    script = folder / "wheels/pip-1.whl/pip/__main__.py"
+    script.parent.mkdir(parents=True)
+    script.write_text(text)
+    return {"project": "zsim-1.whl", "pip": "pip-1.whl", "wheels": [], "extras": [], "modules": [], "note": {}}
+
+
+def test_what_is_being_installed_ends_with_the_channel(tmp_path: Path) -> None:
+    """Nobody but pip holds the writing end of the pipe; it is at its end when pip is gone."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    order = write_pip(tmp_path, f"import signal; held = open({str(pipe)!r}, 'w'); signal.pause()")
+
+    async def work() -> None:
+        async with installer(Greeting(), sys.executable, str(tmp_path), hush) as program:
+            asked = asyncio.create_task(program.ask("install", ASK_S, **order))
+            reading = await asyncio.to_thread(open, pipe)
+            asked.cancel()
+            await asyncio.wait([asked])
+        stream = asyncio.StreamReader()
+        loop = asyncio.get_running_loop()
+        way, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(stream), reading)
+        assert await asyncio.wait_for(stream.read(), ASK_S) == b""
+        way.close()
+
+    asyncio.run(work())
+
+
+def test_a_program_ends_whose_launcher_fell_silent(tmp_path: Path) -> None:
+    command = [sys.executable, "-P", on_host.__file__, str(tmp_path), "anna", "0.1"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as program:
+        assert program.wait(ASK_S) == 0  # its standard input is still open
+
+
+def test_a_launcher_that_lives_shows_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("zsim_deploy.installer.BEAT_S", 0.01)
+
+    async def work() -> dict[str, Any]:
+        host = Greeting()
+        async with installer(host, sys.executable, str(tmp_path), hush) as program:
+            await host.processes[0].beaten.wait()
+            return await program.ask("look", ASK_S)
+
+    assert asyncio.run(work())["installed"] is None
+
+
+def test_what_pip_says_is_a_line(tmp_path: Path) -> None:
+    order = write_pip(tmp_path, "import sys; sys.exit('ERROR: No space left on device\\nnote: more')")
+
+    async def work() -> None:
+        async with installer(Greeting(), sys.executable, str(tmp_path), hush) as program:
+            await program.ask("install", ASK_S, **order)
+
+    with pytest.raises(HostsError, match=r"^h1: [^\n]+: ERROR: No space left on device$"):
+        asyncio.run(work())
+
+
+def test_a_second_push_says_whom_it_waits_for(tmp_path: Path) -> None:
+    async def second(waits: asyncio.Event, told: list[str]) -> dict[str, Any]:
+        def tell(text: str) -> None:
+            told.append(text)
+            waits.set()
+
+        async with installer(Greeting(), sys.executable, str(tmp_path), tell) as program:
+            return await program.ask("look", ASK_S)
+
+    async def work() -> list[str]:
+        told: list[str] = []
+        waits = asyncio.Event()
+        first = Greeting()
+        async with installer(first, sys.executable, str(tmp_path), hush):
+            waiting = asyncio.create_task(second(waits, told))
+            await waits.wait()
+            pid = first.processes[0].process.pid
+        assert (await waiting)["folder"] == str(tmp_path)
+        assert told == [f"waiting for the push of {getpass.getuser()}@{socket.gethostname()} (process {pid} there)"]
+        return told
+
+    assert asyncio.run(work())
+
+
+def test_who_pushes_for_too_long_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("zsim_deploy.installer.WAIT_S", 0.01)
+
+    async def work() -> str:
+        async with installer(Greeting(), sys.executable, str(tmp_path), hush):
+            return await asyncio.to_thread(refused, sys.executable, tmp_path)
+
+    said = asyncio.run(work())
+    assert said.startswith(f"h1: {getpass.getuser()}@{socket.gethostname()} (process ")
+    assert said.endswith(" there) is pushing to it; wait for that to end, or end it there")
 
 
 def placed(**hosts: Host) -> Placed:
@@ -97,11 +266,20 @@ def test_a_host_that_is_not_in_the_inventory_is_a_line(tmp_path: Path) -> None:
         pushed(placed(a=Host(address="192.0.2.1"), b=Host(address="192.0.2.2")), ["c"], tmp_path)
 
 
+def test_an_extra_that_is_none_is_a_line_with_those_that_are(tmp_path: Path) -> None:
+    where = placed(a=Host(address="192.0.2.1"))
+    with pytest.raises(InventoryError, match=r"^--extra nonsense: must be one of agents, all, .*, world$"):
+        asyncio.run(push(where, [], ["agents", "nonsense"], lambda host, text: None, tmp_path))
+
+
 def test_every_host_that_fails_has_its_line(tmp_path: Path) -> None:
     port = inventory.SSH_PORT - 21  # tcpmux; nobody has it
     closed = Host(address="127.0.0.1", port=port)
+    where = placed(a=closed, b=closed, c=Host(address="127.0.0.1", python="/opt/python"))
+    told: list[tuple[str, str]] = []
     with pytest.raises(HostsError) as caught:
-        pushed(placed(a=closed, b=closed, c=Host(address="127.0.0.1", python="/opt/python")), [], tmp_path)
+        asyncio.run(push(where, [], [], lambda host, text: told.append((host, text)), tmp_path))
+    assert {("a", "failed"), ("b", "failed")} <= set(told)  # why is said once, in the end
     lines = str(caught.value).splitlines()
     assert [line.partition(": ")[0] for line in lines] == ["a", "b"]
     assert all("cannot be reached (Connection refused)" in line for line in lines)

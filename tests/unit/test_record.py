@@ -19,7 +19,7 @@ from zsim import keys, messages
 from zsim.errors import RecordError
 from zsim.messages import Clock, Imu
 from zsim.record import Recorded, RecordReader, RecordWriter, repair
-from zsim.record.layout import places
+from zsim.record.layout import CHUNK_HEAD, HEAD, places
 
 GATE_NS = 20_000_000
 CHUNK_MESSAGES = 40  # per chunk of the records below
@@ -195,6 +195,23 @@ def test_a_length_that_cannot_be_right_hides_what_follows_and_is_counted(tmp_pat
             assert reader.complete
             assert list(reader.messages(by_time=False)) == recorded[: 2 * CHUNK_MESSAGES]
             assert reader.damaged == 1
+
+
+def test_a_chunk_whose_head_is_damaged_is_passed_over_and_left_out_of_the_summary(tmp_path):
+    path = tmp_path / "run.mcap"
+    sizes = write(path, recorded := flight(200))
+    data = bytearray(path.read_bytes())
+    name = sizes[2 * CHUNK_MESSAGES - 1] + HEAD.size + CHUNK_HEAD.size - 4  # length of the third chunk's compression
+    assert data[name : name + 8] == b"\x04\x00\x00\x00zstd"
+    data[name : name + 4] = b"\x00\xff\xff\x00"
+    path.write_bytes(data[:-1])  # cut, so that there is something to repair
+    sound = recorded[: 2 * CHUNK_MESSAGES] + recorded[3 * CHUNK_MESSAGES :]
+    assert repair(path)
+    with RecordReader(path) as reader:
+        assert list(reader.messages(by_time=False)) == sound
+        assert reader.damaged == 1
+    with open(path, "rb") as file:
+        assert sum(1 for _ in make_reader(file).iter_messages()) == len(sound)
 
 
 @pytest.mark.parametrize("opcode", [Opcode.SCHEMA, Opcode.CHANNEL])

@@ -13,6 +13,7 @@ from zsim_deploy.host_link import Loop
 from zsim_deploy.log import Log
 from zsim_deploy.remote import LOST, Remote
 
+FILES = {"identity/estimator.d1/key.pem": b"secret"}
 PATIENCE_S = 20.0  # after which a test that waits for ever fails
 
 
@@ -57,6 +58,11 @@ class Link:
 
     def __init__(self, then: Process | Exception | None) -> None:
         self._then = then
+        self.brought: list[tuple[str, dict[str, bytes]]] = []
+
+    async def put_files(self, folder: str, files: dict[str, bytes], *_: Any, patient: bool) -> None:
+        assert patient
+        self.brought.append((folder, files))
 
     @asynccontextmanager
     async def channel(self, patient: bool = False) -> AsyncIterator["Link"]:
@@ -88,7 +94,7 @@ def started(tmp_path: Path) -> Iterator[Start]:
 
     def start(link: Any, on_line: Any = None, log: Log | None = None) -> Remote:
         log = log or Log(tmp_path / "estimator.d1.log", lambda text: None)
-        remote = Remote("estimator.d1", ["estimator"], link, "python3", loop, log, on_line)
+        remote = Remote("estimator.d1", ["estimator"], link, "python3", loop, log, on_line, "/z/runs/1", FILES)
         remote.start()
         return remote
 
@@ -139,3 +145,13 @@ def test_one_that_waits_for_its_host_can_be_given_up(started: Start) -> None:
     remote.kill()
     assert remote.wait(PATIENCE_S)
     assert remote.code == LOST
+
+
+def test_one_that_is_started_again_gets_its_key_again_which_it_has_taken_away(started: Start) -> None:
+    link = Link(Process("zsim-pid 77\n"))
+    remote = started(link)
+    assert remote.wait(PATIENCE_S)
+    assert link.brought == []
+    remote.start()
+    assert remote.wait(PATIENCE_S)
+    assert link.brought == [("/z/runs/1", FILES)]

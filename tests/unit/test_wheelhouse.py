@@ -5,6 +5,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import socket
 import sys
 import sysconfig
 import tarfile
@@ -14,9 +15,10 @@ from typing import Any, cast
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy import wheelhouse
+from zsim_deploy import package_index, wheelhouse
+from zsim_deploy.package_index import PipError, gather, pip
 from zsim_deploy.target import Target, target
-from zsim_deploy.wheelhouse import House, PipError, Wheelhouse, gather, requirement
+from zsim_deploy.wheelhouse import House, Wheelhouse, requirement
 
 BACKEND = """
 # A build backend without dependencies: a wheel with one module.
@@ -158,6 +160,57 @@ def test_a_project_that_cannot_be_built_is_a_line(checkout: Path, tmp_path: Path
     (checkout / "backend.py").write_text("raise ImportError('no backend')\n")
     with pytest.raises(HostsError, match=rf"^launcher: no wheel of zsim from {checkout}: [^\n]+$"):
         house(tmp_path / "cache", [])
+
+
+@pytest.fixture
+def no_index(index: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An index at which nobody listens, beside the folder."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    monkeypatch.delenv("PIP_NO_INDEX")
+    monkeypatch.setenv("PIP_INDEX_URL", f"http://127.0.0.1:{port}/simple")
+
+
+def test_an_index_that_cannot_be_reached_is_no_missing_wheel(
+    checkout: Path, no_index: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "index/gadget-1.0.tar.gz").unlink()
+    (tmp_path / "index/gadget-1.0-py3-none-any.whl").unlink()
+    calls: list[tuple[str, ...]] = []
+
+    async def counted(*arguments: str, **options: Any) -> None:
+        calls.append(arguments)
+        await pip(*arguments, **options)
+
+    for module in (wheelhouse, package_index):
+        monkeypatch.setattr(module, "pip", counted)
+    told: list[str] = []
+    kept = Wheelhouse(tmp_path / "cache", told.append)
+    for _ in range(2):
+        with pytest.raises(HostsError) as caught:
+            asyncio.run(kept.house("h", ELSEWHERE, ["agents"]))
+        assert str(caught.value) == (
+            "launcher: the package index cannot be reached (Connection refused); connect this machine to it for the "
+            "first push, or give pip a folder with all wheels (PIP_NO_INDEX=1 PIP_FIND_LINKS=FOLDER)"
+        )
+    assert [arguments[0] for arguments in calls] == ["wheel", "download"]
+    assert told[-1] == "the package index does not answer (Connection refused); asking once more"
+
+
+def test_what_is_in_a_folder_needs_no_index(checkout: Path, no_index: None, tmp_path: Path) -> None:
+    assert house(tmp_path / "cache", ["agents"])[0].others
+
+
+@pytest.mark.parametrize(
+    ("shown", "reason"),
+    [
+        ("\"HTTPSConnection(host='a.b', port=443): Failed to resolve 'a.b' ([Errno -2] Name or service not known)\"", "Failed to resolve 'a.b' (Name or service not known)"),
+        ("'<pip._vendor.urllib3.connection.HTTPSConnection object at 0x7f>, 'Connection to a.b timed out. (connect timeout=15)'", "Connection to a.b timed out. (connect timeout=15)"),
+        ("'Cannot connect to proxy.', OSError('Tunnel connection failed: 403 Forbidden')", "403 Forbidden"),
+    ],
+)  # fmt: skip
+def test_why_an_index_does_not_answer_is_said_without_what_surrounds_it(shown: str, reason: str) -> None:
+    assert package_index._reason(shown) == reason
 
 
 class Installed:
