@@ -195,10 +195,11 @@ class HostLink:
             HostsError: they could not be written.
         """
         content = archive(files)
-        into, part = shell.word(folder), shell.word(f"{folder}/.part")
-        is_whole = f"[ $(wc -c < {part}) -eq {len(content)} ] || {{ echo it came in part >&2; exit 1; }}"
-        unpack = f"{{ {is_whole}; }} && tar -xof {part} -C {into}"
-        script = f"umask 077; mkdir -p {into} && cat > {part} && {unpack} && rm {part}"
+        into = shell.word(folder)
+        part = f"{into}/.part.$$"  # others may be writing there at the same time
+        is_whole = f"[ $(wc -c < {part}) -eq {len(content)} ] || {{ echo it came in part >&2; false; }}"
+        unpack = f"cat > {part} && {{ {is_whole}; }} && tar -xof {part} -C {into}"
+        script = f"umask 077; mkdir -p {into} && {{ {unpack}; code=$?; rm -f {part}; exit $code; }}"
         await self.run(script, content, timeout_s, what=f"writing into {folder}", patient=patient)
 
     async def echo(self) -> None:
