@@ -19,6 +19,7 @@ from zsim.replay import replay
 from zsim.session import Sample, Session
 
 REPLAY_S = 2.0  # a hub answers a replay within milliseconds; a lost link does not
+REJOINS_MAX = 6  # times that a return is said before it is taken for granted; a router forwards nothing at first
 RETRY_S = 0.5  # wall time between two attempts at what is owed
 ASKED_MAX = 10  # answers to what is lost that may lack it; the world answers from what it has on the way, too
 GATES_KEPT = 2  # gates of which the outputs are kept to answer a get, contract; more where the world runs ahead
@@ -60,6 +61,8 @@ class Membership:
         ahead = info.command_delay_ns // info.gate_ns
         self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
         self._must_rejoin = False
+        self._unproved = 0
+        self._proof_ns = 0
         self._missed_since_ns: int | None = None
         self._asked_ns = -1
         self._asked = 0
@@ -137,11 +140,12 @@ class Membership:
     @property
     def owes(self) -> bool:
         """Tell whether something was asked of the world that it has not answered yet."""
-        return self._must_rejoin or self._missed_since_ns is not None
+        return self._must_rejoin or self._unproved > 0 or self._missed_since_ns is not None
 
     def taken_in(self, entry: Entry) -> None:
         """Take the news that this process came after one of its name, or that another came after this one."""
         if entry.incarnation == self._incarnation:
+            self._unproved = 0
             if self.done_ns < 0:
                 self._catch_up(max(entry.from_ns - 1, entry.done_ns))
         elif entry.former_pid == os.getpid() and entry.pid != os.getpid():
@@ -183,6 +187,8 @@ class Membership:
             return
         if self._must_rejoin:
             self._rejoin()
+        elif self._unproved:
+            self._insist()
         if self._missed_since_ns is not None and not self._must_rejoin:
             self._fetch(self._missed_since_ns)
         self._retry_s = self._wall_s() + RETRY_S
@@ -196,6 +202,19 @@ class Membership:
         if info.run_id != self._info.run_id:
             self.failure = RunError(f"{self._agent.name}: the world has begun another run")
             return
+        self._unproved, self._proof_ns = REJOINS_MAX, self.done_ns + GATES_KEPT * self._info.command_delay_ns
+        self._say_again()
+
+    def _insist(self) -> None:
+        """Say again what may not have got through, unless the world has gone on with what this process said."""
+        self._unproved -= 1
+        if self.done_ns > self._proof_ns:
+            self._unproved = 0
+        else:
+            self._say_again()
+
+    def _say_again(self) -> None:
+        """Join, and repeat what the world may lack."""
         self._join()
         for t_ns, outputs in self._kept:
             for key, message in outputs:

@@ -59,10 +59,13 @@ class Tally:
 def tally(request: pytest.FixtureRequest) -> Iterator[Tally]:
     made = Tally()
     yield made
-    terminal: Any = request.config.pluginmanager.getplugin("terminalreporter")
-    terminal.ensure_newline()
-    for line in made.lines():
-        terminal.write_line(line)
+    plugins = request.config.pluginmanager
+    terminal: Any = plugins.getplugin("terminalreporter")
+    capture: Any = plugins.getplugin("capturemanager")
+    with capture.global_and_fixture_disabled():
+        terminal.ensure_newline()
+        for line in made.lines():
+            terminal.write_line(line)
 
 
 @functools.cache

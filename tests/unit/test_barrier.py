@@ -16,8 +16,8 @@ def join(incarnation: int = 1, period_ns: int = GATE_NS, run_id: str = RUN, host
     return Join(0, 0, run_id, incarnation, "estimator", host, 42, period_ns, "0.1.0", "f00d")
 
 
-def done(gate: int, sent: int = 0, incarnation: int = 1, run_id: str = RUN) -> Done:
-    return Done(gate * GATE_NS, gate, run_id, incarnation, gate * GATE_NS, sent)
+def done(gate: int, sent: int = 0, incarnation: int = 1, run_id: str = RUN, seq: int | None = None) -> Done:
+    return Done(gate * GATE_NS, gate if seq is None else seq, run_id, incarnation, gate * GATE_NS, sent)
 
 
 def barrier(*names: str, expected: list[str] | None = None, period_ns: int = GATE_NS) -> Barrier:
@@ -74,9 +74,9 @@ def test_a_participant_that_does_not_gate_is_never_waited_for():
 def test_a_longer_period_owes_only_its_own_instants(period: int, need: int, owed: int):
     made = barrier("a", period_ns=period * GATE_NS)
     if owed:
-        made.done("a", done(owed - period), need * GATE_NS, 0)
+        made.done("a", done(owed - period, seq=0), need * GATE_NS, 0)
         assert blocked(made, need) == ["a"]
-    made.done("a", done(owed), need * GATE_NS, 0)
+    made.done("a", done(owed, seq=1), need * GATE_NS, 0)
     assert blocked(made, need) == []
 
 
@@ -252,6 +252,29 @@ def test_once_written_off_a_loss_hides_none_that_comes_after(found: int, gone: i
     assert made.short() == []
     made.done("a", done(1, sent=1), GATE_NS, 0)
     assert names(made.short()) == ["a"]
+
+
+def test_a_lost_done_takes_the_count_of_what_was_lost_before_it_with_it():
+    """Of gate 1 one output came, the other and the done did not; the surplus must not pay for what is lost of 2."""
+    made = barrier("a")
+    made.done("a", done(0), 2 * GATE_NS, 0)
+    for _ in range(3):
+        made.received("a")
+    made.done("a", done(2, sent=2), 2 * GATE_NS, 0)
+    assert names(made.short()) == blocked(made, 2) == ["a"]
+    assert made.participants["a"].write_off() == 0
+    assert made.short() == blocked(made, 2) == []
+
+
+@pytest.mark.parametrize(("pid", "doubtful"), [(42, True), (43, False)])
+def test_a_done_that_was_lost_with_the_link_shows_after_the_return(pid: int, doubtful: bool):
+    """A process goes on counting its dones; another one in its place begins anew."""
+    made = barrier("a")
+    made.done("a", done(0), 3 * GATE_NS, 0)
+    back = Join(0, 1, RUN, 2, "estimator", "laptop", pid, GATE_NS, "0.1.0", "f00d")
+    assert made.join("a", back, 3 * GATE_NS, 0) is None
+    made.done("a", done(2, incarnation=2), 3 * GATE_NS, 0)
+    assert bool(made.short()) == doubtful
 
 
 def test_outputs_of_strangers_are_nobody_s():

@@ -129,13 +129,15 @@ class Lossy(FakeLink):
         keeps: whether it still has them when it is asked.
     """
 
-    def __init__(self, loses: set[tuple[str, int]], keeps: bool = True) -> None:
+    def __init__(self, loses: set[tuple[str, int]], keeps: bool = True, incarnation: int = 1) -> None:
         super().__init__()
+        self._incarnation = incarnation
         self.on_said, self.on_request = self._answer, self._outputs
         self._loses, self._keeps = loses, keeps
         self._kept: list[list[Any]] = []
         self._gate = 0
-        self.deliver(keys.process(ME, "join"), Join(0, 0, "run1", 1, "tester", "h", 1, GATE_NS))
+        for number in range(1, incarnation + 1):
+            self.deliver(keys.process(ME, "join"), Join(0, number, "run1", number, "tester", "h", 1, GATE_NS))
 
     def _answer(self, key: str, payload: bytes) -> None:
         if key == keys.CLOCK and messages.decode(key, payload).step == self._gate <= GATES:
@@ -152,7 +154,7 @@ class Lossy(FakeLink):
                 self.deliver(key, message)
             if self._keeps or not lost:
                 self._kept.append([key, messages.encode(message)])
-        self.deliver(keys.process(ME, "done"), Done(gate * GATE_NS, gate, "run1", 1, gate * GATE_NS, 2))
+        self.deliver(keys.process(ME, "done"), Done(gate * GATE_NS, gate, "run1", self._incarnation, gate * GATE_NS, 2))
 
     def _outputs(self, key: str, args: dict[str, Any]) -> ControlAnswer:
         assert key == keys.process(ME, "outputs")
@@ -171,6 +173,16 @@ def test_every_loss_is_found_and_nothing_comes_twice():
     assert len(link.requests) == 3
     assert events(link, "outputs_missing") == []
     assert link.recorded(ESTIMATE) == link.recorded(STATE) == list(range(GATES + 1))
+
+
+@pytest.mark.parametrize(("incarnation", "missing"), [(1, [1]), (2, [])])
+def test_who_has_just_come_back_is_asked_until_it_answers(incarnation: int, missing: list[int]):
+    """Behind a new router it cannot be asked at once; of anybody else silence is an answer."""
+    link = Lossy({(ESTIMATE, 2)}, incarnation=incarnation)
+    silent = iter(range(3))
+    link.on_request = lambda key, args: link._outputs(key, args) if next(silent, None) is None else UNANSWERED
+    run(world(ME), link)
+    assert [event.data["missing"] for event in events(link, "outputs_missing")] == missing
 
 
 def test_an_old_output_does_not_stand_in_for_the_one_that_is_missing():

@@ -21,6 +21,9 @@ class Participant:
         done_ns: newest gate that it is through with.
         received: outputs that came in since its last done.
         missing: outputs that it counted in its dones and that have not come in.
+        done_seq: number of its newest done, None before the first of its process.
+        doubtful: whether a done was lost, and with it the count of what else was.
+        again: whether another incarnation of its name was there before.
         since_wall_ns: when it was last heard of: join, done or death.
         joined_wall_ns: when this incarnation joined.
     """
@@ -36,6 +39,9 @@ class Participant:
     done_ns: int = -1
     received: int = 0
     missing: int = 0
+    done_seq: int | None = None
+    doubtful: bool = False
+    again: bool = False
     alive: bool = True
     since_wall_ns: int = 0
     joined_wall_ns: int = 0
@@ -52,6 +58,12 @@ class Participant:
         required = need_ns // self.period_ns * self.period_ns
         return required if required >= self.from_ns else None
 
+    def number(self, seq: int) -> None:
+        """Take the number of a done; a gap shows that one was lost."""
+        if self.done_seq is not None and seq > self.done_seq + 1:
+            self.doubtful = True
+        self.done_seq = seq if self.done_seq is None else max(seq, self.done_seq)
+
     def settle(self, sent: int) -> None:
         """Set what a done counts against what came in; a surplus belongs to the next done."""
         balance = self.received - self.missing - sent
@@ -62,13 +74,13 @@ class Participant:
 
         A surplus would hide the next loss: outputs that belong to the next done do not come while some are missing.
         """
-        missing, self.missing, self.received = self.missing, 0, 0
+        missing, self.missing, self.received, self.doubtful = self.missing, 0, 0, False
         return missing
 
     def owes(self, need_ns: int) -> bool:
         """Tell whether its done (or an output that it counted) is not in yet."""
         required = self.required_ns(need_ns)
-        return required is not None and (self.done_ns < required or self.missing > 0)
+        return required is not None and (self.done_ns < required or self.missing > 0 or self.doubtful)
 
 
 class Barrier:
@@ -115,6 +127,8 @@ class Barrier:
             since_wall_ns=wall_ns,
             joined_wall_ns=wall_ns,
             deadline_misses=former.deadline_misses if former else 0,
+            done_seq=former.done_seq if former and (former.host, former.pid) == (message.host, message.pid) else None,
+            again=former is not None,
         )
         return None
 
@@ -141,6 +155,7 @@ class Barrier:
         if message.done_ns > participant.done_ns:
             participant.done_ns = message.done_ns
             participant.since_wall_ns = wall_ns
+        participant.number(message.seq)
         participant.settle(message.sent)
         return None
 
@@ -180,8 +195,8 @@ class Barrier:
         return [p for p in self.participants.values() if p.owes(need_ns)]
 
     def short(self) -> list[Participant]:
-        """Return who counted more outputs in its done than have come in."""
-        return [p for p in self.participants.values() if p.missing]
+        """Return who counted more outputs in its done than have come in, or of whom a done was lost."""
+        return [p for p in self.participants.values() if p.missing or p.doubtful]
 
     def waiting_for(self, need_ns: int, wall_ns: int, start_wall_ns: int) -> tuple[Waiting, ...]:
         """Return whom the world waits for, as `clock` names them: first the dead, then who is silent for longest.

@@ -32,6 +32,7 @@ VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
 NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
 RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
+RETURN_NS = 10_000_000_000  # wall time after a return to the run in which it may take until it can be asked
 PHASE_EVERY = 10  # states of a cluster between two looks at the phase that progress shows
 Tell = Callable[[str, Any, str], None]
 # Outputs first, dones last: whoever says done has sent its outputs before, on the same link.
@@ -250,22 +251,26 @@ class WorldProcess:
 
     def _recover_short(self) -> None:
         """Ask a participant again for outputs that it counted and that did not come, as after a cut link."""
-        if self._world.mode == "realtime":
-            return
         for participant in self._world.barrier.short():
-            for sample in self._unheard(participant):
+            if self._world.mode == "realtime":
+                participant.doubtful = False
+                continue
+            lost = self._unheard(participant)
+            if lost is None and participant.again and time.monotonic_ns() - participant.joined_wall_ns < RETURN_NS:
+                continue
+            for sample in lost or ():
                 self._take_in(time.monotonic_ns(), sample)
             missing = participant.write_off()
             if missing:
                 text = f"{participant.name}: {missing} of its outputs did not come"
                 self._world.event("outputs_missing", participant.name, text, missing=missing)
 
-    def _unheard(self, participant: Participant) -> list[Sample]:
-        """Return what a participant has kept of its outputs and that has not come."""
+    def _unheard(self, participant: Participant) -> list[Sample] | None:
+        """Return what a participant has kept of its outputs and that has not come; None if it does not answer."""
         key = keys.process(participant.name, "outputs")
         try:
             answer = self._link.request(key, "outputs", WORLD, timeout_s=RECOVERY_S)
-            return unheard(answer.result, participant.done_ns, self._history) if answer.ok else []
+            return unheard(answer.result, participant.done_ns, self._history) if answer.ok else None
         except DecodeError as error:
             self.health.refused += 1
             self._world.refuse(participant.name, key, str(error))
