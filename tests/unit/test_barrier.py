@@ -277,6 +277,15 @@ def test_a_done_that_was_lost_with_the_link_shows_after_the_return(pid: int, dou
     assert bool(made.short()) == doubtful
 
 
+def test_a_done_that_was_refused_was_not_lost():
+    made = barrier("a")
+    made.done("a", done(0), 3 * GATE_NS, 0)
+    assert made.join("a", join(incarnation=2), 3 * GATE_NS, 0) is None
+    assert made.done("a", done(1, incarnation=1), 3 * GATE_NS, 0)
+    assert made.done("a", done(2, incarnation=2), 3 * GATE_NS, 0) is None
+    assert made.short() == []
+
+
 def test_outputs_of_strangers_are_nobody_s():
     made = barrier("a")
     made.received("stranger")

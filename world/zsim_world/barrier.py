@@ -64,6 +64,11 @@ class Participant:
             self.doubtful = True
         self.done_seq = seq if self.done_seq is None else max(seq, self.done_seq)
 
+    def refuse(self, seq: int) -> None:
+        """Take the number of a done that is refused, if it is the next of the same process: it was not lost."""
+        if self.done_seq is not None and seq == self.done_seq + 1:
+            self.done_seq = seq
+
     def settle(self, sent: int) -> None:
         """Set what a done counts against what came in; a surplus belongs to the next done."""
         balance = self.received - self.missing - sent
@@ -149,6 +154,7 @@ class Barrier:
         if message.run_id != self._run_id:
             return f"run_id is {message.run_id[:40]!r}; must be {self._run_id!r} (read world/info)"
         if message.incarnation != participant.incarnation:
+            participant.refuse(message.seq)
             return f"incarnation is {message.incarnation}; must be {participant.incarnation}, the newest to join"
         if message.done_ns > now_ns:
             return f"done_ns is {message.done_ns}; must be <= {now_ns}, the newest gate"
