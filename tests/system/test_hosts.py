@@ -177,18 +177,6 @@ def test_a_killed_router_is_started_again(lab: Lab, tmp_path: Path) -> None:
         assert team.record().sha256() == in_process(tmp_path, 30.0)
 
 
-def test_a_router_per_site_each_at_the_world(lab: Lab, tmp_path: Path) -> None:
-    """What an estimator of one site says reaches the controller of the other through the world.
-
-    estimator.drone2, controller.main ─── router.a ─── world ─── router.b ─── estimator.drone3
-    """
-    routers = {"a": {"host": "h2"}, "b": {"host": "h3"}}
-    with closing(Team(lab, ROLES, routers=routers, through={"h2": "a", "h3": "b"})) as team:
-        run = team.up("--duration", "10")
-        run.ends(with_code=0, within_s=START_S)
-        assert team.record().sha256() == in_process(tmp_path, 10.0)
-
-
 def test_a_full_disk_at_the_recorder_ends_the_run_and_keeps_the_record(
     lab: Lab, small_disk: Callable[[Path, int], None]
 ) -> None:
