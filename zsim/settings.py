@@ -13,7 +13,8 @@ from zsim.identity import Identity
 
 LEASE_LOCKSTEP_MS = 3_600_000  # a stopped or debugged process must not lose its link in lockstep
 LEASE_REALTIME_MS = 1_000
-LEASE_READER_MS = 10_000  # nobody waits for one that only reads, so nobody would name it when it is stopped
+# Nobody waits for one that only reads: nobody would name it when it is stopped, nor need it be missed within a second.
+LEASE_READER_MS = 10_000
 CLOSE_AFTER_US = 3_600_000_000  # -1 means for ever and panics in 1.10.2
 # A stopped reader (a recorder, `zsim echo`) fills its link and then holds up the hub and everybody; it loses its link.
 # A stopped participant does not: time stands before its link is full.
@@ -36,7 +37,7 @@ def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
         timing: of the run.
         reader: it does not gate.
     """
-    lease = LEASE_REALTIME_MS if timing == "realtime" else LEASE_READER_MS if reader else LEASE_LOCKSTEP_MS
+    lease = LEASE_READER_MS if reader else LEASE_REALTIME_MS if timing == "realtime" else LEASE_LOCKSTEP_MS
     return {
         "mode": json.dumps(mode),
         "scouting/multicast/enabled": "false",

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from zsim.identity import Identity
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+REALTIME = "--realtime"  # of the world and the routers, whose lease it shortens
 
 
 def positive(value: float | None) -> float | None:
@@ -30,7 +31,7 @@ ScenarioPath = Annotated[Path, typer.Argument(help="Scenario file (YAML).", show
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override a field: a.b.c=value. Repeatable.")]
 Seed = Annotated[int | None, typer.Option(help="Seed instead of the scenario's.")]
 Duration = Annotated[float | None, typer.Option(help="Simulated seconds instead of the scenario's.")]
-Realtime = Annotated[bool, typer.Option("--realtime", help="Pace by the wall clock and wait for nobody.")]
+Realtime = Annotated[bool, typer.Option(REALTIME, help="Pace by the wall clock and wait for nobody.")]
 RateOption = Annotated[float | None, typer.Option(help="Simulated per wall second (realtime 1, lockstep unpaced).")]
 Connect = Annotated[str, typer.Option(help="Where the world (or a router) listens.")]
 Federation = Annotated[str, typer.Option(help="Name of the federation: the prefix of its keys.")]
@@ -67,3 +68,8 @@ def mode_and_rate(realtime: bool, rate: float | None) -> tuple[str, float]:
     if rate is not None and not 0 < rate <= 1000:
         raise typer.BadParameter(f"--rate is {rate:g}; must be > 0 and <= 1000")
     return ("realtime", rate or 1.0) if realtime else ("lockstep", rate or 0.0)
+
+
+def pace_options(mode: str, rate: float) -> list[str]:
+    """Return mode and pace as options of the world."""
+    return [*([REALTIME] if mode == "realtime" else []), *(["--rate", str(rate)] if rate else [])]

@@ -7,7 +7,17 @@ from typing import Annotated, Any
 
 import typer
 
-from zsim_deploy.arguments import Duration, RateOption, Realtime, ScenarioPath, Seed, Set, load_scenario, mode_and_rate
+from zsim_deploy.arguments import (
+    Duration,
+    RateOption,
+    Realtime,
+    ScenarioPath,
+    Seed,
+    Set,
+    load_scenario,
+    mode_and_rate,
+    pace_options,
+)
 
 app = typer.Typer(
     name="render", help="Write systemd units, compose files or manifests for an inventory.", no_args_is_help=True
@@ -87,10 +97,7 @@ def _read(
 
 def _pace(realtime: bool, rate: float | None) -> list[str]:
     """Return the world's options for that."""
-    from zsim_deploy.render.process import REALTIME
-
-    mode, pace = mode_and_rate(realtime, rate)
-    return [*([REALTIME] if mode == "realtime" else []), *(["--rate", str(pace)] if pace else [])]
+    return pace_options(*mode_and_rate(realtime, rate))
 
 
 def _write(out: Path, target: str, texts: Mapping[str, str]) -> None:

@@ -13,6 +13,7 @@ from zsim.errors import RecordError, RunError, SessionError
 from zsim.identity import Identity
 from zsim.record import repair
 from zsim.scenario import Scenario
+from zsim_deploy.arguments import pace_options
 from zsim_deploy.child import Child
 from zsim_deploy.leash import Leash
 from zsim_deploy.progress import Screen
@@ -42,8 +43,7 @@ def _children(options: Options, endpoint: str, watch: Watch) -> list[Child]:
     # Another run's world may listen where ours could not: nobody of this run is to join that one.
     launched = ["--launched", uuid.uuid4().hex[:12], *(["--insecure"] if options.insecure else [])]
     reach = ["--connect", endpoint, "--federation", federation, *launched]
-    pace = ["--realtime"] if options.mode == "realtime" else []
-    pace += ["--rate", str(options.rate)] if options.rate else []
+    pace = pace_options(options.mode, options.rate)
     world = ["world", str(file), "--listen", endpoint, "--expect", "recorder", *pace, *launched]
     record = ["record", "--out", str(options.out), *reach]
     children = [Child("world", world, logs, watch.take_line), Child("recorder", record, logs)]

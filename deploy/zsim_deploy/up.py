@@ -15,6 +15,7 @@ from zsim.record import repair
 from zsim.rights import RECORDER, WORLD
 from zsim.scenario import Scenario
 from zsim_deploy import ports, shell
+from zsim_deploy.arguments import pace_options
 from zsim_deploy.board import Board
 from zsim_deploy.doctor import Report, about, compared
 from zsim_deploy.earlier import RECORD, earlier
@@ -27,7 +28,6 @@ from zsim_deploy.log import Log
 from zsim_deploy.orders import Orders
 from zsim_deploy.plan import Plan
 from zsim_deploy.remote import Remote
-from zsim_deploy.render.process import REALTIME
 from zsim_deploy.signals import CLOSED, Signals
 from zsim_deploy.watch import Outcome, Watch
 
@@ -50,8 +50,7 @@ class Options:
 
     def pace(self) -> list[str]:
         """Return that as options of the world."""
-        realtime = [REALTIME] if self.mode == "realtime" else []
-        return [*realtime, *(["--rate", str(self.rate)] if self.rate else [])]
+        return pace_options(self.mode, self.rate)
 
 
 class Look(NamedTuple):

@@ -8,12 +8,13 @@ import json
 import signal
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Any, Protocol
 
+from zsim.death import on_death
 from zsim.errors import RunError
 from zsim.scenario import OnDeath
 from zsim_deploy.progress import Show
@@ -27,7 +28,6 @@ RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; more is a fault that
 RESTART_WINDOW_S = 20.0
 USER_FAULT = 2  # exit code of a role that refuses its arguments or cannot run at all
 SUPERSEDED = 3  # exit code of a role whose place another process of its name has taken
-ON_DEATH: dict[str, OnDeath] = {"estimator": "restart", "controller": "restart", "recorder": "end", "router": "restart"}
 
 
 class Member(Protocol):
@@ -269,12 +269,6 @@ class Watch:
         latest_s = now_s + (INTERRUPT_S if self._interrupted else END_S)
         self._until_s = latest_s if self._until_s is None else min(self._until_s, latest_s)
         return max(0.0, self._until_s - now_s)
-
-
-def on_death(given: Mapping[str, OnDeath], name: str) -> OnDeath:
-    """Return what is to be done when a process dies: as the scenario says of it or its role, else as ON_DEATH does."""
-    role = name.partition(".")[0]
-    return given.get(name) or given.get(role) or ON_DEATH.get(role, "drop")
 
 
 def _settle(outcome: Future[Any], act: Callable[[], Any]) -> None:

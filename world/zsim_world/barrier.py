@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 from zsim import keys
 from zsim.messages import Done, Join, Waiting
-
-WORLD = "world"  # the one process that does not join
+from zsim.rights import WORLD
 
 
 @dataclass

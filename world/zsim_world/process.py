@@ -18,9 +18,10 @@ from zsim.errors import DecodeError
 from zsim.health import HealthMeter
 from zsim.identity import Identity
 from zsim.messages import ControlAnswer
+from zsim.rights import WORLD
 from zsim.session import Query, Sample, Session
 from zsim_world import replays
-from zsim_world.barrier import WORLD, Participant
+from zsim_world.barrier import Participant
 from zsim_world.history import History
 from zsim_world.inputs import TICK_S, Direct, Inputs, Timed
 from zsim_world.recovery import unheard

@@ -9,8 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 from zsim import CONTRACT, __version__, keys, messages, scenario_file
+from zsim.death import on_death
 from zsim.fingerprint import fingerprint
-from zsim.scenario import OnDeath, Scenario
+from zsim.scenario import Scenario
 from zsim_world.barrier import Barrier, Participant
 from zsim_world.command_desk import CommandDesk
 from zsim_world.commander import Commanders
@@ -20,12 +21,6 @@ from zsim_world.requests import Requests, brief
 from zsim_world.statistics import Measurements
 from zsim_world.truth_hash import TruthHash
 
-ON_DEATH: dict[str, OnDeath] = {
-    "world": "end",
-    "recorder": "end",
-    "estimator": "restart",
-    "controller": "restart",
-}
 REFUSALS_TOLD = 20  # events per source and reason; what follows is counted only
 
 
@@ -180,7 +175,7 @@ class World:
         participant = self.barrier.died(name, wall_ns)
         if participant is None:
             return
-        what = self.on_death(participant.role, name)
+        what = on_death(self.scenario.processes.on_death, name, participant.role)
         text = f"{name} on {participant.host} (pid {participant.pid}) died; on_death: {what}"
         self.event("death", name, text, host=participant.host, pid=participant.pid, on_death=what)
         if self.mode == "realtime" or what == "drop":
@@ -190,11 +185,6 @@ class World:
             self.event("drop", name, f"{name} is waited for no longer", from_ns=self.now_ns)
         elif what == "end":
             self.stop(f"{name} died")
-
-    def on_death(self, role: str, name: str) -> OnDeath:
-        """Return what the death of a process means, by its name or its role."""
-        given = self.scenario.processes.on_death
-        return given.get(name) or given.get(role) or ON_DEATH.get(role, "drop")
 
     def _leave_drones(self, name: str) -> None:
         for drone in self.commanders.gone(name):

@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from zsim.death import on_death
 from zsim.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario import OnDeath, Scenario
 from zsim_deploy import inventory as inv
+from zsim_deploy.arguments import REALTIME
 from zsim_deploy.extras import KINDS, NAMED
 from zsim_deploy.inventory import Placed
-from zsim_deploy.watch import on_death
 
-REALTIME = "--realtime"  # of the world and the routers, whose lease it shortens
 MODULE = ("-m", "zsim_deploy.cli")  # after the interpreter
 STOP_S = 15  # a world that is stopped waits 5 s for byes, and a recorder may have a disk to wait for
 
