@@ -261,12 +261,14 @@ def _sample(raw: zenoh.Sample, prefix: str) -> Sample:
 def listen(
     endpoints: Sequence[str], federation: str, mode: Mode, identity: Identity | None = None
 ) -> Iterator[Session]:
-    """Open the hub: a peer that listens, to which every other role is a client.
+    """Open the hub: a router that listens, to which every other role is a client.
+
+    A peer would do for clients, but carries nothing between two routers that both connect to it.
 
     Raises:
         SessionError: an endpoint is taken or malformed, or the identity is of no use.
     """
-    with _listening("peer", endpoints, federation, mode, identity or Identity(), {}) as session:
+    with _listening("router", endpoints, federation, mode, identity or Identity(), {}) as session:
         session.use(mode)
         yield session
 
