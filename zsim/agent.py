@@ -33,6 +33,7 @@ class Agent(ABC):
         reads: key expressions it subscribes to.
         gate_keys: keys of which one message stamped t closes the gate t, e.g. the drone's sensor/status.
         counted: drones of which it reads all sensors, so that what their status counts is waited for.
+        serves: names of processes for which it stands beside its own.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Agent(ABC):
     reads: tuple[str, ...]
     gate_keys: tuple[str, ...]
     counted: tuple[str, ...] = ()
+    serves: tuple[str, ...] = ()
 
     def __init__(self) -> None:
         self._seq: defaultdict[str, int] = defaultdict(int)

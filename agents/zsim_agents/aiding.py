@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from zsim.scenario import ErrorModel, Mount, Sensors
+from zsim_agents.error_state import BiasPrior
 from zsim_agents.madgwick import Vector
 from zsim_agents.mount import mount_rotation
-from zsim_agents.navigation_filter import BiasPrior
 from zsim_agents.sensor_noise import has_bias, white_sigma
 
 # Errors of the model itself, so that a scenario without noise does not ask for infinite trust.
@@ -21,6 +21,7 @@ SIGMA_MIN = {
     "flow": (0.005,),  # m/s
 }
 VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and squares of more would drown the rest
+SQUARE_MAX = 1e8  # of an innovation, in its unit; more would cost the covariance its digits
 # A sensor refused for this long without a break is believed again, its states losing their certainty [s].
 # Height and velocity are lost quickly where they are wrong; a field may be disturbed in passing.
 PATIENCE_S = {"gps": 10.0, "mag": 10.0, "baro": 5.0, "sonar": math.inf, "flow": 1.0}

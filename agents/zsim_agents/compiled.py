@@ -18,6 +18,9 @@ SOURCES = (  # every file that uses `compiled`
     "cluster_frame.py",
     "cluster_space.py",
     "dead_reckoning.py",
+    "estimator_fusion.py",
+    "estimator_motion.py",
+    "estimator_rows.py",
     "flight_judge.py",
     "formation.py",
     "kalman_update.py",
@@ -27,6 +30,7 @@ SOURCES = (  # every file that uses `compiled`
     "trajectory.py",
     "triad_cluster.py",
 )
+CONSTANTS = ("aiding.py", "estimator_prior.py", "strapdown.py")  # files of which constants are compiled in
 
 try:
     import numba
@@ -39,8 +43,8 @@ COMPILES = numba is not None  # whether `compiled` compiles here
 
 
 def sources_digest(folder: Path = Path(__file__).parent) -> str:
-    """Return the SHA-256 of the files with compiled functions."""
-    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in SOURCES)).hexdigest()
+    """Return the SHA-256 of the files with compiled functions, or with constants of theirs."""
+    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in SOURCES + CONSTANTS)).hexdigest()
 
 
 _DIGEST = sources_digest()

@@ -15,15 +15,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from zsim.scenario import Drone, Environment, Estimation
 from zsim_agents.aiding import VALUE_MAX, Aid, Measurement, aids
 from zsim_agents.dead_reckoning import ATTITUDE, heading_and_sigma, plus
+from zsim_agents.estimate import Estimate, age_max_s
 from zsim_agents.estimator_prior import (
     HEADING_SIGMA_RAD,
+    HEADING_WAIT_S,
+    SET_DOWN_SIGMA_RAD,
     bias_priors,
     madgwick_beta,
     process_noise,
@@ -31,7 +33,6 @@ from zsim_agents.estimator_prior import (
 )
 from zsim_agents.fusion import Fusion
 from zsim_agents.madgwick import (
-    Quaternion,
     Vector,
     heading,
     normalised,
@@ -44,25 +45,7 @@ from zsim_agents.navigation_filter import NavigationFilter
 from zsim_agents.state_history import StateHistory
 from zsim_agents.strapdown import Strapdown
 
-SET_DOWN_SIGMA_RAD = 0.05  # rad: how well a drone is set down by eye, where there is no magnetometer
-HEADING_WAIT_S = 1.0  # s without a magnetometer's reading, after which the heading of the scenario is taken
 YAW = slice(ATTITUDE + 2, ATTITUDE + 3)
-
-
-class Estimate(NamedTuple):
-    """What is published at every gate; see the contract."""
-
-    position_m: Vector
-    velocity_m_s: Vector
-    orientation_wxyz: Quaternion
-    yaw_rad: float
-    covariance: tuple[float, ...]
-    """Of position and velocity, 6 x 6, row-major."""
-    yaw_sigma_rad: float
-    gyro_bias_rad_s: Vector
-    """In the body frame."""
-    sensors: dict[str, tuple[int, int]]
-    """Readings (used, refused) since the start."""
 
 
 class DroneEstimator:
@@ -89,10 +72,9 @@ class DroneEstimator:
         noise = process_noise(imu, beta, gravity)
         self.filter = NavigationFilter(noise, bias_priors(imu, wanted), estimation.gate_probability)
         """Read only; `y` and `S` are the innovations of its last update."""
-        set_start(self.filter)
+        set_start(self.filter.P)
         self._strapdown = Strapdown(imu, self.filter.with_accel_bias, noise.accel_sigma, beta, gravity, gate_s)
-        latency_s = max(getattr(drone.sensors, name).latency_ms for name in ("imu", *self._aids)) * 1e-3
-        self._age_max_s = 2.0 * latency_s + 5.0 * gate_s
+        self._age_max_s = age_max_s(drone, gate_s)
         history = StateHistory(self._age_max_s, gate_s)
         self._fusion = Fusion(self.filter, self._strapdown, history, self._field)
         self._waiting: list[Measurement] = []

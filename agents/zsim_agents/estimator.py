@@ -1,98 +1,93 @@
-"""The estimator of one drone as an agent: sensors in, estimate out at every gate.
+"""The estimator of one drone, or of several, as an agent: sensors in, an estimate of each drone out at every gate.
 
-Order of this file: the agent, `receive` by message, `step`, warm start.
+Order of this file: the agent, `receive` by key, `step`, warm start.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from zsim import keys, messages
 from zsim.agent import Agent, Output
 from zsim.errors import RunError
 from zsim.scenario import Scenario
-from zsim_agents.drone_estimator import DroneEstimator
+from zsim_agents.estimator_set import estimators
 
 
 class Estimator(Agent):
-    """Feeds a DroneEstimator from `drone/{d}/sensor/*`.
+    """Feeds an EstimatorSet from `drone/{d}/sensor/*`.
+
+    It has the name of the first of its drones and stands for the estimators of the others too.
 
     Args:
         info: of the run.
         scenario: the resolved one that the info carries.
-        drone: name.
+        drones: a name, or several.
 
     Raises:
-        RunError: the scenario has no such drone.
+        RunError: the scenario has no such drone, or none is named.
     """
 
-    def __init__(self, info: messages.Info, scenario: Scenario, drone: str) -> None:
+    def __init__(self, info: messages.Info, scenario: Scenario, drones: str | Sequence[str]) -> None:
         super().__init__()
-        if drone not in {d.name for d in scenario.drones}:
-            known = ", ".join(d.name for d in scenario.drones)
-            raise RunError(f"estimator: drone is {drone!r}; must be one of {known}")
-        self.name = f"estimator.{drone}"
+        names = (drones,) if isinstance(drones, str) else tuple(drones)
+        _check(names, scenario)
+        self.name, *others = (f"estimator.{drone}" for drone in names)
+        self.serves = tuple(others)
         self.period_ns = info.gate_ns
-        # One subscription per sensor: the process sleeps until status, the last of a gate, and wakes once.
-        self.reads = (*(keys.sensor(drone, kind) for kind in keys.SENSORS), keys.status(drone))
-        self.gate_keys = (keys.status(drone),)
-        self.counted = (drone,)
-        self._key = keys.estimate(drone)
-        self._settings = (scenario.drone(drone), scenario.environment, scenario.estimation, info.gate_ns / 1e9)
-        self._core = DroneEstimator(*self._settings)
-        self._take: dict[type, Callable[[Any], None]] = {
-            messages.Imu: self._on_imu,
-            messages.Gps: self._on_gps,
-            messages.Mag: self._on_mag,
-            messages.Baro: self._on_baro,
-            messages.Sonar: self._on_sonar,
-            messages.Flow: self._on_flow,
-            messages.Status: lambda message: None,
+        self.reads = tuple(expression for drone in names for expression in _reads(drone))
+        self.gate_keys = tuple(keys.status(drone) for drone in names)
+        self.counted = names
+        self._estimate_keys = tuple(keys.estimate(drone) for drone in names)
+        specs = [scenario.drone(drone) for drone in names]
+        self._settings = (specs, scenario.environment, scenario.estimation, info.gate_ns / 1e9)
+        self._set = estimators(*self._settings)
+        self._take = {key: take for i, drone in enumerate(names) for key, take in self._takers(i, drone)}
+
+    def _takers(self, i: int, drone: str) -> list[tuple[str, Callable[[Any], None]]]:
+        """Return what is to be done with a message of each key of a drone."""
+        s = self._set
+        by_kind: dict[str, Callable[[Any], None]] = {
+            "imu": lambda m: s.imu(i, m.t_sample_ns * 1e-9, m.accel_m_s2, m.gyro_rad_s),
+            "gps": lambda m: s.gps(
+                i, m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.position_m, m.velocity_m_s, m.sigma_m, m.fix
+            ),
+            "mag": lambda m: s.mag(i, m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.field_ut),
+            "baro": lambda m: s.baro(i, m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.altitude_m),
+            "sonar": lambda m: s.sonar(i, m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.range_m, m.valid),
+            "flow": lambda m: s.flow(i, m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.velocity_m_s, m.quality),
+            "status": lambda m: None,
         }
+        return [(keys.sensor(drone, kind), take) for kind, take in by_kind.items()]
 
     def receive(self, key: str, message: Any) -> None:
-        self._take[type(message)](message)
-
-    def _on_imu(self, m: messages.Imu) -> None:
-        self._core.imu(m.t_sample_ns * 1e-9, m.accel_m_s2, m.gyro_rad_s)
-
-    def _on_gps(self, m: messages.Gps) -> None:
-        self._core.gps(m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.position_m, m.velocity_m_s, m.sigma_m, m.fix)
-
-    def _on_mag(self, m: messages.Mag) -> None:
-        self._core.mag(m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.field_ut)
-
-    def _on_baro(self, m: messages.Baro) -> None:
-        self._core.baro(m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.altitude_m)
-
-    def _on_sonar(self, m: messages.Sonar) -> None:
-        self._core.sonar(m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.range_m, m.valid)
-
-    def _on_flow(self, m: messages.Flow) -> None:
-        self._core.flow(m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.velocity_m_s, m.quality)
+        self._take[key](message)
 
     def step(self, t_ns: int) -> list[Output]:
-        estimate = self._core.close(t_ns * 1e-9)
-        message = messages.Estimate(t_ns, self.next_seq(self._key), *estimate, source=self.name)
-        return [Output(self._key, message)]
+        told = zip(self._estimate_keys, self._set.close(t_ns * 1e-9), strict=True)
+        return [
+            Output(key, messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.name))
+            for key, estimate in told
+        ]
 
     def rehearse(self) -> None:
-        drone, place, _, gate_s = self._settings
-        twin, still, sigma_m, fix = DroneEstimator(*self._settings), (0.0, 0.0, 0.0), 1.0, 3
+        drones, place, _, gate_s = self._settings
+        twin, still, sigma_m, fix = estimators(*self._settings), (0.0, 0.0, 0.0), 1.0, 3
         for gate in range(1, 4):
             t_s = gate * gate_s
-            twin.imu(t_s, (0.0, 0.0, place.gravity_m_s2), still)
-            twin.mag(t_s, t_s, place.magnetic_field_ut)
-            twin.gps(t_s, t_s, still, still, sigma_m, fix)
-            twin.baro(t_s, t_s, 0.0)
-            twin.sonar(t_s, t_s, drone.sensors.sonar.min_m, True)
-            twin.flow(t_s, t_s, still, 1.0)
+            twin.imu(0, t_s, (0.0, 0.0, place.gravity_m_s2), still)
+            twin.mag(0, t_s, t_s, place.magnetic_field_ut)
+            twin.gps(0, t_s, t_s, still, still, sigma_m, fix)
+            twin.baro(0, t_s, t_s, 0.0)
+            twin.sonar(0, t_s, t_s, drones[0].sensors.sonar.min_m, True)
+            twin.flow(0, t_s, t_s, still, 1.0)
             twin.close(t_s)
 
     def warm_start_keys(self) -> tuple[str, ...]:
-        return (self._key,)
+        return self._estimate_keys
 
     def warm_start(self, key: str, message: messages.Estimate) -> None:
-        self._core.warm_start(
+        self._set.warm_start(
+            self._estimate_keys.index(key),
             message.position_m,
             message.velocity_m_s,
             message.orientation_wxyz,
@@ -100,3 +95,15 @@ class Estimator(Agent):
             message.yaw_sigma_rad,
             message.gyro_bias_rad_s,
         )
+
+
+def _reads(drone: str) -> tuple[str, ...]:
+    """One subscription per sensor: the process sleeps until status, the last of a gate, and wakes once."""
+    return (*(keys.sensor(drone, kind) for kind in keys.SENSORS), keys.status(drone))
+
+
+def _check(names: Sequence[str], scenario: Scenario) -> None:
+    known = [drone.name for drone in scenario.drones]
+    for name in names or ("",):
+        if name not in known:
+            raise RunError(f"estimator: drone is {name!r}; must be one of {', '.join(known)}")

@@ -9,8 +9,8 @@ from zsim.presets import BOARD_RATE_HZ
 from zsim.scenario import Estimation, Imu
 from zsim_agents.aiding import Aid
 from zsim_agents.dead_reckoning import ATTITUDE, POSITION, VELOCITY
+from zsim_agents.error_state import Array, BiasPrior, ProcessNoise, set_variance
 from zsim_agents.madgwick import beta_for, levelling_time_s
-from zsim_agents.navigation_filter import BiasPrior, NavigationFilter, ProcessNoise
 from zsim_agents.sensor_noise import has_bias, white_sigma
 from zsim_agents.strapdown import MANOEUVRE_M_S2, MANOEUVRE_S
 
@@ -20,6 +20,8 @@ POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
 VELOCITY_SIGMA_M_S = 1.0  # m/s: a start at rest, or in gentle flight
 TILT_SIGMA_RAD = 0.05  # rad: ground that is level to 3 deg
 HEADING_SIGMA_RAD = 0.5  # rad: before the first reading of the magnetometer, which turns the attitude to it
+SET_DOWN_SIGMA_RAD = 0.05  # rad: how well a drone is set down by eye, where there is no magnetometer
+HEADING_WAIT_S = 1.0  # s without a magnetometer's reading, after which the heading of the scenario is taken
 GYRO_BIAS_MIN = math.radians(0.01)  # rad/s: bias that is allowed for where the scenario has none
 GYRO_WALK_MIN = math.radians(1e-4)  # rad/s/sqrt(s), likewise
 ACCEL_SIGMA_MIN = 0.02  # m/s^2 per sample: what sampling and the trapezoidal rule lose
@@ -74,9 +76,9 @@ def bias_priors(imu: Imu, aids: Sequence[Aid]) -> dict[str, BiasPrior]:
     return priors
 
 
-def set_start(navigation: NavigationFilter) -> None:
-    """Give position, velocity and attitude the uncertainty of a start."""
-    navigation.set_variance(slice(POSITION, POSITION + 3), POSITION_SIGMA_M**2)
-    navigation.set_variance(slice(VELOCITY, VELOCITY + 3), VELOCITY_SIGMA_M_S**2)
-    navigation.set_variance(slice(ATTITUDE, ATTITUDE + 2), TILT_SIGMA_RAD**2)
-    navigation.set_variance(slice(ATTITUDE + 2, ATTITUDE + 3), HEADING_SIGMA_RAD**2)
+def set_start(P: Array) -> None:
+    """Give position, velocity and attitude in a covariance (n, n) the uncertainty of a start."""
+    set_variance(P, slice(POSITION, POSITION + 3), POSITION_SIGMA_M**2)
+    set_variance(P, slice(VELOCITY, VELOCITY + 3), VELOCITY_SIGMA_M_S**2)
+    set_variance(P, slice(ATTITUDE, ATTITUDE + 2), TILT_SIGMA_RAD**2)
+    set_variance(P, slice(ATTITUDE + 2, ATTITUDE + 3), HEADING_SIGMA_RAD**2)

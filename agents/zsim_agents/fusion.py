@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from zsim_agents.aiding import Aid, Measurement
+from zsim_agents.aiding import SQUARE_MAX, Aid, Measurement
 from zsim_agents.aiding_models import write_baro, write_flow, write_gps, write_mag, write_sonar
 from zsim_agents.dead_reckoning import ATTITUDE, POSITION, VELOCITY
 from zsim_agents.estimator_prior import HEADING_SIGMA_RAD
@@ -12,8 +12,6 @@ from zsim_agents.madgwick import Vector, rotation
 from zsim_agents.navigation_filter import NavigationFilter, Stack
 from zsim_agents.state_history import Moment, StateHistory
 from zsim_agents.strapdown import Strapdown
-
-SQUARE_MAX = 1e8  # of an innovation, in its unit; more would cost the covariance its digits
 
 
 class Fusion:

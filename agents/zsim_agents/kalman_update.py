@@ -11,6 +11,8 @@ import numpy as np
 from zsim_agents.aiding_models import within_gates
 from zsim_agents.compiled import compiled
 
+ROWS_MAX = 32  # of one stacked update; more measurements of a gate go into a second one
+
 
 @compiled
 def predicted_covariance(P: np.ndarray, F: np.ndarray, Q: np.ndarray) -> np.ndarray:

@@ -1,55 +1,27 @@
 """The error-state EKF of one drone, on filterpy's ExtendedKalmanFilter.
 
-Error state: position (3), velocity (3), small rotation of the attitude (3), all in the world frame, gyroscope
-bias (3) in the body frame, accelerometer bias (3) where the drone has one, then the bias of every other
-channel that has one. Its mean is zero between gates: what an update finds is moved into the nominal state.
+Its states are those of error_state.py. Their mean is zero between gates: what an update finds is moved into the
+nominal state.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
-from zsim_agents.aiding_models import DOF_MAX, within_gates
+from zsim_agents.aiding_models import within_gates
 from zsim_agents.compiled import COMPILES
-from zsim_agents.dead_reckoning import GYRO_BIAS, write_prediction
-from zsim_agents.kalman_update import predicted_covariance, stacked_update
+from zsim_agents.dead_reckoning import write_prediction
+from zsim_agents.error_state import BiasPrior, ErrorState, ProcessNoise, innovation_limits, set_variance
+from zsim_agents.kalman_update import ROWS_MAX, predicted_covariance, stacked_update
 from zsim_agents.strapdown import Interval, Strapdown
 
 Array = NDArray[np.float64]
 
-ROWS_MAX = 32  # of one stacked update; more measurements of a gate go into a second one
 _NO_BLOCKS = np.zeros((0, 2), dtype=np.int64)
-
-
-@dataclass(frozen=True)
-class BiasPrior:
-    """Three equal states of bias, or one."""
-
-    size: int
-    sigma: float
-    """Standard deviation at the start, in the channel's unit."""
-    walk: float
-    """Random walk, per sqrt(s)."""
-
-
-@dataclass(frozen=True)
-class ProcessNoise:
-    """What drives the error state between measurements."""
-
-    accel_sigma: float
-    """White noise of the accelerometer per sample [m/s^2]."""
-    gyro_sigma: float
-    """White noise of the gyroscope per sample [rad/s]."""
-    tilt_density: float
-    """What Madgwick's pull adds to the tilt [rad^2/s]."""
-    levelling_s: float
-    """Time constant of Madgwick's pull [s]."""
 
 
 class Stack:
@@ -108,34 +80,25 @@ class NavigationFilter(ExtendedKalmanFilter):
     """
 
     def __init__(self, noise: ProcessNoise, biases: dict[str, BiasPrior], gate_probability: float) -> None:
-        self.bias_index: dict[str, int] = {}
-        size = GYRO_BIAS
-        for name, prior in biases.items():
-            self.bias_index[name] = size
-            size += prior.size
-        super().__init__(size, ROWS_MAX)
+        states = ErrorState(biases)
+        super().__init__(states.size, ROWS_MAX)
         self.noise = noise
-        self.x = np.zeros(size)
-        self.P = np.zeros((size, size))
-        self.Q = np.zeros((size, size))
-        self._zero = np.zeros(size)
-        self._walk = np.zeros(size)
-        self._all = np.arange(size)
-        self.with_accel_bias = "accel" in biases
-        self.aiding_biases = bool(set(biases) - {"gyro", "accel"})
+        self.x = np.zeros(states.size)
+        self.P = states.covariance
+        self.Q = np.zeros((states.size, states.size))
+        self.bias_index = states.bias_index
+        self.with_accel_bias = states.with_accel_bias
+        self.aiding_biases = states.aiding_biases
+        self._zero = np.zeros(states.size)
+        self._walk = states.walk
+        self._all = np.arange(states.size)
         self._distances = np.zeros(ROWS_MAX)
         self._blocks: dict[tuple[tuple[int, int], ...], NDArray[np.int64]] = {}
-        self._limits = np.append(0.0, chdtri(np.arange(1, DOF_MAX + 1), 1.0 - gate_probability))
-        for name, prior in biases.items():
-            span = slice(self.bias_index[name], self.bias_index[name] + prior.size)
-            self._walk[span] = prior.walk**2
-            self.set_variance(span, prior.sigma**2)
+        self._limits = innovation_limits(gate_probability)
 
     def set_variance(self, span: slice, variance: float | Sequence[float]) -> None:
         """Give states a new variance without any correlation with the others."""
-        self.P[span, :] = 0.0
-        self.P[:, span] = 0.0
-        self.P[self._all[span], self._all[span]] = variance
+        set_variance(self.P, span, variance)
 
     def add_variance(self, span: slice, variance: float | Sequence[float]) -> None:
         """Make states less certain, their correlations kept."""

@@ -31,7 +31,7 @@ class StateHistory:
     """
 
     def __init__(self, span_s: float, step_s: float) -> None:
-        self._moments: deque[Moment] = deque(maxlen=int(span_s / step_s) + 3)
+        self._moments: deque[Moment] = deque(maxlen=history_length(span_s, step_s))
 
     def clear(self) -> None:
         """Forget everything, when corrections have made the past attitude meaningless."""
@@ -56,6 +56,11 @@ class StateHistory:
                 return earlier if moment.t_s == t_s else _between(earlier, _as_seen(later, now), t_s)
             later = moment
         return _as_seen(later, now)
+
+
+def history_length(span_s: float, step_s: float) -> int:
+    """Return how many entries, `step_s` apart, reach back for `span_s`."""
+    return int(span_s / step_s) + 3
 
 
 def _as_seen(past: Moment, now: Moment) -> Moment:

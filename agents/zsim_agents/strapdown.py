@@ -72,10 +72,10 @@ class Strapdown:
         self.running = False
         self._with_accel_bias, self._beta, self.gravity = with_accel_bias, beta, gravity
         self._period_s = 1.0 / imu.rate_hz
-        self._coast_after_s = imu.latency_ms * 1e-3 + gate_s + 5.0 * self._period_s
+        self._coast_after_s = coast_after_s(imu, gate_s)
         self._R_BS, self._arm = mount_rotation(imu.mount), imu.mount.position_m
         self._mounted_aside = imu.mount.rpy_deg != ZERO or self._arm != ZERO
-        self._jolt_m_s2 = max(JOLT_SIGMAS * accel_sigma, JOLT_MIN_M_S2)
+        self._jolt_m_s2 = jolt_m_s2(accel_sigma)
         self._interval_from(0.0)
 
     def start(self, t_s: float) -> None:
@@ -120,7 +120,8 @@ class Strapdown:
         fx, fy, fz = self.state[5]
         jolt = abs(fx - bx) + abs(fy - by) + abs(fz - bz)
         if jolt > self._jolt_m_s2:
-            self._lost_velocity += (0.5 * jolt * dt) ** 2  # what a step anywhere between two samples hides
+            hidden = 0.5 * jolt * dt  # what a step anywhere between two samples hides
+            self._lost_velocity += hidden * hidden
         self.t_s = t_sample_s
         self._square_s2 += dt * dt
         self.used += 1
@@ -176,14 +177,25 @@ class Strapdown:
 
     def _lose(self, missing_s: float) -> None:
         """Count samples that did not come as motion unseen."""
-        self._lost_velocity += (MANOEUVRE_M_S2 * missing_s) ** 2
-        self._lost_turn += (LOST_TURN_RAD_S * missing_s) ** 2
+        velocity, turned = MANOEUVRE_M_S2 * missing_s, LOST_TURN_RAD_S * missing_s
+        self._lost_velocity += velocity * velocity
+        self._lost_turn += turned * turned
 
     def _of_body(self, accel: Vector, gyro: Vector, dt: float) -> tuple[Vector, Vector]:
         """Return a sample of a turned or displaced IMU as one of the centre of mass, in body axes."""
         accel, gyro = turn(self._R_BS, accel), turn(self._R_BS, gyro)
         w = plus(gyro, self.gyro_bias, -1.0)
         return plus(accel, arm_acceleration(w, self.state[4], self._arm, dt), -1.0), gyro
+
+
+def coast_after_s(imu: Imu, gate_s: float) -> float:
+    """Return after how long without an IMU dead reckoning goes on without one [s]."""
+    return imu.latency_ms * 1e-3 + gate_s + 5.0 * (1.0 / imu.rate_hz)
+
+
+def jolt_m_s2(accel_sigma: float) -> float:
+    """Return the change of specific force from one sample to the next that is more than noise and rotors [m/s^2]."""
+    return max(JOLT_SIGMAS * accel_sigma, JOLT_MIN_M_S2)
 
 
 def _plus_three(a: Vector, values: list[float], first: int) -> Vector:

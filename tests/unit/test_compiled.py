@@ -1,6 +1,7 @@
 """The compiled mathematics: every file that is compiled counts for the cache, and a change of one renews it."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import zsim_agents
-from zsim_agents.compiled import SOURCES, sources_digest
+from zsim_agents.compiled import CONSTANTS, SOURCES, sources_digest
 
 PACKAGE = Path(zsim_agents.__file__).parent
 
@@ -19,16 +20,24 @@ def test_every_file_with_compiled_functions_is_listed():
     assert users == set(SOURCES)
 
 
+def test_every_file_that_the_estimators_kernel_imports_is_listed():
+    """Where a function is compiled, the constants that it names are too, wherever they come from."""
+    texts = [(PACKAGE / name).read_text() for name in SOURCES if name.startswith("estimator_")]
+    imported = {name for text in texts for name in re.findall(r"^from zsim_agents\.(\w+) import", text, re.MULTILINE)}
+    assert {f"{name}.py" for name in imported} - {"compiled.py"} <= {*SOURCES, *CONSTANTS}
+
+
 def test_the_digest_changes_with_each_file(tmp_path: Path):
     digests = set()
-    for changed in (None, *SOURCES):
-        for name in SOURCES:
+    files = (*SOURCES, *CONSTANTS)
+    for changed in (None, *files):
+        for name in files:
             shutil.copy(PACKAGE / name, tmp_path)
         if changed:
             with (tmp_path / changed).open("a") as file:
                 file.write("# another line\n")
         digests.add(sources_digest(tmp_path))
-    assert len(digests) == len(SOURCES) + 1
+    assert len(digests) == len(files) + 1
 
 
 ASK = """

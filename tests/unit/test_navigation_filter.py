@@ -11,8 +11,9 @@ from scipy.stats import chi2
 
 from zsim.scenario import ErrorModel, Imu
 from zsim_agents import aiding_models, dead_reckoning
+from zsim_agents.error_state import BiasPrior, ProcessNoise
 from zsim_agents.madgwick import LEVEL, rotation
-from zsim_agents.navigation_filter import BiasPrior, NavigationFilter, ProcessNoise, Stack
+from zsim_agents.navigation_filter import NavigationFilter, Stack
 from zsim_agents.strapdown import Interval, Strapdown
 
 G = 9.80665  # m/s^2

@@ -22,20 +22,21 @@ env = scenario.environment
 info = messages.Info(0, 0, 1, "r", "zsim", "lockstep", 0.0, 20_000_000, 2_500_000, 20_000_000, 1,
                      messages.Origin(0.0, 0.0, 0.0), (), (), "", "", "", "")
 agent, chance, said = Estimator(info, scenario, "drone1"), np.random.default_rng(5), []
+at = "drone/drone1/sensor/"
 for gate in range(1, 151):
     t_ns = gate * 20_000_000
     noise = chance.normal(size=20).tolist()
     for k in range(4):
         at_ns = t_ns - (3 - k) * 5_000_000
         accel = (0.3 * noise[0], 0.3 * noise[1], env.gravity_m_s2 + 0.3 * noise[2])
-        agent.receive("", Imu(at_ns, 4 * gate + k, at_ns, accel, (0.01 * noise[3], 0.01 * noise[4], 0.01 * noise[5])))
-    agent.receive("", Mag(t_ns, gate, t_ns, tuple(env.magnetic_field_ut)))
-    agent.receive("", Baro(t_ns, gate, t_ns, 101325.0, 0.1 * noise[6]))
-    agent.receive("", Sonar(t_ns, gate, t_ns, 0.3 + 0.01 * noise[7], True))
-    agent.receive("", Flow(t_ns, gate, t_ns, (0.1 * noise[8], 0.1 * noise[9], 0.0), 1.0))
+        agent.receive(at + "imu", Imu(at_ns, 4 * gate + k, at_ns, accel, (0.01 * noise[3], 0.01 * noise[4], 0.01 * noise[5])))
+    agent.receive(at + "mag", Mag(t_ns, gate, t_ns, tuple(env.magnetic_field_ut)))
+    agent.receive(at + "baro", Baro(t_ns, gate, t_ns, 101325.0, 0.1 * noise[6]))
+    agent.receive(at + "sonar", Sonar(t_ns, gate, t_ns, 0.3 + 0.01 * noise[7], True))
+    agent.receive(at + "flow", Flow(t_ns, gate, t_ns, (0.1 * noise[8], 0.1 * noise[9], 0.0), 1.0))
     if gate % 10 == 0:
         p, v = tuple(noise[10:13]), tuple(0.1 * n for n in noise[13:16])
-        agent.receive("", Gps(t_ns, gate // 10, t_ns, 0.0, 0.0, 0.0, p, v, 1.0, 3, 9))
+        agent.receive(at + "gps", Gps(t_ns, gate // 10, t_ns, 0.0, 0.0, 0.0, p, v, 1.0, 3, 9))
     for output in agent.step(t_ns):
         message = messages.decode(output.key, messages.encode(output.message))
         said.append([*message.position_m, *message.velocity_m_s, *message.orientation_wxyz, *message.covariance])
