@@ -33,6 +33,7 @@ class Agent(ABC):
         reads: key expressions it subscribes to.
         gate_keys: keys of which one message stamped t closes the gate t, e.g. the drone's sensor/status.
         counted: drones of which it reads all sensors, so that what their status counts is waited for.
+        writes: keys that it publishes at every gate and that others of its process may read.
         serves: names of processes for which it stands beside its own.
     """
 
@@ -41,14 +42,25 @@ class Agent(ABC):
     reads: tuple[str, ...]
     gate_keys: tuple[str, ...]
     counted: tuple[str, ...] = ()
+    writes: tuple[str, ...] = ()
     serves: tuple[str, ...] = ()
 
     def __init__(self) -> None:
         self._seq: defaultdict[str, int] = defaultdict(int)
+        self._process = ""
 
     @property
     def role(self) -> str:
         return self.name.split(".", 1)[0]
+
+    @property
+    def source(self) -> str:
+        """Name of the process that publishes what it says: its own, unless it shares one."""
+        return self._process or self.name
+
+    def speak_as(self, process: str) -> None:
+        """Share a process of this name."""
+        self._process = process
 
     @abstractmethod
     def receive(self, key: str, message: Any) -> None:

@@ -98,6 +98,7 @@ class Bus:
                 period_ns=agent.period_ns,
                 version=__version__,
                 fingerprint=fingerprint(),
+                serves=agent.serves,
             )
             self._to_hub(keys.process(agent.name, "join"), join)
 

@@ -127,6 +127,7 @@ class Membership:
             period_ns=self._agent.period_ns,
             version=__version__,
             fingerprint=fingerprint(),
+            serves=self._agent.serves,
         )
         self._link.put(keys.process(self._agent.name, "join"), join)
 

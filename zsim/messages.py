@@ -283,7 +283,8 @@ class ClusterState(Message, frozen=True):
 class Join(Message, frozen=True):
     """A process takes part from now on; the newest of several random incarnations counts.
 
-    `period_ns` is how often it says done: a multiple of the gate, 0 for never.
+    `period_ns` is how often it says done: a multiple of the gate, 0 for never. `serves` names processes that need not
+    join, since this one does what they would.
     """
 
     run_id: str
@@ -294,6 +295,7 @@ class Join(Message, frozen=True):
     period_ns: Whole
     version: str = ""
     fingerprint: str = ""
+    serves: tuple[str, ...] = ()
 
 
 class Done(Message, frozen=True):

@@ -49,6 +49,7 @@ class Controller(Agent):
         states = tuple(keys.status(drone) for drone in spec.drones)
         self.gate_keys = states + estimates
         self.reads = self.gate_keys
+        self.writes = (keys.cluster_state(cluster),)
         self._state_key = keys.cluster_state(cluster)
         self._view_key = f"view/cluster/{cluster}"
         self._control_key = keys.cluster_control(cluster)
@@ -90,7 +91,7 @@ class Controller(Agent):
         outputs = []
         for drone, mode in output.modes:
             key = keys.command(drone, "mode")
-            outputs.append(Output(key, messages.Mode(t_ns, self.next_seq(key), self.name, mode)))  # type: ignore[arg-type]
+            outputs.append(Output(key, messages.Mode(t_ns, self.next_seq(key), self.source, mode)))  # type: ignore[arg-type]
         return outputs
 
     def _velocities(self, t_ns: int, output: GateOutput) -> list[Output]:
@@ -101,7 +102,7 @@ class Controller(Agent):
                 continue
             key = self._velocity_keys[place]
             velocity = in_heading(setpoint.v_W.tolist(), estimate.yaw_rad)
-            message = messages.Velocity(t_ns, self.next_seq(key), self.name, velocity, setpoint.yaw_rate)
+            message = messages.Velocity(t_ns, self.next_seq(key), self.source, velocity, setpoint.yaw_rate)
             outputs.append(Output(key, message))
         return outputs
 
@@ -120,7 +121,7 @@ class Controller(Agent):
             trajectory_t_s=output.trajectory_t_s,
             margin=output.margin if math.isfinite(output.margin) else 0.0,
             reason=output.reason,
-            source=self.name,
+            source=self.source,
             plan_step=output.plan_step,
         )
         seq = self.next_seq(self._view_key)

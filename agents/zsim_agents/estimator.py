@@ -37,7 +37,7 @@ class Estimator(Agent):
         self.reads = tuple(expression for drone in names for expression in _reads(drone))
         self.gate_keys = tuple(keys.status(drone) for drone in names)
         self.counted = names
-        self._estimate_keys = tuple(keys.estimate(drone) for drone in names)
+        self.writes = tuple(keys.estimate(drone) for drone in names)
         specs = [scenario.drone(drone) for drone in names]
         self._settings = (specs, scenario.environment, scenario.estimation, info.gate_ns / 1e9)
         self._set = estimators(*self._settings)
@@ -63,9 +63,9 @@ class Estimator(Agent):
         self._take[key](message)
 
     def step(self, t_ns: int) -> list[Output]:
-        told = zip(self._estimate_keys, self._set.close(t_ns * 1e-9), strict=True)
+        told = zip(self.writes, self._set.close(t_ns * 1e-9), strict=True)
         return [
-            Output(key, messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.name))
+            Output(key, messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.source))
             for key, estimate in told
         ]
 
@@ -83,11 +83,11 @@ class Estimator(Agent):
             twin.close(t_s)
 
     def warm_start_keys(self) -> tuple[str, ...]:
-        return self._estimate_keys
+        return self.writes
 
     def warm_start(self, key: str, message: messages.Estimate) -> None:
         self._set.warm_start(
-            self._estimate_keys.index(key),
+            self.writes.index(key),
             message.position_m,
             message.velocity_m_s,
             message.orientation_wxyz,

@@ -63,6 +63,9 @@ def run(
         str | None, typer.Option(help="Endpoint of the world (default tcp/127.0.0.1:7447, or a free port).")
     ] = None,
     insecure: Insecure = False,
+    hosted: Annotated[
+        bool, typer.Option("--hosted", help="Estimators and controllers in one process: faster, the same bits.")
+    ] = False,
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
     order: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
@@ -71,7 +74,12 @@ def run(
     from zsim_deploy.run import Options, check_endpoint, make_directory, run_in_process, run_processes
     from zsim_deploy.watch import Outcome
 
-    given = {"--realtime": realtime, "--rate": rate is not None, "--listen": listen is not None}
+    given = {
+        "--realtime": realtime,
+        "--rate": rate is not None,
+        "--listen": listen is not None,
+        "--hosted": hosted,
+    }
     if in_process and any(given.values()):
         useless = " and ".join(name for name, is_given in given.items() if is_given)
         raise typer.BadParameter(f"--in-process is lockstep, unpaced, without Zenoh; leave out {useless}, or it")
@@ -79,7 +87,7 @@ def run(
     loaded = load_scenario(scenario, set_, seed, duration)
     mode, pace = mode_and_rate(realtime, rate)
     folder, first = make_directory(out, loaded), [name for name in order.split(",") if name]
-    options = Options(loaded, folder, mode, pace, listen, insecure, first)
+    options = Options(loaded, folder, mode, pace, listen, insecure, hosted, first)
     with Screen(loaded.duration_s) as screen:
         try:
             outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)
@@ -174,7 +182,10 @@ def world(
 
 @app.command(rich_help_panel=ROLES)
 def estimator(
-    drone: Annotated[str, typer.Argument(help="Name of the drone.", show_default=False)],
+    drones: Annotated[
+        list[str],
+        typer.Argument(metavar="DRONE...", help="Drones, or patterns: 'drone*'.", show_default=False),
+    ],
     connect: Connect = DEFAULT_ENDPOINT,
     federation: Federation = "zsim",
     wait: Wait = None,
@@ -183,10 +194,10 @@ def estimator(
     insecure: Insecure = False,
     host: Host = None,
 ) -> None:
-    """Run the estimator of one drone."""
+    """Run the estimator of one drone, or of several in one process."""
     from zsim_deploy import roles
 
-    roles.agent(roles.estimator(drone), connect, federation, wait, launched, identity(host, tls, insecure))
+    roles.agent(roles.estimator(drones), connect, federation, wait, launched, identity(host, tls, insecure))
 
 
 @app.command(rich_help_panel=ROLES)
@@ -204,6 +215,25 @@ def controller(
     from zsim_deploy import roles
 
     roles.agent(roles.controller(cluster), connect, federation, wait, launched, identity(host, tls, insecure))
+
+
+@app.command("host", rich_help_panel=ROLES)
+def host_agents(
+    names: Annotated[
+        list[str],
+        typer.Argument(metavar="NAME...", help="Processes, or patterns: 'estimator.*' controller.main."),
+    ],
+    connect: Connect = DEFAULT_ENDPOINT,
+    federation: Federation = "zsim",
+    wait: Wait = None,
+    launched: Launched = None,
+    insecure: Insecure = False,
+    host: Host = None,
+) -> None:
+    """Run several estimators and controllers in one process, which is faster."""
+    from zsim_deploy import roles
+
+    roles.agent(roles.host(names), connect, federation, wait, launched, identity(host, None, insecure))
 
 
 @app.command(rich_help_panel=ROLES)

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,11 @@ from typing import Any
 from zsim import messages, scenario_file, session, tls
 from zsim.agent import Agent
 from zsim.connection import find_world
-from zsim.errors import RecordError, SessionError
+from zsim.errors import RecordError, RunError, SessionError
 from zsim.identity import Identity
 from zsim.runner import Runner
 from zsim.scenario import Scenario
+from zsim_deploy.hosting import chosen, hosted
 from zsim_deploy.leash import Leash
 from zsim_deploy.lent import lent
 from zsim_deploy.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
@@ -132,17 +133,42 @@ def agent(
     found = find_world(endpoint, federation, wait_s, say, leash.pulled, run_id=launched, identity=identity)
     with found as (link, info):
         made = build(info, scenario_file.from_text(info.scenario))
-        say(f"{made.name}: in run {info.run_id}")
+        check_certificate(made, identity)
+        say(f"{made.name}: in run {info.run_id}{_also(made)}")
         gc.collect()
         gc.freeze()
         reason = Runner(link, info, made, leash.pulled, say, leash.deserted).run()
     say(f"{made.name}: left, {reason}")
 
 
-def estimator(drone: str) -> Callable[[messages.Info, Scenario], Agent]:
+def estimator(drones: Sequence[str]) -> Callable[[messages.Info, Scenario], Agent]:
+    """Return what builds the estimator of some drones, named or by patterns such as `drone*`."""
     from zsim_agents.estimator import Estimator
 
-    return lambda info, scenario: Estimator(info, scenario, drone)
+    def build(info: messages.Info, scenario: Scenario) -> Agent:
+        known = [drone.name for drone in scenario.drones]
+        return Estimator(info, scenario, chosen("estimator: drone", drones, known))
+
+    return build
+
+
+def host(names: Sequence[str]) -> Callable[[messages.Info, Scenario], Agent]:
+    """Return what builds several estimators and controllers as one agent, named or by patterns."""
+    return lambda info, scenario: hosted(info, scenario, names)
+
+
+def check_certificate(made: Agent, identity: Identity) -> None:
+    """Refuse to speak for other processes where access control would drop it without a word."""
+    if made.serves and identity.tls:
+        others = ", ".join(made.serves)
+        raise RunError(
+            f"{made.name}: a certificate is for one process, and this one stands for {others} too; "
+            "run each by itself, or without TLS"
+        )
+
+
+def _also(made: Agent) -> str:
+    return f", and stands for {', '.join(made.serves)}" if made.serves else ""
 
 
 def controller(cluster: str) -> Callable[[messages.Info, Scenario], Agent]:

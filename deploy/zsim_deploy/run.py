@@ -15,6 +15,7 @@ from zsim.record import repair
 from zsim.scenario import Scenario
 from zsim_deploy.arguments import pace_options
 from zsim_deploy.child import Child
+from zsim_deploy.hosting import agents_of
 from zsim_deploy.leash import Leash
 from zsim_deploy.progress import Screen
 from zsim_deploy.watch import Outcome, Watch
@@ -33,6 +34,7 @@ class Options:
     rate: float = 0.0
     listen: str | None = None
     insecure: bool = False
+    hosted: bool = False
     order: list[str] = field(default_factory=list)
 
 
@@ -47,13 +49,14 @@ def _children(options: Options, endpoint: str, watch: Watch) -> list[Child]:
     world = ["world", str(file), "--listen", endpoint, "--expect", "recorder", *pace, *launched]
     record = ["record", "--out", str(options.out), *reach]
     children = [Child("world", world, logs, watch.take_line), Child("recorder", record, logs)]
-    things = [("estimator", drone.name) for drone in scenario.drones]
-    things += [("controller", cluster.name) for cluster in scenario.clusters]
-    # a name of the contract may begin with -
-    children += [Child(f"{role}.{thing}", [role, *reach, "--", thing], logs) for role, thing in things]
     wanted = scenario.processes.expect
-    if wanted is not None:
-        children = [c for c in children if c.role in ("world", "recorder") or c.name in wanted]
+    names = [name for name in agents_of(scenario) if wanted is None or name in wanted]
+    if options.hosted and names:
+        children.append(Child(names[-1], ["host", *reach, "--", *names], logs))
+    else:
+        # a name of the contract may begin with -
+        split = [name.partition(".") for name in names]
+        children += [Child(f"{role}.{thing}", [role, *reach, "--", thing], logs) for role, _, thing in split]
     rank = {name: i for i, name in enumerate(options.order)}
     return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
 

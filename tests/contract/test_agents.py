@@ -40,7 +40,9 @@ AGENTS: dict[str, Make] = {
     "estimator.drone1": lambda info, scenario: Estimator(info, scenario, "drone1"),
     "estimator.drone3": lambda info, scenario: Estimator(info, scenario, "drone3"),
     "controller.main": lambda info, scenario: Controller(info, scenario, "main"),
+    "estimator.drone2": lambda info, scenario: Estimator(info, scenario, SEVERAL["estimator.drone2"]),
 }
+SEVERAL = {"estimator.drone2": ["drone2", "drone3"]}
 MAY_WRITE = {
     "estimator": ("drone/{thing}/estimate",),
     "controller": (
@@ -278,8 +280,9 @@ def test_it_answers_every_gate_of_its_period(name: str):
 @every_agent
 def test_it_writes_only_where_it_may(name: str):
     role, _, thing = name.partition(".")
-    drones = [thing] if role == "estimator" else scenario().cluster(thing).drones
-    allowed = {key.format(thing=thing, drone=drone) for key in MAY_WRITE[role] for drone in drones}
+    drones = SEVERAL.get(name, [thing]) if role == "estimator" else scenario().cluster(thing).drones
+    things = drones if role == "estimator" else [thing]
+    allowed = {key.format(thing=t, drone=drone) for key in MAY_WRITE[role] for t in things for drone in drones}
     written = {key for _, gate in flown(name) for key, _ in gate}
     assert written <= allowed
     assert written

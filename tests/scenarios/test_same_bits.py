@@ -41,6 +41,40 @@ def test_as_processes(federation: Federation, pair_sha256: str) -> None:
     assert record.end()["last_ns"] == 12_000_000_000
 
 
+def test_with_all_agents_in_one_process(federation: Federation, pair_sha256: str) -> None:
+    """Estimators and controller share a process; the estimators one kernel.
+
+        world ──sensors──▶ ( estimators ──▶ controller ) ──estimates, velocity──▶ world
+                └──▶ recorder
+
+    Expected: one participant beside the recorder, everything that the contract has on record, and the same hash.
+    """
+    federation.run(PAIR, "--hosted").ends(with_code=0)
+    federation.nobody_left()
+    record = federation.record()
+    assert record.sha256() == pair_sha256 == record.recomputed_sha256(DRONES)
+    assert {event["subject"] for event in record.events("join")} == {"controller.main", "recorder"}
+    for drone in DRONES:
+        assert len(record.all(f"drone/{drone}/estimate")) == len(record.all(f"drone/{drone}/truth"))
+
+
+def test_with_one_estimator_for_all_drones(federation: Federation, pair_sha256: str) -> None:
+    """One process is the estimator of every drone.
+
+        world ──sensors──▶ estimator 'drone*' ──estimates──▶ controller.main ──velocity──▶ world
+
+    Expected: the same hash.
+    """
+    others = [
+        federation.role("estimator", "drone*"),
+        federation.role("controller", "main"),
+        federation.role("record", "--out", str(federation.out)),
+    ]
+    for role in (federation.world(PAIR, "--expect", "recorder"), *others):
+        role.ends(with_code=0)
+    assert federation.record().sha256() == pair_sha256
+
+
 @pytest.mark.usefixtures("busy_cores")
 def test_with_loaded_cores(federation: Federation, pair_sha256: str) -> None:
     """As before, while two other processes take all they can get of the machine.

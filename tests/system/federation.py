@@ -218,7 +218,8 @@ class Federation:
         role = "record" if role == "recorder" else role
         for pid, command in self._processes():
             named = command[2:4] == ["zsim_deploy.cli", role] and (not thing or thing in command[4:])
-            if named and "--launched" in command:
+            hosted = command[2:4] == ["zsim_deploy.cli", "host"] and name == command[-1]
+            if (named or hosted) and "--launched" in command:
                 return pid
         return pytest.fail(f"{name} does not run")
 

@@ -208,7 +208,7 @@ def lines(block: Block) -> list[str]:
 
 EXAMPLE_S = 25.0  # simulated seconds of an example: past the take-off at 20 s
 LEADERS = r"zsim (run|world|router) "
-ANSWERED = ("estimator", "controller", "record", "keys", "echo", "hz", "pub", "ask")
+ANSWERED = ("estimator", "controller", "host", "record", "keys", "echo", "hz", "pub", "ask")
 FOREIGN = ("plain_client.py", "foreign_estimator.py", "range_sensor.py")  # take the endpoint as an argument
 OURS = ("my_estimator.py", "fly_square.py")
 

@@ -51,9 +51,13 @@ def check_end(federation: Federation, whole: bool) -> Record:
     return record
 
 
-@pytest.mark.parametrize("name", ["estimator.drone1", "controller.main"])
-def test_restart(federation: Federation, undisturbed: dict[str, np.ndarray], name: str) -> None:
-    flight = Flight(federation)
+@pytest.mark.parametrize(
+    ("name", "options"), [("estimator.drone1", ()), ("controller.main", ()), ("controller.main", ("--hosted",))]
+)
+def test_restart(
+    federation: Federation, undisturbed: dict[str, np.ndarray], name: str, options: tuple[str, ...]
+) -> None:
+    flight = Flight(federation, *options)
     killed_s = federation.kill(name)
     death = flight.event("death", name)
     assert death.wall_s - killed_s < SAID_WITHIN_S

@@ -1,5 +1,6 @@
 """The barrier: who is waited for, since when, and what a join, a done, a death or a bye changes."""
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -48,6 +49,18 @@ def test_the_run_waits_for_everybody_expected():
     made.join("estimator.d1", join(), 0, 0)
     made.join("console.1", join(period_ns=0), 0, 0)
     assert made.absent() == []
+
+
+def test_one_process_may_stand_for_several_that_are_expected():
+    made = Barrier(RUN, GATE_NS, ["estimator.d1", "estimator.d2", "controller.main"])
+    message = msgspec.structs.replace(join(), serves=("estimator.d1", "estimator.d2"))
+    made.join("controller.main", message, 0, 0)
+    assert made.absent() == []
+    assert blocked(made, 0) == ["controller.main"]
+    made.remove("controller.main")
+    assert made.absent() == []
+    made.expect("estimator.d2")
+    assert made.absent() == ["estimator.d2"]
 
 
 def test_before_the_first_gate_nobody_owes_anything():

@@ -17,6 +17,7 @@ class Participant:
 
     Attributes:
         from_ns: first gate that it is waited for.
+        serves: names of expected processes for which it stands.
         done_ns: newest gate that it is through with.
         received: outputs that came in since its last done.
         missing: outputs that it counted in its dones and that have not come in.
@@ -35,6 +36,7 @@ class Participant:
     period_ns: int
     fingerprint: str
     from_ns: int
+    serves: tuple[str, ...] = ()
     done_ns: int = -1
     received: int = 0
     missing: int = 0
@@ -127,6 +129,7 @@ class Barrier:
             period_ns=message.period_ns,
             fingerprint=message.fingerprint,
             from_ns=former.from_ns if former and former.gating else next_gate_ns,
+            serves=message.serves,
             done_ns=former.done_ns if former else -1,
             since_wall_ns=wall_ns,
             joined_wall_ns=wall_ns,
@@ -188,12 +191,15 @@ class Barrier:
 
     def remove(self, name: str) -> Participant | None:
         """Take a participant out: it said bye or is dropped."""
-        self._expected.pop(name, None)
-        return self.participants.pop(name, None)
+        removed = self.participants.pop(name, None)
+        for gone in (name, *(removed.serves if removed else ())):
+            self._expected.pop(gone, None)
+        return removed
 
     def absent(self) -> list[str]:
         """Return the expected names that have not joined yet."""
-        return [name for name in self._expected if name not in self.participants]
+        there = {each for p in self.participants.values() for each in (p.name, *p.serves)}
+        return [name for name in self._expected if name not in there]
 
     def blocking(self, need_ns: int) -> list[Participant]:
         """Return who owes a done for `need_ns`."""

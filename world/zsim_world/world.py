@@ -149,6 +149,7 @@ class World:
             "pid": message.pid,
             "from_ns": joined.from_ns,
             "done_ns": joined.done_ns,
+            **({"serves": message.serves} if message.serves else {}),
         }
         if former is not None and again:
             data["former_pid"] = former.pid
@@ -165,10 +166,15 @@ class World:
         if participant is not None:
             self.event("leave", name, f"{name} left: {message.reason}", source=name, reason=message.reason)
             self._leave_drones(name)
-            if self.state == "waiting" and name in expected(self.scenario):
-                self.barrier.expect(name)
+            if self.state == "waiting":
+                self._expect_again(name, *participant.serves)
             if participant.role == "recorder" and not self.ended:
                 self.stop(f"the recorder left: {message.reason}")
+
+    def _expect_again(self, *names: str) -> None:
+        for name in names:
+            if name in expected(self.scenario):
+                self.barrier.expect(name)
 
     def died(self, name: str, wall_ns: int) -> None:
         """Take the death of a process: its token is gone without a bye."""
