@@ -94,6 +94,11 @@ class Fleet:
         self._bodies, self._boards, self._senses = self._w.bodies, self._w.boards, self._w.senses
         self._hull_m = float(self._bodies.vehicle[:, vehicle.HULL_RADIUS].max())
         self._integrate(0)
+        self._rehearse()
+
+    def _rehearse(self) -> None:
+        """Load or compile what the first command needs: in realtime no gate may wait for it."""
+        gate.enter(self._boards.memory[0].copy(), self._boards.belief[0].copy(), firmware.LANDED)
 
     @property
     def t_ns(self) -> int:
@@ -220,7 +225,7 @@ class Fleet:
         return f"{self.names[i]} is {firmware.MODES[self._mode(i)]}; {need}"
 
     def _enter(self, i: int, mode: int) -> None:
-        firmware.enter(self._boards.memory[i], self._boards.belief[i], mode)
+        gate.enter(self._boards.memory[i], self._boards.belief[i], mode)
 
     def _integrate(self, ticks: int) -> None:
         logged, least, diverged = gate.advance(self._w, ticks)

@@ -252,6 +252,12 @@ def _diverged(state: NDArray) -> int:
 
 
 @kernel(SOURCES)
+def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
+    """Put the firmware of a drone, by its rows of `boards`, into a mode."""
+    firmware.enter(memory, belief, mode)
+
+
+@kernel(SOURCES)
 def advance(w: Arrays, ticks: int) -> tuple[int, float, int]:
     """Integrate so many physics ticks; 0 ticks: take the samples of the present instant.
 
