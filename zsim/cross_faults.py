@@ -11,10 +11,12 @@ import numpy as np
 
 from zsim.faults import Fault, show
 from zsim.presets import BOARD_RATE_HZ
-from zsim.scenario import SEA_HEIGHT_MAX_M
+from zsim.scenario import SEA_HEIGHT_MAX_M, kinematics
 
 START_SEPARATION_MIN_M = 0.6  # m, two hulls of 0.515 m side by side (OpenMAS, weighed and measured)
 FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
+TEMPLATE_ROBOTS_MIN = 3  # fewer are in one line
+TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: anything is; where a formation may fly, the controller asks for more
 LIFT_SHARE_MAX = 0.9  # of what the rotors lift; the rest is left for control
 
 
@@ -30,6 +32,8 @@ def cross_faults(scenario: Any) -> Iterator[Fault]:
     yield from _membership_faults(drones, clusters)
     for index, cluster in clusters:
         yield from ((f"clusters[{index}].{path}", text) for path, text in _plan_faults(cluster))
+    for index, cluster in clusters:
+        yield from ((f"clusters[{index}].{path}", text) for path, text in _shape_faults(cluster, drones))
     yield from _process_faults(scenario.processes, drones, clusters)
     yield from _window_faults(scenario.report)
 
@@ -140,6 +144,60 @@ def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
 
 def _listed(names: list[str]) -> str:
     return ", ".join(names[:20]) + (f", … ({len(names)})" if len(names) > 20 else "")
+
+
+def _shape_faults(cluster: Any, drones: _Entries) -> Iterator[Fault]:
+    """Yield what is wrong with the groups and templates of a cluster."""
+    if not _known(cluster.drones, cluster.groups) or None in cluster.groups:
+        return
+    placed = {drone.name: drone.position_m for _, drone in drones if _known(drone.name)}
+    starts = [placed.get(name) for name in cluster.drones]
+    groups = _entries(cluster.groups)
+    yield from _group_faults(cluster, groups)
+    centres: list[Any] = []
+    for index, group in groups:
+        if group.size is None:
+            return
+        own, starts = starts[: group.size], starts[group.size :]
+        yield from ((f"groups[{index}].{path}", text) for path, text in _template_faults(group, own, group.size))
+        centres.append(np.array(own, dtype=float).mean(axis=0) if own and _known(*own) else None)
+    robots = len(groups) or len(cluster.drones)
+    yield from _template_faults(cluster, centres if groups else starts, robots)
+
+
+def _group_faults(cluster: Any, groups: _Entries) -> Iterator[Fault]:
+    yield from _name_faults("groups", groups)
+    if len(groups) == 1:
+        yield "groups", "has 1 entry; must have none, or 2 or more"
+    sizes = [group.size for _, group in groups]
+    if groups and _known(*sizes) and sum(sizes) != len(cluster.drones):
+        yield "groups", f"has sizes that add up to {sum(sizes)}; must be {len(cluster.drones)}, one for each drone"
+
+
+def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Fault]:
+    """Yield what is wrong with a formation of so many robots, or with where they stand at the start."""
+    given = spec.template_m
+    if given is None or robots < 2:
+        return
+    if kinematics(spec.space, robots, bool(given)) == "triad":
+        if given:
+            yield "template_m", "is given; must be left out where space is triad"
+    elif robots < TEMPLATE_ROBOTS_MIN:
+        path = "space" if spec.space else "template_m"
+        yield path, f"asks for a template of {robots} robots; must be {TEMPLATE_ROBOTS_MIN} or more"
+    elif given and len(given) != robots:
+        yield "template_m", f"has {len(given)} places; must have {robots}, one for each robot"
+    elif given and _known(*given) and _in_line(given):
+        yield "template_m", f"is in one line, within {TEMPLATE_WIDTH_MIN_M:g} m; must span a plane or space"
+    elif not given and len(starts) == robots and _known(*starts) and _in_line(starts):
+        yield "template_m", "is missing, and the robots start in one line; must be given, or space must be triad"
+
+
+def _in_line(places: list[Any]) -> bool:
+    """Return whether places (n, 3) are within a line, in the root mean square."""
+    p = np.array(places, dtype=float)
+    widths = np.linalg.svd(p - p.mean(axis=0), compute_uv=False) / np.sqrt(len(p))
+    return bool(np.hypot(*widths[1:]) < TEMPLATE_WIDTH_MIN_M)
 
 
 def _plan_faults(cluster: Any) -> Iterator[Fault]:

@@ -9,6 +9,7 @@ from msgspec import Meta, Struct, field
 
 from zsim.presets import G_M_S2, SEA_LEVEL_KG_M3
 
+TEMPLATE_FROM = 5  # robots; below it the variables of the triad are fewer to name, and as well conditioned
 DRONES_MAX = 1000  # one world integrates them all
 SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
 
@@ -206,9 +207,28 @@ class Plan(Spec, frozen=True, kw_only=True):
     land_s: NonNegative | None = None
 
 
+Kinematics = Literal["triad", "template"]
+"""How the variables of a formation follow from its robots; a robot is a drone, or a group of them."""
+
+
+class Group(Spec, frozen=True, kw_only=True):
+    """So many of a cluster's drones, the next ones in its order, that are one robot of it."""
+
+    name: Name
+    size: Annotated[int, Meta(ge=2)]
+    space: Kinematics | None = None
+    template_m: list[Vector3] = []
+
+
 class Cluster(Spec, frozen=True, kw_only=True):
     name: Name
     drones: Annotated[list[Name], Meta(min_length=2)]
+    groups: list[Group] = []
+    """Empty: every drone is a robot of the cluster by itself."""
+    space: Kinematics | None = None
+    """None: see `kinematics`."""
+    template_m: list[Vector3] = []
+    """Places of the robots, x ahead and y left of the formation; empty: as they stand at the start."""
     gains: Gains = Gains()
     plan: Plan = Plan()
 
@@ -277,3 +297,8 @@ class Document(Scenario, frozen=True, kw_only=True):
     """What a file may say: a scenario, and what all its drones share."""
 
     sensors: Sensors | None = None
+
+
+def kinematics(space: Kinematics | None, robots: int, template: bool) -> Kinematics:
+    """Return the space of so many robots: as said, else a template where one is given or from five robots on."""
+    return space or ("template" if template or robots >= TEMPLATE_FROM else "triad")

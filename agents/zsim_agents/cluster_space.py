@@ -14,12 +14,13 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim_agents.compiled import compiled
+from zsim_agents.compiled import COMPILES, compiled
 
 Array = NDArray[np.float64]
 
 TAU = 2 * math.pi
 CONDITION_LENGTH_M = 4.0  # p and q of the paper's formation, equation (3)
+NAMES_SHOWN = 20  # in a message; the paper's cluster has 12
 ROBOTS_MAX = 64  # beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
 
 
@@ -37,6 +38,8 @@ class ClusterSpace(ABC):
         angular: (4n,) bool, true for the angles that wrap (roll, yaw, phi_i, azimuth_k).
         in_radians: (4n,) bool, true for all angles, also those that do not wrap (pitch, beta, elevation_k).
         bounds: (4n, 2) open bounds of the values that `forward` can give, infinite where there is none.
+        neutral: (4n,) bool, true for the variables that are zero in a formation of which nothing else was said: tilts,
+            headings against the formation, departures from a template.
         tilts: places of roll and pitch in c.
         spread_text: what `spread` measures, in words for messages.
     """
@@ -46,12 +49,14 @@ class ClusterSpace(ABC):
         self.size = 4 * n
         self.names = tuple(names)
         self.spread_text = spread_text
-        self.angular = np.array([_stem(name) in {"roll", "yaw", "phi", "azimuth"} for name in names])
-        self.in_radians = self.angular | np.array([_stem(name) in _BOUNDED_ANGLES for name in names])
+        stems = [_stem(name) for name in names]
+        self.angular = np.array([stem in {"roll", "yaw", "phi", "azimuth"} for stem in stems])
+        self.in_radians = self.angular | np.array([stem in _BOUNDED_ANGLES for stem in stems])
+        self.neutral = np.array([stem in {"roll", "pitch", "phi", "w"} for stem in stems])
         self._period = np.where(self.angular, TAU, 0.0)
-        self.bounds = np.array([_BOUNDS.get(_stem(name), (-math.inf, math.inf)) for name in names])
-        self.tilts = tuple(i for i, name in enumerate(names) if name in {"roll", "pitch"})
-        self._lengths = [i for i, name in enumerate(names) if _stem(name) in {"p", "q", "rho"}]
+        self.bounds = np.array([_BOUNDS.get(stem, (-math.inf, math.inf)) for stem in stems])
+        self.tilts = tuple(i for i, stem in enumerate(stems) if stem in {"roll", "pitch"})
+        self._lengths = [i for i, stem in enumerate(stems) if stem in _LENGTHS]
         self._pitch = self.names.index("pitch")
 
     @abstractmethod
@@ -90,6 +95,17 @@ class ClusterSpace(ABC):
     def spread(self, c: Array) -> float:
         """Return the smallest height of the shape [m] (see `spread_text`); 0 where the shape is singular."""
 
+    def motion(self, c: Array, c_dot: Array) -> Array:
+        """Return r_dot (4n,) = J^-1 c_dot; spaces whose J^-1 is large have a shorter way than through the matrix."""
+        return self.inverse_jacobian(c) @ c_dot
+
+    def specimen(self, apart_m: float) -> Array:
+        """Return c (4n,) of some formation with robots at least so far apart, level, to try code on."""
+        radius_m = self.n * apart_m
+        turns = np.arange(self.n) * (TAU / self.n)
+        p_W = radius_m * np.column_stack((np.cos(turns), np.sin(turns), np.ones(self.n)))
+        return self.forward(p_W, np.zeros(self.n))
+
     def margin(self, c: Array) -> float:
         """Return the distance to singularity [m]: spread(c) cos(pitch).
 
@@ -125,7 +141,7 @@ class ClusterSpace(ABC):
             ValueError: there is no such variable.
         """
         if name not in self.names:
-            raise ValueError(f"variable {name[:40]!r} is unknown; allowed: {', '.join(self.names)}")
+            raise ValueError(f"variable {name[:40]!r} is unknown; allowed: {_listed(self.names)}")
         return self.names.index(name)
 
 
@@ -146,7 +162,7 @@ def cluster_space(n: int) -> ClusterSpace:
 
 def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Array]:
     """Return velocities (n, 3) [m/s, W] and yaw rates (n,) [rad/s] of the robots of c moving at c_dot."""
-    r_dot = (space.inverse_jacobian(c) @ c_dot).reshape(space.n, 4)
+    r_dot = space.motion(c, c_dot).reshape(space.n, 4)
     return r_dot[:, :3].copy(), r_dot[:, 3].copy()
 
 
@@ -156,9 +172,23 @@ def wrapped(c: Array, period: Array) -> Array:
     return c - period * np.rint(c / TAU)
 
 
-@compiled
 def closest_pair(p_W: Array) -> tuple[float, int, int]:
     """Return the least distance [m] between two of the positions (n, 3), and the indices of that pair."""
+    return least_distance(p_W) if COMPILES else least_distance_at_once(p_W)
+
+
+def least_distance_at_once(p_W: Array) -> tuple[float, int, int]:
+    """Return the same as `least_distance` by array operations, the faster way where nothing is compiled."""
+    first, second = np.triu_indices(len(p_W), 1)
+    x, y, z = (p_W[second] - p_W[first]).T
+    distances = np.nan_to_num(np.sqrt(x * x + y * y + z * z), nan=math.inf, posinf=math.inf)
+    at = int(np.argmin(distances))
+    return float(distances[at]), int(first[at]), int(second[at])
+
+
+@compiled
+def least_distance(p_W: Array) -> tuple[float, int, int]:
+    """Return what `closest_pair` does."""
     least, first, second = math.inf, 0, 1
     for i in range(p_W.shape[0]):
         for j in range(i + 1, p_W.shape[0]):
@@ -174,6 +204,12 @@ def numbered(stem: str, robots: Iterable[int]) -> list[str]:
     return [f"{stem}_{k}" for k in robots]
 
 
+def unit(name: str) -> str:
+    """Return the unit of a variable of any cluster space: m or rad."""
+    return "m" if name in ("x_c", "y_c", "z_c") or _stem(name) in _LENGTHS | {"w"} else "rad"
+
+
+_LENGTHS = {"p", "q", "rho"}
 _BOUNDED_ANGLES = {"pitch", "beta", "elevation"}
 _BOUNDS = {
     "pitch": (-math.pi / 2, math.pi / 2),
@@ -186,4 +222,12 @@ _BOUNDS = {
 
 
 def _stem(name: str) -> str:
-    return name.rstrip("0123456789").rstrip("_")
+    """Return a name without its group and its number: phi for left.phi_2."""
+    return name.rpartition(".")[2].rstrip("0123456789").rstrip("_")
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names for a line of text, of many the first and the last."""
+    if len(names) <= NAMES_SHOWN:
+        return ", ".join(names)
+    return ", ".join((*names[: NAMES_SHOWN - 1], f"… {names[-1]}")) + f" ({len(names)})"

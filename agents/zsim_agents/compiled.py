@@ -25,6 +25,7 @@ SOURCES = (  # every file that uses `compiled`
     "formation.py",
     "kalman_update.py",
     "madgwick.py",
+    "near_pairs.py",
     "pair_cluster.py",
     "reference_check.py",
     "trajectory.py",

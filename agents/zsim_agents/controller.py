@@ -13,14 +13,16 @@ from zsim.agent import Agent, Output
 from zsim.errors import RunError
 from zsim.messages import ControlAnswer, ControlRequest
 from zsim.scenario import Cluster, Gains, Scenario
-from zsim_agents.cluster_space import ClusterSpace, cluster_space, robot_rates
+from zsim_agents.cluster_space import ClusterSpace, robot_rates
 from zsim_agents.engagement import Engagement
 from zsim_agents.flight_data import GateInput, GateOutput
 from zsim_agents.flight_plan import Scheduled
 from zsim_agents.flight_request import Engage, Follow, Land, RequestError, TakeOff, Target, read_request
 from zsim_agents.formation import FormationGains, guard, load
+from zsim_agents.scenario_space import scenario_space
 from zsim_agents.trajectory import Hold, ramp_onto
 
+APART_M = 2.0  # of robots in a rehearsal, any distance well above zero
 SIGMA_AT = (0, 7, 14)  # places of the position's variances in the 6 x 6 covariance, row-major
 
 
@@ -57,7 +59,7 @@ class Controller(Agent):
         self._velocity_keys = [keys.command(drone, "velocity") for drone in spec.drones]
         self._estimates: list[messages.Estimate | None] = [None] * len(spec.drones)
         self._states: list[str] = ["landed"] * len(spec.drones)
-        self._engagement = engagement_of(spec)
+        self._engagement = engagement_of(scenario, spec)
 
     def receive(self, key: str, message: Any) -> None:
         place = self._place[keys.thing(key)]
@@ -159,14 +161,14 @@ _UNKNOWN = messages.Estimate(
 )
 
 
-def engagement_of(cluster: Cluster) -> Engagement:
-    """Return the phase machine that a scenario's cluster asks for.
+def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
+    """Return the phase machine that one of a scenario's clusters asks for.
 
     Raises:
         RunError: the plan can never be flown; the text says why.
     """
     try:
-        space, gains = cluster_space(len(cluster.drones)), gains_of(cluster.gains)
+        space, gains = scenario_space(scenario, cluster), gains_of(cluster.gains)
         rehearse(space, gains)
         return Engagement(space, cluster.drones, gains, plan=plan_of(cluster))
     except ValueError as error:
@@ -174,16 +176,14 @@ def engagement_of(cluster: Cluster) -> Engagement:
 
 
 def rehearse(space: ClusterSpace, gains: FormationGains) -> None:
-    """Fly a gate of a ring of robots that nobody sees: code is compiled, or loaded, here and not in flight."""
-    robots = range(space.n)
-    radius = space.n * gains.separation_min_m
-    turns = [2 * math.pi * i / space.n for i in robots]
-    p_W = np.array([(radius * math.cos(turn), radius * math.sin(turn), radius) for turn in turns])
+    """Fly a gate of a formation that nobody sees: code is compiled, or loaded, here and not in flight."""
+    c = space.specimen(max(gains.separation_min_m, APART_M))
+    p_W, yaw = space.inverse(c)
+    c = space.forward(p_W, yaw)
     none = np.zeros((space.n, 3))
-    c = space.forward(p_W, np.zeros(space.n))
-    ring = Engagement(space, [str(i) for i in robots], gains)
-    ring.warm_start("engaged", c)
-    ring.step(GateInput(0.0, p_W, np.zeros(space.n), none, none, np.zeros(space.n), ("flying",) * space.n))
+    unseen = Engagement(space, [str(i) for i in range(space.n)], gains)
+    unseen.warm_start("engaged", c)
+    unseen.step(GateInput(0.0, p_W, yaw, none, none, np.zeros(space.n), ("flying",) * space.n))
     ramp_onto(space, c, c, Hold(c), 0.0, 2.0).value(1.0)
     guard(p_W, none, none, gains)
     load(*robot_rates(space, c, c), gains)

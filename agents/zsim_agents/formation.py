@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from zsim_agents.cluster_frame import Vector, between, dot, length, row
 from zsim_agents.cluster_space import Array, ClusterSpace
 from zsim_agents.compiled import compiled
+from zsim_agents.near_pairs import PairTable, near_pairs
 
 Pairs = tuple[tuple[int, int], ...]
 
@@ -118,7 +119,7 @@ class FormationLaw:
         """
         error = self.space.difference(c_des, c)
         c_dot = cluster_rate(c_dot_des, error, self.integral, self.gains.k_1_s)
-        r_dot = self.space.inverse_jacobian(c) @ c_dot
+        r_dot = self.space.motion(c, c_dot)
         v_cmd_W, yaw_rate, factor, acts = limited(r_dot, p_W, v_W, self.gains.limits)
         guarded, alarmed = pairs_of(*acts)
         if factor == 1.0 and not guarded:
@@ -227,31 +228,32 @@ def held_apart(p_W: Array, v_W: Array, v_cmd_W: Array, limits: Limits) -> Guardi
     """
     n = p_W.shape[0]
     order = np.zeros((n, n), np.int64)
-    alarms = note_alarms(p_W, limits.separation_alarm_m, order)
+    near = near_pairs(p_W, max(reach(limits), limits.separation_alarm_m))
+    alarms = note_alarms(p_W, near, limits.separation_alarm_m, order)
     guards = 0
     for _ in range(GUARD_SWEEPS):
         settled = True
-        for j in range(1, n):
-            for i in range(j):
-                if part(p_W, v_W, v_cmd_W, i, j, limits):
-                    settled = False
-                    if order[i, j] == 0:
-                        guards += 1
-                        order[i, j] = guards
+        for k in range(near.shape[0]):
+            i, j = near[k, 0], near[k, 1]
+            if part(p_W, v_W, v_cmd_W, i, j, limits):
+                settled = False
+                if order[i, j] == 0:
+                    guards += 1
+                    order[i, j] = guards
         if settled:
             break
     return guards, alarms, order
 
 
 @compiled
-def note_alarms(p_W: Array, separation_alarm_m: float, order: Order) -> int:
-    """Number the pairs that are nearer than the alarm threshold, below the diagonal; return how many."""
+def note_alarms(p_W: Array, near: PairTable, separation_alarm_m: float, order: Order) -> int:
+    """Number those of the near pairs that are nearer than the alarm threshold, below the diagonal; return how many."""
     alarms = 0
-    for j in range(1, p_W.shape[0]):
-        for i in range(j):
-            if length(between(row(p_W, i), row(p_W, j))) < separation_alarm_m:
-                alarms += 1
-                order[j, i] = alarms
+    for k in range(near.shape[0]):
+        i, j = near[k, 0], near[k, 1]
+        if length(between(row(p_W, i), row(p_W, j))) < separation_alarm_m:
+            alarms += 1
+            order[j, i] = alarms
     return alarms
 
 

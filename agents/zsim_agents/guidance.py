@@ -16,7 +16,7 @@ class Guidance:
 
     What the formation is about (a target or a trajectory, its home) is kept apart from what is flown now
     (a ramp onto it). A variable that a request does not name keeps its goal: the last value that a request
-    gave it; before any, its value at engagement, and zero for roll, pitch and phi_i.
+    gave it; before any, its value at engagement, and zero for the neutral ones (roll, pitch, phi_i, w_k).
 
     Methods that change the reference raise TrajectoryError, ExpressionError or SingularClusterError where
     the way is not allowed, and change nothing then.
@@ -51,7 +51,7 @@ class Guidance:
     def engage(self, c: Array) -> None:
         """Start at the estimate c (4n,) and stay there."""
         self._goal = c.copy()
-        self._goal[[name in ("roll", "pitch") or name.startswith("phi_") for name in self.space.names]] = 0.0
+        self._goal[self.space.neutral] = 0.0
         self._home = self._flown = Hold(c)
         self.paused = False
 

@@ -4,24 +4,15 @@ Where numba is missing nothing is compiled, and there is nothing to do. `zsim pu
 """
 
 import importlib.util
+import math
 import time
+from typing import Any
 
 from zsim import scenario_file
 
-FORMATIONS = """
-name: warm-up
-duration_s: 1
-drones:
-  - {name: drone1, position_m: [0, 0, 0]}
-  - {name: drone2, position_m: [4, 0, 0]}
-  - {name: drone3, position_m: [8, 0, 0]}
-  - {name: drone4, position_m: [12, 0, 0]}
-  - {name: drone5, position_m: [16, 0, 0]}
-clusters:
-  - {name: pair, drones: [drone1, drone2]}
-  - {name: triad, drones: [drone3, drone4, drone5]}
-"""
-"""Each kind of cluster, since each has code of its own."""
+SIZES = {"pair": 2, "triad": 3, "template": 5}  # drones of the kinds of cluster: each has code of its own
+NESTED = ("groups", 2, 3)  # name, groups, drones of each
+APART_M = 4.0  # on circles, so that no formation stands in a line
 
 
 def main() -> None:
@@ -30,7 +21,7 @@ def main() -> None:
         return
     from zsim_world.world import World
 
-    scenario = scenario_file.from_text(FORMATIONS)
+    scenario = scenario_file.resolve(formations())
     info = World(scenario, "lockstep", 0.0, time.monotonic_ns, None).info()
     if not _has("filterpy"):
         return
@@ -40,6 +31,21 @@ def main() -> None:
     Estimator(info, scenario, scenario.drones[0].name).rehearse()
     for cluster in scenario.clusters:
         Controller(info, scenario, cluster.name).rehearse()
+
+
+def formations() -> dict[str, Any]:
+    """Return a scenario with one cluster of each kind."""
+    nested, groups, size = NESTED
+    names = {kind: [f"{kind}{i}" for i in range(count)] for kind, count in (SIZES | {nested: groups * size}).items()}
+    clusters: list[dict[str, Any]] = [{"name": kind, "drones": drones} for kind, drones in names.items()]
+    clusters[-1]["groups"] = [{"name": f"g{i}", "size": size} for i in range(groups)]
+    places = [(name, _place(i, row)) for row, each in enumerate(names.values()) for i, name in enumerate(each)]
+    drones = [{"name": name, "position_m": place} for name, place in places]
+    return {"name": "warm-up", "duration_s": 1, "drones": drones, "clusters": clusters}
+
+
+def _place(i: int, row: int) -> list[float]:
+    return [APART_M * math.cos(i), APART_M * math.sin(i) + 4 * APART_M * row, 0.0]
 
 
 def _has(module: str) -> bool:

@@ -13,7 +13,10 @@ from zsim_agents.cluster_space import (
     SingularClusterError,
     closest_pair,
     cluster_space,
+    least_distance,
+    least_distance_at_once,
     robot_rates,
+    unit,
 )
 
 SIZES = (2, 3, 4, 5, 8)
@@ -164,6 +167,13 @@ def test_impossible_numbers_of_robots_are_refused(n):
         cluster_space(n)
 
 
+def test_units_follow_from_names_in_any_space():
+    lengths = ["x_c", "y_c", "z_c", "p", "q", "rho_4", "w_12", "left.p", "a.w_1", "a.b.rho_5"]
+    angles = ["roll", "pitch", "yaw", "phi_1", "beta", "azimuth_4", "elevation_4", "left.beta", "p.phi_2", "w.roll"]
+    assert {unit(name) for name in lengths} == {"m"}
+    assert {unit(name) for name in angles} == {"rad"}
+
+
 def test_an_unknown_name_is_refused_with_those_allowed():
     with pytest.raises(ValueError, match=r"'gamma'.*x_c, y_c"):
         cluster_space(3).index("gamma")
@@ -204,6 +214,16 @@ def test_a_larger_formation_is_not_judged_nearer_to_singularity():
 
 def test_the_closest_pair_is_found():
     assert closest_pair(np.array([(0.0, 0, 0), (5, 0, 0), (5, 1, 0)])) == (1.0, 1, 2)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_the_closest_pair_is_found_alike_by_loops_and_at_once(n):
+    rng = np.random.default_rng(n)
+    for _ in range(100):
+        p_W = rng.integers(-2, 3, size=(n, 3)).astype(float)  # many pairs are equally near
+        assert least_distance_at_once(p_W) == least_distance(p_W)
+        p_W[rng.integers(n), 0] = rng.choice([math.nan, math.inf, 1e6])
+        assert least_distance_at_once(p_W) == least_distance(p_W)
 
 
 def test_forward_and_inverse_jacobian_of_three_robots_fit_a_gate():

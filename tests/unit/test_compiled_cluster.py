@@ -14,12 +14,16 @@ MODULES = (
     "cluster_space",
     "flight_judge",
     "formation",
+    "nested_cluster",
     "pair_cluster",
     "reference_check",
+    "rotation_fit",
+    "template_cluster",
     "trajectory",
     "triad_cluster",
 )
 SIZES = (2, 3, 5)
+LARGE = 1e-9  # the same, of a hundred variables
 SAME = 1e-12  # relative; both ways should give the same bits where they call the same libm
 DT_S = 0.02
 
@@ -45,9 +49,18 @@ def space_of(way: SimpleNamespace, n: int):
     return way.pair_cluster.PairCluster() if n == 2 else way.triad_cluster.TriadCluster(n)
 
 
-def same(a, b) -> bool:
+def large_space_of(way: SimpleNamespace, kind: str):
+    """Return a template of 10 or 30, or three triads, of these modules."""
+    if kind == "triads":
+        groups = [(name, way.triad_cluster.TriadCluster(3)) for name in "abc"]
+        return way.nested_cluster.NestedCluster(way.triad_cluster.TriadCluster(3), groups)
+    n = int(kind)
+    return way.template_cluster.TemplateCluster(np.random.default_rng(n).normal(scale=6.0, size=(n, 3)))
+
+
+def same(a, b, most: float = SAME) -> bool:
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    return a.shape == b.shape and bool((np.abs(a - b) <= SAME * np.maximum(1.0, np.abs(a))).all())
+    return a.shape == b.shape and bool((np.abs(a - b) <= most * np.maximum(1.0, np.abs(a))).all())
 
 
 def robots(n: int, rng: np.random.Generator, scale_m: float = 4.0) -> tuple[np.ndarray, np.ndarray]:
@@ -56,7 +69,11 @@ def robots(n: int, rng: np.random.Generator, scale_m: float = 4.0) -> tuple[np.n
 
 def test_one_way_is_compiled_and_the_other_is_not(both):
     compiled, plain = both
-    for module, name in (("triad_cluster", "triad_forward"), ("formation", "limited"), ("trajectory", "ramped")):
+    for module, name in (
+        ("triad_cluster", "triad_forward"),
+        ("formation", "limited"),
+        ("trajectory", "ramped"),
+    ):
         assert hasattr(getattr(getattr(compiled, module), name), "py_func")
         assert not hasattr(getattr(getattr(plain, module), name), "py_func")
 
@@ -118,6 +135,26 @@ def test_the_law_is_the_same_with_saturation_guard_and_integral(both, n, scale_m
     assert seen["alarmed"] or scale_m > 1.0
 
 
+@pytest.mark.parametrize("kind", ["10", "30", "triads"])
+def test_large_clusters_are_the_same(both, kind):
+    spaces = [large_space_of(way, kind) for way in both]
+    laws = [way.formation.FormationLaw(space) for way, space in zip(both, spaces, strict=True)]
+    rng, n = np.random.default_rng(3), spaces[0].n
+    for _ in range(10):
+        p_W = spaces[0].inverse(spaces[0].specimen(2.0))[0] + rng.normal(scale=0.7, size=(n, 3))
+        yaw, v_W = rng.uniform(-4.0, 4.0, n), rng.normal(size=(n, 3))
+        c = spaces[0].forward(p_W, yaw)
+        assert same(c, spaces[1].forward(p_W, yaw), most=LARGE)
+        for name in ("margin", "condition", "spread", "inverse_jacobian"):
+            assert same(*(getattr(space, name)(c) for space in spaces), most=LARGE), name
+        c_des, c_dot = c + rng.normal(scale=0.3, size=4 * n), rng.normal(scale=0.1, size=4 * n)
+        a, b = (law.command(c, p_W, v_W, c_des, c_dot, DT_S) for law in laws)
+        assert same(a.v_W, b.v_W, most=LARGE)
+        assert same(a.yaw_rate, b.yaw_rate, most=LARGE)
+        assert (a.guarded, a.alarmed) == (b.guarded, b.alarmed)
+        assert same(*(way.cluster_space.closest_pair(p_W) for way in both))
+
+
 @pytest.mark.parametrize("n", SIZES)
 def test_ramps_are_the_same(both, n):
     rng = np.random.default_rng(20 + n)
@@ -164,18 +201,28 @@ from zsim_agents.engagement import Engagement
 from zsim_agents.flight_data import GateInput
 from zsim_agents.flight_request import Target
 from zsim_agents.formation import FormationGains
+from zsim_agents.nested_cluster import NestedCluster
+from zsim_agents.template_cluster import TemplateCluster
 
 def compiled():
     modules = [module for name, module in sys.modules.items() if name.startswith("zsim_agents.")]
     functions = {id(f): f for module in modules for f in vars(module).values() if hasattr(f, "signatures")}
     return sum(len(f.signatures) for f in functions.values())
 
-n = int(sys.argv[1])
-space, gains = cluster_space(n), FormationGains()
+turn = np.pi / 5 * np.arange(10)
+spaces = {
+    "template": TemplateCluster(np.column_stack((9 * np.cos(turn), 9 * np.sin(turn), 0 * turn))),
+    "nested": NestedCluster(cluster_space(3), [(name, cluster_space(3)) for name in "abc"]),
+}
+kind, gains = sys.argv[1], FormationGains()
+space = spaces[kind] if kind in spaces else cluster_space(int(kind))
+n = space.n
 rehearse(space, gains)
 before = compiled()
 turn = 2 * np.pi * np.arange(n) / n
 p_W, yaw = np.column_stack((9 * np.cos(turn), 9 * np.sin(turn), np.full(n, 9.0))), np.zeros(n)
+if kind == "nested":
+    p_W, yaw = space.inverse(space.specimen(5.0))
 formation = Engagement(space, [str(i) for i in range(n)], gains)
 for gate in range(20):
     still = np.zeros((n, 3))
@@ -185,15 +232,15 @@ for gate in range(20):
     elif gate == 5:
         formation.warm_start("engaged", space.forward(p_W, yaw))
     elif gate == 10:
-        assert formation.request(Target({"z_c": 10.0})) is None
+        assert formation.request(Target({"z_c": space.forward(p_W, yaw)[2] + 1.0})) is None
     output = formation.step(GateInput(*at))
 print(output.phase, before, compiled())
 """
 
 
-@pytest.mark.parametrize("n", SIZES)
-def test_after_the_rehearsal_nothing_is_compiled_in_flight(n):
-    run = [sys.executable, "-c", FLIGHT, str(n)]
+@pytest.mark.parametrize("kind", [*map(str, SIZES), "template", "nested"])
+def test_after_the_rehearsal_nothing_is_compiled_in_flight(kind):
+    run = [sys.executable, "-c", FLIGHT, kind]
     phase, before, after = subprocess.run(run, capture_output=True, text=True, check=True).stdout.split()
     assert phase == "engaged"
     assert int(before) > 10

@@ -23,6 +23,7 @@ from zsim_agents.flight_request import (
     Target,
     read_request,
 )
+from zsim_agents.template_cluster import TemplateCluster
 
 SPACE = cluster_space(3)
 DRONES = ("drone1", "drone2", "drone3")
@@ -662,6 +663,19 @@ def test_other_numbers_of_drones_fly_too(n):
     fleet.fly(60.0)
     assert fleet.output.phase == "engaged"
     assert fleet.output.value[[2, space.index("p")]] == pytest.approx([6.0, 4.0], abs=0.02)
+    assert fleet.closest_m > 2.0
+
+
+def test_a_large_cluster_comes_into_its_template():
+    ring = np.array([(4 * np.cos(k * np.pi / 3), 4 * np.sin(k * np.pi / 3), 0.0) for k in range(6)])
+    space = TemplateCluster(ring)
+    plan = [Scheduled(1.0, TakeOff()), Scheduled(1.0, Engage()), Scheduled(1.0, Target({"z_c": 4.0, "w_1": 0.5}))]
+    fleet = Fleet(Engagement(space, [f"d{i}" for i in range(6)], plan=plan), p_W=ring * (1.2, 0.9, 1.0) + (1, 2, 0))
+    fleet.fly(60.0)
+    assert fleet.output.phase == "engaged"
+    arms = np.linalg.norm(fleet.p_W - fleet.p_W.mean(axis=0), axis=1)
+    assert arms == pytest.approx(np.full(6, 4.5), abs=0.02)
+    assert fleet.p_W.mean(axis=0) == pytest.approx([1.0, 2.0, 4.0], abs=0.02)
     assert fleet.closest_m > 2.0
 
 

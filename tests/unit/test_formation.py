@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from zsim_agents.cluster_space import cluster_space
 from zsim_agents.formation import FormationGains, FormationLaw, guard, load
+from zsim_agents.near_pairs import near_pairs_at_once, near_pairs_in_turn
 
 SPACE = cluster_space(3)
 GOAL = np.array([5, -5, 15, 0, 0, math.pi / 2, 0, 0, 0, 4, 4, math.pi / 4])  # paper, equation (3)
@@ -182,3 +183,15 @@ def test_guarded_robots_never_meet_whatever_is_commanded(seed, n):
         p_W = p_W + v_W * 0.05
         least = min(least, *(math.dist(p_W[i], p_W[j]) for i in range(n) for j in range(i)))
     assert least > GAINS.separation_alarm_m
+
+
+@pytest.mark.parametrize("n", [2, 3, 10])
+def test_near_pairs_are_found_alike_by_loops_and_at_once(n):
+    rng = np.random.default_rng(n)
+    for _ in range(100):
+        p_W = rng.integers(-2, 3, size=(n, 3)).astype(float)
+        p_W[rng.integers(n), 0] = rng.choice([0.5, math.nan, math.inf])
+        in_turn = near_pairs_in_turn(p_W, 2.0)
+        assert in_turn.tolist() == near_pairs_at_once(p_W, 2.0).tolist()
+        apart = np.linalg.norm(p_W[in_turn[:, 0]] - p_W[in_turn[:, 1]], axis=1)
+        assert not (apart >= 2.0).any()

@@ -34,6 +34,13 @@ def document(**fields: Any) -> dict[str, Any]:
     return {"name": "test", "duration_s": 10, "drones": drones, **fields}
 
 
+def clustered(zigzag: float = 2.0, **fields: Any) -> dict[str, Any]:
+    """Return six drones in a zigzag, and a cluster of them."""
+    drones = [drone(f"d{k}", 2.0 * k) for k in range(6)]
+    drones = [{**d, "position_m": [*d["position_m"][:1], zigzag * (k % 2), 0.0]} for k, d in enumerate(drones)]
+    return {"drones": drones, "clusters": [{"name": "c", "drones": [d["name"] for d in drones], **fields}]}
+
+
 def faults_of(fields: dict[str, Any]) -> list[str]:
     with pytest.raises(ScenarioError) as caught:
         scenario_file.resolve(fields, "step.yaml")
@@ -550,10 +557,51 @@ def test_a_fault_that_all_drones_share_is_told_once():
             "clusters[0].drones[1] is 'drone1', which 'c' flies already",
         ),
         ({"clusters": [{"name": "c", "drones": ["drone1"]}]}, "clusters[0].drones has 1 entries; must have at least 2"),
+        (clustered(groups=[{"name": "a", "size": 6}]), "clusters[0].groups has 1 entry; must have none, or 2 or more"),
+        (
+            clustered(groups=[{"name": "a", "size": 2}, {"name": "b", "size": 3}]),
+            "clusters[0].groups has sizes that add up to 5; must be 6, one for each drone",
+        ),
+        (
+            clustered(groups=[{"name": "a", "size": 3}, {"name": "a", "size": 3}]),
+            "clusters[0].groups[1].name is 'a', as groups[0]; must be unique",
+        ),
+        (
+            clustered(groups=[{"name": "a", "size": 4}, {"name": "b", "size": 2, "space": "template"}]),
+            "clusters[0].groups[1].space asks for a template of 2 robots; must be 3 or more",
+        ),
+        (
+            clustered(groups=[{"name": "a", "size": 4}, {"name": "b", "size": 2}], template_m=[[0, 0, 0], [1, 0, 0]]),
+            "clusters[0].template_m asks for a template of 2 robots; must be 3 or more",
+        ),
+        (clustered(space="triad", template_m=[[0, 0, 0]]), "clusters[0].template_m is given; must be left out where"),
+        (clustered(template_m=[[0, 0, 0]]), "clusters[0].template_m has 1 places; must have 6, one for each robot"),
+        (
+            clustered(template_m=[[k, k, 0] for k in range(6)]),
+            "clusters[0].template_m is in one line, within 0.1 m; must span a plane or space",
+        ),
+        (
+            clustered(zigzag=0.0),
+            "clusters[0].template_m is missing, and the robots start in one line; must be given, or space must be triad",
+        ),
+        (clustered(space="ring"), "clusters[0].space is 'ring'; must be one of template, triad (cluster 'c')"),
     ],
 )
 def test_fields_that_do_not_agree_are_told(fields: dict[str, Any], said: str):
     assert said in only(faults_of(document(**fields)))
+
+
+def test_faults_of_groups_are_told_together_and_those_between_faulty_fields_left_out():
+    groups = [{"name": "a", "size": 1}, {"name": "b", "size": 4, "template_m": [[0, 0]] * 4}, {"name": "b", "size": 3}]
+    said = [line.removeprefix("step.yaml: ").split(";")[0] for line in faults_of(document(**clustered(groups=groups)))]
+    assert sorted(said) == [
+        "clusters[0].groups[0].size is 1",
+        "clusters[0].groups[1].template_m[0] is [0, 0]",
+        "clusters[0].groups[1].template_m[1] is [0, 0]",
+        "clusters[0].groups[1].template_m[2] is [0, 0]",
+        "clusters[0].groups[1].template_m[3] is [0, 0]",
+        "clusters[0].groups[2].name is 'b', as groups[1]",
+    ]
 
 
 def test_two_clusters_share_neither_a_name_nor_a_drone():

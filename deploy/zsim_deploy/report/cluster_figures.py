@@ -6,9 +6,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from zsim_agents.cluster_space import unit
 from zsim_deploy.report.canvas import DESIRED, MEASURED, TRUE, dress, legend_above, line, new_figure
 from zsim_deploy.report.flight import Array
-from zsim_deploy.report.formation import Formation, unit
+from zsim_deploy.report.formation import Formation
 
 ROWS_MAX = 24  # parameters in one figure; 6 drones
 SYMBOLS = {

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from zsim_agents.cluster_space import ROBOTS_MAX, ClusterSpace, SingularClusterError, cluster_space
+from zsim.scenario import Scenario
+from zsim_agents.cluster_space import ClusterSpace, SingularClusterError, cluster_space
+from zsim_agents.scenario_space import scenario_space
 from zsim_deploy.report.flight import Array, States, Times, Track
 from zsim_deploy.report.statistics import Errors, common_instants, errors
 
@@ -44,21 +46,14 @@ class Formation:
         return {name: errors(self.est_error[rows, i], self.true_error[rows, i]) for i, name in enumerate(self.names)}
 
 
-def unit(name: str) -> str:
-    """Return the unit of a cluster parameter."""
-    return "m" if name in ("x_c", "y_c", "z_c", "p", "q") or name.startswith("rho") else "rad"
-
-
-def formation(states: States, tracks: list[Track]) -> Formation | None:
+def formation(states: States, tracks: list[Track], scenario: Scenario | None) -> Formation | None:
     """Return a cluster's formation.
 
-    None if its controller published nothing, or variables of another convention than `cluster_space`.
+    None if its controller published nothing, or variables of another convention than the scenario's.
     """
     by_name = {track.name: track for track in tracks}
-    if not len(states.t_ns) or not 2 <= len(states.drones) <= ROBOTS_MAX:
-        return None
-    space = cluster_space(len(states.drones))
-    if states.names != space.names:
+    space = _space(states, scenario) if len(states.t_ns) else None
+    if space is None or states.names != space.names:
         return None
     value, desired = _known(states.value), _known(states.desired)
     members = [by_name[name] for name in states.drones if name in by_name]
@@ -75,6 +70,17 @@ def formation(states: States, tracks: list[Track]) -> Formation | None:
         true_error=_difference(space, true, desired),
         phases=states.phases,
     )
+
+
+def _space(states: States, scenario: Scenario | None) -> ClusterSpace | None:
+    """Return the cluster space that a scenario gives the cluster of these states, else that of so many drones."""
+    clusters = {cluster.name: cluster for cluster in scenario.clusters} if scenario else {}
+    try:
+        if scenario and states.name in clusters:
+            return scenario_space(scenario, clusters[states.name])
+        return cluster_space(len(states.drones))
+    except ValueError:
+        return None
 
 
 def _known(rows: Array) -> Array:

@@ -28,7 +28,7 @@ def judge(record: Path, progress: Callable[[str], None] = lambda _: None) -> tup
         held = f"holds {flight.messages} messages and no truth" if flight.messages else "holds no message"
         raise RecordError(f"{record}: {held}{damaged}; there is nothing to report")
     progress("computing the formation's errors")
-    formations = [found for states in flight.clusters if (found := formation(states, flight.tracks))]
+    formations = [found for states in flight.clusters if (found := formation(states, flight.tracks, flight.scenario))]
     return flight, formations, summarise(flight, formations, record)
 
 

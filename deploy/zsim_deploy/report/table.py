@@ -2,7 +2,7 @@
 
 from rich.table import Table
 
-from zsim_deploy.report.formation import unit
+from zsim_agents.cluster_space import unit
 from zsim_deploy.report.statistics import Errors
 from zsim_deploy.report.summary import Summary
 

@@ -1,0 +1,95 @@
+"""Which cluster space a scenario asks for."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsim import scenario_file
+from zsim.errors import RunError
+from zsim_agents.cluster_space import ClusterSpace
+from zsim_agents.controller import engagement_of
+from zsim_agents.nested_cluster import NestedCluster
+from zsim_agents.pair_cluster import PairCluster
+from zsim_agents.scenario_space import scenario_space
+from zsim_agents.template_cluster import TemplateCluster
+from zsim_agents.triad_cluster import TriadCluster
+
+STARTS = [(0, 5), (-3, 0), (3, 0), (-3, -4), (3, -4), (0, -7), (-6, 4), (6, 4)]
+
+
+def scenario(n: int, yaw_deg: float = 90.0, **cluster: Any):
+    drones = [{"name": f"d{k}", "position_m": [x, y, 0.0], "yaw_deg": yaw_deg} for k, (x, y) in enumerate(STARTS[:n])]
+    clusters = [{"name": "c", "drones": [drone["name"] for drone in drones], **cluster}]
+    return scenario_file.resolve({"name": "test", "duration_s": 10, "drones": drones, "clusters": clusters})
+
+
+def space(n: int, **cluster: Any) -> ClusterSpace:
+    made = scenario(n, **cluster)
+    return scenario_space(made, made.clusters[0])
+
+
+@pytest.mark.parametrize(("n", "kind"), [(2, PairCluster), (3, TriadCluster), (4, TriadCluster), (5, TemplateCluster)])
+def test_the_default_is_a_triad_up_to_four_and_a_template_from_five_on(n: int, kind: type[ClusterSpace]):
+    assert type(space(n)) is kind
+    assert space(n).n == n
+
+
+def test_the_scenario_chooses():
+    assert type(space(8, space="triad")) is TriadCluster
+    assert type(space(3, space="template")) is TemplateCluster
+    assert type(space(3, template_m=[[0, 0, 0], [3, 0, 0], [0, 3, 0]])) is TemplateCluster
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, -30.0])
+def test_the_template_is_where_the_drones_start_seen_along_the_first_one_s_heading(yaw_deg: float):
+    made = space(5, yaw_deg=yaw_deg)
+    starts = np.array([(x, y, 0.0) for x, y in STARTS[:5]])
+    c = made.forward(starts, np.full(5, np.radians(yaw_deg)))
+    expected = np.zeros(20)
+    expected[:3], expected[5] = starts.mean(axis=0), np.radians(yaw_deg)
+    assert np.abs(c - expected).max() < 1e-12
+
+
+def test_a_template_that_is_given_is_in_the_formation_s_axes():
+    places = [[4, 0, 0], [0, 3, 0], [0, -3, 0], [-4, 3, 0], [-4, -3, 1]]
+    made = space(5, template_m=places)
+    assert isinstance(made, TemplateCluster)
+    assert np.abs(made.t_C - (np.array(places) - np.mean(places, axis=0))).max() < 1e-15
+
+
+def test_groups_are_the_next_drones_each():
+    groups = [{"name": "a", "size": 3}, {"name": "b", "size": 5}]
+    made = space(8, groups=groups)
+    assert isinstance(made, NestedCluster)
+    assert type(made.parent) is PairCluster
+    assert made.names[:8] == made.parent.names
+    assert {"a.beta", "b.w_9", "b.phi_5"} <= set(made.names)
+    starts = np.array([(x, y, 0.0) for x, y in STARTS])
+    c = made.forward(starts, np.full(8, np.pi / 2))
+    assert c[:2] == pytest.approx((starts[:3].mean(axis=0) + starts[3:].mean(axis=0))[:2] / 2)
+
+
+def test_the_robots_of_a_template_of_groups_are_their_centroids():
+    groups = [{"name": name, "size": size} for name, size in (("a", 2), ("b", 3), ("c", 2))]
+    made = space(7, groups=groups, space="template")
+    assert isinstance(made, NestedCluster)
+    assert isinstance(made.parent, TemplateCluster)
+    starts = np.array([(x, y, 0.0) for x, y in STARTS])
+    centres = np.array([starts[first:after].mean(axis=0) for first, after in ((0, 2), (2, 5), (5, 7))])
+    seen = (centres - centres.mean(axis=0)) @ np.array([(0, -1, 0), (1, 0, 0), (0, 0, 1)])
+    assert np.abs(made.parent.t_C - seen).max() < 1e-12
+
+
+def test_a_variable_of_a_plan_that_the_space_does_not_have_is_told_with_those_it_has():
+    made = scenario(8, plan={"takeoff_s": 1, "target": {"rho_4": 3.0}})
+    with pytest.raises(RunError, match=r"cluster 'c'.*'rho_4' is unknown; allowed: x_c, .* … w_18 \(32\)"):
+        engagement_of(made, made.clusters[0])
+
+
+def test_more_than_64_drones_are_no_cluster():
+    drones = [{"name": f"d{k}", "position_m": [3 * (k % 9), 3 * (k // 9), 0]} for k in range(65)]
+    clusters = [{"name": "c", "drones": [drone["name"] for drone in drones]}]
+    made = scenario_file.resolve({"name": "test", "duration_s": 10, "drones": drones, "clusters": clusters})
+    with pytest.raises(RunError, match="65 robots is not possible; allowed: 2 to 64"):
+        engagement_of(made, made.clusters[0])
