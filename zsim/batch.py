@@ -1,8 +1,8 @@
-"""Everything that passed the hub since its last gate, in one message: what recorders read.
+"""Many messages in one: what recorders read, and who reads many drones.
 
-Relayed one by one, the messages of a gate cost the recorder and the hub a packet and a wake-up each. The key is
-outside of the contract and begins with `@`, which no wildcard of Zenoh matches: whoever subscribes to `**` hears the
-messages themselves, and does not hear this.
+Relayed one by one, the messages of a gate cost a reader and the hub a piece of work and a wake-up each. The keys are
+outside of the contract and begin with `@`, which no wildcard of Zenoh matches: whoever subscribes to `**` hears the
+messages themselves, and does not hear these.
 """
 
 from typing import Any
@@ -12,7 +12,8 @@ import msgspec
 from zsim.errors import DecodeError
 from zsim.messages import REFUSALS
 
-KEY = "@batch"
+KEY = "@batch"  # everything that passed the hub since its last gate
+GATE = "@gate"  # everything that the world says at a gate
 Batch = list[tuple[str, bytes]]
 MESSAGES_MAX = 5_000  # of one batch; a flood of somebody's messages goes into several
 

@@ -81,6 +81,12 @@ def replay(process_name: str) -> str:
     return process(process_name, "replay")
 
 
+def is_sensor(expression: str) -> bool:
+    """Tell whether a key, or an expression, is about a drone's sensors."""
+    parts = expression.split("/")
+    return len(parts) == 4 and parts[0] == "drone" and parts[2] == "sensor"
+
+
 def thing(key: str) -> str:
     """Return the second part of a key: the drone, cluster or process that it is about."""
     return key.split("/", 2)[1]

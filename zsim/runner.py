@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from zsim import keys, messages, notice
+from zsim import batch, keys, messages, notice
 from zsim.agent import Agent, Output
 from zsim.errors import DecodeError, SessionError
 from zsim.health import HealthMeter
@@ -57,6 +57,7 @@ class Runner:
         self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}
         self._estimated_by: dict[str, str] = {}
         self._boxes: dict[str, Mailbox] = {}
+        self._wanted = dict.fromkeys(agent.reads, True)
         self._notices: deque[Notice] = deque()
         self._queries: deque[Query] = deque()
         self._links: deque[bool] = deque()
@@ -119,33 +120,56 @@ class Runner:
             self._leave = self._leave or "session closed"
             return
         if sample is not None:
-            self._take_in(sample)
+            self._open(sample)
 
     def _take_in_all(self) -> None:
         """Take in what has arrived: first what closes a gate, so that what came before it is found too."""
         for box in self._boxes.values():
             for sample in box.drain():
-                self._take_in(sample)
+                self._open(sample)
+
+    def _open(self, sample: Sample) -> None:
+        """Take in a message, or of many in one those that the agent reads."""
+        if sample.key != batch.GATE:
+            self._take_in(sample)
+            return
+        try:
+            several = batch.decode(sample.payload)
+        except DecodeError as error:
+            self._refuse(error)
+            return
+        for key, payload in several:
+            if self._reads(key):
+                self._take_in(Sample(key, payload))
+
+    def _reads(self, key: str) -> bool:
+        if key not in self._wanted:
+            self._wanted[key] = any(keys.matches(expression, key) for expression in self._agent.reads)
+        return self._wanted[key]
 
     def _take_in(self, sample: Sample) -> None:
         self.health.received += 1
         try:
             message = messages.decode(sample.key, sample.payload)
         except DecodeError as error:
-            self.health.refused += 1
-            if self.health.refused == 1:
-                self._say(str(error))
+            self._refuse(error)
             return
         if type(message) is messages.Estimate:
             self._estimated_by[sample.key] = message.source
         self._inbox.put(sample.key, message)
+
+    def _refuse(self, error: DecodeError) -> None:
+        self.health.refused += 1
+        if self.health.refused == 1:
+            self._say(str(error))
 
     def _blocking_expression(self) -> str:
         """Return the subscription from which the next missing message comes."""
         t_ns = self._inbox.next_gate_ns()
         missing = self._inbox.missing_last(t_ns) if t_ns is not None else None
         wanted = missing or self._agent.gate_keys[-1]
-        return next(e for e in self._agent.reads if keys.matches(e, wanted))
+        expression = next(e for e in self._agent.reads if keys.matches(e, wanted))
+        return expression if expression in self._boxes else batch.GATE
 
     def _ready_gate(self) -> int | None:
         """Return the gate to step now, None if it must be waited for."""
@@ -207,7 +231,10 @@ class Runner:
     def _subscribe(self) -> None:
         closing = [e for e in self._agent.reads if any(keys.matches(e, key) for key in self._agent.gate_keys)]
         for expression in dict.fromkeys([*closing, *self._agent.reads]):
-            self._boxes[expression] = self._link.subscribe(expression)
+            several = len(self._agent.counted) > 1 and keys.is_sensor(expression)
+            box = batch.GATE if several else expression
+            if box not in self._boxes:
+                self._boxes[box] = self._link.subscribe(box)
         self._link.on_message(keys.EVENT, self._on_event)
         self._link.on_link(self._on_link)
         for key in self._agent.control_keys():

@@ -18,7 +18,7 @@ os.environ.setdefault("RUST_LOG", "error")
 import zenoh
 from msgspec import Struct
 
-from zsim import messages, settings, tls
+from zsim import batch, messages, settings, tls
 from zsim.errors import SessionError
 from zsim.identity import Identity
 from zsim.messages import ControlAnswer, ControlRequest
@@ -52,6 +52,7 @@ class Session:
         self._prefix = f"{federation}/"
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._kept: list[Any] = []
+        self._heard: dict[str, bool] = {}
         self._realtime = False
 
     def use(self, mode: Mode) -> None:
@@ -70,9 +71,21 @@ class Session:
 
     def heard(self, key: str) -> bool:
         """Tell whether anybody subscribes to a key of ours."""
+        if key not in self._heard:
+            self._listen_for_readers(key)
+        return self._heard[key]
+
+    def _listen_for_readers(self, key: str) -> None:
+        """Keep up to date whether a key is subscribed to: asked at each gate, Zenoh takes long for it."""
         publisher = self._publishers.get(key) or self._declare(key)
+
+        def note(status: Any) -> None:
+            self._heard[key] = status.matching
+
+        handler = zenoh.handlers.Callback(note, indirect=False)
+        self._kept.append(publisher.declare_matching_listener(handler))
         status: Any = publisher.matching_status  # the stub says bool; it is an object that has one
-        return status.matching
+        self._heard[key] = status.matching
 
     def put_raw(self, key: str, payload: bytes) -> None:
         """Publish an encoded payload; the encoding follows from the key."""
@@ -80,7 +93,7 @@ class Session:
         publisher.put(payload)
 
     def _declare(self, key: str) -> zenoh.Publisher:
-        drop = key.startswith("view/") or (self._realtime and "/sensor/" in key)
+        drop = key.startswith("view/") or (self._realtime and ("/sensor/" in key or key == batch.GATE))
         control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
         encoding = zenoh.Encoding(messages.encoding(key))
         with _named(key):

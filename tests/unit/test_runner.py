@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
-from zsim import keys, membership, messages
+from zsim import batch, keys, membership, messages
 from zsim.agent import Agent, Output
 from zsim.errors import BehindError, RunError, SupersededError
-from zsim.messages import ControlAnswer, Done, Estimate, Event, Info, Origin, Status
+from zsim.messages import ControlAnswer, Done, Estimate, Event, Info, Mag, Origin, Status
 from zsim.runner import Runner
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -159,6 +160,49 @@ def test_who_is_superseded_ends():
     world = World({**estimates(range(3)), 2: tells(event("superseded", ME, **entry))})
     with pytest.raises(SupersededError, match=r"joined from other \(pid \d+\); this one ends"):
         run(world)
+
+
+# Several drones
+
+
+class Swarm(Judge):
+    """Reads all sensors of two drones, and an estimate of a third."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gate_keys = (keys.status("d1"), keys.status("d2"))
+        self.reads = (keys.sensors("d1"), keys.sensors("d2"), keys.estimate("d3"))
+        self.counted = ("d1", "d2")
+
+
+class InOne(World):
+    """Says all of a gate in one message."""
+
+    def _gate(self, gate: int) -> None:
+        t_ns, still = gate * GATE_NS, (0.0, 0.0, 0.0)
+        told = [
+            (keys.sensor("d1", "mag"), Mag(t_ns, gate, t_ns, still)),
+            (keys.status("d1"), replace(status(gate), count=2)),
+            (keys.status("d2"), status(gate)),
+            (keys.status("d3"), status(gate)),
+        ]
+        self._at.get(gate, lambda world: None)(self)
+        self.deliver(batch.GATE, batch.encode([(key, messages.encode(message)) for key, message in told]))
+
+
+def test_who_reads_several_drones_gets_a_gate_in_one_message():
+    swarm, world = Swarm(), InOne({3: lambda world: world.deliver(keys.estimate("d3"), estimate(3))})
+    Runner(world, info(), swarm).run()  # type: ignore[arg-type]
+    assert world.gates_done() == list(range(END + 1))
+    assert swarm.heard[:3] == [("mag", 0), ("status", 0), ("status", 0)]
+    assert len([leaf for leaf, _ in swarm.heard if leaf == "status"]) == 2 * (END + 1)  # d3's are not asked for
+    assert ("estimate", 3) in swarm.heard
+
+
+def test_garbage_in_place_of_a_gate_is_refused_and_changes_nothing():
+    runner = Runner(InOne({2: lambda world: world.deliver(batch.GATE, b"\xc1")}), info(), Swarm())  # type: ignore[arg-type]
+    assert runner.run() == "the run ended"
+    assert runner.health.refused == 1
 
 
 # A world that does not answer at once

@@ -374,6 +374,8 @@ class WorldProcess:
         if not outbox:
             return
         encoded = [(key, messages.encode(message)) for key, message in outbox]
+        if self._link.heard(batch.GATE):
+            self._link.put_raw(batch.GATE, batch.encode(encoded))
         self._link.put_all(encoded)
         self._passed += encoded
         self._put_batch()
