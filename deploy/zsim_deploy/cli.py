@@ -8,7 +8,7 @@ import typer
 
 from zsim import __version__
 from zsim.errors import BehindError, SupersededError, ZsimError
-from zsim_deploy import certs_commands, hosts_commands, look_commands, render_commands
+from zsim_deploy import certs_commands, hosts_commands, look_commands, render_commands, sweep_commands
 from zsim_deploy.arguments import (
     DEFAULT_ENDPOINT,
     Access,
@@ -121,10 +121,14 @@ def validate(scenario: ScenarioPath, set_: Set = None) -> None:
 
 
 @app.command(rich_help_panel=RUN)
-def report(directory: Annotated[Path, typer.Argument(help="Folder of a run.", show_default=False)]) -> None:
-    """Make summary.json, figures and report.html of a run from its record."""
+def report(directory: Annotated[Path, typer.Argument(help="Folder of a run or a sweep.", show_default=False)]) -> None:
+    """Make summary.json, figures and report.html of a run from its record, or of a sweep from its table."""
     from zsim_deploy.look import report_path
+    from zsim_deploy.sweep.plan import is_sweep
 
+    if is_sweep(directory):
+        sweep_commands.make_report(directory)
+        return
     report_path(directory)
     _report(directory)
 
@@ -279,6 +283,7 @@ def _version(asked: bool) -> None:
         raise typer.Exit
 
 
+app.add_typer(sweep_commands.app)
 app.add_typer(look_commands.app)
 hosts_commands.register(app, HOSTS)
 app.add_typer(certs_commands.app, rich_help_panel=HOSTS)

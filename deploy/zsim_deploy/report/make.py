@@ -28,8 +28,14 @@ def judge(record: Path, progress: Callable[[str], None] = lambda _: None) -> tup
         held = f"holds {flight.messages} messages and no truth" if flight.messages else "holds no message"
         raise RecordError(f"{record}: {held}{damaged}; there is nothing to report")
     progress("computing the formation's errors")
-    formations = [found for states in flight.clusters if (found := formation(states, flight.tracks, flight.scenario))]
+    formations = formations_of(flight)
     return flight, formations, summarise(flight, formations, record)
+
+
+def formations_of(flight: Flight) -> list[Formation]:
+    """Return the clusters of a flight that can be judged."""
+    each = (formation(states, flight.tracks, flight.scenario) for states in flight.clusters)
+    return [found for found in each if found]
 
 
 def make_report(directory: Path, progress: Callable[[str], None] = lambda _: None) -> Summary:
@@ -56,13 +62,13 @@ def make_report(directory: Path, progress: Callable[[str], None] = lambda _: Non
             progress("writing the page")
             (Path(new) / "summary.json").write_bytes(summary.json())
             (Path(new) / "report.html").write_text(page(summary, shown, drawn), encoding="utf-8")
-            _move(Path(new), directory)
+            put_in_place(Path(new), directory)
     except OSError as error:
         raise ReportError(f"{directory}: the report cannot be written ({error.strerror})") from error
     return summary
 
 
-def _move(new: Path, directory: Path) -> None:
+def put_in_place(new: Path, directory: Path) -> None:
     """Put a report in its place when all of it is made: a full disk or Ctrl-C leaves no half of one."""
     (directory / "figures").mkdir(exist_ok=True)
     for path in sorted(new.rglob("*.*")):

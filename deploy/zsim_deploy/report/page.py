@@ -4,7 +4,7 @@ import base64
 from collections.abc import Sequence
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
 
 from zsim_deploy.report import paper
 from zsim_deploy.report.figures import Named
@@ -14,23 +14,17 @@ from zsim_deploy.report.table import COLUMNS, cells
 
 def page(summary: Summary, figures: Sequence[Named], directory: Path) -> str:
     """Return the page; `directory` holds the figures' files."""
-    environment = Environment(
-        loader=PackageLoader("zsim_deploy.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-    )
     tables = {
         name: [cells(parameter, errors, paper.TABLE_1.get(parameter)) for parameter, errors in cluster.errors.items()]
         for name, cluster in summary.clusters.items()
     }
-    return environment.get_template("page.html.j2").render(
+    return template("page.html.j2").render(
         summary=summary,
         facts=facts(summary),
         columns=COLUMNS,
         tables=tables,
         paper_note=paper.NOTE,
-        figures=[(figure, _data_uri(directory / figure.name)) for figure in figures],
+        figures=[(figure, data_uri(directory / figure.name)) for figure in figures],
     )
 
 
@@ -69,5 +63,16 @@ def _metres(value: float | None) -> str:
     return "no two drones in the air" if value is None else f"{value:.2f} m in truth"
 
 
-def _data_uri(path: Path) -> str:
+def template(name: str, package: str = "zsim_deploy.report") -> Template:
+    """Return a page's template; what it includes may stand beside it or here."""
+    return Environment(
+        loader=ChoiceLoader([PackageLoader(package, "."), PackageLoader("zsim_deploy.report", ".")]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+    ).get_template(name)
+
+
+def data_uri(path: Path) -> str:
+    """Return a picture as a page holds it within itself."""
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()

@@ -1,4 +1,4 @@
-"""Reads a flight off its record, in one pass."""
+"""Reads a flight in one pass: off its record, or off the messages themselves while it is flown in this process."""
 
 from array import array
 from collections.abc import Callable
@@ -49,15 +49,15 @@ def read_flight(path: Path) -> Flight:
         RecordError: no such record.
     """
     with RecordReader(path) as reader:
-        reading = _Reading()
+        reading = Reading()
         wanted = [key for key in reader.topics() if reading.taker(key)]
         for message in reader.messages(wanted, by_time=False):
             reading.take(message)
-        return reading.flight(reader)
+        return reading.flight(sum(reader.topics().values()), reader.complete, reader.damaged)
 
 
-class _Reading:
-    """The flight while its record is read, message by message."""
+class Reading:
+    """The flight while its record is read, or while it is flown, message by message."""
 
     def __init__(self) -> None:
         self._infos: list[Info] = []
@@ -109,7 +109,13 @@ class _Reading:
             if self._first_wall_ns is None:
                 self._first_wall_ns = message.wall_ns
             self._last_wall_ns = message.wall_ns
-        take(message.key.split("/")[1] if "/" in message.key else "", decoded)
+        take(_thing(message.key), decoded)
+
+    def keep(self, key: str, message: Struct) -> None:
+        """Take one message of a flight in this process; it has not been encoded."""
+        taker = self.taker(key)
+        if taker is not None:
+            taker[1](_thing(key), message)
 
     def _take_truth(self, name: str, truth: _Truth) -> None:
         times, values = self._truth.setdefault(name, (array("q"), array("d")))
@@ -135,8 +141,8 @@ class _Reading:
         process.incarnations += 1
         process.left = ""
 
-    def flight(self, reader: RecordReader) -> Flight:
-        """Return the flight when all is read."""
+    def flight(self, messages: int = 0, complete: bool = True, damaged: int = 0) -> Flight:
+        """Return the flight when all is read; the arguments tell of its record, where there is one."""
         info = self._infos[-1] if self._infos else None
         names = [drone.name for drone in info.drones] if info else sorted(self._truth)
         members = {c.name: c.drones for c in info.clusters} if info else dict.fromkeys(self._states, ())
@@ -147,11 +153,11 @@ class _Reading:
             clusters=[_states(name, drones, self._states.get(name, [])) for name, drones in members.items()],
             events=sorted(self._events, key=lambda event: (event.t_ns, event.seq)),
             participants=list(self._participants.values()),
-            messages=sum(reader.topics().values()),
-            complete=reader.complete,
+            messages=messages,
+            complete=complete,
             wall_s=(self._last_wall_ns - (self._first_wall_ns or 0)) / 1e9,
             undecoded=self._undecoded,
-            damaged=reader.damaged,
+            damaged=damaged,
         )
 
     def _track(self, name: str) -> Track:
@@ -170,6 +176,11 @@ class _Reading:
 
 
 _Taker = tuple[msgspec.msgpack.Decoder[Any], Callable[[str, Any], None]]
+
+
+def _thing(key: str) -> str:
+    """Return whom a key is about; "" for keys of one part."""
+    return key.split("/", 2)[1] if "/" in key else ""
 
 
 def _ignore(_: str, message: Any) -> None:

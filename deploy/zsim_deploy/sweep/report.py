@@ -1,0 +1,65 @@
+"""Makes the report of a sweep: table in, summary, figures and page out."""
+
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from rich.table import Table
+
+from zsim.errors import ReportError
+from zsim_deploy.report.make import put_in_place
+from zsim_deploy.sweep.figures import figures
+from zsim_deploy.sweep.folder import load
+from zsim_deploy.sweep.page import OVERVIEW, overview, page
+from zsim_deploy.sweep.points import Results, SweepSummary
+
+SHOWN_MAX = 40  # points on a terminal
+
+
+def make_sweep_report(directory: Path, progress: Callable[[str], None] = lambda _: None) -> SweepSummary:
+    """Read the finished runs, write DIR/summary.json, DIR/figures/*.png and DIR/report.html; it may fly meanwhile.
+
+    Args:
+        directory: of the sweep.
+        progress: told in words what is being done.
+
+    Raises:
+        RunError: it holds no sweep.
+        ReportError: no run is finished yet, or the directory cannot be written.
+    """
+    folder = load(directory)
+    rows = folder.rows()
+    if not rows:
+        raise ReportError(f"{directory}: no run of this sweep is finished yet; there is nothing to report")
+    results = Results(folder.design, rows)
+    summary = results.summary()
+    try:
+        with TemporaryDirectory(dir=directory, prefix=".report-") as new:
+            drawn = Path(new) / "figures"
+            drawn.mkdir()
+            shown = []
+            for figure in figures(results):
+                progress(f"drawing {figure.name}")
+                figure.drawing.savefig(drawn / figure.name)
+                shown.append(figure)
+            progress("writing the page")
+            (Path(new) / "summary.json").write_bytes(summary.json())
+            (Path(new) / "report.html").write_text(page(summary, shown, drawn), encoding="utf-8")
+            put_in_place(Path(new), directory)
+    except OSError as error:
+        raise ReportError(f"{directory}: the report cannot be written ({error.strerror})") from error
+    return summary
+
+
+def table(summary: SweepSummary) -> Table:
+    """Return the table of all points, for the terminal."""
+    caption = f"± and [ ]: {100 * summary.level:g} % confidence intervals"
+    shown = Table(title=f"{summary.scenario}: {summary.finished} of {summary.runs} runs", caption=caption)
+    shown.add_column(summary.grid)
+    for column in OVERVIEW:
+        shown.add_column(column, justify="right")
+    for point in summary.flown[:SHOWN_MAX]:
+        shown.add_row(point.label, *overview(point))
+    if len(summary.flown) > SHOWN_MAX:
+        shown.add_row(f"… and {len(summary.flown) - SHOWN_MAX} more")
+    return shown

@@ -1,0 +1,198 @@
+"""`zsim sweep` as a user runs it: the same bits as single runs, whoever flies them, is killed or interrupted."""
+
+import json
+import logging
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pyarrow.parquet as pq
+import pytest
+from federation import PAIR, Federation, Role
+from wire import PATIENCE_S
+
+from zsim_deploy.sweep.folder import load, locked
+
+pytestmark = pytest.mark.xdist_group("serial")
+
+GUST = "environment.wind.gust_m_s"
+PLAN = ("--vary", "seed", "--vary", "wind.gust_m_s=0,1", "--duration", "6", "--set", "drones.drone1.mass_kg=0.45")
+RUNS = 4
+FIRST = rf" [1-9] / {RUNS} runs"  # the line of the first run that is finished
+WALL = ("wall_s", "real_time_factor")  # all that may differ between two sweeps
+
+
+def rows(out: Path) -> list[dict[str, Any]]:
+    return pq.read_table(out / "sweep.parquet").to_pylist()
+
+
+def without_wall(out: Path) -> list[dict[str, Any]]:
+    return [{name: value for name, value in row.items() if name not in WALL} for row in rows(out)]
+
+
+def sweep(federation: Federation, out: Path, *options: str) -> Role:
+    path = federation.write(PAIR, "pair.yaml")
+    return federation.start("sweep", path, *PLAN, "--runs", str(RUNS), "--out", str(out), "--no-report", *options)
+
+
+def workers(role: Role) -> list[psutil.Process]:
+    """Return the processes that fly; the other child is multiprocessing's resource tracker."""
+    children = psutil.Process(role.process.pid).children()
+    return [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+
+
+def gone(processes: list[psutil.Process]) -> bool:
+    return psutil.wait_procs(processes, PATIENCE_S)[1] == []
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
+    """A sweep that nobody disturbs, by two workers, with its report."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    with Federation(folder) as federation:
+        sweep(federation, folder / "sweep", "--workers", "2", "--report").ends(with_code=0)
+    return folder / "sweep"
+
+
+def test_a_run_of_a_sweep_has_the_bits_of_a_single_run(federation: Federation, undisturbed: Path) -> None:
+    row = rows(undisturbed)[3]
+    options = ("--in-process", "--duration", "6", "--seed", str(row["seed"]), "--set", "drones.drone1.mass_kg=0.45")
+    federation.run(PAIR, *options, "--set", f"{GUST}={row[GUST]}", "--report").ends(with_code=0)
+    summary = json.loads((federation.out / "summary.json").read_text())
+    assert row["truth_sha256"] == summary["truth_sha256"] == federation.record().sha256()
+    assert row["min_separation_m"] == summary["min_separation_m"]
+    for parameter, errors in summary["errors"].items():
+        assert {each: row[f"errors.{parameter}.{each}"] for each in errors} == errors
+
+
+def test_the_table_and_the_report(undisturbed: Path) -> None:
+    found = rows(undisturbed)
+    assert [row["run"] for row in found] == list(range(RUNS))
+    assert [row[GUST] for row in found] == [0, 1, 0, 1]
+    assert len({row["seed"] for row in found}) == len({row["truth_sha256"] for row in found}) == RUNS
+    assert all(row["failure"] is None and row["sim_s"] == 6.0 for row in found)
+    assert sorted(path.name for path in undisturbed.iterdir() if not path.name.startswith(".")) == [
+        "figures",
+        "plan.json",
+        "report.html",
+        "summary.json",
+        "sweep.parquet",
+    ]
+    points = json.loads((undisturbed / "summary.json").read_text())["points"]
+    assert [(point["values"][GUST], point["runs"]) for point in points] == [(0, 2), (1, 2)]
+
+
+def test_a_killed_worker_is_replaced_and_its_run_flown_again(federation: Federation, undisturbed: Path) -> None:
+    out = federation.folder / "sweep"
+    role = sweep(federation, out, "--workers", "1")
+    role.line(FIRST)
+    (worker,) = workers(role)
+    worker.kill()
+    role.ends(with_code=0)
+    assert "died (killed by SIGKILL); another one flies it again" in role.text()
+    assert without_wall(out) == without_wall(undisturbed)
+
+
+def test_ctrl_c_then_kill_then_the_same_command(federation: Federation, undisturbed: Path) -> None:
+    """Whatever is finished is kept and not flown again; nobody outlives the sweep."""
+    out = federation.folder / "sweep"
+    role = sweep(federation, out, "--workers", "1", "--keep-records")
+    role.line(FIRST)
+    flying = workers(role)
+    os.killpg(role.process.pid, signal.SIGINT)  # as a terminal does: to all of them
+    role.ends(with_code=130)
+    assert gone(flying)
+    assert f"the same command with --out {out} goes on" in role.text()
+    kept = rows(out)
+    assert 1 <= len(kept) < RUNS
+
+    role = sweep(federation, out, "--workers", "1", "--keep-records")
+    role.line(f"{len(kept)} of them (is|are) done already")
+    role.line(rf" [{len(kept) + 1}-{RUNS}] / {RUNS} runs")
+    flying = workers(role)
+    role.signal(signal.SIGKILL)
+    role.ends(with_code=-signal.SIGKILL)
+    assert gone(flying)
+    done = len(kept) + (out / "journal.jsonl").read_text().count("\n")
+    assert done > len(kept)
+
+    role = sweep(federation, out, "--workers", "1", "--keep-records")
+    role.ends(with_code=0)
+    role.line(f"{done} of them are done already")
+    assert without_wall(out) == without_wall(undisturbed)
+    assert rows(out)[: len(kept)] == kept
+    assert sorted(path.name for path in (out / "runs").iterdir()) == [f"{run:06d}" for run in range(RUNS)]
+    assert all((path / "run.mcap").stat().st_size > 10_000 for path in (out / "runs").iterdir())
+    role = sweep(federation, out, "--seed", "9")
+    role.ends(with_code=2)
+    assert role.text() == f"{out}: holds another sweep (seed of its scenario is another one); give --out another folder"
+
+
+def test_runs_that_fail_are_rows(federation: Federation) -> None:
+    """One combination cannot be flown: the others are, and a sweep of which nothing can be flown has failed."""
+    out, path = federation.folder / "sweep", federation.write(PAIR, "pair.yaml")
+    values = "processes.expect=[estimator.drone1,estimator.drone2,controller.main],[console.1]"
+    role = federation.start("sweep", path, "--vary", values, "--duration", "0.2", "--out", str(out), "--workers", "1")
+    role.ends(with_code=0)
+    failures = [row["failure"] for row in rows(out)]
+    reason = "the world waits for console.1, not run in-process; see `processes.expect`"
+    assert failures == [None, reason]
+    assert f"1 of 2 runs failed: {reason}" in role.text()
+    assert reason in (out / "report.html").read_text()
+
+
+BAD = {
+    "no such field": (("--vary", "wings=1"), "wings is not known; allowed: "),
+    "several at once": (("--vary", "duration_s=1,-1", "--vary", "time.gate_ms=0"), "\npair.yaml: duration_s is -1"),
+    "no variation": (("--vary", "duration_s"), "--vary duration_s: is no variation; must be seed, a.b.c=v1,v2"),
+    "a bad override": (("--set", "drones.drone9.mass_kg=1"), "--set drones.drone9.mass_kg=1: drone9 is not in drones"),
+    "too few runs": (("--vary", "duration_s=1,2,3", "--runs", "2"), "--runs is 2; must be at least 3"),
+    "the same again": (("--runs", "2"), "--runs is 2; must be 1, for further ones would have the same bits"),
+    "no runs": (("--runs", "0"), "invalid value for '--runs'"),
+    "workers and dask": (("--workers", "2", "--dask", "tcp://127.0.0.1:9"), "--workers is for processes of this host"),
+    "no scheduler": (("--dask", "nonsense://127.0.0.1:9"), "--dask nonsense://127.0.0.1:9: no scheduler"),
+    "a file in the way": (("--out", __file__), "cannot be made"),
+}
+
+
+def test_bad_sweeps(federation: Federation) -> None:
+    path = federation.write(PAIR, "pair.yaml")
+    started = {
+        name: federation.start("sweep", path, "--out", str(federation.folder / "sweep"), *options)
+        for name, (options, _) in BAD.items()
+    }
+    for name, role in started.items():
+        role.ends(with_code=2)
+        assert BAD[name][1] in role.text(), name
+        assert "Traceback" not in role.text()
+    assert not (federation.folder / "sweep/sweep.parquet").exists() or rows(federation.folder / "sweep") == []
+
+
+# Dask
+
+
+@pytest.fixture
+def cluster() -> Iterator[str]:
+    """Address of a Dask cluster of two processes on this host."""
+    pytest.importorskip("distributed", reason="the extra `dask` is not installed")
+    from distributed import LocalCluster
+
+    options: dict[str, Any] = {"dashboard_address": None, "silence_logs": logging.CRITICAL}
+    local: Any = LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **options)
+    with local:
+        yield local.scheduler_address
+
+
+def test_a_dask_cluster_flies_the_same_rows(federation: Federation, undisturbed: Path, cluster: str) -> None:
+    """A cluster goes on with what other workers have begun."""
+    out = federation.folder / "sweep"
+    with locked(out, load(undisturbed).plan) as folder, folder.journal() as journal:
+        journal.append(rows(undisturbed)[1])
+    role = sweep(federation, out, "--dask", cluster)
+    role.ends(with_code=0)
+    assert "1 of them is done already" in role.text()
+    assert "2 Dask workers at tcp://127.0.0.1:" in role.text()
+    assert without_wall(out) == without_wall(undisturbed)

@@ -1,0 +1,229 @@
+"""How the runs of a sweep are flown: one in this process, many by workers that may die."""
+
+import multiprocessing
+import pickle
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsim import scenario_file
+from zsim.errors import RecordError, RunError
+from zsim.fingerprint import fingerprint
+from zsim.record import RecordWriter
+from zsim_deploy import in_process
+from zsim_deploy.report import judge
+from zsim_deploy.sweep import pool
+from zsim_deploy.sweep.flight import fly
+from zsim_deploy.sweep.row import Row
+from zsim_deploy.sweep.task import Task
+from zsim_deploy.sweep.worker import READY
+from zsim_world.fleet import DivergedError, Fleet
+
+GATE_NS = 20_000_000
+ONE = """
+name: one
+seed: 3
+duration_s: 0.5
+drones: [{name: d1, position_m: [0, 0, 0]}]
+processes: {expect: []}
+"""
+PAIR = """
+name: pair
+seed: 3
+duration_s: 3
+sensors: {preset: paper}
+environment: {wind: {gust_m_s: 0.3}}
+drones:
+  - {name: drone1, position_m: [2, 0, 0], yaw_deg: 90}
+  - {name: drone2, position_m: [-2, 0, 0], yaw_deg: 90}
+clusters:
+  - {name: main, drones: [drone1, drone2], plan: {takeoff_s: 0.2}}
+"""
+
+
+def task(text: str = ONE, run: int = 7, record: Path | None = None, varied: dict[str, Any] | None = None) -> Task:
+    return Task(run, 1, varied or {}, scenario_file.from_text(text), str(record) if record else None)
+
+
+# One run
+
+
+def test_a_row_is_what_the_report_of_a_record_says(tmp_path: Path) -> None:
+    """The same numbers as from the record of `zsim run --in-process`, and the same from a record of its own."""
+    row = fly(task(PAIR, record=tmp_path / "000007", varied={"environment.wind.gust_m_s": 0.3}))
+    in_process.fly(scenario_file.from_text(PAIR), tmp_path / "run.mcap")
+    for record in (tmp_path / "run.mcap", tmp_path / "000007/run.mcap"):
+        _, _, summary = judge(record)
+        assert row["truth_sha256"] == summary.truth_sha256
+        for name in ("ended", "sim_s", "min_separation_m", "seed"):
+            assert row[name] == getattr(summary, name)
+        for parameter, errors in summary.errors.items():
+            for each in ("est_std", "est_rms", "est_mean", "true_std", "true_rms", "true_mean"):
+                assert row[f"errors.{parameter}.{each}"] == getattr(errors, each)
+    assert len(summary.errors) == 8
+    assert list(row)[:4] == ["run", "point", "seed", "environment.wind.gust_m_s"]
+    assert (row["run"], row["failure"], row["collisions"], row["fingerprint"]) == (7, None, 0, fingerprint())
+    text = (tmp_path / "000007/scenario.yaml").read_text()
+    assert scenario_file.from_text(text) == scenario_file.from_text(PAIR)
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_task_can_be_sent() -> None:
+    assert pickle.loads(pickle.dumps(task(PAIR))) == task(PAIR)
+
+
+def test_a_run_that_diverges_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    advance = Fleet.advance
+
+    def diverge(fleet: Fleet) -> None:
+        if fleet.t_ns == 5 * GATE_NS:
+            raise DivergedError("d1", 0.12)
+        advance(fleet)
+
+    monkeypatch.setattr(Fleet, "advance", diverge)
+    row = fly(task())
+    assert row["failure"].startswith("d1 at 0.120 s: the state is no longer finite")
+    assert row["sim_s"] == 0.1
+    assert len(row["truth_sha256"]) == 64
+    assert not [name for name in row if name.startswith("errors.")]
+
+
+def test_a_run_that_crashes_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    row = fly(task(ONE.replace("[]}", "[console.1]}")))
+    assert row["failure"] == "the world waits for console.1, not run in-process; see `processes.expect`"
+    assert (row["run"], row["seed"], row["truth_sha256"]) == (7, 3, None)
+
+    def crash(fleet: Fleet) -> None:
+        raise ZeroDivisionError("a bug\nof two lines")
+
+    monkeypatch.setattr(Fleet, "advance", crash)
+    assert fly(task())["failure"] == "ZeroDivisionError: a bug of two lines"
+
+
+def test_a_full_disk_is_the_sweep_s_end_and_no_fault_of_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(writer: RecordWriter, key: str, message: Any, wall_ns: int) -> None:
+        raise RecordError("no space left")
+
+    monkeypatch.setattr(RecordWriter, "add_message", full)
+    with pytest.raises(RecordError, match="no space left"):
+        fly(task(record=tmp_path / "000007"))
+
+
+# Many runs
+
+
+class FakeWorker:
+    """A worker without a process: flies at once, and dies of what it is told to."""
+
+    dies_of: dict[int, int]  # by run: how many workers still will
+    stillborn = 0  # how many of the next will not get ready
+    answer: Any = None
+    flown: list[int]
+    alive: set["FakeWorker"]
+
+    def __init__(self) -> None:
+        self.link, self._far = multiprocessing.Pipe()
+        self.ready = False
+        self.task: Task | None = None
+        FakeWorker.alive.add(self)
+        if FakeWorker.stillborn:
+            FakeWorker.stillborn -= 1
+            self._die()
+        else:
+            self._far.send(READY)
+
+    def give(self, task: Task) -> None:
+        self.task = task
+        if FakeWorker.dies_of.get(task.run, 0):
+            FakeWorker.dies_of[task.run] -= 1
+            self._die()
+        else:
+            FakeWorker.flown.append(task.run)
+            self._far.send(FakeWorker.answer or {"run": task.run, "failure": None})
+
+    def hear(self) -> Any:
+        try:
+            return self.link.recv()
+        except EOFError:
+            return None
+
+    def leave(self) -> None:
+        self._die()
+        self.link.close()
+
+    def cause(self) -> str:
+        return "killed by SIGKILL"
+
+    def _die(self) -> None:
+        FakeWorker.alive.discard(self)
+        self._far.close()
+
+
+@pytest.fixture(autouse=True)
+def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(pool, "Worker", FakeWorker)
+    monkeypatch.setattr(FakeWorker, "stillborn", 0)
+    monkeypatch.setattr(FakeWorker, "answer", None)
+    FakeWorker.dies_of, FakeWorker.flown, FakeWorker.alive = {}, [], set()
+    yield
+    assert FakeWorker.alive == set()
+
+
+def rows(count: int, said: list[str], workers: int = 2) -> list[Row]:
+    return list(pool.Pool(workers, said.append).rows(task(run=run) for run in range(count)))
+
+
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_every_run_is_flown_once(workers: int) -> None:
+    said: list[str] = []
+    found = rows(9, said, workers)
+    assert sorted(row["run"] for row in found) == sorted(FakeWorker.flown) == list(range(9))
+    assert said == []
+
+
+def test_the_run_of_a_dead_worker_is_flown_again() -> None:
+    said: list[str] = []
+    FakeWorker.dies_of = {0: 1, 4: 2}
+    found = rows(6, said)
+    assert sorted(FakeWorker.flown) == list(range(6))
+    assert [row["failure"] for row in found] == [None] * 6
+    assert sorted(set(said)) == [
+        f"the worker of run {run} died (killed by SIGKILL); another one flies it again" for run in (0, 4)
+    ]
+    assert len(said) == 3
+
+
+def test_a_run_that_is_fatal_to_every_worker_is_a_row() -> None:
+    said: list[str] = []
+    FakeWorker.dies_of = {2: 99}
+    found = {row["run"]: row["failure"] for row in rows(5, said)}
+    assert found.pop(2) == "3 workers died of it, the last one killed by SIGKILL"
+    assert found == dict.fromkeys((0, 1, 3, 4))
+
+
+def test_workers_that_cannot_start_end_the_sweep() -> None:
+    FakeWorker.stillborn = 99
+    with pytest.raises(RunError, match="die before they are ready"):
+        rows(5, [])
+
+
+def test_a_worker_that_did_not_start_once_is_replaced() -> None:
+    FakeWorker.stillborn = 2
+    assert len(rows(5, [])) == 5
+
+
+def test_what_no_run_survives_ends_the_sweep() -> None:
+    FakeWorker.answer = RuntimeError("no space left")
+    with pytest.raises(RunError, match="no space left"):
+        rows(5, [])
+
+
+def test_a_sweep_that_is_closed_leaves_no_worker() -> None:
+    flying = pool.Pool(2, lambda _: None).rows(task(run=run) for run in range(50))
+    next(flying)
+    flying.close()
+    assert FakeWorker.alive == set()
