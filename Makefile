@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 SCENARIO ?= scenarios/step.yaml
+PARTS ?=
 WORKERS ?= 2
 
 .PHONY: run test setup lint soak bench clean help
@@ -27,11 +28,11 @@ lint: $(VENV)/.dev ## style, types, and who may import whom
 soak: $(VENV)/.dev ## repetitions and long runs
 	$(BIN)/pytest -m soak -p no:xdist
 
-bench: $(VENV)/.dev ## measure; see docs/performance.md
-	$(BIN)/python benchmarks/real_time_factor.py
+bench: $(VENV)/.dev ## measure against others, all or PARTS='a b'; see docs/performance.md
+	$(BIN)/python -m benchmarks $(PARTS)
 
 clean:           ## remove the environment and what tools leave behind
-	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) .venv-bench .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

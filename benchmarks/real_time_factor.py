@@ -1,101 +1,80 @@
-"""How fast Test 1 flies, as processes and in one process, and which role spends what.
+"""Part c: how fast a whole run flies: world, estimators, controllers, record; as processes, and in one process.
 
-    .venv/bin/python benchmarks/real_time_factor.py [--repeats 3] [--seconds 120] [--json FILE]
-
-Each repeat flies both, so that a busy machine slows both; medians are printed. A factor counts simulated seconds per
-wall second between the first gate and the last, as `summary.json` does. CPU per role is read from the kernel while
-the processes fly.
+A factor counts simulated seconds per wall second between the first gate and the last, as `summary.json` does.
 """
 
-import argparse
-import json
 import statistics
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 
-import msgspec
-import psutil
+from benchmarks import grid
+from benchmarks.child import RefusedError
+from benchmarks.peers import ROOT
+from benchmarks.progress import Progress
+from benchmarks.run import fly
+from benchmarks.sheet import Sheet
+from benchmarks.table import figure, ratios, table
 
-from zsim import messages
-from zsim.record import RecordReader
-
-SCENARIO = Path(__file__).parent.parent / "scenarios" / "step.yaml"
-
-
-def end_event(folder: Path) -> dict[str, float]:
-    """Return what the world measured of its run."""
-    records = RecordReader(folder / "run.mcap").messages(keys=["world/event"])
-    events = [msgspec.msgpack.decode(record.payload, type=messages.Event) for record in records]
-    return next(event.data for event in events if event.kind == "end")
-
-
-def fly(seconds: float, *options: str) -> tuple[dict[str, float], dict[str, float]]:
-    """Fly once; return the world's figures, and CPU seconds by role."""
-    with tempfile.TemporaryDirectory() as temporary:
-        out = Path(temporary) / "run"
-        command = [sys.executable, "-m", "zsim_deploy.cli", "run", str(SCENARIO), "--no-report"]
-        command += ["--duration", str(seconds), "--out", str(out), *options]
-        process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-        cpu: dict[str, float] = {}
-        while process.poll() is None:
-            cpu.update(cpu_by_role(process.pid))
-            time.sleep(0.1)
-        assert process.returncode == 0, f"exit code {process.returncode}"
-        return end_event(out), cpu
+TEST_1 = ROOT / "scenarios" / "step.yaml"
+SIZES = {3: 120.0, 10: 20.0, 30: 8.0, 100: 4.0}  # drones: simulated seconds; 3 is Test 1, the others stand on a grid
+PROCESSES_MAX = 10  # drones; beyond, a process each needs more memory than many machines have
+LABELS = {
+    "in_process": "one process (`--in-process`)",
+    "hosted": "world, recorder, and one process for all others (`--hosted`)",
+    "processes": "processes, one for each role",
+}
+OPTIONS: dict[str, tuple[str, ...]] = {"in_process": ("--in-process",), "hosted": ("--hosted",), "processes": ()}
 
 
-def cpu_by_role(launcher: int) -> dict[str, float]:
-    """Return user + system CPU seconds of the launcher and of each of its children."""
-    found = {}
-    try:
-        parent = psutil.Process(launcher)
-        for process in [parent, *parent.children()]:
-            words = process.cmdline()[3:5]
-            name = (
-                "launcher" if process.pid == launcher else ".".join(w for w in words if "/" not in w and w[:2] != "--")
-            )
-            times = process.cpu_times()
-            found[name] = times.user + times.system
-    except psutil.NoSuchProcess:
-        return found
-    return found
-
-
-def median(values: list[float]) -> float:
-    return round(statistics.median(values), 2)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=120.0)
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
-    fly(2.0)  # compiles what is not compiled yet
-    together: list[float] = []
-    apart: list[float] = []
+def measure(repeats: int) -> Sheet:
+    """Fly every size, as processes and in one, in turn, so often."""
+    sheet = Sheet("c", "× real time")
+    todo = [(name, size) for size in SIZES for name in LABELS if name != "processes" or size <= PROCESSES_MAX]
+    progress = Progress("c", repeats * len(todo))
     by_role: list[dict[str, float]] = []
-    for number in range(given.repeats):
-        apart_figures, cpu = fly(given.seconds)
-        apart.append(apart_figures["real_time_factor"])
+    with tempfile.TemporaryDirectory() as folder:
+        paths = {size: _scenario(Path(folder), size) for size in SIZES}
+        fly(TEST_1, 2.0, "--in-process")  # compiles what is not compiled yet
+        for _ in range(repeats):
+            for name, size in todo:
+                told = _measured(sheet, name, size, paths[size], by_role)
+                progress.tell(f"{LABELS[name]}, N = {size}: {told}")
+    sheet.notes["cpu_ms_per_simulated_s_with_start"] = _medians(by_role, SIZES[3])
+    return sheet
+
+
+def _scenario(folder: Path, size: int) -> Path:
+    if size == 3:
+        return TEST_1
+    path = folder / f"grid{size}.yaml"
+    grid.write(path, size, SIZES[size])
+    return path
+
+
+def _measured(sheet: Sheet, name: str, size: int, path: Path, by_role: list[dict[str, float]]) -> str:
+    try:
+        found, cpu = fly(path, SIZES[size], *OPTIONS[name])
+    except RefusedError as error:
+        sheet.refused[f"{name}@{size}"] = str(error)
+        sheet.add(name, size, None)
+        return str(error)
+    sheet.add(name, size, found["real_time_factor"])
+    if name == "processes" and size == 3:
         by_role.append(cpu)
-        together.append(fly(given.seconds, "--in-process")[0]["real_time_factor"])
-        print(f"repeat {number + 1}: processes {apart[-1]:.1f}, one process {together[-1]:.1f}", file=sys.stderr)
-    roles = {name: median([1e3 * cpu.get(name, 0.0) / given.seconds for cpu in by_role]) for name in by_role[0]}
-    result = {
-        "processes": median(apart),
-        "in_process": median(together),
-        "cpu_ms_per_simulated_s_with_start": roles,
-        "simulated_s": given.seconds,
-        "repeats": given.repeats,
+    return f"{found['real_time_factor']:.1f} × real time"
+
+
+def _medians(by_role: list[dict[str, float]], simulated_s: float) -> dict[str, float]:
+    roles = sorted({role for cpu in by_role for role in cpu})
+    return {
+        role: round(1e3 * statistics.median(cpu.get(role, 0.0) for cpu in by_role) / simulated_s, 2) for role in roles
     }
-    print(json.dumps(result, indent=2))
-    if given.json:
-        given.json.write_text(json.dumps(result, indent=2))
 
 
-if __name__ == "__main__":
-    main()
+def page(sheet: Sheet) -> str:
+    """Return the measured section."""
+    roles = sheet.notes["cpu_ms_per_simulated_s_with_start"]
+    spent = table(
+        ["role", "CPU ms per simulated second, start-up included"], [[r, figure(v)] for r, v in roles.items()]
+    )
+    return f"{ratios(sheet, LABELS, 'in_process')}\n\n{spent}"

@@ -20,7 +20,8 @@ def chosen(what: str, patterns: Sequence[str], known: Sequence[str]) -> list[str
     """
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in known):
-            raise RunError(f"{what} is {pattern!r}; must be, or match, one of {_listed(known)}")
+            how = "match" if any(sign in pattern for sign in "*?[") else "be"
+            raise RunError(f"{what} is {pattern!r}; must {how} one of {_listed(known)}")
     return [name for name in known if any(fnmatchcase(name, pattern) for pattern in patterns)]
 
 

@@ -11,7 +11,8 @@ import pytest
 from zsim_deploy.signals import Signals
 
 TALKS = """
-import sys
+import signal, sys
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever runs the tests may be under nohup
 from pathlib import Path
 from zsim_deploy.signals import Signals
 told = []

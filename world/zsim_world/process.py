@@ -75,7 +75,7 @@ class WorldProcess:
         self._head = msgspec.msgpack.Decoder(_Head)
         self._queries: deque[Query] = deque()
         self._tokens: deque[tuple[str, bool]] = deque()
-        self._doubted: set[str] = set()
+        self._doubted: dict[str, int] = {}  # when to look again at a token that seemed to go, by process
         self._over = threading.Event()
         self._clock_wall_ns = 0
         self._turn_wall_ns = 0  # when the present turn began; 0 when there is none
@@ -320,24 +320,27 @@ class WorldProcess:
             self._publish(Output(keys.process(WORLD, "health"), health))
             self._tell("health", health, WORLD)
 
-    def _serve_token(self, name: str, alive: bool) -> None:
-        if alive or keys.token(name) in self._link.tokens(keys.token(name), timeout_s=RECOVERY_S):
+    def _serve_token(self, name: str, alive: bool, again: bool = True) -> None:
+        """Take the news of a token; `again`: look once more where it does not agree with what is found."""
+        if alive:
             return
-        participant = self._world.barrier.participants.get(name)
-        if participant and time.monotonic_ns() - participant.joined_wall_ns < NEW_TOKEN_NS:
-            self._doubted.add(name)  # through a router a new token is not always found at once
+        now_ns, participant = time.monotonic_ns(), self._world.barrier.participants.get(name)
+        if keys.token(name) in self._link.tokens(keys.token(name), timeout_s=RECOVERY_S):
+            if again:  # a successor's, or one that Zenoh has not forgotten yet
+                self._doubted[name] = now_ns + NEW_TOKEN_NS
+        elif participant and now_ns - participant.joined_wall_ns < NEW_TOKEN_NS:
+            self._doubted[name] = participant.joined_wall_ns + NEW_TOKEN_NS  # a new token is not always found at once
         else:
             self._take_in_all()
             self._world.died(name, time.monotonic_ns())
             self._flush()
 
     def _serve_doubted(self) -> None:
-        """Look again at tokens that were not found just after their process had joined."""
-        participants, now_ns = self._world.barrier.participants, time.monotonic_ns()
-        for name in list(self._doubted):
-            if name not in participants or now_ns - participants[name].joined_wall_ns >= NEW_TOKEN_NS:
-                self._doubted.discard(name)
-                self._serve_token(name, alive=False)
+        """Look again at tokens of which the news and what was found did not agree."""
+        now_ns = time.monotonic_ns()
+        for name in [name for name, due_ns in self._doubted.items() if due_ns <= now_ns]:
+            del self._doubted[name]
+            self._serve_token(name, alive=False, again=False)
 
     def _serve_query(self, query: Query) -> None:
         asker = keys.thing(query.expression) if keys.matches(keys.replay("*"), query.expression) else None

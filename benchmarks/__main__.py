@@ -1,0 +1,82 @@
+"""Measure, and put what was measured into docs/performance.md.
+
+make bench                                        everything; makes the peers' environment first
+.venv/bin/python -m benchmarks a b --repeats 7    some parts
+.venv/bin/python -m benchmarks a --page           write the page from results/a.json again, measuring nothing
+"""
+
+import argparse
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from benchmarks import command_age, growth, kernels, lockstep, machine, page, peers, real_time_factor
+from benchmarks.sheet import Sheet, read
+
+RESULTS = Path(__file__).parent / "results"
+
+
+class Part(NamedTuple):
+    """A part: measures so many repeats into a sheet, and tells a sheet in Markdown."""
+
+    measure: Callable[[int], Sheet]
+    page: Callable[[Sheet], str]
+
+
+PARTS = {
+    "a": Part(lockstep.measure, lockstep.page),
+    "b": Part(kernels.measure, kernels.page),
+    "c": Part(real_time_factor.measure, real_time_factor.page),
+    "d": Part(command_age.measure, command_age.page),
+    "e": Part(growth.measure, growth.page),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {' '.join(PARTS)}; all if none is given")
+    parser.add_argument("--repeats", type=int, default=5, help="of every measurement; medians are told (5)")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON files")
+    parser.add_argument("--page", action="store_true", help="measure nothing; write the page from the JSON files")
+    parser.add_argument("--no-page", action="store_true", help="leave docs/performance.md and its pictures alone")
+    given = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # so that contenders are ended
+    if unknown := set(given.parts) - set(PARTS):
+        parser.error(f"part is {', '.join(sorted(unknown))}; must be of {' '.join(PARTS)}")
+    chosen = given.parts or list(PARTS)
+    if not given.page and {"a", "b"} & set(chosen):
+        peers.ensure(_say)
+    for part in chosen:
+        path = given.results / f"{part}.json"
+        sheet = read(path) if given.page else _measured(part, given.repeats, path)
+        if not given.no_page:
+            page.update(part, f"{_where(sheet)}\n\n{PARTS[part].page(sheet)}")
+
+
+def _measured(part: str, repeats: int, path: Path) -> Sheet:
+    start_s, described = time.monotonic(), machine.describe()
+    sheet = PARTS[part].measure(repeats)
+    sheet.machine = {**described, "peers": peers.versions() if part in "ab" else {}, "repeats": repeats}
+    sheet.machine["minutes"] = round((time.monotonic() - start_s) / 60.0, 1)
+    sheet.write(path)
+    _say(f"{part}: {sheet.machine['minutes']} min, written to {path}")
+    return sheet
+
+
+def _where(sheet: Sheet) -> str:
+    """Return when, where and how a sheet was measured."""
+    others = ", ".join(f"{name} {version}" for name, version in sheet.machine["peers"].items())
+    peers_told = f" Beside it: {others}." if others else ""
+    repeats = sheet.machine["repeats"]
+    return f"{machine.line(sheet.machine)}{peers_told} Medians of {repeats} (least to greatest)."
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    main()

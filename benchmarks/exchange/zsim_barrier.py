@@ -1,0 +1,152 @@
+"""zsim's own lockstep with nothing to compute: the real world, barrier, hub and runner over Zenoh.
+
+In: WorldProcess, World, Barrier and History, with truth, status and clock of every gate built, encoded, hashed, put
+and kept; in every agent Runner, Inbox and Membership, with status decoded and done encoded and put; joins, tokens,
+health. Out: the fleet (its truth stands still and it has no samples), and the agents' outputs.
+"""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from itertools import repeat
+from typing import Any
+from unittest import mock
+
+import numpy as np
+
+from benchmarks.exchange.lap import Lap, agents, free_port, parser
+from zsim import keys, messages, scenario_file, settings
+from zsim.agent import Agent, Output
+from zsim.connection import find_world
+from zsim.runner import Runner
+from zsim.session import Session
+from zsim_world import process, world
+from zsim_world.fleet import Truth
+
+LOW_LATENCY = {"transport/unicast/qos/enabled": "false", "transport/unicast/lowlatency": "true"}
+FEDERATION = "exchange"
+LONG_S = 1e6  # s, simulated: longer than any run here
+GATE_NS = 20_000_000
+
+
+def main() -> None:
+    options = parser(__doc__)
+    options.add_argument("--low-latency", action="store_true", help="the transport without priorities and fragments")
+    given = options.parse_args()
+    with _transport(given.low_latency):
+        if given.agent is None:
+            run_world(given.agents, given.seconds, given.lookahead, given.low_latency)
+        else:
+            run_agent(given.agent, given.at)
+
+
+def run_world(count: int, seconds: float, lookahead: bool, low_latency: bool) -> Lap:
+    """Run gates for so many wall seconds; without lookahead every gate waits for the dones of the one before it."""
+    with mock.patch.object(world, "Fleet", NullFleet):
+        made = world.World(_scenario(count))
+    if not lookahead:
+        made.delay_ns = 0  # no scenario can say so: a command would take effect at the instant that it answers
+    lap, over = Lap(seconds), False
+
+    def tell(kind: str, message: Any, phase: str) -> None:
+        nonlocal over
+        if kind == "clock" and message.state == "running":
+            over = over or not lap.more()
+
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    options = ["--at", endpoint, *["--low-latency"] * low_latency]
+    with agents("benchmarks.exchange.zsim_barrier", count, *options):
+        process.run(made, [endpoint], lambda: "measured" if over else None, tell)
+    lap.report()
+    return lap
+
+
+def run_agent(number: int, endpoint: str) -> None:
+    """Say done to every gate until the run ends."""
+    with find_world(endpoint, FEDERATION, wait_s=60.0) as (link, info):
+        Runner(link, info, NullAgent(f"drone{number}")).run()
+
+
+class NullAgent(Agent):
+    """Reads the status of a drone and says nothing but done."""
+
+    def __init__(self, drone: str) -> None:
+        super().__init__()
+        self.name = f"null.{drone}"
+        self.period_ns = GATE_NS
+        self.gate_keys = self.reads = (keys.status(drone),)
+
+    def receive(self, key: str, message: Any) -> None:
+        """Take the status."""
+
+    def step(self, t_ns: int) -> list[Output]:
+        return []
+
+
+class NullFleet:
+    """What a world asks of a fleet, standing still and without sensors."""
+
+    def __init__(self, scenario: Any) -> None:
+        self.names = [drone.name for drone in scenario.drones]
+        self.count = len(self.names)
+        self.gps_sigma_m = list(repeat(1.0, self.count))
+        self.t_ns = 0
+        still = [np.zeros((self.count, width)) for width in (3, 3, 4, 3, 3, 4)]
+        self._truth = Truth(*still)
+        self.wind_m_s = still[0]
+
+    def advance(self) -> None:
+        self.t_ns += GATE_NS
+
+    def samples(self) -> list[Any]:
+        return []
+
+    def truth(self) -> Truth:
+        return self._truth
+
+    def status(self, i: int) -> tuple[messages.DroneState, float, bool]:
+        return "flying", 100.0, False
+
+    def closest_m(self) -> float:
+        return 4.0
+
+    def collisions(self) -> list[tuple[int, int]]:
+        return []
+
+    def release(self, i: int) -> None:
+        """Nobody flies it."""
+
+
+def _scenario(count: int) -> Any:
+    names = [f"drone{number}" for number in range(count)]
+    return scenario_file.resolve(
+        {
+            "name": FEDERATION,
+            "federation": FEDERATION,
+            "duration_s": LONG_S,
+            "drones": [{"name": name, "position_m": [4.0 * k, 0.0, 0.0]} for k, name in enumerate(names)],
+            "processes": {"expect": [f"null.{name}" for name in names]},
+        }
+    )
+
+
+@contextmanager
+def _transport(low_latency: bool) -> Iterator[None]:
+    """Let sessions use the low-latency transport, which zsim itself does not offer.
+
+    Zenoh 1.10.2 panics when a listener to transport events is declared on it, so the agents do without theirs: they
+    would not notice a lost link.
+    """
+    common = settings.common
+
+    def lower(*options: Any, **named: Any) -> settings.Settings:
+        return common(*options, **named) | LOW_LATENCY
+
+    with ExitStack() as stack:
+        if low_latency:
+            stack.enter_context(mock.patch.object(settings, "common", lower))
+            stack.enter_context(mock.patch.object(Session, "on_link", return_value=None))
+        yield
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,52 @@
+"""A run in one process, measured in CPU time from its second simulated second on; prints a line of JSON.
+
+.venv/bin/python -m benchmarks.flight --drones 10 --seconds 5
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import psutil
+
+from benchmarks import grid
+from zsim.in_process import Bus
+from zsim.record import RecordWriter
+from zsim_deploy.in_process import agents
+from zsim_world.world import World
+
+WARM_GATES = 50
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--drones", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=5.0, help="simulated")
+    given = parser.parse_args()
+    print(json.dumps(fly(given.drones, given.seconds)), flush=True)
+
+
+def fly(drones: int, seconds: float) -> dict[str, float]:
+    """Return CPU seconds per simulated second, and resident memory at the end [MB]."""
+    world = World(grid.scenario(drones, duration_s=1.0 + seconds), "lockstep", 0.0, time.monotonic_ns)
+    with tempfile.TemporaryDirectory() as folder:
+        writer = RecordWriter(Path(folder) / "run.mcap")
+        bus = Bus(world, agents(world), time.monotonic_ns, lambda k, m: writer.add_message(k, m, time.time_ns()))
+        bus.join()
+        for _ in range(WARM_GATES):
+            bus.turn()
+        start_s, start_ns = time.process_time(), world.now_ns
+        while bus.turn():
+            pass
+        cpu_s = time.process_time() - start_s
+        simulated_s = (world.now_ns - start_ns) / 1e9
+        resident = psutil.Process().memory_info().rss / 1e6
+        bus.end()
+        writer.close()
+    return {"cpu_s_per_simulated_s": cpu_s / simulated_s, "resident_mb": resident}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""crazyflow on JAX's CPU: rotors and body from first principles, attitude controller; no sensors, wind, contacts.
+
+400 Hz as zsim's physics; Euler (its default) or Runge-Kutta of fourth order (`--rk4`). A call flies 20 ms, as a
+command every gate asks for, or a second (`--long`). Compiled and warm.
+"""
+# pyright: reportMissingImports=false
+
+import argparse
+import os
+
+from benchmarks.kernel.stopwatch import Flight, serve, single
+
+RATE_HZ = 400
+TOGETHER_MAX = 100  # drones in one world; a thousand take two minutes to build there and fly as fast in a world each
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--rk4", action="store_true")
+    parser.add_argument("--long", action="store_true", help="a second per call")
+    parser.add_argument("--threads", action="store_true", help="on all cores")
+    given = parser.parse_args()
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    if not given.threads:
+        os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"
+        single()
+    serve(lambda count: flight(count, given.rk4, RATE_HZ if given.long else RATE_HZ // 50))
+
+
+def flight(count: int, rk4: bool, steps: int) -> Flight:
+    """Return drones that hover."""
+    import jax
+    import numpy as np
+    from crazyflow.control import Control
+    from crazyflow.sim import Sim
+    from crazyflow.sim.integration import Integrator
+
+    worlds, each = (1, count) if count <= TOGETHER_MAX else (count, 1)
+    sim = Sim(
+        n_worlds=worlds,
+        n_drones=each,
+        freq=RATE_HZ,
+        attitude_freq=RATE_HZ,
+        body_rate_freq=RATE_HZ,
+        force_torque_freq=RATE_HZ,
+        control=Control.attitude,
+        integrator=Integrator.rk4 if rk4 else Integrator.euler,
+    )
+    sim.reset()
+    command = np.zeros((worlds, each, 4), dtype=np.float32)
+    command[..., 3] = float(np.ravel(sim.data.params.mass)[0]) * 9.81  # N
+
+    def advance() -> None:
+        sim.attitude_control(command)
+        sim.step(steps)
+        jax.block_until_ready(sim.data.states.pos)
+
+    return Flight(advance, steps / RATE_HZ)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""What all contenders of the kernel share: measuring a step in CPU time of all threads, and being asked for it."""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+WARM_CALLS = 3
+
+
+class Flight(NamedTuple):
+    """Drones ready to be flown.
+
+    Attributes:
+        advance: flies on; called again and again.
+        span_s: simulated seconds per call.
+    """
+
+    advance: Callable[[], object]
+    span_s: float
+
+
+def serve(build: Callable[[int], Flight]) -> None:
+    """Answer {"drones": N, "cpu_s": S} lines on stdin by {"drone_s_per_cpu_s": …} lines on stdout, until its end."""
+    flights: dict[int, Flight] = {}
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what peers print is no answer
+    for line in sys.stdin:
+        asked = json.loads(line)
+        count = asked["drones"]
+        try:
+            if count not in flights:
+                flights[count] = build(count)
+            found = {"drone_s_per_cpu_s": count * rate(flights[count], asked["cpu_s"])}
+        except Exception as error:
+            found = {"refused": f"{type(error).__name__}: {error}"[:200]}
+        answers.write(json.dumps(found) + "\n")
+        answers.flush()
+
+
+def rate(flight: Flight, cpu_s: float) -> float:
+    """Return simulated seconds per CPU second, over at least so many CPU seconds."""
+    for _ in range(WARM_CALLS):
+        flight.advance()
+    start, calls = time.process_time(), 0  # user and system time of all threads
+    while (spent := time.process_time() - start) < cpu_s:
+        for _ in range(10 if calls > 100 else 1):
+            flight.advance()
+            calls += 1
+    return calls * flight.span_s / spent
+
+
+def single() -> None:
+    """Keep this process on one core; libraries then start one thread, or share the core."""
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})

@@ -1,0 +1,65 @@
+"""zsim's fleet: firmware, all noisy sensors, wind, encounters; or its compiled kernel alone (`--bare`).
+
+Physics every 2.5 ms by Runge-Kutta of fourth order, firmware and IMU every 5 ms, a call per gate of 20 ms. The fleet
+draws its noise, returns samples and truth; the bare kernel reads the same noise again and returns nothing.
+"""
+
+import argparse
+from itertools import count as counting
+from typing import Any
+
+from benchmarks.grid import scenario
+from benchmarks.kernel.stopwatch import Flight, serve, single
+from zsim_world import gate
+from zsim_world.fleet import NOISE_GATES, Fleet
+
+CLIMB_GATES = 300  # 6 s: taking off is over
+LONG_S = 1e6  # s, simulated: longer than any measurement
+CHARGE_MAH = 1e6  # no battery is empty before the measurement is over
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--bare", action="store_true")
+    bare = parser.parse_args().bare
+    single()
+    serve(lambda count: kernel(count) if bare else fleet(count))
+
+
+def fleet(count: int) -> Flight:
+    """Return a fleet that hovers and is flown as the world does."""
+    made = _airborne(count)
+
+    def advance() -> Any:
+        made.advance()
+        return made.samples(), made.truth()
+
+    return Flight(advance, 0.02)
+
+
+def kernel(count: int) -> Flight:
+    """Return a fleet of which only the compiled kernel is run."""
+    made = _airborne(count)
+    gates = counting()
+
+    def advance() -> None:
+        if next(gates) % NOISE_GATES == 0:
+            made._noise.cursor[:] = 0
+        gate.advance(made._w, made._ticks)
+
+    return Flight(advance, 0.02)
+
+
+def _airborne(count: int) -> Fleet:
+    made = Fleet(scenario(count, LONG_S, cluster=0, drone={"battery_mah": CHARGE_MAH}))
+    for i in range(count):
+        refused = made.takeoff(i)
+        assert refused is None, refused
+    for _ in range(CLIMB_GATES):
+        made.advance()
+    assert all(made.truth().position_m[:, 2] > 0.5), "not in the air"
+    return made
+
+
+if __name__ == "__main__":
+    main()

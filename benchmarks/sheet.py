@@ -1,0 +1,90 @@
+"""Figures of one part of the benchmarks: for each contender and size, a value per repeat; medians, spreads, ratios."""
+
+import json
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A median with the least and the greatest value."""
+
+    median: float
+    low: float
+    high: float
+
+
+@dataclass
+class Sheet:
+    """What one run of a part measured.
+
+    Attributes:
+        part: letter.
+        unit: of the values.
+        values: by contender, by size, in order of the repeats; None for a repeat that gave none.
+        refused: why a contender, or a contender at a size, has no value.
+        notes: whatever else is to be kept.
+        machine: where and with what it ran.
+    """
+
+    part: str
+    unit: str
+    values: dict[str, dict[int, list[float | None]]] = field(default_factory=dict)
+    refused: dict[str, str] = field(default_factory=dict)
+    notes: dict[str, Any] = field(default_factory=dict)
+    machine: dict[str, Any] = field(default_factory=dict)
+
+    def add(self, contender: str, size: int, value: float | None) -> None:
+        """Take the value of one more repeat, None if there is none."""
+        self.values.setdefault(contender, {}).setdefault(size, []).append(value)
+
+    def sizes(self) -> list[int]:
+        """Return all sizes that were measured, in order."""
+        return sorted({size for by_size in self.values.values() for size in by_size})
+
+    def spread(self, contender: str, size: int) -> Spread | None:
+        """Return median, least and greatest of the repeats; None if there is none."""
+        return spread(self.values.get(contender, {}).get(size, []))
+
+    def ratio(self, contender: str, reference: str, size: int) -> Spread | None:
+        """Return how many times the reference a contender is, each repeat against the same repeat; None if unknown."""
+        mine = self.values.get(contender, {}).get(size, [])
+        its = self.values.get(reference, {}).get(size, [])
+        return spread([a / b if a is not None and b else None for a, b in zip(mine, its, strict=False)])
+
+    def best(self, contenders: list[str], size: int) -> str | None:
+        """Return the contender with the greatest median at a size."""
+        found = {name: s.median for name in contenders if (s := self.spread(name, size))}
+        return max(found, key=lambda name: found[name]) if found else None
+
+    def write(self, path: Path) -> None:
+        """Write it as JSON."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(asdict(self), indent=1) + "\n")
+
+
+def read(path: Path) -> Sheet:
+    """Return what `Sheet.write` wrote."""
+    content = json.loads(path.read_text())
+    values = {name: {int(size): v for size, v in by_size.items()} for name, by_size in content.pop("values").items()}
+    return Sheet(values=values, **content)
+
+
+def spread(values: Sequence[float | None]) -> Spread | None:
+    """Return median, least and greatest of what there is; None of nothing."""
+    found = [value for value in values if value is not None]
+    return Spread(statistics.median(found), min(found), max(found)) if found else None
+
+
+def exponent(points: dict[int, float]) -> float:
+    """Return the least-squares slope of log value against log size: 1 means proportional to the size.
+
+    Raises:
+        StatisticsError: there are fewer than two points.
+    """
+    logs = [(math.log(size), math.log(value)) for size, value in points.items()]
+    return statistics.linear_regression([x for x, _ in logs], [y for _, y in logs]).slope

@@ -1,0 +1,135 @@
+"""The frame of the benchmarks: statistics, tables, the page, contenders that are asked or fail, and a tiny exchange."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks import grid, lockstep, page, peers
+from benchmarks.child import RefusedError, Server, result
+from benchmarks.exchange.lap import Lap
+from benchmarks.sheet import Sheet, Spread, exponent, read
+from benchmarks.table import figure, ratios, spread
+
+ECHO = """
+import json, sys
+for line in sys.stdin:
+    asked = json.loads(line)
+    print(json.dumps({"refused": "too many"} if asked["drones"] > 9 else {"twice": 2 * asked["drones"]}), flush=True)
+"""
+
+
+def sheet() -> Sheet:
+    made = Sheet("a", "steps/s")
+    for ours, theirs in ((40.0, 10.0), (30.0, 20.0), (50.0, 10.0)):
+        made.add("zsim", 1, ours)
+        made.add("other", 1, theirs)
+    made.add("zsim", 10, 7.0)
+    made.refused = {"absent": "pip: no such thing", "other@10": "not through after 60 s"}
+    return made
+
+
+def test_a_ratio_compares_each_repeat_with_the_same_repeat() -> None:
+    assert sheet().spread("zsim", 1) == Spread(40.0, 30.0, 50.0)
+    assert sheet().ratio("zsim", "other", 1) == Spread(4.0, 1.5, 5.0)  # 4, 1.5, 5: not 40 / 10 of the medians' spread
+    assert sheet().ratio("zsim", "other", 10) is None
+    assert sheet().best(["zsim", "other"], 1) == "zsim"
+    assert sheet().best(["other"], 10) is None
+
+
+def test_a_repeat_that_failed_is_left_out_of_the_ratio_with_its_partner() -> None:
+    made = Sheet("a", "steps/s")
+    for ours, theirs in ((40.0, None), (30.0, 10.0)):
+        made.add("zsim", 1, ours)
+        made.add("other", 1, theirs)
+    assert made.ratio("zsim", "other", 1) == Spread(3.0, 3.0, 3.0)
+    assert made.spread("other", 1) == Spread(10.0, 10.0, 10.0)
+
+
+def test_a_sheet_is_read_as_it_was_written(tmp_path: Path) -> None:
+    sheet().write(tmp_path / "new" / "a.json")
+    assert read(tmp_path / "new" / "a.json") == sheet()
+
+
+@pytest.mark.parametrize("power", [0.0, 1.0, 1.7])
+def test_the_exponent_of_a_power_is_found(power: float) -> None:
+    assert exponent({size: 3.0 * size**power for size in (1, 3, 10, 100)}) == pytest.approx(power)
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"), [(0.0, "0"), (0.08512, "0.0851"), (2.0, "2"), (845.6, "846"), (12345.0, "12 300")]
+)
+def test_three_digits_are_shown(value: float, shown: str) -> None:
+    assert figure(value) == shown
+
+
+def test_who_has_no_figure_is_a_row_that_says_why() -> None:
+    labels = {"zsim": "zsim", "other": "the other", "absent": "the absent"}
+    lines = ratios(sheet(), labels, "zsim").splitlines()
+    assert lines[0] == "|  | N = 1 | N = 10 |"
+    assert lines[2] == "| zsim [steps/s] | 40 (30 to 50) | 7 (7 to 7) |"
+    assert lines[3] == "| the other | 0.25 (0.2 to 0.667) | not through after 60 s |"
+    assert lines[4] == "| the absent | not measured: pip: no such thing |  |"
+    assert spread(None) == "–"
+
+
+def test_only_the_measured_section_of_the_page_is_replaced() -> None:
+    text = "words\n<!-- measured: a -->\nold\n<!-- end: a -->\nmore\n"
+    assert page.replaced(text, "a", "new\n") == "words\n<!-- measured: a -->\nnew\n<!-- end: a -->\nmore\n"
+    with pytest.raises(ValueError, match=r"has no lines <!-- measured: b -->"):
+        page.replaced(text, "b", "new")
+
+
+def test_the_page_has_a_section_for_every_part() -> None:
+    for part in "abcde":
+        page.replaced(page.PAGE.read_text(), part, "")
+
+
+def test_a_contender_that_fails_is_refused_with_its_last_words() -> None:
+    with pytest.raises(RefusedError, match="exit code 1: ValueError: no"):
+        result([sys.executable, "-c", "raise ValueError('no')"], 30.0)
+    with pytest.raises(RefusedError, match=r"not through after 0\.2 s"):
+        result([sys.executable, "-c", "input() if False else __import__('time').sleep(60)"], 0.2)
+
+
+def test_a_contender_is_asked_and_may_refuse() -> None:
+    server = Server([sys.executable, "-c", ECHO])
+    try:
+        assert server.ask({"drones": 4}, 30.0) == {"twice": 8}
+        with pytest.raises(RefusedError, match="too many"):
+            server.ask({"drones": 10}, 30.0)
+    finally:
+        server.close()
+
+
+def test_a_peer_that_is_not_installed_has_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peers, "STATE", tmp_path / "peers.json")
+    assert peers.missing("helics") == "its environment was not made; `make bench` makes it"
+    peers.STATE.write_text(json.dumps({"helics": "pip: ERROR: none", "mosaik": None}))
+    assert peers.missing("helics") == "pip: ERROR: none"
+    assert peers.missing("mosaik") is None
+
+
+def test_a_lap_counts_what_comes_after_the_warm_up() -> None:
+    lap = Lap(seconds=0.02, warm_s=0.0)
+    calls = 1
+    while lap.more():
+        calls += 1
+    assert lap.steps == calls - 2  # the first call begins the warm-up, the second the count
+    assert lap.steps_per_s >= lap.steps / 1.0
+
+
+@pytest.mark.parametrize(("count", "clusters"), [(1, 0), (3, 1), (10, 3)])
+def test_drones_stand_apart_in_clusters_of_three(count: int, clusters: int) -> None:
+    made = grid.scenario(count, duration_s=1.0)
+    assert (len(made.drones), len(made.clusters)) == (count, clusters)
+    places = {drone.position_m for drone in made.drones}
+    assert len(places) == count
+    assert all(x % grid.SPACING_M == 0.0 and y % grid.SPACING_M == 0.0 for x, y, _ in places)
+
+
+@pytest.mark.parametrize("name", ["zsim", "zsim_lookahead", "zenoh_queue", "raw_tcp"])
+def test_a_world_and_one_agent_exchange_steps(name: str) -> None:
+    found = result(lockstep.command(lockstep.CONTENDERS[name], 1, 0.05), 60.0)
+    assert found["steps"] > 3
