@@ -218,19 +218,19 @@ def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
     endpoint = f"tcp/127.0.0.1:{ports[0]}"
     own = "7447" in line
     line = line.replace("0.0.0.0", "127.0.0.1").replace("7447", str(ports[0])).replace("7448", str(ports[1]))
-    line = re.sub(r"\bmake (\w+)", rf"make -n -C {ROOT} \1 >/dev/null", line)
-    line = re.sub(r"(?<!/)\bzsim (run)\b(?!.*--in-process)", rf"zsim \1 --listen {endpoint}", line)
-    if longest_s is not None and re.search(r"(?<!/)\bzsim run\b", line):
+    line = re.sub(r"\bzsim (run)\b(?!.*--in-process)", rf"zsim \1 --listen {endpoint}", line)
+    if longest_s is not None and re.search(r"\bzsim run\b", line):
         line = re.sub(r"--duration \S+", "", line).replace("zsim run", f"zsim run --duration {longest_s:g}")
     line = re.sub(r"(examples/.* --duration) (\S+)", lambda m: f"{m[1]} {min(float(m[2]), EXAMPLE_S):g}", line)
     if " --out " not in line:
-        line = re.sub(r"(?<!/)\bzsim run\b", "zsim run --no-report", line)
+        line = re.sub(r"\bzsim run\b", "zsim run --no-report", line)
     if not own:
         line = re.sub(r"\bzsim world\b", f"zsim world --listen {endpoint}", line)
         line = re.sub(rf"\bzsim ({'|'.join(ANSWERED)})\b", rf"zsim \1 --connect {endpoint}", line)
         line = re.sub(rf"({'|'.join(map(re.escape, FOREIGN))})", rf"\1 {endpoint}", line)
         line = re.sub(rf"({'|'.join(map(re.escape, OURS))})", rf"\1 --connect {endpoint}", line)
-    return re.sub(r"\bzsim (keys|echo|hz|pub|ask)\b", rf"zsim \1 --wait {PATIENCE_S}", line)
+    line = re.sub(r"\bzsim (keys|echo|hz|pub|ask)\b", rf"zsim \1 --wait {PATIENCE_S}", line)
+    return re.sub(r"\bmake (\w+)", rf"make -n -C {ROOT} \1 >/dev/null", line)  # last: ROOT may end with zsim
 
 
 def free_ports(count: int) -> tuple[int, ...]:
