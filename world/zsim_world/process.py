@@ -8,7 +8,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -31,6 +31,7 @@ STUCK_NS = 2_000_000_000  # wall time in one turn from which on a person is told
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
+BYE_NS = 200_000_000  # wall time by which a bye may come after the news that the token of its process went
 NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
 RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
 RETURN_NS = 10_000_000_000  # wall time after a return to the run in which it may take until it can be asked
@@ -46,6 +47,13 @@ class _Head(msgspec.Struct):
     t_ns: int
     seq: int
     source: str = ""
+
+
+class Doubt(NamedTuple):
+    """When to look again at a process whose token seemed to go, and whether once more after that."""
+
+    due_ns: int
+    again: bool = True
 
 
 class WorldProcess:
@@ -75,7 +83,7 @@ class WorldProcess:
         self._head = msgspec.msgpack.Decoder(_Head)
         self._queries: deque[Query] = deque()
         self._tokens: deque[tuple[str, bool]] = deque()
-        self._doubted: dict[str, int] = {}  # when to look again at a token that seemed to go, by process
+        self._doubted: dict[str, Doubt] = {}  # whose token seemed to go
         self._over = threading.Event()
         self._clock_wall_ns = 0
         self._turn_wall_ns = 0  # when the present turn began; 0 when there is none
@@ -320,27 +328,32 @@ class WorldProcess:
             self._publish(Output(keys.process(WORLD, "health"), health))
             self._tell("health", health, WORLD)
 
-    def _serve_token(self, name: str, alive: bool, again: bool = True) -> None:
-        """Take the news of a token; `again`: look once more where it does not agree with what is found."""
-        if alive:
-            return
-        now_ns, participant = time.monotonic_ns(), self._world.barrier.participants.get(name)
-        if keys.token(name) in self._link.tokens(keys.token(name), timeout_s=RECOVERY_S):
-            if again:  # a successor's, or one that Zenoh has not forgotten yet
-                self._doubted[name] = now_ns + NEW_TOKEN_NS
-        elif participant and now_ns - participant.joined_wall_ns < NEW_TOKEN_NS:
-            self._doubted[name] = participant.joined_wall_ns + NEW_TOKEN_NS  # a new token is not always found at once
-        else:
-            self._take_in_all()
-            self._world.died(name, time.monotonic_ns())
-            self._flush()
+    def _serve_token(self, name: str, alive: bool) -> None:
+        """Take the news of a token: who has lost his is not dead yet, since his bye may come after it."""
+        participant = self._world.barrier.participants.get(name)
+        if not alive and participant and participant.alive:
+            self._doubted[name] = Doubt(time.monotonic_ns() + BYE_NS)
 
     def _serve_doubted(self) -> None:
-        """Look again at tokens of which the news and what was found did not agree."""
+        """Look again at those whose token seemed to go."""
         now_ns = time.monotonic_ns()
-        for name in [name for name, due_ns in self._doubted.items() if due_ns <= now_ns]:
-            del self._doubted[name]
-            self._serve_token(name, alive=False, again=False)
+        for name in [name for name, doubt in self._doubted.items() if doubt.due_ns <= now_ns]:
+            self._take_in_all()
+            self._judge(name, self._doubted.pop(name), now_ns)
+
+    def _judge(self, name: str, doubt: Doubt, now_ns: int) -> None:
+        """Take the death of a process that has no token; look once more where one is found, or may be too new to be."""
+        participant = self._world.barrier.participants.get(name)
+        if participant is None:
+            return
+        if keys.token(name) in self._link.tokens(keys.token(name), timeout_s=RECOVERY_S):
+            if doubt.again:  # a successor's, or one that Zenoh has not forgotten yet
+                self._doubted[name] = Doubt(now_ns + NEW_TOKEN_NS, again=False)
+        elif now_ns - participant.joined_wall_ns < NEW_TOKEN_NS:  # a new token is not always found at once
+            self._doubted[name] = Doubt(participant.joined_wall_ns + NEW_TOKEN_NS, doubt.again)
+        else:
+            self._world.died(name, time.monotonic_ns())
+            self._flush()
 
     def _serve_query(self, query: Query) -> None:
         asker = keys.thing(query.expression) if keys.matches(keys.replay("*"), query.expression) else None
