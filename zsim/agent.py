@@ -35,6 +35,7 @@ class Agent(ABC):
         counted: drones of which it reads all sensors, so that what their status counts is waited for.
         writes: keys that it publishes at every gate and that others of its process may read.
         serves: names of processes for which it stands beside its own.
+        takes_bundles: whether `receive` takes all that the world says at a gate as one (batch.GATE, Bundle).
     """
 
     name: str
@@ -44,6 +45,7 @@ class Agent(ABC):
     counted: tuple[str, ...] = ()
     writes: tuple[str, ...] = ()
     serves: tuple[str, ...] = ()
+    takes_bundles: bool = False
 
     def __init__(self) -> None:
         self._seq: defaultdict[str, int] = defaultdict(int)

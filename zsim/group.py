@@ -8,8 +8,9 @@ A process costs more than the agents in it; three estimators and a controller in
 from collections.abc import Sequence
 from typing import Any
 
-from zsim import keys
+from zsim import batch, keys
 from zsim.agent import Agent, Output
+from zsim.bundle import Bundle, Selection
 from zsim.errors import RunError
 from zsim.messages import ControlAnswer, ControlRequest
 
@@ -41,12 +42,22 @@ class Group(Agent):
         self.counted = _joined(member.counted for member in members)
         self._waiting: list[list[tuple[str, Any]]] = [[] for _ in members]
         self._readers: dict[str, list[int]] = {}
+        self.takes_bundles = any(member.takes_bundles for member in members)
+        self._selections = [Selection(member.reads) for member in members]
         for member in members:
             member.speak_as(self.name)
 
     def receive(self, key: str, message: Any) -> None:
+        if key == batch.GATE:
+            self._receive_bundle(message)
+            return
         for place in self._readers_of(key):
             self._waiting[place].append((key, message))
+
+    def _receive_bundle(self, bundle: Bundle) -> None:
+        for place, member in enumerate(self._members):
+            whole = member.takes_bundles
+            self._waiting[place] += [(batch.GATE, bundle)] if whole else self._selections[place].of(bundle)
 
     def step(self, t_ns: int) -> list[Output]:
         outputs: list[Output] = []

@@ -10,8 +10,9 @@ from typing import Any, Protocol
 
 from msgspec import Struct
 
-from zsim import __version__, keys, messages
+from zsim import __version__, batch, keys, messages
 from zsim.agent import Agent, Output
+from zsim.bundle import Bundle, Selection
 from zsim.errors import RunError
 from zsim.fingerprint import fingerprint
 from zsim.inbox import Inbox
@@ -43,7 +44,7 @@ class Hub(Protocol):
         ...
 
     def take_outbox(self) -> Sequence[tuple[str, Any]]:
-        """Return keys and messages to be published, in order, and forget them."""
+        """Return keys and messages to be published, in order, and forget them; on batch.GATE a Bundle of many."""
         ...
 
     def waiting_for(self, wall_ns: int) -> Sequence[messages.Waiting]:
@@ -56,7 +57,8 @@ class Hub(Protocol):
         ...
 
 
-Sink = Callable[[str, Struct], None]
+Sink = Callable[[str, Any], None]
+"""Takes a key and a message, or batch.GATE and a Bundle."""
 
 
 class Bus:
@@ -66,7 +68,7 @@ class Bus:
         hub: the world.
         agents: in the order in which they are asked.
         wall_ns: monotonic wall time.
-        sink: takes every message in order of publication: the recorder.
+        sink: takes everything in order of publication: the recorder.
     """
 
     def __init__(
@@ -80,6 +82,7 @@ class Bus:
         self._wall_ns = wall_ns
         self._sink = sink
         self._agents = [(agent, Inbox(agent.gate_keys, agent.counted)) for agent in agents]
+        self._selections = [Selection(agent.reads) for agent in agents]
         self._routes: dict[str, list[Inbox]] = {}
         self._t_ns = 0
 
@@ -139,7 +142,15 @@ class Bus:
     def _spread(self) -> None:
         for key, message in self._hub.take_outbox():
             self._sink(key, message)
+            if key == batch.GATE:
+                self._hand_out(message)
+                continue
             for inbox in self._route(key):
+                inbox.put(key, message)
+
+    def _hand_out(self, bundle: Bundle) -> None:
+        for (agent, inbox), selection in zip(self._agents, self._selections, strict=True):
+            for key, message in [(batch.GATE, bundle)] if agent.takes_bundles else selection.of(bundle):
                 inbox.put(key, message)
 
     def _step(self, agent: Agent, inbox: Inbox) -> bool:
@@ -173,6 +184,6 @@ class Bus:
     def _route(self, key: str) -> list[Inbox]:
         if key not in self._routes:
             self._routes[key] = [
-                inbox for agent, inbox in self._agents if any(keys.matches(e, key) for e in agent.reads)
+                inbox for (_, inbox), taken in zip(self._agents, self._selections, strict=True) if taken.takes(key)
             ]
         return self._routes[key]

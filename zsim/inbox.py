@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from operator import itemgetter
 from typing import Any
 
-from zsim import keys
+from zsim import batch, keys
 
 GAP_MAX = 10  # gates lost in a row that are asked for again; the world runs ahead of nobody by more
 ALWAYS_NS = -1  # before every gate
@@ -71,6 +71,8 @@ class Inbox:
             _insert(came, t_ns)
         if key in self._closing:
             self._close(key, message)
+        elif key == batch.GATE:
+            self._close_all(message)
         return True
 
     def _put_late(self, key: str, message: Any) -> bool:
@@ -87,12 +89,24 @@ class Inbox:
         self._came_of[key] = came = meter.came if meter else None
         return came
 
-    def _close(self, key: str, message: Any) -> None:
-        lacking = self._lacking.get(message.t_ns)
+    def _close_all(self, bundle: Any) -> None:
+        """Take a bundle: all that its publisher says at a gate, whole by its nature."""
+        lacking = self._lacking_at(bundle.t_ns)
+        for key in self._closing:
+            if key.endswith("/sensor/status"):
+                lacking.pop(key, None)
+        if self._pulse is not None:
+            self._beats[bundle.t_ns] = bundle.seq
+
+    def _lacking_at(self, t_ns: int) -> dict[str, None]:
+        lacking = self._lacking.get(t_ns)
         if lacking is None:
-            lacking = self._lacking[message.t_ns] = self._closing.copy()
-            _insert(self._gates, message.t_ns)
-        lacking.pop(key, None)
+            lacking = self._lacking[t_ns] = self._closing.copy()
+            _insert(self._gates, t_ns)
+        return lacking
+
+    def _close(self, key: str, message: Any) -> None:
+        self._lacking_at(message.t_ns).pop(key, None)
         if key == self._pulse:
             self._beats[message.t_ns] = message.seq
         if key in self._meters:

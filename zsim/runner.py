@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 from zsim import batch, keys, messages, notice
 from zsim.agent import Agent, Output
+from zsim.bundle import KeyTable, Selection
 from zsim.errors import DecodeError, SessionError
 from zsim.health import HealthMeter
 from zsim.inbox import Inbox
@@ -57,7 +58,8 @@ class Runner:
         self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}
         self._estimated_by: dict[str, str] = {}
         self._boxes: dict[str, Mailbox] = {}
-        self._wanted = dict.fromkeys(agent.reads, True)
+        self._selection = Selection(agent.reads)
+        self._table = KeyTable()
         self._notices: deque[Notice] = deque()
         self._queries: deque[Query] = deque()
         self._links: deque[bool] = deque()
@@ -138,14 +140,24 @@ class Runner:
         except DecodeError as error:
             self._refuse(error)
             return
+        if self._agent.takes_bundles and self._take_in_bundle(several):
+            return
         for key, payload in several:
-            if self._reads(key):
+            if self._selection.takes(key):
                 self._take_in(Sample(key, payload))
 
-    def _reads(self, key: str) -> bool:
-        if key not in self._wanted:
-            self._wanted[key] = any(keys.matches(expression, key) for expression in self._agent.reads)
-        return self._wanted[key]
+    def _take_in_bundle(self, several: batch.Batch) -> bool:
+        """Take in a gate as a whole; return False for one in which no status tells which it is."""
+        pulse = next((payload for key, payload in several if key == self._agent.gate_keys[0]), None)
+        try:
+            status = messages.decode(self._agent.gate_keys[0], pulse) if pulse else None
+        except DecodeError:
+            return False
+        if status is None:
+            return False
+        self.health.received += len(several)
+        self._inbox.put(batch.GATE, self._table.bundle(status.t_ns, status.seq, several))
+        return True
 
     def _take_in(self, sample: Sample) -> None:
         self.health.received += 1

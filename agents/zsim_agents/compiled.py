@@ -23,6 +23,7 @@ SOURCES = (  # every file that uses `compiled`
     "estimator_rows.py",
     "flight_judge.py",
     "formation.py",
+    "gate_reader.py",
     "kalman_update.py",
     "madgwick.py",
     "near_pairs.py",

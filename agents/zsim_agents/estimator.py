@@ -6,10 +6,12 @@ Order of this file: the agent, `receive` by key, `step`, warm start.
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from zsim import keys, messages
+from zsim import batch, keys, messages
 from zsim.agent import Agent, Output
+from zsim.bundle import Bundle, Selection
 from zsim.errors import RunError
 from zsim.scenario import Scenario
+from zsim_agents.compiled import COMPILES
 from zsim_agents.estimator_set import estimators
 
 
@@ -41,6 +43,8 @@ class Estimator(Agent):
         specs = [scenario.drone(drone) for drone in names]
         self._settings = (specs, scenario.environment, scenario.estimation, info.gate_ns / 1e9)
         self._set = estimators(*self._settings)
+        self.takes_bundles = COMPILES
+        self._selection = Selection(self.reads)
         self._take = {key: take for i, drone in enumerate(names) for key, take in self._takers(i, drone)}
 
     def _takers(self, i: int, drone: str) -> list[tuple[str, Callable[[Any], None]]]:
@@ -60,7 +64,15 @@ class Estimator(Agent):
         return [(keys.sensor(drone, kind), take) for kind, take in by_kind.items()]
 
     def receive(self, key: str, message: Any) -> None:
-        self._take[key](message)
+        if key == batch.GATE:
+            self._receive_bundle(message)
+        else:
+            self._take[key](message)
+
+    def _receive_bundle(self, bundle: Bundle) -> None:
+        if not self._set.bundle(bundle):
+            for key, message in self._selection.of(bundle):
+                self._take[key](message)
 
     def step(self, t_ns: int) -> list[Output]:
         told = zip(self.writes, self._set.close(t_ns * 1e-9), strict=True)

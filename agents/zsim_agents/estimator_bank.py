@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.bundle import Bundle
 from zsim.scenario import Drone, Environment, Estimation
 from zsim_agents import estimator_rows as er
 from zsim_agents.aiding import PATIENCE_S, Aid, aids
@@ -20,6 +21,7 @@ from zsim_agents.error_state import ErrorState, innovation_limits
 from zsim_agents.estimate import Estimate, age_max_s
 from zsim_agents.estimator_fusion import YAW_STATE, close, set_variance
 from zsim_agents.estimator_prior import HEADING_SIGMA_RAD, bias_priors, madgwick_beta, process_noise, set_start
+from zsim_agents.gate_reader import GateReader
 from zsim_agents.madgwick import LEVEL, Vector, normalised
 from zsim_agents.mount import mount_rotation
 from zsim_agents.state_history import history_length
@@ -51,6 +53,7 @@ class EstimatorBank:
         self.rows = _rows(believed, estimation.gate_probability)
         self._make_room(_ROOM)
         self._came = 0
+        self._reader = GateReader([drone.name for drone in drones])
         self._told = np.zeros((len(drones), er.ESTIMATE_COLUMNS))
 
     def imu(self, i: int, t_sample_s: float, accel_m_s2: Vector, gyro_rad_s: Vector) -> None:
@@ -78,6 +81,15 @@ class EstimatorBank:
     def flow(self, i: int, t_s: float, t_sample_s: float, velocity_m_s: Vector, quality: float) -> None:
         """Take a velocity in the heading frame; without quality, or before a heading is known, it is refused."""
         self._keep(i, er.FLOW, t_s, t_sample_s, *velocity_m_s, 0.0, 0.0, 0.0, quality, 0.0)
+
+    def bundle(self, bundle: Bundle) -> bool:
+        """Take all sensors in a bundle; False, and none, if one of its messages is not as the world writes it."""
+        while self._came + len(bundle) > len(self._readings):
+            self._grow()
+        came = self._reader.take(bundle, self._readings, self._came)
+        if came >= 0:
+            self._came = came
+        return came >= 0
 
     def close(self, t_s: float) -> list[Estimate]:
         """Use what has come since the last gate and return the estimates for `t_s`."""
@@ -119,11 +131,14 @@ class EstimatorBank:
 
     def _keep(self, *reading: float) -> None:
         if self._came == len(self._readings):
-            former = self._readings
-            self._make_room(2 * len(former))
-            self._readings[: len(former)] = former
+            self._grow()
         _READING.pack_into(self._room, self._came * _READING.size, *reading)
         self._came += 1
+
+    def _grow(self) -> None:
+        former = self._readings
+        self._make_room(2 * len(former))
+        self._readings[: len(former)] = former
 
     def _make_room(self, readings: int) -> None:
         self._room = bytearray(readings * _READING.size)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
+from zsim.bundle import Bundle
 from zsim.scenario import Drone, Environment, Estimation
 from zsim_agents.compiled import COMPILES
 from zsim_agents.estimate import Estimate
@@ -27,6 +28,8 @@ class EstimatorSet(Protocol):
     def sonar(self, i: int, t_s: float, t_sample_s: float, range_m: float, valid: bool) -> None: ...
 
     def flow(self, i: int, t_s: float, t_sample_s: float, velocity_m_s: Vector, quality: float) -> None: ...
+
+    def bundle(self, bundle: Bundle) -> bool: ...
 
     def close(self, t_s: float) -> list[Estimate]: ...
 
@@ -71,6 +74,9 @@ class OneByOne:
 
     def flow(self, i: int, t_s: float, t_sample_s: float, velocity_m_s: Vector, quality: float) -> None:
         self._cores[i].flow(t_s, t_sample_s, velocity_m_s, quality)
+
+    def bundle(self, bundle: Bundle) -> bool:
+        return False
 
     def close(self, t_s: float) -> list[Estimate]:
         return [core.close(t_s) for core in self._cores]

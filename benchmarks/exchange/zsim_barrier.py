@@ -7,20 +7,18 @@ health. Out: the fleet (its truth stands still and it has no samples), and the a
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from itertools import repeat
 from typing import Any
 from unittest import mock
 
-import numpy as np
-
 from benchmarks.exchange.lap import Lap, agents, free_port, parser
-from zsim import keys, messages, scenario_file, settings
+from zsim import keys, scenario_file, settings
 from zsim.agent import Agent, Output
 from zsim.connection import find_world
 from zsim.runner import Runner
 from zsim.session import Session
 from zsim_world import process, world
-from zsim_world.fleet import Truth
+from zsim_world.fleet import Fleet
+from zsim_world.samples import NONE
 
 LOW_LATENCY = {"transport/unicast/qos/enabled": "false", "transport/unicast/lowlatency": "true"}
 FEDERATION = "exchange"
@@ -82,38 +80,15 @@ class NullAgent(Agent):
         return []
 
 
-class NullFleet:
-    """What a world asks of a fleet, standing still and without sensors."""
+class NullFleet(Fleet):
+    """A fleet that stands still and has no sensors."""
 
     def __init__(self, scenario: Any) -> None:
-        self.names = [drone.name for drone in scenario.drones]
-        self.count = len(self.names)
-        self.gps_sigma_m = list(repeat(1.0, self.count))
-        self.t_ns = 0
-        still = [np.zeros((self.count, width)) for width in (3, 3, 4, 3, 3, 4)]
-        self._truth = Truth(*still)
-        self.wind_m_s = still[0]
+        super().__init__(scenario)
+        self.sampled = NONE
 
     def advance(self) -> None:
-        self.t_ns += GATE_NS
-
-    def samples(self) -> list[Any]:
-        return []
-
-    def truth(self) -> Truth:
-        return self._truth
-
-    def status(self, i: int) -> tuple[messages.DroneState, float, bool]:
-        return "flying", 100.0, False
-
-    def closest_m(self) -> float:
-        return 4.0
-
-    def collisions(self) -> list[tuple[int, int]]:
-        return []
-
-    def release(self, i: int) -> None:
-        """Nobody flies it."""
+        self._tick += self._ticks
 
 
 def _scenario(count: int) -> Any:

@@ -14,23 +14,16 @@ from zsim.agent import Agent
 from zsim.in_process import Bus
 from zsim.record import RecordWriter
 from zsim.scenario import Scenario
-from zsim_agents.controller import Controller
-from zsim_agents.estimator import Estimator
+from zsim_deploy.hosting import hosted
 from zsim_deploy.progress import Reasons, Screen, Throttle
 from zsim_world.world import World, expected
 
 
 def agents(world: World) -> list[Agent]:
-    """Return the agents that a scenario expects, built from `world/info` as any process would."""
-    info, scenario = world.info(), world.scenario
-    made: list[Agent] = []
-    for name in expected(scenario):
-        role, _, thing = name.partition(".")
-        if role == "estimator":
-            made.append(Estimator(info, scenario, thing))
-        elif role == "controller":
-            made.append(Controller(info, scenario, thing))
-    return made
+    """Return the agents that a scenario expects as one, built from `world/info` as any process would."""
+    roles = ("estimator.", "controller.")
+    names = [name for name in expected(world.scenario) if name.startswith(roles)]
+    return [hosted(world.info(), world.scenario, names)] if names else []
 
 
 def fly(

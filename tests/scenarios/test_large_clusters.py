@@ -3,13 +3,14 @@
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from federation import Federation
-from msgspec import Struct
 
 from zsim import keys, messages, scenario_file
+from zsim.bundle import Bundle
 from zsim.in_process import Bus
 from zsim.scenario import Scenario
 from zsim_agents.cluster_space import Array, closest_pair
@@ -45,8 +46,11 @@ class Flight:
         self.cluster = self.scenario.clusters[0]
         self.space = scenario_space(self.scenario, self.cluster)
 
-    def sink(self, key: str, message: Struct) -> None:
-        if isinstance(message, messages.ClusterState):
+    def sink(self, key: str, message: Any) -> None:
+        if isinstance(message, Bundle):
+            for each in message.messages():
+                self.sink(*each)
+        elif isinstance(message, messages.ClusterState):
             self.states.append(message)
         elif isinstance(message, messages.Truth):
             self.truth.setdefault(message.t_ns, {})[keys.thing(key)] = message.position_m

@@ -127,10 +127,9 @@ def test_a_stopped_reader(federation: Federation) -> None:
 
 
 def test_a_stopped_recorder(federation: Federation) -> None:
-    """A recorder that takes nothing for long is as good as dead."""
+    """A recorder that takes nothing for long is as good as dead, whether or not a put has waited for it before."""
     flight = Flight(federation, "--rate", "1000", "--duration", "100000")
     federation.kill("recorder", signal.SIGSTOP)
-    flight.run.line("stuck: nothing can be published for .*; one of recorder,")
     flight.run.line("death: recorder .*; on_death: end")
     flight.run.ends(with_code=1)
     assert "ended: recorder died" in flight.run.text()

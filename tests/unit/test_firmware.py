@@ -269,7 +269,7 @@ def test_an_overturned_drone_cuts_its_motors():
 
 def test_a_drone_on_its_back_does_not_take_off():
     flight = fleet(gust=0.0)
-    flight._bodies.state[0, 6:10] = flight._boards.belief[0, :4] = quaternion_from_rpy((3.0, 0.0, 0.0))
+    flight.bodies.state[0, 6:10] = flight.boards.belief[0, :4] = quaternion_from_rpy((3.0, 0.0, 0.0))
     assert "upright" in str(flight.takeoff(0))
 
 
@@ -291,7 +291,7 @@ def test_an_empty_battery_stops_the_rotors():
 def test_it_flies_on_its_flow_and_not_on_truth():
     """A flow sensor that shows 0.3 m/s too much makes the drone drift by as much the other way."""
     flight = airborne(gust=0.0)
-    flight._senses.bias[0, 5, 0] += 0.3
+    flight._w.senses.bias[0, 5, 0] += 0.3
     track = run(flight, 10.0, every(flight, (0.0, 0.0, 0.0)))
     drift = np.mean([in_heading_frame(truth) for truth in track[-200:]], axis=0)
     np.testing.assert_allclose(drift, (-0.3, 0.0, 0.0), atol=0.1)
@@ -357,7 +357,7 @@ def test_belief_agrees_with_truth(sensors):
     run(flight, 30.0, every(flight, (0.3, 0.0, 0.0), 0.1))
     truth = flight.truth()
     for i in range(3):
-        belief = flight._boards.belief[i]
+        belief = flight.boards.belief[i]
         q = truth.orientation_wxyz[i]
         own = belief[observer.ATTITUDE : observer.ATTITUDE + 4]
         z, z_own = (np.array([2 * (a[1] * a[3] + a[0] * a[2]), 2 * (a[2] * a[3] - a[0] * a[1])]) for a in (q, own))

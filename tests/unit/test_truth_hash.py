@@ -20,7 +20,7 @@ def instants(count: int) -> list[tuple[int, list[np.ndarray]]]:
 def digest(said: list[tuple[int, list[np.ndarray]]]) -> str:
     truth = TruthHash(DRONES)
     for t_ns, arrays in said:
-        truth.add(t_ns, *arrays)
+        truth.add(t_ns, np.hstack(arrays))
     return truth.hexdigest()
 
 
@@ -68,6 +68,6 @@ def test_time_and_order_count():
 def test_the_hash_may_be_asked_on_the_way():
     truth = TruthHash(DRONES)
     for t_ns, arrays in instants(4):
-        truth.add(t_ns, *arrays)
+        truth.add(t_ns, np.hstack(arrays))
         truth.hexdigest()
     assert truth.hexdigest() == digest(instants(4))

@@ -1,8 +1,7 @@
 """The fleet: all drones of a scenario, one gate at a time. The only thing that the rest of the world uses.
 
-Samples are published in the contract's order of fields. Heights: `baro` altitude_m is the height over the origin of W
-(zeroed at the field, as the aircraft does at power-up), and pressure_pa is that of the standard atmosphere at
-`environment.height_m` + altitude_m.
+Heights: `baro` altitude_m is the height over the origin of W (zeroed at the field, as the aircraft does at power-up),
+and pressure_pa is that of the standard atmosphere at `environment.height_m` + altitude_m.
 """
 
 import math
@@ -10,17 +9,14 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from msgspec import Struct
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from zsim.errors import RunError
 from zsim.messages import DroneState
 from zsim.scenario import Gps, Scenario
 from zsim_world import firmware, gate, observer, sensor_set, vehicle, wind
-from zsim_world.geodetic import anchor, geodetic
 from zsim_world.noise import NoiseTable
-from zsim_world.sensor_set import SENSORS, VALUES, SensorName
+from zsim_world.samples import Sample, Sampled, Sampler
 from zsim_world.start import arrays
 
 GPS_FIX = 3  # NMEA: a three-dimensional fix
@@ -41,21 +37,6 @@ class DivergedError(RunError):
         self.drone = drone
 
 
-class Sample(Struct, frozen=True, gc=False):
-    """One measurement; `values` in the contract's order of fields.
-
-    imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude, longitude [deg], altitude [m], e, n, u [m],
-    ve, vn, vu [m/s] (see `Fleet.gps_sigma_m`, GPS_FIX, GPS_SATELLITES); mag: x, y, z [uT]; baro: pressure [Pa],
-    altitude [m]; sonar: range [m], valid 0 or 1; flow: forward, left, up [m/s], quality.
-    """
-
-    sensor: SensorName
-    drone: int
-    t_ns: int
-    t_sample_ns: int
-    values: tuple[float, ...]
-
-
 class Truth(NamedTuple):
     """The true state of N drones, copied."""
 
@@ -68,7 +49,17 @@ class Truth(NamedTuple):
 
 
 class Fleet:
-    """All drones of a scenario, stepped together gate by gate from t = 0, standing on the ground."""
+    """All drones of a scenario, stepped together gate by gate from t = 0, standing on the ground.
+
+    Attributes:
+        names: in scenario order, in which drones are counted.
+        gps_sigma_m: of each drone's fixes.
+        bodies, boards: the arrays that the kernel works on; to be read only.
+        sampled: what fell due for publication in the last gate.
+        touching: whether a drone's hull touched another's in the last gate, (N,).
+    """
+
+    sampled: Sampled
 
     def __init__(self, scenario: Scenario) -> None:
         """Place the drones and take the samples of t = 0.
@@ -79,26 +70,22 @@ class Fleet:
         self.names = [drone.name for drone in scenario.drones]
         self.count = len(self.names)
         self.gps_sigma_m = [_gps_sigma(drone.sensors.gps) for drone in scenario.drones]
-        place = scenario.environment
-        self._anchor = anchor(place.latitude_deg, place.longitude_deg, place.height_m)
         self._tick_ns = round(scenario.time.physics_dt_ms * 1_000_000)
         self._ticks = round(scenario.time.gate_ms / scenario.time.physics_dt_ms)
         self._tick = 0
         self._gates = 0
-        latency_ns = _latencies(scenario)
-        self._delayed = any(any(row) for row in latency_ns)
-        self._kinds = [list(zip(SENSORS, VALUES, row, strict=True)) for row in latency_ns]
-        self._later: list[Sample] = []
+        self._sampler = Sampler(scenario)
         self._noise = NoiseTable(scenario, NOISE_GATES)
         self._w = arrays(scenario, self._noise)
-        self._bodies, self._boards, self._senses = self._w.bodies, self._w.boards, self._w.senses
-        self._hull_m = float(self._bodies.vehicle[:, vehicle.HULL_RADIUS].max())
+        self.bodies, self.boards = self._w.bodies, self._w.boards
+        self.touching = np.zeros(self.count, dtype=bool)
+        self._hull_m = float(self.bodies.vehicle[:, vehicle.HULL_RADIUS].max())
         self._integrate(0)
         self._rehearse()
 
     def _rehearse(self) -> None:
         """Load or compile what the first command needs: in realtime no gate may wait for it."""
-        gate.enter(self._boards.memory[0].copy(), self._boards.belief[0].copy(), firmware.LANDED)
+        gate.enter(self.boards.memory[0].copy(), self.boards.belief[0].copy(), firmware.LANDED)
 
     @property
     def t_ns(self) -> int:
@@ -123,17 +110,17 @@ class Fleet:
 
     def samples(self) -> list[Sample]:
         """Return what fell due for publication in the last gate, in the order of (t_ns, drone, sensor)."""
-        return self._samples
+        return self.sampled.each()
 
     def truth(self) -> Truth:
         """Return the true state now."""
-        s = self._bodies.state.copy()
-        return Truth(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], self._bodies.accel[:, 0:3].copy(), s[:, 13:17])
+        s = self.bodies.state.copy()
+        return Truth(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], self.bodies.accel[:, 0:3].copy(), s[:, 13:17])
 
     def status(self, i: int) -> tuple[DroneState, float, bool]:
         """Return the firmware's mode, the charge [%], and whether the hull touched another in the last gate."""
-        charge = 100.0 * self._bodies.energy.item(i) / self._bodies.vehicle.item(i, vehicle.CAPACITY)
-        return firmware.MODES[self._mode(i)], charge, i in self._touching
+        charge = 100.0 * self.bodies.energy.item(i) / self.bodies.vehicle.item(i, vehicle.CAPACITY)
+        return firmware.MODES[self._mode(i)], charge, bool(self.touching[i])
 
     def closest_m(self) -> float:
         """Return the least distance between two drones over the last gate; inf for a single one."""
@@ -150,7 +137,7 @@ class Fleet:
             return self._not_while(i, "a take-off needs it landed")
         if charge < TAKEOFF_PERCENT_MIN:
             return f"{self.names[i]} has {charge:.1f} % of charge; a take-off needs {TAKEOFF_PERCENT_MIN:g} %"
-        x, y = self._boards.belief[i, observer.ATTITUDE + 1 : observer.ATTITUDE + 3]
+        x, y = self.boards.belief[i, observer.ATTITUDE + 1 : observer.ATTITUDE + 3]
         if 1.0 - 2.0 * (x * x + y * y) < UPRIGHT_COSINE:
             return f"{self.names[i]} does not stand upright; a take-off needs it within 30 deg of level"
         self._enter(i, firmware.TAKING_OFF)
@@ -205,27 +192,27 @@ class Fleet:
 
     def release(self, i: int) -> None:
         """Let nobody fly the drone any more: it hovers."""
-        self._boards.setpoint[i, firmware.KIND] = firmware.NONE
+        self.boards.setpoint[i, firmware.KIND] = firmware.NONE
 
     def _set(self, i: int, kind: int, values: tuple[float, ...]) -> str | None:
         if self._mode(i) not in (firmware.HOVERING, firmware.FLYING):
             return self._not_while(i, "a setpoint needs it hovering or flying")
         if not math.isfinite(sum(values)):
             return f"{self.names[i]} was sent a setpoint with {list(values)}; must be finite"
-        row = self._boards.setpoint[i]
+        row = self.boards.setpoint[i]
         row[firmware.KIND] = kind
         row[firmware.VALUE : firmware.VALUE + len(values)] = values
-        self._boards.set_tick[i] = self._tick
+        self.boards.set_tick[i] = self._tick
         return None
 
     def _mode(self, i: int) -> int:
-        return int(self._boards.memory.item(i, firmware.MODE))
+        return int(self.boards.memory.item(i, firmware.MODE))
 
     def _not_while(self, i: int, need: str) -> str:
         return f"{self.names[i]} is {firmware.MODES[self._mode(i)]}; {need}"
 
     def _enter(self, i: int, mode: int) -> None:
-        gate.enter(self._boards.memory[i], self._boards.belief[i], mode)
+        gate.enter(self.boards.memory[i], self.boards.belief[i], mode)
 
     def _integrate(self, ticks: int) -> None:
         logged, least, diverged = gate.advance(self._w, ticks)
@@ -234,53 +221,14 @@ class Fleet:
         self._tick += ticks
         self._least = least
         self._meet(least)
-        fresh = self._fresh(logged)
-        self._samples = self._due(fresh) if self._delayed else fresh
+        self.sampled = self._sampler.due(self._w.senses, logged, self.t_ns)
 
     def _meet(self, least: float) -> None:
         self._began: list[tuple[int, int]] = []
-        self._touching: set[int] = set()
+        self.touching.fill(False)
         if least < 2.0 * self._hull_m:
-            self._began = [(int(i), int(j)) for i, j in np.argwhere(self._bodies.touched)]
-            self._touching = {int(k) for k in np.argwhere(self._bodies.touched | self._bodies.touching).ravel()}
-
-    def _fresh(self, logged: int) -> list[Sample]:
-        """Return the samples that the kernel took, in the order of (time, drone, sensor)."""
-        out, tick_ns = [], self._tick_ns
-        fixes: list[int] = []
-        index, values = self._senses.whose[:logged].tolist(), self._senses.value[:logged].tolist()
-        for (s, i, tick), value in zip(index, values, strict=True):
-            t_ns = tick * tick_ns
-            if s == sensor_set.GPS:
-                fixes.append(len(out))
-            name, size, latency_ns = self._kinds[i][s]
-            out.append(Sample(name, i, t_ns + latency_ns, t_ns, tuple(value[:size])))
-        if fixes:
-            self._locate(out, fixes)
-        return out
-
-    def _locate(self, out: list[Sample], fixes: list[int]) -> None:
-        """Put latitude, longitude and height in front of the values of GPS samples."""
-        places = geodetic(np.array([out[k].values[:3] for k in fixes]), *self._anchor).tolist()
-        for k, place in zip(fixes, places, strict=True):
-            out[k] = replace(out[k], values=(*place, *out[k].values))
-
-    def _due(self, fresh: list[Sample]) -> list[Sample]:
-        """Return what is due by now of the fresh and the delayed samples, and keep the rest."""
-        now, waiting = self.t_ns, self._later + fresh
-        self._later = [sample for sample in waiting if sample.t_ns > now]
-        return sorted((sample for sample in waiting if sample.t_ns <= now), key=_order)
-
-
-def _order(sample: Sample) -> tuple[int, int, int]:
-    return sample.t_ns, sample.drone, SENSORS.index(sample.sensor)
-
-
-def _latencies(scenario: Scenario) -> list[list[int]]:
-    """Return t_ns - t_sample_ns of each drone and sensor [ns]."""
-    return [
-        [round(getattr(drone.sensors, name).latency_ms * 1_000_000) for name in SENSORS] for drone in scenario.drones
-    ]
+            self._began = [(int(i), int(j)) for i, j in np.argwhere(self.bodies.touched)]
+            self.touching[np.argwhere(self.bodies.touched | self.bodies.touching).ravel()] = True
 
 
 def _gps_sigma(gps: Gps) -> float:

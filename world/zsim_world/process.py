@@ -14,6 +14,7 @@ import msgspec
 
 from zsim import batch, keys, messages, rights, session
 from zsim.agent import Output
+from zsim.bundle import Bundle
 from zsim.errors import DecodeError
 from zsim.health import HealthMeter
 from zsim.identity import Identity
@@ -31,7 +32,7 @@ STUCK_NS = 2_000_000_000  # wall time in one turn from which on a person is told
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
-BYE_NS = 200_000_000  # wall time by which a bye may come after the news that the token of its process went
+BYE_NS = 100_000_000  # wall time by which a bye may come after the news that the token of its process went
 NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
 RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
 RETURN_NS = 10_000_000_000  # wall time after a return to the run in which it may take until it can be asked
@@ -389,7 +390,9 @@ class WorldProcess:
         outbox = self._world.take_outbox()
         if not outbox:
             return
-        encoded = [(key, messages.encode(message)) for key, message in outbox]
+        encoded: batch.Batch = []
+        for key, message in outbox:
+            encoded += message.encoded if type(message) is Bundle else [(key, messages.encode(message))]
         if self._link.heard(batch.GATE):
             self._link.put_raw(batch.GATE, batch.encode(encoded))
         self._link.put_all(encoded)

@@ -8,7 +8,7 @@ import uuid
 from collections.abc import Callable
 from typing import Any
 
-from zsim import CONTRACT, __version__, keys, messages, scenario_file
+from zsim import CONTRACT, __version__, batch, keys, messages, scenario_file
 from zsim.death import on_death
 from zsim.fingerprint import fingerprint
 from zsim.scenario import Scenario
@@ -16,11 +16,12 @@ from zsim_world.barrier import Barrier, Participant
 from zsim_world.command_desk import CommandDesk
 from zsim_world.commander import Commanders
 from zsim_world.fleet import DivergedError, Fleet
-from zsim_world.publication import Outgoing, Publication
+from zsim_world.publication import Publication
 from zsim_world.requests import Requests, brief
 from zsim_world.statistics import Measurements
 from zsim_world.truth_hash import TruthHash
 
+Outgoing = tuple[str, Any]  # key and message; or batch.GATE and the Bundle of what the drones say at a gate
 REFUSALS_TOLD = 20  # events per source and reason; what follows is counted only
 
 
@@ -289,15 +290,8 @@ class World:
             self.event("collision", self.fleet.names[i], f"{pair} collide", other=self.fleet.names[j])
 
     def _publish_gate(self, wall_ns: int) -> None:
-        truth = self.fleet.truth()
-        self._hash.add(
-            self.now_ns,
-            truth.position_m,
-            truth.velocity_m_s,
-            truth.orientation_wxyz,
-            truth.angular_velocity_rad_s,
-        )
-        self.outbox.extend(self._publication.gate(truth, self.commanders.holder))
+        self._hash.add(self.now_ns, self.fleet.bodies.state)
+        self.outbox.append((batch.GATE, self._publication.gate(self.commanders.holder)))
         self._measured.gate(self.now_ns, wall_ns)
         self.tell_clock()
 

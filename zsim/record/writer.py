@@ -10,7 +10,8 @@ import msgspec
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from zsim import messages
+from zsim import batch, messages
+from zsim.bundle import Bundle
 from zsim.errors import RecordError
 from zsim.record.finish import finish, finish_bare, write_all
 from zsim.record.layout import HEAD, MESSAGE, MESSAGE_FIXED, chunk, opening, packed
@@ -21,7 +22,7 @@ CHANNELS_MAX = 65_535  # MCAP counts channels in 16 bits
 _SEQUENCE_MASK = 2**32 - 1  # MCAP counts messages of a channel in 32 bits
 _TIME_MAX = 2**64 - 1
 _MESSAGE = int(Opcode.MESSAGE)
-_pack = MESSAGE.pack
+_pack, _pack_into = MESSAGE.pack, MESSAGE.pack_into
 _encode = messages.encode
 
 
@@ -59,7 +60,7 @@ class RecordWriter:
         self._channels: dict[str, _Channel] = {}
         self._schemas: dict[str, int] = {}
         self._ahead: list[bytes] = []  # schemas and channels that the open chunk is the first to use
-        self._open: list[bytes] = []
+        self._open: list[bytes | bytearray] = []
         self._size = 0
         self._since_ns = 0  # first message of the open chunk
         self._seen = (0, 0)  # where the file ended at a tick, and when that tick was
@@ -91,16 +92,51 @@ class RecordWriter:
             self._take(channel, payload, _time(t_ns), _time(wall_ns))
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Take one message of this process, encoded as for the wire.
+        """Take one message of this process, encoded as for the wire, or a bundle on its key.
 
         Raises:
             RecordError: as `add`.
         """
+        if key == batch.GATE:
+            self.add_bundle(message, wall_ns)
+            return
         channel = self._channels.get(key) or self._register(key, messages.encoding(key))
         if channel is None:
             self.refused += 1
             return
         self._take(channel, _encode(message), message.t_ns, wall_ns)
+
+    def add_bundle(self, bundle: Bundle, wall_ns: int) -> None:
+        """Take the messages of a bundle, and its buffer, to which the bytes before each payload are added here.
+
+        Raises:
+            RecordError: as `add`.
+        """
+        places: list[int] = bundle.which.tolist()
+        keys = [bundle.table[place] for place in places]
+        found = [self._channels.get(key) or self._register(key, messages.encoding(key)) for key in keys]
+        channels = [channel for channel in found if channel is not None]
+        if len(channels) < len(keys):
+            self._add_each(bundle, wall_ns)
+            return
+        if not self._size:
+            self._since_ns = wall_ns
+        buffer, at, start = bundle.buffer, self._size, 0
+        for channel, t_ns, end in zip(channels, bundle.stamps.tolist(), bundle.ends.tolist(), strict=True):
+            count, length = channel.count, end - start - HEAD.size
+            _pack_into(buffer, start, _MESSAGE, length, channel.number, count & _SEQUENCE_MASK, t_ns, wall_ns)
+            channel.entries += (t_ns, at + start)
+            channel.count = count + 1
+            start = end
+        self._open.append(buffer)
+        self.messages += len(bundle)
+        self._size = at + start
+        if self._size >= CHUNK_BYTES or wall_ns - self._since_ns >= CHUNK_AGE_NS:
+            self._end_chunk()
+
+    def _add_each(self, bundle: Bundle, wall_ns: int) -> None:
+        for (key, payload), t_ns in zip(bundle.encoded, bundle.stamps.tolist(), strict=True):
+            self.add(key, payload, messages.encoding(key), t_ns, wall_ns)
 
     def _take(self, channel: _Channel, payload: bytes, t_ns: int, wall_ns: int) -> None:
         length, count, at = len(payload) + MESSAGE_FIXED, channel.count, self._size

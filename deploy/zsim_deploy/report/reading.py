@@ -9,7 +9,8 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from zsim import keys, scenario_file
+from zsim import batch, keys, scenario_file
+from zsim.bundle import Bundle
 from zsim.errors import ZsimError
 from zsim.messages import Bye, Event, Info, Join, Quaternion, Vector3
 from zsim.record import Recorded, RecordReader
@@ -111,11 +112,20 @@ class Reading:
             self._last_wall_ns = message.wall_ns
         take(_thing(message.key), decoded)
 
-    def keep(self, key: str, message: Struct) -> None:
-        """Take one message of a flight in this process; it has not been encoded."""
+    def keep(self, key: str, message: Any) -> None:
+        """Take one message of a flight in this process, not encoded, or a bundle."""
+        if key == batch.GATE:
+            self._keep_bundle(message)
+            return
         taker = self.taker(key)
         if taker is not None:
             taker[1](_thing(key), message)
+
+    def _keep_bundle(self, bundle: Bundle) -> None:
+        for key, payload in bundle.encoded:
+            taker = self.taker(key)
+            if taker is not None:
+                taker[1](_thing(key), taker[0].decode(payload))
 
     def _take_truth(self, name: str, truth: _Truth) -> None:
         times, values = self._truth.setdefault(name, (array("q"), array("d")))

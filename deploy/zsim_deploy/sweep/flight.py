@@ -10,7 +10,6 @@ from shutil import rmtree
 from typing import Any
 
 import msgspec
-from msgspec import Struct
 
 from zsim import keys, scenario_file
 from zsim.errors import RecordError, ZsimError
@@ -27,7 +26,7 @@ from zsim_deploy.sweep.row import Result, Row, failed, row
 from zsim_deploy.sweep.task import Task
 from zsim_world.world import World
 
-Sink = Callable[[str, Struct], None]
+Sink = Callable[[str, Any], None]
 REASON_MAX = 300  # characters
 
 
@@ -77,7 +76,7 @@ def flown(scenario: Scenario, keep: Sink | None = None) -> tuple[Flight, Excepti
 
 
 def _both(first: Sink, second: Sink) -> Sink:
-    def sink(key: str, message: Struct) -> None:
+    def sink(key: str, message: Any) -> None:
         first(key, message)
         second(key, message)
 

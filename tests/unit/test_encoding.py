@@ -1,0 +1,122 @@
+"""Messages written from rows are to the byte what the encoder of objects gives."""
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from zsim import messages
+from zsim.encoding import BOOL, FLOATS, INT, Layouts, read, words, write
+
+WHOLE = st.integers(-(2**63), 2**63 - 1) | st.sampled_from(
+    [0, 127, 128, 255, 256, 65535, 65536, 2**32 - 1, 2**32, -1, -32, -33, -128, -129, -32768, -32769, -(2**31) - 1]
+)
+COUNT = WHOLE.map(lambda value: value if value >= 0 else -(value + 1))
+NUMBER = st.floats(allow_nan=False, allow_infinity=False)
+TEXTS = ["landed", "flying", "", "controller.main", "ö" * 15, None]
+SENSORS = ("gps", "mag", "baro", "sonar", "flow", "imu")
+
+
+def written(kinds: list[type], rows: list[tuple[int, list[int], list[float]]]) -> list[bytes]:
+    """Return what is written of (kind, whole numbers, floats), having read it again."""
+    layouts, texts = Layouts(kinds, {"sensors": SENSORS}), words(TEXTS)
+    found = []
+    for kind, whole, real in rows:
+        ints, floats = padded(whole, layouts.ints, np.int64), padded(real, layouts.floats, np.float64)
+        out = np.zeros(layouts.room(texts), dtype=np.uint8)
+        size = write(layouts.program, texts, kind, ints, floats.view(np.uint64), out, 0)
+        found.append(out[:size].tobytes())
+        check_reading(layouts, kind, found[-1], ints, floats)
+    return found
+
+
+def padded(values: list[Any], size: int, dtype: type) -> np.ndarray:
+    return np.array([*values, *[0] * size][:size], dtype=dtype)
+
+
+def check_reading(layouts: Layouts, kind: int, payload: bytes, ints: np.ndarray, floats: np.ndarray) -> None:
+    """Whatever was written is read again, but for texts; what is cut off or longer is not."""
+    data = np.frombuffer(payload, dtype=np.uint8)
+    again, bits = ints.copy(), np.zeros(len(floats), dtype=np.uint64)
+    for end in range(0, len(data), 41):
+        assert not read(layouts.program, kind, data, 0, end, again, bits)
+    assert not read(layouts.program, kind, np.append(data, np.uint8(0)), 0, len(data) + 1, again, bits)
+    again, bits = ints.copy(), floats.view(np.uint64).copy()
+    places = layouts.program.ops[layouts.program.first[kind] : layouts.program.first[kind + 1]]
+    for op, place, size in places.tolist():
+        if op in (INT, BOOL):
+            again[place] = 99
+        elif op == FLOATS:
+            bits[place : place + size] = 0
+    assert read(layouts.program, kind, data, 0, len(data), again, bits)
+    assert again.tolist() == ints.tolist()
+    assert bits.tolist() == floats.view(np.uint64).tolist()
+
+
+@given(st.data())
+@settings(max_examples=10, deadline=None)
+def test_any_numbers_give_the_encoders_bytes(data: st.DataObject) -> None:
+    t_ns, seq, count = data.draw(COUNT), data.draw(COUNT), data.draw(COUNT)
+    sample_ns = data.draw(WHOLE)
+    real = data.draw(st.lists(NUMBER, min_size=51, max_size=51))
+    flag, text, name = data.draw(st.booleans()), data.draw(st.integers(0, 1)), data.draw(st.integers(0, len(TEXTS) - 1))
+    tally = data.draw(st.lists(COUNT, min_size=12, max_size=12))
+    source: Any = TEXTS[data.draw(st.integers(0, 4))]
+    imu: Any = messages.Imu  # rows have no shapes to be checked
+    gps: Any = messages.Gps
+    estimate: Any = messages.Estimate
+    three, pairs = tuple(real[:3]), {kind: (tally[2 * k], tally[2 * k + 1]) for k, kind in enumerate(SENSORS)}
+    state: Any = TEXTS[text]
+    cases: list[tuple[Any, list[int]]] = [
+        (imu(t_ns, seq, sample_ns, three, tuple(real[3:6])), [t_ns, seq, sample_ns]),
+        (gps(t_ns, seq, sample_ns, *real[:3], tuple(real[3:6]), tuple(real[6:9]), real[9], count, 9),
+         [t_ns, seq, sample_ns, count, 9]),
+        (messages.Sonar(t_ns, seq, sample_ns, real[0], flag), [t_ns, seq, sample_ns, flag]),
+        (messages.Status(t_ns, seq, state, real[0], flag, TEXTS[name], count), [t_ns, seq, text, flag, name, count]),
+        (estimate(t_ns, seq, three, tuple(real[3:6]), tuple(real[6:10]), real[10], tuple(real[11:47]),
+                           real[47], tuple(real[48:51]), pairs, source),
+         [t_ns, seq, *tally, TEXTS.index(source)]),
+    ]  # fmt: skip
+    rows = [(k, whole, real) for k, (_, whole) in enumerate(cases)]
+    found = written([type(message) for message, _ in cases], rows)
+    assert found == [messages.encode(message) for message, _ in cases]
+
+
+@pytest.mark.parametrize("kind", [messages.Mag, messages.Baro, messages.Flow, messages.Truth])
+def test_every_kind_that_a_world_says_has_a_layout(kind: type) -> None:
+    values = [0.5 * k for k in range(20)]
+    whole = [7, 300] if kind is messages.Truth else [7, 300, -5]
+    (payload,) = written([kind], [(0, whole, values)])
+    message: Any = messages.decode_as(kind, payload, "here")
+    assert (message.t_ns, message.seq) == (7, 300)
+    assert messages.encode(message) == payload
+
+
+def test_a_kind_with_a_list_of_any_length_has_none() -> None:
+    class Several(msgspec.Struct):
+        values: list[float]
+
+    with pytest.raises(TypeError, match="Several: values"):
+        Layouts([Several])
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
+def test_what_is_not_finite_is_not_read(bad: float) -> None:
+    layouts = Layouts([messages.Mag])
+    payload = messages.encode(messages.Mag(1, 2, 3, (0.0, bad, 1.0)))
+    ints, bits = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.uint64)
+    assert not read(layouts.program, 0, np.frombuffer(payload, dtype=np.uint8), 0, len(payload), ints, bits)
+
+
+def test_fields_in_another_order_or_of_another_type_are_not_read() -> None:
+    layouts = Layouts([messages.Mag])
+    ints, bits = np.zeros(3, dtype=np.int64), np.zeros(3, dtype=np.uint64)
+    for message in ({"seq": 1, "t_ns": 2, "t_sample_ns": 3, "field_ut": [1.0, 2.0, 3.0]},
+                    {"t_ns": 1.0, "seq": 2, "t_sample_ns": 3, "field_ut": [1.0, 2.0, 3.0]},
+                    {"t_ns": 1, "seq": 2, "t_sample_ns": 3, "field_ut": [1, 2.0, 3.0]},
+                    {"t_ns": 2**64 - 1, "seq": 2, "t_sample_ns": 3, "field_ut": [1.0, 2.0, 3.0]}):  # fmt: skip
+        data = np.frombuffer(msgspec.msgpack.encode(message), dtype=np.uint8)
+        assert not read(layouts.program, 0, data, 0, len(data), ints, bits)

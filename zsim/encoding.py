@@ -1,0 +1,250 @@
+"""Messages of one kind after another as msgpack, from rows of numbers: the bytes that `messages.encode` gives.
+
+A layout is what stands in every message of a kind: names, heads of arrays, and the places of its values.
+
+    rows of numbers ── write ──▶ bytes ── read ──▶ rows of numbers
+
+`write` and `read` are plain source for whoever compiles them: an object and an encoding of every message cost twenty
+times as much.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+from msgspec import inspect as kinds_of
+from numpy.typing import NDArray
+
+LITERAL, FLOATS, INT, BOOL, TEXT = range(5)
+GAP = 31  # bytes left free before each payload: what a record puts there, see `zsim.record.layout.MESSAGE`
+INT_BYTES_MAX, FLOAT_BYTES = 9, 9
+FLOAT64, NIL, FALSE, TRUE, MAP = 0xCB, 0xC0, 0xC2, 0xC3, 0x80  # msgpack's marks
+UINT8, INT8 = 0xCC, 0xD0  # and those of 16, 32 and 64 bits after them
+TEXT_MIN, TEXT_MAX = 0xA0, 0xBF  # a text of 0 to 31 bytes
+INFINITE = np.uint64(0x7FF0_0000_0000_0000)  # exponent of what is not finite
+Named = Mapping[str, Sequence[str]]
+
+
+class Program(NamedTuple):
+    """The layouts of some kinds, as `write` reads them."""
+
+    ops: NDArray[np.int64]  # (K, 3): what, and its two arguments
+    first: NDArray[np.int64]  # (kinds + 1,), where the layout of each kind begins
+    literals: NDArray[np.uint8]
+
+
+class Words(NamedTuple):
+    """Texts that may stand in a message, by number."""
+
+    data: NDArray[np.uint8]
+    ends: NDArray[np.int64]
+
+
+class Layouts:
+    """How messages of some kinds are written.
+
+    A kind's whole numbers, truths and texts (by their number in Words) stand in one row, its floats in another, both
+    in the order of its fields.
+
+    Args:
+        kinds: of messages, in the order in which `write` counts them.
+        named: by field, the names in a map of pairs of whole numbers.
+
+    Raises:
+        TypeError: a field is of a type that has no place here.
+    """
+
+    def __init__(self, kinds: Iterable[type[Struct]], named: Named | None = None) -> None:
+        self._literals = bytearray()
+        self._ops: list[tuple[int, int, int]] = []
+        self.ints = self.floats = self._int = self._float = 0
+        first = []
+        for kind in kinds:
+            first.append(len(self._ops))
+            self._add(kind, named or {})
+        first.append(len(self._ops))
+        ops, literals = np.array(self._ops, dtype=np.int64), np.frombuffer(bytes(self._literals), dtype=np.uint8)
+        self.program = Program(ops, np.array(first), literals)
+
+    def room(self, words: Words) -> int:
+        """Return the bytes that a message can have at most, with GAP."""
+        longest = int(np.diff(words.ends, prepend=0).max(initial=0))
+        fixed = sum(size for op, _, size in self._ops if op == LITERAL)
+        return GAP + fixed + self.floats * FLOAT_BYTES + self.ints * max(INT_BYTES_MAX, longest)
+
+    def _add(self, kind: type[Struct], named: Named) -> None:
+        fields: Any = kinds_of.type_info(kind)
+        self._int = self._float = 0
+        self._ops.append((LITERAL, len(self._literals), 0))
+        self._literal(bytes([MAP | len(fields.fields)]))
+        for field in fields.fields:
+            self._literal(packed(field.encode_name))
+            where = f"{kind.__name__}: {field.encode_name}"
+            self._value(field.type, named.get(field.encode_name, ()), where)
+        self.ints, self.floats = max(self.ints, self._int), max(self.floats, self._float)
+
+    def _value(self, kind: Any, names: Sequence[str], where: str) -> None:
+        if isinstance(kind, kinds_of.FloatType):
+            self._take_floats(1)
+        elif isinstance(kind, kinds_of.TupleType):
+            self._literal(array_head(len(kind.item_types)))
+            self._take_floats(len(kind.item_types))
+        elif isinstance(kind, kinds_of.VarTupleType) and kind.min_length == kind.max_length and kind.min_length:
+            self._literal(array_head(kind.min_length))
+            self._take_floats(kind.min_length)
+        elif isinstance(kind, kinds_of.DictType):
+            self._pairs(names)
+        elif type(kind) in _WHOLE:
+            self._take_int(_WHOLE[type(kind)])
+        else:
+            raise TypeError(f"{where} is of a type that has no fixed place in a row")
+
+    def _pairs(self, names: Sequence[str]) -> None:
+        self._literal(bytes([MAP | len(names)]))
+        for name in names:
+            self._literal(packed(name) + array_head(2))
+            self._take_int(INT)
+            self._take_int(INT)
+
+    def _take_floats(self, count: int) -> None:
+        self._ops.append((FLOATS, self._float, count))
+        self._float += count
+
+    def _take_int(self, op: int) -> None:
+        self._ops.append((op, self._int, 0))
+        self._int += 1
+
+    def _literal(self, data: bytes) -> None:
+        op, place, size = self._ops[-1]
+        if op == LITERAL:
+            self._ops[-1] = (LITERAL, place, size + len(data))
+        else:
+            self._ops.append((LITERAL, len(self._literals), len(data)))
+        self._literals += data
+
+
+_WHOLE = {
+    kinds_of.IntType: INT,
+    kinds_of.BoolType: BOOL,
+    kinds_of.LiteralType: TEXT,
+    kinds_of.StrType: TEXT,
+    kinds_of.UnionType: TEXT,
+}
+
+packed = msgspec.msgpack.Encoder().encode
+
+
+def array_head(size: int) -> bytes:
+    """Return what stands before the entries of an array."""
+    return packed([0] * size)[:-size]
+
+
+def words(texts: Iterable[str | None]) -> Words:
+    """Return texts as `write` reads them."""
+    parts = [packed(text) for text in texts]
+    return Words(np.frombuffer(b"".join(parts), dtype=np.uint8), np.cumsum([len(part) for part in parts]))
+
+
+def write(program: Program, words: Words, kind: int, ints: NDArray, bits: NDArray, out: NDArray, start: int) -> int:
+    """Write one message into `out` from `start` on; return where it ends. To be compiled.
+
+    Args:
+        program, words: see Layouts.
+        kind: of the message.
+        ints: its whole numbers (I,); bits: its floats (F,) as uint64.
+        out: uint8, with room enough.
+    """
+    at = start
+    for k in range(program.first[kind], program.first[kind + 1]):
+        op, place, size = program.ops[k, 0], program.ops[k, 1], program.ops[k, 2]
+        if op == LITERAL:
+            for i in range(size):
+                out[at + i] = program.literals[place + i]
+            at += size
+        elif op == FLOATS:
+            for column in range(place, place + size):
+                out[at] = FLOAT64
+                for i in range(8):
+                    out[at + 1 + i] = (bits[column] >> np.uint64(56 - 8 * i)) & np.uint64(0xFF)
+                at += FLOAT_BYTES
+        elif op == BOOL:
+            out[at] = TRUE if ints[place] else FALSE
+            at += 1
+        elif op == TEXT:
+            word = ints[place]
+            for i in range(words.ends[word - 1] if word else 0, words.ends[word]):
+                out[at] = words.data[i]
+                at += 1
+        else:
+            value, size = ints[place], 1
+            if value < -32 or value > 127:
+                reach = value if value > 0 else 2 * (-1 - value)  # int8 reaches to -128 as uint8 does to 255
+                power = 0 if reach < 1 << 8 else 1 if reach < 1 << 16 else 2 if reach < 1 << 32 else 3
+                size = 1 << power
+                out[at] = (UINT8 if value > 0 else INT8) + power
+                at += 1
+            for i in range(size):
+                out[at + i] = (value >> (8 * (size - 1 - i))) & 0xFF
+            at += size
+    return at
+
+
+def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints: NDArray, bits: NDArray) -> bool:
+    """Read a message that `write` could have written; False for any other, which may be right all the same.
+
+    Texts are passed over. To be compiled.
+
+    Args:
+        program: see Layouts.
+        kind: of the message.
+        data: uint8; the message is what stands in [start, end).
+        ints: takes its whole numbers (I,); bits: its floats (F,) as uint64. All floats are finite.
+    """
+    at = start
+    for k in range(program.first[kind], program.first[kind + 1]):
+        op, place, size = program.ops[k, 0], program.ops[k, 1], program.ops[k, 2]
+        if at + (size if op == LITERAL else size * FLOAT_BYTES if op == FLOATS else 1) > end:
+            return False
+        if op == LITERAL:
+            for i in range(size):
+                if data[at + i] != program.literals[place + i]:
+                    return False
+            at += size
+        elif op == FLOATS:
+            for column in range(place, place + size):
+                word = np.uint64(0)
+                for i in range(8):
+                    word = (word << np.uint64(8)) | np.uint64(data[at + 1 + i])
+                if data[at] != FLOAT64 or (word & INFINITE) == INFINITE:
+                    return False
+                bits[column] = word
+                at += FLOAT_BYTES
+        else:
+            mark = np.int64(data[at])
+            at += 1
+            if op == BOOL:
+                if mark != TRUE and mark != FALSE:
+                    return False
+                ints[place] = mark == TRUE
+            elif op == TEXT:
+                if mark != NIL and not TEXT_MIN <= mark <= TEXT_MAX:
+                    return False
+                at += 0 if mark == NIL else mark - TEXT_MIN
+            else:
+                size, value = 0, mark if mark < 0x80 else mark - 0x100
+                if 0x80 <= mark < 0xE0:
+                    if not UINT8 <= mark <= INT8 + 3:
+                        return False
+                    size = 1 << ((mark - UINT8) & 3)
+                    if at + size > end:
+                        return False
+                    value = np.int64(-1 if mark >= INT8 and data[at] >= 0x80 else 0)
+                    for i in range(size):
+                        value = (value << 8) | np.int64(data[at + i])
+                    if mark == UINT8 + 3 and value < 0:
+                        return False
+                ints[place] = value
+                at += size
+    return at == end
