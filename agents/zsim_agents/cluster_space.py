@@ -37,6 +37,7 @@ class ClusterSpace(ABC):
         names: their names in the order of c; lengths in metres, angles in radians.
         angular: (4n,) bool, true for the angles that wrap (roll, yaw, phi_i, azimuth_k).
         in_radians: (4n,) bool, true for all angles, also those that do not wrap (pitch, beta, elevation_k).
+        period: (4n,) of the angles that wrap, 2 pi, and 0 for all else.
         bounds: (4n, 2) open bounds of the values that `forward` can give, infinite where there is none.
         neutral: (4n,) bool, true for the variables that are zero in a formation of which nothing else was said: tilts,
             headings against the formation, departures from a template.
@@ -53,7 +54,7 @@ class ClusterSpace(ABC):
         self.angular = np.array([stem in {"roll", "yaw", "phi", "azimuth"} for stem in stems])
         self.in_radians = self.angular | np.array([stem in _BOUNDED_ANGLES for stem in stems])
         self.neutral = np.array([stem in {"roll", "pitch", "phi", "w"} for stem in stems])
-        self._period = np.where(self.angular, TAU, 0.0)
+        self.period = np.where(self.angular, TAU, 0.0)
         self.bounds = np.array([_BOUNDS.get(stem, (-math.inf, math.inf)) for stem in stems])
         self.tilts = tuple(i for i, stem in enumerate(stems) if stem in {"roll", "pitch"})
         self._lengths = [i for i, stem in enumerate(stems) if stem in _LENGTHS]
@@ -97,7 +98,7 @@ class ClusterSpace(ABC):
 
     def motion(self, c: Array, c_dot: Array) -> Array:
         """Return r_dot (4n,) = J^-1 c_dot; spaces whose J^-1 is large have a shorter way than through the matrix."""
-        return self.inverse_jacobian(c) @ c_dot
+        return self.inverse_jacobian(c).dot(c_dot)  # the same bits as @, in half of its time at so small a size
 
     def specimen(self, apart_m: float) -> Array:
         """Return c (4n,) of some formation with robots at least so far apart, level, to try code on."""
@@ -113,7 +114,12 @@ class ClusterSpace(ABC):
         further robot on the z axis through robot 1, or pitch at 90 degrees), and a length: how far one
         robot may move before a level formation becomes singular.
         """
-        return self.spread(c) * math.cos(c[self._pitch])
+        return self.measures(c)[1]
+
+    def measures(self, c: Array) -> tuple[float, float]:
+        """Return spread and margin [m]."""
+        spread = self.spread(c)
+        return spread, spread * math.cos(c[self._pitch])
 
     def condition(self, c: Array) -> float:
         """Return the condition number of J^-1 (2-norm, metres and radians as they are).
@@ -131,8 +137,12 @@ class ClusterSpace(ABC):
         return self.wrapped(c_to - c_from)
 
     def wrapped(self, c: Array) -> Array:
-        """Return c (4n,) with the angles that wrap taken to [-pi, pi]."""
-        return wrapped(c, self._period)
+        """Return c (4n,), or a table (m, 4n) of them, with the angles that wrap taken to [-pi, pi]."""
+        if c.ndim > 1:
+            return c - self.period * np.rint(c / TAU)
+        near = np.empty(self.size)
+        put_wrapped(c, self.period, near)
+        return near
 
     def index(self, name: str) -> int:
         """Return the place of a variable in c.
@@ -167,9 +177,10 @@ def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Arr
 
 
 @compiled
-def wrapped(c: Array, period: Array) -> Array:
-    """Return c with each variable taken to half a period about zero; period is 2 pi or, for none, 0."""
-    return c - period * np.rint(c / TAU)
+def put_wrapped(c: Array, period: Array, near: Array) -> None:
+    """Write c with each variable taken to half a period about zero; period is 2 pi or, for none, 0."""
+    for k in range(c.size):
+        near[k] = c[k] - period[k] * np.rint(c[k] / TAU)
 
 
 def closest_pair(p_W: Array) -> tuple[float, int, int]:

@@ -29,6 +29,8 @@ SOURCES = (  # every file that uses `compiled`
     "near_pairs.py",
     "pair_cluster.py",
     "reference_check.py",
+    "rotation_fit.py",
+    "template_cluster.py",
     "trajectory.py",
     "triad_cluster.py",
 )

@@ -85,6 +85,8 @@ class Engagement:
         self._landing_s = -math.inf
         self._fault = ""  # why an engaged formation does not close its loop
         self._well_since_s = math.inf
+        self._sound = np.empty(0)  # the last reference that may be flown; one at rest stays the same array
+        self._shown = self._sound, self._sound  # the last reference and the same with wrapped angles
 
     @property
     def phase(self) -> str:
@@ -191,7 +193,7 @@ class Engagement:
         alarmed: Pairs = ()
         if self.judge.estimate_fault(gate) is None:
             below_m = self.limits.assembly_height_m - gate.p_W[:, 2]
-            v_W[:, 2] = np.clip(CLIMB_GAIN_1_S * below_m, 0.0, self.limits.assembly_climb_m_s)
+            v_W[:, 2] = np.minimum(np.maximum(CLIMB_GAIN_1_S * below_m, 0.0), self.limits.assembly_climb_m_s)
             v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, self.gains)
         return self._output(gate, reason, modes=modes, command=self._upright(v_W, alarmed))
 
@@ -205,7 +207,9 @@ class Engagement:
         reason = "held on request" if self.guidance.paused else ""
         if command.guarded:
             reason = f"the guard parts {self._pairs(command.guarded)}"
-        return self._output(gate, reason, command=command, reference=(self.space.wrapped(c_des), c_dot_des))
+        if c_des is not self._shown[0]:
+            self._shown = c_des, self.space.wrapped(c_des)
+        return self._output(gate, reason, command=command, reference=(self._shown[1], c_dot_des))
 
     def _held(self, gate: GateInput) -> GateOutput:
         v_W = np.zeros((self.space.n, 3))
@@ -247,7 +251,9 @@ class Engagement:
     def _reference_fault(self, t_s: float) -> str | None:
         """Return why the reference may not be flown now: checks before the flight end after a while."""
         try:
-            fault = place_fault(self.space, self.guidance.value(t_s)[0], self.gains, self.limits.shape)
+            c_des = self.guidance.value(t_s)[0]
+            fault = None if c_des is self._sound else place_fault(self.space, c_des, self.gains, self.limits.shape)
+            self._sound = self._sound if fault else c_des
         except REFUSALS as error:
             fault = str(error)
         return f"reference: {fault}" if fault else None
@@ -287,10 +293,10 @@ class Engagement:
     @staticmethod
     def _setpoints(gate: GateInput, command: FormationCommand) -> tuple[Setpoint | None, ...]:
         """Return the setpoints of the drones that follow one."""
-        rates = command.yaw_rate.tolist()
-        return tuple(
-            [Setpoint(command.v_W[i], rates[i]) if state in AIRBORNE else None for i, state in enumerate(gate.states)]
-        )
+        setpoints = map(Setpoint, command.v_W.tolist(), command.yaw_rate.tolist())
+        if AIRBORNE.issuperset(gate.states):
+            return tuple(setpoints)
+        return tuple(s if state in AIRBORNE else None for s, state in zip(setpoints, gate.states, strict=True))
 
     def _pairs(self, pairs: Pairs) -> str:
         return ", ".join(f"{self.drones[i]} and {self.drones[j]}" for i, j in pairs)

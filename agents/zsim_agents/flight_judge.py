@@ -8,7 +8,7 @@ from zsim_agents.cluster_space import Array, ClusterSpace, SingularClusterError,
 from zsim_agents.compiled import compiled
 from zsim_agents.flight_data import AIRBORNE, EngagementLimits, GateInput
 from zsim_agents.formation import FormationGains
-from zsim_agents.reference_check import FAR, shape_fault
+from zsim_agents.reference_check import FAR, bounds_of, first_outside, shape_fault
 
 WELL, OLD, WILD, VAGUE = range(4)  # what an estimate is: fit, too old, not finite, too uncertain
 
@@ -33,29 +33,34 @@ class FlightJudge:
         self.gains = gains
         self.limits = limits
         self._shape_in_flight = limits.shape_in_flight
+        self._bounds_in_flight = bounds_of(space, self._shape_in_flight)
         self.value: Array = np.zeros(space.size)
         self.margin = 0.0
+        self._spread = 0.0
         self._no_frame: str | None = "nothing was observed yet"
+        self._flaw = (WELL, 0)  # of the estimates of the gate that was observed, by the limits in flight
 
     def observe(self, gate: GateInput) -> None:
         """Take over the estimates of a gate."""
         self.margin, self._no_frame = 0.0, "an estimate is not finite"
-        if not all_near(gate.p_W, gate.yaw):
+        self._flaw = self._first_flaw(gate, self.limits.sigma_lost_m)
+        if self._flaw[0] != WELL and not all_near(gate.p_W, gate.yaw):
             return
         try:
             self.value = self.space.forward(gate.p_W, gate.yaw)
-            self.margin, self._no_frame = self.space.margin(self.value), None
+            self._spread, self.margin = self.space.measures(self.value)
+            self._no_frame = None
         except SingularClusterError as error:
             self._no_frame = str(error)
 
     def take_off_fault(self, gate: GateInput) -> str | None:
         """Return why the drones may not take off; drones that fly already need not stand well."""
-        fault = self.state_fault(gate, AIRBORNE | {"landed"}) or self._estimate_fault(gate, self.limits.sigma_max_m)
+        fault = self.state_fault(gate, AIRBORNE | {"landed"}) or self._start_fault(gate)
         return fault or (self.formation_fault(gate) if "landed" in gate.states else None)
 
     def engagement_fault(self, gate: GateInput) -> str | None:
         """Return why the formation cannot be engaged."""
-        fault = self.state_fault(gate, AIRBORNE) or self._estimate_fault(gate, self.limits.sigma_max_m)
+        fault = self.state_fault(gate, AIRBORNE) or self._start_fault(gate)
         if fault:
             return fault
         low = int(np.argmin(gate.p_W[:, 2]))
@@ -67,11 +72,14 @@ class FlightJudge:
     def flight_fault(self, gate: GateInput) -> str | None:
         """Return why the loop of an engaged formation cannot be closed."""
         fault = self.state_fault(gate, AIRBORNE) or self.estimate_fault(gate) or self._no_frame
-        return fault or shape_fault(self.space, self.value, self._shape_in_flight)
+        shape = self._shape_in_flight
+        if fault or (self._spread > shape.spread_min_m and first_outside(self.value, self._bounds_in_flight) < 0):
+            return fault
+        return shape_fault(self.space, self.value, shape, self._spread)
 
     def formation_fault(self, gate: GateInput) -> str | None:
         """Return why the robots, where they are, make no formation to start from."""
-        fault = self._no_frame or shape_fault(self.space, self.value, self.limits.shape)
+        fault = self._no_frame or shape_fault(self.space, self.value, self.limits.shape, self._spread)
         if fault:
             return fault
         distance, i, j = closest_pair(gate.p_W)
@@ -81,8 +89,8 @@ class FlightJudge:
         return f"{pair} are {distance:.2f} m apart; allowed: {self.gains.separation_min_m:g} m or more"
 
     def estimate_fault(self, gate: GateInput) -> str | None:
-        """Return why the estimates of drones in flight cannot be flown on."""
-        return self._estimate_fault(gate, self.limits.sigma_lost_m)
+        """Return why the estimates of drones in flight cannot be flown on, those of the gate that was observed."""
+        return self._in_words(gate, self._flaw, self.limits.sigma_lost_m)
 
     def state_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
         """Return which drone is in another state than those allowed."""
@@ -91,12 +99,19 @@ class FlightJudge:
         drone, state = next(pair for pair in zip(self.drones, gate.states, strict=True) if pair[1] not in allowed)
         return f"{drone} is in state {state}; allowed: {', '.join(sorted(allowed))}"
 
-    def _estimate_fault(self, gate: GateInput, sigma_max_m: float) -> str | None:
+    def _start_fault(self, gate: GateInput) -> str | None:
+        sigma_max_m = self.limits.sigma_max_m
+        return self._in_words(gate, self._first_flaw(gate, sigma_max_m), sigma_max_m)
+
+    def _first_flaw(self, gate: GateInput, sigma_max_m: float) -> tuple[int, int]:
         age_max_s = self.limits.age_max_s
-        kind, i = estimate_flaw(gate.age_s, gate.p_W, gate.v_W, gate.yaw, gate.sigma_m, age_max_s, sigma_max_m)
+        return estimate_flaw(gate.age_s, gate.p_W, gate.v_W, gate.yaw, gate.sigma_m, age_max_s, sigma_max_m)
+
+    def _in_words(self, gate: GateInput, flaw: tuple[int, int], sigma_max_m: float) -> str | None:
+        kind, i = flaw
         if kind == WELL:
             return None
-        drone = self.drones[i]
+        drone, age_max_s = self.drones[i], self.limits.age_max_s
         if kind == OLD:
             return f"the estimate of {drone} is {gate.age_s[i]:.2f} s old; allowed: {age_max_s:g} s"
         if kind == WILD:

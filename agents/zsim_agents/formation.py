@@ -14,17 +14,17 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from zsim_agents.cluster_frame import Vector, between, dot, length, row
-from zsim_agents.cluster_space import Array, ClusterSpace
+from zsim_agents.cluster_space import TAU, Array, ClusterSpace
 from zsim_agents.compiled import compiled
 from zsim_agents.near_pairs import PairTable, near_pairs
 
 Pairs = tuple[tuple[int, int], ...]
 
 Order = NDArray[np.int64]
-Guarding = tuple[int, int, Order]
 
 NEAR_M = 1e-6  # robots that are nearer have no direction from one to the other
 SETTLED_M_S = 1e-9  # a rate that lacks less is reached
@@ -77,7 +77,7 @@ class FormationGains:
         return Limits(*(float(getattr(self, name)) for name in Limits._fields))
 
 
-class FormationCommand(NamedTuple):
+class FormationCommand(Struct, eq=False):
     """What the law asks of the robots.
 
     Attributes:
@@ -101,6 +101,9 @@ class FormationLaw:
         self.space = space
         self.gains = gains or FormationGains()
         self._clamp = np.where(space.in_radians, self.gains.integral_max_rad_s, self.gains.integral_max_m_s)
+        # Scratch of `command`, of which nothing leaves it.
+        self._error, self._c_dot = np.empty(space.size), np.empty(space.size)
+        self._order = np.empty((space.n, space.n), np.int64)
         self.reset()
 
     def reset(self) -> None:
@@ -117,18 +120,15 @@ class FormationLaw:
             c_des, c_dot_des: (4n,) reference and its rate.
             dt_s: time since the last command, for the integral.
         """
-        error = self.space.difference(c_des, c)
-        c_dot = cluster_rate(c_dot_des, error, self.integral, self.gains.k_1_s)
-        r_dot = self.space.motion(c, c_dot)
-        v_cmd_W, yaw_rate, factor, acts = limited(r_dot, p_W, v_W, self.gains.limits)
-        guarded, alarmed = pairs_of(*acts)
-        if factor == 1.0 and not guarded:
-            self._integrate(error, dt_s)
+        space, gains, error, c_dot, order = self.space, self.gains, self._error, self._c_dot, self._order
+        put_cluster_rate(c_des, c, space.period, c_dot_des, self.integral, gains.k_1_s, error, c_dot)
+        r_dot = space.motion(c, c_dot)
+        v_cmd_W, yaw_rate = np.empty((space.n, 3)), np.empty(space.n)
+        factor, guards, alarms = limited(r_dot, p_W, v_W, v_cmd_W, yaw_rate, order, *gains.limits)
+        if factor == 1.0 and not guards:  # the integral runs only while the robots follow the law
+            grow(self.integral, error, gains.integral_1_s2 * dt_s, self._clamp)
+        guarded, alarmed = pairs_of(guards, alarms, order) if guards or alarms else ((), ())
         return FormationCommand(v_cmd_W, yaw_rate, factor, guarded, alarmed)
-
-    def _integrate(self, error: Array, dt_s: float) -> None:
-        """Advance the integral; it runs only while the robots follow the law, and never past its clamp."""
-        self.integral = grown(self.integral, error, self.gains.integral_1_s2 * dt_s, self._clamp)
 
 
 def load(v_W: Array, yaw_rate: Array, gains: FormationGains) -> float:
@@ -145,12 +145,13 @@ def guard(p_W: Array, v_W: Array, v_cmd_W: Array, gains: FormationGains) -> tupl
     which last for their response time. Each robot of a pair takes half of the change;
     a few sweeps settle several pairs.
     """
-    parted_W = v_cmd_W.copy()
-    return parted_W, *pairs_of(*held_apart(p_W, v_W, parted_W, gains.limits))
+    parted_W, order = v_cmd_W.copy(), np.empty((len(p_W), len(p_W)), np.int64)
+    guards, alarms = hold_apart(p_W, v_W, parted_W, order, *gains.limits)
+    return parted_W, *pairs_of(guards, alarms, order)
 
 
 def pairs_of(guards: int, alarms: int, order: Order) -> tuple[Pairs, Pairs]:
-    """Return the pairs that `held_apart` has held apart, and those in alarm."""
+    """Return the pairs that `hold_apart` has held apart, and those in alarm."""
     return _numbered(order) if guards else (), _numbered(order.T) if alarms else ()
 
 
@@ -162,31 +163,35 @@ def _numbered(order: Order) -> Pairs:
 
 
 @compiled
-def cluster_rate(c_dot_des: Array, error: Array, integral: Array, k: float) -> Array:
-    """Return c_dot_des + k error + integral."""
-    c_dot = np.empty(error.size)
-    for i in range(error.size):
+def put_cluster_rate(
+    c_des: Array, c: Array, period: Array, c_dot_des: Array, integral: Array, k: float, error: Array, c_dot: Array
+) -> None:
+    """Write the error c_des - c, angles the short way, and the rate c_dot_des + k error + integral, all (4n,)."""
+    for i in range(c.size):
+        apart = c_des[i] - c[i]
+        error[i] = apart - period[i] * np.rint(apart / TAU)
         c_dot[i] = c_dot_des[i] + k * error[i] + integral[i]
-    return c_dot
 
 
 @compiled
-def limited(r_dot: Array, p_W: Array, v_W: Array, limits: Limits) -> tuple[Array, Array, float, Guarding]:
-    """Return velocities (n, 3) and yaw rates (n,) of r_dot (4n,), saturated and guarded.
+def limited(
+    r_dot: Array, p_W: Array, v_W: Array, v_cmd_W: Array, yaw_rate: Array, order: Order, *limits_of: float
+) -> tuple[float, int, int]:
+    """Write velocities (n, 3) and yaw rates (n,) of r_dot (4n,), saturated and guarded.
 
-    Third comes the factor of the saturation, then what `held_apart` returns.
+    Returns the factor of the saturation, then what `hold_apart` does; limits_of are the fields of Limits: a tuple
+    takes longer to hand over to compiled code than all else here.
     """
-    n = r_dot.size // 4
-    v_cmd_W, yaw_rate = np.empty((n, 3)), np.empty(n)
-    for i in range(n):
+    limits = Limits(*limits_of)
+    for i in range(yaw_rate.size):
         v_cmd_W[i, 0], v_cmd_W[i, 1], v_cmd_W[i, 2] = r_dot[4 * i], r_dot[4 * i + 1], r_dot[4 * i + 2]
         yaw_rate[i] = r_dot[4 * i + 3]
     factor = min(1.0, 1.0 / max(greatest_load(v_cmd_W, yaw_rate, limits), LOAD_MIN))
     scale(v_cmd_W, yaw_rate, factor)
-    acts = held_apart(p_W, v_W, v_cmd_W, limits)
-    if acts[0]:
+    guards, alarms = hold_apart(p_W, v_W, v_cmd_W, order, *limits_of)
+    if guards:
         scale(v_cmd_W, yaw_rate, 1.0 / max(greatest_load(v_cmd_W, yaw_rate, limits), 1.0))
-    return v_cmd_W, yaw_rate, factor, acts
+    return factor, guards, alarms
 
 
 @compiled
@@ -211,23 +216,21 @@ def scale(v_W: Array, yaw_rate: Array, factor: float) -> None:
 
 
 @compiled
-def grown(integral: Array, error: Array, rate: float, clamp: Array) -> Array:
-    """Return integral + rate error within its clamp."""
-    after = np.empty(integral.size)
+def grow(integral: Array, error: Array, rate: float, clamp: Array) -> None:
+    """Add rate error to the integral, within its clamp."""
     for k in range(integral.size):
-        after[k] = min(max(integral[k] + rate * error[k], -clamp[k]), clamp[k])
-    return after
+        integral[k] = min(max(integral[k] + rate * error[k], -clamp[k]), clamp[k])
 
 
 @compiled
-def held_apart(p_W: Array, v_W: Array, v_cmd_W: Array, limits: Limits) -> Guarding:
+def hold_apart(p_W: Array, v_W: Array, v_cmd_W: Array, order: Order, *limits_of: float) -> tuple[int, int]:
     """Change commands in place until every pair separates at its least rate (see `guard`).
 
-    Returns how many pairs were changed, how many are nearer than the alarm threshold, and (n, n) with the
-    numbers of the former, from 1 on, above the diagonal and of the latter below it.
+    Returns how many pairs were changed and how many are nearer than the alarm threshold; writes into order (n, n)
+    the numbers of the former, from 1 on, above the diagonal and of the latter below it, all else zero.
     """
-    n = p_W.shape[0]
-    order = np.zeros((n, n), np.int64)
+    limits = Limits(*limits_of)
+    order[:] = 0
     near = near_pairs(p_W, max(reach(limits), limits.separation_alarm_m))
     alarms = note_alarms(p_W, near, limits.separation_alarm_m, order)
     guards = 0
@@ -242,7 +245,7 @@ def held_apart(p_W: Array, v_W: Array, v_cmd_W: Array, limits: Limits) -> Guardi
                     order[i, j] = guards
         if settled:
             break
-    return guards, alarms, order
+    return guards, alarms
 
 
 @compiled

@@ -11,8 +11,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zsim_agents.cluster_space import Array, ClusterSpace
+
+Places = NDArray[np.intp]
 
 BODY = ("x_c", "y_c", "z_c", "yaw")  # of a group: what a robot of the parent has
 
@@ -31,8 +34,8 @@ class _Group(NamedTuple):
     space: ClusterSpace
     robots: slice
     rows: slice
-    body: list[int]
-    rest: list[int]
+    body: Places
+    rest: Places
     own: slice
     at: slice
 
@@ -58,8 +61,8 @@ class NestedCluster(ClusterSpace):
         self._groups: list[_Group] = []
         names, robots = list(parent.names), 0
         for k, (name, space) in enumerate(groups):
-            body = [space.index(variable) for variable in BODY]
-            rest = [i for i in range(space.size) if i not in body]
+            body = np.array([space.index(variable) for variable in BODY])
+            rest = np.setdiff1d(np.arange(space.size), body)
             own = slice(len(names), len(names) + len(rest))
             after = robots + space.n
             rows, at = slice(4 * robots, 4 * after), slice(4 * k, 4 * k + 4)
@@ -127,11 +130,12 @@ class NestedCluster(ClusterSpace):
     def parts(self, c: Array) -> list[Array]:
         """Return the cluster of the parent (4m,), then the whole cluster of each group (4n_k,)."""
         parent = c[: self.parent.size]
-        p_W, heading = self.parent.inverse(parent)
+        bodies = np.empty((self.parent.n, 4))
+        bodies[:, :3], bodies[:, 3] = self.parent.inverse(parent)
         found = [parent]
         for k, group in enumerate(self._groups):
             own = np.empty(group.space.size)
-            own[group.body], own[group.rest] = (*p_W[k], heading[k]), c[group.own]
+            own[group.body], own[group.rest] = bodies[k], c[group.own]
             found.append(own)
         return found
 
@@ -141,7 +145,11 @@ class NestedCluster(ClusterSpace):
 
     def margin(self, c: Array) -> float:
         """Return the least margin of the parent and of the groups [m]: the whole is singular where one of them is."""
-        return min(space.margin(part) for space, part in self._pairs(c))
+        return self.measures(c)[1]
+
+    def measures(self, c: Array) -> tuple[float, float]:
+        spreads, margins = zip(*(space.measures(part) for space, part in self._pairs(c)), strict=True)
+        return min(spreads), min(margins)
 
     def condition(self, c: Array) -> float:
         """Return the greatest condition number of the parent and of the groups, each in its own measure.

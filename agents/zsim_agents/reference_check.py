@@ -7,8 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from zsim_agents.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair, robot_rates
-from zsim_agents.compiled import compiled
+from zsim_agents.cluster_space import (
+    Array,
+    ClusterSpace,
+    SingularClusterError,
+    closest_pair,
+    least_distance,
+    robot_rates,
+)
+from zsim_agents.compiled import COMPILES, compiled
 from zsim_agents.formation import FormationGains, load
 from zsim_agents.trajectory import Ramp, Reference, Shifted, TrajectoryError, ramp_onto
 
@@ -41,12 +48,16 @@ class ShapeLimits:
     share: float = 0.8  # chosen
 
 
-def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits) -> str | None:
-    """Return why c is no formation to engage or to lead to, or None; names quantity, value and limit."""
+def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: float | None = None) -> str | None:
+    """Return why c is no formation to engage or to lead to, or None; names quantity, value and limit.
+
+    Args:
+        spread: of c, where it is known.
+    """
     outside = first_outside(c, space.bounds)
     if outside >= 0:
         return _value_fault(space, c, outside)
-    spread = space.spread(c)
+    spread = space.spread(c) if spread is None else spread
     if spread <= limits.spread_min_m:
         return f"{space.spread_text} is {spread:.2f} m; allowed: above {limits.spread_min_m:g} m"
     for k in space.tilts:
@@ -57,6 +68,15 @@ def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits) -> str | Non
     if not condition < limits.condition_max:
         return f"condition number of J^-1 is {condition:.1f}; allowed: below {limits.condition_max:g}"
     return None
+
+
+def bounds_of(space: ClusterSpace, limits: ShapeLimits) -> Array:
+    """Return the open bounds (4n, 2) of variables of which `shape_fault` finds none at fault, but for the condition."""
+    bounds = space.bounds.copy()
+    for k in space.tilts:
+        bounds[k, 0] = max(bounds[k, 0], -limits.tilt_max_rad)
+        bounds[k, 1] = min(bounds[k, 1], limits.tilt_max_rad)
+    return bounds
 
 
 @compiled
@@ -78,6 +98,8 @@ def _value_fault(space: ClusterSpace, c: Array, k: int) -> str:
 def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
     """Return why the robots may not stand where c puts them (too near to each other, too low), or None."""
     p_W, _ = space.inverse(c)
+    if COMPILES and well_placed(p_W, gains.separation_min_m, limits.height_min_m):
+        return None
     distance, i, j = closest_pair(p_W)
     if distance < gains.separation_min_m:
         pair = f"robots {i + 1} and {j + 1}"
@@ -88,6 +110,15 @@ def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: Sh
         low = heights.index(lowest)
         return f"robot {low + 1} is at z = {lowest:.2f} m; allowed: {limits.height_min_m:g} m or more"
     return None
+
+
+@compiled
+def well_placed(p_W: Array, separation_min_m: float, height_min_m: float) -> bool:
+    """Return whether robots at p_W (n, 3) are neither too near to each other nor too low."""
+    fit = least_distance(p_W)[0] >= separation_min_m
+    for i in range(p_W.shape[0]):
+        fit = fit and p_W[i, 2] >= height_min_m
+    return fit
 
 
 def reference_fault(

@@ -10,7 +10,9 @@ import math
 
 import numpy as np
 
+from zsim_agents.cluster_frame import row
 from zsim_agents.cluster_space import Array
+from zsim_agents.compiled import compiled
 
 
 def fitted_rotation(H: Array) -> tuple[float, Array]:
@@ -24,31 +26,31 @@ def fitted_rotation(H: Array) -> tuple[float, Array]:
         eigenvalue of tr(S) I - S, S = sum of R^T b_i t_i^T. It is zero where several rotations fit equally well, or
         H is not finite.
     """
-    if not math.isfinite(H.sum()):
+    K, R = np.empty((4, 4)), np.empty((3, 3))
+    if not put_horn_matrix(H, K):
         return 0.0, np.eye(3)
-    values, vectors = np.linalg.eigh(horn_matrix(H))
-    return float(values[3] - values[2]) / 2.0, rotation_of(*vectors[:, 3].tolist())
+    values, vectors = np.linalg.eigh(K)
+    put_rotation_of(vectors[:, 3], R)
+    return float(values[3] - values[2]) / 2.0, R
 
 
-def horn_matrix(H: Array) -> Array:
-    """Return the symmetric (4, 4) whose greatest eigenvector is the quaternion, w first."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = H.tolist()
-    return np.array(
-        [
-            (xx + yy + zz, yz - zy, zx - xz, xy - yx),
-            (yz - zy, xx - yy - zz, xy + yx, zx + xz),
-            (zx - xz, xy + yx, -xx + yy - zz, yz + zy),
-            (xy - yx, zx + xz, yz + zy, -xx - yy + zz),
-        ]
-    )
+@compiled
+def put_horn_matrix(H: Array, K: Array) -> bool:
+    """Write the symmetric (4, 4) whose greatest eigenvector is the quaternion, w first; return whether it is finite."""
+    xx, xy, xz = row(H, 0)
+    yx, yy, yz = row(H, 1)
+    zx, zy, zz = row(H, 2)
+    K[0, 0], K[0, 1], K[0, 2], K[0, 3] = xx + yy + zz, yz - zy, zx - xz, xy - yx
+    K[1, 0], K[1, 1], K[1, 2], K[1, 3] = yz - zy, xx - yy - zz, xy + yx, zx + xz
+    K[2, 0], K[2, 1], K[2, 2], K[2, 3] = zx - xz, xy + yx, -xx + yy - zz, yz + zy
+    K[3, 0], K[3, 1], K[3, 2], K[3, 3] = xy - yx, zx + xz, yz + zy, -xx - yy + zz
+    return math.isfinite(xx + xy + xz + yx + yy + yz + zx + zy + zz)
 
 
-def rotation_of(w: float, x: float, y: float, z: float) -> Array:
-    """Return R (3, 3) of a unit quaternion."""
-    return np.array(
-        [
-            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-            (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-            (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-        ]
-    )
+@compiled
+def put_rotation_of(q: Array, R: Array) -> None:
+    """Write R (3, 3) of a unit quaternion (4,)."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    R[0, 0], R[0, 1], R[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
+    R[1, 0], R[1, 1], R[1, 2] = 2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
+    R[2, 0], R[2, 1], R[2, 2] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)

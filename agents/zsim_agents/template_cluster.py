@@ -17,8 +17,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from zsim_agents.cluster_frame import LENGTH_MIN_M, Vector, euler_axes_C, euler_rates, pitch_yaw, rotation_WC
+from zsim_agents.cluster_frame import LENGTH_MIN_M, euler_axes_C, euler_rates, pitch_yaw, rotation_WC
 from zsim_agents.cluster_space import CONDITION_LENGTH_M, TAU, Array, ClusterSpace, SingularClusterError, numbered
+from zsim_agents.compiled import compiled
 from zsim_agents.rotation_fit import fitted_rotation
 from zsim_agents.shape_modes import centred, shape_modes
 
@@ -65,12 +66,12 @@ class TemplateCluster(ClusterSpace):
         c[3:6] = euler_angles(R_WC)
         c[6 : self._shape] = yaw - c[5]
         c[6 : self._shape] -= TAU * np.rint(c[6 : self._shape] / TAU)
-        c[self._shape :] = self._gathered @ (b_C - self.t_C).ravel()
+        c[self._shape :] = self._gathered.dot((b_C - self.t_C).ravel())
         return c
 
     def inverse(self, c: Array) -> tuple[Array, Array]:
         yaw = c[5] + c[6 : self._shape]
-        return c[:3] + self._places_C(c) @ _rotation(c).T, yaw - TAU * np.rint(yaw / TAU)
+        return c[:3] + self._places_C(c).dot(_rotation(c).T), yaw - TAU * np.rint(yaw / TAU)
 
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
         """Return J; with b_C = R^T (P - C): w_WC_C = M^-1 sum of t_i x R^T v_i, M = tr(S) I - S, S = sum of b_i t_i^T.
@@ -97,7 +98,7 @@ class TemplateCluster(ClusterSpace):
         R_WC, place_C = _rotation(c), self._places_C(c)
         J_inv = np.zeros((self.n, 4, self.size))
         J_inv[:, :3, :3] = np.eye(3)
-        for k, axis_C in enumerate(euler_axes_C(c[3], c[4]), start=3):
+        for k, axis_C in enumerate(_axes_C(c), start=3):
             J_inv[:, :3, k] = place_C @ skew(axis_C).T @ R_WC.T
         J_inv[:, :3, self._shape :] = R_WC @ self.modes_C
         J_inv[:, 3, 5] = 1.0
@@ -105,10 +106,10 @@ class TemplateCluster(ClusterSpace):
         return J_inv.reshape(self.size, self.size)
 
     def motion(self, c: Array, c_dot: Array) -> Array:
-        w_WC_C = c_dot[3:6] @ np.array(euler_axes_C(c[3], c[4]))
-        v_C = self._places_C(c) @ skew(w_WC_C).T + (self._modes @ c_dot[self._shape :]).reshape(self.n, 3)
+        w_WC_C = c_dot[3:6].dot(_axes_C(c))
+        v_C = self._places_C(c).dot(skew(w_WC_C).T) + self._modes.dot(c_dot[self._shape :]).reshape(self.n, 3)
         r_dot = np.empty((self.n, 4))
-        r_dot[:, :3] = c_dot[:3] + v_C @ _rotation(c).T
+        r_dot[:, :3] = c_dot[:3] + v_C.dot(_rotation(c).T)
         r_dot[:, 3] = c_dot[5] + c_dot[6 : self._shape]
         return r_dot.ravel()
 
@@ -127,7 +128,7 @@ class TemplateCluster(ClusterSpace):
         It is the least eigenvalue of M (see `jacobian`) over sqrt(n times that of the template): exact for a template
         of any size, and zero where another rotation would fit as well.
         """
-        S = self._places_C(c).T @ self.t_C
+        S = self._places_C(c).T.dot(self.t_C)
         return float(np.linalg.eigvalsh(inertia((S + S.T) / 2))[0]) / self._reach_m
 
     def condition(self, c: Array) -> float:
@@ -140,7 +141,7 @@ class TemplateCluster(ClusterSpace):
         """
         place_C = self._places_C(c)
         scale = min(1.0, CONDITION_LENGTH_M / max(float(np.linalg.norm(place_C, axis=1).max()), LENGTH_MIN_M))
-        axes = np.array(euler_axes_C(c[3], c[4])).T
+        axes = _axes_C(c).T
         M = scale**2 * axes.T @ inertia(place_C.T @ self.t_C).T  # the template scaled alike
         stiff = np.linalg.solve(scale**2 * self._inertia, M.T)
         whole = scale**2 * axes.T @ inertia(place_C.T @ place_C) @ axes
@@ -155,27 +156,47 @@ class TemplateCluster(ClusterSpace):
 
     def _places_C(self, c: Array) -> Array:
         """Return the places of the robots from the centroid (n, 3) [m; C]."""
-        return self.t_C + (self._modes @ c[self._shape :]).reshape(self.n, 3)
+        return self.t_C + self._modes.dot(c[self._shape :]).reshape(self.n, 3)
 
     def _fitted(self, p_W: Array) -> tuple[Array, Array, Array]:
         """Return the centroid (3,), the places from it in C (n, 3), and R_WC (3, 3)."""
-        centre_W = p_W.mean(axis=0)
+        centre_W = np.add.reduce(p_W, axis=0) / self.n
         b_W = p_W - centre_W
-        gap, R_WC = fitted_rotation(self.t_C.T @ b_W)
+        gap, R_WC = fitted_rotation(self.t_C.T.dot(b_W))
         if not gap > LENGTH_MIN_M * self._reach_m:  # also true for NaN
             raise SingularClusterError(NO_FRAME)
-        return centre_W, b_W @ R_WC, R_WC
+        return centre_W, b_W.dot(R_WC), R_WC
 
 
 def inertia(S: Array) -> Array:
     """Return tr(S) I - S (3, 3)."""
-    return np.trace(S) * np.eye(3) - S
+    M = np.empty((3, 3))
+    put_inertia(S, M)
+    return M
 
 
-def skew(a: Array | Vector) -> Array:
+@compiled
+def put_inertia(S: Array, M: Array) -> None:
+    """Write tr(S) I - S."""
+    trace = S[0, 0] + S[1, 1] + S[2, 2]
+    for i in range(3):
+        for j in range(3):
+            M[i, j] = (trace if i == j else 0.0) - S[i, j]
+
+
+def skew(a: Array) -> Array:
     """Return the matrix (3, 3) of a x ."""
-    x, y, z = a
-    return np.array([(0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)])
+    A = np.empty((3, 3))
+    put_skew(a, A)
+    return A
+
+
+@compiled
+def put_skew(a: Array, A: Array) -> None:
+    """Write the matrix of a x ."""
+    A[0, 0], A[0, 1], A[0, 2] = 0.0, -a[2], a[1]
+    A[1, 0], A[1, 1], A[1, 2] = a[2], 0.0, -a[0]
+    A[2, 0], A[2, 1], A[2, 2] = -a[1], a[0], 0.0
 
 
 def euler_angles(R_WC: Array) -> tuple[float, float, float]:
@@ -185,7 +206,31 @@ def euler_angles(R_WC: Array) -> tuple[float, float, float]:
 
 
 def _rotation(c: Array) -> Array:
-    return np.array(rotation_WC(c[3], c[4], c[5]))
+    R_WC = np.empty((3, 3))
+    put_rotation(c, R_WC)
+    return R_WC
+
+
+@compiled
+def put_rotation(c: Array, R_WC: Array) -> None:
+    """Write R_WC of a cluster (4n,)."""
+    rows = rotation_WC(c[3], c[4], c[5])
+    for i in range(3):
+        R_WC[i, 0], R_WC[i, 1], R_WC[i, 2] = rows[i]
+
+
+def _axes_C(c: Array) -> Array:
+    axes_C = np.empty((3, 3))
+    put_axes(c, axes_C)
+    return axes_C
+
+
+@compiled
+def put_axes(c: Array, axes_C: Array) -> None:
+    """Write w_WC_C of a unit rate of roll, of pitch and of yaw, row by row."""
+    rows = euler_axes_C(c[3], c[4])
+    for i in range(3):
+        axes_C[i, 0], axes_C[i, 1], axes_C[i, 2] = rows[i]
 
 
 def _root(E: Array, n: int) -> Array:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 from zsim_agents.cluster_space import Array, ClusterSpace
 from zsim_agents.compiled import compiled
@@ -130,6 +129,8 @@ class WaypointTrajectory:
         self._places = np.array(places)
         self._slopes = np.zeros_like(self._places)
         if len(places) > 2:
+            from scipy.interpolate import PchipInterpolator  # here, because it takes longer to load than all else
+
             self._slopes[1:-1] = PchipInterpolator(self._times, self._places)(self._times[1:-1], 1)
         self.duration_s: float | None = self._times[-1]
 
@@ -187,21 +188,23 @@ class Ramp:
         s = max((t_s - self.start_s) / self.over_s, 0.0)
         if s >= 1.0:
             return c, c_dot
-        return ramped(c, c_dot, self.offset, self.offset_rate, s, self.over_s)
+        value, rate = np.empty(c.size), np.empty(c.size)
+        put_ramped(c, c_dot, self.offset, self.offset_rate, s, self.over_s, value, rate)
+        return value, rate
 
 
 @compiled
-def ramped(c: Array, c_dot: Array, offset: Array, offset_rate: Array, s: float, over_s: float) -> tuple[Array, Array]:
-    """Return c and c_dot with what is left of an offset and its rate at share s of a ramp over over_s."""
+def put_ramped(
+    c: Array, c_dot: Array, offset: Array, offset_rate: Array, s: float, over_s: float, value: Array, rate: Array
+) -> None:
+    """Write c and c_dot with what is left of an offset and its rate at share s of a ramp over over_s."""
     left = 1.0 - s * s * s * (10.0 - s * (15.0 - 6.0 * s))
     left_rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / over_s
     swing = s * (1.0 - s * s * (6.0 - s * (8.0 - 3.0 * s))) * over_s
     swing_rate = 1.0 - s * s * (18.0 - s * (32.0 - 15.0 * s))
-    value, rate = np.empty(c.size), np.empty(c.size)
     for k in range(c.size):
         value[k] = c[k] + left * offset[k] + swing * offset_rate[k]
         rate[k] = c_dot[k] + left_rate * offset[k] + swing_rate * offset_rate[k]
-    return value, rate
 
 
 def ramp_onto(space: ClusterSpace, c: Array, c_dot: Array, onto: Reference, start_s: float, over_s: float) -> Ramp:

@@ -51,14 +51,14 @@ class TriadCluster(ClusterSpace):
         self._shape = 6 + n  # place of p in c
 
     def forward(self, p_W: Array, yaw: Array) -> Array:
-        found, c = triad_forward(p_W, yaw)
-        if not found:
+        c = np.empty(self.size)
+        if not triad_forward(p_W, yaw, c):
             raise SingularClusterError(NO_FRAME)
         return c
 
     def inverse(self, c: Array) -> tuple[Array, Array]:
-        found, p_W, yaw = triad_inverse(c)
-        if not found:
+        p_W, yaw = np.empty((self.n, 3)), np.empty(self.n)
+        if not triad_inverse(c, p_W, yaw):
             raise self._no_direction(c)
         return p_W, yaw
 
@@ -87,8 +87,8 @@ class TriadCluster(ClusterSpace):
         return J.reshape(self.size, self.size)
 
     def inverse_jacobian(self, c: Array) -> Array:
-        found, J_inv = triad_inverse_jacobian(c)
-        if not found:
+        J_inv = np.zeros((self.size, self.size))
+        if not triad_inverse_jacobian(c, J_inv):
             raise self._no_direction(c)
         return J_inv
 
@@ -101,16 +101,15 @@ class TriadCluster(ClusterSpace):
 
 
 @compiled
-def triad_forward(p_W: Array, yaw: Array) -> tuple[bool, Array]:
-    """Return whether the robots have a frame, and c (4n,)."""
+def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
+    """Write c (4n,); return whether the robots have a frame, without which nothing is written."""
     n = yaw.size
     at = 6 + n  # place of p in c
-    c = np.zeros(4 * n)
     p_1 = row(p_W, 0)
     d2, d3 = between(p_1, row(p_W, 1)), between(p_1, row(p_W, 2))
     x, y, z, h, area = triad_axes(d2, d3)
     if h == 0.0:
-        return False, c
+        return False
     c[0], c[1], c[2] = centroid(p_W)
     c[3] = math.atan2(y[2], z[2])
     c[4], c[5] = pitch_yaw(x)
@@ -120,35 +119,35 @@ def triad_forward(p_W: Array, yaw: Array) -> tuple[bool, Array]:
     for k in range(3, n):
         first = at + 3 * (k - 2)
         c[first], c[first + 1], c[first + 2] = spherical(turned((x, y, z), between(p_1, row(p_W, k))))
-    return True, c
+    return True
 
 
 @compiled
-def triad_inverse(c: Array) -> tuple[bool, Array, Array]:
-    """Return whether the shape has an extent, positions (n, 3) and headings (n,)."""
+def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
+    """Write positions (n, 3) and headings (n,); return whether the shape has an extent, else they mean nothing."""
     n = c.size // 4
-    p_W, yaw = places_C(c), np.empty(n)
+    put_places_C(c, p_W)
     R_WC = rotation_WC(c[3], c[4], c[5])
     for i in range(n):
         d_W = turned(R_WC, row(p_W, i))
         for k in range(3):
             p_W[i, k] = c[k] + d_W[k]
         yaw[i] = wrap_angle(c[5] + c[6 + i])
-    return has_direction(c), p_W, yaw
+    return has_direction(c)
 
 
 @compiled
-def triad_inverse_jacobian(c: Array) -> tuple[bool, Array]:
-    """Return whether the shape has an extent, and J^-1 (4n, 4n).
+def triad_inverse_jacobian(c: Array, J_inv: Array) -> bool:
+    """Write J^-1 (4n, 4n) into zeros; return whether the shape has an extent, without which nothing is written.
 
     Robot i moves at v_c + R_WC (w_WC_C x place_i + its place's derivatives by the shape times their rates),
     and turns at yaw' + phi_i'.
     """
     n = c.size // 4
-    J_inv = np.zeros((4 * n, 4 * n))
     if not has_direction(c):
-        return False, J_inv
-    R_WC, axes_C, place_C = rotation_WC(c[3], c[4], c[5]), euler_axes_C(c[3], c[4]), places_C(c)
+        return False
+    R_WC, axes_C, place_C = rotation_WC(c[3], c[4], c[5]), euler_axes_C(c[3], c[4]), np.empty((n, 3))
+    put_places_C(c, place_C)
     for i in range(n):
         first = 4 * i
         for k in range(3):
@@ -156,7 +155,7 @@ def triad_inverse_jacobian(c: Array) -> tuple[bool, Array]:
             put(J_inv, first, 3 + k, turned(R_WC, cross(axes_C[k], row(place_C, i))))
         J_inv[first + 3, 5] = J_inv[first + 3, 6 + i] = 1.0
     put_shape_rates(J_inv, c, R_WC)
-    return True, J_inv
+    return True
 
 
 @compiled
@@ -197,13 +196,13 @@ def triad_spread(c: Array) -> float:
 
 
 @compiled
-def places_C(c: Array) -> Array:
-    """Return the places of the robots from the centroid, in C (n, 3) [m]."""
+def put_places_C(c: Array, place: Array) -> None:
+    """Write the places of the robots from the centroid, in C (n, 3) [m]."""
     n = c.size // 4
     at = 6 + n
     p, q = c[at], c[at + 1]
     ca2, sa2, ca3, sa3, _ = split_beta(p, q, c[at + 2])
-    place = np.zeros((n, 3))  # from robot 1
+    place[:3] = 0.0  # from robot 1
     place[1, 0], place[1, 1] = -p * ca2, p * sa2
     place[2, 0], place[2, 1] = -q * ca3, -q * sa3
     for k in range(3, n):
@@ -213,7 +212,6 @@ def places_C(c: Array) -> Array:
     for i in range(n):
         for k in range(3):
             place[i, k] -= centre[k]
-    return place
 
 
 @compiled

@@ -190,6 +190,12 @@ def test_differences_of_wrapping_angles_go_the_short_way():
     assert space.wrapped(np.full(12, 7.0))[5] == pytest.approx(7.0 - 2 * math.pi)
 
 
+def test_a_table_is_wrapped_as_its_rows_are():
+    space = cluster_space(3)
+    table = np.random.default_rng(4).normal(scale=20.0, size=(50, 12))
+    assert space.wrapped(table).tolist() == [space.wrapped(row).tolist() for row in table]
+
+
 def test_the_margin_falls_to_zero_at_each_singularity():
     space = cluster_space(3)
     good = np.array([0, 0, 10, 0, 0, 0, 0, 0, 0, 4.0, 4.0, math.pi / 2])

@@ -72,7 +72,7 @@ def test_one_way_is_compiled_and_the_other_is_not(both):
     for module, name in (
         ("triad_cluster", "triad_forward"),
         ("formation", "limited"),
-        ("trajectory", "ramped"),
+        ("trajectory", "put_ramped"),
     ):
         assert hasattr(getattr(getattr(compiled, module), name), "py_func")
         assert not hasattr(getattr(getattr(plain, module), name), "py_func")
@@ -90,6 +90,7 @@ def test_the_kinematics_are_the_same(both, n):
             assert same(a, b)
         assert same(*(space.inverse_jacobian(c) for space in spaces))
         assert same(*(space.margin(c) for space in spaces))
+        assert [type(space.margin(c)) for space in spaces] == [float, float]  # it goes into a message
         assert same(*(space.wrapped(c * 3.0) for space in spaces))
         assert same(*(way.cluster_space.closest_pair(p_W) for way in both))
 
@@ -160,8 +161,48 @@ def test_ramps_are_the_same(both, n):
     rng = np.random.default_rng(20 + n)
     offsets = [rng.normal(size=4 * n) for _ in range(4)]
     for s in np.linspace(0.0, 1.0, 11).tolist():
-        for a, b in zip(*(way.trajectory.ramped(*offsets, s, 7.0) for way in both), strict=True):
-            assert same(a, b)
+        found = []
+        for way in both:
+            value, rate = np.empty(4 * n), np.empty(4 * n)
+            way.trajectory.put_ramped(*offsets, s, 7.0, value, rate)
+            found.append([*value, *rate])
+        assert same(*found)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_places_are_judged_the_same_at_once_and_in_words(both, n):
+    space, plain = (space_of(way, n) for way in both)
+    rng, found = np.random.default_rng(40 + n), set()
+    gains, limits = both[0].formation.FormationGains(), both[0].reference_check.ShapeLimits()
+    for _ in range(200):
+        p_W, yaw = robots(n, rng)
+        p_W[:, 2] += 6.0
+        c = space.forward(p_W, yaw)
+        faults = [
+            way.reference_check.place_fault(of, c, gains, limits) for way, of in zip(both, (space, plain), strict=True)
+        ]
+        least_m = both[0].cluster_space.closest_pair(p_W)[0]
+        assert faults[0] == faults[1]
+        assert (faults[0] is None) == (least_m >= gains.separation_min_m and p_W[:, 2].min() >= limits.height_min_m)
+        found.add("apart" if faults[0] and "apart" in faults[0] else bool(faults[0]))
+    assert found == {"apart", True, False}
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_bounds_in_flight_are_those_of_the_judgement_in_words(both, n):
+    check, space = both[0].reference_check, space_of(both[0], n)
+    limits = check.ShapeLimits(spread_min_m=0.0, condition_max=math.inf)
+    bounds, rng, found = check.bounds_of(space, limits), np.random.default_rng(50 + n), set()
+    for _ in range(300):
+        c = rng.uniform(0.01, 1.0, 4 * n)
+        c[rng.choice(space.tilts)] = rng.uniform(-0.7, 0.7)
+        if rng.random() < 0.3:
+            c[rng.integers(4 * n)] = rng.choice(BAD)
+        fault = check.shape_fault(space, c, limits)
+        if fault is None or f"{space.spread_text} is" not in fault:
+            assert (fault is None) == (check.first_outside(c, bounds) < 0)
+            found.add(fault is None)
+    assert found == {True, False}
 
 
 BAD = (math.nan, math.inf, -math.inf, 1e7, 0.0, 1.7)

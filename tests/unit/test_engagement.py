@@ -1,8 +1,8 @@
 """The phase machine flown on ideal drones: phases, refusals, faults in flight, plans."""
 
-import dataclasses
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -79,7 +79,7 @@ class Fleet:
             self.modes.append((self.t_s, drone, mode))
             self.states[self.engagement.drones.index(drone)] = "taking_off" if mode == "takeoff" else "landing"
         for i, setpoint in enumerate(output.setpoints):
-            self.v_W[i], self.yaw_rate[i] = setpoint or (np.zeros(3), 0.0)
+            self.v_W[i], self.yaw_rate[i] = (setpoint.v_W, setpoint.yaw_rate) if setpoint else (0.0, 0.0)
         self.gate += 1
         return output
 
@@ -94,7 +94,7 @@ class Fleet:
             age_s=np.zeros(n),
             states=tuple(self.states),
         )
-        return dataclasses.replace(gate, **self.spoil)
+        return msgspec.structs.replace(gate, **self.spoil)
 
     def _move(self):
         for i, state in enumerate(self.states):
@@ -361,7 +361,7 @@ def test_a_fault_in_flight_holds_the_formation_and_it_goes_on_without_a_bump(spo
         assert np.isfinite(output.value).all()
         assert np.isfinite(output.desired).all()
     if "p_W" not in spoil:
-        assert all(not s.v_W.any() and s.yaw_rate == 0.0 for s in held[-1].setpoints if s is not None)
+        assert all(not any(s.v_W) and s.yaw_rate == 0.0 for s in held[-1].setpoints if s is not None)
     fleet.spoil = {}
     fleet.fly(0.4)
     assert fleet.output.phase == "held"
