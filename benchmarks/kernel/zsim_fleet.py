@@ -1,7 +1,7 @@
 """zsim's fleet: firmware, all noisy sensors, wind, encounters; or its compiled kernel alone (`--bare`).
 
 Physics every 2.5 ms by Runge-Kutta of fourth order, firmware and IMU every 5 ms, a call per gate of 20 ms. The fleet
-draws its noise, returns samples and truth; the bare kernel reads the same noise again and returns nothing.
+draws its noise, returns samples and truth as arrays; the bare kernel reads the same noise again and returns nothing.
 """
 
 import argparse
@@ -32,7 +32,7 @@ def fleet(count: int) -> Flight:
 
     def advance() -> Any:
         made.advance()
-        return made.samples(), made.truth()
+        return made.sampled, made.truth()
 
     return Flight(advance, 0.02)
 
@@ -45,7 +45,7 @@ def kernel(count: int) -> Flight:
     def advance() -> None:
         if next(gates) % NOISE_GATES == 0:
             made._noise.cursor[:] = 0
-        gate.advance(made._w, made._ticks)
+        gate.advance(made._held, made._ticks)
 
     return Flight(advance, 0.02)
 

@@ -8,7 +8,9 @@ import pytest
 from zsim.scenario_file import resolve
 from zsim_world import rigid_body as body
 from zsim_world import vehicle
+from zsim_world.arrays import Near
 from zsim_world.encounter import JET_WIDTHS, downwash, encounters, hull_force
+from zsim_world.start import near
 
 RADIUS = vehicle.HULL_RADIUS_M
 
@@ -28,7 +30,7 @@ def meet(rows, positions, velocities=None, rotor=0.0):
         state[:, 3:6] = velocities
     air, push = np.zeros((n, 3)), np.zeros((n, 3))
     touching, touched = np.zeros((n, n), np.int8), np.zeros((n, n), np.int8)
-    least = encounters(rows[:n], state, air, push, touching, touched)
+    least = encounters(rows[:n], state, air, push, touching, touched, near(n))
     return least, air, push, touching, touched
 
 
@@ -64,10 +66,10 @@ def test_head_on_collision_rebounds_and_loses_energy(rows):
     state[:, 3] = (1.5, -1.5)
     air, push = np.zeros((2, 3)), np.zeros((2, 3))
     touching, touched = np.zeros((2, 2), np.int8), np.zeros((2, 2), np.int8)
-    anchor, least = np.zeros((8, 2)), 9.0
+    anchor, least, pairs = np.zeros((8, 2)), 9.0, near(2)
     for _ in range(400):
         push[:] = 0.0
-        least = min(least, encounters(rows[:2], state, air, push, touching, touched))
+        least = min(least, encounters(rows[:2], state, air, push, touching, touched, pairs))
         for i in range(2):
             body.step(rows[i], anchor, state[i], (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), body.vector(push[i], 0), 0.0025)
     assert abs(state[:, 3].sum()) < 1e-9
@@ -103,3 +105,37 @@ def test_downwash_blows_on_the_lower_drone_only(rows):
 
 def test_downwash_ends_beside_the_jet():
     assert downwash(4.2, 1.225, 0.1, 2.0, JET_WIDTHS * 0.43) == 0.0
+
+
+def all_pairs(state):
+    """Return every pair as near, wherever the drones go next."""
+    n = len(state)
+    pairs = np.array([(i, j) for i in range(n) for j in range(i + 1, n)], dtype=np.int32)
+    return Near(pair=pairs, noted=np.array([len(pairs)]), origin=state[:, :3].copy())
+
+
+@pytest.mark.parametrize(
+    ("size_m", "speed_m_s"), [((3.0, 3.0, 3.0), 1.0), ((15.0, 15.0, 40.0), 8.0), ((0.5, 9.0, 9.0), 3.0)]
+)
+def test_near_pairs_give_the_bits_of_all_pairs(rows, size_m, speed_m_s):
+    """Drones of two sizes in a box, for 3 s: every touch, every jet and the least distance are found."""
+    rng = np.random.default_rng(7)
+    n, found = 12, 0
+    rows = np.repeat(rows[:1], n, axis=0)
+    rows[::3, [vehicle.ROTOR_RADIUS, vehicle.HULL_RADIUS]] *= 1.7
+    state = np.zeros((n, body.COLUMNS))
+    state[:, body.ATTITUDE], state[:, body.ROTOR :] = 1.0, 350.0
+    state[:, :3] = rng.uniform(0.0, size_m, (n, 3))
+    pairs, ours, theirs = near(n), *(np.zeros((2, n, n), np.int8) for _ in range(2))
+    for _ in range(300):
+        state[:, 3:6] = rng.normal(0.0, speed_m_s, (n, 3))
+        state[:, :3] += 0.01 * state[:, 3:6]
+        (air, push), (other_air, other_push) = np.zeros((2, n, 3)), np.zeros((2, n, 3))
+        before = pairs.origin.copy()
+        least = encounters(rows, state, air, push, ours[0], ours[1], pairs)
+        found += not np.array_equal(before, pairs.origin)
+        assert least == encounters(rows, state, other_air, other_push, theirs[0], theirs[1], all_pairs(state))
+        for one, other in ((air, other_air), (push, other_push), (ours, theirs)):
+            np.testing.assert_array_equal(one, other)
+    assert 1 < found < 300
+    assert pairs.noted[0] > 0

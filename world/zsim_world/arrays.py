@@ -17,6 +17,14 @@ class Time(NamedTuple):
     spans: NDArray  # (3,), s, as above
 
 
+class Near(NamedTuple):
+    """Pairs of drones that can matter to each other, and for which places that was found (encounter.py)."""
+
+    pair: NDArray  # int32 (N (N - 1) / 2, 2), i < j, ascending
+    noted: NDArray  # int64 (1,), how many pairs
+    origin: NDArray  # (N, 3), m
+
+
 class Bodies(NamedTuple):
     """N aircraft, as physics has them."""
 
@@ -30,6 +38,9 @@ class Bodies(NamedTuple):
     push: NDArray  # (N, 3), N
     touching: NDArray  # int8 (N, N)
     touched: NDArray  # int8 (N, N), contacts that began in this gate
+    near: Near
+    decay: NDArray  # (N,), of a rotor's lag in half a tick (rigid_body.half_decay)
+    lanes: NDArray  # (lanes.LANES * lanes.COLUMNS,), where drones are laid side by side
 
 
 class Boards(NamedTuple):

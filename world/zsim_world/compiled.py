@@ -1,9 +1,13 @@
 """How this package compiles: no fast-math, so that the same input gives the same bits.
 
 Division by zero gives inf as in numpy: a diverged state is found at the end of a gate, not by an exception inside.
-What `compiled` functions call is compiled into their caller. Only a `kernel`, called from Python, is kept on disk:
+What is `compiled` or `inlined` becomes part of its caller. Only a `kernel`, called from Python, is kept on disk:
 numba's own cache looks at the file of a function alone, so its name there carries the digest of every file that is
 compiled into it.
+
+An `inlined` function takes views of arrays, floats and tuples of them, and makes no array. So nothing in it has an
+owner to be counted: the atomic counts that numba keeps for every view took a fifth of a gate's time, calls of functions
+that were not inlined another.
 """
 
 import hashlib
@@ -13,22 +17,31 @@ from typing import Any
 
 from numba import njit
 
-compiled = njit(error_model="numpy", fastmath=False)
+_EXACT: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
+_UNCOUNTED: dict[str, Any] = {
+    "_nrt": False
+}  # numba's name for doing without its counts; making an array is then refused
+
+compiled = njit(**_EXACT)
+inlined = njit(**_EXACT, **_UNCOUNTED, forceinline=True)
 
 
-def kernel(sources: Iterable[Path]) -> Callable[[Callable[..., Any]], Any]:
+def kernel(sources: Iterable[Path], makes_arrays: bool = True) -> Callable[[Callable[..., Any]], Any]:
     """Return the decorator of a function that is compiled once per machine.
 
     Args:
         sources: every file that is compiled into it, for its functions or for its constants.
+        makes_arrays: False for one that, as all that it calls, only works on the arrays that it is given.
     """
+
+    options = _EXACT if makes_arrays else {**_EXACT, **_UNCOUNTED}
 
     def compile_(function: Callable[..., Any]) -> Any:
         function.__qualname__ = f"{function.__qualname__}_{digest(sources)}"
         try:
-            return njit(error_model="numpy", fastmath=False, cache=True)(function)
+            return njit(**options, cache=True)(function)
         except RuntimeError:  # neither beside its file nor in the user's cache may anything be written
-            return compiled(function)
+            return njit(**options)(function)
 
     return compile_
 

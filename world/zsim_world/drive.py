@@ -6,22 +6,23 @@ from numpy.typing import NDArray
 
 from zsim_world import observer as ob
 from zsim_world import rotation as rot
-from zsim_world.compiled import compiled
+from zsim_world.compiled import inlined
 from zsim_world.observer import STEP_S
 from zsim_world.rigid_body import four, vector
-from zsim_world.rotation import Vector, axpy
+from zsim_world.rotation import Quaternion, Vector, axpy
 from zsim_world.rotors import Four, mix
 from zsim_world.vehicle import (
     DRIVE_LAG_LEAD,
     INERTIA_X,
     INERTIA_Y,
     INERTIA_Z,
-    ROTOR_LAG,
     ROTOR_MAX,
     ROTOR_MIN,
 )
 
-K_RATE, K_TILT = 6, 7  # columns of the firmware's settings, 1/s
+# Columns of the firmware's settings
+K_RATE, K_TILT = 6, 7  # 1/s
+ROTOR_DECAY, OVERDRIVE = 10, 11  # left of the rotors' lag after a step; part of the way to command beyond it
 RATE_PER_LAG = 0.42  # rate gain times the overdriven lag: damping 0.77 of rate loop and rotors together
 LAG_MIN_S = 0.015  # s, three control steps: faster rotors do not make a faster loop
 LOOP_RATIO = 3.1  # of a loop's gain to that of the loop around it
@@ -35,10 +36,24 @@ def loop_gains(rotor_lag_s: float) -> tuple[float, float, float]:
     return rate, rate / LOOP_RATIO, rate / LOOP_RATIO**2
 
 
-@compiled
-def drive(belief: NDArray, row: NDArray, setting: NDArray, z_des: Vector, thrust_n: float, yaw_rate: float) -> Four:
+def lag_shares(rotor_lag_s: float) -> tuple[float, float]:
+    """Return what is left of a rotor's lag after a step, and by how much to overdrive it to halve that lag."""
+    decay = math.exp(-STEP_S / rotor_lag_s)
+    return decay, (1.0 - math.exp(-STEP_S / (DRIVE_LAG_LEAD * rotor_lag_s))) / (1.0 - decay)
+
+
+@inlined
+def drive(
+    belief: NDArray,
+    own: Quaternion,
+    row: NDArray,
+    setting: NDArray,
+    z_des: Vector,
+    thrust_n: float,
+    yaw_rate: float,
+) -> Four:
     """Return rotor commands for a wanted z_B (heading frame), thrust [N] and yaw rate [rad/s]."""
-    q_HB = ob.level(four(belief, ob.ATTITUDE))
+    q_HB = rot.level(own, four(belief, ob.ATTITUDE))
     z_B = rot.rotate_back(q_HB, z_des)
     up_B = rot.rotate_back(q_HB, (0.0, 0.0, yaw_rate))
     w = vector(belief, ob.BODY_RATE)
@@ -51,14 +66,12 @@ def drive(belief: NDArray, row: NDArray, setting: NDArray, z_des: Vector, thrust
         iy * setting[K_RATE] * (s * wy + up_B[1] - w[1]) + (ix - iz) * w[2] * w[0],
         iz * setting[K_RATE] * YAW_SHARE * (up_B[2] - w[2]) + (iy - ix) * w[0] * w[1],
     )
-    return _overdriven(belief, row, mix(row, thrust_n, moment))
+    return _overdriven(belief, row, setting[OVERDRIVE], mix(row, thrust_n, moment))
 
 
-@compiled
-def _overdriven(belief: NDArray, row: NDArray, wanted: Four) -> Four:
+@inlined
+def _overdriven(belief: NDArray, row: NDArray, s: float, wanted: Four) -> Four:
     """Return commands under which the rotors move to `wanted` with a part of their lag only."""
-    lag = row[ROTOR_LAG]
-    s = (1.0 - math.exp(-STEP_S / (DRIVE_LAG_LEAD * lag))) / (1.0 - math.exp(-STEP_S / lag))
     r = four(belief, ob.ROTOR)
     return clipped(
         row,
@@ -71,7 +84,7 @@ def _overdriven(belief: NDArray, row: NDArray, wanted: Four) -> Four:
     )
 
 
-@compiled
+@inlined
 def clipped(row: NDArray, speed: Four) -> Four:
     """Return rotor speeds [rad/s] within the rotors' limits."""
     low, high = row[ROTOR_MIN], row[ROTOR_MAX]
@@ -83,11 +96,11 @@ def clipped(row: NDArray, speed: Four) -> Four:
     )
 
 
-@compiled
-def limited_tilt(z: Vector, tilt: float) -> Vector:
-    """Return the unit vector along z, no farther from the vertical than `tilt`."""
+@inlined
+def limited_tilt(z: Vector, slope: float) -> Vector:
+    """Return the unit vector along z, no farther from the vertical than the tilt of this tangent."""
     across = math.sqrt(z[0] * z[0] + z[1] * z[1])
-    most = max(z[2], 1e-3) * math.tan(tilt)
+    most = max(z[2], 1e-3) * slope
     s = 1.0 if across <= most else most / across
     z = (s * z[0], s * z[1], max(z[2], 1e-3))
     return axpy((0.0, 0.0, 0.0), 1.0 / rot.norm(z), z)

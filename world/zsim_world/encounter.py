@@ -4,18 +4,28 @@ import math
 
 from numpy.typing import NDArray
 
-from zsim_world.compiled import compiled
+from zsim_world.arrays import Near
+from zsim_world.compiled import inlined
 from zsim_world.rigid_body import ATTITUDE, POSITION, ROTOR, VELOCITY, four
-from zsim_world.rotation import z_axis
+from zsim_world.rotation import Vector, z_axis
 from zsim_world.rotors import Four
 from zsim_world.vehicle import AIR_DENSITY, HULL_DAMPING, HULL_RADIUS, HULL_STIFFNESS, ROTOR_RADIUS, THRUST
 
 JET_START = 2.0  # rotor radii, width at which a Gaussian jet of speed 2 v_h carries the thrust of four rotors
 JET_SPREAD = 0.107  # growth of a round jet's 1/e width (Fischer et al., Mixing in Inland and Coastal Waters, 1979)
 JET_WIDTHS = 3.0  # beyond three widths the jet is 1e-4 of its core
+DISTANCE_MIN_M = 1e-9  # m, so that two drones in one place have a direction
+STRAY_M = 0.25  # m, by which each drone may move before near pairs are found anew: some 20 gates of a usual flight
+APPROACH_M = 0.501  # m, by which a pair's distance may have changed by then: twice as much, and room for rounding
 
 
-@compiled
+@inlined
+def jet_reach(radius_m: float, below_m: float) -> float:
+    """Return how far aside [m] of a drone of rotors of this radius its jet blows, so much below it."""
+    return JET_WIDTHS * (JET_START * radius_m + JET_SPREAD * below_m)
+
+
+@inlined
 def downwash(thrust_n: float, density: float, radius_m: float, below_m: float, aside_m: float) -> float:
     """Return the downward speed [m/s] of the air below a hovering drone.
 
@@ -36,7 +46,7 @@ def downwash(thrust_n: float, density: float, radius_m: float, below_m: float, a
     return core * math.exp(-ratio * ratio)
 
 
-@compiled
+@inlined
 def hull_force(stiffness: float, damping: float, depth_m: float, closing_m_s: float) -> float:
     """Return the force [N] that parts two hulls dented by `depth_m`; never an attraction."""
     if depth_m <= 0.0:
@@ -44,7 +54,7 @@ def hull_force(stiffness: float, damping: float, depth_m: float, closing_m_s: fl
     return max(stiffness * depth_m + damping * closing_m_s, 0.0)
 
 
-@compiled
+@inlined
 def _free_thrust(row: NDArray, speed: Four) -> float:
     s = 0.0
     for k in range(4):
@@ -52,16 +62,24 @@ def _free_thrust(row: NDArray, speed: Four) -> float:
     return row[THRUST] * s
 
 
-@compiled
+@inlined
+def _apart(state: NDArray, i: int, j: int) -> Vector:
+    """Return p_j - p_i [m]."""
+    return (
+        state[j, POSITION] - state[i, POSITION],
+        state[j, POSITION + 1] - state[i, POSITION + 1],
+        state[j, POSITION + 2] - state[i, POSITION + 2],
+    )
+
+
+@inlined
 def _blow(vehicle: NDArray, state: NDArray, above: int, below: int, aside: float, drop: float, air: NDArray) -> None:
     thrust = _free_thrust(vehicle[above], four(state[above], ROTOR)) * z_axis(four(state[above], ATTITUDE))[2]
     air[below, 2] -= downwash(thrust, vehicle[above, AIR_DENSITY], vehicle[above, ROTOR_RADIUS], drop, aside)
 
 
-@compiled
-def _touch(
-    vehicle: NDArray, state: NDArray, i: int, j: int, d: tuple[float, float, float], distance: float, push: NDArray
-) -> None:
+@inlined
+def _touch(vehicle: NDArray, state: NDArray, i: int, j: int, d: Vector, distance: float, push: NDArray) -> None:
     """Push drones i and j apart along d = p_j - p_i."""
     closing = 0.0
     for k in range(3):
@@ -76,35 +94,89 @@ def _touch(
         push[j, k] += force * d[k]
 
 
-@compiled
+@inlined
+def _meet(
+    vehicle: NDArray,
+    state: NDArray,
+    i: int,
+    j: int,
+    air: NDArray,
+    push: NDArray,
+    touching: NDArray,
+    touched: NDArray,
+) -> float:
+    """Let drones i < j act on each other; return their distance [m]."""
+    dx, dy, dz = _apart(state, i, j)
+    aside2 = dx * dx + dy * dy
+    distance = max(math.sqrt(aside2 + dz * dz), DISTANCE_MIN_M)
+    contact = distance < vehicle[i, HULL_RADIUS] + vehicle[j, HULL_RADIUS]
+    if contact:
+        _touch(vehicle, state, i, j, (dx, dy, dz), distance, push)
+        if touching[i, j] == 0:
+            touched[i, j] = 1
+    touching[i, j] = 1 if contact else 0
+    above = j if dz > 0.0 else i
+    reach = jet_reach(vehicle[above, ROTOR_RADIUS], abs(dz))
+    if aside2 < reach * reach:
+        _blow(vehicle, state, above, i + j - above, math.sqrt(aside2), abs(dz), air)
+    return distance
+
+
+@inlined
+def _strayed(state: NDArray, origin: NDArray) -> bool:
+    """Return whether a drone has left the surroundings for which the near pairs were found."""
+    for i in range(state.shape[0]):
+        square = 0.0
+        for k in range(3):
+            square += (state[i, POSITION + k] - origin[i, k]) ** 2
+        if not square < STRAY_M * STRAY_M:
+            return True
+    return False
+
+
+@inlined
+def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: Near) -> None:
+    """Note all pairs that can touch, blow on each other or be the closest before a drone strays; forget the others."""
+    count, least = 0, math.inf
+    for i in range(state.shape[0]):
+        for k in range(3):
+            near.origin[i, k] = state[i, POSITION + k]
+        for j in range(i + 1, state.shape[0]):
+            dx, dy, dz = _apart(state, i, j)
+            aside = math.sqrt(dx * dx + dy * dy)
+            distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+            least = min(least, distance)
+            closest = max(least + APPROACH_M, vehicle[i, HULL_RADIUS] + vehicle[j, HULL_RADIUS]) + APPROACH_M
+            radius = max(vehicle[i, ROTOR_RADIUS], vehicle[j, ROTOR_RADIUS])
+            jet = jet_reach(radius, abs(dz) + APPROACH_M) + APPROACH_M
+            if distance > closest and aside > jet:
+                touching[i, j] = 0
+            else:
+                near.pair[count, 0], near.pair[count, 1] = i, j
+                count += 1
+    near.noted[0] = count
+
+
+@inlined
 def encounters(
-    vehicle: NDArray, state: NDArray, air: NDArray, push: NDArray, touching: NDArray, touched: NDArray
+    vehicle: NDArray, state: NDArray, air: NDArray, push: NDArray, touching: NDArray, touched: NDArray, near: Near
 ) -> float:
     """Add downwash to `air`, the forces between hulls to `push`, and return the least distance [m].
+
+    Only near pairs are looked at, in the order of all pairs: the result is that of all pairs, to the last bit. They are
+    found anew when a drone has moved by STRAY_M since.
 
     Args:
         vehicle, state: parameters and state, a row per drone.
         air: (N, 3) velocity of the air [m/s], added to.
         push: (N, 3) force [N], added to.
         touching: (N, N) 1 where i < j are in contact now, updated; touched: (N, N) set to 1 where contact begins.
+        near: what was found last.
     """
+    if _strayed(state, near.origin):
+        _find_near(vehicle, state, touching, near)
     least = math.inf
-    for i in range(state.shape[0]):
-        for j in range(i + 1, state.shape[0]):
-            dx = state[j, POSITION] - state[i, POSITION]
-            dy = state[j, POSITION + 1] - state[i, POSITION + 1]
-            dz = state[j, POSITION + 2] - state[i, POSITION + 2]
-            aside2 = dx * dx + dy * dy
-            distance = max(math.sqrt(aside2 + dz * dz), 1e-9)
-            least = min(least, distance)
-            contact = distance < vehicle[i, HULL_RADIUS] + vehicle[j, HULL_RADIUS]
-            if contact:
-                _touch(vehicle, state, i, j, (dx, dy, dz), distance, push)
-                if touching[i, j] == 0:
-                    touched[i, j] = 1
-            touching[i, j] = 1 if contact else 0
-            above = j if dz > 0.0 else i
-            reach = JET_WIDTHS * (JET_START * vehicle[above, ROTOR_RADIUS] + JET_SPREAD * abs(dz))
-            if aside2 < reach * reach:
-                _blow(vehicle, state, above, i + j - above, math.sqrt(aside2), abs(dz), air)
+    for n in range(near.noted[0]):
+        i, j = near.pair[n, 0], near.pair[n, 1]
+        least = min(least, _meet(vehicle, state, i, j, air, push, touching, touched))
     return least

@@ -19,11 +19,21 @@ from zsim.messages import DroneState
 from zsim.scenario import Drone
 from zsim_world import observer as ob
 from zsim_world import rotation as rot
-from zsim_world.compiled import compiled
-from zsim_world.drive import K_RATE, K_TILT, clipped, drive, limited_tilt, loop_gains
+from zsim_world.compiled import inlined
+from zsim_world.drive import (
+    K_RATE,
+    K_TILT,
+    OVERDRIVE,
+    ROTOR_DECAY,
+    clipped,
+    drive,
+    lag_shares,
+    limited_tilt,
+    loop_gains,
+)
 from zsim_world.observer import STEP_S
 from zsim_world.rigid_body import four, vector
-from zsim_world.rotation import Vector, axpy
+from zsim_world.rotation import Quaternion, Vector, axpy
 from zsim_world.rotors import Four
 from zsim_world.vehicle import DRAG, GRAVITY, MASS, ROTOR_MIN, STAND_HEIGHT
 
@@ -43,9 +53,9 @@ MEMORY_COLUMNS = 8
 RISING, HOLDING = 1.0, 2.0  # values of HOLDS_Z: the height held rises to that of the take-off, or stays
 
 # Columns of the settings: limits of what a commander may ask, and the loop gains
-TILT, SPEED, CLIMB, YAW_RATE, ALTITUDE, TAKEOFF_HEIGHT = 0, 1, 2, 3, 4, 5  # rad, m/s, m/s, rad/s, m, m
-K_VELOCITY, K_CLIMB = 8, 9  # 1/s; drive.py has the two before them
-SETTING_COLUMNS = 10
+SLOPE, SPEED, CLIMB, YAW_RATE, ALTITUDE, TAKEOFF_HEIGHT = 0, 1, 2, 3, 4, 5  # tan of tilt, m/s, m/s, rad/s, m, m
+K_VELOCITY, K_CLIMB = 8, 9  # 1/s; drive.py has the two before them, and the two after
+SETTING_COLUMNS = 12
 
 CLIMB_SHARE = 1 / 7  # of the rate gain, 4 1/s: thrust needs no tilt first
 K_HOLD = 0.8  # 1/s, position on the own odometry
@@ -70,18 +80,20 @@ def settings(drone: Drone) -> NDArray[np.float64]:
     """Return limits and loop gains of one drone, shape (SETTING_COLUMNS,)."""
     limits = drone.limits
     row = np.empty(SETTING_COLUMNS)
-    row[TILT], row[YAW_RATE] = math.radians(limits.tilt_deg), math.radians(limits.yaw_rate_deg_s)
+    row[SLOPE], row[YAW_RATE] = math.tan(math.radians(limits.tilt_deg)), math.radians(limits.yaw_rate_deg_s)
     row[SPEED], row[CLIMB] = limits.horizontal_speed_m_s, limits.vertical_speed_m_s
     row[ALTITUDE], row[TAKEOFF_HEIGHT] = limits.altitude_m, min(drone.takeoff_height_m, limits.altitude_m)
     row[K_RATE], row[K_TILT], row[K_VELOCITY] = loop_gains(drone.rotor_time_constant_s)
     row[K_CLIMB] = CLIMB_SHARE * row[K_RATE]
+    row[ROTOR_DECAY], row[OVERDRIVE] = lag_shares(drone.rotor_time_constant_s)
     return row
 
 
-@compiled
+@inlined
 def control(
     memory: NDArray,
     belief: NDArray,
+    own: Quaternion,
     row: NDArray,
     setting: NDArray,
     setpoint: NDArray,
@@ -94,6 +106,7 @@ def control(
 
     Args:
         memory: modes and holds, in place; belief: observer.py, the rotor model advanced in place.
+        own: the heading frame in W of the attitude believed.
         row: the aircraft (vehicle.py); setting: limits and gains; setpoint: the commander's wish, cleared on landing.
         silence_s: time since the setpoint was sent; hover_s: hover after so much, and land land_s later.
         charge_percent: of the battery.
@@ -102,20 +115,20 @@ def control(
     mode = int(memory[MODE])
     command = (0.0, 0.0, 0.0, 0.0)
     if mode in (TAKING_OFF, HOVERING, FLYING, LANDING):
-        command = _fly(mode, memory, belief, row, setting, setpoint)
+        command = _fly(mode, memory, belief, own, row, setting, setpoint)
     memory[STEPS] += 1.0
-    ob.model_rotors(belief, row, command)
+    ob.model_rotors(belief, setting[ROTOR_DECAY], command)
     return command
 
 
-@compiled
+@inlined
 def stands(memory: NDArray) -> bool:
     """Return whether the firmware knows that it stands on the ground: landed, or spinning up."""
     spinning_up = memory[MODE] == TAKING_OFF and memory[STEPS] * STEP_S < SPIN_UP_S
     return memory[MODE] == LANDED or spinning_up
 
 
-@compiled
+@inlined
 def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
     """Change the mode and forget the holds."""
     memory[MODE], memory[STEPS], memory[TOUCH] = mode, 0.0, 0.0
@@ -124,7 +137,7 @@ def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
         belief[ob.STILL_STEPS] = ob.STILL_STEPS_MIN
 
 
-@compiled
+@inlined
 def _change_mode(
     memory: NDArray,
     belief: NDArray,
@@ -157,7 +170,7 @@ def _change_mode(
         setpoint[KIND] = NONE
 
 
-@compiled
+@inlined
 def _wanted(kind: int, silence_s: float, hover_s: float, land_s: float) -> int:
     """Return the mode in the air that a setpoint of this kind and the commander's silence ask for."""
     if kind == NONE:
@@ -167,7 +180,7 @@ def _wanted(kind: int, silence_s: float, hover_s: float, land_s: float) -> int:
     return FLYING if kind != HOVER and silence_s < hover_s else HOVERING
 
 
-@compiled
+@inlined
 def _arrived(memory: NDArray, belief: NDArray) -> bool:
     if memory[STEPS] * STEP_S > TAKEOFF_S_MAX:
         return True
@@ -175,8 +188,16 @@ def _arrived(memory: NDArray, belief: NDArray) -> bool:
     return near and abs(belief[ob.VELOCITY + 2]) < ARRIVED_M_S
 
 
-@compiled
-def _fly(mode: int, memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray, setpoint: NDArray) -> Four:
+@inlined
+def _fly(
+    mode: int,
+    memory: NDArray,
+    belief: NDArray,
+    own: Quaternion,
+    row: NDArray,
+    setting: NDArray,
+    setpoint: NDArray,
+) -> Four:
     """Return rotor commands in the air, or on the way there."""
     kind = int(setpoint[KIND])
     if mode == FLYING and kind == ROTORS:
@@ -185,65 +206,70 @@ def _fly(mode: int, memory: NDArray, belief: NDArray, row: NDArray, setting: NDA
         low = row[ROTOR_MIN]
         return (low, low, low, low)
     if mode == FLYING and kind == ATTITUDE:
-        z_des, lift, yaw_rate = _attitude_wish(belief, row, setting, setpoint)
+        z_des, lift, yaw_rate = _attitude_wish(own, setting, setpoint)
     else:
-        z_des, lift, yaw_rate = _velocity_wish(mode, kind, memory, belief, row, setting, setpoint)
-    return drive(belief, row, setting, z_des, lift, yaw_rate)
+        z_des, lift, yaw_rate = _velocity_wish(mode, kind, memory, belief, own, row, setting, setpoint)
+    return drive(belief, own, row, setting, z_des, lift, yaw_rate)
 
 
-@compiled
-def _attitude_wish(belief: NDArray, row: NDArray, setting: NDArray, setpoint: NDArray) -> tuple[Vector, float, float]:
+@inlined
+def _attitude_wish(own: Quaternion, setting: NDArray, setpoint: NDArray) -> tuple[Vector, float, float]:
     """Return wanted z_B in the heading frame, thrust [N] and yaw rate of an attitude setpoint."""
     q = rot.normalised(four(setpoint, VALUE))
-    own = rot.about_z(rot.heading(four(belief, ob.ATTITUDE)))
-    z_des = limited_tilt(rot.rotate_back(own, rot.z_axis(q)), setting[TILT])
+    z_des = limited_tilt(rot.rotate_back(own, rot.z_axis(q)), setting[SLOPE])
     yaw_rate = _clip(setpoint[VALUE + 5], setting[YAW_RATE])
     return z_des, setpoint[VALUE + 4], yaw_rate
 
 
-@compiled
+@inlined
 def _velocity_wish(
-    mode: int, kind: int, memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray, setpoint: NDArray
+    mode: int,
+    kind: int,
+    memory: NDArray,
+    belief: NDArray,
+    own: Quaternion,
+    row: NDArray,
+    setting: NDArray,
+    setpoint: NDArray,
 ) -> tuple[Vector, float, float]:
     """Return wanted z_B in the heading frame, thrust [N] and yaw rate of all modes that fly by velocity."""
     v = vector(belief, ob.VELOCITY)
     wish, yaw_rate = (0.0, 0.0, 0.0), 0.0
     if mode == FLYING:
-        wish, yaw_rate = _asked_velocity(kind, belief, setting, setpoint)
+        wish, yaw_rate = _asked_velocity(kind, own, setting, setpoint)
     else:
-        wish = _held(memory, belief, wish)
+        wish = _held(memory, belief, own, wish)
     wish = (wish[0], wish[1], _climb(mode, wish[2], memory, belief, row, setting))
     # what the thrust must give: the acceleration wanted, less disturbance and drag, plus the weight
     f = axpy(vector(belief, ob.DISTURBANCE), -row[DRAG] / row[MASS], v)
     up = max(setting[K_CLIMB] * (wish[2] - v[2]) - f[2] + row[GRAVITY], LIFT_SHARE_MIN * row[GRAVITY])
     if mode == FLYING and kind == ARDRONE:
-        across = math.tan(setting[TILT])
+        across = setting[SLOPE]
         z = (across * _clip(setpoint[VALUE], 1.0), across * _clip(setpoint[VALUE + 1], 1.0), 1.0)
     else:
         z = (setting[K_VELOCITY] * (wish[0] - v[0]) - f[0], setting[K_VELOCITY] * (wish[1] - v[1]) - f[1], up)
-    z = limited_tilt(z, setting[TILT])
+    z = limited_tilt(z, setting[SLOPE])
     true_z = rot.z_axis(four(belief, ob.ATTITUDE))[2]
     return z, row[MASS] * up / max(true_z, 0.5), yaw_rate
 
 
-@compiled
-def _asked_velocity(kind: int, belief: NDArray, setting: NDArray, setpoint: NDArray) -> tuple[Vector, float]:
+@inlined
+def _asked_velocity(kind: int, own: Quaternion, setting: NDArray, setpoint: NDArray) -> tuple[Vector, float]:
     """Return the commander's velocity in the heading frame [m/s] and yaw rate [rad/s], within the limits."""
     if kind == ARDRONE:
         climb = setting[CLIMB] * _clip(setpoint[VALUE + 2], 1.0)
         return (0.0, 0.0, climb), setting[YAW_RATE] * _clip(setpoint[VALUE + 3], 1.0)
     v = vector(setpoint, VALUE)
     if kind == VELOCITY_WORLD:
-        v = rot.rotate_back(rot.about_z(rot.heading(four(belief, ob.ATTITUDE))), v)
+        v = rot.rotate_back(own, v)
     speed = math.sqrt(v[0] * v[0] + v[1] * v[1])
     s = 1.0 if speed <= setting[SPEED] else setting[SPEED] / speed
     return (s * v[0], s * v[1], _clip(v[2], setting[CLIMB])), _clip(setpoint[VALUE + 3], setting[YAW_RATE])
 
 
-@compiled
-def _held(memory: NDArray, belief: NDArray, wish: Vector) -> Vector:
+@inlined
+def _held(memory: NDArray, belief: NDArray, own: Quaternion, wish: Vector) -> Vector:
     """Return the wish with the horizontal velocity that holds the place of the own odometry."""
-    own = rot.about_z(rot.heading(four(belief, ob.ATTITUDE)))
     v_W = rot.rotate(own, vector(belief, ob.VELOCITY))
     for k in range(2):
         if memory[HOLDS_XY] == 0.0:
@@ -255,7 +281,7 @@ def _held(memory: NDArray, belief: NDArray, wish: Vector) -> Vector:
     return (v[0], v[1], wish[2])
 
 
-@compiled
+@inlined
 def _climb(mode: int, asked: float, memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) -> float:
     """Return the wanted vertical velocity [m/s]: take-off, landing, height hold, or what is asked."""
     height = belief[ob.HEIGHT]
@@ -272,7 +298,7 @@ def _climb(mode: int, asked: float, memory: NDArray, belief: NDArray, row: NDArr
     return _clip(K_HEIGHT * (memory[HOLD_Z] - height), setting[CLIMB])
 
 
-@compiled
+@inlined
 def _ascent(memory: NDArray, row: NDArray, setting: NDArray, height: float) -> float:
     """Return the vertical velocity of a take-off [m/s]: along a height that rises evenly."""
     if memory[HOLDS_Z] == 0.0:
@@ -286,7 +312,7 @@ def _ascent(memory: NDArray, row: NDArray, setting: NDArray, height: float) -> f
     return rising + _clip(K_HEIGHT * (memory[HOLD_Z] - height), setting[CLIMB])
 
 
-@compiled
+@inlined
 def _descent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) -> float:
     """Return the speed of descent [m/s], and count how long the ground has borne the weight."""
     borne = ob.lift(belief, row) < TOUCH_SHARE * row[GRAVITY] and belief[ob.VELOCITY + 2] > -TOUCH_M_S
@@ -295,6 +321,6 @@ def _descent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) -
     return min(DESCENT_M_S + faster, max(setting[CLIMB], DESCENT_M_S))
 
 
-@compiled
+@inlined
 def _clip(x: float, most: float) -> float:
     return min(max(x, -most), most)

@@ -77,6 +77,7 @@ class Fleet:
         self._sampler = Sampler(scenario)
         self._noise = NoiseTable(scenario, NOISE_GATES)
         self._w = arrays(scenario, self._noise)
+        self._held = gate.hold(self._w)
         self.bodies, self.boards = self._w.bodies, self._w.boards
         self.touching = np.zeros(self.count, dtype=bool)
         self._hull_m = float(self.bodies.vehicle[:, vehicle.HULL_RADIUS].max())
@@ -215,7 +216,7 @@ class Fleet:
         gate.enter(self.boards.memory[i], self.boards.belief[i], mode)
 
     def _integrate(self, ticks: int) -> None:
-        logged, least, diverged = gate.advance(self._w, ticks)
+        logged, least, diverged = gate.advance(self._held, ticks)
         if diverged >= 0:
             raise DivergedError(self.names[diverged], (self._tick + ticks) * self._tick_ns / 1e9)
         self._tick += ticks

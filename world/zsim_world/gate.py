@@ -6,7 +6,9 @@ drones are integrated; gusts move on (every 5 ms); drones meet; sensors that are
 
 import math
 from pathlib import Path
+from typing import Any
 
+from numba.typed.typedlist import List
 from numpy.typing import NDArray
 
 from zsim import presets
@@ -29,9 +31,9 @@ from zsim_world.arrays import (
     Time,
 )
 from zsim_world.battery import drained, percent
-from zsim_world.compiled import compiled, kernel
+from zsim_world.compiled import inlined, kernel
 from zsim_world.encounter import encounters
-from zsim_world.ground import drag_anchors
+from zsim_world.lanes import move
 from zsim_world.rigid_body import four, put, put_four, vector
 from zsim_world.rotation import Vector, norm
 from zsim_world.vehicle import GRAVITY
@@ -48,6 +50,7 @@ KERNEL_FILES = (
     "gains.py",
     "gate.py",
     "ground.py",
+    "lanes.py",
     "observer.py",
     "rigid_body.py",
     "rotation.py",
@@ -64,39 +67,29 @@ POSITION_MAX_M, RATE_MAX_RAD_S = 1e6, 1e4  # beyond, the integration has diverge
 Pair = tuple[Vector, Vector]
 
 
-@compiled
+@inlined
 def _steer(time: Time, bodies: Bodies, boards: Boards) -> None:
     """Let the firmware of every drone see and act."""
     for i in range(bodies.state.shape[0]):
         memory, belief, row = boards.memory[i], boards.belief[i], bodies.vehicle[i]
         on_ground = firmware.stands(memory)
-        observer.observe(belief, row, boards.gain[i], boards.device[i], boards.calibration[i], on_ground)
+        own = observer.observe(belief, row, boards.gain[i], boards.device[i], boards.calibration[i], on_ground)
         silence = (time.clock[TICK] - boards.set_tick[i]) * time.spans[DT]
         hover_s, land_s = time.spans[SILENCE_HOVER], time.spans[SILENCE_LAND]
         charge = percent(row, bodies.energy[i])
         setting, setpoint = boards.setting[i], boards.setpoint[i]
-        u = firmware.control(memory, belief, row, setting, setpoint, silence, hover_s, land_s, charge)
+        u = firmware.control(memory, belief, own, row, setting, setpoint, silence, hover_s, land_s, charge)
         put_four(bodies.command[i], 0, u if charge > 0.0 else (0.0, 0.0, 0.0, 0.0))
 
 
-@compiled
-def _move(bodies: Bodies, dt: float) -> None:
-    """Integrate every drone over one tick."""
-    for i in range(bodies.state.shape[0]):
-        row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
-        air, push, command = vector(bodies.air[i], 0), vector(bodies.push[i], 0), four(bodies.command[i], 0)
-        body.step(row, anchor, state, command, air, push, dt)
-        drag_anchors(row, anchor, vector(state, body.POSITION), four(state, body.ATTITUDE))
-
-
-@compiled
+@inlined
 def _drain(bodies: Bodies) -> None:
     for i in range(bodies.state.shape[0]):
         speed = four(bodies.state[i], body.ROTOR)
         bodies.energy[i] = drained(bodies.vehicle[i], bodies.energy[i], speed, observer.STEP_S)
 
 
-@compiled
+@inlined
 def _gusts(wind: NDArray, gust: NDArray, state: NDArray, noise: Noise) -> None:
     """Let the gusts of every drone move on by one step."""
     count = gust.shape[0]
@@ -108,17 +101,18 @@ def _gusts(wind: NDArray, gust: NDArray, state: NDArray, noise: Noise) -> None:
         noise.cursor[i, WIND_STREAM] += 1
 
 
-@compiled
+@inlined
 def _meet(wind: NDArray, gust: NDArray, bodies: Bodies) -> float:
     """Set air and pushes for the next tick; return the least distance of two drones [m]."""
     for i in range(gust.shape[0]):
         for k in range(3):
             bodies.air[i, k] = wind[STEADY + k] + gust[i, k]
             bodies.push[i, k] = 0.0
-    return encounters(bodies.vehicle, bodies.state, bodies.air, bodies.push, bodies.touching, bodies.touched)
+    b = bodies
+    return encounters(b.vehicle, b.state, b.air, b.push, b.touching, b.touched, b.near)
 
 
-@compiled
+@inlined
 def _accelerate(bodies: Bodies) -> None:
     """Note the accelerations of every drone in its present state."""
     for i in range(bodies.state.shape[0]):
@@ -131,7 +125,7 @@ def _accelerate(bodies: Bodies) -> None:
         put(bodies.accel[i], 3, alpha)
 
 
-@compiled
+@inlined
 def _ideal(s: int, config: NDArray, state: NDArray, accel: NDArray, gravity: float, place: NDArray) -> Pair:
     """Return the errorless values of sensor s; unused places are zero."""
     p, v, q, rate = body.pose(state)
@@ -152,7 +146,7 @@ def _ideal(s: int, config: NDArray, state: NDArray, accel: NDArray, gravity: flo
     return velocity, (quality, 0.0, 0.0)
 
 
-@compiled
+@inlined
 def _read(s: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray, at: int, height: float) -> bool:
     """Turn errorless values into a reading, in place; return False if it is lost."""
     n = ss.CHANNELS[s]
@@ -170,7 +164,7 @@ def _read(s: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray
     return noise[at + 2 * n] >= config[ss.DROP]
 
 
-@compiled
+@inlined
 def _sample(s: int, i: int, bodies: Bodies, noise: Noise, senses: Senses, value: NDArray) -> bool:
     """Write a reading of sensor s of drone i into value (6,); return False if it is lost."""
     gravity, config = bodies.vehicle[i, GRAVITY], senses.config[i, s]
@@ -182,7 +176,7 @@ def _sample(s: int, i: int, bodies: Bodies, noise: Noise, senses: Senses, value:
     return _read(s, value, config, senses.bias[i, s], noise.table[i], at, senses.place[ORIGIN_HEIGHT])
 
 
-@compiled
+@inlined
 def _register(device: NDArray, s: int, value: NDArray) -> None:
     """Hand a sample to the firmware."""
     if s == ss.IMU:
@@ -201,7 +195,7 @@ def _register(device: NDArray, s: int, value: NDArray) -> None:
         device[observer.NEW_FLOW] = 1.0
 
 
-@compiled
+@inlined
 def _due(plan: NDArray, tick: int) -> bool:
     """Return whether a sample is due, and plan the next one if so."""
     if plan[ss.DUE] > tick:
@@ -211,7 +205,7 @@ def _due(plan: NDArray, tick: int) -> bool:
     return True
 
 
-@compiled
+@inlined
 def _sense(tick: int, step: bool, logged: int, bodies: Bodies, device: NDArray, noise: Noise, senses: Senses) -> int:
     """Let all sensors sample what is due at this tick; return the length of the log.
 
@@ -232,13 +226,13 @@ def _sense(tick: int, step: bool, logged: int, bodies: Bodies, device: NDArray, 
     return logged
 
 
-@compiled
+@inlined
 def _note(row: NDArray, s: int, i: int, tick: int) -> None:
     """Note whose sample it is."""
     row[0], row[1], row[2] = s, i, tick
 
 
-@compiled
+@inlined
 def _diverged(state: NDArray) -> int:
     """Return the first drone whose state is no longer one, or -1."""
     for i in range(state.shape[0]):
@@ -251,19 +245,36 @@ def _diverged(state: NDArray) -> int:
     return -1
 
 
-@kernel(SOURCES)
+@kernel(SOURCES, makes_arrays=False)
 def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
     """Put the firmware of a drone, by its rows of `boards`, into a mode."""
     firmware.enter(memory, belief, mode)
 
 
 @kernel(SOURCES)
-def advance(w: Arrays, ticks: int) -> tuple[int, float, int]:
+def hold(w: Arrays) -> Any:
+    """Return the arrays in a list of one, for `advance`: numba takes a list as one thing, and each array apart."""
+    held = List()
+    held.append(w)
+    return held
+
+
+@kernel(SOURCES)
+def advance(held: List, ticks: int) -> tuple[int, float, int]:
     """Integrate so many physics ticks; 0 ticks: take the samples of the present instant.
+
+    Args:
+        held: the arrays, by `hold`.
 
     Returns:
         number of samples logged, least distance of two drones [m], diverged drone or -1.
     """
+    return _advance(held[0], ticks)
+
+
+@inlined
+def _advance(w: Arrays, ticks: int) -> tuple[int, float, int]:
+    """Do as `advance` says."""
     time, bodies, boards, noise, senses, wind, gust = w
     clock, device = time.clock, boards.device
     logged, least = 0, math.inf
@@ -275,7 +286,7 @@ def advance(w: Arrays, ticks: int) -> tuple[int, float, int]:
     for _ in range(ticks):
         if clock[TICK] % clock[TICKS_PER_STEP] == 0:
             _steer(time, bodies, boards)
-        _move(bodies, time.spans[DT])
+        move(bodies, time.spans[DT])
         clock[TICK] += 1
         step = clock[TICK] % clock[TICKS_PER_STEP] == 0
         if step:

@@ -8,21 +8,21 @@ import math
 
 from numpy.typing import NDArray
 
-from zsim_world.compiled import compiled
+from zsim_world.compiled import inlined
 from zsim_world.rotation import Quaternion, Vector, add, cross, rotate, rotate_back
-from zsim_world.vehicle import CONTACT_POINTS_B, CONTACT_REACH_M, FOOT_DAMPING, FOOT_STIFFNESS, FRICTION, SIZE
+from zsim_world.vehicle import CONTACT_POINTS_B, CONTACT_REACH_M, FOOT_DAMPING, FOOT_STIFFNESS, FRICTION, SIZE, Row
 
 Pair = tuple[float, float]
 
 
-@compiled
-def _point(row: NDArray, k: int) -> Vector:
+@inlined
+def _point(row: Row, k: int) -> Vector:
     s = row[SIZE]
     return (s * CONTACT_POINTS_B[k, 0], s * CONTACT_POINTS_B[k, 1], s * CONTACT_POINTS_B[k, 2])
 
 
-@compiled
-def _tangential(row: NDArray, normal: float, gap: Pair, speed: Pair) -> Pair:
+@inlined
+def _tangential(row: Row, normal: float, gap: Pair, speed: Pair) -> Pair:
     """Return the friction force [N] of one point, within the cone."""
     fx = -row[FOOT_STIFFNESS] * gap[0] - row[FOOT_DAMPING] * speed[0]
     fy = -row[FOOT_STIFFNESS] * gap[1] - row[FOOT_DAMPING] * speed[1]
@@ -33,9 +33,9 @@ def _tangential(row: NDArray, normal: float, gap: Pair, speed: Pair) -> Pair:
     return fx * limit / size, fy * limit / size
 
 
-@compiled
+@inlined
 def contact(
-    row: NDArray, anchor: NDArray, p_WB: Vector, v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector
+    row: Row, anchor: NDArray, p_WB: Vector, v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector
 ) -> tuple[Vector, Vector]:
     """Return force in W [N] and moment in B [N m] of the ground on one drone.
 
@@ -62,7 +62,7 @@ def contact(
     return force, moment
 
 
-@compiled
+@inlined
 def drag_anchors(row: NDArray, anchor: NDArray, p_WB: Vector, q_WB: Quaternion) -> None:
     """Move the anchors after a step: to the point itself in the air, along with it where it slides."""
     for k in range(CONTACT_POINTS_B.shape[0]):

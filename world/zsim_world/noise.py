@@ -11,6 +11,7 @@ import numpy as np
 from zsim.presets import BOARD_RATE_HZ
 from zsim.scenario import Scenario
 from zsim.streams import stream
+from zsim_world import normals
 from zsim_world.sensor_set import CHANNELS, CHANNELS_MAX, NOISE_WIDTH, SENSORS, channels, rate_of
 
 WIDTHS = (*NOISE_WIDTH, 3)  # numbers per row: of a sample, of a gust
@@ -21,43 +22,37 @@ class NoiseTable:
 
     def __init__(self, scenario: Scenario, gates: int) -> None:
         names = [drone.name for drone in scenario.drones]
-        self._streams = [[stream(scenario.seed, f"{name}/{s}") for s in (*SENSORS, "wind")] for name in names]
-        self._common = stream(scenario.seed, "wind")
-        rows = _rows(scenario, gates)
-        ends = np.cumsum([count * width for count, width in zip(rows, WIDTHS, strict=True)])
-        self._rows = rows
+        streams = [[stream(scenario.seed, f"{name}/{s}") for s in (*SENSORS, "wind")] for name in names]
+        common = stream(scenario.seed, "wind")
+        self._rows, self._widths = np.array(_rows(scenario, gates)), np.array(WIDTHS)
+        ends = np.cumsum(self._rows * self._widths)
         self.at = np.array([0, *ends[:-1]], dtype=np.int64)
         self.table = np.zeros((len(names) + 1, ends[-1]))
         self.cursor = np.zeros((len(names) + 1, len(WIDTHS)), dtype=np.int64)
         self.bias = np.zeros((len(names), len(SENSORS), CHANNELS_MAX))
         self.gust = np.zeros((len(names), 3))
-        self._draw_start(scenario)
-        self.cursor[:] = rows  # nothing drawn yet
+        self._draw_start(scenario, streams, common)
+        self._words = np.zeros((len(names) + 1, len(WIDTHS), normals.COLUMNS), dtype=np.uint64)
+        self._words[:-1] = [[normals.words(rng) for rng in row] for row in streams]
+        self._words[-1, -1] = normals.words(common)
+        self.cursor[:-1], self.cursor[-1, -1] = self._rows, self._rows[-1]  # nothing drawn yet
         self.refill()
 
     def refill(self) -> None:
         """Draw as many rows as have been used."""
-        for i, streams in enumerate(self._streams):
-            for s, rng in enumerate(streams):
-                self._refill(i, s, rng)
-        self._refill(len(self._streams), len(SENSORS), self._common)
+        normals.refill(self.table, self.at, self._rows, self._widths, self.cursor, self._words)
 
-    def _refill(self, i: int, s: int, rng: np.random.Generator) -> None:
-        used = int(self.cursor[i, s])
-        block = self.table[i, self.at[s] : self.at[s] + self._rows[s] * WIDTHS[s]].reshape(-1, WIDTHS[s])
-        block[: len(block) - used] = block[used:].copy()
-        block[len(block) - used :] = rng.standard_normal((used, WIDTHS[s]))
-        self.cursor[i, s] = 0
-
-    def _draw_start(self, scenario: Scenario) -> None:
+    def _draw_start(
+        self, scenario: Scenario, streams: list[list[np.random.Generator]], shared: np.random.Generator
+    ) -> None:
         """Draw the biases and gusts at the start, first of each stream."""
-        common = self._common.standard_normal(3)
+        common = shared.standard_normal(3)
         share = scenario.environment.wind.gust_correlation
         for i, drone in enumerate(scenario.drones):
             for s, name in enumerate(SENSORS):
                 sigma = [model.bias for model in channels(drone.sensors, name)]
-                self.bias[i, s, : CHANNELS[s]] = sigma * self._streams[i][s].standard_normal(CHANNELS[s])
-            own = self._streams[i][-1].standard_normal(3)
+                self.bias[i, s, : CHANNELS[s]] = sigma * streams[i][s].standard_normal(CHANNELS[s])
+            own = streams[i][-1].standard_normal(3)
             self.gust[i] = math.sqrt(share) * common + math.sqrt(1.0 - share) * own
         self.gust *= scenario.environment.wind.gust_m_s
 

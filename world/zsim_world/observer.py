@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from zsim.presets import BOARD_RATE_HZ
 from zsim_world import gains as g
 from zsim_world import rotation as rot
-from zsim_world.compiled import compiled
+from zsim_world.compiled import inlined
 from zsim_world.rigid_body import four, put, put_four, vector
 from zsim_world.rotation import Quaternion, Vector, axpy
-from zsim_world.rotors import lagged
-from zsim_world.vehicle import DRAG, GRAVITY, MASS, ROTOR_LAG, STAND_HEIGHT, THRUST
+from zsim_world.rotors import Four, lagged
+from zsim_world.vehicle import DRAG, GRAVITY, MASS, STAND_HEIGHT, THRUST
 
 STEP_S = 1.0 / BOARD_RATE_HZ  # s
 
@@ -44,29 +44,26 @@ SONAR_AGE_MAX = 100.0  # steps, 0.5 s without echo: heights come from the barome
 MAG_MIN_UT = 1.0  # uT, a horizontal field that still gives a heading
 
 
-@compiled
-def level(q_WB: Quaternion) -> Quaternion:
-    """Return q_HB, the attitude over the heading frame: tilt without heading."""
-    return rot.multiply(rot.about_z(-rot.heading(q_WB)), q_WB)
-
-
-@compiled
+@inlined
 def turn_by(belief: NDArray, r_H: Vector) -> None:
     """Turn the believed attitude by a small rotation vector [rad] given in the heading frame."""
     q = four(belief, ATTITUDE)
-    r_W = rot.rotate(rot.about_z(rot.heading(q)), r_H)
+    r_W = rot.rotate(rot.facing(q), r_H)
     put_four(belief, ATTITUDE, rot.normalised(rot.multiply(rot.from_rotation_vector(r_W), q)))
 
 
-@compiled
+@inlined
 def _take_bias(belief: NDArray, r_H: Vector) -> None:
     """Take a rate error [rad/s], given in the heading frame, out of the gyro's bias."""
-    q_HB = level(four(belief, ATTITUDE))
+    q = four(belief, ATTITUDE)
+    q_HB = rot.level(rot.facing(q), q)
     put(belief, GYRO_BIAS, axpy(vector(belief, GYRO_BIAS), -1.0, rot.rotate_back(q_HB, r_H)))
 
 
-@compiled
-def observe(belief: NDArray, row: NDArray, gain: NDArray, device: NDArray, board: NDArray, on_ground: bool) -> None:
+@inlined
+def observe(
+    belief: NDArray, row: NDArray, gain: NDArray, device: NDArray, board: NDArray, on_ground: bool
+) -> Quaternion:
     """Advance the belief by one step of 5 ms and take in what the devices have sampled since the last.
 
     Args:
@@ -75,6 +72,9 @@ def observe(belief: NDArray, row: NDArray, gain: NDArray, device: NDArray, board
         device: (REGISTERS,) newest samples; the marks of new ones are cleared.
         board: (CALIBRATION,).
         on_ground: standing: velocity zero, gravity is all that the accelerometer feels.
+
+    Returns:
+        the heading frame in W, as rotation.facing gives it for the attitude now believed.
     """
     before = rot.heading(four(belief, ATTITUDE))
     w = axpy(rot.rotate(four(board, IMU_TURN), vector(device, GYRO)), -1.0, vector(belief, GYRO_BIAS))
@@ -82,12 +82,15 @@ def observe(belief: NDArray, row: NDArray, gain: NDArray, device: NDArray, board
     turn = rot.from_rotation_vector((w[0] * STEP_S, w[1] * STEP_S, w[2] * STEP_S))
     put_four(belief, ATTITUDE, rot.normalised(rot.multiply(four(belief, ATTITUDE), turn)))
     f_B = rot.rotate(four(board, IMU_TURN), vector(device, ACCEL))
+    heading = rot.heading(four(belief, ATTITUDE))
+    own, corrected = rot.about_z(heading), on_ground or device[NEW_MAG] > 0.0
     if on_ground:
-        _stand(belief, row, f_B, w)
+        _stand(belief, row, own, f_B, w)
     else:
-        _fly(belief, row, gain, f_B, rot.heading(four(belief, ATTITUDE)) - before)
+        _fly(belief, row, gain, own, f_B, heading - before)
         if device[NEW_FLOW] > 0.0 and device[FLOW_QUALITY] >= FLOW_QUALITY_MIN:
             _see_flow(belief, gain, vector(device, FLOW))
+            corrected = True
         _measure_height(belief, gain, device, board[SONAR_MIN])
     if device[NEW_BARO] > 0.0:
         _see_baro(belief, gain, device[BARO], on_ground)
@@ -95,14 +98,15 @@ def observe(belief: NDArray, row: NDArray, gain: NDArray, device: NDArray, board
         _see_mag(belief, gain, rot.rotate(four(board, MAG_TURN), vector(device, MAG)), board[MAG_BEARING])
     for k in range(NEW_FLOW, NEW_SONAR + 1):
         device[k] = 0.0
+    return rot.facing(four(belief, ATTITUDE)) if corrected else own
 
 
-@compiled
-def _stand(belief: NDArray, row: NDArray, f_B: Vector, w: Vector) -> None:
+@inlined
+def _stand(belief: NDArray, row: NDArray, own: Quaternion, f_B: Vector, w: Vector) -> None:
     """Average gravity and the gyro's bias while standing; the first 20 s weigh alike."""
     n = min(belief[STILL_STEPS] + 1.0, STILL_STEPS_MAX)
     belief[STILL_STEPS] = n
-    q_HB = level(four(belief, ATTITUDE))
+    q_HB = rot.level(own, four(belief, ATTITUDE))
     f_H = rot.rotate(q_HB, f_B)
     s = 1.0 / (n * row[GRAVITY])
     turn_by(belief, (f_H[1] * s, -f_H[0] * s, 0.0))
@@ -113,17 +117,16 @@ def _stand(belief: NDArray, row: NDArray, f_B: Vector, w: Vector) -> None:
     belief[HEIGHT] = row[STAND_HEIGHT]
 
 
-@compiled
-def _fly(belief: NDArray, row: NDArray, gain: NDArray, f_B: Vector, turned: float) -> None:
+@inlined
+def _fly(belief: NDArray, row: NDArray, gain: NDArray, own: Quaternion, f_B: Vector, turned: float) -> None:
     """Predict velocity, height and odometry by one step and take in the accelerometer."""
-    q = four(belief, ATTITUDE)
-    q_HB = level(q)
+    q_HB = rot.level(own, four(belief, ATTITUDE))
     up = lift(belief, row)
     c = row[DRAG] / row[MASS]
     v, u = vector(belief, VELOCITY), vector(belief, DISTURBANCE)
     a = axpy(axpy(u, -c, v), up, rot.z_axis(q_HB))
     a = (a[0], a[1], a[2] - row[GRAVITY])
-    east = rot.rotate(rot.about_z(rot.heading(q)), axpy(v, 0.5 * STEP_S, a))
+    east = rot.rotate(own, axpy(v, 0.5 * STEP_S, a))
     belief[ODOMETRY] += STEP_S * east[0]
     belief[ODOMETRY + 1] += STEP_S * east[1]
     belief[HEIGHT] += STEP_S * east[2]
@@ -137,7 +140,7 @@ def _fly(belief: NDArray, row: NDArray, gain: NDArray, f_B: Vector, turned: floa
     _lift_by(belief, gain, g.LIFT_Z, e[2] - belief[LIFT_BIAS])
 
 
-@compiled
+@inlined
 def lift(belief: NDArray, row: NDArray) -> float:
     """Return the modelled thrust over mass [m/s^2]."""
     s = 0.0
@@ -146,7 +149,7 @@ def lift(belief: NDArray, row: NDArray) -> float:
     return row[THRUST] * s / row[MASS]
 
 
-@compiled
+@inlined
 def _correct(belief: NDArray, gain: NDArray, at: int, e: Vector) -> None:
     """Correct horizontal velocity and disturbance by an innovation; the gains stand at `at`."""
     for k in range(2):
@@ -154,7 +157,7 @@ def _correct(belief: NDArray, gain: NDArray, at: int, e: Vector) -> None:
         belief[DISTURBANCE + k] += gain[at + 3] * e[k]
 
 
-@compiled
+@inlined
 def _correct_tilt(belief: NDArray, gain: NDArray, e: Vector) -> None:
     """Correct tilt and gyro bias by an innovation of the flow (the accelerometer's share of it is nothing)."""
     tilt, rate = gain[g.FLOW_TILT], gain[g.FLOW_RATE]
@@ -162,7 +165,7 @@ def _correct_tilt(belief: NDArray, gain: NDArray, e: Vector) -> None:
     _take_bias(belief, (-rate * e[1], rate * e[0], 0.0))
 
 
-@compiled
+@inlined
 def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
     """Correct height, climb, vertical disturbance and accelerometer bias by an innovation; the gains stand at `at`."""
     belief[HEIGHT] += gain[at] * e
@@ -171,7 +174,7 @@ def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
     belief[LIFT_BIAS] += gain[at + 3] * e
 
 
-@compiled
+@inlined
 def _see_flow(belief: NDArray, gain: NDArray, flow_H: Vector) -> None:
     e = axpy(flow_H, -1.0, vector(belief, VELOCITY))
     _correct(belief, gain, g.FLOW_V, e)
@@ -179,7 +182,7 @@ def _see_flow(belief: NDArray, gain: NDArray, flow_H: Vector) -> None:
     _lift_by(belief, gain, g.CLIMB_Z, e[2])
 
 
-@compiled
+@inlined
 def _measure_height(belief: NDArray, gain: NDArray, device: NDArray, sonar_min: float) -> None:
     """Take the height from the sonar where it has an echo, else from the barometer."""
     belief[SONAR_AGE] += 1.0
@@ -191,7 +194,7 @@ def _measure_height(belief: NDArray, gain: NDArray, device: NDArray, sonar_min: 
         _lift_by(belief, gain, g.BARO_Z, device[BARO] - belief[BARO_ZERO] - belief[HEIGHT])
 
 
-@compiled
+@inlined
 def _see_baro(belief: NDArray, gain: NDArray, altitude: float, on_ground: bool) -> None:
     """Learn what the barometer shows at height zero: on the ground, and in the air while the sonar gives the height."""
     if on_ground or belief[SONAR_AGE] <= SONAR_AGE_MAX:
@@ -200,22 +203,23 @@ def _see_baro(belief: NDArray, gain: NDArray, altitude: float, on_ground: bool) 
         belief[BARO_ZERO] += max(1.0 / n, gain[g.BARO_ZERO]) * (altitude - belief[HEIGHT] - belief[BARO_ZERO])
 
 
-@compiled
+@inlined
 def _see_mag(belief: NDArray, gain: NDArray, field_B: Vector, bearing: float) -> None:
     """Correct heading and the gyro's bias about the vertical; the first samples are averaged."""
     q = four(belief, ATTITUDE)
-    field_H = rot.rotate(level(q), field_B)
+    heading = rot.heading(q)
+    field_H = rot.rotate(rot.level(rot.about_z(heading), q), field_B)
     if field_H[0] * field_H[0] + field_H[1] * field_H[1] < MAG_MIN_UT * MAG_MIN_UT:
         return
     n = belief[MAG_SAMPLES] + 1.0
     belief[MAG_SAMPLES] = n
-    e = rot.wrapped(bearing - math.atan2(field_H[1], field_H[0]) - rot.heading(q))
+    e = rot.wrapped(bearing - math.atan2(field_H[1], field_H[0]) - heading)
     turn_by(belief, (0.0, 0.0, max(1.0 / n, gain[g.MAG_PSI]) * e))
     if 1.0 / n < gain[g.MAG_PSI]:
         _take_bias(belief, (0.0, 0.0, gain[g.MAG_RATE] * e))
 
 
-@compiled
-def model_rotors(belief: NDArray, row: NDArray, command: tuple[float, float, float, float]) -> None:
-    """Advance the modelled rotors by one step under a command [rad/s]."""
-    put_four(belief, ROTOR, lagged(four(belief, ROTOR), command, math.exp(-STEP_S / row[ROTOR_LAG])))
+@inlined
+def model_rotors(belief: NDArray, decay: float, command: Four) -> None:
+    """Advance the modelled rotors by one step under a command [rad/s]; decay: what is left of their lag after it."""
+    put_four(belief, ROTOR, lagged(four(belief, ROTOR), command, decay))

@@ -5,49 +5,62 @@ import math
 from numpy.typing import NDArray
 
 from zsim_world import rotation as rot
-from zsim_world.compiled import compiled
+from zsim_world.compiled import inlined
 from zsim_world.ground import contact
 from zsim_world.rotation import Quaternion, Vector, add, axpy
 from zsim_world.rotors import Four, lagged, wrench
-from zsim_world.vehicle import DRAG, GRAVITY, INERTIA_X, INERTIA_Y, INERTIA_Z, MASS, ROTOR_LAG
+from zsim_world.vehicle import (
+    CONTACT_REACH_M,
+    DRAG,
+    GRAVITY,
+    INERTIA_X,
+    INERTIA_Y,
+    INERTIA_Z,
+    MASS,
+    ROTOR_LAG,
+    SIZE,
+    Row,
+)
 
 # Columns of the state, one row per drone
 POSITION, VELOCITY, ATTITUDE, RATE, ROTOR = 0, 3, 6, 10, 13  # m, m/s, quaternion, rad/s in B, rad/s
 COLUMNS = 17
 
+NOTHING = (0.0, 0.0, 0.0)  # N or N m
 
-@compiled
-def vector(row: NDArray, at: int) -> Vector:
+
+@inlined
+def vector(row: Row, at: int) -> Vector:
     """Return three numbers of a row."""
     return (row[at], row[at + 1], row[at + 2])
 
 
-@compiled
-def four(row: NDArray, at: int) -> Four:
+@inlined
+def four(row: Row, at: int) -> Four:
     """Return four numbers of a row."""
     return (row[at], row[at + 1], row[at + 2], row[at + 3])
 
 
-@compiled
+@inlined
 def put(row: NDArray, at: int, a: Vector) -> None:
     """Write three numbers into a row."""
     row[at], row[at + 1], row[at + 2] = a
 
 
-@compiled
+@inlined
 def put_four(row: NDArray, at: int, a: Four) -> None:
     """Write four numbers into a row."""
     row[at], row[at + 1], row[at + 2], row[at + 3] = a
 
 
-@compiled
+@inlined
 def pose(state: NDArray) -> tuple[Vector, Vector, Quaternion, Vector]:
     """Return p_WB, v_WB, q_WB, w_WB_B of one drone's state."""
     return vector(state, POSITION), vector(state, VELOCITY), four(state, ATTITUDE), vector(state, RATE)
 
 
-@compiled
-def slew(row: NDArray, speed: Four, command: Four) -> Four:
+@inlined
+def slew(row: Row, speed: Four, command: Four) -> Four:
     """Return the rotors' accelerations [rad/s^2] under their first-order lag."""
     s = 1.0 / row[ROTOR_LAG]
     return (
@@ -58,9 +71,9 @@ def slew(row: NDArray, speed: Four, command: Four) -> Four:
     )
 
 
-@compiled
+@inlined
 def accelerations(
-    row: NDArray,
+    row: Row,
     anchor: NDArray,
     p_WB: Vector,
     v_WB: Vector,
@@ -81,11 +94,28 @@ def accelerations(
         p_WB, v_WB, q_WB, w_WB_B, speed: state; command: rotor speeds wanted [rad/s].
         air_W: velocity of the air at the drone [m/s]; push_W: force of other drones [N].
     """
+    ground = contact(row, anchor, p_WB, v_WB, q_WB, w_WB_B)
+    return _driven(row, ground, p_WB[2], v_WB, q_WB, w_WB_B, speed, command, air_W, push_W)
+
+
+@inlined
+def _driven(
+    row: Row,
+    ground: tuple[Vector, Vector],
+    height_m: float,
+    v_WB: Vector,
+    q_WB: Quaternion,
+    w_WB_B: Vector,
+    speed: Four,
+    command: Four,
+    air_W: Vector,
+    push_W: Vector,
+) -> tuple[Vector, Vector]:
+    """Return the accelerations under a force [N; W] and a moment [N m; B] of the ground."""
     ix, iy, iz = row[INERTIA_X], row[INERTIA_Y], row[INERTIA_Z]
-    thrust, moment = wrench(row, q_WB, p_WB[2], w_WB_B, speed, slew(row, speed, command))
-    ground, ground_moment = contact(row, anchor, p_WB, v_WB, q_WB, w_WB_B)
-    moment = add(moment, ground_moment)
-    force = add(add(ground, push_W), rot.rotate(q_WB, (0.0, 0.0, thrust)))
+    thrust, moment = wrench(row, q_WB, height_m, w_WB_B, speed, slew(row, speed, command))
+    moment = add(moment, ground[1])
+    force = add(add(ground[0], push_W), rot.rotate(q_WB, (0.0, 0.0, thrust)))
     force = axpy(force, -row[DRAG], axpy(v_WB, -1.0, air_W))
     inv = 1.0 / row[MASS]
     wx, wy, wz = w_WB_B
@@ -99,12 +129,12 @@ def accelerations(
     )
 
 
-@compiled
+@inlined
 def _turned(q: Quaternion, s: float, dq: Quaternion) -> Quaternion:
     return (q[0] + s * dq[0], q[1] + s * dq[1], q[2] + s * dq[2], q[3] + s * dq[3])
 
 
-@compiled
+@inlined
 def _mean(a: Vector, b: Vector, c: Vector, d: Vector) -> Vector:
     """Return the Runge-Kutta mean (a + 2b + 2c + d) / 6."""
     s = 1.0 / 6.0
@@ -115,7 +145,7 @@ def _mean(a: Vector, b: Vector, c: Vector, d: Vector) -> Vector:
     )
 
 
-@compiled
+@inlined
 def step(
     row: NDArray, anchor: NDArray, state: NDArray, command: Four, air_W: Vector, push_W: Vector, dt: float
 ) -> None:
@@ -123,28 +153,88 @@ def step(
 
     The rotors' lag is integrated exactly, also inside the step; air and pushes of others are held over it.
     """
+    decay = half_decay(row[ROTOR_LAG], dt)
     p, v, q, w = pose(state)
-    r0, h = four(state, ROTOR), 0.5 * dt
-    decay = math.exp(-h / row[ROTOR_LAG])
+    p, v, q, w, speed, _ = stepped(True, row, anchor, p, v, q, w, four(state, ROTOR), command, air_W, push_W, decay, dt)
+    put(state, POSITION, p)
+    put(state, VELOCITY, v)
+    put_four(state, ATTITUDE, q)
+    put(state, RATE, w)
+    put_four(state, ROTOR, speed)
+
+
+@inlined
+def half_decay(lag_s: float, dt: float) -> float:
+    """Return what is left of a rotor's distance to its commanded speed after half a step."""
+    return math.exp(-0.5 * dt / lag_s)
+
+
+@inlined
+def stepped(
+    grounded: bool,
+    row: Row,
+    anchor: NDArray,
+    p: Vector,
+    v: Vector,
+    q: Quaternion,
+    w: Vector,
+    r0: Four,
+    command: Four,
+    air_W: Vector,
+    push_W: Vector,
+    decay: float,
+    dt: float,
+) -> tuple[Vector, Vector, Quaternion, Vector, Four, bool]:
+    """Return p_WB, v_WB, q_WB, w_WB_B and rotor speeds after dt [s], and whether the ground was out of reach.
+
+    Args:
+        grounded: a constant where it is called. False leaves the ground out, and then the result holds only where
+            the ground was out of reach; so there is no branch in the step, and several drones go at once (lanes.py).
+        row, anchor, command, air_W, push_W: as for `accelerations`.
+        p, v, q, w, r0: state; decay: of the rotors' lag, see `half_decay`.
+    """
+    h, reach = 0.5 * dt, CONTACT_REACH_M * row[SIZE]
     r1 = lagged(r0, command, decay)
     r2 = lagged(r0, command, decay * decay)
 
-    a1, b1 = accelerations(row, anchor, p, v, q, w, r0, command, air_W, push_W)
+    a1, b1 = _stage(grounded, row, anchor, p, v, q, w, r0, command, air_W, push_W)
     d1 = rot.rate(q, w)
-    v2, w2, q2 = axpy(v, h, a1), axpy(w, h, b1), _turned(q, h, d1)
-    a2, b2 = accelerations(row, anchor, axpy(p, h, v), v2, q2, w2, r1, command, air_W, push_W)
+    p2, v2, w2, q2 = axpy(p, h, v), axpy(v, h, a1), axpy(w, h, b1), _turned(q, h, d1)
+    a2, b2 = _stage(grounded, row, anchor, p2, v2, q2, w2, r1, command, air_W, push_W)
     d2 = rot.rate(q2, w2)
-    v3, w3, q3 = axpy(v, h, a2), axpy(w, h, b2), _turned(q, h, d2)
-    a3, b3 = accelerations(row, anchor, axpy(p, h, v2), v3, q3, w3, r1, command, air_W, push_W)
+    p3, v3, w3, q3 = axpy(p, h, v2), axpy(v, h, a2), axpy(w, h, b2), _turned(q, h, d2)
+    a3, b3 = _stage(grounded, row, anchor, p3, v3, q3, w3, r1, command, air_W, push_W)
     d3 = rot.rate(q3, w3)
-    v4, w4, q4 = axpy(v, dt, a3), axpy(w, dt, b3), _turned(q, dt, d3)
-    a4, b4 = accelerations(row, anchor, axpy(p, dt, v3), v4, q4, w4, r2, command, air_W, push_W)
+    p4, v4, w4, q4 = axpy(p, dt, v3), axpy(v, dt, a3), axpy(w, dt, b3), _turned(q, dt, d3)
+    a4, b4 = _stage(grounded, row, anchor, p4, v4, q4, w4, r2, command, air_W, push_W)
     d4 = rot.rate(q4, w4)
 
-    put(state, POSITION, axpy(p, dt, _mean(v, v2, v3, v4)))
-    put(state, VELOCITY, axpy(v, dt, _mean(a1, a2, a3, a4)))
-    put(state, RATE, axpy(w, dt, _mean(b1, b2, b3, b4)))
     s = dt / 6.0
-    q = _turned(_turned(_turned(_turned(q, s, d1), 2.0 * s, d2), 2.0 * s, d3), s, d4)
-    put_four(state, ATTITUDE, rot.normalised(q))
-    put_four(state, ROTOR, r2)
+    return (
+        axpy(p, dt, _mean(v, v2, v3, v4)),
+        axpy(v, dt, _mean(a1, a2, a3, a4)),
+        rot.normalised(_turned(_turned(_turned(_turned(q, s, d1), 2.0 * s, d2), 2.0 * s, d3), s, d4)),
+        axpy(w, dt, _mean(b1, b2, b3, b4)),
+        r2,
+        (p[2] > reach) & (p2[2] > reach) & (p3[2] > reach) & (p4[2] > reach),
+    )
+
+
+@inlined
+def _stage(
+    grounded: bool,
+    row: Row,
+    anchor: NDArray,
+    p: Vector,
+    v: Vector,
+    q: Quaternion,
+    w: Vector,
+    speed: Four,
+    command: Four,
+    air_W: Vector,
+    push_W: Vector,
+) -> tuple[Vector, Vector]:
+    """Return the accelerations in one stage of a step."""
+    if grounded:
+        return accelerations(row, anchor, p, v, q, w, speed, command, air_W, push_W)
+    return _driven(row, (NOTHING, NOTHING), p[2], v, q, w, speed, command, air_W, push_W)

@@ -5,7 +5,7 @@ A vector is (x, y, z). A quaternion is Hamilton (w, x, y, z) and turns body comp
 
 import math
 
-from zsim_world.compiled import compiled
+from zsim_world.compiled import inlined
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -13,37 +13,37 @@ Quaternion = tuple[float, float, float, float]
 _SMALL_ANGLE = 1e-8  # rad; below it sin(x)/x is 1 to the last bit
 
 
-@compiled
+@inlined
 def add(a: Vector, b: Vector) -> Vector:
     """Return a + b."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
-@compiled
+@inlined
 def axpy(a: Vector, s: float, b: Vector) -> Vector:
     """Return a + s b."""
     return (a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2])
 
 
-@compiled
+@inlined
 def cross(a: Vector, b: Vector) -> Vector:
     """Return a × b."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@compiled
+@inlined
 def dot(a: Vector, b: Vector) -> float:
     """Return a · b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@compiled
+@inlined
 def norm(a: Vector) -> float:
     """Return |a|."""
     return math.sqrt(dot(a, a))
 
 
-@compiled
+@inlined
 def rotate(q: Quaternion, a: Vector) -> Vector:
     """Return R(q) a: body components to world components."""
     w, x, y, z = q
@@ -57,13 +57,13 @@ def rotate(q: Quaternion, a: Vector) -> Vector:
     )
 
 
-@compiled
+@inlined
 def rotate_back(q: Quaternion, a: Vector) -> Vector:
     """Return R(q)^T a: world components to body components."""
     return rotate((q[0], -q[1], -q[2], -q[3]), a)
 
 
-@compiled
+@inlined
 def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
     """Return the Hamilton product p q: first q, then p."""
     return (
@@ -74,14 +74,14 @@ def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
     )
 
 
-@compiled
+@inlined
 def normalised(q: Quaternion) -> Quaternion:
     """Return q / |q|."""
     s = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return (q[0] * s, q[1] * s, q[2] * s, q[3] * s)
 
 
-@compiled
+@inlined
 def from_rotation_vector(r: Vector) -> Quaternion:
     """Return the quaternion of a turn by |r| radians about r."""
     angle = norm(r)
@@ -89,7 +89,7 @@ def from_rotation_vector(r: Vector) -> Quaternion:
     return (math.cos(0.5 * angle), s * r[0], s * r[1], s * r[2])
 
 
-@compiled
+@inlined
 def rate(q: Quaternion, w_WB_B: Vector) -> Quaternion:
     """Return dq/dt = q (0, w) / 2 for the body rate w [rad/s]."""
     w, x, y, z = q
@@ -97,27 +97,39 @@ def rate(q: Quaternion, w_WB_B: Vector) -> Quaternion:
     return (-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a)
 
 
-@compiled
+@inlined
 def heading(q: Quaternion) -> float:
     """Return the heading [rad]: the angle of the body's x axis from east, counter-clockwise seen from above."""
     w, x, y, z = q
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
-@compiled
+@inlined
 def about_z(angle: float) -> Quaternion:
     """Return the quaternion of a turn about z."""
     return (math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle))
 
 
-@compiled
+@inlined
+def facing(q: Quaternion) -> Quaternion:
+    """Return the turn about z by the heading of q: the attitude of the heading frame."""
+    return about_z(heading(q))
+
+
+@inlined
+def level(own: Quaternion, q_WB: Quaternion) -> Quaternion:
+    """Return q_HB, the attitude over the heading frame, tilt without heading; own = facing(q_WB)."""
+    return multiply((own[0], 0.0, 0.0, -own[3]), q_WB)
+
+
+@inlined
 def z_axis(q: Quaternion) -> Vector:
     """Return the body's z axis in world components."""
     w, x, y, z = q
     return (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
 
 
-@compiled
+@inlined
 def wrapped(angle: float) -> float:
     """Return the angle in [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))

@@ -4,7 +4,7 @@ import math
 
 from numpy.typing import NDArray
 
-from zsim_world.compiled import compiled
+from zsim_world.compiled import inlined
 from zsim_world.rotation import Quaternion, Vector, rotate
 from zsim_world.vehicle import (
     ROTOR_INERTIA,
@@ -14,6 +14,7 @@ from zsim_world.vehicle import (
     ROTOR_XY,
     THRUST,
     TORQUE,
+    Row,
 )
 
 Four = tuple[float, float, float, float]
@@ -24,7 +25,7 @@ TURN = (1.0, -1.0, 1.0, -1.0)
 GROUND_CLEARANCE_MIN = 0.5  # radii, the formula below is not meant for less
 
 
-@compiled
+@inlined
 def lagged(speed: Four, command: Four, decay: float) -> Four:
     """Return rotor speeds [rad/s] after a first-order lag has decayed to the fraction `decay` = exp(-t / lag)."""
     return (
@@ -35,7 +36,7 @@ def lagged(speed: Four, command: Four, decay: float) -> Four:
     )
 
 
-@compiled
+@inlined
 def ground_effect(height_m: float, radius_m: float) -> float:
     """Return the thrust near the ground over that in free air: 1 / (1 - (R / 4z)^2).
 
@@ -46,9 +47,9 @@ def ground_effect(height_m: float, radius_m: float) -> float:
     return 1.0 / (1.0 - ratio * ratio)
 
 
-@compiled
+@inlined
 def wrench(
-    row: NDArray, q_WB: Quaternion, height_m: float, w_WB_B: Vector, speed: Four, slew: Four
+    row: Row, q_WB: Quaternion, height_m: float, w_WB_B: Vector, speed: Four, slew: Four
 ) -> tuple[float, Vector]:
     """Return thrust along z_B [N] and moment in B [N m] of the four rotors.
 
@@ -75,7 +76,7 @@ def wrench(
     return total, (mx + w_WB_B[1] * spin, my - w_WB_B[0] * spin, mz)
 
 
-@compiled
+@inlined
 def shaft_power(row: NDArray, speed: Four) -> float:
     """Return the mechanical power of the four rotors [W]: sum of k_M w^3."""
     s = 0.0
@@ -84,7 +85,7 @@ def shaft_power(row: NDArray, speed: Four) -> float:
     return row[TORQUE] * s
 
 
-@compiled
+@inlined
 def mix(row: NDArray, thrust_n: float, moment: Vector) -> Four:
     """Return rotor speeds [rad/s] for a thrust [N] and a moment in B [N m] within the rotors' limits.
 

@@ -5,7 +5,7 @@ A sensor stands at p_BS in the body and is turned by R_BS (q_BS: sensor componen
 
 import math
 
-from zsim_world.compiled import compiled
+from zsim_world.compiled import inlined
 from zsim_world.rotation import Quaternion, Vector, add, cross, heading, rotate, rotate_back, z_axis
 
 SEA_LEVEL_PA = 101_325.0  # Pa, ISO 2533
@@ -14,13 +14,13 @@ PRESSURE_EXPONENT = 5.25588  # g M / (R L), ISO 2533
 SONAR_COSINE_MIN = 0.5  # an echo comes back up to 60 deg from the vertical; beyond, it is scattered away
 
 
-@compiled
+@inlined
 def point_velocity(v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector, p_BS: Vector) -> Vector:
     """Return the velocity of a point of the body in W: v_WB + R (w × p_BS)."""
     return add(v_WB, rotate(q_WB, cross(w_WB_B, p_BS)))
 
 
-@compiled
+@inlined
 def imu(
     a_WB: Vector, q_WB: Quaternion, w_WB_B: Vector, alpha_B: Vector, gravity: float, p_BS: Vector, q_BS: Quaternion
 ) -> tuple[Vector, Vector]:
@@ -36,25 +36,25 @@ def imu(
     return rotate_back(q_BS, f), rotate_back(q_BS, w_WB_B)
 
 
-@compiled
+@inlined
 def gps(p_WB: Vector, v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector, p_BS: Vector) -> tuple[Vector, Vector]:
     """Return position [m] and velocity [m/s] of the antenna in W."""
     return add(p_WB, rotate(q_WB, p_BS)), point_velocity(v_WB, q_WB, w_WB_B, p_BS)
 
 
-@compiled
+@inlined
 def mag(q_WB: Quaternion, q_BS: Quaternion, field_W: Vector) -> Vector:
     """Return the Earth's field in S, in the unit of `field_W`."""
     return rotate_back(q_BS, rotate_back(q_WB, field_W))
 
 
-@compiled
+@inlined
 def height(p_WB: Vector, q_WB: Quaternion, p_BS: Vector) -> float:
     """Return the height of the sensor over the origin of W [m]."""
     return p_WB[2] + rotate(q_WB, p_BS)[2]
 
 
-@compiled
+@inlined
 def pressure(altitude_m: float) -> float:
     """Return the static pressure [Pa] of the standard atmosphere at an altitude above sea level (ISO 2533).
 
@@ -64,7 +64,7 @@ def pressure(altitude_m: float) -> float:
     return SEA_LEVEL_PA * math.pow(max(1.0 - LAPSE_1_M * altitude_m, 0.0), PRESSURE_EXPONENT)
 
 
-@compiled
+@inlined
 def sonar(p_WB: Vector, q_WB: Quaternion, p_BS: Vector, q_BS: Quaternion, range_max: float) -> tuple[float, bool]:
     """Return the distance [m] to the ground along -z of the sensor, and whether there is an echo.
 
@@ -77,7 +77,7 @@ def sonar(p_WB: Vector, q_WB: Quaternion, p_BS: Vector, q_BS: Quaternion, range_
     return min(distance, range_max), distance <= range_max
 
 
-@compiled
+@inlined
 def flow(v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector, p_BS: Vector) -> tuple[Vector, float]:
     """Return the sensor's velocity [m/s] in the heading frame, and the quality in [0, 1].
 
@@ -90,7 +90,7 @@ def flow(v_WB: Vector, q_WB: Quaternion, w_WB_B: Vector, p_BS: Vector) -> tuple[
     return (c * v[0] + s * v[1], c * v[1] - s * v[0], v[2]), max(z_axis(q_WB)[2], 0.0)
 
 
-@compiled
+@inlined
 def reading(value: float, bias: float, white: float, quantum: float) -> float:
     """Return what the converter gives: value + bias + white, rounded to the quantum (0: none)."""
     x = value + bias + white

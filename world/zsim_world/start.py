@@ -1,14 +1,15 @@
 """A fleet at t = 0: every drone on its feet, rotors still, batteries as the scenario says."""
 
 import math
+from typing import Any, cast
 
 import numpy as np
 
 from zsim.frames import quaternion_from_heading, quaternion_from_rpy
 from zsim.scenario import Drone, Scenario
-from zsim_world import firmware, gains, observer, rigid_body, sensor_set, vehicle
+from zsim_world import firmware, gains, lanes, observer, rigid_body, sensor_set, vehicle
 from zsim_world import wind as wind_model
-from zsim_world.arrays import Arrays, Boards, Bodies, Noise, Senses, Time
+from zsim_world.arrays import Arrays, Boards, Bodies, Near, Noise, Senses, Time
 from zsim_world.noise import NoiseTable, samples_per_gate
 
 
@@ -22,11 +23,12 @@ def arrays(scenario: Scenario, noise: NoiseTable) -> Arrays:
     )
     numbers = Noise(table=noise.table, at=noise.at, cursor=noise.cursor)
     boards, senses = _boards(scenario, row), _senses(scenario, noise)
-    return Arrays(time, _bodies(scenario, row), boards, numbers, senses, _wind(scenario), noise.gust)
+    return Arrays(time, _bodies(scenario, row, dt), boards, numbers, senses, _wind(scenario), noise.gust)
 
 
-def _bodies(scenario: Scenario, row: np.ndarray) -> Bodies:
+def _bodies(scenario: Scenario, row: np.ndarray, dt: float) -> Bodies:
     drones, n = scenario.drones, len(scenario.drones)
+    half_decay = cast(Any, rigid_body.half_decay).py_func  # as Python: compiling it for a few numbers takes longer
     return Bodies(
         vehicle=row,
         state=np.array([_standing(*each) for each in zip(drones, row, strict=True)]),
@@ -38,7 +40,16 @@ def _bodies(scenario: Scenario, row: np.ndarray) -> Bodies:
         push=np.zeros((n, 3)),
         touching=np.zeros((n, n), dtype=np.int8),
         touched=np.zeros((n, n), dtype=np.int8),
+        near=near(n),
+        decay=np.array([half_decay(lag, dt) for lag in row[:, vehicle.ROTOR_LAG]]),
+        lanes=np.zeros(lanes.LANES * lanes.COLUMNS),
     )
+
+
+def near(n: int) -> Near:
+    """Return near pairs that are yet to be found: no drone is where it was."""
+    pairs = np.zeros((n * (n - 1) // 2, 2), dtype=np.int32)
+    return Near(pair=pairs, noted=np.zeros(1, dtype=np.int64), origin=np.full((n, 3), np.inf))
 
 
 def _boards(scenario: Scenario, row: np.ndarray) -> Boards:

@@ -24,6 +24,7 @@ CAPACITY = 17  # J, of a full battery
 ROTOR_RADIUS, ROTOR_INERTIA = 18, 19  # m, kg m^2
 SIZE, HULL_RADIUS, STAND_HEIGHT = 20, 21, 22  # of the AR.Drone's, m, m
 COLUMNS = 23
+Row = NDArray[np.float64] | tuple[float, ...]  # of one drone: a view, or loaded
 
 REFERENCE_DENSITY_KG_M3 = SEA_LEVEL_KG_M3  # k_F, k_M and the drag of a scenario hold there
 # The AR.Drone's rotor; another aircraft's is taken as similar in shape: k_F grows as R^4, k_M and the inertia as R^5

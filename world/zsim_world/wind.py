@@ -4,7 +4,7 @@ import math
 
 from numpy.typing import NDArray
 
-from zsim_world.compiled import compiled
+from zsim_world.compiled import inlined
 from zsim_world.rotation import Vector
 
 # Columns of the one row of wind parameters
@@ -12,7 +12,7 @@ STEADY, GUST, LENGTH, SPEED_MIN, CORRELATION = 0, 3, 4, 5, 6  # m/s (3), m/s, m,
 COLUMNS = 7
 
 
-@compiled
+@inlined
 def gust_decay(length_m: float, airspeed_m_s: float, speed_min_m_s: float, dt: float) -> float:
     """Return exp(-dt / tau) with the correlation time tau = L / max(airspeed, V0) of the Dryden form.
 
@@ -21,13 +21,13 @@ def gust_decay(length_m: float, airspeed_m_s: float, speed_min_m_s: float, dt: f
     return math.exp(-dt * max(airspeed_m_s, speed_min_m_s) / length_m)
 
 
-@compiled
+@inlined
 def gust_noise(correlation: float, common: float, own: float) -> float:
     """Return a standard normal number that drones share to the given correlation."""
     return math.sqrt(correlation) * common + math.sqrt(1.0 - correlation) * own
 
 
-@compiled
+@inlined
 def blow(wind: NDArray, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt: float) -> None:
     """Advance the gust (3,) [m/s] at one drone by dt in place, by the exact discretisation of the filter.
 

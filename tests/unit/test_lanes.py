@@ -1,0 +1,64 @@
+"""Eight drones in one step: the bits of each drone's own."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsim.scenario_file import resolve
+from zsim_world import lanes
+from zsim_world import rigid_body as body
+from zsim_world.compiled import inlined
+from zsim_world.fleet import Fleet
+from zsim_world.ground import drag_anchors
+from zsim_world.rigid_body import four, vector
+
+DT = 0.0025  # s
+COUNT = 11  # a whole block and a part of one
+
+
+@inlined
+def each(bodies, dt):
+    """Integrate one drone after the other, the ground always with it."""
+    for i in range(bodies.state.shape[0]):
+        row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
+        air, push, command = vector(bodies.air[i], 0), vector(bodies.push[i], 0), four(bodies.command[i], 0)
+        body.step(row, anchor, state, command, air, push, dt)
+        drag_anchors(row, anchor, vector(state, body.POSITION), four(state, body.ATTITUDE))
+
+
+def bodies_in_motion(rng, height_m, count=COUNT):
+    """Return drones of two kinds that tumble, some of them through the ground."""
+    heavy: Any = {"mass_kg": 0.6, "arm_m": 0.25, "thrust_n_s2": 1.2e-5, "rotor_time_constant_s": 0.05}
+    drones = [
+        {"name": f"d{k}", "position_m": [2.0 * k, 0.0, height_m], **(heavy if k % 3 == 1 else {})} for k in range(count)
+    ]
+    bodies = Fleet(resolve({"name": "t", "duration_s": 1, "drones": drones})).bodies
+    state = bodies.state
+    state[:, body.VELOCITY : body.VELOCITY + 3] = rng.normal(0.0, 4.0, (count, 3))
+    turned = rng.normal((1.0, 0.0, 0.0, 0.0), 0.4, (count, 4))
+    state[:, body.ATTITUDE : body.ATTITUDE + 4] = turned / np.linalg.norm(turned, axis=1)[:, None]
+    state[:, body.RATE : body.RATE + 3] = rng.normal(0.0, 2.0, (count, 3))
+    state[:, body.ROTOR :], bodies.command[:] = rng.uniform(200.0, 500.0, (2, count, 4))
+    bodies.air[:], bodies.push[:] = rng.normal(0.0, 1.0, (2, count, 3))
+    return bodies
+
+
+def copied(bodies):
+    return type(bodies)(*(type(x)(*(y.copy() for y in x)) if isinstance(x, tuple) else x.copy() for x in bodies))
+
+
+@pytest.mark.parametrize("count", [1, 8, COUNT])
+@pytest.mark.parametrize("height_m", [0.0, 0.3, 0.8, 30.0])
+def test_a_block_gives_the_bits_of_each_drone(height_m, count):
+    one = bodies_in_motion(np.random.default_rng(3), height_m, count)
+    other, least_m = copied(one), np.inf
+    for _ in range(400):
+        lanes.move(one, DT)
+        each(other, DT)
+        np.testing.assert_array_equal(one.state, other.state)
+        least_m = min(least_m, one.state[:, 2].min())
+    assert np.isfinite(one.state).all()
+    assert count == 1 or (least_m < 0.2) == (height_m < 30.0)
+    low = one.state[:, 2] < 0.2
+    np.testing.assert_array_equal(one.anchor[low], other.anchor[low])
