@@ -1,6 +1,6 @@
 """Many messages in one: what recorders read, and who reads many drones.
 
-Relayed one by one, the messages of a gate cost a reader and the hub a piece of work and a wake-up each. The keys are
+Put one by one, the messages of a gate cost a reader and the hub a piece of work and a wake-up each. The keys are
 outside of the contract and begin with `@`, which no wildcard of Zenoh matches: whoever subscribes to `**` hears the
 messages themselves, and does not hear these.
 """
@@ -16,6 +16,12 @@ KEY = "@batch"  # everything that passed the hub since its last gate
 GATE = "@gate"  # everything that the world says at a gate
 Batch = list[tuple[str, bytes]]
 MESSAGES_MAX = 5_000  # of one batch; a flood of somebody's messages goes into several
+
+
+def gate(drone: str) -> str:
+    """Return the key of everything that the world says of a drone at a gate."""
+    return f"{GATE}/{drone}"
+
 
 _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(Batch)

@@ -1,17 +1,44 @@
-"""Many messages of one publisher at one gate, encoded one behind the other in one buffer."""
+"""Many messages of the world at one gate, encoded one behind the other in one buffer."""
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import Any
+from itertools import pairwise
+from typing import Any, NoReturn
 
+import msgspec
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from zsim import keys, messages
-from zsim.batch import Batch
+from zsim.batch import GATE, Batch
 from zsim.encoding import GAP
+from zsim.errors import DecodeError
+from zsim.messages import REFUSALS, Count
 
-_GAP = bytes(GAP)
+KINDS = (*keys.SENSORS, "truth", "status")  # what the world says of a drone
+PATTERNS_MAX = 1000  # kept; sensors of a few rates have some dozens
+_INT = np.dtype("<i8")
+
+
+def table_of(drones: Sequence[str]) -> tuple[str, ...]:
+    """Return the keys on which the world speaks of some drones, drone by drone."""
+    return tuple(keys.truth(d) if kind == "truth" else keys.sensor(d, kind) for d in drones for kind in KINDS)
+
+
+class _Packed(Struct, array_like=True, gc=False):
+    """A bundle on its way; whole numbers as little-endian int64."""
+
+    t_ns: Count
+    seq: Count
+    which: bytes
+    stamps: bytes
+    ends: bytes
+    buffer: bytes
+
+
+_encode = msgspec.msgpack.Encoder().encode
+_decode = msgspec.msgpack.Decoder(_Packed).decode
 
 
 class Bundle:
@@ -20,14 +47,15 @@ class Bundle:
     Args:
         t_ns: gate [ns].
         seq: number of the gate.
-        table: keys, the same object at every gate; it may grow.
+        table: keys; the same object at every gate.
         which: the place of each message's key in the table, (M,).
         stamps: t_ns of each [ns], (M,).
         ends: where each ends in the buffer, (M,); GAP bytes before each payload are free.
         buffer: owned by the bundle.
+        first: where the messages of each drone begin, and their end, (N + 1,); empty where that is not known.
     """
 
-    __slots__ = ("__dict__", "buffer", "ends", "seq", "stamps", "t_ns", "table", "which")
+    __slots__ = ("__dict__", "buffer", "ends", "first", "seq", "stamps", "t_ns", "table", "which")
 
     def __init__(
         self,
@@ -37,7 +65,8 @@ class Bundle:
         which: NDArray[np.int64],
         stamps: NDArray[np.int64],
         ends: NDArray[np.int64],
-        buffer: bytearray,
+        buffer: bytes | bytearray,
+        first: Sequence[int] = (),
     ) -> None:
         self.t_ns, self.seq = t_ns, seq
         self.table = table
@@ -45,6 +74,15 @@ class Bundle:
         self.stamps = stamps
         self.ends = ends
         self.buffer = buffer
+        self.first = first
+
+    @classmethod
+    def of(cls, t_ns: int, seq: int, table: Sequence[str], said: Batch) -> "Bundle":
+        """Return encoded messages as a bundle, all stamped t_ns."""
+        ends = np.cumsum([GAP + len(payload) for _, payload in said])
+        which = np.array([table.index(key) for key, _ in said])
+        buffer = b"".join([bytes(GAP) + payload for _, payload in said])
+        return cls(t_ns, seq, table, which, np.full(len(said), t_ns), ends, buffer)
 
     def __len__(self) -> int:
         return len(self.which)
@@ -52,38 +90,50 @@ class Bundle:
     @cached_property
     def encoded(self) -> Batch:
         """Keys and payloads, as on the wire."""
-        data, table, start, found = bytes(self.buffer), self.table, 0, []
-        for place, end in zip(self.which.tolist(), self.ends.tolist(), strict=True):
-            found.append((table[place], data[start + GAP : end]))
-            start = end
-        return found
+        data, table = bytes(self.buffer), self.table
+        places: list[int] = self.which.tolist()
+        bounds = pairwise([0, *self.ends.tolist()])
+        return [(table[p], data[start + GAP : end]) for p, (start, end) in zip(places, bounds, strict=True)]
+
+    def payload(self, m: int) -> bytes:
+        """Return the payload of one message."""
+        start = int(self.ends[m - 1]) if m else 0
+        return bytes(self.buffer[start + GAP : int(self.ends[m])])
 
     def messages(self) -> Iterator[tuple[str, Any]]:
         """Yield keys and messages."""
         for key, payload in self.encoded:
             yield key, messages.decode(key, payload)
 
+    def packed(self, first: int = 0, last: int | None = None) -> bytes:
+        """Return messages [first, last) as one payload."""
+        start = int(self.ends[first - 1]) if first else 0
+        ends = self.ends[first:last] - start
+        data = bytes(memoryview(self.buffer)[start : start + int(ends[-1])])
+        which, stamps = self.which[first:last].tobytes(), self.stamps[first:last].tobytes()
+        return _encode(_Packed(self.t_ns, self.seq, which, stamps, ends.tobytes(), data))
 
-class KeyTable:
-    """Keys in the order in which they were first met."""
 
-    def __init__(self) -> None:
-        self.keys: list[str] = []
-        self._place: dict[str, int] = {}
+def unpacked(payload: bytes, table: Sequence[str]) -> Bundle:
+    """Return the bundle in a payload.
 
-    def bundle(self, t_ns: int, seq: int, passed: Batch) -> Bundle:
-        """Return what came as keys and payloads; the stamp of each is that of the gate."""
-        which = np.array([self._find(key) for key, _ in passed], dtype=np.int64)
-        ends = np.cumsum([GAP + len(payload) for _, payload in passed])
-        buffer = bytearray(b"".join([part for _, payload in passed for part in (_GAP, payload)]))
-        return Bundle(t_ns, seq, self.keys, which, np.full(len(passed), t_ns), ends, buffer)
+    Its columns may still lead outside of it: whoever follows them looks.
 
-    def _find(self, key: str) -> int:
-        place = self._place.get(key)
-        if place is None:
-            place = self._place[key] = len(self.keys)
-            self.keys.append(key)
-        return place
+    Raises:
+        DecodeError: it is none.
+    """
+    try:
+        p = _decode(payload)
+    except REFUSALS as error:
+        _refuse(str(error))
+    if not len(p.which) == len(p.stamps) == len(p.ends) or len(p.which) % _INT.itemsize:
+        _refuse("its columns differ in length")
+    which, stamps, ends = (np.frombuffer(column, _INT) for column in (p.which, p.stamps, p.ends))
+    return Bundle(p.t_ns, p.seq, table, which, stamps, ends, p.buffer)
+
+
+def _refuse(reason: str) -> NoReturn:
+    raise DecodeError(f"{GATE}: {reason}; must be the messages of a gate")
 
 
 class Selection:
@@ -96,6 +146,8 @@ class Selection:
     def __init__(self, reads: Sequence[str]) -> None:
         self._reads = tuple(reads)
         self._wanted: dict[str, bool] = {}
+        self._table: Sequence[str] = ()
+        self._found: dict[bytes, list[tuple[int, str]]] = {}
 
     def of(self, bundle: Bundle) -> list[tuple[str, Any]]:
         """Return keys and messages.
@@ -103,7 +155,25 @@ class Selection:
         Raises:
             DecodeError: one is no message of its key.
         """
-        return [(key, messages.decode(key, payload)) for key, payload in bundle.encoded if self.takes(key)]
+        if bundle.table is not self._table:
+            self._table = bundle.table
+            self._found.clear()
+        pattern = bundle.which.tobytes()
+        found = self._found.get(pattern)
+        if found is None:
+            found = self._find(bundle, pattern)
+        return [(key, messages.decode(key, bundle.payload(m))) for m, key in found]
+
+    def _find(self, bundle: Bundle, pattern: bytes) -> list[tuple[int, str]]:
+        """Return places and keys of what is read; the same pattern of sensors comes again and again."""
+        table = bundle.table
+        places: list[int] = bundle.which.tolist()
+        if not all(0 <= place < len(table) for place in places):
+            _refuse("a key is not in its table")
+        found = [(m, table[place]) for m, place in enumerate(places) if self.takes(table[place])]
+        if len(self._found) < PATTERNS_MAX:
+            self._found[pattern] = found
+        return found
 
     def takes(self, key: str) -> bool:
         """Tell whether a key is read."""

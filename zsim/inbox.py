@@ -41,7 +41,7 @@ class Inbox:
         self._lacking: dict[int, dict[str, None]] = {}
         self._gates: list[int] = []
         self._expected_from_ns: dict[str, int] = {}
-        self._pulse = next((key for key in gate_keys if key.endswith("/sensor/status")), None)
+        self._pulse = next((key for key in gate_keys if keys.is_status(key)), None)
         self._beats: dict[int, int] = {}
         self._last_beat: tuple[int, int] | None = None
         self._taken_ns = -1
@@ -93,7 +93,7 @@ class Inbox:
         """Take a bundle: all that its publisher says at a gate, whole by its nature."""
         lacking = self._lacking_at(bundle.t_ns)
         for key in self._closing:
-            if key.endswith("/sensor/status"):
+            if keys.is_status(key):
                 lacking.pop(key, None)
         if self._pulse is not None:
             self._beats[bundle.t_ns] = bundle.seq

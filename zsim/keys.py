@@ -87,6 +87,11 @@ def is_sensor(expression: str) -> bool:
     return len(parts) == 4 and parts[0] == "drone" and parts[2] == "sensor"
 
 
+def is_status(key: str) -> bool:
+    """Tell whether a key is a drone's status."""
+    return key.endswith("/sensor/status")
+
+
 def thing(key: str) -> str:
     """Return the second part of a key: the drone, cluster or process that it is about."""
     return key.split("/", 2)[1]

@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from zsim import __version__, keys, messages
+from zsim import __version__, batch, keys, messages
 from zsim.agent import Agent, Output
 from zsim.connection import read_info
 from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
@@ -60,6 +60,7 @@ class Membership:
         self._done_key = keys.process(agent.name, "done")
         ahead = info.command_delay_ns // info.gate_ns
         self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
+        self._unsent: batch.Batch = []
         self._must_rejoin = False
         self._unproved = 0
         self._proof_ns = 0
@@ -104,7 +105,13 @@ class Membership:
         self._kept.append((t_ns, outputs))
         encoded = [(key, messages.encode(message)) for key, message in outputs]
         encoded.append((self._done_key, messages.encode(self._done(t_ns, len(outputs)))))
-        self._link.put_all(encoded)
+        self._unsent += encoded
+
+    def send(self) -> None:
+        """Put what was published since the last time, in one go: many messages at once cost fewer wake-ups."""
+        if self._unsent:
+            unsent, self._unsent = self._unsent, []
+            self._link.put_all(unsent)
 
     def outputs(self) -> list[list[object]]:
         """Return [key, payload] of the outputs of the last gates, for a world that lost them with a link."""

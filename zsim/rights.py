@@ -10,7 +10,7 @@ from zsim import batch, keys
 from zsim.scenario import Scenario
 
 TOLD_TO_ALL = (keys.INFO, keys.CLOCK, keys.EVENT)
-EVERYTHING = ("**", batch.KEY)  # no wildcard takes a key that begins with @
+EVERYTHING = ("**", batch.KEY, batch.GATE, batch.gate("*"))  # no wildcard takes a key that begins with @
 LAST_VALUES = (keys.INFO, keys.CLOCK, "drone/*/sensor/status", "drone/*/truth", "drone/*/estimate", "cluster/*/state")
 OPERATOR, RECORDER, WORLD, ROUTER = "operator", "recorder", "world", "router"
 
@@ -76,7 +76,7 @@ def _own(process: str) -> Rights:
     )
 
 
-_READER = Rights(reads=EVERYTHING, asks=LAST_VALUES, watches=(keys.token("*"),))
+_READER = Rights(reads=("**", batch.KEY), asks=LAST_VALUES, watches=(keys.token("*"),))
 _OPERATOR = Rights(writes=(keys.command("*", "*"),), asks=(keys.CONTROL, keys.cluster_control("*")))
 
 
@@ -84,7 +84,9 @@ def _estimator(thing: str, scenario: Scenario, role: str) -> Rights:
     if role == "controller" or thing not in {drone.name for drone in scenario.drones}:
         return Rights()
     estimate = (keys.estimate(thing),)
-    return Rights(reads=(keys.sensors(thing), *estimate), writes=estimate, asks=(keys.status(thing), *estimate))
+    return Rights(
+        reads=(keys.sensors(thing), batch.gate(thing), *estimate), writes=estimate, asks=(keys.status(thing), *estimate)
+    )
 
 
 def _controller(thing: str, scenario: Scenario, role: str) -> Rights:

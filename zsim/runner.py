@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 from zsim import batch, keys, messages, notice
 from zsim.agent import Agent, Output
-from zsim.bundle import KeyTable, Selection
+from zsim.bundle import Selection, table_of, unpacked
 from zsim.errors import DecodeError, SessionError
 from zsim.health import HealthMeter
 from zsim.inbox import Inbox
@@ -59,7 +59,8 @@ class Runner:
         self._estimated_by: dict[str, str] = {}
         self._boxes: dict[str, Mailbox] = {}
         self._selection = Selection(agent.reads)
-        self._table = KeyTable()
+        self._table = table_of([drone.name for drone in info.drones])
+        self._gate_box = _gate_box(agent)
         self._notices: deque[Notice] = deque()
         self._queries: deque[Query] = deque()
         self._links: deque[bool] = deque()
@@ -109,6 +110,7 @@ class Runner:
         while self._leave is None and (t_ns := self._ready_gate()) is not None:
             self._step(t_ns)
             stepped = True
+        self._member.send()
         if self._leave is None:
             self._look_for_end()
         if self._leave is None and not stepped:
@@ -132,32 +134,18 @@ class Runner:
 
     def _open(self, sample: Sample) -> None:
         """Take in a message, or of many in one those that the agent reads."""
-        if sample.key != batch.GATE:
+        if sample.key != self._gate_box:
             self._take_in(sample)
             return
         try:
-            several = batch.decode(sample.payload)
+            bundle = unpacked(sample.payload, self._table)
+            taken = [(batch.GATE, bundle)] if self._agent.takes_bundles else self._selection.of(bundle)
         except DecodeError as error:
             self._refuse(error)
             return
-        if self._agent.takes_bundles and self._take_in_bundle(several):
-            return
-        for key, payload in several:
-            if self._selection.takes(key):
-                self._take_in(Sample(key, payload))
-
-    def _take_in_bundle(self, several: batch.Batch) -> bool:
-        """Take in a gate as a whole; return False for one in which no status tells which it is."""
-        pulse = next((payload for key, payload in several if key == self._agent.gate_keys[0]), None)
-        try:
-            status = messages.decode(self._agent.gate_keys[0], pulse) if pulse else None
-        except DecodeError:
-            return False
-        if status is None:
-            return False
-        self.health.received += len(several)
-        self._inbox.put(batch.GATE, self._table.bundle(status.t_ns, status.seq, several))
-        return True
+        self.health.received += len(bundle)
+        for key, message in taken:
+            self._inbox.put(key, message)
 
     def _take_in(self, sample: Sample) -> None:
         self.health.received += 1
@@ -181,7 +169,7 @@ class Runner:
         missing = self._inbox.missing_last(t_ns) if t_ns is not None else None
         wanted = missing or self._agent.gate_keys[-1]
         expression = next(e for e in self._agent.reads if keys.matches(e, wanted))
-        return expression if expression in self._boxes else batch.GATE
+        return expression if expression in self._boxes else self._gate_box
 
     def _ready_gate(self) -> int | None:
         """Return the gate to step now, None if it must be waited for."""
@@ -243,8 +231,7 @@ class Runner:
     def _subscribe(self) -> None:
         closing = [e for e in self._agent.reads if any(keys.matches(e, key) for key in self._agent.gate_keys)]
         for expression in dict.fromkeys([*closing, *self._agent.reads]):
-            several = len(self._agent.counted) > 1 and keys.is_sensor(expression)
-            box = batch.GATE if several else expression
+            box = self._gate_box if self._gate_box and keys.is_sensor(expression) else expression
             if box not in self._boxes:
                 self._boxes[box] = self._link.subscribe(box)
         self._link.on_message(keys.EVENT, self._on_event)
@@ -347,3 +334,10 @@ class Runner:
         except DecodeError as error:
             answer = ControlAnswer(ok=False, error=str(error))
         query.answer(answer)
+
+
+def _gate_box(agent: Agent) -> str:
+    """Return on which key an agent takes the sensors of a gate in one message; none for one that does not."""
+    if len(agent.counted) > 1:
+        return batch.GATE
+    return batch.gate(agent.counted[0]) if agent.counted and agent.takes_bundles else ""

@@ -93,7 +93,7 @@ class Session:
         publisher.put(payload)
 
     def _declare(self, key: str) -> zenoh.Publisher:
-        drop = key.startswith("view/") or (self._realtime and ("/sensor/" in key or key == batch.GATE))
+        drop = key.startswith("view/") or (self._realtime and ("/sensor/" in key or key.startswith(batch.GATE)))
         control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
         encoding = zenoh.Encoding(messages.encoding(key))
         with _named(key):

@@ -47,9 +47,11 @@ class GateReader:
         Args:
             readings: (M, READING_COLUMNS), with room for all messages of the bundle.
         """
-        if bundle.table is not self._table or len(bundle.table) != len(self._owner):
+        if bundle.table is not self._table:
             self._learn(bundle.table)
         data = np.frombuffer(bundle.buffer, dtype=np.uint8)
+        for array in (bundle.which, bundle.ends, data):
+            array.setflags(write=False)  # as off the wire: what may be written is compiled anew
         row = (self._ints, self._floats, self._bits)
         return collect(self._program, self._owner, bundle.which, bundle.ends, data, row, readings, came)
 
@@ -74,6 +76,8 @@ def collect(
     start, first = 0, came
     marks = np.empty(which.shape[0], np.int64)
     for m in range(which.shape[0]):
+        if not (0 <= which[m] < owner.shape[0] and start + GAP <= ends[m] <= data.shape[0]):
+            return -1
         i, kind = owner[which[m], 0], owner[which[m], 1]
         if i >= 0:
             if not read(program, kind, data, start + GAP, ends[m], ints, bits):

@@ -25,6 +25,9 @@ world/event                       r       r       r       r
 world/control                     -       -       r       rg
 clock                             rg      rg      rg      rg
 @batch                            -       -       r       r
+@gate                             -       -       -       -
+@gate/drone1                      r       -       -       -
+@gate/drone2                      -       -       -       -
 drone/drone1/sensor/imu           r       -       r       r
 drone/drone1/sensor/gps           r       -       r       r
 drone/drone1/sensor/mag           r       -       r       r

@@ -29,17 +29,25 @@ class Hub:
         self._gates = gates
         self._waits_for = tuple(Waiting(name, "", 1.0) for name in waits_for)
         self._gate = 0
+        self._periods: dict[str, int] = {}
+        self._done: dict[str, int] = {}
         self._outbox: list[Output] = []
         self.ended: str | None = None
 
     def handle(self, key: str, message: Any, wall_ns: int) -> None:
         self.handled.append((key, message))
+        if isinstance(message, Join):
+            self._periods[keys.thing(key)] = message.period_ns
+        elif isinstance(message, Done):
+            self._done[keys.thing(key)] = message.done_ns
 
     def output_of(self, source: str) -> None:
         self.outputs.append(source)
 
     def may_advance(self) -> bool:
-        return self.ended is None and not self._waits_for
+        last_ns = (self._gate - 1) * GATE_NS
+        owed = [name for name, period in self._periods.items() if self._done.get(name, -1) < last_ns // period * period]
+        return self.ended is None and not self._waits_for and (self._gate == 0 or not owed)
 
     def waiting_for(self, wall_ns: int) -> Sequence[Waiting]:
         return self._waits_for

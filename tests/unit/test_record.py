@@ -289,12 +289,12 @@ def test_closing_twice_does_nothing(tmp_path):
 
 def test_no_more_than_a_chunk_is_held_back(tmp_path):
     path, payload = tmp_path / "run.mcap", random.Random(4).randbytes(1000)
-    writer = RecordWriter(path)
-    for i in range(2000):
-        writer.add("clock", payload, "", i, 0)
-        if i % 100 == 0:
-            assert (i - len(read(path))) * len(payload) <= 256 * 1024
-    writer.close()
+    with RecordWriter(path) as writer:
+        for i in range(2000):
+            writer.add("clock", payload, "", i, 0)
+            if i % 100 == 0:
+                assert (i - len(read(path))) * len(payload) <= 256 * 1024
+    assert len(read(path)) == 2000
 
 
 def test_times_and_keys_beyond_the_format_are_held_in_bounds(tmp_path, monkeypatch):
@@ -333,6 +333,7 @@ FILL = """
         writer = RecordWriter(path)
         for i in range(100_000):
             writer.add("clock", rng.randbytes(100), "application/msgpack;Clock", i, i)
+        writer.close()
     except RecordError as error:
         print(error)
         sys.exit(3)

@@ -11,14 +11,16 @@ from msgspec.structs import replace
 
 from zsim import batch, keys, membership, messages
 from zsim.agent import Agent, Output
+from zsim.bundle import Bundle, table_of
 from zsim.errors import BehindError, RunError, SupersededError
-from zsim.messages import ControlAnswer, Done, Estimate, Event, Info, Mag, Origin, Status
+from zsim.messages import ControlAnswer, Done, DroneInfo, Estimate, Event, Info, Mag, Origin, Status
 from zsim.runner import Runner
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fake_link import UNANSWERED, FakeLink
 
 GATE_NS = 20_000_000
+DRONES = tuple(DroneInfo(name, "ardrone") for name in ("d1", "d2", "d3"))
 END = 6  # last gate of the runs here
 ME = "judge.main"
 REPLAY = keys.replay(ME)
@@ -42,7 +44,7 @@ class Judge(Agent):
 
 def info(run_id: str = "run1") -> Info:
     origin = Origin(0.0, 0.0, 0.0)
-    return Info(0, 0, 1, run_id, "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, origin, (), (), "", "", "", "")
+    return Info(0, 0, 1, run_id, "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, origin, DRONES, (), "", "", "", "")
 
 
 def status(gate: int) -> Status:
@@ -175,6 +177,12 @@ class Swarm(Judge):
         self.counted = ("d1", "d2")
 
 
+def bundle_of(t_ns: int, seq: int, told: list[tuple[str, Any]]) -> Bundle:
+    """Return messages on drones d1 to d3 as the world bundles them."""
+    table = table_of([drone.name for drone in DRONES])
+    return Bundle.of(t_ns, seq, table, [(key, messages.encode(message)) for key, message in told])
+
+
 class InOne(World):
     """Says all of a gate in one message."""
 
@@ -187,7 +195,7 @@ class InOne(World):
             (keys.status("d3"), status(gate)),
         ]
         self._at.get(gate, lambda world: None)(self)
-        self.deliver(batch.GATE, batch.encode([(key, messages.encode(message)) for key, message in told]))
+        self.deliver(batch.GATE, bundle_of(t_ns, gate, told).packed())
 
 
 def test_who_reads_several_drones_gets_a_gate_in_one_message():

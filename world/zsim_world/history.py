@@ -5,11 +5,11 @@ for dead publishers too.
 """
 
 from collections import deque
-from collections.abc import Callable, Container
-from itertools import islice
+from collections.abc import Callable, Container, Iterator
 from typing import NamedTuple
 
 from zsim import keys
+from zsim.batch import Batch
 
 KEEP_NS = 5_000_000_000  # simulated time that a replay reaches back
 KEEP_BYTES = 500_000_000  # payloads kept at most: 1000 drones say about 300 MB in KEEP_NS
@@ -29,6 +29,15 @@ class Page(NamedTuple):
     more: int | None
 
 
+class _Said(NamedTuple):
+    """Messages that passed together: the world's clock then, their stamp, keys and payloads, bytes of the latter."""
+
+    now_ns: int
+    t_ns: int
+    messages: Batch
+    size: int
+
+
 class History:
     """Payloads as on the wire, by key.
 
@@ -39,7 +48,7 @@ class History:
 
     def __init__(self, keep_bytes: int = KEEP_BYTES, page_bytes: int = PAGE_BYTES) -> None:
         self._last: dict[str, bytes] = {}
-        self._recent: deque[tuple[int, int, str, bytes]] = deque()
+        self._recent: deque[_Said] = deque()
         self._now_ns = 0
         self._bytes = 0
         self._keep_bytes = keep_bytes
@@ -55,11 +64,21 @@ class History:
             self._now_ns = t_ns
         if key in self._last or len(self._last) < LAST_MAX:
             self._last[key] = payload
-        self._recent.append((self._now_ns, t_ns, key, payload))
-        self._bytes += len(payload)
-        while self._bytes > self._keep_bytes or self._recent[0][0] < self._now_ns - KEEP_NS:
-            self._bytes -= len(self._recent.popleft()[3])
-            self._forgotten += 1
+        self._remember(_Said(self._now_ns, t_ns, [(key, payload)], len(payload)))
+
+    def add_all(self, said: Batch, t_ns: int) -> None:
+        """Remember what the world itself says, all stamped t_ns, its newest gate."""
+        self._now_ns = t_ns
+        self._last.update(said)
+        self._remember(_Said(t_ns, t_ns, said, sum([len(payload) for _, payload in said])))
+
+    def _remember(self, said: "_Said") -> None:
+        self._recent.append(said)
+        self._bytes += said.size
+        while self._bytes > self._keep_bytes or self._recent[0].now_ns < self._now_ns - KEEP_NS:
+            oldest = self._recent.popleft()
+            self._bytes -= oldest.size
+            self._forgotten += len(oldest.messages)
 
     def last(self, expression: str) -> list[tuple[str, bytes]]:
         """Return the last value of every key that an expression takes."""
@@ -78,11 +97,12 @@ class History:
         passed: list[tuple[str, bytes]] = []
         known: dict[str, bool] = {}
         size = 0
-        first = max(0, start - self._forgotten)
-        for number, (_, t_ns, key, payload) in enumerate(islice(self._recent, first, None), self._forgotten + first):
+        for number, (t_ns, key, payload) in enumerate(self._each(), self._forgotten):
+            if number < start or t_ns <= from_ns:
+                continue
             if key not in known:
                 known[key] = wanted(key)
-            if t_ns <= from_ns or not known[key]:
+            if not known[key]:
                 continue
             size += len(payload)
             if passed and size > self._page_bytes:
@@ -92,4 +112,9 @@ class History:
 
     def said(self, marks: Container[tuple[str, int]]) -> list[tuple[str, bytes]]:
         """Return (key, payload) of what was said on any of some (key, t_ns), as far as a replay reaches back."""
-        return [(key, payload) for _, t_ns, key, payload in self._recent if (key, t_ns) in marks]
+        return [(key, payload) for t_ns, key, payload in self._each() if (key, t_ns) in marks]
+
+    def _each(self) -> Iterator[tuple[int, str, bytes]]:
+        for said in self._recent:
+            for key, payload in said.messages:
+                yield said.t_ns, key, payload

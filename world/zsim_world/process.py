@@ -8,6 +8,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import msgspec
@@ -23,6 +24,7 @@ from zsim.rights import WORLD
 from zsim.session import Query, Sample, Session
 from zsim_world import replays
 from zsim_world.barrier import Participant
+from zsim_world.burst import Burst
 from zsim_world.history import History
 from zsim_world.inputs import TICK_S, Direct, Inputs, Timed
 from zsim_world.recovery import unheard
@@ -81,6 +83,9 @@ class WorldProcess:
         self._tell = tell
         self._history = History()
         self._passed: batch.Batch = []
+        self._burst = Burst(world)
+        self._unsent: batch.Batch = []
+        self._gate_keys = [batch.gate(name) for name in world.fleet.names]
         self._head = msgspec.msgpack.Decoder(_Head)
         self._queries: deque[Query] = deque()
         self._tokens: deque[tuple[str, bool]] = deque()
@@ -145,11 +150,12 @@ class WorldProcess:
         self._serve_rare()
         self._recover_short()
         wall_ns = time.monotonic_ns()
-        if self._world.ended is None and self._world.may_advance():
+        if self._world.ended is None and self._world.may_advance() and not self._burst.holds_back(wall_ns):
             left_ns = self._due_ns(wall_ns) - wall_ns
             if left_ns <= 0:
                 self._advance(wall_ns, -left_ns)
             else:
+                self._flush()
                 self._inputs.wait(left_ns / 1e9)
         else:
             self._stand_still(wall_ns)
@@ -158,7 +164,9 @@ class WorldProcess:
         if self._world.mode == "realtime" and late_ns > self._world.gate_ns / self._world.rate:
             self._world.missed_own_deadline()
         self._world.advance(wall_ns)
-        self._flush()
+        self._gather()
+        if not self._burst.goes_on():
+            self._send()
         if self._world.diverged is None:
             self._publish_view(wall_ns)
         self.health.step(time.monotonic_ns() - wall_ns)
@@ -180,6 +188,7 @@ class WorldProcess:
     def _stand_still(self, wall_ns: int) -> None:
         """Time stands still: say so once a second, and wait for whatever comes."""
         self._flush()
+        self._burst.end(wall_ns)
         if wall_ns - self._clock_wall_ns >= CLOCK_STANDING_NS:
             self._world.tell_clock(self._world.waiting_for(wall_ns))
             self._flush()
@@ -189,7 +198,7 @@ class WorldProcess:
         """Return the keys of the dones without which the world cannot go on."""
         if self._world.state != "running" or self._world.mode == "realtime":
             return set()
-        return {keys.process(p.name, "done") for p in self._world.owing()}
+        return {keys.process(p.name, "done") for p in self._burst.owing()}
 
     def _say_goodbye(self) -> None:
         """Publish the end, then wait until every participant that lives has said bye."""
@@ -386,26 +395,45 @@ class WorldProcess:
     # Publication
 
     def _flush(self) -> None:
-        """Publish the outbox: encoded first and put in one go, so that the transport sends it in few packets."""
+        """Publish the outbox."""
+        self._gather()
+        self._send()
+
+    def _send(self) -> None:
+        """Put what was gathered in one go: readers wake once, and the transport sends few packets."""
+        unsent, self._unsent = self._unsent, []
+        self._link.put_all(unsent)
+        self._put_batch()
+
+    def _gather(self) -> None:
+        """Encode the outbox and keep it."""
         outbox = self._world.take_outbox()
         if not outbox:
             return
         encoded: batch.Batch = []
         for key, message in outbox:
-            encoded += message.encoded if type(message) is Bundle else [(key, messages.encode(message))]
-        if self._link.heard(batch.GATE):
-            self._link.put_raw(batch.GATE, batch.encode(encoded))
-        self._link.put_all(encoded)
+            if type(message) is Bundle:
+                self._gather_bundle(message)
+                encoded += message.encoded
+            else:
+                encoded.append((key, messages.encode(message)))
+        self._unsent += encoded
         self._passed += encoded
-        self._put_batch()
-        for key, payload in encoded:
-            self._history.add(key, payload, self._world.now_ns)
+        self._history.add_all(encoded, self._world.now_ns)
         for key, message in outbox:
             if key == keys.CLOCK:
                 self._clock_wall_ns = time.monotonic_ns()
                 self._tell("clock", message, self._phase)
             elif key == keys.EVENT:
                 self._tell("event", message, self._phase)
+
+    def _gather_bundle(self, bundle: Bundle) -> None:
+        """Keep what is said at a gate in one message, of all drones and of each, where somebody reads it so."""
+        if self._link.heard(batch.GATE):
+            self._unsent.append((batch.GATE, bundle.packed()))
+        for key, (first, last) in zip(self._gate_keys, pairwise(bundle.first), strict=True):
+            if self._link.heard(key):
+                self._unsent.append((key, bundle.packed(first, last)))
 
     def _put_batch(self) -> None:
         """Hand what has passed to the recorders, if there are any."""

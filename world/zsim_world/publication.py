@@ -10,17 +10,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim import encoding, keys, messages
-from zsim.bundle import Bundle
+from zsim import encoding, messages
+from zsim.bundle import KINDS, Bundle, table_of
 from zsim.encoding import GAP, Layouts, Program, Words
 from zsim_world import battery, firmware, fleet, rigid_body, samples, sensor_set, vehicle
-from zsim_world.arrays import Boards, Bodies
 from zsim_world.battery import percent
 from zsim_world.compiled import compiled, kernel
 from zsim_world.fleet import GPS_FIX, GPS_SATELLITES, Fleet
 from zsim_world.samples import Sampled
 
-KINDS = (
+MESSAGES = (  # of the kinds of a bundle, in their order
     messages.Imu,
     messages.Gps,
     messages.Mag,
@@ -31,8 +30,12 @@ KINDS = (
     messages.Status,
 )
 TRUTH, STATUS = 6, 7  # after the six sensors
+WHICH, STAMPS, ENDS = 0, 1, 2  # rows of `columns`
+LAYOUTS = Layouts(MESSAGES)
+INTS, FLOATS = LAYOUTS.ints, LAYOUTS.floats
+OPS, FIRST, LITERALS = LAYOUTS.program  # compiled in
 COMMANDER = len(firmware.MODES)  # the first commander among the words: nobody
-MODULES = (encoding, fleet, firmware, rigid_body, samples, sensor_set, battery, vehicle)
+MODULES = (encoding, messages, fleet, firmware, rigid_body, samples, sensor_set, battery, vehicle)
 SOURCES = (Path(__file__), *(Path(str(module.__file__)) for module in MODULES))
 
 write = compiled(encoding.write)
@@ -41,9 +44,8 @@ write = compiled(encoding.write)
 class Written(NamedTuple):
     """M messages, and room for more."""
 
-    which: NDArray[np.int64]  # (M,), place of each one's key in the table
-    stamps: NDArray[np.int64]  # (M,), ns
-    ends: NDArray[np.int64]  # (M,), in `data`
+    columns: NDArray[np.int64]  # (3, M): WHICH, STAMPS, ENDS
+    first: NDArray[np.int64]  # (N + 1,), where the messages of each drone begin
     data: NDArray[np.uint8]
 
 
@@ -53,6 +55,16 @@ class Row(NamedTuple):
     ints: NDArray[np.int64]
     floats: NDArray[np.float64]
     bits: NDArray[np.uint64]  # the same floats
+
+
+class Seen(NamedTuple):
+    """The arrays of a fleet that are told, see `zsim_world.arrays`."""
+
+    state: NDArray[np.float64]
+    accel: NDArray[np.float64]
+    energy: NDArray[np.float64]
+    vehicle: NDArray[np.float64]
+    memory: NDArray[np.float64]
 
 
 class Fleetwide(NamedTuple):
@@ -69,56 +81,55 @@ class Publication:
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        kinds = (*keys.SENSORS, "truth", "status")
-        self.table = tuple(_key(name, kind) for name in fleet.names for kind in kinds)
-        self._layouts = Layouts(KINDS)
-        floats = np.zeros(self._layouts.floats)
-        self._row = Row(np.zeros(self._layouts.ints, dtype=np.int64), floats, floats.view(np.uint64))
-        whole = np.zeros(fleet.count, dtype=np.int64)
-        counts = np.zeros((fleet.count, len(kinds)), dtype=np.int64)
-        self._fleetwide = Fleetwide(fleet.touching, np.array(fleet.gps_sigma_m), whole, counts)
+        self.table = table_of(fleet.names)
+        bodies = fleet.bodies
+        self._seen = Seen(bodies.state, bodies.accel, bodies.energy, bodies.vehicle, fleet.boards.memory)
+        commanders = np.zeros(fleet.count, dtype=np.int64)
+        counts = np.zeros((fleet.count, len(KINDS)), dtype=np.int64)
+        self._fleetwide = Fleetwide(fleet.touching, np.array(fleet.gps_sigma_m), commanders, counts)
         self._known: dict[str | None, int] = {None: COMMANDER}
         self._words = encoding.words((*firmware.MODES, None))
         self._make_room(16 * fleet.count)
+        self._rehearse()
+
+    def _rehearse(self) -> None:
+        """Load or compile what the first gate needs."""
+        uncounted = self._fleetwide._replace(counts=self._fleetwide.counts.copy())
+        publish(self._words, self._fleet.sampled, self._seen, uncounted, 0, self._written)
 
     def gate(self, holder: Callable[[int], str | None]) -> Bundle:
         """Return the messages of the gate that the fleet stands at."""
         fleet, wide = self._fleet, self._fleetwide
         count = len(fleet.sampled.whose) + 2 * fleet.count
-        if count > len(self._written.which):
+        if count > self._written.columns.shape[1]:
             self._make_room(2 * count)
         for i in range(fleet.count):
             wide.commanders[i] = self._number(holder(i))
-        out, program = self._written, self._layouts.program
-        size = publish(
-            program, self._words, fleet.sampled, fleet.bodies, fleet.boards, wide, fleet.t_ns, self._row, out
-        )
-        which, stamps, ends = out.which[:count].copy(), out.stamps[:count].copy(), out.ends[:count].copy()
+        out = self._written
+        size = publish(self._words, fleet.sampled, self._seen, wide, fleet.t_ns, out)
+        which, stamps, ends = out.columns[:, :count].copy()
         seq = int(wide.counts[0, STATUS]) - 1
-        return Bundle(fleet.t_ns, seq, self.table, which, stamps, ends, bytearray(out.data[:size].data))
+        data = bytearray(out.data[:size].data)
+        return Bundle(fleet.t_ns, seq, self.table, which, stamps, ends, data, out.first.tolist())
 
     def _number(self, commander: str | None) -> int:
         """Return the number of a word; a new one is learnt."""
         if commander not in self._known:
             self._known[commander] = COMMANDER + len(self._known)
             self._words = encoding.words((*firmware.MODES, *self._known))
-            self._make_room(len(self._written.which))
+            self._make_room(self._written.columns.shape[1])
         return self._known[commander]
 
     def _make_room(self, count: int) -> None:
-        which, stamps, ends = (np.zeros(count, dtype=np.int64) for _ in range(3))
-        self._written = Written(which, stamps, ends, np.zeros(count * self._layouts.room(self._words), dtype=np.uint8))
-
-
-def _key(drone: str, kind: str) -> str:
-    return keys.truth(drone) if kind == "truth" else keys.sensor(drone, kind)
+        columns, first = np.zeros((3, count), dtype=np.int64), np.zeros(self._fleet.count + 1, dtype=np.int64)
+        self._written = Written(columns, first, np.zeros(count * LAYOUTS.room(self._words), dtype=np.uint8))
 
 
 @compiled
-def _fill_sample(row: Row, sampled: Sampled, m: int, seq: int, sigma_m: float) -> None:
+def _fill_sample(row: Row, sampled: Sampled, m: int, sigma_m: float) -> None:
     """Put sample m of a gate into a row."""
     s, ints, floats = sampled.whose[m, samples.SENSOR], row.ints, row.floats
-    ints[0], ints[1], ints[2] = sampled.whose[m, samples.STAMP], seq, sampled.whose[m, samples.SAMPLED]
+    ints[0], ints[2] = sampled.whose[m, samples.STAMP], sampled.whose[m, samples.SAMPLED]
     for k in range(samples.VALUE_COLUMNS):
         floats[k] = sampled.values[m, k]
     if s == sensor_set.GPS:
@@ -138,23 +149,22 @@ def _fill_truth(row: Row, state: NDArray, accel: NDArray) -> None:
 
 
 @compiled
-def _by_drone(index: NDArray, drones: int) -> NDArray:
-    """Return where the messages of each drone begin, (N + 1,): its samples, truth and status."""
-    first = np.zeros(drones + 1, np.int64)
-    for m in range(index.shape[0]):
-        first[index[m, samples.DRONE] + 1] += 1
-    for i in range(drones):
+def _by_drone(whose: NDArray, first: NDArray) -> None:
+    """Set where the messages of each drone begin, (N + 1,): its samples, truth and status."""
+    first[:] = 0
+    for m in range(whose.shape[0]):
+        first[whose[m, samples.DRONE] + 1] += 1
+    for i in range(len(first) - 1):
         first[i + 1] += first[i] + 2
-    return first
 
 
 @compiled
-def _in_order(index: NDArray, first: NDArray) -> NDArray:
+def _in_order(whose: NDArray, first: NDArray) -> NDArray:
     """Return which sample, or -1 for truth and -2 for status, stands at each place."""
     drones = len(first) - 1
     order, free = np.empty(first[drones], np.int64), first.copy()
-    for m in range(index.shape[0]):
-        i = index[m, samples.DRONE]
+    for m in range(whose.shape[0]):
+        i = whose[m, samples.DRONE]
         order[free[i]] = m
         free[i] += 1
     for i in range(drones):
@@ -162,36 +172,35 @@ def _in_order(index: NDArray, first: NDArray) -> NDArray:
     return order
 
 
+@compiled
+def _fill(row: Row, m: int, i: int, sampled: Sampled, seen: Seen, wide: Fleetwide, now_ns: int, count: int) -> int:
+    """Put sample m of drone i, its truth or its status into a row, and count it; return its kind."""
+    kind = sampled.whose[m, samples.SENSOR] if m >= 0 else TRUTH if m == -1 else STATUS
+    row.ints[0], row.ints[1] = now_ns, wide.counts[i, kind]
+    if m >= 0:
+        _fill_sample(row, sampled, m, wide.sigma_m[i])
+    elif kind == TRUTH:
+        _fill_truth(row, seen.state[i], seen.accel[i])
+    else:
+        row.ints[2], row.ints[3] = int(seen.memory[i, firmware.MODE]), wide.touching[i]
+        row.ints[4], row.ints[5] = wide.commanders[i], count
+        row.floats[0] = percent(seen.vehicle[i], seen.energy[i])
+    wide.counts[i, kind] += 1
+    return kind
+
+
 @kernel(SOURCES)
-def publish(
-    program: Program,
-    words: Words,
-    sampled: Sampled,
-    bodies: Bodies,
-    boards: Boards,
-    wide: Fleetwide,
-    now_ns: int,
-    row: Row,
-    out: Written,
-) -> int:
+def publish(words: Words, sampled: Sampled, seen: Seen, wide: Fleetwide, now_ns: int, out: Written) -> int:
     """Write the messages of a gate, drone by drone, and count them; return how many bytes that were."""
+    floats = np.zeros(FLOATS)
+    row, program = Row(np.zeros(INTS, np.int64), floats, floats.view(np.uint64)), Program(OPS, FIRST, LITERALS)
     drones, kinds = wide.counts.shape
-    first, at = _by_drone(sampled.whose, drones), 0
+    first, columns, at = out.first, out.columns, 0
+    _by_drone(sampled.whose, first)
     order = _in_order(sampled.whose, first)
     for i in range(drones):
         for place in range(first[i], first[i + 1]):
-            m = order[place]
-            kind = sampled.whose[m, samples.SENSOR] if m >= 0 else TRUTH if m == -1 else STATUS
-            row.ints[0], row.ints[1] = now_ns, wide.counts[i, kind]
-            if m >= 0:
-                _fill_sample(row, sampled, m, wide.counts[i, kind], wide.sigma_m[i])
-            elif kind == TRUTH:
-                _fill_truth(row, bodies.state[i], bodies.accel[i])
-            else:
-                row.ints[2], row.ints[3] = int(boards.memory[i, firmware.MODE]), wide.touching[i]
-                row.ints[4], row.ints[5] = wide.commanders[i], first[i + 1] - first[i] - 1
-                row.floats[0] = percent(bodies.vehicle[i], bodies.energy[i])
-            wide.counts[i, kind] += 1
+            kind = _fill(row, order[place], i, sampled, seen, wide, now_ns, first[i + 1] - first[i] - 1)
             at = write(program, words, kind, row.ints, row.bits, out.data, at + GAP)
-            out.which[place], out.stamps[place], out.ends[place] = i * kinds + kind, row.ints[0], at
+            columns[WHICH, place], columns[STAMPS, place], columns[ENDS, place] = i * kinds + kind, row.ints[0], at
     return at

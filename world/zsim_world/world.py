@@ -236,9 +236,9 @@ class World:
             return False
         return self.mode == "realtime" or not self.barrier.blocking(self.now_ns - self.delay_ns)
 
-    def owing(self) -> list[Participant]:
-        """Return who owes a done without which the world cannot go on."""
-        return self.barrier.blocking(self.now_ns - self.delay_ns)
+    def owing(self, ahead_ns: int = 0) -> list[Participant]:
+        """Return who owes a done without which the world cannot go on, or could not after so much more time."""
+        return self.barrier.blocking(self.now_ns - self.delay_ns + ahead_ns)
 
     def waiting_for(self, wall_ns: int) -> tuple[messages.Waiting, ...]:
         """Return whom the world waits for now."""

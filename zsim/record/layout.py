@@ -43,7 +43,7 @@ _STANDARD = frozenset(range(Opcode.HEADER, Opcode.DATA_END + 1))
 
 def _compressor() -> zstandard.ZstdCompressor:
     if not hasattr(_own, "compressor"):
-        _own.compressor = zstandard.ZstdCompressor(level=1)
+        _own.compressor = zstandard.ZstdCompressor(level=-1)
     return _own.compressor
 
 

@@ -1,7 +1,7 @@
 """Writes a record while a run goes on."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from io import FileIO
 from pathlib import Path
 from typing import Any, NoReturn
@@ -11,7 +11,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from zsim import batch, messages
-from zsim.bundle import Bundle
+from zsim.bundle import PATTERNS_MAX, Bundle
 from zsim.errors import RecordError
 from zsim.record.finish import finish, finish_bare, write_all
 from zsim.record.layout import HEAD, MESSAGE, MESSAGE_FIXED, chunk, opening, packed
@@ -58,6 +58,8 @@ class RecordWriter:
         self.messages = 0
         self.refused = 0
         self._channels: dict[str, _Channel] = {}
+        self._table: Sequence[str] = ()
+        self._patterns: dict[bytes, list[_Channel]] = {}  # of the bundles of a table
         self._schemas: dict[str, int] = {}
         self._ahead: list[bytes] = []  # schemas and channels that the open chunk is the first to use
         self._open: list[bytes | bytearray] = []
@@ -112,11 +114,8 @@ class RecordWriter:
         Raises:
             RecordError: as `add`.
         """
-        places: list[int] = bundle.which.tolist()
-        keys = [bundle.table[place] for place in places]
-        found = [self._channels.get(key) or self._register(key, messages.encoding(key)) for key in keys]
-        channels = [channel for channel in found if channel is not None]
-        if len(channels) < len(keys):
+        channels = self._channels_of(bundle)
+        if channels is None:
             self._add_each(bundle, wall_ns)
             return
         if not self._size:
@@ -133,6 +132,24 @@ class RecordWriter:
         self._size = at + start
         if self._size >= CHUNK_BYTES or wall_ns - self._since_ns >= CHUNK_AGE_NS:
             self._end_chunk()
+
+    def _channels_of(self, bundle: Bundle) -> list[_Channel] | None:
+        """Return the channel of each message, None if there is none left for one."""
+        if bundle.table is not self._table:
+            self._table = bundle.table
+            self._patterns.clear()
+        pattern = bundle.which.tobytes()
+        channels = self._patterns.get(pattern)
+        if channels is None:
+            places: list[int] = bundle.which.tolist()
+            keys = [bundle.table[place] for place in places]
+            found = [self._channels.get(key) or self._register(key, messages.encoding(key)) for key in keys]
+            channels = [channel for channel in found if channel is not None]
+            if len(channels) < len(keys):
+                return None
+            if len(self._patterns) < PATTERNS_MAX:
+                self._patterns[pattern] = channels
+        return channels
 
     def _add_each(self, bundle: Bundle, wall_ns: int) -> None:
         for (key, payload), t_ns in zip(bundle.encoded, bundle.stamps.tolist(), strict=True):

@@ -1,0 +1,132 @@
+"""All that the world says at a gate in one buffer: written, sent, read, recorded as the messages one by one."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from zsim import batch, keys, messages, scenario_file
+from zsim.bundle import Bundle, Selection, table_of, unpacked
+from zsim.errors import DecodeError
+from zsim.record import RecordReader, RecordWriter
+from zsim_world.fleet import Fleet
+from zsim_world.publication import Publication
+
+DRONES = ["d1", "d2", "d3"]
+
+
+@pytest.fixture(scope="module")
+def said() -> list[Bundle]:
+    """Two seconds of three drones, one of which is flown by somebody."""
+    places = [{"name": name, "position_m": [3 * i, 0, 0]} for i, name in enumerate(DRONES)]
+    latency = {"gps": {"latency_ms": 35.0}, "baro": {"latency_ms": 12.5}}
+    fleet = Fleet(scenario_file.resolve({"name": "bundle", "duration_s": 5, "drones": places, "sensors": latency}))
+    publication, bundles = Publication(fleet), []
+    for gate in range(100):
+        fleet.advance()
+        bundles.append(publication.gate(lambda i, gate=gate: "pilot.one" if i == 1 and gate > 50 else None))
+    return bundles
+
+
+def test_every_message_is_of_the_contract_and_to_the_byte_what_its_encoder_gives(said: list[Bundle]) -> None:
+    heard = set()
+    for bundle in said:
+        for key, payload in bundle.encoded:
+            assert messages.encode(messages.decode(key, payload)) == payload
+            heard.add(key)
+    assert heard == set(table_of(DRONES))
+
+
+def test_numbers_count_on_per_key_and_status_counts_what_came(said: list[Bundle]) -> None:
+    seq = dict.fromkeys(table_of(DRONES), 0)
+    for bundle in said:
+        of_drone = dict.fromkeys(DRONES, 0)
+        for key, message in bundle.messages():
+            assert message.seq == seq[key]
+            seq[key] += 1
+            of_drone[keys.thing(key)] += keys.is_sensor(key)
+            if keys.is_status(key):
+                assert (message.t_ns, message.seq) == (bundle.t_ns, bundle.seq)
+                assert message.count == of_drone[keys.thing(key)]
+            assert bundle.t_ns - 20_000_000 < message.t_ns <= bundle.t_ns
+
+
+def test_a_commander_is_named(said: list[Bundle]) -> None:
+    told = [message for key, message in said[-1].messages() if keys.is_status(key)]
+    assert [status.commander for status in told] == [None, "pilot.one", None]
+    assert {status.state for status in told} == {"landed"}
+
+
+def test_samples_of_a_drone_come_in_the_order_of_their_stamps_and_none_is_lost(said: list[Bundle]) -> None:
+    for drone in DRONES:
+        samples = [m for bundle in said for key, m in bundle.messages() if key == keys.sensor(drone, "gps")]
+        assert [m.t_ns - m.t_sample_ns for m in samples] == [35_000_000] * len(samples)
+        assert np.all(np.diff([m.t_sample_ns for m in samples]) > 0)
+        stamps = [[m.t_ns for key, m in b.messages() if keys.is_sensor(key) and keys.thing(key) == drone] for b in said]
+        assert all(stamp == sorted(stamp) for stamp in stamps)
+
+
+def test_a_part_travels_and_comes_out_the_same(said: list[Bundle]) -> None:
+    for bundle in said[::10]:
+        whole = unpacked(bundle.packed(), bundle.table)
+        assert (whole.t_ns, whole.seq, whole.encoded) == (bundle.t_ns, bundle.seq, bundle.encoded)
+        first, last = bundle.first[1], bundle.first[2]
+        part = unpacked(bundle.packed(first, last), bundle.table)
+        assert part.encoded == bundle.encoded[first:last]
+        assert {keys.thing(key) for key, _ in part.encoded} == {"d2"}
+
+
+def test_who_reads_some_keys_gets_their_messages(said: list[Bundle]) -> None:
+    selection = Selection(["drone/d3/sensor/*", keys.status("d1")])
+    found = selection.of(said[20])
+    wanted = [(key, m) for key, m in said[20].messages() if selection.takes(key)]
+    assert found == wanted
+    assert {keys.thing(key) for key, _ in found} == {"d1", "d3"}
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xc1",
+        msgspec.msgpack.encode([1, 2, b"", b"", b"12345678", b""]),
+        msgspec.msgpack.encode([1, 2, b"123", b"123", b"123", b""]),
+        msgspec.msgpack.encode([-1, 2, b"", b"", b"", b""]),
+        msgspec.msgpack.encode({"t_ns": 1}),
+    ],
+)
+def test_what_is_no_bundle_is_refused(payload: bytes) -> None:
+    with pytest.raises(DecodeError, match=r"^@gate: .*must be the messages of a gate"):
+        unpacked(payload, table_of(DRONES))
+
+
+@pytest.mark.parametrize("place", [-1000, 24, 2**62])
+def test_keys_that_are_not_there_are_refused_where_they_are_followed(said: list[Bundle], place: int) -> None:
+    b = said[0]
+    bad = Bundle(b.t_ns, b.seq, b.table, np.full(len(b), place), b.stamps, b.ends, b.buffer)
+    with pytest.raises(DecodeError, match="@gate: "):
+        Selection(["**"]).of(unpacked(bad.packed(), b.table))
+
+
+def test_a_record_of_bundles_is_that_of_their_messages(said: list[Bundle], tmp_path) -> None:
+    with RecordWriter(tmp_path / "whole.mcap") as writer:
+        for bundle in said:
+            copy = Bundle(bundle.t_ns, bundle.seq, bundle.table, bundle.which, bundle.stamps, bundle.ends,
+                          bytearray(bundle.buffer))  # fmt: skip
+            writer.add_message(batch.GATE, copy, 5)
+    with RecordWriter(tmp_path / "each.mcap") as writer:
+        for bundle in said:
+            for (key, payload), t_ns in zip(bundle.encoded, bundle.stamps.tolist(), strict=True):
+                writer.add(key, payload, messages.encoding(key), t_ns, 5)
+    whole, each = (list(RecordReader(tmp_path / f"{name}.mcap")) for name in ("whole", "each"))
+    assert whole == each
+    assert len(whole) == sum(map(len, said))
+
+
+def test_a_record_that_has_no_number_left_for_a_key_takes_the_others(
+    said: list[Bundle], tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("zsim.record.writer.CHANNELS_MAX", 2)
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        writer.add_bundle(said[0], 5)
+    assert writer.messages + writer.refused == len(said[0])
+    assert len({message.key for message in RecordReader(tmp_path / "run.mcap")}) == 2

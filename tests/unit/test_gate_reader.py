@@ -1,0 +1,95 @@
+"""Sensors read out of a bundle by compiled code are the readings that their messages make."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from zsim import batch, keys, scenario_file
+from zsim.bundle import Bundle
+from zsim.scenario import Scenario
+from zsim_agents.compiled import COMPILES
+from zsim_agents.estimator import Estimator
+from zsim_world.world import World
+
+DRONES = ("d1", "d2", "d3")
+
+
+def scenario() -> Scenario:
+    places = [{"name": name, "position_m": [3 * i, 0, 0]} for i, name in enumerate(DRONES)]
+    latency = {"gps": {"latency_ms": 35.0}, "mag": {"latency_ms": 5.0}}
+    return scenario_file.resolve({"name": "reader", "drones": places, "sensors": latency, "duration_s": 5})
+
+
+@pytest.fixture(scope="module")
+def flight() -> tuple[World, list[Bundle]]:
+    world = World(scenario())
+    world.state = "running"
+    bundles = []
+    for gate in range(120):
+        if gate == 20:
+            assert world.fleet.takeoff(0) is None
+        world._publish_gate(0)
+        bundles += [message for key, message in world.take_outbox() if key == batch.GATE]
+        world.fleet.advance()
+    return world, bundles
+
+
+def estimates(agent: Estimator, bundles: list[Bundle], whole: bool) -> list[object]:
+    """Return what an estimator says of a flight, heard as bundles or as messages in the order of a runner."""
+    said = []
+    for bundle in bundles:
+        if whole:
+            agent.receive(batch.GATE, bundle)
+        else:
+            heard = [(key, m) for key, m in bundle.messages() if keys.is_sensor(key)]
+            for key, message in sorted(heard, key=lambda entry: (entry[1].t_ns, entry[0], entry[1].seq)):
+                if keys.thing(key) in agent.counted:
+                    agent.receive(key, message)
+        said += agent.step(bundle.t_ns)
+    return said
+
+
+@pytest.mark.skipif(not COMPILES, reason="numba is not installed: bundles are taken apart")
+@pytest.mark.parametrize("drones", [DRONES, ("d2",), ("d3", "d1")])
+def test_a_bundle_gives_the_estimates_of_its_messages(
+    flight: tuple[World, list[Bundle]], drones: tuple[str, ...]
+) -> None:
+    world, bundles = flight
+    whole, each = (Estimator(world.info(), world.scenario, drones) for _ in range(2))
+    assert whole.takes_bundles
+    assert estimates(whole, bundles, whole=True) == estimates(each, bundles, whole=False)
+
+
+@pytest.mark.skipif(not COMPILES, reason="numba is not installed: bundles are taken apart")
+def test_a_message_that_the_world_would_not_write_so_is_decoded_all_the_same(
+    flight: tuple[World, list[Bundle]],
+) -> None:
+    """One whose floats are whole numbers on the wire: right, but not what the compiled reader knows."""
+    world, bundles = flight
+    gate = next(b for b in bundles if any(key.endswith("mag") for key, _ in b.encoded))
+    changed = [_with_whole_numbers(gate) if b is gate else b for b in bundles]
+    whole, each = (Estimator(world.info(), world.scenario, DRONES) for _ in range(2))
+    assert estimates(whole, changed, whole=True) == estimates(each, changed, whole=False)
+
+
+def test_columns_that_lead_outside_are_not_followed(flight: tuple[World, list[Bundle]]) -> None:
+    world, bundles = flight
+    b, agent = bundles[0], Estimator(world.info(), world.scenario, DRONES)
+    for which, ends in (
+        (np.full(len(b), 10**9), b.ends),
+        (np.full(len(b), -5), b.ends),
+        (b.which, b.ends + 10**9),
+        (b.which, b.ends[::-1].copy()),
+        (b.which, -b.ends),
+    ):
+        agent.receive(batch.GATE, Bundle(b.t_ns, b.seq, b.table, which, b.stamps, ends, bytes(b.buffer)))
+    assert len(agent.step(b.t_ns)) == len(DRONES)
+
+
+def _with_whole_numbers(bundle: Bundle) -> Bundle:
+    said = [(key, _rounded(payload) if key.endswith("/mag") else payload) for key, payload in bundle.encoded]
+    return Bundle.of(bundle.t_ns, bundle.seq, bundle.table, said)
+
+
+def _rounded(payload: bytes) -> bytes:
+    return msgspec.msgpack.encode({**msgspec.msgpack.decode(payload), "field_ut": [20, 0, -40]})
