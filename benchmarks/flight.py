@@ -33,7 +33,13 @@ def fly(drones: int, seconds: float) -> dict[str, float]:
     world = World(grid.scenario(drones, duration_s=1.0 + seconds), "lockstep", 0.0, time.monotonic_ns)
     with tempfile.TemporaryDirectory() as folder:
         writer = RecordWriter(Path(folder) / "run.mcap")
-        bus = Bus(world, agents(world), time.monotonic_ns, lambda k, m: writer.add_message(k, m, time.time_ns()))
+        bus = Bus(
+            world,
+            agents(world),
+            time.monotonic_ns,
+            lambda key, message: writer.add_message(key, message, time.time_ns()),
+            lambda bundle: writer.add_bundle(bundle, time.time_ns()),
+        )
         bus.join()
         for _ in range(WARM_GATES):
             bus.turn()

@@ -60,7 +60,6 @@ class Hub(Protocol):
 
 
 Sink = Callable[[str, Any], None]
-"""Takes a key and a message, or batch.GATE and a Bundle."""
 
 
 class Bus:
@@ -70,7 +69,8 @@ class Bus:
         hub: the world.
         agents: in the order in which they are asked.
         wall_ns: monotonic wall time.
-        sink: takes everything in order of publication: the recorder.
+        sink: takes every message in order of publication.
+        whole: takes what the world says at a gate in place of the sink, which then need not be given objects of it.
     """
 
     def __init__(
@@ -79,10 +79,12 @@ class Bus:
         agents: Sequence[Agent],
         wall_ns: Callable[[], int],
         sink: Sink = lambda key, message: None,
+        whole: Callable[[Bundle], None] | None = None,
     ) -> None:
         self._hub = hub
         self._wall_ns = wall_ns
         self._sink = sink
+        self._whole = whole
         self._agents = [(agent, Inbox(agent.gate_keys, agent.counted)) for agent in agents]
         self._selections = [Selection(agent.reads) for agent in agents]
         self._routes: dict[str, list[Inbox]] = {}
@@ -151,14 +153,19 @@ class Bus:
 
     def _spread(self) -> None:
         for key, message in self._hub.take_outbox():
-            self._sink(key, message)
             if key == batch.GATE:
                 self._hand_out(message)
                 continue
+            self._sink(key, message)
             for inbox in self._route(key):
                 inbox.put(key, message)
 
     def _hand_out(self, bundle: Bundle) -> None:
+        if self._whole:
+            self._whole(bundle)
+        else:
+            for each in bundle.messages():
+                self._sink(*each)
         for (agent, inbox), selection in zip(self._agents, self._selections, strict=True):
             for key, message in [(batch.GATE, bundle)] if agent.takes_bundles else selection.of(bundle):
                 inbox.put(key, message)

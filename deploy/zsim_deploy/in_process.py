@@ -11,6 +11,7 @@ from msgspec import Struct
 
 from zsim import keys, messages
 from zsim.agent import Agent
+from zsim.bundle import Bundle
 from zsim.in_process import Bus
 from zsim.record import RecordWriter
 from zsim.scenario import Scenario
@@ -49,7 +50,7 @@ def fly(
     team = agents(world)  # may refuse the scenario; a record that was begun could not be begun again
     writer = RecordWriter(record) if record else None
     show = _Show(world, writer, screen)
-    bus = Bus(world, team, time.monotonic_ns, show.sink)
+    bus = Bus(world, team, time.monotonic_ns, show.sink, show.whole)
     try:
         show.sink(keys.INFO, world.info())
         bus.join()
@@ -74,12 +75,17 @@ class _Show:
     def __init__(self, world: World, writer: RecordWriter | None, screen: Screen | None) -> None:
         self._world = world
         self._add = writer.add_message if writer else None
+        self._add_bundle = writer.add_bundle if writer else None
         self._screen = screen
         self._throttle = Throttle()
         self._reasons = Reasons()
         states = (keys.cluster_state(cluster.name) for cluster in world.scenario.clusters)
         self._watched = {keys.CLOCK, keys.EVENT, *states}
         self._phase = ""
+
+    def whole(self, bundle: Bundle) -> None:
+        if self._add_bundle is not None:
+            self._add_bundle(bundle, time_ns())
 
     def sink(self, key: str, message: Any) -> None:
         if self._add is not None:

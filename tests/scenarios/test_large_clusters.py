@@ -10,7 +10,6 @@ import pytest
 from federation import Federation
 
 from zsim import keys, messages, scenario_file
-from zsim.bundle import Bundle
 from zsim.in_process import Bus
 from zsim.scenario import Scenario
 from zsim_agents.cluster_space import Array, closest_pair
@@ -47,10 +46,7 @@ class Flight:
         self.space = scenario_space(self.scenario, self.cluster)
 
     def sink(self, key: str, message: Any) -> None:
-        if isinstance(message, Bundle):
-            for each in message.messages():
-                self.sink(*each)
-        elif isinstance(message, messages.ClusterState):
+        if isinstance(message, messages.ClusterState):
             self.states.append(message)
         elif isinstance(message, messages.Truth):
             self.truth.setdefault(message.t_ns, {})[keys.thing(key)] = message.position_m

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from zsim import batch, keys, messages, scenario_file
+from zsim import keys, messages, scenario_file
 from zsim.bundle import Bundle, Selection, table_of, unpacked
 from zsim.errors import DecodeError
 from zsim.record import RecordReader, RecordWriter
@@ -112,7 +112,7 @@ def test_a_record_of_bundles_is_that_of_their_messages(said: list[Bundle], tmp_p
         for bundle in said:
             copy = Bundle(bundle.t_ns, bundle.seq, bundle.table, bundle.which, bundle.stamps, bundle.ends,
                           bytearray(bundle.buffer))  # fmt: skip
-            writer.add_message(batch.GATE, copy, 5)
+            writer.add_bundle(copy, 5)
     with RecordWriter(tmp_path / "each.mcap") as writer:
         for bundle in said:
             for (key, payload), t_ns in zip(bundle.encoded, bundle.stamps.tolist(), strict=True):

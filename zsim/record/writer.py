@@ -10,7 +10,7 @@ import msgspec
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from zsim import batch, messages
+from zsim import messages
 from zsim.bundle import PATTERNS_MAX, Bundle
 from zsim.errors import RecordError
 from zsim.record.finish import finish, finish_bare, write_all
@@ -94,14 +94,11 @@ class RecordWriter:
             self._take(channel, payload, _time(t_ns), _time(wall_ns))
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
-        """Take one message of this process, encoded as for the wire, or a bundle on its key.
+        """Take one message of this process, encoded as for the wire.
 
         Raises:
             RecordError: as `add`.
         """
-        if key == batch.GATE:
-            self.add_bundle(message, wall_ns)
-            return
         channel = self._channels.get(key) or self._register(key, messages.encoding(key))
         if channel is None:
             self.refused += 1

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from zsim import batch, keys, scenario_file
+from zsim import keys, scenario_file
 from zsim.bundle import Bundle
 from zsim.errors import ZsimError
 from zsim.messages import Bye, Event, Info, Join, Quaternion, Vector3
@@ -113,15 +113,13 @@ class Reading:
         take(_thing(message.key), decoded)
 
     def keep(self, key: str, message: Any) -> None:
-        """Take one message of a flight in this process, not encoded, or a bundle."""
-        if key == batch.GATE:
-            self._keep_bundle(message)
-            return
+        """Take one message of a flight in this process; it has not been encoded."""
         taker = self.taker(key)
         if taker is not None:
             taker[1](_thing(key), message)
 
-    def _keep_bundle(self, bundle: Bundle) -> None:
+    def keep_bundle(self, bundle: Bundle) -> None:
+        """Take what the world says at a gate."""
         for key, payload in bundle.encoded:
             taker = self.taker(key)
             if taker is not None:

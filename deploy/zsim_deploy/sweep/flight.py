@@ -3,7 +3,7 @@
 import gc
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from shutil import rmtree
@@ -12,6 +12,7 @@ from typing import Any
 import msgspec
 
 from zsim import keys, scenario_file
+from zsim.bundle import Bundle
 from zsim.errors import RecordError, ZsimError
 from zsim.fingerprint import fingerprint
 from zsim.in_process import Bus
@@ -26,7 +27,6 @@ from zsim_deploy.sweep.row import Result, Row, failed, row
 from zsim_deploy.sweep.task import Task
 from zsim_world.world import World
 
-Sink = Callable[[str, Any], None]
 REASON_MAX = 300  # characters
 
 
@@ -38,8 +38,8 @@ def fly(task: Task) -> Row:
     """
     where = {"host": socket.gethostname(), "fingerprint": fingerprint()}
     try:
-        with _record(task) as keep:
-            flight, diverged = flown(task.scenario, keep)
+        with _record(task) as writer:
+            flight, diverged = flown(task.scenario, writer)
         summary = _summary(flight)
     except (RecordError, OSError):
         raise
@@ -56,17 +56,26 @@ def reason_of(error: BaseException) -> str:
     return text if isinstance(error, ZsimError) and text else f"{type(error).__name__}: {text}"
 
 
-def flown(scenario: Scenario, keep: Sink | None = None) -> tuple[Flight, Exception | None]:
+def flown(scenario: Scenario, writer: RecordWriter | None = None) -> tuple[Flight, Exception | None]:
     """Fly a scenario; return the flight, and how it diverged if it did.
 
     Args:
         scenario: resolved.
-        keep: takes every message as well.
+        writer: takes every message as well.
     """
-    world = World(scenario, "lockstep", 0.0, time.monotonic_ns)
-    reading = Reading()
-    sink = _both(reading.keep, keep) if keep else reading.keep
-    bus = Bus(world, agents(world), time.monotonic_ns, sink)
+    world, reading = World(scenario, "lockstep", 0.0, time.monotonic_ns), Reading()
+
+    def sink(key: str, message: Any) -> None:
+        reading.keep(key, message)
+        if writer:
+            writer.add_message(key, message, time.time_ns())
+
+    def whole(bundle: Bundle) -> None:
+        reading.keep_bundle(bundle)
+        if writer:
+            writer.add_bundle(bundle, time.time_ns())
+
+    bus = Bus(world, agents(world), time.monotonic_ns, sink, whole)
     sink(keys.INFO, world.info())
     bus.join()
     while bus.turn():
@@ -75,16 +84,8 @@ def flown(scenario: Scenario, keep: Sink | None = None) -> tuple[Flight, Excepti
     return reading.flight(), world.diverged
 
 
-def _both(first: Sink, second: Sink) -> Sink:
-    def sink(key: str, message: Any) -> None:
-        first(key, message)
-        second(key, message)
-
-    return sink
-
-
 @contextmanager
-def _record(task: Task) -> Iterator[Sink | None]:
+def _record(task: Task) -> Iterator[RecordWriter | None]:
     """Yield what writes the record, None where none is kept; a run cut short leaves a folder named .part."""
     if task.record is None:
         yield None
@@ -96,7 +97,7 @@ def _record(task: Task) -> Iterator[Sink | None]:
     (part / "scenario.yaml").write_text(scenario_file.to_text(task.scenario))
     writer = RecordWriter(part / "run.mcap")
     try:
-        yield lambda key, message: writer.add_message(key, message, time.time_ns())
+        yield writer
     finally:
         writer.close()
         part.rename(folder)
