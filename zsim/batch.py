@@ -12,7 +12,7 @@ import msgspec
 from zsim.errors import DecodeError
 from zsim.messages import REFUSALS
 
-KEY = "@batch"  # everything that passed the hub since its last gate
+KEY = "@batch"  # everything that passed the hub; what the world says of its drones at a gate under GATE
 GATE = "@gate"  # everything that the world says at a gate
 Batch = list[tuple[str, bytes]]
 MESSAGES_MAX = 5_000  # of one batch; a flood of somebody's messages goes into several

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import pairwise
+from operator import sub
 from typing import Any, NoReturn
 
 import msgspec
@@ -94,6 +95,13 @@ class Bundle:
         places: list[int] = self.which.tolist()
         bounds = pairwise([0, *self.ends.tolist()])
         return [(table[p], data[start + GAP : end]) for p, (start, end) in zip(places, bounds, strict=True)]
+
+    def is_sound(self) -> bool:
+        """Tell whether its columns lead nowhere outside of it, and its stamps are times."""
+        which, stamps, ends = self.which.tolist(), self.stamps.tolist(), self.ends.tolist()
+        if not ends or ends[-1] != len(self.buffer) or min(map(sub, ends, [0, *ends])) < GAP:
+            return False
+        return min(which) >= 0 and max(which) < len(self.table) and min(stamps) >= 0
 
     def payload(self, m: int) -> bytes:
         """Return the payload of one message."""

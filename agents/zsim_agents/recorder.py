@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 
 from zsim import __version__, batch, keys, messages
+from zsim.bundle import Bundle, table_of, unpacked
 from zsim.connection import read_info
 from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, SupersededError
 from zsim.health import HealthMeter
@@ -74,6 +75,7 @@ class Recorder:
         self._link_lost = False
         self._must_look = False
         self._writer = RecordWriter(path)
+        self._table = table_of([drone.name for drone in info.drones])
         self._head = msgspec.msgpack.Decoder(_Head)
         self._clock = msgspec.msgpack.Decoder(messages.Clock)
         self._known: dict[tuple[str, bytes], None] = {}
@@ -184,9 +186,24 @@ class Recorder:
     def _write_batch(self, sample: Sample) -> None:
         try:
             for key, payload in batch.decode(sample.payload):
-                self._write(key, payload)
+                if key == batch.GATE:
+                    self._write_bundle(unpacked(payload, self._table))
+                else:
+                    self._write(key, payload)
         except DecodeError:
             self.health.refused += 1
+
+    def _write_bundle(self, bundle: Bundle) -> None:
+        if not bundle.is_sound():
+            self.health.refused += 1
+        elif self._known:
+            for key, payload in bundle.encoded:
+                self._write(key, payload)
+        else:
+            self.health.received += len(bundle)
+            self._now_ns = bundle.t_ns
+            bundle.buffer = bytearray(bundle.buffer)
+            self._writer.add_bundle(bundle, time.time_ns())
 
     def _write(self, key: str, payload: bytes) -> None:
         if self._known and (key, payload) in self._known:

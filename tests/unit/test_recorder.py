@@ -4,11 +4,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
 import pytest
 from msgspec import Struct
 
 from zsim import batch, keys, messages
-from zsim.messages import Clock, ControlAnswer, Imu, Info, Origin
+from zsim.bundle import Bundle, table_of
+from zsim.messages import Clock, ControlAnswer, DroneInfo, Imu, Info, Origin
 from zsim.record import RecordReader
 from zsim_agents import recorder
 from zsim_agents.recorder import record
@@ -18,8 +21,10 @@ from fake_link import BAD_UTF8, NESTED, UNANSWERED, FakeLink
 
 GATE_NS = 20_000_000
 INFO = Info(
-    0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(0.0, 0.0, 0.0), (), (), "", "", "", ""
-)
+    0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(0.0, 0.0, 0.0), (DroneInfo("d1", "any"),), (),
+    "", "", "", "",
+)  # fmt: skip
+TABLE = table_of(["d1"])
 IMU = keys.sensor("d1", "imu")
 Pair = tuple[str, bytes]
 
@@ -34,6 +39,11 @@ def clock(gate: int, state: str = "running") -> Pair:
 
 def imu(gate: int) -> Pair:
     return pair(IMU, Imu(gate * GATE_NS, gate, gate * GATE_NS, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0)))
+
+
+def whole(gate: int) -> list[Pair]:
+    """Return a gate as the world hands it over: its samples in one."""
+    return [(batch.GATE, Bundle.of(gate * GATE_NS, gate, TABLE, [imu(gate)]).packed()), clock(gate)]
 
 
 def gates(*numbers: int) -> list[Pair]:
@@ -66,6 +76,38 @@ def test_a_late_recorder_writes_what_it_hears_twice_once(tmp_path: Path):
     found = recorded(tmp_path / "run.mcap", replayed, gates(4), gates(5, 6), gates(7), gates(8))
     assert stamps(found, IMU) == list(range(9))
     assert stamps(found, keys.CLOCK) == [*range(9), 99]
+
+
+def test_gates_in_one_are_recorded_message_by_message_and_once(tmp_path: Path):
+    replayed = [page(gates(0, 1, 2, 3))]
+    found = recorded(tmp_path / "run.mcap", replayed, whole(2), whole(3), whole(4), whole(5))
+    assert stamps(found, IMU) == list(range(6))
+    assert [payload for key, payload in found if key == IMU] == [imu(gate)[1] for gate in range(6)]
+
+
+def test_a_gate_whose_columns_lead_outside_is_refused(tmp_path: Path):
+    """Whoever may publish may send such a thing; the record stays whole."""
+    good = Bundle.of(GATE_NS, 1, TABLE, [imu(1), imu(2)])
+    bad = [b"", b"\xc1"]
+    for which, stamps_, ends in (
+        (np.array([0, 8]), good.stamps, good.ends),
+        (np.array([0, -1]), good.stamps, good.ends),
+        (good.which, -good.stamps, good.ends),
+        (good.which, good.stamps, good.ends + 1),
+        (good.which, good.stamps, good.ends[::-1].copy()),
+        (good.which, good.stamps, np.array([5, good.ends[1]])),
+        (good.which[:0], good.stamps[:0], good.ends[:0]),
+    ):
+        bundle = Bundle(GATE_NS, 1, TABLE, which, stamps_, ends, good.buffer)
+        bad.append(_packed(bundle))
+    batches = [[(batch.GATE, payload)] for payload in bad]
+    found = recorded(tmp_path / "run.mcap", [page(gates(0))], gates(1), *batches, gates(2), whole(3))
+    assert stamps(found, IMU) == [0, 1, 2, 3]
+
+
+def _packed(b: Bundle) -> bytes:
+    columns = [column.astype("<i8").tobytes() for column in (b.which, b.stamps, b.ends)]
+    return msgspec.msgpack.encode([b.t_ns, b.seq, *columns, bytes(b.buffer)])
 
 
 def test_the_newest_of_a_long_replay_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

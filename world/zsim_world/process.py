@@ -416,9 +416,10 @@ class WorldProcess:
                 self._gather_bundle(message)
                 encoded += message.encoded
             else:
-                encoded.append((key, messages.encode(message)))
+                pair = (key, messages.encode(message))
+                encoded.append(pair)
+                self._passed.append(pair)
         self._unsent += encoded
-        self._passed += encoded
         self._history.add_all(encoded, self._world.now_ns)
         for key, message in outbox:
             if key == keys.CLOCK:
@@ -429,8 +430,10 @@ class WorldProcess:
 
     def _gather_bundle(self, bundle: Bundle) -> None:
         """Keep what is said at a gate in one message, of all drones and of each, where somebody reads it so."""
+        whole = (batch.GATE, bundle.packed())
+        self._passed.append(whole)
         if self._link.heard(batch.GATE):
-            self._unsent.append((batch.GATE, bundle.packed()))
+            self._unsent.append(whole)
         for key, (first, last) in zip(self._gate_keys, pairwise(bundle.first), strict=True):
             if self._link.heard(key):
                 self._unsent.append((key, bundle.packed(first, last)))
