@@ -45,7 +45,7 @@ class Commanders:
         self._holders: list[Holder | None] = [None] * len(drones)
         self._priorities: dict[tuple[int, str], int] = {}
         self._due: dict[int, list[Due]] = {}  # by the instant at which they take effect
-        self._seen: dict[tuple[int, str, int, Any], None] = {}
+        self._seen: dict[tuple[int, str, int, str, int], Any] = {}  # messages by what is quickly compared of them
 
     def holder(self, drone: int) -> str | None:
         """Return the name of the commander."""
@@ -54,10 +54,10 @@ class Commanders:
 
     def push(self, drone: int, kind: str, message: Any, apply_ns: int) -> bool:
         """Keep a command until its instant; return False for one that has come before."""
-        mark = (drone, kind, apply_ns, message)
-        if mark in self._seen:
+        mark = (drone, kind, apply_ns, message.source, message.seq)
+        if self._seen.get(mark) == message:
             return False
-        self._seen[mark] = None
+        self._seen[mark] = message
         if len(self._seen) > SEEN_PER_DRONE * len(self._names):
             del self._seen[next(iter(self._seen))]
         priority = self._priorities.get((drone, message.source), PROGRAM)
