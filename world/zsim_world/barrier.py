@@ -177,8 +177,9 @@ class Barrier:
                 participant.received += 1
 
     def is_gating(self, name: str) -> bool:
+        """Tell whether a process is waited for, also one that seems dead: what it sent may come before its return."""
         participant = self.participants.get(name)
-        return participant is not None and participant.gating and participant.alive
+        return participant is not None and participant.gating
 
     def died(self, name: str, wall_ns: int) -> Participant | None:
         """Mark a participant as dead; it stays in the barrier until it is dropped or rejoins."""
