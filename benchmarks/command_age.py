@@ -45,10 +45,7 @@ def _measured(sheet: Sheet, name: str, size: int, folder: Path) -> str:
     try:
         found = _realtime(size, folder, ZSIM[name]) if name in ZSIM else _bare(name, size)
     except RefusedError as error:
-        sheet.refused[f"{name}@{size}"] = str(error)
-        for quantile in QUANTILES:
-            sheet.add(f"{name}_{quantile}", size, None)
-        return str(error)
+        return sheet.refuse(name, size, str(error), [f"{name}_{quantile}" for quantile in QUANTILES])
     for key, value in found.items():
         sheet.add(f"{name}_{key}", size, value)
     return ", ".join(f"{key} {value:.2f} ms" for key, value in found.items() if key in QUANTILES)

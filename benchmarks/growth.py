@@ -41,9 +41,7 @@ def _grown(sheet: Sheet, size: int, seconds: float) -> str:
     try:
         found = result(command, TIMEOUT_S)
     except RefusedError as error:
-        sheet.refused[f"in_process@{size}"] = str(error)
-        sheet.add("in_process", size, None)
-        return str(error)
+        return sheet.refuse("in_process", size, str(error), ["in_process"])
     sheet.add("in_process", size, 1e3 * found["cpu_s_per_simulated_s"] / size)
     sheet.add("resident_mb", size, found["resident_mb"])
     return f"{1e3 * found['cpu_s_per_simulated_s'] / size:.1f} ms per drone-second"

@@ -91,9 +91,7 @@ def _measured(sheet: Sheet, name: str, server: Server, size: int, cpu_s: float) 
     try:
         found = server.ask({"drones": size, "cpu_s": cpu_s}, TIMEOUT_S)["drone_s_per_cpu_s"]
     except RefusedError as error:
-        sheet.refused[f"{name}@{size}"] = str(error)
-        sheet.add(name, size, None)
-        return str(error)
+        return sheet.refuse(name, size, str(error), [name])
     sheet.add(name, size, found)
     return f"{found:.0f} drone-seconds per CPU second"
 

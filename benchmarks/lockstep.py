@@ -64,9 +64,7 @@ def _measured(sheet: Sheet, name: str, size: int, seconds: float) -> str:
     try:
         rate = result(command(CONTENDERS[name], size, seconds), TIMEOUT_S)["steps_per_s"]
     except RefusedError as error:
-        sheet.refused[f"{name}@{size}"] = str(error)
-        sheet.add(name, size, None)
-        return str(error)
+        return sheet.refuse(name, size, str(error), [name])
     sheet.add(name, size, rate)
     return f"{rate:.0f} steps/s"
 

@@ -55,9 +55,7 @@ def _measured(sheet: Sheet, name: str, size: int, path: Path, by_role: list[dict
     try:
         found, cpu = fly(path, SIZES[size], *OPTIONS[name])
     except RefusedError as error:
-        sheet.refused[f"{name}@{size}"] = str(error)
-        sheet.add(name, size, None)
-        return str(error)
+        return sheet.refuse(name, size, str(error), [name])
     sheet.add(name, size, found["real_time_factor"])
     if name == "processes" and size == 3:
         by_role.append(cpu)

@@ -42,6 +42,13 @@ class Sheet:
         """Take the value of one more repeat, None if there is none."""
         self.values.setdefault(contender, {}).setdefault(size, []).append(value)
 
+    def refuse(self, contender: str, size: int, reason: str, rows: Sequence[str]) -> str:
+        """Note why a contender gave no values at a size in this repeat, for any of its rows; return the reason."""
+        self.refused[f"{contender}@{size}"] = reason
+        for row in rows:
+            self.add(row, size, None)
+        return reason
+
     def sizes(self) -> list[int]:
         """Return all sizes that were measured, in order."""
         return sorted({size for by_size in self.values.values() for size in by_size})

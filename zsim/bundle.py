@@ -56,8 +56,6 @@ class Bundle:
         first: where the messages of each drone begin, and their end, (N + 1,); empty where that is not known.
     """
 
-    __slots__ = ("__dict__", "buffer", "ends", "first", "seq", "stamps", "t_ns", "table", "which")
-
     def __init__(
         self,
         t_ns: int,

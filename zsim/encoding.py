@@ -4,11 +4,10 @@ A layout is what stands in every message of a kind: names, heads of arrays, and 
 
     rows of numbers ── write ──▶ bytes ── read ──▶ rows of numbers
 
-`write` and `read` are plain source for whoever compiles them: an object and an encoding of every message cost twenty
-times as much.
+`write` and `read` are plain source for whoever compiles them, to do without an object for every message.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import msgspec
@@ -20,11 +19,10 @@ from numpy.typing import NDArray
 LITERAL, FLOATS, INT, BOOL, TEXT = range(5)
 GAP = 31  # bytes left free before each payload: what a record puts there, see `zsim.record.layout.MESSAGE`
 INT_BYTES_MAX, FLOAT_BYTES = 9, 9
-FLOAT64, NIL, FALSE, TRUE, MAP = 0xCB, 0xC0, 0xC2, 0xC3, 0x80  # msgpack's marks
+FLOAT64, FALSE, TRUE, MAP = 0xCB, 0xC2, 0xC3, 0x80  # msgpack's marks
 UINT8, INT8 = 0xCC, 0xD0  # and those of 16, 32 and 64 bits after them
-TEXT_MIN, TEXT_MAX = 0xA0, 0xBF  # a text of 0 to 31 bytes
+COUNT_MAX = 0x7F  # largest whole number that is its own mark
 INFINITE = np.uint64(0x7FF0_0000_0000_0000)  # exponent of what is not finite
-Named = Mapping[str, Sequence[str]]
 
 
 class Program(NamedTuple):
@@ -50,20 +48,19 @@ class Layouts:
 
     Args:
         kinds: of messages, in the order in which `write` counts them.
-        named: by field, the names in a map of pairs of whole numbers.
 
     Raises:
         TypeError: a field is of a type that has no place here.
     """
 
-    def __init__(self, kinds: Iterable[type[Struct]], named: Named | None = None) -> None:
+    def __init__(self, kinds: Iterable[type[Struct]]) -> None:
         self._literals = bytearray()
         self._ops: list[tuple[int, int, int]] = []
         self.ints = self.floats = self._int = self._float = 0
         first = []
         for kind in kinds:
             first.append(len(self._ops))
-            self._add(kind, named or {})
+            self._add(kind)
         first.append(len(self._ops))
         ops, literals = np.array(self._ops, dtype=np.int64), np.frombuffer(bytes(self._literals), dtype=np.uint8)
         self.program = Program(ops, np.array(first), literals)
@@ -74,39 +71,26 @@ class Layouts:
         fixed = sum(size for op, _, size in self._ops if op == LITERAL)
         return GAP + fixed + self.floats * FLOAT_BYTES + self.ints * max(INT_BYTES_MAX, longest)
 
-    def _add(self, kind: type[Struct], named: Named) -> None:
+    def _add(self, kind: type[Struct]) -> None:
         fields: Any = kinds_of.type_info(kind)
         self._int = self._float = 0
         self._ops.append((LITERAL, len(self._literals), 0))
         self._literal(bytes([MAP | len(fields.fields)]))
         for field in fields.fields:
             self._literal(packed(field.encode_name))
-            where = f"{kind.__name__}: {field.encode_name}"
-            self._value(field.type, named.get(field.encode_name, ()), where)
+            self._value(field.type, f"{kind.__name__}: {field.encode_name}")
         self.ints, self.floats = max(self.ints, self._int), max(self.floats, self._float)
 
-    def _value(self, kind: Any, names: Sequence[str], where: str) -> None:
+    def _value(self, kind: Any, where: str) -> None:
         if isinstance(kind, kinds_of.FloatType):
             self._take_floats(1)
         elif isinstance(kind, kinds_of.TupleType):
             self._literal(array_head(len(kind.item_types)))
             self._take_floats(len(kind.item_types))
-        elif isinstance(kind, kinds_of.VarTupleType) and kind.min_length == kind.max_length and kind.min_length:
-            self._literal(array_head(kind.min_length))
-            self._take_floats(kind.min_length)
-        elif isinstance(kind, kinds_of.DictType):
-            self._pairs(names)
         elif type(kind) in _WHOLE:
             self._take_int(_WHOLE[type(kind)])
         else:
             raise TypeError(f"{where} is of a type that has no fixed place in a row")
-
-    def _pairs(self, names: Sequence[str]) -> None:
-        self._literal(bytes([MAP | len(names)]))
-        for name in names:
-            self._literal(packed(name) + array_head(2))
-            self._take_int(INT)
-            self._take_int(INT)
 
     def _take_floats(self, count: int) -> None:
         self._ops.append((FLOATS, self._float, count))
@@ -192,21 +176,22 @@ def write(program: Program, words: Words, kind: int, ints: NDArray, bits: NDArra
 
 
 def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints: NDArray, bits: NDArray) -> bool:
-    """Read a message that `write` could have written; False for any other, which may be right all the same.
+    """Read a message that `write` has written; False for any other, which may be right all the same.
 
-    Texts are passed over. To be compiled.
+    It reads floats that are finite, truths, and whole numbers from zero on; no texts. To be compiled.
 
     Args:
         program: see Layouts.
         kind: of the message.
         data: uint8; the message is what stands in [start, end).
-        ints: takes its whole numbers (I,); bits: its floats (F,) as uint64. All floats are finite.
+        ints: takes its whole numbers (I,); bits: its floats (F,) as uint64.
     """
     at = start
     for k in range(program.first[kind], program.first[kind + 1]):
         op, place, size = program.ops[k, 0], program.ops[k, 1], program.ops[k, 2]
         if at + (size if op == LITERAL else size * FLOAT_BYTES if op == FLOATS else 1) > end:
             return False
+        mark = np.int64(data[at])
         if op == LITERAL:
             for i in range(size):
                 if data[at + i] != program.literals[place + i]:
@@ -221,30 +206,20 @@ def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints:
                     return False
                 bits[column] = word
                 at += FLOAT_BYTES
-        else:
-            mark = np.int64(data[at])
+        elif op == BOOL and mark in (FALSE, TRUE):
+            ints[place] = mark == TRUE
             at += 1
-            if op == BOOL:
-                if mark != TRUE and mark != FALSE:
-                    return False
-                ints[place] = mark == TRUE
-            elif op == TEXT:
-                if mark != NIL and not TEXT_MIN <= mark <= TEXT_MAX:
-                    return False
-                at += 0 if mark == NIL else mark - TEXT_MIN
-            else:
-                size, value = 0, mark if mark < 0x80 else mark - 0x100
-                if 0x80 <= mark < 0xE0:
-                    if not UINT8 <= mark <= INT8 + 3:
-                        return False
-                    size = 1 << ((mark - UINT8) & 3)
-                    if at + size > end:
-                        return False
-                    value = np.int64(-1 if mark >= INT8 and data[at] >= 0x80 else 0)
-                    for i in range(size):
-                        value = (value << 8) | np.int64(data[at + i])
-                    if mark == UINT8 + 3 and value < 0:
-                        return False
-                ints[place] = value
-                at += size
+        elif op == INT and (mark <= COUNT_MAX or UINT8 <= mark < INT8):
+            size = 0 if mark <= COUNT_MAX else 1 << (mark - UINT8)
+            value = mark if size == 0 else np.int64(0)
+            if at + 1 + size > end:
+                return False
+            for i in range(size):
+                value = (value << 8) | np.int64(data[at + 1 + i])
+            if value < 0:
+                return False
+            ints[place] = value
+            at += 1 + size
+        else:
+            return False
     return at == end

@@ -101,7 +101,7 @@ class Membership:
             self._catch_up(self.done_ns)
 
     def publish(self, t_ns: int, outputs: Sequence[Output]) -> None:
-        """Publish the outputs of a gate and the done that counts them, encoded first and put in one go."""
+        """Encode the outputs of a gate and the done that counts them, for `send`."""
         self._kept.append((t_ns, outputs))
         encoded = [(key, messages.encode(message)) for key, message in outputs]
         encoded.append((self._done_key, messages.encode(self._done(t_ns, len(outputs)))))
