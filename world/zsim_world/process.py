@@ -8,14 +8,12 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 
-from zsim import batch, keys, messages, rights, session
+from zsim import keys, messages, rights, session
 from zsim.agent import Output
-from zsim.bundle import Bundle
 from zsim.errors import DecodeError
 from zsim.health import HealthMeter
 from zsim.identity import Identity
@@ -25,8 +23,10 @@ from zsim.session import Query, Sample, Session
 from zsim_world import replays
 from zsim_world.barrier import Participant
 from zsim_world.burst import Burst
+from zsim_world.deaths import Deaths
 from zsim_world.history import History
 from zsim_world.inputs import TICK_S, Direct, Inputs, Timed
+from zsim_world.outgoing import Outgoing
 from zsim_world.recovery import unheard
 from zsim_world.world import World
 
@@ -34,8 +34,6 @@ STUCK_NS = 2_000_000_000  # wall time in one turn from which on a person is told
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
-BYE_NS = 100_000_000  # wall time by which a bye may come after the news that the token of its process went
-NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
 RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
 RETURN_NS = 10_000_000_000  # wall time after a return to the run in which it may take until it can be asked
 PHASE_EVERY = 10  # states of a cluster between two looks at the phase that progress shows
@@ -50,13 +48,6 @@ class _Head(msgspec.Struct):
     t_ns: int
     seq: int
     source: str = ""
-
-
-class Doubt(NamedTuple):
-    """When to look again at a process whose token seemed to go, and whether once more after that."""
-
-    due_ns: int
-    again: bool = True
 
 
 class WorldProcess:
@@ -82,14 +73,12 @@ class WorldProcess:
         self._stopped = stopped
         self._tell = tell
         self._history = History()
-        self._passed: batch.Batch = []
         self._burst = Burst(world)
-        self._unsent: batch.Batch = []
-        self._gate_keys = [batch.gate(name) for name in world.fleet.names]
+        self._outgoing = Outgoing(link, world, self._history, self._said)
         self._head = msgspec.msgpack.Decoder(_Head)
         self._queries: deque[Query] = deque()
-        self._tokens: deque[tuple[str, bool]] = deque()
-        self._doubted: dict[str, Doubt] = {}  # whose token seemed to go
+        self._gone: deque[str] = deque()  # whose token seemed to go
+        self._deaths = Deaths(link, world, self._take_in_all)
         self._over = threading.Event()
         self._clock_wall_ns = 0
         self._turn_wall_ns = 0  # when the present turn began; 0 when there is none
@@ -127,7 +116,7 @@ class WorldProcess:
 
     def _announce(self) -> None:
         info = self._world.info()
-        self._publish(Output(keys.INFO, info))
+        self._outgoing.publish(Output(keys.INFO, info))
         for expression in (
             keys.INFO,
             keys.CLOCK,
@@ -155,7 +144,7 @@ class WorldProcess:
             if left_ns <= 0:
                 self._advance(wall_ns, -left_ns)
             else:
-                self._flush()
+                self._outgoing.flush()
                 self._inputs.wait(left_ns / 1e9)
         else:
             self._stand_still(wall_ns)
@@ -164,9 +153,9 @@ class WorldProcess:
         if self._world.mode == "realtime" and late_ns > self._world.gate_ns / self._world.rate:
             self._world.missed_own_deadline()
         self._world.advance(wall_ns)
-        self._gather()
+        self._outgoing.gather()
         if not self._burst.goes_on():
-            self._send()
+            self._outgoing.send()
         if self._world.diverged is None:
             self._publish_view(wall_ns)
         self.health.step(time.monotonic_ns() - wall_ns)
@@ -187,11 +176,11 @@ class WorldProcess:
 
     def _stand_still(self, wall_ns: int) -> None:
         """Time stands still: say so once a second, and wait for whatever comes."""
-        self._flush()
+        self._outgoing.flush()
         self._burst.end(wall_ns)
         if wall_ns - self._clock_wall_ns >= CLOCK_STANDING_NS:
             self._world.tell_clock(self._world.waiting_for(wall_ns))
-            self._flush()
+            self._outgoing.flush()
         self._inputs.wait_for(self._owed_dones())
 
     def _owed_dones(self) -> set[str]:
@@ -204,14 +193,14 @@ class WorldProcess:
         """Publish the end, then wait until every participant that lives has said bye."""
         self._turn_wall_ns = 0
         self._world.tell_end(time.monotonic_ns())
-        self._flush()
+        self._outgoing.flush()
         until_s = time.monotonic() + BYE_S
         while time.monotonic() < until_s and any(p.alive for p in self._world.barrier.participants.values()):
             self._inputs.wait(TICK_S)
             self._take_in_all()
             self._serve_rare()
-            self._put_batch()
-        self._flush()
+            self._outgoing.put_batch()
+        self._outgoing.flush()
 
     # What arrives
 
@@ -222,7 +211,7 @@ class WorldProcess:
     def _take_in(self, wall_ns: int, sample: Sample) -> None:
         key = sample.key
         self.health.received += 1
-        self._passed.append(sample)
+        self._outgoing.passed(sample)
         try:
             if key.endswith(("/estimate", "/state")):
                 self._pass_on(key, sample.payload)
@@ -302,8 +291,9 @@ class WorldProcess:
         self._inputs.wake()
 
     def _on_token(self, key: str, alive: bool) -> None:
-        self._tokens.append((keys.thing(key), alive))
-        self._inputs.wake()
+        if not alive:
+            self._gone.append(keys.thing(key))
+            self._inputs.wake()
 
     def _tick(self) -> None:
         told_ns = 0
@@ -328,42 +318,14 @@ class WorldProcess:
             self._world.stop(reason)
         while self._queries:
             self._serve_query(self._queries.popleft())
-        while self._tokens:
-            self._serve_token(*self._tokens.popleft())
-        if self._doubted:
-            self._serve_doubted()
+        while self._gone:
+            self._deaths.suspect(self._gone.popleft())
+        self._deaths.judge_due()
         if self.health.due():
             seq, self._health_seq = self._health_seq, self._health_seq + 1
             health = self.health.message(self._world.now_ns, seq)
-            self._publish(Output(keys.process(WORLD, "health"), health))
+            self._outgoing.publish(Output(keys.process(WORLD, "health"), health))
             self._tell("health", health, WORLD)
-
-    def _serve_token(self, name: str, alive: bool) -> None:
-        """Take the news of a token: who has lost his is not dead yet, since his bye may come after it."""
-        participant = self._world.barrier.participants.get(name)
-        if not alive and participant and participant.alive:
-            self._doubted[name] = Doubt(time.monotonic_ns() + BYE_NS)
-
-    def _serve_doubted(self) -> None:
-        """Look again at those whose token seemed to go."""
-        now_ns = time.monotonic_ns()
-        for name in [name for name, doubt in self._doubted.items() if doubt.due_ns <= now_ns]:
-            self._take_in_all()
-            self._judge(name, self._doubted.pop(name), now_ns)
-
-    def _judge(self, name: str, doubt: Doubt, now_ns: int) -> None:
-        """Take the death of a process that has no token; look once more where one is found, or may be too new to be."""
-        participant = self._world.barrier.participants.get(name)
-        if participant is None:
-            return
-        if keys.token(name) in self._link.tokens(keys.token(name), timeout_s=RECOVERY_S):
-            if doubt.again:  # a successor's, or one that Zenoh has not forgotten yet
-                self._doubted[name] = Doubt(now_ns + NEW_TOKEN_NS, again=False)
-        elif now_ns - participant.joined_wall_ns < NEW_TOKEN_NS:  # a new token is not always found at once
-            self._doubted[name] = Doubt(participant.joined_wall_ns + NEW_TOKEN_NS, doubt.again)
-        else:
-            self._world.died(name, time.monotonic_ns())
-            self._flush()
 
     def _serve_query(self, query: Query) -> None:
         asker = keys.thing(query.expression) if keys.matches(keys.replay("*"), query.expression) else None
@@ -377,7 +339,7 @@ class WorldProcess:
         except DecodeError as error:
             answer = ControlAnswer(ok=False, error=str(error))
         query.answer(answer)
-        self._flush()
+        self._outgoing.flush()
 
     def _do(self, request: messages.ControlRequest, asker: str | None) -> ControlAnswer:
         """Do what is asked on `world/control`, or, by a process of which access control knows the name, on its own."""
@@ -394,63 +356,12 @@ class WorldProcess:
 
     # Publication
 
-    def _flush(self) -> None:
-        """Publish the outbox."""
-        self._gather()
-        self._send()
-
-    def _send(self) -> None:
-        """Put what was gathered in one go: readers wake once, and the transport sends few packets."""
-        unsent, self._unsent = self._unsent, []
-        self._link.put_all(unsent)
-        self._put_batch()
-
-    def _gather(self) -> None:
-        """Encode the outbox and keep it."""
-        outbox = self._world.take_outbox()
-        if not outbox:
-            return
-        encoded: batch.Batch = []
-        for key, message in outbox:
-            if type(message) is Bundle:
-                self._gather_bundle(message)
-                encoded += message.encoded
-            else:
-                pair = (key, messages.encode(message))
-                encoded.append(pair)
-                self._passed.append(pair)
-        self._unsent += encoded
-        self._history.add_all(encoded, self._world.now_ns)
-        for key, message in outbox:
-            if key == keys.CLOCK:
-                self._clock_wall_ns = time.monotonic_ns()
-                self._tell("clock", message, self._phase)
-            elif key == keys.EVENT:
-                self._tell("event", message, self._phase)
-
-    def _gather_bundle(self, bundle: Bundle) -> None:
-        """Keep what is said at a gate in one message, of all drones and of each, where somebody reads it so."""
-        whole = (batch.GATE, bundle.packed())
-        self._passed.append(whole)
-        if self._link.heard(batch.GATE):
-            self._unsent.append(whole)
-        for key, (first, last) in zip(self._gate_keys, pairwise(bundle.first), strict=True):
-            if self._link.heard(key):
-                self._unsent.append((key, bundle.packed(first, last)))
-
-    def _put_batch(self) -> None:
-        """Hand what has passed to the recorders, if there are any."""
-        passed, self._passed = self._passed, []
-        if self._link.heard(batch.KEY):
-            for first in range(0, len(passed), batch.MESSAGES_MAX):
-                self._link.put_raw(batch.KEY, batch.encode(passed[first : first + batch.MESSAGES_MAX]))
-
-    def _publish(self, output: Output) -> None:
-        """Publish one message beside the outbox."""
-        payload = messages.encode(output.message)
-        self._passed.append((output.key, payload))
-        self._history.add(output.key, payload, self._world.now_ns)
-        self._link.put_raw(output.key, payload)
+    def _said(self, key: str, message: Any) -> None:
+        if key == keys.CLOCK:
+            self._clock_wall_ns = time.monotonic_ns()
+            self._tell("clock", message, self._phase)
+        elif key == keys.EVENT:
+            self._tell("event", message, self._phase)
 
     def _publish_view(self, wall_ns: int) -> None:
         if wall_ns - self._view_wall_ns < VIEW_PERIOD_NS:

@@ -21,7 +21,7 @@ from zsim_world.requests import Requests, brief
 from zsim_world.statistics import Measurements
 from zsim_world.truth_hash import TruthHash
 
-Outgoing = tuple[str, Any]  # key and message; or batch.GATE and the Bundle of what the drones say at a gate
+Said = tuple[str, Any]  # key and message; or batch.GATE and the Bundle of what the drones say at a gate
 REFUSALS_TOLD = 20  # events per source and reason; what follows is counted only
 
 
@@ -55,7 +55,7 @@ class World:
         self.gate_ns = round(scenario.time.gate_ms * 1e6)
         self.delay_ns = scenario.time.command_delay_gates * self.gate_ns
         self.last_ns = round(scenario.duration_s * 1e9) // self.gate_ns * self.gate_ns
-        self.outbox: list[Outgoing] = []
+        self.outbox: list[Said] = []
         self.state = "waiting"
         self.ended: str | None = None
         self.diverged: DivergedError | None = None
@@ -342,7 +342,7 @@ class World:
         message = messages.Event(self.now_ns, self._next_seq(keys.EVENT), kind, source, subject, text, data)
         self.outbox.append((keys.EVENT, message))
 
-    def take_outbox(self) -> list[Outgoing]:
+    def take_outbox(self) -> list[Said]:
         """Return what is to be published, in order, and forget it."""
         outbox, self.outbox = self.outbox, []
         return outbox
