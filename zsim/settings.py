@@ -57,6 +57,7 @@ def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
     return {
         "listen/endpoints": json.dumps(list(endpoints)),
         "listen/exit_on_failure": "true",
+        "scouting/delay": "0",  # ms that opening waits for others to be found; nobody is looked for
         _CLOSE_AFTER: str(HUB_CLOSE_AFTER_US),
         **_security(identity, endpoints, "listen on"),
     }
