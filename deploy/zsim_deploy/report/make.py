@@ -1,10 +1,11 @@
 """Makes a report: record in, summary, figures and page out."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from zsim.errors import RecordError, ReportError
+from zsim.errors import RecordError
+from zsim_deploy.report import folder
 from zsim_deploy.report.figures import figures
 from zsim_deploy.report.flight import Flight
 from zsim_deploy.report.formation import Formation, formation
@@ -50,26 +51,6 @@ def make_report(directory: Path, progress: Callable[[str], None] = lambda _: Non
         ReportError: the directory cannot be written.
     """
     flight, formations, summary = judge(directory / RECORD, progress)
-    try:
-        with TemporaryDirectory(dir=directory, prefix=".report-") as new:
-            drawn = Path(new) / "figures"
-            drawn.mkdir()
-            shown = []
-            for figure in figures(flight, formations, summary.window_s):
-                progress(f"drawing {figure.name}")
-                figure.drawing.savefig(drawn / figure.name)
-                shown.append(figure)
-            progress("writing the page")
-            (Path(new) / "summary.json").write_bytes(summary.json())
-            (Path(new) / "report.html").write_text(page(summary, shown, drawn), encoding="utf-8")
-            put_in_place(Path(new), directory)
-    except OSError as error:
-        raise ReportError(f"{directory}: the report cannot be written ({error.strerror})") from error
+    drawings = figures(flight, formations, summary.window_s)
+    folder.write(directory, summary.json(), drawings, partial(page, summary), progress)
     return summary
-
-
-def put_in_place(new: Path, directory: Path) -> None:
-    """Put a report in its place when all of it is made: a full disk or Ctrl-C leaves no half of one."""
-    (directory / "figures").mkdir(exist_ok=True)
-    for path in sorted(new.rglob("*.*")):
-        path.replace(directory / path.relative_to(new))

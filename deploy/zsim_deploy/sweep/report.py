@@ -1,13 +1,13 @@
 """Makes the report of a sweep: table in, summary, figures and page out."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from rich.table import Table
 
 from zsim.errors import ReportError
-from zsim_deploy.report.make import put_in_place
+from zsim_deploy.report import folder
 from zsim_deploy.sweep.figures import figures
 from zsim_deploy.sweep.folder import load
 from zsim_deploy.sweep.page import OVERVIEW, overview, page
@@ -27,27 +27,13 @@ def make_sweep_report(directory: Path, progress: Callable[[str], None] = lambda 
         RunError: it holds no sweep.
         ReportError: no run is finished yet, or the directory cannot be written.
     """
-    folder = load(directory)
-    rows = folder.rows()
+    sweep = load(directory)
+    rows = sweep.rows()
     if not rows:
         raise ReportError(f"{directory}: no run of this sweep is finished yet; there is nothing to report")
-    results = Results(folder.design, rows)
+    results = Results(sweep.design, rows)
     summary = results.summary()
-    try:
-        with TemporaryDirectory(dir=directory, prefix=".report-") as new:
-            drawn = Path(new) / "figures"
-            drawn.mkdir()
-            shown = []
-            for figure in figures(results):
-                progress(f"drawing {figure.name}")
-                figure.drawing.savefig(drawn / figure.name)
-                shown.append(figure)
-            progress("writing the page")
-            (Path(new) / "summary.json").write_bytes(summary.json())
-            (Path(new) / "report.html").write_text(page(summary, shown, drawn), encoding="utf-8")
-            put_in_place(Path(new), directory)
-    except OSError as error:
-        raise ReportError(f"{directory}: the report cannot be written ({error.strerror})") from error
+    folder.write(directory, summary.json(), figures(results), partial(page, summary), progress)
     return summary
 
 
