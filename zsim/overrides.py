@@ -1,13 +1,17 @@
 """Overrides of a scenario document: texts `a.b.c=value`, entries of lists by place or by name."""
 
 import re
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, get_args
+
+from msgspec import Struct, structs
 
 from zsim.faults import show
+from zsim.scenario import Document
 
 SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
 _STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # one step of a path: a word, or anything between brackets
+_FIRST = re.compile(r"[^.\[\]]+")
 _PATH = re.compile(r"([^.\[\]]+|\[[^\[\]]+\])(\.[^.\[\]]+|\[[^\[\]]+\])*")
 
 
@@ -23,10 +27,31 @@ def apply(document: dict[str, Any], text: str, parse: Callable[[str], Any]) -> s
     if not equals or not _PATH.fullmatch(path):
         return f"{_name(text)}: is no assignment; must be {SYNTAX}"
     try:
-        _assign(document, [word or bracket for word, bracket in _STEP.findall(path)], parse(given))
+        steps = [word or bracket for word, bracket in _STEP.findall(whole_path(path))]
+        _assign(document, steps, parse(given))
     except ValueError as error:
         return f"{_name(text)}: {error}"
     return None
+
+
+def whole_path(path: str) -> str:
+    """Return the path of a field from the top of a scenario.
+
+    The name of a section may be left out where only one section has such a field: wind.gust_m_s stands for
+    environment.wind.gust_m_s.
+    """
+    first = _FIRST.match(path)
+    sections = {field.name: field for field in _fields(Document)}
+    if first is None or first[0] in sections:
+        return path
+    owners = [name for name, field in sections.items() if any(f.name == first[0] for f in _fields(field.type))]
+    return f"{owners[0]}.{path}" if len(owners) == 1 else path
+
+
+def _fields(kind: Any) -> Sequence[Any]:
+    """Return the fields of a section, none of any other type; a section may be one that need not be given."""
+    sections = [each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, Struct)]
+    return structs.fields(sections[0]) if sections else ()
 
 
 def _assign(document: dict[str, Any], steps: list[str], value: Any) -> None:

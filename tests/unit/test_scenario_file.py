@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from zsim import scenario_file
 from zsim.errors import ScenarioError
+from zsim.overrides import whole_path
 from zsim.presets import G_M_S2, PRESETS
 from zsim.scenario import DRONES_MAX, Scenario
 from zsim.scenario_file import FAULTS_MAX
@@ -267,6 +268,26 @@ def test_overrides_apply_in_order():
     scenario = scenario_file.load(STEP, [*overrides, "seed=2", "seed=3"])
     assert scenario.drone("lead").yaw_deg == 45.0
     assert scenario.seed == 3
+
+
+@pytest.mark.parametrize(
+    ("path", "whole"),
+    [
+        ("wind.gust_m_s", "environment.wind.gust_m_s"),
+        ("wind[gust_m_s]", "environment.wind[gust_m_s]"),
+        ("gate_ms", "time.gate_ms"),
+        ("imu.rate_hz", "sensors.imu.rate_hz"),
+        ("drones[0].mass_kg", "drones[0].mass_kg"),
+        ("environment.wind.gust_m_s", "environment.wind.gust_m_s"),
+        ("nothing.here", "nothing.here"),
+    ],
+)
+def test_the_name_of_a_section_may_be_left_out(path: str, whole: str):
+    assert whole_path(path) == whole
+
+
+def test_an_override_may_leave_out_the_name_of_a_section():
+    assert scenario_file.load(STEP, ["wind.gust_m_s=0.25"]).environment.wind.gust_m_s == 0.25
 
 
 def test_values_are_yaml():

@@ -11,7 +11,7 @@ import pytest
 
 from zsim import scenario_file
 from zsim.errors import ScenarioError
-from zsim_deploy.sweep.axes import Draw, Grid, Seeds, parse, whole_path
+from zsim_deploy.sweep.axes import Draw, Grid, Seeds, parse
 from zsim_deploy.sweep.design import Design, make_plan
 from zsim_deploy.sweep.document import read
 from zsim_deploy.sweep.plan import Plan, difference
@@ -47,22 +47,6 @@ def faults(*vary: str, runs: int | None = None, **values: Any) -> list[str]:
 )
 def test_variations(text: str, axis: Seeds | Grid | Draw) -> None:
     assert parse(text) == axis
-
-
-@pytest.mark.parametrize(
-    ("given", "whole"),
-    [
-        ("wind.gust_m_s", GUST),
-        ("wind[gust_m_s]", "environment.wind[gust_m_s]"),
-        ("gate_ms", "time.gate_ms"),
-        ("imu.rate_hz", "sensors.imu.rate_hz"),
-        ("drones[0].mass_kg", "drones[0].mass_kg"),
-        (GUST, GUST),
-        ("nothing.here", "nothing.here"),
-    ],
-)
-def test_the_name_of_a_section_may_be_left_out(given: str, whole: str) -> None:
-    assert whole_path(given) == whole
 
 
 @pytest.mark.parametrize(

@@ -4,22 +4,21 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Callable, Sequence
-from typing import Any, get_args
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from msgspec import Struct, structs
+from msgspec import Struct
 
 from zsim import yaml_file
 from zsim.faults import show
-from zsim.scenario import Document
+from zsim.overrides import whole_path
 from zsim.streams import stream
 
 SEED = "seed"
 SEEDS = 2**32  # drawn below it: ten digits that a person can type
 SYNTAX = "seed, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std)"
 _DRAWN = re.compile(r"\s*([a-z]+)\((.*)\)\s*")
-_FIRST = re.compile(r"[^.\[\]]+")
 
 
 class Seeds(Struct, frozen=True):
@@ -75,26 +74,6 @@ def parse(text: str) -> Axis:
     path = whole_path(path.strip())
     drawn = _DRAWN.fullmatch(given)
     return _draw(path, drawn[1], drawn[2]) if drawn else Grid(path, _values(given))
-
-
-def whole_path(path: str) -> str:
-    """Return the path of a field from the top of a scenario.
-
-    The name of a section may be left out where only one section has such a field: wind.gust_m_s stands for
-    environment.wind.gust_m_s.
-    """
-    first = _FIRST.match(path)
-    sections = {field.name: field for field in _fields(Document)}
-    if first is None or first[0] in sections:
-        return path
-    owners = [name for name, field in sections.items() if any(f.name == first[0] for f in _fields(field.type))]
-    return f"{owners[0]}.{path}" if len(owners) == 1 else path
-
-
-def _fields(kind: Any) -> Sequence[Any]:
-    """Return the fields of a section, none of any other type; a section may be one that need not be given."""
-    sections = [each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, Struct)]
-    return structs.fields(sections[0]) if sections else ()
 
 
 def _values(given: str) -> tuple[Any, ...]:
