@@ -13,10 +13,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks import command_age, growth, kernels, lockstep, machine, page, peers, real_time_factor
+from benchmarks import command_age, growth, kernels, lockstep, machine, page, peers, real_time_factor, runs_per_hour
 from benchmarks.sheet import Sheet, read
 
 RESULTS = Path(__file__).parent / "results"
+BESIDE = frozenset("abf")  # parts with peers
 
 
 class Part(NamedTuple):
@@ -32,6 +33,7 @@ PARTS = {
     "c": Part(real_time_factor.measure, real_time_factor.page),
     "d": Part(command_age.measure, command_age.page),
     "e": Part(growth.measure, growth.page),
+    "f": Part(runs_per_hour.measure, runs_per_hour.page),
 }
 
 
@@ -47,7 +49,7 @@ def main() -> None:
     if unknown := set(given.parts) - set(PARTS):
         parser.error(f"part is {', '.join(sorted(unknown))}; must be of {' '.join(PARTS)}")
     chosen = given.parts or list(PARTS)
-    if not given.page and {"a", "b"} & set(chosen):
+    if not given.page and BESIDE & set(chosen):
         peers.ensure(_say)
     for part in chosen:
         path = given.results / f"{part}.json"
@@ -59,7 +61,7 @@ def main() -> None:
 def _measured(part: str, repeats: int, path: Path) -> Sheet:
     start_s, described = time.monotonic(), machine.describe()
     sheet = PARTS[part].measure(repeats)
-    sheet.machine = {**described, "peers": peers.versions() if part in "ab" else {}, "repeats": repeats}
+    sheet.machine = {**described, "peers": peers.versions() if part in BESIDE else {}, "repeats": repeats}
     sheet.machine["minutes"] = round((time.monotonic() - start_s) / 60.0, 1)
     sheet.write(path)
     _say(f"{part}: {sheet.machine['minutes']} min, written to {path}")

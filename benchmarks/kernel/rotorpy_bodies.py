@@ -11,6 +11,7 @@ import math
 from typing import Any
 
 import numpy as np
+import torch
 from rotorpy.vehicles.crazyflie_params import quad_params
 from rotorpy.vehicles.multirotor import BatchedMultirotor, BatchedMultirotorParams, Multirotor
 
@@ -27,6 +28,7 @@ def main() -> None:
     given = parser.parse_args()
     if not given.threads:
         single()
+        torch.set_num_threads(1)  # rotorpy imports it before; two threads on one core wait for each other
     serve(batch if given.batch else objects)
 
 
@@ -45,8 +47,6 @@ def objects(count: int) -> Flight:
 
 def batch(count: int) -> Flight:
     """Return all drones as one batch."""
-    import torch
-
     device = torch.device("cpu")
     each = [_state(k) for k in range(count)]
     state: Any = {name: torch.from_numpy(np.stack([s[name] for s in each])) for name in each[0]}

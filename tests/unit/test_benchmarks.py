@@ -82,7 +82,7 @@ def test_only_the_measured_section_of_the_page_is_replaced() -> None:
 
 
 def test_the_page_has_a_section_for_every_part() -> None:
-    for part in "abcde":
+    for part in "abcdef":
         page.replaced(page.PAGE.read_text(), part, "")
 
 

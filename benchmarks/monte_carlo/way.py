@@ -1,0 +1,43 @@
+"""The ways of Test 1's drones, which the peers' drones follow: where each was every 20 ms of a flight of zsim's."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+GATE_S = 0.02  # between two points
+
+
+class Way(NamedTuple):
+    """Where three drones truly were, every gate from t = 0.
+
+    Attributes:
+        p_W: (K, 3, 3) positions [m].
+        v_W: (K, 3, 3) velocities [m/s].
+        yaw: (K, 3) [rad].
+    """
+
+    p_W: NDArray[np.float64]
+    v_W: NDArray[np.float64]
+    yaw: NDArray[np.float64]
+
+    @property
+    def span_s(self) -> float:
+        """Return how long it takes."""
+        return (len(self.p_W) - 1) * GATE_S
+
+    def at(self, t_s: float) -> int:
+        """Return the index of the last point not after a time."""
+        return min(int(t_s / GATE_S + 1e-6), len(self.p_W) - 1)
+
+
+def write(way: Way, path: Path) -> None:
+    """Write it for another process."""
+    np.savez(path, **way._asdict())
+
+
+def read(path: Path) -> Way:
+    """Return what `write` wrote."""
+    with np.load(path) as found:
+        return Way(found["p_W"], found["v_W"], found["yaw"])

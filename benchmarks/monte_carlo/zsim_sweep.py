@@ -1,0 +1,71 @@
+"""zsim itself: `zsim sweep` as a user calls it, and a flight of Test 1 whose ways the others follow."""
+
+import resource
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from benchmarks.child import RefusedError
+from benchmarks.monte_carlo.way import GATE_S, Way
+from benchmarks.peers import ROOT
+from benchmarks.run import CLI
+from zsim import scenario_file
+from zsim_deploy.sweep.flight import flown
+
+TEST_1 = ROOT / "scenarios" / "step.yaml"
+TIMEOUT_S = 900.0
+
+
+def fly(runs: int, workers: int, duration_s: float | None = None) -> dict[str, float]:
+    """Fly a sweep over seeds; return wall and CPU seconds, start-up included, and the least distance of two drones.
+
+    Raises:
+        RefusedError: it failed, or a run of it did.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "sweep"
+        command = [*CLI, "sweep", str(TEST_1), "--runs", str(runs), "--vary", "seed", "--workers", str(workers)]
+        command += ["--no-report", "--out", str(folder)]
+        command += [] if duration_s is None else ["--duration", str(duration_s)]
+        start_s, spent_s = time.perf_counter(), _children_cpu_s()
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
+        found = {"wall_s": time.perf_counter() - start_s, "cpu_s": _children_cpu_s() - spent_s}
+        if done.returncode:
+            raise RefusedError(f"zsim sweep: exit code {done.returncode}: {done.stderr.strip()[-160:]}")
+        return {**found, "closest_m": _closest_m(folder / "sweep.parquet")}
+
+
+def _closest_m(path: Path) -> float:
+    """Return the least distance of two drones in any run of a table.
+
+    Raises:
+        RefusedError: a run failed.
+    """
+    rows = pq.read_table(path, columns=["failure", "min_separation_m"]).to_pylist()
+    if failures := [row["failure"] for row in rows if row["failure"]]:
+        raise RefusedError(f"zsim sweep: {len(failures)} of {len(rows)} runs failed: {failures[0]}"[:200])
+    return min(row["min_separation_m"] for row in rows)
+
+
+def flown_way(duration_s: float | None = None) -> Way:
+    """Fly Test 1 (None: all of it) with the scenario's seed and return where its drones went."""
+    overrides = [] if duration_s is None else [f"duration_s={duration_s}"]
+    flight, diverged = flown(scenario_file.load(TEST_1, overrides))
+    if diverged:
+        raise diverged
+    gate_ns = round(GATE_S * 1e9)
+    t_ns = np.arange(int(flight.tracks[0].t_ns[-1]) // gate_ns + 1) * gate_ns
+    at = [np.searchsorted(track.t_ns, t_ns) for track in flight.tracks]
+    truth = np.stack([track.truth[i] for track, i in zip(flight.tracks, at, strict=True)], axis=1)
+    yaw = np.stack([track.yaw[i] for track, i in zip(flight.tracks, at, strict=True)], axis=1)
+    return Way(truth[..., 0:3], truth[..., 3:6], yaw)
+
+
+def _children_cpu_s() -> float:
+    """Return user and system time of all processes that were started here and are through."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
