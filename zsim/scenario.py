@@ -11,6 +11,7 @@ from zsim.presets import G_M_S2, SEA_LEVEL_KG_M3
 
 TEMPLATE_FROM = 5  # robots; below it the variables of the triad are fewer to name, and as well conditioned
 DRONES_MAX = 1000  # one world integrates them all
+ROBOTS_MAX = 64  # drones of a cluster; beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
 SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
 
 # LARGE keeps squares and products of what is given finite; it is beyond any quantity of a flight in SI units.
@@ -222,7 +223,7 @@ class Group(Spec, frozen=True, kw_only=True):
 
 class Cluster(Spec, frozen=True, kw_only=True):
     name: Name
-    drones: Annotated[list[Name], Meta(min_length=2)]
+    drones: Annotated[list[Name], Meta(min_length=2, max_length=ROBOTS_MAX)]
     groups: list[Group] = []
     """Empty: every drone is a robot of the cluster by itself."""
     space: Kinematics | None = None

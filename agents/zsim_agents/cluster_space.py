@@ -14,6 +14,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.scenario import ROBOTS_MAX
 from zsim_agents.compiled import COMPILES, compiled
 
 Array = NDArray[np.float64]
@@ -21,7 +22,6 @@ Array = NDArray[np.float64]
 TAU = 2 * math.pi
 CONDITION_LENGTH_M = 4.0  # p and q of the paper's formation, equation (3)
 NAMES_SHOWN = 20  # in a message; the paper's cluster has 12
-ROBOTS_MAX = 64  # beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
 
 
 class SingularClusterError(ValueError):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from zsim.scenario import Cluster, Group, Scenario, kinematics
-from zsim_agents.cluster_space import ROBOTS_MAX, Array, ClusterSpace, cluster_space
+from zsim_agents.cluster_space import Array, ClusterSpace, cluster_space
 from zsim_agents.nested_cluster import NestedCluster
 from zsim_agents.template_cluster import TemplateCluster
 
@@ -17,11 +17,8 @@ def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
     """Return the cluster space of one of a scenario's clusters.
 
     Raises:
-        ValueError: there is none: too many drones, or a template in one line.
+        ValueError: there is none: a template in one line.
     """
-    n = len(cluster.drones)
-    if n > ROBOTS_MAX:
-        raise ValueError(f"a cluster of {n} robots is not possible; allowed: 2 to {ROBOTS_MAX}")
     starts = _starts(scenario, cluster.drones)
     if not cluster.groups:
         return _space(cluster, starts)

@@ -577,7 +577,8 @@ def test_a_fault_that_all_drones_share_is_told_once():
             {"clusters": [{"name": "c", "drones": ["drone1", "drone1"]}]},
             "clusters[0].drones[1] is 'drone1', which 'c' flies already",
         ),
-        ({"clusters": [{"name": "c", "drones": ["drone1"]}]}, "clusters[0].drones has 1 entries; must have at least 2"),
+        ({"clusters": [{"name": "c", "drones": ["drone1"]}]}, "clusters[0].drones has 1 entries; must have 2 to 64"),
+        ({"clusters": [{"name": "c", "drones": [f"d{k}" for k in range(65)]}]}, "has 65 entries; must have 2 to 64"),
         (clustered(groups=[{"name": "a", "size": 6}]), "clusters[0].groups has 1 entry; must have none, or 2 or more"),
         (
             clustered(groups=[{"name": "a", "size": 2}, {"name": "b", "size": 3}]),

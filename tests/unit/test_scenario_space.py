@@ -85,11 +85,3 @@ def test_a_variable_of_a_plan_that_the_space_does_not_have_is_told_with_those_it
     made = scenario(8, plan={"takeoff_s": 1, "target": {"rho_4": 3.0}})
     with pytest.raises(RunError, match=r"cluster 'c'.*'rho_4' is unknown; allowed: x_c, .* … w_18 \(32\)"):
         engagement_of(made, made.clusters[0])
-
-
-def test_more_than_64_drones_are_no_cluster():
-    drones = [{"name": f"d{k}", "position_m": [3 * (k % 9), 3 * (k // 9), 0]} for k in range(65)]
-    clusters = [{"name": "c", "drones": [drone["name"] for drone in drones]}]
-    made = scenario_file.resolve({"name": "test", "duration_s": 10, "drones": drones, "clusters": clusters})
-    with pytest.raises(RunError, match="65 robots is not possible; allowed: 2 to 64"):
-        engagement_of(made, made.clusters[0])
