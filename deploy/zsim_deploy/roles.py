@@ -28,7 +28,7 @@ PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
 PATIENCE_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
 SHOWN_EVENTS = 2000  # events told per run besides those below; all of them are in the record
 HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but anybody can publish more
-VITAL = frozenset({"death", "end"})  # how a run ends, and why
+VITAL = frozenset({"death", "doubled", "end"})  # how a run ends, and why; and what is wrong with who takes part
 
 
 def world(

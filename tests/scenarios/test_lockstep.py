@@ -133,6 +133,49 @@ def test_a_restart_after_death(federation: Federation) -> None:
     step.leave()
 
 
+def test_another_takes_the_place_of_the_dead(federation: Federation) -> None:
+    """A program dies, time stands (on_death: wait), and one of another name comes that does its work.
+
+        tester.one  ──5── dies
+        tester.two         └─ join (serves tester.one) ──6──▶
+
+    Expected: the newcomer goes on where the dead one was, and nobody waits for that one any more.
+    """
+    step = Lockstep(federation, "--set", "processes.on_death={tester.one: wait}")
+    step.answer(5 * GATE_NS)
+    step.stands_at(7 * GATE_NS)
+    step.me.die()
+    step.event("death", ME)
+    step.me = step.client.join("tester.two", step.info, GATE_NS, (ME,))
+    assert step.event("join", "tester.two").message["data"]["done_ns"] == 5 * GATE_NS
+    step.stands_at(7 * GATE_NS, "tester.two")
+    step.me.done_ns = 5 * GATE_NS
+    step.answer(6 * GATE_NS)
+    step.stands_at(8 * GATE_NS, "tester.two")
+    step.leave()
+
+
+def test_two_that_do_the_same_work(federation: Federation) -> None:
+    """A program joins that does another's work as well, and that one dies.
+
+        tester.one  ──5──┬──────── dies
+        tester.two       └ join (serves tester.one) ──8──▶
+
+    Expected: that both do it is told; who is left does it alone, and nobody waits for the dead.
+    """
+    step = Lockstep(federation, "--set", "processes.on_death={tester.one: wait}")
+    step.answer(5 * GATE_NS)
+    step.stands_at(7 * GATE_NS)
+    two = step.client.join("tester.two", step.info, GATE_NS, (ME,))
+    assert "both do the work of tester.one" in step.event("doubled", "tester.two").message["text"]
+    step.me.die()
+    assert step.event("death", ME).message["text"].endswith("tester.two does its work")
+    step.me, two.done_ns = two, 7 * GATE_NS
+    step.answer(8 * GATE_NS)
+    step.stands_at(10 * GATE_NS, "tester.two")
+    step.leave()
+
+
 def test_joins_and_dones_that_are_refused(federation: Federation) -> None:
     """What does not fit the run is refused with the reason, and moves nothing.
 

@@ -146,10 +146,12 @@ class Client:
         """Declare the liveliness token of a process; `undeclare` it to play its death."""
         return self.session.liveliness().declare_token(f"{self._prefix}process/{name}")
 
-    def join(self, name: str, info: dict[str, Any], period_ns: int, **others: Any) -> "Participant":
-        """Take part in the run under a name."""
+    def join(
+        self, name: str, info: dict[str, Any], period_ns: int, serves: tuple[str, ...] = (), **others: Any
+    ) -> "Participant":
+        """Take part in the run under a name, and do the work of others beside."""
         participant = Participant(self, name, {**info, **others}, period_ns)
-        participant.join()
+        participant.join(serves)
         return participant
 
 
@@ -167,9 +169,9 @@ class Participant:
         self.sent = 0
         self.token = client.token(name)
 
-    def join(self) -> None:
+    def join(self, serves: tuple[str, ...] = ()) -> None:
         role = self.name.split(".")[0]
-        about = {"role": role, "host": "elsewhere", "pid": os.getpid(), "period_ns": self.period_ns}
+        about = {"role": role, "host": "elsewhere", "pid": os.getpid(), "period_ns": self.period_ns, "serves": serves}
         self.client.put(f"process/{self.name}/join", **{"t_ns": 0, **self.run, **about})
 
     def done(self, t_ns: int, sent: int | None = None) -> None:

@@ -63,6 +63,43 @@ def test_one_process_may_stand_for_several_that_are_expected():
     assert made.absent() == ["estimator.d2"]
 
 
+def serving(*others: str, incarnation: int = 1) -> Join:
+    return msgspec.structs.replace(join(incarnation), serves=others)
+
+
+def test_who_does_the_work_of_the_dead_takes_their_place_and_goes_on_where_they_were():
+    made = barrier("estimator.d2", "controller.main", "estimator.d3")
+    for name, gate in (("estimator.d2", 7), ("controller.main", 5), ("estimator.d3", 6)):
+        made.done(name, done(gate), 9 * GATE_NS, 0)
+    made.died("estimator.d2", WALL_NS)
+    made.died("controller.main", WALL_NS)
+    made.join("controller.main", serving("estimator.d1", "estimator.d2", incarnation=2), 10 * GATE_NS, WALL_NS)
+    assert list(made.participants) == ["controller.main", "estimator.d3"]
+    joined = made.participants["controller.main"]
+    assert (joined.from_ns, joined.done_ns) == (0, 5 * GATE_NS)
+
+
+def test_nobody_takes_the_place_of_one_that_lives_or_does_more():
+    made = barrier("estimator.d1")
+    made.join("estimator.d3", serving("estimator.d2"), 0, 0)
+    made.died("estimator.d3", WALL_NS)
+    made.join("controller.main", serving("estimator.d1", "estimator.d3"), 0, 0)
+    assert list(made.participants) == ["estimator.d1", "estimator.d3", "controller.main"]
+
+
+def test_whose_work_is_done_twice():
+    made = barrier("estimator.d2")
+    made.join("controller.main", serving("estimator.d1", "estimator.d2"), 0, 0)
+    assert made.doubles("controller.main") == {"estimator.d2": {"estimator.d2"}}
+    assert made.doubles("estimator.d2") == {"controller.main": {"estimator.d2"}}
+    stand_in, none = made.stand_in("estimator.d2"), made.stand_in("controller.main")
+    assert stand_in is not None
+    assert (stand_in.name, none) == ("controller.main", None)
+    made.died("controller.main", WALL_NS)
+    assert made.doubles("estimator.d2") == {}
+    assert made.stand_in("estimator.d2") is None
+
+
 def test_before_the_first_gate_nobody_owes_anything():
     assert blocked(barrier("a", "b"), -1) == []
 

@@ -52,6 +52,11 @@ class Participant:
     def gating(self) -> bool:
         return self.period_ns > 0
 
+    @property
+    def duties(self) -> set[str]:
+        """Return the names of the processes whose work it does."""
+        return {self.name, *self.serves}
+
     def required_ns(self, need_ns: int) -> int | None:
         """Return the done that it owes for `need_ns`, None if it owes none yet."""
         if not self.gating:
@@ -111,8 +116,8 @@ class Barrier:
     def join(self, name: str, message: Join, next_gate_ns: int, wall_ns: int) -> str | None:
         """Take a participant in; return the reason if it is refused.
 
-        A known name keeps what it has done: the new incarnation goes on from there. The same join again
-        changes nothing.
+        A known name keeps what it has done: the new incarnation goes on from there. So does a participant that does
+        all the work of others that are dead: it takes their place. The same join again changes nothing.
         """
         reason = self._join_fault(name, message)
         if reason:
@@ -120,6 +125,10 @@ class Barrier:
         former = self.participants.get(name)
         if former is not None and former.alive and former.incarnation == message.incarnation:
             return None
+        replaced = self.replaced(name, message)
+        for gone in replaced:
+            del self.participants[gone.name]
+        before = [*([former] if former else []), *replaced]
         self.participants[name] = Participant(
             name=name,
             incarnation=message.incarnation,
@@ -128,9 +137,9 @@ class Barrier:
             pid=message.pid,
             period_ns=message.period_ns,
             fingerprint=message.fingerprint,
-            from_ns=former.from_ns if former and former.gating else next_gate_ns,
+            from_ns=min((each.from_ns for each in before if each.gating), default=next_gate_ns),
             serves=message.serves,
-            done_ns=former.done_ns if former else -1,
+            done_ns=min((each.done_ns for each in before), default=-1),
             since_wall_ns=wall_ns,
             joined_wall_ns=wall_ns,
             deadline_misses=former.deadline_misses if former else 0,
@@ -138,6 +147,11 @@ class Barrier:
             again=former is not None,
         )
         return None
+
+    def replaced(self, name: str, message: Join) -> list[Participant]:
+        """Return the dead whose work a newcomer of another name is to do."""
+        duties = {name, *message.serves}
+        return [p for p in self.participants.values() if not p.alive and p.name != name and p.duties <= duties]
 
     def _join_fault(self, name: str, message: Join) -> str | None:
         if name == WORLD or not keys.PROCESS_NAME.fullmatch(name):
@@ -189,6 +203,18 @@ class Barrier:
         participant.alive = False
         participant.since_wall_ns = wall_ns
         return participant
+
+    def stand_in(self, name: str) -> Participant | None:
+        """Return who lives and does all the work of a participant beside its own."""
+        duties = self.participants[name].duties
+        others = (p for p in self.participants.values() if p.name != name and p.alive)
+        return next((p for p in others if duties <= p.duties), None)
+
+    def doubles(self, name: str) -> dict[str, set[str]]:
+        """Return whose work a participant does that others who live do as well, by their names."""
+        mine = self.participants[name].duties
+        others = (p for p in self.participants.values() if p.name != name and p.alive)
+        return {p.name: both for p in others if (both := mine & p.duties)}
 
     def remove(self, name: str) -> Participant | None:
         """Take a participant out: it said bye or is dropped."""

@@ -113,8 +113,7 @@ class World:
 
     def handle(self, key: str, message: Any, wall_ns: int) -> None:
         """Take one message that a participant or anyone else published."""
-        kind, name, *rest = key.split("/", 2)
-        what = rest[0] if rest else ""
+        kind, name, what = keys.parts(key)
         if kind == "process" and what == "done":
             self._on_done(name, message, wall_ns)
         elif kind == "drone" and what.startswith("cmd/"):
@@ -136,7 +135,7 @@ class World:
             self.refuse(name, f"process/{name}/done", reason)
 
     def _on_join(self, name: str, message: messages.Join, wall_ns: int) -> None:
-        former = self.barrier.participants.get(name)
+        former, replaced = self.barrier.participants.get(name), self.barrier.replaced(name, message)
         reason = self.barrier.join(name, message, self.next_ns, wall_ns)
         if reason:
             self.refuse(name, f"process/{name}/join", reason)
@@ -155,7 +154,15 @@ class World:
         if former is not None and again:
             data["former_pid"] = former.pid
         self.event(kind, name, f"{name} on {message.host} (pid {message.pid})", source=name, **data)
+        for dead in replaced:
+            self._leave_drones(dead.name)
         self._warn_fingerprint(name, message)
+        self._warn_doubled(name)
+
+    def _warn_doubled(self, name: str) -> None:
+        for other, both in self.barrier.doubles(name).items():
+            text = f"{name} and {other} both do the work of {', '.join(sorted(both))}; end one of them"
+            self.event("doubled", name, text, other=other)
 
     def _warn_fingerprint(self, name: str, message: messages.Join) -> None:
         if message.fingerprint and message.fingerprint != fingerprint():
@@ -182,15 +189,18 @@ class World:
         participant = self.barrier.died(name, wall_ns)
         if participant is None:
             return
-        what = on_death(self.scenario.processes.on_death, name, participant.role)
-        text = f"{name} on {participant.host} (pid {participant.pid}) died; on_death: {what}"
+        stand_in = self.barrier.stand_in(name)
+        what = "drop" if stand_in else on_death(self.scenario.processes.on_death, name, participant.role)
+        then = f"{stand_in.name} does its work" if stand_in else f"on_death: {what}"
+        text = f"{name} on {participant.host} (pid {participant.pid}) died; {then}"
         self.event("death", name, text, host=participant.host, pid=participant.pid, on_death=what)
         if self.mode == "realtime" or what == "drop":
             self._leave_drones(name)
         if what == "drop":
             self.barrier.remove(name)
+        if what == "drop" and stand_in is None:
             self.event("drop", name, f"{name} is waited for no longer", from_ns=self.now_ns)
-        elif what == "end":
+        if what == "end":
             self.stop(f"{name} died")
 
     def _leave_drones(self, name: str) -> None:
@@ -291,7 +301,7 @@ class World:
 
     def _publish_gate(self, wall_ns: int) -> None:
         self._hash.add(self.now_ns, self.fleet.bodies.state)
-        self.outbox.append((batch.GATE, self._publication.gate(self.commanders.holder)))
+        self.outbox.append((batch.GATE, self._publication.gate(self.commanders.holders())))
         self._measured.gate(self.now_ns, wall_ns)
         self.tell_clock()
 
