@@ -11,7 +11,7 @@ from zsim_world import rigid_body as body
 from zsim_world.compiled import inlined
 from zsim_world.fleet import Fleet
 from zsim_world.ground import drag_anchors
-from zsim_world.rigid_body import four, vector
+from zsim_world.rigid_body import four, put, vector
 
 DT = 0.0025  # s
 COUNT = 11  # a whole block and a part of one
@@ -25,6 +25,18 @@ def each(bodies, dt):
         air, push, command = vector(bodies.air[i], 0), vector(bodies.push[i], 0), four(bodies.command[i], 0)
         body.step(row, anchor, state, command, air, push, dt)
         drag_anchors(row, anchor, vector(state, body.POSITION), four(state, body.ATTITUDE))
+
+
+@inlined
+def accelerate_each(bodies):
+    """Note the accelerations of one drone after the other, the ground always with it."""
+    for i in range(bodies.state.shape[0]):
+        row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
+        (p, v, q, w), speed, command = body.pose(state), four(state, body.ROTOR), four(bodies.command[i], 0)
+        air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
+        a, alpha = body.accelerations(True, row, anchor, p, v, q, w, speed, command, air, push)
+        put(bodies.accel[i], 0, a)
+        put(bodies.accel[i], 3, alpha)
 
 
 def bodies_in_motion(rng, height_m, count=COUNT):
@@ -53,10 +65,14 @@ def copied(bodies):
 def test_a_block_gives_the_bits_of_each_drone(height_m, count):
     one = bodies_in_motion(np.random.default_rng(3), height_m, count)
     other, least_m = copied(one), np.inf
+    lanes.line_up(one)
     for _ in range(400):
         lanes.move(one, DT)
         each(other, DT)
         np.testing.assert_array_equal(one.state, other.state)
+        lanes.accelerate(one)
+        accelerate_each(other)
+        np.testing.assert_array_equal(one.accel, other.accel)
         least_m = min(least_m, one.state[:, 2].min())
     assert np.isfinite(one.state).all()
     assert count == 1 or (least_m < 0.2) == (height_m < 30.0)

@@ -39,8 +39,7 @@ class Bodies(NamedTuple):
     touching: NDArray  # int8 (N, N)
     touched: NDArray  # int8 (N, N), contacts that began in this gate
     near: Near
-    decay: NDArray  # (N,), of a rotor's lag in half a tick (rigid_body.half_decay)
-    lanes: NDArray  # (lanes.LANES * lanes.COLUMNS,), where drones are laid side by side
+    lanes: NDArray  # (blocks, block.LANES * lanes.COLUMNS), where they are side by side
 
 
 class Boards(NamedTuple):
@@ -54,6 +53,7 @@ class Boards(NamedTuple):
     memory: NDArray  # (N, firmware.MEMORY_COLUMNS)
     belief: NDArray  # (N, observer.COLUMNS)
     device: NDArray  # (N, observer.REGISTERS)
+    lanes: NDArray  # (blocks, block.LANES * steering.COLUMNS), where they are side by side
 
 
 class Noise(NamedTuple):
@@ -70,6 +70,7 @@ class Senses(NamedTuple):
     place: NDArray  # (4,), as above
     config: NDArray  # (N, 6, sensor_set.COLUMNS)
     schedule: NDArray  # int64 (N, 6, 4)
+    soonest: NDArray  # int64 (N,), tick at which one of the sensors but the IMU falls due
     bias: NDArray  # (N, 6, 6)
     whose: NDArray  # int64 (samples, 3): sensor, drone, tick
     value: NDArray  # (samples, 6)

@@ -2,13 +2,9 @@
 
 import math
 
-from numpy.typing import NDArray
-
-from zsim_world import observer as ob
 from zsim_world import rotation as rot
 from zsim_world.compiled import inlined
 from zsim_world.observer import STEP_S
-from zsim_world.rigid_body import four, vector
 from zsim_world.rotation import Quaternion, Vector, axpy
 from zsim_world.rotors import Four, mix
 from zsim_world.vehicle import (
@@ -18,11 +14,14 @@ from zsim_world.vehicle import (
     INERTIA_Z,
     ROTOR_MAX,
     ROTOR_MIN,
+    Row,
 )
 
 # Columns of the firmware's settings
+SLOPE = 0  # tan of the largest tilt
 K_RATE, K_TILT = 6, 7  # 1/s
 ROTOR_DECAY, OVERDRIVE = 10, 11  # left of the rotors' lag after a step; part of the way to command beyond it
+GAINS = (K_RATE, K_TILT, OVERDRIVE, SLOPE)  # what the drive needs of them
 RATE_PER_LAG = 0.42  # rate gain times the overdriven lag: damping 0.77 of rate loop and rotors together
 LAG_MIN_S = 0.015  # s, three control steps: faster rotors do not make a faster loop
 LOOP_RATIO = 3.1  # of a loop's gain to that of the loop around it
@@ -44,35 +43,43 @@ def lag_shares(rotor_lag_s: float) -> tuple[float, float]:
 
 @inlined
 def drive(
-    belief: NDArray,
+    row: Row,
+    gains: Four,
     own: Quaternion,
-    row: NDArray,
-    setting: NDArray,
+    q_WB: Quaternion,
+    w_WB_B: Vector,
+    rotor: Four,
     z_des: Vector,
     thrust_n: float,
     yaw_rate: float,
 ) -> Four:
-    """Return rotor commands for a wanted z_B (heading frame), thrust [N] and yaw rate [rad/s]."""
-    q_HB = rot.level(own, four(belief, ob.ATTITUDE))
-    z_B = rot.rotate_back(q_HB, z_des)
+    """Return rotor commands for a wanted direction of z_B (heading frame), thrust [N] and yaw rate [rad/s].
+
+    Without a branch, so that several drones go at once (steering.py).
+
+    Args:
+        row: the aircraft (vehicle.py); gains: its settings in GAINS.
+        own: the heading frame in W; q_WB, w_WB_B, rotor: attitude, body rate and rotor speeds believed.
+    """
+    k_rate, k_tilt, overdrive, slope = gains
+    q_HB = rot.level(own, q_WB)
+    z_B = rot.rotate_back(q_HB, limited_tilt(z_des, slope))
     up_B = rot.rotate_back(q_HB, (0.0, 0.0, yaw_rate))
-    w = vector(belief, ob.BODY_RATE)
-    wx, wy = -setting[K_TILT] * z_B[1], setting[K_TILT] * z_B[0]
+    w, wx, wy = w_WB_B, -k_tilt * z_B[1], k_tilt * z_B[0]
     size = math.sqrt(wx * wx + wy * wy)
     s = 1.0 if size <= BODY_RATE_MAX else BODY_RATE_MAX / size
     ix, iy, iz = row[INERTIA_X], row[INERTIA_Y], row[INERTIA_Z]
     moment = (
-        ix * setting[K_RATE] * (s * wx + up_B[0] - w[0]) + (iz - iy) * w[1] * w[2],
-        iy * setting[K_RATE] * (s * wy + up_B[1] - w[1]) + (ix - iz) * w[2] * w[0],
-        iz * setting[K_RATE] * YAW_SHARE * (up_B[2] - w[2]) + (iy - ix) * w[0] * w[1],
+        ix * k_rate * (s * wx + up_B[0] - w[0]) + (iz - iy) * w[1] * w[2],
+        iy * k_rate * (s * wy + up_B[1] - w[1]) + (ix - iz) * w[2] * w[0],
+        iz * k_rate * YAW_SHARE * (up_B[2] - w[2]) + (iy - ix) * w[0] * w[1],
     )
-    return _overdriven(belief, row, setting[OVERDRIVE], mix(row, thrust_n, moment))
+    return _overdriven(row, rotor, overdrive, mix(row, thrust_n, moment))
 
 
 @inlined
-def _overdriven(belief: NDArray, row: NDArray, s: float, wanted: Four) -> Four:
-    """Return commands under which the rotors move to `wanted` with a part of their lag only."""
-    r = four(belief, ob.ROTOR)
+def _overdriven(row: Row, r: Four, s: float, wanted: Four) -> Four:
+    """Return commands under which rotors at r move to `wanted` with a part of their lag only."""
     return clipped(
         row,
         (
@@ -85,7 +92,7 @@ def _overdriven(belief: NDArray, row: NDArray, s: float, wanted: Four) -> Four:
 
 
 @inlined
-def clipped(row: NDArray, speed: Four) -> Four:
+def clipped(row: Row, speed: Four) -> Four:
     """Return rotor speeds [rad/s] within the rotors' limits."""
     low, high = row[ROTOR_MIN], row[ROTOR_MAX]
     return (

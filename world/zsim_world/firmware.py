@@ -11,6 +11,7 @@ The inner gains follow from the rotors' lag, so that another aircraft flies too.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +26,9 @@ from zsim_world.drive import (
     K_TILT,
     OVERDRIVE,
     ROTOR_DECAY,
+    SLOPE,
     clipped,
-    drive,
     lag_shares,
-    limited_tilt,
     loop_gains,
 )
 from zsim_world.observer import STEP_S
@@ -53,8 +53,8 @@ MEMORY_COLUMNS = 8
 RISING, HOLDING = 1.0, 2.0  # values of HOLDS_Z: the height held rises to that of the take-off, or stays
 
 # Columns of the settings: limits of what a commander may ask, and the loop gains
-SLOPE, SPEED, CLIMB, YAW_RATE, ALTITUDE, TAKEOFF_HEIGHT = 0, 1, 2, 3, 4, 5  # tan of tilt, m/s, m/s, rad/s, m, m
-K_VELOCITY, K_CLIMB = 8, 9  # 1/s; drive.py has the two before them, and the two after
+SPEED, CLIMB, YAW_RATE, ALTITUDE, TAKEOFF_HEIGHT = 1, 2, 3, 4, 5  # m/s, m/s, rad/s, m, m
+K_VELOCITY, K_CLIMB = 8, 9  # 1/s; drive.py has the others
 SETTING_COLUMNS = 12
 
 CLIMB_SHARE = 1 / 7  # of the rate gain, 4 1/s: thrust needs no tilt first
@@ -89,8 +89,24 @@ def settings(drone: Drone) -> NDArray[np.float64]:
     return row
 
 
+class Wish(NamedTuple):
+    """What the firmware has decided on for the next 5 ms."""
+
+    driven: bool  # True: the drive is to find the command for the last three; False: it is given
+    command: Four  # rad/s
+    z_H: Vector  # along the body's z wanted, in the heading frame
+    thrust_n: float
+    yaw_rate: float  # rad/s
+
+
 @inlined
-def control(
+def _commanded(command: Four) -> Wish:
+    """Return the wish that the rotors turn at these speeds [rad/s]."""
+    return Wish(False, command, (0.0, 0.0, 1.0), 0.0, 0.0)
+
+
+@inlined
+def decide(
     memory: NDArray,
     belief: NDArray,
     own: Quaternion,
@@ -101,11 +117,11 @@ def control(
     hover_s: float,
     land_s: float,
     charge_percent: float,
-) -> Four:
-    """Return the rotor commands [rad/s] of the next 5 ms.
+) -> Wish:
+    """Return what the rotors are to do in the next 5 ms.
 
     Args:
-        memory: modes and holds, in place; belief: observer.py, the rotor model advanced in place.
+        memory: modes and holds, in place; belief: observer.py.
         own: the heading frame in W of the attitude believed.
         row: the aircraft (vehicle.py); setting: limits and gains; setpoint: the commander's wish, cleared on landing.
         silence_s: time since the setpoint was sent; hover_s: hover after so much, and land land_s later.
@@ -113,12 +129,11 @@ def control(
     """
     _change_mode(memory, belief, setpoint, silence_s, hover_s, land_s, charge_percent)
     mode = int(memory[MODE])
-    command = (0.0, 0.0, 0.0, 0.0)
+    wish = _commanded((0.0, 0.0, 0.0, 0.0))
     if mode in (TAKING_OFF, HOVERING, FLYING, LANDING):
-        command = _fly(mode, memory, belief, own, row, setting, setpoint)
+        wish = _fly(mode, memory, belief, own, row, setting, setpoint)
     memory[STEPS] += 1.0
-    ob.model_rotors(belief, setting[ROTOR_DECAY], command)
-    return command
+    return wish
 
 
 @inlined
@@ -197,26 +212,26 @@ def _fly(
     row: NDArray,
     setting: NDArray,
     setpoint: NDArray,
-) -> Four:
-    """Return rotor commands in the air, or on the way there."""
+) -> Wish:
+    """Return what the rotors are to do in the air, or on the way there."""
     kind = int(setpoint[KIND])
     if mode == FLYING and kind == ROTORS:
-        return clipped(row, four(setpoint, VALUE))
+        return _commanded(clipped(row, four(setpoint, VALUE)))
     if stands(memory):
         low = row[ROTOR_MIN]
-        return (low, low, low, low)
+        return _commanded((low, low, low, low))
     if mode == FLYING and kind == ATTITUDE:
         z_des, lift, yaw_rate = _attitude_wish(own, setting, setpoint)
     else:
         z_des, lift, yaw_rate = _velocity_wish(mode, kind, memory, belief, own, row, setting, setpoint)
-    return drive(belief, own, row, setting, z_des, lift, yaw_rate)
+    return Wish(True, (0.0, 0.0, 0.0, 0.0), z_des, lift, yaw_rate)
 
 
 @inlined
 def _attitude_wish(own: Quaternion, setting: NDArray, setpoint: NDArray) -> tuple[Vector, float, float]:
     """Return wanted z_B in the heading frame, thrust [N] and yaw rate of an attitude setpoint."""
     q = rot.normalised(four(setpoint, VALUE))
-    z_des = limited_tilt(rot.rotate_back(own, rot.z_axis(q)), setting[SLOPE])
+    z_des = rot.rotate_back(own, rot.z_axis(q))
     yaw_rate = _clip(setpoint[VALUE + 5], setting[YAW_RATE])
     return z_des, setpoint[VALUE + 4], yaw_rate
 
@@ -248,7 +263,6 @@ def _velocity_wish(
         z = (across * _clip(setpoint[VALUE], 1.0), across * _clip(setpoint[VALUE + 1], 1.0), 1.0)
     else:
         z = (setting[K_VELOCITY] * (wish[0] - v[0]) - f[0], setting[K_VELOCITY] * (wish[1] - v[1]) - f[1], up)
-    z = limited_tilt(z, setting[SLOPE])
     true_z = rot.z_axis(four(belief, ob.ATTITUDE))[2]
     return z, row[MASS] * up / max(true_z, 0.5), yaw_rate
 

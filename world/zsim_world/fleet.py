@@ -24,7 +24,7 @@ GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone
 TAKEOFF_PERCENT_MIN = 2.0 * firmware.LOW_BATTERY_PERCENT  # %, below which it does not take off
 UPRIGHT_COSINE = 0.87  # 30 deg, beyond which it does not take off
 QUATERNION_SQUARE_MIN = 1e-6  # shorter, a quaternion has no direction
-NOISE_GATES = 64  # gates between two refills of the noise
+NOISE_GATES = 8  # gates between two refills of the noise: that of 100 drones then fits a cache of 1 MB
 
 
 class DivergedError(RunError):

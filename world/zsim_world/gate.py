@@ -19,23 +19,20 @@ from zsim_world.arrays import (
     DT,
     FIELD,
     ORIGIN_HEIGHT,
-    SILENCE_HOVER,
-    SILENCE_LAND,
     TICK,
     TICKS_PER_STEP,
     Arrays,
-    Boards,
     Bodies,
     Noise,
     Senses,
-    Time,
 )
-from zsim_world.battery import drained, percent
+from zsim_world.battery import drained
 from zsim_world.compiled import inlined, kernel
 from zsim_world.encounter import encounters
-from zsim_world.lanes import move
+from zsim_world.lanes import accelerate, line_up, move
 from zsim_world.rigid_body import four, put, put_four, vector
 from zsim_world.rotation import Vector, norm
+from zsim_world.steering import steer
 from zsim_world.vehicle import GRAVITY
 from zsim_world.wind import STEADY, blow
 
@@ -43,6 +40,7 @@ from zsim_world.wind import STEADY, blow
 KERNEL_FILES = (
     "arrays.py",
     "battery.py",
+    "block.py",
     "compiled.py",
     "drive.py",
     "encounter.py",
@@ -57,29 +55,16 @@ KERNEL_FILES = (
     "rotors.py",
     "sensor_set.py",
     "sensors.py",
+    "steering.py",
     "vehicle.py",
     "wind.py",
 )
 SOURCES = (*(Path(__file__).parent / name for name in KERNEL_FILES), Path(str(presets.__file__)))
 WIND_STREAM = 6  # after the six sensors
+NEVER = 2**63 - 1  # a tick that does not come
 POSITION_MAX_M, RATE_MAX_RAD_S = 1e6, 1e4  # beyond, the integration has diverged
 
 Pair = tuple[Vector, Vector]
-
-
-@inlined
-def _steer(time: Time, bodies: Bodies, boards: Boards) -> None:
-    """Let the firmware of every drone see and act."""
-    for i in range(bodies.state.shape[0]):
-        memory, belief, row = boards.memory[i], boards.belief[i], bodies.vehicle[i]
-        on_ground = firmware.stands(memory)
-        own = observer.observe(belief, row, boards.gain[i], boards.device[i], boards.calibration[i], on_ground)
-        silence = (time.clock[TICK] - boards.set_tick[i]) * time.spans[DT]
-        hover_s, land_s = time.spans[SILENCE_HOVER], time.spans[SILENCE_LAND]
-        charge = percent(row, bodies.energy[i])
-        setting, setpoint = boards.setting[i], boards.setpoint[i]
-        u = firmware.control(memory, belief, own, row, setting, setpoint, silence, hover_s, land_s, charge)
-        put_four(bodies.command[i], 0, u if charge > 0.0 else (0.0, 0.0, 0.0, 0.0))
 
 
 @inlined
@@ -94,9 +79,9 @@ def _gusts(wind: NDArray, gust: NDArray, state: NDArray, noise: Noise) -> None:
     """Let the gusts of every drone move on by one step."""
     count = gust.shape[0]
     at = noise.at[WIND_STREAM] + 3 * noise.cursor[count, WIND_STREAM]
-    common = vector(noise.table[count], at)
+    common, loaded = vector(noise.table[count], at), vector(wind, 0) + four(wind, 3)
     for i in range(count):
-        blow(wind, vector(state[i], body.VELOCITY), gust[i], common, vector(noise.table[i], at), observer.STEP_S)
+        blow(loaded, vector(state[i], body.VELOCITY), gust[i], common, vector(noise.table[i], at), observer.STEP_S)
     for i in range(count + 1):
         noise.cursor[i, WIND_STREAM] += 1
 
@@ -110,19 +95,6 @@ def _meet(wind: NDArray, gust: NDArray, bodies: Bodies) -> float:
             bodies.push[i, k] = 0.0
     b = bodies
     return encounters(b.vehicle, b.state, b.air, b.push, b.touching, b.touched, b.near)
-
-
-@inlined
-def _accelerate(bodies: Bodies) -> None:
-    """Note the accelerations of every drone in its present state."""
-    for i in range(bodies.state.shape[0]):
-        s, row, anchor = bodies.state[i], bodies.vehicle[i], bodies.anchor[i]
-        p, v, q, rate = body.pose(s)
-        speed, command = four(s, body.ROTOR), four(bodies.command[i], 0)
-        air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
-        a, alpha = body.accelerations(row, anchor, p, v, q, rate, speed, command, air, push)
-        put(bodies.accel[i], 0, a)
-        put(bodies.accel[i], 3, alpha)
 
 
 @inlined
@@ -212,17 +184,27 @@ def _sense(tick: int, step: bool, logged: int, bodies: Bodies, device: NDArray, 
     The IMU samples in every step of the board, and what is due of it is published.
     """
     for i in range(bodies.state.shape[0]):
-        for s in range(len(ss.CHANNELS)):
-            while step if s == ss.IMU else senses.schedule[i, s, ss.DUE] <= tick:
-                value = senses.value[logged]
-                kept = _sample(s, i, bodies, noise, senses, value)
-                if kept:
-                    _register(device[i], s, value)
-                if _due(senses.schedule[i, s], tick) and kept:
-                    _note(senses.whose[logged], s, i, tick)
-                    logged += 1
-                if s == ss.IMU:
-                    break
+        if step:
+            logged = _take(ss.IMU, i, tick, logged, bodies, device[i], noise, senses)
+        if senses.soonest[i] <= tick:
+            senses.soonest[i] = NEVER
+            for s in range(ss.IMU + 1, len(ss.CHANNELS)):
+                while senses.schedule[i, s, ss.DUE] <= tick:
+                    logged = _take(s, i, tick, logged, bodies, device[i], noise, senses)
+                senses.soonest[i] = min(senses.soonest[i], senses.schedule[i, s, ss.DUE])
+    return logged
+
+
+@inlined
+def _take(s: int, i: int, tick: int, logged: int, bodies: Bodies, device: NDArray, noise: Noise, senses: Senses) -> int:
+    """Let sensor s of drone i sample, and the firmware see it; return the length of the log, with it if it is due."""
+    value = senses.value[logged]
+    kept = _sample(s, i, bodies, noise, senses, value)
+    if kept:
+        _register(device, s, value)
+    if _due(senses.schedule[i, s], tick) and kept:
+        _note(senses.whose[logged], s, i, tick)
+        logged += 1
     return logged
 
 
@@ -279,21 +261,19 @@ def _advance(w: Arrays, ticks: int) -> tuple[int, float, int]:
     clock, device = time.clock, boards.device
     logged, least = 0, math.inf
     bodies.touched.fill(0)
-    if ticks == 0:
-        least = _meet(wind, gust, bodies)
-        _accelerate(bodies)
-        logged = _sense(clock[TICK], True, logged, bodies, device, noise, senses)
-    for _ in range(ticks):
-        if clock[TICK] % clock[TICKS_PER_STEP] == 0:
-            _steer(time, bodies, boards)
-        move(bodies, time.spans[DT])
-        clock[TICK] += 1
-        step = clock[TICK] % clock[TICKS_PER_STEP] == 0
-        if step:
+    line_up(bodies)
+    for _ in range(max(ticks, 1)):
+        if ticks > 0:
+            if clock[TICK] % clock[TICKS_PER_STEP] == 0:
+                steer(time, bodies, boards)
+            move(bodies, time.spans[DT])
+            clock[TICK] += 1
+        step = ticks == 0 or clock[TICK] % clock[TICKS_PER_STEP] == 0
+        if step and ticks > 0:
             _gusts(wind, gust, bodies.state, noise)
             _drain(bodies)
         least = min(least, _meet(wind, gust, bodies))
         if step:
-            _accelerate(bodies)
+            accelerate(bodies)
         logged = _sense(clock[TICK], step, logged, bodies, device, noise, senses)
     return logged, least, _diverged(bodies.state)

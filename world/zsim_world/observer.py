@@ -25,7 +25,8 @@ HEIGHT, BARO_ZERO, ODOMETRY = 13, 14, 15  # m over the ground; m; m in W from po
 BODY_RATE, ROTOR = 17, 20  # rad/s in B; rad/s, modelled (4)
 STILL_STEPS, BARO_SAMPLES, MAG_SAMPLES, SONAR_AGE = 24, 25, 26, 27  # counts; steps since the last good echo
 LIFT_BIAS = 28  # m/s^2, of the accelerometer along the vertical
-COLUMNS = 29
+HEADING = 29  # rad, of ATTITUDE
+COLUMNS = 30
 
 # Columns of the device registers: the newest sample of each sensor and whether it is new
 ACCEL, GYRO, FLOW, FLOW_QUALITY, MAG, BARO, SONAR, SONAR_VALID = 0, 3, 6, 9, 10, 13, 14, 15
@@ -45,76 +46,97 @@ MAG_MIN_UT = 1.0  # uT, a horizontal field that still gives a heading
 
 
 @inlined
-def turn_by(belief: NDArray, r_H: Vector) -> None:
-    """Turn the believed attitude by a small rotation vector [rad] given in the heading frame."""
-    q = four(belief, ATTITUDE)
-    r_W = rot.rotate(rot.facing(q), r_H)
-    put_four(belief, ATTITUDE, rot.normalised(rot.multiply(rot.from_rotation_vector(r_W), q)))
+def _face(belief: NDArray, q: Quaternion) -> Quaternion:
+    """Believe an attitude; return its heading frame in W, which all that follows is given."""
+    put_four(belief, ATTITUDE, q)
+    belief[HEADING] = rot.heading(q)
+    return rot.about_z(belief[HEADING])
 
 
 @inlined
-def _take_bias(belief: NDArray, r_H: Vector) -> None:
+def _turn_by(belief: NDArray, own: Quaternion, r_H: Vector) -> Quaternion:
+    """Turn the believed attitude by a small rotation vector [rad] given in the heading frame; return the new frame."""
+    turn = rot.from_rotation_vector(rot.rotate(own, r_H))
+    return _face(belief, rot.normalised(rot.multiply(turn, four(belief, ATTITUDE))))
+
+
+@inlined
+def _take_bias(belief: NDArray, own: Quaternion, r_H: Vector) -> None:
     """Take a rate error [rad/s], given in the heading frame, out of the gyro's bias."""
-    q = four(belief, ATTITUDE)
-    q_HB = rot.level(rot.facing(q), q)
+    q_HB = rot.level(own, four(belief, ATTITUDE))
     put(belief, GYRO_BIAS, axpy(vector(belief, GYRO_BIAS), -1.0, rot.rotate_back(q_HB, r_H)))
 
 
 @inlined
+def body_rate(mount: Quaternion, gyro: Vector, bias: Vector) -> Vector:
+    """Return the body rate [rad/s] that a gyro of this mount shows, less its bias."""
+    return axpy(rot.rotate(mount, gyro), -1.0, bias)
+
+
+@inlined
+def step_turn(w: Vector) -> Vector:
+    """Return the rotation vector [rad] of a step at this body rate [rad/s]."""
+    return (w[0] * STEP_S, w[1] * STEP_S, w[2] * STEP_S)
+
+
+@inlined
 def observe(
-    belief: NDArray, row: NDArray, gain: NDArray, device: NDArray, board: NDArray, on_ground: bool
+    belief: NDArray,
+    own: Quaternion,
+    turned: float,
+    row: NDArray,
+    gain: NDArray,
+    device: NDArray,
+    board: NDArray,
+    on_ground: bool,
 ) -> Quaternion:
     """Advance the belief by one step of 5 ms and take in what the devices have sampled since the last.
 
+    Body rate, attitude and heading are at the end of the step already, as the gyro has them (steering.py).
+
     Args:
         belief: (COLUMNS,) in place.
+        own: the heading frame in W; turned: by how much it has turned in this step [rad].
         row: the aircraft's nominal parameters (vehicle.py); gain: gains.py.
         device: (REGISTERS,) newest samples; the marks of new ones are cleared.
         board: (CALIBRATION,).
         on_ground: standing: velocity zero, gravity is all that the accelerometer feels.
 
     Returns:
-        the heading frame in W, as rotation.facing gives it for the attitude now believed.
+        the heading frame in W of the attitude now believed.
     """
-    before = rot.heading(four(belief, ATTITUDE))
-    w = axpy(rot.rotate(four(board, IMU_TURN), vector(device, GYRO)), -1.0, vector(belief, GYRO_BIAS))
-    put(belief, BODY_RATE, w)
-    turn = rot.from_rotation_vector((w[0] * STEP_S, w[1] * STEP_S, w[2] * STEP_S))
-    put_four(belief, ATTITUDE, rot.normalised(rot.multiply(four(belief, ATTITUDE), turn)))
     f_B = rot.rotate(four(board, IMU_TURN), vector(device, ACCEL))
-    heading = rot.heading(four(belief, ATTITUDE))
-    own, corrected = rot.about_z(heading), on_ground or device[NEW_MAG] > 0.0
     if on_ground:
-        _stand(belief, row, own, f_B, w)
+        own = _stand(belief, row, own, f_B, vector(belief, BODY_RATE))
     else:
-        _fly(belief, row, gain, own, f_B, heading - before)
+        _fly(belief, row, gain, own, f_B, turned)
         if device[NEW_FLOW] > 0.0 and device[FLOW_QUALITY] >= FLOW_QUALITY_MIN:
-            _see_flow(belief, gain, vector(device, FLOW))
-            corrected = True
+            own = _see_flow(belief, gain, own, vector(device, FLOW))
         _measure_height(belief, gain, device, board[SONAR_MIN])
     if device[NEW_BARO] > 0.0:
         _see_baro(belief, gain, device[BARO], on_ground)
     if device[NEW_MAG] > 0.0:
-        _see_mag(belief, gain, rot.rotate(four(board, MAG_TURN), vector(device, MAG)), board[MAG_BEARING])
+        own = _see_mag(belief, gain, own, rot.rotate(four(board, MAG_TURN), vector(device, MAG)), board[MAG_BEARING])
     for k in range(NEW_FLOW, NEW_SONAR + 1):
         device[k] = 0.0
-    return rot.facing(four(belief, ATTITUDE)) if corrected else own
+    return own
 
 
 @inlined
-def _stand(belief: NDArray, row: NDArray, own: Quaternion, f_B: Vector, w: Vector) -> None:
-    """Average gravity and the gyro's bias while standing; the first 20 s weigh alike."""
+def _stand(belief: NDArray, row: NDArray, own: Quaternion, f_B: Vector, w: Vector) -> Quaternion:
+    """Average gravity and the gyro's bias while standing; the first 20 s weigh alike. Return the new heading frame."""
     n = min(belief[STILL_STEPS] + 1.0, STILL_STEPS_MAX)
     belief[STILL_STEPS] = n
     q_HB = rot.level(own, four(belief, ATTITUDE))
     f_H = rot.rotate(q_HB, f_B)
     s = 1.0 / (n * row[GRAVITY])
-    turn_by(belief, (f_H[1] * s, -f_H[0] * s, 0.0))
+    own = _turn_by(belief, own, (f_H[1] * s, -f_H[0] * s, 0.0))
     put(belief, GYRO_BIAS, axpy(vector(belief, GYRO_BIAS), 1.0 / (n + STILL_STEPS_SWAY), w))
     put(belief, VELOCITY, (0.0, 0.0, 0.0))
     put(belief, DISTURBANCE, (0.0, 0.0, 0.0))
     belief[LIFT_BIAS] += (f_H[2] - row[GRAVITY] - belief[LIFT_BIAS]) / n
     belief[HEIGHT] = row[STAND_HEIGHT]
+    return own
 
 
 @inlined
@@ -158,11 +180,12 @@ def _correct(belief: NDArray, gain: NDArray, at: int, e: Vector) -> None:
 
 
 @inlined
-def _correct_tilt(belief: NDArray, gain: NDArray, e: Vector) -> None:
+def _correct_tilt(belief: NDArray, gain: NDArray, own: Quaternion, e: Vector) -> Quaternion:
     """Correct tilt and gyro bias by an innovation of the flow (the accelerometer's share of it is nothing)."""
     tilt, rate = gain[g.FLOW_TILT], gain[g.FLOW_RATE]
-    turn_by(belief, (-tilt * e[1], tilt * e[0], 0.0))  # faster forward than believed: pitched farther forward
-    _take_bias(belief, (-rate * e[1], rate * e[0], 0.0))
+    own = _turn_by(belief, own, (-tilt * e[1], tilt * e[0], 0.0))  # faster forward than believed: pitched farther so
+    _take_bias(belief, own, (-rate * e[1], rate * e[0], 0.0))
+    return own
 
 
 @inlined
@@ -175,11 +198,13 @@ def _lift_by(belief: NDArray, gain: NDArray, at: int, e: float) -> None:
 
 
 @inlined
-def _see_flow(belief: NDArray, gain: NDArray, flow_H: Vector) -> None:
+def _see_flow(belief: NDArray, gain: NDArray, own: Quaternion, flow_H: Vector) -> Quaternion:
+    """Correct velocity, disturbance, tilt, bias and climb by a velocity seen; return the new heading frame."""
     e = axpy(flow_H, -1.0, vector(belief, VELOCITY))
     _correct(belief, gain, g.FLOW_V, e)
-    _correct_tilt(belief, gain, e)
+    own = _correct_tilt(belief, gain, own, e)
     _lift_by(belief, gain, g.CLIMB_Z, e[2])
+    return own
 
 
 @inlined
@@ -204,19 +229,18 @@ def _see_baro(belief: NDArray, gain: NDArray, altitude: float, on_ground: bool) 
 
 
 @inlined
-def _see_mag(belief: NDArray, gain: NDArray, field_B: Vector, bearing: float) -> None:
-    """Correct heading and the gyro's bias about the vertical; the first samples are averaged."""
-    q = four(belief, ATTITUDE)
-    heading = rot.heading(q)
-    field_H = rot.rotate(rot.level(rot.about_z(heading), q), field_B)
+def _see_mag(belief: NDArray, gain: NDArray, own: Quaternion, field_B: Vector, bearing: float) -> Quaternion:
+    """Correct heading and the gyro's bias about the vertical; the first samples are averaged. Return the new frame."""
+    field_H = rot.rotate(rot.level(own, four(belief, ATTITUDE)), field_B)
     if field_H[0] * field_H[0] + field_H[1] * field_H[1] < MAG_MIN_UT * MAG_MIN_UT:
-        return
+        return own
     n = belief[MAG_SAMPLES] + 1.0
     belief[MAG_SAMPLES] = n
-    e = rot.wrapped(bearing - math.atan2(field_H[1], field_H[0]) - heading)
-    turn_by(belief, (0.0, 0.0, max(1.0 / n, gain[g.MAG_PSI]) * e))
+    e = rot.wrapped(bearing - math.atan2(field_H[1], field_H[0]) - belief[HEADING])
+    own = _turn_by(belief, own, (0.0, 0.0, max(1.0 / n, gain[g.MAG_PSI]) * e))
     if 1.0 / n < gain[g.MAG_PSI]:
-        _take_bias(belief, (0.0, 0.0, gain[g.MAG_RATE] * e))
+        _take_bias(belief, own, (0.0, 0.0, gain[g.MAG_RATE] * e))
+    return own
 
 
 @inlined

@@ -73,6 +73,7 @@ def slew(row: Row, speed: Four, command: Four) -> Four:
 
 @inlined
 def accelerations(
+    grounded: bool,
     row: Row,
     anchor: NDArray,
     p_WB: Vector,
@@ -90,30 +91,17 @@ def accelerations(
     I dw/dt = M - w × (I w)
 
     Args:
+        grounded: a constant where it is called. False leaves the ground out, and then the result holds only where
+            the ground is out of reach; so there is no branch in it, and several drones go at once (lanes.py).
         row: parameters (vehicle.py); anchor: of its contact points (ground.py).
         p_WB, v_WB, q_WB, w_WB_B, speed: state; command: rotor speeds wanted [rad/s].
         air_W: velocity of the air at the drone [m/s]; push_W: force of other drones [N].
     """
-    ground = contact(row, anchor, p_WB, v_WB, q_WB, w_WB_B)
-    return _driven(row, ground, p_WB[2], v_WB, q_WB, w_WB_B, speed, command, air_W, push_W)
-
-
-@inlined
-def _driven(
-    row: Row,
-    ground: tuple[Vector, Vector],
-    height_m: float,
-    v_WB: Vector,
-    q_WB: Quaternion,
-    w_WB_B: Vector,
-    speed: Four,
-    command: Four,
-    air_W: Vector,
-    push_W: Vector,
-) -> tuple[Vector, Vector]:
-    """Return the accelerations under a force [N; W] and a moment [N m; B] of the ground."""
+    ground = NOTHING, NOTHING
+    if grounded:
+        ground = contact(row, anchor, p_WB, v_WB, q_WB, w_WB_B)
     ix, iy, iz = row[INERTIA_X], row[INERTIA_Y], row[INERTIA_Z]
-    thrust, moment = wrench(row, q_WB, height_m, w_WB_B, speed, slew(row, speed, command))
+    thrust, moment = wrench(row, q_WB, p_WB[2], w_WB_B, speed, slew(row, speed, command))
     moment = add(moment, ground[1])
     force = add(add(ground[0], push_W), rot.rotate(q_WB, (0.0, 0.0, thrust)))
     force = axpy(force, -row[DRAG], axpy(v_WB, -1.0, air_W))
@@ -188,25 +176,23 @@ def stepped(
     """Return p_WB, v_WB, q_WB, w_WB_B and rotor speeds after dt [s], and whether the ground was out of reach.
 
     Args:
-        grounded: a constant where it is called. False leaves the ground out, and then the result holds only where
-            the ground was out of reach; so there is no branch in the step, and several drones go at once (lanes.py).
-        row, anchor, command, air_W, push_W: as for `accelerations`.
+        grounded, row, anchor, command, air_W, push_W: as for `accelerations`.
         p, v, q, w, r0: state; decay: of the rotors' lag, see `half_decay`.
     """
     h, reach = 0.5 * dt, CONTACT_REACH_M * row[SIZE]
     r1 = lagged(r0, command, decay)
     r2 = lagged(r0, command, decay * decay)
 
-    a1, b1 = _stage(grounded, row, anchor, p, v, q, w, r0, command, air_W, push_W)
+    a1, b1 = accelerations(grounded, row, anchor, p, v, q, w, r0, command, air_W, push_W)
     d1 = rot.rate(q, w)
     p2, v2, w2, q2 = axpy(p, h, v), axpy(v, h, a1), axpy(w, h, b1), _turned(q, h, d1)
-    a2, b2 = _stage(grounded, row, anchor, p2, v2, q2, w2, r1, command, air_W, push_W)
+    a2, b2 = accelerations(grounded, row, anchor, p2, v2, q2, w2, r1, command, air_W, push_W)
     d2 = rot.rate(q2, w2)
     p3, v3, w3, q3 = axpy(p, h, v2), axpy(v, h, a2), axpy(w, h, b2), _turned(q, h, d2)
-    a3, b3 = _stage(grounded, row, anchor, p3, v3, q3, w3, r1, command, air_W, push_W)
+    a3, b3 = accelerations(grounded, row, anchor, p3, v3, q3, w3, r1, command, air_W, push_W)
     d3 = rot.rate(q3, w3)
     p4, v4, w4, q4 = axpy(p, dt, v3), axpy(v, dt, a3), axpy(w, dt, b3), _turned(q, dt, d3)
-    a4, b4 = _stage(grounded, row, anchor, p4, v4, q4, w4, r2, command, air_W, push_W)
+    a4, b4 = accelerations(grounded, row, anchor, p4, v4, q4, w4, r2, command, air_W, push_W)
     d4 = rot.rate(q4, w4)
 
     s = dt / 6.0
@@ -218,23 +204,3 @@ def stepped(
         r2,
         (p[2] > reach) & (p2[2] > reach) & (p3[2] > reach) & (p4[2] > reach),
     )
-
-
-@inlined
-def _stage(
-    grounded: bool,
-    row: Row,
-    anchor: NDArray,
-    p: Vector,
-    v: Vector,
-    q: Quaternion,
-    w: Vector,
-    speed: Four,
-    command: Four,
-    air_W: Vector,
-    push_W: Vector,
-) -> tuple[Vector, Vector]:
-    """Return the accelerations in one stage of a step."""
-    if grounded:
-        return accelerations(row, anchor, p, v, q, w, speed, command, air_W, push_W)
-    return _driven(row, (NOTHING, NOTHING), p[2], v, q, w, speed, command, air_W, push_W)

@@ -85,8 +85,15 @@ def normalised(q: Quaternion) -> Quaternion:
 def from_rotation_vector(r: Vector) -> Quaternion:
     """Return the quaternion of a turn by |r| radians about r."""
     angle = norm(r)
-    s = 0.5 if angle < _SMALL_ANGLE else math.sin(0.5 * angle) / angle
-    return (math.cos(0.5 * angle), s * r[0], s * r[1], s * r[2])
+    half = 0.5 * angle
+    return turn_about(r, angle, math.sin(half), math.cos(half))
+
+
+@inlined
+def turn_about(r: Vector, angle: float, sine: float, cosine: float) -> Quaternion:
+    """Return the quaternion of a turn by |r| = angle about r, from sine and cosine of half the angle."""
+    s = 0.5 if angle < _SMALL_ANGLE else sine / angle
+    return (cosine, s * r[0], s * r[1], s * r[2])
 
 
 @inlined
@@ -100,8 +107,15 @@ def rate(q: Quaternion, w_WB_B: Vector) -> Quaternion:
 @inlined
 def heading(q: Quaternion) -> float:
     """Return the heading [rad]: the angle of the body's x axis from east, counter-clockwise seen from above."""
+    north, east = forwards(q)
+    return math.atan2(north, east)
+
+
+@inlined
+def forwards(q: Quaternion) -> tuple[float, float]:
+    """Return how far the body's x axis points north, and east."""
     w, x, y, z = q
-    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return 2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)
 
 
 @inlined
@@ -111,14 +125,8 @@ def about_z(angle: float) -> Quaternion:
 
 
 @inlined
-def facing(q: Quaternion) -> Quaternion:
-    """Return the turn about z by the heading of q: the attitude of the heading frame."""
-    return about_z(heading(q))
-
-
-@inlined
 def level(own: Quaternion, q_WB: Quaternion) -> Quaternion:
-    """Return q_HB, the attitude over the heading frame, tilt without heading; own = facing(q_WB)."""
+    """Return q_HB, the attitude over the heading frame, tilt without heading; own = about_z(heading(q_WB))."""
     return multiply((own[0], 0.0, 0.0, -own[3]), q_WB)
 
 

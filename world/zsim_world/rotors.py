@@ -86,7 +86,7 @@ def shaft_power(row: NDArray, speed: Four) -> float:
 
 
 @inlined
-def mix(row: NDArray, thrust_n: float, moment: Vector) -> Four:
+def mix(row: Row, thrust_n: float, moment: Vector) -> Four:
     """Return rotor speeds [rad/s] for a thrust [N] and a moment in B [N m] within the rotors' limits.
 
     What cannot be had is given up in this order: yaw first, then thrust, tilt last.
@@ -95,9 +95,8 @@ def mix(row: NDArray, thrust_n: float, moment: Vector) -> Four:
     high = row[THRUST] * row[ROTOR_MAX] * row[ROTOR_MAX]
     roll, pitch = 0.25 * moment[0] / row[ROTOR_XY], 0.25 * moment[1] / row[ROTOR_XY]
     reach = abs(roll) + abs(pitch)
-    if 2.0 * reach > high - low:
-        scale = (high - low) / (2.0 * reach)
-        roll, pitch, reach = roll * scale, pitch * scale, reach * scale
+    scale = (high - low) / (2.0 * reach) if 2.0 * reach > high - low else 1.0
+    roll, pitch, reach = roll * scale, pitch * scale, reach * scale
     mean = min(max(0.25 * thrust_n, low + reach), high - reach)
     yaw = 0.25 * moment[2] * row[THRUST] / row[TORQUE]
     f0, f1 = mean + roll - pitch, mean - roll - pitch

@@ -7,7 +7,7 @@ import numpy as np
 
 from zsim.frames import quaternion_from_heading, quaternion_from_rpy
 from zsim.scenario import Drone, Scenario
-from zsim_world import firmware, gains, lanes, observer, rigid_body, sensor_set, vehicle
+from zsim_world import block, drive, firmware, gains, lanes, observer, rigid_body, sensor_set, steering, vehicle
 from zsim_world import wind as wind_model
 from zsim_world.arrays import Arrays, Boards, Bodies, Near, Noise, Senses, Time
 from zsim_world.noise import NoiseTable, samples_per_gate
@@ -41,8 +41,7 @@ def _bodies(scenario: Scenario, row: np.ndarray, dt: float) -> Bodies:
         touching=np.zeros((n, n), dtype=np.int8),
         touched=np.zeros((n, n), dtype=np.int8),
         near=near(n),
-        decay=np.array([half_decay(lag, dt) for lag in row[:, vehicle.ROTOR_LAG]]),
-        lanes=np.zeros(lanes.LANES * lanes.COLUMNS),
+        lanes=block.blocks(lanes.COLUMNS, row, np.array([[half_decay(lag, dt)] for lag in row[:, vehicle.ROTOR_LAG]])),
     )
 
 
@@ -54,15 +53,19 @@ def near(n: int) -> Near:
 
 def _boards(scenario: Scenario, row: np.ndarray) -> Boards:
     drones, n = scenario.drones, len(scenario.drones)
+    setting = np.array([firmware.settings(drone) for drone in drones])
+    calibration = np.array([_calibration(drone, scenario) for drone in drones])
+    mounts = calibration[:, observer.IMU_TURN : observer.IMU_TURN + 4]
     return Boards(
-        setting=np.array([firmware.settings(drone) for drone in drones]),
+        setting=setting,
         gain=np.array([gains.gain_row(drone, scenario.environment) for drone in drones]),
-        calibration=np.array([_calibration(drone, scenario) for drone in drones]),
+        calibration=calibration,
         setpoint=np.zeros((n, firmware.SETPOINT_COLUMNS)),
         set_tick=np.zeros(n, dtype=np.int64),
         memory=np.zeros((n, firmware.MEMORY_COLUMNS)),
         belief=np.array([_first_belief(height) for height in row[:, vehicle.STAND_HEIGHT]]),
         device=np.zeros((n, observer.REGISTERS)),
+        lanes=block.blocks(steering.COLUMNS, row, setting[:, drive.GAINS], mounts),
     )
 
 
@@ -72,6 +75,7 @@ def _senses(scenario: Scenario, noise: NoiseTable) -> Senses:
         place=np.array([*field.magnetic_field_ut, field.height_m]),
         config=sensor_set.config(scenario),
         schedule=sensor_set.schedule(scenario),
+        soonest=np.zeros(len(scenario.drones), dtype=np.int64),
         bias=noise.bias,
         whose=np.zeros((log, 3), dtype=np.int64),
         value=np.zeros((log, 6)),

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from zsim_world.compiled import inlined
 from zsim_world.rotation import Vector
+from zsim_world.vehicle import Row
 
 # Columns of the one row of wind parameters
 STEADY, GUST, LENGTH, SPEED_MIN, CORRELATION = 0, 3, 4, 5, 6  # m/s (3), m/s, m, m/s, -
@@ -28,11 +29,11 @@ def gust_noise(correlation: float, common: float, own: float) -> float:
 
 
 @inlined
-def blow(wind: NDArray, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt: float) -> None:
+def blow(wind: Row, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt: float) -> None:
     """Advance the gust (3,) [m/s] at one drone by dt in place, by the exact discretisation of the filter.
 
     Args:
-        wind: the wind's parameters (COLUMNS,).
+        wind: the wind's parameters (COLUMNS,); for many drones best loaded, then its roots are drawn once.
         v_WB: the drone's velocity [m/s].
         common: standard normal numbers that all drones share; own: of this drone.
     """
@@ -42,5 +43,6 @@ def blow(wind: NDArray, v_WB: Vector, gust: NDArray, common: Vector, own: Vector
         square += relative * relative
     decay = gust_decay(wind[LENGTH], math.sqrt(square), wind[SPEED_MIN], dt)
     fresh = wind[GUST] * math.sqrt(1.0 - decay * decay)
+    share = wind[CORRELATION]
     for k in range(3):
-        gust[k] = decay * gust[k] + fresh * gust_noise(wind[CORRELATION], common[k], own[k])
+        gust[k] = decay * gust[k] + fresh * gust_noise(share, common[k], own[k])
