@@ -140,27 +140,28 @@ def write(program: Program, words: Words, kind: int, ints: NDArray, bits: NDArra
         ints: its whole numbers (I,); bits: its floats (F,) as uint64.
         out: uint8, with room enough.
     """
-    at = start
+    at = np.uint64(start)  # a place without a sign is not looked at for being negative: bytes become words
     for k in range(program.first[kind], program.first[kind + 1]):
         op, place, size = program.ops[k, 0], program.ops[k, 1], program.ops[k, 2]
         if op == LITERAL:
-            for i in range(size):
-                out[at + i] = program.literals[place + i]
-            at += size
+            for i in range(np.uint64(size)):
+                out[at + i] = program.literals[np.uint64(place) + i]
+            at += np.uint64(size)
         elif op == FLOATS:
             for column in range(place, place + size):
+                word = bits[column]
                 out[at] = FLOAT64
                 for i in range(8):
-                    out[at + 1 + i] = (bits[column] >> np.uint64(56 - 8 * i)) & np.uint64(0xFF)
-                at += FLOAT_BYTES
+                    out[at + np.uint64(1 + i)] = (word >> np.uint64(56 - 8 * i)) & np.uint64(0xFF)
+                at += np.uint64(FLOAT_BYTES)
         elif op == BOOL:
             out[at] = TRUE if ints[place] else FALSE
-            at += 1
+            at += np.uint64(1)
         elif op == TEXT:
             word = ints[place]
             for i in range(words.ends[word - 1] if word else 0, words.ends[word]):
                 out[at] = words.data[i]
-                at += 1
+                at += np.uint64(1)
         else:
             value, size = ints[place], 1
             if value < -32 or value > 127:
@@ -168,11 +169,11 @@ def write(program: Program, words: Words, kind: int, ints: NDArray, bits: NDArra
                 power = 0 if reach < 1 << 8 else 1 if reach < 1 << 16 else 2 if reach < 1 << 32 else 3
                 size = 1 << power
                 out[at] = (UINT8 if value > 0 else INT8) + power
-                at += 1
+                at += np.uint64(1)
             for i in range(size):
-                out[at + i] = (value >> (8 * (size - 1 - i))) & 0xFF
-            at += size
-    return at
+                out[at] = (value >> (8 * (size - 1 - i))) & 0xFF
+                at += np.uint64(1)
+    return int(np.int64(at))
 
 
 def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints: NDArray, bits: NDArray) -> bool:
@@ -186,40 +187,40 @@ def read(program: Program, kind: int, data: NDArray, start: int, end: int, ints:
         data: uint8; the message is what stands in [start, end).
         ints: takes its whole numbers (I,); bits: its floats (F,) as uint64.
     """
-    at = start
+    at, stop = np.uint64(start), np.uint64(end)
     for k in range(program.first[kind], program.first[kind + 1]):
         op, place, size = program.ops[k, 0], program.ops[k, 1], program.ops[k, 2]
-        if at + (size if op == LITERAL else size * FLOAT_BYTES if op == FLOATS else 1) > end:
+        if at + np.uint64(size if op == LITERAL else size * FLOAT_BYTES if op == FLOATS else 1) > stop:
             return False
         mark = np.int64(data[at])
         if op == LITERAL:
-            for i in range(size):
-                if data[at + i] != program.literals[place + i]:
+            for i in range(np.uint64(size)):
+                if data[at + i] != program.literals[np.uint64(place) + i]:
                     return False
-            at += size
+            at += np.uint64(size)
         elif op == FLOATS:
             for column in range(place, place + size):
                 word = np.uint64(0)
                 for i in range(8):
-                    word = (word << np.uint64(8)) | np.uint64(data[at + 1 + i])
+                    word |= np.uint64(data[at + np.uint64(1 + i)]) << np.uint64(56 - 8 * i)
                 if data[at] != FLOAT64 or (word & INFINITE) == INFINITE:
                     return False
                 bits[column] = word
-                at += FLOAT_BYTES
+                at += np.uint64(FLOAT_BYTES)
         elif op == BOOL and mark in (FALSE, TRUE):
             ints[place] = mark == TRUE
-            at += 1
+            at += np.uint64(1)
         elif op == INT and (mark <= COUNT_MAX or UINT8 <= mark < INT8):
             size = 0 if mark <= COUNT_MAX else 1 << (mark - UINT8)
             value = mark if size == 0 else np.int64(0)
-            if at + 1 + size > end:
+            if at + np.uint64(1 + size) > stop:
                 return False
             for i in range(size):
-                value = (value << 8) | np.int64(data[at + 1 + i])
+                value = (value << 8) | np.int64(data[at + np.uint64(1 + i)])
             if value < 0:
                 return False
             ints[place] = value
-            at += 1 + size
+            at += np.uint64(1 + size)
         else:
             return False
-    return at == end
+    return at == stop

@@ -65,15 +65,17 @@ class Group(Agent):
             for key, message in self._take(place):
                 member.receive(key, message)
             said = member.step(t_ns)
-            for key, message in said:
-                self.receive(key, message)
+            for output in said:
+                for reader in self._readers_of(output.key):
+                    self._waiting[reader].append(output)
             outputs += said
         return outputs
 
     def _take(self, place: int) -> list[tuple[str, Any]]:
         """Return what a member is to receive, in the order in which a runner would hand it over."""
         inputs, self._waiting[place] = self._waiting[place], []
-        inputs.sort(key=lambda entry: (entry[1].t_ns, entry[0], entry[1].seq))
+        if len(inputs) > 1:
+            inputs.sort(key=_canonical)
         return inputs
 
     def _readers_of(self, key: str) -> list[int]:
@@ -108,6 +110,11 @@ class Group(Agent):
     def _owner(self, key: str) -> Agent:
         """Return who takes over the last value of a key."""
         return next(member for member in self._members if key in member.warm_start_keys())
+
+
+def _canonical(entry: tuple[str, Any]) -> tuple[int, str, int]:
+    key, message = entry
+    return message.t_ns, key, message.seq
 
 
 def _joined(parts: Any) -> tuple[str, ...]:

@@ -5,8 +5,8 @@ The agents get the same inputs in the same order as on Zenoh, and so give the sa
 
 import os
 import socket
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
 
 from msgspec import Struct
 
@@ -60,6 +60,14 @@ class Hub(Protocol):
 
 
 Sink = Callable[[str, Any], None]
+VIEW, OUTPUT, COMMAND = range(3)  # what an agent says: for eyes alone, for whoever reads it, for the world
+
+
+class _Way(NamedTuple):
+    """Where the messages of a key go."""
+
+    inboxes: tuple[Inbox, ...]
+    kind: int
 
 
 class Bus:
@@ -87,7 +95,8 @@ class Bus:
         self._whole = whole
         self._agents = [(agent, Inbox(agent.gate_keys, agent.counted)) for agent in agents]
         self._selections = [Selection(agent.reads) for agent in agents]
-        self._routes: dict[str, list[Inbox]] = {}
+        self._ways: dict[str, _Way] = {}
+        self._done_keys = {agent.name: keys.process(agent.name, "done") for agent in agents}
         self._t_ns = 0
 
     def join(self) -> None:
@@ -112,7 +121,8 @@ class Bus:
     def turn(self) -> bool:
         """Let the world go as far as it may, and every agent answer; return whether the run goes on.
 
-        Several gates in a row of the world, then of each agent, keep the code of each in the processor's caches.
+        Several gates in a row of the world, of each agent, and of what they say, keep the code of each in the
+        processor's caches.
 
         Raises:
             RunError: the world waits for somebody who is not on this bus.
@@ -123,8 +133,8 @@ class Bus:
         gates = 0
         while gates < GATES_MAX and self._hub.may_advance():
             self._hub.advance(self._wall_ns())
-            self._spread()
             gates += 1
+        self._spread()
         while self._round():
             pass
         return True
@@ -135,11 +145,13 @@ class Bus:
             raise RunError(f"the world waits for {names}, not run in-process; see `processes.expect`")
 
     def _round(self) -> bool:
-        """Let every agent take all its complete gates; return whether any had one."""
+        """Let every agent take all its complete gates, then publish what it says; return whether any had one."""
         stepped = False
         for agent, inbox in self._agents:
-            while self._step(agent, inbox):
-                stepped = True
+            said = list(self._steps(agent, inbox))
+            for t_ns, outputs in said:
+                self._publish(agent, t_ns, outputs)
+            stepped = stepped or bool(said)
         return stepped
 
     def end(self) -> None:
@@ -157,7 +169,7 @@ class Bus:
                 self._hand_out(message)
                 continue
             self._sink(key, message)
-            for inbox in self._route(key):
+            for inbox in self._way(key).inboxes:
                 inbox.put(key, message)
 
     def _hand_out(self, bundle: Bundle) -> None:
@@ -170,37 +182,43 @@ class Bus:
             for key, message in [(batch.GATE, bundle)] if agent.takes_bundles else selection.of(bundle):
                 inbox.put(key, message)
 
-    def _step(self, agent: Agent, inbox: Inbox) -> bool:
+    def _steps(self, agent: Agent, inbox: Inbox) -> Iterator[tuple[int, Sequence[Output]]]:
+        """Hand an agent each complete gate; yield those at which it steps, with what it says."""
         t_ns = inbox.next_gate_ns()
-        if t_ns is None or inbox.missing(t_ns) is not None:
-            return False
-        self._t_ns = t_ns
-        for key, message in inbox.take(t_ns):
-            agent.receive(key, message)
-        if t_ns % agent.period_ns == 0:
-            self._publish(agent, t_ns, agent.step(t_ns))
-        return True
+        while t_ns is not None and inbox.missing(t_ns) is None:
+            self._t_ns = t_ns
+            for key, message in inbox.take(t_ns):
+                agent.receive(key, message)
+            if t_ns % agent.period_ns == 0:
+                yield t_ns, agent.step(t_ns)
+            t_ns = inbox.next_gate_ns()
 
     def _publish(self, agent: Agent, t_ns: int, outputs: Sequence[Output]) -> None:
-        counted = [output for output in outputs if not output.key.startswith("view/")]
-        for key, message in counted:
-            for inbox in self._route(key):
+        sent = 0
+        for key, message in outputs:
+            inboxes, kind = self._way(key)
+            if kind == VIEW:
+                continue
+            sent += 1
+            for inbox in inboxes:
                 inbox.put(key, message)
-            if key.endswith(("/estimate", "/state")):
+            if kind == OUTPUT:
                 self._sink(key, message)
                 self._hub.output_of(agent.name)
             else:
                 self._to_hub(key, message)
-        done = messages.Done(t_ns, agent.next_seq("done"), self._hub.run_id, 0, t_ns, len(counted))
-        self._to_hub(keys.process(agent.name, "done"), done)
+        done = messages.Done(t_ns, agent.next_seq("done"), self._hub.run_id, 0, t_ns, sent)
+        self._to_hub(self._done_keys[agent.name], done)
 
     def _to_hub(self, key: str, message: Struct) -> None:
         self._sink(key, message)
         self._hub.handle(key, message, self._wall_ns())
 
-    def _route(self, key: str) -> list[Inbox]:
-        if key not in self._routes:
-            self._routes[key] = [
-                inbox for (_, inbox), taken in zip(self._agents, self._selections, strict=True) if taken.takes(key)
-            ]
-        return self._routes[key]
+    def _way(self, key: str) -> _Way:
+        way = self._ways.get(key)
+        if way is None:
+            readers = zip(self._agents, self._selections, strict=True)
+            inboxes = tuple(inbox for (_, inbox), taken in readers if taken.takes(key))
+            kind = VIEW if key.startswith("view/") else OUTPUT if key.endswith(("/estimate", "/state")) else COMMAND
+            way = self._ways[key] = _Way(inboxes, kind)
+        return way

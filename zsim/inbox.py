@@ -34,6 +34,7 @@ class Inbox:
 
     def __init__(self, gate_keys: Sequence[str], counted: Sequence[str] = (), keep_late: bool = False) -> None:
         self._closing = dict.fromkeys(gate_keys)
+        self._beside = dict.fromkeys(key for key in gate_keys if not keys.is_status(key))  # what a bundle leaves open
         self._meters = {keys.status(drone): _Meter() for drone in counted}
         self._came_of: dict[str, list[int] | None] = {}
         self._waiting: dict[int, dict[tuple[str, int], tuple[str, Any]]] = {}
@@ -91,12 +92,14 @@ class Inbox:
 
     def _close_all(self, bundle: Any) -> None:
         """Take a bundle: all that its publisher says at a gate, whole by its nature."""
-        lacking = self._lacking_at(bundle.t_ns)
-        for key in self._closing:
-            if keys.is_status(key):
-                lacking.pop(key, None)
+        t_ns = bundle.t_ns
+        if t_ns in self._lacking:
+            self._lacking[t_ns] = {key: None for key in self._lacking[t_ns] if key in self._beside}
+        else:
+            self._lacking[t_ns] = self._beside.copy()
+            _insert(self._gates, t_ns)
         if self._pulse is not None:
-            self._beats[bundle.t_ns] = bundle.seq
+            self._beats[t_ns] = bundle.seq
 
     def _lacking_at(self, t_ns: int) -> dict[str, None]:
         lacking = self._lacking.get(t_ns)
@@ -138,7 +141,7 @@ class Inbox:
             if self._expects(key, t_ns):
                 return key
         for key, meter in self._meters.items():
-            if meter.short(t_ns) and self._expects(key, t_ns):
+            if meter.counts and meter.short(t_ns) and self._expects(key, t_ns):
                 return key
         return None
 
@@ -172,7 +175,8 @@ class Inbox:
             if gate_ns in self._beats:
                 self._last_beat = (gate_ns, self._beats.pop(gate_ns))
         for meter in self._meters.values():
-            meter.forget(t_ns)
+            if meter.partial or meter.counts or meter.came:
+                meter.forget(t_ns)
         self._taken_ns = t_ns
         return ready
 
@@ -205,33 +209,35 @@ class _Meter:
 
     Attributes:
         came: stamps of the drone's messages that wait, sorted.
+        counts: stamps of the drone's statuses that wait, and what they count; a meter without any is not short.
+        partial: whether nothing is compared yet.
     """
 
     def __init__(self) -> None:
         self.came: list[int] = []
-        self._counts: list[tuple[int, int]] = []
-        self._partial = True
+        self.counts: list[tuple[int, int]] = []
+        self.partial = True
 
     def count(self, status: Any) -> None:
-        insort(self._counts, (status.t_ns, status.count))
+        insort(self.counts, (status.t_ns, status.count))
         if status.seq == 0:
-            self._partial = False
+            self.partial = False
 
     def short(self, t_ns: int) -> bool:
         """Tell whether sensor messages of the gates up to t_ns are still to come."""
-        if self._partial:
+        if self.partial:
             return False
-        due = sum(count for _, count in self._counts[: self._until(t_ns)])
+        due = sum(count for _, count in self.counts[: self._until(t_ns)])
         return bisect_right(self.came, t_ns) < due
 
     def forget(self, t_ns: int) -> None:
         _cut(self.came, t_ns)
-        del self._counts[: self._until(t_ns)]
-        self._partial = False
+        del self.counts[: self._until(t_ns)]
+        self.partial = False
 
     def _until(self, t_ns: int) -> int:
         """Return how many of the counts are of gates up to t_ns."""
-        return bisect_right(self._counts, t_ns, key=itemgetter(0))
+        return bisect_right(self.counts, t_ns, key=itemgetter(0))
 
 
 def _insert(stamps: list[int], t_ns: int) -> None:

@@ -76,6 +76,13 @@ def process(process_name: str, what: str) -> str:
     return f"process/{process_name}/{what}"
 
 
+@lru_cache(maxsize=4096)
+def parts(key: str) -> tuple[str, str, str]:
+    """Return what a key is about, whose it is, and what of it; empty where it is shorter: `drone`, name, `cmd/mode`."""
+    kind, whose, what, *_ = *key.split("/", 2), "", ""
+    return kind, whose, what
+
+
 def replay(process_name: str) -> str:
     """Return the key on which the world answers a process for what it may read and missed."""
     return process(process_name, "replay")

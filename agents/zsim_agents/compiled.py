@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
+from zsim import encoding
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 SOURCES = (  # every file that uses `compiled`
@@ -35,6 +37,7 @@ SOURCES = (  # every file that uses `compiled`
     "triad_cluster.py",
 )
 CONSTANTS = ("aiding.py", "estimator_prior.py", "strapdown.py")  # files of which constants are compiled in
+SHARED = (encoding,)  # modules of other packages whose functions are compiled
 
 try:
     import numba
@@ -48,7 +51,8 @@ COMPILES = numba is not None  # whether `compiled` compiles here
 
 def sources_digest(folder: Path = Path(__file__).parent) -> str:
     """Return the SHA-256 of the files with compiled functions, or with constants of theirs."""
-    return hashlib.sha256(b"".join((folder / name).read_bytes() for name in SOURCES + CONSTANTS)).hexdigest()
+    files = [folder / name for name in SOURCES + CONSTANTS] + [Path(str(module.__file__)) for module in SHARED]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 _DIGEST = sources_digest()

@@ -76,7 +76,7 @@ class Controller(Agent):
         self._state_key = keys.cluster_state(cluster)
         self._view_key = f"view/cluster/{cluster}"
         self._control_key = keys.cluster_control(cluster)
-        self._place = {drone: i for i, drone in enumerate(spec.drones)}
+        self._place = {key: i for of_drones in (states, estimates) for i, key in enumerate(of_drones)}
         self._velocity_keys = [keys.command(drone, "velocity") for drone in spec.drones]
         self._estimates = [_UNKNOWN] * len(spec.drones)
         self._table = GateTable(len(spec.drones))
@@ -84,7 +84,7 @@ class Controller(Agent):
         self._engagement = engagement_of(scenario, spec)
 
     def receive(self, key: str, message: Any) -> None:
-        place = self._place[keys.thing(key)]
+        place = self._place[key]
         if type(message) is messages.Estimate:
             former = self._estimates[place]
             if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in realtime an older one may come later

@@ -90,7 +90,7 @@ class _Show:
     def sink(self, key: str, message: Any) -> None:
         if self._add is not None:
             self._add(key, message, time_ns())
-        if key in self._watched and self._screen is not None:
+        if self._screen is not None and key in self._watched:
             self._show(key, message, self._screen)
 
     def _show(self, key: str, message: Struct, screen: Screen) -> None:

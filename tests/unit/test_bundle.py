@@ -23,7 +23,7 @@ def said() -> list[Bundle]:
     publication, bundles = Publication(fleet), []
     for gate in range(100):
         fleet.advance()
-        bundles.append(publication.gate(lambda i, gate=gate: "pilot.one" if i == 1 and gate > 50 else None))
+        bundles.append(publication.gate([None, "pilot.one" if gate > 50 else None, *[None] * (fleet.count - 2)]))
     return bundles
 
 

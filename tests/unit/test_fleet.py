@@ -129,7 +129,7 @@ def test_the_sigma_that_a_gps_tells_is_that_of_its_errors():
     """noise 3 m and density 2 m/sqrt(Hz) at 4 Hz: 5 m."""
     gps = {"rate_hz": 4, "position_m": {"noise": 3.0, "density": 2.0}}
     fleet = Fleet(scenario(1, sensors={"preset": "paper", "gps": gps}))
-    told = [m for _, m in Publication(fleet).gate(lambda drone: None).messages() if isinstance(m, messages.Gps)]
+    told = [m for _, m in Publication(fleet).gate([None]).messages() if isinstance(m, messages.Gps)]
     assert [(m.sigma_m, m.fix, m.satellites) for m in told] == [(5.0, GPS_FIX, GPS_SATELLITES)]
 
 
@@ -263,7 +263,7 @@ def test_truth_is_a_copy():
 def test_the_kernel_is_named_after_every_file_with_compiled_code():
     folder = Path(gate.__file__).parent
     compiled = {p.name for p in folder.glob("*.py") if "\n@inlined" in p.read_text() or p.name == "compiled.py"}
-    assert compiled - {"normals.py"} <= set(gate.KERNEL_FILES)
+    assert compiled - {"normals.py", "publication.py"} <= set(gate.KERNEL_FILES)  # these have kernels of their own
     assert all((folder / name).exists() for name in gate.KERNEL_FILES)
     assert set(gate.SOURCES) == {*(folder / name for name in gate.KERNEL_FILES), Path(presets.__file__)}
 

@@ -49,6 +49,9 @@ def test_keys_are_taken_apart():
     assert keys.thing("process/estimator.drone1/done") == "estimator.drone1"
     assert keys.leaf("drone/drone1/sensor/imu") == "imu"
     assert keys.leaf("clock") == "clock"
+    assert keys.parts("drone/drone1/cmd/velocity") == ("drone", "drone1", "cmd/velocity")
+    assert keys.parts("process/world") == ("process", "world", "")
+    assert keys.parts("clock") == ("clock", "", "")
 
 
 @pytest.mark.parametrize(

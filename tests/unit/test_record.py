@@ -20,6 +20,7 @@ from zsim.errors import RecordError
 from zsim.messages import Clock, Imu
 from zsim.record import Recorded, RecordReader, RecordWriter, repair
 from zsim.record.layout import CHUNK_HEAD, HEAD, places
+from zsim.record.writer import CHUNK_BYTES
 
 GATE_NS = 20_000_000
 CHUNK_MESSAGES = 40  # per chunk of the records below
@@ -95,6 +96,23 @@ def test_messages_of_some_keys_only(tmp_path):
     wanted = {recorded[1].key}
     assert read(tmp_path / "run.mcap", keys=wanted) == [m for m in recorded if m.key in wanted]
     assert read(tmp_path / "run.mcap", keys=()) == []
+
+
+def test_messages_of_a_key_are_counted_on_from_chunk_to_chunk(tmp_path):
+    path, rng = tmp_path / "run.mcap", random.Random(8)
+    keys = ["a/x", "b/x", "c/x"]
+    with RecordWriter(path) as writer:
+        for i in range(90):
+            writer.add(rng.choice(keys[: 1 + i // 30]), rng.randbytes(rng.randrange(50)), "", i, i)
+            if i % 7 == 0:
+                writer.flush()
+    counts = dict.fromkeys(keys, 0)
+    with open(path, "rb") as file:
+        for _, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+            assert message.sequence == counts[channel.topic]
+            counts[channel.topic] += 1
+    assert sum(counts.values()) == 90
+    assert min(counts.values()) > 0
 
 
 def test_other_tools_find_encoding_schema_and_sequence(tmp_path):
@@ -290,11 +308,11 @@ def test_closing_twice_does_nothing(tmp_path):
 def test_no_more_than_a_chunk_is_held_back(tmp_path):
     path, payload = tmp_path / "run.mcap", random.Random(4).randbytes(1000)
     with RecordWriter(path) as writer:
-        for i in range(2000):
+        for i in range(3000):
             writer.add("clock", payload, "", i, 0)
-            if i % 100 == 0:
-                assert (i - len(read(path))) * len(payload) <= 256 * 1024
-    assert len(read(path)) == 2000
+            if i % 250 == 0:
+                assert (i - len(read(path))) * len(payload) <= CHUNK_BYTES
+    assert len(read(path)) == 3000
 
 
 def test_times_and_keys_beyond_the_format_are_held_in_bounds(tmp_path, monkeypatch):
@@ -340,7 +358,7 @@ FILL = """
 """
 
 
-@pytest.mark.parametrize("limit", [10, 100, 1_000, 900_000, 1_000_000, 1_234_567])
+@pytest.mark.parametrize("limit", [10, 100, 1_000, 2_900_000, 3_000_000, 3_234_567])
 def test_a_full_disk_is_one_line_and_leaves_a_readable_record(tmp_path, limit):
     path = tmp_path / "run.mcap"
     command = [sys.executable, "-c", textwrap.dedent(FILL), str(path), str(limit)]
@@ -353,7 +371,7 @@ def test_a_full_disk_is_one_line_and_leaves_a_readable_record(tmp_path, limit):
         found = [message.t_ns for message in reader]
         assert reader.complete or limit < 1_000
     assert found == list(range(len(found)))
-    assert len(found) * 145 > limit - 350_000  # all but the chunk that did not fit, 145 bytes a message
+    assert len(found) * 145 > limit - 1.3 * CHUNK_BYTES  # all but the chunk that did not fit, 145 bytes a message
     if limit > 100_000:
         with open(path, "rb") as file:
             assert sum(1 for _ in make_reader(file).iter_messages()) == len(found) > 0

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from zsim_world.statistics import AGES_KEPT, GATES_KEPT, Ages, Measurements, Rate
+from zsim_world.statistics import GATES_KEPT, Ages, Measurements, Rate
 
 MS = 1_000_000
 GATE_NS = 20 * MS
@@ -38,7 +38,7 @@ def test_a_command_that_answers_no_gate_has_no_age():
     assert ages.summary_ms() is None
 
 
-def test_old_gates_and_ages_are_forgotten():
+def test_old_gates_are_forgotten():
     ages = Ages()
     for gate in range(GATES_KEPT + 1):
         ages.published(gate, gate)
@@ -46,7 +46,15 @@ def test_old_gates_and_ages_are_forgotten():
     assert ages.summary_ms() is None
     ages.arrived(1, 10)
     assert ages.summary_ms() is not None
-    assert ages._ages_ns.maxlen == AGES_KEPT
+
+
+def test_old_ages_are_forgotten(monkeypatch):
+    monkeypatch.setattr("zsim_world.statistics.AGES_KEPT", 2)
+    ages = Ages()
+    ages.published(0, 0)
+    for age_ms in (9, 8, 3, 2, 1):
+        ages.arrived(0, age_ms * MS)
+    assert ages.summary_ms() == pytest.approx({"p50": 1.5, "p99": 1.99, "max": 2.0})
 
 
 def test_a_gate_published_twice_is_still_known():

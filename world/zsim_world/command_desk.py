@@ -19,33 +19,34 @@ class CommandDesk:
 
     def take(self, drone: str, kind: str, message: Any) -> bool:
         """Keep a command until its instant, or refuse it; return False for one that has come before."""
-        world = self._world
-        index = world.index.get(drone)
-        if not keys.PROCESS_NAME.fullmatch(message.source):
-            reason = f"source is {message.source[:48]!r}; must be 1 to 48 of a-z 0-9 _ . -"
+        world, source = self._world, message.source
+        gating = world.barrier.is_gating(source)  # its name was looked at when it joined
+        if not gating and not keys.PROCESS_NAME.fullmatch(source):
+            reason = f"source is {source[:48]!r}; must be 1 to 48 of a-z 0-9 _ . -"
             world.refuse("somebody", f"drone/{drone[:40]}/cmd/{kind}", reason)
             return True
-        reason = "no such drone; see world/info" if index is None else self._age_refusal(message)
+        index = world.index.get(drone)
+        reason = "no such drone; see world/info" if index is None else self._age_refusal(message, gating)
         if index is None or reason:
-            world.refuse(message.source, f"drone/{drone[:40]}/cmd/{kind}", reason or "")
+            world.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", reason or "")
             return True
-        return world.commanders.push(index, kind, message, self._apply_ns(drone, kind, message))
+        apply_ns = message.t_ns + world.delay_ns if gating else self._foreign_ns(drone, kind, message)
+        return world.commanders.push(index, kind, message, apply_ns)
 
-    def _age_refusal(self, message: Any) -> str | None:
+    def _age_refusal(self, message: Any, gating: bool) -> str | None:
         world = self._world
-        age_ms = (world.now_ns - message.t_ns) / 1e6
-        limit_ms = world.scenario.time.max_command_age_ms
-        if world.mode == "realtime" and age_ms > limit_ms:
-            return f"age is {age_ms:.0f} ms; must be <= {limit_ms:g} ms"
-        if message.t_ns > world.now_ns and world.barrier.is_gating(message.source):
-            return f"t_ns is {message.t_ns}; must be <= {world.now_ns}, the newest gate"
+        now_ns = world.now_ns
+        if world.mode == "realtime":
+            age_ms, limit_ms = (now_ns - message.t_ns) / 1e6, world.scenario.time.max_command_age_ms
+            if age_ms > limit_ms:
+                return f"age is {age_ms:.0f} ms; must be <= {limit_ms:g} ms"
+        if gating and message.t_ns > now_ns:
+            return f"t_ns is {message.t_ns}; must be <= {now_ns}, the newest gate"
         return None
 
-    def _apply_ns(self, drone: str, kind: str, message: Any) -> int:
-        """Return when a command takes effect; say so for senders that are not in the lockstep."""
+    def _foreign_ns(self, drone: str, kind: str, message: Any) -> int:
+        """Say, and return, when a command takes effect whose sender is not in the lockstep."""
         world, source = self._world, message.source
-        if world.barrier.is_gating(source):
-            return message.t_ns + world.delay_ns
         apply_ns = world.next_ns + world.delay_ns
         fields = {name: getattr(message, name) for name in messages.fields(type(message))}
         text = f"{source} sends {kind} to {drone}"

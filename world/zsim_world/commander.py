@@ -10,7 +10,7 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 PROGRAM = 0  # priority of a program, contract
-SEEN_PER_DRONE = 256  # commands remembered to know them again; a rejoin repeats those of two gates
+SEEN_PER_DRONE = 32  # commands remembered to know them again; a rejoin repeats those of two gates
 
 
 class Due(NamedTuple):
@@ -52,6 +52,10 @@ class Commanders:
         holder = self._holders[drone]
         return holder.source if holder else None
 
+    def holders(self) -> list[str | None]:
+        """Return the name of each drone's commander."""
+        return [holder.source if holder else None for holder in self._holders]
+
     def push(self, drone: int, kind: str, message: Any, apply_ns: int) -> bool:
         """Keep a command until its instant; return False for one that has come before."""
         mark = (drone, kind, apply_ns, message.source, message.seq)
@@ -70,7 +74,7 @@ class Commanders:
 
         Drone and kind stand last in the order only to make it independent of arrival.
         """
-        instants = sorted(instant for instant in self._due if instant <= t_ns)
+        instants = sorted([instant for instant in self._due if instant <= t_ns])
         return [due for instant in instants for due in sorted(self._due.pop(instant), key=_order)]
 
     def refusal(self, due: Due) -> str | None:

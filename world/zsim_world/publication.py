@@ -3,11 +3,11 @@
 Per drone: its samples in time order, truth, and status last, which counts them.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numba.typed.typedlist import List
 from numpy.typing import NDArray
 
 from zsim import encoding, messages
@@ -15,8 +15,9 @@ from zsim.bundle import KINDS, Bundle, table_of
 from zsim.encoding import GAP, Layouts, Program, Words
 from zsim_world import battery, firmware, fleet, rigid_body, samples, sensor_set, vehicle
 from zsim_world.battery import percent
-from zsim_world.compiled import compiled, kernel
+from zsim_world.compiled import compiled, inlined, kernel
 from zsim_world.fleet import GPS_FIX, GPS_SATELLITES, Fleet
+from zsim_world.gate import hold
 from zsim_world.samples import Sampled
 
 MESSAGES = (  # of the kinds of a bundle, in their order
@@ -38,7 +39,7 @@ COMMANDER = len(firmware.MODES)  # the first commander among the words: nobody
 MODULES = (encoding, messages, fleet, firmware, rigid_body, samples, sensor_set, battery, vehicle)
 SOURCES = (Path(__file__), *(Path(str(module.__file__)) for module in MODULES))
 
-write = compiled(encoding.write)
+write = inlined(encoding.write)
 
 
 class Written(NamedTuple):
@@ -76,6 +77,15 @@ class Fleetwide(NamedTuple):
     counts: NDArray[np.int64]  # (N, kinds), messages that each key has had
 
 
+class Told(NamedTuple):
+    """What `publish` works on from gate to gate."""
+
+    words: Words
+    seen: Seen
+    wide: Fleetwide
+    out: Written
+
+
 class Publication:
     """Writes the messages of each gate and counts them per key."""
 
@@ -84,6 +94,7 @@ class Publication:
         self.table = table_of(fleet.names)
         bodies = fleet.bodies
         self._seen = Seen(bodies.state, bodies.accel, bodies.energy, bodies.vehicle, fleet.boards.memory)
+        self._commanders: list[str | None] = []  # of the last gate
         commanders = np.zeros(fleet.count, dtype=np.int64)
         counts = np.zeros((fleet.count, len(KINDS)), dtype=np.int64)
         self._fleetwide = Fleetwide(fleet.touching, np.array(fleet.gps_sigma_m), commanders, counts)
@@ -95,21 +106,22 @@ class Publication:
     def _rehearse(self) -> None:
         """Load or compile what the first gate needs."""
         uncounted = self._fleetwide._replace(counts=self._fleetwide.counts.copy())
-        publish(self._words, self._fleet.sampled, self._seen, uncounted, 0, self._written)
+        publish(hold(Told(self._words, self._seen, uncounted, self._written)), *self._fleet.sampled, 0)
 
-    def gate(self, holder: Callable[[int], str | None]) -> Bundle:
-        """Return the messages of the gate that the fleet stands at."""
+    def gate(self, commanders: list[str | None]) -> Bundle:
+        """Return the messages of the gate that the fleet stands at; `commanders` are the names of who flies each."""
         fleet, wide = self._fleet, self._fleetwide
         count = len(fleet.sampled.whose) + 2 * fleet.count
         if count > self._written.columns.shape[1]:
             self._make_room(2 * count)
-        for i in range(fleet.count):
-            wide.commanders[i] = self._number(holder(i))
+        if commanders != self._commanders:
+            wide.commanders[:] = [self._number(commander) for commander in commanders]
+            self._commanders = commanders
         out = self._written
-        size = publish(self._words, fleet.sampled, self._seen, wide, fleet.t_ns, out)
+        size = publish(self._held, *fleet.sampled, fleet.t_ns)
         which, stamps, ends = out.columns[:, :count].copy()
         seq = int(wide.counts[0, STATUS]) - 1
-        data = bytearray(out.data[:size].data)
+        data = out.data[:size].tobytes()
         return Bundle(fleet.t_ns, seq, self.table, which, stamps, ends, data, out.first.tolist())
 
     def _number(self, commander: str | None) -> int:
@@ -123,9 +135,10 @@ class Publication:
     def _make_room(self, count: int) -> None:
         columns, first = np.zeros((3, count), dtype=np.int64), np.zeros(self._fleet.count + 1, dtype=np.int64)
         self._written = Written(columns, first, np.zeros(count * LAYOUTS.room(self._words), dtype=np.uint8))
+        self._held = hold(Told(self._words, self._seen, self._fleetwide, self._written))
 
 
-@compiled
+@inlined
 def _fill_sample(row: Row, sampled: Sampled, m: int, sigma_m: float) -> None:
     """Put sample m of a gate into a row."""
     s, ints, floats = sampled.whose[m, samples.SENSOR], row.ints, row.floats
@@ -138,7 +151,7 @@ def _fill_sample(row: Row, sampled: Sampled, m: int, sigma_m: float) -> None:
         ints[3] = sampled.values[m, 1] != 0.0
 
 
-@compiled
+@inlined
 def _fill_truth(row: Row, state: NDArray, accel: NDArray) -> None:
     for k in range(rigid_body.ROTOR):
         row.floats[k] = state[k]
@@ -172,7 +185,7 @@ def _in_order(whose: NDArray, first: NDArray) -> NDArray:
     return order
 
 
-@compiled
+@inlined
 def _fill(row: Row, m: int, i: int, sampled: Sampled, seen: Seen, wide: Fleetwide, now_ns: int, count: int) -> int:
     """Put sample m of drone i, its truth or its status into a row, and count it; return its kind."""
     kind = sampled.whose[m, samples.SENSOR] if m >= 0 else TRUTH if m == -1 else STATUS
@@ -190,14 +203,21 @@ def _fill(row: Row, m: int, i: int, sampled: Sampled, seen: Seen, wide: Fleetwid
 
 
 @kernel(SOURCES)
-def publish(words: Words, sampled: Sampled, seen: Seen, wide: Fleetwide, now_ns: int, out: Written) -> int:
-    """Write the messages of a gate, drone by drone, and count them; return how many bytes that were."""
+def publish(held: List, whose: NDArray, values: NDArray, now_ns: int) -> int:
+    """Write the messages of a gate, drone by drone, and count them; return how many bytes that were.
+
+    Args:
+        held: a Told, by `hold`.
+        whose, values: of Sampled.
+    """
+    words, seen, wide, out = held[0]
+    sampled = Sampled(whose, values)
     floats = np.zeros(FLOATS)
     row, program = Row(np.zeros(INTS, np.int64), floats, floats.view(np.uint64)), Program(OPS, FIRST, LITERALS)
     drones, kinds = wide.counts.shape
     first, columns, at = out.first, out.columns, 0
-    _by_drone(sampled.whose, first)
-    order = _in_order(sampled.whose, first)
+    _by_drone(whose, first)
+    order = _in_order(whose, first)
     for i in range(drones):
         for place in range(first[i], first[i + 1]):
             kind = _fill(row, order[place], i, sampled, seen, wide, now_ns, first[i + 1] - first[i] - 1)

@@ -1,6 +1,7 @@
 """What a run measures of itself: rate, command age, deadline misses, how near drones came to each other."""
 
 import math
+from array import array
 from collections import deque
 from collections.abc import Iterable
 from typing import Any
@@ -9,8 +10,9 @@ import numpy as np
 
 from zsim_world.barrier import Participant
 
-GATES_KEPT = 1024  # gates whose publication time is remembered for the age of commands
+GATES_KEPT = 256  # gates whose publication time is remembered for the age of commands; 5 s, older ones are refused
 AGES_KEPT = 1_000_000  # ages kept for the percentiles; 8 MB
+MARK_NS = 10_000_000  # wall time between two marks of the rate, which looks back over a second
 
 
 class Ages:
@@ -18,7 +20,8 @@ class Ages:
 
     def __init__(self) -> None:
         self._published: dict[int, int] = {}
-        self._ages_ns: deque[int] = deque(maxlen=AGES_KEPT)
+        self._ages_ns = array("q")
+        self._oldest = 0  # place of the oldest age once so many are kept
 
     def published(self, t_ns: int, wall_ns: int) -> None:
         """Note when the gate t_ns was published."""
@@ -30,7 +33,14 @@ class Ages:
         """Note when a command stamped t_ns arrived; its age is unknown where no gate of that stamp is remembered."""
         published = self._published.get(t_ns)
         if published is not None:
-            self._ages_ns.append(wall_ns - published)
+            self._keep(wall_ns - published)
+
+    def _keep(self, age_ns: int) -> None:
+        if len(self._ages_ns) < AGES_KEPT:
+            self._ages_ns.append(age_ns)
+        else:
+            self._ages_ns[self._oldest] = age_ns
+            self._oldest = (self._oldest + 1) % AGES_KEPT
 
     def summary_ms(self) -> dict[str, float] | None:
         """Return p50, p99 and max in milliseconds, None when no command came."""
@@ -47,28 +57,27 @@ class Rate:
     def __init__(self) -> None:
         self._marks: deque[tuple[int, int]] = deque()
         self._start_wall_ns: int | None = None
-        self._last_wall_ns = 0
+        self._last = (0, 0)
 
     def gate(self, t_ns: int, wall_ns: int) -> None:
         """Note when the gate t_ns was published."""
         if self._start_wall_ns is None:
             self._start_wall_ns = wall_ns
-        self._last_wall_ns = wall_ns
-        self._marks.append((t_ns, wall_ns))
-        while len(self._marks) > 2 and wall_ns - self._marks[0][1] > 1_000_000_000:
-            self._marks.popleft()
+        self._last, marks = (t_ns, wall_ns), self._marks
+        while len(marks) > 1 and wall_ns - marks[0][1] > 1_000_000_000:
+            marks.popleft()
+        if not marks or wall_ns - marks[-1][1] >= MARK_NS:
+            marks.append(self._last)
 
     def now(self) -> float:
         """Return the factor over the last wall second."""
-        if len(self._marks) < 2:
-            return 0.0
-        (t0, w0), (t1, w1) = self._marks[0], self._marks[-1]
+        (t0, w0), (t1, w1) = self._marks[0] if self._marks else self._last, self._last
         return (t1 - t0) / (w1 - w0) if w1 > w0 else 0.0
 
     @property
     def wall_s(self) -> float:
         """Return the wall time from the first gate to the last."""
-        return 0.0 if self._start_wall_ns is None else (self._last_wall_ns - self._start_wall_ns) / 1e9
+        return 0.0 if self._start_wall_ns is None else (self._last[1] - self._start_wall_ns) / 1e9
 
 
 class Measurements:

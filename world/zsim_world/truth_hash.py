@@ -5,6 +5,7 @@ import hashlib
 import numpy as np
 
 COLUMNS = 13  # of a drone's state that count
+HELD_BYTES = 16_384  # hashed in one go, which takes as long as a few instants
 
 
 class TruthHash:
@@ -14,14 +15,24 @@ class TruthHash:
     """
 
     def __init__(self, drones: int) -> None:
+        row = np.dtype([("t", "<i8"), ("x", "<f8", COLUMNS)])
         self._hash = hashlib.sha256()
-        self._rows = np.zeros(drones, dtype=[("t", "<i8"), ("x", "<f8", COLUMNS)])
+        self._rows = np.zeros((max(1, HELD_BYTES // (drones * row.itemsize)), drones), dtype=row)
+        self._t, self._x = self._rows["t"], self._rows["x"]
+        self._held = 0
 
     def add(self, t_ns: int, state: np.ndarray) -> None:
         """Add one instant of N drones; state (N, 13 or more): position, velocity, orientation, angular velocity."""
-        self._rows["t"] = t_ns
-        self._rows["x"] = state[:, :COLUMNS]
-        self._hash.update(self._rows.data)
+        self._t[self._held] = t_ns
+        self._x[self._held] = state[:, :COLUMNS]
+        self._held += 1
+        if self._held == len(self._rows):
+            self._take_in()
+
+    def _take_in(self) -> None:
+        self._hash.update(self._rows[: self._held].data)
+        self._held = 0
 
     def hexdigest(self) -> str:
+        self._take_in()
         return self._hash.hexdigest()

@@ -19,7 +19,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Header, McapRecord, Schema
+from mcap.records import Channel, Header, McapRecord, Schema
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from zsim import __version__
@@ -29,10 +29,11 @@ HEAD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE = struct.Struct("<BQHIQQ")  # head, channel, sequence, log time, publish time; then the payload
 MESSAGE_FIXED = MESSAGE.size - HEAD.size  # bytes that a message's length counts beside its payload
 CHUNK_HEAD = struct.Struct("<QQQII")  # first, last log time, plain size, plain CRC, bytes of name
+SIZE = struct.Struct("<Q")  # of a chunk's content, behind the name
 INDEX_HEAD = struct.Struct("<HI")  # channel, bytes of its entries
 INDEX_ENTRY = 16  # bytes: log time, place in the chunk
 FOOTER_SIZE = HEAD.size + 20
-LEAST = {Opcode.CHUNK: CHUNK_HEAD.size + 8, Opcode.MESSAGE_INDEX: INDEX_HEAD.size}  # bytes that are always read
+LEAST = {Opcode.CHUNK: CHUNK_HEAD.size + SIZE.size, Opcode.MESSAGE_INDEX: INDEX_HEAD.size}  # bytes that are always read
 
 Source = bytes | mmap
 Known = TypeVar("Known", Schema, Channel)
@@ -163,29 +164,19 @@ def is_complete(source: Source) -> bool:
     return foot >= len(MAGIC) and source[foot] == Opcode.FOOTER and source[-len(MAGIC) :] == MAGIC
 
 
-def chunk(content: bytes, indexes: dict[int, list[int]]) -> list[bytes]:
-    """Return a run of message records as a chunk record and its message index records.
-
-    Args:
-        content: message records.
-        indexes: what `indexes_of(content)` returns.
-    """
-    record = Chunk(
-        compression="zstd",
-        data=_compressor().compress(content),
-        message_start_time=min(min(entries[::2]) for entries in indexes.values()),
-        message_end_time=max(max(entries[::2]) for entries in indexes.values()),
-        uncompressed_crc=zlib.crc32(content),
-        uncompressed_size=len(content),
-    )
-    return [packed(record), *packed_indexes(indexes)]
+def chunk(content: bytes | memoryview, first_ns: int, last_ns: int) -> list[bytes]:
+    """Return the parts of a chunk record that holds a run of message records, given their first and last log time."""
+    data, name = _compressor().compress(content), b"zstd"
+    head = CHUNK_HEAD.pack(first_ns, last_ns, len(content), zlib.crc32(content), len(name))
+    length = len(head) + len(name) + SIZE.size + len(data)
+    return [HEAD.pack(Opcode.CHUNK, length), head, name, SIZE.pack(len(data)), data]
 
 
 def chunk_head(source: Source, place: Place) -> ChunkHead:
     """Return the head of the chunk at a place."""
     first, last, size, crc, name = CHUNK_HEAD.unpack_from(source, place.body)
     at = place.body + CHUNK_HEAD.size
-    return ChunkHead(first, last, size, crc, source[at : at + name].decode("utf-8", "replace"), at + name + 8)
+    return ChunkHead(first, last, size, crc, source[at : at + name].decode("utf-8", "replace"), at + name + SIZE.size)
 
 
 def content_of(source: Source, place: Place) -> bytes | None:

@@ -1,40 +1,26 @@
 """Writes a record while a run goes on."""
 
-import struct
 from collections.abc import Callable, Sequence
 from io import FileIO
 from pathlib import Path
 from typing import Any, NoReturn
 
 import msgspec
-from mcap.opcode import Opcode
+import numpy as np
 from mcap.records import Channel, Schema
 
 from zsim import messages
 from zsim.bundle import PATTERNS_MAX, Bundle
 from zsim.errors import RecordError
 from zsim.record.finish import finish, finish_bare, write_all
-from zsim.record.layout import HEAD, MESSAGE, MESSAGE_FIXED, chunk, opening, packed
+from zsim.record.layout import chunk, opening, packed
+from zsim.record.open_chunk import OpenChunk
 
-CHUNK_BYTES = 256 * 1024  # not yet on disk at most, besides the last message
+CHUNK_BYTES = 1024 * 1024  # not yet on disk at most, besides the last message
 CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s nothing waits longer than 0.5 s
 CHANNELS_MAX = 65_535  # MCAP counts channels in 16 bits
-_SEQUENCE_MASK = 2**32 - 1  # MCAP counts messages of a channel in 32 bits
 _TIME_MAX = 2**64 - 1
-_MESSAGE = int(Opcode.MESSAGE)
-_pack, _pack_into = MESSAGE.pack, MESSAGE.pack_into
 _encode = messages.encode
-
-
-class _Channel:
-    """A key on record: its number in the file, and how many messages it has had."""
-
-    __slots__ = ("count", "entries", "number")
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-        self.count = 0
-        self.entries: list[int] = []  # log times and places of its messages in the open chunk, by turns
 
 
 class RecordWriter:
@@ -57,14 +43,12 @@ class RecordWriter:
         self.path = Path(path)
         self.messages = 0
         self.refused = 0
-        self._channels: dict[str, _Channel] = {}
+        self._channels: dict[str, int] = {}  # by key, counted from 1
         self._table: Sequence[str] = ()
-        self._patterns: dict[bytes, list[_Channel]] = {}  # of the bundles of a table
+        self._patterns: dict[bytes, bytes] = {}  # channels of the bundles of a table
         self._schemas: dict[str, int] = {}
         self._ahead: list[bytes] = []  # schemas and channels that the open chunk is the first to use
-        self._open: list[bytes | bytearray] = []
-        self._size = 0
-        self._since_ns = 0  # first message of the open chunk
+        self._open = OpenChunk(CHUNK_BYTES + CHUNK_BYTES // 4)
         self._seen = (0, 0)  # where the file ended at a tick, and when that tick was
         self._end = 0  # of the last whole chunk
         self._error = ""
@@ -85,13 +69,11 @@ class RecordWriter:
             RecordError: the disk is full or gone; the file was closed at its last whole chunk.
         """
         channel = self._channels.get(key) or self._register(key, encoding)
-        if channel is None:
+        if not channel:
             self.refused += 1
             return
-        try:
-            self._take(channel, payload, t_ns, wall_ns)
-        except struct.error:
-            self._take(channel, payload, _time(t_ns), _time(wall_ns))
+        self._open.add(channel, payload, _time(t_ns), _time(wall_ns))
+        self._took(1, wall_ns)
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
         """Take one message of this process, encoded as for the wire.
@@ -100,13 +82,14 @@ class RecordWriter:
             RecordError: as `add`.
         """
         channel = self._channels.get(key) or self._register(key, messages.encoding(key))
-        if channel is None:
+        if not channel:
             self.refused += 1
             return
-        self._take(channel, _encode(message), message.t_ns, wall_ns)
+        self._open.add(channel, _encode(message), message.t_ns, wall_ns)
+        self._took(1, wall_ns)
 
     def add_bundle(self, bundle: Bundle, wall_ns: int) -> None:
-        """Take the messages of a bundle, and its buffer, to which the bytes before each payload are added here.
+        """Take the messages of a bundle.
 
         Raises:
             RecordError: as `add`.
@@ -115,22 +98,16 @@ class RecordWriter:
         if channels is None:
             self._add_each(bundle, wall_ns)
             return
-        if not self._size:
-            self._since_ns = wall_ns
-        buffer, at, start = bundle.buffer, self._size, 0
-        for channel, t_ns, end in zip(channels, bundle.stamps.tolist(), bundle.ends.tolist(), strict=True):
-            count, length = channel.count, end - start - HEAD.size
-            _pack_into(buffer, start, _MESSAGE, length, channel.number, count & _SEQUENCE_MASK, t_ns, wall_ns)
-            channel.entries += (t_ns, at + start)
-            channel.count = count + 1
-            start = end
-        self._open.append(buffer)
-        self.messages += len(bundle)
-        self._size = at + start
-        if self._size >= CHUNK_BYTES or wall_ns - self._since_ns >= CHUNK_AGE_NS:
+        self._open.add_bundle(channels, bundle, wall_ns)
+        self._took(len(bundle), wall_ns)
+
+    def _took(self, count: int, wall_ns: int) -> None:
+        """Note that messages have come into the open chunk; end one that is large or old."""
+        self.messages += count
+        if self._open.size >= CHUNK_BYTES or wall_ns - self._open.since_ns >= CHUNK_AGE_NS:
             self._end_chunk()
 
-    def _channels_of(self, bundle: Bundle) -> list[_Channel] | None:
+    def _channels_of(self, bundle: Bundle) -> bytes | None:
         """Return the channel of each message, None if there is none left for one."""
         if bundle.table is not self._table:
             self._table = bundle.table
@@ -141,9 +118,9 @@ class RecordWriter:
             places: list[int] = bundle.which.tolist()
             keys = [bundle.table[place] for place in places]
             found = [self._channels.get(key) or self._register(key, messages.encoding(key)) for key in keys]
-            channels = [channel for channel in found if channel is not None]
-            if len(channels) < len(keys):
+            if not all(found):
                 return None
+            channels = np.array(found).tobytes()
             if len(self._patterns) < PATTERNS_MAX:
                 self._patterns[pattern] = channels
         return channels
@@ -151,19 +128,6 @@ class RecordWriter:
     def _add_each(self, bundle: Bundle, wall_ns: int) -> None:
         for (key, payload), t_ns in zip(bundle.encoded, bundle.stamps.tolist(), strict=True):
             self.add(key, payload, messages.encoding(key), t_ns, wall_ns)
-
-    def _take(self, channel: _Channel, payload: bytes, t_ns: int, wall_ns: int) -> None:
-        length, count, at = len(payload) + MESSAGE_FIXED, channel.count, self._size
-        head = _pack(_MESSAGE, length, channel.number, count & _SEQUENCE_MASK, t_ns, wall_ns)
-        if not at:
-            self._since_ns = wall_ns
-        self._open += (head, payload)
-        channel.entries += (t_ns, at)
-        channel.count = count + 1
-        self.messages += 1
-        self._size = size = at + HEAD.size + length
-        if size >= CHUNK_BYTES or wall_ns - self._since_ns >= CHUNK_AGE_NS:
-            self._end_chunk()
 
     def tick(self, wall_ns: int) -> None:
         """Put the open chunk on disk when it is old; call it every 0.1 s, also while nothing arrives.
@@ -175,8 +139,8 @@ class RecordWriter:
             RecordError: as `add`.
         """
         end, since_ns = self._seen
-        if not self._open or end != self._end:
-            self._seen = (self._end if self._open else 0, wall_ns)
+        if not self._open.size or end != self._end:
+            self._seen = (self._end if self._open.size else 0, wall_ns)
         elif wall_ns - since_ns >= CHUNK_AGE_NS:
             self._end_chunk()
 
@@ -186,7 +150,7 @@ class RecordWriter:
         Raises:
             RecordError: as `add`.
         """
-        if self._open:
+        if self._open.size:
             self._end_chunk()
 
     def close(self) -> None:
@@ -207,14 +171,15 @@ class RecordWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _register(self, key: str, encoding: str) -> _Channel | None:
+    def _register(self, key: str, encoding: str) -> int:
+        """Return the number of a new channel, 0 if there is none left."""
         if len(self._channels) >= CHANNELS_MAX:
-            return None
-        self._channels[key] = channel = _Channel(len(self._channels) + 1)
+            return 0
+        self._channels[key] = number = len(self._channels) + 1
         media, _, name = encoding.partition(";")
-        record = Channel(channel.number, key, _message_encoding(media), {}, self._schema(key, name))
+        record = Channel(number, key, _message_encoding(media), {}, self._schema(key, name))
         self._ahead.append(packed(record))
-        return channel
+        return number
 
     def _schema(self, key: str, name: str) -> int:
         """Return the number of the schema of a key's messages, 0 when nothing names them."""
@@ -228,21 +193,12 @@ class RecordWriter:
         return self._schemas.get(name, 0)
 
     def _end_chunk(self) -> None:
-        content = b"".join(self._open)
-        self._open.clear()
-        self._size = 0
+        content = self._open.take()
         if self._error:
             raise RecordError(self._error)
-        self._append(b"".join([*self._ahead, *chunk(content, self._take_indexes())]))
+        record = chunk(content.data, content.first_ns, content.last_ns)
+        self._append(b"".join([*self._ahead, *record, *content.indexes()]))
         self._ahead.clear()
-
-    def _take_indexes(self) -> dict[int, list[int]]:
-        """Return the indexes of the open chunk by channel; the next chunk begins with none."""
-        indexes = {}
-        for channel in self._channels.values():
-            if channel.entries:
-                indexes[channel.number], channel.entries = channel.entries, []
-        return indexes
 
     def _append(self, data: bytes) -> None:
         self._guarded(lambda: write_all(self._file, data))
@@ -290,4 +246,4 @@ def _message_encoding(media: str) -> str:
 
 def _time(value: int) -> int:
     """Return a time that MCAP can hold."""
-    return min(max(int(value), 0), _TIME_MAX)
+    return value if type(value) is int and 0 <= value <= _TIME_MAX else min(max(int(value), 0), _TIME_MAX)
