@@ -4,6 +4,8 @@ import json
 import logging
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from typing import Any
 import psutil
 import pyarrow.parquet as pq
 import pytest
-from federation import PAIR, Federation, Role
+from federation import PAIR, Federation, Role, free_port
 from wire import PATIENCE_S
 
 from zsim_deploy.sweep.folder import load, locked
@@ -144,6 +146,17 @@ def test_runs_that_fail_are_rows(federation: Federation) -> None:
     assert reason in (out / "report.html").read_text()
 
 
+@pytest.mark.parametrize("name", ["stüp.yaml", b"st\xfcp.yaml".decode(errors="surrogateescape")])
+def test_a_scenario_file_of_any_name(federation: Federation, name: str) -> None:
+    """Also where the locale knows nothing but ASCII."""
+    out, path = federation.folder / "sweep", federation.write(PAIR, name)
+    ascii_only = ("env", "LC_ALL=C", "PYTHONUTF8=0")
+    options = ("--duration", "0.2", "--workers", "1", "--no-report", "--out", str(out))
+    federation.start("sweep", path, *options, prefix=ascii_only).ends(with_code=0)
+    assert [row["failure"] for row in rows(out)] == [None]
+    federation.start("sweep", path, *options).ends(with_code=0)
+
+
 BAD = {
     "no such field": (("--vary", "wings=1"), "wings is not known; allowed: "),
     "several at once": (("--vary", "duration_s=1,-1", "--vary", "time.gate_ms=0"), "\npair.yaml: duration_s is -1"),
@@ -196,3 +209,40 @@ def test_a_dask_cluster_flies_the_same_rows(federation: Federation, undisturbed:
     assert "1 of them is done already" in role.text()
     assert "2 Dask workers at tcp://127.0.0.1:" in role.text()
     assert without_wall(out) == without_wall(undisturbed)
+
+
+@pytest.fixture
+def hosts(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """Address and process of a Dask scheduler that can be killed; it has one worker."""
+    pytest.importorskip("distributed", reason="the extra `dask` is not installed")
+    from distributed import Client
+
+    dask, said = [sys.executable, "-m", "dask"], tmp_path / "dask.log"
+    address = f"tcp://127.0.0.1:{free_port()}"
+    where = ("--no-dashboard", "--host", "127.0.0.1")
+    with said.open("w") as log:
+        scheduler = subprocess.Popen([*dask, "scheduler", *where, "--port", address.rpartition(":")[2]], stderr=log)
+        worker = subprocess.Popen([*dask, "worker", address, *where, "--nthreads", "1", "--no-nanny"], stderr=log)
+    try:
+        with Client(address, timeout=PATIENCE_S, set_as_default=False) as client:
+            client.wait_for_workers(1, timeout=PATIENCE_S)
+        yield address, scheduler
+    finally:
+        for process in (worker, scheduler):
+            process.kill()
+            process.wait()
+
+
+def test_a_dask_scheduler_that_dies_ends_the_sweep_in_a_line(
+    federation: Federation, hosts: tuple[str, subprocess.Popen[bytes]]
+) -> None:
+    (address, scheduler), out = hosts, federation.folder / "sweep"
+    path = federation.write(PAIR, "pair.yaml")
+    command = ("sweep", path, "--vary", "seed", "--duration", "2", "--out", str(out), "--no-report", "--dask", address)
+    role = federation.start(*command, "--runs", "500")
+    role.line(r" [1-9]\d* / 500 runs")
+    scheduler.kill()
+    role.ends(with_code=2)
+    assert role.text().endswith(f"--dask {address}: the cluster is gone; the same command goes on")
+    assert "Traceback" not in role.text()
+    assert 1 <= len(rows(out)) < 500

@@ -14,6 +14,7 @@ from zsim.errors import ScenarioError
 from zsim_deploy.sweep.axes import Draw, Grid, Seeds, parse
 from zsim_deploy.sweep.design import Design, make_plan
 from zsim_deploy.sweep.document import read
+from zsim_deploy.sweep.places import inside, place
 from zsim_deploy.sweep.plan import Plan, difference
 
 STEP = Path(__file__).parents[2] / "scenarios/step.yaml"
@@ -62,6 +63,7 @@ def test_variations(text: str, axis: Seeds | Grid | Draw) -> None:
         ("duration_s=uniform(1)", "must hold two numbers"),
         ("duration_s=normal(1,0)", "must be finite numbers with std > 0"),
         ("duration_s=normal(nan,1)", "must be finite numbers"),
+        ("wind.gust_m_s=uniform(-1e308,1e308)", "must be finite numbers with low < high, high - low finite too"),
     ],
 )
 def test_what_is_no_variation(text: str, reason: str) -> None:
@@ -176,3 +178,73 @@ def test_which_plans_are_the_same_sweep() -> None:
     ):
         assert said in (difference(one, msgspec.structs.replace(one, **changed)) or "")
     assert msgspec.json.decode(msgspec.json.encode(one), type=Plan) == one
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "reason"),
+    [
+        ("drones.drone2.mass_kg=0.40,0.45", "drones[1].mass_kg=0.42,0.43", "drones[1].mass_kg varies already by"),
+        (
+            "drones[0].mass_kg=uniform(0.4,0.5)",
+            "drones[drone1].mass_kg=0.42",
+            "drones[drone1].mass_kg varies already by",
+        ),
+        (
+            "clusters.main.gains={proportional_1_s: 0.5},{proportional_1_s: 0.7}",
+            "clusters[0].gains.proportional_1_s=0.6,0.4",
+            "clusters[0].gains.proportional_1_s is part of what varies already by",
+        ),
+        ("wind.gust_m_s=0,1", "environment.wind={gust_m_s: 2}", "environment.wind holds what varies already by"),
+    ],
+)
+def test_one_field_varies_once_under_whichever_of_its_names(first: str, second: str, reason: str) -> None:
+    (fault,) = faults(first, second)
+    assert fault.startswith(f"--vary {second}: {reason} {first}; ")
+    assert plan(first).vary == (first,)
+    assert plan(second).vary == (second,)
+
+
+def test_a_place_has_one_name() -> None:
+    document = {"drones": [{"name": "a"}, {"name": "b.c"}, 3], "seed": 1}
+    for path, steps in {
+        "drones.a.mass_kg": ("drones", 0, "mass_kg"),
+        "drones[b.c].mass_kg": ("drones", 1, "mass_kg"),
+        "drones.01.mass_kg": ("drones", 1, "mass_kg"),
+        "drones[2].x.y": ("drones", 2, "x", "y"),
+        "drones.nobody.x": ("drones", "nobody", "x"),
+        "wind.gust_m_s": ("environment", "wind", "gust_m_s"),
+        "seed.x": ("seed", "x"),
+    }.items():
+        assert place(document, path) == steps
+    assert inside(("a", 1, "b"), ("a", 1))
+    assert not inside(("a", 1), ("a", 1))
+    assert not inside(("a", 1), ("a", 1, "b"))
+
+
+def test_a_run_does_not_change_the_values_of_an_axis() -> None:
+    """Two axes of one place are refused, so that it takes a plan that nobody checked to set a part of a value."""
+    document, _ = read(STEP, [])
+    gains, part = "clusters.main.gains={proportional_1_s: 0.5}", "clusters.main.gains.proportional_1_s=0.6"
+    design = Design(Plan(source=STEP.name, document=document, vary=(gains, part), runs=1))
+    assert design.scenario(0).clusters[0].gains.proportional_1_s == 0.6
+    assert design.values(0)["clusters.main.gains"] == {"proportional_1_s": 0.5}
+
+
+def test_a_refused_variation_brings_no_second_fault() -> None:
+    (fault,) = faults("duration_s=uniform(2,1)", runs=20)
+    assert "must be finite numbers with low < high" in fault
+    assert len(faults("duration_s=uniform(2,1)", "wind.gust_m_s=0,1,2", runs=2)) == 2
+
+
+@pytest.mark.parametrize("name", ["stüp.yaml", b"st\xfcp.yaml".decode(errors="surrogateescape")])
+def test_a_file_may_have_any_name(name: str) -> None:
+    document, _ = read(STEP, [])
+    of = make_plan(name, document, ["seed"], 2)
+    assert of.source == ("stüp.yaml" if name.isprintable() else "st\ufffdp.yaml")
+    assert msgspec.json.decode(msgspec.json.encode(of), type=Plan) == of
+
+
+def test_a_sweep_is_the_same_under_the_short_name_of_a_field() -> None:
+    one = plan("seed", "wind.gust_m_s=0,1", runs=4)
+    assert difference(one, plan("seed", f"{GUST}=0,1", runs=4)) is None
+    assert difference(one, plan("seed", f"{GUST}=0,2", runs=4)) is not None

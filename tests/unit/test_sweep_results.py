@@ -21,7 +21,7 @@ from zsim_deploy.sweep.design import Design
 from zsim_deploy.sweep.figures import slices
 from zsim_deploy.sweep.folder import Folder, load, locked
 from zsim_deploy.sweep.plan import Plan, is_sweep
-from zsim_deploy.sweep.points import Results, parameters, spread
+from zsim_deploy.sweep.points import Parameter, Results, parameters, spread
 from zsim_deploy.sweep.report import make_sweep_report
 from zsim_deploy.sweep.report import table as shown_table
 from zsim_deploy.sweep.row import Result, Row, row
@@ -190,6 +190,23 @@ def test_a_folder_goes_on_with_its_own_plan_and_refuses_any_other(tmp_path: Path
         load(out)
 
 
+def test_a_sweep_of_which_nothing_is_finished_claims_no_folder(tmp_path: Path) -> None:
+    with locked(tmp_path, plan("seed", runs=1_000_000)) as folder:
+        folder.compact()
+    with locked(tmp_path, plan("seed", "duration_s=1,2", runs=4)) as folder, folder.journal() as book:
+        book.append(well(folder.plan, 1))
+    with pytest.raises(RunError, match="holds another sweep"), locked(tmp_path, plan("seed", runs=4)):
+        pass
+
+
+def test_a_plan_that_is_no_text_is_refused_in_a_line(tmp_path: Path) -> None:
+    with (
+        pytest.raises(RunError, match=r"plan\.json: cannot be written \('\\udcfc' is no character\)"),
+        locked(tmp_path, plan("name=a\udcfc")),
+    ):
+        pass
+
+
 def test_a_crash_between_table_and_journal_doubles_nothing(tmp_path: Path) -> None:
     of = plan("seed", runs=2)
     folder = Folder(tmp_path, of)
@@ -282,8 +299,51 @@ def test_parameters_are_found_in_the_names_of_columns() -> None:
         "errors.left.p.true_rms",
         "clusters.a.b.errors.yaw.true_rms",
     ]
-    found = parameters(columns)
-    assert found == {"errors.x_c": "x_c", "errors.left.p": "left.p", "clusters.a.b.errors.yaw": "yaw"}
+    found = parameters(columns, ["main", "a.b"])
+    assert found == {
+        "errors.x_c": Parameter("x_c", "main"),
+        "errors.left.p": Parameter("left.p", "main"),
+        "clusters.a.b.errors.yaw": Parameter("yaw", "a.b"),
+    }
+    assert parameters(columns[:1], ["main"]) == parameters(columns[:1], []) == {"errors.x_c": Parameter("x_c")}
+    hostile = parameters(["clusters.errors.errors.x_c.est_std"], ["a", "errors"])
+    assert hostile == {"clusters.errors.errors.x_c": Parameter("x_c", "errors")}
+    assert [each.labelled("x_c (m)") for each in hostile.values()] == ["errors: x_c (m)"]
+
+
+def engaged(of: Plan, run: int, **since_s: float | None) -> Row:
+    """Return the row of a run with clusters that were engaged, or never."""
+    begun = {f"clusters.{name}.engaged_s": value for name, value in since_s.items()}
+    known = {name: 0.1 if value else None for name, value in since_s.items()}
+    errors = {f"clusters.{name}.errors.x_c.true_rms": value for name, value in known.items() if name != "main"}
+    flown = {**well(of, run), "engaged": None not in since_s.values()}
+    for name in [name for name in flown if name.startswith("errors.") and not known["main"]]:
+        flown[name] = None
+    return {**flown, **begun, **errors}
+
+
+def test_the_report_says_which_cluster_and_how_many_were_engaged(tmp_path: Path) -> None:
+    of = plan("seed", "duration_s=1,2", runs=8)
+    rows = [
+        engaged(of, run, main=5.0 if run % 2 or run < 4 else None, errors=6.0 if run % 2 else None) for run in range(8)
+    ]
+    page = report_of(tmp_path, of, rows)
+    assert "<th>main: x_c (m)</th>" in page
+    assert "<th>errors: x_c (m)</th>" in page
+    assert "<td>main: beta (rad)</td>" in page
+    assert "In 4 runs that ended well a cluster was never engaged within the judged window" in page
+    summary = msgspec.json.decode((tmp_path / "summary.json").read_bytes())
+    assert [point["engaged"] for point in summary["points"]] == [0, 4]
+    assert [point["spreads"]["errors.x_c.true_rms"]["runs"] for point in summary["points"]] == [2, 4]
+    assert "clusters.errors.errors.x_c.true_rms" not in summary["points"][0]["spreads"]
+    assert summary["not_engaged"] == 4
+    with locked(tmp_path, of) as folder:
+        again = folder.compact()
+    assert [row["clusters.errors.engaged_s"] for row in again] == [None, 6.0] * 4
+    assert (
+        Results(Design(of), table.read(tmp_path / "sweep.parquet")).summary().json()
+        == (tmp_path / "summary.json").read_bytes()
+    )
 
 
 def test_columns_of_a_failed_run_are_no_samples() -> None:

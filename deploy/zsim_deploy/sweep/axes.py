@@ -97,8 +97,8 @@ def _draw(path: str, kind: str, given: str) -> Draw:
     except ValueError:
         raise ValueError(f"has {kind}({given[:40]}); must hold two numbers") from None
     span = second - first if kind == "uniform" else second
-    if not (math.isfinite(first) and math.isfinite(second) and span > 0):
-        need = "low < high" if kind == "uniform" else "std > 0"
+    if not (math.isfinite(first) and math.isfinite(second) and 0 < span < math.inf):
+        need = "low < high, high - low finite too" if kind == "uniform" else "std > 0"
         raise ValueError(f"has {kind}({given[:40]}); must be finite numbers with {need}")
     return Draw(path, kind, first, second)
 

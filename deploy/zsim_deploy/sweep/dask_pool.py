@@ -4,6 +4,7 @@ Dask flies a run again whose worker died, and keeps a run that was fatal to seve
 """
 
 import asyncio
+import logging
 import threading
 from collections.abc import Callable, Generator, Iterator
 from typing import Any
@@ -44,6 +45,7 @@ class DaskPool:
     def __init__(self, address: str, say: Callable[[str], None]) -> None:
         self._address = address
         self._say = say
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what ends the sweep is raised here
         try:
             asyncio.run(_reach(address))  # first, for a client that reaches nobody is slow to give up
             self._client: Any = Client(address, timeout=REACH_S, set_as_default=False)
@@ -57,15 +59,21 @@ class DaskPool:
         Raises:
             RunError: the cluster is gone, or no run can be kept.
         """
-        with self._client:
-            self._await_workers()
-            flying = _as_completed(loop=self._client.loop)
-            asked: dict[str, Task] = {}
+        try:
+            with self._client:
+                yield from self._rows(tasks)
+        except (OSError, CancelledError) as error:  # links that break are OSErrors too
+            raise RunError(f"--dask {self._address}: the cluster is gone; the same command goes on") from error
+
+    def _rows(self, tasks: Iterator[Task]) -> Generator[Row]:
+        self._await_workers()
+        flying = _as_completed(loop=self._client.loop)
+        asked: dict[str, Task] = {}
+        self._fill(flying, asked, tasks)
+        for future in flying:
+            task = asked.pop(future.key)
+            yield self._row(future, task)
             self._fill(flying, asked, tasks)
-            for future in flying:
-                task = asked.pop(future.key)
-                yield self._row(future, task)
-                self._fill(flying, asked, tasks)
 
     def _await_workers(self) -> None:
         if not self._client.nthreads():
@@ -93,8 +101,8 @@ class DaskPool:
             return future.result()
         except KilledWorker:
             return failed(task, "several workers died of it, see Dask's allowed-failures")
-        except CancelledError as error:
-            raise RunError(f"--dask {self._address}: the cluster is gone; the same command goes on") from error
+        except CancelledError:
+            raise
         except Exception as error:  # what `fly` raises stands for something that no further run would survive
             raise RunError(f"--dask {self._address}: {reason_of(error)}") from error
 

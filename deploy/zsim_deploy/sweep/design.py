@@ -13,6 +13,7 @@ from zsim import overrides, scenario_file
 from zsim.errors import ScenarioError
 from zsim.scenario import Scenario
 from zsim_deploy.sweep.axes import SEED, Axis, Draw, Grid, parse, text_of
+from zsim_deploy.sweep.places import Place, inside, place
 from zsim_deploy.sweep.plan import RUNS_MAX, Plan
 
 FAULTS_MAX = 100  # lines; what follows is counted
@@ -131,12 +132,13 @@ def make_plan(
     Raises:
         ScenarioError: with every fault of the variations and of what comes of them, a line each.
     """
-    texts, wrong = _parsed(vary)
+    texts, wrong = _parsed(vary, document)
     faults = [*before, *wrong]
+    source = source.encode(errors="surrogateescape").decode(errors="replace")  # a file's name may be any bytes
     plan = Plan(source=source, document=document, vary=tuple(texts), runs=runs or 1, records=records)
     plan = msgspec.structs.replace(plan, runs=runs or Design(plan).points)
     design = Design(plan)
-    faults += _count_faults(design)
+    faults += _count_faults(design, all_known=not wrong)
     if plan.runs <= RUNS_MAX:
         faults += _faults(lambda _: scenario_file.resolve(copy.deepcopy(document), source), 0)
         faults += [fault for fault in design.faults(progress) if fault not in faults]
@@ -146,30 +148,50 @@ def make_plan(
     return plan
 
 
-def _parsed(vary: list[str]) -> tuple[list[str], list[str]]:
+def _parsed(vary: list[str], document: dict[str, Any]) -> tuple[list[str], list[str]]:
     """Return the texts of `--vary` that can be taken, and a line for each of the others."""
-    taken: dict[str, str] = {}
+    taken: dict[Place, str] = {}
     faults = []
     for text in vary:
-        shown = text[:80] if text.isprintable() else repr(text)[:80]
+        shown = _shown(text)
         try:
             path = parse(text).path
         except ValueError as error:
             faults.append(f"--vary {shown}: {error}")
             continue
-        if path in taken:
-            faults.append(f"--vary {shown}: {path} varies already by {taken[path]}; give it once")
-        taken.setdefault(path, text)
+        where = place(document, path)
+        fault = _overlap(path, where, taken)
+        if fault:
+            faults.append(f"--vary {shown}: {fault}")
+        else:
+            taken[where] = text
     return list(taken.values()), faults
 
 
-def _count_faults(design: Design) -> list[str]:
+def _shown(text: str) -> str:
+    return text[:80] if text.isprintable() else repr(text)[:80]
+
+
+def _overlap(path: str, where: Place, taken: dict[Place, str]) -> str | None:
+    """Say what is wrong with a path of which a part, or the whole, varies already."""
+    for other, text in taken.items():
+        if where == other:
+            return f"{path} varies already by {_shown(text)}; give it once"
+        if inside(where, other):
+            return f"{path} is part of what varies already by {_shown(text)}; vary one of the two"
+        if inside(other, where):
+            return f"{path} holds what varies already by {_shown(text)}; vary one of the two"
+    return None
+
+
+def _count_faults(design: Design, all_known: bool) -> list[str]:
+    """Return what is wrong with the number of runs; `all_known`: no axis was refused, that could be one by chance."""
     runs, points = design.plan.runs, design.points
     if runs > RUNS_MAX:
         return [f"--runs is {runs}; must be at most {RUNS_MAX}"]
     if runs < points:
         return [f"--runs is {runs}; must be at least {points}, the combinations of the grid"]
-    if runs > points and all(isinstance(axis, Grid) for axis in design.axes):
+    if all_known and runs > points and all(isinstance(axis, Grid) for axis in design.axes):
         return [f"--runs is {runs}; must be {points}, for further ones would have the same bits, or add --vary seed"]
     return []
 
@@ -183,6 +205,6 @@ def _faults(make: Callable[[int], Scenario], run: int) -> list[str]:
 
 
 def _assign(document: dict[str, Any], path: str, value: Any) -> str | None:
-    """Set a field of a document; return the fault if there is one."""
-    fault = overrides.apply(document, f"{path}={text_of(value)}", lambda _: value)
+    """Set a field of a document to a copy of a value; return the fault if there is one."""
+    fault = overrides.apply(document, f"{path}={text_of(value)}", lambda _: copy.deepcopy(value))
     return f"--vary {fault.removeprefix('--set ')}" if fault else None

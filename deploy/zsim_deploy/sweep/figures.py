@@ -13,7 +13,7 @@ from zsim_deploy.report.canvas import BLACK, BLUE, GREEN, GREY, VERMILION, dress
 from zsim_deploy.report.cluster_figures import label
 from zsim_deploy.report.figures import Named
 from zsim_deploy.sweep import intervals
-from zsim_deploy.sweep.points import Results
+from zsim_deploy.sweep.points import Parameter, Results
 
 Samples = NDArray[np.float64]
 
@@ -37,14 +37,14 @@ def figures(results: Results) -> Iterator[Named]:
             "true_rms.png",
             "How well the formation was flown",
             "RMS of truth − desired within the window, a sample per run." + _legend(results),
-            _panels(results, {f"{prefix}.true_rms": name for prefix, name in parameters.items()}, {}),
+            _panels(results, {f"{prefix}.true_rms": each for prefix, each in parameters.items()}, {}),
         )
         yield Named(
             "est_std.png",
             "Standard deviations as the controller sees them, beside the paper's Table I",
             "Standard deviation of estimate − desired within the window, a sample per run; dashed: the paper's figure."
             + _legend(results),
-            _panels(results, {f"{prefix}.est_std": name for prefix, name in parameters.items()}, paper.TABLE_1),
+            _panels(results, {f"{prefix}.est_std": each for prefix, each in parameters.items()}, paper.TABLE_1),
         )
     yield Named(
         "safety.png",
@@ -73,16 +73,16 @@ def _legend(results: Results) -> str:
     return f" Boxes: quartiles and median, whiskers to 1.5 of the box. Orange: mean with its {level} interval.{more}"
 
 
-def _panels(results: Results, columns: dict[str, str], printed: dict[str, float]) -> Figure:
-    """Return a panel per column, given with the name of its parameter."""
+def _panels(results: Results, columns: dict[str, Parameter], printed: dict[str, float]) -> Figure:
+    """Return a panel per column, given with its parameter."""
     across = COLUMNS if results.design.points <= NARROW_MAX else COLUMNS - 1
     rows = -(-len(columns) // across)
     figure = new_figure(12, 0.8 + rows * (2.7 if _turned(results) else 2.4))
     grid = figure.subplots(rows, across, squeeze=False).ravel()
-    for axes, (column, name) in zip(grid, columns.items(), strict=False):
-        _distribution(axes, results, column, label(name))
-        if name in printed:
-            _mark(axes, printed[name], results.design.points == 1)
+    for axes, (column, parameter) in zip(grid, columns.items(), strict=False):
+        _distribution(axes, results, column, parameter.labelled(label(parameter.name)))
+        if parameter.name in printed:
+            _mark(axes, printed[parameter.name], results.design.points == 1)
     for axes in grid[len(columns) :]:
         axes.set_visible(False)
     if printed:
@@ -214,13 +214,13 @@ def _shares(axes: Axes, results: Results) -> None:
         axes.set_xlim(-0.8, 0.8)
 
 
-def _scatter(results: Results, path: str, parameters: dict[str, str]) -> Figure:
+def _scatter(results: Results, path: str, parameters: dict[str, Parameter]) -> Figure:
     rows = -(-len(parameters) // COLUMNS)
     figure = new_figure(12, 0.6 + 2.5 * rows)
     grid = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
     x = results.values(path)
-    for axes, (prefix, name) in zip(grid, parameters.items(), strict=False):
-        dress(axes, label(name))
+    for axes, (prefix, parameter) in zip(grid, parameters.items(), strict=False):
+        dress(axes, parameter.labelled(label(parameter.name)))
         axes.set_xlabel(path if len(path) <= 40 else _short(path), fontsize=9)
         y = results.values(f"{prefix}.true_rms")
         axes.plot(x, y, ".", color=BLUE, ms=4, alpha=0.45, mew=0, zorder=2)

@@ -4,12 +4,13 @@ import gc
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from zsim import keys, scenario_file
 from zsim.bundle import Bundle
@@ -20,10 +21,11 @@ from zsim.record import RecordWriter
 from zsim.scenario import Scenario
 from zsim_deploy.in_process import agents
 from zsim_deploy.report.flight import Flight
+from zsim_deploy.report.formation import Formation
 from zsim_deploy.report.make import formations_of
 from zsim_deploy.report.reading import Reading
 from zsim_deploy.report.summary import Summary, summarise
-from zsim_deploy.sweep.row import Result, Row, failed, row
+from zsim_deploy.sweep.row import Result, Row, engaged_column, failed, row
 from zsim_deploy.sweep.task import Task
 from zsim_world.world import World
 
@@ -40,14 +42,16 @@ def fly(task: Task) -> Row:
     try:
         with _record(task) as writer:
             flight, diverged = flown(task.scenario, writer)
-        summary = _summary(flight)
+        formations = formations_of(flight)
+        summary = summarise(flight, formations, Path())  # the world lived to say all that else needs the record
     except (RecordError, OSError):
         raise
     except Exception as error:  # of any kind: the scenario brought it about
         return failed(task, reason_of(error), **where)
     finally:
         gc.collect()
-    return _row(task, flight, summary, diverged, where)
+    engaged = engaged_s(formations, summary.window_s)
+    return _row(task, flight, summary, engaged, diverged, where)
 
 
 def reason_of(error: BaseException) -> str:
@@ -86,28 +90,67 @@ def flown(scenario: Scenario, writer: RecordWriter | None = None) -> tuple[Fligh
 
 @contextmanager
 def _record(task: Task) -> Iterator[RecordWriter | None]:
-    """Yield what writes the record, None where none is kept; a run cut short leaves a folder named .part."""
+    """Yield what writes the record, None where none is kept; one that could not be written whole stays named .part."""
     if task.record is None:
         yield None
         return
-    folder, part = Path(task.record), Path(f"{task.record}.part")
-    for former in (folder, part):
-        rmtree(former, ignore_errors=True)
-    part.mkdir(parents=True)
-    (part / "scenario.yaml").write_text(scenario_file.to_text(task.scenario))
-    writer = RecordWriter(part / "run.mcap")
+    folder = Path(task.record)
+    writer = _begun(folder, task.scenario)
     try:
         yield writer
-    finally:
-        writer.close()
-        part.rename(folder)
+    except (RecordError, OSError):
+        with suppress(RecordError):
+            writer.close()
+        raise
+    except Exception:
+        _keep(writer, folder)
+        raise
+    _keep(writer, folder)
 
 
-def _summary(flight: Flight) -> Summary:
-    return summarise(flight, formations_of(flight), Path())  # the world lived to say all that else needs the record
+def _begun(folder: Path, scenario: Scenario) -> RecordWriter:
+    """Return the writer of a new record, in the place of what a former flight left there."""
+    part = _part(folder)
+    for former in (folder, part):
+        rmtree(former, ignore_errors=True)
+    try:
+        part.mkdir(parents=True)
+        (part / "scenario.yaml").write_text(scenario_file.to_text(scenario), encoding="utf-8")
+    except OSError as error:
+        raise RecordError(
+            f"{part}: cannot be written ({error.strerror}); make room, the same command goes on"
+        ) from error
+    return RecordWriter(part / "run.mcap")
 
 
-def _row(task: Task, flight: Flight, summary: Summary, diverged: Exception | None, where: dict[str, str]) -> Row:
+def _keep(writer: RecordWriter, folder: Path) -> None:
+    writer.close()
+    _part(folder).rename(folder)
+
+
+def _part(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.part")
+
+
+def engaged_s(formations: list[Formation], window_s: tuple[float, float]) -> dict[str, float | None]:
+    """Return the first instant [s] of a window at which each cluster was engaged, None where it never was."""
+    return {each.name: _engaged_s(each, window_s) for each in formations}
+
+
+def _engaged_s(formation: Formation, window_s: tuple[float, float]) -> float | None:
+    rows = np.flatnonzero(formation.within(window_s))
+    return next((float(formation.t_s[row]) for row in rows if formation.phases[row] == "engaged"), None)
+
+
+def _row(
+    task: Task,
+    flight: Flight,
+    summary: Summary,
+    engaged: dict[str, float | None],
+    diverged: Exception | None,
+    where: dict[str, str],
+) -> Row:
+    clusters = [cluster.name for cluster in task.scenario.clusters]
     result = Result(
         run=task.run,
         point=task.point,
@@ -120,17 +163,22 @@ def _row(task: Task, flight: Flight, summary: Summary, diverged: Exception | Non
         real_time_factor=summary.real_time_factor,
         min_separation_m=summary.min_separation_m,
         collisions=sum(event.kind == "collision" for event in flight.events),
+        engaged=all(engaged.get(name) is not None for name in clusters) if clusters else None,
         **where,
     )
-    return row(result, task.varied, {} if diverged else _errors(summary))
+    begun = {engaged_column(name): engaged.get(name) for name in clusters}
+    return row(result, task.varied, begun if diverged else {**begun, **_errors(summary, engaged)})
 
 
-def _errors(summary: Summary) -> dict[str, Any]:
-    """Return the errors of the formations by their paths in summary.json; `errors` is the first cluster."""
+def _errors(summary: Summary, engaged: dict[str, float | None]) -> dict[str, float | None]:
+    """Return the errors of the formations by their paths in summary.json; `errors` is the first cluster.
+
+    Those of a cluster that was not engaged are None: who stands on the ground holds no formation.
+    """
     found = {}
     for i, (name, cluster) in enumerate(summary.clusters.items()):
         prefix = "errors" if i == 0 else f"clusters.{name}.errors"
         for parameter, errors in cluster.errors.items():
             for statistic, value in msgspec.structs.asdict(errors).items():
-                found[f"{prefix}.{parameter}.{statistic}"] = value
+                found[f"{prefix}.{parameter}.{statistic}"] = None if engaged[name] is None else value
     return found

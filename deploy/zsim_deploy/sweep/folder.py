@@ -99,17 +99,27 @@ def locked(path: Path, plan: Plan) -> Iterator[Folder]:
 
 
 def _settle(path: Path, plan: Plan) -> None:
-    """Write the plan, unless the folder holds something else."""
+    """Write the plan, unless the folder holds something else; a sweep of which nothing is finished may be replaced."""
+    text = _text(path, plan)
     if is_sweep(path):
-        asked = msgspec.json.decode(msgspec.json.encode(plan), type=Plan)  # as it would be read again
-        other = difference(load(path).plan, asked)
-        if other:
+        there = load(path)
+        other = difference(there.plan, msgspec.json.decode(text, type=Plan))  # both as they are read again
+        if other and there.rows():
             raise RunError(f"{path}: holds another sweep ({other}); give --out another folder")
     elif (path / "run.mcap").exists() or (path / TABLE).exists():
         raise RunError(f"{path}: holds something else already; give --out another folder")
     new = path / f".{PLAN}.new"
     try:
-        new.write_bytes(msgspec.json.format(msgspec.json.encode(plan), indent=2) + b"\n")
+        new.write_bytes(text)
         new.replace(path / PLAN)
     except OSError as error:
         raise RunError(f"{path}: cannot be written ({error.strerror}); give --out another folder") from error
+
+
+def _text(path: Path, plan: Plan) -> bytes:
+    """Return the content of plan.json."""
+    try:
+        return msgspec.json.format(msgspec.json.encode(plan), indent=2) + b"\n"
+    except UnicodeEncodeError as error:
+        found = error.object[error.start : error.end][:1]
+        raise RunError(f"{path / PLAN}: cannot be written ({found!a} is no character); give text in UTF-8") from error

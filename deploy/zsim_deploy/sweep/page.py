@@ -10,25 +10,26 @@ from zsim_deploy.report import paper
 from zsim_deploy.report.figures import Named
 from zsim_deploy.report.page import data_uri, template
 from zsim_deploy.sweep.intervals import Interval
-from zsim_deploy.sweep.points import Point, Spread, SweepSummary, parameters
+from zsim_deploy.sweep.points import Parameter, Point, Spread, SweepSummary
 
 POINTS_MAX = 200  # in a table of the page; sweep.parquet has all
 DETAILED_MAX = 24  # points with a table of their own
-OVERVIEW = ("runs", "ended well", "no collision", "separation (m)", "least (m)")
+OVERVIEW = ("runs", "ended well", "engaged", "no collision", "separation (m)", "least (m)")
 DETAILS = ("parameter", "paper std", "est. std", "true std", "true RMS", "true mean", "true RMS, 5 to 95 %")
 
 
 def page(summary: SweepSummary, figures: Sequence[Named], directory: Path) -> str:
     """Return the page; `directory` holds the figures' files."""
     shown = summary.flown[:POINTS_MAX]
-    names = parameters(column for point in shown for column in point.spreads if column.endswith(".true_rms"))
+    known = {column for point in shown for column in point.spreads}
+    names = {prefix: each for prefix, each in summary.parameters.items() if f"{prefix}.true_rms" in known}
     return template("sweep.html.j2", "zsim_deploy.sweep").render(
         summary=summary,
         facts=facts(summary),
         notes=notes(summary),
         overview=[summary.grid, *OVERVIEW],
         points=[(point.label, *overview(point)) for point in shown],
-        parameters=[f"{name} ({unit(name)})" for name in names.values()],
+        parameters=[_titled(each) for each in names.values()],
         errors=[(point.label, *(_mean(point, f"{p}.true_rms") for p in names)) for point in shown],
         left_out=len(summary.flown) - len(shown),
         details=DETAILS,
@@ -58,6 +59,11 @@ def notes(summary: SweepSummary) -> list[str]:
     if summary.finished < summary.runs:
         found.append(f"{summary.runs - summary.finished} runs are not finished; the same command goes on with them.")
     found += [f"{count} of {summary.finished} runs failed: {reason}" for reason, count in summary.failed.items()]
+    if summary.not_engaged:
+        found.append(
+            f"In {summary.not_engaged} runs that ended well a cluster was never engaged within the judged window; "
+            "its errors are left out."
+        )
     if len(summary.fingerprints) > 1:
         found.append("The hosts compute with different numeric fingerprints; the same bits are not promised.")
     return found
@@ -67,20 +73,25 @@ def overview(point: Point) -> list[str]:
     """Return one row of the table of all points, without its label."""
     separation = point.spreads.get("min_separation_m")
     least = "–" if separation is None else f"{separation.least:.2f}"
-    shares = [_share(share) for share in (point.ended_well, point.without_collision)]
-    return [str(point.runs), *shares, _spread(separation), least]
+    engaged = "–" if point.engaged is None else str(point.engaged)
+    well, apart = _share(point.ended_well), _share(point.without_collision)
+    return [str(point.runs), well, engaged, apart, _spread(separation), least]
 
 
-def details(point: Point, names: dict[str, str]) -> list[list[str]]:
+def details(point: Point, names: dict[str, Parameter]) -> list[list[str]]:
     """Return the table of one point, a row per formation parameter."""
     rows = []
-    for prefix, name in names.items():
-        printed = paper.TABLE_1.get(name)
+    for prefix, parameter in names.items():
+        printed = paper.TABLE_1.get(parameter.name)
         rms = point.spreads.get(f"{prefix}.true_rms")
         span = "–" if rms is None else f"{rms.p5:.4f} to {rms.p95:.4f}"
         means = [_mean(point, f"{prefix}.{each}") for each in ("est_std", "true_std", "true_rms", "true_mean")]
-        rows.append([f"{name} ({unit(name)})", "" if printed is None else f"{printed:g}", *means, span])
+        rows.append([_titled(parameter), "" if printed is None else f"{printed:g}", *means, span])
     return rows
+
+
+def _titled(parameter: Parameter) -> str:
+    return parameter.labelled(f"{parameter.name} ({unit(parameter.name)})")
 
 
 def _mean(point: Point, column: str) -> str:

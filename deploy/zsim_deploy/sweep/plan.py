@@ -6,6 +6,7 @@ from typing import Any
 from msgspec import Struct
 
 from zsim import __version__
+from zsim.overrides import whole_path
 
 FILE = "plan.json"
 RUNS_MAX = 1_000_000
@@ -39,13 +40,19 @@ def difference(there: Plan, here: Plan) -> str | None:
         keys = sorted(there.document.keys() | here.document.keys())
         other = next(key for key in keys if there.document.get(key) != here.document.get(key))
         return f"{other} of its scenario is another one"
-    if there.vary != here.vary:
+    if _whole(there.vary) != _whole(here.vary):
         return f"it varies {' '.join(there.vary) or 'nothing'}, not {' '.join(here.vary) or 'nothing'}"
     if there.records != here.records:
         return f"it {'keeps' if there.records else 'does not keep'} records"
     if here.runs < there.runs:
         return f"it has {there.runs} runs, more than {here.runs}"
     return None
+
+
+def _whole(vary: tuple[str, ...]) -> list[str]:
+    """Return texts of `--vary` with their paths from the top of the scenario."""
+    parts = [text.partition("=") for text in vary]
+    return [f"{whole_path(path.strip())}{equals}{given}" for path, equals, given in parts]
 
 
 def is_sweep(folder: Path) -> bool:

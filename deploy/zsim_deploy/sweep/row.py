@@ -9,7 +9,8 @@ from msgspec import Struct
 from zsim_deploy.sweep.task import Task
 
 Row = dict[str, Any]
-"""Values by column; the columns are `FIXED`, the varied paths, and the errors by their paths in summary.json."""
+"""Values by column; the columns are `FIXED`, the varied paths, when each cluster was engaged (`engaged_column`), and
+the errors by their paths in summary.json."""
 
 
 class Result(Struct, frozen=True, kw_only=True):
@@ -20,6 +21,7 @@ class Result(Struct, frozen=True, kw_only=True):
         ended: the run's own words.
         wall_s: wall time of the flight.
         collisions: contacts between drones.
+        engaged: whether every cluster was engaged at some instant of the judged window, None without a cluster.
         host: where it was flown.
         fingerprint: numeric; equal ones promise equal bits.
     """
@@ -35,11 +37,17 @@ class Result(Struct, frozen=True, kw_only=True):
     real_time_factor: float | None = None
     min_separation_m: float | None = None
     collisions: int | None = None
+    engaged: bool | None = None
     host: str = ""
     fingerprint: str = ""
 
 
 FIXED = {field.name: field.type for field in msgspec.structs.fields(Result)}
+
+
+def engaged_column(cluster: str) -> str:
+    """Return the column of the first instant [s] of the judged window at which a cluster was engaged."""
+    return f"clusters.{cluster}.engaged_s"
 
 
 def row(result: Result, varied: Mapping[str, Any], errors: Mapping[str, float | None]) -> Row:
