@@ -17,7 +17,7 @@ from zsim.record import RecordWriter
 from zsim_deploy.in_process import agents
 from zsim_world.world import World
 
-WARM_GATES = 50
+WARM_NS = 1_000_000_000  # simulated, not counted
 
 
 def main() -> None:
@@ -30,7 +30,7 @@ def main() -> None:
 
 def fly(drones: int, seconds: float) -> dict[str, float]:
     """Return CPU seconds per simulated second, and resident memory at the end [MB]."""
-    world = World(grid.scenario(drones, duration_s=1.0 + seconds), "lockstep", 0.0, time.monotonic_ns)
+    world = World(grid.scenario(drones, duration_s=WARM_NS / 1e9 + seconds), "lockstep", 0.0, time.monotonic_ns)
     with tempfile.TemporaryDirectory() as folder:
         writer = RecordWriter(Path(folder) / "run.mcap")
         bus = Bus(
@@ -41,7 +41,7 @@ def fly(drones: int, seconds: float) -> dict[str, float]:
             lambda bundle: writer.add_bundle(bundle, time.time_ns()),
         )
         bus.join()
-        for _ in range(WARM_GATES):
+        while world.now_ns < WARM_NS:
             bus.turn()
         start_s, start_ns = time.process_time(), world.now_ns
         while bus.turn():

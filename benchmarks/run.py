@@ -15,6 +15,7 @@ from zsim.record import RecordReader
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
 TIMEOUT_S = 300.0
+LOOK_S = 0.5  # wall time between two looks at what processes have spent; a look takes milliseconds
 
 
 def fly(scenario: Path, seconds: float, *options: str) -> tuple[dict[str, float], dict[str, float]]:
@@ -32,7 +33,7 @@ def fly(scenario: Path, seconds: float, *options: str) -> tuple[dict[str, float]
         try:
             while process.poll() is None and time.monotonic() < until_s:
                 cpu.update(_cpu_by_role(process.pid))
-                time.sleep(0.1)
+                time.sleep(LOOK_S)
         finally:
             if process.poll() is None:
                 process.terminate()

@@ -27,11 +27,15 @@ def apply(document: dict[str, Any], text: str, parse: Callable[[str], Any]) -> s
     if not equals or not _PATH.fullmatch(path):
         return f"{_name(text)}: is no assignment; must be {SYNTAX}"
     try:
-        steps = [word or bracket for word, bracket in _STEP.findall(whole_path(path))]
-        _assign(document, steps, parse(given))
+        _assign(document, steps_of(path), parse(given))
     except ValueError as error:
         return f"{_name(text)}: {error}"
     return None
+
+
+def steps_of(path: str) -> list[str]:
+    """Return the steps of a path from the top of a scenario: fields, and entries by place or by name."""
+    return [word or bracket for word, bracket in _STEP.findall(whole_path(path))]
 
 
 def whole_path(path: str) -> str:

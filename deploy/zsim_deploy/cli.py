@@ -1,6 +1,7 @@
 """The command line: thin commands that read options, call one function, and print one line for a fault."""
 
 import sys
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -299,6 +300,7 @@ def options(
 
 def main() -> None:
     """Run the command line; a user's fault is a line, not a traceback."""
+    _say_anything()
     try:
         code = app(standalone_mode=False, prog_name="zsim")
     except ZsimError as error:
@@ -312,6 +314,13 @@ def main() -> None:
     if code == INTERRUPTED:
         print("interrupted", file=sys.stderr)
     sys.exit(code)
+
+
+def _say_anything() -> None:
+    """Let a terminal that knows few letters show a question mark for the others, rather than end the command."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def _show_usage(error: Any) -> None:

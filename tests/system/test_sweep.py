@@ -151,7 +151,7 @@ def test_a_scenario_file_of_any_name(federation: Federation, name: str) -> None:
     """Also where the locale knows nothing but ASCII."""
     out, path = federation.folder / "sweep", federation.write(PAIR, name)
     ascii_only = ("env", "LC_ALL=C", "PYTHONUTF8=0")
-    options = ("--duration", "0.2", "--workers", "1", "--no-report", "--out", str(out))
+    options = ("--duration", "0.2", "--workers", "1", "--out", str(out))
     federation.start("sweep", path, *options, prefix=ascii_only).ends(with_code=0)
     assert [row["failure"] for row in rows(out)] == [None]
     federation.start("sweep", path, *options).ends(with_code=0)

@@ -3,10 +3,9 @@
 import re
 from typing import Any
 
-from zsim.overrides import whole_path
+from zsim.overrides import steps_of
 
 Place = tuple[str | int, ...]
-_STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # a word, or anything between brackets
 
 
 def place(document: dict[str, Any], path: str) -> Place:
@@ -18,8 +17,7 @@ def place(document: dict[str, Any], path: str) -> Place:
     """
     steps: list[str | int] = []
     there: Any = document
-    for word, bracket in _STEP.findall(whole_path(path)):
-        text = word or bracket
+    for text in steps_of(path):
         step = _entry(there, text) if isinstance(there, list) else text
         steps.append(step)
         there = _inside(there, step)
