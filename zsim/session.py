@@ -281,7 +281,7 @@ def listen(
     Raises:
         SessionError: an endpoint is taken or malformed, or the identity is of no use.
     """
-    with _listening("router", endpoints, federation, mode, identity or Identity(), {}) as session:
+    with _listening("router", endpoints, federation, mode, identity or Identity(), settings.hub()) as session:
         session.use(mode)
         yield session
 

@@ -57,7 +57,6 @@ def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
     return {
         "listen/endpoints": json.dumps(list(endpoints)),
         "listen/exit_on_failure": "true",
-        "scouting/delay": "0",  # ms that opening waits for others to be found; nobody is looked for
         _CLOSE_AFTER: str(HUB_CLOSE_AFTER_US),
         **_security(identity, endpoints, "listen on"),
     }
@@ -74,6 +73,14 @@ def connecting(endpoint: str, identity: Identity, wait_s: float) -> Settings:
         "connect/timeout_ms": str(int(1000 * wait_s)),
         **_security(identity, [endpoint], "connect to"),
     }
+
+
+def hub() -> Settings:
+    """Return what the hub has beside it: nobody is above it, so opening waits for none to be found.
+
+    A router keeps Zenoh's half a second, in which it learns from the one above who answers there.
+    """
+    return {"scouting/delay": "0"}
 
 
 def upstream(endpoint: str, identity: Identity) -> Settings:

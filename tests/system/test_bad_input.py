@@ -83,7 +83,7 @@ COMMANDS = {
     "no file": (("run", "nowhere.yaml"), "nowhere.yaml: cannot be read (No such file or directory)"),
     "a folder": (("validate", "/"), "cannot be read (Is a directory)"),
     "set without value": (("run", "{one}", "--set", "seed"), "--set seed: is no assignment; must be a.b.c=value"),
-    "set of an unknown key": (("run", "{one}", "--set", "wind.gust=1"), "wind is not known"),
+    "set of an unknown key": (("run", "{one}", "--set", "wings.gust=1"), "wings is not known"),
     "set of an unknown drone": (("run", "{one}", "--set", "drones.drone9.mass_kg=1"), "drone9 is not in drones"),
     "set of a bad value": (("run", "{one}", "--set", "seed=[1"), "is not YAML"),
     "negative duration": (("run", "{one}", "--duration", "-1"), "duration_s is -1.0; must be > 0"),
