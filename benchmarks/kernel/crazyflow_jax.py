@@ -7,6 +7,7 @@ command every gate asks for, or a second (`--long`). Compiled and warm.
 
 import argparse
 import os
+from typing import Any
 
 from benchmarks.kernel.stopwatch import Flight, serve, single
 
@@ -27,26 +28,25 @@ def main() -> None:
     serve(lambda count: flight(count, given.rk4, RATE_HZ if given.long else RATE_HZ // 50))
 
 
+def simulator(worlds: int, drones: int, **options: Any) -> Any:
+    """Return worlds of drones at rest, with body, rotors and attitude at RATE_HZ."""
+    from crazyflow.sim import Sim
+
+    rates = dict.fromkeys(("freq", "attitude_freq", "body_rate_freq", "force_torque_freq"), RATE_HZ)
+    sim = Sim(n_worlds=worlds, n_drones=drones, **rates, **options)
+    sim.reset()
+    return sim
+
+
 def flight(count: int, rk4: bool, steps: int) -> Flight:
     """Return drones that hover."""
     import jax
     import numpy as np
     from crazyflow.control import Control
-    from crazyflow.sim import Sim
     from crazyflow.sim.integration import Integrator
 
     worlds, each = (1, count) if count <= TOGETHER_MAX else (count, 1)
-    sim = Sim(
-        n_worlds=worlds,
-        n_drones=each,
-        freq=RATE_HZ,
-        attitude_freq=RATE_HZ,
-        body_rate_freq=RATE_HZ,
-        force_torque_freq=RATE_HZ,
-        control=Control.attitude,
-        integrator=Integrator.rk4 if rk4 else Integrator.euler,
-    )
-    sim.reset()
+    sim = simulator(worlds, each, control=Control.attitude, integrator=Integrator.rk4 if rk4 else Integrator.euler)
     command = np.zeros((worlds, each, 4), dtype=np.float32)
     command[..., 3] = float(np.ravel(sim.data.params.mass)[0]) * 9.81  # N
 

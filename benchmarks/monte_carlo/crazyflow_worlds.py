@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.kernel.crazyflow_jax import RATE_HZ, simulator
 from benchmarks.monte_carlo.way import Way
 from benchmarks.monte_carlo.worker import Flown, Fly, serve
 
-RATE_HZ = 400
 GATE_HZ = 50
 MASS_STD = 0.01  # of the mass; chosen, so that no flight is like another
 
@@ -31,44 +31,16 @@ def main() -> None:
 def build(way: Way, given: argparse.Namespace) -> Fly:
     """Return worlds that stand where the drones of Test 1 do."""
     import jax
-    import jax.numpy as jnp
     from crazyflow.control import Control
-    from crazyflow.sim import Sim, functional
     from crazyflow.sim.integration import Integrator
 
     worlds = given.worlds
     with TemporaryDirectory() as folder, chdir(folder):  # MuJoCo writes a log of its warnings where it is
-        sim = Sim(
-            n_worlds=worlds,
-            n_drones=3,
-            freq=RATE_HZ,
-            state_freq=GATE_HZ,
-            attitude_freq=RATE_HZ,
-            body_rate_freq=RATE_HZ,
-            force_torque_freq=RATE_HZ,
-            control=Control.state,
-            integrator=Integrator.euler,
-        )
-    sim.reset()
-    step = sim.build_step_fn()
+        sim = simulator(worlds, 3, state_freq=GATE_HZ, control=Control.state, integrator=Integrator.euler)
     gates = min(round(given.seconds * GATE_HZ), len(way.p_W) - 1)
-    commands = jnp.asarray(_commands(way)[:gates], dtype=jnp.float32)
+    commands = jax.numpy.asarray(_commands(way)[:gates], dtype=jax.numpy.float32)
     start: Any = sim.data.replace(states=_standing(sim.data.states, commands[0]))
-
-    @jax.jit
-    def fly(data: Any) -> Any:
-        def gate(carry: Any, command: Any) -> tuple[Any, None]:
-            data, squares, closest = carry
-            data = functional.state_control(data, jnp.broadcast_to(command, (worlds, 3, 16)))
-            data = step(data, n_steps=RATE_HZ // GATE_HZ)
-            p_W = data.states.pos
-            squares += jnp.sum((p_W - command[:, :3]) ** 2, axis=(1, 2))
-            apart = jnp.linalg.norm(p_W - jnp.roll(p_W, 1, axis=1), axis=-1)
-            return (data, squares, jnp.minimum(closest, apart.min(axis=1))), None
-
-        none = jnp.zeros(worlds), jnp.full(worlds, jnp.inf)
-        (_, squares, closest), _ = jax.lax.scan(gate, (data, *none), commands)
-        return squares / (3 * len(commands)), closest
+    fly = _loop(sim.build_step_fn(), commands, worlds)
 
     def flown(seed: int) -> Flown:
         drawn = jax.random.normal(jax.random.key(seed + 1000 * given.worker), (worlds, 3, 1))
@@ -78,6 +50,30 @@ def build(way: Way, given: argparse.Namespace) -> Fly:
         return Flown(flights, float(np.sqrt(np.mean(squares))), float(np.min(closest)))
 
     return flown
+
+
+def _loop(step: Any, commands: Any, worlds: int) -> Any:
+    """Return what flies all worlds along the commands and gives mean square and least distance of each, compiled."""
+    import jax
+    import jax.numpy as jnp
+    from crazyflow.sim import functional
+
+    def gate(carry: Any, command: Any) -> tuple[Any, None]:
+        data, squares, closest = carry
+        data = functional.state_control(data, jnp.broadcast_to(command, (worlds, 3, 16)))
+        data = step(data, n_steps=RATE_HZ // GATE_HZ)
+        p_W = data.states.pos
+        squares += jnp.sum((p_W - command[:, :3]) ** 2, axis=(1, 2))
+        apart = jnp.linalg.norm(p_W - jnp.roll(p_W, 1, axis=1), axis=-1)
+        return (data, squares, jnp.minimum(closest, apart.min(axis=1))), None
+
+    @jax.jit
+    def fly(data: Any) -> Any:
+        none = jnp.zeros(worlds), jnp.full(worlds, jnp.inf)
+        (_, squares, closest), _ = jax.lax.scan(gate, (data, *none), commands)
+        return squares / (3 * len(commands)), closest
+
+    return fly
 
 
 def _commands(way: Way) -> np.ndarray:
