@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 from msgspec import Struct
 
-from zsim.messages import ControlAnswer, ControlRequest
+from zsim.link_faults import LinkFaults
+from zsim.messages import ControlAnswer, ControlRequest, Faults, Info
 
 
 class Output(NamedTuple):
@@ -46,6 +47,7 @@ class Agent(ABC):
     writes: tuple[str, ...] = ()
     serves: tuple[str, ...] = ()
     takes_bundles: bool = False
+    _links: LinkFaults | None = None
 
     def __init__(self) -> None:
         self._seq: defaultdict[str, int] = defaultdict(int)
@@ -64,6 +66,21 @@ class Agent(ABC):
         """Share a process of this name."""
         self._process = process
 
+    def heed(self, info: Info, faults: Faults) -> None:
+        """Learn which faults are injected into the run; called before the first gate in which one of them acts."""
+        if self._links is None and faults.faults:
+            names, clusters = (self.name, *self.serves), {cluster.name: cluster.drones for cluster in info.clusters}
+            self._links = LinkFaults(names, self.reads, info.seed, info.gate_ns, clusters)
+        if self._links is not None:
+            self._links.heed(faults)
+
+    def hear(self, t_ns: int, inputs: Sequence[tuple[str, Any]]) -> None:
+        """Take the inputs of a gate, as far as faults of the links bring them."""
+        if self._links is not None:
+            inputs = self._links.through(t_ns, inputs)
+        for key, message in inputs:
+            self.receive(key, message)
+
     @abstractmethod
     def receive(self, key: str, message: Any) -> None:
         """Take one input; called in order of (t_ns, key, seq) just before `step`."""
@@ -71,6 +88,14 @@ class Agent(ABC):
     @abstractmethod
     def step(self, t_ns: int) -> Sequence[Output]:
         """Return the outputs of the gate t_ns."""
+
+    def views(self, t_ns: int) -> Sequence[Output]:
+        """Return what eyes are shown on `view/**`, as of the gate t_ns, the last that it stepped.
+
+        Asked after some gates only, as often as eyes can follow, and never where the agents share a process with the
+        world: nothing may depend on it.
+        """
+        return ()
 
     def rehearse(self) -> None:
         """Load and compile whatever the first step would; called before joining, so that no gate waits for it."""

@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from zsim import fault_flaws
 from zsim.faults import Fault, show
+from zsim.obstacle import nearest, row_of
 from zsim.presets import BOARD_RATE_HZ
 from zsim.scenario import SEA_HEIGHT_MAX_M, kinematics
 
 START_SEPARATION_MIN_M = 0.6  # m, two hulls of 0.515 m side by side (OpenMAS, weighed and measured)
+START_CLEARANCE_MIN_M = 0.3  # m, a hull's radius of 0.26 m, and room
 FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
 TEMPLATE_ROBOTS_MIN = 3  # fewer are in one line
 TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: anything is; where a formation may fly, the controller asks for more
@@ -27,6 +30,7 @@ def cross_faults(scenario: Any) -> Iterator[Fault]:
     yield from _name_faults("clusters", clusters)
     yield from _time_faults(scenario.time)
     yield from _start_faults(drones)
+    yield from _obstacle_faults(_entries(scenario.environment and scenario.environment.obstacles), drones)
     for index, drone in drones:
         yield from ((f"drones[{index}].{path}", text) for path, text in _drone_faults(drone, scenario))
     yield from _membership_faults(drones, clusters)
@@ -35,6 +39,7 @@ def cross_faults(scenario: Any) -> Iterator[Fault]:
     for index, cluster in clusters:
         yield from ((f"clusters[{index}].{path}", text) for path, text in _shape_faults(cluster, drones))
     yield from _process_faults(scenario.processes, drones, clusters)
+    yield from _injected_faults(scenario, drones, clusters)
     yield from _window_faults(scenario.report)
 
 
@@ -86,6 +91,41 @@ def _start_faults(drones: _Entries) -> Iterator[Fault]:
                 f"is {distances.min():.2f} m from {other.name or f'drones[{nearest}]'!r}; "
                 f"must be >= {START_SEPARATION_MIN_M} m",
             )
+
+
+_SIZES = {"box": ("size_m",), "cylinder": ("radius_m", "height_m"), "sphere": ("radius_m",)}
+
+
+def _obstacle_faults(obstacles: _Entries, drones: _Entries) -> Iterator[Fault]:
+    """Yield what is wrong with obstacles: names, sizes, and drones that start in one."""
+    yield from _name_faults("environment.obstacles", obstacles)
+    names = _names(drones)
+    for index, obstacle in obstacles:
+        path = f"environment.obstacles[{index}]"
+        if obstacle.name in names:
+            yield f"{path}.name", f"is {obstacle.name!r}, as a drone; must be another"
+        wanted = _SIZES.get(obstacle.shape)
+        if wanted is None:
+            continue
+        given = [name for name in ("size_m", "radius_m", "height_m") if getattr(obstacle, name) is not None]
+        for name in wanted:
+            if name not in given:
+                yield f"{path}.{name}", f"is missing; must be given for a {obstacle.shape}"
+        for name in given:
+            if name not in wanted:
+                yield f"{path}.{name}", f"is given; must be left out of a {obstacle.shape}"
+        if sorted(given) == sorted(wanted) and _known(obstacle.position_m, obstacle.yaw_deg):
+            yield from _buried_faults(obstacle, drones)
+
+
+def _buried_faults(obstacle: Any, drones: _Entries) -> Iterator[Fault]:
+    row = row_of(obstacle)
+    for index, drone in drones:
+        if drone.position_m is not None:
+            distance = nearest(row, *drone.position_m)[0]
+            if distance < START_CLEARANCE_MIN_M:
+                found = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
+                yield f"drones[{index}].position_m", f"{found}; must be >= {START_CLEARANCE_MIN_M} m"
 
 
 def _drone_faults(drone: Any, scenario: Any) -> Iterator[Fault]:
@@ -226,6 +266,18 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
             named = _listed(known) or f"a {kind}, and there is none"
             allowed = f"must be {role}.NAME of {named}, or a name of your own"
             yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
+
+
+def _injected_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
+    """Yield what is wrong with the faults that a scenario injects, if it is known who could be their targets."""
+    if any(item.name is None for _, item in [*drones, *clusters]) or not drones:
+        return
+    expected = scenario.processes and scenario.processes.expect
+    processes = tuple(name for name in expected or () if name is not None)
+    known = fault_flaws.Known(tuple(_names(drones)), tuple(_names(clusters)), processes)
+    for index, given in _entries(scenario.faults):
+        for path, text in fault_flaws.flaws(given, known):
+            yield f"faults[{index}]{f'.{path}' if path else ''}", text
 
 
 def _window_faults(report: Any) -> Iterator[Fault]:

@@ -112,6 +112,35 @@ def rotation_matrix(q: ArrayLike) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def quaternion_from_matrix(R: ArrayLike) -> Array:
+    """Return the unit quaternions of rotation matrices (..., 3, 3), either of their two signs.
+
+    By the largest part, which is never small (Shepperd, J. Guidance and Control 1 (1978) 223-224).
+    """
+    R = np.asarray(R, dtype=float)
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(R, (-2, -1), (0, 1))
+    rows = [
+        [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
+        [zy - yz, 1 + xx - yy - zz, yx + xy, zx + xz],
+        [xz - zx, yx + xy, 1 - xx + yy - zz, zy + yz],
+        [yx - xy, zx + xz, zy + yz, 1 - xx - yy + zz],
+    ]
+    products = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)  # 4 q q^T
+    largest = np.diagonal(products, axis1=-2, axis2=-1).argmax(axis=-1)
+    q = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+
+
+def principal_axes(covariance: ArrayLike) -> tuple[Array, Array]:
+    """Return the standard deviations (..., 3) of covariances (..., 3, 3) along their axes, and the axes' quaternions.
+
+    The quaternions turn components along the axes into those in which the covariances are given.
+    """
+    variances, axes = np.linalg.eigh(np.asarray(covariance, dtype=float))
+    axes[..., :, 0] *= np.where(np.linalg.det(axes) < 0, -1.0, 1.0)[..., None]
+    return np.sqrt(np.maximum(variances, 0.0)), quaternion_from_matrix(axes)
+
+
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:
     """Return R(q) v: body components to world components."""
     return np.einsum("...ij,...j->...i", rotation_matrix(q), np.asarray(v, dtype=float))

@@ -12,7 +12,7 @@ from zsim import batch, keys
 from zsim.agent import Agent, Output
 from zsim.bundle import Bundle, Selection
 from zsim.errors import RunError
-from zsim.messages import ControlAnswer, ControlRequest
+from zsim.messages import ControlAnswer, ControlRequest, Faults, Info
 
 
 class Group(Agent):
@@ -47,6 +47,14 @@ class Group(Agent):
         for member in members:
             member.speak_as(self.name)
 
+    def heed(self, info: Info, faults: Faults) -> None:
+        for member in self._members:
+            member.heed(info, faults)
+
+    def hear(self, t_ns: int, inputs: Sequence[tuple[str, Any]]) -> None:
+        for key, message in inputs:  # each member has links of its own
+            self.receive(key, message)
+
     def receive(self, key: str, message: Any) -> None:
         if key == batch.GATE:
             self._receive_bundle(message)
@@ -62,14 +70,16 @@ class Group(Agent):
     def step(self, t_ns: int) -> list[Output]:
         outputs: list[Output] = []
         for place, member in enumerate(self._members):
-            for key, message in self._take(place):
-                member.receive(key, message)
+            member.hear(t_ns, self._take(place))
             said = member.step(t_ns)
             for output in said:
                 for reader in self._readers_of(output.key):
                     self._waiting[reader].append(output)
             outputs += said
         return outputs
+
+    def views(self, t_ns: int) -> list[Output]:
+        return [output for member in self._members for output in member.views(t_ns)]
 
     def _take(self, place: int) -> list[tuple[str, Any]]:
         """Return what a member is to receive, in the order in which a runner would hand it over."""

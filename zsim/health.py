@@ -6,6 +6,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 
 from zsim.messages import Health
 
@@ -72,6 +73,6 @@ class HealthMeter:
 def resident_bytes() -> int:
     """Return the resident memory of this process; 0 where the system does not tell."""
     if sys.platform == "linux":
-        with open("/proc/self/statm", encoding="ascii") as statm:
+        with suppress(OSError), open("/proc/self/statm", encoding="ascii") as statm:  # no file may be left to open
             return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return 0

@@ -14,6 +14,7 @@ from zsim import __version__, batch, keys, messages
 from zsim.agent import Agent, Output
 from zsim.bundle import Bundle, Selection
 from zsim.errors import RunError
+from zsim.fault_kinds import PROCESS_KILL
 from zsim.fingerprint import fingerprint
 from zsim.inbox import Inbox
 
@@ -24,6 +25,10 @@ class Hub(Protocol):
     """What the bus needs of a world."""
 
     run_id: str
+
+    def info(self) -> messages.Info:
+        """Return the message of `world/info`."""
+        ...
 
     def handle(self, key: str, message: Any, wall_ns: int) -> None:
         """Take what a process says to the world: join, done, bye, a command."""
@@ -60,7 +65,7 @@ class Hub(Protocol):
 
 
 Sink = Callable[[str, Any], None]
-VIEW, OUTPUT, COMMAND = range(3)  # what an agent says: for eyes alone, for whoever reads it, for the world
+OUTPUT, COMMAND = range(2)  # what an agent says: for whoever reads it, for the world
 
 
 class _Way(NamedTuple):
@@ -98,6 +103,7 @@ class Bus:
         self._ways: dict[str, _Way] = {}
         self._done_keys = {agent.name: keys.process(agent.name, "done") for agent in agents}
         self._t_ns = 0
+        self._info: messages.Info | None = None
 
     def join(self) -> None:
         """Let every agent make ready and join the run."""
@@ -169,8 +175,22 @@ class Bus:
                 self._hand_out(message)
                 continue
             self._sink(key, message)
+            if key == keys.FAULTS:
+                self._tell_faults(message)
             for inbox in self._way(key).inboxes:
                 inbox.put(key, message)
+
+    def _tell_faults(self, faults: messages.Faults) -> None:
+        if not faults.faults and self._info is None:
+            return
+        for fault in faults.faults:
+            if fault.kind == PROCESS_KILL:
+                raise RunError(
+                    f"{PROCESS_KILL} of {fault.target}: must be left out in-process, where nobody is a process"
+                )
+        info = self._info = self._info or self._hub.info()
+        for agent, _ in self._agents:
+            agent.heed(info, faults)
 
     def _hand_out(self, bundle: Bundle) -> None:
         if self._whole:
@@ -187,8 +207,7 @@ class Bus:
         t_ns = inbox.next_gate_ns()
         while t_ns is not None and inbox.missing(t_ns) is None:
             self._t_ns = t_ns
-            for key, message in inbox.take(t_ns):
-                agent.receive(key, message)
+            agent.hear(t_ns, inbox.take(t_ns))
             if t_ns % agent.period_ns == 0:
                 yield t_ns, agent.step(t_ns)
             t_ns = inbox.next_gate_ns()
@@ -197,8 +216,6 @@ class Bus:
         sent = 0
         for key, message in outputs:
             inboxes, kind = self._way(key)
-            if kind == VIEW:
-                continue
             sent += 1
             for inbox in inboxes:
                 inbox.put(key, message)
@@ -219,6 +236,6 @@ class Bus:
         if way is None:
             readers = zip(self._agents, self._selections, strict=True)
             inboxes = tuple(inbox for (_, inbox), taken in readers if taken.takes(key))
-            kind = VIEW if key.startswith("view/") else OUTPUT if key.endswith(("/estimate", "/state")) else COMMAND
+            kind = OUTPUT if key.endswith(("/estimate", "/state", "/request")) else COMMAND
             way = self._ways[key] = _Way(inboxes, kind)
         return way

@@ -16,6 +16,7 @@ SENSORS = ("imu", "gps", "mag", "baro", "sonar", "flow")
 INFO = "world/info"
 CLOCK = "clock"
 EVENT = "world/event"
+FAULTS = "world/faults"
 CONTROL = "world/control"
 VIEW_DRONES = "view/drones"
 
@@ -63,8 +64,18 @@ def cluster_control(cluster: str) -> str:
     return f"cluster/{cluster}/control"
 
 
+def cluster_request(cluster: str) -> str:
+    """Return the key on which a controller tells the requests that it took."""
+    return f"cluster/{cluster}/request"
+
+
 def cluster_view(cluster: str) -> str:
     return f"view/cluster/{cluster}"
+
+
+def estimates_view(process_name: str) -> str:
+    """Return the key on which an estimator shows eyes what it believes of all its drones."""
+    return f"view/estimates/{process_name}"
 
 
 def token(process: str) -> str:

@@ -230,7 +230,13 @@ class Membership:
             self._link.put(self._done_key, self._done(t_ns, len(outputs)))
         self._missed_since_ns = self.done_ns
 
+    def ask_faults(self) -> None:
+        """Take in which faults are injected."""
+        for sample in self._link.get(keys.FAULTS):
+            self._take_in(sample)
+
     def _fetch(self, since_ns: int) -> None:
+        self.ask_faults()
         try:
             for key, payload in replay(self._link, self._agent.name, since_ns, self._agent.reads, REPLAY_S):
                 self._take_in(Sample(key, payload))

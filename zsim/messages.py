@@ -63,7 +63,8 @@ class ClusterInfo(Struct, frozen=True):
 class Info(Message, frozen=True):
     """What a process needs to take part: the resolved scenario and how its time runs, `world/info`.
 
-    `rate` is simulated per wall seconds, 0 for as fast as possible; `scenario` is YAML text.
+    `rate` is simulated per wall seconds, 0 for as fast as possible; `scenario` is YAML text. `replay_of` is the
+    run_id of the run that is played back; empty for a flight.
     """
 
     contract: Count
@@ -82,6 +83,7 @@ class Info(Message, frozen=True):
     scenario_sha256: str
     version: str
     fingerprint: str
+    replay_of: str = ""
 
 
 class Waiting(Struct, frozen=True):
@@ -280,6 +282,20 @@ class ClusterState(Message, frozen=True):
     plan_step: Count = 0
 
 
+class ClusterRequest(Message, frozen=True):
+    """A request on `cluster/{c}/control` as the controller took it, before its outputs of the gate `t_ns`.
+
+    `source` is who asked; `error` is why it is refused. `controller` is the process that answered.
+    """
+
+    op: str
+    args: dict[str, Any]
+    source: str
+    ok: bool
+    error: str = ""
+    controller: str = ""
+
+
 class Join(Message, frozen=True):
     """A process takes part from now on; the newest of several random incarnations counts.
 
@@ -334,6 +350,7 @@ class DroneView(Struct, frozen=True):
     rotor_rad_s: Rotors
     state: str
     battery_percent: Number
+    commander: str | None = None
 
 
 class ViewDrones(Message, frozen=True):
@@ -341,6 +358,26 @@ class ViewDrones(Message, frozen=True):
 
     drones: tuple[DroneView, ...]
     wind_m_s: tuple[Vector3, ...] = ()
+
+
+class EstimateView(Struct, frozen=True):
+    """An estimate as eyes see it; fields as in Estimate.
+
+    `covariance_m2` is that of the position in W, the upper triangle row by row: xx, xy, xz, yy, yz, zz.
+    """
+
+    name: str
+    position_m: Vector3
+    covariance_m2: tuple[Number, Number, Number, Number, Number, Number]
+    yaw_rad: Number
+    yaw_sigma_rad: Number
+    sensors: dict[str, tuple[Count, Count]]
+
+
+class ViewEstimates(Message, frozen=True):
+    """What an estimator believes of all its drones, for eyes; never gates and may skip."""
+
+    estimates: tuple[EstimateView, ...]
 
 
 class ViewCluster(Message, frozen=True):
@@ -351,6 +388,29 @@ class ViewCluster(Message, frozen=True):
     value: tuple[Number, ...]
     desired: tuple[Number, ...]
     reason: str
+
+
+class Fault(Struct, frozen=True):
+    """An injected fault: a kind and parameters of docs/faults.md, a drone, link, cluster or process as its target.
+
+    It acts in the gates after `from_ns` up to `until_ns`, or until it is cleared. `source` is "scenario", or who asked.
+    `rank` counts those of the same kind, target and start before it: each of them has a stream of its own.
+    """
+
+    id: Count
+    kind: str
+    target: str
+    parameters: dict[str, Any]
+    from_ns: Count
+    until_ns: Count | None = None
+    source: str = ""
+    rank: Count = 0
+
+
+class Faults(Message, frozen=True):
+    """The faults that are planned or act, in the order of their ids; said before the first gate that a change is in."""
+
+    faults: tuple[Fault, ...] = ()
 
 
 class ControlRequest(Struct, frozen=True):
@@ -374,6 +434,7 @@ _FIXED: dict[str, type[Struct]] = {
     "world/info": Info,
     "clock": Clock,
     "world/event": Event,
+    "world/faults": Faults,
     "view/drones": ViewDrones,
 }
 _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
@@ -392,12 +453,13 @@ _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
     ("drone", "cmd/mode"): Mode,
     ("drone", "estimate"): Estimate,
     ("cluster", "state"): ClusterState,
+    ("cluster", "request"): ClusterRequest,
     ("process", "join"): Join,
     ("process", "done"): Done,
     ("process", "bye"): Bye,
     ("process", "health"): Health,
 }
-_VIEW_CLUSTER = "view/cluster/"
+_VIEWS: dict[str, type[Struct]] = {"view/cluster/": ViewCluster, "view/estimates/": ViewEstimates}
 KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
 
 encode: Callable[[Struct], bytes] = msgspec.msgpack.Encoder().encode
@@ -407,8 +469,9 @@ encode: Callable[[Struct], bytes] = msgspec.msgpack.Encoder().encode
 @lru_cache(maxsize=KEYS_KEPT)
 def type_of(key: str) -> type[Struct] | None:
     """Return the message type that the contract puts on a key, None for a key that it does not know."""
-    if key.startswith(_VIEW_CLUSTER):
-        return ViewCluster
+    for start, message in _VIEWS.items():
+        if key.startswith(start):
+            return message
     parts = key.split("/", 2)
     return _FIXED.get(key) or (_BY_SHAPE.get((parts[0], parts[2])) if len(parts) == 3 else None)
 
@@ -416,7 +479,7 @@ def type_of(key: str) -> type[Struct] | None:
 def types_by_shape() -> dict[str, type[Struct]]:
     """Return all message types by the shape of their key, for documentation and for tests."""
     shapes = {f"{kind}/*/{rest}": message for (kind, rest), message in _BY_SHAPE.items()}
-    return {**_FIXED, **shapes, "view/cluster/*": ViewCluster}
+    return {**_FIXED, **shapes, **{f"{start}*": message for start, message in _VIEWS.items()}}
 
 
 def fields(kind: type[Struct]) -> Iterable[str]:
@@ -505,7 +568,7 @@ def _event_fault(event: Event) -> str | None:
     return _free_fault("data", event.data)
 
 
-def _request_fault(request: ControlRequest) -> str | None:
+def _request_fault(request: ControlRequest | ClusterRequest) -> str | None:
     return _free_fault("args", request.args)
 
 
@@ -551,6 +614,7 @@ def _length_fault(message: Struct, names: tuple[str, ...], wanted: int) -> str |
 _RELATIONS: dict[type[Struct], Callable[[Any], str | None]] = {
     Event: _event_fault,
     ControlRequest: _request_fault,
+    ClusterRequest: _request_fault,
     ControlAnswer: _answer_fault,
     ClusterState: _state_fault,
     ViewCluster: _view_fault,

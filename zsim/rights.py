@@ -9,9 +9,17 @@ from typing import NamedTuple
 from zsim import batch, keys
 from zsim.scenario import Scenario
 
-TOLD_TO_ALL = (keys.INFO, keys.CLOCK, keys.EVENT)
+TOLD_TO_ALL = (keys.INFO, keys.CLOCK, keys.EVENT, keys.FAULTS)
 EVERYTHING = ("**", batch.KEY, batch.GATE, batch.gate("*"))  # no wildcard takes a key that begins with @
-LAST_VALUES = (keys.INFO, keys.CLOCK, "drone/*/sensor/status", "drone/*/truth", "drone/*/estimate", "cluster/*/state")
+LAST_VALUES = (
+    keys.INFO,
+    keys.CLOCK,
+    keys.FAULTS,
+    "drone/*/sensor/status",
+    "drone/*/truth",
+    "drone/*/estimate",
+    "cluster/*/state",
+)
 OPERATOR, RECORDER, WORLD, ROUTER = "operator", "recorder", "world", "router"
 
 
@@ -70,7 +78,7 @@ def _own(process: str) -> Rights:
     return Rights(
         reads=TOLD_TO_ALL,
         writes=tuple(keys.process(process, what) for what in ("join", "done", "bye", "health")),
-        asks=(keys.INFO, keys.CLOCK, keys.replay(process)),
+        asks=(keys.INFO, keys.CLOCK, keys.FAULTS, keys.replay(process)),
         answers=(keys.process(process, "outputs"),),
         tokens=(keys.token(process),),
     )
@@ -85,7 +93,9 @@ def _estimator(thing: str, scenario: Scenario, role: str) -> Rights:
         return Rights()
     estimate = (keys.estimate(thing),)
     return Rights(
-        reads=(keys.sensors(thing), batch.gate(thing), *estimate), writes=estimate, asks=(keys.status(thing), *estimate)
+        reads=(keys.sensors(thing), batch.gate(thing), *estimate),
+        writes=(*estimate, keys.estimates_view(f"{role}.{thing}")),
+        asks=(keys.status(thing), *estimate),
     )
 
 
@@ -97,7 +107,12 @@ def _controller(thing: str, scenario: Scenario, role: str) -> Rights:
     state = keys.cluster_state(thing)
     return Rights(
         reads=(*heard, state),
-        writes=(*(keys.command(drone, "*") for drone in drones), state, keys.cluster_view(thing)),
+        writes=(
+            *(keys.command(drone, "*") for drone in drones),
+            state,
+            keys.cluster_request(thing),
+            keys.cluster_view(thing),
+        ),
         asks=(*heard, state),
         answers=(keys.cluster_control(thing),),
     )

@@ -7,12 +7,13 @@ the next one is there.
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from zsim import batch, keys, messages, notice
-from zsim.agent import Agent, Output
+from zsim.agent import Agent
 from zsim.bundle import Selection, table_of, unpacked
 from zsim.errors import DecodeError, SessionError
+from zsim.fault_kinds import PROCESS_KILL
 from zsim.health import HealthMeter
 from zsim.inbox import Inbox
 from zsim.membership import Membership
@@ -22,7 +23,7 @@ from zsim.session import Mailbox, Query, Sample, Session
 
 TICK_S = 0.1  # how often a stop, and what the world has not answered, is looked for while nothing arrives
 DRAIN_S = 1.0  # how long the last gates are waited for once the run has ended
-VIEW_PERIOD_S = 1 / 30  # contract: at most 30 Hz wall
+VIEW_PERIOD_S = 1 / 20  # contract: at most 30 Hz wall; a console draws 20 pictures a second
 
 
 class Runner:
@@ -35,6 +36,9 @@ class Runner:
         stopped: asked every TICK_S; True ends the process with a bye.
         say: told what a person should know.
         deserted: asked at the end; True leaves without a bye, as one that dies, so that the world waits for a new one.
+
+    Attributes:
+        killed: whether a fault has ended it, without a bye; its process is to die as well.
     """
 
     def __init__(
@@ -64,12 +68,17 @@ class Runner:
         self._notices: deque[Notice] = deque()
         self._queries: deque[Query] = deque()
         self._links: deque[bool] = deque()
+        self._told: deque[messages.Faults] = deque()
+        self._list_seq = -1
+        self._kills: dict[int, messages.Fault] = {}  # by id
+        self._lives_after_ns: int | None = None  # what was to die up to this gate was an earlier one of its name
         self._lacks = False
         self._view_wall_s = 0.0
         self._end_ns: int | None = None
         self._end_wall_s = 0.0
         self._leave: str | None = None
         self._over = threading.Event()
+        self.killed = False
         self.health = HealthMeter(agent.role, host=link.host)
 
     def run(self) -> str:
@@ -82,9 +91,11 @@ class Runner:
         """
         self._agent.rehearse()
         self._subscribe()
+        self._member.ask_faults()
         last_ns = self._member.warm_start()
         if last_ns is not None:
             self._inbox.start_after(last_ns)
+            self._lives_after_ns = last_ns
         self._member.enter()
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         ticker.start()
@@ -96,7 +107,7 @@ class Runner:
             ticker.join()
         if self._member.failure:
             raise self._member.failure
-        if not self._deserted():
+        if not self._deserted() and not self.killed:
             self._member.leave(self._leave)
         return self._leave
 
@@ -148,6 +159,9 @@ class Runner:
             self._inbox.put(key, message)
 
     def _take_in(self, sample: Sample) -> None:
+        if sample.key == keys.FAULTS:
+            self._on_faults(sample)
+            return
         self.health.received += 1
         try:
             message = messages.decode(sample.key, sample.payload)
@@ -201,30 +215,51 @@ class Runner:
 
     def _step(self, t_ns: int) -> None:
         start_ns = time.perf_counter_ns()
-        for key, message in self._inbox.take(t_ns):
-            self._agent.receive(key, message)
+        self._heed_faults()
+        self._agent.hear(t_ns, self._inbox.take(t_ns))
         if t_ns % self._agent.period_ns:
             return
         outputs = self._agent.step(t_ns)
-        self._publish(t_ns, outputs)
+        self._member.publish(t_ns, outputs)
+        self._show(t_ns)
+        self._die(t_ns)
         self.health.step(time.perf_counter_ns() - start_ns)
         newest_ns = self._inbox.latest_gate_ns()
         self.health.lag_ns = newest_ns - t_ns if newest_ns is not None else 0
 
-    def _publish(self, t_ns: int, outputs: Sequence[Output]) -> None:
-        """Publish the outputs of a gate: first what the world counts, with its done, then views for eyes."""
-        counted = [output for output in outputs if not output.key.startswith("view/")]
-        self._member.publish(t_ns, counted)
-        if len(counted) < len(outputs):
-            self._publish_views(outputs)
-
-    def _publish_views(self, outputs: Sequence[Output]) -> None:
+    def _show(self, t_ns: int) -> None:
+        """Publish what eyes are shown, as often as they can follow."""
         now_s = time.monotonic()
         if now_s - self._view_wall_s >= VIEW_PERIOD_S:
             self._view_wall_s = now_s
-            for key, message in outputs:
-                if key.startswith("view/"):
-                    self._link.put(key, message)
+            for key, message in self._agent.views(t_ns):
+                self._link.put(key, message)
+
+    def _heed_faults(self) -> None:
+        """Learn of faults: what the world says of them before a gate has come before that gate."""
+        while self._told:
+            told = self._told.popleft()
+            self._agent.heed(self._info, told)
+            if told.seq > self._list_seq:
+                self._list_seq = told.seq
+                self._heed_kills(told)
+
+    def _heed_kills(self, told: messages.Faults) -> None:
+        """Learn which kills are its own: a list may have forgotten one that a late process has still to die of.
+
+        One that has not begun when a list is said, and is not on it, is cleared.
+        """
+        names = (self._agent.name, *self._agent.serves)
+        begun = {n: kill for n, kill in self._kills.items() if kill.until_ns is not None and kill.until_ns <= told.t_ns}
+        self._kills = begun | {f.id: f for f in told.faults if f.kind == PROCESS_KILL and f.target in names}
+
+    def _die(self, t_ns: int) -> None:
+        """End, if a fault wants it in the gates that it has lived; what was said of them still goes out."""
+        if self._lives_after_ns is None:
+            self._lives_after_ns = t_ns - self._agent.period_ns
+        for fault in self._kills.values():
+            if self._lives_after_ns < fault.from_ns + self._info.gate_ns <= t_ns:
+                self._leave, self.killed = f"killed by fault {fault.id}", True
 
     # Beginning and end
 
@@ -235,6 +270,7 @@ class Runner:
             if box not in self._boxes:
                 self._boxes[box] = self._link.subscribe(box)
         self._link.on_message(keys.EVENT, self._on_event)
+        self._link.on_message(keys.FAULTS, self._on_faults)
         self._link.on_link(self._on_link)
         for key in self._agent.control_keys():
             self._link.answer(key, self._on_query)
@@ -260,6 +296,12 @@ class Runner:
         if read is not None:
             self._notices.append(read)
             self._wake()
+
+    def _on_faults(self, sample: Sample) -> None:
+        try:
+            self._told.append(messages.decode(keys.FAULTS, sample.payload))
+        except DecodeError:
+            self.health.refused += 1
 
     def _on_link(self, up: bool) -> None:
         self._links.append(up)

@@ -3,7 +3,7 @@
 A file is read by `scenario_file.load`; the limits written here are the ones that its faults quote.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct, field
 
@@ -11,6 +11,8 @@ from zsim.presets import G_M_S2, SEA_LEVEL_KG_M3
 
 TEMPLATE_FROM = 5  # robots; below it the variables of the triad are fewer to name, and as well conditioned
 DRONES_MAX = 1000  # one world integrates them all
+OBSTACLES_MAX = 1000  # every drone is compared with each, in every step
+FAULTS_MAX = 1000  # injected ones, planned and active; each is looked at wherever one begins or ends
 ROBOTS_MAX = 64  # drones of a cluster; beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
 SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
 
@@ -150,6 +152,18 @@ class Wind(Spec, frozen=True, kw_only=True):
     gust_correlation: Fraction = 0.5  # chosen: drones some metres apart share half of the variance
 
 
+class Obstacle(Spec, frozen=True, kw_only=True):
+    """A solid that drones run into: a box and a cylinder stand upright, a sphere is where it is."""
+
+    name: Name
+    shape: Literal["box", "cylinder", "sphere"]
+    position_m: Position
+    size_m: tuple[Positive, Positive, Positive] | None = None
+    radius_m: Positive | None = None
+    height_m: Positive | None = None
+    yaw_deg: Real = 0.0
+
+
 class Environment(Spec, frozen=True, kw_only=True):
     """The field of the flight: default Buenos Aires, where the paper comes from."""
 
@@ -160,6 +174,7 @@ class Environment(Spec, frozen=True, kw_only=True):
     magnetic_field_ut: Vector3 = (-2.8, 17.8, 14.0)  # ENU, within 0.4 uT of IGRF-14 there on 1 January 2013
     air_density_kg_m3: Positive = SEA_LEVEL_KG_M3
     wind: Wind = Wind()
+    obstacles: Annotated[list[Obstacle], Meta(max_length=OBSTACLES_MAX)] = []
 
 
 class Silence(Spec, frozen=True, kw_only=True):
@@ -283,6 +298,8 @@ class Scenario(Spec, frozen=True, kw_only=True):
     clusters: list[Cluster] = []
     estimation: Estimation = Estimation()
     processes: Processes = Processes()
+    faults: Annotated[list[dict[str, Any]], Meta(max_length=FAULTS_MAX)] = []
+    """Faults to inject, each a map; `fault_flaws` says what they may be."""
     report: Figures = field(default_factory=Figures)
 
     def drone(self, name: str) -> Drone:
@@ -292,6 +309,13 @@ class Scenario(Spec, frozen=True, kw_only=True):
     def cluster(self, name: str) -> Cluster:
         """Return the cluster of that name; KeyError if there is none."""
         return {cluster.name: cluster for cluster in self.clusters}[name]
+
+    def expected(self) -> list[str]:
+        """Return the names of the processes without which a run does not start."""
+        if self.processes.expect is not None:
+            return list(self.processes.expect)
+        estimators = [f"estimator.{drone.name}" for drone in self.drones]
+        return estimators + [f"controller.{cluster.name}" for cluster in self.clusters]
 
 
 class Document(Scenario, frozen=True, kw_only=True):

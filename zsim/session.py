@@ -8,7 +8,7 @@ import os
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1))")
 os.environ.setdefault("RUST_LOG", "error")
 
 import zenoh
+import zenoh.ext
 from msgspec import Struct
 
 from zsim import batch, messages, settings, tls
@@ -35,6 +36,26 @@ class Sample(NamedTuple):
     payload: bytes
 
 
+class Heard(NamedTuple):
+    """A publication, or an answer to a get, as it stands on the wire.
+
+    Attributes:
+        kind: "PUT" or "DELETE"; "ERROR" for an answer that refuses, which has no key.
+        key: without the prefix of the session that heard it.
+        payload: as sent.
+        encoding: Zenoh's text of it, e.g. "application/msgpack;Imu".
+        timestamp: of Zenoh, as text; None where nobody stamped it.
+        attachment: what was sent beside the payload; empty where nothing was.
+    """
+
+    kind: str
+    key: str
+    payload: bytes
+    encoding: str
+    timestamp: str | None
+    attachment: bytes = b""
+
+
 class Session:
     """One process's access to a federation.
 
@@ -49,9 +70,13 @@ class Session:
         self.federation = federation
         self.host = identity.host
         self.guarded = identity.access is not None
-        self._prefix = f"{federation}/"
+        self._prefix = f"{federation}/" if federation else ""
         self._publishers: dict[str, zenoh.Publisher] = {}
+        self._keepers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._kept: list[Any] = []
+        self._hearing: dict[int, Any] = {}
+        self._boxes: list[Mailbox] = []
+        self._bare: list[Session] = []
         self._heard: dict[str, bool] = {}
         self._realtime = False
 
@@ -93,11 +118,16 @@ class Session:
         publisher.put(payload)
 
     def _declare(self, key: str) -> zenoh.Publisher:
-        drop = key.startswith("view/") or (self._realtime and ("/sensor/" in key or key.startswith(batch.GATE)))
+        view = key.startswith("view/")
+        drop = view or (self._realtime and ("/sensor/" in key or key.startswith(batch.GATE)))
         control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
+        # A queue of its own: in one with others, a view that the hub passes on would wait behind a put that blocks.
+        priority = zenoh.Priority.DATA_LOW if view else zenoh.Priority.DATA
         encoding = zenoh.Encoding(messages.encoding(key))
         with _named(key):
-            publisher = self._raw.declare_publisher(self._prefix + key, encoding=encoding, congestion_control=control)
+            publisher = self._raw.declare_publisher(
+                self._prefix + key, encoding=encoding, congestion_control=control, priority=priority
+            )
         self._publishers[key] = publisher
         return publisher
 
@@ -108,7 +138,18 @@ class Session:
             SessionError: it is no key expression.
         """
         with _named(expression):
-            return Mailbox(self._raw, self._prefix, expression)
+            return self._kept_box(Mailbox(self._raw, self._prefix, expression))
+
+    def overhear(self, without: tuple[str, ...]) -> "Mailbox":
+        """Return a mailbox that takes everything that other sessions publish, but on keys that begin so.
+
+        Nothing wakes who waits for it.
+        """
+        return self._kept_box(Mailbox(self._raw, self._prefix, "**", without))
+
+    def _kept_box(self, box: "Mailbox") -> "Mailbox":
+        self._boxes.append(box)
+        return box
 
     def on_message(self, expression: str, callback: Callable[[Sample], None]) -> None:
         """Call back, in a thread of Zenoh's, for the rare messages on an expression."""
@@ -116,6 +157,125 @@ class Session:
             self._prefix + expression, lambda sample: callback(_sample(sample, self._prefix))
         )
         self._kept.append(subscriber)
+
+    def hear(self, expression: str, callback: Callable[[Heard], None]) -> Callable[[], None]:
+        """Call back, in a thread of Zenoh's, for everything on an expression until the returned function is called.
+
+        Raises:
+            SessionError: it is no key expression.
+        """
+        with _named(expression):
+            subscriber = self._raw.declare_subscriber(
+                self._prefix + expression, lambda sample: callback(_heard(sample, self._prefix))
+            )
+        self._hearing[id(subscriber)] = subscriber
+
+        def stop() -> None:
+            if self._hearing.pop(id(subscriber), None) is not None:
+                subscriber.undeclare()
+
+        return stop
+
+    def bare(self) -> "Session":
+        """Return the same session by whole keys, the federation's name included: for who passes on others' keys."""
+        session = Session(self._raw, "", Identity(host=self.host))
+        self._bare.append(session)
+        return session
+
+    def release(self) -> None:
+        """Undeclare everything: what is declared when a Zenoh session closes keeps files and memory of it for ever."""
+        hearing, self._hearing = self._hearing, {}
+        declared = [*self._publishers.values(), *self._keepers.values(), *self._kept, *hearing.values()]
+        for each in declared:
+            with suppress(zenoh.ZError):  # undeclared already, or its session is gone
+                each.undeclare()
+        for box in self._boxes:
+            with suppress(zenoh.ZError):
+                box.close()
+        for session in self._bare:
+            session.release()
+
+    def zid(self) -> str:
+        """Return Zenoh's name of this session: hexadecimal digits."""
+        return str(self._raw.info.zid())
+
+    def put_as(self, key: str, payload: bytes, encoding: str = "", attachment: bytes = b"", drop: bool = False) -> None:
+        """Publish a payload of any encoding on any of many keys, without keeping anything for the next time.
+
+        Args:
+            key, payload, encoding: of the publication.
+            attachment: what goes beside the payload.
+            drop: whether a full link loses it rather than waits.
+
+        Raises:
+            SessionError: it is no key.
+        """
+        beside: dict[str, Any] = {"attachment": attachment} if attachment else {}
+        control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
+        with _named(key):
+            self._raw.put(
+                self._prefix + key, payload, encoding=zenoh.Encoding(encoding), congestion_control=control, **beside
+            )
+
+    def writer(self, key: str, encoding: str) -> Callable[[bytes, bytes], None]:
+        """Return what publishes (payload, attachment) on one key, again and again; a full link loses it.
+
+        Raises:
+            SessionError: it is no key.
+        """
+        with _named(key):
+            publisher = self._raw.declare_publisher(
+                self._prefix + key,
+                encoding=zenoh.Encoding(encoding),
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
+        self._kept.append(publisher)
+        return lambda payload, attachment: publisher.put(payload, attachment=attachment)
+
+    def put_kept(self, key: str, payload: bytes, encoding: str = "", attachment: bytes = b"") -> None:
+        """Publish a payload for those too who subscribe later, as far as they ask (Zenoh's advanced subscribers do).
+
+        Raises:
+            SessionError: it is no key.
+        """
+        with _named(key):
+            publisher = self._keepers.get(key) or self._declare_keeper(key, encoding)
+            publisher.put(payload, attachment=attachment)
+
+    def _declare_keeper(self, key: str, encoding: str) -> zenoh.ext.AdvancedPublisher:
+        """Return a publisher that keeps its last sample; it numbers them, since no session here stamps times."""
+        publisher = self._keepers[key] = zenoh.ext.declare_advanced_publisher(
+            self._raw,
+            self._prefix + key,
+            encoding=zenoh.Encoding(encoding),
+            cache=zenoh.ext.CacheConfig(1),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+            publisher_detection=True,
+        )
+        return publisher
+
+    def delete(self, key: str) -> None:
+        """Publish that a key has no value any more.
+
+        Raises:
+            SessionError: it is no key.
+        """
+        with _named(key):
+            self._raw.delete(self._prefix + key)
+
+    def inquire(
+        self, expression: str, parameters: str = "", payload: bytes = b"", encoding: str = "", timeout_s: float = 2.0
+    ) -> list[Heard]:
+        """Return everything that is answered to a get, refusals too.
+
+        Raises:
+            SessionError: it is no key expression.
+        """
+        asked: dict[str, Any] = {"payload": payload, "encoding": zenoh.Encoding(encoding)} if payload else {}
+        with _named(expression):
+            selector = zenoh.Selector(self._prefix + expression, parameters)
+            replies = self._raw.get(selector, timeout=timeout_s, **asked)
+        return [_answered(reply, self._prefix) for reply in replies]
 
     def declare_token(self, key: str) -> None:
         """Show that this process lives; the token goes with it."""
@@ -165,10 +325,16 @@ class Session:
         what = f"no answer came within {timeout_s:g} s" if late else "nobody answers there"
         return ControlAnswer(ok=False, error=f"{key}: {what}; is it running?")
 
-    def answer(self, expression: str, callback: Callable[["Query"], None]) -> None:
-        """Call back, in a thread of Zenoh's, for every get on an expression."""
+    def answer(self, expression: str, callback: Callable[["Query"], None], complete: bool = False) -> None:
+        """Call back, in a thread of Zenoh's, for every get on an expression.
+
+        Args:
+            expression: what is answered on.
+            callback: takes each get.
+            complete: whether nobody else need be asked about it.
+        """
         queryable = self._raw.declare_queryable(
-            self._prefix + expression, lambda query: callback(Query(query, self._prefix))
+            self._prefix + expression, lambda query: callback(Query(query, self._prefix)), complete=complete
         )
         self._kept.append(queryable)
 
@@ -193,6 +359,7 @@ class Query:
         self._prefix = prefix
         self.expression = str(raw.key_expr).removeprefix(prefix)
         self.payload = raw.payload.to_bytes() if raw.payload is not None else b""
+        self.attachment = raw.attachment.to_bytes() if raw.attachment is not None else b""
 
     def request(self) -> ControlRequest:
         """Return the request in it; DecodeError if it is none."""
@@ -206,6 +373,12 @@ class Query:
         """Add one reply."""
         if self._raw is not None:
             self._raw.reply(self._prefix + key, payload, encoding=zenoh.Encoding(messages.encoding(key)))
+
+    def reply_as(self, key: str, payload: bytes, attachment: bytes) -> None:
+        """Reply with a payload that is no message of the contract, and end the query."""
+        if self._raw is not None:
+            self._raw.reply(self._prefix + key, payload, attachment=attachment)
+        self.end()
 
     def answer(self, answer: ControlAnswer) -> None:
         """Reply to a request and end it."""
@@ -222,28 +395,39 @@ class Query:
 
 
 class Mailbox:
-    """Everything that others publish on one expression, in the order of its arrival on this session."""
+    """Everything that others publish on one expression, in the order of its arrival on this session.
 
-    def __init__(self, raw: zenoh.Session, prefix: str, expression: str) -> None:
+    Args:
+        raw: the session.
+        prefix: of its keys.
+        expression: what to take.
+        without: beginnings of keys to leave out; then what this session itself publishes is left out too.
+    """
+
+    def __init__(self, raw: zenoh.Session, prefix: str, expression: str, without: tuple[str, ...] = ()) -> None:
         self._raw = raw
+        self._without = without
         self._prefix = prefix
         self._cut = len(prefix)
         self._key = None if "*" in expression else expression
         self.expression = expression
         self._wake_key = prefix + expression.replace("**", "wake").replace("*", "wake")
-        self._handler_owner = raw.declare_subscriber(prefix + expression, zenoh.handlers.FifoChannel(QUEUE))
+        origin = zenoh.Locality.REMOTE if without else zenoh.Locality.ANY
+        self._handler_owner = raw.declare_subscriber(
+            prefix + expression, zenoh.handlers.FifoChannel(QUEUE), allowed_origin=origin
+        )
         self._handler = self._handler_owner.handler
 
     def receive(self) -> Sample | None:
         """Wait for one message; None when woken by `wake`.
 
         Raises:
-            SessionError: the session was closed meanwhile.
+            SessionError: the session, or the mailbox, was closed meanwhile.
         """
         try:
             return self._take(self._handler.recv())
         except zenoh.ZError as error:
-            raise SessionError(f"{self.expression}: the session is closed") from error
+            raise SessionError(f"{self.expression}: is closed") from error
 
     def drain(self) -> Iterator[Sample]:
         """Yield what has arrived, without waiting."""
@@ -259,11 +443,30 @@ class Mailbox:
         except zenoh.ZError:
             return  # closed: nobody waits any more
 
+    def close(self) -> None:
+        """Take no more; a waiting `receive` raises SessionError."""
+        self._handler_owner.undeclare()
+
     def _take(self, raw: zenoh.Sample) -> Sample | None:
-        payload = raw.payload.to_bytes()
-        if not payload:  # a wake, or a deletion; no message of the contract is empty
+        key = self._key or str(raw.key_expr)[self._cut :]
+        if self._without and key.startswith(self._without):
             return None
-        return Sample(self._key or str(raw.key_expr)[self._cut :], payload)
+        payload = raw.payload.to_bytes()
+        return Sample(key, payload) if payload else None  # empty: a wake, or a deletion; no message is
+
+
+def _heard(raw: zenoh.Sample, prefix: str) -> Heard:
+    kind = "PUT" if raw.kind == zenoh.SampleKind.PUT else "DELETE"
+    stamp = str(raw.timestamp) if raw.timestamp is not None else None
+    beside = raw.attachment.to_bytes() if raw.attachment is not None else b""
+    return Heard(kind, str(raw.key_expr).removeprefix(prefix), raw.payload.to_bytes(), str(raw.encoding), stamp, beside)
+
+
+def _answered(reply: zenoh.Reply, prefix: str) -> Heard:
+    if reply.ok is not None:
+        return _heard(reply.ok, prefix)
+    assert reply.err is not None
+    return Heard("ERROR", "", reply.err.payload.to_bytes(), str(reply.err.encoding), None)
 
 
 def _sample(raw: zenoh.Sample, prefix: str) -> Sample:
@@ -329,6 +532,16 @@ def connect(
         yield session
 
 
+def check_expression(expression: str) -> None:
+    """Refuse what is no key expression.
+
+    Raises:
+        SessionError: with what was found and what is allowed.
+    """
+    with _named(expression):
+        zenoh.KeyExpr(expression)
+
+
 def check_listening(endpoints: Sequence[str], identity: Identity | None = None) -> None:
     """Refuse endpoints on which nobody can listen, without listening.
 
@@ -359,9 +572,11 @@ def _opened(chosen: Settings, federation: str, identity: Identity, explain: Call
         raw = zenoh.open(config)
     except zenoh.ZError as error:
         raise SessionError(explain(_brief(error))) from error
+    session = Session(raw, federation, identity)
     try:
-        yield Session(raw, federation, identity)
+        yield session
     finally:
+        session.release()
         raw.close()
 
 

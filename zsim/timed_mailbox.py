@@ -21,12 +21,11 @@ class TimedMailbox:
         self._mailbox = mailbox
         self._fresh = fresh
         self._arrived: deque[tuple[int, Sample]] = deque()
-        self._open = True
         self._thread = threading.Thread(target=self._pump, name="mailbox", daemon=True)
         self._thread.start()
 
     def _pump(self) -> None:
-        while self._open:
+        while True:
             try:
                 sample = self._mailbox.receive()
             except SessionError:
@@ -42,6 +41,5 @@ class TimedMailbox:
 
     def close(self) -> None:
         """Stop the reading thread."""
-        self._open = False
-        self._mailbox.wake()
+        self._mailbox.close()
         self._thread.join(timeout=2.0)

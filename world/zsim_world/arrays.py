@@ -39,6 +39,9 @@ class Bodies(NamedTuple):
     touching: NDArray  # int8 (N, N)
     touched: NDArray  # int8 (N, N), contacts that began in this gate
     near: Near
+    obstacle: NDArray  # (M, obstacle.COLUMNS)
+    bumping: NDArray  # int8 (N, M), whose hull touches which obstacle
+    bumped: NDArray  # int8 (N, M), contacts that began in this gate
     lanes: NDArray  # (blocks, block.LANES * lanes.COLUMNS), where they are side by side
 
 
@@ -52,6 +55,7 @@ class Boards(NamedTuple):
     set_tick: NDArray  # int64 (N,), when the setpoint was sent
     memory: NDArray  # (N, firmware.MEMORY_COLUMNS)
     belief: NDArray  # (N, observer.COLUMNS)
+    actuator: NDArray  # (N, steering.ACTUATOR_COLUMNS), what faults make of the commands to the rotors
     device: NDArray  # (N, observer.REGISTERS)
     lanes: NDArray  # (blocks, block.LANES * steering.COLUMNS), where they are side by side
 
@@ -69,6 +73,7 @@ class Senses(NamedTuple):
 
     place: NDArray  # (4,), as above
     config: NDArray  # (N, 6, sensor_set.COLUMNS)
+    fault: NDArray  # (N, 6, sensor_set.FAULT_COLUMNS)
     schedule: NDArray  # int64 (N, 6, 4)
     soonest: NDArray  # int64 (N,), tick at which one of the sensors but the IMU falls due
     bias: NDArray  # (N, 6, 6)

@@ -5,7 +5,7 @@ Nobody starves meanwhile: the first gate of a burst comes while the last ones of
 """
 
 from zsim_world.barrier import Participant
-from zsim_world.world import World
+from zsim_world.hub import Hub
 
 LAG_GATES = 2  # that the slowest may still have before it when a burst begins
 GATES_SENT = 3  # at once; more keep agents waiting that could work
@@ -19,7 +19,7 @@ class Burst:
         world: in lockstep, as fast as it can.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: Hub) -> None:
         self._world = world
         self._goes_on = True
         self._since_wall_ns = 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from zsim import keys, messages
+from zsim_world.command_links import CommandLinks
 from zsim_world.commander import Due
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ class CommandDesk:
 
     def __init__(self, world: World) -> None:
         self._world = world
+        self._links = CommandLinks(world)
 
     def take(self, drone: str, kind: str, message: Any) -> bool:
         """Keep a command until its instant, or refuse it; return False for one that has come before."""
@@ -30,7 +32,13 @@ class CommandDesk:
         if index is None or reason:
             world.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", reason or "")
             return True
-        apply_ns = message.t_ns + world.delay_ns if gating else self._foreign_ns(drone, kind, message)
+        gate_ns = message.t_ns if gating else world.next_ns
+        late_ns = self._links.delay_ns(drone, keys.command(drone, kind), message, gate_ns)
+        if late_ns is None:
+            return True  # its sender has sent it, and nobody hears it
+        apply_ns = gate_ns + world.delay_ns + late_ns
+        if not gating:
+            self._tell_foreign(drone, kind, message, apply_ns)
         return world.commanders.push(index, kind, message, apply_ns)
 
     def _age_refusal(self, message: Any, gating: bool) -> str | None:
@@ -44,18 +52,18 @@ class CommandDesk:
             return f"t_ns is {message.t_ns}; must be <= {now_ns}, the newest gate"
         return None
 
-    def _foreign_ns(self, drone: str, kind: str, message: Any) -> int:
-        """Say, and return, when a command takes effect whose sender is not in the lockstep."""
+    def _tell_foreign(self, drone: str, kind: str, message: Any, apply_ns: int) -> None:
+        """Say when a command takes effect whose sender is not in the lockstep."""
         world, source = self._world, message.source
-        apply_ns = world.next_ns + world.delay_ns
         fields = {name: getattr(message, name) for name in messages.fields(type(message))}
         text = f"{source} sends {kind} to {drone}"
         world.event("command", drone, text, source=source, command=kind, apply_t_ns=apply_ns, message=fields)
-        return apply_ns
 
     def apply(self, t_ns: int) -> None:
         """Hand the commands that are due at t_ns to the firmware."""
         for due in self._world.commanders.pop(t_ns):
+            if self._links.lost_on_air(due, t_ns + self._world.gate_ns):
+                continue
             refusal = self._world.commanders.refusal(due) or self._hand_over(due)
             if refusal:
                 subject = keys.command(self._world.fleet.names[due.drone], due.kind)

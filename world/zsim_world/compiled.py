@@ -24,6 +24,7 @@ _UNCOUNTED: dict[str, Any] = {
 
 compiled = njit(**_EXACT)
 inlined = njit(**_EXACT, **_UNCOUNTED, forceinline=True)
+apart = njit(**_EXACT, **_UNCOUNTED)  # for what is rarely run: it does not crowd its caller's code
 
 
 def kernel(sources: Iterable[Path], makes_arrays: bool = True) -> Callable[[Callable[..., Any]], Any]:

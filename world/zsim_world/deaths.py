@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 from zsim import keys
 from zsim.session import Session
-from zsim_world.world import World
+from zsim_world.hub import Hub
 
 BYE_NS = 100_000_000  # wall time by which a bye may come after the news that the token of its process went
 NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
 LOOK_S = 1.0  # a router answers which tokens it knows within milliseconds
+SILENT_S = 10  # seconds of health in a row that one that only reads may leave out; its link is given up after as many
 
 
 class Doubt(NamedTuple):
@@ -29,11 +30,31 @@ class Deaths:
         take_in: reads what has arrived; a bye may be among it.
     """
 
-    def __init__(self, link: Session, world: World, take_in: Callable[[], None]) -> None:
+    def __init__(self, link: Session, world: Hub, take_in: Callable[[], None]) -> None:
         self._link = link
         self._world = world
         self._take_in = take_in
         self._doubted: dict[str, Doubt] = {}
+        self._silent_s: dict[str, int] = {}  # of those that tell of their health
+
+    def heard(self, name: str) -> None:
+        """Take the news that a process told of its health."""
+        self._silent_s[name] = 0
+
+    def second(self) -> None:
+        """Count a second in which the world itself ran.
+
+        Who only reads and tells nothing for long is dead: it may be stopped, and Zenoh does not always tell that it has
+        closed the full link of one that takes nothing. For one that gates time stands, and somebody looks.
+        """
+        for name in list(self._silent_s):
+            participant = self._world.barrier.participants.get(name)
+            if participant is None or not participant.alive or participant.gating:
+                del self._silent_s[name]
+                continue
+            self._silent_s[name] += 1
+            if self._silent_s[name] > SILENT_S:
+                self._world.died(name, time.monotonic_ns())
 
     def suspect(self, name: str) -> None:
         """Take the news that a token went: its process is not dead yet, since its bye may come after it."""

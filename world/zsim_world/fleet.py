@@ -15,6 +15,7 @@ from zsim.errors import RunError
 from zsim.messages import DroneState
 from zsim.scenario import Gps, Scenario
 from zsim_world import firmware, gate, observer, sensor_set, vehicle, wind
+from zsim_world.impairment import Impairment
 from zsim_world.noise import NoiseTable
 from zsim_world.samples import Sample, Sampled, Sampler
 from zsim_world.start import arrays
@@ -54,6 +55,7 @@ class Fleet:
     Attributes:
         names: in scenario order, in which drones are counted.
         gps_sigma_m: of each drone's fixes.
+        impairment: what faults do to it.
         bodies, boards: the arrays that the kernel works on; to be read only.
         sampled: what fell due for publication in the last gate.
         touching: whether a drone's hull touched another's in the last gate, (N,).
@@ -79,6 +81,7 @@ class Fleet:
         self._w = arrays(scenario, self._noise)
         self._held = gate.hold(self._w)
         self.bodies, self.boards = self._w.bodies, self._w.boards
+        self.impairment = Impairment(self._w, self.names)
         self.touching = np.zeros(self.count, dtype=bool)
         self._hull_m = float(self.bodies.vehicle[:, vehicle.HULL_RADIUS].max())
         self._integrate(0)
@@ -130,6 +133,12 @@ class Fleet:
     def collisions(self) -> list[tuple[int, int]]:
         """Return the pairs whose hulls began to touch in the last gate."""
         return self._began
+
+    def bumps(self) -> list[tuple[int, int]]:
+        """Return who began to touch which obstacle in the last gate."""
+        if not self.bodies.obstacle.size:
+            return []
+        return [(int(i), int(m)) for i, m in np.argwhere(self.bodies.bumped)]
 
     def takeoff(self, i: int) -> str | None:
         """Start a take-off; return None, or why not."""
@@ -227,6 +236,8 @@ class Fleet:
     def _meet(self, least: float) -> None:
         self._began: list[tuple[int, int]] = []
         self.touching.fill(False)
+        if self.bodies.obstacle.size:
+            self.touching[:] = self.bodies.bumping.any(axis=1)
         if least < 2.0 * self._hull_m:
             self._began = [(int(i), int(j)) for i, j in np.argwhere(self.bodies.touched)]
             self.touching[np.argwhere(self.bodies.touched | self.bodies.touching).ravel()] = True

@@ -12,7 +12,7 @@ from numba.typed.typedlist import List
 from numpy.typing import NDArray
 
 from zsim import presets
-from zsim_world import firmware, observer, sensors
+from zsim_world import bump, firmware, observer, sensors
 from zsim_world import rigid_body as body
 from zsim_world import sensor_set as ss
 from zsim_world.arrays import (
@@ -27,7 +27,8 @@ from zsim_world.arrays import (
     Senses,
 )
 from zsim_world.battery import drained
-from zsim_world.compiled import inlined, kernel
+from zsim_world.bump import bumps
+from zsim_world.compiled import apart, inlined, kernel
 from zsim_world.encounter import encounters
 from zsim_world.lanes import accelerate, line_up, move
 from zsim_world.rigid_body import four, put, put_four, vector
@@ -41,6 +42,7 @@ KERNEL_FILES = (
     "arrays.py",
     "battery.py",
     "block.py",
+    "bump.py",
     "compiled.py",
     "drive.py",
     "encounter.py",
@@ -59,7 +61,7 @@ KERNEL_FILES = (
     "vehicle.py",
     "wind.py",
 )
-SOURCES = (*(Path(__file__).parent / name for name in KERNEL_FILES), Path(str(presets.__file__)))
+SOURCES = (*(Path(__file__).parent / name for name in KERNEL_FILES), Path(str(presets.__file__)), bump.SOURCE)
 WIND_STREAM = 6  # after the six sensors
 NEVER = 2**63 - 1  # a tick that does not come
 POSITION_MAX_M, RATE_MAX_RAD_S = 1e6, 1e4  # beyond, the integration has diverged
@@ -94,6 +96,8 @@ def _meet(wind: NDArray, gust: NDArray, bodies: Bodies) -> float:
             bodies.air[i, k] = wind[STEADY + k] + gust[i, k]
             bodies.push[i, k] = 0.0
     b = bodies
+    if b.obstacle.shape[0] > 0:
+        bumps(b.vehicle, b.state, b.push, b.obstacle, b.bumping, b.bumped)
     return encounters(b.vehicle, b.state, b.air, b.push, b.touching, b.touched, b.near)
 
 
@@ -145,7 +149,41 @@ def _sample(s: int, i: int, bodies: Bodies, noise: Noise, senses: Senses, value:
     put(value, 3, second)
     at = noise.at[s] + noise.cursor[i, s] * ss.NOISE_WIDTH[s]
     noise.cursor[i, s] += 1
-    return _read(s, value, config, senses.bias[i, s], noise.table[i], at, senses.place[ORIGIN_HEIGHT])
+    height = senses.place[ORIGIN_HEIGHT]
+    if config[ss.FAULTY] != 0.0:
+        return _read_faulty(s, value, config, senses.bias[i, s], senses.fault[i, s], noise.table[i], at, height)
+    return _read(s, value, config, senses.bias[i, s], noise.table[i], at, height)
+
+
+@apart
+def _read_faulty(
+    s: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray, noise: NDArray, at: int, height: float
+) -> bool:
+    """Do as `_read`, with what faults add to the errorless values and what they hold of the readings."""
+    _displace(s, value, fault)
+    kept = _read(s, value, config, bias, noise, at, height)
+    if kept:
+        _hold(value, fault)
+    return kept
+
+
+@inlined
+def _displace(s: int, value: NDArray, fault: NDArray) -> None:
+    """Add what a fault adds to the errorless values of a sensor, in place."""
+    for k in range(ss.CHANNELS[s]):
+        value[k] += fault[ss.OFFSET + k]
+
+
+@inlined
+def _hold(value: NDArray, fault: NDArray) -> None:
+    """Keep a reading (6,) that is the first of a stuck sensor, or give the one kept, in place."""
+    if fault[ss.HOLD] == ss.ARMED:
+        fault[ss.HOLD] = ss.HOLDING
+        for k in range(ss.CHANNELS_MAX):
+            fault[ss.HELD + k] = value[k]
+    elif fault[ss.HOLD] == ss.HOLDING:
+        for k in range(ss.CHANNELS_MAX):
+            value[k] = fault[ss.HELD + k]
 
 
 @inlined
@@ -261,6 +299,7 @@ def _advance(w: Arrays, ticks: int) -> tuple[int, float, int]:
     clock, device = time.clock, boards.device
     logged, least = 0, math.inf
     bodies.touched.fill(0)
+    bodies.bumped.fill(0)
     line_up(bodies)
     for _ in range(max(ticks, 1)):
         if ticks > 0:

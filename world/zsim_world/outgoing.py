@@ -9,7 +9,7 @@ from zsim.agent import Output
 from zsim.bundle import Bundle
 from zsim.session import Sample, Session
 from zsim_world.history import History
-from zsim_world.world import World
+from zsim_world.hub import Hub
 
 
 class Outgoing:
@@ -22,14 +22,14 @@ class Outgoing:
         said: told every key and message beside those of drones.
     """
 
-    def __init__(self, link: Session, world: World, history: History, said: Callable[[str, Any], None]) -> None:
+    def __init__(self, link: Session, world: Hub, history: History, said: Callable[[str, Any], None]) -> None:
         self._link = link
         self._world = world
         self._history = history
         self._said = said
         self._unsent: batch.Batch = []
         self._passed: batch.Batch = []
-        self._gate_keys = [batch.gate(name) for name in world.fleet.names]
+        self._gate_keys = [batch.gate(name) for name in world.names]
 
     def flush(self) -> None:
         """Publish the outbox."""
@@ -63,7 +63,7 @@ class Outgoing:
         if self._link.heard(batch.GATE):
             self._unsent.append(whole)
         for key, (first, last) in zip(self._gate_keys, pairwise(bundle.first), strict=True):
-            if self._link.heard(key):
+            if last > first and self._link.heard(key):
                 self._unsent.append((key, bundle.packed(first, last)))
 
     def send(self) -> None:

@@ -25,10 +25,10 @@ from zsim_world.barrier import Participant
 from zsim_world.burst import Burst
 from zsim_world.deaths import Deaths
 from zsim_world.history import History
+from zsim_world.hub import Hub
 from zsim_world.inputs import TICK_S, Direct, Inputs, Timed
 from zsim_world.outgoing import Outgoing
 from zsim_world.recovery import unheard
-from zsim_world.world import World
 
 STUCK_NS = 2_000_000_000  # wall time in one turn from which on a person is told; a turn takes milliseconds
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
@@ -39,7 +39,9 @@ RETURN_NS = 10_000_000_000  # wall time after a return to the run in which it ma
 PHASE_EVERY = 10  # states of a cluster between two looks at the phase that progress shows
 Tell = Callable[[str, Any, str], None]
 # Outputs first, dones last: whoever says done has sent its outputs before, on the same link.
-INPUTS = ("drone/*/cmd/*", "drone/*/estimate", "cluster/*/state", "process/**")
+PROCESSES, VIEWS = "process/", "view/"  # the first have a mailbox of their own, the last are nobody's business here
+OWN = keys.process(WORLD, "")
+RELAYED = (messages.Estimate, messages.ClusterState, messages.ClusterRequest)
 
 
 class _Head(msgspec.Struct):
@@ -48,6 +50,7 @@ class _Head(msgspec.Struct):
     t_ns: int
     seq: int
     source: str = ""
+    controller: str = ""  # of a ClusterRequest, whose source is somebody else
 
 
 class WorldProcess:
@@ -64,7 +67,7 @@ class WorldProcess:
     def __init__(
         self,
         link: Session,
-        world: World,
+        world: Hub,
         stopped: Callable[[], str | None] = lambda: None,
         tell: Tell = lambda kind, message, phase: None,
     ) -> None:
@@ -89,7 +92,7 @@ class WorldProcess:
         self._phase = ""
         self._start_wall_ns = 0
         self._start_sim_ns = 0
-        self._paced_rate = 0.0
+        self._pace = (0.0, 0)  # of the clock that runs: rate, leaps of time before it
         self.health = HealthMeter(WORLD, host=link.host)
 
     def run(self) -> None:
@@ -98,7 +101,7 @@ class WorldProcess:
         Raises:
             DivergedError: the state of a drone was no longer finite; everybody has been told the end before.
         """
-        boxes = [self._link.subscribe(expression) for expression in INPUTS]
+        boxes = [self._link.overhear((PROCESSES, VIEWS)), self._link.subscribe(f"{PROCESSES}**")]
         self._inputs: Inputs = Timed(boxes) if self._world.mode == "realtime" else Direct(boxes)
         self._announce()
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
@@ -120,12 +123,14 @@ class WorldProcess:
         for expression in (
             keys.INFO,
             keys.CLOCK,
+            keys.FAULTS,
             keys.CONTROL,
             keys.replay("*"),
             "drone/*/sensor/status",
             "drone/*/truth",
             "drone/*/estimate",
             "cluster/*/state",
+            *self._world.also_asked,
         ):
             self._link.answer(expression, self._on_query)
         self._link.on_token("process/*", self._on_token)
@@ -164,14 +169,14 @@ class WorldProcess:
         """Return the wall time of the next gate; the pace starts anew when the rate changes or time stood still."""
         world = self._world
         if world.rate <= 0 or world.state != "running":
-            self._paced_rate = 0.0
+            self._pace = (0.0, 0)
             return wall_ns
-        if self._paced_rate != world.rate:
-            self._paced_rate = world.rate
+        if self._pace != (world.rate, world.leaps):
+            self._pace = (world.rate, world.leaps)
             self._start_wall_ns, self._start_sim_ns = wall_ns, world.next_ns
         due_ns = self._start_wall_ns + round((world.next_ns - self._start_sim_ns) / world.rate)
         if world.mode == "lockstep" and wall_ns - due_ns > CLOCK_STANDING_NS:
-            self._paced_rate = 0.0
+            self._pace = (0.0, 0)
         return due_ns
 
     def _stand_still(self, wall_ns: int) -> None:
@@ -206,23 +211,29 @@ class WorldProcess:
 
     def _take_in_all(self) -> None:
         for wall_ns, sample in self._inputs.drain():
-            self._take_in(wall_ns, sample)
+            if not sample.key.startswith(OWN):  # it has noted its own words when it said them
+                self._take_in(wall_ns, sample)
 
     def _take_in(self, wall_ns: int, sample: Sample) -> None:
         key = sample.key
         self.health.received += 1
-        self._outgoing.passed(sample)
+        kind = messages.type_of(key)
         try:
-            if key.endswith(("/estimate", "/state")):
+            if kind in RELAYED:
+                self._outgoing.passed(sample)
                 self._pass_on(key, sample.payload)
-            elif key.startswith("process/") or "/cmd/" in key:
+            elif key.startswith(PROCESSES) or (key.startswith("drone/") and "/cmd/" in key):
+                self._outgoing.passed(sample)
                 message = messages.decode(key, sample.payload)
                 self._history.add(key, sample.payload, message.t_ns)
                 self._world.handle(key, message, wall_ns)
                 if type(message) is messages.Health:
+                    self._deaths.heard(keys.thing(key))
                     self._tell("health", message, keys.thing(key))
-            elif not key.startswith("view/"):
-                raise DecodeError(f"{key}: only the world publishes here, or the key is not of the contract")
+            elif kind is None:
+                self._outgoing.passed(sample)  # a key of somebody's own
+            else:
+                raise DecodeError(f"{key}: only the world publishes here")
         except DecodeError as error:
             self.health.refused += 1
             self._world.refuse("somebody", key[:80], str(error))
@@ -231,7 +242,8 @@ class WorldProcess:
     def _count_unread(self, sample: Sample) -> None:
         """Count an output that was refused, so that its sender's done is not taken to be short of it."""
         with contextlib.suppress(DecodeError):  # nobody can be named
-            self._world.output_of(self._head_of(sample.key, sample.payload).source)
+            head = self._head_of(sample.key, sample.payload)
+            self._world.output_of(head.controller or head.source)
 
     def _pass_on(self, key: str, payload: bytes) -> None:
         """Keep an output that the hub only relays, and count it for the done of who sent it."""
@@ -239,10 +251,12 @@ class WorldProcess:
         if head.t_ns > self._world.now_ns:
             raise DecodeError(f"{key}: t_ns is {head.t_ns}; must be <= {self._world.now_ns}, the newest gate")
         self._history.add(key, payload, head.t_ns)
-        role = "estimator" if key.startswith("drone/") else "controller"
-        if role == "controller":
+        kind = messages.type_of(key)
+        if kind is messages.ClusterState:
             self._look_at_phase(key, payload)
-        self._world.output_of(head.source or f"{role}.{keys.thing(key)}")
+        role = "estimator" if kind is messages.Estimate else "controller"
+        source = head.controller if kind is messages.ClusterRequest else head.source
+        self._world.output_of(source or f"{role}.{keys.thing(key)}")
 
     def _head_of(self, key: str, payload: bytes) -> _Head:
         try:
@@ -322,12 +336,16 @@ class WorldProcess:
             self._deaths.suspect(self._gone.popleft())
         self._deaths.judge_due()
         if self.health.due():
+            self._deaths.second()
             seq, self._health_seq = self._health_seq, self._health_seq + 1
             health = self.health.message(self._world.now_ns, seq)
             self._outgoing.publish(Output(keys.process(WORLD, "health"), health))
             self._tell("health", health, WORLD)
 
     def _serve_query(self, query: Query) -> None:
+        if query.expression in self._world.also_asked:
+            self._refuse(query)
+            return
         asker = keys.thing(query.expression) if keys.matches(keys.replay("*"), query.expression) else None
         if query.expression != keys.CONTROL and asker is None:
             for key, payload in self._history.last(query.expression):
@@ -340,6 +358,14 @@ class WorldProcess:
             answer = ControlAnswer(ok=False, error=str(error))
         query.answer(answer)
         self._outgoing.flush()
+
+    def _refuse(self, query: Query) -> None:
+        """Refuse a request that nobody takes here, unless somebody else answers it."""
+        reason = self._world.refusal_at(query.expression)
+        if reason is None:
+            query.end()
+        else:
+            query.answer(ControlAnswer(ok=False, error=reason))
 
     def _do(self, request: messages.ControlRequest, asker: str | None) -> ControlAnswer:
         """Do what is asked on `world/control`, or, by a process of which access control knows the name, on its own."""
@@ -367,13 +393,13 @@ class WorldProcess:
         if wall_ns - self._view_wall_ns < VIEW_PERIOD_NS:
             return
         self._view_wall_ns = wall_ns
-        view = self._world.view(self._view_seq)
+        for key, message in self._world.views(self._view_seq):
+            self._link.put(key, message)
         self._view_seq += 1
-        self._link.put(keys.VIEW_DRONES, view)
 
 
 def run(
-    world: World,
+    world: Hub,
     endpoints: Sequence[str],
     stopped: Callable[[], str | None] = lambda: None,
     tell: Tell = lambda kind, message, phase: None,

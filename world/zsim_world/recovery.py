@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 from zsim import batch, messages
 from zsim.errors import DecodeError
-from zsim.messages import ClusterState, Command, Estimate
+from zsim.messages import ClusterRequest, ClusterState, Command, Estimate
 from zsim.session import Sample
 from zsim_world.history import History
 
@@ -44,7 +44,7 @@ def unheard(kept: Any, done_ns: int, history: History) -> list[Sample]:
 def _mark(key: str, payload: bytes) -> _Mark | None:
     """Return the mark of an output, None for anything that a done does not count or a reader refuses."""
     kind = messages.type_of(key)
-    if kind is None or not issubclass(kind, Command | Estimate | ClusterState):
+    if kind is None or not issubclass(kind, Command | Estimate | ClusterState | ClusterRequest):
         return None
     try:
         message = messages.decode(key, payload)

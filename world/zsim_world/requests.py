@@ -1,34 +1,34 @@
-"""What may be asked of the world on `world/control`, besides replay."""
+"""What may be asked of the hub on `world/control`, besides replay: of any run, and of a flight."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from zsim import keys
+from zsim.limits import GATES_MAX, PRIORITY_MAX, RATE_MAX
 from zsim.messages import ControlAnswer, ControlRequest
 
 if TYPE_CHECKING:
+    from zsim_world.hub import Hub
     from zsim_world.world import World
 
-GATES_MAX = 1_000_000  # of one `step`: 5.5 hours at 20 ms
-RATE_MAX = 1000.0  # simulated per wall second; beyond it nothing paces
-PRIORITY_MAX = 100  # programs have 0, operators 10
+ARGS_BYTES_MAX = 4000  # of arguments that are told as they are; what is done on a request needs far fewer
 
 
-class Requests:
-    """Answers requests; each operation returns the reason of its refusal, None when it is done."""
+class TimeRequests:
+    """Answers requests about time; each operation returns the reason of its refusal, None when done, or an answer."""
 
-    def __init__(self, world: World) -> None:
-        self._world = world
-        self._operations: dict[str, Callable[[ControlRequest], str | None]] = {
+    def __init__(self, hub: Hub) -> None:
+        self._hub = hub
+        self._operations: dict[str, Callable[[ControlRequest], str | ControlAnswer | None]] = {
             "pause": self._pause,
             "resume": self._resume,
             "step": self._step,
             "rate": self._rate,
             "stop": self._stop,
-            "acquire": self._acquire,
-            "release": self._release,
         }
 
     def answer(self, request: ControlRequest) -> ControlAnswer:
@@ -39,44 +39,58 @@ class Requests:
         if operation is None:
             allowed = ", ".join([*self._operations, "replay"])
             return ControlAnswer(False, f"op is {request.op[:40]!r}; must be one of {allowed}")
-        fault = operation(request)
-        return ControlAnswer(fault is None, fault or "")
+        done = operation(request)
+        return done if isinstance(done, ControlAnswer) else ControlAnswer(done is None, done or "")
 
     def _pause(self, _: ControlRequest) -> str | None:
-        if self._world.state != "running":
-            return f"the run is {self._world.state}; pause needs a running one"
-        self._world.state, self._world.steps_allowed = "paused", 0
+        if self._hub.state != "running":
+            return f"the run is {self._hub.state}; pause needs a running one"
+        self._hub.state, self._hub.steps_allowed = "paused", 0
         return None
 
     def _resume(self, _: ControlRequest) -> str | None:
-        if self._world.state != "paused":
-            return f"the run is {self._world.state}; resume needs a paused one"
-        self._world.state = "running"
+        if self._hub.state != "paused":
+            return f"the run is {self._hub.state}; resume needs a paused one"
+        self._hub.state = "running"
         return None
 
     def _step(self, request: ControlRequest) -> str | None:
         gates = _number(request.args.get("gates", 1))
         if gates is None or gates != int(gates) or not 1 <= gates <= GATES_MAX:
             return f"gates is {_shown(request, 'gates')}; must be a whole number from 1 to {GATES_MAX}"
-        if self._world.state != "paused":
-            return f"the run is {self._world.state}; step needs a paused one"
-        self._world.steps_allowed += int(gates)
+        if self._hub.state != "paused":
+            return f"the run is {self._hub.state}; step needs a paused one"
+        self._hub.steps_allowed += int(gates)
         return None
 
     def _rate(self, request: ControlRequest) -> str | None:
         value = _number(request.args.get("value"))
-        realtime = self._world.mode == "realtime"
+        realtime = self._hub.mode == "realtime"
         if value is None or not 0 <= value <= RATE_MAX or (realtime and value == 0):
             allowed = f"from 0 (as fast as possible, lockstep only) to {RATE_MAX:g}"
             return f"value is {_shown(request, 'value')}; must be {allowed}"
-        self._world.rate = value
+        self._hub.rate = value
         return None
 
     def _stop(self, request: ControlRequest) -> str | None:
         reason = str(request.args.get("reason", ""))[:200]
         who = request.source[:40] or "somebody"
-        self._world.stop(f"stopped by {who}" + (f": {reason}" if reason else ""))
+        self._hub.stop(f"stopped by {who}" + (f": {reason}" if reason else ""))
         return None
+
+
+class Requests(TimeRequests):
+    """Answers requests about a flight too."""
+
+    def __init__(self, world: World) -> None:
+        super().__init__(world)
+        self._world = world
+        self._operations |= {
+            "acquire": self._acquire,
+            "release": self._release,
+            "fault_add": world.faults.add,
+            "fault_clear": world.faults.clear,
+        }
 
     def _acquire(self, request: ControlRequest) -> str | None:
         drone, priority = self._drone(request), _number(request.args.get("priority", 0))
@@ -106,7 +120,9 @@ class Requests:
 
 
 def brief(args: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments short enough for an event."""
+    """Return the arguments for an event: as they are, since a run is flown again by them, or shortened if too long."""
+    if len(msgspec.msgpack.encode(args)) <= ARGS_BYTES_MAX:
+        return args
     pairs = list(args.items())[:8]
     return {str(name)[:40]: value if _number(value) is not None else str(value)[:80] for name, value in pairs}
 

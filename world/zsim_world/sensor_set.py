@@ -25,7 +25,14 @@ WHITE, WALK, QUANTUM = 0, 6, 12  # per channel: std per sample, std of the bias'
 MOUNT, TURN = 18, 21  # p_BS [m] (3), q_BS (4)
 DROP = 25  # a sample is lost when its standard normal number is below this
 LIMIT_MIN, LIMIT_MAX = 26, 27  # sonar [m]
-COLUMNS = 28
+FAULTY = 28  # 0: the fault row below has no say
+COLUMNS = 29
+
+# Columns of `fault[drone, sensor]`: what is added to the errorless values; whether the next sample is kept, or given
+# again and again; that sample
+OFFSET, HOLD, HELD = 0, 6, 7
+FAULT_COLUMNS = 13
+FREE, ARMED, HOLDING = 0.0, 1.0, 2.0  # values of HOLD
 
 # Columns of `schedule[drone, sensor]`: sample n falls due at the first physics tick >= n * NUMERATOR / DENOMINATOR
 NUMERATOR, DENOMINATOR, COUNT, DUE = 0, 1, 2, 3

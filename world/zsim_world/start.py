@@ -7,7 +7,7 @@ import numpy as np
 
 from zsim.frames import quaternion_from_heading, quaternion_from_rpy
 from zsim.scenario import Drone, Scenario
-from zsim_world import block, drive, firmware, gains, lanes, observer, rigid_body, sensor_set, steering, vehicle
+from zsim_world import block, bump, drive, firmware, gains, lanes, observer, rigid_body, sensor_set, steering, vehicle
 from zsim_world import wind as wind_model
 from zsim_world.arrays import Arrays, Boards, Bodies, Near, Noise, Senses, Time
 from zsim_world.noise import NoiseTable, samples_per_gate
@@ -27,7 +27,7 @@ def arrays(scenario: Scenario, noise: NoiseTable) -> Arrays:
 
 
 def _bodies(scenario: Scenario, row: np.ndarray, dt: float) -> Bodies:
-    drones, n = scenario.drones, len(scenario.drones)
+    drones, n, obstacles = scenario.drones, len(scenario.drones), bump.rows(scenario.environment)
     half_decay = cast(Any, rigid_body.half_decay).py_func  # as Python: compiling it for a few numbers takes longer
     return Bodies(
         vehicle=row,
@@ -41,6 +41,9 @@ def _bodies(scenario: Scenario, row: np.ndarray, dt: float) -> Bodies:
         touching=np.zeros((n, n), dtype=np.int8),
         touched=np.zeros((n, n), dtype=np.int8),
         near=near(n),
+        obstacle=obstacles,
+        bumping=np.zeros((n, len(obstacles)), dtype=np.int8),
+        bumped=np.zeros((n, len(obstacles)), dtype=np.int8),
         lanes=block.blocks(lanes.COLUMNS, row, np.array([[half_decay(lag, dt)] for lag in row[:, vehicle.ROTOR_LAG]])),
     )
 
@@ -64,6 +67,7 @@ def _boards(scenario: Scenario, row: np.ndarray) -> Boards:
         set_tick=np.zeros(n, dtype=np.int64),
         memory=np.zeros((n, firmware.MEMORY_COLUMNS)),
         belief=np.array([_first_belief(height) for height in row[:, vehicle.STAND_HEIGHT]]),
+        actuator=steering.sound_actuators(n),
         device=np.zeros((n, observer.REGISTERS)),
         lanes=block.blocks(steering.COLUMNS, row, setting[:, drive.GAINS], mounts),
     )
@@ -74,6 +78,7 @@ def _senses(scenario: Scenario, noise: NoiseTable) -> Senses:
     return Senses(
         place=np.array([*field.magnetic_field_ut, field.height_m]),
         config=sensor_set.config(scenario),
+        fault=np.zeros((len(scenario.drones), len(sensor_set.SENSORS), sensor_set.FAULT_COLUMNS)),
         schedule=sensor_set.schedule(scenario),
         soonest=np.zeros(len(scenario.drones), dtype=np.int64),
         bias=noise.bias,

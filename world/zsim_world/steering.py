@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 from numpy.typing import NDArray
 
 from zsim_world import block, drive, firmware, observer
@@ -9,7 +10,7 @@ from zsim_world import rotation as rot
 from zsim_world.arrays import DT, SILENCE_HOVER, SILENCE_LAND, TICK, Boards, Bodies, Time
 from zsim_world.battery import percent
 from zsim_world.block import LANES
-from zsim_world.compiled import inlined
+from zsim_world.compiled import apart, inlined
 from zsim_world.rigid_body import four, put, put_four, vector
 from zsim_world.rotors import Four
 from zsim_world.vehicle import COLUMNS as PARAMETERS
@@ -25,6 +26,19 @@ UPWARDS, LIFT, YAW_RATE = OWN + 4, OWN + 7, OWN + 8  # wanted: z_B in the headin
 DRIVEN, COMMAND = YAW_RATE + 1, YAW_RATE + 2  # 0 if the firmware itself has set the command [rad/s] (4)
 COLUMNS = COMMAND + 4
 STILL = (0.0, 0.0, 0.0, 0.0)  # rad/s
+
+# Columns of the actuators, a row per drone: 0 where all is sound; by how much the speed of each rotor is less than
+# commanded (4); the speed at which it turns whatever is commanded [rad/s] (4), below 0 for none
+FAULTY, FACTOR, HELD = 0, 1, 5
+ACTUATOR_COLUMNS = 9
+FOLLOWS = -1.0  # rad/s, of a rotor that is not held
+
+
+def sound_actuators(n: int) -> NDArray[np.float64]:
+    """Return the rows of n drones whose rotors turn as commanded, (n, ACTUATOR_COLUMNS)."""
+    rows = np.ones((n, ACTUATOR_COLUMNS))
+    rows[:, FAULTY], rows[:, HELD:] = 0.0, FOLLOWS
+    return rows
 
 
 @inlined
@@ -121,3 +135,13 @@ def _command(bodies: Bodies, boards: Boards, i: int, command: Four) -> None:
     observer.model_rotors(boards.belief[i], boards.setting[i, drive.ROTOR_DECAY], command)
     charge = percent(bodies.vehicle[i], bodies.energy[i])
     put_four(bodies.command[i], 0, command if charge > 0.0 else STILL)
+    if boards.actuator[i, FAULTY] != 0.0 and charge > 0.0:
+        _weaken(bodies.command[i], boards.actuator[i])
+
+
+@apart
+def _weaken(command: NDArray, actuator: NDArray) -> None:
+    """Make of a command to the rotors [rad/s] (4,), in place, what faulty ones do of it."""
+    for k in range(4):
+        held = actuator[HELD + k]
+        command[k] = held if held >= 0.0 else actuator[FACTOR + k] * command[k]

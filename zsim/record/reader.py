@@ -40,6 +40,7 @@ class Recorded(NamedTuple):
 class _Chunk(NamedTuple):
     place: Place
     first_ns: int
+    last_ns: int
     channels: frozenset[int]
 
 
@@ -64,30 +65,40 @@ class RecordReader:
         check_magic(self._source, self.path)
         self.complete = is_complete(self._source)
         self._keys: dict[int, str] = {}
-        self.damaged = int(self._channels() != Opcode.FOOTER and self.complete)
+        self._rest_damaged = self._channels() != Opcode.FOOTER and self.complete
+        self._damaged: set[int] = set()  # where damaged chunks begin
         self._chunks = list(self._scan())
 
     def topics(self) -> dict[str, int]:
         """Return the keys on record with the number of their messages, in the order of their first one."""
         return {key: self._counts[number] for number, key in self._keys.items() if self._counts[number]}
 
-    def messages(self, keys: Collection[str] | None = None, by_time: bool = True) -> Iterator[Recorded]:
+    def messages(
+        self, keys: Collection[str] | None = None, by_time: bool = True, from_ns: int = 0
+    ) -> Iterator[Recorded]:
         """Yield the messages of some keys (None: of all).
 
         Args:
             keys: exact keys; chunks without any of them are not decompressed.
             by_time: in order of simulated time, messages of one time as they were written; otherwise all as
                 they were written.
+            from_ns: chunks in which everything is older are passed over; a chunk holds a quarter of a wall second.
 
         Raises:
             RecordError: compressed by another tool in a way that is not ours.
         """
         wanted = {number: key for number, key in self._keys.items() if keys is None or key in keys}
-        chunks = [chunk for chunk in self._chunks if not chunk.channels.isdisjoint(wanted)]
+        late = (chunk for chunk in self._chunks if chunk.last_ns >= from_ns)
+        chunks = [chunk for chunk in late if not chunk.channels.isdisjoint(wanted)]
         return self._by_time(chunks, wanted) if by_time else self._as_written(chunks, wanted)
 
     def __iter__(self) -> Iterator[Recorded]:
         return self.messages()
+
+    @property
+    def damaged(self) -> int:
+        """Return how many damaged chunks were met so far; everything behind unreadable records is one."""
+        return len(self._damaged) + self._rest_damaged
 
     def last(self, key: str) -> Recorded | None:
         """Return the message of a key that was written last, None if there is none."""
@@ -126,8 +137,8 @@ class RecordReader:
             counts = self._counted(group) if cut else {index.channel: index.messages for index in group.indexes}
             self._counts.update(counts)
             channels = frozenset(counts)
-            first_ns = chunk_head(self._source, group.place).first_ns
-            yield _Chunk(group.place, first_ns, known.setdefault(channels, channels))
+            head = chunk_head(self._source, group.place)
+            yield _Chunk(group.place, head.first_ns, head.last_ns, known.setdefault(channels, channels))
 
     def _counted(self, group: Group) -> dict[int, int]:
         """Return the messages per channel of a chunk whose message indexes may have been cut."""
@@ -138,7 +149,7 @@ class RecordReader:
         for chunk in chunks:
             content = content_of(self._source, chunk.place)
             if content is None:
-                self.damaged += 1
+                self._damaged.add(chunk.place.start)
                 continue
             yield from _recorded(content, wanted)
 

@@ -1,0 +1,56 @@
+"""Obstacles as solids: how far a point is from one, and in which direction it is farther. Pure; the world compiles it.
+
+An obstacle is a row: its shape, centre in W, cosine and sine of its yaw, and half of its size along its own axes (of a
+cylinder: radius, nothing, half of the height; of a sphere: radius).
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+BOX, CYLINDER, SPHERE = range(3)
+SHAPES = ("box", "cylinder", "sphere")
+SHAPE, CENTRE, COSINE, SINE, HALF = 0, 1, 4, 5, 6
+COLUMNS = 9
+TINY = 1e-12  # m, so that a point on an axis has a direction
+WIDE = 1e9  # m, half of the side that a cylinder does not have
+
+
+def row_of(obstacle: Any) -> list[float]:
+    """Return the row of an obstacle of a scenario, whose place is the middle of its foot, of a sphere its centre."""
+    x, y, z = obstacle.position_m
+    if obstacle.shape == "box":
+        half = [0.5 * side for side in obstacle.size_m]
+    elif obstacle.shape == "cylinder":
+        half = [obstacle.radius_m, 0.0, 0.5 * obstacle.height_m]
+    else:
+        half = [obstacle.radius_m, 0.0, 0.0]
+    yaw = math.radians(obstacle.yaw_deg)
+    return [float(SHAPES.index(obstacle.shape)), x, y, z + half[2], math.cos(yaw), math.sin(yaw), *half]
+
+
+def nearest(row: Sequence[float], x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """Return the distance of a point from the surface [m], below 0 inside, and the unit vector away from it; in W."""
+    dx, dy, qz = x - row[CENTRE], y - row[CENTRE + 1], z - row[CENTRE + 2]
+    c, s = row[COSINE], row[SINE]
+    qx, qy = c * dx + s * dy, c * dy - s * dx
+    r = max(math.sqrt(qx * qx + qy * qy), TINY)
+    if row[SHAPE] == SPHERE:
+        away = max(math.sqrt(qx * qx + qy * qy + qz * qz), TINY)
+        distance, nx, ny, nz = away - row[HALF], qx / away, qy / away, qz / away
+    else:
+        round_ = row[SHAPE] == CYLINDER
+        ax, ay = (r, 0.0) if round_ else (qx, qy)
+        ox, oy, oz = abs(ax) - row[HALF], abs(ay) - (WIDE if round_ else row[HALF + 1]), abs(qz) - row[HALF + 2]
+        most = max(ox, oy, oz)
+        if most > 0.0:
+            ox, oy, oz = max(ox, 0.0), max(oy, 0.0), max(oz, 0.0)
+            distance = math.sqrt(ox * ox + oy * oy + oz * oz)
+        else:  # inside: out by the nearest face
+            distance = most
+            ox, oy, oz = 1.0 if ox == most else 0.0, 1.0 if oy == most else 0.0, 1.0 if oz == most else 0.0
+        length = max(math.sqrt(ox * ox + oy * oy + oz * oz), TINY)
+        nx, ny, nz = math.copysign(ox, ax) / length, math.copysign(oy, ay) / length, math.copysign(oz, qz) / length
+        if round_:
+            nx, ny = nx * qx / r, nx * qy / r
+    return distance, c * nx - s * ny, s * nx + c * ny, nz
