@@ -15,6 +15,7 @@ import numpy as np
 from zsim import keys, messages
 from zsim.agent import Agent, Output
 from zsim.errors import RunError
+from zsim.eyes import cluster_view
 from zsim.messages import ControlAnswer, ControlRequest
 from zsim.scenario import Cluster, Gains, Scenario
 from zsim_agents.cluster_space import ClusterSpace, closest_pair, robot_rates
@@ -27,6 +28,7 @@ from zsim_agents.formation import FormationGains, guard, load
 from zsim_agents.scenario_space import scenario_space
 from zsim_agents.trajectory import Hold, ramp_onto
 
+TAKEN_MAX = 1000  # requests between two gates, as in a run that is paused: all are said at the next one
 APART_M = 2.0  # of robots in a rehearsal, any distance well above zero
 
 variances_of = itemgetter(0, 7, 14)  # of the position, in the 6 x 6 covariance, row-major
@@ -74,14 +76,18 @@ class Controller(Agent):
         self.reads = self.gate_keys
         self.writes = (keys.cluster_state(cluster),)
         self._state_key = keys.cluster_state(cluster)
-        self._view_key = f"view/cluster/{cluster}"
+        self._view_key = keys.cluster_view(cluster)
         self._control_key = keys.cluster_control(cluster)
         self._place = {key: i for of_drones in (states, estimates) for i, key in enumerate(of_drones)}
         self._velocity_keys = [keys.command(drone, "velocity") for drone in spec.drones]
         self._estimates = [_UNKNOWN] * len(spec.drones)
         self._table = GateTable(len(spec.drones))
         self._states: list[str] = ["landed"] * len(spec.drones)
+        self._told_ns = [0] * len(spec.drones)
         self._engagement = engagement_of(scenario, spec)
+        self._shown: messages.ClusterState | None = None
+        self._request_key = keys.cluster_request(cluster)
+        self._taken: list[tuple[ControlRequest, ControlAnswer]] = []  # since the last gate
 
     def receive(self, key: str, message: Any) -> None:
         place = self._place[key]
@@ -89,12 +95,27 @@ class Controller(Agent):
             former = self._estimates[place]
             if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in realtime an older one may come later
                 self._estimates[place] = message
-        else:
-            self._states[place] = message.state
+        elif message.t_ns >= self._told_ns[place]:  # over a link that jitters, too
+            self._states[place], self._told_ns[place] = message.state, message.t_ns
 
     def step(self, t_ns: int) -> list[Output]:
         output = self._engagement.step(self._gate(t_ns))
-        return [*self._modes(t_ns, output), *self._velocities(t_ns, output), *self._state(t_ns, output)]
+        commands = [*self._modes(t_ns, output), *self._velocities(t_ns, output)]
+        return [*self._requests(t_ns), *commands, *self._state(t_ns, output)]
+
+    def _requests(self, t_ns: int) -> list[Output]:
+        """Return what was asked since the last gate: whoever flies the run again asks it before this one."""
+        taken, self._taken = self._taken, []
+        key, by = self._request_key, self.source
+        return [
+            Output(
+                key,
+                messages.ClusterRequest(
+                    t_ns, self.next_seq(key), request.op, request.args, request.source, answer.ok, answer.error, by
+                ),
+            )
+            for request, answer in taken
+        ]
 
     def _gate(self, t_ns: int) -> GateInput:
         positions, velocities, variances, yaws, ages_s = [], [], [], [], []
@@ -145,19 +166,29 @@ class Controller(Agent):
             source=self.source,
             plan_step=output.plan_step,
         )
+        self._shown = state
+        return [Output(self._state_key, state)]
+
+    def views(self, t_ns: int) -> list[Output]:
+        state = self._shown
+        if state is None:
+            return []
         seq = self.next_seq(self._view_key)
-        view = messages.ViewCluster(t_ns, seq, state.phase, names, value, desired, output.reason)
-        return [Output(self._state_key, state), Output(self._view_key, view)]
+        return [Output(self._view_key, cluster_view(state, t_ns, seq))]
 
     def control_keys(self) -> tuple[str, ...]:
         return (self._control_key,)
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
+        if len(self._taken) >= TAKEN_MAX:
+            return ControlAnswer(ok=False, error=f"{key}: {TAKEN_MAX} requests wait for the next gate; ask after it")
         try:
             refusal = self._engagement.request(read_request(request.op, request.args))
         except RequestError as error:
             refusal = str(error)
-        return ControlAnswer(ok=refusal is None, error=refusal or "")
+        answer = ControlAnswer(ok=refusal is None, error=refusal or "")
+        self._taken.append((request, answer))
+        return answer
 
     def warm_start_keys(self) -> tuple[str, ...]:
         return (self._state_key,)

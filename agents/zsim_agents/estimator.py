@@ -11,8 +11,10 @@ from zsim import batch, keys, messages
 from zsim.agent import Agent, Output
 from zsim.bundle import Bundle, Selection, table_of
 from zsim.errors import DecodeError, RunError
+from zsim.eyes import estimate_view
 from zsim.scenario import Scenario
 from zsim_agents.compiled import COMPILES
+from zsim_agents.estimate import Estimate
 from zsim_agents.estimator_set import estimators
 
 
@@ -44,8 +46,11 @@ class Estimator(Agent):
         specs = [scenario.drone(drone) for drone in names]
         self._settings = (specs, scenario.environment, scenario.estimation, info.gate_ns / 1e9)
         self._set = estimators(*self._settings)
+        self._told: list[Estimate] = []
+        self._view_key = keys.estimates_view(self.name)
         self.takes_bundles = COMPILES
         self._selection = Selection(self.reads)
+        self._since_ns = 0
         self._take = {key: take for i, drone in enumerate(names) for key, take in self._takers(i, drone)}
 
     def _takers(self, i: int, drone: str) -> list[tuple[str, Callable[[Any], None]]]:
@@ -54,15 +59,23 @@ class Estimator(Agent):
         by_kind: dict[str, Callable[[Any], None]] = {
             "imu": lambda m: s.imu(i, m.t_sample_ns * 1e-9, m.accel_m_s2, m.gyro_rad_s),
             "gps": lambda m: s.gps(
-                i, m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.position_m, m.velocity_m_s, m.sigma_m, m.fix
+                i, self._arrived_s(m), m.t_sample_ns * 1e-9, m.position_m, m.velocity_m_s, m.sigma_m, m.fix
             ),
-            "mag": lambda m: s.mag(i, m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.field_ut),
-            "baro": lambda m: s.baro(i, m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.altitude_m),
-            "sonar": lambda m: s.sonar(i, m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.range_m, m.valid),
-            "flow": lambda m: s.flow(i, m.t_ns * 1e-9, m.t_sample_ns * 1e-9, m.velocity_m_s, m.quality),
+            "mag": lambda m: s.mag(i, self._arrived_s(m), m.t_sample_ns * 1e-9, m.field_ut),
+            "baro": lambda m: s.baro(i, self._arrived_s(m), m.t_sample_ns * 1e-9, m.altitude_m),
+            "sonar": lambda m: s.sonar(i, self._arrived_s(m), m.t_sample_ns * 1e-9, m.range_m, m.valid),
+            "flow": lambda m: s.flow(i, self._arrived_s(m), m.t_sample_ns * 1e-9, m.velocity_m_s, m.quality),
             "status": lambda m: None,
         }
         return [(keys.sensor(drone, kind), take) for kind, take in by_kind.items()]
+
+    def hear(self, t_ns: int, inputs: Sequence[tuple[str, Any]]) -> None:
+        self._since_ns = t_ns - self.period_ns
+        super().hear(t_ns, inputs)
+
+    def _arrived_s(self, message: Any) -> float:
+        """Return when a reading came: as it says, or, when a slow link brings it, not before the last gate."""
+        return max(message.t_ns, self._since_ns) * 1e-9
 
     def receive(self, key: str, message: Any) -> None:
         if key == batch.GATE:
@@ -78,11 +91,16 @@ class Estimator(Agent):
                 self._take[key](message)
 
     def step(self, t_ns: int) -> list[Output]:
-        told = zip(self.writes, self._set.close(t_ns * 1e-9), strict=True)
+        self._told = self._set.close(t_ns * 1e-9)
+        told = zip(self.writes, self._told, strict=True)
         return [
             Output(key, messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.source))
             for key, estimate in told
         ]
+
+    def views(self, t_ns: int) -> list[Output]:
+        shown = tuple(map(estimate_view, self.counted, self._told))
+        return [Output(self._view_key, messages.ViewEstimates(t_ns, self.next_seq(self._view_key), shown))]
 
     def rehearse(self) -> None:
         drones, place, _, gate_s = self._settings

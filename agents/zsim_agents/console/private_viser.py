@@ -1,0 +1,66 @@
+"""A viser server that nobody but the console's own door can reach, whoever else is on this machine."""
+
+import contextlib
+import http
+import io
+import secrets
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import viser
+import websockets.asyncio.server
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+SECRET_HEADER = "X-Zsim-Console"
+HOST = "127.0.0.1"
+
+
+class PrivateViser:
+    """A viser server on a port of loopback that answers only who shows the secret.
+
+    Attributes:
+        server: viser's.
+        secret: to be shown in SECRET_HEADER.
+    """
+
+    def __init__(self) -> None:
+        self.secret = secrets.token_urlsafe(24)
+        with _silent(), _bolted(self.secret):
+            self.server = viser.ViserServer(host=HOST, port=0, verbose=False)
+
+    @property
+    def port(self) -> int:
+        return self.server.get_port()
+
+    def close(self) -> None:
+        """End it."""
+        with _silent():
+            self.server.stop()
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Keep viser from printing an address that is of no use to a person."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
+
+
+@contextlib.contextmanager
+def _bolted(secret: str) -> Iterator[None]:
+    """Let servers that are started meanwhile refuse who does not show the secret: viser has no setting for it."""
+    serve = websockets.asyncio.server.serve
+
+    def bolted(*args: Any, process_request: Callable[..., Any] | None = None, **more: Any) -> Any:
+        def check(connection: Any, request: Request) -> Response | None:
+            if not secrets.compare_digest(request.headers.get(SECRET_HEADER, ""), secret):
+                return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", Headers(), b"")
+            return None
+
+        return serve(*args, process_request=check, **more)
+
+    websockets.asyncio.server.serve = bolted  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]

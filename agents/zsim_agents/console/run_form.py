@@ -1,0 +1,55 @@
+"""Steering of the run's time, and of drones one by one or all together."""
+
+import viser
+
+from zsim.limits import GATES_MAX, RATE_MAX
+from zsim.scenario import Scenario
+from zsim_agents.console.desk import Desk
+
+
+class RunForm:
+    """Pause, go on, single steps, rate.
+
+    Args:
+        gui: viser's, in the place where they are to be.
+        desk: sends what is asked for.
+    """
+
+    def __init__(self, gui: viser.GuiApi, desk: Desk) -> None:
+        gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE).on_click(lambda _: desk.world("pause"))
+        gui.add_button("Resume", icon=viser.Icon.PLAYER_PLAY).on_click(lambda _: desk.world("resume"))
+        gates = gui.add_number("gates", 1, min=1, max=GATES_MAX, step=1)
+        step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT)
+        step.on_click(lambda _: desk.world("step", gates=int(gates.value)))
+        rate = gui.add_number(
+            "rate", 1.0, min=0.0, max=RATE_MAX, step=0.5, hint="Real time is 1; 0: as fast as it goes"
+        )
+        gui.add_button("Set rate").on_click(lambda _: desk.world("rate", value=float(rate.value)))
+
+
+class DroneForm:
+    """Take-off, landing and emergency of one drone; of all of them, what has no formation to do it.
+
+    Args:
+        gui: viser's, in the place where they are to be.
+        desk: sends what is asked for.
+        scenario: names the drones.
+    """
+
+    def __init__(self, gui: viser.GuiApi, desk: Desk, scenario: Scenario) -> None:
+        names = [drone.name for drone in scenario.drones]
+        self._chosen = gui.add_dropdown("drone", names)
+        for label, mode, icon in (
+            ("Take off drone", "takeoff", viser.Icon.PLANE_DEPARTURE),
+            ("Land drone", "land", viser.Icon.PLANE_ARRIVAL),
+            ("Emergency drone", "emergency", viser.Icon.ALERT_TRIANGLE),
+            ("Reset drone", "reset", viser.Icon.REFRESH),
+        ):
+            colour = "red" if mode == "emergency" else "gray"
+            button = gui.add_button(label, icon=icon, color=colour)
+            button.on_click(lambda _, mode=mode: desk.mode([self._chosen.value], mode))
+
+    @property
+    def chosen(self) -> str:
+        """Name of the drone that is chosen."""
+        return self._chosen.value

@@ -1,0 +1,70 @@
+"""The console: one page after the other's run, behind one door."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from zsim.messages import Info
+from zsim.session import Session
+from zsim_agents.console.door import Door, Inside, Place
+from zsim_agents.console.followers import Followers
+from zsim_agents.console.guard import OPERATOR, VIEWER
+from zsim_agents.console.private_viser import PrivateViser
+from zsim_agents.console.show import Show
+from zsim_agents.presence import Presence
+
+
+class Console:
+    """One console.
+
+    Args:
+        place: where pages are served.
+        name: process name.
+        token: of operators; None on this machine alone.
+        rate_hz: pictures a second; None: as many as suit the number of drones.
+        say: told what a person should know.
+
+    Raises:
+        RunError: others could reach it, and there is no token.
+    """
+
+    def __init__(
+        self, place: Place, name: str, token: str | None, rate_hz: float | None, say: Callable[[str], None]
+    ) -> None:
+        self._name = name
+        self._rate_hz = rate_hz
+        self._say = say
+        self._show: Show | None = None
+        self._viser = PrivateViser()
+        self._followers = Followers(self._viser.server)
+        inside = Inside(self._viser.port, self._viser.secret, self._state, self._followers.harmless)
+        self._door = Door(place, token, inside)
+
+    @contextmanager
+    def open(self) -> Iterator[None]:
+        """Let pages in.
+
+        Raises:
+            RunError: the port is taken.
+        """
+        try:
+            with self._door.open():
+                links = self._door.links()
+                self._say(f"{self._name}: steer at {links[OPERATOR]}")
+                self._say(f"{self._name}: look, without steering, at {links[VIEWER]}")
+                yield
+        finally:
+            self._viser.close()
+
+    def serve(
+        self, link: Session, info: Info, presence: Presence, stopped: Callable[[], bool], say: Callable[[str], None]
+    ) -> None:
+        """Show a run until it is over, or somebody says stop."""
+        self._show = show = Show(self._viser.server, link, info, presence, self._followers, self._rate_hz)
+        try:
+            show.run(stopped)
+        finally:
+            show.close()
+
+    def _state(self) -> dict[str, Any]:
+        return self._show.state() if self._show else {"run_id": None}

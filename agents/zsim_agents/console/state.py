@@ -1,0 +1,50 @@
+"""What the console shows, as plain data: for programs, and for tests. Read in another thread than that which draws."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from zsim.messages import ViewCluster, ViewDrones
+from zsim_agents.console.eyes import Eyes
+from zsim_agents.console.picture import Shape
+from zsim_agents.console.words import sigma_m
+
+EVENTS_TOLD = 20
+
+
+def state(run_id: str, eyes: Eyes, shapes: Mapping[str, Shape | None]) -> dict[str, Any]:
+    """Return what is shown of a run.
+
+    Args:
+        run_id: of the run.
+        eyes: have heard it.
+        shapes: the formations as they truly stand.
+    """
+    view, clock, clusters = eyes.drones, eyes.clock, dict(eyes.clusters)
+    return {
+        "run_id": run_id,
+        "t_s": view.t_ns / 1e9 if view else 0.0,
+        "clock": clock.state if clock else None,
+        "drones": _drones(view, eyes) if view else [],
+        "clusters": [_cluster(name, each, shapes.get(name)) for name, each in clusters.items()],
+        "faults": [{"id": f.id, "kind": f.kind, "target": f.target} for f in eyes.faults],
+        "events": [{"t_s": e.t_ns / 1e9, "kind": e.kind, "text": e.text} for e in list(eyes.events)[:EVENTS_TOLD]],
+    }
+
+
+def _drones(view: ViewDrones, eyes: Eyes) -> list[dict[str, Any]]:
+    sigmas = {name: sigma_m(estimate) for name, estimate in eyes.estimates().items()}
+    return [
+        {"name": d.name, "position_m": list(d.position_m), "state": d.state, "sigma_m": sigmas.get(d.name)}
+        for d in view.drones
+    ]
+
+
+def _cluster(name: str, view: ViewCluster, found: Shape | None) -> dict[str, Any]:
+    return {
+        "name": name,
+        "phase": view.phase,
+        "reason": view.reason,
+        "desired": dict(zip(view.names, view.desired, strict=True)),
+        "value": dict(zip(view.names, view.value, strict=True)),
+        "true": {} if found is None else dict(zip(view.names, found.c.tolist(), strict=True)),
+    }

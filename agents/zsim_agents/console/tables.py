@@ -1,0 +1,123 @@
+"""What the page says in words and numbers: tables of HTML. Pure; everything that others wrote is escaped."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import NamedTuple
+
+from zsim.messages import Clock, Event
+
+LATE_MS = 200.0  # of an estimator: ten gates of 20 ms
+LOW_PERCENT = 20.0  # of a battery; the AR.Drone warns there
+GREY, RED, AMBER, GREEN, BLUE = "#868e96", "#e03131", "#e8890c", "#2f9e44", "#1971c2"
+COLOURS = {
+    "landed": GREY,
+    "taking_off": BLUE,
+    "hovering": GREEN,
+    "flying": GREEN,
+    "landing": BLUE,
+    "emergency": RED,
+}
+LOUD = {"refused": RED, "death": RED, "collision": RED, "fault": AMBER, "fault_end": AMBER, "fault_clear": AMBER}
+FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
+STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"
+
+
+class Row(NamedTuple):
+    """A drone as the table tells of it."""
+
+    name: str
+    state: str
+    battery_percent: float
+    lag_ms: float | None
+    commander: str | None
+    gps: str
+    faults: tuple[str, ...]
+
+
+class SensorRow(NamedTuple):
+    """What an estimator made of one kind of sensor."""
+
+    kind: str
+    used: int
+    refused: int
+    rate_hz: float | None
+
+
+def drones(rows: Sequence[Row]) -> str:
+    """Return the table of all drones."""
+    head = _row("th", ("drone", "state", "bat", "lag", "GPS", "flown by"))
+    return _table(head + "".join(map(_drone, rows)))
+
+
+def _drone(row: Row) -> str:
+    state = _coloured(row.state.replace("_", " "), COLOURS.get(row.state, GREY))
+    battery = _coloured(f"{row.battery_percent:.0f} %", RED if row.battery_percent < LOW_PERCENT else "inherit")
+    lag = "–" if row.lag_ms is None else f"{row.lag_ms:.0f} ms"
+    late = row.lag_ms is not None and row.lag_ms > LATE_MS
+    cells = (escape(row.name), state, battery, _coloured(lag, AMBER if late else "inherit"), escape(row.gps))
+    line = _cells("td", (*cells, escape(row.commander or "nobody")))
+    if row.faults:
+        told = escape(", ".join(row.faults))
+        line += f"<tr><td colspan=6 style='color:{AMBER};padding:0 4px 2px 12px'>⚠ {told}</td></tr>"
+    return line
+
+
+def sensors(name: str, rows: Iterable[SensorRow], sigma_m: float | None, yaw_sigma_deg: float | None) -> str:
+    """Return the table of one drone's sensors, and how sure its estimator is."""
+    told = [
+        _row("td", (row.kind, row.used, row.refused, "–" if row.rate_hz is None else f"{row.rate_hz:.0f} Hz"))
+        for row in rows
+    ]
+    sure = "no estimate yet"
+    if sigma_m is not None and yaw_sigma_deg is not None:
+        sure = f"σ of position {sigma_m:.2f} m, of heading {yaw_sigma_deg:.1f}°"
+    title = f"<div style='{STYLE};padding:2px 0'><b>{escape(name)}</b>: {sure}</div>"
+    return title + _table(_row("th", ("sensor", "used", "refused", "rate")) + "".join(told))
+
+
+def clusters(told: Mapping[str, tuple[str, str]]) -> str:
+    """Return phase and reason of each formation by name."""
+    lines = [
+        f"<b>{escape(name)}</b>: {escape(phase.replace('_', ' '))}" + (f" – {escape(reason)}" if reason else "")
+        for name, (phase, reason) in told.items()
+    ]
+    return f"<div style='{STYLE};{FEW_LINES};padding:2px 4px'>{'<br>'.join(lines) or 'no formation'}</div>"
+
+
+def clock(now: Clock | None, t_ns: int) -> str:
+    """Return where the run's time is, and who is waited for."""
+    if now is None:
+        return f"<div style='{STYLE};padding:2px 4px'>no clock yet</div>"
+    waiting = [w for w in now.waiting_for if now.state == "waiting" or w.since_wall_s > 0.5]
+    colour = {"running": GREEN, "paused": AMBER}.get(now.state, GREY)
+    text = f"{_coloured(now.state, colour)} <b>{t_ns / 1e9:.1f} s</b> × {now.rate:.1f} real time"
+    if waiting:
+        names = ", ".join(f"{w.name} on {w.host} ({w.since_wall_s:.0f} s)" for w in waiting[:4])
+        text += f"<br>waiting for {escape(names)}"
+    return f"<div style='{STYLE};padding:2px 4px;font-size:14px'>{text}</div>"
+
+
+def events(told: Iterable[Event]) -> str:
+    """Return events as they are given: newest first."""
+    lines = [
+        f"<tr><td style='text-align:right;color:{GREY}'>{event.t_ns / 1e9:.2f}</td>"
+        f"<td>{_coloured(event.kind, LOUD.get(event.kind, GREY))}</td><td>{escape(event.text)}</td></tr>"
+        for event in told
+    ]
+    return _table("".join(lines))
+
+
+def _table(body: str) -> str:
+    return f"<table style='{STYLE};border-spacing:4px 1px;width:100%'>{body}</table>"
+
+
+def _row(tag: str, cells: Iterable[object]) -> str:
+    return _cells(tag, (escape(str(cell)) for cell in cells))
+
+
+def _cells(tag: str, cells: Iterable[str]) -> str:
+    return f"<tr>{''.join(f'<{tag} align=left>{cell}</{tag}>' for cell in cells)}</tr>"
+
+
+def _coloured(text: str, colour: str) -> str:
+    return f"<span style='color:{colour}'>{escape(text)}</span>"

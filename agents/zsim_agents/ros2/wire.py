@@ -1,0 +1,136 @@
+"""What rmw_zenoh writes on the wire: keys, liveliness tokens, quality of service, attachments, identities. All pure.
+
+Of ros2/rmw_zenoh as Jazzy (from 0.2.4), Kilted and Rolling ship it: `liveliness_utils.cpp` for tokens and quality of
+service, `attachment_helpers.cpp` for attachments. Humble's has neither type hashes nor this attachment.
+"""
+
+import struct
+from typing import Literal, NamedTuple
+
+import xxhash
+
+SPACE = "@ros2_lv"  # of all tokens; `**` does not match it
+Kind = Literal["NN", "MP", "MS", "SS", "SC"]
+"""A node, a publisher, a subscription, a service, a client."""
+TOKEN_PARTS = 13  # of an endpoint's token
+GID_BYTES = 16
+_HEAD = struct.Struct("<qqB")  # sequence number, wall time [ns], length of the gid
+ATTACHMENT_BYTES = _HEAD.size + GID_BYTES
+
+
+class Qos(NamedTuple):
+    """What an endpoint promises or asks for; the last `depth` messages are kept."""
+
+    depth: int = 10
+    best_effort: bool = False
+    transient_local: bool = False
+
+    def text(self) -> str:
+        """Return it as tokens have it: what is rmw_zenoh's default (reliable, volatile, keep last) is left out."""
+        reliability = "2" if self.best_effort else ""
+        durability = "1" if self.transient_local else ""
+        return f"{reliability}:{durability}:,{self.depth}:,:,:,,"
+
+
+SENSOR = Qos(depth=5, best_effort=True)  # rmw_qos_profile_sensor_data
+DEFAULT = Qos(depth=10)  # rmw_qos_profile_default, and that of services
+CLOCK = Qos(depth=1, best_effort=True)  # rclcpp::ClockQoS
+TF = Qos(depth=100)  # tf2_ros::DynamicBroadcasterQoS
+TF_STATIC = Qos(depth=1, transient_local=True)  # tf2_ros::StaticBroadcasterQoS
+
+
+class NodeId(NamedTuple):
+    """A node of a Zenoh session; `namespace` is absolute, `/` for the root."""
+
+    domain: int
+    zid: str
+    number: int
+    namespace: str
+    name: str
+
+
+class Endpoint(NamedTuple):
+    """What a token tells of a publisher, subscription, service or client that is about us."""
+
+    kind: str
+    name: str
+    type_name: str
+    type_hash: str
+
+    def key(self, domain: int) -> str:
+        """Return where its messages or requests go."""
+        return data_key(domain, self.name, self.type_name, self.type_hash)
+
+
+def dds_name(ros_type: str) -> str:
+    """Return the name of a type on the wire: `std_msgs/msg/Empty` is `std_msgs::msg::dds_::Empty_`."""
+    package, kind, name = ros_type.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+def data_key(domain: int, name: str, type_name: str, type_hash: str) -> str:
+    """Return the key of a topic's messages or of a service's requests."""
+    return f"{domain}/{name.strip('/')}/{type_name}/{type_hash}"
+
+
+def node_token(node: NodeId) -> str:
+    """Return the token of a node."""
+    return f"{_head(node, node.number, 'NN')}"
+
+
+def endpoint_token(node: NodeId, number: int, endpoint: Endpoint, qos: Qos) -> str:
+    """Return the token of one of a node's endpoints."""
+    about = f"{_mangled(endpoint.name)}/{endpoint.type_name}/{endpoint.type_hash}/{qos.text()}"
+    return f"{_head(node, number, endpoint.kind)}/{about}"
+
+
+def _head(node: NodeId, number: int, kind: str) -> str:
+    enclave = "%"
+    place = f"{SPACE}/{node.domain}/{node.zid}/{node.number}/{number}/{kind}"
+    return f"{place}/{enclave}/{_mangled(node.namespace)}/{node.name}"
+
+
+def _mangled(name: str) -> str:
+    return name.replace("/", "%")
+
+
+def subscriptions(domain: int) -> str:
+    """Return the expression of the tokens of all subscriptions."""
+    return f"{SPACE}/{domain}/*/*/*/MS/**"
+
+
+def endpoint_of(token: str) -> Endpoint | None:
+    """Return what a token tells of an endpoint; None where it is none."""
+    parts = token.split("/")
+    if len(parts) != TOKEN_PARTS or parts[0] != SPACE:
+        return None
+    return Endpoint(parts[5], parts[9].replace("%", "/"), parts[10], parts[11])
+
+
+def gid_of(token: str) -> bytes:
+    """Return the identity of an endpoint: XXH3-128 of its token, the low half first, both little-endian."""
+    digest = xxhash.xxh3_128_intdigest(token.encode())
+    return digest.to_bytes(GID_BYTES, "little")
+
+
+class Attachment(NamedTuple):
+    """What goes beside every message, request and reply: its number (from 1), its wall time, and who sent it."""
+
+    sequence: int
+    wall_ns: int
+    gid: bytes
+
+    def packed(self) -> bytes:
+        return _HEAD.pack(self.sequence, self.wall_ns, GID_BYTES) + self.gid
+
+
+def attachment_of(data: bytes) -> Attachment:
+    """Return what an attachment says.
+
+    Raises:
+        ValueError: it is none of rmw_zenoh's.
+    """
+    if len(data) != ATTACHMENT_BYTES or data[_HEAD.size - 1] != GID_BYTES:
+        raise ValueError(f"the attachment has {len(data)} bytes; must have {ATTACHMENT_BYTES}, of rmw_zenoh >= 0.2.4")
+    sequence, wall_ns, _ = _HEAD.unpack_from(data)
+    return Attachment(sequence, wall_ns, data[_HEAD.size :])
