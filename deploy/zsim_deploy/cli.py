@@ -9,7 +9,20 @@ import typer
 
 from zsim import __version__
 from zsim.errors import BehindError, SupersededError, ZsimError
-from zsim_deploy import certs_commands, hosts_commands, look_commands, render_commands, sweep_commands
+from zsim_deploy import (
+    certs_commands,
+    console_command,
+    export_command,
+    fault_commands,
+    gateway_command,
+    hosts_commands,
+    look_commands,
+    render_commands,
+    replay_command,
+    ros1_command,
+    ros2_command,
+    sweep_commands,
+)
 from zsim_deploy.arguments import (
     DEFAULT_ENDPOINT,
     Access,
@@ -67,6 +80,7 @@ def run(
     hosted: Annotated[
         bool, typer.Option("--hosted", help="Estimators and controllers in one process: faster, the same bits.")
     ] = False,
+    console: Annotated[bool, typer.Option("--console", help="Show it in the browser, and steer it there.")] = False,
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
     order: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
@@ -80,15 +94,18 @@ def run(
         "--rate": rate is not None,
         "--listen": listen is not None,
         "--hosted": hosted,
+        "--console": console,
     }
     if in_process and any(given.values()):
         useless = " and ".join(name for name, is_given in given.items() if is_given)
         raise typer.BadParameter(f"--in-process is lockstep, unpaced, without Zenoh; leave out {useless}, or it")
+    if console:
+        console_command.check()
     check_endpoint(listen, insecure)
     loaded = load_scenario(scenario, set_, seed, duration)
     mode, pace = mode_and_rate(realtime, rate)
     folder, first = make_directory(out, loaded), [name for name in order.split(",") if name]
-    options = Options(loaded, folder, mode, pace, listen, insecure, hosted, first)
+    options = Options(loaded, folder, mode, pace, listen, insecure, hosted, first, console)
     with Screen(loaded.duration_s) as screen:
         try:
             outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)
@@ -122,11 +139,24 @@ def validate(scenario: ScenarioPath, set_: Set = None) -> None:
 
 
 @app.command(rich_help_panel=RUN)
-def report(directory: Annotated[Path, typer.Argument(help="Folder of a run or a sweep.", show_default=False)]) -> None:
-    """Make summary.json, figures and report.html of a run from its record, or of a sweep from its table."""
+def report(
+    directories: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Folder of a run or a sweep; of several runs, to compare.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Page that compares (default compare-NAMES.html beside the first).")
+    ] = None,
+) -> None:
+    """Make summary.json, figures and report.html of a run from its record, or of a sweep; or compare several runs."""
     from zsim_deploy.look import report_path
     from zsim_deploy.sweep.plan import is_sweep
 
+    if len(directories) > 1:
+        _compare(directories, out)
+        return
+    directory = directories[0]
+    if out is not None:
+        raise typer.BadParameter("--out is for the page that compares several runs; leave it out")
     if is_sweep(directory):
         sweep_commands.make_report(directory)
         return
@@ -156,6 +186,23 @@ def _report(directory: Path) -> None:
         summary = make_report(directory, lambda text: status.update(text))
     Console().print(table(summary))
     print(f"report: {directory / 'report.html'}")
+
+
+def _compare(directories: list[Path], out: Path | None) -> None:
+    from rich.console import Console
+
+    from zsim_deploy.look import report_path
+    from zsim_deploy.report import compare, comparison_path
+    from zsim_deploy.sweep.plan import is_sweep
+
+    for directory in directories:
+        if is_sweep(directory):
+            raise typer.BadParameter(f"{directory} is a sweep; runs can be compared, a sweep has a report of its own")
+        report_path(directory)
+    page = out or comparison_path(directories)
+    with Console(stderr=True).status("reading the records …") as status:
+        compare(directories, page, lambda text: status.update(text))
+    print(f"report: {page}")
 
 
 @app.command(rich_help_panel=ROLES)
@@ -285,7 +332,14 @@ def _version(asked: bool) -> None:
 
 
 app.add_typer(sweep_commands.app)
+app.add_typer(export_command.app)
+app.add_typer(replay_command.app)
 app.add_typer(look_commands.app)
+app.add_typer(fault_commands.app, rich_help_panel=look_commands.PANEL)
+app.add_typer(console_command.app)
+app.add_typer(gateway_command.app)
+app.add_typer(ros1_command.app)
+app.add_typer(ros2_command.app)
 hosts_commands.register(app, HOSTS)
 app.add_typer(certs_commands.app, rich_help_panel=HOSTS)
 app.add_typer(render_commands.app, rich_help_panel=HOSTS)

@@ -17,13 +17,13 @@ from zsim.record import RecordWriter
 from zsim.scenario import Scenario
 from zsim_deploy.hosting import hosted
 from zsim_deploy.progress import Reasons, Screen, Throttle
-from zsim_world.world import World, expected
+from zsim_world.world import World
 
 
 def agents(world: World) -> list[Agent]:
     """Return the agents that a scenario expects as one, built from `world/info` as any process would."""
     roles = ("estimator.", "controller.")
-    names = [name for name in expected(world.scenario) if name.startswith(roles)]
+    names = [name for name in world.scenario.expected() if name.startswith(roles)]
     return [hosted(world.info(), world.scenario, names)] if names else []
 
 

@@ -151,11 +151,7 @@ def _circles(document: dict[str, Any]) -> Iterator[Fault]:
 
 def roles(scenario: Scenario) -> list[str]:
     """Return the names of the processes that a scenario needs, the world first."""
-    wanted = scenario.processes.expect
-    if wanted is None:
-        estimators = [f"estimator.{drone.name}" for drone in scenario.drones]
-        wanted = [*estimators, *(f"controller.{cluster.name}" for cluster in scenario.clusters)]
-    return [WORLD, RECORDER, *(name for name in wanted if name != RECORDER)]
+    return [WORLD, RECORDER, *(name for name in scenario.expected() if name != RECORDER)]
 
 
 def placement(placed: Placed, scenario: Scenario) -> dict[str, str]:

@@ -34,7 +34,7 @@ def keys(
     """List the keys that speak, with their message and how many came in a second."""
     from zsim_deploy import look
 
-    with _link(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
+    with linked(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
         for key, kind, count in look.list_keys(link):
             print(f"{key:<36} {kind:<14} {count:>6}")
 
@@ -57,7 +57,7 @@ def echo(
     def emit(name: str, message: Any) -> None:
         print(json.dumps({"key": name, "message": message}), flush=True)
 
-    with _link(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
+    with linked(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
         look.echo(link, key, count, emit, raw)
 
 
@@ -76,7 +76,7 @@ def hz(
     """Print how often messages come on a key, in wall and in simulated time."""
     from zsim_deploy import look
 
-    with _link(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
+    with linked(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
         look.hz(link, key, window, seconds or math.inf, lambda line: print(line, flush=True))
 
 
@@ -96,7 +96,7 @@ def pub(
     """Send a command to a drone; t_ns, seq and source are filled in."""
     from zsim_deploy import poke
 
-    with _link(connect, federation, wait, identity(host, tls, insecure)) as (link, info):
+    with linked(connect, federation, wait, identity(host, tls, insecure)) as (link, info):
         sent = poke.publish(link, info, key, message, count, rate_hz)
     print(f"published {sent} on {key}")
 
@@ -116,13 +116,13 @@ def ask(
     """Send a request to the world or a controller and print the answer."""
     from zsim_deploy import poke
 
-    with _link(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
+    with linked(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
         result = poke.ask(link, key, op, args)
     print("ok" if result is None else json.dumps(result))
 
 
 @contextmanager
-def _link(endpoint: str, federation: str, wait_s: float | None, who: "Identity") -> Iterator[tuple["Session", "Info"]]:
+def linked(endpoint: str, federation: str, wait_s: float | None, who: "Identity") -> Iterator[tuple["Session", "Info"]]:
     """Yield a session to the federation's hub, and what its world says of the run."""
     from zsim.connection import find_world
 

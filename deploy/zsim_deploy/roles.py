@@ -2,6 +2,7 @@
 
 import gc
 import os
+import signal
 import sys
 import threading
 import time
@@ -23,6 +24,7 @@ from zsim_deploy.leash import Leash
 from zsim_deploy.lent import lent
 from zsim_deploy.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
 
+NICE = 5  # of processes for which nobody waits
 TICK_S = 0.1  # how often a router looks for a stop
 PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
 PATIENCE_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
@@ -52,11 +54,11 @@ def world(
     gc.collect()
     gc.freeze()
     if launched:
-        run(run_world, endpoints, leash.reason, _told(Teller()), identity=identity)
+        run(run_world, endpoints, leash.reason, told(Teller()), identity=identity)
         return
     with Screen(scenario.duration_s) as screen:
         listening = f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run"
-        run(run_world, endpoints, leash.reason, _told(screen), lambda: screen.say(listening), identity)
+        run(run_world, endpoints, leash.reason, told(screen), lambda: screen.say(listening), identity)
         screen.say(f"ended: {run_world.ended}")
 
 
@@ -77,7 +79,7 @@ def _patience(teller: Teller | None) -> Iterator[None]:
         timer.cancel()
 
 
-def _told(show: Show) -> Callable[[str, Any, str], None]:
+def told(show: Show) -> Callable[[str, Any, str], None]:
     """Return what the world calls with its clocks, its events, and what passes it."""
     throttle, reasons = Throttle(), Reasons()
     told = [0]
@@ -129,7 +131,7 @@ def agent(
 ) -> None:
     """Run one agent against the world on an endpoint."""
     leash = Leash(launched is not None, lent(identity, launched))
-    say = _speaker(launched is not None)
+    say = speaker(launched is not None)
     found = find_world(endpoint, federation, wait_s, say, leash.pulled, run_id=launched, identity=identity)
     with found as (link, info):
         made = build(info, scenario_file.from_text(info.scenario))
@@ -137,8 +139,16 @@ def agent(
         say(f"{made.name}: in run {info.run_id}{_also(made)}")
         gc.collect()
         gc.freeze()
-        reason = Runner(link, info, made, leash.pulled, say, leash.deserted).run()
+        runner = Runner(link, info, made, leash.pulled, say, leash.deserted)
+        reason = runner.run()
     say(f"{made.name}: left, {reason}")
+    if runner.killed:
+        _die()
+
+
+def _die() -> None:
+    """End as by kill -9, so that who launched this process sees it die."""
+    os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))  # Windows has no SIGKILL; there this is as hard
 
 
 def estimator(drones: Sequence[str]) -> Callable[[messages.Info, Scenario], Agent]:
@@ -188,9 +198,9 @@ def recorder(
     """Record the run of the world on an endpoint into a file."""
     from zsim_agents.recorder import record
 
-    os.nice(5) if hasattr(os, "nice") else None
+    give_way()
     leash = Leash(launched is not None, lent(identity, launched))
-    say = _speaker(launched is not None)
+    say = speaker(launched is not None)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -216,7 +226,7 @@ def router(
         SessionError: the port is taken, or a certificate, here or upstream, is refused.
     """
     leash = Leash(launched is not None, lent(identity, launched))
-    say = _speaker(launched is not None)
+    say = speaker(launched is not None)
     with session.route(endpoint, upstream, federation, mode, identity) as link:
         say(f"router.{name}: {endpoint} leads to {upstream}")
         probe_s = 0.0
@@ -233,7 +243,13 @@ def _refuse(fault: str | None, upstream: str) -> None:
         raise SessionError(f"cannot connect to {upstream}: {fault}")
 
 
-def _speaker(launched: bool) -> Callable[[str], None]:
+def give_way() -> None:
+    """Let the world go first where both want the processor: for those for whom nobody waits. Threads to come, too."""
+    if hasattr(os, "nice"):
+        os.nice(NICE)
+
+
+def speaker(launched: bool) -> Callable[[str], None]:
     """Return how a role speaks to a person: plain lines on standard error, which a launcher keeps as its log."""
 
     def say(text: str) -> None:

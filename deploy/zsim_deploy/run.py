@@ -13,6 +13,7 @@ from zsim.errors import RecordError, RunError, SessionError
 from zsim.identity import Identity
 from zsim.record import repair
 from zsim.scenario import Scenario
+from zsim_deploy import console_command
 from zsim_deploy.arguments import pace_options
 from zsim_deploy.child import Child
 from zsim_deploy.hosting import agents_of
@@ -36,6 +37,7 @@ class Options:
     insecure: bool = False
     hosted: bool = False
     order: list[str] = field(default_factory=list)
+    console: bool = False
 
 
 def _children(options: Options, endpoint: str, watch: Watch) -> list[Child]:
@@ -57,6 +59,9 @@ def _children(options: Options, endpoint: str, watch: Watch) -> list[Child]:
         # a name of the contract may begin with -
         split = [name.partition(".") for name in names]
         children += [Child(f"{role}.{thing}", [role, *reach, "--", thing], logs) for role, _, thing in split]
+    if options.console:
+        show = ["console", "--name", console_command.OF_A_RUN, "--port", str(_page_port()), *reach]
+        children.append(Child(console_command.OF_A_RUN, show, logs, watch.take_line))
     rank = {name: i for i, name in enumerate(options.order)}
     return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
 
@@ -86,13 +91,22 @@ def _is_free(port: int) -> bool:
     return True
 
 
+def _page_port() -> int:
+    """Return the console's port, or another free one where that is taken."""
+    return console_command.PORT if _is_free(console_command.PORT) else _any_port()
+
+
+def _any_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
 def free_port(screen: Screen) -> int:
     """Return Zenoh's port, or another free one, and say so, where that is taken."""
     if _is_free(DEFAULT_PORT):
         return DEFAULT_PORT
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = _any_port()
     screen.say(f"port {DEFAULT_PORT} is in use; this run is on tcp/127.0.0.1:{port} (--connect for other commands)")
     return port
 

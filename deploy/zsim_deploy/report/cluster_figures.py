@@ -40,10 +40,10 @@ def draw_errors(formation: Formation, window_s: tuple[float, float]) -> Figure:
     grid = figure.subplots(len(names), 2, squeeze=False, sharex="col", width_ratios=(1, 1))
     rows = formation.within(window_s)
     for name, (whole, zoom) in zip(names, grid, strict=True):
-        _draw_error(whole, formation, name, np.ones(len(rows), bool))
+        draw_error(whole, formation, name, np.ones(len(rows), bool))
         whole.axvspan(*window_s, color="#eef2f6", zorder=0)
         whole.set_ylabel(label(name), fontsize=10)
-        _draw_error(zoom, formation, name, rows)
+        draw_error(zoom, formation, name, rows)
         _write_statistics(zoom, formation, name, rows)
     grid[0, 0].set_title("whole run (shaded: window)", fontsize=10)
     grid[0, 1].set_title(f"window, {window_s[0]:g} to {window_s[1]:g} s", fontsize=10)
@@ -54,7 +54,8 @@ def draw_errors(formation: Formation, window_s: tuple[float, float]) -> Figure:
     return figure
 
 
-def _draw_error(axes: Axes, formation: Formation, name: str, rows: np.ndarray) -> None:
+def draw_error(axes: Axes, formation: Formation, name: str, rows: np.ndarray) -> None:
+    """Draw the errors of a parameter, estimated and true, at some instants."""
     i = formation.column(name)
     dress(axes)
     axes.axhline(0, color="#000000", lw=0.6, zorder=1)

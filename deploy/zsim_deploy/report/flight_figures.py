@@ -49,7 +49,7 @@ def draw_plan(flight: Flight, formations: Sequence[Formation]) -> Figure:
     axes.set_xlabel("east x (m)", fontsize=10)
     axes.set_aspect("equal", adjustable="datalim")
     for i, track in enumerate(flight.tracks):
-        _draw_path(axes, track, drone_colour(i), named=i < NAMED_MAX)
+        draw_path(axes, track, drone_colour(i), named=i < NAMED_MAX)
     for formation in formations:
         _draw_desired(axes, formation)
         _draw_outlines(axes, formation, flight.tracks)
@@ -57,7 +57,8 @@ def draw_plan(flight: Flight, formations: Sequence[Formation]) -> Figure:
     return figure
 
 
-def _draw_path(axes: Axes, track: Track, colour: str, named: bool) -> None:
+def draw_path(axes: Axes, track: Track, colour: str, named: bool) -> None:
+    """Draw a true path from above, with its start and its end."""
     if not len(track.t_ns):
         return
     step = max(1, len(track.t_ns) // 4000)  # a path has no extremes to keep, only a shape
@@ -122,18 +123,19 @@ def draw_drones(flight: Flight) -> Figure:
         style = {"color": drone_colour(i), "lw": 1.1, "label": track.name if i < NAMED_MAX else None}
         line(altitude, track.t_ns / 1e9, track.p_W[:, 2], **style)
         line(battery, track.status_t_ns / 1e9, track.battery_percent, **style)
-        _draw_states(state, track, i)
+        draw_states(state, track, i)
     state.set_yticks(range(count), [track.name for track in flight.tracks])
     state.invert_yaxis()
     state.grid(False)
     battery.set_xlabel("simulated time (s)", fontsize=10)
-    _name_states(state, flight.tracks)
+    name_states(state, flight.tracks)
     figure.align_ylabels()
     legend_above(figure, altitude)
     return figure
 
 
-def _draw_states(axes: Axes, track: Track, lane: int) -> None:
+def draw_states(axes: Axes, track: Track, lane: int) -> None:
+    """Draw the states of a drone as a bar in a lane of its own."""
     if not track.states:
         return
     states = np.array(track.states)
@@ -144,7 +146,7 @@ def _draw_states(axes: Axes, track: Track, lane: int) -> None:
         axes.broken_barh([(left, right - left)], (lane - 0.36, 0.72), color=colour)
 
 
-def _name_states(axes: Axes, tracks: Sequence[Track]) -> None:
+def name_states(axes: Axes, tracks: Sequence[Track]) -> None:
     """Put the names of the states that occur beside the axes."""
     occur = [name for name in STATES if any(name in track.states for track in tracks)]
     handles: list[Patch | Line2D] = [Patch(color=STATES[name], label=name.replace("_", " ")) for name in occur]

@@ -1,0 +1,77 @@
+"""The command that shows a run in the browser, and steers it."""
+
+from typing import Annotated
+
+import typer
+
+from zsim_deploy.arguments import (
+    DEFAULT_ENDPOINT,
+    Connect,
+    Federation,
+    Host,
+    Insecure,
+    Launched,
+    Tls,
+    Wait,
+    identity,
+    positive,
+)
+
+PANEL = "Watch and steer"
+PORT = 8080
+OF_A_RUN = "console.run"  # the one that a run starts: not to be taken over by the first that is started by hand
+MODULES = ("aiohttp", "viser")  # of the extra
+TOKEN = "ZSIM_TOKEN"  # in the environment: a command line can be read by everybody on the machine
+
+app = typer.Typer()
+
+
+@app.command(rich_help_panel=PANEL)
+def console(
+    listen: Annotated[str, typer.Option(help="Address on which the page is served.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port of the page.", min=1, max=65535)] = PORT,
+    token: Annotated[
+        str | None, typer.Option(envvar=TOKEN, help="What operators must show; needed off loopback.")
+    ] = None,
+    rate_hz: Annotated[
+        float | None,
+        typer.Option(callback=positive, help="Pictures a second (20; 10 from 20 drones on).", show_default=False),
+    ] = None,
+    name: Annotated[str, typer.Option(help="Process name (default console.1, or the certificate's).")] = "",
+    connect: Connect = DEFAULT_ENDPOINT,
+    federation: Federation = "zsim",
+    wait: Wait = None,
+    launched: Launched = None,
+    tls: Tls = None,
+    insecure: Insecure = False,
+    host: Host = None,
+) -> None:
+    """Show a run in the browser, and steer it: scene, plots, events, faults."""
+    check()
+    from zsim_agents.console.door import Place
+    from zsim_agents.console.server import Console
+    from zsim_deploy.progress import Teller
+    from zsim_deploy.roles import give_way, speaker
+    from zsim_deploy.visitor import named, visit
+
+    give_way()
+    mine = named("console", name, tls, "1")
+    say = Teller().say if launched else speaker(False)
+    shown = Console(Place(listen, port), mine, token, rate_hz, say)
+    with shown.open():
+        visit(mine, shown.serve, connect, federation, wait, launched, identity(host, tls, insecure))
+
+
+def check() -> None:
+    """Refuse where what the page is made of is not installed.
+
+    Raises:
+        RunError: says what to install.
+    """
+    from importlib.util import find_spec
+
+    from zsim.errors import RunError
+
+    missing = [module for module in MODULES if find_spec(module) is None]
+    if missing:
+        raise RunError(f"console: {' and '.join(missing)} is not installed; pip install 'zsim[console]'")

@@ -1,0 +1,80 @@
+"""The command that lets in programs that have sockets or HTTP and no Zenoh."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from zsim_deploy.arguments import (
+    DEFAULT_ENDPOINT,
+    Connect,
+    Federation,
+    Host,
+    Insecure,
+    Launched,
+    Tls,
+    Wait,
+    identity,
+)
+
+if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from zsim.identity import Identity
+    from zsim.messages import Info
+    from zsim.session import Session
+
+PANEL = "Others come in"
+TOKEN = "ZSIM_TOKEN"  # in the environment: a command line can be read by everybody on the machine
+
+app = typer.Typer()
+
+
+@app.command(rich_help_panel=PANEL)
+def gateway(
+    listen: Annotated[str, typer.Option(help="Address on which clients come in.")] = "127.0.0.1",
+    http: Annotated[int, typer.Option(help="Port of HTTP and WebSocket.", min=1, max=65535)] = 8000,
+    lines: Annotated[int, typer.Option(help="Port of JSON lines on TCP.", min=1, max=65535)] = 7470,
+    token: Annotated[
+        str | None, typer.Option(envvar=TOKEN, help="What clients must show; needed off loopback.")
+    ] = None,
+    name: Annotated[str, typer.Option(help="Process name (default gateway.main, or the certificate's).")] = "",
+    connect: Connect = DEFAULT_ENDPOINT,
+    federation: Federation = "zsim",
+    wait: Wait = None,
+    launched: Launched = None,
+    tls: Tls = None,
+    insecure: Insecure = False,
+    host: Host = None,
+) -> None:
+    """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
+    from zsim.connection import find_world
+    from zsim_agents.gateway.server import Doors, Gateway
+    from zsim_deploy.roles import give_way, speaker
+    from zsim_deploy.visitor import named, visit
+
+    give_way()
+    who = identity(host, tls, insecure)
+    mine = named("gateway", name, tls)
+
+    def dial(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
+        return find_world(connect, federation, 5.0, identity=_of_seat(who, process))
+
+    doors = Doors(listen, http, lines)
+    gate = Gateway(doors, mine, token, dial, speaker(launched is not None), secured=tls is not None)
+    with gate.open():
+        visit(mine, gate.serve, connect, federation, wait, launched, who)
+
+
+def _of_seat(who: "Identity", process: str) -> "Identity":
+    """Return who a client's seat is on the network: its certificate lies beside the gateway's."""
+    from zsim.errors import SessionError
+
+    if who.tls is None:
+        return who
+    folder: Path = who.tls.parent / process
+    if not folder.is_dir():
+        raise SessionError(
+            f"{process}: has no certificate here ({folder}); name it in the scenario and in the inventory"
+        )
+    return who._replace(tls=folder)

@@ -1,0 +1,47 @@
+"""The command that lets ROS 1 nodes in."""
+
+from functools import partial
+from typing import Annotated
+
+import typer
+
+from zsim_agents.ros1.master_uri import DEFAULT_MASTER, reachable_as
+from zsim_deploy.arguments import DEFAULT_ENDPOINT, Connect, Federation, Host, Insecure, Launched, Tls, Wait, identity
+
+PANEL = "Others come in"
+
+app = typer.Typer()
+
+
+@app.command(rich_help_panel=PANEL)
+def ros1(
+    master: Annotated[str, typer.Option(envvar="ROS_MASTER_URI", help="The ROS master.")] = DEFAULT_MASTER,
+    ros_host: Annotated[
+        str | None,
+        typer.Option(
+            "--ros-host",
+            "--ip",
+            help="Name or address under which ROS nodes reach this host (default $ROS_HOSTNAME, $ROS_IP, or found).",
+        ),
+    ] = None,
+    name: Annotated[str, typer.Option(help="Process name (default ros1.main, or the certificate's).")] = "",
+    connect: Connect = DEFAULT_ENDPOINT,
+    federation: Federation = "zsim",
+    wait: Wait = None,
+    launched: Launched = None,
+    tls: Tls = None,
+    insecure: Insecure = False,
+    host: Host = None,
+) -> None:
+    """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
+    from zsim_agents.ros1.bridge import DismissedError, serve
+    from zsim_deploy.roles import give_way
+    from zsim_deploy.visitor import named, visit
+
+    give_way()
+    mine = named("ros1", name, tls)
+    bridge = partial(serve, master_uri=master, host=ros_host or reachable_as(master))
+    try:
+        visit(mine, bridge, connect, federation, wait, launched, identity(host, tls, insecure))
+    except DismissedError as error:
+        print(error)

@@ -1,0 +1,65 @@
+"""Processes that let others in: they stay when a run ends, and serve the next."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from zsim.connection import find_world
+from zsim.errors import NoWorldError, SupersededError
+from zsim.identity import Identity
+from zsim.messages import Info
+from zsim.session import Session
+from zsim_agents.presence import Presence
+from zsim_deploy.leash import Leash
+from zsim_deploy.lent import lent
+from zsim_deploy.roles import speaker
+
+PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits for byes
+
+Stopped = Callable[[], bool]
+Say = Callable[[str], None]
+Serve = Callable[[Session, Info, Presence, Stopped, Say], None]
+"""Serves one run with (session, info, presence, stopped, say), until its presence is over or it is stopped."""
+
+
+def visit(
+    name: str, serve: Serve, endpoint: str, federation: str, wait_s: float | None, launched: str | None, who: Identity
+) -> None:
+    """Serve one run after the other of the world on an endpoint, until it is told to stop; launched, only one.
+
+    Raises:
+        NoWorldError: there was no first world within `wait_s`.
+        SupersededError: another process of this name has taken over.
+    """
+    leash = Leash(launched is not None, lent(who, launched))
+    say = speaker(launched is not None)
+    former = ""
+    try:
+        while not leash.pulled():
+            with find_world(endpoint, federation, wait_s, say, leash.pulled, True, launched, who) as (link, info):
+                if info.run_id != former:
+                    _serve(serve, link, Presence(link, info, name), info, leash, say)
+                else:
+                    time.sleep(PAUSE_S)
+            if launched:
+                return
+            former, wait_s = info.run_id, None
+    except NoWorldError:
+        if not leash.pulled():
+            raise
+
+
+def named(role: str, name: str, tls: Path | None, thing: str = "main") -> str:
+    """Return a process's name: as told, or its certificate's, or the role's first."""
+    return name or (tls.name if tls else f"{role}.{thing}")
+
+
+def _serve(serve: Serve, link: Session, presence: Presence, info: Info, leash: Leash, say: Say) -> None:
+    presence.enter()
+    say(f"{presence.name}: in run {info.run_id}")
+    serve(link, info, presence, leash.pulled, say)
+    reason = presence.over or leash.reason() or "stopped"
+    presence.leave(reason)
+    if presence.superseded:
+        raise SupersededError(f"{presence.name}: {reason}; this one ends")
+    say(f"{presence.name}: left, {reason}")
