@@ -1,0 +1,60 @@
+/**
+ * Flies drone1 through a square of 2 m at the lockstep's pace: a seat in it, a controller, and an end.
+ *
+ *     node examples/js/fly.mjs [tcp://HOST:PORT | ws://HOST:PORT/stream]
+ */
+import { connect } from "../../clients/js/zsim.js";
+
+const DRONE = "drone1";
+const GAIN_1_S = 0.8; // speed for a metre of error
+const SPEED_M_S = 0.8; // at most, on each axis
+const NEAR_M = 0.25; // from a corner that counts as reached; the estimate is no better
+const LEG_S = 8; // for a corner that is not reached; then the next one is tried
+const CORNERS = [[0, 0, 1.5], [2, 0, 1.5], [2, 2, 1.5], [0, 2, 1.5], [0, 0, 1.5]]; // from where it took off
+
+const zsim = await connect(process.argv[2] ?? "tcp://127.0.0.1:7470", { name: "square", timeoutS: 30 });
+await zsim.untilRun();
+
+const reads = [`drone/${DRONE}/estimate`, `drone/${DRONE}/sensor/status`];
+const square = flight();
+for await (const gate of await zsim.join("square", { periodS: 0.02, reads })) {
+  const { position_m } = gate.input(`drone/${DRONE}/estimate`) ?? {};
+  const { state } = gate.input(`drone/${DRONE}/sensor/status`) ?? {};
+  if (position_m === undefined) continue;
+  if (state === "landed" && square.over) {
+    console.log(`landed at t = ${(gate.t_ns / 1e9).toFixed(2)} s`);
+    break;
+  }
+  if (state === "landed") square.startsAt(position_m, gate);
+  else if (square.over) gate.mode(DRONE, "land");
+  else if (state === "hovering" || state === "flying") square.fly(position_m, gate);
+}
+zsim.close();
+
+/** The flight: towards a corner, to the next one where it is reached, and down after the last. */
+function flight() {
+  let start = [0, 0, 0];
+  let corner = 0;
+  let since_s;
+  return {
+    get over() {
+      return corner === CORNERS.length;
+    },
+    startsAt(position_m, gate) {
+      start = [position_m[0], position_m[1], 0];
+      gate.mode(DRONE, "takeoff");
+    },
+    fly(position_m, gate) {
+      const t_s = gate.t_ns / 1e9;
+      since_s ??= t_s;
+      const error_m = position_m.map((at, i) => start[i] + CORNERS[corner][i] - at);
+      const far_m = Math.hypot(...error_m);
+      gate.velocity(DRONE, error_m.map((e) => Math.max(-SPEED_M_S, Math.min(SPEED_M_S, GAIN_1_S * e))), 0, "world");
+      if (far_m > NEAR_M && t_s - since_s < LEG_S) return;
+      const at = position_m.map((x) => x.toFixed(2)).join(" ");
+      console.log(`t = ${t_s.toFixed(2)} s  corner ${corner}  at ${at} m, ${far_m.toFixed(2)} m away`);
+      since_s = t_s;
+      corner += 1;
+    },
+  };
+}
