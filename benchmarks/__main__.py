@@ -13,7 +13,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks import command_age, growth, kernels, lockstep, machine, page, peers, real_time_factor, runs_per_hour
+from benchmarks import (
+    command_age,
+    console,
+    gateway,
+    growth,
+    kernels,
+    lockstep,
+    machine,
+    page,
+    peers,
+    real_time_factor,
+    recorder,
+    runs_per_hour,
+)
 from benchmarks.sheet import Sheet, read
 
 RESULTS = Path(__file__).parent / "results"
@@ -34,6 +47,9 @@ PARTS = {
     "d": Part(command_age.measure, command_age.page),
     "e": Part(growth.measure, growth.page),
     "f": Part(runs_per_hour.measure, runs_per_hour.page),
+    "g": Part(gateway.measure, gateway.page),
+    "h": Part(console.measure, console.page),
+    "i": Part(recorder.measure, recorder.page),
 }
 
 

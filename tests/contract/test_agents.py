@@ -47,7 +47,7 @@ MAY_WRITE = {
     "estimator": ("drone/{thing}/estimate",),
     "controller": (
         "cluster/{thing}/state",
-        "view/cluster/{thing}",
+        "cluster/{thing}/request",
         "drone/{drone}/cmd/velocity",
         "drone/{drone}/cmd/mode",
     ),
@@ -278,6 +278,30 @@ def test_it_answers_every_gate_of_its_period(name: str):
 
 
 @every_agent
+def test_it_shows_eyes_what_it_said_last(name: str):
+    agent = make(name)
+    outputs = run(agent, inputs(agent))
+    t_ns, said = outputs[-1]
+    (shown,) = agent.views(t_ns)
+    assert messages.type_of(shown.key) is type(shown.message)
+    assert messages.decode(shown.key, messages.encode(shown.message)) == shown.message
+    if isinstance(shown.message, messages.ViewCluster):
+        state = next(message for key, message in said if key.endswith("/state"))
+        assert isinstance(state, messages.ClusterState)
+        assert shown.key == f"view/cluster/{name.partition('.')[2]}"
+        assert (shown.message.value, shown.message.desired) == (state.value, state.desired)
+    else:
+        assert isinstance(shown.message, messages.ViewEstimates)
+        assert shown.key == f"view/estimates/{name}"
+        told: dict[str, Any] = {keys.thing(key): message for key, message in said}
+        assert [e.name for e in shown.message.estimates] == list(told)
+        for estimate in shown.message.estimates:
+            P = np.reshape(told[estimate.name].covariance, (6, 6))[:3, :3]
+            assert estimate.position_m == told[estimate.name].position_m
+            assert estimate.covariance_m2 == tuple(P[np.triu_indices(3)])
+
+
+@every_agent
 def test_it_writes_only_where_it_may(name: str):
     role, _, thing = name.partition(".")
     drones = SEVERAL.get(name, [thing]) if role == "estimator" else scenario().cluster(thing).drones
@@ -291,7 +315,7 @@ def test_it_writes_only_where_it_may(name: str):
 def test_the_flight_makes_the_controller_say_all_that_it_can():
     """Else the rules above would hold of messages that never came."""
     written = {keys.leaf(key) for _, gate in flown("controller.main") for key, _ in gate}
-    assert written == {"state", "velocity", "mode", "main"}
+    assert written == {"state", "velocity", "mode"}
 
 
 @every_agent
@@ -449,7 +473,12 @@ def test_a_refused_request_changes_no_bit(name: str):
         t_ns = said[-1][1].t_ns
         for key, message in inbox.take(t_ns):
             agent.receive(key, message)
-        outputs.append((t_ns, list(agent.step(t_ns))))
+        told = agent.step(t_ns)
+        asked = [output.message for output in told if isinstance(output.message, messages.ClusterRequest)]
+        assert [(a.t_ns, a.op, a.ok, a.controller) for a in asked] == [
+            (t_ns, "target", False, name) for _ in agent.control_keys()
+        ]
+        outputs.append((t_ns, [output for output in told if output.message not in asked]))
     assert wire(outputs) == wire(flown(name))
 
 

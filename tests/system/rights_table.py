@@ -22,6 +22,7 @@ ROLES: tuple[str, ...] = ("estimator.drone1", "controller.main", "recorder", "op
 TABLE = """
 world/info                        rg      rg      rg      rg
 world/event                       r       r       r       r
+world/faults                      rg      rg      rg      rg
 world/control                     -       -       r       rg
 clock                             rg      rg      rg      rg
 @batch                            -       -       r       r
@@ -56,11 +57,14 @@ drone/drone3/cmd/velocity         -       -       r       rp
 drone/drone3/cmd/mode             -       -       r       rp
 drone/drone3/estimate             -       -       rg      rg
 cluster/main/state                -       rpg     rg      rg
+cluster/main/request              -       p       r       r
 cluster/main/control              -       a       r       rg
 cluster/other/state               -       -       rg      rg
 cluster/other/control             -       -       r       rg
 view/drones                       -       -       r       r
 view/cluster/main                 -       p       r       r
+view/estimates/estimator.drone1   p       -       r       r
+view/estimates/estimator.drone2   -       -       r       r
 process/world                     -       -       rw      rw
 process/world/health              -       -       r       r
 process/estimator.drone1          t       -       rw      rw

@@ -4,6 +4,7 @@ How a fenced block is marked, in the line that opens it:
 
     bash run            executed as it stands, line after line; must succeed
     bash terminals      each line is a process of its own, as in a terminal of its own, until the next heading
+    bash with PROGRAM   as `bash run`, where there is this program; where there is none, the test says so by skipping
     bash elsewhere      not for this machine (installs, other hosts); every `zsim` line must be one that the
                         command line takes, and the others must be among ELSEWHERE
     yaml, yaml part     a whole scenario; top-level sections to be put into scenarios/step.yaml
@@ -18,14 +19,17 @@ differs from what is printed: endpoints, shorter durations, and no report where 
 import os
 import re
 import shlex
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.request import urlopen
 
 import msgspec
 import pytest
@@ -41,10 +45,12 @@ ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 RUN_S = 4.0  # simulated seconds of a run that has no other process to serve
 PATIENCE_S = 120  # wall seconds for one line on a machine that does other work as well
+PROGRAMS = ("octave-cli", "gcc", "node", "zenoh-ros2", "rostopic")
 KINDS = (
     "bash run",
     "bash terminals",
     "bash elsewhere",
+    *(f"bash with {program}" for program in PROGRAMS),
     "yaml",
     "yaml part",
     "yaml inventory",
@@ -98,29 +104,35 @@ def test_every_block_is_of_a_known_kind(page: Path) -> None:
 
 @pytest.mark.parametrize("page", pages_with("bash run", "bash terminals"))
 def test_commands_run(page: Path, tmp_path: Path) -> None:
+    missing: list[str] = []
     with Desk(tmp_path) as desk:
         chapter = 0
         for block in blocks(page):
             if block.chapter != chapter:
                 desk.close_terminals()
                 chapter = block.chapter
-            if block.kind == "bash run":
+            program = block.kind.removeprefix("bash with ")
+            if program != block.kind and not desk.has(program):
+                missing.append(program)
+            elif block.kind == "bash run" or program != block.kind:
                 desk.run(block, page)
             elif block.kind == "bash terminals":
                 desk.open_terminals(block, page)
+    if missing:
+        pytest.skip(f"{page.name}: all but the blocks with {', '.join(missing)}, which this machine does not have")
 
 
 class Desk:
-    """A folder like a fresh checkout, two free ports, and the terminals that are open."""
+    """A folder like a fresh checkout, free ports, and the terminals that are open."""
 
     def __init__(self, folder: Path) -> None:
-        for name in ("scenarios", "examples", "docs", "agents", "world", "zsim"):
+        for name in ("scenarios", "examples", "clients", "docs", "agents", "world", "zsim"):
             (folder / name).symlink_to(ROOT / name)
         (folder / ".venv").symlink_to(sys.prefix)
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         self._environment = {**os.environ, "PATH": path, "COLUMNS": "100"}
         self._folder = folder
-        self._ports = free_ports(2)
+        self._ports = free_ports(len(PORTS))
         self._terminals: list[tuple[str, Path, subprocess.Popen[bytes]]] = []
 
     def __enter__(self) -> "Desk":
@@ -134,6 +146,10 @@ class Desk:
             for _, _, process in self._terminals:
                 process.kill()
                 process.wait()
+
+    def has(self, program: str) -> bool:
+        """Tell whether there is a program."""
+        return shutil.which(program, path=self._environment["PATH"]) is not None
 
     def run(self, block: Block, page: Path) -> None:
         """Run a block as one script."""
@@ -172,14 +188,25 @@ class Desk:
                     start_new_session=True,
                 )
             self._terminals.append((f"{page.name}:{block.line}: {text}", log, process))
-        if re.search(r"\bzsim (run|world) ", block.text):
-            self._wait_for_port()
+        if re.search(r"\bzsim (run|world|replay) ", block.text):
+            self._wait_for_port(self._ports[0])
+        if "zsim gateway" in block.text:
+            self._wait_for_run(self._ports[PORTS.index("8000")])
 
-    def _wait_for_port(self) -> None:
+    def _wait_for_run(self, port: int) -> None:
+        """Wait until a gateway has been told of a drone's estimate: then everybody is there."""
+        until_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until_s:
+            with suppress(OSError), urlopen(f"http://127.0.0.1:{port}/json/drone/drone1/estimate"):
+                return
+            time.sleep(0.1)
+        raise AssertionError(f"the gateway tells of no estimate\n{self._said()}")
+
+    def _wait_for_port(self, port: int) -> None:
         until_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < until_s:
             with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", self._ports[0])) == 0:
+                if probe.connect_ex(("127.0.0.1", port)) == 0:
                     return
             time.sleep(0.05)
         raise AssertionError(f"nobody listens\n{self._said()}")
@@ -207,8 +234,10 @@ def lines(block: Block) -> list[str]:
 
 
 EXAMPLE_S = 25.0  # simulated seconds of an example: past the take-off at 20 s
-LEADERS = r"zsim (run|world|router) "
-ANSWERED = ("estimator", "controller", "host", "record", "keys", "echo", "hz", "pub", "ask")
+PORTS = ("7447", "7448", "8000", "7470", "11311")  # as printed: world, router, HTTP, lines, ROS master
+LEADERS = r"zsim (run|world|replay|router|gateway|ros1|ros2)\b"
+ANSWERED = ("estimator", "controller", "host", "record", "keys", "echo", "hz", "pub", "ask", "gateway", "ros1", "ros2",
+            "fault (?:add|clear|list)")  # fmt: skip
 FOREIGN = ("plain_client.py", "foreign_estimator.py", "range_sensor.py")  # take the endpoint as an argument
 OURS = ("my_estimator.py", "fly_square.py")
 
@@ -217,7 +246,9 @@ def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
     """Return a command with this test's endpoints, no longer than longest_s where that is given."""
     endpoint = f"tcp/127.0.0.1:{ports[0]}"
     own = "7447" in line
-    line = line.replace("0.0.0.0", "127.0.0.1").replace("7447", str(ports[0])).replace("7448", str(ports[1]))
+    line = re.sub(r"\bzsim gateway\b", "zsim gateway --http 8000 --lines 7470", line.replace("0.0.0.0", "127.0.0.1"))
+    for printed, port in zip(PORTS, ports, strict=True):
+        line = re.sub(rf"\b{printed}\b", str(port), line)
     line = re.sub(r"\bzsim (run)\b(?!.*--in-process)", rf"zsim \1 --listen {endpoint}", line)
     if longest_s is not None and re.search(r"\bzsim run\b", line):
         line = re.sub(r"--duration \S+", "", line).replace("zsim run", f"zsim run --duration {longest_s:g}")
@@ -225,11 +256,11 @@ def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
     if " --out " not in line:
         line = re.sub(r"\bzsim run\b", "zsim run --no-report", line)
     if not own:
-        line = re.sub(r"\bzsim world\b", f"zsim world --listen {endpoint}", line)
+        line = re.sub(r"\bzsim (world|replay)\b", rf"zsim \1 --listen {endpoint}", line)
         line = re.sub(rf"\bzsim ({'|'.join(ANSWERED)})\b", rf"zsim \1 --connect {endpoint}", line)
         line = re.sub(rf"({'|'.join(map(re.escape, FOREIGN))})", rf"\1 {endpoint}", line)
         line = re.sub(rf"({'|'.join(map(re.escape, OURS))})", rf"\1 --connect {endpoint}", line)
-    line = re.sub(r"\bzsim (keys|echo|hz|pub|ask)\b", rf"zsim \1 --wait {PATIENCE_S}", line)
+    line = re.sub(r"\bzsim (keys|echo|hz|pub|ask|fault (?:add|clear|list))\b", rf"zsim \1 --wait {PATIENCE_S}", line)
     return re.sub(r"\bmake (\w+)", rf"make -n -C {ROOT} \1 >/dev/null", line)  # last: ROOT may end with zsim
 
 
@@ -437,6 +468,8 @@ def allowed(info: types.Type) -> str:
         return f"[{info.cls.__name__}](#{info.cls.__name__.lower()})"
     if isinstance(info, types.LiteralType):
         return ", ".join(f"`{value}`" for value in info.values)
+    if isinstance(info, types.AnyType):
+        return "anything"
     if isinstance(info, types.StrType):
         return "name" if info.pattern else "text"
     assert isinstance(info, types.BoolType)
@@ -493,7 +526,10 @@ def _flat(value: dict[str, Any], path: str = "") -> Iterator[tuple[str, float]]:
 def test_the_protocol_names_every_message_and_field(shape: str) -> None:
     """The row of a key holds the message's name and those of all its fields, nested ones too."""
     kind = messages.types_by_shape()[shape]
-    key = shape.replace("drone/*", "drone/{d}").replace("cluster/*", "cluster/{c}").replace("process/*", "process/{p}")
+    things = {"drone/*": "drone/{d}", "cluster/*": "cluster/{c}", "process/*": "process/{p}"}
+    key = shape.replace("estimates/*", "estimates/{p}")
+    for stars, names in things.items():
+        key = key.replace(stars, names)
     text = (ROOT / "docs/protocol.md").read_text()
     row = next(line for line in text.splitlines() if line.startswith(f"| `{key}` |"))
     wanted = [kind.__name__, *(f for f in messages.fields(kind) if f not in ("t_ns", "seq"))]

@@ -12,6 +12,7 @@ INTERRUPTED_WITHIN_S = 3.0  # wall time from Ctrl-C until the whole run has ende
 JUMP_MAX_M = 0.5  # truth of a run with a restart against the run without
 ENGAGED_NS = 6_000_000_000
 UNWRITTEN_NS = 2_500_000_000  # simulated, at four times real time: what comes waits up to half a second in the recorder
+UNWRITTEN_S = 3.0  # wall time: the same for a run as fast as it goes, in which that half second can be twenty simulated
 
 pytestmark = pytest.mark.xdist_group("serial")
 
@@ -130,6 +131,8 @@ def test_a_stopped_reader(federation: Federation) -> None:
 def test_a_stopped_recorder(federation: Federation) -> None:
     """A recorder that takes nothing for long is as good as dead, whether or not a put has waited for it before."""
     flight = Flight(federation, "--rate", "1000", "--duration", "100000")
+    engaged_s = flight.clock.heard[-1].wall_s
+    flight.clock.until(lambda _: flight.clock.heard[-1].wall_s > engaged_s + UNWRITTEN_S)
     federation.kill("recorder", signal.SIGSTOP)
     flight.run.line("death: recorder .*; on_death: end")
     flight.run.ends(with_code=1)

@@ -20,12 +20,14 @@ NESTED = b"\x83\xa4t_ns\x00\xa3seq\x00\xa1x" + b"\x91" * 5000 + b"\xc0"
 class FakeBox:
     """A mailbox."""
 
-    def __init__(self, expression: str) -> None:
+    def __init__(self, expression: str, without: tuple[str, ...] = ()) -> None:
         self.expression = expression
+        self._without = without
         self._arrived: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
 
     def put(self, sample: Sample | None) -> None:
-        self._arrived.put(sample)
+        if sample is None or not (self._without and sample.key.startswith(self._without)):
+            self._arrived.put(sample)
 
     def receive(self) -> Sample | None:
         return self._arrived.get(timeout=PATIENCE_S)
@@ -88,13 +90,16 @@ class FakeLink:
 
     # What a session does
 
-    def subscribe(self, expression: str) -> FakeBox:
-        box = FakeBox(expression)
+    def subscribe(self, expression: str, without: tuple[str, ...] = ()) -> FakeBox:
+        box = FakeBox(expression, without)
         self._boxes.append(box)
         for sample in self._early:
             if keys.matches(expression, sample.key):
                 box.put(sample)
         return box
+
+    def overhear(self, without: tuple[str, ...]) -> FakeBox:
+        return self.subscribe("**", without)
 
     def on_message(self, expression: str, callback: Callable[[Sample], None]) -> None:
         self._callbacks.append((expression, callback))

@@ -92,7 +92,7 @@ def test_who_is_not_named_gets_nothing(scenario: Any) -> None:
     [("my.drone1", "estimator.drone1"), ("fence.main", "controller.main")],
 )
 def test_a_process_that_takes_the_place_of_ours_has_its_rights(scenario: Any, process: str, like: str) -> None:
-    own = {f"process/{like}", f"process/{process}"}
+    own = {f"{of}/{name}" for of in ("process", "view/estimates") for name in (like, process)}
 
     def of_others(name: str, act: str) -> set[str]:
         expressions = getattr(rights.of(name, scenario), ACTS[act])
@@ -106,7 +106,7 @@ def test_a_process_that_takes_the_place_of_ours_has_its_rights(scenario: Any, pr
 )
 def test_a_process_about_nothing_known_hears_what_all_are_told(scenario: Any, process: str) -> None:
     found = rights.of(process, scenario)
-    assert found.reads == ("world/info", "clock", "world/event")
+    assert found.reads == ("world/info", "clock", "world/event", "world/faults")
     assert all(key.startswith(f"process/{process}/") for key in found.writes)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsim import messages, presets
+from zsim import messages, obstacle, presets
 from zsim.frames import geodetic_to_enu
 from zsim.scenario_file import resolve
 from zsim_world import gate
@@ -262,10 +262,15 @@ def test_truth_is_a_copy():
 
 def test_the_kernel_is_named_after_every_file_with_compiled_code():
     folder = Path(gate.__file__).parent
-    compiled = {p.name for p in folder.glob("*.py") if "\n@inlined" in p.read_text() or p.name == "compiled.py"}
+    marked = re.compile(r"^@(inlined|apart)$", re.MULTILINE)
+    compiled = {p.name for p in folder.glob("*.py") if marked.search(p.read_text()) or p.name == "compiled.py"}
     assert compiled - {"normals.py", "publication.py"} <= set(gate.KERNEL_FILES)  # these have kernels of their own
     assert all((folder / name).exists() for name in gate.KERNEL_FILES)
-    assert set(gate.SOURCES) == {*(folder / name for name in gate.KERNEL_FILES), Path(presets.__file__)}
+    assert set(gate.SOURCES) == {
+        *(folder / name for name in gate.KERNEL_FILES),
+        Path(presets.__file__),
+        Path(obstacle.__file__),
+    }
 
 
 def test_constants_that_are_compiled_in_come_from_files_that_count():

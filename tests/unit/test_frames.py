@@ -82,6 +82,25 @@ def test_euler_angles_agree_with_scipy(roll, pitch, yaw):
     np.testing.assert_allclose(frames.wrap_angle(frames.heading(q) - yaw), 0.0, atol=1e-9)
 
 
+def test_a_matrix_has_the_quaternion_that_it_was_made_from():
+    """Random attitudes, and half turns about each axis, of which one part alone is not zero."""
+    q = np.random.default_rng(4).normal(size=(5, 40, 4))
+    q /= np.linalg.norm(q, axis=-1, keepdims=True)
+    again = frames.quaternion_from_matrix(frames.rotation_matrix(q))
+    np.testing.assert_allclose(np.abs((again * q).sum(axis=-1)), 1.0, atol=1e-12)
+    np.testing.assert_allclose(frames.quaternion_from_matrix(frames.rotation_matrix(np.eye(4))), np.eye(4))
+    turn = Rotation.from_quat(again[0, 0], scalar_first=True).as_matrix()
+    np.testing.assert_allclose(turn, frames.rotation_matrix(q[0, 0]), atol=1e-12)
+
+
+def test_principal_axes_make_their_covariance_again():
+    half = np.random.default_rng(3).standard_normal((20, 3, 3))
+    covariance = half @ np.swapaxes(half, -1, -2)
+    sigma, axes = frames.principal_axes(covariance)
+    R = frames.rotation_matrix(axes)
+    np.testing.assert_allclose(R * np.square(sigma)[:, None, :] @ np.swapaxes(R, -1, -2), covariance, atol=1e-12)
+
+
 def test_products_and_inverses_over_leading_shapes():
     rng = np.random.default_rng(2)
     p, q = rng.normal(size=(2, 4, 4))

@@ -11,7 +11,7 @@ from zsim import keys
 from zsim.agent import Agent, Output
 from zsim.errors import RunError
 from zsim.in_process import Bus
-from zsim.messages import Bye, ClusterState, Done, Estimate, Imu, Join, Status, Velocity, ViewCluster, Waiting
+from zsim.messages import Bye, ClusterState, Done, Estimate, Imu, Info, Join, Status, Velocity, ViewCluster, Waiting
 
 GATE_NS = 20_000_000
 DRONES = ("d1", "d2")
@@ -43,6 +43,9 @@ class Hub:
 
     def output_of(self, source: str) -> None:
         self.outputs.append(source)
+
+    def info(self) -> Info:
+        raise AssertionError("nobody asks where there are no faults")
 
     def may_advance(self) -> bool:
         last_ns = (self._gate - 1) * GATE_NS
@@ -110,12 +113,14 @@ class FakeController(Notes):
 
     def step(self, t_ns: int) -> list[Output]:
         self.notes.append(("step", t_ns))
-        command, state, view = keys.command("d1", "velocity"), keys.cluster_state("main"), "view/cluster/main"
+        command, state = keys.command("d1", "velocity"), keys.cluster_state("main")
         return [
             Output(command, Velocity(t_ns, self.next_seq(command), self.name, (0.0, 0.0, 0.0), 0.0)),
             Output(state, ClusterState(t_ns, self.next_seq(state), "idle", (), (), (), (), (), None, 0.0, "")),
-            Output(view, ViewCluster(t_ns, self.next_seq(view), "idle", (), (), (), "")),
         ]
+
+    def views(self, t_ns: int) -> list[Output]:
+        return [Output("view/cluster/main", ViewCluster(t_ns, 0, "idle", (), (), (), ""))]
 
 
 def fly(gates: int, agents: list[Agent]) -> tuple[Hub, Said]:

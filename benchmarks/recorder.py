@@ -1,0 +1,174 @@
+"""Part i: the recorder beside a federation of 50 drones: whether it writes everything, and its share of a core.
+
+Everything is counted by `seq`, which every key has from 0 without gaps. The share is processor time by wall time from
+the first megabyte on record to the end of the run, so that start-up is left out.
+"""
+
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import psutil
+
+from benchmarks import grid, run
+from benchmarks.child import RefusedError
+from benchmarks.peers import ROOT
+from benchmarks.progress import Progress
+from benchmarks.run import CLI
+from benchmarks.sheet import Sheet
+from benchmarks.table import figure, spread, table
+from zsim.messages import REFUSALS
+from zsim.record import RecordReader
+
+DRONES = 50
+TEST_1 = ROOT / "scenarios" / "step.yaml"
+SECONDS = 20.0  # simulated
+OPTIONS: dict[str, tuple[str, ...]] = {"lockstep": (), "realtime": ("--realtime",)}
+LABELS = {"lockstep": "lockstep, as fast as it goes", "realtime": "realtime, 1×"}
+BEGUN_BYTES = 1_000_000  # on record when the run is under way
+LOOK_S = 0.25  # wall time between two looks at the recorder
+TIMEOUT_S = 300.0
+FIELDS = ("core_percent", "messages_per_s", "megabytes_per_s", "missing")
+
+
+class _Seq(msgspec.Struct):
+    seq: int
+
+
+class Flown(NamedTuple):
+    """What a recorder did.
+
+    Attributes:
+        cpu_s: its processor time while the run was under way.
+        wall_s: that while.
+        sim_s: simulated in all.
+        messages: on record.
+        size_bytes: of the record.
+        faults: by key, where its count is broken; of views, which may skip, only what comes twice or backwards.
+        missing: numbers that are not on record, views left out.
+    """
+
+    cpu_s: float
+    wall_s: float
+    sim_s: float
+    messages: int
+    size_bytes: int
+    faults: dict[str, str]
+    missing: int
+
+
+def fly(drones: int, seconds: float, *options: str) -> Flown:
+    """Fly a grid of drones with everything that they have, estimators and controllers in one process.
+
+    Raises:
+        RefusedError: the run failed.
+    """
+    with tempfile.TemporaryDirectory() as temporary:
+        scenario, out = Path(temporary) / "grid.yaml", Path(temporary) / "run"
+        grid.write(scenario, drones, seconds)
+        command = [*CLI, "run", str(scenario), "--hosted", "--no-report", "--out", str(out), *options]
+        looks: list[tuple[float, float]] = []
+        with tempfile.TemporaryFile("w+") as said:
+            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=said, text=True)
+            try:
+                looks = list(_looks(process, out / "run.mcap"))
+            finally:
+                if process.poll() is None:
+                    process.terminate()
+                process.wait()
+            said.seek(0)
+            if process.returncode or len(looks) < 2:
+                raise RefusedError(f"zsim run: exit code {process.returncode}: {said.read().strip()[-200:]}")
+        faults, missing, messages, last_ns = counted(out / "run.mcap")
+        (first_wall_s, first_cpu_s), (wall_s, cpu_s) = looks[0], looks[-1]
+        size = (out / "run.mcap").stat().st_size
+        return Flown(cpu_s - first_cpu_s, wall_s - first_wall_s, last_ns / 1e9, messages, size, faults, missing)
+
+
+def _looks(launcher: subprocess.Popen[str], record: Path) -> Iterator[tuple[float, float]]:
+    """Yield wall time and the recorder's processor time [s] now and then while a run is under way."""
+    recorder: psutil.Process | None = None
+    until_s = time.monotonic() + TIMEOUT_S
+    while launcher.poll() is None and time.monotonic() < until_s:
+        recorder = recorder or _recorder(launcher.pid)
+        if recorder is not None and record.exists() and record.stat().st_size > BEGUN_BYTES:
+            try:
+                spent = recorder.cpu_times()
+            except psutil.NoSuchProcess:
+                continue
+            yield time.monotonic(), spent.user + spent.system
+        time.sleep(LOOK_S)
+
+
+def _recorder(launcher: int) -> psutil.Process | None:
+    try:
+        children = psutil.Process(launcher).children()
+        return next((child for child in children if child.cmdline()[3:4] == ["record"]), None)
+    except psutil.NoSuchProcess:
+        return None
+
+
+def counted(path: Path) -> tuple[dict[str, str], int, int, int]:
+    """Return the keys whose count is broken, how many numbers are missing, messages, and the last time [ns]."""
+    expected: dict[str, int] = {}
+    faults: dict[str, str] = {}
+    missing = messages = last_ns = 0
+    decoder = msgspec.msgpack.Decoder(_Seq)
+    with RecordReader(path) as reader:
+        for message in reader.messages(by_time=False):
+            messages, last_ns = messages + 1, max(last_ns, message.t_ns)
+            try:
+                seq = decoder.decode(message.payload).seq
+            except REFUSALS:
+                faults[message.key] = "is no message of the contract"
+                continue
+            wanted = expected.get(message.key, 0)
+            expected[message.key] = seq + 1
+            may_skip = message.key.startswith("view/")
+            if seq < wanted or (seq > wanted and not may_skip):
+                faults.setdefault(message.key, f"{seq} follows {wanted - 1}")
+                missing += max(0, seq - wanted)
+    return faults, missing, messages, last_ns
+
+
+def measure(repeats: int) -> Sheet:
+    """Fly in both modes, in turn, so often."""
+    sheet = Sheet("i", "of a core")
+    progress = Progress("i", repeats * len(LABELS))
+    run.fly(TEST_1, 2.0, "--in-process")  # compiles what is not compiled yet
+    for _ in range(repeats):
+        for name in LABELS:
+            progress.tell(f"{LABELS[name]}: {_measured(sheet, name)}")
+    return sheet
+
+
+def _measured(sheet: Sheet, name: str) -> str:
+    try:
+        flown = fly(DRONES, SECONDS, *OPTIONS[name])
+    except RefusedError as error:
+        return sheet.refuse(name, DRONES, str(error), [f"{name}_{field}" for field in FIELDS])
+    wall_s = flown.wall_s
+    values = (
+        100.0 * flown.cpu_s / wall_s,
+        flown.messages / wall_s,
+        flown.size_bytes / wall_s / 1e6,
+        float(flown.missing),
+    )
+    for field, value in zip(FIELDS, values, strict=True):
+        sheet.add(f"{name}_{field}", DRONES, value)
+    return f"{values[0]:.0f} % of a core, {flown.messages} messages, {flown.missing} missing"
+
+
+def page(sheet: Sheet) -> str:
+    """Return the measured section."""
+    head = [f"{DRONES} drones", "share of a core, %", "messages/s", "MB/s on disk", "missing"]
+    rows = []
+    for name, label in LABELS.items():
+        found = [spread(sheet.spread(f"{name}_{field}", DRONES)) for field in FIELDS[:-1]]
+        lost = sheet.spread(f"{name}_missing", DRONES)
+        rows.append([label, *found, figure(lost.high) if lost else sheet.refused.get(f"{name}@{DRONES}", "–")])
+    return table(head, rows)

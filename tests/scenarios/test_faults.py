@@ -1,0 +1,369 @@
+"""Injected faults: every kind gives the same bits twice, and others than a run without it; wherever the agents run."""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import yaml
+from federation import PAIR, PAIR_ROLES, Federation
+
+from zsim import keys, messages, scenario_file
+from zsim.agent import Agent
+from zsim.errors import RunError
+from zsim.fault_kinds import KINDS
+from zsim.in_process import Bus
+from zsim.messages import ControlRequest, Event
+from zsim_agents.controller import Controller
+from zsim_agents.estimator import Estimator
+from zsim_deploy.in_process import agents
+from zsim_world.world import World
+
+AT_S, FOR_S, DURATION_S = 6.0, 2.0, 9.0  # the formation of PAIR is engaged from 5 s on
+Given = dict[str, Any]
+LINK = "estimator.drone1/controller.main"
+KILL = "process_kill"
+
+# What a fault of each kind is to be, so that the flight feels it
+MATRIX: dict[str, Given] = {
+    **{f"{sensor}_dropout": {"target": "drone1"} for sensor in ("gps", "mag", "baro", "sonar", "flow")},
+    "imu_dropout": {"target": "drone1", "probability": 0.3},
+    **{f"{sensor}_stuck": {"target": "drone1"} for sensor in ("gps", "mag", "baro", "sonar", "flow")},
+    "imu_stuck": {"target": "drone1", "for_s": 0.04},
+    "accel_bias": {"target": "drone1", "value_m_s2": [0.3, 0, 0]},
+    "gyro_bias": {"target": "drone1", "value_deg_s": [1, 0, 0]},
+    "gps_bias": {"target": "drone1", "value_m": [2, 0, 0]},
+    "mag_bias": {"target": "drone1", "value_ut": [5, 0, 0]},
+    "baro_bias": {"target": "drone1", "value_m": 0.2},
+    "sonar_bias": {"target": "drone1", "value_m": 0.2},
+    "flow_bias": {"target": "drone1", "value_m_s": [0.3, 0, 0]},
+    **{kind: {"target": "drone1", "factor": 3} for kind in KINDS if kind.endswith("_noise")},
+    "rotor_efficiency": {"target": "drone1", "rotor": "front_left", "value": 0.85},
+    "rotor_stuck": {"target": "drone1", "rotor": "all", "for_s": 0.1},
+    "gust": {"target": "world", "velocity_m_s": [3, 0, 0]},
+    "link_delay": {"target": LINK, "delay_ms": 60},
+    "link_jitter": {"target": LINK, "jitter_ms": 100},
+    "link_loss": {"target": "controller.main/world", "probability": 0.5},
+    "link_cut": {"target": "world/estimator.drone1"},
+    "radio": {"target": "main", "range_m": 2, "spread_m": 1},
+}
+SEVERAL: list[Given] = [
+    {"kind": "link_loss", "target": "world/estimator.drone2", "probability": 0.3, "at_s": 4},
+    {"kind": "link_jitter", "target": LINK, "jitter_ms": 70, "at_s": 5, "for_s": 4},
+    {"kind": "link_delay", "target": "controller.main/world", "delay_ms": 30, "at_s": 6},
+    {
+        "kind": "radio",
+        "target": "world",
+        "range_m": 3,
+        "spread_m": 2,
+        "place": {"controller.main": "drone2"},
+        "at_s": 7,
+    },
+    {"kind": "gps_noise", "target": "drone2", "factor": 2, "at_s": 5, "for_s": 3},
+    {"kind": "rotor_efficiency", "target": "drone1", "rotor": "rear_left", "value": 0.9, "at_s": 6},
+    {"kind": "gust", "target": "world", "velocity_m_s": [0, 2, 0], "at_s": 6, "for_s": 2},
+]
+
+
+class Flight(NamedTuple):
+    """What a run left behind."""
+
+    sha256: str
+    events: list[Event]
+    states: list[messages.ClusterState]
+    estimates: list[messages.Estimate]
+    statuses: list[messages.Status]
+
+    def told(self, *kinds: str) -> list[Event]:
+        return [event for event in self.events if event.kind in kinds]
+
+    def changes(self) -> list[tuple[float, str]]:
+        """Return when drone1 came into each state [s], and which."""
+        pairs = zip(self.statuses, self.statuses[1:], strict=False)
+        return [(after.t_ns / 1e9, after.state) for before, after in pairs if after.state != before.state]
+
+
+def document(faults: Sequence[Given], **values: Any) -> Given:
+    return {**yaml.safe_load(PAIR), "duration_s": DURATION_S, "faults": list(faults), **values}
+
+
+def apart(world: World) -> list[Agent]:
+    """Return estimators and controller as agents of their own, as in a run of processes."""
+    info, scenario = world.info(), world.scenario
+    estimators = [Estimator(info, scenario, drone.name) for drone in scenario.drones]
+    return [*estimators, Controller(info, scenario, "main")]
+
+
+def fly(
+    faults: Sequence[Given],
+    team: Callable[[World], list[Agent]] = agents,
+    between: Callable[[World], None] = lambda world: None,
+    **values: Any,
+) -> Flight:
+    """Fly PAIR in one process; `between` is called between gates, as requests come."""
+    world = World(scenario_file.resolve(document(faults, **values)))
+    flight = Flight("", [], [], [], [])
+    kept = {
+        keys.EVENT: flight.events,
+        keys.cluster_state("main"): flight.states,
+        keys.estimate("drone1"): flight.estimates,
+        keys.status("drone1"): flight.statuses,
+    }
+
+    def sink(key: str, message: Any) -> None:
+        if key in kept:
+            kept[key].append(message)
+
+    bus = Bus(world, team(world), time.monotonic_ns, sink)
+    bus.join()
+    while bus.turn():
+        between(world)
+    bus.end()
+    return flight._replace(sha256=world.result()["truth_sha256"])
+
+
+@pytest.fixture(scope="module")
+def undisturbed() -> Flight:
+    return fly([])
+
+
+def test_every_kind_is_in_the_matrix() -> None:
+    assert {*MATRIX, KILL} == {*KINDS}
+
+
+@pytest.mark.parametrize("kind", MATRIX)
+def test_the_same_bits_twice_and_others_than_without(kind: str, undisturbed: Flight) -> None:
+    """The fault from 6 s on for 2 s, unless it says otherwise.
+
+    Expected: the same hash twice, and another one than without it; an event at its start and at its end; the flight
+    goes on to the end.
+    """
+    fault = {"kind": kind, "at_s": AT_S, "for_s": FOR_S, **MATRIX[kind]}
+    first, second = fly([fault]), fly([fault])
+    assert first.sha256 == second.sha256 != undisturbed.sha256
+    told = [(event.kind, event.t_ns / 1e9) for event in first.told("fault", "fault_end")]
+    assert told == [("fault", AT_S), ("fault_end", AT_S + fault["for_s"])]
+    assert first.told("end")[0].data["last_ns"] == 9_000_000_000
+
+
+def test_a_fault_that_comes_after_the_end_changes_nothing(undisturbed: Flight) -> None:
+    assert fly([{"kind": "gps_dropout", "target": "drone1", "at_s": 100}]).sha256 == undisturbed.sha256
+
+
+@pytest.mark.parametrize("delay_gates", [1, 5])
+def test_agents_in_one_process_and_apart_hear_the_same(delay_gates: int) -> None:
+    """Several faults at once, in a Group and in agents of their own; the world may run ahead by delay_gates.
+
+    Expected: the same hash.
+    """
+    delay = {"command_delay_gates": delay_gates}
+    assert fly(SEVERAL, time=delay).sha256 == fly(SEVERAL, apart, time=delay).sha256
+
+
+def test_as_processes(federation: Federation) -> None:
+    """Several faults at once, every role a process.
+
+        world ──╳──sensors──▶ estimators ──╳──estimates──▶ controller ──╳──velocity──▶ world
+
+    Expected: the hash of the run in one process; what the world says of faults is on record.
+    """
+    federation.run(yaml.safe_dump(document(SEVERAL))).ends(with_code=0)
+    record = federation.record()
+    assert record.sha256() == fly(SEVERAL).sha256
+    assert len(record.all(keys.FAULTS)[0]["faults"]) == len(SEVERAL)
+    assert len(record.events("fault")) == len(SEVERAL)
+
+
+def asking(at_gate: int, op: str, **args: Any) -> Callable[[World], None]:
+    """Return what asks the world for something once, between gates."""
+    asked: list[Any] = []
+
+    def ask(world: World) -> None:
+        if not asked and world.now_ns >= at_gate * world.gate_ns:
+            asked.append(world.control(ControlRequest(op, args, "tester.one")))
+            assert asked[0].ok, asked[0].error
+
+    return ask
+
+
+def planned_of(events: Sequence[Any]) -> list[Given]:
+    """Return the faults of a scenario that those which begin in some events are."""
+    return [
+        {
+            "kind": data["kind"],
+            "target": data["target"],
+            "at_s": data["from_ns"] / 1e9,
+            **({} if data["until_ns"] is None else {"for_s": (data["until_ns"] - data["from_ns"]) / 1e9}),
+            **{name: value for name, value in data["parameters"].items() if value is not None},
+        }
+        for data in events
+    ]
+
+
+@pytest.mark.parametrize("kind", ["gps_stuck", "rotor_stuck", "link_loss", "link_delay", "radio", "gust"])
+def test_by_request_gives_the_bits_of_its_events(kind: str, undisturbed: Flight) -> None:
+    """The fault is asked for in flight; then the same is planned from what its event tells.
+
+    Expected: the same hash, another one than without.
+    """
+    fault = {"kind": kind, "for_s": 0.5, **MATRIX[kind]}
+    asked = fly([], between=asking(300, "fault_add", **fault))
+    again = fly(planned_of([event.data for event in asked.told("fault")]))
+    assert asked.sha256 == again.sha256 != undisturbed.sha256
+
+
+def test_cleared_by_request(undisturbed: Flight) -> None:
+    """A weak rotor from 6 s on, cleared in flight.
+
+    Expected: it acts until then, so the bits are those of one that ends there.
+    """
+    weak = {"kind": "rotor_efficiency", "at_s": AT_S, **MATRIX["rotor_efficiency"]}
+    cleared = fly([weak], between=asking(350, "fault_clear", target="drone1"))
+    (told,) = cleared.told("fault_clear")
+    again = fly(planned_of([told.data]))
+    assert cleared.sha256 == again.sha256 != fly([weak]).sha256
+    assert told.data["until_ns"] == told.t_ns
+    assert cleared.sha256 != undisturbed.sha256
+
+
+def test_by_command_on_a_running_federation(federation: Federation) -> None:
+    """`zsim fault add` and `clear` on processes; then the same faults planned, in one process.
+
+    Expected: what the commands say; the same hash.
+    """
+    run = federation.run(yaml.safe_dump(document([], duration_s=12.0)), "--rate", "2")
+    client = federation.client()
+    clock = client.watch("clock")
+    clock.until(lambda m: m["t_ns"] > 5.5e9)
+    client.ask("world/control", "pause")
+    said = [
+        fault(federation, "add", "drone1", "gps_bias", "value_m=[2, 0, 0]"),
+        fault(federation, "add", LINK, "link_jitter", "jitter_ms=90", "--for", "1500ms"),
+        fault(federation, "add", "world", "gust", "velocity_m_s=[2, 1, 0]", "--for", "1s", "--at", "11s"),
+        fault(federation, "list"),
+    ]
+    client.ask("world/control", "step", gates=50)
+    clock.until(lambda m: m["t_ns"] > 6.5e9)
+    said.append(fault(federation, "clear", "drone1"))
+    client.ask("world/control", "resume")
+    run.ends(with_code=0)
+    assert "fault 1: gps_bias of drone1 from" in said[0]
+    assert "until it is cleared" in said[0]
+    assert "fault 2: link_jitter" in said[1]
+    assert "fault 3: gust of world from 11.00 s to 12.00 s" in said[2]
+    assert [line.split()[:2] for line in said[3].splitlines()] == [["1", "acts"], ["2", "acts"], ["3", "planned"]]
+    assert "cleared 1" in said[4]
+    record = federation.record()
+    begun = {event["data"]["id"]: event["data"] for event in record.events("fault")}
+    begun |= {event["data"]["id"]: event["data"] for event in record.events("fault_clear")}
+    assert {data["source"] for data in begun.values()} == {"zsim.fault"}
+    assert record.sha256() == fly(planned_of([begun[number] for number in sorted(begun)]), duration_s=12.0).sha256
+
+
+def fault(federation: Federation, *arguments: str) -> str:
+    """Run `zsim fault`; return what it says."""
+    role = federation.role("fault", *arguments)
+    role.ends(with_code=0)
+    return role.text()
+
+
+@pytest.mark.parametrize("victim", PAIR_ROLES[1:])
+def test_a_killed_process_is_started_again_and_gives_the_same_bits(federation: Federation, victim: str) -> None:
+    """The victim dies by itself after its outputs of the gate at 6.02 s.
+
+        estimator or controller ──────┤ SIGKILL   started again ├──────▶
+        clock                   ──────┤ waiting_for             ├──────▶ 9 s
+
+    Expected: the launcher sees a death and starts it again, a warm start; the same hash twice. On a busy machine it may
+    be back before the world has noticed that it was gone.
+    """
+    kill = [{"kind": KILL, "target": victim, "at_s": AT_S}]
+    hashes = []
+    for number in range(2):
+        federation.out = federation.folder / f"run{number}"
+        run = federation.run(yaml.safe_dump(document(kill)))
+        run.line(f"{victim} .*(died|ended: killed by signal 9).*restart")
+        run.ends(with_code=0)
+        federation.nobody_left()
+        record = federation.record()
+        again = [*record.events("restart"), *record.events("superseded")]  # before or after its death is noticed
+        assert [event["subject"] for event in again] == [victim]
+        assert {event["data"]["on_death"] for event in record.events("death")} <= {"restart"}
+        assert f"{record.events('fault')[0]['subject']}" == victim
+        log = (federation.out / "logs" / f"{victim}.log").read_text()
+        assert "warm start from t = 6.02 s" in log
+        hashes.append(record.sha256())
+    assert hashes[0] == hashes[1] != fly([]).sha256
+
+
+def test_no_process_dies_where_none_is() -> None:
+    with pytest.raises(RunError, match=r"process_kill of estimator\.drone1: must be left out in-process"):
+        fly([{"kind": KILL, "target": "estimator.drone1", "at_s": 1}])
+
+
+# What the agents make of it
+
+
+def test_an_estimator_without_sensors_says_how_little_it_knows() -> None:
+    """Nothing reaches estimator.drone1 from 6 s on.
+
+    Expected: an estimate at every gate, finite, whose sigma grows and covers the truth; the controller holds the
+    formation and says why.
+    """
+    flight = fly([{"kind": "link_cut", "target": "world/estimator.drone1", "at_s": AT_S}])
+    sigmas = [np.sqrt(np.array(e.covariance)[[0, 7, 14]]) for e in flight.estimates]
+    assert len(flight.estimates) == 451
+    assert np.isfinite(sigmas).all()
+    assert sigmas[300].max() < 1.0
+    assert sigmas[-1].min() > 2.0
+    last = flight.states[-1]
+    assert last.phase == "held"
+    assert "the position of drone1 has a sigma of" in last.reason
+
+
+@pytest.mark.parametrize("kind", ["link_cut", "link_loss"])
+def test_a_controller_without_an_estimate_holds_and_says_so(kind: str) -> None:
+    """No estimate of drone1 reaches the controller from 6 s to 8 s.
+
+    Expected: held after half a second, with the age of the estimate as the reason; engaged again at the end.
+    """
+    given = {"kind": kind, "target": LINK, "at_s": AT_S, "for_s": FOR_S}
+    flight = fly([{**given, "probability": 1} if kind == "link_loss" else given])
+    held = [state for state in flight.states if state.phase == "held"]
+    assert held[0].t_ns / 1e9 == pytest.approx(AT_S + 0.5, abs=0.05)
+    assert "the estimate of drone1 is" in held[0].reason
+    assert flight.states[-1].phase == "engaged"
+
+
+@pytest.mark.parametrize(("for_s", "lands"), [(1.5, False), (3.5, True)])
+def test_drones_without_a_controller_hover_and_then_land(for_s: float, lands: bool) -> None:
+    """No command reaches the world from 6 s on, for a second and a half, or for longer than the firmware waits.
+
+        cut    6.0 ├───────────────┤ 7.5     or     ├──────────────────────────────┤ 9.5
+        state      flying │ hovering │ flying       flying │ hovering     │ landing
+                         6.5                              6.5            8.5
+
+    Expected: after half a second of silence the firmware hovers, and two seconds later it lands; nobody falls.
+    """
+    cut = {"kind": "link_cut", "target": "world/controller.main", "at_s": AT_S, "for_s": for_s}
+    flight = fly([cut], duration_s=10.0)
+    assert flight.told("collision", "diverged") == []
+    changes = [(t_s, state) for t_s, state in flight.changes() if t_s > AT_S]
+    assert [state for _, state in changes] == ["hovering", "landing" if lands else "flying"]
+    assert [t_s for t_s, _ in changes] == pytest.approx([AT_S + 0.5, AT_S + (2.5 if lands else for_s)], abs=0.07)
+
+
+def test_a_delay_of_commands_is_a_longer_command_delay() -> None:
+    """Commands that take two gates longer, from the start.
+
+    Expected: to the bit what a scenario gives whose command delay is two gates longer.
+    """
+    slow = fly([{"kind": "link_delay", "target": "controller.main/world", "delay_ms": 40, "one_way": True}])
+    assert slow.sha256 == fly([], time={"command_delay_gates": 3}).sha256
+
+
+def test_events_are_json(undisturbed: Flight) -> None:
+    for event in fly([{"kind": "radio", "at_s": 1, **MATRIX["radio"]}]).told("fault"):
+        assert json.loads(json.dumps(event.data))["kind"] == "radio"

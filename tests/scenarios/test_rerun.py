@@ -1,0 +1,197 @@
+"""A run is flown again from its record: the same bits, whoever had a hand in it; and where not, it is said where."""
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import msgpack
+import pytest
+from federation import ONE, PAIR, ROOT, Federation, Role
+from wire import PATIENCE_S
+
+from zsim.record import RecordReader, RecordWriter
+
+PILOT = "operator.pilot"
+PLAIN = ROOT / "examples" / "plain_client.py"
+
+
+def rerun(federation: Federation, *options: str, code: int = 0, of: Path | None = None) -> Role:
+    """Fly the recorded run again, and wait for the end of that."""
+    role = federation.start("rerun", str(of or federation.out), *options)
+    role.ends(with_code=code)
+    return role
+
+
+def same(role: Role, sha256: str) -> None:
+    role.line(f"truth_sha256 is the same: {sha256}$")
+
+
+def doctored(record: Path, into: Path, change: Callable[[str, bytes], bytes | None]) -> Path:
+    """Write a record anew, with messages changed or (None) left out."""
+    into.mkdir()
+    with RecordReader(record / "run.mcap") as reader, RecordWriter(into / "run.mcap") as writer:
+        for m in reader.messages(by_time=False):
+            payload = change(m.key, m.payload)
+            if payload is not None:
+                writer.add(m.key, payload, "", m.t_ns, m.wall_ns)
+    return into
+
+
+def test_a_plain_run(federation: Federation, pair_sha256: str) -> None:
+    """PAIR, every role a process.
+
+    Expected: world and agents flown again in one process give the same hash, and so does the world alone.
+    """
+    federation.run(PAIR).ends(with_code=0)
+    role = rerun(federation)
+    role.line("run again: world, estimator.drone1, estimator.drone2, controller.main")
+    same(role, pair_sha256)
+    alone = rerun(federation, "--commands-only", of=federation.out / "run.mcap")
+    alone.line("agents are not run again: as asked; the world alone, with all recorded commands")
+    same(alone, pair_sha256)
+
+
+@pytest.fixture
+def steered(federation: Federation) -> Federation:
+    """A run in which an operator had a hand.
+
+    operator.pilot ── target z_c ── no GPS for drone1 ── acquire drone2 ── velocity ── mode ── release ── bye
+    """
+    run = federation.run(PAIR, "--rate", "4")
+    client = federation.client()
+    clock, states = client.watch("clock"), client.watch("cluster/main/state")
+    states.until(lambda m: m["phase"] == "engaged")
+    answer = client.ask("cluster/main/control", "target", source=PILOT, values={"z_c": 4.0})
+    assert answer["ok"], answer
+    assert not client.ask("cluster/main/control", "target", source=PILOT, values={"nothing": 1.0})["ok"]
+    clock.until(lambda m: m["t_ns"] > 7e9)
+    ask = {"source": PILOT, "kind": "gps_dropout", "target": "drone1", "for_s": 1.0}
+    assert client.ask("world/control", "fault_add", **ask)["ok"]
+    assert client.ask("world/control", "acquire", source=PILOT, drone="drone2", priority=10)["ok"]
+    velocity = {"t_ns": 0, "source": PILOT, "velocity_m_s": [0.4, 0.1, 0.0], "yaw_rate_rad_s": 0.3}
+    for until_ns in (7.3e9, 7.6e9, 7.9e9):
+        client.put("drone/drone2/cmd/velocity", **velocity)
+        clock.until(lambda m, until_ns=until_ns: m["t_ns"] > until_ns)
+    assert client.ask("world/control", "pause", source=PILOT)["ok"]
+    client.put("drone/drone2/cmd/mode", t_ns=0, source=PILOT, mode="land")
+    client.watch("world/event").until(lambda m: m["kind"] == "command")
+    assert client.ask("world/control", "step", source=PILOT, gates=5)["ok"]
+    assert client.ask("world/control", "release", source=PILOT, drone="drone2")["ok"]
+    assert client.ask("world/control", "resume", source=PILOT)["ok"]
+    run.ends(with_code=0)
+    return federation
+
+
+def test_a_run_that_was_steered(steered: Federation, pair_sha256: str) -> None:
+    """The operator's run, and what is left of it when the record is cut or changed.
+
+    Expected: the same hash from the operator's inputs; of a cut record the same truth as far as it goes; without the
+    request on record other agents' answers, of the same world; with another wind another world; with the instant, the
+    drone and by how much.
+    """
+    sha256 = steered.record().sha256()
+    assert sha256 != pair_sha256
+    requests = steered.record().all("cluster/main/request")
+    assert [(r["op"], r["ok"], r["source"]) for r in requests] == [("target", True, PILOT), ("target", False, PILOT)]
+    same(rerun(steered), sha256)
+    same(rerun(steered, "--commands-only"), sha256)
+
+    cut = steered.folder / "cut"
+    cut.mkdir()
+    whole = (steered.out / "run.mcap").read_bytes()
+    (cut / "run.mcap").write_bytes(whole[: len(whole) * 3 // 4])
+    text = rerun(steered, of=cut).text()
+    found = re.search(r"the record was cut and has no truth_sha256; truth is the same at all (\d+) instants", text)
+    assert found
+    assert 350 < int(found[1]) < 601
+
+    unasked = doctored(
+        steered.out, steered.folder / "unasked", lambda key, payload: payload if key != REQUEST else None
+    )
+    role = rerun(steered, of=unasked, code=1)
+    role.line(r"truth differs: first drone\d at (4|5|6)\.\d+ s by .* m, .* m/s, .* deg, .* deg/s")
+    role.line("the world alone, with all recorded commands, gives the recorded truth: the agents answer differently")
+    role.line(r"the first answer that differs is (cluster/main/state|drone/drone\d/cmd/velocity) at (4|5|6)\.\d+ s")
+
+    other = doctored(steered.out, steered.folder / "other", another_wind)
+    role = rerun(steered, of=other, code=1)
+    role.line(r"truth differs: first drone1 at 0\.020 s")
+    role.line(r"the world alone, with all recorded commands, differs too: first drone1 at 0\.020 s")
+
+
+REQUEST = "cluster/main/request"
+
+
+def another_wind(key: str, payload: bytes) -> bytes:
+    if key != "world/info":
+        return payload
+    info = msgpack.unpackb(payload)
+    former = info["scenario"]
+    info["scenario"] = former.replace("gust_m_s: 0.3", "gust_m_s: 0.31")
+    assert info["scenario"] != former
+    return msgpack.packb(info) or b""
+
+
+def test_a_foreign_program_that_gates(federation: Federation) -> None:
+    """One drone, flown in the lockstep by a page of zenoh and msgpack.
+
+    Expected: its commands come off the record with their stamps; the same hash.
+    """
+    record = federation.role("record", "--out", str(federation.out))
+    world = federation.world(ONE, "--expect", "recorder", "--expect", "plain.client")
+    federation.client().info()  # the world is there
+    subprocess.run(
+        [sys.executable, str(PLAIN), federation.endpoint], check=True, timeout=PATIENCE_S, capture_output=True
+    )
+    world.ends(with_code=0)
+    record.ends(with_code=0)
+    role = rerun(federation)
+    role.line("agents are not run again: none of zsim's took part")
+    same(role, federation.record().sha256())
+    assert federation.record().positions("drone1")[-1][2] > 0.5
+
+
+def test_an_estimator_that_was_killed(federation: Federation) -> None:
+    """An estimator dies in flight and is started again.
+
+    Expected: it is said that agents are not run again, and why; the world alone gives the same hash.
+    """
+    run = federation.run(PAIR, "--rate", "6")
+    federation.client().watch("clock").until(lambda m: m["t_ns"] > 6e9)
+    federation.kill("estimator.drone2")
+    run.ends(with_code=0)
+    role = rerun(federation)
+    role.line(r"agents are not run again: death of estimator.drone2 at 6\.\d+ s; the world alone")
+    same(role, federation.record().sha256())
+
+
+def test_a_run_in_realtime(federation: Federation) -> None:
+    """PAIR in realtime at four times its pace, where commands come when they come.
+
+    Expected: the world alone, with the commands as they came, gives the same hash.
+    """
+    federation.run(PAIR, "--realtime", "--rate", "4").ends(with_code=0)
+    role = rerun(federation)
+    role.line("agents are not run again: in realtime it is not in the scenario when they answered")
+    same(role, federation.record().sha256())
+
+
+def test_what_is_no_record_of_a_flight(federation: Federation) -> None:
+    """A folder without a record, and a record that begins in flight.
+
+    Expected: one line each, and the exit code of a user's fault.
+    """
+    rerun(federation, code=2, of=federation.folder).line("holds no run.mcap; give the folder of a run")
+    federation.run(PAIR, "--in-process", "--duration", "2").ends(with_code=0)
+    late = doctored(federation.out, federation.folder / "late", from_the_second_second())
+    rerun(federation, code=2, of=late).line("the record has nothing of 0.00 s; a run is flown again from its start")
+
+
+def from_the_second_second() -> Callable[[str, bytes], bytes | None]:
+    def change(key: str, payload: bytes) -> bytes | None:
+        early = key != "world/info" and msgpack.unpackb(payload)["t_ns"] < 1e9
+        return None if early else payload
+
+    return change

@@ -1,0 +1,30 @@
+"""GNU Octave, as far as it is installed: runs the MATLAB client's code in tests."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+CLIENT = ROOT / "clients" / "matlab"
+EXAMPLES = ROOT / "examples" / "matlab"
+OCTAVE = shutil.which("octave-cli")
+needs_octave = pytest.mark.skipif(
+    OCTAVE is None, reason="octave-cli is not installed; on Debian: apt-get install octave octave-sockets"
+)
+
+
+def command(code: str) -> list[str]:
+    """Return the command that runs code with the client and its tests on the path."""
+    assert OCTAVE is not None
+    paths = ", ".join(f"'{path}'" for path in (CLIENT, CLIENT / "tests", EXAMPLES))
+    return [OCTAVE, "--no-gui", "--no-window-system", "--norc", "-q", "--eval", f"addpath({paths}); {code}"]
+
+
+def run(code: str, within_s: float = 60.0) -> str:
+    """Run code to its end; return what it prints. Fails with its error, or with its warnings if there are any."""
+    done = subprocess.run(command(code), cwd=ROOT, capture_output=True, text=True, timeout=within_s)
+    assert done.returncode == 0, done.stderr
+    assert "warning" not in done.stderr, done.stderr
+    return done.stdout

@@ -1,0 +1,167 @@
+"""A ROS 1 graph of the test's own: Debian's unmodified roscore and command line tools, and nodes with rospy."""
+
+import os
+import shutil
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from federation import free_port
+from wire import PATIENCE_S
+
+TOOLS = ("roscore", "rosmaster", "rosparam", "rostopic", "rosnode", "rosservice")
+MODULES = ("rospy", "std_msgs", "std_srvs", "geometry_msgs", "sensor_msgs", "nav_msgs", "rosgraph_msgs", "genpy")
+PYTHON = "/usr/bin/python3"  # the one that Debian's packages are for
+RELAY = "/usr/lib/topic_tools/relay"
+GENERATOR = Path("/usr/lib/genpy/genmsg_py.py")
+HEADER = "uint32 seq\ntime stamp\nstring frame_id\n"  # std_msgs/Header
+
+
+def missing() -> str:
+    """Return what of ROS 1 is not installed here, as text; empty where nothing is."""
+    tools = [tool for tool in (*TOOLS, RELAY, str(GENERATOR)) if shutil.which(tool) is None]
+    if tools:
+        return f"ROS 1 is not installed: no {', '.join(tools)}"
+    found = subprocess.run([PYTHON, "-c", f"import {', '.join(MODULES)}"], capture_output=True, text=True)
+    return "" if found.returncode == 0 else f"ROS 1 is not whole: {found.stderr.strip().splitlines()[-1]}"
+
+
+class Tool:
+    """A started program; its output is read all the time."""
+
+    def __init__(self, command: list[str], env: dict[str, str]) -> None:
+        self.command = " ".join(command)
+        self.lines: list[str] = []
+        self._news = threading.Condition()
+        self.process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=env,
+            start_new_session=True,
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            with self._news:
+                self.lines.append(line.rstrip("\n"))
+                self._news.notify_all()
+
+    def until(self, wanted: Callable[[str], object], within_s: float = PATIENCE_S) -> str:
+        """Return the first line from now on that is wanted; fail when none comes."""
+        until_s = time.monotonic() + within_s
+        with self._news:
+            seen = len(self.lines)
+            while (left_s := until_s - time.monotonic()) > 0:
+                for line in self.lines[seen:]:
+                    if wanted(line):
+                        return line
+                seen = len(self.lines)
+                self._news.wait(left_s)
+        last = "\n".join(self.lines[-6:])
+        return pytest.fail(f"{self.command}: no such line within {within_s:g} s; the last ones were\n{last}")
+
+    def end(self, number: int = signal.SIGINT) -> None:
+        """End it and its children."""
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, number)
+            try:
+                self.process.wait(PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                os.killpg(self.process.pid, signal.SIGKILL)
+                self.process.wait()
+        self._reader.join(PATIENCE_S)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+class RosGraph:
+    """A master on a free port, and who is at it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.port = free_port()
+        self.uri = f"http://127.0.0.1:{self.port}"
+        self._packages = folder / "packages"
+        self._tools: list[Tool] = []
+        self._master: Tool | None = None
+        wanted = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_", "PYTHON", "VIRTUAL"))}
+        self.env = wanted | {
+            "ROS_MASTER_URI": self.uri,
+            "ROS_HOSTNAME": "127.0.0.1",
+            "ROS_HOME": str(folder / "ros"),
+            "ROS_LOG_DIR": str(folder / "log"),
+            "PYTHONPATH": str(self._packages),
+            "PYTHONUNBUFFERED": "1",
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
+
+    def start_master(self, *master: str) -> None:
+        """Start roscore, or another master, and wait until it answers; simulated time is what nodes are to use."""
+        self._master = self.start(*(master or ("roscore",)), "-p", str(self.port))
+        until_s = time.monotonic() + PATIENCE_S
+        while self._call("rosparam", "set", "/use_sim_time", "true").returncode:
+            assert time.monotonic() < until_s, self._master.lines
+
+    def stop_master(self) -> None:
+        """Let the master die; not for roscore, which must be let end those that it has started."""
+        assert self._master is not None
+        self._master.end(signal.SIGKILL)
+
+    def start(self, *command: str, **env: str) -> Tool:
+        """Start a program in this graph."""
+        tool = Tool(list(command), self.env | env)
+        self._tools.append(tool)
+        return tool
+
+    def run(self, *command: str) -> str:
+        """Return what a program prints, which must end well."""
+        done = self._call(*command)
+        assert done.returncode == 0, f"{' '.join(command)}:\n{done.stdout}{done.stderr}"
+        return done.stdout
+
+    def refused(self, *command: str) -> str:
+        """Return what a program prints that must not end well."""
+        done = self._call(*command)
+        assert done.returncode != 0, f"{' '.join(command)}:\n{done.stdout}"
+        return done.stdout + done.stderr
+
+    def watch(self, topic: str) -> Tool:
+        """Start `rostopic echo` of numbers, a line of them each time; times come first."""
+        return self.start("rostopic", "echo", "-p", topic)
+
+    def generate(self, package: str, name: str, definition: str) -> None:
+        """Let ROS's own generator make a message type for its tools, as building its package would."""
+        source, headers, out = (self._packages / part for part in ("source", "std", f"{package}/msg"))
+        for folder in (source, headers, out):
+            folder.mkdir(parents=True)
+        (source / f"{name}.msg").write_text(definition)
+        (headers / "Header.msg").write_text(HEADER)
+        (out.parent / "__init__.py").write_text("")
+        found = [f"-I{package}:{source}", f"-Istd_msgs:{headers}"]
+        self.run(PYTHON, str(GENERATOR), "-p", package, *found, "-o", str(out), str(source / f"{name}.msg"))
+        self.run(PYTHON, str(GENERATOR), "--initpy", "-p", package, "-o", str(out))
+
+    def close(self) -> None:
+        """End whoever is left, the master last."""
+        for tool in reversed(self._tools):
+            tool.end()
+
+    def _call(self, *command: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(command, env=self.env, capture_output=True, text=True, timeout=PATIENCE_S)
+
+
+def numbers(line: str) -> list[float]:
+    """Return the numbers of a line of `rostopic echo -p`, its time in seconds first; none of its head."""
+    if line.startswith("%"):
+        return []
+    first, *others = line.split(",")
+    return [int(first) * 1e-9, *map(float, others)]

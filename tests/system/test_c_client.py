@@ -1,0 +1,531 @@
+"""clients/c: the JSON reader, the client against a played gateway, and flights through a real one."""
+
+import json
+import os
+import random
+import re
+import shutil
+import subprocess
+import textwrap
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from door import Door
+from fake_gateway import HELLO, FakeGateway
+from federation import ONE, ROOT, Federation
+from wire import PATIENCE_S
+
+HERE = ROOT / "clients" / "c"
+GCC = shutil.which("gcc")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wshadow", "-Wconversion")
+SANITIZED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+SMALL = ("-DZSIM_LINE_MAX=1024",)
+LOCALES = {"de_DE": "a decimal comma", "ps_AF": "a decimal point of two bytes"}
+ESTIMATE = {
+    "op": "gate", "t_ns": 20_000_000, "inputs": [
+        {"key": "drone/drone1/estimate", "value": {"t_ns": 0, "position_m": [0.1, -2.5e-3, 1], "state": "flä\n"}},
+        {"key": "drone/drone1/estimate", "value": {"t_ns": 20_000_000, "position_m": [1, 2, 3], "sensors": {"gps": [1, 0]}}},
+    ],
+}  # fmt: skip
+SQUARE = ONE.replace("expect: []", "expect: [estimator.drone1, client.square]")
+
+pytestmark = pytest.mark.skipif(GCC is None, reason="gcc is not installed; on Debian: apt-get install gcc libc6-dev")
+Build = Callable[..., Path]
+
+
+@pytest.fixture(scope="module")
+def build(tmp_path_factory: pytest.TempPathFactory) -> Build:
+    """Compile a program with the client, strictly; each with the same flags once."""
+    folder = tmp_path_factory.mktemp("c")
+    built: dict[tuple[str, ...], Path] = {}
+
+    def compile_it(source: str, *flags: str) -> Path:
+        if (source, *flags) not in built:
+            program = folder / f"{Path(source).stem}-{len(built)}"
+            files = [str(ROOT / source), str(HERE / "zsim.c")]
+            done = subprocess.run(
+                [str(GCC), *STRICT, *flags, f"-I{HERE}", *files, "-lm", "-o", str(program)],
+                capture_output=True,
+                text=True,
+            )
+            assert done.returncode == 0, done.stderr
+            built[source, *flags] = program
+        return built[source, *flags]
+
+    return compile_it
+
+
+def output(*command: object, **options: object) -> str:
+    """Run a program to its end, which must be a good one; return what it prints."""
+    done = subprocess.run(
+        [str(each) for each in command],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        **options,  # type: ignore[call-overload]
+    )
+    assert done.returncode == 0, f"{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def locales(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Return the environment in which the LOCALES are known."""
+    folder = tmp_path_factory.mktemp("locales")
+    if shutil.which("localedef") is None or not all(Path("/usr/share/i18n/locales", each).exists() for each in LOCALES):
+        pytest.skip("no sources of locales; on Debian: apt-get install locales")
+    for each in LOCALES:
+        subprocess.run(["localedef", "-i", each, "-f", "UTF-8", str(folder / f"{each}.UTF-8")], check=True)
+    return {**os.environ, "LOCPATH": str(folder)}
+
+
+# The reader
+
+
+def test_the_reader(build: Build) -> None:
+    assert output(build("clients/c/tests/json_test.c", *SANITIZED)) == "decimal point ., 0 failures\n"
+
+
+@pytest.mark.parametrize("name", LOCALES, ids=LOCALES.get)
+def test_the_reader_where_people_write_numbers_otherwise(build: Build, locales: dict[str, str], name: str) -> None:
+    said = output(build("clients/c/tests/json_test.c", *SANITIZED), f"{name}.UTF-8", env=locales)
+    assert re.fullmatch(r"decimal point [^.]+, 0 failures\n", said)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_reader_takes_any_bytes(build: Build, seed: int) -> None:
+    said = output(build("clients/c/tests/json_fuzz.c", *SANITIZED), seed, 5_000, input=json.dumps(ESTIMATE))
+    lines, valid, values = map(int, re.findall(r"\d+", said))
+    assert lines == 5_000
+    assert 50 < valid < 4_500  # it was neither all spoilt nor left as it was
+    assert values > 5_000
+
+
+def test_a_windows_compiler_takes_it(tmp_path: Path) -> None:
+    compiler = shutil.which("x86_64-w64-mingw32-gcc")
+    if compiler is None:
+        pytest.skip("no compiler for Windows; on Debian: apt-get install gcc-mingw-w64-x86-64-win32")
+    output(compiler, *STRICT[:-1], "-c", HERE / "zsim.c", "-o", tmp_path / "zsim.obj")
+
+
+def test_the_header_is_one_of_cpp_too(tmp_path: Path) -> None:
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("g++ is not installed; on Debian: apt-get install g++")
+    source = tmp_path / "main.cpp"
+    source.write_text(
+        '#include "zsim.h"\nint main() { zsim_client c; return zsim_connect(&c, "", 0, "", 0, 0) > 0; }\n'
+    )
+    client = tmp_path / "zsim.o"
+    output(GCC, *STRICT, "-c", HERE / "zsim.c", "-o", client)
+    output(compiler, "-Wall", "-Wextra", "-Werror", "-pedantic", f"-I{HERE}", source, client, "-o", tmp_path / "main")
+
+
+# The client, call by call
+
+
+class Talk:
+    """clients/c/tests/talk.c: makes the calls that it is told to make."""
+
+    def __init__(self, program: Path, *arguments: str, env: dict[str, str] | None = None) -> None:
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(
+            [str(program), *arguments],
+            stdin=pipe,
+            stdout=pipe,
+            stderr=pipe,
+            text=True,
+            errors="replace",
+            bufsize=1,
+            env=env,
+        )
+
+    def calls(self, line: str) -> None:
+        """Let it make a call."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{line}\n")
+
+    def returned(self) -> str:
+        """Return what the call returned."""
+        assert self._process.stdout is not None
+        return self._process.stdout.readline().rstrip("\n")
+
+    def does(self, line: str) -> str:
+        """Let it make a call and return what that returned."""
+        self.calls(line)
+        return self.returned()
+
+    def ends(self) -> None:
+        """Let it end, well."""
+        try:
+            _, said = self._process.communicate(timeout=PATIENCE_S)
+        finally:
+            self._process.kill()
+        assert self._process.returncode == 0, said
+
+
+@pytest.fixture
+def fake() -> Iterator[FakeGateway]:
+    with FakeGateway() as made:
+        yield made
+
+
+@pytest.fixture
+def talk(build: Build) -> Iterator[Talk]:
+    made = Talk(build("clients/c/tests/talk.c", *SANITIZED))
+    yield made
+    made.ends()
+
+
+def connected(talk: Talk, fake: FakeGateway, timeout_s: float = PATIENCE_S) -> None:
+    talk.calls(f"connect {fake.port} {timeout_s} me")
+    fake.greets()
+    assert talk.returned() == "1 client.me r1 lockstep 0.02 1200000000"
+
+
+def test_it_waits_for_a_run(talk: Talk, fake: FakeGateway) -> None:
+    talk.calls(f"connect {fake.port} {PATIENCE_S} me secret")
+    hello = fake.hears("hello")
+    assert (hello["name"], hello["token"]) == ("me", "secret")
+    fake.answers(hello, name="client.me", run_id=None)
+    fake.says({"op": "run", "state": "begun", "run_id": "r1"})
+    fake.greets()
+    assert talk.returned().startswith("1 client.me r1")
+
+
+def test_what_is_wrong_with_a_connection_is_a_line(talk: Talk, fake: FakeGateway) -> None:
+    assert re.fullmatch(
+        r"-1 zsim: nobody answers on 127.0.0.1:1; start `zsim gateway` there", talk.does("connect 1 0.1 me")
+    )
+    assert talk.does("latest clock t_ns").startswith("-1 zsim: there is no connection")
+    talk.calls(f"connect {fake.port} {PATIENCE_S} me")
+    fake.says({"op": "error", "error": "hello: no token, or a wrong\none", "id": fake.hears("hello")["id"]})
+    assert talk.returned() == "-1 hello: no token, or a wrong one"
+
+
+def test_values_wait_while_an_answer_is_awaited(talk: Talk, fake: FakeGateway) -> None:
+    connected(talk, fake)
+    talk.calls("subscribe drone/*/truth")
+    fake.answers(fake.hears("subscribe"), key="drone/*/truth")
+    assert talk.returned() == "1"
+    talk.calls("latest clock t_ns")
+    asked = fake.hears("latest")
+    fake.says(*({"op": "value", "key": "a", "value": n} for n in (1, 2)))
+    fake.answers(asked, values=[{"key": "clock", "value": {"t_ns": 7}}])
+    fake.says({"op": "value", "key": "b", "value": [3]})
+    assert talk.returned() == "1 7"
+    assert [talk.does("next 60") for _ in range(3)] == ["1 a 1 lost 0", "1 a 2 lost 0", "1 b [3] lost 0"]
+    assert talk.does("next 0") == "0"
+
+
+def test_an_answer_that_came_too_late_is_nobodys(talk: Talk, fake: FakeGateway) -> None:
+    connected(talk, fake, timeout_s=1)
+    talk.calls("latest clock t_ns")
+    late = fake.hears("latest")
+    assert talk.returned() == "-1 zsim: no answer within 1.0 s"
+    fake.answers(late, values=[{"key": "clock", "value": {"t_ns": 1}}])
+    talk.calls("latest clock t_ns")
+    fake.answers(fake.hears("latest"), values=[{"key": "clock", "value": {"t_ns": 2}}])
+    assert talk.returned() == "1 2"
+    talk.calls("latest nothing t_ns")
+    fake.answers(fake.hears("latest"), values=[])
+    assert talk.returned() == "0"
+
+
+def test_a_setpoint_does_not_wait_and_its_refusal_is_told_with_the_next_call(talk: Talk, fake: FakeGateway) -> None:
+    connected(talk, fake)
+    assert talk.does("velocity drone1 0.1 -2 1e-300 0.5") == "1"
+    put = fake.hears("put")
+    assert (put["key"], put["quiet"]) == ("drone/drone1/cmd/velocity", True)
+    assert put["value"] == {"velocity_m_s": [0.1, -2, 1e-300], "yaw_rate_rad_s": 0.5}
+    fake.says({"op": "error", "error": "drone/drone1/cmd/velocity: refused", "id": put["id"]})
+    assert talk.does("next 60") == "-1 drone/drone1/cmd/velocity: refused"
+    assert talk.does("velocity drone1 0 nan 0 0") == "-1 drone/drone1/cmd/velocity: velocity_m_s is not finite"
+    talk.calls("mode drone1 land")
+    fake.answers(fake.hears("put"))
+    assert talk.returned() == "1"
+
+
+def test_what_is_written_is_json_in_one_line(talk: Talk, fake: FakeGateway) -> None:
+    connected(talk, fake)
+    talk.calls('fields my/"key" -0 \\"\x01ä')
+    put = fake.hears("put")
+    assert put["key"] == 'my/"key"'
+    assert put["value"] == {"number": 0, "text": '\\"\x01ä', "integer": -(2**63), "json": {"a": [1, 2]}}
+    fake.answers(put)
+    assert talk.returned() == "1"
+    assert talk.does("put my/key {1:2}") == "-1 my/key: what is to be put is no JSON"
+    assert talk.does("fields my/key inf text") == "-1 my/key: number is not finite"
+
+
+def test_it_asks(talk: Talk, fake: FakeGateway) -> None:
+    connected(talk, fake)
+    talk.calls('ask world/control acquire {"drone":"drone1"}')
+    asked = fake.hears("ask")
+    assert (asked["key"], asked["request"], asked["args"]) == ("world/control", "acquire", {"drone": "drone1"})
+    fake.says({"op": "answer", "ok": True, "error": None, "result": 5, "id": asked["id"]})
+    assert talk.returned() == "1 5"
+    talk.calls("ask world/control pause")
+    fake.says({"op": "answer", "ok": False, "error": "is paused", "result": None, "id": fake.hears("ask")["id"]})
+    assert talk.returned() == "-1 world/control pause: is paused"
+    assert talk.does("ask world/control pause {").startswith("-1 zsim_ask: args is no JSON")
+
+
+def joined(talk: Talk, fake: FakeGateway) -> None:
+    connected(talk, fake)
+    seated(talk, fake)
+
+
+def seated(talk: Talk, fake: FakeGateway) -> None:
+    talk.calls("join square 0.02 drone/*/estimate,clock")
+    join = fake.hears("join")
+    assert (join["name"], join["period_s"], join["reads"]) == ("square", 0.02, ["drone/*/estimate", "clock"])
+    fake.answers(join, name="client.square", gates=[])
+    assert talk.returned() == "1"
+
+
+def test_a_gate(talk: Talk, fake: FakeGateway) -> None:
+    joined(talk, fake)
+    assert talk.does("gate 0") == "0"
+    assert talk.does("done").startswith("-1 zsim_done: no gate is open")
+    fake.says(ESTIMATE)
+    assert talk.does("gate 60") == "1"
+    assert talk.does("input drone/drone1/estimate position_m") == "1 [1, 2, 3]"  # the newest
+    assert talk.does("input drone/drone2/estimate position_m") == "1 "
+    assert talk.does("gate 0").startswith("-1 zsim_gate: the gate of 0.020 s is open")
+    talk.calls("latest clock t_ns")
+    fake.answers(fake.hears("latest"), values=[{"key": "clock", "value": {"t_ns": 7}}])
+    assert talk.returned() == "1 7"
+    assert talk.does("input drone/drone1/estimate sensors.gps.0") == "1 1"  # still there
+    assert talk.does("velocity drone1 1 0 0 0 world") == "1"
+    assert talk.does("velocity drone1 1 0 inf 0 world").startswith("-1 ")  # leaves no trace
+    assert talk.does("put my/key [1]") == "1"
+    assert talk.does("done") == "1"
+    done = fake.hears("done")
+    flown = {"velocity_m_s": [1, 0, 0], "yaw_rate_rad_s": 0, "frame": "world"}
+    assert done["t_ns"] == 20_000_000
+    assert done["outputs"] == [{"key": "drone/drone1/cmd/velocity", "value": flown}, {"key": "my/key", "value": [1]}]
+
+
+def test_a_refused_done_leaves_the_gate_open(talk: Talk, fake: FakeGateway) -> None:
+    joined(talk, fake)
+    fake.says(ESTIMATE)
+    assert [talk.does("gate 60"), talk.does("mode drone1 fly"), talk.does("done")] == ["1", "1", "1"]
+    fake.says({"op": "error", "error": "mode is fly", "id": fake.hears("done")["id"]})
+    assert talk.does("gate 60") == "-1 mode is fly"
+    assert [talk.does("mode drone1 land"), talk.does("done")] == ["1", "1"]
+    assert fake.hears("done")["outputs"] == [{"key": "drone/drone1/cmd/mode", "value": {"mode": "land"}}]
+
+
+def test_a_put_that_is_begun_and_not_ended_leaves_no_trace(talk: Talk, fake: FakeGateway) -> None:
+    joined(talk, fake)
+    assert talk.does("end").startswith("-1 zsim_put_end: nothing was begun")
+    assert [talk.does("begin my/lost"), talk.does("add a b")] == ["1", "1"]
+    talk.calls("latest clock t_ns")
+    fake.answers(fake.hears("latest"), values=[])
+    assert talk.returned() == "0"
+    assert talk.does("end").startswith("-1 zsim_put_end: nothing was begun")
+    assert talk.does("begin my/lost") == "1"
+    fake.says(ESTIMATE)
+    assert [talk.does("gate 60"), talk.does("add a b")] == ["1", "1"]
+    assert talk.does("end").startswith("-1 zsim_put_end: nothing was begun")
+    assert [talk.does("begin my/lost"), talk.does("add a b"), talk.does("begin my/key")] == ["1", "1", "1"]
+    assert talk.does("done") == "-1 zsim_done: my/key was begun and not ended; say zsim_put_end"
+    assert [talk.does("add a b"), talk.does("end"), talk.does("done")] == ["1", "1", "1"]
+    assert fake.hears("done")["outputs"] == [{"key": "my/key", "value": {"a": "b"}}]
+
+
+def test_a_seat_knows_nothing_of_the_seat_before(talk: Talk, fake: FakeGateway) -> None:
+    joined(talk, fake)
+    assert (
+        talk.does("join other 0.02 clock")
+        == "-1 zsim_join: is client.square already; zsim_leave first, or use another connection"
+    )
+    fake.says(ESTIMATE)
+    assert [talk.does("gate 60"), talk.does("done")] == ["1", "1"]
+    fake.says({"op": "left", "reason": "the run ended"})
+    fake.says({"op": "error", "error": "done: has not joined", "id": fake.hears("done")["id"]})
+    assert talk.does("gate 60") == "-1 zsim: the seat is lost: the run ended"
+    seated(talk, fake)
+    fake.says(ESTIMATE)  # on its way while it leaves
+    talk.calls("leave")
+    fake.answers(fake.hears("leave"))
+    assert talk.returned() == "1"
+    seated(talk, fake)
+    fake.says({"op": "gate", "t_ns": 40_000_000, "inputs": []})
+    assert [talk.does("gate 60"), talk.does("done")] == ["1", "1"]
+    assert fake.hears("done")["t_ns"] == 40_000_000
+
+
+def test_a_lost_seat_and_a_run_that_ends_are_told(talk: Talk, fake: FakeGateway) -> None:
+    joined(talk, fake)
+    fake.says({"op": "left", "reason": "the run ended"}, {"op": "run", "state": "ended", "run_id": "r1"})
+    assert talk.does("gate 60") == "-1 zsim: the seat is lost: the run ended"
+    assert talk.does("gate 60").startswith("-1 zsim: there is no seat")
+    assert talk.does("next 60").startswith("-1 zsim: the run ended")
+    fake.says({"op": "run", "state": "begun", "run_id": "r2"}, {"op": "value", "key": "a", "value": 1})
+    assert talk.does("next 60") == "1 a 1 lost 0"
+    talk.calls("hello")
+    fake.says({**HELLO, "run_id": "r2", "id": fake.hears("hello")["id"]})
+    assert talk.returned() == "1"
+
+
+@pytest.mark.parametrize("rubbish", [b"no json\n", b"\xff\x00\n", b"[" * 900 + b"\n", b'{"op": "value"\n', b"\n"])
+def test_what_is_no_json_ends_the_connection(talk: Talk, fake: FakeGateway, rubbish: bytes) -> None:
+    connected(talk, fake)
+    fake.says(rubbish)
+    assert talk.does("next 60") == "-1 zsim: what the gateway sent is no JSON; close, and connect again"
+    assert talk.does("next 60").startswith("-1 zsim: there is no connection")
+
+
+def test_half_a_line_is_waited_for(talk: Talk, fake: FakeGateway) -> None:
+    connected(talk, fake)
+    fake.says(b'{"op": "value", "key": "a", "va')
+    assert talk.does("next 0.05") == "0"
+    fake.says(b'lue": 1}\n{"op"')
+    assert talk.does("next 60") == "1 a 1 lost 0"
+    fake.hang_up()
+    assert talk.does("next 60") == "-1 zsim: the gateway hung up; close, and connect again"
+
+
+def test_of_too_many_values_the_oldest_go(build: Build, fake: FakeGateway) -> None:
+    talk = Talk(build("clients/c/tests/talk.c", *SANITIZED, *SMALL))
+    connected(talk, fake)
+    talk.calls("latest clock t_ns")
+    asked = fake.hears("latest")
+    fake.says(*({"op": "value", "key": "a", "value": f"{n:030}"} for n in range(100)))
+    fake.says({"op": "lost", "lines": 5})
+    fake.answers(asked, values=[])
+    assert talk.returned() == "0"
+    kept = [talk.does("next 0") for _ in range(12)]
+    numbers = [int(each.split('"')[1]) for each in kept]
+    assert numbers == list(range(numbers[0], numbers[0] + 12))  # the newest, in order, without a gap
+    lost = int(kept[0].split()[-1])
+    assert lost == numbers[0] + 5
+    fake.says(b'{"op": "value", "key": "' + b"a" * 2000)
+    last = ""
+    while last == "" or last.startswith("1 a"):
+        last = talk.does("next 60")
+    assert last == "-1 zsim: a line of the gateway is longer than ZSIM_LINE_MAX; close, and connect again"
+    talk.ends()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_gateway_that_raves_does_no_harm(talk: Talk, fake: FakeGateway, seed: int) -> None:
+    """Lines that were spoilt at random, to any call: it returns, and nothing is read or written that should not be."""
+    rng = random.Random(seed)
+    joined(talk, fake)
+    said = [
+        ESTIMATE,
+        HELLO,
+        {"op": "latest", "values": [{"key": "a", "value": 1}], "id": 5},
+        {"op": "left", "reason": "x"},
+    ]
+    for _ in range(30):
+        line = bytearray(json.dumps(rng.choice(said)).encode())
+        for _ in range(rng.randrange(3)):
+            line[rng.randrange(len(line))] = rng.choice(b'{}[]",:0123456789.eE+-\\u \xff\x00\n')
+        fake.says(bytes(line) + b"\n")
+    fake.says(b'{"op": "answer", "id": ')
+    calls = ("gate 0", "next 0", "done", "input drone/drone1/estimate position_m", "velocity drone1 1 0 0 0")
+    assert all(re.match(r"-1 \S|[01]", talk.does(rng.choice(calls))) for _ in range(60))
+
+
+@pytest.mark.parametrize("name", LOCALES, ids=LOCALES.get)
+def test_commands_where_people_write_numbers_otherwise(
+    build: Build, fake: FakeGateway, locales: dict[str, str], name: str
+) -> None:
+    talk = Talk(build("clients/c/tests/talk.c", *SANITIZED), f"{name}.UTF-8", env=locales)
+    point = {"de_DE": ",", "ps_AF": "\u066b"}[name]
+    talk.calls(f"connect {fake.port} 60 me")
+    fake.greets()
+    assert talk.returned() == f"1 client.me r1 lockstep 0{point}02 1200000000"
+    assert talk.does(f"velocity drone1 0{point}1 0{point}2 -0{point}3 0") == "1"
+    assert fake.hears("put")["value"]["velocity_m_s"] == [0.1, 0.2, -0.3]
+    talk.ends()
+
+
+# Flights
+
+
+def flown(federation: Federation, program: Path, *options: str, stop: bool = False) -> tuple[list[list[float]], str]:
+    """Fly the square through a gateway; return t [s] and position [m; W] at its corners, and the hash of the truth."""
+    world = federation.world(SQUARE, *options)
+    federation.role("estimator", "drone1")
+    client = federation.client()
+    events = client.watch("world/event")
+    door = Door(federation)
+    said = output(program, "127.0.0.1", door.lines_port)
+    if stop:
+        client.ask("world/control", "stop")
+    corners = [
+        [float(n) for n in re.findall(r"-?\d+\.\d+", line)[:4]] for line in said.splitlines() if "corner" in line
+    ]
+    assert re.search(r"landed at t = \d+\.\d\d s\n$", said), said
+    assert len(corners) == 5, said
+    end = events.until(lambda m: m["kind"] == "end").message["data"]
+    world.ends(with_code=0)
+    return corners, end["truth_sha256"]
+
+
+def is_a_square(corners: list[list[float]]) -> None:
+    start = [corners[0][1], corners[0][2]]
+    offsets = [[x - start[0], y - start[1]] for _, x, y, _ in corners]
+    for offset, wanted in zip(offsets, [(0, 0), (2, 0), (2, 2), (0, 2), (0, 0)], strict=True):
+        assert offset == pytest.approx(wanted, abs=0.6)  # two corners, each reached to 0.25 m
+    assert all(z == pytest.approx(1.5, abs=0.3) for *_, z in corners)
+
+
+def test_it_flies_a_square_in_lockstep_with_the_same_bits_each_time(
+    build: Build, tmp_path: Path, compiled: None
+) -> None:
+    """Built fast and built slow: time waits for it, so the flight is the same."""
+    flights = []
+    for name, flags in (("fast", ("-O2",)), ("slow", SANITIZED)):
+        (tmp_path / name).mkdir()
+        with Federation(tmp_path / name) as federation:
+            flights.append(flown(federation, build("examples/c/square.c", *flags), "--duration", "22"))
+    is_a_square(flights[0][0])
+    assert flights[0] == flights[1]
+
+
+def test_it_flies_a_square_in_realtime(build: Build, federation: Federation) -> None:
+    program = build("examples/c/square.c", *SANITIZED)
+    corners, _ = flown(federation, program, "--realtime", "--rate", "5", "--duration", "60", stop=True)
+    is_a_square(corners)
+
+
+def test_the_real_gateway_and_every_call(talk: Talk, federation: Federation) -> None:
+    federation.world(ONE, "--rate", "4", "--duration", "600")
+    door = Door(federation, "--token", "secret")
+    assert (
+        talk.does(f"connect {door.lines_port} 5 me wrong")
+        == "-1 hello: no token, or a wrong one; ask whoever started the gateway for it"
+    )
+    assert re.match(r"1 client\.me \w+ lockstep 0\.02 \d+", talk.does(f"connect {door.lines_port} 60 me secret"))
+    assert talk.does("subscribe drone/*/sensor/status") == "1"
+    assert re.match(r'1 drone/drone1/sensor/status \{.*"state":"landed".* lost 0', talk.does("next 60"))
+    assert talk.does("unsubscribe drone/*/sensor/status") == "1"
+    assert talk.does("mode drone1 takeof").startswith("-1 drone/drone1/cmd/mode: ")
+    assert talk.does("mode drone1 takeoff") == "1"
+    assert talk.does("velocity drone1 1 0 0 0 inertial") == "1"
+    assert "inertial" in talk.does("latest clock state")  # the refusal of what did not wait
+    assert talk.does("latest clock state") == '1 "running"'
+    assert talk.does('ask world/control acquire {"drone":"drone1","priority":3}').startswith("1")
+    assert re.match(r"-1 world/control dance: .*dance", talk.does("ask world/control dance"))
+    assert talk.does("join me 0.02 clock") == "1"
+    for _ in range(3):
+        assert [talk.does("gate 60"), talk.does("velocity drone1 0 0 0 0"), talk.does("done")] == ["1", "1", "1"]
+    assert talk.does("leave") == "1"
+    assert talk.does("close") == "1"
+
+
+def test_the_first_program_of_the_docs(build: Build, federation: Federation, tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "clients-c.md").read_text()
+    program = tmp_path / "first.c"
+    lines = re.findall(r"^    (#include \"zsim.h\"\n(?:(?:    .*)?\n)*?    })\n\n", page, flags=re.MULTILINE)
+    federation.world(ONE, "--duration", "600", "--rate", "4")
+    door = Door(federation)
+    program.write_text(textwrap.dedent(f"    {lines[0]}\n").replace("ZSIM_PORT", str(door.lines_port)))
+    assert output(build(str(program))) == "it hovers\n"

@@ -1,0 +1,379 @@
+"""The operator's console: in a real browser, on a running federation."""
+
+import io
+import json
+import shutil
+import signal
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from queue import SimpleQueue
+from typing import Any
+from urllib.parse import urlsplit
+
+import msgspec
+import pytest
+import zstandard
+from federation import Federation, Role, free_port
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from wire import PATIENCE_S
+
+from zsim_agents.console.guard import Camera
+
+CHROMIUM = shutil.which("chromium")
+FLAGS = (  # as root, without a screen and without a graphics card, in a container
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-dev-shm-usage",
+)
+VIEWPORT = {"width": 860, "height": 420}  # pictures without a graphics card take long
+STRIP = {"width": 860, "height": 120}  # of a page whose picture nobody looks at
+POLL_MS = 100  # between two looks at what a page shows
+STEER, PATIENCE_MS = "a-good-token", 1000 * PATIENCE_S
+TRIAD = """
+name: triad
+seed: 3
+duration_s: 3600
+sensors: {preset: paper, gps: {position_m: {noise: 0.2}}}
+drones:
+  - {name: drone1, position_m: [0.0, 1.5, 0.0], yaw_deg: 90}
+  - {name: drone2, position_m: [-1.5, -1.5, 0.0], yaw_deg: 90}
+  - {name: drone3, position_m: [1.5, -1.5, 0.0], yaw_deg: 90}
+clusters:
+  - {name: main, drones: [drone1, drone2, drone3]}
+"""
+PLACE_OF_P = 9  # among the sliders: x_c, y_c, z_c, roll, pitch, yaw, three headings, p
+CAMERA = Camera(  # what a page says first; before it, viser heeds no control of it
+    (1.0, 0.0, 0.0, 0.0), (0.0, -5.0, 3.0), 1.0, 0.01, 1000.0, 600, 800, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+)
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no chromium; on Debian: apt-get install chromium")
+
+
+class Watched:
+    """A page of the console, and all that it asked for."""
+
+    def __init__(self, page: Any, address: str) -> None:
+        self.page = page
+        self.asked: list[str] = []
+        self.faults: list[str] = []
+        page.set_default_timeout(PATIENCE_MS)
+        page.on("request", lambda request: self.asked.append(request.url))
+        page.on("websocket", lambda socket: self.asked.append(socket.url))
+        page.on("pageerror", lambda error: self.faults.append(str(error)))
+        page.goto(address)
+
+    def press(self, name: str) -> None:
+        self.page.get_by_role("button", name=name, exact=True).click()
+
+    def turn_to(self, tab: str) -> None:
+        self.page.get_by_role("tab", name=tab, exact=True).click()
+
+    def says(self, text: str) -> None:
+        """Wait until the page shows a text."""
+        self.page.get_by_text(text).first.wait_for()
+
+    def state(self) -> dict[str, Any]:
+        """Return what the page shows, as the page itself reads it."""
+        return self.page.evaluate("fetch(location.pathname.replace(/\\/$/, '') + '/state').then(r => r.json())")
+
+    def until(self, condition: str) -> dict[str, Any]:
+        """Wait until a condition (JavaScript) holds of the state `s`; return the state."""
+        look = f"async () => {{ const s = await (await fetch('/state')).json(); return [{condition}, s]; }}"
+        until_s = time.monotonic() + PATIENCE_S
+        while True:
+            holds, state = self.page.evaluate(look)
+            if holds:
+                return state
+            assert time.monotonic() < until_s, f"{condition} never came true: {state}"
+            self.page.wait_for_timeout(POLL_MS)
+
+    def outside(self) -> set[str]:
+        """Return the hosts that it asked for something, beside this machine."""
+        urls = (urlsplit(url) for url in self.asked)
+        return {str(url.hostname) for url in urls if url.scheme not in ("data", "blob")} - {"127.0.0.1"}
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Debian's chromium without a window, driven by playwright."""
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed; pip install playwright")
+    with api.sync_playwright() as playwright:
+        made = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        yield made
+        made.close()
+
+
+@pytest.fixture
+def opened(browser: Any) -> Iterator[Callable[..., Watched]]:
+    """Open an address in a browser of its own, with cookies of its own."""
+    with ExitStack() as stack:
+
+        def open_it(address: str, viewport: dict[str, int] = VIEWPORT) -> Watched:
+            context = browser.new_context(viewport=viewport)
+            stack.callback(context.close)
+            return Watched(context.new_page(), address)
+
+        yield open_it
+
+
+def console(federation: Federation, *options: str) -> tuple[Role, dict[str, str]]:
+    """Start a console; return it with its links."""
+    role = federation.role("console", "--port", str(free_port()), *options)
+    steer = role.line("steer at").text.rpartition(" ")[2]
+    return role, {"steer": steer, "look": role.line("look, without").text.rpartition(" ")[2]}
+
+
+def status(address: str, **headers: str) -> int:
+    """Return what HTTP answers to a get."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=PATIENCE_S) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        error.close()
+        return error.code
+
+
+def colours(picture: bytes) -> int:
+    """Return how many colours a picture has."""
+    image = pytest.importorskip("PIL.Image")
+    return len(image.open(io.BytesIO(picture)).convert("RGB").resize((160, 90)).getcolors(160 * 90))
+
+
+class Wire:
+    """A page without a picture: what viser's own page says and is told, over the same websocket.
+
+    Attributes:
+        ids: of the page's controls, by their label.
+    """
+
+    def __init__(self, address: str) -> None:
+        viser = pytest.importorskip("viser", reason="viser is not installed; pip install 'zsim[console]'")
+        spoken: Any = [f"viser-v{viser.__version__}"]
+        where = f"ws://{urlsplit(address).netloc}{urlsplit(address).path}"
+        self._socket = connect(where, subprotocols=spoken, compression=None, max_size=None)
+        self._socket.send(msgspec.msgpack.encode(CAMERA))
+        self._heard: SimpleQueue[list[dict[str, Any]]] = SimpleQueue()
+        self.ids: dict[str, str] = {}
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._socket.close()
+        self._thread.join()
+
+    def _read(self) -> None:
+        """Read all the time, as a page does: what is not read would keep back what is said after it."""
+        with suppress(ConnectionClosed):
+            for told in self._socket:
+                assert isinstance(told, bytes)
+                size = int.from_bytes(told[8:16], "little")
+                plain = zstandard.ZstdDecompressor().decompress(told[16 : 16 + size])
+                self._heard.put(msgspec.msgpack.decode(plain, strict=False)["messages"])
+
+    def put(self, label: str, value: Any) -> None:
+        """Say that somebody has moved a control, or pressed it."""
+        said = {"type": "GuiUpdateMessage", "uuid": self.ids[label], "updates": {"value": value}}
+        self._socket.send(msgspec.msgpack.encode(said))
+
+    def until(self, heard: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """Return the next thing of a kind that the page is told, and learn of controls meanwhile."""
+        until_s = time.monotonic() + PATIENCE_S
+        while True:
+            for message in self._heard.get(timeout=max(0.0, until_s - time.monotonic())):
+                label = (message.get("props") or {}).get("label")
+                if label and "uuid" in message:
+                    self.ids[label] = message["uuid"]
+                if heard(message):
+                    return message
+
+    def knows(self, label: str) -> None:
+        """Wait until the page has a control."""
+        self.until(lambda _: label in self.ids)
+
+
+@pytest.fixture
+def wired() -> Iterator[Callable[[str], Wire]]:
+    """Open an address as a page without a picture."""
+    with ExitStack() as stack:
+
+        def open_it(address: str) -> Wire:
+            made = Wire(address)
+            stack.callback(made.close)
+            return made
+
+        yield open_it
+
+
+def shown(address: str, until: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    """Return what a console shows once a condition holds of it."""
+    until_s = time.monotonic() + PATIENCE_S
+    while True:
+        with urllib.request.urlopen(f"{address}state", timeout=PATIENCE_S) as answer:
+            state = json.load(answer)
+        if until(state):
+            return state
+        assert time.monotonic() < until_s, f"it never came so far: {state}"
+        time.sleep(POLL_MS / 1000)
+
+
+def states(shown: dict[str, Any]) -> list[str]:
+    return [drone["state"] for drone in shown.get("drones", ())]
+
+
+@needs_browser
+@pytest.mark.slow
+def test_an_operator_sees_three_drones_and_flies_them(federation: Federation, opened: Callable[..., Watched]) -> None:
+    federation.run(TRIAD, "--rate", "1")
+    _, links = console(federation, "--token", STEER)
+
+    # who may come in
+    bare = links["steer"].partition("?")[0]
+    assert status(bare) == 401
+    assert status(f"{bare}state") == 401
+    assert status(f"{bare}?token=wrong") == 401
+    refused = opened(bare, STRIP)
+    refused.says("needs the token")
+
+    operator = opened(links["steer"])
+    assert "token" not in operator.page.url
+    viewer = opened(links["look"], STRIP)
+    operator.says("running")
+    start = operator.until("s.drones.length == 3 && s.clusters.length == 1 && s.clock == 'running'")
+    assert [drone["state"] for drone in start["drones"]] == ["landed"] * 3
+
+    # a viewer sees the controls, and moves nothing with them
+    button = viewer.page.get_by_role("button", name="Take off", exact=True)
+    button.wait_for(state="attached")
+    button.evaluate("button => button.click()")
+    later = operator.until(f"s.t_s > {start['t_s'] + 2}")
+    assert later["clusters"][0]["phase"] == "idle"
+
+    # what is refused is told
+    operator.press("Engage")
+    operator.says("Refused: main: engage")
+
+    # they take off by the button, and move
+    operator.press("Take off")
+    aloft = operator.until("s.drones.every(d => d.state == 'flying' && d.position_m[2] > 0.8)")
+    for before, after in zip(start["drones"], aloft["drones"], strict=True):
+        assert after["position_m"][2] - before["position_m"][2] > 0.7
+    viewer.page.get_by_text("main: assembling").first.wait_for(state="attached")
+    viewer.page.close()
+    assert colours(operator.page.screenshot(timeout=PATIENCE_MS)) > 200
+    operator.until("s.clusters[0].reason == 'ready to engage'")
+    operator.press("Engage")
+    engaged = operator.until("s.clusters[0].phase == 'engaged'")
+
+    # p by its slider, and the true p follows
+    slider = operator.page.get_by_role("slider").nth(PLACE_OF_P)
+    asked_s = operator.state()["t_s"]
+    slider.focus()
+    for _ in range(12):
+        slider.press("ArrowRight")
+    wanted = float(str(slider.get_attribute("aria-valuenow")))
+    assert wanted > engaged["clusters"][0]["desired"]["p"] + 1.0
+    operator.until(f"Math.abs(s.clusters[0].desired.p - {wanted}) < 0.06")
+    there = operator.until(f"Math.abs(s.clusters[0].true.p - {wanted}) < 0.3")
+    assert there["t_s"] < asked_s + 20.0
+
+    # GPS lost by a button
+    before = there["drones"][0]["sigma_m"]
+    operator.turn_to("Faults")
+    operator.press("GPS lost")
+    operator.until("s.faults.some(f => f.kind == 'gps_dropout' && f.target == 'drone1')")
+    grown = operator.until(f"s.drones[0].sigma_m > {1.5 * before}")
+    assert grown["drones"][1]["sigma_m"] < 1.2 * before
+    operator.turn_to("Events")
+    operator.says("gps_dropout of drone1 begins")
+    operator.press("Clear all faults")
+    operator.until("s.faults.length == 0")
+
+    # and down again
+    operator.turn_to("Fly")
+    operator.press("Land")
+    operator.until("s.drones.every(d => d.state == 'landed')")
+    for page in (operator, viewer, refused):
+        assert page.outside() == set()
+        assert page.faults == []
+
+
+def test_what_one_operator_moves_the_other_sees_move(federation: Federation, wired: Callable[[str], Wire]) -> None:
+    federation.world(TRIAD, "--rate", "1")
+    role, links = console(federation)
+    role.line("console.1: in run")
+    label = "p [m]"
+    one, other = wired(links["steer"]), wired(links["steer"])
+    for page in (one, other):
+        page.knows(label)
+    one.put(label, 7.5)
+    moved = other.until(lambda message: message["type"] == "GuiUpdateMessage" and message["uuid"] == one.ids[label])
+    assert moved["updates"]["value"] == 7.5
+
+
+def test_an_emergency_stops_a_drone_that_another_operator_flies(
+    federation: Federation, wired: Callable[[str], Wire]
+) -> None:
+    federation.run(TRIAD, "--rate", "1")
+    role, links = console(federation)
+    role.line("console.1: in run")
+    address = links["steer"]
+    page = wired(address)
+    page.knows("EMERGENCY – all rotors stop")
+    page.knows("Take off")
+    shown(address, lambda state: states(state) == ["landed"] * 3)
+    page.put("Take off", True)
+    shown(address, lambda state: states(state) == ["flying"] * 3)
+    assert federation.client().ask("world/control", "acquire", drone="drone1", priority=10)["ok"]
+    page.put("EMERGENCY – all rotors stop", True)
+    shown(address, lambda state: states(state) == ["emergency"] * 3)
+
+
+def test_a_run_with_a_console_prints_its_link_and_ends_as_a_whole(federation: Federation) -> None:
+    run = federation.run(TRIAD, "--rate", "2", "--console")
+    address = run.line("steer at").text.rpartition(" ")[2]
+    assert status(address) == 200
+    assert status(f"{address}view") == 200
+    assert status(address, Host="evil.example") == 401
+    assert status(address, Origin="http://evil.example") == 401
+    run.line("× 2.0 real time")
+    with urllib.request.urlopen(f"{address}state", timeout=PATIENCE_S) as answer:
+        state = json.load(answer)
+    assert [drone["name"] for drone in state["drones"]] == ["drone1", "drone2", "drone3"]
+    run.signal(signal.SIGINT)
+    run.ends(with_code=130)
+    federation.nobody_left()
+
+
+def test_a_console_serves_one_run_after_the_other(federation: Federation) -> None:
+    role, links = console(federation)
+    world = federation.world(TRIAD, "--duration", "600")
+    role.line("console.1: in run")
+    world.signal(signal.SIGINT)
+    world.ends(with_code=0)
+    role.line("console.1: left, the run ended")
+    assert status(links["steer"]) == 200
+    federation.world(TRIAD, "--duration", "600")
+    first = role.line("console.1: in run").text
+    role.line(f"console.1: in run (?!{first.rpartition(' ')[2]})")
+    role.signal(signal.SIGINT)
+    role.ends(with_code=0)
+
+
+def test_others_are_let_in_with_a_token_only(federation: Federation) -> None:
+    role = federation.role("console", "--listen", "0.0.0.0", "--port", str(free_port()))
+    role.ends(with_code=2)
+    assert "0.0.0.0 can be reached by others; give it a --token, or --listen 127.0.0.1" in role.text()
+
+
+def test_a_port_that_is_taken_is_named(federation: Federation) -> None:
+    _, links = console(federation)
+    port = urlsplit(links["steer"]).port
+    other = federation.role("console", "--port", str(port))
+    other.ends(with_code=2)
+    assert f"cannot listen on 127.0.0.1, port {port}" in other.text()

@@ -1,0 +1,120 @@
+"""The gateway under requests that nobody meant: no 5xx, no end, no effect of what was refused."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from door import Door, Stream
+from federation import Federation
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_gateway import FLOWN, fly
+
+SCHEMATHESIS = Path(sys.executable).with_name("st")
+EXAMPLES = 10  # of each operation; in `make soak` a hundred times as many
+CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
+STRICT = f"{CHECKS},negative_data_rejection,positive_data_acceptance,unsupported_method"
+GATES_FUZZED = 180  # of the 201 of the flight; with the last ones the run is over
+OWN_KEYS = r"\{key\}"  # of one's own, where a key that the pattern does not take may do as well
+
+
+def fuzz(door: Door, checks: str, mode: str, *options: str, examples: int = EXAMPLES) -> str:
+    """Let schemathesis at a gateway by its description; return what it says, and fail if it found anything."""
+    command = [
+        SCHEMATHESIS, "run", f"{door.url}/openapi.json", "--checks", checks, "--mode", mode, "--seed", "1",
+        "--max-examples", str(examples), "--phases", "examples,coverage,fuzzing", "--warnings", "off", "--no-color",
+        "--generation-database", "none", *options,
+    ]  # fmt: skip
+    environment = {**os.environ, "SCHEMATHESIS_HOOKS": ""}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=door.folder, env=environment, timeout=300)
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_what_it_says_of_itself_holds(federation):
+    federation.world(FLOWN.replace("duration_s: 4", "duration_s: 3600"), "--expect", "nobody.yet")
+    door = Door(federation).in_run()
+    fuzz(door, STRICT, "all", "--exclude-path-regex", OWN_KEYS)
+    fuzz(door, CHECKS, "all", "--include-path-regex", OWN_KEYS)
+    assert door.http("GET", "/json/clock").status == 200
+
+
+JUNK = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda part: st.lists(part, max_size=4) | st.dictionaries(st.text(max_size=8), part, max_size=4),
+    max_leaves=8,
+)
+FIELDS = st.sampled_from(["t_ns", "seq", "source", "velocity_m_s", "yaw_rate_rad_s", "frame", "mode", "position_m"])
+BODIES = st.binary(max_size=60) | (JUNK | st.dictionaries(FIELDS, JUNK, max_size=6)).map(
+    lambda value: json.dumps(value).encode()
+)
+COMMANDS = st.sampled_from(["velocity", "mode", "ardrone", "attitude", "rotors"])
+
+
+WAYS = ("json", "zenoh", "stream", "control", "headers")
+
+
+class Refused(NamedTuple):
+    """A request that is none: a way in, a kind of command, and a body."""
+
+    way: str
+    kind: str
+    body: bytes
+
+
+def junk(count: int) -> list[Refused]:
+    """Return requests that hypothesis thinks of, always the same."""
+    made: list[Refused] = []
+
+    @settings(max_examples=count, deadline=None, derandomize=True, database=None)
+    @given(st.sampled_from(WAYS), COMMANDS, BODIES)
+    def think(way: str, kind: str, body: bytes) -> None:
+        made.append(Refused(way, kind, body))
+
+    think()
+    return made
+
+
+def test_what_is_refused_changes_no_bit(tmp_path):
+    hashes = [_flown(tmp_path / "alone", []), _flown(tmp_path / "fuzzed", junk(GATES_FUZZED))]
+    assert hashes[0] == hashes[1]
+
+
+def _flown(folder: Path, requests: list[Refused]) -> str:
+    """Return the truth of a flight between whose gates requests are refused."""
+    folder.mkdir()
+    left = iter(requests)
+    with Federation(folder) as federation:
+        world = federation.world(FLOWN, "--expect", "recorder")
+        recorder = federation.role("record", "--out", str(federation.out))
+        door = Door(federation).in_run()
+        with door.stream() as stream:
+            stream.ask("hello")
+            fly(door, lambda: _refused(door, stream, next(left, None)))
+        world.ends(with_code=0)
+        recorder.ends(with_code=0)
+        assert next(left, None) is None
+        assert "failed" not in door.role.text()
+        return federation.record().sha256()
+
+
+def _refused(door: Door, stream: Stream, request: Refused | None) -> None:
+    """Send a request and see it refused."""
+    if request is None:
+        return
+    way, kind, body = request
+    if way == "stream":
+        value = body if b"\n" not in body and body else b"{"
+        stream.send(b'{"op": "put", "key": "drone/drone1/cmd/%b", "value": %b}' % (kind.encode(), value))
+        stream.next("error")
+        return
+    headers = {"Content-Type": body[:20].hex() + "\xff"} if way == "headers" else {}
+    path = {"json": f"/json/drone/drone1/cmd/{kind}", "control": "/json/world/control"}.get(way)
+    method = "POST" if way == "control" else "PUT"
+    answer = door.http(method, path or f"/zsim/drone/drone1/cmd/{kind}", body, headers)
+    assert answer.status == 400, (answer, request)

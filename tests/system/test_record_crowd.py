@@ -1,0 +1,39 @@
+"""The recorder beside 50 drones with everything that they say: nothing is missing, counted by the `seq` of each key."""
+
+import pytest
+
+from benchmarks.recorder import DRONES, Flown, fly
+
+RATES_HZ = (
+    200 + 5 + 25 + 25 + 25 + 15 + 4 * 50
+)  # of a drone: its sensors; status, truth, estimate and command every gate
+SHARE = 0.6  # of those at least: commands begin with the flight, and the `paper` preset leaves nothing out
+
+
+def complete(flown: Flown, seconds: float) -> None:
+    """Fail if anything is missing."""
+    assert flown.faults == {}
+    assert flown.missing == 0
+    assert flown.sim_s == pytest.approx(seconds)
+    assert flown.messages > SHARE * RATES_HZ * DRONES * seconds
+
+
+@pytest.mark.slow
+def test_five_seconds_as_fast_as_they_go_are_recorded_without_a_gap(compiled: None) -> None:
+    complete(fly(DRONES, 5.0), 5.0)
+
+
+@pytest.mark.slow
+def test_five_seconds_in_realtime_are_recorded_without_a_gap(compiled: None) -> None:
+    complete(fly(DRONES, 5.0, "--realtime"), 5.0)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("options", [(), ("--realtime",)], ids=["lockstep", "realtime"])
+def test_two_minutes_are_recorded_without_a_gap(compiled: None, options: tuple[str, ...]) -> None:
+    flown = fly(DRONES, 120.0, *options)
+    print(
+        f"\n{' '.join(options) or 'lockstep'}: {100 * flown.cpu_s / flown.wall_s:.0f} % of a core, "
+        f"{flown.messages / flown.wall_s:.0f} messages/s, {flown.size_bytes / flown.wall_s / 1e6:.1f} MB/s"
+    )
+    complete(flown, 120.0)

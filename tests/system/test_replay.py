@@ -1,0 +1,260 @@
+"""A record played back onto the keys: the same bytes, for whoever would listen to a flight."""
+
+import shutil
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+import zenoh
+from federation import PAIR, PAIR_ROLES, Federation, Role
+from wire import Client
+
+from zsim.record import RecordReader
+
+GATE_NS = 20_000_000
+RESAID = ("drone/*/sensor/*", "drone/*/truth", "drone/*/estimate", "drone/*/cmd/*", "cluster/*/state")
+
+
+@pytest.fixture(scope="session")
+def flown(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Path:
+    """The folder of a run of PAIR, 12 s."""
+    with Federation(tmp_path_factory.mktemp("flown")) as federation:
+        federation.run(PAIR, "--in-process").ends(with_code=0)
+        return federation.out
+
+
+def replay(federation: Federation, folder: Path, *options: str) -> Role:
+    role = federation.start("replay", str(folder), "--listen", federation.endpoint, *options)
+    role.line("replay of run [0-9a-f]+ as 'zsim' on tcp/")
+    return role
+
+
+class Ear:
+    """Keeps the payloads of some keys, byte by byte."""
+
+    def __init__(self, client: Client, *expressions: str) -> None:
+        self.heard: defaultdict[str, list[bytes]] = defaultdict(list)
+        self._kept = [client.session.declare_subscriber(f"zsim/{each}", self._take) for each in expressions]
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        self.heard[str(sample.key_expr).removeprefix("zsim/")].append(sample.payload.to_bytes())
+
+
+def recorded(folder: Path, *expressions: str) -> dict[str, list[bytes]]:
+    said: defaultdict[str, list[bytes]] = defaultdict(list)
+    with RecordReader(folder / "run.mcap") as reader:
+        wanted = [key for key in reader.topics() if any(matches(each, key) for each in expressions)]
+        for m in reader.messages(wanted):
+            said[m.key].append(m.payload)
+    return dict(said)
+
+
+def matches(expression: str, key: str) -> bool:
+    return zenoh.KeyExpr(expression).includes(zenoh.KeyExpr(key))
+
+
+def resume(client: Client) -> None:
+    assert client.ask("world/control", "resume")["ok"]
+
+
+def without_source(payload: bytes) -> dict[str, Any]:
+    """Return an estimate without the name of its process: in the recorded run one process did all."""
+    return unsigned(msgpack.unpackb(payload))
+
+
+def unsigned(message: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in message.items() if name != "source"}
+
+
+def test_the_same_payloads(federation: Federation, flown: Path) -> None:
+    """Everything that was said of and by the drones, said again as fast as it goes.
+
+        run.mcap ──▶ zsim replay ──▶ sensors, truth, estimates, commands, states ──▶ a client
+
+    Expected: byte by byte what was recorded; another run_id, and whose replay it is; views, though none are on record;
+    a clock of its own that ends.
+    """
+    role = replay(federation, flown, "--rate", "0", "--paused")
+    client = federation.client()
+    ear, clock, views = Ear(client, *RESAID), client.watch("clock"), client.watch("view/**")
+    info = client.info()
+    original = msgpack.unpackb(recorded(flown, "world/info")["world/info"][0])
+    assert info["replay_of"] == original["run_id"] != info["run_id"]
+    assert info["scenario"] == original["scenario"]
+    clock.until(lambda m: m["state"] == "paused")
+    first = recorded(flown, *RESAID)
+    resume(client)
+    clock.until(lambda m: m["state"] == "stopped")
+    role.ends(with_code=0)
+    assert "ended: the record is over" in role.text()
+    for key, payloads in first.items():
+        rest = [payload for payload in payloads if msgpack.unpackb(payload)["t_ns"] > 0]
+        said = [payload for payload in ear.heard[key] if msgpack.unpackb(payload)["t_ns"] > 0]
+        assert said == rest, key
+    assert {view.key for view in views.now()} >= {"view/drones", "view/cluster/main"}
+
+
+def test_a_part_of_it(federation: Federation, flown: Path) -> None:
+    """From 5 s to 6 s, the GPS and the truth alone, at four times its pace; looked at with `zsim echo`.
+
+    Expected: exactly these messages; last values to be got; no faster than asked for.
+    """
+    keys = ("drone/*/truth", "drone/*/sensor/gps")
+    options = [part for key in keys for part in ("--keys", key)]
+    role = replay(federation, flown, "--from", "5", "--to", "6", "--rate", "4", "--paused", *options)
+    client = federation.client()
+    ear, clock = Ear(client, "drone/**", "cluster/**"), client.watch("clock")
+    stood = clock.until(lambda m: m["state"] == "paused")
+    assert stood.message["t_ns"] == 5_000_000_000
+    assert client.get("drone/drone1/truth")["drone/drone1/truth"]["t_ns"] == 5_000_000_000
+    resume(client)
+    over = clock.until(lambda m: m["state"] == "stopped")
+    role.ends(with_code=0)
+    assert "ended: played to 6 s" in role.text()
+    assert over.wall_s - stood.wall_s > 0.24  # 1 s at 4, but for the gate that time stood at
+    assert {key.split("/", 2)[2] for key in ear.heard} == {"truth", "sensor/gps"}
+    wanted = recorded(flown, *keys)
+    for key, payloads in ear.heard.items():
+        in_time = [p for p in wanted[key] if 5_000_000_000 < msgpack.unpackb(p)["t_ns"] <= 6_000_000_000]
+        assert [p for p in payloads if msgpack.unpackb(p)["t_ns"] > 5_000_000_000] == in_time
+
+
+def test_echo(federation: Federation, flown: Path) -> None:
+    """`zsim echo` on a replay at its own pace.
+
+    Expected: it prints payloads of the record.
+    """
+    replay(federation, flown)
+    echo = federation.role("echo", "drone/drone2/sensor/imu", "--raw", "-n", "20")
+    echo.ends(with_code=0)
+    on_record = {payload.hex() for payload in recorded(flown, "drone/drone2/sensor/imu")["drone/drone2/sensor/imu"]}
+    said = [line.text.split('"message": "')[1].rstrip('"}') for line in echo.lines if '"message"' in line.text]
+    assert len(said) == 20
+    assert set(said) <= on_record
+
+
+def test_an_estimator_under_test(federation: Federation, flown: Path) -> None:
+    """Our own estimator of drone1 works from the record, in lockstep; a recorder beside it.
+
+        run.mcap ──▶ zsim replay ──sensors──▶ estimator.drone1 ──estimate──▶ recorder
+
+    Expected: its estimates are those that were recorded in flight, to the bit, and are not played; those of drone2
+    are; the record made is that of a replay, and is not flown again.
+    """
+    role = replay(federation, flown, "--rate", "0", "--expect", "estimator.drone1", "--expect", "recorder")
+    others = [federation.role("estimator", "drone1"), federation.role("record", "--out", str(federation.out))]
+    for each in (role, *others):
+        each.ends(with_code=0)
+    mine, yours = recorded(federation.out, "drone/*/estimate"), recorded(flown, "drone/*/estimate")
+    assert len(mine["drone/drone1/estimate"]) == 601
+    assert [*map(without_source, mine["drone/drone1/estimate"])] == [
+        *map(without_source, yours["drone/drone1/estimate"])
+    ]
+    assert {msgpack.unpackb(payload)["source"] for payload in mine["drone/drone1/estimate"]} == {"estimator.drone1"}
+    assert mine["drone/drone2/estimate"] == yours["drone/drone2/estimate"]
+    again = federation.start("rerun", str(federation.out))
+    again.ends(with_code=2)
+    again.line("is the record of a replay; rerun that of run")
+
+
+def test_an_estimator_without_gps(federation: Federation, flown: Path) -> None:
+    """The estimator under test hears no GPS, by --keys.
+
+    Expected: it is not waited for what is left out; it counts no GPS, and the others as in flight.
+    """
+    kinds = [part for kind in ("imu", "mag", "baro", "flow", "status") for part in ("--keys", f"drone/*/sensor/{kind}")]
+    role = replay(federation, flown, "--rate", "0", "--expect", "estimator.drone1", "--to", "4", *kinds)
+    client = federation.client()
+    estimates = client.watch("drone/drone1/estimate")
+    federation.role("estimator", "drone1").ends(with_code=0)
+    role.ends(with_code=0)
+    last = estimates.until(lambda m: m["t_ns"] == 4_000_000_000).message
+    assert last["sensors"]["gps"] == [0, 0]
+    flew = next(
+        m
+        for m in map(msgpack.unpackb, recorded(flown, "drone/drone1/estimate")["drone/drone1/estimate"])
+        if m["t_ns"] == 4_000_000_000
+    )
+    assert sum(last["sensors"]["baro"]) == sum(flew["sensors"]["baro"]) > 0
+
+
+def test_what_may_be_asked(federation: Federation, flown: Path) -> None:
+    """Time is steered, flight is refused.
+
+    Expected: pause, step, seek, rate, resume and stop as of a run; who flies is told why not.
+    """
+    role = replay(federation, flown, "--rate", "2")
+    client = federation.client()
+    clock, events = client.watch("clock"), client.watch("world/event")
+    clock.until(lambda m: m["t_ns"] > 0)
+    assert client.ask("world/control", "pause")["ok"]
+    stood_ns = clock.until(lambda m: m["state"] == "paused").message["t_ns"]
+    assert client.ask("world/control", "step", gates=3)["ok"]
+    assert clock.until(lambda m: m["t_ns"] > stood_ns + 2 * GATE_NS).message["t_ns"] == stood_ns + 3 * GATE_NS
+    assert client.ask("world/control", "seek", t_s=8)["ok"]
+    assert client.ask("world/control", "step")["ok"]
+    clock.until(lambda m: m["t_ns"] == 8_000_000_000)
+    assert client.get("drone/drone1/truth")["drone/drone1/truth"]["t_ns"] == 8_000_000_000
+    assert "must be a time on record" in client.ask("world/control", "seek", t_s=99)["error"]
+    assert "must be a number of seconds" in client.ask("world/control", "seek", t_s="noon")["error"]
+    for key, op, args in (
+        ("world/control", "acquire", {"drone": "drone1", "priority": 10}),
+        ("world/control", "fault_add", {"kind": "gps_dropout", "target": "drone1"}),
+        ("cluster/main/control", "takeoff", {}),
+    ):
+        assert client.ask(key, op, **args)["error"] == "a replay: nobody can be flown"
+    client.put("drone/drone1/cmd/mode", t_ns=0, source="tester.one", mode="land")
+    refused = events.until(lambda m: m["kind"] == "refused" and m["source"] == "tester.one").message
+    assert refused["data"]["reason"] == "a replay: nobody can be flown"
+    assert client.ask("world/control", "seek", t_s=2)["ok"]
+    assert client.ask("world/control", "rate", value=20)["ok"]
+    resume(client)
+    clock.until(lambda m: 2_000_000_000 < m["t_ns"] < 3_000_000_000)
+    assert client.ask("world/control", "stop", reason="seen enough")["ok"]
+    assert events.until(lambda m: m["kind"] == "end").message["data"]["replay_of"]
+    role.ends(with_code=0)
+
+
+def test_all_roles_beside_a_replay(federation: Federation, flown: Path) -> None:
+    """Both estimators and the controller take part as in a flight.
+
+    Expected: they answer as they did in flight, and what they said then is not played besides.
+    """
+    expect = [part for name in PAIR_ROLES for part in ("--expect", name)]
+    role = replay(federation, flown, "--rate", "0", "--to", "6", *expect)
+    client = federation.client()
+    answers = ("cluster/main/state", "drone/drone1/estimate", "drone/drone2/estimate")
+    watches = {key: client.watch(key) for key in answers}
+    split = [name.split(".") for name in PAIR_ROLES]
+    others = [federation.role(role_, thing) for role_, thing in split]
+    for each in (role, *others):
+        each.ends(with_code=0)
+    for key, watch in watches.items():
+        watch.until(lambda m: m["t_ns"] == 6_000_000_000)
+        said = [unsigned(heard.message) for heard in watch.heard]
+        assert said == [*map(without_source, recorded(flown, key)[key][:301])]
+
+
+def test_a_record_that_was_cut(federation: Federation, flown: Path) -> None:
+    """The writer of the record died.
+
+    Expected: it is played as far as it goes; a folder without a record, and a time after its end, are told in a line.
+    """
+    cut = federation.folder / "cut"
+    cut.mkdir()
+    whole = (flown / "run.mcap").read_bytes()
+    (cut / "run.mcap").write_bytes(whole[: len(whole) // 2])
+    role = replay(federation, cut, "--rate", "0")
+    role.ends(with_code=0)
+    assert "ended: the record is over" in role.text()
+    for folder, options, text in (
+        (federation.folder, [], "holds no run.mcap"),
+        (flown, ["--from", "100"], "holds no gate from 100 s on; nothing can be played"),
+        (flown, ["--keys", "a//b"], "key is 'a//b'"),
+    ):
+        refused = federation.start("replay", str(folder), "--listen", federation.endpoint, *options)
+        refused.ends(with_code=2)
+        refused.line(text)
+    shutil.rmtree(cut)

@@ -1,0 +1,161 @@
+"""The console's desk: what is asked in whose name, in what order, and what is told of a refusal."""
+
+import threading
+from collections.abc import Iterator
+from queue import SimpleQueue
+from typing import Any
+
+import pytest
+
+from zsim.errors import SessionError
+from zsim.messages import ControlAnswer
+from zsim_agents.console.desk import HANDS, PRIORITY, PRIORITY_EMERGENCY, Desk, Told
+
+PATIENCE_S = 10.0
+
+
+class Link:
+    """A session that notes what is asked of it."""
+
+    def __init__(self) -> None:
+        self.said: list[tuple[Any, ...]] = []
+        self.refusals: dict[str, str] = {}
+        self.given_back = threading.Event()
+        self.answers = threading.Event()  # whether anybody answers those who ask for what never ends
+
+    def request(self, key: str, op: str, source: str, args: dict[str, Any], timeout_s: float) -> ControlAnswer:
+        self.said.append((key, op, source, args))
+        if op == "broken":
+            raise SessionError("the session is closed")
+        if op == "wrong":
+            raise ValueError("no such thing")
+        if op == "hangs":
+            assert self.answers.wait(PATIENCE_S)
+        if op == "release":
+            self.given_back.set()
+        refusal = self.refusals.get(op, "")
+        return ControlAnswer(ok=not refusal, error=refusal)
+
+    def put(self, key: str, message: Any) -> None:
+        self.said.append((key, message))
+
+
+class Eyes:
+    """Hears at once that a command was taken."""
+
+    def answered(self, drone: str) -> int:
+        return 0
+
+    def await_answer(self, drone: str, beyond: int, within_s: float) -> None:
+        return
+
+
+class Table:
+    """A desk, what it said, and what it told."""
+
+    def __init__(self) -> None:
+        self.link = Link()
+        self.told: SimpleQueue[Told] = SimpleQueue()
+        self.eyes = Eyes()
+        self.desk = Desk(self.link, "console.1", self.eyes, lambda: 7, self.told.put)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def table() -> Iterator[Table]:
+    made = Table()
+    yield made
+    made.desk.close()
+
+
+def test_a_request_goes_out_in_the_console_s_name(table: Table):
+    table.desk.cluster("main", "target", values={"p": 4.0}, over_s=5.0)
+    assert table.told.get(timeout=PATIENCE_S) == Told("main: target values p=4, over_s 5", "")
+    args = {"values": {"p": 4.0}, "over_s": 5.0}
+    assert table.link.said == [("cluster/main/control", "target", "console.1", args)]
+
+
+def test_a_refusal_is_told_with_its_reason(table: Table):
+    table.link.refusals["pause"] = "the run is paused; pause needs a running one"
+    table.desk.world("pause")
+    assert table.told.get(timeout=PATIENCE_S) == Told("pause", "the run is paused; pause needs a running one")
+
+
+def test_a_session_that_fails_is_a_refusal(table: Table):
+    table.desk.world("broken")
+    assert table.told.get(timeout=PATIENCE_S).refusal == "the session is closed"
+
+
+def test_whatever_goes_wrong_is_told(table: Table):
+    table.desk.world("wrong")
+    assert table.told.get(timeout=PATIENCE_S).refusal == "ValueError: no such thing"
+
+
+def test_a_page_that_outlives_its_run_is_told_so(table: Table):
+    table.desk.close()
+    table.desk.world("pause")
+    table.desk.mode(["drone1"], "land")
+    assert table.told.get(timeout=PATIENCE_S) == Told("pause", "the run has ended")
+    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: land", "the run has ended")
+    assert table.link.said == []
+
+
+def test_a_drone_is_taken_told_and_given_back(table: Table):
+    table.desk.mode(["drone1"], "land")
+    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: land", "")
+    assert table.link.given_back.wait(PATIENCE_S)
+    acquire, (key, mode), release = table.link.said
+    assert acquire == ("world/control", "acquire", "console.1", {"drone": "drone1", "priority": PRIORITY})
+    assert (key, mode.mode, mode.source, mode.t_ns, mode.seq) == ("drone/drone1/cmd/mode", "land", "console.1", 7, 0)
+    assert release == ("world/control", "release", "console.1", {"drone": "drone1"})
+
+
+def test_a_drone_that_another_operator_has_is_not_commanded(table: Table):
+    table.link.refusals["acquire"] = "drone1 is flown by 'console.2' with priority 10"
+    table.desk.mode(["drone1"], "takeoff")
+    assert table.told.get(timeout=PATIENCE_S).refusal == "drone1 is flown by 'console.2' with priority 10"
+    assert [said[1] for said in table.link.said] == ["acquire"]
+
+
+def test_an_emergency_reaches_every_drone(table: Table):
+    names = [f"drone{i}" for i in range(30)]
+    table.desk.mode(names, "emergency")
+    told = {table.told.get(timeout=PATIENCE_S) for _ in names}
+    assert told == {Told(f"{name}: emergency", "") for name in names}
+    modes = [said for said in table.link.said if len(said) == 2]
+    assert {key for key, _ in modes} == {f"drone/{name}/cmd/mode" for name in names}
+
+
+def test_an_emergency_comes_before_whoever_flies(table: Table):
+    table.desk.mode(["drone1"], "emergency")
+    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: emergency", "")
+    args = {"drone": "drone1", "priority": PRIORITY_EMERGENCY}
+    assert table.link.said[0] == ("world/control", "acquire", "console.1", args)
+
+
+def test_an_emergency_is_sent_even_where_the_drone_is_refused(table: Table):
+    table.link.refusals["acquire"] = "drone1 is flown by 'console.2' with priority 100"
+    table.desk.mode(["drone1"], "emergency")
+    told = table.told.get(timeout=PATIENCE_S)
+    assert told.refusal == "drone1 is flown by 'console.2' with priority 100; emergency was sent all the same"
+    (mode,) = [said[1] for said in table.link.said if len(said) == 2]
+    assert mode.mode == "emergency"
+
+
+def test_an_emergency_does_not_wait_for_those_who_do_not_answer(table: Table):
+    for _ in range(3 * HANDS):
+        table.desk.cluster("main", "hangs")
+    table.desk.mode(["drone1"], "emergency")
+    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: emergency", "")
+    assert not table.link.answers.is_set()
+    table.link.answers.set()
+
+
+def test_what_is_given_back_keeps_no_emergency_waiting(table: Table):
+    heard = threading.Event()
+    table.eyes.await_answer = lambda *_: heard.wait(PATIENCE_S)  # type: ignore[method-assign, assignment]
+    names = [f"drone{i}" for i in range(3 * HANDS)]
+    table.desk.mode(names, "land")
+    assert {table.told.get(timeout=PATIENCE_S).what for _ in names} == {f"{name}: land" for name in names}
+    table.desk.mode(names, "emergency")
+    assert {table.told.get(timeout=PATIENCE_S).what for _ in names} == {f"{name}: emergency" for name in names}
+    heard.set()

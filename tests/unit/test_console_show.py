@@ -1,0 +1,247 @@
+"""One run on the page, drawn by a viser of its own that nobody looks at but the test."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsim import keys, messages, scenario_file
+from zsim.messages import ControlAnswer, DroneView, EstimateView, ViewCluster, ViewDrones, ViewEstimates
+from zsim_agents.console import stage as stages
+from zsim_agents.console.followers import Followers
+from zsim_agents.console.picture import drones_of
+from zsim_agents.console.private_viser import PrivateViser
+from zsim_agents.console.show import Show
+from zsim_agents.scenario_space import scenario_space
+
+STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
+SCENARIO = scenario_file.load(STEP)
+NAMES = tuple(drone.name for drone in SCENARIO.drones)
+CLUSTER = SCENARIO.clusters[0].name
+SPACE = scenario_space(SCENARIO, SCENARIO.clusters[0])
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+ROTORS = (300.0, 300.0, 300.0, 300.0)  # rad/s
+ORIGIN = (0.0, 0.0, 0.0)
+OBSTACLES = """
+name: field
+duration_s: 1
+drones: [{name: drone1, position_m: [0, 0, 0]}]
+environment:
+  obstacles:
+    - {name: wall, shape: box, position_m: [5, 0, 0], size_m: [1, 4, 3]}
+    - {name: mast, shape: cylinder, position_m: [9, 0, 0], radius_m: 0.2, height_m: 6}
+    - {name: balloon, shape: sphere, position_m: [9, 9, 5], radius_m: 1}
+"""
+
+
+class Link:
+    """A session on which only the test speaks."""
+
+    host = "lab"
+
+    def __init__(self) -> None:
+        self.say: Callable[[Any], None] = lambda _: None
+        self.asked: list[tuple[str, str, dict[str, Any]]] = []
+
+    def hear(self, expression: str, callback: Callable[[Any], None]) -> None:
+        self.say = callback
+
+    def on_message(self, expression: str, callback: Callable[[Any], None]) -> None:
+        return
+
+    def get(self, expression: str, timeout_s: float = 2.0) -> list[Any]:
+        return []
+
+    def request(self, key: str, op: str, source: str, args: dict[str, Any], timeout_s: float) -> ControlAnswer:
+        self.asked.append((key, op, args))
+        return ControlAnswer(True, "")
+
+
+class Seen:
+    """A run on a page: what is said of it, a picture after the other."""
+
+    def __init__(self, server: Any, watched: bool) -> None:
+        self.link: Any = Link()
+        health = SimpleNamespace(received=0, refused=0)
+        self.presence: Any = SimpleNamespace(
+            name="console.1", now_ns=0, over="", health=health, heed=lambda _: None, tick=lambda: None
+        )
+        drones = [SimpleNamespace(name=name) for name in NAMES]
+        info: Any = SimpleNamespace(run_id="r1", drones=drones, scenario=STEP.read_text())
+        server.get_clients = lambda: {0: None} if watched else {}
+        self.show = Show(server, self.link, info, self.presence, Followers(server), 1000.0)
+
+    def draw(self, *said: tuple[str, Any]) -> dict[str, Any]:
+        """Say something, draw a picture, and return what is shown."""
+        turns = iter((False, True))
+
+        def stopped() -> bool:
+            over = next(turns)
+            for key, message in () if over else said:
+                self.link.say(SimpleNamespace(key=key, payload=messages.encode(message)))
+            return over
+
+        self.show.run(stopped)
+        return self.show.state()
+
+
+@pytest.fixture(scope="module")
+def viser() -> Iterator[PrivateViser]:
+    made = PrivateViser()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def seen(viser: PrivateViser) -> Iterator[Seen]:
+    made = Seen(viser.server, watched=True)
+    yield made
+    made.show.close()
+
+
+def drones(*names: str, t_ns: int = 20_000_000, away_m: float = 0.0) -> tuple[str, ViewDrones]:
+    """A triangle, or what a replay has of it."""
+    places = {name: (4.0 * (i == 1) + away_m, 3.0 * (i == 2), 2.0) for i, name in enumerate(NAMES)}
+    views = tuple(DroneView(n, places.get(n, ORIGIN), LEVEL, ROTORS, "flying", 80.0) for n in names)
+    return keys.VIEW_DRONES, ViewDrones(t_ns, 0, views, ((3.0, 0.0, 0.0),))
+
+
+def cluster(name: str = CLUSTER, names: tuple[str, ...] = SPACE.names) -> tuple[str, ViewCluster]:
+    c = tuple(SPACE.specimen(4.0).tolist())[: len(names)]
+    return keys.cluster_view(name), ViewCluster(20_000_000, 0, "engaged", names, c, c, "")
+
+
+def test_a_whole_formation_is_shown(seen: Seen):
+    state = seen.draw(drones(*NAMES), cluster())
+    assert [drone["name"] for drone in state["drones"]] == list(NAMES)
+    assert state["clusters"][0]["true"]["p"] == pytest.approx(4.0)
+    assert state["t_s"] == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("watched", [True, False])
+def test_a_replay_of_some_drones_is_shown_as_far_as_it_goes(viser: PrivateViser, watched: bool):
+    seen = Seen(viser.server, watched)
+    state = seen.draw(drones(NAMES[1]), cluster())
+    assert [drone["name"] for drone in state["drones"]] == [NAMES[1]]
+    assert state["clusters"][0]["true"] == {}
+    assert seen.draw(drones())["drones"] == []
+    assert len(seen.draw(drones(*NAMES, "stranger"))["drones"]) == 4
+    seen.show.close()
+
+
+def test_a_run_that_nobody_watched_leaves_its_last_picture(viser: PrivateViser):
+    seen = Seen(viser.server, watched=False)
+    seen.draw(drones(*NAMES), cluster())
+    page = seen.show._page
+    assert "flying" in page.drones.content
+    assert "engaged" in page.phases.content
+    seen.show.close()
+
+
+def test_a_drone_that_is_missing_is_hidden_and_the_others_keep_their_places(viser: PrivateViser):
+    stage = stages.Stage(viser.server, NAMES, 3, 1)
+    found = drones_of(drones(NAMES[2])[1], NAMES)
+    stage.drones(found, 0.05)
+    stage.wind(found)
+    p_W = np.asarray(stage._airframes.batched_positions)
+    assert p_W[2].tolist() == [0.0, 3.0, 2.0]
+    assert p_W[0].tolist() == p_W[1].tolist() == list(stages.HIDDEN)
+    assert np.isfinite(stage._rotors.batched_positions).all()
+    assert stage._wind.visible
+    stage.wind(drones_of(drones()[1], NAMES))
+    assert not stage._wind.visible
+
+
+def test_views_of_another_controller_are_left_out(seen: Seen):
+    fewer = SPACE.names[:-1]
+    state = seen.draw(drones(*NAMES), cluster(names=fewer), cluster("strange"))
+    assert state["clusters"] == []
+    assert seen.presence.health.refused == 2
+    assert [each["name"] for each in seen.draw(cluster())["clusters"]] == [CLUSTER]
+
+
+def test_estimates_of_strangers_are_left_out(seen: Seen):
+    strangers = [EstimateView(f"s{i}", ORIGIN, (1.0, 0.0, 0.0, 1.0, 0.0, 1.0), 0.0, 0.1, {}) for i in range(9)]
+    mine = EstimateView(NAMES[0], ORIGIN, (4.0, 0.0, 0.0, 4.0, 0.0, 4.0), 0.0, 0.1, {"gps": (1, 0)})
+    view = ViewEstimates(20_000_000, 0, (*strangers, mine))
+    state = seen.draw(drones(*NAMES), (keys.estimates_view("estimator.drone1"), view))
+    assert state["drones"][0]["sigma_m"] == pytest.approx(2.0)
+
+
+def test_trails_go_when_a_replay_goes_back(viser: PrivateViser):
+    stage = stages.Stage(viser.server, NAMES, 3, 1)
+    stage.trails(np.ones((2, 2, 3)), np.array([0, 1]))
+    stage.trails(np.zeros((0, 2, 3)), np.zeros(0, dtype=np.int64))
+    assert (np.asarray(stage._trail_node.points)[..., 2] < -100.0).all()
+
+
+def test_obstacles_stand_where_the_scenario_says(viser: PrivateViser):
+    obstacles = scenario_file.from_text(OBSTACLES).environment.obstacles
+    added: dict[str, Any] = {}
+    scene: Any = viser.server.scene
+    stage = stages.Stage(viser.server, NAMES, 3, 1)
+    for shape in ("box", "cylinder", "icosphere"):
+        setattr(scene, f"add_{shape}", lambda name, **look: added.update({name: look["position"]}))
+    try:
+        stage.obstacles(obstacles)
+    finally:
+        for shape in ("box", "cylinder", "icosphere"):
+            delattr(scene, f"add_{shape}")
+    assert added == {
+        "/obstacles/wall": (5.0, 0.0, 1.5),
+        "/obstacles/mast": (9.0, 0.0, 3.0),
+        "/obstacles/balloon": (9.0, 9.0, 5.0),
+    }
+
+
+def test_a_slider_that_was_moved_just_before_its_page_closed_is_sent_now_or_never(viser: PrivateViser):
+    seen = Seen(viser.server, watched=False)
+    sent: list[float] = []
+    for form in seen.show._page.forms.values():
+        form.send = sent.append  # type: ignore[method-assign]
+    seen.draw(drones(*NAMES))
+    assert len(sent) == 1
+    seen.show.close()
+
+
+class Page:
+    """A page of viser's, with its camera and its switch."""
+
+    def __init__(self, number: int) -> None:
+        self.client_id = number
+        self.camera = SimpleNamespace(position=np.zeros(3), look_at=np.zeros(3))
+        self.switch = SimpleNamespace(value=False, _impl=SimpleNamespace(uuid=f"u{number}"))
+        self.gui = SimpleNamespace(add_checkbox=lambda *_, **__: self.switch)
+
+    def atomic(self) -> "Page":
+        return self
+
+    def __enter__(self) -> None:
+        return
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+
+def test_cameras_follow_where_their_page_says_so():
+    calls: dict[str, Any] = {}
+    server: Any = SimpleNamespace(
+        on_client_connect=lambda call: calls.update(come=call),
+        on_client_disconnect=lambda call: calls.update(go=call),
+    )
+    followers = Followers(server)
+    one, other = Page(1), Page(2)
+    calls["come"](one)
+    calls["come"](other)
+    assert followers.harmless == {"u1", "u2"}
+    one.switch.value = True
+    followers.follow(np.array([(10.0, 0.0, 2.0), (12.0, 0.0, 2.0)]))
+    followers.follow(np.zeros((0, 3)))
+    assert one.camera.look_at.tolist() == [11.0, 0.0, 2.0]
+    assert other.camera.look_at.tolist() == [0.0, 0.0, 0.0]
+    calls["go"](one)
+    assert followers.harmless == {"u2"}
+    assert followers._places == {}

@@ -1,0 +1,81 @@
+"""Who has died: one that only reads and tells nothing for long, for whom no token needs to go."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsim import keys, scenario_file
+from zsim.messages import Join
+from zsim_world.deaths import SILENT_S, Deaths
+from zsim_world.world import World
+
+sys.path.insert(0, str(Path(__file__).parent))
+from fake_link import FakeLink
+
+GATE_NS = 20_000_000
+SCENARIO = """
+name: one
+duration_s: 1
+drones: [{name: d1, position_m: [0, 0, 0]}]
+processes: {expect: [], on_death: {recorder: end}}
+"""
+
+
+class Case:
+    """A world, one participant, and who judges its death."""
+
+    def __init__(self, name: str, period_ns: int = 0) -> None:
+        self.name = name
+        self.world = World(scenario_file.from_text(SCENARIO), run_id="run1")
+        self.deaths = Deaths(FakeLink(), self.world, lambda: None)  # type: ignore[arg-type]
+        role = name.split(".")[0]
+        join = Join(0, 0, run_id="run1", incarnation=1, role=role, host="h", pid=7, period_ns=period_ns)
+        self.world.handle(keys.process(name, "join"), join, 0)
+
+    def seconds(self, count: int) -> None:
+        for _ in range(count):
+            self.deaths.second()
+
+    def told(self) -> list[Any]:
+        return [message for key, message in self.world.outbox if key == keys.EVENT and message.kind == "death"]
+
+
+@pytest.mark.parametrize("name", ["recorder", "console.1"])
+def test_a_silent_reader_is_dead(name: str) -> None:
+    case = Case(name)
+    case.deaths.heard(name)
+    case.seconds(SILENT_S)
+    assert case.told() == []
+    case.seconds(2)
+    assert [event.subject for event in case.told()] == [name]
+    assert (case.world.ended is not None) == (name == "recorder")
+
+
+def test_one_that_speaks_is_not() -> None:
+    case = Case("recorder")
+    for _ in range(3):
+        case.deaths.heard("recorder")
+        case.seconds(SILENT_S)
+    assert case.told() == []
+
+
+def test_nor_one_that_never_told_of_its_health() -> None:
+    case = Case("recorder")
+    case.seconds(3 * SILENT_S)
+    assert case.told() == []
+
+
+def test_nor_one_that_gates_since_time_stands_for_it() -> None:
+    case = Case("estimator.d1", GATE_NS)
+    case.deaths.heard("estimator.d1")
+    case.seconds(3 * SILENT_S)
+    assert case.told() == []
+
+
+def test_nor_a_stranger() -> None:
+    case = Case("recorder")
+    case.deaths.heard("somebody")
+    case.seconds(3 * SILENT_S)
+    assert case.told() == []

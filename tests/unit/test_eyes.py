@@ -1,0 +1,25 @@
+"""What eyes are shown of an estimate and of a formation."""
+
+import numpy as np
+
+from zsim.eyes import cluster_view, estimate_view
+from zsim.messages import ClusterState, Estimate
+
+
+def test_an_estimate_is_shown_with_the_upper_triangle_of_its_position():
+    half = np.random.default_rng(1).normal(size=(6, 6))
+    P = half @ half.T
+    level = (1.0, 0.0, 0.0, 0.0)
+    position, velocity, bias = (1.0, 2.0, 3.0), (4.0, 5.0, 6.0), (7.0, 8.0, 9.0)
+    told = Estimate(0, 0, position, velocity, level, 0.4, tuple(P.ravel().tolist()), 0.1, bias, {"gps": (3, 1)})
+    shown = estimate_view("d1", told)
+    assert (shown.name, shown.position_m, shown.yaw_rad, shown.yaw_sigma_rad) == ("d1", position, 0.4, 0.1)
+    assert shown.covariance_m2 == tuple(P[:3, :3][np.triu_indices(3)])
+    assert shown.sensors == {"gps": (3, 1)}
+
+
+def test_a_formation_is_shown_with_what_it_is_and_what_it_is_to_be():
+    state = ClusterState(20, 1, "held", ("d1",), ("x_c",), (1.0,), (2.0,), (3.0,), None, 0.5, "too near")
+    shown = cluster_view(state, 40, 7)
+    assert (shown.t_ns, shown.seq, shown.phase, shown.reason) == (40, 7, "held", "too near")
+    assert (shown.names, shown.value, shown.desired) == (("x_c",), (1.0,), (2.0,))

@@ -1,0 +1,60 @@
+"""`zsim fault`: what a person types becomes a request, or a line."""
+
+import pytest
+import typer
+
+from zsim.fault_kinds import KINDS
+from zsim.messages import Fault
+from zsim_deploy import fault_commands
+from zsim_deploy.fault_commands import row, seconds, selector
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("10s", 10.0), ("500ms", 0.5), ("2min", 120.0), ("3", 3.0), ("1.5 s", 1.5), (None, None)]
+)
+def test_durations(text: str | None, value: float | None):
+    assert seconds(text) == value
+
+
+@pytest.mark.parametrize("text", ["", "s", "-1s", "10h", "1e3s", "nan"])
+def test_what_is_no_duration(text: str):
+    with pytest.raises(typer.BadParameter, match="must be a duration such as 10s, 500ms or 2min"):
+        seconds(text)
+
+
+def test_parameters():
+    given = ["factor=3", "value_m=[2, 0, -1]", "place={controller.main: d1}", "rotor=all", "one_way=true"]
+    assert fault_commands._values(given) == {
+        "factor": 3,
+        "value_m": [2, 0, -1],
+        "place": {"controller.main": "d1"},
+        "rotor": "all",
+        "one_way": True,
+    }
+
+
+@pytest.mark.parametrize("text", ["factor", "=3", "a b=3", "value=[1"])
+def test_what_is_no_parameter(text: str):
+    with pytest.raises(typer.BadParameter):
+        fault_commands._values([text])
+
+
+@pytest.mark.parametrize(
+    ("which", "args"),
+    [("all", {}), ("3", {"id": 3}), ("drone2", {"target": "drone2"}), ("gps_dropout", {"kind": "gps_dropout"})],
+)
+def test_which_are_cleared(which: str, args: dict[str, object]):
+    assert selector(which) == args
+
+
+def test_a_row_says_when_and_what():
+    fault = Fault(1, "gps_dropout", "drone1", {"probability": 0.5}, 2_000_000_000, None, "me")
+    cells = [cell.strip() for cell in row(fault, 3_000_000_000)]
+    assert cells == ["1", "acts", "drone1", "gps_dropout", "2.00 to ... s", "probability=0.5"]
+    assert row(fault, 0)[1].strip() == "planned"
+
+
+def test_every_kind_is_listed(capsys: pytest.CaptureFixture[str]):
+    fault_commands.kinds()
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(KINDS)

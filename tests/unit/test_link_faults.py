@@ -1,0 +1,232 @@
+"""Faults of a link: what an agent is handed of the messages of a gate, and when."""
+
+import math
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from zsim import batch, keys, scenario_file
+from zsim.bundle import Bundle, table_of
+from zsim.fault_kinds import planned
+from zsim.link_faults import LinkFaults, heard, place_of, senders, uniform
+from zsim.messages import ControlRequest, Estimate, Fault, Faults, Imu, Mode, Status, encode
+from zsim_agents.controller import TAKEN_MAX, Controller
+from zsim_world.world import World
+
+GATE_NS = 20_000_000
+ME, OTHER = "controller.main", "estimator.d1"
+ESTIMATE, STATUS = keys.estimate("d1"), keys.status("d1")
+ZEROS = (0.0, 0.0, 0.0)
+Given = tuple[str, Any]
+
+
+def estimate(
+    gate: int, position_m: tuple[float, float, float] = ZEROS, source: str = OTHER, drone: str = "d1"
+) -> Given:
+    return keys.estimate(drone), Estimate(
+        gate * GATE_NS, gate, position_m, ZEROS, (1.0, 0.0, 0.0, 0.0), 0.0, (0.0,) * 36, 0.1, ZEROS, {}, source
+    )
+
+
+def status(gate: int) -> Given:
+    return STATUS, Status(gate * GATE_NS, gate, "flying", 90.0, False, None, 1)
+
+
+def links(*faults: Fault, names: tuple[str, ...] = (ME,), reads: tuple[str, ...] = (), seed: int = 1) -> LinkFaults:
+    made = LinkFaults(names, reads, seed, GATE_NS, {"main": ["d1", "d2"]})
+    made.heed(Faults(0, 0, faults))
+    return made
+
+
+def fault(kind: str, target: str = f"{OTHER}/{ME}", number: int = 1, **given: Any) -> Fault:
+    return planned({"kind": kind, "target": target, **given}, number, "test", 0, GATE_NS)
+
+
+def gates(made: LinkFaults, last: int, given: Any = estimate) -> list[tuple[int, int]]:
+    """Hand over a message per gate; return (gate of delivery, gate of the message)."""
+    handed = [(gate, made.through(gate * GATE_NS, [given(gate)])) for gate in range(1, last + 1)]
+    return [(gate, message.t_ns // GATE_NS) for gate, some in handed for _, message in some]
+
+
+def test_without_a_fault_everything_passes_as_it_is():
+    inputs = [estimate(1)]
+    assert links().through(GATE_NS, inputs) is inputs
+
+
+def test_a_cut_acts_in_the_gates_after_its_start_up_to_its_end():
+    made = links(fault("link_cut", at_s=0.04, for_s=0.06))
+    assert gates(made, 8) == [(gate, gate) for gate in (1, 2, 6, 7, 8)]
+
+
+@pytest.mark.parametrize(("delay_ms", "late"), [(1, 1), (20, 1), (21, 2), (60, 3)])
+def test_a_delay_is_in_whole_gates(delay_ms: float, late: int):
+    made = links(fault("link_delay", delay_ms=delay_ms))
+    assert gates(made, 10) == [(gate + late, gate) for gate in range(1, 11 - late)]
+
+
+def test_what_is_on_its_way_when_a_delay_ends_still_comes_and_first():
+    made = links(fault("link_delay", delay_ms=40, for_s=0.06))
+    assert gates(made, 6) == [(3, 1), (4, 2), (4, 4), (5, 3), (5, 5), (6, 6)]
+
+
+def test_delays_add_up_and_a_cut_beside_them_wins():
+    late = [fault("link_delay", delay_ms=20), fault("link_delay", number=2, delay_ms=30)]
+    assert gates(links(*late), 5) == [(4, 1), (5, 2)]
+    assert gates(links(*late, fault("link_cut", number=3)), 5) == []
+
+
+def test_a_loss_loses_its_share_and_never_depends_on_the_order_of_arrival():
+    share, count = 0.3, 4000
+    kept = {gate for gate, _ in gates(links(fault("link_loss", probability=share)), count)}
+    assert len(kept) / count == pytest.approx(1 - share, abs=4 * math.sqrt(share * (1 - share) / count))
+    made = links(fault("link_loss", probability=share))
+    backwards = {gate for gate in range(count, 0, -1) if made.through(gate * GATE_NS, [estimate(gate)])}
+    assert backwards == kept
+    other = {gate for gate, _ in gates(links(fault("link_loss", probability=share), seed=2), count)}
+    assert other != kept
+
+
+def test_a_loss_of_all_and_of_none():
+    assert gates(links(fault("link_loss", probability=1.0)), 50) == []
+    assert len(gates(links(fault("link_loss", probability=0.0)), 50)) == 50
+
+
+def test_two_losses_draw_apart():
+    first, second = fault("link_loss", probability=0.5), fault("link_loss", number=2, probability=0.5)
+    count = 2000
+    kept = len(gates(links(first, replace(second, rank=1)), count)) / count
+    assert kept == pytest.approx(0.25, abs=4 * math.sqrt(0.25 * 0.75 / count))
+
+
+def test_two_jitters_draw_apart():
+    """Two even delays of up to two gates each: their sum is a triangle over four."""
+    first, second = fault("link_jitter", jitter_ms=40), fault("link_jitter", number=2, jitter_ms=40)
+    count = 2000
+    late = [to - of for to, of in gates(links(first, replace(second, rank=1)), count)]
+    shares = [late.count(gate) / len(late) for gate in (1, 2, 3, 4)]
+    assert shares == pytest.approx([1 / 8, 3 / 8, 3 / 8, 1 / 8], abs=4 * math.sqrt(0.25 / count))
+
+
+def test_jitter_is_spread_evenly_up_to_its_most():
+    late = [to - of for to, of in gates(links(fault("link_jitter", jitter_ms=100)), 3000)]
+    assert set(late) == {1, 2, 3, 4, 5}  # a delay of anything above zero is a gate at least
+    assert sum(late) / len(late) == pytest.approx(3.0, abs=0.1)
+
+
+def test_both_ways_unless_it_is_one_way():
+    there, back = fault("link_cut", f"{ME}/{OTHER}"), fault("link_cut", f"{ME}/{OTHER}", one_way=True)
+    assert gates(links(there), 3) == []
+    assert len(gates(links(back), 3)) == 3
+    assert gates(links(fault("link_cut", f"{OTHER}/{ME}", one_way=True)), 3) == []
+
+
+def test_other_links_are_not_touched():
+    made = links(
+        fault("link_cut", "estimator.d2/controller.main"), fault("link_cut", f"{OTHER}/controller.b", number=2)
+    )
+    assert len(gates(made, 3)) == 3
+    assert len(gates(links(fault("link_cut")), 3, status)) == 3  # a status is the world's
+    assert gates(links(fault("link_cut", f"world/{ME}")), 3, status) == []
+
+
+def test_who_sends():
+    assert senders(ESTIMATE, estimate(1)[1]) == (OTHER,)
+    assert senders(ESTIMATE, estimate(1, source="controller.main")[1]) == (OTHER,)  # they share a process
+    assert senders(ESTIMATE, estimate(1, source="my.filter")[1]) == (OTHER, "my.filter")
+    assert senders(STATUS, status(1)[1]) == ("world",)
+    assert senders(keys.command("d1", "mode"), Mode(0, 0, "console.1", "land")) == ("console.1",)
+
+
+def test_an_older_list_says_nothing_and_a_newer_one_counts():
+    made = links(fault("link_cut"))
+    made.heed(Faults(0, 0, ()))
+    assert gates(made, 1) == []
+    made.heed(Faults(0, 1, ()))
+    assert len(gates(made, 1)) == 1
+
+
+def test_an_estimator_of_several_drones_has_the_link_of_each():
+    table, bundle = table_of(["d1", "d2"]), []
+    for drone in ("d1", "d2"):
+        bundle.append((keys.sensor(drone, "imu"), encode(Imu(GATE_NS, 1, GATE_NS, ZEROS, ZEROS))))
+    whole = Bundle.of(GATE_NS, 1, table, bundle)
+    reads = tuple(keys.sensors(drone) for drone in ("d1", "d2"))
+    made = links(fault("link_cut", "world/estimator.d2"), names=("estimator.d1", "estimator.d2"), reads=reads)
+    handed = made.through(GATE_NS, [(batch.GATE, whole)])
+    assert [key for key, _ in handed] == [keys.sensor("d1", "imu")]
+    later = made.through(2 * GATE_NS, [(batch.GATE, Bundle.of(2 * GATE_NS, 2, table, bundle))])
+    assert len(later) == 1
+    made.heed(Faults(0, 1, ()))
+    assert made.through(3 * GATE_NS, [(batch.GATE, whole)]) == [(batch.GATE, whole)]
+
+
+def radio(**place: Any) -> Fault:
+    return fault(
+        "radio", "main", range_m=50, spread_m=5, place={name.replace("_", "."): at for name, at in place.items()}
+    )
+
+
+@pytest.mark.parametrize("distance_m", [30.0, 45.0, 50.0, 55.0, 70.0])
+def test_a_radio_loses_more_the_farther_it_reaches(distance_m: float):
+    count = 2000
+    kept = len(gates(links(radio()), count, lambda gate: estimate(gate, (distance_m, 0.0, 0.0))))
+    expected = 1 / (1 + math.exp((distance_m - 50) / 5))
+    assert kept / count == pytest.approx(expected, abs=4 * math.sqrt(0.25 / count))
+    assert heard(distance_m, 50, 5) == pytest.approx(expected)
+
+
+def test_a_radio_is_where_its_process_is():
+    far = (1000.0, 0.0, 0.0)
+    assert gates(links(radio()), 5, lambda gate: estimate(gate, far)) == []
+    assert len(gates(links(radio(controller_main=[990, 0, 0])), 5, lambda gate: estimate(gate, far))) == 5
+    on_d2 = links(radio(controller_main="d2"))
+    beside = [on_d2.through(gate * GATE_NS, [estimate(gate, far), estimate(gate, far, drone="d2")]) for gate in (1, 2)]
+    assert [len(handed) for handed in beside] == [2, 2]
+    apart = [on_d2.through(gate * GATE_NS, [estimate(gate, far), estimate(gate, drone="d2")]) for gate in (3, 4)]
+    assert [[message.position_m for _, message in handed] for handed in apart] == [[ZEROS], [ZEROS]]
+
+
+def test_a_radio_is_not_between_a_drone_and_its_own_estimator():
+    made = links(fault("radio", "world", range_m=1, spread_m=0.1), names=(OTHER,))
+    assert len(gates(made, 5, lambda gate: estimate(gate, (1000.0, 0.0, 0.0)))) == 5
+
+
+def test_an_unknown_place_loses_nothing():
+    assert len(gates(links(radio()), 5, status)) == 5  # no estimate has come yet
+    assert place_of("controller.main", {"controller.main": "d9"}, {}.get) is None
+
+
+def test_draws_are_even_and_their_own():
+    cut = fault("link_loss", probability=0.5)
+    draws = [uniform(1, ME, cut, ESTIMATE, gate * GATE_NS, gate) for gate in range(5000)]
+    assert min(draws) >= 0.0
+    assert max(draws) < 1.0
+    assert sum(draws) / len(draws) == pytest.approx(0.5, abs=4 / math.sqrt(12 * len(draws)))
+    assert uniform(1, "controller.b", cut, ESTIMATE, GATE_NS, 1) != draws[1]
+    assert uniform(1, ME, cut, ESTIMATE, GATE_NS, 1) == draws[1]
+
+
+def controller() -> Controller:
+    drones = [{"name": name, "position_m": [3 * k, 0, 0]} for k, name in enumerate(("d1", "d2"))]
+    given = {"name": "t", "duration_s": 1, "drones": drones, "clusters": [{"name": "main", "drones": ["d1", "d2"]}]}
+    world = World(scenario_file.resolve(given))
+    return Controller(world.info(), world.scenario, "main")
+
+
+def test_a_controller_keeps_the_newest_state_of_a_drone():
+    made = controller()
+    newest = Status(3 * GATE_NS, 3, "landing", 90.0, False, None, 1)
+    made.hear(3 * GATE_NS, [(STATUS, newest)])
+    made.hear(4 * GATE_NS, [status(2)])
+    assert made._states == ["landing", "landed"]
+
+
+def test_a_controller_takes_so_many_requests_between_two_gates():
+    """As in a run that is paused; at the next gate it says what it took, and takes others."""
+    made, (key,) = controller(), controller().control_keys()
+    answers = [made.control(key, ControlRequest("sing", {}, "op.1")) for _ in range(TAKEN_MAX + 1)]
+    assert [answer.error for answer in answers if "wait for the next gate" in answer.error] == [answers[-1].error]
+    said = [output.key for output in made.step(GATE_NS)]
+    assert said.count(keys.cluster_request("main")) == TAKEN_MAX
+    assert "wait for" not in made.control(key, ControlRequest("sing", {}, "op.1")).error

@@ -1,0 +1,135 @@
+"""Obstacles: distances in closed form, hulls that are stopped, events, what a scenario may say."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsim import keys
+from zsim.errors import ScenarioError
+from zsim.obstacle import nearest, row_of
+from zsim.scenario import Obstacle, Scenario
+from zsim.scenario_file import resolve
+from zsim_world.fleet import Fleet
+from zsim_world.vehicle import HULL_RADIUS_M
+from zsim_world.world import World
+
+BOX = {"name": "wall", "shape": "box", "position_m": [4, 0, 0], "size_m": [1, 6, 5]}
+PILLAR = {"name": "pillar", "shape": "cylinder", "position_m": [4, 0.1, 0], "radius_m": 0.5, "height_m": 5}
+BALL = {"name": "ball", "shape": "sphere", "position_m": [4, 0.1, 1.1], "radius_m": 0.6}
+
+
+def row(shape: str, **given: Any) -> list[float]:
+    return row_of(Obstacle(name="o", shape=shape, **given))  # type: ignore[arg-type]
+
+
+R2 = math.sqrt(0.5)
+BOX_ROW = row("box", position_m=(1, 2, 0), size_m=(2, 4, 6), yaw_deg=90)  # 4 along x, 2 along y
+ROUND = row("cylinder", position_m=(0, 0, 1), radius_m=1, height_m=2)
+
+
+@pytest.mark.parametrize(
+    ("solid", "point", "distance", "away"),
+    [
+        (BOX_ROW, (4, 2, 3), 1.0, (1, 0, 0)),
+        (BOX_ROW, (1, 0, 3), 1.0, (0, -1, 0)),
+        (BOX_ROW, (1, 2, 8), 2.0, (0, 0, 1)),
+        (BOX_ROW, (4, 4, 3), math.sqrt(2), (R2, R2, 0)),
+        (BOX_ROW, (2.9, 2, 3), -0.1, (1, 0, 0)),
+        (ROUND, (3, 0, 2), 2.0, (1, 0, 0)),
+        (ROUND, (0, -3, 2), 2.0, (0, -1, 0)),
+        (ROUND, (0, 0, 3.5), 0.5, (0, 0, 1)),
+        (ROUND, (0, 2, 4), math.sqrt(2), (0, R2, R2)),
+        (ROUND, (0.9, 0, 2), -0.1, (1, 0, 0)),
+        (row("sphere", position_m=(0, 0, 2), radius_m=1), (0, 2, 4), 2 * math.sqrt(2) - 1, (0, R2, R2)),
+        (row("sphere", position_m=(0, 0, 2), radius_m=1), (0, 0, 1.5), -0.5, (0, 0, -1)),
+    ],
+)
+def test_distance_and_direction(solid: list[float], point: Any, distance: float, away: Any):
+    found = nearest(solid, *point)
+    assert found[0] == pytest.approx(distance, abs=1e-9)
+    assert found[1:] == pytest.approx(away, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "solid", [BOX_ROW, ROUND, row("sphere", position_m=(0, 0, 2), radius_m=1)], ids=["box", "cylinder", "sphere"]
+)
+def test_the_direction_is_the_slope_of_the_distance(solid: list[float]):
+    rng = np.random.default_rng(1)
+    for p in rng.uniform(-5, 6, (300, 3)):
+        d, *away = nearest(solid, *p)
+        assert math.hypot(*away) == pytest.approx(1.0)
+        if d > 0.0:
+            assert nearest(solid, *(p + 0.01 * np.array(away)))[0] == pytest.approx(d + 0.01, abs=1e-9)
+
+
+def scenario(*obstacles: Any, **more: Any) -> Scenario:
+    drones = [{"name": "d1", "position_m": [0, 0, 0]}, {"name": "d2", "position_m": [0, 8, 0]}]
+    document = {"name": "t", "duration_s": 30, "drones": drones, "processes": {"expect": []}}
+    return resolve({**document, "environment": {"obstacles": list(obstacles)}, **more})
+
+
+@pytest.mark.parametrize("given", [BOX, PILLAR, BALL], ids=lambda o: o["shape"])
+def test_a_drone_that_flies_into_an_obstacle_does_not_get_through(given: dict[str, Any]):
+    fleet = Fleet(scenario(given))
+    solid = row_of(
+        resolve(
+            {
+                "name": "t",
+                "duration_s": 1,
+                "drones": [{"name": "x", "position_m": [0, 0, 0]}],
+                "environment": {"obstacles": [given]},
+            }
+        ).environment.obstacles[0]
+    )
+    assert fleet.takeoff(0) is None
+    began, depths = [], []
+    for gate in range(600):
+        if gate > 250:
+            fleet.set_velocity(0, (1.0, 0.0, 0.0), 0.0, "world")
+        fleet.advance()
+        began += fleet.bumps()
+        depths.append(HULL_RADIUS_M - nearest(solid, *fleet.truth().position_m[0])[0])
+    assert began[0] == (0, 0)
+    assert 0.0 < max(depths) < 0.1  # of the hull's 0.26 m
+    assert fleet.touching.tolist() == [bool(depths[-1] > 0), False]
+    if given is BOX:
+        assert fleet.truth().position_m[0, 0] < 3.5
+
+
+def test_the_world_says_who_runs_into_what():
+    world = World(scenario(BOX), run_id="r")
+    for gate in range(600):
+        if gate == 1:
+            world.fleet.takeoff(0)
+        if gate > 250:
+            world.fleet.set_velocity(0, (1.0, 0.0, 0.0), 0.0, "world")
+        world.advance(0)
+    said = [m for key, m in world.take_outbox() if key == keys.EVENT and m.kind == "collision"]
+    assert (said[0].subject, said[0].data, said[0].text) == ("d1", {"other": "wall"}, "d1 runs into wall")
+
+
+def test_an_obstacle_out_of_reach_changes_nothing():
+    near, far = Fleet(scenario()), Fleet(scenario(BOX))
+    for fleet in (near, far):
+        fleet.takeoff(0)
+        for _ in range(200):
+            fleet.advance()
+    assert (near.bodies.state == far.bodies.state).all()
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        ({**BOX, "size_m": None}, "environment.obstacles[0].size_m is missing; must be given for a box"),
+        ({**BALL, "height_m": 2}, "environment.obstacles[0].height_m is given; must be left out of a sphere"),
+        ({**PILLAR, "name": "d1"}, "environment.obstacles[0].name is 'd1', as a drone; must be another"),
+        ({**PILLAR, "position_m": [0.6, 0, 0]}, "drones[0].position_m is 0.10 m from 'pillar'; must be >= 0.3 m (drone 'd1')"),
+        ({**BOX, "shape": "cone"}, "environment.obstacles[0].shape is 'cone'; must be one of box, cylinder, sphere"),
+    ],
+)  # fmt: skip
+def test_what_an_obstacle_cannot_be(given: dict[str, Any], line: str):
+    with pytest.raises(ScenarioError) as told:
+        scenario(given)
+    assert str(told.value).splitlines() == [f"scenario: {line}"]

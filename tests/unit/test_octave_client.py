@@ -1,0 +1,319 @@
+"""The MATLAB client, run by GNU Octave, against a gateway that says exactly what a test wants."""
+
+import json
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from octave import needs_octave, run
+
+pytestmark = needs_octave
+
+PATIENCE_S = 30.0
+RUN = {
+    "run_id": "abc", "federation": "zsim", "mode": "lockstep", "gate_s": 0.02, "t_ns": 0,
+    "drones": ["drone1"], "clusters": [{"name": "main", "drones": ["drone1"]}],
+}  # fmt: skip
+Said = dict[str, Any]
+Answer = Callable[[Said], list[Said | bytes]]
+
+
+class FakeGateway:
+    """Takes one connection and answers each line as it is told, everything after `hello` by `answer`."""
+
+    def __init__(self, answer: Answer, hello: Answer | None = None) -> None:
+        self._answer = answer
+        self._hello = hello or (lambda asked: [{"op": "hello", "name": "client.test", **RUN}])
+        self._door = socket.create_server(("127.0.0.1", 0))
+        self._door.settimeout(PATIENCE_S)
+        self.port = self._door.getsockname()[1]
+        self.heard: list[Said] = []
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        link, _ = self._door.accept()
+        with link, link.makefile("rb") as lines:
+            link.settimeout(PATIENCE_S)
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            for line in lines:
+                asked = json.loads(line)
+                self.heard.append(asked)
+                answers = (self._hello if asked["op"] == "hello" else self._answer)(asked)
+                if not answers:
+                    return
+                for said in answers:
+                    link.sendall(said if isinstance(said, bytes) else _line(said, asked))
+
+    def close(self) -> None:
+        self._thread.join(PATIENCE_S)
+        self._door.close()
+
+
+def _line(said: Said, asked: Said) -> bytes:
+    """Return a line; what is no message of itself answers what was asked."""
+    answered = {} if said["op"] in ("value", "gate", "left", "lost", "run") else {"id": asked.get("id")}
+    return json.dumps({**said, **answered}, separators=(",", ":"), ensure_ascii=False).encode() + b"\n"
+
+
+@contextmanager
+def gateway(answer: Answer, hello: Answer | None = None) -> Iterator[FakeGateway]:
+    made = FakeGateway(answer, hello)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def said(port: int, code: str) -> list[str]:
+    """Return the lines that code prints with `c`, a client of this port."""
+    return run(f"c = zsim.Client('127.0.0.1', 'Port', {port}, 'Timeout', 5); {code} c.delete();").splitlines()
+
+
+def echo(asked: Said) -> list[Said | bytes]:
+    return [{"op": asked["op"], "key": asked.get("key")}]
+
+
+def test_requests_as_the_gateway_wants_them() -> None:
+    """What each method puts on the wire; times and lists of one as what they are."""
+    code = """
+    c.put('any/key', struct('t_ns', 330000000000, 'list', {{'one'}}));
+    c.velocity('drone1', [1; 2; 0.25], 0.5);
+    c.velocity('drone1', [0 0 1], 0, 'world');
+    c.takeoff(); c.land('drone1');
+    c.subscribe('drone/*/truth'); c.unsubscribe('drone/*/truth');
+    """
+    with gateway(echo) as fake:
+        said(fake.port, code)
+    (hello, *rest) = [{k: v for k, v in asked.items() if k != "id"} for asked in fake.heard]
+    assert (hello["op"], hello["name"]) == ("hello", "")
+    assert rest == [
+        {"op": "put", "key": "any/key", "value": {"t_ns": 330000000000, "list": ["one"]}},
+        {
+            "op": "put",
+            "key": "drone/drone1/cmd/velocity",
+            "value": {"velocity_m_s": [1, 2, 0.25], "yaw_rate_rad_s": 0.5},
+        },
+        {
+            "op": "put",
+            "key": "drone/drone1/cmd/velocity",
+            "value": {"velocity_m_s": [0, 0, 1], "yaw_rate_rad_s": 0, "frame": "world"},
+        },
+        {"op": "put", "key": "drone/drone1/cmd/mode", "value": {"mode": "takeoff"}},
+        {"op": "put", "key": "drone/drone1/cmd/mode", "value": {"mode": "land"}},
+        {"op": "subscribe", "key": "drone/*/truth"},
+        {"op": "unsubscribe", "key": "drone/*/truth"},
+    ]
+    assert isinstance(rest[0]["value"]["t_ns"], int)
+
+
+def test_requests_of_the_world_and_of_a_cluster() -> None:
+    code = """
+    c.pause(); c.advance(3); c.resume(); c.rate(2); c.stop('done');
+    c.clusterTarget('main', struct('z_c', 10), 20); c.clusterHold('main');
+    c.acquire('drone1', 10); r = c.ask('world/control', 'step', struct('gates', 1)); disp(r.at);
+    """
+
+    def answer(asked: Said) -> list[Said | bytes]:
+        return [{"op": "answer", "ok": True, "error": "", "result": {"at": [1, 2, 3]}}]
+
+    with gateway(answer) as fake:
+        assert said(fake.port, code) == ["   1   2   3"]
+    asked = [(a["key"], a["request"], a["args"]) for a in fake.heard[1:]]
+    assert asked == [
+        ("world/control", "pause", {}),
+        ("world/control", "step", {"gates": 3}),
+        ("world/control", "resume", {}),
+        ("world/control", "rate", {"value": 2}),
+        ("world/control", "stop", {"reason": "done"}),
+        ("cluster/main/control", "target", {"values": {"z_c": 10}, "over_s": 20}),
+        ("cluster/main/control", "hold", {}),
+        ("world/control", "acquire", {"drone": "drone1", "priority": 10}),
+        ("world/control", "step", {"gates": 1}),
+    ]
+
+
+def test_lines_however_they_are_cut() -> None:
+    """An answer of 1 MB in pieces, an answer byte by byte within a letter, and many lines in one piece."""
+
+    def answer(asked: Said) -> list[Said | bytes]:
+        value = {"text": "ü" * 500_000 if asked["key"] == "long" else "grün", "v": [1, 2, 3]}
+        entry = {"key": asked["key"], "value": value}
+        line = _line({"op": "latest", "values": [entry]}, asked)
+        values = b"".join(_line({"op": "value", "key": f"k{i}", "value": i}, asked) for i in range(1000))
+        step = 10_007 if asked["key"] == "long" else 1
+        return [*(line[i : i + step] for i in range(0, len(line), step)), values]
+
+    code = """
+    a = c.latest('long'); b = c.latest('short');
+    printf('%d %s %d\\n', numel(a.text), b.text, b.v(3));
+    for k = 0:1999
+        [value, key] = c.next(5);
+        assert(value == mod(k, 1000) && strcmp(key, sprintf('k%d', value)));
+    end
+    """
+    with gateway(answer) as fake:
+        assert said(fake.port, code) == ["1000000 grün 3"]
+
+
+def test_nothing_is_there_yet() -> None:
+    """No value, no values and no news are empty, not errors."""
+
+    def answer(asked: Said) -> list[Said | bytes]:
+        return [{"op": "latest", "values": []}]
+
+    code = """
+    disp(isempty(c.imu('drone1'))); disp(size(c.latest('drone/*/truth')));
+    [value, key] = c.next(0.05); disp(isempty(value) && isempty(key));
+    """
+    with gateway(answer) as fake:
+        assert said(fake.port, code) == ["1", "   0   0", "1"]
+
+
+FAILS = "try, {code} catch e, printf('%s %s\\n', e.identifier, e.message); end;"
+
+
+def test_refusals_and_ends() -> None:
+    """A refusal is an error and the client goes on; an end of the connection is another."""
+
+    def answer(asked: Said) -> list[Said | bytes]:
+        if asked["op"] == "put":
+            return [{"op": "error", "error": "drone/drone9: drone is 'drone9'; must be one of drone1"}]
+        if asked["op"] == "ask":
+            return [{"op": "answer", "ok": False, "error": "phase is idle", "result": None}]
+        return []
+
+    code = "".join(
+        FAILS.format(code=tried)
+        for tried in (
+            "c.velocity('drone9', [0 0 0], 0);",
+            "c.clusterLand('main');",
+            "c.velocity('drone1', [0 0], 0);",
+            "c.velocity('drone1', [0 0 NaN], 0);",
+            "c.step();",
+            "c.truth('drone1');",
+            "c.truth('drone1');",
+        )
+    )
+    with gateway(answer) as fake:
+        lines = said(fake.port, code)
+    assert lines == [
+        "zsim:refused drone/drone9: drone is 'drone9'; must be one of drone1",
+        "zsim:refused cluster/main/control land: phase is idle",
+        "zsim:argument velocity has 2 numbers; must have 3: x, y, z",
+        "zsim:argument velocity or yaw rate of drone1 is not finite",
+        "zsim:refused step: has not joined; say join first",
+        f"zsim:connection the gateway on 127.0.0.1:{fake.port} closed the connection; make a new zsim.Client",
+        f"zsim:connection the connection to 127.0.0.1:{fake.port} is closed; make a new zsim.Client",
+    ]
+
+
+def test_no_answer_and_a_late_one() -> None:
+    """A request without an answer ends after the timeout; its late refusal does not concern the next."""
+    first: list[int] = []
+
+    def answer(asked: Said) -> list[Said | bytes]:
+        if not first:
+            first.append(asked["id"])
+            return [b"\n"]
+        late = json.dumps({"op": "error", "error": "late", "id": first[0]}).encode() + b"\n"
+        return [late, {"op": "put", "key": asked["key"]}]
+
+    with gateway(answer) as fake:
+        made = f"c = zsim.Client('127.0.0.1', 'Port', {fake.port}, 'Timeout', 0.3);"
+        text = run(made + FAILS.format(code="c.put('a', 1);") + "c.put('b', 2); disp('goes on'); c.delete();")
+    assert text.splitlines() == [
+        f"zsim:timeout put: no answer from 127.0.0.1:{fake.port} within 0.3 s",
+        "goes on",
+    ]
+
+
+def test_a_run_that_begins_later() -> None:
+    """Until a run begins the client waits, so long as its option says; then it knows the drones."""
+    asked_before: list[Said] = []
+
+    def hello(asked: Said) -> list[Said | bytes]:
+        asked_before.append(asked)
+        if len(asked_before) == 1:
+            return [
+                {"op": "hello", "name": "client.test", "run_id": None},
+                {"op": "run", "state": "begun", "run_id": "abc"},
+            ]
+        return [{"op": "hello", "name": "client.test", **RUN}]
+
+    with gateway(echo, hello) as fake:
+        assert said(fake.port, "disp(c.run.run_id); disp(c.run.drones{1}); disp(c.run.clusters(1).name);") == [
+            "abc", "drone1", "main",
+        ]  # fmt: skip
+
+    def never(asked: Said) -> list[Said | bytes]:
+        return [{"op": "hello", "name": "client.test", "run_id": None}]
+
+    with gateway(echo, never) as fake:
+        text = run(FAILS.format(code=f"zsim.Client('127.0.0.1', 'Port', {fake.port}, 'Wait', 0.2);"))
+    wanted = f"no run on the gateway at 127.0.0.1:{fake.port} within 0.2 s; start one with: zsim run"
+    assert text.strip() == f"zsim:timeout {wanted}"
+
+
+def test_the_lockstep() -> None:
+    """What is said in a gate is its answer; a refused answer leaves it open; `left` ends it."""
+    gates = iter(range(1, 10))
+
+    def answer(asked: Said) -> list[Said | bytes]:
+        gate = {"op": "gate", "t_ns": 20_000_000 * next(gates), "inputs": []}
+        entry = {"key": "drone/drone1/estimate", "value": {"position_m": [1, 2, 3]}}
+        match asked["op"]:
+            case "join":
+                return [{"op": "join", "name": "client.x", "gates": ["clock"]}, {**gate, "t_ns": 0, "inputs": [entry]}]
+            case "done" if any(output["key"] == "bad" for output in asked["outputs"]):
+                return [{"op": "error", "error": "done: 'bad' is wrong"}]
+            case "done" if asked["t_ns"] >= 80_000_000:
+                return [{"op": "left", "reason": "the run ended"}]
+        return [{**gate, "inputs": [entry, {"key": "b", "value": 1}]}]
+
+    code = f"""
+    disp(c.join('x', 0.02, 'drone/drone1/estimate'){{1}});
+    gate = c.step();
+    e = zsim.heard(gate, 'drone/drone1/estimate');
+    printf('%g %d\\n', gate.t_s, e.position_m(3));
+    c.velocity('drone1', [1 0 0], 0);
+    gate = c.step({{'k', 1; 'l', struct('m', 2)}});
+    c.put('bad', 1);
+    {FAILS.format(code="c.step();")}
+    c.put('good', 1);
+    while ~isempty(gate)
+        gate = c.step();
+    end
+    disp(c.left);
+    """
+    with gateway(answer) as fake:
+        assert said(fake.port, code) == ["clock", "0 3", "zsim:refused done: 'bad' is wrong", "the run ended"]
+    join, *dones = [asked for asked in fake.heard if asked["op"] in ("join", "done")]
+    assert join["reads"] == ["drone/drone1/estimate"]
+    velocity = {"velocity_m_s": [1, 0, 0], "yaw_rate_rad_s": 0}
+    assert [output["key"] for output in dones[0]["outputs"]] == ["drone/drone1/cmd/velocity", "k", "l"]
+    assert dones[0]["outputs"][0]["value"] == velocity
+    assert [output["key"] for output in dones[2]["outputs"]] == ["good"]
+    assert [done["t_ns"] for done in dones[:3]] == [0, 40_000_000, 40_000_000]
+    assert all(isinstance(done["t_ns"], int) for done in dones)
+
+
+def test_faults_before_there_is_a_connection() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    code = FAILS.format(code=f"zsim.Client('127.0.0.1', 'Port', {port});") + FAILS.format(
+        code="zsim.Client('127.0.0.1', 'Prt', 1);"
+    )
+    nobody, wrong = run(code).splitlines()
+    assert nobody.startswith(f"zsim:connection no gateway on 127.0.0.1:{port} (")
+    assert nobody.endswith("start one with: zsim gateway")
+    assert wrong == "zsim:argument option 'Prt' is unknown; allowed: Port, Token, Name, Timeout, Wait"
+
+
+def test_the_tests_in_matlab() -> None:
+    """clients/matlab/tests, as a user runs them."""
+    lines = run("run_tests()").splitlines()
+    assert lines
+    assert all(line.startswith("ok ") for line in lines)

@@ -1,0 +1,370 @@
+"""A record as a run that is played: which message comes with which gate, what is said again, what is refused."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from zsim import batch, keys, messages, scenario_file
+from zsim.errors import RecordError
+from zsim.messages import (
+    Bye,
+    Clock,
+    ClusterState,
+    ControlRequest,
+    Done,
+    Estimate,
+    Event,
+    Fault,
+    Faults,
+    Gps,
+    Imu,
+    Join,
+    Message,
+    Status,
+    Truth,
+    Velocity,
+    ViewDrones,
+)
+from zsim.record import Recorded, RecordReader, RecordWriter
+from zsim_world.playback import NOBODY, Choice, Playback
+from zsim_world.playback_tape import Tape
+from zsim_world.world import World
+
+GATE_NS = 20_000_000
+ZEROS = (0.0, 0.0, 0.0)
+SCENARIO = scenario_file.from_text("""
+name: two
+seed: 3
+duration_s: 1
+drones: [{name: d1, position_m: [0, 0, 0]}, {name: d2, position_m: [3, 0, 0]}]
+clusters: [{name: main, drones: [d1, d2]}]
+""")
+INFO = World(SCENARIO, run_id="flown").info()
+CMD = keys.command("d1", "velocity")
+Said = tuple[str, Message]
+
+
+def clock(gate: int, state: Any = "running") -> Said:
+    return keys.CLOCK, Clock(gate * GATE_NS, gate, "flown", gate, state, 1.0)
+
+
+def estimate(gate: int, drone: str = "d1", source: str = "") -> Said:
+    bare = Estimate(gate * GATE_NS, gate, ZEROS, ZEROS, (1.0, *ZEROS), 0.0, (0.5,) * 36, 0.1, ZEROS, {})
+    return keys.estimate(drone), msgspec.structs.replace(bare, source=source)
+
+
+def command(t_ns: int, source: str = "tester.one") -> Said:
+    return CMD, Velocity(t_ns, 0, source, ZEROS, 0.0)
+
+
+def event(gate: int, kind: str, seq: int = 0) -> Said:
+    return keys.EVENT, Event(gate * GATE_NS, seq, kind, "world", "d1", kind)
+
+
+def drone(gate: int, name: str) -> Iterator[Said]:
+    """Yield what the world says of a drone at a gate: an IMU before it, a fix at it, truth, status."""
+    t_ns = gate * GATE_NS
+    yield keys.sensor(name, "imu"), Imu(max(0, t_ns - 5_000_000), gate, t_ns, ZEROS, ZEROS)
+    yield keys.sensor(name, "gps"), Gps(t_ns, gate, t_ns, 0.0, 0.0, 0.0, (float(gate), 0.0, 0.0), ZEROS, 2.0, 3, 9)
+    yield (
+        keys.truth(name),
+        Truth(t_ns, gate, (float(gate), 0.0, 1.0), ZEROS, (1.0, *ZEROS), ZEROS, ZEROS, (9.0, 9.0, 9.0, 9.0)),
+    )
+    yield keys.status(name), Status(t_ns, gate, "flying", 50.0, False, None, 3)
+
+
+def gate(number: int) -> list[Said]:
+    return [*drone(number, "d1"), *drone(number, "d2"), clock(number)]
+
+
+def write(folder: Path, said: list[Said]) -> RecordReader:
+    path = folder / "run.mcap"
+    with RecordWriter(path) as writer:
+        for place, (key, message) in enumerate(said):
+            writer.add_message(key, message, 1_000_000 * place)
+    return RecordReader(path)
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Iterator[RecordReader]:
+    """Ten gates; the estimators answer a gate late, the controller two."""
+    said: list[Said] = [(keys.INFO, INFO), event(0, "join"), clock(0, "waiting")]
+    join = Join(0, 0, "flown", 1, "estimator", "h", 1, GATE_NS)
+    said += [(keys.process("estimator.d1", "join"), join)]
+    state = ClusterState(0, 0, "engaged", (), (), (), (), (), None, 1.0, "")
+    for number in range(10):
+        said += gate(number)
+        said += [estimate(number), estimate(number, "d2")]
+        said += [(keys.process("estimator.d1", "done"), Done(0, number, "flown", 1, number * GATE_NS, 1))]
+        said += [(keys.VIEW_DRONES, ViewDrones(number * GATE_NS, number, (), ((1.0, 0.0, 0.0), (2.0, 0.0, 0.0))))]
+        said += [command(max(0, number - 1) * GATE_NS, "controller.main")]
+        said += [(keys.cluster_state("main"), msgspec.structs.replace(state, t_ns=number * GATE_NS, seq=number))]
+    said += [event(9, "end", 1), clock(9, "stopped"), (keys.process("estimator.d1", "bye"), Bye(0, 0, "over"))]
+    with write(tmp_path, said) as reader:
+        yield reader
+
+
+def playback(reader: RecordReader, **choice: Any) -> Playback:
+    return Playback(reader, SCENARIO, INFO, Choice(**choice), 0.0, lambda: 0, "replay")
+
+
+def played(made: Playback) -> list[tuple[str, bytes]]:
+    """Play to the end; return key and payload of everything said."""
+    said: list[tuple[str, bytes]] = []
+    while made.may_advance():
+        made.advance(0)
+        for key, message in made.take_outbox():
+            said += message.encoded if key == batch.GATE else [(key, messages.encode(message))]
+    return said
+
+
+def on(key: str, said: list[tuple[str, bytes]]) -> list[Any]:
+    return [messages.decode(name, payload) for name, payload in said if name == key]
+
+
+# Which message comes with which gate
+
+
+def home(said: list[Said], tmp_path: Path, delay_gates: int = 1) -> dict[int, list[tuple[str, int]]]:
+    """Return (key, t_ns) of what is played with each gate."""
+    with write(tmp_path, said) as reader:
+        tape = Tape(reader, GATE_NS, delay_gates * GATE_NS, set(reader.topics()))
+        return {g.t_ns // GATE_NS: [(m.key, m.t_ns) for m in g.said] for g in tape.gates()}
+
+
+@pytest.mark.parametrize("late", [0, 1, 2, 4])
+def test_an_answer_comes_with_its_gate_however_far_the_world_ran_ahead(late: int, tmp_path: Path):
+    said = [clock(0)]
+    for number in range(1, 20):
+        said += [clock(number), *([estimate(number - 1 - late)] if number > late else [])]
+    found = home(said, tmp_path, delay_gates=5)
+    for number in range(18 - late):
+        assert found[number] == [(keys.estimate("d1"), number * GATE_NS)]
+
+
+def test_a_stamp_that_means_nothing_does_not_move_a_message(tmp_path: Path):
+    said = [message for number in range(10) for message in (clock(number), command(0), command(10**15))]
+    found = home(said, tmp_path)
+    assert found[0] == found[1] == [] or found[0][0] == (CMD, 0)
+    # written after the clock of gate k, they are played with gate k + 1, but where the stamp 0 may be an answer's
+    assert [len(found[number]) for number in range(4, 10)] == [2] * 6
+    assert sum(map(len, found.values())) == 18  # what follows the last clock belongs to no gate
+
+
+def test_sensors_between_two_gates_belong_to_the_second(tmp_path: Path):
+    found = home([message for number in range(4) for message in gate(number)], tmp_path)
+    assert [len(found[number]) for number in range(4)] == [8] * 4
+    assert (keys.sensor("d2", "imu"), 2 * GATE_NS - 5_000_000) in found[2]
+
+
+def test_the_clocks_of_a_run_that_stands_are_no_gates(tmp_path: Path):
+    said = [clock(0, "waiting"), clock(0, "waiting"), *gate(0), clock(0, "paused"), *gate(1), clock(1, "stopped")]
+    assert [*home(said, tmp_path)] == [0, 1]
+
+
+def test_a_gate_that_is_cut_is_not_played(tmp_path: Path):
+    said = [*gate(0), *gate(1), *[*drone(2, "d1")]]
+    assert [*home(said, tmp_path)] == [0, 1]
+
+
+def test_it_reads_a_few_gates_ahead_and_no_more(tmp_path: Path):
+    with write(tmp_path, [message for number in range(1000) for message in gate(number)]) as reader:
+        read: list[Recorded] = []
+
+        class Counted:
+            def messages(self, *args: Any, **options: Any) -> Iterator[Recorded]:
+                for recorded in reader.messages(*args, **options):
+                    read.append(recorded)
+                    yield recorded
+
+        tape = Tape(Counted(), GATE_NS, GATE_NS, set(reader.topics()))  # type: ignore[arg-type]
+        gates = tape.gates()
+        for number in range(500):
+            assert next(gates).t_ns == number * GATE_NS
+            assert len(read) <= 9 * (number + 3)
+
+
+# What is said again
+
+
+def test_all_of_it_is_said_again_but_what_processes_said_of_themselves(flight: RecordReader):
+    said = played(playback(flight))
+    again = ("drone/d1/sensor/imu", "drone/d2/truth", "drone/d1/sensor/status", "drone/d2/estimate", CMD)
+    for key in (*again, "cluster/main/state"):
+        recorded = [m.payload for m in flight.messages([key])]
+        assert [payload for name, payload in said if name == key] == recorded, key
+    assert not [key for key, _ in said if key.startswith(("process/", "view/")) or key == keys.INFO]
+    clocks = on(keys.CLOCK, said)
+    assert [c.t_ns // GATE_NS for c in clocks] == list(range(10))
+    assert [c.seq for c in clocks] == list(range(10))
+    assert {c.run_id for c in clocks} == {"replay"}
+    assert [e.kind for e in on(keys.EVENT, said)] == ["join"]  # its own end is told by tell_end
+
+
+def test_the_info_is_that_of_a_replay(flight: RecordReader):
+    info = playback(flight).info()
+    assert (info.run_id, info.replay_of, info.mode, info.rate) == ("replay", "flown", "lockstep", 0.0)
+    assert info.scenario_sha256 == INFO.scenario_sha256
+
+
+def test_the_end_is_told_with_whose_replay_it_was(flight: RecordReader):
+    made = playback(flight, to_ns=5 * GATE_NS)
+    said = played(made)
+    assert on(keys.CLOCK, said)[-1].t_ns == 5 * GATE_NS
+    made.tell_end(0)
+    (_, end), (_, last) = made.take_outbox()
+    assert (end.kind, end.data["replay_of"], end.data["last_ns"]) == ("end", "flown", 5 * GATE_NS)
+    assert end.seq == 1  # after the recorded join
+    assert (last.state, made.ended) == ("stopped", "played to 0.1 s")
+
+
+def test_a_part_is_played(flight: RecordReader):
+    made = playback(flight, from_ns=4 * GATE_NS - 1, keys=("drone/*/truth", "drone/d1/sensor/*"), paused=True)
+    assert made.next_ns == 4 * GATE_NS
+    made.advance(0)
+    assert made.state == "paused"
+    assert not made.may_advance()
+    assert made.control(ControlRequest("resume")).ok
+    said = played(made)
+    assert {key for key, _ in said} >= {"drone/d1/truth", "drone/d2/truth", "drone/d1/sensor/imu"}
+    assert not [key for key, _ in said if key.startswith(("drone/d2/sensor", "cluster")) or key.endswith("estimate")]
+
+
+def test_a_status_counts_what_is_played(flight: RecordReader):
+    whole = on(keys.status("d1"), played(playback(flight)))
+    part = on(keys.status("d1"), played(playback(flight, keys=("drone/*/sensor/imu", "drone/*/sensor/status"))))
+    assert {status.count for status in whole} == {3}
+    assert part == [msgspec.structs.replace(status, count=2) for status in whole]
+
+
+def test_bundles_are_as_the_world_makes_them(flight: RecordReader):
+    made = playback(flight)
+    made.advance(0)
+    made.take_outbox()
+    made.advance(0)
+    bundle = next(message for key, message in made.take_outbox() if key == batch.GATE)
+    assert bundle.is_sound()
+    assert (bundle.t_ns, bundle.seq, bundle.first) == (GATE_NS, 1, [0, 4, 8])
+    assert bundle.stamps.tolist() == [15_000_000, GATE_NS, GATE_NS, GATE_NS] * 2
+    assert [key for key, _ in bundle.encoded][3::4] == [keys.status("d1"), keys.status("d2")]
+
+
+def test_views_are_made_of_what_was_played(flight: RecordReader):
+    made = playback(flight)
+    played(made)
+    views = {output.key: output.message for output in made.views(7)}
+    assert set(views) == {
+        "view/drones",
+        "view/cluster/main",
+        "view/estimates/estimator.d1",
+        "view/estimates/estimator.d2",
+    }
+    shown: Any = views["view/drones"]
+    assert [(d.name, d.position_m, d.state) for d in shown.drones] == [
+        ("d1", (9.0, 0.0, 1.0), "flying"),
+        ("d2", (9.0, 0.0, 1.0), "flying"),
+    ]
+    assert shown.wind_m_s == ((1.0, 0.0, 0.0), (2.0, 0.0, 0.0))
+    for key, message in views.items():
+        assert messages.decode(key, messages.encode(message)) == message
+
+
+# Who takes part
+
+
+def join(made: Playback, name: str, period_ns: int = GATE_NS) -> None:
+    made.handle(keys.process(name, "join"), Join(0, 0, "replay", 5, name.split(".")[0], "h", 1, period_ns), 0)
+
+
+def test_who_takes_part_is_waited_for_and_speaks_for_itself(flight: RecordReader):
+    made = playback(flight)
+    made.barrier.expect("estimator.d1")
+    assert not made.may_advance()
+    join(made, "estimator.d1")
+    said = []
+    for number in range(10):
+        assert made.may_advance()
+        made.advance(0)
+        said += [(key, message) for key, message in made.take_outbox() if key != batch.GATE]
+        if 0 < number < 9:  # the replay is a gate ahead, as a world is
+            assert not made.may_advance()
+            done = Done(0, number, "replay", 5, (number - 1) * GATE_NS, 0)
+            made.handle(keys.process("estimator.d1", "done"), done, 0)
+    spoken = [key for key, _ in said if key.endswith("/estimate")]
+    assert spoken == [keys.estimate("d2")] * 10
+    assert "view/estimates/estimator.d1" not in [output.key for output in made.views(0)]
+
+
+def test_who_dies_or_leaves_does_not_end_it(flight: RecordReader):
+    made = playback(flight)
+    join(made, "recorder", 0)
+    join(made, "estimator.d1")
+    made.died("estimator.d1", 0)
+    made.handle(keys.process("recorder", "bye"), Bye(0, 0, "enough"), 0)
+    assert len(on(keys.CLOCK, played(made))) == 10
+    assert made.ended == "the record is over"
+
+
+def test_nobody_can_be_flown(flight: RecordReader):
+    made = playback(flight)
+    made.handle(CMD, Velocity(0, 0, "tester.one", ZEROS, 0.0), 0)
+    (_, refused) = made.take_outbox()[-1]
+    assert (refused.kind, refused.source, refused.data["reason"]) == ("refused", "tester.one", NOBODY)
+    for op in ("acquire", "release", "fault_add", "fault_clear"):
+        assert made.control(ControlRequest(op, {"drone": "d1"}, "tester.one")).error == NOBODY
+    assert made.also_asked == ("cluster/main/control",)
+    assert made.refusal_at("cluster/main/control") == NOBODY
+    join(made, "controller.main")
+    assert made.refusal_at("cluster/main/control") is None
+
+
+def test_seek(flight: RecordReader):
+    made = playback(flight)
+    made.advance(0)
+    assert made.control(ControlRequest("seek", {"t_s": 0.12})).ok
+    assert (made.next_ns, made.leaps) == (6 * GATE_NS, 1)
+    made.advance(0)
+    assert made.now_ns == 6 * GATE_NS
+    for t_s in (5, -1, "noon", True, None, float("nan")):
+        assert "t_s is" in made.control(ControlRequest("seek", {"t_s": t_s})).error
+    assert made.next_ns == 7 * GATE_NS
+    assert made.control(ControlRequest("seek", {"t_s": 0})).ok
+    assert made.next_ns == 0
+    join(made, "estimator.d1")
+    assert "estimator.d1 takes part in the lockstep" in made.control(ControlRequest("seek", {"t_s": 0.1})).error
+
+
+def test_a_record_without_a_gate_cannot_be_played(flight: RecordReader):
+    with pytest.raises(RecordError, match=r"run\.mcap: holds no gate from 7 s on; nothing can be played"):
+        playback(flight, from_ns=7_000_000_000)
+
+
+def test_faults_that_stand_are_told_before_the_first_gate(tmp_path: Path):
+    def faults(number: int, *kinds: str) -> Said:
+        all_ = tuple(Fault(i, kind, "d1", {}, 0, None, "tester.one") for i, kind in enumerate(kinds))
+        return keys.FAULTS, Faults(number * GATE_NS, number, all_)
+
+    said: list[Said] = [(keys.INFO, INFO), faults(0), *gate(0), *gate(1), faults(1, "gps_dropout"), *gate(2), *gate(3)]
+    with write(tmp_path, said) as reader:
+        whole, late = played(playback(reader)), played(playback(reader, from_ns=3 * GATE_NS))
+    assert [len(told.faults) for told in on(keys.FAULTS, whole)] == [0, 1]
+    assert [told.faults[0].kind for told in on(keys.FAULTS, late)] == ["gps_dropout"]
+    assert [key for key, _ in late].index(keys.FAULTS) == 0
+
+
+def test_a_kill_on_record_kills_nobody_who_takes_part(tmp_path: Path):
+    """What is left of the list is as it was; a list without a kill is the same to the byte."""
+    cut = Fault(1, "gps_dropout", "d1", {}, 0, None, "tester.one")
+    kill = Fault(2, "process_kill", "estimator.d1", {}, GATE_NS, None, "tester.one")
+    said: list[Said] = [(keys.INFO, INFO)]
+    for number, faults in enumerate(((cut,), (cut, kill), (kill,))):
+        said += [(keys.FAULTS, Faults(number * GATE_NS, number, faults)), *gate(number)]
+    with write(tmp_path, [*said, *gate(3)]) as reader:
+        whole, late = played(playback(reader)), played(playback(reader, from_ns=3 * GATE_NS))
+    assert [told.faults for told in on(keys.FAULTS, whole)] == [(cut,), (cut,), ()]
+    assert [told.seq for told in on(keys.FAULTS, whole)] == [0, 1, 2]
+    assert [told.faults for told in on(keys.FAULTS, late)] == [()]
+    assert next(payload for key, payload in whole if key == keys.FAULTS) == messages.encode(said[1][1])

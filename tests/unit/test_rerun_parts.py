@@ -1,0 +1,236 @@
+"""The parts of a rerun: who is run again, what is fed, where truth differs."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from zsim import __version__, keys, messages, scenario_file
+from zsim.messages import Bye, Clock, ClusterRequest, Estimate, Event, Health, Join, Message, Mode, Truth
+from zsim.record import RecordReader, RecordWriter
+from zsim_deploy.rerun_cast import Cast, Team, cast_of
+from zsim_deploy.rerun_compare import Answers, Comparison, difference
+from zsim_deploy.rerun_tape import passages
+from zsim_world.world import World
+
+GATE_NS = 20_000_000
+PRINT = "f" * 16
+ZEROS = (0.0, 0.0, 0.0)
+TEXT = """
+name: two
+seed: 3
+duration_s: 1
+drones: [{name: d1, position_m: [0, 0, 0]}, {name: d2, position_m: [3, 0, 0]}]
+clusters: [{name: main, drones: [d1, d2]}]
+"""
+SCENARIO = scenario_file.from_text(TEXT)
+INFO = World(SCENARIO, run_id="flown").info()
+KILL = {"kind": "process_kill", "target": "estimator.d1"}
+Said = tuple[str, Message]
+
+
+def join(name: str, fingerprint: str = PRINT, serves: tuple[str, ...] = (), version: str = __version__) -> Said:
+    role = name.partition(".")[0]
+    message = Join(0, 0, "flown", 1, role, "h", 1, GATE_NS, version, fingerprint, serves)
+    return keys.process(name, "join"), message
+
+
+def event(kind: str, subject: str, gate: int = 5, **data: Any) -> Said:
+    return keys.EVENT, Event(gate * GATE_NS, 0, kind, "world", subject, kind, data)
+
+
+def truth(gate: int, drone: str, x: float = 0.0) -> Said:
+    message = Truth(gate * GATE_NS, gate, (x, 0.0, 1.0), ZEROS, (1.0, *ZEROS), ZEROS, ZEROS, (9.0, 9.0, 9.0, 9.0))
+    return keys.truth(drone), message
+
+
+def clock(gate: int, state: Any = "running") -> Said:
+    return keys.CLOCK, Clock(gate * GATE_NS, gate, "flown", gate, state, 1.0)
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Iterator[Any]:
+    readers: list[RecordReader] = []
+
+    def write(*said: Said) -> RecordReader:
+        path = tmp_path / f"{len(readers)}.mcap"
+        with RecordWriter(path) as writer:
+            for place, (key, message) in enumerate(said):
+                writer.add_message(key, message, place)
+        readers.append(RecordReader(path))
+        return readers[-1]
+
+    yield write
+    for reader in readers:
+        reader.close()
+
+
+OURS = (join("estimator.d1"), join("estimator.d2"), join("controller.main"))
+
+
+def cast(reader: RecordReader, **info: Any) -> Cast:
+    return cast_of(reader, msgspec.structs.replace(INFO, **info), SCENARIO)
+
+
+# Who is run again
+
+
+def test_our_agents_are_run_again_by_their_processes(write: Any):
+    found = cast(write(*reversed(OURS), join("recorder", ""), event("end", "world", truth_sha256="abc")))
+    assert found.teams == (
+        Team("estimator.d1", ("estimator.d1",)),
+        Team("estimator.d2", ("estimator.d2",)),
+        Team("controller.main", ("controller.main",)),
+    )
+    assert (found.why_not, found.truth_sha256, found.fingerprints) == ("", "abc", {PRINT})
+
+
+def test_who_served_others_does_so_again(write: Any):
+    found = cast(write(join("controller.main", serves=("estimator.d1", "estimator.d2"))))
+    assert found.teams == (Team("controller.main", ("estimator.d1", "estimator.d2", "controller.main")),)
+    assert found.played == {"controller.main", "estimator.d1", "estimator.d2"}
+
+
+@pytest.mark.parametrize("foreign", [join("estimator.d2", ""), join("estimator.d2", PRINT, version="")])
+def test_others_under_our_names_are_not(write: Any, foreign: Said):
+    found = cast(write(join("estimator.d1"), foreign, join("matlab.main"), join("controller.other")))
+    assert [team.name for team in found.teams] == ["estimator.d1"]
+
+
+@pytest.mark.parametrize(
+    ("said", "reason"),
+    [
+        (event("death", "estimator.d1"), "death of estimator.d1 at 0.10 s"),
+        (event("superseded", "controller.main"), "superseded of controller.main at 0.10 s"),
+        (event("leave", "estimator.d2"), "leave of estimator.d2 at 0.10 s"),
+        (event("outputs_missing", "estimator.d2"), "outputs of estimator.d2 were lost at 0.10 s"),
+        (event("join", "estimator.d2", from_ns=GATE_NS), "estimator.d2 joined at 0.10 s, after the start"),
+        (event("control", "fault_add", ok=True, args=KILL), "a process_kill was asked for at 0.10 s"),
+    ],
+)
+def test_why_agents_are_not_run_again(write: Any, said: Said, reason: str):
+    found = cast(write(*OURS, said, event("end", "world", gate=9)))
+    assert (found.teams, found.why_not) == ((), reason)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        event("death", "operator.pilot"),
+        event("leave", "matlab.main"),
+        event("join", "estimator.d2", from_ns=0),
+        event("control", "fault_add", ok=False, args=KILL),
+    ],
+)
+def test_what_is_no_reason(write: Any, said: Said):
+    assert cast(write(*OURS, said, event("end", "world", gate=9), event("leave", "estimator.d1", gate=9))).why_not == ""
+
+
+def test_a_run_in_realtime_or_without_ours_has_a_reason(write: Any):
+    assert "realtime" in cast(write(*OURS), mode="realtime").why_not
+    assert cast(write(join("matlab.main"))).why_not == "none of zsim's took part"
+
+
+def test_a_kill_in_the_scenario_is_a_reason(write: Any):
+    scenario = scenario_file.from_text(f"{TEXT}faults: [{{kind: process_kill, target: estimator.d1, at_s: 0.5}}]")
+    assert cast_of(write(*OURS), INFO, scenario).why_not == "a process_kill was planned"
+
+
+def test_requests_are_kept_in_their_order(write: Any):
+    key = keys.cluster_request("main")
+    asked = [(key, ClusterRequest(gate * GATE_NS, gate, "hold", {}, "operator.pilot", True)) for gate in range(3)]
+    assert list(cast(write(*OURS, *asked)).requests) == asked
+
+
+# What is fed
+
+
+def test_inputs_count_before_the_clock_that_follows_them(write: Any):
+    mode = (keys.command("d1", "mode"), Mode(0, 0, "tester.one", "takeoff"))
+    estimate = Estimate(0, 0, ZEROS, ZEROS, (1.0, *ZEROS), 0.0, (0.0,) * 36, 0.1, ZEROS, {})
+    health = (keys.process("recorder", "health"), Health(0, 0, "recorder", "h", 1, {}, 0, 0, 0, 0))
+    reader = write(
+        clock(0, "waiting"), join("tester.one"), truth(0, "d1"), truth(0, "d2"), clock(0), mode, health, clock(0, "paused"),
+        (keys.estimate("d1"), estimate), truth(1, "d1"), truth(1, "d2"), clock(1), clock(1, "stopped"),
+        (keys.process("tester.one", "bye"), Bye(0, 0, "over")),
+    )  # fmt: skip
+    first, second = passages(reader, ["d1", "d2"])
+    assert (first.t_ns, [m.key for m in first.inputs]) == (0, ["process/tester.one/join"])
+    assert (second.t_ns, [m.key for m in second.inputs]) == (GATE_NS, [mode[0], keys.estimate("d1")])
+    assert first.truth == {drone: messages.encode(truth(0, drone)[1]) for drone in ("d1", "d2")}
+
+
+def test_a_gate_without_its_clock_is_no_passage(write: Any):
+    assert list(passages(write(truth(0, "d1"), truth(0, "d2")), ["d1", "d2"])) == []
+
+
+# Where truth differs
+
+
+def encoded(**changes: Any) -> bytes:
+    return messages.encode(msgspec.structs.replace(truth(3, "d1")[1], **changes))
+
+
+def test_how_far_two_states_are_apart():
+    c, s = math.cos(0.05), math.sin(0.05)
+    other = encoded(
+        position_m=(3.0, 4.0, 1.0),
+        velocity_m_s=(0.0, 0.0, 2.0),
+        orientation_wxyz=(-c, 0.0, 0.0, -s),
+        angular_velocity_rad_s=(0.0, 0.3, 0.4),
+    )
+    found = difference(3 * GATE_NS, "d1", encoded(), other)
+    assert found is not None
+    assert found[:5] == (3 * GATE_NS, "d1", 5.0, 2.0, pytest.approx(0.1))
+    assert found.rate_rad_s == pytest.approx(0.5)
+    assert str(found) == "d1 at 0.060 s by 5 m, 2 m/s, 5.73 deg, 28.6 deg/s"
+
+
+def test_what_is_not_hashed_does_not_count():
+    other = encoded(accel_m_s2=(1.0, 0.0, 0.0), rotor_rad_s=(1.0, 2.0, 3.0, 4.0))
+    assert difference(0, "d1", encoded(), other) is None
+
+
+def test_the_smallest_difference_counts():
+    assert difference(0, "d1", encoded(position_m=(1.0, 0.0, 1.0)), encoded(position_m=(1.0 + 2**-52, 0.0, 1.0)))
+
+
+def test_the_first_and_the_last_difference_are_kept():
+    compared = Comparison(["d1", "d2"])
+    same = {"d1": encoded(), "d2": encoded()}
+    for t_ns, flown in enumerate([same, {**same, "d2": encoded(position_m=(1.0, 0.0, 1.0))}, same]):
+        compared.take(t_ns, same, flown)
+    compared.take(3, same, dict.fromkeys(same, encoded(position_m=(2.0, 0.0, 1.0))))
+    assert compared.first is not None
+    assert compared.last is not None
+    assert (compared.instants, compared.first.t_ns, compared.first.drone) == (4, 1, "d2")
+    assert (compared.last.t_ns, compared.last.drone, compared.last.position_m) == (3, "d2", 2.0)
+
+
+def command(gate: int, mode: Any = "land", seq: int | None = None) -> Mode:
+    return Mode(gate * GATE_NS, gate if seq is None else seq, "controller.main", mode)
+
+
+def test_answers_that_are_the_same_in_any_order_are_no_difference():
+    answers = Answers(2 * GATE_NS)
+    for gate in range(10):
+        answers.take("a", command(gate))
+        if gate:
+            answers.take("a", command(gate - 1))
+        answers.close(gate * GATE_NS)
+    assert answers.first == ""
+
+
+def test_the_earliest_answer_that_differs_or_is_missing_is_told():
+    answers = Answers(2 * GATE_NS)
+    answers.take("missing", command(3))
+    for mode in ("land", "takeoff"):
+        answers.take("later", command(4, mode))
+    assert answers.first == "later at 0.08 s"
+    answers.close(5 * GATE_NS)
+    assert answers.first == "later at 0.08 s"
+    answers.close(6 * GATE_NS)
+    assert answers.first == "missing at 0.06 s"

@@ -1,0 +1,361 @@
+"""The bridge without Zenoh: what it converts and when, what it sends on, what it refuses."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from federation import PAIR
+
+from zsim import keys, messages, scenario_file
+from zsim.messages import ClusterInfo, ControlAnswer, DroneInfo, Info, Origin
+from zsim.session import Heard, Sample
+from zsim.settings import Mode
+from zsim_agents.presence import Presence
+from zsim_agents.ros2 import wire
+from zsim_agents.ros2.bridge import Bridge
+from zsim_agents.ros2.feeds import SAMPLES_MAX
+from zsim_agents.ros2.inbox import Inbox
+from zsim_agents.ros2.participant import Participant
+from zsim_agents.ros2.types import Types
+from zsim_agents.ros2.wire import Attachment, Endpoint, NodeId
+
+TYPES = Types()
+READER = NodeId(0, "abc", 1, "/", "reader")
+WALL_NS = 1_700_000_000_000_000_000
+BESIDE = Attachment(7, 1, bytes(range(16))).packed()
+IMU, TWIST, EMPTY, TRIGGER = (
+    "sensor_msgs/msg/Imu",
+    "geometry_msgs/msg/Twist",
+    "std_msgs/msg/Empty",
+    "std_srvs/srv/Trigger",
+)
+
+
+class Link:
+    """A session to both sides; a test delivers what others say."""
+
+    host = "laptop"
+
+    def __init__(self) -> None:
+        self.said: list[tuple[str, Any]] = []
+        self.sent: list[tuple[str, bytes, bytes]] = []
+        self.kept: list[tuple[str, bytes, bytes]] = []
+        self.hearing: dict[str, list[Callable[[Heard], None]]] = {}
+        self.tokens: list[str] = []
+        self.services: dict[str, Callable[[Any], None]] = {}
+        self.asked: list[tuple[str, str, str, dict[str, Any]]] = []
+        self.last: dict[str, bytes] = {}
+        self.on_token_of: Callable[[str, bool], None] = lambda token, alive: None
+
+    def deliver(self, key: str, payload: bytes, attachment: bytes = b"") -> None:
+        for callback in list(self.hearing.get(key, [])):
+            callback(Heard("PUT", key, payload, "", None, attachment))
+
+    def zid(self) -> str:
+        return "f00d"
+
+    def subscribe(self, key: str) -> "Box":
+        return Box(self, key)
+
+    def hear(self, key: str, callback: Callable[[Heard], None]) -> Callable[[], None]:
+        self.hearing.setdefault(key, []).append(callback)
+        return lambda: self.hearing[key].remove(callback)
+
+    def put(self, key: str, message: Any) -> None:
+        self.said.append((key, message))
+
+    def writer(self, key: str, encoding: str) -> Callable[[bytes, bytes], None]:
+        return lambda payload, attachment: self.sent.append((key, payload, attachment))
+
+    def put_kept(self, key: str, payload: bytes, encoding: str, attachment: bytes) -> None:
+        self.kept.append((key, payload, attachment))
+
+    def declare_token(self, key: str) -> None:
+        self.tokens.append(key)
+
+    def on_token(self, expression: str, callback: Callable[[str, bool], None]) -> None:
+        self.on_token_of = callback
+
+    def on_message(self, expression: str, callback: Any) -> None:
+        return
+
+    def answer(self, key: str, callback: Callable[[Any], None], complete: bool) -> None:
+        assert complete
+        self.services[key] = callback
+
+    def request(self, key: str, op: str, source: str, args: dict[str, Any]) -> ControlAnswer:
+        self.asked.append((key, op, source, args))
+        return ControlAnswer(False, "phase is idle; possible when engaged")
+
+    def get(self, key: str, timeout_s: float) -> list[Sample]:
+        return [Sample(key, self.last[key])] if key in self.last else []
+
+
+class Box:
+    """A mailbox."""
+
+    def __init__(self, link: Link, key: str) -> None:
+        self._arrived: list[Sample] = []
+        self.close = link.hear(key, lambda heard: self._arrived.append(Sample(heard.key, heard.payload)))
+
+    def drain(self) -> list[Sample]:
+        arrived, self._arrived = self._arrived, []
+        return arrived
+
+
+class Query:
+    """A request of ROS's."""
+
+    def __init__(self, payload: bytes, attachment: bytes) -> None:
+        self.payload, self.attachment = payload, attachment
+        self.replies: list[tuple[str, bytes, bytes]] = []
+        self.ended = False
+
+    def reply_as(self, key: str, payload: bytes, attachment: bytes) -> None:
+        self.replies.append((key, payload, attachment))
+
+    def end(self) -> None:
+        self.ended = True
+
+
+class Bench:
+    """A bridge in a run of two drones, whose names ROS does not take as they are."""
+
+    def __init__(self, mode: Mode = "lockstep") -> None:
+        text = scenario_file.to_text(scenario_file.from_text(PAIR.replace("drone1", "drone-1").replace("main", "m.x")))
+        drones = tuple(DroneInfo(name, "ardrone2") for name in ("drone-1", "drone2"))
+        clusters = (ClusterInfo("m.x", ("drone-1", "drone2")),)
+        self.info = Info(
+            0, 0, 1, "run", "zsim", mode, 0.0, 20_000_000, 5_000_000, 20_000_000, 3, Origin(0.0, 0.0, 0.0),
+            drones, clusters, text, "", "", "",
+        )  # fmt: skip
+        self.link: Any = Link()
+        self.lines: list[str] = []
+        self.presence = Presence(self.link, self.info, "ros2.main")
+        self.bridge = Bridge(self.link, self.info, self.presence, self.lines.append, wall_ns)
+        self.bridge.enter(Participant(self.link, 0, TYPES, wall_ns, self.bridge.refuse))
+
+    def turn(self) -> None:
+        self.bridge.turn(0.0)
+
+    def reader(self, topic: str, kind: str, alive: bool = True) -> None:
+        """Let a subscription come or go."""
+        endpoint = Endpoint("MS", topic, wire.dds_name(kind), TYPES.hash(kind))
+        self.link.on_token_of(wire.endpoint_token(READER, 2, endpoint, wire.DEFAULT), alive)
+        self.turn()
+
+    def key(self, topic: str, kind: str) -> str:
+        return wire.data_key(0, topic, wire.dds_name(kind), TYPES.hash(kind))
+
+    def publish(self, topic: str, kind: str, message: Any, attachment: bytes = BESIDE) -> None:
+        """Let a ROS node publish."""
+        payload = message if isinstance(message, bytes) else TYPES.encode(message, kind)
+        self.link.deliver(self.key(topic, kind), payload, attachment)
+        self.turn()
+
+    def ask(self, service: str, payload: bytes = b"\x00\x01\x00\x00\x00", attachment: bytes = BESIDE) -> Query:
+        query = Query(payload, attachment)
+        self.link.services[self.key(service, TRIGGER)](query)
+        self.turn()
+        return query
+
+
+def wall_ns() -> int:
+    return WALL_NS
+
+
+def twist(*numbers: float) -> Any:
+    vector = TYPES.of("geometry_msgs/msg/Vector3")
+    return TYPES.of(TWIST)(vector(*numbers[:3]), vector(*numbers[3:]))
+
+
+def imu(t_ns: int) -> bytes:
+    return messages.encode(messages.Imu(t_ns, 0, t_ns, (0.0, 0.0, 9.81), (0.0, 0.0, 0.0)))
+
+
+def test_a_topic_is_read_and_converted_only_while_somebody_subscribes() -> None:
+    bench, key = Bench(), keys.sensor("drone-1", "imu")
+    assert not bench.link.hearing.get(key)
+    bench.reader("/drone_1/imu", IMU)
+    assert len(bench.link.hearing[key]) == 1
+    for t_ns in (0, 5_000_000):
+        bench.link.deliver(key, imu(t_ns))
+    bench.turn()
+    (first, payload, beside), (_, _, later) = bench.link.sent
+    assert first == bench.key("/drone_1/imu", IMU)
+    assert TYPES.decode(payload, IMU).header.frame_id == "drone_1/imu_link"
+    (token,) = (each for each in bench.link.tokens if "/%drone_1%imu/" in each)
+    sent = wire.attachment_of(beside)
+    assert sent == (1, WALL_NS, wire.gid_of(token))
+    assert wire.attachment_of(later).sequence == 2
+    bench.reader("/drone_1/imu", IMU, alive=False)
+    assert not bench.link.hearing[key]
+
+
+def test_topics_of_one_source_share_it_until_the_last_is_left() -> None:
+    bench, key = Bench(), keys.estimate("drone-1")
+    bench.reader("/drone_1/odometry", "nav_msgs/msg/Odometry")
+    bench.reader("/tf", "tf2_msgs/msg/TFMessage")
+    assert len(bench.link.hearing[key]) == 1
+    bench.reader("/drone_1/odometry", "nav_msgs/msg/Odometry", alive=False)
+    assert len(bench.link.hearing[key]) == 1
+    bench.reader("/tf", "tf2_msgs/msg/TFMessage", alive=False)
+    assert not bench.link.hearing[key]
+
+
+def test_who_subscribes_to_another_type_is_told_of_and_gets_nothing() -> None:
+    bench = Bench()
+    bench.reader("/drone_1/imu", "std_msgs/msg/String")
+    assert not bench.link.hearing.get(keys.sensor("drone-1", "imu"))
+    assert any(
+        "somebody subscribes to std_msgs::msg::dds_::String_; it is sensor_msgs/msg/Imu" in s for s in bench.lines
+    )
+
+
+def test_names_that_ros_does_not_take_are_told() -> None:
+    said = "\n".join(Bench().lines)
+    assert "drone-1 is drone_1 in ROS" in said
+    assert "m.x is m_x in ROS" in said
+    assert "drone2 is" not in said
+
+
+def test_a_twist_becomes_a_velocity_in_the_heading_frame_at_the_newest_gate() -> None:
+    bench = Bench()
+    clock = messages.Clock(4_000_000_000, 0, "run", 200, "running", 1.0)
+    bench.link.deliver(keys.CLOCK, messages.encode(clock))
+    bench.turn()
+    for speed in (1.0, 0.5):
+        bench.publish("/drone_1/cmd_vel", TWIST, twist(speed, -0.5, 0.25, 9.0, 9.0, 0.75))
+    (key, first), (_, second) = bench.link.said
+    assert key == "drone/drone-1/cmd/velocity"
+    assert (first.t_ns, first.seq, first.source, first.frame) == (4_000_000_000, 0, "ros2.main", "heading")
+    assert (first.velocity_m_s, first.yaw_rate_rad_s) == ((1.0, -0.5, 0.25), 0.75)
+    assert (second.seq, second.velocity_m_s[0]) == (1, 0.5)
+
+
+def test_modes_and_the_emergency_button() -> None:
+    bench, empty = Bench(), TYPES.of(EMPTY)()
+    status = keys.status("drone-1")
+    bench.publish("/drone_1/takeoff", EMPTY, empty)
+    bench.publish("/drone_1/land", EMPTY, empty)
+    bench.publish("/drone_1/reset", EMPTY, empty)  # nobody tells the state: neither
+    for state in ("flying", "emergency"):
+        bench.link.last[status] = messages.encode(messages.Status(0, 0, state, 50.0, False, None, 1))
+        bench.publish("/drone_1/reset", EMPTY, empty)
+    assert [(m.mode, m.seq) for _, m in bench.link.said] == [
+        ("takeoff", 0),
+        ("land", 1),
+        ("emergency", 2),
+        ("reset", 3),
+    ]
+    assert bench.presence.health.refused == 1
+
+
+@pytest.mark.parametrize(
+    ("message", "attachment", "why"),
+    [
+        (b"\x00\x01\x00\x00short", BESIDE, "are no CDR of geometry_msgs/msg/Twist"),
+        (twist(0, 0, 0, 0, 0, 0), b"", "must have 33"),
+        (twist(0, 0, 0, 0, 0, 0), BESIDE[:-1], "must have 33"),
+        (twist(math.nan, 0, 0, 0, 0, 0), BESIDE, "must be finite"),
+        (twist(0, 0, 0, 0, 0, math.inf), BESIDE, "must be finite"),
+    ],
+)
+def test_garbage_is_refused_counted_and_told_once(message: Any, attachment: bytes, why: str) -> None:
+    bench = Bench()
+    for _ in range(3):
+        bench.publish("/drone_1/cmd_vel", TWIST, message, attachment)
+    assert bench.link.said == []
+    assert bench.presence.health.refused == 3
+    told = [line for line in bench.lines if "refused" in line]
+    assert len(told) == 1
+    assert why in told[0]
+
+
+def test_what_does_not_fit_a_ros_type_is_refused() -> None:
+    bench, key = Bench(), keys.sensor("drone-1", "baro")
+    bench.reader("/drone_1/navdata", "zsim_msgs/msg/Navdata")
+    bench.link.deliver(key, messages.encode(messages.Baro(0, 0, 0, 1e300, 0.0)))
+    bench.link.deliver(keys.status("drone-1"), messages.encode(messages.Status(0, 0, "flying", 50.0, False, None, 1)))
+    bench.link.deliver(key, b"garbage")
+    bench.turn()
+    assert bench.link.sent == []
+    assert bench.presence.health.refused == 2
+
+
+def test_a_service_asks_the_controller_and_echoes_who_asked() -> None:
+    bench = Bench()
+    query = bench.ask("/cluster/m_x/engage")
+    assert bench.link.asked == [("cluster/m.x/control", "engage", "ros2.main", {})]
+    ((key, payload, beside),) = query.replies
+    assert key == bench.key("/cluster/m_x/engage", TRIGGER)
+    response = TYPES.decode(payload, "std_srvs/srv/Trigger_Response")
+    assert (response.success, response.message) == (False, "phase is idle; possible when engaged")
+    assert wire.attachment_of(beside) == (7, WALL_NS, bytes(range(16)))
+
+
+def test_a_request_that_is_none_ends_without_a_reply() -> None:
+    bench = Bench()
+    for query in (bench.ask("/drone_1/release", b"\x00\x01\x00\x00"), bench.ask("/drone_1/release", attachment=b"")):
+        assert query.ended
+        assert query.replies == []
+    assert bench.link.asked == []
+    assert bench.presence.health.refused == 2
+
+
+def test_a_summary_of_a_gate_has_what_was_told_up_to_it() -> None:
+    """Also where several gates wait at once, and the status was read before the sensors were."""
+    bench, imu_key, status_key = Bench(), keys.sensor("drone-1", "imu"), keys.status("drone-1")
+    bench.reader("/drone_1/state", "std_msgs/msg/String")
+    bench.reader("/drone_1/navdata", "zsim_msgs/msg/Navdata")
+    for gate in range(3):
+        t_ns, accel = gate * 20_000_000, (0.0, 0.0, 9.80665 * gate)
+        bench.link.deliver(imu_key, messages.encode(messages.Imu(t_ns, 0, t_ns, accel, (0.0, 0.0, 0.0))))
+        status = messages.Status(t_ns, 0, "flying", 50.0, False, None, 1)
+        bench.link.deliver(status_key, messages.encode(status))
+    bench.turn()
+    navdata = [payload for key, payload, _ in bench.link.sent if "Navdata" in key]
+    assert [TYPES.decode(each, "zsim_msgs/msg/Navdata").az for each in navdata] == pytest.approx([0.0, 1.0, 2.0])
+
+
+def test_frames_that_never_move_are_kept_for_who_comes_later() -> None:
+    ((key, payload, _),) = Bench().link.kept
+    assert key == wire.data_key(
+        0, "/tf_static", "tf2_msgs::msg::dds_::TFMessage_", TYPES.hash("tf2_msgs/msg/TFMessage")
+    )
+    children = {each.child_frame_id for each in TYPES.decode(payload, "tf2_msgs/msg/TFMessage").transforms}
+    assert {"drone_1/odom", "drone2/odom", "drone_1/sonar_link", "drone2/imu_link"} <= children
+
+
+def test_closed_it_hears_nothing() -> None:
+    bench = Bench()
+    bench.reader("/drone_1/imu", IMU)
+    bench.bridge.close()
+    assert not any(bench.link.hearing.values())
+
+
+def test_samples_that_nobody_takes_go_the_oldest_first_and_acts_never() -> None:
+    inbox, done = Inbox(3), []
+    for k in range(5):
+        inbox.sample("key", bytes([k]))
+        inbox.act(lambda k=k: done.append(k))
+    taken = inbox.take(0.0)
+    for act in taken.acts:
+        act()
+    assert [payload for _, payload in taken.samples] == [b"\2", b"\3", b"\4"]
+    assert (done, inbox.dropped) == ([0, 1, 2, 3, 4], 2)
+    assert inbox.take(0.0) == ([], [])
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_what_is_dropped_is_told_in_health(mode: Mode) -> None:
+    bench, key, estimate = Bench(mode), keys.sensor("drone-1", "imu"), keys.estimate("drone-1")
+    bench.reader("/drone_1/imu", IMU)
+    bench.reader("/tf", "tf2_msgs/msg/TFMessage")
+    for k in range(SAMPLES_MAX + 10):
+        bench.link.deliver(key, imu(k))
+        bench.link.deliver(estimate, b"estimate")
+    bench.turn()
+    assert len(bench.link.sent) == SAMPLES_MAX
+    assert bench.presence.health.dropped == 20
