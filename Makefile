@@ -43,11 +43,16 @@ $(VENV)/bin/python:
 
 $(VENV)/.run: pyproject.toml | $(VENV)/bin/python
 	$(BIN)/pip install --disable-pip-version-check -q -e '.[all]'
-	@echo "compiling what flies (once on this machine, about half a minute)"
-	@folder=$$(mktemp -d) && $(BIN)/zsim run scenarios/step.yaml --in-process --duration 0.1 --no-report \
-		--out $$folder/run 2>/dev/null && rm -r $$folder
+	$(COMPILE)
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
 	$(BIN)/pip install --disable-pip-version-check -q -e '.[dev]'
+	$(COMPILE)
 	@touch $@ $(VENV)/.run
+
+define COMPILE
+	@echo "compiling what flies (once on this machine, about half a minute)"
+	@folder=$$(mktemp -d) && $(BIN)/zsim run scenarios/step.yaml --in-process --duration 0.1 --no-report \
+		--out $$folder/run 2>/dev/null && rm -r $$folder
+endef
