@@ -382,7 +382,7 @@ def _show_usage(error: Any) -> None:
     if isinstance(error, typer.BadParameter) and error.param is None:
         said = error.message
     else:
-        said = " ".join(error.format_message().split())
+        said = " ".join(error.format_message().split()).replace("Value error, ", "")  # newer typers ask pydantic
     command = error.ctx.command_path if error.ctx else "zsim"
     if said:
         print(f"{command}: {said[0].lower()}{said[1:].rstrip('.')}; see `{command} --help`", file=sys.stderr)

@@ -51,7 +51,8 @@ def export(
     from zsim_deploy.export.selection import Selection
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("looking through the record", total=None)
         done = write(
             directory,

@@ -27,11 +27,18 @@ app = typer.Typer()
 Place = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run, or its run.mcap.", show_default=False)]
 
 
+def _rate(value: float) -> float:
+    """Return a pace that a replay can have."""
+    if not 0 <= value <= RATE_MAX:
+        raise typer.BadParameter(f"is {value:g}; must be >= 0 and <= {RATE_MAX:g}")
+    return value
+
+
 @app.command(rich_help_panel=PANEL)
 def replay(
     directory: Place,
     rate: Annotated[
-        float, typer.Option(min=0.0, max=RATE_MAX, help="Simulated per wall second; 0 = as fast as it goes.")
+        float, typer.Option(callback=_rate, help="Simulated per wall second; 0 = as fast as it goes.")
     ] = 1.0,
     from_: Annotated[
         float, typer.Option("--from", callback=not_negative, help="Simulated seconds of the first gate.")

@@ -64,7 +64,7 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> bool:
             why = "as asked" if commands_only else cast.why_not
             say(f"agents are not run again: {why}; the world alone, with all recorded commands")
             return _judge(cast.truth_sha256, _fly(record, _nobody(cast)), say)
-        say(f"run again: world, {', '.join(team.name for team in cast.teams)}")
+        say(f"run again: world, {', '.join(map(str, cast.teams))}")
         again = _fly(record, cast)
         same = _judge(cast.truth_sha256, again, say)
         if not same:

@@ -19,6 +19,10 @@ class Team(NamedTuple):
     name: str
     members: tuple[str, ...]
 
+    def __str__(self) -> str:
+        others = ", ".join(member for member in self.members if member != self.name)
+        return f"{self.name} (with {others})" if others else self.name
+
 
 class Cast(NamedTuple):
     """Who took part.

@@ -179,7 +179,7 @@ def bench() -> Bench:
     ],
 )
 def test_the_run_is_asked_for_what_the_button_says(bench: Bench, label: str, asked: tuple[Any, ...]):
-    RunForm(bench.gui, bench.desk)
+    RunForm(bench.gui, bench.desk, 1.0)
     bench.gui.at["gates"].value, bench.gui.at["rate"].value = 7.0, 2.5
     bench.gui.press(label)
     assert bench.desk.asked == [("world", *asked)]
@@ -353,9 +353,9 @@ def test_a_trajectory_that_is_none_is_told_and_not_sent(bench: Bench):
 def test_emergency_stops_everybody_and_switches_change_the_scene(bench: Bench):
     shown: list[tuple[str, bool]] = []
     spaces = {bench.cluster.name: bench.space}
-    page = Page(
-        bench.gui, bench.scenario, spaces, bench.desk, bench.told.append, lambda *switched: shown.append(switched)
-    )
+    show = lambda *switched: shown.append(switched)  # noqa: E731
+    page = Page(bench.gui, bench.scenario, spaces, bench.desk, bench.told.append, show, 2.0)
+    assert bench.gui.at["rate"].value == 2.0
     bench.gui.press("EMERGENCY – all rotors stop")
     assert bench.desk.asked == [(bench.names, "emergency")]
     assert page.chosen == bench.cluster.name

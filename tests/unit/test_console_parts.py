@@ -3,6 +3,8 @@
 import math
 import socket
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,6 +16,7 @@ from zsim.messages import Clock, DroneView, EstimateView, Event, ViewCluster, Vi
 from zsim_agents.cluster_space import cluster_space
 from zsim_agents.console import picture as pic
 from zsim_agents.console import tables, typed
+from zsim_agents.console.controls import KnownControls
 from zsim_agents.console.door import Place
 from zsim_agents.console.guard import OPERATOR, VIEWER, Asked, Camera, Guard, may_pass
 from zsim_agents.console.history import EVERY_S, POINTS_MAX, History
@@ -349,15 +352,45 @@ def test_others_need_a_token():
 
 
 CAMERA = msgspec.to_builtins(Camera((1, 0, 0, 0), (1.0, 2.5, 3.0), 1.3, 0.01, 1000, 600, 800, (0, 0, 0), (0, 0, 1)))
-UPDATE = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": 1}}
+UPDATE = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": True}}
 
 
 def test_a_viewer_steers_nothing_but_its_own_page():
     packed = msgspec.msgpack.encode
-    assert may_pass(packed(CAMERA), VIEWER, set())
-    assert not may_pass(packed(UPDATE), VIEWER, set())
-    assert may_pass(packed(UPDATE), VIEWER, {"a"})
-    assert may_pass(packed(UPDATE), OPERATOR, set())
+    others, own = controls(a=True), controls(switches={"a"})
+    assert may_pass(packed(CAMERA), VIEWER, others)
+    assert not may_pass(packed(UPDATE), VIEWER, others)
+    assert may_pass(packed(UPDATE), VIEWER, own)
+    assert may_pass(packed(UPDATE), OPERATOR, others)
+
+
+def controls(switches: set[str] | None = None, **values: Any) -> KnownControls:
+    """Return what is known of controls that hold such values; a list is that of a dropdown."""
+    handles = {
+        uuid: SimpleNamespace(value=now[0], options=now) if isinstance(now, list) else SimpleNamespace(value=now)
+        for uuid, now in values.items()
+    }
+    gui: Any = SimpleNamespace(_gui_input_handle_from_uuid=handles)
+    return KnownControls(gui, switches or set())
+
+
+@pytest.mark.parametrize(
+    ("now", "good", "bad"),
+    [
+        (False, [True], [1, 0.5, "x"]),
+        (1, [2, 0.5, -3], [True, "x", "", 1e300]),
+        (0.5, [2, 0.5], [False, "0.5"]),
+        ("drone1", ["", "anything"], [True, 1]),
+        (["gust", "updraught"], ["gust"], ["Gust", "", 1, True]),
+    ],
+)
+def test_a_control_takes_what_its_page_could_put_into_it(now: Any, good: list[Any], bad: list[Any]):
+    there = controls(a=now)
+    said = {value: msgspec.msgpack.encode({**UPDATE, "updates": {"value": value}}) for value in good}
+    assert all(may_pass(said[value], OPERATOR, there) for value in good)
+    for value in bad:
+        assert not may_pass(msgspec.msgpack.encode({**UPDATE, "updates": {"value": value}}), OPERATOR, there)
+    assert not may_pass(said[good[0]], OPERATOR, controls(b=now))
 
 
 @pytest.mark.parametrize(
@@ -381,7 +414,7 @@ def test_a_viewer_steers_nothing_but_its_own_page():
     ],
 )
 def test_nobody_says_what_no_control_says(said: bytes):
-    assert not may_pass(said, OPERATOR, {"a"})
+    assert not may_pass(said, OPERATOR, controls(a=True))
 
 
 # In words

@@ -70,7 +70,7 @@ class Seen:
             name="console.1", now_ns=0, over="", health=health, heed=lambda _: None, tick=lambda: None
         )
         drones = [SimpleNamespace(name=name) for name in NAMES]
-        info: Any = SimpleNamespace(run_id="r1", drones=drones, scenario=STEP.read_text())
+        info: Any = SimpleNamespace(run_id="r1", rate=1.0, drones=drones, scenario=STEP.read_text())
         server.get_clients = lambda: {0: None} if watched else {}
         self.show = Show(server, self.link, info, self.presence, Followers(server), 1000.0)
 
@@ -236,12 +236,12 @@ def test_cameras_follow_where_their_page_says_so():
     one, other = Page(1), Page(2)
     calls["come"](one)
     calls["come"](other)
-    assert followers.harmless == {"u1", "u2"}
+    assert followers.switches == {"u1", "u2"}
     one.switch.value = True
     followers.follow(np.array([(10.0, 0.0, 2.0), (12.0, 0.0, 2.0)]))
     followers.follow(np.zeros((0, 3)))
     assert one.camera.look_at.tolist() == [11.0, 0.0, 2.0]
     assert other.camera.look_at.tolist() == [0.0, 0.0, 0.0]
     calls["go"](one)
-    assert followers.harmless == {"u2"}
+    assert followers.switches == {"u2"}
     assert followers._places == {}

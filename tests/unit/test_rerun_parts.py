@@ -91,6 +91,7 @@ def test_our_agents_are_run_again_by_their_processes(write: Any):
 def test_who_served_others_does_so_again(write: Any):
     found = cast(write(join("controller.main", serves=("estimator.d1", "estimator.d2"))))
     assert found.teams == (Team("controller.main", ("estimator.d1", "estimator.d2", "controller.main")),)
+    assert str(found.teams[0]) == "controller.main (with estimator.d1, estimator.d2)"
     assert found.played == {"controller.main", "estimator.d1", "estimator.d2"}
 
 

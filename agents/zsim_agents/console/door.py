@@ -15,7 +15,7 @@ import msgspec
 from aiohttp import ClientError, ClientSession, WSMsgType, web
 
 from zsim.errors import RunError
-from zsim_agents.console.guard import OPERATOR, SAID_MAX, VIEW_PATH, VIEWER, Asked, Guard, may_pass
+from zsim_agents.console.guard import OPERATOR, SAID_MAX, VIEW_PATH, VIEWER, Asked, Controls, Guard, may_pass
 from zsim_agents.console.private_viser import HOST, SECRET_HEADER
 from zsim_agents.loop_thread import opened_on
 
@@ -58,13 +58,13 @@ class Inside(NamedTuple):
         port: of viser on this machine.
         secret: that viser asks for.
         state: returns what is shown, as plain data.
-        harmless: ids of controls that change nothing but their own page.
+        controls: of all pages.
     """
 
     port: int
     secret: str
     state: Callable[[], dict[str, Any]]
-    harmless: set[str]
+    controls: Controls
 
 
 class Door:
@@ -189,7 +189,7 @@ class Door:
 
     async def _inwards(self, page: web.WebSocketResponse, viser: Any, role: str) -> None:
         async for said in page:
-            if said.type is WSMsgType.BINARY and may_pass(said.data, role, self._inside.harmless):
+            if said.type is WSMsgType.BINARY and may_pass(said.data, role, self._inside.controls):
                 await viser.send_bytes(said.data)
 
 

@@ -20,11 +20,11 @@ class Followers:
         server: viser's.
 
     Attributes:
-        harmless: ids of the controls by which each page chooses for itself.
+        switches: ids of the controls by which each page chooses for itself.
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
-        self.harmless: set[str] = set()
+        self.switches: set[str] = set()
         self._lock = threading.Lock()
         self._switches: dict[int, tuple[viser.ClientHandle, Any]] = {}
         self._places: dict[int, Array] = {}
@@ -60,14 +60,14 @@ class Followers:
         switch = client.gui.add_checkbox("Camera follows the formation", False, order=-1.0)
         with self._lock:
             self._switches[client.client_id] = (client, switch)
-            self.harmless.add(switch._impl.uuid)
+            self.switches.add(switch._impl.uuid)
 
     def _go(self, client: viser.ClientHandle) -> None:
         with self._lock:
             _, switch = self._switches.pop(client.client_id, (None, None))
             self._places.pop(client.client_id, None)
             if switch is not None:
-                self.harmless.discard(switch._impl.uuid)
+                self.switches.discard(switch._impl.uuid)
 
 
 def _look(client: viser.ClientHandle, centre: Array, offset: Array) -> None:

@@ -1,7 +1,7 @@
 """Who may open which page, and what a page may say. Pure."""
 
 import hmac
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, Protocol
 from urllib.parse import urlsplit
 
 import msgspec
@@ -15,6 +15,8 @@ OPERATOR, VIEWER = "operator", "viewer"
 VIEW_PATH = "/view"
 SAID_MAX = 100_000  # bytes of one thing that a page says
 VALUE_MAX = 2_000  # characters of a control's text: expressions of twelve variables, a line each
+
+Value = bool | messages.Number | Annotated[str, Meta(max_length=VALUE_MAX)]
 
 
 class Camera(Struct, tag_field="type", tag="ViewerCameraMessage"):
@@ -37,7 +39,7 @@ class Moved(Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fie
     class Updates(Struct, forbid_unknown_fields=True):
         """Of a control its value alone."""
 
-        value: bool | messages.Number | Annotated[str, Meta(max_length=VALUE_MAX)]
+        value: Value
 
     uuid: str
     updates: Updates
@@ -120,13 +122,25 @@ def _is_own(asked: Asked) -> bool:
         return False
 
 
-def may_pass(said: bytes, role: str, harmless: frozenset[str] | set[str]) -> bool:
+class Controls(Protocol):
+    """What is known of the controls of pages, by their ids."""
+
+    def harmless(self, uuid: str) -> bool:
+        """Tell whether a control changes nothing but its own page."""
+        ...
+
+    def fits(self, uuid: str, value: Value) -> bool:
+        """Tell whether a control takes such a value."""
+        ...
+
+
+def may_pass(said: bytes, role: str, controls: Controls) -> bool:
     """Tell whether something that a page says may reach the console.
 
     Args:
         said: one message of viser's: a msgpack map with its type.
         role: of the page.
-        harmless: ids of controls that change nothing but the page itself.
+        controls: of all pages.
     """
     if len(said) > SAID_MAX:
         return False
@@ -134,4 +148,7 @@ def may_pass(said: bytes, role: str, harmless: frozenset[str] | set[str]) -> boo
         message = _SAID.decode(said)
     except (msgspec.MsgspecError, ValueError, RecursionError):
         return False
-    return isinstance(message, Camera) or role == OPERATOR or message.uuid in harmless
+    if isinstance(message, Camera):
+        return True
+    permitted = role == OPERATOR or controls.harmless(message.uuid)
+    return permitted and controls.fits(message.uuid, message.updates.value)

@@ -59,8 +59,8 @@ def ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> list[Ra
     centre = [sum(p[axis] for p in starts) / len(starts) for axis in range(2)]
     side = (max(cluster.gains.separation_min_m, STEPS["m"]), SIDE_MAX_M)
     bounds = {
-        "x_c": (math.floor(centre[0] - AWAY_M), math.ceil(centre[0] + AWAY_M)),
-        "y_c": (math.floor(centre[1] - AWAY_M), math.ceil(centre[1] + AWAY_M)),
+        "x_c": (round(centre[0]) - AWAY_M, round(centre[0]) + AWAY_M),
+        "y_c": (round(centre[1]) - AWAY_M, round(centre[1]) + AWAY_M),
         "z_c": (HEIGHT_MIN_M, top_m),
         **dict.fromkeys(("p", "q", "rho"), side),
         **dict.fromkeys(("roll", "pitch", "elevation"), (-TILT_MAX_DEG, TILT_MAX_DEG)),

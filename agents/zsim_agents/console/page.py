@@ -32,6 +32,7 @@ class Page:
         desk: sends what is asked for.
         tell: told what is refused already here.
         show: shows or hides one of `SWITCHES` in the scene.
+        rate: that the run was started with.
 
     Attributes:
         clock, phases, drones, sensors, events: what is told in words.
@@ -48,12 +49,14 @@ class Page:
         desk: Desk,
         tell: Callable[[Told], None],
         show: Callable[[str, bool], None],
+        rate: float,
     ) -> None:
         self._scenario = scenario
         self._spaces = spaces
         self._desk = desk
         self._tell = tell
         self._show = show
+        self._rate = rate
         self.forms: dict[str, FormationForm] = {}
         self.plots: dict[str, Plots] = {}
         self.chosen = next(iter(spaces), "")
@@ -84,7 +87,7 @@ class Page:
         with tabs.add_tab("Faults"):
             FaultForm(gui, self._desk, self._tell, self._scenario)
         with tabs.add_tab("Run"):
-            RunForm(gui, self._desk)
+            RunForm(gui, self._desk, self._rate)
             self._switches(gui)
 
     def _formation_tabs(self, gui: viser.GuiApi, tabs: Any) -> None:

@@ -23,6 +23,7 @@ SHARE_WITHIN = 1 - math.erfc(SIGMAS / math.sqrt(2)) - math.sqrt(2 / math.pi) * S
 RADIUS_MAX_M = 60.0  # of an ellipsoid: before the first fix nothing is known, and the page would be inside of it
 SPIN = np.array([-1.0, 1.0, -1.0, 1.0])  # against the drag torque of each rotor, zsim_world/rotors.py
 SHAPED = frozenset({"assembling", "engaged", "held"})  # phases in which a formation has somewhere to be
+INTO = 0.25  # of the way from a corner to the opposite side; there its angle is written, clear of names and sides
 SIDES = {"p": (0, 1), "q": (0, 2)}  # robots at their ends; docs/conventions.md
 
 
@@ -133,5 +134,5 @@ def shape(space: ClusterSpace, p_W: Array, yaw: Array) -> Shape | None:
     corner = None
     if "beta" in space.names and len(known) == 2:
         sides.append(Side("", p_W[[1, 2]]))
-        corner = (p_W[0], f"β {math.degrees(c[space.index('beta')]):.1f}°")
+        corner = (p_W[0] + INTO * (p_W[1:].mean(axis=0) - p_W[0]), f"β {math.degrees(c[space.index('beta')]):.1f}°")
     return Shape(c, c[:3], frames.quaternion_from_rpy((roll, pitch, turn)), tuple(sides), corner)

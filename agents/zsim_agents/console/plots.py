@@ -13,6 +13,7 @@ from zsim_agents.console.limits import Range
 AT_ONCE = 3  # plots
 COLOURS = ("#868e96", "#1971c2", "#e8590c")  # of SERIES
 HEIGHT_PX = 150
+AXIS_PX = 56  # of figures such as -12.5, which would be clipped
 NONE = "none"
 
 
@@ -31,7 +32,7 @@ class Plots:
         self._in_degrees = [each.unit == "deg" for each in ranges]
         self._choices = {_title(ranges[k : k + AT_ONCE]): k for k in range(0, len(ranges), AT_ONCE)}
         self._choice = gui.add_dropdown("variables", [NONE, *self._choices], initial_value=next(iter(self._choices)))
-        gui.add_markdown(f"<sub>{_legend()}; the last {SPAN_S:g} s</sub>")
+        gui.add_markdown(f"<sub>{_legend()} over time [s], the last {SPAN_S:g} s</sub>")
         self._plots = [_plot(gui, each) for each in ranges[:AT_ONCE]]
         self._first: int | None = 0
 
@@ -73,6 +74,7 @@ def _plot(gui: viser.GuiApi, range_: Range) -> Any:
         (uplot.Series(label="t [s]"), *curves),
         title=range_.label,
         height=HEIGHT_PX,
+        axes=(uplot.Axis(), uplot.Axis(size=AXIS_PX)),
         scales={"x": uplot.Scale(time=False, auto=True)},
         legend=uplot.Legend(show=False),
     )

@@ -13,18 +13,19 @@ class RunForm:
     Args:
         gui: viser's, in the place where they are to be.
         desk: sends what is asked for.
+        rate: that the run was started with.
     """
 
-    def __init__(self, gui: viser.GuiApi, desk: Desk) -> None:
+    def __init__(self, gui: viser.GuiApi, desk: Desk, rate: float) -> None:
         gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE).on_click(lambda _: desk.world("pause"))
         gui.add_button("Resume", icon=viser.Icon.PLAYER_PLAY).on_click(lambda _: desk.world("resume"))
         gates = gui.add_number("gates", 1, min=1, max=GATES_MAX, step=1)
         step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT)
         step.on_click(lambda _: desk.world("step", gates=int(gates.value)))
-        rate = gui.add_number(
-            "rate", 1.0, min=0.0, max=RATE_MAX, step=0.5, hint="Real time is 1; 0: as fast as it goes"
+        wanted = gui.add_number(
+            "rate", rate, min=0.0, max=RATE_MAX, step=0.5, hint="Real time is 1; 0: as fast as it goes"
         )
-        gui.add_button("Set rate").on_click(lambda _: desk.world("rate", value=float(rate.value)))
+        gui.add_button("Set rate").on_click(lambda _: desk.world("rate", value=float(wanted.value)))
 
 
 class DroneForm:

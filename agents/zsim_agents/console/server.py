@@ -6,6 +6,7 @@ from typing import Any
 
 from zsim.messages import Info
 from zsim.session import Session
+from zsim_agents.console.controls import KnownControls
 from zsim_agents.console.door import Door, Inside, Place
 from zsim_agents.console.followers import Followers
 from zsim_agents.console.guard import OPERATOR, VIEWER
@@ -37,7 +38,8 @@ class Console:
         self._show: Show | None = None
         self._viser = PrivateViser()
         self._followers = Followers(self._viser.server)
-        inside = Inside(self._viser.port, self._viser.secret, self._state, self._followers.harmless)
+        controls = KnownControls(self._viser.server.gui, self._followers.switches)
+        inside = Inside(self._viser.port, self._viser.secret, self._state, controls)
         self._door = Door(place, token, inside)
 
     @contextmanager

@@ -75,7 +75,8 @@ class Show:
         robots = sum(space.n for space in self._spaces.values())
         self._stage = Stage(server, names, robots, len(self._spaces))
         self._stage.obstacles(self._scenario.environment.obstacles)
-        self._page = Page(server.gui, self._scenario, self._spaces, self._desk, self._tell, self._stage.show)
+        show = self._stage.show
+        self._page = Page(server.gui, self._scenario, self._spaces, self._desk, self._tell, show, info.rate)
 
     def close(self) -> None:
         """Send nothing any more."""

@@ -24,7 +24,7 @@ WIND_M_PER_M_S = 0.5  # length of the arrow
 WIND_MIN_M_S = 0.05  # below it no arrow
 ABOVE_M = 1.5  # of the arrow over the highest drone
 LABEL_B = np.array([0.0, 0.0, 0.32])  # m; of a name over its drone
-UNDER_B = np.array([0.0, 0.0, -0.3])  # m; of the angle at a corner under its drone
+MIDDLE = "center-center"  # of a label, where it is written
 LABELS_MAX = 3  # p, q and beta
 HIDDEN = (0.0, 0.0, -1000.0)  # m; where what is not there is put, since instances cannot be hidden one by one
 
@@ -169,7 +169,9 @@ class _Shapes:
         p, q, _ = _padded(count, np.zeros((0, 3)), np.zeros((0, 4)))
         self._frames: Any = scene.add_batched_axes("/formations/frames", q, p, axes_length=0.7, axes_radius=0.02)
         self._lines: Any = None
-        self._labels = [scene.add_label(f"/formations/label{i}", "", visible=False) for i in range(LABELS_MAX)]
+        self._labels = [
+            scene.add_label(f"/formations/label{i}", "", visible=False, anchor=MIDDLE) for i in range(LABELS_MAX)
+        ]
 
     def show(self, shapes: Sequence[Shape | None], chosen: int) -> None:
         there = [shape for shape in shapes if shape is not None]
@@ -186,7 +188,7 @@ class _Shapes:
 
     def _write(self, shape: Shape | None) -> None:
         texts = [] if shape is None else [(s.name, s.ends_W.mean(axis=0)) for s in shape.sides if s.name]
-        texts += [(shape.corner[1], shape.corner[0] + UNDER_B)] if shape is not None and shape.corner else []
+        texts += [(shape.corner[1], shape.corner[0])] if shape is not None and shape.corner else []
         for i, label in enumerate(self._labels):
             label.visible = i < len(texts)
             if label.visible:

@@ -45,7 +45,14 @@ class SensorRow(NamedTuple):
 
 def drones(rows: Sequence[Row]) -> str:
     """Return the table of all drones."""
-    head = _row("th", ("drone", "state", "bat", "lag", "GPS", "flown by"))
+    head = _head(
+        ("drone", ""),
+        ("state", "of its firmware"),
+        ("battery", ""),
+        ("lag", "how far its estimator is behind the run"),
+        ("GPS", "fixes that its estimator used / refused"),
+        ("flown by", "who holds it: whose commands it obeys"),
+    )
     return _table(head + "".join(map(_drone, rows)))
 
 
@@ -72,7 +79,13 @@ def sensors(name: str, rows: Iterable[SensorRow], sigma_m: float | None, yaw_sig
     if sigma_m is not None and yaw_sigma_deg is not None:
         sure = f"σ of position {sigma_m:.2f} m, of heading {yaw_sigma_deg:.1f}°"
     title = f"<div style='{STYLE};padding:2px 0'><b>{escape(name)}</b>: {sure}</div>"
-    return title + _table(_row("th", ("sensor", "used", "refused", "rate")) + "".join(told))
+    head = _head(
+        ("sensor", "of the drone"),
+        ("used", "measurements that its estimator took in"),
+        ("refused", "measurements that were too unlikely, or of no use"),
+        ("rate", "of those used, in simulated time"),
+    )
+    return title + _table(head + "".join(told))
 
 
 def clusters(told: Mapping[str, tuple[str, str]]) -> str:
@@ -104,11 +117,17 @@ def events(told: Iterable[Event]) -> str:
         f"<td>{_coloured(event.kind, LOUD.get(event.kind, GREY))}</td><td>{escape(event.text)}</td></tr>"
         for event in told
     ]
-    return _table("".join(lines))
+    return _table(_head(("t [s]", "simulated time"), ("event", ""), ("newest first", "")) + "".join(lines))
 
 
 def _table(body: str) -> str:
     return f"<table style='{STYLE};border-spacing:4px 1px;width:100%'>{body}</table>"
+
+
+def _head(*titles: tuple[str, str]) -> str:
+    """Return a row of titles, each with what a pointer over it is told."""
+    cells = (f"<th align=left title='{escape(told)}'>{escape(title)}</th>" for title, told in titles)
+    return f"<tr>{''.join(cells)}</tr>"
 
 
 def _row(tag: str, cells: Iterable[object]) -> str:

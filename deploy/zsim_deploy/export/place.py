@@ -1,5 +1,6 @@
 """Puts an export in its place when all of it is written: Ctrl-C and full disks leave nothing that looks finished."""
 
+import os
 import secrets
 import shutil
 from collections.abc import Iterator
@@ -40,6 +41,11 @@ def _is_export(file: Path) -> bool:
     return head.startswith(HEADS) and file.name not in OF_A_RUN
 
 
+def _reason(error: OSError) -> str:
+    """Return why, without what libraries that write files say around it."""
+    return os.strerror(error.errno) if error.errno else str(error)
+
+
 @contextmanager
 def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
     """Yield a path for each file or folder that is to be written; put them in place together at the end.
@@ -59,6 +65,6 @@ def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
                 target.replace(folder / f"{target.name}.old")
             new.replace(target)
     except OSError as error:
-        raise ReportError(f"{targets[0]}: cannot be written ({error.strerror or error})") from error
+        raise ReportError(f"{targets[0]}: cannot be written ({_reason(error)}); make room and export again") from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)

@@ -18,11 +18,11 @@ from foxglove.channels import (
 )
 from foxglove.messages import PoseInFrame
 
-from zsim.errors import ReportError
 from zsim.frames import heading
 from zsim.messages import ClusterState, Status
 from zsim_agents.cluster_space import ClusterSpace, SingularClusterError
 from zsim_deploy.export.foxglove import contents, scene
+from zsim_deploy.export.foxglove.disk import Disk
 from zsim_deploy.export.foxglove.instants import Instant
 from zsim_deploy.export.foxglove.numbers import Numbers
 from zsim_deploy.export.foxglove.shapes import MAGENTA, drone_colour, pose, timestamp
@@ -47,7 +47,8 @@ class FoxgloveFile:
 
     def __init__(self, path: Path, arms_m: Mapping[str, float], spaces: Mapping[str, ClusterSpace]) -> None:
         self._context = foxglove.Context()
-        self._file = foxglove.open_mcap(path, context=self._context)
+        self._disk = Disk(path)
+        self._file = foxglove.open_mcap(self._disk, context=self._context)
         self._arms_m = arms_m
         self._spaces = spaces
         self._order = {name: i for i, name in enumerate(arms_m)}
@@ -64,19 +65,22 @@ class FoxgloveFile:
         """End the file.
 
         Raises:
-            ReportError: it could not be written.
+            OSError: it could not be written.
         """
-        try:
-            self._file.close()
-        except RuntimeError as error:  # whatever Foxglove's library meets, a full disk too
-            raise ReportError(f"the Foxglove file cannot be written ({error}); make room and export again") from error
+        self._file.close()
+        self._disk.close()
 
     def variables(self) -> dict[str, tuple[str, ...]]:
         """Return the names of the fields that are plotted of each cluster."""
         return {name: numbers.numbers for name, numbers in self._variables.items()}
 
     def write(self, instant: Instant) -> None:
-        """Write all that is shown of an instant."""
+        """Write all that is shown of an instant.
+
+        Raises:
+            OSError: it could not be written.
+        """
+        self._disk.check()
         self._status.update(instant.status)
         if not self._begun and instant.truth:
             self._log(DRONES, SceneUpdateChannel, scene.drones(instant.t_ns, self._arms_m), instant.t_ns)
