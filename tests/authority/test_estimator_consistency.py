@@ -52,7 +52,10 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=CASES)
+@pytest.fixture(
+    scope="module",  # the flights of a case are flown once, by the worker that has its tests
+    params=[pytest.param(case, marks=pytest.mark.xdist_group(f"consistency {case}"), id=case) for case in CASES],
+)
 def runs(request: pytest.FixtureRequest) -> Runs:
     flown = [fly(scenario_file.load(SCENARIO, CASES[request.param], seed=seed)) for seed in SEEDS]
     return Runs(*(np.concatenate(parts) for parts in zip(*flown, strict=True)))

@@ -95,7 +95,7 @@ def test_without_world_or_recorder_the_run_ends(team: Team, role: str) -> None:
     assert team.record().keys()["clock"] > 10
 
 
-@pytest.mark.parametrize("cut_s", [1.0, 5.0, 20.0])
+@pytest.mark.parametrize("cut_s", [1.0, 5.0, pytest.param(20.0, marks=pytest.mark.soak)])
 def test_time_stands_still_while_a_host_is_cut_off(team: Team, tmp_path: Path, cut_s: float) -> None:
     run = team.up("--rate", "5", "--duration", "25")
     in_flight(run)
@@ -124,13 +124,13 @@ def test_in_realtime_drones_land_while_their_controller_is_cut_off(team: Team) -
     world, recorder, estimator.drone1 ─── h1        h2 ─── controller.main, estimator.drone2
                                              cut 5 s
     """
-    run = team.up("--realtime", "--duration", "40", "--set", "clusters.main.plan.takeoff_s=1")
+    run = team.up("--realtime", "--duration", "28", "--set", "clusters.main.plan.takeoff_s=1")
     run.line("real time  (assembling|engaged)", START_S)
     cut_at_s = team.cut("h2")
     run.line("waiting for controller.main on h2|host h2 does not answer", START_S)
     threading.Event().wait(cut_at_s + CUT_IN_REALTIME_S - time.monotonic())
     team.heal("h2")
-    run.ends(with_code=0, within_s=40.0 + START_S)
+    run.ends(with_code=0, within_s=28.0 + START_S)
     record = team.record()
     for drone in DRONES:
         states = [status["state"] for status in record.all(f"drone/{drone}/sensor/status")]
@@ -139,7 +139,7 @@ def test_in_realtime_drones_land_while_their_controller_is_cut_off(team: Team) -
     assert any(re.search(r"age is \d+ ms; must be <= 500 ms", text) for text in late)
     steps = {clock["step"] for clock in record.all("clock")}
     assert steps == set(range(max(steps) + 1))
-    assert max(steps) > 35 * GATES_PER_S
+    assert max(steps) > 24 * GATES_PER_S
 
 
 def test_a_host_whose_clock_is_an_hour_off_takes_part(lab: Lab, faketime: str, tmp_path: Path) -> None:
@@ -207,8 +207,8 @@ def test_over_a_poor_link_it_flies_in_realtime(lab: Lab) -> None:
     """50 ± 10 ms and 2 % loss each way to the host of an estimator."""
     lab.slow("h3", 50, 10, 0.02)
     with closing(Team(lab, ROLES)) as team:
-        run = team.up("--realtime", "--duration", "32")
-        run.ends(with_code=0, within_s=32.0 + START_S)
+        run = team.up("--realtime", "--duration", "18", "--set", "clusters.main.plan.takeoff_s=2")
+        run.ends(with_code=0, within_s=18.0 + START_S)
         record = team.record()
         assert record.all("cluster/main/state")[-1]["phase"] == "engaged"
         for drone in DRONES:
