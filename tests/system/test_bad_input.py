@@ -160,7 +160,7 @@ EXPRESSIONS = {
 @pytest.mark.parametrize("name", EXPRESSIONS)
 def test_a_plan_that_can_never_be_flown_ends_the_run(federation: Federation, name: str) -> None:
     text, says = EXPRESSIONS[name]
-    run = federation.run(with_expression(text))
+    run = federation.run(with_expression(text), *(() if name == "not closed" else ("--in-process",)))
     assert run.process.wait(PATIENCE_S) != 0
     run.close()
     assert says in run.text()
