@@ -1,8 +1,8 @@
 """Part h: what the console costs: its share of a core, and what a run in lockstep loses by it.
 
 The share is processor time by wall time of the console's process, with one page open: a client that reads all that a
-page is sent, or a real browser. The run's loss is its real-time factor with the console, and such a client, by that
-without, one after the other.
+page is sent. The run's loss is its real-time factor while there is a console, and such a client, by that just before,
+in one run, again and again.
 """
 
 import json
@@ -13,8 +13,9 @@ import threading
 import time
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import psutil
@@ -29,14 +30,18 @@ from benchmarks.exchange.lap import free_port
 from benchmarks.progress import Progress
 from benchmarks.sheet import Sheet
 from benchmarks.table import figure, spread, table
-from zsim.record import RecordReader
+from zsim import keys, messages
+from zsim import session as zenoh_session
+from zsim.session import Session
 from zsim_agents.console.guard import Camera
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
 SIZES = (3, 50)  # drones
 SECONDS = 15.0  # wall time over which a share is taken
 SETTLE_S = 5.0  # wall time before it: a page that is opened is sent everything at once
-FLIGHT_S = {3: 120.0, 50: 12.0}  # simulated, of a run whose real-time factor is taken
+FLIGHT_S = 100_000.0  # simulated, of a run whose real-time factor is taken: it is ended before
+WINDOW_S = 8.0  # wall time over which it is taken
+PAIRS = 5  # of windows without and with a console, in one run
 TIMEOUT_S = 300.0
 LOOK_S = 0.2
 GOALS = {3: 15.0, 50: 60.0}  # percent of a core
@@ -45,11 +50,23 @@ PICTURES_HZ = {3: 20.0, 50: 10.0}  # of the console, by its number of drones
 LEAST_PICTURES = 0.8  # share of them; below it the console was starved, and looks cheap
 LEAST_RATE = 0.9  # of real time; below it the run was starved, and gave the console less to draw
 DRONES = "/drones"  # the node of the scene
-CHROMIUM = "/usr/bin/chromium"
-FLAGS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 CAMERA = Camera(  # what a page says first; before it, viser heeds no control of it
     (1.0, 0.0, 0.0, 0.0), (0.0, -5.0, 3.0), 1.0, 0.01, 1000.0, 600, 800, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 )
+
+
+class Share(NamedTuple):
+    """What was seen of a console meanwhile.
+
+    Attributes:
+        percent: of a core.
+        read_per_s: what was counted at the page.
+        factor: simulated by wall time.
+    """
+
+    percent: float
+    read_per_s: float
+    factor: float
 
 
 class Reader:
@@ -136,26 +153,14 @@ def _flying(folder: Path, count: int) -> Iterator[tuple[int, psutil.Process]]:
         yield port, psutil.Process(console.pid)
 
 
-def _share(console: psutil.Process, read: Callable[[], int]) -> tuple[float, float]:
-    """Return the share of a core [%], and what a page was sent meanwhile [kB/s]."""
+def _share(console: psutil.Process, port: int, read: Callable[[], int] = lambda: 0) -> Share:
+    """Return what the console spends, and what a page is sent and sees, over SECONDS."""
     time.sleep(SETTLE_S)
-    before, sent, start_s = console.cpu_times(), read(), time.monotonic()
+    before, sent, simulated_s, start_s = console.cpu_times(), read(), _shown_s(port), time.monotonic()
     time.sleep(SECONDS)
     after, wall_s = console.cpu_times(), time.monotonic() - start_s
     spent_s = after.user + after.system - before.user - before.system
-    return 100.0 * spent_s / wall_s, (read() - sent) / wall_s / 1000.0
-
-
-@contextmanager
-def _kept_up(port: int, reader: Reader, count: int) -> Iterator[None]:
-    """Refuse what was measured if too few pictures were drawn meanwhile, or the run did not keep up with real time."""
-    pictures, simulated_s, wall_s = reader.pictures, _shown_s(port), time.monotonic()
-    yield
-    wall_s = time.monotonic() - wall_s
-    drawn_hz, factor = (reader.pictures - pictures) / wall_s, (_shown_s(port) - simulated_s) / wall_s
-    if drawn_hz < LEAST_PICTURES * PICTURES_HZ[count] or factor < LEAST_RATE:
-        goal = f"{PICTURES_HZ[count]:g} pictures a second at × 1"
-        raise RefusedError(f"{count} drones: {drawn_hz:.1f} pictures a second at × {factor:.2f}; must be about {goal}")
+    return Share(100.0 * spent_s / wall_s, (read() - sent) / wall_s, (_shown_s(port) - simulated_s) / wall_s)
 
 
 def _shown_s(port: int) -> float:
@@ -166,60 +171,67 @@ def _shown_s(port: int) -> float:
 
 def _measure_shares(sheet: Sheet, folder: Path, count: int) -> str:
     with _flying(folder, count) as (port, console):
-        alone, _ = _share(console, lambda: 0)
+        alone = _share(console, port)
         reader = Reader(port)
         try:
-            with _kept_up(port, reader, count):
-                read, rate = _share(console, lambda: reader.received)
+            sent = _share(console, port, lambda: reader.received)
+            drawn = _share(console, port, lambda: reader.pictures)
         finally:
             reader.close()
-        browser = _browser_share(console, port)
-    for name, value in {"alone": alone, "read": read, "rate": rate, "browser": browser}.items():
-        sheet.add(name, count, value)
-    return f"{count} drones: {read:.1f} % of a core"
+    _check_kept_up(count, drawn)
+    sheet.add("alone", count, alone.percent)
+    sheet.add("read", count, (sent.percent + drawn.percent) / 2)
+    sheet.add("rate", count, sent.read_per_s / 1000.0)
+    return f"{count} drones: {sheet.values['read'][count][-1]:.1f} % of a core"
 
 
-def _browser_share(console: psutil.Process, port: int) -> float | None:
-    """Return the share with a page in a real browser [%], None where there is none."""
-    try:
-        from playwright.sync_api import sync_playwright
-    except ImportError:
-        return None
-    if not Path(CHROMIUM).exists():
-        return None
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+def _check_kept_up(count: int, drawn: Share) -> None:
+    """Refuse what was measured if too few pictures were drawn meanwhile, or the run did not keep up with real time."""
+    if drawn.read_per_s < LEAST_PICTURES * PICTURES_HZ[count] or drawn.factor < LEAST_RATE:
+        found = f"{drawn.read_per_s:.1f} pictures a second at × {drawn.factor:.2f}"
+        raise RefusedError(f"{count} drones: {found}; must be about {PICTURES_HZ[count]:g} at × 1")
+
+
+def _measure_factors(sheet: Sheet, folder: Path, count: int) -> str:
+    """Fly one run as fast as it goes; let a console that is looked at come and go, and note how fast it goes."""
+    scenario, world = folder / f"fast{count}.yaml", free_port()
+    endpoint = f"tcp/127.0.0.1:{world}"
+    grid.write(scenario, count, FLIGHT_S)
+    run = ("run", str(scenario), "--listen", endpoint, "--hosted", "--no-report", "--out", str(folder / f"out{world}"))
+    with _started(*run), zenoh_session.connect(endpoint, "zsim", wait_s=TIMEOUT_S, reader=True) as link:
+        _await(lambda: _now_s(link) > 1.0, "the run")
+        for _ in range(PAIRS):
+            sheet.add("without", count, _factor(link))
+            with _looked_at(endpoint):
+                sheet.add("with", count, _factor(link))
+    return f"{count} drones: {spread(sheet.ratio('with', 'without', count))} of the real-time factor"
+
+
+@contextmanager
+def _looked_at(endpoint: str) -> Iterator[None]:
+    """Let there be a console, and a page that reads all that it is sent."""
+    port = free_port()
+    with _started("console", "--connect", endpoint, "--port", str(port)):
+        _await(lambda: _runs(port), "a run on the console")
+        reader = Reader(port)
         try:
-            page = browser.new_page(viewport={"width": 800, "height": 500})
-            page.goto(f"http://127.0.0.1:{port}/", timeout=1000 * TIMEOUT_S)
-            page.get_by_text("running").first.wait_for(timeout=1000 * TIMEOUT_S)
-            return _share(console, lambda: 0)[0]
+            yield
         finally:
-            browser.close()
+            reader.close()
 
 
-def _factor(folder: Path, count: int, shown: bool) -> float:
-    """Return the real-time factor of a run as fast as it goes, with a console that is looked at, or without."""
-    scenario, world, port = folder / f"fast{count}.yaml", free_port(), free_port()
-    out, endpoint = folder / f"out{world}", f"tcp/127.0.0.1:{world}"
-    grid.write(scenario, count, FLIGHT_S[count])
-    run = ("run", str(scenario), "--listen", endpoint, "--hosted", "--no-report", "--out", str(out))
-    with ExitStack() as stack:
-        if shown:
-            stack.enter_context(_started("console", "--connect", endpoint, "--port", str(port)))
-            _await(lambda: _answers(port), "the console's page")
-            stack.callback(Reader(port).close)
-        process = stack.enter_context(_started(*run))
-        process.wait(TIMEOUT_S)
-    with RecordReader(out / "run.mcap") as reader:
-        said = [msgspec.msgpack.decode(message.payload) for message in reader.messages(("world/event",))]
-    return next(event["data"]["real_time_factor"] for event in said if event["kind"] == "end")
+def _factor(link: Session) -> float:
+    """Return the real-time factor over WINDOW_S."""
+    time.sleep(SETTLE_S)
+    simulated_s, start_s = _now_s(link), time.monotonic()
+    time.sleep(WINDOW_S)
+    return (_now_s(link) - simulated_s) / (time.monotonic() - start_s)
 
 
-def _answers(port: int) -> bool:
-    with suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}/state", timeout=5.0):
-        return True
-    return False
+def _now_s(link: Session) -> float:
+    """Return the simulated time of a run; 0 where nobody says it."""
+    found = link.get(keys.CLOCK)
+    return messages.decode(keys.CLOCK, found[0].payload).t_ns / 1e9 if found else 0.0
 
 
 def measure(repeats: int) -> Sheet:
@@ -230,10 +242,7 @@ def measure(repeats: int) -> Sheet:
         for _ in range(repeats):
             for count in SIZES:
                 progress.tell(_measure_shares(sheet, Path(temporary), count))
-                for name in ("without", "with"):
-                    sheet.add(name, count, _factor(Path(temporary), count, name == "with"))
-                found = [sheet.values[name][count][-1] for name in ("without", "with")]
-                progress.tell(f"{count} drones: × {found[0]:.1f} without, × {found[1]:.1f} with")
+                progress.tell(_measure_factors(sheet, Path(temporary), count))
     return sheet
 
 
@@ -242,12 +251,11 @@ def page(sheet: Sheet) -> str:
     rows = [
         ["nobody looks [% of a core]", *_cells(sheet, "alone")],
         ["one page, read whole [% of a core]", *_cells(sheet, "read")],
-        ["one page in Chromium [% of a core]", *_cells(sheet, "browser")],
         ["goal for one page [% of a core]", *(f"≤ {figure(GOALS[count])}" for count in SIZES)],
         ["sent to a page [kB/s]", *_cells(sheet, "rate")],
         ["as fast as it goes, without [× real time]", *_cells(sheet, "without")],
         ["as fast as it goes, with one page [× real time]", *_cells(sheet, "with")],
-        ["ratio", *(spread(sheet.ratio("with", "without", count)) for count in SIZES)],
+        ["ratio, window by window", *(spread(sheet.ratio("with", "without", count)) for count in SIZES)],
     ]
     return table(["", "3 drones, 20 Hz", "50 drones, 10 Hz"], rows)
 

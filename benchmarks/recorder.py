@@ -7,7 +7,8 @@ the first megabyte on record to the end of the run, so that start-up is left out
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,7 +33,8 @@ LABELS = {"lockstep": "lockstep, as fast as it goes", "realtime": "realtime, 1×
 BEGUN_BYTES = 1_000_000  # on record when the run is under way
 LOOK_S = 0.25  # wall time between two looks at the recorder
 TIMEOUT_S = 300.0
-FIELDS = ("core_percent", "messages_per_s", "megabytes_per_s", "missing")
+FIELDS = ("core_percent", "messages_per_s", "megabytes_per_s", "missing", "broken")
+SLOWEST_S = 1.0  # five times the period of GPS, the slowest of what has a rate
 
 
 class _Seq(msgspec.Struct):
@@ -96,11 +98,9 @@ def _looks(launcher: subprocess.Popen[str], record: Path) -> Iterator[tuple[floa
     while launcher.poll() is None and time.monotonic() < until_s:
         recorder = recorder or _recorder(launcher.pid)
         if recorder is not None and record.exists() and record.stat().st_size > BEGUN_BYTES:
-            try:
+            with suppress(psutil.NoSuchProcess):
                 spent = recorder.cpu_times()
-            except psutil.NoSuchProcess:
-                continue
-            yield time.monotonic(), spent.user + spent.system
+                yield time.monotonic(), spent.user + spent.system
         time.sleep(LOOK_S)
 
 
@@ -116,6 +116,7 @@ def counted(path: Path) -> tuple[dict[str, str], int, int, int]:
     """Return the keys whose count is broken, how many numbers are missing, messages, and the last time [ns]."""
     expected: dict[str, int] = {}
     faults: dict[str, str] = {}
+    ends_ns: dict[str, int] = {}
     missing = messages = last_ns = 0
     decoder = msgspec.msgpack.Decoder(_Seq)
     with RecordReader(path) as reader:
@@ -128,11 +129,19 @@ def counted(path: Path) -> tuple[dict[str, str], int, int, int]:
                 continue
             wanted = expected.get(message.key, 0)
             expected[message.key] = seq + 1
+            ends_ns[message.key] = message.t_ns
             may_skip = message.key.startswith("view/")
             if seq < wanted or (seq > wanted and not may_skip):
                 faults.setdefault(message.key, f"{seq} follows {wanted - 1}")
                 missing += max(0, seq - wanted)
-    return faults, missing, messages, last_ns
+    return faults | _cut_short(ends_ns, last_ns), missing, messages, last_ns
+
+
+def _cut_short(ends_ns: Mapping[str, int], last_ns: int) -> dict[str, str]:
+    """Return the keys of drones that stop before the run does: what is lost at the end leaves no gap."""
+    early = {key: (last_ns - end_ns) / 1e9 for key, end_ns in ends_ns.items() if key.startswith("drone/")}
+    of_a_rate = {key: by_s for key, by_s in early.items() if "/sensor/" in key or key.endswith(("/truth", "/estimate"))}
+    return {key: f"ends {by_s:g} s before the run" for key, by_s in of_a_rate.items() if by_s > SLOWEST_S}
 
 
 def measure(repeats: int) -> Sheet:
@@ -157,18 +166,21 @@ def _measured(sheet: Sheet, name: str) -> str:
         flown.messages / wall_s,
         flown.size_bytes / wall_s / 1e6,
         float(flown.missing),
+        float(len(flown.faults)),
     )
     for field, value in zip(FIELDS, values, strict=True):
         sheet.add(f"{name}_{field}", DRONES, value)
-    return f"{values[0]:.0f} % of a core, {flown.messages} messages, {flown.missing} missing"
+    counted_up = f"{flown.messages} messages, {flown.missing} missing; broken: {flown.faults or 'none'}"
+    return f"{values[0]:.0f} % of a core, {counted_up}"
 
 
 def page(sheet: Sheet) -> str:
     """Return the measured section."""
-    head = [f"{DRONES} drones", "share of a core, %", "messages/s", "MB/s on disk", "missing"]
+    head = [f"{DRONES} drones", "share of a core, %", "messages/s", "MB/s on disk", "missing", "broken keys"]
     rows = []
     for name, label in LABELS.items():
-        found = [spread(sheet.spread(f"{name}_{field}", DRONES)) for field in FIELDS[:-1]]
-        lost = sheet.spread(f"{name}_missing", DRONES)
-        rows.append([label, *found, figure(lost.high) if lost else sheet.refused.get(f"{name}@{DRONES}", "–")])
+        found = [spread(sheet.spread(f"{name}_{field}", DRONES)) for field in FIELDS[:3]]
+        lost, broken = (sheet.spread(f"{name}_{field}", DRONES) for field in FIELDS[3:])
+        refused = sheet.refused.get(f"{name}@{DRONES}", "–")
+        rows.append([label, *found, figure(lost.high) if lost else refused, figure(broken.high) if broken else "–"])
     return table(head, rows)
