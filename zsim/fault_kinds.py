@@ -76,6 +76,7 @@ _SENSORS = {
     "sonar": "sonar",
     "flow": "optical flow",
 }
+# The greatest values are chosen: about ten times what any such sensor can show, so that only slips are refused.
 _BIASES = {
     "accel": _vector("value_m_s2", "in the sensor's axes", "m/s^2", 500.0),
     "gyro": _vector("value_deg_s", "in the sensor's axes", "deg/s", 5700.0),
@@ -126,7 +127,7 @@ KINDS: dict[str, Kind] = {
     "link_delay": Kind(
         "link",
         "messages come later",
-        (_number("delay_ms", "in whole gates, rounded up", "ms", 0.0, 60_000.0, above=True), _ONE_WAY),
+        (_number("delay_ms", "after it, a message comes with the next gate", "ms", 0.0, 60_000.0, above=True), _ONE_WAY),
     ),
     "link_jitter": Kind(
         "link",
