@@ -9,6 +9,14 @@ from typing import Any, TypeVar
 Opened = TypeVar("Opened")
 
 
+async def _end_others() -> None:
+    """End what still runs: a loop that closes over it complains of each."""
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in others:
+        task.cancel()
+    await asyncio.gather(*others, return_exceptions=True)
+
+
 @contextmanager
 def opened_on(
     loop: asyncio.AbstractEventLoop,
@@ -32,6 +40,7 @@ def opened_on(
         finally:
             asyncio.run_coroutine_threadsafe(leave(opened), loop).result()
     finally:
+        asyncio.run_coroutine_threadsafe(_end_others(), loop).result()
         loop.call_soon_threadsafe(loop.stop)
         thread.join()
         loop.close()

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import msgspec
 from aiohttp import ClientError, ClientSession, WSMsgType, web
@@ -48,7 +49,7 @@ class Place(NamedTuple):
         """Return the address of a page, as others reach it where all of them may."""
         host = socket.gethostname() if self.host in EVERYWHERE else self.host
         shown = f"[{host}]" if ":" in host else host
-        return f"http://{shown}:{self.port}{path}" + (f"?token={token}" if token else "")
+        return f"http://{shown}:{self.port}{path}" + (f"?token={quote(token, safe='')}" if token else "")
 
 
 class Inside(NamedTuple):

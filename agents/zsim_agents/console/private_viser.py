@@ -1,5 +1,6 @@
 """A viser server that nobody but the console's own door can reach, whoever else is on this machine."""
 
+import asyncio
 import contextlib
 import http
 import io
@@ -8,12 +9,40 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import viser
+import viser.infra._infra
 import websockets.asyncio.server
+from viser.infra._async_message_buffer import AsyncMessageBuffer
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 SECRET_HEADER = "X-Zsim-Console"
 HOST = "127.0.0.1"
+
+
+class AnyThreadEvent(asyncio.Event):
+    """An event that other threads may set: it is marked then, and who waits for it is woken by the loop's own `set`.
+
+    An asyncio.Event goes through those who wait, and breaks off when the loop changes them meanwhile.
+    """
+
+    def set(self) -> None:
+        """Mark it; on the loop, wake those who wait, though another thread has marked it before."""
+        if asyncio._get_running_loop() is None:
+            self._value = True
+        else:
+            self._value = False
+            super().set()
+
+
+class _Buffer(AsyncMessageBuffer):
+    """viser's, which sets its event from every thread, and once more on the loop."""
+
+    def __init__(self, *args: Any, **more: Any) -> None:
+        super().__init__(*args, **more)
+        self.message_event = AnyThreadEvent()
+
+
+viser.infra._infra.AsyncMessageBuffer = _Buffer  # type: ignore[misc]
 
 
 class PrivateViser:
