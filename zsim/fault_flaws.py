@@ -1,6 +1,7 @@
 """What is wrong with a fault as somebody gives it: by the same tables in scenarios, requests and commands. Pure."""
 
 from collections.abc import Iterator, Mapping
+from difflib import SequenceMatcher
 from typing import Any, NamedTuple
 
 from zsim import keys
@@ -10,6 +11,7 @@ from zsim.faults import show
 
 FOR_EVER_S = 1e6  # s, as the longest scenario
 DEAF = ("world", "recorder", "console", "gateway", "router")  # roles that no gate waits for: none hears of a kill
+ALIKE = 0.85  # of difflib, chosen: from here on, words as long as "controller" differ by a slip of the hand
 COMMON = ("kind", "target", "at_s", "for_s")  # what every fault may say; the rest are parameters
 
 
@@ -50,7 +52,7 @@ def _found(given: Mapping[str, Any], field: str) -> str:
 def _target_flaws(given: Mapping[str, Any], name: str, kind: Kind, known: Known) -> Iterator[Flaw]:
     found, target = _found(given, "target"), given.get("target")
     if kind.strikes == "link":
-        yield from _link_flaws(found, target, known)
+        yield from _link_flaws(found, target, given.get("one_way") is True, known)
     elif kind.strikes == "process":
         if not isinstance(target, str) or not _takes_part(target, known):
             yield "target", f"{found}; must be a process that takes part, as {_example(known)}"
@@ -62,20 +64,36 @@ def _target_flaws(given: Mapping[str, Any], name: str, kind: Kind, known: Known)
             yield "target", f"{found}; must be {'one of ' if len(allowed) > 1 else ''}{_listed(allowed)}"
 
 
-def _link_flaws(found: str, target: Any, known: Known) -> Iterator[Flaw]:
+def _link_flaws(found: str, target: Any, one_way: bool, known: Known) -> Iterator[Flaw]:
     names = target.split("/") if isinstance(target, str) else []
     if len(names) != 2 or names[0] == names[1]:
         yield "target", f"{found}; must be two processes, as world/{_example(known)}"
         return
     for name in names:
-        role, _, thing = name.partition(".")
-        ours = {"estimator": known.drones, "controller": known.clusters}.get(role)
-        if not keys.PROCESS_NAME.fullmatch(name):
-            yield "target", f"{found}; {name[:48]!r} must be 1 to 48 of a-z 0-9 _ . -"
-        elif ours is not None and thing not in ours and name not in known.processes:
-            yield "target", f"{found}; {name!r} must be {role}.NAME of {_listed(ours)}"
+        allowed = _allowed_instead(name, known)
+        if allowed:
+            yield "target", f"{found}; {name[:48]!r} must be {allowed}"
+    heeds = f"the world or a process that takes part, as {_example(known)}"
     if not any(name == "world" or _takes_part(name, known) for name in names):
-        yield "target", f"{found}; one of them must be the world or a process that takes part, as {_example(known)}"
+        yield "target", f"{found}; one of them must be {heeds}"
+    elif one_way and names[1] != "world" and names[1].partition(".")[0] in DEAF:
+        yield "target", f"{found}, one way, and {names[1]!r} is outside of the lockstep; the second must be {heeds}"
+
+
+def _allowed_instead(name: str, known: Known) -> str | None:
+    """Return what must stand in place of a process's name, None if it may stand: most names may be somebody's own."""
+    if not keys.PROCESS_NAME.fullmatch(name):
+        return "1 to 48 of a-z 0-9 _ . -"
+    if name in known.processes:
+        return None
+    role, dot, thing = name.partition(".")
+    things = {"estimator": known.drones, "controller": known.clusters}
+    if role in things and thing not in things[role]:
+        return f"{role}.NAME of {_listed(things[role])}"
+    for ours, there in {**things, "world": ("",)}.items():
+        if thing in there and ours not in role and SequenceMatcher(None, role, ours).ratio() >= ALIKE:
+            return f"{ours}{dot}{thing}, or a name less like it"
+    return None
 
 
 def _takes_part(name: str, known: Known) -> bool:
@@ -130,6 +148,9 @@ def _place_flaws(value: Any, p: Parameter, known: Known) -> Iterator[Flaw]:
         yield p.name, f"is {show(value)}; must be {expected(p)}"
         return
     for process, place in value.items():
+        allowed = _allowed_instead(process if isinstance(process, str) else "", known)
+        if allowed:
+            yield f"{p.name}.{str(process)[:48]}", f"names no process; must be {allowed}"
         point = isinstance(place, list | tuple) and len(place) == 3 and all(_within(x, -1e6, 1e6) for x in place)
         if not point and place not in known.drones:
             yield f"{p.name}.{str(process)[:48]}", f"is {show(place)}; must be a drone or [x, y, z] in m"

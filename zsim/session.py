@@ -312,9 +312,13 @@ class Session:
         """Ask `key` to do something; an answer that never comes is an answer that says so.
 
         Raises:
-            SessionError: it is no key.
+            SessionError: it is no key, or something among the arguments fits into no message.
         """
-        payload = messages.encode(ControlRequest(op=op, args=args or {}, source=source))
+        try:
+            payload = messages.encode(ControlRequest(op=op, args=args or {}, source=source))
+        except (OverflowError, UnicodeEncodeError) as error:
+            allowed = "must hold whole numbers of 64 bits, and text in UTF-8"
+            raise SessionError(f"{key}: {op} cannot be sent ({error}); {allowed}") from error
         start_s = time.monotonic()
         with _named(key):
             replies = self._raw.get(self._prefix + key, payload=payload, timeout=timeout_s)

@@ -20,6 +20,7 @@ app = typer.Typer(name="fault", help="Inject faults into a running federation, a
 UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "": 1.0}  # s
 SOURCE = "zsim.fault"
 ALL = "all"
+GIVEN_BY = {"target": "the argument TARGET", "kind": "the argument KIND", "for_s": "--for", "at_s": "--at"}
 
 
 def seconds(text: str | None) -> float | None:
@@ -160,8 +161,12 @@ def _values(parameters: Sequence[str]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for text in parameters:
         name, equals, given = text.partition("=")
-        if not equals or not re.fullmatch("[a-z_]+", name):
+        if not equals or not re.fullmatch("[a-z][a-z0-9_]*", name):
             raise typer.BadParameter(f"{text[:40]!r} is no parameter; must be NAME=VALUE, see `zsim fault kinds`")
+        if name in GIVEN_BY:
+            raise typer.BadParameter(f"{name} is no parameter of a kind; give it by {GIVEN_BY[name]}")
+        if name in values:
+            raise typer.BadParameter(f"{name} is given twice; must be given once")
         try:
             values[name] = yaml_file.value(given)
         except ValueError as error:

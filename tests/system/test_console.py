@@ -8,6 +8,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from queue import SimpleQueue
@@ -159,6 +160,7 @@ class Wire:
         self._socket = connect(where, subprotocols=spoken, compression=None, max_size=None)
         self._socket.send(msgspec.msgpack.encode(CAMERA))
         self._heard: SimpleQueue[list[dict[str, Any]]] = SimpleQueue()
+        self._told: deque[dict[str, Any]] = deque()  # taken from what was heard, and not looked at
         self.ids: dict[str, str] = {}
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -185,16 +187,26 @@ class Wire:
         """Return the next thing of a kind that the page is told, and learn of controls meanwhile."""
         until_s = time.monotonic() + PATIENCE_S
         while True:
-            for message in self._heard.get(timeout=max(0.0, until_s - time.monotonic())):
-                label = (message.get("props") or {}).get("label")
-                if label and "uuid" in message:
-                    self.ids[label] = message["uuid"]
+            while self._told:
+                message = self._told.popleft()
                 if heard(message):
                     return message
+            self._take_in(until_s)
 
     def knows(self, label: str) -> None:
         """Wait until the page has a control."""
-        self.until(lambda _: label in self.ids)
+        until_s = time.monotonic() + PATIENCE_S
+        while label not in self.ids:
+            self._take_in(until_s)
+
+    def _take_in(self, until_s: float) -> None:
+        """Take what was said at once, with all controls in it."""
+        batch = self._heard.get(timeout=max(0.0, until_s - time.monotonic()))
+        for message in batch:
+            label = (message.get("props") or {}).get("label")
+            if label and "uuid" in message:
+                self.ids[label] = message["uuid"]
+        self._told.extend(batch)
 
 
 @pytest.fixture

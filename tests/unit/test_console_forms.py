@@ -5,16 +5,20 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import pytest
 
 from zsim import scenario_file
+from zsim.fault_kinds import KINDS
 from zsim.messages import ViewCluster
+from zsim.scenario import Scenario
 from zsim_agents.console.desk import Told
 from zsim_agents.console.fault_form import FOR_S, GUST_M_S, LOSS, WEAK, FaultForm
-from zsim_agents.console.formation_form import OVER_S, QUIET_S, FormationForm
+from zsim_agents.console.formation_form import QUIET_S, FormationForm
 from zsim_agents.console.limits import ranges
 from zsim_agents.console.page import SWITCHES, Page
-from zsim_agents.console.run_form import DroneForm, RunForm
+from zsim_agents.console.run_form import DroneForm, FleetForm, RunForm
+from zsim_agents.console.variable_slider import STILL_S
 from zsim_agents.scenario_space import scenario_space
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -76,6 +80,9 @@ class Gui:
 
     def add_button(self, label: str, **_: Any) -> Control:
         return self._add(label)
+
+    def add_button_group(self, label: str, options: list[str]) -> Control:
+        return self._add(label, options[0])
 
     def add_dropdown(self, label: str, options: list[str], initial_value: str | None = None) -> Control:
         return self._add(None if label in self.at else label, initial_value or options[0])
@@ -203,6 +210,30 @@ def test_the_chosen_drone_alone_gets_its_mode(bench: Bench, label: str, mode: st
     assert bench.desk.asked == [((bench.names[1],), mode)]
 
 
+@pytest.mark.parametrize(("label", "what"), [("Take off all", "takeoff"), ("Land all", "land")])
+def test_all_formations_and_all_drones_of_none_take_off_and_land(bench: Bench, label: str, what: str):
+    FleetForm(bench.gui, bench.desk, mixed())
+    bench.gui.at["all drones"].put(label)
+    assert bench.desk.asked == [("main", what, {}), ("other", what, {}), (("d5", "d6"), what)]
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_all_drones_are_in_formations_or_none_is(bench: Bench, alone: bool):
+    scenario = mixed()
+    clusters, drones = ([], scenario.drones[4:]) if alone else (scenario.clusters, scenario.drones[:4])
+    FleetForm(bench.gui, bench.desk, msgspec.structs.replace(scenario, clusters=clusters, drones=drones))
+    bench.gui.at["all drones"].put("Land all")
+    formations = [("main", "land", {}), ("other", "land", {})]
+    assert bench.desk.asked == ([(("d5", "d6"), "land")] if alone else formations)
+
+
+def mixed() -> Scenario:
+    """Return two formations, and two drones of none."""
+    drones = [{"name": f"d{k}", "position_m": [3 * k, 0, 0]} for k in range(1, 7)]
+    clusters = [{"name": "main", "drones": ["d1", "d2"]}, {"name": "other", "drones": ["d3", "d4"]}]
+    return scenario_file.resolve({"name": "t", "duration_s": 1, "drones": drones, "clusters": clusters}, "mixed.yaml")
+
+
 # Faults
 
 
@@ -248,12 +279,38 @@ def test_any_fault_is_injected_with_what_was_typed(bench: Bench):
     assert bench.desk.asked == [("world", "fault_add", asked)]
 
 
-def test_parameters_that_are_none_are_told_and_not_sent(bench: Bench):
+def test_a_time_among_the_parameters_is_the_one_that_is_sent(bench: Bench):
     bench.faults()
-    bench.gui.at["parameters"].value = "value"
+    bench.gui.at["parameters"].value = "for_s: 5, at_s: 40"
+    bench.gui.press("Inject it")
+    asked = {"kind": next(iter(KINDS)), "target": bench.names[0], "for_s": 5, "at_s": 40}
+    assert bench.desk.asked == [("world", "fault_add", asked)]
+
+
+def test_a_kill_by_its_kind_is_sent_without_a_duration(bench: Bench):
+    bench.faults()
+    bench.gui.at["kind"].put("process_kill")
+    bench.gui.at["target"].value = "estimator.drone1"
+    bench.gui.press("Inject it")
+    assert bench.desk.asked == [("world", "fault_add", {"kind": "process_kill", "target": "estimator.drone1"})]
+
+
+@pytest.mark.parametrize("text", ["value", "a: 2024-13-45", "[" * 2000, "probability: 1, probability: 0"])
+def test_parameters_that_are_none_are_told_and_not_sent(bench: Bench, text: str):
+    bench.faults()
+    bench.gui.at["parameters"].value = text
     bench.gui.press("Inject it")
     assert bench.desk.asked == []
     assert "must be NAME: VALUE" in bench.told[0].refusal
+
+
+@pytest.mark.parametrize("name", ["kind", "target", "op", "self", "value"])
+def test_a_parameter_that_a_kind_has_not_is_told_and_not_sent(bench: Bench, name: str):
+    bench.faults()
+    bench.gui.at["parameters"].value = f"{name}: x"
+    bench.gui.press("Inject it")
+    assert bench.desk.asked == []
+    assert bench.told[0].refusal.endswith(f"{name!r} is not known, allowed: at_s, for_s, probability")
 
 
 # A formation
@@ -276,7 +333,7 @@ def test_sliders_that_rest_are_sent_together_and_once(bench: Bench):
     assert bench.desk.asked == []
     form.send(LATER_S)
     form.send(LATER_S + QUIET_S)
-    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0, "z_c": 4.0}, "over_s": OVER_S})]
+    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0, "z_c": 4.0}})]
 
 
 def test_a_slider_that_the_console_moves_asks_for_nothing(bench: Bench):
@@ -293,10 +350,36 @@ def test_sliders_follow_the_formation_but_for_those_that_somebody_moves(bench: B
     assert bench.gui.at["p [m]"].value == 5.0
     assert bench.gui.at["q [m]"].value == 8.0
     form.send(LATER_S)
-    form.refresh(bench.view(p=7.0), LATER_S + 1.0)
-    assert bench.gui.at["p [m]"].value == 5.0  # the formation is on its way there
-    form.refresh(bench.view(p=7.0), LATER_S + 100.0)
-    assert bench.gui.at["p [m]"].value == 7.0
+    for step in range(1, 20):
+        form.refresh(bench.view(p=7.0 - 0.1 * step), LATER_S + step)
+        assert bench.gui.at["p [m]"].value == 5.0  # the formation is on its way there
+    form.refresh(bench.view(p=5.1), LATER_S + 19.0 + 2 * STILL_S)  # it was held
+    assert bench.gui.at["p [m]"].value == 5.1
+
+
+def test_a_move_lasts_as_long_as_is_asked_for(bench: Bench):
+    form = bench.formation()
+    bench.gui.at["over [s]"].value = 20.0
+    form.target({"p": 5.0})
+    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0}, "over_s": 20.0})]
+
+
+@pytest.mark.parametrize("left_s", [0.0, LATER_S])
+def test_a_number_out_of_range_is_not_flown_to_the_limit_when_its_box_is_left(bench: Bench, left_s: float):
+    form = bench.formation()
+    box = bench.gui.at["y_c [m]"]
+    limit = form._ranges["y_c"].high
+    box.put(500.0)
+    form.send(left_s)
+    box.put(limit)  # the page does, when its box is left
+    form.send(LATER_S)
+    assert bench.desk.asked == []
+    assert [told.refusal.partition(";")[0] for told in bench.told] == ["y_c is 500 m"]
+    form.refresh(bench.view(y_c=-5.0), LATER_S)
+    assert box.value == -5.0
+    box.put(limit)  # somebody means it
+    form.send(LATER_S)
+    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {"y_c": limit}})]
 
 
 def test_a_value_out_of_range_is_told_and_not_sent(bench: Bench):
@@ -312,7 +395,7 @@ def test_of_many_variables_the_others_are_moved_one_at_a_time():
     bench.gui.at["variable"].value = hidden
     bench.gui.at["value [m or deg]"].value = 0.5
     bench.gui.press("Move it")
-    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {hidden: 0.5}, "over_s": OVER_S})]
+    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {hidden: 0.5}})]
 
 
 def test_trajectories_are_flown_as_they_are_typed(bench: Bench):

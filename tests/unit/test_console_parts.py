@@ -19,7 +19,7 @@ from zsim_agents.console import tables, typed
 from zsim_agents.console.controls import KnownControls
 from zsim_agents.console.door import Place
 from zsim_agents.console.guard import OPERATOR, VIEWER, Asked, Camera, Guard, may_pass
-from zsim_agents.console.history import EVERY_S, POINTS_MAX, History
+from zsim_agents.console.history import EVERY_S, POINTS_MAX, SPAN_S, History
 from zsim_agents.console.limits import foremost, ranges
 from zsim_agents.console.rates import Rates
 from zsim_agents.console.trails import APART_M, POINTS_OF_ONE, Trails
@@ -193,6 +193,15 @@ def test_curves_keep_the_last_minutes():
     assert np.isnan(true[0])
 
 
+def test_curves_of_a_fast_run_go_back_no_further():
+    history = History(1)
+    for k in range(100):
+        history.add(k * SPAN_S / 10, (1.0,), (2.0,), None)
+    t, *_ = history.curves(0, angular=False)
+    assert len(t) == 11
+    assert t[-1] - t[0] == pytest.approx(SPAN_S)
+
+
 def test_an_angle_that_goes_round_breaks_the_curve():
     history = History(1)
     for k, angle in enumerate((3.0, 3.1, 3.2, 3.3)):
@@ -207,6 +216,22 @@ def test_rates_follow_from_counts():
     assert rates.of("d1", 0, {"gps": (10, 0)}) == {}
     assert rates.of("d1", 2_000_000_000, {"gps": (19, 1)})["gps"] == pytest.approx(5.0)
     assert rates.of("d2", 2_000_000_000, {"gps": (50, 1)}) == {}
+
+
+def test_a_run_that_stands_still_adds_nothing_to_the_rates():
+    rates = Rates()
+    rates.of("d1", 0, {"gps": (0, 0)})
+    for _ in range(1000):
+        assert rates.of("d1", 500_000_000, {"gps": (5, 0)})["gps"] == pytest.approx(10.0)
+    assert len(rates._marks) == 2
+
+
+def test_rates_begin_anew_with_a_fresh_estimator():
+    rates = Rates()
+    rates.of("d1", 0, {"gps": (100, 0), "imu": (9, 0)})
+    assert rates.of("d1", 1_000_000_000, {"imu": (10, 0)}) == {}
+    assert rates.of("d1", 2_000_000_000, {"gps": (5, 0), "imu": (20, 0)})["imu"] == pytest.approx(10.0)
+    assert rates.of("d1", 3_000_000_000, {"gps": (2, 0), "imu": (30, 0)}) == {}
 
 
 # Limits
@@ -238,6 +263,18 @@ def test_what_is_out_of_range_is_refused_with_what_is_allowed():
     assert found["p"].shown(1.0) == 2.0
 
 
+@pytest.mark.parametrize(
+    ("altitude_m", "separation_m"), [(100.0, 0.0), (1.0, 20.0), (0.8, 25.0), (1e-3, 1e9), (10_000.0, 19.95)]
+)
+def test_every_range_has_room_whatever_the_scenario_allows(altitude_m: float, separation_m: float):
+    given = {"drones.drone1.limits.altitude_m": altitude_m, "clusters.main.gains.separation_min_m": separation_m}
+    scenario = scenario_file.load(SCENARIOS / "step.yaml", [f"{path}={value}" for path, value in given.items()])
+    cluster = scenario.clusters[0]
+    for found in ranges(scenario_space(scenario, cluster), cluster, scenario):
+        assert found.low < found.high, found.name
+        assert found.low <= found.shown(0.0) <= found.high
+
+
 def test_of_many_variables_those_of_the_whole_are_shown():
     scenario = scenario_file.load(SCENARIOS / "grid30.yaml")
     space = scenario_space(scenario, scenario.clusters[0])
@@ -263,18 +300,20 @@ def test_waypoints_are_read():
 
 
 def test_parameters_are_read():
-    assert typed.parameters("rotor: all, value: 0.5, velocity_m_s: [1, 2, 3]") == {
+    names = ("rotor", "value", "velocity_m_s")
+    assert typed.parameters("rotor: all, value: 1e3, velocity_m_s: [1, 2, 3]", names) == {
         "rotor": "all",
-        "value": 0.5,
+        "value": 1000.0,
         "velocity_m_s": [1, 2, 3],
     }
-    assert typed.parameters("") == {}
+    assert typed.parameters("", names) == {}
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("x_c", "line 1 is 'x_c'; must be VARIABLE = EXPRESSION"),
+        ("x_c = 5\nyc = 6", "yc is no variable, nor used as a constant; variables are x_c"),
         ("x_c = 1\nradius = wide", "line 2: radius is no variable, and as a constant is 'wide'; must be a number"),
         ("", "trajectory is empty"),
     ],
@@ -290,10 +329,28 @@ def test_a_waypoint_that_is_none_is_refused_in_words(text: str):
         typed.waypoints(text)
 
 
-@pytest.mark.parametrize("text", ["value", "value: [", "1: 2", "value:"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "value",
+        "value: [",
+        "1: 2",
+        "value:",
+        "value: 1, value: 2",
+        "value: &a 1, b: *a",
+        "value: 2024-13-45",
+        "[" * 2000,
+    ],
+    ids=lambda text: text[:20],
+)
 def test_parameters_that_are_none_are_refused_in_words(text: str):
     with pytest.raises(typed.TypedError, match="must be NAME: VALUE"):
-        typed.parameters(text)
+        typed.parameters(text, ("value",))
+
+
+def test_a_parameter_that_is_not_known_is_refused_by_its_name():
+    with pytest.raises(typed.TypedError, match="'target' is not known, allowed: at_s, value"):
+        typed.parameters("value: 2, target: drone2", ("at_s", "value"))
 
 
 # Who may pass
@@ -453,5 +510,6 @@ def test_a_link_names_this_machine_where_all_may_come():
     assert Place("127.0.0.1", 8080).address() == "http://127.0.0.1:8080/"
     assert Place("::1", 8080).address("/view") == "http://[::1]:8080/view"
     for everywhere in ("0.0.0.0", "::"):
+        assert Place(everywhere, 8080).address("/", "a b&#").endswith(":8080/?token=a%20b%26%23")
         address = Place(everywhere, 8080).address("/", "steer")
         assert address == f"http://{socket.gethostname()}:8080/?token=steer"

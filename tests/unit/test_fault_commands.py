@@ -1,10 +1,17 @@
 """`zsim fault`: what a person types becomes a request, or a line."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 import typer
 
+from zsim import keys
+from zsim.errors import SessionError
+from zsim.fault_flaws import COMMON
 from zsim.fault_kinds import KINDS
 from zsim.messages import Fault
+from zsim.session import Session
 from zsim_deploy import fault_commands
 from zsim_deploy.fault_commands import row, seconds, selector
 
@@ -22,6 +29,11 @@ def test_what_is_no_duration(text: str):
         seconds(text)
 
 
+@pytest.mark.parametrize("name", sorted({each.name for kind in KINDS.values() for each in kind.parameters}))
+def test_every_parameter_of_every_kind_can_be_typed(name: str):
+    assert fault_commands._values([f"{name}=1"]) == {name: 1}
+
+
 def test_parameters():
     given = ["factor=3", "value_m=[2, 0, -1]", "place={controller.main: d1}", "rotor=all", "one_way=true"]
     assert fault_commands._values(given) == {
@@ -37,6 +49,29 @@ def test_parameters():
 def test_what_is_no_parameter(text: str):
     with pytest.raises(typer.BadParameter):
         fault_commands._values([text])
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        (["target=drone2"], "target is no parameter of a kind; give it by the argument TARGET"),
+        (["kind=gps_stuck"], "kind is no parameter of a kind; give it by the argument KIND"),
+        (["for_s=2"], "for_s is no parameter of a kind; give it by --for"),
+        (["at_s=2"], "at_s is no parameter of a kind; give it by --at"),
+        (["factor=2", "factor=3"], "factor is given twice; must be given once"),
+    ],
+)
+def test_what_is_given_elsewhere_or_twice_is_no_parameter(given: list[str], line: str):
+    with pytest.raises(typer.BadParameter, match=line):
+        fault_commands._values(given)
+    assert set(fault_commands.GIVEN_BY) == set(COMMON)
+
+
+@pytest.mark.parametrize("value", [10**20, [0, 10**24], {10**20: 1}, "\udcff"], ids=ascii)
+def test_what_fits_into_no_message_is_refused_in_a_line(value: Any):
+    nowhere: Any = SimpleNamespace()
+    with pytest.raises(SessionError, match=r"world/control: fault_add cannot be sent .*must hold whole numbers"):
+        Session.request(nowhere, keys.CONTROL, "fault_add", "zsim.fault", {"value": value})
 
 
 @pytest.mark.parametrize(

@@ -101,6 +101,18 @@ def test_what_has_ended_stays_on_the_list_while_somebody_may_work_on_its_gates()
     assert listed(made) == [[]]
 
 
+def test_nothing_is_kept_of_what_has_left_the_list():
+    made = world("[{kind: gps_dropout, target: d1, at_s: 0.02, for_s: 0.04}]")
+    go(made, 1)
+    add(made, "mag_stuck", "d2")
+    go(made, 1)
+    ask(made, "fault_clear", kind="mag_stuck")
+    assert made.faults._begun
+    go(made, 8)
+    assert made.faults.all == ()
+    assert made.faults._begun == made.faults._over == set()
+
+
 def test_a_kill_has_no_end():
     made = world("[{kind: process_kill, target: estimator.d1, at_s: 0.04}]")
     go(made, 8)

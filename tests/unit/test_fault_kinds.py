@@ -80,6 +80,13 @@ def test_every_parameter_is_checked(kind: str, bad: Any):
         (sound("link_cut", target="world/estimator.drone9"), "target is 'world/estimator.drone9'; 'estimator.drone9' must be estimator.NAME of drone1, drone2 (link_cut)"),
         (sound("link_cut", target="console.1/gateway.main"), "target is 'console.1/gateway.main'; one of them must be the world or a process that takes part, as estimator.drone1 (link_cut)"),
         (sound("radio", place={"controller.main": "drone9"}), "place.controller.main is 'drone9'; must be a drone or [x, y, z] in m (radio)"),
+        (sound("link_cut", target="world/controler.main"), "target is 'world/controler.main'; 'controler.main' must be controller.main, or a name less like it (link_cut)"),
+        (sound("link_cut", target="wrld/controller.main"), "target is 'wrld/controller.main'; 'wrld' must be world, or a name less like it (link_cut)"),
+        (sound("link_cut", target="world/recorder", one_way=True), "target is 'world/recorder', one way, and 'recorder' is outside of the lockstep; the second must be the world or a process that takes part, as estimator.drone1 (link_cut)"),
+        (sound("radio", place={"controler.main": "drone1"}), "place.controler.main names no process; must be controller.main, or a name less like it (radio)"),
+        (sound("radio", place={"controller.man": "drone1"}), "place.controller.man names no process; must be controller.NAME of main (radio)"),
+        (sound("radio", place={"estimator.drone9": [0, 0, 1]}), "place.estimator.drone9 names no process; must be estimator.NAME of drone1, drone2 (radio)"),
+        (sound("radio", place={3: "drone1"}), "place.3 names no process; must be 1 to 48 of a-z 0-9 _ . - (radio)"),
         (sound("gps_dropout", at_s=-1), "at_s is -1; must be from 0 to 1e+06 s (gps_dropout)"),
         (sound("gps_dropout", for_s=0), "for_s is 0; must be > 0 and <= 1e+06 s (gps_dropout)"),
         (sound("gps_dropout", value=3), "value is not known; allowed: kind, target, at_s, for_s, probability (gps_dropout)"),
@@ -103,6 +110,26 @@ def test_links_of_others_and_of_one_s_own_processes_are_taken():
     for target in ("console.1/world", "my.filter/controller.main", "estimator.drone1/estimator.drone2"):
         assert list(flaws(sound("link_cut", target=target), KNOWN)) == []
     assert list(flaws(sound("process_kill", target="my.filter"), KNOWN)) == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["my.filter", "pilot", "estimator2.drone1", "my_estimator.drone1", "controllers.main", "control.main", "contr.x"],
+)
+def test_a_name_of_one_s_own_is_taken_before_it_has_joined(name: str):
+    assert list(flaws(sound("radio", place={name: "drone1"}), KNOWN)) == []
+    for target in (f"{name}/world", f"world/{name}"):
+        assert list(flaws(sound("link_cut", target=target, one_way=True), KNOWN)) == []
+
+
+def test_a_name_that_looks_mistyped_is_taken_of_one_that_takes_part():
+    known = Known(("drone1",), ("main",), ("controler.main",))
+    assert list(flaws(sound("link_cut", target="world/controler.main"), known)) == []
+
+
+def test_one_way_from_one_outside_of_the_lockstep_is_taken():
+    for target in ("console.1/world", "recorder/controller.main"):
+        assert list(flaws(sound("link_cut", target=target, one_way=True), KNOWN)) == []
 
 
 def test_a_kill_of_who_would_not_hear_of_it_is_a_flaw():

@@ -112,6 +112,8 @@ class FaultDesk:
         past = [fault.id for fault in self.all if _end_ns(fault) + late_ns <= now_ns]
         for number in past:
             del self._faults[number]
+        self._begun.difference_update(past)
+        self._over.difference_update(past)
         if past:
             self._tell()
 

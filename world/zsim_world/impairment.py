@@ -128,9 +128,9 @@ def dropped(limit: float, probability: float) -> float:
 
 
 def gust_m_s(fault: Fault, t_ns: int) -> NDArray[np.float64]:
-    """Return the velocity that a gust adds [m/s; W]: v (1 - cos(2 pi t / T)) / 2, the form of MIL-HDBK-1797, discrete.
+    """Return the velocity that a gust adds [m/s; W]: v (1 - cos(2 pi t / T)) / 2, as in CS 25.341(a)(2).
 
-    Over its length T it rises to v and falls again.
+    Over its length T, twice the gust gradient distance there, it rises to v and falls again.
     """
     assert fault.until_ns is not None  # a gust always has a length
     phase = 2.0 * math.pi * (t_ns - fault.from_ns) / (fault.until_ns - fault.from_ns)

@@ -5,7 +5,7 @@ from typing import Any
 
 import viser
 
-from zsim.fault_kinds import KINDS
+from zsim.fault_kinds import KINDS, PROCESS_KILL
 from zsim.scenario import Scenario
 from zsim_agents.console import typed
 from zsim_agents.console.desk import Desk, Told
@@ -14,6 +14,7 @@ FOR_S = 30.0  # of a fault, unless another time is typed
 WEAK = 0.7  # share of thrust of a weak motor: less, and the aircraft cannot be held level
 GUST_M_S = (4.0, 0.0, 0.0)  # about what the drones of the formation can still hold against
 LOSS = 0.3
+TIMES = ("at_s", "for_s")  # s, simulated; what any fault may be given beside its own parameters
 
 
 class FaultForm:
@@ -36,9 +37,7 @@ class FaultForm:
         self._button(gui, "Motor weak", lambda: self._on_drone("rotor_efficiency", rotor="front_left", value=WEAK))
         self._button(gui, "Gust", lambda: self._add("gust", "world", velocity_m_s=list(GUST_M_S)))
         self._button(gui, "Link loss", lambda: self._add("link_loss", f"world/{self._estimator()}", probability=LOSS))
-        self._button(gui, "Kill estimator", lambda: self._desk.world(
-            "fault_add", kind="process_kill", target=self._estimator()
-        ))  # fmt: skip
+        self._button(gui, "Kill estimator", lambda: self._add(PROCESS_KILL, self._estimator()))
         self._any(gui, names)
         gui.add_button("Clear all faults", color="green").on_click(lambda _: desk.world("fault_clear"))
 
@@ -52,15 +51,15 @@ class FaultForm:
         self._add(kind, self._drone.value, **parameters)
 
     def _add(self, kind: str, target: str, **parameters: Any) -> None:
-        lasting = {"for_s": float(self._for.value)} if self._for.value > 0 else {}
-        self._desk.world("fault_add", kind=kind, target=target, **lasting, **parameters)
+        lasting = {"for_s": float(self._for.value)} if self._for.value > 0 and KINDS[kind].lasts != "once" else {}
+        self._desk.world("fault_add", kind=kind, target=target, **{**lasting, **parameters})
 
     def _any(self, gui: viser.GuiApi, names: list[str]) -> None:
         with gui.add_folder("Any fault", expand_by_default=False):
             kind = gui.add_dropdown("kind", list(KINDS))
             target = gui.add_text("target", names[0], hint="drone, world, process, or link A/B")
             help_ = gui.add_markdown(_help(kind.value))
-            text = gui.add_text("parameters", "", hint="NAME: VALUE, NAME: VALUE, …")
+            text = gui.add_text("parameters", "", hint="NAME: VALUE, NAME: VALUE, …; at_s and for_s too")
             kind.on_update(lambda _: setattr(help_, "content", _help(kind.value)))
             gui.add_button("Inject it", color="orange").on_click(
                 lambda _: self._inject(kind.value, target.value, text.value)
@@ -68,7 +67,7 @@ class FaultForm:
 
     def _inject(self, kind: str, target: str, text: str) -> None:
         try:
-            parameters = typed.parameters(text)
+            parameters = typed.parameters(text, [*TIMES, *(p.name for p in KINDS[kind].parameters)])
         except typed.TypedError as error:
             self._tell(Told("fault_add", str(error)))
             return

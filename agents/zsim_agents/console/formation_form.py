@@ -1,7 +1,5 @@
 """Steering of one formation: phases, sliders of its variables, trajectories."""
 
-import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -14,10 +12,10 @@ from zsim_agents.console import typed
 from zsim_agents.console.desk import Desk, Told
 from zsim_agents.console.limits import Range, foremost
 from zsim_agents.console.picture import SHAPED
+from zsim_agents.console.variable_slider import VariableSlider
 
-QUIET_S = 0.3  # wall; for so long a slider must rest before its value is sent
-REST_S = 2.0  # wall; for so long after a move a slider is not taken back to where the formation is to be
-OVER_S = 5.0  # simulated; of a move, unless another is typed
+QUIET_S = 1.0  # wall; for so long sliders must rest before their values are sent: people type slowly
+OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
 OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Land": "land"}
 ICONS = {
     "takeoff": viser.Icon.PLANE_DEPARTURE,
@@ -49,14 +47,12 @@ class FormationForm:
         self._cluster = cluster
         self._space = space
         self._ranges = {each.name: each for each in ranges}
-        self._lock = threading.Lock()
-        self._moved: dict[str, tuple[float, float]] = {}  # what was moved, to where, and when on the wall
-        self._kept_s: dict[str, float] = {}  # until when on the wall a slider is left where it was put
         for label, op in OPERATIONS.items():
             self._button(gui, label, op)
-        self._over = gui.add_number("over [s]", OVER_S, min=0.1, max=600.0, step=0.5, hint="Duration of a move")
+        hint = "Duration of a move; 0: as fast as the robots' limits let it"
+        self._over = gui.add_number("over [s]", 0.0, min=0.0, max=OVER_MAX_S, step=0.5, hint=hint)
         shown = foremost(space.names)
-        self._sliders = {name: self._slider(gui, self._ranges[name]) for name in shown}
+        self._sliders = {name: VariableSlider(gui, self._ranges[name]) for name in shown}
         if len(shown) < space.size:
             self._one_of_many(gui, [name for name in space.names if name not in shown])
         self._trajectories(gui, cluster.plan.trajectory)
@@ -67,50 +63,41 @@ class FormationForm:
             return
         shown = view.desired if view.phase in SHAPED else view.value
         for name, slider in self._sliders.items():
-            if name not in self._moved and wall_s > self._kept_s.get(name, 0.0):
-                slider.value = self._ranges[name].shown(shown[self._space.index(name)])
+            slider.follow(shown[self._space.index(name)], wall_s)
 
     def send(self, wall_s: float) -> None:
         """Ask for what the sliders that have come to rest show."""
-        with self._lock:
-            moved = self._moved
-            if not moved or wall_s - max(at_s for _, at_s in moved.values()) < QUIET_S:
-                return
-            self._moved = {}
-        for name in moved:
-            self._kept_s[name] = wall_s + REST_S + float(self._over.value)
-        self.target({name: value for name, (value, _) in moved.items()})
+        moved_s = [slider.moved_s for slider in self._sliders.values()]
+        if wall_s - max((at_s for at_s in moved_s if at_s is not None), default=wall_s) < QUIET_S:
+            return
+        moved = {name: value for name, slider in self._sliders.items() if (value := slider.take()) is not None}
+        if self.target(moved):
+            for name in moved:
+                self._sliders[name].keep(wall_s)
 
-    def target(self, shown: dict[str, float]) -> None:
-        """Ask for values as they are shown."""
+    def target(self, shown: dict[str, float]) -> bool:
+        """Ask for values as they are shown; return whether they could be asked for."""
         refusals = [refusal for name, value in shown.items() if (refusal := self._ranges[name].refusal(value))]
         if refusals:
             self._tell(Told(f"{self._cluster.name}: target", "; ".join(refusals)))
-            return
+            return False
         values = {name: self._ranges[name].meant(value) for name, value in shown.items()}
-        self._desk.cluster(self._cluster.name, "target", values=values, over_s=float(self._over.value))
+        lasting = {"over_s": float(self._over.value)} if self._over.value > 0 else {}
+        self._desk.cluster(self._cluster.name, "target", values=values, **lasting)
+        return True
 
     def _button(self, gui: viser.GuiApi, label: str, op: str) -> None:
         button = gui.add_button(label, icon=ICONS[op], color="blue" if op in ("takeoff", "engage") else "gray")
         button.on_click(lambda _: self._desk.cluster(self._cluster.name, op))
 
-    def _slider(self, gui: viser.GuiApi, range_: Range) -> Any:
-        start = range_.shown(0.0)
-        slider = gui.add_slider(range_.label, range_.low, range_.high, range_.step, start)
-
-        def moved(event: viser.GuiEvent[Any]) -> None:
-            if event.client_id is not None:  # by a person, not by `refresh`
-                with self._lock:
-                    self._moved[range_.name] = (float(slider.value), time.monotonic())
-
-        slider.on_update(moved)
-        return slider
-
     def _one_of_many(self, gui: viser.GuiApi, names: list[str]) -> None:
         with gui.add_folder("Other variables", expand_by_default=False):
             name = gui.add_dropdown("variable", names)
             value = gui.add_number("value [m or deg]", 0.0, step=0.1)
-            gui.add_button("Move it").on_click(lambda _: self.target({name.value: float(value.value)}))
+            gui.add_button("Move it").on_click(lambda _: self._move(name.value, float(value.value)))
+
+    def _move(self, name: str, shown: float) -> None:
+        self.target({name: shown})
 
     def _trajectories(self, gui: viser.GuiApi, planned: Trajectory | None) -> None:
         with gui.add_folder("Trajectory", expand_by_default=False):

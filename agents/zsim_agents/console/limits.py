@@ -11,8 +11,9 @@ AWAY_M = 50.0  # of the drones' starts, sideways; chosen: as far as a page shows
 HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # chosen: clear of the ground, and what an AR.Drone's owner would still see
 SIDE_MAX_M = 20.0  # of a formation; chosen
 DEPART_M = 5.0  # of a robot from its place in a template; chosen
-TILT_MAX_DEG = 45.0  # of a formation; at 90 degrees its frame does not exist
+TILT_MAX_DEG = 29.0  # of a formation; controllers take less than 30, reference_check.py
 CORNER_DEG = 10.0  # least angle at a corner; at 0 and at 180 degrees robots stand in line
+DIGITS = 6  # of a value as it is shown: 5.1, not 5.1000000000000005
 STEPS = {"m": 0.1, "deg": 1.0}
 FEW = 16  # variables that a page shows one by one; of more, those of the whole formation
 
@@ -39,7 +40,7 @@ class Range(NamedTuple):
     def shown(self, value: float) -> float:
         """Return a value [m, rad] in the unit of the range, to its step, within it."""
         found = math.degrees(math.remainder(value, math.tau)) if self.unit == "deg" else value
-        return min(max(round(found / self.step) * self.step, self.low), self.high)
+        return min(max(round(round(found / self.step) * self.step, DIGITS), self.low), self.high)
 
     def meant(self, shown: float) -> float:
         """Return the value [m, rad] of what is shown."""
@@ -57,11 +58,12 @@ def ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> list[Ra
     starts = [scenario.drone(name).position_m for name in cluster.drones]
     top_m = min(HEIGHT_MAX_M, *(scenario.drone(name).limits.altitude_m for name in cluster.drones))
     centre = [sum(p[axis] for p in starts) / len(starts) for axis in range(2)]
-    side = (max(cluster.gains.separation_min_m, STEPS["m"]), SIDE_MAX_M)
+    apart_m = max(cluster.gains.separation_min_m, STEPS["m"])
+    side = (apart_m, max(SIDE_MAX_M, 2.0 * apart_m))
     bounds = {
         "x_c": (round(centre[0]) - AWAY_M, round(centre[0]) + AWAY_M),
         "y_c": (round(centre[1]) - AWAY_M, round(centre[1]) + AWAY_M),
-        "z_c": (HEIGHT_MIN_M, top_m),
+        "z_c": (min(HEIGHT_MIN_M, top_m / 2.0), top_m),
         **dict.fromkeys(("p", "q", "rho"), side),
         **dict.fromkeys(("roll", "pitch", "elevation"), (-TILT_MAX_DEG, TILT_MAX_DEG)),
         "beta": (CORNER_DEG, 180.0 - CORNER_DEG),

@@ -12,7 +12,7 @@ from zsim_agents.console.fault_form import FaultForm
 from zsim_agents.console.formation_form import FormationForm
 from zsim_agents.console.limits import ranges
 from zsim_agents.console.plots import Plots
-from zsim_agents.console.run_form import DroneForm, RunForm
+from zsim_agents.console.run_form import DroneForm, FleetForm, RunForm
 
 PANEL_PX = 330
 SWITCHES = {
@@ -75,9 +75,7 @@ class Page:
     def _right(self, gui: viser.GuiApi) -> None:
         self.clock = gui.add_html("")
         self.phases = gui.add_html("")
-        everybody = [drone.name for drone in self._scenario.drones]
-        stop = gui.add_button("EMERGENCY – all rotors stop", color="red", icon=viser.Icon.ALERT_OCTAGON)
-        stop.on_click(lambda _: self._desk.mode(everybody, "emergency"))
+        FleetForm(gui, self._desk, self._scenario)
         if len(self._spaces) > 1:
             choice = gui.add_dropdown("formation", list(self._spaces))
             choice.on_update(lambda _: self._choose(choice.value))

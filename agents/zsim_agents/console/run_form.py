@@ -6,6 +6,8 @@ from zsim.limits import GATES_MAX, RATE_MAX
 from zsim.scenario import Scenario
 from zsim_agents.console.desk import Desk
 
+FLEET = {"Take off all": "takeoff", "Land all": "land"}  # an operation of a formation, and a mode of a drone
+
 
 class RunForm:
     """Pause, go on, single steps, rate.
@@ -28,8 +30,37 @@ class RunForm:
         gui.add_button("Set rate").on_click(lambda _: desk.world("rate", value=float(wanted.value)))
 
 
+class FleetForm:
+    """Emergency, take-off and landing of all drones.
+
+    Formations take off and land by their controllers, drones of none each by itself.
+
+    Args:
+        gui: viser's, in the place where they are to be.
+        desk: sends what is asked for.
+        scenario: names the drones and formations.
+    """
+
+    def __init__(self, gui: viser.GuiApi, desk: Desk, scenario: Scenario) -> None:
+        self._desk = desk
+        self._formations = [cluster.name for cluster in scenario.clusters]
+        in_formation = {name for cluster in scenario.clusters for name in cluster.drones}
+        everybody = [drone.name for drone in scenario.drones]
+        self._single = [name for name in everybody if name not in in_formation]
+        stop = gui.add_button("EMERGENCY – all rotors stop", color="red", icon=viser.Icon.ALERT_OCTAGON)
+        stop.on_click(lambda _: desk.mode(everybody, "emergency"))
+        both = gui.add_button_group("all drones", list(FLEET))
+        both.on_click(lambda _: self._ask(FLEET[both.value]))
+
+    def _ask(self, what: str) -> None:
+        for name in self._formations:
+            self._desk.cluster(name, what)
+        if self._single:
+            self._desk.mode(self._single, what)
+
+
 class DroneForm:
-    """Take-off, landing and emergency of one drone; of all of them, what has no formation to do it.
+    """Take-off, landing and emergency of one drone.
 
     Args:
         gui: viser's, in the place where they are to be.

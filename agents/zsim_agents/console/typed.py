@@ -1,8 +1,10 @@
 """What an operator types into the page, as requests: trajectories, waypoints, parameters of a fault. Pure."""
 
+import re
+from collections.abc import Collection
 from typing import Any
 
-import yaml
+from zsim import yaml_file
 
 
 class TypedError(ValueError):
@@ -28,6 +30,9 @@ def expressions(text: str, names: tuple[str, ...]) -> dict[str, Any]:
             constants[name] = _number(value, f"line {number}: {name} is no variable, and as a constant")
     if not found:
         raise TypedError("trajectory is empty; must have a line VARIABLE = EXPRESSION at least")
+    for name in constants:
+        if not any(re.search(rf"\b{re.escape(name)}\b", expression) for expression in found.values()):
+            raise TypedError(f"{name} is no variable, nor used as a constant; variables are {', '.join(names)}")
     return {"expressions": found, "constants": constants}
 
 
@@ -50,18 +55,22 @@ def waypoints(text: str) -> dict[str, Any]:
     return {"waypoints": found}
 
 
-def parameters(text: str) -> dict[str, Any]:
+def parameters(text: str, names: Collection[str]) -> dict[str, Any]:
     """Return a fault's own parameters, of `name: value, name: value`.
 
     Raises:
-        TypedError: it is no such list.
+        TypedError: it is no such list, or names something that is not among `names`.
     """
+    given, allowed = f"parameters are {text[:40]!r}", "must be NAME: VALUE, NAME: VALUE, …"
     try:
-        found = yaml.safe_load("{" + text + "}")
-    except yaml.YAMLError:
-        found = None
+        found = yaml_file.value("{" + text + "}")
+    except ValueError as error:
+        raise TypedError(f"{given}: {error}; {allowed}") from None
     if not isinstance(found, dict) or not all(isinstance(name, str) for name in found) or None in found.values():
-        raise TypedError(f"parameters are {text[:40]!r}; must be NAME: VALUE, NAME: VALUE, …")
+        raise TypedError(f"{given}; {allowed}")
+    for name in found:
+        if name not in names:
+            raise TypedError(f"{given}; {name[:40]!r} is not known, allowed: {', '.join(names)}")
     return found
 
 
