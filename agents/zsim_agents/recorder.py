@@ -19,6 +19,7 @@ from zsim.connection import read_info
 from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, SupersededError
 from zsim.health import HealthMeter
 from zsim.record import RecordWriter
+from zsim.record.writer import CHANNELS_MAX
 from zsim.replay import replay
 from zsim.session import Sample, Session
 
@@ -86,6 +87,7 @@ class Recorder:
         self._stopped_s: float | None = None
         self._now_ns = 0
         self._seq = {"join": 0, "bye": 0, "health": 0}
+        self._left_out = 0
         self._leavers: set[str] = set()
         self._joined: set[str] = set()
         self.health = HealthMeter(NAME, host=link.host)
@@ -108,6 +110,9 @@ class Recorder:
         finally:
             self._over.set()
             ticker.join()
+        if self._left_out:
+            why = f"a record holds {CHANNELS_MAX} keys, and theirs are further ones"
+            self._say_line(f"{self._name}: {self._left_out} messages are not on record: {why}")
         if self._successor:
             raise SupersededError(
                 f"{self._name}: another process of this name joined from {self._successor}; this one ends, its record "
@@ -145,6 +150,7 @@ class Recorder:
             for sample in self._views.drain():
                 self._write(sample.key, sample.payload)
             self._writer.tick(time.monotonic_ns())
+            self._count_left_out()
             if self._successor:
                 return "superseded"
             if self._is_another_run():
@@ -153,6 +159,11 @@ class Recorder:
                 return "stopped"
             if self._ended_s is not None and self._all_left():
                 return "the run ended"
+
+    def _count_left_out(self) -> None:
+        """Count among the refused what the record has no room for."""
+        self.health.refused += self._writer.refused - self._left_out
+        self._left_out = self._writer.refused
 
     def _may_stop(self) -> bool:
         """Tell whether it was told to stop and the run does not end meanwhile."""
@@ -168,6 +179,7 @@ class Recorder:
 
     def _catch_up(self) -> None:
         """Write what was said before this process came: the world keeps it for those who ask."""
+        self._write_lasting()
         while not self._caught_up and not self._stopped():
             try:
                 for key, payload in replay(self._link, self._name, -1, ["**"], REPLAY_S):
@@ -176,6 +188,15 @@ class Recorder:
                 self._caught_up = True
             except NoWorldError:
                 self._over.wait(TICK_S)
+
+    def _write_lasting(self) -> None:
+        """Write of what run this is, and the newest faults: said long ago, the replay has them no longer."""
+        lasting = {keys.INFO: messages.encode(self._info)}
+        for key in (keys.INFO, keys.FAULTS):
+            lasting |= {sample.key: sample.payload for sample in self._link.get(key)}
+        for key, payload in lasting.items():
+            self._write(key, payload)
+            self._know(key, payload)
 
     def _know(self, key: str, payload: bytes) -> None:
         """Remember what the world has replayed: the newest of it comes in a batch too."""
@@ -202,7 +223,6 @@ class Recorder:
         else:
             self.health.received += len(bundle)
             self._now_ns = bundle.t_ns
-            bundle.buffer = bytearray(bundle.buffer)
             self._writer.add_bundle(bundle, time.time_ns())
 
     def _write(self, key: str, payload: bytes) -> None:

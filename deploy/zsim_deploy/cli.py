@@ -148,7 +148,7 @@ def report(
     ] = None,
 ) -> None:
     """Make summary.json, figures and report.html of a run from its record, or of a sweep; or compare several runs."""
-    from zsim_deploy.look import report_path
+    from zsim_deploy.run_folder import record_in
     from zsim_deploy.sweep.plan import is_sweep
 
     if len(directories) > 1:
@@ -160,7 +160,7 @@ def report(
     if is_sweep(directory):
         sweep_commands.make_report(directory)
         return
-    report_path(directory)
+    record_in(directory)
     _report(directory)
 
 
@@ -191,14 +191,14 @@ def _report(directory: Path) -> None:
 def _compare(directories: list[Path], out: Path | None) -> None:
     from rich.console import Console
 
-    from zsim_deploy.look import report_path
     from zsim_deploy.report import compare, comparison_path
+    from zsim_deploy.run_folder import record_in
     from zsim_deploy.sweep.plan import is_sweep
 
     for directory in directories:
         if is_sweep(directory):
             raise typer.BadParameter(f"{directory} is a sweep; runs can be compared, a sweep has a report of its own")
-        report_path(directory)
+        record_in(directory)
     page = out or comparison_path(directories)
     with Console(stderr=True).status("reading the records …") as status:
         compare(directories, page, lambda text: status.update(text))

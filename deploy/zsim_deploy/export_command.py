@@ -17,7 +17,7 @@ app = typer.Typer()
 
 @app.command(rich_help_panel=PANEL)
 def export(
-    directory: Annotated[Path, typer.Argument(help="Folder of a run.", show_default=False)],
+    run: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run, or its record.", show_default=False)],
     form: Annotated[
         Format, typer.Option("--format", help="Tables (csv, parquet), a MATLAB file, or an MCAP file for Foxglove.")
     ],
@@ -41,11 +41,11 @@ def export(
     from rich.progress import Progress
 
     from zsim_deploy.export.form import check_installed
-    from zsim_deploy.look import report_path
+    from zsim_deploy.run_folder import record_at
 
     if from_ is not None and to is not None and to < from_:
         raise typer.BadParameter(f"--to is {to:g}, before --from {from_:g}; must be at or after it")
-    report_path(directory)
+    record_at(run)
     check_installed(form)
     from zsim_deploy.export.make import export as write
     from zsim_deploy.export.selection import Selection
@@ -55,7 +55,7 @@ def export(
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("looking through the record", total=None)
         done = write(
-            directory,
+            run,
             form,
             out,
             Selection(tuple(keys or ()), from_, to),

@@ -4,17 +4,17 @@ import math
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from zsim import keys, messages
-from zsim.errors import DecodeError, RunError
-from zsim.session import Mailbox, Sample, Session
+from zsim.errors import DecodeError
+from zsim.session import Mailbox, Sample, Session, check_expression
 
 LISTEN_S = 1.0  # wall time that `keys` listens: every key of the contract that lives speaks at least once a second
 PACKET_S = 0.05  # wait between two looks into an empty mailbox
+LINE_S = 1.0  # between two lines of `hz`
 SILENCE_S = 1.0  # from which on a key that spoke is said to be silent; later where its own gaps are longer
 
 
@@ -39,14 +39,22 @@ def echo(link: Session, expression: str, count: int | None, emit: Callable[[str,
 
 
 def readable(sample: Sample) -> Any:
-    """Return a message as plain data; what is not of the contract is decoded as far as it goes."""
+    """Return a message as JSON can say it; what is not of the contract is decoded as far as it goes."""
     try:
-        return msgspec.to_builtins(messages.decode(sample.key, sample.payload))
+        return _plain(messages.decode(sample.key, sample.payload))
     except DecodeError as error:
         try:
-            return msgspec.msgpack.decode(sample.payload)
+            return _plain(msgspec.msgpack.decode(sample.payload))
         except messages.REFUSALS:
             return {"refused": str(error), "bytes": len(sample.payload)}
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON can say it: bytes in base64, in Python's words what it has no form for."""
+    try:
+        return msgspec.to_builtins(value, str_keys=True, enc_hook=repr)
+    except messages.REFUSALS:  # a key that is neither text nor a number, say
+        return repr(value)
 
 
 class Rate:
@@ -80,13 +88,26 @@ class Rate:
 
 
 def hz(link: Session, expression: str, window: int, seconds: float, emit: Callable[[str], None]) -> None:
-    """Tell once a second, and at the end, how often messages come on an expression."""
-    box, rate = link.subscribe(expression), Rate(window)
-    head = msgspec.msgpack.Decoder(_Stamp)
+    """Tell once a second, and at the end, how often messages come on an expression.
+
+    Raises:
+        SessionError: it is no key expression.
+    """
+    check_expression(expression)
+    arrived: deque[tuple[float, bytes]] = deque()
+
+    def arrive(sample: Sample) -> None:  # in Zenoh's thread, so that a gap is one between messages
+        if sample.payload:  # empty: a deletion
+            arrived.append((time.monotonic(), sample.payload))
+
+    link.on_message(expression, arrive)
+    rate, head = Rate(window), msgspec.msgpack.Decoder(_Stamp)
     until_s = time.monotonic() + seconds
-    while time.monotonic() < until_s:
-        for sample in _samples(box, min(time.monotonic() + 1.0, until_s)):
-            rate.add(time.monotonic(), _stamp(head, sample.payload))
+    while (now_s := time.monotonic()) < until_s:
+        time.sleep(min(LINE_S, until_s - now_s))
+        for _ in range(len(arrived)):
+            wall_s, payload = arrived.popleft()
+            rate.add(wall_s, _stamp(head, payload))
         nothing = f"no message on {expression} yet; `zsim keys` lists what speaks"
         emit(rate.line(time.monotonic()) if rate.total else nothing)
 
@@ -118,15 +139,3 @@ def _samples(box: Mailbox, until_s: float) -> Iterator[Sample]:
                 return
         if not arrived:
             time.sleep(min(PACKET_S, max(0.0, until_s - time.monotonic())))
-
-
-def report_path(directory: Path) -> Path:
-    """Return the record in a run's folder.
-
-    Raises:
-        RunError: there is none.
-    """
-    path = directory / "run.mcap"
-    if not path.is_file():
-        raise RunError(f"{directory}: holds no run.mcap; give the folder of a run, as `zsim run` printed it")
-    return path

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from zsim import keys, messages, scenario_file
-from zsim.errors import DecodeError, RecordError, RunError
+from zsim.errors import DecodeError, RecordError
 from zsim.record import RecordReader
 from zsim.scenario import Scenario
+from zsim_deploy.run_folder import record_at
 
 
 class Opened(NamedTuple):
@@ -28,10 +29,7 @@ def opened(place: Path) -> Iterator[Opened]:
         RecordError: it is no record, or does not say which run it is of.
         ScenarioError: its scenario is none of this version.
     """
-    path = place / "run.mcap" if place.is_dir() else place
-    if not path.is_file():
-        raise RunError(f"{place}: holds no run.mcap; give the folder of a run, as `zsim run` printed it, or the file")
-    with RecordReader(path) as reader:
+    with RecordReader(record_at(place)) as reader:
         info = _info(reader)
         yield Opened(reader, info, scenario_file.from_text(info.scenario))
 

@@ -1,7 +1,7 @@
 """A record played back onto the keys by a process that stands in for the world."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ from zsim_deploy.lent import lent
 from zsim_deploy.progress import Screen
 from zsim_deploy.replay_record import opened
 from zsim_deploy.roles import told
+from zsim_deploy.run_folder import record_notes
 from zsim_world.playback import Choice, Playback
 from zsim_world.process import run
 
@@ -60,7 +61,7 @@ def play(place: Path, wish: Wish, who: Identity) -> None:
             where = f"{scenario.federation!r} on {', '.join(wish.endpoints)}"
             text = f"replay of run {info.run_id} as {where}; Ctrl-C ends it"
             run(playback, wish.endpoints, leash.reason, told(screen), lambda: screen.say(text), who)
-            for note in _notes(reader):
+            for note in record_notes(reader.complete, reader.damaged):
                 screen.say(note)
             screen.say(f"ended: {playback.ended}")
 
@@ -71,11 +72,3 @@ def _check(expressions: Sequence[str], reader: RecordReader) -> None:
     for expression in expressions:
         if not any(keys.matches(expression, key) for key in on_record):
             raise RunError(f"--keys is {expression!r}; must match a key on record: {', '.join(list(on_record)[:20])} …")
-
-
-def _notes(reader: RecordReader) -> Iterator[str]:
-    """Yield what a person has to know of what was played."""
-    if not reader.complete:
-        yield "the record was cut: what was written before was played"
-    if reader.damaged:
-        yield f"{reader.damaged} chunks of the record are damaged and were passed over"

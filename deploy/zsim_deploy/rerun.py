@@ -9,11 +9,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from zsim import __version__, messages
 from zsim.errors import RecordError, RunError
 from zsim.fingerprint import fingerprint
+from zsim.record import RecordReader
 from zsim_deploy.progress import Screen, Throttle
 from zsim_deploy.replay_record import Opened, opened
 from zsim_deploy.rerun_bus import RerunBus
@@ -23,6 +24,7 @@ from zsim_deploy.rerun_tape import Passage, passages
 from zsim_world.world import World
 
 Say = Callable[[str], None]
+State = Literal["whole", "cut", "damaged"]  # of a record
 
 
 class Flown(NamedTuple):
@@ -63,11 +65,11 @@ def rerun_record(place: Path, commands_only: bool, say: Say, note: Say) -> bool:
         if commands_only or cast.why_not:
             why = "as asked" if commands_only else cast.why_not
             say(f"agents are not run again: {why}; the world alone, with all recorded commands")
-            return _judge(cast.truth_sha256, _fly(record, _nobody(cast)), say)
+            return _judge(cast.truth_sha256, _fly(record, _nobody(cast)), _state(record.reader), say)
         say(f"run again: world, {', '.join(map(str, cast.teams))}")
         again = _fly(record, cast)
-        same = _judge(cast.truth_sha256, again, say)
-        if not same:
+        same = _judge(cast.truth_sha256, again, _state(record.reader), say)
+        if again.compared.first is not None:
             _find_cause(again.parted, _fly(record, _nobody(cast)), say)
         return same
 
@@ -130,25 +132,43 @@ def _progress(duration_s: float, what: str) -> Iterator[Callable[[int], None]]:
         yield show
 
 
-def _judge(recorded: str | None, flown: Flown, say: Say) -> bool:
-    """Say how truth compares; return whether it is the same."""
+def _state(reader: RecordReader) -> State:
+    """Return how whole a record is, as far as it was read."""
+    if reader.damaged:
+        return "damaged"
+    return "whole" if reader.complete else "cut"
+
+
+def _judge(recorded: str | None, flown: Flown, state: State, say: Say) -> bool:
+    """Say how truth compares; return whether it is the same, at all instants of a record that is not damaged."""
     compared = flown.compared
     for refusal in flown.refused:
         say(f"was done on record, and is refused now: {refusal}")
-    if compared.first is None and recorded == flown.sha256 and not flown.until:
-        say(f"truth_sha256 is the same: {flown.sha256}")
-        return True
-    if compared.first is None and (recorded is None or flown.until):
-        cut = flown.until or "the record was cut and has no truth_sha256"
-        damaged = f": the record is damaged there, and {recorded} cannot be shown" if recorded else ""
-        say(f"{cut}{damaged}; truth is the same at all {compared.instants} instants before, to the bit")
-        return recorded is None
     if compared.first is None:
-        say(f"truth is the same at all {compared.instants} instants, and truth_sha256 differs: the record is not whole")
-        return False
+        return _judge_same(recorded, flown, state, say)
     say(f"truth differs: first {compared.first}")
     say(f"               last  {compared.last}; {compared.instants} instants compared")
+    if state == "damaged":
+        say("the record is damaged: what it lacks may be the difference")
     return False
+
+
+def _judge_same(recorded: str | None, flown: Flown, state: State, say: Say) -> bool:
+    """Say how far truth was compared, of which no instant differs; return whether more cannot be asked for."""
+    if recorded == flown.sha256 and not flown.until:
+        say(f"truth_sha256 is the same: {flown.sha256}")
+        return True
+    why = _end_of(recorded, flown.until, state)
+    say(f"{why}; truth is the same at all {flown.compared.instants} instants before, to the bit")
+    return recorded is None and not flown.until and state != "damaged"
+
+
+def _end_of(recorded: str | None, until: str, state: State) -> str:
+    """Return why truth was compared no further."""
+    flaw = {"damaged": "is damaged", "cut": "was cut", "whole": "does not hold the whole run"}[state]
+    if until:
+        return f"{until}, for it {flaw}"
+    return f"the record {flaw} and " + (f"{recorded} cannot be shown" if recorded else "has no truth_sha256")
 
 
 def _find_cause(parted: str, alone: Flown, say: Say) -> None:

@@ -9,9 +9,11 @@ from pathlib import Path
 import msgpack
 import pytest
 from federation import ONE, PAIR, ROOT, Federation, Role
+from mcap.opcode import Opcode
 from wire import PATIENCE_S
 
 from zsim.record import RecordReader, RecordWriter
+from zsim.record.layout import places
 
 PILOT = "operator.pilot"
 PLAIN = ROOT / "examples" / "plain_client.py"
@@ -187,6 +189,46 @@ def test_what_is_no_record_of_a_flight(federation: Federation) -> None:
     federation.run(PAIR, "--in-process", "--duration", "2").ends(with_code=0)
     late = doctored(federation.out, federation.folder / "late", from_the_second_second())
     rerun(federation, code=2, of=late).line("the record has nothing of 0.00 s; a run is flown again from its start")
+
+
+def damaged(record: Path, into: Path, part: float, cut: int = 0) -> Path:
+    """Write a record anew in many chunks, turn a bit in one, and cut bytes off its end.
+
+    Args:
+        part: of its chunks before the one that is damaged, 0 to 1.
+    """
+    into.mkdir()
+    path = into / "run.mcap"
+    with RecordReader(record / "run.mcap") as reader, RecordWriter(path) as writer:
+        for count, m in enumerate(reader.messages(by_time=False), start=1):
+            writer.add(m.key, m.payload, "", m.t_ns, m.wall_ns)
+            if count % 300 == 0:
+                writer.flush()
+    data = bytearray(path.read_bytes())
+    chunks = [place for place in places(bytes(data)) if place.opcode == Opcode.CHUNK]
+    data[chunks[round(part * (len(chunks) - 1))].end - 9] ^= 4
+    path.write_bytes(data[: len(data) - cut])
+    return into
+
+
+def test_a_damaged_record(federation: Federation) -> None:
+    """A bit is turned in the last chunk of a record, in the last of one that is cut too, in one in the middle.
+
+    Expected: it is not told as a cut; truth is the same as far as it can be compared, which is not what was asked.
+    """
+    federation.run(PAIR, "--in-process", "--duration", "2").ends(with_code=0)
+    alike = r"; truth is the same at all (\d+) instants before, to the bit"
+    for name, part, cut, text in (
+        ("last", 1.0, 0, "the record is damaged and has no truth_sha256"),
+        ("last and cut", 1.0, 9, "the record is damaged and has no truth_sha256"),
+        ("middle", 0.5, 0, r"the record has nothing of \d+\.\d+ s, for it is damaged"),
+    ):
+        said = rerun(federation, code=1, of=damaged(federation.out, federation.folder / name, part, cut)).text()
+        found = re.search(text + alike, said)
+        assert found, said
+        assert 20 < int(found[1]) < 101
+        assert "was cut" not in said
+        assert "the world alone" not in said
 
 
 def from_the_second_second() -> Callable[[str, bytes], bytes | None]:

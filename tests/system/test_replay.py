@@ -217,6 +217,32 @@ def test_what_may_be_asked(federation: Federation, flown: Path) -> None:
     role.ends(with_code=0)
 
 
+def test_a_recorder_that_comes_late(federation: Federation, flown: Path) -> None:
+    """A recorder joins a replay from 2 s on, when it has played 6 s of it and nobody keeps its beginning.
+
+    Expected: its record says of which run it is; its end tells the time that was played.
+    """
+    role = replay(federation, flown, "--from", "2", "--to", "9", "--rate", "0", "--paused")
+    client = federation.client()
+    clock, events = client.watch("clock"), client.watch("world/event")
+    clock.until(lambda m: m["state"] == "paused")
+    assert client.ask("world/control", "step", gates=300)["ok"]
+    clock.until(lambda m: m["t_ns"] == 8_000_000_000)
+    recorder = federation.role("record", "--out", str(federation.out))
+    events.until(lambda m: m["kind"] == "join" and m["subject"] == "recorder")
+    resume(client)
+    for each in (role, recorder):
+        each.ends(with_code=0)
+    on_record = recorded(federation.out, "world/*", "drone/drone1/truth")
+    (info,) = map(msgpack.unpackb, on_record["world/info"])
+    assert info["replay_of"]
+    stamps = [msgpack.unpackb(payload)["t_ns"] for payload in on_record["drone/drone1/truth"]]
+    assert 2_900_000_000 < stamps[0] < 3_100_000_000  # the last 5 s
+    assert stamps[-1] == 9_000_000_000
+    end = next(m for m in map(msgpack.unpackb, on_record["world/event"]) if m["kind"] == "end")
+    assert end["data"]["sim_s"] == 7.0
+
+
 def test_all_roles_beside_a_replay(federation: Federation, flown: Path) -> None:
     """Both estimators and the controller take part as in a flight.
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ import scipy.io
 from typer.testing import CliRunner
 
 from zsim import keys, messages
-from zsim.errors import RecordError, ReportError
+from zsim.errors import ReportError, RunError
 from zsim.record import RecordReader, RecordWriter
 from zsim_deploy.cli import app
 from zsim_deploy.export import form, matlab
@@ -29,6 +30,7 @@ from zsim_deploy.export.columns import fields, table_name
 from zsim_deploy.export.form import Format
 from zsim_deploy.export.make import export
 from zsim_deploy.export.matlab import matlab_names
+from zsim_deploy.export.place import placed
 from zsim_deploy.export.selection import Selection
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -194,6 +196,40 @@ def test_a_variable_that_matlab_would_not_load_is_refused(run: Path, monkeypatch
     assert not list(run.glob("large*"))
 
 
+def test_times_make_a_variable_small_enough(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(matlab, "VARIABLE_MAX", 100_000)
+    estimates = Selection(("drone/*/estimate",))
+    with pytest.raises(ReportError, match=r"^estimate: would have .*; choose --keys, --from and --to"):
+        export(run, Format.MAT, tmp_path / "all.mat", estimates)
+    done = export(run, Format.MAT, tmp_path / "some.mat", estimates._replace(from_s=1.0, to_s=1.1))
+    assert done.tables == {"estimate": 3 * 6}
+
+
+def test_what_a_message_does_not_have_is_empty(tmp_path: Path) -> None:
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        for k, drones in enumerate([("a", "b"), ("c",)]):
+            names = ("x_c", "y_c", "z_c", "yaw", "pitch", "phi_1", "phi_2", "p")[: 4 * len(drones)]
+            values = (1.5,) * len(names)
+            state = messages.ClusterState(k, 0, "engaged", drones, names, values, values, values, None, 1.0, "")
+            key = keys.cluster_state(f"of_{len(drones)}")
+            writer.add(key, messages.encode(state), messages.encoding(key), k, k)
+    export(tmp_path, Format.CSV)
+    export(tmp_path, Format.PARQUET)
+    lines = (tmp_path / "csv" / "cluster_state.csv").read_text().splitlines()
+    place = lines[0].split(",").index('"value_p"')
+    assert "nan" not in lines[2]
+    assert [line.split(",")[place] for line in lines[1:]] == ["1.5", ""]
+    column = pq.read_table(tmp_path / "parquet" / "cluster_state.parquet").column("value_p")
+    assert (column.null_count, column.to_pylist()) == (1, [1.5, None])
+
+
+def test_the_record_itself_can_be_given(run: Path, tmp_path: Path) -> None:
+    shutil.copy(run / "run.mcap", tmp_path / "flight1.mcap")
+    done = export(tmp_path / "flight1.mcap", Format.CSV, selection=Selection(("clock",)))
+    assert done.paths == (tmp_path / "csv",)
+    assert done.tables == {"clock.csv": counts(run)["clock"]}
+
+
 def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
     selection = Selection(("drone/*/truth", "cluster/**"), from_s=1.0, to_s=2.0)
     done = export(run, Format.PARQUET, tmp_path / "some", selection)
@@ -223,8 +259,69 @@ def test_nothing_is_overwritten_without_force(run: Path, tmp_path: Path) -> None
     with pytest.raises(ReportError, match="file of something else"):
         export(run, Format.MAT, tmp_path / "home" / "thesis.tex", some, force=True)
     assert (tmp_path / "home" / "thesis.tex").read_text() == "precious"
+    (tmp_path / "home" / "export.json").write_text("[]")
+    with pytest.raises(ReportError, match=r"folder of something else than an export \(it has no export\.json of one"):
+        export(run, Format.CSV, tmp_path / "home", some, force=True)
     for _ in range(2):
         export(run, Format.MAT, tmp_path / "again.mat", some, force=True)
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "plots"])
+def test_force_does_not_replace_a_folder_that_holds_more(run: Path, tmp_path: Path, name: str) -> None:
+    some, out = Selection(("clock",)), tmp_path / "out"
+    export(run, Format.CSV, out, some)
+    (out / name).mkdir() if name == "plots" else (out / name).write_text("precious")
+    with pytest.raises(ReportError, match=rf"something else than an export \(it holds {name}\); give --out"):
+        export(run, Format.CSV, out, some, force=True)
+    assert {path.name for path in out.iterdir()} == {"clock.csv", "export.json", name}
+
+
+def test_force_does_not_replace_files_that_are_not_of_an_export(run: Path, tmp_path: Path) -> None:
+    shutil.copy(run / "run.mcap", tmp_path / "flight1.mcap")
+    (tmp_path / "own.mat").write_bytes(b"MATLAB 5.0 MAT-file, Platform: GLNXA64, Created on: Sun Nov 22".ljust(128))
+    for name in ("flight1.mcap", "own.mat"):
+        before = (tmp_path / name).read_bytes()
+        with pytest.raises(ReportError, match="file of something else"):
+            export(run, Format.FOXGLOVE, tmp_path / name, Selection(("clock",)), force=True)
+        assert (tmp_path / name).read_bytes() == before
+
+
+def test_what_fails_leaves_no_folder_that_it_made(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(ReportError, match="has no message on nothing"):
+        export(run, Format.CSV, tmp_path / "new" / "a" / "b", Selection(("nothing/**",)))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("after", [False, True])
+@pytest.mark.parametrize("step", range(4))
+def test_an_interrupt_while_it_is_put_in_place_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int, after: bool
+) -> None:
+    """Interrupted before or after any of the four moves that replace a folder and a file, all is as it was."""
+    folder, file, moves, replace = tmp_path / "folder", tmp_path / "file", count(), Path.replace
+    folder.mkdir()
+    (folder / "old").touch()
+    file.write_text("old")
+
+    def interrupted(self: Path, target: Path) -> Path:
+        due = next(moves) == step
+        if not due or after:
+            replace(self, target)
+        if due:
+            raise KeyboardInterrupt
+        return target
+
+    def put() -> None:
+        with placed(folder, file) as (new_folder, new_file):
+            new_folder.mkdir()
+            new_file.write_text("new")
+            monkeypatch.setattr(Path, "replace", interrupted)
+
+    with pytest.raises(KeyboardInterrupt):
+        put()
+    assert [path.name for path in folder.iterdir()] == ["old"]
+    assert file.read_text() == "old"
+    assert {path.name for path in tmp_path.iterdir()} == {"folder", "file"}
 
 
 def test_garbage_on_record_is_left_out_and_told(run: Path, tmp_path: Path) -> None:
@@ -242,7 +339,7 @@ def test_garbage_on_record_is_left_out_and_told(run: Path, tmp_path: Path) -> No
 
 
 def test_nothing_to_export_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(RecordError, match=r"run\.mcap: cannot be read \(No such file"):
+    with pytest.raises(RunError, match=r"holds no run\.mcap; give the folder of a run, .*, or the file"):
         export(tmp_path, Format.CSV)
     RecordWriter(tmp_path / "run.mcap").close()
     for each in Format:

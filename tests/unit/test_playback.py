@@ -337,17 +337,69 @@ def test_seek(flight: RecordReader):
     assert "estimator.d1 takes part in the lockstep" in made.control(ControlRequest("seek", {"t_s": 0.1})).error
 
 
+def told_faults(number: int, *kinds: str) -> Said:
+    """Return what the world says of the faults that stand from a gate on."""
+    all_ = tuple(Fault(i, kind, "d1", {}, 0, None, "tester.one") for i, kind in enumerate(kinds))
+    return keys.FAULTS, Faults(number * GATE_NS, number, all_)
+
+
+@pytest.fixture
+def faulty(tmp_path: Path) -> Iterator[RecordReader]:
+    """Six gates; from the fourth on a fault stands."""
+    said: list[Said] = [(keys.INFO, INFO), *gate(0), *gate(1), *gate(2), told_faults(3, "gps_dropout")]
+    said += [message for number in range(3, 6) for message in gate(number)]
+    with write(tmp_path, said) as reader:
+        yield reader
+
+
+def test_a_seek_that_is_refused_changes_nothing(faulty: RecordReader):
+    made = playback(faulty)
+    made.advance(0)
+    assert "t_s is 5" in made.control(ControlRequest("seek", {"t_s": 5})).error
+    made.take_outbox()
+    made.advance(0)
+    assert keys.FAULTS not in [key for key, _ in made.take_outbox()]
+
+
+def test_after_a_seek_back_nothing_of_the_future_is_left(faulty: RecordReader):
+    made = playback(faulty)
+    for _ in range(5):
+        made.advance(0)
+    assert made.views(0)
+    made.take_outbox()
+    assert made.control(ControlRequest("seek", {"t_s": 0.02})).ok
+    assert not made.views(0)
+    made.advance(0)
+    faults = [messages.decode(key, messages.encode(m)) for key, m in made.take_outbox() if key == keys.FAULTS]
+    assert [(told.t_ns, told.faults) for told in faults] == [(GATE_NS, ())]
+
+
+def test_a_replay_measures_what_it_plays(flight: RecordReader):
+    """From gate 6 to gate 8, then gates 1 to 3, a gate per 10 ms."""
+    made = playback(flight, from_ns=6 * GATE_NS)
+    for number in range(6):
+        if number == 3:
+            assert made.control(ControlRequest("seek", {"t_s": 0.02})).ok
+        made.advance(number * 10_000_000)
+    result = made.result()
+    assert (result["sim_s"], result["wall_s"]) == (4 * GATE_NS / 1e9, 0.05)
+    assert result["last_ns"] == 3 * GATE_NS
+
+
+@pytest.mark.parametrize(("from_ns", "to_ns"), [(GATE_NS + 1, GATE_NS + 2), (0, -1)])
+def test_what_holds_no_gate_is_not_played(flight: RecordReader, from_ns: int, to_ns: int):
+    with pytest.raises(RecordError, match=r"run\.mcap: holds no gate from [\d.]+ s to -?[\d.e-]+ s; nothing"):
+        playback(flight, from_ns=from_ns, to_ns=to_ns)
+
+
 def test_a_record_without_a_gate_cannot_be_played(flight: RecordReader):
     with pytest.raises(RecordError, match=r"run\.mcap: holds no gate from 7 s on; nothing can be played"):
         playback(flight, from_ns=7_000_000_000)
 
 
 def test_faults_that_stand_are_told_before_the_first_gate(tmp_path: Path):
-    def faults(number: int, *kinds: str) -> Said:
-        all_ = tuple(Fault(i, kind, "d1", {}, 0, None, "tester.one") for i, kind in enumerate(kinds))
-        return keys.FAULTS, Faults(number * GATE_NS, number, all_)
-
-    said: list[Said] = [(keys.INFO, INFO), faults(0), *gate(0), *gate(1), faults(1, "gps_dropout"), *gate(2), *gate(3)]
+    said: list[Said] = [(keys.INFO, INFO), told_faults(0), *gate(0), *gate(1), told_faults(1, "gps_dropout")]
+    said += [*gate(2), *gate(3)]
     with write(tmp_path, said) as reader:
         whole, late = played(playback(reader)), played(playback(reader, from_ns=3 * GATE_NS))
     assert [len(told.faults) for told in on(keys.FAULTS, whole)] == [0, 1]

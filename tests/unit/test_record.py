@@ -153,6 +153,7 @@ def test_cut_at_any_byte_is_readable_up_to_the_cut(tmp_path):
         whole = sum(size <= cut for size in sizes) // CHUNK_MESSAGES * CHUNK_MESSAGES
         with RecordReader(cut_path) as reader:
             assert not reader.complete
+            assert not reader.damaged
             found = list(reader.messages(by_time=False))
             assert sum(reader.topics().values()) == len(found)
         assert len(found) - whole in (0, CHUNK_MESSAGES)  # the cut may have taken a chunk's indexes only
@@ -200,6 +201,19 @@ def test_a_damaged_chunk_is_passed_over_and_counted(tmp_path):
         assert reader.damaged == 1
 
 
+def test_a_damaged_chunk_before_a_cut_is_counted_before_anything_is_read(tmp_path):
+    path = tmp_path / "run.mcap"
+    write(path, recorded := flight(2 * CHUNK_MESSAGES))
+    data = bytearray(path.read_bytes()[:-1])
+    last = [place for place in places(bytes(data)) if place.opcode == Opcode.CHUNK][-1]
+    data[last.end - 20] ^= 4
+    path.write_bytes(data)
+    with RecordReader(path) as reader:
+        assert reader.damaged == 1
+        assert list(reader.messages(by_time=False)) == recorded[:CHUNK_MESSAGES]
+        assert reader.damaged == 1
+
+
 def test_a_length_that_cannot_be_right_hides_what_follows_and_is_counted(tmp_path):
     path = tmp_path / "run.mcap"
     sizes = write(path, recorded := flight(200))
@@ -213,6 +227,22 @@ def test_a_length_that_cannot_be_right_hides_what_follows_and_is_counted(tmp_pat
             assert reader.complete
             assert list(reader.messages(by_time=False)) == recorded[: 2 * CHUNK_MESSAGES]
             assert reader.damaged == 1
+
+
+@pytest.mark.parametrize("bit", [4, 14, 20, 62])
+def test_a_length_that_leads_behind_a_cut_is_not_told_as_the_cut(tmp_path, bit):
+    path = tmp_path / "run.mcap"
+    sizes = write(path, recorded := flight(600))
+    data = bytearray(path.read_bytes()[:-1000])
+    chunk = sizes[2 * CHUNK_MESSAGES - 1]  # the third chunk begins here
+    for place in (chunk, next(place.start for place in places(bytes(data)) if place.start > chunk)):
+        changed = bytearray(data)
+        changed[place + 1 + bit // 8] ^= 1 << bit % 8
+        path.write_bytes(changed)
+        with RecordReader(path) as reader:
+            found = list(reader.messages(by_time=False))
+            assert found == recorded[: len(found)]
+            assert (reader.complete, len(found) <= 3 * CHUNK_MESSAGES, reader.damaged >= 1) == (False, True, True)
 
 
 def test_a_chunk_whose_head_is_damaged_is_passed_over_and_left_out_of_the_summary(tmp_path):
@@ -325,6 +355,27 @@ def test_times_and_keys_beyond_the_format_are_held_in_bounds(tmp_path, monkeypat
         writer.add("a", b"4", "", 4, 4)
     assert [(message.key, message.t_ns) for message in read(path)] == [("a", 0), ("a", 4), ("b", 2**64 - 1)]
     assert (writer.messages, writer.refused) == (3, 1)
+
+
+@pytest.mark.parametrize("wanted", [None, {"clock"}])
+def test_a_message_without_a_time_in_every_chunk_does_not_hold_them_all(tmp_path, wanted):
+    """60 chunks of 50 kB, of 1 s each; read by time, a few of them are held."""
+    path, rng = tmp_path / "run.mcap", random.Random(9)
+    with RecordWriter(path) as writer:
+        for i in range(3000):
+            writer.add("clock", rng.randbytes(1000), "", i * GATE_NS, 0)
+            if i % 50 == 49:
+                writer.add("own/command", b"%d" % i, "", 0 if i % 100 == 49 else 10**15, 0)
+                writer.flush()
+    with RecordReader(path) as reader:
+        tracemalloc.start()
+        times = [message.t_ns for message in reader.messages(wanted)]
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    strays = [0] * 30, [10**15] * 30
+    clocks = [i * GATE_NS for i in range(3000)]
+    assert times == (clocks if wanted else [*strays[0], *clocks, *strays[1]])
+    assert peak < 600_000  # bytes; the whole is 3 MB
 
 
 def test_writer_keeps_nothing_of_what_is_on_disk(tmp_path):

@@ -11,7 +11,7 @@ from msgspec import Struct
 
 from zsim import batch, keys, messages
 from zsim.bundle import Bundle, table_of
-from zsim.messages import Clock, ControlAnswer, DroneInfo, Imu, Info, Origin
+from zsim.messages import Clock, ControlAnswer, DroneInfo, Faults, Imu, Info, Origin
 from zsim.record import RecordReader
 from zsim_agents import recorder
 from zsim_agents.recorder import record
@@ -54,9 +54,12 @@ def page(passed: list[Pair], more: int | None = None) -> ControlAnswer:
     return ControlAnswer(True, result=[list(each) for each in passed], more=more)
 
 
-def recorded(path: Path, answers: list[ControlAnswer], *batches: list[Pair]) -> list[Pair]:
-    """Record a run that answers replays and sends batches; return what is in the record."""
+def recorded(
+    path: Path, answers: list[ControlAnswer], *batches: list[Pair], last: dict[str, bytes] | None = None
+) -> list[Pair]:
+    """Record a run that answers replays, has last values, and sends batches; return what is in the record."""
     link, left = FakeLink(), iter(answers)
+    link.last = last or {}
     link.on_request = lambda key, args: next(left)
     for passed in (*batches, [clock(99, "stopped")]):
         link.deliver(batch.KEY, batch.encode(passed))
@@ -76,6 +79,24 @@ def test_a_late_recorder_writes_what_it_hears_twice_once(tmp_path: Path):
     found = recorded(tmp_path / "run.mcap", replayed, gates(4), gates(5, 6), gates(7), gates(8))
     assert stamps(found, IMU) == list(range(9))
     assert stamps(found, keys.CLOCK) == [*range(9), 99]
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_which_run_it_is_is_on_record_however_late_the_recorder_comes(tmp_path: Path, kept: bool):
+    """The replay has lost the world's first words; what the hub still answers comes as it is, once."""
+    told = pair(keys.INFO, INFO)
+    found = recorded(tmp_path / "run.mcap", [page(gates(7))], gates(8), last=dict([told] if kept else []))
+    assert found[0] == told
+    assert [key for key, _ in found].count(keys.INFO) == 1
+
+
+def test_the_newest_faults_are_on_record_once(tmp_path: Path):
+    first, second, third = (pair(keys.FAULTS, Faults(gate * GATE_NS, gate, ())) for gate in (1, 5, 8))
+    for number, passed in enumerate(([*gates(7)], [first, *gates(2), second, *gates(7)])):
+        found = recorded(
+            tmp_path / f"{number}.mcap", [page(passed)], [third, *gates(8)], last=dict([second, pair(keys.INFO, INFO)])
+        )
+        assert stamps(found, keys.FAULTS) == ([5, 8], [1, 5, 8])[number]
 
 
 def test_gates_in_one_are_recorded_message_by_message_and_once(tmp_path: Path):
@@ -132,6 +153,18 @@ def test_what_is_not_answered_is_asked_for_again(tmp_path: Path, first: ControlA
 def test_garbage_is_recorded_as_it_came(tmp_path: Path, key: str, payload: bytes):
     found = recorded(tmp_path / "run.mcap", [page([(key, payload)])], [(key, payload), clock(2), (key, payload)])
     assert [each for each in found if each[1] == payload] == [(key, payload)] * 2
+
+
+def test_what_a_record_has_no_room_for_is_counted_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("zsim.record.writer.CHANNELS_MAX", 2)
+    link, said = FakeLink(), []
+    link.on_request = lambda key, args: page([])
+    link.deliver(batch.KEY, batch.encode([imu(1), clock(1), imu(2), clock(3, "stopped")]))
+    link.deliver("view/drones", b"\x81\xa4t_ns\x01")
+    made: Any = recorder.Recorder(link, INFO, tmp_path / "run.mcap", "recorder", lambda: False, said.append)  # type: ignore[arg-type]
+    assert made.run() == "the run ended"
+    assert made.health.refused == 3
+    assert said == ["recorder: 3 messages are not on record: a record holds 65535 keys, and theirs are further ones"]
 
 
 @pytest.mark.parametrize("garbage", [b"\x91\x92\xa1\xff\xc4\x00", b"\x91" * 5000 + b"\xc0", b"\xc1"])

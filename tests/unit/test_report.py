@@ -170,6 +170,32 @@ def test_truth_that_is_not_on_record_is_told(tmp_path):
     assert summary.errors["p"].true_std == pytest.approx(AMPLITUDE[9] / math.sqrt(2), rel=0.05)
 
 
+def test_a_replay_is_told_and_judged_from_where_it_begins(tmp_path):
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        for key, message, wall_ns in synthetic_record.traffic(flown(end=None)):
+            if key == keys.INFO:
+                message = msgspec.structs.replace(message, replay_of="20261122-run")
+            elif message.t_ns < 9_000_000_000:
+                continue
+            writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
+    summary = make_report(tmp_path)
+    assert summary.record.truth_missing == 0
+    assert summary.sim_s == pytest.approx(3.0)
+    assert summary.real_time_factor == pytest.approx(20.0)
+    assert "This is a replay of run 20261122-run, no flight of its own." in summary.notes
+    assert "a replay of run 20261122-run" in (tmp_path / "report.html").read_text()
+
+
+def test_a_flight_whose_recorder_came_late_lacks_its_beginning(tmp_path):
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        for key, message, wall_ns in synthetic_record.traffic(flown(end=None)):
+            if key == keys.INFO or message.t_ns >= 9_000_000_000:
+                writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
+    summary = judge(tmp_path / "run.mcap")[-1]
+    assert summary.record.truth_missing == 3 * 449
+    assert summary.real_time_factor == pytest.approx(20.0)
+
+
 def test_separation_is_the_closest_pair_in_truth(tmp_path):
     summary = report_of(tmp_path, flown(amplitude=np.zeros(12), offset=np.zeros(12)))
     assert summary.min_separation_m == pytest.approx(8 * math.sin(math.pi / 8), rel=1e-9)  # 2 p sin(beta / 2)

@@ -81,9 +81,17 @@ def test_the_scenarios_differ_in_what_was_overridden(runs: list[Path]) -> None:
     assert rows == {
         "seed": ("1", "5", "1"),
         "clusters.main": (THERE, THERE, ABSENT),
-        "clusters": (ABSENT, ABSENT, "[]"),
     }
     assert scenario_rows(judged(runs[:1] * 2)) == []
+
+
+def test_faults_are_told_as_a_whole(runs: list[Path], tmp_path: Path) -> None:
+    faults = 'faults=[{"kind": "gps_bias", "target": "drone1", "at_s": 1, "for_s": 0.5, "value_m": [3, 0, 0]}]'
+    record(tmp_path / "with", Flown(duration_s=2.0, overrides=(faults,)))
+    rows = {row.name: row.cells for row in scenario_rows(judged([runs[0], tmp_path / "with"]))}
+    assert rows["faults.0"][0] == ABSENT
+    assert rows["faults.0"][1] == "at_s 1, for_s 0.5, kind gps_bias, target drone1, value_m [3, 0, 0]"
+    assert not any(name.startswith("faults.0.") or name == "faults" for name in rows)
 
 
 def test_named_things_are_compared_by_name() -> None:
@@ -128,6 +136,33 @@ def test_other_drones_and_variables_are_said(runs: list[Path], tmp_path: Path) -
     names = {row.name for row in scenario_rows(both)}
     assert {"drones.drone2", "drones.x"} <= names
     assert not any(name.startswith("drones.x.") for name in names)
+
+
+def test_differences_that_rounding_hides_are_told(runs: list[Path], tmp_path: Path) -> None:
+    other = "environment.wind.gust_m_s=0.1234567"
+    near = "environment.wind.gust_m_s=0.12345671"
+    record(tmp_path / "other", Flown(duration_s=2.0, overrides=(other,)))
+    record(tmp_path / "near", Flown(duration_s=2.0, overrides=(near,)))
+    rows = scenario_rows(judged([tmp_path / "other", tmp_path / "near"]))
+    assert [(row.name, row.cells) for row in rows] == [("environment.wind.gust_m_s", ("0.1234567", "0.12345671"))]
+
+
+def test_a_comparison_of_other_runs_is_not_replaced(runs: list[Path], tmp_path: Path) -> None:
+    for place in ("A/one", "B/two", "C/two", "B/one"):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "run.mcap").write_bytes((runs[2] / "run.mcap").read_bytes())
+
+    def page(*places: str) -> str:
+        directories = [tmp_path / place for place in places]
+        path = comparison_path(directories)
+        compare(directories, path)
+        return str(path.relative_to(tmp_path))
+
+    assert page("A/one", "B/one") == "A/compare-A-one-B-one.html"
+    assert page("A/one", "B/two") == "A/compare-one-two.html"
+    assert page("A/one", "C/two") == "A/compare-one-two-2.html"
+    assert page("A/one", "B/two") == "A/compare-one-two.html"
+    assert page("A/one", "C/two") == "A/compare-one-two-2.html"
 
 
 def test_names_tell_the_runs_apart(tmp_path: Path) -> None:

@@ -83,6 +83,19 @@ def test_the_rate_is_simulated_per_wall_time_over_the_last_second():
     assert rate.wall_s == pytest.approx(2.5)
 
 
+def test_time_that_leaps_does_not_pass():
+    """From 300 s on, five seconds at twice its pace; then back to 1 s, and five more."""
+    rate = Rate()
+    for number in range(11):
+        if number == 6:
+            rate.leap()
+        t_s = 300 + number if number < 6 else number - 5
+        rate.gate(t_s * 1_000 * MS, number * 500 * MS)
+        assert rate.now() == pytest.approx(0.0 if number in (0, 6) else 2.0)
+    assert rate.sim_s == pytest.approx(9.0)
+    assert rate.wall_s == pytest.approx(5.0)
+
+
 def test_gates_further_apart_than_a_second_still_have_a_rate():
     rate = Rate()
     for gate in range(4):
@@ -119,10 +132,10 @@ def test_the_result_counts_who_was_late_and_how_near_drones_came():
     measured.own_misses += 1
     for t_ns, wall_ns in ((0, 0), (2_000_000_000, 500_000_000)):
         measured.gate(t_ns, wall_ns)
-    result = measured.result(2_000_000_000, [late, quick])  # type: ignore[list-item]
+    result = measured.result([late, quick])  # type: ignore[list-item]
     assert result["real_time_factor"] == 4.0
     assert result["deadlines"] == 6
     assert result["deadline_misses_by"] == {"late": 2, "quick": 0, "world": 1}
     assert result["deadline_misses"] == 3
     assert result["closest_m"] == 0.5
-    assert Measurements(math.inf).result(0, [])["closest_m"] is None
+    assert Measurements(math.inf).result([])["closest_m"] is None

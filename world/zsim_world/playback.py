@@ -91,8 +91,10 @@ class Playback(Hub):
         self._tape = Tape(reader, self.gate_ns, self.delay_ns, wanted | ({keys.VIEW_DRONES} & topics.keys()))
         self._now_ns = 0
         self._wind(choice.from_ns)
-        if self._coming is None:
-            raise RecordError(f"{reader.path}: holds no gate from {choice.from_ns / 1e9:g} s on; nothing can be played")
+        if self._coming is None or (choice.to_ns is not None and self._coming.t_ns > choice.to_ns):
+            until = "on" if choice.to_ns is None else f"to {choice.to_ns / 1e9:.12g} s"
+            where = f"from {choice.from_ns / 1e9:.12g} s {until}"
+            raise RecordError(f"{reader.path}: holds no gate {where}; nothing can be played")
 
     @property
     def now_ns(self) -> int:
@@ -139,13 +141,22 @@ class Playback(Hub):
         gating = [p.name for p in self.barrier.participants.values() if p.gating]
         if gating:
             return f"{', '.join(gating)} takes part in the lockstep; seek needs nobody who is waited for"
-        former = self._gates, self._coming
+        former = self._gates, self._coming, self._standing
         self._wind(round(t_s * 1e9))
         if self._coming is None:
-            self._gates, self._coming = former
+            self._gates, self._coming, self._standing = former
             return f"t_s is {t_s:g}; must be a time on record"
+        self._forget(self._coming.t_ns)
         self.leaps += 1
         return None
+
+    def _forget(self, t_ns: int) -> None:
+        """Forget what was said before a leap to the gate t_ns: there it may never have been."""
+        self._last.clear()
+        self._measured.rate.leap()
+        if self._plays_faults and self._standing is None:
+            none = messages.encode(messages.Faults(t_ns, 0, ()))
+            self._standing = Recorded(keys.FAULTS, none, t_ns, 0)
 
     def _wind(self, from_ns: int) -> None:
         self._gates = self._tape.gates(from_ns)
@@ -213,7 +224,7 @@ class Playback(Hub):
 
     def result(self) -> dict[str, Any]:
         """Return what the replay measured of itself."""
-        measured = self._measured.result(self._now_ns, self.barrier.participants.values())
+        measured = self._measured.result(self.barrier.participants.values())
         about = {"replay_of": self._recorded.run_id, "refused": self.refused}
         return {"reason": self.ended, "last_ns": self._now_ns, **measured, **about}
 

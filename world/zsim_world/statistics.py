@@ -58,21 +58,33 @@ class Rate:
         self._marks: deque[tuple[int, int]] = deque()
         self._start_wall_ns: int | None = None
         self._last = (0, 0)
+        self._sim_ns = 0
 
     def gate(self, t_ns: int, wall_ns: int) -> None:
         """Note when the gate t_ns was published."""
         if self._start_wall_ns is None:
             self._start_wall_ns = wall_ns
+        if self._marks:
+            self._sim_ns += t_ns - self._last[0]
         self._last, marks = (t_ns, wall_ns), self._marks
         while len(marks) > 1 and wall_ns - marks[0][1] > 1_000_000_000:
             marks.popleft()
         if not marks or wall_ns - marks[-1][1] >= MARK_NS:
             marks.append(self._last)
 
+    def leap(self) -> None:
+        """Note that simulated time leaps to the next gate: it does not pass."""
+        self._marks.clear()
+
     def now(self) -> float:
         """Return the factor over the last wall second."""
         (t0, w0), (t1, w1) = self._marks[0] if self._marks else self._last, self._last
         return (t1 - t0) / (w1 - w0) if w1 > w0 else 0.0
+
+    @property
+    def sim_s(self) -> float:
+        """Return the simulated time that has passed gate by gate since the first one."""
+        return self._sim_ns / 1e9
 
     @property
     def wall_s(self) -> float:
@@ -111,10 +123,10 @@ class Measurements:
                 self._deadlines += 1
                 participant.deadline_misses += participant.owes(need_ns)
 
-    def result(self, t_ns: int, participants: Iterable[Participant]) -> dict[str, Any]:
-        """Return the figures of a run that got to t_ns."""
+    def result(self, participants: Iterable[Participant]) -> dict[str, Any]:
+        """Return the figures of the run as far as it got."""
         by_name = {p.name: p.deadline_misses for p in participants if p.gating}
-        sim_s, wall_s = t_ns / 1e9, self.rate.wall_s
+        sim_s, wall_s = self.rate.sim_s, self.rate.wall_s
         return {
             "sim_s": sim_s,
             "wall_s": wall_s,

@@ -146,7 +146,7 @@ class World(Hub):
         return {
             "reason": self.ended,
             "last_ns": self.now_ns,
-            **self._measured.result(self.now_ns, self.barrier.participants.values()),
+            **self._measured.result(self.barrier.participants.values()),
             "refused": self.refused,
             "truth_sha256": self._hash.hexdigest(),
         }

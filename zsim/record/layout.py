@@ -30,9 +30,12 @@ MESSAGE = struct.Struct("<BQHIQQ")  # head, channel, sequence, log time, publish
 MESSAGE_FIXED = MESSAGE.size - HEAD.size  # bytes that a message's length counts beside its payload
 CHUNK_HEAD = struct.Struct("<QQQII")  # first, last log time, plain size, plain CRC, bytes of name
 SIZE = struct.Struct("<Q")  # of a chunk's content, behind the name
+ZSTD = b"zstd"  # the name of our compression
+CUT_HEAD = CHUNK_HEAD.size + len(ZSTD) + SIZE.size  # bytes of a chunk before its content
 INDEX_HEAD = struct.Struct("<HI")  # channel, bytes of its entries
 INDEX_ENTRY = 16  # bytes: log time, place in the chunk
 FOOTER_SIZE = HEAD.size + 20
+SMALL_MAX = 1 << 20  # bytes of a schema, a channel or a part of the summary; statistics of 65 535 channels take 0.7 MB
 LEAST = {Opcode.CHUNK: CHUNK_HEAD.size + SIZE.size, Opcode.MESSAGE_INDEX: INDEX_HEAD.size}  # bytes that are always read
 
 Source = bytes | mmap
@@ -40,6 +43,7 @@ Known = TypeVar("Known", Schema, Channel)
 
 _own = threading.local()  # zstandard's objects crash when two threads use one at a time
 _STANDARD = frozenset(range(Opcode.HEADER, Opcode.DATA_END + 1))
+_ANY_SIZE = frozenset({Opcode.MESSAGE, Opcode.ATTACHMENT})  # of other tools, outside of chunks
 
 
 def _compressor() -> zstandard.ZstdCompressor:
@@ -132,6 +136,32 @@ def places(source: Source) -> Iterator[Place]:
         at = end
 
 
+def is_cut(source: Source, at: int) -> bool:
+    """Tell whether what stands behind the last whole record, at a byte of the file, is the beginning of another one.
+
+    Otherwise it is damaged: a length that is wrong hides what follows, however much that is.
+    """
+    left = len(source) - at - HEAD.size
+    if left < 0:
+        return True
+    opcode, length = HEAD.unpack_from(source, at)
+    if opcode not in _STANDARD or length < LEAST.get(opcode, 0):
+        return False
+    if opcode not in LEAST:
+        return opcode in _ANY_SIZE or length <= SMALL_MAX
+    return left < CUT_HEAD or length == _length_inside(source, Place(opcode, at, len(source)))
+
+
+def _length_inside(source: Source, place: Place) -> int | None:
+    """Return the length of a chunk or message index as it follows from what it says of its content."""
+    if place.opcode == Opcode.MESSAGE_INDEX:
+        return INDEX_HEAD.size + INDEX_HEAD.unpack_from(source, place.body)[1]
+    content = chunk_head(source, place).content
+    if content > len(source):
+        return None
+    return content - place.body + SIZE.unpack_from(source, content - SIZE.size)[0]
+
+
 def groups(source: Source) -> Iterator[Group]:
     """Yield schemas, channels and chunks of the data section in order."""
     pending: list[Place] = []
@@ -166,10 +196,10 @@ def is_complete(source: Source) -> bool:
 
 def chunk(content: bytes | memoryview, first_ns: int, last_ns: int) -> list[bytes]:
     """Return the parts of a chunk record that holds a run of message records, given their first and last log time."""
-    data, name = _compressor().compress(content), b"zstd"
-    head = CHUNK_HEAD.pack(first_ns, last_ns, len(content), zlib.crc32(content), len(name))
-    length = len(head) + len(name) + SIZE.size + len(data)
-    return [HEAD.pack(Opcode.CHUNK, length), head, name, SIZE.pack(len(data)), data]
+    data = _compressor().compress(content)
+    head = CHUNK_HEAD.pack(first_ns, last_ns, len(content), zlib.crc32(content), len(ZSTD))
+    length = len(head) + len(ZSTD) + SIZE.size + len(data)
+    return [HEAD.pack(Opcode.CHUNK, length), head, ZSTD, SIZE.pack(len(data)), data]
 
 
 def chunk_head(source: Source, place: Place) -> ChunkHead:

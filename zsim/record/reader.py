@@ -14,6 +14,7 @@ from zsim.errors import RecordError
 from zsim.record.finish import check_magic
 from zsim.record.layout import (
     HEAD,
+    MAGIC,
     MESSAGE,
     Group,
     Place,
@@ -23,9 +24,12 @@ from zsim.record.layout import (
     groups,
     indexes_of,
     is_complete,
+    is_cut,
     places,
     unpacked,
 )
+
+OVERLAP_NS = 1_000_000_000  # simulated time; a chunk begins less than that before the end of the one before it
 
 
 class Recorded(NamedTuple):
@@ -42,6 +46,9 @@ class _Chunk(NamedTuple):
     first_ns: int
     last_ns: int
     channels: frozenset[int]
+
+
+_Held = tuple[int, int, Recorded]  # simulated time, number of its chunk, message
 
 
 class RecordReader:
@@ -65,7 +72,7 @@ class RecordReader:
         check_magic(self._source, self.path)
         self.complete = is_complete(self._source)
         self._keys: dict[int, str] = {}
-        self._rest_damaged = self._channels() != Opcode.FOOTER and self.complete
+        self._rest_damaged = self._is_rest_damaged()
         self._damaged: set[int] = set()  # where damaged chunks begin
         self._chunks = list(self._scan())
 
@@ -81,7 +88,7 @@ class RecordReader:
         Args:
             keys: exact keys; chunks without any of them are not decompressed.
             by_time: in order of simulated time, messages of one time as they were written; otherwise all as
-                they were written.
+                they were written. In memory are the chunks that overlap in time, and stragglers one by one.
             from_ns: chunks in which everything is older are passed over; a chunk holds a quarter of a wall second.
 
         Raises:
@@ -119,15 +126,15 @@ class RecordReader:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _channels(self) -> int:
-        """Note the channels, also those that other tools put into the summary only; return the last opcode met."""
-        opcode = 0
+    def _is_rest_damaged(self) -> bool:
+        """Tell whether something follows that cannot be read; note the channels, which may be in the summary only."""
+        opcode, end = 0, len(MAGIC)
         for place in places(self._source):
-            opcode = place.opcode
+            opcode, end = place.opcode, place.end
             if opcode == Opcode.CHANNEL:
                 channel = unpacked(Channel, self._source, place)
                 self._keys[channel.id] = channel.topic
-        return opcode
+        return opcode != Opcode.FOOTER and (self.complete or not is_cut(self._source, end))
 
     def _scan(self) -> Iterator[_Chunk]:
         known: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
@@ -142,8 +149,10 @@ class RecordReader:
 
     def _counted(self, group: Group) -> dict[int, int]:
         """Return the messages per channel of a chunk whose message indexes may have been cut."""
-        content = content_of(self._source, group.place) or b""
-        return {channel: len(entries) // 2 for channel, entries in indexes_of(content).items()}
+        content = content_of(self._source, group.place)
+        if content is None:
+            self._damaged.add(group.place.start)
+        return {channel: len(entries) // 2 for channel, entries in indexes_of(content or b"").items()}
 
     def _as_written(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
         for chunk in chunks:
@@ -154,18 +163,37 @@ class RecordReader:
             yield from _recorded(content, wanted)
 
     def _by_time(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
-        """Yield by time, holding no more chunks in memory than overlap in time."""
-        held: list[tuple[int, int, Recorded]] = []
-        order = sorted(range(len(chunks)), key=lambda number: chunks[number].first_ns)
-        for number in order:
-            first_ns = chunks[number].first_ns
+        """Yield by time, holding no more chunks in memory than overlap in time, and stragglers."""
+        held, floors = self._stragglers(chunks, wanted)
+        starts = [floors.get(number, chunk.first_ns) for number, chunk in enumerate(chunks)]
+        for number in sorted(range(len(chunks)), key=starts.__getitem__):
+            first_ns, floor_ns = starts[number], floors.get(number, 0)
             held.sort(key=itemgetter(0, 1))
             ready = next((i for i, (t_ns, _, _) in enumerate(held) if t_ns >= first_ns), len(held))
             yield from (message for _, _, message in held[:ready])
             del held[:ready]
-            held += [(m.t_ns, number, m) for m in self._as_written([chunks[number]], wanted)]
+            found = self._as_written([chunks[number]], wanted)
+            held += [(m.t_ns, number, m) for m in found if m.t_ns >= floor_ns]
         held.sort(key=itemgetter(0, 1))
         yield from (message for _, _, message in held)
+
+    def _stragglers(self, chunks: list[_Chunk], wanted: dict[int, str]) -> tuple[list[_Held], dict[int, int]]:
+        """Return messages that are stamped long before the rest of their chunk, and when that rest begins, by chunk.
+
+        A program that stamps nothing gives every chunk a message of time 0. In the order of their oldest messages,
+        all chunks would be read and held at the beginning.
+        """
+        strays: list[_Held] = []
+        floors: dict[int, int] = {}
+        for number in range(1, len(chunks)):
+            chunk = chunks[number]
+            if chunk.first_ns >= chunks[number - 1].last_ns - OVERLAP_NS:
+                continue
+            found = [(m.t_ns, number, m) for m in self._as_written([chunk], wanted)]
+            floor_ns = _floor_ns([t_ns for t_ns, _, _ in found])
+            strays += (each for each in found if each[0] < floor_ns)
+            floors[number] = min((t_ns for t_ns, _, _ in found if t_ns >= floor_ns), default=chunk.first_ns)
+        return strays, floors
 
 
 def _recorded(content: bytes, wanted: dict[int, str]) -> Iterator[Recorded]:
@@ -178,6 +206,15 @@ def _recorded(content: bytes, wanted: dict[int, str]) -> Iterator[Recorded]:
         if channel in wanted and opcode == Opcode.MESSAGE:
             yield Recorded(wanted[channel], content[at + payload : after], t_ns, wall_ns)
         at = after
+
+
+def _floor_ns(times: list[int]) -> int:
+    """Return a time before most of some times: few that lie far off, on either side, do not move it."""
+    if not times:
+        return 0
+    ordered = sorted(times)
+    middle, late = ordered[len(times) // 2], ordered[3 * len(times) // 4]
+    return middle - 3 * (late - middle) - OVERLAP_NS  # evenly spread, they begin at middle - 2 (late - middle)
 
 
 def _mapped(path: Path) -> Source:

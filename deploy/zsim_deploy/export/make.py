@@ -12,9 +12,7 @@ from zsim.record import RecordReader
 from zsim_deploy.export.form import DEFAULTS, Format
 from zsim_deploy.export.place import MANIFEST, check_free, placed
 from zsim_deploy.export.selection import Selection
-
-RECORD = "run.mcap"
-
+from zsim_deploy.run_folder import record_at, record_notes
 
 Progress = Callable[[int, int], None]  # messages read so far, of how many
 
@@ -34,7 +32,7 @@ class Exported(NamedTuple):
 
 
 def export(
-    directory: Path,
+    run: Path,
     form: Format,
     out: Path | None = None,
     selection: Selection | None = None,
@@ -44,20 +42,20 @@ def export(
     """Write the record of a run in the form of another tool, all of it or nothing.
 
     Args:
-        directory: the run's.
+        run: its folder, or its record.
         form: what to write.
-        out: where, None for the usual place in the run's folder.
+        out: where, None for the usual place beside the record.
         selection: which messages, None for all.
         force: replace what an earlier export has written.
         progress: told now and then.
 
     Raises:
-        RecordError: there is no record.
+        RunError, RecordError: there is no record.
         ReportError: nothing on record is wanted; or it cannot be written there.
         KeyboardInterrupt: nothing was written.
     """
-    record, chosen = directory / RECORD, selection or Selection()
-    target = out or directory / DEFAULTS[form]
+    record, chosen = record_at(run), selection or Selection()
+    target = out or record.parent / DEFAULTS[form]
     with RecordReader(record) as reader:
         if form is Format.FOXGLOVE:
             return _foxglove(reader, chosen, target, force, progress)
@@ -80,7 +78,7 @@ def _tables(reader: RecordReader, form: Format, selection: Selection, target: Pa
             written = sink.finish()
         if not written:
             raise ReportError(f"{reader.path}: {_nothing(reader, selection)}")
-        notes = [*record_notes(reader), *_refused(gathering.refused)]
+        notes = [*record_notes(reader.complete, reader.damaged), *_refused(gathering.refused)]
         if form is not Format.MAT:
             (new / MANIFEST).write_bytes(_manifest(reader, selection, written, notes))
     return Exported((target,), {table.file: table.rows for table in written}, notes)
@@ -107,17 +105,7 @@ def _foxglove(reader: RecordReader, selection: Selection, target: Path, force: b
         topics, refused = convert(reader, selection, new, new_layout, progress)
         if not topics:
             raise ReportError(f"{reader.path}: {_nothing(reader, selection)}")
-    return Exported((target, layout), topics, [*record_notes(reader), *_refused(refused)])
-
-
-def record_notes(reader: RecordReader) -> list[str]:
-    """Return what is to be said of a record that is not whole."""
-    notes = []
-    if not reader.complete:
-        notes.append("the record was cut: its writer did not close it; everything up to the cut was read")
-    if reader.damaged:
-        notes.append(f"{reader.damaged} chunks of the record are damaged and were passed over")
-    return notes
+    return Exported((target, layout), topics, [*record_notes(reader.complete, reader.damaged), *_refused(refused)])
 
 
 def _refused(count: int) -> list[str]:
@@ -131,7 +119,7 @@ def _nothing(reader: RecordReader, selection: Selection) -> str:
     asked = [f"on {' '.join(selection.expressions)}"] if selection.expressions else []
     asked += [f"from {selection.from_s:g} s"] if selection.from_s is not None else []
     asked += [f"to {selection.to_s:g} s"] if selection.to_s is not None else []
-    return f"has no message {' '.join(asked)} that can be exported; it holds {count} messages"
+    return " ".join(["has no message", *asked, f"that can be exported; it holds {count} messages"])
 
 
 def _manifest(reader: RecordReader, selection: Selection, written: list[Any], notes: list[str]) -> bytes:

@@ -44,8 +44,8 @@ class MatFile:
         self._fields: dict[type[Struct], tuple[Field, ...]] = {}
         self._blocks: dict[type[Struct], dict[str, list[_Block]]] = {}
         for kind, rows in survey.rows.items():
-            if kind is not None:
-                _check_size(table_name(kind), 8 * rows * self.columns(kind))
+            if kind is not None and 8 * rows * self.columns(kind) > VARIABLE_MAX:  # of the times, only if it matters
+                _check_size(table_name(kind), 8 * survey.rows_within(kind) * self.columns(kind))
 
     def columns(self, kind: type[Struct]) -> int:
         """Return the numbers in a row of a type."""

@@ -23,6 +23,8 @@ class Survey:
     """
 
     def __init__(self, reader: RecordReader, selection: Selection) -> None:
+        self._reader = reader
+        self._selection = selection
         self.wanted = selection.keys(reader)
         self.kinds = {key: kind for key in self.wanted if (kind := messages.type_of(key))}
         counts = reader.topics()
@@ -30,20 +32,25 @@ class Survey:
         for key in self.wanted:
             self.rows[self.kinds.get(key)] += counts[key]
         self._found: dict[type[Struct], dict[str, dict[str, None]]] = {}
-        self._look(reader, selection)
+        self._look()
 
     def fields(self, kind: type[Struct]) -> tuple[Field, ...]:
         """Return the fields of a type's table."""
         found: dict[str, Sequence[str]] = {name: list(seen) for name, seen in self._found.get(kind, {}).items()}
         return fields(kind, found)
 
-    def _look(self, reader: RecordReader, selection: Selection) -> None:
+    def rows_within(self, kind: type[Struct]) -> int:
+        """Return the messages of a type within the times; they are read through for it."""
+        wanted = [key for key, of in self.kinds.items() if of is kind]
+        return sum(1 for _ in self._selection.messages(self._reader, wanted))
+
+    def _look(self) -> None:
         """Read those messages through that have open fields."""
         opened = {kind: open_fields(kind) for kind in set(self.kinds.values())}
         wanted = [key for key, kind in self.kinds.items() if opened[kind]]
         for kind, opens in opened.items():
             self._found[kind] = {each.name: {} for each in opens}
-        for message in selection.messages(reader, wanted) if wanted else ():
+        for message in self._selection.messages(self._reader, wanted) if wanted else ():
             decoded = decoded_or_none(message.key, message.payload)
             if decoded is None:
                 continue

@@ -113,8 +113,9 @@ class _Layout:
         head += [[message.seq for message in batch.messages]] if self._counted else []
         own = [column for field in self._fields for column in _columns(field, batch.messages)]
         wall_ns = np.array(batch.wall_ns, np.uint64).astype(np.int64)
-        arrays = [
-            pa.array(column, entry.type) for column, entry in zip([*head, *own, wall_ns], self.schema, strict=True)
+        arrays = [  # no message holds NaN: where it stands, there is no value
+            pa.array(column, entry.type, from_pandas=True)
+            for column, entry in zip([*head, *own, wall_ns], self.schema, strict=True)
         ]
         return pa.RecordBatch.from_arrays(arrays, schema=self.schema)
 

@@ -1,24 +1,43 @@
 """Makes a comparison: records of several runs in, one page out."""
 
 from collections.abc import Callable, Sequence
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from zsim.errors import ReportError
-from zsim_deploy.report.comparison import Compared, run_names
+from zsim_deploy.report.comparison import Compared, run_names, runs_id
 from zsim_deploy.report.comparison_figures import comparison_figures
 from zsim_deploy.report.comparison_page import comparison_page
-from zsim_deploy.report.make import RECORD, judge
+from zsim_deploy.report.make import judge
+from zsim_deploy.run_folder import RECORD
 
-NAMED = 3  # runs whose names the page's own name holds
+NAMED, NAMES_MAX = 3, 100  # runs whose names the page's own name holds, and characters of them
 MARK, MARK_WITHIN = b": comparison</title>", 4_000  # of a page of ours, within its first bytes
 
 
 def comparison_path(directories: Sequence[Path]) -> Path:
-    """Return where the comparison of runs goes: beside the first of them."""
-    names = [directory.resolve().name for directory in directories]
-    more = [f"and-{len(names) - NAMED}-more"] if len(names) > NAMED else []
-    return directories[0].resolve().parent / f"compare-{'-'.join([*names[:NAMED], *more])}.html"
+    """Return where the comparison of runs goes: beside the first of them, under a name that no other one has."""
+    names = [name.replace("/", "-") for name in run_names(directories)]
+    more = f"-and-{len(names) - NAMED}-more" if len(names) > NAMED else ""
+    stem = f"compare-{'-'.join(names[:NAMED])[:NAMES_MAX]}{more}"
+    folder = directories[0].resolve().parent
+    numbered = (folder / f"{stem}{'' if number == 1 else f'-{number}'}.html" for number in count(1))
+    return next(path for path in numbered if not _is_of_others(path, directories))
+
+
+def _is_of_others(page: Path, directories: Sequence[Path]) -> bool:
+    """Tell whether a page that is there compares other runs than these."""
+    head = _head(page)
+    return MARK in head and runs_id(directories).encode() not in head
+
+
+def _head(page: Path) -> bytes:
+    """Return the beginning of a file, nothing where there is none."""
+    if not page.is_file():
+        return b""
+    with page.open("rb") as file:
+        return file.read(MARK_WITHIN)
 
 
 def compare(directories: Sequence[Path], out: Path, progress: Callable[[str], None] = lambda _: None) -> list[Compared]:
@@ -53,7 +72,7 @@ def _check(directories: Sequence[Path], out: Path) -> None:
     for place, directory in enumerate(directories):
         if places[place] in places[:place]:
             raise ReportError(f"{directory}: is given twice; a run is compared with others")
-    if out.exists() and not (out.is_file() and MARK in out.read_bytes()[:MARK_WITHIN]):
+    if out.exists() and MARK not in _head(out):
         raise ReportError(f"{out}: exists and is no comparison of runs; give --out another place")
 
 

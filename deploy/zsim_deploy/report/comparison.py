@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
+from os.path import relpath
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,13 @@ def run_names(directories: Sequence[Path]) -> list[str]:
     return [f"{path.name} ({number})" for number, path in enumerate(paths, start=1)]
 
 
+def runs_id(directories: Sequence[Path]) -> str:
+    """Return a word for these runs in this order: the same wherever their folders are moved together."""
+    paths = [directory.resolve() for directory in directories]
+    places = "\0".join(relpath(path, paths[0].parent) for path in paths)
+    return sha256(places.encode(errors="surrogateescape")).hexdigest()[:16]
+
+
 def clusters(runs: Iterable[Compared]) -> list[str]:
     """Return the clusters of all runs, in the order in which they are met."""
     return list(dict.fromkeys(formation.name for run in runs for formation in run.formations))
@@ -80,8 +89,13 @@ def scenario_rows(runs: Sequence[Compared]) -> list[Row]:
     flat = [dict(flattened(msgspec.to_builtins(run.flight.scenario))) if run.flight.scenario else {} for run in runs]
     paths = dict.fromkeys(path for each in flat for path in each)
     partly = tuple(f"{path}." for path in paths if _is_partly(path, flat))
-    rows = (Row(path, tuple(_text(each[path]) if path in each else ABSENT for each in flat)) for path in paths)
-    return [row for row in rows if row.differs and not row.name.startswith(partly)]
+    told = [path for path in paths if not path.startswith(partly) and _differ(path, flat)]
+    return [Row(path, tuple(_text(each[path]) if path in each else ABSENT for each in flat)) for path in told]
+
+
+def _differ(path: str, flat: Sequence[Mapping[str, Any]]) -> bool:
+    """Tell whether a field has not the same value in all runs; its text may be the same."""
+    return any(path not in each for each in flat) or any(each[path] != flat[0][path] for each in flat)
 
 
 def _is_partly(path: str, flat: Sequence[Mapping[str, Any]]) -> bool:
@@ -90,24 +104,29 @@ def _is_partly(path: str, flat: Sequence[Mapping[str, Any]]) -> bool:
 
 
 def flattened(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
-    """Yield path and value of every leaf; items that have a name go by it, so that their order tells nothing."""
+    """Yield path and value of every leaf; items that have a name go by it, so that their order tells nothing.
+
+    Others are told as a whole by their number; of none there is nothing to tell.
+    """
     if isinstance(value, Mapping):
         for name, item in value.items():
             yield from flattened(item, f"{path}.{name}" if path else str(name))
     elif isinstance(value, list | tuple) and value and all(isinstance(item, Mapping) for item in value):
         for number, item in enumerate(value):
-            place = f"{path}.{item.get('name', number)}"
-            yield place, THERE
-            yield from flattened(item, place)
-    else:
+            if "name" in item:
+                yield f"{path}.{item['name']}", THERE
+                yield from flattened(item, f"{path}.{item['name']}")
+            else:
+                yield f"{path}.{number}", item
+    elif value != [] and value != ():
         yield path, value
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:g}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_text, value))}]"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_text(item)}" for name, item in value.items() if item is not None)
     return "none" if value is None else str(value)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from zsim_agents.cluster_space import unit
-from zsim_deploy.report.comparison import ABSENT, Compared, Row, clusters, notes, parameters, scenario_rows
+from zsim_deploy.report.comparison import ABSENT, Compared, Row, clusters, notes, parameters, runs_id, scenario_rows
 from zsim_deploy.report.figures import Named
 from zsim_deploy.report.page import data_uri, facts, template
 from zsim_deploy.report.statistics import Errors
@@ -16,6 +16,7 @@ def comparison_page(runs: Sequence[Compared], figures: Sequence[Named], director
     """Return the page; `directory` holds the figures' files."""
     return template("comparison.html.j2").render(
         runs=runs,
+        runs_id=runs_id([run.directory for run in runs]),
         facts=fact_rows(runs),
         notes=notes(runs),
         statistics=STATISTICS,

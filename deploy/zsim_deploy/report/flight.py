@@ -103,6 +103,16 @@ class Flight:
         return said[-1] if said else None
 
     @property
+    def replay_of(self) -> str:
+        """Return the run_id of the run that was played back, "" for a flight."""
+        return self.info.replay_of if self.info else ""
+
+    @property
+    def first_ns(self) -> int:
+        """Return the first instant of truth."""
+        return min((int(track.t_ns[0]) for track in self.tracks if len(track.t_ns)), default=0)
+
+    @property
     def last_ns(self) -> int:
         """Return the last instant of truth."""
         return max((int(track.t_ns[-1]) for track in self.tracks if len(track.t_ns)), default=0)

@@ -12,8 +12,7 @@ from zsim_deploy.report.formation import Formation, formation
 from zsim_deploy.report.page import page
 from zsim_deploy.report.reading import read_flight
 from zsim_deploy.report.summary import Summary, summarise
-
-RECORD = "run.mcap"
+from zsim_deploy.run_folder import RECORD
 
 
 def judge(record: Path, progress: Callable[[str], None] = lambda _: None) -> tuple[Flight, list[Formation], Summary]:

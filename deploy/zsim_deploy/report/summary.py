@@ -15,6 +15,7 @@ from zsim_deploy.report.flight import Flight, Participant
 from zsim_deploy.report.formation import Formation
 from zsim_deploy.report.statistics import Errors, min_separation_m, window
 from zsim_deploy.report.truth_hash import TruthHash, truth_hash
+from zsim_deploy.run_folder import record_notes
 
 EVENTS_PER_KIND = 100  # a flood of refusals must not push a restart out of the list
 EVENTS_MAX = 1000
@@ -86,11 +87,12 @@ def summarise(flight: Flight, formations: list[Formation], record: Path) -> Summ
     """Return the summary of a flight; what the world did not live to say is worked out from its record."""
     end = flight.end or {}
     info = flight.info
-    found = truth_hash(flight.tracks, info.gate_ns if info else None, end.get("last_ns", flight.last_ns))
+    found = _hash(flight, end.get("last_ns", flight.last_ns))
     asked = flight.scenario.report.window_s if flight.scenario else None
     window_s, window_note = window(asked, flight.last_ns / 1e9)
     clusters = {f.name: ClusterErrors(f.drones, f.errors(window_s)) for f in formations}
-    wall_s, sim_s = end.get("wall_s", flight.wall_s), end.get("sim_s", flight.last_ns / 1e9)
+    wall_s, span_s = end.get("wall_s", flight.wall_s), (flight.last_ns - flight.first_ns) / 1e9
+    sim_s = end.get("sim_s", span_s if flight.replay_of else flight.last_ns / 1e9)
     lines, left_out = _lines(flight.events)
     return Summary(
         scenario=flight.scenario.name if flight.scenario else None,
@@ -99,7 +101,7 @@ def summarise(flight: Flight, formations: list[Formation], record: Path) -> Summ
         run_id=info.run_id if info else None,
         versions=_versions(flight),
         fingerprint=info.fingerprint if info else None,
-        real_time_factor=end.get("real_time_factor", sim_s / wall_s if wall_s > 0 else None),
+        real_time_factor=end.get("real_time_factor", span_s / wall_s if wall_s > 0 else None),
         wall_s=wall_s,
         sim_s=sim_s,
         ended=_ended(flight),
@@ -126,6 +128,13 @@ def summarise(flight: Flight, formations: list[Formation], record: Path) -> Summ
         ),
         notes=_notes(flight, found, formations, window_s, window_note),
     )
+
+
+def _hash(flight: Flight, last_ns: int) -> TruthHash:
+    """Return the hash of truth; a flight has truth from 0 or the first gate on, a replay from where it was begun."""
+    gate_ns = flight.info.gate_ns if flight.info else None
+    first_ns = flight.first_ns if flight.replay_of else min(flight.first_ns, gate_ns or 0)
+    return truth_hash(flight.tracks, gate_ns, first_ns, last_ns)
 
 
 def _notes(
@@ -183,12 +192,11 @@ def _participant(process: Participant) -> dict[str, Any]:
 
 def _record_notes(flight: Flight) -> list[str]:
     notes = []
+    if flight.replay_of:
+        notes.append(f"This is a replay of run {flight.replay_of}, no flight of its own.")
     if flight.end is None:
         notes.append("The world did not report the run's end; times and command age are worked out from the record.")
-    if not flight.complete:
-        notes.append("The record was cut: its writer did not close it. Everything up to the cut was read.")
-    if flight.damaged:
-        notes.append(f"{flight.damaged} chunks of the record are damaged and were passed over.")
+    notes += [f"{note[0].upper()}{note[1:]}." for note in record_notes(flight.complete, flight.damaged)]
     if flight.undecoded:
         notes.append(f"{flight.undecoded} messages on record are not what their key promises and were passed over.")
     if flight.info is None:

@@ -25,18 +25,21 @@ class TruthHash(Struct, frozen=True):
     missing: int
 
 
-def truth_hash(tracks: list[Track], gate_ns: int | None, last_ns: int) -> TruthHash:
+def truth_hash(tracks: list[Track], gate_ns: int | None, first_ns: int, last_ns: int) -> TruthHash:
     """Return the hash of drones given in scenario order.
 
     Args:
         tracks: the drones.
         gate_ns: spacing of truth; None: unknown, nothing can be missed.
+        first_ns: the first instant of the run.
         last_ns: the last instant of the run as far as it is known.
     """
     rows = np.concatenate([_rows(track) for track in tracks] or [np.zeros(0, _ROW)])
     drone = np.repeat(np.arange(len(tracks)), [len(track.t_ns) for track in tracks])
     ordered = rows[np.lexsort((drone, rows["t"]))]
-    return TruthHash(hashlib.sha256(ordered.tobytes()).hexdigest(), len(rows), _missing(tracks, gate_ns, last_ns))
+    return TruthHash(
+        hashlib.sha256(ordered.tobytes()).hexdigest(), len(rows), _missing(tracks, gate_ns, first_ns, last_ns)
+    )
 
 
 def _rows(track: Track) -> np.ndarray:
@@ -45,11 +48,9 @@ def _rows(track: Track) -> np.ndarray:
     return rows
 
 
-def _missing(tracks: list[Track], gate_ns: int | None, last_ns: int) -> int:
-    """Return how many truth messages there are not, every gate from 0 or the first one on to the last."""
-    starts = [int(track.t_ns[0]) for track in tracks if len(track.t_ns)]
-    if not gate_ns or not starts:
+def _missing(tracks: list[Track], gate_ns: int | None, first_ns: int, last_ns: int) -> int:
+    """Return how many truth messages there are not, every gate from the first one on to the last."""
+    if not gate_ns or not any(len(track.t_ns) for track in tracks):
         return 0
-    first_ns = min(*starts, gate_ns)
     expected = len(tracks) * ((last_ns - first_ns) // gate_ns + 1)
     return max(0, expected - sum(len(track.t_ns) for track in tracks))
