@@ -127,7 +127,7 @@ KINDS: dict[str, Kind] = {
     "link_delay": Kind(
         "link",
         "messages come later",
-        (_number("delay_ms", "after it, a message comes with the next gate", "ms", 0.0, 60_000.0, above=True), _ONE_WAY),
+        (_number("delay_ms", "after it, a message comes at the next gate", "ms", 0.0, 60_000.0, above=True), _ONE_WAY),
     ),
     "link_jitter": Kind(
         "link",

@@ -66,18 +66,19 @@ class Presence:
         )
         self._link.put(keys.process(self.name, "join"), join)
 
-    def heed(self, payload: bytes) -> None:
-        """Follow the run by a message on `clock`."""
+    def heed(self, payload: bytes) -> messages.Clock | None:
+        """Follow the run by a message on `clock`; return it, None where it is none."""
         try:
-            clock = messages.decode(keys.CLOCK, payload)
+            clock: messages.Clock = messages.decode(keys.CLOCK, payload)
         except DecodeError:
             self.health.refused += 1
-            return
+            return None
         self.now_ns = clock.t_ns
         if clock.run_id != self._info.run_id:
             self.over = "the world has begun another run"
         elif clock.state == "stopped":
             self.over = "the run ended"
+        return clock
 
     def tick(self) -> None:
         """Tell of its health once a wall second; to be called more often."""

@@ -229,22 +229,23 @@ class Recorder:
         if self._known and (key, payload) in self._known:
             return
         self.health.received += 1
-        t_ns = self._stamp(key, payload)
+        t_ns = self._stamp(payload)
         self._writer.add(key, payload, messages.encoding(key), t_ns, time.time_ns())
         if key == keys.CLOCK:
+            self._now_ns = t_ns
             self._on_clock(payload)
         elif key == keys.EVENT:
             self._on_event(payload)
         elif key.startswith("process/"):
             self._on_process(key)
 
-    def _stamp(self, key: str, payload: bytes) -> int:
-        """Return the message's own time; garbage is recorded at the time of its neighbours."""
+    def _stamp(self, payload: bytes) -> int:
+        """Return the message's own time; one that has none is recorded at the world's."""
         try:
-            self._now_ns = max(0, min(self._head.decode(payload).t_ns, 2**62))
+            return max(0, min(self._head.decode(payload).t_ns, 2**62))
         except messages.REFUSALS:
             self.health.refused += 1
-        return self._now_ns
+            return self._now_ns
 
     def _on_clock(self, payload: bytes) -> None:
         try:

@@ -9,7 +9,7 @@ import pytest
 
 from zsim.errors import SessionError
 from zsim.messages import ControlAnswer
-from zsim_agents.console.desk import HANDS, PRIORITY, PRIORITY_EMERGENCY, Desk, Told
+from zsim_agents.console.desk import HANDS, OVERTAKEN, PRIORITY, PRIORITY_EMERGENCY, Desk, Told
 
 PATIENCE_S = 10.0
 
@@ -22,6 +22,13 @@ class Link:
         self.refusals: dict[str, str] = {}
         self.given_back = threading.Event()
         self.answers = threading.Event()  # whether anybody answers those who ask for what never ends
+        self.held: dict[int, threading.Event] = {}  # by priority, what keeps an acquire from being answered
+        self.acquiring: SimpleQueue[int] = SimpleQueue()
+
+    @property
+    def modes(self) -> list[str]:
+        """What has been sent, in order."""
+        return [said[1].mode for said in self.said if len(said) == 2]
 
     def request(self, key: str, op: str, source: str, args: dict[str, Any], timeout_s: float) -> ControlAnswer:
         self.said.append((key, op, source, args))
@@ -31,6 +38,10 @@ class Link:
             raise ValueError("no such thing")
         if op == "hangs":
             assert self.answers.wait(PATIENCE_S)
+        if op == "acquire":
+            self.acquiring.put(args["priority"])
+            held = self.held.get(args["priority"])
+            assert held is None or held.wait(PATIENCE_S)
         if op == "release":
             self.given_back.set()
         refusal = self.refusals.get(op, "")
@@ -159,3 +170,53 @@ def test_what_is_given_back_keeps_no_emergency_waiting(table: Table):
     table.desk.mode(names, "emergency")
     assert {table.told.get(timeout=PATIENCE_S).what for _ in names} == {f"{name}: emergency" for name in names}
     heard.set()
+
+
+def test_modes_of_one_drone_go_out_in_the_order_of_the_clicks(table: Table):
+    table.link.held[PRIORITY] = threading.Event()
+    for mode in ("reset", "takeoff", "land"):
+        table.desk.mode(["drone1"], mode)
+    assert table.link.acquiring.get(timeout=PATIENCE_S) == PRIORITY
+    table.desk.mode(["drone2"], "land")
+    table.link.acquiring.get(timeout=PATIENCE_S)
+    assert [said[3]["drone"] for said in table.link.said] == ["drone1", "drone2"]
+    table.link.held[PRIORITY].set()
+    told = [table.told.get(timeout=PATIENCE_S).what for _ in range(4)]
+    assert [what for what in told if "drone1" in what] == ["drone1: reset", "drone1: takeoff", "drone1: land"]
+    sent = [said[1].mode for said in table.link.said if said[0] == "drone/drone1/cmd/mode"]
+    assert sent == ["reset", "takeoff", "land"]
+
+
+def test_nothing_that_was_asked_for_before_an_emergency_is_sent_after_it(table: Table):
+    table.link.held[PRIORITY] = threading.Event()
+    table.desk.mode(["drone1"], "takeoff")
+    assert table.link.acquiring.get(timeout=PATIENCE_S) == PRIORITY
+    table.desk.mode(["drone1"], "land")
+    table.desk.mode(["drone1"], "emergency")
+    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: emergency", "")
+    table.link.held[PRIORITY].set()
+    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: takeoff", OVERTAKEN)
+    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: land", OVERTAKEN)
+    assert table.link.modes == ["emergency"]
+
+
+def test_the_end_of_an_emergency_comes_after_it(table: Table):
+    table.link.held[PRIORITY_EMERGENCY] = threading.Event()
+    table.desk.mode(["drone1"], "emergency")
+    assert table.link.acquiring.get(timeout=PATIENCE_S) == PRIORITY_EMERGENCY
+    table.desk.mode(["drone1"], "reset")
+    table.desk.mode(["drone2"], "land")
+    assert table.told.get(timeout=PATIENCE_S) == Told("drone2: land", "")
+    table.link.held[PRIORITY_EMERGENCY].set()
+    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: emergency", "")
+    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: reset", "")
+    assert table.link.modes == ["land", "emergency", "reset"]
+
+
+def test_who_presses_emergency_again_and_again_does_not_keep_it_from_being_sent(table: Table):
+    table.link.held[PRIORITY_EMERGENCY] = threading.Event()
+    for _ in range(3):
+        table.desk.mode(["drone1"], "emergency")
+    table.link.held[PRIORITY_EMERGENCY].set()
+    assert {table.told.get(timeout=PATIENCE_S) for _ in range(3)} == {Told("drone1: emergency", "")}
+    assert table.link.modes == ["emergency"] * 3

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from zsim import keys, messages, scenario_file
-from zsim.messages import ControlAnswer, DroneView, EstimateView, ViewCluster, ViewDrones, ViewEstimates
+from zsim.messages import ControlAnswer, DroneView, EstimateView, Event, ViewCluster, ViewDrones, ViewEstimates
 from zsim_agents.console import stage as stages
 from zsim_agents.console.followers import Followers
 from zsim_agents.console.picture import drones_of
 from zsim_agents.console.private_viser import PrivateViser
 from zsim_agents.console.show import Show
+from zsim_agents.console.watch import Watch
 from zsim_agents.scenario_space import scenario_space
 
 STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
@@ -44,13 +45,14 @@ class Link:
 
     def __init__(self) -> None:
         self.say: Callable[[Any], None] = lambda _: None
+        self.tell: Callable[[Any], None] = lambda _: None
         self.asked: list[tuple[str, str, dict[str, Any]]] = []
 
     def hear(self, expression: str, callback: Callable[[Any], None]) -> None:
         self.say = callback
 
     def on_message(self, expression: str, callback: Callable[[Any], None]) -> None:
-        return
+        self.tell = callback
 
     def get(self, expression: str, timeout_s: float = 2.0) -> list[Any]:
         return []
@@ -70,7 +72,8 @@ class Seen:
             name="console.1", now_ns=0, over="", health=health, heed=lambda _: None, tick=lambda: None
         )
         drones = [SimpleNamespace(name=name) for name in NAMES]
-        info: Any = SimpleNamespace(run_id="r1", rate=1.0, drones=drones, scenario=STEP.read_text())
+        scenario = STEP.read_text()
+        info: Any = SimpleNamespace(run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario)
         server.get_clients = lambda: {0: None} if watched else {}
         self.show = Show(server, self.link, info, self.presence, Followers(server), 1000.0)
 
@@ -178,6 +181,41 @@ def test_trails_go_when_a_replay_goes_back(viser: PrivateViser):
     assert (np.asarray(stage._trail_node.points)[..., 2] < -100.0).all()
 
 
+def test_trails_of_a_replay_that_goes_back_before_anybody_looks_go_too(viser: PrivateViser):
+    seen = Seen(viser.server, watched=False)
+    for t_ns, away_m in ((20_000_000, 0.0), (40_000_000, 5.0)):
+        seen.draw(drones(*NAMES, t_ns=t_ns, away_m=away_m))
+    assert len(trails(seen)) > len(NAMES)
+    seen.draw(drones(*NAMES, t_ns=20_000_000, away_m=9.0))
+    assert len(trails(seen)) == len(NAMES)  # nowhere but where they are
+    seen.show.close()
+
+
+def trails(seen: Seen) -> np.ndarray:
+    assert seen.show._drones is not None
+    return seen.show._trails.segments(seen.show._drones.p_W)[0]
+
+
+def test_what_the_world_refuses_of_the_console_s_commands_is_shown_in_the_corner(seen: Seen):
+    shown: list[tuple[str, str]] = []
+    seen.draw(drones(*NAMES))
+    client = SimpleNamespace(add_notification=lambda title, body, **_: shown.append((title, body)))
+    seen.show._server.get_clients = lambda: {0: client}  # type: ignore[assignment, dict-item, return-value]
+    subject, reason = "drone/drone1/cmd/mode", "age is 800 ms; must be <= 500 ms"
+    for source in ("somebody", "console.1"):
+        event = Event(0, 0, "refused", source, subject, f"{subject}: {reason}", {"reason": reason})
+        seen.link.tell(SimpleNamespace(key=keys.EVENT, payload=messages.encode(event)))
+    assert shown == [(f"Refused: {subject}", reason)]
+    assert [event.kind for event in seen.show.eyes.events] == ["refused", "refused"]
+
+
+def test_a_world_that_is_gone_is_told_on_the_page(seen: Seen, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Watch, "silent_s", 12.0)
+    state = seen.draw(drones(*NAMES))
+    assert (state["clock"], state["silent_s"]) == ("silent", 12.0)
+    assert "no answer from the world for 12 s" in seen.show._page.clock.content
+
+
 def test_obstacles_stand_where_the_scenario_says(viser: PrivateViser):
     obstacles = scenario_file.from_text(OBSTACLES).environment.obstacles
     added: dict[str, Any] = {}
@@ -226,13 +264,30 @@ class Page:
         return
 
 
-def test_cameras_follow_where_their_page_says_so():
-    calls: dict[str, Any] = {}
-    server: Any = SimpleNamespace(
+def cameras(calls: dict[str, Any], there: set[int]) -> Any:
+    """Return a server that has pages of some numbers."""
+    return SimpleNamespace(
         on_client_connect=lambda call: calls.update(come=call),
         on_client_disconnect=lambda call: calls.update(go=call),
+        get_clients=lambda: dict.fromkeys(there),
     )
-    followers = Followers(server)
+
+
+def test_a_page_that_went_before_it_was_known_is_forgotten():
+    calls: dict[str, Any] = {}
+    followers = Followers(cameras(calls, set()))
+    gone = Page(1)
+    calls["go"](gone)
+    calls["come"](gone)
+    assert followers.switches == set()
+    gone.switch.value = True
+    followers.follow(np.array([(10.0, 0.0, 2.0)]))
+    assert followers._places == {}
+
+
+def test_cameras_follow_where_their_page_says_so():
+    calls: dict[str, Any] = {}
+    followers = Followers(cameras(calls, {1, 2}))
     one, other = Page(1), Page(2)
     calls["come"](one)
     calls["come"](other)

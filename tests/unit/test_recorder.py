@@ -167,6 +167,15 @@ def test_what_a_record_has_no_room_for_is_counted_and_told(tmp_path: Path, monke
     assert said == ["recorder: 3 messages are not on record: a record holds 65535 keys, and theirs are further ones"]
 
 
+def test_what_has_no_time_is_recorded_at_the_worlds_whatever_strangers_stamp(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    strange = ("my/thing", msgspec.msgpack.encode({"t_ns": 2**61, "seq": 0}))
+    recorded(path, [page(gates(0, 1, 2, 3))], [*gates(3), *gates(4), strange, ("my/raw", b"as it is")], gates(5))
+    with RecordReader(path) as reader:
+        times = {message.key: message.t_ns for message in reader.messages() if message.key.startswith("my/")}
+    assert times == {"my/thing": 2**61, "my/raw": 4 * GATE_NS}
+
+
 @pytest.mark.parametrize("garbage", [b"\x91\x92\xa1\xff\xc4\x00", b"\x91" * 5000 + b"\xc0", b"\xc1"])
 def test_a_batch_of_a_stranger_ends_nothing(tmp_path: Path, garbage: bytes):
     link = FakeLink()

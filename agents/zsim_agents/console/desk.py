@@ -1,20 +1,24 @@
 """What an operator asks for, sent to whoever answers it, off the page's threads; what comes of it is told."""
 
 import threading
+from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from typing import Any, NamedTuple
 
 from zsim import keys, messages
 from zsim.errors import ZsimError
 from zsim.session import Session
 from zsim_agents.console.eyes import Eyes
+from zsim_agents.console.turns import Turns
 
 PRIORITY = 10  # contract: of operators
 PRIORITY_EMERGENCY = 100  # contract: the highest; an operator who flies a drone must not keep others from stopping it
 HANDS = 8  # under way at once, of each kind: requests that nobody answers must not keep modes waiting
 ANSWER_S = 5.0  # the world and controllers answer within a gate
+OVERTAKEN = "an emergency was asked for after it"
 TAKEN_S = 1.0  # how long the world may take to say that it has a command, before the drone is given back
 
 
@@ -32,7 +36,7 @@ class Desk:
         link: an open session.
         name: of the console's process.
         eyes: hears when a command has been taken.
-        now_ns: simulated time.
+        now_ns: simulated time for a stamp; may ask for it.
         tell: told what came of each request, in any thread.
     """
 
@@ -44,15 +48,19 @@ class Desk:
         self._eyes = eyes
         self._now_ns = now_ns
         self._tell = tell
-        self._seqs: dict[str, int] = {}
+        self._seqs: Counter[str] = Counter()  # modes sent to each drone
+        self._stops: Counter[str] = Counter()  # emergencies asked for of each drone
         self._lock = threading.Lock()
-        self._requests, self._modes, self._gifts = (
-            ThreadPoolExecutor(HANDS, thread_name_prefix=name) for name in ("desk", "desk-modes", "desk-gifts")
-        )
+        self._hands = [
+            ThreadPoolExecutor(HANDS, thread_name_prefix=f"desk-{what}") for what in ("ask", "mode", "stop", "give")
+        ]
+        self._requests, modes, stops, self._gifts = self._hands
+        self._turns = Turns(modes, stops)
 
     def close(self) -> None:
         """Wait for nobody any more."""
-        for hands in (self._requests, self._modes, self._gifts):
+        self._turns.close()
+        for hands in self._hands:
             hands.shutdown(wait=False, cancel_futures=True)
 
     def world(self, op: str, **args: Any) -> None:
@@ -64,20 +72,29 @@ class Desk:
         self._ask(keys.cluster_control(cluster), op, args, f"{cluster}: {op} {_listed(args)}".strip())
 
     def mode(self, drones: Sequence[str], mode: str) -> None:
-        """Let drones take off, land, stop at once or leave the emergency, whoever flies them."""
+        """Let drones take off, land, stop at once or leave the emergency, whoever flies them.
+
+        Modes of one drone are sent in the order in which they were asked for; an emergency waits for none of them,
+        and none that was asked for before it is sent after it.
+        """
         for drone in drones:
-            act = self._stop if mode == "emergency" else self._mode
-            self._do(self._modes, f"{drone}: {mode}", act, drone, mode)
+            if mode == "emergency":
+                with self._lock:
+                    self._stops[drone] += 1
+                self._do(partial(self._turns.do_at_once, drone), f"{drone}: {mode}", self._stop, drone, mode)
+            else:
+                turn, stops = partial(self._turns.do, drone), self._stops[drone]
+                self._do(turn, f"{drone}: {mode}", self._mode, drone, mode, stops)
 
     def _ask(self, key: str, op: str, args: dict[str, Any], what: str) -> None:
-        self._do(self._requests, what, self._request, key, op, args)
+        self._do(self._requests.submit, what, self._request, key, op, args)
 
-    def _do(self, hands: ThreadPoolExecutor, what: str, act: Callable[..., str], *args: Any) -> None:
+    def _do(self, begin: Callable[[Callable[[], None]], Any], what: str, act: Callable[..., str], *args: Any) -> None:
         def done() -> None:
             self._tell(Told(what, _refusal(act, *args)))
 
         try:
-            hands.submit(done)
+            begin(done)
         except RuntimeError:  # closed; a page of the run may still be open
             self._tell(Told(what, "the run has ended"))
 
@@ -85,12 +102,11 @@ class Desk:
         answer = self._link.request(key, op, self._name, args, ANSWER_S)
         return "" if answer.ok else answer.error or "refused without a reason"
 
-    def _mode(self, drone: str, mode: str) -> str:
-        """Take a drone from whoever flies it, and send the mode."""
-        refusal = self._acquire(drone, PRIORITY)
-        if not refusal:
-            self._send(drone, mode)
-        return refusal
+    def _mode(self, drone: str, mode: str, stops: int) -> str:
+        """Take a drone from whoever flies it, and send the mode, unless more emergencies were asked for meanwhile."""
+        if self._stops[drone] > stops:
+            return OVERTAKEN
+        return self._acquire(drone, PRIORITY) or self._send(drone, mode, stops)
 
     def _stop(self, drone: str, mode: str) -> str:
         """Send the mode whatever becomes of the request for the drone: the world may heed it all the same."""
@@ -101,15 +117,18 @@ class Desk:
     def _acquire(self, drone: str, priority: int) -> str:
         return self._request(keys.CONTROL, "acquire", {"drone": drone, "priority": priority})
 
-    def _send(self, drone: str, mode: str) -> None:
-        before = self._eyes.answered(drone)
-        key = keys.command(drone, "mode")
+    def _send(self, drone: str, mode: str, stops: int | None = None) -> str:
+        """Send a mode, unless more emergencies than `stops` were asked for; let others fly the drone afterwards."""
+        before, now_ns = self._eyes.answered(drone), self._now_ns()
         with self._lock:
-            seq = self._seqs.get(key, 0)
-            self._seqs[key] = seq + 1
-            self._link.put(key, messages.Mode(self._now_ns(), seq, self._name, mode))  # type: ignore[arg-type]
+            overtaken = stops is not None and self._stops[drone] > stops
+            if not overtaken:
+                seq, self._seqs[drone] = self._seqs[drone], self._seqs[drone] + 1
+                said = messages.Mode(now_ns, seq, self._name, mode)  # type: ignore[arg-type]
+                self._link.put(keys.command(drone, "mode"), said)
         with suppress(RuntimeError):  # closed: who leaves a run gives back what it has
             self._gifts.submit(self._give_back, drone, before)
+        return OVERTAKEN if overtaken else ""
 
     def _give_back(self, drone: str, before: int) -> None:
         """Let others fly a drone, once the world has the mode that was sent with an operator's priority."""

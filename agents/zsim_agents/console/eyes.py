@@ -1,45 +1,73 @@
 """What the console hears of a run, kept until the next picture is drawn."""
 
 import threading
+import time
 from collections import Counter, deque
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 from zsim import keys, messages
-from zsim.errors import DecodeError, ZsimError
-from zsim.messages import Clock, EstimateView, Event, Fault, Health, Info, ViewCluster, ViewDrones, ViewEstimates
+from zsim.errors import DecodeError
+from zsim.messages import EstimateView, Event, Fault, Health, Info, ViewCluster, ViewDrones, ViewEstimates
 from zsim.session import Heard, Sample, Session
 from zsim_agents.presence import Presence
 
 EVENTS_KEPT = 200
 SHOWN_BUT = frozenset({"command"})  # kinds of events that say nothing which the next one does not: a mode, a refusal
-CLOCK_WAIT_S = 1.0  # the world answers within milliseconds
+FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
+
+
+class Belief(NamedTuple):
+    """What is believed of a drone.
+
+    Attributes:
+        process: the estimator.
+        t_ns: simulated.
+        fresh: whether it is of the present.
+    """
+
+    process: str
+    t_ns: int
+    estimate: EstimateView
+    fresh: bool
 
 
 class Eyes:
-    """Keeps the newest view of everything; a view that nobody draws is never decoded.
+    """Keeps the newest view of everything until the next look; what comes between two looks is never decoded.
 
     Args:
         link: an open session.
         info: of the run.
-        presence: of the console in it; it follows the run's clock.
+        presence: of the console in it.
         variables: names of each formation's variables: of another formation, or with others, no view is taken.
+        refused: told, in a thread of Zenoh's, of what the world refuses of the console's own commands.
+        wall_s: monotonic.
 
     Attributes:
         drones: the newest view of the drones.
         clusters: the newest view of each formation.
         estimators: the newest view of each estimator, by its process.
         healths: what each process said of itself last.
-        clock: the newest that was asked for.
         faults: injected ones, planned and active.
         events: newest first.
     """
 
-    def __init__(self, link: Session, info: Info, presence: Presence, variables: Mapping[str, tuple[str, ...]]) -> None:
+    def __init__(
+        self,
+        link: Session,
+        info: Info,
+        presence: Presence,
+        variables: Mapping[str, tuple[str, ...]],
+        refused: Callable[[Event], None],
+        wall_s: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._link = link
         self._names = frozenset(drone.name for drone in info.drones)
         self._presence = presence
         self._variables = variables
+        self._refused = refused
+        self._wall_s = wall_s
+        self._taken_s: dict[str, float] = {}  # wall time by key, of views of drones and estimators
         self._new: dict[str, bytes] = {}
         self._arrived = threading.Condition()
         self._lock = threading.Lock()
@@ -48,7 +76,6 @@ class Eyes:
         self.clusters: dict[str, ViewCluster] = {}
         self.estimators: dict[str, ViewEstimates] = {}
         self.healths: dict[str, Health] = {}
-        self.clock: Clock | None = None
         self.faults: tuple[Fault, ...] = ()
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
 
@@ -57,9 +84,10 @@ class Eyes:
         for expression in ("view/**", keys.FAULTS, "process/*/health"):
             self._link.hear(expression, self._keep)
         self._link.on_message(keys.EVENT, self._on_event)
-        for sample in self._link.get(keys.FAULTS):
-            self._new[sample.key] = sample.payload
-        self.ask_clock()
+        told = self._link.get(keys.FAULTS)
+        with self._lock:
+            for sample in told:
+                self._new.setdefault(sample.key, sample.payload)  # what was heard meanwhile is newer
 
     def look(self) -> bool:
         """Take in what has come since the last look; return whether drones have been seen anew."""
@@ -72,20 +100,24 @@ class Eyes:
                 self._presence.health.refused += 1
         return keys.VIEW_DRONES in new
 
-    def estimates(self) -> dict[str, EstimateView]:
-        """Return the newest estimate of each drone."""
-        views = list(self.estimators.values())
-        return {e.name: e for view in views for e in view.estimates if e.name in self._names}
+    def beliefs(self) -> dict[str, Belief]:
+        """Return the newest belief of each drone by name: of two estimators, one of them dead, that of the other.
 
-    def ask_clock(self) -> None:
-        """Ask how the run's time goes: rarely, since to be told of each gate costs those that make it."""
-        try:
-            samples = self._link.get(keys.CLOCK, timeout_s=CLOCK_WAIT_S)
-        except ZsimError:
-            return  # the link is lost, and comes back
-        for sample in samples:
-            self._presence.heed(sample.payload)
-            self.clock = messages.decode(keys.CLOCK, sample.payload)
+        What is of the future was said before a replay went back.
+        """
+        now_ns = self.drones.t_ns if self.drones else 0
+        found: dict[str, Belief] = {}
+        for process, view in sorted(self.estimators.items(), key=lambda each: each[1].t_ns):
+            fresh = self._is_fresh(process, view.t_ns - now_ns)
+            if fresh or view.t_ns <= now_ns:
+                names = (estimate for estimate in view.estimates if estimate.name in self._names)
+                found |= {each.name: Belief(process, view.t_ns, each, fresh) for each in names}
+        return found
+
+    def _is_fresh(self, process: str, ahead_ns: int) -> bool:
+        """Tell whether an estimator's view goes with that of the drones: in a fast run, both skip many gates."""
+        seen_s = self._taken_s.get(keys.VIEW_DRONES, 0.0) - self._taken_s[keys.estimates_view(process)]
+        return abs(ahead_ns) <= FRESH_S * 1e9 or abs(seen_s) <= FRESH_S
 
     def answered(self, drone: str) -> int:
         """Return how many commands to a drone the world has said that it took, or refused."""
@@ -107,10 +139,11 @@ class Eyes:
 
     def _take(self, key: str, message: Any) -> None:
         if isinstance(message, ViewDrones):
-            self.drones = message
+            self.drones, self._taken_s[key] = message, self._wall_s()
         elif isinstance(message, ViewCluster):
             self._take_cluster(key.rpartition("/")[2], message)
         elif isinstance(message, ViewEstimates):
+            self._taken_s[key] = self._wall_s()
             self.estimators[key.rpartition("/")[2]] = message
         elif isinstance(message, Health):
             self.healths[keys.thing(key)] = message
@@ -135,6 +168,8 @@ class Eyes:
                 self._arrived.notify_all()
         if event.kind not in SHOWN_BUT:
             self.events.appendleft(event)
+        if event.kind == "refused" and event.source == self._presence.name:
+            self._refused(event)
 
 
 def _drone(event: Event) -> str:

@@ -25,6 +25,7 @@ class Followers:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.switches: set[str] = set()
+        self._server = server
         self._lock = threading.Lock()
         self._switches: dict[int, tuple[viser.ClientHandle, Any]] = {}
         self._places: dict[int, Array] = {}
@@ -48,11 +49,19 @@ class Followers:
         with self._lock:
             switches = list(self._switches.items())
         for number, (client, switch) in switches:
-            if not switch.value:
-                self._places.pop(number, None)
-            elif np.linalg.norm(centre - self._places.get(number, np.full(3, np.inf))) > NEAR_M:
-                self._places[number] = centre
+            if self._moves(number, switch.value, centre):
                 _look(client, centre, client.camera.position - client.camera.look_at)
+
+    def _moves(self, number: int, follows: bool, centre: Array) -> bool:
+        """Tell whether a page's camera goes to a place, and note that it does."""
+        with self._lock:
+            if not follows:
+                self._places.pop(number, None)
+            near = np.linalg.norm(centre - self._places.get(number, np.full(3, np.inf))) <= NEAR_M
+            if not follows or near or number not in self._switches:
+                return False
+            self._places[number] = centre
+            return True
 
     def _come(self, client: viser.ClientHandle) -> None:
         with client.atomic():
@@ -61,6 +70,8 @@ class Followers:
         with self._lock:
             self._switches[client.client_id] = (client, switch)
             self.switches.add(switch._impl.uuid)
+        if client.client_id not in self._server.get_clients():
+            self._go(client)  # it went while it came
 
     def _go(self, client: viser.ClientHandle) -> None:
         with self._lock:

@@ -42,6 +42,9 @@ class History:
         columns = (unknown if each is None else np.asarray(each, dtype=float) for each in (desired, value, true))
         self._times.append(t_s)
         self._rows.append(np.array(list(columns)))
+        while t_s - self._times[0] > SPAN_S:  # points of a fast run are far apart
+            self._times.popleft()
+            self._rows.popleft()
         return True
 
     def curves(self, place: int, angular: bool) -> tuple[Array, ...]:

@@ -1,5 +1,6 @@
 """One run on the page: what has been heard becomes pictures, tables and plots; what is asked for is sent."""
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -9,7 +10,7 @@ import numpy as np
 import viser
 
 from zsim import frames, scenario_file
-from zsim.messages import Event, Info
+from zsim.messages import Event, Info, ViewDrones
 from zsim.session import Session
 from zsim_agents.console import tables
 from zsim_agents.console.desk import Desk, Told
@@ -20,12 +21,13 @@ from zsim_agents.console.picture import Drones, Shape, drones_of, ellipsoids, gh
 from zsim_agents.console.stage import Stage
 from zsim_agents.console.state import state
 from zsim_agents.console.trails import Trails
+from zsim_agents.console.watch import Watch
 from zsim_agents.console.words import Words
 from zsim_agents.presence import Presence
 from zsim_agents.scenario_space import scenario_space
 
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
-CLOCK_S = 0.25  # wall; of looks at the run's time, and at its end
+STAMPS_PER_AGE = 5.0  # a stamp is at most so small a part as old as commands may be; on its way it ages too
 EVENTS_SHOWN = 60
 NOTICE_S = 8.0  # wall; how long a refusal stays in the corner
 FEW = 20  # drones from which on pictures come half as often
@@ -62,8 +64,10 @@ class Show:
         self._period_s = 1.0 / (rate_hz or (RATE_MANY_HZ if len(names) >= FEW else RATE_FEW_HZ))
         self._spaces = {c.name: scenario_space(self._scenario, c) for c in self._scenario.clusters}
         variables = {name: space.names for name, space in self._spaces.items()}
-        self.eyes = Eyes(link, info, presence, variables)
-        self._desk = Desk(link, presence.name, self.eyes, lambda: presence.now_ns, self._tell)
+        age_s = self._scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
+        self._watch = Watch(link, presence, age_s if info.mode == "realtime" else math.inf)
+        self.eyes = Eyes(link, info, presence, variables, self._tell_refused)
+        self._desk = Desk(link, presence.name, self.eyes, self._watch.now_ns, self._tell)
         self._names = names
         self._members = {c.name: [names.index(d) for d in c.drones] for c in self._scenario.clusters}
         self._trails = Trails(len(names))
@@ -71,7 +75,7 @@ class Show:
         self._shapes: dict[str, Shape | None] = {}
         self._drones: Drones | None = None
         self._ghosted: dict[str, Any] = {}
-        self._drawn_ns = self._table_s = self._clock_s = 0.0
+        self._drawn_ns = self._table_s = 0.0
         robots = sum(space.n for space in self._spaces.values())
         self._stage = Stage(server, names, robots, len(self._spaces))
         self._stage.obstacles(self._scenario.environment.obstacles)
@@ -87,23 +91,21 @@ class Show:
         self.eyes.open()
         pause = threading.Event()
         next_s = time.monotonic()
-        while not self._presence.over and not stopped():
-            self._turn(time.monotonic())
-            next_s = max(next_s + self._period_s, time.monotonic())
-            pause.wait(next_s - time.monotonic())
+        with self._watch.asking():
+            while not self._presence.over and not stopped():
+                self._turn(time.monotonic())
+                next_s = max(next_s + self._period_s, time.monotonic())
+                pause.wait(next_s - time.monotonic())
         self._leave()
 
     def state(self) -> dict[str, Any]:
         """Return what is shown, as plain data: for programs, and for tests."""
-        return state(self._info.run_id, self.eyes, dict(self._shapes))
+        return state(self._info.run_id, self.eyes, self._watch, dict(self._shapes))
 
     # A picture
 
     def _turn(self, wall_s: float) -> None:
-        if wall_s - self._clock_s >= CLOCK_S:
-            self._clock_s = wall_s
-            self.eyes.ask_clock()
-            self._presence.tick()
+        self._presence.tick()
         new = self.eyes.look()
         for form in self._page.forms.values():
             form.send(wall_s)
@@ -127,23 +129,26 @@ class Show:
     def _remember(self, new: bool) -> None:
         """Keep up what pages want to see of the time before they were opened."""
         if new and self.eyes.drones is not None:
-            self._drones = drones_of(self.eyes.drones, self._names)
-            self._note_shapes(self._drones)
-            self._trails.add(self._drones.p_W)
-            self._drawn_ns = self._drones.t_ns
-            self._followers.begin_at(self._followed(self._drones))
+            self._followers.begin_at(self._followed(self._take_in(self.eyes.drones)))
+
+    def _take_in(self, view: ViewDrones) -> Drones:
+        """Keep up with the drones; return them."""
+        drones = drones_of(view, self._names)
+        if drones.t_ns < self._drawn_ns:
+            self._trails.clear()  # a replay has gone back
+        self._drones, self._drawn_ns = drones, drones.t_ns
+        self._trails.add(drones.p_W)
+        self._note_shapes(drones)
+        return drones
 
     def _draw(self) -> None:
         assert self.eyes.drones is not None
-        drones = drones_of(self.eyes.drones, self._names)
-        if drones.t_ns < self._drawn_ns:
-            self._trails.clear()  # a replay has gone back
-        dt_s = min(self._period_s, max(0.0, (drones.t_ns - self._drawn_ns) / 1e9))
-        self._drones, self._drawn_ns = drones, drones.t_ns
+        before_ns = self._drawn_ns
+        drones = self._take_in(self.eyes.drones)
+        dt_s = min(self._period_s, max(0.0, (drones.t_ns - before_ns) / 1e9))
         self._stage.drones(drones, dt_s)
-        self._stage.estimates(ellipsoids(list(self.eyes.estimates().values())))
-        self._trails.add(drones.p_W)
-        self._note_shapes(drones)
+        beliefs = self.eyes.beliefs().values()
+        self._stage.estimates(ellipsoids([belief.estimate for belief in beliefs if belief.fresh]))
         if self._shapes:
             self._stage.shapes(list(self._shapes.values()), list(self._shapes).index(self._page.chosen))
         self._draw_ghosts()
@@ -181,7 +186,7 @@ class Show:
 
     def _tell_in_words(self, wall_s: float) -> None:
         page = self._page
-        page.clock.content = tables.clock(self.eyes.clock, int(self._drawn_ns))
+        page.clock.content = tables.clock(self._watch.clock, int(self._drawn_ns), self._watch.silent_s)
         page.phases.content = tables.clusters({n: (v.phase, v.reason) for n, v in self.eyes.clusters.items()})
         page.drones.content = tables.drones(self._words.rows())
         page.sensors.content = self._words.sensors(page.drone_form.chosen)
@@ -199,5 +204,12 @@ class Show:
             return
         event = Event(self._presence.now_ns, 0, "refused", self._presence.name, "", f"{told.what}: {told.refusal}")
         self.eyes.note(event)
+        self._notify(told.what, told.refusal)
+
+    def _tell_refused(self, event: Event) -> None:
+        """Show what the world refuses of a command that the console has sent."""
+        self._notify(event.subject, str(event.data.get("reason", event.text)))
+
+    def _notify(self, what: str, refusal: str) -> None:
         for client in self._server.get_clients().values():
-            client.add_notification(f"Refused: {told.what}", told.refusal, color="red", auto_close_seconds=NOTICE_S)
+            client.add_notification(f"Refused: {what}", refusal, color="red", auto_close_seconds=NOTICE_S)

@@ -69,21 +69,18 @@ def _drone(row: Row) -> str:
     return line
 
 
-def sensors(name: str, rows: Iterable[SensorRow], sigma_m: float | None, yaw_sigma_deg: float | None) -> str:
-    """Return the table of one drone's sensors, and how sure its estimator is."""
+def sensors(name: str, rows: Iterable[SensorRow], sure: str) -> str:
+    """Return the table of one drone's sensors, and how `sure` its estimator is."""
     told = [
         _row("td", (row.kind, row.used, row.refused, "–" if row.rate_hz is None else f"{row.rate_hz:.0f} Hz"))
         for row in rows
     ]
-    sure = "no estimate yet"
-    if sigma_m is not None and yaw_sigma_deg is not None:
-        sure = f"σ of position {sigma_m:.2f} m, of heading {yaw_sigma_deg:.1f}°"
-    title = f"<div style='{STYLE};padding:2px 0'><b>{escape(name)}</b>: {sure}</div>"
+    title = f"<div style='{STYLE};padding:2px 0'><b>{escape(name)}</b>: {escape(sure)}</div>"
     head = _head(
         ("sensor", "of the drone"),
         ("used", "measurements that its estimator took in"),
         ("refused", "measurements that were too unlikely, or of no use"),
-        ("rate", "of those used, in simulated time"),
+        ("rate", "at which they come, in simulated time"),
     )
     return title + _table(head + "".join(told))
 
@@ -97,8 +94,11 @@ def clusters(told: Mapping[str, tuple[str, str]]) -> str:
     return f"<div style='{STYLE};{FEW_LINES};padding:2px 4px'>{'<br>'.join(lines) or 'no formation'}</div>"
 
 
-def clock(now: Clock | None, t_ns: int) -> str:
-    """Return where the run's time is, and who is waited for."""
+def clock(now: Clock | None, t_ns: int, silent_s: float = 0.0) -> str:
+    """Return where the run's time is, and who is waited for; or for how long the world has been `silent_s`."""
+    if silent_s:
+        told = _coloured(f"no answer from the world for {silent_s:.0f} s", RED)
+        return f"<div style='{STYLE};padding:2px 4px;font-size:14px'>{told}, last at <b>{t_ns / 1e9:.1f} s</b></div>"
     if now is None:
         return f"<div style='{STYLE};padding:2px 4px'>no clock yet</div>"
     waiting = [w for w in now.waiting_for if now.state == "waiting" or w.since_wall_s > 0.5]

@@ -2,9 +2,9 @@
 
 import math
 
-from zsim.messages import EstimateView
+from zsim.messages import EstimateView, Fault
 from zsim_agents.console import tables
-from zsim_agents.console.eyes import Eyes
+from zsim_agents.console.eyes import Belief, Eyes
 from zsim_agents.console.rates import Rates
 
 
@@ -21,40 +21,51 @@ class Words:
 
     def rows(self) -> list[tables.Row]:
         """Return a row for each drone."""
-        view, estimates, lags = self._eyes.drones, self._eyes.estimates(), self._lags_ms()
-        found = []
-        for drone in view.drones if view else ():
-            gps = estimates[drone.name].sensors.get("gps") if drone.name in estimates else None
-            faults = tuple(f.kind for f in self._eyes.faults if f.target == drone.name)
+        view, beliefs, found = self._eyes.drones, self._eyes.beliefs(), []
+        if view is None:
+            return []
+        acting = [fault for fault in self._eyes.faults if _acts(fault, view.t_ns)]
+        for drone in view.drones:
+            belief = beliefs.get(drone.name)
+            gps = belief.estimate.sensors.get("gps") if belief else None
+            faults = tuple(fault.kind for fault in acting if fault.target == drone.name)
             told = "–" if gps is None else f"{gps[0]} / {gps[1]}"
-            lag = lags.get(drone.name)
+            lag = self._lag_ms(belief, view.t_ns) if belief else None
             row = (drone.name, drone.state, drone.battery_percent, lag, drone.commander, told, faults)
             found.append(tables.Row(*row))
         return found
 
     def sensors(self, drone: str) -> str:
         """Return the table of one drone's sensors."""
-        views = list(self._eyes.estimators.values())
-        found = next(((v.t_ns, e) for v in views for e in v.estimates if e.name == drone), None)
-        if found is None:
-            return tables.sensors(drone, (), None, None)
-        t_ns, estimate = found
-        rates = self._rates.of(drone, t_ns, estimate.sensors)
+        belief = self._eyes.beliefs().get(drone)
+        if belief is None:
+            return tables.sensors(drone, (), "no estimate yet")
+        estimate = belief.estimate
+        rates = self._rates.of(drone, belief.t_ns, estimate.sensors) if belief.fresh else {}
         rows = [tables.SensorRow(kind, *counts, rates.get(kind)) for kind, counts in estimate.sensors.items()]
-        return tables.sensors(drone, rows, sigma_m(estimate), math.degrees(estimate.yaw_sigma_rad))
+        return tables.sensors(drone, rows, _certainty(belief))
 
-    def _lags_ms(self) -> dict[str, float]:
-        """Return how far each drone's estimator is behind, as it says of itself or as its view shows."""
-        now_ns = self._eyes.drones.t_ns if self._eyes.drones else 0
-        found = {}
-        for process, view in self._eyes.estimators.items():
-            health = self._eyes.healths.get(process)
-            lag_ns = health.lag_ns if health else max(0, now_ns - view.t_ns)
-            found |= {estimate.name: lag_ns / 1e6 for estimate in view.estimates}
-        return found
+    def _lag_ms(self, belief: Belief, now_ns: int) -> float:
+        """Return how far an estimator is behind: as it says of itself, or as its view shows where that is old."""
+        health = self._eyes.healths.get(belief.process)
+        if health is not None and belief.fresh:
+            return health.lag_ns / 1e6
+        return max(0, now_ns - belief.t_ns) / 1e6
+
+
+def _acts(fault: Fault, now_ns: int) -> bool:
+    return fault.from_ns <= now_ns and (fault.until_ns is None or fault.until_ns > now_ns)
+
+
+def _certainty(belief: Belief) -> str:
+    """Return in words how sure an estimator is."""
+    if not belief.fresh:
+        return f"no estimate since {belief.t_ns / 1e9:.1f} s"
+    heading_deg = math.degrees(belief.estimate.yaw_sigma_rad)
+    return f"σ of position {sigma_m(belief.estimate):.2f} m, of heading {heading_deg:.1f}°"
 
 
 def sigma_m(estimate: EstimateView) -> float:
-    """Return the root of the mean variance of the position over its axes."""
+    """Return the root of the mean variance of the position over its axes; 0 where that is negative, so none."""
     xx, _, _, yy, _, zz = estimate.covariance_m2
-    return math.sqrt((xx + yy + zz) / 3)
+    return math.sqrt(max(0.0, xx + yy + zz) / 3)

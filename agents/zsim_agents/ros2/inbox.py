@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-Act = Callable[[], None]
+Act = Callable[[], object]
 
 
 class Taken(NamedTuple):
