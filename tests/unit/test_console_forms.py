@@ -133,11 +133,13 @@ class Desk:
 
     def __init__(self) -> None:
         self.asked: list[tuple[Any, ...]] = []
+        self.said: list[str] = []
 
     def world(self, op: str, **args: Any) -> None:
         self.asked.append(("world", op, args))
 
-    def cluster(self, cluster: str, op: str, **args: Any) -> None:
+    def cluster(self, cluster: str, op: str, said: str = "", **args: Any) -> None:
+        self.said.append(said)
         self.asked.append((cluster, op, args))
 
     def mode(self, drones: list[str], mode: str) -> None:
@@ -355,6 +357,11 @@ def test_sliders_follow_the_formation_but_for_those_that_somebody_moves(bench: B
         assert bench.gui.at["p [m]"].value == 5.0  # the formation is on its way there
     form.refresh(bench.view(p=5.1), LATER_S + 19.0 + 2 * STILL_S)  # it was held
     assert bench.gui.at["p [m]"].value == 5.1
+
+
+def test_people_are_told_of_targets_in_the_units_of_the_page(bench: Bench):
+    bench.formation().target({"p": 5.0, "yaw": 180.0})
+    assert bench.desk.said == ["p 5 m, yaw 180 deg"]
 
 
 def test_a_move_lasts_as_long_as_is_asked_for(bench: Bench):

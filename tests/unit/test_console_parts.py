@@ -503,6 +503,19 @@ def test_the_clock_says_whom_the_run_waits_for():
     assert "no clock" in tables.clock(None, 0)
 
 
+def test_the_clock_tells_a_pace_only_while_the_run_goes_on():
+    running, paused = (Clock(2_020_000_000, 0, "r", 101, state, 3.0) for state in ("running", "paused"))  # type: ignore[arg-type]
+    assert "2.0 s</b> × 3.0 real time" in tables.clock(running, 2_010_000_000)
+    assert "2.02 s</b><" in tables.clock(paused, 0)  # nothing is drawn yet
+
+
+def test_acting_faults_are_listed():
+    assert tables.NO_FAULT in tables.acting([])
+    assert "gust of world until 5.0 s<br>⚠ link_cut of a/&lt;b&gt;" in tables.acting(
+        ["gust of world until 5.0 s", "link_cut of a/<b>"]
+    )
+
+
 # Where it is
 
 

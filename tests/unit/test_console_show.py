@@ -11,6 +11,7 @@ import pytest
 from zsim import keys, messages, scenario_file
 from zsim.messages import ControlAnswer, DroneView, EstimateView, Event, ViewCluster, ViewDrones, ViewEstimates
 from zsim_agents.console import stage as stages
+from zsim_agents.console.desk import Told
 from zsim_agents.console.followers import Followers
 from zsim_agents.console.picture import drones_of
 from zsim_agents.console.private_viser import PrivateViser
@@ -293,10 +294,22 @@ def test_cameras_follow_where_their_page_says_so():
     calls["come"](other)
     assert followers.switches == {"u1", "u2"}
     one.switch.value = True
+    followers.follow(np.array([(0.0, 0.0, 2.0), (2.0, 0.0, 2.0)]))  # the first picture: everybody looks there
     followers.follow(np.array([(10.0, 0.0, 2.0), (12.0, 0.0, 2.0)]))
     followers.follow(np.zeros((0, 3)))
     assert one.camera.look_at.tolist() == [11.0, 0.0, 2.0]
-    assert other.camera.look_at.tolist() == [0.0, 0.0, 0.0]
+    assert other.camera.look_at.tolist() == [1.0, 0.0, 2.0]
+    followers.begin()  # another run
+    followers.follow(np.array([(30.0, 0.0, 2.0)]))
+    assert other.camera.look_at.tolist() == [30.0, 0.0, 2.0]
     calls["go"](one)
     assert followers.switches == {"u2"}
     assert followers._places == {}
+
+
+def test_what_formations_were_asked_for_is_among_the_events_and_refusals_on_every_page(seen: Seen):
+    seen.show._server.get_clients = dict  # type: ignore[assignment]  # nobody looks
+    for told in (Told("main: takeoff", ""), Told("rate value 2", ""), Told("main: engage", "not yet")):
+        seen.show._tell(told)
+    found = [(event.kind, event.text) for event in seen.show.eyes.events]
+    assert found == [("refused", "main: engage: not yet"), ("control", "main: takeoff: done")]

@@ -67,9 +67,9 @@ class Desk:
         """Ask the world."""
         self._ask(keys.CONTROL, op, args, f"{op} {_listed(args)}".strip())
 
-    def cluster(self, cluster: str, op: str, **args: Any) -> None:
-        """Ask a formation's controller."""
-        self._ask(keys.cluster_control(cluster), op, args, f"{cluster}: {op} {_listed(args)}".strip())
+    def cluster(self, cluster: str, op: str, said: str = "", **args: Any) -> None:
+        """Ask a formation's controller; `said` tells people of the arguments in units of theirs."""
+        self._ask(keys.cluster_control(cluster), op, args, f"{cluster}: {op} {said or _listed(args)}".strip())
 
     def mode(self, drones: Sequence[str], mode: str) -> None:
         """Let drones take off, land, stop at once or leave the emergency, whoever flies them.

@@ -31,8 +31,13 @@ class Followers:
         self._places: dict[int, Array] = {}
         self._centre: Array = np.zeros(3)
         self._offset: Array = FROM_M
+        self._begun = False
         server.on_client_connect(self._come)
         server.on_client_disconnect(self._go)
+
+    def begin(self) -> None:
+        """Let all cameras look at what is to be seen first: another run may fly elsewhere."""
+        self._begun = False
 
     def begin_at(self, p_W: Array) -> None:
         """Let the cameras of pages to come look at what stands at some places (n, 3) [m], unless there is nothing."""
@@ -48,6 +53,10 @@ class Followers:
         centre = self._centre
         with self._lock:
             switches = list(self._switches.items())
+        if not self._begun and len(p_W):
+            self._begun = True
+            for _, (client, _) in switches:
+                _look(client, centre, self._offset)
         for number, (client, switch) in switches:
             if self._moves(number, switch.value, centre):
                 _look(client, centre, client.camera.position - client.camera.look_at)

@@ -83,7 +83,8 @@ class FormationForm:
             return False
         values = {name: self._ranges[name].meant(value) for name, value in shown.items()}
         lasting = {"over_s": float(self._over.value)} if self._over.value > 0 else {}
-        self._desk.cluster(self._cluster.name, "target", values=values, **lasting)
+        said = ", ".join(f"{name} {value:g} {self._ranges[name].unit}" for name, value in shown.items())
+        self._desk.cluster(self._cluster.name, "target", said=said, values=values, **lasting)
         return True
 
     def _button(self, gui: viser.GuiApi, label: str, op: str) -> None:

@@ -35,7 +35,7 @@ class Page:
         rate: that the run was started with.
 
     Attributes:
-        clock, phases, drones, sensors, events: what is told in words.
+        clock, phases, drones, sensors, acting, events: what is told in words.
         forms, plots: of each formation.
         chosen: the formation that is shown; empty where there is none.
         drone_form: knows the drone that is chosen.
@@ -83,6 +83,7 @@ class Page:
         if self._spaces:
             self._formation_tabs(gui, tabs)
         with tabs.add_tab("Faults"):
+            self.acting = gui.add_html("")
             FaultForm(gui, self._desk, self._tell, self._scenario)
         with tabs.add_tab("Run"):
             RunForm(gui, self._desk, self._rate)

@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import viser
+
 from zsim.messages import Info
 from zsim.session import Session
 from zsim_agents.console.controls import KnownControls
@@ -38,6 +40,7 @@ class Console:
         self._show: Show | None = None
         self._viser = PrivateViser()
         self._followers = Followers(self._viser.server)
+        _say_on(self._viser.server.gui, "waiting for a world")
         controls = KnownControls(self._viser.server.gui, self._followers.switches)
         inside = Inside(self._viser.port, self._viser.secret, self._state, controls)
         self._door = Door(place, token, inside)
@@ -70,3 +73,10 @@ class Console:
 
     def _state(self) -> dict[str, Any]:
         return self._show.state() if self._show else {"run_id": None}
+
+
+def _say_on(gui: viser.GuiApi, text: str) -> None:
+    """Put a line on pages that have no run to show."""
+    gui.configure_theme(show_logo=False, show_share_button=False)
+    gui.set_panel_label("zsim")
+    gui.add_markdown(text)

@@ -59,6 +59,7 @@ class Show:
         self._info = info
         self._presence = presence
         self._followers = followers
+        followers.begin()
         self._scenario = scenario_file.from_text(info.scenario)
         names = tuple(drone.name for drone in info.drones)
         self._period_s = 1.0 / (rate_hz or (RATE_MANY_HZ if len(names) >= FEW else RATE_FEW_HZ))
@@ -121,6 +122,7 @@ class Show:
 
     def _leave(self) -> None:
         """Draw how it ended: for pages that are opened between two runs."""
+        self.eyes.look()
         with self._server.atomic():
             if self.eyes.drones is not None:
                 self._draw()
@@ -190,6 +192,7 @@ class Show:
         page.phases.content = tables.clusters({n: (v.phase, v.reason) for n, v in self.eyes.clusters.items()})
         page.drones.content = tables.drones(self._words.rows())
         page.sensors.content = self._words.sensors(page.drone_form.chosen)
+        page.acting.content = tables.acting(self._words.acting())
         page.events.content = tables.events(list(self.eyes.events)[:EVENTS_SHOWN])
         if page.chosen:
             page.forms[page.chosen].refresh(self.eyes.clusters.get(page.chosen), wall_s)
@@ -199,12 +202,16 @@ class Show:
             self._stage.wind(self._drones)
 
     def _tell(self, told: Told) -> None:
-        """Show what came of a request: a refusal in the corner of every page, and among the events."""
-        if not told.refusal:
-            return
-        event = Event(self._presence.now_ns, 0, "refused", self._presence.name, "", f"{told.what}: {told.refusal}")
-        self.eyes.note(event)
-        self._notify(told.what, told.refusal)
+        """Show what came of a request: a refusal in the corner of every page, and among the events.
+
+        Of what was done the world tells, but not of what formations were asked for.
+        """
+        kind, outcome = ("refused", told.refusal) if told.refusal else ("control", "done")
+        if told.refusal or told.what.partition(":")[0] in self._spaces:
+            said = f"{told.what}: {outcome}"
+            self.eyes.note(Event(self._presence.now_ns, 0, kind, self._presence.name, "", said))
+        if told.refusal:
+            self._notify(told.what, told.refusal)
 
     def _tell_refused(self, event: Event) -> None:
         """Show what the world refuses of a command that the console has sent."""

@@ -18,6 +18,7 @@ COLOURS = {
     "emergency": RED,
 }
 LOUD = {"refused": RED, "death": RED, "collision": RED, "fault": AMBER, "fault_end": AMBER, "fault_clear": AMBER}
+NO_FAULT = "no fault acts"
 FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
 STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"
 
@@ -95,7 +96,10 @@ def clusters(told: Mapping[str, tuple[str, str]]) -> str:
 
 
 def clock(now: Clock | None, t_ns: int, silent_s: float = 0.0) -> str:
-    """Return where the run's time is, and who is waited for; or for how long the world has been `silent_s`."""
+    """Return where the run's time is, and who is waited for; or for how long the world has been `silent_s`.
+
+    `t_ns` is the time of the picture, 0 before the first.
+    """
     if silent_s:
         told = _coloured(f"no answer from the world for {silent_s:.0f} s", RED)
         return f"<div style='{STYLE};padding:2px 4px;font-size:14px'>{told}, last at <b>{t_ns / 1e9:.1f} s</b></div>"
@@ -103,7 +107,9 @@ def clock(now: Clock | None, t_ns: int, silent_s: float = 0.0) -> str:
         return f"<div style='{STYLE};padding:2px 4px'>no clock yet</div>"
     waiting = [w for w in now.waiting_for if now.state == "waiting" or w.since_wall_s > 0.5]
     colour = {"running": GREEN, "paused": AMBER}.get(now.state, GREY)
-    text = f"{_coloured(now.state, colour)} <b>{t_ns / 1e9:.1f} s</b> × {now.rate:.1f} real time"
+    t_s = (t_ns or now.t_ns) / 1e9
+    time, pace = (f"{t_s:.1f}", f" × {now.rate:.1f} real time") if now.state == "running" else (f"{t_s:.2f}", "")
+    text = f"{_coloured(now.state, colour)} <b>{time} s</b>{pace}"
     if waiting:
         names = ", ".join(f"{w.name} on {w.host} ({w.since_wall_s:.0f} s)" for w in waiting[:4])
         text += f"<br>waiting for {escape(names)}"
@@ -117,11 +123,19 @@ def events(told: Iterable[Event]) -> str:
         f"<td>{_coloured(event.kind, LOUD.get(event.kind, GREY))}</td><td>{escape(event.text)}</td></tr>"
         for event in told
     ]
-    return _table(_head(("t [s]", "simulated time"), ("event", ""), ("newest first", "")) + "".join(lines))
+    head = _head(("t [s]", "simulated time"), ("event", ""), ("newest first", ""))
+    return _table(head + "".join(lines), "overflow-wrap:anywhere")
 
 
-def _table(body: str) -> str:
-    return f"<table style='{STYLE};border-spacing:4px 1px;width:100%'>{body}</table>"
+def acting(faults: Sequence[str]) -> str:
+    """Return which faults act on anything."""
+    told = "<br>".join(f"⚠ {escape(fault)}" for fault in faults)
+    style = f"{STYLE};{FEW_LINES};padding:2px 4px;color:{AMBER if faults else GREY}"
+    return f"<div style='{style}'>{told or NO_FAULT}</div>"
+
+
+def _table(body: str, wrap: str = "white-space:nowrap") -> str:
+    return f"<table style='{STYLE};{wrap};border-spacing:4px 1px;width:100%'>{body}</table>"
 
 
 def _head(*titles: tuple[str, str]) -> str:

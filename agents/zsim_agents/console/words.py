@@ -24,7 +24,7 @@ class Words:
         view, beliefs, found = self._eyes.drones, self._eyes.beliefs(), []
         if view is None:
             return []
-        acting = [fault for fault in self._eyes.faults if _acts(fault, view.t_ns)]
+        acting = self._acting()
         for drone in view.drones:
             belief = beliefs.get(drone.name)
             gps = belief.estimate.sensors.get("gps") if belief else None
@@ -34,6 +34,14 @@ class Words:
             row = (drone.name, drone.state, drone.battery_percent, lag, drone.commander, told, faults)
             found.append(tables.Row(*row))
         return found
+
+    def acting(self) -> list[str]:
+        """Return which faults act, and on what."""
+        return [f"{fault.kind} of {fault.target}{_until(fault)}" for fault in self._acting()]
+
+    def _acting(self) -> list[Fault]:
+        now_ns = self._eyes.drones.t_ns if self._eyes.drones else 0
+        return [fault for fault in self._eyes.faults if _acts(fault, now_ns)]
 
     def sensors(self, drone: str) -> str:
         """Return the table of one drone's sensors."""
@@ -55,6 +63,10 @@ class Words:
 
 def _acts(fault: Fault, now_ns: int) -> bool:
     return fault.from_ns <= now_ns and (fault.until_ns is None or fault.until_ns > now_ns)
+
+
+def _until(fault: Fault) -> str:
+    return "" if fault.until_ns is None else f" until {fault.until_ns / 1e9:.1f} s"
 
 
 def _certainty(belief: Belief) -> str:
