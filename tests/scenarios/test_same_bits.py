@@ -75,6 +75,7 @@ def test_with_one_estimator_for_all_drones(federation: Federation, pair_sha256: 
     assert federation.record().sha256() == pair_sha256
 
 
+@pytest.mark.soak
 @pytest.mark.usefixtures("busy_cores")
 def test_with_loaded_cores(federation: Federation, pair_sha256: str) -> None:
     """As before, while two other processes take all they can get of the machine.
@@ -148,6 +149,7 @@ def test_another_seed(federation: Federation, pair_sha256: str) -> None:
     assert federation.record().sha256() != pair_sha256
 
 
+@pytest.mark.soak
 def test_paced(federation: Federation, pair_sha256: str) -> None:
     """PAIR at ten times real time: pacing is a switch of its own.
 

@@ -62,7 +62,7 @@ def test_a_killed_launcher_leaves_nobody(team: Team) -> None:
     team.nobody_left()
 
 
-@pytest.mark.parametrize("role", ["estimator.drone2", "controller.main"])
+@pytest.mark.parametrize("role", [pytest.param("estimator.drone2", marks=pytest.mark.soak), "controller.main"])
 def test_a_killed_role_is_started_again(team: Team, role: str) -> None:
     run = team.up("--rate", "8", "--duration", "30")
     in_flight(run)

@@ -54,7 +54,12 @@ def check_end(federation: Federation, whole: bool) -> Record:
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [("estimator.drone1", ()), ("controller.main", ()), ("controller.main", ("--hosted",))]
+    ("name", "options"),
+    [
+        ("estimator.drone1", ()),
+        pytest.param("controller.main", (), marks=pytest.mark.soak),
+        ("controller.main", ("--hosted",)),
+    ],
 )
 def test_restart(
     federation: Federation, undisturbed: dict[str, np.ndarray], name: str, options: tuple[str, ...]
@@ -75,7 +80,7 @@ def test_restart(
     assert "warm start from t = " in log
 
 
-@pytest.mark.parametrize("name", ["estimator.drone1", "controller.main"])
+@pytest.mark.parametrize("name", ["estimator.drone1", pytest.param("controller.main", marks=pytest.mark.soak)])
 def test_wait(federation: Federation, name: str) -> None:
     flight = Flight(federation, "--set", f"processes.on_death={{{name}: wait}}")
     killed_s = federation.kill(name)
@@ -93,7 +98,7 @@ def test_wait(federation: Federation, name: str) -> None:
     assert [event["subject"] for event in check_end(federation, whole=True).events("restart")] == [name]
 
 
-@pytest.mark.parametrize("name", ["estimator.drone1", "controller.main"])
+@pytest.mark.parametrize("name", [pytest.param("estimator.drone1", marks=pytest.mark.soak), "controller.main"])
 def test_drop(federation: Federation, name: str) -> None:
     flight = Flight(federation, "--set", f"processes.on_death={{{name}: drop}}")
     killed_s = federation.kill(name)
@@ -103,7 +108,9 @@ def test_drop(federation: Federation, name: str) -> None:
     assert record.events("restart") == []
 
 
-@pytest.mark.parametrize("name", ["estimator.drone1", "controller.main", "recorder"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("estimator.drone1", marks=pytest.mark.soak), "controller.main", "recorder"]
+)
 def test_end(federation: Federation, name: str) -> None:
     own = [] if name == "recorder" else ["--set", f"processes.on_death={{{name}: end}}"]  # a recorder's death ends it
     flight = Flight(federation, *own)

@@ -11,7 +11,7 @@ NOBODY_FLIES = "processes.on_death={controller: drop}"
 GATE_NS = 20_000_000
 
 
-@pytest.mark.parametrize("rate", [1, 5])
+@pytest.mark.parametrize("rate", [1, pytest.param(5, marks=pytest.mark.soak)])
 def test_it_keeps_pace(federation: Federation, rate: int) -> None:
     duration_s = 6 * rate
     run = federation.run(PAIR, "--realtime", "--rate", str(rate), "--duration", str(duration_s))

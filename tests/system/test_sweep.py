@@ -146,7 +146,9 @@ def test_runs_that_fail_are_rows(federation: Federation) -> None:
     assert reason in (out / "report.html").read_text()
 
 
-@pytest.mark.parametrize("name", ["stüp.yaml", b"st\xfcp.yaml".decode(errors="surrogateescape")])
+@pytest.mark.parametrize(
+    "name", [pytest.param("stüp.yaml", marks=pytest.mark.soak), b"st\xfcp.yaml".decode(errors="surrogateescape")]
+)
 def test_a_scenario_file_of_any_name(federation: Federation, name: str) -> None:
     """Also where the locale knows nothing but ASCII."""
     out, path = federation.folder / "sweep", federation.write(PAIR, name)
