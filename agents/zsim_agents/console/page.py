@@ -14,7 +14,7 @@ from zsim_agents.console.limits import ranges
 from zsim_agents.console.plots import Plots
 from zsim_agents.console.run_form import DroneForm, FleetForm, RunForm
 
-PANEL_PX = 330
+PANEL_PX = 350
 SWITCHES = {
     "ghosts": "Ghosts: where the formation is to be",
     "estimates": "Estimates: 2σ ellipsoids (hold 74 % in 3-D)",
