@@ -43,6 +43,7 @@ from zsim_deploy.arguments import (
     load_scenario,
     mode_and_rate,
 )
+from zsim_deploy.reach import Reach, takes_part
 
 app = typer.Typer(
     name="zsim",
@@ -233,40 +234,30 @@ def world(
 
 
 @app.command(rich_help_panel=ROLES)
+@takes_part
 def estimator(
+    reach: Reach,
     drones: Annotated[
         list[str],
         typer.Argument(metavar="DRONE...", help="Drones, or patterns: 'drone*'.", show_default=False),
     ],
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = None,
-    launched: Launched = None,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """Run the estimator of one drone, or of several in one process."""
     from zsim_deploy import roles
 
-    roles.agent(roles.estimator(drones), connect, federation, wait, launched, identity(host, tls, insecure))
+    roles.agent(roles.estimator(drones), reach)
 
 
 @app.command(rich_help_panel=ROLES)
+@takes_part
 def controller(
+    reach: Reach,
     cluster: Annotated[str, typer.Argument(help="Name of the cluster.")] = "main",
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = None,
-    launched: Launched = None,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """Run the cluster-space controller of one cluster."""
     from zsim_deploy import roles
 
-    roles.agent(roles.controller(cluster), connect, federation, wait, launched, identity(host, tls, insecure))
+    roles.agent(roles.controller(cluster), reach)
 
 
 @app.command("host", rich_help_panel=ROLES)
@@ -285,24 +276,19 @@ def host_agents(
     """Run several estimators and controllers in one process, which is faster."""
     from zsim_deploy import roles
 
-    roles.agent(roles.host(names), connect, federation, wait, launched, identity(host, None, insecure))
+    roles.agent(roles.host(names), Reach(connect, federation, wait, None, insecure, host, launched))
 
 
 @app.command(rich_help_panel=ROLES)
+@takes_part
 def record(
+    reach: Reach,
     out: Annotated[Path, typer.Option(help="Folder for run.mcap.")] = Path("."),
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = None,
-    launched: Launched = None,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """Record every message of a federation into run.mcap."""
     from zsim_deploy import roles
 
-    roles.recorder(out / "run.mcap", connect, federation, wait, launched, identity(host, tls, insecure))
+    roles.recorder(out / "run.mcap", reach)
 
 
 @app.command(rich_help_panel=ROLES)

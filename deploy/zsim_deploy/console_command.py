@@ -5,17 +5,9 @@ from typing import Annotated
 import typer
 
 from zsim_deploy.arguments import (
-    DEFAULT_ENDPOINT,
-    Connect,
-    Federation,
-    Host,
-    Insecure,
-    Launched,
-    Tls,
-    Wait,
-    identity,
     positive,
 )
+from zsim_deploy.reach import Reach, takes_part
 
 PANEL = "Watch and steer"
 PORT = 8080
@@ -27,7 +19,9 @@ app = typer.Typer()
 
 
 @app.command(rich_help_panel=PANEL)
+@takes_part
 def console(
+    reach: Reach,
     listen: Annotated[str, typer.Option(help="Address on which the page is served.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port of the page.", min=1, max=65535)] = PORT,
     token: Annotated[
@@ -38,13 +32,6 @@ def console(
         typer.Option(callback=positive, help="Pictures a second (20; 10 from 20 drones on).", show_default=False),
     ] = None,
     name: Annotated[str, typer.Option(help="Process name (default console.1, or the certificate's).")] = "",
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = None,
-    launched: Launched = None,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """Show a run in the browser, and steer it: scene, plots, events, faults."""
     check()
@@ -55,11 +42,11 @@ def console(
     from zsim_deploy.visitor import named, visit
 
     give_way()
-    mine = named("console", name, tls, "1")
-    say = Teller().say if launched else speaker(False)
+    mine = named("console", name, reach.tls, "1")
+    say = Teller().say if reach.launched else speaker(False)
     shown = Console(Place(listen, port), mine, token, rate_hz, say)
     with shown.open():
-        visit(mine, shown.serve, connect, federation, wait, launched, identity(host, tls, insecure))
+        visit(mine, shown.serve, reach)
 
 
 def check() -> None:

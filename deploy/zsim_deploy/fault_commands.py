@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from zsim_deploy.arguments import DEFAULT_ENDPOINT, Connect, Federation, Host, Insecure, Tls, Wait, identity
 from zsim_deploy.look_commands import linked
+from zsim_deploy.reach import Reach, looks
 
 if TYPE_CHECKING:
     from zsim.fault_kinds import Kind
@@ -50,7 +50,9 @@ At = Annotated[
 
 
 @app.command()
+@looks
 def add(
+    reach: Reach,
     target: Annotated[
         str, typer.Argument(help="Drone, link (a/b), process, cluster, or world: as the kind asks.", show_default=False)
     ],
@@ -60,51 +62,37 @@ def add(
     ] = None,
     for_: For = None,
     at: At = None,
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = 5.0,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """Inject a fault, e.g. `zsim fault add drone2 gps_dropout --for 10s`."""
     times = {"for_s": seconds(for_), "at_s": seconds(at)}
     args = {"kind": kind, "target": target, **times, **_values(parameters or ())}
-    with linked(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
+    with linked(reach) as (link, _):
         done = _ask(link, "fault_add", args)
     until = "until it is cleared" if done["until_ns"] is None else f"to {done['until_ns'] / 1e9:.2f} s"
     print(f"fault {done['id']}: {kind} of {target} from {done['from_ns'] / 1e9:.2f} s {until}")
 
 
 @app.command()
+@looks
 def clear(
+    reach: Reach,
     which: Annotated[str, typer.Argument(help="Number, target or kind of faults, or all.")] = ALL,
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = 5.0,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """End faults: all, or those of a number, a target or a kind."""
-    with linked(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
+    with linked(reach) as (link, _):
         done = _ask(link, "fault_clear", selector(which))
     print(f"cleared {', '.join(map(str, done['cleared'])) or 'nothing: no fault was planned or acting'}")
 
 
 @app.command("list")
+@looks
 def list_(
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = 5.0,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
+    reach: Reach,
 ) -> None:
     """List the faults that are planned or act."""
     from zsim import keys, messages
 
-    with linked(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
+    with linked(reach) as (link, _):
         now_ns = max((messages.decode(keys.CLOCK, s.payload).t_ns for s in link.get(keys.CLOCK)), default=0)
         told = [messages.decode(keys.FAULTS, sample.payload) for sample in link.get(keys.FAULTS)]
     rows = [row(fault, now_ns) for message in told for fault in message.faults if not _is_over(fault, now_ns)]

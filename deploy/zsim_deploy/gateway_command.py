@@ -5,17 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsim_deploy.arguments import (
-    DEFAULT_ENDPOINT,
-    Connect,
-    Federation,
-    Host,
-    Insecure,
-    Launched,
-    Tls,
-    Wait,
-    identity,
-)
+from zsim_deploy.reach import LOOK_S, Reach, takes_part
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -31,7 +21,9 @@ app = typer.Typer()
 
 
 @app.command(rich_help_panel=PANEL)
+@takes_part
 def gateway(
+    reach: Reach,
     listen: Annotated[str, typer.Option(help="Address on which clients come in.")] = "127.0.0.1",
     http: Annotated[int, typer.Option(help="Port of HTTP and WebSocket.", min=1, max=65535)] = 8000,
     lines: Annotated[int, typer.Option(help="Port of JSON lines on TCP.", min=1, max=65535)] = 7470,
@@ -39,13 +31,6 @@ def gateway(
         str | None, typer.Option(envvar=TOKEN, help="What clients must show; needed off loopback.")
     ] = None,
     name: Annotated[str, typer.Option(help="Process name (default gateway.main, or the certificate's).")] = "",
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = None,
-    launched: Launched = None,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
     from zsim.connection import find_world
@@ -54,16 +39,16 @@ def gateway(
     from zsim_deploy.visitor import named, visit
 
     give_way()
-    who = identity(host, tls, insecure)
-    mine = named("gateway", name, tls)
+    who = reach.who
+    mine = named("gateway", name, reach.tls)
 
     def dial(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
-        return find_world(connect, federation, 5.0, identity=_of_seat(who, process))
+        return find_world(reach.endpoint, reach.federation, LOOK_S, identity=_of_seat(who, process))
 
     doors = Doors(listen, http, lines)
-    gate = Gateway(doors, mine, token, dial, speaker(launched is not None), secured=tls is not None)
+    gate = Gateway(doors, mine, token, dial, speaker(reach.launched is not None), secured=reach.tls is not None)
     with gate.open():
-        visit(mine, gate.serve, connect, federation, wait, launched, who)
+        visit(mine, gate.serve, reach)
 
 
 def _of_seat(who: "Identity", process: str) -> "Identity":

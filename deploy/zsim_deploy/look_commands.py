@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from zsim_deploy.arguments import DEFAULT_ENDPOINT, Connect, Federation, Host, Insecure, Tls, Wait, identity, positive
+from zsim_deploy.arguments import positive
+from zsim_deploy.reach import Reach, looks
 
 if TYPE_CHECKING:
-    from zsim.identity import Identity
     from zsim.messages import Info
     from zsim.session import Session
 
@@ -23,33 +23,25 @@ app = typer.Typer()
 
 
 @app.command(rich_help_panel=PANEL)
+@looks
 def keys(
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = 5.0,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
+    reach: Reach,
 ) -> None:
     """List the keys that speak, with their message and how many came in a second."""
     from zsim_deploy import look
 
-    with linked(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
+    with linked(reach) as (link, _):
         for key, kind, count in look.list_keys(link):
             print(f"{key:<36} {kind:<14} {count:>6}")
 
 
 @app.command(rich_help_panel=PANEL)
+@looks
 def echo(
+    reach: Reach,
     key: Annotated[str, typer.Argument(help="Key or expression, e.g. drone/drone1/sensor/imu or 'drone/*/truth'.")],
     count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after so many messages.")] = None,
     raw: Annotated[bool, typer.Option("--raw", help="Payload as hexadecimal digits.")] = False,
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = 5.0,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """Print the messages on a key as JSON lines."""
     from zsim_deploy import look
@@ -57,77 +49,65 @@ def echo(
     def emit(name: str, message: Any) -> None:
         print(json.dumps({"key": name, "message": message}), flush=True)
 
-    with linked(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
+    with linked(reach) as (link, _):
         look.echo(link, key, count, emit, raw)
 
 
 @app.command(rich_help_panel=PANEL)
+@looks
 def hz(
+    reach: Reach,
     key: Annotated[str, typer.Argument(help="Key or expression.")],
     window: Annotated[int, typer.Option(help="Messages that the rate is taken over.", min=2, max=1_000_000)] = 1000,
     seconds: Annotated[float | None, typer.Option(callback=positive, help="Stop after so many seconds.")] = None,
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = 5.0,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """Print how often messages come on a key, in wall and in simulated time."""
     from zsim_deploy import look
 
-    with linked(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
+    with linked(reach) as (link, _):
         look.hz(link, key, window, seconds or math.inf, lambda line: print(line, flush=True))
 
 
 @app.command(rich_help_panel=PANEL)
+@looks
 def pub(
+    reach: Reach,
     key: Annotated[str, typer.Argument(help="Key, e.g. drone/drone1/cmd/velocity.")],
     message: Annotated[str, typer.Argument(help='JSON, e.g. \'{"velocity_m_s": [1, 0, 0], "yaw_rate_rad_s": 0}\'.')],
     count: Annotated[int, typer.Option("--count", "-n", min=1, help="How many times.")] = 1,
     rate_hz: Annotated[float, typer.Option(callback=positive, max=1000, help="How often per wall second.")] = 10.0,
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = 5.0,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """Send a command to a drone; t_ns, seq and source are filled in."""
     from zsim_deploy import poke
 
-    with linked(connect, federation, wait, identity(host, tls, insecure)) as (link, info):
+    with linked(reach) as (link, info):
         sent = poke.publish(link, info, key, message, count, rate_hz)
     print(f"published {sent} on {key}")
 
 
 @app.command(rich_help_panel=PANEL)
+@looks
 def ask(
+    reach: Reach,
     key: Annotated[str, typer.Argument(help="world/control or cluster/NAME/control.")],
     op: Annotated[str, typer.Argument(help="E.g. pause, resume, step, stop; engage, hold, land, target.")],
     args: Annotated[str, typer.Argument(help="JSON map, e.g. '{\"gates\": 50}'.")] = "{}",
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = 5.0,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """Send a request to the world or a controller and print the answer."""
     from zsim_deploy import poke
 
-    with linked(connect, federation, wait, identity(host, tls, insecure)) as (link, _):
+    with linked(reach) as (link, _):
         result = poke.ask(link, key, op, args)
     print("ok" if result is None else json.dumps(result))
 
 
 @contextmanager
-def linked(endpoint: str, federation: str, wait_s: float | None, who: "Identity") -> Iterator[tuple["Session", "Info"]]:
+def linked(reach: Reach) -> Iterator[tuple["Session", "Info"]]:
     """Yield a session to the federation's hub, and what its world says of the run."""
     from zsim.connection import find_world
 
     say = partial(print, file=sys.stderr)
-    with find_world(endpoint, federation, wait_s, say, reader=True, identity=who) as found:
+    with find_world(reach.endpoint, reach.federation, reach.wait_s, say, reader=True, identity=reach.who) as found:
         try:
             yield found
         except KeyboardInterrupt:  # the usual end of `zsim echo` and `zsim hz`

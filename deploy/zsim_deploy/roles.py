@@ -23,6 +23,7 @@ from zsim_deploy.hosting import chosen, hosted
 from zsim_deploy.leash import Leash
 from zsim_deploy.lent import lent
 from zsim_deploy.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
+from zsim_deploy.reach import Reach
 
 NICE = 5  # of processes for which nobody waits
 TICK_S = 0.1  # how often a router looks for a stop
@@ -121,21 +122,15 @@ def _event_line(event: messages.Event) -> dict[str, Any]:
     }
 
 
-def agent(
-    build: Callable[[messages.Info, Scenario], Agent],
-    endpoint: str,
-    federation: str,
-    wait_s: float | None,
-    launched: str | None,
-    identity: Identity,
-) -> None:
-    """Run one agent against the world on an endpoint."""
-    leash = Leash(launched is not None, lent(identity, launched))
+def agent(build: Callable[[messages.Info, Scenario], Agent], reach: Reach) -> None:
+    """Run one agent against a world."""
+    launched, who = reach.launched, reach.who
+    leash = Leash(launched is not None, lent(who, launched))
     say = speaker(launched is not None)
-    found = find_world(endpoint, federation, wait_s, say, leash.pulled, run_id=launched, identity=identity)
+    found = find_world(reach.endpoint, reach.federation, reach.wait_s, say, leash.pulled, run_id=launched, identity=who)
     with found as (link, info):
         made = build(info, scenario_file.from_text(info.scenario))
-        check_certificate(made, identity)
+        check_certificate(made, who)
         say(f"{made.name}: in run {info.run_id}{_also(made)}")
         gc.collect()
         gc.freeze()
@@ -187,25 +182,20 @@ def controller(cluster: str) -> Callable[[messages.Info, Scenario], Agent]:
     return lambda info, scenario: Controller(info, scenario, cluster)
 
 
-def recorder(
-    path: Path,
-    endpoint: str,
-    federation: str,
-    wait_s: float | None,
-    launched: str | None,
-    identity: Identity,
-) -> None:
-    """Record the run of the world on an endpoint into a file."""
+def recorder(path: Path, reach: Reach) -> None:
+    """Record the run of a world into a file."""
     from zsim_agents.recorder import record
 
     give_way()
-    leash = Leash(launched is not None, lent(identity, launched))
+    launched, who = reach.launched, reach.who
+    leash = Leash(launched is not None, lent(who, launched))
     say = speaker(launched is not None)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RecordError(f"{path.parent}: cannot be made ({error.strerror}); give --out another folder") from error
-    with find_world(endpoint, federation, wait_s, say, leash.pulled, True, launched, identity) as (link, info):
+    found = find_world(reach.endpoint, reach.federation, reach.wait_s, say, leash.pulled, True, launched, who)
+    with found as (link, info):
         say(f"recorder: run {info.run_id} into {path}")
         reason = record(link, info, path, stopped=leash.pulled, say=say)
     say(f"recorder: {path} is complete, {reason}")

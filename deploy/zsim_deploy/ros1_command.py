@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from zsim_agents.ros1.master_uri import DEFAULT_MASTER, reachable_as
-from zsim_deploy.arguments import DEFAULT_ENDPOINT, Connect, Federation, Host, Insecure, Launched, Tls, Wait, identity
+from zsim_deploy.reach import Reach, takes_part
 
 PANEL = "Others come in"
 
@@ -14,7 +14,9 @@ app = typer.Typer()
 
 
 @app.command(rich_help_panel=PANEL)
+@takes_part
 def ros1(
+    reach: Reach,
     master: Annotated[str, typer.Option(envvar="ROS_MASTER_URI", help="The ROS master.")] = DEFAULT_MASTER,
     ros_host: Annotated[
         str | None,
@@ -25,13 +27,6 @@ def ros1(
         ),
     ] = None,
     name: Annotated[str, typer.Option(help="Process name (default ros1.main, or the certificate's).")] = "",
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = None,
-    launched: Launched = None,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
     from zsim_agents.ros1.bridge import DismissedError, serve
@@ -39,9 +34,9 @@ def ros1(
     from zsim_deploy.visitor import named, visit
 
     give_way()
-    mine = named("ros1", name, tls)
+    mine = named("ros1", name, reach.tls)
     bridge = partial(serve, master_uri=master, host=ros_host or reachable_as(master))
     try:
-        visit(mine, bridge, connect, federation, wait, launched, identity(host, tls, insecure))
+        visit(mine, bridge, reach)
     except DismissedError as error:
         print(error)

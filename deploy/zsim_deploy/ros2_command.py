@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from zsim_deploy.arguments import DEFAULT_ENDPOINT, Connect, Federation, Host, Insecure, Launched, Tls, Wait, identity
+from zsim_deploy.reach import Reach, takes_part
 
 PANEL = "Others come in"
 DOMAIN_MAX = 232  # the highest ROS_DOMAIN_ID that ROS 2 takes
@@ -16,8 +16,9 @@ app = typer.Typer()
 
 
 @app.command(rich_help_panel=PANEL)
+@takes_part
 def ros2(
-    connect: Connect = DEFAULT_ENDPOINT,
+    reach: Reach,
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=DOMAIN_MAX, help="ROS_DOMAIN_ID.")] = 0,
     router: Annotated[
         str | None, typer.Option(help="Where ROS's own router (rmw_zenohd) listens; the world's hub if not given.")
@@ -26,12 +27,6 @@ def ros2(
     write_package: Annotated[
         Path | None, typer.Option(help="Only write the ROS package zsim_msgs into this folder, for a ROS workspace.")
     ] = None,
-    federation: Federation = "zsim",
-    wait: Wait = None,
-    launched: Launched = None,
-    tls: Tls = None,
-    insecure: Insecure = False,
-    host: Host = None,
 ) -> None:
     """Show the drones to ROS 2 (RMW_IMPLEMENTATION=rmw_zenoh_cpp) as topics and services, without ROS here."""
     if write_package is not None:
@@ -43,15 +38,15 @@ def ros2(
     from zsim_deploy.roles import give_way
     from zsim_deploy.visitor import named, visit
 
-    if tls and router is None:
+    if reach.tls and router is None:
         why = "the world's access control lets no ROS keys pass"
         raise typer.BadParameter(f"--tls needs --router, the endpoint of a rmw_zenohd: {why}")
     give_way()
-    who = identity(host, tls, insecure)
-    to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=insecure)
+    who = reach.who
+    to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
     door = Door(domain, router, to_router)
-    mine = named("ros2", name, tls)
-    visit(mine, partial(serve, door=door, wall_ns=time.time_ns), connect, federation, wait, launched, who)
+    mine = named("ros2", name, reach.tls)
+    visit(mine, partial(serve, door=door, wall_ns=time.time_ns), reach)
 
 
 def _write_package(folder: Path) -> None:

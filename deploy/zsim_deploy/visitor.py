@@ -6,12 +6,12 @@ from pathlib import Path
 
 from zsim.connection import find_world
 from zsim.errors import NoWorldError, SupersededError
-from zsim.identity import Identity
 from zsim.messages import Info
 from zsim.session import Session
 from zsim_agents.presence import Presence
 from zsim_deploy.leash import Leash
 from zsim_deploy.lent import lent
+from zsim_deploy.reach import Reach
 from zsim_deploy.roles import speaker
 
 PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits for byes
@@ -22,21 +22,23 @@ Serve = Callable[[Session, Info, Presence, Stopped, Say], None]
 """Serves one run with (session, info, presence, stopped, say), until its presence is over or it is stopped."""
 
 
-def visit(
-    name: str, serve: Serve, endpoint: str, federation: str, wait_s: float | None, launched: str | None, who: Identity
-) -> None:
+def visit(name: str, serve: Serve, reach: Reach) -> None:
     """Serve one run after the other of the world on an endpoint, until it is told to stop; launched, only one.
 
     Raises:
         NoWorldError: there was no first world within `wait_s`.
         SupersededError: another process of this name has taken over.
     """
+    launched, wait_s, who = reach.launched, reach.wait_s, reach.who
     leash = Leash(launched is not None, lent(who, launched))
     say = speaker(launched is not None)
     former = ""
     try:
         while not leash.pulled():
-            with find_world(endpoint, federation, wait_s, say, leash.pulled, True, launched, who) as (link, info):
+            with find_world(reach.endpoint, reach.federation, wait_s, say, leash.pulled, True, launched, who) as (
+                link,
+                info,
+            ):
                 if info.run_id != former:
                     _serve(serve, link, Presence(link, info, name), info, leash, say)
                 else:
