@@ -1,19 +1,12 @@
 """One launched process: started, watched, told to stop, its last words kept."""
 
-import os
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-SINGLE_THREADED = {
-    "OPENBLAS_NUM_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "NUMBA_NUM_THREADS": "1",
-}  # matrices of a dozen rows: threads only cost, and would compete with the other roles
+from zsim_deploy.nursery import Nursery, Process
 
 
 class Child:
@@ -23,11 +16,17 @@ class Child:
         name: process name `role.thing`.
         arguments: of the `zsim` command.
         logs: folder for its standard error.
+        nursery: where it is started.
         on_line: told every line of its standard output; None sends that to the log too.
     """
 
     def __init__(
-        self, name: str, arguments: list[str], logs: Path, on_line: Callable[[str], None] | None = None
+        self,
+        name: str,
+        arguments: list[str],
+        logs: Path,
+        nursery: Nursery,
+        on_line: Callable[[str], None] | None = None,
     ) -> None:
         self.name = name
         self.role = name.split(".", 1)[0]
@@ -35,30 +34,22 @@ class Child:
         self.started_s = 0.0
         self._arguments = arguments
         self._log = logs / f"{name}.log"
+        self._nursery = nursery
         self._on_line = on_line
         self._reader: threading.Thread | None = None
-        self._process: subprocess.Popen[str] | None = None
+        self._process: Process | None = None
 
     def start(self) -> None:
         """Start it, or start it again."""
-        command = [sys.executable, "-m", "zsim_deploy.cli", *self._arguments]
         with self._log.open("a") as log:
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE if self._on_line else log,
-                stderr=log,
-                text=True,
-                env={**SINGLE_THREADED, **os.environ},
-                start_new_session=True,
-            )
+            self._process = self._nursery.start(self._arguments, log, listened=self._on_line is not None)
         self.started_s = time.monotonic()
         if self._on_line:
             self._reader = threading.Thread(target=self._read, args=(self._process, self._on_line), daemon=True)
             self._reader.start()
 
     @staticmethod
-    def _read(process: "subprocess.Popen[str]", on_line: Callable[[str], None]) -> None:
+    def _read(process: Process, on_line: Callable[[str], None]) -> None:
         assert process.stdout is not None
         for line in process.stdout:
             on_line(line)

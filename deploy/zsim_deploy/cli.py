@@ -1,11 +1,13 @@
 """The command line: thin commands that read options, call one function, and print one line for a fault."""
 
 import sys
+from functools import cache
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.main import get_command
 
 from zsim import __version__
 from zsim.errors import BehindError, SupersededError, ZsimError
@@ -338,11 +340,17 @@ def options(
     """Co-simulate drone formations: one world, estimators and controllers as processes on Zenoh, in lockstep."""
 
 
+@cache
+def command() -> Any:
+    """Return the command line, made once: a process that is forked has it already."""
+    return get_command(app)
+
+
 def main() -> None:
     """Run the command line; a user's fault is a line, not a traceback."""
     _say_anything()
     try:
-        code = app(standalone_mode=False, prog_name="zsim")
+        code = command()(standalone_mode=False, prog_name="zsim")
     except ZsimError as error:
         print(error, file=sys.stderr)
         sys.exit(EXIT_CODES.get(type(error), USER_FAULT))

@@ -4,9 +4,7 @@ from typing import Annotated
 
 import typer
 
-from zsim_deploy.arguments import (
-    positive,
-)
+from zsim_deploy.arguments import positive
 from zsim_deploy.reach import Reach, takes_part
 
 PANEL = "Watch and steer"
@@ -41,7 +39,7 @@ def console(
     from zsim_deploy.roles import give_way, speaker
     from zsim_deploy.visitor import named, visit
 
-    give_way()
+    give_way(for_eyes=True)
     mine = named("console", name, reach.tls, "1")
     say = Teller().say if reach.launched else speaker(False)
     shown = Console(Place(listen, port), mine, token, rate_hz, say)

@@ -17,9 +17,9 @@ import asyncssh
 
 from zsim.errors import HostsError
 from zsim_deploy import shell
-from zsim_deploy.child import SINGLE_THREADED
 from zsim_deploy.host_link import HostLink, Loop
 from zsim_deploy.log import Log
+from zsim_deploy.nursery import SINGLE_THREADED
 
 BEAT_S = 1.0  # how often the launcher shows that it lives
 ORPHAN_S = 60.0  # without a beat a process ends itself; a link may be cut for shorter than that

@@ -25,7 +25,8 @@ from zsim_deploy.lent import lent
 from zsim_deploy.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
 from zsim_deploy.reach import Reach
 
-NICE = 5  # of processes for which nobody waits
+NICE = 5  # of processes for which no gate waits
+NICE_FOR_EYES = 10  # of those that only people look at: a picture may come later, a gate may not
 TICK_S = 0.1  # how often a router looks for a stop
 PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
 PATIENCE_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
@@ -233,10 +234,16 @@ def _refuse(fault: str | None, upstream: str) -> None:
         raise SessionError(f"cannot connect to {upstream}: {fault}")
 
 
-def give_way() -> None:
-    """Let the world go first where both want the processor: for those for whom nobody waits. Threads to come, too."""
+def give_way(for_eyes: bool = False) -> None:
+    """Let the world go first where both want the processor: for those for whom no gate waits. Threads to come, too.
+
+    Args:
+        for_eyes: a person alone waits; then it does not interrupt others when it wakes up either (SCHED_BATCH).
+    """
     if hasattr(os, "nice"):
-        os.nice(NICE)
+        os.nice(NICE_FOR_EYES if for_eyes else NICE)
+    if for_eyes and sys.platform == "linux":
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
 def speaker(launched: bool) -> Callable[[str], None]:

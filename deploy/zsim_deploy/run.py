@@ -18,6 +18,7 @@ from zsim_deploy.arguments import pace_options
 from zsim_deploy.child import Child
 from zsim_deploy.hosting import agents_of
 from zsim_deploy.leash import Leash
+from zsim_deploy.nursery import Nursery
 from zsim_deploy.progress import Screen
 from zsim_deploy.watch import Outcome, Watch
 
@@ -40,7 +41,7 @@ class Options:
     console: bool = False
 
 
-def _children(options: Options, endpoint: str, watch: Watch) -> list[Child]:
+def _children(options: Options, endpoint: str, watch: Watch, nursery: Nursery) -> list[Child]:
     """Return the processes of a run, not started."""
     logs, file = options.out / "logs", options.out / "scenario.yaml"
     scenario, federation = options.scenario, options.scenario.federation
@@ -50,18 +51,18 @@ def _children(options: Options, endpoint: str, watch: Watch) -> list[Child]:
     pace = pace_options(options.mode, options.rate)
     world = ["world", str(file), "--listen", endpoint, "--expect", "recorder", *pace, *launched]
     record = ["record", "--out", str(options.out), *reach]
-    children = [Child("world", world, logs, watch.take_line), Child("recorder", record, logs)]
+    children = [Child("world", world, logs, nursery, watch.take_line), Child("recorder", record, logs, nursery)]
     wanted = scenario.processes.expect
     names = [name for name in agents_of(scenario) if wanted is None or name in wanted]
     if options.hosted and names:
-        children.append(Child(names[-1], ["host", *reach, "--", *names], logs))
+        children.append(Child(names[-1], ["host", *reach, "--", *names], logs, nursery))
     else:
         # a name of the contract may begin with -
         split = [name.partition(".") for name in names]
-        children += [Child(f"{role}.{thing}", [role, *reach, "--", thing], logs) for role, _, thing in split]
+        children += [Child(f"{role}.{thing}", [role, *reach, "--", thing], logs, nursery) for role, _, thing in split]
     if options.console:
         show = ["console", "--name", console_command.OF_A_RUN, "--port", str(_page_port()), *reach]
-        children.append(Child(console_command.OF_A_RUN, show, logs, watch.take_line))
+        children.append(Child(console_command.OF_A_RUN, show, logs, nursery, watch.take_line))
     rank = {name: i for i, name in enumerate(options.order)}
     return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
 
@@ -138,24 +139,27 @@ def run_processes(options: Options, screen: Screen) -> Outcome:
     scenario = options.scenario
     _write_scenario(options, logs=True)
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
-    outcome = _go(options, options.listen, screen) if options.listen else _go_on_a_free_port(options, screen)
+    with Nursery(screen.say) as nursery:
+        nursery.await_ready()
+        listen = options.listen
+        outcome = _go(options, listen, screen, nursery) if listen else _go_on_a_free_port(options, screen, nursery)
     with contextlib.suppress(RecordError):
         repair(options.out / "run.mcap")
     return outcome
 
 
-def _go(options: Options, endpoint: str, screen: Screen) -> Outcome:
+def _go(options: Options, endpoint: str, screen: Screen, nursery: Nursery) -> Outcome:
     watch = Watch(options.scenario.processes.on_death, screen)
-    watch.members = [*_children(options, endpoint, watch)]
+    watch.members = [*_children(options, endpoint, watch, nursery)]
     return watch.go()
 
 
-def _go_on_a_free_port(options: Options, screen: Screen, tries: int = PORTS_TRIED) -> Outcome:
+def _go_on_a_free_port(options: Options, screen: Screen, nursery: Nursery, tries: int = PORTS_TRIED) -> Outcome:
     port = free_port(screen)
     endpoint = f"tcp/127.0.0.1:{port}"
-    outcome = _go(options, endpoint, screen)
+    outcome = _go(options, endpoint, screen, nursery)
     if tries > 1 and _was_too_late(outcome, endpoint, port):
-        return _go_on_a_free_port(options, screen, tries - 1)
+        return _go_on_a_free_port(options, screen, nursery, tries - 1)
     return outcome
 
 

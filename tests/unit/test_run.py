@@ -9,6 +9,7 @@ import pytest
 from zsim import scenario_file
 from zsim.errors import RunError, SessionError
 from zsim_deploy import run
+from zsim_deploy.nursery import Nursery
 from zsim_deploy.run import Options
 from zsim_deploy.watch import Outcome
 
@@ -43,9 +44,19 @@ class FakeWatch:
         return Outcome(reason, failed=reason != "ended")
 
 
+class NoNursery(Nursery):
+    """A nursery that starts nothing."""
+
+    def __enter__(self) -> Nursery:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+
 @pytest.fixture
 def watched(monkeypatch: pytest.MonkeyPatch) -> type[FakeWatch]:
     FakeWatch.outcomes, FakeWatch.ports = [], []
+    monkeypatch.setattr(run, "Nursery", NoNursery)
     monkeypatch.setattr(run, "Watch", FakeWatch)
     monkeypatch.setattr(run, "_is_free", lambda port: port == run.DEFAULT_PORT and not FakeWatch.ports)
     return FakeWatch
@@ -85,7 +96,8 @@ def test_trying_ports_has_an_end(watched: type[FakeWatch], tmp_path: Path):
 
 def test_no_name_is_taken_for_an_option(tmp_path: Path):
     made = options(tmp_path, "drones.drone1.name=-._", "clusters.main.drones=[-._, drone2, drone3]")
-    lines = [child._arguments for child in run._children(made, "tcp/127.0.0.1:20001", FakeWatch())]  # type: ignore[arg-type]
+    children = run._children(made, "tcp/127.0.0.1:20001", FakeWatch(), NoNursery(print))  # type: ignore[arg-type]
+    lines = [child._arguments for child in children]
     (line,) = (line for line in lines if "-._" in line)
     assert line[0] == "estimator"
     assert line[-2:] == ["--", "-._"]

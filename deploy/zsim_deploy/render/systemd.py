@@ -13,8 +13,8 @@ from zsim.faults import show
 from zsim.rights import ROUTER, WORLD
 from zsim.scenario import Scenario
 from zsim_deploy import inventory as inv
-from zsim_deploy.child import SINGLE_THREADED
 from zsim_deploy.inventory import Host, Placed
+from zsim_deploy.nursery import SINGLE_THREADED
 from zsim_deploy.render.process import (
     STOP_S,
     Files,
