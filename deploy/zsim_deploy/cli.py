@@ -21,31 +21,26 @@ from zsim_deploy import (
     look_commands,
     render_commands,
     replay_command,
+    report_commands,
+    role_commands,
     ros1_command,
     ros2_command,
     sweep_commands,
 )
 from zsim_deploy.arguments import (
-    DEFAULT_ENDPOINT,
-    Access,
-    Connect,
+    HOSTS,
+    INTERRUPTED,
+    RUN,
     Duration,
-    Federation,
-    Host,
     Insecure,
-    Launched,
     RateOption,
     Realtime,
     ScenarioPath,
     Seed,
     Set,
-    Tls,
-    Wait,
-    identity,
     load_scenario,
     mode_and_rate,
 )
-from zsim_deploy.reach import Reach, takes_part
 
 app = typer.Typer(
     name="zsim",
@@ -59,9 +54,6 @@ app = typer.Typer(
 UsageError: Any = typer.BadParameter.__bases__[0]  # click's, or that of the click inside of newer typers
 USER_FAULT = 2  # exit code of whatever a person has to put right
 EXIT_CODES = {SupersededError: 3, BehindError: 1}  # of the faults after which somebody else goes on; see watch.py
-INTERRUPTED = 130  # exit code of a shell for a program that Ctrl-C ended
-RUN, ROLES = "Run", "Roles, started by hand, on any machine, in any order"
-HOSTS = "On several machines"
 
 
 @app.command(rich_help_panel=RUN)
@@ -92,16 +84,8 @@ def run(
     from zsim_deploy.run import Options, check_endpoint, make_directory, run_in_process, run_processes
     from zsim_deploy.watch import Outcome
 
-    given = {
-        "--realtime": realtime,
-        "--rate": rate is not None,
-        "--listen": listen is not None,
-        "--hosted": hosted,
-        "--console": console,
-    }
-    if in_process and any(given.values()):
-        useless = " and ".join(name for name, is_given in given.items() if is_given)
-        raise typer.BadParameter(f"--in-process is lockstep, unpaced, without Zenoh; leave out {useless}, or it")
+    if in_process:
+        _refuse_with_others(realtime, rate, listen, hosted, console)
     if console:
         console_command.check()
     check_endpoint(listen, insecure)
@@ -114,23 +98,21 @@ def run(
             outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)
         except KeyboardInterrupt:
             outcome = Outcome("interrupted twice, nobody was waited for", interrupted=True)
-    conclude(outcome, options.out, report)
+    report_commands.conclude(outcome, options.out, report)
 
 
-def conclude(outcome: Any, out: Path, report: bool) -> None:
-    """Say how a run ended, make its report, and end with the exit code that tells it."""
-    if outcome.failed or outcome.interrupted:
-        print(f"ended: {outcome.reason}", file=sys.stderr)
-    recorded = (out / "run.mcap").exists()
-    if outcome.interrupted:
-        if recorded:
-            print(f"the record so far is {out / 'run.mcap'}; `zsim report {out}` makes its report", file=sys.stderr)
-        sys.exit(INTERRUPTED)
-    if report and recorded:
-        _report_at_the_end(out, outcome.failed)
-    if outcome.failed:
-        print(f"logs are in {out / 'logs'}", file=sys.stderr)
-        raise typer.Exit(1)
+def _refuse_with_others(realtime: bool, rate: float | None, listen: str | None, hosted: bool, console: bool) -> None:
+    """Refuse what says nothing to a run in one process."""
+    given = {
+        "--realtime": realtime,
+        "--rate": rate is not None,
+        "--listen": listen is not None,
+        "--hosted": hosted,
+        "--console": console,
+    }
+    useless = " and ".join(name for name, is_given in given.items() if is_given)
+    if useless:
+        raise typer.BadParameter(f"--in-process is lockstep, unpaced, without Zenoh; leave out {useless}, or it")
 
 
 @app.command(rich_help_panel=RUN)
@@ -141,196 +123,28 @@ def validate(scenario: ScenarioPath, set_: Set = None) -> None:
     print(scenario_file.to_text(load_scenario(scenario, set_)), end="")
 
 
-@app.command(rich_help_panel=RUN)
-def report(
-    directories: Annotated[
-        list[Path], typer.Argument(metavar="DIR...", help="Folder of a run or a sweep; of several runs, to compare.")
-    ],
-    out: Annotated[
-        Path | None, typer.Option(help="Page that compares (default compare-NAMES.html beside the first).")
-    ] = None,
-) -> None:
-    """Make summary.json, figures and report.html of a run from its record, or of a sweep; or compare several runs."""
-    from zsim_deploy.run_folder import record_in
-    from zsim_deploy.sweep.plan import is_sweep
-
-    if len(directories) > 1:
-        _compare(directories, out)
-        return
-    directory = directories[0]
-    if out is not None:
-        raise typer.BadParameter("--out is for the page that compares several runs; leave it out")
-    if is_sweep(directory):
-        sweep_commands.make_report(directory)
-        return
-    record_in(directory)
-    _report(directory)
-
-
-def _report_at_the_end(out: Path, failed: bool) -> None:
-    try:
-        _report(out)
-    except ZsimError as error:
-        if not failed:
-            raise
-        print(error, file=sys.stderr)
-    except KeyboardInterrupt:
-        print(f"interrupted; the record is complete, `zsim report {out}` makes its report", file=sys.stderr)
-        sys.exit(INTERRUPTED)
-
-
-def _report(directory: Path) -> None:
-    from rich.console import Console
-
-    from zsim_deploy.report import make_report, table
-
-    console = Console(stderr=True)
-    with console.status("reading the record …") as status:
-        summary = make_report(directory, lambda text: status.update(text))
-    Console().print(table(summary))
-    print(f"report: {directory / 'report.html'}")
-
-
-def _compare(directories: list[Path], out: Path | None) -> None:
-    from rich.console import Console
-
-    from zsim_deploy.report import compare, comparison_path
-    from zsim_deploy.run_folder import record_in
-    from zsim_deploy.sweep.plan import is_sweep
-
-    for directory in directories:
-        if is_sweep(directory):
-            raise typer.BadParameter(f"{directory} is a sweep; runs can be compared, a sweep has a report of its own")
-        record_in(directory)
-    page = out or comparison_path(directories)
-    with Console(stderr=True).status("reading the records …") as status:
-        compare(directories, page, lambda text: status.update(text))
-    print(f"report: {page}")
-
-
-@app.command(rich_help_panel=ROLES)
-def world(
-    scenario: ScenarioPath,
-    listen: Annotated[
-        list[str] | None, typer.Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")
-    ] = None,
-    seed: Seed = None,
-    duration: Duration = None,
-    realtime: Realtime = False,
-    rate: RateOption = None,
-    set_: Set = None,
-    expect: Annotated[list[str] | None, typer.Option(help="Wait for this process too, e.g. recorder.")] = None,
-    launched: Launched = None,
-    tls: Tls = None,
-    access: Access = None,
-    insecure: Insecure = False,
-    host: Host = None,
-) -> None:
-    """Run the world: integrates all drones and owns simulated time."""
-    from zsim_deploy import roles
-
-    loaded = load_scenario(scenario, set_, seed, duration)
-    mode, pace = mode_and_rate(realtime, rate)
-    who = identity(host, tls, insecure, access)
-    roles.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who)
-
-
-@app.command(rich_help_panel=ROLES)
-@takes_part
-def estimator(
-    reach: Reach,
-    drones: Annotated[
-        list[str],
-        typer.Argument(metavar="DRONE...", help="Drones, or patterns: 'drone*'.", show_default=False),
-    ],
-) -> None:
-    """Run the estimator of one drone, or of several in one process."""
-    from zsim_deploy import roles
-
-    roles.agent(roles.estimator(drones), reach)
-
-
-@app.command(rich_help_panel=ROLES)
-@takes_part
-def controller(
-    reach: Reach,
-    cluster: Annotated[str, typer.Argument(help="Name of the cluster.")] = "main",
-) -> None:
-    """Run the cluster-space controller of one cluster."""
-    from zsim_deploy import roles
-
-    roles.agent(roles.controller(cluster), reach)
-
-
-@app.command("host", rich_help_panel=ROLES)
-def host_agents(
-    names: Annotated[
-        list[str],
-        typer.Argument(metavar="NAME...", help="Processes, or patterns: 'estimator.*' controller.main."),
-    ],
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    wait: Wait = None,
-    launched: Launched = None,
-    insecure: Insecure = False,
-    host: Host = None,
-) -> None:
-    """Run several estimators and controllers in one process, which is faster."""
-    from zsim_deploy import roles
-
-    roles.agent(roles.host(names), Reach(connect, federation, wait, None, insecure, host, launched))
-
-
-@app.command(rich_help_panel=ROLES)
-@takes_part
-def record(
-    reach: Reach,
-    out: Annotated[Path, typer.Option(help="Folder for run.mcap.")] = Path("."),
-) -> None:
-    """Record every message of a federation into run.mcap."""
-    from zsim_deploy import roles
-
-    roles.recorder(out / "run.mcap", reach)
-
-
-@app.command(rich_help_panel=ROLES)
-def router(
-    name: Annotated[str, typer.Argument(help="Name of the router.")] = "main",
-    listen: Annotated[str, typer.Option(help="Endpoint for its clients.")] = "tcp/127.0.0.1:7448",
-    connect: Connect = DEFAULT_ENDPOINT,
-    federation: Federation = "zsim",
-    realtime: Realtime = False,
-    launched: Launched = None,
-    tls: Tls = None,
-    access: Access = None,
-    insecure: Insecure = False,
-    host: Host = None,
-) -> None:
-    """Run a router: carries the clients of one network to a world, or a router, in another."""
-    from zsim_deploy import roles
-
-    mode = "realtime" if realtime else "lockstep"
-    roles.router(name, listen, connect, federation, mode, launched, identity(host, tls, insecure, access))
-
-
 def _version(asked: bool) -> None:
     if asked:
         print(f"zsim {__version__}")
         raise typer.Exit
 
 
-app.add_typer(sweep_commands.app)
-app.add_typer(export_command.app)
-app.add_typer(replay_command.app)
-app.add_typer(look_commands.app)
-app.add_typer(fault_commands.app, rich_help_panel=look_commands.PANEL)
-app.add_typer(console_command.app)
-app.add_typer(gateway_command.app)
-app.add_typer(ros1_command.app)
-app.add_typer(ros2_command.app)
-hosts_commands.register(app, HOSTS)
-app.add_typer(certs_commands.app, rich_help_panel=HOSTS)
-app.add_typer(render_commands.app, rich_help_panel=HOSTS)
+for part in (
+    report_commands,
+    role_commands,
+    hosts_commands,
+    sweep_commands,
+    export_command,
+    replay_command,
+    look_commands,
+    console_command,
+    gateway_command,
+    ros1_command,
+    ros2_command,
+):
+    app.add_typer(part.app)
+for group, panel in ((fault_commands, look_commands.PANEL), (certs_commands, HOSTS), (render_commands, HOSTS)):
+    app.add_typer(group.app, rich_help_panel=panel)
 
 
 @app.callback()

@@ -29,7 +29,10 @@ def console(
         float | None,
         typer.Option(callback=positive, help="Pictures a second (20; 10 from 20 drones on).", show_default=False),
     ] = None,
-    name: Annotated[str, typer.Option(help="Process name (default console.1, or the certificate's).")] = "",
+    name: Annotated[
+        str,
+        typer.Option(help="Process name (default the certificate's, or console.1, .2, …)."),
+    ] = "",
 ) -> None:
     """Show a run in the browser, and steer it: scene, plots, events, faults."""
     check()
@@ -40,9 +43,9 @@ def console(
     from zsim_deploy.visitor import named, visit
 
     give_way(for_eyes=True)
-    mine = named("console", name, reach.tls, "1")
+    mine = named("console", name, reach.tls, "*")
     say = Teller().say if reach.launched else speaker(False)
-    shown = Console(Place(listen, port), mine, token, rate_hz, say)
+    shown = Console(Place(listen, port), mine.removesuffix(".*"), token, rate_hz, say)
     with shown.open():
         visit(mine, shown.serve, reach)
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from zsim_deploy.arguments import (
+    HOSTS,
     Duration,
     Insecure,
     RateOption,
@@ -23,6 +24,8 @@ from zsim_deploy.arguments import (
     mode_and_rate,
 )
 from zsim_deploy.push_command import push
+
+app = typer.Typer()
 
 FOLLOW_S = 0.2  # between two looks at a log that is followed
 
@@ -46,7 +49,7 @@ def up(
     """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything."""
     from zsim_deploy import inventory
     from zsim_deploy.board import Board
-    from zsim_deploy.cli import conclude
+    from zsim_deploy.report_commands import conclude
     from zsim_deploy.up import Options, Up
 
     loaded = load_scenario(scenario, set_, seed, duration)
@@ -204,7 +207,5 @@ def _placement(placed: Any, scenario: Path | None) -> dict[str, str] | None:
     return inventory.placement(placed, scenario_file.load(scenario)) if scenario else None
 
 
-def register(app: typer.Typer, panel: str) -> None:
-    """Add the commands to the command line."""
-    for command in (push, doctor, up, ps, logs, restart, move, down):
-        app.command(rich_help_panel=panel)(command)
+for _command in (push, doctor, up, ps, logs, restart, move, down):
+    app.command(rich_help_panel=HOSTS)(_command)

@@ -140,7 +140,10 @@ def run_processes(options: Options, screen: Screen) -> Outcome:
     _write_scenario(options, logs=True)
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
     with Nursery(screen.say) as nursery:
-        nursery.await_ready()
+        try:
+            nursery.await_ready()
+        except KeyboardInterrupt:
+            return Outcome("interrupted by Ctrl-C", interrupted=True)
         listen = options.listen
         outcome = _go(options, listen, screen, nursery) if listen else _go_on_a_free_port(options, screen, nursery)
     with contextlib.suppress(RecordError):

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsim_deploy.arguments import Duration, ScenarioPath, Seed, Set
+from zsim_deploy.arguments import INTERRUPTED, Duration, ScenarioPath, Seed, Set
 
 if TYPE_CHECKING:
     from zsim_deploy.sweep.plan import Plan
 
 PANEL = "Run"
-INTERRUPTED = 130  # exit code of a shell for a program that Ctrl-C ended
 
 app = typer.Typer()
 

@@ -2,8 +2,10 @@
 
 import time
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 
+from zsim import keys
 from zsim.connection import find_world
 from zsim.errors import NoWorldError, SupersededError
 from zsim.messages import Info
@@ -25,6 +27,11 @@ Serve = Callable[[Session, Info, Presence, Stopped, Say], None]
 def visit(name: str, serve: Serve, reach: Reach) -> None:
     """Serve one run after the other of the world on an endpoint, until it is told to stop; launched, only one.
 
+    Args:
+        name: of the process; `role.*` for the first number that nobody has, kept from run to run.
+        serve: what it does in a run.
+        reach: of the world.
+
     Raises:
         NoWorldError: there was no first world within `wait_s`.
         SupersededError: another process of this name has taken over.
@@ -40,6 +47,7 @@ def visit(name: str, serve: Serve, reach: Reach) -> None:
                 info,
             ):
                 if info.run_id != former:
+                    name = _numbered(link, name)
                     _serve(serve, link, Presence(link, info, name), info, leash, say)
                 else:
                     time.sleep(PAUSE_S)
@@ -54,6 +62,15 @@ def visit(name: str, serve: Serve, reach: Reach) -> None:
 def named(role: str, name: str, tls: Path | None, thing: str = "main") -> str:
     """Return a process's name: as told, or its certificate's, or the role's first."""
     return name or (tls.name if tls else f"{role}.{thing}")
+
+
+def _numbered(link: Session, name: str) -> str:
+    """Return a name; for `role.*` the first of role.1, role.2, ... that nobody has."""
+    role, _, thing = name.partition(".")
+    if thing != "*":
+        return name
+    taken = link.tokens(keys.token(f"{role}.$*"))
+    return next(numbered for i in count(1) if keys.token(numbered := f"{role}.{i}") not in taken)
 
 
 def _serve(serve: Serve, link: Session, presence: Presence, info: Info, leash: Leash, say: Say) -> None:

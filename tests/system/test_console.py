@@ -377,6 +377,19 @@ def test_a_console_serves_one_run_after_the_other(federation: Federation) -> Non
     role.ends(with_code=0)
 
 
+def test_a_second_console_has_a_name_of_its_own(federation: Federation) -> None:
+    federation.world(TRIAD, "--duration", "600")
+    first, _ = console(federation)
+    first.line("console.1: in run")
+    second, _ = console(federation)
+    second.line("console.2: in run")
+    first.signal(signal.SIGINT)
+    first.ends(with_code=0)
+    third, _ = console(federation)
+    third.line("console.1: in run")
+    assert second.process.poll() is None
+
+
 def test_others_are_let_in_with_a_token_only(federation: Federation) -> None:
     role = federation.role("console", "--listen", "0.0.0.0", "--port", str(free_port()))
     role.ends(with_code=2)

@@ -230,6 +230,7 @@ def test_some_are_cleared(args: dict[str, Any], cleared: list[int]):
         ("fault_add", {}, "kind is missing; must be one of imu_dropout, "),
         ("fault_add", {"kind": "gps_dropout", "target": "d3"}, "target is 'd3'; must be one of d1, d2 (gps_dropout)"),
         ("fault_add", {"kind": "gps_dropout", "target": "d1", "at_s": 0.01}, "at_s is 0.01; must be >= 0.06, the present, or left out"),
+        ("fault_add", {"kind": "gps_dropout", "target": "d1", "at_s": 2.0}, "at_s is 2; must be < 2, the end of the run"),
         ("fault_add", {"kind": "process_kill", "target": "my.filter"}, "target is 'my.filter'; must be a process that takes part"),
         ("fault_clear", {"id": 7}, "id is 7; must be one of 1"),
         ("fault_clear", {"name": 7}, "name is not known; allowed: id, target, kind, or nothing"),

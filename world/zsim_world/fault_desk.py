@@ -184,6 +184,8 @@ class FaultDesk:
         at_s, now_s = given.get("at_s"), world.now_ns / 1e9
         if at_s is not None and at_s < now_s:
             return f"at_s is {at_s:g}; must be >= {now_s:g}, the present, or left out"
+        if at_s is not None and at_s >= world.scenario.duration_s:
+            return f"at_s is {at_s:g}; must be < {world.scenario.duration_s:g}, the end of the run"
         if len(self._faults) >= FAULTS_MAX:
             return f"{len(self._faults)} faults are planned or act; must be at most {FAULTS_MAX}, so clear some"
         return None
