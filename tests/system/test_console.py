@@ -366,6 +366,7 @@ def test_a_console_serves_one_run_after_the_other(federation: Federation) -> Non
     role, links = console(federation)
     world = federation.world(TRIAD, "--duration", "600")
     role.line("console.1: in run")
+    shown(links["steer"], lambda state: state.get("clock") == "waiting")
     world.signal(signal.SIGINT)
     world.ends(with_code=0)
     role.line("console.1: left, the run ended")

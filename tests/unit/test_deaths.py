@@ -30,9 +30,21 @@ class Case:
         self.name = name
         self.world = World(scenario_file.from_text(SCENARIO), run_id="run1")
         self.deaths = Deaths(FakeLink(), self.world, lambda: None)  # type: ignore[arg-type]
-        role = name.split(".")[0]
-        join = Join(0, 0, run_id="run1", incarnation=1, role=role, host="h", pid=7, period_ns=period_ns)
-        self.world.handle(keys.process(name, "join"), join, 0)
+        self.period_ns = period_ns
+        self.join(incarnation=1, pid=7)
+
+    def join(self, incarnation: int, pid: int) -> None:
+        role = self.name.split(".")[0]
+        join = Join(
+            0, 0, run_id="run1", incarnation=incarnation, role=role, host="h", pid=pid, period_ns=self.period_ns
+        )
+        self.deaths.joins(self.name, join)
+        self.world.handle(keys.process(self.name, "join"), join, 0)
+
+    def events(self) -> list[str]:
+        return [
+            message.kind for key, message in self.world.outbox if key == keys.EVENT and message.subject == self.name
+        ]
 
     def seconds(self, count: int) -> None:
         for _ in range(count):
@@ -79,3 +91,19 @@ def test_nor_a_stranger() -> None:
     case.deaths.heard("somebody")
     case.seconds(3 * SILENT_S)
     assert case.told() == []
+
+
+@pytest.mark.parametrize(("pid", "kinds"), [(8, ["death", "restart"]), (7, ["superseded"])])
+def test_who_joins_in_place_of_one_whose_token_went_had_no_need_to_wait_for_its_death(
+    pid: int, kinds: list[str]
+) -> None:
+    case = Case("estimator.d1", GATE_NS)
+    case.deaths.suspect(case.name)
+    case.join(incarnation=2, pid=pid)
+    assert case.events()[1:] == kinds
+
+
+def test_who_joins_in_place_of_one_that_lives_takes_over() -> None:
+    case = Case("estimator.d1", GATE_NS)
+    case.join(incarnation=2, pid=8)
+    assert case.events()[1:] == ["superseded"]

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from zsim import keys
+from zsim.messages import Join
 from zsim.session import Session
 from zsim_world.hub import Hub
 
@@ -61,6 +62,13 @@ class Deaths:
         participant = self._world.barrier.participants.get(name)
         if participant and participant.alive:
             self._doubted[name] = Doubt(time.monotonic_ns() + BYE_NS)
+
+    def joins(self, name: str, join: Join) -> None:
+        """Take the news that a process is about to join: another of its name whose token went has died before."""
+        former = self._world.barrier.participants.get(name)
+        if name in self._doubted and former and former.alive and (former.host, former.pid) != (join.host, join.pid):
+            del self._doubted[name]
+            self._world.died(name, time.monotonic_ns())
 
     def judge_due(self) -> None:
         """Look again at those of whom it is time."""

@@ -226,6 +226,9 @@ class WorldProcess:
                 self._outgoing.passed(sample)
                 message = messages.decode(key, sample.payload)
                 self._history.add(key, sample.payload, message.t_ns)
+                if type(message) is messages.Join:
+                    self._suspect_gone()
+                    self._deaths.joins(keys.thing(key), message)
                 self._world.handle(key, message, wall_ns)
                 if type(message) is messages.Health:
                     self._deaths.heard(keys.thing(key))
@@ -332,8 +335,7 @@ class WorldProcess:
             self._world.stop(reason)
         while self._queries:
             self._serve_query(self._queries.popleft())
-        while self._gone:
-            self._deaths.suspect(self._gone.popleft())
+        self._suspect_gone()
         self._deaths.judge_due()
         if self.health.due():
             self._deaths.second()
@@ -341,6 +343,10 @@ class WorldProcess:
             health = self.health.message(self._world.now_ns, seq)
             self._outgoing.publish(Output(keys.process(WORLD, "health"), health))
             self._tell("health", health, WORLD)
+
+    def _suspect_gone(self) -> None:
+        while self._gone:
+            self._deaths.suspect(self._gone.popleft())
 
     def _serve_query(self, query: Query) -> None:
         if query.expression in self._world.also_asked:
