@@ -6,7 +6,10 @@ from zsim.limits import GATES_MAX, RATE_MAX
 from zsim.scenario import Scenario
 from zsim_agents.console.desk import Desk
 
-PINNED = "div:has(> [id='{}']) {{position: sticky; top: 0; z-index: 10}}"  # CSS: seen however far a page is scrolled
+PINNED = """<style>
+.mantine-ScrollArea-content div:has(.icon-tabler-alert-octagon) {overflow: visible !important}
+div:has(> button .icon-tabler-alert-octagon) {position: sticky; top: 0; z-index: 10}
+</style>"""  # the button of that icon is seen however far a page is scrolled: no box around it may clip
 FLEET = {"Take off all": "takeoff", "Land all": "land"}  # an operation of a formation, and a mode of a drone
 
 
@@ -50,7 +53,7 @@ class FleetForm:
         self._single = [name for name in everybody if name not in in_formation]
         stop = gui.add_button("EMERGENCY – all rotors stop", color="red", icon=viser.Icon.ALERT_OCTAGON)
         stop.on_click(lambda _: desk.mode(everybody, "emergency"))
-        gui.add_html(f"<style>{PINNED.format(stop._impl.uuid)}</style>")
+        gui.add_html(PINNED)
         both = gui.add_button_group("all drones", list(FLEET))
         both.on_click(lambda _: self._ask(FLEET[both.value]))
 
