@@ -75,8 +75,13 @@ def value(text: str) -> Any:
         raise ValueError(f"{where}is not YAML ({problem[:100]})") from error
 
 
+_READ_OTHERWISE = re.compile("[\t\ufeff?]|[|>][-+0-9]*#")  # libyaml takes tabs, ? and |# where PyYAML does not
+
+
 def _is_plain(text: str) -> bool:
     """Tell whether C code may read it: that knows no limit of its stack, and does not say where an alias stands."""
+    if _READ_OTHERWISE.search(text):
+        return False
     depth = 0
     for event in yaml.parse(text, Loader=yaml.CSafeLoader):
         depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
@@ -111,7 +116,7 @@ class _Loader(_DistinctKeys, yaml.SafeLoader):
 
 
 def _fast_loader() -> type[Any] | None:
-    """Return a loader that means the same by what is plain, ten times as fast; None where PyYAML has none."""
+    """Return a loader that means the same by what is plain, several times as fast; None where PyYAML has none."""
     if not yaml.__with_libyaml__:
         return None
 

@@ -43,6 +43,13 @@ def test_both_read_numbers_alike(text: str) -> None:
 
 
 @pytest.mark.parametrize(
+    "text", ["a: 1\t", "a:\t1", "[a,\tb]", "[a?b]", "{a: b?}", "a: |#\n  x", "a: >-#\n  x", "\n\ufeffa: 1"]
+)
+def test_where_they_differ_python_reads(text: str) -> None:
+    assert not yaml_file._is_plain(text)
+
+
+@pytest.mark.parametrize(
     ("text", "fault"),
     [
         ("a: &x 1\nb: *x", "line 2 .*aliases are not allowed"),
