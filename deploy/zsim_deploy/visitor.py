@@ -16,6 +16,7 @@ from zsim_deploy.lent import lent
 from zsim_deploy.reach import Reach
 from zsim_deploy.roles import speaker
 
+ANY = "*"  # in a name, for a number
 PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits for byes
 
 Stopped = Callable[[], bool]
@@ -28,32 +29,36 @@ def visit(name: str, serve: Serve, reach: Reach) -> None:
     """Serve one run after the other of the world on an endpoint, until it is told to stop; launched, only one.
 
     Args:
-        name: of the process; `role.*` for the first number that nobody has, kept from run to run.
+        name: of the process; `role.*` for the first number that nobody has, kept until somebody takes it.
         serve: what it does in a run.
         reach: of the world.
 
     Raises:
         NoWorldError: there was no first world within `wait_s`.
-        SupersededError: another process of this name has taken over.
+        SupersededError: another process of the name that was given has taken over.
     """
     launched, wait_s, who = reach.launched, reach.wait_s, reach.who
     leash = Leash(launched is not None, lent(who, launched))
     say = speaker(launched is not None)
-    former = ""
+    mine, served = name, ""
     try:
         while not leash.pulled():
             with find_world(reach.endpoint, reach.federation, wait_s, say, leash.pulled, True, launched, who) as (
                 link,
                 info,
             ):
-                if info.run_id != former:
-                    name = _numbered(link, name)
-                    _serve(serve, link, Presence(link, info, name), info, leash, say)
+                if info.run_id != served:
+                    mine = _free(link, mine)
+                    presence = Presence(link, info, mine)
+                    _serve(serve, link, presence, info, leash, say)
+                    served = info.run_id
+                    if presence.superseded:
+                        mine, served = _next(name, presence), ""
                 else:
                     time.sleep(PAUSE_S)
             if launched:
                 return
-            former, wait_s = info.run_id, None
+            wait_s = None
     except NoWorldError:
         if not leash.pulled():
             raise
@@ -64,13 +69,25 @@ def named(role: str, name: str, tls: Path | None, thing: str = "main") -> str:
     return name or (tls.name if tls else f"{role}.{thing}")
 
 
-def _numbered(link: Session, name: str) -> str:
+def _free(link: Session, name: str) -> str:
     """Return a name; for `role.*` the first of role.1, role.2, ... that nobody has."""
     role, _, thing = name.partition(".")
-    if thing != "*":
+    if thing != ANY:
         return name
     taken = link.tokens(keys.token(f"{role}.$*"))
-    return next(numbered for i in count(1) if keys.token(numbered := f"{role}.{i}") not in taken)
+    return next(free for i in count(1) if keys.token(free := f"{role}.{i}") not in taken)
+
+
+def _next(name: str, presence: Presence) -> str:
+    """Return the name under which to come in again; two that were to choose a number may have chosen the same one.
+
+    Raises:
+        SupersededError: the name was given.
+    """
+    role, _, thing = name.partition(".")
+    if thing != ANY:
+        raise SupersededError(f"{name}: {presence.over}; this one ends")
+    return f"{role}.{int(presence.name.rpartition('.')[2]) + 1}"
 
 
 def _serve(serve: Serve, link: Session, presence: Presence, info: Info, leash: Leash, say: Say) -> None:
@@ -79,6 +96,4 @@ def _serve(serve: Serve, link: Session, presence: Presence, info: Info, leash: L
     serve(link, info, presence, leash.pulled, say)
     reason = presence.over or leash.reason() or "stopped"
     presence.leave(reason)
-    if presence.superseded:
-        raise SupersededError(f"{presence.name}: {reason}; this one ends")
     say(f"{presence.name}: left, {reason}")
