@@ -55,7 +55,7 @@ def _cpu_by_role(launcher: int) -> dict[str, float]:
     try:
         parent = psutil.Process(launcher)
         for process in [parent, *parent.children()]:
-            words = process.cmdline()[3:]
+            words = [word for word in process.cmdline() if word]  # a role that was forked has empty ones behind it
             times = process.cpu_times()
             found["launcher" if process.pid == launcher else _role(words)] = times.user + times.system
     except psutil.NoSuchProcess:
@@ -64,6 +64,9 @@ def _cpu_by_role(launcher: int) -> dict[str, float]:
 
 
 def _role(words: list[str]) -> str:
-    """Return `role.thing` of a child's command line."""
+    """Return `role.thing` of a child's command line; that from which roles are forked is the cradle."""
+    if words[2:3] != ["zsim_deploy.cli"]:
+        return "cradle"
+    words = words[3:]
     thing = words[words.index("--") + 1 :] if "--" in words else []
     return ".".join([*words[:1], *thing])

@@ -1,23 +1,23 @@
 """Where the roles of a run come from: forked from one process that has everything imported, which is far cheaper.
 
-Roles are children of this process either way. Only Linux can do it; elsewhere, and if that process is gone, a role is
-started as any other program.
+Roles are children of this process either way. Only Linux can do it; elsewhere, and if that process is gone or does not
+answer, a role is started as any other program.
 """
 
 import ctypes
 import json
-import math
 import os
 import signal
 import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from types import TracebackType
-from typing import IO, Protocol
+from typing import IO, NamedTuple, Protocol
+
+from zsim_deploy.forked import Forked
 
 SINGLE_THREADED = {
     "OPENBLAS_NUM_THREADS": "1",
@@ -25,13 +25,15 @@ SINGLE_THREADED = {
     "MKL_NUM_THREADS": "1",
     "NUMBA_NUM_THREADS": "1",
 }  # matrices of a dozen rows: threads only cost, and would compete with the other roles
-ROOM = " " * 4096  # behind the cradle's command line: each role writes its own there
-PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
+CRADLE = (sys.executable, "-m", "zsim_deploy.cradle")
+ROLE = (sys.executable, "-m", "zsim_deploy.cli")
+ROOM = " " * 1024  # behind the cradle's command line: each role writes its own there
+PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # linux/prctl.h
+PACKET_MAX = 1 << 17  # bytes, of a command line; a thousand names of drones are half of it
 SAID_MAX = 32  # bytes, of what a cradle says: that it is ready, and then process numbers
-POLL_S = 0.01  # how often one looks whether a process has ended
+ANSWER_S = 5.0  # a cradle that is ready answers within 20 ms, unless it is stopped
 PATIENCE_S = 3.0  # what is compiled is loaded within two, unless the machine is busy
 PATIENCE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
-COMMAND = [sys.executable, "-m", "zsim_deploy.cli"]
 
 
 class Process(Protocol):
@@ -46,45 +48,44 @@ class Process(Protocol):
     def kill(self) -> None: ...
 
 
+class _Pipe(NamedTuple):
+    """Both ends, as file numbers."""
+
+    read: int
+    write: int
+
+
 class Nursery:
-    """Starts roles.
+    """Starts roles. To be entered by the main thread, which then waits until they can be started.
 
     Args:
         say: told what takes long.
+        run: what the run is known by, shown beside the cradle in lists of processes.
     """
 
-    def __init__(self, say: Callable[[str], None]) -> None:
+    def __init__(self, say: Callable[[str], None], run: str = "") -> None:
         self._say = say
+        self._run = run
         self._cradle: subprocess.Popen[bytes] | None = None
         self._line: socket.socket | None = None
+        self._inherited = 0
         self._lock = threading.Lock()
 
     def __enter__(self) -> "Nursery":
-        if _inherits(True):
-            self._line, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            with other:
-                self._cradle = _cradle(other.fileno())
+        if sys.platform == "linux":
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # whoever started this may not have wanted to know exit codes
+            self._inherited = _subreaper()
+            try:
+                self._make_cradle()
+            except BaseException:  # Ctrl-C, too
+                self._end()
+                raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._give_up()
-        if self._cradle is not None:
-            self._cradle.kill()  # it may still be importing
-            self._cradle.wait()
-        _inherits(False)
-
-    def await_ready(self) -> None:
-        """Wait until roles can be started at once."""
-        if self._line is None:
-            return
-        timer = threading.Timer(PATIENCE_S, self._say, args=(PATIENCE,))
-        timer.start()
-        try:
-            self._heard()
-        finally:
-            timer.cancel()
+        self._end()
 
     def start(self, arguments: Sequence[str], log: IO[str], listened: bool) -> Process:
         """Start a `zsim` command, its standard input a pipe.
@@ -97,23 +98,55 @@ class Nursery:
         with self._lock:
             return self._forked(arguments, log, listened) or _started(arguments, log, listened)
 
-    def _forked(self, arguments: Sequence[str], log: IO[str], listened: bool) -> "Forked | None":
-        """Return None where there is no cradle."""
-        if self._line is None:
+    def _make_cradle(self) -> None:
+        """Start the cradle, and wait until it has loaded everything."""
+        _set_subreaper(1)
+        self._line, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with other:
+            quiet, environment = subprocess.DEVNULL, {**SINGLE_THREADED, **os.environ}
+            self._cradle = subprocess.Popen(
+                [*CRADLE, self._run, ROOM], stdin=other.fileno(), stdout=quiet, stderr=quiet, env=environment,
+                start_new_session=True,
+            )  # fmt: skip
+        timer = threading.Timer(PATIENCE_S, self._say, args=(PATIENCE,))
+        timer.start()
+        try:
+            self._heard()
+        finally:
+            timer.cancel()
+
+    def _forked(self, arguments: Sequence[str], log: IO[str], listened: bool) -> Forked | None:
+        """Return None where the cradle cannot do it."""
+        packet = json.dumps(list(arguments)).encode()
+        if self._line is None or len(packet) > PACKET_MAX:
             return None
-        theirs, stdin = os.pipe()
-        stdout, output = os.pipe() if listened else (None, os.dup(log.fileno()))
-        with open(theirs), open(output, "w"), ExitStack() as ours:
-            pipes = ours.enter_context(open(stdin, "w")), ours.enter_context(open(stdout)) if stdout else None
-            with suppress(OSError):
-                socket.send_fds(self._line, [json.dumps(list(arguments)).encode()], [theirs, output, log.fileno()])
-            pid = self._heard()
-            if pid:
-                ours.pop_all()
-            return Forked(int(pid), *pipes) if pid else None
+        go, stdin = _Pipe(*os.pipe()), _Pipe(*os.pipe())
+        stdout = _Pipe(*os.pipe()) if listened else None
+        theirs = [stdin.read, stdout.write if stdout else log.fileno(), log.fileno(), go.read]
+        pid = self._asked(packet, theirs)
+        _close(go.read, stdin.read, *([stdout.write] if stdout else []))
+        if pid is None:
+            _close(go.write, stdin.write, *([stdout.read] if stdout else []))
+            return None
+        with suppress(BrokenPipeError):  # killed already
+            os.write(go.write, b"!")
+        os.close(go.write)
+        return Forked(pid, os.fdopen(stdin.write, "w"), os.fdopen(stdout.read) if stdout else None)
+
+    def _asked(self, packet: bytes, files: Sequence[int]) -> int | None:
+        """Return the number of the process that the cradle has forked; it lives only when it is told to go."""
+        assert self._line is not None
+        self._line.settimeout(ANSWER_S)
+        try:
+            socket.send_fds(self._line, [packet], files)
+        except OSError:
+            self._give_up()
+            return None
+        heard = self._heard()
+        return int(heard) if heard else None
 
     def _heard(self) -> bytes:
-        """Return what the cradle says; nothing where it is gone, and then it is asked no more."""
+        """Return what the cradle says; nothing where it is gone or silent, and then it is asked no more."""
         heard = b""
         if self._line is not None:
             with suppress(OSError):
@@ -123,69 +156,39 @@ class Nursery:
         return heard
 
     def _give_up(self) -> None:
+        """Do without a cradle."""
         if self._line is not None:
             self._line.close()
             self._line = None
+        if self._cradle is not None:
+            self._cradle.kill()  # it may be importing, or stopped
+            self._cradle.wait()
+
+    def _end(self) -> None:
+        self._give_up()
+        if sys.platform == "linux":
+            _set_subreaper(self._inherited)
 
 
-class Forked:
-    """A role that a cradle has forked for this process.
-
-    Attributes:
-        pid: its process number.
-        stdin, stdout: the other ends of its pipes.
-    """
-
-    def __init__(self, pid: int, stdin: IO[str], stdout: IO[str] | None) -> None:
-        self.pid = pid
-        self.stdin: IO[str] | None = stdin
-        self.stdout = stdout
-        self._code: int | None = None
-        self._lock = threading.Lock()
-
-    def poll(self) -> int | None:
-        """Return its exit code, negative for a signal; None while it lives."""
-        with self._lock:
-            if self._code is None:
-                found, status = os.waitpid(self.pid, os.WNOHANG)
-                if found:
-                    self._code = os.waitstatus_to_exitcode(status)
-            return self._code
-
-    def wait(self, timeout: float | None = None) -> int:
-        """Return its exit code when it has ended.
-
-        Raises:
-            subprocess.TimeoutExpired: it has not, within so many seconds.
-        """
-        until_s = math.inf if timeout is None else time.monotonic() + timeout
-        while (code := self.poll()) is None:
-            if time.monotonic() >= until_s:
-                raise subprocess.TimeoutExpired(COMMAND, timeout or 0.0)
-            time.sleep(POLL_S)
-        return code
-
-    def kill(self) -> None:
-        """Send SIGKILL; harmless when it is gone."""
-        if self.poll() is None:
-            os.kill(self.pid, signal.SIGKILL)
+def _subreaper() -> int:
+    """Return whether this process is the parent of what its descendants leave behind."""
+    found = ctypes.c_int()
+    ctypes.CDLL(None).prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(found), 0, 0, 0)
+    return found.value
 
 
-def _inherits(wanted: bool) -> bool:
-    """Become, or be no more, the parent of what descendants leave behind; return whether that is so."""
-    return sys.platform == "linux" and ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, int(wanted), 0, 0, 0) == 0
+def _set_subreaper(wanted: int) -> None:
+    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, wanted, 0, 0, 0)
 
 
-def _cradle(line: int) -> "subprocess.Popen[bytes]":
-    quiet = subprocess.DEVNULL
-    environment = {**SINGLE_THREADED, **os.environ}
-    command = [sys.executable, "-m", "zsim_deploy.cradle", ROOM]
-    return subprocess.Popen(command, stdin=line, stdout=quiet, stderr=quiet, env=environment, start_new_session=True)
+def _close(*files: int) -> None:
+    for file in files:
+        os.close(file)
 
 
 def _started(arguments: Sequence[str], log: IO[str], listened: bool) -> "subprocess.Popen[str]":
     return subprocess.Popen(
-        [*COMMAND, *arguments],
+        [*ROLE, *arguments],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE if listened else log,
         stderr=log,

@@ -8,7 +8,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -243,7 +243,8 @@ def give_way(for_eyes: bool = False) -> None:
     if hasattr(os, "nice"):
         os.nice(NICE_FOR_EYES if for_eyes else NICE)
     if for_eyes and sys.platform == "linux":
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        with suppress(OSError):  # it may be in a class from which one does not come back
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
 def speaker(launched: bool) -> Callable[[str], None]:

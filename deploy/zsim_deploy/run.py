@@ -2,9 +2,11 @@
 
 import contextlib
 import re
+import signal
 import socket
 import time
 import uuid
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -139,16 +141,31 @@ def run_processes(options: Options, screen: Screen) -> Outcome:
     scenario = options.scenario
     _write_scenario(options, logs=True)
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
-    with Nursery(screen.say) as nursery:
+    with contextlib.ExitStack() as stack:
         try:
-            nursery.await_ready()
-        except KeyboardInterrupt:
-            return Outcome("interrupted by Ctrl-C", interrupted=True)
+            with _interruptible():
+                nursery = stack.enter_context(Nursery(screen.say, str(options.out)))
+        except KeyboardInterrupt as error:
+            return Outcome(str(error) or "interrupted by Ctrl-C", interrupted=True)
         listen = options.listen
         outcome = _go(options, listen, screen, nursery) if listen else _go_on_a_free_port(options, screen, nursery)
     with contextlib.suppress(RecordError):
         repair(options.out / "run.mcap")
     return outcome
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """Take SIGTERM as Ctrl-C."""
+
+    def terminate(*_: object) -> None:
+        raise KeyboardInterrupt("terminated")
+
+    former = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, former)
 
 
 def _go(options: Options, endpoint: str, screen: Screen, nursery: Nursery) -> Outcome:

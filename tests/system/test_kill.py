@@ -1,6 +1,7 @@
 """kill -9 of every process of a run: the rest says so in time, does what on_death says, and leaves nothing behind."""
 
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -191,3 +192,18 @@ def test_two_interrupts(federation: Federation) -> None:
     flight.run.signal(signal.SIGINT)
     assert flight.run.ends(with_code=130) - asked_s < INTERRUPTED_WITHIN_S
     check_end(federation, whole=False)
+
+
+@pytest.mark.parametrize(
+    ("number", "reason"), [(signal.SIGINT, "interrupted by Ctrl-C"), (signal.SIGTERM, "terminated")]
+)
+def test_a_run_that_is_told_to_end_before_it_has_loaded(
+    federation: Federation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, reason: str
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "nothing_is_compiled"))
+    run = federation.run(PAIR)
+    run.line("2 drones, 12 s, into")
+    run.signal(number)
+    run.ends(with_code=130)
+    assert f"ended: {reason}" in run.text()
+    federation.nobody_left()

@@ -1,5 +1,7 @@
 """Roles that are forked: what a launcher sees of them is what it sees of any program that it starts."""
 
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -11,9 +13,10 @@ import pytest
 
 from zsim import __version__
 from zsim_deploy import nursery as nursery_module
+from zsim_deploy.forked import Forked
 from zsim_deploy.nursery import Nursery, Process
 
-LINUX = sys.platform == "linux"
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="roles are forked on Linux alone")
 WAITING = ["record", "--connect", "tcp/127.0.0.1:1", "--launched", "0", "--wait", "100"]  # for a world that never comes
 END_S = 30.0
 LOOK_S = 0.02
@@ -25,8 +28,7 @@ def quiet(_: str) -> None:
 
 @pytest.fixture(scope="module")
 def nursery() -> Iterator[Nursery]:
-    with Nursery(quiet) as made:
-        made.await_ready()
+    with Nursery(quiet, "a run") as made:
         yield made
 
 
@@ -100,11 +102,13 @@ def test_it_is_a_child_of_its_own_session_under_its_own_name(nursery: Nursery, l
     end(role)
 
 
-def test_no_role_holds_the_pipe_of_another(nursery: Nursery, log: Path) -> None:
-    first, second = (start(nursery, log, *WAITING) for _ in range(2))
+def test_no_role_holds_the_pipes_of_another(nursery: Nursery, log: Path) -> None:
+    first, second = (start(nursery, log, *WAITING, listened=True) for _ in range(2))
     assert first.stdin is not None
+    assert first.stdout is not None
     first.stdin.close()
     first.wait(END_S)
+    assert first.stdout.read() == ""  # it ends, so nobody can write to it any more
     assert second.poll() is None
     end(first, second)
 
@@ -120,12 +124,9 @@ def test_it_heeds_what_it_is_told(nursery: Nursery, log: Path) -> None:
     end(role)
 
 
-def test_where_its_cradle_is_gone_a_role_is_started_as_a_program(log: Path) -> None:
+def test_where_its_cradle_fails_a_role_is_started_as_a_program(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nursery_module, "CRADLE", (sys.executable, "-c", "pass"))
     with Nursery(quiet) as nursery:
-        assert nursery._cradle is not None or not LINUX
-        if nursery._cradle is not None:
-            nursery._cradle.kill()
-        nursery.await_ready()
         roles = [start(nursery, log, "--version") for _ in range(2)]
         assert all(isinstance(role, subprocess.Popen) for role in roles)
         assert [role.wait(END_S) for role in roles] == [0, 0]
@@ -133,26 +134,88 @@ def test_where_its_cradle_is_gone_a_role_is_started_as_a_program(log: Path) -> N
     assert log.read_text() == 2 * f"zsim {__version__}\n"
 
 
-def test_a_cradle_that_dies_later_is_not_missed_either(log: Path) -> None:
+@LINUX
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_cradle_that_dies_or_stands_is_done_without(number: int, log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nursery_module, "ANSWER_S", 0.2)
     with Nursery(quiet) as nursery:
-        nursery.await_ready()
-        if nursery._cradle is not None:
-            nursery._cradle.kill()
-            nursery._cradle.wait()
+        assert nursery._cradle is not None
+        os.kill(nursery._cradle.pid, number)
         role = start(nursery, log, "--version", listened=True)
+        assert isinstance(role, subprocess.Popen)
         assert role.wait(END_S) == 0
+        assert nursery._cradle.poll() is not None
         end(role)
 
 
-def test_nothing_is_left_of_it() -> None:
+@LINUX
+def test_a_role_of_which_the_launcher_does_not_know_never_begins(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Nursery(quiet) as nursery:
-        cradle = nursery._cradle
-    assert cradle is None or cradle.poll() is not None
+        monkeypatch.setattr(nursery, "_heard", lambda: b"")
+        role = start(nursery, log, "--version")
+        assert role.wait(END_S) == 0
+        end(role)
+    assert log.read_text() == f"zsim {__version__}\n"  # once: the one that was forked has printed nothing
+
+
+@LINUX
+def test_a_command_that_is_too_long_for_a_packet_is_no_matter(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Nursery(quiet) as nursery:
+        monkeypatch.setattr(nursery_module, "PACKET_MAX", 5)
+        role = start(nursery, log, "--version")
+        monkeypatch.undo()
+        again = start(nursery, log, "--version")
+        assert [isinstance(each, Forked) for each in (role, again)] == [False, True]
+        assert [each.wait(END_S) for each in (role, again)] == [0, 0]
+        end(role, again)
+
+
+@LINUX
+def test_one_within_another_leaves_it_its_children(log: Path) -> None:
+    with Nursery(quiet) as outer:
+        with Nursery(quiet) as inner:
+            assert inner._cradle is not None
+        assert inner._cradle.poll() is not None
+        role = start(outer, log, "estimator")
+        assert role.wait(END_S) == 2
+        end(role)
+
+
+@LINUX
+def test_a_cradle_ends_with_its_launcher() -> None:
+    code = "import time\nfrom zsim_deploy.nursery import Nursery\n"
+    code += "with Nursery(print) as nursery: print(nursery._cradle.pid, flush=True); time.sleep(100)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as launcher:
+        assert launcher.stdout is not None
+        cradle = psutil.Process(int(launcher.stdout.readline()))
+        launcher.kill()
+    cradle.wait(END_S)
 
 
 def test_what_takes_long_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setattr(nursery_module, "PATIENCE_S", 0.0)
-    with Nursery(said.append) as nursery:
-        nursery.await_ready()
-    assert said == [nursery_module.PATIENCE]
+    with Nursery(said.append):
+        assert said == [nursery_module.PATIENCE] or sys.platform != "linux"
+
+
+@LINUX
+def test_ctrl_c_while_it_loads_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(_: Nursery) -> bytes:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Nursery, "_heard", interrupt)
+    nursery = Nursery(quiet)
+    with pytest.raises(KeyboardInterrupt), nursery:
+        pass
+    assert nursery._cradle is not None
+    assert nursery._cradle.poll() is not None
+
+
+def test_an_exit_code_that_somebody_else_took_is_no_error() -> None:
+    with subprocess.Popen([sys.executable, "-c", "pass"], stdin=subprocess.PIPE, text=True) as child:
+        child.wait()
+        assert child.stdin is not None
+        gone = Forked(child.pid, child.stdin, None)
+        assert gone.poll() == 0
+        gone.kill()
