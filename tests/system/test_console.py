@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 import signal
 import threading
@@ -284,12 +285,14 @@ def test_an_operator_sees_three_drones_and_flies_them(federation: Federation, op
 
     # p by its slider, and the true p follows
     slider = operator.page.get_by_role("slider").nth(PLACE_OF_P)
+    engaged_p = engaged["clusters"][0]["desired"]["p"]
+    slider.and_(operator.page.locator(f"[aria-valuenow='{engaged_p:.1f}']")).wait_for(timeout=PATIENCE_MS)
     asked_s = operator.state()["t_s"]
     slider.focus()
     for _ in range(12):
         slider.press("ArrowRight")
     wanted = float(str(slider.get_attribute("aria-valuenow")))
-    assert wanted > engaged["clusters"][0]["desired"]["p"] + 1.0
+    assert wanted > engaged_p + 1.0
     operator.until(f"Math.abs(s.clusters[0].desired.p - {wanted}) < 0.06")
     there = operator.until(f"Math.abs(s.clusters[0].true.p - {wanted}) < 0.3")
     assert there["t_s"] < asked_s + 20.0
@@ -389,6 +392,23 @@ def test_a_second_console_has_a_name_of_its_own(federation: Federation) -> None:
     third, _ = console(federation)
     third.line("console.1: in run")
     assert second.process.poll() is None
+
+
+def test_two_that_wait_for_a_world_do_not_take_each_others_name(federation: Federation) -> None:
+    consoles = [console(federation)[0] for _ in range(2)]
+    for each in consoles:
+        each.line("waiting for a world")
+    federation.world(TRIAD, "--duration", "600")
+    until_s = time.monotonic() + PATIENCE_S
+    while {named(each) for each in consoles} != {"console.1", "console.2"}:
+        assert time.monotonic() < until_s, [each.text() for each in consoles]
+        time.sleep(POLL_MS / 1000)
+    assert all(each.process.poll() is None for each in consoles)
+
+
+def named(role: Role) -> str:
+    """Return under which name a console is in a run; empty before."""
+    return (re.findall(r"^(console\.\d+): in run", role.text(), re.MULTILINE) or [""])[-1]
 
 
 def test_others_are_let_in_with_a_token_only(federation: Federation) -> None:
