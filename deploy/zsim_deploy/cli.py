@@ -1,5 +1,6 @@
 """The command line: thin commands that read options, call one function, and print one line for a fault."""
 
+import signal
 import sys
 from functools import cache
 from io import TextIOWrapper
@@ -82,7 +83,7 @@ def run(
     """Fly a scenario: start every process, show progress, record, report."""
     from zsim_deploy.progress import Screen
     from zsim_deploy.run import Options, check_endpoint, make_directory, run_in_process, run_processes
-    from zsim_deploy.watch import Outcome
+    from zsim_deploy.watch import REASONS, Outcome
 
     if in_process:
         _refuse_with_others(realtime, rate, listen, hosted, console)
@@ -96,8 +97,8 @@ def run(
     with Screen(loaded.duration_s) as screen:
         try:
             outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)
-        except KeyboardInterrupt:
-            outcome = Outcome("interrupted twice, nobody was waited for", interrupted=True)
+        except KeyboardInterrupt as error:
+            outcome = Outcome(str(error) or REASONS[signal.SIGINT], interrupted=True)
     report_commands.conclude(outcome, options.out, report)
 
 

@@ -22,7 +22,7 @@ from zsim_deploy.hosting import agents_of
 from zsim_deploy.leash import Leash
 from zsim_deploy.nursery import Nursery
 from zsim_deploy.progress import Screen
-from zsim_deploy.watch import Outcome, Watch
+from zsim_deploy.watch import REASONS, Outcome, Watch
 
 DEFAULT_PORT = 7447  # Zenoh's own
 PORTS_TRIED = 5  # when other runs that start at this moment take each before our world listens
@@ -137,18 +137,18 @@ def _fresh(folder: Path) -> Path:
 
 
 def run_processes(options: Options, screen: Screen) -> Outcome:
-    """Run a scenario as real processes; the record is finished whatever happens."""
+    """Run a scenario as real processes; the record is finished whatever happens.
+
+    Raises:
+        KeyboardInterrupt: with the reason, where nothing flew yet, or somebody would not wait for the end.
+    """
     scenario = options.scenario
-    _write_scenario(options, logs=True)
-    screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
-    with contextlib.ExitStack() as stack:
-        try:
-            with _interruptible():
-                nursery = stack.enter_context(Nursery(screen.say, str(options.out)))
-        except KeyboardInterrupt as error:
-            return Outcome(str(error) or "interrupted by Ctrl-C", interrupted=True)
-        listen = options.listen
-        outcome = _go(options, listen, screen, nursery) if listen else _go_on_a_free_port(options, screen, nursery)
+    with _interruptible():
+        _write_scenario(options, logs=True)
+        screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
+        with Nursery(screen.say, str(options.out)) as nursery:
+            listen = options.listen
+            outcome = _go(options, listen, screen, nursery) if listen else _go_on_a_free_port(options, screen, nursery)
     with contextlib.suppress(RecordError):
         repair(options.out / "run.mcap")
     return outcome
@@ -156,16 +156,17 @@ def run_processes(options: Options, screen: Screen) -> Outcome:
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
-    """Take SIGTERM as Ctrl-C."""
+    """Take SIGTERM as Ctrl-C, and say which it was."""
 
-    def terminate(*_: object) -> None:
-        raise KeyboardInterrupt("terminated")
+    def interrupt(number: int, _: object) -> None:
+        raise KeyboardInterrupt(REASONS[number])
 
-    former = signal.signal(signal.SIGTERM, terminate)
+    former = {number: signal.signal(number, interrupt) for number in REASONS}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, former)
+        for number, handler in former.items():
+            signal.signal(number, handler)
 
 
 def _go(options: Options, endpoint: str, screen: Screen, nursery: Nursery) -> Outcome:

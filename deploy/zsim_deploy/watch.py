@@ -26,6 +26,8 @@ INTERRUPT_S = 2.5  # after Ctrl-C, how long anybody may take; the whole is promi
 TAKE_OVER_S = 60.0  # how long a process may stay once another was started in its place; a slow one starts in half
 RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; more is a fault that a restart does not heal
 RESTART_WINDOW_S = 20.0
+REASONS: dict[int, str] = {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}
+IMPATIENT = "interrupted twice, nobody was waited for"
 USER_FAULT = 2  # exit code of a role that refuses its arguments or cannot run at all
 SUPERSEDED = 3  # exit code of a role whose place another process of its name has taken
 
@@ -110,10 +112,10 @@ class Watch:
 
         def on_signal(number: int, _: object) -> None:
             if self._interrupted:
-                raise KeyboardInterrupt
-            self._interrupted = "interrupted by Ctrl-C" if number == signal.SIGINT else "terminated"
+                raise KeyboardInterrupt(IMPATIENT)
+            self._interrupted = REASONS[number]
 
-        former = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        former = {number: signal.signal(number, on_signal) for number in REASONS}
         try:
             yield
         finally:

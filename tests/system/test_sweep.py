@@ -195,7 +195,7 @@ def cluster() -> Iterator[str]:
     pytest.importorskip("distributed", reason="the extra `dask` is not installed")
     from distributed import LocalCluster
 
-    options: dict[str, Any] = {"dashboard_address": None, "silence_logs": logging.CRITICAL}
+    options: dict[str, Any] = {"dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
     local: Any = LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **options)
     with local:
         yield local.scheduler_address
