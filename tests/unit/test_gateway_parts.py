@@ -19,6 +19,7 @@ from zsim.session import Heard
 from zsim_agents.gateway import requests
 from zsim_agents.gateway import values as values_module
 from zsim_agents.gateway.client import Client
+from zsim_agents.gateway.echoes import Echoes
 from zsim_agents.gateway.json_tree import methods
 from zsim_agents.gateway.limits import Bucket, Turnstile
 from zsim_agents.gateway.openapi import description
@@ -147,6 +148,43 @@ def test_values_of_ones_own_have_a_bound_in_bytes(monkeypatch: pytest.MonkeyPatc
     values.drop("a")
     values.add("c", b"1234567890")
     assert [key for key, _ in values.of("*")] == ["c"]
+
+
+def test_an_echo_does_not_undo_what_was_said_since():
+    def heard(payload: bytes) -> list[bytes]:
+        values.add_batch(batch.encode([("my/own", payload)]))
+        return [said for _, said in values.of("my/own")]
+
+    values = Values(("drone1",))
+    values.say("my/own", b"1", "text/plain")
+    values.say("my/own", b"2", "text/plain")
+    assert (heard(b"1"), values.encoding("my/own")) == ([b"2"], "text/plain")
+    assert heard(b"other") == [b"other"]  # it came to the world before ours
+    assert heard(b"2") == [b"2"]
+    values.say("my/own", b"3")
+    values.drop("my/own")
+    assert heard(b"3") == []
+    assert heard(b"3") == [b"3"]  # somebody else's
+    values.drop("my/own")
+    assert heard(b"3") == [b"3"]
+
+
+def test_an_echo_that_never_came_is_forgotten_with_the_next():
+    values = Values(("drone1",))
+    for payload in (b"lost", b"1"):
+        values.say("my/own", payload)
+    values.add_batch(batch.encode([("my/own", b"1")]))
+    values.add_batch(batch.encode([("my/own", b"lost")]))
+    assert values.of("my/own") == [("my/own", b"lost")]
+
+
+def test_echoes_that_are_waited_for_have_a_bound():
+    echoes = Echoes()
+    for i in range(1000):
+        echoes.said("my/own", b"%d" % i)
+    assert not echoes.is_old("my/own", b"0")
+    assert echoes.is_old("my/own", b"998")
+    assert not echoes.is_old("my/own", b"999")
 
 
 def test_garbage_in_place_of_a_batch_is_counted():

@@ -115,7 +115,7 @@ class Flight:
         """Publish payloads that have been checked."""
         for key, payload in said:
             self.link.put_as(key, payload, messages.encoding(key))
-            self.values.add(key, payload)
+            self.values.say(key, payload)
 
     def payload(self, key: str, value: Any) -> bytes:
         """Return plain data as the payload of a key on which a client may speak.
@@ -202,7 +202,7 @@ class Flight:
             messages.decode(own, payload)
         self.whole.put_as(key, payload, encoding)
         if own is not None:
-            self.values.add(own, payload, encoding)
+            self.values.say(own, payload, encoding)
 
     def delete_whole(self, key: str) -> None:
         """Publish that a whole key has no value any more.

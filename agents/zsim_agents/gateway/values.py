@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from zsim import batch, keys, messages
 from zsim.bundle import Bundle, table_of, unpacked
 from zsim.errors import DecodeError
+from zsim_agents.gateway.echoes import Echoes
 
 OWN_BYTES_MAX = 64_000_000  # of the values on keys that are none of the contract's
 KEYS_MAX = 200_000  # kept; 1000 drones have about 12 000
@@ -28,18 +29,28 @@ class Values:
         self._own_bytes = 0
         self._lock = threading.Lock()  # clients' thread and the world's both add to what is counted
         self._encodings: dict[str, tuple[bytes, str]] = {}
+        self._echoes = Echoes()
         self._bundled: dict[int, tuple[Bundle, int]] = {}
         self.refused = 0
 
     def add(self, key: str, payload: bytes, encoding: str = "") -> None:
         """Take one message; of an encoding that is not its key's where one is given."""
         with self._lock:
-            if messages.type_of(key) is None and not self._has_room(key, payload):
-                self._drop(key)
-            elif key in self._said or len(self._said) < KEYS_MAX:
-                self._said[key] = payload
-                if encoding:
-                    self._encodings[key] = (payload, encoding)
+            self._add(key, payload, encoding)
+
+    def say(self, key: str, payload: bytes, encoding: str = "") -> None:
+        """Take one message that is said here, and that the world will hand out, too."""
+        with self._lock:
+            self._echoes.said(key, payload)
+            self._add(key, payload, encoding)
+
+    def _add(self, key: str, payload: bytes, encoding: str) -> None:
+        if messages.type_of(key) is None and not self._has_room(key, payload):
+            self._drop(key)
+        elif key in self._said or len(self._said) < KEYS_MAX:
+            self._said[key] = payload
+            if encoding:
+                self._encodings[key] = (payload, encoding)
 
     def _has_room(self, key: str, payload: bytes) -> bool:
         """Tell whether a value of a key of somebody's own may be kept."""
@@ -50,8 +61,9 @@ class Values:
         return has
 
     def drop(self, key: str) -> None:
-        """Forget the value of a key that was deleted."""
+        """Forget the value of a key that is deleted here."""
         with self._lock:
+            self._echoes.deleted(key)
             self._drop(key)
 
     def _drop(self, key: str) -> None:
@@ -77,8 +89,13 @@ class Values:
             if key == batch.GATE:
                 self._add_bundle(said)
             else:
-                self.add(key, said)
+                self._hear(key, said)
         return alone
+
+    def _hear(self, key: str, payload: bytes) -> None:
+        with self._lock:
+            if not self._echoes.is_old(key, payload):
+                self._add(key, payload, "")
 
     def _add_bundle(self, payload: bytes) -> None:
         try:
