@@ -12,8 +12,8 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import IO, NamedTuple, Protocol
 
@@ -68,24 +68,22 @@ class Nursery:
         self._run = run
         self._cradle: subprocess.Popen[bytes] | None = None
         self._line: socket.socket | None = None
-        self._inherited = 0
         self._lock = threading.Lock()
 
     def __enter__(self) -> "Nursery":
         if sys.platform == "linux":
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # whoever started this may not have wanted to know exit codes
-            self._inherited = _subreaper()
             try:
                 self._make_cradle()
             except BaseException:  # Ctrl-C, too
-                self._end()
+                self._give_up()
                 raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._end()
+        self._give_up()
 
     def start(self, arguments: Sequence[str], log: IO[str], listened: bool) -> Process:
         """Start a `zsim` command, its standard input a pipe.
@@ -100,7 +98,6 @@ class Nursery:
 
     def _make_cradle(self) -> None:
         """Start the cradle, and wait until it has loaded everything."""
-        _set_subreaper(1)
         self._line, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with other:
             quiet, environment = subprocess.DEVNULL, {**SINGLE_THREADED, **os.environ}
@@ -137,12 +134,13 @@ class Nursery:
         """Return the number of the process that the cradle has forked; it lives only when it is told to go."""
         assert self._line is not None
         self._line.settimeout(ANSWER_S)
-        try:
-            socket.send_fds(self._line, [packet], files)
-        except OSError:
-            self._give_up()
-            return None
-        heard = self._heard()
+        with _inheriting():
+            try:
+                socket.send_fds(self._line, [packet], files)
+            except OSError:
+                self._give_up()
+                return None
+            heard = self._heard()
         return int(heard) if heard else None
 
     def _heard(self) -> bytes:
@@ -164,21 +162,17 @@ class Nursery:
             self._cradle.kill()  # it may be importing, or stopped
             self._cradle.wait()
 
-    def _end(self) -> None:
-        self._give_up()
-        if sys.platform == "linux":
-            _set_subreaper(self._inherited)
 
-
-def _subreaper() -> int:
-    """Return whether this process is the parent of what its descendants leave behind."""
-    found = ctypes.c_int()
-    ctypes.CDLL(None).prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(found), 0, 0, 0)
-    return found.value
-
-
-def _set_subreaper(wanted: int) -> None:
-    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, wanted, 0, 0, 0)
+@contextmanager
+def _inheriting() -> Iterator[None]:
+    """Become, for as long as it takes, the parent of what descendants leave behind."""
+    libc, former = ctypes.CDLL(None), ctypes.c_int()
+    libc.prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(former), 0, 0, 0)
+    libc.prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    try:
+        yield
+    finally:
+        libc.prctl(PR_SET_CHILD_SUBREAPER, former.value, 0, 0, 0)
 
 
 def _close(*files: int) -> None:
