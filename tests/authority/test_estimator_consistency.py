@@ -7,6 +7,7 @@ section 5.4.2).
 """
 
 import math
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -57,8 +58,13 @@ CASES = {
     params=[pytest.param(case, marks=pytest.mark.xdist_group(f"consistency {case}"), id=case) for case in CASES],
 )
 def runs(request: pytest.FixtureRequest) -> Runs:
-    flown = [fly(scenario_file.load(SCENARIO, CASES[request.param], seed=seed)) for seed in SEEDS]
-    return Runs(*(np.concatenate(parts) for parts in zip(*flown, strict=True)))
+    return flown(request.param)
+
+
+@cache
+def flown(case: str) -> Runs:
+    flights = [fly(scenario_file.load(SCENARIO, CASES[case], seed=seed)) for seed in SEEDS]
+    return Runs(*(np.concatenate(parts) for parts in zip(*flights, strict=True)))
 
 
 def fly(scenario: Scenario) -> Runs:

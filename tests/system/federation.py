@@ -26,14 +26,16 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import msgpack
 import numpy as np
 import pytest
+import warm
 from wire import PATIENCE_S, Client
 
 from zsim.record import RecordReader, repair
+from zsim_deploy.nursery import Process
 
 ROOT = Path(__file__).parents[2]
 ZSIM = (sys.executable, "-m", "zsim_deploy.cli")
@@ -90,22 +92,28 @@ class Role:
         self.lines: list[Line] = []
         self._news = threading.Condition()
         self._closed = False
-        self.process = subprocess.Popen(
-            [*prefix, *ZSIM, *arguments],
+        given = {"COLUMNS": "200", **(env or {})}
+        started = None if prefix else warm.start(arguments, str(ROOT), given)
+        self.process, self._output = started or self._start_cold([*prefix, *ZSIM, *arguments], given)
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _start_cold(self, command: list[str], environment: dict[str, str]) -> tuple[Process, IO[str]]:
+        process = subprocess.Popen(
+            command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             cwd=ROOT,
-            env={**os.environ, "COLUMNS": "200", **(env or {})},
+            env={**os.environ, **environment},
             start_new_session=True,
         )
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        assert process.stdout is not None
+        return process, process.stdout
 
     def _read(self) -> None:
-        assert self.process.stdout is not None
-        for text in self.process.stdout:
+        for text in self._output:
             self._note(Line(time.monotonic(), text.rstrip("\n")))
         self._closed = True
         self._note(None)
@@ -150,7 +158,8 @@ class Role:
 
     def signal(self, number: int) -> float:
         """Send it a signal; return the wall time."""
-        self.process.send_signal(number)
+        if self.process.poll() is None:
+            os.kill(self.process.pid, number)
         return time.monotonic()
 
     def close(self) -> None:
@@ -159,8 +168,7 @@ class Role:
             self.process.kill()
         self.process.wait()
         self._reader.join(PATIENCE_S)
-        assert self.process.stdout is not None
-        self.process.stdout.close()
+        self._output.close()
 
     def __repr__(self) -> str:
         return f"zsim {' '.join(self.arguments)}"
