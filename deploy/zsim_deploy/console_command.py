@@ -27,7 +27,9 @@ def console(
     ] = None,
     rate_hz: Annotated[
         float | None,
-        typer.Option(callback=positive, help="Pictures a second (20; 10 from 20 drones on).", show_default=False),
+        typer.Option(
+            callback=positive, help="Pictures a second (20; 10 from 20 drones or 4 × real time on).", show_default=False
+        ),
     ] = None,
     name: Annotated[
         str,

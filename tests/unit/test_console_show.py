@@ -15,7 +15,7 @@ from zsim_agents.console.desk import Told
 from zsim_agents.console.followers import Followers
 from zsim_agents.console.picture import drones_of
 from zsim_agents.console.private_viser import PrivateViser
-from zsim_agents.console.show import Show
+from zsim_agents.console.show import Show, pictures_hz
 from zsim_agents.console.watch import Watch
 from zsim_agents.scenario_space import scenario_space
 
@@ -116,6 +116,11 @@ def drones(*names: str, t_ns: int = 20_000_000, away_m: float = 0.0) -> tuple[st
 def cluster(name: str = CLUSTER, names: tuple[str, ...] = SPACE.names) -> tuple[str, ViewCluster]:
     c = tuple(SPACE.specimen(4.0).tolist())[: len(names)]
     return keys.cluster_view(name), ViewCluster(20_000_000, 0, "engaged", names, c, c, "")
+
+
+@pytest.mark.parametrize(("drones", "rate", "hz"), [(3, 1.0, 20.0), (50, 1.0, 10.0), (3, 25.0, 10.0), (3, 0.0, 20.0)])
+def test_pictures_are_as_many_as_an_eye_can_follow(drones: int, rate: float, hz: float):
+    assert pictures_hz(drones, rate) == hz
 
 
 def test_a_whole_formation_is_shown(seen: Seen):

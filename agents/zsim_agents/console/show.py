@@ -31,7 +31,13 @@ STAMPS_PER_AGE = 5.0  # a stamp is at most so small a part as old as commands ma
 EVENTS_SHOWN = 60
 NOTICE_S = 8.0  # wall; how long a refusal stays in the corner
 FEW = 20  # drones from which on pictures come half as often
-RATE_FEW_HZ, RATE_MANY_HZ = 20.0, 10.0
+RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
+FAST = 4.0  # x real time; from then on, too: no eye follows it, and the run needs the processors
+
+
+def pictures_hz(drones: int, rate: float) -> float:
+    """Return how many pictures a second suit so many drones, and a run that goes so many times as fast as real time."""
+    return RATE_LOW_HZ if drones >= FEW or rate >= FAST else RATE_HZ
 
 
 class Show:
@@ -43,7 +49,7 @@ class Show:
         info: of the run.
         presence: of the console in it.
         followers: knows whose cameras go with the formation.
-        rate_hz: pictures a second; None: fewer where there are many drones.
+        rate_hz: pictures a second; None: fewer where there are many drones, or time flies.
     """
 
     def __init__(
@@ -62,7 +68,7 @@ class Show:
         followers.begin()
         self._scenario = scenario_file.from_text(info.scenario)
         names = tuple(drone.name for drone in info.drones)
-        self._period_s = 1.0 / (rate_hz or (RATE_MANY_HZ if len(names) >= FEW else RATE_FEW_HZ))
+        self._rate_hz = rate_hz
         self._spaces = {c.name: scenario_space(self._scenario, c) for c in self._scenario.clusters}
         variables = {name: space.names for name, space in self._spaces.items()}
         age_s = self._scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
@@ -95,7 +101,7 @@ class Show:
         with self._watch.asking():
             while not self._presence.over and not stopped():
                 self._turn(time.monotonic())
-                next_s = max(next_s + self._period_s, time.monotonic())
+                next_s = max(next_s + self._period_s(), time.monotonic())
                 pause.wait(next_s - time.monotonic())
         self._leave()
 
@@ -104,6 +110,11 @@ class Show:
         return state(self._info.run_id, self.eyes, self._watch, dict(self._shapes))
 
     # A picture
+
+    def _period_s(self) -> float:
+        """Return the time from one to the next [wall]."""
+        rate = self._watch.clock.rate if self._watch.clock is not None else 0.0
+        return 1.0 / (self._rate_hz or pictures_hz(len(self._names), rate))
 
     def _turn(self, wall_s: float) -> None:
         self._presence.tick()
@@ -147,7 +158,7 @@ class Show:
         assert self.eyes.drones is not None
         before_ns = self._drawn_ns
         drones = self._take_in(self.eyes.drones)
-        dt_s = min(self._period_s, max(0.0, (drones.t_ns - before_ns) / 1e9))
+        dt_s = min(self._period_s(), max(0.0, (drones.t_ns - before_ns) / 1e9))
         self._stage.drones(drones, dt_s)
         beliefs = self.eyes.beliefs().values()
         self._stage.estimates(ellipsoids([belief.estimate for belief in beliefs if belief.fresh]))
