@@ -1,4 +1,8 @@
-"""Scenarios of any number of drones: a grid on the ground, GPS and all sensors, an estimator for each."""
+"""Scenarios of any number of drones: a grid on the ground, GPS and all sensors, an estimator for each.
+
+Three drones in a row are no triangle, and would not take off: those of a cluster of three stand at three corners of a
+square, and the squares on a grid.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,6 +15,7 @@ from zsim.scenario import Scenario
 SPACING_M = 4.0  # about ten hulls: hulls never meet, and downwash reaches no neighbour
 GUST_M_S = 0.5  # as in Test 1
 CLUSTER = 3  # drones per cluster: the size of the paper's
+CORNERS = ((0, 0), (1, 0), (0, 1))  # of a square
 
 
 def document(
@@ -24,8 +29,7 @@ def document(
         cluster: drones per cluster, each of which takes off; who is left over stands by. 0: none.
         drone: what every drone has beside its place.
     """
-    side = math.ceil(math.sqrt(count))
-    places = [(SPACING_M * (k % side), SPACING_M * (k // side), 0.0) for k in range(count)]
+    places = _triangles(count) if cluster == CLUSTER else _rows(count, SPACING_M)
     names = [f"drone{k + 1}" for k in range(count)]
     groups = [names[k : k + cluster] for k in range(0, count - cluster + 1, cluster)] if cluster else []
     return {
@@ -42,6 +46,17 @@ def document(
             {"name": f"c{k + 1}", "drones": group, "plan": {"takeoff_s": 1.0}} for k, group in enumerate(groups)
         ],
     }
+
+
+def _rows(count: int, pitch_m: float) -> list[tuple[float, float, float]]:
+    side = math.ceil(math.sqrt(count))
+    return [(pitch_m * (k % side), pitch_m * (k // side), 0.0) for k in range(count)]
+
+
+def _triangles(count: int) -> list[tuple[float, float, float]]:
+    squares = _rows(math.ceil(count / CLUSTER), 2.0 * SPACING_M)
+    places = [(x + SPACING_M * i, y + SPACING_M * j, 0.0) for x, y, _ in squares for i, j in CORNERS]
+    return places[:count]
 
 
 def scenario(

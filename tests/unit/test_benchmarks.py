@@ -120,13 +120,17 @@ def test_a_lap_counts_what_comes_after_the_warm_up() -> None:
     assert lap.steps_per_s >= lap.steps / 1.0
 
 
-@pytest.mark.parametrize(("count", "clusters"), [(1, 0), (3, 1), (10, 3)])
+@pytest.mark.parametrize(("count", "clusters"), [(1, 0), (3, 1), (10, 3), (50, 16)])
 def test_drones_stand_apart_in_clusters_of_three(count: int, clusters: int) -> None:
     made = grid.scenario(count, duration_s=1.0)
     assert (len(made.drones), len(made.clusters)) == (count, clusters)
     places = {drone.position_m for drone in made.drones}
     assert len(places) == count
     assert all(x % grid.SPACING_M == 0.0 and y % grid.SPACING_M == 0.0 for x, y, _ in places)
+    at = {drone.name: drone.position_m for drone in made.drones}
+    for cluster in made.clusters:
+        (ax, ay, _), (bx, by, _), (cx, cy, _) = (at[name] for name in cluster.drones)
+        assert (bx - ax) * (cy - ay) - (cx - ax) * (by - ay) == grid.SPACING_M**2  # a triangle: else it stays landed
 
 
 @pytest.mark.parametrize("name", ["zsim", "zsim_lookahead", "zenoh_queue", "raw_tcp"])
