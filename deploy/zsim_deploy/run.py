@@ -142,16 +142,24 @@ def run_processes(options: Options, screen: Screen) -> Outcome:
     Raises:
         KeyboardInterrupt: with the reason, where nothing flew yet, or somebody would not wait for the end.
     """
-    scenario = options.scenario
-    with _interruptible():
-        _write_scenario(options, logs=True)
-        screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
-        with Nursery(screen.say, str(options.out)) as nursery:
-            listen = options.listen
-            outcome = _go(options, listen, screen, nursery) if listen else _go_on_a_free_port(options, screen, nursery)
+    try:
+        with _interruptible():
+            outcome = _run(options, screen)
+    except KeyboardInterrupt:
+        with contextlib.suppress(OSError):
+            (options.out / "logs").rmdir()  # nobody has written there: the folder may be used again
+        raise
     with contextlib.suppress(RecordError):
         repair(options.out / "run.mcap")
     return outcome
+
+
+def _run(options: Options, screen: Screen) -> Outcome:
+    scenario, listen = options.scenario, options.listen
+    _write_scenario(options, logs=True)
+    screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
+    with Nursery(screen.say, str(options.out)) as nursery:
+        return _go(options, listen, screen, nursery) if listen else _go_on_a_free_port(options, screen, nursery)
 
 
 @contextlib.contextmanager

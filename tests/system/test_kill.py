@@ -207,3 +207,4 @@ def test_a_run_that_is_told_to_end_before_it_has_loaded(
     run.ends(with_code=130)
     assert f"ended: {reason}" in run.text()
     federation.nobody_left()
+    assert [path.name for path in federation.out.iterdir()] == ["scenario.yaml"]  # nothing flew: it may be used again
