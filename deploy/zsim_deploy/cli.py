@@ -81,9 +81,10 @@ def run(
     order: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
     """Fly a scenario: start every process, show progress, record, report."""
+    from zsim_deploy.interrupts import REASONS
     from zsim_deploy.progress import Screen
     from zsim_deploy.run import Options, check_endpoint, make_directory, run_in_process, run_processes
-    from zsim_deploy.watch import REASONS, Outcome
+    from zsim_deploy.watch import Outcome
 
     if in_process:
         _refuse_with_others(realtime, rate, listen, hosted, console)

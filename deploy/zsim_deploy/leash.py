@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 
+from zsim_deploy.interrupts import IMPATIENT, REASONS
 from zsim_deploy.lent import Lent
 
 GRACE_S = 4.0  # a role that was told to stop and hangs is ended; the world waits 5 s for byes only if unstopped
@@ -29,8 +30,8 @@ class Leash:
         self._reason: str | None = None
         self._deserted = False
         self._heard_s = time.monotonic()
-        self._former = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-        signal.signal(signal.SIGTERM, lambda *_: self._stop("terminated"))
+        self._former = {number: signal.getsignal(number) for number in REASONS}
+        signal.signal(signal.SIGTERM, lambda *_: self._stop(REASONS[signal.SIGTERM]))
         if launched:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             threading.Thread(target=self._listen, name="leash", daemon=True).start()
@@ -59,9 +60,9 @@ class Leash:
 
     def _on_interrupt(self, *_: object) -> None:
         if self._reason is not None:
-            os.write(2, b"interrupted twice, nobody was waited for\n")
+            os.write(2, f"{IMPATIENT}\n".encode())
             os._exit(130)
-        self._stop("interrupted by Ctrl-C")
+        self._stop(REASONS[signal.SIGINT])
 
     def _listen(self) -> None:
         for line in sys.stdin:

@@ -68,15 +68,10 @@ def _report_at_the_end(out: Path, failed: bool) -> None:
 
 
 def _report(directory: Path) -> None:
-    from rich.console import Console
-
+    from zsim_deploy import report_terminal
     from zsim_deploy.report import make_report, table
 
-    console = Console(stderr=True)
-    with console.status("reading the record …") as status:
-        summary = make_report(directory, lambda text: status.update(text))
-    Console().print(table(summary))
-    print(f"report: {directory / 'report.html'}")
+    report_terminal.show(directory, "reading the record …", make_report, table)
 
 
 def _compare(directories: list[Path], out: Path | None) -> None:

@@ -2,11 +2,9 @@
 
 import contextlib
 import re
-import signal
 import socket
 import time
 import uuid
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,10 +17,11 @@ from zsim_deploy import console_command
 from zsim_deploy.arguments import pace_options
 from zsim_deploy.child import Child
 from zsim_deploy.hosting import agents_of
+from zsim_deploy.interrupts import REASONS, handled_by
 from zsim_deploy.leash import Leash
 from zsim_deploy.nursery import Nursery
 from zsim_deploy.progress import Screen
-from zsim_deploy.watch import REASONS, Outcome, Watch
+from zsim_deploy.watch import Outcome, Watch
 
 DEFAULT_PORT = 7447  # Zenoh's own
 PORTS_TRIED = 5  # when other runs that start at this moment take each before our world listens
@@ -143,7 +142,7 @@ def run_processes(options: Options, screen: Screen) -> Outcome:
         KeyboardInterrupt: with the reason, where nothing flew yet, or somebody would not wait for the end.
     """
     try:
-        with _interruptible():
+        with handled_by(_interrupt):
             outcome = _run(options, screen)
     except KeyboardInterrupt:
         with contextlib.suppress(OSError):
@@ -162,19 +161,8 @@ def _run(options: Options, screen: Screen) -> Outcome:
         return _go(options, listen, screen, nursery) if listen else _go_on_a_free_port(options, screen, nursery)
 
 
-@contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
-    """Take SIGTERM as Ctrl-C, and say which it was."""
-
-    def interrupt(number: int, _: object) -> None:
-        raise KeyboardInterrupt(REASONS[number])
-
-    former = {number: signal.signal(number, interrupt) for number in REASONS}
-    try:
-        yield
-    finally:
-        for number, handler in former.items():
-            signal.signal(number, handler)
+def _interrupt(number: int, _: object) -> None:
+    raise KeyboardInterrupt(REASONS[number])
 
 
 def _go(options: Options, endpoint: str, screen: Screen, nursery: Nursery) -> Outcome:

@@ -99,12 +99,7 @@ def _conclude(folder: Path, failures: list[str], runs: int, report: bool) -> Non
 
 def make_report(folder: Path) -> None:
     """Make the report of a sweep, and show its table."""
-    from rich.console import Console
-
+    from zsim_deploy import report_terminal
     from zsim_deploy.sweep.report import make_sweep_report, table
 
-    console = Console(stderr=True)
-    with console.status("reading the table …") as status:
-        summary = make_sweep_report(folder, lambda text: status.update(text))
-    Console().print(table(summary))
-    print(f"report: {folder / 'report.html'}")
+    report_terminal.show(folder, "reading the table …", make_sweep_report, table)

@@ -3,13 +3,12 @@
 Where a process runs, on this machine (child.py) or on another one (remote.py), makes no difference here.
 """
 
-import contextlib
 import json
-import signal
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Any, Protocol
@@ -17,6 +16,7 @@ from typing import Any, Protocol
 from zsim.death import on_death
 from zsim.errors import RunError
 from zsim.scenario import OnDeath
+from zsim_deploy.interrupts import IMPATIENT, REASONS, handled_by
 from zsim_deploy.progress import Show
 
 POLL_S = 0.05  # how often the processes are looked at
@@ -26,8 +26,6 @@ INTERRUPT_S = 2.5  # after Ctrl-C, how long anybody may take; the whole is promi
 TAKE_OVER_S = 60.0  # how long a process may stay once another was started in its place; a slow one starts in half
 RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; more is a fault that a restart does not heal
 RESTART_WINDOW_S = 20.0
-REASONS: dict[int, str] = {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}
-IMPATIENT = "interrupted twice, nobody was waited for"
 USER_FAULT = 2  # exit code of a role that refuses its arguments or cannot run at all
 SUPERSEDED = 3  # exit code of a role whose place another process of its name has taken
 
@@ -106,8 +104,7 @@ class Watch:
                 _close([*self.members, *(child for child, _ in self._leaving.values()), *self._gone])
         return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
 
-    @contextlib.contextmanager
-    def _interrupts(self) -> Any:
+    def _interrupts(self) -> AbstractContextManager[None]:
         """Take Ctrl-C and SIGTERM as a wish to end the run well; a second Ctrl-C does not wait."""
 
         def on_signal(number: int, _: object) -> None:
@@ -115,12 +112,7 @@ class Watch:
                 raise KeyboardInterrupt(IMPATIENT)
             self._interrupted = REASONS[number]
 
-        former = {number: signal.signal(number, on_signal) for number in REASONS}
-        try:
-            yield
-        finally:
-            for number, handler in former.items():
-                signal.signal(number, handler)
+        return handled_by(on_signal)
 
     def take_line(self, text: str) -> None:
         """Take a line of the world's progress."""

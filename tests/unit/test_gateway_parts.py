@@ -179,12 +179,21 @@ def test_an_echo_that_never_came_is_forgotten_with_the_next():
 
 
 def test_echoes_that_are_waited_for_have_a_bound():
-    echoes = Echoes()
+    echoes = Echoes(keys_max=1)
     for i in range(1000):
         echoes.said("my/own", b"%d" % i)
     assert not echoes.is_old("my/own", b"0")
     assert echoes.is_old("my/own", b"998")
     assert not echoes.is_old("my/own", b"999")
+
+
+def test_echoes_of_more_keys_than_may_be_are_taken_as_news():
+    echoes = Echoes(keys_max=1)
+    for key in ("a", "b"):
+        for payload in (b"1", b"2"):
+            echoes.said(key, payload)
+    assert echoes.is_old("a", b"1")
+    assert not echoes.is_old("b", b"1")
 
 
 def test_garbage_in_place_of_a_batch_is_counted():

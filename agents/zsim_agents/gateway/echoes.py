@@ -3,7 +3,6 @@
 from collections import deque
 
 WAITING_MAX = 256  # of a key; a world that is paused hands out nothing, and clients may go on
-KEYS_MAX = 200_000  # as many as values are kept
 DELETED = None
 
 
@@ -12,14 +11,18 @@ class Echoes:
 
     Who says two values in a row hears the first from the world when the second is there already; who says one and
     deletes it hears it afterwards. An echo that never comes is forgotten with the next of its key.
+
+    Args:
+        keys_max: of how many keys it is known.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, keys_max: int) -> None:
+        self._keys_max = keys_max
         self._waiting: dict[str, deque[int | None]] = {}
 
     def said(self, key: str, payload: bytes) -> None:
         """Note that a payload is on its way to the world."""
-        if key in self._waiting or len(self._waiting) < KEYS_MAX:
+        if key in self._waiting or len(self._waiting) < self._keys_max:
             self._waiting.setdefault(key, deque(maxlen=WAITING_MAX)).append(hash(payload))
 
     def deleted(self, key: str) -> None:
@@ -29,11 +32,11 @@ class Echoes:
 
     def is_old(self, key: str, payload: bytes) -> bool:
         """Tell whether what the world hands out is an echo of what has been followed by something since."""
-        waiting = self._waiting.get(key, ())
+        waiting = [*self._waiting.get(key, ())]
         if hash(payload) not in waiting:
             return False
         del self._waiting[key]
-        rest = [*waiting][[*waiting].index(hash(payload)) + 1 :]
+        rest = waiting[waiting.index(hash(payload)) + 1 :]
         if any(mark is not DELETED for mark in rest):
             self._waiting[key] = deque(rest, maxlen=WAITING_MAX)
         return bool(rest)

@@ -29,7 +29,7 @@ class Values:
         self._own_bytes = 0
         self._lock = threading.Lock()  # clients' thread and the world's both add to what is counted
         self._encodings: dict[str, tuple[bytes, str]] = {}
-        self._echoes = Echoes()
+        self._echoes = Echoes(KEYS_MAX)
         self._bundled: dict[int, tuple[Bundle, int]] = {}
         self.refused = 0
 

@@ -1,0 +1,20 @@
+"""The signals by which a person or a system asks for an end, and what is said of them."""
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+REASONS: dict[int, str] = {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}
+IMPATIENT = "interrupted twice, nobody was waited for"
+
+
+@contextmanager
+def handled_by(handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Hand these signals to a function, and afterwards to whom they went before."""
+    former = {number: signal.signal(number, handler) for number in REASONS}
+    try:
+        yield
+    finally:
+        for number, before in former.items():
+            signal.signal(number, before)
