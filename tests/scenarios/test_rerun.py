@@ -77,8 +77,9 @@ def steered(federation: Federation) -> Federation:
         client.put("drone/drone2/cmd/velocity", **velocity)
         clock.until(lambda m, until_ns=until_ns: m["t_ns"] > until_ns)
     assert client.ask("world/control", "pause", source=PILOT)["ok"]
+    events = client.watch("world/event")
     client.put("drone/drone2/cmd/mode", t_ns=0, source=PILOT, mode="land")
-    client.watch("world/event").until(lambda m: m["kind"] == "command")
+    events.until(lambda m: m["kind"] == "command")
     assert client.ask("world/control", "step", source=PILOT, gates=5)["ok"]
     assert client.ask("world/control", "release", source=PILOT, drone="drone2")["ok"]
     assert client.ask("world/control", "resume", source=PILOT)["ok"]

@@ -35,6 +35,7 @@ import msgspec
 import pytest
 import typer
 import yaml
+from federation import free_port
 from msgspec import inspect as types
 
 from zsim import messages, presets, scenario, scenario_file
@@ -132,7 +133,7 @@ class Desk:
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         self._environment = {**os.environ, "PATH": path, "COLUMNS": "100"}
         self._folder = folder
-        self._ports = free_ports(len(PORTS))
+        self._ports = tuple(free_port() for _ in PORTS)
         self._terminals: list[tuple[str, Path, subprocess.Popen[bytes]]] = []
 
     def __enter__(self) -> "Desk":
@@ -262,17 +263,6 @@ def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
         line = re.sub(rf"({'|'.join(map(re.escape, OURS))})", rf"\1 --connect {endpoint}", line)
     line = re.sub(r"\bzsim (keys|echo|hz|pub|ask|fault (?:add|clear|list))\b", rf"zsim \1 --wait {PATIENCE_S}", line)
     return re.sub(r"\bmake (\w+)", rf"make -n -C {ROOT} \1 >/dev/null", line)  # last: ROOT may end with zsim
-
-
-def free_ports(count: int) -> tuple[int, ...]:
-    """Return ports that nobody listens on now."""
-    probes = [socket.socket() for _ in range(count)]
-    for probe in probes:
-        probe.bind(("127.0.0.1", 0))
-    ports = tuple(probe.getsockname()[1] for probe in probes)
-    for probe in probes:
-        probe.close()
-    return ports
 
 
 @pytest.mark.parametrize("page", pages_with("bash elsewhere"))
