@@ -72,9 +72,9 @@ def to_text(scenario: Scenario) -> str:
     return yaml_file.dump(msgspec.to_builtins(scenario))
 
 
-def sha256(scenario: Scenario) -> str:
-    """Return the hash that names a resolved scenario."""
-    return hashlib.sha256(to_text(scenario).encode()).hexdigest()
+def sha256(text: str) -> str:
+    """Return the hash that names a resolved scenario, from its text."""
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _expand_presets(document: dict[str, Any]) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 A launched process has a pipe from its launcher as standard input. The launcher writes "stop REASON"; when it dies,
 the pipe ends. So nothing outlives its launcher, on any system, also after kill -9. A launcher on another host writes
-"orphan-after SECONDS" and then a "beat" every second: a host that vanishes closes no pipe.
+"orphan-after SECONDS" and then a "beat" every second: a host that vanishes closes no pipe. A launched process that is
+sent SIGTERM instead ends well, too, but counts as dead: its launcher did not want it.
 """
 
 import os
@@ -14,6 +15,7 @@ import time
 from zsim_deploy.interrupts import IMPATIENT, REASONS
 from zsim_deploy.lent import Lent
 
+TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it
 GRACE_S = 4.0  # a role that was told to stop and hangs is ended; the world waits 5 s for byes only if unstopped
 
 
@@ -26,12 +28,13 @@ class Leash:
     """
 
     def __init__(self, launched: bool, lent: Lent | None = None) -> None:
+        self._launched = launched
         self._lent = lent
         self._reason: str | None = None
-        self._deserted = False
+        self._deserted = self._terminated = False
         self._heard_s = time.monotonic()
         self._former = {number: signal.getsignal(number) for number in REASONS}
-        signal.signal(signal.SIGTERM, lambda *_: self._stop(REASONS[signal.SIGTERM]))
+        signal.signal(signal.SIGTERM, self._on_terminate)
         if launched:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             threading.Thread(target=self._listen, name="leash", daemon=True).start()
@@ -47,8 +50,17 @@ class Leash:
         return self._reason is not None
 
     def deserted(self) -> bool:
-        """Tell whether the launcher is gone: for all others this process then dies, it does not leave."""
+        """Tell whether the launcher is gone, or does not want this end: for all others it is a death, no leave."""
         return self._deserted
+
+    def account(self) -> None:
+        """Tell the launcher, by the exit code, that somebody else has ended this process; to be called last.
+
+        Raises:
+            SystemExit: that is so.
+        """
+        if self._terminated:
+            raise SystemExit(TERMINATED)
 
     def let_go(self) -> None:
         """Take no signals any more: what is left to do may be interrupted as anything."""
@@ -57,6 +69,11 @@ class Leash:
 
     def _stop(self, reason: str) -> None:
         self._reason = self._reason or reason
+
+    def _on_terminate(self, *_: object) -> None:
+        if self._launched and self._reason is None:
+            self._deserted = self._terminated = True
+        self._stop(REASONS[signal.SIGTERM])
 
     def _on_interrupt(self, *_: object) -> None:
         if self._reason is not None:

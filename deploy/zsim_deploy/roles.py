@@ -57,6 +57,7 @@ def world(
     gc.freeze()
     if launched:
         run(run_world, endpoints, leash.reason, told(Teller()), identity=identity)
+        leash.account()
         return
     with Screen(scenario.duration_s) as screen:
         listening = f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run"
@@ -140,6 +141,7 @@ def agent(build: Callable[[messages.Info, Scenario], Agent], reach: Reach) -> No
     say(f"{made.name}: left, {reason}")
     if runner.killed:
         _die()
+    leash.account()
 
 
 def _die() -> None:
@@ -200,6 +202,7 @@ def recorder(path: Path, reach: Reach) -> None:
         say(f"recorder: run {info.run_id} into {path}")
         reason = record(link, info, path, stopped=leash.pulled, say=say)
     say(f"recorder: {path} is complete, {reason}")
+    leash.account()
 
 
 def router(
@@ -227,6 +230,7 @@ def router(
                 probe_s = time.monotonic() + PROBE_S
             time.sleep(TICK_S)
     say(f"router.{name}: left, {leash.reason()}")
+    leash.account()
 
 
 def _refuse(fault: str | None, upstream: str) -> None:

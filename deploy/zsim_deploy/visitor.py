@@ -57,6 +57,7 @@ def visit(name: str, serve: Serve, reach: Reach) -> None:
                 else:
                     time.sleep(PAUSE_S)
             if launched:
+                leash.account()
                 return
             wait_s = None
     except NoWorldError:

@@ -30,6 +30,7 @@ HEIGHT_M, CIRCLE_M, CIRCLE_RAD_S = 4.0, 2.0, 0.4  # a circle beside the start, s
 GAIN_1_S, SPEED_M_S = 0.6, 1.0
 
 Array = NDArray[np.float64]
+pytestmark = pytest.mark.xdist_group("consistency")  # the flights of a case are flown once
 
 
 class Runs(NamedTuple):
@@ -53,10 +54,7 @@ CASES = {
 }
 
 
-@pytest.fixture(
-    scope="module",  # the flights of a case are flown once, by the worker that has its tests
-    params=[pytest.param(case, marks=pytest.mark.xdist_group(f"consistency {case}"), id=case) for case in CASES],
-)
+@pytest.fixture(scope="module", params=CASES)
 def runs(request: pytest.FixtureRequest) -> Runs:
     return flown(request.param)
 

@@ -79,7 +79,7 @@ def info() -> Info:
         drones=tuple(messages.DroneInfo(drone.name, drone.model) for drone in it.drones),
         clusters=tuple(messages.ClusterInfo(cluster.name, tuple(cluster.drones)) for cluster in it.clusters),
         scenario=scenario_file.to_text(it),
-        scenario_sha256=scenario_file.sha256(it),
+        scenario_sha256=scenario_file.sha256(scenario_file.to_text(it)),
         version="0.1.0",
         fingerprint="f00d",
     )

@@ -28,7 +28,7 @@ def test_three_hosts_give_the_bits_of_one_process(team: Team, tmp_path: Path) ->
 
 
 def test_ps_logs_restart_move_and_down(team: Team) -> None:
-    run = team.up("--rate", "4", "--duration", "300")
+    run = team.up("--rate", "4", "--duration", "3600")
     in_flight(run)
     rows = team.ps()
     assert {role: row["host"] for role, row in rows.items()} == {
@@ -56,7 +56,7 @@ def test_ps_logs_restart_move_and_down(team: Team) -> None:
 
 
 def test_a_killed_launcher_leaves_nobody(team: Team) -> None:
-    run = team.up("--rate", "4", "--duration", "300")
+    run = team.up("--rate", "4", "--duration", "3600")
     in_flight(run)
     run.signal(signal.SIGKILL)
     team.nobody_left()
@@ -87,7 +87,7 @@ def test_a_broken_ssh_session_is_the_death_of_its_roles(team: Team) -> None:
 
 @pytest.mark.parametrize("role", ["world", "recorder"])
 def test_without_world_or_recorder_the_run_ends(team: Team, role: str) -> None:
-    run = team.up("--rate", "4", "--duration", "300")
+    run = team.up("--rate", "4", "--duration", "3600")
     in_flight(run)
     team.kill(role)
     run.ends(with_code=1, within_s=START_S)
@@ -197,7 +197,7 @@ def test_a_full_disk_at_the_recorder_ends_the_run_and_keeps_the_record(
     small_disk(lab.host_folder("h3"), DISK_BYTES)
     lab.environment("h3")  # a new sshd, which sees the new disk
     with closing(Team(lab, {**ROLES, "recorder": "h3"})) as team:
-        run = team.up("--duration", "300")
+        run = team.up("--duration", "3600")
         run.ends(with_code=1, within_s=START_S)
         assert "No space left on device" in run.text()
         assert team.record().keys()["clock"] > 50

@@ -41,7 +41,7 @@ def test_restarts_at_once_and_moves_refused_and_carried_out(lab: Lab) -> None:
     """One move has no certificate there, the other is to a host that was not used before."""
     with closing(Team(lab, ROLES)) as team:
         rmtree(lab.folder / "certs" / SPARE / "estimator.drone1", ignore_errors=True)
-        run = team.up("--rate", "4", "--duration", "300")
+        run = team.up("--rate", "4", "--duration", "3600")
         in_flight(run)
         both = [team.zsim("restart", "estimator.drone2") for _ in range(2)]
         for command in both:
@@ -72,7 +72,7 @@ def test_restarts_at_once_and_moves_refused_and_carried_out(lab: Lab) -> None:
 def test_a_closed_terminal_ends_the_run_as_ctrl_c_does(lab: Lab) -> None:
     """Meanwhile others who want to fly there are refused before anything is started, and leave nothing."""
     with closing(Team(lab, ROLES, secure=False)) as team:
-        run = team.up("--rate", "4", "--duration", "300")
+        run = team.up("--rate", "4", "--duration", "3600")
         in_flight(run)
         follower = team.zsim("logs", "estimator.drone2", "--follow")
         follower.line("estimator.drone2: in run")
@@ -96,7 +96,7 @@ def test_a_closed_terminal_ends_the_run_as_ctrl_c_does(lab: Lab) -> None:
 def test_a_killed_launcher_leaves_a_record_and_no_key(lab: Lab) -> None:
     """Whoever flies next is told of the record and how to fetch it; a second that cannot be fetched fails its run."""
     with closing(Team(lab, ROLES)) as team:
-        run = team.up("--rate", "4", "--duration", "300")
+        run = team.up("--rate", "4", "--duration", "3600")
         in_flight(run)
         run.signal(signal.SIGKILL)
         team.nobody_left()
@@ -126,7 +126,7 @@ def test_a_killed_launcher_leaves_a_record_and_no_key(lab: Lab) -> None:
 def test_nobody_waits_for_a_recorder_that_is_cut_off(lab: Lab) -> None:
     """The record stays where it is, the keys are taken from the hosts that can be reached."""
     with closing(Team(lab, {**ROLES, "recorder": SPARE})) as team:
-        run = team.up("--rate", "4", "--duration", "300")
+        run = team.up("--rate", "4", "--duration", "3600")
         in_flight(run)
         team.cut(SPARE)
         run.line(f"host {SPARE} does not answer", START_S)

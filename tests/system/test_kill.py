@@ -123,6 +123,18 @@ def test_end(federation: Federation, name: str) -> None:
     check_end(federation, whole=False)
 
 
+def test_who_is_terminated_has_died(federation: Federation) -> None:
+    """SIGTERM from somebody who is not the launcher: first to an estimator, then to the recorder."""
+    flight = Flight(federation, "--duration", "300")
+    federation.kill("estimator.drone1", signal.SIGTERM)
+    assert flight.event("death", "estimator.drone1").message["data"]["on_death"] == "restart"
+    flight.event("restart", "estimator.drone1")
+    federation.kill("recorder", signal.SIGTERM)
+    flight.run.line(r"recorder .*ended: exit code 143: recorder: .* is complete, stopped; on_death: end")
+    flight.run.ends(with_code=1)
+    assert check_end(federation, whole=False).complete
+
+
 def test_a_stopped_reader(federation: Federation) -> None:
     """Whoever only listens and takes nothing loses its link; the terminal says meanwhile why nothing moves."""
     run = federation.run(PAIR, "--duration", "100000")

@@ -87,7 +87,7 @@ def info(scenario) -> messages.Info:
         drones=tuple(messages.DroneInfo(drone.name, drone.model) for drone in scenario.drones),
         clusters=tuple(messages.ClusterInfo(c.name, tuple(c.drones)) for c in scenario.clusters),
         scenario=scenario_file.to_text(scenario),
-        scenario_sha256=scenario_file.sha256(scenario),
+        scenario_sha256=scenario_file.sha256(scenario_file.to_text(scenario)),
         version="0.1.0",
         fingerprint="f" * 16,
     )

@@ -63,6 +63,7 @@ class World(Hub):
     def info(self) -> messages.Info:
         """Return the message of `world/info`."""
         s, env = self.scenario, self.scenario.environment
+        text = scenario_file.to_text(s)
         return messages.Info(
             t_ns=0,
             seq=0,
@@ -78,8 +79,8 @@ class World(Hub):
             origin=messages.Origin(env.latitude_deg, env.longitude_deg, env.height_m),
             drones=tuple(messages.DroneInfo(d.name, d.model) for d in s.drones),
             clusters=tuple(messages.ClusterInfo(c.name, tuple(c.drones)) for c in s.clusters),
-            scenario=scenario_file.to_text(s),
-            scenario_sha256=scenario_file.sha256(s),
+            scenario=text,
+            scenario_sha256=scenario_file.sha256(text),
             version=__version__,
             fingerprint=fingerprint(),
         )
