@@ -115,7 +115,7 @@ def _has_drones(said: str | bytes) -> bool:
 def _started(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
     """Start a `zsim` command, and end it."""
     quiet = subprocess.DEVNULL
-    process = subprocess.Popen([*CLI, *arguments], stdin=quiet, stdout=quiet, stderr=quiet)
+    process = subprocess.Popen([*CLI, *arguments], stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
     try:
         yield process
     finally:

@@ -40,8 +40,9 @@ def console(
     check()
     from zsim_agents.console.door import Place
     from zsim_agents.console.server import Console
+    from zsim_deploy.priority import give_way
     from zsim_deploy.progress import Teller
-    from zsim_deploy.roles import give_way, speaker
+    from zsim_deploy.roles import speaker
     from zsim_deploy.visitor import named, visit
 
     give_way(for_eyes=True)

@@ -35,7 +35,8 @@ def gateway(
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
     from zsim.connection import find_world
     from zsim_agents.gateway.server import Doors, Gateway
-    from zsim_deploy.roles import give_way, speaker
+    from zsim_deploy.priority import give_way
+    from zsim_deploy.roles import speaker
     from zsim_deploy.visitor import named, visit
 
     give_way()

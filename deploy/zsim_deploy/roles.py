@@ -8,7 +8,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,10 @@ from zsim.scenario import Scenario
 from zsim_deploy.hosting import chosen, hosted
 from zsim_deploy.leash import Leash
 from zsim_deploy.lent import lent
+from zsim_deploy.priority import give_way
 from zsim_deploy.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
 from zsim_deploy.reach import Reach
 
-NICE = 5  # of processes for which no gate waits
-NICE_FOR_EYES = 10  # of those that only people look at: a picture may come later, a gate may not
 TICK_S = 0.1  # how often a router looks for a stop
 PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
 PATIENCE_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
@@ -236,19 +235,6 @@ def router(
 def _refuse(fault: str | None, upstream: str) -> None:
     if fault:
         raise SessionError(f"cannot connect to {upstream}: {fault}")
-
-
-def give_way(for_eyes: bool = False) -> None:
-    """Let the world go first where both want the processor: for those for whom no gate waits. Threads to come, too.
-
-    Args:
-        for_eyes: a person alone waits; then it does not interrupt others when it wakes up either (SCHED_BATCH).
-    """
-    if hasattr(os, "nice"):
-        os.nice(NICE_FOR_EYES if for_eyes else NICE)
-    if for_eyes and sys.platform == "linux":
-        with suppress(OSError):  # it may be in a class from which one does not come back
-            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
 def speaker(launched: bool) -> Callable[[str], None]:

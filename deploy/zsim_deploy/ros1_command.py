@@ -30,7 +30,7 @@ def ros1(
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
     from zsim_agents.ros1.bridge import DismissedError, serve
-    from zsim_deploy.roles import give_way
+    from zsim_deploy.priority import give_way
     from zsim_deploy.visitor import named, visit
 
     give_way()

@@ -35,7 +35,7 @@ def ros2(
     from zsim.identity import Identity
     from zsim.tls import is_tls
     from zsim_agents.ros2.bridge import Door, serve
-    from zsim_deploy.roles import give_way
+    from zsim_deploy.priority import give_way
     from zsim_deploy.visitor import named, visit
 
     if reach.tls and router is None:

@@ -1,0 +1,44 @@
+"""Who goes first where two processes want the same processor: those for whom a gate waits."""
+
+import os
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+NICE = 5  # of processes for which no gate waits
+NICE_FOR_EYES = 10  # of those that only people look at: a picture may come later, a gate may not
+AUTOGROUP = Path("/proc/self/autogroup")  # sched(7)
+TRIES = 5
+AGAIN_S = 0.12  # the kernel lets ordinary users write there ten times a second, all of them together
+
+
+def give_way(for_eyes: bool = False) -> None:
+    """Let the world go first. Threads to come, too.
+
+    Args:
+        for_eyes: a person alone waits; then it does not interrupt others when it wakes up either (SCHED_BATCH).
+    """
+    niceness = NICE_FOR_EYES if for_eyes else NICE
+    if hasattr(os, "nice"):
+        os.nice(niceness)
+    if sys.platform != "linux":
+        return
+    if os.getsid(0) == os.getpid():
+        _give_way_as_session(niceness)
+    if for_eyes:
+        with suppress(OSError):  # it may be in a class from which one does not come back
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+def _give_way_as_session(niceness: int) -> None:
+    """Where Linux shares processors between sessions, niceness counts within each of them only; so lower this one."""
+    for _ in range(TRIES):
+        try:
+            AUTOGROUP.write_text(str(niceness))
+        except BlockingIOError:
+            time.sleep(AGAIN_S)
+        except OSError:
+            return  # not shared that way here, or not for us to say
+        else:
+            return
