@@ -1,0 +1,51 @@
+"""How tests are shared among workers: the last of three or more is a quiet one.
+
+It runs what is pure, and only in the time that the others, whose tests start processes and wait for them, leave over.
+When the others have nothing else left to do, they run what is pure, too.
+"""
+
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from xdist.scheduler import LoadGroupScheduling
+
+PURE = ("tests/authority/", "tests/contract/", "tests/unit/")
+LEAST = 3  # workers of which one is quiet
+NICE = 10
+
+
+def quiet_one(workers: int) -> str | None:
+    """Return the name of the quiet one among so many workers, if there is one."""
+    return f"gw{workers - 1}" if workers >= LEAST else None
+
+
+class QuietScheduling(LoadGroupScheduling):
+    """Hands out tests as `--dist loadgroup` does, but to each worker its own kind."""
+
+    def _assign_work_unit(self, node: Any) -> None:
+        is_quiet = node.gateway.id == quiet_one(self.numnodes)
+        own = (scope for scope, tests in self.workqueue.items() if next(iter(tests)).startswith(PURE) == is_quiet)
+        scope = next(own, None)
+        if scope is not None:
+            self.workqueue.move_to_end(scope, last=False)
+        elif is_quiet:
+            node.shutdown()
+            return
+        super()._assign_work_unit(node)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> QuietScheduling | None:
+    return QuietScheduling(config, log) if config.getoption("dist") == "loadgroup" else None
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    worker = getattr(config, "workerinput", None)
+    if worker and sys.platform == "linux" and worker["workerid"] == quiet_one(worker["workercount"]):
+        os.nice(NICE)
+        os.setsid()  # Linux shares processors between sessions first: it needs one of its own to give way
+        with suppress(OSError):
+            Path("/proc/self/autogroup").write_text(str(NICE))
