@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from zsim.identity import Identity
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-INTERRUPTED = 130  # exit code of a shell for a program that Ctrl-C ended
 RUN, HOSTS = "Run", "On several machines"  # panels of the help
 REALTIME = "--realtime"  # of the world and the routers, whose lease it shortens
 

@@ -30,7 +30,6 @@ from zsim_deploy import (
 )
 from zsim_deploy.arguments import (
     HOSTS,
-    INTERRUPTED,
     RUN,
     Duration,
     Insecure,
@@ -42,6 +41,7 @@ from zsim_deploy.arguments import (
     load_scenario,
     mode_and_rate,
 )
+from zsim_deploy.interrupts import INTERRUPTED
 
 app = typer.Typer(
     name="zsim",

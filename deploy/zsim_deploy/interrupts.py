@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 REASONS: dict[int, str] = {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}
+INTERRUPTED = 130  # exit code of a shell for a program that Ctrl-C ended
 IMPATIENT = "interrupted twice, nobody was waited for"
 
 

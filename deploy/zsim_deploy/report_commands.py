@@ -8,7 +8,8 @@ import typer
 
 from zsim.errors import ZsimError
 from zsim_deploy import sweep_commands
-from zsim_deploy.arguments import INTERRUPTED, RUN
+from zsim_deploy.arguments import RUN
+from zsim_deploy.interrupts import INTERRUPTED
 
 app = typer.Typer()
 

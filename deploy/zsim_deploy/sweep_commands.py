@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsim_deploy.arguments import INTERRUPTED, Duration, ScenarioPath, Seed, Set
+from zsim_deploy.arguments import Duration, ScenarioPath, Seed, Set
+from zsim_deploy.interrupts import INTERRUPTED
 
 if TYPE_CHECKING:
     from zsim_deploy.sweep.plan import Plan

@@ -1,0 +1,27 @@
+"""The `zsim` command: Ctrl-C ends it in a line from its first moment on, also while it loads what it needs."""
+
+import os
+import signal
+
+from zsim_deploy.interrupts import INTERRUPTED
+
+
+def main() -> None:
+    """Load the command line, and run it."""
+    heeded = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where a shell has it ignored
+    if heeded:
+        signal.signal(signal.SIGINT, _leave)
+    from zsim_deploy import cli
+
+    if heeded:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    cli.main()
+
+
+def _leave(*_: object) -> None:
+    os.write(2, b"interrupted\n")
+    os._exit(INTERRUPTED)  # nothing has been started or written yet
+
+
+if __name__ == "__main__":
+    main()

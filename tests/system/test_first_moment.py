@@ -1,0 +1,28 @@
+"""Ctrl-C while a command still loads what it needs: a line, as later."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from federation import free_port
+
+LOADS = (sys.executable, "-X", "importtime", "-m", "zsim_deploy")  # Python itself says what it has loaded
+
+
+@pytest.mark.parametrize("loaded", ["zsim.errors", "typer"])
+def test_ctrl_c_while_it_loads_is_a_line(loaded: str) -> None:
+    command = [*LOADS, "keys", "--wait", "60", "--connect", f"tcp/127.0.0.1:{free_port()}"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    assert process.stderr is not None
+    said = []
+    with process.stderr:
+        for line in process.stderr:
+            said.append(line)
+            if line.endswith(f" {loaded}\n"):
+                os.kill(process.pid, signal.SIGINT)
+    assert process.wait() == 130, said[-5:]
+    told = [line for line in said if not line.startswith("import time:")]
+    assert told[-1:] == ["interrupted\n"]
+    assert "Traceback" not in "".join(told)
