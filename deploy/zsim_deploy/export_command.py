@@ -1,6 +1,5 @@
 """`zsim export`: the record of a run for pandas, MATLAB, Foxglove and Rerun."""
 
-import signal
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +8,7 @@ import typer
 
 from zsim_deploy.arguments import not_negative
 from zsim_deploy.export.form import Format
+from zsim_deploy.interrupts import interruptible
 
 PANEL = "Run"
 
@@ -50,9 +50,8 @@ def export(
     from zsim_deploy.export.make import export as write
     from zsim_deploy.export.selection import Selection
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+    with interruptible(), Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("looking through the record", total=None)
         done = write(
             run,

@@ -86,7 +86,8 @@ class Watched:
 
     def until(self, condition: str) -> dict[str, Any]:
         """Wait until a condition (JavaScript) holds of the state `s`; return the state."""
-        look = f"async () => {{ const s = await (await fetch('/state')).json(); return [{condition}, s]; }}"
+        there = f"(() => {{ try {{ return {condition}; }} catch {{ return false; }} }})()"  # it may show no run yet
+        look = f"async () => {{ const s = await (await fetch('/state')).json(); return [{there}, s]; }}"
         until_s = time.monotonic() + PATIENCE_S
         while True:
             holds, state = self.page.evaluate(look)
