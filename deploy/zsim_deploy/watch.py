@@ -22,7 +22,7 @@ from zsim_deploy.progress import Show
 POLL_S = 0.05  # how often the processes are looked at
 END_S = 8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for
 WORLD_FIRST_S = 1.0  # after Ctrl-C, how long the world has to end the run for everybody
-INTERRUPT_S = 2.5  # after Ctrl-C, how long anybody may take; the whole is promised within 3 s
+INTERRUPT_S = 2.0  # after Ctrl-C, how long anybody may take; the whole is promised within 3 s
 TAKE_OVER_S = 60.0  # how long a process may stay once another was started in its place; a slow one starts in half
 RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; more is a fault that a restart does not heal
 RESTART_WINDOW_S = 20.0
