@@ -165,8 +165,8 @@ def write(program: Program, words: Words, kind: int, ints: NDArray, bits: NDArra
         else:
             value, size = ints[place], 1
             if value < -32 or value > 127:
-                reach = value if value > 0 else 2 * (-1 - value)  # int8 reaches to -128 as uint8 does to 255
-                power = 0 if reach < 1 << 8 else 1 if reach < 1 << 16 else 2 if reach < 1 << 32 else 3
+                reach, free = (value, 8) if value > 0 else (-1 - value, 7)  # int8 reaches to -128, uint8 to 255
+                power = 0 if reach < 1 << free else 1 if reach < 1 << free + 8 else 2 if reach < 1 << free + 24 else 3
                 size = 1 << power
                 out[at] = (UINT8 if value > 0 else INT8) + power
                 at += np.uint64(1)

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from zsim import messages
 from zsim.encoding import BOOL, FLOATS, INT, TEXT, Layouts, read, words, write
 
-WHOLE = st.integers(-(2**63), 2**63 - 1) | st.sampled_from(
-    [0, 127, 128, 255, 256, 65535, 65536, 2**32 - 1, 2**32, -1, -32, -33, -128, -129, -32768, -32769, -(2**31) - 1]
-)
+EDGES = (0, 127, 128, 255, 256, 65535, 65536, 2**32 - 1, 2**32, 2**63 - 1, -1, -32, -33, -128, -129, -32768, -32769)
+EDGES += (-(2**31), -(2**31) - 1, -(2**62) - 1, -(2**63))
+WHOLE = st.integers(-(2**63), 2**63 - 1) | st.sampled_from(EDGES)
 COUNT = WHOLE.map(lambda value: value if value >= 0 else -(value + 1))
 NUMBER = st.floats(allow_nan=False, allow_infinity=False)
 TEXTS = ["landed", "flying", "", "controller.main", "ö" * 15, None]
@@ -55,6 +55,12 @@ def check_reading(layouts: Layouts, kind: int, payload: bytes, ints: np.ndarray,
     if readable:
         assert again.tolist() == ints.tolist()
         assert bits.tolist() == floats.view(np.uint64).tolist()
+
+
+@pytest.mark.parametrize("whole", EDGES)
+def test_whole_numbers_at_the_edges_give_the_encoders_bytes(whole: int) -> None:
+    message: Any = messages.Imu(0, 0, whole, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    assert written([messages.Imu], [(0, [0, 0, whole], [])]) == [messages.encode(message)]
 
 
 @given(st.data())
