@@ -26,7 +26,7 @@ lint: $(VENV)/.dev ## style, types, and who may import whom
 	$(BIN)/pyright
 
 soak: $(VENV)/.dev ## repetitions and long runs
-	$(BIN)/pytest -m soak -p no:xdist
+	$(BIN)/pytest -n 0 -m soak
 
 bench: $(VENV)/.dev ## measure against others, all or PARTS='a b'; see docs/performance.md
 	$(BIN)/python -m benchmarks $(PARTS)
@@ -52,7 +52,7 @@ $(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
 	@touch $@ $(VENV)/.run
 
 define COMPILE
-	@echo "compiling what flies (once on this machine, about half a minute)"
+	@echo "compiling what flies (once on this machine, about a minute)"
 	@folder=$$(mktemp -d) && $(BIN)/zsim run scenarios/step.yaml --in-process --duration 0.1 --no-report \
 		--out $$folder/run 2>/dev/null && rm -r $$folder
 endef

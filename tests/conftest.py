@@ -6,12 +6,12 @@ When the others have nothing else left to do, they run what is pure, too.
 
 import os
 import sys
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import pytest
 from xdist.scheduler import LoadGroupScheduling
+
+from zsim_deploy.priority import lower
 
 PURE = ("tests/authority/", "tests/contract/", "tests/unit/")
 LEAST = 3  # workers of which one is quiet
@@ -45,7 +45,5 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> QuietSchedul
 def pytest_configure(config: pytest.Config) -> None:
     worker = getattr(config, "workerinput", None)
     if worker and sys.platform == "linux" and worker["workerid"] == quiet_one(worker["workercount"]):
-        os.nice(NICE)
-        os.setsid()  # Linux shares processors between sessions first: it needs one of its own to give way
-        with suppress(OSError):
-            Path("/proc/self/autogroup").write_text(str(NICE))
+        os.setsid()
+        lower(NICE)

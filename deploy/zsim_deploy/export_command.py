@@ -2,13 +2,16 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from zsim_deploy.arguments import not_negative
 from zsim_deploy.export.form import Format
 from zsim_deploy.interrupts import interruptible
+
+if TYPE_CHECKING:
+    from zsim_deploy.export.make import Exported
 
 PANEL = "Run"
 
@@ -61,6 +64,10 @@ def export(
             force,
             lambda count, of: bar.update(task, description="reading messages", completed=count, total=of),
         )
+    _show(done)
+
+
+def _show(done: "Exported") -> None:
     for note in done.notes:
         print(f"note: {note}", file=sys.stderr)
     for name, rows in done.tables.items():

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 
-from zsim_deploy.interrupts import IMPATIENT, REASONS
+from zsim_deploy.interrupts import IMPATIENT, INTERRUPTED, REASONS
 from zsim_deploy.lent import Lent
 
 TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it
@@ -28,17 +28,17 @@ class Leash:
     """
 
     def __init__(self, launched: bool, lent: Lent | None = None) -> None:
-        self._launched = launched
         self._lent = lent
         self._reason: str | None = None
         self._deserted = self._terminated = False
         self._heard_s = time.monotonic()
         self._former = {number: signal.getsignal(number) for number in REASONS}
-        signal.signal(signal.SIGTERM, self._on_terminate)
         if launched:
+            signal.signal(signal.SIGTERM, self._on_kill)
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             threading.Thread(target=self._listen, name="leash", daemon=True).start()
         else:
+            signal.signal(signal.SIGTERM, lambda *_: self._stop(REASONS[signal.SIGTERM]))
             signal.signal(signal.SIGINT, self._on_interrupt)
 
     def reason(self) -> str | None:
@@ -70,15 +70,15 @@ class Leash:
     def _stop(self, reason: str) -> None:
         self._reason = self._reason or reason
 
-    def _on_terminate(self, *_: object) -> None:
-        if self._launched and self._reason is None:
+    def _on_kill(self, *_: object) -> None:
+        if self._reason is None:
             self._deserted = self._terminated = True
         self._stop(REASONS[signal.SIGTERM])
 
     def _on_interrupt(self, *_: object) -> None:
         if self._reason is not None:
             os.write(2, f"{IMPATIENT}\n".encode())
-            os._exit(130)
+            os._exit(INTERRUPTED)
         self._stop(REASONS[signal.SIGINT])
 
     def _listen(self) -> None:

@@ -19,20 +19,24 @@ def give_way(for_eyes: bool = False) -> None:
     Args:
         for_eyes: a person alone waits; then it does not interrupt others when it wakes up either (SCHED_BATCH).
     """
-    niceness = NICE_FOR_EYES if for_eyes else NICE
-    if hasattr(os, "nice"):
-        os.nice(niceness)
-    if sys.platform != "linux":
-        return
-    if os.getsid(0) == os.getpid():
-        _give_way_as_session(niceness)
-    if for_eyes:
+    lower(NICE_FOR_EYES if for_eyes else NICE)
+    if for_eyes and sys.platform == "linux":
         with suppress(OSError):  # it may be in a class from which one does not come back
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
-def _give_way_as_session(niceness: int) -> None:
-    """Where Linux shares processors between sessions, niceness counts within each of them only; so lower this one."""
+def lower(niceness: int) -> None:
+    """Make this process nicer, and with it the session that it leads, if it does.
+
+    Where Linux shares processors between sessions, niceness counts within each of them only.
+    """
+    if hasattr(os, "nice"):
+        os.nice(niceness)
+    if sys.platform == "linux" and os.getsid(0) == os.getpid():
+        _lower_session(niceness)
+
+
+def _lower_session(niceness: int) -> None:
     for _ in range(TRIES):
         try:
             AUTOGROUP.write_text(str(niceness))
