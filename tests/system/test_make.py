@@ -12,7 +12,9 @@ MARKED = "tests/system/test_kill.py"  # holds a group, soaks and others
 
 @pytest.mark.parametrize("target", ["test", "soak"])
 def test_its_tests_are_found(target: str) -> None:
-    printed = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    printed = subprocess.run(
+        ["make", "-n", "--no-print-directory", target], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
     command = [*shlex.split(printed.splitlines()[-1]), "--collect-only", "-q", MARKED]
     found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert found.returncode == 0, found.stdout[-2000:]

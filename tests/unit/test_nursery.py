@@ -184,7 +184,7 @@ def test_one_within_another_leaves_it_its_children(log: Path) -> None:
 @LINUX
 def test_a_cradle_ends_with_its_launcher() -> None:
     code = "import time\nfrom zsim_deploy.nursery import Nursery\n"
-    code += "with Nursery(print) as nursery: print(nursery._cradle.pid, flush=True); time.sleep(100)"
+    code += "with Nursery(lambda _: None) as nursery: print(nursery._cradle.pid, flush=True); time.sleep(100)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as launcher:
         assert launcher.stdout is not None
         cradle = psutil.Process(int(launcher.stdout.readline()))
