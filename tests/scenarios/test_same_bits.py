@@ -115,7 +115,7 @@ def test_a_stopped_estimator(federation: Federation, pair_sha256: str) -> None:
 
     Expected: time stands, `clock` names the estimator, its host, and since when; then the same hash.
     """
-    run = federation.run(PAIR, "--rate", "10")
+    run = federation.run(PAIR, "--rate", "3")
     clock = federation.client().watch("clock")
     clock.until(lambda m: m["t_ns"] > 6e9)
     federation.kill("estimator.drone1", signal.SIGSTOP)

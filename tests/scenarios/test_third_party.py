@@ -71,14 +71,15 @@ def test_a_foreign_estimator_takes_over_in_flight(federation: Federation) -> Non
 
     Expected: the launcher does not start ours again; the run ends well.
     """
-    run = federation.run(PAIR, "--rate", "10")
+    run = federation.run(PAIR, "--rate", "3")
     client = federation.client()
     clock, events = client.watch("clock"), client.watch("world/event")
     clock.until(lambda m: m["t_ns"] > 6e9)
     truth = client.watch("drone/drone2/truth")
+    former_pid = federation.pid("estimator.drone2")
     foreign = client.join("estimator.drone2", client.info(), GATE_NS)
     taken = events.until(lambda m: m["kind"] == "superseded").message["data"]
-    assert taken["former_pid"] == federation.pid("estimator.drone2")
+    assert taken["former_pid"] == former_pid
     run.line("estimator.drone2: another process of this name joined from elsewhere")
     answer_from(client, foreign, truth, taken["done_ns"] + GATE_NS)
     run.ends(with_code=0)
@@ -169,7 +170,7 @@ def test_the_outputs_of_a_role(federation: Federation) -> None:
 
     Expected: the commands, estimates and state of the gates that it has said done for last.
     """
-    run = federation.run(PAIR, "--rate", "10")
+    run = federation.run(PAIR, "--rate", "10", "--duration", "600")
     client = federation.client()
     client.watch("clock").until(lambda m: m["t_ns"] > 6e9)
     assert client.ask("world/control", "pause")["ok"]

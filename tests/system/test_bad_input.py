@@ -131,7 +131,7 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_bad_command_is_a_line(tmp_path: Path, name: str) -> None:
+def test_a_bad_command_is_a_line(tmp_path: Path, compiled: None, name: str) -> None:
     (tmp_path / "one.yaml").write_text(ONE)
     (tmp_path / "bad.yaml").write_text(with_expression("sin("))
     (tmp_path / "cut").mkdir()

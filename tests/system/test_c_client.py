@@ -492,7 +492,7 @@ def test_it_flies_a_square_in_lockstep_with_the_same_bits_each_time(
 
 def test_it_flies_a_square_in_realtime(build: Build, federation: Federation) -> None:
     program = build("examples/c/square.c", *SANITIZED)
-    corners, _ = flown(federation, program, "--realtime", "--rate", "5", "--duration", "60", stop=True)
+    corners, _ = flown(federation, program, "--realtime", "--rate", "3", "--duration", "60", stop=True)
     is_a_square(corners)
 
 

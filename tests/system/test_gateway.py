@@ -24,7 +24,10 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Federation, 
     """A world of one drone in realtime, and a gateway."""
     with Federation(tmp_path_factory.mktemp("lab")) as federation:
         federation.world(ONE.replace("duration_s: 10", "duration_s: 3600"), "--realtime")
-        yield federation, Door(federation).in_run()
+        door = Door(federation).in_run()
+        with door.events("/json/drone/drone1/sensor/imu") as events:
+            next(events)
+        yield federation, door
 
 
 @pytest.fixture
@@ -412,9 +415,10 @@ def test_clients_stay_while_runs_come_and_go(federation):
         assert door.http("GET", "/json/clock").status == 503
         stream.tell("subscribe", key="clock")
         for _ in range(2):
-            world = federation.world(ONE.replace("duration_s: 10", "duration_s: 2"), "--realtime")
+            world = federation.world(STANDING, "--realtime")
             begun = stream.next("run")
             assert begun["state"] == "begun"
+            stream.tell("ask", key="world/control", request="stop")
             ended = stream.next("run")
             assert (ended["state"], ended["run_id"]) == ("ended", begun["run_id"])
             world.ends(with_code=0)

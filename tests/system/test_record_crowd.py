@@ -23,11 +23,6 @@ def test_five_seconds_as_fast_as_they_go_are_recorded_without_a_gap(compiled: No
     complete(fly(DRONES, 5.0), 5.0)
 
 
-@pytest.mark.slow
-def test_five_seconds_in_realtime_are_recorded_without_a_gap(compiled: None) -> None:
-    complete(fly(DRONES, 5.0, "--realtime"), 5.0)
-
-
 @pytest.mark.soak
 @pytest.mark.parametrize("options", [(), ("--realtime",)], ids=["lockstep", "realtime"])
 def test_two_minutes_are_recorded_without_a_gap(compiled: None, options: tuple[str, ...]) -> None:

@@ -126,7 +126,7 @@ def test_echo(federation: Federation, flown: Path) -> None:
 
     Expected: it prints payloads of the record.
     """
-    replay(federation, flown)
+    replay(federation, flown, "--rate", "0.2")
     echo = federation.role("echo", "drone/drone2/sensor/imu", "--raw", "-n", "20")
     echo.ends(with_code=0)
     on_record = {payload.hex() for payload in recorded(flown, "drone/drone2/sensor/imu")["drone/drone2/sensor/imu"]}
@@ -209,7 +209,7 @@ def test_what_may_be_asked(federation: Federation, flown: Path) -> None:
     refused = events.until(lambda m: m["kind"] == "refused" and m["source"] == "tester.one").message
     assert refused["data"]["reason"] == "a replay: nobody can be flown"
     assert client.ask("world/control", "seek", t_s=2)["ok"]
-    assert client.ask("world/control", "rate", value=20)["ok"]
+    assert client.ask("world/control", "rate", value=3)["ok"]
     resume(client)
     clock.until(lambda m: 2_000_000_000 < m["t_ns"] < 3_000_000_000)
     assert client.ask("world/control", "stop", reason="seen enough")["ok"]

@@ -257,7 +257,7 @@ def test_wire_of_what_we_send_and_what_we_refuse(federation: Federation, ros: RO
 
     When the last reader dies, nothing is read for it any more.
     """
-    federation.world(ONE.replace("duration_s: 10", "duration_s: 1000"), "--rate", "2")
+    federation.world(ONE.replace("duration_s: 10", "duration_s: 1000"), "--rate", "0.5")
     started = bridge(federation)
     node, raw = ros[0](port_of(federation.endpoint)), federation.client()
     node.ask("subscribe", topic="/drone1/imu", kind="sensor_msgs/msg/Imu")

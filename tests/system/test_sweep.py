@@ -21,9 +21,11 @@ from zsim_deploy.sweep.folder import load, locked
 pytestmark = pytest.mark.xdist_group("serial")
 
 GUST = "environment.wind.gust_m_s"
-PLAN = ("--vary", "seed", "--vary", "wind.gust_m_s=0,1", "--duration", "6", "--set", "drones.drone1.mass_kg=0.45")
+DURATION_S = 12.0  # the time for a test to act before the next run is finished
+FLIGHT = ("--duration", str(DURATION_S), "--set", "drones.drone1.mass_kg=0.45")
+PLAN = ("--vary", "seed", "--vary", "wind.gust_m_s=0,1", *FLIGHT)
 RUNS = 4
-FIRST = rf" [1-9] / {RUNS} runs"  # the line of the first run that is finished
+FIRST = rf" [1-{RUNS - 1}] / {RUNS} runs"  # a line while there is still something to fly
 WALL = ("wall_s", "real_time_factor")  # all that may differ between two sweeps
 
 
@@ -61,7 +63,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> Pat
 
 def test_a_run_of_a_sweep_has_the_bits_of_a_single_run(federation: Federation, undisturbed: Path) -> None:
     row = rows(undisturbed)[3]
-    options = ("--in-process", "--duration", "6", "--seed", str(row["seed"]), "--set", "drones.drone1.mass_kg=0.45")
+    options = ("--in-process", *FLIGHT, "--seed", str(row["seed"]))
     federation.run(PAIR, *options, "--set", f"{GUST}={row[GUST]}", "--report").ends(with_code=0)
     summary = json.loads((federation.out / "summary.json").read_text())
     assert row["truth_sha256"] == summary["truth_sha256"] == federation.record().sha256()
@@ -75,7 +77,7 @@ def test_the_table_and_the_report(undisturbed: Path) -> None:
     assert [row["run"] for row in found] == list(range(RUNS))
     assert [row[GUST] for row in found] == [0, 1, 0, 1]
     assert len({row["seed"] for row in found}) == len({row["truth_sha256"] for row in found}) == RUNS
-    assert all(row["failure"] is None and row["sim_s"] == 6.0 for row in found)
+    assert all(row["failure"] is None and row["sim_s"] == DURATION_S for row in found)
     assert sorted(path.name for path in undisturbed.iterdir() if not path.name.startswith(".")) == [
         "figures",
         "plan.json",

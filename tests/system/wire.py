@@ -96,9 +96,9 @@ class Client:
         self._kept.append(subscriber)
         return watch
 
-    def get(self, expression: str, payload: bytes | None = None, within_s: float = 5.0) -> dict[str, Any]:
+    def get(self, expression: str, payload: bytes | None = None) -> dict[str, Any]:
         """Return the last values that are answered on an expression, by key."""
-        replies = self.session.get(self._prefix + expression, payload=payload, timeout=within_s)
+        replies = self.session.get(self._prefix + expression, payload=payload, timeout=PATIENCE_S)
         good = [reply.ok for reply in replies if reply.ok is not None]
         return {str(ok.key_expr).removeprefix(self._prefix): read(ok.payload.to_bytes()) for ok in good}
 
@@ -114,7 +114,7 @@ class Client:
     def ask(self, key: str, op: str, source: str = "tester", **args: Any) -> dict[str, Any]:
         """Send a request and return its answer."""
         request = msgpack.packb({"op": op, "args": args, "source": source})
-        return self.get(key, payload=request, within_s=PATIENCE_S)[key]
+        return self.get(key, payload=request)[key]
 
     def put(self, key: str, **fields: Any) -> None:
         """Publish a message; `seq` is counted here."""
