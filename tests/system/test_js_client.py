@@ -128,7 +128,10 @@ class Watched:
 
     def says(self, pattern: str) -> None:
         """Wait until the page shows a text."""
-        self.page.get_by_text(re.compile(pattern)).first.wait_for()
+        try:
+            self.page.get_by_text(re.compile(pattern)).first.wait_for()
+        except Exception:
+            pytest.fail(f"no {pattern!r} on the page, but:\n{self.page.inner_text('body')}\n{self.faults}")
 
     def map(self) -> str:
         """Return the picture on the canvas."""

@@ -179,7 +179,7 @@ class Gateway:
         flight.enter()
         self._on_loop(self._begin, flight)
         say(f"{self._name}: clients are let into run {info.run_id}")
-        link.on_link(_Link(lambda state: self.loop.call_soon_threadsafe(self._tell, state, flight)).note)
+        link.on_link(_Link(lambda state: self.loop.call_soon_threadsafe(self._tell_of_link, state, flight)).note)
         try:
             flight.follow(stopped)
         finally:
@@ -221,6 +221,11 @@ class Gateway:
     def _tell(self, state: str, flight: Flight) -> None:
         for client in self._clients:
             client.tell_of_run(state, flight.info.run_id)
+
+    def _tell_of_link(self, state: str, flight: Flight) -> None:
+        """Tell of a link that is lost or back, but not when its world goes after the end of its run."""
+        if flight is self._flight:
+            self._tell(state, flight)
 
     def _on_loop(self, do: Callable[..., None], *args: Any) -> None:
         async def call() -> None:
