@@ -28,6 +28,7 @@ async function main() {
       await follow();
       show(await zsim.closed);
     } catch (error) {
+      zsim?.close(); // a request that was answered too late: the next connection is the only one
       show(error.message);
     }
     await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
