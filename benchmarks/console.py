@@ -30,10 +30,10 @@ from benchmarks.exchange.lap import free_port
 from benchmarks.progress import Progress
 from benchmarks.sheet import Sheet
 from benchmarks.table import figure, spread, table
-from zsim import keys, messages
-from zsim import session as zenoh_session
-from zsim.session import Session
-from zsim_agents.console.guard import Camera
+from zsim.contract import keys, messages
+from zsim.transport import session as zenoh_session
+from zsim.transport.session import Session
+from zsim_bridges.console.http.page_rights import Camera
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
 SIZES = (3, 50)  # drones

@@ -12,10 +12,10 @@ from pathlib import Path
 import psutil
 
 from benchmarks import grid
-from zsim.in_process import Bus
 from zsim.record import RecordWriter
-from zsim_deploy.in_process import agents
-from zsim_world.world import World
+from zsim.runtime.bus import Bus
+from zsim_analysis.in_process import agents
+from zsim_world.flight.world import World
 
 WARM_NS = 1_000_000_000  # simulated, not counted
 

@@ -9,8 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from zsim import scenario_file, yaml_file
-from zsim.scenario import Scenario
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim.schema import yaml_file
 
 SPACING_M = 4.0  # about ten hulls: hulls never meet, and downwash reaches no neighbour
 GUST_M_S = 0.5  # as in Test 1

@@ -22,7 +22,7 @@ from benchmarks.progress import Progress
 from benchmarks.run import CLI
 from benchmarks.sheet import Sheet
 from benchmarks.table import figure, spread, table
-from zsim.messages import REFUSALS
+from zsim.contract.messages import REFUSALS
 from zsim.record import RecordReader
 
 DRONES = 50

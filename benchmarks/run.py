@@ -10,7 +10,7 @@ import msgspec
 import psutil
 
 from benchmarks.child import RefusedError
-from zsim import messages
+from zsim.contract import messages
 from zsim.record import RecordReader
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")

@@ -14,7 +14,7 @@ from benchmarks import grid
 from benchmarks.child import RefusedError
 from benchmarks.exchange.lap import free_port
 from benchmarks.run import CLI
-from zsim.connection import find_world
+from zsim.transport.connection import find_world
 
 FEDERATION = "zsim"
 PATIENCE_S = 60.0

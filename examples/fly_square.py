@@ -10,9 +10,9 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
-from zsim import keys, messages
-from zsim.connection import find_world
-from zsim.session import Mailbox, Session
+from zsim.contract import keys, messages
+from zsim.transport.connection import find_world
+from zsim.transport.session import Mailbox, Session
 
 CLUSTER = "main"
 ME = "square.main"

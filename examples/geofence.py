@@ -12,13 +12,14 @@ from typing import Any
 
 from msgspec import Struct
 
-from zsim import keys, messages, scenario_file
-from zsim.agent import Agent, Output
-from zsim.connection import find_world
-from zsim.in_process import Bus
-from zsim.runner import Runner
-from zsim_deploy.in_process import agents
-from zsim_world.world import World
+from zsim.contract import keys, messages
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.bus import Bus
+from zsim.runtime.runner import Runner
+from zsim.scenario import scenario_file
+from zsim.transport.connection import find_world
+from zsim_analysis.in_process import agents
+from zsim_world.flight.world import World
 
 
 class Geofence(Agent):

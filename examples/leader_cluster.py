@@ -12,15 +12,16 @@ from pathlib import Path
 import numpy as np
 from msgspec import Struct
 
-from zsim import messages, scenario_file
-from zsim.in_process import Bus
-from zsim.scenario import Scenario
-from zsim_agents.cluster_space import Array
-from zsim_agents.controller import Controller, gains_of, plan_of
-from zsim_agents.engagement import Engagement
-from zsim_agents.estimator import Estimator
-from zsim_agents.triad_cluster import TriadCluster
-from zsim_world.world import World
+from zsim.contract import messages
+from zsim.runtime.bus import Bus
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_agents.estimation.estimator import Estimator
+from zsim_agents.formation.controller import Controller, gains_of, plan_of
+from zsim_agents.formation.engagement import Engagement
+from zsim_agents.formation.spaces.cluster_space import Array
+from zsim_agents.formation.spaces.triad_cluster import TriadCluster
+from zsim_world.flight.world import World
 
 STEP = 1e-6  # m or rad, of the differences
 

@@ -14,13 +14,14 @@ from pathlib import Path
 from msgspec import Struct
 from my_estimator import MyEstimator
 
-from zsim import keys, messages, scenario_file
-from zsim.agent import Agent
-from zsim.in_process import Bus
-from zsim.scenario import Scenario
-from zsim_agents.controller import Controller
-from zsim_agents.estimator import Estimator
-from zsim_world.world import World
+from zsim.contract import keys, messages
+from zsim.runtime.agent import Agent
+from zsim.runtime.bus import Bus
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_agents.estimation.estimator import Estimator
+from zsim_agents.formation.controller import Controller
+from zsim_world.flight.world import World
 
 DRONE, SETTLED_S = "drone1", 10.0  # errors before are those of the first fixes
 Build = Callable[[messages.Info, Scenario, str], Agent]

@@ -8,11 +8,12 @@ import argparse
 import math
 from typing import Any
 
-from zsim import keys, messages, scenario_file
-from zsim.agent import Agent, Output
-from zsim.connection import find_world
-from zsim.runner import Runner
-from zsim.scenario import Scenario
+from zsim.contract import keys, messages
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.runner import Runner
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim.transport.connection import find_world
 
 GPS_GAIN = 0.02  # of a fix, once that many have come
 HEIGHT_GAIN, HEADING_GAIN = 0.1, 0.05  # of a barometer and of a magnetometer sample

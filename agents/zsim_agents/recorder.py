@@ -13,15 +13,16 @@ from pathlib import Path
 
 import msgspec
 
-from zsim import __version__, batch, keys, messages
-from zsim.bundle import Bundle, table_of, unpacked
-from zsim.connection import read_info
+from zsim import __version__
+from zsim.contract import batch, keys, messages
+from zsim.contract.bundle import Bundle, table_of, unpacked
 from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, SupersededError
-from zsim.health import HealthMeter
 from zsim.record import RecordWriter
-from zsim.record.writer import CHANNELS_MAX
-from zsim.replay import replay
-from zsim.session import Sample, Session
+from zsim.record.record_writer import CHANNELS_MAX
+from zsim.runtime.health import HealthMeter
+from zsim.runtime.replay import replay
+from zsim.transport.connection import read_info
+from zsim.transport.session import Sample, Session
 
 NAME = "recorder"
 ANOTHER_RUN = "the world has begun another run"

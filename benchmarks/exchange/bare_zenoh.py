@@ -2,10 +2,10 @@
 
 from contextlib import ExitStack
 
-from zsim import session, settings
-from zsim.identity import Identity
+from zsim.transport import session, zenoh_settings
+from zsim.transport.identity import Identity
 
-import zenoh  # isort: skip  # zsim.session chooses its runtime first
+import zenoh  # isort: skip  # zsim.transport.session chooses its runtime first
 
 from benchmarks.exchange.lap import PAYLOAD, Lap, agents, free_port, parser
 
@@ -29,7 +29,7 @@ def world(count: int, seconds: float, receive: str, express: bool, low_latency: 
     """Put to every agent, wait for every agent."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     options = ["--at", endpoint, *["--express"] * express, *["--low-latency"] * low_latency]
-    chosen = settings.common("router", "lockstep") | settings.listening([endpoint], Identity())
+    chosen = zenoh_settings.common("router", "lockstep") | zenoh_settings.listening([endpoint], Identity())
     with ExitStack() as stack:
         link = stack.enter_context(zenoh.open(config(chosen, low_latency)))
         subscriber = link.declare_subscriber("bench/up/*", zenoh.handlers.FifoChannel(session.QUEUE))
@@ -62,7 +62,7 @@ def _drain(handler: zenoh.handlers.Handler, count: int) -> None:
 
 def agent(number: int, endpoint: str, express: bool, low_latency: bool) -> None:
     """Say that it is there, then answer everything until the stop."""
-    chosen = settings.common("client", "lockstep") | settings.connecting(endpoint, Identity(), 10.0)
+    chosen = zenoh_settings.common("client", "lockstep") | zenoh_settings.connecting(endpoint, Identity(), 10.0)
     with zenoh.open(config(chosen, low_latency)) as link:
         subscriber = link.declare_subscriber(f"bench/down/{number}", zenoh.handlers.FifoChannel(session.QUEUE))
         publisher = _publisher(link, f"bench/up/{number}", express)
@@ -75,7 +75,7 @@ def _publisher(link: zenoh.Session, key: str, express: bool) -> zenoh.Publisher:
     return link.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK, express=express)
 
 
-def config(chosen: settings.Settings, low_latency: bool) -> zenoh.Config:
+def config(chosen: zenoh_settings.Settings, low_latency: bool) -> zenoh.Config:
     """Return Zenoh's configuration."""
     config = zenoh.Config()
     for path, value in (chosen | (LOW_LATENCY if low_latency else {})).items():

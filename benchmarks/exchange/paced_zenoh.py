@@ -11,10 +11,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
-from zsim import session, settings
-from zsim.identity import Identity
+from zsim.transport import session, zenoh_settings
+from zsim.transport.identity import Identity
 
-import zenoh  # isort: skip  # zsim.session chooses its runtime first
+import zenoh  # isort: skip  # zsim.transport.session chooses its runtime first
 
 from benchmarks.exchange.bare_zenoh import config
 from benchmarks.exchange.lap import PAYLOAD, agents, free_port, parser
@@ -45,7 +45,7 @@ def hub(count: int, seconds: float, path: str) -> None:
     sent_s: list[float] = []
     ages_ms: list[float] = []
     ready, over = threading.Semaphore(0), threading.Semaphore(0)
-    chosen = settings.common("router", "realtime") | settings.listening([endpoint], Identity())
+    chosen = zenoh_settings.common("router", "realtime") | zenoh_settings.listening([endpoint], Identity())
     others = count + (path == "command")
 
     def take(step: int) -> None:
@@ -137,7 +137,7 @@ def _children(count: int, others: int, endpoint: str, path: str) -> Iterator[Non
 
 @contextmanager
 def _connected(endpoint: str) -> Iterator[zenoh.Session]:
-    chosen = settings.common("client", "realtime") | settings.connecting(endpoint, Identity(), 10.0)
+    chosen = zenoh_settings.common("client", "realtime") | zenoh_settings.connecting(endpoint, Identity(), 10.0)
     with zenoh.open(config(chosen, False)) as link:
         yield link
 

@@ -11,14 +11,17 @@ from typing import Any
 from unittest import mock
 
 from benchmarks.exchange.lap import Lap, agents, free_port, parser
-from zsim import keys, scenario_file, settings
-from zsim.agent import Agent, Output
-from zsim.connection import find_world
-from zsim.runner import Runner
-from zsim.session import Session
-from zsim_world import process, world
-from zsim_world.fleet import Fleet
-from zsim_world.samples import NONE
+from zsim.contract import keys
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.runner import Runner
+from zsim.scenario import scenario_file
+from zsim.transport import zenoh_settings
+from zsim.transport.connection import find_world
+from zsim.transport.session import Session
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.flight import world
+from zsim_world.sensors.sampler import NONE
+from zsim_world.server import world_process
 
 LOW_LATENCY = {"transport/unicast/qos/enabled": "false", "transport/unicast/lowlatency": "true"}
 FEDERATION = "exchange"
@@ -53,7 +56,7 @@ def run_world(count: int, seconds: float, lookahead: bool, low_latency: bool) ->
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     options = ["--at", endpoint, *["--low-latency"] * low_latency]
     with agents("benchmarks.exchange.zsim_barrier", count, *options):
-        process.run(made, [endpoint], lambda: "measured" if over else None, tell)
+        world_process.run(made, [endpoint], lambda: "measured" if over else None, tell)
     lap.report()
     return lap
 
@@ -111,14 +114,14 @@ def _transport(low_latency: bool) -> Iterator[None]:
     Zenoh 1.10.2 panics when a listener to transport events is declared on it, so the agents do without theirs: they
     would not notice a lost link.
     """
-    common = settings.common
+    common = zenoh_settings.common
 
-    def lower(*options: Any, **named: Any) -> settings.Settings:
+    def lower(*options: Any, **named: Any) -> zenoh_settings.Settings:
         return common(*options, **named) | LOW_LATENCY
 
     with ExitStack() as stack:
         if low_latency:
-            stack.enter_context(mock.patch.object(settings, "common", lower))
+            stack.enter_context(mock.patch.object(zenoh_settings, "common", lower))
             stack.enter_context(mock.patch.object(Session, "on_link", return_value=None))
         yield
 

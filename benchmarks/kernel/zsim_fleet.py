@@ -10,8 +10,8 @@ from typing import Any
 
 from benchmarks.grid import scenario
 from benchmarks.kernel.stopwatch import Flight, serve, single
-from zsim_world import gate
-from zsim_world.fleet import NOISE_GATES, Fleet
+from zsim_world.fleet import kernel
+from zsim_world.fleet.fleet import NOISE_GATES, Fleet
 
 CLIMB_GATES = 300  # 6 s: taking off is over
 LONG_S = 1e6  # s, simulated: longer than any measurement
@@ -23,7 +23,7 @@ def main() -> None:
     parser.add_argument("--bare", action="store_true")
     bare = parser.parse_args().bare
     single()
-    serve(lambda count: kernel(count) if bare else fleet(count))
+    serve(lambda count: bare_kernel(count) if bare else fleet(count))
 
 
 def fleet(count: int) -> Flight:
@@ -37,7 +37,7 @@ def fleet(count: int) -> Flight:
     return Flight(advance, 0.02)
 
 
-def kernel(count: int) -> Flight:
+def bare_kernel(count: int) -> Flight:
     """Return a fleet of which only the compiled kernel is run."""
     made = _airborne(count)
     gates = counting()
@@ -45,7 +45,7 @@ def kernel(count: int) -> Flight:
     def advance() -> None:
         if next(gates) % NOISE_GATES == 0:
             made._noise.cursor[:] = 0
-        gate.advance(made._held, made._ticks)
+        kernel.advance(made._held, made._ticks)
 
     return Flight(advance, 0.02)
 

@@ -14,8 +14,8 @@ from msgspec.structs import replace
 from benchmarks.monte_carlo.way import Way
 from benchmarks.monte_carlo.worker import Flown, Fly, serve
 from benchmarks.monte_carlo.zsim_sweep import TEST_1
-from zsim import scenario_file
-from zsim_world.fleet import Fleet
+from zsim.scenario import scenario_file
+from zsim_world.fleet.fleet import Fleet
 
 TAKEOFF_S = 20.0  # scenarios/step.yaml
 GAIN_1_S = 0.6  # of position and yaw, as the cluster controller's

@@ -13,8 +13,8 @@ from benchmarks.child import RefusedError
 from benchmarks.monte_carlo.way import GATE_S, Way
 from benchmarks.peers import ROOT
 from benchmarks.run import CLI
-from zsim import scenario_file
-from zsim_deploy.sweep.flight import flown
+from zsim.scenario import scenario_file
+from zsim_analysis.sweep.fly.sweep_run import flown
 
 TEST_1 = ROOT / "scenarios" / "step.yaml"
 TIMEOUT_S = 900.0

@@ -3,7 +3,7 @@
 import os
 import signal
 
-from zsim_deploy.interrupts import INTERRUPTED
+from zsim_deploy.terminal.interrupts import INTERRUPTED
 
 
 def main() -> None:
@@ -11,7 +11,7 @@ def main() -> None:
     heeded = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where a shell has it ignored
     if heeded:
         signal.signal(signal.SIGINT, _leave)
-    from zsim_deploy import cli
+    from zsim_deploy.cli import cli
 
     if heeded:
         signal.signal(signal.SIGINT, signal.default_int_handler)

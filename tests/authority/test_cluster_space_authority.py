@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from zsim_agents.cluster_space import Array, closest_pair, cluster_space
-from zsim_agents.formation import FormationGains, FormationLaw
-from zsim_agents.reference_check import ShapeLimits, plan_ramp
-from zsim_agents.trajectory import ExpressionTrajectory, Hold, Reference
+from zsim_agents.formation.formation_law import FormationGains, FormationLaw
+from zsim_agents.formation.reference_check import ShapeLimits, plan_ramp
+from zsim_agents.formation.spaces.cluster_space import Array, closest_pair, cluster_space
+from zsim_agents.formation.trajectory import ExpressionTrajectory, Hold, Reference
 
 SPACE = cluster_space(3)
 C_DES = np.array([5, -5, 15, 0, 0, math.pi / 2, 0, 0, 0, 4, 4, math.pi / 4])  # paper, equation (3)

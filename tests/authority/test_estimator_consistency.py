@@ -16,11 +16,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from zsim import scenario_file
-from zsim.frames import heading, wrap_angle
-from zsim.scenario import Scenario
-from zsim_agents.drone_estimator import DroneEstimator, Estimate
-from zsim_world.fleet import GPS_FIX, Fleet, Sample
+from zsim.math.frames import heading, wrap_angle
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_agents.estimation.drone_estimator import DroneEstimator, Estimate
+from zsim_world.fleet.fleet import GPS_FIX, Fleet, Sample
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "step.yaml"  # three drones, preset paper, gusts of 0.5 m/s
 SEEDS = range(1, 21)

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsim.fault_kinds import planned
-from zsim.scenario_file import resolve
-from zsim_world.fleet import Fleet
+from zsim.scenario.fault_kinds import planned
+from zsim.scenario.scenario_file import resolve
+from zsim_world.fleet.fleet import Fleet
 
 GATE_NS, STEP_NS = 20_000_000, 2_500_000
 MASS_KG, GRAVITY, THRUST_N_S2 = 0.429, 9.80665, 8.048e-6

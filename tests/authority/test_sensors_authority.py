@@ -10,10 +10,10 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from zsim.scenario_file import resolve
-from zsim_world import sensors
-from zsim_world.fleet import Fleet
-from zsim_world.sensor_set import SENSORS
+from zsim.scenario.scenario_file import resolve
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.sensors import measurement
+from zsim_world.sensors.sensor_set import SENSORS
 
 P_BS = (0.11, -0.07, 0.05)
 RPY_BS_DEG = (12.0, -25.0, 140.0)
@@ -65,7 +65,7 @@ def test_imu_is_what_the_sensor_itself_moves_like(t):
     turned = [(own_attitude.inv() * sensor_pose(t + s * 1e-4)[1]).as_rotvec() for s in (-1, 1)]
     expected_rate = (turned[1] - turned[0]) / 2e-4
     arguments = (tuple(accel), wxyz(attitude), tuple(rate), tuple(angular))
-    force, gyro = sensors.imu(*arguments, G, P_BS, wxyz(mount()))
+    force, gyro = measurement.imu(*arguments, G, P_BS, wxyz(mount()))
     np.testing.assert_allclose(force, expected_force, atol=2e-4)
     np.testing.assert_allclose(gyro, expected_rate, atol=2e-6)
     assert np.linalg.norm(np.cross(rate, np.cross(rate, P_BS))) > 0.01  # the lever arm matters here
@@ -78,16 +78,16 @@ def test_gps_flow_and_sonar_are_those_of_the_sensors_point(t):
     h = 1e-5
     own_velocity = (sensor_pose(t + h)[0] - sensor_pose(t - h)[0]) / (2 * h)
     q = wxyz(attitude)
-    place, moving = sensors.gps(tuple(p), tuple(velocity), q, tuple(rate), P_BS)
+    place, moving = measurement.gps(tuple(p), tuple(velocity), q, tuple(rate), P_BS)
     np.testing.assert_allclose(place, sensor_pose(t)[0], atol=1e-12)
     np.testing.assert_allclose(moving, own_velocity, atol=1e-5)
     forward = attitude.apply([1, 0, 0])
     to_heading = Rotation.from_euler("z", -math.atan2(forward[1], forward[0]))
-    flow, _ = sensors.flow(tuple(velocity), q, tuple(rate), P_BS)
+    flow, _ = measurement.flow(tuple(velocity), q, tuple(rate), P_BS)
     np.testing.assert_allclose(flow, to_heading.apply(own_velocity), atol=1e-5)
     small = Rotation.from_euler("ZYX", (40.0, 8.0, -11.0), degrees=True)
     beam = (attitude * small).apply([0, 0, -1.0])
-    distance, echo = sensors.sonar(tuple(p), q, P_BS, wxyz(small), 50.0)
+    distance, echo = measurement.sonar(tuple(p), q, P_BS, wxyz(small), 50.0)
     assert echo
     assert sensor_pose(t)[0][2] + distance * beam[2] == pytest.approx(0.0, abs=1e-9)
 
@@ -95,7 +95,7 @@ def test_gps_flow_and_sonar_are_those_of_the_sensors_point(t):
 @pytest.mark.parametrize("t", [0.0, 2.2])
 def test_magnetometer_shows_the_field_in_its_own_axes(t):
     attitude = pose(t)[1]
-    field = sensors.mag(wxyz(attitude), wxyz(mount()), tuple(FIELD_W))
+    field = measurement.mag(wxyz(attitude), wxyz(mount()), tuple(FIELD_W))
     np.testing.assert_allclose(field, sensor_pose(t)[1].inv().apply(FIELD_W), atol=1e-12)
 
 

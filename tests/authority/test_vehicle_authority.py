@@ -9,11 +9,11 @@ import math
 import numpy as np
 import pytest
 
-from zsim.scenario_file import resolve
-from zsim_world import rigid_body as body
-from zsim_world import vehicle
-from zsim_world.fleet import Fleet
-from zsim_world.rotors import ground_effect
+from zsim.scenario.scenario_file import resolve
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.physics import rigid_body as body
+from zsim_world.physics.rotors import ground_effect
+from zsim_world.state import vehicle
 
 
 def calm(count=1, gust=0.0, seed=1, sensors=None, **drone):

@@ -7,10 +7,10 @@ import pytest
 from numba import njit
 from scipy import signal
 
-from zsim.scenario_file import resolve
-from zsim_world import wind
-from zsim_world.fleet import Fleet
-from zsim_world.noise import NoiseTable
+from zsim.scenario.scenario_file import resolve
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.physics import wind
+from zsim_world.sensors.noise import NoiseTable
 
 TAU_S = 5.0  # L / V0 = 10 m / 2 m/s while the airspeed is below 2 m/s
 SIGMA = 0.3  # m/s, so that |gust| of standing drones hardly ever exceeds V0

@@ -14,14 +14,15 @@ import numpy as np
 import pytest
 from msgspec import Struct
 
-from zsim import keys, messages, scenario_file
-from zsim.agent import Agent, Output
+from zsim.contract import keys, messages
+from zsim.contract.messages import ControlAnswer, ControlRequest, Info
 from zsim.errors import RunError
-from zsim.inbox import Inbox
-from zsim.messages import ControlAnswer, ControlRequest, Info
-from zsim.scenario import Scenario
-from zsim_agents.controller import Controller
-from zsim_agents.estimator import Estimator
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.inbox import Inbox
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_agents.estimation.estimator import Estimator
+from zsim_agents.formation.controller import Controller
 
 STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 GATE_NS = 20_000_000

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import inspect as types
 
-from zsim import messages
+from zsim.contract import messages
 from zsim.errors import DecodeError
 
 # Fields besides t_ns and seq, in the contract's order.

@@ -10,16 +10,17 @@ import pytest
 import yaml
 from federation import PAIR, PAIR_ROLES, Federation
 
-from zsim import keys, messages, scenario_file
-from zsim.agent import Agent
+from zsim.contract import keys, messages
+from zsim.contract.messages import ControlRequest, Event
 from zsim.errors import RunError
-from zsim.fault_kinds import KINDS
-from zsim.in_process import Bus
-from zsim.messages import ControlRequest, Event
-from zsim_agents.controller import Controller
-from zsim_agents.estimator import Estimator
-from zsim_deploy.in_process import agents
-from zsim_world.world import World
+from zsim.runtime.agent import Agent
+from zsim.runtime.bus import Bus
+from zsim.scenario import scenario_file
+from zsim.scenario.fault_kinds import KINDS
+from zsim_agents.estimation.estimator import Estimator
+from zsim_agents.formation.controller import Controller
+from zsim_analysis.in_process import agents
+from zsim_world.flight.world import World
 
 AT_S, FOR_S, DURATION_S = 6.0, 2.0, 9.0  # the formation of PAIR is engaged from 5 s on
 Given = dict[str, Any]

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from federation import Federation
 
-from zsim import keys, messages, scenario_file
-from zsim.in_process import Bus
-from zsim.scenario import Scenario
-from zsim_agents.cluster_space import Array, closest_pair
-from zsim_agents.scenario_space import scenario_space
-from zsim_deploy.in_process import agents
-from zsim_world.world import World
+from zsim.contract import keys, messages
+from zsim.runtime.bus import Bus
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_agents.formation.spaces.cluster_space import Array, closest_pair
+from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_analysis.in_process import agents
+from zsim_world.flight.world import World
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SHORT = (  # a good GPS, so that the drones need not stand still first, and a short way up

@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 from wire import PATIENCE_S
 
 from zsim.record import RecordReader, RecordWriter
-from zsim.record.layout import places
+from zsim.record.mcap_layout import places
 
 PILOT = "operator.pilot"
 PLAIN = ROOT / "examples" / "plain_client.py"

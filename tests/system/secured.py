@@ -21,11 +21,12 @@ from federation import free_port
 from rights_table import ROLES, SCENARIO
 from wire import PATIENCE_S
 
-from zsim import scenario_file, session
-from zsim.identity import Identity
-from zsim_deploy import certificates
-from zsim_deploy.access import access_control
-from zsim_deploy.enrolment import Wanted
+from zsim.scenario import scenario_file
+from zsim.transport import session
+from zsim.transport.identity import Identity
+from zsim_deploy.security import certificates
+from zsim_deploy.security.access_control import access_control
+from zsim_deploy.security.enrolment import Wanted
 
 HOST = "lab"
 SITE = "router.site"

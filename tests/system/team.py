@@ -16,9 +16,9 @@ import pytest
 from federation import ROOT, Record, Role
 from lab import LAUNCHER, Lab
 
-from zsim import scenario_file
 from zsim.record import RecordReader, repair
-from zsim_deploy.in_process import fly
+from zsim.scenario import scenario_file
+from zsim_analysis.in_process import fly
 
 STEP = ROOT / "scenarios" / "step.yaml"
 ROLES = {"world": "h1", "controller.main": "h2", "estimator.*": ["h1", "h2", "h3"]}

@@ -38,9 +38,10 @@ import yaml
 from federation import free_port
 from msgspec import inspect as types
 
-from zsim import messages, presets, scenario, scenario_file
-from zsim_deploy import inventory
-from zsim_deploy.cli import app
+from zsim.contract import messages
+from zsim.scenario import scenario, scenario_file, sensor_presets
+from zsim_deploy.cli.cli import app
+from zsim_deploy.inventory import inventory
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
@@ -325,8 +326,8 @@ def test_inventories_are_valid(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("block", scenario_blocks())
 def test_scenarios_are_valid(block: Block) -> None:
-    from zsim.messages import Info
-    from zsim_agents.controller import Controller
+    from zsim.contract.messages import Info
+    from zsim_agents.formation.controller import Controller
 
     given = yaml.safe_load(block.text)
     base = yaml.safe_load((ROOT / "scenarios/step.yaml").read_text()) if block.kind == "yaml part" else {}
@@ -357,7 +358,7 @@ _INFO: dict[str, Any] = {
 }
 
 
-# The reference of fields: a table after `<!-- fields: Name -->` for each section of zsim/scenario.py
+# The reference of fields: a table after `<!-- fields: Name -->` for each section of zsim/scenario/scenario.py
 
 SECTIONS = {
     name: section
@@ -491,8 +492,8 @@ def test_the_presets_are_written_as_they_are() -> None:
 
 def preset_rows() -> Iterator[list[str]]:
     """Yield every value that a preset sets: path, then the value in each preset, – where it keeps the default."""
-    flat = {name: dict(_flat(preset)) for name, preset in presets.PRESETS.items()}
-    printed = dict(_flat(presets.AS_PRINTED))
+    flat = {name: dict(_flat(preset)) for name, preset in sensor_presets.PRESETS.items()}
+    printed = dict(_flat(sensor_presets.AS_PRINTED))
     paths = list(dict.fromkeys(path for values in flat.values() for path in values))
     for path in paths:
         cells = [f"{flat[name][path]:g}" if path in flat[name] else "–" for name in ("ardrone2", "paper")]

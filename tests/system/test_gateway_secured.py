@@ -7,8 +7,8 @@ from door import Door
 from federation import PAIR, Federation
 from secured import Certificates, tls_endpoint
 
-from zsim import scenario_file
-from zsim_deploy.access import access_control
+from zsim.scenario import scenario_file
+from zsim_deploy.security.access_control import access_control
 
 SEATED = PAIR.replace("clusters:", "processes: {expect: [matlab.main]}\nclusters:").replace(
     "duration_s: 12", "duration_s: 2"

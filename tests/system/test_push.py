@@ -17,11 +17,13 @@ from federation import ZSIM
 from lab import LAUNCHER, Lab
 
 from zsim import __version__
-from zsim_deploy import extras, inventory, on_host, shell
-from zsim_deploy.host_link import HostLink
-from zsim_deploy.installer import installer
-from zsim_deploy.target import chosen, interpreters, question, target
-from zsim_deploy.wheelhouse import House, Wheelhouse
+from zsim_deploy.inventory import extras, inventory
+from zsim_deploy.push import on_host
+from zsim_deploy.push.installer import installer
+from zsim_deploy.push.target import chosen, interpreters, question, target
+from zsim_deploy.push.wheelhouse import House, Wheelhouse
+from zsim_deploy.ssh import shell
+from zsim_deploy.ssh.host_link import HostLink
 
 CACHE = Path(tempfile.gettempdir()) / "zsim-tests-cache"  # kept between runs, as a user's is
 PUSH_S = 180.0  # wall time for two installations on a loaded machine

@@ -22,9 +22,9 @@ import yaml
 from federation import PAIR, ZSIM, free_port
 from wire import PATIENCE_S
 
-from zsim import scenario_file
 from zsim.record import RecordReader
-from zsim_deploy import inventory
+from zsim.scenario import scenario_file
+from zsim_deploy.inventory import inventory
 from zsim_deploy.render import compose, kubernetes, systemd
 
 ROOT = Path(__file__).parents[2]

@@ -18,10 +18,10 @@ pytest.importorskip("zenoh_ros2_sdk", reason="PyPI zenoh-ros2-sdk is not install
 from ros2_lab import TRIGGER, Peer, Router, write_definitions
 from secured import Certificates, tls_endpoint
 
-from zsim import scenario_file
-from zsim_agents.ros2 import wire
-from zsim_agents.ros2.types import Types
-from zsim_deploy.access import access_control
+from zsim.scenario import scenario_file
+from zsim_bridges.ros2 import rmw_zenoh
+from zsim_bridges.ros2.ros_types import Types
+from zsim_deploy.security.access_control import access_control
 
 TWIST, EMPTY = "geometry_msgs/msg/Twist", "std_msgs/msg/Empty"
 TAKEN = ("cmd_vel", "takeoff", "land", "reset")
@@ -266,16 +266,16 @@ def test_wire_of_what_we_send_and_what_we_refuse(federation: Federation, ros: RO
     assert [after - before for before, after in pairwise(stamps)] == pytest.approx([0.005] * (len(stamps) - 1))
 
     types = Types()
-    key = wire.data_key(0, "/drone1/cmd_vel", wire.dds_name(TWIST), types.hash(TWIST))
+    key = rmw_zenoh.data_key(0, "/drone1/cmd_vel", rmw_zenoh.dds_name(TWIST), types.hash(TWIST))
     vector = types.of("geometry_msgs/msg/Vector3")
     good = types.encode(types.of(TWIST)(vector(1.0, 0.0, 0.0), vector(0.0, 0.0, 0.0)), TWIST)
     bad = types.encode(types.of(TWIST)(vector(math.nan, 0.0, 0.0), vector(0.0, 0.0, 0.0)), TWIST)
-    beside = wire.Attachment(1, 1, bytes(16)).packed()
+    beside = rmw_zenoh.Attachment(1, 1, bytes(16)).packed()
     for payload, attachment in ((b"\x00\x01\x00\x00garbage", beside), (good, b""), (good, beside[:-1]), (bad, beside)):
         raw.session.put(key, payload, attachment=attachment)
     raw.watch("process/ros2.main/health").until(lambda m: m["refused"] >= 4)
     assert started.text().count("/drone1/cmd_vel: refused") == 1
-    service = wire.data_key(0, "/drone1/release", wire.dds_name(TRIGGER["kind"]), types.hash(TRIGGER["kind"]))
+    service = rmw_zenoh.data_key(0, "/drone1/release", rmw_zenoh.dds_name(TRIGGER["kind"]), types.hash(TRIGGER["kind"]))
     assert list(raw.session.get(service, payload=b"\x00\x01\x00\x00", attachment=beside)) == []
     raw.watch("process/ros2.main/health").until(lambda m: m["refused"] >= 5)
     assert raw.get("drone/drone1/sensor/status")["drone/drone1/sensor/status"]["commander"] is None
@@ -305,7 +305,7 @@ def check_attachments(session: zenoh.Session, node: Peer) -> None:
     subscriber.undeclare()
     said = [struct.unpack("<qqB16s", each) for each in beside]
     assert [sequence for sequence, *_ in said] == list(range(said[0][0], said[0][0] + len(said)))
-    assert {(size, gid) for _, _, size, gid in said} == {(16, wire.gid_of(token))}
+    assert {(size, gid) for _, _, size, gid in said} == {(16, rmw_zenoh.gid_of(token))}
 
 
 def test_either_side_may_restart(federation: Federation, ros: ROS) -> None:

@@ -18,11 +18,13 @@ from rights_table import KEYS, ROLES, SCENARIO, keys_of
 from secured import HOST, PREFIX, READY, SHORT_S, SITE, Certificates, Heard, Tryer, hub, site, tls_endpoint
 from wire import PATIENCE_S
 
-from zsim import rights, scenario_file, session
-from zsim.identity import Identity
-from zsim.rights import permits
-from zsim.tls import peer_fault
-from zsim_deploy.access import access_control
+from zsim.contract import rights
+from zsim.contract.rights import permits
+from zsim.scenario import scenario_file
+from zsim.transport import session
+from zsim.transport.identity import Identity
+from zsim.transport.tls import peer_fault
+from zsim_deploy.security.access_control import access_control
 
 WAYS = ("at the world", "through a router")
 TOKENS = tuple(key for key in KEYS if key.startswith("process/") and key.count("/") == 1)

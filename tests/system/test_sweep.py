@@ -16,7 +16,7 @@ import pytest
 from federation import PAIR, Federation, Role, free_port
 from wire import PATIENCE_S
 
-from zsim_deploy.sweep.folder import load, locked
+from zsim_analysis.sweep.sweep_folder import load, locked
 
 pytestmark = pytest.mark.xdist_group("serial")
 

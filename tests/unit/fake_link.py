@@ -6,9 +6,9 @@ from typing import Any
 
 from msgspec import Struct
 
-from zsim import keys, messages
-from zsim.messages import ControlAnswer
-from zsim.session import Sample
+from zsim.contract import keys, messages
+from zsim.contract.messages import ControlAnswer
+from zsim.transport.session import Sample
 
 PATIENCE_S = 20.0  # after which a test that waits for ever fails
 UNANSWERED = ControlAnswer(False, "nobody answered")

@@ -6,9 +6,10 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
-from zsim import messages, scenario_file
+from zsim.contract import messages
 from zsim.record import RecordReader, RecordWriter
-from zsim_deploy.in_process import fly
+from zsim.scenario import scenario_file
+from zsim_analysis.in_process import fly
 
 SCENARIO: dict[str, Any] = {
     "name": "trio",

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from zsim import scenario_file
-from zsim.scenario import ErrorModel, Scenario, Sensor
-from zsim.streams import stream
-from zsim_agents.drone_estimator import DroneEstimator, Estimate
+from zsim.scenario import scenario_file
+from zsim.scenario.random_streams import stream
+from zsim.scenario.scenario import ErrorModel, Scenario, Sensor
+from zsim_agents.estimation.drone_estimator import DroneEstimator, Estimate
 
 Array = NDArray[np.float64]
 

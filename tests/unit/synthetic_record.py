@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from zsim import keys, messages, scenario_file
+from zsim.contract import keys, messages
 from zsim.record import RecordWriter
-from zsim_agents.cluster_space import cluster_space
+from zsim.scenario import scenario_file
+from zsim_agents.formation.spaces.cluster_space import cluster_space
 
 GATE_NS = 20_000_000
 SCENARIOS = Path(__file__).parents[2] / "scenarios"

@@ -7,8 +7,9 @@ import pytest
 import zenoh
 from rights_table import KEYS, ROLES, SCENARIO, keys_of
 
-from zsim import rights, scenario_file
-from zsim_deploy.access import access_control
+from zsim.contract import rights
+from zsim.scenario import scenario_file
+from zsim_deploy.security.access_control import access_control
 
 ACTS = {"r": "reads", "p": "writes", "g": "asks", "a": "answers", "t": "tokens", "w": "watches"}
 # What each act is on the wire at the process that listens: (flow, message); all of them are needed.

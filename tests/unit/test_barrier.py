@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim.messages import Done, Join, Waiting
-from zsim_world.barrier import Barrier, Participant
+from zsim.contract.messages import Done, Join, Waiting
+from zsim_world.flight.barrier import Barrier, Participant
 
 RUN = "run1"
 GATE_NS = 20_000_000

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from zsim.scenario_file import resolve
-from zsim_world import battery, vehicle
+from zsim.scenario.scenario_file import resolve
+from zsim_world.physics import battery
+from zsim_world.state import vehicle
 
 
 @pytest.fixture(scope="module")

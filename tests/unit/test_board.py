@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from zsim_deploy.board import Board, table
+from zsim_deploy.control.status_table import Board, table
 
 
 class Link:

@@ -4,12 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from zsim import keys, messages, scenario_file
-from zsim.bundle import Bundle, Selection, table_of, unpacked
+from zsim.contract import keys, messages
+from zsim.contract.bundle import Bundle, Selection, table_of, unpacked
 from zsim.errors import DecodeError
 from zsim.record import RecordReader, RecordWriter
-from zsim_world.fleet import Fleet
-from zsim_world.publication import Publication
+from zsim.scenario import scenario_file
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.fleet.publication import Publication
 
 DRONES = ["d1", "d2", "d3"]
 
@@ -125,7 +126,7 @@ def test_a_record_of_bundles_is_that_of_their_messages(said: list[Bundle], tmp_p
 def test_a_record_that_has_no_number_left_for_a_key_takes_the_others(
     said: list[Bundle], tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("zsim.record.writer.CHANNELS_MAX", 2)
+    monkeypatch.setattr("zsim.record.record_writer.CHANNELS_MAX", 2)
     with RecordWriter(tmp_path / "run.mcap") as writer:
         writer.add_bundle(said[0], 5)
     assert writer.messages + writer.refused == len(said[0])

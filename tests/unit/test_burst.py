@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from zsim_world.burst import GATES_SENT, HOLD_NS, LAG_GATES, Burst
+from zsim_world.server.pipelining import GATES_SENT, HOLD_NS, LAG_GATES, Burst
 
 GATE_NS = 20_000_000
 

@@ -13,11 +13,11 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from zsim.errors import RunError
-from zsim.identity import Identity
-from zsim.tls import own_fault
-from zsim_deploy import certificates
-from zsim_deploy.certificates import DAYS, due, issue
-from zsim_deploy.enrolment import Wanted
+from zsim.transport.identity import Identity
+from zsim.transport.tls import own_fault
+from zsim_deploy.security import certificates
+from zsim_deploy.security.certificates import DAYS, due, issue
+from zsim_deploy.security.enrolment import Wanted
 
 NOW = datetime(2026, 11, 1, 12, tzinfo=UTC)
 ESTIMATOR = Wanted("h1", "estimator.drone1", ("10.0.0.1",))

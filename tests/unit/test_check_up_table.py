@@ -5,8 +5,8 @@ import io
 import pytest
 from rich.console import Console
 
-from zsim_deploy.check_up import _hosts_table, _paths_table
-from zsim_deploy.doctor import Path, Report
+from zsim_deploy.doctor.check_up import _hosts_table, _paths_table
+from zsim_deploy.doctor.doctor import Path, Report
 
 SAID = {"python": "3.11.2", "zsim": "1", "fingerprint": "abc", "cores": 2, "load": 0.1, "governors": ["[/x]"]}
 

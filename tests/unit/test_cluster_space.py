@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim_agents.cluster_space import (
+from zsim_agents.formation.spaces.cluster_space import (
     ROBOTS_MAX,
     SingularClusterError,
     closest_pair,

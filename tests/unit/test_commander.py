@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim.messages import Mode, Velocity
-from zsim_world.commander import PROGRAM, SEEN_PER_DRONE, Commanders, Due
+from zsim.contract.messages import Mode, Velocity
+from zsim_world.flight.commander import PROGRAM, SEEN_PER_DRONE, Commanders, Due
 
 D1, D2 = 0, 1
 OPERATOR = 10  # priority that docs/protocol.md gives to operators

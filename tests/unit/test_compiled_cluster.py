@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 MODULES = (
-    "cluster_space",
-    "flight_judge",
-    "formation",
-    "nested_cluster",
-    "pair_cluster",
-    "reference_check",
-    "rotation_fit",
-    "template_cluster",
-    "trajectory",
-    "triad_cluster",
+    "formation.spaces.cluster_space",
+    "formation.flight_check",
+    "formation.formation_law",
+    "formation.spaces.nested_cluster",
+    "formation.spaces.pair_cluster",
+    "formation.reference_check",
+    "formation.spaces.rotation_fit",
+    "formation.spaces.template_cluster",
+    "formation.trajectory",
+    "formation.spaces.triad_cluster",
 )
 SIZES = (2, 3, 5)
 LARGE = 1e-9  # the same, of a hundred variables
@@ -31,7 +31,9 @@ pytest.importorskip("numba")
 
 
 def package() -> SimpleNamespace:
-    return SimpleNamespace(**{name: importlib.import_module(f"zsim_agents.{name}") for name in MODULES})
+    return SimpleNamespace(
+        **{name.rpartition(".")[2]: importlib.import_module(f"zsim_agents.{name}") for name in MODULES}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +41,9 @@ def both() -> tuple[SimpleNamespace, SimpleNamespace]:
     """Return the modules as they are, and a copy of them imported where numba is missing."""
     compiled = package()
     with patch.dict(sys.modules, {"numba": None}):
-        for name in [name for name in sys.modules if name.partition(".")[0] == "zsim_agents"]:
+        for name in [
+            name for name in sys.modules if name.partition(".")[0] == "zsim_agents" or name.startswith("zsim.math")
+        ]:
             del sys.modules[name]
         return compiled, package()
 
@@ -236,14 +240,14 @@ def test_judgements_are_the_same(both, n):
 FLIGHT = """
 import sys
 import numpy as np
-from zsim_agents.cluster_space import cluster_space
-from zsim_agents.controller import rehearse
-from zsim_agents.engagement import Engagement
-from zsim_agents.flight_data import GateInput
-from zsim_agents.flight_request import Target
-from zsim_agents.formation import FormationGains
-from zsim_agents.nested_cluster import NestedCluster
-from zsim_agents.template_cluster import TemplateCluster
+from zsim_agents.formation.spaces.cluster_space import cluster_space
+from zsim_agents.formation.controller import rehearse
+from zsim_agents.formation.engagement import Engagement
+from zsim_agents.formation.flight_data import GateInput
+from zsim_agents.formation.flight_request import Target
+from zsim_agents.formation.formation_law import FormationGains
+from zsim_agents.formation.spaces.nested_cluster import NestedCluster
+from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 
 def compiled():
     modules = [module for name, module in sys.modules.items() if name.startswith("zsim_agents.")]

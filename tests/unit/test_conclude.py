@@ -7,8 +7,8 @@ import pytest
 import typer
 
 from zsim.errors import RecordError
-from zsim_deploy import report_commands
-from zsim_deploy.watch import Outcome
+from zsim_deploy.cli import report_commands
+from zsim_deploy.launch.supervisor import Outcome
 
 INTERRUPTED = Outcome("interrupted by Ctrl-C", interrupted=True)
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from zsim import session
-from zsim.connection import find_world
 from zsim.errors import NoWorldError, SessionError
-from zsim.identity import Identity
+from zsim.transport import session
+from zsim.transport.connection import find_world
+from zsim.transport.identity import Identity
 
 
 class Silent:

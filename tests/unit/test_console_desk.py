@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from zsim.contract.messages import ControlAnswer
 from zsim.errors import SessionError
-from zsim.messages import ControlAnswer
-from zsim_agents.console.desk import HANDS, OVERTAKEN, PRIORITY, PRIORITY_EMERGENCY, Desk, Told
+from zsim_bridges.console.command_client import HANDS, OVERTAKEN, PRIORITY, PRIORITY_EMERGENCY, Desk, Told
 
 PATIENCE_S = 10.0
 

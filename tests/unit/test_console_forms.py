@@ -8,18 +8,18 @@ from typing import Any
 import msgspec
 import pytest
 
-from zsim import scenario_file
-from zsim.fault_kinds import KINDS
-from zsim.messages import ViewCluster
-from zsim.scenario import Scenario
-from zsim_agents.console.desk import Told
-from zsim_agents.console.fault_form import FOR_S, GUST_M_S, LOSS, WEAK, FaultForm
-from zsim_agents.console.formation_form import QUIET_S, FormationForm
-from zsim_agents.console.limits import ranges
-from zsim_agents.console.page import SWITCHES, Page
-from zsim_agents.console.run_form import DroneForm, FleetForm, RunForm
-from zsim_agents.console.variable_slider import STILL_S
-from zsim_agents.scenario_space import scenario_space
+from zsim.contract.messages import ViewCluster
+from zsim.scenario import scenario_file
+from zsim.scenario.fault_kinds import KINDS
+from zsim.scenario.scenario import Scenario
+from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_bridges.console.command_client import Told
+from zsim_bridges.console.console_page import SWITCHES, Page
+from zsim_bridges.console.forms.fault_form import FOR_S, GUST_M_S, LOSS, WEAK, FaultForm
+from zsim_bridges.console.forms.formation_form import QUIET_S, FormationForm
+from zsim_bridges.console.forms.run_form import DroneForm, FleetForm, RunForm
+from zsim_bridges.console.forms.slider_limits import ranges
+from zsim_bridges.console.forms.variable_slider import STILL_S
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 PERSON, NOBODY = 1, None  # who moved a slider

@@ -10,20 +10,22 @@ import msgspec
 import numpy as np
 import pytest
 
-from zsim import frames, scenario_file
+from zsim.contract.messages import Clock, DroneView, EstimateView, Event, ViewCluster, ViewDrones, Waiting
 from zsim.errors import RunError
-from zsim.messages import Clock, DroneView, EstimateView, Event, ViewCluster, ViewDrones, Waiting
-from zsim_agents.cluster_space import cluster_space
-from zsim_agents.console import picture as pic
-from zsim_agents.console import tables, typed
-from zsim_agents.console.controls import KnownControls
-from zsim_agents.console.door import Place
-from zsim_agents.console.guard import OPERATOR, VIEWER, Asked, Camera, Guard, may_pass
-from zsim_agents.console.history import EVERY_S, POINTS_MAX, SPAN_S, History
-from zsim_agents.console.limits import foremost, ranges
-from zsim_agents.console.rates import Rates
-from zsim_agents.console.trails import APART_M, POINTS_OF_ONE, Trails
-from zsim_agents.scenario_space import scenario_space
+from zsim.math import frames
+from zsim.scenario import scenario_file
+from zsim_agents.formation.spaces.cluster_space import cluster_space
+from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_bridges.console import html_tables
+from zsim_bridges.console.forms import form_input
+from zsim_bridges.console.forms.controls import KnownControls
+from zsim_bridges.console.forms.slider_limits import foremost, ranges
+from zsim_bridges.console.http.http_proxy import Place
+from zsim_bridges.console.http.page_rights import OPERATOR, VIEWER, Asked, Camera, Guard, may_pass
+from zsim_bridges.console.scene import picture as pic
+from zsim_bridges.console.scene.trails import APART_M, POINTS_OF_ONE, Trails
+from zsim_bridges.console.scene.variable_history import EVERY_S, POINTS_MAX, SPAN_S, History
+from zsim_bridges.console.sensor_rates import Rates
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -287,26 +289,26 @@ def test_of_many_variables_those_of_the_whole_are_shown():
 
 def test_expressions_are_read_with_their_constants():
     text = "# a circle\nx_c = R*cos(0.1*t)\n\ny_c = R*sin(0.1*t)\nR = 5"
-    assert typed.expressions(text, ("x_c", "y_c")) == {
+    assert form_input.expressions(text, ("x_c", "y_c")) == {
         "expressions": {"x_c": "R*cos(0.1*t)", "y_c": "R*sin(0.1*t)"},
         "constants": {"R": 5.0},
     }
 
 
 def test_waypoints_are_read():
-    assert typed.waypoints("0: x_c = 1, p=4\n20.5: x_c=2") == {
+    assert form_input.waypoints("0: x_c = 1, p=4\n20.5: x_c=2") == {
         "waypoints": [{"at_s": 0.0, "values": {"x_c": 1.0, "p": 4.0}}, {"at_s": 20.5, "values": {"x_c": 2.0}}]
     }
 
 
 def test_parameters_are_read():
     names = ("rotor", "value", "velocity_m_s")
-    assert typed.parameters("rotor: all, value: 1e3, velocity_m_s: [1, 2, 3]", names) == {
+    assert form_input.parameters("rotor: all, value: 1e3, velocity_m_s: [1, 2, 3]", names) == {
         "rotor": "all",
         "value": 1000.0,
         "velocity_m_s": [1, 2, 3],
     }
-    assert typed.parameters("", names) == {}
+    assert form_input.parameters("", names) == {}
 
 
 @pytest.mark.parametrize(
@@ -319,14 +321,14 @@ def test_parameters_are_read():
     ],
 )
 def test_an_expression_that_is_none_is_refused_in_words(text: str, said: str):
-    with pytest.raises(typed.TypedError, match=said):
-        typed.expressions(text, ("x_c",))
+    with pytest.raises(form_input.TypedError, match=said):
+        form_input.expressions(text, ("x_c",))
 
 
 @pytest.mark.parametrize("text", ["x_c = 1", "0 x_c=1", "0: 5", "a: x_c = 1", ""])
 def test_a_waypoint_that_is_none_is_refused_in_words(text: str):
-    with pytest.raises(typed.TypedError, match=r"must (be|have)"):
-        typed.waypoints(text)
+    with pytest.raises(form_input.TypedError, match=r"must (be|have)"):
+        form_input.waypoints(text)
 
 
 @pytest.mark.parametrize(
@@ -344,13 +346,13 @@ def test_a_waypoint_that_is_none_is_refused_in_words(text: str):
     ids=lambda text: text[:20],
 )
 def test_parameters_that_are_none_are_refused_in_words(text: str):
-    with pytest.raises(typed.TypedError, match="must be NAME: VALUE"):
-        typed.parameters(text, ("value",))
+    with pytest.raises(form_input.TypedError, match="must be NAME: VALUE"):
+        form_input.parameters(text, ("value",))
 
 
 def test_a_parameter_that_is_not_known_is_refused_by_its_name():
-    with pytest.raises(typed.TypedError, match="'target' is not known, allowed: at_s, value"):
-        typed.parameters("value: 2, target: drone2", ("at_s", "value"))
+    with pytest.raises(form_input.TypedError, match="'target' is not known, allowed: at_s, value"):
+        form_input.parameters("value: 2, target: drone2", ("at_s", "value"))
 
 
 # Who may pass
@@ -478,40 +480,40 @@ def test_nobody_says_what_no_control_says(said: bytes):
 
 
 def test_tables_show_text_of_others_as_text():
-    row = tables.Row("d1", "flying", 12.0, 400.0, "<script>", "3 / 1", ("gps_dropout",))
-    told = tables.drones([row])
+    row = html_tables.Row("d1", "flying", 12.0, 400.0, "<script>", "3 / 1", ("gps_dropout",))
+    told = html_tables.drones([row])
     assert "<script>" not in told
     assert "&lt;script&gt;" in told
     assert "gps_dropout" in told
-    assert told.count(tables.AMBER) == 2  # late, and a fault
-    assert tables.RED in told  # the battery
-    events = tables.events([Event(1_500_000_000, 0, "refused", "x", "y", "<b>no</b>")])
+    assert told.count(html_tables.AMBER) == 2  # late, and a fault
+    assert html_tables.RED in told  # the battery
+    events = html_tables.events([Event(1_500_000_000, 0, "refused", "x", "y", "<b>no</b>")])
     assert "1.50" in events
     assert "&lt;b&gt;no" in events
 
 
 def test_many_formations_leave_room_for_the_emergency_button():
-    told = tables.clusters({f"c{i}": ("taking_off", "<waits>") for i in range(16)})
-    assert tables.FEW_LINES in told
+    told = html_tables.clusters({f"c{i}": ("taking_off", "<waits>") for i in range(16)})
+    assert html_tables.FEW_LINES in told
     assert told.count("<br>") == 15
     assert "taking off – &lt;waits&gt;" in told
 
 
 def test_the_clock_says_whom_the_run_waits_for():
     now = Clock(2_000_000_000, 0, "r", 100, "waiting", 0.0, (Waiting("estimator.d1", "lab", 3.0),))
-    assert "waiting for estimator.d1 on lab (3 s)" in tables.clock(now, now.t_ns)
-    assert "no clock" in tables.clock(None, 0)
+    assert "waiting for estimator.d1 on lab (3 s)" in html_tables.clock(now, now.t_ns)
+    assert "no clock" in html_tables.clock(None, 0)
 
 
 def test_the_clock_tells_a_pace_only_while_the_run_goes_on():
     running, paused = (Clock(2_020_000_000, 0, "r", 101, state, 3.0) for state in ("running", "paused"))  # type: ignore[arg-type]
-    assert "2.0 s</b> × 3.0 real time" in tables.clock(running, 2_010_000_000)
-    assert "2.02 s</b><" in tables.clock(paused, 0)  # nothing is drawn yet
+    assert "2.0 s</b> × 3.0 real time" in html_tables.clock(running, 2_010_000_000)
+    assert "2.02 s</b><" in html_tables.clock(paused, 0)  # nothing is drawn yet
 
 
 def test_acting_faults_are_listed():
-    assert tables.NO_FAULT in tables.acting([])
-    assert "gust of world until 5.0 s<br>⚠ link_cut of a/&lt;b&gt;" in tables.acting(
+    assert html_tables.NO_FAULT in html_tables.acting([])
+    assert "gust of world until 5.0 s<br>⚠ link_cut of a/&lt;b&gt;" in html_tables.acting(
         ["gust of world until 5.0 s", "link_cut of a/<b>"]
     )
 

@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsim import keys, messages, scenario_file
-from zsim.messages import ControlAnswer, DroneView, EstimateView, Event, ViewCluster, ViewDrones, ViewEstimates
-from zsim_agents.console import stage as stages
-from zsim_agents.console.desk import Told
-from zsim_agents.console.followers import Followers
-from zsim_agents.console.picture import drones_of
-from zsim_agents.console.private_viser import PrivateViser
-from zsim_agents.console.show import Show, pictures_hz
-from zsim_agents.console.watch import Watch
-from zsim_agents.scenario_space import scenario_space
+from zsim.contract import keys, messages
+from zsim.contract.messages import ControlAnswer, DroneView, EstimateView, Event, ViewCluster, ViewDrones, ViewEstimates
+from zsim.scenario import scenario_file
+from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_bridges.console.command_client import Told
+from zsim_bridges.console.http.private_viser import PrivateViser
+from zsim_bridges.console.run_page import Show, pictures_hz
+from zsim_bridges.console.scene import scene_nodes as stages
+from zsim_bridges.console.scene.camera_follow import Followers
+from zsim_bridges.console.scene.picture import drones_of
+from zsim_bridges.console.time_monitor import Watch
 
 STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
 SCENARIO = scenario_file.load(STEP)

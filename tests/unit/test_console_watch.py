@@ -6,14 +6,24 @@ from typing import Any
 
 import pytest
 
-from zsim import keys, messages
-from zsim.messages import Clock, DroneView, EstimateView, Event, Fault, Faults, Health, ViewDrones, ViewEstimates
-from zsim_agents.console import tables
-from zsim_agents.console.eyes import Eyes
-from zsim_agents.console.state import state
-from zsim_agents.console.watch import SILENT_S, Watch
-from zsim_agents.console.words import Words, sigma_m
-from zsim_agents.presence import Presence
+from zsim.contract import keys, messages
+from zsim.contract.messages import (
+    Clock,
+    DroneView,
+    EstimateView,
+    Event,
+    Fault,
+    Faults,
+    Health,
+    ViewDrones,
+    ViewEstimates,
+)
+from zsim_bridges.console import html_tables
+from zsim_bridges.console.http.console_state import state
+from zsim_bridges.console.table_rows import Words, sigma_m
+from zsim_bridges.console.time_monitor import SILENT_S, Watch
+from zsim_bridges.console.view_buffer import Eyes
+from zsim_bridges.observer_process import Presence
 
 S = 1_000_000_000  # ns
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -166,9 +176,9 @@ def test_silence_of_the_world_is_told_and_for_how_long():
 
 
 def test_a_silent_world_is_not_called_running():
-    told = tables.clock(clock(7 * S), 7 * S, 12.3)
+    told = html_tables.clock(clock(7 * S), 7 * S, 12.3)
     assert "no answer from the world for 12 s" in told
-    assert tables.RED in told
+    assert html_tables.RED in told
     assert "running" not in told
 
 

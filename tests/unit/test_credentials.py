@@ -10,14 +10,15 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from zsim import scenario_file
 from zsim.errors import RunError
-from zsim_deploy import certificates, inventory
-from zsim_deploy.certificates import issue
-from zsim_deploy.check_up import check_up
-from zsim_deploy.cli import app
-from zsim_deploy.credentials import exposed, lacks
-from zsim_deploy.enrolment import Wanted
+from zsim.scenario import scenario_file
+from zsim_deploy.cli.cli import app
+from zsim_deploy.doctor.check_up import check_up
+from zsim_deploy.inventory import inventory
+from zsim_deploy.security import certificates
+from zsim_deploy.security.certificates import issue
+from zsim_deploy.security.credentials import exposed, lacks
+from zsim_deploy.security.enrolment import Wanted
 
 SCENARIO = """
 name: pair

@@ -6,10 +6,11 @@ from typing import Any
 
 import pytest
 
-from zsim import keys, scenario_file
-from zsim.messages import Join
-from zsim_world.deaths import SILENT_S, Deaths
-from zsim_world.world import World
+from zsim.contract import keys
+from zsim.contract.messages import Join
+from zsim.scenario import scenario_file
+from zsim_world.flight.world import World
+from zsim_world.server.liveliness import SILENT_S, Deaths
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fake_link import FakeLink

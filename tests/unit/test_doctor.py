@@ -17,12 +17,13 @@ import pytest
 
 from zsim import __version__
 from zsim.errors import HostsError
-from zsim_deploy import certificates, doctor, probe
-from zsim_deploy.check_up import CheckUp, check_up
-from zsim_deploy.doctor import Path, Report, compared, path_faults
-from zsim_deploy.enrolment import Wanted
-from zsim_deploy.host_link import HostLink
-from zsim_deploy.inventory import Host, Inventory, Placed
+from zsim_deploy.doctor import doctor, probe
+from zsim_deploy.doctor.check_up import CheckUp, check_up
+from zsim_deploy.doctor.doctor import Path, Report, compared, path_faults
+from zsim_deploy.inventory.inventory import Host, Inventory, Placed
+from zsim_deploy.security import certificates
+from zsim_deploy.security.enrolment import Wanted
+from zsim_deploy.ssh.host_link import HostLink
 
 SOUND = {
     "python": platform.python_version(),

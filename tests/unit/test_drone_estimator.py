@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from zsim_agents.drone_estimator import DroneEstimator, Estimate
-from zsim_agents.estimator_prior import LEVELLING_S, madgwick_beta
-from zsim_agents.madgwick import levelling_time_s
+from zsim_agents.estimation.drone_estimator import DroneEstimator, Estimate
+from zsim_agents.estimation.estimator_prior import LEVELLING_S, madgwick_beta
+from zsim_agents.estimation.madgwick import levelling_time_s
 
 sys.path.insert(0, str(Path(__file__).parent))
 from synthetic_flight import GATE_S, Flight, Reading, estimator, feed, fly, readings, scenario

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy import ports
-from zsim_deploy.earlier import earlier, scp, told
-from zsim_deploy.host_link import HostLink
-from zsim_deploy.inventory import Host
-from zsim_deploy.orders import _refuse_unless_able
+from zsim_deploy.control.orders import _refuse_unless_able
+from zsim_deploy.hosts.leftover_runs import earlier, scp, told
+from zsim_deploy.inventory import ports
+from zsim_deploy.inventory.inventory import Host
+from zsim_deploy.ssh.host_link import HostLink
 
 WAITS = "import sys; print('there', flush=True); sys.stdin.read()"
 
@@ -100,7 +100,7 @@ def test_a_host_whose_python_lacks_the_agents_takes_no_role(tmp_path: Path) -> N
     bare.write_text(f'#!/bin/sh\nexec {sys.executable} -I -S "$@"\n')
     bare.chmod(0o755)
     link = local(tmp_path)
-    says = r"^h1: import zsim_agents.estimator failed: ModuleNotFoundError.*; controller.main cannot run on h1; install"
+    says = r"^h1: import zsim_agents.estimation.estimator failed: ModuleNotFoundError.*; controller.main cannot run on h1; install"
     with pytest.raises(HostsError, match=says):
         asyncio.run(_refuse_unless_able(link, str(bare), "controller.main"))
     asyncio.run(_refuse_unless_able(link, sys.executable, "controller.main"))

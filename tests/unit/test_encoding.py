@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim import messages
-from zsim.encoding import BOOL, FLOATS, INT, TEXT, Layouts, read, words, write
+from zsim.contract import messages
+from zsim.contract.encoding import BOOL, FLOATS, INT, TEXT, Layouts, read, words, write
 
 EDGES = (0, 127, 128, 255, 256, 65535, 65536, 2**32 - 1, 2**32, 2**63 - 1, -1, -32, -33, -128, -129, -32768, -32769)
 EDGES += (-(2**31), -(2**31) - 1, -(2**62) - 1, -(2**63))

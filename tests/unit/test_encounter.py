@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from zsim.scenario_file import resolve
-from zsim_world import rigid_body as body
-from zsim_world import vehicle
-from zsim_world.arrays import Near
-from zsim_world.encounter import JET_WIDTHS, downwash, encounters, hull_force
-from zsim_world.start import near
+from zsim.scenario.scenario_file import resolve
+from zsim_world.fleet.initial_state import near
+from zsim_world.physics import rigid_body as body
+from zsim_world.physics.encounter import JET_WIDTHS, downwash, encounters, hull_force
+from zsim_world.state import vehicle
+from zsim_world.state.fleet_arrays import Near
 
 RADIUS = vehicle.HULL_RADIUS_M
 

@@ -8,12 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim_agents import reference_check
-from zsim_agents.cluster_space import closest_pair, cluster_space
-from zsim_agents.engagement import Engagement
-from zsim_agents.flight_data import EngagementLimits, GateInput, GateOutput
-from zsim_agents.flight_plan import Scheduled
-from zsim_agents.flight_request import (
+from zsim_agents.formation import reference_check
+from zsim_agents.formation.engagement import Engagement
+from zsim_agents.formation.flight_data import EngagementLimits, GateInput, GateOutput
+from zsim_agents.formation.flight_plan import Scheduled
+from zsim_agents.formation.flight_request import (
     Engage,
     Follow,
     Land,
@@ -23,7 +22,8 @@ from zsim_agents.flight_request import (
     Target,
     read_request,
 )
-from zsim_agents.template_cluster import TemplateCluster
+from zsim_agents.formation.spaces.cluster_space import closest_pair, cluster_space
+from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 
 SPACE = cluster_space(3)
 DRONES = ("drone1", "drone2", "drone3")

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from zsim import scenario_file
 from zsim.errors import BadNameError, InventoryError, RunError
-from zsim_deploy import inventory
-from zsim_deploy.cli import app
-from zsim_deploy.enrolment import Enrolment, Wanted
+from zsim.scenario import scenario_file
+from zsim_deploy.cli.cli import app
+from zsim_deploy.inventory import inventory
+from zsim_deploy.security.enrolment import Enrolment, Wanted
 
 SCENARIO = """
 name: enrolled

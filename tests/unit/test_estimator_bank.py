@@ -11,12 +11,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from zsim import scenario_file
-from zsim.scenario import Scenario
-from zsim_agents.compiled import COMPILES
-from zsim_agents.drone_estimator import DroneEstimator
-from zsim_agents.estimate import Estimate
-from zsim_agents.estimator_bank import EstimatorBank
+from zsim.math.compiled import COMPILES
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_agents.estimation.drone_estimator import DroneEstimator
+from zsim_agents.estimation.estimate import Estimate
+from zsim_agents.estimation.estimator_bank import EstimatorBank
 
 sys.path.insert(0, str(Path(__file__).parent))
 from synthetic_flight import GATE_S, Flight, Reading, readings

@@ -17,17 +17,17 @@ import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 
-from zsim import keys, messages
-from zsim.frames import quaternion_from_rpy, rotation_matrix
-from zsim.messages import ClusterState
+from zsim.contract import keys, messages
+from zsim.contract.messages import ClusterState
+from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.record import RecordReader
-from zsim_agents.cluster_space import SingularClusterError, cluster_space
-from zsim_deploy.export.form import Format
-from zsim_deploy.export.foxglove.instants import Instant
-from zsim_deploy.export.foxglove.numbers import Numbers
-from zsim_deploy.export.foxglove.writer import FoxgloveFile
-from zsim_deploy.export.make import export
-from zsim_deploy.export.selection import Selection
+from zsim_agents.formation.spaces.cluster_space import SingularClusterError, cluster_space
+from zsim_analysis.export.formats import Format
+from zsim_analysis.export.foxglove.instants import Instant
+from zsim_analysis.export.foxglove.numbers import Numbers
+from zsim_analysis.export.foxglove.topic_writer import FoxgloveFile
+from zsim_analysis.export.make_export import export
+from zsim_analysis.export.selection import Selection
 
 sys.path.insert(0, str(Path(__file__).parent))
 import recorded_run

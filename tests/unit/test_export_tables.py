@@ -21,17 +21,17 @@ import pytest
 import scipy.io
 from typer.testing import CliRunner
 
-from zsim import keys, messages
+from zsim.contract import keys, messages
 from zsim.errors import ReportError, RunError
 from zsim.record import RecordReader, RecordWriter
-from zsim_deploy.cli import app
-from zsim_deploy.export import form, matlab
-from zsim_deploy.export.columns import fields, table_name
-from zsim_deploy.export.form import Format
-from zsim_deploy.export.make import export
-from zsim_deploy.export.matlab import matlab_names
-from zsim_deploy.export.place import placed
-from zsim_deploy.export.selection import Selection
+from zsim_analysis.export import formats, matlab
+from zsim_analysis.export.atomic_output import placed
+from zsim_analysis.export.columns import fields, table_name
+from zsim_analysis.export.formats import Format
+from zsim_analysis.export.make_export import export
+from zsim_analysis.export.matlab import matlab_names
+from zsim_analysis.export.selection import Selection
+from zsim_deploy.cli.cli import app
 
 sys.path.insert(0, str(Path(__file__).parent))
 import recorded_run
@@ -349,7 +349,7 @@ def test_nothing_to_export_is_one_line(tmp_path: Path) -> None:
 
 
 def test_what_is_not_installed_is_named(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(form, "find_spec", lambda module: None if module == "foxglove" else module)
+    monkeypatch.setattr(formats, "find_spec", lambda module: None if module == "foxglove" else module)
     done = CliRunner().invoke(app, ["export", str(run), "--format", "foxglove"])
     assert str(done.exception) == "zsim export: foxglove is not installed; install zsim[export]"
 
@@ -374,7 +374,7 @@ def test_the_command_prints_what_it_wrote(run: Path, tmp_path: Path) -> None:
 EXPORT = """
     import resource, sys
     from pathlib import Path
-    from zsim_deploy.export.make import Format, export
+    from zsim_analysis.export.make_export import Format, export
     print("begun", flush=True)
     export(Path(sys.argv[1]), Format(sys.argv[2]))
     print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)

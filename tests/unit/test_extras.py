@@ -2,8 +2,8 @@
 
 import pytest
 
-from zsim_deploy.extras import needed
-from zsim_deploy.inventory import Host, Inventory, Router
+from zsim_deploy.inventory.extras import needed
+from zsim_deploy.inventory.inventory import Host, Inventory, Router
 
 AGENTS, RECORD, WORLD = "agents", "record", "world"
 

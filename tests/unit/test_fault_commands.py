@@ -6,14 +6,14 @@ from typing import Any
 import pytest
 import typer
 
-from zsim import keys
+from zsim.contract import keys
+from zsim.contract.messages import Fault
 from zsim.errors import SessionError
-from zsim.fault_flaws import COMMON
-from zsim.fault_kinds import KINDS
-from zsim.messages import Fault
-from zsim.session import Session
-from zsim_deploy import fault_commands
-from zsim_deploy.fault_commands import row, seconds, selector
+from zsim.scenario.fault_check import COMMON
+from zsim.scenario.fault_kinds import KINDS
+from zsim.transport.session import Session
+from zsim_deploy.cli import fault_commands
+from zsim_deploy.cli.fault_commands import row, seconds, selector
 
 
 @pytest.mark.parametrize(

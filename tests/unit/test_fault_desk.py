@@ -4,9 +4,10 @@ from typing import Any
 
 import pytest
 
-from zsim import batch, keys, scenario_file
-from zsim.messages import ControlAnswer, ControlRequest, Done, Event, Faults, Join, Velocity
-from zsim_world.world import World
+from zsim.contract import batch, keys
+from zsim.contract.messages import ControlAnswer, ControlRequest, Done, Event, Faults, Join, Velocity
+from zsim.scenario import scenario_file
+from zsim_world.flight.world import World
 
 GATE_NS = 20_000_000
 SCENARIO = """
@@ -120,7 +121,7 @@ def test_a_kill_has_no_end():
 
 
 def joined(made: World, name: str, period_gates: int, fingerprint: str = "x") -> None:
-    """Let a process join, as one of zsim.runner does, unless it has no fingerprint."""
+    """Let a process join, as one of zsim.runtime.runner does, unless it has no fingerprint."""
     run_id, period_ns = made.info().run_id, period_gates * GATE_NS
     join = Join(0, 0, run_id, 1, name.partition(".")[0], "here", 1, period_ns, fingerprint=fingerprint)
     made.handle(keys.process(name, "join"), join, 0)
@@ -145,7 +146,7 @@ def test_what_has_ended_stays_on_the_list_for_who_steps_rarely():
     ("name", "period_gates", "fingerprint", "why"),
     [
         ("console.one", 0, "x", "target is 'console.one'"),
-        ("my.filter", 1, "", "target is 'my.filter', which does not run on zsim.runner"),
+        ("my.filter", 1, "", "target is 'my.filter', which does not run on zsim.runtime.runner"),
         ("estimator.d1", 0, "x", "target is 'estimator.d1', which takes no part in the lockstep"),
         ("my.filter", 1, "x", ""),
     ],

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from zsim import keys
-from zsim.messages import Fault, Faults, encode
-from zsim.runner import Runner
+from zsim.contract import keys
+from zsim.contract.messages import Fault, Faults, encode
+from zsim.runtime.runner import Runner
 
 sys.path.insert(0, str(Path(__file__).parent))
 from test_runner import END, GATE_NS, ME, Judge, World, estimate, estimates, info

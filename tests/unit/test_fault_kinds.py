@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from zsim import scenario_file
 from zsim.errors import ScenarioError
-from zsim.fault_flaws import Known, flaws
-from zsim.fault_kinds import KINDS, Parameter, acts, expected, planned
-from zsim.scenario_file import resolve
+from zsim.scenario import scenario_file
+from zsim.scenario.fault_check import Known, flaws
+from zsim.scenario.fault_kinds import KINDS, Parameter, acts, expected, planned
+from zsim.scenario.scenario_file import resolve
 
 GATE_NS = 20_000_000
 KNOWN = Known(("drone1", "drone2"), ("main",), ("my.filter",))

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import Meta, Struct
 
-from zsim.faults import faults, first_fault, show, sound
+from zsim.schema.checker import faults, first_fault, show, sound
 
 
 class Part(Struct, forbid_unknown_fields=True):

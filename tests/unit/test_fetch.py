@@ -10,8 +10,8 @@ import asyncssh
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy import fetch as module
-from zsim_deploy.fetch import fetch
+from zsim_deploy.ssh import fetch as module
+from zsim_deploy.ssh.fetch import fetch
 
 Get = Callable[[Path, Callable[..., None]], Awaitable[None]]
 

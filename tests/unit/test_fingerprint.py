@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from zsim import fingerprint as module
-from zsim.fingerprint import PACKAGES, fingerprint, parts
+from zsim.contract import fingerprint as module
+from zsim.contract.fingerprint import PACKAGES, fingerprint, parts
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +24,7 @@ def test_it_is_sixteen_hex_digits():
 
 
 def test_another_process_has_the_same():
-    command = [sys.executable, "-c", "from zsim.fingerprint import fingerprint; print(fingerprint())"]
+    command = [sys.executable, "-c", "from zsim.contract.fingerprint import fingerprint; print(fingerprint())"]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == fingerprint()
 
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from zsim.frames import heading, quaternion_from_rpy
-from zsim.scenario_file import resolve
-from zsim_world import observer
-from zsim_world.fleet import Fleet
+from zsim.math.frames import heading, quaternion_from_rpy
+from zsim.scenario.scenario_file import resolve
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.vehicles import observer
 
 PRESETS = [
     {"preset": "paper"},

@@ -2,20 +2,17 @@
 
 import hashlib
 import math
-import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from zsim import messages, obstacle, presets
-from zsim.frames import geodetic_to_enu
-from zsim.scenario_file import resolve
-from zsim_world import gate
-from zsim_world.fleet import GPS_FIX, GPS_SATELLITES, DivergedError, Fleet
-from zsim_world.publication import Publication
-from zsim_world.sensor_set import SENSORS, schedule
+from zsim.contract import messages
+from zsim.math.frames import geodetic_to_enu
+from zsim.scenario.scenario_file import resolve
+from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, DivergedError, Fleet
+from zsim_world.fleet.publication import Publication
+from zsim_world.sensors.sensor_set import SENSORS, schedule
 
 GATE_NS = 20_000_000
 WIDTH = {"imu": 6, "gps": 9, "mag": 3, "baro": 2, "sonar": 2, "flow": 4}
@@ -258,25 +255,6 @@ def test_truth_is_a_copy():
     fleet.takeoff(0)
     gates(fleet, 100)
     np.testing.assert_array_equal(before.position_m, kept)
-
-
-def test_the_kernel_is_named_after_every_file_with_compiled_code():
-    folder = Path(gate.__file__).parent
-    marked = re.compile(r"^@(inlined|apart)$", re.MULTILINE)
-    compiled = {p.name for p in folder.glob("*.py") if marked.search(p.read_text()) or p.name == "compiled.py"}
-    assert compiled - {"normals.py", "publication.py"} <= set(gate.KERNEL_FILES)  # these have kernels of their own
-    assert all((folder / name).exists() for name in gate.KERNEL_FILES)
-    assert set(gate.SOURCES) == {
-        *(folder / name for name in gate.KERNEL_FILES),
-        Path(presets.__file__),
-        Path(obstacle.__file__),
-    }
-
-
-def test_constants_that_are_compiled_in_come_from_files_that_count():
-    for path in gate.SOURCES:
-        for module, names in re.findall(r"^from (zsim\.\w+) import (.*)$", path.read_text(), re.MULTILINE):
-            assert module == "zsim.presets" or not re.search(r"\b[A-Z][A-Z0-9_]+\b", names), (path, module)
 
 
 def test_a_drone_placed_above_the_ground_falls_onto_it():

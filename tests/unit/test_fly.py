@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from zsim import keys, messages, scenario_file
+from zsim.contract import keys, messages
 from zsim.record import RecordReader
-from zsim_deploy import run
-from zsim_deploy.progress import Screen
-from zsim_world.fleet import DivergedError, Fleet
+from zsim.scenario import scenario_file
+from zsim_deploy.launch import run
+from zsim_deploy.terminal.progress import Screen
+from zsim_world.fleet.fleet import DivergedError, Fleet
 
 GATE_NS = 20_000_000
 SCENARIO = """

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from zsim import frames
+from zsim.math import frames
 
 ORIGIN = (-34.603, -58.368, 25.0)
 few = settings(max_examples=100, deadline=None)

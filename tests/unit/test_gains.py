@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
 
-from zsim.scenario_file import resolve
-from zsim_world import gains
+from zsim.scenario.scenario_file import resolve
+from zsim_world.vehicles import observer_gains
 
 PRESETS = [{"preset": "paper"}, {"preset": "paper", "as_printed": True}, {"preset": "ardrone2"}]
 NAMES = ["paper", "as_printed", "ardrone2"]
@@ -17,7 +17,7 @@ NAMES = ["paper", "as_printed", "ardrone2"]
 def row_of(sensors, **drone):
     drones = [{"name": "a", "position_m": [0, 0, 0], **drone}]
     scenario = resolve({"name": "t", "duration_s": 1, "sensors": sensors, "drones": drones})
-    return gains.gain_row(scenario.drones[0], scenario.environment)
+    return observer_gains.gain_row(scenario.drones[0], scenario.environment)
 
 
 @pytest.mark.parametrize("sensors", PRESETS, ids=NAMES)
@@ -26,8 +26,8 @@ def test_observer_gains_make_a_stable_filter_over_its_true_schedule(sensors):
     row = row_of(sensors)
     c, g = 0.249 / 0.429, 9.80665
     step = np.eye(4) + 0.005 * np.array([[-c, g, 0, 1], [0, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]])
-    accel = np.eye(4) - np.outer(row[gains.ACCEL_V : gains.ACCEL_U + 1], [-c, 0, 0, 1])
-    flow = np.eye(4) - np.outer(row[gains.FLOW_V : gains.FLOW_U + 1], [1, 0, 0, 0])
+    accel = np.eye(4) - np.outer(row[observer_gains.ACCEL_V : observer_gains.ACCEL_U + 1], [-c, 0, 0, 1])
+    flow = np.eye(4) - np.outer(row[observer_gains.FLOW_V : observer_gains.FLOW_U + 1], [1, 0, 0, 0])
     second = np.eye(4)
     for k in range(200):
         second = accel @ step @ second
@@ -40,7 +40,7 @@ def test_steady_gain_of_a_scalar_filter_is_the_closed_form():
     """A random walk of q per sqrt(s) seen at 200 Hz with sigma: p = (q' + sqrt(q'^2 + 4 q' r)) / 2."""
     q, r = 0.3**2 / 200, 0.5**2
     p = (q + math.sqrt(q * q + 4 * q * r)) / 2
-    gain = gains.steady_gains(np.zeros((1, 1)), np.array([0.3]), [([1.0], 0.5, 200.0)])
+    gain = observer_gains.steady_gains(np.zeros((1, 1)), np.array([0.3]), [([1.0], 0.5, 200.0)])
     assert gain[0, 0] == pytest.approx(p / (p + r), rel=1e-9)
 
 
@@ -54,7 +54,7 @@ def test_covariance_solves_the_riccati_equation():
     steps = [expm(a * dt * s) @ np.diag(walks**2) @ expm(a * dt * s).T for s in np.linspace(0, 1, 201)]
     noise = dt * np.trapezoid(steps, dx=1 / 200, axis=0)
     expected = solve_discrete_are(expm(a * dt).T, h.T, noise, r)
-    np.testing.assert_allclose(gains.covariance(a, walks, meters), expected, rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose(observer_gains.covariance(a, walks, meters), expected, rtol=1e-3, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -69,4 +69,9 @@ def test_gains_are_finite_for_absurd_sensors(accel, flow, rate, drag):
     }
     row = row_of(sensors, drag_n_s_m=drag)
     assert np.isfinite(row).all()
-    assert np.abs(row[[gains.FLOW_V, gains.BARO_Z, gains.SONAR_Z, gains.MAG_PSI]]).max() <= 1.0
+    assert (
+        np.abs(
+            row[[observer_gains.FLOW_V, observer_gains.BARO_Z, observer_gains.SONAR_Z, observer_gains.MAG_PSI]]
+        ).max()
+        <= 1.0
+    )

@@ -4,12 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from zsim import batch, keys, scenario_file
-from zsim.bundle import Bundle
-from zsim.scenario import Scenario
-from zsim_agents.compiled import COMPILES
-from zsim_agents.estimator import Estimator
-from zsim_world.world import World
+from zsim.contract import batch, keys
+from zsim.contract.bundle import Bundle
+from zsim.math.compiled import COMPILES
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_agents.estimation.estimator import Estimator
+from zsim_world.flight.world import World
 
 DRONES = ("d1", "d2", "d3")
 

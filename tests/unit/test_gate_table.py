@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from zsim import messages, scenario_file
-from zsim_agents.controller import Controller
+from zsim.contract import messages
+from zsim.scenario import scenario_file
+from zsim_agents.formation.controller import Controller
 
 GATE_NS = 20_000_000
 DRONES = ("d1", "d2", "d3")

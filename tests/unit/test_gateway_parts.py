@@ -11,26 +11,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsim import batch, messages
-from zsim.bundle import Bundle, table_of
+from zsim.contract import batch, messages
+from zsim.contract.bundle import Bundle, table_of
+from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin, Status, Velocity
 from zsim.errors import DecodeError, NoWorldError
-from zsim.messages import ClusterInfo, DroneInfo, Imu, Info, Origin, Status, Velocity
-from zsim.session import Heard
-from zsim_agents.gateway import requests
-from zsim_agents.gateway import values as values_module
-from zsim_agents.gateway.client import Client
-from zsim_agents.gateway.echoes import Echoes
-from zsim_agents.gateway.json_tree import methods
-from zsim_agents.gateway.limits import Bucket, Turnstile
-from zsim_agents.gateway.openapi import description
-from zsim_agents.gateway.outbox import Outbox
-from zsim_agents.gateway.refusals import TooManyError
-from zsim_agents.gateway.rest import described
-from zsim_agents.gateway.seat import Seat, closing
-from zsim_agents.gateway.speech import is_control, is_others
-from zsim_agents.gateway.stamps import Stamps
-from zsim_agents.gateway.transcoding import plain, to_json, to_payload, value_line
-from zsim_agents.gateway.values import Values
+from zsim.transport.session import Heard
+from zsim_bridges.gateway import last_values as values_module
+from zsim_bridges.gateway.client_limits import Bucket, Turnstile
+from zsim_bridges.gateway.echo_filter import Echoes
+from zsim_bridges.gateway.http.http_errors import TooManyError
+from zsim_bridges.gateway.http.json_tree import methods
+from zsim_bridges.gateway.http.openapi import description
+from zsim_bridges.gateway.http.zenoh_rest import described
+from zsim_bridges.gateway.key_policy import is_control, is_others
+from zsim_bridges.gateway.last_values import Values
+from zsim_bridges.gateway.lines import stream_requests
+from zsim_bridges.gateway.lines.outbox import Outbox
+from zsim_bridges.gateway.lines.stream_client import Client
+from zsim_bridges.gateway.lockstep_agent import Seat, closing
+from zsim_bridges.gateway.message_defaults import Stamps
+from zsim_bridges.gateway.transcoding import plain, to_json, to_payload, value_line
 
 VELOCITY = "drone/drone1/cmd/velocity"
 GATE_NS = 20_000_000
@@ -247,13 +247,13 @@ def test_clients_speak_where_nobody_else_does(key: str, allowed: tuple[str, ...]
 )
 def test_what_is_no_request_is_refused(line: bytes):
     with pytest.raises(DecodeError, match="request: "):
-        requests.read(line)
+        stream_requests.read(line)
 
 
 @given(st.binary(max_size=200))
 def test_no_bytes_are_more_than_refused(line: bytes):
     with suppress(DecodeError):
-        requests.read(line)
+        stream_requests.read(line)
 
 
 # Limits

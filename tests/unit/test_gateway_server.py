@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 from typing import Any
 
-from zsim_agents.gateway.server import Doors, Gateway
+from zsim_bridges.gateway.gateway_server import Doors, Gateway
 
 
 class Ear:

@@ -1,4 +1,4 @@
-"""The compiled way of a GPS fix to latitude and longitude, against the one of zsim.frames."""
+"""The compiled way of a GPS fix to latitude and longitude, against the one of zsim.math.frames."""
 
 import os
 import shutil
@@ -11,8 +11,8 @@ import pytest
 
 import zsim
 import zsim_world
-from zsim.frames import enu_to_geodetic
-from zsim_world.geodetic import anchor, geodetic
+from zsim.math.frames import enu_to_geodetic
+from zsim.math.geodetic import anchor, geodetic
 
 
 @pytest.mark.parametrize(
@@ -28,13 +28,13 @@ def test_it_agrees_with_frames(origin):
 
 ASK = """
 import numpy as np
-from zsim_world.geodetic import geodetic
+from zsim.math.geodetic import geodetic
 print(geodetic(np.zeros((1, 3)), np.eye(3), np.array((6_378_144.0, 0.0, 0.0)))[0, 2])
 """
 
 
 def test_a_change_of_a_constant_that_is_compiled_in_reaches_the_kernel(tmp_path):
-    """The radius stands in zsim/frames.py: numba's own cache would go on with the old one."""
+    """The radius stands in zsim/math/frames.py: numba's own cache would go on with the old one."""
     for package in (zsim, zsim_world):
         source = Path(package.__path__[0])
         shutil.copytree(source, tmp_path / source.name, ignore=shutil.ignore_patterns("__pycache__"))

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from zsim.frames import quaternion_from_rpy, rpy_from_quaternion
-from zsim.scenario_file import resolve
-from zsim_world import rigid_body as body
-from zsim_world import vehicle
-from zsim_world.ground import contact, drag_anchors
+from zsim.math.frames import quaternion_from_rpy, rpy_from_quaternion
+from zsim.scenario.scenario_file import resolve
+from zsim_world.physics import rigid_body as body
+from zsim_world.physics.ground import contact, drag_anchors
+from zsim_world.state import vehicle
 
 OFF, CALM = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 DT = 0.0025

@@ -5,11 +5,11 @@ from typing import Any
 
 import pytest
 
-from zsim import keys
-from zsim.agent import Agent, Output
+from zsim.contract import keys
+from zsim.contract.messages import Bye, ControlAnswer, ControlRequest, Status
 from zsim.errors import RunError
-from zsim.group import Group
-from zsim.messages import Bye, ControlAnswer, ControlRequest, Status
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.group import Group
 
 GATE_NS = 20_000_000
 CLUSTER = keys.cluster_control("main")

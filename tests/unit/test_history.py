@@ -1,7 +1,7 @@
 """The history: last values for who asks, the last seconds for who must catch up, and never more than its share."""
 
-from zsim import keys
-from zsim_world.history import KEEP_NS, History
+from zsim.contract import keys
+from zsim_world.server.message_history import KEEP_NS, History
 
 SECOND_NS = 1_000_000_000
 IMU = keys.sensor("d1", "imu")

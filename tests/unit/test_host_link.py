@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy import host_link
-from zsim_deploy.host_link import CHANNELS, HostLink, Loop
-from zsim_deploy.inventory import Host, Inventory, Placed
-from zsim_deploy.links import Links
+from zsim_deploy.inventory.inventory import Host, Inventory, Placed
+from zsim_deploy.ssh import host_link
+from zsim_deploy.ssh.host_link import CHANNELS, HostLink, Loop
+from zsim_deploy.ssh.host_links import Links
 
 FILES = {"identity/world/key.pem": b"secret\n", "scenario.yaml": b"name: one\n" * 5000}
 

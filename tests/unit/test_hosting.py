@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from zsim import scenario_file
 from zsim.errors import RunError
-from zsim.group import Group
-from zsim.identity import Identity
-from zsim_deploy import roles
-from zsim_deploy.hosting import agents_of, chosen, hosted
-from zsim_world.world import World
+from zsim.runtime.group import Group
+from zsim.scenario import scenario_file
+from zsim.transport.identity import Identity
+from zsim_agents.hosting import agents_of, chosen, hosted
+from zsim_deploy.roles import roles
+from zsim_world.flight.world import World
 
 STEP = scenario_file.load(Path(__file__).parents[2] / "scenarios" / "step.yaml")
 ESTIMATORS = ["estimator.drone1", "estimator.drone2", "estimator.drone3"]

@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsim.fault_kinds import ROTORS, planned
-from zsim.messages import Fault
-from zsim.scenario_file import resolve
-from zsim_world.fleet import Fleet
-from zsim_world.impairment import gust_m_s
-from zsim_world.sensor_set import SensorName
+from zsim.contract.messages import Fault
+from zsim.scenario.fault_kinds import ROTORS, planned
+from zsim.scenario.scenario_file import resolve
+from zsim_world.fleet.fault_effects import gust_m_s
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.sensors.sensor_set import SensorName
 
 GATE_NS = 20_000_000
 FIELDS = {"imu": 6, "gps": 9, "mag": 3, "baro": 2, "sonar": 2, "flow": 4}

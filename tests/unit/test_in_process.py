@@ -7,11 +7,23 @@ from typing import Any
 import pytest
 from msgspec import Struct
 
-from zsim import keys
-from zsim.agent import Agent, Output
+from zsim.contract import keys
+from zsim.contract.messages import (
+    Bye,
+    ClusterState,
+    Done,
+    Estimate,
+    Imu,
+    Info,
+    Join,
+    Status,
+    Velocity,
+    ViewCluster,
+    Waiting,
+)
 from zsim.errors import RunError
-from zsim.in_process import Bus
-from zsim.messages import Bye, ClusterState, Done, Estimate, Imu, Info, Join, Status, Velocity, ViewCluster, Waiting
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.bus import Bus
 
 GATE_NS = 20_000_000
 DRONES = ("d1", "d2")

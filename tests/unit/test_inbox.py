@@ -6,9 +6,9 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim import keys
-from zsim.inbox import GAP_MAX, Inbox
-from zsim.messages import Baro, Estimate, Imu, Status
+from zsim.contract import keys
+from zsim.contract.messages import Baro, Estimate, Imu, Status
+from zsim.runtime.inbox import GAP_MAX, Inbox
 
 GATE_NS = 20_000_000
 STEP_NS = 5_000_000

@@ -7,13 +7,13 @@ import socket
 import pytest
 
 from zsim.errors import HostsError, RunError
-from zsim_deploy import intercom
-from zsim_deploy.intercom import Intercom
+from zsim_deploy.control import control_socket
+from zsim_deploy.control.control_socket import Intercom
 
 
 @pytest.fixture(autouse=True)
 def own_place(tmp_path, monkeypatch):
-    monkeypatch.setattr(intercom.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(control_socket.tempfile, "gettempdir", lambda: str(tmp_path))
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
 
 
@@ -36,7 +36,7 @@ def line():
 
 @pytest.mark.usefixtures("line")
 def test_an_answer_comes_back():
-    assert intercom.ask("zsim", "add", a=2, b=3) == 5
+    assert control_socket.ask("zsim", "add", a=2, b=3) == 5
 
 
 @pytest.mark.usefixtures("line")
@@ -53,16 +53,16 @@ def test_an_answer_comes_back():
 )
 def test_what_is_refused_says_why(op, args, says):
     with pytest.raises(RunError, match=says):
-        intercom.ask("zsim", op, **args)
+        control_socket.ask("zsim", op, **args)
 
 
 @pytest.mark.usefixtures("line")
 def test_garbage_is_answered_and_the_next_one_served():
     with socket.socket(socket.AF_UNIX) as raw:
-        raw.connect(str(intercom.place("zsim")))
+        raw.connect(str(control_socket.place("zsim")))
         raw.sendall(b"\xff\n")
         assert not json.loads(raw.makefile("rb").readline())["ok"]
-    assert intercom.ask("zsim", "add", a=1, b=1) == 2
+    assert control_socket.ask("zsim", "add", a=1, b=1) == 2
 
 
 @pytest.mark.usefixtures("line")
@@ -73,38 +73,38 @@ def test_a_federation_is_up_only_once():
 
 def test_nobody_is_up():
     with pytest.raises(RunError, match="no `zsim up` of federation 'zsim' runs"):
-        intercom.ask("zsim", "ps")
+        control_socket.ask("zsim", "ps")
 
 
 def test_the_socket_of_a_killed_launcher_is_no_hindrance():
-    place = intercom.place("zsim")
+    place = control_socket.place("zsim")
     place.parent.mkdir(mode=0o700)
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(place))
     found = Intercom("zsim", {"add": lambda a, b: a + b})
-    assert intercom.ask("zsim", "add", a=1, b=2) == 3
+    assert control_socket.ask("zsim", "add", a=1, b=2) == 3
     found.close()
     assert not place.exists()
 
 
 def test_only_its_user_may_come_in(line):
-    assert intercom.place("zsim").parent.stat().st_mode & 0o077 == 0
+    assert control_socket.place("zsim").parent.stat().st_mode & 0o077 == 0
 
 
 def test_a_launcher_that_does_not_answer_is_not_taken_for_none(monkeypatch):
-    monkeypatch.setattr(intercom, "ANSWER_S", 0.05)
-    place = intercom.place("zsim")
+    monkeypatch.setattr(control_socket, "ANSWER_S", 0.05)
+    place = control_socket.place("zsim")
     place.parent.mkdir(mode=0o700)
     with socket.socket(socket.AF_UNIX) as busy:
         busy.bind(str(place))
         busy.listen()
         with pytest.raises(RunError, match="`zsim up` has not answered ps within"):
-            intercom.ask("zsim", "ps")
+            control_socket.ask("zsim", "ps")
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o750])
 def test_a_folder_in_which_others_may_write_or_read_is_refused(mode):
-    folder = intercom.place("zsim").parent
+    folder = control_socket.place("zsim").parent
     folder.mkdir()
     folder.chmod(mode)
     with pytest.raises(RunError, match=f"is not a folder that is yours alone .* mode {mode:o}"):
@@ -113,14 +113,14 @@ def test_a_folder_in_which_others_may_write_or_read_is_refused(mode):
 
 def test_a_link_to_somewhere_else_is_refused(tmp_path):
     (tmp_path / "elsewhere").mkdir(mode=0o700)
-    intercom.place("zsim").parent.symlink_to(tmp_path / "elsewhere")
+    control_socket.place("zsim").parent.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(RunError, match="is not a folder that is yours alone"):
         Intercom("zsim", {})
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
 def test_a_folder_of_another_user_is_refused():
-    folder = intercom.place("zsim").parent
+    folder = control_socket.place("zsim").parent
     folder.mkdir(mode=0o700)
     os.chown(folder, 12345, 12345)
     with pytest.raises(RunError, match="owner 12345"):
@@ -134,9 +134,9 @@ def test_a_path_that_is_too_long_is_a_line(tmp_path, monkeypatch):
     with pytest.raises(RunError, match="longer than 107 bytes; set XDG_RUNTIME_DIR or TMPDIR"):
         Intercom("zsim", {})
     with pytest.raises(RunError, match="no `zsim up` of federation"):
-        intercom.ask("zsim", "ps")
+        control_socket.ask("zsim", "ps")
 
 
 def test_the_runtime_folder_is_preferred(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    assert intercom.place("zsim") == tmp_path / "zsim" / "zsim.sock"
+    assert control_socket.place("zsim") == tmp_path / "zsim" / "zsim.sock"

@@ -5,7 +5,7 @@ from contextlib import suppress
 
 import pytest
 
-from zsim_deploy.interrupts import interruptible
+from zsim_deploy.terminal.interrupts import interruptible
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

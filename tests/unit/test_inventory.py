@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 import yaml
 
-from zsim import scenario_file
 from zsim.errors import InventoryError
-from zsim.scenario import Scenario
-from zsim_deploy import inventory
-from zsim_deploy.inventory import Placed
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_deploy.inventory import inventory
+from zsim_deploy.inventory.inventory import Placed
 
 ROOT = Path(__file__).parents[2]
 HOSTS = {"lab": {"address": "192.168.1.10"}, "one": {"address": "192.168.1.21"}, "two": {"address": "192.168.1.22"}}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter
 
-from zsim_agents.kalman_update import predicted_covariance, stacked_update
+from zsim_agents.estimation.kalman_update import predicted_covariance, stacked_update
 
 LIMITS = np.full(7, 1e9)  # gates that nothing misses
 

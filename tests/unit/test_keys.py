@@ -7,7 +7,7 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim import keys
+from zsim.contract import keys
 from zsim.errors import BadNameError
 
 

@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsim.scenario_file import resolve
-from zsim_world import lanes
-from zsim_world import rigid_body as body
-from zsim_world.compiled import inlined
-from zsim_world.fleet import Fleet
-from zsim_world.ground import drag_anchors
-from zsim_world.rigid_body import four, put, vector
+from zsim.math.compiled import inlined
+from zsim.scenario.scenario_file import resolve
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.physics import rigid_body as body
+from zsim_world.physics import simd_body
+from zsim_world.physics.ground import drag_anchors
+from zsim_world.physics.rigid_body import four, put, vector
 
 DT = 0.0025  # s
 COUNT = 11  # a whole block and a part of one
@@ -65,12 +65,12 @@ def copied(bodies):
 def test_a_block_gives_the_bits_of_each_drone(height_m, count):
     one = bodies_in_motion(np.random.default_rng(3), height_m, count)
     other, least_m = copied(one), np.inf
-    lanes.line_up(one)
+    simd_body.line_up(one)
     for _ in range(400):
-        lanes.move(one, DT)
+        simd_body.move(one, DT)
         each(other, DT)
         np.testing.assert_array_equal(one.state, other.state)
-        lanes.accelerate(one)
+        simd_body.accelerate(one)
         accelerate_each(other)
         np.testing.assert_array_equal(one.accel, other.accel)
         least_m = min(least_m, one.state[:, 2].min())

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from zsim.identity import Identity
-from zsim_deploy.lent import Lent, lent
+from zsim.transport.identity import Identity
+from zsim_deploy.security.key_lease import Lent, lent
 
 ROLE = """
 import os, sys, time
 from pathlib import Path
-from zsim.identity import Identity
-from zsim_deploy.leash import Leash
-from zsim_deploy.lent import lent
+from zsim.transport.identity import Identity
+from zsim_deploy.roles.stop_channel import Leash
+from zsim_deploy.security.key_lease import lent
 folder = Path(sys.argv[1])
 leash = Leash(True, lent(Identity(tls=folder), "run1"))
 print("ready", flush=True)

@@ -6,13 +6,14 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from zsim import batch, keys, scenario_file
-from zsim.bundle import Bundle, table_of
-from zsim.fault_kinds import planned
-from zsim.link_faults import LinkFaults, heard, place_of, senders, uniform
-from zsim.messages import ControlRequest, Estimate, Fault, Faults, Imu, Mode, Status, encode
-from zsim_agents.controller import TAKEN_MAX, Controller
-from zsim_world.world import World
+from zsim.contract import batch, keys
+from zsim.contract.bundle import Bundle, table_of
+from zsim.contract.messages import ControlRequest, Estimate, Fault, Faults, Imu, Mode, Status, encode
+from zsim.runtime.link_faults import LinkFaults, heard, place_of, senders, uniform
+from zsim.scenario import scenario_file
+from zsim.scenario.fault_kinds import planned
+from zsim_agents.formation.controller import TAKEN_MAX, Controller
+from zsim_world.flight.world import World
 
 GATE_NS = 20_000_000
 ME, OTHER = "controller.main", "estimator.d1"

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from zsim.errors import RunError
-from zsim_deploy import hosts_commands
-from zsim_deploy.hosts_commands import logs
-from zsim_deploy.intercom import Intercom
+from zsim_deploy.cli import hosts_commands
+from zsim_deploy.cli.hosts_commands import logs
+from zsim_deploy.control.control_socket import Intercom
 
 ROLES = ["world", "recorder", "estimator.d1"]
 

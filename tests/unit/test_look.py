@@ -7,10 +7,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from zsim import keys, messages
+from zsim.contract import keys, messages
 from zsim.errors import SessionError
-from zsim.session import Sample
-from zsim_deploy import look
+from zsim.transport.session import Sample
+from zsim_deploy.cli.inspect import look
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fake_link import BAD_UTF8, NESTED, FakeLink

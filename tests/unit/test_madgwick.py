@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from zsim_agents import madgwick
+from zsim_agents.estimation import madgwick
 
 G = 9.80665  # m/s^2
 DT = 0.005  # s, 200 Hz
@@ -125,7 +125,7 @@ def test_the_length_stays_one_over_many_steps():
 
 PATH = """
 import numpy as np
-from zsim_agents.dead_reckoning import reckon
+from zsim_agents.estimation.dead_reckoning import reckon
 rng = np.random.default_rng(5)
 zero = (0.0, 0.0, 0.0)
 state = (zero, zero, (1.0, 0.0, 0.0, 0.0), zero, zero, zero)

@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from zsim import batch, keys
-from zsim.agent import Agent, Output
+from zsim.contract import batch, keys
+from zsim.contract.messages import ControlAnswer, Info, Origin
 from zsim.errors import DecodeError, NoWorldError
-from zsim.membership import RETRY_S, Membership
-from zsim.messages import ControlAnswer, Info, Origin
-from zsim.replay import replay
-from zsim.session import Sample
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.membership import RETRY_S, Membership
+from zsim.runtime.replay import replay
+from zsim.transport.session import Sample
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fake_link import UNANSWERED, FakeLink

@@ -9,12 +9,12 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from zsim.scenario import ErrorModel, Imu
-from zsim_agents import aiding_models, dead_reckoning
-from zsim_agents.error_state import BiasPrior, ProcessNoise
-from zsim_agents.madgwick import LEVEL, rotation
-from zsim_agents.navigation_filter import NavigationFilter, Stack
-from zsim_agents.strapdown import Interval, Strapdown
+from zsim.scenario.scenario import ErrorModel, Imu
+from zsim_agents.estimation import aiding_models, dead_reckoning
+from zsim_agents.estimation.error_state import BiasPrior, ProcessNoise
+from zsim_agents.estimation.madgwick import LEVEL, rotation
+from zsim_agents.estimation.navigation_filter import NavigationFilter, Stack
+from zsim_agents.estimation.strapdown import Interval, Strapdown
 
 G = 9.80665  # m/s^2
 GATE_S = 0.02  # s

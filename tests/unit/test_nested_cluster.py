@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from zsim_agents.cluster_space import SingularClusterError, cluster_space
-from zsim_agents.nested_cluster import NestedCluster
-from zsim_agents.template_cluster import TemplateCluster
+from zsim_agents.formation.spaces.cluster_space import SingularClusterError, cluster_space
+from zsim_agents.formation.spaces.nested_cluster import NestedCluster
+from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 
 SQUARE = np.array([(2.0, 2.0, 0.0), (-2.0, 2.0, 0.0), (-2.0, -2.0, 0.0), (2.0, -2.0, 0.0)])
 PENTAGON = 8.0 * np.array([(math.cos(k * 0.4 * math.pi), math.sin(k * 0.4 * math.pi), 0.0) for k in range(5)])

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from zsim.streams import stream
-from zsim_world import normals
+from zsim.scenario.random_streams import stream
+from zsim_world.physics import normal_variates
 
 
 def drawn(words, rows, width, used, table):
     """Refill one stream of which so many rows are used; return its place in the table."""
     cursor = np.full((1, 1), used)
-    normals.refill(table, np.array([0]), np.array([rows]), np.array([width]), cursor, words)
+    normal_variates.refill(table, np.array([0]), np.array([rows]), np.array([width]), cursor, words)
     assert cursor[0, 0] == 0
     return table[0].copy()
 
@@ -19,7 +19,7 @@ def drawn(words, rows, width, used, table):
 def test_numbers_are_those_of_numpy_also_after_leaving_some(seed):
     """800 000 numbers: some 200 of them come from the tail, and 10 000 from the edge of a layer."""
     rng, width, rows = stream(seed, "drone1/imu"), 13, 60_000
-    words = np.array([[normals.words(rng)]], dtype=np.uint64)
+    words = np.array([[normal_variates.words(rng)]], dtype=np.uint64)
     table = np.zeros((1, rows * width))
     numbers = rng.standard_normal((rows, width))
     np.testing.assert_array_equal(drawn(words, rows, width, rows, table), numbers.ravel())
@@ -27,9 +27,9 @@ def test_numbers_are_those_of_numpy_also_after_leaving_some(seed):
     for used in (0, 1, 777):
         numbers = np.concatenate((numbers[used:], rng.standard_normal((used, width))))
         np.testing.assert_array_equal(drawn(words, rows, width, used, table), numbers.ravel())
-    assert words[0, 0].tolist() == normals.words(rng)
+    assert words[0, 0].tolist() == normal_variates.words(rng)
 
 
 def test_another_generator_is_refused():
     with pytest.raises(ValueError, match="numpy's generator is MT19937; must be PCG64"):
-        normals.words(np.random.Generator(np.random.MT19937(1)))
+        normal_variates.words(np.random.Generator(np.random.MT19937(1)))

@@ -12,9 +12,9 @@ import psutil
 import pytest
 
 from zsim import __version__
-from zsim_deploy import nursery as nursery_module
-from zsim_deploy.forked import Forked
-from zsim_deploy.nursery import Nursery, Process
+from zsim_deploy.forkserver import role_launcher as nursery_module
+from zsim_deploy.forkserver.forked_process import Forked
+from zsim_deploy.forkserver.role_launcher import Nursery, Process
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="roles are forked on Linux alone")
 WAITING = ["record", "--connect", "tcp/127.0.0.1:1", "--launched", "0", "--wait", "100"]  # for a world that never comes
@@ -183,7 +183,7 @@ def test_one_within_another_leaves_it_its_children(log: Path) -> None:
 
 @LINUX
 def test_a_cradle_ends_with_its_launcher() -> None:
-    code = "import time\nfrom zsim_deploy.nursery import Nursery\n"
+    code = "import time\nfrom zsim_deploy.forkserver.role_launcher import Nursery\n"
     code += "with Nursery(lambda _: None) as nursery: print(nursery._cradle.pid, flush=True); time.sleep(100)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as launcher:
         assert launcher.stdout is not None

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsim import keys
+from zsim.contract import keys
 from zsim.errors import ScenarioError
-from zsim.obstacle import nearest, row_of
-from zsim.scenario import Obstacle, Scenario
-from zsim.scenario_file import resolve
-from zsim_world.fleet import Fleet
-from zsim_world.vehicle import HULL_RADIUS_M
-from zsim_world.world import World
+from zsim.scenario.obstacle import nearest, row_of
+from zsim.scenario.scenario import Obstacle, Scenario
+from zsim.scenario.scenario_file import resolve
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.flight.world import World
+from zsim_world.state.vehicle import HULL_RADIUS_M
 
 BOX = {"name": "wall", "shape": "box", "position_m": [4, 0, 0], "size_m": [1, 6, 5]}
 PILLAR = {"name": "pillar", "shape": "cylinder", "position_m": [4, 0.1, 0], "radius_m": 0.5, "height_m": 5}

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from octave import needs_octave, run
 
-from zsim.scenario import Gains
-from zsim_agents.cluster_space import cluster_space
-from zsim_agents.controller import gains_of
-from zsim_agents.engagement import Engagement
-from zsim_agents.flight_data import GateInput, GateOutput
-from zsim_agents.flight_plan import Scheduled
-from zsim_agents.flight_request import Engage, Land, TakeOff, Target
-from zsim_agents.formation import FormationLaw
+from zsim.scenario.scenario import Gains
+from zsim_agents.formation.controller import gains_of
+from zsim_agents.formation.engagement import Engagement
+from zsim_agents.formation.flight_data import GateInput, GateOutput
+from zsim_agents.formation.flight_plan import Scheduled
+from zsim_agents.formation.flight_request import Engage, Land, TakeOff, Target
+from zsim_agents.formation.formation_law import FormationLaw
+from zsim_agents.formation.spaces.cluster_space import cluster_space
 
 pytestmark = needs_octave
 

@@ -7,12 +7,14 @@ from typing import Any
 import pytest
 import yaml
 
-from zsim import scenario_file
 from zsim.errors import HostsError, RunError
-from zsim_deploy import certificates, hosts_commands, inventory
-from zsim_deploy.enrolment import Enrolment
-from zsim_deploy.intercom import Intercom
-from zsim_deploy.plan import Plan
+from zsim.scenario import scenario_file
+from zsim_deploy.cli import hosts_commands
+from zsim_deploy.control.control_socket import Intercom
+from zsim_deploy.hosts.host_plan import Plan
+from zsim_deploy.inventory import inventory
+from zsim_deploy.security import certificates
+from zsim_deploy.security.enrolment import Enrolment
 
 SCENARIO = """
 name: pair

@@ -7,9 +7,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from zsim import batch, keys, messages, scenario_file
-from zsim.errors import RecordError
-from zsim.messages import (
+from zsim.contract import batch, keys, messages
+from zsim.contract.messages import (
     Bye,
     Clock,
     ClusterState,
@@ -28,10 +27,12 @@ from zsim.messages import (
     Velocity,
     ViewDrones,
 )
+from zsim.errors import RecordError
 from zsim.record import Recorded, RecordReader, RecordWriter
-from zsim_world.playback import NOBODY, Choice, Playback
-from zsim_world.playback_tape import Tape
-from zsim_world.world import World
+from zsim.scenario import scenario_file
+from zsim_world.flight.world import World
+from zsim_world.playback.gate_reader import Tape
+from zsim_world.playback.playback import NOBODY, Choice, Playback
 
 GATE_NS = 20_000_000
 ZEROS = (0.0, 0.0, 0.0)

@@ -6,16 +6,16 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from zsim import keys, messages
+from zsim.contract import keys, messages
+from zsim.contract.messages import ControlAnswer
 from zsim.errors import RunError
-from zsim.messages import ControlAnswer
-from zsim_deploy import poke
+from zsim_deploy.cli.inspect import poke
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fake_link import FakeLink
 from synthetic_record import SCENARIOS, info
 
-from zsim import scenario_file
+from zsim.scenario import scenario_file
 
 INFO = info(scenario_file.load(SCENARIOS / "step.yaml"))
 MODE = "drone/drone1/cmd/mode"

@@ -15,12 +15,13 @@ from typing import Any
 import pytest
 
 from zsim.errors import HostsError, InventoryError
-from zsim_deploy import inventory, on_host
-from zsim_deploy.host_link import HostLink
-from zsim_deploy.installer import installer
-from zsim_deploy.inventory import Host, Inventory, Placed
-from zsim_deploy.push import ASK_S, is_there, missing, push
-from zsim_deploy.wheelhouse import House, Wheel
+from zsim_deploy.inventory import inventory
+from zsim_deploy.inventory.inventory import Host, Inventory, Placed
+from zsim_deploy.push import on_host
+from zsim_deploy.push.installer import installer
+from zsim_deploy.push.push import ASK_S, is_there, missing, push
+from zsim_deploy.push.wheelhouse import House, Wheel
+from zsim_deploy.ssh.host_link import HostLink
 
 
 def wheel(name: str, size_bytes: int = 1, sha256: str | None = None) -> Wheel:
@@ -191,7 +192,7 @@ def test_a_program_ends_whose_launcher_fell_silent(tmp_path: Path) -> None:
 
 
 def test_a_launcher_that_lives_shows_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("zsim_deploy.installer.BEAT_S", 0.01)
+    monkeypatch.setattr("zsim_deploy.push.installer.BEAT_S", 0.01)
 
     async def work() -> dict[str, Any]:
         host = Greeting()
@@ -238,7 +239,7 @@ def test_a_second_push_says_whom_it_waits_for(tmp_path: Path) -> None:
 
 
 def test_who_pushes_for_too_long_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("zsim_deploy.installer.WAIT_S", 0.01)
+    monkeypatch.setattr("zsim_deploy.push.installer.WAIT_S", 0.01)
 
     async def work() -> str:
         async with installer(Greeting(), sys.executable, str(tmp_path), hush):

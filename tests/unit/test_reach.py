@@ -5,8 +5,8 @@ from typing import Any
 import typer
 from typer.testing import CliRunner
 
-from zsim_deploy.arguments import DEFAULT_ENDPOINT
-from zsim_deploy.reach import LOOK_S, Reach, looks, takes_part
+from zsim_deploy.options.arguments import DEFAULT_ENDPOINT
+from zsim_deploy.options.reach import LOOK_S, Reach, looks, takes_part
 
 
 def given(decorate: Any, *arguments: str) -> tuple[Reach, str, int]:

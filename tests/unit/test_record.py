@@ -15,12 +15,12 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from zsim import keys, messages
+from zsim.contract import keys, messages
+from zsim.contract.messages import Clock, Imu
 from zsim.errors import RecordError
-from zsim.messages import Clock, Imu
 from zsim.record import Recorded, RecordReader, RecordWriter, repair
-from zsim.record.layout import CHUNK_HEAD, HEAD, places
-from zsim.record.writer import CHUNK_BYTES
+from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, places
+from zsim.record.record_writer import CHUNK_BYTES
 
 GATE_NS = 20_000_000
 CHUNK_MESSAGES = 40  # per chunk of the records below
@@ -346,7 +346,7 @@ def test_no_more_than_a_chunk_is_held_back(tmp_path):
 
 
 def test_times_and_keys_beyond_the_format_are_held_in_bounds(tmp_path, monkeypatch):
-    monkeypatch.setattr("zsim.record.writer.CHANNELS_MAX", 2)
+    monkeypatch.setattr("zsim.record.record_writer.CHANNELS_MAX", 2)
     path = tmp_path / "run.mcap"
     with RecordWriter(path) as writer:
         writer.add("a", b"1", "", -5, 1)

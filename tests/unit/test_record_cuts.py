@@ -12,14 +12,14 @@ from mcap.records import Chunk, MessageIndex
 from mcap.stream_reader import StreamReader
 from typer.testing import CliRunner
 
-from zsim import messages
+from zsim.contract import messages
 from zsim.errors import RecordError, ZsimError
 from zsim.record import Recorded, RecordReader, repair
-from zsim.record.layout import CHUNK_HEAD, HEAD, MAGIC, Place, places
-from zsim_deploy.export.form import Format
-from zsim_deploy.export.make import export
-from zsim_deploy.export.selection import Selection
-from zsim_deploy.report import judge
+from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, MAGIC, Place, places
+from zsim_analysis.export.formats import Format
+from zsim_analysis.export.make_export import export
+from zsim_analysis.export.selection import Selection
+from zsim_analysis.report import judge
 
 sys.path.insert(0, str(Path(__file__).parent))
 import recorded_run
@@ -219,7 +219,7 @@ def test_everybody_reads_what_is_before_the_cut(work: Callable[[Path], Made], ru
 
 
 def test_the_commands_say_that_a_record_was_cut(run: Path, tmp_path: Path) -> None:
-    from zsim_deploy.cli import app
+    from zsim_deploy.cli.cli import app
 
     data = run.read_bytes()
     (tmp_path / "run.mcap").write_bytes(data[: len(data) // 2])

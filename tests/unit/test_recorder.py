@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from msgspec import Struct
 
-from zsim import batch, keys, messages
-from zsim.bundle import Bundle, table_of
-from zsim.messages import Clock, ControlAnswer, DroneInfo, Faults, Imu, Info, Origin
+from zsim.contract import batch, keys, messages
+from zsim.contract.bundle import Bundle, table_of
+from zsim.contract.messages import Clock, ControlAnswer, DroneInfo, Faults, Imu, Info, Origin
 from zsim.record import RecordReader
 from zsim_agents import recorder
 from zsim_agents.recorder import record
@@ -156,7 +156,7 @@ def test_garbage_is_recorded_as_it_came(tmp_path: Path, key: str, payload: bytes
 
 
 def test_what_a_record_has_no_room_for_is_counted_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("zsim.record.writer.CHANNELS_MAX", 2)
+    monkeypatch.setattr("zsim.record.record_writer.CHANNELS_MAX", 2)
     link, said = FakeLink(), []
     link.on_request = lambda key, args: page([])
     link.deliver(batch.KEY, batch.encode([imu(1), clock(1), imu(2), clock(3, "stopped")]))

@@ -3,11 +3,11 @@
 import pytest
 from msgspec import Struct
 
-from zsim import keys, messages
-from zsim.messages import Done, Velocity
-from zsim.session import Sample
-from zsim_world.history import History
-from zsim_world.recovery import unheard
+from zsim.contract import keys, messages
+from zsim.contract.messages import Done, Velocity
+from zsim.transport.session import Sample
+from zsim_world.server.lost_outputs import unheard
+from zsim_world.server.message_history import History
 
 VELOCITY = keys.command("d1", "velocity")
 

@@ -1,6 +1,6 @@
 """Which refusals are told."""
 
-from zsim_world.refusals import REASONS, TOLD, Refusals
+from zsim_world.flight.refusal_log import REASONS, TOLD, Refusals
 
 MODE = "drone/d1/cmd/mode"
 

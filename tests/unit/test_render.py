@@ -13,14 +13,15 @@ import typer
 import yaml
 from typer.testing import CliRunner
 
-from zsim import scenario_file
 from zsim.errors import InventoryError, RunError
-from zsim.scenario import Scenario
-from zsim_deploy import inventory, render_commands
-from zsim_deploy.cli import app
-from zsim_deploy.inventory import Placed
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_deploy.cli import render_commands
+from zsim_deploy.cli.cli import app
+from zsim_deploy.inventory import inventory
+from zsim_deploy.inventory.inventory import Placed
 from zsim_deploy.render import compose, kubernetes, systemd
-from zsim_deploy.render.folder import write
+from zsim_deploy.render.render_folder import write
 
 ROOT = Path(__file__).parents[2]
 STEP = ROOT / "scenarios/step.yaml"

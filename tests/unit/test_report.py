@@ -16,13 +16,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from zsim import keys, messages, scenario_file
+from zsim.contract import keys, messages
 from zsim.errors import RecordError, ReportError
 from zsim.record import RecordReader, RecordWriter
-from zsim_deploy.report import judge, make_report, table
-from zsim_deploy.report.canvas import thinned
-from zsim_deploy.report.page import page
-from zsim_deploy.report.statistics import window
+from zsim.scenario import scenario_file
+from zsim_analysis.reading.formation_errors import window
+from zsim_analysis.report import judge, make_report, table
+from zsim_analysis.report.figures.canvas import thinned
+from zsim_analysis.report.report_page import page
 
 sys.path.insert(0, str(Path(__file__).parent))
 import synthetic_record

@@ -10,9 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from zsim.errors import RecordError, ReportError
-from zsim_deploy.cli import app
-from zsim_deploy.report import compare, comparison_path, judge
-from zsim_deploy.report.comparison import (
+from zsim_analysis.report import compare, comparison_path, judge
+from zsim_analysis.report.comparison.comparison import (
     ABSENT,
     THERE,
     Compared,
@@ -22,9 +21,10 @@ from zsim_deploy.report.comparison import (
     run_names,
     scenario_rows,
 )
-from zsim_deploy.report.comparison_figures import comparison_figures
-from zsim_deploy.report.comparison_page import STATISTICS, fact_rows, statistics_rows
-from zsim_deploy.report.comparison_style import STYLES, style
+from zsim_analysis.report.comparison.comparison_figures import comparison_figures
+from zsim_analysis.report.comparison.comparison_page import STATISTICS, fact_rows, statistics_rows
+from zsim_analysis.report.comparison.comparison_style import STYLES, style
+from zsim_deploy.cli.cli import app
 
 sys.path.insert(0, str(Path(__file__).parent))
 import synthetic_record

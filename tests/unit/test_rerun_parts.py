@@ -8,13 +8,15 @@ from typing import Any
 import msgspec
 import pytest
 
-from zsim import __version__, keys, messages, scenario_file
-from zsim.messages import Bye, Clock, ClusterRequest, Estimate, Event, Health, Join, Message, Mode, Truth
+from zsim import __version__
+from zsim.contract import keys, messages
+from zsim.contract.messages import Bye, Clock, ClusterRequest, Estimate, Event, Health, Join, Message, Mode, Truth
 from zsim.record import RecordReader, RecordWriter
-from zsim_deploy.rerun_cast import Cast, Team, cast_of
-from zsim_deploy.rerun_compare import Answers, Comparison, difference
-from zsim_deploy.rerun_tape import passages
-from zsim_world.world import World
+from zsim.scenario import scenario_file
+from zsim_analysis.rerun.participants import Cast, Team, cast_of
+from zsim_analysis.rerun.recorded_inputs import passages
+from zsim_analysis.rerun.truth_comparison import Answers, Comparison, difference
+from zsim_world.flight.world import World
 
 GATE_NS = 20_000_000
 PRINT = "f" * 16

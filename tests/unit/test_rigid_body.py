@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from zsim.scenario_file import resolve
-from zsim_world import rigid_body as body
-from zsim_world import vehicle
+from zsim.scenario.scenario_file import resolve
+from zsim_world.physics import rigid_body as body
+from zsim_world.state import vehicle
 
 OFF = (0.0, 0.0, 0.0, 0.0)
 CALM = NOBODY = (0.0, 0.0, 0.0)

@@ -9,19 +9,20 @@ from typing import Any, cast
 import msgspec
 import pytest
 
-from zsim import batch, keys, messages, scenario_file
-from zsim.bundle import Bundle, table_of
+from zsim.contract import batch, keys, messages
+from zsim.contract.bundle import Bundle, table_of
 from zsim.errors import RunError, SessionError
-from zsim.health import HealthMeter
-from zsim.scenario import Scenario
-from zsim.session import Sample
-from zsim_agents.presence import Presence
-from zsim_agents.ros1 import intake as intake_module
-from zsim_agents.ros1 import message_types
-from zsim_agents.ros1.bridge import Bridge, check_names
-from zsim_agents.ros1.drone_topics import DroneTopics
-from zsim_agents.ros1.intake import Intake
-from zsim_agents.ros1.node import Node
+from zsim.runtime.health import HealthMeter
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim.transport.session import Sample
+from zsim_bridges.observer_process import Presence
+from zsim_bridges.ros1 import intake as intake_module
+from zsim_bridges.ros1.bridge import Bridge, check_names
+from zsim_bridges.ros1.drone_topics import DroneTopics
+from zsim_bridges.ros1.intake import Intake
+from zsim_bridges.ros1.wire import message_types
+from zsim_bridges.ros1.wire.node import Node
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fake_link import FakeLink

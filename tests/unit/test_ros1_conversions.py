@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from zsim import messages
-from zsim_agents.ros1 import conversions, message_types
-from zsim_agents.ros1.conversions import Frames
-from zsim_agents.ros1.onboard import Onboard
+from zsim.contract import messages
+from zsim_bridges.ros1 import conversions
+from zsim_bridges.ros1.conversions import Frames
+from zsim_bridges.ros1.onboard import Onboard
+from zsim_bridges.ros1.wire import message_types
 
 T_NS = 61_040_000_000
 FRAMES = Frames("drone1")

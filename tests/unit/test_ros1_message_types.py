@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsim_agents.ros1 import message_types
+from zsim_bridges.ros1.wire import message_types
 
 MD5 = {  # as `rosmsg md5` of Noetic prints them; of Navdata as ardrone_autonomy's generated code has it
     "std_msgs/String": "992ce8a1687cec8c8bd883ec73ca41d1",

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from zsim.errors import RunError
-from zsim_agents.ros1 import message_types, registration, streams, tcpros
-from zsim_agents.ros1.master_uri import master_address, reachable_as
-from zsim_agents.ros1.node import Node
+from zsim_bridges.ros1.wire import message_types, registration, tcpros, tcpros_streams
+from zsim_bridges.ros1.wire.master_uri import master_address, reachable_as
+from zsim_bridges.ros1.wire.node import Node
 
 sys.path.insert(0, str(Path(__file__).parent))
 from ros1_master import Master
@@ -138,7 +138,7 @@ def test_a_subscriber_is_told_type_and_definition(graph):
         a.publish("/t", TWIST, 10)
         async with a.running():
             reader, writer = await connect(await graph.port("/t"), subscriber("/t"))
-            header = await streams.read_header(reader)
+            header = await tcpros_streams.read_header(reader)
             writer.close()
             return header
 
@@ -165,7 +165,7 @@ def test_who_wants_something_else_is_refused_as_ros_does(graph, header, reason):
         a.publish("/t", TWIST, 10)
         async with a.running():
             reader, writer = await connect(await graph.port("/t"), header)
-            answer = await streams.read_header(reader)
+            answer = await tcpros_streams.read_header(reader)
             assert await reader.read() == b""  # and hung up
             writer.close()
             return answer["error"]
@@ -181,14 +181,14 @@ def test_garbage_ends_its_own_connection_only(graph, garbage):
         async with a.running():
             port = await graph.port("/t")
             reader, writer = await connect(port, subscriber("/t"))
-            await streams.read_header(reader)
+            await tcpros_streams.read_header(reader)
             other, nonsense = await asyncio.open_connection("127.0.0.1", port)
             nonsense.write(garbage)
             nonsense.write_eof()
             await other.read()
             nonsense.close()
             topic.publish(lambda _: twist(7.0))
-            assert message_types.deserialize(TWIST, await streams.read_frame(reader)).linear.x == 7.0
+            assert message_types.deserialize(TWIST, await tcpros_streams.read_frame(reader)).linear.x == 7.0
             writer.close()
 
     asyncio.run(run())
@@ -205,11 +205,11 @@ def test_a_subscriber_that_does_not_read_loses_the_oldest_and_holds_up_nobody(gr
             lazy = socket.create_connection(("127.0.0.1", port))
             lazy.sendall(tcpros.encode_header(subscriber("/t")))
             reader, writer = await connect(port, subscriber("/t"))
-            await streams.read_header(reader)
+            await tcpros_streams.read_header(reader)
             await until(lambda: len(topic.outlets) == 2)
             for n in range(200):
                 topic.publish(lambda _, n=n: string(data=f"{n:04d}{text}"))
-                assert (await streams.read_frame(reader))[4:8] == b"%04d" % n
+                assert (await tcpros_streams.read_frame(reader))[4:8] == b"%04d" % n
             stuck = max(topic.outlets, key=lambda outlet: outlet.lost)
             assert stuck.lost > 0
             assert sum(outlet.lost for outlet in topic.outlets) == stuck.lost  # the other lost nothing
@@ -233,7 +233,7 @@ def test_a_publisher_that_sends_garbage_is_told_of_once_and_heard_again(graph):
         node.subscribe("/t", TWIST, take)
 
         async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            await streams.read_header(reader)
+            await tcpros_streams.read_header(reader)
             writer.write(tcpros.encode_header(tcpros.publisher_header(message_types.offer("/t", TWIST), "/bad")))
             negative, good = (message_types.serialize(TWIST, twist(x)) for x in (-1.0, 5.0))
             for payload in (b"short", negative, b"x" * 49, good):
@@ -340,7 +340,7 @@ def test_what_a_node_said_just_before_it_left_is_heard(graph):
         left = asyncio.Event()
 
         async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            await streams.read_header(reader)
+            await tcpros_streams.read_header(reader)
             writer.write(tcpros.encode_header(tcpros.publisher_header(message_types.offer("/t", TWIST), "/a")))
             await left.wait()
             writer.write(tcpros.frame(message_types.serialize(TWIST, twist(3.0))))
@@ -379,10 +379,10 @@ def test_a_service_answers_and_refuses(graph):
 
     async def ask(port: int, request: bytes = b"") -> tuple[int, bytes]:
         reader, writer = await connect(port, {"callerid": "/tester", "service": "/s", "md5sum": "*"})
-        assert (await streams.read_header(reader))["type"] == "std_srvs/Empty"
+        assert (await tcpros_streams.read_header(reader))["type"] == "std_srvs/Empty"
         writer.write(tcpros.frame(request))
         (ok,) = await reader.readexactly(1)
-        answer = await streams.read_frame(reader)
+        answer = await tcpros_streams.read_frame(reader)
         assert await reader.read() == b""
         writer.close()
         return ok, answer
@@ -410,11 +410,11 @@ def test_a_service_can_be_asked_for_its_type_and_asked_again_and_again(graph):
             port = int(graph.master.graph.services["/s"].rsplit(":", 1)[1])
             asked = {"callerid": "/tester", "service": "/s", "md5sum": "*"}
             reader, writer = await connect(port, asked | {"probe": "1"})
-            assert (await streams.read_header(reader))["request_type"] == "std_srvs/EmptyRequest"
+            assert (await tcpros_streams.read_header(reader))["request_type"] == "std_srvs/EmptyRequest"
             assert await reader.read() == b""
             writer.close()
             reader, writer = await connect(port, asked | {"persistent": "1"})
-            await streams.read_header(reader)
+            await tcpros_streams.read_header(reader)
             for _ in range(3):
                 writer.write(tcpros.frame(b""))
                 assert await reader.readexactly(5) == b"\x01\0\0\0\0"
@@ -431,9 +431,9 @@ def test_the_slave_api_tells_what_ros_s_tools_ask(graph):
         async with a.running():
             uri = await graph.uri("/t")
             reader, writer = await connect(await graph.port("/t"), subscriber("/t"))
-            await streams.read_header(reader)
+            await tcpros_streams.read_header(reader)
             topic.publish(lambda _: twist(1.0))
-            await streams.read_frame(reader)
+            await tcpros_streams.read_frame(reader)
             await until(lambda: topic.outlets[0].sent > 0)
             assert (await call(uri, "getPublications"))[2] == [["/t", TWIST]]
             assert (await call(uri, "getSubscriptions"))[2] == [["/in", EMPTY]]

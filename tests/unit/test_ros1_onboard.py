@@ -5,10 +5,10 @@ import math
 import msgspec
 import pytest
 
-from zsim import messages
-from zsim.scenario import Mount
-from zsim_agents import ros_frames
-from zsim_agents.ros1.onboard import Onboard
+from zsim.contract import messages
+from zsim.scenario.scenario import Mount
+from zsim_bridges import ros_frames
+from zsim_bridges.ros1.onboard import Onboard
 
 S = 1_000_000_000
 REST = (0.0, 0.0, 9.80665)

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from zsim import messages
-from zsim_agents.ros1 import message_types
-from zsim_agents.ros1.pilot import REPEAT_NS, Pilot, Tilt, tilt_of
+from zsim.contract import messages
+from zsim_bridges.ros1.pilot import REPEAT_NS, Pilot, Tilt, tilt_of
+from zsim_bridges.ros1.wire import message_types
 
 GATE_NS = 20_000_000
 Vector3 = message_types.message("geometry_msgs/Vector3")

@@ -7,18 +7,19 @@ from typing import Any
 import pytest
 from federation import PAIR
 
-from zsim import keys, messages, scenario_file
-from zsim.messages import ClusterInfo, ControlAnswer, DroneInfo, Info, Origin
-from zsim.session import Heard, Sample
-from zsim.settings import Mode
-from zsim_agents.presence import Presence
-from zsim_agents.ros2 import wire
-from zsim_agents.ros2.bridge import Bridge
-from zsim_agents.ros2.feeds import SAMPLES_MAX
-from zsim_agents.ros2.inbox import Inbox
-from zsim_agents.ros2.participant import Participant
-from zsim_agents.ros2.types import Types
-from zsim_agents.ros2.wire import Attachment, Endpoint, NodeId
+from zsim.contract import keys, messages
+from zsim.contract.messages import ClusterInfo, ControlAnswer, DroneInfo, Info, Origin
+from zsim.scenario import scenario_file
+from zsim.transport.session import Heard, Sample
+from zsim.transport.zenoh_settings import Mode
+from zsim_bridges.observer_process import Presence
+from zsim_bridges.ros2 import rmw_zenoh
+from zsim_bridges.ros2.bridge import Bridge
+from zsim_bridges.ros2.callback_queue import Inbox
+from zsim_bridges.ros2.participant import Participant
+from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId
+from zsim_bridges.ros2.ros_types import Types
+from zsim_bridges.ros2.source_keys import SAMPLES_MAX
 
 TYPES = Types()
 READER = NodeId(0, "abc", 1, "/", "reader")
@@ -141,12 +142,12 @@ class Bench:
 
     def reader(self, topic: str, kind: str, alive: bool = True) -> None:
         """Let a subscription come or go."""
-        endpoint = Endpoint("MS", topic, wire.dds_name(kind), TYPES.hash(kind))
-        self.link.on_token_of(wire.endpoint_token(READER, 2, endpoint, wire.DEFAULT), alive)
+        endpoint = Endpoint("MS", topic, rmw_zenoh.dds_name(kind), TYPES.hash(kind))
+        self.link.on_token_of(rmw_zenoh.endpoint_token(READER, 2, endpoint, rmw_zenoh.DEFAULT), alive)
         self.turn()
 
     def key(self, topic: str, kind: str) -> str:
-        return wire.data_key(0, topic, wire.dds_name(kind), TYPES.hash(kind))
+        return rmw_zenoh.data_key(0, topic, rmw_zenoh.dds_name(kind), TYPES.hash(kind))
 
     def publish(self, topic: str, kind: str, message: Any, attachment: bytes = BESIDE) -> None:
         """Let a ROS node publish."""
@@ -186,9 +187,9 @@ def test_a_topic_is_read_and_converted_only_while_somebody_subscribes() -> None:
     assert first == bench.key("/drone_1/imu", IMU)
     assert TYPES.decode(payload, IMU).header.frame_id == "drone_1/imu_link"
     (token,) = (each for each in bench.link.tokens if "/%drone_1%imu/" in each)
-    sent = wire.attachment_of(beside)
-    assert sent == (1, WALL_NS, wire.gid_of(token))
-    assert wire.attachment_of(later).sequence == 2
+    sent = rmw_zenoh.attachment_of(beside)
+    assert sent == (1, WALL_NS, rmw_zenoh.gid_of(token))
+    assert rmw_zenoh.attachment_of(later).sequence == 2
     bench.reader("/drone_1/imu", IMU, alive=False)
     assert not bench.link.hearing[key]
 
@@ -292,7 +293,7 @@ def test_a_service_asks_the_controller_and_echoes_who_asked() -> None:
     assert key == bench.key("/cluster/m_x/engage", TRIGGER)
     response = TYPES.decode(payload, "std_srvs/srv/Trigger_Response")
     assert (response.success, response.message) == (False, "phase is idle; possible when engaged")
-    assert wire.attachment_of(beside) == (7, WALL_NS, bytes(range(16)))
+    assert rmw_zenoh.attachment_of(beside) == (7, WALL_NS, bytes(range(16)))
 
 
 def test_a_request_that_is_none_ends_without_a_reply() -> None:
@@ -321,7 +322,7 @@ def test_a_summary_of_a_gate_has_what_was_told_up_to_it() -> None:
 
 def test_frames_that_never_move_are_kept_for_who_comes_later() -> None:
     ((key, payload, _),) = Bench().link.kept
-    assert key == wire.data_key(
+    assert key == rmw_zenoh.data_key(
         0, "/tf_static", "tf2_msgs::msg::dds_::TFMessage_", TYPES.hash("tf2_msgs/msg/TFMessage")
     )
     children = {each.child_frame_id for each in TYPES.decode(payload, "tf2_msgs/msg/TFMessage").transforms}

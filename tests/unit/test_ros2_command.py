@@ -7,9 +7,9 @@ import typer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from zsim.errors import RunError
-from zsim_agents.ros2.definitions import MESSAGES
-from zsim_agents.ros2.types import Types
-from zsim_deploy.ros2_command import ros2
+from zsim_bridges.ros2.definitions import MESSAGES
+from zsim_bridges.ros2.ros_types import Types
+from zsim_deploy.cli.ros2_command import ros2
 
 
 def test_the_package_has_the_types_that_go_over_the_wire(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

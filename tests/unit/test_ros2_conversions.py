@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from federation import ONE
 
-from zsim import messages, scenario_file
-from zsim.frames import quaternion_from_rpy, rotate
-from zsim.messages import Quaternion, Vector3
-from zsim.scenario import ErrorModel, Mount, Sensors
-from zsim_agents.ros2 import conversions, frames, topics, wire
-from zsim_agents.ros2.navdata import Navdata
-from zsim_agents.ros2.types import Types
+from zsim.contract import messages
+from zsim.contract.messages import Quaternion, Vector3
+from zsim.math.frames import quaternion_from_rpy, rotate
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import ErrorModel, Mount, Sensors
+from zsim_bridges.ros2 import conversions, rmw_zenoh, sensor_frames, topics
+from zsim_bridges.ros2.navdata import Navdata
+from zsim_bridges.ros2.ros_types import Types
 
 TYPES = Types()
 SENSORS = scenario_file.from_text(ONE).drones[0].sensors
@@ -125,7 +126,7 @@ def test_odometry_turns_as_its_attitudes_do(rate: Vector3) -> None:
     angle = math.hypot(*half)
     first = quaternion(0.1, -0.2, 3.0)
     turn = [math.cos(angle), *(math.sin(angle) / angle * each if angle else 0.0 for each in half)]
-    second = frames.quaternion_multiply(first, turn)
+    second = sensor_frames.quaternion_multiply(first, turn)
     maker.take("", estimate(T_NS, first))
     for q in (second, -second):
         maker.take("", estimate(T_NS, first))
@@ -135,14 +136,14 @@ def test_odometry_turns_as_its_attitudes_do(rate: Vector3) -> None:
 
 def test_into_body_is_the_inverse_of_the_frames_rotation() -> None:
     q = quaternion(0.3, -0.4, 2.0)
-    assert rotate(q, frames.into_body(q, (1.0, 2.0, 3.0))) == pytest.approx([1.0, 2.0, 3.0])
+    assert rotate(q, sensor_frames.into_body(q, (1.0, 2.0, 3.0))) == pytest.approx([1.0, 2.0, 3.0])
 
 
 def test_sonar_frame_looks_along_the_beam_of_a_turned_mount() -> None:
     """ROS's range finders look along x; this sonar is tilted by 30 deg about y, its beam from down to the front."""
     mount = Mount(position_m=(0.1, 0.0, -0.02), rpy_deg=(0.0, -30.0, 0.0))
     spec = _with_sonar(mount)
-    placed = {pose.child: pose for pose in frames.fixed("drone1", spec)}
+    placed = {pose.child: pose for pose in sensor_frames.fixed("drone1", spec)}
     sonar = placed["drone1/sonar_link"]
     assert sonar.position_m == (0.1, 0.0, -0.02)
     beam = rotate(sonar.orientation_wxyz, (1.0, 0.0, 0.0))
@@ -230,7 +231,7 @@ def test_navdata_of_a_drone_that_has_told_nothing_yet() -> None:
 def test_the_documents_table_has_every_topic() -> None:
     """docs/ros2.md: topic, type, frame, QoS; the drone's and the cluster's name is NAME there."""
     page = (Path(__file__).parents[2] / "docs" / "ros2.md").read_text()
-    qos = {wire.SENSOR: "sensor", wire.DEFAULT: "default", wire.CLOCK: "clock", wire.TF: "tf"}
+    qos = {rmw_zenoh.SENSOR: "sensor", rmw_zenoh.DEFAULT: "default", rmw_zenoh.CLOCK: "clock", rmw_zenoh.TF: "tf"}
     rows = [[cell.strip().strip("`") for cell in line.split("|")[1:-1]] for line in page.splitlines() if "|" in line]
     told = {row[0]: (row[1], row[3]) for row in rows if len(row) == 6 and row[0].startswith("/")}
     assert told.pop("/tf_static") == ("tf2_msgs/msg/TFMessage", "static")

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsim_agents.ros2.definitions import MESSAGES
-from zsim_agents.ros2.types import Types
+from zsim_bridges.ros2.definitions import MESSAGES
+from zsim_bridges.ros2.ros_types import Types
 
 TYPES = Types()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from zsim_agents import ros_frames
+from zsim_bridges import ros_frames
 
 
 def test_a_time_is_seconds_and_nanoseconds():

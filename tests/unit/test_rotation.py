@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from zsim_world import rotation as rot
+from zsim.math import rotation as rot
 
 number = st.floats(-5.0, 5.0)
 vectors = st.tuples(number, number, number)

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim.scenario import Drone, Environment
-from zsim.scenario_file import resolve
-from zsim_world import vehicle
-from zsim_world.rotors import ground_effect, lagged, mix, wrench
+from zsim.scenario.scenario import Drone, Environment
+from zsim.scenario.scenario_file import resolve
+from zsim_world.physics.rotors import ground_effect, lagged, mix, wrench
+from zsim_world.state import vehicle
 
 LEVEL, STILL, NO_SLEW = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
 HIGH = 1000.0  # m, out of ground effect

@@ -6,12 +6,12 @@ from typing import Any, ClassVar
 
 import pytest
 
-from zsim import scenario_file
 from zsim.errors import RunError, SessionError
-from zsim_deploy import run
-from zsim_deploy.nursery import Nursery
-from zsim_deploy.run import Options
-from zsim_deploy.watch import Outcome
+from zsim.scenario import scenario_file
+from zsim_deploy.forkserver.role_launcher import Nursery
+from zsim_deploy.launch import run
+from zsim_deploy.launch.run import Options
+from zsim_deploy.launch.supervisor import Outcome
 
 sys.path.insert(0, str(Path(__file__).parent))
 from synthetic_record import SCENARIOS

@@ -9,12 +9,13 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from zsim import batch, keys, membership, messages
-from zsim.agent import Agent, Output
-from zsim.bundle import Bundle, table_of
+from zsim.contract import batch, keys, messages
+from zsim.contract.bundle import Bundle, table_of
+from zsim.contract.messages import ControlAnswer, Done, DroneInfo, Estimate, Event, Info, Mag, Origin, Status
 from zsim.errors import BehindError, RunError, SupersededError
-from zsim.messages import ControlAnswer, Done, DroneInfo, Estimate, Event, Info, Mag, Origin, Status
-from zsim.runner import Runner
+from zsim.runtime import membership
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.runner import Runner
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fake_link import UNANSWERED, FakeLink

@@ -12,13 +12,13 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim import scenario_file
 from zsim.errors import ScenarioError
-from zsim.overrides import whole_path
-from zsim.presets import G_M_S2, PRESETS
-from zsim.scenario import DRONES_MAX, Scenario
-from zsim.scenario_file import FAULTS_MAX
-from zsim.yaml_file import FILE_SIZE_MAX
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import DRONES_MAX, Scenario
+from zsim.scenario.scenario_file import FAULTS_MAX
+from zsim.scenario.sensor_presets import G_M_S2, PRESETS
+from zsim.schema.overrides import whole_path
+from zsim.schema.yaml_file import FILE_SIZE_MAX
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 STEP = SCENARIOS / "step.yaml"

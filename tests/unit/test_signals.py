@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from zsim_deploy.signals import Signals
+from zsim_deploy.terminal.signals import Signals
 
 TALKS = """
 import signal, sys
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever runs the tests may be under nohup
 from pathlib import Path
-from zsim_deploy.signals import Signals
+from zsim_deploy.terminal.signals import Signals
 told = []
 with Signals(Path(sys.argv[1]), lambda: told.append(1)):
     print("ready", flush=True)

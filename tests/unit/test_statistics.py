@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from zsim_world.statistics import GATES_KEPT, Ages, Measurements, Rate
+from zsim_world.flight.run_statistics import GATES_KEPT, Ages, Measurements, Rate
 
 MS = 1_000_000
 GATE_NS = 20 * MS
@@ -49,7 +49,7 @@ def test_old_gates_are_forgotten():
 
 
 def test_old_ages_are_forgotten(monkeypatch):
-    monkeypatch.setattr("zsim_world.statistics.AGES_KEPT", 2)
+    monkeypatch.setattr("zsim_world.flight.run_statistics.AGES_KEPT", 2)
     ages = Ages()
     ages.published(0, 0)
     for age_ms in (9, 8, 3, 2, 1):

@@ -4,11 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from zsim.scenario_file import resolve
-from zsim_world import drive, observer, rotation, steering
-from zsim_world.block import LANES
-from zsim_world.fleet import Fleet
-from zsim_world.vehicle import COLUMNS as PARAMETERS
+from zsim.math import rotation
+from zsim.scenario.scenario_file import resolve
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.physics.simd import LANES
+from zsim_world.state.vehicle import COLUMNS as PARAMETERS
+from zsim_world.vehicles import attitude_control, observer, simd_firmware
 
 COUNT = 11  # a whole block and a part of one
 STEP_TICKS = 2  # of 2.5 ms
@@ -54,26 +55,26 @@ def test_a_block_turns_and_drives_with_the_bits_of_each_drone():
         before = boards.belief.copy()
         fleet._integrate(STEP_TICKS)
         for i in range(COUNT):
-            w = lane(lanes, i, steering.BODY_RATE, 3)
+            w = lane(lanes, i, simd_firmware.BODY_RATE, 3)
             turn = rotation.from_rotation_vector(observer.step_turn(w))
             q = rotation.normalised(
                 rotation.multiply(tuple(before[i, observer.ATTITUDE : observer.ATTITUDE + 4]), turn)
             )
-            assert lane(lanes, i, steering.HEADING, 1) == (rotation.heading(q),)
-            if lane(lanes, i, steering.DRIVEN, 1) == (0.0,):
+            assert lane(lanes, i, simd_firmware.HEADING, 1) == (rotation.heading(q),)
+            if lane(lanes, i, simd_firmware.DRIVEN, 1) == (0.0,):
                 continue
             driven += 1
             sizes = {
-                steering.OWN: 4,
-                steering.ATTITUDE: 4,
-                steering.BODY_RATE: 3,
-                steering.ROTOR: 4,
-                steering.UPWARDS: 3,
+                simd_firmware.OWN: 4,
+                simd_firmware.ATTITUDE: 4,
+                simd_firmware.BODY_RATE: 3,
+                simd_firmware.ROTOR: 4,
+                simd_firmware.UPWARDS: 3,
             }
             own, believed, rate, rotor, z = (lane(lanes, i, at, size) for at, size in sizes.items())
-            thrust, yaw_rate = lane(lanes, i, steering.LIFT, 2)
-            row, gains = lane(lanes, i, 0, PARAMETERS), lane(lanes, i, steering.GAINS, 4)
-            found = drive.drive(row, gains, own, believed, rate, rotor, z, thrust, yaw_rate)
-            assert lane(lanes, i, steering.COMMAND, 4) == found
+            thrust, yaw_rate = lane(lanes, i, simd_firmware.LIFT, 2)
+            row, gains = lane(lanes, i, 0, PARAMETERS), lane(lanes, i, simd_firmware.GAINS, 4)
+            found = attitude_control.drive(row, gains, own, believed, rate, rotor, z, thrust, yaw_rate)
+            assert lane(lanes, i, simd_firmware.COMMAND, 4) == found
     assert driven == 60 * (COUNT - 2)
-    np.testing.assert_array_equal(lane(lanes, 2, steering.COMMAND, 4), fleet.bodies.command[2])
+    np.testing.assert_array_equal(lane(lanes, 2, simd_firmware.COMMAND, 4), fleet.bodies.command[2])

@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsim import scenario_file
+from zsim.contract.fingerprint import fingerprint
 from zsim.errors import RecordError, RunError
-from zsim.fingerprint import fingerprint
-from zsim.record import writer as record_writer
-from zsim_deploy import in_process
-from zsim_deploy.report import judge
-from zsim_deploy.report.formation import Formation
-from zsim_deploy.sweep import pool
-from zsim_deploy.sweep.flight import engaged_s, fly
-from zsim_deploy.sweep.row import Row
-from zsim_deploy.sweep.task import Task
-from zsim_deploy.sweep.worker import READY
-from zsim_world.fleet import DivergedError, Fleet
+from zsim.record import record_writer
+from zsim.scenario import scenario_file
+from zsim_analysis import in_process
+from zsim_analysis.reading.formation_variables import Formation
+from zsim_analysis.report import judge
+from zsim_analysis.sweep.fly import process_pool
+from zsim_analysis.sweep.fly.sweep_run import engaged_s, fly
+from zsim_analysis.sweep.fly.task import Task
+from zsim_analysis.sweep.fly.worker import READY
+from zsim_analysis.sweep.results.row import Row
+from zsim_world.fleet.fleet import DivergedError, Fleet
 
 GATE_NS = 20_000_000
 ONE = """
@@ -233,7 +233,7 @@ class FakeWorker:
 
 @pytest.fixture(autouse=True)
 def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(pool, "Worker", FakeWorker)
+    monkeypatch.setattr(process_pool, "Worker", FakeWorker)
     monkeypatch.setattr(FakeWorker, "stillborn", 0)
     monkeypatch.setattr(FakeWorker, "answer", None)
     FakeWorker.dies_of, FakeWorker.flown, FakeWorker.alive = {}, [], set()
@@ -242,7 +242,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def rows(count: int, said: list[str], workers: int = 2) -> list[Row]:
-    return list(pool.Pool(workers, said.append).rows(task(run=run) for run in range(count)))
+    return list(process_pool.Pool(workers, said.append).rows(task(run=run) for run in range(count)))
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
@@ -291,7 +291,7 @@ def test_what_no_run_survives_ends_the_sweep() -> None:
 
 
 def test_a_sweep_that_is_closed_leaves_no_worker() -> None:
-    flying = pool.Pool(2, lambda _: None).rows(task(run=run) for run in range(50))
+    flying = process_pool.Pool(2, lambda _: None).rows(task(run=run) for run in range(50))
     next(flying)
     flying.close()
     assert FakeWorker.alive == set()

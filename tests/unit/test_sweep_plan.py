@@ -9,13 +9,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from zsim import scenario_file
 from zsim.errors import ScenarioError
-from zsim_deploy.sweep.axes import Draw, Grid, Seeds, parse
-from zsim_deploy.sweep.design import Design, make_plan
-from zsim_deploy.sweep.document import read
-from zsim_deploy.sweep.places import inside, place
-from zsim_deploy.sweep.plan import Plan, difference
+from zsim.scenario import scenario_file
+from zsim_analysis.sweep.axes import Draw, Grid, Seeds, parse
+from zsim_analysis.sweep.design import Design, make_plan
+from zsim_analysis.sweep.document import read
+from zsim_analysis.sweep.paths import inside, place
+from zsim_analysis.sweep.sweep_plan import Plan, difference
 
 STEP = Path(__file__).parents[2] / "scenarios/step.yaml"
 GUST = "environment.wind.gust_m_s"

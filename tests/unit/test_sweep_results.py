@@ -15,17 +15,17 @@ import scipy.stats
 from rich.console import Console
 
 from zsim.errors import ReportError, RunError
-from zsim.streams import stream
-from zsim_deploy.sweep import intervals, journal, table
-from zsim_deploy.sweep.design import Design
-from zsim_deploy.sweep.figures import slices
-from zsim_deploy.sweep.folder import Folder, load, locked
-from zsim_deploy.sweep.plan import Plan, is_sweep
-from zsim_deploy.sweep.points import Parameter, Results, parameters, spread
-from zsim_deploy.sweep.report import make_sweep_report
-from zsim_deploy.sweep.report import table as shown_table
-from zsim_deploy.sweep.row import Result, Row, row
-from zsim_deploy.sweep.screen import SweepScreen, span
+from zsim.scenario.random_streams import stream
+from zsim_analysis.sweep.design import Design
+from zsim_analysis.sweep.results import intervals, journal, sweep_table
+from zsim_analysis.sweep.results.make_sweep_report import make_sweep_report
+from zsim_analysis.sweep.results.make_sweep_report import table as shown_table
+from zsim_analysis.sweep.results.points import Parameter, Results, parameters, spread
+from zsim_analysis.sweep.results.row import Result, Row, row
+from zsim_analysis.sweep.results.sweep_figures import slices
+from zsim_analysis.sweep.screen import SweepScreen, span
+from zsim_analysis.sweep.sweep_folder import Folder, load, locked
+from zsim_analysis.sweep.sweep_plan import Plan, is_sweep
 
 NAMES = ("x_c", "y_c", "beta")
 
@@ -132,7 +132,7 @@ def test_the_table_has_a_typed_column_for_all_that_is_known(tmp_path: Path) -> N
     of = plan(*vary, runs=32)
     rows = [made(of, 0, failure="diverged"), *(well(of, run) for run in range(1, 32))]
     path = tmp_path / "sweep.parquet"
-    table.write(path, reversed(rows), of, Design(of).axes)
+    sweep_table.write(path, reversed(rows), of, Design(of).axes)
     found = pq.read_table(path)
     types = {field.name: str(field.type) for field in found.schema}
     assert list(types)[:9] == ["run", "point", "seed", "duration_s", "sensors.preset", "a", "b", "c", "failure"]
@@ -142,8 +142,8 @@ def test_the_table_has_a_typed_column_for_all_that_is_known(tmp_path: Path) -> N
     assert found.column("run").to_pylist() == list(range(32))
     assert found.column("a").to_pylist()[:4:2] == ["[1,2]", "[3]"]
     assert found.column("errors.x_c.true_rms").null_count == 1
-    assert msgspec.json.decode(found.schema.metadata[table.PLAN], type=Plan) == of
-    again = table.read(path)
+    assert msgspec.json.decode(found.schema.metadata[sweep_table.PLAN], type=Plan) == of
+    again = sweep_table.read(path)
     assert [{name: value for name, value in each.items() if value is not None} for each in again] == [
         {name: value for name, value in each.items() if value is not None} for each in rows
     ]
@@ -153,7 +153,7 @@ def test_a_table_that_is_none(tmp_path: Path) -> None:
     path = tmp_path / "sweep.parquet"
     path.write_bytes(b"PAR1")
     with pytest.raises(ReportError, match=r"sweep\.parquet: cannot be read"):
-        table.read(path)
+        sweep_table.read(path)
 
 
 # The folder
@@ -341,7 +341,7 @@ def test_the_report_says_which_cluster_and_how_many_were_engaged(tmp_path: Path)
         again = folder.compact()
     assert [row["clusters.errors.engaged_s"] for row in again] == [None, 6.0] * 4
     assert (
-        Results(Design(of), table.read(tmp_path / "sweep.parquet")).summary().json()
+        Results(Design(of), sweep_table.read(tmp_path / "sweep.parquet")).summary().json()
         == (tmp_path / "summary.json").read_bytes()
     )
 

@@ -5,7 +5,7 @@ import subprocess
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy.target import Interpreter, chosen, interpreters, question, target
+from zsim_deploy.push.target import Interpreter, chosen, interpreters, question, target
 
 HERE = (3, 11)
 SAID = {

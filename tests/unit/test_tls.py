@@ -2,7 +2,7 @@
 
 import pytest
 
-from zsim.tls import leaves_machine
+from zsim.transport.tls import leaves_machine
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,13 @@ import pytest
 import yaml
 from rich.console import Console
 
-from zsim import scenario_file
 from zsim.errors import HostsError
-from zsim_deploy import inventory
-from zsim_deploy import up as module
-from zsim_deploy.board import Board
-from zsim_deploy.up import Options, Up
-from zsim_deploy.watch import Outcome
+from zsim.scenario import scenario_file
+from zsim_deploy.control.status_table import Board
+from zsim_deploy.hosts import up as module
+from zsim_deploy.hosts.up import Options, Up
+from zsim_deploy.inventory import inventory
+from zsim_deploy.launch.supervisor import Outcome
 
 SCENARIO = "name: one\nduration_s: 1\ndrones: [{name: drone1, position_m: [0, 0, 0]}]\nprocesses: {expect: []}\n"
 HOSTS = {

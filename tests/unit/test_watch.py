@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from zsim.errors import RunError
-from zsim_deploy.watch import RESTARTS_MAX, SUPERSEDED, USER_FAULT, Watch
+from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT, Watch
 
 
 class Show:
@@ -110,7 +110,7 @@ def test_too_many_deaths_in_a_row_end_the_run():
 
 def test_deaths_far_apart_do_not_add_up(monkeypatch):
     now = iter(range(0, 100_000, 100))
-    monkeypatch.setattr("zsim_deploy.watch.time.monotonic", lambda: float(next(now)))
+    monkeypatch.setattr("zsim_deploy.launch.supervisor.time.monotonic", lambda: float(next(now)))
     team = Team(Member("estimator.d1", *[1] * 8, None), looks=12)
     assert not team.go().failed
     assert team.others[0].restarts == 8
@@ -209,7 +209,7 @@ def test_an_order_that_comes_too_late_is_not_carried_out():
 
 
 def test_a_process_that_does_not_make_way_is_killed(monkeypatch):
-    monkeypatch.setattr("zsim_deploy.watch.TAKE_OVER_S", -1.0)
+    monkeypatch.setattr("zsim_deploy.launch.supervisor.TAKE_OVER_S", -1.0)
     old, new = Member("estimator.d1", lives_for=1000), Member("estimator.d1")
     team = Team(old)
     team.watch.order(lambda: team.watch.replace(new))

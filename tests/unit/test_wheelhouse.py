@@ -15,10 +15,10 @@ from typing import Any, cast
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy import package_index, wheelhouse
-from zsim_deploy.package_index import PipError, gather, pip
-from zsim_deploy.target import Target, target
-from zsim_deploy.wheelhouse import House, Wheelhouse, requirement
+from zsim_deploy.push import package_index, wheelhouse
+from zsim_deploy.push.package_index import PipError, gather, pip
+from zsim_deploy.push.target import Target, target
+from zsim_deploy.push.wheelhouse import House, Wheelhouse, requirement
 
 BACKEND = """
 # A build backend without dependencies: a wheel with one module.

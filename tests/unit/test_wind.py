@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from zsim_world import wind
+from zsim_world.physics import wind
 
 CALM = (0.0, 0.0, 0.0)
 

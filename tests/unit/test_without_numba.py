@@ -12,10 +12,11 @@ import json, sys
 if "without" in sys.argv:
     sys.modules["numba"] = None
 import numpy as np
-from zsim import messages, scenario_file
-from zsim.messages import Baro, Flow, Gps, Imu, Mag, Sonar
-from zsim_agents.compiled import COMPILES
-from zsim_agents.estimator import Estimator
+from zsim.contract import messages
+from zsim.scenario import scenario_file
+from zsim.contract.messages import Baro, Flow, Gps, Imu, Mag, Sonar
+from zsim.math.compiled import COMPILES
+from zsim_agents.estimation.estimator import Estimator
 
 scenario = scenario_file.load(sys.argv[1])
 env = scenario.environment

@@ -7,13 +7,24 @@ from typing import Any
 
 import pytest
 
-from zsim import batch, keys, messages, scenario_file
+from zsim.contract import batch, keys, messages
+from zsim.contract.messages import (
+    ClusterState,
+    ControlAnswer,
+    ControlRequest,
+    Done,
+    Estimate,
+    Event,
+    Health,
+    Join,
+    Velocity,
+)
 from zsim.errors import DecodeError
-from zsim.health import HealthMeter
-from zsim.messages import ClusterState, ControlAnswer, ControlRequest, Done, Estimate, Event, Health, Join, Velocity
-from zsim_world.fleet import DivergedError
-from zsim_world.process import WorldProcess
-from zsim_world.world import World
+from zsim.runtime.health import HealthMeter
+from zsim.scenario import scenario_file
+from zsim_world.fleet.fleet import DivergedError
+from zsim_world.flight.world import World
+from zsim_world.server.world_process import WorldProcess
 
 sys.path.insert(0, str(Path(__file__).parent))
 from fake_link import BAD_UTF8, NESTED, UNANSWERED, FakeLink

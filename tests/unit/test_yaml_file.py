@@ -7,7 +7,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsim import yaml_file
+from zsim.schema import yaml_file
 
 ROOT = Path(__file__).parents[2]
 FILES = sorted([*ROOT.glob("scenarios/**/*.yaml"), *ROOT.glob("examples/**/*.yaml")])

@@ -8,8 +8,8 @@ Topic = key without the federation's prefix, message encoding `msgpack`, log tim
 time = wall clock of the recorder. Other MCAP tools open it.
 """
 
-from zsim.record.finish import repair
-from zsim.record.reader import Recorded, RecordReader
-from zsim.record.writer import RecordWriter
+from zsim.record.record_end import repair
+from zsim.record.record_reader import Recorded, RecordReader
+from zsim.record.record_writer import RecordWriter
 
 __all__ = ["RecordReader", "RecordWriter", "Recorded", "repair"]

@@ -7,8 +7,8 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from zsim.bundle import Bundle
-from zsim.record.layout import HEAD, INDEX_ENTRY, INDEX_HEAD, MESSAGE
+from zsim.contract.bundle import Bundle
+from zsim.record.mcap_layout import HEAD, INDEX_ENTRY, INDEX_HEAD, MESSAGE
 
 _SEQUENCE_MASK = 2**32 - 1  # MCAP counts messages of a channel in 32 bits
 _HEAD = np.dtype(  # MESSAGE, as numpy has it

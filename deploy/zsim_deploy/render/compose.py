@@ -6,13 +6,15 @@ Zenoh's endpoints and the certificates name the hosts of the inventory, so conta
 from collections.abc import Sequence
 from typing import Any
 
-from zsim import __version__, scenario_file
-from zsim.rights import RECORDER, WORLD
-from zsim.scenario import Scenario
-from zsim_deploy.inventory import Placed
+from zsim import __version__
+from zsim.contract.rights import RECORDER, WORLD
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_deploy.inventory.inventory import Placed
+from zsim_deploy.launch.supervisor import RESTARTS_MAX
 from zsim_deploy.render import container
 from zsim_deploy.render.container import ACCESS, CACHE, CERTIFICATES, RUNS, SCENARIO, USER
-from zsim_deploy.render.process import (
+from zsim_deploy.render.rendered_process import (
     STOP_S,
     Files,
     Process,
@@ -26,7 +28,6 @@ from zsim_deploy.render.process import (
     used_hosts,
 )
 from zsim_deploy.render.yaml_text import document
-from zsim_deploy.watch import RESTARTS_MAX
 
 CACHE_VOLUME = "cache"
 

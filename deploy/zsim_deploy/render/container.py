@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from zsim import __version__
-from zsim_deploy.inventory import Host, Placed
-from zsim_deploy.nursery import SINGLE_THREADED
+from zsim_deploy.forkserver.role_launcher import SINGLE_THREADED
+from zsim_deploy.inventory.inventory import Host, Placed
 
 BASE = "python:3.11-slim"  # the oldest Python that zsim runs on
 WHEEL = f"zsim-{__version__}-py3-none-any.whl"

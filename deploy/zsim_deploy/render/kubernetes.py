@@ -8,14 +8,16 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from zsim import __version__, scenario_file
+from zsim import __version__
+from zsim.contract.rights import ROUTER, WORLD
 from zsim.errors import InventoryError
-from zsim.rights import ROUTER, WORLD
-from zsim.scenario import Scenario
-from zsim_deploy.inventory import Placed
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_deploy.inventory.inventory import Placed
+from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT
 from zsim_deploy.render import container, pod
 from zsim_deploy.render.container import RUNS
-from zsim_deploy.render.process import (
+from zsim_deploy.render.rendered_process import (
     Process,
     Rendered,
     access_file,
@@ -25,7 +27,6 @@ from zsim_deploy.render.process import (
     used_hosts,
 )
 from zsim_deploy.render.yaml_text import document, documents
-from zsim_deploy.watch import RESTARTS_MAX, SUPERSEDED, USER_FAULT
 
 IMAGE = f"zsim:{__version__}"
 CONFIG_BYTES_MAX = 1_048_576  # of a ConfigMap; Kubernetes, "ConfigMaps"

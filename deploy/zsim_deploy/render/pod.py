@@ -4,10 +4,10 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from zsim.identity import CERTIFICATES as IDENTITY_FILES
-from zsim.rights import RECORDER, WORLD
+from zsim.contract.rights import RECORDER, WORLD
+from zsim.transport.identity import CERTIFICATES as IDENTITY_FILES
 from zsim_deploy.render.container import ACCESS, CACHE, CERTIFICATES, ENVIRONMENT, RUNS, SCENARIO, USER
-from zsim_deploy.render.process import STOP_S, Files, Process, command
+from zsim_deploy.render.rendered_process import STOP_S, Files, Process, command
 
 NAME_MAX = 63  # RFC 1123 label
 CPU = "250m"  # to find a node by; in lockstep a role takes what there is

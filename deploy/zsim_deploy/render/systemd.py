@@ -1,21 +1,22 @@
 """systemd: a folder per host with a unit per process, and `zsim.target`, which starts and stops them together.
 
 Options are those of systemd.exec(5) and systemd.service(5). Limits of restarts and exit codes are those of
-zsim_deploy.watch: a role is started again under systemd where it would be under `zsim run`.
+zsim_deploy.launch.supervisor: a role is started again under systemd where it would be under `zsim run`.
 """
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
 
-from zsim import scenario_file
+from zsim.contract.rights import ROUTER, WORLD
 from zsim.errors import InventoryError
-from zsim.faults import show
-from zsim.rights import ROUTER, WORLD
-from zsim.scenario import Scenario
-from zsim_deploy import inventory as inv
-from zsim_deploy.inventory import Host, Placed
-from zsim_deploy.nursery import SINGLE_THREADED
-from zsim_deploy.render.process import (
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim.schema.checker import show
+from zsim_deploy.forkserver.role_launcher import SINGLE_THREADED
+from zsim_deploy.inventory import inventory as inv
+from zsim_deploy.inventory.inventory import Host, Placed
+from zsim_deploy.launch.supervisor import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED, USER_FAULT
+from zsim_deploy.render.rendered_process import (
     STOP_S,
     Files,
     Process,
@@ -27,7 +28,6 @@ from zsim_deploy.render.process import (
     processes,
     used_hosts,
 )
-from zsim_deploy.watch import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED, USER_FAULT
 
 TARGET = "zsim.target"
 STATE = "/var/lib/zsim"  # StateDirectory=zsim

@@ -1,0 +1,227 @@
+"""Strapdown dead reckoning of one drone, and how its small errors grow, in plain floats and compiled loops.
+
+Errors are additive for position and velocity; the attitude's is a small rotation in the world frame,
+R_true = (I + [theta_W]x) R_WB, so that a past attitude has the error of the present one.
+J. Solà, "Quaternion kinematics for the error-state Kalman filter", 2017, section 7 (globally defined errors).
+"""
+
+import math
+
+import numpy as np
+
+from zsim.math.compiled import portable
+from zsim_agents.estimation.madgwick import (
+    Quaternion,
+    Rotation,
+    Vector,
+    cross,
+    heading,
+    madgwick_step,
+    normalised,
+    product,
+    rotation,
+    rotation_vector_quaternion,
+    turn,
+)
+
+POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCEL_BIAS = 0, 3, 6, 9, 12  # first index of each in the error state
+
+HORIZONTAL_MIN = 1e-6  # of a squared unit vector; nearer to the zenith a heading is not defined
+
+Reckoning = tuple[Vector, Vector, Quaternion, Vector, Vector, Vector]
+"""p_WB [m], v_WB [m/s], q_WB, a_WB [m/s^2; W]; rate [rad/s] and specific force [m/s^2] in B, bias-free."""
+
+
+@portable
+def plus(a: Vector, b: Vector, scale: float) -> Vector:
+    """Return a + scale b."""
+    return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
+
+
+@portable
+def acceleration(q: Quaternion, f_B: Vector, gravity: float) -> Vector:
+    """Return R_WB f_B + g_W [m/s^2; W]."""
+    f_W = turn(rotation(q), f_B)
+    return f_W[0], f_W[1], f_W[2] - gravity
+
+
+@portable
+def reckon(
+    state: Reckoning,
+    accel: Vector,
+    gyro: Vector,
+    accel_bias: Vector,
+    gyro_bias: Vector,
+    beta: float,
+    gravity: float,
+    dt: float,
+) -> Reckoning:
+    """Return the state after one IMU sample: Madgwick's step, then velocity and position by trapezoids.
+
+    Args:
+        state: at the previous sample.
+        accel: specific force of the centre of mass as measured [m/s^2; B].
+        gyro: body rate as measured [rad/s; B].
+        accel_bias, gyro_bias: to be taken off.
+        beta: Madgwick's gain [rad/s].
+        gravity: length of g_W [m/s^2], along -z.
+        dt: length of the step [s].
+    """
+    p, v, q, a_before, w_before, _ = state
+    w = plus(gyro, gyro_bias, -1.0)
+    f_B = plus(accel, accel_bias, -1.0)
+    w_mean = (0.5 * (w_before[0] + w[0]), 0.5 * (w_before[1] + w[1]), 0.5 * (w_before[2] + w[2]))
+    q = madgwick_step(q, w_mean, f_B, beta, dt)
+    a = acceleration(q, f_B, gravity)
+    half = 0.5 * dt
+    v_new = plus(plus(v, a_before, half), a, half)
+    p_new = plus(plus(p, v, half), v_new, half)
+    return p_new, v_new, q, a, w, f_B
+
+
+@portable
+def corrected(state: Reckoning, error: np.ndarray, with_accel_bias: bool, gravity: float) -> Reckoning:
+    """Return the state with an error of the filter put into it, biases into what they were taken off.
+
+    Args:
+        state: nominal state.
+        error: error state, (n,), as `write_transition` orders it.
+        with_accel_bias: whether it holds an accelerometer bias.
+        gravity: [m/s^2].
+    """
+    p, v, q, _, w, f_B = state
+    p = (p[0] + float(error[0]), p[1] + float(error[1]), p[2] + float(error[2]))
+    v = (v[0] + float(error[3]), v[1] + float(error[4]), v[2] + float(error[5]))
+    q = normalised(product(rotation_vector_quaternion((float(error[6]), float(error[7]), float(error[8]))), q))
+    w = (w[0] - float(error[9]), w[1] - float(error[10]), w[2] - float(error[11]))
+    if with_accel_bias:
+        f_B = (f_B[0] - float(error[12]), f_B[1] - float(error[13]), f_B[2] - float(error[14]))
+    return p, v, q, acceleration(q, f_B, gravity), w, f_B
+
+
+@portable
+def arm_acceleration(w: Vector, w_before: Vector, arm: Vector, dt: float) -> Vector:
+    """Return alpha x r + w x (w x r) [m/s^2; B], which a sensor at p_BS = `arm` feels beyond the centre."""
+    alpha = ((w[0] - w_before[0]) / dt, (w[1] - w_before[1]) / dt, (w[2] - w_before[2]) / dt)
+    tangential = cross(alpha, arm)
+    centripetal = cross(w, cross(w, arm))
+    return (
+        tangential[0] + centripetal[0],
+        tangential[1] + centripetal[1],
+        tangential[2] + centripetal[2],
+    )
+
+
+@portable
+def write_minus_cross(M: np.ndarray, row: int, column: int, a: Vector, scale: float) -> None:
+    """Write -scale [a]x into a 3 x 3 block whose diagonal is already zero."""
+    M[row, column + 1] = scale * a[2]
+    M[row, column + 2] = -scale * a[1]
+    M[row + 1, column] = -scale * a[2]
+    M[row + 1, column + 2] = scale * a[0]
+    M[row + 2, column] = scale * a[1]
+    M[row + 2, column + 1] = -scale * a[0]
+
+
+@portable
+def write_minus_rotation(M: np.ndarray, row: int, column: int, R: Rotation, scale: float) -> None:
+    """Write -scale R into a 3 x 3 block."""
+    for i in range(3):
+        for j in range(3):
+            M[row + i, column + j] = -scale * R[3 * i + j]
+
+
+@portable
+def write_transition(
+    F: np.ndarray, f_W: Vector, R_WB: Rotation, levelling_s: float, with_accel_bias: bool, dt: float
+) -> None:
+    """Write the transition of the error state over `dt` into F, which starts as the identity.
+
+    p' = v; v' = -[f_W]x theta - R b_a; theta' = -R b_g - (theta_x, theta_y, 0)/levelling_s.
+
+    Args:
+        F: (n, n) with n >= 12, or 15 with an accelerometer bias.
+        f_W: mean specific force over the interval [m/s^2].
+        R_WB: attitude.
+        levelling_s: time constant of Madgwick's pull [s]; may be infinite.
+        dt: length of the interval [s].
+    """
+    for i in range(3):
+        F[POSITION + i, VELOCITY + i] = dt
+    write_minus_cross(F, POSITION, ATTITUDE, f_W, 0.5 * dt * dt)
+    write_minus_cross(F, VELOCITY, ATTITUDE, f_W, dt)
+    write_minus_rotation(F, ATTITUDE, GYRO_BIAS, R_WB, dt)
+    F[ATTITUDE, ATTITUDE] = F[ATTITUDE + 1, ATTITUDE + 1] = 1.0 / (1.0 + dt / levelling_s)
+    if with_accel_bias:
+        write_minus_rotation(F, POSITION, ACCEL_BIAS, R_WB, 0.5 * dt * dt)
+        write_minus_rotation(F, VELOCITY, ACCEL_BIAS, R_WB, dt)
+
+
+@portable
+def write_process_noise(Q: np.ndarray, walk: np.ndarray, variances: Vector, dt: float) -> None:
+    """Write the noise that the interval `dt` adds into Q, which starts as zero.
+
+    Args:
+        Q: (n, n).
+        walk: (n,), density of each bias' random walk [unit^2/s], zero elsewhere.
+        variances: gained over the interval per axis by velocity [m^2/s^2], tilt and yaw [rad^2].
+        dt: length of the interval [s].
+    """
+    velocity_variance, tilt_variance, yaw_variance = variances
+    for i in range(3):
+        Q[POSITION + i, POSITION + i] = velocity_variance * dt * dt / 3.0
+        Q[POSITION + i, VELOCITY + i] = Q[VELOCITY + i, POSITION + i] = velocity_variance * dt / 2.0
+        Q[VELOCITY + i, VELOCITY + i] = velocity_variance
+    Q[ATTITUDE, ATTITUDE] = Q[ATTITUDE + 1, ATTITUDE + 1] = tilt_variance
+    Q[ATTITUDE + 2, ATTITUDE + 2] = yaw_variance
+    for i in range(GYRO_BIAS, walk.shape[0]):
+        Q[i, i] = walk[i] * dt
+
+
+@portable
+def write_prediction(
+    F: np.ndarray,
+    Q: np.ndarray,
+    walk: np.ndarray,
+    state: Reckoning,
+    v_before: Vector,
+    gravity: float,
+    levelling_s: float,
+    with_accel_bias: bool,
+    variances: Vector,
+    dt: float,
+) -> None:
+    """Write transition and process noise of an interval at whose end the nominal state is `state`.
+
+    Args:
+        F, Q, walk, levelling_s, with_accel_bias, dt: as in `write_transition` and `write_process_noise`.
+        v_before: velocity at the start of the interval [m/s].
+        gravity: [m/s^2].
+        variances: gained by velocity [m^2/s^2], tilt and yaw [rad^2].
+    """
+    v = state[1]
+    f_W = (
+        (v[0] - v_before[0]) / dt,
+        (v[1] - v_before[1]) / dt,
+        (v[2] - v_before[2]) / dt + gravity,
+    )
+    write_transition(F, f_W, rotation(state[2]), levelling_s, with_accel_bias, dt)
+    write_process_noise(Q, walk, variances, dt)
+
+
+@portable
+def heading_gradient(R: Rotation) -> Vector:
+    """Return the derivative of the heading over a small world rotation; (0, 0, 1) when the nose is level."""
+    squared = max(R[0] * R[0] + R[3] * R[3], HORIZONTAL_MIN)
+    return -R[6] * R[0] / squared, -R[6] * R[3] / squared, 1.0
+
+
+@portable
+def heading_and_sigma(q: Quaternion, P: np.ndarray) -> tuple[float, float]:
+    """Return the heading [rad] and its standard deviation [rad] under the covariance P of the error state."""
+    gradient = heading_gradient(rotation(q))
+    variance = 0.0
+    for i in range(3):
+        for j in range(3):
+            variance += gradient[i] * P[ATTITUDE + i, ATTITUDE + j] * gradient[j]
+    return heading(q), math.sqrt(max(variance, 0.0))

@@ -1,0 +1,311 @@
+"""The phases of a formation flight: take-off, assembly, engaged flight on references, hold, landing.
+
+A plain object: estimates in, commands out, once per gate; requests in between. Nothing is engaged, resumed or
+followed that was not checked, every refusal has a reason, and every reference starts where the formation is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from zsim_agents.formation.flight_check import FlightJudge
+from zsim_agents.formation.flight_data import (
+    AIRBORNE,
+    DOWN,
+    EngagementLimits,
+    GateInput,
+    GateOutput,
+    ModeCommand,
+    Setpoint,
+)
+from zsim_agents.formation.flight_plan import FlightPlan, Scheduled
+from zsim_agents.formation.flight_request import (
+    REFUSALS,
+    Engage,
+    FlightRequest,
+    Follow,
+    Land,
+    Pause,
+    RefusalError,
+    TakeOff,
+    Target,
+    refuse,
+)
+from zsim_agents.formation.formation_law import FormationCommand, FormationGains, FormationLaw, Pairs, guard
+from zsim_agents.formation.guidance import Guidance
+from zsim_agents.formation.mode_sender import ModeSender
+from zsim_agents.formation.reference_check import place_fault
+from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
+
+DT_MAX_S = 0.1  # longest step of the integral, after a gap
+CLIMB_GAIN_1_S = 0.8  # of the climb to the assembly height
+HOLD_APART_M = 0.1  # a held formation is kept this much farther apart than the minimum
+
+
+class Engagement:
+    """The phase machine of one formation.
+
+    Args:
+        space: cluster space of n robots.
+        drones: their names in the order of the robots, for commands and reasons.
+        plan: what the scenario asks for by itself; a Land by request drops the rest of it.
+
+    Raises:
+        ValueError: the plan can never be flown (see `FlightPlan`), or the number of names is not n.
+    """
+
+    def __init__(
+        self,
+        space: ClusterSpace,
+        drones: Sequence[str],
+        gains: FormationGains | None = None,
+        limits: EngagementLimits | None = None,
+        plan: Sequence[Scheduled] = (),
+    ) -> None:
+        if len(drones) != space.n:
+            raise ValueError(f"cluster: {len(drones)} drones; allowed: {space.n}, as its cluster space has")
+        self.space = space
+        self.drones = tuple(drones)
+        self.gains = gains or FormationGains()
+        self.limits = limits or EngagementLimits()
+        self.law = FormationLaw(space, self.gains)
+        self.guidance = Guidance(space, self.gains, self.limits.shape)
+        self.plan = FlightPlan(space, plan)
+        held_apart_m = self.gains.separation_min_m + HOLD_APART_M
+        self._apart = dataclasses.replace(self.gains, separation_min_m=held_apart_m)
+        self.judge = FlightJudge(space, self.drones, self.gains, self.limits)
+        self._phase = "idle"
+        self._gate: GateInput | None = None
+        self._dt_s = 0.0
+        self._modes = ModeSender(self.drones, self.limits.resend_s)
+        self._landing_s = -math.inf
+        self._fault = ""  # why an engaged formation does not close its loop
+        self._well_since_s = math.inf
+        self._sound = np.empty(0)  # the last reference that may be flown; one at rest stays the same array
+        self._shown = self._sound, self._sound  # the last reference and the same with wrapped angles
+
+    @property
+    def phase(self) -> str:
+        """Return idle, taking_off, assembling, engaged, landing or held."""
+        return "held" if self._phase == "engaged" and (self._fault or self.guidance.paused) else self._phase
+
+    def step(self, gate: GateInput) -> GateOutput:
+        """Advance to this gate and return its commands and state."""
+        last_s = self._gate.t_s if self._gate else gate.t_s
+        self._dt_s = min(max(gate.t_s - last_s, 0.0), DT_MAX_S)
+        self._gate = gate
+        self.judge.observe(gate)
+        self.plan.run(gate.t_s, self._try)
+        if self._phase in ("assembling", "engaged") and gate.down:
+            self._phase = "idle"
+        return _PHASES[self._phase](self, gate)
+
+    def request(self, request: FlightRequest) -> str | None:
+        """Grant a request and return None, or return why it is refused; then nothing has changed."""
+        refusal = self._try(request)
+        if refusal is None and isinstance(request, Land):
+            self.plan.clear()
+        elif refusal is None and isinstance(request, Target | Follow):
+            self.plan.overrule()
+        return refusal
+
+    def warm_start(self, phase: str, desired: Array, plan_step: int = 0) -> None:
+        """Go on where a former process of this formation was: in its phase, at its reference (4n,).
+
+        Its plan goes on after the steps that the former one was through with, as `GateOutput.plan_step` said; what it
+        flew by the plan (a target, a trajectory) is asked for again, from that reference.
+        """
+        self._phase = "engaged" if phase == "held" else phase
+        if self._phase == "engaged":
+            self.guidance.engage(desired)
+        self.plan.start_at(plan_step)
+
+    def _try(self, request: FlightRequest) -> str | None:
+        if self._gate is None:
+            return "no gate was seen yet; ask again when the simulation runs"
+        try:
+            self._grant(request, self._gate)
+        except REFUSALS as refusal:
+            return str(refusal)
+        return None
+
+    def _grant(self, request: FlightRequest, gate: GateInput) -> None:
+        if isinstance(request, TakeOff):
+            self._grant_take_off(gate)
+        elif isinstance(request, Engage):
+            self._grant_engage(gate)
+        elif isinstance(request, Land):
+            self._grant_land(gate)
+        elif self._phase != "engaged":
+            raise RefusalError(f"phase is {self.phase}; possible when engaged")
+        elif self._fault:
+            raise RefusalError(self._fault)
+        elif isinstance(request, Pause):
+            self.guidance.pause(gate.t_s)
+        elif isinstance(request, Target):
+            self.guidance.target(request, gate.t_s)
+        else:
+            self.guidance.follow(request, gate.t_s)
+
+    def _grant_take_off(self, gate: GateInput) -> None:
+        if self._phase != "idle":
+            raise RefusalError(f"phase is {self.phase}; take-off is possible when idle")
+        refuse(self.judge.take_off_fault(gate))
+        self._phase = "taking_off"
+        self._modes.restart()
+
+    def _grant_engage(self, gate: GateInput) -> None:
+        if self._phase == "engaged" and self.guidance.paused and not self._fault:
+            self.guidance.resume(gate.t_s)
+            return
+        if self._phase != "assembling":
+            raise RefusalError(f"phase is {self.phase}; possible when assembling, or when held on request")
+        refuse(self.judge.engagement_fault(gate))
+        self.guidance.engage(self.judge.value)
+        self.plan.overrule()
+        self.law.reset()
+        self._fault = ""
+        self._phase = "engaged"
+
+    def _grant_land(self, gate: GateInput) -> None:
+        if self._phase == "idle" and gate.down:
+            raise RefusalError("all drones are on the ground")
+        self._phase, self._landing_s = "landing", gate.t_s
+        self._modes.restart()
+
+    def _taking_off(self, gate: GateInput) -> GateOutput:
+        waiting = self.judge.state_fault(gate, AIRBORNE)
+        if waiting is None:
+            self._phase = "assembling"
+            return self._assembling(gate)
+        return self._climb(gate, waiting, self._modes.commands(gate, "takeoff", frozenset({"landed"})))
+
+    def _assembling(self, gate: GateInput) -> GateOutput:
+        return self._climb(gate, self.judge.engagement_fault(gate) or "ready to engage")
+
+    def _climb(self, gate: GateInput, reason: str, modes: tuple[ModeCommand, ...] = ()) -> GateOutput:
+        """Lead the drones that fly straight up to the assembly height, each by its own velocity loop."""
+        v_W = np.zeros((self.space.n, 3))
+        alarmed: Pairs = ()
+        if self.judge.estimate_fault(gate) is None:
+            below_m = self.limits.assembly_height_m - gate.p_W[:, 2]
+            v_W[:, 2] = np.minimum(np.maximum(CLIMB_GAIN_1_S * below_m, 0.0), self.limits.assembly_climb_m_s)
+            v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, self.gains)
+        return self._output(gate, reason, modes=modes, command=self._upright(v_W, alarmed))
+
+    def _engaged(self, gate: GateInput) -> GateOutput:
+        self._judge(gate)
+        return self._held(gate) if self._fault else self._fly(gate)
+
+    def _fly(self, gate: GateInput) -> GateOutput:
+        c_des, c_dot_des = self.guidance.value(gate.t_s)
+        command = self.law.command(self.judge.value, gate.p_W, gate.v_W, c_des, c_dot_des, self._dt_s)
+        reason = "held on request" if self.guidance.paused else ""
+        if command.guarded:
+            reason = f"the guard parts {self._pairs(command.guarded)}"
+        if c_des is not self._shown[0]:
+            self._shown = c_des, self.space.wrapped(c_des)
+        return self._output(gate, reason, command=command, reference=(self._shown[1], c_dot_des))
+
+    def _held(self, gate: GateInput) -> GateOutput:
+        v_W = np.zeros((self.space.n, 3))
+        alarmed: Pairs = ()
+        if self.judge.estimate_fault(gate) is None:
+            v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, self._apart)
+        return self._output(gate, self._fault, command=self._upright(v_W, alarmed))
+
+    def _upright(self, v_W: Array, alarmed: Pairs) -> FormationCommand:
+        """Return velocities (n, 3) without turning."""
+        return FormationCommand(v_W, np.zeros(self.space.n), 1.0, (), alarmed)
+
+    def _landing(self, gate: GateInput) -> GateOutput:
+        # A take-off sent just before may still be on its way: idle only after a while on the ground.
+        if gate.down and gate.t_s - self._landing_s >= self.limits.resend_s:
+            self._phase = "idle"
+        modes = self._modes.commands(gate, "land", AIRBORNE | {"taking_off"})
+        return self._output(gate, self.judge.state_fault(gate, DOWN) or "", modes=modes)
+
+    def _judge(self, gate: GateInput) -> None:
+        """Set the fault of an engaged formation, or heal it when all has been well for a while."""
+        fault = self.judge.flight_fault(gate) or (None if self._fault else self._reference_fault(gate.t_s))
+        if fault:
+            self._fault, self._well_since_s = fault, math.inf
+        elif self._fault:
+            self._well_since_s = min(self._well_since_s, gate.t_s)
+            if gate.t_s - self._well_since_s >= self.limits.heal_s:
+                self._heal(gate)
+
+    def _heal(self, gate: GateInput) -> None:
+        try:
+            self.guidance.rejoin(self.judge.value, gate.t_s, self.limits.shape_in_flight)
+        except REFUSALS as refusal:
+            self._fault, self._well_since_s = f"cannot go on: {refusal}", gate.t_s
+        else:
+            self._fault = ""
+            self.law.reset()
+
+    def _reference_fault(self, t_s: float) -> str | None:
+        """Return why the reference may not be flown now: checks before the flight end after a while."""
+        try:
+            c_des = self.guidance.value(t_s)[0]
+            fault = None if c_des is self._sound else place_fault(self.space, c_des, self.gains, self.limits.shape)
+            self._sound = self._sound if fault else c_des
+        except REFUSALS as error:
+            fault = str(error)
+        return f"reference: {fault}" if fault else None
+
+    def _output(
+        self,
+        gate: GateInput,
+        reason: str,
+        *,
+        modes: tuple[ModeCommand, ...] = (),
+        command: FormationCommand | None = None,
+        reference: tuple[Array, Array] | None = None,
+    ) -> GateOutput:
+        """Return the output of a gate; without a reference the formation is said to be where it wants to be."""
+        alarmed = command.alarmed if command else ()
+        if alarmed:
+            limit_m = self.gains.separation_alarm_m
+            reason = f"ALARM, nearer than {limit_m:g} m: {self._pairs(alarmed)}; {reason}"
+        if self.plan.note:
+            reason = f"{reason}; {self.plan.note}" if reason else self.plan.note
+        desired, desired_rate = reference or (self.judge.value, np.zeros(self.space.size))
+        return GateOutput(
+            modes=modes,
+            setpoints=self._setpoints(gate, command) if command else (None,) * self.space.n,
+            phase=self.phase,
+            value=self.judge.value,
+            desired=desired,
+            desired_rate=desired_rate,
+            trajectory_t_s=self.guidance.trajectory_t_s(gate.t_s) if self._phase == "engaged" else None,
+            margin=self.judge.margin,
+            reason=reason,
+            factor=command.factor if command else 1.0,
+            alarmed=alarmed,
+            plan_step=self.plan.resume_at(engaged=self._phase == "engaged" and not self.guidance.paused),
+        )
+
+    @staticmethod
+    def _setpoints(gate: GateInput, command: FormationCommand) -> tuple[Setpoint | None, ...]:
+        """Return the setpoints of the drones that follow one."""
+        setpoints = map(Setpoint, command.v_W.tolist(), command.yaw_rate.tolist())
+        if AIRBORNE.issuperset(gate.states):
+            return tuple(setpoints)
+        return tuple(s if state in AIRBORNE else None for s, state in zip(setpoints, gate.states, strict=True))
+
+    def _pairs(self, pairs: Pairs) -> str:
+        return ", ".join(f"{self.drones[i]} and {self.drones[j]}" for i, j in pairs)
+
+
+_PHASES = {
+    "idle": lambda engagement, gate: engagement._output(gate, ""),
+    "taking_off": Engagement._taking_off,
+    "assembling": Engagement._assembling,
+    "engaged": Engagement._engaged,
+    "landing": Engagement._landing,
+}

@@ -1,0 +1,151 @@
+"""Whether a formation may take off, be engaged, and be flown on: every fault in words."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from zsim.math.compiled import portable
+from zsim_agents.formation.flight_data import AIRBORNE, EngagementLimits, GateInput
+from zsim_agents.formation.formation_law import FormationGains
+from zsim_agents.formation.reference_check import FAR, bounds_of, first_outside, shape_fault
+from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
+
+WELL, OLD, WILD, VAGUE = range(4)  # what an estimate is: fit, too old, not finite, too uncertain
+
+
+class FlightJudge:
+    """Judges the estimates and states of a gate; each judgement is the fault, or None where all is well.
+
+    Attributes:
+        value: (4n,) cluster of the newest estimates that had a frame, zero before any.
+        margin: its distance to singularity [m] (`ClusterSpace.margin`), 0 while the estimates have no frame.
+    """
+
+    def __init__(
+        self,
+        space: ClusterSpace,
+        drones: tuple[str, ...],
+        gains: FormationGains,
+        limits: EngagementLimits,
+    ) -> None:
+        self.space = space
+        self.drones = drones
+        self.gains = gains
+        self.limits = limits
+        self._shape_in_flight = limits.shape_in_flight
+        self._bounds_in_flight = bounds_of(space, self._shape_in_flight)
+        self.value: Array = np.zeros(space.size)
+        self.margin = 0.0
+        self._spread = 0.0
+        self._no_frame: str | None = "nothing was observed yet"
+        self._flaw = (WELL, 0)  # of the estimates of the gate that was observed, by the limits in flight
+
+    def observe(self, gate: GateInput) -> None:
+        """Take over the estimates of a gate."""
+        self.margin, self._no_frame = 0.0, "an estimate is not finite"
+        self._flaw = self._first_flaw(gate, self.limits.sigma_lost_m)
+        if self._flaw[0] != WELL and not all_near(gate.p_W, gate.yaw):
+            return
+        try:
+            self.value = self.space.forward(gate.p_W, gate.yaw)
+            self._spread, self.margin = self.space.measures(self.value)
+            self._no_frame = None
+        except SingularClusterError as error:
+            self._no_frame = str(error)
+
+    def take_off_fault(self, gate: GateInput) -> str | None:
+        """Return why the drones may not take off; drones that fly already need not stand well."""
+        fault = self.state_fault(gate, AIRBORNE | {"landed"}) or self._start_fault(gate)
+        return fault or (self.formation_fault(gate) if "landed" in gate.states else None)
+
+    def engagement_fault(self, gate: GateInput) -> str | None:
+        """Return why the formation cannot be engaged."""
+        fault = self.state_fault(gate, AIRBORNE) or self._start_fault(gate)
+        if fault:
+            return fault
+        low = int(np.argmin(gate.p_W[:, 2]))
+        least_m = self.limits.assembly_height_m - self.limits.assembly_within_m
+        if gate.p_W[low, 2] < least_m:
+            return f"{self.drones[low]} is at z = {gate.p_W[low, 2]:.2f} m; allowed: {least_m:.2f} m or more"
+        return self.formation_fault(gate)
+
+    def flight_fault(self, gate: GateInput) -> str | None:
+        """Return why the loop of an engaged formation cannot be closed."""
+        fault = self.state_fault(gate, AIRBORNE) or self.estimate_fault(gate) or self._no_frame
+        shape = self._shape_in_flight
+        if fault or (self._spread > shape.spread_min_m and first_outside(self.value, self._bounds_in_flight) < 0):
+            return fault
+        return shape_fault(self.space, self.value, shape, self._spread)
+
+    def formation_fault(self, gate: GateInput) -> str | None:
+        """Return why the robots, where they are, make no formation to start from."""
+        fault = self._no_frame or shape_fault(self.space, self.value, self.limits.shape, self._spread)
+        if fault:
+            return fault
+        distance, i, j = closest_pair(gate.p_W)
+        if distance >= self.gains.separation_min_m:
+            return None
+        pair = f"{self.drones[i]} and {self.drones[j]}"
+        return f"{pair} are {distance:.2f} m apart; allowed: {self.gains.separation_min_m:g} m or more"
+
+    def estimate_fault(self, gate: GateInput) -> str | None:
+        """Return why the estimates of drones in flight cannot be flown on, those of the gate that was observed."""
+        return self._in_words(gate, self._flaw, self.limits.sigma_lost_m)
+
+    def state_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
+        """Return which drone is in another state than those allowed."""
+        if allowed.issuperset(gate.states):
+            return None
+        drone, state = next(pair for pair in zip(self.drones, gate.states, strict=True) if pair[1] not in allowed)
+        return f"{drone} is in state {state}; allowed: {', '.join(sorted(allowed))}"
+
+    def _start_fault(self, gate: GateInput) -> str | None:
+        sigma_max_m = self.limits.sigma_max_m
+        return self._in_words(gate, self._first_flaw(gate, sigma_max_m), sigma_max_m)
+
+    def _first_flaw(self, gate: GateInput, sigma_max_m: float) -> tuple[int, int]:
+        age_max_s = self.limits.age_max_s
+        return estimate_flaw(gate.age_s, gate.p_W, gate.v_W, gate.yaw, gate.sigma_m, age_max_s, sigma_max_m)
+
+    def _in_words(self, gate: GateInput, flaw: tuple[int, int], sigma_max_m: float) -> str | None:
+        kind, i = flaw
+        if kind == WELL:
+            return None
+        drone, age_max_s = self.drones[i], self.limits.age_max_s
+        if kind == OLD:
+            return f"the estimate of {drone} is {gate.age_s[i]:.2f} s old; allowed: {age_max_s:g} s"
+        if kind == WILD:
+            return f"the estimate of {drone} is not finite; allowed: up to {FAR:g} m, m/s or rad"
+        worst_m = max(gate.sigma_m[i].tolist())
+        return f"the position of {drone} has a sigma of {worst_m:.2f} m; allowed: {sigma_max_m:g} m"
+
+
+@portable
+def all_near(p_W: Array, yaw: Array) -> bool:
+    """Return whether all positions (n, 3) and headings (n,) are finite and below FAR."""
+    fit = True
+    for i in range(yaw.size):
+        fit = fit and near(p_W, i) and abs(yaw[i]) < FAR
+    return fit
+
+
+@portable
+def near(vectors: Array, i: int) -> bool:
+    """Return whether row i of (n, 3) is finite and below FAR; false for NaN."""
+    return abs(vectors[i, 0]) < FAR and abs(vectors[i, 1]) < FAR and abs(vectors[i, 2]) < FAR
+
+
+@portable
+def estimate_flaw(
+    age_s: Array, p_W: Array, v_W: Array, yaw: Array, sigma_m: Array, age_max_s: float, sigma_max_m: float
+) -> tuple[int, int]:
+    """Return what the first estimate that is not well is (OLD, WILD or VAGUE), and whose; else WELL."""
+    for i in range(yaw.size):
+        if not age_s[i] <= age_max_s:
+            return OLD, i
+        if not (near(p_W, i) and near(v_W, i) and abs(yaw[i]) < FAR):
+            return WILD, i
+        for k in range(3):
+            if not sigma_m[i, k] <= sigma_max_m:
+                return VAGUE, i
+    return WELL, 0

@@ -1,0 +1,125 @@
+"""What the phase machine of a formation reads and gives at every gate.
+
+What is made at every gate is a Struct, which takes a fifth of the time of a tuple or dataclass with names.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from msgspec import Struct
+
+from zsim_agents.formation.reference_check import ShapeLimits
+from zsim_agents.formation.spaces.cluster_space import Array
+
+AIRBORNE = frozenset({"hovering", "flying"})  # states of a drone that follows velocity commands
+DOWN = frozenset({"landed", "emergency"})  # states of a drone that is on the ground, or falls to it
+
+
+@dataclass(frozen=True)
+class EngagementLimits:
+    """Limits and heights of the phase machine; all chosen, `shape` so that no formation comes near a singularity.
+
+    Attributes:
+        shape: where a formation may be engaged and led.
+        flight_slack: in flight the spread may fall to its limit over this, the tilt grow to its limit times
+            this.
+        assembly_height_m: height to which drones climb straight up before engagement, within
+            assembly_within_m.
+        assembly_climb_m_s: greatest speed of that climb.
+        age_max_s: oldest estimate that is flown on.
+        sigma_max_m: greatest sigma of position for take-off and engagement; sigma_lost_m: in flight.
+        heal_s: how long everything must be well before a held formation goes on.
+        resend_s: after it a mode command without effect is sent again.
+    """
+
+    shape: ShapeLimits = field(default_factory=ShapeLimits)
+    flight_slack: float = 1.5  # so that noise of the estimates at the limit holds nobody
+    assembly_height_m: float = 1.5  # many rotor radii over the ground, and a fall that the hull takes
+    assembly_within_m: float = 0.3  # three sigma of the barometer
+    assembly_climb_m_s: float = 0.5  # half of what the firmware allows: the drones climb alike
+    age_max_s: float = 0.5  # as the firmware's silence: 25 gates
+    sigma_max_m: float = 1.0  # half of the least separation of 2 m
+    sigma_lost_m: float = 2.0  # of a single GPS fix: nothing else helps any more
+    heal_s: float = 0.5  # 25 gates without a fault are no accident
+    resend_s: float = 1.0  # ten times the delay of commands in the paper's scenario, 100 ms
+
+    @property
+    def shape_in_flight(self) -> ShapeLimits:
+        """Return the wider limits beyond which a formation in flight is held."""
+        return dataclasses.replace(
+            self.shape,
+            spread_min_m=self.shape.spread_min_m / self.flight_slack,
+            tilt_max_rad=self.shape.tilt_max_rad * self.flight_slack,
+            condition_max=math.inf,
+        )
+
+
+class GateInput(Struct, eq=False):
+    """The newest estimates of n drones at a gate; its arrays may be filled anew for the next.
+
+    Attributes:
+        t_s: simulated time.
+        p_W, v_W: (n, 3) [m, m/s]; yaw: (n,) [rad]; non-finite where nothing is known.
+        sigma_m: (n, 3) standard deviations of position.
+        age_s: (n,) ages of the estimates; infinite where there is none.
+        states: (n,) `state` of each drone's sensor/status.
+    """
+
+    t_s: float
+    p_W: Array
+    yaw: Array
+    v_W: Array
+    sigma_m: Array
+    age_s: Array
+    states: tuple[str, ...]
+
+    @property
+    def down(self) -> bool:
+        """Return whether no drone is in the air."""
+        return DOWN.issuperset(self.states)
+
+
+class ModeCommand(NamedTuple):
+    """A mode command for one drone: takeoff or land."""
+
+    drone: str
+    mode: str
+
+
+class Setpoint(Struct, eq=False):
+    """A velocity command for one drone [m/s, W; rad/s]."""
+
+    v_W: Sequence[float]
+    yaw_rate: float
+
+
+class GateOutput(Struct, eq=False):
+    """Commands of a gate, and the fields of the cluster's state message.
+
+    Attributes:
+        modes: mode commands to send.
+        setpoints: (n,) what each drone is to do, None for no command.
+        phase, value, desired, desired_rate, trajectory_t_s, margin, reason: as in the message; value and
+            desired with wrapped angles.
+        factor: common factor of the saturation, 1 where nothing is saturated.
+        alarmed: pairs of drone indices that are nearer than the alarm threshold.
+        plan_step: as in the message.
+    """
+
+    modes: tuple[ModeCommand, ...]
+    setpoints: tuple[Setpoint | None, ...]
+    phase: str
+    value: Array
+    desired: Array
+    desired_rate: Array
+    trajectory_t_s: float | None
+    margin: float
+    reason: str
+    factor: float
+    alarmed: tuple[tuple[int, int], ...]
+    plan_step: int

@@ -1,0 +1,142 @@
+"""The cluster frame C and its Z-Y-X Euler angles, in plain floats and compiled, because a gate has microseconds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from zsim.math.compiled import portable
+from zsim_agents.formation.spaces.cluster_space import TAU, Array, SingularClusterError
+
+Vector = tuple[float, float, float]
+Rows = tuple[Vector, Vector, Vector]  # of a matrix (3, 3)
+
+LENGTH_MIN_M = 1e-9  # a nanometre: below it a direction is rounding noise
+
+
+@portable
+def wrap_angle(angle: float) -> float:
+    """Return the angle taken to [-pi, pi]."""
+    return angle - TAU * np.rint(angle / TAU)
+
+
+@portable
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return a x b."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@portable
+def dot(a: Vector, b: Vector) -> float:
+    """Return a . b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@portable
+def length(a: Vector) -> float:
+    """Return |a|."""
+    return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+
+
+@portable
+def scaled(a: Vector, factor: float) -> Vector:
+    """Return factor a."""
+    return factor * a[0], factor * a[1], factor * a[2]
+
+
+@portable
+def row(table: Array, i: int) -> Vector:
+    """Return row i of a table (n, 3)."""
+    return float(table[i, 0]), float(table[i, 1]), float(table[i, 2])
+
+
+@portable
+def between(a: Vector, b: Vector) -> Vector:
+    """Return the vector from a to b."""
+    return b[0] - a[0], b[1] - a[1], b[2] - a[2]
+
+
+@portable
+def turned(R: Rows, v: Vector) -> Vector:
+    """Return R v."""
+    return dot(R[0], v), dot(R[1], v), dot(R[2], v)
+
+
+@portable
+def put(J: Array, first: int, column: int, v: Vector) -> None:
+    """Write v into a column of J, from row first on."""
+    J[first, column], J[first + 1, column], J[first + 2, column] = v
+
+
+@portable
+def centroid(p_W: Array) -> Vector:
+    """Return the mean of positions (n, 3)."""
+    n = p_W.shape[0]
+    x, y, z = row(p_W, 0)
+    for i in range(1, n):
+        a = row(p_W, i)
+        x, y, z = x + a[0], y + a[1], z + a[2]
+    return x / n, y / n, z / n
+
+
+@portable
+def rotation_WC(roll: float, pitch: float, yaw: float) -> Rows:
+    """Return R_WC = Rz(yaw) Ry(pitch) Rx(roll), row by row."""
+    sr, cr = math.sin(roll), math.cos(roll)
+    sp, cp = math.sin(pitch), math.cos(pitch)
+    sy, cy = math.sin(yaw), math.cos(yaw)
+    return (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        (-sp, cp * sr, cp * cr),
+    )
+
+
+@portable
+def pitch_yaw(x_W: Vector) -> tuple[float, float]:
+    """Return pitch and yaw of a frame from its x axis in W."""
+    flat = math.sqrt(x_W[0] * x_W[0] + x_W[1] * x_W[1])
+    return math.atan2(-x_W[2], flat), math.atan2(x_W[1], x_W[0])
+
+
+@portable
+def euler_axes_C(roll: float, pitch: float) -> Rows:
+    """Return w_WC_C of a unit rate of roll, of pitch and of yaw."""
+    sr, cr = math.sin(roll), math.cos(roll)
+    sp, cp = math.sin(pitch), math.cos(pitch)
+    return (1.0, 0.0, 0.0), (0.0, cr, -sr), (-sp, sr * cp, cr * cp)
+
+
+def euler_rates(roll: float, pitch: float) -> Array:
+    """Return T (3, 3) with (roll', pitch', yaw') = T w_WC_C.
+
+    Raises:
+        SingularClusterError: pitch is at 90 degrees.
+    """
+    sr, cr = math.sin(roll), math.cos(roll)
+    sp, cp = math.sin(pitch), math.cos(pitch)
+    if cp < LENGTH_MIN_M:
+        raise SingularClusterError("pitch is 90 deg: roll and yaw of the formation are one rotation there")
+    return np.array([(1.0, sr * sp / cp, cr * sp / cp), (0.0, cr, -sr), (0.0, sr / cp, cr / cp)])
+
+
+@portable
+def triad_axes(d2: Vector, d3: Vector) -> tuple[Vector, Vector, Vector, float, float]:
+    """Return the axes x, y, z of C in W, h = |d2 + d3| [m] and the area |d2 x d3| [m^2].
+
+    x_C points from the middle of robots 2 and 3 to robot 1, z_C along d2 x d3; robot 2 is on the left.
+    All is zero where the three robots are in line or in one place.
+
+    Args:
+        d2, d3: P2 - P1 and P3 - P1, both in W [m].
+    """
+    m = (d2[0] + d3[0], d2[1] + d3[1], d2[2] + d3[2])
+    normal = cross(d2, d3)
+    h, area = length(m), length(normal)
+    if not (h > LENGTH_MIN_M and area > LENGTH_MIN_M * h):  # also true for NaN
+        none = (0.0, 0.0, 0.0)
+        return none, none, none, 0.0, 0.0
+    x = (-m[0] / h, -m[1] / h, -m[2] / h)
+    z = (normal[0] / area, normal[1] / area, normal[2] / area)
+    return x, cross(z, x), z, h, area

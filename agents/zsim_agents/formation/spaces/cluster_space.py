@@ -1,0 +1,244 @@
+"""Cluster space: a formation of n robots described as one articulated body.
+
+Robot space is r = (x_i, y_i, z_i, theta_i), i = 1..n, positions in W [m], headings about z of W [rad];
+cluster space c holds as many variables: where the formation is, how it is turned, how each robot is turned
+against it, and its shape. Velocities are related by c_dot = J(r) r_dot (Mas, Curi, Sanchez Pena, eqs. 1, 2).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.math.compiled import COMPILES, portable
+from zsim.scenario.scenario import ROBOTS_MAX
+
+Array = NDArray[np.float64]
+
+TAU = 2 * math.pi
+CONDITION_LENGTH_M = 4.0  # p and q of the paper's formation, equation (3)
+NAMES_SHOWN = 20  # in a message; the paper's cluster has 12
+
+
+class SingularClusterError(ValueError):
+    """The formation is so degenerate that its cluster frame does not exist."""
+
+
+class ClusterSpace(ABC):
+    """One convention of cluster variables for n robots; every method is a pure function.
+
+    Attributes:
+        n: number of robots.
+        size: number of cluster variables, 4 n.
+        names: their names in the order of c; lengths in metres, angles in radians.
+        angular: (4n,) bool, true for the angles that wrap (roll, yaw, phi_i, azimuth_k).
+        in_radians: (4n,) bool, true for all angles, also those that do not wrap (pitch, beta, elevation_k).
+        period: (4n,) of the angles that wrap, 2 pi, and 0 for all else.
+        bounds: (4n, 2) open bounds of the values that `forward` can give, infinite where there is none.
+        neutral: (4n,) bool, true for the variables that are zero in a formation of which nothing else was said: tilts,
+            headings against the formation, departures from a template.
+        tilts: places of roll and pitch in c.
+        spread_text: what `spread` measures, in words for messages.
+    """
+
+    def __init__(self, n: int, names: Sequence[str], spread_text: str) -> None:
+        self.n = n
+        self.size = 4 * n
+        self.names = tuple(names)
+        self.spread_text = spread_text
+        stems = [_stem(name) for name in names]
+        self.angular = np.array([stem in {"roll", "yaw", "phi", "azimuth"} for stem in stems])
+        self.in_radians = self.angular | np.array([stem in _BOUNDED_ANGLES for stem in stems])
+        self.neutral = np.array([stem in {"roll", "pitch", "phi", "w"} for stem in stems])
+        self.period = np.where(self.angular, TAU, 0.0)
+        self.bounds = np.array([_BOUNDS.get(stem, (-math.inf, math.inf)) for stem in stems])
+        self.tilts = tuple(i for i, stem in enumerate(stems) if stem in {"roll", "pitch"})
+        self._lengths = [i for i, stem in enumerate(stems) if stem in _LENGTHS]
+        self._pitch = self.names.index("pitch")
+
+    @abstractmethod
+    def forward(self, p_W: Array, yaw: Array) -> Array:
+        """Return c (4n,) of robots at p_W (n, 3) [m] with headings yaw (n,) [rad].
+
+        Raises:
+            SingularClusterError: robots coincide or stand in line, so that there is no frame.
+        """
+
+    @abstractmethod
+    def inverse(self, c: Array) -> tuple[Array, Array]:
+        """Return positions p_W (n, 3) [m] and headings yaw (n,) [rad, wrapped] of the robots of c (4n,).
+
+        Raises:
+            SingularClusterError: the shape has no extent (h = 0), so that robots have no place.
+        """
+
+    @abstractmethod
+    def jacobian(self, p_W: Array, yaw: Array) -> Array:
+        """Return J (4n, 4n) with c_dot = J r_dot; r_dot ordered (vx, vy, vz, yaw rate) robot by robot, W.
+
+        Raises:
+            SingularClusterError: as in `forward`.
+        """
+
+    @abstractmethod
+    def inverse_jacobian(self, c: Array) -> Array:
+        """Return J^-1 (4n, 4n) with r_dot = J^-1 c_dot, in closed form.
+
+        Raises:
+            SingularClusterError: as in `inverse`.
+        """
+
+    @abstractmethod
+    def spread(self, c: Array) -> float:
+        """Return the smallest height of the shape [m] (see `spread_text`); 0 where the shape is singular."""
+
+    def motion(self, c: Array, c_dot: Array) -> Array:
+        """Return r_dot (4n,) = J^-1 c_dot; spaces whose J^-1 is large have a shorter way than through the matrix."""
+        return self.inverse_jacobian(c).dot(c_dot)  # the same bits as @, in half of its time at so small a size
+
+    def specimen(self, apart_m: float) -> Array:
+        """Return c (4n,) of some formation with robots at least so far apart, level, to try code on."""
+        radius_m = self.n * apart_m
+        turns = np.arange(self.n) * (TAU / self.n)
+        p_W = radius_m * np.column_stack((np.cos(turns), np.sin(turns), np.ones(self.n)))
+        return self.forward(p_W, np.zeros(self.n))
+
+    def margin(self, c: Array) -> float:
+        """Return the distance to singularity [m]: spread(c) cos(pitch).
+
+        It is zero exactly where J^-1 is singular (robots 1, 2, 3 in line or two of them in one place, a
+        further robot on the z axis through robot 1, or pitch at 90 degrees), and a length: how far one
+        robot may move before a level formation becomes singular.
+        """
+        return self.measures(c)[1]
+
+    def measures(self, c: Array) -> tuple[float, float]:
+        """Return spread and margin [m]."""
+        spread = self.spread(c)
+        return spread, spread * math.cos(c[self._pitch])
+
+    def condition(self, c: Array) -> float:
+        """Return the condition number of J^-1 (2-norm, metres and radians as they are).
+
+        It grows with the unit of length, so a formation larger than 4 m is judged scaled down to 4 m: a
+        large formation is not nearer to singularity than a small one of the same shape.
+        """
+        lengths = np.abs(c[self._lengths])
+        scaled = c.copy()
+        scaled[self._lengths] *= min(1.0, CONDITION_LENGTH_M / max(float(lengths.max()), CONDITION_LENGTH_M))
+        return float(np.linalg.cond(self.inverse_jacobian(scaled)))
+
+    def difference(self, c_to: Array, c_from: Array) -> Array:
+        """Return c_to - c_from (4n,), angles that wrap the short way."""
+        return self.wrapped(c_to - c_from)
+
+    def wrapped(self, c: Array) -> Array:
+        """Return c (4n,), or a table (m, 4n) of them, with the angles that wrap taken to [-pi, pi]."""
+        if c.ndim > 1:
+            return c - self.period * np.rint(c / TAU)
+        near = np.empty(self.size)
+        put_wrapped(c, self.period, near)
+        return near
+
+    def index(self, name: str) -> int:
+        """Return the place of a variable in c.
+
+        Raises:
+            ValueError: there is no such variable.
+        """
+        if name not in self.names:
+            raise ValueError(f"variable {name[:40]!r} is unknown; allowed: {_listed(self.names)}")
+        return self.names.index(name)
+
+
+def cluster_space(n: int) -> ClusterSpace:
+    """Return the cluster space of n robots: the paper's at n = 3, its triad generalisation elsewhere.
+
+    Raises:
+        ValueError: n is not from 2 to 64.
+    """
+    # Imported here because both build on the class above.
+    from zsim_agents.formation.spaces.pair_cluster import PairCluster
+    from zsim_agents.formation.spaces.triad_cluster import TriadCluster
+
+    if not 2 <= n <= ROBOTS_MAX:
+        raise ValueError(f"a cluster of {n} robots is not possible; allowed: 2 to {ROBOTS_MAX}")
+    return PairCluster() if n == 2 else TriadCluster(n)
+
+
+def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Array]:
+    """Return velocities (n, 3) [m/s, W] and yaw rates (n,) [rad/s] of the robots of c moving at c_dot."""
+    r_dot = space.motion(c, c_dot).reshape(space.n, 4)
+    return r_dot[:, :3].copy(), r_dot[:, 3].copy()
+
+
+@portable
+def put_wrapped(c: Array, period: Array, near: Array) -> None:
+    """Write c with each variable taken to half a period about zero; period is 2 pi or, for none, 0."""
+    for k in range(c.size):
+        near[k] = c[k] - period[k] * np.rint(c[k] / TAU)
+
+
+def closest_pair(p_W: Array) -> tuple[float, int, int]:
+    """Return the least distance [m] between two of the positions (n, 3), and the indices of that pair."""
+    return least_distance(p_W) if COMPILES else least_distance_at_once(p_W)
+
+
+def least_distance_at_once(p_W: Array) -> tuple[float, int, int]:
+    """Return the same as `least_distance` by array operations, the faster way where nothing is compiled."""
+    first, second = np.triu_indices(len(p_W), 1)
+    x, y, z = (p_W[second] - p_W[first]).T
+    distances = np.nan_to_num(np.sqrt(x * x + y * y + z * z), nan=math.inf, posinf=math.inf)
+    at = int(np.argmin(distances))
+    return float(distances[at]), int(first[at]), int(second[at])
+
+
+@portable
+def least_distance(p_W: Array) -> tuple[float, int, int]:
+    """Return what `closest_pair` does."""
+    least, first, second = math.inf, 0, 1
+    for i in range(p_W.shape[0]):
+        for j in range(i + 1, p_W.shape[0]):
+            x, y, z = p_W[j, 0] - p_W[i, 0], p_W[j, 1] - p_W[i, 1], p_W[j, 2] - p_W[i, 2]
+            distance = math.sqrt(x * x + y * y + z * z)
+            if distance < least:
+                least, first, second = distance, i, j
+    return least, first, second
+
+
+def numbered(stem: str, robots: Iterable[int]) -> list[str]:
+    """Return the names of a variable that every robot has, robots counted from 1."""
+    return [f"{stem}_{k}" for k in robots]
+
+
+def unit(name: str) -> str:
+    """Return the unit of a variable of any cluster space: m or rad."""
+    return "m" if name in ("x_c", "y_c", "z_c") or _stem(name) in _LENGTHS | {"w"} else "rad"
+
+
+_LENGTHS = {"p", "q", "rho"}
+_BOUNDED_ANGLES = {"pitch", "beta", "elevation"}
+_BOUNDS = {
+    "pitch": (-math.pi / 2, math.pi / 2),
+    "elevation": (-math.pi / 2, math.pi / 2),
+    "beta": (0.0, math.pi),
+    "p": (0.0, math.inf),
+    "q": (0.0, math.inf),
+    "rho": (0.0, math.inf),
+}
+
+
+def _stem(name: str) -> str:
+    """Return a name without its group and its number: phi for left.phi_2."""
+    return name.rpartition(".")[2].rstrip("0123456789").rstrip("_")
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names for a line of text, of many the first and the last."""
+    if len(names) <= NAMES_SHOWN:
+        return ", ".join(names)
+    return ", ".join((*names[: NAMES_SHOWN - 1], f"… {names[-1]}")) + f" ({len(names)})"

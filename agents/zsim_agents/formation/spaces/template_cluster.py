@@ -1,0 +1,246 @@
+"""The cluster of many robots: a template that moves and turns as one body, and small departures from it.
+
+    P_i = C + R (t_i + (N w)_i)
+
+C is the centroid, t_i the template's places, N a basis of the displacements that neither move nor turn it, and R the
+rotation that brings the template nearest to the robots. No robot is privileged, and what one robot does changes the
+frame by its n-th part only. Order of this file: the space, its pure parts.
+
+Attitudes by best fit: Kabsch 1976, Horn 1987; as a formation's frame: Belta and Kumar, Abstraction and control for
+groups of robots, IEEE Trans. Robotics 20 (2004).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from zsim.math.compiled import portable
+from zsim_agents.formation.spaces.cluster_frame import LENGTH_MIN_M, euler_axes_C, euler_rates, pitch_yaw, rotation_WC
+from zsim_agents.formation.spaces.cluster_space import (
+    CONDITION_LENGTH_M,
+    TAU,
+    Array,
+    ClusterSpace,
+    SingularClusterError,
+    numbered,
+)
+from zsim_agents.formation.spaces.rotation_fit import fitted_rotation
+from zsim_agents.formation.spaces.shape_modes import centred, shape_modes
+
+NO_FRAME = "the robots are in one line or one place, or too far from the template: the formation has no frame"
+HEADING, TURN, BEND = 6, slice(0, 3), slice(3, 6)  # places in the small matrix of `condition`
+
+
+class TemplateCluster(ClusterSpace):
+    """c = (x_c, y_c, z_c, roll, pitch, yaw, phi_1..phi_n, w_1..w_{3n-6}); w in metres rms over the robots.
+
+    w_1 is growth: robots go outwards, by w_1 in the root mean square. Then come the stretches and shears that the
+    template has room for (`shape_modes`).
+
+    Attributes:
+        t_C: (n, 3) places of the template about their centroid, in C [m].
+        modes_C: (n, 3, 3n - 6), N.
+
+    Args:
+        places_m: (n, 3) the template, n from 3 on; its origin does not matter.
+
+    Raises:
+        ValueError: fewer than three places, or all in one line.
+    """
+
+    def __init__(self, places_m: ArrayLike) -> None:
+        self.t_C = centred(places_m)
+        n = len(self.t_C)
+        if n < 3:
+            raise ValueError(f"template: {n} places; allowed: 3 or more")
+        self.modes_C = shape_modes(self.t_C)
+        self._modes = self.modes_C.reshape(3 * n, 3 * n - 6)
+        self._gathered = np.ascontiguousarray(self._modes.T) / n  # N^T / n, the inverse of N on its span
+        self._inertia = inertia(self.t_C.T @ self.t_C)
+        self._reach_m = math.sqrt(n * float(np.linalg.eigvalsh(self._inertia)[0]))
+        names = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", *numbered("phi", range(1, n + 1))]
+        spread_text = "root mean square distance of the robots from the line through them"
+        super().__init__(n, [*names, *numbered("w", range(1, 3 * n - 5))], spread_text)
+        self._shape = 6 + n  # place of w_1 in c
+
+    def forward(self, p_W: Array, yaw: Array) -> Array:
+        centre_W, b_C, R_WC = self._fitted(p_W)
+        c = np.empty(self.size)
+        c[:3] = centre_W
+        c[3:6] = euler_angles(R_WC)
+        c[6 : self._shape] = yaw - c[5]
+        c[6 : self._shape] -= TAU * np.rint(c[6 : self._shape] / TAU)
+        c[self._shape :] = self._gathered.dot((b_C - self.t_C).ravel())
+        return c
+
+    def inverse(self, c: Array) -> tuple[Array, Array]:
+        yaw = c[5] + c[6 : self._shape]
+        return c[:3] + self._places_C(c).dot(_rotation(c).T), yaw - TAU * np.rint(yaw / TAU)
+
+    def jacobian(self, p_W: Array, yaw: Array) -> Array:
+        """Return J; with b_C = R^T (P - C): w_WC_C = M^-1 sum of t_i x R^T v_i, M = tr(S) I - S, S = sum of b_i t_i^T.
+
+        It follows from the sum of t_i x b_i being zero, which is what makes R the best fit.
+        """
+        _, b_C, R_WC = self._fitted(p_W)
+        n = self.n
+        arms = np.array([skew(t) @ R_WC.T for t in self.t_C]).transpose(1, 0, 2)  # of t_i x R^T v_i: (3, n, 3)
+        turn = np.linalg.solve(inertia(b_C.T @ self.t_C), arms.reshape(3, 3 * n)).reshape(3, n, 3)
+        roll, pitch, _ = euler_angles(R_WC)
+        moved_C = np.einsum("iab,bjk->iajk", np.array([skew(b) for b in b_C]), turn)  # b_i' = R^T v_i - w_WC_C x b_i
+        moved_C[range(n), :, range(n)] += R_WC.T  # less that of the centroid, of which N^T knows nothing
+
+        J = np.zeros((self.size, n, 4))
+        J[:3, :, :3] = np.eye(3)[:, None] / n
+        J[3:6, :, :3] = np.tensordot(euler_rates(roll, pitch), turn, 1)
+        J[6 : self._shape, :, 3] = np.eye(n)
+        J[6 : self._shape] -= J[5]
+        J[self._shape :, :, :3] = (self._gathered @ moved_C.reshape(3 * n, 3 * n)).reshape(-1, n, 3)
+        return J.reshape(self.size, self.size)
+
+    def inverse_jacobian(self, c: Array) -> Array:
+        R_WC, place_C = _rotation(c), self._places_C(c)
+        J_inv = np.zeros((self.n, 4, self.size))
+        J_inv[:, :3, :3] = np.eye(3)
+        for k, axis_C in enumerate(_axes_C(c), start=3):
+            J_inv[:, :3, k] = place_C @ skew(axis_C).T @ R_WC.T
+        J_inv[:, :3, self._shape :] = R_WC @ self.modes_C
+        J_inv[:, 3, 5] = 1.0
+        J_inv[:, 3, 6 : self._shape] = np.eye(self.n)
+        return J_inv.reshape(self.size, self.size)
+
+    def motion(self, c: Array, c_dot: Array) -> Array:
+        w_WC_C = c_dot[3:6].dot(_axes_C(c))
+        v_C = self._places_C(c).dot(skew(w_WC_C).T) + self._modes.dot(c_dot[self._shape :]).reshape(self.n, 3)
+        r_dot = np.empty((self.n, 4))
+        r_dot[:, :3] = c_dot[:3] + v_C.dot(_rotation(c).T)
+        r_dot[:, 3] = c_dot[5] + c_dot[6 : self._shape]
+        return r_dot.ravel()
+
+    def specimen(self, apart_m: float) -> Array:
+        """Return the template itself, wide enough."""
+        c = np.zeros(self.size)
+        distance = np.linalg.norm(self.t_C[:, None] - self.t_C, axis=2)[np.triu_indices(self.n, 1)].min()
+        radius_m = math.sqrt(float((self.t_C**2).sum()) / self.n)
+        c[self._shape] = radius_m * max(apart_m / max(float(distance), LENGTH_MIN_M) - 1.0, 0.0)
+        c[2] = float(np.abs(self._places_C(c)).max()) + apart_m
+        return c
+
+    def spread(self, c: Array) -> float:
+        """Return the root mean square distance from the line through the robots, measured along the template.
+
+        It is the least eigenvalue of M (see `jacobian`) over sqrt(n times that of the template): exact for a template
+        of any size, and zero where another rotation would fit as well.
+        """
+        S = self._places_C(c).T.dot(self.t_C)
+        return float(np.linalg.eigvalsh(inertia((S + S.T) / 2))[0]) / self._reach_m
+
+    def condition(self, c: Array) -> float:
+        """Return the condition number of J^-1 where what each robot has (velocity, heading, phi) counts by its
+        root mean square over the robots, so that it does not grow with their number; of a formation with robots
+        farther than 4 m from the centroid, of one scaled down to that.
+
+        w_k and the centroid are orthonormal in this measure; what is left is a matrix of 7 x 7: turns, the three
+        directions of w that they mix with, and the mean of phi.
+        """
+        place_C = self._places_C(c)
+        scale = min(1.0, CONDITION_LENGTH_M / max(float(np.linalg.norm(place_C, axis=1).max()), LENGTH_MIN_M))
+        axes = _axes_C(c).T
+        M = scale**2 * axes.T @ inertia(place_C.T @ self.t_C).T  # the template scaled alike
+        stiff = np.linalg.solve(scale**2 * self._inertia, M.T)
+        whole = scale**2 * axes.T @ inertia(place_C.T @ place_C) @ axes
+        G = np.eye(7)
+        G[TURN, TURN] = whole / self.n
+        G[2, 2] += 1.0  # a turn in yaw turns every heading
+        G[TURN, BEND] = _root(whole - M @ stiff, self.n)
+        G[BEND, TURN] = G[TURN, BEND].T
+        G[HEADING, 2] = G[2, HEADING] = 1.0
+        values = np.linalg.eigvalsh(G)
+        return math.sqrt(values[-1] / values[0]) if values[0] > 0.0 else math.inf
+
+    def _places_C(self, c: Array) -> Array:
+        """Return the places of the robots from the centroid (n, 3) [m; C]."""
+        return self.t_C + self._modes.dot(c[self._shape :]).reshape(self.n, 3)
+
+    def _fitted(self, p_W: Array) -> tuple[Array, Array, Array]:
+        """Return the centroid (3,), the places from it in C (n, 3), and R_WC (3, 3)."""
+        centre_W = np.add.reduce(p_W, axis=0) / self.n
+        b_W = p_W - centre_W
+        gap, R_WC = fitted_rotation(self.t_C.T.dot(b_W))
+        if not gap > LENGTH_MIN_M * self._reach_m:  # also true for NaN
+            raise SingularClusterError(NO_FRAME)
+        return centre_W, b_W.dot(R_WC), R_WC
+
+
+def inertia(S: Array) -> Array:
+    """Return tr(S) I - S (3, 3)."""
+    M = np.empty((3, 3))
+    put_inertia(S, M)
+    return M
+
+
+@portable
+def put_inertia(S: Array, M: Array) -> None:
+    """Write tr(S) I - S."""
+    trace = S[0, 0] + S[1, 1] + S[2, 2]
+    for i in range(3):
+        for j in range(3):
+            M[i, j] = (trace if i == j else 0.0) - S[i, j]
+
+
+def skew(a: Array) -> Array:
+    """Return the matrix (3, 3) of a x ."""
+    A = np.empty((3, 3))
+    put_skew(a, A)
+    return A
+
+
+@portable
+def put_skew(a: Array, A: Array) -> None:
+    """Write the matrix of a x ."""
+    A[0, 0], A[0, 1], A[0, 2] = 0.0, -a[2], a[1]
+    A[1, 0], A[1, 1], A[1, 2] = a[2], 0.0, -a[0]
+    A[2, 0], A[2, 1], A[2, 2] = -a[1], a[0], 0.0
+
+
+def euler_angles(R_WC: Array) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of R_WC = Rz(yaw) Ry(pitch) Rx(roll)."""
+    pitch, yaw = pitch_yaw((R_WC[0, 0], R_WC[1, 0], R_WC[2, 0]))
+    return math.atan2(R_WC[2, 1], R_WC[2, 2]), pitch, yaw
+
+
+def _rotation(c: Array) -> Array:
+    R_WC = np.empty((3, 3))
+    put_rotation(c, R_WC)
+    return R_WC
+
+
+@portable
+def put_rotation(c: Array, R_WC: Array) -> None:
+    """Write R_WC of a cluster (4n,)."""
+    rows = rotation_WC(c[3], c[4], c[5])
+    for i in range(3):
+        R_WC[i, 0], R_WC[i, 1], R_WC[i, 2] = rows[i]
+
+
+def _axes_C(c: Array) -> Array:
+    axes_C = np.empty((3, 3))
+    put_axes(c, axes_C)
+    return axes_C
+
+
+@portable
+def put_axes(c: Array, axes_C: Array) -> None:
+    """Write w_WC_C of a unit rate of roll, of pitch and of yaw, row by row."""
+    rows = euler_axes_C(c[3], c[4])
+    for i in range(3):
+        axes_C[i, 0], axes_C[i, 1], axes_C[i, 2] = rows[i]
+
+
+def _root(E: Array, n: int) -> Array:
+    """Return the symmetric root of E / n (3, 3), E without negative eigenvalues but for rounding."""
+    values, vectors = np.linalg.eigh((E + E.T) / 2)
+    return (vectors * np.sqrt(np.maximum(values, 0.0) / n)) @ vectors.T

@@ -1,0 +1,308 @@
+"""The cluster of three robots of the paper, and its generalisation to more of them.
+
+Robots 1, 2, 3 give the frame C and the triangle (p, q, beta); each further robot k adds its distance rho,
+azimuth and elevation, seen from robot 1 in C. The origin is the centroid of all robots.
+
+Order of this file: the space, the compiled mathematics from robots to c and back and of J^-1, the rows of J.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from zsim.math.compiled import portable
+from zsim_agents.formation.spaces.cluster_frame import (
+    LENGTH_MIN_M,
+    Rows,
+    Vector,
+    between,
+    centroid,
+    cross,
+    dot,
+    euler_axes_C,
+    euler_rates,
+    length,
+    pitch_yaw,
+    put,
+    rotation_WC,
+    row,
+    triad_axes,
+    turned,
+    wrap_angle,
+)
+from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, numbered
+
+NO_FRAME = "robots 1, 2 and 3 are in line or in one place: the formation has no frame"
+
+
+class TriadCluster(ClusterSpace):
+    """c = (x_c, y_c, z_c, roll, pitch, yaw, phi_1..phi_n, p, q, beta, rho_4, azimuth_4, elevation_4, ...).
+
+    det J^-1 = -p^2 q^2 sin(beta) cos(pitch) at n = 3.
+    """
+
+    def __init__(self, n: int) -> None:
+        others = [name for k in range(4, n + 1) for name in (f"rho_{k}", f"azimuth_{k}", f"elevation_{k}")]
+        names = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", *numbered("phi", range(1, n + 1))]
+        spread_text = "sin(beta) min(p, q)" if n == 3 else "least of sin(beta) min(p, q) and rho_k cos(elevation_k)"
+        super().__init__(n, [*names, "p", "q", "beta", *others], spread_text)
+        self._shape = 6 + n  # place of p in c
+
+    def forward(self, p_W: Array, yaw: Array) -> Array:
+        c = np.empty(self.size)
+        if not triad_forward(p_W, yaw, c):
+            raise SingularClusterError(NO_FRAME)
+        return c
+
+    def inverse(self, c: Array) -> tuple[Array, Array]:
+        p_W, yaw = np.empty((self.n, 3)), np.empty(self.n)
+        if not triad_inverse(c, p_W, yaw):
+            raise self._no_direction(c)
+        return p_W, yaw
+
+    def jacobian(self, p_W: Array, yaw: Array) -> Array:
+        d_W = p_W - p_W[0]
+        x, y, z, h, area = triad_axes(row(d_W, 1), row(d_W, 2))
+        if h == 0.0:
+            raise SingularClusterError(NO_FRAME)
+        R_WC = np.array([x, y, z]).T
+        d_C = d_W @ R_WC
+        rate = np.zeros((3, self.n, 3))  # w_WC_C = sum over robots of rate[:, i] v_i
+        rate[0, :3] = np.outer((d_C[2, 0] - d_C[1, 0], -d_C[2, 0], d_C[1, 0]), z) / area
+        rate[1, :3] = np.outer((-2.0, 1.0, 1.0), z) / h
+        rate[2, :3] = np.outer((2.0, -1.0, -1.0), y) / h
+        roll, pitch = math.atan2(y[2], z[2]), pitch_yaw(x)[0]
+
+        J = np.zeros((self.size, self.n, 4))
+        J[:3, :, :3] = np.eye(3)[:, None] / self.n
+        J[3:6, :, :3] = np.tensordot(euler_rates(roll, pitch), rate, 1)
+        J[6 : 6 + self.n, :, 3] = np.eye(self.n)
+        J[6 : 6 + self.n] -= J[5]
+        J[self._shape : self._shape + 3, :3, :3] = _triangle_rows(d_W[1], d_W[2], np.array(z))
+        for k in range(3, self.n):
+            first = self._shape + 3 * (k - 2)
+            J[first : first + 3, :, :3] = _spherical_rows(k, d_C[k], R_WC, rate)
+        return J.reshape(self.size, self.size)
+
+    def inverse_jacobian(self, c: Array) -> Array:
+        J_inv = np.zeros((self.size, self.size))
+        if not triad_inverse_jacobian(c, J_inv):
+            raise self._no_direction(c)
+        return J_inv
+
+    def spread(self, c: Array) -> float:
+        return float(triad_spread(c))
+
+    def _no_direction(self, c: Array) -> SingularClusterError:
+        p, q, beta = c[self._shape : self._shape + 3].tolist()
+        return SingularClusterError(f"p {p:.3g} m, q {q:.3g} m, beta {beta:.3g} rad: the formation has no direction")
+
+
+@portable
+def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
+    """Write c (4n,); return whether the robots have a frame, without which nothing is written."""
+    n = yaw.size
+    at = 6 + n  # place of p in c
+    p_1 = row(p_W, 0)
+    d2, d3 = between(p_1, row(p_W, 1)), between(p_1, row(p_W, 2))
+    x, y, z, h, area = triad_axes(d2, d3)
+    if h == 0.0:
+        return False
+    c[0], c[1], c[2] = centroid(p_W)
+    c[3] = math.atan2(y[2], z[2])
+    c[4], c[5] = pitch_yaw(x)
+    for i in range(n):
+        c[6 + i] = wrap_angle(yaw[i] - c[5])
+    c[at], c[at + 1], c[at + 2] = length(d2), length(d3), math.atan2(area, dot(d2, d3))
+    for k in range(3, n):
+        first = at + 3 * (k - 2)
+        c[first], c[first + 1], c[first + 2] = spherical(turned((x, y, z), between(p_1, row(p_W, k))))
+    return True
+
+
+@portable
+def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
+    """Write positions (n, 3) and headings (n,); return whether the shape has an extent, else they mean nothing."""
+    n = c.size // 4
+    put_places_C(c, p_W)
+    R_WC = rotation_WC(c[3], c[4], c[5])
+    for i in range(n):
+        d_W = turned(R_WC, row(p_W, i))
+        for k in range(3):
+            p_W[i, k] = c[k] + d_W[k]
+        yaw[i] = wrap_angle(c[5] + c[6 + i])
+    return has_direction(c)
+
+
+@portable
+def triad_inverse_jacobian(c: Array, J_inv: Array) -> bool:
+    """Write J^-1 (4n, 4n) into zeros; return whether the shape has an extent, without which nothing is written.
+
+    Robot i moves at v_c + R_WC (w_WC_C x place_i + its place's derivatives by the shape times their rates),
+    and turns at yaw' + phi_i'.
+    """
+    n = c.size // 4
+    if not has_direction(c):
+        return False
+    R_WC, axes_C, place_C = rotation_WC(c[3], c[4], c[5]), euler_axes_C(c[3], c[4]), np.empty((n, 3))
+    put_places_C(c, place_C)
+    for i in range(n):
+        first = 4 * i
+        for k in range(3):
+            J_inv[first + k, k] = 1.0
+            put(J_inv, first, 3 + k, turned(R_WC, cross(axes_C[k], row(place_C, i))))
+        J_inv[first + 3, 5] = J_inv[first + 3, 6 + i] = 1.0
+    put_shape_rates(J_inv, c, R_WC)
+    return True
+
+
+@portable
+def put_shape_rates(J_inv: Array, c: Array, R_WC: Rows) -> None:
+    """Write the columns of the shape variables into J^-1."""
+    n = c.size // 4
+    at = 6 + n
+    triangle_C = triangle_rates(c[at], c[at + 1], c[at + 2])
+    for robot in range(1, 3):
+        for k in range(3):
+            add_rate(J_inv, robot, at + k, turned(R_WC, triangle_C[robot - 1][k]))
+    for robot in range(3, n):
+        first = at + 3 * (robot - 2)
+        rates_C = spherical_rates(c[first], c[first + 1], c[first + 2])
+        for k in range(3):
+            add_rate(J_inv, robot, first + k, turned(R_WC, rates_C[k]))
+
+
+@portable
+def add_rate(J_inv: Array, robot: int, column: int, rate_W: Vector) -> None:
+    """Let one robot move with a variable; the centroid stays, so that all move back by the mean."""
+    n = J_inv.shape[0] // 4
+    for k in range(3):
+        back = rate_W[k] / n
+        for i in range(n):
+            J_inv[4 * i + k, column] -= back
+        J_inv[4 * robot + k, column] += rate_W[k]
+
+
+@portable
+def triad_spread(c: Array) -> float:
+    """Return the least of sin(beta) min(p, q) and rho_k cos(elevation_k)."""
+    at = 6 + c.size // 4
+    least = math.sin(c[at + 2]) * min(c[at], c[at + 1])
+    for first in range(at + 3, c.size, 3):
+        least = min(least, c[first] * math.cos(c[first + 2]))
+    return least
+
+
+@portable
+def put_places_C(c: Array, place: Array) -> None:
+    """Write the places of the robots from the centroid, in C (n, 3) [m]."""
+    n = c.size // 4
+    at = 6 + n
+    p, q = c[at], c[at + 1]
+    ca2, sa2, ca3, sa3, _ = split_beta(p, q, c[at + 2])
+    place[:3] = 0.0  # from robot 1
+    place[1, 0], place[1, 1] = -p * ca2, p * sa2
+    place[2, 0], place[2, 1] = -q * ca3, -q * sa3
+    for k in range(3, n):
+        first = at + 3 * (k - 2)
+        place[k, 0], place[k, 1], place[k, 2] = spherical_place(c[first], c[first + 1], c[first + 2])
+    centre = centroid(place)
+    for i in range(n):
+        for k in range(3):
+            place[i, k] -= centre[k]
+
+
+@portable
+def has_direction(c: Array) -> bool:
+    """Return whether the middle of robots 2 and 3 is apart from robot 1."""
+    at = 6 + c.size // 4
+    return split_beta(c[at], c[at + 1], c[at + 2])[4] > 0.0
+
+
+@portable
+def split_beta(p: float, q: float, beta: float) -> tuple[float, float, float, float, float]:
+    """Return cos and sin of the angle at robot 1 from -x_C to robot 2, the same to robot 3, and h [m].
+
+    All is zero where there is no such axis.
+    """
+    along2, along3 = p + q * math.cos(beta), q + p * math.cos(beta)
+    h = math.sqrt(max(p * along2 + q * along3, 0.0))
+    if not h > LENGTH_MIN_M:  # also true for NaN
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    return along2 / h, q * math.sin(beta) / h, along3 / h, p * math.sin(beta) / h, h
+
+
+@portable
+def triangle_rates(p: float, q: float, beta: float) -> tuple[Rows, Rows]:
+    """Return the derivatives of robot 2 from robot 1, in C, by p, by q and by beta, and those of robot 3."""
+    ca2, sa2, ca3, sa3, h = split_beta(p, q, beta)
+    by_p, by_q = -sa2 / h, sa3 / h  # of the angle of robot 2; that of robot 3 turns the other way
+    of_2 = (
+        (-ca2 + p * sa2 * by_p, sa2 + p * ca2 * by_p, 0.0),
+        (p * sa2 * by_q, p * ca2 * by_q, 0.0),
+        (p * sa2 * q * ca3 / h, p * ca2 * q * ca3 / h, 0.0),
+    )
+    of_3 = (
+        (-q * sa3 * by_p, q * ca3 * by_p, 0.0),
+        (-ca3 - q * sa3 * by_q, -sa3 + q * ca3 * by_q, 0.0),
+        (q * sa3 * p * ca2 / h, -q * ca3 * p * ca2 / h, 0.0),
+    )
+    return of_2, of_3
+
+
+@portable
+def spherical(d_C: Vector) -> Vector:
+    """Return distance, azimuth and elevation of a vector."""
+    flat = math.sqrt(d_C[0] * d_C[0] + d_C[1] * d_C[1])
+    return length(d_C), math.atan2(d_C[1], d_C[0]), math.atan2(d_C[2], flat)
+
+
+@portable
+def spherical_place(rho: float, azimuth: float, elevation: float) -> Vector:
+    """Return (x, y, z) of distance, azimuth and elevation."""
+    flat = rho * math.cos(elevation)
+    return flat * math.cos(azimuth), flat * math.sin(azimuth), rho * math.sin(elevation)
+
+
+@portable
+def spherical_rates(rho: float, azimuth: float, elevation: float) -> Rows:
+    """Return the derivatives of (x, y, z) by distance, by azimuth and by elevation."""
+    sa, ca, se, ce = math.sin(azimuth), math.cos(azimuth), math.sin(elevation), math.cos(elevation)
+    return (
+        (ce * ca, ce * sa, se),
+        (-rho * ce * sa, rho * ce * ca, 0.0),
+        (-rho * se * ca, -rho * se * sa, rho * ce),
+    )
+
+
+def _triangle_rows(d2_W: Array, d3_W: Array, z_W: Array) -> Array:
+    """Return the rows of J for p, q, beta on robots 1, 2, 3: (3, 3 robots, 3)."""
+    p, q = math.hypot(*d2_W), math.hypot(*d3_W)
+    u2, u3 = d2_W / p, d3_W / q
+    t2, t3 = np.cross(z_W, u2) / p, np.cross(z_W, u3) / q
+    none = np.zeros(3)
+    return np.array([[-u2, u2, none], [-u3, none, u3], [t2 - t3, -t2, t3]])
+
+
+def _spherical_rows(k: int, d_C: Array, R_WC: Array, rate: Array) -> Array:
+    """Return the rows of J for rho, azimuth and elevation of robot index k, (3, n, 3).
+
+    In C the robot moves from robot 1 at R_WC^T (v_k - v_1) - w_WC_C x d_C.
+    """
+    x, y, z = d_C.tolist()
+    flat, rho = math.hypot(x, y), math.hypot(x, y, z)
+    if not flat > LENGTH_MIN_M:
+        raise SingularClusterError(f"robot {k + 1} is on the z axis through robot 1: it has no azimuth")
+    gradient = np.array(
+        [
+            (x / rho, y / rho, z / rho),
+            (-y / flat**2, x / flat**2, 0.0),
+            (-x * z / (flat * rho**2), -y * z / (flat * rho**2), flat / rho**2),
+        ]
+    )
+    motion_C = np.tensordot(np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)]), rate, 1)
+    motion_C[:, k] += R_WC.T
+    motion_C[:, 0] -= R_WC.T
+    return np.tensordot(gradient, motion_C, 1)

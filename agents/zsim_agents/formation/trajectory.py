@@ -1,0 +1,254 @@
+"""References in cluster space: a value and its rate for every instant.
+
+Time is in seconds from the start of the reference; outside [0, duration_s] a reference stands still at the
+nearest end. Angles are continuous in time, not wrapped.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from zsim.math.compiled import portable
+from zsim_agents.formation.expression import Expression, ExpressionError, finite_number
+from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
+
+WAYPOINTS_MAX = 10_000
+
+
+class TrajectoryError(ValueError):
+    """A trajectory is not possible as written; the message names the place, finding and remedy."""
+
+
+class Reference(Protocol):
+    """A motion in cluster space."""
+
+    @property
+    def duration_s(self) -> float | None:
+        """Return the time after which the reference stands still, or None where it never does."""
+        ...
+
+    def value(self, t_s: float) -> tuple[Array, Array]:
+        """Return c and c_dot, each (4n,), at t_s; c_dot is the exact derivative of c."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """A reference that stands at c (4n,)."""
+
+    c: Array
+    duration_s: float | None = 0.0
+
+    def value(self, t_s: float) -> tuple[Array, Array]:
+        return self.c, np.zeros(self.c.size)
+
+
+@dataclass(frozen=True, eq=False)
+class Shifted:
+    """A reference that starts at start_s of the time in which it is asked."""
+
+    reference: Reference
+    start_s: float
+
+    @property
+    def duration_s(self) -> float | None:
+        own = self.reference.duration_s
+        return None if own is None else max(0.0, self.start_s + own)
+
+    def value(self, t_s: float) -> tuple[Array, Array]:
+        return self.reference.value(t_s - self.start_s)
+
+
+class ExpressionTrajectory:
+    """Variables as expressions of t; those without one stay at base (4n,).
+
+    Args:
+        expressions: text or a number by variable name, e.g. {"x_c": "5*cos(2*pi*f*t)", "p": 4}.
+        constants: user constants by name, e.g. {"f": 0.01}.
+        duration_s: end of the motion, None for none.
+
+    Raises:
+        ExpressionError, TrajectoryError: an unknown name, an expression or duration not allowed.
+    """
+
+    def __init__(
+        self,
+        space: ClusterSpace,
+        expressions: Mapping[str, str | float],
+        base: Array,
+        constants: Mapping[str, float] | None = None,
+        duration_s: float | None = None,
+    ) -> None:
+        if duration_s is not None and not (finite_number(duration_s) or 0.0) > 0.0:
+            raise TrajectoryError(f"trajectory: duration_s is {duration_s}; allowed: a finite number above 0")
+        self.duration_s = duration_s
+        self._base = base.copy()
+        self._moving: list[tuple[int, Expression]] = []
+        for name, text in expressions.items():
+            index = _index(space, name, "expressions")
+            expression = Expression(name, _as_text(name, text), constants)
+            if expression.constant:
+                self._base[index] = expression(0.0)[0]
+            else:
+                self._moving.append((index, expression))
+
+    def value(self, t_s: float) -> tuple[Array, Array]:
+        end = math.inf if self.duration_s is None else self.duration_s
+        clamped = min(max(t_s, 0.0), end)
+        c, c_dot = self._base.copy(), np.zeros_like(self._base)
+        for index, expression in self._moving:
+            c[index], c_dot[index] = expression(clamped)
+        return c, c_dot if clamped == t_s else np.zeros_like(c)
+
+
+class WaypointTrajectory:
+    """Waypoints joined by cubics with the slopes of PCHIP: C1, at rest at both ends, without overshoot.
+
+    A waypoint is {"at_s": 10.0, "values": {"x_c": 5.0, ...}}; what it does not name stays as in the one
+    before (in the first: as in base). Angles that wrap turn the short way.
+
+    Raises:
+        TrajectoryError: names the waypoint and what is wrong with it.
+    """
+
+    def __init__(self, space: ClusterSpace, waypoints: Sequence[Mapping[str, object]], base: Array) -> None:
+        if not 1 <= len(waypoints) <= WAYPOINTS_MAX:
+            raise TrajectoryError(f"trajectory: {len(waypoints)} waypoints; allowed: 1 to {WAYPOINTS_MAX}")
+        self._times: list[float] = []
+        places: list[Array] = []
+        for number, waypoint in enumerate(waypoints, start=1):
+            self._times.append(self._time(waypoint, number))
+            named = _waypoint_values(space, waypoint, number, places[-1] if places else base)
+            places.append(places[-1] + space.difference(named, places[-1]) if places else named)
+        self._places = np.array(places)
+        self._slopes = np.zeros_like(self._places)
+        if len(places) > 2:
+            from scipy.interpolate import PchipInterpolator  # here, because it takes longer to load than all else
+
+            self._slopes[1:-1] = PchipInterpolator(self._times, self._places)(self._times[1:-1], 1)
+        self.duration_s: float | None = self._times[-1]
+
+    def value(self, t_s: float) -> tuple[Array, Array]:
+        after = bisect.bisect_right(self._times, t_s)
+        if after in (0, len(self._times)):
+            place = self._places[min(after, len(self._times) - 1)]
+            return place.copy(), np.zeros_like(place)
+        span = self._times[after] - self._times[after - 1]
+        s = (t_s - self._times[after - 1]) / span
+        start, step = self._places[after - 1], self._places[after] - self._places[after - 1]
+        m0, m1 = self._slopes[after - 1] * span, self._slopes[after] * span
+        c = start + s * (m0 + s * (3 * step - 2 * m0 - m1 + s * (m0 + m1 - 2 * step)))
+        c_dot = (m0 + s * (6 * step - 4 * m0 - 2 * m1 + 3 * s * (m0 + m1 - 2 * step))) / span
+        return c, c_dot
+
+    def _time(self, waypoint: Mapping[str, object], number: int) -> float:
+        at_s = finite_number(waypoint.get("at_s")) if isinstance(waypoint, Mapping) else None
+        least = self._times[-1] if self._times else -1e-9
+        if at_s is None or not at_s > least:
+            found = waypoint.get("at_s") if isinstance(waypoint, Mapping) else waypoint
+            raise TrajectoryError(
+                f"waypoint {number}: at_s is {str(found)[:40]}; allowed: a number of seconds"
+                + (f" above {least:g}, that of the waypoint before" if self._times else ", 0 or more")
+            )
+        return at_s
+
+
+@dataclass(frozen=True, eq=False)
+class Ramp:
+    """A smooth move from a state of motion onto another reference.
+
+    c(t) = onto(t) + the offset of the start, which a quintic takes to zero with its first and second
+    derivative. On a reference at rest, from rest, this is the minimum-jerk move.
+
+    Attributes:
+        onto: where the ramp leads; it may move meanwhile.
+        start_s, over_s: the ramp runs in [start_s, start_s + over_s] of the time of `onto`.
+        offset, offset_rate: (4n,) c and c_dot at start_s less those of onto; use `ramp_onto`.
+    """
+
+    onto: Reference
+    start_s: float
+    over_s: float
+    offset: Array
+    offset_rate: Array
+
+    @property
+    def duration_s(self) -> float | None:
+        onto = self.onto.duration_s
+        return None if onto is None else max(onto, self.start_s + self.over_s)
+
+    def value(self, t_s: float) -> tuple[Array, Array]:
+        c, c_dot = self.onto.value(t_s)
+        s = max((t_s - self.start_s) / self.over_s, 0.0)
+        if s >= 1.0:
+            return c, c_dot
+        value, rate = np.empty(c.size), np.empty(c.size)
+        put_ramped(c, c_dot, self.offset, self.offset_rate, s, self.over_s, value, rate)
+        return value, rate
+
+
+@portable
+def put_ramped(
+    c: Array, c_dot: Array, offset: Array, offset_rate: Array, s: float, over_s: float, value: Array, rate: Array
+) -> None:
+    """Write c and c_dot with what is left of an offset and its rate at share s of a ramp over over_s."""
+    left = 1.0 - s * s * s * (10.0 - s * (15.0 - 6.0 * s))
+    left_rate = -30.0 * s * s * (1.0 - s) * (1.0 - s) / over_s
+    swing = s * (1.0 - s * s * (6.0 - s * (8.0 - 3.0 * s))) * over_s
+    swing_rate = 1.0 - s * s * (18.0 - s * (32.0 - 15.0 * s))
+    for k in range(c.size):
+        value[k] = c[k] + left * offset[k] + swing * offset_rate[k]
+        rate[k] = c_dot[k] + left_rate * offset[k] + swing_rate * offset_rate[k]
+
+
+def ramp_onto(space: ClusterSpace, c: Array, c_dot: Array, onto: Reference, start_s: float, over_s: float) -> Ramp:
+    """Return the ramp from c, moving at c_dot, at start_s onto a reference after over_s; angles short."""
+    c_onto, c_dot_onto = onto.value(start_s)
+    return Ramp(onto, start_s, over_s, space.difference(c, c_onto), c_dot - c_dot_onto)
+
+
+def named_values(space: ClusterSpace, values: object, where: str, base: Array) -> Array:
+    """Return base (4n,) with the values put in by name.
+
+    Raises:
+        TrajectoryError: no mapping, an unknown name, or no finite number.
+    """
+    if not isinstance(values, Mapping):
+        raise TrajectoryError(f"{where}: found {str(values)[:40]!r}; allowed: numbers by name of variable")
+    c = base.copy()
+    for name, value in values.items():
+        number = finite_number(value)
+        index = _index(space, name, where)
+        if number is None:
+            raise TrajectoryError(f"{where}: {name} is {str(value)[:40]}; allowed: a finite number")
+        c[index] = number
+    return c
+
+
+def _waypoint_values(space: ClusterSpace, waypoint: Mapping[str, object], number: int, base: Array) -> Array:
+    unknown = sorted(str(key)[:40] for key in waypoint if key not in ("at_s", "values"))
+    if unknown:
+        raise TrajectoryError(f"waypoint {number}: field {unknown[0]!r} is unknown; allowed: at_s, values")
+    return named_values(space, waypoint.get("values"), f"waypoint {number}", base)
+
+
+def _index(space: ClusterSpace, name: object, where: str) -> int:
+    try:
+        return space.index(str(name))
+    except ValueError as error:
+        raise TrajectoryError(f"{where}: {error}") from None
+
+
+def _as_text(name: str, text: object) -> str:
+    if isinstance(text, str):
+        return text
+    number = finite_number(text)
+    if number is None:
+        raise ExpressionError(f"{name}: found {str(text)[:40]!r}; allowed: text or a finite number")
+    return repr(number)

@@ -1,0 +1,159 @@
+"""What an operator asks for, sent to whoever answers it, off the page's threads; what comes of it is told."""
+
+import threading
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import partial
+from typing import Any, NamedTuple
+
+from zsim.contract import keys, messages
+from zsim.errors import ZsimError
+from zsim.transport.session import Session
+from zsim_bridges.console.drone_queue import Turns
+from zsim_bridges.console.view_buffer import Eyes
+
+PRIORITY = 10  # contract: of operators
+PRIORITY_EMERGENCY = 100  # contract: the highest; an operator who flies a drone must not keep others from stopping it
+HANDS = 8  # under way at once, of each kind: requests that nobody answers must not keep modes waiting
+ANSWER_S = 5.0  # the world and controllers answer within a gate
+OVERTAKEN = "an emergency was asked for after it"
+TAKEN_S = 1.0  # how long the world may take to say that it has a command, before the drone is given back
+
+
+class Told(NamedTuple):
+    """What came of a request: what was asked, and why it was refused; empty where it was not."""
+
+    what: str
+    refusal: str
+
+
+class Desk:
+    """Sends requests in the console's name.
+
+    Args:
+        link: an open session.
+        name: of the console's process.
+        eyes: hears when a command has been taken.
+        now_ns: simulated time for a stamp; may ask for it.
+        tell: told what came of each request, in any thread.
+    """
+
+    def __init__(
+        self, link: Session, name: str, eyes: Eyes, now_ns: Callable[[], int], tell: Callable[[Told], None]
+    ) -> None:
+        self._link = link
+        self._name = name
+        self._eyes = eyes
+        self._now_ns = now_ns
+        self._tell = tell
+        self._seqs: Counter[str] = Counter()  # modes sent to each drone
+        self._stops: Counter[str] = Counter()  # emergencies asked for of each drone
+        self._lock = threading.Lock()
+        self._hands = [
+            ThreadPoolExecutor(HANDS, thread_name_prefix=f"desk-{what}") for what in ("ask", "mode", "stop", "give")
+        ]
+        self._requests, modes, stops, self._gifts = self._hands
+        self._turns = Turns(modes, stops)
+
+    def close(self) -> None:
+        """Wait for nobody any more."""
+        self._turns.close()
+        for hands in self._hands:
+            hands.shutdown(wait=False, cancel_futures=True)
+
+    def world(self, op: str, **args: Any) -> None:
+        """Ask the world."""
+        self._ask(keys.CONTROL, op, args, f"{op} {_listed(args)}".strip())
+
+    def cluster(self, cluster: str, op: str, said: str = "", **args: Any) -> None:
+        """Ask a formation's controller; `said` tells people of the arguments in units of theirs."""
+        self._ask(keys.cluster_control(cluster), op, args, f"{cluster}: {op} {said or _listed(args)}".strip())
+
+    def mode(self, drones: Sequence[str], mode: str) -> None:
+        """Let drones take off, land, stop at once or leave the emergency, whoever flies them.
+
+        Modes of one drone are sent in the order in which they were asked for; an emergency waits for none of them,
+        and none that was asked for before it is sent after it.
+        """
+        for drone in drones:
+            if mode == "emergency":
+                with self._lock:
+                    self._stops[drone] += 1
+                self._do(partial(self._turns.do_at_once, drone), f"{drone}: {mode}", self._stop, drone, mode)
+            else:
+                turn, stops = partial(self._turns.do, drone), self._stops[drone]
+                self._do(turn, f"{drone}: {mode}", self._mode, drone, mode, stops)
+
+    def _ask(self, key: str, op: str, args: dict[str, Any], what: str) -> None:
+        self._do(self._requests.submit, what, self._request, key, op, args)
+
+    def _do(self, begin: Callable[[Callable[[], None]], Any], what: str, act: Callable[..., str], *args: Any) -> None:
+        def done() -> None:
+            self._tell(Told(what, _refusal(act, *args)))
+
+        try:
+            begin(done)
+        except RuntimeError:  # closed; a page of the run may still be open
+            self._tell(Told(what, "the run has ended"))
+
+    def _request(self, key: str, op: str, args: dict[str, Any]) -> str:
+        answer = self._link.request(key, op, self._name, args, ANSWER_S)
+        return "" if answer.ok else answer.error or "refused without a reason"
+
+    def _mode(self, drone: str, mode: str, stops: int) -> str:
+        """Take a drone from whoever flies it, and send the mode, unless more emergencies were asked for meanwhile."""
+        if self._stops[drone] > stops:
+            return OVERTAKEN
+        return self._acquire(drone, PRIORITY) or self._send(drone, mode, stops)
+
+    def _stop(self, drone: str, mode: str) -> str:
+        """Send the mode whatever becomes of the request for the drone: the world may heed it all the same."""
+        refusal = _refusal(self._acquire, drone, PRIORITY_EMERGENCY)
+        self._send(drone, mode)
+        return refusal and f"{refusal}; {mode} was sent all the same"
+
+    def _acquire(self, drone: str, priority: int) -> str:
+        return self._request(keys.CONTROL, "acquire", {"drone": drone, "priority": priority})
+
+    def _send(self, drone: str, mode: str, stops: int | None = None) -> str:
+        """Send a mode, unless more emergencies than `stops` were asked for; let others fly the drone afterwards."""
+        before, now_ns = self._eyes.answered(drone), self._now_ns()
+        with self._lock:
+            overtaken = stops is not None and self._stops[drone] > stops
+            if not overtaken:
+                seq, self._seqs[drone] = self._seqs[drone], self._seqs[drone] + 1
+                said = messages.Mode(now_ns, seq, self._name, mode)  # type: ignore[arg-type]
+                self._link.put(keys.command(drone, "mode"), said)
+        with suppress(RuntimeError):  # closed: who leaves a run gives back what it has
+            self._gifts.submit(self._give_back, drone, before)
+        return OVERTAKEN if overtaken else ""
+
+    def _give_back(self, drone: str, before: int) -> None:
+        """Let others fly a drone, once the world has the mode that was sent with an operator's priority."""
+        self._eyes.await_answer(drone, before, TAKEN_S)
+        with suppress(ZsimError):  # the run has ended
+            self._request(keys.CONTROL, "release", {"drone": drone})
+
+
+def _refusal(act: Callable[..., str], *args: Any) -> str:
+    """Return why something was not done; empty where it was."""
+    try:
+        return act(*args)
+    except ZsimError as error:
+        return str(error)
+    except Exception as error:  # nobody asks a thread of a pool how it ended
+        return f"{type(error).__name__}: {error}"
+
+
+def _listed(args: dict[str, Any]) -> str:
+    return ", ".join(f"{name} {_short(value)}" for name, value in args.items())
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, dict):
+        return " ".join(f"{name}={_short(item)}" for name, item in value.items())[:120]
+    return str(value)[:120]

@@ -1,0 +1,177 @@
+"""What the console hears of a run, kept until the next picture is drawn."""
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+from zsim.contract import keys, messages
+from zsim.contract.messages import EstimateView, Event, Fault, Health, Info, ViewCluster, ViewDrones, ViewEstimates
+from zsim.errors import DecodeError
+from zsim.transport.session import Heard, Sample, Session
+from zsim_bridges.observer_process import Presence
+
+EVENTS_KEPT = 200
+SHOWN_BUT = frozenset({"command"})  # kinds of events that say nothing which the next one does not: a mode, a refusal
+FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
+
+
+class Belief(NamedTuple):
+    """What is believed of a drone.
+
+    Attributes:
+        process: the estimator.
+        t_ns: simulated.
+        fresh: whether it is of the present.
+    """
+
+    process: str
+    t_ns: int
+    estimate: EstimateView
+    fresh: bool
+
+
+class Eyes:
+    """Keeps the newest view of everything until the next look; what comes between two looks is never decoded.
+
+    Args:
+        link: an open session.
+        info: of the run.
+        presence: of the console in it.
+        variables: names of each formation's variables: of another formation, or with others, no view is taken.
+        refused: told, in a thread of Zenoh's, of what the world refuses of the console's own commands.
+        wall_s: monotonic.
+
+    Attributes:
+        drones: the newest view of the drones.
+        clusters: the newest view of each formation.
+        estimators: the newest view of each estimator, by its process.
+        healths: what each process said of itself last.
+        faults: injected ones, planned and active.
+        events: newest first.
+    """
+
+    def __init__(
+        self,
+        link: Session,
+        info: Info,
+        presence: Presence,
+        variables: Mapping[str, tuple[str, ...]],
+        refused: Callable[[Event], None],
+        wall_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._link = link
+        self._names = frozenset(drone.name for drone in info.drones)
+        self._presence = presence
+        self._variables = variables
+        self._refused = refused
+        self._wall_s = wall_s
+        self._taken_s: dict[str, float] = {}  # wall time by key, of views of drones and estimators
+        self._new: dict[str, bytes] = {}
+        self._arrived = threading.Condition()
+        self._lock = threading.Lock()
+        self._answers: Counter[str] = Counter()
+        self.drones: ViewDrones | None = None
+        self.clusters: dict[str, ViewCluster] = {}
+        self.estimators: dict[str, ViewEstimates] = {}
+        self.healths: dict[str, Health] = {}
+        self.faults: tuple[Fault, ...] = ()
+        self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
+
+    def open(self) -> None:
+        """Begin to hear, and learn what was said before."""
+        for expression in ("view/**", keys.FAULTS, "process/*/health"):
+            self._link.hear(expression, self._keep)
+        self._link.on_message(keys.EVENT, self._on_event)
+        told = self._link.get(keys.FAULTS)
+        with self._lock:
+            for sample in told:
+                self._new.setdefault(sample.key, sample.payload)  # what was heard meanwhile is newer
+
+    def look(self) -> bool:
+        """Take in what has come since the last look; return whether drones have been seen anew."""
+        with self._lock:
+            new, self._new = self._new, {}
+        for key, payload in new.items():
+            try:
+                self._take(key, messages.decode(key, payload))
+            except DecodeError:
+                self._presence.health.refused += 1
+        return keys.VIEW_DRONES in new
+
+    def beliefs(self) -> dict[str, Belief]:
+        """Return the newest belief of each drone by name: of two estimators, one of them dead, that of the other.
+
+        What is of the future was said before a replay went back.
+        """
+        now_ns = self.drones.t_ns if self.drones else 0
+        found: dict[str, Belief] = {}
+        for process, view in sorted(self.estimators.items(), key=lambda each: each[1].t_ns):
+            fresh = self._is_fresh(process, view.t_ns - now_ns)
+            if fresh or view.t_ns <= now_ns:
+                names = (estimate for estimate in view.estimates if estimate.name in self._names)
+                found |= {each.name: Belief(process, view.t_ns, each, fresh) for each in names}
+        return found
+
+    def _is_fresh(self, process: str, ahead_ns: int) -> bool:
+        """Tell whether an estimator's view goes with that of the drones: in a fast run, both skip many gates."""
+        seen_s = self._taken_s.get(keys.VIEW_DRONES, 0.0) - self._taken_s[keys.estimates_view(process)]
+        return abs(ahead_ns) <= FRESH_S * 1e9 or abs(seen_s) <= FRESH_S
+
+    def answered(self, drone: str) -> int:
+        """Return how many commands to a drone the world has said that it took, or refused."""
+        return self._answers[drone]
+
+    def await_answer(self, drone: str, beyond: int, within_s: float) -> None:
+        """Wait, but not for ever, until more commands to a drone than that have been answered."""
+        with self._arrived:
+            self._arrived.wait_for(lambda: self._answers[drone] > beyond, within_s)
+
+    def note(self, event: Event) -> None:
+        """Add an event of the console's own."""
+        self.events.appendleft(event)
+
+    def _keep(self, heard: Heard) -> None:
+        self._presence.health.received += 1
+        with self._lock:
+            self._new[heard.key] = heard.payload
+
+    def _take(self, key: str, message: Any) -> None:
+        if isinstance(message, ViewDrones):
+            self.drones, self._taken_s[key] = message, self._wall_s()
+        elif isinstance(message, ViewCluster):
+            self._take_cluster(key.rpartition("/")[2], message)
+        elif isinstance(message, ViewEstimates):
+            self._taken_s[key] = self._wall_s()
+            self.estimators[key.rpartition("/")[2]] = message
+        elif isinstance(message, Health):
+            self.healths[keys.thing(key)] = message
+        elif isinstance(message, messages.Faults):
+            self.faults = message.faults
+
+    def _take_cluster(self, cluster: str, view: ViewCluster) -> None:
+        """Keep a view, unless a controller of another scenario says it."""
+        if self._variables.get(cluster) == view.names and len(view.value) == len(view.desired) == len(view.names):
+            self.clusters[cluster] = view
+        else:
+            self._presence.health.refused += 1
+
+    def _on_event(self, sample: Sample) -> None:
+        try:
+            event = messages.decode(keys.EVENT, sample.payload)
+        except DecodeError:
+            return  # somebody else's garbage
+        if event.kind in ("command", "refused"):
+            with self._arrived:
+                self._answers[_drone(event)] += 1
+                self._arrived.notify_all()
+        if event.kind not in SHOWN_BUT:
+            self.events.appendleft(event)
+        if event.kind == "refused" and event.source == self._presence.name:
+            self._refused(event)
+
+
+def _drone(event: Event) -> str:
+    """Return the drone that a command was for: of a refused one, the subject is the key."""
+    return keys.thing(event.subject) if event.kind == "refused" and "/" in event.subject else event.subject

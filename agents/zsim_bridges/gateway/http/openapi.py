@@ -1,0 +1,183 @@
+"""What the gateway answers over HTTP, as OpenAPI 3.1; made from the messages themselves. Pure."""
+
+from functools import cache
+from typing import Any
+
+import msgspec
+
+from zsim import __version__
+from zsim.contract import messages
+from zsim.contract.messages import ControlAnswer, ControlRequest
+from zsim_bridges.gateway.key_policy import is_spoken
+
+FILLED = ("t_ns", "seq", "source")  # what a client may leave out
+ASKED = ("world/control", "cluster/{cluster}/control")
+_REF = "#/components/schemas/{name}"
+_OWN_KEY = "^[A-Za-z0-9_.-]{1,64}$"  # of one's own; Zenoh takes more
+_REFUSED = {
+    400: "a key or a value that is none",
+    401: "no token, or a wrong one",
+    403: "somebody else speaks there, or a page of another site asks",
+    404: "no such drone or cluster, or no value yet",
+    405: "something else may be done with this key",
+    413: "a body that is too long",
+    429: "too many requests",
+    503: "there is no run now",
+}
+
+
+@cache
+def description() -> dict[str, Any]:
+    """Return the document."""
+    shapes = messages.types_by_shape()
+    kinds = dict.fromkeys([*shapes.values(), ControlRequest, ControlAnswer])
+    _, found = msgspec.json.schema_components(list(kinds), ref_template=_REF)
+    schemas = _plain(found)
+    refusal = {"type": "object", "properties": {"error": {"type": "string"}}, "required": ["error"]}
+    paths = {path: item for shape, kind in shapes.items() for path, item in [_value(shape, kind)]}
+    return {
+        "openapi": "3.1.0",
+        "info": {"title": "zsim gateway", "version": __version__, "description": "See docs/gateway.md."},
+        "paths": {**paths, **dict(map(_asked, ASKED)), **_any_key(), **_zenoh()},
+        "components": {
+            "schemas": {**schemas, **_sent(shapes, schemas), "Refusal": refusal},
+            "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
+        },
+        "security": [{}, {"token": []}],
+    }
+
+
+def _plain(schema: Any) -> Any:
+    """Return a schema with vectors as arrays of one kind of entry: fewer tools know `prefixItems`."""
+    if isinstance(schema, list):
+        return [_plain(entry) for entry in schema]
+    if not isinstance(schema, dict):
+        return schema
+    parts = {name: _plain(part) for name, part in schema.items()}
+    if "prefixItems" in parts:
+        parts["items"] = parts.pop("prefixItems")[0]
+    return parts
+
+
+def _value(shape: str, kind: type[msgspec.Struct]) -> tuple[str, dict[str, Any]]:
+    path, parameters = _path(shape)
+    item: dict[str, Any] = {"parameters": parameters, "get": _got(kind.__name__, kind.__doc__ or "")}
+    if is_spoken(shape.replace("*", "any")):
+        item["put"] = {
+            "summary": f"Publish a {kind.__name__}; {', '.join(FILLED)} may be left out",
+            "requestBody": _body(f"{kind.__name__}Sent"),
+            "responses": {"200": {"description": "published"}, **_refusals()},
+        }
+    return f"/json/{path}", item
+
+
+def _path(shape: str) -> tuple[str, list[dict[str, Any]]]:
+    """Return a path of a key's shape, and what is to be put into it."""
+    parts = shape.split("/")
+    names = [parts[i - 1] for i, part in enumerate(parts) if part == "*"]
+    path = "/".join(f"{{{parts[i - 1]}}}" if part == "*" else part for i, part in enumerate(parts))
+    return path, [_parameter(name) for name in names]
+
+
+def _parameter(name: str) -> dict[str, Any]:
+    most = 48 if name in ("process", "estimates") else 32  # of a process's name, or of a drone's or cluster's
+    schema = {"type": "string", "pattern": f"^[a-z0-9_.-]{{1,{most}}}$"}
+    return {"name": name, "in": "path", "required": True, "schema": schema}
+
+
+def _got(kind: str, text: str) -> dict[str, Any]:
+    return {
+        "summary": f"The last {kind}, or with Accept: text/event-stream every one from now on",
+        "description": text,
+        "responses": {
+            "200": _answer({"$ref": _REF.format(name=kind)}),
+            **_refusals(),
+        },
+    }
+
+
+def _asked(key: str) -> tuple[str, dict[str, Any]]:
+    parameters = [_parameter("cluster")] if "{cluster}" in key else []
+    post = {
+        "summary": "Ask; the answer says whether it was done",
+        "requestBody": _body("ControlRequest"),
+        "responses": {"200": _answer({"$ref": _REF.format(name="ControlAnswer")}), **_refusals()},
+    }
+    return f"/json/{key}", {"parameters": parameters, "post": post}
+
+
+def _any_key() -> dict[str, Any]:
+    """Return the path of keys that are none of the contract's."""
+    key = {"name": "key", "in": "path", "required": True, "schema": {"type": "string", "pattern": _OWN_KEY}}
+    anything = {"description": "a value, or of an expression a list of key and value"}
+    return {
+        "/json/{key}": {
+            "parameters": [key],
+            "get": {"summary": "The last value", "responses": {"200": _answer(anything), **_refusals()}},
+            "put": {
+                "summary": "Publish any JSON on a key of one's own",
+                "requestBody": {"required": True, "content": {"application/json": {"schema": {}}}},
+                "responses": {"200": {"description": "published"}, **_refusals()},
+            },
+        }
+    }
+
+
+def _zenoh() -> dict[str, Any]:
+    """Return the path of whole keys, as Zenoh's REST plugin has it."""
+    named = {"federation": "zsim", "key": "world/info"}
+    parameters = [
+        {
+            "name": name,
+            "in": "path",
+            "required": True,
+            "schema": {"type": "string", "pattern": _OWN_KEY},
+            "example": example,
+        }
+        for name, example in named.items()
+    ]
+    entry = {
+        "type": "object",
+        "required": ["key", "value", "encoding", "timestamp"],
+        "properties": {
+            "key": {"type": "string"},
+            "value": {"description": "base64, unless the encoding is JSON or text"},
+            "encoding": {"type": "string"},
+            "timestamp": {"type": ["string", "null"]},
+        },
+    }
+    got = {"200": _answer({"type": "array", "items": entry}), **_refusals()}
+    done = {"200": {"description": "done"}, **_refusals()}
+    body = {"content": {"*/*": {"schema": {"type": "string", "format": "binary"}}}}
+    return {
+        "/{federation}/{key}": {
+            "parameters": parameters,
+            "get": {"summary": "Query", "responses": got},
+            "post": {"summary": "Query with a payload", "requestBody": body, "responses": got},
+            "put": {"summary": "Publish", "requestBody": body, "responses": done},
+            "patch": {"summary": "Publish", "requestBody": body, "responses": done},
+            "delete": {"summary": "Delete", "responses": done},
+        }
+    }
+
+
+def _sent(shapes: dict[str, type[msgspec.Struct]], schemas: dict[str, Any]) -> dict[str, Any]:
+    """Return the schemas of what clients send: what is filled in is not required, what nobody knows is ignored."""
+    kinds = [kind.__name__ for shape, kind in shapes.items() if is_spoken(shape.replace("*", "any"))]
+    return {
+        f"{kind}Sent": {**schemas[kind], "required": [name for name in schemas[kind]["required"] if name not in FILLED]}
+        for kind in kinds
+    }
+
+
+def _body(schema: str) -> dict[str, Any]:
+    return {"required": True, "content": {"application/json": {"schema": {"$ref": _REF.format(name=schema)}}}}
+
+
+def _answer(schema: dict[str, Any], text: str = "answered") -> dict[str, Any]:
+    return {"description": text, "content": {"application/json": {"schema": schema}}}
+
+
+def _refusals() -> dict[str, Any]:
+    schema = {"$ref": _REF.format(name="Refusal")}
+    return {str(status): _answer(schema, text) for status, text in _REFUSED.items()}

@@ -1,0 +1,151 @@
+"""A ROS 1 node: topics published and taken, services, its slave API, and its place at the master."""
+
+import asyncio
+import contextlib
+import threading
+from asyncio import StreamReader, StreamWriter
+from collections.abc import AsyncIterator, Callable, Mapping
+from typing import Any
+
+from zsim_bridges.ros1.wire import message_types, tcpros_streams, xmlrpc
+from zsim_bridges.ros1.wire.publisher import Publication
+from zsim_bridges.ros1.wire.registration import Place, Registration
+from zsim_bridges.ros1.wire.service import Service
+from zsim_bridges.ros1.wire.slave_api import SlaveApi
+from zsim_bridges.ros1.wire.subscriber import Subscription
+
+EVERYWHERE, LOOPBACK = "0.0.0.0", "127.0.0.1"
+STOP_POLL_S = 0.1  # how soon the XML-RPC server ends
+Say = Callable[[str], None]
+
+
+class Node:
+    """One node; all but its slave API lives in one asyncio loop.
+
+    Args:
+        name: in the ROS graph, "/zsim".
+        master_uri: of the master.
+        host: name or address under which other nodes reach us.
+        say: told what a person should know.
+
+    Attributes:
+        dismissed: who wants this node to end, and why; empty while nobody does.
+    """
+
+    def __init__(self, name: str, master_uri: str, host: str, say: Say) -> None:
+        self.name = name
+        self.dismissed = ""
+        self._master_uri = master_uri
+        self._host = host
+        self._say = say
+        self._published: dict[str, Publication] = {}
+        self._subscribed: dict[str, Subscription] = {}
+        self._services: dict[str, Service] = {}
+        self._connections: set[asyncio.Task[Any]] = set()
+
+    def publish(self, topic: str, kind: str, queue_size: int) -> Publication:
+        """Offer a topic; before `running`."""
+        made = self._published[topic] = Publication(message_types.offer(topic, kind), queue_size)
+        return made
+
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
+        """Take a topic; before `running`. `take` raises ValueError for a message that it refuses."""
+        self._subscribed[topic] = Subscription(message_types.offer(topic, kind), self.name, take, self._say)
+
+    def serve(self, name: str, act: Callable[[], str | None]) -> None:
+        """Offer a std_srvs/Empty service; before `running`. `act` returns why it fails, None where it is done."""
+        self._services[name] = Service(message_types.EMPTY_SERVICE._replace(name=name), act)
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Be in the ROS graph."""
+        bound = LOOPBACK if _is_loopback(self._host) else EVERYWHERE
+        doors = await asyncio.start_server(self._meet, bound, 0)
+        port: int = doors.sockets[0].getsockname()[1]
+        api = xmlrpc.Server(bound, self._slave_api(port))
+        threading.Thread(target=api.serve_forever, args=(STOP_POLL_S,), name="slave API", daemon=True).start()
+        registration = self._registration(api.server_address[1], port)
+        registration.start()
+        try:
+            yield
+        finally:
+            await asyncio.to_thread(registration.close)
+            doors.close()
+            await asyncio.to_thread(api.shutdown)
+            api.server_close()
+            await self._hang_up()
+
+    def _slave_api(self, port: int) -> SlaveApi:
+        loop = asyncio.get_running_loop()
+        return SlaveApi(
+            self.name,
+            self._master_uri,
+            (self._host, port),
+            self._published,
+            self._subscribed,
+            lambda topic, uris: _later(loop, self._subscribed[topic].update, uris),
+            self._dismiss,
+        )
+
+    def _registration(self, api_port: int, port: int) -> Registration:
+        loop = asyncio.get_running_loop()
+        place = Place(
+            self.name,
+            f"http://{self._host}:{api_port}/",
+            f"rosrpc://{self._host}:{port}",
+            [(topic, published.offer.type) for topic, published in self._published.items()],
+            [(topic, taken.offer.type) for topic, taken in self._subscribed.items()],
+            list(self._services),
+        )
+        return Registration(
+            self._master_uri,
+            place,
+            lambda topic, uris: _later(loop, self._subscribed[topic].update, uris, False),
+            self._dismiss,
+            self._say,
+        )
+
+    def _dismiss(self, reason: str) -> None:
+        self.dismissed = self.dismissed or reason
+
+    async def _meet(self, reader: StreamReader, writer: StreamWriter) -> None:
+        """Serve one connection until it ends, whatever it is."""
+        task = asyncio.current_task()
+        assert task is not None
+        self._connections.add(task)
+        try:
+            with contextlib.suppress(*tcpros_streams.BROKEN):
+                header = await tcpros_streams.read_header(reader)
+                await self._serve(reader, writer, header)
+        except asyncio.CancelledError:
+            writer.transport.abort()  # what a slow subscriber has not read would keep it open
+        finally:
+            self._connections.discard(task)
+            writer.close()
+
+    async def _serve(self, reader: StreamReader, writer: StreamWriter, header: Mapping[str, str]) -> None:
+        offered = self._services if "service" in header else self._published
+        name = header.get("service") or header.get("topic", "")
+        wanted = offered.get(name)
+        if wanted is None:
+            await tcpros_streams.say_error(writer, f"[{self.name}] has no topic or service [{name[:200]}]")
+            return
+        await wanted.serve(reader, writer, header, self.name)
+
+    async def _hang_up(self) -> None:
+        """End all connections."""
+        for subscription in self._subscribed.values():
+            await subscription.close()
+        for task in list(self._connections):
+            task.cancel()
+        await asyncio.gather(*self._connections, return_exceptions=True)
+
+
+def _later(loop: asyncio.AbstractEventLoop, act: Callable[..., None], *arguments: Any) -> None:
+    """Act in the loop, unless it is over."""
+    with contextlib.suppress(RuntimeError):
+        loop.call_soon_threadsafe(act, *arguments)
+
+
+def _is_loopback(host: str) -> bool:
+    return host == "localhost" or host.startswith("127.")

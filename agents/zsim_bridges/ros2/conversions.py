@@ -1,0 +1,207 @@
+"""From zsim's messages to those of ROS: SI units and ENU/FLU frames on both sides, so mostly names change. All pure.
+
+Covariances are row-major; what nobody tells is zero in them, unless the message's definition has a sign for it.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys.stores import ros2_jazzy as ros
+
+from zsim.contract import messages
+from zsim.contract.messages import Quaternion, Vector3
+from zsim.math.frames import quaternion_from_rpy
+from zsim.scenario import scenario
+from zsim_bridges.ros2.sensor_frames import UNTURNED, Pose, cluster, into_body, rows
+
+Array = NDArray[np.float64]
+Time, Header = ros.builtin_interfaces__msg__Time, ros.std_msgs__msg__Header
+Xyz, Point, Turn = ros.geometry_msgs__msg__Vector3, ros.geometry_msgs__msg__Point, ros.geometry_msgs__msg__Quaternion
+
+SECOND_NS = 1_000_000_000
+TESLA_PER_UT = 1e-6
+UNKNOWN = np.array([-1.0, *[0.0] * 8])  # what sensor_msgs/Imu asks for where there is no attitude
+GPS_SERVICE = 1  # sensor_msgs/NavSatStatus.SERVICE_GPS
+KNOWN_DIAGONAL = 2  # sensor_msgs/NavSatFix.COVARIANCE_TYPE_DIAGONAL_KNOWN
+ULTRASOUND = 0  # sensor_msgs/Range
+BEAM_RAD = 0.0  # the model's beam is a line
+DISCHARGING, GOOD, LIPO = 2, 1, 3  # sensor_msgs/BatteryState
+NO_CELLS = np.empty(0, dtype=np.float32)
+NAN = math.nan
+
+
+def stamp(t_ns: int) -> Any:
+    """Return simulated time as ROS writes it."""
+    return Time(t_ns // SECOND_NS, t_ns % SECOND_NS)
+
+
+def header(t_ns: int, frame: str) -> Any:
+    return Header(stamp(t_ns), frame)
+
+
+def clock(message: messages.Clock) -> Any:
+    return ros.rosgraph_msgs__msg__Clock(stamp(message.t_ns))
+
+
+def imu(message: messages.Imu, frame: str, gyro: Array, accel: Array) -> Any:
+    """Return specific force and rates; it tells no attitude. `gyro` and `accel` are covariances (9,)."""
+    return ros.sensor_msgs__msg__Imu(
+        header(message.t_sample_ns, frame),
+        Turn(0.0, 0.0, 0.0, 1.0),
+        UNKNOWN,
+        Xyz(*message.gyro_rad_s),
+        gyro,
+        Xyz(*message.accel_m_s2),
+        accel,
+    )
+
+
+def fix(message: messages.Gps, frame: str) -> Any:
+    """Return a fix: altitude over the ellipsoid, covariance in ENU."""
+    status: Any = ros.sensor_msgs__msg__NavSatStatus(0 if message.fix else -1, GPS_SERVICE)
+    return ros.sensor_msgs__msg__NavSatFix(
+        header(message.t_sample_ns, frame),
+        status,
+        message.latitude_deg,
+        message.longitude_deg,
+        message.altitude_m,
+        diagonal(message.sigma_m**2),
+        KNOWN_DIAGONAL,
+    )
+
+
+def fix_velocity(message: messages.Gps, frame: str) -> Any:
+    """Return the receiver's velocity in `frame`, which is ENU."""
+    twist = ros.geometry_msgs__msg__Twist(Xyz(*message.velocity_m_s), Xyz(0.0, 0.0, 0.0))
+    return ros.geometry_msgs__msg__TwistStamped(header(message.t_sample_ns, frame), twist)
+
+
+def mag(message: messages.Mag, frame: str, covariance: Array) -> Any:
+    """Return the field [T]."""
+    field = Xyz(*(TESLA_PER_UT * each for each in message.field_ut))
+    return ros.sensor_msgs__msg__MagneticField(header(message.t_sample_ns, frame), field, covariance)
+
+
+def pressure(message: messages.Baro, frame: str) -> Any:
+    return ros.sensor_msgs__msg__FluidPressure(header(message.t_sample_ns, frame), message.pressure_pa, 0.0)
+
+
+def sonar_range(message: messages.Sonar, frame: str, sonar: scenario.Sonar, variance: float) -> Any:
+    """Return a distance; without an echo it is +Inf (REP-117)."""
+    return ros.sensor_msgs__msg__Range(
+        header(message.t_sample_ns, frame),
+        ULTRASOUND,
+        BEAM_RAD,
+        sonar.min_m,
+        sonar.max_m,
+        message.range_m if message.valid else math.inf,
+        variance,
+    )
+
+
+def battery(message: messages.Status, frame: str) -> Any:
+    return ros.sensor_msgs__msg__BatteryState(
+        header(message.t_ns, frame),
+        NAN, NAN, NAN, NAN, NAN, NAN,
+        message.battery_percent / 100.0,
+        DISCHARGING, GOOD, LIPO,
+        True, NO_CELLS, NO_CELLS, "", "",
+    )  # fmt: skip
+
+
+def state(message: messages.Status) -> Any:
+    return ros.std_msgs__msg__String(message.state)
+
+
+def true_odometry(message: messages.Truth, frame: str, child: str) -> Any:
+    """Return the true state; twist in the body, without any uncertainty."""
+    q = message.orientation_wxyz
+    nothing = np.zeros(36)
+    return ros.nav_msgs__msg__Odometry(
+        header(message.t_ns, frame),
+        child,
+        ros.geometry_msgs__msg__PoseWithCovariance(pose(message.position_m, q), nothing),
+        _twist(into_body(q, message.velocity_m_s), message.angular_velocity_rad_s, nothing),
+    )
+
+
+def odometry(message: messages.Estimate, frame: str, child: str, w_WB_B: Vector3) -> Any:
+    """Return an estimate; twist in the body. Of the attitude only the heading has an uncertainty to tell."""
+    P = np.array(message.covariance).reshape(6, 6)
+    R = np.array(rows(message.orientation_wxyz))
+    of_pose, of_twist = np.zeros((6, 6)), np.zeros((6, 6))
+    of_pose[:3, :3], of_pose[5, 5] = P[:3, :3], message.yaw_sigma_rad**2
+    of_twist[:3, :3] = R.T @ P[3:, 3:] @ R
+    q = message.orientation_wxyz
+    return ros.nav_msgs__msg__Odometry(
+        header(message.t_ns, frame),
+        child,
+        ros.geometry_msgs__msg__PoseWithCovariance(pose(message.position_m, q), of_pose.ravel()),
+        _twist(into_body(q, message.velocity_m_s), w_WB_B, of_twist.ravel()),
+    )
+
+
+def _twist(linear: Vector3, angular: Vector3, covariance: Array) -> Any:
+    twist = ros.geometry_msgs__msg__Twist(Xyz(*linear), Xyz(*angular))
+    return ros.geometry_msgs__msg__TwistWithCovariance(twist, covariance)
+
+
+def pose(position_m: Vector3, q: Quaternion) -> Any:
+    return ros.geometry_msgs__msg__Pose(Point(*position_m), turn(q))
+
+
+def turn(q: Quaternion) -> Any:
+    """Return a quaternion in ROS's order: w last."""
+    w, x, y, z = q
+    return Turn(x, y, z, w)
+
+
+def transform(t_ns: int, placed: Pose) -> Any:
+    moved = ros.geometry_msgs__msg__Transform(Xyz(*placed.position_m), turn(placed.orientation_wxyz))
+    return ros.geometry_msgs__msg__TransformStamped(header(t_ns, placed.parent), placed.child, moved)
+
+
+def transforms(t_ns: int, placed: list[Pose]) -> Any:
+    return ros.tf2_msgs__msg__TFMessage([transform(t_ns, each) for each in placed])
+
+
+def cluster_pose(message: messages.ClusterState, parent: str, name: str) -> Pose:
+    """Return where the cluster frame C is, by the estimates; a pair has no roll."""
+    values = dict(zip(message.names, message.value, strict=True))
+    x, y, z, roll, pitch, yaw = (values.get(each, 0.0) for each in ("x_c", "y_c", "z_c", "roll", "pitch", "yaw"))
+    q = UNTURNED if not roll and not pitch and not yaw else tuple(quaternion_from_rpy((roll, pitch, yaw)).tolist())
+    return Pose(parent, cluster(name), (x, y, z), q)
+
+
+def posed(t_ns: int, placed: Pose) -> Any:
+    """Return a pose as a message."""
+    where = pose(placed.position_m, placed.orientation_wxyz)
+    return ros.geometry_msgs__msg__PoseStamped(header(t_ns, placed.parent), where)
+
+
+def cluster_state(kind: Any, message: messages.ClusterState, frame: str) -> Any:
+    """Return a zsim_msgs/ClusterState; `kind` is its class."""
+    return kind(
+        header=header(message.t_ns, frame),
+        phase=message.phase,
+        drones=list(message.drones),
+        names=list(message.names),
+        value=np.array(message.value),
+        desired=np.array(message.desired),
+        desired_rate=np.array(message.desired_rate),
+        trajectory_time=NAN if message.trajectory_t_s is None else message.trajectory_t_s,
+        margin=message.margin,
+        reason=message.reason,
+    )
+
+
+def variance(error: scenario.ErrorModel, rate_hz: float) -> float:
+    """Return the variance of one sample about its bias, in the unit of the error squared."""
+    return error.noise**2 + error.density**2 * rate_hz + error.quantum**2 / 12.0  # a step's rounding is uniform
+
+
+def diagonal(each: float) -> Array:
+    """Return a covariance (9,) of three independent axes."""
+    return np.diag([each] * 3).ravel()

@@ -1,0 +1,118 @@
+"""What a record says of a flight, as arrays."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.contract.messages import Event, Info
+from zsim.scenario.scenario import Scenario
+
+Array = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+TRUTH_WIDTH = 13  # position, velocity, orientation, angular velocity
+
+
+@dataclass
+class Track:
+    """One drone as it truly flew, W and B as in the contract.
+
+    Attributes:
+        t_ns: (T,) instants of truth, ascending, without doubles.
+        truth: (T, 13) position [m], velocity [m/s], orientation w first, angular velocity [rad/s; B].
+        status_t_ns: (S,) instants of status.
+        states: (S,) its state in words.
+        battery_percent: (S,).
+    """
+
+    name: str
+    t_ns: Times
+    truth: Array
+    status_t_ns: Times
+    states: list[str]
+    battery_percent: Array
+
+    @property
+    def p_W(self) -> Array:
+        return self.truth[:, :3]
+
+    @property
+    def yaw(self) -> Array:
+        """Return the heading (T,) [rad]."""
+        w, x, y, z = self.truth[:, 6:10].T
+        return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+@dataclass
+class States:
+    """What the controller of one cluster published: K instants, n names."""
+
+    name: str
+    drones: tuple[str, ...]
+    names: tuple[str, ...] = ()
+    t_ns: Times = field(default_factory=lambda: np.zeros(0, np.int64))
+    value: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    desired: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    phases: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Participant:
+    """A process that joined."""
+
+    name: str
+    role: str = ""
+    host: str = ""
+    pid: int = 0
+    version: str = ""
+    fingerprint: str = ""
+    incarnations: int = 0
+    left: str = ""
+
+
+@dataclass
+class Flight:
+    """Everything of a record that a report needs; what was not on record is None or empty.
+
+    Attributes:
+        messages: on record, all keys.
+        complete: the record was closed, not cut.
+        wall_s: wall time from the first truth to the last, as they reached the recorder.
+        undecoded: payloads that are not what their key promises.
+        damaged: chunks of the record that cannot be read.
+    """
+
+    info: Info | None
+    scenario: Scenario | None
+    tracks: list[Track]
+    clusters: list[States]
+    events: list[Event]
+    participants: list[Participant]
+    messages: int
+    complete: bool
+    wall_s: float
+    undecoded: int = 0
+    damaged: int = 0
+
+    @property
+    def end(self) -> dict[str, Any] | None:
+        """Return what the world said of the run at its end, None if it did not live to say it."""
+        said = [event.data for event in self.events if event.kind == "end"]
+        return said[-1] if said else None
+
+    @property
+    def replay_of(self) -> str:
+        """Return the run_id of the run that was played back, "" for a flight."""
+        return self.info.replay_of if self.info else ""
+
+    @property
+    def first_ns(self) -> int:
+        """Return the first instant of truth."""
+        return min((int(track.t_ns[0]) for track in self.tracks if len(track.t_ns)), default=0)
+
+    @property
+    def last_ns(self) -> int:
+        """Return the last instant of truth."""
+        return max((int(track.t_ns[-1]) for track in self.tracks if len(track.t_ns)), default=0)

@@ -1,0 +1,223 @@
+"""Reads a flight in one pass: off its record, or off the messages themselves while it is flown in this process."""
+
+from array import array
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from zsim.contract import keys
+from zsim.contract.bundle import Bundle
+from zsim.contract.messages import Bye, Event, Info, Join, Quaternion, Vector3
+from zsim.errors import ZsimError
+from zsim.record import Recorded, RecordReader
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_analysis.reading.flight import TRUTH_WIDTH, Flight, Participant, States, Track
+
+
+class _Truth(Struct):
+    """The part of a truth message that is needed here."""
+
+    t_ns: int
+    position_m: Vector3
+    velocity_m_s: Vector3
+    orientation_wxyz: Quaternion
+    angular_velocity_rad_s: Vector3
+
+
+class _Status(Struct):
+    t_ns: int
+    state: str
+    battery_percent: float
+
+
+class _State(Struct):
+    t_ns: int
+    phase: str
+    names: tuple[str, ...]
+    value: tuple[float, ...]
+    desired: tuple[float, ...]
+    drones: tuple[str, ...] = ()
+
+
+def read_flight(path: Path) -> Flight:
+    """Return the flight of a record.
+
+    Raises:
+        RecordError: no such record.
+    """
+    with RecordReader(path) as reader:
+        reading = Reading()
+        wanted = [key for key in reader.topics() if reading.taker(key)]
+        for message in reader.messages(wanted, by_time=False):
+            reading.take(message)
+        return reading.flight(sum(reader.topics().values()), reader.complete, reader.damaged)
+
+
+class Reading:
+    """The flight while its record is read, or while it is flown, message by message."""
+
+    def __init__(self) -> None:
+        self._infos: list[Info] = []
+        self._events: list[Event] = []
+        self._truth: dict[str, tuple[array[int], array[float]]] = {}
+        self._status: dict[str, tuple[array[int], list[str], array[float]]] = {}
+        self._states: dict[str, list[_State]] = {}
+        self._participants: dict[str, Participant] = {}
+        self._first_wall_ns: int | None = None
+        self._last_wall_ns = 0
+        self._undecoded = 0
+        self._takers: dict[str, _Taker | None] = {}
+
+    def taker(self, key: str) -> "_Taker | None":
+        """Return what takes the messages of a key, None when nobody needs them."""
+        if key not in self._takers:
+            kind, take = self._kind(key)
+            self._takers[key] = (msgspec.msgpack.Decoder(kind), take) if kind else None
+        return self._takers[key]
+
+    def _kind(self, key: str) -> tuple[type[Struct] | None, Callable[[str, Any], None]]:
+        leaf = keys.leaf(key)
+        if key == keys.INFO:
+            return Info, lambda _, message: self._infos.append(message)
+        if key == keys.EVENT:
+            return Event, lambda _, message: self._events.append(message)
+        if key.startswith("process/"):
+            kind = {"join": Join, "bye": Bye}.get(leaf)
+            return kind, self._take_process
+        kinds = {"truth": (_Truth, self._take_truth), "status": (_Status, self._take_status)}
+        if key.startswith("drone/") and leaf in kinds:
+            return kinds[leaf]
+        if key.startswith("cluster/") and leaf == "state":
+            return _State, lambda name, message: self._states.setdefault(name, []).append(message)
+        return None, _ignore
+
+    def take(self, message: Recorded) -> None:
+        """Take one message; what cannot be decoded is counted."""
+        taker = self.taker(message.key)
+        if taker is None:
+            return
+        decoder, take = taker
+        try:
+            decoded = decoder.decode(message.payload)
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+            self._undecoded += 1
+            return
+        if isinstance(decoded, _Truth):
+            if self._first_wall_ns is None:
+                self._first_wall_ns = message.wall_ns
+            self._last_wall_ns = message.wall_ns
+        take(_thing(message.key), decoded)
+
+    def keep(self, key: str, message: Any) -> None:
+        """Take one message of a flight in this process; it has not been encoded."""
+        taker = self.taker(key)
+        if taker is not None:
+            taker[1](_thing(key), message)
+
+    def keep_bundle(self, bundle: Bundle) -> None:
+        """Take what the world says at a gate."""
+        for key, payload in bundle.encoded:
+            taker = self.taker(key)
+            if taker is not None:
+                taker[1](_thing(key), taker[0].decode(payload))
+
+    def _take_truth(self, name: str, truth: _Truth) -> None:
+        times, values = self._truth.setdefault(name, (array("q"), array("d")))
+        times.append(truth.t_ns)
+        values.extend(truth.position_m)
+        values.extend(truth.velocity_m_s)
+        values.extend(truth.orientation_wxyz)
+        values.extend(truth.angular_velocity_rad_s)
+
+    def _take_status(self, name: str, status: _Status) -> None:
+        times, states, battery = self._status.setdefault(name, (array("q"), [], array("d")))
+        times.append(status.t_ns)
+        states.append(status.state)
+        battery.append(status.battery_percent)
+
+    def _take_process(self, name: str, message: Join | Bye) -> None:
+        process = self._participants.setdefault(name, Participant(name))
+        if isinstance(message, Bye):
+            process.left = message.reason
+            return
+        process.role, process.host, process.pid = message.role, message.host, message.pid
+        process.version, process.fingerprint = message.version, message.fingerprint
+        process.incarnations += 1
+        process.left = ""
+
+    def flight(self, messages: int = 0, complete: bool = True, damaged: int = 0) -> Flight:
+        """Return the flight when all is read; the arguments tell of its record, where there is one."""
+        info = self._infos[-1] if self._infos else None
+        names = [drone.name for drone in info.drones] if info else sorted(self._truth)
+        members = {c.name: c.drones for c in info.clusters} if info else dict.fromkeys(self._states, ())
+        return Flight(
+            info=info,
+            scenario=_scenario(info),
+            tracks=[self._track(name) for name in names],
+            clusters=[_states(name, drones, self._states.get(name, [])) for name, drones in members.items()],
+            events=sorted(self._events, key=lambda event: (event.t_ns, event.seq)),
+            participants=list(self._participants.values()),
+            messages=messages,
+            complete=complete,
+            wall_s=(self._last_wall_ns - (self._first_wall_ns or 0)) / 1e9,
+            undecoded=self._undecoded,
+            damaged=damaged,
+        )
+
+    def _track(self, name: str) -> Track:
+        times, values = self._truth.get(name, (array("q"), array("d")))
+        status_times, states, battery = self._status.get(name, (array("q"), [], array("d")))
+        t_ns, first = np.unique(np.array(times, np.int64), return_index=True)
+        status_t_ns, status_first = np.unique(np.array(status_times, np.int64), return_index=True)
+        return Track(
+            name=name,
+            t_ns=t_ns,
+            truth=np.array(values, np.float64).reshape(-1, TRUTH_WIDTH)[first],
+            status_t_ns=status_t_ns,
+            states=[states[i] for i in status_first],
+            battery_percent=np.array(battery, np.float64)[status_first],
+        )
+
+
+_Taker = tuple[msgspec.msgpack.Decoder[Any], Callable[[str, Any], None]]
+
+
+def _thing(key: str) -> str:
+    """Return whom a key is about; "" for keys of one part."""
+    return key.split("/", 2)[1] if "/" in key else ""
+
+
+def _ignore(_: str, message: Any) -> None:
+    """Take nothing."""
+
+
+def _scenario(info: Info | None) -> Scenario | None:
+    """Return the scenario that the world announced; None if this version cannot read it."""
+    try:
+        return scenario_file.from_text(info.scenario) if info else None
+    except ZsimError:
+        return None
+
+
+def _states(name: str, drones: tuple[str, ...], states: list[_State]) -> States:
+    """Return the cluster states that have the width of the last one, by time."""
+    if not states:
+        return States(name, drones)
+    names = states[-1].names
+    fit = [s for s in states if len(s.names) == len(s.value) == len(s.desired) == len(names) > 0]
+    by_time = {state.t_ns: state for state in sorted(fit, key=lambda state: state.t_ns)}
+    kept = list(by_time.values())
+    return States(
+        name=name,
+        drones=drones or states[-1].drones,
+        names=names,
+        t_ns=np.array(list(by_time), np.int64),
+        value=np.array([state.value for state in kept]).reshape(-1, len(names)),
+        desired=np.array([state.desired for state in kept]).reshape(-1, len(names)),
+        phases=[state.phase for state in kept],
+    )

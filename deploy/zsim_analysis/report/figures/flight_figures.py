@@ -1,0 +1,154 @@
+"""Figures of the drones themselves: their paths from above, their altitude, state and battery."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from zsim_analysis.reading.flight import Array, Flight, Track
+from zsim_analysis.reading.formation_errors import common_instants
+from zsim_analysis.reading.formation_variables import Formation
+from zsim_analysis.report.figures.canvas import (
+    BLACK,
+    BLUE,
+    DARK,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    dress,
+    drone_colour,
+    legend_above,
+    line,
+    new_figure,
+)
+
+OUTLINES = 7  # formations drawn into the plan, so that they can be told apart
+APART = 0.6  # of the formation's own size: outlines nearer than this would cover each other
+NAMED_MAX = 12  # drones that a legend names
+STATES = {
+    "landed": GREY,
+    "taking_off": ORANGE,
+    "hovering": SKY,
+    "flying": BLUE,
+    "landing": PURPLE,
+    "emergency": VERMILION,
+}
+
+
+def draw_plan(flight: Flight, formations: Sequence[Formation]) -> Figure:
+    """Return the true paths from above with the outlines of the formations at some instants."""
+    figure = new_figure(9, 9)
+    axes = figure.subplots()
+    dress(axes, "north y (m)")
+    axes.set_xlabel("east x (m)", fontsize=10)
+    axes.set_aspect("equal", adjustable="datalim")
+    for i, track in enumerate(flight.tracks):
+        draw_path(axes, track, drone_colour(i), named=i < NAMED_MAX)
+    for formation in formations:
+        _draw_desired(axes, formation)
+        _draw_outlines(axes, formation, flight.tracks)
+    legend_above(figure, axes, columns=4)
+    return figure
+
+
+def draw_path(axes: Axes, track: Track, colour: str, named: bool) -> None:
+    """Draw a true path from above, with its start and its end."""
+    if not len(track.t_ns):
+        return
+    step = max(1, len(track.t_ns) // 4000)  # a path has no extremes to keep, only a shape
+    x, y = track.p_W[::step, 0], track.p_W[::step, 1]
+    axes.plot(x, y, color=colour, lw=0.8, alpha=0.6, zorder=2, label=track.name if named else None)
+    axes.plot(x[0], y[0], marker="s", color=colour, ms=7, mec="white", zorder=5)
+    axes.plot(*track.p_W[-1, :2], marker="o", color=colour, ms=7, mec="white", zorder=5)
+
+
+def _draw_desired(axes: Axes, formation: Formation) -> None:
+    if "x_c" in formation.names and len(formation.t_s):
+        engaged = np.array([phase == "engaged" for phase in formation.phases])
+        desired = np.where(engaged[:, None], formation.desired, np.nan)
+        x, y = (desired[:, formation.column(name)] for name in ("x_c", "y_c"))
+        step = max(1, len(x) // 4000)
+        axes.plot(x[::step], y[::step], color=BLACK, lw=1.3, zorder=3, label=f"desired centroid of {formation.name}")
+
+
+def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) -> None:
+    members = [track for name in formation.drones for track in tracks if track.name == name]
+    for t_s, p_W in outlines(members):
+        ring = np.vstack([p_W, p_W[:1]])
+        axes.fill(ring[:, 0], ring[:, 1], facecolor="#0000000d", edgecolor=DARK, lw=1.2, zorder=4)
+        out = p_W[0] - p_W.mean(axis=0)
+        away = out / max(float(np.linalg.norm(out)), 1e-9)
+        axes.annotate(
+            f"{t_s:.0f} s",
+            p_W[0],
+            xytext=18 * away,
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            fontsize=9,
+            zorder=6,
+            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
+        )
+
+
+def outlines(members: Sequence[Track]) -> Iterator[tuple[float, Array]]:
+    """Yield times [s] and positions (n, 2) [m] at which a formation stands clear of the outlines before."""
+    t_ns, places = common_instants(list(members))
+    if not len(t_ns):
+        return
+    p_W = np.stack([track.p_W[place, :2] for track, place in zip(members, places, strict=True)], axis=1)
+    drawn: list[Array] = []
+    for k in np.linspace(len(t_ns) - 1, 0, OUTLINES).astype(int):
+        size = np.linalg.norm(p_W[k] - p_W[k].mean(axis=0), axis=1).max()
+        if all(np.linalg.norm(p_W[k] - other, axis=1).max() > APART * size for other in drawn):
+            drawn.append(p_W[k])
+            yield float(t_ns[k]) / 1e9, p_W[k]
+
+
+def draw_drones(flight: Flight) -> Figure:
+    """Return altitude, state and battery of every drone over the run."""
+    count = len(flight.tracks)
+    figure = new_figure(11, 6.4 + 0.28 * count)
+    altitude, state, battery = figure.subplots(3, 1, sharex=True, height_ratios=(3, 0.5 + 0.28 * count, 2))
+    dress(altitude, "true altitude (m)")
+    dress(state, "state")
+    dress(battery, "battery (%)")
+    for i, track in enumerate(flight.tracks):
+        style = {"color": drone_colour(i), "lw": 1.1, "label": track.name if i < NAMED_MAX else None}
+        line(altitude, track.t_ns / 1e9, track.p_W[:, 2], **style)
+        line(battery, track.status_t_ns / 1e9, track.battery_percent, **style)
+        draw_states(state, track, i)
+    state.set_yticks(range(count), [track.name for track in flight.tracks])
+    state.invert_yaxis()
+    state.grid(False)
+    battery.set_xlabel("simulated time (s)", fontsize=10)
+    name_states(state, flight.tracks)
+    figure.align_ylabels()
+    legend_above(figure, altitude)
+    return figure
+
+
+def draw_states(axes: Axes, track: Track, lane: int) -> None:
+    """Draw the states of a drone as a bar in a lane of its own."""
+    if not track.states:
+        return
+    states = np.array(track.states)
+    starts = np.flatnonzero(np.r_[True, states[1:] != states[:-1]])
+    edges = np.r_[track.status_t_ns[starts], track.status_t_ns[-1]] / 1e9
+    for start, left, right in zip(starts, edges[:-1], edges[1:], strict=True):
+        colour = STATES.get(states[start], GREEN)
+        axes.broken_barh([(left, right - left)], (lane - 0.36, 0.72), color=colour)
+
+
+def name_states(axes: Axes, tracks: Sequence[Track]) -> None:
+    """Put the names of the states that occur beside the axes."""
+    occur = [name for name in STATES if any(name in track.states for track in tracks)]
+    handles: list[Patch | Line2D] = [Patch(color=STATES[name], label=name.replace("_", " ")) for name in occur]
+    if handles:
+        axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.005, 0.5), frameon=False, fontsize=9)

@@ -1,0 +1,240 @@
+"""summary.json: what a run was and how well it flew."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from zsim import __version__
+from zsim.contract.messages import Event
+from zsim.record.run_folder import record_notes
+from zsim_analysis.reading.command_age import command_age_ms
+from zsim_analysis.reading.flight import Flight, Participant
+from zsim_analysis.reading.formation_errors import Errors, min_separation_m, window
+from zsim_analysis.reading.formation_variables import Formation
+from zsim_analysis.reading.recorded_truth import TruthHash, truth_hash
+from zsim_analysis.report import paper
+
+EVENTS_PER_KIND = 100  # a flood of refusals must not push a restart out of the list
+EVENTS_MAX = 1000
+
+
+class EventLine(Struct, frozen=True):
+    """One event of the run."""
+
+    t_s: float
+    kind: str
+    source: str
+    subject: str
+    text: str
+
+
+class ClusterErrors(Struct, frozen=True):
+    """How one cluster flew within the window."""
+
+    drones: tuple[str, ...]
+    errors: dict[str, Errors]
+
+
+class Record(Struct, frozen=True):
+    """What the report was made from."""
+
+    messages: int
+    complete: bool
+    undecoded: int
+    truth_instants: int
+    truth_missing: int
+    truth_sha256: str
+
+
+class Summary(Struct, frozen=True):
+    """Everything that is said of a run; None where nobody knows."""
+
+    scenario: str | None
+    seed: int | None
+    mode: str | None
+    run_id: str | None
+    versions: dict[str, str]
+    fingerprint: str | None
+    real_time_factor: float | None
+    wall_s: float
+    sim_s: float
+    ended: str
+    deadlines: int | None
+    deadline_misses: int | None
+    deadline_misses_by: dict[str, int]
+    command_age_ms: dict[str, float] | None
+    window_s: tuple[float, float]
+    errors: dict[str, Errors]
+    clusters: dict[str, ClusterErrors]
+    min_separation_m: float | None
+    paper_table_1: dict[str, float]
+    events: list[EventLine]
+    events_left_out: dict[str, int]
+    participants: list[dict[str, Any]]
+    truth_sha256: str
+    record: Record
+    notes: list[str]
+
+    def json(self) -> bytes:
+        """Return the text of summary.json."""
+        return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
+
+
+def summarise(flight: Flight, formations: list[Formation], record: Path) -> Summary:
+    """Return the summary of a flight; what the world did not live to say is worked out from its record."""
+    end = flight.end or {}
+    info = flight.info
+    found = _hash(flight, end.get("last_ns", flight.last_ns))
+    asked = flight.scenario.report.window_s if flight.scenario else None
+    window_s, window_note = window(asked, flight.last_ns / 1e9)
+    clusters = {f.name: ClusterErrors(f.drones, f.errors(window_s)) for f in formations}
+    wall_s, span_s = end.get("wall_s", flight.wall_s), (flight.last_ns - flight.first_ns) / 1e9
+    sim_s = end.get("sim_s", span_s if flight.replay_of else flight.last_ns / 1e9)
+    lines, left_out = _lines(flight.events)
+    return Summary(
+        scenario=flight.scenario.name if flight.scenario else None,
+        seed=info.seed if info else None,
+        mode=info.mode if info else None,
+        run_id=info.run_id if info else None,
+        versions=_versions(flight),
+        fingerprint=info.fingerprint if info else None,
+        real_time_factor=end.get("real_time_factor", span_s / wall_s if wall_s > 0 else None),
+        wall_s=wall_s,
+        sim_s=sim_s,
+        ended=_ended(flight),
+        deadlines=end.get("deadlines"),
+        deadline_misses=end.get("deadline_misses"),
+        deadline_misses_by=end.get("deadline_misses_by", {}),
+        command_age_ms=end["command_age_ms"] if "command_age_ms" in end else command_age_ms(record),
+        window_s=window_s,
+        errors=next((cluster.errors for cluster in clusters.values()), {}),
+        clusters=clusters,
+        min_separation_m=min_separation_m(flight.tracks),
+        paper_table_1=paper.TABLE_1,
+        events=lines,
+        events_left_out=left_out,
+        participants=[_participant(process) for process in flight.participants],
+        truth_sha256=end.get("truth_sha256", found.sha256),
+        record=Record(
+            messages=flight.messages,
+            complete=flight.complete,
+            undecoded=flight.undecoded,
+            truth_instants=found.instants,
+            truth_missing=found.missing,
+            truth_sha256=found.sha256,
+        ),
+        notes=_notes(flight, found, formations, window_s, window_note),
+    )
+
+
+def _hash(flight: Flight, last_ns: int) -> TruthHash:
+    """Return the hash of truth; a flight has truth from 0 or the first gate on, a replay from where it was begun."""
+    gate_ns = flight.info.gate_ns if flight.info else None
+    first_ns = flight.first_ns if flight.replay_of else min(flight.first_ns, gate_ns or 0)
+    return truth_hash(flight.tracks, gate_ns, first_ns, last_ns)
+
+
+def _notes(
+    flight: Flight, found: TruthHash, formations: list[Formation], window_s: tuple[float, float], window_note: str
+) -> list[str]:
+    """Return what a reader has to know of the figures."""
+    notes = [
+        *_record_notes(flight),
+        *_truth_notes(found, (flight.end or {}).get("truth_sha256")),
+        window_note,
+        *_formation_notes(flight, formations, window_s),
+        *_fingerprint_notes(flight),
+    ]
+    return [note for note in notes if note]
+
+
+def _ended(flight: Flight) -> str:
+    """Return why the run ended; who died is not told by a record without an end."""
+    if flight.end:
+        return str(flight.end.get("reason", "ended"))
+    at = f"{flight.last_ns / 1e9:.2f} s"
+    return f"the record {'ends here at' if flight.complete else 'was cut after'} {at}: no end is on record"
+
+
+def _lines(events: list[Event]) -> tuple[list[EventLine], dict[str, int]]:
+    """Return the first events of every kind, and how many of each kind were left out."""
+    kept: Counter[str] = Counter()
+    left_out: Counter[str] = Counter()
+    lines = []
+    for event in events:
+        if kept[event.kind] >= EVENTS_PER_KIND or len(lines) >= EVENTS_MAX:
+            left_out[event.kind] += 1
+            continue
+        kept[event.kind] += 1
+        lines.append(EventLine(event.t_ns / 1e9, event.kind, event.source, event.subject, event.text))
+    return lines, dict(left_out)
+
+
+def _versions(flight: Flight) -> dict[str, str]:
+    world = {"world": flight.info.version} if flight.info else {}
+    own = {process.name: process.version for process in flight.participants if process.version}
+    return {**world, **own, "report": __version__}
+
+
+def _participant(process: Participant) -> dict[str, Any]:
+    return {
+        "name": process.name,
+        "role": process.role,
+        "host": process.host,
+        "pid": process.pid,
+        "incarnations": process.incarnations,
+        "left": process.left,
+    }
+
+
+def _record_notes(flight: Flight) -> list[str]:
+    notes = []
+    if flight.replay_of:
+        notes.append(f"This is a replay of run {flight.replay_of}, no flight of its own.")
+    if flight.end is None:
+        notes.append("The world did not report the run's end; times and command age are worked out from the record.")
+    notes += [f"{note[0].upper()}{note[1:]}." for note in record_notes(flight.complete, flight.damaged)]
+    if flight.undecoded:
+        notes.append(f"{flight.undecoded} messages on record are not what their key promises and were passed over.")
+    if flight.info is None:
+        notes.append("world/info is not on record: scenario, seed and the order of the drones are not known.")
+    elif flight.scenario is None:
+        notes.append("The scenario on record cannot be read by this version.")
+    return notes
+
+
+def _truth_notes(found: TruthHash, said: str | None) -> list[str]:
+    notes = []
+    if found.missing:
+        notes.append(f"{found.missing} of {found.missing + found.instants} truth messages are not on record.")
+    if said and said != found.sha256:
+        notes.append(f"The truth on record has the hash {found.sha256}, the world reported {said}.")
+    return notes
+
+
+def _formation_notes(flight: Flight, formations: list[Formation], window_s: tuple[float, float]) -> list[str]:
+    notes = []
+    judged = {formation.name for formation in formations}
+    for cluster in flight.clusters:
+        if cluster.name not in judged:
+            notes.append(f"Cluster {cluster.name} published no state that can be judged: no table of it.")
+    for formation in formations:
+        rows = formation.within(window_s)
+        engaged = sum(phase == "engaged" for phase, row in zip(formation.phases, rows, strict=True) if row)
+        if not rows.any():
+            notes.append(f"Cluster {formation.name} published no state inside the window.")
+        elif engaged < rows.sum():
+            notes.append(f"Cluster {formation.name} was engaged in {engaged} of {rows.sum()} instants of the window.")
+    if not flight.clusters:
+        notes.append("The scenario has no cluster: there is no table of errors.")
+    return notes
+
+
+def _fingerprint_notes(flight: Flight) -> list[str]:
+    own = flight.info.fingerprint if flight.info else ""
+    others = [p.name for p in flight.participants if own and p.fingerprint and p.fingerprint != own]
+    text = "computed with another numeric fingerprint than the world; the same bits are not promised."
+    return [f"{', '.join(others)} {text}"] if others else []

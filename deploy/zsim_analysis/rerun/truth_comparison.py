@@ -1,0 +1,113 @@
+"""Two flights of one run, instant by instant. Pure."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from zsim.contract import keys, messages
+from zsim.contract.messages import Message
+
+COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")  # of truth_sha256
+
+
+class Difference(NamedTuple):
+    """Where two flights are apart: when, which drone, and by how much [m, m/s, rad, rad/s]."""
+
+    t_ns: int
+    drone: str
+    position_m: float
+    velocity_m_s: float
+    angle_rad: float
+    rate_rad_s: float
+
+    def __str__(self) -> str:
+        angle_deg, rate_deg_s = math.degrees(self.angle_rad), math.degrees(self.rate_rad_s)
+        by = f"{self.position_m:.3g} m, {self.velocity_m_s:.3g} m/s, {angle_deg:.3g} deg, {rate_deg_s:.3g} deg/s"
+        return f"{self.drone} at {self.t_ns / 1e9:.3f} s by {by}"
+
+
+class Comparison:
+    """Compares the truth of two flights as it comes.
+
+    Args:
+        drones: in scenario order.
+
+    Attributes:
+        instants: compared so far.
+        first, last: the first difference, and the last.
+    """
+
+    def __init__(self, drones: Sequence[str]) -> None:
+        self._drones = tuple(drones)
+        self.instants = 0
+        self.first: Difference | None = None
+        self.last: Difference | None = None
+
+    def take(self, t_ns: int, recorded: Mapping[str, bytes], flown: Mapping[str, bytes]) -> None:
+        """Take the truth of a gate from both, by drone."""
+        self.instants += 1
+        for drone in self._drones:
+            if recorded[drone] != flown[drone] and (apart := difference(t_ns, drone, recorded[drone], flown[drone])):
+                self.first = self.first or apart
+                self.last = apart
+
+
+class Answers:
+    """Holds what agents answer against what they answered on record; each may come before the other.
+
+    Args:
+        patience_ns: simulated time after which the other comes no more.
+    """
+
+    def __init__(self, patience_ns: int) -> None:
+        self._patience_ns = patience_ns
+        self._single: dict[tuple[str, int, int], Message] = {}
+        self._apart: list[tuple[int, str]] = []
+
+    @property
+    def first(self) -> str:
+        """Return the first answer that differs, or that one of the two lacks, and when; empty where there is none."""
+        if not self._apart:
+            return ""
+        t_ns, key = min(self._apart)
+        return f"{key} at {t_ns / 1e9:.2f} s"
+
+    def take(self, key: str, answer: Any) -> None:
+        """Take an answer of either."""
+        mark = (key, answer.seq, answer.t_ns)
+        other = self._single.pop(mark, None)
+        if other is None:
+            self._single[mark] = answer
+        elif other != answer:
+            self._note(key, answer.t_ns)
+
+    def close(self, t_ns: int) -> None:
+        """Give up waiting for the other of those that are old at t_ns."""
+        for mark in [mark for mark in self._single if mark[2] < t_ns - self._patience_ns]:
+            del self._single[mark]
+            self._note(mark[0], mark[2])
+
+    def _note(self, key: str, t_ns: int) -> None:
+        if not self._apart or t_ns <= min(self._apart)[0]:
+            self._apart.append((t_ns, key))
+
+
+def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Difference | None:
+    """Return how far two true states are apart; None if what counts is the same to the bit.
+
+    Raises:
+        DecodeError: one is no truth.
+    """
+    key = keys.truth(drone)
+    a, b = messages.decode(key, recorded), messages.decode(key, flown)
+    if all(getattr(a, part) == getattr(b, part) for part in COUNTED):
+        return None
+    cosine = abs(sum(p * q for p, q in zip(a.orientation_wxyz, b.orientation_wxyz, strict=True)))
+    return Difference(
+        t_ns,
+        drone,
+        math.dist(a.position_m, b.position_m),
+        math.dist(a.velocity_m_s, b.velocity_m_s),
+        2 * math.acos(min(1.0, cosine)),
+        math.dist(a.angular_velocity_rad_s, b.angular_velocity_rad_s),
+    )

@@ -1,0 +1,63 @@
+"""A row of the table: what one run came to."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from zsim_analysis.sweep.fly.task import Task
+
+Row = dict[str, Any]
+"""Values by column; the columns are `FIXED`, the varied paths, when each cluster was engaged (`engaged_column`), and
+the errors by their paths in summary.json."""
+
+
+class Result(Struct, frozen=True, kw_only=True):
+    """The columns that every run has, in their order; None where a failed run has nothing to say.
+
+    Attributes:
+        failure: why it did not end well, None if it did.
+        ended: the run's own words.
+        wall_s: wall time of the flight.
+        collisions: contacts between drones.
+        engaged: whether every cluster was engaged at some instant of the judged window, None without a cluster.
+        host: where it was flown.
+        fingerprint: numeric; equal ones promise equal bits.
+    """
+
+    run: int
+    point: int
+    seed: int
+    failure: str | None = None
+    ended: str | None = None
+    truth_sha256: str | None = None
+    sim_s: float | None = None
+    wall_s: float | None = None
+    real_time_factor: float | None = None
+    min_separation_m: float | None = None
+    collisions: int | None = None
+    engaged: bool | None = None
+    host: str = ""
+    fingerprint: str = ""
+
+
+FIXED = {field.name: field.type for field in msgspec.structs.fields(Result)}
+
+
+def engaged_column(cluster: str) -> str:
+    """Return the column of the first instant [s] of the judged window at which a cluster was engaged."""
+    return f"clusters.{cluster}.engaged_s"
+
+
+def row(result: Result, varied: Mapping[str, Any], errors: Mapping[str, float | None]) -> Row:
+    """Return the row of a run: first what was asked, then what came of it."""
+    columns: Row = msgspec.structs.asdict(result)
+    asked = {name: columns.pop(name) for name in ("run", "point", "seed")}
+    return {**asked, **varied, **columns, **errors}
+
+
+def failed(task: Task, reason: str, **known: Any) -> Row:
+    """Return the row of a run that did not end well."""
+    result = Result(run=task.run, point=task.point, seed=task.scenario.seed, failure=reason, **known)
+    return row(result, task.varied, {})

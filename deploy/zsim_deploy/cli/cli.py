@@ -1,0 +1,202 @@
+"""The command line: thin commands that read options, call one function, and print one line for a fault."""
+
+import signal
+import sys
+from functools import cache
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.main import get_command
+
+from zsim import __version__
+from zsim.errors import BehindError, SupersededError, ZsimError
+from zsim_deploy.cli import (
+    certs_commands,
+    console_command,
+    export_command,
+    fault_commands,
+    gateway_command,
+    hosts_commands,
+    look_commands,
+    render_commands,
+    replay_command,
+    report_commands,
+    role_commands,
+    ros1_command,
+    ros2_command,
+    sweep_commands,
+)
+from zsim_deploy.options.arguments import (
+    HOSTS,
+    RUN,
+    Duration,
+    Insecure,
+    RateOption,
+    Realtime,
+    ScenarioPath,
+    Seed,
+    Set,
+    load_scenario,
+    mode_and_rate,
+)
+from zsim_deploy.terminal.interrupts import INTERRUPTED
+
+app = typer.Typer(
+    name="zsim",
+    help="Co-simulate drone formations: one world, estimators and controllers as processes on Zenoh, in lockstep.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+UsageError: Any = typer.BadParameter.__bases__[0]  # click's, or that of the click inside of newer typers
+USER_FAULT = 2  # exit code of whatever a person has to put right
+EXIT_CODES = {SupersededError: 3, BehindError: 1}  # of the faults after which somebody else goes on; see watch.py
+
+
+@app.command(rich_help_panel=RUN)
+def run(
+    scenario: ScenarioPath,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the run (default runs/NAME-TIME).", show_default=False)
+    ] = None,
+    seed: Seed = None,
+    duration: Duration = None,
+    in_process: Annotated[bool, typer.Option("--in-process", help="Everything in this process, no Zenoh.")] = False,
+    realtime: Realtime = False,
+    rate: RateOption = None,
+    set_: Set = None,
+    listen: Annotated[
+        str | None, typer.Option(help="Endpoint of the world (default tcp/127.0.0.1:7447, or a free port).")
+    ] = None,
+    insecure: Insecure = False,
+    hosted: Annotated[
+        bool, typer.Option("--hosted", help="Estimators and controllers in one process: faster, the same bits.")
+    ] = False,
+    console: Annotated[bool, typer.Option("--console", help="Show it in the browser, and steer it there.")] = False,
+    report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
+    order: Annotated[str, typer.Option(hidden=True)] = "",
+) -> None:
+    """Fly a scenario: start every process, show progress, record, report."""
+    from zsim_deploy.launch.run import Options, check_endpoint, make_directory, run_in_process, run_processes
+    from zsim_deploy.launch.supervisor import Outcome
+    from zsim_deploy.terminal.interrupts import REASONS
+    from zsim_deploy.terminal.progress import Screen
+
+    if in_process:
+        _refuse_with_others(realtime, rate, listen, hosted, console)
+    if console:
+        console_command.check()
+    check_endpoint(listen, insecure)
+    loaded = load_scenario(scenario, set_, seed, duration)
+    mode, pace = mode_and_rate(realtime, rate)
+    folder, first = make_directory(out, loaded), [name for name in order.split(",") if name]
+    options = Options(loaded, folder, mode, pace, listen, insecure, hosted, first, console)
+    with Screen(loaded.duration_s) as screen:
+        try:
+            outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)
+        except KeyboardInterrupt as error:
+            outcome = Outcome(str(error) or REASONS[signal.SIGINT], interrupted=True)
+    report_commands.conclude(outcome, options.out, report)
+
+
+def _refuse_with_others(realtime: bool, rate: float | None, listen: str | None, hosted: bool, console: bool) -> None:
+    """Refuse what says nothing to a run in one process."""
+    given = {
+        "--realtime": realtime,
+        "--rate": rate is not None,
+        "--listen": listen is not None,
+        "--hosted": hosted,
+        "--console": console,
+    }
+    useless = " and ".join(name for name, is_given in given.items() if is_given)
+    if useless:
+        raise typer.BadParameter(f"--in-process is lockstep, unpaced, without Zenoh; leave out {useless}, or it")
+
+
+@app.command(rich_help_panel=RUN)
+def validate(scenario: ScenarioPath, set_: Set = None) -> None:
+    """Check a scenario and print what it resolves to; every fault is a line."""
+    from zsim.scenario import scenario_file
+
+    print(scenario_file.to_text(load_scenario(scenario, set_)), end="")
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"zsim {__version__}")
+        raise typer.Exit
+
+
+for part in (
+    report_commands,
+    role_commands,
+    hosts_commands,
+    sweep_commands,
+    export_command,
+    replay_command,
+    look_commands,
+    console_command,
+    gateway_command,
+    ros1_command,
+    ros2_command,
+):
+    app.add_typer(part.app)
+for group, panel in ((fault_commands, look_commands.PANEL), (certs_commands, HOSTS), (render_commands, HOSTS)):
+    app.add_typer(group.app, rich_help_panel=panel)
+
+
+@app.callback()
+def options(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")] = False,
+) -> None:
+    """Co-simulate drone formations: one world, estimators and controllers as processes on Zenoh, in lockstep."""
+
+
+@cache
+def command() -> Any:
+    """Return the command line, made once: a process that is forked has it already."""
+    return get_command(app)
+
+
+def main() -> None:
+    """Run the command line; a user's fault is a line, not a traceback."""
+    _say_anything()
+    try:
+        code = command()(standalone_mode=False, prog_name="zsim")
+    except ZsimError as error:
+        print(error, file=sys.stderr)
+        sys.exit(EXIT_CODES.get(type(error), USER_FAULT))
+    except UsageError as error:
+        _show_usage(error)
+        sys.exit(2)
+    except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
+    if code == INTERRUPTED:
+        print("interrupted", file=sys.stderr)
+    sys.exit(code)
+
+
+def _say_anything() -> None:
+    """Let a terminal that knows few letters show a question mark for the others, rather than end the command."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def _show_usage(error: Any) -> None:
+    """Print what was wrong with a command line in one line; after a bare `zsim` the help has been printed."""
+    if isinstance(error, typer.BadParameter) and error.param is None:
+        said = error.message
+    else:
+        said = " ".join(error.format_message().split()).replace("Value error, ", "")  # newer typers ask pydantic
+    command = error.ctx.command_path if error.ctx else "zsim"
+    if said:
+        print(f"{command}: {said[0].lower()}{said[1:].rstrip('.')}; see `{command} --help`", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

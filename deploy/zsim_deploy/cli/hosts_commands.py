@@ -1,0 +1,211 @@
+"""The commands of a run on several hosts."""
+
+import codecs
+import contextlib
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from zsim_deploy.cli.push_command import push
+from zsim_deploy.options.arguments import (
+    HOSTS,
+    Duration,
+    Insecure,
+    RateOption,
+    Realtime,
+    ScenarioPath,
+    Seed,
+    Set,
+    load_scenario,
+    mode_and_rate,
+)
+
+app = typer.Typer()
+
+FOLLOW_S = 0.2  # between two looks at a log that is followed
+
+Hosts = Annotated[Path, typer.Option("--hosts", help="Inventory (YAML): which hosts, which role where.")]
+Federation = Annotated[str, typer.Option(help="Federation that is up.")]
+Role = Annotated[str, typer.Argument(help="Process name, e.g. estimator.drone2.", show_default=False)]
+
+
+def up(
+    scenario: ScenarioPath,
+    hosts: Hosts,
+    out: Annotated[Path | None, typer.Option(help="Folder of the run (default runs/NAME-TIME).")] = None,
+    seed: Seed = None,
+    duration: Duration = None,
+    realtime: Realtime = False,
+    rate: RateOption = None,
+    set_: Set = None,
+    insecure: Insecure = False,
+    report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
+) -> None:
+    """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything."""
+    from zsim_deploy.cli.report_commands import conclude
+    from zsim_deploy.control.status_table import Board
+    from zsim_deploy.hosts.up import Options, Up
+    from zsim_deploy.inventory import inventory
+
+    loaded = load_scenario(scenario, set_, seed, duration)
+    placed = inventory.load(hosts)
+    placed = inventory.insecure(placed) if insecure else placed
+    inventory.placement(placed, loaded)
+    mode, pace = mode_and_rate(realtime, rate)
+    with _folder(out, loaded) as folder:
+        with Board(loaded.duration_s) as board:
+            outcome = Up(Options(loaded, placed, folder, mode, pace), board).go()
+        conclude(outcome, folder, report)
+
+
+@contextlib.contextmanager
+def _folder(out: Path | None, scenario: Any) -> Iterator[Path]:
+    """Lend a folder for a run, which is taken away again if the run was refused and nothing is in it."""
+    from zsim_deploy.launch.run import make_directory
+
+    was_there = out is not None and out.exists()
+    folder = make_directory(out, scenario)
+    try:
+        yield folder
+    finally:
+        if not was_there:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+
+def down(federation: Federation = "zsim") -> None:
+    """End the run that is up, on all hosts."""
+    from zsim_deploy.control import control_socket
+
+    control_socket.ask(federation, "down")
+
+
+def ps(
+    federation: Federation = "zsim",
+    as_json: Annotated[bool, typer.Option("--json", help="As a JSON line.")] = False,
+) -> None:
+    """Show the processes of the run that is up: role, host, pid, state, lag, messages/s, round trip, restarts."""
+    from rich.console import Console
+
+    from zsim_deploy.control import control_socket
+    from zsim_deploy.control.status_table import table
+
+    found = control_socket.ask(federation, "ps")
+    if as_json:
+        print(json.dumps(found))
+    else:
+        Console().print(table(found["rows"]))
+
+
+def logs(
+    role: Role,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what is written from now on.")] = False,
+    federation: Federation = "zsim",
+) -> None:
+    """Print what a process of the run that is up has said; what the world tells is shown by `zsim up` itself."""
+    from zsim.errors import RunError
+    from zsim_deploy.control import control_socket
+
+    where = control_socket.ask(federation, "where")
+    if role not in where["roles"]:
+        raise RunError(f"role is {role!r}; must be one of {', '.join(where['roles'])}")
+    path = Path(where["out"]) / "logs" / f"{role}.log"
+    if not path.exists():
+        print(_silent(role), file=sys.stderr)
+    for text in _written(path, follow, lambda: _is_up(federation, where["out"])):
+        sys.stdout.write(text)
+        sys.stdout.flush()
+
+
+def _written(path: Path, follow: bool, goes_on: Callable[[], bool]) -> Iterator[str]:
+    """Yield what is in a file, and what is added to it for as long as something goes on; it may not be there yet."""
+    done, last = 0, not follow
+    decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
+    while True:
+        if path.exists():
+            with path.open("rb") as log:
+                log.seek(done)
+                new = log.read()
+            done += len(new)
+            yield decoder.decode(new)
+        if last:
+            return
+        time.sleep(FOLLOW_S)
+        last = not goes_on()
+
+
+def _silent(role: str) -> str:
+    """Return why there is nothing of a role."""
+    from zsim.contract.rights import WORLD
+
+    if role == WORLD:
+        return "world has had no fault to tell; its progress and events are shown by `zsim up`, and are in the record"
+    return f"{role} has said nothing yet"
+
+
+def _is_up(federation: str, out: str) -> bool:
+    """Tell whether the launcher of a federation still has the run of this folder."""
+    from zsim.errors import RunError
+    from zsim_deploy.control import control_socket
+
+    try:
+        return control_socket.ask(federation, "where")["out"] == out
+    except RunError:
+        return False
+
+
+def restart(role: Role, federation: Federation = "zsim") -> None:
+    """Start a process of the run anew where it is; it takes over from its former self."""
+    from zsim_deploy.control import control_socket
+
+    print(f"restarting {control_socket.ask(federation, 'restart', role=role)}")
+
+
+def move(
+    role: Role,
+    host: Annotated[str, typer.Argument(help="Host of the inventory.", show_default=False)],
+    federation: Federation = "zsim",
+) -> None:
+    """Let another host run a process of the run from now on."""
+    from zsim_deploy.control import control_socket
+
+    print(f"moving {control_socket.ask(federation, 'move', role=role, host=host)}")
+
+
+def doctor(
+    hosts: Hosts,
+    scenario: Annotated[Path | None, typer.Argument(help="Scenario whose roles are to be placed.")] = None,
+) -> None:
+    """Check every host: ssh, versions, clock, load, and how the hosts reach each other."""
+    from rich.console import Console
+
+    from zsim.errors import HostsError
+    from zsim_deploy.doctor.check_up import check_up
+    from zsim_deploy.inventory import inventory
+
+    placed = inventory.load(hosts)
+    result = check_up(placed, _placement(placed, scenario))
+    console = Console()
+    for shown in result.tables:
+        console.print(shown)
+    for warning in result.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    if result.faults:
+        raise HostsError("\n".join(result.faults))
+    print("all hosts are ready")
+
+
+def _placement(placed: Any, scenario: Path | None) -> dict[str, str] | None:
+    from zsim.scenario import scenario_file
+    from zsim_deploy.inventory import inventory
+
+    return inventory.placement(placed, scenario_file.load(scenario)) if scenario else None
+
+
+for _command in (push, doctor, up, ps, logs, restart, move, down):
+    app.command(rich_help_panel=HOSTS)(_command)

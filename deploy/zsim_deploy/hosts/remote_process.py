@@ -1,0 +1,215 @@
+"""One process of a run on another host, over ssh: started, watched, told to stop, its last words kept.
+
+The process has our end of the ssh channel as standard input. It ends when that closes, which sshd does when the
+launcher dies; and when it has heard nothing on it for ORPHAN_S, as when the launcher's host is gone (leash.py).
+"""
+
+import asyncio
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from typing import Any
+
+import asyncssh
+
+from zsim.errors import HostsError
+from zsim_deploy.forkserver.role_launcher import SINGLE_THREADED
+from zsim_deploy.ssh import shell
+from zsim_deploy.ssh.host_link import HostLink, Loop
+from zsim_deploy.ssh.remote_log import Log
+
+BEAT_S = 1.0  # how often the launcher shows that it lives
+ORPHAN_S = 60.0  # without a beat a process ends itself; a link may be cut for shorter than that
+LEND_S = 60.0  # how long its files may take to reach the host again; as long as a link may be cut
+KILL_S = 5.0  # how long a kill may take to reach the host: a few round trips
+LOST = -1000  # code of a process of which nobody knows how it ended
+PID = "zsim-pid "  # begins the line with its process id; a login shell may say something before
+
+
+class Remote:
+    """A role on another host.
+
+    Args:
+        name: process name `role.thing`.
+        arguments: of the `zsim` command there.
+        link: to the host.
+        python: interpreter there that has zsim.
+        loop: on which the link lives.
+        log: for what it says.
+        on_line: told every line of its standard output; None sends that to the log too.
+        folder: of the run there.
+        files: what it needs below that folder and takes away when it ends; brought again whenever it is started again.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        arguments: list[str],
+        link: HostLink,
+        python: str,
+        loop: Loop,
+        log: Log,
+        on_line: Callable[[str], None] | None = None,
+        folder: str = "",
+        files: Mapping[str, bytes] | None = None,
+    ) -> None:
+        self.name = name
+        self.role = name.split(".", 1)[0]
+        self.host = link.name
+        self.restarts = 0
+        self.started_s = 0.0
+        self.pid = 0
+        self._arguments = arguments
+        self._link = link
+        self._python = python
+        self._loop = loop
+        self._log = log
+        self._on_line = on_line
+        self._folder = folder
+        self._files = files or {}
+        self._starts = 0
+        self._process: asyncssh.SSHClientProcess[str] | None = None
+        self._life: Future[None] | None = None
+        self._code: int | None = None
+        self._fault = ""
+        self._ended = threading.Event()
+        self._stop: str | None = None
+
+    @property
+    def code(self) -> int | None:
+        """Return its exit code, None while it lives or is on its way; negative for a signal."""
+        return self._code
+
+    @property
+    def state(self) -> str:
+        if self._code is not None:
+            return "ended"
+        return "running" if self.pid else "starting"
+
+    def start(self) -> None:
+        """Start it, or start it again; returns at once."""
+        self._starts += 1
+        self.pid, self._code, self._process, self._stop, self._fault = 0, None, None, None, ""
+        self._ended.clear()
+        self.started_s = time.monotonic()
+        self._life = self._loop.spawn(self._live())
+
+    async def _live(self) -> None:
+        """Run the process to its end, which is noticed whatever happens."""
+        code = LOST
+        try:
+            code = await self._run()
+        except (asyncssh.Error, OSError, HostsError) as error:
+            self._lose(f"the connection to {self.host} broke ({error})")
+        except Exception as error:
+            self._lose(f"the launcher could not follow it ({error!r})")
+        finally:
+            self._code = code
+            self._ended.set()
+
+    def _lose(self, fault: str) -> None:
+        self._fault = fault
+        self._log.write(f"{fault}\n")
+
+    async def _run(self) -> int:
+        if self._starts > 1 and self._files:
+            await self._link.put_files(self._folder, self._files, LEND_S, patient=True)
+        async with (
+            self._link.channel(patient=True) as connection,
+            connection.create_process(self._command(), encoding="utf-8", errors="replace") as process,
+        ):
+            self.pid = await _pid(process.stdout)
+            self._process = process
+            process.stdin.write(f"orphan-after {ORPHAN_S:g}\n")
+            if self._stop is not None:
+                self._send(f"stop {self._stop}\n")
+            beats = asyncio.create_task(self._beat(process))
+            try:
+                await asyncio.gather(self._read_lines(process.stdout, self._on_line), self._read_lines(process.stderr))
+                done = await process.wait()
+            finally:
+                beats.cancel()
+            return _code(done)
+
+    def _command(self) -> str:
+        words = [self._python, "-m", "zsim_deploy.cli", *self._arguments]
+        settings = " ".join(f"{name}={value}" for name, value in SINGLE_THREADED.items())
+        return f"echo {PID}$$; exec env {settings} {shell.line(words)}"
+
+    async def _read_lines(self, stream: Any, on_line: Callable[[str], None] | None = None) -> None:
+        async for line in stream:
+            if on_line:
+                on_line(line)
+            else:
+                self._log.write(line)
+
+    @staticmethod
+    async def _beat(process: "asyncssh.SSHClientProcess[str]") -> None:
+        with contextlib.suppress(OSError, asyncssh.Error):
+            while True:
+                await asyncio.sleep(BEAT_S)
+                process.stdin.write("beat\n")
+
+    def outcome(self) -> str:
+        """Say in words how it ended."""
+        code = self._code
+        if code == LOST:
+            return self._fault or f"the connection to {self.host} broke"
+        if code is not None and code < 0:
+            return f"killed by signal {-code}"
+        last = self.last_words()
+        return f"exit code {code}" + (f": {last}" if last else "")
+
+    def last_words(self) -> str:
+        """Return the last line that it wrote to its log."""
+        return self._log.last
+
+    def tell_stop(self, reason: str) -> None:
+        """Ask it to leave; harmless when it is gone, remembered when it is still on its way."""
+        self._stop = reason
+        self._loop.tell(self._send, f"stop {reason}\n")
+
+    def _send(self, line: str) -> None:
+        if self._process is not None:
+            with contextlib.suppress(OSError, asyncssh.Error):
+                self._process.stdin.write(line)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until it has ended; return whether it has."""
+        return self._ended.wait(max(0.0, timeout_s))
+
+    def kill(self) -> None:
+        """Send SIGKILL, as to one that hangs, or stop trying to start it; returns at once."""
+        if self._code is not None or self._life is None:
+            return
+        if self.pid:
+            self._loop.spawn(self._kill(self.pid))
+        else:
+            self._life.cancel()
+
+    async def _kill(self, pid: int) -> None:
+        with contextlib.suppress(HostsError):
+            await self._link.run(f"kill -9 {pid}", timeout_s=KILL_S)
+
+    def close(self) -> None:
+        """End it whatever it does; one that cannot be reached ends by itself."""
+        if self._life is not None:
+            self.kill()
+            self._ended.wait(KILL_S)
+
+
+async def _pid(said: "asyncssh.SSHReader[str]") -> int:
+    """Return the process id that the shell says, 0 if it ends without."""
+    async for line in said:
+        if line.startswith(PID):
+            return int(line.removeprefix(PID))
+    return 0
+
+
+def _code(done: asyncssh.SSHCompletedProcess) -> int:
+    if done.exit_signal:
+        return -int(getattr(signal, f"SIG{done.exit_signal[0]}", signal.SIGKILL))
+    return done.exit_status if done.exit_status is not None else LOST

@@ -1,0 +1,215 @@
+"""A whole run: every process of a scenario started, watched, recorded, ended, and reported."""
+
+import contextlib
+import re
+import socket
+import time
+import uuid
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from zsim.errors import RecordError, RunError, SessionError
+from zsim.record import repair
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim.transport.identity import Identity
+from zsim_agents.hosting import agents_of
+from zsim_deploy.cli import console_command
+from zsim_deploy.forkserver.role_launcher import Nursery
+from zsim_deploy.launch.child import Child
+from zsim_deploy.launch.supervisor import Outcome, Watch
+from zsim_deploy.options.arguments import pace_options
+from zsim_deploy.roles.stop_channel import Leash
+from zsim_deploy.terminal.interrupts import REASONS, handled_by
+from zsim_deploy.terminal.progress import Screen
+
+DEFAULT_PORT = 7447  # Zenoh's own
+PORTS_TRIED = 5  # when other runs that start at this moment take each before our world listens
+
+
+@dataclass
+class Options:
+    """How to run a scenario."""
+
+    scenario: Scenario
+    out: Path
+    mode: str = "lockstep"
+    rate: float = 0.0
+    listen: str | None = None
+    insecure: bool = False
+    hosted: bool = False
+    order: list[str] = field(default_factory=list)
+    console: bool = False
+
+
+def _children(options: Options, endpoint: str, watch: Watch, nursery: Nursery) -> list[Child]:
+    """Return the processes of a run, not started."""
+    logs, file = options.out / "logs", options.out / "scenario.yaml"
+    scenario, federation = options.scenario, options.scenario.federation
+    # Another run's world may listen where ours could not: nobody of this run is to join that one.
+    launched = ["--launched", uuid.uuid4().hex[:12], *(["--insecure"] if options.insecure else [])]
+    reach = ["--connect", endpoint, "--federation", federation, *launched]
+    pace = pace_options(options.mode, options.rate)
+    world = ["world", str(file), "--listen", endpoint, "--expect", "recorder", *pace, *launched]
+    record = ["record", "--out", str(options.out), *reach]
+    children = [Child("world", world, logs, nursery, watch.take_line), Child("recorder", record, logs, nursery)]
+    wanted = scenario.processes.expect
+    names = [name for name in agents_of(scenario) if wanted is None or name in wanted]
+    if options.hosted and names:
+        children.append(Child(names[-1], ["host", *reach, "--", *names], logs, nursery))
+    else:
+        # a name of the contract may begin with -
+        split = [name.partition(".") for name in names]
+        children += [Child(f"{role}.{thing}", [role, *reach, "--", thing], logs, nursery) for role, _, thing in split]
+    if options.console:
+        show = ["console", "--name", console_command.OF_A_RUN, "--port", str(_page_port()), *reach]
+        children.append(Child(console_command.OF_A_RUN, show, logs, nursery, watch.take_line))
+    rank = {name: i for i, name in enumerate(options.order)}
+    return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
+
+
+def check_endpoint(endpoint: str | None, insecure: bool) -> None:
+    """Refuse an endpoint on which no world can listen, before anything is started.
+
+    Raises:
+        SessionError: it is malformed, or less secure than was asked for.
+    """
+    if endpoint is None:
+        return
+    from zsim.transport.session import check_listening
+
+    check_listening([endpoint], Identity(insecure=insecure))
+    if endpoint.startswith("tcp/") and not re.fullmatch(r"tcp/.+:[0-9]{1,5}", endpoint):
+        raise SessionError(f"endpoint is {endpoint!r}; must be tcp/ADDRESS:PORT such as tcp/127.0.0.1:{DEFAULT_PORT}")
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return False
+    return True
+
+
+def _page_port() -> int:
+    """Return the console's port, or another free one where that is taken."""
+    return console_command.PORT if _is_free(console_command.PORT) else _any_port()
+
+
+def _any_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def free_port(screen: Screen) -> int:
+    """Return Zenoh's port, or another free one, and say so, where that is taken."""
+    if _is_free(DEFAULT_PORT):
+        return DEFAULT_PORT
+    port = _any_port()
+    screen.say(f"port {DEFAULT_PORT} is in use; this run is on tcp/127.0.0.1:{port} (--connect for other commands)")
+    return port
+
+
+def make_directory(out: Path | None, scenario: Scenario) -> Path:
+    """Return the run's folder, made new.
+
+    Raises:
+        RunError: it holds a record already, or cannot be made.
+    """
+    folder = out or _fresh(Path("runs") / f"{scenario.name}-{time.strftime('%Y%m%d-%H%M%S')}")
+    if (folder / "run.mcap").exists() or (folder / "logs").exists():
+        raise RunError(f"{folder}: holds a run already; give --out another folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"{folder}: cannot be made ({error.strerror}); give --out another folder") from error
+    return folder
+
+
+def _fresh(folder: Path) -> Path:
+    """Return a folder that is not there yet: two runs may start within one second."""
+    names = [folder, *(folder.with_name(f"{folder.name}-{i}") for i in range(2, 1000))]
+    return next(name for name in names if not name.exists())
+
+
+def run_processes(options: Options, screen: Screen) -> Outcome:
+    """Run a scenario as real processes; the record is finished whatever happens.
+
+    Raises:
+        KeyboardInterrupt: with the reason, where nothing flew yet, or somebody would not wait for the end.
+    """
+    try:
+        with handled_by(_interrupt):
+            outcome = _run(options, screen)
+    except KeyboardInterrupt:
+        with contextlib.suppress(OSError):
+            (options.out / "logs").rmdir()  # nobody has written there: the folder may be used again
+        raise
+    with contextlib.suppress(RecordError):
+        repair(options.out / "run.mcap")
+    return outcome
+
+
+def _run(options: Options, screen: Screen) -> Outcome:
+    scenario, listen = options.scenario, options.listen
+    _write_scenario(options, logs=True)
+    screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
+    with Nursery(screen.say, str(options.out)) as nursery:
+        return _go(options, listen, screen, nursery) if listen else _go_on_a_free_port(options, screen, nursery)
+
+
+def _interrupt(number: int, _: object) -> None:
+    raise KeyboardInterrupt(REASONS[number])
+
+
+def _go(options: Options, endpoint: str, screen: Screen, nursery: Nursery) -> Outcome:
+    watch = Watch(options.scenario.processes.on_death, screen)
+    watch.members = [*_children(options, endpoint, watch, nursery)]
+    return watch.go()
+
+
+def _go_on_a_free_port(options: Options, screen: Screen, nursery: Nursery, tries: int = PORTS_TRIED) -> Outcome:
+    port = free_port(screen)
+    endpoint = f"tcp/127.0.0.1:{port}"
+    outcome = _go(options, endpoint, screen, nursery)
+    if tries > 1 and _was_too_late(outcome, endpoint, port):
+        return _go_on_a_free_port(options, screen, nursery, tries - 1)
+    return outcome
+
+
+def _was_too_late(outcome: Outcome, endpoint: str, port: int) -> bool:
+    """Tell whether somebody else took the port between our look at it and our world's start."""
+    return outcome.failed and f"cannot listen on {endpoint}" in outcome.reason and not _is_free(port)
+
+
+def _write_scenario(options: Options, logs: bool) -> None:
+    """Put what is to be flown into the run's folder.
+
+    Raises:
+        RunError: it cannot be written.
+    """
+    try:
+        if logs:
+            (options.out / "logs").mkdir()
+        (options.out / "scenario.yaml").write_text(scenario_file.to_text(options.scenario))
+    except OSError as error:
+        raise RunError(f"{options.out}: cannot be written ({error.strerror}); give --out another folder") from error
+
+
+def run_in_process(options: Options, screen: Screen) -> Outcome:
+    """Run a scenario in this process: the same bits, without Zenoh."""
+    from zsim_analysis.in_process import fly
+    from zsim_world.fleet.fleet import DivergedError
+
+    _write_scenario(options, logs=False)
+    leash = Leash(launched=False)
+    try:
+        reason = fly(options.scenario, options.out / "run.mcap", leash.reason, screen)
+    except DivergedError as error:
+        return Outcome(str(error), failed=True)
+    finally:
+        leash.let_go()
+    return Outcome(reason, interrupted=leash.pulled())

@@ -1,0 +1,280 @@
+"""The watch over the processes of a run: what is done when one of them ends, and how all of them end.
+
+Where a process runs, on this machine (child.py) or on another one (remote.py), makes no difference here.
+"""
+
+import json
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from queue import SimpleQueue
+from typing import Any, Protocol
+
+from zsim.errors import RunError
+from zsim.scenario.on_death import on_death
+from zsim.scenario.scenario import OnDeath
+from zsim_deploy.terminal.interrupts import IMPATIENT, REASONS, handled_by
+from zsim_deploy.terminal.progress import Show
+
+POLL_S = 0.05  # how often the processes are looked at
+END_S = 8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for
+WORLD_FIRST_S = 1.0  # after Ctrl-C, how long the world has to end the run for everybody
+INTERRUPT_S = 2.0  # after Ctrl-C, how long anybody may take; the whole is promised within 3 s
+TAKE_OVER_S = 60.0  # how long a process may stay once another was started in its place; a slow one starts in half
+RESTARTS_MAX = 5  # of one process within RESTART_WINDOW_S; more is a fault that a restart does not heal
+RESTART_WINDOW_S = 20.0
+USER_FAULT = 2  # exit code of a role that refuses its arguments or cannot run at all
+SUPERSEDED = 3  # exit code of a role whose place another process of its name has taken
+
+
+class Member(Protocol):
+    """A process of a run."""
+
+    name: str
+    role: str
+    restarts: int
+    started_s: float
+
+    @property
+    def pid(self) -> int: ...
+    @property
+    def code(self) -> int | None: ...
+    def start(self) -> None: ...
+    def outcome(self) -> str: ...
+    def last_words(self) -> str: ...
+    def tell_stop(self, reason: str) -> None: ...
+    def wait(self, timeout_s: float) -> bool: ...
+    def kill(self) -> None: ...
+    def close(self) -> None: ...
+
+
+@dataclass
+class Outcome:
+    """How a run ended."""
+
+    reason: str
+    failed: bool = False
+    interrupted: bool = False
+
+
+class Watch:
+    """Starts the processes of a run, watches them, and leaves nothing behind.
+
+    Args:
+        on_death: of the scenario, by process name or role.
+        show: takes progress.
+
+    Attributes:
+        members: to be given before `go`; the world among them.
+    """
+
+    def __init__(self, on_death: dict[str, OnDeath], show: Show) -> None:
+        self.members: list[Member] = []
+        self._given = on_death
+        self._show = show
+        self._reason = ""
+        self._failed = False
+        self._interrupted: str | None = None
+        self._until_s: float | None = None
+        self._dead: set[str] = set()
+        self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
+        self._leaving: dict[str, tuple[Member, float]] = {}  # whose place was taken, and since when (monotonic, s)
+        self._gone: list[Member] = []  # nobody waits for them any more
+        self._orders: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
+
+    def go(self, look: Callable[[], None] = lambda: None) -> Outcome:
+        """Start everything, watch it to its end, leave nothing behind.
+
+        Args:
+            look: called at every look at the processes.
+        """
+        if self._interrupted:
+            return Outcome(self._interrupted, interrupted=True)
+        with self._interrupts():
+            try:
+                for child in self.members:
+                    child.start()
+                self._watch(look)
+                self._finish()
+            finally:
+                self._refuse_orders()
+                _close([*self.members, *(child for child, _ in self._leaving.values()), *self._gone])
+        return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
+
+    def _interrupts(self) -> AbstractContextManager[None]:
+        """Take Ctrl-C and SIGTERM as a wish to end the run well; a second Ctrl-C does not wait."""
+
+        def on_signal(number: int, _: object) -> None:
+            if self._interrupted:
+                raise KeyboardInterrupt(IMPATIENT)
+            self._interrupted = REASONS[number]
+
+        return handled_by(on_signal)
+
+    def take_line(self, text: str) -> None:
+        """Take a line of the world's progress."""
+        try:
+            line = json.loads(text)
+        except ValueError:
+            return  # not progress: something printed by a library
+        if not isinstance(line, dict):
+            return  # a number that was printed is JSON too
+        if "clock" in line:
+            self._show.clock(line["clock"])
+        elif "event" in line:
+            self._on_event(line["event"])
+        elif "health" in line:
+            self._show.health(line["health"])
+        elif "say" in line:
+            self._show.say(line["say"])
+
+    def _on_event(self, event: dict[str, Any]) -> None:
+        self._show.event(event)
+        if event["kind"] == "end":
+            self._reason = self._reason or event["text"]
+        elif event["kind"] == "death" and event["data"].get("on_death") == "end":
+            self._fail(f"{event['subject']} died")
+
+    # Watching
+
+    def _watch(self, look: Callable[[], None]) -> None:
+        """Return when the world has ended, or when it has to."""
+        world = next(child for child in self.members if child.role == "world")
+        while world.code is None:
+            if self._interrupted:
+                self._reason = self._interrupted
+                world.tell_stop(self._reason)
+                world.wait(min(WORLD_FIRST_S, self._left_s()))
+                return
+            for child in self.members:
+                if child is not world and child.code is not None and child.name not in self._dead:
+                    self._on_exit(child, world)
+            self._carry_out_orders()
+            self._see_off()
+            look()
+            world.wait(POLL_S)
+        if world.code != 0:
+            self._fail(f"the world died: {world.outcome()}")
+
+    def order(self, act: Callable[[], Any]) -> Future[Any]:
+        """Let the watch do something between two looks at the processes; callable from any thread.
+
+        Returns:
+            what comes of it, also if it fails; cancelled when the run ends before.
+        """
+        outcome: Future[Any] = Future()
+        self._orders.put((act, outcome))
+        return outcome
+
+    def interrupt(self, reason: str) -> None:
+        """End the run for everybody, as Ctrl-C does."""
+        self._interrupted = self._interrupted or reason
+
+    def replace(self, new: Member) -> None:
+        """Start a process that takes the place of the one of its name, which then leaves or is killed.
+
+        Raises:
+            RunError: another one is taking that place at this moment; the last to come would not be the last to join.
+        """
+        self._see_off()
+        if self.is_taken_over(new.name):
+            raise RunError(f"{new.name} is being taken over already; try again when its former process has ended")
+        index = next(i for i, child in enumerate(self.members) if child.name == new.name)
+        old, self.members[index] = self.members[index], new
+        new.restarts = old.restarts + 1
+        self._dead.discard(new.name)
+        self._leaving[new.name] = (old, time.monotonic())
+        if not old.pid:
+            old.kill()  # it waits for its host, and must not take the name back when that is there
+        new.start()
+
+    def is_taken_over(self, name: str) -> bool:
+        """Tell whether a process is taking the place of another that has not left yet; callable from any thread."""
+        return name in self._leaving
+
+    def _see_off(self) -> None:
+        """Let go of those that have left their place; kill one that hangs there."""
+        for name, (child, since_s) in list(self._leaving.items()):
+            hangs = child.code is None and time.monotonic() - since_s > TAKE_OVER_S
+            if hangs:
+                self._show.say(f"{name} (pid {child.pid}) has not made way within {TAKE_OVER_S:g} s; it is killed")
+                child.kill()
+            if hangs or child.code is not None:
+                del self._leaving[name]
+                self._gone.append(child)
+
+    def _carry_out_orders(self) -> None:
+        while not self._orders.empty():
+            act, outcome = self._orders.get()
+            if outcome.set_running_or_notify_cancel():
+                _settle(outcome, act)
+
+    def _refuse_orders(self) -> None:
+        while not self._orders.empty():
+            self._orders.get()[1].cancel()
+
+    def _on_exit(self, child: Member, world: Member) -> None:
+        """Do what on_death says of a role that ended while the world runs."""
+        if child.code in (0, SUPERSEDED):
+            self._dead.add(child.name)
+            if child.code == SUPERSEDED:
+                self._show.say(child.last_words())
+            return
+        what = on_death(self._given, child.name)
+        if child.code == USER_FAULT or (what == "restart" and self._too_often(child)):
+            what = "end"
+        self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; on_death: {what}")
+        if what == "restart":
+            child.restarts += 1
+            child.start()
+            return
+        self._dead.add(child.name)
+        if what == "end":
+            self._fail(f"{child.name} ended: {child.outcome()}")
+            world.tell_stop(self._reason)
+
+    def _too_often(self, child: Member) -> bool:
+        """Note a death; tell whether there were more of them in a row than a restart heals."""
+        deaths = self._deaths[child.name]
+        deaths.append(time.monotonic())
+        return len(deaths) > RESTARTS_MAX and deaths[-1] - deaths[0] < RESTART_WINDOW_S
+
+    def _fail(self, reason: str) -> None:
+        self._reason, self._failed = self._reason or reason, True
+
+    def _finish(self) -> None:
+        """Let everybody leave; the recorder leaves last, by itself."""
+        for child in self.members:
+            if self._failed or self._interrupted or child.role != "recorder":
+                child.tell_stop(self._reason)
+        for child in self.members:
+            while not child.wait(min(POLL_S, self._left_s())) and self._left_s() > 0:
+                continue
+        recorder = next(child for child in self.members if child.role == "recorder")
+        if recorder.code not in (0, None) and recorder.name not in self._dead:
+            self._fail(f"the recorder ended: {recorder.outcome()}")
+
+    def _left_s(self) -> float:
+        """Return how long the others may still take, now that the run is to end; Ctrl-C makes it shorter."""
+        now_s = time.monotonic()
+        latest_s = now_s + (INTERRUPT_S if self._interrupted else END_S)
+        self._until_s = latest_s if self._until_s is None else min(self._until_s, latest_s)
+        return max(0.0, self._until_s - now_s)
+
+
+def _settle(outcome: Future[Any], act: Callable[[], Any]) -> None:
+    """Carry out an order; whatever goes wrong is told to who gave it, and the run goes on."""
+    try:
+        outcome.set_result(act())
+    except Exception as error:
+        outcome.set_exception(error)
+
+
+def _close(members: Sequence[Member]) -> None:
+    """End all of them at once: one that cannot be reached keeps nobody waiting."""
+    with ThreadPoolExecutor(len(members)) as pool:
+        for closed in [pool.submit(member.close) for member in members]:
+            closed.result()

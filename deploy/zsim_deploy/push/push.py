@@ -1,0 +1,193 @@
+"""`zsim push`: install zsim on the hosts of an inventory, over ssh alone; the hosts need no internet."""
+
+import asyncio
+import os
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import asyncssh
+
+from zsim import __version__
+from zsim.errors import HostsError, InventoryError
+from zsim_deploy.inventory import extras
+from zsim_deploy.inventory.inventory import Host, Placed
+from zsim_deploy.push.installer import Installer, installer
+from zsim_deploy.push.target import chosen, interpreters, question, target
+from zsim_deploy.push.wheelhouse import House, Wheel, Wheelhouse
+from zsim_deploy.roles import warm_up
+from zsim_deploy.ssh import shell
+from zsim_deploy.ssh.host_link import HostLink
+
+LAUNCHER = "launcher"  # how this machine is called among the hosts, in what is told
+ASK_S = 30.0  # wall time for a host to start a few Pythons; a small computer takes seconds
+INSTALL_S = 900.0  # wall time to unpack 100 MB of wheels on a slow memory card
+COMPILE_S = 900.0  # wall time to compile what flies; half a minute on a laptop's core
+COPIES = 4  # files under way to one host at a time
+
+Told = Callable[[str, str], None]  # host, what is being done there
+
+
+async def push(placed: Placed, names: Sequence[str], more: Iterable[str], told: Told, cache: Path) -> dict[str, bool]:
+    """Install on hosts what their roles need.
+
+    Args:
+        names: of the hosts; all of the inventory if empty.
+        more: extras for each of them beside those of its roles.
+        told: hears what is being done.
+        cache: folder of the wheelhouse.
+
+    Returns:
+        For each host whether anything had to be done there.
+
+    Raises:
+        InventoryError: a host is not in the inventory, or there is no such extra.
+        HostsError: with a line for each host at which it failed; the others are done.
+    """
+    hosts = placed.inventory.hosts
+    more = list(more)
+    unknown = [f"--host {name}: must be one of {', '.join(hosts)}" for name in names if name not in hosts]
+    known = extras.known()
+    unknown += [f"--extra {name}: must be one of {', '.join(known)}" for name in more if name not in known]
+    if unknown:
+        raise InventoryError(unknown)
+    wanted = extras.needed(placed.inventory, more)
+    house = Wheelhouse(cache, lambda text: told(LAUNCHER, text))
+    chosen_names = list(dict.fromkeys(names)) or list(hosts)
+    work = [_one(name, hosts[name], placed.folder, wanted[name], house, told) for name in chosen_names]
+    results = await asyncio.gather(*work, return_exceptions=True)
+    _raise_all(results)
+    return {name: result is True for name, result in zip(chosen_names, results, strict=True)}
+
+
+def _raise_all(results: Sequence[Any]) -> None:
+    """Raise what failed, as lines of one error; anything that is no host's fault as it is."""
+    for result in results:
+        if isinstance(result, BaseException) and not isinstance(result, HostsError):
+            raise result
+    if lines := list(dict.fromkeys(str(result) for result in results if isinstance(result, HostsError))):
+        raise HostsError("\n".join(lines))
+
+
+async def _one(name: str, host: Host, base: Path, wanted: frozenset[str], house: Wheelhouse, told: Told) -> bool:
+    """Install on one host; return whether anything had to be done."""
+    if host.python:
+        told(name, f"has zsim of its own in {host.python}")
+        return False
+    link = HostLink(name, host, base)
+    try:
+        told(name, "looking what is there")
+        python = await _python(link)
+        async with installer(link, python, host.folder, partial(told, name)) as program:
+            return await _install(There(link, program), wanted, house, partial(told, name))
+    except HostsError:
+        told(name, "failed")
+        raise
+    finally:
+        await link.close()
+
+
+async def _python(link: HostLink) -> str:
+    """Return the Python of a host to install for."""
+    said = await link.run(shell.line(["sh", "-c", question()]), timeout_s=ASK_S)
+    return chosen(link.name, interpreters(said.decode(errors="replace")), sys.version_info[:2]).path
+
+
+async def _install(there: "There", wanted: frozenset[str], house: Wheelhouse, told: Callable[[str], None]) -> bool:
+    """Install what is wanted; return whether anything had to be done."""
+    await there.look()
+    needed = await house.house(there.name, target(there.name, there.found), wanted)
+    described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
+    if is_there(needed, there.found["installed"]):
+        told(f"{described} is there")
+        return False
+    await there.copy(missing(needed, there.found), told)
+    told("installing")
+    await there.install(needed)
+    if any(wheel.path.name.startswith("numba-") for wheel in needed.others):
+        told("compiling what flies")
+        await there.warm_up()
+    told(f"{described} installed")
+    return True
+
+
+def is_there(house: House, installed: dict[str, Any] | None) -> bool:
+    """Tell whether a host has what it needs, by the note of the last push: perhaps more, but nothing else."""
+    if installed is None or installed["project"] != house.project.sha256:
+        return False
+    return set(house.extras) <= set(installed["extras"]) and not _new(house, installed)
+
+
+def _new(house: House, installed: dict[str, Any] | None) -> list[Wheel]:
+    """Return the wheels of other projects that are not installed yet."""
+    known = installed["wheels"] if installed else {}
+    return [wheel for wheel in house.others if known.get(wheel.path.name) != wheel.sha256]
+
+
+def missing(house: House, found: dict[str, Any]) -> list[Wheel]:
+    """Return the wheels that must be copied to a host, small ones last so that progress is smooth."""
+    needed = [house.project, house.pip, *_new(house, found["installed"])]
+    lacking = [wheel for wheel in needed if found["wheels"].get(wheel.path.name) != wheel.sha256]
+    return sorted(lacking, key=lambda wheel: -wheel.size_bytes)
+
+
+class There:
+    """What is on a host, and what is done to it."""
+
+    def __init__(self, link: HostLink, program: Installer) -> None:
+        self.name = link.name
+        self._link, self._program = link, program
+        self.found: dict[str, Any] = {}
+
+    async def look(self) -> None:
+        """Find what is installed."""
+        self.found = await self._program.ask("look", ASK_S)
+
+    async def install(self, house: House) -> None:
+        order = {
+            "project": house.project.path.name,
+            "pip": house.pip.path.name,
+            "wheels": [wheel.path.name for wheel in _new(house, self.found["installed"])],
+            "extras": house.extras,
+            "modules": [extras.MODULES[extra] for extra in ("", *house.extras) if extra in extras.MODULES],
+            "note": house.note(),
+        }
+        await self._program.ask("install", INSTALL_S, **order)
+
+    async def warm_up(self) -> None:
+        await self._program.ask("warm_up", COMPILE_S, module=warm_up.__name__)
+
+    async def copy(self, wheels: Sequence[Wheel], told: Callable[[str], None]) -> None:
+        """Copy wheels to the host; what broke off is not mistaken for a wheel."""
+        folder = f"{self.found['folder']}/wheels"
+        total, done = sum(wheel.size_bytes for wheel in wheels), 0
+        gate = asyncio.Semaphore(COPIES)
+
+        async def one(sftp: asyncssh.SFTPClient, wheel: Wheel) -> None:
+            nonlocal done
+            part, seen = f"{folder}/{wheel.path.name}.part", 0
+
+            def progress(_source: bytes, _target: bytes, copied: int, _size: int) -> None:
+                nonlocal done, seen
+                done, seen = done + copied - seen, copied
+                told(f"copying {done / 1e6:.0f} of {total / 1e6:.0f} MB")
+
+            async with gate:
+                await sftp.put(str(wheel.path), part, progress_handler=progress)
+                await sftp.posix_rename(part, part.removesuffix(".part"))
+
+        try:
+            async with (await self._link.open()).start_sftp_client() as sftp:
+                await sftp.makedirs(folder, exist_ok=True)
+                await asyncio.gather(*(one(sftp, wheel) for wheel in wheels))
+        except (asyncssh.Error, OSError) as error:
+            raise HostsError(
+                f"{self.name}: copying to {folder} failed ({error}); is there space, is the link up?"
+            ) from error
+
+
+def default_cache() -> Path:
+    """Return the folder of the wheelhouse on this machine (XDG Base Directory Specification)."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zsim"

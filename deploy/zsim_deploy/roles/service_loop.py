@@ -1,0 +1,100 @@
+"""Processes that let others in: they stay when a run ends, and serve the next."""
+
+import time
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+
+from zsim.contract import keys
+from zsim.contract.messages import Info
+from zsim.errors import NoWorldError, SupersededError
+from zsim.transport.connection import find_world
+from zsim.transport.session import Session
+from zsim_bridges.observer_process import Presence
+from zsim_deploy.options.reach import Reach
+from zsim_deploy.roles.roles import speaker
+from zsim_deploy.roles.stop_channel import Leash
+from zsim_deploy.security.key_lease import lent
+
+ANY = "*"  # in a name, for a number
+PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits for byes
+
+Stopped = Callable[[], bool]
+Say = Callable[[str], None]
+Serve = Callable[[Session, Info, Presence, Stopped, Say], None]
+"""Serves one run with (session, info, presence, stopped, say), until its presence is over or it is stopped."""
+
+
+def visit(name: str, serve: Serve, reach: Reach) -> None:
+    """Serve one run after the other of the world on an endpoint, until it is told to stop; launched, only one.
+
+    Args:
+        name: of the process; `role.*` for the first number that nobody has, kept until somebody takes it.
+        serve: what it does in a run.
+        reach: of the world.
+
+    Raises:
+        NoWorldError: there was no first world within `wait_s`.
+        SupersededError: another process of the name that was given has taken over.
+    """
+    launched, wait_s, who = reach.launched, reach.wait_s, reach.who
+    leash = Leash(launched is not None, lent(who, launched))
+    say = speaker(launched is not None)
+    mine, served = name, ""
+    try:
+        while not leash.pulled():
+            with find_world(reach.endpoint, reach.federation, wait_s, say, leash.pulled, True, launched, who) as (
+                link,
+                info,
+            ):
+                if info.run_id != served:
+                    mine = _free(link, mine)
+                    presence = Presence(link, info, mine)
+                    _serve(serve, link, presence, info, leash, say)
+                    served = info.run_id
+                    if presence.superseded:
+                        mine, served = _next(name, presence), ""
+                else:
+                    time.sleep(PAUSE_S)
+            if launched:
+                leash.account()
+                return
+            wait_s = None
+    except NoWorldError:
+        if not leash.pulled():
+            raise
+
+
+def named(role: str, name: str, tls: Path | None, thing: str = "main") -> str:
+    """Return a process's name: as told, or its certificate's, or the role's first."""
+    return name or (tls.name if tls else f"{role}.{thing}")
+
+
+def _free(link: Session, name: str) -> str:
+    """Return a name; for `role.*` the first of role.1, role.2, ... that nobody has."""
+    role, _, thing = name.partition(".")
+    if thing != ANY:
+        return name
+    taken = link.tokens(keys.token(f"{role}.$*"))
+    return next(free for i in count(1) if keys.token(free := f"{role}.{i}") not in taken)
+
+
+def _next(name: str, presence: Presence) -> str:
+    """Return the name under which to come in again; two that were to choose a number may have chosen the same one.
+
+    Raises:
+        SupersededError: the name was given.
+    """
+    role, _, thing = name.partition(".")
+    if thing != ANY:
+        raise SupersededError(f"{name}: {presence.over}; this one ends")
+    return f"{role}.{int(presence.name.rpartition('.')[2]) + 1}"
+
+
+def _serve(serve: Serve, link: Session, presence: Presence, info: Info, leash: Leash, say: Say) -> None:
+    presence.enter()
+    say(f"{presence.name}: in run {info.run_id}")
+    serve(link, info, presence, leash.pulled, say)
+    reason = presence.over or leash.reason() or "stopped"
+    presence.leave(reason)
+    say(f"{presence.name}: left, {reason}")

@@ -1,0 +1,106 @@
+"""How a process learns that it is to stop: a signal, a word from its launcher, or the launcher's death.
+
+A launched process has a pipe from its launcher as standard input. The launcher writes "stop REASON"; when it dies,
+the pipe ends. So nothing outlives its launcher, on any system, also after kill -9. A launcher on another host writes
+"orphan-after SECONDS" and then a "beat" every second: a host that vanishes closes no pipe. A launched process that is
+sent SIGTERM instead ends well, too, but counts as dead: its launcher did not want it.
+"""
+
+import os
+import signal
+import sys
+import threading
+import time
+
+from zsim_deploy.security.key_lease import Lent
+from zsim_deploy.terminal.interrupts import IMPATIENT, INTERRUPTED, REASONS
+
+TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it
+GRACE_S = 4.0  # a role that was told to stop and hangs is ended; the world waits 5 s for byes only if unstopped
+
+
+class Leash:
+    """The reason to stop, once there is one.
+
+    Args:
+        launched: whether standard input is a launcher's pipe; then Ctrl-C is the launcher's business.
+        lent: key that goes back as soon as the launcher is gone.
+    """
+
+    def __init__(self, launched: bool, lent: Lent | None = None) -> None:
+        self._lent = lent
+        self._reason: str | None = None
+        self._deserted = self._terminated = False
+        self._heard_s = time.monotonic()
+        self._former = {number: signal.getsignal(number) for number in REASONS}
+        if launched:
+            signal.signal(signal.SIGTERM, self._on_kill)
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            threading.Thread(target=self._listen, name="leash", daemon=True).start()
+        else:
+            signal.signal(signal.SIGTERM, lambda *_: self._stop(REASONS[signal.SIGTERM]))
+            signal.signal(signal.SIGINT, self._on_interrupt)
+
+    def reason(self) -> str | None:
+        """Return why to stop, None to go on."""
+        return self._reason
+
+    def pulled(self) -> bool:
+        """Tell whether to stop."""
+        return self._reason is not None
+
+    def deserted(self) -> bool:
+        """Tell whether the launcher is gone, or does not want this end: for all others it is a death, no leave."""
+        return self._deserted
+
+    def account(self) -> None:
+        """Tell the launcher, by the exit code, that somebody else has ended this process; to be called last.
+
+        Raises:
+            SystemExit: that is so.
+        """
+        if self._terminated:
+            raise SystemExit(TERMINATED)
+
+    def let_go(self) -> None:
+        """Take no signals any more: what is left to do may be interrupted as anything."""
+        for number, handler in self._former.items():
+            signal.signal(number, handler)
+
+    def _stop(self, reason: str) -> None:
+        self._reason = self._reason or reason
+
+    def _on_kill(self, *_: object) -> None:
+        if self._reason is None:
+            self._deserted = self._terminated = True
+        self._stop(REASONS[signal.SIGTERM])
+
+    def _on_interrupt(self, *_: object) -> None:
+        if self._reason is not None:
+            os.write(2, f"{IMPATIENT}\n".encode())
+            os._exit(INTERRUPTED)
+        self._stop(REASONS[signal.SIGINT])
+
+    def _listen(self) -> None:
+        for line in sys.stdin:
+            self._heard_s = time.monotonic()
+            word, _, rest = line.strip().partition(" ")
+            if word == "stop":
+                self._stop(rest or "stopped by the launcher")
+            elif word == "orphan-after":
+                threading.Thread(target=self._await_beats, args=(float(rest),), name="beats", daemon=True).start()
+        self._leave("the launcher is gone")
+
+    def _await_beats(self, limit_s: float) -> None:
+        """End this process when nothing has been heard for so long."""
+        while (left_s := self._heard_s + limit_s - time.monotonic()) > 0:
+            time.sleep(left_s)
+        self._leave(f"nothing heard from the launcher for {limit_s:g} s")
+
+    def _leave(self, reason: str) -> None:
+        self._deserted = True
+        if self._lent is not None:
+            self._lent.give_back()
+        self._stop(reason)
+        time.sleep(GRACE_S)
+        os._exit(1)

@@ -1,0 +1,114 @@
+"""Who needs a certificate, and whom each listening process lets in: from an inventory and a scenario. Pure."""
+
+import shlex
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from zsim.contract import keys
+from zsim.contract.rights import OPERATOR, ROUTER, WORLD
+from zsim.errors import InventoryError
+from zsim.scenario.scenario import Scenario
+from zsim_deploy.inventory import inventory as inv
+from zsim_deploy.inventory.inventory import Placed
+from zsim_deploy.security.access_control import access_control
+
+OPERATORS = "operators"  # folder of the operators that are at no host of the inventory
+
+
+def folder_of(placed: Placed) -> Path:
+    """Return the folder of an inventory's certificates."""
+    return placed.folder / Path(placed.inventory.security.certificates).expanduser()
+
+
+def init_command(placed: Placed, renew: bool = False) -> str:
+    """Return the command that makes an inventory's certificates, as a person is told to type it."""
+    words = ["zsim", "certs", "init", str(placed.folder / placed.source)]
+    return " ".join([shlex.join(words), "--scenario FILE", *(["--renew"] if renew else [])])
+
+
+class Wanted(NamedTuple):
+    """A certificate that is to be there.
+
+    Attributes:
+        host: name of the host in the inventory; a folder.
+        process: name of the process; the common name.
+        addresses: of the host, IP or DNS.
+    """
+
+    host: str
+    process: str
+    addresses: tuple[str, ...] = ()
+
+
+class Enrolment:
+    """What an inventory and a scenario ask for.
+
+    Args:
+        placed: the inventory.
+        scenario: whose processes run.
+        operators: people and programs that look and command, each NAME or NAME@HOST; at a host they come in as its
+            roles do, through its router if it has one, otherwise at the world. One may be at several places.
+
+    Raises:
+        InventoryError: a process has no place, or an operator is at no host of the inventory.
+        BadNameError: an operator's name is none of the contract.
+    """
+
+    def __init__(self, placed: Placed, scenario: Scenario, operators: Sequence[str] = ()) -> None:
+        self._inventory = placed.inventory
+        self._scenario = scenario
+        self._places = inv.placement(placed, scenario)
+        self._operators = list(dict.fromkeys(self._read_operator(text, placed.source) for text in operators))
+
+    def certificates(self) -> list[Wanted]:
+        """Return the certificates; a role has one for every host, so that it can be moved there during a run."""
+        fixed = [(self._places[WORLD], WORLD)]
+        fixed += [(router.host, f"{ROUTER}.{name}") for name, router in self._inventory.routers.items()]
+        movable = [(host, name) for name in self._movable() for host in self._inventory.hosts]
+        operators = [(host or OPERATORS, name) for name, host in self._operators]
+        return [Wanted(host, name, self._addresses(host)) for host, name in [*fixed, *movable, *operators]]
+
+    def access(self) -> Iterator[tuple[str, str, dict[str, Any]]]:
+        """Yield (host, process, access control) of every process that listens."""
+        clients = [*self._movable(), *self._operators_at(None)]
+        yield self._places[WORLD], WORLD, access_control(self._scenario, clients, self._below(None))
+        for name, router in self._inventory.routers.items():
+            above = f"{ROUTER}.{router.upstream}" if router.upstream else WORLD
+            rules = access_control(self._scenario, self._at(name), self._below(name), [above])
+            yield router.host, f"{ROUTER}.{name}", rules
+
+    def _read_operator(self, text: str, source: str) -> tuple[str, str | None]:
+        name, at, host = text.partition("@")
+        name = keys.name(name.removeprefix(f"{OPERATOR}."), OPERATOR)
+        if at and host not in self._inventory.hosts:
+            known = ", ".join(self._inventory.hosts)
+            raise InventoryError([f"{source}: operator {name!r} is at {host!r}; must be one of hosts: {known}"])
+        return f"{OPERATOR}.{name}", host or None
+
+    def _movable(self) -> list[str]:
+        return [name for name in self._places if name != WORLD]
+
+    def _addresses(self, host: str) -> tuple[str, ...]:
+        return (self._inventory.hosts[host].address,) if host in self._inventory.hosts else ()
+
+    def _router_of(self, host: str | None) -> str | None:
+        return self._inventory.hosts[host].router if host is not None else None
+
+    def _below(self, router: str | None) -> dict[str, list[str]]:
+        """Return the routers that connect to a router, or to the world, with all processes behind each."""
+        direct = [name for name, below in self._inventory.routers.items() if below.upstream == router]
+        return {f"{ROUTER}.{name}": self._behind(name) for name in direct if self._behind(name)}
+
+    def _behind(self, router: str) -> list[str]:
+        lower = [name for name, below in self._inventory.routers.items() if below.upstream == router]
+        return [*self._at(router), *(process for name in lower for process in self._behind(name))]
+
+    def _at(self, router: str) -> list[str]:
+        """Return the processes that may come to a router: every role, as any may be moved to a host of it."""
+        has_hosts = any(host.router == router for host in self._inventory.hosts.values())
+        return [*(self._movable() if has_hosts else []), *self._operators_at(router)]
+
+    def _operators_at(self, router: str | None) -> list[str]:
+        """Return the operators that come in at a router, or at the world."""
+        return list(dict.fromkeys(name for name, host in self._operators if self._router_of(host) == router))

@@ -1,0 +1,153 @@
+"""What a person sees of a running federation: one live line, and lines for what happens.
+
+The world tells it as JSON lines (`Teller`) when it is launched, or shows it itself (`Screen`).
+"""
+
+import json
+import re
+import sys
+import time
+from typing import Any, Protocol
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from zsim.contract.messages import ClusterState
+
+PERIOD_S = 0.2  # wall time between two updates
+REASON_NS = 5_000_000_000  # simulated time; a take-off gives one reason for 3 s
+_NUMBER = re.compile(r"-?[0-9][0-9.]*")
+QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
+
+
+class Show(Protocol):
+    """Whoever takes progress."""
+
+    def clock(self, line: dict[str, Any]) -> None: ...
+    def event(self, line: dict[str, Any]) -> None: ...
+    def health(self, line: dict[str, Any]) -> None: ...
+    def say(self, text: str) -> None: ...
+
+
+class Throttle:
+    """Lets one in PERIOD_S pass."""
+
+    def __init__(self, period_s: float = PERIOD_S) -> None:
+        self._period_s = period_s
+        self._last_s = 0.0
+
+    def passes(self) -> bool:
+        now_s = time.monotonic()
+        if now_s - self._last_s < self._period_s:
+            return False
+        self._last_s = now_s
+        return True
+
+
+class Reasons:
+    """What keeps clusters from going on, told once when it lasts."""
+
+    def __init__(self) -> None:
+        self._since: dict[str, tuple[str, int]] = {}
+        self._told: set[tuple[str, str]] = set()
+
+    def line(self, cluster: str, state: ClusterState) -> str | None:
+        """Return what to say of a state: its reason if that has been the same, but for its numbers, for REASON_NS."""
+        shape = _NUMBER.sub("#", state.reason)
+        former, since_ns = self._since.get(cluster, ("", 0))
+        if shape != former:
+            self._since[cluster] = (shape, state.t_ns)
+            return None
+        if not shape or state.t_ns - since_ns < REASON_NS or (cluster, shape) in self._told:
+            return None
+        self._told.add((cluster, shape))
+        return f"  {state.t_ns / 1e9:8.2f} s  {cluster}, {state.phase}: {state.reason}"
+
+
+class Teller:
+    """Writes progress as JSON lines for a launcher."""
+
+    def clock(self, line: dict[str, Any]) -> None:
+        self._write({"clock": line})
+
+    def event(self, line: dict[str, Any]) -> None:
+        self._write({"event": line})
+
+    def health(self, line: dict[str, Any]) -> None:
+        self._write({"health": line})
+
+    def say(self, text: str) -> None:
+        self._write({"say": text})
+
+    def _write(self, line: dict[str, Any]) -> None:
+        try:
+            sys.stdout.write(json.dumps(line) + "\n")
+            sys.stdout.flush()
+        except (BrokenPipeError, ValueError):
+            return  # the launcher is gone; the leash ends this process
+
+
+class Screen:
+    """Shows progress on a terminal; on anything else, a line every ten simulated seconds and events."""
+
+    def __init__(self, duration_s: float, console: Console | None = None) -> None:
+        self.console = console or Console(stderr=True)
+        self._duration_s = duration_s
+        self._live = Live(Text("starting …"), console=self.console, refresh_per_second=5, transient=True)
+        self._is_live = self.console.is_terminal
+        self._next_plain_s = 0.0
+        self._last_plain = ""
+
+    def __enter__(self) -> "Screen":
+        if self._is_live:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._is_live:
+            self._live.stop()
+
+    def say(self, text: str) -> None:
+        """Show a line that stays."""
+        self.console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def clock(self, line: dict[str, Any]) -> None:
+        text = describe(line, self._duration_s)
+        if self._is_live:
+            self._live.update(Text(text))
+            return
+        waiting = bool(line["waiting_for"])
+        if (line["t_s"] >= self._next_plain_s or waiting) and text != self._last_plain:
+            self._next_plain_s = line["t_s"] + 10.0
+            self._last_plain = text
+            self.say(text)
+
+    def event(self, line: dict[str, Any]) -> None:
+        if line["kind"] not in QUIET:
+            self.say(f"  {line['t_s']:8.2f} s  {line['kind']}: {line['text']}")
+
+    def health(self, line: dict[str, Any]) -> None:
+        """One live line has no room for it; `zsim up` has a table."""
+
+
+def describe(line: dict[str, Any], duration_s: float) -> str:
+    """Return the live line: simulated time, real-time factor, phase, who is waited for."""
+    share = min(1.0, line["t_s"] / duration_s) if duration_s else 0.0
+    filled = int(20 * share)
+    bar = "█" * filled + "░" * (20 - filled)
+    text = f"{bar} {line['t_s']:7.1f} / {duration_s:g} s  × {line['rate']:.1f} real time"
+    if line.get("phase"):
+        text += f"  {line['phase']}"
+    if line["state"] != "running":
+        text += f"  {line['state']}"
+    waiting = [w for w in line["waiting_for"] if line["state"] == "waiting" or w["since_wall_s"] > 0.5]
+    if waiting:
+        named = ", ".join(_name(w) for w in waiting[:4]) + (" …" if len(waiting) > 4 else "")
+        text += f"  waiting for {named}"
+    return text
+
+
+def _name(waiting: dict[str, Any]) -> str:
+    host = f" on {waiting['host']}" if waiting["host"] else ""
+    return f"{waiting['name']}{host} ({waiting['since_wall_s']:.1f} s)"

@@ -1,0 +1,140 @@
+"""What faults do to the arrays of a fleet: sensors, rotors and the air. Without any, the arrays are as at the start."""
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from zsim.contract.messages import Fault
+from zsim.scenario.fault_kinds import ROTORS
+from zsim_world.physics import rigid_body, wind
+from zsim_world.sensors import sensor_set as ss
+from zsim_world.state.fleet_arrays import Arrays
+from zsim_world.vehicles import simd_firmware
+
+DEG = math.pi / 180.0  # rad
+# Of a kind's first word: sensor, first channel, channels, and what a unit of its bias is in that of the channel
+CHANNELS: dict[str, tuple[int, int, int, float]] = {
+    "imu": (ss.IMU, 0, 6, 1.0),
+    "accel": (ss.IMU, 0, 3, 1.0),
+    "gyro": (ss.IMU, 3, 3, DEG),
+    "gps": (ss.GPS, 0, 6, 1.0),
+    "mag": (ss.MAG, 0, 3, 1.0),
+    "baro": (ss.BARO, 0, 1, 1.0),
+    "sonar": (ss.SONAR, 0, 1, 1.0),
+    "flow": (ss.FLOW, 0, 3, 1.0),
+}
+
+
+class Impairment:
+    """The faults of a fleet's drones and of its air.
+
+    Args:
+        arrays: of the fleet, before its first gate.
+        drones: their names in scenario order.
+    """
+
+    def __init__(self, arrays: Arrays, drones: Sequence[str]) -> None:
+        self._w = arrays
+        self._index = {name: i for i, name in enumerate(drones)}
+        self._config = arrays.senses.config.copy()
+        self._steady = arrays.wind[wind.STEADY : wind.STEADY + 3].copy()
+        self._sound = simd_firmware.sound_actuators(len(drones))
+        self._held: dict[int, tuple[float, ...]] = {}  # by fault: at which speed the rotors of its drone turned
+        self._gusts: tuple[Fault, ...] = ()
+        self._calm = True
+
+    def strike(self, acting: Sequence[Fault]) -> None:
+        """Let these faults act from now on, and no others; those that have acted before go on."""
+        self._w.senses.config[:] = self._config
+        self._w.boards.actuator[:] = self._sound
+        offsets = self._w.senses.fault[:, :, ss.OFFSET : ss.HOLD]
+        offsets[:] = 0.0
+        stuck: set[tuple[int, int]] = set()
+        self._held = {fault.id: self._held[fault.id] for fault in acting if fault.id in self._held}
+        for fault in acting:
+            if fault.target in self._index:
+                self._impair(fault, self._index[fault.target], stuck)
+        self._release(stuck)
+        self._gusts = tuple(fault for fault in acting if fault.kind == "gust")
+
+    def blow(self, from_ns: int, until_ns: int) -> None:
+        """Set the steady wind for what happens between two instants."""
+        if self._calm and not self._gusts:
+            return
+        at_ns = (from_ns + until_ns) // 2
+        steady = self._w.wind[wind.STEADY : wind.STEADY + 3]
+        steady[:] = self._steady + sum((gust_m_s(fault, at_ns) for fault in self._gusts), np.zeros(3))
+        self._calm = not self._gusts
+
+    def _impair(self, fault: Fault, i: int, stuck: set[tuple[int, int]]) -> None:
+        what, _, how = fault.kind.rpartition("_")
+        if what == "rotor":
+            self._impair_rotors(fault, i, how)
+            return
+        s, first, count, unit = CHANNELS[what]
+        row = self._w.senses.config[i, s]
+        if how == "dropout":
+            row[ss.DROP] = dropped(row[ss.DROP], fault.parameters["probability"])
+        elif how == "noise":
+            row[ss.WHITE + first : ss.WHITE + first + count] *= fault.parameters["factor"]
+        else:
+            row[ss.FAULTY] = 1.0
+            if how == "stuck":
+                stuck.add((i, s))
+            else:
+                bias = np.atleast_1d(_bias(fault)) * unit
+                self._w.senses.fault[i, s, ss.OFFSET + first : ss.OFFSET + first + len(bias)] += bias
+
+    def _release(self, stuck: Iterable[tuple[int, int]]) -> None:
+        """Let sensors that have just got stuck keep their next sample, and free those that are no longer."""
+        hold = self._w.senses.fault[:, :, ss.HOLD]
+        kept = {(i, s) for i, s in stuck if hold[i, s] == ss.HOLDING}
+        hold[:] = ss.FREE
+        for place in stuck:
+            hold[place] = ss.HOLDING if place in kept else ss.ARMED
+
+    def _impair_rotors(self, fault: Fault, i: int, how: str) -> None:
+        row, which = self._w.boards.actuator[i], fault.parameters["rotor"]
+        row[simd_firmware.FAULTY] = 1.0
+        for k, name in enumerate(ROTORS):
+            if which in (name, "all"):
+                if how == "efficiency":
+                    row[simd_firmware.FACTOR + k] *= math.sqrt(
+                        fault.parameters["value"]
+                    )  # thrust is as the speed squared
+                else:
+                    row[simd_firmware.HELD + k] = self._held_speed(fault, i)[k]
+
+    def _held_speed(self, fault: Fault, i: int) -> tuple[float, ...]:
+        """Return at which speed each rotor is held [rad/s]: as told, or as it turned when the fault began."""
+        if fault.id not in self._held:
+            told = fault.parameters["speed_rad_s"]
+            turning = self._w.bodies.state[i, rigid_body.ROTOR : rigid_body.ROTOR + 4].tolist()
+            self._held[fault.id] = tuple(turning) if told is None else (told,) * 4
+        return self._held[fault.id]
+
+
+def _bias(fault: Fault) -> float | Sequence[float]:
+    """Return the one number or vector of a fault, whatever its unit."""
+    (value,) = fault.parameters.values()
+    return value
+
+
+def dropped(limit: float, probability: float) -> float:
+    """Return below which standard normal number a sample is lost, where it is so below `limit` already."""
+    if probability == 1.0:
+        return math.inf
+    return float(ndtri(1.0 - (1.0 - ndtr(limit)) * (1.0 - probability)))
+
+
+def gust_m_s(fault: Fault, t_ns: int) -> NDArray[np.float64]:
+    """Return the velocity that a gust adds [m/s; W]: v (1 - cos(2 pi t / T)) / 2, as in CS 25.341(a)(2).
+
+    Over its length T, twice the gust gradient distance there, it rises to v and falls again.
+    """
+    assert fault.until_ns is not None  # a gust always has a length
+    phase = 2.0 * math.pi * (t_ns - fault.from_ns) / (fault.until_ns - fault.from_ns)
+    return 0.5 * (1.0 - math.cos(phase)) * np.array(fault.parameters["velocity_m_s"])

@@ -1,0 +1,251 @@
+"""The fleet: all drones of a scenario, one gate at a time. The only thing that the rest of the world uses.
+
+Heights: `baro` altitude_m is the height over the origin of W (zeroed at the field, as the aircraft does at power-up),
+and pressure_pa is that of the standard atmosphere at `environment.height_m` + altitude_m.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.contract.messages import DroneState
+from zsim.errors import RunError
+from zsim.scenario.scenario import Gps, Scenario
+from zsim_world.fleet import kernel
+from zsim_world.fleet.fault_effects import Impairment
+from zsim_world.fleet.initial_state import arrays
+from zsim_world.physics import wind
+from zsim_world.sensors import sensor_set
+from zsim_world.sensors.noise import NoiseTable
+from zsim_world.sensors.sampler import Sample, Sampled, Sampler
+from zsim_world.state import vehicle
+from zsim_world.vehicles import firmware, observer
+
+GPS_FIX = 3  # NMEA: a three-dimensional fix
+GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone
+TAKEOFF_PERCENT_MIN = 2.0 * firmware.LOW_BATTERY_PERCENT  # %, below which it does not take off
+UPRIGHT_COSINE = 0.87  # 30 deg, beyond which it does not take off
+QUATERNION_SQUARE_MIN = 1e-6  # shorter, a quaternion has no direction
+NOISE_GATES = 8  # gates between two refills of the noise: that of 100 drones then fits a cache of 1 MB
+
+
+class DivergedError(RunError):
+    """The state of a drone is no longer finite; the text names the drone and the time."""
+
+    def __init__(self, drone: str, t_s: float) -> None:
+        super().__init__(
+            f"{drone} at {t_s:.3f} s: the state is no longer finite; check its mass, inertia, rotors and dt"
+        )
+        self.drone = drone
+
+
+class Truth(NamedTuple):
+    """The true state of N drones, copied."""
+
+    position_m: NDArray[np.float64]  # (N, 3), W
+    velocity_m_s: NDArray[np.float64]  # (N, 3), W
+    orientation_wxyz: NDArray[np.float64]  # (N, 4), B to W
+    angular_velocity_rad_s: NDArray[np.float64]  # (N, 3), B
+    accel_m_s2: NDArray[np.float64]  # (N, 3), W
+    rotor_rad_s: NDArray[np.float64]  # (N, 4)
+
+
+class Fleet:
+    """All drones of a scenario, stepped together gate by gate from t = 0, standing on the ground.
+
+    Attributes:
+        names: in scenario order, in which drones are counted.
+        gps_sigma_m: of each drone's fixes.
+        impairment: what faults do to it.
+        bodies, boards: the arrays that the kernel works on; to be read only.
+        sampled: what fell due for publication in the last gate.
+        touching: whether a drone's hull touched another's in the last gate, (N,).
+    """
+
+    sampled: Sampled
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Place the drones and take the samples of t = 0.
+
+        Raises:
+            DivergedError: the scenario's numbers cannot be integrated.
+        """
+        self.names = [drone.name for drone in scenario.drones]
+        self.count = len(self.names)
+        self.gps_sigma_m = [_gps_sigma(drone.sensors.gps) for drone in scenario.drones]
+        self._tick_ns = round(scenario.time.physics_dt_ms * 1_000_000)
+        self._ticks = round(scenario.time.gate_ms / scenario.time.physics_dt_ms)
+        self._tick = 0
+        self._gates = 0
+        self._sampler = Sampler(scenario)
+        self._noise = NoiseTable(scenario, NOISE_GATES)
+        self._w = arrays(scenario, self._noise)
+        self._held = kernel.hold(self._w)
+        self.bodies, self.boards = self._w.bodies, self._w.boards
+        self.impairment = Impairment(self._w, self.names)
+        self.touching = np.zeros(self.count, dtype=bool)
+        self._hull_m = float(self.bodies.vehicle[:, vehicle.HULL_RADIUS].max())
+        self._integrate(0)
+        self._rehearse()
+
+    def _rehearse(self) -> None:
+        """Load or compile what the first command needs: in realtime no gate may wait for it."""
+        kernel.enter(self.boards.memory[0].copy(), self.boards.belief[0].copy(), firmware.LANDED)
+
+    @property
+    def t_ns(self) -> int:
+        """Simulated time of the present state."""
+        return self._tick * self._tick_ns
+
+    @property
+    def wind_m_s(self) -> NDArray[np.float64]:
+        """Wind at each drone in W, steady and gusts, without the downwash of others; (N, 3)."""
+        return self._w.gust + self._w.wind[wind.STEADY : wind.STEADY + 3]
+
+    def advance(self) -> None:
+        """Integrate one gate with the present setpoints.
+
+        Raises:
+            DivergedError: the state of a drone is no longer finite.
+        """
+        if self._gates % NOISE_GATES == 0:
+            self._noise.refill()
+        self._gates += 1
+        self._integrate(self._ticks)
+
+    def samples(self) -> list[Sample]:
+        """Return what fell due for publication in the last gate, in the order of (t_ns, drone, sensor)."""
+        return self.sampled.each()
+
+    def truth(self) -> Truth:
+        """Return the true state now."""
+        s = self.bodies.state.copy()
+        return Truth(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], self.bodies.accel[:, 0:3].copy(), s[:, 13:17])
+
+    def status(self, i: int) -> tuple[DroneState, float, bool]:
+        """Return the firmware's mode, the charge [%], and whether the hull touched another in the last gate."""
+        charge = 100.0 * self.bodies.energy.item(i) / self.bodies.vehicle.item(i, vehicle.CAPACITY)
+        return firmware.MODES[self._mode(i)], charge, bool(self.touching[i])
+
+    def closest_m(self) -> float:
+        """Return the least distance between two drones over the last gate; inf for a single one."""
+        return self._least
+
+    def collisions(self) -> list[tuple[int, int]]:
+        """Return the pairs whose hulls began to touch in the last gate."""
+        return self._began
+
+    def bumps(self) -> list[tuple[int, int]]:
+        """Return who began to touch which obstacle in the last gate."""
+        if not self.bodies.obstacle.size:
+            return []
+        return [(int(i), int(m)) for i, m in np.argwhere(self.bodies.bumped)]
+
+    def takeoff(self, i: int) -> str | None:
+        """Start a take-off; return None, or why not."""
+        charge = self.status(i)[1]
+        if self._mode(i) != firmware.LANDED:
+            return self._not_while(i, "a take-off needs it landed")
+        if charge < TAKEOFF_PERCENT_MIN:
+            return f"{self.names[i]} has {charge:.1f} % of charge; a take-off needs {TAKEOFF_PERCENT_MIN:g} %"
+        x, y = self.boards.belief[i, observer.ATTITUDE + 1 : observer.ATTITUDE + 3]
+        if 1.0 - 2.0 * (x * x + y * y) < UPRIGHT_COSINE:
+            return f"{self.names[i]} does not stand upright; a take-off needs it within 30 deg of level"
+        self._enter(i, firmware.TAKING_OFF)
+        return None
+
+    def land(self, i: int) -> str | None:
+        """Start a landing; return None, or why not."""
+        if self._mode(i) in (firmware.LANDED, firmware.EMERGENCY):
+            return self._not_while(i, "a landing needs it in the air")
+        if self._mode(i) != firmware.LANDING:
+            self._enter(i, firmware.LANDING)
+        return None
+
+    def emergency(self, i: int) -> str | None:
+        """Stop the rotors at once; always accepted."""
+        self._enter(i, firmware.EMERGENCY)
+        return None
+
+    def reset(self, i: int) -> str | None:
+        """Leave the emergency; return None, or why not."""
+        if self._mode(i) != firmware.EMERGENCY:
+            return self._not_while(i, "a reset needs an emergency")
+        self._enter(i, firmware.LANDED)
+        return None
+
+    def set_velocity(
+        self,
+        i: int,
+        velocity_m_s: Sequence[float],
+        yaw_rate_rad_s: float = 0.0,
+        frame: Literal["heading", "world"] = "heading",
+    ) -> str | None:
+        """Fly a velocity in the heading frame, or in W by the firmware's own heading; return None, or why not."""
+        kind = firmware.VELOCITY if frame == "heading" else firmware.VELOCITY_WORLD
+        return self._set(i, kind, (*velocity_m_s, yaw_rate_rad_s))
+
+    def set_ardrone(
+        self, i: int, forward: float, left: float, up: float, yaw_left: float, hover: bool = False
+    ) -> str | None:
+        """Fly by tilt, climb and yaw rate, each in [-1, 1] of its limit, or hover; return None, or why not."""
+        return self._set(i, firmware.HOVER if hover else firmware.ARDRONE, (forward, left, up, yaw_left))
+
+    def set_attitude(self, i: int, q_WB: Sequence[float], thrust_n: float, yaw_rate_rad_s: float = 0.0) -> str | None:
+        """Fly a tilt (of q_WB, w first; its heading is not used), thrust [N] and yaw rate; return None, or why not."""
+        if sum(x * x for x in q_WB) < QUATERNION_SQUARE_MIN:
+            return f"{self.names[i]} was sent the orientation {list(q_WB)}; must be a quaternion of length 1"
+        return self._set(i, firmware.ATTITUDE, (*q_WB, thrust_n, yaw_rate_rad_s))
+
+    def set_rotors(self, i: int, speed_rad_s: Sequence[float]) -> str | None:
+        """Command four rotor speeds within the rotors' limits; return None, or why not."""
+        return self._set(i, firmware.ROTORS, tuple(speed_rad_s))
+
+    def release(self, i: int) -> None:
+        """Let nobody fly the drone any more: it hovers."""
+        self.boards.setpoint[i, firmware.KIND] = firmware.NONE
+
+    def _set(self, i: int, kind: int, values: tuple[float, ...]) -> str | None:
+        if self._mode(i) not in (firmware.HOVERING, firmware.FLYING):
+            return self._not_while(i, "a setpoint needs it hovering or flying")
+        if not math.isfinite(sum(values)):
+            return f"{self.names[i]} was sent a setpoint with {list(values)}; must be finite"
+        row = self.boards.setpoint[i]
+        row[firmware.KIND] = kind
+        row[firmware.VALUE : firmware.VALUE + len(values)] = values
+        self.boards.set_tick[i] = self._tick
+        return None
+
+    def _mode(self, i: int) -> int:
+        return int(self.boards.memory.item(i, firmware.MODE))
+
+    def _not_while(self, i: int, need: str) -> str:
+        return f"{self.names[i]} is {firmware.MODES[self._mode(i)]}; {need}"
+
+    def _enter(self, i: int, mode: int) -> None:
+        kernel.enter(self.boards.memory[i], self.boards.belief[i], mode)
+
+    def _integrate(self, ticks: int) -> None:
+        logged, least, diverged = kernel.advance(self._held, ticks)
+        if diverged >= 0:
+            raise DivergedError(self.names[diverged], (self._tick + ticks) * self._tick_ns / 1e9)
+        self._tick += ticks
+        self._least = least
+        self._meet(least)
+        self.sampled = self._sampler.due(self._w.senses, logged, self.t_ns)
+
+    def _meet(self, least: float) -> None:
+        self._began: list[tuple[int, int]] = []
+        self.touching.fill(False)
+        if self.bodies.obstacle.size:
+            self.touching[:] = self.bodies.bumping.any(axis=1)
+        if least < 2.0 * self._hull_m:
+            self._began = [(int(i), int(j)) for i, j in np.argwhere(self.bodies.touched)]
+            self.touching[np.argwhere(self.bodies.touched | self.bodies.touching).ravel()] = True
+
+
+def _gps_sigma(gps: Gps) -> float:
+    return sensor_set.noise_sigma(gps.position_m, gps.rate_hz)

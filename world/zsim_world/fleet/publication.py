@@ -1,0 +1,225 @@
+"""From the fleet's arrays to the encoded messages of a gate, in the contract's order.
+
+Per drone: its samples in time order, truth, and status last, which counts them.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba.typed.typedlist import List
+from numpy.typing import NDArray
+
+from zsim.contract import encoding, messages
+from zsim.contract.bundle import KINDS, Bundle, table_of
+from zsim.contract.encoding import GAP, Layouts, Program, Words
+from zsim.math.compiled import compiled, inlined, kernel
+from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
+from zsim_world.fleet.kernel import hold
+from zsim_world.physics import rigid_body
+from zsim_world.physics.battery import percent
+from zsim_world.sensors import sampler, sensor_set
+from zsim_world.sensors.sampler import Sampled
+from zsim_world.vehicles import firmware
+
+MESSAGES = (  # of the kinds of a bundle, in their order
+    messages.Imu,
+    messages.Gps,
+    messages.Mag,
+    messages.Baro,
+    messages.Sonar,
+    messages.Flow,
+    messages.Truth,
+    messages.Status,
+)
+TRUTH, STATUS = 6, 7  # after the six sensors
+WHICH, STAMPS, ENDS = 0, 1, 2  # rows of `columns`
+LAYOUTS = Layouts(MESSAGES)
+INTS, FLOATS = LAYOUTS.ints, LAYOUTS.floats
+OPS, FIRST, LITERALS = LAYOUTS.program  # compiled in
+COMMANDER = len(firmware.MODES)  # the first commander among the words: nobody
+
+write = inlined(encoding.write)
+
+
+class Written(NamedTuple):
+    """M messages, and room for more."""
+
+    columns: NDArray[np.int64]  # (3, M): WHICH, STAMPS, ENDS
+    first: NDArray[np.int64]  # (N + 1,), where the messages of each drone begin
+    data: NDArray[np.uint8]
+
+
+class Row(NamedTuple):
+    """What one message is made of."""
+
+    ints: NDArray[np.int64]
+    floats: NDArray[np.float64]
+    bits: NDArray[np.uint64]  # the same floats
+
+
+class Seen(NamedTuple):
+    """The arrays of a fleet that are told, see `zsim_world.state.fleet_arrays`."""
+
+    state: NDArray[np.float64]
+    accel: NDArray[np.float64]
+    energy: NDArray[np.float64]
+    vehicle: NDArray[np.float64]
+    memory: NDArray[np.float64]
+
+
+class Fleetwide(NamedTuple):
+    """What the messages tell of N drones beside their arrays."""
+
+    touching: NDArray[np.bool_]  # (N,), whether a hull touched another in this gate
+    sigma_m: NDArray[np.float64]  # (N,), of each one's GPS
+    commanders: NDArray[np.int64]  # (N,), number of the word that names each one's
+    counts: NDArray[np.int64]  # (N, kinds), messages that each key has had
+
+
+class Told(NamedTuple):
+    """What `publish` works on from gate to gate."""
+
+    words: Words
+    seen: Seen
+    wide: Fleetwide
+    out: Written
+
+
+class Publication:
+    """Writes the messages of each gate and counts them per key."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._fleet = fleet
+        self.table = table_of(fleet.names)
+        bodies = fleet.bodies
+        self._seen = Seen(bodies.state, bodies.accel, bodies.energy, bodies.vehicle, fleet.boards.memory)
+        self._commanders: list[str | None] = []  # of the last gate
+        commanders = np.zeros(fleet.count, dtype=np.int64)
+        counts = np.zeros((fleet.count, len(KINDS)), dtype=np.int64)
+        self._fleetwide = Fleetwide(fleet.touching, np.array(fleet.gps_sigma_m), commanders, counts)
+        self._known: dict[str | None, int] = {None: COMMANDER}
+        self._words = encoding.words((*firmware.MODES, None))
+        self._make_room(16 * fleet.count)
+        self._rehearse()
+
+    def _rehearse(self) -> None:
+        """Load or compile what the first gate needs."""
+        uncounted = self._fleetwide._replace(counts=self._fleetwide.counts.copy())
+        publish(hold(Told(self._words, self._seen, uncounted, self._written)), *self._fleet.sampled, 0)
+
+    def gate(self, commanders: list[str | None]) -> Bundle:
+        """Return the messages of the gate that the fleet stands at; `commanders` are the names of who flies each."""
+        fleet, wide = self._fleet, self._fleetwide
+        count = len(fleet.sampled.whose) + 2 * fleet.count
+        if count > self._written.columns.shape[1]:
+            self._make_room(2 * count)
+        if commanders != self._commanders:
+            wide.commanders[:] = [self._number(commander) for commander in commanders]
+            self._commanders = commanders
+        out = self._written
+        size = publish(self._held, *fleet.sampled, fleet.t_ns)
+        which, stamps, ends = out.columns[:, :count].copy()
+        seq = int(wide.counts[0, STATUS]) - 1
+        data = out.data[:size].tobytes()
+        return Bundle(fleet.t_ns, seq, self.table, which, stamps, ends, data, out.first.tolist())
+
+    def _number(self, commander: str | None) -> int:
+        """Return the number of a word; a new one is learnt."""
+        if commander not in self._known:
+            self._known[commander] = COMMANDER + len(self._known)
+            self._words = encoding.words((*firmware.MODES, *self._known))
+            self._make_room(self._written.columns.shape[1])
+        return self._known[commander]
+
+    def _make_room(self, count: int) -> None:
+        columns, first = np.zeros((3, count), dtype=np.int64), np.zeros(self._fleet.count + 1, dtype=np.int64)
+        self._written = Written(columns, first, np.zeros(count * LAYOUTS.room(self._words), dtype=np.uint8))
+        self._held = hold(Told(self._words, self._seen, self._fleetwide, self._written))
+
+
+@inlined
+def _fill_sample(row: Row, sampled: Sampled, m: int, sigma_m: float) -> None:
+    """Put sample m of a gate into a row."""
+    s, ints, floats = sampled.whose[m, sampler.SENSOR], row.ints, row.floats
+    ints[0], ints[2] = sampled.whose[m, sampler.STAMP], sampled.whose[m, sampler.SAMPLED]
+    for k in range(sampler.VALUE_COLUMNS):
+        floats[k] = sampled.values[m, k]
+    if s == sensor_set.GPS:
+        floats[sampler.VALUE_COLUMNS], ints[3], ints[4] = sigma_m, GPS_FIX, GPS_SATELLITES
+    elif s == sensor_set.SONAR:
+        ints[3] = sampled.values[m, 1] != 0.0
+
+
+@inlined
+def _fill_truth(row: Row, state: NDArray, accel: NDArray) -> None:
+    for k in range(rigid_body.ROTOR):
+        row.floats[k] = state[k]
+    for k in range(3):
+        row.floats[rigid_body.ROTOR + k] = accel[k]
+    for k in range(4):
+        row.floats[rigid_body.ROTOR + 3 + k] = state[rigid_body.ROTOR + k]
+
+
+@compiled
+def _by_drone(whose: NDArray, first: NDArray) -> None:
+    """Set where the messages of each drone begin, (N + 1,): its samples, truth and status."""
+    first[:] = 0
+    for m in range(whose.shape[0]):
+        first[whose[m, sampler.DRONE] + 1] += 1
+    for i in range(len(first) - 1):
+        first[i + 1] += first[i] + 2
+
+
+@compiled
+def _in_order(whose: NDArray, first: NDArray) -> NDArray:
+    """Return which sample, or -1 for truth and -2 for status, stands at each place."""
+    drones = len(first) - 1
+    order, free = np.empty(first[drones], np.int64), first.copy()
+    for m in range(whose.shape[0]):
+        i = whose[m, sampler.DRONE]
+        order[free[i]] = m
+        free[i] += 1
+    for i in range(drones):
+        order[free[i]], order[free[i] + 1] = -1, -2
+    return order
+
+
+@inlined
+def _fill(row: Row, m: int, i: int, sampled: Sampled, seen: Seen, wide: Fleetwide, now_ns: int, count: int) -> int:
+    """Put sample m of drone i, its truth or its status into a row, and count it; return its kind."""
+    kind = sampled.whose[m, sampler.SENSOR] if m >= 0 else TRUTH if m == -1 else STATUS
+    row.ints[0], row.ints[1] = now_ns, wide.counts[i, kind]
+    if m >= 0:
+        _fill_sample(row, sampled, m, wide.sigma_m[i])
+    elif kind == TRUTH:
+        _fill_truth(row, seen.state[i], seen.accel[i])
+    else:
+        row.ints[2], row.ints[3] = int(seen.memory[i, firmware.MODE]), wide.touching[i]
+        row.ints[4], row.ints[5] = wide.commanders[i], count
+        row.floats[0] = percent(seen.vehicle[i], seen.energy[i])
+    wide.counts[i, kind] += 1
+    return kind
+
+
+@kernel()
+def publish(held: List, whose: NDArray, values: NDArray, now_ns: int) -> int:
+    """Write the messages of a gate, drone by drone, and count them; return how many bytes that were.
+
+    Args:
+        held: a Told, by `hold`.
+        whose, values: of Sampled.
+    """
+    words, seen, wide, out = held[0]
+    sampled = Sampled(whose, values)
+    floats = np.zeros(FLOATS)
+    row, program = Row(np.zeros(INTS, np.int64), floats, floats.view(np.uint64)), Program(OPS, FIRST, LITERALS)
+    drones, kinds = wide.counts.shape
+    first, columns, at = out.first, out.columns, 0
+    _by_drone(whose, first)
+    order = _in_order(whose, first)
+    for i in range(drones):
+        for place in range(first[i], first[i + 1]):
+            kind = _fill(row, order[place], i, sampled, seen, wide, now_ns, first[i + 1] - first[i] - 1)
+            at = write(program, words, kind, row.ints, row.bits, out.data, at + GAP)
+            columns[WHICH, place], columns[STAMPS, place], columns[ENDS, place] = i * kinds + kind, row.ints[0], at
+    return at

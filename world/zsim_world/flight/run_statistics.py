@@ -1,0 +1,139 @@
+"""What a run measures of itself: rate, command age, deadline misses, how near drones came to each other."""
+
+import math
+from array import array
+from collections import deque
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from zsim_world.flight.barrier import Participant
+
+GATES_KEPT = 256  # gates whose publication time is remembered for the age of commands; 5 s, older ones are refused
+AGES_KEPT = 1_000_000  # ages kept for the percentiles; 8 MB
+MARK_NS = 10_000_000  # wall time between two marks of the rate, which looks back over a second
+
+
+class Ages:
+    """Wall time from a gate's publication to the arrival of a command that answers it."""
+
+    def __init__(self) -> None:
+        self._published: dict[int, int] = {}
+        self._ages_ns = array("q")
+        self._oldest = 0  # place of the oldest age once so many are kept
+
+    def published(self, t_ns: int, wall_ns: int) -> None:
+        """Note when the gate t_ns was published."""
+        self._published[t_ns] = wall_ns
+        if len(self._published) > GATES_KEPT:
+            del self._published[next(iter(self._published))]
+
+    def arrived(self, t_ns: int, wall_ns: int) -> None:
+        """Note when a command stamped t_ns arrived; its age is unknown where no gate of that stamp is remembered."""
+        published = self._published.get(t_ns)
+        if published is not None:
+            self._keep(wall_ns - published)
+
+    def _keep(self, age_ns: int) -> None:
+        if len(self._ages_ns) < AGES_KEPT:
+            self._ages_ns.append(age_ns)
+        else:
+            self._ages_ns[self._oldest] = age_ns
+            self._oldest = (self._oldest + 1) % AGES_KEPT
+
+    def summary_ms(self) -> dict[str, float] | None:
+        """Return p50, p99 and max in milliseconds, None when no command came."""
+        if not self._ages_ns:
+            return None
+        ages = np.array(self._ages_ns) / 1e6
+        p50, p99 = np.percentile(ages, [50, 99])
+        return {"p50": float(p50), "p99": float(p99), "max": float(ages.max())}
+
+
+class Rate:
+    """Simulated per wall seconds, over the last wall second and over the run."""
+
+    def __init__(self) -> None:
+        self._marks: deque[tuple[int, int]] = deque()
+        self._start_wall_ns: int | None = None
+        self._last = (0, 0)
+        self._sim_ns = 0
+
+    def gate(self, t_ns: int, wall_ns: int) -> None:
+        """Note when the gate t_ns was published."""
+        if self._start_wall_ns is None:
+            self._start_wall_ns = wall_ns
+        if self._marks:
+            self._sim_ns += t_ns - self._last[0]
+        self._last, marks = (t_ns, wall_ns), self._marks
+        while len(marks) > 1 and wall_ns - marks[0][1] > 1_000_000_000:
+            marks.popleft()
+        if not marks or wall_ns - marks[-1][1] >= MARK_NS:
+            marks.append(self._last)
+
+    def leap(self) -> None:
+        """Note that simulated time leaps to the next gate: it does not pass."""
+        self._marks.clear()
+
+    def now(self) -> float:
+        """Return the factor over the last wall second."""
+        (t0, w0), (t1, w1) = self._marks[0] if self._marks else self._last, self._last
+        return (t1 - t0) / (w1 - w0) if w1 > w0 else 0.0
+
+    @property
+    def sim_s(self) -> float:
+        """Return the simulated time that has passed gate by gate since the first one."""
+        return self._sim_ns / 1e9
+
+    @property
+    def wall_s(self) -> float:
+        """Return the wall time from the first gate to the last."""
+        return 0.0 if self._start_wall_ns is None else (self._last[1] - self._start_wall_ns) / 1e9
+
+
+class Measurements:
+    """All that a run tells of itself at its end.
+
+    Attributes:
+        own_misses: gates that the world itself published too late.
+        closest_m: least distance between two drones so far, standing ones too [m]; inf for a single one.
+    """
+
+    def __init__(self, closest_m: float) -> None:
+        self.ages = Ages()
+        self.rate = Rate()
+        self.own_misses = 0
+        self.closest_m = closest_m
+        self._deadlines = 0
+
+    def gate(self, t_ns: int, wall_ns: int) -> None:
+        """Note when the gate t_ns was published."""
+        self.ages.published(t_ns, wall_ns)
+        self.rate.gate(t_ns, wall_ns)
+
+    def apart(self, closest_m: float) -> None:
+        """Note the least distance between two drones in a gate [m]."""
+        self.closest_m = min(self.closest_m, closest_m)
+
+    def deadlines_of(self, participants: Iterable[Participant], need_ns: int) -> None:
+        """Count whose done for need_ns was due, and whose is missing."""
+        for participant in participants:
+            if participant.required_ns(need_ns) is not None:
+                self._deadlines += 1
+                participant.deadline_misses += participant.owes(need_ns)
+
+    def result(self, participants: Iterable[Participant]) -> dict[str, Any]:
+        """Return the figures of the run as far as it got."""
+        by_name = {p.name: p.deadline_misses for p in participants if p.gating}
+        sim_s, wall_s = self.rate.sim_s, self.rate.wall_s
+        return {
+            "sim_s": sim_s,
+            "wall_s": wall_s,
+            "real_time_factor": sim_s / wall_s if wall_s > 0 else 0.0,
+            "deadlines": self._deadlines,
+            "deadline_misses": sum(by_name.values()) + self.own_misses,
+            "deadline_misses_by": {**by_name, "world": self.own_misses},
+            "command_age_ms": self.ages.summary_ms(),
+            "closest_m": self.closest_m if math.isfinite(self.closest_m) else None,
+        }

@@ -1,0 +1,206 @@
+"""One drone as a rigid body under rotors, drag, ground and pushes; one step of fourth-order Runge-Kutta."""
+
+import math
+
+from numpy.typing import NDArray
+
+from zsim.math import rotation as rot
+from zsim.math.compiled import inlined
+from zsim.math.rotation import Quaternion, Vector, add, axpy
+from zsim_world.physics.ground import contact
+from zsim_world.physics.rotors import Four, lagged, wrench
+from zsim_world.state.vehicle import (
+    CONTACT_REACH_M,
+    DRAG,
+    GRAVITY,
+    INERTIA_X,
+    INERTIA_Y,
+    INERTIA_Z,
+    MASS,
+    ROTOR_LAG,
+    SIZE,
+    Row,
+)
+
+# Columns of the state, one row per drone
+POSITION, VELOCITY, ATTITUDE, RATE, ROTOR = 0, 3, 6, 10, 13  # m, m/s, quaternion, rad/s in B, rad/s
+COLUMNS = 17
+
+NOTHING = (0.0, 0.0, 0.0)  # N or N m
+
+
+@inlined
+def vector(row: Row, at: int) -> Vector:
+    """Return three numbers of a row."""
+    return (row[at], row[at + 1], row[at + 2])
+
+
+@inlined
+def four(row: Row, at: int) -> Four:
+    """Return four numbers of a row."""
+    return (row[at], row[at + 1], row[at + 2], row[at + 3])
+
+
+@inlined
+def put(row: NDArray, at: int, a: Vector) -> None:
+    """Write three numbers into a row."""
+    row[at], row[at + 1], row[at + 2] = a
+
+
+@inlined
+def put_four(row: NDArray, at: int, a: Four) -> None:
+    """Write four numbers into a row."""
+    row[at], row[at + 1], row[at + 2], row[at + 3] = a
+
+
+@inlined
+def pose(state: NDArray) -> tuple[Vector, Vector, Quaternion, Vector]:
+    """Return p_WB, v_WB, q_WB, w_WB_B of one drone's state."""
+    return vector(state, POSITION), vector(state, VELOCITY), four(state, ATTITUDE), vector(state, RATE)
+
+
+@inlined
+def slew(row: Row, speed: Four, command: Four) -> Four:
+    """Return the rotors' accelerations [rad/s^2] under their first-order lag."""
+    s = 1.0 / row[ROTOR_LAG]
+    return (
+        (command[0] - speed[0]) * s,
+        (command[1] - speed[1]) * s,
+        (command[2] - speed[2]) * s,
+        (command[3] - speed[3]) * s,
+    )
+
+
+@inlined
+def accelerations(
+    grounded: bool,
+    row: Row,
+    anchor: NDArray,
+    p_WB: Vector,
+    v_WB: Vector,
+    q_WB: Quaternion,
+    w_WB_B: Vector,
+    speed: Four,
+    command: Four,
+    air_W: Vector,
+    push_W: Vector,
+) -> tuple[Vector, Vector]:
+    """Return a_WB in W [m/s^2] and the angular acceleration in B [rad/s^2].
+
+    m a = R z_B T - D (v - air) + ground + push - m g z_W
+    I dw/dt = M - w × (I w)
+
+    Args:
+        grounded: a constant where it is called. False leaves the ground out, and then the result holds only where
+            the ground is out of reach; so there is no branch in it, and several drones go at once (lanes.py).
+        row: parameters (vehicle.py); anchor: of its contact points (ground.py).
+        p_WB, v_WB, q_WB, w_WB_B, speed: state; command: rotor speeds wanted [rad/s].
+        air_W: velocity of the air at the drone [m/s]; push_W: force of other drones [N].
+    """
+    ground = NOTHING, NOTHING
+    if grounded:
+        ground = contact(row, anchor, p_WB, v_WB, q_WB, w_WB_B)
+    ix, iy, iz = row[INERTIA_X], row[INERTIA_Y], row[INERTIA_Z]
+    thrust, moment = wrench(row, q_WB, p_WB[2], w_WB_B, speed, slew(row, speed, command))
+    moment = add(moment, ground[1])
+    force = add(add(ground[0], push_W), rot.rotate(q_WB, (0.0, 0.0, thrust)))
+    force = axpy(force, -row[DRAG], axpy(v_WB, -1.0, air_W))
+    inv = 1.0 / row[MASS]
+    wx, wy, wz = w_WB_B
+    return (
+        (force[0] * inv, force[1] * inv, force[2] * inv - row[GRAVITY]),
+        (
+            (moment[0] - (iz - iy) * wy * wz) / ix,
+            (moment[1] - (ix - iz) * wz * wx) / iy,
+            (moment[2] - (iy - ix) * wx * wy) / iz,
+        ),
+    )
+
+
+@inlined
+def _turned(q: Quaternion, s: float, dq: Quaternion) -> Quaternion:
+    return (q[0] + s * dq[0], q[1] + s * dq[1], q[2] + s * dq[2], q[3] + s * dq[3])
+
+
+@inlined
+def _mean(a: Vector, b: Vector, c: Vector, d: Vector) -> Vector:
+    """Return the Runge-Kutta mean (a + 2b + 2c + d) / 6."""
+    s = 1.0 / 6.0
+    return (
+        (a[0] + 2.0 * (b[0] + c[0]) + d[0]) * s,
+        (a[1] + 2.0 * (b[1] + c[1]) + d[1]) * s,
+        (a[2] + 2.0 * (b[2] + c[2]) + d[2]) * s,
+    )
+
+
+@inlined
+def step(
+    row: NDArray, anchor: NDArray, state: NDArray, command: Four, air_W: Vector, push_W: Vector, dt: float
+) -> None:
+    """Advance one drone's state (COLUMNS,) by dt [s] in place.
+
+    The rotors' lag is integrated exactly, also inside the step; air and pushes of others are held over it.
+    """
+    decay = half_decay(row[ROTOR_LAG], dt)
+    p, v, q, w = pose(state)
+    p, v, q, w, speed, _ = stepped(True, row, anchor, p, v, q, w, four(state, ROTOR), command, air_W, push_W, decay, dt)
+    put(state, POSITION, p)
+    put(state, VELOCITY, v)
+    put_four(state, ATTITUDE, q)
+    put(state, RATE, w)
+    put_four(state, ROTOR, speed)
+
+
+@inlined
+def half_decay(lag_s: float, dt: float) -> float:
+    """Return what is left of a rotor's distance to its commanded speed after half a step."""
+    return math.exp(-0.5 * dt / lag_s)
+
+
+@inlined
+def stepped(
+    grounded: bool,
+    row: Row,
+    anchor: NDArray,
+    p: Vector,
+    v: Vector,
+    q: Quaternion,
+    w: Vector,
+    r0: Four,
+    command: Four,
+    air_W: Vector,
+    push_W: Vector,
+    decay: float,
+    dt: float,
+) -> tuple[Vector, Vector, Quaternion, Vector, Four, bool]:
+    """Return p_WB, v_WB, q_WB, w_WB_B and rotor speeds after dt [s], and whether the ground was out of reach.
+
+    Args:
+        grounded, row, anchor, command, air_W, push_W: as for `accelerations`.
+        p, v, q, w, r0: state; decay: of the rotors' lag, see `half_decay`.
+    """
+    h, reach = 0.5 * dt, CONTACT_REACH_M * row[SIZE]
+    r1 = lagged(r0, command, decay)
+    r2 = lagged(r0, command, decay * decay)
+
+    a1, b1 = accelerations(grounded, row, anchor, p, v, q, w, r0, command, air_W, push_W)
+    d1 = rot.rate(q, w)
+    p2, v2, w2, q2 = axpy(p, h, v), axpy(v, h, a1), axpy(w, h, b1), _turned(q, h, d1)
+    a2, b2 = accelerations(grounded, row, anchor, p2, v2, q2, w2, r1, command, air_W, push_W)
+    d2 = rot.rate(q2, w2)
+    p3, v3, w3, q3 = axpy(p, h, v2), axpy(v, h, a2), axpy(w, h, b2), _turned(q, h, d2)
+    a3, b3 = accelerations(grounded, row, anchor, p3, v3, q3, w3, r1, command, air_W, push_W)
+    d3 = rot.rate(q3, w3)
+    p4, v4, w4, q4 = axpy(p, dt, v3), axpy(v, dt, a3), axpy(w, dt, b3), _turned(q, dt, d3)
+    a4, b4 = accelerations(grounded, row, anchor, p4, v4, q4, w4, r2, command, air_W, push_W)
+    d4 = rot.rate(q4, w4)
+
+    s = dt / 6.0
+    return (
+        axpy(p, dt, _mean(v, v2, v3, v4)),
+        axpy(v, dt, _mean(a1, a2, a3, a4)),
+        rot.normalised(_turned(_turned(_turned(_turned(q, s, d1), 2.0 * s, d2), 2.0 * s, d3), s, d4)),
+        axpy(w, dt, _mean(b1, b2, b3, b4)),
+        r2,
+        (p[2] > reach) & (p2[2] > reach) & (p3[2] > reach) & (p4[2] > reach),
+    )

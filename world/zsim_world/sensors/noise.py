@@ -1,0 +1,74 @@
+"""The random numbers of a fleet: one stream per drone and sensor, one of wind per drone, one of wind for all.
+
+The kernel takes rows of standard normal numbers from one table; `refill` moves what is left to the front and draws the
+rest. What a stream gives does not depend on the size of the table, nor on the other drones.
+"""
+
+import math
+
+import numpy as np
+
+from zsim.scenario.random_streams import stream
+from zsim.scenario.scenario import Scenario
+from zsim.scenario.sensor_presets import BOARD_RATE_HZ
+from zsim_world.physics import normal_variates
+from zsim_world.sensors.sensor_set import CHANNELS, CHANNELS_MAX, NOISE_WIDTH, SENSORS, channels, rate_of
+
+WIDTHS = (*NOISE_WIDTH, 3)  # numbers per row: of a sample, of a gust
+
+
+class NoiseTable:
+    """Standard normal numbers for `gates` gates: `table` (N + 1, all streams), `at` and `cursor` for the kernel."""
+
+    def __init__(self, scenario: Scenario, gates: int) -> None:
+        names = [drone.name for drone in scenario.drones]
+        streams = [[stream(scenario.seed, f"{name}/{s}") for s in (*SENSORS, "wind")] for name in names]
+        common = stream(scenario.seed, "wind")
+        self._rows, self._widths = np.array(_rows(scenario, gates)), np.array(WIDTHS)
+        ends = np.cumsum(self._rows * self._widths)
+        self.at = np.array([0, *ends[:-1]], dtype=np.int64)
+        self.table = np.zeros((len(names) + 1, ends[-1]))
+        self.cursor = np.zeros((len(names) + 1, len(WIDTHS)), dtype=np.int64)
+        self.bias = np.zeros((len(names), len(SENSORS), CHANNELS_MAX))
+        self.gust = np.zeros((len(names), 3))
+        self._draw_start(scenario, streams, common)
+        self._words = np.zeros((len(names) + 1, len(WIDTHS), normal_variates.COLUMNS), dtype=np.uint64)
+        self._words[:-1] = [[normal_variates.words(rng) for rng in row] for row in streams]
+        self._words[-1, -1] = normal_variates.words(common)
+        self.cursor[:-1], self.cursor[-1, -1] = self._rows, self._rows[-1]  # nothing drawn yet
+        self.refill()
+
+    def refill(self) -> None:
+        """Draw as many rows as have been used."""
+        normal_variates.refill(self.table, self.at, self._rows, self._widths, self.cursor, self._words)
+
+    def _draw_start(
+        self, scenario: Scenario, streams: list[list[np.random.Generator]], shared: np.random.Generator
+    ) -> None:
+        """Draw the biases and gusts at the start, first of each stream."""
+        common = shared.standard_normal(3)
+        share = scenario.environment.wind.gust_correlation
+        for i, drone in enumerate(scenario.drones):
+            for s, name in enumerate(SENSORS):
+                sigma = [model.bias for model in channels(drone.sensors, name)]
+                self.bias[i, s, : CHANNELS[s]] = sigma * streams[i][s].standard_normal(CHANNELS[s])
+            own = streams[i][-1].standard_normal(3)
+            self.gust[i] = math.sqrt(share) * common + math.sqrt(1.0 - share) * own
+        self.gust *= scenario.environment.wind.gust_m_s
+
+
+def _rows(scenario: Scenario, gates: int) -> list[int]:
+    """Return how many rows of each stream a table needs, the sample at t = 0 included."""
+    span = gates * scenario.time.gate_ms / 1000.0
+    rates = [max(rate_of(getattr(d.sensors, name), name) for d in scenario.drones) for name in SENSORS]
+    return [math.ceil(span * rate) + 2 for rate in (*rates, BOARD_RATE_HZ)]
+
+
+def samples_per_gate(scenario: Scenario) -> int:
+    """Return the most samples that all drones together take in one gate."""
+    span = scenario.time.gate_ms / 1000.0
+    return sum(
+        math.ceil(span * rate_of(getattr(drone.sensors, name), name)) + 1
+        for drone in scenario.drones
+        for name in SENSORS
+    )

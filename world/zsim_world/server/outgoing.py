@@ -1,0 +1,91 @@
+"""What the world says, on its way: encoded, remembered, put in one go, and handed to recorders with what passed."""
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+from zsim.contract import batch, messages
+from zsim.contract.bundle import Bundle
+from zsim.runtime.agent import Output
+from zsim.transport.session import Sample, Session
+from zsim_world.flight.coordinator import Hub
+from zsim_world.server.message_history import History
+
+
+class Outgoing:
+    """The way from a world's outbox to the link.
+
+    Args:
+        link: of the hub.
+        world: whose outbox it is.
+        history: remembers what is said.
+        said: told every key and message beside those of drones.
+    """
+
+    def __init__(self, link: Session, world: Hub, history: History, said: Callable[[str, Any], None]) -> None:
+        self._link = link
+        self._world = world
+        self._history = history
+        self._said = said
+        self._unsent: batch.Batch = []
+        self._passed: batch.Batch = []
+        self._gate_keys = [batch.gate(name) for name in world.names]
+
+    def flush(self) -> None:
+        """Publish the outbox."""
+        self.gather()
+        self.send()
+
+    def gather(self) -> None:
+        """Encode the outbox and keep it."""
+        outbox = self._world.take_outbox()
+        if not outbox:
+            return
+        encoded: batch.Batch = []
+        for key, message in outbox:
+            if type(message) is Bundle:
+                self._gather_bundle(message)
+                encoded += message.encoded
+            else:
+                pair = (key, messages.encode(message))
+                encoded.append(pair)
+                self._passed.append(pair)
+        self._unsent += encoded
+        self._history.add_all(encoded, self._world.now_ns)
+        for key, message in outbox:
+            if type(message) is not Bundle:
+                self._said(key, message)
+
+    def _gather_bundle(self, bundle: Bundle) -> None:
+        """Keep what is said at a gate in one message, of all drones and of each, where somebody reads it so."""
+        whole = (batch.GATE, bundle.packed())
+        self._passed.append(whole)
+        if self._link.heard(batch.GATE):
+            self._unsent.append(whole)
+        for key, (first, last) in zip(self._gate_keys, pairwise(bundle.first), strict=True):
+            if last > first and self._link.heard(key):
+                self._unsent.append((key, bundle.packed(first, last)))
+
+    def send(self) -> None:
+        """Put what was gathered in one go: readers wake once, and the transport sends few packets."""
+        unsent, self._unsent = self._unsent, []
+        self._link.put_all(unsent)
+        self.put_batch()
+
+    def publish(self, output: Output) -> None:
+        """Publish one message beside the outbox."""
+        payload = messages.encode(output.message)
+        self._passed.append((output.key, payload))
+        self._history.add(output.key, payload, self._world.now_ns)
+        self._link.put_raw(output.key, payload)
+
+    def passed(self, sample: Sample) -> None:
+        """Note what somebody else has said."""
+        self._passed.append(sample)
+
+    def put_batch(self) -> None:
+        """Hand what has passed to the recorders, if there are any."""
+        passed, self._passed = self._passed, []
+        if self._link.heard(batch.KEY):
+            for first in range(0, len(passed), batch.MESSAGES_MAX):
+                self._link.put_raw(batch.KEY, batch.encode(passed[first : first + batch.MESSAGES_MAX]))

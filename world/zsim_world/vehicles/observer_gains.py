@@ -1,0 +1,181 @@
+"""The firmware's fixed observer gains: steady Kalman gains for the noises of its own sensors, computed once.
+
+The design model of one horizontal axis (heading frame), driven by white noise:
+    dv/dt = -c v + g tilt + u      c: drag over mass; u: disturbance (wind, collisions, model error)
+    dtilt/dt = rate + noise        rate: error of the gyro's bias
+    drate/dt = noise, du/dt = noise
+measured by the accelerometer (u - c v: a multirotor's specific force across its thrust is its drag and disturbance)
+and by the optical flow (v). Vertical: dz/dt = v, dv/dt = -c v + u, with a height and the accelerometer's bias besides
+(u - c v + bias; across, a bias is one with a tilt). Heading: psi and rate.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from zsim.scenario.scenario import Drone, Environment, ErrorModel, Sensor
+from zsim.scenario.sensor_presets import BOARD_RATE_HZ
+from zsim_world.sensors.sensor_set import heading_sigma, noise_sigma, radians
+from zsim_world.state.vehicle import REFERENCE_DENSITY_KG_M3
+
+Array = NDArray[np.float64]
+
+DISTURBANCE_WALK = 0.2  # m/s^2/sqrt(s): gusts of 0.5 m/s over 5 s on a drag of 0.58 1/s give 0.18
+LIFT_WALK = 0.4  # m/s^2/sqrt(s): ground effect and downwash come faster than gusts
+TILT_WALK = 6e-4  # rad/sqrt(s), least: vibration, rounding, and what a turn leaves
+BIAS_WALK = 2e-5  # rad/s/sqrt(s), least: a bias of 0.1 deg/s is found within a minute
+LIFT_BIAS_WALK = 3e-3  # m/s^2/sqrt(s), least: what the board's temperature does to its accelerometer
+# Least and largest standard deviation of a sample that the design counts with: none is trusted blindly, and beyond the
+# largest a meter is as good as none
+SIGMAS = {
+    "accel": (0.02, 50.0),  # m/s^2
+    "gyro": (1e-4, 1.0),  # rad/s
+    "flow": (0.02, 10.0),  # m/s
+    "baro": (0.02, 100.0),  # m
+    "sonar": (0.01, 10.0),  # m
+    "mag": (0.01, 3.0),  # rad
+}
+DOUBLINGS = 24  # 2^24 steps of 5 ms are a day
+HEARD_MIN_HZ = 0.1  # Hz, a meter is not counted with less often
+
+# Columns of the gain row: innovation -> state
+ACCEL_V, ACCEL_TILT, ACCEL_RATE, ACCEL_U = 0, 1, 2, 3
+FLOW_V, FLOW_TILT, FLOW_RATE, FLOW_U = 4, 5, 6, 7
+LIFT_Z, LIFT_V, LIFT_U, LIFT_BIAS = 8, 9, 10, 11  # accelerometer, vertical
+CLIMB_Z, CLIMB_V, CLIMB_U, CLIMB_BIAS = 12, 13, 14, 15  # flow, vertical
+BARO_Z = 16  # and three more, as above
+SONAR_Z = 20  # and three more
+BARO_ZERO = 24
+MAG_PSI, MAG_RATE = 25, 26
+COLUMNS = 27
+
+
+Meter = tuple[float, float]  # standard deviation of a sample, samples per second
+
+
+class Design(NamedTuple):
+    """What the gains of one drone follow from."""
+
+    drag_1_s: float
+    gravity_m_s2: float
+    accel: Meter  # m/s^2
+    accel_walk: float  # m/s^2/sqrt(s)
+    tilt_walk: float  # rad/sqrt(s)
+    gyro_walk: float  # rad/s/sqrt(s)
+    flow: Meter  # m/s
+    baro: Meter  # m
+    sonar: Meter  # m
+    mag: Meter  # rad
+
+
+def gain_row(drone: Drone, environment: Environment) -> Array:
+    """Return the gains of one drone, shape (COLUMNS,)."""
+    s = drone.sensors
+    field = math.hypot(*environment.magnetic_field_ut[:2])
+    gyro = _sigma(radians(s.imu.gyro_deg_s), BOARD_RATE_HZ, "gyro")
+    design = Design(
+        drag_1_s=drone.drag_n_s_m * environment.air_density_kg_m3 / REFERENCE_DENSITY_KG_M3 / drone.mass_kg,
+        gravity_m_s2=environment.gravity_m_s2,
+        accel=(_sigma(s.imu.accel_m_s2, BOARD_RATE_HZ, "accel"), BOARD_RATE_HZ),
+        accel_walk=max(s.imu.accel_m_s2.bias_walk, LIFT_BIAS_WALK),
+        tilt_walk=math.hypot(gyro / math.sqrt(BOARD_RATE_HZ), TILT_WALK),
+        gyro_walk=max(radians(s.imu.gyro_deg_s).bias_walk, BIAS_WALK),
+        flow=(_sigma(s.flow.velocity_m_s, s.flow.rate_hz, "flow"), heard(s.flow)),
+        baro=(_sigma(s.baro.altitude_m, s.baro.rate_hz, "baro"), heard(s.baro)),
+        sonar=(_sigma(s.sonar.range_m, s.sonar.rate_hz, "sonar"), heard(s.sonar)),
+        mag=(_within(heading_sigma(s.mag, field), "mag"), heard(s.mag)),
+    )
+    return _gains(design)
+
+
+def heard(sensor: Sensor) -> float:
+    """Return the rate [Hz] at which samples really come."""
+    return max(sensor.rate_hz * (1.0 - sensor.dropout), HEARD_MIN_HZ)
+
+
+def _sigma(model: ErrorModel, rate_hz: float, name: str) -> float:
+    return _within(math.hypot(noise_sigma(model, rate_hz), model.quantum / math.sqrt(12.0)), name)
+
+
+def _within(sigma: float, name: str) -> float:
+    least, most = SIGMAS[name]
+    return min(max(sigma, least), most)
+
+
+@lru_cache(maxsize=256)
+def _gains(d: Design) -> Array:
+    row = np.empty(COLUMNS)
+    row[ACCEL_V : FLOW_U + 1] = _across(d).ravel()
+    row[LIFT_Z:SONAR_Z] = _upwards(d, d.baro).ravel()
+    row[SONAR_Z:BARO_ZERO] = _upwards(d, d.sonar)[2]
+    row[BARO_ZERO] = 1.0 / (10.0 * d.baro[1])  # ten seconds
+    row[MAG_PSI : MAG_RATE + 1] = _turning(d)[0]
+    row = np.array([float(f"{x:.9g}") for x in row])  # nine digits: the same bits whatever the BLAS
+    row.setflags(write=False)
+    return row
+
+
+def _across(d: Design) -> Array:
+    c = d.drag_1_s
+    a = np.array([[-c, d.gravity_m_s2, 0, 1], [0, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
+    walks = np.array([0.0, d.tilt_walk, d.gyro_walk, DISTURBANCE_WALK])
+    return steady_gains(a, walks, [([-c, 0, 0, 1], *d.accel), ([1, 0, 0, 0], *d.flow)])
+
+
+def _upwards(d: Design, height: Meter) -> Array:
+    """Return the gains of accelerometer, flow and a meter of the height."""
+    c = d.drag_1_s
+    a = np.array([[0, 1, 0, 0], [0, -c, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
+    walks = np.array([0.0, 0.0, LIFT_WALK, d.accel_walk])
+    moving = [([0, -c, 1, 1], *d.accel), ([0, 1, 0, 0], *d.flow)]
+    return steady_gains(a, walks, [*moving, ([1, 0, 0, 0], *height)])
+
+
+def _turning(d: Design) -> Array:
+    a = np.array([[0, 1], [0, 0]], dtype=float)
+    return steady_gains(a, np.array([d.tilt_walk, d.gyro_walk]), [([1, 0], *d.mag)])
+
+
+def steady_gains(a: Array, walks: Array, meters: list[tuple[list[float], float, float]]) -> Array:
+    """Return the gain per sample of each meter in the steady state of a Kalman filter, shape (meters, states).
+
+    A meter slower than the board counts as one of 200 Hz with as much information; its gain per sample is then that
+    of the one covariance reached, P H^T / (H P H^T + sigma^2).
+
+    Args:
+        a: dx/dt = a x; walks: white noise on each state [unit/sqrt(s)].
+        meters: (row of H, standard deviation of a sample, samples per second).
+    """
+    p = covariance(a, walks, meters)
+    gains = [p @ np.array(h) / (np.array(h) @ p @ np.array(h) + sigma**2) for h, sigma, _ in meters]
+    return np.array(gains)
+
+
+def covariance(a: Array, walks: Array, meters: list[tuple[list[float], float, float]]) -> Array:
+    """Return the steady covariance before an update, for the meters of `steady_gains`."""
+    dt = 1.0 / BOARD_RATE_HZ
+    h = np.array([row for row, _, _ in meters], dtype=float)
+    r = np.diag([sigma**2 * BOARD_RATE_HZ / rate for _, sigma, rate in meters])
+    # process noise over one step by Simpson's rule: exact to dt^5 for these chains
+    q = np.diag(walks**2)
+    half, full = (np.asarray(expm(a * s), dtype=np.float64) for s in (dt / 2, dt))
+    noise = dt / 6.0 * (q + 4.0 * half @ q @ half.T + full @ q @ full.T)
+    return _riccati(full, h.T @ np.linalg.solve(r, h), noise)
+
+
+def _riccati(f: Array, information: Array, noise: Array) -> Array:
+    """Return the steady prior covariance of x' = f x + noise, seen with `information` = H^T R^-1 H in every step.
+
+    Structure-preserving doubling, 2^k steps after k rounds (Chu, Fan, Lin and Wang, Int. J. Control 77 (2004) 767-788):
+    scipy's solver fails on chains whose meters differ by ten decades.
+    """
+    a, g, p = f.T, information, noise
+    for _ in range(DOUBLINGS):
+        back = np.linalg.solve(np.eye(len(a)) + g @ p, np.hstack([a, g]))
+        turned, spread = back[:, : len(a)], back[:, len(a) :]
+        g, p, a = g + a @ spread @ a.T, p + a.T @ p @ turned, a @ turned
+    return 0.5 * (p + p.T)

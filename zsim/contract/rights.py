@@ -1,0 +1,118 @@
+"""What each process may do on the keys of the contract: the least that its role needs. Pure.
+
+Zenoh's access control is made of it (deploy), and the world answers replays by it.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from zsim.contract import batch, keys
+from zsim.scenario.scenario import Scenario
+
+TOLD_TO_ALL = (keys.INFO, keys.CLOCK, keys.EVENT, keys.FAULTS)
+EVERYTHING = ("**", batch.KEY, batch.GATE, batch.gate("*"))  # no wildcard takes a key that begins with @
+LAST_VALUES = (
+    keys.INFO,
+    keys.CLOCK,
+    keys.FAULTS,
+    "drone/*/sensor/status",
+    "drone/*/truth",
+    "drone/*/estimate",
+    "cluster/*/state",
+)
+OPERATOR, RECORDER, WORLD, ROUTER = "operator", "recorder", "world", "router"
+
+
+class Rights(NamedTuple):
+    """Key expressions, without the federation.
+
+    Attributes:
+        reads: what it may subscribe to.
+        writes: what it may publish.
+        asks: what it may get; a get on a control key is a request.
+        answers: what it may answer gets on.
+        tokens: liveliness tokens that it may declare.
+        watches: liveliness tokens that it may see.
+    """
+
+    reads: tuple[str, ...] = ()
+    writes: tuple[str, ...] = ()
+    asks: tuple[str, ...] = ()
+    answers: tuple[str, ...] = ()
+    tokens: tuple[str, ...] = ()
+    watches: tuple[str, ...] = ()
+
+
+ALL = Rights(*[EVERYTHING] * len(Rights._fields))
+
+
+def of(process: str, scenario: Scenario) -> Rights:
+    """Return the rights of a process by its name, role.thing; there is one world and one recorder, without a thing.
+
+    A role that is not zsim's and is about a drone may do what the estimator of that drone may, one that is about a
+    cluster what its controller may: it takes their place. One about neither takes part, and hears what all are told.
+    """
+    role, _, thing = process.partition(".")
+    if process == WORLD:
+        return ALL
+    if process == RECORDER:
+        return union([_own(process), _READER])
+    if role == OPERATOR:
+        return union([_own(process), _READER, _OPERATOR])
+    return union([_own(process), _estimator(thing, scenario, role), _controller(thing, scenario, role)])
+
+
+def union(many: Iterable[Rights]) -> Rights:
+    """Return what any of several may do, as a router needs that carries them."""
+    columns = zip(Rights(), *many, strict=True)
+    return Rights(*(tuple(dict.fromkeys(key for keys_ in column for key in keys_)) for column in columns))
+
+
+def permits(expressions: Iterable[str], key: str) -> bool:
+    """Tell whether a key is among some expressions."""
+    return any(keys.matches(expression, key) for expression in expressions)
+
+
+def _own(process: str) -> Rights:
+    """Return what every process may do in its own name."""
+    return Rights(
+        reads=TOLD_TO_ALL,
+        writes=tuple(keys.process(process, what) for what in ("join", "done", "bye", "health")),
+        asks=(keys.INFO, keys.CLOCK, keys.FAULTS, keys.replay(process)),
+        answers=(keys.process(process, "outputs"),),
+        tokens=(keys.token(process),),
+    )
+
+
+_READER = Rights(reads=("**", batch.KEY), asks=LAST_VALUES, watches=(keys.token("*"),))
+_OPERATOR = Rights(writes=(keys.command("*", "*"),), asks=(keys.CONTROL, keys.cluster_control("*")))
+
+
+def _estimator(thing: str, scenario: Scenario, role: str) -> Rights:
+    if role == "controller" or thing not in {drone.name for drone in scenario.drones}:
+        return Rights()
+    estimate = (keys.estimate(thing),)
+    return Rights(
+        reads=(keys.sensors(thing), batch.gate(thing), *estimate),
+        writes=(*estimate, keys.estimates_view(f"{role}.{thing}")),
+        asks=(keys.status(thing), *estimate),
+    )
+
+
+def _controller(thing: str, scenario: Scenario, role: str) -> Rights:
+    if role == "estimator" or thing not in {cluster.name for cluster in scenario.clusters}:
+        return Rights()
+    drones = scenario.cluster(thing).drones
+    heard = [key for drone in drones for key in (keys.estimate(drone), keys.status(drone))]
+    state = keys.cluster_state(thing)
+    return Rights(
+        reads=(*heard, state),
+        writes=(
+            *(keys.command(drone, "*") for drone in drones),
+            state,
+            keys.cluster_request(thing),
+            keys.cluster_view(thing),
+        ),
+        asks=(*heard, state),
+        answers=(keys.cluster_control(thing),),
+    )

@@ -1,0 +1,71 @@
+"""The events of the world that a process acts on, with their data checked: anybody may publish on `world/event`."""
+
+from typing import NamedTuple
+
+import msgspec
+from msgspec import Struct
+
+from zsim.contract import keys, messages
+from zsim.contract.messages import REFUSALS, Count, Whole
+from zsim.errors import DecodeError
+
+
+class Nothing(Struct, frozen=True):
+    """Data of which nothing is used."""
+
+
+class End(Struct, frozen=True):
+    """The run is over; `last_ns` is its last gate."""
+
+    last_ns: Count
+
+
+class Entry(Struct, frozen=True):
+    """A process has been taken in.
+
+    Attributes:
+        from_ns: first gate that it is waited for.
+        done_ns: newest gate that it, or its former incarnation, is through with; -1 for none.
+        former_pid: of the incarnation whose place it takes.
+    """
+
+    incarnation: int
+    host: str
+    pid: int
+    from_ns: Count
+    done_ns: Whole = -1
+    former_pid: int | None = None
+
+
+class Notice(NamedTuple):
+    """An event of a kind that processes act on."""
+
+    kind: str
+    subject: str
+    data: Struct
+
+
+_DATA: dict[str, type[Struct]] = {
+    "end": End,
+    "join": Entry,
+    "restart": Entry,
+    "superseded": Entry,
+    "leave": Nothing,
+    "drop": Nothing,
+}
+
+
+def read(payload: bytes) -> Notice | None:
+    """Return the notice in an event, None for an event of another kind.
+
+    Raises:
+        DecodeError: it is no event, or its data is not what its kind has.
+    """
+    event: messages.Event = messages.decode(keys.EVENT, payload)
+    kind = _DATA.get(event.kind)
+    if kind is None:
+        return None
+    try:
+        return Notice(event.kind, event.subject, msgspec.convert(event.data, kind))
+    except REFUSALS as error:
+        raise DecodeError(f"{keys.EVENT}: data of {event.kind!r} is refused ({error}); see docs/protocol.md") from error

@@ -1,0 +1,124 @@
+"""Compiles plain-float mathematics with numba; without numba the same source runs as Python.
+
+No fast-math and no fused operations, so that the same input gives the same bits, compiled or not.
+
+    inlined, apart   parts of a kernel: they take views of arrays, floats and tuples, and make no array
+    compiled         part of a kernel that may make arrays
+    kernel           called from Python and kept on disk; 1 / 0 is inf, as in numpy
+    portable         called from Python and kept on disk; 1 / 0 raises ZeroDivisionError, as in Python
+
+Numba's own cache on disk looks at the file of a function alone, although all that the function calls is compiled into
+it. So the name of what is kept carries the digest of every file that its module imports, directly or not.
+
+An `inlined` function has no owner of an array to be counted: the atomic counts that numba keeps for every view took a
+fifth of a gate's time, calls of functions that were not inlined another.
+"""
+
+import hashlib
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+try:
+    from numba import njit
+except ImportError:
+    njit = None
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+COMPILES = njit is not None  # whether anything is compiled here
+_EXACT: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
+_UNCOUNTED: dict[str, Any] = {"_nrt": False}  # numba's name for doing without its counts; making an array is refused
+_IMPORTS = re.compile(r"^from (zsim[\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
+
+
+def compiled(function: Function) -> Function:
+    """Return a part of kernels."""
+    return _compile(function, _EXACT)
+
+
+def inlined(function: Function) -> Function:
+    """Return a part of kernels that becomes part of its caller's code, and makes no array."""
+    return _compile(function, {**_EXACT, **_UNCOUNTED, "forceinline": True})
+
+
+def apart(function: Function) -> Function:
+    """Return a part of kernels that makes no array and is rarely run: it does not crowd its caller's code."""
+    return _compile(function, {**_EXACT, **_UNCOUNTED})
+
+
+def kernel(makes_arrays: bool = True) -> Callable[[Function], Function]:
+    """Return the decorator of a function that is compiled once per machine.
+
+    Args:
+        makes_arrays: False for one that, as all that it calls, only works on the arrays that it is given.
+    """
+    options = _EXACT if makes_arrays else {**_EXACT, **_UNCOUNTED}
+    return lambda function: _kept(function, options)
+
+
+def portable(function: Function) -> Function:
+    """Return a function that is compiled once per machine, and that divides as Python does."""
+    return _kept(function, {})
+
+
+def _compile(function: Function, options: dict[str, Any]) -> Function:
+    made: Any = function if njit is None else njit(**options)(function)
+    return made
+
+
+def _kept(function: Function, options: dict[str, Any]) -> Function:
+    if njit is None:
+        return function
+    function.__qualname__ = f"{function.__qualname__}_{digest(sources(function.__module__))}"
+    try:
+        made: Any = njit(**options, cache=True)(function)
+    except RuntimeError:  # neither beside its file nor in the user's cache may anything be written
+        made = njit(**options)(function)
+    return made
+
+
+def is_kept(function: Callable[..., Any]) -> bool:
+    """Tell whether a compilation of a kernel, as its sources are now, is on disk; it is then only loaded."""
+    stats = getattr(function, "stats", None)  # of numba's dispatcher
+    folder = stats and stats.cache_path
+    return bool(folder) and any(Path(folder).glob(f"*{function.__qualname__}*.nbc"))
+
+
+def sources(module: str) -> frozenset[Path]:
+    """Return the files of a module and of all modules of zsim that it imports at its top, directly or not."""
+    reached: set[str] = set()
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        if name not in reached:
+            reached.add(name)
+            waiting += _imported(name)
+    return frozenset(Path(str(sys.modules[name].__file__)) for name in reached)
+
+
+@cache
+def _imported(module: str) -> tuple[str, ...]:
+    """Return the modules of zsim that a loaded module imports."""
+    text = Path(str(sys.modules[module].__file__)).read_text(encoding="utf-8")
+    return tuple(name for name in _candidates(text) if getattr(sys.modules.get(name), "__file__", None))
+
+
+def _candidates(text: str) -> Iterator[str]:
+    """Yield what may be a module in the import lines of a text: a package, or what is taken out of it."""
+    for package, names in _IMPORTS.findall(text):
+        yield package
+        yield from (f"{package}.{name}" for name in re.findall(r"\w+", names))
+
+
+def digest(files: Iterable[Path]) -> str:
+    """Return what changes with the text of any of the files."""
+    return hashlib.sha256(b"".join(map(_text, sorted(files)))).hexdigest()[:12]
+
+
+@cache
+def _text(path: Path) -> bytes:
+    return path.read_bytes()

@@ -1,0 +1,143 @@
+"""Vectors and quaternions as tuples of floats, for compiled code: no allocation, a fixed order of operations.
+
+A vector is (x, y, z). A quaternion is Hamilton (w, x, y, z) and turns body components into world components.
+"""
+
+import math
+
+from zsim.math.compiled import inlined
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+_SMALL_ANGLE = 1e-8  # rad; below it sin(x)/x is 1 to the last bit
+
+
+@inlined
+def add(a: Vector, b: Vector) -> Vector:
+    """Return a + b."""
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+@inlined
+def axpy(a: Vector, s: float, b: Vector) -> Vector:
+    """Return a + s b."""
+    return (a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2])
+
+
+@inlined
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return a × b."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@inlined
+def dot(a: Vector, b: Vector) -> float:
+    """Return a · b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def norm(a: Vector) -> float:
+    """Return |a|."""
+    return math.sqrt(dot(a, a))
+
+
+@inlined
+def rotate(q: Quaternion, a: Vector) -> Vector:
+    """Return R(q) a: body components to world components."""
+    w, x, y, z = q
+    t0 = 2.0 * (y * a[2] - z * a[1])
+    t1 = 2.0 * (z * a[0] - x * a[2])
+    t2 = 2.0 * (x * a[1] - y * a[0])
+    return (
+        a[0] + w * t0 + y * t2 - z * t1,
+        a[1] + w * t1 + z * t0 - x * t2,
+        a[2] + w * t2 + x * t1 - y * t0,
+    )
+
+
+@inlined
+def rotate_back(q: Quaternion, a: Vector) -> Vector:
+    """Return R(q)^T a: world components to body components."""
+    return rotate((q[0], -q[1], -q[2], -q[3]), a)
+
+
+@inlined
+def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
+    """Return the Hamilton product p q: first q, then p."""
+    return (
+        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+    )
+
+
+@inlined
+def normalised(q: Quaternion) -> Quaternion:
+    """Return q / |q|."""
+    s = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    return (q[0] * s, q[1] * s, q[2] * s, q[3] * s)
+
+
+@inlined
+def from_rotation_vector(r: Vector) -> Quaternion:
+    """Return the quaternion of a turn by |r| radians about r."""
+    angle = norm(r)
+    half = 0.5 * angle
+    return turn_about(r, angle, math.sin(half), math.cos(half))
+
+
+@inlined
+def turn_about(r: Vector, angle: float, sine: float, cosine: float) -> Quaternion:
+    """Return the quaternion of a turn by |r| = angle about r, from sine and cosine of half the angle."""
+    s = 0.5 if angle < _SMALL_ANGLE else sine / angle
+    return (cosine, s * r[0], s * r[1], s * r[2])
+
+
+@inlined
+def rate(q: Quaternion, w_WB_B: Vector) -> Quaternion:
+    """Return dq/dt = q (0, w) / 2 for the body rate w [rad/s]."""
+    w, x, y, z = q
+    a, b, c = 0.5 * w_WB_B[0], 0.5 * w_WB_B[1], 0.5 * w_WB_B[2]
+    return (-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a)
+
+
+@inlined
+def heading(q: Quaternion) -> float:
+    """Return the heading [rad]: the angle of the body's x axis from east, counter-clockwise seen from above."""
+    north, east = forwards(q)
+    return math.atan2(north, east)
+
+
+@inlined
+def forwards(q: Quaternion) -> tuple[float, float]:
+    """Return how far the body's x axis points north, and east."""
+    w, x, y, z = q
+    return 2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)
+
+
+@inlined
+def about_z(angle: float) -> Quaternion:
+    """Return the quaternion of a turn about z."""
+    return (math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle))
+
+
+@inlined
+def level(own: Quaternion, q_WB: Quaternion) -> Quaternion:
+    """Return q_HB, the attitude over the heading frame, tilt without heading; own = about_z(heading(q_WB))."""
+    return multiply((own[0], 0.0, 0.0, -own[3]), q_WB)
+
+
+@inlined
+def z_axis(q: Quaternion) -> Vector:
+    """Return the body's z axis in world components."""
+    w, x, y, z = q
+    return (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
+
+
+@inlined
+def wrapped(angle: float) -> float:
+    """Return the angle in [-pi, pi)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))

@@ -1,0 +1,226 @@
+"""Reads a record, whole or cut at any byte."""
+
+from collections import Counter
+from collections.abc import Collection, Iterator
+from mmap import ACCESS_READ, mmap
+from operator import itemgetter
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import Channel
+
+from zsim.errors import RecordError
+from zsim.record.mcap_layout import (
+    HEAD,
+    MAGIC,
+    MESSAGE,
+    Group,
+    Place,
+    Source,
+    chunk_head,
+    content_of,
+    groups,
+    indexes_of,
+    is_complete,
+    is_cut,
+    places,
+    unpacked,
+)
+from zsim.record.record_end import check_magic
+
+OVERLAP_NS = 1_000_000_000  # simulated time; a chunk begins less than that before the end of the one before it
+
+
+class Recorded(NamedTuple):
+    """One message of a record, not decoded."""
+
+    key: str
+    payload: bytes
+    t_ns: int
+    wall_ns: int
+
+
+class _Chunk(NamedTuple):
+    place: Place
+    first_ns: int
+    last_ns: int
+    channels: frozenset[int]
+
+
+_Held = tuple[int, int, Recorded]  # simulated time, number of its chunk, message
+
+
+class RecordReader:
+    """A record as it stands on disk when it is opened; a writer may go on appending to it.
+
+    Attributes:
+        complete: the record was closed, not cut.
+        damaged: what was met so far and passed over: chunks whose check sum differs, and, as one, everything
+            behind a length that cannot be right.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Open a record and look through its chunks, without decompressing them.
+
+        Raises:
+            RecordError: no such file, no MCAP file, or the name of a channel is damaged.
+        """
+        self.path = Path(path)
+        self._counts: Counter[int] = Counter()
+        self._source = _mapped(self.path)
+        check_magic(self._source, self.path)
+        self.complete = is_complete(self._source)
+        self._keys: dict[int, str] = {}
+        self._rest_damaged = self._is_rest_damaged()
+        self._damaged: set[int] = set()  # where damaged chunks begin
+        self._chunks = list(self._scan())
+
+    def topics(self) -> dict[str, int]:
+        """Return the keys on record with the number of their messages, in the order of their first one."""
+        return {key: self._counts[number] for number, key in self._keys.items() if self._counts[number]}
+
+    def messages(
+        self, keys: Collection[str] | None = None, by_time: bool = True, from_ns: int = 0
+    ) -> Iterator[Recorded]:
+        """Yield the messages of some keys (None: of all).
+
+        Args:
+            keys: exact keys; chunks without any of them are not decompressed.
+            by_time: in order of simulated time, messages of one time as they were written; otherwise all as
+                they were written. In memory are the chunks that overlap in time, and stragglers one by one.
+            from_ns: chunks in which everything is older are passed over; a chunk holds a quarter of a wall second.
+
+        Raises:
+            RecordError: compressed by another tool in a way that is not ours.
+        """
+        wanted = {number: key for number, key in self._keys.items() if keys is None or key in keys}
+        late = (chunk for chunk in self._chunks if chunk.last_ns >= from_ns)
+        chunks = [chunk for chunk in late if not chunk.channels.isdisjoint(wanted)]
+        return self._by_time(chunks, wanted) if by_time else self._as_written(chunks, wanted)
+
+    def __iter__(self) -> Iterator[Recorded]:
+        return self.messages()
+
+    @property
+    def damaged(self) -> int:
+        """Return how many damaged chunks were met so far; everything behind unreadable records is one."""
+        return len(self._damaged) + self._rest_damaged
+
+    def last(self, key: str) -> Recorded | None:
+        """Return the message of a key that was written last, None if there is none."""
+        for number in (number for number, name in self._keys.items() if name == key):
+            for chunk in reversed(self._chunks):
+                if number in chunk.channels and (found := list(self._as_written([chunk], {number: key}))):
+                    return found[-1]
+        return None
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if isinstance(self._source, mmap):
+            self._source.close()
+
+    def __enter__(self) -> "RecordReader":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _is_rest_damaged(self) -> bool:
+        """Tell whether something follows that cannot be read; note the channels, which may be in the summary only."""
+        opcode, end = 0, len(MAGIC)
+        for place in places(self._source):
+            opcode, end = place.opcode, place.end
+            if opcode == Opcode.CHANNEL:
+                channel = unpacked(Channel, self._source, place)
+                self._keys[channel.id] = channel.topic
+        return opcode != Opcode.FOOTER and (self.complete or not is_cut(self._source, end))
+
+    def _scan(self) -> Iterator[_Chunk]:
+        known: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
+        found = [group for group in groups(self._source) if group.place.opcode == Opcode.CHUNK]
+        for group in found:
+            cut = group is found[-1] and not self.complete
+            counts = self._counted(group) if cut else {index.channel: index.messages for index in group.indexes}
+            self._counts.update(counts)
+            channels = frozenset(counts)
+            head = chunk_head(self._source, group.place)
+            yield _Chunk(group.place, head.first_ns, head.last_ns, known.setdefault(channels, channels))
+
+    def _counted(self, group: Group) -> dict[int, int]:
+        """Return the messages per channel of a chunk whose message indexes may have been cut."""
+        content = content_of(self._source, group.place)
+        if content is None:
+            self._damaged.add(group.place.start)
+        return {channel: len(entries) // 2 for channel, entries in indexes_of(content or b"").items()}
+
+    def _as_written(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
+        for chunk in chunks:
+            content = content_of(self._source, chunk.place)
+            if content is None:
+                self._damaged.add(chunk.place.start)
+                continue
+            yield from _recorded(content, wanted)
+
+    def _by_time(self, chunks: list[_Chunk], wanted: dict[int, str]) -> Iterator[Recorded]:
+        """Yield by time, holding no more chunks in memory than overlap in time, and stragglers."""
+        held, floors = self._stragglers(chunks, wanted)
+        starts = [floors.get(number, chunk.first_ns) for number, chunk in enumerate(chunks)]
+        for number in sorted(range(len(chunks)), key=starts.__getitem__):
+            first_ns, floor_ns = starts[number], floors.get(number, 0)
+            held.sort(key=itemgetter(0, 1))
+            ready = next((i for i, (t_ns, _, _) in enumerate(held) if t_ns >= first_ns), len(held))
+            yield from (message for _, _, message in held[:ready])
+            del held[:ready]
+            found = self._as_written([chunks[number]], wanted)
+            held += [(m.t_ns, number, m) for m in found if m.t_ns >= floor_ns]
+        held.sort(key=itemgetter(0, 1))
+        yield from (message for _, _, message in held)
+
+    def _stragglers(self, chunks: list[_Chunk], wanted: dict[int, str]) -> tuple[list[_Held], dict[int, int]]:
+        """Return messages that are stamped long before the rest of their chunk, and when that rest begins, by chunk.
+
+        A program that stamps nothing gives every chunk a message of time 0. In the order of their oldest messages,
+        all chunks would be read and held at the beginning.
+        """
+        strays: list[_Held] = []
+        floors: dict[int, int] = {}
+        for number in range(1, len(chunks)):
+            chunk = chunks[number]
+            if chunk.first_ns >= chunks[number - 1].last_ns - OVERLAP_NS:
+                continue
+            found = [(m.t_ns, number, m) for m in self._as_written([chunk], wanted)]
+            floor_ns = _floor_ns([t_ns for t_ns, _, _ in found])
+            strays += (each for each in found if each[0] < floor_ns)
+            floors[number] = min((t_ns for t_ns, _, _ in found if t_ns >= floor_ns), default=chunk.first_ns)
+        return strays, floors
+
+
+def _recorded(content: bytes, wanted: dict[int, str]) -> Iterator[Recorded]:
+    """Yield the messages of a chunk's content."""
+    at, end = 0, len(content) - MESSAGE.size
+    unpack, payload, head = MESSAGE.unpack_from, MESSAGE.size, HEAD.size
+    while at <= end:
+        opcode, length, channel, _, t_ns, wall_ns = unpack(content, at)
+        after = at + head + length
+        if channel in wanted and opcode == Opcode.MESSAGE:
+            yield Recorded(wanted[channel], content[at + payload : after], t_ns, wall_ns)
+        at = after
+
+
+def _floor_ns(times: list[int]) -> int:
+    """Return a time before most of some times: few that lie far off, on either side, do not move it."""
+    if not times:
+        return 0
+    ordered = sorted(times)
+    middle, late = ordered[len(times) // 2], ordered[3 * len(times) // 4]
+    return middle - 3 * (late - middle) - OVERLAP_NS  # evenly spread, they begin at middle - 2 (late - middle)
+
+
+def _mapped(path: Path) -> Source:
+    """Return the bytes of a file without reading them yet."""
+    try:
+        with open(path, "rb") as file:
+            return mmap(file.fileno(), 0, access=ACCESS_READ) if path.stat().st_size else b""
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read ({error.strerror})") from error

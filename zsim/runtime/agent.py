@@ -1,0 +1,127 @@
+"""An agent: a plain object, inputs in, outputs out, that knows neither Zenoh nor the wall clock.
+
+    runner ──receive(key, message)──▶ agent          every input of a gate, in canonical order
+    runner ──step(t_ns)────────────▶ agent ──▶ [(key, message), …]
+
+Two runners drive it: `zsim.runtime.runner` as a process on Zenoh, `zsim.runtime.bus` on an in-memory bus. Both hand
+over the same inputs in the same order, so that the outputs are the same to the bit.
+"""
+
+from abc import ABC, abstractmethod
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from msgspec import Struct
+
+from zsim.contract.messages import ControlAnswer, ControlRequest, Faults, Info
+from zsim.runtime.link_faults import LinkFaults
+
+
+class Output(NamedTuple):
+    """A message on its way out; the key is without the federation's prefix."""
+
+    key: str
+    message: Struct
+
+
+class Agent(ABC):
+    """Base of everything that takes part in the lockstep.
+
+    Attributes:
+        name: process name `role.thing`, e.g. `estimator.drone1`.
+        period_ns: how often it says done; a multiple of the gate.
+        reads: key expressions it subscribes to.
+        gate_keys: keys of which one message stamped t closes the gate t, e.g. the drone's sensor/status.
+        counted: drones of which it reads all sensors, so that what their status counts is waited for.
+        writes: keys that it publishes at every gate and that others of its process may read.
+        serves: names of processes for which it stands beside its own.
+        takes_bundles: whether `receive` takes all that the world says at a gate as one (batch.GATE, Bundle).
+    """
+
+    name: str
+    period_ns: int
+    reads: tuple[str, ...]
+    gate_keys: tuple[str, ...]
+    counted: tuple[str, ...] = ()
+    writes: tuple[str, ...] = ()
+    serves: tuple[str, ...] = ()
+    takes_bundles: bool = False
+    _links: LinkFaults | None = None
+
+    def __init__(self) -> None:
+        self._seq: defaultdict[str, int] = defaultdict(int)
+        self._process = ""
+
+    @property
+    def role(self) -> str:
+        return self.name.split(".", 1)[0]
+
+    @property
+    def source(self) -> str:
+        """Name of the process that publishes what it says: its own, unless it shares one."""
+        return self._process or self.name
+
+    def speak_as(self, process: str) -> None:
+        """Share a process of this name."""
+        self._process = process
+
+    def heed(self, info: Info, faults: Faults) -> None:
+        """Learn which faults are injected into the run; called before the first gate in which one of them acts."""
+        if self._links is None and faults.faults:
+            names, clusters = (self.name, *self.serves), {cluster.name: cluster.drones for cluster in info.clusters}
+            self._links = LinkFaults(names, self.reads, info.seed, info.gate_ns, clusters)
+        if self._links is not None:
+            self._links.heed(faults)
+
+    def hear(self, t_ns: int, inputs: Sequence[tuple[str, Any]]) -> None:
+        """Take the inputs of a gate, as far as faults of the links bring them."""
+        if self._links is not None:
+            inputs = self._links.through(t_ns, inputs)
+        for key, message in inputs:
+            self.receive(key, message)
+
+    @abstractmethod
+    def receive(self, key: str, message: Any) -> None:
+        """Take one input; called in order of (t_ns, key, seq) just before `step`."""
+
+    @abstractmethod
+    def step(self, t_ns: int) -> Sequence[Output]:
+        """Return the outputs of the gate t_ns."""
+
+    def views(self, t_ns: int) -> Sequence[Output]:
+        """Return what eyes are shown on `view/**`, as of the gate t_ns, the last that it stepped.
+
+        Asked after some gates only, as often as eyes can follow, and never where the agents share a process with the
+        world: nothing may depend on it.
+        """
+        return ()
+
+    def rehearse(self) -> None:
+        """Load and compile whatever the first step would; called before joining, so that no gate waits for it."""
+        return
+
+    def control_keys(self) -> tuple[str, ...]:
+        """Return the keys on which it answers requests."""
+        return ()
+
+    def control(self, key: str, request: ControlRequest) -> ControlAnswer:
+        """Answer a request; called between gates."""
+        return ControlAnswer(ok=False, error=f"{key}: {self.name} answers no requests")
+
+    def warm_start_keys(self) -> tuple[str, ...]:
+        """Return the keys whose last values a restarted incarnation wants before anything else."""
+        return ()
+
+    def warm_start(self, key: str, message: Any) -> None:  # noqa: B027 - taking over nothing is a choice
+        """Take over the last value that the former incarnation published."""
+
+    def next_seq(self, key: str) -> int:
+        """Return the next sequence number of one of its keys, from 0."""
+        count = self._seq[key]
+        self._seq[key] = count + 1
+        return count
+
+    def resume_seq(self, key: str, last: int) -> None:
+        """Go on counting after `last`, so that a restart leaves no doubt about what is new."""
+        self._seq[key] = last + 1

@@ -1,0 +1,78 @@
+"""What a process says of itself once a wall second."""
+
+import os
+import socket
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+
+from zsim.contract.messages import Health
+
+PERIOD_S = 1.0  # contract: 1 Hz wall
+STEPS_KEPT = 1000
+
+
+class HealthMeter:
+    """Counters of one process.
+
+    Args:
+        role: of the process.
+        wall_s: monotonic wall time.
+        host: the name of its host; None asks the system.
+
+    Attributes:
+        received, refused, dropped: messages taken in, not decodable, and gates given up.
+        lag_ns: how far the newest gate is ahead of the one just handled.
+        link_lost: whether the world cannot be reached now.
+    """
+
+    def __init__(self, role: str, wall_s: Callable[[], float] = time.monotonic, host: str | None = None) -> None:
+        self._role = role
+        self._host = host or socket.gethostname()
+        self._wall_s = wall_s
+        self._steps_us: deque[float] = deque(maxlen=STEPS_KEPT)
+        self._last_s = wall_s()
+        self.received = 0
+        self.refused = 0
+        self.dropped = 0
+        self.lag_ns = 0
+        self.link_lost = False
+
+    def step(self, duration_ns: int) -> None:
+        """Note how long one step took."""
+        self._steps_us.append(duration_ns / 1000)
+
+    def due(self) -> bool:
+        """Tell, once a wall second, that it is time to publish."""
+        now_s = self._wall_s()
+        if now_s - self._last_s < PERIOD_S:
+            return False
+        self._last_s = now_s
+        return True
+
+    def message(self, t_ns: int, seq: int) -> Health:
+        """Return the message of `process/{p}/health`."""
+        steps = sorted(self._steps_us) or [0.0]
+        return Health(
+            t_ns=t_ns,
+            seq=seq,
+            role=self._role,
+            host=self._host,
+            pid=os.getpid(),
+            step_us={"p50": steps[len(steps) // 2], "p99": steps[int(len(steps) * 0.99)]},
+            lag_ns=self.lag_ns,
+            dropped=self.dropped,
+            refused=self.refused,
+            rss_bytes=resident_bytes(),
+            received=self.received,
+        )
+
+
+def resident_bytes() -> int:
+    """Return the resident memory of this process; 0 where the system does not tell."""
+    if sys.platform == "linux":
+        with suppress(OSError), open("/proc/self/statm", encoding="ascii") as statm:  # no file may be left to open
+            return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return 0

@@ -1,0 +1,256 @@
+"""The inputs of an agent, sorted by gate: what has come, what is missing, what came twice.
+
+Arrival order is never trusted: a gate is complete when each of its closing keys has a message stamped with it
+and every counted sensor message is there. A gate of which nothing has come is known by the gap that it leaves in
+the numbers of a status.
+"""
+
+from bisect import bisect_right, insort
+from collections.abc import Sequence
+from operator import itemgetter
+from typing import Any
+
+from zsim.contract import batch, keys
+
+GAP_MAX = 10  # gates lost in a row that are asked for again; the world runs ahead of nobody by more
+ALWAYS_NS = -1  # before every gate
+NEVER_NS = 2**63 - 1  # after every gate
+
+
+class Inbox:
+    """Collects messages until the gate that they belong to is complete.
+
+    Args:
+        gate_keys: keys of which one message with t_ns == t closes the gate t. For a drone's sensor/status its
+            `count` is checked too, when `counted` says that all of that drone's sensors are read.
+        counted: drones of which all `sensor/*` keys are read.
+        keep_late: hand out what comes after its gate was taken, once, with the next gate: in realtime an old input
+            is better than none.
+
+    Attributes:
+        duplicates: messages that came again before their gate was taken.
+        late: messages that came when their gate had been taken.
+    """
+
+    def __init__(self, gate_keys: Sequence[str], counted: Sequence[str] = (), keep_late: bool = False) -> None:
+        self._closing = dict.fromkeys(gate_keys)
+        self._beside = dict.fromkeys(key for key in gate_keys if not keys.is_status(key))  # what a bundle leaves open
+        self._meters = {keys.status(drone): _Meter() for drone in counted}
+        self._came_of: dict[str, list[int] | None] = {}
+        self._waiting: dict[int, dict[tuple[str, int], tuple[str, Any]]] = {}
+        self._stamps: list[int] = []
+        self._lacking: dict[int, dict[str, None]] = {}
+        self._gates: list[int] = []
+        self._expected_from_ns: dict[str, int] = {}
+        self._pulse = next((key for key in gate_keys if keys.is_status(key)), None)
+        self._beats: dict[int, int] = {}
+        self._last_beat: tuple[int, int] | None = None
+        self._taken_ns = -1
+        self._keep_late = keep_late
+        self._belated: dict[tuple[str, int], tuple[str, Any]] = {}
+        self._newest: dict[str, int] = {}  # t_ns handed out per key, where late ones are kept
+        self.duplicates = 0
+        self.late = 0
+
+    def put(self, key: str, message: Any) -> bool:
+        """Keep one message; return False for a duplicate or one that is too late."""
+        t_ns = message.t_ns
+        if t_ns <= self._taken_ns:
+            self.late += 1
+            return self._put_late(key, message)
+        stamped = self._waiting.get(t_ns)
+        if stamped is None:
+            stamped = self._waiting[t_ns] = {}
+            _insert(self._stamps, t_ns)
+        mark = (key, message.seq)
+        if mark in stamped:
+            self.duplicates += 1
+            return False
+        stamped[mark] = (key, message)
+        came = self._came_of[key] if key in self._came_of else self._find_came(key)
+        if came is not None:
+            _insert(came, t_ns)
+        if key in self._closing:
+            self._close(key, message)
+        elif key == batch.GATE:
+            self._close_all(message)
+        return True
+
+    def _put_late(self, key: str, message: Any) -> bool:
+        """Keep a late message unless a newer one of its key, or itself, has been handed out."""
+        if not self._keep_late or message.t_ns <= self._newest.get(key, ALWAYS_NS):
+            return False
+        self._belated[key, message.seq] = (key, message)
+        return True
+
+    def _find_came(self, key: str) -> list[int] | None:
+        """Return the list of what has come of the counted drone that a sensor key belongs to."""
+        parent, _, _ = key.rpartition("/")
+        meter = self._meters.get(f"{parent}/status")
+        self._came_of[key] = came = meter.came if meter else None
+        return came
+
+    def _close_all(self, bundle: Any) -> None:
+        """Take a bundle: all that its publisher says at a gate, whole by its nature."""
+        t_ns = bundle.t_ns
+        if t_ns in self._lacking:
+            self._lacking[t_ns] = {key: None for key in self._lacking[t_ns] if key in self._beside}
+        else:
+            self._lacking[t_ns] = self._beside.copy()
+            _insert(self._gates, t_ns)
+        if self._pulse is not None:
+            self._beats[t_ns] = bundle.seq
+
+    def _lacking_at(self, t_ns: int) -> dict[str, None]:
+        lacking = self._lacking.get(t_ns)
+        if lacking is None:
+            lacking = self._lacking[t_ns] = self._closing.copy()
+            _insert(self._gates, t_ns)
+        return lacking
+
+    def _close(self, key: str, message: Any) -> None:
+        self._lacking_at(message.t_ns).pop(key, None)
+        if key == self._pulse:
+            self._beats[message.t_ns] = message.seq
+        if key in self._meters:
+            self._meters[key].count(message)
+
+    def next_gate_ns(self) -> int | None:
+        """Return the earliest gate that is not taken, as far as closing messages tell."""
+        if not self._gates:
+            return None
+        skipped_ns = self._skipped_ns(self._gates[0])
+        return self._gates[0] if skipped_ns is None else skipped_ns
+
+    def _skipped_ns(self, t_ns: int) -> int | None:
+        """Return the gate after the last one taken if t_ns is not that gate but a later one."""
+        if t_ns not in self._beats or self._last_beat is None:
+            return None
+        last_ns, last_seq = self._last_beat
+        gates = self._beats[t_ns] - last_seq
+        next_ns = last_ns + (t_ns - last_ns) // gates if 1 < gates <= GAP_MAX + 1 else -1
+        return next_ns if next_ns > self._taken_ns else None
+
+    def latest_gate_ns(self) -> int | None:
+        """Return the latest gate for which a closing message has come."""
+        return self._gates[-1] if self._gates else None
+
+    def missing(self, t_ns: int) -> str | None:
+        """Return a key that the gate still lacks, None when it is complete."""
+        for key in self._lacking.get(t_ns, self._closing):
+            if self._expects(key, t_ns):
+                return key
+        for key, meter in self._meters.items():
+            if meter.counts and meter.short(t_ns) and self._expects(key, t_ns):
+                return key
+        return None
+
+    def missing_last(self, t_ns: int) -> str | None:
+        """Return the missing key that stands last among the closing keys: whoever sleeps until it comes wakes once."""
+        for key in reversed(self._lacking.get(t_ns, self._closing)):
+            if self._expects(key, t_ns):
+                return key
+        return self.missing(t_ns)
+
+    def lost(self, t_ns: int) -> str | None:
+        """Return a missing key whose message will not come any more: its publisher has gone on without it."""
+        key = self.missing(t_ns)
+        if key is None or key not in self._lacking.get(t_ns, self._closing):
+            return key
+        return key if any(key not in self._lacking[gate] for gate in self._gates if gate > t_ns) else None
+
+    def _expects(self, key: str, t_ns: int) -> bool:
+        return t_ns >= self._expected_from_ns.get(key, ALWAYS_NS)
+
+    def take(self, t_ns: int) -> list[tuple[str, Any]]:
+        """Return all inputs stamped up to t_ns in order of (t_ns, key, seq), and forget them."""
+        ready: list[tuple[str, Any]] = []
+        for stamp in _cut(self._stamps, t_ns):
+            stamped = self._waiting.pop(stamp)
+            ready += stamped.values() if len(stamped) == 1 else map(stamped.__getitem__, sorted(stamped))
+        if self._keep_late:
+            ready = self._with_belated(ready)
+        for gate_ns in _cut(self._gates, t_ns):
+            del self._lacking[gate_ns]
+            if gate_ns in self._beats:
+                self._last_beat = (gate_ns, self._beats.pop(gate_ns))
+        for meter in self._meters.values():
+            if meter.partial or meter.counts or meter.came:
+                meter.forget(t_ns)
+        self._taken_ns = t_ns
+        return ready
+
+    def _with_belated(self, ready: list[tuple[str, Any]]) -> list[tuple[str, Any]]:
+        """Put what came late in front, and note what is handed out."""
+        belated = sorted(self._belated.values(), key=lambda entry: (entry[1].t_ns, entry[0], entry[1].seq))
+        self._belated.clear()
+        for key, message in (*belated, *ready):
+            self._newest[key] = max(self._newest.get(key, ALWAYS_NS), message.t_ns)
+        return [*belated, *ready]
+
+    def ignore(self, key: str) -> None:
+        """Wait for a key no longer: its publisher is dropped from the run."""
+        self._expected_from_ns[key] = NEVER_NS
+
+    def expect(self, key: str, from_ns: int = ALWAYS_NS) -> None:
+        """Wait for a key again, from the gate `from_ns` on."""
+        self._expected_from_ns[key] = from_ns
+
+    def start_after(self, t_ns: int) -> None:
+        """Ignore everything up to and including t_ns; the next gate is counted in full."""
+        self.take(t_ns)
+
+
+class _Meter:
+    """Compares what has come of a drone's sensors with what its status counts.
+
+    The first gate of a late joiner is not compared, since it began before the joiner was there; a status with
+    seq 0 counts from the beginning.
+
+    Attributes:
+        came: stamps of the drone's messages that wait, sorted.
+        counts: stamps of the drone's statuses that wait, and what they count; a meter without any is not short.
+        partial: whether nothing is compared yet.
+    """
+
+    def __init__(self) -> None:
+        self.came: list[int] = []
+        self.counts: list[tuple[int, int]] = []
+        self.partial = True
+
+    def count(self, status: Any) -> None:
+        insort(self.counts, (status.t_ns, status.count))
+        if status.seq == 0:
+            self.partial = False
+
+    def short(self, t_ns: int) -> bool:
+        """Tell whether sensor messages of the gates up to t_ns are still to come."""
+        if self.partial:
+            return False
+        due = sum(count for _, count in self.counts[: self._until(t_ns)])
+        return bisect_right(self.came, t_ns) < due
+
+    def forget(self, t_ns: int) -> None:
+        _cut(self.came, t_ns)
+        del self.counts[: self._until(t_ns)]
+        self.partial = False
+
+    def _until(self, t_ns: int) -> int:
+        """Return how many of the counts are of gates up to t_ns."""
+        return bisect_right(self.counts, t_ns, key=itemgetter(0))
+
+
+def _insert(stamps: list[int], t_ns: int) -> None:
+    """Put a stamp into a sorted list; nearly always it is the latest."""
+    if not stamps or t_ns >= stamps[-1]:
+        stamps.append(t_ns)
+    else:
+        insort(stamps, t_ns)
+
+
+def _cut(stamps: list[int], t_ns: int) -> list[int]:
+    """Take the stamps up to t_ns off a sorted list and return them."""
+    place = bisect_right(stamps, t_ns)
+    taken = stamps[:place]
+    del stamps[:place]
+    return taken

@@ -1,0 +1,212 @@
+"""What faults of the links make of the messages of a gate, in their receiver: now, later, or never. Pure.
+
+    inbox ──all messages of a gate──▶ LinkFaults ──▶ agent
+
+The barrier has seen the messages; only the agent does not, or sees them later. Whether a message is lost, and how
+late it comes, is drawn from the stream of its link by what the message is (key, t_ns, seq), so that neither the order
+of arrival nor a restart of the receiver changes a draw.
+"""
+
+import hashlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from zsim.contract import batch, keys
+from zsim.contract.bundle import Selection
+from zsim.contract.messages import Estimate, Fault, Faults
+from zsim.errors import DecodeError
+from zsim.scenario import fault_kinds
+
+WORLD = "world"
+KINDS = frozenset(name for name, kind in fault_kinds.KINDS.items() if kind.strikes in ("link", "radio"))
+NEVER = None  # as a delay: the message does not come
+Point = Sequence[float]
+Where = Callable[[str], Point | None]
+"""Returns where a drone is in W [m], None where that is not known."""
+
+
+def uniform(seed: int, link: str, fault: Fault, key: str, t_ns: int, seq: int) -> float:
+    """Return the number in [0, 1) that a message draws from the stream of a link for a fault.
+
+    The first 53 bits of BLAKE2b: as even as a double can be, and the same on every machine.
+    """
+    text = f"{seed}|{link}|{fault.kind}|{fault.target}|{fault.from_ns}|{fault.rank}|{key}|{t_ns}|{seq}"
+    digest = hashlib.blake2b(text.encode(), digest_size=8).digest()
+    return (int.from_bytes(digest, "big") >> 11) * 2.0**-53
+
+
+def senders(key: str, message: Any) -> tuple[str, ...]:
+    """Return the names of who has sent a message.
+
+    Estimators and controllers may share a process and be published by one of them: they go by what the key is about.
+    """
+    kind, whose, what = keys.parts(key)
+    if kind == "drone" and what.startswith("cmd/"):
+        return (message.source,)
+    if kind == "drone" and what == "estimate":
+        return _doing(f"estimator.{whose}", message.source)
+    if kind == "cluster":
+        return _doing(f"controller.{whose}", getattr(message, "source", ""))
+    return (whose,) if kind == "process" else (WORLD,)
+
+
+def _doing(role: str, source: str) -> tuple[str, ...]:
+    """Return a role, and who else does its work."""
+    shared = source.partition(".")[0] in ("estimator", "controller")
+    return (role,) if shared or not source else (role, source)
+
+
+def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
+    """Tell whether a fault is of the link from one of some names to another."""
+    first, _, second = fault.target.partition("/")
+    if second == to and first in froms:
+        return True
+    return first == to and second in froms and not fault.parameters["one_way"]
+
+
+def heard(distance_m: float, range_m: float, spread_m: float) -> float:
+    """Return the probability that a message comes over a radio: 1 / (1 + exp((d - range) / spread))."""
+    return 1.0 / (1.0 + math.exp(min((distance_m - range_m) / spread_m, 700.0)))  # exp(700) is the last finite one
+
+
+def place_of(process: str, places: Mapping[str, Any], where: Where) -> Point | None:
+    """Return where a process is [m; W]: where `places` has it, on its drone, or at the origin."""
+    place = places.get(process)
+    if place is None:
+        role, _, thing = process.partition(".")
+        place = thing if role == "estimator" else fault_kinds.ORIGIN
+    return where(place) if isinstance(place, str) else place
+
+
+def delay_ns(fault: Fault, draw: float, distance_m: float | None = None) -> int | None:
+    """Return by how much a message comes later for a fault that acts on it; NEVER if it does not.
+
+    Args:
+        draw: its number of the link's stream.
+        distance_m: between sender and receiver, for a radio; None where it is not known.
+    """
+    p = fault.parameters
+    if fault.kind == "link_delay":
+        return math.ceil(p["delay_ms"] * 1e6)
+    if fault.kind == "link_jitter":
+        return math.ceil(draw * p["jitter_ms"] * 1e6)
+    if fault.kind == "link_loss":
+        return NEVER if draw < p["probability"] else 0
+    if fault.kind == "radio":
+        comes = distance_m is None or draw < heard(distance_m, p["range_m"], p["spread_m"])
+        return 0 if comes else NEVER
+    return NEVER  # link_cut
+
+
+class LinkFaults:
+    """Keeps back, of the messages that one receiver is handed at a gate, what its links do not bring yet or ever.
+
+    Args:
+        names: of the receiver; an estimator of several drones has the name of each one's.
+        reads: its key expressions.
+        seed: of the scenario.
+        gate_ns: the interval of the gates.
+        clusters: name and drones of each.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        reads: Sequence[str],
+        seed: int,
+        gate_ns: int,
+        clusters: Mapping[str, Sequence[str]],
+    ) -> None:
+        self._names = tuple(names)
+        self._seed = seed
+        self._gate_ns = gate_ns
+        self._clusters = clusters
+        self._selection = Selection(reads)
+        self._seq = -1
+        self._faults: list[Fault] = []
+        self._later: list[tuple[int, str, Any]] = []  # the gate at which it comes, key, message
+        self._positions: dict[str, Point] = {}
+
+    def heed(self, told: Faults) -> None:
+        """Learn which faults there are; an older list than the last one says nothing."""
+        if told.seq <= self._seq:
+            return
+        self._seq = told.seq
+        self._faults = [fault for fault in told.faults if fault.kind in KINDS and self._concerns(fault)]
+
+    def _concerns(self, fault: Fault) -> bool:
+        return fault.kind == "radio" or any(name in fault.target.split("/") for name in self._names)
+
+    def through(self, t_ns: int, inputs: Sequence[tuple[str, Any]]) -> Sequence[tuple[str, Any]]:
+        """Return what the receiver is handed at the gate t_ns, in order of (t_ns, key, seq).
+
+        Args:
+            inputs: what has come for that gate, in the same order; a bundle only where it is read as one.
+        """
+        acting = [fault for fault in self._faults if fault_kinds.acts(fault, t_ns)]
+        if not acting and not self._later:
+            return inputs
+        if acting:
+            inputs = self._unbundled(inputs)
+            self._note_positions(inputs)
+        coming = [entry for entry in self._later if entry[0] <= t_ns]
+        self._later = [entry for entry in self._later if entry[0] > t_ns]
+        handed = [(key, message) for _, key, message in coming]
+        handed += [(key, message) for key, message in inputs if self._comes_now(t_ns, key, message, acting)]
+        return sorted(handed, key=lambda entry: (entry[1].t_ns, entry[0], entry[1].seq))
+
+    def _unbundled(self, inputs: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
+        """Return all messages one by one, in canonical order within a gate."""
+        single: list[tuple[str, Any]] = []
+        for key, message in inputs:
+            try:
+                single += self._selection.of(message) if key == batch.GATE else [(key, message)]
+            except DecodeError:
+                continue  # not the world's: it is as good as lost
+        return single
+
+    def _note_positions(self, inputs: Sequence[tuple[str, Any]]) -> None:
+        for key, message in inputs:
+            if type(message) is Estimate:
+                self._positions[keys.thing(key)] = message.position_m
+
+    def _comes_now(self, t_ns: int, key: str, message: Any, acting: Sequence[Fault]) -> bool:
+        """Tell whether a message is handed over at once; keep it if it comes later."""
+        late_ns = self._delay_ns(key, message, acting)
+        if late_ns is None:
+            return False
+        gate_ns = -(-(message.t_ns + late_ns) // self._gate_ns) * self._gate_ns
+        if late_ns == 0 or gate_ns <= t_ns:
+            return True
+        self._later.append((gate_ns, key, message))
+        return False
+
+    def _delay_ns(self, key: str, message: Any, acting: Sequence[Fault]) -> int | None:
+        froms, to, total_ns = senders(key, message), self._receiver(key), 0
+        for fault in acting:
+            radio = fault.kind == "radio"
+            if not (self._on_the_air(fault, key, to) if radio else joins(fault, froms, to)):
+                continue
+            draw = uniform(self._seed, to, fault, key, message.t_ns, message.seq)
+            late_ns = delay_ns(fault, draw, self._distance_m(fault, key, to) if radio else None)
+            if late_ns is None:
+                return NEVER
+            total_ns += late_ns
+        return total_ns
+
+    def _receiver(self, key: str) -> str:
+        """Return the name under which the receiver takes a key: of several estimators, that of the drone's."""
+        stock = f"estimator.{keys.thing(key)}" if keys.is_sensor(key) else ""
+        return stock if stock in self._names else self._names[0]
+
+    def _on_the_air(self, fault: Fault, key: str, to: str) -> bool:
+        """Tell whether a message is sent by a drone of the fault's to a process that is not on it."""
+        kind, drone, _ = keys.parts(key)
+        drones = self._clusters.get(fault.target)
+        return kind == "drone" and to != f"estimator.{drone}" and (drones is None or drone in drones)
+
+    def _distance_m(self, fault: Fault, key: str, to: str) -> float | None:
+        there = self._positions.get(keys.thing(key))
+        here = place_of(to, fault.parameters["place"], self._positions.get)
+        return math.dist(there, here) if there is not None and here is not None else None

@@ -1,0 +1,247 @@
+"""A process's place in a run: it joins, says what it is through with, catches up, and comes back after a lost link.
+
+What the world does not answer stays owed, and is asked for again until it does.
+"""
+
+import os
+import secrets
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+
+from zsim import __version__
+from zsim.contract import batch, keys, messages
+from zsim.contract.fingerprint import fingerprint
+from zsim.contract.world_events import Entry
+from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.replay import replay
+from zsim.transport.connection import read_info
+from zsim.transport.session import Sample, Session
+
+REPLAY_S = 2.0  # a hub answers a replay within milliseconds; a lost link does not
+REJOINS_MAX = 6  # times that a return is said before it is taken for granted; a router forwards nothing at first
+RETRY_S = 0.5  # wall time between two attempts at what is owed
+ASKED_MAX = 10  # answers to what is lost that may lack it; the world answers from what it has on the way, too
+GATES_KEPT = 2  # gates of which the outputs are kept to answer a get, contract; more where the world runs ahead
+
+
+class Membership:
+    """One agent's process in one run.
+
+    Args:
+        link: an open session.
+        info: of the run.
+        agent: whose name and sequence numbers it goes by.
+        take_in: takes what a replay brings.
+        say: told what a person should know.
+        wall_s: monotonic wall time.
+
+    Attributes:
+        done_ns: newest gate that it is through with, -1 before the first.
+        failure: why it can take part no longer, None while it can.
+    """
+
+    def __init__(
+        self,
+        link: Session,
+        info: messages.Info,
+        agent: Agent,
+        take_in: Callable[[Sample], None],
+        say: Callable[[str], None],
+        wall_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._link = link
+        self._info = info
+        self._agent = agent
+        self._take_in = take_in
+        self._say = say
+        self._wall_s = wall_s
+        self._incarnation = secrets.randbits(62)
+        self._done_key = keys.process(agent.name, "done")
+        ahead = info.command_delay_ns // info.gate_ns
+        self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
+        self._unsent: batch.Batch = []
+        self._must_rejoin = False
+        self._unproved = 0
+        self._proof_ns = 0
+        self._missed_since_ns: int | None = None
+        self._asked_ns = -1
+        self._asked = 0
+        self._retry_s = 0.0
+        self.done_ns = -1
+        self.failure: RunError | None = None
+
+    # Taking part
+
+    def warm_start(self) -> int | None:
+        """Hand the agent what a former incarnation published last; return the time of it, None if there was none."""
+        for key in self._agent.warm_start_keys():
+            for sample in self._link.get(key):
+                self._hand_over(key, sample.payload)
+        if self.done_ns < 0:
+            return None
+        self._say(f"{self._agent.name}: warm start from t = {self.done_ns / 1e9:.2f} s")
+        return self.done_ns
+
+    def _hand_over(self, key: str, payload: bytes) -> None:
+        try:
+            message = messages.decode(key, payload)
+        except DecodeError as error:
+            self._say(f"{self._agent.name}: cold start, the last value is of no use: {error}")
+            return
+        self._agent.warm_start(key, message)
+        self._agent.resume_seq(key, message.seq)
+        self.done_ns = max(self.done_ns, message.t_ns)
+
+    def enter(self) -> None:
+        """Join; after a warm start, go on where the former incarnation was."""
+        self._join()
+        if self.done_ns >= 0:
+            self._link.put(self._done_key, self._done(self.done_ns, 0))
+            self._catch_up(self.done_ns)
+
+    def publish(self, t_ns: int, outputs: Sequence[Output]) -> None:
+        """Encode the outputs of a gate and the done that counts them, for `send`."""
+        self._kept.append((t_ns, outputs))
+        encoded = [(key, messages.encode(message)) for key, message in outputs]
+        encoded.append((self._done_key, messages.encode(self._done(t_ns, len(outputs)))))
+        self._unsent += encoded
+
+    def send(self) -> None:
+        """Put what was published since the last time, in one go: many messages at once cost fewer wake-ups."""
+        if self._unsent:
+            unsent, self._unsent = self._unsent, []
+            self._link.put_all(unsent)
+
+    def outputs(self) -> list[list[object]]:
+        """Return [key, payload] of the outputs of the last gates, for a world that lost them with a link."""
+        return [[key, messages.encode(message)] for _, outputs in self._kept for key, message in outputs]
+
+    def leave(self, reason: str) -> None:
+        """Say bye."""
+        bye = messages.Bye(max(0, self.done_ns), self._agent.next_seq("bye"), reason)
+        self._link.put(keys.process(self._agent.name, "bye"), bye)
+
+    def _join(self) -> None:
+        join = messages.Join(
+            t_ns=max(0, self.done_ns),
+            seq=self._agent.next_seq("join"),
+            run_id=self._info.run_id,
+            incarnation=self._incarnation,
+            role=self._agent.role,
+            host=self._link.host,
+            pid=os.getpid(),
+            period_ns=self._agent.period_ns,
+            version=__version__,
+            fingerprint=fingerprint(),
+            serves=self._agent.serves,
+        )
+        self._link.put(keys.process(self._agent.name, "join"), join)
+
+    def _done(self, t_ns: int, sent: int) -> messages.Done:
+        self.done_ns = max(self.done_ns, t_ns)
+        seq = self._agent.next_seq("done")
+        return messages.Done(t_ns, seq, self._info.run_id, self._incarnation, t_ns, sent)
+
+    # Catching up and coming back
+
+    @property
+    def owes(self) -> bool:
+        """Tell whether something was asked of the world that it has not answered yet."""
+        return self._must_rejoin or self._unproved > 0 or self._missed_since_ns is not None
+
+    def taken_in(self, entry: Entry) -> None:
+        """Take the news that this process came after one of its name, or that another came after this one."""
+        if entry.incarnation == self._incarnation:
+            self._unproved = 0
+            if self.done_ns < 0:
+                self._catch_up(max(entry.from_ns - 1, entry.done_ns))
+        elif entry.former_pid == os.getpid() and entry.pid != os.getpid():
+            self.failure = SupersededError(
+                f"{self._agent.name}: another process of this name joined from {entry.host} "
+                f"(pid {entry.pid}); this one ends. Give each process its own name."
+            )
+
+    def ask_again(self, t_ns: int, missing: str) -> None:
+        """Fetch the rest of a gate of which messages did not come, as after a link that was cut."""
+        if t_ns != self._asked_ns:
+            self._asked_ns, self._asked, self._retry_s = t_ns, 0, 0.0
+            self._say(f"{self._agent.name}: {missing} of t = {t_ns / 1e9:.2f} s did not come; asking for it again")
+        if self._asked >= ASKED_MAX:
+            self.failure = BehindError(
+                f"{self._agent.name}: {missing} of t = {t_ns / 1e9:.2f} s is kept by nobody any more; this one ends, "
+                "start it again"
+            )
+            return
+        self._missed_since_ns = t_ns - self._info.gate_ns
+        self.settle()
+
+    def come_back(self) -> None:
+        """Take part again by a new incarnation, now that the link is back."""
+        self._incarnation = secrets.randbits(62)
+        self._must_rejoin = True
+        self._retry_s = 0.0
+        self.settle()
+
+    def _catch_up(self, since_ns: int) -> None:
+        """Fetch what is stamped after `since_ns`."""
+        self._missed_since_ns = since_ns
+        self._retry_s = 0.0
+        self.settle()
+
+    def settle(self) -> None:
+        """Do what is owed, unless it was tried a moment ago; what the world does not answer stays owed."""
+        if not self.owes or self._wall_s() < self._retry_s:
+            return
+        if self._must_rejoin:
+            self._rejoin()
+        elif self._unproved:
+            self._insist()
+        if self._missed_since_ns is not None and not self._must_rejoin:
+            self._fetch(self._missed_since_ns)
+        self._retry_s = self._wall_s() + RETRY_S
+
+    def _rejoin(self) -> None:
+        """Join again, and say once more what may have been lost."""
+        info = read_info(self._link)
+        if info is None:
+            return
+        self._must_rejoin = False
+        if info.run_id != self._info.run_id:
+            self.failure = RunError(f"{self._agent.name}: the world has begun another run")
+            return
+        self._unproved, self._proof_ns = REJOINS_MAX, self.done_ns + GATES_KEPT * self._info.command_delay_ns
+        self._say_again()
+
+    def _insist(self) -> None:
+        """Say again what may not have got through, unless the world has gone on with what this process said."""
+        self._unproved -= 1
+        if self.done_ns > self._proof_ns:
+            self._unproved = 0
+        else:
+            self._say_again()
+
+    def _say_again(self) -> None:
+        """Join, and repeat what the world may lack."""
+        self._join()
+        for t_ns, outputs in self._kept:
+            for key, message in outputs:
+                self._link.put(key, message)
+            self._link.put(self._done_key, self._done(t_ns, len(outputs)))
+        self._missed_since_ns = self.done_ns
+
+    def ask_faults(self) -> None:
+        """Take in which faults are injected."""
+        for sample in self._link.get(keys.FAULTS):
+            self._take_in(sample)
+
+    def _fetch(self, since_ns: int) -> None:
+        self.ask_faults()
+        try:
+            for key, payload in replay(self._link, self._agent.name, since_ns, self._agent.reads, REPLAY_S):
+                self._take_in(Sample(key, payload))
+        except NoWorldError:
+            return
+        self._missed_since_ns = None
+        self._asked += 1

@@ -1,0 +1,286 @@
+"""What no single field of a scenario can know: names that must agree, distances, times that must divide.
+
+Works on what is sound of a document (`faults.sound`): a check whose fields are missing or faulty is left out.
+"""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from zsim.scenario import fault_check
+from zsim.scenario.obstacle import nearest, row_of
+from zsim.scenario.scenario import SEA_HEIGHT_MAX_M, kinematics
+from zsim.scenario.sensor_presets import BOARD_RATE_HZ
+from zsim.schema.checker import Fault, show
+
+START_SEPARATION_MIN_M = 0.6  # m, two hulls of 0.515 m side by side (OpenMAS, weighed and measured)
+START_CLEARANCE_MIN_M = 0.3  # m, a hull's radius of 0.26 m, and room
+FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
+TEMPLATE_ROBOTS_MIN = 3  # fewer are in one line
+TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: anything is; where a formation may fly, the controller asks for more
+LIFT_SHARE_MAX = 0.9  # of what the rotors lift; the rest is left for control
+
+
+def cross_faults(scenario: Any) -> Iterator[Fault]:
+    """Yield every fault between fields of a scenario, or of the sound parts of one."""
+    drones, clusters = _entries(scenario.drones), _entries(scenario.clusters)
+    yield from _name_faults("drones", drones)
+    yield from _name_faults("clusters", clusters)
+    yield from _time_faults(scenario.time)
+    yield from _start_faults(drones)
+    yield from _obstacle_faults(_entries(scenario.environment and scenario.environment.obstacles), drones)
+    for index, drone in drones:
+        yield from ((f"drones[{index}].{path}", text) for path, text in _drone_faults(drone, scenario))
+    yield from _membership_faults(drones, clusters)
+    for index, cluster in clusters:
+        yield from ((f"clusters[{index}].{path}", text) for path, text in _plan_faults(cluster))
+    for index, cluster in clusters:
+        yield from ((f"clusters[{index}].{path}", text) for path, text in _shape_faults(cluster, drones))
+    yield from _process_faults(scenario.processes, drones, clusters)
+    yield from _injected_faults(scenario, drones, clusters)
+    yield from _window_faults(scenario.report)
+
+
+_Entries = list[tuple[int, Any]]
+
+
+def _entries(items: list[Any] | None) -> _Entries:
+    return [(index, item) for index, item in enumerate(items or ()) if item is not None]
+
+
+def _names(entries: _Entries) -> list[str]:
+    return [item.name for _, item in entries if item.name is not None]
+
+
+def _known(*values: Any) -> bool:
+    return all(value is not None for value in values)
+
+
+def _name_faults(path: str, entries: _Entries) -> Iterator[Fault]:
+    first: dict[str, int] = {}
+    for index, item in entries:
+        if item.name is not None and first.setdefault(item.name, index) != index:
+            yield f"{path}[{index}].name", f"is {item.name!r}, as {path}[{first[item.name]}]; must be unique"
+
+
+def _time_faults(time: Any) -> Iterator[Fault]:
+    if time is None:
+        return
+    gate_us = time.gate_ms * 1000 if _known(time.gate_ms) else 0.0
+    dt_us = time.physics_dt_ms * 1000 if _known(time.physics_dt_ms) else FIRMWARE_STEP_US
+    step_ms = FIRMWARE_STEP_US / 1000
+    if gate_us % FIRMWARE_STEP_US:
+        yield "time.gate_ms", f"is {time.gate_ms:g}; must be a multiple of {step_ms:g} (the firmware's step)"
+    if dt_us % 1 or FIRMWARE_STEP_US % dt_us:
+        yield "time.physics_dt_ms", f"is {time.physics_dt_ms:g}; must divide {step_ms:g} (the firmware's step)"
+
+
+def _start_faults(drones: _Entries) -> Iterator[Fault]:
+    placed = [(index, drone) for index, drone in drones if drone.position_m is not None]
+    positions = np.array([drone.position_m for _, drone in placed], dtype=float).reshape(-1, 3)
+    for place, (index, _) in enumerate(placed):
+        if positions[place, 2] < 0:
+            yield f"drones[{index}].position_m[2]", f"is {positions[place, 2]:g}; must be >= 0 (the ground)"
+        distances = np.linalg.norm(positions[:place] - positions[place], axis=1)
+        if place and distances.min() < START_SEPARATION_MIN_M:
+            nearest, other = placed[int(distances.argmin())]
+            yield (
+                f"drones[{index}].position_m",
+                f"is {distances.min():.2f} m from {other.name or f'drones[{nearest}]'!r}; "
+                f"must be >= {START_SEPARATION_MIN_M} m",
+            )
+
+
+_SIZES = {"box": ("size_m",), "cylinder": ("radius_m", "height_m"), "sphere": ("radius_m",)}
+
+
+def _obstacle_faults(obstacles: _Entries, drones: _Entries) -> Iterator[Fault]:
+    """Yield what is wrong with obstacles: names, sizes, and drones that start in one."""
+    yield from _name_faults("environment.obstacles", obstacles)
+    names = _names(drones)
+    for index, obstacle in obstacles:
+        path = f"environment.obstacles[{index}]"
+        if obstacle.name in names:
+            yield f"{path}.name", f"is {obstacle.name!r}, as a drone; must be another"
+        wanted = _SIZES.get(obstacle.shape)
+        if wanted is None:
+            continue
+        given = [name for name in ("size_m", "radius_m", "height_m") if getattr(obstacle, name) is not None]
+        for name in wanted:
+            if name not in given:
+                yield f"{path}.{name}", f"is missing; must be given for a {obstacle.shape}"
+        for name in given:
+            if name not in wanted:
+                yield f"{path}.{name}", f"is given; must be left out of a {obstacle.shape}"
+        if sorted(given) == sorted(wanted) and _known(obstacle.position_m, obstacle.yaw_deg):
+            yield from _buried_faults(obstacle, drones)
+
+
+def _buried_faults(obstacle: Any, drones: _Entries) -> Iterator[Fault]:
+    row = row_of(obstacle)
+    for index, drone in drones:
+        if drone.position_m is not None:
+            distance = nearest(row, *drone.position_m)[0]
+            if distance < START_CLEARANCE_MIN_M:
+                found = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
+                yield f"drones[{index}].position_m", f"{found}; must be >= {START_CLEARANCE_MIN_M} m"
+
+
+def _drone_faults(drone: Any, scenario: Any) -> Iterator[Fault]:
+    low, high = drone.rotor_min_rad_s, drone.rotor_max_rad_s
+    if _known(low, high) and low >= high:
+        yield "rotor_min_rad_s", f"is {low:g}; must be < rotor_max_rad_s ({high:g})"
+    gravity = scenario.environment and scenario.environment.gravity_m_s2
+    if _known(drone.mass_kg, drone.thrust_n_s2, high, gravity):
+        most = LIFT_SHARE_MAX * 4 * drone.thrust_n_s2 * high**2 / gravity
+        if drone.mass_kg >= most:
+            yield (
+                "mass_kg",
+                f"is {drone.mass_kg:g}; must be < {most:.3f}, nine tenths of what its rotors lift",
+            )
+    yield from _height_faults(drone, scenario.environment and scenario.environment.height_m)
+    if drone.sensors is not None:
+        yield from ((f"sensors.{path}", text) for path, text in _sensor_faults(drone.sensors))
+
+
+def _height_faults(drone: Any, origin_m: float | None) -> Iterator[Fault]:
+    heights = {
+        "position_m[2]": drone.position_m and drone.position_m[2],
+        "limits.altitude_m": drone.limits and drone.limits.altitude_m,
+    }
+    for path, height_m in heights.items():
+        if _known(origin_m, height_m) and origin_m + height_m > SEA_HEIGHT_MAX_M:
+            limit = f"with environment.height_m ({origin_m:g}) it must be <= {SEA_HEIGHT_MAX_M} m above the sea"
+            yield path, f"is {height_m:g}; {limit}"
+
+
+def _sensor_faults(sensors: Any) -> Iterator[Fault]:
+    if sensors.as_printed and sensors.preset == "ardrone2":
+        yield "as_printed", "is true; must be false unless preset is paper"
+    if sensors.imu and _known(sensors.imu.rate_hz) and sensors.imu.rate_hz > BOARD_RATE_HZ:
+        most = f"{BOARD_RATE_HZ:g}, the rate of the navigation board"
+        yield "imu.rate_hz", f"is {sensors.imu.rate_hz:g}; must be <= {most}"
+    sonar = sensors.sonar
+    if sonar and _known(sonar.min_m, sonar.max_m) and sonar.min_m >= sonar.max_m:
+        yield "sonar.min_m", f"is {sonar.min_m:g}; must be < max_m ({sonar.max_m:g})"
+
+
+def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
+    known = _names(drones)
+    judged = len(known) == len(drones) and bool(drones)
+    owner: dict[str, str] = {}
+    for index, cluster in clusters:
+        called = cluster.name or f"clusters[{index}]"
+        for place, name in _entries(cluster.drones):
+            path = f"clusters[{index}].drones[{place}]"
+            if name in owner:
+                yield path, f"is {name!r}, which {owner[name]!r} flies already; a drone is in one cluster"
+            elif judged and name not in known:
+                yield path, f"is {name!r}; must be one of the drones {_listed(list(dict.fromkeys(known)))}"
+            owner.setdefault(name, called)
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:20]) + (f", … ({len(names)})" if len(names) > 20 else "")
+
+
+def _shape_faults(cluster: Any, drones: _Entries) -> Iterator[Fault]:
+    """Yield what is wrong with the groups and templates of a cluster."""
+    if not _known(cluster.drones, cluster.groups) or None in cluster.groups:
+        return
+    placed = {drone.name: drone.position_m for _, drone in drones if _known(drone.name)}
+    starts = [placed.get(name) for name in cluster.drones]
+    groups = _entries(cluster.groups)
+    yield from _group_faults(cluster, groups)
+    centres: list[Any] = []
+    for index, group in groups:
+        if group.size is None:
+            return
+        own, starts = starts[: group.size], starts[group.size :]
+        yield from ((f"groups[{index}].{path}", text) for path, text in _template_faults(group, own, group.size))
+        centres.append(np.array(own, dtype=float).mean(axis=0) if own and _known(*own) else None)
+    robots = len(groups) or len(cluster.drones)
+    yield from _template_faults(cluster, centres if groups else starts, robots)
+
+
+def _group_faults(cluster: Any, groups: _Entries) -> Iterator[Fault]:
+    yield from _name_faults("groups", groups)
+    if len(groups) == 1:
+        yield "groups", "has 1 entry; must have none, or 2 or more"
+    sizes = [group.size for _, group in groups]
+    if groups and _known(*sizes) and sum(sizes) != len(cluster.drones):
+        yield "groups", f"has sizes that add up to {sum(sizes)}; must be {len(cluster.drones)}, one for each drone"
+
+
+def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Fault]:
+    """Yield what is wrong with a formation of so many robots, or with where they stand at the start."""
+    given = spec.template_m
+    if given is None or robots < 2:
+        return
+    if kinematics(spec.space, robots, bool(given)) == "triad":
+        if given:
+            yield "template_m", "is given; must be left out where space is triad"
+    elif robots < TEMPLATE_ROBOTS_MIN:
+        path = "space" if spec.space else "template_m"
+        yield path, f"asks for a template of {robots} robots; must be {TEMPLATE_ROBOTS_MIN} or more"
+    elif given and len(given) != robots:
+        yield "template_m", f"has {len(given)} places; must have {robots}, one for each robot"
+    elif given and _known(*given) and _in_line(given):
+        yield "template_m", f"is in one line, within {TEMPLATE_WIDTH_MIN_M:g} m; must span a plane or space"
+    elif not given and len(starts) == robots and _known(*starts) and _in_line(starts):
+        yield "template_m", "is missing, and the robots start in one line; must be given, or space must be triad"
+
+
+def _in_line(places: list[Any]) -> bool:
+    """Return whether places (n, 3) are within a line, in the root mean square."""
+    p = np.array(places, dtype=float)
+    widths = np.linalg.svd(p - p.mean(axis=0), compute_uv=False) / np.sqrt(len(p))
+    return bool(np.hypot(*widths[1:]) < TEMPLATE_WIDTH_MIN_M)
+
+
+def _plan_faults(cluster: Any) -> Iterator[Fault]:
+    trajectory = cluster.plan and cluster.plan.trajectory
+    if not trajectory:
+        return
+    expressions, waypoints = trajectory.expressions, trajectory.waypoints
+    if _known(expressions, waypoints) and bool(expressions) == bool(waypoints):
+        yield "plan.trajectory", "has both or neither of expressions and waypoints; must have one of them"
+    for (_, before), (index, after) in pairwise(_entries(waypoints)):
+        if _known(before.at_s, after.at_s) and after.at_s <= before.at_s:
+            path = f"plan.trajectory.waypoints[{index}].at_s"
+            yield path, f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
+
+
+def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
+    first: dict[str, int] = {}
+    things = {"estimator": ("drone", drones), "controller": ("cluster", clusters)}
+    for index, name in _entries(processes and processes.expect):
+        if first.setdefault(name, index) != index:
+            yield f"processes.expect[{index}]", f"is {name!r}, as expect[{first[name]}]; must be unique"
+        role, _, thing = name.partition(".")
+        kind, entries = things.get(role, ("", []))
+        known = _names(entries)
+        if kind and thing not in known and len(known) == len(entries):
+            named = _listed(known) or f"a {kind}, and there is none"
+            allowed = f"must be {role}.NAME of {named}, or a name of your own"
+            yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
+
+
+def _injected_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
+    """Yield what is wrong with the faults that a scenario injects, if it is known who could be their targets."""
+    if any(item.name is None for _, item in [*drones, *clusters]) or not drones:
+        return
+    expected = scenario.processes and scenario.processes.expect
+    processes = tuple(name for name in expected or () if name is not None)
+    known = fault_check.Known(tuple(_names(drones)), tuple(_names(clusters)), processes)
+    for index, given in _entries(scenario.faults):
+        for path, text in fault_check.flaws(given, known):
+            yield f"faults[{index}]{f'.{path}' if path else ''}", text
+
+
+def _window_faults(report: Any) -> Iterator[Fault]:
+    window = report and report.window_s
+    if window is not None and not 0 <= window[0] < window[1]:
+        yield "report.window_s", f"is {show(list(window))}; must be [start, end] with 0 <= start < end"

@@ -1,0 +1,329 @@
+"""What a scenario says: typed, immutable, every quantity with its unit in its name.
+
+A file is read by `scenario_file.load`; the limits written here are the ones that its faults quote.
+"""
+
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta, Struct, field
+
+from zsim.scenario.sensor_presets import G_M_S2, SEA_LEVEL_KG_M3
+
+TEMPLATE_FROM = 5  # robots; below it the variables of the triad are fewer to name, and as well conditioned
+DRONES_MAX = 1000  # one world integrates them all
+OBSTACLES_MAX = 1000  # every drone is compared with each, in every step
+FAULTS_MAX = 1000  # injected ones, planned and active; each is looked at wherever one begins or ends
+ROBOTS_MAX = 64  # drones of a cluster; beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
+SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
+
+# LARGE keeps squares and products of what is given finite; it is beyond any quantity of a flight in SI units.
+LARGE = 1e9
+Name = Annotated[str, Meta(pattern=r"^[a-z0-9_.-]{1,32}\Z")]
+Real = Annotated[float, Meta(ge=-LARGE, le=LARGE)]
+Positive = Annotated[float, Meta(gt=0, le=LARGE)]
+NonNegative = Annotated[float, Meta(ge=0, le=LARGE)]
+Fraction = Annotated[float, Meta(ge=0, le=1)]
+Coordinate = Annotated[float, Meta(ge=-100_000, le=100_000)]  # m; beyond it a tangent plane is no map
+Vector3 = tuple[Real, Real, Real]
+Position = tuple[Coordinate, Coordinate, Coordinate]
+
+
+class Spec(Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of every section: unknown keys are faults, not surprises."""
+
+
+class ErrorModel(Spec, frozen=True, kw_only=True):
+    """Error of one channel, in the channel's unit."""
+
+    noise: NonNegative = 0.0
+    """White, standard deviation per sample."""
+    density: NonNegative = 0.0
+    """White, per sqrt(Hz): adds density * sqrt(rate) in quadrature to `noise`."""
+    bias: NonNegative = 0.0
+    """Constant over a run, standard deviation over runs, per axis."""
+    bias_walk: NonNegative = 0.0
+    """Random walk of the bias, per sqrt(s)."""
+    quantum: NonNegative = 0.0
+    """Step of the converter; 0 = none."""
+
+
+class Mount(Spec, frozen=True, kw_only=True):
+    """Pose of the sensor in the body, X_BS."""
+
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    rpy_deg: Vector3 = (0.0, 0.0, 0.0)
+
+
+class Sensor(Spec, frozen=True, kw_only=True):
+    """What all sensors share."""
+
+    rate_hz: Annotated[float, Meta(ge=0.01, le=1000)]
+    latency_ms: Annotated[float, Meta(ge=0, le=10_000)] = 0.0
+    dropout: Fraction = 0.0
+    """Probability that a sample is lost, independent per sample."""
+    mount: Mount = Mount()
+
+
+class Imu(Sensor, frozen=True, kw_only=True):
+    accel_m_s2: ErrorModel = ErrorModel()
+    gyro_deg_s: ErrorModel = ErrorModel()
+
+
+class Gps(Sensor, frozen=True, kw_only=True):
+    position_m: ErrorModel = ErrorModel()
+    velocity_m_s: ErrorModel = ErrorModel()
+
+
+class Mag(Sensor, frozen=True, kw_only=True):
+    field_ut: ErrorModel = ErrorModel()
+
+
+class Baro(Sensor, frozen=True, kw_only=True):
+    altitude_m: ErrorModel = ErrorModel()
+
+
+class Sonar(Sensor, frozen=True, kw_only=True):
+    range_m: ErrorModel = ErrorModel()
+    min_m: NonNegative = 0.03
+    max_m: Positive = 6.0
+
+
+class Flow(Sensor, frozen=True, kw_only=True):
+    velocity_m_s: ErrorModel = ErrorModel()
+
+
+class Sensors(Spec, frozen=True, kw_only=True):
+    """The sensors of one drone, after preset and overrides."""
+
+    preset: Literal["ardrone2", "paper"]
+    as_printed: bool = False
+    """With `paper`: accelerometer 0.35 g as the paper prints it, instead of 0.35 m/s^2."""
+    imu: Imu
+    gps: Gps
+    mag: Mag
+    baro: Baro
+    sonar: Sonar
+    flow: Flow
+
+
+class Limits(Spec, frozen=True, kw_only=True):
+    """What the firmware allows a commander; defaults and ranges of the SDK's outdoor set where it has them."""
+
+    tilt_deg: Annotated[float, Meta(gt=0, le=30)] = 20.0  # outdoor_euler_angle_max, 0.349 rad
+    horizontal_speed_m_s: Annotated[float, Meta(gt=0, le=10)] = 5.0  # chosen, the SDK has none; 20 deg hold 6 m/s
+    vertical_speed_m_s: Annotated[float, Meta(ge=0.2, le=2)] = 1.0  # outdoor_control_vz_max
+    yaw_rate_deg_s: Annotated[float, Meta(gt=0, le=350)] = 200.0  # outdoor_control_yaw, 3.49 rad/s
+    altitude_m: Positive = 100.0  # altitude_max: what it takes for no limit
+
+
+class Drone(Spec, frozen=True, kw_only=True):
+    """One aircraft; the defaults are the AR.Drone 2.0 (Li 2014 through AuRoRA, zsim_world/vehicle.py)."""
+
+    name: Name
+    model: Literal["ardrone2"] = "ardrone2"
+    position_m: Position
+    yaw_deg: Real = 0.0
+    mass_kg: Annotated[float, Meta(gt=0, le=100)] = 0.429
+    inertia_kg_m2: tuple[Positive, Positive, Positive] = (2.237568e-3, 2.985236e-3, 4.80374e-3)
+    arm_m: Annotated[float, Meta(gt=0, le=10)] = 0.1785
+    thrust_n_s2: Positive = 8.048e-6
+    torque_nm_s2: Positive = 2.423e-7
+    rotor_time_constant_s: Annotated[float, Meta(ge=0.005, le=1)] = 0.030
+    rotor_min_rad_s: NonNegative = 126.0
+    rotor_max_rad_s: Positive = 503.0
+    drag_n_s_m: NonNegative = 0.249
+    battery_mah: Positive = 1000.0
+    battery_percent: Annotated[float, Meta(ge=0, le=100)] = 100.0
+    takeoff_height_m: Annotated[float, Meta(ge=0.3, le=5)] = 1.0
+    limits: Limits = Limits()
+    sensors: Sensors
+
+
+class Wind(Spec, frozen=True, kw_only=True):
+    """Steady wind and Dryden gusts, `gust_m_s` being the standard deviation per axis.
+
+    The form is that of MIL-HDBK-1797; its lengths, for aeroplanes high above the ground, are not used.
+    """
+
+    steady_m_s: Vector3 = (0.0, 0.0, 0.0)
+    gust_m_s: NonNegative = 0.0
+    gust_length_m: Positive = 10.0  # chosen: eddies about as large as the flight is high
+    gust_speed_min_m_s: Positive = 2.0  # chosen: with 10 m, gusts on a hovering drone last 5 s
+    gust_correlation: Fraction = 0.5  # chosen: drones some metres apart share half of the variance
+
+
+class Obstacle(Spec, frozen=True, kw_only=True):
+    """A solid that drones run into: a box and a cylinder stand upright, a sphere is where it is."""
+
+    name: Name
+    shape: Literal["box", "cylinder", "sphere"]
+    position_m: Position
+    size_m: tuple[Positive, Positive, Positive] | None = None
+    radius_m: Positive | None = None
+    height_m: Positive | None = None
+    yaw_deg: Real = 0.0
+
+
+class Environment(Spec, frozen=True, kw_only=True):
+    """The field of the flight: default Buenos Aires, where the paper comes from."""
+
+    latitude_deg: Annotated[float, Meta(ge=-90, le=90)] = -34.603
+    longitude_deg: Annotated[float, Meta(ge=-180, le=180)] = -58.368
+    height_m: Annotated[float, Meta(ge=-100_000, le=SEA_HEIGHT_MAX_M)] = 25.0
+    gravity_m_s2: Positive = G_M_S2
+    magnetic_field_ut: Vector3 = (-2.8, 17.8, 14.0)  # ENU, within 0.4 uT of IGRF-14 there on 1 January 2013
+    air_density_kg_m3: Positive = SEA_LEVEL_KG_M3
+    wind: Wind = Wind()
+    obstacles: Annotated[list[Obstacle], Meta(max_length=OBSTACLES_MAX)] = []
+
+
+class Silence(Spec, frozen=True, kw_only=True):
+    """What the firmware does when the commander falls silent, in simulated time."""
+
+    hover_s: Positive = 0.5  # chosen: 25 gates, long against any delay of a link, short against a collision
+    land_s: Positive = 2.0  # after that; the AR.Drone's com_watchdog
+
+
+class Gains(Spec, frozen=True, kw_only=True):
+    """Of the cluster controller; see zsim_agents/formation.py.
+
+    All chosen. The loop is unstable from a proportional gain of about 2 1/s on, and answers well from 0.5 to 0.8.
+    """
+
+    proportional_1_s: Annotated[float, Meta(gt=0, le=2)] = 0.6
+    integral_1_s2: Annotated[float, Meta(ge=0, le=0.5)] = 0.05  # takes a steady wind's offset away within half a minute
+    horizontal_speed_m_s: Positive = 1.5  # a third of what the firmware allows: the rest is for the wind
+    vertical_speed_m_s: Positive = 0.8  # of the 1 m/s that the firmware allows
+    yaw_rate_deg_s: Positive = 60.0  # of 200 deg/s; a turning drone lags across its way
+    separation_min_m: NonNegative = 2.0  # about four hulls; estimates err by 0.2 m along a side
+    separation_alarm_m: NonNegative = 1.5  # about three hulls
+
+
+class Waypoint(Spec, frozen=True, kw_only=True):
+    at_s: NonNegative
+    values: dict[str, Real]
+
+
+class Trajectory(Spec, frozen=True, kw_only=True):
+    """A reference as expressions of t (seconds since `start_s`) or as waypoints."""
+
+    start_s: NonNegative = 0.0
+    constants: dict[str, Real] = {}
+    expressions: dict[str, str] = {}
+    waypoints: list[Waypoint] = []
+
+
+class Plan(Spec, frozen=True, kw_only=True):
+    """What the controller does by itself."""
+
+    takeoff_s: NonNegative | None = None
+    target: dict[str, Real] = {}
+    target_over_s: Positive | None = None
+    trajectory: Trajectory | None = None
+    land_s: NonNegative | None = None
+
+
+Kinematics = Literal["triad", "template"]
+"""How the variables of a formation follow from its robots; a robot is a drone, or a group of them."""
+
+
+class Group(Spec, frozen=True, kw_only=True):
+    """So many of a cluster's drones, the next ones in its order, that are one robot of it."""
+
+    name: Name
+    size: Annotated[int, Meta(ge=2)]
+    space: Kinematics | None = None
+    template_m: list[Vector3] = []
+
+
+class Cluster(Spec, frozen=True, kw_only=True):
+    name: Name
+    drones: Annotated[list[Name], Meta(min_length=2, max_length=ROBOTS_MAX)]
+    groups: list[Group] = []
+    """Empty: every drone is a robot of the cluster by itself."""
+    space: Kinematics | None = None
+    """None: see `kinematics`."""
+    template_m: list[Vector3] = []
+    """Places of the robots, x ahead and y left of the formation; empty: as they stand at the start."""
+    gains: Gains = Gains()
+    plan: Plan = Plan()
+
+
+class Estimation(Spec, frozen=True, kw_only=True):
+    """Settings of the estimators; noise figures come from the drone's own sensors."""
+
+    madgwick_beta: Annotated[float, Meta(ge=0, le=1)] | None = None
+    """rad/s; None: chosen from the accelerometer's noise."""
+    gate_probability: Annotated[float, Meta(gt=0.5, lt=1)] = 0.9999
+    magnetometer: bool = True
+    flow: bool = True
+
+
+OnDeath = Literal["wait", "restart", "drop", "end"]
+
+
+class Processes(Spec, frozen=True, kw_only=True):
+    """Who takes part. `expect: null` means an estimator per drone and a controller per cluster."""
+
+    expect: list[Name] | None = None
+    on_death: dict[str, OnDeath] = {}
+
+
+class Time(Spec, frozen=True, kw_only=True):
+    """Steps of simulated time; all chosen."""
+
+    gate_ms: Annotated[float, Meta(gt=0, le=1000)] = 20.0  # 50 Hz, against the formation loop's 1.7 s
+    physics_dt_ms: Annotated[float, Meta(gt=0, le=20)] = 2.5  # a twelfth of the rotors' lag, the fastest motion
+    command_delay_gates: Annotated[int, Meta(ge=1, le=50)] = 1  # the least with which world and agents work at once
+    max_command_age_ms: Positive = 500.0  # as silence.hover_s: an older command counts as silence
+
+
+class Figures(Spec, frozen=True, kw_only=True):
+    """Windows of the statistics, in simulated seconds; None: the last two thirds of the run."""
+
+    window_s: tuple[Real, Real] | None = None
+
+
+class Scenario(Spec, frozen=True, kw_only=True):
+    """A whole run."""
+
+    name: Name
+    federation: Name = "zsim"
+    seed: Annotated[int, Meta(ge=0, le=2**62)] = 1
+    duration_s: Annotated[float, Meta(gt=0, le=1e6)]
+    time: Time = Time()
+    environment: Environment = Environment()
+    silence: Silence = Silence()
+    drones: Annotated[list[Drone], Meta(min_length=1, max_length=DRONES_MAX)]
+    clusters: list[Cluster] = []
+    estimation: Estimation = Estimation()
+    processes: Processes = Processes()
+    faults: Annotated[list[dict[str, Any]], Meta(max_length=FAULTS_MAX)] = []
+    """Faults to inject, each a map; `fault_flaws` says what they may be."""
+    report: Figures = field(default_factory=Figures)
+
+    def drone(self, name: str) -> Drone:
+        """Return the drone of that name; KeyError if there is none."""
+        return {drone.name: drone for drone in self.drones}[name]
+
+    def cluster(self, name: str) -> Cluster:
+        """Return the cluster of that name; KeyError if there is none."""
+        return {cluster.name: cluster for cluster in self.clusters}[name]
+
+    def expected(self) -> list[str]:
+        """Return the names of the processes without which a run does not start."""
+        if self.processes.expect is not None:
+            return list(self.processes.expect)
+        estimators = [f"estimator.{drone.name}" for drone in self.drones]
+        return estimators + [f"controller.{cluster.name}" for cluster in self.clusters]
+
+
+class Document(Scenario, frozen=True, kw_only=True):
+    """What a file may say: a scenario, and what all its drones share."""
+
+    sensors: Sensors | None = None
+
+
+def kinematics(space: Kinematics | None, robots: int, template: bool) -> Kinematics:
+    """Return the space of so many robots: as said, else a template where one is given or from five robots on."""
+    return space or ("template" if template or robots >= TEMPLATE_FROM else "triad")

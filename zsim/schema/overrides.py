@@ -1,0 +1,96 @@
+"""Overrides of a scenario document: texts `a.b.c=value`, entries of lists by place or by name."""
+
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, get_args
+
+from msgspec import Struct, structs
+
+from zsim.scenario.scenario import Document
+from zsim.schema.checker import show
+
+SYNTAX = "a.b.c=value, e.g. drones.drone2.mass_kg=0.5 or environment.wind.gust_m_s=0.5"
+_STEP = re.compile(r"([^.\[\]]+)|\[([^\[\]]+)\]")  # one step of a path: a word, or anything between brackets
+_FIRST = re.compile(r"[^.\[\]]+")
+_PATH = re.compile(r"([^.\[\]]+|\[[^\[\]]+\])(\.[^.\[\]]+|\[[^\[\]]+\])*")
+
+
+def apply(document: dict[str, Any], text: str, parse: Callable[[str], Any]) -> str | None:
+    """Apply one override to a raw document; return the fault if there is one, and then nothing has changed.
+
+    Args:
+        document: changed in place.
+        text: as given, e.g. "drones[2].yaw_deg=90".
+        parse: turns the text of a value into the value; its ValueError says what is wrong.
+    """
+    path, equals, given = text.partition("=")
+    if not equals or not _PATH.fullmatch(path):
+        return f"{_name(text)}: is no assignment; must be {SYNTAX}"
+    try:
+        _assign(document, steps_of(path), parse(given))
+    except ValueError as error:
+        return f"{_name(text)}: {error}"
+    return None
+
+
+def steps_of(path: str) -> list[str]:
+    """Return the steps of a path from the top of a scenario: fields, and entries by place or by name."""
+    return [word or bracket for word, bracket in _STEP.findall(whole_path(path))]
+
+
+def whole_path(path: str) -> str:
+    """Return the path of a field from the top of a scenario.
+
+    The name of a section may be left out where only one section has such a field: wind.gust_m_s stands for
+    environment.wind.gust_m_s.
+    """
+    first = _FIRST.match(path)
+    sections = {field.name: field for field in _fields(Document)}
+    if first is None or first[0] in sections:
+        return path
+    owners = [name for name, field in sections.items() if any(f.name == first[0] for f in _fields(field.type))]
+    return f"{owners[0]}.{path}" if len(owners) == 1 else path
+
+
+def _fields(kind: Any) -> Sequence[Any]:
+    """Return the fields of a section, none of any other type; a section may be one that need not be given."""
+    sections = [each for each in (kind, *get_args(kind)) if isinstance(each, type) and issubclass(each, Struct)]
+    return structs.fields(sections[0]) if sections else ()
+
+
+def _assign(document: dict[str, Any], steps: list[str], value: Any) -> None:
+    place: Any = document
+    for depth, step in enumerate(steps[:-1]):
+        place = _inside(place, step, steps[:depth])
+    if isinstance(place, list):
+        place[_index(place, steps[-1], steps[:-1])] = value
+    elif isinstance(place, dict):
+        place[steps[-1]] = value
+    else:
+        raise ValueError(f"{'.'.join(steps[:-1])} is {show(place)}; must be a map or a list")
+
+
+def _inside(place: Any, step: str, path: list[str]) -> Any:
+    """Return what stands at one step; a section that is not there, or empty, begins here."""
+    if isinstance(place, list):
+        return place[_index(place, step, path)]
+    if not isinstance(place, dict):
+        raise ValueError(f"{'.'.join(path)} is {show(place)}; must be a map or a list")
+    if place.get(step) is None:
+        place[step] = {}
+    return place[step]
+
+
+def _index(place: list[Any], step: str, path: list[str]) -> int:
+    names = [item.get("name") if isinstance(item, dict) else None for item in place]
+    if step in names:
+        return names.index(step)
+    if re.fullmatch(r"[0-9]{1,9}", step) and int(step) < len(place):
+        return int(step)
+    known = ", ".join(str(name) for name in names if isinstance(name, str))
+    allowed = f"0 to {len(place) - 1}{' or ' if known else ''}{known}" if place else "nothing, it is empty"
+    raise ValueError(f"{step[:40]} is not in {'.'.join(path)}; allowed: {allowed}")
+
+
+def _name(text: str) -> str:
+    return f"--set {text if len(text) <= 80 and text.isprintable() else show(text)}"

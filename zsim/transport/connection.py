@@ -1,0 +1,138 @@
+"""Finding the world: connect, read `world/info`, wait with progress when there is none yet."""
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from functools import partial
+
+from zsim.contract import keys, messages
+from zsim.errors import DecodeError, NoWorldError, SessionError
+from zsim.transport import session
+from zsim.transport.identity import Identity
+from zsim.transport.session import Session
+
+ATTEMPT_S = 1.0  # one try to connect, so that waiting can be shown and interrupted
+PAUSE_S = 0.1  # between two questions to a hub where no world answers: another federation's, or one on its way up
+ANSWER_S = 1.0  # a hub that is there answers within milliseconds, unless it still compiles
+
+
+@contextmanager
+def find_world(
+    endpoint: str,
+    federation: str,
+    wait_s: float | None = None,
+    say: Callable[[str], None] = lambda text: None,
+    stopped: Callable[[], bool] = lambda: False,
+    reader: bool = False,
+    run_id: str | None = None,
+    identity: Identity | None = None,
+) -> Iterator[tuple[Session, messages.Info]]:
+    """Yield a session and the `world/info` of the run that it belongs to.
+
+    Args:
+        endpoint: where the world (or a router) listens.
+        federation: its name.
+        wait_s: how long to wait for a world; None waits for ever.
+        say: told at growing intervals whom it waits for.
+        stopped: asked while waiting.
+        reader: it does not gate; see `session.connect`.
+        run_id: of the only run to take part in; None takes any.
+        identity: see `session.connect`.
+
+    Raises:
+        NoWorldError: no world answered within `wait_s`, or `stopped` said so.
+        SessionError: what no waiting mends: a malformed endpoint, a certificate that is refused.
+        BadNameError: the federation's name is outside the contract.
+    """
+    keys.name(federation, "federation")
+    with ExitStack() as stack:
+        dial = partial(session.connect, endpoint, federation, reader=reader, identity=identity)
+        link, info = _search(stack, dial, endpoint, federation, wait_s, say, stopped, run_id, identity)
+        if info.mode == "realtime":
+            stack.pop_all().close()
+            link = stack.enter_context(dial(mode="realtime", wait_s=5.0))
+        link.use(info.mode)
+        yield link, info
+
+
+def _search(
+    stack: ExitStack,
+    dial: Callable[..., AbstractContextManager[Session]],
+    endpoint: str,
+    federation: str,
+    wait_s: float | None,
+    say: Callable[[str], None],
+    stopped: Callable[[], bool],
+    run_id: str | None,
+    identity: Identity | None,
+) -> tuple[Session, messages.Info]:
+    start_s, next_say_s = time.monotonic(), 0.0
+    link: Session | None = None
+    while not stopped():
+        waited_s = time.monotonic() - start_s
+        left_s = float("inf") if wait_s is None else wait_s - waited_s
+        try:
+            if link is None:
+                attempt_s = max(0.05, min(ATTEMPT_S, left_s))
+                link = stack.enter_context(dial(wait_s=attempt_s))
+            info = read_info(link)
+            if info is not None and run_id in (None, info.run_id):
+                return link, info
+            time.sleep(PAUSE_S)
+        except SessionError as error:
+            _refuse_lasting(error)
+        if waited_s >= (wait_s if wait_s is not None else float("inf")):
+            why = _no_answer(identity) if link is not None else _no_link(endpoint)
+            raise NoWorldError(f"no world of federation {federation!r} on {endpoint} within {wait_s:g} s{why}")
+        if waited_s >= next_say_s:
+            next_say_s = max(2 * next_say_s, 1.0)
+            say(f"waiting for a world of {federation!r} on {endpoint} ({waited_s:.0f} s)")
+    raise NoWorldError(f"stopped while waiting for a world on {endpoint}")
+
+
+def _refuse_lasting(error: SessionError) -> None:
+    """Raise again what no waiting mends."""
+    if "nobody listens" not in str(error) or "not supported" in str(error):
+        raise error
+
+
+def _no_answer(identity: Identity | None) -> str:
+    """Return why a hub that is there may not answer; Zenoh does not tell those whom it lets do nothing."""
+    may_be = ", but somebody listens there: another federation, a world on its way up, a router without one"
+    if identity is None or identity.tls is None:
+        return f"{may_be}; correct --federation, or wait longer"
+    return (
+        f"{may_be}, or we are refused or not allowed here; correct --federation, wait longer, "
+        "or let us in with `zsim certs init --operator` and start the world again"
+    )
+
+
+def _no_link(endpoint: str) -> str:
+    """Return why there is no session; a port that opens nevertheless is one of somebody who speaks otherwise."""
+    if not _opens(endpoint):
+        return "; start one with `zsim world`"
+    return ", but who listens there refuses us; if it is a world with TLS, say tls/ and give --tls FOLDER"
+
+
+def _opens(endpoint: str) -> bool:
+    """Tell whether anybody takes a connection to an endpoint without TLS."""
+    protocol, _, place = endpoint.partition("/")
+    if protocol != "tcp":
+        return False
+    host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), ANSWER_S):
+            return True
+    except (OSError, OverflowError, ValueError):
+        return False
+
+
+def read_info(link: Session) -> messages.Info | None:
+    """Return the `world/info` that the hub answers, None if nobody does."""
+    for sample in link.get(keys.INFO, timeout_s=ANSWER_S):
+        try:
+            return messages.decode(keys.INFO, sample.payload)
+        except DecodeError as error:
+            raise NoWorldError(f"{error}; is the world of another version?") from error
+    return None

@@ -1,0 +1,171 @@
+"""Why a TLS link does not come up, in words: Zenoh says no more than that it could not connect.
+
+Python's ssl does the same handshake with the same files and is told the reason. Dates are left to this file, so that
+a certificate whose time is over can still be read and named.
+"""
+
+import contextlib
+import ipaddress
+import re
+import socket
+import ssl
+import time
+from typing import Any
+
+from zsim.transport.identity import CERTIFICATES, Identity
+
+PROBE_S = 2.0  # of one step of the handshake; a process that listens and is not frozen answers within milliseconds
+LATE_S = 1.0  # in TLS 1.3 a server judges the client's certificate after the client thinks that all is well
+NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME, openssl/x509_vfy.h
+NETWORKED = ("tcp", "udp", "ws")  # of what Zenoh's wheel has without encryption; the others stay on the machine
+MEND = "make new ones with zsim certs init"
+RENEW = f"{MEND} --renew"
+
+_ENDPOINT = re.compile(r"(?:tls|quic)/\[?(?P<host>[^\]]*?)\]?:(?P<port>\d+)(?:[?#].*)?")
+_UNRELATED = (18, 19, 20, 21)  # X509_V_ERR_ self-signed, self-signed in chain, no issuer here, signature unverified
+_MISNAMED = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
+
+
+def is_tls(endpoint: str) -> bool:
+    """Tell whether a link of an endpoint is encrypted."""
+    return endpoint.startswith(("tls/", "quic/"))
+
+
+def leaves_machine(endpoint: str) -> bool:
+    """Tell whether a link of an endpoint goes over a network; what is no endpoint does not."""
+    protocol, _, place = endpoint.partition("/")
+    host = (place.rpartition(":")[0] or place).strip("[]")
+    if protocol not in NETWORKED or host == "localhost":
+        return False
+    try:
+        return not ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return True
+
+
+def own_fault(identity: Identity) -> str | None:
+    """Return what is wrong with a process's own files, None if nothing is."""
+    assert identity.tls is not None
+    for name in CERTIFICATES:
+        try:
+            with open(identity.tls / name, "rb") as file:
+                file.read(1)
+        except OSError as error:
+            return (
+                f"{identity.tls / name}: cannot be read ({error.strerror}); --tls needs a folder with "
+                f"{', '.join(CERTIFICATES[:2])} and {CERTIFICATES[2]}, as zsim certs init makes"
+            )
+    try:
+        found = _read_own(identity)
+    except (ssl.SSLError, ValueError) as error:
+        return f"{identity.tls}: certificate.pem, key.pem and ca.pem do not go together ({_reason(error)}); {MEND}"
+    return _date_fault(found)
+
+
+def no_link(identity: Identity, endpoint: str, error: str) -> str:
+    """Return why a client did not come in, in a line; `error` is what Zenoh says."""
+    fault = peer_fault(identity, endpoint)
+    if fault:
+        return f"cannot connect to {endpoint}: {fault}"
+    return f"nobody listens on {endpoint}; start a world there ({error})"
+
+
+def peer_fault(identity: Identity, endpoint: str) -> str | None:
+    """Return why a handshake with whoever listens on an endpoint fails.
+
+    None where it does not fail, and where nobody listens or answers: that may change by waiting.
+    """
+    place = _ENDPOINT.fullmatch(endpoint)
+    if identity.tls is None or place is None:
+        return None
+    try:
+        with socket.create_connection((place["host"], int(place["port"])), PROBE_S) as plain:
+            return _shake(_client(identity), plain, place["host"], endpoint)
+    except OSError:
+        return None
+
+
+def _shake(context: ssl.SSLContext, plain: socket.socket, host: str, endpoint: str) -> str | None:
+    try:
+        with context.wrap_socket(plain, server_hostname=host) as link:
+            fault = _date_fault(link.getpeercert() or {})
+            if fault is None:
+                link.settimeout(LATE_S)
+                with contextlib.suppress(TimeoutError):
+                    link.recv(1)
+            return fault
+    except ssl.SSLError as error:
+        return _words(error, host, endpoint)
+
+
+def _client(identity: Identity) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.load_verify_locations(identity.authority)
+    context.load_cert_chain(identity.certificate, identity.key)
+    context.verify_flags |= NO_CHECK_TIME
+    return context
+
+
+def _words(error: ssl.SSLError, host: str, endpoint: str) -> str | None:
+    """Return an error of the handshake in words; None where it may be gone at the next try."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        if error.verify_code in _UNRELATED:
+            return f"the certificate of who listens there is of another authority than ours; {MEND} and use one set"
+        if error.verify_code in _MISNAMED:
+            return f"the certificate of who listens there is not for {host}; name it in the hosts file and {MEND}"
+        return f"the certificate of who listens there is refused ({error.verify_message}); {MEND}"
+    reason = error.reason or ""
+    if "EXPIRED" in reason:
+        return f"our certificate has expired by the clock of who listens there; {RENEW}"
+    if "UNKNOWN_CA" in reason or "DECRYPT_ERROR" in reason:
+        return f"our certificate is of another authority than that of who listens there; {MEND} and use one set"
+    if "ALERT" in reason:
+        return f"who listens there refuses our certificate ({_reason(error)}); {MEND}"
+    if "WRONG_VERSION" in reason or "RECORD_LAYER" in reason or "HTTP" in reason:
+        return f"who listens there speaks no TLS; start it with --tls, or say tcp/ instead of {endpoint.split('/')[0]}/"
+    return None
+
+
+def _reason(error: Exception) -> str:
+    reason = getattr(error, "reason", None) or str(error)
+    return reason.lower().replace("_", " ")
+
+
+def _date_fault(found: dict[str, Any]) -> str | None:
+    """Return whether a certificate's time is over, or not yet come."""
+    if not found:
+        return None
+    now_s = time.time()
+    if now_s > ssl.cert_time_to_seconds(found["notAfter"]):
+        return f"the certificate of {_name(found)} expired on {_day(found['notAfter'])}; {RENEW}"
+    if now_s < ssl.cert_time_to_seconds(found["notBefore"]):
+        return f"the certificate of {_name(found)} is valid from {_day(found['notBefore'])}; set the clock of this host"
+    return None
+
+
+def _name(found: dict[str, Any]) -> str:
+    names = dict(pair for part in found["subject"] for pair in part)
+    return names.get("commonName", "nobody")
+
+
+def _day(text: str) -> str:
+    return time.strftime("%Y-%m-%d", time.gmtime(ssl.cert_time_to_seconds(text)))
+
+
+def _read_own(identity: Identity) -> dict[str, Any]:
+    """Return what a process's own certificate says, by a handshake with itself in memory.
+
+    Raises:
+        ssl.SSLError: key, certificate and authority do not belong together.
+    """
+    server_side = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    server_side.load_cert_chain(identity.certificate, identity.key)
+    client_side = _client(identity)
+    client_side.check_hostname = False
+    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
+    server = server_side.wrap_bio(there, back, server_side=True)
+    client = client_side.wrap_bio(back, there)
+    for side in (client, server, client):
+        with contextlib.suppress(ssl.SSLWantReadError):
+            side.do_handshake()
+    return client.getpeercert() or {}

@@ -1,0 +1,150 @@
+"""What a session is configured with, as {path in Zenoh's configuration: JSON5}; reasons in docs/decisions/0002.
+
+Order of this file: link and timing, TLS, access control.
+"""
+
+import json
+from collections.abc import Sequence
+from typing import Any, Literal
+
+from zsim.errors import SessionError
+from zsim.transport import tls
+from zsim.transport.identity import Identity
+
+LEASE_LOCKSTEP_MS = 3_600_000  # a stopped or debugged process must not lose its link in lockstep
+LEASE_REALTIME_MS = 1_000
+# Nobody waits for one that only reads: nobody would name it when it is stopped, nor need it be missed within a second.
+LEASE_READER_MS = 10_000
+CLOSE_AFTER_US = 3_600_000_000  # -1 means for ever and panics in 1.10.2
+# A stopped reader (a recorder, `zsim echo`) fills its link and then holds up the hub and everybody; it loses its link.
+# A stopped participant does not: time stands before its link is full.
+HUB_CLOSE_AFTER_US = 10_000_000
+CONNECT_RETRY_MS = 100
+
+_CLOSE_AFTER = "transport/link/tx/queue/congestion_control/block/wait_before_close"
+_TLS = "transport/link/tls"
+ACCESS = "access_control"
+
+Mode = Literal["lockstep", "realtime"]
+Settings = dict[str, str]
+
+
+def common(mode: str, timing: Mode, reader: bool = False) -> Settings:
+    """Return what every session has.
+
+    Args:
+        mode: Zenoh's: client, peer or router.
+        timing: of the run.
+        reader: it does not gate.
+    """
+    lease = LEASE_READER_MS if reader else LEASE_REALTIME_MS if timing == "realtime" else LEASE_LOCKSTEP_MS
+    return {
+        "mode": json.dumps(mode),
+        "scouting/multicast/enabled": "false",
+        "scouting/gossip/enabled": "false",
+        "connect/retry": f"{{period_init_ms: {CONNECT_RETRY_MS}, period_max_ms: {2 * CONNECT_RETRY_MS}}}",
+        "transport/link/tx/lease": str(lease),
+        _CLOSE_AFTER: str(CLOSE_AFTER_US),
+    }
+
+
+def listening(endpoints: Sequence[str], identity: Identity) -> Settings:
+    """Return what a hub or a router has beside it: it needs its port, and gives up on who takes nothing.
+
+    Raises:
+        SessionError: endpoints and identity do not go together, or a file of the identity is of no use.
+    """
+    return {
+        "listen/endpoints": json.dumps(list(endpoints)),
+        "listen/exit_on_failure": "true",
+        _CLOSE_AFTER: str(HUB_CLOSE_AFTER_US),
+        **_security(identity, endpoints, "listen on"),
+    }
+
+
+def connecting(endpoint: str, identity: Identity, wait_s: float) -> Settings:
+    """Return what a client has beside it; it tries for `wait_s`.
+
+    Raises:
+        SessionError: as for `listening`.
+    """
+    return {
+        "connect/endpoints": json.dumps([endpoint]),
+        "connect/timeout_ms": str(int(1000 * wait_s)),
+        **_security(identity, [endpoint], "connect to"),
+    }
+
+
+def hub() -> Settings:
+    """Return what the hub has beside it: nobody is above it, so opening waits for none to be found.
+
+    A router keeps Zenoh's half a second, in which it learns from the one above who answers there.
+    """
+    return {"scouting/delay": "0"}
+
+
+def upstream(endpoint: str, identity: Identity) -> Settings:
+    """Return what a router has beside it: it tries for ever to reach what is above it."""
+    return connecting(endpoint, identity, 0.0) | {"connect/exit_on_failure": "false", "connect/timeout_ms": "-1"}
+
+
+def _security(identity: Identity, endpoints: Sequence[str], doing: str) -> Settings:
+    """Return TLS with a certificate on both sides, and access control."""
+    _agree(identity, endpoints)
+    if identity.tls is None:
+        return {}
+    fault = tls.own_fault(identity)
+    if fault:
+        raise SessionError(f"cannot {doing} {', '.join(endpoints)}: {fault}")
+    files = {
+        "root_ca_certificate": identity.authority,
+        "listen_certificate": identity.certificate,
+        "listen_private_key": identity.key,
+        "connect_certificate": identity.certificate,
+        "connect_private_key": identity.key,
+    }
+    found = {f"{_TLS}/{name}": json.dumps(str(path.resolve())) for name, path in files.items()}
+    found[f"{_TLS}/enable_mtls"] = "true"
+    if identity.access is not None:
+        found[ACCESS] = json.dumps(_read_access(identity))
+    return found
+
+
+def refusal(path: str, value: str, identity: Identity) -> str:
+    """Return what to say of a setting that Zenoh refuses: only endpoints and access control come from a person."""
+    if path == ACCESS:
+        return f"{identity.access}: is no access control of Zenoh's; must be an access.json of zsim certs init"
+    found = ", ".join(map(repr, json.loads(value)))
+    return f"endpoint is {found}; must be PROTOCOL/ADDRESS such as tcp/127.0.0.1:7447"
+
+
+def _agree(identity: Identity, endpoints: Sequence[str]) -> None:
+    """Refuse what would be less secure than it looks."""
+    for endpoint in endpoints:
+        secure = tls.is_tls(endpoint)
+        if secure and identity.tls is None:
+            raise SessionError(f"{endpoint}: needs a certificate; give --tls the folder that zsim certs init made")
+        if not secure and identity.tls is not None:
+            raise SessionError(f"{endpoint}: is not encrypted; with --tls it must be tls/ADDRESS:PORT")
+        if not secure and not identity.insecure and tls.leaves_machine(endpoint):
+            raise SessionError(
+                f"{endpoint}: is not encrypted and leaves this machine; give --tls and a tls/ endpoint (zsim certs "
+                "init makes certificates), or --insecure on a network that is nobody else's"
+            )
+    if identity.access is not None and identity.tls is None:
+        raise SessionError(f"{identity.access}: access control goes by certificate; give --tls too")
+
+
+def _read_access(identity: Identity) -> Any:
+    """Return the access control of a file; Zenoh judges its content."""
+    assert identity.access is not None
+    try:
+        return json.loads(identity.access.read_bytes())
+    except OSError as error:
+        raise SessionError(
+            f"{identity.access}: cannot be read ({error.strerror}); zsim certs init makes access.json"
+        ) from error
+    except ValueError as error:
+        raise SessionError(
+            f"{identity.access}: is not JSON ({error}); must be an access.json of zsim certs init"
+        ) from error
