@@ -1,5 +1,5 @@
 function cluster_cases(path)
-    % Print what triad and cluster_step make of the cases in a JSON file; tests/unit/test_octave_cluster.py compares.
+    % Print what triad and cluster_step make of the cases in a JSON file; tests/unit/clients/test_octave_cluster.py compares.
     %
     %   maps     robots p_W, yaw and their rates r_dot, a reference c_des with its rate, integral, dt_s, v_W
     %   flights  gates: what the estimates say; targets: from which gate on which target

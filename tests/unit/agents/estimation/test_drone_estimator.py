@@ -1,0 +1,439 @@
+"""The estimator of one drone on flights of known truth."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from synthetic_flight import GATE_S, Flight, Reading, estimator, feed, fly, readings, scenario
+
+from zsim_agents.estimation.drone_estimator import DroneEstimator, Estimate
+from zsim_agents.estimation.estimator_prior import LEVELLING_S, madgwick_beta
+from zsim_agents.estimation.madgwick import levelling_time_s
+
+NAN, INF = math.nan, math.inf
+AIDING = ("gps", "mag", "baro", "sonar", "flow")
+
+
+def flown(seed: int = 1, end_s: float = 20.0, **sections):
+    """Return scenario, flight, readings and the estimates of a flight."""
+    of = scenario(**sections)
+    flight = Flight(seed)
+    coming = readings(flight, of, seed, end_s)
+    return of, flight, coming, fly(estimator(of), coming, end_s)
+
+
+def position_errors(flight: Flight, estimates, after_s: float = 0.0) -> np.ndarray:
+    t = np.array([t for t, _ in estimates if t > after_s])
+    return np.array([e.position_m for t, e in estimates if t > after_s]) - flight.position(t)
+
+
+def velocity_errors(flight: Flight, estimates, after_s: float = 0.0) -> np.ndarray:
+    t = np.array([t for t, _ in estimates if t > after_s])
+    return np.array([e.velocity_m_s for t, e in estimates if t > after_s]) - flight.velocity(t)
+
+
+def heading_errors(flight: Flight, estimates, after_s: float = 0.0) -> np.ndarray:
+    t = np.array([t for t, _ in estimates if t > after_s])
+    error = np.array([e.yaw_rad for t, e in estimates if t > after_s]) - flight.heading(t)
+    return np.angle(np.exp(1j * error))
+
+
+def rms(error: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(error**2, axis=0))
+
+
+def covariance(estimate: Estimate) -> np.ndarray:
+    return np.array(estimate.covariance).reshape(6, 6)
+
+
+def nees(flight: Flight, estimates, after_s: float) -> float:
+    """Mean over time of e^T P^-1 e of position and velocity."""
+    error = np.hstack([position_errors(flight, estimates, after_s), velocity_errors(flight, estimates, after_s)])
+    P = np.array([covariance(e) for t, e in estimates if t > after_s])
+    return float(np.mean(np.einsum("ni,ni->n", error, np.linalg.solve(P, error[:, :, None])[:, :, 0])))
+
+
+def test_a_flight_is_followed_to_the_sensors_limits():
+    _, flight, _, estimates = flown(end_s=40.0)
+    after = 20.0
+    east, north, up = rms(position_errors(flight, estimates, after))
+    assert max(east, north) < 0.45  # m; sigma is 0.2 m and wanders slowly
+    assert up < 0.03
+    assert max(rms(velocity_errors(flight, estimates, after))) < 0.04  # m/s
+    assert rms(heading_errors(flight, estimates, after)) < 0.01  # rad
+
+
+@pytest.mark.parametrize(
+    "sections",
+    [
+        {},
+        {"sensors": {"as_printed": True}},
+        {"preset": "ardrone2"},
+        {"estimation": {"madgwick_beta": 0.1}},
+        {"estimation": {"madgwick_beta": 0.0}},
+        {"estimation": {"flow": False}},
+        {"estimation": {"magnetometer": False}},
+    ],
+    ids=["paper", "as_printed", "ardrone2", "beta .1", "gyro alone", "no flow", "no magnetometer"],
+)
+def test_the_covariance_tells_the_truth(sections):
+    of = scenario(**sections, yaw_deg=0.0)
+    seeds, end_s = range(6), 25.0
+    means = []
+    for seed in seeds:
+        flight = Flight(seed)
+        flight.yaw_start = 0.0
+        means.append(nees(flight, fly(estimator(of), readings(flight, of, seed, end_s), end_s), 12.0))
+    low, high = chi2.ppf([0.001, 0.999], 6 * len(means)) / len(means)
+    assert low < np.mean(means) < high
+
+
+def test_innovations_are_white_and_of_the_right_size():
+    of, flight = scenario(), Flight(2)
+    core = estimator(of)
+    normalised: dict[int, list[np.ndarray]] = {}
+    update = core.filter.update
+
+    def listening(*args, **kwargs):
+        update(*args, **kwargs)
+        root = np.linalg.cholesky(core.filter.S)
+        normalised.setdefault(len(core.filter.y), []).append(np.linalg.solve(root, core.filter.y))
+
+    core.filter.update = listening
+    fly(core, readings(flight, of, 2, 60.0), 60.0)
+    for rows, series in normalised.items():
+        y = np.array(series[20:])  # after the first second or so
+        if len(y) < 100:
+            continue
+        three_sigma = 3.0 * math.sqrt(2.0 / y.size)
+        assert np.mean(y**2) == pytest.approx(1.0, abs=three_sigma + 0.02), rows
+        correlation = np.mean(y[1:] * y[:-1], axis=0)
+        assert np.abs(correlation).max() < 4.0 / math.sqrt(len(y)), rows
+
+
+@pytest.mark.parametrize("name", AIDING)
+def test_an_outlier_is_refused_and_counted(name: str):
+    of, flight = scenario(), Flight(3, start_s=100.0)
+    outlier = {
+        "gps": ((60.0, 2.0, 0.0), (0.0, 0.0, 0.0), 2.0, 3),
+        "mag": ((80.0, 0.0, 0.0),),
+        "baro": (9.0,),
+        "sonar": (2.0, True),
+        "flow": ((4.0, 0.0, 0.0), 1.0),
+    }[name]
+    coming = readings(flight, of, 3, 10.0)
+    if name == "sonar":  # on the ground the range is below the least that a sonar reads
+        coming = [r._replace(values=(0.05, True)) if r.sensor == "sonar" else r for r in coming]
+    core = estimator(of)
+    before = fly(core, coming, 10.0)[-1][1]
+    feed(core, Reading(10.02, name, 10.02, outlier))
+    after = core.close(10.02)
+    assert after.sensors[name] == (before.sensors[name][0], before.sensors[name][1] + 1)
+    assert after.position_m == pytest.approx(before.position_m, abs=0.01)
+    assert after.yaw_rad == pytest.approx(before.yaw_rad, abs=1e-3)
+
+
+@pytest.mark.parametrize("bad", [NAN, INF, -INF, 1e300], ids=str)
+def test_what_is_no_number_is_refused_counted_and_harmless(bad: float):
+    of, _, coming, clean = flown(seed=4, end_s=8.0)
+    poison = [
+        ("imu", ((bad, 0.0, 9.8), (0.0, 0.0, 0.0))),
+        ("imu", ((0.0, 0.0, 9.8), (0.0, bad, 0.0))),
+        ("gps", ((0.0, bad, 0.0), (0.0, 0.0, 0.0), 2.0, 3)),
+        ("gps", ((0.0, 0.0, 0.0), (0.0, 0.0, bad), 2.0, 3)),
+        ("gps", ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), bad, 3)),
+        ("mag", ((0.0, 0.0, bad),)),
+        ("baro", (bad,)),
+        ("sonar", (bad, True)),
+        ("flow", ((0.0, 0.0, bad), 1.0)),
+    ]
+    extra = [Reading(4.003, name, 4.003, values) for name, values in poison]
+    tampered = fly(estimator(of), sorted([*coming, *extra], key=lambda r: r.t_s), 8.0)
+    end, unharmed = tampered[-1][1], clean[-1][1]
+    assert end.position_m == unharmed.position_m
+    assert end.covariance == unharmed.covariance
+    refused = {name: end.sensors[name][1] - unharmed.sensors[name][1] for name in end.sensors}
+    assert refused == {"imu": 2, "gps": 3, "mag": 1, "baro": 1, "sonar": 1, "flow": 1}
+
+
+def test_duplicates_change_nothing_and_old_readings_are_refused():
+    of, _, coming, clean = flown(seed=5, end_s=8.0)
+    twice = [r for reading in coming for r in (reading, reading)]
+    assert fly(estimator(of), twice, 8.0)[-1][1] == clean[-1][1]
+    old = [next(r for r in coming if r.sensor == name)._replace(t_s=5.001) for name in ("gps", "imu")]
+    end = fly(estimator(of), sorted([*coming, *old], key=lambda r: r.t_s), 8.0)[-1][1]
+    assert end.position_m == clean[-1][1].position_m
+    for name in ("gps", "imu"):
+        assert end.sensors[name][1] == clean[-1][1].sensors[name][1] + 1
+
+
+def test_the_order_within_a_gate_does_not_matter_much():
+    of, _, coming, clean = flown(seed=6, end_s=10.0)
+
+    def backwards(reading: Reading) -> tuple[int, int, float]:
+        gate = math.ceil(reading.t_s / GATE_S - 1e-9)
+        return gate, len(AIDING) if reading.sensor == "imu" else -AIDING.index(reading.sensor), reading.t_s
+
+    core, end, waiting = estimator(of), clean[0][1], sorted(coming, key=backwards)
+    for k in range(1, round(10.0 / GATE_S) + 1):
+        while waiting and waiting[0].t_s <= k * GATE_S + 1e-9:
+            feed(core, waiting.pop(0))
+        end = core.close(k * GATE_S)
+    assert end.position_m == pytest.approx(clean[-1][1].position_m, abs=1e-6)
+
+
+def test_a_fix_without_fix_and_flow_without_quality_are_refused():
+    of, _, coming, clean = flown(seed=7, end_s=6.0)
+    blind = [
+        r._replace(values=(*r.values[:3], 0)) if r.sensor == "gps" and r.t_s > 4.0
+        else r._replace(values=(r.values[0], 0.0)) if r.sensor == "flow" and r.t_s > 4.0
+        else r
+        for r in coming
+    ]  # fmt: skip
+    end = fly(estimator(of), blind, 6.0)[-1][1]
+    assert end.sensors["gps"] == (20, 10)
+    assert end.sensors["flow"][1] == 30
+    assert covariance(end)[0, 0] > covariance(clean[-1][1])[0, 0]
+
+
+@pytest.mark.parametrize("yaw_deg", [-170.0, -60.0, 0.0, 95.0, 179.0])
+def test_the_heading_converges_from_anywhere(yaw_deg: float):
+    of = scenario(yaw_deg=yaw_deg + 70.0)  # the scenario's own heading must not matter
+    flight = Flight(8, start_s=100.0)
+    flight.yaw_start = math.radians(yaw_deg)
+    estimates = fly(estimator(of), readings(flight, of, 8, 3.0), 3.0)
+    errors = heading_errors(flight, estimates)
+    assert abs(errors[int(0.1 / GATE_S)]) < 0.25  # rad, from the first reading or two of 0.05 rad
+    assert abs(errors[-1]) < 0.03
+    assert abs(errors[-1]) < 4.0 * estimates[-1][1].yaw_sigma_rad
+
+
+def test_without_a_magnetometer_the_heading_is_the_one_it_was_set_down_with():
+    flight = Flight(9, start_s=100.0)
+    flight.yaw_start = math.radians(-100.0)
+    of = scenario(yaw_deg=-100.0, estimation={"magnetometer": False})
+    estimates = fly(estimator(of), readings(flight, of, 9, 3.0), 3.0)
+    assert abs(heading_errors(flight, estimates)[-1]) < 0.01
+    assert estimates[-1][1].yaw_sigma_rad == pytest.approx(0.05, rel=0.1)
+    assert estimates[-1][1].sensors["mag"] == (0, 0)
+
+
+def test_a_gyro_bias_is_found():
+    of, _, coming, _ = flown(seed=10, end_s=0.1, preset="ardrone2")
+    flight, bias = Flight(10), (0.002, -0.003, 0.0015)  # rad/s; the preset's sigma is 0.0017
+    coming = [
+        r._replace(values=(r.values[0], tuple(w + b for w, b in zip(r.values[1], bias, strict=True))))
+        if r.sensor == "imu"
+        else r
+        for r in readings(flight, scenario(preset="ardrone2", sensors={"imu": QUIET_GYRO}), 10, 40.0)
+    ]
+    end = fly(estimator(of), coming, 40.0)[-1][1]
+    assert end.gyro_bias_rad_s == pytest.approx(bias, abs=3e-4)
+
+
+QUIET_GYRO = {"gyro_deg_s": {"noise": 0.06, "bias": 0.0, "bias_walk": 0.0, "quantum": 0.0}}
+
+
+def test_late_fixes_are_compared_with_the_past():
+    """At a steady 2 m/s, 400 ms of latency are 0.8 m if they are not made good."""
+    of = scenario(sensors={"gps": {"latency_ms": 400.0, "position_m": {"noise": 0.05}}})
+    cruise = 2.0  # m/s
+    core = estimator(of)
+    start = {"position_m": (0.0, 0.0, 10.0), "velocity_m_s": (cruise, 0.0, 0.0)}
+    core.warm_start(
+        **start,
+        orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
+        covariance=np.diag([1.0] * 3 + [0.01] * 3).ravel().tolist(),
+        yaw_sigma_rad=0.01,
+        gyro_bias_rad_s=(0.0, 0.0, 0.0),
+    )
+    end = core.close(0.0)
+    for k in range(1, 2001):
+        t = k * 0.005
+        core.imu(t, (0.0, 0.0, 9.80665), (0.0, 0.0, 0.0))
+        if k % 40 == 0 and t > 0.4:
+            core.gps(t, t - 0.4, (cruise * (t - 0.4), 0.0, 10.0), (cruise, 0.0, 0.0), 0.05, 3)
+        if k % 4 == 0:
+            end = core.close(t)
+    assert end.position_m == pytest.approx((cruise * 10.0, 0.0, 10.0), abs=0.02)
+    assert end.sensors["gps"][1] == 0
+
+
+def test_latencies_of_all_sensors_are_made_good():
+    late = {name: {"latency_ms": 80.0} for name in AIDING} | {
+        "gps": {"latency_ms": 300.0},
+        "imu": {"latency_ms": 10.0},
+    }
+    _, flight, _, estimates = flown(seed=11, end_s=30.0, sensors=late)
+    assert max(rms(velocity_errors(flight, estimates, 15.0))) < 0.045  # m/s
+    assert rms(heading_errors(flight, estimates, 15.0)) < 0.01
+    assert nees(flight, estimates, 15.0) < chi2.ppf(0.999, 6)
+    assert all(refused <= 2 for _, refused in estimates[-1][1].sensors.values())
+
+
+MOUNTS = {
+    "imu": {"mount": {"position_m": [0.1, -0.2, 0.05], "rpy_deg": [10.0, 20.0, -120.0]}},
+    "gps": {"mount": {"position_m": [-0.6, 0.4, 0.9]}, "position_m": {"noise": 0.1}},
+    "mag": {"mount": {"rpy_deg": [180.0, 10.0, 45.0]}},
+    "baro": {"mount": {"position_m": [0.5, 0.5, 0.2]}},
+    "sonar": {"mount": {"position_m": [0.2, -0.1, -0.05], "rpy_deg": [10.0, -15.0, 30.0]}},
+    "flow": {"mount": {"position_m": [0.3, 0.4, -0.1]}},
+}
+
+
+def test_mounts_are_taken_off():
+    of, flight = scenario(sensors=MOUNTS), Flight(12, yaw_rate=0.8, accel=0.8)
+    estimates = fly(estimator(of), readings(flight, of, 12, 30.0), 30.0)
+    assert max(rms(position_errors(flight, estimates, 15.0))) < 0.05  # m; the antenna alone is 0.9 m off
+    assert max(rms(velocity_errors(flight, estimates, 15.0))) < 0.045
+    assert rms(heading_errors(flight, estimates, 15.0)) < 0.01
+    assert nees(flight, estimates, 15.0) < chi2.ppf(0.999, 6)
+
+
+def test_mounts_matter():
+    """The same readings without the mounts are far off, so the test before this one can fail."""
+    of, flight = scenario(sensors=MOUNTS), Flight(12, yaw_rate=0.8, accel=0.8)
+    unmounted = {name: {k: v for k, v in s.items() if k != "mount"} for name, s in MOUNTS.items() if name != "imu"}
+    wrong = scenario(sensors=unmounted | {"imu": MOUNTS["imu"], "mag": MOUNTS["mag"]})
+    estimates = fly(estimator(wrong), readings(flight, of, 12, 30.0), 30.0)
+    assert max(rms(position_errors(flight, estimates, 15.0))) > 0.15
+
+
+def test_biases_of_aiding_sensors_widen_the_covariance():
+    biased = {
+        "gps": {"position_m": {"noise": 2.0, "bias": 3.0}},
+        "baro": {"altitude_m": {"noise": 0.1, "bias": 2.0}},
+    }
+    seeds = range(20, 28)
+    ends = []
+    for seed in seeds:
+        _, flight, _, estimates = flown(seed=seed, end_s=12.0, sensors=biased)
+        ends.append(nees(flight, estimates[-1:], 0.0))
+        assert math.sqrt(covariance(estimates[-1][1])[0, 0]) > 2.9
+    low, high = chi2.ppf([0.001, 0.999], 6 * len(ends)) / len(ends)
+    assert low < np.mean(ends) < high
+
+
+def restart(estimate: Estimate, of) -> DroneEstimator:
+    core = estimator(of)
+    core.warm_start(
+        estimate.position_m,
+        estimate.velocity_m_s,
+        estimate.orientation_wxyz,
+        estimate.covariance,
+        estimate.yaw_sigma_rad,
+        estimate.gyro_bias_rad_s,
+    )
+    return core
+
+
+@pytest.mark.parametrize("preset", ["paper", "ardrone2"])
+def test_a_warm_start_goes_on_where_it_was(preset: str):
+    of, flight, coming, unbroken = flown(seed=13, end_s=30.0, preset=preset)
+    at = round(20.0 / GATE_S) - 1
+    core = restart(unbroken[at][1], of)
+    resumed = fly(core, coming, 30.0, from_s=20.0)
+    apart = np.array(
+        [np.subtract(a.position_m, b.position_m) for (_, a), (_, b) in zip(resumed, unbroken[at + 1 :], strict=True)]
+    )
+    assert np.linalg.norm(apart, axis=1).max() < 0.15  # m
+    assert np.linalg.norm(apart[0]) < 0.02
+    assert max(rms(velocity_errors(flight, resumed))) < 0.06
+    assert np.abs(heading_errors(flight, resumed)).max() < 0.02
+    assert nees(flight, resumed, 20.0) < chi2.ppf(0.999, 6)
+
+
+def test_a_cold_start_in_flight_converges():
+    of, flight, coming, _ = flown(seed=3, end_s=30.0)
+    estimates = fly(estimator(of), coming, 30.0, from_s=20.0)
+    assert max(rms(velocity_errors(flight, estimates, 22.0))) < 0.05  # m/s
+    assert np.abs(heading_errors(flight, estimates, 23.0)).max() < 0.03
+    assert nees(flight, estimates, 20.0) < chi2.ppf(0.999, 6)
+
+
+def test_without_an_imu_the_covariance_grows_and_comes_back():
+    of, flight, coming, _ = flown(seed=14, end_s=30.0)
+    gap = [r for r in coming if not 15.0 < r.t_s < 20.0 or r.sensor == "gps"]
+    estimates = {round(t, 2): e for t, e in fly(estimator(of), gap, 30.0)}
+
+    def sigma(t: float) -> float:
+        return math.sqrt(covariance(estimates[t])[3, 3])
+
+    assert sigma(15.0) < 0.05
+    assert sigma(16.0) > 0.3
+    assert sigma(29.0) < 0.05
+    assert nees(flight, [(t, e) for t, e in estimates.items() if 15.0 < t < 20.0], 0.0) < 6.0 * 3.0
+    assert max(rms(velocity_errors(flight, list(estimates.items()), 25.0))) < 0.05
+
+
+def test_without_any_imu_the_other_sensors_still_place_the_drone():
+    of, flight, coming, _ = flown(seed=15, end_s=20.0)
+    estimates = fly(estimator(of), [r for r in coming if r.sensor != "imu"], 20.0)
+    assert max(rms(position_errors(flight, estimates, 10.0))) < 2.0
+    assert estimates[-1][1].sensors["imu"] == (0, 0)
+
+
+def test_nothing_at_all_gives_a_wide_finite_estimate():
+    core = estimator(scenario())
+    estimate = [core.close(k * GATE_S) for k in range(1, 101)][-1]
+    assert np.isfinite(estimate.covariance).all()
+    assert math.sqrt(covariance(estimate)[0, 0]) >= 100.0
+    assert estimate.sensors == dict.fromkeys(("gps", "mag", "baro", "sonar", "flow", "imu"), (0, 0))
+
+
+def test_a_jump_of_gps_is_refused_at_first_and_believed_when_it_stays():
+    of, flight, coming, _ = flown(seed=16, end_s=40.0)
+    jumped = [
+        r._replace(values=(tuple(np.add(r.values[0], (30.0, 0.0, 0.0)).tolist()), *r.values[1:]))
+        if r.sensor == "gps" and r.t_s > 15.0
+        else r
+        for r in coming
+    ]
+    estimates = fly(estimator(of), jumped, 40.0)
+    east = position_errors(flight, estimates)[:, 0]
+    assert np.abs(east[: round(24.0 / GATE_S)]).max() < 2.5
+    assert east[-1] == pytest.approx(30.0, abs=2.0)
+
+
+def test_the_covariance_stays_positive_and_symmetric():
+    _, _, _, estimates = flown(seed=17, end_s=30.0, preset="ardrone2")
+    for _, estimate in estimates[::50]:
+        P = covariance(estimate)
+        assert (P == P.T).all()
+        assert np.linalg.eigvalsh(P).min() > 0.0
+
+
+def test_the_estimate_is_plain_python():
+    _, _, _, estimates = flown(seed=18, end_s=1.0)
+    end = estimates[-1][1]
+    numbers = [
+        *end.position_m,
+        *end.velocity_m_s,
+        *end.orientation_wxyz,
+        *end.covariance,
+        *end.gyro_bias_rad_s,
+    ]
+    numbers += [end.yaw_rad, end.yaw_sigma_rad]
+    assert {type(x) for x in numbers} == {float}
+    assert len(end.covariance) == 36
+    assert {type(n) for pair in end.sensors.values() for n in pair} == {int}
+    yaw = Rotation.from_quat(end.orientation_wxyz, scalar_first=True).as_euler("ZYX")[0]
+    assert end.yaw_rad == pytest.approx(yaw)
+
+
+def test_the_gain_follows_the_accelerometer():
+    gains = {}
+    for name, of in {"paper": scenario(), "printed": scenario(sensors={"as_printed": True})}.items():
+        imu = of.drones[0].sensors.imu
+        gains[name] = madgwick_beta(of.estimation, imu, 9.80665)
+        sigma = imu.accel_m_s2.noise / 9.80665
+        assert levelling_time_s(gains[name], sigma) == pytest.approx(LEVELLING_S)
+    assert gains["paper"] == pytest.approx(4.7e-4, rel=0.02)
+    assert gains["printed"] == pytest.approx(4.7e-4 * 9.80665, rel=0.02)
+
+
+def test_the_same_readings_give_the_same_bits():
+    of, _, coming, first = flown(seed=19, end_s=5.0)
+    assert fly(estimator(of), coming, 5.0) == first

@@ -1,0 +1,292 @@
+"""The compiled mathematics of the controller: the numbers of plain Python, and nothing left to compile in flight."""
+
+import importlib
+import math
+import subprocess
+import sys
+from types import SimpleNamespace
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+MODULES = (
+    "formation.spaces.cluster_space",
+    "formation.flight_check",
+    "formation.formation_law",
+    "formation.spaces.nested_cluster",
+    "formation.spaces.pair_cluster",
+    "formation.reference_check",
+    "formation.spaces.rotation_fit",
+    "formation.spaces.template_cluster",
+    "formation.trajectory",
+    "formation.spaces.triad_cluster",
+)
+SIZES = (2, 3, 5)
+LARGE = 1e-9  # the same, of a hundred variables
+SAME = 1e-12  # relative; both ways should give the same bits where they call the same libm
+DT_S = 0.02
+
+pytest.importorskip("numba")
+
+
+def package() -> SimpleNamespace:
+    return SimpleNamespace(
+        **{name.rpartition(".")[2]: importlib.import_module(f"zsim_agents.{name}") for name in MODULES}
+    )
+
+
+@pytest.fixture(scope="module")
+def both() -> tuple[SimpleNamespace, SimpleNamespace]:
+    """Return the modules as they are, and a copy of them imported where numba is missing."""
+    compiled = package()
+    with patch.dict(sys.modules, {"numba": None}):
+        for name in [
+            name for name in sys.modules if name.partition(".")[0] == "zsim_agents" or name.startswith("zsim.math")
+        ]:
+            del sys.modules[name]
+        return compiled, package()
+
+
+def space_of(way: SimpleNamespace, n: int):
+    """Return a cluster space of these modules; `cluster_space` would import the classes anew, compiled."""
+    return way.pair_cluster.PairCluster() if n == 2 else way.triad_cluster.TriadCluster(n)
+
+
+def large_space_of(way: SimpleNamespace, kind: str):
+    """Return a template of 10 or 30, or three triads, of these modules."""
+    if kind == "triads":
+        groups = [(name, way.triad_cluster.TriadCluster(3)) for name in "abc"]
+        return way.nested_cluster.NestedCluster(way.triad_cluster.TriadCluster(3), groups)
+    n = int(kind)
+    return way.template_cluster.TemplateCluster(np.random.default_rng(n).normal(scale=6.0, size=(n, 3)))
+
+
+def same(a, b, most: float = SAME) -> bool:
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    return a.shape == b.shape and bool((np.abs(a - b) <= most * np.maximum(1.0, np.abs(a))).all())
+
+
+def robots(n: int, rng: np.random.Generator, scale_m: float = 4.0) -> tuple[np.ndarray, np.ndarray]:
+    return rng.normal(scale=scale_m, size=(n, 3)), rng.uniform(-4.0, 4.0, n)
+
+
+def test_one_way_is_compiled_and_the_other_is_not(both):
+    compiled, plain = both
+    for module, name in (
+        ("triad_cluster", "triad_forward"),
+        ("formation_law", "limited"),
+        ("trajectory", "put_ramped"),
+    ):
+        assert hasattr(getattr(getattr(compiled, module), name), "py_func")
+        assert not hasattr(getattr(getattr(plain, module), name), "py_func")
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_the_kinematics_are_the_same(both, n):
+    spaces = [space_of(way, n) for way in both]
+    rng = np.random.default_rng(n)
+    for _ in range(50):
+        p_W, yaw = robots(n, rng)
+        c = spaces[0].forward(p_W, yaw)
+        assert same(c, spaces[1].forward(p_W, yaw))
+        for a, b in zip(*(space.inverse(c) for space in spaces), strict=True):
+            assert same(a, b)
+        assert same(*(space.inverse_jacobian(c) for space in spaces))
+        assert same(*(space.margin(c) for space in spaces))
+        assert [type(space.margin(c)) for space in spaces] == [float, float]  # it goes into a message
+        assert same(*(space.wrapped(c * 3.0) for space in spaces))
+        assert same(*(way.cluster_space.closest_pair(p_W) for way in both))
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_singular_shapes_are_refused_in_the_same_words(both, n):
+    words = []
+    for way in both:
+        space = space_of(way, n)
+        with pytest.raises(way.cluster_space.SingularClusterError) as refusal:
+            space.forward(np.ones((n, 3)), np.zeros(n))
+        words.append(str(refusal.value))
+        if n > 2:
+            with pytest.raises(way.cluster_space.SingularClusterError) as refusal:
+                space.inverse(np.zeros(4 * n))
+            words[-1] += str(refusal.value)
+    assert words[0] == words[1]
+
+
+@pytest.mark.parametrize("n", SIZES)
+@pytest.mark.parametrize("scale_m", [1.0, 4.0], ids=["crowded", "apart"])
+def test_the_law_is_the_same_with_saturation_guard_and_integral(both, n, scale_m):
+    laws = [way.formation_law.FormationLaw(space_of(way, n)) for way in both]
+    rng = np.random.default_rng(10 + n)
+    seen = {"saturated": 0, "free": 0, "guarded": 0, "alarmed": 0}
+    for _ in range(100):
+        p_W, yaw = robots(n, rng, scale_m)
+        c = laws[0].space.forward(p_W, yaw)
+        reach = rng.choice([0.01, 1.0])
+        gate = (c, p_W, rng.normal(size=(n, 3)), c + rng.normal(scale=reach, size=4 * n), np.zeros(4 * n), DT_S)
+        a, b = (law.command(*gate) for law in laws)
+        assert same(a.v_W, b.v_W)
+        assert same(a.yaw_rate, b.yaw_rate)
+        assert same(a.factor, b.factor)
+        assert (a.guarded, a.alarmed) == (b.guarded, b.alarmed)
+        assert same(*(law.integral for law in laws))
+        seen["saturated" if a.factor < 1.0 else "free"] += 1
+        seen["guarded"] += bool(a.guarded)
+        seen["alarmed"] += bool(a.alarmed)
+    assert seen["saturated"]
+    assert seen["free"]
+    assert seen["guarded"]
+    assert seen["alarmed"] or scale_m > 1.0
+
+
+@pytest.mark.parametrize("kind", ["10", "30", "triads"])
+def test_large_clusters_are_the_same(both, kind):
+    spaces = [large_space_of(way, kind) for way in both]
+    laws = [way.formation_law.FormationLaw(space) for way, space in zip(both, spaces, strict=True)]
+    rng, n = np.random.default_rng(3), spaces[0].n
+    for _ in range(10):
+        p_W = spaces[0].inverse(spaces[0].specimen(2.0))[0] + rng.normal(scale=0.7, size=(n, 3))
+        yaw, v_W = rng.uniform(-4.0, 4.0, n), rng.normal(size=(n, 3))
+        c = spaces[0].forward(p_W, yaw)
+        assert same(c, spaces[1].forward(p_W, yaw), most=LARGE)
+        for name in ("margin", "condition", "spread", "inverse_jacobian"):
+            assert same(*(getattr(space, name)(c) for space in spaces), most=LARGE), name
+        c_des, c_dot = c + rng.normal(scale=0.3, size=4 * n), rng.normal(scale=0.1, size=4 * n)
+        a, b = (law.command(c, p_W, v_W, c_des, c_dot, DT_S) for law in laws)
+        assert same(a.v_W, b.v_W, most=LARGE)
+        assert same(a.yaw_rate, b.yaw_rate, most=LARGE)
+        assert (a.guarded, a.alarmed) == (b.guarded, b.alarmed)
+        assert same(*(way.cluster_space.closest_pair(p_W) for way in both))
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_ramps_are_the_same(both, n):
+    rng = np.random.default_rng(20 + n)
+    offsets = [rng.normal(size=4 * n) for _ in range(4)]
+    for s in np.linspace(0.0, 1.0, 11).tolist():
+        found = []
+        for way in both:
+            value, rate = np.empty(4 * n), np.empty(4 * n)
+            way.trajectory.put_ramped(*offsets, s, 7.0, value, rate)
+            found.append([*value, *rate])
+        assert same(*found)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_places_are_judged_the_same_at_once_and_in_words(both, n):
+    space, plain = (space_of(way, n) for way in both)
+    rng, found = np.random.default_rng(40 + n), set()
+    gains, limits = both[0].formation_law.FormationGains(), both[0].reference_check.ShapeLimits()
+    for _ in range(200):
+        p_W, yaw = robots(n, rng)
+        p_W[:, 2] += 6.0
+        c = space.forward(p_W, yaw)
+        faults = [
+            way.reference_check.place_fault(of, c, gains, limits) for way, of in zip(both, (space, plain), strict=True)
+        ]
+        least_m = both[0].cluster_space.closest_pair(p_W)[0]
+        assert faults[0] == faults[1]
+        assert (faults[0] is None) == (least_m >= gains.separation_min_m and p_W[:, 2].min() >= limits.height_min_m)
+        found.add("apart" if faults[0] and "apart" in faults[0] else bool(faults[0]))
+    assert found == {"apart", True, False}
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_bounds_in_flight_are_those_of_the_judgement_in_words(both, n):
+    check, space = both[0].reference_check, space_of(both[0], n)
+    limits = check.ShapeLimits(spread_min_m=0.0, condition_max=math.inf)
+    bounds, rng, found = check.bounds_of(space, limits), np.random.default_rng(50 + n), set()
+    for _ in range(300):
+        c = rng.uniform(0.01, 1.0, 4 * n)
+        c[rng.choice(space.tilts)] = rng.uniform(-0.7, 0.7)
+        if rng.random() < 0.3:
+            c[rng.integers(4 * n)] = rng.choice(BAD)
+        fault = check.shape_fault(space, c, limits)
+        if fault is None or f"{space.spread_text} is" not in fault:
+            assert (fault is None) == (check.first_outside(c, bounds) < 0)
+            found.add(fault is None)
+    assert found == {True, False}
+
+
+BAD = (math.nan, math.inf, -math.inf, 1e7, 0.0, 1.7)
+
+
+@pytest.mark.parametrize("n", SIZES)
+def test_judgements_are_the_same(both, n):
+    rng = np.random.default_rng(30 + n)
+    bounds = space_of(both[0], n).bounds
+    found = set()
+    for _ in range(300):
+        p_W, yaw = robots(n, rng)
+        values = [np.full(n, 0.1), p_W, rng.normal(size=(n, 3)), yaw, np.full((n, 3), 0.2)]
+        spoiled = values[rng.integers(5)].reshape(-1)
+        spoiled[rng.integers(spoiled.size)] = rng.choice(BAD)
+        flaws = [way.flight_check.estimate_flaw(*values, 0.5, 1.0) for way in both]
+        assert flaws[0] == flaws[1]
+        found.add(flaws[0][0])
+        near = [way.flight_check.all_near(p_W, yaw) for way in both]
+        assert near[0] == near[1] == bool((np.abs(p_W) < 1e6).all() and (np.abs(yaw) < 1e6).all())
+        c = rng.uniform(0.1, 1.5, 4 * n)
+        c[rng.integers(4 * n)] = rng.choice(BAD)
+        outside = [way.reference_check.first_outside(c, bounds) for way in both]
+        assert outside[0] == outside[1]
+        out = ~((np.abs(c) < 1e6) & (bounds[:, 0] < c) & (c < bounds[:, 1]))
+        assert outside[0] == (int(np.argmax(out)) if out.any() else -1)
+    judge = both[0].flight_check
+    assert found == {judge.WELL, judge.OLD, judge.WILD, judge.VAGUE}
+
+
+FLIGHT = """
+import sys
+import numpy as np
+from zsim_agents.formation.spaces.cluster_space import cluster_space
+from zsim_agents.formation.controller import rehearse
+from zsim_agents.formation.engagement import Engagement
+from zsim_agents.formation.flight_data import GateInput
+from zsim_agents.formation.flight_request import Target
+from zsim_agents.formation.formation_law import FormationGains
+from zsim_agents.formation.spaces.nested_cluster import NestedCluster
+from zsim_agents.formation.spaces.template_cluster import TemplateCluster
+
+def compiled():
+    modules = [module for name, module in sys.modules.items() if name.startswith("zsim_agents.")]
+    functions = {id(f): f for module in modules for f in vars(module).values() if hasattr(f, "signatures")}
+    return sum(len(f.signatures) for f in functions.values())
+
+turn = np.pi / 5 * np.arange(10)
+spaces = {
+    "template": TemplateCluster(np.column_stack((9 * np.cos(turn), 9 * np.sin(turn), 0 * turn))),
+    "nested": NestedCluster(cluster_space(3), [(name, cluster_space(3)) for name in "abc"]),
+}
+kind, gains = sys.argv[1], FormationGains()
+space = spaces[kind] if kind in spaces else cluster_space(int(kind))
+n = space.n
+rehearse(space, gains)
+before = compiled()
+turn = 2 * np.pi * np.arange(n) / n
+p_W, yaw = np.column_stack((9 * np.cos(turn), 9 * np.sin(turn), np.full(n, 9.0))), np.zeros(n)
+if kind == "nested":
+    p_W, yaw = space.inverse(space.specimen(5.0))
+formation = Engagement(space, [str(i) for i in range(n)], gains)
+for gate in range(20):
+    still = np.zeros((n, 3))
+    at = (gate * 0.02, p_W.copy(), yaw.copy(), still, still + 0.1, np.zeros(n), ("flying",) * n)
+    if gate == 1:
+        formation.warm_start("assembling", np.zeros(4 * n))
+    elif gate == 5:
+        formation.warm_start("engaged", space.forward(p_W, yaw))
+    elif gate == 10:
+        assert formation.request(Target({"z_c": space.forward(p_W, yaw)[2] + 1.0})) is None
+    output = formation.step(GateInput(*at))
+print(output.phase, before, compiled())
+"""
+
+
+@pytest.mark.parametrize("kind", [*map(str, SIZES), "template", "nested"])
+def test_after_the_rehearsal_nothing_is_compiled_in_flight(kind):
+    run = [sys.executable, "-c", FLIGHT, kind]
+    phase, before, after = subprocess.run(run, capture_output=True, text=True, check=True).stdout.split()
+    assert phase == "engaged"
+    assert int(before) > 10
+    assert after == before

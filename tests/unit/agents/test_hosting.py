@@ -1,0 +1,62 @@
+"""Which agents share a process, by names and patterns."""
+
+from pathlib import Path
+
+import pytest
+
+from zsim.errors import RunError
+from zsim.runtime.group import Group
+from zsim.scenario import scenario_file
+from zsim.transport.identity import Identity
+from zsim_agents.hosting import agents_of, chosen, hosted
+from zsim_deploy.roles import roles
+from zsim_world.flight.world import World
+
+STEP = scenario_file.load(Path(__file__).parents[3] / "scenarios" / "step.yaml")
+ESTIMATORS = ["estimator.drone1", "estimator.drone2", "estimator.drone3"]
+
+
+@pytest.mark.parametrize(
+    ("patterns", "wanted"),
+    [
+        (["*"], [*ESTIMATORS, "controller.main"]),
+        (["controller.main", "estimator.*"], [*ESTIMATORS, "controller.main"]),
+        (["estimator.drone3", "estimator.drone1"], ["estimator.drone1", "estimator.drone3"]),
+        (["estimator.drone[12]"], ESTIMATORS[:2]),
+    ],
+)
+def test_names_and_patterns(patterns: list[str], wanted: list[str]):
+    assert agents_of(STEP, patterns) == wanted
+
+
+def test_a_pattern_that_matches_nobody_is_refused():
+    said = r"estimator: drone is 'dorne\*'; must match one of drone1, drone2, drone3$"
+    with pytest.raises(RunError, match=said):
+        chosen("estimator: drone", ["drone1", "dorne*"], ["drone1", "drone2", "drone3"])
+
+
+def test_of_many_names_a_refusal_lists_ten():
+    with pytest.raises(RunError, match=r"d0, d1, d2, d3, d4, d5, d6, d7, d8, d9, and 90 more$"):
+        chosen("estimator: drone", ["x"], [f"d{i}" for i in range(100)])
+
+
+def test_estimators_share_one_kernel_and_a_controller_comes_after_them():
+    group = hosted(World(STEP).info(), STEP, ["*"])
+    assert isinstance(group, Group)
+    assert (group.name, group.serves) == ("controller.main", tuple(ESTIMATORS))
+    assert group.gate_keys == tuple(f"drone/drone{i}/sensor/status" for i in (1, 2, 3))
+
+
+def test_one_estimator_serves_several_drones():
+    made = roles.estimator(["drone*"])(World(STEP).info(), STEP)
+    assert (made.name, made.serves) == ("estimator.drone1", ("estimator.drone2", "estimator.drone3"))
+
+
+def test_a_certificate_is_for_one_process(tmp_path: Path):
+    group = hosted(World(STEP).info(), STEP, ["*"])
+    said = (
+        r"controller\.main: a certificate is for one process, and this one stands for estimator\.drone1, .*; run each"
+    )
+    with pytest.raises(RunError, match=said):
+        roles.check_certificate(group, Identity(tls=tmp_path))
+    roles.check_certificate(group, Identity())

@@ -1,0 +1,184 @@
+"""The recorder: what was said before it came, once and without a gap, and garbage as it came."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from fake_link import BAD_UTF8, NESTED, UNANSWERED, FakeLink
+from msgspec import Struct
+
+from zsim.contract import batch, keys, messages
+from zsim.contract.bundle import Bundle, table_of
+from zsim.contract.messages import Clock, ControlAnswer, DroneInfo, Faults, Imu, Info, Origin
+from zsim.record import RecordReader
+from zsim_agents import recorder
+from zsim_agents.recorder import record
+
+GATE_NS = 20_000_000
+INFO = Info(
+    0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(0.0, 0.0, 0.0), (DroneInfo("d1", "any"),), (),
+    "", "", "", "",
+)  # fmt: skip
+TABLE = table_of(["d1"])
+IMU = keys.sensor("d1", "imu")
+Pair = tuple[str, bytes]
+
+
+def pair(key: str, message: Struct) -> Pair:
+    return key, messages.encode(message)
+
+
+def clock(gate: int, state: str = "running") -> Pair:
+    return pair(keys.CLOCK, Clock(gate * GATE_NS, gate, "r", gate, state, 1.0))  # type: ignore[arg-type]
+
+
+def imu(gate: int) -> Pair:
+    return pair(IMU, Imu(gate * GATE_NS, gate, gate * GATE_NS, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0)))
+
+
+def whole(gate: int) -> list[Pair]:
+    """Return a gate as the world hands it over: its samples in one."""
+    return [(batch.GATE, Bundle.of(gate * GATE_NS, gate, TABLE, [imu(gate)]).packed()), clock(gate)]
+
+
+def gates(*numbers: int) -> list[Pair]:
+    return [each for gate in numbers for each in (imu(gate), clock(gate))]
+
+
+def page(passed: list[Pair], more: int | None = None) -> ControlAnswer:
+    return ControlAnswer(True, result=[list(each) for each in passed], more=more)
+
+
+def recorded(
+    path: Path, answers: list[ControlAnswer], *batches: list[Pair], last: dict[str, bytes] | None = None
+) -> list[Pair]:
+    """Record a run that answers replays, has last values, and sends batches; return what is in the record."""
+    link, left = FakeLink(), iter(answers)
+    link.last = last or {}
+    link.on_request = lambda key, args: next(left)
+    for passed in (*batches, [clock(99, "stopped")]):
+        link.deliver(batch.KEY, batch.encode(passed))
+    assert record(link, INFO, path) == "the run ended"  # type: ignore[arg-type]
+    assert next(left, None) is None
+    with RecordReader(path) as reader:
+        return [(message.key, message.payload) for message in reader.messages()]
+
+
+def stamps(found: list[Pair], key: str) -> list[int]:
+    return [messages.decode(key, payload).t_ns // GATE_NS for name, payload in found if name == key]
+
+
+def test_a_late_recorder_writes_what_it_hears_twice_once(tmp_path: Path):
+    """The replay reaches gate 6; the batches since its subscription begin with gate 4."""
+    replayed = [page(gates(0, 1, 2, 3, 4, 5, 6))]
+    found = recorded(tmp_path / "run.mcap", replayed, gates(4), gates(5, 6), gates(7), gates(8))
+    assert stamps(found, IMU) == list(range(9))
+    assert stamps(found, keys.CLOCK) == [*range(9), 99]
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_which_run_it_is_is_on_record_however_late_the_recorder_comes(tmp_path: Path, kept: bool):
+    """The replay has lost the world's first words; what the hub still answers comes as it is, once."""
+    told = pair(keys.INFO, INFO)
+    found = recorded(tmp_path / "run.mcap", [page(gates(7))], gates(8), last=dict([told] if kept else []))
+    assert found[0] == told
+    assert [key for key, _ in found].count(keys.INFO) == 1
+
+
+def test_the_newest_faults_are_on_record_once(tmp_path: Path):
+    first, second, third = (pair(keys.FAULTS, Faults(gate * GATE_NS, gate, ())) for gate in (1, 5, 8))
+    for number, passed in enumerate(([*gates(7)], [first, *gates(2), second, *gates(7)])):
+        found = recorded(
+            tmp_path / f"{number}.mcap", [page(passed)], [third, *gates(8)], last=dict([second, pair(keys.INFO, INFO)])
+        )
+        assert stamps(found, keys.FAULTS) == ([5, 8], [1, 5, 8])[number]
+
+
+def test_gates_in_one_are_recorded_message_by_message_and_once(tmp_path: Path):
+    replayed = [page(gates(0, 1, 2, 3))]
+    found = recorded(tmp_path / "run.mcap", replayed, whole(2), whole(3), whole(4), whole(5))
+    assert stamps(found, IMU) == list(range(6))
+    assert [payload for key, payload in found if key == IMU] == [imu(gate)[1] for gate in range(6)]
+
+
+def test_a_gate_whose_columns_lead_outside_is_refused(tmp_path: Path):
+    """Whoever may publish may send such a thing; the record stays whole."""
+    good = Bundle.of(GATE_NS, 1, TABLE, [imu(1), imu(2)])
+    bad = [b"", b"\xc1"]
+    for which, stamps_, ends in (
+        (np.array([0, 8]), good.stamps, good.ends),
+        (np.array([0, -1]), good.stamps, good.ends),
+        (good.which, -good.stamps, good.ends),
+        (good.which, good.stamps, good.ends + 1),
+        (good.which, good.stamps, good.ends[::-1].copy()),
+        (good.which, good.stamps, np.array([5, good.ends[1]])),
+        (good.which[:0], good.stamps[:0], good.ends[:0]),
+    ):
+        bundle = Bundle(GATE_NS, 1, TABLE, which, stamps_, ends, good.buffer)
+        bad.append(_packed(bundle))
+    batches = [[(batch.GATE, payload)] for payload in bad]
+    found = recorded(tmp_path / "run.mcap", [page(gates(0))], gates(1), *batches, gates(2), whole(3))
+    assert stamps(found, IMU) == [0, 1, 2, 3]
+
+
+def _packed(b: Bundle) -> bytes:
+    columns = [column.astype("<i8").tobytes() for column in (b.which, b.stamps, b.ends)]
+    return msgspec.msgpack.encode([b.t_ns, b.seq, *columns, bytes(b.buffer)])
+
+
+def test_the_newest_of_a_long_replay_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(recorder, "KNOWN_MAX", 6)
+    found = recorded(tmp_path / "run.mcap", [page(gates(*range(10)))], gates(8, 9, 10))
+    assert stamps(found, IMU) == list(range(11))
+
+
+def test_all_pages_of_a_replay_are_written(tmp_path: Path):
+    pages = [page(gates(0, 1), more=4), page(gates(2, 3), more=8), page(gates(4))]
+    assert stamps(recorded(tmp_path / "run.mcap", pages, gates(5)), IMU) == [0, 1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("first", [UNANSWERED, page(gates(0), more=2)], ids=["nothing", "a page"])
+def test_what_is_not_answered_is_asked_for_again(tmp_path: Path, first: ControlAnswer):
+    answers = [first, UNANSWERED, page(gates(0, 1))]
+    assert stamps(recorded(tmp_path / "run.mcap", answers, gates(2)), IMU) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("key", [keys.CLOCK, keys.EVENT, IMU, "process/x.y/join", "of/somebody"])
+@pytest.mark.parametrize("payload", [BAD_UTF8, NESTED, b"\xc1", b"\x91" * 5000], ids=["utf8", "nested", "no", "deep"])
+def test_garbage_is_recorded_as_it_came(tmp_path: Path, key: str, payload: bytes):
+    found = recorded(tmp_path / "run.mcap", [page([(key, payload)])], [(key, payload), clock(2), (key, payload)])
+    assert [each for each in found if each[1] == payload] == [(key, payload)] * 2
+
+
+def test_what_a_record_has_no_room_for_is_counted_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("zsim.record.record_writer.CHANNELS_MAX", 2)
+    link, said = FakeLink(), []
+    link.on_request = lambda key, args: page([])
+    link.deliver(batch.KEY, batch.encode([imu(1), clock(1), imu(2), clock(3, "stopped")]))
+    link.deliver("view/drones", b"\x81\xa4t_ns\x01")
+    made: Any = recorder.Recorder(link, INFO, tmp_path / "run.mcap", "recorder", lambda: False, said.append)  # type: ignore[arg-type]
+    assert made.run() == "the run ended"
+    assert made.health.refused == 3
+    assert said == ["recorder: 3 messages are not on record: a record holds 65535 keys, and theirs are further ones"]
+
+
+def test_what_has_no_time_is_recorded_at_the_worlds_whatever_strangers_stamp(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    strange = ("my/thing", msgspec.msgpack.encode({"t_ns": 2**61, "seq": 0}))
+    recorded(path, [page(gates(0, 1, 2, 3))], [*gates(3), *gates(4), strange, ("my/raw", b"as it is")], gates(5))
+    with RecordReader(path) as reader:
+        times = {message.key: message.t_ns for message in reader.messages() if message.key.startswith("my/")}
+    assert times == {"my/thing": 2**61, "my/raw": 4 * GATE_NS}
+
+
+@pytest.mark.parametrize("garbage", [b"\x91\x92\xa1\xff\xc4\x00", b"\x91" * 5000 + b"\xc0", b"\xc1"])
+def test_a_batch_of_a_stranger_ends_nothing(tmp_path: Path, garbage: bytes):
+    link = FakeLink()
+    link.on_request = lambda key, args: page([])
+    for payload in (garbage, batch.encode([clock(3, "stopped")])):
+        link.deliver(batch.KEY, payload)
+    made: Any = recorder.Recorder(link, INFO, tmp_path / "run.mcap", "recorder", lambda: False)  # type: ignore[arg-type]
+    assert made.run() == "the run ended"
+    assert made.health.refused == 1

@@ -1,0 +1,440 @@
+"""Tables and MATLAB files: what pandas, pyarrow, scipy and Octave read is what was recorded."""
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+import recorded_run
+import scipy.io
+from typer.testing import CliRunner
+
+from zsim.contract import keys, messages
+from zsim.errors import ReportError, RunError
+from zsim.record import RecordReader, RecordWriter
+from zsim_analysis.export import formats, matlab
+from zsim_analysis.export.atomic_output import placed
+from zsim_analysis.export.columns import fields, table_name
+from zsim_analysis.export.formats import Format
+from zsim_analysis.export.make_export import export
+from zsim_analysis.export.matlab import matlab_names
+from zsim_analysis.export.selection import Selection
+from zsim_deploy.cli.cli import app
+
+GATES = 301  # of six seconds
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a run with a message of every kind, exported in all three forms."""
+    folder = tmp_path_factory.mktemp("run")
+    recorded_run.write(folder / "run.mcap")
+    for each in (Format.CSV, Format.PARQUET, Format.MAT):
+        export(folder, each)
+    return folder
+
+
+def said(run: Path, key: str) -> list[Any]:
+    """Return the messages of a key on record."""
+    with RecordReader(run / "run.mcap") as reader:
+        return [messages.decode(key, message.payload) for message in reader.messages({key})]
+
+
+def counts(run: Path) -> dict[str, int]:
+    """Return how many messages of each table are on record."""
+    found: dict[str, int] = {}
+    with RecordReader(run / "run.mcap") as reader:
+        for key, count in reader.topics().items():
+            kind = messages.type_of(key)
+            name = table_name(kind) if kind else "foreign"
+            found[name] = found.get(name, 0) + count
+    return found
+
+
+def csv(run: Path, name: str) -> Any:
+    """Return a table as pandas reads it."""
+    return pd.read_csv(run / "csv" / f"{name}.csv")
+
+
+def parquet(path: Path) -> Any:
+    """Return a table as pandas reads it."""
+    return pd.read_parquet(path)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_every_message_is_a_row_of_its_table(run: Path, suffix: str) -> None:
+    reads = {"csv": lambda path: len(pd.read_csv(path)), "parquet": lambda path: len(parquet(path))}
+    found = {path.stem: reads[suffix](path) for path in (run / suffix).glob(f"*.{suffix}")}
+    assert found == counts(run)
+
+
+@pytest.mark.parametrize("drone", ["drone1", "a-b.c", "end"])
+def test_truth_is_the_same_to_the_bit(run: Path, drone: str) -> None:
+    truths = said(run, keys.truth(drone))
+    for table in (csv(run, "truth"), parquet(run / "parquet" / "truth.parquet")):
+        mine = table[table["name"] == drone]
+        assert len(mine) == GATES
+        assert mine["t_ns"].tolist() == [truth.t_ns for truth in truths]
+        assert mine["t_s"].tolist() == [truth.t_ns / 1e9 for truth in truths]
+        for field, columns in {
+            "position_m": ["position_m_x", "position_m_y", "position_m_z"],
+            "orientation_wxyz": ["orientation_w", "orientation_x", "orientation_y", "orientation_z"],
+            "rotor_rad_s": [
+                f"rotor_rad_s_{place}" for place in ("front_left", "front_right", "rear_right", "rear_left")
+            ],
+        }.items():
+            assert mine[columns].to_numpy().tolist() == [list(getattr(truth, field)) for truth in truths]
+
+
+def test_covariances_sensors_and_variables_have_a_column_each(run: Path) -> None:
+    table, estimates = csv(run, "estimate"), said(run, keys.estimate("end"))
+    mine = table[table["name"] == "end"]
+    assert mine["covariance_01"].tolist() == [estimate.covariance[1] for estimate in estimates]
+    assert mine["covariance_55"].tolist() == [estimate.covariance[35] for estimate in estimates]
+    used = [estimate.sensors.get("gps", (np.nan, np.nan))[0] for estimate in estimates]
+    np.testing.assert_array_equal(mine["sensors_gps_used"], used)
+    states, table = said(run, keys.cluster_state("main")), csv(run, "cluster_state")
+    assert table["desired_beta"].tolist() == [state.desired[state.names.index("beta")] for state in states]
+    assert table["phase"].tolist() == [state.phase for state in states]
+    assert table["trajectory_t_s"].isna().all()
+
+
+def test_flags_are_numbers_in_csv_and_flags_in_parquet(run: Path) -> None:
+    assert set(csv(run, "status")["collision"]) <= {0, 1}
+    assert pq.read_schema(run / "parquet" / "status.parquet").field("collision").type == "bool"
+
+
+def test_what_has_no_columns_is_json(run: Path) -> None:
+    events = csv(run, "event")
+    recorded = said(run, keys.EVENT)
+    assert [json.loads(text) for text in events["data"]] == [msgspec.to_builtins(event.data) for event in recorded]
+    foreign = csv(run, "foreign")
+    assert json.loads(foreign["content"][0])["x"] == [1, 2]
+    assert json.loads(foreign["content"][1]) == {"hexadecimal": "c100"}
+    info = csv(run, "info")
+    assert json.loads(info["drones"][0])[1]["name"] == "a-b.c"
+    assert info["origin_latitude_deg"][0] == said(run, keys.INFO)[0].origin.latitude_deg
+
+
+def test_the_manifest_tells_what_the_tables_are(run: Path) -> None:
+    manifest = json.loads((run / "csv" / "export.json").read_bytes())
+    assert manifest["complete"] is True
+    assert manifest["notes"] == []
+    told = {file.removesuffix(".csv"): table["rows"] for file, table in manifest["tables"].items()}
+    assert told == counts(run)
+    for file, table in manifest["tables"].items():
+        assert (run / "csv" / file).read_text().splitlines()[0] == ",".join(f'"{name}"' for name in table["columns"])
+
+
+def test_no_table_has_a_column_twice() -> None:
+    for kind in set(messages.types_by_shape().values()):
+        names = [column for field in fields(kind, {}) for column in field.columns]
+        assert len(names) == len(set(names)), kind
+
+
+def test_a_matlab_file_has_a_struct_per_drone(run: Path) -> None:
+    loaded = scipy.io.loadmat(run / "run.mat", simplify_cells=True)
+    assert set(loaded["truth"]) == {"drone1", "a_b_c", "xend"}
+    for drone, valid in {"drone1": "drone1", "a-b.c": "a_b_c", "end": "xend"}.items():
+        truths, struct = said(run, keys.truth(drone)), loaded["truth"][valid]
+        assert struct["name"] == drone
+        assert struct["t_ns"].dtype == np.int64
+        np.testing.assert_array_equal(struct["position_m"], [truth.position_m for truth in truths])
+        np.testing.assert_array_equal(struct["orientation_wxyz"], [truth.orientation_wxyz for truth in truths])
+    estimate = said(run, keys.estimate("drone1"))
+    struct = loaded["estimate"]["drone1"]
+    assert struct["covariance"].shape == (GATES, 36)
+    np.testing.assert_array_equal(struct["sensors"]["gps"][-1], estimate[-1].sensors["gps"])
+    states = said(run, keys.cluster_state("main"))
+    struct = loaded["cluster_state"]["main"]
+    assert struct["names"].tolist() == list(states[0].names)
+    np.testing.assert_array_equal(struct["desired"], [state.desired for state in states])
+
+
+@pytest.mark.skipif(shutil.which("octave-cli") is None, reason="Octave is not installed")
+def test_octave_loads_it(run: Path) -> None:
+    script = (
+        f"load('{run / 'run.mat'}'); t = truth.a_b_c; "
+        "printf('%d %d %.17g %s %s %s\\n', size(t.position_m), t.position_m(end, 3), class(t.t_ns), "
+        "cellstr(status.xend.state){end}, cluster_state.main.names{1});"
+    )
+    done = subprocess.run(["octave-cli", "--norc", "--eval", script], capture_output=True, text=True, timeout=120)
+    z = said(run, keys.truth("a-b.c"))[-1].position_m[2]
+    state = said(run, keys.status("end"))[-1].state
+    assert done.stdout.split() == [str(GATES), "3", f"{z:.17g}", "int64", state, "x_c"], done.stderr
+
+
+def test_matlab_names_are_valid_and_never_the_same() -> None:
+    names = ["a.b", "a-b", "a_b", "2nd", "_x", "end", "for", "é", "q" * 80, "q" * 81]
+    made = matlab_names(names)
+    assert len(set(made.values())) == len(names)
+    assert all(made[name].isascii() and made[name].isidentifier() and made[name][0] != "_" for name in names)
+    assert all(len(valid) <= 63 and valid not in matlab.KEYWORDS for valid in made.values())
+
+
+def test_a_variable_that_matlab_would_not_load_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(matlab, "VARIABLE_MAX", 100_000)
+    with pytest.raises(
+        ReportError, match=r"^\w+: would have .* GB, and MATLAB loads .*; choose --keys, .*parquetread$"
+    ):
+        export(run, Format.MAT, run / "large.mat")
+    assert not list(run.glob("large*"))
+
+
+def test_times_make_a_variable_small_enough(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(matlab, "VARIABLE_MAX", 100_000)
+    estimates = Selection(("drone/*/estimate",))
+    with pytest.raises(ReportError, match=r"^estimate: would have .*; choose --keys, --from and --to"):
+        export(run, Format.MAT, tmp_path / "all.mat", estimates)
+    done = export(run, Format.MAT, tmp_path / "some.mat", estimates._replace(from_s=1.0, to_s=1.1))
+    assert done.tables == {"estimate": 3 * 6}
+
+
+def test_what_a_message_does_not_have_is_empty(tmp_path: Path) -> None:
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        for k, drones in enumerate([("a", "b"), ("c",)]):
+            names = ("x_c", "y_c", "z_c", "yaw", "pitch", "phi_1", "phi_2", "p")[: 4 * len(drones)]
+            values = (1.5,) * len(names)
+            state = messages.ClusterState(k, 0, "engaged", drones, names, values, values, values, None, 1.0, "")
+            key = keys.cluster_state(f"of_{len(drones)}")
+            writer.add(key, messages.encode(state), messages.encoding(key), k, k)
+    export(tmp_path, Format.CSV)
+    export(tmp_path, Format.PARQUET)
+    lines = (tmp_path / "csv" / "cluster_state.csv").read_text().splitlines()
+    place = lines[0].split(",").index('"value_p"')
+    assert "nan" not in lines[2]
+    assert [line.split(",")[place] for line in lines[1:]] == ["1.5", ""]
+    column = pq.read_table(tmp_path / "parquet" / "cluster_state.parquet").column("value_p")
+    assert (column.null_count, column.to_pylist()) == (1, [1.5, None])
+
+
+def test_the_record_itself_can_be_given(run: Path, tmp_path: Path) -> None:
+    shutil.copy(run / "run.mcap", tmp_path / "flight1.mcap")
+    done = export(tmp_path / "flight1.mcap", Format.CSV, selection=Selection(("clock",)))
+    assert done.paths == (tmp_path / "csv",)
+    assert done.tables == {"clock.csv": counts(run)["clock"]}
+
+
+def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
+    selection = Selection(("drone/*/truth", "cluster/**"), from_s=1.0, to_s=2.0)
+    done = export(run, Format.PARQUET, tmp_path / "some", selection)
+    assert done.tables == {"cluster_state.parquet": 51, "truth.parquet": 153}
+    times = parquet(tmp_path / "some" / "truth.parquet")["t_ns"]
+    assert (times.min(), times.max()) == (1_000_000_000, 2_000_000_000)
+    with pytest.raises(
+        ReportError, match=r"run\.mcap: has no message on drone/nobody/\*\* that can be exported; it holds"
+    ):
+        export(run, Format.CSV, tmp_path / "none", Selection(("drone/nobody/**",)))
+    assert not (tmp_path / "none").exists()
+
+
+def test_nothing_is_overwritten_without_force(run: Path, tmp_path: Path) -> None:
+    some = Selection(("clock",))
+    export(run, Format.CSV, tmp_path / "out", some)
+    with pytest.raises(ReportError, match="out: exists; give --out another place, or --force"):
+        export(run, Format.CSV, tmp_path / "out", some)
+    export(run, Format.CSV, tmp_path / "out", Selection(("world/info",)), force=True)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"info.csv", "export.json"}
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "thesis.tex").write_text("precious")
+    with pytest.raises(ReportError, match="folder of something else"):
+        export(run, Format.CSV, tmp_path / "home", some, force=True)
+    with pytest.raises(ReportError, match="is the record itself"):
+        export(run, Format.MAT, run / "run.mcap", some, force=True)
+    with pytest.raises(ReportError, match="file of something else"):
+        export(run, Format.MAT, tmp_path / "home" / "thesis.tex", some, force=True)
+    assert (tmp_path / "home" / "thesis.tex").read_text() == "precious"
+    (tmp_path / "home" / "export.json").write_text("[]")
+    with pytest.raises(ReportError, match=r"folder of something else than an export \(it has no export\.json of one"):
+        export(run, Format.CSV, tmp_path / "home", some, force=True)
+    for _ in range(2):
+        export(run, Format.MAT, tmp_path / "again.mat", some, force=True)
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "plots"])
+def test_force_does_not_replace_a_folder_that_holds_more(run: Path, tmp_path: Path, name: str) -> None:
+    some, out = Selection(("clock",)), tmp_path / "out"
+    export(run, Format.CSV, out, some)
+    (out / name).mkdir() if name == "plots" else (out / name).write_text("precious")
+    with pytest.raises(ReportError, match=rf"something else than an export \(it holds {name}\); give --out"):
+        export(run, Format.CSV, out, some, force=True)
+    assert {path.name for path in out.iterdir()} == {"clock.csv", "export.json", name}
+
+
+def test_force_does_not_replace_files_that_are_not_of_an_export(run: Path, tmp_path: Path) -> None:
+    shutil.copy(run / "run.mcap", tmp_path / "flight1.mcap")
+    (tmp_path / "own.mat").write_bytes(b"MATLAB 5.0 MAT-file, Platform: GLNXA64, Created on: Sun Nov 22".ljust(128))
+    for name in ("flight1.mcap", "own.mat"):
+        before = (tmp_path / name).read_bytes()
+        with pytest.raises(ReportError, match="file of something else"):
+            export(run, Format.FOXGLOVE, tmp_path / name, Selection(("clock",)), force=True)
+        assert (tmp_path / name).read_bytes() == before
+
+
+def test_what_fails_leaves_no_folder_that_it_made(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(ReportError, match="has no message on nothing"):
+        export(run, Format.CSV, tmp_path / "new" / "a" / "b", Selection(("nothing/**",)))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("after", [False, True])
+@pytest.mark.parametrize("step", range(4))
+def test_an_interrupt_while_it_is_put_in_place_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int, after: bool
+) -> None:
+    """Interrupted before or after any of the four moves that replace a folder and a file, all is as it was."""
+    folder, file, moves, replace = tmp_path / "folder", tmp_path / "file", count(), Path.replace
+    folder.mkdir()
+    (folder / "old").touch()
+    file.write_text("old")
+
+    def interrupted(self: Path, target: Path) -> Path:
+        due = next(moves) == step
+        if not due or after:
+            replace(self, target)
+        if due:
+            raise KeyboardInterrupt
+        return target
+
+    def put() -> None:
+        with placed(folder, file) as (new_folder, new_file):
+            new_folder.mkdir()
+            new_file.write_text("new")
+            monkeypatch.setattr(Path, "replace", interrupted)
+
+    with pytest.raises(KeyboardInterrupt):
+        put()
+    assert [path.name for path in folder.iterdir()] == ["old"]
+    assert file.read_text() == "old"
+    assert {path.name for path in tmp_path.iterdir()} == {"folder", "file"}
+
+
+def test_garbage_on_record_is_left_out_and_told(run: Path, tmp_path: Path) -> None:
+    with RecordReader(run / "run.mcap") as reader, RecordWriter(tmp_path / "run.mcap") as writer:
+        for message in reader.messages(by_time=False):
+            writer.add(message.key, message.payload, messages.encoding(message.key), message.t_ns, message.wall_ns)
+        for payload in (b"", b"\xff", msgspec.msgpack.encode({"t_ns": "soon"})):
+            writer.add(keys.truth("drone1"), payload, "", 5, 5)
+        huge = {**msgspec.to_builtins(said(run, "process/controller.main/join")[0]), "incarnation": 2**63}
+        writer.add("process/controller.main/join", msgspec.msgpack.encode(huge), "", 5, 5)
+    done = export(tmp_path, Format.PARQUET)
+    assert done.notes == ["3 messages on record are not what their key promises and were left out"]
+    assert done.tables["truth.parquet"] == counts(run)["truth"]
+    assert parquet(tmp_path / "parquet" / "join.parquet")["incarnation"].isna().sum() == 1
+
+
+def test_nothing_to_export_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"holds no run\.mcap; give the folder of a run, .*, or the file"):
+        export(tmp_path, Format.CSV)
+    RecordWriter(tmp_path / "run.mcap").close()
+    for each in Format:
+        with pytest.raises(ReportError, match="holds no message; there is nothing to export"):
+            export(tmp_path, each)
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+
+
+def test_what_is_not_installed_is_named(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(formats, "find_spec", lambda module: None if module == "foxglove" else module)
+    done = CliRunner().invoke(app, ["export", str(run), "--format", "foxglove"])
+    assert str(done.exception) == "zsim export: foxglove is not installed; install zsim[export]"
+
+
+def test_the_command_line_starts_without_what_exports_need() -> None:
+    loaded = "import sys, zsim_deploy.cli; print({'mcap', 'pyarrow', 'scipy', 'foxglove'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+def test_the_command_prints_what_it_wrote(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    asked = ["export", str(run), "--format", "csv", "--keys", "drone/*/truth", "--from", "1", "--out", str(out)]
+    done = CliRunner().invoke(app, asked)
+    assert done.exit_code == 0, done.output
+    assert [line.split() for line in done.stdout.splitlines()] == [["truth.csv", "753"], ["written:", str(out)]]
+    refused = CliRunner().invoke(app, [*asked, "--to", "0.5"])
+    assert refused.exit_code == 2
+    assert "before --from" in refused.output
+
+
+EXPORT = """
+    import resource, sys
+    from pathlib import Path
+    from zsim_analysis.export.make_export import Format, export
+    print("begun", flush=True)
+    export(Path(sys.argv[1]), Format(sys.argv[2]))
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
+"""
+
+
+def long_record(path: Path, gates: int) -> None:
+    """Write the estimates of a run of so many gates."""
+    covariance = tuple(float(i) for i in range(36))
+    with RecordWriter(path) as writer:
+        for k in range(gates):
+            t_ns = 20_000_000 * k
+            for name in ("a", "b", "c", "d"):
+                v = (0.1 * k, 0.2, 0.3)
+                counts = {"gps": (k, 0), "imu": (k, k)}
+                estimate = messages.Estimate(t_ns, k, v, v, (1.0, 0.0, 0.0, 0.0), 0.1, covariance, 0.1, v, counts)
+                key = keys.estimate(name)
+                writer.add(key, messages.encode(estimate), messages.encoding(key), t_ns, t_ns)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_a_longer_record_takes_no_more_memory(tmp_path: Path, suffix: str) -> None:
+    """Ten times as many messages may take a row group's worth more, 30 MB; all of them as objects would be 400 MB."""
+    peaks_mb = []
+    for gates in (2_000, 20_000):
+        folder = tmp_path / str(gates)
+        folder.mkdir()
+        long_record(folder / "run.mcap", gates)
+        command = [sys.executable, "-c", textwrap.dedent(EXPORT), str(folder), suffix]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+        peaks_mb.append(int(done.stdout.split()[-1]))
+    assert peaks_mb[1] - peaks_mb[0] < 120
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet", "mat", "foxglove"])
+def test_ctrl_c_leaves_nothing(tmp_path: Path, suffix: str) -> None:
+    long_record(tmp_path / "run.mcap", 5_000)
+    command = [sys.executable, "-m", "zsim_deploy.cli", "export", str(tmp_path), "--format", suffix]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    until_s = time.monotonic() + 60
+    while not list(tmp_path.glob(".export-*")) and time.monotonic() < until_s:
+        os.sched_yield()
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(run: Path, tmp_path: Path) -> None:
+    shutil.copy(run / "run.mcap", tmp_path)
+    limit = 50_000
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+
+    for each in Format:
+        command = [sys.executable, "-m", "zsim_deploy.cli", "export", str(tmp_path), "--format", each.value]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, preexec_fn=limited)
+        assert done.returncode == 2, done.stderr
+        assert done.stderr.strip().count("\n") == 0, done.stderr
+        assert done.stderr.endswith("; make room and export again\n")
+        assert done.stderr.startswith(str(tmp_path))
+        assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]

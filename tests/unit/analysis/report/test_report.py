@@ -1,0 +1,412 @@
+"""The report: known flights give their closed-form figures, broken records give what there is."""
+
+import hashlib
+import json
+import math
+import re
+import struct
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import matplotlib.image
+import msgspec
+import numpy as np
+import pytest
+import synthetic_record
+from rich.console import Console
+from synthetic_record import GATE_NS, SCENARIOS, Flown
+
+from zsim.contract import keys, messages
+from zsim.errors import RecordError, ReportError
+from zsim.record import RecordReader, RecordWriter
+from zsim.scenario import scenario_file
+from zsim_analysis.reading.formation_errors import window
+from zsim_analysis.report import judge, make_report, table
+from zsim_analysis.report.figures.canvas import thinned
+from zsim_analysis.report.report_page import page
+
+NAMES = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", "phi_1", "phi_2", "phi_3", "p", "q", "beta"]
+AMPLITUDE = np.array([0.12, 0.13, 0.03, 0.02, 0.01, 0.07, 0.05, 0.06, 0.04, 0.28, 0.3, 0.08])
+OFFSET = np.array([0.05, -0.04, 0.01, 0.003, -0.002, 0.02, 0.01, -0.01, 0.03, 0.1, -0.1, 0.01])
+FIGURES = {
+    "figure_5_errors.png",
+    "figure_6_position.png",
+    "figure_7_orientation.png",
+    "figure_8_shape.png",
+    "plan_view.png",
+    "drones.png",
+}
+CONTRACT_FIELDS = {
+    "scenario",
+    "seed",
+    "mode",
+    "versions",
+    "fingerprint",
+    "real_time_factor",
+    "wall_s",
+    "sim_s",
+    "ended",
+    "deadline_misses",
+    "command_age_ms",
+    "window_s",
+    "errors",
+    "min_separation_m",
+    "paper_table_1",
+    "events",
+    "truth_sha256",
+}
+
+
+def flown(**options) -> Flown:
+    """Return a flight of 12 s whose window of 8 s holds four whole waves of its error."""
+    wave = {"amplitude": AMPLITUDE, "offset": OFFSET, "est_amplitude": 0.5 * AMPLITUDE, "period_s": 2.0}
+    return Flown(**{"duration_s": 12.0, "overrides": ("report.window_s=[2, 9.98]",), **wave, **options})
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("run")
+    end = {
+        "reason": "the scenario's duration is over",
+        "wall_s": 0.6,
+        "sim_s": 12.0,
+        "last_ns": 12_000_000_000,
+        "real_time_factor": 20.0,
+        "deadlines": 600,
+        "deadline_misses": 2,
+        "deadline_misses_by": {"estimator.drone1": 2},
+        "command_age_ms": {"p50": 1.0, "p99": 2.0, "max": 3.0},
+        "truth_sha256": "0" * 64,
+    }
+    script = messages.Event(GATE_NS, 0, "refused", "eve", "drone1", "<script>alert(1)</script>", {})
+    synthetic_record.write(directory / "run.mcap", flown(end=end, events=(script,)))
+    steps: list[str] = []
+    summary = make_report(directory, steps.append)
+    assert len(steps) == 3 + len(FIGURES)
+    return directory, summary
+
+
+def report_of(directory: Path, flight: Flown):
+    synthetic_record.write(directory / "run.mcap", flight)
+    return judge(directory / "run.mcap")[-1]
+
+
+def test_errors_are_those_of_the_closed_form(run):
+    _, summary = run
+    assert summary.window_s == (2.0, 9.98)
+    assert list(summary.errors) == NAMES
+    for name, amplitude, offset in zip(NAMES, AMPLITUDE, OFFSET, strict=True):
+        errors = summary.errors[name]
+        sine = amplitude / math.sqrt(2)
+        assert errors.true_mean == pytest.approx(offset, abs=1e-9)
+        assert errors.true_std == pytest.approx(sine, rel=1e-9)
+        assert errors.true_rms == pytest.approx(math.hypot(sine, offset), rel=1e-9)
+        assert errors.est_mean == pytest.approx(0, abs=1e-9)
+        assert errors.est_std == pytest.approx(sine / 2, rel=1e-9)
+        assert errors.est_rms == pytest.approx(sine / 2, rel=1e-9)
+
+
+def test_angles_wrap_the_short_way(tmp_path):
+    # Test 2 turns by 0.1 rad/s and passes pi; estimates are on the wire in [-pi, pi].
+    flight = flown(scenario="trajectory", duration_s=64.0, overrides=("report.window_s=[22, 61.98]",))
+    summary = report_of(tmp_path, flight)
+    yaw, sine = summary.errors["yaw"], AMPLITUDE[5] / math.sqrt(2)
+    assert (yaw.true_std, yaw.true_mean, yaw.est_std) == pytest.approx((sine, OFFSET[5], sine / 2), rel=1e-6)
+
+
+def test_summary_json_has_the_fields_of_the_contract(run):
+    directory, summary = run
+    said = json.loads((directory / "summary.json").read_bytes())
+    assert said.keys() >= CONTRACT_FIELDS
+    assert said["errors"]["p"].keys() == {
+        "est_std",
+        "est_rms",
+        "est_mean",
+        "true_std",
+        "true_rms",
+        "true_mean",
+    }
+    assert said["clusters"]["main"]["errors"] == said["errors"]
+    assert said["paper_table_1"]["beta"] == 0.012
+    assert (said["scenario"], said["seed"], said["mode"]) == ("step", 1, "lockstep")
+    assert (said["real_time_factor"], said["wall_s"], said["deadline_misses"]) == (20.0, 0.6, 2)
+    assert said["ended"] == "the scenario's duration is over"
+    assert [event["kind"] for event in said["events"]] == ["refused", "end"]
+    assert said["versions"]["estimator.drone1"] == "0.1.0"
+    assert msgspec.json.decode((directory / "summary.json").read_bytes(), type=type(summary)) == summary
+
+
+def test_truth_hash_is_the_one_of_the_contract(run):
+    directory, summary = run
+    digest = hashlib.sha256()
+    with RecordReader(directory / "run.mcap") as reader:
+        instants = {}
+        for n in (1, 2, 3):
+            for message in reader.messages({keys.truth(f"drone{n}")}):
+                truth = messages.decode(message.key, message.payload)
+                instants[truth.t_ns, n] = truth
+    for _, truth in sorted(instants.items()):
+        parts = truth.position_m, truth.velocity_m_s, truth.orientation_wxyz, truth.angular_velocity_rad_s
+        digest.update(struct.pack("<q13d", truth.t_ns, *(number for part in parts for number in part)))
+    assert summary.record.truth_sha256 == digest.hexdigest()
+    assert summary.truth_sha256 == "0" * 64
+    assert any("the world reported 000" in note for note in summary.notes)
+    assert summary.record.truth_missing == 0
+
+
+def test_truth_that_is_not_on_record_is_told(tmp_path):
+    synthetic_record.write(tmp_path / "all.mcap", flown())
+    with RecordReader(tmp_path / "all.mcap") as reader, RecordWriter(tmp_path / "run.mcap") as writer:
+        for message in reader.messages(by_time=False):
+            if message.key == keys.truth("drone2") and 3_000_000_000 <= message.t_ns < 4_000_000_000:
+                continue
+            writer.add(message.key, message.payload, messages.encoding(message.key), message.t_ns, message.wall_ns)
+    summary = judge(tmp_path / "run.mcap")[-1]
+    assert summary.record.truth_missing == 50
+    assert any("50 of 1803 truth messages are not on record" in note for note in summary.notes)
+    assert summary.errors["p"].true_std == pytest.approx(AMPLITUDE[9] / math.sqrt(2), rel=0.05)
+
+
+def test_a_replay_is_told_and_judged_from_where_it_begins(tmp_path):
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        for key, message, wall_ns in synthetic_record.traffic(flown(end=None)):
+            if key == keys.INFO:
+                message = msgspec.structs.replace(message, replay_of="20261122-run")
+            elif message.t_ns < 9_000_000_000:
+                continue
+            writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
+    summary = make_report(tmp_path)
+    assert summary.record.truth_missing == 0
+    assert summary.sim_s == pytest.approx(3.0)
+    assert summary.real_time_factor == pytest.approx(20.0)
+    assert "This is a replay of run 20261122-run, no flight of its own." in summary.notes
+    assert "a replay of run 20261122-run" in (tmp_path / "report.html").read_text()
+
+
+def test_a_flight_whose_recorder_came_late_lacks_its_beginning(tmp_path):
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        for key, message, wall_ns in synthetic_record.traffic(flown(end=None)):
+            if key == keys.INFO or message.t_ns >= 9_000_000_000:
+                writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
+    summary = judge(tmp_path / "run.mcap")[-1]
+    assert summary.record.truth_missing == 3 * 449
+    assert summary.real_time_factor == pytest.approx(20.0)
+
+
+def test_separation_is_the_closest_pair_in_truth(tmp_path):
+    summary = report_of(tmp_path, flown(amplitude=np.zeros(12), offset=np.zeros(12)))
+    assert summary.min_separation_m == pytest.approx(8 * math.sin(math.pi / 8), rel=1e-9)  # 2 p sin(beta / 2)
+
+
+def test_separation_counts_in_the_air_only(tmp_path):
+    # p and q grow from 1 m on the ground; the state is landed until 1 s.
+    away, grow = np.zeros(12), np.zeros(12)
+    away[9:11], grow[9:11] = -3.0, 3.0
+    growing = Flown(duration_s=8.0, climb_s=10.0, offset=away, amplitude=grow, period_s=40.0)
+    at_lift_off = 1 + 3 * math.sin(2 * math.pi / 40)
+    assert report_of(tmp_path, growing).min_separation_m == pytest.approx(2 * at_lift_off * math.sin(math.pi / 8))
+    (tmp_path / "run.mcap").unlink()
+    nobody_flies = replace(growing, duration_s=0.9)
+    assert report_of(tmp_path, nobody_flies).min_separation_m == pytest.approx(2 * math.sin(math.pi / 8))
+
+
+def test_a_world_that_died_leaves_all_that_can_be_known(tmp_path):
+    summary = report_of(tmp_path, flown(end=None, other_traffic=True))
+    assert summary.ended == "the record ends here at 12.00 s: no end is on record"
+    assert summary.wall_s == pytest.approx(0.6)  # the synthetic recorder takes 1 ms a gate
+    assert summary.real_time_factor == pytest.approx(20.0)
+    assert summary.deadline_misses is None
+    assert summary.command_age_ms == {"p50": 0.0, "p99": 0.0, "max": 0.0}
+    assert summary.truth_sha256 == summary.record.truth_sha256
+    assert summary.errors["p"].true_std == pytest.approx(AMPLITUDE[9] / math.sqrt(2), rel=1e-9)
+
+
+def test_a_cut_record_is_reported_up_to_the_cut(tmp_path):
+    flight = flown(other_traffic=True, end=None)
+    synthetic_record.write(tmp_path / "whole.mcap", flight)
+    data = (tmp_path / "whole.mcap").read_bytes()
+    (tmp_path / "run.mcap").write_bytes(data[: len(data) // 2])
+    summary = judge(tmp_path / "run.mcap")[-1]
+    assert 4 < summary.sim_s < 8
+    assert summary.ended == f"the record was cut after {summary.sim_s:.2f} s: no end is on record"
+    assert any("The run ended at" in note for note in summary.notes)
+    assert any("was cut" in note for note in summary.notes)
+
+
+def test_a_run_without_a_cluster(tmp_path):
+    summary = report_of(tmp_path, flown(overrides=("clusters=[]",)))
+    make_report(tmp_path)
+    assert summary.errors == {}
+    assert any("no cluster" in note for note in summary.notes)
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"plan_view.png", "drones.png"}
+    assert "No cluster published a state" in (tmp_path / "report.html").read_text()
+
+
+def test_a_cluster_that_said_nothing(tmp_path):
+    synthetic_record.write(tmp_path / "all.mcap", flown())
+    with RecordReader(tmp_path / "all.mcap") as reader, RecordWriter(tmp_path / "run.mcap") as writer:
+        for message in reader.messages(by_time=False):
+            if message.key != keys.cluster_state("main"):
+                encoding = messages.encoding(message.key)
+                writer.add(message.key, message.payload, encoding, message.t_ns, message.wall_ns)
+    summary = judge(tmp_path / "run.mcap")[-1]
+    assert summary.errors == {}
+    assert any("Cluster main published no state" in note for note in summary.notes)
+
+
+@pytest.mark.parametrize("length", [0, 1, 100])
+def test_a_record_without_a_message_is_refused(tmp_path, length):
+    synthetic_record.write(tmp_path / "whole.mcap", flown(duration_s=0.1))
+    (tmp_path / "run.mcap").write_bytes((tmp_path / "whole.mcap").read_bytes()[:length])
+    with pytest.raises(RecordError, match=r"run\.mcap: holds no message; there is nothing to report"):
+        make_report(tmp_path)
+    assert [path.name for path in tmp_path.iterdir() if path.suffix != ".mcap"] == []
+
+
+def test_a_record_on_which_no_drone_moves_is_refused(tmp_path):
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        for key, message, wall_ns in synthetic_record.traffic(flown(duration_s=0.1)):
+            if not key.endswith("/truth"):
+                writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
+    with pytest.raises(RecordError, match=r"holds \d+ messages and no truth"):
+        make_report(tmp_path)
+
+
+def test_garbage_on_the_keys_is_counted_and_passed_over(tmp_path):
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        for key, message, wall_ns in synthetic_record.traffic(flown()):
+            writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
+            if key == keys.CLOCK:
+                for rubbish in (b"", b"\xff" * 40, msgspec.msgpack.encode({"t_ns": "soon"})):
+                    writer.add(keys.truth("drone1"), rubbish, "", 0, 0)
+                    writer.add(keys.cluster_state("main"), rubbish, "", 0, 0)
+                    writer.add(keys.EVENT, rubbish, "", 0, 0)
+    summary = judge(tmp_path / "run.mcap")[-1]
+    assert summary.record.undecoded == 601 * 9
+    assert summary.errors["p"].true_std == pytest.approx(AMPLITUDE[9] / math.sqrt(2), rel=1e-9)
+
+
+def test_a_flood_of_events_does_not_hide_a_restart(tmp_path):
+    flood = [messages.Event(GATE_NS, i, "refused", "eve", "drone1", f"refused {i}", {}) for i in range(5000)]
+    restart = messages.Event(2 * GATE_NS, 0, "restart", "world", "estimator.drone1", "restarted", {})
+    summary = report_of(tmp_path, flown(events=(*flood, restart)))
+    assert [event.kind for event in summary.events].count("restart") == 1
+    assert summary.events_left_out == {"refused": 4900}
+    assert "4900 × refused" in page(summary, [], tmp_path)
+
+
+class Links(HTMLParser):
+    """Collects everything in a page that a browser would fetch or run."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.scripts = 0
+
+    def handle_starttag(self, tag, attrs):
+        self.scripts += tag == "script"
+        self.found += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "action", "data")]
+
+
+def test_the_page_asks_nothing_of_the_network_and_runs_nothing(run):
+    directory, _ = run
+    text = (directory / "report.html").read_text()
+    links = Links()
+    links.feed(text)
+    assert len([link for link in links.found if link.startswith("data:image/png;base64,")]) == len(FIGURES)
+    assert all(link.startswith("data:") for link in links.found)
+    assert links.scripts == 0
+    assert not re.search(r"https?:|@import|url\(", text)
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+    assert 'name="viewport"' in text
+    assert "2 of 600 (estimator.drone1 2)" in text
+
+
+def test_figures_show_something(run):
+    directory, _ = run
+    assert {path.name for path in (directory / "figures").iterdir()} == FIGURES
+    for name in FIGURES:
+        picture = matplotlib.image.imread(directory / "figures" / name)[:, :, :3]
+        assert picture.shape[1] >= 1000
+        inked = (picture < 0.9).any(axis=2)
+        assert 0.005 < inked.mean() < 0.6
+        colours = (picture * 255).astype(int) @ (65_536, 256, 1)
+        assert len(np.unique(colours)) > 50
+
+
+def test_the_terminal_table_stands_beside_the_paper(run):
+    _, summary = run
+    console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(table(summary))
+    console.file.close()
+    text = console.export_text()
+    row = next(line for line in text.splitlines() if line.strip("│ ").startswith("p (m)"))
+    assert "0.032" in row
+    assert f"{AMPLITUDE[9] / math.sqrt(2):.4f}" in row
+
+
+def test_nothing_to_report_on_is_one_line(tmp_path):
+    with pytest.raises(RecordError, match=r"run\.mcap: cannot be read \(No such file"):
+        make_report(tmp_path)
+    synthetic_record.write(tmp_path / "run.mcap", flown(duration_s=0.1))
+    (tmp_path / "figures").write_text("in the way")
+    with pytest.raises(ReportError, match="the report cannot be written"):
+        make_report(tmp_path)
+    assert not (tmp_path / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "length_s", "expected", "noted"),
+    [
+        (None, 30.0, (10.0, 30.0), ""),
+        ((120, 320), 330.0, (120, 320), ""),
+        ((120, 320), 200.0, (120, 200.0), "inside the window"),
+        ((120, 320), 60.0, (20.0, 60.0), "before the window"),
+        (None, 0.0, (0.0, 0.0), ""),
+    ],
+)
+def test_window_of_the_statistics(asked, length_s, expected, noted):
+    found, note = window(asked, length_s)
+    assert found == pytest.approx(expected)
+    assert noted in note
+    assert bool(noted) == bool(note)
+
+
+def test_thinning_keeps_every_extreme():
+    rng = np.random.default_rng(7)
+    y = rng.standard_normal(100_000)
+    y[31_234], y[77_777], y[50_000:50_300] = 40.0, -50.0, np.nan
+    x = np.arange(len(y), dtype=float)
+    few_x, few_y = thinned(x, y)
+    assert len(few_x) <= 2000
+    assert (np.nanmax(few_y), np.nanmin(few_y)) == (40.0, -50.0)
+    assert np.isnan(few_y).any()
+    assert np.all(np.diff(few_x) > 0)
+
+
+def test_several_clusters_have_a_table_and_figures_each(tmp_path):
+    scenario = scenario_file.load(SCENARIOS / "step.yaml")
+    second = msgspec.structs.replace(
+        synthetic_record.info(scenario),
+        clusters=(
+            messages.ClusterInfo("pair", ("drone1", "drone2")),
+            messages.ClusterInfo("main", ("drone1", "drone2", "drone3")),
+        ),
+    )
+    pair_names = ("x_c", "y_c", "z_c", "pitch", "yaw", "phi_1", "phi_2", "p")
+    with RecordWriter(tmp_path / "run.mcap") as writer:
+        for key, message, wall_ns in synthetic_record.traffic(flown()):
+            message = second if key == keys.INFO else message
+            t_ns = message.t_ns
+            writer.add(key, messages.encode(message), messages.encoding(key), t_ns, wall_ns)
+            if key == keys.CLOCK:
+                rest = {"names": pair_names, "value": (1.0,) * 8, "desired": (1.0,) * 8}
+                state = {"t_ns": t_ns, "seq": 0, "phase": "engaged", **rest}
+                writer.add(keys.cluster_state("pair"), msgspec.msgpack.encode(state), "", t_ns, wall_ns)
+    summary = make_report(tmp_path)
+    assert list(summary.clusters) == ["pair", "main"]
+    assert summary.errors == summary.clusters["pair"].errors
+    assert set(summary.errors) == set(pair_names)
+    assert (tmp_path / "figures" / "figure_8_shape.png").exists()
+    assert (tmp_path / "figures" / "figure_8_shape_main.png").exists()

@@ -1,0 +1,321 @@
+"""One run on the page, drawn by a viser of its own that nobody looks at but the test."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsim.contract import keys, messages
+from zsim.contract.messages import ControlAnswer, DroneView, EstimateView, Event, ViewCluster, ViewDrones, ViewEstimates
+from zsim.scenario import scenario_file
+from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_bridges.console.command_client import Told
+from zsim_bridges.console.http.private_viser import PrivateViser
+from zsim_bridges.console.run_page import Show, pictures_hz
+from zsim_bridges.console.scene import scene_nodes as stages
+from zsim_bridges.console.scene.camera_follow import Followers
+from zsim_bridges.console.scene.picture import drones_of
+from zsim_bridges.console.time_monitor import Watch
+
+STEP = Path(__file__).parents[4] / "scenarios" / "step.yaml"
+SCENARIO = scenario_file.load(STEP)
+NAMES = tuple(drone.name for drone in SCENARIO.drones)
+CLUSTER = SCENARIO.clusters[0].name
+SPACE = scenario_space(SCENARIO, SCENARIO.clusters[0])
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+ROTORS = (300.0, 300.0, 300.0, 300.0)  # rad/s
+ORIGIN = (0.0, 0.0, 0.0)
+OBSTACLES = """
+name: field
+duration_s: 1
+drones: [{name: drone1, position_m: [0, 0, 0]}]
+environment:
+  obstacles:
+    - {name: wall, shape: box, position_m: [5, 0, 0], size_m: [1, 4, 3]}
+    - {name: mast, shape: cylinder, position_m: [9, 0, 0], radius_m: 0.2, height_m: 6}
+    - {name: balloon, shape: sphere, position_m: [9, 9, 5], radius_m: 1}
+"""
+
+
+class Link:
+    """A session on which only the test speaks."""
+
+    host = "lab"
+
+    def __init__(self) -> None:
+        self.say: Callable[[Any], None] = lambda _: None
+        self.tell: Callable[[Any], None] = lambda _: None
+        self.asked: list[tuple[str, str, dict[str, Any]]] = []
+
+    def hear(self, expression: str, callback: Callable[[Any], None]) -> None:
+        self.say = callback
+
+    def on_message(self, expression: str, callback: Callable[[Any], None]) -> None:
+        self.tell = callback
+
+    def get(self, expression: str, timeout_s: float = 2.0) -> list[Any]:
+        return []
+
+    def request(self, key: str, op: str, source: str, args: dict[str, Any], timeout_s: float) -> ControlAnswer:
+        self.asked.append((key, op, args))
+        return ControlAnswer(True, "")
+
+
+class Seen:
+    """A run on a page: what is said of it, a picture after the other."""
+
+    def __init__(self, server: Any, watched: bool) -> None:
+        self.link: Any = Link()
+        health = SimpleNamespace(received=0, refused=0)
+        self.presence: Any = SimpleNamespace(
+            name="console.1", now_ns=0, over="", health=health, heed=lambda _: None, tick=lambda: None
+        )
+        drones = [SimpleNamespace(name=name) for name in NAMES]
+        scenario = STEP.read_text()
+        info: Any = SimpleNamespace(run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario)
+        server.get_clients = lambda: {0: None} if watched else {}
+        self.show = Show(server, self.link, info, self.presence, Followers(server), 1000.0)
+
+    def draw(self, *said: tuple[str, Any]) -> dict[str, Any]:
+        """Say something, draw a picture, and return what is shown."""
+        turns = iter((False, True))
+
+        def stopped() -> bool:
+            over = next(turns)
+            for key, message in () if over else said:
+                self.link.say(SimpleNamespace(key=key, payload=messages.encode(message)))
+            return over
+
+        self.show.run(stopped)
+        return self.show.state()
+
+
+@pytest.fixture(scope="module")
+def viser() -> Iterator[PrivateViser]:
+    made = PrivateViser()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def seen(viser: PrivateViser) -> Iterator[Seen]:
+    made = Seen(viser.server, watched=True)
+    yield made
+    made.show.close()
+
+
+def drones(*names: str, t_ns: int = 20_000_000, away_m: float = 0.0) -> tuple[str, ViewDrones]:
+    """A triangle, or what a replay has of it."""
+    places = {name: (4.0 * (i == 1) + away_m, 3.0 * (i == 2), 2.0) for i, name in enumerate(NAMES)}
+    views = tuple(DroneView(n, places.get(n, ORIGIN), LEVEL, ROTORS, "flying", 80.0) for n in names)
+    return keys.VIEW_DRONES, ViewDrones(t_ns, 0, views, ((3.0, 0.0, 0.0),))
+
+
+def cluster(name: str = CLUSTER, names: tuple[str, ...] = SPACE.names) -> tuple[str, ViewCluster]:
+    c = tuple(SPACE.specimen(4.0).tolist())[: len(names)]
+    return keys.cluster_view(name), ViewCluster(20_000_000, 0, "engaged", names, c, c, "")
+
+
+@pytest.mark.parametrize(("drones", "rate", "hz"), [(3, 1.0, 20.0), (50, 1.0, 10.0), (3, 25.0, 10.0), (3, 0.0, 20.0)])
+def test_pictures_are_as_many_as_an_eye_can_follow(drones: int, rate: float, hz: float):
+    assert pictures_hz(drones, rate) == hz
+
+
+def test_a_whole_formation_is_shown(seen: Seen):
+    state = seen.draw(drones(*NAMES), cluster())
+    assert [drone["name"] for drone in state["drones"]] == list(NAMES)
+    assert state["clusters"][0]["true"]["p"] == pytest.approx(4.0)
+    assert state["t_s"] == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("watched", [True, False])
+def test_a_replay_of_some_drones_is_shown_as_far_as_it_goes(viser: PrivateViser, watched: bool):
+    seen = Seen(viser.server, watched)
+    state = seen.draw(drones(NAMES[1]), cluster())
+    assert [drone["name"] for drone in state["drones"]] == [NAMES[1]]
+    assert state["clusters"][0]["true"] == {}
+    assert seen.draw(drones())["drones"] == []
+    assert len(seen.draw(drones(*NAMES, "stranger"))["drones"]) == 4
+    seen.show.close()
+
+
+def test_a_run_that_nobody_watched_leaves_its_last_picture(viser: PrivateViser):
+    seen = Seen(viser.server, watched=False)
+    seen.draw(drones(*NAMES), cluster())
+    page = seen.show._page
+    assert "flying" in page.drones.content
+    assert "engaged" in page.phases.content
+    seen.show.close()
+
+
+def test_a_drone_that_is_missing_is_hidden_and_the_others_keep_their_places(viser: PrivateViser):
+    stage = stages.Stage(viser.server, NAMES, 3, 1)
+    found = drones_of(drones(NAMES[2])[1], NAMES)
+    stage.drones(found, 0.05)
+    stage.wind(found)
+    p_W = np.asarray(stage._airframes.batched_positions)
+    assert p_W[2].tolist() == [0.0, 3.0, 2.0]
+    assert p_W[0].tolist() == p_W[1].tolist() == list(stages.HIDDEN)
+    assert np.isfinite(stage._rotors.batched_positions).all()
+    assert stage._wind.visible
+    stage.wind(drones_of(drones()[1], NAMES))
+    assert not stage._wind.visible
+
+
+def test_views_of_another_controller_are_left_out(seen: Seen):
+    fewer = SPACE.names[:-1]
+    state = seen.draw(drones(*NAMES), cluster(names=fewer), cluster("strange"))
+    assert state["clusters"] == []
+    assert seen.presence.health.refused == 2
+    assert [each["name"] for each in seen.draw(cluster())["clusters"]] == [CLUSTER]
+
+
+def test_estimates_of_strangers_are_left_out(seen: Seen):
+    strangers = [EstimateView(f"s{i}", ORIGIN, (1.0, 0.0, 0.0, 1.0, 0.0, 1.0), 0.0, 0.1, {}) for i in range(9)]
+    mine = EstimateView(NAMES[0], ORIGIN, (4.0, 0.0, 0.0, 4.0, 0.0, 4.0), 0.0, 0.1, {"gps": (1, 0)})
+    view = ViewEstimates(20_000_000, 0, (*strangers, mine))
+    state = seen.draw(drones(*NAMES), (keys.estimates_view("estimator.drone1"), view))
+    assert state["drones"][0]["sigma_m"] == pytest.approx(2.0)
+
+
+def test_trails_go_when_a_replay_goes_back(viser: PrivateViser):
+    stage = stages.Stage(viser.server, NAMES, 3, 1)
+    stage.trails(np.ones((2, 2, 3)), np.array([0, 1]))
+    stage.trails(np.zeros((0, 2, 3)), np.zeros(0, dtype=np.int64))
+    assert (np.asarray(stage._trail_node.points)[..., 2] < -100.0).all()
+
+
+def test_trails_of_a_replay_that_goes_back_before_anybody_looks_go_too(viser: PrivateViser):
+    seen = Seen(viser.server, watched=False)
+    for t_ns, away_m in ((20_000_000, 0.0), (40_000_000, 5.0)):
+        seen.draw(drones(*NAMES, t_ns=t_ns, away_m=away_m))
+    assert len(trails(seen)) > len(NAMES)
+    seen.draw(drones(*NAMES, t_ns=20_000_000, away_m=9.0))
+    assert len(trails(seen)) == len(NAMES)  # nowhere but where they are
+    seen.show.close()
+
+
+def trails(seen: Seen) -> np.ndarray:
+    assert seen.show._drones is not None
+    return seen.show._trails.segments(seen.show._drones.p_W)[0]
+
+
+def test_what_the_world_refuses_of_the_console_s_commands_is_shown_in_the_corner(seen: Seen):
+    shown: list[tuple[str, str]] = []
+    seen.draw(drones(*NAMES))
+    client = SimpleNamespace(add_notification=lambda title, body, **_: shown.append((title, body)))
+    seen.show._server.get_clients = lambda: {0: client}  # type: ignore[assignment, dict-item, return-value]
+    subject, reason = "drone/drone1/cmd/mode", "age is 800 ms; must be <= 500 ms"
+    for source in ("somebody", "console.1"):
+        event = Event(0, 0, "refused", source, subject, f"{subject}: {reason}", {"reason": reason})
+        seen.link.tell(SimpleNamespace(key=keys.EVENT, payload=messages.encode(event)))
+    assert shown == [(f"Refused: {subject}", reason)]
+    assert [event.kind for event in seen.show.eyes.events] == ["refused", "refused"]
+
+
+def test_a_world_that_is_gone_is_told_on_the_page(seen: Seen, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(Watch, "silent_s", 12.0)
+    state = seen.draw(drones(*NAMES))
+    assert (state["clock"], state["silent_s"]) == ("silent", 12.0)
+    assert "no answer from the world for 12 s" in seen.show._page.clock.content
+
+
+def test_obstacles_stand_where_the_scenario_says(viser: PrivateViser):
+    obstacles = scenario_file.from_text(OBSTACLES).environment.obstacles
+    added: dict[str, Any] = {}
+    scene: Any = viser.server.scene
+    stage = stages.Stage(viser.server, NAMES, 3, 1)
+    for shape in ("box", "cylinder", "icosphere"):
+        setattr(scene, f"add_{shape}", lambda name, **look: added.update({name: look["position"]}))
+    try:
+        stage.obstacles(obstacles)
+    finally:
+        for shape in ("box", "cylinder", "icosphere"):
+            delattr(scene, f"add_{shape}")
+    assert added == {
+        "/obstacles/wall": (5.0, 0.0, 1.5),
+        "/obstacles/mast": (9.0, 0.0, 3.0),
+        "/obstacles/balloon": (9.0, 9.0, 5.0),
+    }
+
+
+def test_a_slider_that_was_moved_just_before_its_page_closed_is_sent_now_or_never(viser: PrivateViser):
+    seen = Seen(viser.server, watched=False)
+    sent: list[float] = []
+    for form in seen.show._page.forms.values():
+        form.send = sent.append  # type: ignore[method-assign]
+    seen.draw(drones(*NAMES))
+    assert len(sent) == 1
+    seen.show.close()
+
+
+class Page:
+    """A page of viser's, with its camera and its switch."""
+
+    def __init__(self, number: int) -> None:
+        self.client_id = number
+        self.camera = SimpleNamespace(position=np.zeros(3), look_at=np.zeros(3))
+        self.switch = SimpleNamespace(value=False, _impl=SimpleNamespace(uuid=f"u{number}"))
+        self.gui = SimpleNamespace(add_checkbox=lambda *_, **__: self.switch)
+
+    def atomic(self) -> "Page":
+        return self
+
+    def __enter__(self) -> None:
+        return
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+
+def cameras(calls: dict[str, Any], there: set[int]) -> Any:
+    """Return a server that has pages of some numbers."""
+    return SimpleNamespace(
+        on_client_connect=lambda call: calls.update(come=call),
+        on_client_disconnect=lambda call: calls.update(go=call),
+        get_clients=lambda: dict.fromkeys(there),
+    )
+
+
+def test_a_page_that_went_before_it_was_known_is_forgotten():
+    calls: dict[str, Any] = {}
+    followers = Followers(cameras(calls, set()))
+    gone = Page(1)
+    calls["go"](gone)
+    calls["come"](gone)
+    assert followers.switches == set()
+    gone.switch.value = True
+    followers.follow(np.array([(10.0, 0.0, 2.0)]))
+    assert followers._places == {}
+
+
+def test_cameras_follow_where_their_page_says_so():
+    calls: dict[str, Any] = {}
+    followers = Followers(cameras(calls, {1, 2}))
+    one, other = Page(1), Page(2)
+    calls["come"](one)
+    calls["come"](other)
+    assert followers.switches == {"u1", "u2"}
+    one.switch.value = True
+    followers.follow(np.array([(0.0, 0.0, 2.0), (2.0, 0.0, 2.0)]))  # the first picture: everybody looks there
+    followers.follow(np.array([(10.0, 0.0, 2.0), (12.0, 0.0, 2.0)]))
+    followers.follow(np.zeros((0, 3)))
+    assert one.camera.look_at.tolist() == [11.0, 0.0, 2.0]
+    assert other.camera.look_at.tolist() == [1.0, 0.0, 2.0]
+    followers.begin()  # another run
+    followers.follow(np.array([(30.0, 0.0, 2.0)]))
+    assert other.camera.look_at.tolist() == [30.0, 0.0, 2.0]
+    calls["go"](one)
+    assert followers.switches == {"u2"}
+    assert followers._places == {}
+
+
+def test_what_formations_were_asked_for_is_among_the_events_and_refusals_on_every_page(seen: Seen):
+    seen.show._server.get_clients = dict  # type: ignore[assignment]  # nobody looks
+    for told in (Told("main: takeoff", ""), Told("rate value 2", ""), Told("main: engage", "not yet")):
+        seen.show._tell(told)
+    found = [(event.kind, event.text) for event in seen.show.eyes.events]
+    assert found == [("refused", "main: engage: not yet"), ("control", "main: takeoff: done")]

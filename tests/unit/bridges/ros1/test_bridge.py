@@ -1,0 +1,214 @@
+"""The bridge's parts between the keys and the topics: what is published from what, and what is let go."""
+
+import asyncio
+import threading
+from typing import Any, cast
+
+import msgspec
+import pytest
+from fake_link import FakeLink
+
+from zsim.contract import batch, keys, messages
+from zsim.contract.bundle import Bundle, table_of
+from zsim.errors import RunError, SessionError
+from zsim.runtime.health import HealthMeter
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim.transport.session import Sample
+from zsim_bridges.observer_process import Presence
+from zsim_bridges.ros1 import intake as intake_module
+from zsim_bridges.ros1.bridge import Bridge, check_names
+from zsim_bridges.ros1.drone_topics import DroneTopics
+from zsim_bridges.ros1.intake import Intake
+from zsim_bridges.ros1.wire import message_types
+from zsim_bridges.ros1.wire.node import Node
+
+GATE_NS = 20_000_000
+SCENARIO = """
+name: one
+duration_s: 10
+sensors: {preset: paper}
+drones: [{name: quad-1, position_m: [0, 0, 0]}]
+"""
+LEVEL, ZERO, STILL = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
+
+
+def scenario() -> Scenario:
+    return scenario_file.resolve(msgspec.yaml.decode(SCENARIO.encode()))
+
+
+class Ear:
+    """A subscriber that keeps what is published, as messages."""
+
+    def __init__(self, node: Node, topic: str) -> None:
+        published = node._published[topic]
+        self._kind = published.offer.type
+        self.heard: list[Any] = []
+        published.outlets.append(cast(Any, self))
+
+    def put(self, framed: bytes) -> None:
+        self.heard.append(message_types.deserialize(self._kind, framed[4:]))
+
+
+class Drone:
+    """The topics of a drone, without a graph."""
+
+    def __init__(self) -> None:
+        self.node = Node("/zsim", "http://127.0.0.1:1", "127.0.0.1", print)
+        self.sent: list[tuple[str, Any]] = []
+        (drone,) = scenario().drones
+        tf = self.node.publish("/tf", "tf2_msgs/TFMessage", 10)
+        self.topics = DroneTopics(self.node, drone, "ros1.main", lambda key, said: self.sent.append((key, said)), tf)
+
+    def ear(self, topic: str) -> Ear:
+        return Ear(self.node, topic)
+
+    def hear(self, *said: Any) -> None:
+        for message in said:
+            self.topics.hear(message)
+
+
+def status(t_ns: int) -> messages.Status:
+    return messages.Status(t_ns, 0, "hovering", 90.0, False, None, 1)
+
+
+def truth(t_ns: int) -> messages.Truth:
+    return messages.Truth(t_ns, 0, (1e3, 2e3, 3e3), (4.0, 5.0, 6.0), (0.0, 1.0, 0.0, 0.0), (7.0, 8.0, 9.0), ZERO, STILL)
+
+
+def test_the_namespace_is_the_drone_s_name_as_ros_can_write_it():
+    assert "/quad_1/ardrone/navdata" in Drone().node._published
+    assert set(Drone().node._subscribed) == {
+        f"/quad_1/{topic}" for topic in ("cmd_vel", "ardrone/takeoff", "ardrone/land", "ardrone/reset")
+    }
+    assert set(Drone().node._services) == {"/quad_1/ardrone/flattrim"}
+
+
+def test_a_gate_is_navdata_odometry_and_transforms():
+    drone = Drone()
+    ears = [drone.ear(topic) for topic in ("/quad_1/ardrone/navdata", "/quad_1/ardrone/odometry", "/tf")]
+    for gate in range(3):
+        drone.hear(status(gate * GATE_NS))
+    assert [len(ear.heard) for ear in ears] == [3, 3, 3]
+    assert [message.header.seq for message in ears[0].heard] == [0, 1, 2]
+
+
+def test_truth_is_on_ground_truth_alone():
+    """Whatever the truth says, nothing else that is published changes with it."""
+    topics = ["navdata", "odometry", "imu", "mag"]
+    heard: list[list[Any]] = []
+    for whole in (False, True):
+        drone = Drone()
+        ears = [
+            *(drone.ear(f"/quad_1/ardrone/{topic}") for topic in topics),
+            drone.ear("/tf"),
+            drone.ear("/quad_1/fix"),
+        ]
+        ground_truth = drone.ear("/quad_1/ground_truth/state")
+        for gate in range(1, 5):
+            t_ns = gate * GATE_NS
+            drone.hear(messages.Imu(t_ns, gate, t_ns, (0.0, 0.0, 9.8), (0.1, 0.0, 0.0)))
+            drone.hear(messages.Mag(t_ns, gate, t_ns, (1.0, 2.0, 3.0)))
+            drone.hear(messages.Flow(t_ns, gate, t_ns, (1.0, 0.0, 0.0), 1.0))
+            if whole:
+                drone.hear(truth(t_ns))
+            drone.hear(status(t_ns))
+        assert len(ground_truth.heard) == (4 if whole else 0)
+        heard.append([repr(ear.heard) for ear in ears])
+    assert heard[0] == heard[1]
+
+
+def test_a_take_off_that_a_node_publishes_is_sent_to_the_drone():
+    drone = Drone()
+    drone.hear(status(GATE_NS))
+    drone.node._subscribed["/quad_1/ardrone/takeoff"]._take(message_types.message("std_msgs/Empty")())
+    ((key, said),) = drone.sent
+    assert key == "drone/quad-1/cmd/mode"
+    assert (said.mode, said.source, said.t_ns) == ("takeoff", "ros1.main", GATE_NS)
+    messages.decode(key, messages.encode(said))
+
+
+def test_drones_that_ros_cannot_tell_from_each_other_are_refused():
+    check_names(["drone1", "drone2"])
+    with pytest.raises(RunError, match=r"'quad-1' and 'quad\.1' are both 'quad_1' in ROS"):
+        check_names(["drone1", "quad-1", "quad.1"])
+
+
+def test_numbers_beyond_the_fields_of_ros_are_refused_and_told_once_and_the_next_are_passed_on():
+    said: list[str] = []
+    info: Any = messages.Info(
+        0, 0, 1, "run", "zsim", "lockstep", 0.0, GATE_NS, 5_000_000, GATE_NS, 1, messages.Origin(0.0, 0.0, 0.0),
+        (messages.DroneInfo("quad-1", "ardrone2"),), (), scenario_file.to_text(scenario()), "", "", "",
+    )  # fmt: skip
+    presence = Presence(cast(Any, FakeLink()), info, "ros1.main")
+    node = Node("/zsim", "http://127.0.0.1:1", "127.0.0.1", said.append)
+    bridge = Bridge(cast(Any, FakeLink()), info, presence, node, said.append)
+    navdata = Ear(node, "/quad_1/ardrone/navdata")
+
+    def gate(n: int, range_m: float) -> None:
+        t_ns = n * GATE_NS
+        sonar = messages.Sonar(t_ns, n, t_ns, range_m, True)
+        bridge.hear(keys.sensor("quad-1", "sonar"), messages.encode(sonar))
+        bridge.hear(keys.status("quad-1"), messages.encode(status(t_ns)))
+
+    gate(1, 1e30)
+    gate(2, 1e30)
+    bridge.hear(keys.status("quad-1"), b"garbage")
+    gate(3, 1.5)
+    assert [message.altd for message in navdata.heard] == [1500]
+    assert presence.health.refused == 3
+    assert len(said) == 1
+    assert "drone/quad-1/sensor/status" in said[0]
+
+
+class Link:
+    """A session whose only mailbox holds some payloads, and then waits to be closed."""
+
+    def __init__(self, payloads: list[bytes]) -> None:
+        self._payloads = iter(payloads)
+        self._closed = threading.Event()
+        self.emptied = threading.Event()
+
+    def get(self, key: str) -> list[Any]:
+        return []
+
+    def subscribe(self, expression: str) -> "Link":
+        assert expression == batch.KEY
+        return self
+
+    def receive(self) -> Sample:
+        for payload in self._payloads:
+            return Sample(batch.KEY, payload)
+        self.emptied.set()
+        self._closed.wait(10.0)
+        raise SessionError("closed")
+
+    def close(self) -> None:
+        self._closed.set()
+
+
+def test_who_is_too_slow_loses_the_oldest_gates(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(intake_module, "BACKLOG", 3)
+    info: Any = type("Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")]})()
+    table = table_of(["drone1"])
+
+    def payload(gate: int) -> bytes:
+        said = [(keys.status("drone1"), messages.encode(status(gate * GATE_NS)))]
+        bundle = Bundle.of(gate * GATE_NS, gate, table, said)
+        return batch.encode([(batch.GATE, bundle.packed()), (keys.CLOCK, b"clock %d" % gate)])
+
+    link: Any = Link([payload(gate) for gate in range(5)] + [b"no batch"])
+
+    async def run() -> tuple[list[Any], HealthMeter]:
+        health = HealthMeter("ros1")
+        intake = Intake(link, info, health, asyncio.get_running_loop())
+        await asyncio.to_thread(link.emptied.wait, 10.0)
+        await asyncio.wait_for(intake.news.wait(), 10.0)
+        found = list(intake.batches())
+        intake.close()
+        return found, health
+
+    found, health = asyncio.run(run())
+    assert [[key for key, _ in said] for said in found] == [[keys.status("drone1"), keys.CLOCK]] * 2 + [[]]
+    assert [said[1][1] for said in found[:2]] == [b"clock 3", b"clock 4"]
+    assert (health.dropped, health.refused, health.received) == (3, 1, 6)

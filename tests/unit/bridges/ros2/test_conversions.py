@@ -1,0 +1,239 @@
+"""From zsim's messages to ROS's: stamps, frames, signs, units and covariances."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from federation import ONE
+
+from zsim.contract import messages
+from zsim.contract.messages import Quaternion, Vector3
+from zsim.math.frames import quaternion_from_rpy, rotate
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import ErrorModel, Mount, Sensors
+from zsim_bridges.ros2 import conversions, rmw_zenoh, sensor_frames, topics
+from zsim_bridges.ros2.navdata import Navdata
+from zsim_bridges.ros2.ros_types import Types
+
+TYPES = Types()
+SENSORS = scenario_file.from_text(ONE).drones[0].sensors
+T_NS = 3_020_000_000
+NORTH: Quaternion = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # x forward is north
+
+
+def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
+    w, x, y, z = quaternion_from_rpy((roll, pitch, yaw)).tolist()
+    return w, x, y, z
+
+
+def estimate(t_ns: int, q: Quaternion, **others: Any) -> messages.Estimate:
+    fields: dict[str, Any] = {
+        "position_m": (1.0, 2.0, 3.0),
+        "velocity_m_s": (0.0, 2.0, 0.5),
+        "yaw_rad": 0.0,
+        "covariance": tuple(float(k) for k in np.diag([1, 2, 3, 4, 5, 6]).ravel()),
+        "yaw_sigma_rad": 0.1,
+        "gyro_bias_rad_s": (0.0, 0.0, 0.0),
+        "sensors": {},
+    }
+    return messages.Estimate(t_ns, 0, orientation_wxyz=q, **{**fields, **others})
+
+
+def xyz(vector: Any) -> list[float]:
+    return [vector.x, vector.y, vector.z]
+
+
+def all_topics() -> dict[str, topics.Topic]:
+    drone = topics.of_drone("drone1", "drone1", SENSORS, TYPES)
+    cluster = topics.of_cluster("main", "main", TYPES)
+    run = topics.of_run(topics.Names({"drone1": "drone1"}, {"main": "main"}))
+    return {topic.name: topic for topic in (*run, *drone, *cluster)}
+
+
+def convert(topic: str, message: Any) -> Any:
+    """Return what a topic makes of a message on its first source, after a way through CDR."""
+    found = all_topics()[topic]
+    made = found.convert(found.sources[0], message)
+    return TYPES.decode(TYPES.encode(made, found.kind), found.kind)
+
+
+def test_samples_are_stamped_with_the_time_for_which_they_hold() -> None:
+    imu = convert("/drone1/imu", messages.Imu(T_NS, 0, T_NS - 15_000_000, (0.0, 0.0, 9.81), (0.1, 0.2, 0.3)))
+    assert (imu.header.stamp.sec, imu.header.stamp.nanosec) == (3, 5_000_000)
+    assert (imu.header.frame_id, xyz(imu.angular_velocity)) == ("drone1/imu_link", [0.1, 0.2, 0.3])
+    assert xyz(imu.linear_acceleration) == [0.0, 0.0, 9.81]
+    assert imu.orientation_covariance[0] == -1.0
+
+
+def test_times_before_the_start_are_written_as_ros_writes_them() -> None:
+    """A sample may hold for a time before the start: seconds go down, nanoseconds stay positive."""
+    stamp = conversions.stamp(-20_000_000)
+    assert (stamp.sec, stamp.nanosec) == (-1, 980_000_000)
+
+
+def test_covariances_are_those_of_the_scenario() -> None:
+    error = ErrorModel(noise=0.3, density=0.02, quantum=0.1)
+    assert conversions.variance(error, 100.0) == pytest.approx(0.09 + 0.04 + 0.01 / 12)
+    imu = convert("/drone1/imu", messages.Imu(T_NS, 0, T_NS, (0.0, 0.0, 9.81), (0.0, 0.0, 0.0)))
+    gyro = math.radians(math.sqrt(conversions.variance(SENSORS.imu.gyro_deg_s, SENSORS.imu.rate_hz)))
+    assert imu.angular_velocity_covariance.reshape(3, 3) == pytest.approx(np.eye(3) * gyro**2)
+
+
+def test_fix_has_ellipsoidal_height_and_variance() -> None:
+    gps = messages.Gps(T_NS, 0, T_NS, -34.6, -58.4, 27.5, (0.0, 0.0, 2.5), (1.0, -2.0, 0.5), 1.5, 3, 9)
+    fix = convert("/drone1/fix", gps)
+    assert (fix.latitude, fix.longitude, fix.altitude, fix.status.status) == (-34.6, -58.4, 27.5, 0)
+    assert fix.position_covariance.reshape(3, 3) == pytest.approx(np.eye(3) * 2.25)
+    assert xyz(convert("/drone1/fix_velocity", gps).twist.linear) == [1.0, -2.0, 0.5]
+
+
+def test_field_is_in_tesla_and_range_without_echo_infinite() -> None:
+    mag = convert("/drone1/mag", messages.Mag(T_NS, 0, T_NS, (20.0, -3.0, 14.0)))
+    assert xyz(mag.magnetic_field) == pytest.approx([20e-6, -3e-6, 14e-6])
+    assert convert("/drone1/range", messages.Sonar(T_NS, 0, T_NS, 1.25, True)).range == 1.25
+    assert convert("/drone1/range", messages.Sonar(T_NS, 0, T_NS, 6.0, False)).range == math.inf
+
+
+def test_true_twist_is_in_the_body() -> None:
+    """A drone that heads north and flies north and up flies ahead and up."""
+    still, rotors = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
+    truth = messages.Truth(T_NS, 0, (1.0, 2.0, 3.0), (0.0, 2.0, 0.5), NORTH, (0.1, 0.2, 0.3), still, rotors)
+    odometry = convert("/drone1/ground_truth", truth)
+    assert xyz(odometry.twist.twist.linear) == pytest.approx([2.0, 0.0, 0.5])
+    assert xyz(odometry.twist.twist.angular) == [0.1, 0.2, 0.3]
+    assert xyz(odometry.pose.pose.position) == [1.0, 2.0, 3.0]
+    q = odometry.pose.pose.orientation
+    assert (q.w, q.x, q.y, q.z) == NORTH
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "drone1/base_link")
+
+
+def test_odometry_has_the_estimates_covariance_where_it_belongs() -> None:
+    """East and north change places in the body of a drone that heads north; of angles only the yaw has a sigma."""
+    odometry = convert("/drone1/odometry", estimate(T_NS, NORTH))
+    assert odometry.pose.covariance.reshape(6, 6) == pytest.approx(np.diag([1, 2, 3, 0, 0, 0.01]))
+    assert odometry.twist.covariance.reshape(6, 6) == pytest.approx(np.diag([5, 4, 6, 0, 0, 0]))
+    assert xyz(odometry.twist.twist.linear) == pytest.approx([2.0, 0.0, 0.5])
+    assert odometry.header.frame_id == "drone1/odom"
+
+
+@pytest.mark.parametrize("rate", [(0.0, 0.0, 0.5), (0.0, 0.0, -0.5), (2.0, -1.0, 0.3), (0.0, 0.0, 0.0)])
+def test_odometry_turns_as_its_attitudes_do(rate: Vector3) -> None:
+    """Two attitudes 20 ms apart, the second turned by the body rate; also where the quaternion changes its sign."""
+    maker = topics.Odometry("odom", "base")
+    half = [0.01 * each for each in rate]
+    angle = math.hypot(*half)
+    first = quaternion(0.1, -0.2, 3.0)
+    turn = [math.cos(angle), *(math.sin(angle) / angle * each if angle else 0.0 for each in half)]
+    second = sensor_frames.quaternion_multiply(first, turn)
+    maker.take("", estimate(T_NS, first))
+    for q in (second, -second):
+        maker.take("", estimate(T_NS, first))
+        odometry = maker.take("", estimate(T_NS + 20_000_000, tuple(q.tolist())))
+        assert xyz(odometry.twist.twist.angular) == pytest.approx(rate, abs=1e-9)
+
+
+def test_into_body_is_the_inverse_of_the_frames_rotation() -> None:
+    q = quaternion(0.3, -0.4, 2.0)
+    assert rotate(q, sensor_frames.into_body(q, (1.0, 2.0, 3.0))) == pytest.approx([1.0, 2.0, 3.0])
+
+
+def test_sonar_frame_looks_along_the_beam_of_a_turned_mount() -> None:
+    """ROS's range finders look along x; this sonar is tilted by 30 deg about y, its beam from down to the front."""
+    mount = Mount(position_m=(0.1, 0.0, -0.02), rpy_deg=(0.0, -30.0, 0.0))
+    spec = _with_sonar(mount)
+    placed = {pose.child: pose for pose in sensor_frames.fixed("drone1", spec)}
+    sonar = placed["drone1/sonar_link"]
+    assert sonar.position_m == (0.1, 0.0, -0.02)
+    beam = rotate(sonar.orientation_wxyz, (1.0, 0.0, 0.0))
+    assert beam == pytest.approx([math.sin(math.radians(30)), 0.0, -math.cos(math.radians(30))])
+    assert placed["drone1/odom"].parent == "map"
+
+
+def _with_sonar(mount: Mount) -> Sensors:
+    position, turn = list(mount.position_m), list(mount.rpy_deg)
+    mounted = f"sensors: {{preset: paper, sonar: {{mount: {{position_m: {position}, rpy_deg: {turn}}}}}}}"
+    return scenario_file.from_text(ONE.replace("sensors: {preset: paper}", mounted)).drones[0].sensors
+
+
+def test_tf_goes_from_odom_to_base_and_from_map_to_the_cluster() -> None:
+    tf: Any = all_topics()["/tf"]
+    (moved,) = tf.convert("drone/drone1/estimate", estimate(T_NS, NORTH)).transforms
+    assert (moved.header.frame_id, moved.child_frame_id) == ("drone1/odom", "drone1/base_link")
+    assert xyz(moved.transform.translation) == [1.0, 2.0, 3.0]
+    (placed,) = tf.convert("cluster/main/state", cluster_state()).transforms
+    assert (placed.header.frame_id, placed.child_frame_id) == ("map", "cluster/main")
+
+
+def cluster_state(**others: Any) -> messages.ClusterState:
+    names = ("x_c", "y_c", "z_c", "pitch", "yaw", "phi_1", "phi_2", "p")
+    fields: dict[str, Any] = {"trajectory_t_s": None, "margin": 4.0, "reason": ""}
+    value = (1.0, 2.0, 3.0, 0.0, math.pi / 2, 0.0, 0.0, 4.0)
+    return messages.ClusterState(
+        T_NS, 0, "engaged", ("a", "b"), names, value, value, (0.0,) * 8, **{**fields, **others}
+    )
+
+
+def test_cluster_pose_and_state() -> None:
+    pose = convert("/cluster/main/pose", cluster_state())
+    assert xyz(pose.pose.position) == [1.0, 2.0, 3.0]
+    assert (pose.pose.orientation.w, pose.pose.orientation.z) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
+    state = convert("/cluster/main/state", cluster_state())
+    assert (state.phase, state.drones, state.names[0]) == ("engaged", ["a", "b"], "x_c")
+    assert math.isnan(state.trajectory_time)
+    assert convert("/cluster/main/state", cluster_state(trajectory_t_s=1.5)).trajectory_time == 1.5
+
+
+def status(t_ns: int, state: messages.DroneState = "flying") -> messages.Status:
+    return messages.Status(t_ns, 0, state, 62.5, False, None, 1)
+
+
+def test_battery_comes_each_second_and_state_when_it_changes_too() -> None:
+    found = all_topics()
+    battery, state = found["/drone1/battery"].convert, found["/drone1/state"].convert
+    times = range(0, 2_000_000_000, 20_000_000)
+    assert [t for t in times if battery("", status(t))] == [0, 1_000_000_000]
+    said = [(t, made.data) for t in times if (made := state("", status(t, "landed" if t < 500_000_000 else "flying")))]
+    assert said == [(0, "landed"), (500_000_000, "flying"), (1_000_000_000, "flying")]
+    assert convert("/drone1/battery", status(0)).percentage == pytest.approx(0.625)
+
+
+def test_navdata_is_in_the_drivers_units_and_signs() -> None:
+    """Right side down, nose down and counter-clockwise are positive; g, mm, mm/s, deg, Pa, us."""
+    navdata = Navdata(TYPES.of("zsim_msgs/msg/Navdata"), "base")
+    told: dict[str, Any] = {
+        "imu": messages.Imu(T_NS, 0, T_NS, (0.0, -4.903325, 9.80665), (0.0, 0.0, 0.0)),
+        "baro": messages.Baro(T_NS, 0, T_NS, 101_325.4, 0.0),
+        "sonar": messages.Sonar(T_NS, 0, T_NS, 1.2346, True),
+        "flow": messages.Flow(T_NS, 0, T_NS, (1.5, -0.5, 0.0), 1.0),
+        "mag": messages.Mag(T_NS, 0, T_NS, (1.0, 2.0, 3.0)),
+    }
+    for kind, message in told.items():
+        assert navdata.take(f"drone/drone1/sensor/{kind}", message) is None
+    navdata.take("drone/drone1/estimate", estimate(T_NS, quaternion(0.1, 0.2, 0.3)))
+    made: Any = navdata.take("drone/drone1/sensor/status", status(T_NS))
+    assert (made.state, made.battery_percent, made.pressure, made.altd) == (3, 62.5, 101_325, 1235)
+    assert (made.rot_x, made.rot_y, made.rot_z) == pytest.approx(tuple(np.degrees([0.1, 0.2, 0.3])))
+    assert (made.ax, made.ay, made.az) == pytest.approx((0.0, -0.5, 1.0))
+    assert (made.vx, made.vy, made.tm) == (1500.0, -500.0, 3_020_000.0)
+    assert TYPES.encode(made, "zsim_msgs/msg/Navdata")
+
+
+def test_navdata_of_a_drone_that_has_told_nothing_yet() -> None:
+    navdata = Navdata(TYPES.of("zsim_msgs/msg/Navdata"), "base")
+    made: Any = navdata.take("drone/drone1/sensor/status", status(0, "emergency"))
+    assert (made.state, made.pressure, made.altd) == (0, 0, 0)
+    assert math.isnan(made.rot_x)
+    assert math.isnan(made.az)
+
+
+def test_the_documents_table_has_every_topic() -> None:
+    """docs/ros2.md: topic, type, frame, QoS; the drone's and the cluster's name is NAME there."""
+    page = (Path(__file__).parents[4] / "docs" / "ros2.md").read_text()
+    qos = {rmw_zenoh.SENSOR: "sensor", rmw_zenoh.DEFAULT: "default", rmw_zenoh.CLOCK: "clock", rmw_zenoh.TF: "tf"}
+    rows = [[cell.strip().strip("`") for cell in line.split("|")[1:-1]] for line in page.splitlines() if "|" in line]
+    told = {row[0]: (row[1], row[3]) for row in rows if len(row) == 6 and row[0].startswith("/")}
+    assert told.pop("/tf_static") == ("tf2_msgs/msg/TFMessage", "static")
+    found = {name.replace("drone1", "NAME").replace("main", "NAME"): topic for name, topic in all_topics().items()}
+    assert told == {name: (topic.kind, qos[topic.qos]) for name, topic in found.items()}

@@ -1,0 +1,298 @@
+"""Inventories: which process runs where, who connects to whom, and every fault told at once, a line each."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from zsim.errors import InventoryError
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_deploy.inventory import inventory
+from zsim_deploy.inventory.inventory import Placed
+
+ROOT = Path(__file__).parents[4]
+HOSTS = {"lab": {"address": "192.168.1.10"}, "one": {"address": "192.168.1.21"}, "two": {"address": "192.168.1.22"}}
+ROLES: dict[str, Any] = {"world": "lab", "controller.*": "lab", "estimator.*": ["one", "two"]}
+
+
+@pytest.fixture
+def step() -> Scenario:
+    """Three drones in one cluster."""
+    return scenario_file.load(ROOT / "scenarios/step.yaml")
+
+
+def load(folder: Path, document: Any) -> Placed:
+    path = folder / "hosts.yaml"
+    path.write_text(document if isinstance(document, str) else yaml.safe_dump(document, sort_keys=False))
+    return inventory.load(path)
+
+
+def placed(folder: Path, **fields: Any) -> Placed:
+    return load(folder, {"hosts": HOSTS, "roles": ROLES, **fields})
+
+
+def faults(folder: Path, document: Any) -> list[str]:
+    with pytest.raises(InventoryError) as caught:
+        load(folder, document)
+    return caught.value.faults
+
+
+def places(folder: Path, scenario: Scenario, roles: dict[str, Any]) -> dict[str, str]:
+    return inventory.placement(placed(folder, roles=roles), scenario)
+
+
+# The one that comes with it
+
+
+def test_the_example_places_every_process_of_the_step_scenario(step: Scenario) -> None:
+    found = inventory.placement(inventory.load(ROOT / "examples/hosts.yaml"), step)
+    assert found == {
+        "world": "lab-pc",
+        "recorder": "lab-pc",
+        "estimator.drone1": "onboard1",
+        "estimator.drone2": "onboard2",
+        "estimator.drone3": "onboard3",
+        "controller.main": "lab-pc",
+    }
+
+
+def test_the_example_is_secure() -> None:
+    example = inventory.load(ROOT / "examples/hosts.yaml")
+    assert not example.inventory.security.insecure
+    assert example.folder == ROOT / "examples"
+
+
+# Where a process runs
+
+
+def test_hosts_of_a_list_take_turns(tmp_path: Path, step: Scenario) -> None:
+    found = places(tmp_path, step, ROLES)
+    assert [found[f"estimator.drone{i}"] for i in (1, 2, 3)] == ["one", "two", "one"]
+
+
+def test_a_name_counts_more_than_a_pattern_and_takes_no_turn(tmp_path: Path, step: Scenario) -> None:
+    found = places(tmp_path, step, {**ROLES, "estimator.drone1": "lab"})
+    assert [found[f"estimator.drone{i}"] for i in (1, 2, 3)] == ["lab", "one", "two"]
+
+
+def test_a_longer_pattern_counts_more(tmp_path: Path, step: Scenario) -> None:
+    found = places(tmp_path, step, {"*": "lab", "estimator.*": "one", "estimator.*3": "two"})
+    assert found["world"] == found["controller.main"] == found["recorder"] == "lab"
+    assert [found[f"estimator.drone{i}"] for i in (1, 2, 3)] == ["one", "one", "two"]
+
+
+def test_the_order_in_the_file_does_not_matter(tmp_path: Path, step: Scenario) -> None:
+    backwards = dict(reversed(list(ROLES.items())))
+    assert places(tmp_path, step, backwards) == places(tmp_path, step, ROLES)
+
+
+@pytest.mark.parametrize(("roles", "host"), [({}, "lab"), ({"recorder": "two"}, "two")])
+def test_the_recorder_is_where_the_world_is_unless_placed(
+    tmp_path: Path, step: Scenario, roles: dict[str, str], host: str
+) -> None:
+    assert places(tmp_path, step, {**ROLES, **roles})["recorder"] == host
+
+
+@pytest.mark.parametrize(
+    ("roles", "host"),
+    [
+        ({"world": ["one", "two"]}, "one"),
+        ({"world": "lab", "*": ["one", "two"]}, "one"),
+        ({"*": ["one", "two"]}, "two"),
+    ],
+)
+def test_a_recorder_takes_a_turn_only_where_it_is_placed(
+    tmp_path: Path, step: Scenario, roles: dict[str, Any], host: str
+) -> None:
+    agents = {name: ROLES[name] for name in ("controller.*", "estimator.*")}
+    assert places(tmp_path, step, {**agents, **roles})["recorder"] == host
+
+
+def test_programs_of_the_user_s_own_are_placed_too(tmp_path: Path) -> None:
+    expect = ["my.drone1", "recorder", "controller.main"]
+    own = scenario_file.load(ROOT / "scenarios/step.yaml", [f"processes.expect=[{', '.join(expect)}]"])
+    found = places(tmp_path, own, {"world": "lab", "my.*": "one", "controller.main": "two"})
+    assert found == {"world": "lab", "recorder": "lab", "my.drone1": "one", "controller.main": "two"}
+
+
+def test_what_has_no_place_and_what_places_nobody_are_told_at_once(tmp_path: Path, step: Scenario) -> None:
+    with pytest.raises(InventoryError) as caught:
+        places(tmp_path, step, {"world": "lab", "estimator.drone1": "one", "estimater.*": "two"})
+    lines = caught.value.faults
+    assert lines[:3] == [
+        f"hosts.yaml: roles has no place for {name}; add {name!r}"
+        for name in ("estimator.drone2", "estimator.drone3", "controller.main")
+    ]
+    assert len(lines) == 4
+    assert lines[3].startswith("hosts.yaml: roles.estimater.* matches no process of 'step'; it has world, recorder, ")
+
+
+# Who connects to whom
+
+SITES = {"site": {"host": "one", "port": 7448}, "yard": {"host": "two", "port": 7449, "upstream": "site"}}
+
+
+@pytest.fixture
+def sites(tmp_path: Path) -> Placed:
+    """Host two is behind its own router, which is behind host one's."""
+    return placed(tmp_path, routers=SITES, hosts={**HOSTS, "two": {"address": "192.168.1.22", "router": "yard"}})
+
+
+def test_a_role_connects_to_the_world_or_to_its_host_s_router(sites: Placed, step: Scenario) -> None:
+    found = inventory.placement(sites, step)
+    assert inventory.endpoint(sites, found, "one") == "tls/192.168.1.10:7447"
+    assert inventory.endpoint(sites, found, "two") == "tls/192.168.1.22:7449"
+
+
+def test_a_router_connects_to_the_one_above_or_to_the_world(sites: Placed, step: Scenario) -> None:
+    found = inventory.placement(sites, step)
+    assert inventory.upstream(sites, found, "yard") == "tls/192.168.1.21:7448"
+    assert inventory.upstream(sites, found, "site") == "tls/192.168.1.10:7447"
+
+
+def test_who_connects_to_whom_across_hosts(sites: Placed, step: Scenario) -> None:
+    """Estimators on one and two; two's go to the router on two, that to one's, that to the world."""
+    found = inventory.placement(sites, step)
+    assert inventory.connections(sites, found) == {("lab", 7447): {"one"}, ("one", 7448): {"two"}}
+
+
+def test_a_host_that_has_a_router_only_connects_too(tmp_path: Path, step: Scenario) -> None:
+    hosts = {**HOSTS, "one": {"address": "192.168.1.21", "router": "gate"}, "gate": {"address": "192.168.1.30"}}
+    found = placed(tmp_path, hosts=hosts, routers={"gate": {"host": "gate"}}, roles={**ROLES, "estimator.*": "one"})
+    ways = inventory.connections(found, inventory.placement(found, step))
+    assert ways == {("gate", 7448): {"one"}, ("lab", 7447): {"gate"}}
+
+
+def test_the_world_itself_connects_to_nobody(tmp_path: Path, step: Scenario) -> None:
+    hosts = {**HOSTS, "lab": {"address": "192.168.1.10", "router": "gate"}}
+    roles = {"world": "lab", "*": "one"}
+    found = placed(tmp_path, hosts=hosts, routers={"gate": {"host": "two"}}, roles=roles)
+    ways = inventory.connections(found, inventory.placement(found, step))
+    assert ways == {("lab", 7447): {"one", "two"}}
+
+
+def test_routers_come_after_those_that_they_connect_to(tmp_path: Path) -> None:
+    chain = {f"r{i}": {"host": "lab", "port": 8000 + i, "upstream": f"r{i + 1}"} for i in range(4)}
+    found = placed(tmp_path, routers={**chain, "r4": {"host": "one"}, "a": {"host": "two"}})
+    assert inventory.routers_in_order(found.inventory) == ["a", "r4", "r3", "r2", "r1", "r0"]
+
+
+@pytest.mark.parametrize(
+    ("address", "insecure", "endpoint"),
+    [
+        ("192.168.1.10", False, "tls/192.168.1.10:7000"),
+        ("192.168.1.10", True, "tcp/192.168.1.10:7000"),
+        ("lab.example.org", False, "tls/lab.example.org:7000"),
+        ("fe80::1%eth0", False, "tls/[fe80::1%eth0]:7000"),
+    ],
+)
+def test_endpoints(tmp_path: Path, step: Scenario, address: str, insecure: bool, endpoint: str) -> None:
+    hosts = {**HOSTS, "lab": {"address": address}}
+    found = placed(tmp_path, hosts=hosts, port=7000, security={"insecure": insecure})
+    assert inventory.listening(found, "lab", 7000) == endpoint
+    assert inventory.endpoint(found, inventory.placement(found, step), "one") == endpoint
+
+
+# Faults
+
+
+def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
+    document = {
+        "hosts": {"lab": {"address": "192.168.1.10", "router": "yrad", "prot": 22}, "one": {"port": 0, "address": "x"}},
+        "roles": {"world": "lba", "estimator.*": ["one", "three"], "recorder": []},
+        "routers": {"yard": {"host": "tow", "upstream": "site"}},
+        "port": "7447",
+        "security": {"insecure": "yes please"},
+    }
+    found = faults(tmp_path, document)
+    assert all(line.startswith("hosts.yaml: ") and line.isprintable() for line in found)
+    assert [line.split()[1] for line in found] == [
+        "hosts.lab.prot",
+        "hosts.one.port",
+        "port",
+        "security.insecure",
+        "roles.world",
+        "roles.estimator.*",
+        "roles.recorder",
+        "routers.yard.host",
+        "routers.yard.upstream",
+        "hosts.lab.router",
+    ]
+
+
+def test_an_unknown_name_is_told_with_the_known_ones(tmp_path: Path) -> None:
+    document = {"hosts": HOSTS, "roles": {**ROLES, "world": "lba"}}
+    assert faults(tmp_path, document) == [
+        "hosts.yaml: roles.world is 'lba'; must be one of hosts: lab, one, two"
+    ]  # fmt: skip
+    document = {"hosts": {**HOSTS, "two": {"address": "x", "router": "yard"}}, "roles": ROLES}
+    assert faults(tmp_path, document) == [
+        "hosts.yaml: hosts.two.router is 'yard'; must be one of routers: none are given"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("circle", [["a"], ["a", "b"], ["a", "b", "c"]])
+def test_routers_in_a_circle_are_each_told_and_one_that_leads_there_is_not(tmp_path: Path, circle: list[str]) -> None:
+    after = dict(zip(circle, circle[1:] + circle[:1], strict=True))
+    routers = {name: {"host": "lab", "upstream": above} for name, above in {**after, "tail": "a"}.items()}
+    found = faults(tmp_path, {"hosts": HOSTS, "roles": ROLES, "routers": routers})
+    assert found == [
+        f"hosts.yaml: routers.{name}.upstream leads back to itself; must lead to the world" for name in circle
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("hosts: {}\nroles: {}", ["hosts has 0 entries; must have 1 at least"]),
+        ("roles: {}", ["hosts is missing; must be a map"]),
+        ("hosts: 5\nroles: {}", ["hosts is 5; must be a map"]),
+        ("hosts: true\nroles: {}\nrouters: 4.5", ["hosts is true; must be a map", "routers is 4.5; must be a map"]),
+        ("hosts: [a]\nroles: [b]\nrouters: [c]", [f"{k} is ['{v}']; must be a map" for k, v in [("hosts", "a"), ("roles", "b"), ("routers", "c")]]),
+        ("hosts: {a: {address: x}}\nroles: {world: a}\nrouters: {r: {host: a, upstream: [r]}}", ["routers.r.upstream is ['r']; must be text"]),
+        ("hosts: {a: {address: x}}\nroles: {world: a}\nrouters: {r: {host: a, upstream: {}}}", ["routers.r.upstream is {}; must be text"]),
+        ("hosts: {a: {address: x}}\nroles: {world: a}\nrouters: {r: null}", ["routers.r is null; must be a map"]),
+        ("hosts: {a: {address: 'x y'}}\nroles: {world: a}", ["hosts.a.address is 'x y'; must match [A-Za-z0-9_.:%-]{1,253}"]),
+        ("hosts: {A: {address: x}}\nroles: {}", ["hosts.A as a key is 'A'; must match [a-z0-9_.-]{1,32}"]),
+    ],
+)  # fmt: skip
+def test_faults(tmp_path: Path, text: str, told: list[str]) -> None:
+    assert faults(tmp_path, text) == [f"hosts.yaml: {line}" for line in told]
+
+
+@pytest.mark.parametrize("name", [".", ".."])
+def test_a_host_is_no_way_out_of_a_folder(tmp_path: Path, name: str) -> None:
+    """Folders are named after hosts, here and by `zsim certs` and `zsim render`."""
+    (line,) = faults(tmp_path, {"hosts": {name: {"address": "x"}}, "roles": {"world": name}})
+    assert line.startswith(f"hosts.yaml: hosts.{name} ")
+
+
+def test_two_cannot_listen_on_one_port(tmp_path: Path, step: Scenario) -> None:
+    routers = {"a": {"host": "lab", "port": 7447}, "b": {"host": "one"}, "c": {"host": "one"}, "d": {"host": "two"}}
+    with pytest.raises(InventoryError) as caught:
+        inventory.placement(placed(tmp_path, routers=routers), step)
+    assert caught.value.faults == [
+        "hosts.yaml: routers.a.port is 7447, on which world listens on lab; give another",
+        "hosts.yaml: routers.c.port is 7448, on which router.b listens on one; give another",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (None, "cannot be read (No such file or directory); give the path of a YAML file"),
+        ("", "is empty; must be a map as in examples/hosts.yaml"),
+        ("hosts: {a: {address: x}", "is not YAML"),
+        ("hosts: {a: {address: x}, a: {address: y}}\nroles: {}", "is given twice"),
+    ],
+)
+def test_a_file_that_is_no_inventory_is_one_line(tmp_path: Path, content: str | None, told: str) -> None:
+    path = tmp_path / "own.yaml"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(InventoryError) as caught:
+        inventory.load(path)
+    (line,) = caught.value.faults
+    assert told in line

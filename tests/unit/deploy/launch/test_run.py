@@ -1,0 +1,120 @@
+"""`zsim run` before and around its processes: their command lines, the port, the folder."""
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+from synthetic_record import SCENARIOS
+
+from zsim.errors import RunError, SessionError
+from zsim.scenario import scenario_file
+from zsim_deploy.forkserver.role_launcher import Nursery
+from zsim_deploy.launch import run
+from zsim_deploy.launch.run import Options
+from zsim_deploy.launch.supervisor import Outcome
+
+TAKEN = "the world died: exit code 2: cannot listen on tcp/127.0.0.1:{port} (Address already in use)"
+
+
+class Say:
+    """A screen that keeps nothing."""
+
+    def say(self, text: str) -> None: ...
+
+
+class FakeWatch:
+    """A watch whose runs end as told; notes on which port each world was to listen."""
+
+    outcomes: ClassVar[list[str]] = []
+    ports: ClassVar[list[int]] = []
+
+    def __init__(self, *_: Any) -> None:
+        self.members: list[Any] = []
+
+    def take_line(self, text: str) -> None: ...
+
+    def go(self) -> Outcome:
+        world = next(child for child in self.members if child.role == "world")
+        endpoint = world._arguments[world._arguments.index("--listen") + 1]
+        self.ports.append(int(endpoint.rsplit(":", 1)[1]))
+        reason = self.outcomes.pop(0).format(port=self.ports[-1])
+        return Outcome(reason, failed=reason != "ended")
+
+
+class NoNursery(Nursery):
+    """A nursery that starts nothing."""
+
+    def __enter__(self) -> Nursery:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+@pytest.fixture
+def watched(monkeypatch: pytest.MonkeyPatch) -> type[FakeWatch]:
+    FakeWatch.outcomes, FakeWatch.ports = [], []
+    monkeypatch.setattr(run, "Nursery", NoNursery)
+    monkeypatch.setattr(run, "Watch", FakeWatch)
+    monkeypatch.setattr(run, "_is_free", lambda port: port == run.DEFAULT_PORT and not FakeWatch.ports)
+    return FakeWatch
+
+
+def options(out: Path, *overrides: str, **others: Any) -> Options:
+    out.mkdir(exist_ok=True)
+    return Options(scenario_file.load(SCENARIOS / "step.yaml", overrides), out, **others)
+
+
+def test_a_port_taken_in_between_is_another_port(watched: type[FakeWatch], tmp_path: Path):
+    watched.outcomes = [TAKEN, TAKEN, "ended"]
+    outcome = run.run_processes(options(tmp_path), Say())  # type: ignore[arg-type]
+    assert not outcome.failed
+    assert watched.ports[0] == run.DEFAULT_PORT
+    assert len(set(watched.ports)) == 3
+
+
+def test_a_port_asked_for_is_tried_once(watched: type[FakeWatch], tmp_path: Path):
+    watched.outcomes = [TAKEN]
+    outcome = run.run_processes(options(tmp_path, listen="tcp/127.0.0.1:20001"), Say())  # type: ignore[arg-type]
+    assert outcome.failed
+    assert watched.ports == [20001]
+
+
+def test_another_end_is_the_end(watched: type[FakeWatch], tmp_path: Path):
+    watched.outcomes = ["the world died: killed by signal 9"]
+    assert run.run_processes(options(tmp_path), Say()).failed  # type: ignore[arg-type]
+    assert len(watched.ports) == 1
+
+
+def test_trying_ports_has_an_end(watched: type[FakeWatch], tmp_path: Path):
+    watched.outcomes = [TAKEN] * 100
+    assert run.run_processes(options(tmp_path), Say()).failed  # type: ignore[arg-type]
+    assert len(watched.ports) == run.PORTS_TRIED
+
+
+def test_no_name_is_taken_for_an_option(tmp_path: Path):
+    made = options(tmp_path, "drones.drone1.name=-._", "clusters.main.drones=[-._, drone2, drone3]")
+    children = run._children(made, "tcp/127.0.0.1:20001", FakeWatch(), NoNursery(print))  # type: ignore[arg-type]
+    lines = [child._arguments for child in children]
+    (line,) = (line for line in lines if "-._" in line)
+    assert line[0] == "estimator"
+    assert line[-2:] == ["--", "-._"]
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["bogus", "tcp/127.0.0.1", "tcp/127.0.0.1:", "tcp/127.0.0.1:0", "tls/127.0.0.1:7000", ""]
+)
+def test_an_endpoint_is_checked_before_anything_starts(endpoint: str):
+    with pytest.raises(SessionError):
+        run.check_endpoint(endpoint, insecure=False)
+
+
+@pytest.mark.parametrize("endpoint", [None, "tcp/127.0.0.1:20001", "tcp/[::1]:20001", "tcp/localhost:20001"])
+def test_good_endpoints_pass(endpoint: str | None):
+    run.check_endpoint(endpoint, insecure=False)
+
+
+def test_a_folder_that_takes_no_files_is_a_line(tmp_path: Path):
+    made = options(tmp_path)
+    (tmp_path / "scenario.yaml").mkdir()
+    with pytest.raises(RunError, match="cannot be written"):
+        run._write_scenario(made, logs=True)

@@ -1,0 +1,257 @@
+"""The world as a process: what strangers send it, outputs that got lost, a state that is no longer finite."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from fake_link import BAD_UTF8, NESTED, UNANSWERED, FakeLink
+
+from zsim.contract import batch, keys, messages
+from zsim.contract.messages import (
+    ClusterState,
+    ControlAnswer,
+    ControlRequest,
+    Done,
+    Estimate,
+    Event,
+    Health,
+    Join,
+    Velocity,
+)
+from zsim.errors import DecodeError
+from zsim.runtime.health import HealthMeter
+from zsim.scenario import scenario_file
+from zsim_world.fleet.fleet import DivergedError
+from zsim_world.flight.world import World
+from zsim_world.server.world_process import WorldProcess
+
+GATE_NS = 20_000_000
+GATES = 10
+ME = "tester.one"
+ESTIMATE, STATE, VELOCITY = keys.estimate("d1"), keys.cluster_state("main"), keys.command("d1", "velocity")
+SCENARIO = f"""
+name: one
+seed: 3
+duration_s: {GATES * GATE_NS / 1e9}
+drones: [{{name: d1, position_m: [0, 0, 0]}}]
+processes: {{expect: []}}
+"""
+ZEROS = (0.0, 0.0, 0.0)
+
+
+def world(*expect: str) -> World:
+    made = World(scenario_file.from_text(SCENARIO), run_id="run1")
+    for name in expect:
+        made.barrier.expect(name)
+    return made
+
+
+def run(made: World, link: FakeLink, **options: Any) -> WorldProcess:
+    process = WorldProcess(link, made, **options)  # type: ignore[arg-type]
+    process.run()
+    return process
+
+
+def events(link: FakeLink, kind: str) -> list[Event]:
+    return [event for event in link.all(keys.EVENT) if event.kind == kind]
+
+
+# What strangers send
+
+
+@pytest.mark.parametrize("key", [ESTIMATE, STATE, VELOCITY, keys.process(ME, "done"), keys.process(ME, "health")])
+@pytest.mark.parametrize("payload", [BAD_UTF8, NESTED, b"\xc1", b"\x91" * 5000], ids=["utf8", "nested", "no", "deep"])
+def test_no_payload_ends_the_run(key: str, payload: bytes):
+    made, link = world(), FakeLink()
+    link.deliver(key, payload)
+    assert run(made, link).health.refused == 1
+    assert made.ended == "the scenario's duration is over"
+    assert link.all(keys.CLOCK)[-1].state == "stopped"
+    assert [event.subject for event in events(link, "refused")] == [key]
+
+
+def test_an_estimate_of_the_future_is_refused():
+    made, link = world(), FakeLink()
+    link.deliver(ESTIMATE, estimate(10**6))
+    run(made, link)
+    assert "t_ns is 20000000000000; must be <= 0, the newest gate" in events(link, "refused")[0].text
+
+
+@pytest.mark.parametrize("source", ["\x1b[2J", "Über", "a b", "x" * 49, ""])
+def test_a_sender_without_a_name_is_refused(source: str):
+    made, link = world(), FakeLink()
+    link.deliver(VELOCITY, Velocity(0, 0, source, ZEROS, 0.0))
+    run(made, link)
+    (event,) = events(link, "refused")
+    assert event.source == "somebody"
+    assert f"source is {source[:48]!r}; must be 1 to 48 of a-z 0-9 _ . -" in event.text
+    assert events(link, "commander") == []
+
+
+def test_a_request_of_somebody_without_a_name_is_refused():
+    made = world()
+    answer = made.control(ControlRequest("stop", {}, "\x1b[2J"))
+    assert answer.error == "source is '\\x1b[2J'; must be 1 to 48 of a-z 0-9 _ . -"
+    assert made.ended is None
+    assert made.control(ControlRequest("stop", {}, "")).ok
+
+
+def test_states_are_told_with_the_name_of_their_cluster():
+    made, link, told = world(), FakeLink(), []
+    link.deliver(STATE, state(0))
+    run(made, link, tell=lambda kind, message, about: told.append((kind, about)))
+    assert told.count(("state", "main")) == 1
+
+
+def test_healths_are_told_with_the_name_of_the_process():
+    made, link, told = world(), FakeLink(), []
+    health = Health(0, 0, "estimator", "h", 1, {}, 0, 0, 0, 0, received=7)
+    link.deliver("process/estimator.d1/health", health)
+    process = WorldProcess(link, made, tell=lambda *said: told.append(said))  # type: ignore[arg-type]
+    seconds = iter(range(1000))
+    process.health = HealthMeter("world", lambda: float(next(seconds)))
+    process.run()
+    healths = [said[1:] for said in told if said[0] == "health"]
+    assert healths[0] == (health, "estimator.d1")
+    assert {name for _, name in healths[1:]} == {"world"}
+    assert healths[-1][0].received == 1
+
+
+# Outputs that got lost
+
+
+def estimate(gate: int) -> Estimate:
+    return Estimate(gate * GATE_NS, gate, ZEROS, ZEROS, (1.0, *ZEROS), 0.0, (0.0,) * 36, 0.1, ZEROS, {}, ME)
+
+
+def state(gate: int) -> ClusterState:
+    return ClusterState(gate * GATE_NS, gate, "idle", (), (), (), (), (), None, 0.0, "", ME)
+
+
+class Lossy(FakeLink):
+    """A link to one participant that says two outputs and a done per gate, and loses some outputs on the way.
+
+    Args:
+        loses: (key, gate).
+        keeps: whether it still has them when it is asked.
+    """
+
+    def __init__(self, loses: set[tuple[str, int]], keeps: bool = True, incarnation: int = 1) -> None:
+        super().__init__()
+        self._incarnation = incarnation
+        self.on_said, self.on_request = self._answer, self._outputs
+        self._loses, self._keeps = loses, keeps
+        self._kept: list[list[Any]] = []
+        self._gate = 0
+        for number in range(1, incarnation + 1):
+            self.deliver(keys.process(ME, "join"), Join(0, number, "run1", number, "tester", "h", 1, GATE_NS))
+
+    def _answer(self, key: str, payload: bytes) -> None:
+        if key == keys.CLOCK and messages.decode(key, payload).step == self._gate <= GATES:
+            if messages.decode(key, payload).state == "running":
+                self._say(self._gate)
+                self._gate += 1
+        elif key == keys.EVENT and messages.decode(key, payload).kind == "end":
+            self.deliver(keys.process(ME, "bye"), messages.Bye(0, 0, "over"))
+
+    def _say(self, gate: int) -> None:
+        for key, message in ((ESTIMATE, estimate(gate)), (STATE, state(gate))):
+            lost = (key, gate) in self._loses
+            if not lost:
+                self.deliver(key, message)
+            if self._keeps or not lost:
+                self._kept.append([key, messages.encode(message)])
+        self.deliver(keys.process(ME, "done"), Done(gate * GATE_NS, gate, "run1", self._incarnation, gate * GATE_NS, 2))
+
+    def _outputs(self, key: str, args: dict[str, Any]) -> ControlAnswer:
+        assert key == keys.process(ME, "outputs")
+        return ControlAnswer(True, result=self._kept[-6:])
+
+    def recorded(self, key: str) -> list[int]:
+        """Return the gates of the messages on a key in the order in which the recorder hears of them."""
+        passed = [pair for name, payload in self.said if name == batch.KEY for pair in batch.decode(payload)]
+        return [messages.decode(name, payload).t_ns // GATE_NS for name, payload in passed if name == key]
+
+
+def test_every_loss_is_found_and_nothing_comes_twice():
+    """A loss in each of two gates in a row, then one alone: each is asked for once, none hides another."""
+    link = Lossy({(ESTIMATE, 2), (STATE, 3), (ESTIMATE, 7)})
+    run(world(ME), link)
+    assert len(link.requests) == 3
+    assert events(link, "outputs_missing") == []
+    assert link.recorded(ESTIMATE) == link.recorded(STATE) == list(range(GATES + 1))
+
+
+@pytest.mark.parametrize(("incarnation", "missing"), [(1, [1]), (2, [])])
+def test_who_has_just_come_back_is_asked_until_it_answers(incarnation: int, missing: list[int]):
+    """Behind a new router it cannot be asked at once; of anybody else silence is an answer."""
+    link = Lossy({(ESTIMATE, 2)}, incarnation=incarnation)
+    silent = iter(range(3))
+    link.on_request = lambda key, args: link._outputs(key, args) if next(silent, None) is None else UNANSWERED
+    run(world(ME), link)
+    assert [event.data["missing"] for event in events(link, "outputs_missing")] == missing
+
+
+def test_an_old_output_does_not_stand_in_for_the_one_that_is_missing():
+    link = Lossy({(ESTIMATE, 4)}, keeps=False)
+    run(world(ME), link)
+    assert [event.data["missing"] for event in events(link, "outputs_missing")] == [1]
+    assert link.recorded(ESTIMATE) == [gate for gate in range(GATES + 1) if gate != 4]
+
+
+def refuse(key: str, args: dict[str, Any]) -> ControlAnswer:
+    raise DecodeError(f"{key}: ok is missing")
+
+
+BAD_ANSWERS: dict[str, Callable[[str, dict[str, Any]], ControlAnswer]] = {
+    "none": lambda key, args: UNANSWERED,
+    "no answer": refuse,
+    "a number": lambda key, args: ControlAnswer(True, result=7),
+    "nothing": lambda key, args: ControlAnswer(True),
+    "no pairs": lambda key, args: ControlAnswer(True, result=[[ESTIMATE], 3]),
+    "no payload": lambda key, args: ControlAnswer(True, result=[[ESTIMATE, "text"]]),
+    "garbage": lambda key, args: ControlAnswer(True, result=[[ESTIMATE, b"\xc1"], ["a", b"x"], [STATE, BAD_UTF8]]),
+    "a done": lambda key, args: ControlAnswer(True, result=[[keys.process(ME, "bye"), b"\x80"], ["clock", b"x"]]),
+}
+
+
+@pytest.mark.parametrize("name", BAD_ANSWERS)
+def test_an_answer_that_is_none_changes_nothing(name: str):
+    link = Lossy({(ESTIMATE, 4)})
+    link.on_request = BAD_ANSWERS[name]
+    made = world(ME)
+    run(made, link)
+    assert [event.data["missing"] for event in events(link, "outputs_missing")] == [1]
+    assert made.ended == "the scenario's duration is over"
+
+
+def test_the_age_of_a_command_is_that_of_its_first_coming():
+    made = world()
+    made.handle(keys.process(ME, "join"), Join(0, 0, "run1", 1, "tester", "h", 1, GATE_NS), 0)
+    made.advance(0)
+    command = Velocity(0, 0, ME, ZEROS, 0.0)
+    for wall_ns in (1_000_000, 900_000_000):
+        made.handle(VELOCITY, command, wall_ns)
+    assert made.result()["command_age_ms"]["max"] == pytest.approx(1.0)
+
+
+# A state that is no longer finite
+
+
+def test_a_diverged_state_ends_the_run_for_everybody(monkeypatch: pytest.MonkeyPatch):
+    made, link = world(), FakeLink()
+    advance = made.fleet.advance
+
+    def diverge() -> None:
+        if made.now_ns == 3 * GATE_NS:
+            raise DivergedError("d1", 0.08)
+        advance()
+
+    monkeypatch.setattr(made.fleet, "advance", diverge)
+    with pytest.raises(DivergedError, match=r"^d1 at 0\.080 s: the state is no longer finite"):
+        run(made, link)
+    assert [(event.kind, event.subject) for event in link.all(keys.EVENT)] == [("diverged", "d1"), ("end", "world")]
+    end = events(link, "end")[0]
+    assert end.text.startswith("d1 at 0.080 s: the state is no longer finite")
+    assert end.data["last_ns"] == 3 * GATE_NS
+    assert link.all(keys.CLOCK)[-1].state == "stopped"

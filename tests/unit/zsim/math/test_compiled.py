@@ -1,0 +1,89 @@
+"""The compiled mathematics: every file that is compiled counts for the cache, and a change of one renews it."""
+
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import zsim
+from zsim.math import compiled
+
+ROOT = Path(zsim.__file__).parents[1]
+
+
+def names(module: str) -> set[str]:
+    return {path.stem for path in compiled.sources(importlib.import_module(module).__name__)}
+
+
+def test_the_sources_of_a_kernel_are_all_that_its_module_imports():
+    """Where a function is compiled, what it calls and the constants that it names are too, wherever they come from."""
+    assert {"dead_reckoning", "madgwick", "compiled"} <= names("zsim_agents.estimation.estimator_fusion")
+    pytest.importorskip("numba")
+    flown = {
+        "kernel",
+        "firmware",
+        "rigid_body",
+        "simd",
+        "rotation",
+        "vehicle",
+        "obstacle",
+        "sensor_presets",
+        "compiled",
+    }
+    assert flown <= names("zsim_world.fleet.kernel")
+    assert "kernel" not in names("zsim_world.physics.normal_variates")
+
+
+def test_the_digest_changes_with_each_file(tmp_path: Path):
+    files = [tmp_path / name for name in ("a.py", "b.py", "c.py")]
+    digests = set()
+    for changed in (None, *files):
+        for number, file in enumerate(files):
+            file.write_text(f"# {number}{' changed' if file == changed else ''}\n")
+        compiled.digest.__globals__["_text"].cache_clear()
+        digests.add(compiled.digest(files))
+    assert len(digests) == len(files) + 1
+
+
+ASK = """
+from zsim_agents.estimation.dead_reckoning import acceleration
+print(acceleration((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 9.0))
+"""
+
+
+def test_a_change_of_what_is_called_reaches_the_caller(tmp_path: Path):
+    """`dead_reckoning.acceleration` calls `madgwick.turn`: numba's own cache would go on with the old one."""
+    pytest.importorskip("numba")
+    shutil.copytree(
+        ROOT / "agents" / "zsim_agents", tmp_path / "zsim_agents", ignore=shutil.ignore_patterns("__pycache__")
+    )
+
+    def ask() -> str:
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+        run = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(tmp_path)!r}){ASK}"]
+        return subprocess.run(run, env=environment, capture_output=True, text=True, check=True).stdout.strip()
+
+    assert ask() == "(0.0, 0.0, -9.0)"
+    madgwick = tmp_path / "zsim_agents" / "estimation" / "madgwick.py"
+    text = madgwick.read_text()
+    assert text.count("        R[0] * v[0] + R[1] * v[1] + R[2] * v[2],") == 1
+    madgwick.write_text(text.replace("        R[0] * v[0] + R[1]", "        1.0 + R[0] * v[0] + R[1]"))
+    assert ask() == "(1.0, 0.0, -9.0)"
+
+
+def test_a_kernel_is_known_to_be_kept_once_it_was_compiled(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    pytest.importorskip("numba")
+    from zsim.math.compiled import is_kept, kernel
+
+    (tmp_path / "doubling.py").write_text("def doubled(x: float) -> float:\n    return 2.0 * x\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    import doubling  # type: ignore[import-not-found]
+
+    made = kernel()(doubling.doubled)
+    assert not is_kept(made)
+    assert made(2.0) == 4.0
+    assert is_kept(made)

@@ -1,0 +1,226 @@
+"""A record of a real run, cut at any byte and with any bit turned: what is before the cut is read, by everybody."""
+
+import random
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import recorded_run
+from mcap.opcode import Opcode
+from mcap.records import Chunk, MessageIndex
+from mcap.stream_reader import StreamReader
+from typer.testing import CliRunner
+
+from zsim.contract import messages
+from zsim.errors import RecordError, ZsimError
+from zsim.record import Recorded, RecordReader, repair
+from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, MAGIC, Place, places
+from zsim_analysis.export.formats import Format
+from zsim_analysis.export.make_export import export
+from zsim_analysis.export.selection import Selection
+from zsim_analysis.report import judge
+
+CUTS = 100
+FLIPS = 60
+
+Content = tuple[bytes, int, int]  # payload, simulated and wall time [ns] of a message
+Made = tuple[int, list[str]]  # rows of what was made from a record, and what was said of it
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a record with a message of every kind."""
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    recorded_run.write(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(run: Path) -> dict[str, list[Recorded]]:
+    """Return all its messages by key."""
+    return by_key(run)
+
+
+def by_key(path: Path) -> dict[str, list[Recorded]]:
+    found: dict[str, list[Recorded]] = defaultdict(list)
+    with RecordReader(path) as reader:
+        for message in reader.messages(by_time=False):
+            found[message.key].append(message)
+        assert reader.topics() == {key: len(messages) for key, messages in found.items()}
+    return dict(found)
+
+
+def test_the_record_has_every_kind_of_message(run: Path) -> None:
+    with RecordReader(run) as reader:
+        kinds = {messages.type_of(key) for key in reader.topics()}
+    assert kinds == {*messages.types_by_shape().values(), None}
+
+
+def chunks(data: bytes) -> list[Place]:
+    return [place for place in places(data) if place.opcode == Opcode.CHUNK]
+
+
+def nasty(data: bytes) -> list[int]:
+    """Return places at which a cut hurts: in and around the magic, heads, chunks, indexes, summary and footer."""
+    found = chunks(data)
+    middle, last = found[len(found) // 2], found[-1]
+    indexes = [place for place in places(data) if place.opcode == Opcode.MESSAGE_INDEX]
+    ends = {place.opcode: place for place in places(data)}
+    at = [0, 1, len(MAGIC) - 1, len(MAGIC), len(MAGIC) + 1, len(MAGIC) + HEAD.size, found[0].start]
+    for chunk in (found[0], middle, last):
+        at += [chunk.start, chunk.start + 1, chunk.body, chunk.body + CHUNK_HEAD.size - 2, chunk.body + CHUNK_HEAD.size]
+        at += [(chunk.start + chunk.end) // 2, chunk.end - 1, chunk.end, chunk.end + 1]
+    at += [indexes[-1].start + 3, indexes[-1].end - 1, indexes[-1].end]
+    for opcode in (Opcode.DATA_END, Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.FOOTER):
+        place = ends[opcode]
+        at += [place.start, place.start + 1, place.body, place.end - 1, place.end]
+    return [*at, len(data) - len(MAGIC) // 2, len(data) - 1]
+
+
+def cuts(data: bytes) -> list[int]:
+    rng = random.Random(11)
+    return [*(rng.randrange(len(data)) for _ in range(CUTS)), *nasty(data)]
+
+
+def test_whatever_is_cut_off_the_rest_is_read(run: Path, whole: dict[str, list[Recorded]], tmp_path: Path) -> None:
+    """What is read is what was recorded first on each key, and lacks at most the chunk that was cut."""
+    data, cut = run.read_bytes(), tmp_path / "cut.mcap"
+    ends = {place.end: number for number, place in enumerate(chunks(data), start=1)}
+    per_chunk = chunk_sizes(run)
+    for at in cuts(data):
+        cut.write_bytes(data[:at])
+        with RecordReader(cut) as reader:
+            assert not reader.damaged, f"cut at {at}"
+        found = by_key(cut)
+        for key, recorded in found.items():
+            assert recorded == whole[key][: len(recorded)], f"cut at {at}: {key}"
+        before = max((number for end, number in ends.items() if end <= at), default=0)
+        assert sum(map(len, found.values())) == sum(per_chunk[:before]), f"cut at {at}"
+
+
+def chunk_sizes(path: Path) -> list[int]:
+    """Return how many messages each chunk holds."""
+    counts: list[int] = []
+    with open(path, "rb") as file:
+        for record in StreamReader(file, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                counts.append(0)
+            elif isinstance(record, MessageIndex):
+                counts[-1] += len(record.records)
+    return counts
+
+
+def test_a_cut_record_that_was_mended_is_the_same(run: Path, tmp_path: Path) -> None:
+    data, cut = run.read_bytes(), tmp_path / "cut.mcap"
+    for at in cuts(data)[::5]:
+        cut.write_bytes(data[:at])
+        before = by_key(cut)
+        repair(cut)
+        assert by_key(cut) == before
+        with RecordReader(cut) as reader:
+            assert reader.complete
+
+
+def turned(data: bytes, rng: random.Random) -> bytes:
+    """Return data with one to eight bits turned."""
+    changed = bytearray(data)
+    for _ in range(rng.randrange(1, 9)):
+        changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
+    return bytes(changed)
+
+
+def read_all(path: Path) -> set[Content]:
+    with RecordReader(path) as reader:
+        found = {content(message) for message in reader}
+        return found | {content(last) for key in reader.topics() if (last := reader.last(key))}
+
+
+def content(message: Recorded) -> Content:
+    """Return what a check sum guards of a message."""
+    return message.payload, message.t_ns, message.wall_ns
+
+
+def exported(path: Path, form: Format, selection: Selection) -> Made:
+    done = export(path.parent, form, selection=selection, force=True)
+    return sum(done.tables.values()), done.notes
+
+
+def to_csv(path: Path) -> Made:
+    return exported(path, Format.CSV, Selection(("world/**", "cluster/**", "process/**")))
+
+
+def to_foxglove(path: Path) -> Made:
+    return exported(path, Format.FOXGLOVE, Selection(to_s=1.0))
+
+
+def to_mat(path: Path) -> Made:
+    return exported(path, Format.MAT, Selection(("world/**", "drone/*/sensor/gps")))
+
+
+def to_summary(path: Path) -> Made:
+    summary = judge(path)[-1]
+    return summary.record.truth_instants, summary.notes
+
+
+WORKS: tuple[tuple[Callable[[Path], object], int], ...] = (
+    (repair, FLIPS),
+    (to_summary, 8),
+    (to_csv, 8),
+    (to_foxglove, 5),
+    (to_mat, 5),
+)
+
+
+def test_whatever_bits_are_turned_what_is_read_was_recorded(
+    run: Path, whole: dict[str, list[Recorded]], tmp_path: Path
+) -> None:
+    data, rng, path = run.read_bytes(), random.Random(12), tmp_path / "run.mcap"
+    recorded = {content(message) for messages in whole.values() for message in messages}
+    read = 0
+    for _ in range(FLIPS):
+        path.write_bytes(turned(data, rng))
+        try:
+            found = read_all(path)
+        except RecordError:
+            continue
+        assert found <= recorded
+        read += len(found)
+    assert read > FLIPS * len(recorded) / 4
+
+
+@pytest.mark.parametrize(("work", "times"), WORKS, ids=[work.__name__ for work, _ in WORKS])
+def test_whatever_bits_are_turned_it_is_read_or_refused_in_one_line(
+    work: Callable[[Path], object], times: int, run: Path, tmp_path: Path
+) -> None:
+    data, rng, path = run.read_bytes(), random.Random(12), tmp_path / "run.mcap"
+    for _ in range(times):
+        path.write_bytes(turned(data, rng))
+        said = ""
+        try:
+            work(path)
+        except ZsimError as error:
+            said = str(error)
+        assert "\n" not in said
+
+
+@pytest.mark.parametrize("work", [to_summary, to_csv, to_foxglove, to_mat])
+def test_everybody_reads_what_is_before_the_cut(work: Callable[[Path], Made], run: Path, tmp_path: Path) -> None:
+    data, path, read = run.read_bytes(), tmp_path / "run.mcap", []
+    for at in (len(data) // 3, 2 * len(data) // 3, len(data) - 9):
+        path.write_bytes(data[:at])
+        rows, notes = work(path)
+        assert any("the record was cut" in note.lower() for note in notes), notes
+        read.append(rows)
+    assert 0 < read[0] <= read[1] <= read[2]
+
+
+def test_the_commands_say_that_a_record_was_cut(run: Path, tmp_path: Path) -> None:
+    from zsim_deploy.cli.cli import app
+
+    data = run.read_bytes()
+    (tmp_path / "run.mcap").write_bytes(data[: len(data) // 2])
+    done = CliRunner().invoke(app, ["export", str(tmp_path), "--format", "parquet", "--keys", "drone/*/truth"])
+    assert done.exit_code == 0, done.output
+    assert "the record was cut" in done.output
+    assert "truth.parquet" in done.output

@@ -1,0 +1,100 @@
+"""A process's place in a run: what the world does not answer stays owed, and is not asked for all the time."""
+
+from typing import Any
+
+import pytest
+from fake_link import UNANSWERED, FakeLink
+
+from zsim.contract import batch, keys
+from zsim.contract.messages import ControlAnswer, Info, Origin
+from zsim.errors import DecodeError, NoWorldError
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.membership import RETRY_S, Membership
+from zsim.runtime.replay import replay
+from zsim.transport.session import Sample
+
+GATE_NS = 20_000_000
+INFO = Info(
+    0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(0.0, 0.0, 0.0), (), (), "", "", "", ""
+)
+
+
+class Quiet(Agent):
+    name, period_ns, reads, gate_keys = "quiet.one", GATE_NS, ("drone/d1/truth",), ("drone/d1/truth",)
+
+    def receive(self, key: str, message: Any) -> None:
+        return
+
+    def step(self, t_ns: int) -> list[Output]:
+        return []
+
+
+class Wall:
+    now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def test_what_is_not_answered_is_asked_for_again_after_a_while():
+    link, wall, came = FakeLink(), Wall(), []
+    member = Membership(link, INFO, Quiet(), came.append, lambda text: None, wall)  # type: ignore[arg-type]
+    for turns in (1, 2, 3):
+        for _ in range(5):
+            member.ask_again(3 * GATE_NS, "drone/d1/truth")
+            member.settle()
+        assert len(link.requests) == turns
+        assert member.owes
+        wall.now_s += RETRY_S
+    link.on_request = lambda key, args: ControlAnswer(True, result=[["drone/d1/truth", b"x"]])
+    member.settle()
+    assert came == [Sample("drone/d1/truth", b"x")]
+    assert not member.owes
+
+
+def test_another_gate_is_asked_for_at_once():
+    link = FakeLink()
+    member = Membership(link, INFO, Quiet(), lambda sample: None, lambda text: None, Wall())  # type: ignore[arg-type]
+    for gate in (3, 4):
+        member.ask_again(gate * GATE_NS, "drone/d1/truth")
+    assert [args["from_ns"] // GATE_NS for _, args in link.requests] == [2, 3]
+
+
+# The pages of a replay
+
+
+def pages(link: FakeLink, *answers: ControlAnswer) -> list[tuple[str, bytes]]:
+    left = iter(answers)
+    link.on_request = lambda key, args: next(left)
+    return list(replay(link, "quiet.one", 7, ["**"], 1.0))  # type: ignore[arg-type]
+
+
+def test_a_replay_goes_on_until_the_last_page():
+    link = FakeLink()
+    first, second = ControlAnswer(True, result=[["a", b"1"]], more=41), ControlAnswer(True, result=[["b", b"2"]])
+    assert pages(link, first, second) == [("a", b"1"), ("b", b"2")]
+    assert link.requests == [
+        (keys.replay("quiet.one"), {"from_ns": 7, "keys": ["**"], "page": page}) for page in (0, 41)
+    ]
+
+
+NO_PAIRS = [None, 7, "text", [1], [["a"]], [["a", "dGV4dA=="]], [["a", b"1", b"2"]], {"a": b"1"}, [[b"a", b"1"]]]
+
+
+@pytest.mark.parametrize("result", NO_PAIRS)
+def test_a_result_that_is_no_list_of_pairs_is_none(result: Any):
+    with pytest.raises(DecodeError, match=r"^result: .*; must be a list of \[key, payload\]$"):
+        batch.of(result)
+    with pytest.raises(NoWorldError, match="replay is of no use"):
+        pages(FakeLink(), ControlAnswer(True, result=result))
+
+
+def test_no_answer_is_said():
+    with pytest.raises(NoWorldError, match="nobody answered"):
+        pages(FakeLink(), UNANSWERED)
+
+
+@pytest.mark.parametrize("payload", [b"\x91\x92\xa1\xff\xc4\x00", b"\x91" * 5000 + b"\xc0", b"\xc1", b""])
+def test_a_batch_that_is_none_is_refused(payload: bytes):
+    with pytest.raises(DecodeError, match=r"^@batch: .*must be a list"):
+        batch.decode(payload)

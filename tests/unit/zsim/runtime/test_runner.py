@@ -1,0 +1,407 @@
+"""The runner: whose estimates a gate waits for, events that are no events, and a world that does not answer at once."""
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from fake_link import UNANSWERED, FakeLink
+from msgspec.structs import replace
+
+from zsim.contract import batch, keys, messages
+from zsim.contract.bundle import Bundle, table_of
+from zsim.contract.messages import (
+    ControlAnswer,
+    Done,
+    DroneInfo,
+    Estimate,
+    Event,
+    Fault,
+    Faults,
+    Info,
+    Mag,
+    Origin,
+    Status,
+    encode,
+)
+from zsim.errors import BehindError, RunError, SupersededError
+from zsim.runtime import membership
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.runner import Runner
+
+GATE_NS = 20_000_000
+DRONES = tuple(DroneInfo(name, "ardrone") for name in ("d1", "d2", "d3"))
+END = 6  # last gate of the runs here
+ME = "judge.main"
+REPLAY = keys.replay(ME)
+
+
+class Judge(Agent):
+    """Closes a gate with the status and the estimate of one drone, and says nothing."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.name, self.period_ns = ME, GATE_NS
+        self.gate_keys = self.reads = (keys.status("d1"), keys.estimate("d1"))
+        self.heard: list[tuple[str, int]] = []
+
+    def receive(self, key: str, message: Any) -> None:
+        self.heard.append((keys.leaf(key), message.t_ns // GATE_NS))
+
+    def step(self, t_ns: int) -> list[Output]:
+        return []
+
+
+def info(run_id: str = "run1") -> Info:
+    origin = Origin(0.0, 0.0, 0.0)
+    return Info(0, 0, 1, run_id, "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, origin, DRONES, (), "", "", "", "")
+
+
+def status(gate: int) -> Status:
+    return Status(gate * GATE_NS, gate, "flying", 50.0, False, None, 1)
+
+
+def estimate(gate: int, source: str = "my.d1") -> Estimate:
+    zeros, t_ns = (0.0, 0.0, 0.0), gate * GATE_NS
+    return Estimate(t_ns, gate, zeros, zeros, (1.0, *zeros), 0.0, (0.0,) * 36, 0.1, zeros, {}, source)
+
+
+def event(kind: str, subject: str, **data: Any) -> Event:
+    return Event(0, 0, kind, "world", subject, "", data)
+
+
+class World(FakeLink):
+    """Says a status per gate, the next one when the judge is done with the last, and the end.
+
+    Args:
+        at: what happens just before the status of a gate, by gate.
+    """
+
+    def __init__(self, at: dict[int, Callable[["World"], None]]) -> None:
+        super().__init__()
+        self.last = {keys.INFO: messages.encode(info())}
+        self.on_said = self._answer
+        self._at = at
+        self._next = 0
+        self._gate(0)
+
+    def _answer(self, key: str, payload: bytes) -> None:
+        if key == keys.process(ME, "done"):
+            gate = messages.decode(key, payload).done_ns // GATE_NS
+            if gate < self._next:
+                return
+            self._next = gate + 1
+            if gate == END:
+                self.deliver(keys.EVENT, event("end", "world", last_ns=END * GATE_NS))
+            else:
+                self._gate(gate + 1)
+
+    def _gate(self, gate: int) -> None:
+        self._at.get(gate, lambda world: None)(self)
+        self.deliver(keys.status("d1"), status(gate))
+
+    def gates_done(self) -> list[int]:
+        return [m.done_ns // GATE_NS for m in self.all(keys.process(ME, "done"))]
+
+
+def run(world: World, stopped: Callable[[], bool] = lambda: False) -> Judge:
+    judge = Judge()
+    said: list[str] = []
+    Runner(world, info(), judge, stopped, said.append).run()  # type: ignore[arg-type]
+    return judge
+
+
+def estimates(gates: range, source: str = "my.d1") -> dict[int, Callable[[World], None]]:
+    return {gate: lambda world, g=gate: world.deliver(keys.estimate("d1"), estimate(g, source)) for gate in gates}
+
+
+def tells(*said: Event | Estimate) -> Callable[[World], None]:
+    def tell(world: World) -> None:
+        for each in said:
+            world.deliver(keys.EVENT if isinstance(each, Event) else keys.estimate("d1"), each)
+
+    return tell
+
+
+@pytest.mark.parametrize("kind", ["drop", "leave"])
+@pytest.mark.parametrize("source", ["my.d1", "estimator.d1", ""])
+def test_whose_estimates_are_waited_for_no_longer_follows_from_their_source(kind: str, source: str):
+    world = World({**estimates(range(2), source), 2: tells(event(kind, source or "estimator.d1"))})
+    run(world)
+    assert world.gates_done() == list(range(END + 1))
+
+
+@pytest.mark.parametrize("subject", ["range.d1", "estimator.d1"])
+def test_the_loss_of_another_process_changes_nothing(subject: str):
+    world = World({**estimates(range(2)), 2: tells(event("drop", subject))})
+    ticks = iter(range(10))
+    run(world, stopped=lambda: next(ticks, None) is None)
+    assert world.gates_done() == [0, 1]
+
+
+@pytest.mark.parametrize("successor", ["my.d1", "estimator.d1"])
+def test_who_joins_in_its_place_is_waited_for_from_its_own_first_gate(successor: str):
+    joins = event("join", successor, incarnation=1, host="x", pid=1, from_ns=4 * GATE_NS)
+    world = World({**estimates(range(2)), 2: tells(event("drop", "my.d1")), 3: tells(joins)})
+    ticks = iter(range(10))
+    run(world, stopped=lambda: next(ticks, None) is None)
+    assert world.gates_done() == [0, 1, 2, 3]
+
+
+GARBAGE = [
+    event("end", "world", last_ns="soon"),
+    event("end", "world", last_ns=None),
+    event("end", "world"),
+    event("join", "my.d1", from_ns="soon"),
+    event("join", "my.d1"),
+    event("restart", ME),
+    event("superseded", ME, incarnation="mine", pid=None, host=3, from_ns=0.5),
+]
+
+
+def test_events_that_nobody_can_mean_are_refused_and_change_nothing():
+    world = World({**estimates(range(END + 1)), 2: tells(*GARBAGE, estimate(2))})
+    runner = Runner(world, info(), Judge())  # type: ignore[arg-type]
+    assert runner.run() == "the run ended"
+    assert world.gates_done() == list(range(END + 1))
+    assert runner.health.refused == len(GARBAGE)
+
+
+def test_who_is_superseded_ends():
+    entry = {"incarnation": 1, "host": "other", "pid": os.getpid() + 1, "from_ns": 0, "former_pid": os.getpid()}
+    world = World({**estimates(range(3)), 2: tells(event("superseded", ME, **entry))})
+    with pytest.raises(SupersededError, match=r"joined from other \(pid \d+\); this one ends"):
+        run(world)
+
+
+# Several drones
+
+
+class Swarm(Judge):
+    """Reads all sensors of two drones, and an estimate of a third."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gate_keys = (keys.status("d1"), keys.status("d2"))
+        self.reads = (keys.sensors("d1"), keys.sensors("d2"), keys.estimate("d3"))
+        self.counted = ("d1", "d2")
+
+
+def bundle_of(t_ns: int, seq: int, told: list[tuple[str, Any]]) -> Bundle:
+    """Return messages on drones d1 to d3 as the world bundles them."""
+    table = table_of([drone.name for drone in DRONES])
+    return Bundle.of(t_ns, seq, table, [(key, messages.encode(message)) for key, message in told])
+
+
+class InOne(World):
+    """Says all of a gate in one message."""
+
+    def _gate(self, gate: int) -> None:
+        t_ns, still = gate * GATE_NS, (0.0, 0.0, 0.0)
+        told = [
+            (keys.sensor("d1", "mag"), Mag(t_ns, gate, t_ns, still)),
+            (keys.status("d1"), replace(status(gate), count=2)),
+            (keys.status("d2"), status(gate)),
+            (keys.status("d3"), status(gate)),
+        ]
+        self._at.get(gate, lambda world: None)(self)
+        self.deliver(batch.GATE, bundle_of(t_ns, gate, told).packed())
+
+
+def test_who_reads_several_drones_gets_a_gate_in_one_message():
+    swarm, world = Swarm(), InOne({3: lambda world: world.deliver(keys.estimate("d3"), estimate(3))})
+    Runner(world, info(), swarm).run()  # type: ignore[arg-type]
+    assert world.gates_done() == list(range(END + 1))
+    assert swarm.heard[:3] == [("mag", 0), ("status", 0), ("status", 0)]
+    assert len([leaf for leaf, _ in swarm.heard if leaf == "status"]) == 2 * (END + 1)  # d3's are not asked for
+    assert ("estimate", 3) in swarm.heard
+
+
+def test_garbage_in_place_of_a_gate_is_refused_and_changes_nothing():
+    runner = Runner(InOne({2: lambda world: world.deliver(batch.GATE, b"\xc1")}), info(), Swarm())  # type: ignore[arg-type]
+    assert runner.run() == "the run ended"
+    assert runner.health.refused == 1
+
+
+# A world that does not answer at once
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let what is owed be tried at every tick."""
+    monkeypatch.setattr(membership, "RETRY_S", 0.0)
+
+
+def answers(*given: ControlAnswer) -> Callable[[str, dict[str, Any]], ControlAnswer]:
+    """Answer requests in turn."""
+    left = iter(given)
+    return lambda key, args: next(left)
+
+
+def replayed(*gates: int) -> ControlAnswer:
+    pairs = [[keys.estimate("d1"), messages.encode(estimate(gate))] for gate in gates]
+    pairs += [[keys.status("d1"), messages.encode(status(gate))] for gate in gates]
+    return ControlAnswer(True, result=pairs)
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("before", [[], [UNANSWERED], [UNANSWERED, ControlAnswer(True, result=7), replayed()]])
+def test_a_gate_that_was_lost_is_asked_for_until_it_is_there(before: list[ControlAnswer]):
+    """The estimate of gate 2 is lost; that of gate 3 shows it; then nothing comes any more but answers."""
+
+    def loses(world: World) -> None:
+        world.deliver(keys.estimate("d1"), estimate(3))
+
+    rest = {gate: each for gate, each in estimates(range(END + 1)).items() if gate not in (2, 3)}
+    world = World({**rest, 2: loses})
+    world.on_request = answers(*before, replayed(2))
+    judge = run(world)
+    assert world.gates_done() == list(range(END + 1))
+    assert [gate for kind, gate in judge.heard if kind == "estimate"] == list(range(END + 1))
+    assert world.requests[0] == (REPLAY, {"from_ns": GATE_NS, "keys": list(judge.reads), "page": 0})
+
+
+@pytest.mark.usefixtures("quick")
+def test_what_nobody_keeps_any_more_ends_it():
+    """Estimate 2 is lost, and the world, which went on without this process, has it no more."""
+    rest = {gate: each for gate, each in estimates(range(END + 1)).items() if gate not in (2, 3)}
+    world = World({**rest, 2: tells(estimate(3))})
+    world.on_request = lambda key, args: replayed()
+    with pytest.raises(
+        BehindError, match=r"drone/d1/estimate of t = 0\.04 s is kept by nobody any more; this one ends"
+    ):
+        run(world)
+    assert not world.all(keys.process(ME, "bye"))
+
+
+@pytest.mark.parametrize("deserted", [False, True])
+def test_who_lost_its_launcher_dies_and_does_not_leave(deserted: bool):
+    world = World(estimates(range(END + 1)))
+    reason = Runner(world, info(), Judge(), lambda: True, deserted=lambda: deserted).run()  # type: ignore[arg-type]
+    assert reason == "stopped"
+    assert len(world.all(keys.process(ME, "bye"))) == (not deserted)
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize("hears", [True, False])
+def test_after_a_lost_link_it_rejoins_as_soon_as_the_world_answers(hears: bool):
+    """The link goes and comes at gate 2, which is lost with it; the world takes its time to answer.
+
+    A process that does not hear that it was taken in again says so several times.
+    """
+    asked = iter(range(3))
+
+    def cut(world: World) -> None:
+        world.last = {}
+        world.cut(False)
+        world.cut(True)
+
+    class Slow(World):
+        def get(self, expression: str, timeout_s: float = 2.0) -> list[Any]:
+            if expression == keys.INFO and next(asked, None) is None:
+                self.last = {keys.INFO: messages.encode(info())}
+            return super().get(expression, timeout_s)
+
+        def _answer(self, key: str, payload: bytes) -> None:
+            if key == keys.process(ME, "join") and hears and len(self.all(key)) > 1:
+                said = messages.decode(key, payload)
+                entry = {"incarnation": said.incarnation, "host": "h", "pid": said.pid, "from_ns": 0, "done_ns": 0}
+                self.deliver(keys.EVENT, event("restart", ME, **entry, former_pid=said.pid))
+            super()._answer(key, payload)
+
+        def _gate(self, gate: int) -> None:
+            if gate == 2:
+                cut(self)
+            else:
+                super()._gate(gate)
+
+    world = Slow(estimates(range(END + 1)))
+    world.on_request = answers(UNANSWERED, UNANSWERED, replayed(2), *[replayed()] * 9)
+    run(world)
+    dones: list[Done] = world.all(keys.process(ME, "done"))
+    joins = world.all(keys.process(ME, "join"))
+    again = 1 if hears else len(joins) - 1
+    assert (again > 1) != hears
+    assert again <= 1 + membership.REJOINS_MAX
+    assert [done.done_ns // GATE_NS for done in dones[:4]] == [0, 1, 0, 1]
+    assert {done.done_ns // GATE_NS for done in dones[4:]} >= set(range(2, END + 1))
+    assert len(dones) == END + 3 or not hears
+    assert {done.incarnation for done in dones[2:]} == {joins[1].incarnation} != {joins[0].incarnation}
+
+
+@pytest.mark.usefixtures("quick")
+def test_after_a_lost_link_another_run_is_none_of_its_business():
+    def cut(world: World) -> None:
+        world.last = {keys.INFO: messages.encode(info("run2"))}
+        world.cut(False)
+        world.cut(True)
+
+    with pytest.raises(RunError, match="the world has begun another run"):
+        run(World({**estimates(range(END + 1)), 2: cut}))
+
+
+# A process that a fault kills dies once, however late it steps and in whatever order the lists come.
+
+KILL = Fault(1, "process_kill", ME, {}, 2 * GATE_NS, 3 * GATE_NS, "tester.one")
+
+
+def told(gate: int, seq: int, *faults: Fault) -> Faults:
+    return Faults(gate * GATE_NS, seq, faults)
+
+
+def last_gate(before_gate: int, *lists: Faults) -> int:
+    """Return the last gate of a judge to whom some lists are said at once, before a gate."""
+
+    def tell(world: World) -> None:
+        for each in lists:
+            world.deliver(keys.FAULTS, each)
+        world.deliver(keys.estimate("d1"), estimate(before_gate))
+
+    world = World({**estimates(range(END + 1)), before_gate: tell})
+    runner = Runner(world, info(), Judge())  # type: ignore[arg-type]
+    runner.run()
+    said_bye = len(world.all(keys.process(ME, "bye")))
+    assert said_bye == (0 if runner.killed else 1)
+    return world.gates_done()[-1]
+
+
+def test_a_kill_is_at_the_first_gate_in_which_it_acts():
+    assert last_gate(1, told(0, 0, KILL)) == 3
+
+
+@pytest.mark.parametrize("lists", [(told(2, 0, KILL), told(4, 1)), (told(4, 1), told(2, 0, KILL))], ids=["late", "old"])
+def test_what_was_forgotten_before_a_late_process_heard_of_it(lists: tuple[Faults, Faults]):
+    """Both lists are heard at once: one that names the kill, and the newer one, said when it was over."""
+    died = lists[0].faults != ()
+    assert last_gate(2, *lists) == (3 if died else END)
+
+
+def test_a_kill_that_is_heard_of_too_late_still_kills():
+    assert last_gate(5, told(2, 0, KILL)) == 5
+
+
+def test_a_kill_that_is_cleared_kills_nobody():
+    assert last_gate(1, told(0, 0, KILL), told(1, 1)) == END
+
+
+def test_an_older_list_does_not_take_a_kill_away():
+    assert last_gate(1, told(1, 1, KILL), told(0, 0)) == 3
+
+
+class Second(Judge):
+    """A judge that takes over the estimate that the world has for it."""
+
+    def warm_start_keys(self) -> tuple[str, ...]:
+        return (keys.estimate("d1"),)
+
+
+@pytest.mark.parametrize(("former_gate", "killed"), [(2, True), (3, False), (4, False)])
+def test_who_is_started_again_after_its_kill_lives(former_gate: int, killed: bool):
+    """The former process of its name got as far as a gate; the kill is of gate 3."""
+    world = World(estimates(range(END + 1)))
+    world.last[keys.estimate("d1")] = encode(estimate(former_gate))
+    world.last[keys.FAULTS] = encode(told(0, 0, KILL))
+    runner = Runner(world, info(), Second())  # type: ignore[arg-type]
+    runner.run()
+    assert runner.killed == killed
+    assert world.gates_done()[-1] == (3 if killed else END)

@@ -1,0 +1,197 @@
+"""What a fault may be: every kind with what it needs, every flaw in a line."""
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsim.errors import ScenarioError
+from zsim.scenario import scenario_file
+from zsim.scenario.fault_check import Known, flaws
+from zsim.scenario.fault_kinds import KINDS, Parameter, acts, expected, planned
+from zsim.scenario.scenario_file import resolve
+
+GATE_NS = 20_000_000
+KNOWN = Known(("drone1", "drone2"), ("main",), ("my.filter",))
+TARGETS = {
+    "drone": "drone1",
+    "world": "world",
+    "link": "estimator.drone1/controller.main",
+    "radio": "main",
+    "process": "estimator.drone2",
+}
+SOUND: dict[str, dict[str, Any]] = {
+    "accel_bias": {"value_m_s2": [0.1, 0, 0]},
+    "gyro_bias": {"value_deg_s": [1, 0, 0]},
+    "gps_bias": {"value_m": [1, 2, 3]},
+    "mag_bias": {"value_ut": [1, 2, 3]},
+    "baro_bias": {"value_m": -2},
+    "sonar_bias": {"value_m": 0.1},
+    "flow_bias": {"value_m_s": [0.1, 0, 0]},
+    **{kind: {"factor": 3} for kind in KINDS if kind.endswith("_noise")},
+    "rotor_efficiency": {"rotor": "all", "value": 0.8},
+    "rotor_stuck": {"rotor": "front_left"},
+    "gust": {"velocity_m_s": [3, 0, 0], "for_s": 2},
+    "link_delay": {"delay_ms": 40},
+    "link_jitter": {"jitter_ms": 40},
+    "link_loss": {"probability": 0.3},
+    "radio": {"range_m": 30},
+}
+
+
+def sound(kind: str, **more: Any) -> dict[str, Any]:
+    return {"kind": kind, "target": TARGETS[KINDS[kind].strikes], **SOUND.get(kind, {}), **more}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_is_taken_with_what_it_needs(kind: str):
+    assert list(flaws(sound(kind), KNOWN)) == []
+    for parameter in KINDS[kind].parameters:
+        left_out = {name: value for name, value in sound(kind).items() if name != parameter.name}
+        told = [path for path, _ in flaws(left_out, KNOWN)]
+        assert told == ([parameter.name] if parameter.required else [])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("bad", [math.nan, math.inf, "x", True, [1, 2], {}, -1e12, 10**400, [math.nan, 0, 0]], ids=str)
+def test_every_parameter_is_checked(kind: str, bad: Any):
+    for parameter in KINDS[kind].parameters:
+        if (parameter.shape == "flag" and bad is True) or (parameter.shape == "places" and bad == {}):
+            continue
+        ((path, text),) = flaws(sound(kind, **{parameter.name: bad}), KNOWN)
+        assert path == parameter.name
+        assert text.endswith(f" ({kind})")
+        assert "; must be " in text
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        (sound("link_loss", probability=1.4), "probability is 1.4; must be from 0 to 1 (link_loss)"),
+        (sound("gps_dropout", target="drone9"), "target is 'drone9'; must be one of drone1, drone2 (gps_dropout)"),
+        (sound("gust", target="drone1"), "target is 'drone1'; must be world (gust)"),
+        ({"kind": "gust", "target": "world", "velocity_m_s": [1, 0, 0]}, "for_s is missing; must be its length in s (gust)"),
+        (sound("process_kill", for_s=3), "for_s is 3; must be left out (process_kill)"),
+        (sound("process_kill", target="world"), "target is 'world'; must be a process that takes part, as estimator.drone1 (process_kill)"),
+        (sound("link_cut", target="drone1"), "target is 'drone1'; must be two processes, as world/estimator.drone1 (link_cut)"),
+        (sound("link_cut", target="world/world"), "target is 'world/world'; must be two processes, as world/estimator.drone1 (link_cut)"),
+        (sound("link_cut", target="world/estimator.drone9"), "target is 'world/estimator.drone9'; 'estimator.drone9' must be estimator.NAME of drone1, drone2 (link_cut)"),
+        (sound("link_cut", target="console.1/gateway.main"), "target is 'console.1/gateway.main'; one of them must be the world or a process that takes part, as estimator.drone1 (link_cut)"),
+        (sound("radio", place={"controller.main": "drone9"}), "place.controller.main is 'drone9'; must be a drone or [x, y, z] in m (radio)"),
+        (sound("link_cut", target="world/controler.main"), "target is 'world/controler.main'; 'controler.main' must be controller.main, or a name less like it (link_cut)"),
+        (sound("link_cut", target="wrld/controller.main"), "target is 'wrld/controller.main'; 'wrld' must be world, or a name less like it (link_cut)"),
+        (sound("link_cut", target="world/recorder", one_way=True), "target is 'world/recorder', one way, and 'recorder' is outside of the lockstep; the second must be the world or a process that takes part, as estimator.drone1 (link_cut)"),
+        (sound("radio", place={"controler.main": "drone1"}), "place.controler.main names no process; must be controller.main, or a name less like it (radio)"),
+        (sound("radio", place={"controller.man": "drone1"}), "place.controller.man names no process; must be controller.NAME of main (radio)"),
+        (sound("radio", place={"estimator.drone9": [0, 0, 1]}), "place.estimator.drone9 names no process; must be estimator.NAME of drone1, drone2 (radio)"),
+        (sound("radio", place={3: "drone1"}), "place.3 names no process; must be 1 to 48 of a-z 0-9 _ . - (radio)"),
+        (sound("gps_dropout", at_s=-1), "at_s is -1; must be from 0 to 1e+06 s (gps_dropout)"),
+        (sound("gps_dropout", for_s=0), "for_s is 0; must be > 0 and <= 1e+06 s (gps_dropout)"),
+        (sound("gps_dropout", value=3), "value is not known; allowed: kind, target, at_s, for_s, probability (gps_dropout)"),
+        (sound("rotor_stuck", rotor="left"), "rotor is 'left'; must be one of front_left, front_right, rear_right, rear_left, all (rotor_stuck)"),
+    ],
+)  # fmt: skip
+def test_a_flaw_is_a_line(given: dict[str, Any], line: str):
+    assert [f"{path} {text}" for path, text in flaws(given, KNOWN)] == [line]
+
+
+def test_an_unknown_kind_names_all_kinds_and_hides_nothing_else():
+    ((path, text),) = flaws({"kind": "gremlin"}, KNOWN)
+    assert path == "kind"
+    assert text.startswith("is 'gremlin'; must be one of imu_dropout, ")
+    assert all(kind in text for kind in KINDS)
+    assert [path for path, _ in flaws({}, KNOWN)] == ["kind"]
+    assert [text for _, text in flaws([], KNOWN)] == ["is []; must be a map with kind and target"]
+
+
+def test_links_of_others_and_of_one_s_own_processes_are_taken():
+    for target in ("console.1/world", "my.filter/controller.main", "estimator.drone1/estimator.drone2"):
+        assert list(flaws(sound("link_cut", target=target), KNOWN)) == []
+    assert list(flaws(sound("process_kill", target="my.filter"), KNOWN)) == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["my.filter", "pilot", "estimator2.drone1", "my_estimator.drone1", "controllers.main", "control.main", "contr.x"],
+)
+def test_a_name_of_one_s_own_is_taken_before_it_has_joined(name: str):
+    assert list(flaws(sound("radio", place={name: "drone1"}), KNOWN)) == []
+    for target in (f"{name}/world", f"world/{name}"):
+        assert list(flaws(sound("link_cut", target=target, one_way=True), KNOWN)) == []
+
+
+def test_a_name_that_looks_mistyped_is_taken_of_one_that_takes_part():
+    known = Known(("drone1",), ("main",), ("controler.main",))
+    assert list(flaws(sound("link_cut", target="world/controler.main"), known)) == []
+
+
+def test_one_way_from_one_outside_of_the_lockstep_is_taken():
+    for target in ("console.1/world", "recorder/controller.main"):
+        assert list(flaws(sound("link_cut", target=target, one_way=True), KNOWN)) == []
+
+
+def test_a_kill_of_who_would_not_hear_of_it_is_a_flaw():
+    known = Known(("drone1",), (), ("recorder",))
+    ((path, text),) = flaws(sound("process_kill", target="recorder"), known)
+    assert path == "target"
+    assert text.startswith("is 'recorder', outside of the lockstep; must be a process that takes part, as estimator.d")
+
+
+def test_times_are_whole_gates():
+    fault = planned(sound("baro_bias", at_s=1.009, for_s=0.031), 3, "me", 0, GATE_NS)
+    assert (fault.id, fault.source, fault.from_ns, fault.until_ns) == (3, "me", 50 * GATE_NS, 52 * GATE_NS)
+    assert [gate for gate in range(48, 56) if acts(fault, gate * GATE_NS)] == [51, 52]
+    at_once = planned(sound("baro_bias"), 1, "me", 7 * GATE_NS, GATE_NS)
+    assert (at_once.from_ns, at_once.until_ns) == (7 * GATE_NS, None)
+    assert acts(at_once, 10**15)
+    short = planned(sound("baro_bias", for_s=0.001), 1, "me", 0, GATE_NS)
+    assert short.until_ns == GATE_NS
+    kill = planned(sound("process_kill", at_s=1), 1, "me", 0, GATE_NS)
+    assert (kill.from_ns, kill.until_ns) == (50 * GATE_NS, 51 * GATE_NS)
+
+
+def test_every_parameter_is_told():
+    assert planned(sound("link_cut"), 1, "me", 0, GATE_NS).parameters == {"one_way": False}
+    told = planned(sound("radio", place={"controller.main": [1, 2, 3]}), 1, "me", 0, GATE_NS).parameters
+    assert told == {"range_m": 30.0, "spread_m": 5.0, "place": {"controller.main": [1.0, 2.0, 3.0]}}
+    assert planned(sound("rotor_stuck"), 1, "me", 0, GATE_NS).parameters == {"rotor": "front_left", "speed_rad_s": None}
+
+
+def document(*given: Any) -> dict[str, Any]:
+    drones = [{"name": f"drone{k}", "position_m": [3 * k, 0, 0]} for k in (1, 2)]
+    clusters = [{"name": "main", "drones": ["drone1", "drone2"]}]
+    return {"name": "t", "duration_s": 1, "drones": drones, "clusters": clusters, "faults": list(given)}
+
+
+def test_a_scenario_tells_every_flaw_at_once():
+    with pytest.raises(ScenarioError) as told:
+        resolve(document(sound("gps_dropout"), sound("link_loss", probability=1.4), {"kind": "x"}, 3), "step.yaml")
+    lines = str(told.value).splitlines()
+    assert "step.yaml: faults[1].probability is 1.4; must be from 0 to 1 (link_loss)" in lines
+    assert "step.yaml: faults[3] is 3; must be a map" in lines
+    assert len(lines) == 3
+
+
+def test_a_scenario_takes_every_kind_and_comes_back_from_its_text():
+    everything = [sound(kind, at_s=1.5) for kind in KINDS]
+    scenario = resolve(document(*everything))
+    text = scenario_file.to_text(scenario)
+    assert scenario_file.from_text(text).faults == scenario.faults == everything
+
+
+def test_the_table_of_kinds_in_the_documentation_says_what_the_code_says():
+    text = (Path(__file__).parents[4] / "docs/faults.md").read_text()
+    table = re.search(r"<!-- kinds -->\n\n((?:\|.*\n)+)", text)
+    assert table
+    written = [[cell.strip() for cell in row.strip("|").split("|")] for row in table[1].splitlines()[2:]]
+    assert written == [
+        [f"`{name}`", kind.strikes, kind.said, "<br>".join(map(told, kind.parameters)) or "–"]
+        for name, kind in KINDS.items()
+    ]
+
+
+def told(p: Parameter) -> str:
+    standing = f"default {p.default:g}" if isinstance(p.default, float) else "may be left out"
+    return f"`{p.name}` {p.said}: {expected(p)}{'' if p.required else f'; {standing}'}"

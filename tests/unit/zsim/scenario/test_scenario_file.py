@@ -1,0 +1,801 @@
+"""Scenario files: what is right is the same everywhere, and what is wrong is told all at once, a line each."""
+
+import hashlib
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from zsim.errors import ScenarioError
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import DRONES_MAX, Scenario
+from zsim.scenario.scenario_file import FAULTS_MAX
+from zsim.scenario.sensor_presets import G_M_S2, PRESETS
+from zsim.schema.overrides import whole_path
+from zsim.schema.yaml_file import FILE_SIZE_MAX
+
+SCENARIOS = Path(__file__).parents[4] / "scenarios"
+STEP = SCENARIOS / "step.yaml"
+FILES = sorted(SCENARIOS.glob("**/*.yaml"))
+DURATION = "duration_s is missing; must be a finite number > 0 and <= 1e+06"
+
+
+def drone(name: str, x: float = 0.0, **fields: Any) -> dict[str, Any]:
+    return {"name": name, "position_m": [x, 0.0, 0.0], **fields}
+
+
+def document(**fields: Any) -> dict[str, Any]:
+    drones = [drone("drone1"), drone("drone2", 2.0), drone("drone3", 4.0)]
+    return {"name": "test", "duration_s": 10, "drones": drones, **fields}
+
+
+def clustered(zigzag: float = 2.0, **fields: Any) -> dict[str, Any]:
+    """Return six drones in a zigzag, and a cluster of them."""
+    drones = [drone(f"d{k}", 2.0 * k) for k in range(6)]
+    drones = [{**d, "position_m": [*d["position_m"][:1], zigzag * (k % 2), 0.0]} for k, d in enumerate(drones)]
+    return {"drones": drones, "clusters": [{"name": "c", "drones": [d["name"] for d in drones], **fields}]}
+
+
+def faults_of(fields: dict[str, Any]) -> list[str]:
+    with pytest.raises(ScenarioError) as caught:
+        scenario_file.resolve(fields, "step.yaml")
+    assert_lines(caught.value.faults)
+    assert str(caught.value) == "\n".join(caught.value.faults)
+    return caught.value.faults
+
+
+def faults_in(path: Path | str, *overrides: str, **values: Any) -> list[str]:
+    with pytest.raises(ScenarioError) as caught:
+        scenario_file.load(path, overrides, **values)
+    assert_lines(caught.value.faults)
+    return caught.value.faults
+
+
+def faults_of_text(tmp_path: Path, text: str | bytes) -> list[str]:
+    path = tmp_path / "own.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return faults_in(path)
+
+
+def assert_lines(lines: list[str]) -> None:
+    assert lines
+    for line in lines:
+        assert line.isprintable(), line
+        assert len(line) < 500, line
+
+
+def only(lines: list[str]) -> str:
+    (line,) = lines
+    return line
+
+
+# The files that come with it
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_every_scenario_of_the_house_is_valid(path: Path):
+    scenario = scenario_file.load(path)
+    assert scenario.drones
+
+
+def test_the_paper_s_two_tests_are_there():
+    assert {"step.yaml", "trajectory.yaml"} <= {path.name for path in FILES}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_the_resolved_text_is_the_same_scenario(path: Path):
+    scenario = scenario_file.load(path)
+    text = scenario_file.to_text(scenario)
+    again = scenario_file.from_text(text)
+    assert again == scenario
+    assert scenario_file.to_text(again) == text
+    assert scenario_file.sha256(text) == hashlib.sha256(text.encode()).hexdigest()
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_the_resolved_text_is_yaml_to_others(path: Path):
+    scenario = scenario_file.load(path)
+    plain = yaml.safe_load(scenario_file.to_text(scenario))
+    assert [entry["name"] for entry in plain["drones"]] == [entry.name for entry in scenario.drones]
+    assert plain["drones"][0]["mass_kg"] == scenario.drones[0].mass_kg
+
+
+# What resolving gives
+
+
+def test_defaults_are_the_ardrone_in_buenos_aires():
+    scenario = scenario_file.resolve(document())
+    assert scenario.drone("drone2").mass_kg == 0.429
+    assert scenario.drone("drone2").sensors.preset == "ardrone2"
+    assert scenario.environment.latitude_deg == -34.603
+    assert scenario.time.gate_ms == 20.0
+    assert scenario.federation == "zsim"
+
+
+def test_things_are_found_by_name():
+    scenario = scenario_file.load(STEP)
+    assert scenario.drone("drone2").name == "drone2"
+    assert scenario.cluster("main").drones == ["drone1", "drone2", "drone3"]
+    with pytest.raises(KeyError):
+        scenario.drone("drone9")
+    with pytest.raises(KeyError):
+        scenario.cluster("other")
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+def test_a_preset_gives_all_its_figures(preset: str):
+    sensors = scenario_file.resolve(document(sensors={"preset": preset})).drones[0].sensors
+    plain = msgspec.to_builtins(sensors)
+    for sensor, figures in PRESETS[preset].items():
+        for name, value in figures.items():
+            found = plain[sensor][name]
+            assert found == ({**found, **value} if isinstance(value, dict) else value)
+
+
+def test_the_drone_s_sensors_win_over_the_scenario_s_and_those_over_the_preset():
+    drones = [drone("a"), drone("b", 2.0, sensors={"gps": {"position_m": {"noise": 0.5}}})]
+    shared = {"preset": "paper", "gps": {"position_m": {"noise": 1.0, "bias": 0.1}}}
+    first, second = scenario_file.resolve(document(drones=drones, sensors=shared)).drones
+    assert (first.sensors.gps.position_m.noise, first.sensors.gps.position_m.bias) == (1.0, 0.1)
+    assert (second.sensors.gps.position_m.noise, second.sensors.gps.position_m.bias) == (0.5, 0.1)
+    assert second.sensors.gps.rate_hz == 5.0
+    assert second.sensors.imu.accel_m_s2.noise == 0.35
+
+
+def test_a_drone_may_have_a_preset_of_its_own():
+    drones = [drone("a"), drone("b", 2.0, sensors={"preset": "ardrone2"})]
+    first, second = scenario_file.resolve(document(drones=drones, sensors={"preset": "paper"})).drones
+    assert (first.sensors.preset, second.sensors.preset) == ("paper", "ardrone2")
+    assert second.sensors.imu.accel_m_s2.noise == PRESETS["ardrone2"]["imu"]["accel_m_s2"]["noise"]
+
+
+def test_the_paper_s_accelerometer_as_printed_is_0_35_g():
+    sensors = scenario_file.load(STEP, ["sensors.as_printed=true"]).drones[0].sensors
+    assert sensors.imu.accel_m_s2.noise == 0.35 * G_M_S2
+    assert sensors.imu.gyro_deg_s.noise == 0.01
+
+
+def test_resolving_leaves_the_document_as_it_was():
+    raw = document(sensors={"preset": "paper"})
+    before = msgspec.json.encode(raw)
+    scenario_file.resolve(raw)
+    assert msgspec.json.encode(raw) == before
+
+
+def named(scenario: Scenario) -> str:
+    return scenario_file.sha256(scenario_file.to_text(scenario))
+
+
+def test_whole_numbers_and_floats_are_the_same_scenario():
+    whole, floats = document(duration_s=10), document(duration_s=10.0)
+    assert named(scenario_file.resolve(whole)) == named(scenario_file.resolve(floats))
+
+
+@pytest.mark.parametrize(
+    "override", ["seed=2", "drones.drone1.mass_kg=0.4290001", "environment.wind.gust_correlation=0.4999999999999999"]
+)
+def test_any_change_is_another_hash(override: str):
+    assert named(scenario_file.load(STEP, [override])) != named(scenario_file.load(STEP))
+
+
+texts = st.text(st.characters(codec="utf-8"), max_size=30) | st.sampled_from(
+    [
+        "1e3",
+        "1e-3",
+        "1.5",
+        "010",
+        "0x1F",
+        "1_000",
+        "1:30",
+        "yes",
+        "null",
+        "~",
+        "",
+        " ",
+        "- a",
+        "a: b",
+        "#",
+        "nan",
+        ".inf",
+    ]
+)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    expressions=st.dictionaries(texts, texts, min_size=1, max_size=3),
+    numbers=st.lists(st.floats(-1e9, 1e9), min_size=4, max_size=4),
+)
+def test_any_text_and_number_survives_world_info(expressions: dict[str, str], numbers: list[float]):
+    """Texts that look like numbers stay texts, numbers keep their last bit."""
+    plan = {"trajectory": {"expressions": expressions, "constants": {"f": numbers[0]}}}
+    wind = {"steady_m_s": numbers[1:]}
+    clusters = [{"name": "main", "drones": ["drone1", "drone2"], "plan": plan}]
+    scenario = scenario_file.resolve(document(clusters=clusters, environment={"wind": wind}))
+    again = scenario_file.from_text(scenario_file.to_text(scenario))
+    assert again == scenario
+    assert [x.hex() for x in again.environment.wind.steady_m_s] == [float(x).hex() for x in numbers[1:]]
+
+
+def test_numbers_with_an_exponent_are_numbers(tmp_path: Path):
+    path = tmp_path / "own.yaml"
+    path.write_text("name: own\nduration_s: 1e1\ndrones: [{name: a, position_m: [1e-1, +2E0, .5]}]\n")
+    scenario = scenario_file.load(path)
+    assert scenario.duration_s == 10.0
+    assert scenario.drones[0].position_m == (0.1, 2.0, 0.5)
+
+
+def test_a_file_with_a_byte_order_mark_is_read(tmp_path: Path):
+    path = tmp_path / "own.yaml"
+    path.write_bytes(b"\xef\xbb\xbf" + STEP.read_bytes())
+    assert scenario_file.load(path) == scenario_file.load(STEP)
+
+
+def test_values_replace_the_file_s_and_none_does_not():
+    scenario = scenario_file.load(STEP, seed=7, duration_s=None, federation="other")
+    assert (scenario.seed, scenario.duration_s, scenario.federation) == (7, 330.0, "other")
+
+
+# Overrides
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["drones.drone2.mass_kg", "drones.1.mass_kg", "drones[1].mass_kg", "drones[drone2].mass_kg", "drones[1][mass_kg]"],
+)
+def test_an_entry_is_named_by_place_or_by_name(path: str):
+    scenario = scenario_file.load(STEP, [f"{path}=0.5"])
+    assert [d.mass_kg for d in scenario.drones] == [0.429, 0.5, 0.429]
+
+
+def test_sections_that_are_not_in_the_file_begin_with_their_first_override():
+    scenario = scenario_file.load(STEP, ["drones.drone1.limits.tilt_deg=10", "silence.hover_s=1.5"])
+    assert scenario.drone("drone1").limits.tilt_deg == 10.0
+    assert scenario.silence.hover_s == 1.5
+
+
+def test_a_section_that_is_left_empty_is_as_one_that_is_not_there(tmp_path: Path):
+    path = tmp_path / "own.yaml"
+    path.write_text("name: own\nduration_s: 1\nsilence:\ndrones: [{name: a, position_m: [0, 0, 0]}]\n")
+    assert scenario_file.load(path, ["silence.hover_s=1.5"]).silence.hover_s == 1.5
+
+
+def test_overrides_apply_in_order():
+    overrides = ["drones.drone1.name=lead", "drones.lead.yaw_deg=45", "clusters.main.drones=[lead, drone2, drone3]"]
+    scenario = scenario_file.load(STEP, [*overrides, "seed=2", "seed=3"])
+    assert scenario.drone("lead").yaw_deg == 45.0
+    assert scenario.seed == 3
+
+
+@pytest.mark.parametrize(
+    ("path", "whole"),
+    [
+        ("wind.gust_m_s", "environment.wind.gust_m_s"),
+        ("wind[gust_m_s]", "environment.wind[gust_m_s]"),
+        ("gate_ms", "time.gate_ms"),
+        ("imu.rate_hz", "sensors.imu.rate_hz"),
+        ("drones[0].mass_kg", "drones[0].mass_kg"),
+        ("environment.wind.gust_m_s", "environment.wind.gust_m_s"),
+        ("nothing.here", "nothing.here"),
+    ],
+)
+def test_the_name_of_a_section_may_be_left_out(path: str, whole: str):
+    assert whole_path(path) == whole
+
+
+def test_an_override_may_leave_out_the_name_of_a_section():
+    assert scenario_file.load(STEP, ["wind.gust_m_s=0.25"]).environment.wind.gust_m_s == 0.25
+
+
+def test_values_are_yaml():
+    overrides = [
+        "drones.drone1.position_m=[0, 9.5, 0]",
+        "report={window_s: [1, 2]}",
+        "clusters.main.plan.takeoff_s=null",
+    ]
+    scenario = scenario_file.load(STEP, overrides)
+    assert scenario.drone("drone1").position_m == (0.0, 9.5, 0.0)
+    assert scenario.report.window_s == (1.0, 2.0)
+    assert scenario.cluster("main").plan.takeoff_s is None
+
+
+def test_a_drone_named_by_a_number_is_found_by_its_name():
+    drones = [drone("2"), drone("1", 2.0), drone("0", 4.0)]
+    raw = document(drones=drones)
+    assert scenario_file.override.apply(raw, "drones.0.mass_kg=0.5", yaml.safe_load) is None
+    assert raw["drones"][2]["mass_kg"] == 0.5
+
+
+def test_a_name_with_dots_stands_between_brackets():
+    raw = document(drones=[drone("uav.1"), drone("uav.2", 2.0)])
+    assert scenario_file.override.apply(raw, "drones[uav.2].mass_kg=0.5", yaml.safe_load) is None
+    assert raw["drones"][1]["mass_kg"] == 0.5
+
+
+SYNTAX = "is no assignment; must be a.b.c=value"
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("", SYNTAX),
+        ("seed", SYNTAX),
+        ("=1", SYNTAX),
+        ("a..b=1", SYNTAX),
+        (".a=1", SYNTAX),
+        ("a.=1", SYNTAX),
+        ("a[0=1", SYNTAX),
+        ("a]0=1", SYNTAX),
+        ("a[]=1", SYNTAX),
+        ("drones.9.mass_kg=1", "9 is not in drones; allowed: 0 to 2 or drone1, drone2, drone3"),
+        ("drones.-1.mass_kg=1", "-1 is not in drones; allowed: 0 to 2 or drone1, drone2, drone3"),
+        ("drones.drone9=1", "drone9 is not in drones; allowed: 0 to 2 or drone1, drone2, drone3"),
+        ("drones.²=1", "² is not in drones"),
+        (f"drones.{'9' * 5000}=1", "is not in drones"),
+        ("clusters.main.drones.7=drone1", "7 is not in clusters.main.drones; allowed: 0 to 2"),
+        ("seed.x=1", "seed is 1; must be a map or a list"),
+        ("seed.x.y=1", "seed is 1; must be a map or a list"),
+        ("seed=[1", "line 1 is not YAML"),
+        ("seed={", "line 1 is not YAML"),
+        ("seed=*a", "line 1 is not YAML"),
+        ("seed=&a [*a]", "aliases are not allowed"),
+        ("seed=" + "9" * 5000, "is not YAML"),
+        ("seed=" + "[" * 1500, "is nested too deep"),
+        ("seed=!!python/name:os.system", "is not YAML"),
+        ("seed=!!map [1]", "is not YAML"),
+        ("seed=2020-13-45", "is not YAML"),
+        ("seed=\x00", "is not YAML"),
+    ],
+    ids=lambda text: text[:24],
+)
+def test_an_override_that_cannot_be_is_told(override: str, said: str):
+    line = only(faults_in(STEP, override))
+    assert line.startswith("--set ")
+    assert said in line
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("sede=2", "step.yaml: sede is not known; allowed: clusters, drones,"),
+        ("environment.wind.gust=2", "step.yaml: environment.wind.gust is not known; allowed: gust_correlation,"),
+        ("seed=", "step.yaml: seed is null; must be a whole number >= 0 and <= 4611686018427387904"),
+        ("seed=1.5", "step.yaml: seed is 1.5; must be a whole number >= 0"),
+        ("duration_s=.nan", "step.yaml: duration_s is nan; must be a finite number > 0 and <= 1e+06"),
+        ("drones.drone1=5", "step.yaml: drones[0] is 5; must be a map"),
+    ],
+)
+def test_an_override_that_makes_a_fault_is_told_as_the_file_s(override: str, said: str):
+    assert faults_in(STEP, override)[0].startswith(said)
+
+
+def test_faults_of_overrides_and_of_the_file_are_told_together():
+    lines = faults_in(STEP, "seed", "drones.9.mass_kg=1", "drones.drone3.mass_kg=-1.4", seed=-1)
+    assert len(lines) == 4
+    assert [line.split(":")[0] for line in lines] == ["--set seed", "--set drones.9.mass_kg=1"] + ["step.yaml"] * 2
+
+
+@settings(max_examples=100, deadline=None)
+@given(text=st.text(max_size=30) | st.from_regex(r"[a-d.\[\]0-9]{1,12}=[\[\]{}a*&!1:,-]{0,8}", fullmatch=True))
+def test_any_override_is_applied_or_told(text: str):
+    try:
+        scenario_file.load(STEP, [text])
+    except ScenarioError as error:
+        assert_lines(error.faults)
+
+
+# Faults of one field
+
+
+def test_the_fault_of_a_drone_in_full():
+    line = only(faults_in(STEP, "drones.drone3.mass_kg=-1.4"))
+    assert line == "step.yaml: drones[2].mass_kg is -1.4; must be > 0 and <= 100 (drone 'drone3')"
+
+
+def test_the_fault_of_a_cluster_in_full():
+    line = only(faults_in(STEP, "clusters.main.gains.proportional_1_s=3"))
+    said = "clusters[0].gains.proportional_1_s is 3; must be > 0 and <= 2 (cluster 'main')"
+    assert line == f"step.yaml: {said}"
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf], ids=repr)
+@pytest.mark.parametrize(
+    "path",
+    [
+        "duration_s",
+        "environment.height_m",
+        "environment.wind.gust_m_s",
+        "drones.drone1.yaw_deg",
+        "drones.drone1.mass_kg",
+        "clusters.main.plan.takeoff_s",
+        "sensors.imu.rate_hz",
+        "time.gate_ms",
+    ],
+)
+def test_numbers_that_are_not_finite_are_refused(path: str, number: float):
+    text = {"nan": ".nan", "inf": ".inf", "-inf": "-.inf"}[repr(number)]
+    assert f"is {number!r}; must be a finite number" in only(faults_in(STEP, f"{path}={text}"))
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "allowed"),
+    [
+        ("duration_s", "0", "> 0 and <= 1e+06"),
+        ("duration_s", "2e6", "> 0 and <= 1e+06"),
+        ("drones.drone1.mass_kg", "0", "> 0 and <= 100"),
+        ("drones.drone1.position_m", "[1e300, 0, 0]", ">= -100000 and <= 100000"),
+        ("drones.drone1.inertia_kg_m2", "[0, 1, 1]", "> 0"),
+        ("drones.drone1.battery_percent", "101", ">= 0 and <= 100"),
+        ("environment.wind.gust_m_s", "-0.5", ">= 0"),
+        ("environment.wind.steady_m_s", "[1e300, 0, 0]", "<= 1e+09"),
+        ("environment.wind.gust_correlation", "1.5", ">= 0 and <= 1"),
+        ("environment.gravity_m_s2", "-9.8", "> 0"),
+        ("environment.latitude_deg", "91", ">= -90 and <= 90"),
+        ("sensors.gps.dropout", "2", ">= 0 and <= 1"),
+        ("sensors.gps.latency_ms", "-1", ">= 0 and <= 10000"),
+        ("sensors.mag.field_ut.noise", "-0.1", ">= 0"),
+        ("seed", "-1", ">= 0"),
+        ("seed", str(2**62 + 1), "<= 4611686018427387904"),
+        ("time.command_delay_gates", "0", ">= 1 and <= 50"),
+        ("clusters.main.gains.separation_min_m", "-1", ">= 0"),
+        ("silence.hover_s", "0", "> 0"),
+    ],
+)
+def test_limits_are_quoted(path: str, value: str, allowed: str):
+    assert allowed in only(faults_in(STEP, f"{path}={value}"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("name", "Step"),
+        ("name", "a/b"),
+        ("name", "x" * 33),
+        ("federation", "a b"),
+        ("federation", '"a\\n"'),
+        ("name", "''"),
+    ],
+)
+def test_names_are_of_the_contract(name: str, value: str):
+    assert "must match [a-z0-9_.-]{1,32}" in only(faults_in(STEP, f"{name}={value}"))
+
+
+@pytest.mark.parametrize("digits", [19, 400, 4000])
+def test_huge_whole_numbers_are_a_fault_and_no_crash(digits: int):
+    for path in ("seed", "duration_s", "drones.drone1.mass_kg"):
+        assert "must be" in only(faults_in(STEP, f"{path}={'9' * digits}"))
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"drones": []}, "step.yaml: drones has 0 entries; must have 1 to 1000"),
+        ({"drones": None}, "step.yaml: drones is null; must be a list"),
+        ({"drones": {"a": 1}}, "step.yaml: drones is {'a': 1}; must be a list"),
+        ({"drones": [drone("a", i) for i in range(DRONES_MAX + 1)]}, "drones has 1001 entries; must have 1 to 1000"),
+        ({"drones": [7]}, "step.yaml: drones[0] is 7; must be a map"),
+        ({"clusters": 5}, "step.yaml: clusters is 5; must be a list"),
+        ({"sensors": 5}, "step.yaml: sensors is 5; must be a map"),
+        ({"sensors": {"preset": "best"}}, "step.yaml: sensors.preset is 'best'; must be one of ardrone2, paper"),
+        ({"sensors": {"preset": ["paper"]}}, "step.yaml: sensors.preset is ['paper']; must be one of ardrone2, paper"),
+        ({"sensors": {"lidar": {}}}, "step.yaml: sensors.lidar is not known; allowed: as_printed, baro,"),
+        ({"sensors": {"imu": 3}}, "step.yaml: sensors.imu is 3; must be a map"),
+        ({"drones": [drone("a", sensors=3)]}, "step.yaml: drones[0].sensors is 3; must be a map (drone 'a')"),
+        ({"drones": [drone("a", position_m=[1, 2])]}, "drones[0].position_m is [1, 2]; must be a list of 3 entries"),
+        ({"drones": [{"name": "a"}]}, "drones[0].position_m is missing; must be a list of 3 entries (drone 'a')"),
+        ({"drones": [drone("a", model="x")]}, "drones[0].model is 'x'; must be one of ardrone2"),
+        ({"processes": {"on_death": {"world": "weep"}}}, "must be one of drop, end, restart, wait"),
+        ({7: 1}, "step.yaml: 7 is not known; allowed: clusters,"),
+    ],
+)
+def test_a_wrong_shape_is_told(fields: dict[Any, Any], said: str):
+    assert said in only(faults_of(document(clusters=[]) | fields))
+
+
+def test_a_scenario_without_anything_says_all_that_is_missing():
+    lines = faults_of({})
+    assert lines == [
+        "step.yaml: name is missing; must be text",
+        f"step.yaml: {DURATION}",
+        "step.yaml: drones is missing; must be a list",
+    ]
+
+
+def test_a_fault_that_all_drones_share_is_told_once():
+    assert only(faults_of(document(sensors={"imu": {"rate_hz": -5}}))) == (
+        "step.yaml: sensors.imu.rate_hz is -5; must be >= 0.01 and <= 1000"
+    )
+
+
+# Faults between fields
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        (
+            {"drones": [drone("a"), drone("b", 2.0), drone("a", 4.0)]},
+            "drones[2].name is 'a', as drones[0]; must be unique",
+        ),
+        (
+            {"drones": [drone("a"), drone("b", 0.5)]},
+            "drones[1].position_m is 0.50 m from 'a'; must be >= 0.6 m (drone 'b')",
+        ),
+        ({"drones": [drone("a", position_m=[0, 0, -1])]}, "drones[0].position_m[2] is -1; must be >= 0 (the ground)"),
+        (
+            {"drones": [drone("a", mass_kg=2)]},
+            "drones[0].mass_kg is 2; must be < 0.747, nine tenths of what its rotors lift",
+        ),
+        (
+            {"drones": [drone("a", rotor_min_rad_s=600)]},
+            "drones[0].rotor_min_rad_s is 600; must be < rotor_max_rad_s (503)",
+        ),
+        (
+            {"sensors": {"imu": {"rate_hz": 500}}, "drones": [drone("a")]},
+            "drones[0].sensors.imu.rate_hz is 500; must be <= 200",
+        ),
+        (
+            {"sensors": {"sonar": {"min_m": 7}}, "drones": [drone("a")]},
+            "drones[0].sensors.sonar.min_m is 7; must be < max_m (6)",
+        ),
+        (
+            {"sensors": {"as_printed": True}, "drones": [drone("a")]},
+            "drones[0].sensors.as_printed is true; must be false unless",
+        ),
+        (
+            {"environment": {"height_m": 10_500}, "drones": [drone("a", position_m=[0, 0, 600])]},
+            "drones[0].position_m[2] is 600; with environment.height_m (10500) it must be <= 11000 m above the sea",
+        ),
+        (
+            {"environment": {"height_m": 10_500}, "drones": [drone("a", limits={"altitude_m": 501})]},
+            "drones[0].limits.altitude_m is 501; with environment.height_m (10500)",
+        ),
+        ({"environment": {"height_m": 11_001}}, "environment.height_m is 11001; must be >= -100000 and <= 11000"),
+        ({"sensors": {"baro": {"rate_hz": 0.0004}}}, "sensors.baro.rate_hz is 0.0004; must be >= 0.01 and <= 1000"),
+        ({"time": {"gate_ms": 7}}, "time.gate_ms is 7; must be a multiple of 5"),
+        ({"time": {"physics_dt_ms": 3}}, "time.physics_dt_ms is 3; must divide 5"),
+        ({"time": {"physics_dt_ms": 1e-9}}, "time.physics_dt_ms is 1e-09; must divide 5"),
+        ({"report": {"window_s": [5, 5]}}, "report.window_s is [5, 5]; must be [start, end] with 0 <= start < end"),
+        ({"report": {"window_s": [-1, 5]}}, "report.window_s is [-1, 5]; must be"),
+        ({"processes": {"expect": ["a", "b", "a"]}}, "processes.expect[2] is 'a', as expect[0]; must be unique"),
+        (
+            {"processes": {"expect": ["my.drone1", "estimator.ghost"]}},
+            "processes.expect[1] is 'estimator.ghost', and no drone is 'ghost'; must be estimator.NAME of drone1, ",
+        ),
+        (
+            {"processes": {"expect": ["controller.ghost"]}, "clusters": []},
+            "processes.expect[0] is 'controller.ghost', and no cluster is 'ghost'; must be controller.NAME of",
+        ),
+        (
+            {"clusters": [{"name": "c", "drones": ["drone1", "drone9"]}]},
+            "clusters[0].drones[1] is 'drone9'; must be one of the drones",
+        ),
+        (
+            {"clusters": [{"name": "c", "drones": ["drone1", "drone1"]}]},
+            "clusters[0].drones[1] is 'drone1', which 'c' flies already",
+        ),
+        ({"clusters": [{"name": "c", "drones": ["drone1"]}]}, "clusters[0].drones has 1 entries; must have 2 to 64"),
+        ({"clusters": [{"name": "c", "drones": [f"d{k}" for k in range(65)]}]}, "has 65 entries; must have 2 to 64"),
+        (clustered(groups=[{"name": "a", "size": 6}]), "clusters[0].groups has 1 entry; must have none, or 2 or more"),
+        (
+            clustered(groups=[{"name": "a", "size": 2}, {"name": "b", "size": 3}]),
+            "clusters[0].groups has sizes that add up to 5; must be 6, one for each drone",
+        ),
+        (
+            clustered(groups=[{"name": "a", "size": 3}, {"name": "a", "size": 3}]),
+            "clusters[0].groups[1].name is 'a', as groups[0]; must be unique",
+        ),
+        (
+            clustered(groups=[{"name": "a", "size": 4}, {"name": "b", "size": 2, "space": "template"}]),
+            "clusters[0].groups[1].space asks for a template of 2 robots; must be 3 or more",
+        ),
+        (
+            clustered(groups=[{"name": "a", "size": 4}, {"name": "b", "size": 2}], template_m=[[0, 0, 0], [1, 0, 0]]),
+            "clusters[0].template_m asks for a template of 2 robots; must be 3 or more",
+        ),
+        (clustered(space="triad", template_m=[[0, 0, 0]]), "clusters[0].template_m is given; must be left out where"),
+        (clustered(template_m=[[0, 0, 0]]), "clusters[0].template_m has 1 places; must have 6, one for each robot"),
+        (
+            clustered(template_m=[[k, k, 0] for k in range(6)]),
+            "clusters[0].template_m is in one line, within 0.1 m; must span a plane or space",
+        ),
+        (
+            clustered(zigzag=0.0),
+            "clusters[0].template_m is missing, and the robots start in one line; must be given, or space must be triad",
+        ),
+        (clustered(space="ring"), "clusters[0].space is 'ring'; must be one of template, triad (cluster 'c')"),
+    ],
+)
+def test_fields_that_do_not_agree_are_told(fields: dict[str, Any], said: str):
+    assert said in only(faults_of(document(**fields)))
+
+
+def test_faults_of_groups_are_told_together_and_those_between_faulty_fields_left_out():
+    groups = [{"name": "a", "size": 1}, {"name": "b", "size": 4, "template_m": [[0, 0]] * 4}, {"name": "b", "size": 3}]
+    said = [line.removeprefix("step.yaml: ").split(";")[0] for line in faults_of(document(**clustered(groups=groups)))]
+    assert sorted(said) == [
+        "clusters[0].groups[0].size is 1",
+        "clusters[0].groups[1].template_m[0] is [0, 0]",
+        "clusters[0].groups[1].template_m[1] is [0, 0]",
+        "clusters[0].groups[1].template_m[2] is [0, 0]",
+        "clusters[0].groups[1].template_m[3] is [0, 0]",
+        "clusters[0].groups[2].name is 'b', as groups[1]",
+    ]
+
+
+def test_two_clusters_share_neither_a_name_nor_a_drone():
+    clusters = [{"name": "c", "drones": ["drone1", "drone2"]}, {"name": "c", "drones": ["drone2", "drone3"]}]
+    lines = faults_of(document(clusters=clusters))
+    assert lines[0].startswith("step.yaml: clusters[1].name is 'c', as clusters[0]; must be unique")
+    assert lines[1].startswith("step.yaml: clusters[1].drones[0] is 'drone2', which 'c' flies already")
+    assert len(lines) == 2
+
+
+@pytest.mark.parametrize(
+    "trajectory",
+    [
+        {},
+        {"expressions": {"x_c": "t"}, "waypoints": [{"at_s": 0, "values": {"x_c": 1}}]},
+    ],
+)
+def test_a_trajectory_is_expressions_or_waypoints(trajectory: dict[str, Any]):
+    clusters = [{"name": "c", "drones": ["drone1", "drone2"], "plan": {"trajectory": trajectory}}]
+    assert "must have one of them (cluster 'c')" in only(faults_of(document(clusters=clusters)))
+
+
+def test_waypoints_go_forward_in_time():
+    waypoints = [{"at_s": at, "values": {"x_c": 1}} for at in (0, 5, 5, 4, 9)]
+    clusters = [{"name": "c", "drones": ["drone1", "drone2"], "plan": {"trajectory": {"waypoints": waypoints}}}]
+    lines = faults_of(document(clusters=clusters))
+    assert len(lines) == 2
+    assert "waypoints[2].at_s is 5; must be > 5" in lines[0]
+    assert "waypoints[3].at_s is 4; must be > 5" in lines[1]
+
+
+def test_all_faults_at_once_those_between_fields_too():
+    """Every kind together; a check whose fields are themselves faulty is left out, and no other."""
+    drones = [
+        drone("a", yaw_deg=math.inf),
+        drone("a", 2.0, mass_kg=-1.4),
+        drone("b", 2.1, rotor_min_rad_s=900),
+        {"name": "C", "position_m": ["x", 0, 0]},
+        drone("d", 9.0, mass_kg=50),
+        5,
+    ]
+    clusters = [{"name": "main", "drones": ["a", "zz"], "plan": {"takeoff_s": "x", "trajectory": {}}}]
+    time_s = {"gate_ms": 7, "command_delay_gates": 0}
+    raw = document(seed=1.5, colour="red", drones=drones, clusters=clusters, time=time_s, report={"window_s": [2, 1]})
+    said = [line.removeprefix("step.yaml: ").split(";")[0] for line in faults_of(raw)]
+    assert sorted(said) == sorted(
+        [
+            "colour is not known",
+            "seed is 1.5",
+            "time.command_delay_gates is 0",
+            "drones[0].yaw_deg is inf",
+            "drones[1].mass_kg is -1.4",
+            "drones[3].name is 'C'",
+            "drones[3].position_m[0] is 'x'",
+            "drones[5] is 5",
+            "clusters[0].plan.takeoff_s is 'x'",
+            "drones[1].name is 'a', as drones[0]",
+            "time.gate_ms is 7",
+            "drones[2].position_m is 0.10 m from 'a'",
+            "drones[2].rotor_min_rad_s is 900",
+            "drones[4].mass_kg is 50",
+            "clusters[0].plan.trajectory has both or neither of expressions and waypoints",
+            "report.window_s is [2, 1]",
+        ]
+    )
+
+
+def test_a_cluster_s_drones_are_not_judged_while_a_drone_s_name_is_unknown():
+    clusters = [{"name": "c", "drones": ["drone1", "drone9"]}]
+    assert only(faults_of(document(drones=[drone("drone1"), {"position_m": [2, 0, 0]}], clusters=clusters))).startswith(
+        "step.yaml: drones[1].name is missing"
+    )
+
+
+# Files that are none
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "is empty; must be a map"),
+        ("just words", "holds 'just words'; must be a map"),
+        ("- 1\n- 2\n", "holds [1, 2]; must be a map"),
+        ("a: [1", "is not YAML"),
+        ("a: 1\nb: 2\na: 3\n", "line 3 is not YAML (key 'a' is given twice)"),
+        ("a: b: c", "line 1 is not YAML"),
+        ("\ta: 1", "line 1 is not YAML"),
+        ("a: 1\n---\nb: 2\n", "is not YAML"),
+        ("a: &x [1]\nb: *x\n", "line 2 is not YAML (aliases are not allowed)"),
+        ("a: &a [x]\n" + "".join(f"b{i}: &b{i} [*a, *a]\n" for i in range(20)), "aliases are not allowed"),
+        ("[" * 500_000, "is nested too deep"),
+        ("{a: " * 200_000, "is nested too deep"),
+        ("- " * 300_000, "is nested too deep"),
+        ("a: " + "9" * 900_000, "is not YAML"),
+        ("a: !!python/object/apply:os.system [ls]", "line 1 is not YAML (tags are not allowed)"),
+        ("a: !!map [1]", "line 1 is not YAML (tags are not allowed)"),
+        ("a: !!timestamp x", "line 1 is not YAML (tags are not allowed)"),
+        ("a: 2020-13-45", "is not YAML"),
+        ("? [1, 2]\n: 3", "line 1 is not YAML"),
+        ("a: \x07", "is not YAML"),
+        (b"\xff\xfe\x00", "is not text (byte 0); must be YAML in UTF-8"),
+        (b"a: \xe9", "is not text (byte 3); must be YAML in UTF-8"),
+        ("#" * (FILE_SIZE_MAX + 1), "is larger than 1000000 bytes; must be at most that"),
+    ],
+    ids=lambda text: repr(text[:12]),
+)
+def test_a_file_that_is_no_scenario_is_one_line(tmp_path: Path, text: str | bytes, said: str):
+    line = only(faults_of_text(tmp_path, text))
+    assert "own.yaml" in line
+    assert said in line
+
+
+def test_a_path_that_cannot_be_read_is_one_line(tmp_path: Path):
+    assert "cannot be read (No such file" in only(faults_in(tmp_path / "none.yaml"))
+    assert "cannot be read (Is a directory)" in only(faults_in(tmp_path))
+    assert "is no path" in only(faults_in("a\0b"))
+
+
+def test_a_file_without_end_is_not_read_to_its_end():
+    assert "is larger than 1000000 bytes" in only(faults_in("/dev/zero"))
+
+
+def test_a_million_drones_are_refused_at_once():
+    start_s = time.process_time()
+    raw = document(drones=[drone("a")] * 1_000_000)
+    assert only(faults_of(raw)) == "step.yaml: drones has 1000000 entries; must have 1 to 1000"
+    assert time.process_time() - start_s < 2.0
+
+
+def test_a_fault_in_each_of_many_places_is_told_a_hundred_times():
+    lines = faults_of(document(**{f"k{i}": i for i in range(5000)}))
+    assert len(lines) == FAULTS_MAX + 1
+    assert lines[-1] == "… and 4900 more faults"
+
+
+def test_a_thousand_drones_are_a_scenario():
+    drones = [drone(f"d{i}", position_m=[2 * (i % 32), 2 * (i // 32), 0]) for i in range(DRONES_MAX)]
+    assert len(scenario_file.resolve(document(drones=drones)).drones) == DRONES_MAX
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.dates() | st.binary(max_size=3),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5) | st.integers(), inner, max_size=3),
+    max_leaves=5,
+)
+places = st.lists(
+    st.sampled_from([*Scenario.__struct_fields__, "sensors", "name", "position_m", "imu", "plan", "drones", 0, 1]),
+    min_size=1,
+    max_size=4,
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(changes=st.lists(st.tuples(places, values), min_size=1, max_size=3))
+def test_any_document_is_a_scenario_or_told(changes: list[tuple[list[Any], Any]]):
+    clusters = [{"name": "c", "drones": ["drone1", "drone2"], "plan": {"takeoff_s": 1}}]
+    raw: Any = document(clusters=clusters, sensors={"preset": "paper"})
+    for path, value in changes:
+        place = raw
+        for step in path[:-1]:
+            inside = place[step] if isinstance(place, dict) and step in place else None
+            if isinstance(place, list) and isinstance(step, int) and step < len(place):
+                inside = place[step]
+            place = inside if isinstance(inside, dict | list) else place
+        if isinstance(place, dict):
+            place[path[-1]] = value
+    try:
+        scenario = scenario_file.resolve(raw)
+    except ScenarioError as error:
+        assert_lines(error.faults)
+    else:
+        assert scenario_file.from_text(scenario_file.to_text(scenario)) == scenario
