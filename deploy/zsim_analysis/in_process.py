@@ -14,9 +14,9 @@ from zsim.contract.bundle import Bundle
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
+from zsim.runtime.progress import Reasons, Screen, Throttle
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
-from zsim_deploy.terminal.progress import Reasons, Screen, Throttle
 from zsim_world.flight.world import World
 
 

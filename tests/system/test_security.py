@@ -18,9 +18,8 @@ from rights_table import KEYS, ROLES, SCENARIO, keys_of
 from secured import HOST, PREFIX, READY, SHORT_S, SITE, Certificates, Heard, Tryer, hub, site, tls_endpoint
 from wire import PATIENCE_S
 
-from zsim.contract import rights
-from zsim.contract.rights import permits
-from zsim.scenario import scenario_file
+from zsim.scenario import rights, scenario_file
+from zsim.scenario.rights import permits
 from zsim.transport import session
 from zsim.transport.identity import Identity
 from zsim.transport.tls import peer_fault

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Mathematics that several packages share: compiling, quaternions and vectors, frames, the Earth. Imports errors at most."""

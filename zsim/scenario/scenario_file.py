@@ -9,10 +9,10 @@ from typing import Any
 import msgspec
 
 from zsim.errors import ScenarioError
+from zsim.scenario import overrides as override
 from zsim.scenario.consistency import cross_faults
 from zsim.scenario.scenario import DRONES_MAX, Document, Scenario, Sensors
 from zsim.scenario.sensor_presets import AS_PRINTED, PRESETS
-from zsim.schema import overrides as override
 from zsim.schema import yaml_file
 from zsim.schema.checker import faults, sound
 

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Zenoh: sessions, their settings, TLS, and how a process finds the world. `session` alone imports zenoh. Imports scenario."""

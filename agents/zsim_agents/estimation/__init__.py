@@ -1,1 +1,1 @@
-"""TODO."""
+"""The estimator of drones: attitude, dead reckoning, error-state Kalman filter. Imports zsim alone."""

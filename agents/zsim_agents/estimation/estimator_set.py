@@ -51,9 +51,7 @@ class OneByOne:
     def __init__(
         self, drones: Sequence[Drone], environment: Environment, estimation: Estimation, gate_s: float
     ) -> None:
-        from zsim_agents.estimation.drone_estimator import (
-            DroneEstimator,  # with filterpy, which takes a second to import
-        )
+        from zsim_agents.estimation.drone_estimator import DroneEstimator
 
         self._cores = [DroneEstimator(drone, environment, estimation, gate_s) for drone in drones]
 

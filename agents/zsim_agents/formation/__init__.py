@@ -1,1 +1,1 @@
-"""TODO."""
+"""The cluster controller: phases, references, control law. Imports its spaces and zsim."""

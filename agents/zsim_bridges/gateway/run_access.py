@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from zsim.contract import batch, keys, messages, rights
+from zsim.contract import batch, keys, messages
 from zsim.contract.messages import ControlAnswer, Info
 from zsim.errors import DecodeError
-from zsim.scenario import scenario_file
+from zsim.scenario import rights, scenario_file
 from zsim.transport.session import Heard, Mailbox, Session, check_expression
 from zsim_bridges.gateway.http.http_errors import ForbiddenError, TooManyError, UnknownError
 from zsim_bridges.gateway.key_policy import is_control, is_spoken, refuse_others

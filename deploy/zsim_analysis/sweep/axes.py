@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
+from zsim.scenario.overrides import whole_path
 from zsim.scenario.random_streams import stream
 from zsim.schema import yaml_file
 from zsim.schema.checker import show
-from zsim.schema.overrides import whole_path
 
 SEED = "seed"
 SEEDS = 2**32  # drawn below it: ten digits that a person can type

@@ -10,9 +10,8 @@ from typing import Any
 import msgspec
 
 from zsim.errors import ScenarioError
-from zsim.scenario import scenario_file
+from zsim.scenario import overrides, scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim.schema import overrides
 from zsim_analysis.sweep.axes import SEED, Axis, Draw, Grid, parse, text_of
 from zsim_analysis.sweep.paths import Place, inside, place
 from zsim_analysis.sweep.sweep_plan import RUNS_MAX, Plan

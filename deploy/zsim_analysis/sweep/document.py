@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from zsim.errors import ScenarioError
+from zsim.scenario import overrides as override
 from zsim.scenario.scenario_file import EXAMPLE
-from zsim.schema import overrides as override
 from zsim.schema import yaml_file
 
 

@@ -3,7 +3,7 @@
 import re
 from typing import Any
 
-from zsim.schema.overrides import steps_of
+from zsim.scenario.overrides import steps_of
 
 Place = tuple[str | int, ...]
 

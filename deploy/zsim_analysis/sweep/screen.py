@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from zsim_deploy.terminal.progress import Throttle
+from zsim.runtime.progress import Throttle
 
 PLAIN_S = 10.0  # wall time between two lines where no terminal is
 BAR = 20  # characters

@@ -6,7 +6,7 @@ from typing import Any
 from msgspec import Struct
 
 from zsim import __version__
-from zsim.schema.overrides import whole_path
+from zsim.scenario.overrides import whole_path
 
 FILE = "plan.json"
 RUNS_MAX = 1_000_000

@@ -81,10 +81,10 @@ def run(
     order: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
     """Fly a scenario: start every process, show progress, record, report."""
+    from zsim.runtime.progress import Screen
     from zsim_deploy.launch.run import Options, check_endpoint, make_directory, run_in_process, run_processes
     from zsim_deploy.launch.supervisor import Outcome
     from zsim_deploy.terminal.interrupts import REASONS
-    from zsim_deploy.terminal.progress import Screen
 
     if in_process:
         _refuse_with_others(realtime, rate, listen, hosted, console)

@@ -38,12 +38,12 @@ def console(
 ) -> None:
     """Show a run in the browser, and steer it: scene, plots, events, faults."""
     check()
+    from zsim.runtime.progress import Teller
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.http.http_proxy import Place
     from zsim_deploy.roles.priority import give_way
     from zsim_deploy.roles.roles import speaker
     from zsim_deploy.roles.service_loop import named, visit
-    from zsim_deploy.terminal.progress import Teller
 
     give_way(for_eyes=True)
     mine = named("console", name, reach.tls, "*")

@@ -141,7 +141,7 @@ def _written(path: Path, follow: bool, goes_on: Callable[[], bool]) -> Iterator[
 
 def _silent(role: str) -> str:
     """Return why there is nothing of a role."""
-    from zsim.contract.rights import WORLD
+    from zsim.scenario.rights import WORLD
 
     if role == WORLD:
         return "world has had no fault to tell; its progress and events are shown by `zsim up`, and are in the record"

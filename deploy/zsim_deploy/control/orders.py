@@ -8,8 +8,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from zsim.contract.rights import RECORDER, ROUTER, WORLD
 from zsim.errors import HostsError, RunError
+from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim_deploy.control.status_table import Board
 from zsim_deploy.doctor.doctor import about, compared
 from zsim_deploy.hosts.host_plan import Plan

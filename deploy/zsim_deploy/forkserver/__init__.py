@@ -1,1 +1,1 @@
-"""TODO."""
+"""Roles forked from one process that has everything imported. Imports roles."""

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import msgspec
 
-from zsim.contract.rights import RECORDER, ROUTER, WORLD
 from zsim.errors import HostsError
 from zsim.scenario import scenario_file
+from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.transport.identity import CERTIFICATES
 from zsim_deploy.hosts.leftover_runs import RECORD, runs_folder, scp

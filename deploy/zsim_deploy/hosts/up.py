@@ -9,10 +9,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from zsim.contract.rights import RECORDER, WORLD
 from zsim.errors import HostsError, RunError, ZsimError
 from zsim.record import repair
 from zsim.scenario import scenario_file
+from zsim.scenario.rights import RECORDER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.control.control_socket import Intercom
 from zsim_deploy.control.orders import Orders

@@ -3,7 +3,7 @@
 import importlib.metadata
 from collections.abc import Iterable
 
-from zsim.contract.rights import RECORDER, WORLD
+from zsim.scenario.rights import RECORDER, WORLD
 from zsim_deploy.inventory.inventory import Inventory, hosts_of, spread
 
 PROJECT = "zsim"

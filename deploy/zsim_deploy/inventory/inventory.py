@@ -12,8 +12,8 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 from msgspec import Meta
 
-from zsim.contract.rights import RECORDER, ROUTER, WORLD
 from zsim.errors import InventoryError
+from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Name, Scenario, Spec
 from zsim.schema import yaml_file
 from zsim.schema.checker import Fault, faults, sound

@@ -1,1 +1,1 @@
-"""TODO."""
+"""A run on this host: processes started, supervised, ended. Imports forkserver and roles."""

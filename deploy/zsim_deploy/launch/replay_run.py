@@ -6,18 +6,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
+from zsim_analysis.reading.recorded_run import opened
 
 from zsim.contract import keys
 from zsim.errors import RunError
 from zsim.record import RecordReader
 from zsim.record.run_folder import record_notes
+from zsim.runtime.progress import Screen
 from zsim.transport import session
 from zsim.transport.identity import Identity
-from zsim_analysis.rerun.replay_record import opened
 from zsim_deploy.roles.roles import told
 from zsim_deploy.roles.stop_channel import Leash
 from zsim_deploy.security.key_lease import lent
-from zsim_deploy.terminal.progress import Screen
 from zsim_world.playback.playback import Choice, Playback
 from zsim_world.server.world_process import run
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from zsim.errors import RecordError, RunError, SessionError
 from zsim.record import repair
+from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.transport.identity import Identity
@@ -21,7 +22,6 @@ from zsim_deploy.launch.supervisor import Outcome, Watch
 from zsim_deploy.options.arguments import pace_options
 from zsim_deploy.roles.stop_channel import Leash
 from zsim_deploy.terminal.interrupts import REASONS, handled_by
-from zsim_deploy.terminal.progress import Screen
 
 DEFAULT_PORT = 7447  # Zenoh's own
 PORTS_TRIED = 5  # when other runs that start at this moment take each before our world listens

@@ -1,1 +1,1 @@
-"""TODO."""
+"""`zsim push`: wheels gathered here and installed on hosts that have no internet. Imports ssh and inventory."""

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from zsim import __version__
-from zsim.contract.rights import RECORDER, WORLD
 from zsim.scenario import scenario_file
+from zsim.scenario.rights import RECORDER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.inventory.inventory import Placed
 from zsim_deploy.launch.supervisor import RESTARTS_MAX

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from zsim import __version__
-from zsim.contract.rights import ROUTER, WORLD
 from zsim.errors import InventoryError
 from zsim.scenario import scenario_file
+from zsim.scenario.rights import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.inventory.inventory import Placed
 from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from zsim.contract.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.on_death import on_death
+from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import OnDeath, Scenario
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.extras import KINDS, NAMED

@@ -7,9 +7,9 @@ zsim_deploy.launch.supervisor: a role is started again under systemd where it wo
 import re
 from collections.abc import Iterable, Iterator, Sequence
 
-from zsim.contract.rights import ROUTER, WORLD
 from zsim.errors import InventoryError
 from zsim.scenario import scenario_file
+from zsim.scenario.rights import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.schema.checker import show
 from zsim_deploy.forkserver.role_launcher import SINGLE_THREADED

@@ -15,6 +15,7 @@ from typing import Any
 from zsim.contract import messages
 from zsim.errors import RecordError, RunError, SessionError
 from zsim.runtime.agent import Agent
+from zsim.runtime.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
@@ -26,7 +27,6 @@ from zsim_deploy.options.reach import Reach
 from zsim_deploy.roles.priority import give_way
 from zsim_deploy.roles.stop_channel import Leash
 from zsim_deploy.security.key_lease import lent
-from zsim_deploy.terminal.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
 
 TICK_S = 0.1  # how often a router looks for a stop
 PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why

@@ -8,8 +8,8 @@ docs.rs/zenoh-config, AclConfig.
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from zsim.contract import rights
-from zsim.contract.rights import Rights
+from zsim.scenario import rights
+from zsim.scenario.rights import Rights
 from zsim.scenario.scenario import Scenario
 
 # (flow, messages, whose keys): what a right is on the wire, seen from the process that listens

@@ -17,8 +17,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from zsim.contract.rights import OPERATOR
 from zsim.errors import RunError
+from zsim.scenario.rights import OPERATOR
 from zsim.transport.identity import AUTHORITY, CERTIFICATE, CERTIFICATES, DAYS, KEY
 from zsim_deploy.security.enrolment import OPERATORS, Wanted
 

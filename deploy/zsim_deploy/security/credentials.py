@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
-from zsim.contract.rights import ROUTER, WORLD
 from zsim.errors import RunError
+from zsim.scenario.rights import ROUTER, WORLD
 from zsim.transport.identity import AUTHORITY, KEY
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import Placed

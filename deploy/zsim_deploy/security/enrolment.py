@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from zsim.contract import keys
-from zsim.contract.rights import OPERATOR, ROUTER, WORLD
 from zsim.errors import InventoryError
+from zsim.scenario.rights import OPERATOR, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import Placed

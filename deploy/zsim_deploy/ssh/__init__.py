@@ -1,1 +1,1 @@
-"""TODO."""
+"""Connections, commands and files on other hosts over ssh. Imports inventory."""

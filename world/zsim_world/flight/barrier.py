@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from zsim.contract import keys
 from zsim.contract.messages import Done, Join, Waiting
-from zsim.contract.rights import WORLD
+from zsim.scenario.rights import WORLD
 
 
 @dataclass

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Compiled equations of motion: body, rotors, ground, wind, battery, encounters, obstacles. Imports state."""

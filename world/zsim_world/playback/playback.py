@@ -11,13 +11,14 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from zsim.contract import batch, keys, messages, rights
+from zsim.contract import batch, keys, messages
 from zsim.contract.bundle import KINDS, Bundle, table_of
 from zsim.contract.encoding import GAP
 from zsim.contract.messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
 from zsim.runtime.agent import Output
+from zsim.scenario import rights
 from zsim.scenario.fault_kinds import PROCESS_KILL
 from zsim.scenario.scenario import Scenario
 from zsim_world.flight.barrier import Participant

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Sensors of a fleet: measurement equations, error models, schedules, latency. Imports physics and state."""

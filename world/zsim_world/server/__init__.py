@@ -1,1 +1,1 @@
-"""TODO."""
+"""The world as a process on Zenoh: its loop, what comes in and goes out, deaths, history. Imports flight."""

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import msgspec
 
-from zsim.contract import rights
 from zsim.contract.messages import REFUSALS, ControlAnswer, ControlRequest, Count
+from zsim.scenario import rights
 from zsim_world.server.message_history import History
 
 EXPRESSIONS_MAX = 1000  # of one replay; a controller of hundreds of drones reads two keys of each

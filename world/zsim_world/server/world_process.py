@@ -12,12 +12,13 @@ from typing import Any
 
 import msgspec
 
-from zsim.contract import keys, messages, rights
+from zsim.contract import keys, messages
 from zsim.contract.messages import ControlAnswer
-from zsim.contract.rights import WORLD
 from zsim.errors import DecodeError
 from zsim.runtime.agent import Output
 from zsim.runtime.health import HealthMeter
+from zsim.scenario import rights
+from zsim.scenario.rights import WORLD
 from zsim.transport import session
 from zsim.transport.identity import Identity
 from zsim.transport.session import Query, Sample, Session

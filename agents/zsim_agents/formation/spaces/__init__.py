@@ -1,1 +1,1 @@
-"""TODO."""
+"""Cluster spaces: robots to cluster variables and back, with their Jacobians. Imports zsim alone."""

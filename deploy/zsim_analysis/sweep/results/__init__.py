@@ -1,1 +1,1 @@
-"""TODO."""
+"""What a sweep came to: journal, table, distributions, figures, page."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""What looks at a running federation and pokes it: keys, echo, hz, pub, ask."""

@@ -8,9 +8,9 @@ from rich.console import Console
 
 from zsim.contract import keys, messages
 from zsim.record import RecordReader
+from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim_deploy.launch import run
-from zsim_deploy.terminal.progress import Screen
 from zsim_world.fleet.fleet import DivergedError, Fleet
 
 GATE_NS = 20_000_000

@@ -7,8 +7,7 @@ import pytest
 import zenoh
 from rights_table import KEYS, ROLES, SCENARIO, keys_of
 
-from zsim.contract import rights
-from zsim.scenario import scenario_file
+from zsim.scenario import rights, scenario_file
 from zsim_deploy.security.access_control import access_control
 
 ACTS = {"r": "reads", "p": "writes", "g": "asks", "a": "answers", "t": "tokens", "w": "watches"}

@@ -1,7 +1,7 @@
 """What a person is told of a run: a reason that lasts, once."""
 
 from zsim.contract.messages import ClusterState
-from zsim_deploy.terminal.progress import REASON_NS, Reasons
+from zsim.runtime.progress import REASON_NS, Reasons
 
 GATE_NS = 20_000_000
 WAITS = "Follow of the plan waits: the reference is not allowed: p is -1; allowed: between 0 and inf"
