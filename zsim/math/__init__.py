@@ -1,1 +1,4 @@
-"""Mathematics that several packages share: compiling, quaternions and vectors, frames, the Earth. Imports errors at most."""
+"""Mathematics that several packages share: compiling, quaternions and vectors, frames, the Earth.
+
+Imports errors at most.
+"""

@@ -1,1 +1,4 @@
-"""What a scenario says, how its file is read, and what follows from it: rights, faults, streams. Imports contract, schema."""
+"""What a scenario says, how its file is read, and what follows from it: rights, faults, streams.
+
+Imports contract, schema.
+"""

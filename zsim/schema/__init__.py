@@ -1,1 +1,4 @@
-"""Documents that people write, checked as a whole: YAML, and typed descriptions with every fault told. Imports errors."""
+"""Documents that people write, checked as a whole: YAML, and typed descriptions with every fault told.
+
+Imports errors.
+"""

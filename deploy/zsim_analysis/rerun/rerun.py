@@ -17,9 +17,9 @@ from zsim.contract.fingerprint import fingerprint
 from zsim.errors import RecordError, RunError
 from zsim.record import RecordReader
 from zsim.runtime.progress import Screen, Throttle
+from zsim_analysis.reading.recorded_run import Opened, opened
 from zsim_analysis.rerun.participants import Cast, cast_of
 from zsim_analysis.rerun.recorded_inputs import Passage, passages
-from zsim_analysis.reading.recorded_run import Opened, opened
 from zsim_analysis.rerun.rerun_bus import RerunBus
 from zsim_analysis.rerun.truth_comparison import Comparison
 from zsim_world.flight.world import World

@@ -1,1 +1,4 @@
-"""A run on several hosts: planned, started over ssh, watched, its record brought home. Imports ssh, security, launch."""
+"""A run on several hosts: planned, started over ssh, watched, its record brought home.
+
+Imports ssh, security, launch.
+"""

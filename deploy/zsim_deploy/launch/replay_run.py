@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
-from zsim_analysis.reading.recorded_run import opened
 
 from zsim.contract import keys
 from zsim.errors import RunError
@@ -15,6 +14,7 @@ from zsim.record.run_folder import record_notes
 from zsim.runtime.progress import Screen
 from zsim.transport import session
 from zsim.transport.identity import Identity
+from zsim_analysis.reading.recorded_run import opened
 from zsim_deploy.roles.roles import told
 from zsim_deploy.roles.stop_channel import Leash
 from zsim_deploy.security.key_lease import lent
