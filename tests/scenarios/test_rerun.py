@@ -170,6 +170,7 @@ def test_an_estimator_that_was_killed(federation: Federation) -> None:
     same(role, federation.record().sha256())
 
 
+@pytest.mark.soak
 def test_a_run_in_realtime(federation: Federation) -> None:
     """PAIR in realtime at four times its pace, where commands come when they come.
 

@@ -107,6 +107,7 @@ def test_started_by_hand_world_last(federation: Federation, pair_sha256: str) ->
     assert federation.record().sha256() == pair_sha256
 
 
+@pytest.mark.soak
 def test_a_stopped_estimator(federation: Federation, pair_sha256: str) -> None:
     """An estimator is stopped in flight, as in a debugger, and goes on after a while.
 

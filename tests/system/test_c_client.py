@@ -490,6 +490,7 @@ def test_it_flies_a_square_in_lockstep_with_the_same_bits_each_time(
     assert flights[0] == flights[1]
 
 
+@pytest.mark.soak
 def test_it_flies_a_square_in_realtime(build: Build, federation: Federation) -> None:
     program = build("examples/c/square.c", *SANITIZED)
     corners, _ = flown(federation, program, "--realtime", "--rate", "3", "--duration", "60", stop=True)

@@ -399,6 +399,7 @@ def test_a_second_console_has_a_name_of_its_own(federation: Federation) -> None:
     assert second.process.poll() is None
 
 
+@pytest.mark.soak
 def test_two_that_wait_for_a_world_do_not_take_each_others_name(federation: Federation) -> None:
     consoles = [console(federation)[0] for _ in range(2)]
     for each in consoles:

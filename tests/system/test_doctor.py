@@ -46,6 +46,7 @@ def test_a_host_with_a_router_only_is_measured_and_a_greeting_is_passed_over(lab
     assert set(rows(done.stdout)) == {("h2", "h3", "7448"), ("h3", "h1", "7447")}
 
 
+@pytest.mark.soak
 def test_a_slow_link_is_measured(lab: Lab) -> None:
     lab.slow("h2", 150)
     done = doctor(lab, lab.inventory(ROLES, insecure=True))

@@ -424,6 +424,7 @@ def test_clients_stay_while_runs_come_and_go(federation):
             world.ends(with_code=0)
 
 
+@pytest.mark.soak
 def test_a_seat_ends_with_its_run_though_a_gate_was_never_answered(federation):
     world = federation.world(STANDING)
     door = Door(federation).in_run()

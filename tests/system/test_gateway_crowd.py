@@ -44,6 +44,7 @@ def crowded(federation: Federation, seconds: float, clients: int) -> tuple[dict[
     return federation.record().end(), got
 
 
+@pytest.mark.soak
 @pytest.mark.slow
 def test_all_of_a_crowd_are_served(federation):
     _, got = crowded(federation, 5.0, CLIENTS)

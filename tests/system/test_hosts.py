@@ -79,6 +79,7 @@ def test_a_broken_ssh_session_is_the_death_of_its_roles(team: Team) -> None:
     assert {event["subject"] for event in record.events("death")} == {"controller.main", "estimator.drone2"}
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("role", ["world", pytest.param("recorder", marks=pytest.mark.soak)])
 def test_without_world_or_recorder_the_run_ends(team: Team, role: str) -> None:
     run = team.up("--rate", "4", "--duration", "3600")
@@ -112,6 +113,7 @@ def is_named(clock: dict[str, Any], role: str, host: str) -> bool:
     return any((waiting["name"], waiting["host"]) == (role, host) for waiting in clock["waiting_for"])
 
 
+@pytest.mark.soak
 def test_in_realtime_drones_land_while_their_controller_is_cut_off(team: Team) -> None:
     """The firmware's watchdog lands them; what the controller says too late is refused; the world has it all.
 
@@ -136,6 +138,7 @@ def test_in_realtime_drones_land_while_their_controller_is_cut_off(team: Team) -
     assert max(steps) > 24 * GATES_PER_S
 
 
+@pytest.mark.soak
 def test_a_host_whose_clock_is_an_hour_off_takes_part(lab: Lab, faketime: str, tmp_path: Path) -> None:
     """Certificates are back-dated by a day; nothing on the wire is wall time."""
     lab.environment("h3", LD_PRELOAD=faketime, FAKETIME="-1h", FAKETIME_DONT_FAKE_MONOTONIC="1")
@@ -161,6 +164,7 @@ def test_a_host_that_computes_otherwise_is_warned_of_and_shown(lab: Lab, tmp_pat
         assert [event["text"] for event in team.record().events("fingerprint")] == [said]
 
 
+@pytest.mark.soak
 def test_a_killed_router_is_started_again(lab: Lab, tmp_path: Path) -> None:
     """Two hosts behind a router: what it had on the way when it died is fetched again."""
     routers = {"field": {"host": "h2"}}
@@ -185,6 +189,7 @@ def test_a_router_per_site_each_at_the_world(lab: Lab, tmp_path: Path) -> None:
         assert team.record().sha256() == in_process(tmp_path, 10.0)
 
 
+@pytest.mark.soak
 def test_a_full_disk_at_the_recorder_ends_the_run_and_keeps_the_record(
     lab: Lab, small_disk: Callable[[Path, int], None]
 ) -> None:
@@ -197,6 +202,7 @@ def test_a_full_disk_at_the_recorder_ends_the_run_and_keeps_the_record(
         assert team.record().keys()["clock"] > 50
 
 
+@pytest.mark.soak
 def test_over_a_poor_link_it_flies_in_realtime(lab: Lab) -> None:
     """50 ± 10 ms and 2 % loss each way to the host of an estimator."""
     lab.slow("h3", 50, 10, 0.02)

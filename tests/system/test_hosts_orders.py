@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 from shutil import rmtree
 
+import pytest
 import yaml
 from lab import LAUNCHER, Lab
 from team import START_S, STEP, Team, closing, in_flight
@@ -37,6 +38,7 @@ def goes_on(team: Team) -> None:
         threading.Event().wait(0.05)  # nothing tells of a process that is waited for no longer
 
 
+@pytest.mark.soak
 def test_restarts_at_once_and_moves_refused_and_carried_out(lab: Lab) -> None:
     """One move has no certificate there, the other is to a host that was not used before."""
     with closing(Team(lab, ROLES)) as team:
@@ -69,6 +71,7 @@ def test_restarts_at_once_and_moves_refused_and_carried_out(lab: Lab) -> None:
         nothing_stays(team)
 
 
+@pytest.mark.soak
 def test_a_closed_terminal_ends_the_run_as_ctrl_c_does(lab: Lab) -> None:
     """Meanwhile others who want to fly there are refused before anything is started, and leave nothing."""
     with closing(Team(lab, ROLES, secure=False)) as team:
@@ -123,6 +126,7 @@ def test_a_killed_launcher_leaves_a_record_and_no_key(lab: Lab) -> None:
         assert [path.name for path in keys(team) if path.name == KEY] == []
 
 
+@pytest.mark.soak
 def test_nobody_waits_for_a_recorder_that_is_cut_off(lab: Lab) -> None:
     """The record stays where it is, the keys are taken from the hosts that can be reached."""
     with closing(Team(lab, {**ROLES, "recorder": SPARE})) as team:
@@ -142,6 +146,7 @@ def test_nobody_waits_for_a_recorder_that_is_cut_off(lab: Lab) -> None:
         assert {found.relative_to(lab.folder).parts[0] for found in keys(team)} == {SPARE}
 
 
+@pytest.mark.soak
 def test_more_processes_on_a_host_than_sshd_has_channels_for(lab: Lab) -> None:
     drones = [{"name": f"drone{i}", "position_m": [3.0 * i, 0.0, 0.0]} for i in range(DRONES)]
     scenario = lab.folder / "many.yaml"

@@ -136,6 +136,7 @@ def test_who_is_terminated_has_died(federation: Federation) -> None:
     assert check_end(federation, whole=False).complete
 
 
+@pytest.mark.soak
 def test_a_stopped_reader(federation: Federation) -> None:
     """Whoever only listens and takes nothing loses its link; the terminal says meanwhile why nothing moves."""
     run = federation.run(PAIR, "--duration", "100000")
@@ -149,6 +150,7 @@ def test_a_stopped_reader(federation: Federation) -> None:
     run.ends(with_code=130)
 
 
+@pytest.mark.soak
 def test_a_stopped_recorder(federation: Federation) -> None:
     """A recorder that takes nothing for long is as good as dead, whether or not a put has waited for it before."""
     flight = Flight(federation, "--rate", "1000", "--duration", "100000")

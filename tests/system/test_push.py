@@ -146,6 +146,7 @@ def test_a_push_that_is_interrupted_does_not_disturb_the_next_one(lab: Lab, host
     assert (second.returncode, second.stdout) == (0, "installed on 1 of 1 hosts\n"), second.stderr
 
 
+@pytest.mark.soak
 def test_two_pushes_at_a_time_wait_for_each_other(lab: Lab, hosts: Path) -> None:
     gather(lab, hosts, "h2")
     command = (*PUSH, "--hosts", str(hosts), "--host", "h2")
@@ -177,6 +178,7 @@ def test_a_launcher_without_an_index_and_a_cache_is_said_to_be_so(lab: Lab, host
     assert line.startswith("launcher: the package index cannot be reached (")
 
 
+@pytest.mark.soak
 def test_another_build_of_the_same_version_takes_the_place_of_the_first(lab: Lab, hosts: Path, tmp_path: Path) -> None:
     pip = gather(lab, hosts, "h2")["h2"].pip.path
     for text in ("BUILD = 1", "BUILD = 2"):

@@ -128,6 +128,7 @@ def test_the_tools_ask_the_node_itself(graph: RosGraph):
     assert re.search(r"topic: /drone1/ground_truth/state\n    \* to: /rostopic\S+\n    \* direction: outbound", said)
 
 
+@pytest.mark.soak
 def test_rostopic_measures_the_rates_of_the_aircraft_in_simulated_time(graph: RosGraph):
     rates_hz = {"ardrone/imu": 200.0, "ardrone/navdata": 50.0, "fix": 5.0}
     watched = {topic: graph.start("rostopic", "hz", "-w", "200", f"/drone1/{topic}") for topic in rates_hz}

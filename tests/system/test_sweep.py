@@ -148,6 +148,7 @@ def test_runs_that_fail_are_rows(federation: Federation) -> None:
     assert reason in (out / "report.html").read_text()
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(
     "name", [pytest.param("stüp.yaml", marks=pytest.mark.soak), b"st\xfcp.yaml".decode(errors="surrogateescape")]
 )
@@ -237,6 +238,7 @@ def hosts(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
             process.wait()
 
 
+@pytest.mark.soak
 def test_a_dask_scheduler_that_dies_ends_the_sweep_in_a_line(
     federation: Federation, hosts: tuple[str, subprocess.Popen[bytes]]
 ) -> None:
