@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from test_gateway import FLOWN, fly
 
 SCHEMATHESIS = Path(sys.executable).with_name("st")
-EXAMPLES = 4  # of each operation; in `make soak` two hundred times as many
+EXAMPLES = 4  # of each operation
 CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
 STRICT = f"{CHECKS},negative_data_rejection,positive_data_acceptance,unsupported_method"
 GATES_FUZZED = 180  # of the 201 of the flight; with the last ones the run is over
