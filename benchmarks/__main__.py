@@ -1,4 +1,4 @@
-"""Measure, and put what was measured into docs/performance.md.
+"""Measure, and put what was measured into benchmarks/README.md.
 
 make bench                                        everything; makes the peers' environment first
 .venv/bin/python -m benchmarks a b --repeats 7    some parts
@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="of every measurement; medians are told (5)")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON files")
     parser.add_argument("--page", action="store_true", help="measure nothing; write the page from the JSON files")
-    parser.add_argument("--no-page", action="store_true", help="leave docs/performance.md and its pictures alone")
+    parser.add_argument("--no-page", action="store_true", help="leave benchmarks/README.md and its pictures alone")
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # so that contenders are ended
     if unknown := set(given.parts) - set(PARTS):

@@ -1,11 +1,11 @@
-"""The measured sections of docs/performance.md: what stands between two marks is replaced, the words around it stay."""
+"""The measured sections of benchmarks/README.md: what stands between two marks is replaced, the words around it stay."""
 
 from pathlib import Path
 
 from benchmarks.peers import ROOT
 
-PAGE = ROOT / "docs" / "performance.md"
-PICTURES = ROOT / "docs" / "pictures"
+PAGE = ROOT / "benchmarks" / "README.md"
+PICTURES = ROOT / "benchmarks" / "results"
 
 
 def replaced(text: str, part: str, content: str) -> str:
@@ -19,7 +19,7 @@ def replaced(text: str, part: str, content: str) -> str:
     _, closed, after = rest.partition(end)
     if not found or not closed:
         raise ValueError(
-            f"docs/performance.md: has no lines {begin.strip()} and {end}; put them where part {part} goes"
+            f"benchmarks/README.md: has no lines {begin.strip()} and {end}; put them where part {part} goes"
         )
     return f"{before}{begin}{content.strip()}\n{end}{after}"
 

@@ -19,7 +19,7 @@ from benchmarks.exchange.lap import PAYLOAD
 
 TEXT = "x" * len(PAYLOAD)
 WARM_STEPS = 20
-STEPS_S = 1200  # steps/s of one agent on the machine of docs/performance.md, from which the number of steps is chosen
+STEPS_S = 1200  # steps/s of one agent on the machine of benchmarks/README.md, from which the number of steps is chosen
 META: mosaik_api_v3.types.Meta = {
     "api_version": "3.0",
     "type": "time-based",
