@@ -182,7 +182,7 @@ def asking(at_gate: int, op: str, **args: Any) -> Callable[[World], None]:
     asked: list[Any] = []
 
     def ask(world: World) -> None:
-        if not asked and world.now_ns >= at_gate * world.gate_ns:
+        if not asked and world.now_ns >= at_gate * world.clock.gate_ns:
             asked.append(world.control(ControlRequest(op, args, "tester.one")))
             assert asked[0].ok, asked[0].error
 

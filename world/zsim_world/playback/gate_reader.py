@@ -1,32 +1,42 @@
-"""A record as the gates of a run, one after the other, a few of them in memory at a time."""
+"""A record read as the gates of a run, one after the other, a few of them in memory at a time; what of it is played."""
 
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import msgspec
 
-from zsim.contract import keys
+from zsim.contract import keys, messages
 from zsim.contract.messages import REFUSALS
+from zsim.errors import DecodeError
 from zsim.record import Recorded, RecordReader
+from zsim.scenario import rights
+from zsim.scenario.fault_kinds import PROCESS_KILL
+
+VIEWS = (messages.ViewDrones, messages.ViewCluster, messages.ViewEstimates)  # made anew, as often as they are shown
 
 
 class Gate(NamedTuple):
-    """What was said at a gate: stamped after the gate before, up to this one; in the order in which it was written."""
+    """The messages of a gate: stamped after the gate before, up to this one; in order of writing."""
 
     t_ns: int
-    said: list[Recorded]
+    messages: list[Recorded]
 
 
 class _Clock(msgspec.Struct):
     state: str
 
 
-_decode = msgspec.msgpack.Decoder(_Clock).decode
+class _Sourced(msgspec.Struct):
+    source: str = ""
 
 
-class Tape:
-    """Plays a record from any gate on.
+_decode_clock = msgspec.msgpack.Decoder(_Clock).decode
+_decode_sourced = msgspec.msgpack.Decoder(_Sourced).decode
+
+
+class GateReader:
+    """Reads a record from any gate on.
 
     An answer to a gate is written a few gates later, since the world runs ahead of those who answer; it is played with
     the gate that it is stamped with. What comes later than that by its stamp (of a program that stamps nothing, or in
@@ -53,21 +63,21 @@ class Tape:
 
     def _all(self, from_ns: int) -> Iterator[Gate]:
         held: dict[int, list[Recorded]] = {}
-        ticks: deque[int] = deque()
+        gates: deque[int] = deque()
         newest = None
         # What answers the first gate, or was sampled for it, may stand in a chunk that begins before it.
         for recorded in self._reader.messages(self._keys, by_time=False, from_ns=max(0, from_ns - self._slack_ns)):
             if recorded.key != keys.CLOCK:
-                held.setdefault(self._home(recorded.t_ns, newest), []).append(recorded)
-            elif (newest is None or recorded.t_ns > newest) and _runs(recorded.payload):
+                held.setdefault(self._gate_of(recorded.t_ns, newest), []).append(recorded)
+            elif (newest is None or recorded.t_ns > newest) and _is_gate(recorded.payload):
                 newest = recorded.t_ns
-                ticks.append(newest)
-                while ticks[0] + self._slack_ns <= newest:
-                    yield self._take(ticks.popleft(), held)
-        for t_ns in ticks:
+                gates.append(newest)
+                while gates[0] + self._slack_ns <= newest:
+                    yield self._take(gates.popleft(), held)
+        for t_ns in gates:
             yield self._take(t_ns, held)
 
-    def _home(self, t_ns: int, newest: int | None) -> int:
+    def _gate_of(self, t_ns: int, newest: int | None) -> int:
         """Return the gate at which a message is played that was written after the clock of gate `newest`."""
         due_ns = -(-t_ns // self._gate_ns) * self._gate_ns
         if newest is None:
@@ -81,9 +91,44 @@ class Tape:
         return Gate(t_ns, [recorded for gate_ns in due for recorded in held.pop(gate_ns)])
 
 
-def _runs(payload: bytes) -> bool:
+def _is_gate(payload: bytes) -> bool:
     """Tell whether a clock is that of a gate: while a run waits for its start, none has been published."""
     try:
-        return _decode(payload).state != "waiting"
+        return _decode_clock(payload).state != "waiting"
     except REFUSALS:
         return False  # of somebody else
+
+
+def is_played(key: str, expressions: Sequence[str]) -> bool:
+    """Tell whether what stands on a key is played: not what is made anew, nor what absent processes said of themselves.
+
+    Args:
+        expressions: that the user wants to be played.
+    """
+    anew = key in (keys.INFO, keys.CLOCK) or key.startswith("process/") or messages.type_of(key) in VIEWS
+    return not anew and rights.permits(expressions, key)
+
+
+def author(recorded: Recorded) -> str:
+    """Return the process that published a message beside the world, empty where it was none of a known role."""
+    kind = messages.type_of(recorded.key)
+    if kind is messages.Estimate:
+        return f"estimator.{keys.thing(recorded.key)}"
+    if kind in (messages.ClusterState, messages.ClusterRequest):
+        return f"controller.{keys.thing(recorded.key)}"
+    if kind is None or not issubclass(kind, messages.Command):
+        return ""
+    try:
+        return _decode_sourced(recorded.payload).source
+    except REFUSALS:
+        return ""
+
+
+def without_kills(payload: bytes) -> bytes:
+    """Return a list of faults without those of which a process dies: who takes part now is not who was meant."""
+    try:
+        listed: messages.Faults = messages.decode(keys.FAULTS, payload)
+    except DecodeError:
+        return payload
+    others = tuple(fault for fault in listed.faults if fault.kind != PROCESS_KILL)
+    return payload if others == listed.faults else messages.encode(msgspec.structs.replace(listed, faults=others))
