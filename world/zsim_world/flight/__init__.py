@@ -9,7 +9,7 @@ Each file uses those below it only; what an object needs of another one is hande
            ├─ run_statistics              figures of the run
            ├─ barrier                     who takes part, who is waited for
            ├─ run_clock                   simulated time and its requests
-           └─ outbox                      messages, events and refusals to be published
+           └─ run_outbox                messages, events and refusals to be published
 
 Imports fleet and what it stands on.
 """

@@ -10,11 +10,11 @@ from typing import Any
 from zsim.contract import keys
 from zsim.contract.messages import Done, Join, Waiting
 from zsim.scenario.rights import WORLD
-from zsim_world.flight.outbox import Refusal
+from zsim_world.flight.run_outbox import Refusal
 
 
 @dataclass
-class Participant:
+class RunParticipant:
     """One process that has joined, by its newest incarnation.
 
     Attributes:
@@ -133,7 +133,7 @@ class Barrier:
         self._run_id = run_id
         self._gate_ns = gate_ns
         self._expected = dict.fromkeys(expected, 0)
-        self.participants: dict[str, Participant] = {}
+        self.participants: dict[str, RunParticipant] = {}
 
     def expect(self, name: str) -> None:
         """Do not start without this one either."""
@@ -155,7 +155,7 @@ class Barrier:
         for dead in replaced:
             del self.participants[dead.name]
         predecessors = [*([former] if former else []), *replaced]
-        self.participants[name] = Participant(
+        self.participants[name] = RunParticipant(
             name=name,
             incarnation=message.incarnation,
             role=message.role,
@@ -174,7 +174,7 @@ class Barrier:
         )
         return None
 
-    def replaced(self, name: str, message: Join) -> list[Participant]:
+    def replaced(self, name: str, message: Join) -> list[RunParticipant]:
         """Return the dead whose work a newcomer of another name is to do."""
         served = {name, *message.serves}
         return [p for p in self.participants.values() if not p.alive and p.name != name and p.served_names <= served]
@@ -221,7 +221,7 @@ class Barrier:
         participant = self.participants.get(name)
         return participant is not None and participant.gating
 
-    def mark_dead(self, name: str, wall_ns: int) -> Participant | None:
+    def mark_dead(self, name: str, wall_ns: int) -> RunParticipant | None:
         """Mark a participant as dead; it stays in the barrier until it is removed or rejoins."""
         participant = self.participants.get(name)
         if participant is None or not participant.alive:
@@ -230,7 +230,7 @@ class Barrier:
         participant.since_wall_ns = wall_ns
         return participant
 
-    def substitute(self, name: str) -> Participant | None:
+    def substitute(self, name: str) -> RunParticipant | None:
         """Return who lives and does all the work of a participant beside its own."""
         served = self.participants[name].served_names
         others = (p for p in self.participants.values() if p.name != name and p.alive)
@@ -242,7 +242,7 @@ class Barrier:
         others = (p for p in self.participants.values() if p.name != name and p.alive)
         return {p.name: both for p in others if (both := served & p.served_names)}
 
-    def remove(self, name: str) -> Participant | None:
+    def remove(self, name: str) -> RunParticipant | None:
         """Take a participant out: it published bye or is dropped."""
         removed = self.participants.pop(name, None)
         for expected in (name, *(removed.serves if removed else ())):
@@ -254,11 +254,11 @@ class Barrier:
         present = {name for p in self.participants.values() for name in p.served_names}
         return [name for name in self._expected if name not in present]
 
-    def blocking(self, need_ns: int) -> list[Participant]:
+    def blocking(self, need_ns: int) -> list[RunParticipant]:
         """Return whose done for `need_ns` is not in yet."""
         return [p for p in self.participants.values() if p.blocks(need_ns)]
 
-    def incomplete(self) -> list[Participant]:
+    def incomplete(self) -> list[RunParticipant]:
         """Return of whom outputs or a done were lost, or are still on their way."""
         return [p for p in self.participants.values() if p.incomplete]
 

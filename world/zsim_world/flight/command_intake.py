@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from zsim.contract import keys, messages
@@ -13,39 +14,26 @@ from zsim.scenario.scenario import Scenario
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.flight.barrier import Barrier
 from zsim_world.flight.command_queue import CommandQueue, QueuedCommand
-from zsim_world.flight.outbox import Outbox, Refusal
 from zsim_world.flight.run_clock import Operation, RunClock, number, refused_argument
+from zsim_world.flight.run_outbox import Refusal, RunOutbox
 
 RADIO = "radio"
 LinkFaultsAt = Callable[[int], Sequence[Fault]]
 """Returns the faults of links and radios that act in a gate."""
 
 
+@dataclass(eq=False)
 class CommandLinks:
-    """Delays and losses of commands by faults of their links: the world is their receiver.
+    """Delays and losses of commands by faults of their links: the world is their receiver."""
 
-    Args:
-        scenario: resolved.
-        gate_ns: interval of the gates [ns].
-        barrier: knows which processes serve others.
-        faults_at: returns the faults that act in a gate.
-        position_m: returns where a drone truly is [m; W], None for an unknown one.
-    """
+    scenario: Scenario
+    gate_ns: int
+    barrier: Barrier  # knows which processes do the work of others
+    faults_at: LinkFaultsAt
+    position_m: Callable[[str], list[float] | None]  # where a drone truly is [m; W], None for an unknown one
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        gate_ns: int,
-        barrier: Barrier,
-        faults_at: LinkFaultsAt,
-        position_m: Callable[[str], list[float] | None],
-    ) -> None:
-        self._seed = scenario.seed
-        self._gate_ns = gate_ns
-        self._barrier = barrier
-        self._faults_at = faults_at
-        self._position_m = position_m
-        self._cluster_of = {drone: cluster.name for cluster in scenario.clusters for drone in cluster.drones}
+    def __post_init__(self) -> None:
+        self._cluster_of = {drone: cluster.name for cluster in self.scenario.clusters for drone in cluster.drones}
 
     def delay_ns(self, drone: str, key: str, message: Any, gate_ns: int) -> int | None:
         """Return by how many whole gates a command comes later [ns]; None if it does not.
@@ -53,110 +41,94 @@ class CommandLinks:
         Args:
             gate_ns: the gate that it belongs to.
         """
-        faults = self._faults_at(gate_ns)
+        faults = self.faults_at(gate_ns)
         if not faults:
             return 0
         senders, total_ns = (self._sender(drone, message.source),), 0
         for fault in faults:
             if fault.kind != RADIO and link_faults.joins(fault, senders, WORLD):
-                draw = uniform(self._seed, WORLD, fault, key, message.t_ns, message.seq)
+                draw = uniform(self.scenario.seed, WORLD, fault, key, message.t_ns, message.seq)
                 late_ns = link_faults.delay_ns(fault, draw)
                 if late_ns is None:
                     return NEVER
                 total_ns += late_ns
-        return -(-total_ns // self._gate_ns) * self._gate_ns
+        return -(-total_ns // self.gate_ns) * self.gate_ns
 
     def lost_by_radio(self, drone: str, command: QueuedCommand, gate_ns: int) -> bool:
         """Tell whether the radio loses a command that would take effect before a gate."""
-        faults = self._faults_at(gate_ns)
+        faults = self.faults_at(gate_ns)
         return any(fault.kind == RADIO and self._loses(fault, drone, command) for fault in faults)
 
     def _loses(self, fault: Fault, drone: str, command: QueuedCommand) -> bool:
         if fault.target not in (WORLD, self._cluster_of.get(drone)):
             return False
         sender = self._sender(drone, command.source)
-        there = self._position_m(drone)
-        here = link_faults.place_of(sender, fault.parameters["place"], self._position_m)
+        there = self.position_m(drone)
+        here = link_faults.place_of(sender, fault.parameters["place"], self.position_m)
         key, message = keys.command(drone, command.kind), command.message
-        draw = uniform(self._seed, WORLD, fault, key, message.t_ns, message.seq)
+        draw = uniform(self.scenario.seed, WORLD, fault, key, message.t_ns, message.seq)
         distance_m = math.dist(there, here) if there is not None and here is not None else None
         return link_faults.delay_ns(fault, draw, distance_m) is NEVER
 
     def _sender(self, drone: str, source: str) -> str:
         """Return who has sent a command: of the controllers that share a process, that of the drone's cluster."""
         controller = f"controller.{self._cluster_of.get(drone)}"
-        participant = self._barrier.participants.get(source)
+        participant = self.barrier.participants.get(source)
         return controller if participant is not None and controller in participant.serves else source
 
 
+@dataclass(eq=False)
 class CommandIntake:
-    """Takes commands as they arrive, and hands them to the fleet at their instants.
+    """Takes commands as they arrive, and hands them to the fleet at their instants."""
 
-    Args:
-        scenario: resolved.
-        clock: of the run.
-        barrier: knows which sources are in the lockstep.
-        outbox: takes events and refusals.
-        queue: of the commands, and their commanders.
-        fleet: that is commanded.
-        faults_at: returns the faults of links that act in a gate.
-    """
+    scenario: Scenario
+    clock: RunClock
+    barrier: Barrier  # knows which sources are in the lockstep
+    outbox: RunOutbox
+    queue: CommandQueue
+    fleet: Fleet
+    faults_at: LinkFaultsAt
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        clock: RunClock,
-        barrier: Barrier,
-        outbox: Outbox,
-        queue: CommandQueue,
-        fleet: Fleet,
-        faults_at: LinkFaultsAt,
-    ) -> None:
-        self._max_age_ms = scenario.time.max_command_age_ms
-        self._clock = clock
-        self._barrier = barrier
-        self._outbox = outbox
-        self._queue = queue
-        self._fleet = fleet
-        self._index = {name: i for i, name in enumerate(fleet.names)}
-        self._links = CommandLinks(scenario, clock.gate_ns, barrier, faults_at, self._position_m)
+    def __post_init__(self) -> None:
+        self._index = {name: i for i, name in enumerate(self.fleet.names)}
+        self._links = CommandLinks(self.scenario, self.clock.gate_ns, self.barrier, self.faults_at, self._position_m)
 
     def _position_m(self, drone: str) -> list[float] | None:
         """Return where a drone truly is [m; W]."""
         i = self._index.get(drone)
-        return self._fleet.bodies.state[i, :3].tolist() if i is not None else None
+        return self.fleet.bodies.state[i, :3].tolist() if i is not None else None
 
     def accept(self, drone: str, kind: str, message: Any) -> bool:
         """Queue a command for its instant, or refuse it; return False for a duplicate."""
         source = message.source
-        gating = self._barrier.is_gating(source)  # its name was checked when it joined
+        gating = self.barrier.is_gating(source)  # its name was checked when it joined
         if not gating and not keys.PROCESS_NAME.fullmatch(source):
             refusal = Refusal("source", repr(source[:48]), "must be 1 to 48 of a-z 0-9 _ . -")
-            self._outbox.refuse("somebody", f"drone/{drone[:40]}/cmd/{kind}", refusal)
+            self.outbox.refuse("somebody", f"drone/{drone[:40]}/cmd/{kind}", refusal)
             return True
         index = self._index.get(drone)
         refusal = self._no_drone(drone) if index is None else self._age_refusal(message, gating)
         if index is None or refusal:
-            self._outbox.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", refusal or "")
+            self.outbox.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", refusal or "")
             return True
-        gate_ns = message.t_ns if gating else self._clock.next_ns
+        gate_ns = message.t_ns if gating else self.clock.next_ns
         late_ns = self._links.delay_ns(drone, keys.command(drone, kind), message, gate_ns)
         if late_ns is None:
             return True  # the link loses it; its sender has sent it all the same
-        apply_ns = gate_ns + self._clock.delay_ns + late_ns
+        apply_ns = gate_ns + self.clock.delay_ns + late_ns
         if not gating:
             self._publish_command(drone, kind, message, apply_ns)
-        return self._queue.push(index, kind, message, apply_ns)
+        return self.queue.push(index, kind, message, apply_ns)
 
     def _no_drone(self, name: str) -> Refusal:
         return Refusal("drone", repr(name[:40]), "must be one of `drones` in world/info")
 
     def _age_refusal(self, message: Any, gating: bool) -> Refusal | None:
-        now_ns = self._clock.now_ns
-        if self._clock.mode == "realtime":
-            age_ms = (now_ns - message.t_ns) / 1e6
-            if age_ms > self._max_age_ms:
-                return Refusal("age", f"{age_ms:.0f} ms", f"must be <= {self._max_age_ms:g} ms")
+        now_ns = self.clock.now_ns
+        if self.clock.mode == "realtime":
+            age_ms, max_age_ms = (now_ns - message.t_ns) / 1e6, self.scenario.time.max_command_age_ms
+            if age_ms > max_age_ms:
+                return Refusal("age", f"{age_ms:.0f} ms", f"must be <= {max_age_ms:g} ms")
         if gating and message.t_ns > now_ns:
             return Refusal("t_ns", str(message.t_ns), f"must be <= {now_ns}, the newest gate")
         return None
@@ -165,29 +137,29 @@ class CommandIntake:
         """Publish when a command takes effect whose sender is not in the lockstep."""
         fields = {name: getattr(message, name) for name in messages.fields(type(message))}
         data = {"command": kind, "apply_t_ns": apply_ns, "message": fields}
-        self._outbox.event("command", drone, f"{message.source} sends {kind} to {drone}", data, message.source)
+        self.outbox.event("command", drone, f"{message.source} sends {kind} to {drone}", data, message.source)
 
     def apply(self, t_ns: int) -> None:
         """Hand the commands that take effect at t_ns to the firmware."""
-        for command in self._queue.pop(t_ns):
-            drone = self._fleet.names[command.drone]
-            if self._links.lost_by_radio(drone, command, t_ns + self._clock.gate_ns):
+        for command in self.queue.pop(t_ns):
+            drone = self.fleet.names[command.drone]
+            if self._links.lost_by_radio(drone, command, t_ns + self.clock.gate_ns):
                 continue
-            refusal = self._queue.refusal(command) or self._apply(drone, command)
+            refusal = self.queue.refusal(command) or self._apply(drone, command)
             if refusal:
-                self._outbox.refuse(command.source, keys.command(drone, command.kind), refusal)
+                self.outbox.refuse(command.source, keys.command(drone, command.kind), refusal)
 
     def _apply(self, drone: str, command: QueuedCommand) -> str | None:
         """Hand a command to the firmware; return why it is refused."""
         if command.kind == "mode":
             return self._apply_mode(drone, command)
         refusal = self._apply_setpoint(command)
-        if refusal is None and self._queue.claim(command.drone, command.source):
-            self._outbox.event("commander", drone, f"{command.source} flies {drone}", source=command.source)
+        if refusal is None and self.queue.claim(command.drone, command.source):
+            self.outbox.event("commander", drone, f"{command.source} flies {drone}", source=command.source)
         return refusal
 
     def _apply_setpoint(self, command: QueuedCommand) -> str | None:
-        m, i, fleet = command.message, command.drone, self._fleet
+        m, i, fleet = command.message, command.drone, self.fleet
         if command.kind == "velocity":
             return fleet.set_velocity(i, m.velocity_m_s, m.yaw_rate_rad_s, m.frame)
         if command.kind == "ardrone":
@@ -197,18 +169,18 @@ class CommandIntake:
         return fleet.set_rotors(i, m.speed_rad_s)
 
     def _apply_mode(self, drone: str, command: QueuedCommand) -> str | None:
-        fleet, source, mode = self._fleet, command.source, command.message.mode
+        fleet, source, mode = self.fleet, command.source, command.message.mode
         enter = {"takeoff": fleet.takeoff, "land": fleet.land, "emergency": fleet.emergency, "reset": fleet.reset}
         refusal = enter[mode](command.drone)
         if refusal is None:
-            self._outbox.event("mode", drone, f"{source} asks {drone} to {mode}", {"mode": mode}, source)
+            self.outbox.event("mode", drone, f"{source} asks {drone} to {mode}", {"mode": mode}, source)
         return refusal
 
     def release_all(self, source: str) -> None:
         """Take the drones from a process that flew them and is gone: they hover."""
-        for i in self._queue.remove_source(source):
-            self._fleet.release(i)
-            self._outbox.event("release", self._fleet.names[i], f"{source} flies it no longer", source=source)
+        for i in self.queue.remove_source(source):
+            self.fleet.release(i)
+            self.outbox.event("release", self.fleet.names[i], f"{source} flies it no longer", source=source)
 
     # Requests
 
@@ -224,15 +196,15 @@ class CommandIntake:
             return refused_argument(request, "priority", f"from 0 to {PRIORITY_MAX}")
         if not request.source:
             return Refusal("source", "empty", "must be the name under which the commands will come")
-        return self._queue.acquire(index, request.source, int(priority))
+        return self.queue.acquire(index, request.source, int(priority))
 
     def _release(self, request: ControlRequest) -> Refusal | None:
         index = self._requested(request)
         if index is None:
             return refused_argument(request, "drone", f"one of {', '.join(self._index)}")
-        refusal = self._queue.release(index, request.source)
+        refusal = self.queue.release(index, request.source)
         if refusal is None:
-            self._fleet.release(index)
+            self.fleet.release(index)
         return refusal
 
     def _requested(self, request: ControlRequest) -> int | None:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from operator import itemgetter
 from typing import Any, NamedTuple
 
-from zsim_world.flight.outbox import Refusal
+from zsim_world.flight.run_outbox import Refusal
 
 PROGRAM = 0  # priority of a program, contract
 RECENT_PER_DRONE = 32  # commands remembered to recognise duplicates; a rejoin repeats those of two gates

@@ -19,9 +19,9 @@ from zsim.runtime.agent import Output
 from zsim.scenario.on_death import on_death
 from zsim.scenario.rights import WORLD
 from zsim.scenario.scenario import Scenario
-from zsim_world.flight.barrier import Barrier, Participant
-from zsim_world.flight.outbox import KeyedMessage, Outbox, Refusal
+from zsim_world.flight.barrier import Barrier, RunParticipant
 from zsim_world.flight.run_clock import Operation, RunClock, number
+from zsim_world.flight.run_outbox import KeyedMessage, Refusal, RunOutbox
 from zsim_world.flight.run_statistics import RunStatistics
 
 ARGS_BYTES_MAX = 4000  # of arguments that an event repeats as they are; any operation needs far fewer
@@ -63,7 +63,7 @@ class Coordinator(ABC):
         self.run_id = run_id or uuid.uuid4().hex[:12]
         self.names = [drone.name for drone in scenario.drones]
         self.clock = RunClock(scenario.time, mode, rate)
-        self.outbox = Outbox(lambda: self.clock.now_ns)
+        self.outbox = RunOutbox(lambda: self.clock.now_ns)
         self.barrier = Barrier(self.run_id, self.clock.gate_ns, expected)
         self.statistics = RunStatistics()
         self.diverged: RunError | None = None
@@ -144,7 +144,7 @@ class Coordinator(ABC):
             self._release_drones(dead.name)
         self._warn_of(joined)
 
-    def _warn_of(self, joined: Participant) -> None:
+    def _warn_of(self, joined: RunParticipant) -> None:
         """Publish that a newcomer computes with other bits, or does the work of others too."""
         name, own = joined.name, fingerprint()
         if joined.fingerprint and joined.fingerprint != own:
@@ -166,7 +166,7 @@ class Coordinator(ABC):
                     self.barrier.expect(each)
         self._after_bye(participant, message.reason)
 
-    def _after_bye(self, participant: Participant, reason: str) -> None:
+    def _after_bye(self, participant: RunParticipant, reason: str) -> None:
         """Do what the leave of a process means for the run."""
         if participant.role == "recorder":
             self.clock.stop(f"the recorder left: {reason}")
@@ -191,7 +191,7 @@ class Coordinator(ABC):
         if action == "end":
             self.clock.stop(f"{name} died")
 
-    def _on_death(self, participant: Participant) -> str:
+    def _on_death(self, participant: RunParticipant) -> str:
         """Return the action when a process has died."""
         return on_death(self.scenario.processes.on_death, participant.name, participant.role)
 
@@ -234,7 +234,7 @@ class Coordinator(ABC):
             return not self.barrier.absent()
         return clock.mode == "realtime" or not self.barrier.blocking(clock.required_ns)
 
-    def blocking(self, ahead_ns: int = 0) -> list[Participant]:
+    def blocking(self, ahead_ns: int = 0) -> list[RunParticipant]:
         """Return whose dones are missing for the next gate, or for one that comes so much later."""
         return self.barrier.blocking(self.clock.required_ns + ahead_ns)
 

@@ -17,8 +17,8 @@ from zsim.scenario.scenario import FAULTS_MAX, Scenario
 from zsim.schema.checker import show
 from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.flight.barrier import Barrier
-from zsim_world.flight.outbox import Outbox, Refusal
 from zsim_world.flight.run_clock import Operation, RunClock
+from zsim_world.flight.run_outbox import Refusal, RunOutbox
 
 NEVER_NS = 2**63 - 1  # a gate that does not come
 SELECTORS = ("id", "target", "kind")
@@ -31,20 +31,13 @@ class FaultInjector:
     with the same faults at the same instants gives the same bits.
 
     Args:
-        scenario: resolved.
-        clock: of the run.
-        barrier: knows who takes part, and how.
-        outbox: takes events and lists of faults.
         effects: of faults on the fleet.
     """
 
     def __init__(
-        self, scenario: Scenario, clock: RunClock, barrier: Barrier, outbox: Outbox, effects: Impairment
+        self, scenario: Scenario, clock: RunClock, barrier: Barrier, outbox: RunOutbox, effects: Impairment
     ) -> None:
-        self._scenario = scenario
-        self._clock = clock
-        self._barrier = barrier
-        self._outbox = outbox
+        self._scenario, self._clock, self._barrier, self._outbox = scenario, clock, barrier, outbox
         self._effects = effects
         self._faults: dict[int, Fault] = {}
         self._begun: set[int] = set()

@@ -6,7 +6,7 @@ from typing import Any
 from zsim.contract.control_limits import GATES_MAX, RATE_MAX
 from zsim.contract.messages import ControlAnswer, ControlRequest
 from zsim.scenario.scenario import Time
-from zsim_world.flight.outbox import Refusal
+from zsim_world.flight.run_outbox import Refusal
 
 Operation = Callable[[ControlRequest], Refusal | ControlAnswer | None]
 """Does what a request asks for; returns why it is refused, an answer with a result, or None when done."""

@@ -19,12 +19,12 @@ from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
 from zsim.runtime.agent import Output
 from zsim.scenario.scenario import Scenario
-from zsim_world.flight.barrier import Participant
+from zsim_world.flight.barrier import RunParticipant
 from zsim_world.flight.coordinator import Coordinator
-from zsim_world.flight.outbox import Refusal
 from zsim_world.flight.run_clock import number, refused_argument
-from zsim_world.playback.gate_reader import Gate, GateReader, author, is_played, without_kills
+from zsim_world.flight.run_outbox import Refusal
 from zsim_world.playback.playback_views import PlaybackViews
+from zsim_world.playback.recorded_gates import Gate, RecordedGates, author, is_played, without_kills
 
 NOT_FLYABLE = "a replay: nobody can be flown"
 SEEK_MAX_S = 1e9  # beyond it, nanoseconds are no int64
@@ -89,7 +89,7 @@ class Playback(Coordinator):
         self._reader = reader
         self._plays_faults = keys.FAULTS in wanted
         gate_keys = wanted | ({keys.VIEW_DRONES} & topics.keys())
-        self._gate_reader = GateReader(reader, self.clock.gate_ns, self.clock.delay_ns, gate_keys)
+        self._recorded_gates = RecordedGates(reader, self.clock.gate_ns, self.clock.delay_ns, gate_keys)
         self._wind(played.from_ns)
         if self._coming is None or (played.to_ns is not None and self._coming.t_ns > played.to_ns):
             until = "on" if played.to_ns is None else f"to {played.to_ns / 1e9:.12g} s"
@@ -153,7 +153,7 @@ class Playback(Coordinator):
             self._pending_faults = Recorded(keys.FAULTS, none, t_ns, 0)
 
     def _wind(self, from_ns: int) -> None:
-        self._gates = self._gate_reader.gates(from_ns)
+        self._gates = self._recorded_gates.gates(from_ns)
         self._read_next()
         self._pending_faults = self._faults_before(from_ns) if self._plays_faults and from_ns > 0 else None
 
@@ -244,10 +244,10 @@ class Playback(Coordinator):
     def refusal_at(self, key: str) -> str | None:
         return None if f"controller.{keys.thing(key)}" in self._live() else NOT_FLYABLE
 
-    def _after_bye(self, participant: Participant, reason: str) -> None:
+    def _after_bye(self, participant: RunParticipant, reason: str) -> None:
         """Go on: the record is there already."""
 
-    def _on_death(self, participant: Participant) -> str:
+    def _on_death(self, participant: RunParticipant) -> str:
         return "drop"
 
 

@@ -163,27 +163,18 @@ class MessageHistory:
         Raises:
             DecodeError: the result is no list of [key, payload].
         """
-        outputs: dict[_Identity | None, Sample] = {}
+        outputs: dict[Any, Sample] = {}
         for key, payload in batch.of(kept):
             identity = _identity(key, payload)
-            if identity is not None and identity.t_ns <= done_ns:
+            if identity is not None and identity[1] <= done_ns:
                 outputs[identity] = Sample(key, payload)
-        for key, payload in self.at({(identity.key, identity.t_ns) for identity in outputs if identity}):
+        for key, payload in self.at({(key, t_ns) for key, t_ns, _, _ in outputs}):
             outputs.pop(_identity(key, payload), None)
         return list(outputs.values())
 
 
-class _Identity(NamedTuple):
-    """Fields by which two messages are one output."""
-
-    key: str
-    t_ns: int
-    seq: int
-    source: str
-
-
-def _identity(key: str, payload: bytes) -> _Identity | None:
-    """Return the identity of an output, None for anything that a done does not count or a reader refuses."""
+def _identity(key: str, payload: bytes) -> tuple[str, int, int, str] | None:
+    """Return (key, t_ns, seq, source), by which an output is recognised; None for what no done counts."""
     kind = messages.type_of(key)
     if kind is None or not issubclass(kind, Command | Estimate | ClusterState | ClusterRequest):
         return None
@@ -191,4 +182,4 @@ def _identity(key: str, payload: bytes) -> _Identity | None:
         message = messages.decode(key, payload)
     except DecodeError:
         return None
-    return _Identity(key, message.t_ns, message.seq, message.source)
+    return key, message.t_ns, message.seq, message.source

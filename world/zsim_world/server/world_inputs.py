@@ -6,6 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -16,7 +17,7 @@ from zsim.runtime.health import HealthMeter
 from zsim.scenario.rights import WORLD
 from zsim.transport.session import Mailbox, Sample, Session
 from zsim.transport.timed_mailbox import TimedMailbox
-from zsim_world.flight.barrier import Participant
+from zsim_world.flight.barrier import RunParticipant
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
@@ -131,58 +132,36 @@ class _Head(msgspec.Struct):
 _decode_head = msgspec.msgpack.Decoder(_Head).decode
 
 
+@dataclass(eq=False)
 class MessageIntake:
-    """Takes what others publish: checks it, keeps it, counts it for its sender, and hands the world what is for it.
+    """Takes what others publish: checks it, keeps it, counts it for its sender, and hands the world what is for it."""
 
-    Args:
-        link: the listening session.
-        world: that is run.
-        outputs: hands recorders what has passed.
-        history: keeps it.
-        liveliness: is handed joins and healths.
-        health: counts what is received and refused.
-        progress: shows healths and states.
-
-    Attributes:
-        phase: of the cluster whose state was read last.
-    """
-
-    def __init__(
-        self,
-        link: Session,
-        world: Coordinator,
-        outputs: WorldOutputs,
-        history: MessageHistory,
-        liveliness: LivelinessMonitor,
-        health: HealthMeter,
-        progress: ProgressCallback,
-    ) -> None:
-        self._link = link
-        self._world = world
-        self._outputs = outputs
-        self._history = history
-        self._liveliness = liveliness
-        self._health = health
-        self._progress = progress
-        self._states: Counter[str] = Counter()
-        self.phase = ""
+    link: Session
+    world: Coordinator
+    outputs: WorldOutputs  # hands recorders what has passed
+    history: MessageHistory
+    liveliness: LivelinessMonitor
+    health: HealthMeter  # counts what is received and refused
+    progress: ProgressCallback
+    phase: str = ""  # of the cluster whose state was read last
+    _states: Counter[str] = field(default_factory=Counter[str])
 
     def take(self, wall_ns: int, sample: Sample) -> None:
         """Take one message, or refuse it."""
         key = sample.key
         if key.startswith(OWN):
             return  # the world's own health, kept when it was published
-        self._health.received += 1
+        self.health.received += 1
         kind = messages.type_of(key)
         try:
             if kind in RELAYED:
-                self._outputs.passed(sample)
+                self.outputs.passed(sample)
                 self._relay(key, sample.payload)
             elif key.startswith(PROCESSES) or (key.startswith("drone/") and "/cmd/" in key):
-                self._outputs.passed(sample)
+                self.outputs.passed(sample)
                 self._hand_over(key, sample.payload, wall_ns)
             elif kind is None:
-                self._outputs.passed(sample)  # a key of somebody's own
+                self.outputs.passed(sample)  # a key of somebody's own
             else:
                 raise DecodeError(f"{key}: only the world publishes here")
         except DecodeError as error:
@@ -192,50 +171,50 @@ class MessageIntake:
     def _hand_over(self, key: str, payload: bytes, wall_ns: int) -> None:
         """Hand the world a message that it acts on."""
         message = messages.decode(key, payload)
-        self._history.add(key, payload, message.t_ns)
+        self.history.add(key, payload, message.t_ns)
         if type(message) is messages.Join:
-            self._liveliness.before_join(keys.thing(key), message)
-        self._world.handle(key, message, wall_ns)
+            self.liveliness.before_join(keys.thing(key), message)
+        self.world.handle(key, message, wall_ns)
         if type(message) is messages.Health:
-            self._liveliness.health_received(keys.thing(key))
-            self._progress("health", message, keys.thing(key))
+            self.liveliness.health_received(keys.thing(key))
+            self.progress("health", message, keys.thing(key))
 
     def _refuse(self, source: str, subject: str, error: DecodeError) -> None:
-        self._health.refused += 1
-        self._world.outbox.refuse(source, subject, str(error))
+        self.health.refused += 1
+        self.world.outbox.refuse(source, subject, str(error))
 
     def _count_refused(self, sample: Sample) -> None:
         """Count an output that was refused, so that its sender's done is not taken to be short of it."""
         with contextlib.suppress(DecodeError):  # of an unknown sender
             head = _head(sample.key, sample.payload)
-            self._world.count_output(head.controller or head.source)
+            self.world.count_output(head.controller or head.source)
 
     def _relay(self, key: str, payload: bytes) -> None:
         """Keep an output that the world only relays, and count it for the done of who sent it."""
         head = _head(key, payload)
-        if head.t_ns > self._world.now_ns:
-            raise DecodeError(f"{key}: t_ns is {head.t_ns}; must be <= {self._world.now_ns}, the newest gate")
-        self._history.add(key, payload, head.t_ns)
+        if head.t_ns > self.world.now_ns:
+            raise DecodeError(f"{key}: t_ns is {head.t_ns}; must be <= {self.world.now_ns}, the newest gate")
+        self.history.add(key, payload, head.t_ns)
         kind = messages.type_of(key)
         if kind is messages.ClusterState:
             self._read_phase(key, payload)
         role = "estimator" if kind is messages.Estimate else "controller"
         source = head.controller if kind is messages.ClusterRequest else head.source
-        self._world.count_output(source or f"{role}.{keys.thing(key)}")
+        self.world.count_output(source or f"{role}.{keys.thing(key)}")
 
     def _read_phase(self, key: str, payload: bytes) -> None:
         if self._states[key] % PHASE_EVERY == 0:
             state: messages.ClusterState = messages.decode_as(messages.ClusterState, payload, key)
             self.phase = state.phase
-            self._progress("state", state, keys.thing(key))
+            self.progress("state", state, keys.thing(key))
         self._states[key] += 1
 
     # Outputs that were lost
 
     def recover_lost(self) -> None:
         """Request outputs again that a participant counted and that did not come, as after a cut link."""
-        for participant in self._world.barrier.incomplete():
-            if self._world.clock.mode == "realtime":
+        for participant in self.world.barrier.incomplete():
+            if self.world.clock.mode == "realtime":
                 participant.lost_done = False
                 continue
             samples = self._lost_outputs(participant)
@@ -247,14 +226,14 @@ class MessageIntake:
             missing = participant.reset_counts()
             if missing:
                 text = f"{participant.name}: {missing} of its outputs did not come"
-                self._world.outbox.event("outputs_missing", participant.name, text, {"missing": missing})
+                self.world.outbox.event("outputs_missing", participant.name, text, {"missing": missing})
 
-    def _lost_outputs(self, participant: Participant) -> list[Sample] | None:
+    def _lost_outputs(self, participant: RunParticipant) -> list[Sample] | None:
         """Return what a participant has kept of its outputs and that has not come; None if it does not answer."""
         key = keys.process(participant.name, "outputs")
         try:
-            answer = self._link.request(key, "outputs", WORLD, timeout_s=RECOVERY_S)
-            return self._history.lost_outputs(answer.result, participant.done_ns) if answer.ok else None
+            answer = self.link.request(key, "outputs", WORLD, timeout_s=RECOVERY_S)
+            return self.history.lost_outputs(answer.result, participant.done_ns) if answer.ok else None
         except DecodeError as error:
             self._refuse(participant.name, key, error)
             return []

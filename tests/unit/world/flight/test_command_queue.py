@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from zsim.contract.messages import Mode, Velocity
 from zsim_world.flight.command_queue import PROGRAM, RECENT_PER_DRONE, CommandQueue, QueuedCommand
-from zsim_world.flight.outbox import Refusal
+from zsim_world.flight.run_outbox import Refusal
 
 D1, D2 = 0, 1
 OPERATOR = 10  # priority that docs/protocol.md gives to operators

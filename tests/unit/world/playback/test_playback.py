@@ -32,8 +32,8 @@ from zsim.errors import RecordError
 from zsim.record import Recorded, RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim_world.flight.world import World
-from zsim_world.playback.gate_reader import GateReader
 from zsim_world.playback.playback import NOT_FLYABLE, Playback, PlaybackRange
+from zsim_world.playback.recorded_gates import RecordedGates
 
 GATE_NS = 20_000_000
 ZEROS = (0.0, 0.0, 0.0)
@@ -133,8 +133,8 @@ def on(key: str, said: list[tuple[str, bytes]]) -> list[Any]:
 def home(said: list[Said], tmp_path: Path, delay_gates: int = 1) -> dict[int, list[tuple[str, int]]]:
     """Return (key, t_ns) of what is played with each gate."""
     with write(tmp_path, said) as reader:
-        gate_reader = GateReader(reader, GATE_NS, delay_gates * GATE_NS, set(reader.topics()))
-        return {g.t_ns // GATE_NS: [(m.key, m.t_ns) for m in g.messages] for g in gate_reader.gates()}
+        recorded = RecordedGates(reader, GATE_NS, delay_gates * GATE_NS, set(reader.topics()))
+        return {g.t_ns // GATE_NS: [(m.key, m.t_ns) for m in g.messages] for g in recorded.gates()}
 
 
 @pytest.mark.parametrize("late", [0, 1, 2, 4])
@@ -182,8 +182,8 @@ def test_it_reads_a_few_gates_ahead_and_no_more(tmp_path: Path):
                     read.append(recorded)
                     yield recorded
 
-        gate_reader = GateReader(Counted(), GATE_NS, GATE_NS, set(reader.topics()))  # type: ignore[arg-type]
-        gates = gate_reader.gates()
+        counted: Any = Counted()
+        gates = RecordedGates(counted, GATE_NS, GATE_NS, set(reader.topics())).gates()
         for number in range(500):
             assert next(gates).t_ns == number * GATE_NS
             assert len(read) <= 9 * (number + 3)

@@ -1,6 +1,6 @@
 """Refusals: their line, and which of them are events."""
 
-from zsim_world.flight.outbox import EVENTS_MAX, REASONS_MAX, RefusalLog
+from zsim_world.flight.run_outbox import EVENTS_MAX, REASONS_MAX, RefusalLog
 
 MODE = "drone/d1/cmd/mode"
 

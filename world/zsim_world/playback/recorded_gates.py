@@ -35,7 +35,7 @@ _decode_clock = msgspec.msgpack.Decoder(_Clock).decode
 _decode_sourced = msgspec.msgpack.Decoder(_Sourced).decode
 
 
-class GateReader:
+class RecordedGates:
     """Reads a record from any gate on.
 
     An answer to a gate is written a few gates later, since the world runs ahead of those who answer; it is played with

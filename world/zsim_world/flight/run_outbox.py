@@ -61,7 +61,7 @@ class RefusalLog:
         return f"{subject}: {reason}{last}" if former < EVENTS_MAX else None
 
 
-class Outbox:
+class RunOutbox:
     """Messages of the world that are to be published.
 
     Args:
