@@ -23,18 +23,6 @@ PAGE_BYTES = 8_000_000  # payloads of one answer; who lacks more requests the ne
 EXPRESSIONS_MAX = 1000  # of one replay; a controller of hundreds of drones reads two keys of each
 
 
-class ReplayPage(NamedTuple):
-    """A part of the history.
-
-    Attributes:
-        passed: (key, payload) in order of arrival.
-        more: where the next page begins, None after the last one.
-    """
-
-    passed: list[tuple[str, bytes]]
-    more: int | None
-
-
 class _ReplayArgs(msgspec.Struct):
     """The arguments of a replay; `page` is `more` of the answer before."""
 
@@ -100,13 +88,16 @@ class MessageHistory:
             return [(expression, self._last[expression])]
         return [(key, payload) for key, payload in list(self._last.items()) if keys.matches(expression, key)]
 
-    def page(self, from_ns: int, wanted: Callable[[str], bool], start: int = 0) -> ReplayPage:
-        """Return what is stamped after from_ns and on a key that is wanted, oldest first, as far as a page holds it.
+    def page(self, from_ns: int, wanted: Callable[[str], bool], start: int = 0) -> tuple[Batch, int | None]:
+        """Return what is stamped after from_ns and on a key that is wanted, as far as a page holds it.
 
         Args:
             from_ns: simulated time [ns].
             wanted: tells of a key whether it is.
-            start: 0, or `more` of the page before.
+            start: 0, or where the page before ended.
+
+        Returns:
+            (key, payload) in order of arrival, and where the next page begins, None after the last one.
         """
         passed: list[tuple[str, bytes]] = []
         known: dict[str, bool] = {}
@@ -120,9 +111,9 @@ class MessageHistory:
                 continue
             size += len(payload)
             if passed and size > self._page_bytes:
-                return ReplayPage(passed, number)
+                return passed, number
             passed.append((key, payload))
-        return ReplayPage(passed, None)
+        return passed, None
 
     def at(self, stamps: Container[tuple[str, int]]) -> list[tuple[str, bytes]]:
         """Return (key, payload) of the messages with any of some (key, t_ns), as far as a replay reaches back."""
@@ -144,12 +135,12 @@ class MessageHistory:
             replay = msgspec.convert(args, _ReplayArgs)
         except REFUSALS as error:
             return ControlAnswer(False, f"replay: needs from_ns (whole number) and keys (list of texts): {error}")
-        page = self.page(
+        passed, more = self.page(
             replay.from_ns,
             lambda key: rights.permits(replay.keys, key) and rights.permits(readable, key),
             replay.page,
         )
-        return ControlAnswer(True, result=page.passed, more=page.more)
+        return ControlAnswer(True, result=passed, more=more)
 
     def lost_outputs(self, kept: Any, done_ns: int) -> list[Sample]:
         """Return those of the outputs that a participant kept that have not come, each once, as after a cut link.

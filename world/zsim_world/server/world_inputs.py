@@ -28,7 +28,7 @@ RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within 
 REJOINED_NS = 10_000_000_000  # wall time after a rejoin in which it may take until a process can be asked
 PHASE_EVERY = 10  # states of a cluster between two of which the phase is read for the display
 RELAYED = (messages.Estimate, messages.ClusterState, messages.ClusterRequest)
-PROCESSES = "process/"
+PROCESSES, VIEWS = "process/", "view/"  # the last are nothing to the world
 OWN = keys.process(WORLD, "")
 
 ProgressCallback = Callable[[str, Any, str], None]
@@ -118,6 +118,15 @@ class TimedInputs(WorldInputs):
     def close(self) -> None:
         for box in self._boxes:
             box.close()
+
+
+def open_inputs(link: Session, realtime: bool) -> WorldInputs:
+    """Subscribe to what others publish.
+
+    Outputs are drained first, dones last: who publishes a done has published its outputs before, on the same link.
+    """
+    boxes = [link.overhear((PROCESSES, VIEWS)), link.subscribe(f"{PROCESSES}**")]
+    return TimedInputs(boxes) if realtime else DirectInputs(boxes)
 
 
 class _Head(msgspec.Struct):

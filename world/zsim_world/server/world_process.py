@@ -23,22 +23,13 @@ from zsim_world.flight.coordinator import Coordinator
 from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
 from zsim_world.server.pacing import Pacer, Pipelining
-from zsim_world.server.world_inputs import (
-    PROCESSES,
-    TICK_S,
-    DirectInputs,
-    MessageIntake,
-    ProgressCallback,
-    TimedInputs,
-    WorldInputs,
-)
+from zsim_world.server.world_inputs import TICK_S, MessageIntake, ProgressCallback, open_inputs
 from zsim_world.server.world_outputs import WorldOutputs
 
 STUCK_NS = 2_000_000_000  # wall time in one turn from which on it is an event; a turn takes milliseconds
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
-VIEWS = "view/"  # published by others, and nothing to the world
 
 
 class WorldProcess:
@@ -86,9 +77,7 @@ class WorldProcess:
         Raises:
             DivergedError: the state of a drone was no longer finite; the end has been published before.
         """
-        # Outputs first, dones last: who publishes a done has published its outputs before, on the same link.
-        boxes = [self._link.overhear((PROCESSES, VIEWS)), self._link.subscribe(f"{PROCESSES}**")]
-        self._inputs: WorldInputs = TimedInputs(boxes) if self._clock.mode == "realtime" else DirectInputs(boxes)
+        self._inputs = open_inputs(self._link, self._clock.mode == "realtime")
         self._announce()
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         ticker.start()
