@@ -2,6 +2,6 @@
 
 
 def parts(line: str) -> tuple[str, str]:
-    """Return where a line says that something is wrong, and what was found there."""
+    """Return the field or thing that a line refuses, without the key before it, and its value or state."""
     where, _, rest = line.partition(" is ")
-    return where, rest.partition(";")[0]
+    return where.rpartition(": ")[2], rest.partition("; ")[0]
