@@ -1,5 +1,6 @@
-"""Who has died: one that only reads and tells nothing for long, for whom no token needs to go."""
+"""Who has died: a reader that publishes nothing for long, and a process whose token is lost."""
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -25,12 +26,13 @@ class Case:
 
     def __init__(self, name: str, period_ns: int = 0) -> None:
         self.name = name
+        self.take_in: Callable[[], None] = lambda: None
         self.world = World(scenario_file.from_text(SCENARIO), run_id="run1")
         self.liveliness = LivelinessMonitor(
             FakeLink(),  # type: ignore[arg-type]
             self.world.barrier,
             self.world.handle_death,
-            lambda: None,
+            lambda: self.take_in(),
         )
         self.period_ns = period_ns
         self.join(incarnation=1, pid=7)
@@ -69,7 +71,7 @@ def test_a_silent_reader_is_dead(name: str) -> None:
     assert (case.world.ended is not None) == (name == "recorder")
 
 
-def test_one_that_speaks_is_not() -> None:
+def test_one_that_publishes_is_not() -> None:
     case = Case("recorder")
     for _ in range(3):
         case.liveliness.health_received("recorder")
@@ -77,7 +79,7 @@ def test_one_that_speaks_is_not() -> None:
     assert case.deaths() == []
 
 
-def test_nor_one_that_never_told_of_its_health() -> None:
+def test_nor_one_that_never_published_its_health() -> None:
     case = Case("recorder")
     case.seconds(3 * SILENT_S)
     assert case.deaths() == []
@@ -105,6 +107,15 @@ def test_who_joins_in_place_of_one_whose_token_went_had_no_need_to_wait_for_its_
     case.liveliness.token_lost(case.name)
     case.join(incarnation=2, pid=pid)
     assert case.events()[1:] == kinds
+
+
+def test_a_join_that_arrives_while_a_token_is_checked_settles_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("zsim_world.server.liveliness.BYE_NS", 0)
+    case = Case("estimator.d1", GATE_NS)
+    case.take_in = lambda: case.join(incarnation=2, pid=8)
+    case.liveliness.token_lost(case.name)
+    case.liveliness.check_due()
+    assert case.events()[1:] == ["death", "restart"]
 
 
 def test_who_joins_in_place_of_one_that_lives_takes_over() -> None:

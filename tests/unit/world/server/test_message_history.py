@@ -78,7 +78,7 @@ def test_what_is_older_than_the_window_is_forgotten():
     assert kept == list(range(19 - KEEP_NS // SECOND_NS, 20))
 
 
-def test_a_sender_s_stamp_does_not_push_out_what_others_said():
+def test_a_sender_s_stamp_does_not_push_out_messages_of_others():
     history = MessageHistory()
     clock(history, 10 * SECOND_NS)
     history.add(IMU, b"mine", 10 * SECOND_NS)
@@ -103,14 +103,14 @@ def test_memory_is_bounded_while_time_stands_still():
 
 def test_pages_bring_everything_once_and_in_order():
     history = MessageHistory(page_bytes=10)
-    said = [(IMU, bytes([number]) * (number % 5 + 1)) for number in range(50)]
-    for number, (key, payload) in enumerate(said):
+    published = [(IMU, bytes([number]) * (number % 5 + 1)) for number in range(50)]
+    for number, (key, payload) in enumerate(published):
         history.add(key, payload, number)
         history.add("drone/d2/truth", b"another's", number)
-    assert since(history, -1, [IMU]) == said
+    assert since(history, -1, [IMU]) == published
     first, _ = history.page(-1, lambda key: key == IMU)
     assert sum(len(payload) for _, payload in first) <= 10
-    assert first == said[: len(first)]
+    assert first == published[: len(first)]
 
 
 def test_a_page_brings_what_alone_is_longer_than_a_page():
@@ -131,7 +131,7 @@ def test_a_page_goes_on_where_the_last_one_ended_when_the_oldest_is_forgotten_me
     assert [payload[0] for _, payload in (*passed, *history.page(-1, lambda key: True, more)[0])] == [*range(8)]
 
 
-def test_what_was_said_on_a_key_at_a_time_is_found():
+def test_messages_are_found_by_key_and_stamp():
     history = MessageHistory()
     for t_ns, payload in ((1, b"a"), (2, b"b"), (2, b"c"), (3, b"d")):
         history.add(IMU, payload, t_ns)
@@ -175,7 +175,7 @@ def test_what_it_kept_twice_comes_once():
 
 
 @pytest.mark.parametrize("other", [command(1, 1, "c.d"), command(1, 2)])
-def test_what_another_said_or_it_said_besides_does_not_stand_in_for_it(other: Velocity):
+def test_a_message_of_another_source_or_number_does_not_replace_it(other: Velocity):
     assert history_of(other).lost_outputs(kept(command(1, 1)), 1) == samples(command(1, 1))
 
 

@@ -76,7 +76,7 @@ def test_a_paced_world_and_one_without_slack_hold_nothing_back(world: Lagging) -
         assert not pipelining.continues()
 
 
-def test_what_is_said_is_sent_every_few_gates_and_when_the_next_may_not_come() -> None:
+def test_messages_are_sent_every_few_gates_and_when_the_next_may_not_come() -> None:
     world = Lagging(delay=9)
     pipelining = pipelining_of(world)
     sent = []

@@ -54,7 +54,7 @@ def run(made: World, link: FakeLink, **options: Any) -> WorldProcess:
 
 
 def events(link: FakeLink, kind: str) -> list[Event]:
-    return [event for event in link.all(keys.EVENT) if event.kind == kind]
+    return [event for event in link.published_on(keys.EVENT) if event.kind == kind]
 
 
 # What strangers send
@@ -67,7 +67,7 @@ def test_no_payload_ends_the_run(key: str, payload: bytes):
     link.deliver(key, payload)
     assert run(made, link).health.refused == 1
     assert made.ended == "the scenario's duration is over"
-    assert link.all(keys.CLOCK)[-1].state == "stopped"
+    assert link.published_on(keys.CLOCK)[-1].state == "stopped"
     assert [event.subject for event in events(link, "refused")] == [key]
 
 
@@ -140,7 +140,7 @@ class Lossy(FakeLink):
     def __init__(self, loses: set[tuple[str, int]], keeps: bool = True, incarnation: int = 1) -> None:
         super().__init__()
         self._incarnation = incarnation
-        self.on_said, self.on_request = self._answer, self._outputs
+        self.on_publish, self.on_request = self._answer, self._outputs
         self._loses, self._keeps = loses, keeps
         self._kept: list[list[Any]] = []
         self._gate = 0
@@ -170,7 +170,7 @@ class Lossy(FakeLink):
 
     def recorded(self, key: str) -> list[int]:
         """Return the gates of the messages on a key in the order in which the recorder hears of them."""
-        passed = [pair for name, payload in self.said if name == batch.KEY for pair in batch.decode(payload)]
+        passed = [pair for name, payload in self.published if name == batch.KEY for pair in batch.decode(payload)]
         return [messages.decode(name, payload).t_ns // GATE_NS for name, payload in passed if name == key]
 
 
@@ -251,8 +251,11 @@ def test_a_diverged_state_ends_the_run_for_everybody(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(made.fleet, "advance", diverge)
     with pytest.raises(DivergedError, match=r"^d1 at 0\.080 s: the state is no longer finite"):
         run(made, link)
-    assert [(event.kind, event.subject) for event in link.all(keys.EVENT)] == [("diverged", "d1"), ("end", "world")]
+    assert [(event.kind, event.subject) for event in link.published_on(keys.EVENT)] == [
+        ("diverged", "d1"),
+        ("end", "world"),
+    ]
     end = events(link, "end")[0]
     assert end.text.startswith("d1 at 0.080 s: the state is no longer finite")
     assert end.data["last_ns"] == 3 * GATE_NS
-    assert link.all(keys.CLOCK)[-1].state == "stopped"
+    assert link.published_on(keys.CLOCK)[-1].state == "stopped"
