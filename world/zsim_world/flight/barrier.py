@@ -18,8 +18,8 @@ class RunParticipant:
     """One process that has joined, by its newest incarnation.
 
     Attributes:
+        join: as it has published it.
         from_ns: first gate that it is waited for.
-        serves: names of expected processes whose work it does.
         done_ns: newest gate that it is through with.
         surplus: outputs that came in since its last done.
         missing: outputs that it counted in its dones and that have not come in.
@@ -32,14 +32,8 @@ class RunParticipant:
     """
 
     name: str
-    incarnation: int
-    role: str
-    host: str
-    pid: int
-    period_ns: int
-    fingerprint: str
+    join: Join
     from_ns: int
-    serves: tuple[str, ...] = ()
     done_ns: int = -1
     surplus: int = 0
     missing: int = 0
@@ -53,12 +47,16 @@ class RunParticipant:
 
     @property
     def gating(self) -> bool:
-        return self.period_ns > 0
+        return self.join.period_ns > 0
+
+    def is_process_of(self, join: Join) -> bool:
+        """Tell whether another join comes from the same process."""
+        return (self.join.host, self.join.pid) == (join.host, join.pid)
 
     @property
     def served_names(self) -> set[str]:
         """Return the names of the processes whose work it does, its own among them."""
-        return {self.name, *self.serves}
+        return {self.name, *self.join.serves}
 
     @property
     def incomplete(self) -> bool:
@@ -69,7 +67,7 @@ class RunParticipant:
         """Return the newest done required of it for `need_ns`, None if none is yet."""
         if not self.gating:
             return None
-        required = need_ns // self.period_ns * self.period_ns
+        required = need_ns // self.join.period_ns * self.join.period_ns
         return required if required >= self.from_ns else None
 
     def blocks(self, need_ns: int) -> bool:
@@ -108,16 +106,20 @@ class RunParticipant:
         missing, self.missing, self.surplus, self.lost_done = self.missing, 0, 0, False
         return missing
 
+    def waiting(self, wall_ns: int) -> Waiting:
+        """Return the entry of `clock` that names it as waited for."""
+        return Waiting(self.name, self.join.host, (wall_ns - self.since_wall_ns) / 1e9)
+
     def entry(self) -> dict[str, Any]:
         """Return the data of the event of its join."""
         entry: dict[str, Any] = {
-            "incarnation": self.incarnation,
-            "host": self.host,
-            "pid": self.pid,
+            "incarnation": self.join.incarnation,
+            "host": self.join.host,
+            "pid": self.join.pid,
             "from_ns": self.from_ns,
             "done_ns": self.done_ns,
         }
-        return {**entry, "serves": self.serves} if self.serves else entry
+        return {**entry, "serves": self.join.serves} if self.join.serves else entry
 
 
 class Barrier:
@@ -149,7 +151,7 @@ class Barrier:
         if refusal:
             return refusal
         former = self.participants.get(name)
-        if former is not None and former.alive and former.incarnation == message.incarnation:
+        if former is not None and former.alive and former.join.incarnation == message.incarnation:
             return None
         replaced = self.replaced(name, message)
         for dead in replaced:
@@ -157,19 +159,13 @@ class Barrier:
         predecessors = [*([former] if former else []), *replaced]
         self.participants[name] = RunParticipant(
             name=name,
-            incarnation=message.incarnation,
-            role=message.role,
-            host=message.host,
-            pid=message.pid,
-            period_ns=message.period_ns,
-            fingerprint=message.fingerprint,
+            join=message,
             from_ns=min((each.from_ns for each in predecessors if each.gating), default=next_gate_ns),
-            serves=message.serves,
             done_ns=min((each.done_ns for each in predecessors), default=-1),
             since_wall_ns=wall_ns,
             joined_wall_ns=wall_ns,
             deadline_misses=former.deadline_misses if former else 0,
-            done_seq=former.done_seq if former and (former.host, former.pid) == (message.host, message.pid) else None,
+            done_seq=former.done_seq if former and former.is_process_of(message) else None,
             rejoined=former is not None,
         )
         return None
@@ -198,9 +194,9 @@ class Barrier:
             return Refusal("join", "missing", f"must publish process/{name}/join first")
         if message.run_id != self._run_id:
             return self._run_id_refusal(message.run_id)
-        if message.incarnation != participant.incarnation:
+        if message.incarnation != participant.join.incarnation:
             participant.note_refused_done(message.seq)
-            allowed = f"must be {participant.incarnation}, the newest to join"
+            allowed = f"must be {participant.join.incarnation}, the newest to join"
             return Refusal("incarnation", str(message.incarnation), allowed)
         if message.done_ns > now_ns:
             return Refusal("done_ns", str(message.done_ns), f"must be <= {now_ns}, the newest gate")
@@ -245,7 +241,7 @@ class Barrier:
     def remove(self, name: str) -> RunParticipant | None:
         """Take a participant out: it published bye or is dropped."""
         removed = self.participants.pop(name, None)
-        for expected in (name, *(removed.serves if removed else ())):
+        for expected in (name, *(removed.join.serves if removed else ())):
             self._expected.pop(expected, None)
         return removed
 
@@ -270,4 +266,4 @@ class Barrier:
         absent = [Waiting(name, "", (wall_ns - start_wall_ns) / 1e9) for name in self.absent()]
         rank = {name: place for place, name in enumerate(self._expected)}
         late = sorted(self.blocking(need_ns), key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank))))
-        return (*absent, *(Waiting(p.name, p.host, (wall_ns - p.since_wall_ns) / 1e9) for p in late))
+        return (*absent, *(p.waiting(wall_ns) for p in late))

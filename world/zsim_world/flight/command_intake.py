@@ -74,7 +74,7 @@ class CommandLinks:
         """Return who has sent a command: of the controllers that share a process, that of the drone's cluster."""
         controller = f"controller.{self._cluster_of.get(drone)}"
         participant = self.barrier.participants.get(source)
-        return controller if participant is not None and controller in participant.serves else source
+        return controller if participant is not None and controller in participant.join.serves else source
 
 
 @dataclass(eq=False)

@@ -137,8 +137,8 @@ class Coordinator(ABC):
             return
         joined = self.barrier.participants[name]
         kind, data = "join", joined.entry()
-        if former is not None and former.incarnation != message.incarnation:
-            kind, data["former_pid"] = "superseded" if former.alive else "restart", former.pid
+        if former is not None and former.join.incarnation != message.incarnation:
+            kind, data["former_pid"] = "superseded" if former.alive else "restart", former.join.pid
         self.outbox.event(kind, name, f"{name} on {message.host} (pid {message.pid})", data, name)
         for dead in replaced:
             self._release_drones(dead.name)
@@ -146,10 +146,10 @@ class Coordinator(ABC):
 
     def _warn_of(self, joined: RunParticipant) -> None:
         """Publish that a newcomer computes with other bits, or does the work of others too."""
-        name, own = joined.name, fingerprint()
-        if joined.fingerprint and joined.fingerprint != own:
-            text = f"{name} on {joined.host} computes with another numeric fingerprint; the same bits are not promised"
-            self.outbox.event("fingerprint", name, text, {"found": joined.fingerprint, "expected": own})
+        name, join, own = joined.name, joined.join, fingerprint()
+        if join.fingerprint and join.fingerprint != own:
+            text = f"{name} on {join.host} computes with another numeric fingerprint; the same bits are not promised"
+            self.outbox.event("fingerprint", name, text, {"found": join.fingerprint, "expected": own})
         for other, both in self.barrier.duplicates(name).items():
             text = f"{name} and {other} both do the work of {', '.join(sorted(both))}; end one of them"
             self.outbox.event("doubled", name, text, {"other": other})
@@ -161,14 +161,14 @@ class Coordinator(ABC):
         self.outbox.event("leave", name, f"{name} left: {message.reason}", {"reason": message.reason}, name)
         self._release_drones(name)
         if self.clock.state == "waiting":
-            for each in (name, *participant.serves):
+            for each in (name, *participant.join.serves):
                 if each in self._expected:
                     self.barrier.expect(each)
         self._after_bye(participant, message.reason)
 
     def _after_bye(self, participant: RunParticipant, reason: str) -> None:
         """Do what the leave of a process means for the run."""
-        if participant.role == "recorder":
+        if participant.join.role == "recorder":
             self.clock.stop(f"the recorder left: {reason}")
 
     def handle_death(self, name: str, wall_ns: int) -> None:
@@ -179,9 +179,9 @@ class Coordinator(ABC):
         substitute = self.barrier.substitute(name)
         action = "drop" if substitute else self._on_death(participant)
         then = f"{substitute.name} does its work" if substitute else f"on_death: {action}"
-        text = f"{name} on {participant.host} (pid {participant.pid}) died; {then}"
-        data = {"host": participant.host, "pid": participant.pid, "on_death": action}
-        self.outbox.event("death", name, text, data)
+        host, pid = participant.join.host, participant.join.pid
+        data = {"host": host, "pid": pid, "on_death": action}
+        self.outbox.event("death", name, f"{name} on {host} (pid {pid}) died; {then}", data)
         if self.clock.mode == "realtime" or action == "drop":
             self._release_drones(name)
         if action == "drop":
@@ -193,7 +193,7 @@ class Coordinator(ABC):
 
     def _on_death(self, participant: RunParticipant) -> str:
         """Return the action when a process has died."""
-        return on_death(self.scenario.processes.on_death, participant.name, participant.role)
+        return on_death(self.scenario.processes.on_death, participant.name, participant.join.role)
 
     # Requests
 
@@ -241,11 +241,7 @@ class Coordinator(ABC):
     def waiting_for(self, wall_ns: int) -> tuple[messages.Waiting, ...]:
         """Return whom the world waits for now."""
         if self.clock.mode == "realtime" and self.clock.state != "waiting":
-            return tuple(
-                messages.Waiting(p.name, p.host, (wall_ns - p.since_wall_ns) / 1e9)
-                for p in self.barrier.participants.values()
-                if not p.alive
-            )
+            return tuple(p.waiting(wall_ns) for p in self.barrier.participants.values() if not p.alive)
         return self.barrier.waiting_for(self.clock.required_ns, wall_ns, self._start_wall_ns)
 
     # Publication

@@ -106,11 +106,11 @@ class FaultInjector:
             return None  # one that is not here yet, or whose work another does
         if not participant.gating:
             return "takes no part in the lockstep"
-        return None if participant.fingerprint else "does not run on zsim.runtime.runner"
+        return None if participant.join.fingerprint else "does not run on zsim.runtime.runner"
 
     def _late_ns(self) -> int:
         """Return how far behind the newest gate a process may still work: the command delay and one period."""
-        periods = (p.period_ns for p in self._barrier.participants.values())
+        periods = (p.join.period_ns for p in self._barrier.participants.values())
         return self._clock.delay_ns + max(periods, default=0)
 
     def _remove_past(self, now_ns: int) -> None:

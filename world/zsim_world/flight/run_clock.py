@@ -48,7 +48,7 @@ class RunClock:
 
     @property
     def is_halted(self) -> bool:
-        """Tell whether time may not pass, whoever is ready: the run has ended or is paused."""
+        """Tell whether time stands whatever dones there are: the run has ended or is paused."""
         return self.ended is not None or (self.state == "paused" and self.steps_allowed == 0)
 
     def start(self, t_ns: int, paused: bool = False) -> None:

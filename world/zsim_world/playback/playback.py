@@ -170,7 +170,7 @@ class Playback(Coordinator):
     # What is played
 
     def _live(self) -> set[str]:
-        """Return the names of the processes whose work somebody who takes part does."""
+        """Return the names of the processes whose work the participants do."""
         return {name for p in self.barrier.participants.values() for name in p.served_names}
 
     def _play(self, gate: Gate, wall_ns: int) -> None:
@@ -252,7 +252,7 @@ class Playback(Coordinator):
 
 
 def _is_of(view: str, live: set[str]) -> bool:
-    """Tell whether a view is published by somebody who takes part."""
+    """Tell whether a participant publishes a view itself."""
     _, kind, whose = (*view.split("/", 2), "")[:3]
     return (kind == "cluster" and f"controller.{whose}" in live) or (kind == "estimates" and whose in live)
 

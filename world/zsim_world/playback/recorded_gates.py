@@ -96,7 +96,7 @@ def _is_gate(payload: bytes) -> bool:
     try:
         return _decode_clock(payload).state != "waiting"
     except REFUSALS:
-        return False  # of somebody else
+        return False  # not the world's
 
 
 def is_played(key: str, expressions: Sequence[str]) -> bool:

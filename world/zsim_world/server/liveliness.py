@@ -56,7 +56,7 @@ class LivelinessMonitor:
         """Count a second in which the world itself ran.
 
         Who only reads and publishes nothing for long is dead: it may be stopped, and Zenoh does not always notice that
-        it has closed the full link of one that takes nothing. For one that gates time stands, and somebody looks.
+        it has closed the full link of one that takes nothing. For one that gates, time stands, and `clock` names it.
         """
         for name in list(self._silent_s):
             participant = self._participants.get(name)
@@ -71,7 +71,7 @@ class LivelinessMonitor:
         """Prepare for a join: another process of that name whose token is lost has died before."""
         self._take_lost()
         former = self._participants.get(name)
-        if name in self._checks and former and former.alive and (former.host, former.pid) != (join.host, join.pid):
+        if name in self._checks and former and former.alive and not former.is_process_of(join):
             del self._checks[name]
             self._handle_death(name, time.monotonic_ns())
 

@@ -1,7 +1,7 @@
 """When the next gate may come: by the wall clock, or pipelined where agents may lag several gates behind.
 
 Pipelining: many gates at once cost every process fewer wake-ups. Time is delayed until the slowest agent has nearly
-caught up; then gates follow one another until its done is required again. Nobody starves meanwhile: the first of
+caught up; then gates follow one another until its done is required again. No agent idles meanwhile: the first of
 these gates comes while agents still work on the last ones before it.
 """
 

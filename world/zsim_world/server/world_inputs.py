@@ -135,7 +135,7 @@ class _Head(msgspec.Struct):
     t_ns: int
     seq: int
     source: str = ""
-    controller: str = ""  # of a ClusterRequest, whose source is somebody else
+    controller: str = ""  # of a ClusterRequest, whose source is the client
 
 
 _decode_head = msgspec.msgpack.Decoder(_Head).decode
@@ -170,7 +170,7 @@ class MessageIntake:
                 self.outputs.passed(sample)
                 self._hand_over(key, sample.payload, wall_ns)
             elif kind is None:
-                self.outputs.passed(sample)  # a key of somebody's own
+                self.outputs.passed(sample)  # a key outside of the contract
             else:
                 raise DecodeError(f"{key}: only the world publishes here")
         except DecodeError as error:

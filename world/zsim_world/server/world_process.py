@@ -220,7 +220,7 @@ class WorldProcess:
             query.end()
 
     def _refuse(self, query: Query) -> None:
-        """Refuse a request that nobody takes here, unless another process answers it."""
+        """Refuse a request on another process's key, unless that process answers it."""
         reason = self._world.refusal_at(query.expression)
         if reason is None:
             query.end()

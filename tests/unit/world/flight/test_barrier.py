@@ -176,7 +176,7 @@ def test_a_new_incarnation_goes_on_where_the_former_was():
     made.mark_dead("a", WALL_NS)
     assert made.join("a", join(2, host="other"), 50 * GATE_NS, WALL_NS) is None
     assert made.participants["a"].alive
-    assert made.participants["a"].host == "other"
+    assert made.participants["a"].join.host == "other"
     assert blocked(made, 3) == []
     assert blocked(made, 4) == ["a"]
     assert made.done("a", done(4, incarnation=2), 5 * GATE_NS, 0) is None
