@@ -1,7 +1,7 @@
 """zsim's own lockstep with nothing to compute: the real world, barrier, hub and runner over Zenoh.
 
-In: WorldProcess, World, Barrier and History, with truth, status and clock of every gate built, encoded, hashed, put
-and kept; in every agent Runner, Inbox and Membership, with status decoded and done encoded and put; joins, tokens,
+In: WorldProcess, World, Barrier and MessageHistory, with truth, status and clock of every gate built, encoded, hashed,
+put and kept; in every agent Runner, Inbox and Membership, with status decoded and done encoded and put; joins, tokens,
 health. Out: the fleet (its truth stands still and it has no samples), and the agents' outputs.
 """
 
@@ -45,7 +45,7 @@ def run_world(count: int, seconds: float, lookahead: bool, low_latency: bool) ->
     with mock.patch.object(world, "Fleet", NullFleet):
         made = world.World(_scenario(count))
     if not lookahead:
-        made.delay_ns = 0  # no scenario can say so: a command would take effect at the instant that it answers
+        made.clock.delay_ns = 0  # no scenario can say so: a command would take effect at the instant that it answers
     lap, over = Lap(seconds), False
 
     def tell(kind: str, message: Any, phase: str) -> None:

@@ -59,7 +59,7 @@ def fly(
         while bus.turn():
             reason = stopped()
             if reason:
-                world.stop(reason)
+                world.clock.stop(reason)
         bus.end()
     finally:
         if writer:

@@ -23,12 +23,12 @@ from zsim_analysis.in_process import agents
 from zsim_world.flight.world import World
 
 AT_S, FOR_S, DURATION_S = 6.0, 2.0, 9.0  # the formation of PAIR is engaged from 5 s on
-Given = dict[str, Any]
+Document = dict[str, Any]
 LINK = "estimator.drone1/controller.main"
 KILL = "process_kill"
 
 # What a fault of each kind is to be, so that the flight feels it
-MATRIX: dict[str, Given] = {
+MATRIX: dict[str, Document] = {
     **{f"{sensor}_dropout": {"target": "drone1"} for sensor in ("gps", "mag", "baro", "sonar", "flow")},
     "imu_dropout": {"target": "drone1", "probability": 0.3},
     **{f"{sensor}_stuck": {"target": "drone1"} for sensor in ("gps", "mag", "baro", "sonar", "flow")},
@@ -50,7 +50,7 @@ MATRIX: dict[str, Given] = {
     "link_cut": {"target": "world/estimator.drone1"},
     "radio": {"target": "main", "range_m": 2, "spread_m": 1},
 }
-SEVERAL: list[Given] = [
+SEVERAL: list[Document] = [
     {"kind": "link_loss", "target": "world/estimator.drone2", "probability": 0.3, "at_s": 4},
     {"kind": "link_jitter", "target": LINK, "jitter_ms": 70, "at_s": 5, "for_s": 4},
     {"kind": "link_delay", "target": "controller.main/world", "delay_ms": 30, "at_s": 6},
@@ -77,7 +77,7 @@ class Flight(NamedTuple):
     estimates: list[messages.Estimate]
     statuses: list[messages.Status]
 
-    def told(self, *kinds: str) -> list[Event]:
+    def events_of(self, *kinds: str) -> list[Event]:
         return [event for event in self.events if event.kind in kinds]
 
     def changes(self) -> list[tuple[float, str]]:
@@ -86,7 +86,7 @@ class Flight(NamedTuple):
         return [(after.t_ns / 1e9, after.state) for before, after in pairs if after.state != before.state]
 
 
-def document(faults: Sequence[Given], **values: Any) -> Given:
+def document(faults: Sequence[Document], **values: Any) -> Document:
     return {**yaml.safe_load(PAIR), "duration_s": DURATION_S, "faults": list(faults), **values}
 
 
@@ -98,7 +98,7 @@ def apart(world: World) -> list[Agent]:
 
 
 def fly(
-    faults: Sequence[Given],
+    faults: Sequence[Document],
     team: Callable[[World], list[Agent]] = agents,
     between: Callable[[World], None] = lambda world: None,
     **values: Any,
@@ -144,9 +144,9 @@ def test_the_same_bits_twice_and_others_than_without(kind: str, undisturbed: Fli
     fault = {"kind": kind, "at_s": AT_S, "for_s": FOR_S, **MATRIX[kind]}
     first, second = fly([fault]), fly([fault])
     assert first.sha256 == second.sha256 != undisturbed.sha256
-    told = [(event.kind, event.t_ns / 1e9) for event in first.told("fault", "fault_end")]
-    assert told == [("fault", AT_S), ("fault_end", AT_S + fault["for_s"])]
-    assert first.told("end")[0].data["last_ns"] == 9_000_000_000
+    times = [(event.kind, event.t_ns / 1e9) for event in first.events_of("fault", "fault_end")]
+    assert times == [("fault", AT_S), ("fault_end", AT_S + fault["for_s"])]
+    assert first.events_of("end")[0].data["last_ns"] == 9_000_000_000
 
 
 def test_a_fault_that_comes_after_the_end_changes_nothing(undisturbed: Flight) -> None:
@@ -154,7 +154,7 @@ def test_a_fault_that_comes_after_the_end_changes_nothing(undisturbed: Flight) -
 
 
 @pytest.mark.parametrize("delay_gates", [1, 5])
-def test_agents_in_one_process_and_apart_hear_the_same(delay_gates: int) -> None:
+def test_agents_in_one_process_and_apart_receive_the_same(delay_gates: int) -> None:
     """Several faults at once, in a Group and in agents of their own; the world may run ahead by delay_gates.
 
     Expected: the same hash.
@@ -168,7 +168,7 @@ def test_as_processes(federation: Federation) -> None:
 
         world ──╳──sensors──▶ estimators ──╳──estimates──▶ controller ──╳──velocity──▶ world
 
-    Expected: the hash of the run in one process; what the world says of faults is on record.
+    Expected: the hash of the run in one process; the lists of faults are on record.
     """
     federation.run(yaml.safe_dump(document(SEVERAL))).ends(with_code=0)
     record = federation.record()
@@ -177,19 +177,19 @@ def test_as_processes(federation: Federation) -> None:
     assert len(record.events("fault")) == len(SEVERAL)
 
 
-def asking(at_gate: int, op: str, **args: Any) -> Callable[[World], None]:
-    """Return what asks the world for something once, between gates."""
+def requesting(at_gate: int, op: str, **args: Any) -> Callable[[World], None]:
+    """Return a function that sends the world a request once, between gates."""
     asked: list[Any] = []
 
     def ask(world: World) -> None:
-        if not asked and world.now_ns >= at_gate * world.gate_ns:
+        if not asked and world.now_ns >= at_gate * world.clock.gate_ns:
             asked.append(world.control(ControlRequest(op, args, "tester.one")))
             assert asked[0].ok, asked[0].error
 
     return ask
 
 
-def planned_of(events: Sequence[Any]) -> list[Given]:
+def planned_of(events: Sequence[Any]) -> list[Document]:
     """Return the faults of a scenario that those which begin in some events are."""
     return [
         {
@@ -205,13 +205,13 @@ def planned_of(events: Sequence[Any]) -> list[Given]:
 
 @pytest.mark.parametrize("kind", ["gps_stuck", "rotor_stuck", "link_loss", "link_delay", "radio", "gust"])
 def test_by_request_gives_the_bits_of_its_events(kind: str, undisturbed: Flight) -> None:
-    """The fault is asked for in flight; then the same is planned from what its event tells.
+    """The fault is requested in flight; then the same is planned from the data of its event.
 
     Expected: the same hash, another one than without.
     """
     fault = {"kind": kind, "for_s": 0.5, **MATRIX[kind]}
-    asked = fly([], between=asking(300, "fault_add", **fault))
-    again = fly(planned_of([event.data for event in asked.told("fault")]))
+    asked = fly([], between=requesting(300, "fault_add", **fault))
+    again = fly(planned_of([event.data for event in asked.events_of("fault")]))
     assert asked.sha256 == again.sha256 != undisturbed.sha256
 
 
@@ -221,25 +221,25 @@ def test_cleared_by_request(undisturbed: Flight) -> None:
     Expected: it acts until then, so the bits are those of one that ends there.
     """
     weak = {"kind": "rotor_efficiency", "at_s": AT_S, **MATRIX["rotor_efficiency"]}
-    cleared = fly([weak], between=asking(350, "fault_clear", target="drone1"))
-    (told,) = cleared.told("fault_clear")
-    again = fly(planned_of([told.data]))
+    cleared = fly([weak], between=requesting(350, "fault_clear", target="drone1"))
+    (event,) = cleared.events_of("fault_clear")
+    again = fly(planned_of([event.data]))
     assert cleared.sha256 == again.sha256 != fly([weak]).sha256
-    assert told.data["until_ns"] == told.t_ns
+    assert event.data["until_ns"] == event.t_ns
     assert cleared.sha256 != undisturbed.sha256
 
 
 def test_by_command_on_a_running_federation(federation: Federation) -> None:
     """`zsim fault add` and `clear` on processes; then the same faults planned, in one process.
 
-    Expected: what the commands say; the same hash.
+    Expected: the lines that the commands print; the same hash.
     """
     run = federation.run(yaml.safe_dump(document([], duration_s=12.0)), "--rate", "2")
     client = federation.client()
     clock = client.watch("clock")
     clock.until(lambda m: m["t_ns"] > 5.5e9)
     client.ask("world/control", "pause")
-    said = [
+    printed = [
         fault(federation, "add", "drone1", "gps_bias", "value_m=[2, 0, 0]"),
         fault(federation, "add", LINK, "link_jitter", "jitter_ms=90", "--for", "1500ms"),
         fault(federation, "add", "world", "gust", "velocity_m_s=[2, 1, 0]", "--for", "1s", "--at", "11s"),
@@ -247,15 +247,15 @@ def test_by_command_on_a_running_federation(federation: Federation) -> None:
     ]
     client.ask("world/control", "step", gates=50)
     clock.until(lambda m: m["t_ns"] > 6.5e9)
-    said.append(fault(federation, "clear", "drone1"))
+    printed.append(fault(federation, "clear", "drone1"))
     client.ask("world/control", "resume")
     run.ends(with_code=0)
-    assert "fault 1: gps_bias of drone1 from" in said[0]
-    assert "until it is cleared" in said[0]
-    assert "fault 2: link_jitter" in said[1]
-    assert "fault 3: gust of world from 11.00 s to 12.00 s" in said[2]
-    assert [line.split()[:2] for line in said[3].splitlines()] == [["1", "acts"], ["2", "acts"], ["3", "planned"]]
-    assert "cleared 1" in said[4]
+    assert "fault 1: gps_bias of drone1 from" in printed[0]
+    assert "until it is cleared" in printed[0]
+    assert "fault 2: link_jitter" in printed[1]
+    assert "fault 3: gust of world from 11.00 s to 12.00 s" in printed[2]
+    assert [line.split()[:2] for line in printed[3].splitlines()] == [["1", "acts"], ["2", "acts"], ["3", "planned"]]
+    assert "cleared 1" in printed[4]
     record = federation.record()
     begun = {event["data"]["id"]: event["data"] for event in record.events("fault")}
     begun |= {event["data"]["id"]: event["data"] for event in record.events("fault_clear")}
@@ -264,7 +264,7 @@ def test_by_command_on_a_running_federation(federation: Federation) -> None:
 
 
 def fault(federation: Federation, *arguments: str) -> str:
-    """Run `zsim fault`; return what it says once it has found the world."""
+    """Run `zsim fault`; return what it prints once it has found the world."""
     role = federation.role("fault", *arguments)
     role.ends(with_code=0)
     return "\n".join(line.text for line in role.lines if not line.text.startswith("waiting for a world of"))
@@ -350,7 +350,7 @@ def test_drones_without_a_controller_hover_and_then_land(for_s: float, lands: bo
     """
     cut = {"kind": "link_cut", "target": "world/controller.main", "at_s": AT_S, "for_s": for_s}
     flight = fly([cut], duration_s=10.0)
-    assert flight.told("collision", "diverged") == []
+    assert flight.events_of("collision", "diverged") == []
     changes = [(t_s, state) for t_s, state in flight.changes() if t_s > AT_S]
     assert [state for _, state in changes] == ["hovering", "landing" if lands else "flying"]
     assert [t_s for t_s, _ in changes] == pytest.approx([AT_S + 0.5, AT_S + (2.5 if lands else for_s)], abs=0.07)
@@ -366,5 +366,5 @@ def test_a_delay_of_commands_is_a_longer_command_delay() -> None:
 
 
 def test_events_are_json(undisturbed: Flight) -> None:
-    for event in fly([{"kind": "radio", "at_s": 1, **MATRIX["radio"]}]).told("fault"):
+    for event in fly([{"kind": "radio", "at_s": 1, **MATRIX["radio"]}]).events_of("fault"):
         assert json.loads(json.dumps(event.data))["kind"] == "radio"

@@ -1,4 +1,4 @@
-"""A run is flown again from its record: the same bits, whoever had a hand in it; and where not, it is said where."""
+"""A run is flown again from its record: the same bits, whoever took part; and where not, a line says where."""
 
 import re
 import subprocess
@@ -159,7 +159,7 @@ def test_a_foreign_program_that_gates(federation: Federation) -> None:
 def test_an_estimator_that_was_killed(federation: Federation) -> None:
     """An estimator dies in flight and is started again.
 
-    Expected: it is said that agents are not run again, and why; the world alone gives the same hash.
+    Expected: a line says that agents are not run again, and why; the world alone gives the same hash.
     """
     run = federation.run(PAIR, "--rate", "3")
     federation.client().watch("clock").until(lambda m: m["t_ns"] > 6e9)
@@ -216,7 +216,7 @@ def damaged(record: Path, into: Path, part: float, cut: int = 0) -> Path:
 def test_a_damaged_record(federation: Federation) -> None:
     """A bit is turned in the last chunk of a record, in the last of one that is cut too, in one in the middle.
 
-    Expected: it is not told as a cut; truth is the same as far as it can be compared, which is not what was asked.
+    Expected: no line calls it a cut; truth is the same as far as it can be compared, which is not what was asked.
     """
     federation.run(PAIR, "--in-process", "--duration", "2").ends(with_code=0)
     alike = r"; truth is the same at all (\d+) instants before, to the bit"
@@ -225,12 +225,12 @@ def test_a_damaged_record(federation: Federation) -> None:
         ("last and cut", 1.0, 9, "the record is damaged and has no truth_sha256"),
         ("middle", 0.5, 0, r"the record has nothing of \d+\.\d+ s, for it is damaged"),
     ):
-        said = rerun(federation, code=1, of=damaged(federation.out, federation.folder / name, part, cut)).text()
-        found = re.search(text + alike, said)
-        assert found, said
-        assert 20 < int(found[1]) < 101
-        assert "was cut" not in said
-        assert "the world alone" not in said
+        printed = rerun(federation, code=1, of=damaged(federation.out, federation.folder / name, part, cut)).text()
+        match = re.search(text + alike, printed)
+        assert match, printed
+        assert 20 < int(match[1]) < 101
+        assert "was cut" not in printed
+        assert "the world alone" not in printed
 
 
 def from_the_second_second() -> Callable[[str, bytes], bytes | None]:

@@ -1,4 +1,4 @@
-"""A session without Zenoh: mailboxes that a test fills, requests that a test answers, everything said kept."""
+"""A session without Zenoh: mailboxes that a test fills, requests that a test answers, everything published kept."""
 
 import queue
 from collections.abc import Callable, Iterator, Sequence
@@ -46,8 +46,8 @@ class FakeLink:
     """A session.
 
     Attributes:
-        said: (key, payload) of all that its process has published.
-        on_said: called with each of these as it is published; a test lets others answer here.
+        published: (key, payload) of all that its process has published.
+        on_publish: called with each of these as it is published; a test lets others answer here.
         on_request: answers a request by its key and arguments.
         requests: (key, arguments) of all requests.
         last: what a get is answered, by key.
@@ -57,8 +57,8 @@ class FakeLink:
     guarded = False
 
     def __init__(self) -> None:
-        self.said: list[tuple[str, bytes]] = []
-        self.on_said: Callable[[str, bytes], None] = lambda key, payload: None
+        self.published: list[tuple[str, bytes]] = []
+        self.on_publish: Callable[[str, bytes], None] = lambda key, payload: None
         self.on_request: Callable[[str, dict[str, Any]], ControlAnswer] = lambda key, args: UNANSWERED
         self.requests: list[tuple[str, dict[str, Any]]] = []
         self.last: dict[str, bytes] = {}
@@ -84,9 +84,9 @@ class FakeLink:
         """Let the link come (True) or go."""
         self._on_link(up)
 
-    def all(self, expression: str) -> list[Any]:
-        """Return the messages said on an expression."""
-        return [messages.decode(key, payload) for key, payload in self.said if keys.matches(expression, key)]
+    def published_on(self, expression: str) -> list[Any]:
+        """Return the messages published on an expression."""
+        return [messages.decode(key, payload) for key, payload in self.published if keys.matches(expression, key)]
 
     # What a session does
 
@@ -108,8 +108,8 @@ class FakeLink:
         self.put_raw(key, messages.encode(message))
 
     def put_raw(self, key: str, payload: bytes) -> None:
-        self.said.append((key, payload))
-        self.on_said(key, payload)
+        self.published.append((key, payload))
+        self.on_publish(key, payload)
 
     def put_all(self, encoded: Sequence[tuple[str, bytes]]) -> None:
         for key, payload in encoded:

@@ -35,7 +35,7 @@ class Hub(Protocol):
         """Take what a process says to the world: join, done, bye, a command."""
         ...
 
-    def output_of(self, source: str) -> None:
+    def count_output(self, source: str) -> None:
         """Count an output that is for others."""
         ...
 
@@ -47,8 +47,8 @@ class Hub(Protocol):
         """Go to the next gate and put its messages into the outbox."""
         ...
 
-    def tell_end(self, wall_ns: int) -> None:
-        """Put the last words of the run into the outbox."""
+    def publish_end(self) -> None:
+        """Put the end of the run into the outbox: event `end`, clock `stopped`."""
         ...
 
     def take_outbox(self) -> Sequence[tuple[str, Any]]:
@@ -163,7 +163,7 @@ class Bus:
 
     def end(self) -> None:
         """Let every agent leave, and the world say its last words."""
-        self._hub.tell_end(self._wall_ns())
+        self._hub.publish_end()
         self._spread()
         for agent, _ in self._agents:
             bye = messages.Bye(self._t_ns, agent.next_seq("bye"), "the run ended")
@@ -222,7 +222,7 @@ class Bus:
                 inbox.put(key, message)
             if kind == OUTPUT:
                 self._sink(key, message)
-                self._hub.output_of(agent.name)
+                self._hub.count_output(agent.name)
             else:
                 self._to_hub(key, message)
         done = messages.Done(t_ns, agent.next_seq("done"), self._hub.run_id, 0, t_ns, sent)

@@ -104,7 +104,7 @@ def _fly(record: Opened, cast: Cast) -> Flown:
                 break
             bus.pass_on(passage)
             compared.take(passage.t_ns, passage.truth, bus.truth)
-            due_ns += world.gate_ns
+            due_ns += world.clock.gate_ns
             show(passage.t_ns)
     if not compared.instants:
         raise RecordError(f"{reader.path}: {until or 'holds no truth'}; a run is flown again from its start")

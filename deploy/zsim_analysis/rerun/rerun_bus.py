@@ -66,7 +66,7 @@ class RerunBus(Bus):
         self._played = cast.played
         self.truth: dict[str, bytes] = {}
         self.refused: list[str] = []
-        self.answers = Answers(world.delay_ns + 2 * world.gate_ns)
+        self.answers = Answers(world.clock.delay_ns + 2 * world.clock.gate_ns)
 
     def pass_on(self, passage: Passage) -> None:
         """Take in what reached the world on the way to a gate, let the agents answer, and go to that gate.
@@ -78,11 +78,11 @@ class RerunBus(Bus):
             self._feed(recorded)
         while self._round():
             pass
-        owing = [p.name for p in self._world.owing() if p.name in self._played]
-        if owing and self._world.state != "waiting":
+        blocking = [p.name for p in self._world.blocking() if p.name in self._played]
+        if blocking and self._world.clock.state != "waiting":
             at = f"before {passage.t_ns / 1e9:.2f} s"
             raise RunError(
-                f"{', '.join(owing)} cannot answer {at}: what it waits for is not on record; --commands-only"
+                f"{', '.join(blocking)} cannot answer {at}: what it waits for is not on record; --commands-only"
             )
         self.answers.close(passage.t_ns)
         self._world.advance(0)
@@ -134,12 +134,12 @@ class RerunBus(Bus):
             return
         for inbox in self._way(key).inboxes:
             inbox.put(key, message)
-        self._world.output_of(source)
+        self._world.count_output(source)
 
     def _feed_event(self, event: messages.Event) -> None:
         """Repeat what reached the world otherwise than as a message: deaths, and requests."""
         if event.kind == "death" and event.subject not in self._played:
-            self._world.died(event.subject, 0)
+            self._world.handle_death(event.subject, 0)
         elif event.kind == "control" and event.subject in STEERS and event.data.get("ok"):
             args = event.data.get("args")
             request = ControlRequest(event.subject, args if isinstance(args, dict) else {}, event.source)

@@ -18,7 +18,7 @@ from zsim_analysis.reading.recorded_run import opened
 from zsim_deploy.roles.roles import told
 from zsim_deploy.roles.stop_channel import Leash
 from zsim_deploy.security.key_lease import lent
-from zsim_world.playback.playback import Choice, Playback
+from zsim_world.playback.playback import Playback, PlaybackRange
 from zsim_world.server.world_process import run
 
 
@@ -33,7 +33,7 @@ class Wish(NamedTuple):
         federation: None for that of the record.
     """
 
-    choice: Choice
+    choice: PlaybackRange
     rate: float
     expect: tuple[str, ...]
     endpoints: tuple[str, ...]

@@ -1,104 +1,212 @@
-"""Commands on their way to the firmware: stamped, ordered, judged, applied, and told where it matters."""
+"""Commands from their arrival to the firmware: checked, delayed by their link, queued, applied, published as events."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 from zsim.contract import keys, messages
-from zsim_world.flight.command_links import CommandLinks
-from zsim_world.flight.commander import Due
+from zsim.contract.control_limits import PRIORITY_MAX
+from zsim.contract.messages import ControlRequest, Fault
+from zsim.runtime import link_faults
+from zsim.runtime.link_faults import NEVER, WORLD, uniform
+from zsim.scenario.scenario import Scenario
+from zsim_world.fleet.fleet import Fleet
+from zsim_world.flight.barrier import Barrier
+from zsim_world.flight.command_queue import CommandQueue, QueuedCommand
+from zsim_world.flight.run_clock import Operation, RunClock, number, refused_argument
+from zsim_world.flight.run_outbox import Refusal, RunOutbox
 
-if TYPE_CHECKING:
-    from zsim_world.flight.world import World
+RADIO = "radio"
+LinkFaultsAt = Callable[[int], Sequence[Fault]]
+"""Returns the faults of links and radios that act in a gate."""
 
 
-class CommandDesk:
-    """Takes commands as they come, and hands them to the fleet at their instants."""
+@dataclass(eq=False)
+class CommandLinks:
+    """Delays and losses of commands by faults of their links: the world is their receiver."""
 
-    def __init__(self, world: World) -> None:
-        self._world = world
-        self._links = CommandLinks(world)
+    scenario: Scenario
+    gate_ns: int
+    barrier: Barrier  # knows which processes do the work of others
+    faults_at: LinkFaultsAt
+    position_m: Callable[[str], list[float] | None]  # where a drone truly is [m; W], None for an unknown one
 
-    def take(self, drone: str, kind: str, message: Any) -> bool:
-        """Keep a command until its instant, or refuse it; return False for one that has come before."""
-        world, source = self._world, message.source
-        gating = world.barrier.is_gating(source)  # its name was looked at when it joined
+    def __post_init__(self) -> None:
+        self._cluster_of = {drone: cluster.name for cluster in self.scenario.clusters for drone in cluster.drones}
+
+    def delay_ns(self, drone: str, key: str, message: Any, gate_ns: int) -> int | None:
+        """Return by how many whole gates a command comes later [ns]; None if it does not.
+
+        Args:
+            gate_ns: the gate that it belongs to.
+        """
+        faults = self.faults_at(gate_ns)
+        if not faults:
+            return 0
+        senders, total_ns = (self._sender(drone, message.source),), 0
+        for fault in faults:
+            if fault.kind != RADIO and link_faults.joins(fault, senders, WORLD):
+                draw = uniform(self.scenario.seed, WORLD, fault, key, message.t_ns, message.seq)
+                late_ns = link_faults.delay_ns(fault, draw)
+                if late_ns is None:
+                    return NEVER
+                total_ns += late_ns
+        return -(-total_ns // self.gate_ns) * self.gate_ns
+
+    def lost_by_radio(self, drone: str, command: QueuedCommand, gate_ns: int) -> bool:
+        """Tell whether the radio loses a command that would take effect before a gate."""
+        faults = self.faults_at(gate_ns)
+        return any(fault.kind == RADIO and self._loses(fault, drone, command) for fault in faults)
+
+    def _loses(self, fault: Fault, drone: str, command: QueuedCommand) -> bool:
+        if fault.target not in (WORLD, self._cluster_of.get(drone)):
+            return False
+        sender = self._sender(drone, command.source)
+        there = self.position_m(drone)
+        here = link_faults.place_of(sender, fault.parameters["place"], self.position_m)
+        key, message = keys.command(drone, command.kind), command.message
+        draw = uniform(self.scenario.seed, WORLD, fault, key, message.t_ns, message.seq)
+        distance_m = math.dist(there, here) if there is not None and here is not None else None
+        return link_faults.delay_ns(fault, draw, distance_m) is NEVER
+
+    def _sender(self, drone: str, source: str) -> str:
+        """Return who has sent a command: of the controllers that share a process, that of the drone's cluster."""
+        controller = f"controller.{self._cluster_of.get(drone)}"
+        participant = self.barrier.participants.get(source)
+        return controller if participant is not None and controller in participant.join.serves else source
+
+
+@dataclass(eq=False)
+class CommandIntake:
+    """Takes commands as they arrive, and hands them to the fleet at their instants."""
+
+    scenario: Scenario
+    clock: RunClock
+    barrier: Barrier  # knows which sources are in the lockstep
+    outbox: RunOutbox
+    queue: CommandQueue
+    fleet: Fleet
+    faults_at: LinkFaultsAt
+
+    def __post_init__(self) -> None:
+        self._index = {name: i for i, name in enumerate(self.fleet.names)}
+        self._links = CommandLinks(self.scenario, self.clock.gate_ns, self.barrier, self.faults_at, self._position_m)
+
+    def _position_m(self, drone: str) -> list[float] | None:
+        """Return where a drone truly is [m; W]."""
+        i = self._index.get(drone)
+        return self.fleet.bodies.state[i, :3].tolist() if i is not None else None
+
+    def accept(self, drone: str, kind: str, message: Any) -> bool:
+        """Queue a command for its instant, or refuse it; return False for a duplicate."""
+        source = message.source
+        gating = self.barrier.is_gating(source)  # its name was checked when it joined
         if not gating and not keys.PROCESS_NAME.fullmatch(source):
-            reason = f"source is {source[:48]!r}; must be 1 to 48 of a-z 0-9 _ . -"
-            world.refuse("somebody", f"drone/{drone[:40]}/cmd/{kind}", reason)
+            refusal = Refusal("source", repr(source[:48]), "must be 1 to 48 of a-z 0-9 _ . -")
+            self.outbox.refuse("somebody", f"drone/{drone[:40]}/cmd/{kind}", refusal)
             return True
-        index = world.index.get(drone)
-        reason = "no such drone; see world/info" if index is None else self._age_refusal(message, gating)
-        if index is None or reason:
-            world.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", reason or "")
+        index = self._index.get(drone)
+        refusal = self._no_drone(drone) if index is None else self._age_refusal(message, gating)
+        if index is None or refusal:
+            self.outbox.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", refusal or "")
             return True
-        gate_ns = message.t_ns if gating else world.next_ns
+        gate_ns = message.t_ns if gating else self.clock.next_ns
         late_ns = self._links.delay_ns(drone, keys.command(drone, kind), message, gate_ns)
         if late_ns is None:
-            return True  # its sender has sent it, and nobody hears it
-        apply_ns = gate_ns + world.delay_ns + late_ns
+            return True  # the link loses it; its sender has sent it all the same
+        apply_ns = gate_ns + self.clock.delay_ns + late_ns
         if not gating:
-            self._tell_foreign(drone, kind, message, apply_ns)
-        return world.commanders.push(index, kind, message, apply_ns)
+            self._publish_command(drone, kind, message, apply_ns)
+        return self.queue.push(index, kind, message, apply_ns)
 
-    def _age_refusal(self, message: Any, gating: bool) -> str | None:
-        world = self._world
-        now_ns = world.now_ns
-        if world.mode == "realtime":
-            age_ms, limit_ms = (now_ns - message.t_ns) / 1e6, world.scenario.time.max_command_age_ms
-            if age_ms > limit_ms:
-                return f"age is {age_ms:.0f} ms; must be <= {limit_ms:g} ms"
+    def _no_drone(self, name: str) -> Refusal:
+        return Refusal("drone", repr(name[:40]), "must be one of `drones` in world/info")
+
+    def _age_refusal(self, message: Any, gating: bool) -> Refusal | None:
+        now_ns = self.clock.now_ns
+        if self.clock.mode == "realtime":
+            age_ms, max_age_ms = (now_ns - message.t_ns) / 1e6, self.scenario.time.max_command_age_ms
+            if age_ms > max_age_ms:
+                return Refusal("age", f"{age_ms:.0f} ms", f"must be <= {max_age_ms:g} ms")
         if gating and message.t_ns > now_ns:
-            return f"t_ns is {message.t_ns}; must be <= {now_ns}, the newest gate"
+            return Refusal("t_ns", str(message.t_ns), f"must be <= {now_ns}, the newest gate")
         return None
 
-    def _tell_foreign(self, drone: str, kind: str, message: Any, apply_ns: int) -> None:
-        """Say when a command takes effect whose sender is not in the lockstep."""
-        world, source = self._world, message.source
+    def _publish_command(self, drone: str, kind: str, message: Any, apply_ns: int) -> None:
+        """Publish when a command takes effect whose sender is not in the lockstep."""
         fields = {name: getattr(message, name) for name in messages.fields(type(message))}
-        text = f"{source} sends {kind} to {drone}"
-        world.event("command", drone, text, source=source, command=kind, apply_t_ns=apply_ns, message=fields)
+        data = {"command": kind, "apply_t_ns": apply_ns, "message": fields}
+        self.outbox.event("command", drone, f"{message.source} sends {kind} to {drone}", data, message.source)
 
     def apply(self, t_ns: int) -> None:
-        """Hand the commands that are due at t_ns to the firmware."""
-        for due in self._world.commanders.pop(t_ns):
-            if self._links.lost_on_air(due, t_ns + self._world.gate_ns):
+        """Hand the commands that take effect at t_ns to the firmware."""
+        for command in self.queue.pop(t_ns):
+            drone = self.fleet.names[command.drone]
+            if self._links.lost_by_radio(drone, command, t_ns + self.clock.gate_ns):
                 continue
-            refusal = self._world.commanders.refusal(due) or self._hand_over(due)
+            refusal = self.queue.refusal(command) or self._apply(drone, command)
             if refusal:
-                subject = keys.command(self._world.fleet.names[due.drone], due.kind)
-                self._world.refuse(due.source, subject, refusal)
+                self.outbox.refuse(command.source, keys.command(drone, command.kind), refusal)
 
-    def _hand_over(self, due: Due) -> str | None:
+    def _apply(self, drone: str, command: QueuedCommand) -> str | None:
         """Hand a command to the firmware; return why it is refused."""
-        if due.kind == "mode":
-            return self._mode(due)
-        refusal = self._setpoint(due)
-        if refusal is None and self._world.commanders.take(due.drone, due.source):
-            name = self._world.fleet.names[due.drone]
-            self._world.event("commander", name, f"{due.source} flies {name}", source=due.source)
+        if command.kind == "mode":
+            return self._apply_mode(drone, command)
+        refusal = self._apply_setpoint(command)
+        if refusal is None and self.queue.claim(command.drone, command.source):
+            self.outbox.event("commander", drone, f"{command.source} flies {drone}", source=command.source)
         return refusal
 
-    def _setpoint(self, due: Due) -> str | None:
-        m, i, fleet = due.message, due.drone, self._world.fleet
-        if due.kind == "velocity":
+    def _apply_setpoint(self, command: QueuedCommand) -> str | None:
+        m, i, fleet = command.message, command.drone, self.fleet
+        if command.kind == "velocity":
             return fleet.set_velocity(i, m.velocity_m_s, m.yaw_rate_rad_s, m.frame)
-        if due.kind == "ardrone":
+        if command.kind == "ardrone":
             return fleet.set_ardrone(i, m.forward, m.left, m.up, m.yaw_left, m.hover)
-        if due.kind == "attitude":
+        if command.kind == "attitude":
             return fleet.set_attitude(i, m.orientation_wxyz, m.thrust_n, m.yaw_rate_rad_s)
         return fleet.set_rotors(i, m.speed_rad_s)
 
-    def _mode(self, due: Due) -> str | None:
-        fleet, mode = self._world.fleet, due.message.mode
-        act = {
-            "takeoff": fleet.takeoff,
-            "land": fleet.land,
-            "emergency": fleet.emergency,
-            "reset": fleet.reset,
-        }
-        refusal = act[mode](due.drone)
+    def _apply_mode(self, drone: str, command: QueuedCommand) -> str | None:
+        fleet, source, mode = self.fleet, command.source, command.message.mode
+        enter = {"takeoff": fleet.takeoff, "land": fleet.land, "emergency": fleet.emergency, "reset": fleet.reset}
+        refusal = enter[mode](command.drone)
         if refusal is None:
-            name = fleet.names[due.drone]
-            self._world.event("mode", name, f"{due.source} asks {name} to {mode}", source=due.source, mode=mode)
+            self.outbox.event("mode", drone, f"{source} asks {drone} to {mode}", {"mode": mode}, source)
         return refusal
+
+    def release_all(self, source: str) -> None:
+        """Take the drones from a process that flew them and is gone: they hover."""
+        for i in self.queue.remove_source(source):
+            self.fleet.release(i)
+            self.outbox.event("release", self.fleet.names[i], f"{source} flies it no longer", source=source)
+
+    # Requests
+
+    def operations(self) -> dict[str, Operation]:
+        """Return what each `op` on `world/control` that is about commanders does."""
+        return {"acquire": self._acquire, "release": self._release}
+
+    def _acquire(self, request: ControlRequest) -> Refusal | None:
+        index, priority = self._requested(request), number(request.args.get("priority", 0))
+        if index is None:
+            return refused_argument(request, "drone", f"one of {', '.join(self._index)}")
+        if priority is None or not 0 <= priority <= PRIORITY_MAX:
+            return refused_argument(request, "priority", f"from 0 to {PRIORITY_MAX}")
+        if not request.source:
+            return Refusal("source", "empty", "must be the name under which the commands will come")
+        return self.queue.acquire(index, request.source, int(priority))
+
+    def _release(self, request: ControlRequest) -> Refusal | None:
+        index = self._requested(request)
+        if index is None:
+            return refused_argument(request, "drone", f"one of {', '.join(self._index)}")
+        refusal = self.queue.release(index, request.source)
+        if refusal is None:
+            self.fleet.release(index)
+        return refusal
+
+    def _requested(self, request: ControlRequest) -> int | None:
+        name = request.args.get("drone")
+        return self._index.get(name) if isinstance(name, str) else None

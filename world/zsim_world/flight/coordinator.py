@@ -1,31 +1,34 @@
-"""The hub of a run: who takes part, who is waited for, what is told. Of a flight (World) and of a replay (Playback).
+"""What a flight (World) and a replay (Playback) have in common: who takes part, who is waited for, what is published.
 
-No session, no clock: a runner hands it what arrives (`handle`, `died`, `control`), asks whether it may go on
-(`may_advance`), lets it go on (`advance`), and publishes what it puts into the outbox. Wall times are passed in.
+No session, no clock: a runner hands it what arrives (`handle`, `handle_death`, `control`), asks whether it may go on
+(`may_advance`), lets it go on (`advance`), and publishes its outbox. Wall times are passed in.
 """
 
-import math
 import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import msgspec
+
 from zsim.contract import keys, messages
+from zsim.contract.fingerprint import fingerprint
+from zsim.contract.messages import ControlAnswer, ControlRequest
 from zsim.errors import RunError
 from zsim.runtime.agent import Output
 from zsim.scenario.on_death import on_death
+from zsim.scenario.rights import WORLD
 from zsim.scenario.scenario import Scenario
-from zsim_world.flight.admission import data_of, warnings
-from zsim_world.flight.barrier import Barrier, Participant
-from zsim_world.flight.control_requests import TimeRequests, brief
-from zsim_world.flight.refusal_log import Refusals
-from zsim_world.flight.run_statistics import Measurements
+from zsim_world.flight.barrier import Barrier, RunParticipant
+from zsim_world.flight.run_clock import Operation, RunClock, number
+from zsim_world.flight.run_outbox import KeyedMessage, Refusal, RunOutbox
+from zsim_world.flight.run_statistics import RunStatistics
 
-Said = tuple[str, Any]  # key and message; or batch.GATE and the Bundle of what the drones say at a gate
+ARGS_BYTES_MAX = 4000  # of arguments that an event repeats as they are; any operation needs far fewer
 
 
-class Hub(ABC):
-    """What a flight and a replay have in common.
+class Coordinator(ABC):
+    """One run, as its participants see it.
 
     Args:
         scenario: resolved.
@@ -37,13 +40,15 @@ class Hub(ABC):
 
     Attributes:
         names: of the drones, in scenario order.
-        also_asked: keys beside `world/control` on which requests are answered, all with a refusal.
-        leaps: how often time was moved otherwise than gate by gate.
-        ended: why the run is over, None while it goes on.
-        diverged: what is to be raised once everybody has been told the end, None for a run that ended well.
+        clock: simulated time.
+        barrier: who takes part.
+        outbox: what is to be published.
+        statistics: of the run so far.
+        refused_queries: keys beside `world/control` on which requests are answered, all with a refusal.
+        diverged: what is to be raised once the end is published, None for a run that ended well.
     """
 
-    also_asked: tuple[str, ...] = ()
+    refused_queries: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -55,31 +60,16 @@ class Hub(ABC):
         expected: list[str],
     ) -> None:
         self.scenario = scenario
-        self.mode = mode
-        self.rate = rate
         self.run_id = run_id or uuid.uuid4().hex[:12]
         self.names = [drone.name for drone in scenario.drones]
-        self.gate_ns = round(scenario.time.gate_ms * 1e6)
-        self.delay_ns = scenario.time.command_delay_gates * self.gate_ns
-        self.last_ns = round(scenario.duration_s * 1e9) // self.gate_ns * self.gate_ns
-        self.outbox: list[Said] = []
-        self.state = "waiting"
-        self.ended: str | None = None
+        self.clock = RunClock(scenario.time, mode, rate)
+        self.outbox = RunOutbox(lambda: self.clock.now_ns)
+        self.barrier = Barrier(self.run_id, self.clock.gate_ns, expected)
+        self.statistics = RunStatistics()
         self.diverged: RunError | None = None
-        self._wall_ns = wall_ns
-        self._start_wall_ns = wall_ns()
-        self.barrier = Barrier(self.run_id, self.gate_ns, expected)
         self._expected = expected
-        self.leaps = self.steps_allowed = 0
-        self._requests = TimeRequests(self)
-        self._measured = Measurements(math.inf)
-        self._refusals = Refusals()
-        self._seq: dict[str, int] = {}
-
-    @property
-    @abstractmethod
-    def now_ns(self) -> int:
-        """Return the newest gate; 0 before the start too."""
+        self._start_wall_ns = wall_ns()
+        self._operations: dict[str, Operation] = self.clock.operations()
 
     @abstractmethod
     def info(self) -> messages.Info:
@@ -91,28 +81,28 @@ class Hub(ABC):
 
     @abstractmethod
     def views(self, seq: int) -> Sequence[Output]:
-        """Return what eyes are shown as of this gate."""
+        """Return the messages of `view/**` as of this gate."""
 
     @abstractmethod
     def result(self) -> dict[str, Any]:
-        """Return what the run measured of itself."""
+        """Return the figures of the run so far."""
 
     @abstractmethod
-    def _command(self, drone: str, kind: str, message: Any) -> bool:
-        """Take a command to a drone; return False for one that has come before."""
+    def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
+        """Take a command to a drone; return False for a duplicate."""
 
-    def _leave_drones(self, name: str) -> None:  # noqa: B027 - where nobody flies, nobody leaves
+    def _release_drones(self, name: str) -> None:  # noqa: B027 - a replay has no commanders
         """Take the drones from a process that flew them and is gone."""
 
     @property
-    def refused(self) -> int:
-        """Return how many messages were refused."""
-        return self._refusals.count
+    def now_ns(self) -> int:
+        """Return the newest gate; 0 before the start too."""
+        return self.clock.now_ns
 
     @property
-    def next_ns(self) -> int:
-        """Return the gate that a newcomer is first waited for."""
-        return 0 if self.state == "waiting" else self.now_ns + self.gate_ns
+    def ended(self) -> str | None:
+        """Return why the run is over, None while it goes on."""
+        return self.clock.ended
 
     # What arrives
 
@@ -120,177 +110,170 @@ class Hub(ABC):
         """Take one message that a participant or anyone else published."""
         kind, name, what = keys.parts(key)
         if kind == "process" and what == "done":
-            self._on_done(name, message, wall_ns)
+            self._handle_done(name, message, wall_ns)
         elif kind == "drone" and what.startswith("cmd/"):
-            self.barrier.received(message.source)
-            if self._command(name, what[4:], message):
-                self._measured.ages.arrived(message.t_ns, wall_ns)
+            self.barrier.count_output(message.source)
+            if self._handle_command(name, what[4:], message):
+                self.statistics.ages.command(message.t_ns, wall_ns)
         elif kind == "process" and what == "join":
-            self._on_join(name, message, wall_ns)
+            self._handle_join(name, message, wall_ns)
         elif kind == "process" and what == "bye":
-            self._on_bye(name, message)
+            self._handle_bye(name, message)
 
-    def output_of(self, source: str) -> None:
+    def count_output(self, source: str) -> None:
         """Count an output (estimate, cluster state) of a participant."""
-        self.barrier.received(source)
+        self.barrier.count_output(source)
 
-    def _on_done(self, name: str, message: messages.Done, wall_ns: int) -> None:
-        reason = self.barrier.done(name, message, self.now_ns, wall_ns)
-        if reason:
-            self.refuse(name, f"process/{name}/done", reason)
+    def _handle_done(self, name: str, message: messages.Done, wall_ns: int) -> None:
+        refusal = self.barrier.done(name, message, self.now_ns, wall_ns)
+        if refusal:
+            self.outbox.refuse(name, f"process/{name}/done", refusal)
 
-    def _on_join(self, name: str, message: messages.Join, wall_ns: int) -> None:
+    def _handle_join(self, name: str, message: messages.Join, wall_ns: int) -> None:
         former, replaced = self.barrier.participants.get(name), self.barrier.replaced(name, message)
-        reason = self.barrier.join(name, message, self.next_ns, wall_ns)
-        if reason:
-            self.refuse(name, f"process/{name}/join", reason)
+        refusal = self.barrier.join(name, message, self.clock.next_ns, wall_ns)
+        if refusal:
+            self.outbox.refuse(name, f"process/{name}/join", refusal)
             return
-        again = former is not None and former.incarnation != message.incarnation
-        kind = ("superseded" if former.alive else "restart") if former and again else "join"
         joined = self.barrier.participants[name]
-        data = data_of(joined, message)
-        if former is not None and again:
-            data["former_pid"] = former.pid
-        self.event(kind, name, f"{name} on {message.host} (pid {message.pid})", source=name, **data)
+        kind, data = "join", joined.entry()
+        if former is not None and former.join.incarnation != message.incarnation:
+            kind, data["former_pid"] = "superseded" if former.alive else "restart", former.join.pid
+        self.outbox.event(kind, name, f"{name} on {message.host} (pid {message.pid})", data, name)
         for dead in replaced:
-            self._leave_drones(dead.name)
-        for warned, text, about in warnings(self.barrier, name, message):
-            self.event(warned, name, text, **about)
+            self._release_drones(dead.name)
+        self._warn_of(joined)
 
-    def _on_bye(self, name: str, message: messages.Bye) -> None:
+    def _warn_of(self, joined: RunParticipant) -> None:
+        """Publish that a newcomer computes with other bits, or does the work of others too."""
+        name, join, own = joined.name, joined.join, fingerprint()
+        if join.fingerprint and join.fingerprint != own:
+            text = f"{name} on {join.host} computes with another numeric fingerprint; the same bits are not promised"
+            self.outbox.event("fingerprint", name, text, {"found": join.fingerprint, "expected": own})
+        for other, both in self.barrier.duplicates(name).items():
+            text = f"{name} and {other} both do the work of {', '.join(sorted(both))}; end one of them"
+            self.outbox.event("doubled", name, text, {"other": other})
+
+    def _handle_bye(self, name: str, message: messages.Bye) -> None:
         participant = self.barrier.remove(name)
-        if participant is not None:
-            self.event("leave", name, f"{name} left: {message.reason}", source=name, reason=message.reason)
-            self._leave_drones(name)
-            if self.state == "waiting":
-                self._expect_again(name, *participant.serves)
-            self._after_leaving(participant, message.reason)
-
-    def _after_leaving(self, participant: Participant, reason: str) -> None:
-        """Do what the leave of a process means for the run."""
-        if participant.role == "recorder" and not self.ended:
-            self.stop(f"the recorder left: {reason}")
-
-    def _fate(self, participant: Participant) -> str:
-        """Return what is to be done when a process has died."""
-        return on_death(self.scenario.processes.on_death, participant.name, participant.role)
-
-    def _expect_again(self, *names: str) -> None:
-        for name in names:
-            if name in self._expected:
-                self.barrier.expect(name)
-
-    def died(self, name: str, wall_ns: int) -> None:
-        """Take the death of a process: its token is gone without a bye."""
-        participant = self.barrier.died(name, wall_ns)
         if participant is None:
             return
-        stand_in = self.barrier.stand_in(name)
-        what = "drop" if stand_in else self._fate(participant)
-        then = f"{stand_in.name} does its work" if stand_in else f"on_death: {what}"
-        text = f"{name} on {participant.host} (pid {participant.pid}) died; {then}"
-        self.event("death", name, text, host=participant.host, pid=participant.pid, on_death=what)
-        if self.mode == "realtime" or what == "drop":
-            self._leave_drones(name)
-        if what == "drop":
-            self.barrier.remove(name)
-        if what == "drop" and stand_in is None:
-            self.event("drop", name, f"{name} is waited for no longer", from_ns=self.now_ns)
-        if what == "end":
-            self.stop(f"{name} died")
+        self.outbox.event("leave", name, f"{name} left: {message.reason}", {"reason": message.reason}, name)
+        self._release_drones(name)
+        if self.clock.state == "waiting":
+            for each in (name, *participant.join.serves):
+                if each in self._expected:
+                    self.barrier.expect(each)
+        self._after_bye(participant, message.reason)
 
-    def refuse(self, source: str, subject: str, reason: str) -> None:
-        """Count a refusal, and tell it while it is not told too often."""
-        text = self._refusals.text(source, subject, reason)
-        if text is not None:
-            self.event("refused", subject, text, source=source, reason=reason)
+    def _after_bye(self, participant: RunParticipant, reason: str) -> None:
+        """Do what the leave of a process means for the run."""
+        if participant.join.role == "recorder":
+            self.clock.stop(f"the recorder left: {reason}")
+
+    def handle_death(self, name: str, wall_ns: int) -> None:
+        """Take the death of a process: its token is gone without a bye."""
+        participant = self.barrier.mark_dead(name, wall_ns)
+        if participant is None:
+            return
+        substitute = self.barrier.substitute(name)
+        action = "drop" if substitute else self._on_death(participant)
+        then = f"{substitute.name} does its work" if substitute else f"on_death: {action}"
+        host, pid = participant.join.host, participant.join.pid
+        data = {"host": host, "pid": pid, "on_death": action}
+        self.outbox.event("death", name, f"{name} on {host} (pid {pid}) died; {then}", data)
+        if self.clock.mode == "realtime" or action == "drop":
+            self._release_drones(name)
+        if action == "drop":
+            self.barrier.remove(name)
+        if action == "drop" and substitute is None:
+            self.outbox.event("drop", name, f"{name} is waited for no longer", {"from_ns": self.now_ns})
+        if action == "end":
+            self.clock.stop(f"{name} died")
+
+    def _on_death(self, participant: RunParticipant) -> str:
+        """Return the action when a process has died."""
+        return on_death(self.scenario.processes.on_death, participant.name, participant.join.role)
 
     # Requests
 
-    def control(self, request: messages.ControlRequest) -> messages.ControlAnswer:
+    def control(self, request: ControlRequest) -> ControlAnswer:
         """Answer a request on `world/control`; every one is an event."""
-        answer = self._requests.answer(request)
+        answer = self._answer(request)
         op, source = request.op[:40], request.source if keys.PROCESS_NAME.fullmatch(request.source) else ""
         text = f"{source or 'somebody'} asks {op}: {'done' if answer.ok else answer.error}"
-        self.event("control", op, text, source=source, args=brief(request.args), ok=answer.ok)
+        self.outbox.event("control", op, text, {"args": _shortened(request.args), "ok": answer.ok}, source)
         return answer
 
-    def refusal_at(self, key: str) -> str | None:
-        """Return why what is asked on one of `also_asked` is refused; None where somebody else answers there."""
-        return f"{key}: is not answered here"
+    def _answer(self, request: ControlRequest) -> ControlAnswer:
+        result = self._perform(request)
+        if isinstance(result, ControlAnswer):
+            return result
+        return ControlAnswer(True) if result is None else ControlAnswer(False, str(result))
 
-    def stop(self, reason: str) -> None:
-        """End the run after the present gate; of several reasons the first is told."""
-        if self.ended is None:
-            self.ended = reason
+    def _perform(self, request: ControlRequest) -> Refusal | ControlAnswer | None:
+        if request.source and not keys.PROCESS_NAME.fullmatch(request.source):
+            return Refusal("source", repr(request.source[:48]), "must be 1 to 48 of a-z 0-9 _ . -")
+        operation = self._operations.get(request.op)
+        if operation is None:
+            return Refusal("op", repr(request.op[:40]), f"must be one of {', '.join([*self._operations, 'replay'])}")
+        return operation(request)
+
+    def refusal_at(self, key: str) -> str | None:
+        """Return why requests on one of `refused_queries` are refused; None where another process answers there."""
+        return f"{key}: is not answered here"
 
     # Time
 
     def may_advance(self) -> bool:
         """Tell whether nothing but pacing keeps the world from the next gate."""
-        if self.ended is not None:
+        clock = self.clock
+        if clock.is_halted:
             return False
-        if self.state == "waiting":
+        if clock.state == "waiting":
             return not self.barrier.absent()
-        if self.state == "paused" and self.steps_allowed == 0:
-            return False
-        return self.mode == "realtime" or not self.barrier.blocking(self.now_ns - self.delay_ns)
+        return clock.mode == "realtime" or not self.barrier.blocking(clock.required_ns)
 
-    def owing(self, ahead_ns: int = 0) -> list[Participant]:
-        """Return who owes a done without which the world cannot go on, or could not after so much more time."""
-        return self.barrier.blocking(self.now_ns - self.delay_ns + ahead_ns)
+    def blocking(self, ahead_ns: int = 0) -> list[RunParticipant]:
+        """Return whose dones are missing for the next gate, or for one that comes so much later."""
+        return self.barrier.blocking(self.clock.required_ns + ahead_ns)
 
     def waiting_for(self, wall_ns: int) -> tuple[messages.Waiting, ...]:
         """Return whom the world waits for now."""
-        if self.mode == "realtime" and self.state != "waiting":
-            return tuple(
-                messages.Waiting(p.name, p.host, (wall_ns - p.since_wall_ns) / 1e9)
-                for p in self.barrier.participants.values()
-                if not p.alive
-            )
-        return self.barrier.waiting_for(self.now_ns - self.delay_ns, wall_ns, self._start_wall_ns)
+        if self.clock.mode == "realtime" and self.clock.state != "waiting":
+            return tuple(p.waiting(wall_ns) for p in self.barrier.participants.values() if not p.alive)
+        return self.barrier.waiting_for(self.clock.required_ns, wall_ns, self._start_wall_ns)
 
-    def missed_own_deadline(self) -> None:
-        """Count a gate that the world itself published more than a gate late."""
-        self._measured.own_misses += 1
+    # Publication
 
-    # What is told
-
-    def tell_clock(self, waiting_for: tuple[messages.Waiting, ...] = ()) -> None:
+    def publish_clock(self, waiting_for: tuple[messages.Waiting, ...] = ()) -> None:
         """Put a `clock` into the outbox."""
         clock = messages.Clock(
             t_ns=self.now_ns,
-            seq=self._next_seq(keys.CLOCK),
+            seq=self.outbox.next_seq(keys.CLOCK),
             run_id=self.run_id,
-            step=self.now_ns // self.gate_ns,
-            state=self.state,  # type: ignore[arg-type]
-            rate=round(self._measured.rate.now(), 3),
+            step=self.now_ns // self.clock.gate_ns,
+            state=self.clock.state,  # type: ignore[arg-type]
+            rate=round(self.statistics.rate.now(), 3),
             waiting_for=waiting_for,
         )
-        self.outbox.append((keys.CLOCK, clock))
+        self.outbox.put(keys.CLOCK, clock)
 
-    def tell_end(self, wall_ns: int) -> None:
-        """Put the last words of the run into the outbox: event `end`, clock `stopped`."""
-        self.ended = self.ended or "ended"
-        self.event("end", "world", self.ended, **self.result())
-        self.state = "stopped"
-        self.tell_clock()
+    def publish_end(self) -> None:
+        """Put the end of the run into the outbox: event `end`, clock `stopped`."""
+        self.clock.stop("ended")
+        self.outbox.event("end", WORLD, self.ended or "", self.result())
+        self.clock.state = "stopped"
+        self.publish_clock()
 
-    def event(self, kind: str, subject: str, text: str, source: str = "world", **data: Any) -> None:
-        """Put an event into the outbox."""
-        self.tell(kind, subject, text, source, data)
-
-    def tell(self, kind: str, subject: str, text: str, source: str, data: dict[str, Any]) -> None:
-        """Put an event with any data into the outbox."""
-        message = messages.Event(self.now_ns, self._next_seq(keys.EVENT), kind, source, subject, text, data)
-        self.outbox.append((keys.EVENT, message))
-
-    def take_outbox(self) -> list[Said]:
+    def take_outbox(self) -> list[KeyedMessage]:
         """Return what is to be published, in order, and forget it."""
-        outbox, self.outbox = self.outbox, []
-        return outbox
+        return self.outbox.take()
 
-    def _next_seq(self, key: str) -> int:
-        count = self._seq.get(key, 0)
-        self._seq[key] = count + 1
-        return count
+
+def _shortened(args: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments for an event: as they are, since a rerun repeats them, or shortened if too long."""
+    if len(msgspec.msgpack.encode(args)) <= ARGS_BYTES_MAX:
+        return args
+    pairs = list(args.items())[:8]
+    return {str(name)[:40]: value if number(value) is not None else str(value)[:80] for name, value in pairs}

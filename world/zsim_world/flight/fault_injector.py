@@ -1,48 +1,54 @@
-"""The injected faults of a run: planned by the scenario or asked for, begun and ended at their gates, and told."""
-
-from __future__ import annotations
+"""The injected faults of a run: planned by the scenario or by requests, begun and ended at their gates, published."""
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
 from zsim.contract import keys
 from zsim.contract.messages import ControlAnswer, ControlRequest, Fault, Faults
-from zsim.runtime.link_faults import KINDS as CARRIED
+from zsim.runtime.link_faults import KINDS as LINK_KINDS
 from zsim.scenario import fault_kinds
 from zsim.scenario.fault_check import Known, flaws
 from zsim.scenario.fault_kinds import PROCESS_KILL
-from zsim.scenario.scenario import FAULTS_MAX
+from zsim.scenario.rights import WORLD
+from zsim.scenario.scenario import FAULTS_MAX, Scenario
 from zsim.schema.checker import show
-
-if TYPE_CHECKING:
-    from zsim_world.flight.world import World
+from zsim_world.fleet.fault_effects import Impairment
+from zsim_world.flight.barrier import Barrier
+from zsim_world.flight.run_clock import Operation, RunClock
+from zsim_world.flight.run_outbox import Refusal, RunOutbox
 
 NEVER_NS = 2**63 - 1  # a gate that does not come
 SELECTORS = ("id", "target", "kind")
 
 
-class FaultDesk:
-    """Keeps the faults, and lets the fleet feel them.
+class FaultInjector:
+    """Keeps the faults, and lets them act on the fleet.
 
-    One that is asked for begins with the gate that is integrated next: nobody can have worked on that yet, so a run
+    One that is requested begins with the gate that is integrated next: nobody can have worked on that yet, so a run
     with the same faults at the same instants gives the same bits.
+
+    Args:
+        effects: of faults on the fleet.
     """
 
-    def __init__(self, world: World) -> None:
-        self._world = world
+    def __init__(
+        self, scenario: Scenario, clock: RunClock, barrier: Barrier, outbox: RunOutbox, effects: Impairment
+    ) -> None:
+        self._scenario, self._clock, self._barrier, self._outbox = scenario, clock, barrier, outbox
+        self._effects = effects
         self._faults: dict[int, Fault] = {}
         self._begun: set[int] = set()
         self._over: set[int] = set()  # ended or cleared, kept for those who still work on gates in which it acted
-        self._count = self._lists = 0
-        self._carried: tuple[Fault, ...] = ()
-        self._carried_at: dict[int, tuple[Fault, ...]] = {}  # by gate, since the last change or integrated gate
-        for given in world.scenario.faults:
-            self._plan(given, "scenario")
+        self._count = self._seq = 0
+        self._of_links: tuple[Fault, ...] = ()
+        self._of_links_at: dict[int, tuple[Fault, ...]] = {}  # by gate, since the last change or integrated gate
+        for planned in scenario.faults:
+            self._plan(planned, "scenario")
         self._next_ns = self._next_change_ns()
-        self._tell()
+        self._publish()
 
     @property
     def all(self) -> tuple[Fault, ...]:
@@ -53,62 +59,62 @@ class FaultDesk:
         """Return the faults that act in a gate."""
         return [fault for fault in self.all if fault_kinds.acts(fault, gate_ns)]
 
-    def carried(self, gate_ns: int) -> tuple[Fault, ...]:
-        """Return the faults of links and radios that act in a gate; asked for at every command."""
-        if not self._carried:
+    def of_links(self, gate_ns: int) -> tuple[Fault, ...]:
+        """Return the faults of links and radios that act in a gate; used for every command."""
+        if not self._of_links:
             return ()
-        there = self._carried_at.get(gate_ns)
-        if there is None:
-            there = tuple(fault for fault in self._carried if fault_kinds.acts(fault, gate_ns))
-            self._carried_at[gate_ns] = there
-        return there
+        acting = self._of_links_at.get(gate_ns)
+        if acting is None:
+            acting = tuple(fault for fault in self._of_links if fault_kinds.acts(fault, gate_ns))
+            self._of_links_at[gate_ns] = acting
+        return acting
 
     # Time
 
     def apply(self, now_ns: int) -> None:
-        """Let begin and end what does so at now_ns, before the gate after it is integrated."""
-        impairment, next_ns = self._world.fleet.impairment, now_ns + self._world.gate_ns
-        self._carried_at.clear()
+        """Begin and end what does so at now_ns, before the gate after it is integrated."""
+        next_ns = now_ns + self._clock.gate_ns
+        self._of_links_at.clear()
         if now_ns >= self._next_ns:
-            self._turn(now_ns)
-            impairment.strike(self.acting(next_ns))
-        impairment.blow(now_ns, next_ns)
+            self._begin_and_end(now_ns)
+            self._effects.strike(self.acting(next_ns))
+        self._effects.blow(now_ns, next_ns)
 
-    def _turn(self, now_ns: int) -> None:
+    def _begin_and_end(self, now_ns: int) -> None:
         for fault in self.all:
             if fault.id not in self._begun and fault.from_ns <= now_ns:
                 self._begun.add(fault.id)
-                self._event("fault", fault, f"{fault.kind} of {fault.target}{self._beginning(fault)}")
+                self._event("fault", fault, self._beginning(fault))
             if fault.id not in self._over and _end_ns(fault) <= now_ns:
                 self._over.add(fault.id)
-                if not _at_once(fault):
-                    self._event("fault_end", fault, f"{fault.kind} of {fault.target} is over")
-        self._forget(now_ns)
+                if not _is_instant(fault):
+                    self._event("fault_end", fault, "is over")
+        self._remove_past(now_ns)
         self._next_ns = self._next_change_ns()
 
     def _beginning(self, fault: Fault) -> str:
-        """Return in words how a fault begins."""
-        if not _at_once(fault):
-            return " begins"
-        deaf = self._deaf(fault.target)
-        return f", which goes on: it {deaf}" if deaf else ""
+        """Return what the event of its beginning says of a fault."""
+        if not _is_instant(fault):
+            return "begins"
+        immune = self._immunity(fault.target)
+        return f"has no effect: the process {immune}" if immune else ""
 
-    def _deaf(self, process: str) -> str | None:
-        """Return why a process that takes part does not die when a fault wants it; None if it does."""
-        participant = self._world.barrier.participants.get(process)
+    def _immunity(self, process: str) -> str | None:
+        """Return why a process that takes part cannot be killed by a fault; None if it can."""
+        participant = self._barrier.participants.get(process)
         if participant is None:
             return None  # one that is not here yet, or whose work another does
         if not participant.gating:
             return "takes no part in the lockstep"
-        return None if participant.fingerprint else "does not run on zsim.runtime.runner"
+        return None if participant.join.fingerprint else "does not run on zsim.runtime.runner"
 
     def _late_ns(self) -> int:
-        """Return how far behind the newest gate somebody may still work: the commands' delay, and a step of his."""
-        periods = (p.period_ns for p in self._world.barrier.participants.values())
-        return self._world.delay_ns + max(periods, default=0)
+        """Return how far behind the newest gate a process may still work: the command delay and one period."""
+        periods = (p.join.period_ns for p in self._barrier.participants.values())
+        return self._clock.delay_ns + max(periods, default=0)
 
-    def _forget(self, now_ns: int) -> None:
-        """Leave out what ended before any gate that somebody may still work on."""
+    def _remove_past(self, now_ns: int) -> None:
+        """Remove what ended before any gate that a process may still work on."""
         late_ns = self._late_ns()
         past = [fault.id for fault in self.all if _end_ns(fault) + late_ns <= now_ns]
         for number in past:
@@ -116,7 +122,7 @@ class FaultDesk:
         self._begun.difference_update(past)
         self._over.difference_update(past)
         if past:
-            self._tell()
+            self._publish()
 
     def _next_change_ns(self) -> int:
         changes, late_ns = [NEVER_NS], self._late_ns()
@@ -128,86 +134,90 @@ class FaultDesk:
 
     # Requests
 
-    def add(self, request: ControlRequest) -> ControlAnswer:
-        """Plan a fault, or say why not."""
-        given = {name: value for name, value in request.args.items() if value is not None}
-        flaw = self._first_flaw(given)
-        if flaw:
-            return ControlAnswer(False, flaw)
-        fault = self._plan(given, request.source)
-        self._tell()
+    def operations(self) -> dict[str, Operation]:
+        """Return what each `op` on `world/control` that is about faults does."""
+        return {"fault_add": self._add, "fault_clear": self._clear}
+
+    def _add(self, request: ControlRequest) -> ControlAnswer:
+        args = _given(request)
+        refusal = self._refusal(args)
+        if refusal:
+            return ControlAnswer(False, str(refusal))
+        fault = self._plan(args, request.source)
+        self._publish()
         self._next_ns = self._next_change_ns()
         return ControlAnswer(True, result={"id": fault.id, "from_ns": fault.from_ns, "until_ns": fault.until_ns})
 
-    def clear(self, request: ControlRequest) -> ControlAnswer:
-        """End the faults of an id, a target or a kind, or all; or say why not."""
-        args = {name: value for name, value in request.args.items() if value is not None}
+    def _clear(self, request: ControlRequest) -> ControlAnswer | Refusal:
+        """End the faults of an id, a target or a kind, or all."""
+        args = _given(request)
         unknown = [name for name in args if name not in SELECTORS]
         if unknown:
-            return ControlAnswer(False, f"{unknown[0][:40]} is not known; allowed: {', '.join(SELECTORS)}, or nothing")
-        there = [fault for fault in self.all if fault.id not in self._over]
+            return Refusal(unknown[0][:40], "not known", f"allowed: {', '.join(SELECTORS)}, or nothing")
+        selected = [fault for fault in self.all if fault.id not in self._over]
         for name, value in args.items():
-            chosen = [fault for fault in there if getattr(fault, name) == value]
-            if not chosen:
-                allowed = (
-                    ", ".join(dict.fromkeys(str(getattr(fault, name)) for fault in there)) or "left out: there is none"
-                )
-                return ControlAnswer(False, f"{name} is {show(value)}; must be {'one of ' if there else ''}{allowed}")
-            there = chosen
-        for fault in there:
-            self._clear(fault, request.source)
-        if there:
-            self._tell()
-            self._next_ns = 0  # the fleet feels it before the next gate
-        return ControlAnswer(True, result={"cleared": [fault.id for fault in there]})
+            matching = [fault for fault in selected if getattr(fault, name) == value]
+            if not matching:
+                values = dict.fromkeys(str(getattr(fault, name)) for fault in selected)
+                allowed = f"one of {', '.join(values)}" if values else "left out: there is none"
+                return Refusal(name, show(value), f"must be {allowed}")
+            selected = matching
+        for fault in selected:
+            self._end(fault, request.source)
+        if selected:
+            self._publish()
+            self._next_ns = 0  # it takes effect before the next gate
+        return ControlAnswer(True, result={"cleared": [fault.id for fault in selected]})
 
-    def _clear(self, fault: Fault, source: str) -> None:
-        now_ns = self._world.now_ns
+    def _end(self, fault: Fault, source: str) -> None:
         if fault.id in self._begun:
-            fault = msgspec.structs.replace(fault, until_ns=now_ns)
+            fault = msgspec.structs.replace(fault, until_ns=self._clock.now_ns)
             self._faults[fault.id] = fault
             self._over.add(fault.id)
         else:
             del self._faults[fault.id]
-        self._event("fault_clear", fault, f"{fault.kind} of {fault.target} is cleared", source)
+        self._event("fault_clear", fault, "is cleared", source)
 
-    def _first_flaw(self, given: Mapping[str, Any]) -> str | None:
-        world = self._world
-        clusters = tuple(cluster.name for cluster in world.scenario.clusters)
-        gating = (p.name for p in world.barrier.participants.values() if p.gating)
-        known = Known(tuple(world.names), clusters, (*world.scenario.expected(), *gating))
-        path, text = next(flaws(given, known), ("", ""))
-        if text:
+    def _refusal(self, args: Mapping[str, Any]) -> Refusal | str | None:
+        """Return the first reason against a fault."""
+        scenario = self._scenario
+        drones = tuple(drone.name for drone in scenario.drones)
+        clusters = tuple(cluster.name for cluster in scenario.clusters)
+        gating = (p.name for p in self._barrier.participants.values() if p.gating)
+        for path, text in flaws(args, Known(drones, clusters, (*scenario.expected(), *gating))):
             return f"{path or 'args'} {text}"
-        deaf = self._deaf(given["target"]) if given["kind"] == PROCESS_KILL else None
-        if deaf:
-            return f"target is {show(given['target'])}, which {deaf}; must be one that dies by it ({PROCESS_KILL})"
-        at_s, now_s = given.get("at_s"), world.now_ns / 1e9
+        immune = self._immunity(args["target"]) if args["kind"] == PROCESS_KILL else None
+        if immune:
+            allowed = f"must be a process that a kill ends ({PROCESS_KILL})"
+            return Refusal("target", f"{show(args['target'])}, which {immune}", allowed)
+        return self._time_refusal(args.get("at_s"))
+
+    def _time_refusal(self, at_s: float | None) -> Refusal | None:
+        now_s, end_s = self._clock.now_ns / 1e9, self._scenario.duration_s
         if at_s is not None and at_s < now_s:
-            return f"at_s is {at_s:g}; must be >= {now_s:g}, the present, or left out"
-        if at_s is not None and at_s >= world.scenario.duration_s:
-            return f"at_s is {at_s:g}; must be < {world.scenario.duration_s:g}, the end of the run"
+            return Refusal("at_s", f"{at_s:g}", f"must be >= {now_s:g}, the present, or left out")
+        if at_s is not None and at_s >= end_s:
+            return Refusal("at_s", f"{at_s:g}", f"must be < {end_s:g}, the end of the run")
         if len(self._faults) >= FAULTS_MAX:
-            return f"{len(self._faults)} faults are planned or act; must be at most {FAULTS_MAX}, so clear some"
+            allowed = f"must be at most {FAULTS_MAX}, so clear some"
+            return Refusal("the number of faults that are planned or act", str(len(self._faults)), allowed)
         return None
 
-    def _plan(self, given: Mapping[str, Any], source: str) -> Fault:
+    def _plan(self, args: Mapping[str, Any], source: str) -> Fault:
         self._count += 1
-        world = self._world
-        fault = fault_kinds.planned(given, self._count, source, world.now_ns, world.gate_ns)
+        fault = fault_kinds.planned(args, self._count, source, self._clock.now_ns, self._clock.gate_ns)
         self._faults[fault.id] = fault
         return fault
 
-    # What is said
+    # Publication
 
-    def _tell(self) -> None:
-        """Put the list into the outbox, before the next gate."""
+    def _publish(self) -> None:
+        """Publish the list, before the next gate."""
         self._rank()
-        self._carried = tuple(fault for fault in self.all if fault.kind in CARRIED)
-        self._carried_at.clear()
-        world, seq = self._world, self._lists
-        self._lists += 1
-        world.outbox.append((keys.FAULTS, Faults(world.now_ns, seq, self.all)))
+        self._of_links = tuple(fault for fault in self.all if fault.kind in LINK_KINDS)
+        self._of_links_at.clear()
+        self._outbox.put(keys.FAULTS, Faults(self._clock.now_ns, self._seq, self.all))
+        self._seq += 1
 
     def _rank(self) -> None:
         """Number those that are equal but for their end, and have not begun: they begin together."""
@@ -215,16 +225,21 @@ class FaultDesk:
         for fault in self.all:
             if fault.id in self._begun:
                 continue
-            what = (fault.kind, fault.target, fault.from_ns)
-            if fault.rank != equal[what]:
-                self._faults[fault.id] = msgspec.structs.replace(fault, rank=equal[what])
-            equal[what] += 1
+            start = (fault.kind, fault.target, fault.from_ns)
+            if fault.rank != equal[start]:
+                self._faults[fault.id] = msgspec.structs.replace(fault, rank=equal[start])
+            equal[start] += 1
 
-    def _event(self, kind: str, fault: Fault, text: str, source: str = "world") -> None:
-        self._world.tell(kind, fault.target, text, source, msgspec.structs.asdict(fault))
+    def _event(self, kind: str, fault: Fault, state: str, source: str = WORLD) -> None:
+        text = f"{fault.kind} of {fault.target} {state}".rstrip()
+        self._outbox.event(kind, fault.target, text, msgspec.structs.asdict(fault), source)
 
 
-def _at_once(fault: Fault) -> bool:
+def _given(request: ControlRequest) -> dict[str, Any]:
+    return {name: value for name, value in request.args.items() if value is not None}
+
+
+def _is_instant(fault: Fault) -> bool:
     """Tell whether a fault is over as soon as it has begun."""
     return fault_kinds.KINDS[fault.kind].lasts == "once"
 

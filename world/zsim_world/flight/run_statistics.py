@@ -1,4 +1,4 @@
-"""What a run measures of itself: rate, command age, deadline misses, how near drones came to each other."""
+"""Statistics of a run: real-time factor, age of commands, deadline misses, least distance between drones."""
 
 import math
 from array import array
@@ -8,32 +8,32 @@ from typing import Any
 
 import numpy as np
 
-from zsim_world.flight.barrier import Participant
+from zsim_world.flight.barrier import RunParticipant
 
 GATES_KEPT = 256  # gates whose publication time is remembered for the age of commands; 5 s, older ones are refused
-AGES_KEPT = 1_000_000  # ages kept for the percentiles; 8 MB
+AGES_KEPT = 1_000_000  # for the percentiles; 8 MB
 MARK_NS = 10_000_000  # wall time between two marks of the rate, which looks back over a second
 
 
-class Ages:
+class CommandAges:
     """Wall time from a gate's publication to the arrival of a command that answers it."""
 
     def __init__(self) -> None:
         self._published: dict[int, int] = {}
         self._ages_ns = array("q")
-        self._oldest = 0  # place of the oldest age once so many are kept
+        self._oldest = 0  # index of the oldest age once so many are kept
 
-    def published(self, t_ns: int, wall_ns: int) -> None:
+    def gate(self, t_ns: int, wall_ns: int) -> None:
         """Note when the gate t_ns was published."""
         self._published[t_ns] = wall_ns
         if len(self._published) > GATES_KEPT:
             del self._published[next(iter(self._published))]
 
-    def arrived(self, t_ns: int, wall_ns: int) -> None:
+    def command(self, t_ns: int, wall_ns: int) -> None:
         """Note when a command stamped t_ns arrived; its age is unknown where no gate of that stamp is remembered."""
-        published = self._published.get(t_ns)
-        if published is not None:
-            self._keep(wall_ns - published)
+        published_wall_ns = self._published.get(t_ns)
+        if published_wall_ns is not None:
+            self._keep(wall_ns - published_wall_ns)
 
     def _keep(self, age_ns: int) -> None:
         if len(self._ages_ns) < AGES_KEPT:
@@ -51,7 +51,7 @@ class Ages:
         return {"p50": float(p50), "p99": float(p99), "max": float(ages.max())}
 
 
-class Rate:
+class RealTimeFactor:
     """Simulated per wall seconds, over the last wall second and over the run."""
 
     def __init__(self) -> None:
@@ -72,8 +72,8 @@ class Rate:
         if not marks or wall_ns - marks[-1][1] >= MARK_NS:
             marks.append(self._last)
 
-    def leap(self) -> None:
-        """Note that simulated time leaps to the next gate: it does not pass."""
+    def jump(self) -> None:
+        """Note that simulated time jumps to the next gate: it does not pass."""
         self._marks.clear()
 
     def now(self) -> float:
@@ -92,38 +92,38 @@ class Rate:
         return 0.0 if self._start_wall_ns is None else (self._last[1] - self._start_wall_ns) / 1e9
 
 
-class Measurements:
-    """All that a run tells of itself at its end.
+class RunStatistics:
+    """All figures of a run that its event `end` gives.
 
     Attributes:
-        own_misses: gates that the world itself published too late.
+        world_misses: gates that the world itself published too late.
         closest_m: least distance between two drones so far, standing ones too [m]; inf for a single one.
     """
 
-    def __init__(self, closest_m: float) -> None:
-        self.ages = Ages()
-        self.rate = Rate()
-        self.own_misses = 0
-        self.closest_m = closest_m
-        self._deadlines = 0
+    def __init__(self) -> None:
+        self.ages = CommandAges()
+        self.rate = RealTimeFactor()
+        self.world_misses = 0
+        self.closest_m = math.inf
+        self._deadline_count = 0
 
     def gate(self, t_ns: int, wall_ns: int) -> None:
         """Note when the gate t_ns was published."""
-        self.ages.published(t_ns, wall_ns)
+        self.ages.gate(t_ns, wall_ns)
         self.rate.gate(t_ns, wall_ns)
 
-    def apart(self, closest_m: float) -> None:
+    def separation(self, closest_m: float) -> None:
         """Note the least distance between two drones in a gate [m]."""
         self.closest_m = min(self.closest_m, closest_m)
 
-    def deadlines_of(self, participants: Iterable[Participant], need_ns: int) -> None:
+    def deadlines(self, participants: Iterable[RunParticipant], need_ns: int) -> None:
         """Count whose done for need_ns was due, and whose is missing."""
         for participant in participants:
             if participant.required_ns(need_ns) is not None:
-                self._deadlines += 1
-                participant.deadline_misses += participant.owes(need_ns)
+                self._deadline_count += 1
+                participant.deadline_misses += participant.blocks(need_ns)
 
-    def result(self, participants: Iterable[Participant]) -> dict[str, Any]:
+    def result(self, participants: Iterable[RunParticipant]) -> dict[str, Any]:
         """Return the figures of the run as far as it got."""
         by_name = {p.name: p.deadline_misses for p in participants if p.gating}
         sim_s, wall_s = self.rate.sim_s, self.rate.wall_s
@@ -131,9 +131,9 @@ class Measurements:
             "sim_s": sim_s,
             "wall_s": wall_s,
             "real_time_factor": sim_s / wall_s if wall_s > 0 else 0.0,
-            "deadlines": self._deadlines,
-            "deadline_misses": sum(by_name.values()) + self.own_misses,
-            "deadline_misses_by": {**by_name, "world": self.own_misses},
+            "deadlines": self._deadline_count,
+            "deadline_misses": sum(by_name.values()) + self.world_misses,
+            "deadline_misses_by": {**by_name, "world": self.world_misses},
             "command_age_ms": self.ages.summary_ms(),
             "closest_m": self.closest_m if math.isfinite(self.closest_m) else None,
         }

@@ -1,4 +1,4 @@
-"""The world of a run: integrates all drones, owns simulated time, judges commands. No session, no clock.
+"""The world of a run: integrates all drones, owns simulated time, applies commands and faults. No session, no clock.
 
 What it shares with a replay, first of all who takes part and who is waited for, is in `zsim_world.flight.coordinator`.
 """
@@ -15,14 +15,13 @@ from zsim.scenario.scenario import Scenario
 from zsim_world.fleet.fleet import DivergedError, Fleet
 from zsim_world.fleet.publication import Publication
 from zsim_world.fleet.truth_hash import TruthHash
-from zsim_world.flight.command_intake import CommandDesk
-from zsim_world.flight.commander import Commanders
-from zsim_world.flight.control_requests import Requests
-from zsim_world.flight.coordinator import Hub
-from zsim_world.flight.fault_injector import FaultDesk
+from zsim_world.flight.command_intake import CommandIntake
+from zsim_world.flight.command_queue import CommandQueue
+from zsim_world.flight.coordinator import Coordinator
+from zsim_world.flight.fault_injector import FaultInjector
 
 
-class World(Hub):
+class World(Coordinator):
     """One run.
 
     Args:
@@ -33,9 +32,10 @@ class World(Hub):
         run_id: given by a launcher, and by tests that compare records.
 
     Attributes:
+        fleet: the drones.
+        queue: of the commands, with the commander of each drone.
         faults: that are injected.
-        ended: why the run is over, None while it goes on.
-        diverged: what is to be raised once everybody has been told the end, None for a state that stayed finite.
+        diverged: what is to be raised once the end is published, None for a state that stayed finite.
     """
 
     def __init__(
@@ -47,20 +47,16 @@ class World(Hub):
         run_id: str | None = None,
     ) -> None:
         super().__init__(scenario, mode, rate, wall_ns, run_id, scenario.expected())
+        clock, barrier, outbox = self.clock, self.barrier, self.outbox
         self.fleet = Fleet(scenario)
+        self.queue = CommandQueue(self.names)
+        self.faults = FaultInjector(scenario, clock, barrier, outbox, self.fleet.impairment)
+        self._intake = CommandIntake(scenario, clock, barrier, outbox, self.queue, self.fleet, self.faults.of_links)
+        self._operations |= {**self._intake.operations(), **self.faults.operations()}
         self._publication = Publication(self.fleet)
-        self.index = {name: i for i, name in enumerate(self.names)}
-        self.commanders = Commanders(self.names)
-        self.faults = FaultDesk(self)
-        self._desk = CommandDesk(self)
-        self._requests = Requests(self)
         self._hash = TruthHash(self.fleet.count)
-        self._measured.apart(self.fleet.closest_m())
-
-    @property
-    def now_ns(self) -> int:
-        """Return the newest gate; 0 before the start too."""
-        return self.fleet.t_ns
+        self._last_ns = round(scenario.duration_s * 1e9) // clock.gate_ns * clock.gate_ns
+        self.statistics.separation(self.fleet.closest_m())
 
     def info(self) -> messages.Info:
         """Return the message of `world/info`."""
@@ -72,11 +68,11 @@ class World(Hub):
             contract=CONTRACT,
             run_id=self.run_id,
             federation=s.federation,
-            mode="lockstep" if self.mode == "lockstep" else "realtime",
-            rate=self.rate,
-            gate_ns=self.gate_ns,
+            mode="lockstep" if self.clock.mode == "lockstep" else "realtime",
+            rate=self.clock.rate,
+            gate_ns=self.clock.gate_ns,
             physics_dt_ns=round(s.time.physics_dt_ms * 1e6),
-            command_delay_ns=self.delay_ns,
+            command_delay_ns=self.clock.delay_ns,
             seed=s.seed,
             origin=messages.Origin(env.latitude_deg, env.longitude_deg, env.height_m),
             drones=tuple(messages.DroneInfo(d.name, d.model) for d in s.drones),
@@ -89,13 +85,11 @@ class World(Hub):
 
     # What arrives
 
-    def _command(self, drone: str, kind: str, message: Any) -> bool:
-        return self._desk.take(drone, kind, message)
+    def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
+        return self._intake.accept(drone, kind, message)
 
-    def _leave_drones(self, name: str) -> None:
-        for drone in self.commanders.gone(name):
-            self.fleet.release(drone)
-            self.event("release", self.fleet.names[drone], f"{name} flies it no longer", source=name)
+    def _release_drones(self, name: str) -> None:
+        self._intake.release_all(name)
 
     # Time
 
@@ -104,53 +98,53 @@ class World(Hub):
 
         A state that is no longer finite ends the run at the gate before; see `diverged`.
         """
-        if self.state == "waiting":
-            self.state = "running"
+        if self.clock.state == "waiting":
+            self.clock.start(self.fleet.t_ns)
         elif not self._integrate():
             return
         self._publish_gate(wall_ns)
-        if self.now_ns >= self.last_ns:
-            self.stop("the scenario's duration is over")
+        if self.now_ns >= self._last_ns:
+            self.clock.stop("the scenario's duration is over")
 
     def _integrate(self) -> bool:
         """Integrate one gate; return whether the state is still finite."""
-        if self.mode == "realtime":
-            self._measured.deadlines_of(self.barrier.participants.values(), self.now_ns - self.delay_ns)
-        self._desk.apply(self.now_ns)
+        if self.clock.mode == "realtime":
+            self.statistics.deadlines(self.barrier.participants.values(), self.clock.required_ns)
+        self._intake.apply(self.now_ns)
         self.faults.apply(self.now_ns)
         try:
             self.fleet.advance()
         except DivergedError as error:
             self.diverged = error
-            self.event("diverged", error.drone, str(error))
-            self.stop(str(error))
+            self.outbox.event("diverged", error.drone, str(error))
+            self.clock.stop(str(error))
             return False
-        self.steps_allowed = max(0, self.steps_allowed - 1)
-        self._measured.apart(self.fleet.closest_m())
-        self._tell_collisions()
+        self.clock.advance(self.fleet.t_ns)
+        self.statistics.separation(self.fleet.closest_m())
+        self._publish_collisions()
         return True
 
-    def _tell_collisions(self) -> None:
+    def _publish_collisions(self) -> None:
         for i, j in self.fleet.collisions():
-            pair = f"{self.fleet.names[i]} and {self.fleet.names[j]}"
-            self.event("collision", self.fleet.names[i], f"{pair} collide", other=self.fleet.names[j])
+            name, other = self.names[i], self.names[j]
+            self.outbox.event("collision", name, f"{name} and {other} collide", {"other": other})
         for i, m in self.fleet.bumps():
-            name, other = self.fleet.names[i], self.scenario.environment.obstacles[m].name
-            self.event("collision", name, f"{name} runs into {other}", other=other)
+            name, other = self.names[i], self.scenario.environment.obstacles[m].name
+            self.outbox.event("collision", name, f"{name} runs into {other}", {"other": other})
 
     def _publish_gate(self, wall_ns: int) -> None:
         self._hash.add(self.now_ns, self.fleet.bodies.state)
-        self.outbox.append((batch.GATE, self._publication.gate(self.commanders.holders())))
-        self._measured.gate(self.now_ns, wall_ns)
-        self.tell_clock()
+        self.outbox.put(batch.GATE, self._publication.gate(self.queue.commanders()))
+        self.statistics.gate(self.now_ns, wall_ns)
+        self.publish_clock()
 
     def result(self) -> dict[str, Any]:
-        """Return what the run measured of itself."""
+        """Return the figures of the run so far."""
         return {
             "reason": self.ended,
             "last_ns": self.now_ns,
-            **self._measured.result(self.barrier.participants.values()),
-            "refused": self.refused,
+            **self.statistics.result(self.barrier.participants.values()),
+            "refused": self.outbox.refusals.count,
             "truth_sha256": self._hash.hexdigest(),
         }
 
@@ -158,10 +152,10 @@ class World(Hub):
         return [Output(keys.VIEW_DRONES, self.view(seq))]
 
     def view(self, seq: int) -> messages.ViewDrones:
-        """Return the compact state for eyes."""
+        """Return the compact state of all drones."""
         truth = self.fleet.truth()
-        drones, commanders = [], self.commanders.holders()
-        for i, name in enumerate(self.fleet.names):
+        drones, commanders = [], self.queue.commanders()
+        for i, name in enumerate(self.names):
             state, battery_percent, _ = self.fleet.status(i)
             pose = (tuple(truth.position_m[i].tolist()), tuple(truth.orientation_wxyz[i].tolist()))
             rotors = tuple(truth.rotor_rad_s[i].tolist())

@@ -1,4 +1,4 @@
-"""What eyes are shown of a replay: made of the last values of truth, status, estimate and state. Pure."""
+"""The messages `view/**` of a replay, made of the last values of truth, status, estimate and state. Pure."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,7 +10,7 @@ from zsim.errors import DecodeError
 from zsim.runtime.agent import Output
 
 
-class Views:
+class PlaybackViews:
     """Makes `view/**` of what a record has.
 
     Args:
@@ -25,13 +25,13 @@ class Views:
         ) | {keys.VIEW_DRONES, *map(keys.cluster_state, clusters)}
         """Keys whose last values are needed."""
 
-    def made(self, last: Mapping[str, bytes], t_ns: int, seq: int) -> Iterator[Output]:
+    def views(self, last: Mapping[str, bytes], t_ns: int, seq: int) -> Iterator[Output]:
         """Yield the views of the gate t_ns, as far as the last values go."""
-        shown = tuple(self._drone_views(last))
-        if shown:
+        drones = tuple(self._drone_views(last))
+        if drones:
             wind = _read(last, keys.VIEW_DRONES)
-            known = wind.wind_m_s if wind is not None and len(wind.wind_m_s) == len(shown) else ()
-            yield Output(keys.VIEW_DRONES, messages.ViewDrones(t_ns, seq, shown, known))
+            wind_m_s = wind.wind_m_s if wind is not None and len(wind.wind_m_s) == len(drones) else ()
+            yield Output(keys.VIEW_DRONES, messages.ViewDrones(t_ns, seq, drones, wind_m_s))
         for cluster in self._clusters:
             state = _read(last, keys.cluster_state(cluster))
             if state is not None:
@@ -48,12 +48,12 @@ class Views:
 
     def _estimates(self, last: Mapping[str, bytes]) -> dict[str, list[messages.EstimateView]]:
         """Return the estimates by the estimator of each drone."""
-        found: defaultdict[str, list[messages.EstimateView]] = defaultdict(list)
+        estimates: defaultdict[str, list[messages.EstimateView]] = defaultdict(list)
         for drone in self._drones:
             estimate = _read(last, keys.estimate(drone))
             if estimate is not None:
-                found[f"estimator.{drone}"].append(estimate_view(drone, estimate))
-        return found
+                estimates[f"estimator.{drone}"].append(estimate_view(drone, estimate))
+        return estimates
 
 
 def _read(last: Mapping[str, bytes], key: str) -> Any:

@@ -1,91 +1,105 @@
-"""Who has died: the news that tokens went, looked at again before it is believed."""
+"""Who has died: lost liveliness tokens, checked again before they are believed, and readers that fell silent."""
 
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
 from zsim.contract import keys
 from zsim.contract.messages import Join
 from zsim.transport.session import Session
-from zsim_world.flight.coordinator import Hub
+from zsim_world.flight.barrier import Barrier
 
-BYE_NS = 100_000_000  # wall time by which a bye may come after the news that the token of its process went
+BYE_NS = 100_000_000  # wall time by which a bye may come after the loss of its process's token
 NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
-LOOK_S = 1.0  # a router answers which tokens it knows within milliseconds
+TOKENS_S = 1.0  # a router answers which tokens it knows within milliseconds
 SILENT_S = 10  # seconds of health in a row that one that only reads may leave out; its link is given up after as many
 
 
-class Doubt(NamedTuple):
-    """When to look again at a process whose token seemed to go, and whether once more after that."""
+class _Check(NamedTuple):
+    """When to check a process whose token seems lost, and whether once more after that."""
 
     due_ns: int
     again: bool = True
 
 
-class Deaths:
-    """Judges whose token seemed to go.
+class LivelinessMonitor:
+    """Finds out which participants have died.
 
     Args:
-        link: of the hub.
-        world: told of deaths.
+        link: the listening session.
+        barrier: who takes part.
+        handle_death: called with name and wall time of each death.
         take_in: reads what has arrived; a bye may be among it.
     """
 
-    def __init__(self, link: Session, world: Hub, take_in: Callable[[], None]) -> None:
+    def __init__(
+        self, link: Session, barrier: Barrier, handle_death: Callable[[str, int], None], take_in: Callable[[], None]
+    ) -> None:
         self._link = link
-        self._world = world
+        self._participants = barrier.participants
+        self._handle_death = handle_death
         self._take_in = take_in
-        self._doubted: dict[str, Doubt] = {}
-        self._silent_s: dict[str, int] = {}  # of those that tell of their health
+        self._lost: deque[str] = deque()  # news of other threads: whose token seems lost
+        self._checks: dict[str, _Check] = {}
+        self._silent_s: dict[str, int] = {}  # of those that publish their health
 
-    def heard(self, name: str) -> None:
-        """Take the news that a process told of its health."""
+    def token_lost(self, name: str) -> None:
+        """Take the news that a token went, from any thread: its process is not dead yet, its bye may come after it."""
+        self._lost.append(name)
+
+    def health_received(self, name: str) -> None:
+        """Note that a process has published its health."""
         self._silent_s[name] = 0
 
-    def second(self) -> None:
+    def count_second(self) -> None:
         """Count a second in which the world itself ran.
 
-        Who only reads and tells nothing for long is dead: it may be stopped, and Zenoh does not always tell that it has
-        closed the full link of one that takes nothing. For one that gates time stands, and somebody looks.
+        Who only reads and publishes nothing for long is dead: it may be stopped, and Zenoh does not always notice that
+        it has closed the full link of one that takes nothing. For one that gates, time stands, and `clock` names it.
         """
         for name in list(self._silent_s):
-            participant = self._world.barrier.participants.get(name)
+            participant = self._participants.get(name)
             if participant is None or not participant.alive or participant.gating:
                 del self._silent_s[name]
                 continue
             self._silent_s[name] += 1
             if self._silent_s[name] > SILENT_S:
-                self._world.died(name, time.monotonic_ns())
+                self._handle_death(name, time.monotonic_ns())
 
-    def suspect(self, name: str) -> None:
-        """Take the news that a token went: its process is not dead yet, since its bye may come after it."""
-        participant = self._world.barrier.participants.get(name)
-        if participant and participant.alive:
-            self._doubted[name] = Doubt(time.monotonic_ns() + BYE_NS)
+    def before_join(self, name: str, join: Join) -> None:
+        """Prepare for a join: another process of that name whose token is lost has died before."""
+        self._take_lost()
+        former = self._participants.get(name)
+        if name in self._checks and former and former.alive and not former.is_process_of(join):
+            del self._checks[name]
+            self._handle_death(name, time.monotonic_ns())
 
-    def joins(self, name: str, join: Join) -> None:
-        """Take the news that a process is about to join: another of its name whose token went has died before."""
-        former = self._world.barrier.participants.get(name)
-        if name in self._doubted and former and former.alive and (former.host, former.pid) != (join.host, join.pid):
-            del self._doubted[name]
-            self._world.died(name, time.monotonic_ns())
-
-    def judge_due(self) -> None:
-        """Look again at those of whom it is time."""
+    def check_due(self) -> None:
+        """Check those processes of which it is time."""
+        self._take_lost()
         now_ns = time.monotonic_ns()
-        for name in [name for name, doubt in self._doubted.items() if doubt.due_ns <= now_ns]:
+        for name in [name for name, check in self._checks.items() if check.due_ns <= now_ns]:
             self._take_in()
-            self._judge(name, self._doubted.pop(name), now_ns)
+            if name in self._checks:  # a join that was taken in settles it
+                self._check(name, self._checks.pop(name), now_ns)
 
-    def _judge(self, name: str, doubt: Doubt, now_ns: int) -> None:
-        """Take the death of a process that has no token; look once more where one is found, or may be too new to be."""
-        participant = self._world.barrier.participants.get(name)
+    def _take_lost(self) -> None:
+        while self._lost:
+            name = self._lost.popleft()
+            participant = self._participants.get(name)
+            if participant and participant.alive:
+                self._checks[name] = _Check(time.monotonic_ns() + BYE_NS)
+
+    def _check(self, name: str, check: _Check, now_ns: int) -> None:
+        """Take the death of a process without a token; check once more where there is one, or it may be too new."""
+        participant = self._participants.get(name)
         if participant is None:
             return
-        if keys.token(name) in self._link.tokens(keys.token(name), timeout_s=LOOK_S):
-            if doubt.again:  # a successor's, or one that Zenoh has not forgotten yet
-                self._doubted[name] = Doubt(now_ns + NEW_TOKEN_NS, again=False)
+        if keys.token(name) in self._link.tokens(keys.token(name), timeout_s=TOKENS_S):
+            if check.again:  # a successor's, or one that Zenoh has not forgotten yet
+                self._checks[name] = _Check(now_ns + NEW_TOKEN_NS, again=False)
         elif now_ns - participant.joined_wall_ns < NEW_TOKEN_NS:  # a new token is not always found at once
-            self._doubted[name] = Doubt(participant.joined_wall_ns + NEW_TOKEN_NS, doubt.again)
+            self._checks[name] = _Check(participant.joined_wall_ns + NEW_TOKEN_NS, check.again)
         else:
-            self._world.died(name, time.monotonic_ns())
+            self._handle_death(name, time.monotonic_ns())

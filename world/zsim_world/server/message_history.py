@@ -1,35 +1,37 @@
-"""What has been said: last values for who asks, and the last seconds for who must catch up.
+"""Messages kept by the world: last values for queries, and the last seconds for who must catch up.
 
-The world is the hub, so everything passes here, its own messages and those of the participants; it answers
-for dead publishers too.
+Everything passes here, the world's own messages and those of the participants; it answers for dead publishers too.
 """
 
 from collections import deque
-from collections.abc import Callable, Container, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Container, Iterator, Sequence
+from typing import Annotated, Any, NamedTuple
 
-from zsim.contract import keys
+import msgspec
+
+from zsim.contract import batch, keys, messages
 from zsim.contract.batch import Batch
+from zsim.contract.messages import REFUSALS, ClusterRequest, ClusterState, Command, ControlAnswer, Count, Estimate
+from zsim.errors import DecodeError
+from zsim.scenario import rights
+from zsim.transport.session import Sample
 
 KEEP_NS = 5_000_000_000  # simulated time that a replay reaches back
-KEEP_BYTES = 500_000_000  # payloads kept at most: 1000 drones say about 300 MB in KEEP_NS
+KEEP_BYTES = 500_000_000  # payloads kept at most: those of 1000 drones are about 300 MB in KEEP_NS
 LAST_MAX = 200_000  # keys of which the last value is kept: 1000 drones have about 12 000
-PAGE_BYTES = 8_000_000  # payloads of one answer; who lacks more asks for the next page
+PAGE_BYTES = 8_000_000  # payloads of one answer; who lacks more requests the next page
+EXPRESSIONS_MAX = 1000  # of one replay; a controller of hundreds of drones reads two keys of each
 
 
-class Page(NamedTuple):
-    """A part of what has been said.
+class _ReplayArgs(msgspec.Struct):
+    """The arguments of a replay; `page` is `more` of the answer before."""
 
-    Attributes:
-        passed: (key, payload) in order of arrival.
-        more: where the next page begins, None after the last one.
-    """
-
-    passed: list[tuple[str, bytes]]
-    more: int | None
+    from_ns: int
+    keys: Annotated[list[str], msgspec.Meta(max_length=EXPRESSIONS_MAX)]
+    page: Count = 0
 
 
-class _Said(NamedTuple):
+class _Entry(NamedTuple):
     """Messages that passed together: the world's clock then, their stamp, keys and payloads, bytes of the latter."""
 
     now_ns: int
@@ -38,7 +40,7 @@ class _Said(NamedTuple):
     size: int
 
 
-class History:
+class MessageHistory:
     """Payloads as on the wire, by key.
 
     Args:
@@ -48,7 +50,7 @@ class History:
 
     def __init__(self, keep_bytes: int = KEEP_BYTES, page_bytes: int = PAGE_BYTES) -> None:
         self._last: dict[str, bytes] = {}
-        self._recent: deque[_Said] = deque()
+        self._recent: deque[_Entry] = deque()
         self._now_ns = 0
         self._bytes = 0
         self._keep_bytes = keep_bytes
@@ -56,7 +58,7 @@ class History:
         self._forgotten = 0
 
     def add(self, key: str, payload: bytes, t_ns: int) -> None:
-        """Remember a message; t_ns is its stamp.
+        """Keep a message; t_ns is its stamp.
 
         How old it is follows from the world's clock at its arrival: a sender's stamp may be anything.
         """
@@ -64,17 +66,17 @@ class History:
             self._now_ns = t_ns
         if key in self._last or len(self._last) < LAST_MAX:
             self._last[key] = payload
-        self._remember(_Said(self._now_ns, t_ns, [(key, payload)], len(payload)))
+        self._keep(_Entry(self._now_ns, t_ns, [(key, payload)], len(payload)))
 
-    def add_all(self, said: Batch, t_ns: int) -> None:
-        """Remember what the world itself says, all stamped t_ns, its newest gate."""
+    def add_all(self, published: Batch, t_ns: int) -> None:
+        """Keep what the world itself publishes, all stamped t_ns, its newest gate."""
         self._now_ns = t_ns
-        self._last.update(said)
-        self._remember(_Said(t_ns, t_ns, said, sum([len(payload) for _, payload in said])))
+        self._last.update(published)
+        self._keep(_Entry(t_ns, t_ns, published, sum([len(payload) for _, payload in published])))
 
-    def _remember(self, said: "_Said") -> None:
-        self._recent.append(said)
-        self._bytes += said.size
+    def _keep(self, entry: _Entry) -> None:
+        self._recent.append(entry)
+        self._bytes += entry.size
         while self._bytes > self._keep_bytes or self._recent[0].now_ns < self._now_ns - KEEP_NS:
             oldest = self._recent.popleft()
             self._bytes -= oldest.size
@@ -86,13 +88,16 @@ class History:
             return [(expression, self._last[expression])]
         return [(key, payload) for key, payload in list(self._last.items()) if keys.matches(expression, key)]
 
-    def page(self, from_ns: int, wanted: Callable[[str], bool], start: int = 0) -> Page:
-        """Return what is stamped after from_ns and on a key that is wanted, oldest first, as far as a page holds it.
+    def page(self, from_ns: int, wanted: Callable[[str], bool], start: int = 0) -> tuple[Batch, int | None]:
+        """Return what is stamped after from_ns and on a key that is wanted, as far as a page holds it.
 
         Args:
             from_ns: simulated time [ns].
             wanted: tells of a key whether it is.
-            start: 0, or `more` of the page before.
+            start: 0, or where the page before ended.
+
+        Returns:
+            (key, payload) in order of arrival, and where the next page begins, None after the last one.
         """
         passed: list[tuple[str, bytes]] = []
         known: dict[str, bool] = {}
@@ -106,15 +111,66 @@ class History:
                 continue
             size += len(payload)
             if passed and size > self._page_bytes:
-                return Page(passed, number)
+                return passed, number
             passed.append((key, payload))
-        return Page(passed, None)
+        return passed, None
 
-    def said(self, marks: Container[tuple[str, int]]) -> list[tuple[str, bytes]]:
-        """Return (key, payload) of what was said on any of some (key, t_ns), as far as a replay reaches back."""
-        return [(key, payload) for t_ns, key, payload in self._each() if (key, t_ns) in marks]
+    def at(self, stamps: Container[tuple[str, int]]) -> list[tuple[str, bytes]]:
+        """Return (key, payload) of the messages with any of some (key, t_ns), as far as a replay reaches back."""
+        return [(key, payload) for t_ns, key, payload in self._each() if (key, t_ns) in stamps]
 
     def _each(self) -> Iterator[tuple[int, str, bytes]]:
-        for said in self._recent:
-            for key, payload in said.messages:
-                yield said.t_ns, key, payload
+        for entry in self._recent:
+            for key, payload in entry.messages:
+                yield entry.t_ns, key, payload
+
+    def replay(self, args: dict[str, Any], readable: Sequence[str]) -> ControlAnswer:
+        """Answer a request for a replay with a page of the history.
+
+        Args:
+            args: of the request: from_ns, keys and page.
+            readable: expressions of the keys that the requesting process may read.
+        """
+        try:
+            replay = msgspec.convert(args, _ReplayArgs)
+        except REFUSALS as error:
+            return ControlAnswer(False, f"replay: needs from_ns (whole number) and keys (list of texts): {error}")
+        passed, more = self.page(
+            replay.from_ns,
+            lambda key: rights.permits(replay.keys, key) and rights.permits(readable, key),
+            replay.page,
+        )
+        return ControlAnswer(True, result=passed, more=more)
+
+    def lost_outputs(self, kept: Any, done_ns: int) -> list[Sample]:
+        """Return those of the outputs that a participant kept that have not come, each once, as after a cut link.
+
+        What it kept of gates later than its newest done is left out: that is on its way, or its done will count it.
+
+        Args:
+            kept: the result of its answer.
+            done_ns: newest gate that it is through with.
+
+        Raises:
+            DecodeError: the result is no list of [key, payload].
+        """
+        outputs: dict[Any, Sample] = {}
+        for key, payload in batch.of(kept):
+            identity = _identity(key, payload)
+            if identity is not None and identity[1] <= done_ns:
+                outputs[identity] = Sample(key, payload)
+        for key, payload in self.at({(key, t_ns) for key, t_ns, _, _ in outputs}):
+            outputs.pop(_identity(key, payload), None)
+        return list(outputs.values())
+
+
+def _identity(key: str, payload: bytes) -> tuple[str, int, int, str] | None:
+    """Return (key, t_ns, seq, source), by which an output is recognised; None for what no done counts."""
+    kind = messages.type_of(key)
+    if kind is None or not issubclass(kind, Command | Estimate | ClusterState | ClusterRequest):
+        return None
+    try:
+        message = messages.decode(key, payload)
+    except DecodeError:
+        return None
+    return key, message.t_ns, message.seq, message.source

@@ -1,45 +1,70 @@
-"""What reaches the world: waited for with a limit or without, drained with the wall time of its arrival."""
+"""What reaches the world: read from its mailboxes, checked, counted, kept, and requested again where it was lost."""
 
+import contextlib
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
-from zsim.transport.session import Mailbox, Sample
+import msgspec
+
+from zsim.contract import keys, messages
+from zsim.errors import DecodeError
+from zsim.runtime.health import HealthMeter
+from zsim.scenario.rights import WORLD
+from zsim.transport.session import Mailbox, Sample, Session
 from zsim.transport.timed_mailbox import TimedMailbox
+from zsim_world.flight.barrier import RunParticipant
+from zsim_world.flight.coordinator import Coordinator
+from zsim_world.server.liveliness import LivelinessMonitor
+from zsim_world.server.message_history import MessageHistory
+from zsim_world.server.world_outputs import WorldOutputs
 
 TICK_S = 0.1  # how often a standing world looks at the wall clock
+RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
+REJOINED_NS = 10_000_000_000  # wall time after a rejoin in which it may take until a process can be asked
+PHASE_EVERY = 10  # states of a cluster between two of which the phase is read for the display
+RELAYED = (messages.Estimate, messages.ClusterState, messages.ClusterRequest)
+PROCESSES, VIEWS = "process/", "view/"  # the last are nothing to the world
+OWN = keys.process(WORLD, "")
+
+ProgressCallback = Callable[[str, Any, str], None]
+"""Called with ("clock" or "event", message, phase of the clusters), ("health", message, process), and every tenth
+("state", message, cluster); shows progress."""
 
 
-class Inputs:
-    """What others publish: waited for with a limit or without, drained with the wall time of arrival."""
+class WorldInputs(ABC):
+    """Mailboxes of the world: waited for with a limit or without, drained with the wall time of arrival."""
 
+    @abstractmethod
     def wait(self, timeout_s: float | None) -> None:
         """Return when something has come, or after timeout_s; without a limit, now and then to look at the clock."""
-        raise NotImplementedError
 
     def wait_for(self, wanted: set[str]) -> None:
         """Wait until something has come on each of the wanted keys, or anything that is not a done."""
         self.wait(None)
 
+    @abstractmethod
     def drain(self) -> Iterator[tuple[int, Sample]]:
         """Yield what has come, with the monotonic wall time of its arrival [ns]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def wake(self) -> None:
         """Let a `wait` of another thread return."""
-        raise NotImplementedError
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - not every one reads on threads of its own
         """Stop reading."""
-        return
 
 
-class Direct(Inputs):
+class DirectInputs(WorldInputs):
     """Reads on the loop's own thread, waiting for the last box: fastest where nothing hangs on the wall clock."""
 
     def __init__(self, boxes: Sequence[Mailbox]) -> None:
         self._boxes = boxes
-        self._first: list[Sample] = []
+        self._received: list[Sample] = []
 
     def wait(self, timeout_s: float | None) -> None:
         if timeout_s is not None and timeout_s < TICK_S:
@@ -47,20 +72,20 @@ class Direct(Inputs):
             return
         sample = self._boxes[-1].receive()
         if sample is not None:
-            self._first.append(sample)
+            self._received.append(sample)
 
     def wait_for(self, wanted: set[str]) -> None:
         while True:
             sample = self._boxes[-1].receive()
             if sample is None:
                 return
-            self._first.append(sample)
+            self._received.append(sample)
             wanted.discard(sample.key)
             if not wanted or not sample.key.endswith("/done"):
                 return
 
     def drain(self) -> Iterator[tuple[int, Sample]]:
-        last, self._first = [*self._first, *self._boxes[-1].drain()], []
+        last, self._received = [*self._received, *self._boxes[-1].drain()], []
         wall_ns = time.monotonic_ns()
         for box in self._boxes[:-1]:
             for sample in box.drain():
@@ -72,7 +97,7 @@ class Direct(Inputs):
         self._boxes[-1].wake()
 
 
-class Timed(Inputs):
+class TimedInputs(WorldInputs):
     """Reads on threads of their own, so that arrivals are stamped while the loop waits for its next gate."""
 
     def __init__(self, boxes: Sequence[Mailbox]) -> None:
@@ -93,3 +118,138 @@ class Timed(Inputs):
     def close(self) -> None:
         for box in self._boxes:
             box.close()
+
+
+def open_inputs(link: Session, realtime: bool) -> WorldInputs:
+    """Subscribe to what others publish.
+
+    Outputs are drained first, dones last: who publishes a done has published its outputs before, on the same link.
+    """
+    boxes = [link.overhear((PROCESSES, VIEWS)), link.subscribe(f"{PROCESSES}**")]
+    return TimedInputs(boxes) if realtime else DirectInputs(boxes)
+
+
+class _Head(msgspec.Struct):
+    """What the world reads of messages that it only relays."""
+
+    t_ns: int
+    seq: int
+    source: str = ""
+    controller: str = ""  # of a ClusterRequest, whose source is the client
+
+
+_decode_head = msgspec.msgpack.Decoder(_Head).decode
+
+
+@dataclass(eq=False)
+class MessageIntake:
+    """Takes what others publish: checks it, keeps it, counts it for its sender, and hands the world what is for it."""
+
+    link: Session
+    world: Coordinator
+    outputs: WorldOutputs  # hands recorders what has passed
+    history: MessageHistory
+    liveliness: LivelinessMonitor
+    health: HealthMeter  # counts what is received and refused
+    progress: ProgressCallback
+    phase: str = ""  # of the cluster whose state was read last
+    _states: Counter[str] = field(default_factory=Counter[str])
+
+    def take(self, wall_ns: int, sample: Sample) -> None:
+        """Take one message, or refuse it."""
+        key = sample.key
+        if key.startswith(OWN):
+            return  # the world's own health, kept when it was published
+        self.health.received += 1
+        kind = messages.type_of(key)
+        try:
+            if kind in RELAYED:
+                self.outputs.passed(sample)
+                self._relay(key, sample.payload)
+            elif key.startswith(PROCESSES) or (key.startswith("drone/") and "/cmd/" in key):
+                self.outputs.passed(sample)
+                self._hand_over(key, sample.payload, wall_ns)
+            elif kind is None:
+                self.outputs.passed(sample)  # a key outside of the contract
+            else:
+                raise DecodeError(f"{key}: only the world publishes here")
+        except DecodeError as error:
+            self._refuse("somebody", key[:80], error)
+            self._count_refused(sample)
+
+    def _hand_over(self, key: str, payload: bytes, wall_ns: int) -> None:
+        """Hand the world a message that it acts on."""
+        message = messages.decode(key, payload)
+        self.history.add(key, payload, message.t_ns)
+        if type(message) is messages.Join:
+            self.liveliness.before_join(keys.thing(key), message)
+        self.world.handle(key, message, wall_ns)
+        if type(message) is messages.Health:
+            self.liveliness.health_received(keys.thing(key))
+            self.progress("health", message, keys.thing(key))
+
+    def _refuse(self, source: str, subject: str, error: DecodeError) -> None:
+        self.health.refused += 1
+        self.world.outbox.refuse(source, subject, str(error))
+
+    def _count_refused(self, sample: Sample) -> None:
+        """Count an output that was refused, so that its sender's done is not taken to be short of it."""
+        with contextlib.suppress(DecodeError):  # of an unknown sender
+            head = _head(sample.key, sample.payload)
+            self.world.count_output(head.controller or head.source)
+
+    def _relay(self, key: str, payload: bytes) -> None:
+        """Keep an output that the world only relays, and count it for the done of who sent it."""
+        head = _head(key, payload)
+        if head.t_ns > self.world.now_ns:
+            raise DecodeError(f"{key}: t_ns is {head.t_ns}; must be <= {self.world.now_ns}, the newest gate")
+        self.history.add(key, payload, head.t_ns)
+        kind = messages.type_of(key)
+        if kind is messages.ClusterState:
+            self._read_phase(key, payload)
+        role = "estimator" if kind is messages.Estimate else "controller"
+        source = head.controller if kind is messages.ClusterRequest else head.source
+        self.world.count_output(source or f"{role}.{keys.thing(key)}")
+
+    def _read_phase(self, key: str, payload: bytes) -> None:
+        if self._states[key] % PHASE_EVERY == 0:
+            state: messages.ClusterState = messages.decode_as(messages.ClusterState, payload, key)
+            self.phase = state.phase
+            self.progress("state", state, keys.thing(key))
+        self._states[key] += 1
+
+    # Outputs that were lost
+
+    def recover_lost(self) -> None:
+        """Request outputs again that a participant counted and that did not come, as after a cut link."""
+        for participant in self.world.barrier.incomplete():
+            if self.world.clock.mode == "realtime":
+                participant.lost_done = False
+                continue
+            samples = self._lost_outputs(participant)
+            age_ns = time.monotonic_ns() - participant.joined_wall_ns
+            if samples is None and participant.rejoined and age_ns < REJOINED_NS:
+                continue
+            for sample in samples or ():
+                self.take(time.monotonic_ns(), sample)
+            missing = participant.reset_counts()
+            if missing:
+                text = f"{participant.name}: {missing} of its outputs did not come"
+                self.world.outbox.event("outputs_missing", participant.name, text, {"missing": missing})
+
+    def _lost_outputs(self, participant: RunParticipant) -> list[Sample] | None:
+        """Return what a participant has kept of its outputs and that has not come; None if it does not answer."""
+        key = keys.process(participant.name, "outputs")
+        try:
+            answer = self.link.request(key, "outputs", WORLD, timeout_s=RECOVERY_S)
+            return self.history.lost_outputs(answer.result, participant.done_ns) if answer.ok else None
+        except DecodeError as error:
+            self._refuse(participant.name, key, error)
+            return []
+
+
+def _head(key: str, payload: bytes) -> _Head:
+    try:
+        return _decode_head(payload)
+    except messages.REFUSALS as error:
+        raise DecodeError(f"{key}: {error}; must be a map with t_ns and seq") from error

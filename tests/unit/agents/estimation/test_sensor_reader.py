@@ -24,7 +24,7 @@ def scenario() -> Scenario:
 @pytest.fixture(scope="module")
 def flight() -> tuple[World, list[Bundle]]:
     world = World(scenario())
-    world.state = "running"
+    world.clock.state = "running"
     bundles = []
     for gate in range(120):
         if gate == 20:

@@ -1,74 +1,72 @@
 """What a run measures of itself: ages of commands, and the rate of its clock."""
 
-import math
-
 import pytest
 
-from zsim_world.flight.run_statistics import GATES_KEPT, Ages, Measurements, Rate
+from zsim_world.flight.run_statistics import GATES_KEPT, CommandAges, RealTimeFactor, RunStatistics
 
 MS = 1_000_000
 GATE_NS = 20 * MS
 
 
 def test_no_command_has_no_age():
-    assert Ages().summary_ms() is None
+    assert CommandAges().summary_ms() is None
 
 
 def test_the_age_of_a_command_is_counted_from_the_gate_that_it_answers():
-    ages = Ages()
-    ages.published(0, 100 * MS)
-    ages.published(GATE_NS, 120 * MS)
-    ages.arrived(0, 103 * MS)
-    ages.arrived(GATE_NS, 121 * MS)
+    ages = CommandAges()
+    ages.gate(0, 100 * MS)
+    ages.gate(GATE_NS, 120 * MS)
+    ages.command(0, 103 * MS)
+    ages.command(GATE_NS, 121 * MS)
     assert ages.summary_ms() == pytest.approx({"p50": 2.0, "p99": 2.98, "max": 3.0})
 
 
 def test_percentiles_of_many_ages():
-    ages = Ages()
-    ages.published(0, 0)
+    ages = CommandAges()
+    ages.gate(0, 0)
     for age_ms in range(101):
-        ages.arrived(0, age_ms * MS)
+        ages.command(0, age_ms * MS)
     assert ages.summary_ms() == pytest.approx({"p50": 50.0, "p99": 99.0, "max": 100.0})
 
 
 def test_a_command_that_answers_no_gate_has_no_age():
-    ages = Ages()
-    ages.published(0, 0)
-    ages.arrived(7, 5 * MS)
+    ages = CommandAges()
+    ages.gate(0, 0)
+    ages.command(7, 5 * MS)
     assert ages.summary_ms() is None
 
 
 def test_old_gates_are_forgotten():
-    ages = Ages()
+    ages = CommandAges()
     for gate in range(GATES_KEPT + 1):
-        ages.published(gate, gate)
-    ages.arrived(0, 10)
+        ages.gate(gate, gate)
+    ages.command(0, 10)
     assert ages.summary_ms() is None
-    ages.arrived(1, 10)
+    ages.command(1, 10)
     assert ages.summary_ms() is not None
 
 
 def test_old_ages_are_forgotten(monkeypatch):
     monkeypatch.setattr("zsim_world.flight.run_statistics.AGES_KEPT", 2)
-    ages = Ages()
-    ages.published(0, 0)
+    ages = CommandAges()
+    ages.gate(0, 0)
     for age_ms in (9, 8, 3, 2, 1):
-        ages.arrived(0, age_ms * MS)
+        ages.command(0, age_ms * MS)
     assert ages.summary_ms() == pytest.approx({"p50": 1.5, "p99": 1.99, "max": 2.0})
 
 
 def test_a_gate_published_twice_is_still_known():
-    ages = Ages()
-    ages.published(0, 5 * MS)
-    ages.published(0, 9 * MS)
+    ages = CommandAges()
+    ages.gate(0, 5 * MS)
+    ages.gate(0, 9 * MS)
     for gate in range(1, 2 * GATES_KEPT):
-        ages.published(gate, gate)
-    ages.arrived(GATES_KEPT, GATES_KEPT + MS)
+        ages.gate(gate, gate)
+    ages.command(GATES_KEPT, GATES_KEPT + MS)
     assert ages.summary_ms() == pytest.approx({"p50": 1.0, "p99": 1.0, "max": 1.0})
 
 
 def test_the_rate_is_simulated_per_wall_time_over_the_last_second():
-    rate = Rate()
+    rate = RealTimeFactor()
     assert rate.now() == 0.0
     assert rate.wall_s == 0.0
     rate.gate(0, 7_000 * MS)
@@ -83,12 +81,12 @@ def test_the_rate_is_simulated_per_wall_time_over_the_last_second():
     assert rate.wall_s == pytest.approx(2.5)
 
 
-def test_time_that_leaps_does_not_pass():
+def test_time_that_jumps_does_not_pass():
     """From 300 s on, five seconds at twice its pace; then back to 1 s, and five more."""
-    rate = Rate()
+    rate = RealTimeFactor()
     for number in range(11):
         if number == 6:
-            rate.leap()
+            rate.jump()
         t_s = 300 + number if number < 6 else number - 5
         rate.gate(t_s * 1_000 * MS, number * 500 * MS)
         assert rate.now() == pytest.approx(0.0 if number in (0, 6) else 2.0)
@@ -97,14 +95,14 @@ def test_time_that_leaps_does_not_pass():
 
 
 def test_gates_further_apart_than_a_second_still_have_a_rate():
-    rate = Rate()
+    rate = RealTimeFactor()
     for gate in range(4):
         rate.gate(gate * GATE_NS, gate * 5_000 * MS)
     assert rate.now() == pytest.approx(0.004)
 
 
 def test_a_wall_clock_that_stands_gives_no_rate():
-    rate = Rate()
+    rate = RealTimeFactor()
     rate.gate(0, 5)
     rate.gate(GATE_NS, 5)
     assert rate.now() == 0.0
@@ -120,16 +118,16 @@ class Owing:
     def required_ns(self, need_ns: int) -> int | None:
         return need_ns if need_ns >= 0 else None
 
-    def owes(self, need_ns: int) -> bool:
+    def blocks(self, need_ns: int) -> bool:
         return need_ns < self._owes_until_ns
 
 
 def test_the_result_counts_who_was_late_and_how_near_drones_came():
-    measured, late, quick = Measurements(3.0), Owing("late", 2), Owing("quick", 0)
+    measured, late, quick = RunStatistics(), Owing("late", 2), Owing("quick", 0)
     for need_ns in (-1, 0, 1, 2):
-        measured.deadlines_of([late, quick], need_ns)  # type: ignore[list-item]
-        measured.apart(2.5 - need_ns)
-    measured.own_misses += 1
+        measured.deadlines([late, quick], need_ns)  # type: ignore[list-item]
+        measured.separation(2.5 - need_ns)
+    measured.world_misses += 1
     for t_ns, wall_ns in ((0, 0), (2_000_000_000, 500_000_000)):
         measured.gate(t_ns, wall_ns)
     result = measured.result([late, quick])  # type: ignore[list-item]
@@ -138,4 +136,4 @@ def test_the_result_counts_who_was_late_and_how_near_drones_came():
     assert result["deadline_misses_by"] == {"late": 2, "quick": 0, "world": 1}
     assert result["deadline_misses"] == 3
     assert result["closest_m"] == 0.5
-    assert Measurements(math.inf).result([])["closest_m"] is None
+    assert RunStatistics().result([])["closest_m"] is None

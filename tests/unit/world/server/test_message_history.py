@@ -1,27 +1,33 @@
-"""The history: last values for who asks, the last seconds for who must catch up, and never more than its share."""
+"""The history: last values, replays, bounded memory, and outputs of a participant that have not come."""
 
-from zsim.contract import keys
-from zsim_world.server.message_history import KEEP_NS, History
+import pytest
+from msgspec import Struct
+
+from zsim.contract import keys, messages
+from zsim.contract.messages import Done, Velocity
+from zsim.transport.session import Sample
+from zsim_world.server.message_history import KEEP_NS, MessageHistory
 
 SECOND_NS = 1_000_000_000
 IMU = keys.sensor("d1", "imu")
+VELOCITY = keys.command("d1", "velocity")
 
 
-def since(history: History, from_ns: int, expressions: list[str]) -> list[tuple[str, bytes]]:
+def since(history: MessageHistory, from_ns: int, expressions: list[str]) -> list[tuple[str, bytes]]:
     """Return all pages of what is stamped later."""
-    found, start = [], 0
+    messages, start = [], 0
     while start is not None:
         passed, start = history.page(from_ns, lambda key: any(keys.matches(e, key) for e in expressions), start)
-        found += passed
-    return found
+        messages += passed
+    return messages
 
 
-def clock(history: History, t_ns: int) -> None:
+def clock(history: MessageHistory, t_ns: int) -> None:
     history.add(keys.CLOCK, b"tick", t_ns)
 
 
 def test_the_last_value_of_a_key_is_answered():
-    history = History()
+    history = MessageHistory()
     history.add("drone/d1/truth", b"old", 0)
     history.add("drone/d1/truth", b"new", 1)
     assert history.last("drone/d1/truth") == [("drone/d1/truth", b"new")]
@@ -29,7 +35,7 @@ def test_the_last_value_of_a_key_is_answered():
 
 
 def test_the_last_values_of_an_expression_are_answered():
-    history = History()
+    history = MessageHistory()
     for key in ("drone/d1/truth", "drone/d2/truth", "drone/d1/estimate", "clock"):
         history.add(key, key.encode(), 0)
     assert sorted(history.last("drone/*/truth")) == [
@@ -40,7 +46,7 @@ def test_the_last_values_of_an_expression_are_answered():
 
 
 def test_the_last_value_outlives_what_a_replay_brings():
-    history = History()
+    history = MessageHistory()
     history.add("drone/d1/truth", b"x", 0)
     clock(history, 100 * SECOND_NS)
     assert history.last("drone/d1/truth") == [("drone/d1/truth", b"x")]
@@ -48,7 +54,7 @@ def test_the_last_value_outlives_what_a_replay_brings():
 
 
 def test_a_replay_brings_what_was_stamped_later_in_order_of_arrival():
-    history = History()
+    history = MessageHistory()
     for t_ns in (1, 3, 2, 4):
         history.add(IMU, b"%d" % t_ns, t_ns)
         history.add("drone/d2/truth", b"other", t_ns)
@@ -58,13 +64,13 @@ def test_a_replay_brings_what_was_stamped_later_in_order_of_arrival():
 
 
 def test_a_message_that_several_expressions_take_comes_once():
-    history = History()
+    history = MessageHistory()
     history.add(IMU, b"x", 5)
     assert since(history, 0, ["drone/**", "**", IMU]) == [(IMU, b"x")]
 
 
 def test_what_is_older_than_the_window_is_forgotten():
-    history = History()
+    history = MessageHistory()
     for second in range(20):
         clock(history, second * SECOND_NS)
         history.add(IMU, b"%d" % second, second * SECOND_NS)
@@ -72,8 +78,8 @@ def test_what_is_older_than_the_window_is_forgotten():
     assert kept == list(range(19 - KEEP_NS // SECOND_NS, 20))
 
 
-def test_a_sender_s_stamp_does_not_push_out_what_others_said():
-    history = History()
+def test_a_sender_s_stamp_does_not_push_out_messages_of_others():
+    history = MessageHistory()
     clock(history, 10 * SECOND_NS)
     history.add(IMU, b"mine", 10 * SECOND_NS)
     history.add("drone/d1/cmd/mode", b"from the future", 2**63 - 1)
@@ -82,52 +88,100 @@ def test_a_sender_s_stamp_does_not_push_out_what_others_said():
 
 
 def test_a_sender_s_stamp_does_not_keep_its_message_for_ever():
-    history = History()
+    history = MessageHistory()
     history.add("drone/d1/cmd/mode", b"from the future", 2**63 - 1)
     clock(history, 100 * SECOND_NS)
     assert since(history, -1, ["drone/**"]) == []
 
 
 def test_memory_is_bounded_while_time_stands_still():
-    history = History(keep_bytes=1000)
+    history = MessageHistory(keep_bytes=1000)
     for number in range(100):
         history.add(IMU, b"%0100d" % number, 0)
     assert [int(payload) for _, payload in since(history, -1, [IMU])] == list(range(90, 100))
 
 
 def test_pages_bring_everything_once_and_in_order():
-    history = History(page_bytes=10)
-    said = [(IMU, bytes([number]) * (number % 5 + 1)) for number in range(50)]
-    for number, (key, payload) in enumerate(said):
+    history = MessageHistory(page_bytes=10)
+    published = [(IMU, bytes([number]) * (number % 5 + 1)) for number in range(50)]
+    for number, (key, payload) in enumerate(published):
         history.add(key, payload, number)
         history.add("drone/d2/truth", b"another's", number)
-    assert since(history, -1, [IMU]) == said
-    first = history.page(-1, lambda key: key == IMU)
-    assert sum(len(payload) for _, payload in first.passed) <= 10
-    assert first.passed == said[: len(first.passed)]
+    assert since(history, -1, [IMU]) == published
+    first, _ = history.page(-1, lambda key: key == IMU)
+    assert sum(len(payload) for _, payload in first) <= 10
+    assert first == published[: len(first)]
 
 
 def test_a_page_brings_what_alone_is_longer_than_a_page():
-    history = History(page_bytes=10)
+    history = MessageHistory(page_bytes=10)
     for payload in (b"x" * 30, b"y"):
         history.add(IMU, payload, 0)
     assert since(history, -1, [IMU]) == [(IMU, b"x" * 30), (IMU, b"y")]
 
 
 def test_a_page_goes_on_where_the_last_one_ended_when_the_oldest_is_forgotten_meanwhile():
-    history = History(keep_bytes=20, page_bytes=4)
+    history = MessageHistory(keep_bytes=20, page_bytes=4)
     for number in range(20):
         history.add(IMU, bytes([number]), number)
     passed, more = history.page(-1, lambda key: True)
     for number in range(20, 22):
         history.add(IMU, bytes([number]), number)
     assert more is not None
-    assert [payload[0] for _, payload in (*passed, *history.page(-1, lambda key: True, more).passed)] == [*range(8)]
+    assert [payload[0] for _, payload in (*passed, *history.page(-1, lambda key: True, more)[0])] == [*range(8)]
 
 
-def test_what_was_said_on_a_key_at_a_time_is_found():
-    history = History()
+def test_messages_are_found_by_key_and_stamp():
+    history = MessageHistory()
     for t_ns, payload in ((1, b"a"), (2, b"b"), (2, b"c"), (3, b"d")):
         history.add(IMU, payload, t_ns)
         history.add("drone/d2/truth", b"x", t_ns)
-    assert history.said({(IMU, 2), (IMU, 3), (IMU, 4)}) == [(IMU, b"b"), (IMU, b"c"), (IMU, b"d")]
+    assert history.at({(IMU, 2), (IMU, 3), (IMU, 4)}) == [(IMU, b"b"), (IMU, b"c"), (IMU, b"d")]
+
+
+# Outputs that were lost
+
+
+def command(t_ns: int, seq: int, source: str = "a.b", speed: float = 0.0) -> Velocity:
+    return Velocity(t_ns, seq, source, (speed, 0.0, 0.0), 0.0)
+
+
+def kept(*outputs: Struct, key: str = VELOCITY) -> list[list[object]]:
+    return [[key, messages.encode(output)] for output in outputs]
+
+
+def history_of(*came: Velocity) -> MessageHistory:
+    made = MessageHistory()
+    for each in came:
+        made.add(VELOCITY, messages.encode(each), each.t_ns)
+    return made
+
+
+def samples(*outputs: Velocity) -> list[Sample]:
+    return [Sample(VELOCITY, messages.encode(output)) for output in outputs]
+
+
+def test_what_has_not_come_is_found():
+    first, second, third = (command(t_ns, t_ns) for t_ns in (1, 2, 3))
+    assert history_of(second).lost_outputs(kept(first, second, third), 3) == samples(first, third)
+
+
+def test_what_its_next_done_counts_is_on_its_way():
+    assert history_of().lost_outputs(kept(command(2, 2), command(3, 3)), 2) == samples(command(2, 2))
+
+
+def test_what_it_kept_twice_comes_once():
+    assert history_of().lost_outputs(kept(command(1, 1), command(1, 1)), 1) == samples(command(1, 1))
+
+
+@pytest.mark.parametrize("other", [command(1, 1, "c.d"), command(1, 2)])
+def test_a_message_of_another_source_or_number_does_not_replace_it(other: Velocity):
+    assert history_of(other).lost_outputs(kept(command(1, 1)), 1) == samples(command(1, 1))
+
+
+def test_only_outputs_that_can_be_read_are_taken():
+    done = kept(Done(1, 1, "r", 1, 1, 0), key="process/a.b/done")
+    assert (
+        history_of().lost_outputs([*done, [VELOCITY, b"\xc1"], [keys.estimate("d1"), b"\x80"], ["of/mine", b""]], 1)
+        == []
+    )

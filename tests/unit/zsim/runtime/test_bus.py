@@ -53,7 +53,7 @@ class Hub:
         elif isinstance(message, Done):
             self._done[keys.thing(key)] = message.done_ns
 
-    def output_of(self, source: str) -> None:
+    def count_output(self, source: str) -> None:
         self.outputs.append(source)
 
     def info(self) -> Info:
@@ -78,7 +78,7 @@ class Hub:
         if self._gate == self._gates:
             self.ended = "over"
 
-    def tell_end(self, wall_ns: int) -> None:
+    def publish_end(self) -> None:
         self._outbox.append(Output(keys.EVENT, _event_end()))
 
     def take_outbox(self) -> list[Output]:

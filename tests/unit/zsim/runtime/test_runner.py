@@ -80,7 +80,7 @@ class World(FakeLink):
     def __init__(self, at: dict[int, Callable[["World"], None]]) -> None:
         super().__init__()
         self.last = {keys.INFO: messages.encode(info())}
-        self.on_said = self._answer
+        self.on_publish = self._answer
         self._at = at
         self._next = 0
         self._gate(0)
@@ -101,7 +101,7 @@ class World(FakeLink):
         self.deliver(keys.status("d1"), status(gate))
 
     def gates_done(self) -> list[int]:
-        return [m.done_ns // GATE_NS for m in self.all(keys.process(ME, "done"))]
+        return [m.done_ns // GATE_NS for m in self.published_on(keys.process(ME, "done"))]
 
 
 def run(world: World, stopped: Callable[[], bool] = lambda: False) -> Judge:
@@ -271,7 +271,7 @@ def test_what_nobody_keeps_any_more_ends_it():
         BehindError, match=r"drone/d1/estimate of t = 0\.04 s is kept by nobody any more; this one ends"
     ):
         run(world)
-    assert not world.all(keys.process(ME, "bye"))
+    assert not world.published_on(keys.process(ME, "bye"))
 
 
 @pytest.mark.parametrize("deserted", [False, True])
@@ -279,7 +279,7 @@ def test_who_lost_its_launcher_dies_and_does_not_leave(deserted: bool):
     world = World(estimates(range(END + 1)))
     reason = Runner(world, info(), Judge(), lambda: True, deserted=lambda: deserted).run()  # type: ignore[arg-type]
     assert reason == "stopped"
-    assert len(world.all(keys.process(ME, "bye"))) == (not deserted)
+    assert len(world.published_on(keys.process(ME, "bye"))) == (not deserted)
 
 
 @pytest.mark.usefixtures("quick")
@@ -303,7 +303,7 @@ def test_after_a_lost_link_it_rejoins_as_soon_as_the_world_answers(hears: bool):
             return super().get(expression, timeout_s)
 
         def _answer(self, key: str, payload: bytes) -> None:
-            if key == keys.process(ME, "join") and hears and len(self.all(key)) > 1:
+            if key == keys.process(ME, "join") and hears and len(self.published_on(key)) > 1:
                 said = messages.decode(key, payload)
                 entry = {"incarnation": said.incarnation, "host": "h", "pid": said.pid, "from_ns": 0, "done_ns": 0}
                 self.deliver(keys.EVENT, event("restart", ME, **entry, former_pid=said.pid))
@@ -318,8 +318,8 @@ def test_after_a_lost_link_it_rejoins_as_soon_as_the_world_answers(hears: bool):
     world = Slow(estimates(range(END + 1)))
     world.on_request = answers(UNANSWERED, UNANSWERED, replayed(2), *[replayed()] * 9)
     run(world)
-    dones: list[Done] = world.all(keys.process(ME, "done"))
-    joins = world.all(keys.process(ME, "join"))
+    dones: list[Done] = world.published_on(keys.process(ME, "done"))
+    joins = world.published_on(keys.process(ME, "join"))
     again = 1 if hears else len(joins) - 1
     assert (again > 1) != hears
     assert again <= 1 + membership.REJOINS_MAX
@@ -360,7 +360,7 @@ def last_gate(before_gate: int, *lists: Faults) -> int:
     world = World({**estimates(range(END + 1)), before_gate: tell})
     runner = Runner(world, info(), Judge())  # type: ignore[arg-type]
     runner.run()
-    said_bye = len(world.all(keys.process(ME, "bye")))
+    said_bye = len(world.published_on(keys.process(ME, "bye")))
     assert said_bye == (0 if runner.killed else 1)
     return world.gates_done()[-1]
 

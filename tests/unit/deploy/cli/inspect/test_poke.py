@@ -38,7 +38,7 @@ def test_a_message_that_cannot_be_meant_is_a_line(name: str):
         poke.publish(link, INFO, key, text, 1, 1.0)  # type: ignore[arg-type]
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
-    assert link.said == []
+    assert link.published == []
 
 
 class Watch:
@@ -63,10 +63,10 @@ def test_messages_keep_to_their_schedule(monkeypatch: pytest.MonkeyPatch):
         sent_s.append(watch.now_s)
         watch.now_s += 0.004
 
-    link.on_said = take
+    link.on_publish = take
     assert poke.publish(link, INFO, MODE, TAKEOFF, 5, 10.0) == 5  # type: ignore[arg-type]
     assert sent_s == pytest.approx([100.0, 100.1, 100.2, 100.3, 100.4])
-    first = messages.decode(MODE, link.said[0][1])
+    first = messages.decode(MODE, link.published[0][1])
     assert (first.t_ns, first.seq, first.source) == (60_000_000, 0, "zsim.pub")
 
 
@@ -77,9 +77,9 @@ def test_time_goes_on_while_it_publishes():
     def pass_time(key: str, payload: bytes) -> None:
         link.deliver(keys.CLOCK, messages.Clock(next(stamps), 0, "run", 0, "running", 1.0, ()))
 
-    link.on_said = pass_time
+    link.on_publish = pass_time
     poke.publish(link, INFO, MODE, TAKEOFF, 2, 1000.0)  # type: ignore[arg-type]
-    assert [messages.decode(key, payload).t_ns for key, payload in link.said] == [0, 20_000_000]
+    assert [messages.decode(key, payload).t_ns for key, payload in link.published] == [0, 20_000_000]
 
 
 @pytest.mark.parametrize(

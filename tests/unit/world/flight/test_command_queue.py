@@ -1,4 +1,4 @@
-"""Commanders: who flies a drone, in which order commands of one instant take effect, and what is refused."""
+"""The command queue: who flies a drone, the order of commands of one instant, and what is refused."""
 
 import random
 
@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsim.contract.messages import Mode, Velocity
-from zsim_world.flight.commander import PROGRAM, SEEN_PER_DRONE, Commanders, Due
+from zsim_world.flight.command_queue import PROGRAM, RECENT_PER_DRONE, CommandQueue, QueuedCommand
+from zsim_world.flight.run_outbox import Refusal
 
 D1, D2 = 0, 1
 OPERATOR = 10  # priority that docs/protocol.md gives to operators
@@ -22,22 +23,22 @@ def mode(source: str, what: str, seq: int = 0, t_ns: int = 0) -> Mode:
     return Mode(t_ns, seq, source, what)  # type: ignore[arg-type]
 
 
-def commanders() -> Commanders:
-    return Commanders(["drone1", "drone2"])
+def queue() -> CommandQueue:
+    return CommandQueue(["drone1", "drone2"])
 
 
-def fly(made: Commanders, t_ns: int) -> list[tuple[Due, str | None]]:
-    """Apply what is due as a world does: judge, then make the source of a setpoint the commander."""
-    judged = []
-    for due in made.pop(t_ns):
-        reason = made.refusal(due)
-        if reason is None and due.kind != "mode":
-            made.take(due.drone, due.source)
-        judged.append((due, reason))
-    return judged
+def fly(made: CommandQueue, t_ns: int) -> list[tuple[QueuedCommand, Refusal | None]]:
+    """Apply what is due as a world does: check, then make the source of a setpoint the commander."""
+    checked = []
+    for command in made.pop(t_ns):
+        reason = made.refusal(command)
+        if reason is None and command.kind != "mode":
+            made.claim(command.drone, command.source)
+        checked.append((command, reason))
+    return checked
 
 
-def send(made: Commanders, drone: int, source: str, t_ns: int = 0) -> str | None:
+def send(made: CommandQueue, drone: int, source: str, t_ns: int = 0) -> Refusal | None:
     made.push(drone, "velocity", velocity(source, t_ns=t_ns), t_ns)
     ((_, reason),) = fly(made, t_ns)
     return reason
@@ -47,10 +48,10 @@ def send(made: Commanders, drone: int, source: str, t_ns: int = 0) -> str | None
 
 
 def test_a_command_waits_for_its_instant():
-    made = commanders()
+    made = queue()
     made.push(D1, "velocity", velocity("a"), GATE_NS)
     assert made.pop(GATE_NS - 1) == []
-    assert [due.source for due in made.pop(GATE_NS)] == ["a"]
+    assert [command.source for command in made.pop(GATE_NS)] == ["a"]
     assert made.pop(GATE_NS) == []
 
 
@@ -58,7 +59,7 @@ def test_a_command_waits_for_its_instant():
 @given(order=st.randoms(use_true_random=False))
 def test_commands_of_one_instant_are_ordered_by_priority_source_and_number(order: random.Random):
     """Whatever the order of arrival; instants before later ones, and the last one wins."""
-    made = commanders()
+    made = queue()
     made.acquire(D1, "a.operator", OPERATOR)
     wanted = [(0, "b", 2), (0, "b", 9), (0, "c", 1), (0, "c", 10), (10, "a.operator", 0), (10, "a.operator", 3)]
     arrivals = [(source, seq, at) for at in (GATE_NS, 2 * GATE_NS) for _, source, seq in wanted]
@@ -66,19 +67,19 @@ def test_commands_of_one_instant_are_ordered_by_priority_source_and_number(order
     for source, seq, at in arrivals:
         made.push(D1, "velocity", velocity(source, seq, at - GATE_NS), at)
     popped = made.pop(2 * GATE_NS)
-    assert [(due.priority, due.source, due.seq) for due in popped] == wanted * 2
-    assert [due.apply_ns for due in popped] == [GATE_NS] * 6 + [2 * GATE_NS] * 6
+    assert [(command.priority, command.source, command.seq) for command in popped] == wanted * 2
+    assert [command.apply_ns for command in popped] == [GATE_NS] * 6 + [2 * GATE_NS] * 6
 
 
 @settings(max_examples=50, deadline=None)
 @given(order=st.randoms(use_true_random=False))
 def test_equal_places_do_not_fall_back_on_the_order_of_arrival(order: random.Random):
-    made = commanders()
+    made = queue()
     arrivals = [(drone, kind) for drone in (D1, D2) for kind in ("mode", "velocity")]
     order.shuffle(arrivals)
     for drone, kind in arrivals:
         made.push(drone, kind, velocity("a") if kind == "velocity" else mode("a", "takeoff"), 0)
-    assert [(due.drone, due.kind) for due in made.pop(0)] == [
+    assert [(command.drone, command.kind) for command in made.pop(0)] == [
         (D1, "mode"),
         (D1, "velocity"),
         (D2, "mode"),
@@ -88,19 +89,19 @@ def test_equal_places_do_not_fall_back_on_the_order_of_arrival(order: random.Ran
 
 def test_a_command_that_comes_again_takes_effect_once():
     """As after a rejoin: an old setpoint must not replace a newer one."""
-    made = commanders()
+    made = queue()
     old, new = velocity("a", 1, 0, x=1.0), velocity("a", 2, GATE_NS, x=2.0)
     assert made.push(D1, "velocity", old, GATE_NS)
     assert not made.push(D1, "velocity", old, GATE_NS)
     assert made.push(D1, "velocity", new, 2 * GATE_NS)
-    assert [due.message for due in made.pop(2 * GATE_NS)] == [old, new]
+    assert [command.message for command in made.pop(2 * GATE_NS)] == [old, new]
     assert not made.push(D1, "velocity", old, GATE_NS)
     assert not made.push(D1, "velocity", new, 2 * GATE_NS)
     assert made.pop(9 * GATE_NS) == []
 
 
 def test_the_same_number_for_another_drone_kind_or_instant_is_another_command():
-    made = commanders()
+    made = queue()
     command = velocity("a")
     assert made.push(D1, "velocity", command, GATE_NS)
     assert made.push(D2, "velocity", command, GATE_NS)
@@ -111,112 +112,114 @@ def test_the_same_number_for_another_drone_kind_or_instant_is_another_command():
 
 
 def test_what_is_remembered_of_commands_is_bounded():
-    made = commanders()
-    for seq in range(10 * SEEN_PER_DRONE):
+    made = queue()
+    for seq in range(10 * RECENT_PER_DRONE):
         made.push(D1, "velocity", velocity("a", seq), 0)
         made.pop(0)
-    assert len(made._seen) <= 2 * SEEN_PER_DRONE
+    assert len(made._recent) <= 2 * RECENT_PER_DRONE
 
 
 # Who flies
 
 
 def test_the_first_setpoint_makes_the_commander():
-    made = commanders()
-    assert made.holder(D1) is None
+    made = queue()
+    assert made.commander(D1) is None
     assert send(made, D1, "controller.main") is None
-    assert made.holder(D1) == "controller.main"
-    assert made.holder(D2) is None
+    assert made.commander(D1) == "controller.main"
+    assert made.commander(D2) is None
 
 
 def test_others_are_refused_with_the_commander_s_name():
-    made = commanders()
+    made = queue()
     send(made, D1, "controller.main")
     reason = send(made, D1, "console.1")
     assert reason is not None
-    assert "drone1 is flown by 'controller.main'" in reason
-    assert "acquire it with a higher priority" in reason
-    assert made.holder(D1) == "controller.main"
+    assert reason[:2] == ("drone1", "flown by 'controller.main' (priority 0)")
+    assert made.commander(D1) == "controller.main"
     assert send(made, D2, "console.1") is None
 
 
-def test_take_tells_who_is_new():
-    made = commanders()
-    assert made.take(D1, "a")
-    assert not made.take(D1, "a")
-    assert not made.take(D1, "b")
+def test_claim_tells_whether_the_commander_is_new():
+    made = queue()
+    assert made.claim(D1, "a")
+    assert not made.claim(D1, "a")
+    assert not made.claim(D1, "b")
 
 
 def test_a_drone_is_acquired_with_a_higher_priority_only():
-    made = commanders()
+    made = queue()
     send(made, D1, "controller.main")
-    said = made.acquire(D1, "console.1", PROGRAM)
-    assert said == "drone1 is flown by 'controller.main' with priority 0"
+    refusal = made.acquire(D1, "console.1", PROGRAM)
+    assert refusal is not None
+    assert refusal[:2] == ("drone1", "flown by 'controller.main' with priority 0")
     assert made.acquire(D1, "console.1", OPERATOR) is None
-    assert made.holder(D1) == "console.1"
+    assert made.commander(D1) == "console.1"
     assert made.acquire(D1, "console.2", OPERATOR) is not None
     assert made.acquire(D1, "console.2", OPERATOR + 1) is None
-    assert made.holder(D1) == "console.2"
+    assert made.commander(D1) == "console.2"
 
 
 def test_the_commander_may_change_its_own_priority():
-    made = commanders()
+    made = queue()
     assert made.acquire(D1, "a", OPERATOR) is None
     assert made.acquire(D1, "a", PROGRAM) is None
     assert made.acquire(D1, "b", PROGRAM + 1) is None
 
 
 def test_a_released_drone_is_free_and_the_priority_is_gone():
-    made = commanders()
+    made = queue()
     made.acquire(D1, "console.1", OPERATOR)
     assert made.release(D1, "console.1") is None
-    assert made.holder(D1) is None
+    assert made.commander(D1) is None
     send(made, D1, "console.1")
     assert made.acquire(D1, "other", PROGRAM + 1) is None
 
 
 @pytest.mark.parametrize(("holder", "who"), [("a", "'a'"), (None, "nobody")])
 def test_only_the_commander_releases(holder: str | None, who: str):
-    made = commanders()
+    made = queue()
     if holder:
-        made.take(D1, holder)
-    assert made.release(D1, "b") == f"drone1 is flown by {who}, not by 'b'"
-    assert made.holder(D1) == holder
+        made.claim(D1, holder)
+    refusal = made.release(D1, "b")
+    assert refusal is not None
+    assert refusal[:2] == ("drone1", f"flown by {who}, not by 'b'")
+    assert made.commander(D1) == holder
 
 
 def test_a_setpoint_on_its_way_does_not_undo_a_release():
-    made = commanders()
+    made = queue()
     send(made, D1, "a")
     made.push(D1, "velocity", velocity("a", 1), GATE_NS)
     made.push(D1, "mode", mode("a", "land"), GATE_NS)
     made.push(D2, "velocity", velocity("a", 1), GATE_NS)
     made.release(D1, "a")
-    assert [(due.drone, due.kind) for due, _ in fly(made, GATE_NS)] == [(D1, "mode"), (D2, "velocity")]
-    assert made.holder(D1) is None
-    assert made.holder(D2) == "a"
+    assert [(command.drone, command.kind) for command, _ in fly(made, GATE_NS)] == [(D1, "mode"), (D2, "velocity")]
+    assert made.commander(D1) is None
+    assert made.commander(D2) == "a"
 
 
 def test_who_is_gone_flies_nothing_any_more():
-    made = commanders()
+    made = queue()
     send(made, D1, "a")
     send(made, D2, "a")
     made.push(D1, "velocity", velocity("a", 1), GATE_NS)
     made.push(D2, "mode", mode("a", "land"), GATE_NS)
     made.push(D2, "velocity", velocity("b", 1), GATE_NS)
-    assert made.gone("a") == [D1, D2]
-    assert made.gone("a") == []
-    assert made.holder(D1) is None
-    assert [(due.source, due.kind) for due in made.pop(GATE_NS)] == [("a", "mode"), ("b", "velocity")]
+    assert made.remove_source("a") == [D1, D2]
+    assert made.remove_source("a") == []
+    assert made.commander(D1) is None
+    assert [(command.source, command.kind) for command in made.pop(GATE_NS)] == [("a", "mode"), ("b", "velocity")]
 
 
 def test_who_is_gone_has_no_priority_any_more():
-    made = commanders()
+    made = queue()
     made.acquire(D1, "console.1", OPERATOR)
     made.acquire(D1, "console.2", OPERATOR + 1)
-    assert made.gone("console.1") == []
+    assert made.remove_source("console.1") == []
     made.release(D1, "console.2")
     made.push(D1, "velocity", velocity("console.1"), 0)
-    assert [due.priority for due in made.pop(0)] == [PROGRAM]
+    assert [command.priority for command in made.pop(0)] == [PROGRAM]
 
 
 # Modes
@@ -226,24 +229,24 @@ def test_who_is_gone_has_no_priority_any_more():
     ("priority", "refused"), [(PROGRAM, True), (OPERATOR - 1, True), (OPERATOR, False), (OPERATOR + 1, False)]
 )
 def test_modes_are_open_to_a_priority_no_lower_than_the_commander_s(priority: int, refused: bool):
-    made = commanders()
+    made = queue()
     made.acquire(D1, "a", OPERATOR)
-    reason = made.refusal(Due(0, priority, "b", 0, D1, "mode", mode("b", "land")))
+    reason = made.refusal(QueuedCommand(0, priority, "b", 0, D1, "mode", mode("b", "land")))
     assert (reason is not None) is refused
 
 
 def test_any_program_may_land_what_a_program_flies():
-    made = commanders()
+    made = queue()
     send(made, D1, "controller.main")
     made.push(D1, "mode", mode("other", "land"), 0)
     ((_, reason),) = fly(made, 0)
     assert reason is None
-    assert made.holder(D1) == "controller.main"
+    assert made.commander(D1) == "controller.main"
 
 
 def test_modes_are_open_to_all_while_nobody_flies():
-    made = commanders()
+    made = queue()
     made.push(D1, "mode", mode("anyone", "takeoff"), 0)
     ((_, reason),) = fly(made, 0)
     assert reason is None
-    assert made.holder(D1) is None
+    assert made.commander(D1) is None

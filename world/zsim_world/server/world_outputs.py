@@ -1,4 +1,4 @@
-"""What the world says, on its way: encoded, remembered, put in one go, and handed to recorders with what passed."""
+"""What the world publishes: encoded, kept in the history, put in one go, and handed to recorders with what passed."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -8,25 +8,27 @@ from zsim.contract import batch, messages
 from zsim.contract.bundle import Bundle
 from zsim.runtime.agent import Output
 from zsim.transport.session import Sample, Session
-from zsim_world.flight.coordinator import Hub
-from zsim_world.server.message_history import History
+from zsim_world.flight.coordinator import Coordinator
+from zsim_world.server.message_history import MessageHistory
 
 
-class Outgoing:
-    """The way from a world's outbox to the link.
+class WorldOutputs:
+    """Publishes the outbox of a world on its link.
 
     Args:
-        link: of the hub.
+        link: the listening session.
         world: whose outbox it is.
-        history: remembers what is said.
-        said: told every key and message beside those of drones.
+        history: keeps what is published.
+        on_message: called with every key and message beside those of drones.
     """
 
-    def __init__(self, link: Session, world: Hub, history: History, said: Callable[[str, Any], None]) -> None:
+    def __init__(
+        self, link: Session, world: Coordinator, history: MessageHistory, on_message: Callable[[str, Any], None]
+    ) -> None:
         self._link = link
         self._world = world
         self._history = history
-        self._said = said
+        self._on_message = on_message
         self._unsent: batch.Batch = []
         self._passed: batch.Batch = []
         self._gate_keys = [batch.gate(name) for name in world.names]
@@ -54,10 +56,10 @@ class Outgoing:
         self._history.add_all(encoded, self._world.now_ns)
         for key, message in outbox:
             if type(message) is not Bundle:
-                self._said(key, message)
+                self._on_message(key, message)
 
     def _gather_bundle(self, bundle: Bundle) -> None:
-        """Keep what is said at a gate in one message, of all drones and of each, where somebody reads it so."""
+        """Keep the messages of a gate as one, of all drones and of each, where there is a subscriber to that."""
         whole = (batch.GATE, bundle.packed())
         self._passed.append(whole)
         if self._link.heard(batch.GATE):
@@ -80,7 +82,7 @@ class Outgoing:
         self._link.put_raw(output.key, payload)
 
     def passed(self, sample: Sample) -> None:
-        """Note what somebody else has said."""
+        """Note a message that a participant or anyone else has published."""
         self._passed.append(sample)
 
     def put_batch(self) -> None:

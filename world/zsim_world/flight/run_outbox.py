@@ -1,0 +1,107 @@
+"""What a run publishes, in order: messages, events among them, and refusals, which are events too."""
+
+import re
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+from zsim.contract import keys, messages
+from zsim.scenario.rights import WORLD
+
+KeyedMessage = tuple[str, Any]  # key and message; or batch.GATE and the Bundle of what is published of drones at a gate
+EVENTS_MAX = 20  # events per source, subject and reason; further refusals are counted only
+REASONS_MAX = 10  # of a source and subject that are kept apart; all further ones count as one
+SUBJECTS_MAX = 10_000  # sources and subjects
+
+_FIGURE = re.compile(r"\d[\d.e+-]*")
+
+
+class Refusal(NamedTuple):
+    """Why something is refused; its text is one line.
+
+    Attributes:
+        where: the field or thing at fault.
+        found: its value or state, as text.
+        allowed: what is allowed, or what to do.
+    """
+
+    where: str
+    found: str
+    allowed: str
+
+    def __str__(self) -> str:
+        return f"{self.where} is {self.found}; {self.allowed}"
+
+
+class RefusalLog:
+    """Counts refusals, and limits how many of them become events.
+
+    Attributes:
+        count: of all of them.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._counts: dict[tuple[str, str], dict[str, int]] = {}
+
+    def add(self, source: str, subject: str, reason: str) -> str | None:
+        """Count a refusal; return the text of its event, None where there have been enough.
+
+        Reasons that differ in figures only, such as an age, are one.
+        """
+        self.count += 1
+        if len(self._counts) > SUBJECTS_MAX:
+            self._counts.clear()
+        by_reason = self._counts.setdefault((source, subject), {})
+        pattern = _FIGURE.sub("#", reason)
+        if pattern not in by_reason and len(by_reason) >= REASONS_MAX:
+            pattern = ""
+        former = by_reason.get(pattern, 0)
+        by_reason[pattern] = former + 1
+        last = " (further ones are counted only)" if former == EVENTS_MAX - 1 else ""
+        return f"{subject}: {reason}{last}" if former < EVENTS_MAX else None
+
+
+class RunOutbox:
+    """Messages of the world that are to be published.
+
+    Args:
+        now_ns: returns the newest gate, with which events are stamped [ns].
+
+    Attributes:
+        pending: keys and messages in order.
+        refusals: counted, also those that are no events any more.
+    """
+
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        self._now_ns = now_ns
+        self._next_seq: dict[str, int] = {}
+        self.pending: list[KeyedMessage] = []
+        self.refusals = RefusalLog()
+
+    def put(self, key: str, message: Any) -> None:
+        """Add a message."""
+        self.pending.append((key, message))
+
+    def take(self) -> list[KeyedMessage]:
+        """Remove and return all messages."""
+        pending, self.pending = self.pending, []
+        return pending
+
+    def next_seq(self, key: str) -> int:
+        """Return the number of the next message on a key."""
+        seq = self._next_seq.get(key, 0)
+        self._next_seq[key] = seq + 1
+        return seq
+
+    def event(
+        self, kind: str, subject: str, text: str, data: Mapping[str, Any] | None = None, source: str = WORLD
+    ) -> None:
+        """Add an event."""
+        seq = self.next_seq(keys.EVENT)
+        self.put(keys.EVENT, messages.Event(self._now_ns(), seq, kind, source, subject, text, dict(data or {})))
+
+    def refuse(self, source: str, subject: str, reason: Refusal | str) -> None:
+        """Count a refusal, and add an event of it unless there have been too many like it."""
+        text = self.refusals.add(source, subject, str(reason))
+        if text is not None:
+            self.event("refused", subject, text, {"reason": str(reason)}, source)

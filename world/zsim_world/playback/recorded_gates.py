@@ -1,0 +1,134 @@
+"""A record read as the gates of a run, one after the other, a few of them in memory at a time; what of it is played."""
+
+from collections import deque
+from collections.abc import Collection, Iterator, Sequence
+from typing import NamedTuple
+
+import msgspec
+
+from zsim.contract import keys, messages
+from zsim.contract.messages import REFUSALS
+from zsim.errors import DecodeError
+from zsim.record import Recorded, RecordReader
+from zsim.scenario import rights
+from zsim.scenario.fault_kinds import PROCESS_KILL
+
+VIEWS = (messages.ViewDrones, messages.ViewCluster, messages.ViewEstimates)  # made anew, as often as they are shown
+
+
+class Gate(NamedTuple):
+    """The messages of a gate: stamped after the gate before, up to this one; in order of writing."""
+
+    t_ns: int
+    messages: list[Recorded]
+
+
+class _Clock(msgspec.Struct):
+    state: str
+
+
+class _Sourced(msgspec.Struct):
+    source: str = ""
+
+
+_decode_clock = msgspec.msgpack.Decoder(_Clock).decode
+_decode_sourced = msgspec.msgpack.Decoder(_Sourced).decode
+
+
+class RecordedGates:
+    """Reads a record from any gate on.
+
+    An answer to a gate is written a few gates later, since the world runs ahead of those who answer; it is played with
+    the gate that it is stamped with. What comes later than that by its stamp (of a program that stamps nothing, or in
+    realtime) is played where it was written.
+
+    Args:
+        reader: of the record.
+        gate_ns: of the run.
+        delay_ns: of its commands, by which the world may be ahead.
+        wanted: keys.
+    """
+
+    def __init__(self, reader: RecordReader, gate_ns: int, delay_ns: int, wanted: Collection[str]) -> None:
+        self._reader = reader
+        self._gate_ns = gate_ns
+        self._slack_ns = delay_ns + gate_ns
+        self._keys = {*wanted, keys.CLOCK}
+
+    def gates(self, from_ns: int = 0) -> Iterator[Gate]:
+        """Yield the gates from the first one at or after `from_ns` on; a gate that the record lacks is left out."""
+        for gate in self._all(from_ns):
+            if gate.t_ns >= from_ns:
+                yield gate
+
+    def _all(self, from_ns: int) -> Iterator[Gate]:
+        held: dict[int, list[Recorded]] = {}
+        gates: deque[int] = deque()
+        newest = None
+        # What answers the first gate, or was sampled for it, may stand in a chunk that begins before it.
+        for recorded in self._reader.messages(self._keys, by_time=False, from_ns=max(0, from_ns - self._slack_ns)):
+            if recorded.key != keys.CLOCK:
+                held.setdefault(self._gate_of(recorded.t_ns, newest), []).append(recorded)
+            elif (newest is None or recorded.t_ns > newest) and _is_gate(recorded.payload):
+                newest = recorded.t_ns
+                gates.append(newest)
+                while gates[0] + self._slack_ns <= newest:
+                    yield self._take(gates.popleft(), held)
+        for t_ns in gates:
+            yield self._take(t_ns, held)
+
+    def _gate_of(self, t_ns: int, newest: int | None) -> int:
+        """Return the gate at which a message is played that was written after the clock of gate `newest`."""
+        due_ns = -(-t_ns // self._gate_ns) * self._gate_ns
+        if newest is None:
+            return due_ns
+        writing_ns = newest + self._gate_ns
+        return due_ns if newest - self._slack_ns < due_ns <= writing_ns else writing_ns
+
+    def _take(self, t_ns: int, held: dict[int, list[Recorded]]) -> Gate:
+        """Return a gate; what has waited longer, for a gate that the record lacks, comes with it."""
+        due = sorted(gate_ns for gate_ns in held if gate_ns <= t_ns)
+        return Gate(t_ns, [recorded for gate_ns in due for recorded in held.pop(gate_ns)])
+
+
+def _is_gate(payload: bytes) -> bool:
+    """Tell whether a clock is that of a gate: while a run waits for its start, none has been published."""
+    try:
+        return _decode_clock(payload).state != "waiting"
+    except REFUSALS:
+        return False  # not the world's
+
+
+def is_played(key: str, expressions: Sequence[str]) -> bool:
+    """Tell whether what stands on a key is played: not what is made anew, nor what absent processes said of themselves.
+
+    Args:
+        expressions: that the user wants to be played.
+    """
+    anew = key in (keys.INFO, keys.CLOCK) or key.startswith("process/") or messages.type_of(key) in VIEWS
+    return not anew and rights.permits(expressions, key)
+
+
+def author(recorded: Recorded) -> str:
+    """Return the process that published a message beside the world, empty where it was none of a known role."""
+    kind = messages.type_of(recorded.key)
+    if kind is messages.Estimate:
+        return f"estimator.{keys.thing(recorded.key)}"
+    if kind in (messages.ClusterState, messages.ClusterRequest):
+        return f"controller.{keys.thing(recorded.key)}"
+    if kind is None or not issubclass(kind, messages.Command):
+        return ""
+    try:
+        return _decode_sourced(recorded.payload).source
+    except REFUSALS:
+        return ""
+
+
+def without_kills(payload: bytes) -> bytes:
+    """Return a list of faults without those of which a process dies: who takes part now is not who was meant."""
+    try:
+        listed: messages.Faults = messages.decode(keys.FAULTS, payload)
+    except DecodeError:
+        return payload
+    others = tuple(fault for fault in listed.faults if fault.kind != PROCESS_KILL)
+    return payload if others == listed.faults else messages.encode(msgspec.structs.replace(listed, faults=others))
