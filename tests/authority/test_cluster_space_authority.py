@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from zsim_agents.formation.formation_law import FormationGains, FormationLaw
 from zsim_agents.formation.reference_check import ShapeLimits, plan_ramp
-from zsim_agents.formation.spaces.cluster_space import Array, closest_pair, cluster_space
+from zsim_agents.formation.spaces.cluster_space import Array, closest_pair
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.trajectory import ExpressionTrajectory, Hold, Reference
 
 SPACE = cluster_space(3)

@@ -15,7 +15,7 @@ from zsim_agents.formation.flight_data import GateInput, GateOutput
 from zsim_agents.formation.flight_plan import Scheduled
 from zsim_agents.formation.flight_request import Engage, Land, TakeOff, Target
 from zsim_agents.formation.formation_law import FormationLaw
-from zsim_agents.formation.spaces.cluster_space import cluster_space
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 
 pytestmark = needs_octave
 

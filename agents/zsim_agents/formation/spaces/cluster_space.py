@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.compiled import COMPILES, portable
-from zsim.scenario.scenario import ROBOTS_MAX
 
 Array = NDArray[np.float64]
 
@@ -153,21 +152,6 @@ class ClusterSpace(ABC):
         if name not in self.names:
             raise ValueError(f"variable {name[:40]!r} is unknown; allowed: {_listed(self.names)}")
         return self.names.index(name)
-
-
-def cluster_space(n: int) -> ClusterSpace:
-    """Return the cluster space of n robots: the paper's at n = 3, its triad generalisation elsewhere.
-
-    Raises:
-        ValueError: n is not from 2 to 64.
-    """
-    # Imported here because both build on the class above.
-    from zsim_agents.formation.spaces.pair_cluster import PairCluster
-    from zsim_agents.formation.spaces.triad_cluster import TriadCluster
-
-    if not 2 <= n <= ROBOTS_MAX:
-        raise ValueError(f"a cluster of {n} robots is not possible; allowed: 2 to {ROBOTS_MAX}")
-    return PairCluster() if n == 2 else TriadCluster(n)
 
 
 def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""The cluster space that a scenario asks for."""
+"""The cluster space that a scenario asks for: the stock ones by their names, clusters of clusters by their groups."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from zsim.scenario.scenario import Cluster, Group, Scenario, kinematics
-from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, cluster_space
+from zsim.scenario.scenario import ROBOTS_MAX, Cluster, Group, Scenario, kinematics
+from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 from zsim_agents.formation.spaces.nested_cluster import NestedCluster
+from zsim_agents.formation.spaces.pair_cluster import PairCluster
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
+from zsim_agents.formation.spaces.triad_cluster import TriadCluster
 
 
 def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
@@ -29,6 +31,17 @@ def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
         centres.append(own.mean(axis=0))
         first += group.size
     return NestedCluster(_space(cluster, np.array(centres)), groups)
+
+
+def cluster_space(n: int) -> ClusterSpace:
+    """Return the space of n robots called triad: the paper's at n = 3, its generalisation elsewhere.
+
+    Raises:
+        ValueError: n is not from 2 to 64.
+    """
+    if not 2 <= n <= ROBOTS_MAX:
+        raise ValueError(f"a cluster of {n} robots is not possible; allowed: 2 to {ROBOTS_MAX}")
+    return PairCluster() if n == 2 else TriadCluster(n)
 
 
 def _space(spec: Cluster | Group, starts: Array) -> ClusterSpace:

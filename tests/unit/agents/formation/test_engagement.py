@@ -22,7 +22,8 @@ from zsim_agents.formation.flight_request import (
     Target,
     read_request,
 )
-from zsim_agents.formation.spaces.cluster_space import closest_pair, cluster_space
+from zsim_agents.formation.spaces.cluster_space import closest_pair
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 
 SPACE = cluster_space(3)

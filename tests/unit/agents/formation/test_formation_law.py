@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from zsim_agents.formation.formation_law import FormationGains, FormationLaw, guard, load
 from zsim_agents.formation.near_pairs import near_pairs_at_once, near_pairs_in_turn
-from zsim_agents.formation.spaces.cluster_space import cluster_space
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 
 SPACE = cluster_space(3)
 GOAL = np.array([5, -5, 15, 0, 0, math.pi / 2, 0, 0, 0, 4, 4, math.pi / 4])  # paper, equation (3)

@@ -17,7 +17,7 @@ MODULES = (
     "formation.spaces.nested_cluster",
     "formation.spaces.pair_cluster",
     "formation.reference_check",
-    "formation.spaces.rotation_fit",
+    "formation.spaces.template_geometry",
     "formation.spaces.template_cluster",
     "formation.trajectory",
     "formation.spaces.triad_cluster",
@@ -240,7 +240,7 @@ def test_judgements_are_the_same(both, n):
 FLIGHT = """
 import sys
 import numpy as np
-from zsim_agents.formation.spaces.cluster_space import cluster_space
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.controller import rehearse
 from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.flight_data import GateInput
