@@ -23,8 +23,10 @@ from zsim.schema.checker import show
 FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that processes started from here search there too
 WHERE = "install it, or put it on PYTHONPATH or beside the scenario"
 
-ModuleName = Annotated[str, Meta(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*\Z")]
-ClassName = Annotated[str, Meta(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z")]
+MODULE_NAME = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
+CLASS_NAME = rf"{MODULE_NAME}:[A-Za-z_]\w*"
+ModuleName = Annotated[str, Meta(pattern=rf"^{MODULE_NAME}\Z")]
+ClassName = Annotated[str, Meta(pattern=rf"^{CLASS_NAME}\Z")]
 
 
 def search(folder: Path) -> None:
@@ -54,7 +56,7 @@ def load(name: str, where: str, kind: type) -> Callable[..., Any]:
     if not isinstance(loaded, type):
         classes = ", ".join(_classes(module)) or "it has none"
         raise DocumentError([f"{where} is {show(name)}; must be a class of {module_name}: {classes}"])
-    missing = [method for method in _methods(kind) if not callable(getattr(loaded, method, None))]
+    missing = [method for method in _methods(kind) if not _is_method(getattr(loaded, method, None))]
     if missing:
         lacks = f"{where} is {show(name)}, which has no {', '.join(missing)}()"
         raise DocumentError([f"{lacks}; must have the methods of {kind.__name__}"])
@@ -86,3 +88,7 @@ def _classes(module: ModuleType) -> list[str]:
 def _methods(kind: type) -> list[str]:
     """Return the public methods of a class or Protocol."""
     return [name for name in dir(kind) if not name.startswith("_") and callable(getattr(kind, name))]
+
+
+def _is_method(attribute: Any) -> bool:
+    return callable(attribute) and not getattr(attribute, "__isabstractmethod__", False)

@@ -4,7 +4,7 @@ Order of this file: the agent, `receive`, `step`, requests, warm start, pure par
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from operator import itemgetter
 from struct import Struct as Packing
@@ -15,15 +15,16 @@ import numpy as np
 from zsim.contract import keys, messages
 from zsim.contract.messages import ControlAnswer, ControlRequest
 from zsim.contract.views import cluster_view
-from zsim.errors import RunError
+from zsim.errors import DocumentError, RunError
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Cluster, Gains, Scenario
+from zsim.schema import plugin
+from zsim_agents.formation.control_law import LAWS, ControlLaw, FormationGains, ProportionalLaw
 from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.flight_check import all_near
 from zsim_agents.formation.flight_data import GateInput, GateOutput
-from zsim_agents.formation.flight_plan import Scheduled
-from zsim_agents.formation.flight_request import Engage, Follow, Land, RequestError, TakeOff, Target, read_request
-from zsim_agents.formation.formation_law import FormationGains, guard, load
+from zsim_agents.formation.flight_plan import RequestError, plan_of, read_request
+from zsim_agents.formation.robot_limits import guard, load
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, closest_pair, robot_rates
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_agents.formation.trajectory import Hold, ramp_onto
@@ -218,27 +219,41 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
         RunError: the plan can never be flown; the text says why.
     """
     try:
-        space, gains = scenario_space(scenario, cluster), gains_of(cluster.gains)
-        rehearse(space, gains)
-        return Engagement(space, cluster.drones, gains, plan=plan_of(cluster))
-    except ValueError as error:
+        space, gains, law = scenario_space(scenario, cluster), gains_of(cluster.gains), law_of(cluster)
+        rehearse(space, gains, law)
+        return Engagement(space, cluster.drones, gains, plan=plan_of(cluster), law=law)
+    except (ValueError, DocumentError) as error:
         raise RunError(f"cluster {cluster.name!r}: {error}") from error
 
 
-def rehearse(space: ClusterSpace, gains: FormationGains) -> None:
+def law_of(cluster: Cluster) -> Callable[[ClusterSpace, FormationGains], ControlLaw]:
+    """Return the class of the control law that a cluster names.
+
+    Raises:
+        DocumentError: a class of the user's own that cannot be loaded.
+    """
+    name = cluster.law or "proportional"
+    return LAWS.get(name) or plugin.load(name, "law", ControlLaw)
+
+
+def rehearse(
+    space: ClusterSpace,
+    gains: FormationGains,
+    law: Callable[[ClusterSpace, FormationGains], ControlLaw] = ProportionalLaw,
+) -> None:
     """Fly a gate of a formation that nobody sees: code is compiled, or loaded, here and not in flight."""
     c = space.specimen(max(gains.separation_min_m, APART_M))
     p_W, yaw = space.inverse(c)
     c = space.forward(p_W, yaw)
     none = np.zeros((space.n, 3))
-    unseen = Engagement(space, [str(i) for i in range(space.n)], gains)
+    unseen = Engagement(space, [str(i) for i in range(space.n)], gains, law=law)
     unseen.warm_start("engaged", c)
     unseen.step(GateInput(0.0, p_W, yaw, none, none, np.zeros(space.n), ("flying",) * space.n))
     ramp_onto(space, c, c, Hold(c), 0.0, 2.0).value(1.0)
     all_near(p_W, yaw)
     closest_pair(p_W)
-    guard(p_W, none, none, gains)
-    load(*robot_rates(space, c, c), gains)
+    guard(p_W, none, none, gains.limits)
+    load(*robot_rates(space, c, c), gains.limits)
 
 
 def gains_of(gains: Gains) -> FormationGains:
@@ -252,28 +267,6 @@ def gains_of(gains: Gains) -> FormationGains:
         separation_min_m=gains.separation_min_m,
         separation_alarm_m=gains.separation_alarm_m,
     )
-
-
-def plan_of(cluster: Cluster) -> list[Scheduled]:
-    """Return the steps of a cluster's plan in their order."""
-    plan, steps = cluster.plan, []
-    if plan.takeoff_s is not None:
-        steps += [Scheduled(plan.takeoff_s, TakeOff()), Scheduled(plan.takeoff_s, Engage())]
-        if plan.target:
-            steps.append(Scheduled(plan.takeoff_s, Target(plan.target, plan.target_over_s)))
-        if plan.trajectory is not None:
-            trajectory = plan.trajectory
-            waypoints = [{"at_s": w.at_s, "values": w.values} for w in trajectory.waypoints]
-            follow = Follow(
-                expressions=trajectory.expressions,
-                constants=trajectory.constants,
-                waypoints=waypoints,
-                start_s=trajectory.start_s,
-            )
-            steps.append(Scheduled(plan.takeoff_s, follow))
-    if plan.land_s is not None:
-        steps.append(Scheduled(plan.land_s, Land()))
-    return steps
 
 
 def in_heading(v_W: Sequence[float], yaw: float) -> tuple[float, float, float]:

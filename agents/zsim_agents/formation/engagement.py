@@ -6,13 +6,13 @@ followed that was not checked, every refusal has a reason, and every reference s
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from zsim_agents.formation.flight_check import FlightJudge
+from zsim_agents.formation.control_law import ControlLaw, FormationCommand, FormationGains, ProportionalLaw
+from zsim_agents.formation.flight_check import FlightJudge, place_fault
 from zsim_agents.formation.flight_data import (
     AIRBORNE,
     DOWN,
@@ -20,25 +20,25 @@ from zsim_agents.formation.flight_data import (
     GateInput,
     GateOutput,
     ModeCommand,
-    Setpoint,
+    ModeSender,
+    setpoints,
 )
-from zsim_agents.formation.flight_plan import FlightPlan, Scheduled
-from zsim_agents.formation.flight_request import (
+from zsim_agents.formation.flight_plan import (
     REFUSALS,
     Engage,
+    FlightPlan,
     FlightRequest,
     Follow,
     Land,
+    MoveTo,
     Pause,
     RefusalError,
+    Scheduled,
     TakeOff,
-    Target,
     refuse,
 )
-from zsim_agents.formation.formation_law import FormationCommand, FormationGains, FormationLaw, Pairs, guard
 from zsim_agents.formation.guidance import Guidance
-from zsim_agents.formation.mode_sender import ModeSender
-from zsim_agents.formation.reference_check import place_fault
+from zsim_agents.formation.robot_limits import Pairs, RobotLimits, guard
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 
 DT_MAX_S = 0.1  # longest step of the integral, after a gap
@@ -53,6 +53,7 @@ class Engagement:
         space: cluster space of n robots.
         drones: their names in the order of the robots, for commands and reasons.
         plan: what the scenario asks for by itself; a Land by request drops the rest of it.
+        law: class of the control law.
 
     Raises:
         ValueError: the plan can never be flown (see `FlightPlan`), or the number of names is not n.
@@ -65,6 +66,7 @@ class Engagement:
         gains: FormationGains | None = None,
         limits: EngagementLimits | None = None,
         plan: Sequence[Scheduled] = (),
+        law: Callable[[ClusterSpace, FormationGains], ControlLaw] = ProportionalLaw,
     ) -> None:
         if len(drones) != space.n:
             raise ValueError(f"cluster: {len(drones)} drones; allowed: {space.n}, as its cluster space has")
@@ -72,11 +74,10 @@ class Engagement:
         self.drones = tuple(drones)
         self.gains = gains or FormationGains()
         self.limits = limits or EngagementLimits()
-        self.law = FormationLaw(space, self.gains)
+        self.law = law(space, self.gains)
         self.guidance = Guidance(space, self.gains, self.limits.shape)
         self.plan = FlightPlan(space, plan)
-        held_apart_m = self.gains.separation_min_m + HOLD_APART_M
-        self._apart = dataclasses.replace(self.gains, separation_min_m=held_apart_m)
+        self._held_limits = self.gains.limits._replace(separation_min_m=self.gains.separation_min_m + HOLD_APART_M)
         self.judge = FlightJudge(space, self.drones, self.gains, self.limits)
         self._phase = "idle"
         self._gate: GateInput | None = None
@@ -109,7 +110,7 @@ class Engagement:
         refusal = self._try(request)
         if refusal is None and isinstance(request, Land):
             self.plan.clear()
-        elif refusal is None and isinstance(request, Target | Follow):
+        elif refusal is None and isinstance(request, MoveTo | Follow):
             self.plan.overrule()
         return refusal
 
@@ -146,7 +147,7 @@ class Engagement:
             raise RefusalError(self._fault)
         elif isinstance(request, Pause):
             self.guidance.pause(gate.t_s)
-        elif isinstance(request, Target):
+        elif isinstance(request, MoveTo):
             self.guidance.target(request, gate.t_s)
         else:
             self.guidance.follow(request, gate.t_s)
@@ -189,13 +190,9 @@ class Engagement:
 
     def _climb(self, gate: GateInput, reason: str, modes: tuple[ModeCommand, ...] = ()) -> GateOutput:
         """Lead the drones that fly straight up to the assembly height, each by its own velocity loop."""
-        v_W = np.zeros((self.space.n, 3))
-        alarmed: Pairs = ()
-        if self.judge.estimate_fault(gate) is None:
-            below_m = self.limits.assembly_height_m - gate.p_W[:, 2]
-            v_W[:, 2] = np.minimum(np.maximum(CLIMB_GAIN_1_S * below_m, 0.0), self.limits.assembly_climb_m_s)
-            v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, self.gains)
-        return self._output(gate, reason, modes=modes, command=self._upright(v_W, alarmed))
+        below_m = self.limits.assembly_height_m - gate.p_W[:, 2]
+        climb_m_s = np.minimum(np.maximum(CLIMB_GAIN_1_S * below_m, 0.0), self.limits.assembly_climb_m_s)
+        return self._output(gate, reason, modes=modes, command=self._upright(gate, climb_m_s, self.gains.limits))
 
     def _engaged(self, gate: GateInput) -> GateOutput:
         self._judge(gate)
@@ -212,14 +209,15 @@ class Engagement:
         return self._output(gate, reason, command=command, reference=(self._shown[1], c_dot_des))
 
     def _held(self, gate: GateInput) -> GateOutput:
+        return self._output(gate, self._fault, command=self._upright(gate, 0.0, self._held_limits))
+
+    def _upright(self, gate: GateInput, climb_m_s: Array | float, limits: RobotLimits) -> FormationCommand:
+        """Return a guarded climb (n,) without turning; rest where the estimates cannot be flown on."""
         v_W = np.zeros((self.space.n, 3))
         alarmed: Pairs = ()
         if self.judge.estimate_fault(gate) is None:
-            v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, self._apart)
-        return self._output(gate, self._fault, command=self._upright(v_W, alarmed))
-
-    def _upright(self, v_W: Array, alarmed: Pairs) -> FormationCommand:
-        """Return velocities (n, 3) without turning."""
+            v_W[:, 2] = climb_m_s
+            v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, limits)
         return FormationCommand(v_W, np.zeros(self.space.n), 1.0, (), alarmed)
 
     def _landing(self, gate: GateInput) -> GateOutput:
@@ -270,14 +268,13 @@ class Engagement:
         """Return the output of a gate; without a reference the formation is said to be where it wants to be."""
         alarmed = command.alarmed if command else ()
         if alarmed:
-            limit_m = self.gains.separation_alarm_m
-            reason = f"ALARM, nearer than {limit_m:g} m: {self._pairs(alarmed)}; {reason}"
+            reason = f"ALARM, nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(alarmed)}; {reason}"
         if self.plan.note:
             reason = f"{reason}; {self.plan.note}" if reason else self.plan.note
         desired, desired_rate = reference or (self.judge.value, np.zeros(self.space.size))
         return GateOutput(
             modes=modes,
-            setpoints=self._setpoints(gate, command) if command else (None,) * self.space.n,
+            setpoints=setpoints(gate, command.v_W, command.yaw_rate) if command else (None,) * self.space.n,
             phase=self.phase,
             value=self.judge.value,
             desired=desired,
@@ -289,14 +286,6 @@ class Engagement:
             alarmed=alarmed,
             plan_step=self.plan.resume_at(engaged=self._phase == "engaged" and not self.guidance.paused),
         )
-
-    @staticmethod
-    def _setpoints(gate: GateInput, command: FormationCommand) -> tuple[Setpoint | None, ...]:
-        """Return the setpoints of the drones that follow one."""
-        setpoints = map(Setpoint, command.v_W.tolist(), command.yaw_rate.tolist())
-        if AIRBORNE.issuperset(gate.states):
-            return tuple(setpoints)
-        return tuple(s if state in AIRBORNE else None for s, state in zip(setpoints, gate.states, strict=True))
 
     def _pairs(self, pairs: Pairs) -> str:
         return ", ".join(f"{self.drones[i]} and {self.drones[j]}" for i, j in pairs)

@@ -1,15 +1,23 @@
-"""Whether a formation may take off, be engaged, and be flown on: every fault in words."""
+"""Whether a formation may take off, be engaged, and be flown on, and where it may be: every fault in words."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from zsim.math.compiled import portable
-from zsim_agents.formation.flight_data import AIRBORNE, EngagementLimits, GateInput
-from zsim_agents.formation.formation_law import FormationGains
-from zsim_agents.formation.reference_check import FAR, bounds_of, first_outside, shape_fault
-from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
+from zsim.math.compiled import COMPILES, portable
+from zsim_agents.formation.control_law import FormationGains
+from zsim_agents.formation.flight_data import AIRBORNE, EngagementLimits, GateInput, ShapeLimits
+from zsim_agents.formation.spaces.cluster_space import (
+    Array,
+    ClusterSpace,
+    SingularClusterError,
+    closest_pair,
+    least_distance,
+)
 
+FAR = 1e6  # m or rad: beyond it a value is a slip
 WELL, OLD, WILD, VAGUE = range(4)  # what an estimate is: fit, too old, not finite, too uncertain
 
 
@@ -149,3 +157,76 @@ def estimate_flaw(
             if not sigma_m[i, k] <= sigma_max_m:
                 return VAGUE, i
     return WELL, 0
+
+
+def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: float | None = None) -> str | None:
+    """Return why c is no formation to engage or to lead to, or None; names quantity, value and limit.
+
+    Args:
+        spread: of c, where it is known.
+    """
+    outside = first_outside(c, space.bounds)
+    if outside >= 0:
+        return _value_fault(space, c, outside)
+    spread = space.spread(c) if spread is None else spread
+    if spread <= limits.spread_min_m:
+        return f"{space.spread_text} is {spread:.2f} m; allowed: above {limits.spread_min_m:g} m"
+    for k in space.tilts:
+        if abs(c[k]) >= limits.tilt_max_rad:
+            found, most = math.degrees(c[k]), math.degrees(limits.tilt_max_rad)
+            return f"{space.names[k]} of the formation is {found:.1f} deg; allowed: below {most:g} deg either way"
+    condition = space.condition(c) if math.isfinite(limits.condition_max) else 0.0
+    if not condition < limits.condition_max:
+        return f"condition number of J^-1 is {condition:.1f}; allowed: below {limits.condition_max:g}"
+    return None
+
+
+def bounds_of(space: ClusterSpace, limits: ShapeLimits) -> Array:
+    """Return the open bounds (4n, 2) of variables of which `shape_fault` finds none at fault, but for the condition."""
+    bounds = space.bounds.copy()
+    for k in space.tilts:
+        bounds[k, 0] = max(bounds[k, 0], -limits.tilt_max_rad)
+        bounds[k, 1] = min(bounds[k, 1], limits.tilt_max_rad)
+    return bounds
+
+
+@portable
+def first_outside(c: Array, bounds: Array) -> int:
+    """Return the place of the first variable of c that is beyond FAR or its open bounds (4n, 2), or -1."""
+    for k in range(c.size):
+        if not (abs(c[k]) < FAR and bounds[k, 0] < c[k] < bounds[k, 1]):  # also true for NaN
+            return k
+    return -1
+
+
+def _value_fault(space: ClusterSpace, c: Array, k: int) -> str:
+    name, value, (low, high) = space.names[k], float(c[k]), space.bounds[k].tolist()
+    if not abs(value) < FAR:
+        return f"{name} is {value:g}; allowed: up to {FAR:g}"
+    return f"{name} is {value:.3g}; allowed: between {low:.3g} and {high:.3g}"
+
+
+def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
+    """Return why the robots may not stand where c puts them (too near to each other, too low), or None."""
+    p_W, _ = space.inverse(c)
+    if COMPILES and well_placed(p_W, gains.separation_min_m, limits.height_min_m):
+        return None
+    distance, i, j = closest_pair(p_W)
+    if distance < gains.separation_min_m:
+        pair = f"robots {i + 1} and {j + 1}"
+        return f"{pair} are {distance:.3f} m apart; allowed: {gains.separation_min_m:g} m or more"
+    heights = p_W[:, 2].tolist()
+    lowest = min(heights)
+    if lowest < limits.height_min_m:
+        low = heights.index(lowest)
+        return f"robot {low + 1} is at z = {lowest:.2f} m; allowed: {limits.height_min_m:g} m or more"
+    return None
+
+
+@portable
+def well_placed(p_W: Array, separation_min_m: float, height_min_m: float) -> bool:
+    """Return whether robots at p_W (n, 3) are neither too near to each other nor too low."""
+    fit = least_distance(p_W)[0] >= separation_min_m
+    for i in range(p_W.shape[0]):
+        fit = fit and p_W[i, 2] >= height_min_m
+    return fit

@@ -59,6 +59,15 @@ class ClusterSpace(ABC):
         self._lengths = [i for i, stem in enumerate(stems) if stem in _LENGTHS]
         self._pitch = self.names.index("pitch")
 
+    @classmethod
+    def for_places(cls, places_m: Array) -> ClusterSpace:
+        """Return the space of as many robots as there are places (n, 3) [m]; here cls(n), what a scenario names.
+
+        Args:
+            places_m: the cluster's `template_m`, else where its robots start; x ahead, y left of the formation.
+        """
+        return cls(len(places_m))  # type: ignore[call-arg]
+
     @abstractmethod
     def forward(self, p_W: Array, yaw: Array) -> Array:
         """Return c (4n,) of robots at p_W (n, 3) [m] with headings yaw (n,) [rad].

@@ -73,6 +73,10 @@ class TemplateCluster(ClusterSpace):
         super().__init__(n, [*names, *numbered("w", range(1, 3 * n - 5))], spread_text)
         self._shape = 6 + n  # place of w_1 in c
 
+    @classmethod
+    def for_places(cls, places_m: Array) -> TemplateCluster:
+        return cls(places_m)
+
     def forward(self, p_W: Array, yaw: Array) -> Array:
         centre_W, b_C, R_WC = self._fitted(p_W)
         c = np.empty(self.size)

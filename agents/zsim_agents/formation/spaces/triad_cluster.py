@@ -292,13 +292,8 @@ def _spherical_rows(k: int, d_C: Array, R_WC: Array, rate: Array) -> Array:
     flat, rho = math.hypot(x, y), math.hypot(x, y, z)
     if not flat > LENGTH_MIN_M:
         raise SingularClusterError(f"robot {k + 1} is on the z axis through robot 1: it has no azimuth")
-    gradient = np.array(
-        [
-            (x / rho, y / rho, z / rho),
-            (-y / flat**2, x / flat**2, 0.0),
-            (-x * z / (flat * rho**2), -y * z / (flat * rho**2), flat / rho**2),
-        ]
-    )
+    rates_C = np.array(spherical_rates(*spherical((x, y, z))))  # its rows are orthogonal, of lengths 1, flat and rho
+    gradient = rates_C / np.array([(1.0,), (flat**2,), (rho**2,)])
     motion_C = np.tensordot(np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)]), rate, 1)
     motion_C[:, k] += R_WC.T
     motion_C[:, 0] -= R_WC.T
