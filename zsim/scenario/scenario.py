@@ -226,11 +226,11 @@ class Plan(Spec, frozen=True, kw_only=True):
 
 SpaceName = Annotated[
     str,
-    Meta(pattern=rf"^(triad|template|{CLASS_NAME})\Z", description="one of triad, template, or package.module:Class"),
+    Meta(pattern=rf"^(triad|template)\Z|{CLASS_NAME}", description="one of triad, template, or package.module:Class"),
 ]
 """How the variables of a formation follow from its robots; a robot is a drone, or a group of them."""
 LawName = Annotated[
-    str, Meta(pattern=rf"^(proportional|{CLASS_NAME})\Z", description="one of proportional, or package.module:Class")
+    str, Meta(pattern=rf"^proportional\Z|{CLASS_NAME}", description="one of proportional, or package.module:Class")
 ]
 
 

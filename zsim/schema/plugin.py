@@ -13,9 +13,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any
-
-from msgspec import Meta
+from typing import Any
 
 from zsim.errors import DocumentError
 from zsim.schema.checker import show
@@ -23,18 +21,16 @@ from zsim.schema.checker import show
 FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that processes started from here search there too
 WHERE = "install it, or put it on PYTHONPATH or beside the scenario"
 
-MODULE_NAME = r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*"
-CLASS_NAME = rf"{MODULE_NAME}:[A-Za-z_]\w*"
-ModuleName = Annotated[str, Meta(pattern=rf"^{MODULE_NAME}\Z")]
-ClassName = Annotated[str, Meta(pattern=rf"^{CLASS_NAME}\Z")]
+MODULE_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*\Z"
+CLASS_NAME = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z"
 
 
 def search(folder: Path) -> None:
-    """Let modules be found in a folder too, here and in processes that are started from here."""
-    folders = list(filter(None, os.environ.get(FOLDERS, "").split(os.pathsep)))
-    path = str(folder.resolve())
-    if path not in folders:
-        os.environ[FOLDERS] = os.pathsep.join([*folders, path])
+    """Let modules be found in the folder of the document that is read now, here and in processes started from here.
+
+    It takes the place of the folder before: a program that reads many documents does not fill its environment.
+    """
+    os.environ[FOLDERS] = str(folder.resolve())
 
 
 def load(name: str, where: str, kind: type) -> Callable[..., Any]:
@@ -51,7 +47,7 @@ def load(name: str, where: str, kind: type) -> Callable[..., Any]:
     module_name, colon, class_name = name.partition(":")
     if not (colon and module_name and class_name):
         raise DocumentError([f"{where} is {show(name)}; must be package.module:Class"])
-    module = load_module(module_name, where)
+    module = _imported(module_name, f"{where} is {show(name)}")
     loaded = getattr(module, class_name, None)
     if not isinstance(loaded, type):
         classes = ", ".join(_classes(module)) or "it has none"
@@ -69,6 +65,10 @@ def load_module(name: str, where: str) -> ModuleType:
     Raises:
         DocumentError: it cannot be imported; one line.
     """
+    return _imported(name, f"{where} is {show(name)}")
+
+
+def _imported(name: str, what: str) -> ModuleType:
     for folder in filter(None, os.environ.get(FOLDERS, "").split(os.pathsep)):
         if folder not in sys.path:
             sys.path.append(folder)
@@ -76,7 +76,7 @@ def load_module(name: str, where: str) -> ModuleType:
         return importlib.import_module(name)
     except Exception as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise DocumentError([f"{where} is {show(name)}, which cannot be imported ({reason}); {WHERE}"]) from error
+        raise DocumentError([f"{what}, which cannot be imported ({reason}); {WHERE}"]) from error
 
 
 def _classes(module: ModuleType) -> list[str]:

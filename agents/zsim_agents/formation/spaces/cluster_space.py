@@ -30,6 +30,19 @@ class SingularClusterError(ValueError):
 class ClusterSpace(ABC):
     """One convention of cluster variables for n robots; every method is a pure function.
 
+    A space of one's own is a subclass with `forward`, `inverse`, `jacobian`, `inverse_jacobian` and `spread`, of which
+    a scenario names the class; it is made by `for_places`.
+
+    Args:
+        n: number of robots.
+        names: of the variables, 4 n, pitch among them. What a name begins with says what it is: p, q, rho are
+            lengths, w departures in metres, roll, yaw, phi, azimuth angles that wrap, pitch, beta, elevation angles
+            that do not.
+        spread_text: what `spread` measures, in words for messages.
+
+    Raises:
+        ValueError: other names.
+
     Attributes:
         n: number of robots.
         size: number of cluster variables, 4 n.
@@ -48,6 +61,9 @@ class ClusterSpace(ABC):
         self.n = n
         self.size = 4 * n
         self.names = tuple(names)
+        if len(self.names) != self.size or "pitch" not in self.names:
+            found = f"{len(self.names)} variables of {n} robots: {_listed(self.names)}"
+            raise ValueError(f"{type(self).__name__} has {found}; must have {self.size}, pitch among them")
         self.spread_text = spread_text
         stems = [_stem(name) for name in names]
         self.angular = np.array([stem in {"roll", "yaw", "phi", "azimuth"} for stem in stems])
