@@ -11,6 +11,7 @@ import numpy as np
 
 from zsim.scenario import fault_check
 from zsim.scenario.obstacle import nearest, row_of
+from zsim.scenario.roles import AGENTS
 from zsim.scenario.scenario import SEA_HEIGHT_MAX_M, space_name
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 from zsim.schema.checker import Fault, show
@@ -258,7 +259,7 @@ def _plan_faults(cluster: Any) -> Iterator[Fault]:
 
 def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
     first: dict[str, int] = {}
-    things = {"estimator": ("drone", drones), "controller": ("cluster", clusters)}
+    things = {role: (each.about, drones if each.about == "drone" else clusters) for role, each in AGENTS.items()}
     for index, name in _entries(processes and processes.expect):
         if first.setdefault(name, index) != index:
             yield f"processes.expect[{index}]", f"is {name!r}, as expect[{first[name]}]; must be unique"

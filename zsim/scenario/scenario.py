@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
+from zsim.scenario.roles import OnDeath, agent_names
 from zsim.scenario.sensor_presets import G_M_S2, SEA_LEVEL_KG_M3
 from zsim.schema.plugin import CLASS_NAME
 
@@ -268,9 +269,6 @@ class Estimation(Spec, frozen=True, kw_only=True):
     flow: bool = True
 
 
-OnDeath = Literal["wait", "restart", "drop", "end"]
-
-
 class Processes(Spec, frozen=True, kw_only=True):
     """Who takes part. `expect: null` means an estimator per drone and a controller per cluster."""
 
@@ -323,8 +321,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
         """Return the names of the processes without which a run does not start."""
         if self.processes.expect is not None:
             return list(self.processes.expect)
-        estimators = [f"estimator.{drone.name}" for drone in self.drones]
-        return estimators + [f"controller.{cluster.name}" for cluster in self.clusters]
+        return agent_names(self)
 
 
 class Document(Scenario, frozen=True, kw_only=True):
