@@ -80,7 +80,6 @@ class ControlLaw(ABC):
         self.space = space
         self.gains = gains or FormationGains()
         self._order = np.empty((space.n, space.n), np.int64)
-        self.reset()
 
     @abstractmethod
     def rates(self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array) -> Array:
@@ -95,7 +94,7 @@ class ControlLaw(ABC):
         """Forget all state: the formation is engaged, or goes on after it was held."""
 
     def followed(self, dt_s: float) -> None:  # noqa: B027
-        """Go on by dt_s [s]: the robots are told what `rates` returned, neither saturated nor held apart.
+        """Go on by dt_s [s]: the robots get what `rates` returned, neither saturated nor held apart.
 
         It is not called otherwise, so that an integral that grows here does not wind up.
         """
@@ -103,9 +102,15 @@ class ControlLaw(ABC):
     def command(
         self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array, dt_s: float
     ) -> FormationCommand:
-        """Return the command of this gate; arguments as in `rates`, dt_s the time since the last command."""
+        """Return the command of this gate; arguments as in `rates`, dt_s the time since the last command.
+
+        Raises:
+            ValueError: `rates` returned another number of rates.
+        """
         n, order = self.space.n, self._order
-        r_dot = self.rates(c, p_W, v_W, c_des, c_dot_des)
+        r_dot = np.asarray(self.rates(c, p_W, v_W, c_des, c_dot_des), dtype=float)
+        if r_dot.shape != c.shape:  # compiled code would read beyond its end
+            raise ValueError(f"law: rates are of shape {r_dot.shape}; must be {c.shape}, four for each robot")
         v_cmd_W, yaw_rate = np.empty((n, 3)), np.empty(n)
         factor, guards, alarms = limited(r_dot, p_W, v_W, v_cmd_W, yaw_rate, order, *self.gains.limits)
         if factor == 1.0 and not guards:
@@ -127,6 +132,7 @@ class ProportionalLaw(ControlLaw):
         super().__init__(space, gains)
         self._clamp = np.where(space.in_radians, self.gains.integral_max_rad_s, self.gains.integral_max_m_s)
         self._error, self._c_dot = np.empty(space.size), np.empty(space.size)
+        self.reset()
 
     def reset(self) -> None:
         self.integral = np.zeros(self.space.size)

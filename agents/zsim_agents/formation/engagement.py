@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from zsim_agents.formation.control_law import ControlLaw, FormationCommand, FormationGains, ProportionalLaw
-from zsim_agents.formation.flight_check import FlightJudge, place_fault
+from zsim_agents.formation.flight_check import FlightCheck, place_fault
 from zsim_agents.formation.flight_data import (
     AIRBORNE,
     DOWN,
@@ -78,7 +78,7 @@ class Engagement:
         self.guidance = Guidance(space, self.gains, self.limits.shape)
         self.plan = FlightPlan(space, plan)
         self._held_limits = self.gains.limits._replace(separation_min_m=self.gains.separation_min_m + HOLD_APART_M)
-        self.judge = FlightJudge(space, self.drones, self.gains, self.limits)
+        self.check = FlightCheck(space, self.drones, self.gains, self.limits)
         self._phase = "idle"
         self._gate: GateInput | None = None
         self._dt_s = 0.0
@@ -86,8 +86,8 @@ class Engagement:
         self._landing_s = -math.inf
         self._fault = ""  # why an engaged formation does not close its loop
         self._well_since_s = math.inf
-        self._sound = np.empty(0)  # the last reference that may be flown; one at rest stays the same array
-        self._shown = self._sound, self._sound  # the last reference and the same with wrapped angles
+        self._checked = np.empty(0)  # the last reference found good; one at rest stays the same array
+        self._wrapped = self._checked, self._checked  # the last reference and the same with wrapped angles
 
     @property
     def phase(self) -> str:
@@ -99,7 +99,7 @@ class Engagement:
         last_s = self._gate.t_s if self._gate else gate.t_s
         self._dt_s = min(max(gate.t_s - last_s, 0.0), DT_MAX_S)
         self._gate = gate
-        self.judge.observe(gate)
+        self.check.observe(gate)
         self.plan.run(gate.t_s, self._try)
         if self._phase in ("assembling", "engaged") and gate.down:
             self._phase = "idle"
@@ -155,7 +155,7 @@ class Engagement:
     def _grant_take_off(self, gate: GateInput) -> None:
         if self._phase != "idle":
             raise RefusalError(f"phase is {self.phase}; take-off is possible when idle")
-        refuse(self.judge.take_off_fault(gate))
+        refuse(self.check.take_off_fault(gate))
         self._phase = "taking_off"
         self._modes.restart()
 
@@ -165,8 +165,8 @@ class Engagement:
             return
         if self._phase != "assembling":
             raise RefusalError(f"phase is {self.phase}; possible when assembling, or when held on request")
-        refuse(self.judge.engagement_fault(gate))
-        self.guidance.engage(self.judge.value)
+        refuse(self.check.engagement_fault(gate))
+        self.guidance.engage(self.check.value)
         self.plan.overrule()
         self.law.reset()
         self._fault = ""
@@ -179,14 +179,14 @@ class Engagement:
         self._modes.restart()
 
     def _taking_off(self, gate: GateInput) -> GateOutput:
-        waiting = self.judge.state_fault(gate, AIRBORNE)
+        waiting = self.check.state_fault(gate, AIRBORNE)
         if waiting is None:
             self._phase = "assembling"
             return self._assembling(gate)
         return self._climb(gate, waiting, self._modes.commands(gate, "takeoff", frozenset({"landed"})))
 
     def _assembling(self, gate: GateInput) -> GateOutput:
-        return self._climb(gate, self.judge.engagement_fault(gate) or "ready to engage")
+        return self._climb(gate, self.check.engagement_fault(gate) or "ready to engage")
 
     def _climb(self, gate: GateInput, reason: str, modes: tuple[ModeCommand, ...] = ()) -> GateOutput:
         """Lead the drones that fly straight up to the assembly height, each by its own velocity loop."""
@@ -200,13 +200,13 @@ class Engagement:
 
     def _fly(self, gate: GateInput) -> GateOutput:
         c_des, c_dot_des = self.guidance.value(gate.t_s)
-        command = self.law.command(self.judge.value, gate.p_W, gate.v_W, c_des, c_dot_des, self._dt_s)
+        command = self.law.command(self.check.value, gate.p_W, gate.v_W, c_des, c_dot_des, self._dt_s)
         reason = "held on request" if self.guidance.paused else ""
         if command.guarded:
             reason = f"the guard parts {self._pairs(command.guarded)}"
-        if c_des is not self._shown[0]:
-            self._shown = c_des, self.space.wrapped(c_des)
-        return self._output(gate, reason, command=command, reference=(self._shown[1], c_dot_des))
+        if c_des is not self._wrapped[0]:
+            self._wrapped = c_des, self.space.wrapped(c_des)
+        return self._output(gate, reason, command=command, reference=(self._wrapped[1], c_dot_des))
 
     def _held(self, gate: GateInput) -> GateOutput:
         return self._output(gate, self._fault, command=self._upright(gate, 0.0, self._held_limits))
@@ -215,7 +215,7 @@ class Engagement:
         """Return a guarded climb (n,) without turning; rest where the estimates cannot be flown on."""
         v_W = np.zeros((self.space.n, 3))
         alarmed: Pairs = ()
-        if self.judge.estimate_fault(gate) is None:
+        if self.check.estimate_fault(gate) is None:
             v_W[:, 2] = climb_m_s
             v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, limits)
         return FormationCommand(v_W, np.zeros(self.space.n), 1.0, (), alarmed)
@@ -225,11 +225,11 @@ class Engagement:
         if gate.down and gate.t_s - self._landing_s >= self.limits.resend_s:
             self._phase = "idle"
         modes = self._modes.commands(gate, "land", AIRBORNE | {"taking_off"})
-        return self._output(gate, self.judge.state_fault(gate, DOWN) or "", modes=modes)
+        return self._output(gate, self.check.state_fault(gate, DOWN) or "", modes=modes)
 
     def _judge(self, gate: GateInput) -> None:
         """Set the fault of an engaged formation, or heal it when all has been well for a while."""
-        fault = self.judge.flight_fault(gate) or (None if self._fault else self._reference_fault(gate.t_s))
+        fault = self.check.flight_fault(gate) or (None if self._fault else self._reference_fault(gate.t_s))
         if fault:
             self._fault, self._well_since_s = fault, math.inf
         elif self._fault:
@@ -239,7 +239,7 @@ class Engagement:
 
     def _heal(self, gate: GateInput) -> None:
         try:
-            self.guidance.rejoin(self.judge.value, gate.t_s, self.limits.shape_in_flight)
+            self.guidance.rejoin(self.check.value, gate.t_s, self.limits.shape_in_flight)
         except REFUSALS as refusal:
             self._fault, self._well_since_s = f"cannot go on: {refusal}", gate.t_s
         else:
@@ -250,8 +250,8 @@ class Engagement:
         """Return why the reference may not be flown now: checks before the flight end after a while."""
         try:
             c_des = self.guidance.value(t_s)[0]
-            fault = None if c_des is self._sound else place_fault(self.space, c_des, self.gains, self.limits.shape)
-            self._sound = self._sound if fault else c_des
+            fault = None if c_des is self._checked else place_fault(self.space, c_des, self.gains, self.limits.shape)
+            self._checked = self._checked if fault else c_des
         except REFUSALS as error:
             fault = str(error)
         return f"reference: {fault}" if fault else None
@@ -265,22 +265,22 @@ class Engagement:
         command: FormationCommand | None = None,
         reference: tuple[Array, Array] | None = None,
     ) -> GateOutput:
-        """Return the output of a gate; without a reference the formation is said to be where it wants to be."""
+        """Return the output of a gate; without a reference its own value is the desired one."""
         alarmed = command.alarmed if command else ()
         if alarmed:
             reason = f"ALARM, nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(alarmed)}; {reason}"
         if self.plan.note:
             reason = f"{reason}; {self.plan.note}" if reason else self.plan.note
-        desired, desired_rate = reference or (self.judge.value, np.zeros(self.space.size))
+        desired, desired_rate = reference or (self.check.value, np.zeros(self.space.size))
         return GateOutput(
             modes=modes,
             setpoints=setpoints(gate, command.v_W, command.yaw_rate) if command else (None,) * self.space.n,
             phase=self.phase,
-            value=self.judge.value,
+            value=self.check.value,
             desired=desired,
             desired_rate=desired_rate,
             trajectory_t_s=self.guidance.trajectory_t_s(gate.t_s) if self._phase == "engaged" else None,
-            margin=self.judge.margin,
+            margin=self.check.margin,
             reason=reason,
             factor=command.factor if command else 1.0,
             alarmed=alarmed,

@@ -90,8 +90,8 @@ class Follow:
         if self.start_s is not None and finite_number(self.start_s) is None:
             raise TrajectoryError(f"trajectory: start_s is {self.start_s}; allowed: a finite number")
         if bool(self.expressions) == bool(self.waypoints):
-            found = "both" if self.expressions else "neither"
-            raise TrajectoryError(f"trajectory: found {found}; allowed: expressions or waypoints")
+            count = "both" if self.expressions else "neither"
+            raise TrajectoryError(f"trajectory: found {count}; allowed: expressions or waypoints")
         if self.waypoints:
             return WaypointTrajectory(space, self.waypoints, base)
         return ExpressionTrajectory(space, self.expressions, base, self.constants, self.duration_s)
@@ -225,17 +225,17 @@ def read_request(op: object, args: object = None) -> FlightRequest:
     if not isinstance(op, str) or op not in _READERS:
         raise RequestError(f"op {str(op)[:40]!r} is unknown; allowed: {', '.join(_READERS)}")
     build, fields = _READERS[op]
-    given = {} if args is None else args
-    if not isinstance(given, Mapping):
+    arguments = {} if args is None else args
+    if not isinstance(arguments, Mapping):
         raise RequestError(f"{op}: args is {type(args).__name__}; allowed: a map of {', '.join(fields) or 'nothing'}")
-    for name, value in given.items():
+    for name, value in arguments.items():
         if name not in fields:
             allowed = ", ".join(fields) or "none"
             raise RequestError(f"{op}: field {str(name)[:40]!r} is unknown; allowed: {allowed}")
         kind, fits = fields[name]
         if not fits(value):
             raise RequestError(f"{op}: {name} is {str(value)[:40]!r}; allowed: {kind}")
-    return build(**{name: value for name, value in given.items() if value is not None})
+    return build(**{name: value for name, value in arguments.items() if value is not None})
 
 
 def _seconds(value: object) -> bool:

@@ -37,7 +37,7 @@ class Guidance:
     the way is not allowed, and change nothing then.
 
     Attributes:
-        paused: the formation was asked to stand still.
+        paused: the formation stands still on request.
     """
 
     def __init__(self, space: ClusterSpace, gains: FormationGains, shape: ShapeLimits) -> None:
@@ -51,7 +51,7 @@ class Guidance:
         self._known: tuple[Reference, float, tuple[Array, Array]] | None = None  # the last answer of value
 
     def value(self, t_s: float) -> tuple[Array, Array]:
-        """Return c_des and its rate, each (4n,); asked twice in a gate, computed once."""
+        """Return c_des and its rate, each (4n,); computed once a gate."""
         if self._known is None or self._known[0] is not self._flown or self._known[1] != t_s:
             self._known = (self._flown, t_s, self._flown.value(t_s))
         return self._known[2]

@@ -51,7 +51,7 @@ class ClusterSpace(ABC):
         in_radians: (4n,) bool, true for all angles, also those that do not wrap (pitch, beta, elevation_k).
         period: (4n,) of the angles that wrap, 2 pi, and 0 for all else.
         bounds: (4n, 2) open bounds of the values that `forward` can give, infinite where there is none.
-        neutral: (4n,) bool, true for the variables that are zero in a formation of which nothing else was said: tilts,
+        neutral: (4n,) bool, true for the variables that are zero in a formation that has no other goal: tilts,
             headings against the formation, departures from a template.
         tilts: places of roll and pitch in c.
         spread_text: what `spread` measures, in words for messages.
@@ -62,8 +62,8 @@ class ClusterSpace(ABC):
         self.size = 4 * n
         self.names = tuple(names)
         if len(self.names) != self.size or "pitch" not in self.names:
-            found = f"{len(self.names)} variables of {n} robots: {_listed(self.names)}"
-            raise ValueError(f"{type(self).__name__} has {found}; must have {self.size}, pitch among them")
+            names_text = f"{len(self.names)} variables of {n} robots: {_listed(self.names)}"
+            raise ValueError(f"{type(self).__name__} has {names_text}; must have {self.size}, pitch among them")
         self.spread_text = spread_text
         stems = [_stem(name) for name in names]
         self.angular = np.array([stem in {"roll", "yaw", "phi", "azimuth"} for stem in stems])

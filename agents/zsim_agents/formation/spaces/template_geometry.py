@@ -158,8 +158,8 @@ def _orthonormal(directions: list[Array], done: list[Array]) -> list[Array]:
         v = direction.ravel()
         size = np.linalg.norm(v)
         for _ in range(2):  # the second pass takes out what rounding left of the first
-            known = np.array([*done, *basis])
-            v = v - known.T @ (known @ v) if len(known) else v
+            earlier = np.array([*done, *basis])
+            v = v - earlier.T @ (earlier @ v) if len(earlier) else v
         if size > 0.0 and np.linalg.norm(v) > INDEPENDENT_MIN * size:
             basis.append(v / np.linalg.norm(v))
     return basis

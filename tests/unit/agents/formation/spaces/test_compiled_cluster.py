@@ -234,8 +234,8 @@ def test_judgements_are_the_same(both, n):
         assert outside[0] == outside[1]
         out = ~((np.abs(c) < 1e6) & (bounds[:, 0] < c) & (c < bounds[:, 1]))
         assert outside[0] == (int(np.argmax(out)) if out.any() else -1)
-    judge = both[0].flight_check
-    assert found == {judge.WELL, judge.OLD, judge.WILD, judge.VAGUE}
+    check = both[0].flight_check
+    assert found == {check.VALID, check.STALE, check.NOT_FINITE, check.UNCERTAIN}
 
 
 FLIGHT = """
