@@ -1,13 +1,15 @@
-"""Which agents share a process: names and patterns of a command line against those that a scenario has."""
+"""The agents of a process, made by the table of roles: names and patterns of a command line against a scenario's."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 
 from zsim.contract.messages import Info
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent
 from zsim.runtime.group import Group
+from zsim.scenario.roles import AGENTS, agent_names
 from zsim.scenario.scenario import Scenario
+from zsim.schema import plugin
 
 NAMED_MAX = 10  # of the known names in a refusal
 
@@ -31,27 +33,33 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def agents_of(scenario: Scenario, patterns: Sequence[str] = ("*",)) -> list[str]:
-    """Return the process names of the estimators and controllers that are meant, estimators first.
+    """Return the process names of the agents that are meant, role by role: estimators first.
 
     Raises:
         RunError: a pattern matches none.
     """
-    known = [f"estimator.{drone.name}" for drone in scenario.drones]
-    known += [f"controller.{cluster.name}" for cluster in scenario.clusters]
-    return chosen("host: process", patterns, known)
+    return chosen("host: process", patterns, agent_names(scenario))
 
 
 def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
-    """Return estimators and controllers as one agent.
+    """Return the agents that are meant, of all roles, as one.
 
     Raises:
         RunError: a pattern matches none, or the scenario cannot be flown.
     """
-    from zsim_agents.estimation.estimator import Estimator
-    from zsim_agents.formation.controller import Controller
-
     split = [name.partition(".") for name in agents_of(scenario, patterns)]
-    drones = [thing for role, _, thing in split if role == "estimator"]
-    clusters = [thing for role, _, thing in split if role == "controller"]
-    members: list[Agent] = [Estimator(info, scenario, drones)] if drones else []
-    return Group([*members, *(Controller(info, scenario, cluster) for cluster in clusters)])
+    by_role = {role: [thing for each, _, thing in split if each == role] for role in AGENTS}
+    return Group([agent for role, names in by_role.items() if names for agent in made(role, info, scenario, names)])
+
+
+def made(role: str, info: Info, scenario: Scenario, names: Sequence[str]) -> list[Agent]:
+    """Return the agents of one role for drones or clusters, as many as it takes."""
+    agent = agent_class(role)
+    if AGENTS[role].joint:
+        return [agent(info, scenario, names)]
+    return [agent(info, scenario, name) for name in names]
+
+
+def agent_class(role: str) -> Callable[..., Agent]:
+    """Return the class of a role's agents; its module is imported here, and not by whoever hosts others."""
+    return plugin.load(AGENTS[role].agent, role, Agent)

@@ -15,6 +15,7 @@ from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
 from zsim.runtime.progress import Reasons, Screen, Throttle
+from zsim.scenario.roles import agent_names
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
 from zsim_world.flight.world import World
@@ -22,8 +23,8 @@ from zsim_world.flight.world import World
 
 def agents(world: World) -> list[Agent]:
     """Return the agents that a scenario expects as one, built from `world/info` as any process would."""
-    roles = ("estimator.", "controller.")
-    names = [name for name in world.scenario.expected() if name.startswith(roles)]
+    known = agent_names(world.scenario)
+    names = [name for name in world.scenario.expected() if name in known]
     return [hosted(world.info(), world.scenario, names)] if names else []
 
 

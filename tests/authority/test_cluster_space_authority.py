@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from zsim_agents.formation.formation_law import FormationGains, FormationLaw
-from zsim_agents.formation.reference_check import ShapeLimits, plan_ramp
-from zsim_agents.formation.spaces.cluster_space import Array, closest_pair, cluster_space
+from zsim_agents.formation.control_law import FormationGains, ProportionalLaw
+from zsim_agents.formation.flight_data import ShapeLimits
+from zsim_agents.formation.guidance import plan_ramp
+from zsim_agents.formation.spaces.cluster_space import Array, closest_pair
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.trajectory import ExpressionTrajectory, Hold, Reference
 
 SPACE = cluster_space(3)
@@ -153,7 +155,7 @@ def fly(
 
     noise_m is the standard deviation of estimated positions, correlated over 1 s as a filter's errors are.
     """
-    law, rng = FormationLaw(SPACE, gains), np.random.default_rng(11)
+    law, rng = ProportionalLaw(SPACE, gains), np.random.default_rng(11)
     p_W, yaw = start[0].copy(), start[1].copy()
     v_W, yaw_rate = np.zeros((3, 3)), np.zeros(3)
     waiting = (np.zeros((3, 3)), np.zeros(3))

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from zsim_agents.formation.spaces.cluster_space import cluster_space
-from zsim_agents.formation.spaces.shape_modes import centred
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster, euler_angles
+from zsim_agents.formation.spaces.template_geometry import centred
 
 N = 10
 RADIUS_M = 3.0

@@ -11,7 +11,7 @@ import numpy as np
 from zsim.contract import keys, messages
 from zsim.record import RecordWriter
 from zsim.scenario import scenario_file
-from zsim_agents.formation.spaces.cluster_space import cluster_space
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 
 GATE_NS = 20_000_000
 SCENARIOS = Path(__file__).parents[2] / "scenarios"

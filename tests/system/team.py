@@ -7,7 +7,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -139,9 +139,9 @@ def in_flight(run: Role) -> None:
     run.line(r"real time  (idle|taking_off|assembling|engaged)", START_S)
 
 
-def in_process(folder: Path, duration_s: float) -> str:
+def in_process(folder: Path, duration_s: float, overrides: Sequence[str] = ()) -> str:
     """Return the hash of the same flight in one process."""
     path = folder / "alone.mcap"
-    fly(scenario_file.load(STEP, duration_s=duration_s), path)
+    fly(scenario_file.load(STEP, overrides, duration_s=duration_s), path)
     with RecordReader(path) as reader:
         return Record(reader).sha256()

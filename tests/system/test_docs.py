@@ -421,6 +421,8 @@ def unit(name: str) -> str:
 def default(section: str, entry: Any) -> str:
     if entry.default is msgspec.NODEFAULT and entry.default_factory is msgspec.NODEFAULT:
         return _required(section, entry.name)
+    if entry.default is msgspec.UNSET:
+        return "left out"
     value = entry.default_factory() if entry.default is msgspec.NODEFAULT else entry.default
     return "see there" if isinstance(value, msgspec.Struct) else f"`{shown(value)}`"
 
@@ -444,6 +446,8 @@ def shown(value: Any) -> str:
 
 def allowed(info: types.Type) -> str:
     """Return the limits of a type in words."""
+    if isinstance(info, types.Metadata):
+        return f"{(info.extra_json_schema or {})['description']}"
     if isinstance(info, types.UnionType):
         options = [t for t in info.types if not isinstance(t, types.NoneType)]
         return ", ".join([*map(allowed, options), "`null`"])

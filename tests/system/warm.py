@@ -10,6 +10,7 @@ import resource
 from functools import cache
 from typing import IO, Any
 
+from zsim.schema.plugin import FOLDERS
 from zsim_deploy.forkserver.role_launcher import Nursery, Process
 
 ROLES = ("world", "estimator", "controller", "record", "gateway", "console")
@@ -30,7 +31,7 @@ def start(arguments: list[str], root: str, environment: dict[str, str]) -> tuple
 
 def _inherited() -> Any:
     """Return what a process hands on to those that it starts."""
-    variables = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
+    variables = {name: value for name, value in os.environ.items() if name not in ("PYTEST_CURRENT_TEST", FOLDERS)}
     return variables, [resource.getrlimit(limit) for limit in LIMITS], os.sched_getaffinity(0)
 
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from zsim.scenario import fault_check
 from zsim.scenario.obstacle import nearest, row_of
-from zsim.scenario.scenario import SEA_HEIGHT_MAX_M, kinematics
+from zsim.scenario.roles import AGENTS
+from zsim.scenario.scenario import SEA_HEIGHT_MAX_M, space_name
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 from zsim.schema.checker import Fault, show
 
@@ -219,14 +220,17 @@ def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Faul
     given = spec.template_m
     if given is None or robots < 2:
         return
-    if kinematics(spec.space, robots, bool(given)) == "triad":
+    space = space_name(spec.space, robots, bool(given))
+    if space == "triad":
         if given:
             yield "template_m", "is given; must be left out where space is triad"
-    elif robots < TEMPLATE_ROBOTS_MIN:
+    elif space == "template" and robots < TEMPLATE_ROBOTS_MIN:
         path = "space" if spec.space else "template_m"
         yield path, f"asks for a template of {robots} robots; must be {TEMPLATE_ROBOTS_MIN} or more"
     elif given and len(given) != robots:
         yield "template_m", f"has {len(given)} places; must have {robots}, one for each robot"
+    elif space != "template":
+        return  # a class of the user's own judges its template itself
     elif given and _known(*given) and _in_line(given):
         yield "template_m", f"is in one line, within {TEMPLATE_WIDTH_MIN_M:g} m; must span a plane or space"
     elif not given and len(starts) == robots and _known(*starts) and _in_line(starts):
@@ -255,7 +259,7 @@ def _plan_faults(cluster: Any) -> Iterator[Fault]:
 
 def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
     first: dict[str, int] = {}
-    things = {"estimator": ("drone", drones), "controller": ("cluster", clusters)}
+    things = {role: (each.about, drones if each.about == "drone" else clusters) for role, each in AGENTS.items()}
     for index, name in _entries(processes and processes.expect):
         if first.setdefault(name, index) != index:
             yield f"processes.expect[{index}]", f"is {name!r}, as expect[{first[name]}]; must be unique"

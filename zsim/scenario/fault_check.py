@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 from zsim.contract import keys
 from zsim.scenario.fault_kinds import KINDS, Kind, Parameter, expected
+from zsim.scenario.roles import AGENTS
 from zsim.schema.checker import Fault as Flaw
 from zsim.schema.checker import show
 
@@ -87,7 +88,7 @@ def _allowed_instead(name: str, known: Known) -> str | None:
     if name in known.processes:
         return None
     role, dot, thing = name.partition(".")
-    things = {"estimator": known.drones, "controller": known.clusters}
+    things = _things(known)
     if role in things and thing not in things[role]:
         return f"{role}.NAME of {_listed(things[role])}"
     for ours, there in {**things, "world": ("",)}.items():
@@ -96,10 +97,14 @@ def _allowed_instead(name: str, known: Known) -> str | None:
     return None
 
 
+def _things(known: Known) -> dict[str, tuple[str, ...]]:
+    """Return what the processes of each role with agents may be named after."""
+    return {name: known.drones if role.about == "drone" else known.clusters for name, role in AGENTS.items()}
+
+
 def _takes_part(name: str, known: Known) -> bool:
     role, _, thing = name.partition(".")
-    ours = {"estimator": known.drones, "controller": known.clusters}.get(role, ())
-    return thing in ours or name in known.processes
+    return thing in _things(known).get(role, ()) or name in known.processes
 
 
 def _example(known: Known) -> str:

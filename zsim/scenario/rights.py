@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from zsim.contract import batch, keys
+from zsim.scenario.roles import AGENTS
 from zsim.scenario.scenario import Scenario
 
 TOLD_TO_ALL = (keys.INFO, keys.CLOCK, keys.EVENT, keys.FAULTS)
@@ -59,7 +60,9 @@ def of(process: str, scenario: Scenario) -> Rights:
         return union([_own(process), _READER])
     if role == OPERATOR:
         return union([_own(process), _READER, _OPERATOR])
-    return union([_own(process), _estimator(thing, scenario, role), _controller(thing, scenario, role)])
+    about = AGENTS[role].about if role in AGENTS else None
+    granted = [rights(thing, scenario, role) for kind, rights in _ABOUT.items() if about in (None, kind)]
+    return union([_own(process), *granted])
 
 
 def union(many: Iterable[Rights]) -> Rights:
@@ -88,8 +91,9 @@ _READER = Rights(reads=("**", batch.KEY), asks=LAST_VALUES, watches=(keys.token(
 _OPERATOR = Rights(writes=(keys.command("*", "*"),), asks=(keys.CONTROL, keys.cluster_control("*")))
 
 
-def _estimator(thing: str, scenario: Scenario, role: str) -> Rights:
-    if role == "controller" or thing not in {drone.name for drone in scenario.drones}:
+def _about_drone(thing: str, scenario: Scenario, role: str) -> Rights:
+    """Return what an estimator of a drone may do."""
+    if thing not in {drone.name for drone in scenario.drones}:
         return Rights()
     estimate = (keys.estimate(thing),)
     return Rights(
@@ -99,20 +103,24 @@ def _estimator(thing: str, scenario: Scenario, role: str) -> Rights:
     )
 
 
-def _controller(thing: str, scenario: Scenario, role: str) -> Rights:
-    if role == "estimator" or thing not in {cluster.name for cluster in scenario.clusters}:
+def _about_cluster(thing: str, scenario: Scenario, role: str) -> Rights:
+    """Return what a controller of a cluster may do."""
+    if thing not in {cluster.name for cluster in scenario.clusters}:
         return Rights()
     drones = scenario.cluster(thing).drones
-    heard = [key for drone in drones for key in (keys.estimate(drone), keys.status(drone))]
+    estimates_and_states = [key for drone in drones for key in (keys.estimate(drone), keys.status(drone))]
     state = keys.cluster_state(thing)
     return Rights(
-        reads=(*heard, state),
+        reads=(*estimates_and_states, state),
         writes=(
             *(keys.command(drone, "*") for drone in drones),
             state,
             keys.cluster_request(thing),
             keys.cluster_view(thing),
         ),
-        asks=(*heard, state),
+        asks=(*estimates_and_states, state),
         answers=(keys.cluster_control(thing),),
     )
+
+
+_ABOUT = {"drone": _about_drone, "cluster": _about_cluster}

@@ -5,9 +5,11 @@ A file is read by `scenario_file.load`; the limits written here are the ones tha
 
 from typing import Annotated, Any, Literal
 
-from msgspec import Meta, Struct, field
+from msgspec import UNSET, Meta, Struct, UnsetType, field
 
+from zsim.scenario.roles import OnDeath, agent_names
 from zsim.scenario.sensor_presets import G_M_S2, SEA_LEVEL_KG_M3
+from zsim.schema.plugin import CLASS_NAME
 
 TEMPLATE_FROM = 5  # robots; below it the variables of the triad are fewer to name, and as well conditioned
 DRONES_MAX = 1000  # one world integrates them all
@@ -223,8 +225,14 @@ class Plan(Spec, frozen=True, kw_only=True):
     land_s: NonNegative | None = None
 
 
-Kinematics = Literal["triad", "template"]
+SpaceName = Annotated[
+    str,
+    Meta(pattern=rf"^(triad|template)\Z|{CLASS_NAME}", description="one of triad, template, or package.module:Class"),
+]
 """How the variables of a formation follow from its robots; a robot is a drone, or a group of them."""
+LawName = Annotated[
+    str, Meta(pattern=rf"^proportional\Z|{CLASS_NAME}", description="one of proportional, or package.module:Class")
+]
 
 
 class Group(Spec, frozen=True, kw_only=True):
@@ -232,7 +240,7 @@ class Group(Spec, frozen=True, kw_only=True):
 
     name: Name
     size: Annotated[int, Meta(ge=2)]
-    space: Kinematics | None = None
+    space: SpaceName | None = None
     template_m: list[Vector3] = []
 
 
@@ -241,10 +249,12 @@ class Cluster(Spec, frozen=True, kw_only=True):
     drones: Annotated[list[Name], Meta(min_length=2, max_length=ROBOTS_MAX)]
     groups: list[Group] = []
     """Empty: every drone is a robot of the cluster by itself."""
-    space: Kinematics | None = None
-    """None: see `kinematics`."""
+    space: SpaceName | None = None
+    """None: see `space_name`."""
     template_m: list[Vector3] = []
     """Places of the robots, x ahead and y left of the formation; empty: as they stand at the start."""
+    law: LawName | UnsetType = UNSET
+    """Unset: proportional. Left out of the resolved text then, which names the scenario by its hash."""
     gains: Gains = Gains()
     plan: Plan = Plan()
 
@@ -257,9 +267,6 @@ class Estimation(Spec, frozen=True, kw_only=True):
     gate_probability: Annotated[float, Meta(gt=0.5, lt=1)] = 0.9999
     magnetometer: bool = True
     flow: bool = True
-
-
-OnDeath = Literal["wait", "restart", "drop", "end"]
 
 
 class Processes(Spec, frozen=True, kw_only=True):
@@ -314,8 +321,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
         """Return the names of the processes without which a run does not start."""
         if self.processes.expect is not None:
             return list(self.processes.expect)
-        estimators = [f"estimator.{drone.name}" for drone in self.drones]
-        return estimators + [f"controller.{cluster.name}" for cluster in self.clusters]
+        return agent_names(self)
 
 
 class Document(Scenario, frozen=True, kw_only=True):
@@ -324,6 +330,6 @@ class Document(Scenario, frozen=True, kw_only=True):
     sensors: Sensors | None = None
 
 
-def kinematics(space: Kinematics | None, robots: int, template: bool) -> Kinematics:
+def space_name(space: str | None, robots: int, template: bool) -> str:
     """Return the space of so many robots: as said, else a template where one is given or from five robots on."""
     return space or ("template" if template or robots >= TEMPLATE_FROM else "triad")

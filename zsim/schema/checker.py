@@ -47,7 +47,7 @@ def _type_info(description: Any) -> types.Type:
 
 def _check(value: Any, info: types.Type, path: str) -> Iterator[Fault]:
     if isinstance(info, types.Metadata):
-        yield from _check(value, info.type, path)
+        yield from _check_described(value, info, path)
     elif isinstance(info, types.UnionType):
         yield from _check_union(value, info, path)
     elif isinstance(info, types.StructType):
@@ -62,6 +62,15 @@ def _check(value: Any, info: types.Type, path: str) -> Iterator[Fault]:
         fault = _scalar_fault(value, info)
         if fault:
             yield path, fault
+
+
+def _check_described(value: Any, info: types.Metadata, path: str) -> Iterator[Fault]:
+    """Yield the faults of a type; its description, where it has one, says in words what is allowed."""
+    description = (info.extra_json_schema or {}).get("description")
+    if description is None:
+        yield from _check(value, info.type, path)
+    elif any(_check(value, info.type, path)):
+        yield path, f"is {show(value)}; must be {description}"
 
 
 def _check_union(value: Any, info: types.UnionType, path: str) -> Iterator[Fault]:

@@ -1,1 +1,4 @@
-"""The cluster controller: phases, references, control law. Imports its spaces and zsim."""
+"""The cluster controller as an agent: phases, requests and plan, references, control law, limits of the robots.
+
+Imports its spaces, and zsim.
+"""

@@ -4,7 +4,7 @@ Order of this file: the agent, `receive`, `step`, requests, warm start, pure par
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from operator import itemgetter
 from struct import Struct as Packing
@@ -15,20 +15,21 @@ import numpy as np
 from zsim.contract import keys, messages
 from zsim.contract.messages import ControlAnswer, ControlRequest
 from zsim.contract.views import cluster_view
-from zsim.errors import RunError
+from zsim.errors import DocumentError, RunError
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Cluster, Gains, Scenario
+from zsim.schema import plugin
+from zsim_agents.formation.control_law import LAWS, ControlLaw, FormationGains, ProportionalLaw
 from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.flight_check import all_near
 from zsim_agents.formation.flight_data import GateInput, GateOutput
-from zsim_agents.formation.flight_plan import Scheduled
-from zsim_agents.formation.flight_request import Engage, Follow, Land, RequestError, TakeOff, Target, read_request
-from zsim_agents.formation.formation_law import FormationGains, guard, load
+from zsim_agents.formation.flight_plan import RequestError, plan_of, read_request
+from zsim_agents.formation.robot_limits import guard, load
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, closest_pair, robot_rates
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_agents.formation.trajectory import Hold, ramp_onto
 
-TAKEN_MAX = 1000  # requests between two gates, as in a run that is paused: all are said at the next one
+REQUESTS_MAX = 1000  # between two gates, as in a run that is paused; the next gate publishes them
 APART_M = 2.0  # of robots in a rehearsal, any distance well above zero
 
 variances_of = itemgetter(0, 7, 14)  # of the position, in the 6 x 6 covariance, row-major
@@ -83,11 +84,11 @@ class Controller(Agent):
         self._estimates = [_UNKNOWN] * len(spec.drones)
         self._table = GateTable(len(spec.drones))
         self._states: list[str] = ["landed"] * len(spec.drones)
-        self._told_ns = [0] * len(spec.drones)
+        self._status_ns = [0] * len(spec.drones)
         self._engagement = engagement_of(scenario, spec)
-        self._shown: messages.ClusterState | None = None
+        self._last_state: messages.ClusterState | None = None
         self._request_key = keys.cluster_request(cluster)
-        self._taken: list[tuple[ControlRequest, ControlAnswer]] = []  # since the last gate
+        self._answered: list[tuple[ControlRequest, ControlAnswer]] = []  # since the last gate
 
     def receive(self, key: str, message: Any) -> None:
         place = self._place[key]
@@ -95,8 +96,8 @@ class Controller(Agent):
             former = self._estimates[place]
             if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in realtime an older one may come later
                 self._estimates[place] = message
-        elif message.t_ns >= self._told_ns[place]:  # over a link that jitters, too
-            self._states[place], self._told_ns[place] = message.state, message.t_ns
+        elif message.t_ns >= self._status_ns[place]:  # over a link that jitters, too
+            self._states[place], self._status_ns[place] = message.state, message.t_ns
 
     def step(self, t_ns: int) -> list[Output]:
         output = self._engagement.step(self._gate(t_ns))
@@ -104,8 +105,8 @@ class Controller(Agent):
         return [*self._requests(t_ns), *commands, *self._state(t_ns, output)]
 
     def _requests(self, t_ns: int) -> list[Output]:
-        """Return what was asked since the last gate: whoever flies the run again asks it before this one."""
-        taken, self._taken = self._taken, []
+        """Return the requests since the last gate; a re-run of the record makes them before this one."""
+        answered, self._answered = self._answered, []
         key, by = self._request_key, self.source
         return [
             Output(
@@ -114,7 +115,7 @@ class Controller(Agent):
                     t_ns, self.next_seq(key), request.op, request.args, request.source, answer.ok, answer.error, by
                 ),
             )
-            for request, answer in taken
+            for request, answer in answered
         ]
 
     def _gate(self, t_ns: int) -> GateInput:
@@ -166,11 +167,11 @@ class Controller(Agent):
             source=self.source,
             plan_step=output.plan_step,
         )
-        self._shown = state
+        self._last_state = state
         return [Output(self._state_key, state)]
 
     def views(self, t_ns: int) -> list[Output]:
-        state = self._shown
+        state = self._last_state
         if state is None:
             return []
         seq = self.next_seq(self._view_key)
@@ -180,14 +181,14 @@ class Controller(Agent):
         return (self._control_key,)
 
     def control(self, key: str, request: ControlRequest) -> ControlAnswer:
-        if len(self._taken) >= TAKEN_MAX:
-            return ControlAnswer(ok=False, error=f"{key}: {TAKEN_MAX} requests wait for the next gate; ask after it")
+        if len(self._answered) >= REQUESTS_MAX:
+            return ControlAnswer(ok=False, error=f"{key}: {REQUESTS_MAX} requests wait for the next gate; ask after it")
         try:
             refusal = self._engagement.request(read_request(request.op, request.args))
         except RequestError as error:
             refusal = str(error)
         answer = ControlAnswer(ok=refusal is None, error=refusal or "")
-        self._taken.append((request, answer))
+        self._answered.append((request, answer))
         return answer
 
     def warm_start_keys(self) -> tuple[str, ...]:
@@ -218,27 +219,41 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
         RunError: the plan can never be flown; the text says why.
     """
     try:
-        space, gains = scenario_space(scenario, cluster), gains_of(cluster.gains)
-        rehearse(space, gains)
-        return Engagement(space, cluster.drones, gains, plan=plan_of(cluster))
-    except ValueError as error:
+        space, gains, law = scenario_space(scenario, cluster), gains_of(cluster.gains), law_of(cluster)
+        rehearse(space, gains, law)
+        return Engagement(space, cluster.drones, gains, plan=plan_of(cluster), law=law)
+    except (ValueError, DocumentError) as error:
         raise RunError(f"cluster {cluster.name!r}: {error}") from error
 
 
-def rehearse(space: ClusterSpace, gains: FormationGains) -> None:
-    """Fly a gate of a formation that nobody sees: code is compiled, or loaded, here and not in flight."""
+def law_of(cluster: Cluster) -> Callable[[ClusterSpace, FormationGains], ControlLaw]:
+    """Return the class of the control law that a cluster names.
+
+    Raises:
+        DocumentError: a class of the user's own that cannot be loaded.
+    """
+    name = cluster.law or "proportional"
+    return LAWS.get(name) or plugin.load(name, "law", ControlLaw)
+
+
+def rehearse(
+    space: ClusterSpace,
+    gains: FormationGains,
+    law: Callable[[ClusterSpace, FormationGains], ControlLaw] = ProportionalLaw,
+) -> None:
+    """Fly a gate of a formation of its own: code is compiled, or loaded, here and not in flight."""
     c = space.specimen(max(gains.separation_min_m, APART_M))
     p_W, yaw = space.inverse(c)
     c = space.forward(p_W, yaw)
     none = np.zeros((space.n, 3))
-    unseen = Engagement(space, [str(i) for i in range(space.n)], gains)
-    unseen.warm_start("engaged", c)
-    unseen.step(GateInput(0.0, p_W, yaw, none, none, np.zeros(space.n), ("flying",) * space.n))
+    rehearsal = Engagement(space, [str(i) for i in range(space.n)], gains, law=law)
+    rehearsal.warm_start("engaged", c)
+    rehearsal.step(GateInput(0.0, p_W, yaw, none, none, np.zeros(space.n), ("flying",) * space.n))
     ramp_onto(space, c, c, Hold(c), 0.0, 2.0).value(1.0)
     all_near(p_W, yaw)
     closest_pair(p_W)
-    guard(p_W, none, none, gains)
-    load(*robot_rates(space, c, c), gains)
+    guard(p_W, none, none, gains.limits)
+    load(*robot_rates(space, c, c), gains.limits)
 
 
 def gains_of(gains: Gains) -> FormationGains:
@@ -254,28 +269,6 @@ def gains_of(gains: Gains) -> FormationGains:
     )
 
 
-def plan_of(cluster: Cluster) -> list[Scheduled]:
-    """Return the steps of a cluster's plan in their order."""
-    plan, steps = cluster.plan, []
-    if plan.takeoff_s is not None:
-        steps += [Scheduled(plan.takeoff_s, TakeOff()), Scheduled(plan.takeoff_s, Engage())]
-        if plan.target:
-            steps.append(Scheduled(plan.takeoff_s, Target(plan.target, plan.target_over_s)))
-        if plan.trajectory is not None:
-            trajectory = plan.trajectory
-            waypoints = [{"at_s": w.at_s, "values": w.values} for w in trajectory.waypoints]
-            follow = Follow(
-                expressions=trajectory.expressions,
-                constants=trajectory.constants,
-                waypoints=waypoints,
-                start_s=trajectory.start_s,
-            )
-            steps.append(Scheduled(plan.takeoff_s, follow))
-    if plan.land_s is not None:
-        steps.append(Scheduled(plan.land_s, Land()))
-    return steps
-
-
 def in_heading(v_W: Sequence[float], yaw: float) -> tuple[float, float, float]:
     """Return a velocity of W in the heading frame: x forward, y left, z up."""
     c, s = math.cos(yaw), math.sin(yaw)
@@ -284,10 +277,10 @@ def in_heading(v_W: Sequence[float], yaw: float) -> tuple[float, float, float]:
 
 def _finite(values: np.ndarray) -> tuple[float, ...]:
     """Return values for the wire, where nothing unknown may travel: zeros in its place."""
-    known = values.tolist()
-    if not math.isfinite(sum(known)):  # one of them is not, or they are too large for a sum
-        known = [value if math.isfinite(value) else 0.0 for value in known]
-    return tuple(known)
+    numbers = values.tolist()
+    if not math.isfinite(sum(numbers)):  # one of them is not, or they are too large for a sum
+        numbers = [number if math.isfinite(number) else 0.0 for number in numbers]
+    return tuple(numbers)
 
 
 def ahead(p_W: np.ndarray, v_W: np.ndarray, age_s: np.ndarray) -> np.ndarray:

@@ -6,13 +6,13 @@ followed that was not checked, every refusal has a reason, and every reference s
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from zsim_agents.formation.flight_check import FlightJudge
+from zsim_agents.formation.control_law import ControlLaw, FormationCommand, FormationGains, ProportionalLaw
+from zsim_agents.formation.flight_check import FlightCheck, place_fault
 from zsim_agents.formation.flight_data import (
     AIRBORNE,
     DOWN,
@@ -20,25 +20,25 @@ from zsim_agents.formation.flight_data import (
     GateInput,
     GateOutput,
     ModeCommand,
-    Setpoint,
+    ModeSender,
+    setpoints,
 )
-from zsim_agents.formation.flight_plan import FlightPlan, Scheduled
-from zsim_agents.formation.flight_request import (
+from zsim_agents.formation.flight_plan import (
     REFUSALS,
     Engage,
+    FlightPlan,
     FlightRequest,
     Follow,
     Land,
+    MoveTo,
     Pause,
     RefusalError,
+    Scheduled,
     TakeOff,
-    Target,
     refuse,
 )
-from zsim_agents.formation.formation_law import FormationCommand, FormationGains, FormationLaw, Pairs, guard
 from zsim_agents.formation.guidance import Guidance
-from zsim_agents.formation.mode_sender import ModeSender
-from zsim_agents.formation.reference_check import place_fault
+from zsim_agents.formation.robot_limits import Pairs, RobotLimits, guard
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 
 DT_MAX_S = 0.1  # longest step of the integral, after a gap
@@ -53,6 +53,7 @@ class Engagement:
         space: cluster space of n robots.
         drones: their names in the order of the robots, for commands and reasons.
         plan: what the scenario asks for by itself; a Land by request drops the rest of it.
+        law: class of the control law.
 
     Raises:
         ValueError: the plan can never be flown (see `FlightPlan`), or the number of names is not n.
@@ -65,6 +66,7 @@ class Engagement:
         gains: FormationGains | None = None,
         limits: EngagementLimits | None = None,
         plan: Sequence[Scheduled] = (),
+        law: Callable[[ClusterSpace, FormationGains], ControlLaw] = ProportionalLaw,
     ) -> None:
         if len(drones) != space.n:
             raise ValueError(f"cluster: {len(drones)} drones; allowed: {space.n}, as its cluster space has")
@@ -72,12 +74,11 @@ class Engagement:
         self.drones = tuple(drones)
         self.gains = gains or FormationGains()
         self.limits = limits or EngagementLimits()
-        self.law = FormationLaw(space, self.gains)
+        self.law = law(space, self.gains)
         self.guidance = Guidance(space, self.gains, self.limits.shape)
         self.plan = FlightPlan(space, plan)
-        held_apart_m = self.gains.separation_min_m + HOLD_APART_M
-        self._apart = dataclasses.replace(self.gains, separation_min_m=held_apart_m)
-        self.judge = FlightJudge(space, self.drones, self.gains, self.limits)
+        self._held_limits = self.gains.limits._replace(separation_min_m=self.gains.separation_min_m + HOLD_APART_M)
+        self.check = FlightCheck(space, self.drones, self.gains, self.limits)
         self._phase = "idle"
         self._gate: GateInput | None = None
         self._dt_s = 0.0
@@ -85,8 +86,8 @@ class Engagement:
         self._landing_s = -math.inf
         self._fault = ""  # why an engaged formation does not close its loop
         self._well_since_s = math.inf
-        self._sound = np.empty(0)  # the last reference that may be flown; one at rest stays the same array
-        self._shown = self._sound, self._sound  # the last reference and the same with wrapped angles
+        self._checked = np.empty(0)  # the last reference found good; one at rest stays the same array
+        self._wrapped = self._checked, self._checked  # the last reference and the same with wrapped angles
 
     @property
     def phase(self) -> str:
@@ -98,7 +99,7 @@ class Engagement:
         last_s = self._gate.t_s if self._gate else gate.t_s
         self._dt_s = min(max(gate.t_s - last_s, 0.0), DT_MAX_S)
         self._gate = gate
-        self.judge.observe(gate)
+        self.check.observe(gate)
         self.plan.run(gate.t_s, self._try)
         if self._phase in ("assembling", "engaged") and gate.down:
             self._phase = "idle"
@@ -109,7 +110,7 @@ class Engagement:
         refusal = self._try(request)
         if refusal is None and isinstance(request, Land):
             self.plan.clear()
-        elif refusal is None and isinstance(request, Target | Follow):
+        elif refusal is None and isinstance(request, MoveTo | Follow):
             self.plan.overrule()
         return refusal
 
@@ -146,7 +147,7 @@ class Engagement:
             raise RefusalError(self._fault)
         elif isinstance(request, Pause):
             self.guidance.pause(gate.t_s)
-        elif isinstance(request, Target):
+        elif isinstance(request, MoveTo):
             self.guidance.target(request, gate.t_s)
         else:
             self.guidance.follow(request, gate.t_s)
@@ -154,7 +155,7 @@ class Engagement:
     def _grant_take_off(self, gate: GateInput) -> None:
         if self._phase != "idle":
             raise RefusalError(f"phase is {self.phase}; take-off is possible when idle")
-        refuse(self.judge.take_off_fault(gate))
+        refuse(self.check.take_off_fault(gate))
         self._phase = "taking_off"
         self._modes.restart()
 
@@ -164,8 +165,8 @@ class Engagement:
             return
         if self._phase != "assembling":
             raise RefusalError(f"phase is {self.phase}; possible when assembling, or when held on request")
-        refuse(self.judge.engagement_fault(gate))
-        self.guidance.engage(self.judge.value)
+        refuse(self.check.engagement_fault(gate))
+        self.guidance.engage(self.check.value)
         self.plan.overrule()
         self.law.reset()
         self._fault = ""
@@ -178,24 +179,20 @@ class Engagement:
         self._modes.restart()
 
     def _taking_off(self, gate: GateInput) -> GateOutput:
-        waiting = self.judge.state_fault(gate, AIRBORNE)
+        waiting = self.check.state_fault(gate, AIRBORNE)
         if waiting is None:
             self._phase = "assembling"
             return self._assembling(gate)
         return self._climb(gate, waiting, self._modes.commands(gate, "takeoff", frozenset({"landed"})))
 
     def _assembling(self, gate: GateInput) -> GateOutput:
-        return self._climb(gate, self.judge.engagement_fault(gate) or "ready to engage")
+        return self._climb(gate, self.check.engagement_fault(gate) or "ready to engage")
 
     def _climb(self, gate: GateInput, reason: str, modes: tuple[ModeCommand, ...] = ()) -> GateOutput:
         """Lead the drones that fly straight up to the assembly height, each by its own velocity loop."""
-        v_W = np.zeros((self.space.n, 3))
-        alarmed: Pairs = ()
-        if self.judge.estimate_fault(gate) is None:
-            below_m = self.limits.assembly_height_m - gate.p_W[:, 2]
-            v_W[:, 2] = np.minimum(np.maximum(CLIMB_GAIN_1_S * below_m, 0.0), self.limits.assembly_climb_m_s)
-            v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, self.gains)
-        return self._output(gate, reason, modes=modes, command=self._upright(v_W, alarmed))
+        below_m = self.limits.assembly_height_m - gate.p_W[:, 2]
+        climb_m_s = np.minimum(np.maximum(CLIMB_GAIN_1_S * below_m, 0.0), self.limits.assembly_climb_m_s)
+        return self._output(gate, reason, modes=modes, command=self._upright(gate, climb_m_s, self.gains.limits))
 
     def _engaged(self, gate: GateInput) -> GateOutput:
         self._judge(gate)
@@ -203,23 +200,24 @@ class Engagement:
 
     def _fly(self, gate: GateInput) -> GateOutput:
         c_des, c_dot_des = self.guidance.value(gate.t_s)
-        command = self.law.command(self.judge.value, gate.p_W, gate.v_W, c_des, c_dot_des, self._dt_s)
+        command = self.law.command(self.check.value, gate.p_W, gate.v_W, c_des, c_dot_des, self._dt_s)
         reason = "held on request" if self.guidance.paused else ""
         if command.guarded:
             reason = f"the guard parts {self._pairs(command.guarded)}"
-        if c_des is not self._shown[0]:
-            self._shown = c_des, self.space.wrapped(c_des)
-        return self._output(gate, reason, command=command, reference=(self._shown[1], c_dot_des))
+        if c_des is not self._wrapped[0]:
+            self._wrapped = c_des, self.space.wrapped(c_des)
+        return self._output(gate, reason, command=command, reference=(self._wrapped[1], c_dot_des))
 
     def _held(self, gate: GateInput) -> GateOutput:
+        return self._output(gate, self._fault, command=self._upright(gate, 0.0, self._held_limits))
+
+    def _upright(self, gate: GateInput, climb_m_s: Array | float, limits: RobotLimits) -> FormationCommand:
+        """Return a guarded climb (n,) without turning; rest where the estimates cannot be flown on."""
         v_W = np.zeros((self.space.n, 3))
         alarmed: Pairs = ()
-        if self.judge.estimate_fault(gate) is None:
-            v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, self._apart)
-        return self._output(gate, self._fault, command=self._upright(v_W, alarmed))
-
-    def _upright(self, v_W: Array, alarmed: Pairs) -> FormationCommand:
-        """Return velocities (n, 3) without turning."""
+        if self.check.estimate_fault(gate) is None:
+            v_W[:, 2] = climb_m_s
+            v_W, _, alarmed = guard(gate.p_W, gate.v_W, v_W, limits)
         return FormationCommand(v_W, np.zeros(self.space.n), 1.0, (), alarmed)
 
     def _landing(self, gate: GateInput) -> GateOutput:
@@ -227,11 +225,11 @@ class Engagement:
         if gate.down and gate.t_s - self._landing_s >= self.limits.resend_s:
             self._phase = "idle"
         modes = self._modes.commands(gate, "land", AIRBORNE | {"taking_off"})
-        return self._output(gate, self.judge.state_fault(gate, DOWN) or "", modes=modes)
+        return self._output(gate, self.check.state_fault(gate, DOWN) or "", modes=modes)
 
     def _judge(self, gate: GateInput) -> None:
         """Set the fault of an engaged formation, or heal it when all has been well for a while."""
-        fault = self.judge.flight_fault(gate) or (None if self._fault else self._reference_fault(gate.t_s))
+        fault = self.check.flight_fault(gate) or (None if self._fault else self._reference_fault(gate.t_s))
         if fault:
             self._fault, self._well_since_s = fault, math.inf
         elif self._fault:
@@ -241,7 +239,7 @@ class Engagement:
 
     def _heal(self, gate: GateInput) -> None:
         try:
-            self.guidance.rejoin(self.judge.value, gate.t_s, self.limits.shape_in_flight)
+            self.guidance.rejoin(self.check.value, gate.t_s, self.limits.shape_in_flight)
         except REFUSALS as refusal:
             self._fault, self._well_since_s = f"cannot go on: {refusal}", gate.t_s
         else:
@@ -252,8 +250,8 @@ class Engagement:
         """Return why the reference may not be flown now: checks before the flight end after a while."""
         try:
             c_des = self.guidance.value(t_s)[0]
-            fault = None if c_des is self._sound else place_fault(self.space, c_des, self.gains, self.limits.shape)
-            self._sound = self._sound if fault else c_des
+            fault = None if c_des is self._checked else place_fault(self.space, c_des, self.gains, self.limits.shape)
+            self._checked = self._checked if fault else c_des
         except REFUSALS as error:
             fault = str(error)
         return f"reference: {fault}" if fault else None
@@ -267,36 +265,27 @@ class Engagement:
         command: FormationCommand | None = None,
         reference: tuple[Array, Array] | None = None,
     ) -> GateOutput:
-        """Return the output of a gate; without a reference the formation is said to be where it wants to be."""
+        """Return the output of a gate; without a reference its own value is the desired one."""
         alarmed = command.alarmed if command else ()
         if alarmed:
-            limit_m = self.gains.separation_alarm_m
-            reason = f"ALARM, nearer than {limit_m:g} m: {self._pairs(alarmed)}; {reason}"
+            reason = f"ALARM, nearer than {self.gains.separation_alarm_m:g} m: {self._pairs(alarmed)}; {reason}"
         if self.plan.note:
             reason = f"{reason}; {self.plan.note}" if reason else self.plan.note
-        desired, desired_rate = reference or (self.judge.value, np.zeros(self.space.size))
+        desired, desired_rate = reference or (self.check.value, np.zeros(self.space.size))
         return GateOutput(
             modes=modes,
-            setpoints=self._setpoints(gate, command) if command else (None,) * self.space.n,
+            setpoints=setpoints(gate, command.v_W, command.yaw_rate) if command else (None,) * self.space.n,
             phase=self.phase,
-            value=self.judge.value,
+            value=self.check.value,
             desired=desired,
             desired_rate=desired_rate,
             trajectory_t_s=self.guidance.trajectory_t_s(gate.t_s) if self._phase == "engaged" else None,
-            margin=self.judge.margin,
+            margin=self.check.margin,
             reason=reason,
             factor=command.factor if command else 1.0,
             alarmed=alarmed,
             plan_step=self.plan.resume_at(engaged=self._phase == "engaged" and not self.guidance.paused),
         )
-
-    @staticmethod
-    def _setpoints(gate: GateInput, command: FormationCommand) -> tuple[Setpoint | None, ...]:
-        """Return the setpoints of the drones that follow one."""
-        setpoints = map(Setpoint, command.v_W.tolist(), command.yaw_rate.tolist())
-        if AIRBORNE.issuperset(gate.states):
-            return tuple(setpoints)
-        return tuple(s if state in AIRBORNE else None for s, state in zip(setpoints, gate.states, strict=True))
 
     def _pairs(self, pairs: Pairs) -> str:
         return ", ".join(f"{self.drones[i]} and {self.drones[j]}" for i, j in pairs)

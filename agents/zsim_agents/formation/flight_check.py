@@ -1,20 +1,28 @@
-"""Whether a formation may take off, be engaged, and be flown on: every fault in words."""
+"""Whether a formation may take off, be engaged, and be flown on, and where it may be: every fault in words."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from zsim.math.compiled import portable
-from zsim_agents.formation.flight_data import AIRBORNE, EngagementLimits, GateInput
-from zsim_agents.formation.formation_law import FormationGains
-from zsim_agents.formation.reference_check import FAR, bounds_of, first_outside, shape_fault
-from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
+from zsim.math.compiled import COMPILES, portable
+from zsim_agents.formation.control_law import FormationGains
+from zsim_agents.formation.flight_data import AIRBORNE, EngagementLimits, GateInput, ShapeLimits
+from zsim_agents.formation.spaces.cluster_space import (
+    Array,
+    ClusterSpace,
+    SingularClusterError,
+    closest_pair,
+    least_distance,
+)
 
-WELL, OLD, WILD, VAGUE = range(4)  # what an estimate is: fit, too old, not finite, too uncertain
+FAR = 1e6  # m or rad: beyond it a value is a slip
+VALID, STALE, NOT_FINITE, UNCERTAIN = range(4)  # state of an estimate
 
 
-class FlightJudge:
-    """Judges the estimates and states of a gate; each judgement is the fault, or None where all is well.
+class FlightCheck:
+    """Checks the estimates and states of a gate; each check returns the fault, or None where all is well.
 
     Attributes:
         value: (4n,) cluster of the newest estimates that had a frame, zero before any.
@@ -38,13 +46,13 @@ class FlightJudge:
         self.margin = 0.0
         self._spread = 0.0
         self._no_frame: str | None = "nothing was observed yet"
-        self._flaw = (WELL, 0)  # of the estimates of the gate that was observed, by the limits in flight
+        self._flaw = (VALID, 0)  # of the estimates of the gate that was observed, by the limits in flight
 
     def observe(self, gate: GateInput) -> None:
         """Take over the estimates of a gate."""
         self.margin, self._no_frame = 0.0, "an estimate is not finite"
         self._flaw = self._first_flaw(gate, self.limits.sigma_lost_m)
-        if self._flaw[0] != WELL and not all_near(gate.p_W, gate.yaw):
+        if self._flaw[0] != VALID and not all_near(gate.p_W, gate.yaw):
             return
         try:
             self.value = self.space.forward(gate.p_W, gate.yaw)
@@ -90,7 +98,7 @@ class FlightJudge:
 
     def estimate_fault(self, gate: GateInput) -> str | None:
         """Return why the estimates of drones in flight cannot be flown on, those of the gate that was observed."""
-        return self._in_words(gate, self._flaw, self.limits.sigma_lost_m)
+        return self._flaw_text(gate, self._flaw, self.limits.sigma_lost_m)
 
     def state_fault(self, gate: GateInput, allowed: frozenset[str]) -> str | None:
         """Return which drone is in another state than those allowed."""
@@ -101,20 +109,20 @@ class FlightJudge:
 
     def _start_fault(self, gate: GateInput) -> str | None:
         sigma_max_m = self.limits.sigma_max_m
-        return self._in_words(gate, self._first_flaw(gate, sigma_max_m), sigma_max_m)
+        return self._flaw_text(gate, self._first_flaw(gate, sigma_max_m), sigma_max_m)
 
     def _first_flaw(self, gate: GateInput, sigma_max_m: float) -> tuple[int, int]:
         age_max_s = self.limits.age_max_s
         return estimate_flaw(gate.age_s, gate.p_W, gate.v_W, gate.yaw, gate.sigma_m, age_max_s, sigma_max_m)
 
-    def _in_words(self, gate: GateInput, flaw: tuple[int, int], sigma_max_m: float) -> str | None:
+    def _flaw_text(self, gate: GateInput, flaw: tuple[int, int], sigma_max_m: float) -> str | None:
         kind, i = flaw
-        if kind == WELL:
+        if kind == VALID:
             return None
         drone, age_max_s = self.drones[i], self.limits.age_max_s
-        if kind == OLD:
+        if kind == STALE:
             return f"the estimate of {drone} is {gate.age_s[i]:.2f} s old; allowed: {age_max_s:g} s"
-        if kind == WILD:
+        if kind == NOT_FINITE:
             return f"the estimate of {drone} is not finite; allowed: up to {FAR:g} m, m/s or rad"
         worst_m = max(gate.sigma_m[i].tolist())
         return f"the position of {drone} has a sigma of {worst_m:.2f} m; allowed: {sigma_max_m:g} m"
@@ -139,13 +147,88 @@ def near(vectors: Array, i: int) -> bool:
 def estimate_flaw(
     age_s: Array, p_W: Array, v_W: Array, yaw: Array, sigma_m: Array, age_max_s: float, sigma_max_m: float
 ) -> tuple[int, int]:
-    """Return what the first estimate that is not well is (OLD, WILD or VAGUE), and whose; else WELL."""
+    """Return what the first estimate that is not well is (STALE, NOT_FINITE or UNCERTAIN), and whose; else VALID."""
     for i in range(yaw.size):
         if not age_s[i] <= age_max_s:
-            return OLD, i
+            return STALE, i
         if not (near(p_W, i) and near(v_W, i) and abs(yaw[i]) < FAR):
-            return WILD, i
+            return NOT_FINITE, i
         for k in range(3):
             if not sigma_m[i, k] <= sigma_max_m:
-                return VAGUE, i
-    return WELL, 0
+                return UNCERTAIN, i
+    return VALID, 0
+
+
+def shape_fault(space: ClusterSpace, c: Array, limits: ShapeLimits, spread: float | None = None) -> str | None:
+    """Return why c is no formation to engage or to lead to, or None; names quantity, value and limit.
+
+    Args:
+        spread: of c, where it is known.
+    """
+    outside = first_outside(c, space.bounds)
+    if outside >= 0:
+        return _value_fault(space, c, outside)
+    spread = space.spread(c) if spread is None else spread
+    if spread <= limits.spread_min_m:
+        return f"{space.spread_text} is {spread:.2f} m; allowed: above {limits.spread_min_m:g} m"
+    for k in space.tilts:
+        if abs(c[k]) >= limits.tilt_max_rad:
+            tilt_deg, most_deg = math.degrees(c[k]), math.degrees(limits.tilt_max_rad)
+            return (
+                f"{space.names[k]} of the formation is {tilt_deg:.1f} deg; allowed: below {most_deg:g} deg either way"
+            )
+    condition = space.condition(c) if math.isfinite(limits.condition_max) else 0.0
+    if not condition < limits.condition_max:
+        return f"condition number of J^-1 is {condition:.1f}; allowed: below {limits.condition_max:g}"
+    return None
+
+
+def bounds_of(space: ClusterSpace, limits: ShapeLimits) -> Array:
+    """Return the open bounds (4n, 2) of variables of which `shape_fault` finds none at fault, but for the condition."""
+    bounds = space.bounds.copy()
+    for k in space.tilts:
+        bounds[k, 0] = max(bounds[k, 0], -limits.tilt_max_rad)
+        bounds[k, 1] = min(bounds[k, 1], limits.tilt_max_rad)
+    return bounds
+
+
+@portable
+def first_outside(c: Array, bounds: Array) -> int:
+    """Return the place of the first variable of c that is beyond FAR or its open bounds (4n, 2), or -1."""
+    for k in range(c.size):
+        if not (abs(c[k]) < FAR and bounds[k, 0] < c[k] < bounds[k, 1]):  # also true for NaN
+            return k
+    return -1
+
+
+def _value_fault(space: ClusterSpace, c: Array, k: int) -> str:
+    name, value, (low, high) = space.names[k], float(c[k]), space.bounds[k].tolist()
+    if not abs(value) < FAR:
+        return f"{name} is {value:g}; allowed: up to {FAR:g}"
+    return f"{name} is {value:.3g}; allowed: between {low:.3g} and {high:.3g}"
+
+
+def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
+    """Return why the robots may not stand where c puts them (too near to each other, too low), or None."""
+    p_W, _ = space.inverse(c)
+    if COMPILES and well_placed(p_W, gains.separation_min_m, limits.height_min_m):
+        return None
+    distance, i, j = closest_pair(p_W)
+    if distance < gains.separation_min_m:
+        pair = f"robots {i + 1} and {j + 1}"
+        return f"{pair} are {distance:.3f} m apart; allowed: {gains.separation_min_m:g} m or more"
+    heights = p_W[:, 2].tolist()
+    lowest = min(heights)
+    if lowest < limits.height_min_m:
+        low = heights.index(lowest)
+        return f"robot {low + 1} is at z = {lowest:.2f} m; allowed: {limits.height_min_m:g} m or more"
+    return None
+
+
+@portable
+def well_placed(p_W: Array, separation_min_m: float, height_min_m: float) -> bool:
+    """Return whether robots at p_W (n, 3) are neither too near to each other nor too low."""
+    fit = least_distance(p_W)[0] >= separation_min_m
+    for i in range(p_W.shape[0]):
+        fit = fit and p_W[i, 2] >= height_min_m
+    return fit

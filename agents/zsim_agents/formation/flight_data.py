@@ -13,11 +13,29 @@ from typing import NamedTuple
 
 from msgspec import Struct
 
-from zsim_agents.formation.reference_check import ShapeLimits
 from zsim_agents.formation.spaces.cluster_space import Array
 
 AIRBORNE = frozenset({"hovering", "flying"})  # states of a drone that follows velocity commands
 DOWN = frozenset({"landed", "emergency"})  # states of a drone that is on the ground, or falls to it
+
+
+@dataclass(frozen=True)
+class ShapeLimits:
+    """Where a formation may be engaged, and where a reference may lead it.
+
+    Attributes:
+        spread_min_m: least height of the shape.
+        tilt_max_rad: greatest roll and pitch of the formation.
+        condition_max: greatest condition number of J^-1.
+        height_min_m: least height of a robot's reference over the ground, z_W = 0.
+        share: share of the robots' speed limits that a reference may use; the law keeps the rest.
+    """
+
+    spread_min_m: float = 1.0  # chosen: five sigma of a side's estimate keep robots out of one line
+    tilt_max_rad: float = math.radians(30.0)  # chosen: far from the 90 deg where Euler angles fail
+    condition_max: float = 20.0  # chosen: beyond it a small motion in cluster space is a large one of a robot
+    height_min_m: float = 0.5  # chosen: five rotor radii, above most of the ground effect
+    share: float = 0.8  # chosen
 
 
 @dataclass(frozen=True)
@@ -91,11 +109,41 @@ class ModeCommand(NamedTuple):
     mode: str
 
 
+class ModeSender:
+    """Sends a mode to each drone that is still in a state from which it is to go, once per resend_s."""
+
+    def __init__(self, drones: tuple[str, ...], resend_s: float) -> None:
+        self._drones = drones
+        self._resend_s = resend_s
+        self._sent_s: dict[str, float] = {}
+
+    def restart(self) -> None:
+        """Begin anew: the next commands are sent at once."""
+        self._sent_s.clear()
+
+    def commands(self, gate: GateInput, mode: str, states: frozenset[str]) -> tuple[ModeCommand, ...]:
+        """Return the commands of this gate for the drones that are in one of the states."""
+        due = []
+        for drone, state in zip(self._drones, gate.states, strict=True):
+            if state in states and gate.t_s - self._sent_s.get(drone, -math.inf) >= self._resend_s:
+                self._sent_s[drone] = gate.t_s
+                due.append(ModeCommand(drone, mode))
+        return tuple(due)
+
+
 class Setpoint(Struct, eq=False):
     """A velocity command for one drone [m/s, W; rad/s]."""
 
     v_W: Sequence[float]
     yaw_rate: float
+
+
+def setpoints(gate: GateInput, v_W: Array, yaw_rate: Array) -> tuple[Setpoint | None, ...]:
+    """Return the setpoints of velocities (n, 3) and yaw rates (n,), None for a drone that does not follow one."""
+    every = map(Setpoint, v_W.tolist(), yaw_rate.tolist())
+    if AIRBORNE.issuperset(gate.states):
+        return tuple(every)
+    return tuple(setpoint if state in AIRBORNE else None for setpoint, state in zip(every, gate.states, strict=True))
 
 
 class GateOutput(Struct, eq=False):

@@ -1,17 +1,112 @@
-"""The flight plan of a scenario: requests with the time from which they are due."""
+"""What a user or a scenario may ask of a formation, and the plan of a scenario: requests and when they are due.
+
+Order of this file: requests, the plan, how requests are read from the wire.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from zsim_agents.formation.flight_request import REFUSALS, FlightRequest, Follow, Land, Target
-from zsim_agents.formation.spaces.cluster_space import ClusterSpace
+from zsim.scenario.scenario import Cluster
+from zsim_agents.formation.expression import ExpressionError, finite_number
+from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError
+from zsim_agents.formation.trajectory import (
+    ExpressionTrajectory,
+    Reference,
+    TrajectoryError,
+    WaypointTrajectory,
+    named_values,
+)
 
 RETRY_S = 0.5  # between two tries of a request that was refused
+
+
+class RefusalError(ValueError):
+    """A request cannot be granted as things stand; the message is the reason."""
+
+
+class RequestError(ValueError):
+    """A request cannot be understood; the message names the field, finding and remedy."""
+
+
+@dataclass(frozen=True)
+class TakeOff:
+    """Take all drones off and climb straight up to the assembly height."""
+
+
+@dataclass(frozen=True)
+class Engage:
+    """Close the formation loop at the present estimate, or resume after a hold."""
+
+
+@dataclass(frozen=True)
+class Pause:
+    """Stand still in formation until engaged again; `hold` on the wire."""
+
+
+@dataclass(frozen=True)
+class Land:
+    """Land all drones where they are."""
+
+
+@dataclass(frozen=True)
+class MoveTo:
+    """Move the formation to values by name, in over_s or as fast as the limits let it."""
+
+    values: Mapping[str, float] = field(default_factory=dict)
+    over_s: float | None = None
+
+    def goal(self, space: ClusterSpace, base: Array) -> Array:
+        """Return the goal (4n,): base with the values put in; raises TrajectoryError."""
+        if not self.values:
+            raise TrajectoryError(f"target: no values; allowed: numbers by name of {', '.join(space.names)}")
+        return named_values(space, self.values, "target", base)
+
+
+@dataclass(frozen=True)
+class Follow:
+    """Bring the formation to the start of a trajectory, then follow it; `trajectory` on the wire.
+
+    Attributes:
+        expressions, constants, duration_s: see `ExpressionTrajectory`; or
+        waypoints: see `WaypointTrajectory`.
+        start_s: simulated time of the trajectory's t = 0; None: when the formation has got there. A
+            formation that gets there later joins the trajectory in motion.
+    """
+
+    expressions: Mapping[str, str | float] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
+    duration_s: float | None = None
+    waypoints: Sequence[Mapping[str, object]] = ()
+    start_s: float | None = None
+
+    def trajectory(self, space: ClusterSpace, base: Array) -> Reference:
+        """Return the trajectory; raises ExpressionError or TrajectoryError."""
+        if self.start_s is not None and finite_number(self.start_s) is None:
+            raise TrajectoryError(f"trajectory: start_s is {self.start_s}; allowed: a finite number")
+        if bool(self.expressions) == bool(self.waypoints):
+            count = "both" if self.expressions else "neither"
+            raise TrajectoryError(f"trajectory: found {count}; allowed: expressions or waypoints")
+        if self.waypoints:
+            return WaypointTrajectory(space, self.waypoints, base)
+        return ExpressionTrajectory(space, self.expressions, base, self.constants, self.duration_s)
+
+
+FlightRequest = TakeOff | Engage | Pause | Land | MoveTo | Follow
+
+
+REFUSALS = (RefusalError, TrajectoryError, ExpressionError, SingularClusterError)
+
+
+def refuse(fault: str | None) -> None:
+    """Raise a RefusalError if there is a fault."""
+    if fault:
+        raise RefusalError(fault)
 
 
 @dataclass(frozen=True)
@@ -50,9 +145,9 @@ class FlightPlan:
             refusal = request(step)
             if refusal:
                 self._try_s = t_s + RETRY_S
-                self.note = f"{type(step).__name__} of the plan waits: {refusal}"
+                self.note = f"{_OPS[type(step)]} of the plan waits: {refusal}"
                 return
-            flown = self._flown if isinstance(step, Target | Follow) else self._next + 1
+            flown = self._flown if isinstance(step, MoveTo | Follow) else self._next + 1
             self._go_to(self._next + 1, flown)
 
     def resume_at(self, engaged: bool) -> int:
@@ -83,6 +178,28 @@ class FlightPlan:
         self._try_s, self.note = -math.inf, ""
 
 
+def plan_of(cluster: Cluster) -> list[Scheduled]:
+    """Return the steps of a cluster's plan in their order."""
+    plan, steps = cluster.plan, []
+    if plan.takeoff_s is not None:
+        steps += [Scheduled(plan.takeoff_s, TakeOff()), Scheduled(plan.takeoff_s, Engage())]
+        if plan.target:
+            steps.append(Scheduled(plan.takeoff_s, MoveTo(plan.target, plan.target_over_s)))
+        if plan.trajectory is not None:
+            trajectory = plan.trajectory
+            waypoints = [{"at_s": w.at_s, "values": w.values} for w in trajectory.waypoints]
+            follow = Follow(
+                expressions=trajectory.expressions,
+                constants=trajectory.constants,
+                waypoints=waypoints,
+                start_s=trajectory.start_s,
+            )
+            steps.append(Scheduled(plan.takeoff_s, follow))
+    if plan.land_s is not None:
+        steps.append(Scheduled(plan.land_s, Land()))
+    return steps
+
+
 def _check(space: ClusterSpace, steps: Sequence[Scheduled]) -> None:
     base = np.zeros(space.size)
     earlier_s = 0.0
@@ -91,9 +208,66 @@ def _check(space: ClusterSpace, steps: Sequence[Scheduled]) -> None:
             raise ValueError(f"plan step {number}: at_s is {step.at_s:g}; allowed: {earlier_s:g} s or later")
         earlier_s = step.at_s
         try:
-            if isinstance(step.request, Target):
+            if isinstance(step.request, MoveTo):
                 step.request.goal(space, base)
             elif isinstance(step.request, Follow):
                 step.request.trajectory(space, base).value(0.0)
         except REFUSALS as error:
             raise ValueError(f"plan step {number}: {error}") from None
+
+
+def read_request(op: object, args: object = None) -> FlightRequest:
+    """Return the request of an operation on the wire, e.g. ("target", {"values": {"z_c": 12.0}}).
+
+    Raises:
+        RequestError: unknown operation or field, or a field of a wrong type.
+    """
+    if not isinstance(op, str) or op not in _READERS:
+        raise RequestError(f"op {str(op)[:40]!r} is unknown; allowed: {', '.join(_READERS)}")
+    build, fields = _READERS[op]
+    arguments = {} if args is None else args
+    if not isinstance(arguments, Mapping):
+        raise RequestError(f"{op}: args is {type(args).__name__}; allowed: a map of {', '.join(fields) or 'nothing'}")
+    for name, value in arguments.items():
+        if name not in fields:
+            allowed = ", ".join(fields) or "none"
+            raise RequestError(f"{op}: field {str(name)[:40]!r} is unknown; allowed: {allowed}")
+        kind, fits = fields[name]
+        if not fits(value):
+            raise RequestError(f"{op}: {name} is {str(value)[:40]!r}; allowed: {kind}")
+    return build(**{name: value for name, value in arguments.items() if value is not None})
+
+
+def _seconds(value: object) -> bool:
+    return value is None or finite_number(value) is not None
+
+
+def _map(value: object) -> bool:
+    return isinstance(value, Mapping)
+
+
+def _list(value: object) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
+
+
+_Fields = dict[str, tuple[str, Callable[[object], bool]]]
+_TARGET: _Fields = {
+    "values": ("a map of numbers by variable", _map),
+    "over_s": ("a number of seconds", _seconds),
+}
+_TRAJECTORY: _Fields = {
+    "expressions": ("a map of expressions by variable", _map),
+    "constants": ("a map of numbers by name", _map),
+    "duration_s": ("a number of seconds", _seconds),
+    "waypoints": ("a list of waypoints", _list),
+    "start_s": ("a number of seconds", _seconds),
+}
+_READERS: dict[str, tuple[Callable[..., Any], _Fields]] = {
+    "takeoff": (TakeOff, {}),
+    "engage": (Engage, {}),
+    "hold": (Pause, {}),
+    "land": (Land, {}),
+    "target": (MoveTo, _TARGET),
+    "trajectory": (Follow, _TRAJECTORY),
+}
+_OPS = {request: op for op, (request, _) in _READERS.items()}

@@ -1,14 +1,29 @@
-"""Where a formation is to be at every instant: the reference, and how requests change it without a bump."""
+"""Where a formation is to be at every instant: the reference, and the ramps by which requests change it smoothly.
+
+Order of this file: the reference in flight, the checks of what is to be flown, ramps within the robots' limits.
+"""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from zsim_agents.formation.flight_request import Follow, Target
-from zsim_agents.formation.formation_law import FormationGains
-from zsim_agents.formation.reference_check import ShapeLimits, fastest_ramp, plan_ramp
-from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
-from zsim_agents.formation.trajectory import Hold, Ramp, Reference, Shifted, TrajectoryError
+from zsim_agents.formation.control_law import FormationGains
+from zsim_agents.formation.flight_check import place_fault, shape_fault
+from zsim_agents.formation.flight_data import ShapeLimits
+from zsim_agents.formation.flight_plan import Follow, MoveTo
+from zsim_agents.formation.robot_limits import load
+from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, robot_rates
+from zsim_agents.formation.trajectory import Hold, Ramp, Reference, Shifted, TrajectoryError, ramp_onto
+
+SAMPLE_S = 0.5  # at 2 m/s a robot moves 1 m between two samples
+SAMPLES_MIN, SAMPLES_MAX = 41, 301
+HORIZON_S = 600.0  # how far an endless trajectory is checked before; the rest is checked while it is flown
+RAMP_MIN_S, RAMP_MAX_S = 2.0, 3600.0
+RAMP_GROWTH = 1.2  # least step of the search for a ramp that is slow enough
+RAMP_SAMPLES = 33  # odd: one falls on the peak rate of a ramp, its middle
+LOAD_TOLERANCE = 1.02  # of the share: ramps are sampled, and one may start at the limit
 
 
 class Guidance:
@@ -22,7 +37,7 @@ class Guidance:
     the way is not allowed, and change nothing then.
 
     Attributes:
-        paused: the formation was asked to stand still.
+        paused: the formation stands still on request.
     """
 
     def __init__(self, space: ClusterSpace, gains: FormationGains, shape: ShapeLimits) -> None:
@@ -36,7 +51,7 @@ class Guidance:
         self._known: tuple[Reference, float, tuple[Array, Array]] | None = None  # the last answer of value
 
     def value(self, t_s: float) -> tuple[Array, Array]:
-        """Return c_des and its rate, each (4n,); asked twice in a gate, computed once."""
+        """Return c_des and its rate, each (4n,); computed once a gate."""
         if self._known is None or self._known[0] is not self._flown or self._known[1] != t_s:
             self._known = (self._flown, t_s, self._flown.value(t_s))
         return self._known[2]
@@ -55,7 +70,7 @@ class Guidance:
         self._home = self._flown = Hold(c)
         self.paused = False
 
-    def target(self, request: Target, t_s: float) -> None:
+    def target(self, request: MoveTo, t_s: float) -> None:
         """Lead to a target."""
         goal = request.goal(self.space, self._base(t_s))
         home = Hold(goal)
@@ -102,3 +117,109 @@ class Guidance:
 
     def _ramp(self, start: tuple[Array, Array], onto: Reference, t_s: float, over_s: float | None = None) -> Ramp:
         return plan_ramp(self.space, start, onto, t_s, self._gains, self._shape, over_s)
+
+
+def reference_fault(
+    space: ClusterSpace,
+    reference: Reference,
+    from_s: float,
+    to_s: float,
+    gains: FormationGains,
+    limits: ShapeLimits,
+) -> str | None:
+    """Return why a reference may not be flown from from_s to to_s, or None; sampled 41 to 301 times."""
+    count = min(max(math.ceil((to_s - from_s) / SAMPLE_S) + 1, SAMPLES_MIN), SAMPLES_MAX)
+    count = count if to_s > from_s else 1
+    for t_s in np.linspace(from_s, to_s, count).tolist():
+        fault = _fault_at(space, *reference.value(t_s), gains, limits)
+        if fault:
+            return f"{t_s - from_s:.1f} s after its start {fault}" if t_s > from_s else fault
+    return None
+
+
+def plan_ramp(
+    space: ClusterSpace,
+    start: tuple[Array, Array],
+    onto: Reference,
+    start_s: float,
+    gains: FormationGains,
+    limits: ShapeLimits,
+    over_s: float | None = None,
+) -> Ramp:
+    """Return the ramp from start (c, c_dot) onto a reference; without over_s as fast as the limits let it.
+
+    The ramp and what follows it (600 s of it at most) are checked.
+
+    Raises:
+        TrajectoryError: too fast, too far, or it leads through a place that is not allowed.
+    """
+    from_s = max(start_s, onto.start_s) if isinstance(onto, Shifted) else start_s
+    end_s = min(math.inf if onto.duration_s is None else onto.duration_s, from_s + HORIZON_S)
+    try:
+        fault = reference_fault(space, onto, from_s, max(from_s, end_s), gains, limits)
+        if fault:
+            raise TrajectoryError(f"the reference is not allowed: {fault}")
+        ramp = fastest_ramp(space, start, onto, start_s, gains, limits)
+        if over_s is not None:
+            ramp = _ramp_over(space, start, onto, start_s, gains, limits, over_s, ramp.over_s)
+        fault = reference_fault(space, ramp, start_s, start_s + ramp.over_s, gains, limits)
+    except SingularClusterError as error:
+        raise TrajectoryError(f"the way is singular: {error}") from None
+    if fault:
+        raise TrajectoryError(f"the way is not allowed: {fault}")
+    return ramp
+
+
+def fastest_ramp(
+    space: ClusterSpace,
+    start: tuple[Array, Array],
+    onto: Reference,
+    start_s: float,
+    gains: FormationGains,
+    limits: ShapeLimits,
+) -> Ramp:
+    """Return the ramp that uses the limits; its way is not checked.
+
+    Raises:
+        TrajectoryError: it would take longer than an hour.
+    """
+    over_s = RAMP_MIN_S
+    while over_s <= RAMP_MAX_S:
+        ramp = ramp_onto(space, *start, onto, start_s, over_s)
+        excess = _peak_load(space, ramp, gains) / limits.share
+        if excess <= LOAD_TOLERANCE:
+            return ramp
+        over_s *= max(min(excess, 10.0), RAMP_GROWTH)
+    raise TrajectoryError(f"not reached within {RAMP_MAX_S:g} s at the robots' limits: too far, or it moves too fast")
+
+
+def _ramp_over(
+    space: ClusterSpace,
+    start: tuple[Array, Array],
+    onto: Reference,
+    start_s: float,
+    gains: FormationGains,
+    limits: ShapeLimits,
+    over_s: float,
+    least_s: float,
+) -> Ramp:
+    if 0.0 < over_s <= RAMP_MAX_S:
+        ramp = ramp_onto(space, *start, onto, start_s, over_s)
+        if _peak_load(space, ramp, gains) <= limits.share * LOAD_TOLERANCE:
+            return ramp
+    raise TrajectoryError(f"over_s is {over_s:g} s; allowed at the robots' limits: {least_s:.1f} s to {RAMP_MAX_S:g} s")
+
+
+def _peak_load(space: ClusterSpace, ramp: Ramp, gains: FormationGains) -> float:
+    times = np.linspace(ramp.start_s, ramp.start_s + ramp.over_s, RAMP_SAMPLES).tolist()
+    return max(load(*robot_rates(space, *ramp.value(t_s)), gains.limits) for t_s in times)
+
+
+def _fault_at(space: ClusterSpace, c: Array, c_dot: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
+    fault = shape_fault(space, c, limits) or place_fault(space, c, gains, limits)
+    if fault:
+        return fault
+    share = load(*robot_rates(space, c, c_dot), gains.limits)
+    if share > limits.share * LOAD_TOLERANCE:
+        return f"a robot moves at {share:.2f} of its limits; allowed: {limits.share:g}"
+    return None

@@ -51,7 +51,7 @@ class Hold:
 
 @dataclass(frozen=True, eq=False)
 class Shifted:
-    """A reference that starts at start_s of the time in which it is asked."""
+    """A reference that starts at start_s of the time in which it is evaluated."""
 
     reference: Reference
     start_s: float
@@ -151,9 +151,9 @@ class WaypointTrajectory:
         at_s = finite_number(waypoint.get("at_s")) if isinstance(waypoint, Mapping) else None
         least = self._times[-1] if self._times else -1e-9
         if at_s is None or not at_s > least:
-            found = waypoint.get("at_s") if isinstance(waypoint, Mapping) else waypoint
+            value = waypoint.get("at_s") if isinstance(waypoint, Mapping) else waypoint
             raise TrajectoryError(
-                f"waypoint {number}: at_s is {str(found)[:40]}; allowed: a number of seconds"
+                f"waypoint {number}: at_s is {str(value)[:40]}; allowed: a number of seconds"
                 + (f" above {least:g}, that of the waypoint before" if self._times else ", 0 or more")
             )
         return at_s

@@ -10,6 +10,7 @@ import numpy as np
 import viser
 
 from zsim.contract.messages import Event, Info, ViewDrones
+from zsim.errors import RunError
 from zsim.math import frames
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
@@ -70,7 +71,10 @@ class Show:
         self._scenario = scenario_file.from_text(info.scenario)
         names = tuple(drone.name for drone in info.drones)
         self._rate_hz = rate_hz
-        self._spaces = {c.name: scenario_space(self._scenario, c) for c in self._scenario.clusters}
+        try:
+            self._spaces = {c.name: scenario_space(self._scenario, c) for c in self._scenario.clusters}
+        except ValueError as error:
+            raise RunError(f"console: {error}") from error
         variables = {name: space.names for name, space in self._spaces.items()}
         age_s = self._scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
         self._watch = Watch(link, presence, age_s if info.mode == "realtime" else math.inf)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from zsim.scenario.scenario import Scenario
-from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError, cluster_space
-from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
+from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
 from zsim_analysis.reading.flight import Array, States, Times, Track
 from zsim_analysis.reading.formation_errors import Errors, common_instants, errors
 

@@ -7,6 +7,7 @@ from zsim.contract import keys, messages
 from zsim.errors import DecodeError
 from zsim.record import RecordReader
 from zsim.scenario.fault_kinds import PROCESS_KILL
+from zsim.scenario.roles import AGENTS
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import agents_of
 
@@ -53,7 +54,7 @@ def cast_of(reader: RecordReader, info: messages.Info, scenario: Scenario) -> Ca
     joins = [(keys.thing(key), join) for key, join in _read(reader, "process/*/join")]
     ours = [(name, join) for name, join in joins if _is_ours(name, join, known)]
     found = [Team(name, (*join.serves, name)) for name, join in dict(ours).items()]
-    teams = tuple(sorted(found, key=lambda team: (not team.name.startswith("estimator."), team.name)))
+    teams = tuple(sorted(found, key=lambda team: ([*AGENTS].index(team.name.partition(".")[0]), team.name)))
     names = frozenset(name for team in teams for name in team.members)
     events: list[messages.Event] = [event for _, event in _read(reader, keys.EVENT)]
     why_not = _reason(info, scenario, events, names)

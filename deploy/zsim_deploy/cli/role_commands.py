@@ -71,7 +71,7 @@ def estimator(
     """Run the estimator of one drone, or of several in one process."""
     from zsim_deploy.roles import roles
 
-    roles.agent(roles.estimator(drones), reach)
+    roles.agent(roles.agent_of("estimator", drones), reach)
 
 
 @app.command(rich_help_panel=ROLES)
@@ -83,7 +83,7 @@ def controller(
     """Run the cluster-space controller of one cluster."""
     from zsim_deploy.roles import roles
 
-    roles.agent(roles.controller(cluster), reach)
+    roles.agent(roles.agent_of("controller", [cluster]), reach)
 
 
 @app.command("host", rich_help_panel=ROLES)

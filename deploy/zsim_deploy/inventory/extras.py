@@ -4,11 +4,12 @@ import importlib.metadata
 from collections.abc import Iterable
 
 from zsim.scenario.rights import RECORDER, WORLD
+from zsim.scenario.roles import AGENTS, ROLES
 from zsim_deploy.inventory.inventory import Inventory, hosts_of, spread
 
 PROJECT = "zsim"
-NAMED = {WORLD: "world", RECORDER: "record"}  # processes that there is one of; hosts are given out in this order
-KINDS = {"estimator.": "agents", "controller.": "agents"}  # by the beginning of the process name
+NAMED = {name: ROLES[name].extra for name in (WORLD, RECORDER)}  # there is one of each; in the order of placement
+KINDS = {f"{name}.": role.extra for name, role in AGENTS.items()}  # by the beginning of the process name
 MODULES = {  # what proves that an extra is whole, the installation without extras first
     "": "zsim.transport.session",
     "agents": "zsim_agents.estimation.estimator",

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from zsim.scenario.on_death import on_death
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
+from zsim.scenario.roles import agent_names, on_death
 from zsim.scenario.scenario import OnDeath, Scenario
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.extras import KINDS, NAMED
@@ -123,12 +123,7 @@ def used_hosts(found: Sequence[Process]) -> list[str]:
 
 def _known(name: str, scenario: Scenario) -> bool:
     """Tell whether zsim has a command for a process."""
-    role, _, thing = name.partition(".")
-    known = {
-        "estimator": [drone.name for drone in scenario.drones],
-        "controller": [cluster.name for cluster in scenario.clusters],
-    }
-    return name in (WORLD, RECORDER) or thing in known.get(role, [])
+    return name in (WORLD, RECORDER, *agent_names(scenario))
 
 
 def _role(

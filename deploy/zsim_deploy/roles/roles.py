@@ -15,14 +15,16 @@ from typing import Any
 from zsim.contract import messages
 from zsim.errors import RecordError, RunError, SessionError
 from zsim.runtime.agent import Agent
+from zsim.runtime.group import Group
 from zsim.runtime.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
+from zsim.scenario.roles import AGENTS, things
 from zsim.scenario.scenario import Scenario
 from zsim.transport import session, tls
 from zsim.transport.connection import find_world
 from zsim.transport.identity import Identity
-from zsim_agents.hosting import chosen, hosted
+from zsim_agents.hosting import agent_class, chosen, hosted, made
 from zsim_deploy.options.reach import Reach
 from zsim_deploy.roles.priority import give_way
 from zsim_deploy.roles.stop_channel import Leash
@@ -132,14 +134,14 @@ def agent(build: Callable[[messages.Info, Scenario], Agent], reach: Reach) -> No
     say = speaker(launched is not None)
     found = find_world(reach.endpoint, reach.federation, reach.wait_s, say, leash.pulled, run_id=launched, identity=who)
     with found as (link, info):
-        made = build(info, scenario_file.from_text(info.scenario))
-        check_certificate(made, who)
-        say(f"{made.name}: in run {info.run_id}{_also(made)}")
+        member = build(info, scenario_file.from_text(info.scenario))
+        check_certificate(member, who)
+        say(f"{member.name}: in run {info.run_id}{_also(member)}")
         gc.collect()
         gc.freeze()
-        runner = Runner(link, info, made, leash.pulled, say, leash.deserted)
+        runner = Runner(link, info, member, leash.pulled, say, leash.deserted)
         reason = runner.run()
-    say(f"{made.name}: left, {reason}")
+    say(f"{member.name}: left, {reason}")
     if runner.killed:
         _die()
     leash.account()
@@ -150,13 +152,14 @@ def _die() -> None:
     os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))  # Windows has no SIGKILL; there this is as hard
 
 
-def estimator(drones: Sequence[str]) -> Callable[[messages.Info, Scenario], Agent]:
-    """Return what builds the estimator of some drones, named or by patterns such as `drone*`."""
-    from zsim_agents.estimation.estimator import Estimator
+def agent_of(role: str, names: Sequence[str]) -> Callable[[messages.Info, Scenario], Agent]:
+    """Return what builds the agent of a role for some drones or clusters, named or by patterns such as `drone*`."""
+    agent_class(role)  # loaded while the world is not there yet
 
     def build(info: messages.Info, scenario: Scenario) -> Agent:
-        known = [drone.name for drone in scenario.drones]
-        return Estimator(info, scenario, chosen("estimator: drone", drones, known))
+        wanted = chosen(f"{role}: {AGENTS[role].about}", names, things(role, scenario))
+        agents = made(role, info, scenario, wanted)
+        return agents[0] if len(agents) == 1 else Group(agents)
 
     return build
 
@@ -178,12 +181,6 @@ def check_certificate(made: Agent, identity: Identity) -> None:
 
 def _also(made: Agent) -> str:
     return f", and stands for {', '.join(made.serves)}" if made.serves else ""
-
-
-def controller(cluster: str) -> Callable[[messages.Info, Scenario], Agent]:
-    from zsim_agents.formation.controller import Controller
-
-    return lambda info, scenario: Controller(info, scenario, cluster)
 
 
 def recorder(path: Path, reach: Reach) -> None:

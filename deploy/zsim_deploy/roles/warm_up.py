@@ -25,12 +25,9 @@ def main() -> None:
     info = World(scenario, "lockstep", 0.0, time.monotonic_ns, None).info()
     if not _has("filterpy"):
         return
-    from zsim_agents.estimation.estimator import Estimator
-    from zsim_agents.formation.controller import Controller
+    from zsim_agents.hosting import hosted
 
-    Estimator(info, scenario, scenario.drones[0].name).rehearse()
-    for cluster in scenario.clusters:
-        Controller(info, scenario, cluster.name).rehearse()
+    hosted(info, scenario, ["*"]).rehearse()
 
 
 def formations() -> dict[str, Any]:

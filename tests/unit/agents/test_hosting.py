@@ -48,7 +48,7 @@ def test_estimators_share_one_kernel_and_a_controller_comes_after_them():
 
 
 def test_one_estimator_serves_several_drones():
-    made = roles.estimator(["drone*"])(World(STEP).info(), STEP)
+    made = roles.agent_of("estimator", ["drone*"])(World(STEP).info(), STEP)
     assert (made.name, made.serves) == ("estimator.drone1", ("estimator.drone2", "estimator.drone3"))
 
 

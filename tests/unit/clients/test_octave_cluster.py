@@ -9,13 +9,12 @@ import pytest
 from octave import needs_octave, run
 
 from zsim.scenario.scenario import Gains
+from zsim_agents.formation.control_law import ProportionalLaw
 from zsim_agents.formation.controller import gains_of
 from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.flight_data import GateInput, GateOutput
-from zsim_agents.formation.flight_plan import Scheduled
-from zsim_agents.formation.flight_request import Engage, Land, TakeOff, Target
-from zsim_agents.formation.formation_law import FormationLaw
-from zsim_agents.formation.spaces.cluster_space import cluster_space
+from zsim_agents.formation.flight_plan import Engage, Land, MoveTo, Scheduled, TakeOff
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 
 pytestmark = needs_octave
 
@@ -107,8 +106,8 @@ def flight() -> tuple[list[dict[str, Any]], list[GateOutput]]:
     plan = [
         Scheduled(5.0, TakeOff()),
         Scheduled(5.0, Engage()),
-        Scheduled(5.0, Target(EQUATION_3)),
-        Scheduled(60.0, Target(TURNED)),
+        Scheduled(5.0, MoveTo(EQUATION_3)),
+        Scheduled(60.0, MoveTo(TURNED)),
         Scheduled(85.0, Land()),
     ]
     engagement, air = Engagement(SPACE, DRONES, GAINS, plan=plan), Air()
@@ -151,7 +150,7 @@ def test_the_mathematics(said: dict[str, Any]) -> None:
         p_W, yaw, v_W = (np.array(case[name]) for name in ("p_W", "yaw", "v_W"))
         c = SPACE.forward(p_W, yaw)
         J, J_inv = SPACE.jacobian(p_W, yaw), SPACE.inverse_jacobian(c)
-        law = FormationLaw(SPACE, GAINS)
+        law = ProportionalLaw(SPACE, GAINS)
         law.integral = np.array(case["integral"])
         wanted = law.command(c, p_W, v_W, np.array(case["c_des"]), np.array(case["c_dot_des"]), case["dt_s"])
         assert found["sound"] is True

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from zsim.math.compiled import portable
+from zsim.math.rotation import Vector, add, cross, dot, norm
 from zsim_agents.formation.spaces.cluster_space import TAU, Array, SingularClusterError
 
-Vector = tuple[float, float, float]
 Rows = tuple[Vector, Vector, Vector]  # of a matrix (3, 3)
 
 LENGTH_MIN_M = 1e-9  # a nanometre: below it a direction is rounding noise
@@ -19,24 +19,6 @@ LENGTH_MIN_M = 1e-9  # a nanometre: below it a direction is rounding noise
 def wrap_angle(angle: float) -> float:
     """Return the angle taken to [-pi, pi]."""
     return angle - TAU * np.rint(angle / TAU)
-
-
-@portable
-def cross(a: Vector, b: Vector) -> Vector:
-    """Return a x b."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@portable
-def dot(a: Vector, b: Vector) -> float:
-    """Return a . b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@portable
-def length(a: Vector) -> float:
-    """Return |a|."""
-    return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
 
 
 @portable
@@ -131,9 +113,9 @@ def triad_axes(d2: Vector, d3: Vector) -> tuple[Vector, Vector, Vector, float, f
     Args:
         d2, d3: P2 - P1 and P3 - P1, both in W [m].
     """
-    m = (d2[0] + d3[0], d2[1] + d3[1], d2[2] + d3[2])
+    m = add(d2, d3)
     normal = cross(d2, d3)
-    h, area = length(m), length(normal)
+    h, area = norm(m), norm(normal)
     if not (h > LENGTH_MIN_M and area > LENGTH_MIN_M * h):  # also true for NaN
         none = (0.0, 0.0, 0.0)
         return none, none, none, 0.0, 0.0

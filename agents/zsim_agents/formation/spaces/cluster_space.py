@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.compiled import COMPILES, portable
-from zsim.scenario.scenario import ROBOTS_MAX
 
 Array = NDArray[np.float64]
 
@@ -31,6 +30,19 @@ class SingularClusterError(ValueError):
 class ClusterSpace(ABC):
     """One convention of cluster variables for n robots; every method is a pure function.
 
+    A space of one's own is a subclass with `forward`, `inverse`, `jacobian`, `inverse_jacobian` and `spread`, of which
+    a scenario names the class; it is made by `for_places`.
+
+    Args:
+        n: number of robots.
+        names: of the variables, 4 n, pitch among them. What a name begins with says what it is: p, q, rho are
+            lengths, w departures in metres, roll, yaw, phi, azimuth angles that wrap, pitch, beta, elevation angles
+            that do not.
+        spread_text: what `spread` measures, in words for messages.
+
+    Raises:
+        ValueError: other names.
+
     Attributes:
         n: number of robots.
         size: number of cluster variables, 4 n.
@@ -39,7 +51,7 @@ class ClusterSpace(ABC):
         in_radians: (4n,) bool, true for all angles, also those that do not wrap (pitch, beta, elevation_k).
         period: (4n,) of the angles that wrap, 2 pi, and 0 for all else.
         bounds: (4n, 2) open bounds of the values that `forward` can give, infinite where there is none.
-        neutral: (4n,) bool, true for the variables that are zero in a formation of which nothing else was said: tilts,
+        neutral: (4n,) bool, true for the variables that are zero in a formation that has no other goal: tilts,
             headings against the formation, departures from a template.
         tilts: places of roll and pitch in c.
         spread_text: what `spread` measures, in words for messages.
@@ -49,6 +61,9 @@ class ClusterSpace(ABC):
         self.n = n
         self.size = 4 * n
         self.names = tuple(names)
+        if len(self.names) != self.size or "pitch" not in self.names:
+            names_text = f"{len(self.names)} variables of {n} robots: {_listed(self.names)}"
+            raise ValueError(f"{type(self).__name__} has {names_text}; must have {self.size}, pitch among them")
         self.spread_text = spread_text
         stems = [_stem(name) for name in names]
         self.angular = np.array([stem in {"roll", "yaw", "phi", "azimuth"} for stem in stems])
@@ -59,6 +74,15 @@ class ClusterSpace(ABC):
         self.tilts = tuple(i for i, stem in enumerate(stems) if stem in {"roll", "pitch"})
         self._lengths = [i for i, stem in enumerate(stems) if stem in _LENGTHS]
         self._pitch = self.names.index("pitch")
+
+    @classmethod
+    def for_places(cls, places_m: Array) -> ClusterSpace:
+        """Return the space of as many robots as there are places (n, 3) [m]; here cls(n), what a scenario names.
+
+        Args:
+            places_m: the cluster's `template_m`, else where its robots start; x ahead, y left of the formation.
+        """
+        return cls(len(places_m))  # type: ignore[call-arg]
 
     @abstractmethod
     def forward(self, p_W: Array, yaw: Array) -> Array:
@@ -153,21 +177,6 @@ class ClusterSpace(ABC):
         if name not in self.names:
             raise ValueError(f"variable {name[:40]!r} is unknown; allowed: {_listed(self.names)}")
         return self.names.index(name)
-
-
-def cluster_space(n: int) -> ClusterSpace:
-    """Return the cluster space of n robots: the paper's at n = 3, its triad generalisation elsewhere.
-
-    Raises:
-        ValueError: n is not from 2 to 64.
-    """
-    # Imported here because both build on the class above.
-    from zsim_agents.formation.spaces.pair_cluster import PairCluster
-    from zsim_agents.formation.spaces.triad_cluster import TriadCluster
-
-    if not 2 <= n <= ROBOTS_MAX:
-        raise ValueError(f"a cluster of {n} robots is not possible; allowed: 2 to {ROBOTS_MAX}")
-    return PairCluster() if n == 2 else TriadCluster(n)
 
 
 def robot_rates(space: ClusterSpace, c: Array, c_dot: Array) -> tuple[Array, Array]:

@@ -132,12 +132,12 @@ class NestedCluster(ClusterSpace):
         parent = c[: self.parent.size]
         bodies = np.empty((self.parent.n, 4))
         bodies[:, :3], bodies[:, 3] = self.parent.inverse(parent)
-        found = [parent]
+        parts = [parent]
         for k, group in enumerate(self._groups):
             own = np.empty(group.space.size)
             own[group.body], own[group.rest] = bodies[k], c[group.own]
-            found.append(own)
-        return found
+            parts.append(own)
+        return parts
 
     def spread(self, c: Array) -> float:
         """Return the least spread of the parent and of the groups [m]."""

@@ -7,13 +7,12 @@ import math
 import numpy as np
 
 from zsim.math.compiled import portable
+from zsim.math.rotation import Vector, norm
 from zsim_agents.formation.spaces.cluster_frame import (
     LENGTH_MIN_M,
     Rows,
-    Vector,
     between,
     centroid,
-    length,
     pitch_yaw,
     put,
     rotation_WC,
@@ -71,7 +70,7 @@ def pair_forward(p_W: Array, yaw: Array, c: Array) -> None:
     c[0], c[1], c[2] = centroid(p_W)
     c[3], c[4] = pitch_yaw(d_W)
     c[5], c[6] = wrap_angle(yaw[0] - c[4]), wrap_angle(yaw[1] - c[4])
-    c[7] = length(d_W)
+    c[7] = norm(d_W)
 
 
 @portable

@@ -1,23 +1,28 @@
-"""The cluster space that a scenario asks for."""
+"""The cluster space that a scenario asks for: the stock ones by their names, clusters of clusters by their groups."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
-from zsim.scenario.scenario import Cluster, Group, Scenario, kinematics
-from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, cluster_space
+from zsim.errors import DocumentError
+from zsim.scenario.scenario import ROBOTS_MAX, Cluster, Group, Scenario, space_name
+from zsim.schema import plugin
+from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 from zsim_agents.formation.spaces.nested_cluster import NestedCluster
+from zsim_agents.formation.spaces.pair_cluster import PairCluster
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
+from zsim_agents.formation.spaces.triad_cluster import TriadCluster
 
 
 def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
     """Return the cluster space of one of a scenario's clusters.
 
     Raises:
-        ValueError: there is none: a template in one line.
+        ValueError: there is none: a template in one line, or a class of the user's own that cannot be loaded.
     """
     starts = _starts(scenario, cluster.drones)
     if not cluster.groups:
@@ -31,11 +36,35 @@ def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
     return NestedCluster(_space(cluster, np.array(centres)), groups)
 
 
+def cluster_space(n: int) -> ClusterSpace:
+    """Return the space of n robots called triad: the paper's at n = 3, its generalisation elsewhere.
+
+    Raises:
+        ValueError: n is not from 2 to 64.
+    """
+    if not 2 <= n <= ROBOTS_MAX:
+        raise ValueError(f"a cluster of {n} robots is not possible; allowed: 2 to {ROBOTS_MAX}")
+    return PairCluster() if n == 2 else TriadCluster(n)
+
+
+STOCK: dict[str, Callable[[Array], ClusterSpace]] = {
+    "triad": lambda places_m: cluster_space(len(places_m)),
+    "template": TemplateCluster,
+}
+
+
 def _space(spec: Cluster | Group, starts: Array) -> ClusterSpace:
     """Return the space of as many robots as there are starting places (n, 3)."""
-    if kinematics(spec.space, len(starts), bool(spec.template_m)) == "template":
-        return TemplateCluster(spec.template_m or starts)
-    return cluster_space(len(starts))
+    places_m = np.array(spec.template_m or starts, dtype=float)
+    name = space_name(spec.space, len(places_m), bool(spec.template_m))
+    if name in STOCK:
+        return STOCK[name](places_m)
+    try:
+        own: Any = plugin.load(name, "space", ClusterSpace)
+    except DocumentError as error:
+        raise ValueError(str(error)) from error
+    space: ClusterSpace = own.for_places(places_m)
+    return space
 
 
 def _starts(scenario: Scenario, drones: Sequence[str]) -> Array:

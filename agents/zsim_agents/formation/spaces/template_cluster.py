@@ -4,7 +4,7 @@
 
 C is the centroid, t_i the template's places, N a basis of the displacements that neither move nor turn it, and R the
 rotation that brings the template nearest to the robots. No robot is privileged, and what one robot does changes the
-frame by its n-th part only. Order of this file: the space, its pure parts.
+frame by its n-th part only.
 
 Attitudes by best fit: Kabsch 1976, Horn 1987; as a formation's frame: Belta and Kumar, Abstraction and control for
 groups of robots, IEEE Trans. Robotics 20 (2004).
@@ -17,8 +17,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from zsim.math.compiled import portable
-from zsim_agents.formation.spaces.cluster_frame import LENGTH_MIN_M, euler_axes_C, euler_rates, pitch_yaw, rotation_WC
+from zsim_agents.formation.spaces.cluster_frame import LENGTH_MIN_M, euler_rates
 from zsim_agents.formation.spaces.cluster_space import (
     CONDITION_LENGTH_M,
     TAU,
@@ -27,8 +26,16 @@ from zsim_agents.formation.spaces.cluster_space import (
     SingularClusterError,
     numbered,
 )
-from zsim_agents.formation.spaces.rotation_fit import fitted_rotation
-from zsim_agents.formation.spaces.shape_modes import centred, shape_modes
+from zsim_agents.formation.spaces.template_geometry import (
+    centred,
+    euler_angles,
+    euler_axes_of,
+    fitted_rotation,
+    inertia,
+    rotation_of,
+    shape_modes,
+    skew,
+)
 
 NO_FRAME = "the robots are in one line or one place, or too far from the template: the formation has no frame"
 HEADING, TURN, BEND = 6, slice(0, 3), slice(3, 6)  # places in the small matrix of `condition`
@@ -66,6 +73,10 @@ class TemplateCluster(ClusterSpace):
         super().__init__(n, [*names, *numbered("w", range(1, 3 * n - 5))], spread_text)
         self._shape = 6 + n  # place of w_1 in c
 
+    @classmethod
+    def for_places(cls, places_m: Array) -> TemplateCluster:
+        return cls(places_m)
+
     def forward(self, p_W: Array, yaw: Array) -> Array:
         centre_W, b_C, R_WC = self._fitted(p_W)
         c = np.empty(self.size)
@@ -78,7 +89,7 @@ class TemplateCluster(ClusterSpace):
 
     def inverse(self, c: Array) -> tuple[Array, Array]:
         yaw = c[5] + c[6 : self._shape]
-        return c[:3] + self._places_C(c).dot(_rotation(c).T), yaw - TAU * np.rint(yaw / TAU)
+        return c[:3] + self._places_C(c).dot(rotation_of(c).T), yaw - TAU * np.rint(yaw / TAU)
 
     def jacobian(self, p_W: Array, yaw: Array) -> Array:
         """Return J; with b_C = R^T (P - C): w_WC_C = M^-1 sum of t_i x R^T v_i, M = tr(S) I - S, S = sum of b_i t_i^T.
@@ -102,10 +113,10 @@ class TemplateCluster(ClusterSpace):
         return J.reshape(self.size, self.size)
 
     def inverse_jacobian(self, c: Array) -> Array:
-        R_WC, place_C = _rotation(c), self._places_C(c)
+        R_WC, place_C = rotation_of(c), self._places_C(c)
         J_inv = np.zeros((self.n, 4, self.size))
         J_inv[:, :3, :3] = np.eye(3)
-        for k, axis_C in enumerate(_axes_C(c), start=3):
+        for k, axis_C in enumerate(euler_axes_of(c), start=3):
             J_inv[:, :3, k] = place_C @ skew(axis_C).T @ R_WC.T
         J_inv[:, :3, self._shape :] = R_WC @ self.modes_C
         J_inv[:, 3, 5] = 1.0
@@ -113,10 +124,10 @@ class TemplateCluster(ClusterSpace):
         return J_inv.reshape(self.size, self.size)
 
     def motion(self, c: Array, c_dot: Array) -> Array:
-        w_WC_C = c_dot[3:6].dot(_axes_C(c))
+        w_WC_C = c_dot[3:6].dot(euler_axes_of(c))
         v_C = self._places_C(c).dot(skew(w_WC_C).T) + self._modes.dot(c_dot[self._shape :]).reshape(self.n, 3)
         r_dot = np.empty((self.n, 4))
-        r_dot[:, :3] = c_dot[:3] + v_C.dot(_rotation(c).T)
+        r_dot[:, :3] = c_dot[:3] + v_C.dot(rotation_of(c).T)
         r_dot[:, 3] = c_dot[5] + c_dot[6 : self._shape]
         return r_dot.ravel()
 
@@ -148,7 +159,7 @@ class TemplateCluster(ClusterSpace):
         """
         place_C = self._places_C(c)
         scale = min(1.0, CONDITION_LENGTH_M / max(float(np.linalg.norm(place_C, axis=1).max()), LENGTH_MIN_M))
-        axes = _axes_C(c).T
+        axes = euler_axes_of(c).T
         M = scale**2 * axes.T @ inertia(place_C.T @ self.t_C).T  # the template scaled alike
         stiff = np.linalg.solve(scale**2 * self._inertia, M.T)
         whole = scale**2 * axes.T @ inertia(place_C.T @ place_C) @ axes
@@ -173,71 +184,6 @@ class TemplateCluster(ClusterSpace):
         if not gap > LENGTH_MIN_M * self._reach_m:  # also true for NaN
             raise SingularClusterError(NO_FRAME)
         return centre_W, b_W.dot(R_WC), R_WC
-
-
-def inertia(S: Array) -> Array:
-    """Return tr(S) I - S (3, 3)."""
-    M = np.empty((3, 3))
-    put_inertia(S, M)
-    return M
-
-
-@portable
-def put_inertia(S: Array, M: Array) -> None:
-    """Write tr(S) I - S."""
-    trace = S[0, 0] + S[1, 1] + S[2, 2]
-    for i in range(3):
-        for j in range(3):
-            M[i, j] = (trace if i == j else 0.0) - S[i, j]
-
-
-def skew(a: Array) -> Array:
-    """Return the matrix (3, 3) of a x ."""
-    A = np.empty((3, 3))
-    put_skew(a, A)
-    return A
-
-
-@portable
-def put_skew(a: Array, A: Array) -> None:
-    """Write the matrix of a x ."""
-    A[0, 0], A[0, 1], A[0, 2] = 0.0, -a[2], a[1]
-    A[1, 0], A[1, 1], A[1, 2] = a[2], 0.0, -a[0]
-    A[2, 0], A[2, 1], A[2, 2] = -a[1], a[0], 0.0
-
-
-def euler_angles(R_WC: Array) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw of R_WC = Rz(yaw) Ry(pitch) Rx(roll)."""
-    pitch, yaw = pitch_yaw((R_WC[0, 0], R_WC[1, 0], R_WC[2, 0]))
-    return math.atan2(R_WC[2, 1], R_WC[2, 2]), pitch, yaw
-
-
-def _rotation(c: Array) -> Array:
-    R_WC = np.empty((3, 3))
-    put_rotation(c, R_WC)
-    return R_WC
-
-
-@portable
-def put_rotation(c: Array, R_WC: Array) -> None:
-    """Write R_WC of a cluster (4n,)."""
-    rows = rotation_WC(c[3], c[4], c[5])
-    for i in range(3):
-        R_WC[i, 0], R_WC[i, 1], R_WC[i, 2] = rows[i]
-
-
-def _axes_C(c: Array) -> Array:
-    axes_C = np.empty((3, 3))
-    put_axes(c, axes_C)
-    return axes_C
-
-
-@portable
-def put_axes(c: Array, axes_C: Array) -> None:
-    """Write w_WC_C of a unit rate of roll, of pitch and of yaw, row by row."""
-    rows = euler_axes_C(c[3], c[4])
-    for i in range(3):
-        axes_C[i, 0], axes_C[i, 1], axes_C[i, 2] = rows[i]
 
 
 def _root(E: Array, n: int) -> Array:

@@ -13,17 +13,14 @@ import math
 import numpy as np
 
 from zsim.math.compiled import portable
+from zsim.math.rotation import Vector, cross, dot, norm
 from zsim_agents.formation.spaces.cluster_frame import (
     LENGTH_MIN_M,
     Rows,
-    Vector,
     between,
     centroid,
-    cross,
-    dot,
     euler_axes_C,
     euler_rates,
-    length,
     pitch_yaw,
     put,
     rotation_WC,
@@ -115,7 +112,7 @@ def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
     c[4], c[5] = pitch_yaw(x)
     for i in range(n):
         c[6 + i] = wrap_angle(yaw[i] - c[5])
-    c[at], c[at + 1], c[at + 2] = length(d2), length(d3), math.atan2(area, dot(d2, d3))
+    c[at], c[at + 1], c[at + 2] = norm(d2), norm(d3), math.atan2(area, dot(d2, d3))
     for k in range(3, n):
         first = at + 3 * (k - 2)
         c[first], c[first + 1], c[first + 2] = spherical(turned((x, y, z), between(p_1, row(p_W, k))))
@@ -256,7 +253,7 @@ def triangle_rates(p: float, q: float, beta: float) -> tuple[Rows, Rows]:
 def spherical(d_C: Vector) -> Vector:
     """Return distance, azimuth and elevation of a vector."""
     flat = math.sqrt(d_C[0] * d_C[0] + d_C[1] * d_C[1])
-    return length(d_C), math.atan2(d_C[1], d_C[0]), math.atan2(d_C[2], flat)
+    return norm(d_C), math.atan2(d_C[1], d_C[0]), math.atan2(d_C[2], flat)
 
 
 @portable
@@ -295,13 +292,8 @@ def _spherical_rows(k: int, d_C: Array, R_WC: Array, rate: Array) -> Array:
     flat, rho = math.hypot(x, y), math.hypot(x, y, z)
     if not flat > LENGTH_MIN_M:
         raise SingularClusterError(f"robot {k + 1} is on the z axis through robot 1: it has no azimuth")
-    gradient = np.array(
-        [
-            (x / rho, y / rho, z / rho),
-            (-y / flat**2, x / flat**2, 0.0),
-            (-x * z / (flat * rho**2), -y * z / (flat * rho**2), flat / rho**2),
-        ]
-    )
+    rates_C = np.array(spherical_rates(*spherical((x, y, z))))  # its rows are orthogonal, of lengths 1, flat and rho
+    gradient = rates_C / np.array([(1.0,), (flat**2,), (rho**2,)])
     motion_C = np.tensordot(np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)]), rate, 1)
     motion_C[:, k] += R_WC.T
     motion_C[:, 0] -= R_WC.T

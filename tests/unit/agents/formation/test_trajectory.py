@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.expression import Expression, ExpressionError
-from zsim_agents.formation.formation_law import FormationGains
-from zsim_agents.formation.reference_check import ShapeLimits, plan_ramp, reference_fault
-from zsim_agents.formation.spaces.cluster_space import cluster_space
+from zsim_agents.formation.flight_data import ShapeLimits
+from zsim_agents.formation.guidance import plan_ramp, reference_fault
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.trajectory import (
     ExpressionTrajectory,
     Hold,

@@ -14,8 +14,7 @@ from zsim.contract.messages import Clock, DroneView, EstimateView, Event, ViewCl
 from zsim.errors import RunError
 from zsim.math import frames
 from zsim.scenario import scenario_file
-from zsim_agents.formation.spaces.cluster_space import cluster_space
-from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
 from zsim_bridges.console import html_tables
 from zsim_bridges.console.forms import form_input
 from zsim_bridges.console.forms.controls import KnownControls

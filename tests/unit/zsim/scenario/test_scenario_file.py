@@ -609,7 +609,10 @@ def test_a_fault_that_all_drones_share_is_told_once():
             clustered(zigzag=0.0),
             "clusters[0].template_m is missing, and the robots start in one line; must be given, or space must be triad",
         ),
-        (clustered(space="ring"), "clusters[0].space is 'ring'; must be one of template, triad (cluster 'c')"),
+        (
+            clustered(space="ring"),
+            "clusters[0].space is 'ring'; must be one of triad, template, or package.module:Class (cluster 'c')",
+        ),
     ],
 )
 def test_fields_that_do_not_agree_are_told(fields: dict[str, Any], said: str):

@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from zsim.scenario.scenario import ROBOTS_MAX
 from zsim_agents.formation.spaces.cluster_space import (
-    ROBOTS_MAX,
     SingularClusterError,
     closest_pair,
-    cluster_space,
     least_distance,
     least_distance_at_once,
     robot_rates,
     unit,
 )
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 
 SIZES = (2, 3, 4, 5, 8)
 TRIANGLE = np.array([(0.0, 1.5, 1.0), (-1.5, -1.5, 1.0), (1.5, -1.5, 1.0)])  # where the drones take off

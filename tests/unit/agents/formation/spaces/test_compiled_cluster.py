@@ -13,11 +13,12 @@ import pytest
 MODULES = (
     "formation.spaces.cluster_space",
     "formation.flight_check",
-    "formation.formation_law",
+    "formation.control_law",
     "formation.spaces.nested_cluster",
     "formation.spaces.pair_cluster",
-    "formation.reference_check",
-    "formation.spaces.rotation_fit",
+    "formation.robot_limits",
+    "formation.flight_data",
+    "formation.spaces.template_geometry",
     "formation.spaces.template_cluster",
     "formation.trajectory",
     "formation.spaces.triad_cluster",
@@ -75,7 +76,7 @@ def test_one_way_is_compiled_and_the_other_is_not(both):
     compiled, plain = both
     for module, name in (
         ("triad_cluster", "triad_forward"),
-        ("formation_law", "limited"),
+        ("robot_limits", "limited"),
         ("trajectory", "put_ramped"),
     ):
         assert hasattr(getattr(getattr(compiled, module), name), "py_func")
@@ -117,7 +118,7 @@ def test_singular_shapes_are_refused_in_the_same_words(both, n):
 @pytest.mark.parametrize("n", SIZES)
 @pytest.mark.parametrize("scale_m", [1.0, 4.0], ids=["crowded", "apart"])
 def test_the_law_is_the_same_with_saturation_guard_and_integral(both, n, scale_m):
-    laws = [way.formation_law.FormationLaw(space_of(way, n)) for way in both]
+    laws = [way.control_law.ProportionalLaw(space_of(way, n)) for way in both]
     rng = np.random.default_rng(10 + n)
     seen = {"saturated": 0, "free": 0, "guarded": 0, "alarmed": 0}
     for _ in range(100):
@@ -143,7 +144,7 @@ def test_the_law_is_the_same_with_saturation_guard_and_integral(both, n, scale_m
 @pytest.mark.parametrize("kind", ["10", "30", "triads"])
 def test_large_clusters_are_the_same(both, kind):
     spaces = [large_space_of(way, kind) for way in both]
-    laws = [way.formation_law.FormationLaw(space) for way, space in zip(both, spaces, strict=True)]
+    laws = [way.control_law.ProportionalLaw(space) for way, space in zip(both, spaces, strict=True)]
     rng, n = np.random.default_rng(3), spaces[0].n
     for _ in range(10):
         p_W = spaces[0].inverse(spaces[0].specimen(2.0))[0] + rng.normal(scale=0.7, size=(n, 3))
@@ -177,13 +178,13 @@ def test_ramps_are_the_same(both, n):
 def test_places_are_judged_the_same_at_once_and_in_words(both, n):
     space, plain = (space_of(way, n) for way in both)
     rng, found = np.random.default_rng(40 + n), set()
-    gains, limits = both[0].formation_law.FormationGains(), both[0].reference_check.ShapeLimits()
+    gains, limits = both[0].control_law.FormationGains(), both[0].flight_data.ShapeLimits()
     for _ in range(200):
         p_W, yaw = robots(n, rng)
         p_W[:, 2] += 6.0
         c = space.forward(p_W, yaw)
         faults = [
-            way.reference_check.place_fault(of, c, gains, limits) for way, of in zip(both, (space, plain), strict=True)
+            way.flight_check.place_fault(of, c, gains, limits) for way, of in zip(both, (space, plain), strict=True)
         ]
         least_m = both[0].cluster_space.closest_pair(p_W)[0]
         assert faults[0] == faults[1]
@@ -194,8 +195,8 @@ def test_places_are_judged_the_same_at_once_and_in_words(both, n):
 
 @pytest.mark.parametrize("n", SIZES)
 def test_bounds_in_flight_are_those_of_the_judgement_in_words(both, n):
-    check, space = both[0].reference_check, space_of(both[0], n)
-    limits = check.ShapeLimits(spread_min_m=0.0, condition_max=math.inf)
+    check, space = both[0].flight_check, space_of(both[0], n)
+    limits = both[0].flight_data.ShapeLimits(spread_min_m=0.0, condition_max=math.inf)
     bounds, rng, found = check.bounds_of(space, limits), np.random.default_rng(50 + n), set()
     for _ in range(300):
         c = rng.uniform(0.01, 1.0, 4 * n)
@@ -229,23 +230,23 @@ def test_judgements_are_the_same(both, n):
         assert near[0] == near[1] == bool((np.abs(p_W) < 1e6).all() and (np.abs(yaw) < 1e6).all())
         c = rng.uniform(0.1, 1.5, 4 * n)
         c[rng.integers(4 * n)] = rng.choice(BAD)
-        outside = [way.reference_check.first_outside(c, bounds) for way in both]
+        outside = [way.flight_check.first_outside(c, bounds) for way in both]
         assert outside[0] == outside[1]
         out = ~((np.abs(c) < 1e6) & (bounds[:, 0] < c) & (c < bounds[:, 1]))
         assert outside[0] == (int(np.argmax(out)) if out.any() else -1)
-    judge = both[0].flight_check
-    assert found == {judge.WELL, judge.OLD, judge.WILD, judge.VAGUE}
+    check = both[0].flight_check
+    assert found == {check.VALID, check.STALE, check.NOT_FINITE, check.UNCERTAIN}
 
 
 FLIGHT = """
 import sys
 import numpy as np
-from zsim_agents.formation.spaces.cluster_space import cluster_space
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.controller import rehearse
 from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.flight_data import GateInput
-from zsim_agents.formation.flight_request import Target
-from zsim_agents.formation.formation_law import FormationGains
+from zsim_agents.formation.flight_plan import MoveTo
+from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.spaces.nested_cluster import NestedCluster
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
 
@@ -277,7 +278,7 @@ for gate in range(20):
     elif gate == 5:
         formation.warm_start("engaged", space.forward(p_W, yaw))
     elif gate == 10:
-        assert formation.request(Target({"z_c": space.forward(p_W, yaw)[2] + 1.0})) is None
+        assert formation.request(MoveTo({"z_c": space.forward(p_W, yaw)[2] + 1.0})) is None
     output = formation.step(GateInput(*at))
 print(output.phase, before, compiled())
 """

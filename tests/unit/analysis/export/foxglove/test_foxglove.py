@@ -22,7 +22,8 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import ClusterState
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.record import RecordReader
-from zsim_agents.formation.spaces.cluster_space import SingularClusterError, cluster_space
+from zsim_agents.formation.spaces.cluster_space import SingularClusterError
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_analysis.export.formats import Format
 from zsim_analysis.export.foxglove.instants import Instant
 from zsim_analysis.export.foxglove.numbers import Numbers

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim_agents.formation.formation_law import FormationGains, FormationLaw, guard, load
-from zsim_agents.formation.near_pairs import near_pairs_at_once, near_pairs_in_turn
-from zsim_agents.formation.spaces.cluster_space import cluster_space
+from zsim_agents.formation.control_law import FormationGains, ProportionalLaw
+from zsim_agents.formation.robot_limits import guard, load, near_pairs_at_once, near_pairs_in_turn
+from zsim_agents.formation.spaces.scenario_space import cluster_space
 
 SPACE = cluster_space(3)
 GOAL = np.array([5, -5, 15, 0, 0, math.pi / 2, 0, 0, 0, 4, 4, math.pi / 4])  # paper, equation (3)
@@ -20,7 +20,7 @@ DT_S = 0.02
 
 
 def command_at(c, c_des, rate=None, law=None):
-    law = law or FormationLaw(SPACE, GAINS)
+    law = law or ProportionalLaw(SPACE, GAINS)
     p_W, _ = SPACE.inverse(c)
     return law.command(c, p_W, AT_REST, c_des, np.zeros(12) if rate is None else rate, DT_S)
 
@@ -59,12 +59,12 @@ def test_yaw_errors_are_taken_the_short_way():
 @given(st.lists(st.floats(-30.0, 30.0), min_size=12, max_size=12))
 def test_saturation_keeps_the_limits_and_the_direction_in_cluster_space(errors):
     gains = dataclasses.replace(GAINS, separation_min_m=0.0, separation_alarm_m=0.0)  # the law without its guard
-    law = FormationLaw(SPACE, gains)
+    law = ProportionalLaw(SPACE, gains)
     error = np.array(errors) * np.where(SPACE.in_radians, 0.1, 1.0)
     p_W, _ = SPACE.inverse(GOAL)
     wanted = error * gains.k_1_s
     command = law.command(GOAL, p_W, AT_REST, GOAL, wanted, DT_S)
-    assert load(command.v_W, command.yaw_rate, gains) <= 1.0 + 1e-9
+    assert load(command.v_W, command.yaw_rate, gains.limits) <= 1.0 + 1e-9
     if not command.guarded:
         assert cluster_rate(GOAL, command) == pytest.approx(command.factor * wanted, abs=1e-9)
 
@@ -87,7 +87,7 @@ def test_each_limit_is_reached_and_not_passed(rate, limited):
 
 
 def test_the_integral_grows_with_the_error_up_to_its_clamp():
-    law = FormationLaw(SPACE, GAINS)
+    law = ProportionalLaw(SPACE, GAINS)
     c = offset(x_c=-0.5, yaw=-0.2)
     command_at(c, GOAL, law=law)
     assert law.integral[[0, 5]] == pytest.approx([0.05 * 0.02 * 0.5, 0.05 * 0.02 * 0.2])
@@ -99,14 +99,14 @@ def test_the_integral_grows_with_the_error_up_to_its_clamp():
 
 
 def test_the_integral_stands_still_while_robots_are_saturated():
-    law = FormationLaw(SPACE, GAINS)
+    law = ProportionalLaw(SPACE, GAINS)
     command = command_at(offset(x_c=-50.0), GOAL, law=law)
     assert command.factor < 1.0
     assert not law.integral.any()
 
 
 def test_the_integral_stands_still_while_the_guard_acts():
-    law = FormationLaw(SPACE, GAINS)
+    law = ProportionalLaw(SPACE, GAINS)
     near = offset(p=-1.5, q=-1.5)  # robots 2 and 3 at 1.9 m
     assert command_at(near, near - 0.01, law=law).guarded
     assert not law.integral.any()
@@ -118,7 +118,7 @@ def test_the_integral_stands_still_while_the_guard_acts():
 def pair(distance, v_1=(0, 0, 0), v_2=(0, 0, 0)):
     p_W = np.array([(0.0, 0.0, 5.0), (distance, 0.0, 5.0)])
     v_cmd_W = np.array([v_1, v_2], dtype=float)
-    return guard(p_W, np.zeros((2, 3)), v_cmd_W, GAINS)
+    return guard(p_W, np.zeros((2, 3)), v_cmd_W, GAINS.limits)
 
 
 def test_the_guard_leaves_robots_alone_that_are_far_or_part():
@@ -155,7 +155,7 @@ def test_the_alarm_is_at_its_threshold():
 def test_the_guard_allows_for_the_way_that_robots_still_go():
     p_W = np.array([(0.0, 0, 5), (2.5, 0, 5)])
     towards = np.array([(1.0, 0, 0), (-1.0, 0, 0)])
-    v_W, guarded, _ = guard(p_W, towards, np.zeros((2, 3)), GAINS)
+    v_W, guarded, _ = guard(p_W, towards, np.zeros((2, 3)), GAINS.limits)
     assert guarded
     assert v_W[1, 0] - v_W[0, 0] == pytest.approx(2 * GAINS.response_s - 0.5)
 
@@ -177,8 +177,8 @@ def test_guarded_robots_never_meet_whatever_is_commanded(seed, n):
     for step in range(400):
         if step % 40 == 0:
             wanted = rng.uniform(-1.5, 1.5, (n, 3)) - 0.3 * (p_W - p_W.mean(axis=0))
-        v_cmd_W, _, _ = guard(p_W, v_W, wanted, GAINS)
-        v_cmd_W = v_cmd_W / max(load(v_cmd_W, np.zeros(n), GAINS), 1.0)
+        v_cmd_W, _, _ = guard(p_W, v_W, wanted, GAINS.limits)
+        v_cmd_W = v_cmd_W / max(load(v_cmd_W, np.zeros(n), GAINS.limits), 1.0)
         v_W = v_W + (v_cmd_W - v_W) * 0.05 / 0.3
         p_W = p_W + v_W * 0.05
         least = min(least, *(math.dist(p_W[i], p_W[j]) for i in range(n) for j in range(i)))

@@ -1,0 +1,168 @@
+"""Control laws of a formation, from the estimated robots and a reference to velocity commands.
+
+Order of this file: gains and command, what all laws share (`law:` of a cluster may name a subclass of one's own), the
+stock law.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from msgspec import Struct
+
+from zsim.math.compiled import portable
+from zsim_agents.formation.robot_limits import Pairs, RobotLimits, limited, pairs_of
+from zsim_agents.formation.spaces.cluster_space import TAU, Array, ClusterSpace
+
+
+@dataclass(frozen=True)
+class FormationGains:
+    """Parameters of the law; all are positive, validated with the scenario.
+
+    Attributes:
+        k_1_s: proportional gain [1/s]; 0.5 to 0.8 is good, unstable from about 2 on a drone's velocity loop.
+        integral_1_s2: integral gain [1/s^2]; takes out the offset that wind leaves, 0 switches it off.
+        integral_max_m_s, integral_max_rad_s: clamp of the integral term for lengths and for angles.
+        separation_min_m: least distance between two robots of a reference, and where the guard acts.
+        all others: see `RobotLimits`.
+    """
+
+    k_1_s: float = 0.6
+    integral_1_s2: float = 0.05
+    integral_max_m_s: float = 0.5
+    integral_max_rad_s: float = 0.1
+    speed_max_m_s: float = 2.0  # limit of velocityXY in the paper's base simulator, hector_quadrotor
+    climb_max_m_s: float = 1.0  # control_vz_max of the AR.Drone SDK outdoors, 1000 mm/s
+    yaw_rate_max_rad_s: float = 1.75  # control_yaw of the AR.Drone SDK
+    separation_min_m: float = 2.0  # four widths of the drone in its hull, 0.52 m
+    separation_alarm_m: float = 1.5
+    guard_horizon_s: float = 1.0
+    response_s: float = 0.3
+
+    @cached_property
+    def limits(self) -> RobotLimits:
+        """Return what the saturation and the guard keep."""
+        return RobotLimits(*(float(getattr(self, name)) for name in RobotLimits._fields))
+
+
+class FormationCommand(Struct, eq=False):
+    """What the law asks of the robots.
+
+    Attributes:
+        v_W: velocities (n, 3) [m/s, W]; yaw_rate: (n,) [rad/s].
+        factor: the common factor of the saturation, 1 where nothing is saturated.
+        guarded: pairs of robot indices that the guard holds apart.
+        alarmed: pairs that are nearer than the alarm threshold.
+    """
+
+    v_W: Array
+    yaw_rate: Array
+    factor: float
+    guarded: Pairs
+    alarmed: Pairs
+
+
+class ControlLaw(ABC):
+    """A law: what it asks of the robots is saturated and guarded here, for all laws alike.
+
+    One factor for all robots keeps the direction in cluster space; the guard keeps the robots apart. A law of one's
+    own has `rates`, and `reset` and `followed` where it has a state.
+
+    Args:
+        space: cluster space of n robots.
+        gains: of the scenario; a law takes those that it knows.
+    """
+
+    def __init__(self, space: ClusterSpace, gains: FormationGains | None = None) -> None:
+        self.space = space
+        self.gains = gains or FormationGains()
+        self._order = np.empty((space.n, space.n), np.int64)
+
+    @abstractmethod
+    def rates(self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array) -> Array:
+        """Return r_dot (4n,) that the robots shall have: (vx, vy, vz [m/s], yaw rate [rad/s]) robot by robot, W.
+
+        Args:
+            c: (4n,) cluster of the estimates; p_W, v_W: the estimates, (n, 3) [m, m/s; W].
+            c_des, c_dot_des: (4n,) reference and its rate.
+        """
+
+    def reset(self) -> None:  # noqa: B027 - a law may have no state
+        """Forget all state: the formation is engaged, or goes on after it was held."""
+
+    def followed(self, dt_s: float) -> None:  # noqa: B027
+        """Go on by dt_s [s]: the robots get what `rates` returned, neither saturated nor held apart.
+
+        It is not called otherwise, so that an integral that grows here does not wind up.
+        """
+
+    def command(
+        self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array, dt_s: float
+    ) -> FormationCommand:
+        """Return the command of this gate; arguments as in `rates`, dt_s the time since the last command.
+
+        Raises:
+            ValueError: `rates` returned another number of rates.
+        """
+        n, order = self.space.n, self._order
+        r_dot = np.asarray(self.rates(c, p_W, v_W, c_des, c_dot_des), dtype=float)
+        if r_dot.shape != c.shape:  # compiled code would read beyond its end
+            raise ValueError(f"law: rates are of shape {r_dot.shape}; must be {c.shape}, four for each robot")
+        v_cmd_W, yaw_rate = np.empty((n, 3)), np.empty(n)
+        factor, guards, alarms = limited(r_dot, p_W, v_W, v_cmd_W, yaw_rate, order, *self.gains.limits)
+        if factor == 1.0 and not guards:
+            self.followed(dt_s)
+        guarded, alarmed = pairs_of(guards, alarms, order) if guards or alarms else ((), ())
+        return FormationCommand(v_cmd_W, yaw_rate, factor, guarded, alarmed)
+
+
+class ProportionalLaw(ControlLaw):
+    """Feed-forward, proportional and integral terms in cluster space.
+
+        c_dot_cmd = c_dot_des + k (c_des - c) + I,    I' = k_i (c_des - c),    r_dot = J^-1(c) c_dot_cmd
+
+    Attributes:
+        integral: I, its only state (4n,) [m/s, rad/s].
+    """
+
+    def __init__(self, space: ClusterSpace, gains: FormationGains | None = None) -> None:
+        super().__init__(space, gains)
+        self._clamp = np.where(space.in_radians, self.gains.integral_max_rad_s, self.gains.integral_max_m_s)
+        self._error, self._c_dot = np.empty(space.size), np.empty(space.size)
+        self.reset()
+
+    def reset(self) -> None:
+        self.integral = np.zeros(self.space.size)
+
+    def rates(self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array) -> Array:
+        error, c_dot = self._error, self._c_dot
+        put_cluster_rate(c_des, c, self.space.period, c_dot_des, self.integral, self.gains.k_1_s, error, c_dot)
+        return self.space.motion(c, c_dot)
+
+    def followed(self, dt_s: float) -> None:
+        grow(self.integral, self._error, self.gains.integral_1_s2 * dt_s, self._clamp)
+
+
+LAWS: dict[str, type[ControlLaw]] = {"proportional": ProportionalLaw}
+"""The stock laws by the names that a scenario gives them."""
+
+
+@portable
+def put_cluster_rate(
+    c_des: Array, c: Array, period: Array, c_dot_des: Array, integral: Array, k: float, error: Array, c_dot: Array
+) -> None:
+    """Write the error c_des - c, angles the short way, and the rate c_dot_des + k error + integral, all (4n,)."""
+    for i in range(c.size):
+        apart = c_des[i] - c[i]
+        error[i] = apart - period[i] * np.rint(apart / TAU)
+        c_dot[i] = c_dot_des[i] + k * error[i] + integral[i]
+
+
+@portable
+def grow(integral: Array, error: Array, rate: float, clamp: Array) -> None:
+    """Add rate error to the integral, within its clamp."""
+    for k in range(integral.size):
+        integral[k] = min(max(integral[k] + rate * error[k], -clamp[k]), clamp[k])

@@ -1,0 +1,60 @@
+"""The roles of a federation, in one table: what a process of each is named after, made of, and needs.
+
+Launchers, the world and access control read it; what a role may do on the keys is in `rights`.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
+
+OnDeath = Literal["wait", "restart", "drop", "end"]
+
+
+class Role(NamedTuple):
+    """What is to be known of a role.
+
+    Attributes:
+        extra: of the distribution, that a host of it needs; empty for none.
+        on_death: what the death of a process means for a run where the scenario does not say.
+        about: what its processes are named after, ROLE.NAME of each drone or cluster; None for roles without an agent.
+        agent: `package.module:Class` of the agent, made of world/info, scenario and name.
+        joint: one agent may do the work of many, made of all their names.
+    """
+
+    extra: str
+    on_death: OnDeath
+    about: Literal["drone", "cluster"] | None = None
+    agent: str = ""
+    joint: bool = False
+
+
+ROLES = {
+    "world": Role("world", "end"),
+    "recorder": Role("record", "end"),
+    "estimator": Role("agents", "restart", "drone", "zsim_agents.estimation.estimator:Estimator", joint=True),
+    "controller": Role("agents", "restart", "cluster", "zsim_agents.formation.controller:Controller"),
+    "router": Role("", "restart"),
+}
+AGENTS = {name: role for name, role in ROLES.items() if role.about}
+
+
+def things(role: str, scenario: Any) -> list[str]:
+    """Return the names of the drones or clusters that a role with agents is about."""
+    return [entry.name for entry in getattr(scenario, f"{AGENTS[role].about}s")]
+
+
+def agent_names(scenario: Any) -> list[str]:
+    """Return the names of all processes with agents that a scenario has, role by role."""
+    return [f"{role}.{thing}" for role in AGENTS for thing in things(role, scenario)]
+
+
+def on_death(given: Mapping[str, OnDeath], name: str, role: str | None = None) -> OnDeath:
+    """Return what is to be done when a process dies: what is said of it, else of its role, else the default.
+
+    Args:
+        given: of the scenario, by process name or role.
+        name: of the process.
+        role: that it says it has; else what its name begins with.
+    """
+    role = role or name.partition(".")[0]
+    default = ROLES[role].on_death if role in ROLES else "drop"
+    return given.get(name) or given.get(role) or default
