@@ -21,10 +21,9 @@ from zsim.contract import keys, messages
 from zsim.errors import RecordError, ReportError
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
-from zsim_analysis.reading.formation_errors import window
-from zsim_analysis.report import judge, make_report, table
-from zsim_analysis.report.figures.canvas import thinned
-from zsim_analysis.report.report_page import page
+from zsim_analysis.reading.formation import window
+from zsim_analysis.report.canvas import thinned
+from zsim_analysis.report.make_report import judge, make_report, page, table
 
 NAMES = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", "phi_1", "phi_2", "phi_3", "p", "q", "beta"]
 AMPLITUDE = np.array([0.12, 0.13, 0.03, 0.02, 0.01, 0.07, 0.05, 0.06, 0.04, 0.28, 0.3, 0.08])
@@ -293,7 +292,7 @@ def test_a_flood_of_events_does_not_hide_a_restart(tmp_path):
     summary = report_of(tmp_path, flown(events=(*flood, restart)))
     assert [event.kind for event in summary.events].count("restart") == 1
     assert summary.events_left_out == {"refused": 4900}
-    assert "4900 × refused" in page(summary, [], tmp_path)
+    assert "4900 × refused" in page(summary, [])
 
 
 class Links(HTMLParser):

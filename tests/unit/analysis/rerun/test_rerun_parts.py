@@ -13,9 +13,8 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import Bye, Clock, ClusterRequest, Estimate, Event, Health, Join, Message, Mode, Truth
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
-from zsim_analysis.rerun.participants import Cast, Team, cast_of
-from zsim_analysis.rerun.recorded_inputs import passages
-from zsim_analysis.rerun.truth_comparison import Answers, Comparison, difference
+from zsim_analysis.rerun.recorded_inputs import AgentProcess, RecordedAgents, gates, recorded_agents
+from zsim_analysis.rerun.truth_comparison import OutputComparison, TruthComparison, difference
 from zsim_world.flight.world import World
 
 GATE_NS = 20_000_000
@@ -73,34 +72,34 @@ def write(tmp_path: Path) -> Iterator[Any]:
 OURS = (join("estimator.d1"), join("estimator.d2"), join("controller.main"))
 
 
-def cast(reader: RecordReader, **info: Any) -> Cast:
-    return cast_of(reader, msgspec.structs.replace(INFO, **info), SCENARIO)
+def agents(reader: RecordReader, **info: Any) -> RecordedAgents:
+    return recorded_agents(reader, msgspec.structs.replace(INFO, **info), SCENARIO)
 
 
 # Who is run again
 
 
 def test_our_agents_are_run_again_by_their_processes(write: Any):
-    found = cast(write(*reversed(OURS), join("recorder", ""), event("end", "world", truth_sha256="abc")))
-    assert found.teams == (
-        Team("estimator.d1", ("estimator.d1",)),
-        Team("estimator.d2", ("estimator.d2",)),
-        Team("controller.main", ("controller.main",)),
+    found = agents(write(*reversed(OURS), join("recorder", ""), event("end", "world", truth_sha256="abc")))
+    assert found.processes == (
+        AgentProcess("estimator.d1", ("estimator.d1",)),
+        AgentProcess("estimator.d2", ("estimator.d2",)),
+        AgentProcess("controller.main", ("controller.main",)),
     )
     assert (found.why_not, found.truth_sha256, found.fingerprints) == ("", "abc", {PRINT})
 
 
 def test_who_served_others_does_so_again(write: Any):
-    found = cast(write(join("controller.main", serves=("estimator.d1", "estimator.d2"))))
-    assert found.teams == (Team("controller.main", ("estimator.d1", "estimator.d2", "controller.main")),)
-    assert str(found.teams[0]) == "controller.main (with estimator.d1, estimator.d2)"
-    assert found.played == {"controller.main", "estimator.d1", "estimator.d2"}
+    found = agents(write(join("controller.main", serves=("estimator.d1", "estimator.d2"))))
+    assert found.processes == (AgentProcess("controller.main", ("estimator.d1", "estimator.d2", "controller.main")),)
+    assert str(found.processes[0]) == "controller.main (with estimator.d1, estimator.d2)"
+    assert found.names == {"controller.main", "estimator.d1", "estimator.d2"}
 
 
 @pytest.mark.parametrize("foreign", [join("estimator.d2", ""), join("estimator.d2", PRINT, version="")])
 def test_others_under_our_names_are_not(write: Any, foreign: Said):
-    found = cast(write(join("estimator.d1"), foreign, join("matlab.main"), join("controller.other")))
-    assert [team.name for team in found.teams] == ["estimator.d1"]
+    found = agents(write(join("estimator.d1"), foreign, join("matlab.main"), join("controller.other")))
+    assert [process.name for process in found.processes] == ["estimator.d1"]
 
 
 @pytest.mark.parametrize(
@@ -115,8 +114,8 @@ def test_others_under_our_names_are_not(write: Any, foreign: Said):
     ],
 )
 def test_why_agents_are_not_run_again(write: Any, said: Said, reason: str):
-    found = cast(write(*OURS, said, event("end", "world", gate=9)))
-    assert (found.teams, found.why_not) == ((), reason)
+    found = agents(write(*OURS, said, event("end", "world", gate=9)))
+    assert (found.processes, found.why_not) == ((), reason)
 
 
 @pytest.mark.parametrize(
@@ -129,23 +128,25 @@ def test_why_agents_are_not_run_again(write: Any, said: Said, reason: str):
     ],
 )
 def test_what_is_no_reason(write: Any, said: Said):
-    assert cast(write(*OURS, said, event("end", "world", gate=9), event("leave", "estimator.d1", gate=9))).why_not == ""
+    assert (
+        agents(write(*OURS, said, event("end", "world", gate=9), event("leave", "estimator.d1", gate=9))).why_not == ""
+    )
 
 
 def test_a_run_in_realtime_or_without_ours_has_a_reason(write: Any):
-    assert "realtime" in cast(write(*OURS), mode="realtime").why_not
-    assert cast(write(join("matlab.main"))).why_not == "none of zsim's took part"
+    assert "realtime" in agents(write(*OURS), mode="realtime").why_not
+    assert agents(write(join("matlab.main"))).why_not == "none of zsim's took part"
 
 
 def test_a_kill_in_the_scenario_is_a_reason(write: Any):
     scenario = scenario_file.from_text(f"{TEXT}faults: [{{kind: process_kill, target: estimator.d1, at_s: 0.5}}]")
-    assert cast_of(write(*OURS), INFO, scenario).why_not == "a process_kill was planned"
+    assert recorded_agents(write(*OURS), INFO, scenario).why_not == "a process_kill was planned"
 
 
 def test_requests_are_kept_in_their_order(write: Any):
     key = keys.cluster_request("main")
     asked = [(key, ClusterRequest(gate * GATE_NS, gate, "hold", {}, "operator.pilot", True)) for gate in range(3)]
-    assert list(cast(write(*OURS, *asked)).requests) == asked
+    assert list(agents(write(*OURS, *asked)).requests) == asked
 
 
 # What is fed
@@ -160,14 +161,14 @@ def test_inputs_count_before_the_clock_that_follows_them(write: Any):
         (keys.estimate("d1"), estimate), truth(1, "d1"), truth(1, "d2"), clock(1), clock(1, "stopped"),
         (keys.process("tester.one", "bye"), Bye(0, 0, "over")),
     )  # fmt: skip
-    first, second = passages(reader, ["d1", "d2"])
+    first, second = gates(reader, ["d1", "d2"])
     assert (first.t_ns, [m.key for m in first.inputs]) == (0, ["process/tester.one/join"])
     assert (second.t_ns, [m.key for m in second.inputs]) == (GATE_NS, [mode[0], keys.estimate("d1")])
     assert first.truth == {drone: messages.encode(truth(0, drone)[1]) for drone in ("d1", "d2")}
 
 
 def test_a_gate_without_its_clock_is_no_passage(write: Any):
-    assert list(passages(write(truth(0, "d1"), truth(0, "d2")), ["d1", "d2"])) == []
+    assert list(gates(write(truth(0, "d1"), truth(0, "d2")), ["d1", "d2"])) == []
 
 
 # Where truth differs
@@ -202,11 +203,11 @@ def test_the_smallest_difference_counts():
 
 
 def test_the_first_and_the_last_difference_are_kept():
-    compared = Comparison(["d1", "d2"])
+    compared = TruthComparison(["d1", "d2"])
     same = {"d1": encoded(), "d2": encoded()}
     for t_ns, flown in enumerate([same, {**same, "d2": encoded(position_m=(1.0, 0.0, 1.0))}, same]):
-        compared.take(t_ns, same, flown)
-    compared.take(3, same, dict.fromkeys(same, encoded(position_m=(2.0, 0.0, 1.0))))
+        compared.add(t_ns, same, flown)
+    compared.add(3, same, dict.fromkeys(same, encoded(position_m=(2.0, 0.0, 1.0))))
     assert compared.first is not None
     assert compared.last is not None
     assert (compared.instants, compared.first.t_ns, compared.first.drone) == (4, 1, "d2")
@@ -217,23 +218,23 @@ def command(gate: int, mode: Any = "land", seq: int | None = None) -> Mode:
     return Mode(gate * GATE_NS, gate if seq is None else seq, "controller.main", mode)
 
 
-def test_answers_that_are_the_same_in_any_order_are_no_difference():
-    answers = Answers(2 * GATE_NS)
+def test_outputs_that_are_the_same_in_any_order_are_no_difference():
+    outputs = OutputComparison(2 * GATE_NS)
     for gate in range(10):
-        answers.take("a", command(gate))
+        outputs.add("a", command(gate))
         if gate:
-            answers.take("a", command(gate - 1))
-        answers.close(gate * GATE_NS)
-    assert answers.first == ""
+            outputs.add("a", command(gate - 1))
+        outputs.expire(gate * GATE_NS)
+    assert outputs.first == ""
 
 
 def test_the_earliest_answer_that_differs_or_is_missing_is_told():
-    answers = Answers(2 * GATE_NS)
-    answers.take("missing", command(3))
+    outputs = OutputComparison(2 * GATE_NS)
+    outputs.add("missing", command(3))
     for mode in ("land", "takeoff"):
-        answers.take("later", command(4, mode))
-    assert answers.first == "later at 0.08 s"
-    answers.close(5 * GATE_NS)
-    assert answers.first == "later at 0.08 s"
-    answers.close(6 * GATE_NS)
-    assert answers.first == "missing at 0.06 s"
+        outputs.add("later", command(4, mode))
+    assert outputs.first == "later at 0.08 s"
+    outputs.expire(5 * GATE_NS)
+    assert outputs.first == "later at 0.08 s"
+    outputs.expire(6 * GATE_NS)
+    assert outputs.first == "missing at 0.06 s"
