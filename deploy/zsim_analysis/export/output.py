@@ -1,8 +1,10 @@
 """What an export can be written as, and its place: a file or folder that is there only when all of it is written.
 
-Ctrl-C and full disks leave nothing that looks finished.
+Ctrl-C and full disks leave nothing that looks finished. The command line imports this at its start:
+it needs no module of an extra.
 """
 
+import json
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -11,12 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import msgspec
-from msgspec import Struct
-
-from zsim.contract.messages import REFUSALS
 from zsim.errors import ReportError, RunError
-from zsim.record.run_folder import RECORD
 
 
 class Format(StrEnum):
@@ -46,7 +43,7 @@ MATLAB = b"MATLAB 5.0 MAT-file Platform: "  # as SciPy begins a file; MATLAB its
 MCAP, MCAP_LIBRARY = b"\x89MCAP", b"foxglove-sdk"  # a file for Foxglove names its library; a record names zsim
 HEAD_MAX = 200  # bytes within which an MCAP file has named its library
 LAYOUT = "-layout.json"  # end of the name of the file beside one for Foxglove
-RUN_FILES = (RECORD, "scenario.yaml", "summary.json", "report.html")  # what no export may replace
+RUN_FILES = ("run.mcap", "scenario.yaml", "summary.json", "report.html")  # what no export may replace
 
 
 def check_installed(form: Format) -> None:
@@ -78,17 +75,13 @@ def check_free(target: Path, force: bool, record: Path) -> None:
         raise ReportError(f"{target}: is a file of something else than an export; give --out another place")
 
 
-class _Manifest(Struct):
-    tables: dict[str, object]
-
-
 def _foreign_content(folder: Path) -> str:
     """Return why a folder is not, or not only, an export; "" if it is one."""
     try:
-        manifest = msgspec.json.decode((folder / MANIFEST).read_bytes(), type=_Manifest)
-    except (OSError, *REFUSALS):
+        tables = json.loads((folder / MANIFEST).read_bytes())["tables"].keys()
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return f"it has no {MANIFEST} of one"
-    others = {path.name for path in folder.iterdir()} - {MANIFEST, *manifest.tables}
+    others = {path.name for path in folder.iterdir()} - {MANIFEST, *tables}
     return f"it holds {min(others)}" if others else ""
 
 
