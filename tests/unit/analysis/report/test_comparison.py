@@ -1,6 +1,9 @@
 """The comparison of runs: side by side what each report says of its own, and in words what one has and another has not."""
 
+import base64
+import io
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.image
@@ -53,8 +56,13 @@ def judged(directories: list[Path]) -> list[ComparedRun]:
     return [ComparedRun(name, d, *judge(d / "run.mcap")) for name, d in zip(names, directories, strict=True)]
 
 
-def test_statistics_stand_side_by_side(runs: list[Path]) -> None:
-    rows = {row.name: row.cells for row in statistics_rows(judged(runs), "main")}
+@pytest.fixture(scope="module")
+def compared(runs: list[Path]) -> list[ComparedRun]:
+    return judged(runs)
+
+
+def test_statistics_stand_side_by_side(compared: list[ComparedRun]) -> None:
+    rows = {row.name: row.cells for row in statistics_rows(compared, "main")}
     width = len(STATISTICS)
     for i, name in enumerate(["x_c (m)", "y_c (m)", "z_c (m)"]):
         sine = ERRORS[i] / np.sqrt(2)
@@ -65,21 +73,21 @@ def test_statistics_stand_side_by_side(runs: list[Path]) -> None:
         assert rows[name][2 * width :] == (ABSENT,) * width
 
 
-def test_facts_that_differ_are_marked(runs: list[Path]) -> None:
-    rows = {row.name: row for row in fact_rows(judged(runs))}
+def test_facts_that_differ_are_marked(compared: list[ComparedRun]) -> None:
+    rows = {row.name: row for row in fact_rows(compared)}
     assert rows["Scenario"].cells[:2] == ("step, seed 1", "step, seed 5")
     assert rows["Scenario"].differs
     assert not rows["Mode"].differs
     assert rows["Clusters"].cells == ("main of 3", "main of 3", "none")
 
 
-def test_the_scenarios_differ_in_what_was_overridden(runs: list[Path]) -> None:
-    rows = {row.name: row.cells for row in scenario_rows(judged(runs))}
+def test_the_scenarios_differ_in_what_was_overridden(compared: list[ComparedRun]) -> None:
+    rows = {row.name: row.cells for row in scenario_rows(compared)}
     assert rows == {
         "seed": ("1", "5", "1"),
         "clusters.main": (THERE, THERE, ABSENT),
     }
-    assert scenario_rows(judged(runs[:1] * 2)) == []
+    assert scenario_rows(compared[:1] * 2) == []
 
 
 def test_faults_are_told_as_a_whole(runs: list[Path], tmp_path: Path) -> None:
@@ -144,6 +152,7 @@ def test_differences_that_rounding_hides_are_told(runs: list[Path], tmp_path: Pa
     assert [(row.name, row.cells) for row in rows] == [("environment.wind.gust_m_s", ("0.1234567", "0.12345671"))]
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_comparison_of_other_runs_is_not_replaced(runs: list[Path], tmp_path: Path) -> None:
     for place in ("A/one", "B/two", "C/two", "B/one"):
         (tmp_path / place).mkdir(parents=True)
@@ -175,11 +184,11 @@ def test_runs_can_be_told_apart_without_colour() -> None:
     assert len({(run_style(i).color, str(run_style(i).dashes)) for i in range(24)}) == 24
 
 
-def test_the_figures_show_something(runs: list[Path], tmp_path: Path) -> None:
-    compared = judged([*runs, runs[0]])
-    assert clusters(compared) == ["main"]
-    drawn = list(comparison_figures(compared))
-    assert [figure.name for figure in drawn] == [
+def test_the_figures_show_every_run(compared: list[ComparedRun]) -> None:
+    four = [*compared, replace(compared[0], name="calm again")]
+    assert clusters(four) == ["main"]
+    drawn = {figure.name: figure.drawing for figure in comparison_figures(four)}
+    assert list(drawn) == [
         "rms_main.png",
         "figure_5_errors_main_0.png",
         "figure_5_errors_main_1.png",
@@ -189,26 +198,36 @@ def test_the_figures_show_something(runs: list[Path], tmp_path: Path) -> None:
         "plan_view.png",
         "drones.png",
     ]
-    for figure in drawn:
-        figure.drawing.savefig(tmp_path / figure.name)
-        picture = matplotlib.image.imread(tmp_path / figure.name)[:, :, :3]
-        assert picture.shape[1] >= 1000
-        assert 0.003 < (picture < 0.9).any(axis=2).mean() < 0.6
+    for name, figure in drawn.items():
+        assert figure.get_size_inches()[0] * figure.dpi >= 1000
+        assert any(axes.has_data() for axes in figure.axes), name
+    x_true, x_measured = drawn["figure_6_position_main.png"].axes[:2]
+    largest = [float(np.nanmax(np.abs(line.get_ydata() - 5.0))) for line in x_true.lines[::2][:3]]
+    assert [line.get_label() for line in x_true.lines[::2][:3]] == ["calm", "rough", "calm again"]
+    assert largest == pytest.approx([ERRORS[0], 3 * ERRORS[0], ERRORS[0]], rel=1e-3)
+    assert len(x_measured.lines) == 6
+    assert [axes.get_title() for axes in drawn["plan_view.png"].axes] == [run.name for run in four]
 
 
 def test_the_page_is_one_file_that_asks_nothing_of_the_network(runs: list[Path], tmp_path: Path) -> None:
     out, steps = tmp_path / "sub" / "page.html", []
-    compare(runs, out, steps.append)
+    compared = compare(runs, out, steps.append)
     text = out.read_text()
     assert [path.name for path in out.parent.iterdir()] == ["page.html"]
-    assert text.count("data:image/png;base64,") == 7
+    pictures = re.findall(r"data:image/png;base64,([^\"]+)", text)
+    assert len(pictures) == 7
+    for each in pictures:
+        picture = matplotlib.image.imread(io.BytesIO(base64.b64decode(each)))[:, :, :3]
+        assert picture.shape[1] >= 1000
+        assert 0.003 < (picture < 0.9).any(axis=2).mean() < 0.6
     assert not re.search(r"https?:|@import|url\(|<script", text)
     assert "<title>calm, rough, alone: comparison</title>" in text
     assert "calm: reading the record" in steps
-    for run in judged(runs):
+    for run in compared:
         assert run.summary.truth_sha256 in text
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_the_command(runs: list[Path], tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["report", *map(str, runs[:2])])
     page = runs[0].parent / "compare-calm-rough.html"
@@ -220,6 +239,7 @@ def test_the_command(runs: list[Path], tmp_path: Path) -> None:
     assert "leave it out" in " ".join(refused.output.replace("│", " ").split())
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_what_cannot_be_compared_is_one_line(runs: list[Path], tmp_path: Path) -> None:
     with pytest.raises(RecordError, match=r"run\.mcap: cannot be read \(No such file"):
         compare([runs[0], tmp_path], tmp_path / "page.html")

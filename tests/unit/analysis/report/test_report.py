@@ -167,6 +167,7 @@ def test_truth_that_is_not_on_record_is_told(tmp_path):
     assert summary.errors["p"].true_std == pytest.approx(AMPLITUDE[9] / math.sqrt(2), rel=0.05)
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_replay_is_told_and_judged_from_where_it_begins(tmp_path):
     with RecordWriter(tmp_path / "run.mcap") as writer:
         for key, message, wall_ns in synthetic_record.traffic(flown(end=None)):
@@ -233,6 +234,7 @@ def test_a_cut_record_is_reported_up_to_the_cut(tmp_path):
     assert any("was cut" in note for note in summary.notes)
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_run_without_a_cluster(tmp_path):
     summary = report_of(tmp_path, flown(overrides=("clusters=[]",)))
     make_report(tmp_path)
@@ -258,7 +260,7 @@ def test_a_cluster_that_said_nothing(tmp_path):
 def test_a_record_without_a_message_is_refused(tmp_path, length):
     synthetic_record.write(tmp_path / "whole.mcap", flown(duration_s=0.1))
     (tmp_path / "run.mcap").write_bytes((tmp_path / "whole.mcap").read_bytes()[:length])
-    with pytest.raises(RecordError, match=r"run\.mcap: holds no message; there is nothing to report"):
+    with pytest.raises(RecordError, match=r"run\.mcap: holds no message"):
         make_report(tmp_path)
     assert [path.name for path in tmp_path.iterdir() if path.suffix != ".mcap"] == []
 
@@ -345,6 +347,7 @@ def test_the_terminal_table_stands_beside_the_paper(run):
     assert f"{AMPLITUDE[9] / math.sqrt(2):.4f}" in row
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_nothing_to_report_on_is_one_line(tmp_path):
     with pytest.raises(RecordError, match=r"run\.mcap: cannot be read \(No such file"):
         make_report(tmp_path)
@@ -384,6 +387,7 @@ def test_thinning_keeps_every_extreme():
     assert np.all(np.diff(few_x) > 0)
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_several_clusters_have_a_table_and_figures_each(tmp_path):
     scenario = scenario_file.load(SCENARIOS / "step.yaml")
     second = msgspec.structs.replace(
