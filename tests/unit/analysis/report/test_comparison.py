@@ -202,7 +202,7 @@ def test_the_figures_show_every_run(compared: list[ComparedRun]) -> None:
         assert figure.get_size_inches()[0] * figure.dpi >= 1000
         assert any(axes.has_data() for axes in figure.axes), name
     x_true, x_measured = drawn["figure_6_position_main.png"].axes[:2]
-    largest = [float(np.nanmax(np.abs(line.get_ydata() - 5.0))) for line in x_true.lines[::2][:3]]
+    largest = [float(np.nanmax(np.abs(np.asarray(line.get_ydata()) - 5.0))) for line in x_true.lines[::2][:3]]
     assert [line.get_label() for line in x_true.lines[::2][:3]] == ["calm", "rough", "calm again"]
     assert largest == pytest.approx([ERRORS[0], 3 * ERRORS[0], ERRORS[0]], rel=1e-3)
     assert len(x_measured.lines) == 6
