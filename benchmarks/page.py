@@ -1,4 +1,4 @@
-"""The measured sections of benchmarks/README.md: what stands between two marks is replaced, the words around it stay."""
+"""The measured sections of benchmarks/README.md: what stands between two marks is replaced, the rest stays."""
 
 from pathlib import Path
 

@@ -14,7 +14,7 @@ from benchmarks.monte_carlo.way import GATE_S, Way
 from benchmarks.peers import ROOT
 from benchmarks.run import CLI
 from zsim.scenario import scenario_file
-from zsim_analysis.sweep.fly.sweep_run import flown
+from zsim_analysis.sweep.sweep_run import fly_scenario
 
 TEST_1 = ROOT / "scenarios" / "step.yaml"
 TIMEOUT_S = 900.0
@@ -54,7 +54,7 @@ def _closest_m(path: Path) -> float:
 def flown_way(duration_s: float | None = None) -> Way:
     """Fly Test 1 (None: all of it) with the scenario's seed and return where its drones went."""
     overrides = [] if duration_s is None else [f"duration_s={duration_s}"]
-    flight, diverged = flown(scenario_file.load(TEST_1, overrides))
+    flight, diverged = fly_scenario(scenario_file.load(TEST_1, overrides))
     if diverged:
         raise diverged
     gate_ns = round(GATE_S * 1e9)

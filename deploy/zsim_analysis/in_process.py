@@ -1,11 +1,10 @@
-"""`zsim run --in-process`: world, agents and record in one process on an in-memory bus."""
+"""A flight in this process: world, agents and what observes them on an in-memory bus, without Zenoh."""
 
 import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from time import time_ns
-from typing import Any
+from typing import Any, Protocol
 
 from msgspec import Struct
 
@@ -21,6 +20,18 @@ from zsim_agents.hosting import hosted
 from zsim_world.flight.world import World
 
 
+class FlightObserver(Protocol):
+    """Receives every message of a flight, as a record writer does."""
+
+    def add_message(self, key: str, message: Any, wall_ns: int) -> None:
+        """Receive one message."""
+        ...
+
+    def add_bundle(self, bundle: Bundle, wall_ns: int) -> None:
+        """Receive the world's messages of a gate."""
+        ...
+
+
 def agents(world: World) -> list[Agent]:
     """Return the agents that a scenario expects as one, built from `world/info` as any process would."""
     known = agent_names(world.scenario)
@@ -28,10 +39,57 @@ def agents(world: World) -> list[Agent]:
     return [hosted(world.info(), world.scenario, names)] if names else []
 
 
+class InProcessFlight:
+    """A world with its agents, ready to be flown once.
+
+    Args:
+        scenario: resolved.
+        run_id: set only by tests that compare records.
+
+    Raises:
+        ScenarioError, RunError: the scenario cannot be flown.
+    """
+
+    def __init__(self, scenario: Scenario, run_id: str | None = None) -> None:
+        self.world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id)
+        self._agents = agents(self.world)
+
+    def run(self, observers: Sequence[FlightObserver], stop_reason: Callable[[], str | None] = lambda: None) -> None:
+        """Fly to the end; `world.ended` and `world.diverged` then have the reason.
+
+        Args:
+            observers: receive every message.
+            stop_reason: called at every gate; a text ends the run.
+        """
+
+        def add_message(key: str, message: Any) -> None:
+            wall_ns = time.time_ns()
+            for observer in observers:
+                observer.add_message(key, message, wall_ns)
+
+        def add_bundle(bundle: Bundle) -> None:
+            wall_ns = time.time_ns()
+            for observer in observers:
+                observer.add_bundle(bundle, wall_ns)
+
+        bus = Bus(self.world, self._agents, time.monotonic_ns, add_message, add_bundle)
+        add_message(keys.INFO, self.world.info())
+        bus.join()
+        gc.collect()
+        gc.freeze()  # what lives as long as the flight is not searched again and again
+        try:
+            while bus.turn():
+                if reason := stop_reason():
+                    self.world.clock.stop(reason)
+            bus.end()
+        finally:
+            gc.unfreeze()
+
+
 def fly(
     scenario: Scenario,
     record: Path | None,
-    stopped: Callable[[], str | None] = lambda: None,
+    stop_reason: Callable[[], str | None] = lambda: None,
     screen: Screen | None = None,
     run_id: str | None = None,
 ) -> str:
@@ -40,72 +98,56 @@ def fly(
     Args:
         scenario: resolved.
         record: path of the record, None for no record.
-        stopped: asked at every gate; a text ends the run.
+        stop_reason: called at every gate; a text ends the run.
         screen: shows progress.
-        run_id: given only by tests that compare records.
+        run_id: set only by tests that compare records.
 
     Raises:
         DivergedError: the state of a drone was no longer finite; the record is complete to its end.
     """
-    world = World(scenario, "lockstep", 0.0, time.monotonic_ns, run_id)
-    team = agents(world)  # may refuse the scenario; a record that was begun could not be begun again
+    flight = InProcessFlight(
+        scenario, run_id
+    )  # first: a refused scenario must leave no record, which would be in the way
     writer = RecordWriter(record) if record else None
-    show = _Show(world, writer, screen)
-    bus = Bus(world, team, time.monotonic_ns, show.sink, show.whole)
+    observers: list[FlightObserver] = [writer] if writer else []
+    if screen:
+        observers.append(_Progress(scenario, screen))
     try:
-        show.sink(keys.INFO, world.info())
-        bus.join()
-        gc.collect()
-        gc.freeze()
-        while bus.turn():
-            reason = stopped()
-            if reason:
-                world.clock.stop(reason)
-        bus.end()
+        flight.run(observers, stop_reason)
     finally:
         if writer:
             writer.close()
-    if world.diverged:
-        raise world.diverged
-    return world.ended or "ended"
+    if flight.world.diverged:
+        raise flight.world.diverged
+    return flight.world.ended or "ended"
 
 
-class _Show:
-    """Takes every message: into the record, and now and then onto the screen."""
+class _Progress:
+    """Shows clock, events and the controllers' reasons on a screen."""
 
-    def __init__(self, world: World, writer: RecordWriter | None, screen: Screen | None) -> None:
-        self._world = world
-        self._add = writer.add_message if writer else None
-        self._add_bundle = writer.add_bundle if writer else None
+    def __init__(self, scenario: Scenario, screen: Screen) -> None:
         self._screen = screen
         self._throttle = Throttle()
         self._reasons = Reasons()
-        states = (keys.cluster_state(cluster.name) for cluster in world.scenario.clusters)
+        states = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
         self._watched = {keys.CLOCK, keys.EVENT, *states}
         self._phase = ""
 
-    def whole(self, bundle: Bundle) -> None:
-        if self._add_bundle is not None:
-            self._add_bundle(bundle, time_ns())
+    def add_bundle(self, bundle: Bundle, wall_ns: int) -> None:
+        """Show nothing: a bundle holds truth, status and sensors only."""
 
-    def sink(self, key: str, message: Any) -> None:
-        if self._add is not None:
-            self._add(key, message, time_ns())
-        if self._screen is not None and key in self._watched:
-            self._show(key, message, self._screen)
+    def add_message(self, key: str, message: Any, wall_ns: int) -> None:
+        """Show a message of a key that is watched."""
+        if key in self._watched:
+            self._show(key, message)
 
-    def _show(self, key: str, message: Struct, screen: Screen) -> None:
+    def _show(self, key: str, message: Struct) -> None:
         if isinstance(message, messages.ClusterState):
             self._phase = message.phase
             if line := self._reasons.line(keys.thing(key), message):
-                screen.say(line)
+                self._screen.say(line)
         elif isinstance(message, messages.Event):
-            screen.event({"t_s": message.t_ns / 1e9, "kind": message.kind, "text": message.text})
+            self._screen.event({"t_s": message.t_ns / 1e9, "kind": message.kind, "text": message.text})
         elif isinstance(message, messages.Clock) and self._throttle.passes():
-            line = {
-                "t_s": message.t_ns / 1e9,
-                "rate": message.rate,
-                "state": message.state,
-                "phase": self._phase,
-            }
-            screen.clock({**line, "waiting_for": []})
+            line = {"t_s": message.t_ns / 1e9, "rate": message.rate, "state": message.state, "phase": self._phase}
+            self._screen.clock({**line, "waiting_for": []})

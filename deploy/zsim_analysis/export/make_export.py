@@ -10,20 +10,19 @@ from zsim import __version__
 from zsim.errors import ReportError
 from zsim.record import RecordReader
 from zsim.record.run_folder import record_at, record_notes
-from zsim_analysis.export.atomic_output import MANIFEST, check_free, placed
-from zsim_analysis.export.formats import DEFAULTS, Format
-from zsim_analysis.export.selection import Selection
+from zsim_analysis.export.output import DEFAULTS, MANIFEST, Format, check_free, placed
+from zsim_analysis.export.selection import DecodedMessages, MessageSelection, TableSurvey, batches
 
 Progress = Callable[[int, int], None]  # messages read so far, of how many
 
 
-class Exported(NamedTuple):
-    """What an export came to.
+class ExportResult(NamedTuple):
+    """The result of an export.
 
     Attributes:
         paths: that were written.
         tables: name and rows of each table, or topic and messages.
-        notes: what a reader has to know: what was cut, damaged or left out.
+        notes: what a reader has to know: whether the record was cut or damaged, and what was left out.
     """
 
     paths: tuple[Path, ...]
@@ -35,26 +34,26 @@ def export(
     run: Path,
     form: Format,
     out: Path | None = None,
-    selection: Selection | None = None,
+    selection: MessageSelection | None = None,
     force: bool = False,
     progress: Progress = lambda done, of: None,
-) -> Exported:
+) -> ExportResult:
     """Write the record of a run in the form of another tool, all of it or nothing.
 
     Args:
         run: its folder, or its record.
-        form: what to write.
+        form: of the output.
         out: where, None for the usual place beside the record.
         selection: which messages, None for all.
         force: replace what an earlier export has written.
-        progress: told now and then.
+        progress: called now and then.
 
     Raises:
         RunError, RecordError: there is no record.
-        ReportError: nothing on record is wanted; or it cannot be written there.
+        ReportError: nothing on record is selected; or it cannot be written there.
         KeyboardInterrupt: nothing was written.
     """
-    record, chosen = record_at(run), selection or Selection()
+    record, chosen = record_at(run), selection or MessageSelection()
     target = out or record.parent / DEFAULTS[form]
     with RecordReader(record) as reader:
         if form is Format.FOXGLOVE:
@@ -63,40 +62,42 @@ def export(
         return _tables(reader, form, chosen, target, progress)
 
 
-def _tables(reader: RecordReader, form: Format, selection: Selection, target: Path, progress: Progress) -> Exported:
-    from zsim_analysis.export.batches import Gathering
-    from zsim_analysis.export.survey import Survey
-
-    survey = Survey(reader, selection)
+def _tables(
+    reader: RecordReader, form: Format, selection: MessageSelection, target: Path, progress: Progress
+) -> ExportResult:
+    survey = TableSurvey(reader, selection)
     total = sum(survey.rows.values())
-    gathering = Gathering(reader, selection, survey)
+    messages = selection.messages(reader, survey.wanted)
+    decoded = DecodedMessages(messages, survey.decode, lambda done: progress(done, total))
     with placed(target) as (new,):
         sink = _sink(form, new, survey)
         with sink:
-            for batch in gathering.batches(sink.columns, lambda done: progress(done, total)):
+            for batch in batches(decoded, sink.columns):
                 sink.write(batch)
             written = sink.finish()
         if not written:
             raise ReportError(f"{reader.path}: {_nothing(reader, selection)}")
-        notes = [*record_notes(reader.complete, reader.damaged), *_refused(gathering.refused)]
+        notes = [*record_notes(reader.complete, reader.damaged), *_refused(decoded.refused)]
         if form is not Format.MAT:
             (new / MANIFEST).write_bytes(_manifest(reader, selection, written, notes))
-    return Exported((target,), {table.file: table.rows for table in written}, notes)
+    return ExportResult((target,), {table.file: table.rows for table in written}, notes)
 
 
-def _sink(form: Format, new: Path, survey: Any) -> Any:
+def _sink(form: Format, new: Path, survey: TableSurvey) -> Any:
     if form is Format.MAT:
         from zsim_analysis.export.matlab import MatFile
 
         return MatFile(new, survey)
-    from zsim_analysis.export.tables import Tables
+    from zsim_analysis.export.tables import TableFolder
 
     new.mkdir()
-    return Tables(new, form.value, survey.fields)
+    return TableFolder(new, form.value, survey.fields)
 
 
-def _foxglove(reader: RecordReader, selection: Selection, target: Path, force: bool, progress: Progress) -> Exported:
-    from zsim_analysis.export.foxglove.convert import convert
+def _foxglove(
+    reader: RecordReader, selection: MessageSelection, target: Path, force: bool, progress: Progress
+) -> ExportResult:
+    from zsim_analysis.export.foxglove_file import convert
 
     layout = target.with_name(f"{target.stem}-layout.json")
     for path in (target, layout):
@@ -105,25 +106,25 @@ def _foxglove(reader: RecordReader, selection: Selection, target: Path, force: b
         topics, refused = convert(reader, selection, new, new_layout, progress)
         if not topics:
             raise ReportError(f"{reader.path}: {_nothing(reader, selection)}")
-    return Exported((target, layout), topics, [*record_notes(reader.complete, reader.damaged), *_refused(refused)])
+    return ExportResult((target, layout), topics, [*record_notes(reader.complete, reader.damaged), *_refused(refused)])
 
 
 def _refused(count: int) -> list[str]:
     return [f"{count} messages on record are not what their key promises and were left out"] if count else []
 
 
-def _nothing(reader: RecordReader, selection: Selection) -> str:
+def _nothing(reader: RecordReader, selection: MessageSelection) -> str:
     count = sum(reader.topics().values())
     if not count:
         return "holds no message; there is nothing to export"
-    asked = [f"on {' '.join(selection.expressions)}"] if selection.expressions else []
-    asked += [f"from {selection.from_s:g} s"] if selection.from_s is not None else []
-    asked += [f"to {selection.to_s:g} s"] if selection.to_s is not None else []
-    return " ".join(["has no message", *asked, f"that can be exported; it holds {count} messages"])
+    criteria = [f"on {' '.join(selection.expressions)}"] if selection.expressions else []
+    criteria += [f"from {selection.from_s:g} s"] if selection.from_s is not None else []
+    criteria += [f"to {selection.to_s:g} s"] if selection.to_s is not None else []
+    return " ".join(["has no message", *criteria, f"that can be exported; it holds {count} messages"])
 
 
-def _manifest(reader: RecordReader, selection: Selection, written: list[Any], notes: list[str]) -> bytes:
-    """Return what lies beside tables: what they were made from, and their columns."""
+def _manifest(reader: RecordReader, selection: MessageSelection, written: list[Any], notes: list[str]) -> bytes:
+    """Return the content of export.json: what tables were made from, and their columns."""
     content = {
         "record": str(reader.path.resolve()),
         "zsim": __version__,

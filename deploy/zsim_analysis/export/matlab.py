@@ -14,10 +14,9 @@ from msgspec import Struct
 from scipy.io import savemat
 
 from zsim.errors import ReportError
-from zsim_analysis.export.batches import Batch
-from zsim_analysis.export.columns import Field, Keyed, Named, Vector, table_name
-from zsim_analysis.export.survey import Survey
-from zsim_analysis.export.tables import Written
+from zsim_analysis.export.message_columns import FieldColumns, KeyedColumns, NamedColumns, VectorColumns, table_name
+from zsim_analysis.export.selection import RowBatch, TableSurvey
+from zsim_analysis.export.tables import WrittenTable
 
 VARIABLE_MAX = 2**31 - 1  # bytes of a variable that MATLAB loads from a Level 5 file
 NAME_MAX = 63  # characters of a MATLAB name
@@ -38,10 +37,10 @@ class MatFile:
         ReportError: a variable would be larger than MATLAB loads.
     """
 
-    def __init__(self, path: Path, survey: Survey) -> None:
+    def __init__(self, path: Path, survey: TableSurvey) -> None:
         self._path = path
         self._survey = survey
-        self._fields: dict[type[Struct], tuple[Field, ...]] = {}
+        self._fields: dict[type[Struct], tuple[FieldColumns, ...]] = {}
         self._blocks: dict[type[Struct], dict[str, list[_Block]]] = {}
         for kind, rows in survey.rows.items():
             if kind is not None and 8 * rows * self.columns(kind) > VARIABLE_MAX:  # of the times, only if it matters
@@ -51,9 +50,9 @@ class MatFile:
         """Return the numbers in a row of a type."""
         return 4 + sum(len(field.columns) for field in self._of(kind))
 
-    def write(self, batch: Batch) -> None:
+    def write(self, batch: RowBatch) -> None:
         """Take rows."""
-        things = self._blocks.setdefault(batch.kind, {})
+        subjects = self._blocks.setdefault(batch.kind, {})
         names = np.array(batch.names)
         for name in dict.fromkeys(batch.names):
             rows = np.flatnonzero(names == name).tolist()
@@ -61,27 +60,27 @@ class MatFile:
             block: _Block = {"t_ns": np.array([message.t_ns for message in chosen], np.int64)}
             if "seq" in batch.kind.__struct_fields__:
                 block["seq"] = np.array([message.seq for message in chosen], np.int64)
-            block |= {_place(field): _plain(field, field.values(chosen)) for field in self._of(batch.kind)}
+            block |= {_entry_name(field): _plain(field, field.values(chosen)) for field in self._of(batch.kind)}
             block["wall_ns"] = np.array([batch.wall_ns[row] for row in rows], np.uint64).astype(np.int64)
-            things.setdefault(name, []).append(block)
+            subjects.setdefault(name, []).append(block)
 
-    def finish(self) -> list[Written]:
+    def finish(self) -> list[WrittenTable]:
         """Write the file; return the variables that are in it.
 
         Raises:
             ReportError: a variable is larger than MATLAB loads.
         """
-        variables, told = {}, []
+        variables, written = {}, []
         for kind in sorted(self._blocks, key=table_name):
-            things = self._blocks.pop(kind)
-            places = matlab_names(things)
-            made = {places[name]: self._struct(kind, name, blocks) for name, blocks in things.items()}
-            _check_size(table_name(kind), _bytes(made))
-            variables[table_name(kind)] = made
-            rows = sum(len(struct["t_ns"]) for struct in made.values())
-            told.append(Written(table_name(kind), rows, list(next(iter(made.values())))))
+            subjects = self._blocks.pop(kind)
+            valid = matlab_names(subjects)
+            structs = {valid[name]: self._struct(kind, name, blocks) for name, blocks in subjects.items()}
+            _check_size(table_name(kind), _bytes(structs))
+            variables[table_name(kind)] = structs
+            rows = sum(len(struct["t_ns"]) for struct in structs.values())
+            written.append(WrittenTable(table_name(kind), rows, list(next(iter(structs.values())))))
         savemat(self._path, variables, long_field_names=True, oned_as="column")
-        return told
+        return written
 
     def __enter__(self) -> "MatFile":
         return self
@@ -92,22 +91,22 @@ class MatFile:
     def _struct(self, kind: type[Struct], name: str, blocks: "list[_Block]") -> dict[str, Any]:
         """Return the arrays of one drone, cluster or process."""
         joined = {field: _joined([block[field] for block in blocks]) for field in blocks[0]}
-        by_place = {_place(field): field for field in self._of(kind)}
+        by_name = {_entry_name(field): field for field in self._of(kind)}
         struct: dict[str, Any] = {"name": name, "t_s": joined["t_ns"] / 1e9}
-        for place, values in joined.items():
-            field = by_place.get(place)
-            if isinstance(field, Named):
+        for entry, values in joined.items():
+            field = by_name.get(entry)
+            if isinstance(field, NamedColumns):
                 known = ~np.isnan(values).all(axis=0)
                 struct["names"] = np.array(field.names, object)[known].reshape(-1, 1)
-                struct[place] = values[:, known]
-            elif isinstance(field, Keyed):
+                struct[entry] = values[:, known]
+            elif isinstance(field, KeyedColumns):
                 valid = matlab_names(field.keys)
-                struct[place] = {valid[key]: values[:, columns] for key, columns in field.keys.items()}
+                struct[entry] = {valid[key]: values[:, columns] for key, columns in field.keys.items()}
             else:
-                struct[place] = values
+                struct[entry] = values
         return struct
 
-    def _of(self, kind: type[Struct]) -> tuple[Field, ...]:
+    def _of(self, kind: type[Struct]) -> tuple[FieldColumns, ...]:
         if kind not in self._fields:
             self._fields[kind] = self._survey.fields(kind)
         return self._fields[kind]
@@ -118,25 +117,25 @@ _Block = dict[str, Any]  # arrays by field, a row per message
 
 def matlab_names(names: Iterable[str]) -> dict[str, str]:
     """Return a valid MATLAB name for each name, no two the same: drone-1.a is drone_1_a."""
-    made: dict[str, str] = {}
+    valid: dict[str, str] = {}
     for name in names:
         plain = re.sub(r"[^a-zA-Z0-9_]", "_", name)
         plain = plain if re.match("[a-zA-Z]", plain) and plain not in KEYWORDS else f"x{plain}"
         plain = unique = plain[: NAME_MAX - len("_999")]
         count = 1
-        while unique in made.values():
+        while unique in valid.values():
             count += 1
             unique = f"{plain}_{count}"
-        made[name] = unique
-    return made
+        valid[name] = unique
+    return valid
 
 
-def _place(field: Field) -> str:
+def _entry_name(field: FieldColumns) -> str:
     """Return the name of a field in its struct: that of the message where it is one array there."""
-    return field.name if isinstance(field, Vector | Named | Keyed) else field.columns[0]
+    return field.name if isinstance(field, VectorColumns | NamedColumns | KeyedColumns) else field.columns[0]
 
 
-def _plain(field: Field, values: Any) -> Any:
+def _plain(field: FieldColumns, values: Any) -> Any:
     """Return values as an array; text stays a list until all of it is known."""
     if field.kind == "text":
         return ["" if value is None else value for value in values]

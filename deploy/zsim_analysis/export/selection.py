@@ -1,14 +1,24 @@
-"""Which messages of a record are exported."""
+"""Which messages of a record are exported, the tables that they become, and the rows of these in batches."""
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
-from zsim.contract import keys
+import msgspec
+from msgspec import Struct
+
+from zsim.contract import keys, messages
+from zsim.contract.messages import REFUSALS
 from zsim.record import Recorded, RecordReader
+from zsim_analysis.export.message_columns import FieldColumns, fields, json_text, open_fields
+from zsim_analysis.reading.recorded_run import decode_or_none
+
+CELLS = 100_000  # of a batch: some 5 MB as Python objects
+PROGRESS_EVERY = 10_000  # messages
 
 
-class Selection(NamedTuple):
-    """Keys and times.
+class MessageSelection(NamedTuple):
+    """Which keys and times are exported.
 
     Attributes:
         expressions: key expressions as Zenoh's; none: every key.
@@ -21,7 +31,7 @@ class Selection(NamedTuple):
     to_s: float | None = None
 
     def keys(self, reader: RecordReader) -> list[str]:
-        """Return the keys on record that are wanted."""
+        """Return the selected keys on record."""
         every = not self.expressions
         return [key for key in reader.topics() if every or any(keys.matches(each, key) for each in self.expressions)]
 
@@ -36,9 +46,144 @@ def _ns(seconds: float | None, otherwise: int) -> int:
     return otherwise if seconds is None else round(seconds * 1e9)
 
 
-def thing(key: str) -> str:
-    """Return whom a key is about: a drone, cluster or process; the world where it is about all."""
+def subject(key: str) -> str:
+    """Return the drone, cluster or process of a key; `world` where it is of all."""
     kind, whose, what = keys.parts(key)
     if kind == "view":
         return what or "world"
     return whose if what else "world"
+
+
+class Foreign(Struct, frozen=True):
+    """A message on a key that the contract does not know; `content` is its payload as JSON."""
+
+    t_ns: int
+    key: str
+    content: str
+
+
+def _content(payload: bytes) -> str:
+    """Return the payload of a foreign message as JSON, as hexadecimal digits if it is not msgpack."""
+    try:
+        return json_text(msgspec.msgpack.decode(payload))
+    except REFUSALS:
+        return json_text({"hexadecimal": payload.hex()})
+
+
+class TableSurvey:
+    """The tables that a selection becomes, by a first look through the record.
+
+    Attributes:
+        wanted: the keys.
+        kinds: the message type of each key of the contract.
+        rows: messages by type, with those outside the times or unreadable; None: of foreign keys.
+    """
+
+    def __init__(self, reader: RecordReader, selection: MessageSelection) -> None:
+        self._reader = reader
+        self._selection = selection
+        self.wanted = selection.keys(reader)
+        self.kinds = {key: kind for key in self.wanted if (kind := messages.type_of(key))}
+        counts = reader.topics()
+        self.rows: Counter[type[Struct] | None] = Counter()
+        for key in self.wanted:
+            self.rows[self.kinds.get(key)] += counts[key]
+        self._names: dict[type[Struct], dict[str, dict[str, None]]] = {}
+        self._read_names()
+
+    def fields(self, kind: type[Struct]) -> tuple[FieldColumns, ...]:
+        """Return the fields of a type's table."""
+        names: dict[str, Sequence[str]] = {name: list(each) for name, each in self._names.get(kind, {}).items()}
+        return fields(kind, names)
+
+    def rows_within(self, kind: type[Struct]) -> int:
+        """Return the messages of a type within the times; they are read through for it."""
+        wanted = [key for key, of in self.kinds.items() if of is kind]
+        return sum(1 for _ in self._selection.messages(self._reader, wanted))
+
+    def decode(self, recorded: Recorded) -> Any:
+        """Return the row of a message, None if it is not of the type of its key."""
+        if recorded.key in self.kinds:
+            return decode_or_none(recorded)
+        return Foreign(recorded.t_ns, recorded.key, _content(recorded.payload))
+
+    def _read_names(self) -> None:
+        """Read the messages that have open fields."""
+        opened = {kind: open_fields(kind) for kind in set(self.kinds.values())}
+        wanted = [key for key, kind in self.kinds.items() if opened[kind]]
+        for kind, opens in opened.items():
+            self._names[kind] = {each.name: {} for each in opens}
+        for message in self._selection.messages(self._reader, wanted) if wanted else ():
+            decoded = decode_or_none(message)
+            if decoded is None:
+                continue
+            kind = type(decoded)
+            for name, field in opened[kind]:
+                names = decoded.names if field == "named" else getattr(decoded, name)
+                self._names[kind][name].update(dict.fromkeys(names))
+
+
+class RowBatch(NamedTuple):
+    """Some rows of one table, in order of time.
+
+    Attributes:
+        kind: of the messages.
+        names: subject of each.
+        messages: decoded.
+        wall_ns: when each reached the recorder.
+    """
+
+    kind: type[Struct]
+    names: list[str]
+    messages: list[Any]
+    wall_ns: list[int]
+
+
+class DecodedMessages:
+    """Selected messages of a record with what they decode to, in order of simulated time.
+
+    Args:
+        messages: of the selection.
+        decode: returns the message, None for one that is left out.
+        progress: called now and then with the number of messages that have been read.
+
+    Attributes:
+        refused: messages that were left out so far.
+    """
+
+    def __init__(
+        self, messages: Iterable[Recorded], decode: Callable[[Recorded], Any], progress: Callable[[int], None]
+    ) -> None:
+        self._messages = messages
+        self._decode = decode
+        self._progress = progress
+        self.refused = 0
+
+    def __iter__(self) -> Iterator[tuple[Recorded, Any]]:
+        for count, recorded in enumerate(self._messages):
+            if count % PROGRESS_EVERY == 0:
+                self._progress(count)
+            message = self._decode(recorded)
+            if message is None:
+                self.refused += 1
+            else:
+                yield recorded, message
+
+
+def batches(decoded: Iterable[tuple[Recorded, Any]], columns: Callable[[type[Struct]], int]) -> Iterator[RowBatch]:
+    """Yield all rows; a table's batches come in order of time.
+
+    Args:
+        decoded: messages in order of time.
+        columns: number of columns of a table: wide ones have fewer rows in a batch.
+    """
+    incomplete: dict[type[Struct], RowBatch] = {}
+    for recorded, message in decoded:
+        kind = type(message)
+        batch = incomplete.setdefault(kind, RowBatch(kind, [], [], []))
+        batch.names.append(subject(recorded.key))
+        batch.messages.append(message)
+        batch.wall_ns.append(recorded.wall_ns)
+        if len(batch.names) * columns(kind) >= CELLS:
+            yield incomplete.pop(kind)
+    yield from incomplete.values()

@@ -1,4 +1,4 @@
-"""A table per message type, as CSV or Parquet: what pandas, MATLAB's readtable and anything else reads."""
+"""A table per message type, as CSV or Parquet: as pandas, MATLAB's readtable and others read it."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -11,8 +11,8 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 from msgspec import Struct
 
-from zsim_analysis.export.batches import Batch, seconds
-from zsim_analysis.export.columns import Field, table_name
+from zsim_analysis.export.message_columns import FieldColumns, table_name
+from zsim_analysis.export.selection import RowBatch
 
 ROW_GROUP = 65_536  # rows of a Parquet row group, of which one per table is held in memory
 _TYPES: dict[str, pa.DataType] = {
@@ -26,7 +26,7 @@ _AFTER = ("wall_ns", pa.int64())
 _SEQ = ("seq", pa.int64())
 
 
-class Written(NamedTuple):
+class WrittenTable(NamedTuple):
     """A table that was written."""
 
     file: str
@@ -40,8 +40,8 @@ class _Sink(Protocol):
     def close(self) -> None: ...
 
 
-class Tables:
-    """A folder of tables; each is begun with its first rows.
+class TableFolder:
+    """A folder of tables; a table's file is opened with its first rows.
 
     Args:
         folder: made already.
@@ -49,7 +49,7 @@ class Tables:
         fields: of a message type.
     """
 
-    def __init__(self, folder: Path, suffix: str, fields: Callable[[type[Struct]], tuple[Field, ...]]) -> None:
+    def __init__(self, folder: Path, suffix: str, fields: Callable[[type[Struct]], tuple[FieldColumns, ...]]) -> None:
         self._folder = folder
         self._suffix = suffix
         self._fields = fields
@@ -62,18 +62,18 @@ class Tables:
         """Return the number of columns of a type's table."""
         return len(self._layout(kind).schema)
 
-    def write(self, batch: Batch) -> None:
+    def write(self, batch: RowBatch) -> None:
         """Add rows to their table."""
         if batch.kind not in self._sinks:
-            self._sinks[batch.kind] = self._begun(batch.kind)
+            self._sinks[batch.kind] = self._open(batch.kind)
         self._sinks[batch.kind].write(self._layout(batch.kind).arrow(batch))
         self._rows[batch.kind] = self._rows.get(batch.kind, 0) + len(batch.names)
 
-    def finish(self) -> list[Written]:
+    def finish(self) -> list[WrittenTable]:
         """End all files; return the tables that were written."""
         self._stack.close()
         return [
-            Written(self._file(kind), rows, self._layout(kind).schema.names)
+            WrittenTable(self._file(kind), rows, self._layout(kind).schema.names)
             for kind, rows in sorted(self._rows.items(), key=lambda item: table_name(item[0]))
         ]
 
@@ -85,13 +85,13 @@ class Tables:
     def _file(self, kind: type[Struct]) -> str:
         return f"{table_name(kind)}.{self._suffix}"
 
-    def _begun(self, kind: type[Struct]) -> _Sink:
+    def _open(self, kind: type[Struct]) -> _Sink:
         path, schema = self._folder / self._file(kind), self._layout(kind).schema
         sink = _Csv(path, schema) if self._suffix == "csv" else _Parquet(path, schema)
         self._stack.callback(sink.close)
         return sink
 
-    def __enter__(self) -> "Tables":
+    def __enter__(self) -> "TableFolder":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -101,16 +101,16 @@ class Tables:
 class _Layout:
     """The Arrow schema of a table, and how a batch becomes its columns."""
 
-    def __init__(self, kind: type[Struct], fields: Sequence[Field]) -> None:
-        self._counted = "seq" in kind.__struct_fields__
+    def __init__(self, kind: type[Struct], fields: Sequence[FieldColumns]) -> None:
+        self._has_seq = "seq" in kind.__struct_fields__
         self._fields = fields
         own = [(column, _TYPES[field.kind]) for field in fields for column in field.columns]
-        self.schema = pa.schema([*_BEFORE, *([_SEQ] if self._counted else []), *own, _AFTER])
+        self.schema = pa.schema([*_BEFORE, *([_SEQ] if self._has_seq else []), *own, _AFTER])
 
-    def arrow(self, batch: Batch) -> pa.RecordBatch:
+    def arrow(self, batch: RowBatch) -> pa.RecordBatch:
         t_ns = [message.t_ns for message in batch.messages]
-        head = [batch.names, seconds(batch.messages), t_ns]
-        head += [[message.seq for message in batch.messages]] if self._counted else []
+        head = [batch.names, [each / 1e9 for each in t_ns], t_ns]
+        head += [[message.seq for message in batch.messages]] if self._has_seq else []
         own = [column for field in self._fields for column in _columns(field, batch.messages)]
         wall_ns = np.array(batch.wall_ns, np.uint64).astype(np.int64)
         arrays = [  # no message holds NaN: where it stands, there is no value
@@ -120,7 +120,7 @@ class _Layout:
         return pa.RecordBatch.from_arrays(arrays, schema=self.schema)
 
 
-def _columns(field: Field, messages: Sequence[Any]) -> Iterator[Any]:
+def _columns(field: FieldColumns, messages: Sequence[Any]) -> Iterator[Any]:
     values = field.values(messages)
     if isinstance(values, np.ndarray):
         yield from values.T

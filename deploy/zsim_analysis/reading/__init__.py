@@ -1,1 +1,1 @@
-"""A record read as arrays: a flight, its formations, its errors. Imports zsim.record and the cluster spaces."""
+"""A record read as arrays: a flight, its formations, their errors. Imports zsim.record and the cluster spaces."""

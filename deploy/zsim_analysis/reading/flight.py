@@ -1,4 +1,4 @@
-"""What a record says of a flight, as arrays."""
+"""A recorded flight as arrays."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,7 +23,7 @@ class Track:
         t_ns: (T,) instants of truth, ascending, without doubles.
         truth: (T, 13) position [m], velocity [m/s], orientation w first, angular velocity [rad/s; B].
         status_t_ns: (S,) instants of status.
-        states: (S,) its state in words.
+        states: (S,) state of the firmware by name.
         battery_percent: (S,).
     """
 
@@ -46,7 +46,7 @@ class Track:
 
 
 @dataclass
-class States:
+class ClusterStates:
     """What the controller of one cluster published: K instants, n names."""
 
     name: str
@@ -59,7 +59,7 @@ class States:
 
 
 @dataclass
-class Participant:
+class RunParticipant:
     """A process that joined."""
 
     name: str
@@ -73,23 +73,23 @@ class Participant:
 
 
 @dataclass
-class Flight:
-    """Everything of a record that a report needs; what was not on record is None or empty.
+class RecordedFlight:
+    """Everything of a record that a report needs; what is not on record is None or empty.
 
     Attributes:
         messages: on record, all keys.
         complete: the record was closed, not cut.
         wall_s: wall time from the first truth to the last, as they reached the recorder.
-        undecoded: payloads that are not what their key promises.
+        undecoded: payloads that are not of the type of their key.
         damaged: chunks of the record that cannot be read.
     """
 
     info: Info | None
     scenario: Scenario | None
     tracks: list[Track]
-    clusters: list[States]
+    clusters: list[ClusterStates]
     events: list[Event]
-    participants: list[Participant]
+    participants: list[RunParticipant]
     messages: int
     complete: bool
     wall_s: float
@@ -98,9 +98,8 @@ class Flight:
 
     @property
     def end(self) -> dict[str, Any] | None:
-        """Return what the world said of the run at its end, None if it did not live to say it."""
-        said = [event.data for event in self.events if event.kind == "end"]
-        return said[-1] if said else None
+        """Return the data of the world's last `end` event, None if there is none on record."""
+        return next((event.data for event in reversed(self.events) if event.kind == "end"), None)
 
     @property
     def replay_of(self) -> str:

@@ -1,4 +1,4 @@
-"""Reads a flight in one pass: off its record, or off the messages themselves while it is flown in this process."""
+"""Reads a flight in one pass: from its record, or from the messages themselves while it is flown in this process."""
 
 from array import array
 from collections.abc import Callable
@@ -12,11 +12,9 @@ from msgspec import Struct
 from zsim.contract import keys
 from zsim.contract.bundle import Bundle
 from zsim.contract.messages import Bye, Event, Info, Join, Quaternion, Vector3
-from zsim.errors import ZsimError
 from zsim.record import Recorded, RecordReader
-from zsim.scenario import scenario_file
-from zsim.scenario.scenario import Scenario
-from zsim_analysis.reading.flight import TRUTH_WIDTH, Flight, Participant, States, Track
+from zsim_analysis.reading.flight import TRUTH_WIDTH, ClusterStates, RecordedFlight, RunParticipant, Track
+from zsim_analysis.reading.recorded_run import scenario_of
 
 
 class _Truth(Struct):
@@ -44,22 +42,22 @@ class _State(Struct):
     drones: tuple[str, ...] = ()
 
 
-def read_flight(path: Path) -> Flight:
+def read_flight(path: Path) -> RecordedFlight:
     """Return the flight of a record.
 
     Raises:
         RecordError: no such record.
     """
     with RecordReader(path) as reader:
-        reading = Reading()
-        wanted = [key for key in reader.topics() if reading.taker(key)]
+        flight = FlightReader()
+        wanted = [key for key in reader.topics() if flight.handler(key)]
         for message in reader.messages(wanted, by_time=False):
-            reading.take(message)
-        return reading.flight(sum(reader.topics().values()), reader.complete, reader.damaged)
+            flight.add(message)
+        return flight.flight(sum(reader.topics().values()), reader.complete, reader.damaged)
 
 
-class Reading:
-    """The flight while its record is read, or while it is flown, message by message."""
+class FlightReader:
+    """The flight while its record is read, or while it is flown in this process, message by message."""
 
     def __init__(self) -> None:
         self._infos: list[Info] = []
@@ -67,66 +65,63 @@ class Reading:
         self._truth: dict[str, tuple[array[int], array[float]]] = {}
         self._status: dict[str, tuple[array[int], list[str], array[float]]] = {}
         self._states: dict[str, list[_State]] = {}
-        self._participants: dict[str, Participant] = {}
+        self._participants: dict[str, RunParticipant] = {}
         self._first_wall_ns: int | None = None
         self._last_wall_ns = 0
         self._undecoded = 0
-        self._takers: dict[str, _Taker | None] = {}
+        self._handlers: dict[str, _Handler | None] = {}
 
-    def taker(self, key: str) -> "_Taker | None":
-        """Return what takes the messages of a key, None when nobody needs them."""
-        if key not in self._takers:
-            kind, take = self._kind(key)
-            self._takers[key] = (msgspec.msgpack.Decoder(kind), take) if kind else None
-        return self._takers[key]
+    def handler(self, key: str) -> "_Handler | None":
+        """Return what decodes and stores the messages of a key, None when no report needs them."""
+        if key not in self._handlers:
+            kind, store = self._kind(key)
+            self._handlers[key] = (msgspec.msgpack.Decoder(kind), store) if kind and store else None
+        return self._handlers[key]
 
-    def _kind(self, key: str) -> tuple[type[Struct] | None, Callable[[str, Any], None]]:
+    def _kind(self, key: str) -> tuple[type[Struct] | None, Callable[[str, Any], None] | None]:
         leaf = keys.leaf(key)
         if key == keys.INFO:
             return Info, lambda _, message: self._infos.append(message)
         if key == keys.EVENT:
             return Event, lambda _, message: self._events.append(message)
         if key.startswith("process/"):
-            kind = {"join": Join, "bye": Bye}.get(leaf)
-            return kind, self._take_process
-        kinds = {"truth": (_Truth, self._take_truth), "status": (_Status, self._take_status)}
+            return {"join": Join, "bye": Bye}.get(leaf), self._store_process
+        kinds = {"truth": (_Truth, self._store_truth), "status": (_Status, self._store_status)}
         if key.startswith("drone/") and leaf in kinds:
             return kinds[leaf]
         if key.startswith("cluster/") and leaf == "state":
             return _State, lambda name, message: self._states.setdefault(name, []).append(message)
-        return None, _ignore
+        return None, None
 
-    def take(self, message: Recorded) -> None:
-        """Take one message; what cannot be decoded is counted."""
-        taker = self.taker(message.key)
-        if taker is None:
+    def add(self, recorded: Recorded) -> None:
+        """Add a message of a record; one that cannot be decoded is counted."""
+        handler = self.handler(recorded.key)
+        if handler is None:
             return
-        decoder, take = taker
+        decoder, store = handler
         try:
-            decoded = decoder.decode(message.payload)
+            message = decoder.decode(recorded.payload)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             self._undecoded += 1
             return
-        if isinstance(decoded, _Truth):
+        if isinstance(message, _Truth):
             if self._first_wall_ns is None:
-                self._first_wall_ns = message.wall_ns
-            self._last_wall_ns = message.wall_ns
-        take(_thing(message.key), decoded)
+                self._first_wall_ns = recorded.wall_ns
+            self._last_wall_ns = recorded.wall_ns
+        store(_thing(recorded.key), message)
 
-    def keep(self, key: str, message: Any) -> None:
-        """Take one message of a flight in this process; it has not been encoded."""
-        taker = self.taker(key)
-        if taker is not None:
-            taker[1](_thing(key), message)
+    def add_message(self, key: str, message: Any, wall_ns: int) -> None:
+        """Add a message of a flight in this process; it has not been encoded."""
+        if handler := self.handler(key):
+            handler[1](_thing(key), message)
 
-    def keep_bundle(self, bundle: Bundle) -> None:
-        """Take what the world says at a gate."""
+    def add_bundle(self, bundle: Bundle, wall_ns: int) -> None:
+        """Add the world's messages of a gate of a flight in this process."""
         for key, payload in bundle.encoded:
-            taker = self.taker(key)
-            if taker is not None:
-                taker[1](_thing(key), taker[0].decode(payload))
+            if handler := self.handler(key):
+                handler[1](_thing(key), handler[0].decode(payload))
 
-    def _take_truth(self, name: str, truth: _Truth) -> None:
+    def _store_truth(self, name: str, truth: _Truth) -> None:
         times, values = self._truth.setdefault(name, (array("q"), array("d")))
         times.append(truth.t_ns)
         values.extend(truth.position_m)
@@ -134,14 +129,14 @@ class Reading:
         values.extend(truth.orientation_wxyz)
         values.extend(truth.angular_velocity_rad_s)
 
-    def _take_status(self, name: str, status: _Status) -> None:
+    def _store_status(self, name: str, status: _Status) -> None:
         times, states, battery = self._status.setdefault(name, (array("q"), [], array("d")))
         times.append(status.t_ns)
         states.append(status.state)
         battery.append(status.battery_percent)
 
-    def _take_process(self, name: str, message: Join | Bye) -> None:
-        process = self._participants.setdefault(name, Participant(name))
+    def _store_process(self, name: str, message: Join | Bye) -> None:
+        process = self._participants.setdefault(name, RunParticipant(name))
         if isinstance(message, Bye):
             process.left = message.reason
             return
@@ -150,14 +145,14 @@ class Reading:
         process.incarnations += 1
         process.left = ""
 
-    def flight(self, messages: int = 0, complete: bool = True, damaged: int = 0) -> Flight:
-        """Return the flight when all is read; the arguments tell of its record, where there is one."""
+    def flight(self, messages: int = 0, complete: bool = True, damaged: int = 0) -> RecordedFlight:
+        """Return the flight when all messages are added; the arguments describe its record, if there is one."""
         info = self._infos[-1] if self._infos else None
         names = [drone.name for drone in info.drones] if info else sorted(self._truth)
         members = {c.name: c.drones for c in info.clusters} if info else dict.fromkeys(self._states, ())
-        return Flight(
+        return RecordedFlight(
             info=info,
-            scenario=_scenario(info),
+            scenario=scenario_of(info),
             tracks=[self._track(name) for name in names],
             clusters=[_states(name, drones, self._states.get(name, [])) for name, drones in members.items()],
             events=sorted(self._events, key=lambda event: (event.t_ns, event.seq)),
@@ -184,35 +179,23 @@ class Reading:
         )
 
 
-_Taker = tuple[msgspec.msgpack.Decoder[Any], Callable[[str, Any], None]]
+_Handler = tuple[msgspec.msgpack.Decoder[Any], Callable[[str, Any], None]]
 
 
 def _thing(key: str) -> str:
-    """Return whom a key is about; "" for keys of one part."""
+    """Return the drone, cluster or process of a key; "" for keys of one part."""
     return key.split("/", 2)[1] if "/" in key else ""
 
 
-def _ignore(_: str, message: Any) -> None:
-    """Take nothing."""
-
-
-def _scenario(info: Info | None) -> Scenario | None:
-    """Return the scenario that the world announced; None if this version cannot read it."""
-    try:
-        return scenario_file.from_text(info.scenario) if info else None
-    except ZsimError:
-        return None
-
-
-def _states(name: str, drones: tuple[str, ...], states: list[_State]) -> States:
-    """Return the cluster states that have the width of the last one, by time."""
+def _states(name: str, drones: tuple[str, ...], states: list[_State]) -> ClusterStates:
+    """Return the states of a cluster that have as many variables as the last one, by time."""
     if not states:
-        return States(name, drones)
+        return ClusterStates(name, drones)
     names = states[-1].names
     fit = [s for s in states if len(s.names) == len(s.value) == len(s.desired) == len(names) > 0]
     by_time = {state.t_ns: state for state in sorted(fit, key=lambda state: state.t_ns)}
     kept = list(by_time.values())
-    return States(
+    return ClusterStates(
         name=name,
         drones=drones or states[-1].drones,
         names=names,

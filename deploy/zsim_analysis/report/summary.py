@@ -1,4 +1,4 @@
-"""summary.json: what a run was and how well it flew."""
+"""summary.json: what a run was and how well it flew, beside what the paper printed."""
 
 from collections import Counter
 from pathlib import Path
@@ -10,13 +10,33 @@ from msgspec import Struct
 from zsim import __version__
 from zsim.contract.messages import Event
 from zsim.record.run_folder import record_notes
-from zsim_analysis.reading.command_age import command_age_ms
-from zsim_analysis.reading.flight import Flight, Participant
-from zsim_analysis.reading.formation_errors import Errors, min_separation_m, window
-from zsim_analysis.reading.formation_variables import Formation
+from zsim_analysis.reading.flight import RecordedFlight, RunParticipant
+from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m, window
+from zsim_analysis.reading.recorded_run import command_age_ms
 from zsim_analysis.reading.recorded_truth import TruthHash, truth_hash
-from zsim_analysis.report import paper
 
+# I. Mas, S. Curi, R. Sanchez Pena, Open-source Multi-UAV Simulator for the ROS Environment.
+# Table I: standard deviation of the formation parameters for Test 1 after steady state; m and rad.
+PAPER_TABLE_1 = {
+    "x_c": 0.11,
+    "y_c": 0.22,
+    "z_c": 0.13,
+    "roll": 0.004,
+    "pitch": 0.0025,
+    "yaw": 0.044,
+    "p": 0.032,
+    "q": 0.035,
+    "beta": 0.012,
+}
+
+PAPER_NOTE = (
+    "With GPS errors of 2.0 m that are independent from drone to drone, the error of a distance between two "
+    "drones is √6 = 2.45 times the error of a coordinate of their centroid, whatever filter each of them "
+    "uses on its own. In Table I p and q are 0.15 to 0.32 times x_c and y_c. So these figures cannot be "
+    "reached in truth with the set-up that the paper describes; they can be read as deviations of the "
+    "estimate from the desired value, which a controller makes small even when the estimate is wrong. "
+    "Compare the column est. std with the paper, and judge the flight by the columns of the truth."
+)
 EVENTS_PER_KIND = 100  # a flood of refusals must not push a restart out of the list
 EVENTS_MAX = 1000
 
@@ -35,10 +55,10 @@ class ClusterErrors(Struct, frozen=True):
     """How one cluster flew within the window."""
 
     drones: tuple[str, ...]
-    errors: dict[str, Errors]
+    errors: dict[str, ParameterErrors]
 
 
-class Record(Struct, frozen=True):
+class RecordFacts(Struct, frozen=True):
     """What the report was made from."""
 
     messages: int
@@ -49,8 +69,8 @@ class Record(Struct, frozen=True):
     truth_sha256: str
 
 
-class Summary(Struct, frozen=True):
-    """Everything that is said of a run; None where nobody knows."""
+class RunSummary(Struct, frozen=True):
+    """The content of summary.json; None where the record does not show a value."""
 
     scenario: str | None
     seed: int | None
@@ -67,7 +87,7 @@ class Summary(Struct, frozen=True):
     deadline_misses_by: dict[str, int]
     command_age_ms: dict[str, float] | None
     window_s: tuple[float, float]
-    errors: dict[str, Errors]
+    errors: dict[str, ParameterErrors]
     clusters: dict[str, ClusterErrors]
     min_separation_m: float | None
     paper_table_1: dict[str, float]
@@ -75,7 +95,7 @@ class Summary(Struct, frozen=True):
     events_left_out: dict[str, int]
     participants: list[dict[str, Any]]
     truth_sha256: str
-    record: Record
+    record: RecordFacts
     notes: list[str]
 
     def json(self) -> bytes:
@@ -83,18 +103,18 @@ class Summary(Struct, frozen=True):
         return msgspec.json.format(msgspec.json.encode(self), indent=2) + b"\n"
 
 
-def summarise(flight: Flight, formations: list[Formation], record: Path) -> Summary:
-    """Return the summary of a flight; what the world did not live to say is worked out from its record."""
+def summarise(flight: RecordedFlight, formations: list[Formation], record: Path) -> RunSummary:
+    """Return the summary of a flight; what the world did not report before it ended is computed from the record."""
     end = flight.end or {}
     info = flight.info
-    found = _hash(flight, end.get("last_ns", flight.last_ns))
+    truth = _hash(flight, end.get("last_ns", flight.last_ns))
     asked = flight.scenario.report.window_s if flight.scenario else None
     window_s, window_note = window(asked, flight.last_ns / 1e9)
     clusters = {f.name: ClusterErrors(f.drones, f.errors(window_s)) for f in formations}
     wall_s, span_s = end.get("wall_s", flight.wall_s), (flight.last_ns - flight.first_ns) / 1e9
     sim_s = end.get("sim_s", span_s if flight.replay_of else flight.last_ns / 1e9)
     lines, left_out = _lines(flight.events)
-    return Summary(
+    return RunSummary(
         scenario=flight.scenario.name if flight.scenario else None,
         seed=info.seed if info else None,
         mode=info.mode if info else None,
@@ -113,24 +133,24 @@ def summarise(flight: Flight, formations: list[Formation], record: Path) -> Summ
         errors=next((cluster.errors for cluster in clusters.values()), {}),
         clusters=clusters,
         min_separation_m=min_separation_m(flight.tracks),
-        paper_table_1=paper.TABLE_1,
+        paper_table_1=PAPER_TABLE_1,
         events=lines,
         events_left_out=left_out,
         participants=[_participant(process) for process in flight.participants],
-        truth_sha256=end.get("truth_sha256", found.sha256),
-        record=Record(
+        truth_sha256=end.get("truth_sha256", truth.sha256),
+        record=RecordFacts(
             messages=flight.messages,
             complete=flight.complete,
             undecoded=flight.undecoded,
-            truth_instants=found.instants,
-            truth_missing=found.missing,
-            truth_sha256=found.sha256,
+            truth_instants=truth.instants,
+            truth_missing=truth.missing,
+            truth_sha256=truth.sha256,
         ),
-        notes=_notes(flight, found, formations, window_s, window_note),
+        notes=_notes(flight, truth, formations, window_s, window_note),
     )
 
 
-def _hash(flight: Flight, last_ns: int) -> TruthHash:
+def _hash(flight: RecordedFlight, last_ns: int) -> TruthHash:
     """Return the hash of truth; a flight has truth from 0 or the first gate on, a replay from where it was begun."""
     gate_ns = flight.info.gate_ns if flight.info else None
     first_ns = flight.first_ns if flight.replay_of else min(flight.first_ns, gate_ns or 0)
@@ -138,12 +158,16 @@ def _hash(flight: Flight, last_ns: int) -> TruthHash:
 
 
 def _notes(
-    flight: Flight, found: TruthHash, formations: list[Formation], window_s: tuple[float, float], window_note: str
+    flight: RecordedFlight,
+    truth: TruthHash,
+    formations: list[Formation],
+    window_s: tuple[float, float],
+    window_note: str,
 ) -> list[str]:
     """Return what a reader has to know of the figures."""
     notes = [
         *_record_notes(flight),
-        *_truth_notes(found, (flight.end or {}).get("truth_sha256")),
+        *_truth_notes(truth, (flight.end or {}).get("truth_sha256")),
         window_note,
         *_formation_notes(flight, formations, window_s),
         *_fingerprint_notes(flight),
@@ -151,8 +175,8 @@ def _notes(
     return [note for note in notes if note]
 
 
-def _ended(flight: Flight) -> str:
-    """Return why the run ended; who died is not told by a record without an end."""
+def _ended(flight: RecordedFlight) -> str:
+    """Return why the run ended; a record without an end does not show which process died."""
     if flight.end:
         return str(flight.end.get("reason", "ended"))
     at = f"{flight.last_ns / 1e9:.2f} s"
@@ -173,13 +197,13 @@ def _lines(events: list[Event]) -> tuple[list[EventLine], dict[str, int]]:
     return lines, dict(left_out)
 
 
-def _versions(flight: Flight) -> dict[str, str]:
+def _versions(flight: RecordedFlight) -> dict[str, str]:
     world = {"world": flight.info.version} if flight.info else {}
     own = {process.name: process.version for process in flight.participants if process.version}
     return {**world, **own, "report": __version__}
 
 
-def _participant(process: Participant) -> dict[str, Any]:
+def _participant(process: RunParticipant) -> dict[str, Any]:
     return {
         "name": process.name,
         "role": process.role,
@@ -190,7 +214,7 @@ def _participant(process: Participant) -> dict[str, Any]:
     }
 
 
-def _record_notes(flight: Flight) -> list[str]:
+def _record_notes(flight: RecordedFlight) -> list[str]:
     notes = []
     if flight.replay_of:
         notes.append(f"This is a replay of run {flight.replay_of}, no flight of its own.")
@@ -206,16 +230,16 @@ def _record_notes(flight: Flight) -> list[str]:
     return notes
 
 
-def _truth_notes(found: TruthHash, said: str | None) -> list[str]:
+def _truth_notes(truth: TruthHash, reported: str | None) -> list[str]:
     notes = []
-    if found.missing:
-        notes.append(f"{found.missing} of {found.missing + found.instants} truth messages are not on record.")
-    if said and said != found.sha256:
-        notes.append(f"The truth on record has the hash {found.sha256}, the world reported {said}.")
+    if truth.missing:
+        notes.append(f"{truth.missing} of {truth.missing + truth.instants} truth messages are not on record.")
+    if reported and reported != truth.sha256:
+        notes.append(f"The truth on record has the hash {truth.sha256}, the world reported {reported}.")
     return notes
 
 
-def _formation_notes(flight: Flight, formations: list[Formation], window_s: tuple[float, float]) -> list[str]:
+def _formation_notes(flight: RecordedFlight, formations: list[Formation], window_s: tuple[float, float]) -> list[str]:
     notes = []
     judged = {formation.name for formation in formations}
     for cluster in flight.clusters:
@@ -233,7 +257,7 @@ def _formation_notes(flight: Flight, formations: list[Formation], window_s: tupl
     return notes
 
 
-def _fingerprint_notes(flight: Flight) -> list[str]:
+def _fingerprint_notes(flight: RecordedFlight) -> list[str]:
     own = flight.info.fingerprint if flight.info else ""
     others = [p.name for p in flight.participants if own and p.fingerprint and p.fingerprint != own]
     text = "computed with another numeric fingerprint than the world; the same bits are not promised."

@@ -1,1 +1,1 @@
-"""The run of a record flown again from its own inputs, and held against the truth on record. Imports reading."""
+"""The run of a record flown again from its own inputs, and compared with the truth on record. Imports reading."""

@@ -1,4 +1,4 @@
-"""A run flown again in this process: its world, its agents, and whatever else reached the world, from the record."""
+"""A run flown again in this process: its world, its agents, and from the record all else that reached the world."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -7,38 +7,38 @@ from typing import Any
 from zsim.contract import keys, messages
 from zsim.contract.bundle import KINDS, Bundle
 from zsim.contract.messages import ControlRequest
-from zsim.errors import DecodeError, RunError
+from zsim.errors import RunError
 from zsim.record import Recorded
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus
 from zsim.runtime.group import Group
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
-from zsim_analysis.rerun.participants import Cast
-from zsim_analysis.rerun.recorded_inputs import OUTPUTS, Passage
-from zsim_analysis.rerun.truth_comparison import Answers
+from zsim_analysis.reading.recorded_run import decode_or_none
+from zsim_analysis.rerun.recorded_inputs import OUTPUTS, GateInputs, RecordedAgents
+from zsim_analysis.rerun.truth_comparison import OutputComparison
 from zsim_world.flight.world import World
 
-STEERS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # requests that change a flight
+FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # requests that change a flight
 TRUTH = KINDS.index("truth")
 
 Requests = dict[int, list[tuple[str, ControlRequest]]]
 
 
-class AskedAgain(Group):
-    """Agents of one process, asked at each gate what they were asked on record.
+class AgentsWithRequests(Group):
+    """Agents of one process that receive the recorded requests again.
 
     Args:
-        team: all of them as one.
-        requests: by the first gate that they shape: control key, request.
+        agents: all of them as one.
+        requests: by the first gate that they affect: control key, request.
     """
 
-    def __init__(self, team: Agent, requests: Requests) -> None:
-        super().__init__([team])
-        self._asked = requests
+    def __init__(self, agents: Agent, requests: Requests) -> None:
+        super().__init__([agents])
+        self._requests = requests
 
     def step(self, t_ns: int) -> list[Output]:
-        for key, request in self._asked.pop(t_ns, ()):
+        for key, request in self._requests.pop(t_ns, ()):
             if key in self.control_keys():
                 self.control(key, request)
         return super().step(t_ns)
@@ -49,98 +49,96 @@ class RerunBus(Bus):
 
     Args:
         world: made anew.
-        cast: whose agents are run again; without any, all commands come from the record.
+        agents: those that are run again; without any, all commands come from the record.
         info, scenario: of the run.
 
     Attributes:
         truth: payloads at the newest gate, by drone.
-        refused: requests that were done on record, and are refused now, in words.
-        answers: of the agents, held against those on record.
+        refused: requests that were carried out on record and are refused now, as text.
+        outputs: of the agents, compared with those on record.
     """
 
-    def __init__(self, world: World, cast: Cast, info: messages.Info, scenario: Scenario) -> None:
-        asked = _by_gate(cast.requests)
-        teams = [AskedAgain(hosted(info, scenario, team.members), dict(asked)) for team in cast.teams]
-        super().__init__(world, teams, lambda: 0, self._say, self._note)
+    def __init__(self, world: World, agents: RecordedAgents, info: messages.Info, scenario: Scenario) -> None:
+        requests = _by_gate(agents.requests)
+        groups = [
+            AgentsWithRequests(hosted(info, scenario, process.members), dict(requests)) for process in agents.processes
+        ]
+        super().__init__(world, groups, lambda: 0, self._compare_output, self._keep_truth)
         self._world = world
-        self._played = cast.played
+        self._rerun = agents.names
         self.truth: dict[str, bytes] = {}
         self.refused: list[str] = []
-        self.answers = Answers(world.clock.delay_ns + 2 * world.clock.gate_ns)
+        self.outputs = OutputComparison(world.clock.delay_ns + 2 * world.clock.gate_ns)
 
-    def pass_on(self, passage: Passage) -> None:
-        """Take in what reached the world on the way to a gate, let the agents answer, and go to that gate.
+    def fly_to(self, gate: GateInputs) -> None:
+        """Receive the inputs of a gate, let the agents answer, and go to that gate.
 
         Raises:
             RunError: an agent does not answer, since what it waits for is not on record.
         """
-        for recorded in passage.inputs:
+        for recorded in gate.inputs:
             self._feed(recorded)
         while self._round():
             pass
-        blocking = [p.name for p in self._world.blocking() if p.name in self._played]
-        if blocking and self._world.clock.state != "waiting":
-            at = f"before {passage.t_ns / 1e9:.2f} s"
+        waiting = [p.name for p in self._world.blocking() if p.name in self._rerun]
+        if waiting and self._world.clock.state != "waiting":
+            at = f"before {gate.t_ns / 1e9:.2f} s"
             raise RunError(
-                f"{', '.join(blocking)} cannot answer {at}: what it waits for is not on record; --commands-only"
+                f"{', '.join(waiting)} cannot answer {at}: what it waits for is not on record; --commands-only"
             )
-        self.answers.close(passage.t_ns)
+        self.outputs.expire(gate.t_ns)
         self._world.advance(0)
         self._spread()
-        if self._world.now_ns != passage.t_ns:
+        if self._world.now_ns != gate.t_ns:
             reason = self._world.ended or "the gates are not those of the record"
             raise RunError(f"flown again, the run ends at {self._world.now_ns / 1e9:.2f} s: {reason}")
 
-    def _say(self, key: str, message: Any) -> None:
+    def _compare_output(self, key: str, message: Any) -> None:
         if isinstance(message, (*OUTPUTS, messages.Command)):
-            self.answers.take(key, message)
+            self.outputs.add(key, message)
 
-    def _note(self, bundle: Bundle) -> None:
+    def _keep_truth(self, bundle: Bundle) -> None:
         places: list[int] = bundle.which.tolist()
         truth = ((m, place) for m, place in enumerate(places) if place % len(KINDS) == TRUTH)
         self.truth = {keys.thing(bundle.table[place]): bundle.payload(m) for m, place in truth}
 
     def _tell_faults(self, faults: messages.Faults) -> None:
-        if self._played:  # alone, the world is fed with what came of them
+        if self._rerun:  # alone, the world receives the commands that resulted from them
             super()._tell_faults(faults)
 
-    # What is fed
-
     def _feed(self, recorded: Recorded) -> None:
-        try:
-            message = messages.decode(recorded.key, recorded.payload)
-        except DecodeError:
-            return  # the world refused it too
-        key = recorded.key
+        key, message = recorded.key, decode_or_none(recorded)
+        if message is None:  # the world refused it too
+            return
         if key == keys.EVENT:
             self._feed_event(message)
         elif isinstance(message, OUTPUTS):
             self._feed_output(key, message)
         elif isinstance(message, messages.Command):
-            if message.source in self._played:
-                self.answers.take(key, message)
+            if message.source in self._rerun:
+                self.outputs.add(key, message)
             else:
                 self._world.handle(key, message, 0)
-        elif keys.thing(key) not in self._played:
+        elif keys.thing(key) not in self._rerun:
             self._world.handle(key, message, 0)
 
     def _feed_output(self, key: str, message: Any) -> None:
-        """Hand what another process estimated, or said of a cluster, to the agents that read it."""
+        """Pass the estimate, or the output about a cluster, of another process to the agents that read it."""
         role = "estimator" if isinstance(message, messages.Estimate) else "controller"
-        asked = isinstance(message, messages.ClusterRequest)
-        source = (message.controller if asked else message.source) or f"{role}.{keys.thing(key)}"
-        if source in self._played:
-            self.answers.take(key, message)
+        is_request = isinstance(message, messages.ClusterRequest)
+        source = (message.controller if is_request else message.source) or f"{role}.{keys.thing(key)}"
+        if source in self._rerun:
+            self.outputs.add(key, message)
             return
         for inbox in self._way(key).inboxes:
             inbox.put(key, message)
         self._world.count_output(source)
 
     def _feed_event(self, event: messages.Event) -> None:
-        """Repeat what reached the world otherwise than as a message: deaths, and requests."""
-        if event.kind == "death" and event.subject not in self._played:
+        """Repeat what reached the world other than as a message: deaths, and requests."""
+        if event.kind == "death" and event.subject not in self._rerun:
             self._world.handle_death(event.subject, 0)
-        elif event.kind == "control" and event.subject in STEERS and event.data.get("ok"):
+        elif event.kind == "control" and event.subject in FLIGHT_REQUESTS and event.data.get("ok"):
             args = event.data.get("args")
             request = ControlRequest(event.subject, args if isinstance(args, dict) else {}, event.source)
             answer = self._world.control(request)
@@ -149,8 +147,8 @@ class RerunBus(Bus):
 
 
 def _by_gate(requests: Sequence[tuple[str, messages.ClusterRequest]]) -> Requests:
-    asked: defaultdict[int, list[tuple[str, ControlRequest]]] = defaultdict(list)
+    by_gate: defaultdict[int, list[tuple[str, ControlRequest]]] = defaultdict(list)
     for key, request in requests:
         control = keys.cluster_control(keys.thing(key))
-        asked[request.t_ns].append((control, ControlRequest(request.op, request.args, request.source)))
-    return dict(asked)
+        by_gate[request.t_ns].append((control, ControlRequest(request.op, request.args, request.source)))
+    return dict(by_gate)

@@ -11,7 +11,7 @@ COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_r
 
 
 class Difference(NamedTuple):
-    """Where two flights are apart: when, which drone, and by how much [m, m/s, rad, rad/s]."""
+    """How two flights differ: when, which drone, and by how much [m, m/s, rad, rad/s]."""
 
     t_ns: int
     drone: str
@@ -26,8 +26,8 @@ class Difference(NamedTuple):
         return f"{self.drone} at {self.t_ns / 1e9:.3f} s by {by}"
 
 
-class Comparison:
-    """Compares the truth of two flights as it comes.
+class TruthComparison:
+    """Compares the truth of two flights gate by gate.
 
     Args:
         drones: in scenario order.
@@ -43,17 +43,19 @@ class Comparison:
         self.first: Difference | None = None
         self.last: Difference | None = None
 
-    def take(self, t_ns: int, recorded: Mapping[str, bytes], flown: Mapping[str, bytes]) -> None:
-        """Take the truth of a gate from both, by drone."""
+    def add(self, t_ns: int, recorded: Mapping[str, bytes], flown: Mapping[str, bytes]) -> None:
+        """Compare the truth of a gate of both, by drone."""
         self.instants += 1
         for drone in self._drones:
-            if recorded[drone] != flown[drone] and (apart := difference(t_ns, drone, recorded[drone], flown[drone])):
-                self.first = self.first or apart
-                self.last = apart
+            if recorded[drone] != flown[drone] and (
+                differing := difference(t_ns, drone, recorded[drone], flown[drone])
+            ):
+                self.first = self.first or differing
+                self.last = differing
 
 
-class Answers:
-    """Holds what agents answer against what they answered on record; each may come before the other.
+class OutputComparison:
+    """Compares what agents put out with what they put out on record; each may come before the other.
 
     Args:
         patience_ns: simulated time after which the other comes no more.
@@ -61,42 +63,42 @@ class Answers:
 
     def __init__(self, patience_ns: int) -> None:
         self._patience_ns = patience_ns
-        self._single: dict[tuple[str, int, int], Message] = {}
-        self._apart: list[tuple[int, str]] = []
+        self._unmatched: dict[tuple[str, int, int], Message] = {}
+        self._different: list[tuple[int, str]] = []
 
     @property
     def first(self) -> str:
-        """Return the first answer that differs, or that one of the two lacks, and when; empty where there is none."""
-        if not self._apart:
+        """Return the first output that differs, or that only one of the two has, and when; empty if there is none."""
+        if not self._different:
             return ""
-        t_ns, key = min(self._apart)
+        t_ns, key = min(self._different)
         return f"{key} at {t_ns / 1e9:.2f} s"
 
-    def take(self, key: str, answer: Any) -> None:
-        """Take an answer of either."""
-        mark = (key, answer.seq, answer.t_ns)
-        other = self._single.pop(mark, None)
+    def add(self, key: str, output: Any) -> None:
+        """Add an output of either."""
+        identity = (key, output.seq, output.t_ns)
+        other = self._unmatched.pop(identity, None)
         if other is None:
-            self._single[mark] = answer
-        elif other != answer:
-            self._note(key, answer.t_ns)
+            self._unmatched[identity] = output
+        elif other != output:
+            self._note(key, output.t_ns)
 
-    def close(self, t_ns: int) -> None:
-        """Give up waiting for the other of those that are old at t_ns."""
-        for mark in [mark for mark in self._single if mark[2] < t_ns - self._patience_ns]:
-            del self._single[mark]
-            self._note(mark[0], mark[2])
+    def expire(self, t_ns: int) -> None:
+        """Count those as different whose counterpart has not come within the patience before t_ns."""
+        for identity in [identity for identity in self._unmatched if identity[2] < t_ns - self._patience_ns]:
+            del self._unmatched[identity]
+            self._note(identity[0], identity[2])
 
     def _note(self, key: str, t_ns: int) -> None:
-        if not self._apart or t_ns <= min(self._apart)[0]:
-            self._apart.append((t_ns, key))
+        if not self._different or t_ns <= min(self._different)[0]:
+            self._different.append((t_ns, key))
 
 
 def difference(t_ns: int, drone: str, recorded: bytes, flown: bytes) -> Difference | None:
-    """Return how far two true states are apart; None if what counts is the same to the bit.
+    """Return the difference of two true states; None if the COUNTED fields are the same to the bit.
 
     Raises:
-        DecodeError: one is no truth.
+        DecodeError: one of them is no truth.
     """
     key = keys.truth(drone)
     a, b = messages.decode(key, recorded), messages.decode(key, flown)

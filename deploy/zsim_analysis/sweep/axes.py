@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
-from zsim.scenario.overrides import whole_path
+from zsim.scenario.overrides import steps_of, whole_path
 from zsim.scenario.random_streams import stream
 from zsim.schema import yaml_file
 from zsim.schema.checker import show
@@ -18,6 +18,7 @@ from zsim.schema.checker import show
 SEED = "seed"
 SEEDS = 2**32  # drawn below it: ten digits that a person can type
 SYNTAX = "seed, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std)"
+FieldPath = tuple[str | int, ...]  # steps to a field of a scenario from the top
 _DRAWN = re.compile(r"\s*([a-z]+)\((.*)\)\s*")
 
 
@@ -29,10 +30,10 @@ class Seeds(Struct, frozen=True):
     def draw(self, seed: int, count: int) -> list[int]:
         """Return the seeds of the first runs of a scenario's seed; more runs leave the earlier ones as they are."""
         rng = stream(seed, "sweep/seed")
-        found: dict[int, None] = {}
-        while len(found) < count:
-            found[int(rng.integers(SEEDS))] = None
-        return list(found)
+        seeds: dict[int, None] = {}
+        while len(seeds) < count:
+            seeds[int(rng.integers(SEEDS))] = None
+        return list(seeds)
 
 
 class Grid(Struct, frozen=True):
@@ -61,24 +62,24 @@ Axis = Seeds | Grid | Draw
 
 
 def parse(text: str) -> Axis:
-    """Return the axis that a text of `--vary` says.
+    """Return the axis of a text of `--vary`.
 
     Raises:
-        ValueError: what is wrong with it.
+        ValueError: it is not of the form of SYNTAX.
     """
-    path, equals, given = text.partition("=")
+    path, equals, values = text.partition("=")
     if text.strip() == SEED:
         return Seeds()
     if not equals or not path.strip():
         raise ValueError(f"is no variation; must be {SYNTAX}")
     path = whole_path(path.strip())
-    drawn = _DRAWN.fullmatch(given)
-    return _draw(path, drawn[1], drawn[2]) if drawn else Grid(path, _values(given))
+    drawn = _DRAWN.fullmatch(values)
+    return _draw(path, drawn[1], drawn[2]) if drawn else Grid(path, _grid_values(values))
 
 
-def _values(given: str) -> tuple[Any, ...]:
+def _grid_values(text: str) -> tuple[Any, ...]:
     try:
-        values = yaml_file.value(f"[{given}]")
+        values = yaml_file.value(f"[{text}]")
     except ValueError as error:
         raise ValueError(f"{error}; must be {SYNTAX}") from error
     if not values:
@@ -89,20 +90,54 @@ def _values(given: str) -> tuple[Any, ...]:
     return tuple(values)
 
 
-def _draw(path: str, kind: str, given: str) -> Draw:
+def _draw(path: str, kind: str, arguments: str) -> Draw:
     if kind not in ("uniform", "normal"):
         raise ValueError(f"draws by {kind}; must be uniform(low,high) or normal(mean,std)")
     try:
-        first, second = (float(part) for part in given.split(","))
+        first, second = (float(part) for part in arguments.split(","))
     except ValueError:
-        raise ValueError(f"has {kind}({given[:40]}); must hold two numbers") from None
+        raise ValueError(f"has {kind}({arguments[:40]}); must hold two numbers") from None
     span = second - first if kind == "uniform" else second
     if not (math.isfinite(first) and math.isfinite(second) and 0 < span < math.inf):
         need = "low < high, high - low finite too" if kind == "uniform" else "std > 0"
-        raise ValueError(f"has {kind}({given[:40]}); must be finite numbers with {need}")
+        raise ValueError(f"has {kind}({arguments[:40]}); must be finite numbers with {need}")
     return Draw(path, kind, first, second)
 
 
 def text_of(value: Any) -> str:
     """Return a value as `--set` takes it, in one line."""
     return value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+def field_path(document: dict[str, Any], path: str) -> FieldPath:
+    """Return the steps to a field from the top; entries of lists count from 0, whether by index or by name.
+
+    Args:
+        document: raw, not changed; steps to fields that it does not have are kept as text.
+        path: as `--set` takes it.
+    """
+    steps: list[str | int] = []
+    value: Any = document
+    for text in steps_of(path):
+        step = _entry(value, text) if isinstance(value, list) else text
+        steps.append(step)
+        value = _value_at(value, step)
+    return tuple(steps)
+
+
+def is_inside(one: FieldPath, other: FieldPath) -> bool:
+    """Return whether one field is part of the other."""
+    return len(one) > len(other) and one[: len(other)] == other
+
+
+def _entry(entries: list[Any], text: str) -> str | int:
+    names = [entry.get("name") if isinstance(entry, dict) else None for entry in entries]
+    if text in names:
+        return names.index(text)
+    return int(text) if re.fullmatch(r"[0-9]{1,9}", text) else text
+
+
+def _value_at(value: Any, step: str | int) -> Any:
+    if isinstance(value, dict):
+        return value.get(step)
+    return value[step] if isinstance(value, list) and isinstance(step, int) and step < len(value) else None

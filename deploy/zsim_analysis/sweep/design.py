@@ -1,27 +1,81 @@
-"""The runs of a plan: which values each of them has, and the scenario that comes of it."""
+"""The plan of a sweep, and its design: the runs, the values that each of them has, and the scenarios of them."""
 
 import copy
 import math
 import re
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec import Struct
 
+from zsim import __version__
 from zsim.errors import ScenarioError
 from zsim.scenario import overrides, scenario_file
+from zsim.scenario.overrides import whole_path
 from zsim.scenario.scenario import Scenario
-from zsim_analysis.sweep.axes import SEED, Axis, Draw, Grid, parse, text_of
-from zsim_analysis.sweep.paths import Place, inside, place
-from zsim_analysis.sweep.sweep_plan import RUNS_MAX, Plan
+from zsim.scenario.scenario_file import EXAMPLE
+from zsim.schema import yaml_file
+from zsim_analysis.sweep.axes import SEED, Axis, Draw, FieldPath, Grid, field_path, is_inside, parse, text_of
 
-FAULTS_MAX = 100  # lines; what follows is counted
-_FOUND = re.compile(r" is [^;]*")  # in a fault: what differs from run to run where values are drawn
+PLAN = "plan.json"
+RUNS_MAX = 1_000_000
+FAULTS_MAX = 100  # lines; further ones are counted
+_VALUE = re.compile(r" is [^;]*")  # in a fault: what differs from run to run where values are drawn
 _DEFAULT_SEED: int = next(f.default for f in msgspec.structs.fields(Scenario) if f.name == SEED)
 
 
-class Design:
+class SweepPlan(Struct, frozen=True, kw_only=True):
+    """One scenario and its variations: the same plan gives the same runs, on any host and in any order.
+
+    Attributes:
+        source: name of the scenario's file, for messages.
+        document: the file with the overrides of the command line, presets not yet expanded.
+        vary: texts of `--vary`, in their order.
+        runs: how many; a plan of more runs begins with the same ones.
+        records: whether every run keeps its record.
+        version: of zsim; another one need not give the same numbers.
+    """
+
+    source: str
+    document: dict[str, Any]
+    vary: tuple[str, ...]
+    runs: int
+    records: bool = False
+    version: str = __version__
+
+
+def difference(old: SweepPlan, new: SweepPlan) -> str | None:
+    """Return in which way two plans are not the same sweep, None if `new` continues `old`."""
+    if old.version != new.version:
+        return f"it was begun by zsim {old.version}, this is {new.version}"
+    if old.document != new.document:
+        keys = sorted(old.document.keys() | new.document.keys())
+        other = next(key for key in keys if old.document.get(key) != new.document.get(key))
+        return f"{other} of its scenario is another one"
+    if _whole(old.vary) != _whole(new.vary):
+        return f"it varies {' '.join(old.vary) or 'nothing'}, not {' '.join(new.vary) or 'nothing'}"
+    if old.records != new.records:
+        return f"it {'keeps' if old.records else 'does not keep'} records"
+    if new.runs < old.runs:
+        return f"it has {old.runs} runs, more than {new.runs}"
+    return None
+
+
+def _whole(vary: tuple[str, ...]) -> list[str]:
+    """Return texts of `--vary` with their paths from the top of the scenario."""
+    parts = [text.partition("=") for text in vary]
+    return [f"{whole_path(path.strip())}{equals}{values}" for path, equals, values in parts]
+
+
+def is_sweep(folder: Path) -> bool:
+    """Return whether a folder holds a sweep."""
+    return (folder / PLAN).is_file()
+
+
+class SweepDesign:
     """Everything that follows from a plan; runs and points count from 0.
 
     Attributes:
@@ -29,7 +83,7 @@ class Design:
         points: how many combinations of the grid's values there are; run i flies the i-th, then the first again.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: SweepPlan) -> None:
         self.plan = plan
         self.axes: list[Axis] = [parse(text) for text in plan.vary]
         self._grids = [axis for axis in self.axes if isinstance(axis, Grid)]
@@ -37,9 +91,9 @@ class Design:
 
     @property
     def seed(self) -> int:
-        """Return the scenario's own seed, from which all that varies by chance is drawn; a faulty one is not flown."""
-        given = self.plan.document.get(SEED)
-        return given if isinstance(given, int) and given >= 0 else _DEFAULT_SEED
+        """Return the scenario's own seed, from which seeds and values are drawn; a faulty one is not flown."""
+        seed = self.plan.document.get(SEED)
+        return seed if isinstance(seed, int) and seed >= 0 else _DEFAULT_SEED
 
     @property
     def varied(self) -> list[str]:
@@ -47,16 +101,16 @@ class Design:
         return [axis.path for axis in self.axes if axis.path != SEED]
 
     def point(self, run: int) -> int:
-        """Return which point of the grid a run flies."""
+        """Return the point of the grid that a run flies."""
         return run % self.points
 
     def at(self, point: int) -> dict[str, Any]:
-        """Return the values of a point by path; the last axis turns fastest."""
-        found = {}
+        """Return the values of a point by path; those of the last axis change fastest."""
+        values = {}
         for grid in reversed(self._grids):
-            point, place = divmod(point, len(grid.values))
-            found[grid.path] = grid.values[place]
-        return dict(reversed(found.items()))
+            point, index = divmod(point, len(grid.values))
+            values[grid.path] = grid.values[index]
+        return dict(reversed(values.items()))
 
     def values(self, run: int) -> dict[str, Any]:
         """Return what a run sets, by path, in the order of the axes."""
@@ -76,32 +130,32 @@ class Design:
         """
         document = copy.deepcopy(self.plan.document)
         assigned = [_assign(document, path, value) for path, value in self.values(run).items()]
-        wrong = [fault for fault in assigned if fault]
+        faults = [fault for fault in assigned if fault]
         try:
             scenario = scenario_file.resolve(document, self.plan.source)
         except ScenarioError as error:
-            raise ScenarioError([*wrong, *error.faults]) from error
-        if wrong:
-            raise ScenarioError(wrong)
+            raise ScenarioError([*faults, *error.faults]) from error
+        if faults:
+            raise ScenarioError(faults)
         return scenario
 
     def faults(self, progress: Callable[[int, int], None] = lambda run, of: None) -> list[str]:
         """Return the faults of every combination: each point of the grid, each run where values are drawn.
 
         Args:
-            progress: told the combination that is looked at, and how many there are.
+            progress: called with the number of the combination that is checked, and how many there are.
         """
         drawn = any(isinstance(axis, Draw) for axis in self.axes)
         checked = self.plan.runs if drawn else min(self.plan.runs, self.points)
-        found: dict[str, tuple[str, list[int]]] = {}
+        runs_of: dict[str, tuple[str, list[int]]] = {}
         for run in range(checked):
             progress(run, checked)
             for fault in _faults(self.scenario, run):
-                found.setdefault(_FOUND.sub(" is …", fault), (fault, []))[1].append(run)
-        return [self._told(fault, runs, checked) for fault, runs in found.values()]
+                runs_of.setdefault(_VALUE.sub(" is …", fault), (fault, []))[1].append(run)
+        return [self._with_runs(fault, runs, checked) for fault, runs in runs_of.values()]
 
-    def _told(self, fault: str, runs: list[int], checked: int) -> str:
-        """Return a fault with the combinations that have it, where not all of them do."""
+    def _with_runs(self, fault: str, runs: list[int], checked: int) -> str:
+        """Return a fault with the combinations that have it, unless all of them do."""
         if len(runs) == checked:
             return fault
         values = {path: value for path, value in self.values(runs[0]).items() if path != SEED}
@@ -116,29 +170,29 @@ def make_plan(
     runs: int | None,
     records: bool = False,
     progress: Callable[[int, int], None] = lambda run, of: None,
-    before: Sequence[str] = (),
-) -> Plan:
+    earlier_faults: Sequence[str] = (),
+) -> SweepPlan:
     """Return the plan of a sweep, all its combinations checked; without `runs`, one run for each of them.
 
     Args:
         source: name of the scenario's file, for messages.
-        document: raw; see `document.read`.
+        document: raw; see `read_document`.
         vary: texts of `--vary`.
         runs: how many, None: as many as the grid has combinations.
         records: whether every run keeps its record.
-        progress: told the combination that is looked at, and how many there are.
-        before: faults found already, to be told with the others.
+        progress: called with the number of the combination that is checked, and how many there are.
+        earlier_faults: of the overrides, reported with the others.
 
     Raises:
         ScenarioError: with every fault of the variations and of what comes of them, a line each.
     """
-    texts, wrong = _parsed(vary, document)
-    faults = [*before, *wrong]
+    texts, vary_faults = _parsed(vary, document)
+    faults = [*earlier_faults, *vary_faults]
     source = source.encode(errors="surrogateescape").decode(errors="replace")  # a file's name may be any bytes
-    plan = Plan(source=source, document=document, vary=tuple(texts), runs=runs or 1, records=records)
-    plan = msgspec.structs.replace(plan, runs=runs or Design(plan).points)
-    design = Design(plan)
-    faults += _count_faults(design, all_known=not wrong)
+    plan = SweepPlan(source=source, document=document, vary=tuple(texts), runs=runs or 1, records=records)
+    plan = msgspec.structs.replace(plan, runs=runs or SweepDesign(plan).points)
+    design = SweepDesign(plan)
+    faults += _count_faults(design, all_known=not vary_faults)
     if plan.runs <= RUNS_MAX:
         faults += _faults(lambda _: scenario_file.resolve(copy.deepcopy(document), source), 0)
         faults += [fault for fault in design.faults(progress) if fault not in faults]
@@ -149,8 +203,8 @@ def make_plan(
 
 
 def _parsed(vary: list[str], document: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """Return the texts of `--vary` that can be taken, and a line for each of the others."""
-    taken: dict[Place, str] = {}
+    """Return the texts of `--vary` that are valid, and a fault for each of the others."""
+    fields: dict[FieldPath, str] = {}
     faults = []
     for text in vary:
         shown = _shown(text)
@@ -159,33 +213,33 @@ def _parsed(vary: list[str], document: dict[str, Any]) -> tuple[list[str], list[
         except ValueError as error:
             faults.append(f"--vary {shown}: {error}")
             continue
-        where = place(document, path)
-        fault = _overlap(path, where, taken)
+        steps = field_path(document, path)
+        fault = _overlap(path, steps, fields)
         if fault:
             faults.append(f"--vary {shown}: {fault}")
         else:
-            taken[where] = text
-    return list(taken.values()), faults
+            fields[steps] = text
+    return list(fields.values()), faults
 
 
 def _shown(text: str) -> str:
     return text[:80] if text.isprintable() else repr(text)[:80]
 
 
-def _overlap(path: str, where: Place, taken: dict[Place, str]) -> str | None:
-    """Say what is wrong with a path of which a part, or the whole, varies already."""
-    for other, text in taken.items():
-        if where == other:
+def _overlap(path: str, steps: FieldPath, fields: dict[FieldPath, str]) -> str | None:
+    """Return the fault of a path of which a part, or the whole, varies already."""
+    for other, text in fields.items():
+        if steps == other:
             return f"{path} varies already by {_shown(text)}; give it once"
-        if inside(where, other):
+        if is_inside(steps, other):
             return f"{path} is part of what varies already by {_shown(text)}; vary one of the two"
-        if inside(other, where):
+        if is_inside(other, steps):
             return f"{path} holds what varies already by {_shown(text)}; vary one of the two"
     return None
 
 
-def _count_faults(design: Design, all_known: bool) -> list[str]:
-    """Return what is wrong with the number of runs; `all_known`: no axis was refused, that could be one by chance."""
+def _count_faults(design: SweepDesign, all_known: bool) -> list[str]:
+    """Return the faults of the number of runs; `all_known`: no axis was refused, which might have been a drawn one."""
     runs, points = design.plan.runs, design.points
     if runs > RUNS_MAX:
         return [f"--runs is {runs}; must be at most {RUNS_MAX}"]
@@ -208,3 +262,20 @@ def _assign(document: dict[str, Any], path: str, value: Any) -> str | None:
     """Set a field of a document to a copy of a value; return the fault if there is one."""
     fault = overrides.apply(document, f"{path}={text_of(value)}", lambda _: copy.deepcopy(value))
     return f"--vary {fault.removeprefix('--set ')}" if fault else None
+
+
+def read_document(path: Path, set_texts: list[str], **values: Any) -> tuple[dict[str, Any], list[str]]:
+    """Return the raw document, as `scenario_file.load` takes it, and the faults of the overrides.
+
+    Args:
+        path: the file.
+        set_texts: texts `a.b.c=value` as given to `--set`, applied in order.
+        values: top-level fields that replace the file's, None being ignored.
+
+    Raises:
+        ScenarioError: the file holds no map.
+    """
+    document = yaml_file.read(path, EXAMPLE, ScenarioError)
+    document.update({key: value for key, value in values.items() if value is not None})
+    applied = [overrides.apply(document, text, yaml_file.value) for text in set_texts]
+    return document, [fault for fault in applied if fault]

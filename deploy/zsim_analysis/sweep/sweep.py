@@ -1,5 +1,6 @@
-"""A whole sweep: plan in, finished runs in a folder, one table of them."""
+"""Flies a whole sweep: plan in; finished runs in a folder, and their table, out; a live line on the terminal."""
 
+import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from importlib.util import find_spec
@@ -7,39 +8,113 @@ from pathlib import Path
 from typing import Protocol
 
 from msgspec import Struct
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
 
 from zsim.errors import RunError
-from zsim_analysis.sweep.fly.process_pool import Pool, cores
-from zsim_analysis.sweep.fly.task import Task
-from zsim_analysis.sweep.results.row import Row
-from zsim_analysis.sweep.screen import SweepScreen
-from zsim_analysis.sweep.sweep_folder import Folder, locked
-from zsim_analysis.sweep.sweep_plan import Plan
+from zsim.runtime.progress import Throttle
+from zsim_analysis.sweep.design import SweepPlan
+from zsim_analysis.sweep.process_pool import ProcessPool, cores
+from zsim_analysis.sweep.sweep_folder import SweepFolder, locked
+from zsim_analysis.sweep.sweep_row import Row, Task
 
+PLAIN_S = 10.0  # wall time between two lines where no terminal is
+BAR = 20  # characters
 NEEDED = {"sweep": ("pyarrow", "numba", "filterpy", "mcap", "matplotlib", "jinja2"), "dask": ("distributed",)}
 
 
-class Order(Struct, frozen=True):
-    """What is to be done.
+class SweepScreen:
+    """Shows how far a sweep is, while it is entered.
+
+    Args:
+        total: runs of the plan.
+        done: of them before this start.
+        now_s: monotonic wall time.
+    """
+
+    def __init__(
+        self, total: int, done: int, console: Console | None = None, now_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.console = console or Console(stderr=True)
+        self._total = total
+        self._before = self._done = done
+        self._failed = 0
+        self._now_s = now_s
+        self._start_s = now_s()
+        self._throttle = Throttle(PLAIN_S)
+        self._live = Live(console=self.console, get_renderable=self._text, refresh_per_second=5, transient=True)
+
+    def __enter__(self) -> "SweepScreen":
+        self._start_s = self._now_s()
+        if self.console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.console.is_terminal:
+            self._live.stop()
+        elif self._done > self._before:
+            self.say(self.line())
+
+    def say(self, text: str) -> None:
+        """Show a line that stays."""
+        self.console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def finished(self, failed: bool) -> None:
+        """Count a run."""
+        self._done += 1
+        self._failed += failed
+        if not self.console.is_terminal and self._done < self._total and self._throttle.passes():
+            self.say(self.line())
+
+    def line(self) -> str:
+        """Return runs done, runs per hour since the start, and time to go at that rate."""
+        filled = int(BAR * self._done / self._total)
+        text = f"{'█' * filled}{'░' * (BAR - filled)} {self._done} / {self._total} runs"
+        flown, elapsed_s = self._done - self._before, self._now_s() - self._start_s
+        if flown and elapsed_s > 0:
+            text += f"  {3600 * flown / elapsed_s:,.0f} runs/h"
+            if self._done < self._total:
+                text += f"  {span((self._total - self._done) * elapsed_s / flown)} to go"
+        elif self._done < self._total:
+            text += f"  the first ones are flying, {span(elapsed_s)}"
+        return text + (f"  {self._failed} failed" if self._failed else "")
+
+    def _text(self) -> Text:
+        return Text(self.line())
+
+
+def span(seconds: float) -> str:
+    """Return a time in words, to the second below an hour."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+
+
+class SweepRequest(Struct, frozen=True):
+    """What to fly, where to, and by which processes.
 
     Attributes:
         plan: what is flown.
         out: folder of the sweep.
         workers: processes on this host, None: one per core.
-        dask: address of a Dask scheduler whose workers fly instead.
+        dask: address of a Dask scheduler whose workers are used instead.
     """
 
-    plan: Plan
+    plan: SweepPlan
     out: Path
     workers: int | None = None
     dask: str | None = None
 
 
-class Flyers(Protocol):
-    """Whoever flies tasks."""
+class WorkerPool(Protocol):
+    """Flies tasks on worker processes, here or on other hosts."""
 
     def rows(self, tasks: Iterator[Task]) -> Generator[Row]:
-        """Yield the rows of tasks as they are finished; closed, fly no further."""
+        """Yield the rows of tasks as they are finished; when closed, fly no further."""
         ...
 
 
@@ -55,27 +130,27 @@ def check_installed(dask: bool) -> None:
             raise RunError(f"zsim sweep: {missing[0]} is not installed; install zsim[{extra}]")
 
 
-def sweep(order: Order) -> list[Row]:
+def sweep(request: SweepRequest) -> list[Row]:
     """Fly what the folder does not hold yet; return all that it holds then, also after Ctrl-C.
 
     Raises:
         RunError: the folder holds something else, or cannot be written; workers cannot start.
         KeyboardInterrupt: the finished runs are in the table.
     """
-    with locked(order.out, order.plan) as folder:
+    with locked(request.out, request.plan) as folder:
         done = {row["run"] for row in folder.compact()}
-        missing = [run for run in range(order.plan.runs) if run not in done]
-        with SweepScreen(order.plan.runs, len(done)) as screen:
+        missing = [run for run in range(request.plan.runs) if run not in done]
+        with SweepScreen(request.plan.runs, len(done)) as screen:
             _say_start(folder, len(done), screen.say)
             try:
                 if missing:
-                    _fly(folder, _flyers(order, len(missing), screen.say), missing, screen)
+                    _fly(folder, _pool(request, len(missing), screen.say), missing, screen)
             finally:
                 rows = folder.compact()
     return rows
 
 
-def _say_start(folder: Folder, done: int, say: Callable[[str], None]) -> None:
+def _say_start(folder: SweepFolder, done: int, say: Callable[[str], None]) -> None:
     plan, points = folder.plan, folder.design.points
     over = f" over {points} combinations" if points > 1 else ""
     say(f"{plan.source}: {plan.runs} runs{over}, into {folder.path}")
@@ -83,22 +158,22 @@ def _say_start(folder: Folder, done: int, say: Callable[[str], None]) -> None:
         say(f"{done} of them {'is' if done == 1 else 'are'} done already")
 
 
-def _flyers(order: Order, missing: int, say: Callable[[str], None]) -> Flyers:
-    if order.dask is None:
-        return Pool(min(order.workers or cores(), missing), say)
-    from zsim_analysis.sweep.fly.dask_pool import DaskPool
+def _pool(request: SweepRequest, missing: int, say: Callable[[str], None]) -> WorkerPool:
+    if request.dask is None:
+        return ProcessPool(min(request.workers or cores(), missing), say)
+    from zsim_analysis.sweep.dask_pool import DaskPool
 
-    return DaskPool(order.dask, say)
+    return DaskPool(request.dask, say)
 
 
-def _fly(folder: Folder, flyers: Flyers, missing: list[int], screen: SweepScreen) -> None:
-    with folder.journal() as journal, closing(flyers.rows(_tasks(folder, missing))) as rows:
+def _fly(folder: SweepFolder, pool: WorkerPool, missing: list[int], screen: SweepScreen) -> None:
+    with folder.journal() as journal, closing(pool.rows(_tasks(folder, missing))) as rows:
         for row in rows:
             journal.append(row)
             screen.finished(row["failure"] is not None)
 
 
-def _tasks(folder: Folder, runs: list[int]) -> Iterator[Task]:
+def _tasks(folder: SweepFolder, runs: list[int]) -> Iterator[Task]:
     """Yield the tasks of some runs, each made when it is asked for."""
     design = folder.design
     for run in runs:

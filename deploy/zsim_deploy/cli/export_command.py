@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsim_analysis.export.formats import Format
+from zsim_analysis.export.output import Format
 from zsim_deploy.options.arguments import not_negative
 from zsim_deploy.terminal.interrupts import interruptible
 
 if TYPE_CHECKING:
-    from zsim_analysis.export.make_export import Exported
+    from zsim_analysis.export.make_export import ExportResult
 
 PANEL = "Run"
 
@@ -44,14 +44,14 @@ def export(
     from rich.progress import Progress
 
     from zsim.record.run_folder import record_at
-    from zsim_analysis.export.formats import check_installed
+    from zsim_analysis.export.output import check_installed
 
     if from_ is not None and to is not None and to < from_:
         raise typer.BadParameter(f"--to is {to:g}, before --from {from_:g}; must be at or after it")
     record_at(run)
     check_installed(form)
     from zsim_analysis.export.make_export import export as write
-    from zsim_analysis.export.selection import Selection
+    from zsim_analysis.export.selection import MessageSelection
 
     console = Console(stderr=True)
     with interruptible(), Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
@@ -60,14 +60,14 @@ def export(
             run,
             form,
             out,
-            Selection(tuple(keys or ()), from_, to),
+            MessageSelection(tuple(keys or ()), from_, to),
             force,
             lambda count, of: bar.update(task, description="reading messages", completed=count, total=of),
         )
     _show(done)
 
 
-def _show(done: "Exported") -> None:
+def _show(done: "ExportResult") -> None:
     for note in done.notes:
         print(f"note: {note}", file=sys.stderr)
     for name, rows in done.tables.items():

@@ -41,7 +41,7 @@ def report(
 ) -> None:
     """Make summary.json, figures and report.html of a run from its record, or of a sweep; or compare several runs."""
     from zsim.record.run_folder import record_in
-    from zsim_analysis.sweep.sweep_plan import is_sweep
+    from zsim_analysis.sweep.design import is_sweep
 
     if len(directories) > 1:
         _compare(directories, out)
@@ -69,7 +69,7 @@ def _report_at_the_end(out: Path, failed: bool) -> None:
 
 
 def _report(directory: Path) -> None:
-    from zsim_analysis.report import make_report, table
+    from zsim_analysis.report.make_report import make_report, table
     from zsim_deploy.terminal import report_terminal
 
     report_terminal.show(directory, "reading the record …", make_report, table)
@@ -79,8 +79,8 @@ def _compare(directories: list[Path], out: Path | None) -> None:
     from rich.console import Console
 
     from zsim.record.run_folder import record_in
-    from zsim_analysis.report import compare, comparison_path
-    from zsim_analysis.sweep.sweep_plan import is_sweep
+    from zsim_analysis.report.make_comparison import compare, comparison_path
+    from zsim_analysis.sweep.design import is_sweep
 
     for directory in directories:
         if is_sweep(directory):

@@ -12,7 +12,7 @@ from zsim_deploy.options.arguments import Duration, ScenarioPath, Seed, Set
 from zsim_deploy.terminal.interrupts import INTERRUPTED
 
 if TYPE_CHECKING:
-    from zsim_analysis.sweep.sweep_plan import Plan
+    from zsim_analysis.sweep.design import SweepPlan
 
 PANEL = "Run"
 
@@ -42,7 +42,7 @@ def sweep(
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
 ) -> None:
     """Fly a scenario many times, with other seeds and values of its fields: one table, one report."""
-    from zsim_analysis.sweep.sweep import Order, check_installed
+    from zsim_analysis.sweep.sweep import SweepRequest, check_installed
     from zsim_analysis.sweep.sweep import sweep as fly
 
     if dask is not None and (keep_records or workers is not None):
@@ -53,7 +53,7 @@ def sweep(
     folder = out or Path("runs") / f"{plan.document['name']}-sweep-{time.strftime('%Y%m%d-%H%M%S')}"
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        rows = fly(Order(plan, folder, workers, dask))
+        rows = fly(SweepRequest(plan, folder, workers, dask))
     except KeyboardInterrupt:
         print(f"interrupted; the same command with --out {folder} goes on, the table so far is in it", file=sys.stderr)
         sys.exit(INTERRUPTED)
@@ -68,13 +68,12 @@ def _plan(
     duration: float | None,
     runs: int | None,
     records: bool,
-) -> "Plan":
+) -> "SweepPlan":
     from rich.console import Console
 
-    from zsim_analysis.sweep.design import make_plan
-    from zsim_analysis.sweep.document import read
+    from zsim_analysis.sweep.design import make_plan, read_document
 
-    document, faults = read(path, overrides, seed=seed, duration_s=duration)
+    document, faults = read_document(path, overrides, seed=seed, duration_s=duration)
     with Console(stderr=True).status("checking every combination …") as status:
         return make_plan(
             path.name,
@@ -100,7 +99,7 @@ def _conclude(folder: Path, failures: list[str], runs: int, report: bool) -> Non
 
 def make_report(folder: Path) -> None:
     """Make the report of a sweep, and show its table."""
-    from zsim_analysis.sweep.results.make_sweep_report import make_sweep_report, table
+    from zsim_analysis.sweep.make_sweep_report import make_sweep_report, table
     from zsim_deploy.terminal import report_terminal
 
     report_terminal.show(folder, "reading the table …", make_sweep_report, table)

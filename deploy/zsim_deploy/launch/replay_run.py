@@ -14,7 +14,7 @@ from zsim.record.run_folder import record_notes
 from zsim.runtime.progress import Screen
 from zsim.transport import session
 from zsim.transport.identity import Identity
-from zsim_analysis.reading.recorded_run import opened
+from zsim_analysis.reading.recorded_run import open_run
 from zsim_deploy.roles.roles import told
 from zsim_deploy.roles.stop_channel import Leash
 from zsim_deploy.security.key_lease import lent
@@ -50,7 +50,7 @@ def play(place: Path, wish: Wish, who: Identity) -> None:
     for expression in wish.choice.keys:
         session.check_expression(expression)
     leash = Leash(False, lent(who, None))
-    with opened(place) as (reader, info, scenario):
+    with open_run(place) as (reader, info, scenario):
         _check(wish.choice.keys, reader)
         if wish.federation is not None:
             federation = keys.name(wish.federation, "federation")

@@ -25,13 +25,12 @@ from typer.testing import CliRunner
 from zsim.contract import keys, messages
 from zsim.errors import ReportError, RunError
 from zsim.record import RecordReader, RecordWriter
-from zsim_analysis.export import formats, matlab
-from zsim_analysis.export.atomic_output import placed
-from zsim_analysis.export.columns import fields, table_name
-from zsim_analysis.export.formats import Format
+from zsim_analysis.export import matlab, output
 from zsim_analysis.export.make_export import export
 from zsim_analysis.export.matlab import matlab_names
-from zsim_analysis.export.selection import Selection
+from zsim_analysis.export.message_columns import fields, table_name
+from zsim_analysis.export.output import Format, placed
+from zsim_analysis.export.selection import MessageSelection
 from zsim_deploy.cli.cli import app
 
 GATES = 301  # of six seconds
@@ -196,7 +195,7 @@ def test_a_variable_that_matlab_would_not_load_is_refused(run: Path, monkeypatch
 
 def test_times_make_a_variable_small_enough(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(matlab, "VARIABLE_MAX", 100_000)
-    estimates = Selection(("drone/*/estimate",))
+    estimates = MessageSelection(("drone/*/estimate",))
     with pytest.raises(ReportError, match=r"^estimate: would have .*; choose --keys, --from and --to"):
         export(run, Format.MAT, tmp_path / "all.mat", estimates)
     done = export(run, Format.MAT, tmp_path / "some.mat", estimates._replace(from_s=1.0, to_s=1.1))
@@ -223,13 +222,13 @@ def test_what_a_message_does_not_have_is_empty(tmp_path: Path) -> None:
 
 def test_the_record_itself_can_be_given(run: Path, tmp_path: Path) -> None:
     shutil.copy(run / "run.mcap", tmp_path / "flight1.mcap")
-    done = export(tmp_path / "flight1.mcap", Format.CSV, selection=Selection(("clock",)))
+    done = export(tmp_path / "flight1.mcap", Format.CSV, selection=MessageSelection(("clock",)))
     assert done.paths == (tmp_path / "csv",)
     assert done.tables == {"clock.csv": counts(run)["clock"]}
 
 
 def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
-    selection = Selection(("drone/*/truth", "cluster/**"), from_s=1.0, to_s=2.0)
+    selection = MessageSelection(("drone/*/truth", "cluster/**"), from_s=1.0, to_s=2.0)
     done = export(run, Format.PARQUET, tmp_path / "some", selection)
     assert done.tables == {"cluster_state.parquet": 51, "truth.parquet": 153}
     times = parquet(tmp_path / "some" / "truth.parquet")["t_ns"]
@@ -237,16 +236,16 @@ def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
     with pytest.raises(
         ReportError, match=r"run\.mcap: has no message on drone/nobody/\*\* that can be exported; it holds"
     ):
-        export(run, Format.CSV, tmp_path / "none", Selection(("drone/nobody/**",)))
+        export(run, Format.CSV, tmp_path / "none", MessageSelection(("drone/nobody/**",)))
     assert not (tmp_path / "none").exists()
 
 
 def test_nothing_is_overwritten_without_force(run: Path, tmp_path: Path) -> None:
-    some = Selection(("clock",))
+    some = MessageSelection(("clock",))
     export(run, Format.CSV, tmp_path / "out", some)
     with pytest.raises(ReportError, match="out: exists; give --out another place, or --force"):
         export(run, Format.CSV, tmp_path / "out", some)
-    export(run, Format.CSV, tmp_path / "out", Selection(("world/info",)), force=True)
+    export(run, Format.CSV, tmp_path / "out", MessageSelection(("world/info",)), force=True)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"info.csv", "export.json"}
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("precious")
@@ -266,7 +265,7 @@ def test_nothing_is_overwritten_without_force(run: Path, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("name", ["notes.txt", "plots"])
 def test_force_does_not_replace_a_folder_that_holds_more(run: Path, tmp_path: Path, name: str) -> None:
-    some, out = Selection(("clock",)), tmp_path / "out"
+    some, out = MessageSelection(("clock",)), tmp_path / "out"
     export(run, Format.CSV, out, some)
     (out / name).mkdir() if name == "plots" else (out / name).write_text("precious")
     with pytest.raises(ReportError, match=rf"something else than an export \(it holds {name}\); give --out"):
@@ -280,13 +279,13 @@ def test_force_does_not_replace_files_that_are_not_of_an_export(run: Path, tmp_p
     for name in ("flight1.mcap", "own.mat"):
         before = (tmp_path / name).read_bytes()
         with pytest.raises(ReportError, match="file of something else"):
-            export(run, Format.FOXGLOVE, tmp_path / name, Selection(("clock",)), force=True)
+            export(run, Format.FOXGLOVE, tmp_path / name, MessageSelection(("clock",)), force=True)
         assert (tmp_path / name).read_bytes() == before
 
 
 def test_what_fails_leaves_no_folder_that_it_made(run: Path, tmp_path: Path) -> None:
     with pytest.raises(ReportError, match="has no message on nothing"):
-        export(run, Format.CSV, tmp_path / "new" / "a" / "b", Selection(("nothing/**",)))
+        export(run, Format.CSV, tmp_path / "new" / "a" / "b", MessageSelection(("nothing/**",)))
     assert not list(tmp_path.iterdir())
 
 
@@ -347,13 +346,13 @@ def test_nothing_to_export_is_one_line(tmp_path: Path) -> None:
 
 
 def test_what_is_not_installed_is_named(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(formats, "find_spec", lambda module: None if module == "foxglove" else module)
+    monkeypatch.setattr(output, "find_spec", lambda module: None if module == "foxglove" else module)
     done = CliRunner().invoke(app, ["export", str(run), "--format", "foxglove"])
     assert str(done.exception) == "zsim export: foxglove is not installed; install zsim[export]"
 
 
 def test_the_command_line_starts_without_what_exports_need() -> None:
-    loaded = "import sys, zsim_deploy.cli; print({'mcap', 'pyarrow', 'scipy', 'foxglove'} & set(sys.modules))"
+    loaded = "import sys, zsim_deploy.cli.cli; print({'mcap', 'pyarrow', 'scipy', 'foxglove'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.strip() == "set()"
 

@@ -21,10 +21,9 @@ from zsim.contract import keys, messages
 from zsim.errors import RecordError, ReportError
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
-from zsim_analysis.reading.formation_errors import window
-from zsim_analysis.report import judge, make_report, table
-from zsim_analysis.report.figures.canvas import thinned
-from zsim_analysis.report.report_page import page
+from zsim_analysis.reading.formation import window
+from zsim_analysis.report.canvas import thinned
+from zsim_analysis.report.make_report import judge, make_report, page, table
 
 NAMES = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", "phi_1", "phi_2", "phi_3", "p", "q", "beta"]
 AMPLITUDE = np.array([0.12, 0.13, 0.03, 0.02, 0.01, 0.07, 0.05, 0.06, 0.04, 0.28, 0.3, 0.08])
@@ -168,6 +167,7 @@ def test_truth_that_is_not_on_record_is_told(tmp_path):
     assert summary.errors["p"].true_std == pytest.approx(AMPLITUDE[9] / math.sqrt(2), rel=0.05)
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_replay_is_told_and_judged_from_where_it_begins(tmp_path):
     with RecordWriter(tmp_path / "run.mcap") as writer:
         for key, message, wall_ns in synthetic_record.traffic(flown(end=None)):
@@ -234,6 +234,7 @@ def test_a_cut_record_is_reported_up_to_the_cut(tmp_path):
     assert any("was cut" in note for note in summary.notes)
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_a_run_without_a_cluster(tmp_path):
     summary = report_of(tmp_path, flown(overrides=("clusters=[]",)))
     make_report(tmp_path)
@@ -259,7 +260,7 @@ def test_a_cluster_that_said_nothing(tmp_path):
 def test_a_record_without_a_message_is_refused(tmp_path, length):
     synthetic_record.write(tmp_path / "whole.mcap", flown(duration_s=0.1))
     (tmp_path / "run.mcap").write_bytes((tmp_path / "whole.mcap").read_bytes()[:length])
-    with pytest.raises(RecordError, match=r"run\.mcap: holds no message; there is nothing to report"):
+    with pytest.raises(RecordError, match=r"run\.mcap: holds no message"):
         make_report(tmp_path)
     assert [path.name for path in tmp_path.iterdir() if path.suffix != ".mcap"] == []
 
@@ -293,7 +294,7 @@ def test_a_flood_of_events_does_not_hide_a_restart(tmp_path):
     summary = report_of(tmp_path, flown(events=(*flood, restart)))
     assert [event.kind for event in summary.events].count("restart") == 1
     assert summary.events_left_out == {"refused": 4900}
-    assert "4900 × refused" in page(summary, [], tmp_path)
+    assert "4900 × refused" in page(summary, [])
 
 
 class Links(HTMLParser):
@@ -346,6 +347,7 @@ def test_the_terminal_table_stands_beside_the_paper(run):
     assert f"{AMPLITUDE[9] / math.sqrt(2):.4f}" in row
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_nothing_to_report_on_is_one_line(tmp_path):
     with pytest.raises(RecordError, match=r"run\.mcap: cannot be read \(No such file"):
         make_report(tmp_path)
@@ -385,6 +387,7 @@ def test_thinning_keeps_every_extreme():
     assert np.all(np.diff(few_x) > 0)
 
 
+@pytest.mark.usefixtures("unrendered")
 def test_several_clusters_have_a_table_and_figures_each(tmp_path):
     scenario = scenario_file.load(SCENARIOS / "step.yaml")
     second = msgspec.structs.replace(

@@ -16,10 +16,10 @@ from zsim.contract import messages
 from zsim.errors import RecordError, ZsimError
 from zsim.record import Recorded, RecordReader, repair
 from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, MAGIC, Place, places
-from zsim_analysis.export.formats import Format
 from zsim_analysis.export.make_export import export
-from zsim_analysis.export.selection import Selection
-from zsim_analysis.report import judge
+from zsim_analysis.export.output import Format
+from zsim_analysis.export.selection import MessageSelection
+from zsim_analysis.report.make_report import judge
 
 CUTS = 100
 FLIPS = 60
@@ -141,21 +141,21 @@ def content(message: Recorded) -> Content:
     return message.payload, message.t_ns, message.wall_ns
 
 
-def exported(path: Path, form: Format, selection: Selection) -> Made:
+def exported(path: Path, form: Format, selection: MessageSelection) -> Made:
     done = export(path.parent, form, selection=selection, force=True)
     return sum(done.tables.values()), done.notes
 
 
 def to_csv(path: Path) -> Made:
-    return exported(path, Format.CSV, Selection(("world/**", "cluster/**", "process/**")))
+    return exported(path, Format.CSV, MessageSelection(("world/**", "cluster/**", "process/**")))
 
 
 def to_foxglove(path: Path) -> Made:
-    return exported(path, Format.FOXGLOVE, Selection(to_s=1.0))
+    return exported(path, Format.FOXGLOVE, MessageSelection(to_s=1.0))
 
 
 def to_mat(path: Path) -> Made:
-    return exported(path, Format.MAT, Selection(("world/**", "drone/*/sensor/gps")))
+    return exported(path, Format.MAT, MessageSelection(("world/**", "drone/*/sensor/gps")))
 
 
 def to_summary(path: Path) -> Made:

@@ -1,0 +1,283 @@
+"""The scene of an instant: drones, their trails, the formation and where it is to be, and the estimates' uncertainty.
+
+Foxglove shows, at any time, the last message of a topic alone; so each message is the whole of what it shows.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from foxglove.messages import (
+    Color,
+    CubePrimitive,
+    CylinderPrimitive,
+    LinePrimitive,
+    LinePrimitiveLineType,
+    Point3,
+    Pose,
+    Quaternion,
+    SceneEntity,
+    SceneUpdate,
+    SpherePrimitive,
+    TextPrimitive,
+    Timestamp,
+    Vector3,
+)
+
+from zsim.contract import keys, messages
+from zsim.contract.messages import ClusterState, Estimate, Event, Gps, Info, Status, Truth
+from zsim.math.frames import principal_axes
+from zsim.record import Recorded
+from zsim_analysis.export.message_columns import Values
+from zsim_analysis.export.selection import subject
+
+LEVEL = Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+# Okabe and Ito's colours, distinct with every kind of colour vision.
+DRONES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+MAGENTA, DARK, GREY = "#d4008f", "#30363d", "#8c959f"
+DRAWN = (Truth, Estimate, Status, Gps, ClusterState, Event)
+WORLD = "world"
+TRAIL_S = 20.0  # s of simulated time that a trail is long
+TRAIL_STEP_NS = 500_000_000  # between two points of a trail, and two messages of trails
+SIGMAS = 2.0  # half axes of an estimate's ellipsoid in standard deviations
+LINE_PX = 2.0  # width of lines on the screen
+ROTOR_RADIUS = 0.57  # of the arm: 0.102 m at the AR.Drone's 0.1785 m
+GROUND_M, GROUND_STEP_M = 50, 5  # half width of the grid on the ground, and its spacing
+
+
+@dataclass
+class Instant:
+    """Messages stamped with one time; of several on a key, the last."""
+
+    t_ns: int
+    truth: dict[str, Truth] = field(default_factory=dict)
+    estimates: dict[str, Estimate] = field(default_factory=dict)
+    status: dict[str, Status] = field(default_factory=dict)
+    gps: dict[str, Gps] = field(default_factory=dict)
+    states: dict[str, ClusterState] = field(default_factory=dict)
+    events: list[Event] = field(default_factory=list)
+
+    def add(self, key: str, message: Any) -> None:
+        """Add a message of a type that is drawn."""
+        if isinstance(message, Event):
+            self.events.append(message)
+            return
+        by_type: dict[type, dict[str, Any]] = {
+            Truth: self.truth,
+            Estimate: self.estimates,
+            Status: self.status,
+            Gps: self.gps,
+            ClusterState: self.states,
+        }
+        by_type[type(message)][subject(key)] = message
+
+
+def is_drawn(key: str) -> bool:
+    """Return whether the messages of a key are drawn."""
+    return messages.type_of(key) in DRAWN or key == keys.INFO
+
+
+def instants(decoded: Iterable[tuple[Recorded, Any]]) -> Iterator[Instant]:
+    """Gather messages, in order of time, by their time; `world/info` is left out."""
+    drawn = ((recorded.key, message) for recorded, message in decoded if not isinstance(message, Info))
+    for t_ns, group in groupby(drawn, key=lambda pair: pair[1].t_ns):
+        instant = Instant(t_ns)
+        for key, message in group:
+            instant.add(key, message)
+        yield instant
+
+
+def timestamp(t_ns: int) -> Timestamp:
+    return Timestamp(t_ns // 10**9, t_ns % 10**9)
+
+
+def vector(v: Sequence[float] | Values) -> Vector3:
+    x, y, z = map(float, v)
+    return Vector3(x=x, y=y, z=z)
+
+
+def point(v: Sequence[float] | Values) -> Point3:
+    x, y, z = map(float, v)
+    return Point3(x=x, y=y, z=z)
+
+
+def quaternion(wxyz: Sequence[float] | Values) -> Quaternion:
+    w, x, y, z = map(float, wxyz)
+    return Quaternion(x=x, y=y, z=z, w=w)
+
+
+def pose(position: Sequence[float] | Values, wxyz: Sequence[float] | Values | None = None) -> Pose:
+    return Pose(position=vector(position), orientation=LEVEL if wxyz is None else quaternion(wxyz))
+
+
+def rgb(text: str) -> tuple[float, float, float]:
+    """Return red, green and blue, 0 to 1, of `#rrggbb`."""
+    red, green, blue = (int(text[i : i + 2], 16) / 255 for i in (1, 3, 5))
+    return red, green, blue
+
+
+def colour(text: str, opacity: float = 1.0) -> Color:
+    """Return the colour of `#rrggbb`."""
+    red, green, blue = rgb(text)
+    return Color(r=red, g=green, b=blue, a=opacity)
+
+
+def drone_colour(index: int) -> str:
+    return DRONES[index % len(DRONES)]
+
+
+def frame(drone: str) -> str:
+    """Return the name of a drone's frame B."""
+    return f"drone/{drone}"
+
+
+def drones(t_ns: int, arms_m: Mapping[str, float]) -> SceneUpdate:
+    """Return the drones, each in its own frame, written once, as their frames move; arms_m: centre to rotor [m]."""
+    entities = [_drone(timestamp(t_ns), name, arm_m, drone_colour(i)) for i, (name, arm_m) in enumerate(arms_m.items())]
+    return SceneUpdate(entities=entities)
+
+
+def _drone(at: Timestamp, name: str, arm_m: float, mark: str) -> SceneEntity:
+    label = TextPrimitive(
+        pose=pose((0, 0, 2 * arm_m)),
+        billboard=True,
+        font_size=12.0,
+        scale_invariant=True,
+        color=colour(mark),
+        text=name,
+    )
+    return _entity(
+        at,
+        name,
+        frame(name),
+        cubes=_hull(arm_m),
+        cylinders=_rotors(arm_m, mark),
+        lines=[_arms(arm_m)],
+        texts=[label],
+        frame_locked=True,
+    )
+
+
+def _hull(arm_m: float) -> list[CubePrimitive]:
+    hull = CubePrimitive(pose=pose((0, 0, 0)), size=vector((arm_m, 0.4 * arm_m, 0.3 * arm_m)), color=colour(DARK))
+    nose = CubePrimitive(  # the hat over the battery and the camera, in the colour by which AR.Drones are known
+        pose=pose((0.35 * arm_m, 0, 0.1 * arm_m)),
+        size=vector((0.5 * arm_m, 0.3 * arm_m, 0.2 * arm_m)),
+        color=colour(MAGENTA),
+    )
+    return [hull, nose]
+
+
+def _rotors(arm_m: float, mark: str) -> list[CylinderPrimitive]:
+    return [
+        CylinderPrimitive(
+            pose=pose((x, y, 0.2 * arm_m)),
+            size=vector((2 * ROTOR_RADIUS * arm_m, 2 * ROTOR_RADIUS * arm_m, 0.03 * arm_m)),
+            bottom_scale=1.0,
+            top_scale=1.0,
+            color=colour(mark, 0.5),
+        )
+        for x, y in _corners(arm_m)
+    ]
+
+
+def _arms(arm_m: float) -> LinePrimitive:
+    front_left, front_right, rear_right, rear_left = _corners(arm_m)
+    return LinePrimitive(
+        type=LinePrimitiveLineType.LineList,
+        pose=pose((0, 0, 0)),
+        thickness=0.1 * arm_m,
+        points=[point((x, y, 0)) for x, y in (front_left, rear_right, front_right, rear_left)],
+        color=colour(DARK),
+    )
+
+
+def _corners(arm_m: float) -> list[tuple[float, float]]:
+    """Return x and y in B of the rotors, in the contract's order."""
+    side = arm_m / math.sqrt(2.0)
+    return [(x * side, y * side) for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+
+
+def ground(t_ns: int) -> SceneUpdate:
+    """Return a grid on the ground, lines every 5 m."""
+    marks = range(-GROUND_M, GROUND_M + 1, GROUND_STEP_M)
+    ends = [((a, -GROUND_M, 0), (a, GROUND_M, 0)) for a in marks] + [
+        ((-GROUND_M, a, 0), (GROUND_M, a, 0)) for a in marks
+    ]
+    grid = _line([end for pair in ends for end in pair], colour(GREY, 0.4), LinePrimitiveLineType.LineList, 1.0)
+    return SceneUpdate(entities=[_entity(timestamp(t_ns), "ground", WORLD, lines=[grid])])
+
+
+def formations(instant: Instant, desired_m: Mapping[str, Values]) -> SceneUpdate:
+    """Return for each cluster the outline of its drones, and as ghosts where they are to be.
+
+    Args:
+        instant: with truth and the states of the clusters.
+        desired_m: by cluster, where its drones are to be (n, 3).
+    """
+    at, entities = timestamp(instant.t_ns), []
+    for name, state in instant.states.items():
+        lines, ghosts = [], []
+        places = [instant.truth[drone].position_m for drone in state.drones if drone in instant.truth]
+        if len(places) > 1:
+            lines.append(_line(places, colour(DARK), LinePrimitiveLineType.LineLoop))
+        if name in desired_m:
+            lines.append(_line(desired_m[name], colour(MAGENTA, 0.6), LinePrimitiveLineType.LineLoop))
+            ghosts = [
+                SpherePrimitive(pose=pose(place), size=vector((0.5, 0.5, 0.2)), color=colour(MAGENTA, 0.3))
+                for place in desired_m[name]
+            ]
+        entities.append(_entity(at, name, WORLD, lines=lines, spheres=ghosts))
+    return SceneUpdate(entities=entities)
+
+
+def estimates(instant: Instant, order: Mapping[str, int]) -> SceneUpdate:
+    """Return the ellipsoids within which the estimators believe their drones to be, at two standard deviations."""
+    at, entities = timestamp(instant.t_ns), []
+    for name, estimate in instant.estimates.items():
+        covariance = np.array(estimate.covariance).reshape(6, 6)[:3, :3]
+        sigma_m, axes = principal_axes(covariance)
+        shown = SpherePrimitive(
+            pose=pose(estimate.position_m, axes),
+            size=vector([2.0 * SIGMAS * each for each in sigma_m]),
+            color=colour(drone_colour(order.get(name, 0)), 0.25),
+        )
+        entities.append(_entity(at, name, WORLD, spheres=[shown]))
+    return SceneUpdate(entities=entities)
+
+
+class DroneTrails:
+    """The last seconds of each drone's path."""
+
+    def __init__(self) -> None:
+        self._paths: dict[str, deque[Sequence[float]]] = {}
+        self._length = round(TRAIL_S * 1e9) // TRAIL_STEP_NS + 1
+
+    def update(self, instant: Instant, order: Mapping[str, int]) -> SceneUpdate:
+        """Add the positions of an instant, return the trails."""
+        at, entities = timestamp(instant.t_ns), []
+        for name, truth in instant.truth.items():
+            path = self._paths.setdefault(name, deque(maxlen=self._length))
+            path.append(truth.position_m)
+            trail = _line(path, colour(drone_colour(order.get(name, 0)), 0.7), LinePrimitiveLineType.LineStrip)
+            entities.append(_entity(at, name, WORLD, lines=[trail]))
+        return SceneUpdate(entities=entities)
+
+
+def _line(points: Iterable[Any], tint: Color, kind: LinePrimitiveLineType, width_px: float = LINE_PX) -> LinePrimitive:
+    return LinePrimitive(
+        type=kind,
+        pose=pose((0, 0, 0)),
+        thickness=width_px,
+        scale_invariant=True,
+        points=[point(each) for each in points],
+        color=tint,
+    )
+
+
+def _entity(at: Timestamp, name: str, frame_id: str, **parts: Any) -> SceneEntity:
+    return SceneEntity(timestamp=at, id=name, frame_id=frame_id, **parts)

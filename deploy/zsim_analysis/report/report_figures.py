@@ -1,0 +1,214 @@
+"""The figures of a report: the paper's of each cluster, the paths from above, and altitude, state and battery."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from zsim_analysis.reading.flight import Array, RecordedFlight, Track
+from zsim_analysis.reading.formation import Formation, common_instants
+from zsim_analysis.report.canvas import (
+    BLACK,
+    BLUE,
+    DARK,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    ReportFigure,
+    dress,
+    drone_colour,
+    label_time,
+    legend_above,
+    line,
+    new_figure,
+)
+from zsim_analysis.report.cluster_figures import draw_errors, draw_parameters, parameter_groups
+
+OUTLINES = 7  # formations drawn into the plan, few enough to be distinct
+APART = 0.6  # of the formation's own size: outlines nearer than this would cover each other
+DRONE_PANELS = ("true altitude (m)", "state", "battery (%)")
+NAMED_MAX = 12  # drones that a legend names
+STATES = {
+    "landed": GREY,
+    "taking_off": ORANGE,
+    "hovering": SKY,
+    "flying": BLUE,
+    "landing": PURPLE,
+    "emergency": VERMILION,
+}
+
+
+def draw_plan(flight: RecordedFlight, formations: Sequence[Formation]) -> Figure:
+    """Return the true paths from above with the outlines of the formations at some instants."""
+    figure = new_figure(9, 9)
+    axes = figure.subplots()
+    dress(axes, "north y (m)")
+    axes.set_xlabel("east x (m)", fontsize=10)
+    axes.set_aspect("equal", adjustable="datalim")
+    for i, track in enumerate(flight.tracks):
+        draw_path(axes, track, drone_colour(i), named=i < NAMED_MAX)
+    for formation in formations:
+        _draw_desired(axes, formation)
+        _draw_outlines(axes, formation, flight.tracks)
+    legend_above(figure, axes, columns=4)
+    return figure
+
+
+def draw_path(axes: Axes, track: Track, colour: str, named: bool) -> None:
+    """Draw a true path from above, with its start and its end."""
+    if not len(track.t_ns):
+        return
+    step = max(1, len(track.t_ns) // 4000)  # a path has no extremes to keep, only a shape
+    x, y = track.p_W[::step, 0], track.p_W[::step, 1]
+    axes.plot(x, y, color=colour, lw=0.8, alpha=0.6, zorder=2, label=track.name if named else None)
+    axes.plot(x[0], y[0], marker="s", color=colour, ms=7, mec="white", zorder=5)
+    axes.plot(*track.p_W[-1, :2], marker="o", color=colour, ms=7, mec="white", zorder=5)
+
+
+def _draw_desired(axes: Axes, formation: Formation) -> None:
+    if "x_c" in formation.names and len(formation.t_s):
+        engaged = np.array([phase == "engaged" for phase in formation.phases])
+        desired = np.where(engaged[:, None], formation.desired, np.nan)
+        x, y = (desired[:, formation.column(name)] for name in ("x_c", "y_c"))
+        step = max(1, len(x) // 4000)
+        axes.plot(x[::step], y[::step], color=BLACK, lw=1.3, zorder=3, label=f"desired centroid of {formation.name}")
+
+
+def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) -> None:
+    members = [track for name in formation.drones for track in tracks if track.name == name]
+    for t_s, p_W in outlines(members):
+        ring = np.vstack([p_W, p_W[:1]])
+        axes.fill(ring[:, 0], ring[:, 1], facecolor="#0000000d", edgecolor=DARK, lw=1.2, zorder=4)
+        out = p_W[0] - p_W.mean(axis=0)
+        away = out / max(float(np.linalg.norm(out)), 1e-9)
+        axes.annotate(
+            f"{t_s:.0f} s",
+            p_W[0],
+            xytext=18 * away,
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            fontsize=9,
+            zorder=6,
+            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
+        )
+
+
+def outlines(members: Sequence[Track]) -> Iterator[tuple[float, Array]]:
+    """Yield times [s] and positions (n, 2) [m] at which a formation stands clear of the outlines before."""
+    t_ns, places = common_instants(list(members))
+    if not len(t_ns):
+        return
+    p_W = np.stack([track.p_W[place, :2] for track, place in zip(members, places, strict=True)], axis=1)
+    drawn: list[Array] = []
+    for k in np.linspace(len(t_ns) - 1, 0, OUTLINES).astype(int):
+        size = np.linalg.norm(p_W[k] - p_W[k].mean(axis=0), axis=1).max()
+        if all(np.linalg.norm(p_W[k] - other, axis=1).max() > APART * size for other in drawn):
+            drawn.append(p_W[k])
+            yield float(t_ns[k]) / 1e9, p_W[k]
+
+
+def draw_drones(flight: RecordedFlight) -> Figure:
+    """Return altitude, state and battery of every drone over the run."""
+    count = len(flight.tracks)
+    figure = new_figure(11, 6.4 + 0.28 * count)
+    panels = figure.subplots(3, 1, sharex=True, height_ratios=drone_panel_heights(count))
+    for axes, quantity in zip(panels, DRONE_PANELS, strict=True):
+        dress(axes, quantity)
+    draw_drone_panels(panels, flight.tracks, {track.name: i for i, track in enumerate(flight.tracks)}, NAMED_MAX)
+    name_states(panels[1], flight.tracks)
+    figure.align_ylabels()
+    legend_above(figure, panels[0])
+    return figure
+
+
+def drone_panel_heights(count: int) -> tuple[float, float, float]:
+    """Return the heights of DRONE_PANELS for so many drones."""
+    return 3.0, 0.5 + 0.28 * count, 2.0
+
+
+def draw_drone_panels(panels: Sequence[Axes], tracks: Sequence[Track], order: dict[str, int], named: int) -> None:
+    """Draw drones into the axes of DRONE_PANELS.
+
+    Args:
+        panels: axes of altitude, state and battery.
+        tracks: of the drones.
+        order: by drone, the number of its colour.
+        named: how many of them the legend is to name.
+    """
+    altitude, state, battery = panels
+    for lane, track in enumerate(tracks):
+        i = order[track.name]
+        style = {"color": drone_colour(i), "lw": 1.1, "label": track.name if i < named else None}
+        line(altitude, track.t_ns / 1e9, track.p_W[:, 2], **style)
+        line(battery, track.status_t_ns / 1e9, track.battery_percent, **style)
+        draw_states(state, track, lane)
+    state.set_yticks(range(len(tracks)), [track.name for track in tracks])
+    state.invert_yaxis()
+    state.grid(False)
+    label_time([battery])
+
+
+def draw_states(axes: Axes, track: Track, lane: int) -> None:
+    """Draw the states of a drone as a bar in a lane of its own."""
+    if not track.states:
+        return
+    states = np.array(track.states)
+    starts = np.flatnonzero(np.r_[True, states[1:] != states[:-1]])
+    edges = np.r_[track.status_t_ns[starts], track.status_t_ns[-1]] / 1e9
+    for start, left, right in zip(starts, edges[:-1], edges[1:], strict=True):
+        colour = STATES.get(states[start], GREEN)
+        axes.broken_barh([(left, right - left)], (lane - 0.36, 0.72), color=colour)
+
+
+def name_states(axes: Axes, tracks: Sequence[Track]) -> None:
+    """Put the names of the states that occur beside the axes."""
+    occur = [name for name in STATES if any(name in track.states for track in tracks)]
+    handles: list[Patch | Line2D] = [Patch(color=STATES[name], label=name.replace("_", " ")) for name in occur]
+    if handles:
+        axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.005, 0.5), frameon=False, fontsize=9)
+
+
+def figures(
+    flight: RecordedFlight, formations: Sequence[Formation], window_s: tuple[float, float]
+) -> Iterator[ReportFigure]:
+    """Yield the figures that the record has data for, the first cluster's under the plain names."""
+    for i, formation in enumerate(formations):
+        yield from _of_cluster(formation, window_s, f"_{formation.name}" if i else "")
+    if any(len(track.t_ns) for track in flight.tracks):
+        yield ReportFigure(
+            "plan_view.png",
+            "Plan view",
+            "True paths from above, with the formation drawn at some instants of simulated time.",
+            draw_plan(flight, formations),
+        )
+        yield ReportFigure(
+            "drones.png",
+            "Drones",
+            "True altitude, state of the firmware and battery of every drone.",
+            draw_drones(flight),
+        )
+
+
+def _of_cluster(formation: Formation, window_s: tuple[float, float], suffix: str) -> Iterator[ReportFigure]:
+    yield ReportFigure(
+        f"figure_5_errors{suffix}.png",
+        "Formation parameters' errors (the paper's Figure 5)",
+        "Left: the whole run. Right: the window of the statistics, on an axis of its own. "
+        "Estimate − desired is what the controller sees; truth − desired is what the drones do. "
+        "Until the formation is engaged, the controller takes its own estimate as the desired value.",
+        draw_errors(formation, window_s),
+    )
+    for file, number, what, names in parameter_groups(formation.names):
+        yield ReportFigure(
+            f"{file}{suffix}.png",
+            f"{what} (the paper's Figure {number})",
+            f"Desired, measured (from the estimates) and true {', '.join(names)}.",
+            draw_parameters(formation, names, what),
+        )

@@ -1,0 +1,117 @@
+"""The workers of a sweep on several hosts: those of a Dask cluster that is running already.
+
+Dask flies a run again whose worker died, and gives up a run in which several of them died.
+"""
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable, Generator, Iterator
+from typing import Any
+
+from distributed import CancelledError, Client, KilledWorker
+from distributed import as_completed as _as_completed
+from distributed.comm.core import connect
+
+from zsim import __version__
+from zsim.errors import RunError
+from zsim_analysis.sweep.sweep_row import Row, Task, failed_row
+from zsim_analysis.sweep.sweep_run import fly, reason_of
+
+AHEAD = 2  # tasks per thread of the cluster, so that none of them waits for us
+CONNECT_S = 5.0  # wall time after which a scheduler that does not answer is an error
+
+_alone = threading.Lock()
+
+
+def fly_alone(task: Task) -> Row:
+    """Fly a run, one at a time in a process: threads of one process would only wait for each other."""
+    with _alone:
+        return fly(task)
+
+
+class DaskPool:
+    """Flies tasks on a Dask cluster.
+
+    Args:
+        address: of the scheduler, e.g. tcp://192.0.2.1:8786.
+        say: called with a line about the cluster.
+
+    Raises:
+        RunError: no scheduler answers there, or a worker has another zsim than this host.
+    """
+
+    def __init__(self, address: str, say: Callable[[str], None]) -> None:
+        self._address = address
+        self._say = say
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what ends the sweep is raised here
+        try:
+            asyncio.run(_connect(address))  # first, since a client without a scheduler is slow to give up
+            self._client: Any = Client(address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise RunError(f"--dask {address}: no scheduler ({reason}); start `dask scheduler` there") from error
+
+    def rows(self, tasks: Iterator[Task]) -> Generator[Row]:
+        """Yield the rows of tasks as they are finished; when closed, the cluster forgets the rest.
+
+        Raises:
+            RunError: the cluster is gone, or rows cannot be recorded.
+        """
+        try:
+            with self._client:
+                yield from self._rows(tasks)
+        except (OSError, CancelledError) as error:  # broken links are OSErrors too
+            raise RunError(f"--dask {self._address}: the cluster is gone; the same command goes on") from error
+
+    def _rows(self, tasks: Iterator[Task]) -> Generator[Row]:
+        self._await_workers()
+        flying = _as_completed(loop=self._client.loop)
+        pending: dict[str, Task] = {}
+        self._fill(flying, pending, tasks)
+        for future in flying:
+            task = pending.pop(future.key)
+            yield self._row(future, task)
+            self._fill(flying, pending, tasks)
+
+    def _await_workers(self) -> None:
+        if not self._client.nthreads():
+            self._say(f"waiting for workers at {self._address}; start `dask worker {self._address}` on every host")
+            self._client.wait_for_workers(1)
+        versions = self._client.run(_version, on_error="return")
+        for worker, version in versions.items():
+            if version != __version__:
+                present = f"zsim {version}" if isinstance(version, str) else reason_of(version)
+                raise RunError(f"--dask {self._address}: worker {worker} has {present}; must have zsim {__version__}")
+        self._say(f"{len(versions)} Dask worker{'s'[: len(versions) != 1]} at {self._address}")
+
+    def _fill(self, flying: Any, pending: dict[str, Task], tasks: Iterator[Task]) -> None:
+        """Keep as many tasks in the cluster as its workers are to have; new workers may come at any time."""
+        while len(pending) < AHEAD * sum(self._client.nthreads().values()):
+            task = next(tasks, None)
+            if task is None:
+                return
+            future = self._client.submit(fly_alone, task, key=f"zsim-{id(self)}-{task.run}", pure=False)
+            pending[future.key] = task
+            flying.add(future)
+
+    def _row(self, future: Any, task: Task) -> Row:
+        try:
+            return future.result()
+        except KilledWorker:
+            return failed_row(task, "several workers died of it, see Dask's allowed-failures")
+        except CancelledError:
+            raise
+        except Exception as error:  # what `fly` raises is an error that every further run would have too
+            raise RunError(f"--dask {self._address}: {reason_of(error)}") from error
+
+
+async def _connect(address: str) -> None:
+    link = await connect(address, timeout=CONNECT_S)
+    await link.close()
+
+
+def _version() -> str:
+    from zsim import __version__ as version
+
+    return version

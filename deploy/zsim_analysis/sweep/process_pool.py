@@ -1,0 +1,182 @@
+"""The worker processes of a sweep on this host: one that dies is replaced, and its run is flown again.
+
+A worker flies one run after the other, so that imports and kernels are loaded once. `ProcessPoolExecutor` would not do:
+it breaks as a whole when a worker dies, and does not show which run was fatal.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+import warnings
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterator
+from multiprocessing import parent_process
+from multiprocessing.connection import Connection, wait
+
+from zsim.errors import RunError
+from zsim_analysis.sweep.sweep_row import Row, Task, failed_row
+
+READY = "ready"
+DEATHS_MAX = 3  # of workers in one run, or one after the other before they are ready
+EXIT_S = 5.0  # wall time that an idle worker has to exit by itself
+
+
+def work(link: Connection) -> None:
+    """Fly the tasks received on a link and send back their rows; `None` ends it, as the launcher's death does.
+
+    An exception that is sent back is an error that every further run would have too.
+    """
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # Ctrl-C reaches every process of the terminal; the launcher acts on it
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    threading.Thread(target=_exit_with_launcher, name="launcher-monitor", daemon=True).start()
+    warnings.simplefilter("ignore", RuntimeWarning)  # a state that overflows is reported in the run's row
+    from zsim_analysis.sweep.sweep_run import fly
+
+    link.send(READY)
+    try:
+        while (task := link.recv()) is not None:
+            try:
+                result = fly(task)
+            except Exception as error:
+                result = RuntimeError(str(error))
+            link.send(result)
+    except (EOFError, BrokenPipeError):
+        return
+
+
+def _exit_with_launcher() -> None:
+    launcher = parent_process()
+    if launcher is not None:
+        wait([launcher.sentinel])
+        os._exit(1)
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class WorkerProcess:
+    """One process and the task that it flies."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.link, far = context.Pipe()
+        self.process = context.Process(target=work, args=(far,), name="zsim-sweep", daemon=True)
+        self.process.start()
+        far.close()  # so that the link ends when the process dies
+        self.ready = False
+        self.task: Task | None = None
+
+    def send(self, task: Task) -> None:
+        """Send a task; a worker that died meanwhile shows at `receive`."""
+        self.task = task
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            self.link.send(task)
+
+    def receive(self) -> Row | str | RuntimeError | None:
+        """Return its next message; None when it is dead."""
+        try:
+            return self.link.recv()
+        except (EOFError, OSError):
+            self.process.join()
+            return None
+
+    def stop(self) -> None:
+        """End the process, at once if it flies a task."""
+        if self.task is None:
+            with contextlib.suppress(OSError):
+                self.link.send(None)
+            self.process.join(EXIT_S)
+        self.process.kill()
+        self.process.join()
+        self.link.close()
+
+    def cause(self) -> str:
+        """Return how it ended."""
+        code = self.process.exitcode or 0
+        return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+
+class ProcessPool:
+    """Flies tasks on worker processes.
+
+    Args:
+        count: of workers.
+        say: called with a line about a worker that died.
+    """
+
+    def __init__(self, count: int, say: Callable[[str], None]) -> None:
+        self._count = count
+        self._say = say
+        self._workers: dict[Connection, WorkerProcess] = {}
+        self._again: deque[Task] = deque()
+        self._deaths: Counter[int] = Counter()
+        self._deaths_at_start = 0
+
+    def rows(self, tasks: Iterator[Task]) -> Generator[Row]:
+        """Yield the rows of tasks as they are finished; at the end, or when closed, no worker is left.
+
+        Raises:
+            RunError: workers cannot start, or rows cannot be recorded.
+        """
+        try:
+            for _ in range(self._count):
+                self._start()
+            while self._workers:
+                for link in wait(list(self._workers)):
+                    yield from self._on_message(self._workers[link], tasks)  # type: ignore[index]
+        finally:
+            for worker in self._workers.values():
+                worker.stop()
+            self._workers.clear()
+
+    def _start(self) -> None:
+        worker = WorkerProcess()
+        self._workers[worker.link] = worker
+
+    def _on_message(self, worker: WorkerProcess, tasks: Iterator[Task]) -> Iterator[Row]:
+        message = worker.receive()
+        if isinstance(message, RuntimeError):
+            raise RunError(str(message))
+        if message is None:
+            yield from self._on_death(worker)
+            return
+        if message == READY:
+            worker.ready, self._deaths_at_start = True, 0
+        else:
+            worker.task = None
+            yield message  # type: ignore[misc]
+        self._send_next(worker, tasks)
+
+    def _send_next(self, worker: WorkerProcess, tasks: Iterator[Task]) -> None:
+        task = self._again.popleft() if self._again else next(tasks, None)
+        if task is not None:
+            worker.send(task)
+            return
+        del self._workers[worker.link]
+        worker.stop()
+
+    def _on_death(self, worker: WorkerProcess) -> Iterator[Row]:
+        """Replace a dead worker; a run in which several died gets a failed row."""
+        del self._workers[worker.link]
+        worker.link.close()
+        self._deaths_at_start += not worker.ready
+        if self._deaths_at_start >= DEATHS_MAX:
+            raise RunError(
+                f"the sweep's workers die before they are ready ({worker.cause()}); see what they said above"
+            )
+        self._start()
+        if worker.task is None:
+            return
+        run = worker.task.run
+        self._deaths[run] += 1
+        if self._deaths[run] < DEATHS_MAX:
+            self._say(f"the worker of run {run} died ({worker.cause()}); another one flies it again")
+            self._again.append(worker.task)
+        else:
+            yield failed_row(worker.task, f"{DEATHS_MAX} workers died of it, the last one {worker.cause()}")

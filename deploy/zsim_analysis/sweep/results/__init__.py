@@ -1,1 +1,0 @@
-"""What a sweep came to: journal, table, distributions, figures, page."""

@@ -1,0 +1,160 @@
+"""Flies one run of a sweep in this process and judges it as `zsim report` does, without a record on disk."""
+
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from shutil import rmtree
+
+import msgspec
+import numpy as np
+
+from zsim.contract.fingerprint import fingerprint
+from zsim.errors import RecordError, ZsimError
+from zsim.record import RecordWriter
+from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
+from zsim_analysis.in_process import InProcessFlight
+from zsim_analysis.reading.flight import RecordedFlight
+from zsim_analysis.reading.flight_reader import FlightReader
+from zsim_analysis.reading.formation import Formation, formations_of
+from zsim_analysis.report.summary import RunSummary, summarise
+from zsim_analysis.sweep.sweep_row import Row, RunResult, Task, engaged_column, failed_row, make_row
+
+REASON_MAX = 300  # characters
+
+
+def fly(task: Task) -> Row:
+    """Return the row of a run; an error of the run is in its row and does not end the sweep.
+
+    Raises:
+        RecordError, OSError: its record cannot be written, so the record of no other run could be.
+    """
+    where = {"host": socket.gethostname(), "fingerprint": fingerprint()}
+    try:
+        with _record(task) as writer:
+            flight, diverged = fly_scenario(task.scenario, writer)
+        formations = formations_of(flight)
+        summary = summarise(flight, formations, Path())  # the end event has all that the record would be needed for
+    except (RecordError, OSError):
+        raise
+    except Exception as error:  # of any type: the scenario caused it
+        return failed_row(task, reason_of(error), **where)
+    engaged = engaged_s(formations, summary.window_s)
+    return _row(task, flight, summary, engaged, diverged, where)
+
+
+def reason_of(error: BaseException) -> str:
+    """Return the message of an exception in one line."""
+    text = " ".join(str(error).split())[:REASON_MAX]
+    return text if isinstance(error, ZsimError) and text else f"{type(error).__name__}: {text}"
+
+
+def fly_scenario(scenario: Scenario, writer: RecordWriter | None = None) -> tuple[RecordedFlight, Exception | None]:
+    """Fly a scenario; return the flight, and the error by which it diverged if it did.
+
+    Args:
+        scenario: resolved.
+        writer: records every message as well.
+    """
+    flight, reader = InProcessFlight(scenario), FlightReader()
+    flight.run([reader, writer] if writer else [reader])
+    return reader.flight(), flight.world.diverged
+
+
+@contextmanager
+def _record(task: Task) -> Iterator[RecordWriter | None]:
+    """Yield the writer of the record, None where none is kept; an incomplete record keeps the name .part."""
+    if task.record is None:
+        yield None
+        return
+    folder = Path(task.record)
+    writer = _begun(folder, task.scenario)
+    try:
+        yield writer
+    except (RecordError, OSError):
+        with suppress(RecordError):
+            writer.close()
+        raise
+    except Exception:
+        _keep(writer, folder)
+        raise
+    _keep(writer, folder)
+
+
+def _begun(folder: Path, scenario: Scenario) -> RecordWriter:
+    """Return the writer of a new record, replacing what an earlier attempt left there."""
+    part = _part(folder)
+    for leftover in (folder, part):
+        rmtree(leftover, ignore_errors=True)
+    try:
+        part.mkdir(parents=True)
+        (part / "scenario.yaml").write_text(scenario_file.to_text(scenario), encoding="utf-8")
+    except OSError as error:
+        raise RecordError(
+            f"{part}: cannot be written ({error.strerror}); make room, the same command goes on"
+        ) from error
+    return RecordWriter(part / "run.mcap")
+
+
+def _keep(writer: RecordWriter, folder: Path) -> None:
+    writer.close()
+    _part(folder).rename(folder)
+
+
+def _part(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.part")
+
+
+def engaged_s(formations: list[Formation], window_s: tuple[float, float]) -> dict[str, float | None]:
+    """Return the first instant [s] of a window at which each cluster was engaged, None where it never was."""
+    return {each.name: _engaged_s(each, window_s) for each in formations}
+
+
+def _engaged_s(formation: Formation, window_s: tuple[float, float]) -> float | None:
+    rows = np.flatnonzero(formation.within(window_s))
+    return next((float(formation.t_s[row]) for row in rows if formation.phases[row] == "engaged"), None)
+
+
+def _row(
+    task: Task,
+    flight: RecordedFlight,
+    summary: RunSummary,
+    engaged: dict[str, float | None],
+    diverged: Exception | None,
+    where: dict[str, str],
+) -> Row:
+    clusters = [cluster.name for cluster in task.scenario.clusters]
+    result = RunResult(
+        run=task.run,
+        point=task.point,
+        seed=task.scenario.seed,
+        failure=reason_of(diverged) if diverged else None,
+        ended=summary.ended,
+        truth_sha256=summary.truth_sha256,
+        sim_s=summary.sim_s,
+        wall_s=summary.wall_s,
+        real_time_factor=summary.real_time_factor,
+        min_separation_m=summary.min_separation_m,
+        collisions=sum(event.kind == "collision" for event in flight.events),
+        engaged=all(engaged.get(name) is not None for name in clusters) if clusters else None,
+        **where,
+    )
+    engaged_columns = {engaged_column(name): engaged.get(name) for name in clusters}
+    return make_row(
+        result, task.varied, engaged_columns if diverged else {**engaged_columns, **_errors(summary, engaged)}
+    )
+
+
+def _errors(summary: RunSummary, engaged: dict[str, float | None]) -> dict[str, float | None]:
+    """Return the errors of the formations by their paths in summary.json; `errors` is the first cluster.
+
+    Those of a cluster that was not engaged are None: drones on the ground hold no formation.
+    """
+    columns: dict[str, float | None] = {}
+    for i, (name, cluster) in enumerate(summary.clusters.items()):
+        prefix = "errors" if i == 0 else f"clusters.{name}.errors"
+        for parameter, errors in cluster.errors.items():
+            for statistic, value in msgspec.structs.asdict(errors).items():
+                columns[f"{prefix}.{parameter}.{statistic}"] = None if engaged[name] is None else value
+    return columns

@@ -1,0 +1,323 @@
+"""The Foxglove file: what the mcap library, protobuf and Rerun read is what was recorded."""
+
+import json
+import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections import Counter, defaultdict
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import recorded_run
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.reader import make_reader
+
+from zsim.contract import keys, messages
+from zsim.contract.messages import ClusterState
+from zsim.math.frames import quaternion_from_rpy, rotation_matrix
+from zsim.record import RecordReader
+from zsim_agents.formation.spaces.cluster_space import SingularClusterError
+from zsim_agents.formation.spaces.scenario_space import cluster_space
+from zsim_analysis.export.foxglove_messages import NumericMessageType
+from zsim_analysis.export.foxglove_scene import Instant
+from zsim_analysis.export.foxglove_topics import FoxgloveFile
+from zsim_analysis.export.make_export import export
+from zsim_analysis.export.output import Format
+from zsim_analysis.export.selection import MessageSelection
+
+DRONES = ("drone1", "a-b.c", "end")
+GATES = 301  # of six seconds
+RERUN = shutil.which("rerun", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+WITHOUT_NETWORK = ("unshare", "--map-root-user", "--net")  # Linux: a network of its own in which there is nobody
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    recorded_run.write(folder / "run.mcap")
+    export(folder, Format.FOXGLOVE)
+    return folder
+
+
+@cache
+def shown(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Return log time and message of every topic, decoded with the descriptors that the file itself brings."""
+    found: dict[str, list[tuple[int, Any]]] = defaultdict(list)
+    types: dict[int, Any] = {}
+    with open(path, "rb") as file:
+        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+            assert schema is not None
+            assert (schema.encoding, channel.message_encoding) == ("protobuf", "protobuf")
+            if schema.id not in types:
+                types[schema.id] = protobuf_type(schema.data, schema.name)
+            found[channel.topic].append((message.log_time, types[schema.id].FromString(message.data)))
+    return dict(found)
+
+
+def protobuf_type(data: bytes, name: str) -> Any:
+    """Return the class of a message out of a FileDescriptorSet."""
+    pool = descriptor_pool.DescriptorPool()
+    waiting = {file.name: file for file in descriptor_pb2.FileDescriptorSet.FromString(data).file}
+
+    def add(file: descriptor_pb2.FileDescriptorProto) -> None:
+        for other in file.dependency:
+            if other in waiting:
+                add(waiting.pop(other))
+        pool.Add(file)
+
+    while waiting:
+        add(waiting.pop(next(iter(waiting))))
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
+
+
+def said(run: Path, key: str) -> list[Any]:
+    with RecordReader(run / "run.mcap") as reader:
+        return [messages.decode(key, message.payload) for message in reader.messages({key})]
+
+
+def xyz(v: Any) -> tuple[float, float, float]:
+    return v.x, v.y, v.z
+
+
+def wxyz(q: Any) -> tuple[float, float, float, float]:
+    return q.w, q.x, q.y, q.z
+
+
+@pytest.mark.parametrize("drone", DRONES)
+def test_poses_are_those_on_record(run: Path, drone: str) -> None:
+    topics = shown(run / "foxglove.mcap")
+    for topic, key in ((f"/drone/{drone}/pose", keys.truth(drone)), (f"/drone/{drone}/estimate", keys.estimate(drone))):
+        recorded = said(run, key)
+        assert len(recorded) == GATES
+        assert [t_ns for t_ns, _ in topics[topic]] == [message.t_ns for message in recorded]
+        for (t_ns, pose), message in zip(topics[topic], recorded, strict=True):
+            assert pose.frame_id == "world"
+            assert pose.timestamp.seconds * 10**9 + pose.timestamp.nanos == t_ns
+            assert xyz(pose.pose.position) == message.position_m
+            assert wxyz(pose.pose.orientation) == message.orientation_wxyz
+
+
+def test_frames_are_where_truth_estimate_and_cluster_are(run: Path) -> None:
+    frames: dict[str, dict[int, Any]] = defaultdict(dict)
+    for t_ns, message in shown(run / "foxglove.mcap")["/tf"]:
+        for transform in message.transforms:
+            assert transform.parent_frame_id == "world"
+            frames[transform.child_frame_id][t_ns] = transform
+    for drone in DRONES:
+        for name, key in ((f"drone/{drone}", keys.truth(drone)), (f"drone/{drone}/estimate", keys.estimate(drone))):
+            for message in said(run, key):
+                assert xyz(frames[name][message.t_ns].translation) == message.position_m
+                assert wxyz(frames[name][message.t_ns].rotation) == message.orientation_wxyz
+    for state in said(run, keys.cluster_state("main")):
+        for name, values in (("cluster/main", state.value), ("cluster/main/desired", state.desired)):
+            assert xyz(frames[name][state.t_ns].translation) == values[:3]
+            turned = wxyz(frames[name][state.t_ns].rotation)
+            assert turned == pytest.approx(quaternion_from_rpy(values[3:6]))
+
+
+def test_the_numbers_of_a_cluster_are_desired_estimated_and_true(run: Path) -> None:
+    space = cluster_space(3)
+    truths = {drone: {truth.t_ns: truth for truth in said(run, keys.truth(drone))} for drone in DRONES}
+    states = said(run, keys.cluster_state("main"))
+    numbers = shown(run / "foxglove.mcap")["/cluster/main/variables"]
+    for (t_ns, message), state in zip(numbers, states, strict=True):
+        assert t_ns == state.t_ns
+        assert [getattr(message, f"desired_{name}") for name in state.names] == list(state.desired)
+        assert [getattr(message, f"estimated_{name}") for name in state.names] == list(state.value)
+        assert (message.phase, message.margin) == (state.phase, state.margin)
+        now = [truths[drone][t_ns] for drone in DRONES]
+        R_WB = [rotation_matrix(truth.orientation_wxyz) for truth in now]
+        yaw = np.array([math.atan2(R[1, 0], R[0, 0]) for R in R_WB])
+        true = space.forward(np.array([truth.position_m for truth in now]), yaw)
+        assert [getattr(message, f"true_{name}") for name in state.names] == pytest.approx(true.tolist(), abs=1e-12)
+
+
+def test_the_numbers_of_a_drone(run: Path) -> None:
+    topics = shown(run / "foxglove.mcap")
+    for drone in DRONES:
+        found = zip(
+            topics[f"/drone/{drone}/numbers"],
+            said(run, keys.truth(drone)),
+            said(run, keys.estimate(drone)),
+            said(run, keys.status(drone)),
+            strict=True,
+        )
+        for (_, message), truth, estimate, status in found:
+            assert (message.true_x_m, message.true_y_m, message.true_z_m) == truth.position_m
+            assert message.error_m == math.dist(truth.position_m, estimate.position_m)
+            assert message.sigma_m == pytest.approx(math.sqrt(sum(estimate.covariance[7 * i] for i in range(3))))
+            assert (message.state, message.battery_percent) == (status.state, status.battery_percent)
+
+
+def test_fixes_and_events(run: Path) -> None:
+    topics = shown(run / "foxglove.mcap")
+    for drone in DRONES:
+        for (_, fix), gps in zip(topics[f"/drone/{drone}/gps"], said(run, keys.sensor(drone, "gps")), strict=True):
+            assert (fix.latitude, fix.longitude, fix.altitude) == (gps.latitude_deg, gps.longitude_deg, gps.altitude_m)
+            assert fix.position_covariance[0] == gps.sigma_m**2
+    events = said(run, keys.EVENT)
+    assert [line.message for _, line in topics["/log"]] == [f"{event.kind}: {event.text}" for event in events]
+    assert [line.name for _, line in topics["/log"]] == [event.source for event in events]
+
+
+def test_the_scene_shows_what_is_there(run: Path) -> None:
+    topics = shown(run / "foxglove.mcap")
+    ((_, drones),) = topics["/scene/drones"]
+    assert {entity.frame_id for entity in drones.entities} == {f"drone/{drone}" for drone in DRONES}
+    assert all(entity.frame_locked and entity.cubes and entity.cylinders for entity in drones.entities)
+    truths = {drone: {truth.t_ns: truth for truth in said(run, keys.truth(drone))} for drone in DRONES}
+    for t_ns, update in topics["/scene/formations"]:
+        (entity,) = update.entities
+        outline = [xyz(corner) for corner in entity.lines[0].points]
+        assert outline == [truths[drone][t_ns].position_m for drone in DRONES]
+        assert len(entity.spheres) == 3
+    estimates = {drone: {each.t_ns: each for each in said(run, keys.estimate(drone))} for drone in DRONES}
+    for t_ns, update in topics["/scene/estimates"]:
+        for entity in update.entities:
+            (sphere,) = entity.spheres
+            estimate = estimates[entity.id][t_ns]
+            assert xyz(sphere.pose.position) == estimate.position_m
+            R, half_m = rotation_matrix(wxyz(sphere.pose.orientation)), np.array(xyz(sphere.size)) / 2
+            covariance = np.array(estimate.covariance).reshape(6, 6)[:3, :3]
+            np.testing.assert_allclose(R @ np.diag(np.square(half_m / 2)) @ R.T, covariance, atol=1e-12)
+    last_ns, trails = topics["/scene/trails"][-1]
+    assert xyz(trails.entities[0].lines[0].points[-1]) == truths["drone1"][last_ns].position_m
+    assert len(trails.entities[0].lines[0].points) == len(topics["/scene/trails"]) == 13
+
+
+def test_a_formation_that_cannot_be_has_no_ghosts(tmp_path: Path) -> None:
+    """A desired formation whose robots are in one line: its cluster has no frame, and the file goes on."""
+    space = cluster_space(3)
+    desired = [1.0] * space.size
+    desired[space.index("p")] = 0.0
+    desired[space.index("q")] = 0.0
+    with pytest.raises(SingularClusterError):
+        space.inverse(np.array(desired))
+    some = tuple(desired)
+    state = ClusterState(0, 0, "engaged", DRONES, space.names, some, some, some, None, 0.0, "")
+    file = FoxgloveFile(tmp_path / "some.mcap", dict.fromkeys(DRONES, 0.2), {"main": space})
+    file.write(Instant(0, states={"main": state}))
+    file.close()
+    assert file.counts["/scene/formations"] == file.counts["/cluster/main/variables"] == 1
+    assert "/points/desired" not in file.counts
+
+
+def test_numbers_are_protobuf_as_its_own_library_writes_it() -> None:
+    numbers = NumericMessageType("Some", [f"n{i}" for i in range(40)], ("text", "more"))
+    kind = protobuf_type(numbers.schema, "zsim.Some")
+    values = [*np.linspace(-1e300, 1e300, 39), math.nan]
+    message = kind.FromString(numbers.encode(values, ("é" * 200, "")))
+    assert [getattr(message, f"n{i}") for i in range(39)] == values[:39]
+    assert math.isnan(message.n39)
+    assert (message.text, message.more) == ("é" * 200, "")
+
+
+def test_the_layout_shows_topics_and_fields_that_are_there(run: Path) -> None:
+    topics = shown(run / "foxglove.mcap")
+    layout = json.loads((run / "foxglove-layout.json").read_text())
+    paths = list(values_of(layout, "value"))
+    assert len([path for path in paths if "/cluster/main/variables." in path]) == 12 * 3 + 1
+    for path in paths:
+        topic, field = path.removeprefix('"').replace('"', "").rsplit(".", 1)
+        assert hasattr(topics[topic][0][1], field), path
+        assert path.startswith('"') == bool(re.search(r"[^\w/]", topic)), path
+    panels = Counter(values_of(layout, "panelType"))
+    assert panels["ThreeDee"] == panels["Log"] == panels["StateTransitions"] == 1
+    assert panels["Plot"] == 15
+    shown_topics = next(config["topics"] for config in values_of(layout, "config") if "topics" in config)
+    assert set(shown_topics) <= set(topics)
+    assert next(values_of(layout, "topicToRender")) in topics
+
+
+def values_of(tree: Any, name: str) -> Any:
+    """Yield the values of all fields of a name."""
+    for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ():
+        if key == name:
+            yield value
+        yield from values_of(value, name)
+
+
+def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
+    chosen = MessageSelection(("drone/end/truth", "world/**"), from_s=2.0, to_s=3.0)
+    done = export(run, Format.FOXGLOVE, tmp_path / "some.mcap", chosen)
+    topics = shown(tmp_path / "some.mcap")
+    assert done.paths == (tmp_path / "some.mcap", tmp_path / "some-layout.json")
+    assert {topic.split("/")[2] for topic in topics if topic.startswith("/drone/")} == {"end"}
+    assert [t_ns for t_ns, _ in topics["/drone/end/pose"]] == list(range(2 * 10**9, 3 * 10**9 + 1, 20_000_000))
+    assert done.tables == {topic: len(found) for topic, found in topics.items()}
+
+
+# Rerun
+
+
+@cache
+def isolated() -> tuple[str, ...]:
+    """Return what runs a command without a network, nothing where this machine does not allow it."""
+    allowed = (
+        shutil.which("unshare") and subprocess.run([*WITHOUT_NETWORK, "true"], capture_output=True).returncode == 0
+    )
+    return WITHOUT_NETWORK if allowed else ()
+
+
+def rerun(home: Path, *arguments: str) -> str:
+    """Run Rerun with a home of its own, in which it is told not to report on its use."""
+    assert RERUN
+    own = {**os.environ, "HOME": str(home), "XDG_CONFIG_HOME": str(home / "config")}
+    if not home.exists():
+        home.mkdir()
+        subprocess.run([RERUN, "analytics", "disable"], env=own, capture_output=True, timeout=120, check=True)
+    done = subprocess.run([*isolated(), RERUN, *arguments], env=own, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def converted(run: Path) -> Path:
+    """Return the file as Rerun converts it, beside a home for Rerun."""
+    path = run / "foxglove.rrd"
+    rerun(run / "home", "mcap", "convert", str(run / "foxglove.mcap"), "-o", str(path))
+    return path
+
+
+def test_rerun_is_told_not_to_report_on_its_use(run: Path, converted: Path) -> None:
+    assert re.search(r"analytics_enabled\W+false", rerun(run / "home", "analytics", "config"))
+
+
+def test_rerun_reads_it_without_a_fault(run: Path, converted: Path) -> None:
+    assert "verified without error" in rerun(run / "home", "rrd", "verify", str(converted))
+    assert "num_chunks" in rerun(run / "home", "rrd", "stats", str(converted))
+    checked = rerun(run / "home", "mcap", "check", str(run / "foxglove.mcap"))
+    assert set(re.findall(r"^(\w+) +\d+ +\d+ +/", checked, flags=re.MULTILINE)) == {"ok"}
+
+
+def test_rerun_has_what_is_drawn_and_plotted_at_every_instant(run: Path, converted: Path) -> None:
+    rows: Counter[tuple[str, str]] = Counter()
+    for count, entity, columns in re.findall(
+        r"^Chunk\(\w+\) with (\d+) rows .* - (/\S*) - data columns: \[(.*)\]",
+        rerun(run / "home", "rrd", "print", "-v", str(converted)),
+        re.M,
+    ):
+        for column in {column.split("@", 1)[1] for column in columns.split()}:
+            rows[entity.replace("\\", ""), column] += int(count)
+    topics = shown(run / "foxglove.mcap")
+    transforms = sum(len(message.transforms) for _, message in topics["/tf"])
+    assert rows["/tf", "Transform3D:translation"] == transforms == GATES * 8
+    for drone in DRONES:
+        assert rows[f"/drone/{drone}/pose", "InstancePoses3D:translations"] == GATES
+        assert rows[f"/drone/{drone}/numbers", "zsim.Drone:message"] == GATES
+        assert rows[f"/drone/{drone}/gps", "GeoPoints:positions"] == len(topics[f"/drone/{drone}/gps"])
+    assert rows["/cluster/main/variables", "zsim.Cluster_main:message"] == GATES
+    assert rows["/points/drones", "Points3D:positions"] == rows["/points/drones", "Points3D:colors"] == 61
+    assert rows["/log", "TextLog:text"] == len(topics["/log"])
+
+
+def test_rerun_has_the_values_and_times_on_record(run: Path, converted: Path) -> None:
+    printed = rerun(run / "home", "rrd", "print", "-vvv", str(converted), "--entity", "/drone/end/pose")
+    times = re.findall(r"1970-01-01T00:00:0(\d\.\d+|\d)", printed)
+    assert {float(each) for each in times} >= {truth.t_ns / 1e9 for truth in said(run, keys.truth("end"))}

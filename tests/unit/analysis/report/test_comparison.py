@@ -1,0 +1,261 @@
+"""The comparison of runs: side by side what each report says of its own, and in words what one has and another has not."""
+
+import base64
+import io
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+import synthetic_record
+from synthetic_record import Flown
+from typer.testing import CliRunner
+
+from zsim.errors import RecordError, ReportError
+from zsim_analysis.report.canvas import STYLES, run_style
+from zsim_analysis.report.comparison import (
+    ABSENT,
+    THERE,
+    ComparedRun,
+    clusters,
+    flattened,
+    notes,
+    run_names,
+    scenario_rows,
+)
+from zsim_analysis.report.comparison_figures import comparison_figures
+from zsim_analysis.report.make_comparison import STATISTICS, compare, comparison_path, fact_rows, statistics_rows
+from zsim_analysis.report.make_report import judge
+from zsim_deploy.cli.cli import app
+
+WINDOW = "report.window_s=[2, 9.98]"
+ERRORS = np.linspace(0.02, 0.2, 12)
+
+
+def record(folder: Path, flight: Flown) -> Path:
+    folder.mkdir(parents=True)
+    synthetic_record.write(folder / "run.mcap", flight)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Return the folders of a calm run, one with larger errors and another seed, and one without a cluster."""
+    home = tmp_path_factory.mktemp("runs")
+    calm = Flown(duration_s=12.0, overrides=(WINDOW,), amplitude=ERRORS, est_amplitude=0.5 * ERRORS)
+    rough = Flown(duration_s=12.0, overrides=(WINDOW, "seed=5"), amplitude=3 * ERRORS, est_amplitude=ERRORS)
+    alone = Flown(duration_s=12.0, overrides=(WINDOW, "clusters=[]"))
+    flights = {"calm": calm, "rough": rough, "alone": alone}
+    return [record(home / name, flight) for name, flight in flights.items()]
+
+
+def judged(directories: list[Path]) -> list[ComparedRun]:
+    names = run_names(directories)
+    return [ComparedRun(name, d, *judge(d / "run.mcap")) for name, d in zip(names, directories, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def compared(runs: list[Path]) -> list[ComparedRun]:
+    return judged(runs)
+
+
+def test_statistics_stand_side_by_side(compared: list[ComparedRun]) -> None:
+    rows = {row.name: row.cells for row in statistics_rows(compared, "main")}
+    width = len(STATISTICS)
+    for i, name in enumerate(["x_c (m)", "y_c (m)", "z_c (m)"]):
+        sine = ERRORS[i] / np.sqrt(2)
+        est_std, true_std, true_rms, true_mean = map(float, rows[name][:width])
+        assert (est_std, true_std, true_rms) == pytest.approx((sine / 2, sine, sine), abs=1e-4)
+        assert true_mean == pytest.approx(0, abs=1e-4)
+        assert float(rows[name][width + 1]) == pytest.approx(3 * sine, abs=1e-4)
+        assert rows[name][2 * width :] == (ABSENT,) * width
+
+
+def test_facts_that_differ_are_marked(compared: list[ComparedRun]) -> None:
+    rows = {row.name: row for row in fact_rows(compared)}
+    assert rows["Scenario"].cells[:2] == ("step, seed 1", "step, seed 5")
+    assert rows["Scenario"].differs
+    assert not rows["Mode"].differs
+    assert rows["Clusters"].cells == ("main of 3", "main of 3", "none")
+
+
+def test_the_scenarios_differ_in_what_was_overridden(compared: list[ComparedRun]) -> None:
+    rows = {row.name: row.cells for row in scenario_rows(compared)}
+    assert rows == {
+        "seed": ("1", "5", "1"),
+        "clusters.main": (THERE, THERE, ABSENT),
+    }
+    assert scenario_rows(compared[:1] * 2) == []
+
+
+def test_faults_are_told_as_a_whole(runs: list[Path], tmp_path: Path) -> None:
+    faults = 'faults=[{"kind": "gps_bias", "target": "drone1", "at_s": 1, "for_s": 0.5, "value_m": [3, 0, 0]}]'
+    record(tmp_path / "with", Flown(duration_s=2.0, overrides=(faults,)))
+    rows = {row.name: row.cells for row in scenario_rows(judged([runs[0], tmp_path / "with"]))}
+    assert rows["faults.0"][0] == ABSENT
+    assert rows["faults.0"][1] == "at_s 1, for_s 0.5, kind gps_bias, target drone1, value_m [3, 0, 0]"
+    assert not any(name.startswith("faults.0.") or name == "faults" for name in rows)
+
+
+def test_named_things_are_compared_by_name() -> None:
+    one = dict(
+        flattened({"drones": [{"name": "a", "x": 1}, {"name": "b", "x": 2}], "list": [1, 2], "map": {"k": None}})
+    )
+    assert one == {"drones.a": THERE, "drones.a.name": "a", "drones.a.x": 1, "drones.b": THERE, "drones.b.name": "b",
+                   "drones.b.x": 2, "list": [1, 2], "map.k": None}  # fmt: skip
+
+
+def test_what_one_run_has_and_another_has_not_is_said(runs: list[Path], tmp_path: Path) -> None:
+    end = record(tmp_path / "short", Flown(duration_s=3.0, overrides=(WINDOW,), end=None))
+    data = (runs[0] / "run.mcap").read_bytes()
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "cut" / "run.mcap").write_bytes(data[: len(data) // 2])
+    said = notes(judged([*runs, end, tmp_path / "cut"]))
+    assert "Cluster main: in calm, rough, short and cut only." in said
+    assert any(note.startswith("The windows of the statistics differ (calm: 2 to 9.98 s;") for note in said)
+    assert any(note.startswith("short: The world did not report the run's end") for note in said)
+    assert any(note.startswith("cut: The record was cut") for note in said)
+    assert "calm and alone flew the same bits." not in said
+    assert "a/calm and b/calm flew the same bits." in notes(twins(tmp_path, runs[0]))
+
+
+def twins(folder: Path, run: Path) -> list[ComparedRun]:
+    for name in ("a", "b"):
+        (folder / name / "calm").mkdir(parents=True)
+        (folder / name / "calm" / "run.mcap").write_bytes((run / "run.mcap").read_bytes())
+    return judged([folder / "a" / "calm", folder / "b" / "calm"])
+
+
+def test_other_drones_and_variables_are_said(runs: list[Path], tmp_path: Path) -> None:
+    pair = tmp_path / "pair"
+    pair.mkdir()
+    other = "drones=[{name: drone1, position_m: [0, 1.5, 0]}, {name: x, position_m: [5, 5, 0]}, {name: y, position_m: [9, 9, 0]}]"
+    members = "clusters.main.drones=[drone1, x, y]"
+    record(tmp_path / "others", Flown(duration_s=4.0, overrides=(other, members)))
+    both = judged([runs[0], tmp_path / "others"])
+    said = notes(both)
+    assert "Drones drone2 and drone3: in calm only." in said
+    assert "Drones x and y: in others only." in said
+    names = {row.name for row in scenario_rows(both)}
+    assert {"drones.drone2", "drones.x"} <= names
+    assert not any(name.startswith("drones.x.") for name in names)
+
+
+def test_differences_that_rounding_hides_are_told(runs: list[Path], tmp_path: Path) -> None:
+    other = "environment.wind.gust_m_s=0.1234567"
+    near = "environment.wind.gust_m_s=0.12345671"
+    record(tmp_path / "other", Flown(duration_s=2.0, overrides=(other,)))
+    record(tmp_path / "near", Flown(duration_s=2.0, overrides=(near,)))
+    rows = scenario_rows(judged([tmp_path / "other", tmp_path / "near"]))
+    assert [(row.name, row.cells) for row in rows] == [("environment.wind.gust_m_s", ("0.1234567", "0.12345671"))]
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_a_comparison_of_other_runs_is_not_replaced(runs: list[Path], tmp_path: Path) -> None:
+    for place in ("A/one", "B/two", "C/two", "B/one"):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "run.mcap").write_bytes((runs[2] / "run.mcap").read_bytes())
+
+    def page(*places: str) -> str:
+        directories = [tmp_path / place for place in places]
+        path = comparison_path(directories)
+        compare(directories, path)
+        return str(path.relative_to(tmp_path))
+
+    assert page("A/one", "B/one") == "A/compare-A-one-B-one.html"
+    assert page("A/one", "B/two") == "A/compare-one-two.html"
+    assert page("A/one", "C/two") == "A/compare-one-two-2.html"
+    assert page("A/one", "B/two") == "A/compare-one-two.html"
+    assert page("A/one", "C/two") == "A/compare-one-two-2.html"
+
+
+def test_names_tell_the_runs_apart(tmp_path: Path) -> None:
+    assert run_names([Path("runs/a"), Path("runs/b")]) == ["a", "b"]
+    assert run_names([Path("one/a"), Path("two/a")]) == ["one/a", "two/a"]
+    assert run_names([tmp_path / "a", tmp_path / "a"]) == ["a (1)", "a (2)"]
+    assert comparison_path([tmp_path / name for name in "abcde"]) == tmp_path / "compare-a-b-c-and-2-more.html"
+
+
+def test_runs_can_be_told_apart_without_colour() -> None:
+    looks = [(str(run_style(i).dashes), run_style(i).marker) for i in range(len(STYLES))]
+    assert len({dashes for dashes, _ in looks}) == len({marker for _, marker in looks}) == len(STYLES)
+    assert len({(run_style(i).color, str(run_style(i).dashes)) for i in range(24)}) == 24
+
+
+def test_the_figures_show_every_run(compared: list[ComparedRun]) -> None:
+    four = [*compared, replace(compared[0], name="calm again")]
+    assert clusters(four) == ["main"]
+    drawn = {figure.name: figure.drawing for figure in comparison_figures(four)}
+    assert list(drawn) == [
+        "rms_main.png",
+        "figure_5_errors_main_0.png",
+        "figure_5_errors_main_1.png",
+        "figure_6_position_main.png",
+        "figure_7_orientation_main.png",
+        "figure_8_shape_main.png",
+        "plan_view.png",
+        "drones.png",
+    ]
+    for name, figure in drawn.items():
+        assert figure.get_size_inches()[0] * figure.dpi >= 1000
+        assert any(axes.has_data() for axes in figure.axes), name
+    x_true, x_measured = drawn["figure_6_position_main.png"].axes[:2]
+    largest = [float(np.nanmax(np.abs(np.asarray(line.get_ydata()) - 5.0))) for line in x_true.lines[::2][:3]]
+    assert [line.get_label() for line in x_true.lines[::2][:3]] == ["calm", "rough", "calm again"]
+    assert largest == pytest.approx([ERRORS[0], 3 * ERRORS[0], ERRORS[0]], rel=1e-3)
+    assert len(x_measured.lines) == 6
+    assert [axes.get_title() for axes in drawn["plan_view.png"].axes] == [run.name for run in four]
+
+
+def test_the_page_is_one_file_that_asks_nothing_of_the_network(runs: list[Path], tmp_path: Path) -> None:
+    out, steps = tmp_path / "sub" / "page.html", []
+    compared = compare(runs, out, steps.append)
+    text = out.read_text()
+    assert [path.name for path in out.parent.iterdir()] == ["page.html"]
+    pictures = re.findall(r"data:image/png;base64,([^\"]+)", text)
+    assert len(pictures) == 7
+    for each in pictures:
+        picture = matplotlib.image.imread(io.BytesIO(base64.b64decode(each)))[:, :, :3]
+        assert picture.shape[1] >= 1000
+        assert 0.003 < (picture < 0.9).any(axis=2).mean() < 0.6
+    assert not re.search(r"https?:|@import|url\(|<script", text)
+    assert "<title>calm, rough, alone: comparison</title>" in text
+    assert "calm: reading the record" in steps
+    for run in compared:
+        assert run.summary.truth_sha256 in text
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_the_command(runs: list[Path], tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["report", *map(str, runs[:2])])
+    page = runs[0].parent / "compare-calm-rough.html"
+    assert done.exit_code == 0, done.output
+    assert done.stdout == f"report: {page}\n"
+    page.unlink()
+    refused = CliRunner().invoke(app, ["report", str(runs[0]), "--out", str(tmp_path / "x.html")])
+    assert refused.exit_code == 2
+    assert "leave it out" in " ".join(refused.output.replace("│", " ").split())
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_what_cannot_be_compared_is_one_line(runs: list[Path], tmp_path: Path) -> None:
+    with pytest.raises(RecordError, match=r"run\.mcap: cannot be read \(No such file"):
+        compare([runs[0], tmp_path], tmp_path / "page.html")
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(ReportError, match="the report cannot be written"):
+        compare(runs[:2], tmp_path / "file" / "page.html")
+
+
+def test_nothing_but_an_earlier_comparison_is_replaced(runs: list[Path]) -> None:
+    record = runs[0] / "run.mcap"
+    before = record.read_bytes()
+    with pytest.raises(ReportError, match=r"run\.mcap: exists and is no comparison"):
+        compare(runs[:2], record)
+    assert record.read_bytes() == before
+
+
+def test_a_run_is_not_compared_with_itself(runs: list[Path], tmp_path: Path) -> None:
+    with pytest.raises(ReportError, match="calm: is given twice"):
+        compare([runs[0], runs[1], runs[0]], tmp_path / "page.html")

@@ -1,0 +1,85 @@
+"""Where the truth of two flights differs, and where the outputs of their agents do."""
+
+import math
+from typing import Any
+
+import msgspec
+import pytest
+
+from zsim.contract import keys, messages
+from zsim.contract.messages import Message, Mode, Truth
+from zsim_analysis.rerun.truth_comparison import OutputComparison, TruthComparison, difference
+
+GATE_NS = 20_000_000
+ZEROS = (0.0, 0.0, 0.0)
+
+
+def truth(gate: int, drone: str, x: float = 0.0) -> tuple[str, Message]:
+    message = Truth(gate * GATE_NS, gate, (x, 0.0, 1.0), ZEROS, (1.0, *ZEROS), ZEROS, ZEROS, (9.0, 9.0, 9.0, 9.0))
+    return keys.truth(drone), message
+
+
+def encoded(**changes: Any) -> bytes:
+    return messages.encode(msgspec.structs.replace(truth(3, "d1")[1], **changes))
+
+
+def test_how_far_two_states_are_apart():
+    c, s = math.cos(0.05), math.sin(0.05)
+    other = encoded(
+        position_m=(3.0, 4.0, 1.0),
+        velocity_m_s=(0.0, 0.0, 2.0),
+        orientation_wxyz=(-c, 0.0, 0.0, -s),
+        angular_velocity_rad_s=(0.0, 0.3, 0.4),
+    )
+    found = difference(3 * GATE_NS, "d1", encoded(), other)
+    assert found is not None
+    assert found[:5] == (3 * GATE_NS, "d1", 5.0, 2.0, pytest.approx(0.1))
+    assert found.rate_rad_s == pytest.approx(0.5)
+    assert str(found) == "d1 at 0.060 s by 5 m, 2 m/s, 5.73 deg, 28.6 deg/s"
+
+
+def test_what_is_not_hashed_does_not_count():
+    other = encoded(accel_m_s2=(1.0, 0.0, 0.0), rotor_rad_s=(1.0, 2.0, 3.0, 4.0))
+    assert difference(0, "d1", encoded(), other) is None
+
+
+def test_the_smallest_difference_counts():
+    assert difference(0, "d1", encoded(position_m=(1.0, 0.0, 1.0)), encoded(position_m=(1.0 + 2**-52, 0.0, 1.0)))
+
+
+def test_the_first_and_the_last_difference_are_kept():
+    compared = TruthComparison(["d1", "d2"])
+    same = {"d1": encoded(), "d2": encoded()}
+    for t_ns, flown in enumerate([same, {**same, "d2": encoded(position_m=(1.0, 0.0, 1.0))}, same]):
+        compared.add(t_ns, same, flown)
+    compared.add(3, same, dict.fromkeys(same, encoded(position_m=(2.0, 0.0, 1.0))))
+    assert compared.first is not None
+    assert compared.last is not None
+    assert (compared.instants, compared.first.t_ns, compared.first.drone) == (4, 1, "d2")
+    assert (compared.last.t_ns, compared.last.drone, compared.last.position_m) == (3, "d2", 2.0)
+
+
+def command(gate: int, mode: Any = "land", seq: int | None = None) -> Mode:
+    return Mode(gate * GATE_NS, gate if seq is None else seq, "controller.main", mode)
+
+
+def test_outputs_that_are_the_same_in_any_order_are_no_difference():
+    outputs = OutputComparison(2 * GATE_NS)
+    for gate in range(10):
+        outputs.add("a", command(gate))
+        if gate:
+            outputs.add("a", command(gate - 1))
+        outputs.expire(gate * GATE_NS)
+    assert outputs.first == ""
+
+
+def test_the_earliest_answer_that_differs_or_is_missing_is_told():
+    outputs = OutputComparison(2 * GATE_NS)
+    outputs.add("missing", command(3))
+    for mode in ("land", "takeoff"):
+        outputs.add("later", command(4, mode))
+    assert outputs.first == "later at 0.08 s"
+    outputs.expire(5 * GATE_NS)
+    assert outputs.first == "later at 0.08 s"
+    outputs.expire(6 * GATE_NS)
+    assert outputs.first == "missing at 0.06 s"

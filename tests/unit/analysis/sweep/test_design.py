@@ -1,0 +1,251 @@
+"""What a sweep flies: axes, combinations, what is drawn, and the faults of all of it at once."""
+
+import copy
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from zsim.errors import ScenarioError
+from zsim.scenario import scenario_file
+from zsim_analysis.sweep.axes import Draw, Grid, Seeds, field_path, is_inside, parse
+from zsim_analysis.sweep.design import SweepDesign, SweepPlan, difference, make_plan, read_document
+
+STEP = Path(__file__).parents[4] / "scenarios/step.yaml"
+GUST = "environment.wind.gust_m_s"
+
+
+def plan(*vary: str, runs: int | None = None, **values: Any) -> SweepPlan:
+    document, faults = read_document(STEP, [], **values)
+    assert faults == []
+    return make_plan(STEP.name, document, list(vary), runs)
+
+
+def faults(*vary: str, runs: int | None = None, **values: Any) -> list[str]:
+    with pytest.raises(ScenarioError) as caught:
+        plan(*vary, runs=runs, **values)
+    return caught.value.faults
+
+
+@pytest.mark.parametrize(
+    ("text", "axis"),
+    [
+        ("seed", Seeds()),
+        ("seed=1,2", Grid("seed", (1, 2))),
+        ("environment.wind.gust_m_s=0,1.5,2", Grid(GUST, (0, 1.5, 2))),
+        ("drones.drone1.position_m=[0,0,0],[1, 0, 0]", Grid("drones.drone1.position_m", ([0, 0, 0], [1, 0, 0]))),
+        ("sensors.preset=paper,ardrone2", Grid("sensors.preset", ("paper", "ardrone2"))),
+        ("estimation.flow=true,false", Grid("estimation.flow", (True, False))),
+        ("a.b=uniform(0,2)", Draw("a.b", "uniform", 0.0, 2.0)),
+        ("a.b= normal(-1e-3, 0.5) ", Draw("a.b", "normal", -1e-3, 0.5)),
+    ],
+)
+def test_variations(text: str, axis: Seeds | Grid | Draw) -> None:
+    assert parse(text) == axis
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("wind", "is no variation; must be seed, a.b.c=v1,v2"),
+        ("=1", "is no variation"),
+        ("duration_s=", "gives no value"),
+        ("duration_s=[1", "is not YAML"),
+        ("duration_s=5,5.0", "gives 5 twice"),
+        ("duration_s=triangle(1,2)", "draws by triangle; must be uniform(low,high) or normal(mean,std)"),
+        ("duration_s=uniform(2,1)", "must be finite numbers with low < high"),
+        ("duration_s=uniform(1)", "must hold two numbers"),
+        ("duration_s=normal(1,0)", "must be finite numbers with std > 0"),
+        ("duration_s=normal(nan,1)", "must be finite numbers"),
+        ("wind.gust_m_s=uniform(-1e308,1e308)", "must be finite numbers with low < high, high - low finite too"),
+    ],
+)
+def test_what_is_no_variation(text: str, reason: str) -> None:
+    (fault,) = faults(text)
+    assert fault.startswith(f"--vary {text}: ")
+    assert reason in fault
+
+
+def test_runs_are_spread_evenly_over_every_combination() -> None:
+    design = SweepDesign(plan("seed", "wind.gust_m_s=0,1,2", "estimation.flow=true,false", runs=20))
+    assert design.points == 6
+    flown = [(design.values(run)[GUST], design.values(run)["estimation.flow"]) for run in range(20)]
+    assert flown[:6] == [(0, True), (0, False), (1, True), (1, False), (2, True), (2, False)]
+    assert set(Counter(flown).values()) == {3, 4}
+    assert [design.at(point) for point in range(6)] == [
+        {GUST: gust, "estimation.flow": flow} for gust in (0, 1, 2) for flow in (True, False)
+    ]
+    assert plan("wind.gust_m_s=0,1,2", "estimation.flow=true,false").runs == 6
+
+
+def test_a_run_s_scenario_is_what_set_would_give() -> None:
+    design = SweepDesign(plan("seed", "wind.gust_m_s=0,1", "drones.drone2.mass_kg=uniform(0.4,0.5)", runs=5))
+    values = design.values(3)
+    overrides = [f"{GUST}={values[GUST]}", f"drones.drone2.mass_kg={values['drones.drone2.mass_kg']!r}"]
+    assert design.scenario(3) == scenario_file.load(STEP, overrides, seed=values["seed"])
+    assert design.varied == [GUST, "drones.drone2.mass_kg"]
+
+
+def test_seeds_are_distinct_and_those_of_a_longer_sweep_begin_alike() -> None:
+    short, long = Seeds().draw(7, 50), Seeds().draw(7, 20_000)
+    assert long[:50] == short
+    assert len(set(long)) == 20_000
+    assert Seeds().draw(8, 50) != short
+    design = SweepDesign(plan("seed", runs=3, seed=7))
+    assert [design.scenario(run).seed for run in range(3)] == short[:3]
+
+
+def test_draws_are_of_their_distribution_and_know_nothing_of_each_other() -> None:
+    uniform, normal = Draw("a", "uniform", -1.0, 3.0), Draw("b", "normal", 5.0, 0.5)
+    u, n = np.array(uniform.draw(1, 20_000)), np.array(normal.draw(1, 20_000))
+    assert u.min() >= -1
+    assert u.max() < 3
+    assert u.mean() == pytest.approx(1.0, abs=4 * (4 / 12**0.5) / 20_000**0.5)
+    assert n.mean() == pytest.approx(5.0, abs=4 * 0.5 / 20_000**0.5)
+    assert n.std() == pytest.approx(0.5, abs=4 * 0.5 / (2 * 20_000) ** 0.5)
+    assert uniform.draw(1, 7) == u[:7].tolist()
+    assert normal.draw(1, 7) == n[:7].tolist()
+    one = SweepDesign(plan("environment.height_m=uniform(0,9)", runs=4))
+    two = SweepDesign(
+        plan("environment.air_density_kg_m3=normal(1.2,0.01)", "environment.height_m=uniform(0,9)", runs=4)
+    )
+    path = "environment.height_m"
+    assert [one.values(run)[path] for run in range(4)] == [two.values(run)[path] for run in range(4)]
+
+
+def test_all_faults_are_told_at_once_before_anything_flies() -> None:
+    found = faults("seed", "wind.gust_m_s=0,-1,-2", "wings=1,2", "estimation.flow", "drones.drone9.mass_kg=1", runs=30)
+    assert [fault.partition(";")[0] for fault in found] == [
+        "--vary estimation.flow: is no variation",
+        "--vary drones.drone9.mass_kg=1: drone9 is not in drones",
+        "step.yaml: wings is not known",
+        f"step.yaml: {GUST} is -1",
+    ]
+    found = faults("seed", "wind.gust_m_s=0,-1,-2", "duration_s=5,nan", "seed=3", runs=30)
+    assert [fault.partition(";")[0] for fault in found] == [
+        "--vary seed=3: seed varies already by seed",
+        "step.yaml: duration_s is 'nan'",
+        f"step.yaml: {GUST} is -1",
+    ]
+    assert found[2].endswith(f"(in 4 of 6 combinations, first {GUST}=-1, duration_s=5)")
+
+
+def test_a_fault_of_the_file_is_told_once() -> None:
+    assert [fault.partition(";")[0] for fault in faults("seed", "wind.gust_m_s=0,1", runs=9, duration_s=-1)] == [
+        "step.yaml: duration_s is -1"
+    ]
+    assert "seed is -4" in faults("seed", runs=3, seed=-4)[0]
+
+
+def test_every_drawn_value_is_checked() -> None:
+    (fault,) = faults("seed", "drones.drone1.limits.tilt_deg=uniform(29,31)", runs=40)
+    design = SweepDesign(
+        SweepPlan(source="", document={}, vary=("drones.drone1.limits.tilt_deg=uniform(29,31)",), runs=40)
+    )
+    too_much = [run for run in range(40) if design.values(run)["drones.drone1.limits.tilt_deg"] > 30]
+    assert 0 < len(too_much) < 40
+    assert "must be > 0 and <= 30" in fault
+    assert f"(in {len(too_much)} of 40 combinations, first drones.drone1.limits.tilt_deg=30." in fault
+
+
+@pytest.mark.parametrize(
+    ("vary", "runs", "reason"),
+    [
+        (["wind.gust_m_s=0,1,2"], 2, "--runs is 2; must be at least 3, the combinations of the grid"),
+        (["wind.gust_m_s=0,1,2"], 4, "--runs is 4; must be 3, for further ones would have the same bits"),
+        ([], 2, "or add --vary seed"),
+        (["seed"], 2_000_000, "--runs is 2000000; must be at most 1000000"),
+    ],
+)
+def test_a_number_of_runs_that_makes_no_sense(vary: list[str], runs: int, reason: str) -> None:
+    (fault,) = faults(*vary, runs=runs)
+    assert reason in fault
+
+
+def test_which_plans_are_the_same_sweep() -> None:
+    one = plan("seed", "wind.gust_m_s=0,1", runs=4)
+    other = copy.deepcopy(one.document)
+    other["duration_s"] = 5
+    assert difference(one, msgspec.structs.replace(one, runs=8)) is None
+    for changed, said in (
+        ({"runs": 2}, "it has 4 runs, more than 2"),
+        ({"vary": ("seed",)}, "it varies seed wind.gust_m_s=0,1, not seed"),
+        ({"document": other}, "duration_s of its scenario is another one"),
+        ({"records": True}, "it does not keep records"),
+        ({"version": "9"}, "this is 9"),
+    ):
+        assert said in (difference(one, msgspec.structs.replace(one, **changed)) or "")
+    assert msgspec.json.decode(msgspec.json.encode(one), type=SweepPlan) == one
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "reason"),
+    [
+        ("drones.drone2.mass_kg=0.40,0.45", "drones[1].mass_kg=0.42,0.43", "drones[1].mass_kg varies already by"),
+        (
+            "drones[0].mass_kg=uniform(0.4,0.5)",
+            "drones[drone1].mass_kg=0.42",
+            "drones[drone1].mass_kg varies already by",
+        ),
+        (
+            "clusters.main.gains={proportional_1_s: 0.5},{proportional_1_s: 0.7}",
+            "clusters[0].gains.proportional_1_s=0.6,0.4",
+            "clusters[0].gains.proportional_1_s is part of what varies already by",
+        ),
+        ("wind.gust_m_s=0,1", "environment.wind={gust_m_s: 2}", "environment.wind holds what varies already by"),
+    ],
+)
+def test_one_field_varies_once_under_whichever_of_its_names(first: str, second: str, reason: str) -> None:
+    (fault,) = faults(first, second)
+    assert fault.startswith(f"--vary {second}: {reason} {first}; ")
+    assert plan(first).vary == (first,)
+    assert plan(second).vary == (second,)
+
+
+def test_a_place_has_one_name() -> None:
+    document = {"drones": [{"name": "a"}, {"name": "b.c"}, 3], "seed": 1}
+    for path, steps in {
+        "drones.a.mass_kg": ("drones", 0, "mass_kg"),
+        "drones[b.c].mass_kg": ("drones", 1, "mass_kg"),
+        "drones.01.mass_kg": ("drones", 1, "mass_kg"),
+        "drones[2].x.y": ("drones", 2, "x", "y"),
+        "drones.nobody.x": ("drones", "nobody", "x"),
+        "wind.gust_m_s": ("environment", "wind", "gust_m_s"),
+        "seed.x": ("seed", "x"),
+    }.items():
+        assert field_path(document, path) == steps
+    assert is_inside(("a", 1, "b"), ("a", 1))
+    assert not is_inside(("a", 1), ("a", 1))
+    assert not is_inside(("a", 1), ("a", 1, "b"))
+
+
+def test_a_run_does_not_change_the_values_of_an_axis() -> None:
+    """Two axes of one place are refused, so that it takes a plan that nobody checked to set a part of a value."""
+    document, _ = read_document(STEP, [])
+    gains, part = "clusters.main.gains={proportional_1_s: 0.5}", "clusters.main.gains.proportional_1_s=0.6"
+    design = SweepDesign(SweepPlan(source=STEP.name, document=document, vary=(gains, part), runs=1))
+    assert design.scenario(0).clusters[0].gains.proportional_1_s == 0.6
+    assert design.values(0)["clusters.main.gains"] == {"proportional_1_s": 0.5}
+
+
+def test_a_refused_variation_brings_no_second_fault() -> None:
+    (fault,) = faults("duration_s=uniform(2,1)", runs=20)
+    assert "must be finite numbers with low < high" in fault
+    assert len(faults("duration_s=uniform(2,1)", "wind.gust_m_s=0,1,2", runs=2)) == 2
+
+
+@pytest.mark.parametrize("name", ["stüp.yaml", b"st\xfcp.yaml".decode(errors="surrogateescape")])
+def test_a_file_may_have_any_name(name: str) -> None:
+    document, _ = read_document(STEP, [])
+    of = make_plan(name, document, ["seed"], 2)
+    assert of.source == ("stüp.yaml" if name.isprintable() else "st\ufffdp.yaml")
+    assert msgspec.json.decode(msgspec.json.encode(of), type=SweepPlan) == of
+
+
+def test_a_sweep_is_the_same_under_the_short_name_of_a_field() -> None:
+    one = plan("seed", "wind.gust_m_s=0,1", runs=4)
+    assert difference(one, plan("seed", f"{GUST}=0,1", runs=4)) is None
+    assert difference(one, plan("seed", f"{GUST}=0,2", runs=4)) is not None

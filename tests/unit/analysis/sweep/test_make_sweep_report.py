@@ -1,0 +1,141 @@
+"""The report of a sweep: summary, figures and page."""
+
+import io
+from pathlib import Path
+
+import matplotlib.image
+import msgspec
+import numpy as np
+import pytest
+from rich.console import Console
+from sweep_rows import made, plan, well
+
+from zsim.errors import ReportError
+from zsim.scenario.random_streams import stream
+from zsim_analysis.sweep.design import SweepDesign, SweepPlan
+from zsim_analysis.sweep.make_sweep_report import make_sweep_report
+from zsim_analysis.sweep.make_sweep_report import table as shown_table
+from zsim_analysis.sweep.points import (
+    SweepResults,
+)
+from zsim_analysis.sweep.sweep_figures import slices
+from zsim_analysis.sweep.sweep_folder import (
+    locked,
+    read_table,
+)
+from zsim_analysis.sweep.sweep_row import Row
+
+
+def report_of(tmp_path: Path, of: SweepPlan, rows: list[Row]) -> str:
+    with locked(tmp_path, of) as folder, folder.journal() as book:
+        for each in rows:
+            book.append(each)
+    summary = make_sweep_report(tmp_path)
+    console = Console(file=io.StringIO(), width=100)
+    console.print(shown_table(summary))
+    return (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize("vary", ["seed", "duration_s=1,2,3"])
+def test_figures_of_a_sweep_show_something(tmp_path: Path, vary: str) -> None:
+    of = plan("seed", *({vary} - {"seed"}), runs=12)
+    report_of(tmp_path, of, [well(of, run) for run in range(of.runs)])
+    for path in (tmp_path / "figures").glob("*.png"):
+        assert matplotlib.image.imread(path).std() > 0.01
+
+
+@pytest.mark.usefixtures("unrendered")
+@pytest.mark.parametrize(
+    ("vary", "figures"),
+    [
+        (("seed",), {"true_rms", "est_std", "safety"}),
+        (("seed", "duration_s=1,2,3"), {"true_rms", "est_std", "safety"}),
+        (("seed", "duration_s=1,2,3,4,5,6", "name=a,b,c,d,e"), {"true_rms", "est_std", "safety"}),
+        (("seed", "duration_s=uniform(1,9)"), {"true_rms", "est_std", "safety", "drawn_1"}),
+        ((), {"true_rms", "est_std", "safety"}),
+    ],
+)
+def test_the_report_of_a_sweep(tmp_path: Path, vary: tuple[str, ...], figures: set[str]) -> None:
+    of = plan(*vary, runs=60 if vary else 1)
+    page = report_of(tmp_path, of, [well(of, run) for run in range(of.runs)])
+    assert {path.stem for path in (tmp_path / "figures").iterdir()} == figures
+    assert page.count("data:image/png;base64,") == len(figures)
+    summary = msgspec.json.decode((tmp_path / "summary.json").read_bytes())
+    assert sum(point["runs"] for point in summary["points"]) == of.runs
+    assert summary["failed"] == {}
+    first = summary["points"][0]
+    samples = [well(of, run)["errors.x_c.true_rms"] for run in range(0, of.runs, len(summary["points"]))]
+    assert first["spreads"]["errors.x_c.true_rms"]["mean"]["value"] == pytest.approx(np.mean(samples), rel=1e-12)
+    assert first["ended_well"]["value"] == 1.0
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_a_report_of_failures_and_of_what_is_not_finished(tmp_path: Path) -> None:
+    of = plan("seed", "duration_s=1,2", runs=40)
+    rows = [well(of, run) if run % 4 == 1 else made(of, run, failure="the <world> waits") for run in range(20)]
+    page = report_of(tmp_path, of, rows)
+    assert "15 of 20 runs failed: the &lt;world&gt; waits" in page
+    assert "20 runs are not finished; the same command goes on with them" in page
+    summary = msgspec.json.decode((tmp_path / "summary.json").read_bytes())
+    assert [point["ended_well"]["value"] for point in summary["points"]] == [0.0, 0.5]
+    assert summary["points"][0]["spreads"] == {}
+    assert summary["points"][1]["spreads"]["min_separation_m"]["runs"] == 5
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_a_sweep_of_which_nothing_ended_well_has_a_report(tmp_path: Path) -> None:
+    of = plan("seed", runs=3)
+    assert "3 of 3 runs failed: no" in report_of(tmp_path, of, [made(of, run, failure="no") for run in range(3)])
+
+
+def test_there_is_no_report_of_nothing(tmp_path: Path) -> None:
+    with (
+        locked(tmp_path, plan("seed", runs=3)),
+        pytest.raises(ReportError, match="no run of this sweep is finished yet"),
+    ):
+        make_sweep_report(tmp_path)
+
+
+def engaged(of: SweepPlan, run: int, **since_s: float | None) -> Row:
+    """Return the row of a run with clusters that were engaged, or never."""
+    begun = {f"clusters.{name}.engaged_s": value for name, value in since_s.items()}
+    known = {name: 0.1 if value else None for name, value in since_s.items()}
+    errors = {f"clusters.{name}.errors.x_c.true_rms": value for name, value in known.items() if name != "main"}
+    flown = {**well(of, run), "engaged": None not in since_s.values()}
+    for name in [name for name in flown if name.startswith("errors.") and not known["main"]]:
+        flown[name] = None
+    return {**flown, **begun, **errors}
+
+
+@pytest.mark.usefixtures("unrendered")
+def test_the_report_says_which_cluster_and_how_many_were_engaged(tmp_path: Path) -> None:
+    of = plan("seed", "duration_s=1,2", runs=8)
+    rows = [
+        engaged(of, run, main=5.0 if run % 2 or run < 4 else None, errors=6.0 if run % 2 else None) for run in range(8)
+    ]
+    page = report_of(tmp_path, of, rows)
+    assert "<th>main: x_c (m)</th>" in page
+    assert "<th>errors: x_c (m)</th>" in page
+    assert "<td>main: beta (rad)</td>" in page
+    assert "In 4 runs that ended well a cluster was never engaged within the judged window" in page
+    summary = msgspec.json.decode((tmp_path / "summary.json").read_bytes())
+    assert [point["engaged"] for point in summary["points"]] == [0, 4]
+    assert [point["spreads"]["errors.x_c.true_rms"]["runs"] for point in summary["points"]] == [2, 4]
+    assert "clusters.errors.errors.x_c.true_rms" not in summary["points"][0]["spreads"]
+    assert summary["not_engaged"] == 4
+    with locked(tmp_path, of) as folder:
+        again = folder.compact()
+    assert [row["clusters.errors.engaged_s"] for row in again] == [None, 6.0] * 4
+    assert (
+        SweepResults(SweepDesign(of), read_table(tmp_path / "sweep.parquet")).summary().json()
+        == (tmp_path / "summary.json").read_bytes()
+    )
+
+
+def test_slices_of_a_drawn_value_hold_as_many_runs_each() -> None:
+    x = stream(1, "x").uniform(0, 6, 600)
+    found = slices(x, 10 * x)
+    assert [len(samples) for _, samples in found] == [100] * 6
+    for k, (middle, samples) in enumerate(found):
+        assert middle == pytest.approx(k + 0.5, abs=0.25)
+        assert samples.mean() == pytest.approx(10 * middle)

@@ -1,0 +1,91 @@
+"""What a sweep came to: confidence intervals, distributions, and the parameters in the names of columns."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.stats
+from sweep_rows import made, plan, well
+
+from zsim.scenario.random_streams import stream
+from zsim_analysis.sweep.design import SweepDesign
+from zsim_analysis.sweep.points import (
+    FormationParameter,
+    SweepResults,
+    distribution,
+    mean_interval,
+    parameters,
+    share_interval,
+)
+
+
+@pytest.mark.parametrize("n", [2, 3, 10, 200])
+@pytest.mark.parametrize("level", [0.9, 0.95, 0.99])
+def test_the_interval_of_a_mean_is_student_s(n: int, level: float) -> None:
+    samples = stream(n, "samples").normal(3.0, 2.0, n)
+    found = mean_interval(samples, level)
+    wanted = scipy.stats.t.interval(level, n - 1, samples.mean(), scipy.stats.sem(samples))
+    assert (found.low, found.high) == pytest.approx(wanted, rel=1e-12)
+    assert found.value == samples.mean()
+
+
+def test_one_sample_has_a_mean_and_no_interval() -> None:
+    found = mean_interval(np.array([4.0]))
+    assert found.value == 4.0
+    assert math.isnan(found.low)
+    assert math.isnan(found.high)
+
+
+@pytest.mark.parametrize(("count", "of"), [(0, 1), (1, 1), (0, 30), (30, 30), (1, 30), (17, 30), (999, 1000)])
+@pytest.mark.parametrize("level", [0.9, 0.95])
+def test_the_interval_of_a_share_is_the_exact_one(count: int, of: int, level: float) -> None:
+    found = share_interval(count, of, level)
+    wanted = scipy.stats.binomtest(count, of).proportion_ci(level, "exact")
+    assert (found.low, found.high) == pytest.approx((wanted.low, wanted.high), rel=1e-9)
+    if count == 0:
+        assert found.high == pytest.approx(1 - ((1 - level) / 2) ** (1 / of), rel=1e-12)
+
+
+def test_intervals_cover_what_they_promise() -> None:
+    """Of 2000 repetitions, as many intervals hold the true value as their level says, within four deviations."""
+    rng = stream(1, "coverage")
+    held = sum(found.low <= 0.5 <= found.high for found in (mean_interval(rng.normal(0.5, 1, 8)) for _ in range(2000)))
+    assert held / 2000 == pytest.approx(0.95, abs=4 * math.sqrt(0.95 * 0.05 / 2000))
+    counts = rng.binomial(20, 0.3, 2000)
+    exact = [share_interval(int(count), 20) for count in counts]
+    assert sum(found.low <= 0.3 <= found.high for found in exact) / 2000 >= 0.95
+
+
+def test_a_spread() -> None:
+    found = distribution(np.array([1.0, 2.0, 3.0, 4.0, np.nan, np.inf]))
+    assert found is not None
+    assert (found.runs, found.median, found.least, found.greatest) == (4, 2.5, 1.0, 4.0)
+    assert found.std == pytest.approx(math.sqrt(5 / 3))
+    assert distribution(np.array([np.nan])) is None
+
+
+def test_parameters_are_found_in_the_names_of_columns() -> None:
+    columns = [
+        "errors.x_c.est_std",
+        "errors.x_c.true_rms",
+        "errors.left.p.true_rms",
+        "clusters.a.b.errors.yaw.true_rms",
+    ]
+    found = parameters(columns, ["main", "a.b"])
+    assert found == {
+        "errors.x_c": FormationParameter("x_c", "main"),
+        "errors.left.p": FormationParameter("left.p", "main"),
+        "clusters.a.b.errors.yaw": FormationParameter("yaw", "a.b"),
+    }
+    assert parameters(columns[:1], ["main"]) == parameters(columns[:1], []) == {"errors.x_c": FormationParameter("x_c")}
+    hostile = parameters(["clusters.errors.errors.x_c.est_std"], ["a", "errors"])
+    assert hostile == {"clusters.errors.errors.x_c": FormationParameter("x_c", "errors")}
+    assert [each.labelled("x_c (m)") for each in hostile.values()] == ["errors: x_c (m)"]
+
+
+def test_columns_of_a_failed_run_are_no_samples() -> None:
+    of = plan("seed", runs=3)
+    results = SweepResults(SweepDesign(of), [well(of, 0), made(of, 1, failure="x", min_separation_m=0.1), well(of, 2)])
+    assert results.values("min_separation_m").tolist() == [2.0, 2.2]
+    assert results.ended_well(0) == (2, 3)
+    assert results.without_collision(0) == (2, 2)

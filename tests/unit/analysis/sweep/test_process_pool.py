@@ -1,0 +1,138 @@
+"""Many runs of a sweep, flown by workers that may die."""
+
+import multiprocessing
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from zsim.errors import RunError
+from zsim.scenario import scenario_file
+from zsim_analysis.sweep import process_pool
+from zsim_analysis.sweep.process_pool import READY
+from zsim_analysis.sweep.sweep_row import Row, Task
+
+ONE = """
+name: one
+seed: 3
+duration_s: 0.5
+drones: [{name: d1, position_m: [0, 0, 0]}]
+processes: {expect: []}
+"""
+
+
+def task(run: int) -> Task:
+    return Task(run, 1, {}, scenario_file.from_text(ONE))
+
+
+class FakeWorker:
+    """A worker without a process: flies at once, and dies of what it is told to."""
+
+    dies_of: dict[int, int]  # by run: how many workers still will
+    stillborn = 0  # how many of the next will not get ready
+    answer: Any = None
+    flown: list[int]
+    alive: set["FakeWorker"]
+
+    def __init__(self) -> None:
+        self.link, self._far = multiprocessing.Pipe()
+        self.ready = False
+        self.task: Task | None = None
+        FakeWorker.alive.add(self)
+        if FakeWorker.stillborn:
+            FakeWorker.stillborn -= 1
+            self._die()
+        else:
+            self._far.send(READY)
+
+    def send(self, task: Task) -> None:
+        self.task = task
+        if FakeWorker.dies_of.get(task.run, 0):
+            FakeWorker.dies_of[task.run] -= 1
+            self._die()
+        else:
+            FakeWorker.flown.append(task.run)
+            self._far.send(FakeWorker.answer or {"run": task.run, "failure": None})
+
+    def receive(self) -> Any:
+        try:
+            return self.link.recv()
+        except EOFError:
+            return None
+
+    def stop(self) -> None:
+        self._die()
+        self.link.close()
+
+    def cause(self) -> str:
+        return "killed by SIGKILL"
+
+    def _die(self) -> None:
+        FakeWorker.alive.discard(self)
+        self._far.close()
+
+
+@pytest.fixture(autouse=True)
+def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(process_pool, "WorkerProcess", FakeWorker)
+    monkeypatch.setattr(FakeWorker, "stillborn", 0)
+    monkeypatch.setattr(FakeWorker, "answer", None)
+    FakeWorker.dies_of, FakeWorker.flown, FakeWorker.alive = {}, [], set()
+    yield
+    assert FakeWorker.alive == set()
+
+
+def rows(count: int, said: list[str], workers: int = 2) -> list[Row]:
+    return list(process_pool.ProcessPool(workers, said.append).rows(task(run=run) for run in range(count)))
+
+
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_every_run_is_flown_once(workers: int) -> None:
+    said: list[str] = []
+    found = rows(9, said, workers)
+    assert sorted(row["run"] for row in found) == sorted(FakeWorker.flown) == list(range(9))
+    assert said == []
+
+
+def test_the_run_of_a_dead_worker_is_flown_again() -> None:
+    said: list[str] = []
+    FakeWorker.dies_of = {0: 1, 4: 2}
+    found = rows(6, said)
+    assert sorted(FakeWorker.flown) == list(range(6))
+    assert [row["failure"] for row in found] == [None] * 6
+    assert sorted(set(said)) == [
+        f"the worker of run {run} died (killed by SIGKILL); another one flies it again" for run in (0, 4)
+    ]
+    assert len(said) == 3
+
+
+def test_a_run_that_is_fatal_to_every_worker_is_a_row() -> None:
+    said: list[str] = []
+    FakeWorker.dies_of = {2: 99}
+    found = {row["run"]: row["failure"] for row in rows(5, said)}
+    assert found.pop(2) == "3 workers died of it, the last one killed by SIGKILL"
+    assert found == dict.fromkeys((0, 1, 3, 4))
+
+
+def test_workers_that_cannot_start_end_the_sweep() -> None:
+    FakeWorker.stillborn = 99
+    with pytest.raises(RunError, match="die before they are ready"):
+        rows(5, [])
+
+
+def test_a_worker_that_did_not_start_once_is_replaced() -> None:
+    FakeWorker.stillborn = 2
+    assert len(rows(5, [])) == 5
+
+
+def test_what_no_run_survives_ends_the_sweep() -> None:
+    FakeWorker.answer = RuntimeError("no space left")
+    with pytest.raises(RunError, match="no space left"):
+        rows(5, [])
+
+
+def test_a_sweep_that_is_closed_leaves_no_worker() -> None:
+    flying = process_pool.ProcessPool(2, lambda _: None).rows(task(run=run) for run in range(50))
+    next(flying)
+    flying.close()
+    assert FakeWorker.alive == set()

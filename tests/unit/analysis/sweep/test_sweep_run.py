@@ -1,0 +1,174 @@
+"""One run of a sweep, flown in this process: its row is what the report of its record shows."""
+
+import errno
+import itertools
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsim.contract.fingerprint import fingerprint
+from zsim.errors import RecordError
+from zsim.record import record_writer
+from zsim.scenario import scenario_file
+from zsim_analysis import in_process
+from zsim_analysis.reading.formation import Formation
+from zsim_analysis.report.make_report import judge
+from zsim_analysis.sweep.sweep_row import Task
+from zsim_analysis.sweep.sweep_run import engaged_s, fly
+from zsim_world.fleet.fleet import DivergedError, Fleet
+
+GATE_NS = 20_000_000
+ONE = """
+name: one
+seed: 3
+duration_s: 0.5
+drones: [{name: d1, position_m: [0, 0, 0]}]
+processes: {expect: []}
+"""
+PAIR = """
+name: pair
+seed: 3
+duration_s: 6
+sensors: {preset: paper}
+environment: {wind: {gust_m_s: 0.3}}
+drones:
+  - {name: drone1, position_m: [2, 0, 0], yaw_deg: 90}
+  - {name: drone2, position_m: [-2, 0, 0], yaw_deg: 90}
+clusters:
+  - {name: main, drones: [drone1, drone2], plan: {takeoff_s: 0.2}}
+"""
+DRONES = """drones:
+  - {name: drone3, position_m: [8, 0, 0], yaw_deg: 90}
+  - {name: drone4, position_m: [12, 0, 0], yaw_deg: 90}
+"""
+GROUNDED = """  - {name: errors, drones: [drone3, drone4], plan: {takeoff_s: 1000}}
+"""
+
+
+def task(text: str = ONE, run: int = 7, record: Path | None = None, varied: dict[str, Any] | None = None) -> Task:
+    return Task(run, 1, varied or {}, scenario_file.from_text(text), str(record) if record else None)
+
+
+def test_a_row_is_what_the_report_of_a_record_says(tmp_path: Path) -> None:
+    """The same numbers as from the record of `zsim run --in-process`, and the same from a record of its own."""
+    row = fly(task(PAIR, record=tmp_path / "000007", varied={"environment.wind.gust_m_s": 0.3}))
+    in_process.fly(scenario_file.from_text(PAIR), tmp_path / "run.mcap")
+    for record in (tmp_path / "run.mcap", tmp_path / "000007/run.mcap"):
+        _, _, summary = judge(record)
+        assert row["truth_sha256"] == summary.truth_sha256
+        for name in ("ended", "sim_s", "min_separation_m", "seed"):
+            assert row[name] == getattr(summary, name)
+        for parameter, errors in summary.errors.items():
+            for each in ("est_std", "est_rms", "est_mean", "true_std", "true_rms", "true_mean"):
+                assert row[f"errors.{parameter}.{each}"] == getattr(errors, each)
+    assert len(summary.errors) == 8
+    assert list(row)[:4] == ["run", "point", "seed", "environment.wind.gust_m_s"]
+    assert (row["run"], row["failure"], row["collisions"], row["fingerprint"]) == (7, None, 0, fingerprint())
+    assert row["engaged"] is True
+    assert 4 < row["clusters.main.engaged_s"] < 6  # take-off is at 0.2 s, and hover from 3.2 s on
+    text = (tmp_path / "000007/scenario.yaml").read_text()
+    assert scenario_file.from_text(text) == scenario_file.from_text(PAIR)
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_cluster_that_was_never_engaged_has_no_errors() -> None:
+    """Of two clusters one stays on the ground, and its std of 0 is no merit."""
+    text = PAIR.replace("drones:\n", DRONES, 1) + GROUNDED
+    row = fly(task(text))
+    assert (row["failure"], row["engaged"]) == (None, False)
+    assert 4 < row["clusters.main.engaged_s"] < 6
+    assert row["clusters.errors.engaged_s"] is None
+    assert row["errors.x_c.true_rms"] > 0
+    grounded = {name: value for name, value in row.items() if name.startswith("clusters.errors.errors.")}
+    assert "clusters.errors.errors.x_c.est_std" in grounded
+    assert set(grounded.values()) == {None}
+
+
+def test_a_run_without_a_cluster_has_none_engaged() -> None:
+    row = fly(task())
+    assert (row["failure"], row["engaged"]) == (None, None)
+
+
+def test_only_what_is_within_the_window_is_engaged() -> None:
+    no = np.zeros((4, 0))
+    phases = ["assembling", "engaged", "engaged", "held"]
+    of = Formation("a", (), (), np.array([1.0, 2.0, 3.0, 4.0]), no, no, no, no, no, phases)
+    assert engaged_s([of], (0.0, 9.0)) == {"a": 2.0}
+    assert engaged_s([of], (2.5, 9.0)) == {"a": 3.0}
+    assert engaged_s([of], (3.5, 9.0)) == {"a": None}
+
+
+def test_a_task_can_be_sent() -> None:
+    assert pickle.loads(pickle.dumps(task(PAIR))) == task(PAIR)
+
+
+def test_a_run_that_diverges_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    advance = Fleet.advance
+
+    def diverge(fleet: Fleet) -> None:
+        if fleet.t_ns == 5 * GATE_NS:
+            raise DivergedError("d1", 0.12)
+        advance(fleet)
+
+    monkeypatch.setattr(Fleet, "advance", diverge)
+    row = fly(task())
+    assert row["failure"].startswith("d1 at 0.120 s: the state is no longer finite")
+    assert row["sim_s"] == 0.1
+    assert len(row["truth_sha256"]) == 64
+    assert not [name for name in row if name.startswith("errors.")]
+
+
+def test_a_run_that_crashes_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    row = fly(task(ONE.replace("[]}", "[console.1]}")))
+    assert row["failure"] == "the world waits for console.1, not run in-process; see `processes.expect`"
+    assert (row["run"], row["seed"], row["truth_sha256"]) == (7, 3, None)
+
+    def crash(fleet: Fleet) -> None:
+        raise ZeroDivisionError("a bug\nof two lines")
+
+    monkeypatch.setattr(Fleet, "advance", crash)
+    assert fly(task())["failure"] == "ZeroDivisionError: a bug of two lines"
+
+
+def test_a_full_disk_is_the_sweep_s_end_and_no_fault_of_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was written of the record keeps the name under which the error speaks of it."""
+
+    def full(file: Any, data: bytes) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(record_writer, "CHUNK_BYTES", 1000)
+    monkeypatch.setattr(record_writer, "write_all", full_after(2, record_writer.write_all, full))
+    part = tmp_path / "000007.part"
+    with pytest.raises(RecordError, match=r"000007\.part/run\.mcap: cannot be written any further \(No space left"):
+        fly(task(record=tmp_path / "000007"))
+    assert [path.name for path in tmp_path.iterdir()] == [part.name]
+    monkeypatch.undo()
+    assert fly(task(record=tmp_path / "000007"))["failure"] is None
+    assert [path.name for path in tmp_path.iterdir()] == ["000007"]
+
+
+def full_after(count: int, write: Callable[..., None], full: Callable[..., None]) -> Callable[..., None]:
+    """Return what writes some times, and then finds the disk full."""
+    calls = itertools.count()
+    return lambda file, data: (write if next(calls) < count else full)(file, data)
+
+
+def test_a_folder_of_records_that_cannot_be_made_is_told_in_a_line(tmp_path: Path) -> None:
+    (tmp_path / "runs").touch()
+    with pytest.raises(RecordError, match=r"runs/000007\.part: cannot be written \(Not a directory\); make room"):
+        fly(task(record=tmp_path / "runs/000007"))
+
+
+def test_the_record_of_a_run_that_crashes_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def crash(fleet: Fleet) -> None:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(Fleet, "advance", crash)
+    assert fly(task(record=tmp_path / "000007"))["failure"] == "ZeroDivisionError: a bug"
+    assert [path.name for path in tmp_path.iterdir()] == ["000007"]
