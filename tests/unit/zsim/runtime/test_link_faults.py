@@ -12,7 +12,7 @@ from zsim.contract.messages import ControlRequest, Estimate, Fault, Faults, Imu,
 from zsim.runtime.link_faults import LinkFaults, heard, place_of, senders, uniform
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import planned
-from zsim_agents.formation.controller import TAKEN_MAX, Controller
+from zsim_agents.formation.controller import REQUESTS_MAX, Controller
 from zsim_world.flight.world import World
 
 GATE_NS = 20_000_000
@@ -226,8 +226,8 @@ def test_a_controller_keeps_the_newest_state_of_a_drone():
 def test_a_controller_takes_so_many_requests_between_two_gates():
     """As in a run that is paused; at the next gate it says what it took, and takes others."""
     made, (key,) = controller(), controller().control_keys()
-    answers = [made.control(key, ControlRequest("sing", {}, "op.1")) for _ in range(TAKEN_MAX + 1)]
+    answers = [made.control(key, ControlRequest("sing", {}, "op.1")) for _ in range(REQUESTS_MAX + 1)]
     assert [answer.error for answer in answers if "wait for the next gate" in answer.error] == [answers[-1].error]
     said = [output.key for output in made.step(GATE_NS)]
-    assert said.count(keys.cluster_request("main")) == TAKEN_MAX
+    assert said.count(keys.cluster_request("main")) == REQUESTS_MAX
     assert "wait for" not in made.control(key, ControlRequest("sing", {}, "op.1")).error
