@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from zsim.math.compiled import COMPILES, portable
+from zsim.math.compiled import portable
 from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.flight_data import AIRBORNE, EngagementLimits, GateInput, ShapeLimits
 from zsim_agents.formation.spaces.cluster_space import (
@@ -14,7 +14,6 @@ from zsim_agents.formation.spaces.cluster_space import (
     ClusterSpace,
     SingularClusterError,
     closest_pair,
-    least_distance,
 )
 
 FAR = 1e6  # m or rad: beyond it a value is a slip
@@ -211,7 +210,7 @@ def _value_fault(space: ClusterSpace, c: Array, k: int) -> str:
 def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
     """Return why the robots may not stand where c puts them (too near to each other, too low), or None."""
     p_W, _ = space.inverse(c)
-    if COMPILES and well_placed(p_W, gains.separation_min_m, limits.height_min_m):
+    if well_placed(p_W, gains.separation_min_m, limits.height_min_m):
         return None
     distance, i, j = closest_pair(p_W)
     if distance < gains.separation_min_m:
@@ -228,7 +227,7 @@ def place_fault(space: ClusterSpace, c: Array, gains: FormationGains, limits: Sh
 @portable
 def well_placed(p_W: Array, separation_min_m: float, height_min_m: float) -> bool:
     """Return whether robots at p_W (n, 3) are neither too near to each other nor too low."""
-    fit = least_distance(p_W)[0] >= separation_min_m
+    fit = closest_pair(p_W)[0] >= separation_min_m
     for i in range(p_W.shape[0]):
         fit = fit and p_W[i, 2] >= height_min_m
     return fit

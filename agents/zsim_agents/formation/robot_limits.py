@@ -1,7 +1,4 @@
-"""What robots may do: the saturation of their velocities, and the guard of the distances between them.
-
-Loops where they are compiled, array operations where they are not; both give the same pairs in the same order.
-"""
+"""What robots may do: the saturation of their velocities, and the guard of the distances between them."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.compiled import COMPILES, portable
+from zsim.math.compiled import portable
 from zsim.math.rotation import Vector, dot, norm
 from zsim_agents.formation.spaces.cluster_frame import between, row
 from zsim_agents.formation.spaces.cluster_space import Array
@@ -115,7 +112,7 @@ def scale(v_W: Array, yaw_rate: Array, factor: float) -> None:
 
 
 @portable
-def near_pairs_in_turn(p_W: Array, within_m: float) -> PairTable:
+def near_pairs(p_W: Array, within_m: float) -> PairTable:
     """Return the pairs (m, 2), i < j, by j and then by i, of positions (n, 3) that are nearer than a distance."""
     n = p_W.shape[0]
     pairs, count = np.empty((n * (n - 1) // 2, 2), np.int64), 0
@@ -126,17 +123,6 @@ def near_pairs_in_turn(p_W: Array, within_m: float) -> PairTable:
                 pairs[count, 0], pairs[count, 1] = i, j
                 count += 1
     return pairs[:count]
-
-
-def near_pairs_at_once(p_W: Array, within_m: float) -> PairTable:
-    """Return the same by array operations."""
-    j, i = np.tril_indices(len(p_W), -1)
-    x, y, z = (p_W[j] - p_W[i]).T
-    near = ~(np.sqrt(x * x + y * y + z * z) >= within_m)
-    return np.column_stack((i[near], j[near]))
-
-
-near_pairs = near_pairs_in_turn if COMPILES else near_pairs_at_once
 
 
 @portable

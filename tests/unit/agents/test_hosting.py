@@ -6,7 +6,8 @@ import pytest
 
 from zsim.errors import RunError
 from zsim.runtime.group import Group
-from zsim.scenario import scenario_file
+from zsim.scenario import rights, scenario_file
+from zsim.scenario.roles import AGENTS, Role
 from zsim.transport.identity import Identity
 from zsim_agents.hosting import agents_of, chosen, hosted
 from zsim_deploy.roles import roles
@@ -50,6 +51,38 @@ def test_estimators_share_one_kernel_and_a_controller_comes_after_them():
 def test_one_estimator_serves_several_drones():
     made = roles.agent_of("estimator", ["drone*"])(World(STEP).info(), STEP)
     assert (made.name, made.serves) == ("estimator.drone1", ("estimator.drone2", "estimator.drone3"))
+
+
+def test_a_role_is_a_row_of_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Its names, its agents, its extra and its rights follow from the row."""
+    (tmp_path / "altimeter_of_mine.py").write_text(ALTIMETER)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(AGENTS, "altimeter", Role("agents", "drop", "drone", "altimeter_of_mine:Altimeter"))
+    altimeters = [f"altimeter.drone{i}" for i in (1, 2, 3)]
+    assert agents_of(STEP) == [*ESTIMATORS, "controller.main", *altimeters]
+    assert STEP.expected() == agents_of(STEP)
+    group = hosted(World(STEP).info(), STEP, ["altimeter.*"])
+    assert (group.name, group.serves) == (altimeters[-1], tuple(altimeters[:-1]))
+    assert rights.of(altimeters[0], STEP).writes == (
+        *(f"process/altimeter.drone1/{what}" for what in ("join", "done", "bye", "health")),
+        "drone/drone1/estimate",
+        "view/estimates/altimeter.drone1",
+    )
+    assert rights.of("altimeter.main", STEP).answers == ("process/altimeter.main/outputs",)
+
+
+ALTIMETER = """
+from zsim.runtime.agent import Agent
+
+class Altimeter(Agent):
+    def __init__(self, info, scenario, drone):
+        super().__init__()
+        self.name, self.period_ns = f"altimeter.{drone}", info.gate_ns
+        self.reads = self.gate_keys = (f"drone/{drone}/sensor/status",)
+
+    def receive(self, key, message): pass
+    def step(self, t_ns): return []
+"""
 
 
 def test_a_certificate_is_for_one_process(tmp_path: Path):

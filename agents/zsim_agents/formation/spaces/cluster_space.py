@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.math.compiled import COMPILES, portable
+from zsim.math.compiled import portable
 
 Array = NDArray[np.float64]
 
@@ -192,23 +192,9 @@ def put_wrapped(c: Array, period: Array, near: Array) -> None:
         near[k] = c[k] - period[k] * np.rint(c[k] / TAU)
 
 
+@portable
 def closest_pair(p_W: Array) -> tuple[float, int, int]:
     """Return the least distance [m] between two of the positions (n, 3), and the indices of that pair."""
-    return least_distance(p_W) if COMPILES else least_distance_at_once(p_W)
-
-
-def least_distance_at_once(p_W: Array) -> tuple[float, int, int]:
-    """Return the same as `least_distance` by array operations, the faster way where nothing is compiled."""
-    first, second = np.triu_indices(len(p_W), 1)
-    x, y, z = (p_W[second] - p_W[first]).T
-    distances = np.nan_to_num(np.sqrt(x * x + y * y + z * z), nan=math.inf, posinf=math.inf)
-    at = int(np.argmin(distances))
-    return float(distances[at]), int(first[at]), int(second[at])
-
-
-@portable
-def least_distance(p_W: Array) -> tuple[float, int, int]:
-    """Return what `closest_pair` does."""
     least, first, second = math.inf, 0, 1
     for i in range(p_W.shape[0]):
         for j in range(i + 1, p_W.shape[0]):

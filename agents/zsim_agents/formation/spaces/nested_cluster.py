@@ -143,11 +143,8 @@ class NestedCluster(ClusterSpace):
         """Return the least spread of the parent and of the groups [m]."""
         return min(space.spread(part) for space, part in self._pairs(c))
 
-    def margin(self, c: Array) -> float:
-        """Return the least margin of the parent and of the groups [m]: the whole is singular where one of them is."""
-        return self.measures(c)[1]
-
     def measures(self, c: Array) -> tuple[float, float]:
+        """Return the least spread and margin of parent and groups: the whole is singular where one of them is."""
         spreads, margins = zip(*(space.measures(part) for space, part in self._pairs(c)), strict=True)
         return min(spreads), min(margins)
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsim_agents.formation.control_law import FormationGains, ProportionalLaw
-from zsim_agents.formation.robot_limits import guard, load, near_pairs_at_once, near_pairs_in_turn
+from zsim_agents.formation.robot_limits import guard, load, near_pairs
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 
 SPACE = cluster_space(3)
@@ -186,12 +186,10 @@ def test_guarded_robots_never_meet_whatever_is_commanded(seed, n):
 
 
 @pytest.mark.parametrize("n", [2, 3, 10])
-def test_near_pairs_are_found_alike_by_loops_and_at_once(n):
+def test_near_pairs_are_all_that_are_not_far_by_the_second_and_then_the_first(n):
     rng = np.random.default_rng(n)
     for _ in range(100):
         p_W = rng.integers(-2, 3, size=(n, 3)).astype(float)
         p_W[rng.integers(n), 0] = rng.choice([0.5, math.nan, math.inf])
-        in_turn = near_pairs_in_turn(p_W, 2.0)
-        assert in_turn.tolist() == near_pairs_at_once(p_W, 2.0).tolist()
-        apart = np.linalg.norm(p_W[in_turn[:, 0]] - p_W[in_turn[:, 1]], axis=1)
-        assert not (apart >= 2.0).any()
+        expected = [[i, j] for j in range(n) for i in range(j) if not np.linalg.norm(p_W[i] - p_W[j]) >= 2.0]
+        assert near_pairs(p_W, 2.0).tolist() == expected
