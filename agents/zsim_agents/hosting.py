@@ -1,10 +1,10 @@
-"""Which agents share a process: names and patterns of a command line against those that a scenario has."""
+"""The agents of a scenario: which share a process, by names and patterns, and whether their classes are here."""
 
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 
 from zsim.contract.messages import Info
-from zsim.errors import RunError
+from zsim.errors import DocumentError, RunError, ScenarioError
 from zsim.runtime.agent import Agent
 from zsim.runtime.group import Group
 from zsim.scenario.scenario import Scenario
@@ -39,6 +39,24 @@ def agents_of(scenario: Scenario, patterns: Sequence[str] = ("*",)) -> list[str]
     known = [f"estimator.{drone.name}" for drone in scenario.drones]
     known += [f"controller.{cluster.name}" for cluster in scenario.clusters]
     return chosen("host: process", patterns, known)
+
+
+def check_classes(scenario: Scenario, source: str) -> None:
+    """Refuse a scenario that names a class which cannot be loaded here.
+
+    Args:
+        scenario: resolved.
+        source: opens the line of a fault: the name of its file.
+
+    Raises:
+        ScenarioError: what is wrong with the name, or with the class; one line.
+    """
+    from zsim_agents.estimation.drone_estimator import estimator_class
+
+    try:
+        estimator_class(scenario.estimation.chosen(), f"{source}: estimation.algorithm")
+    except DocumentError as error:
+        raise ScenarioError(error.faults) from error
 
 
 def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:

@@ -13,7 +13,7 @@ from zsim.scenario import overrides as override
 from zsim.scenario.consistency import cross_faults
 from zsim.scenario.scenario import DRONES_MAX, Document, Scenario, Sensors
 from zsim.scenario.sensor_presets import AS_PRINTED, PRESETS
-from zsim.schema import yaml_file
+from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import faults, sound
 
 EXAMPLE = "scenarios/step.yaml"  # named to whoever gives no scenario
@@ -21,7 +21,7 @@ FAULTS_MAX = 100  # lines; what follows is counted
 
 
 def load(path: str | Path, overrides: Iterable[str] = (), **values: Any) -> Scenario:
-    """Return the resolved scenario of a YAML file.
+    """Return the resolved scenario of a YAML file; modules that it names may stand beside it.
 
     Args:
         path: the file.
@@ -32,6 +32,7 @@ def load(path: str | Path, overrides: Iterable[str] = (), **values: Any) -> Scen
         ScenarioError: with every fault found, a line each.
     """
     path = Path(path)
+    plugin.search(path.parent)
     document = yaml_file.read(path, EXAMPLE, ScenarioError)
     document.update({key: value for key, value in values.items() if value is not None})
     applied = [override.apply(document, text, yaml_file.value) for text in overrides]

@@ -44,7 +44,7 @@ class Estimator(Agent):
         self.writes = tuple(keys.estimate(drone) for drone in names)
         specs = [scenario.drone(drone) for drone in names]
         settings = (specs, scenario.environment, scenario.estimation, info.gate_ns / 1e9)
-        make = estimator_class(scenario.estimation.chosen(), f"{info.run_id}: estimation.algorithm")
+        make = estimator_class(scenario.estimation.chosen(), "world/info: estimation.algorithm")
         self._estimators = EstimatorSet(make, *settings) if make else EstimatorBank(*settings)
         self._settings = None if make else settings
         self.reads = tuple(keys.sensors(drone) for drone in names) if make else _reads(names)

@@ -12,6 +12,7 @@ import msgspec
 from zsim.errors import ScenarioError
 from zsim.scenario import overrides, scenario_file
 from zsim.scenario.scenario import Scenario
+from zsim_agents.hosting import check_classes
 from zsim_analysis.sweep.axes import SEED, Axis, Draw, Grid, parse, text_of
 from zsim_analysis.sweep.paths import Place, inside, place
 from zsim_analysis.sweep.sweep_plan import RUNS_MAX, Plan
@@ -83,6 +84,7 @@ class Design:
             raise ScenarioError([*wrong, *error.faults]) from error
         if wrong:
             raise ScenarioError(wrong)
+        check_classes(scenario, self.plan.source)
         return scenario
 
     def faults(self, progress: Callable[[int, int], None] = lambda run, of: None) -> list[str]:

@@ -6,7 +6,7 @@ from typing import Any
 from zsim.errors import ScenarioError
 from zsim.scenario import overrides as override
 from zsim.scenario.scenario_file import EXAMPLE
-from zsim.schema import yaml_file
+from zsim.schema import plugin, yaml_file
 
 
 def read(path: Path, overrides: list[str], **values: Any) -> tuple[dict[str, Any], list[str]]:
@@ -20,6 +20,7 @@ def read(path: Path, overrides: list[str], **values: Any) -> tuple[dict[str, Any
     Raises:
         ScenarioError: the file holds no map.
     """
+    plugin.search(path.parent)
     document = yaml_file.read(path, EXAMPLE, ScenarioError)
     document.update({key: value for key, value in values.items() if value is not None})
     applied = [override.apply(document, text, yaml_file.value) for text in overrides]
