@@ -98,10 +98,12 @@ def joseph(P: np.ndarray, H: np.ndarray, variance: np.ndarray, K: np.ndarray) ->
     """Return (I - K H) P (I - K H)^T + K R K^T, (n, n)."""
     m, n = H.shape
     A = np.eye(n)
-    for i in range(n):
-        for j in range(m):
-            for k in range(n):
-                A[i, k] -= K[i, j] * H[j, k]
+    for j in range(m):
+        for k in range(n):
+            h = H[j, k]
+            if h != 0.0:
+                for i in range(n):
+                    A[i, k] -= K[i, j] * h
     AP = A @ P
     updated = AP @ A.T
     for i in range(n):
