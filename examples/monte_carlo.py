@@ -8,23 +8,21 @@ A run per seed and estimator: no Zenoh, no files. The other agents are those of 
 import argparse
 import math
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from msgspec import Struct
-from my_estimator import MyEstimator
+from msgspec.structs import replace
 
 from zsim.contract import keys, messages
-from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
 from zsim.scenario import scenario_file
-from zsim.scenario.scenario import Scenario
+from zsim.scenario.scenario import ESTIMATORS, Scenario
 from zsim_agents.estimation.estimator import Estimator
 from zsim_agents.formation.controller import Controller
 from zsim_world.flight.world import World
 
 DRONE, SETTLED_S = "drone1", 10.0  # errors before are those of the first fixes
-Build = Callable[[messages.Info, Scenario, str], Agent]
+MINE = "my_estimator:MyEstimator"  # beside this file
 
 
 class Errors:
@@ -46,12 +44,13 @@ class Errors:
         return math.sqrt(sum(self.squares) / len(self.squares))
 
 
-def fly(scenario: Scenario, build: Build) -> float:
+def fly(scenario: Scenario, algorithm: str) -> float:
     """Fly a scenario with an estimator for DRONE of the given kind; return the RMS of its position [m]."""
     world, errors = World(scenario), Errors()
     info = world.info()
     others = [drone.name for drone in scenario.drones if drone.name != DRONE]
-    agents = [build(info, scenario, DRONE), *(Estimator(info, scenario, drone) for drone in others)]
+    chosen = replace(scenario, estimation=replace(scenario.estimation, algorithm=algorithm))
+    agents = [Estimator(info, chosen, DRONE), *(Estimator(info, scenario, drone) for drone in others)]
     agents += [Controller(info, scenario, cluster.name) for cluster in scenario.clusters]
     bus = Bus(world, agents, time.monotonic_ns, errors)
     bus.join()
@@ -70,7 +69,7 @@ def main() -> None:
     for seed in range(1, args.seeds + 1):
         # nobody is waited for by name: every agent has joined before the first gate
         scenario = scenario_file.load(args.scenario, ["processes.expect=[]"], seed=seed, duration_s=args.duration)
-        stock, mine = fly(scenario, Estimator), fly(scenario, MyEstimator)
+        stock, mine = fly(scenario, ESTIMATORS[0]), fly(scenario, MINE)
         print(f"seed {seed}: RMS of the horizontal position, stock {stock:.3f} m, mine {mine:.3f} m")
 
 

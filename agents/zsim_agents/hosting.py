@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 
 from zsim.contract.messages import Info
-from zsim.errors import RunError
+from zsim.errors import DocumentError, RunError, ScenarioError
 from zsim.runtime.agent import Agent
 from zsim.runtime.group import Group
 from zsim.scenario.roles import AGENTS, agent_names
@@ -39,6 +39,24 @@ def agents_of(scenario: Scenario, patterns: Sequence[str] = ("*",)) -> list[str]
         RunError: a pattern matches none.
     """
     return chosen("host: process", patterns, agent_names(scenario))
+
+
+def check_classes(scenario: Scenario, source: str) -> None:
+    """Refuse a scenario that names a class which cannot be loaded here.
+
+    Args:
+        scenario: resolved.
+        source: opens the line of a fault: the name of its file.
+
+    Raises:
+        ScenarioError: what is wrong with the name, or with the class; one line.
+    """
+    from zsim_agents.estimation.drone_estimator import estimator_class
+
+    try:
+        estimator_class(scenario.estimation.chosen(), f"{source}: estimation.algorithm")
+    except DocumentError as error:
+        raise ScenarioError(error.faults) from error
 
 
 def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:

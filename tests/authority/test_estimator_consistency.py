@@ -9,17 +9,19 @@ section 5.4.2).
 import math
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from zsim.contract import messages
 from zsim.math.frames import heading, wrap_angle
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim_agents.estimation.drone_estimator import DroneEstimator, Estimate
+from zsim_agents.estimation.drone_estimator import StateEstimate
+from zsim_agents.estimation.estimator_bank import EstimatorBank
 from zsim_world.fleet.fleet import GPS_FIX, Fleet, Sample
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "step.yaml"  # three drones, preset paper, gusts of 0.5 m/s
@@ -69,39 +71,41 @@ def fly(scenario: Scenario) -> Runs:
     """Take off and fly circles by the estimates, as a controller would."""
     fleet = Fleet(scenario)
     gate_s = scenario.time.gate_ms / 1000.0
-    cores = [DroneEstimator(d, scenario.environment, scenario.estimation, gate_s) for d in scenario.drones]
+    bank = EstimatorBank(scenario.drones, scenario.environment, scenario.estimation, gate_s)
     rows = []
     for gate in range(round(END_S / gate_s) + 1):
         if gate:
             fleet.advance()
         t = gate * gate_s
         for sample in fleet.samples():
-            feed(cores[sample.drone], sample, fleet.gps_sigma_m[sample.drone])
-        estimates = [core.close(t) for core in cores]
+            feed(bank, sample, fleet.gps_sigma_m[sample.drone])
+        estimates = bank.estimate(t)
         steer(fleet, scenario, estimates, t, gate_s)
         if t > CONVERGED_S:
             rows.append(compare(fleet, estimates))
     return Runs(*(np.stack(parts, 1) for parts in zip(*rows, strict=True)))
 
 
-def feed(core: DroneEstimator, sample: Sample, gps_sigma_m: float) -> None:
-    t, t_sample, v = sample.t_ns * 1e-9, sample.t_sample_ns * 1e-9, sample.values
+def feed(bank: EstimatorBank, sample: Sample, gps_sigma_m: float) -> None:
+    v: Any = sample.values
+    stamps = (sample.t_ns, 0, sample.t_sample_ns)
     match sample.sensor:
         case "imu":
-            core.imu(t_sample, (v[0], v[1], v[2]), (v[3], v[4], v[5]))
+            message = messages.Imu(*stamps, v[:3], v[3:6])
         case "gps":
-            core.gps(t, t_sample, v[3:6], v[6:9], gps_sigma_m, GPS_FIX)
+            message = messages.Gps(*stamps, v[0], v[1], v[2], v[3:6], v[6:9], gps_sigma_m, GPS_FIX, 9)
         case "mag":
-            core.mag(t, t_sample, v)
+            message = messages.Mag(*stamps, v[:3])
         case "baro":
-            core.baro(t, t_sample, v[1])
+            message = messages.Baro(*stamps, v[0], v[1])
         case "sonar":
-            core.sonar(t, t_sample, v[0], bool(v[1]))
-        case "flow":
-            core.flow(t, t_sample, v[:3], v[3])
+            message = messages.Sonar(*stamps, v[0], bool(v[1]))
+        case _:
+            message = messages.Flow(*stamps, v[:3], v[3])
+    bank.receive(sample.drone, sample.sensor, message, sample.t_ns * 1e-9)
 
 
-def steer(fleet: Fleet, scenario: Scenario, estimates: list[Estimate], t: float, gate_s: float) -> None:
+def steer(fleet: Fleet, scenario: Scenario, estimates: list[StateEstimate], t: float, gate_s: float) -> None:
     for i, (drone, estimate) in enumerate(zip(scenario.drones, estimates, strict=True)):
         if abs(t - TAKEOFF_S) < gate_s / 2.0:
             assert fleet.takeoff(i) is None
@@ -115,7 +119,7 @@ def steer(fleet: Fleet, scenario: Scenario, estimates: list[Estimate], t: float,
             assert fleet.set_velocity(i, (ahead, left, v[2]), yaw_rate_rad_s=0.1 * i) is None
 
 
-def compare(fleet: Fleet, estimates: list[Estimate]) -> tuple[Array, Array, Array, Array]:
+def compare(fleet: Fleet, estimates: list[StateEstimate]) -> tuple[Array, Array, Array, Array]:
     """Return the fields of `Runs` for one gate."""
     truth = fleet.truth()
     p = np.array([e.position_m for e in estimates]) - truth.position_m
@@ -173,13 +177,13 @@ def test_a_fall_to_the_ground_is_owned_up_to(case: str):
     scenario = scenario_file.load(SCENARIO, CASES[case], seed=1)
     fleet = Fleet(scenario)
     gate_s = scenario.time.gate_ms / 1000.0
-    cores = [DroneEstimator(d, scenario.environment, scenario.estimation, gate_s) for d in scenario.drones]
+    bank = EstimatorBank(scenario.drones, scenario.environment, scenario.estimation, gate_s)
     nees, heights = [], []
     for gate in range(round(12.0 / gate_s)):
         fleet.advance()
         for sample in fleet.samples():
-            feed(cores[sample.drone], sample, fleet.gps_sigma_m[sample.drone])
-        error, P, _, _ = compare(fleet, [core.close(fleet.t_ns * 1e-9) for core in cores])
+            feed(bank, sample, fleet.gps_sigma_m[sample.drone])
+        error, P, _, _ = compare(fleet, bank.estimate(fleet.t_ns * 1e-9))
         if gate == round(1.0 / gate_s):
             assert [fleet.takeoff(i) for i in range(3)] == [None] * 3
         if gate == round(8.0 / gate_s):

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from zsim.contract import messages
 from zsim.scenario import scenario_file
 from zsim.scenario.random_streams import stream
 from zsim.scenario.scenario import ErrorModel, Scenario, Sensor
-from zsim_agents.estimation.drone_estimator import DroneEstimator, Estimate
+from zsim_agents.estimation.drone_estimator import StateEstimate
+from zsim_agents.estimation.estimator_bank import EstimatorBank
 
 Array = NDArray[np.float64]
 
@@ -35,9 +38,63 @@ def scenario(preset: str = "paper", **sections: Any) -> Scenario:
     )
 
 
-def estimator(of: Scenario) -> DroneEstimator:
+class Reading(NamedTuple):
+    """What a sensor measured, in the order of `message`."""
+
+    t_s: float
+    sensor: str
+    t_sample_s: float
+    values: tuple[Any, ...]
+
+
+def message(reading: Reading) -> Any:
+    """Return a reading as its sensor's message."""
+    stamps = (round(reading.t_s * 1e9), 0, round(reading.t_sample_s * 1e9))
+    match reading.sensor:
+        case "imu":
+            return messages.Imu(*stamps, *reading.values)
+        case "gps":
+            position, velocity, sigma_m, fix = reading.values
+            return messages.Gps(*stamps, 0.0, 0.0, 0.0, position, velocity, sigma_m, fix, 9)
+        case "mag":
+            return messages.Mag(*stamps, *reading.values)
+        case "baro":
+            return messages.Baro(*stamps, 0.0, *reading.values)
+        case "sonar":
+            return messages.Sonar(*stamps, *reading.values)
+        case _:
+            return messages.Flow(*stamps, *reading.values)
+
+
+def seconds(t_s: float) -> float:
+    """Return an instant as an estimator gets it, which counts nanoseconds."""
+    return round(t_s * 1e9) * 1e-9
+
+
+def feed(bank: EstimatorBank, i: int, reading: Reading) -> None:
+    """Hand one reading to a bank."""
+    bank.receive(i, reading.sensor, message(reading), seconds(reading.t_s))
+
+
+class OneDrone:
+    """The estimator that flies, of a scenario's first drone."""
+
+    def __init__(self, of: Scenario) -> None:
+        self.bank = EstimatorBank(of.drones[:1], of.environment, of.estimation, GATE_S)
+        self.warm_start = partial(self.bank.warm_start, 0)
+
+    def feed(self, reading: Reading) -> None:
+        """Hand one reading to it."""
+        feed(self.bank, 0, reading)
+
+    def close(self, t_s: float) -> StateEstimate:
+        """Return the estimate for the end of a gate."""
+        return self.bank.estimate(seconds(t_s))[0]
+
+
+def estimator(of: Scenario) -> OneDrone:
     """Return the estimator of the scenario's drone."""
-    return DroneEstimator(of.drones[0], of.environment, of.estimation, GATE_S)
+    return OneDrone(of)
 
 
 class Flight:
@@ -113,15 +170,6 @@ class Flight:
         return u**4 * (35.0 - 84.0 * u + 70.0 * u**2 - 20.0 * u**3)
 
 
-class Reading(NamedTuple):
-    """A call of one of the estimator's methods."""
-
-    t_s: float
-    sensor: str
-    t_sample_s: float
-    values: tuple[Any, ...]
-
-
 def readings(flight: Flight, of: Scenario, seed: int, end_s: float) -> list[Reading]:
     """Return all readings up to `end_s` in the order in which they arrive."""
     found = [r for name in _READERS for r in _readings_of(name, flight, of, seed, end_s)]
@@ -129,27 +177,18 @@ def readings(flight: Flight, of: Scenario, seed: int, end_s: float) -> list[Read
 
 
 def fly(
-    core: DroneEstimator, coming: Iterable[Reading], end_s: float, from_s: float = 0.0
-) -> list[tuple[float, Estimate]]:
-    """Feed an estimator gate by gate from `from_s` on and return what it says at each gate."""
+    core: OneDrone, coming: Iterable[Reading], end_s: float, from_s: float = 0.0
+) -> list[tuple[float, StateEstimate]]:
+    """Feed an estimator gate by gate from `from_s` on and return its estimate of each gate."""
     rest = [r for r in coming if r.t_s > from_s + 1e-9]
     estimates, k = [], 0
     for gate in range(round(from_s / GATE_S) + 1, round(end_s / GATE_S) + 1):
         t = gate * GATE_S
         while k < len(rest) and rest[k].t_s <= t + 1e-9:
-            feed(core, rest[k])
+            core.feed(rest[k])
             k += 1
         estimates.append((t, core.close(t)))
     return estimates
-
-
-def feed(core: DroneEstimator, reading: Reading) -> None:
-    """Hand one reading to the estimator."""
-    t, name, t_sample, values = reading
-    if name == "imu":
-        core.imu(t_sample, *values)
-    else:
-        getattr(core, name)(t, t_sample, *values)
 
 
 def _readings_of(name: str, flight: Flight, of: Scenario, seed: int, end_s: float) -> list[Reading]:

@@ -241,7 +241,7 @@ LEADERS = r"zsim (run|world|replay|router|gateway|ros1|ros2)\b"
 ANSWERED = ("estimator", "controller", "host", "record", "keys", "echo", "hz", "pub", "ask", "gateway", "ros1", "ros2",
             "fault (?:add|clear|list)")  # fmt: skip
 FOREIGN = ("plain_client.py", "foreign_estimator.py", "range_sensor.py")  # take the endpoint as an argument
-OURS = ("my_estimator.py", "fly_square.py")
+OURS = ("fly_square.py",)
 
 
 def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
@@ -425,6 +425,8 @@ def default(section: str, entry: Any) -> str:
     if entry.default is msgspec.UNSET:
         return "left out"
     value = entry.default_factory() if entry.default is msgspec.NODEFAULT else entry.default
+    if value is msgspec.UNSET:
+        return "–"
     return "see there" if isinstance(value, msgspec.Struct) else f"`{shown(value)}`"
 
 

@@ -3,6 +3,7 @@
 Works on what is sound of a document (`faults.sound`): a check whose fields are missing or faulty is left out.
 """
 
+import re
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
@@ -12,9 +13,10 @@ import numpy as np
 from zsim.scenario import fault_check
 from zsim.scenario.obstacle import nearest, row_of
 from zsim.scenario.roles import AGENTS
-from zsim.scenario.scenario import SEA_HEIGHT_MAX_M, space_name
+from zsim.scenario.scenario import ESTIMATORS, SEA_HEIGHT_MAX_M, space_name
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 from zsim.schema.checker import Fault, show
+from zsim.schema.plugin import CLASS_NAME
 
 START_SEPARATION_MIN_M = 0.6  # m, two hulls of 0.515 m side by side (OpenMAS, weighed and measured)
 START_CLEARANCE_MIN_M = 0.3  # m, a hull's radius of 0.26 m, and room
@@ -39,6 +41,7 @@ def cross_faults(scenario: Any) -> Iterator[Fault]:
         yield from ((f"clusters[{index}].{path}", text) for path, text in _plan_faults(cluster))
     for index, cluster in clusters:
         yield from ((f"clusters[{index}].{path}", text) for path, text in _shape_faults(cluster, drones))
+    yield from _algorithm_faults(scenario.estimation)
     yield from _process_faults(scenario.processes, drones, clusters)
     yield from _injected_faults(scenario, drones, clusters)
     yield from _window_faults(scenario.report)
@@ -255,6 +258,12 @@ def _plan_faults(cluster: Any) -> Iterator[Fault]:
         if _known(before.at_s, after.at_s) and after.at_s <= before.at_s:
             path = f"plan.trajectory.waypoints[{index}].at_s"
             yield path, f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
+
+
+def _algorithm_faults(estimation: Any) -> Iterator[Fault]:
+    name = estimation and estimation.algorithm
+    if name and name not in ESTIMATORS and not re.search(CLASS_NAME, name):
+        yield "estimation.algorithm", f"is {show(name)}; must be {', '.join(ESTIMATORS)} or package.module:Class"
 
 
 def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:

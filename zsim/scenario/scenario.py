@@ -259,14 +259,23 @@ class Cluster(Spec, frozen=True, kw_only=True):
     plan: Plan = Plan()
 
 
+ESTIMATORS = ("ekf", "paper")  # of this product; the first flies unless a scenario chooses
+
+
 class Estimation(Spec, frozen=True, kw_only=True):
     """Settings of the estimators; noise figures come from the drone's own sensors."""
 
+    algorithm: str | UnsetType = UNSET
+    """One of ESTIMATORS, or `package.module:Class`. Unset it stands in no resolved scenario."""
     madgwick_beta: Annotated[float, Meta(ge=0, le=1)] | None = None
     """rad/s; None: chosen from the accelerometer's noise."""
     gate_probability: Annotated[float, Meta(gt=0.5, lt=1)] = 0.9999
     magnetometer: bool = True
     flow: bool = True
+
+    def chosen(self) -> str:
+        """Return the algorithm that flies."""
+        return self.algorithm if isinstance(self.algorithm, str) else ESTIMATORS[0]
 
 
 class Processes(Spec, frozen=True, kw_only=True):

@@ -1,11 +1,10 @@
-"""The estimator of one drone, or of several, as an agent: sensors in, an estimate of each drone out at every gate.
-
-Order of this file: the agent, `receive` by key, `step`, warm start.
-"""
+"""The estimator of one drone, or of several, as an agent: sensors in, an estimate of each drone out at every gate."""
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
+
+from msgspec import Struct
 
 from zsim.contract import batch, keys, messages
 from zsim.contract.bundle import Bundle, Selection, table_of
@@ -14,12 +13,12 @@ from zsim.errors import DecodeError, RunError
 from zsim.math.compiled import COMPILES
 from zsim.runtime.agent import Agent, Output
 from zsim.scenario.scenario import Scenario
-from zsim_agents.estimation.estimate import Estimate
-from zsim_agents.estimation.estimator_set import estimators
+from zsim_agents.estimation.drone_estimator import EstimatorSet, estimator_class
+from zsim_agents.estimation.estimator_bank import EstimatorBank
 
 
 class Estimator(Agent):
-    """Feeds an EstimatorSet from `drone/{d}/sensor/*`.
+    """Feeds the scenario's estimators from `drone/{d}/sensor/*`: an EstimatorBank, or objects of a class.
 
     It has the name of the first of its drones and stands for the estimators of the others too.
 
@@ -30,6 +29,7 @@ class Estimator(Agent):
 
     Raises:
         RunError: the scenario has no such drone, or none is named.
+        DocumentError: the class that the scenario names cannot be loaded here.
     """
 
     def __init__(self, info: messages.Info, scenario: Scenario, drones: str | Sequence[str]) -> None:
@@ -39,102 +39,78 @@ class Estimator(Agent):
         self.name, *others = (f"estimator.{drone}" for drone in names)
         self.serves = tuple(others)
         self.period_ns = info.gate_ns
-        self.reads = tuple(expression for drone in names for expression in _reads(drone))
         self.gate_keys = tuple(keys.status(drone) for drone in names)
         self.counted = names
         self.writes = tuple(keys.estimate(drone) for drone in names)
         specs = [scenario.drone(drone) for drone in names]
-        self._settings = (specs, scenario.environment, scenario.estimation, info.gate_ns / 1e9)
-        self._set = estimators(*self._settings)
-        self._told: list[Estimate] = []
+        settings = (specs, scenario.environment, scenario.estimation, info.gate_ns / 1e9)
+        make = estimator_class(scenario.estimation.chosen(), "world/info: estimation.algorithm")
+        self._estimators = EstimatorSet(make, *settings) if make else EstimatorBank(*settings)
+        self._settings = None if make else settings
+        self.reads = tuple(keys.sensors(drone) for drone in names) if make else _reads(names)
+        self._last: list[messages.Estimate] = []
         self._view_key = keys.estimates_view(self.name)
-        self.takes_bundles = COMPILES
+        self.takes_bundles = COMPILES and not make
         self._selection = Selection(self.reads)
         self._since_ns = 0
-        self._take = {key: take for i, drone in enumerate(names) for key, take in self._takers(i, drone)}
-
-    def _takers(self, i: int, drone: str) -> list[tuple[str, Callable[[Any], None]]]:
-        """Return what is to be done with a message of each key of a drone."""
-        s = self._set
-        by_kind: dict[str, Callable[[Any], None]] = {
-            "imu": lambda m: s.imu(i, m.t_sample_ns * 1e-9, m.accel_m_s2, m.gyro_rad_s),
-            "gps": lambda m: s.gps(
-                i, self._arrived_s(m), m.t_sample_ns * 1e-9, m.position_m, m.velocity_m_s, m.sigma_m, m.fix
-            ),
-            "mag": lambda m: s.mag(i, self._arrived_s(m), m.t_sample_ns * 1e-9, m.field_ut),
-            "baro": lambda m: s.baro(i, self._arrived_s(m), m.t_sample_ns * 1e-9, m.altitude_m),
-            "sonar": lambda m: s.sonar(i, self._arrived_s(m), m.t_sample_ns * 1e-9, m.range_m, m.valid),
-            "flow": lambda m: s.flow(i, self._arrived_s(m), m.t_sample_ns * 1e-9, m.velocity_m_s, m.quality),
-            "status": lambda m: None,
-        }
-        return [(keys.sensor(drone, kind), take) for kind, take in by_kind.items()]
+        self._index = {drone: i for i, drone in enumerate(names)}
 
     def hear(self, t_ns: int, inputs: Sequence[tuple[str, Any]]) -> None:
         self._since_ns = t_ns - self.period_ns
         super().hear(t_ns, inputs)
 
-    def _arrived_s(self, message: Any) -> float:
-        """Return when a reading came: as it says, or, when a slow link brings it, not before the last gate."""
-        return max(message.t_ns, self._since_ns) * 1e-9
-
     def receive(self, key: str, message: Any) -> None:
         if key == batch.GATE:
             self._receive_bundle(message)
-        else:
-            self._take[key](message)
+        elif not isinstance(message, messages.Status):
+            # when a slow link brings it, it came not before the last gate, whatever it says
+            t_arrival_s = max(message.t_ns, self._since_ns) * 1e-9
+            _, drone, what = keys.parts(key)
+            self._estimators.receive(self._index[drone], what.removeprefix("sensor/"), message, t_arrival_s)
 
     def _receive_bundle(self, bundle: Bundle) -> None:
-        if self._set.bundle(bundle):
+        if self._estimators.receive_bundle(bundle):
             return
         with contextlib.suppress(DecodeError):  # not the world's: it is as good as lost
             for key, message in self._selection.of(bundle):
-                self._take[key](message)
+                self.receive(key, message)
 
     def step(self, t_ns: int) -> list[Output]:
-        self._told = self._set.close(t_ns * 1e-9)
-        told = zip(self.writes, self._told, strict=True)
-        return [
-            Output(key, messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.source))
-            for key, estimate in told
-        ]
+        estimates = self._estimators.estimate(t_ns * 1e-9)
+        self._last = [self._message(t_ns, key, each) for key, each in zip(self.writes, estimates, strict=True)]
+        return list(map(Output, self.writes, self._last))
+
+    def _message(self, t_ns: int, key: str, estimate: Any) -> messages.Estimate:
+        return messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.source)
 
     def views(self, t_ns: int) -> list[Output]:
-        shown = tuple(map(estimate_view, self.counted, self._told))
+        shown = tuple(map(estimate_view, self.counted, self._last))
         return [Output(self._view_key, messages.ViewEstimates(t_ns, self.next_seq(self._view_key), shown))]
 
     def rehearse(self) -> None:
-        drones, place, _, gate_s = self._settings
-        twin, still, sigma_m, fix = estimators(*self._settings), (0.0, 0.0, 0.0), 1.0, 3
-        sample = messages.encode(messages.Imu(0, 0, 0, still, still))
-        twin.bundle(Bundle.of(0, 0, table_of(self.counted), [(keys.sensor(self.counted[0], "imu"), sample)]))
-        for gate in range(1, 4):
-            t_s = gate * gate_s
-            twin.imu(0, t_s, (0.0, 0.0, place.gravity_m_s2), still)
-            twin.mag(0, t_s, t_s, place.magnetic_field_ut)
-            twin.gps(0, t_s, t_s, still, still, sigma_m, fix)
-            twin.baro(0, t_s, t_s, 0.0)
-            twin.sonar(0, t_s, t_s, drones[0].sensors.sonar.min_m, True)
-            twin.flow(0, t_s, t_s, still, 1.0)
-            twin.close(t_s)
+        if self._settings is None:
+            return
+        bank, drone, t_ns, still = EstimatorBank(*self._settings), self.counted[0], 1_000_000, (0.0, 0.0, 0.0)
+        readings: dict[str, Struct] = {
+            "imu": messages.Imu(t_ns, 0, t_ns, (0.0, 0.0, 9.8), still),
+            "gps": messages.Gps(t_ns, 0, t_ns, 0.0, 0.0, 0.0, still, still, 1.0, 3, 9),
+            "mag": messages.Mag(t_ns, 0, t_ns, (0.0, 20.0, 0.0)),
+            "baro": messages.Baro(t_ns, 0, t_ns, 101_325.0, 0.0),
+        }
+        payloads = [(keys.sensor(drone, sensor), messages.encode(message)) for sensor, message in readings.items()]
+        bank.receive_bundle(Bundle.of(t_ns, 0, table_of(self.counted), payloads))
+        bank.estimate(t_ns * 1e-9)
 
     def warm_start_keys(self) -> tuple[str, ...]:
         return self.writes
 
     def warm_start(self, key: str, message: messages.Estimate) -> None:
-        self._set.warm_start(
-            self.writes.index(key),
-            message.position_m,
-            message.velocity_m_s,
-            message.orientation_wxyz,
-            message.covariance,
-            message.yaw_sigma_rad,
-            message.gyro_bias_rad_s,
-        )
+        self._estimators.warm_start(self.writes.index(key), message)
 
 
-def _reads(drone: str) -> tuple[str, ...]:
+def _reads(drones: Sequence[str]) -> tuple[str, ...]:
     """One subscription per sensor: the process sleeps until status, the last of a gate, and wakes once."""
-    return (*(keys.sensor(drone, kind) for kind in keys.SENSORS), keys.status(drone))
+    return tuple(keys.sensor(drone, kind) for drone in drones for kind in (*keys.SENSORS, "status"))
 
 
 def _check(names: Sequence[str], scenario: Scenario) -> None:

@@ -1,42 +1,55 @@
-"""The estimators of many drones in one compiled kernel: to the bit what a DroneEstimator of each would say.
+"""The estimators of many drones as rows of arrays: sensors in, a compiled step for all of them, estimates out.
 
-Readings are only written down when they come; the kernel handles them all at the end of the gate.
+Readings are only written down when they come. At the end of the gate every drone's IMU moves its nominal state
+(strapdown), its covariance follows, and its other readings are judged and used (measurement_update).
 """
 
-from __future__ import annotations
-
-import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.bundle import Bundle
+from zsim.contract.keys import SENSORS
+from zsim.contract.messages import Estimate
+from zsim.math.compiled import portable
 from zsim.scenario.scenario import Drone, Environment, Estimation
-from zsim_agents.estimation import estimator_rows as er
-from zsim_agents.estimation.aiding import PATIENCE_S, Aid, aids
-from zsim_agents.estimation.dead_reckoning import acceleration
-from zsim_agents.estimation.error_state import ErrorState, innovation_limits
-from zsim_agents.estimation.estimate import Estimate, age_max_s
-from zsim_agents.estimation.estimator_fusion import YAW_STATE, close, set_variance
-from zsim_agents.estimation.estimator_prior import (
-    HEADING_SIGMA_RAD,
-    bias_priors,
-    madgwick_beta,
-    process_noise,
-    set_start,
+from zsim_agents.estimation import measurement_update, strapdown
+from zsim_agents.estimation.dead_reckoning import acceleration, heading_and_sigma, plus
+from zsim_agents.estimation.drone_estimator import StateEstimate
+from zsim_agents.estimation.filter_setup import initial_rows
+from zsim_agents.estimation.filter_state import (
+    COUNT,
+    ESTIMATE,
+    IMU,
+    LAYOUT,
+    NOMINAL,
+    READING,
+    SETTING,
+    Rows,
+    put,
+    put_quaternion,
+    reckoning,
+    vector,
 )
-from zsim_agents.estimation.madgwick import LEVEL, Vector, normalised
-from zsim_agents.estimation.mount import mount_rotation
+from zsim_agents.estimation.madgwick import normalised, product, rotation_vector_quaternion
+from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD, YAW, set_variance
 from zsim_agents.estimation.sensor_reader import GateReader
-from zsim_agents.estimation.state_history import history_length
-from zsim_agents.estimation.strapdown import ZERO, coast_after_s, jolt_m_s2
 
-_READING = struct.Struct(f"{er.READING_COLUMNS}d")
+_READING = struct.Struct(f"{READING.size}d")
 _ROOM = 256  # readings of a gate, at first
-_NONE = (0.0,) * 6
-_IN_ORDER = [*[*enumerate(er.KINDS)][1:], (er.IMU, "imu")]  # as a DroneEstimator counts them
+_COUNTED = [*[*enumerate(SENSORS)][1:], (IMU, "imu")]  # in the order in which they are published
+
+_VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {  # values and extra of a reading
+    "imu": lambda m: (*m.accel_m_s2, *m.gyro_rad_s, 0.0, 0.0),
+    "gps": lambda m: (*m.position_m, *m.velocity_m_s, m.sigma_m, m.fix),
+    "mag": lambda m: (*m.field_ut, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "baro": lambda m: (m.altitude_m, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+    "sonar": lambda m: (m.range_m, 0.0, 0.0, 0.0, 0.0, 0.0, m.valid, 0.0),
+    "flow": lambda m: (*m.velocity_m_s, 0.0, 0.0, 0.0, m.quality, 0.0),
+}
 
 
 class EstimatorBank:
@@ -46,7 +59,7 @@ class EstimatorBank:
     sensor's last one, not finite, or outside of their gate are refused and counted.
 
     Args:
-        drones: their mounts and error models are what the estimator believes.
+        drones: their mounts and error models are what the filter assumes.
         environment: gravity and magnetic field.
         estimation: settings.
         gate_s: interval of the gates [s].
@@ -55,91 +68,59 @@ class EstimatorBank:
     def __init__(
         self, drones: Sequence[Drone], environment: Environment, estimation: Estimation, gate_s: float
     ) -> None:
-        believed = [_Belief(drone, environment, estimation, gate_s) for drone in drones]
-        self.rows = _rows(believed, estimation.gate_probability)
+        self.rows, self._estimates = initial_rows(drones, environment, estimation, gate_s)
         self._make_room(_ROOM)
-        self._came = 0
+        self._count = 0
         self._reader = GateReader([drone.name for drone in drones])
-        self._told = np.zeros((len(drones), er.ESTIMATE_COLUMNS))
 
-    def imu(self, i: int, t_sample_s: float, accel_m_s2: Vector, gyro_rad_s: Vector) -> None:
-        """Take a sample of an IMU in the sensor's axes."""
-        self._keep(i, er.IMU, t_sample_s, t_sample_s, *accel_m_s2, *gyro_rad_s, 0.0, 0.0)
-
-    def gps(
-        self, i: int, t_s: float, t_sample_s: float, position_m: Vector, velocity_m_s: Vector, sigma_m: float, fix: int
-    ) -> None:
-        """Take a fix; `sigma_m` per axis counts where it is worse than what the scenario says."""
-        self._keep(i, er.GPS, t_s, t_sample_s, *position_m, *velocity_m_s, sigma_m, fix)
-
-    def mag(self, i: int, t_s: float, t_sample_s: float, field_ut: Vector) -> None:
-        """Take the field in the sensor's axes."""
-        self._keep(i, er.MAG, t_s, t_sample_s, *field_ut, 0.0, 0.0, 0.0, 0.0, 0.0)
-
-    def baro(self, i: int, t_s: float, t_sample_s: float, altitude_m: float) -> None:
-        """Take a barometric height over the world's origin."""
-        self._keep(i, er.BARO, t_s, t_sample_s, altitude_m, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-
-    def sonar(self, i: int, t_s: float, t_sample_s: float, range_m: float, valid: bool) -> None:
-        """Take a range to the ground; one marked as invalid says nothing and is not counted."""
-        self._keep(i, er.SONAR, t_s, t_sample_s, range_m, 0.0, 0.0, 0.0, 0.0, 0.0, valid, 0.0)
-
-    def flow(self, i: int, t_s: float, t_sample_s: float, velocity_m_s: Vector, quality: float) -> None:
-        """Take a velocity in the heading frame; without quality, or before a heading is known, it is refused."""
-        self._keep(i, er.FLOW, t_s, t_sample_s, *velocity_m_s, 0.0, 0.0, 0.0, quality, 0.0)
-
-    def bundle(self, bundle: Bundle) -> bool:
-        """Take all sensors in a bundle; False, and none, if one of its messages is not as the world writes it."""
-        while self._came + len(bundle) > len(self._readings):
+    def receive(self, i: int, sensor: str, message: Any, t_arrival_s: float) -> None:
+        """Take a message of a sensor in SENSORS, which came at `t_arrival_s`; others are ignored."""
+        if sensor not in _VALUES:
+            return
+        if self._count == len(self._readings):
             self._grow()
-        came = self._reader.take(bundle, self._readings, self._came)
-        if came >= 0:
-            self._came = came
-        return came >= 0
+        kind, t_sample_s = SENSORS.index(sensor), message.t_sample_ns * 1e-9
+        place, values = self._count * _READING.size, _VALUES[sensor](message)
+        _READING.pack_into(self._room, place, i, kind, t_sample_s if kind == IMU else t_arrival_s, t_sample_s, *values)
+        self._count += 1
 
-    def close(self, t_s: float) -> list[Estimate]:
+    def receive_bundle(self, bundle: Bundle) -> bool:
+        """Take all sensors in a bundle; False, and none, if one of its messages is not as the world writes it."""
+        while self._count + len(bundle) > len(self._readings):
+            self._grow()
+        count = self._reader.take(bundle, self._readings, self._count)
+        if count >= 0:
+            self._count = count
+        return count >= 0
+
+    def estimate(self, t_s: float) -> list[StateEstimate]:
         """Use what has come since the last gate and return the estimates for `t_s`."""
-        came, self._came = self._came, 0
-        self.use(t_s, self._readings[:came])
-        counts = self.rows.tally[:, er.USED :].tolist()
-        return [_estimate(row, count) for row, count in zip(self._told.tolist(), counts, strict=True)]
+        count, self._count = self._count, 0
+        self.use(t_s, self._readings[:count])
+        counts = self.rows.counts[:, COUNT.used :].tolist()
+        return [_estimate(row, count) for row, count in zip(self._estimates.tolist(), counts, strict=True)]
 
     def use(self, t_s: float, readings: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Use readings (M, READING_COLUMNS) and return the estimates for `t_s`, (N, ESTIMATE_COLUMNS)."""
-        close(self.rows, t_s, readings, self._told)
-        return self._told
+        """Use readings (M, READING.size) and return the estimates for `t_s`, (N, ESTIMATE.size)."""
+        step(self.rows, t_s, readings, self._estimates)
+        return self._estimates
 
-    def warm_start(
-        self,
-        i: int,
-        position_m: Sequence[float],
-        velocity_m_s: Sequence[float],
-        orientation_wxyz: Sequence[float],
-        covariance: Sequence[float],
-        yaw_sigma_rad: float,
-        gyro_bias_rad_s: Sequence[float],
-    ) -> None:
+    def warm_start(self, i: int, last: StateEstimate | Estimate) -> None:
         """Continue from a published estimate; call before the first reading.
 
         Tilt and biases, of which the estimate has no covariance, start as uncertain as in a cold start.
         """
-        w, x, y, z = (float(part) for part in orientation_wxyz)
+        w, x, y, z = (float(part) for part in last.orientation_wxyz)
         row, setting, P = self.rows.nominal[i], self.rows.setting[i], self.rows.covariance[i]
-        row[er.P : er.P + 3], row[er.V : er.V + 3] = position_m, velocity_m_s
-        row[er.V_BEFORE : er.V_BEFORE + 3] = velocity_m_s
-        er.put_quaternion(row, er.Q, normalised((w, x, y, z)))
-        state = er.reckoning(row)
-        er.put(row, er.A, acceleration(state[2], state[5], setting[er.GRAVITY]))
-        row[er.GYRO_OFF : er.GYRO_OFF + 3] = gyro_bias_rad_s
-        P[:6, :6] = np.reshape(covariance, (6, 6))
-        set_variance(P, YAW_STATE, yaw_sigma_rad**2)
-        self.rows.tally[i, er.HEADING_KNOWN] = yaw_sigma_rad < HEADING_SIGMA_RAD
-
-    def _keep(self, *reading: float) -> None:
-        if self._came == len(self._readings):
-            self._grow()
-        _READING.pack_into(self._room, self._came * _READING.size, *reading)
-        self._came += 1
+        row[NOMINAL.p_WB : NOMINAL.p_WB + 3] = last.position_m
+        row[NOMINAL.v_WB : NOMINAL.v_WB + 3] = row[NOMINAL.v_start : NOMINAL.v_start + 3] = last.velocity_m_s
+        put_quaternion(row, NOMINAL.q_WB, normalised((w, x, y, z)))
+        state = reckoning(row)
+        put(row, NOMINAL.a_WB, acceleration(state[2], state[5], setting[SETTING.gravity]))
+        row[NOMINAL.gyro_bias : NOMINAL.gyro_bias + 3] = last.gyro_bias_rad_s
+        P[:6, :6] = np.reshape(last.covariance, (6, 6))
+        set_variance(P, YAW, last.yaw_sigma_rad**2)
+        self.rows.counts[i, COUNT.heading_known] = last.yaw_sigma_rad < HEADING_SIGMA_RAD
 
     def _grow(self) -> None:
         former = self._readings
@@ -148,88 +129,86 @@ class EstimatorBank:
 
     def _make_room(self, readings: int) -> None:
         self._room = bytearray(readings * _READING.size)
-        self._readings = np.frombuffer(self._room).reshape(readings, er.READING_COLUMNS)
+        self._readings = np.frombuffer(self._room).reshape(readings, READING.size)
 
 
-class _Belief:
-    """What is believed of one drone before its first reading, as the rows have it."""
-
-    def __init__(self, drone: Drone, environment: Environment, estimation: Estimation, gate_s: float) -> None:
-        imu, gravity, found = drone.sensors.imu, environment.gravity_m_s2, aids(drone.sensors)
-        used = {"mag": estimation.magnetometer, "flow": estimation.flow}
-        wanted = [aid for name, aid in found.items() if used.get(name, True)]
-        beta = madgwick_beta(estimation, imu, gravity)
-        noise, priors = process_noise(imu, beta, gravity), bias_priors(imu, wanted)
-        self.states = ErrorState(priors)
-        set_start(self.states.covariance)
-        oldest_s = age_max_s(drone, gate_s)
-        self.history = history_length(oldest_s, gate_s)
-        mount = imu.mount
-        aside = mount.rpy_deg != ZERO or mount.position_m != ZERO
-        self.setting = [
-            gravity, beta, 1.0 / imu.rate_hz, coast_after_s(imu, gate_s), jolt_m_s2(noise.accel_sigma), oldest_s,
-            math.radians(drone.yaw_deg), noise.accel_sigma**2, noise.gyro_sigma**2, noise.tilt_density,
-            noise.levelling_s, *environment.magnetic_field_ut, *mount_rotation(mount), *mount.position_m,
-        ]  # fmt: skip
-        self.fixed = [
-            self.states.size, self.history, aside, self.states.with_accel_bias, self.states.aiding_biases,
-            estimation.magnetometer, estimation.flow,
-        ]  # fmt: skip
-        for kind in er.KINDS:
-            self.setting += _aid_setting(found.get(kind))
-            self.fixed += self._bias_places(found.get(kind))
-
-    def _bias_places(self, aid: Aid | None) -> list[int]:
-        rows = aid.bias_rows if aid else []
-        places: list[int] = []
-        for channel, row in rows:
-            if aid and channel in self.states.bias_index:
-                places += [self.states.bias_index[channel], row, aid.biases[channel].size]
-        return places + [-1, 0, 0] * ((er.BIAS_COLUMNS - len(places)) // 3)
-
-
-def _aid_setting(aid: Aid | None) -> list[float]:
-    if aid is None:
-        return [0.0] * er.AID_COLUMNS
-    variance = [*aid.variance, *_NONE[len(aid.variance) :]]
-    return [*variance, *aid.arm, *aid.R_BS, *aid.down_B, PATIENCE_S[aid.name]]
-
-
-def _rows(believed: Sequence[_Belief], gate_probability: float) -> er.Rows:
-    count, size = len(believed), max(each.states.size for each in believed)
-    covariance, walk = np.zeros((count, size, size)), np.zeros((count, size))
-    for i, each in enumerate(believed):
-        n = each.states.size
-        covariance[i, :n, :n], walk[i, :n] = each.states.covariance, each.states.walk
-    setting = np.array([each.setting for each in believed], dtype=float)
-    nominal = np.zeros((count, er.NOMINAL_COLUMNS))
-    nominal[:, er.Q : er.Q + 4] = LEVEL
-    nominal[:, er.F + 2] = setting[:, er.GRAVITY]
-    nominal[:, er.START] = nominal[:, er.REFUSED_SINCE : er.REFUSED_SINCE + len(er.KINDS)] = math.nan
-    nominal[:, er.T_SAMPLE : er.T_SAMPLE + len(er.KINDS)] = -math.inf
-    return er.Rows(
-        nominal=nominal,
-        tally=np.zeros((count, er.TALLY_COLUMNS), dtype=np.int64),
-        covariance=covariance,
-        bias=np.zeros((count, size)),
-        history=np.zeros((count, max(each.history for each in believed), er.MOMENT_COLUMNS)),
-        setting=setting,
-        fixed=np.array([each.fixed for each in believed], dtype=np.int64),
-        walk=walk,
-        limits=innovation_limits(gate_probability),
-    )
-
-
-def _estimate(row: list[float], count: list[int]) -> Estimate:
-    """Return a row of estimates and its drone's (used, refused) by kind as what is published."""
-    half = len(er.KINDS)
-    return Estimate(
+def _estimate(row: list[float], count: list[int]) -> StateEstimate:
+    """Return a row of estimates and its drone's (used, refused) by sensor as what is published."""
+    half = len(SENSORS)
+    return StateEstimate(
         (row[0], row[1], row[2]),
         (row[3], row[4], row[5]),
         (row[6], row[7], row[8], row[9]),
-        row[er.YAW],
-        tuple(row[er.COVARIANCE : er.YAW_SIGMA]),
-        row[er.YAW_SIGMA],
-        (row[er.GYRO_BIAS_B], row[er.GYRO_BIAS_B + 1], row[er.GYRO_BIAS_B + 2]),
-        {kind: (count[k], count[half + k]) for k, kind in _IN_ORDER},
+        row[ESTIMATE.yaw],
+        tuple(row[ESTIMATE.covariance : ESTIMATE.yaw_sigma]),
+        row[ESTIMATE.yaw_sigma],
+        (row[ESTIMATE.gyro_bias], row[ESTIMATE.gyro_bias + 1], row[ESTIMATE.gyro_bias + 2]),
+        {name: (count[k], count[half + k]) for k, name in _COUNTED},
     )
+
+
+@portable
+def step(rows: Rows, t_s: float, readings: np.ndarray, estimates: np.ndarray) -> None:
+    """Use the readings of a gate of all drones and write their estimates for `t_s`.
+
+    Args:
+        rows: of N drones; changed.
+        t_s: instant of the gate [s].
+        readings: (M, READING.size), each drone's in the order of their arrival.
+        estimates: (N, ESTIMATE.size), written.
+    """
+    count = rows.nominal.shape[0]
+    first, last = np.full(count, -1), np.full(count, -1)
+    after = np.full(readings.shape[0], -1)  # the next aiding reading of the same drone
+    for m in range(readings.shape[0]):
+        reading, i = readings[m], int(readings[m, READING.drone])
+        if int(reading[READING.sensor]) == IMU:
+            accel, gyro = vector(reading, READING.values), vector(reading, READING.values + 3)
+            strapdown.move(rows, i, reading[READING.t_sample], accel, gyro)
+        elif measurement_update.accept(rows, i, reading):
+            if last[i] < 0:
+                first[i] = m
+            else:
+                after[last[i]] = m
+            last[i] = m
+    for i in range(count):
+        _step_one(rows, i, t_s, readings, first[i], after, estimates[i])
+
+
+@portable
+def _step_one(
+    rows: Rows, i: int, t_s: float, readings: np.ndarray, first: int, after: np.ndarray, estimate: np.ndarray
+) -> None:
+    """Let the covariance of a drone follow its IMU, use its aiding readings, and write its estimate."""
+    row, counts, n = rows.nominal[i], rows.counts[i], rows.layout[i, LAYOUT.states]
+    if not counts[COUNT.running]:
+        strapdown.begin(row, counts, t_s)
+    strapdown.coast(row, rows.setting[i], t_s)
+    P = strapdown.grow(rows, i, rows.covariance[i, :n, :n].copy())
+    if not counts[COUNT.heading_known]:
+        measurement_update.start_heading(rows, i, P, t_s, readings, first, after)
+    P = measurement_update.fuse(rows, i, P, readings, first, after)
+    rows.covariance[i, :n, :n] = P
+    _write_estimate(row, P, t_s, estimate)
+
+
+@portable
+def _write_estimate(row: np.ndarray, P: np.ndarray, t_s: float, estimate: np.ndarray) -> None:
+    """Write the estimate for an instant that the IMU may not have reached yet, (ESTIMATE.size,)."""
+    p, v, q, a_W, w, _ = reckoning(row)
+    ahead = t_s - row[NOMINAL.t]
+    if ahead > 1e-9:
+        p, v = plus(p, v, ahead), plus(v, a_W, ahead)
+        q = normalised(product(q, rotation_vector_quaternion((w[0] * ahead, w[1] * ahead, w[2] * ahead))))
+        P = P.copy()
+        P[:3] += ahead * P[3:6]
+        P[:, :3] += ahead * P[:, 3:6]
+    yaw, yaw_sigma = heading_and_sigma(q, P)
+    put(estimate, ESTIMATE.p_WB, p)
+    put(estimate, ESTIMATE.v_WB, v)
+    put_quaternion(estimate, ESTIMATE.q_WB, q)
+    estimate[ESTIMATE.yaw], estimate[ESTIMATE.yaw_sigma] = yaw, yaw_sigma
+    put(estimate, ESTIMATE.gyro_bias, vector(row, NOMINAL.gyro_bias))
+    for i in range(6):
+        for j in range(i, 6):
+            estimate[ESTIMATE.covariance + 6 * i + j] = estimate[ESTIMATE.covariance + 6 * j + i] = P[i, j]

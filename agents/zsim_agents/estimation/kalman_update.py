@@ -1,7 +1,6 @@
 """Prediction of a covariance, and its update with a stack of independent measurements, compiled.
 
-The equations are those of filterpy's ExtendedKalmanFilter (Joseph form), which stays the reference and is
-what runs where numba is missing; a test holds both together.
+The equations are those of filterpy's ExtendedKalmanFilter (Joseph form), which tests hold them against.
 """
 
 import math
@@ -9,9 +8,9 @@ import math
 import numpy as np
 
 from zsim.math.compiled import portable
-from zsim_agents.estimation.aiding_models import within_gates
 
 ROWS_MAX = 32  # of one stacked update; more measurements of a gate go into a second one
+DOF_MAX = 6  # rows of the largest block, GPS with position and velocity
 
 
 @portable
@@ -99,10 +98,12 @@ def joseph(P: np.ndarray, H: np.ndarray, variance: np.ndarray, K: np.ndarray) ->
     """Return (I - K H) P (I - K H)^T + K R K^T, (n, n)."""
     m, n = H.shape
     A = np.eye(n)
-    for i in range(n):
-        for j in range(m):
-            for k in range(n):
-                A[i, k] -= K[i, j] * H[j, k]
+    for j in range(m):
+        for k in range(n):
+            h = H[j, k]
+            if h != 0.0:
+                for i in range(n):
+                    A[i, k] -= K[i, j] * h
     AP = A @ P
     updated = AP @ A.T
     for i in range(n):
@@ -111,6 +112,45 @@ def joseph(P: np.ndarray, H: np.ndarray, variance: np.ndarray, K: np.ndarray) ->
             for k in range(n):
                 updated[i, k] += weighted * K[k, j]
     return updated
+
+
+@portable
+def within_gates(S: np.ndarray, y: np.ndarray, blocks: np.ndarray, limits: np.ndarray, distances: np.ndarray) -> bool:
+    """Write y^T S^-1 y of every block of innovations by itself, and say whether all are within their limits.
+
+    By the block's Cholesky factor; infinite where it is not positive definite or the innovation not a number.
+
+    Args:
+        S: covariance of all innovations, (m, m).
+        y: all innovations, (m,).
+        blocks: first row and number of rows of each block, (k, 2).
+        limits: by number of rows, (DOF_MAX + 1,).
+        distances: the result, (k,) or longer.
+    """
+    L = np.zeros((DOF_MAX, DOF_MAX))
+    u = np.zeros(DOF_MAX)
+    good = True
+    for block in range(blocks.shape[0]):
+        first, size = blocks[block]
+        total = 0.0
+        for i in range(size):
+            part = y[first + i]
+            for j in range(i + 1):
+                rest = S[first + i, first + j]
+                for k in range(j):
+                    rest -= L[i, k] * L[j, k]
+                if i > j:
+                    L[i, j] = rest / L[j, j]
+                    part -= L[i, j] * u[j]
+                elif rest > 0.0:
+                    L[i, i] = math.sqrt(rest)
+                else:
+                    L[i, i] = math.nan
+            u[i] = part / L[i, i]
+            total += u[i] * u[i]
+        distances[block] = total if total == total else math.inf
+        good = good and distances[block] <= limits[size]
+    return good
 
 
 @portable

@@ -85,6 +85,19 @@ def turn_back(R: Rotation, v: Vector) -> Vector:
     )
 
 
+def rpy_rotation(rpy_deg: Vector) -> Rotation:
+    """Return Rz(yaw) Ry(pitch) Rx(roll) row by row."""
+    roll, pitch, yaw = (math.radians(angle) for angle in rpy_deg)
+    sr, cr, sp, cp, sy, cy = (
+        math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch), math.sin(yaw), math.cos(yaw),
+    )  # fmt: skip
+    return (
+        cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr,
+        sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr,
+        -sp, cp * sr, cp * cr,
+    )  # fmt: skip
+
+
 @portable
 def compose(A: Rotation, B: Rotation) -> Rotation:
     """Return the product A B."""

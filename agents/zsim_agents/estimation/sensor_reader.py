@@ -8,15 +8,14 @@ from numpy.typing import NDArray
 from zsim.contract import encoding, keys, messages
 from zsim.contract.bundle import Bundle
 from zsim.contract.encoding import GAP, Layouts, Program
+from zsim.contract.keys import SENSORS
 from zsim.math.compiled import portable
-from zsim_agents.estimation import estimator_rows as er
+from zsim_agents.estimation.filter_state import BARO, FLOW, GPS, IMU, READING, SIZES, SONAR, VALUES_MAX
 
 NOBODY = -1
 NS_S = 1e-9  # s/ns
-MESSAGES = {"imu": messages.Imu, "gps": messages.Gps, "mag": messages.Mag, "baro": messages.Baro,
-            "sonar": messages.Sonar, "flow": messages.Flow}  # fmt: skip
 BARO_ALTITUDE, GPS_POSITION, GPS_SIGMA, FLOW_QUALITY = 1, 3, 9, 3  # floats of these messages
-RANK = tuple(sorted(er.KINDS).index(kind) for kind in er.KINDS)  # of keys in the order in which runners hand over
+RANK = tuple(sorted(SENSORS).index(kind) for kind in SENSORS)  # of keys in the order in which runners hand over
 GPS_FIX, SONAR_VALID = 3, 3  # whole numbers of these messages
 
 read = portable(encoding.read)
@@ -31,11 +30,12 @@ class GateReader:
 
     def __init__(self, drones: Sequence[str]) -> None:
         self._whose = {
-            keys.sensor(drone, kind): (i, er.KINDS.index(kind)) for i, drone in enumerate(drones) for kind in er.KINDS
+            keys.sensor(drone, kind): (i, SENSORS.index(kind)) for i, drone in enumerate(drones) for kind in SENSORS
         }
         self._table: Sequence[str] = ()
         self._owner = np.empty((0, 2), dtype=np.int64)
-        layouts = Layouts(MESSAGES[kind] for kind in er.KINDS)
+        kinds = [messages.type_of(keys.sensor("any", sensor)) for sensor in SENSORS]
+        layouts = Layouts(kind for kind in kinds if kind)
         self._program = layouts.program
         self._ints = np.zeros(layouts.ints, dtype=np.int64)
         self._floats = np.zeros(layouts.floats)
@@ -45,7 +45,7 @@ class GateReader:
         """Write readings from row `came` on; return how many rows there are then, -1 if a message must be decoded.
 
         Args:
-            readings: (M, READING_COLUMNS), with room for all messages of the bundle.
+            readings: (M, READING.size), with room for all messages of the bundle.
         """
         if bundle.table is not self._table:
             self._learn(bundle.table)
@@ -84,7 +84,7 @@ def collect(
                 return -1
             place = came
             mark = ints[0] * len(RANK) + RANK[kind]
-            while place > first and readings[place - 1, er.DRONE] == i and marks[place - 1 - first] > mark:
+            while place > first and readings[place - 1, READING.drone] == i and marks[place - 1 - first] > mark:
                 readings[place], marks[place - first] = readings[place - 1], marks[place - 1 - first]
                 place -= 1
             fill(readings[place], i, kind, ints, floats)
@@ -97,17 +97,17 @@ def collect(
 @portable
 def fill(reading: NDArray, i: int, kind: int, ints: NDArray, floats: NDArray) -> None:
     """Write one message of drone i as a reading; the columns as in EstimatorBank."""
-    reading[er.DRONE], reading[er.KIND] = i, kind
-    reading[er.ARRIVED], reading[er.SAMPLED] = ints[0] * NS_S, ints[2] * NS_S
-    first = BARO_ALTITUDE if kind == er.BARO else GPS_POSITION if kind == er.GPS else 0
-    for k in range(6):
-        reading[er.VALUE + k] = floats[first + k] if k < er.SIZES[kind] else 0.0
-    reading[er.EXTRA], reading[er.EXTRA + 1] = 0.0, 0.0
-    if kind == er.IMU:
-        reading[er.ARRIVED] = reading[er.SAMPLED]
-    elif kind == er.GPS:
-        reading[er.EXTRA], reading[er.EXTRA + 1] = floats[GPS_SIGMA], ints[GPS_FIX]
-    elif kind == er.SONAR:
-        reading[er.EXTRA] = ints[SONAR_VALID]
-    elif kind == er.FLOW:
-        reading[er.EXTRA] = floats[FLOW_QUALITY]
+    reading[READING.drone], reading[READING.sensor] = i, kind
+    reading[READING.t_arrival], reading[READING.t_sample] = ints[0] * NS_S, ints[2] * NS_S
+    first = BARO_ALTITUDE if kind == BARO else GPS_POSITION if kind == GPS else 0
+    for k in range(VALUES_MAX):
+        reading[READING.values + k] = floats[first + k] if k < SIZES[kind] else 0.0
+    reading[READING.extra], reading[READING.extra + 1] = 0.0, 0.0
+    if kind == IMU:
+        reading[READING.t_arrival] = reading[READING.t_sample]
+    elif kind == GPS:
+        reading[READING.extra], reading[READING.extra + 1] = floats[GPS_SIGMA], ints[GPS_FIX]
+    elif kind == SONAR:
+        reading[READING.extra] = ints[SONAR_VALID]
+    elif kind == FLOW:
+        reading[READING.extra] = floats[FLOW_QUALITY]

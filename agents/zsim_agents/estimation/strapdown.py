@@ -1,25 +1,40 @@
-"""The nominal state of one drone: moved by every IMU sample, put right by the filter."""
+"""The nominal state of a drone, a row: moved by every sample of its IMU, put right by the filter, and remembered."""
 
-from __future__ import annotations
-
-from typing import NamedTuple
+import math
 
 import numpy as np
 
-from zsim.scenario.scenario import Imu
+from zsim.math.compiled import portable
 from zsim_agents.estimation.dead_reckoning import (
-    ACCEL_BIAS,
-    GYRO_BIAS,
-    Reckoning,
     acceleration,
     arm_acceleration,
     corrected,
     plus,
     reckon,
+    write_prediction,
 )
-from zsim_agents.estimation.madgwick import LEVEL, Quaternion, Vector, product, turn
-from zsim_agents.estimation.mount import mount_rotation
-from zsim_agents.estimation.state_history import Moment
+from zsim_agents.estimation.filter_state import (
+    COUNT,
+    IMU,
+    LAYOUT,
+    NOMINAL,
+    SENSOR,
+    SETTING,
+    Moment,
+    Rows,
+    add,
+    matrix,
+    moment_at,
+    put,
+    put_moment,
+    put_quaternion,
+    put_reckoning,
+    quaternion,
+    reckoning,
+    vector,
+)
+from zsim_agents.estimation.kalman_update import predicted_covariance
+from zsim_agents.estimation.madgwick import Vector, normalised, product, rotation_vector_quaternion, turn
 
 ZERO: Vector = (0.0, 0.0, 0.0)
 ACCEL_MAX_M_S2 = 500.0  # m/s^2, 50 g: no MEMS accelerometer of a drone reads more
@@ -28,175 +43,221 @@ MANOEUVRE_M_S2 = 0.3  # m/s^2, standard deviation of the acceleration in gusts o
 MANOEUVRE_S = 0.5  # s, its correlation time
 LOST_TURN_RAD_S = 0.5  # rad/s, standard deviation of the rate that a missing gyroscope sample hides
 COAST_TURN_DENSITY = LOST_TURN_RAD_S**2 * 2.0 * MANOEUVRE_S  # rad^2/s
-JOLT_SIGMAS = 10.0  # of the accelerometer; the sum of three changes of pure noise is 3.4 on average, 1.5 in spread
-JOLT_MIN_M_S2 = 1.0  # m/s^2 from one sample to the next, beyond the rotors in flight; touching the ground has tens
 COAST_VELOCITY_DENSITY = 1.0  # m^2/s^3: 1 m/s after 1 s without an IMU
 
 
-class Interval(NamedTuple):
-    """What has happened between two gates, for the covariance."""
-
-    dt: float
-    """Length [s]."""
-    v_before: Vector
-    """Velocity at its start [m/s]; with the one at its end it gives the mean acceleration."""
-    square_s2: float
-    """Sum of the squared steps of the IMU [s^2]."""
-    lost_velocity: float
-    """Variance of velocity to add for missing samples [m^2/s^2]."""
-    lost_turn: float
-    """Variance of attitude to add for missing samples [rad^2]."""
+@portable
+def possible(accel: Vector, gyro: Vector) -> bool:
+    """Whether an IMU can read that; NaN fails each comparison."""
+    good = True
+    for k in range(3):
+        good = good and abs(accel[k]) < ACCEL_MAX_M_S2 and abs(gyro[k]) < GYRO_MAX_RAD_S
+    return good
 
 
-class Strapdown:
-    """Position, velocity and attitude by dead reckoning.
+@portable
+def begin_interval(row: np.ndarray, t_s: float) -> None:
+    """Let the interval between two gates begin."""
+    row[NOMINAL.t_start] = t_s
+    put(row, NOMINAL.v_start, vector(row, NOMINAL.v_WB))
+    row[NOMINAL.dt_squared] = row[NOMINAL.lost_velocity] = row[NOMINAL.lost_turn] = 0.0
+
+
+@portable
+def begin(row: np.ndarray, counts: np.ndarray, t_s: float) -> None:
+    """Begin at an instant."""
+    row[NOMINAL.t] = t_s
+    counts[COUNT.running] = 1
+    begin_interval(row, t_s)
+
+
+@portable
+def move(rows: Rows, i: int, t_s: float, accel: Vector, gyro: Vector) -> None:
+    """Move to an IMU sample's instant; ignore a duplicate, refuse and count a late or impossible sample.
 
     Args:
-        imu: its rate, mount and latency.
-        with_accel_bias: whether the filter estimates one.
-        accel_sigma: white noise of the accelerometer per sample [m/s^2].
-        beta: Madgwick's gain [rad/s].
-        gravity: [m/s^2].
-        gate_s: interval of the gates [s].
+        rows: of all drones.
+        i: the drone.
+        t_s: instant of the sample [s].
+        accel: specific force [m/s^2; S].
+        gyro: body rate [rad/s; S].
     """
-
-    def __init__(
-        self, imu: Imu, with_accel_bias: bool, accel_sigma: float, beta: float, gravity: float, gate_s: float
-    ) -> None:
-        self.t_s = 0.0
-        self.state: Reckoning = (ZERO, ZERO, LEVEL, ZERO, ZERO, (0.0, 0.0, gravity))
-        self.gyro_bias, self.accel_bias = ZERO, ZERO
-        self.p_corrected, self.v_corrected = ZERO, ZERO
-        self.used = 0
-        self.refused = 0
-        self.running = False
-        self._with_accel_bias, self._beta, self.gravity = with_accel_bias, beta, gravity
-        self._period_s = 1.0 / imu.rate_hz
-        self._coast_after_s = coast_after_s(imu, gate_s)
-        self._R_BS, self._arm = mount_rotation(imu.mount), imu.mount.position_m
-        self._mounted_aside = imu.mount.rpy_deg != ZERO or self._arm != ZERO
-        self._jolt_m_s2 = jolt_m_s2(accel_sigma)
-        self._interval_from(0.0)
-
-    def start(self, t_s: float) -> None:
-        """Begin at an instant."""
-        self.t_s = t_s
-        self.running = True
-        self._interval_from(t_s)
-
-    def imu(self, t_sample_s: float, accel: Vector, gyro: Vector) -> None:
-        """Move to the sample's instant; ignore a duplicate, refuse and count a late or impossible sample.
-
-        Args:
-            t_sample_s: instant of the sample [s].
-            accel: specific force [m/s^2; S].
-            gyro: body rate [rad/s; S].
-        """
-        ax, ay, az = accel
-        wx, wy, wz = gyro
-        # Written out, because it runs at every sample; NaN fails each comparison.
-        if not (
-            -ACCEL_MAX_M_S2 < ax < ACCEL_MAX_M_S2
-            and -ACCEL_MAX_M_S2 < ay < ACCEL_MAX_M_S2
-            and -ACCEL_MAX_M_S2 < az < ACCEL_MAX_M_S2
-            and -GYRO_MAX_RAD_S < wx < GYRO_MAX_RAD_S
-            and -GYRO_MAX_RAD_S < wy < GYRO_MAX_RAD_S
-            and -GYRO_MAX_RAD_S < wz < GYRO_MAX_RAD_S
-        ):
-            self.refused += 1
-            return
-        if not self.running:
-            self.start(t_sample_s - self._period_s)
-        dt = t_sample_s - self.t_s
-        if dt <= 0.0:
-            self.refused += dt < 0.0
-            return
-        if dt > 1.5 * self._period_s:
-            self._lose(dt - self._period_s)
-        if self._mounted_aside:
-            accel, gyro = self._of_body(accel, gyro, dt)
-        bx, by, bz = self.state[5]
-        self.state = reckon(self.state, accel, gyro, self.accel_bias, self.gyro_bias, self._beta, self.gravity, dt)
-        fx, fy, fz = self.state[5]
-        jolt = abs(fx - bx) + abs(fy - by) + abs(fz - bz)
-        if jolt > self._jolt_m_s2:
-            hidden = 0.5 * jolt * dt  # what a step anywhere between two samples hides
-            self._lost_velocity += hidden * hidden
-        self.t_s = t_sample_s
-        self._square_s2 += dt * dt
-        self.used += 1
-
-    def coast(self, t_s: float) -> None:
-        """Go on without an IMU if none came for long: velocity and attitude held, their certainty fading."""
-        dt = t_s - self.t_s
-        if dt <= self._coast_after_s:
-            return
-        p, v, q, _, _, f_B = self.state
-        self.state = (plus(p, v, dt), v, q, ZERO, ZERO, f_B)
-        self.t_s = t_s
-        self._lost_velocity += COAST_VELOCITY_DENSITY * dt
-        self._lost_turn += COAST_TURN_DENSITY * dt
-
-    def take_interval(self) -> Interval:
-        """Return what has happened since the last call."""
-        taken = Interval(self.t_s - self._from_s, self._v_before, self._square_s2, self._lost_velocity, self._lost_turn)
-        self._interval_from(self.t_s)
-        return taken
-
-    def correct(self, error: np.ndarray) -> None:
-        """Put an error of the filter into the state and the biases."""
-        self.state = corrected(self.state, error, self._with_accel_bias, self.gravity)
-        self._v_before = self.state[1]
-        values = error.tolist()
-        self.p_corrected = _plus_three(self.p_corrected, values, 0)
-        self.v_corrected = _plus_three(self.v_corrected, values, 3)
-        self.gyro_bias = _plus_three(self.gyro_bias, values, GYRO_BIAS)
-        if self._with_accel_bias:
-            self.accel_bias = _plus_three(self.accel_bias, values, ACCEL_BIAS)
-
-    def place(self, p: Vector, v: Vector, q: Quaternion) -> None:
-        """Set position, velocity and attitude."""
-        _, _, _, _, w, f_B = self.state
-        self.state = (p, v, q, acceleration(q, f_B, self.gravity), w, f_B)
-        self._v_before = v
-
-    def turn_heading(self, turn_z: Quaternion) -> None:
-        """Turn the attitude about the world's z axis."""
-        p, v, q, _, _, _ = self.state
-        self.place(p, v, product(turn_z, q))
-
-    def moment(self) -> Moment:
-        """Return the present instant for the history."""
-        p, v, q, _, w, _ = self.state
-        return Moment(self.t_s, p, v, q, w, self.p_corrected, self.v_corrected)
-
-    def _interval_from(self, t_s: float) -> None:
-        self._from_s = t_s
-        self._v_before = self.state[1]
-        self._square_s2 = self._lost_velocity = self._lost_turn = 0.0
-
-    def _lose(self, missing_s: float) -> None:
-        """Count samples that did not come as motion unseen."""
-        velocity, turned = MANOEUVRE_M_S2 * missing_s, LOST_TURN_RAD_S * missing_s
-        self._lost_velocity += velocity * velocity
-        self._lost_turn += turned * turned
-
-    def _of_body(self, accel: Vector, gyro: Vector, dt: float) -> tuple[Vector, Vector]:
-        """Return a sample of a turned or displaced IMU as one of the centre of mass, in body axes."""
-        accel, gyro = turn(self._R_BS, accel), turn(self._R_BS, gyro)
-        w = plus(gyro, self.gyro_bias, -1.0)
-        return plus(accel, arm_acceleration(w, self.state[4], self._arm, dt), -1.0), gyro
+    row, counts, setting, layout = rows.nominal[i], rows.counts[i], rows.setting[i], rows.layout[i]
+    if not possible(accel, gyro):
+        counts[COUNT.refused + IMU] += 1
+        return
+    period = setting[SETTING.period]
+    if not counts[COUNT.running]:
+        begin(row, counts, t_s - period)
+    dt = t_s - row[NOMINAL.t]
+    if dt <= 0.0:
+        counts[COUNT.refused + IMU] += 1 if dt < 0.0 else 0
+        return
+    if dt > 1.5 * period:
+        _lose(row, dt - period)
+    if layout[LAYOUT.imu_displaced]:
+        accel, gyro = _of_body(row, setting, accel, gyro, dt)
+    state = reckoning(row)
+    biases = vector(row, NOMINAL.accel_bias), vector(row, NOMINAL.gyro_bias)
+    moved = reckon(state, accel, gyro, biases[0], biases[1], setting[SETTING.beta], setting[SETTING.gravity], dt)
+    put_reckoning(row, moved)
+    before, after = state[5], moved[5]
+    jolt = abs(after[0] - before[0]) + abs(after[1] - before[1]) + abs(after[2] - before[2])
+    if jolt > setting[SETTING.jolt]:
+        hidden = 0.5 * jolt * dt  # what a step anywhere between two samples hides
+        row[NOMINAL.lost_velocity] += hidden * hidden
+    row[NOMINAL.t] = t_s
+    row[NOMINAL.dt_squared] += dt * dt
+    counts[COUNT.used + IMU] += 1
 
 
-def coast_after_s(imu: Imu, gate_s: float) -> float:
-    """Return after how long without an IMU dead reckoning goes on without one [s]."""
-    return imu.latency_ms * 1e-3 + gate_s + 5.0 * (1.0 / imu.rate_hz)
+@portable
+def _lose(row: np.ndarray, missing_s: float) -> None:
+    velocity, turned = MANOEUVRE_M_S2 * missing_s, LOST_TURN_RAD_S * missing_s
+    row[NOMINAL.lost_velocity] += velocity * velocity
+    row[NOMINAL.lost_turn] += turned * turned
 
 
-def jolt_m_s2(accel_sigma: float) -> float:
-    """Return the change of specific force from one sample to the next that is more than noise and rotors [m/s^2]."""
-    return max(JOLT_SIGMAS * accel_sigma, JOLT_MIN_M_S2)
+@portable
+def _of_body(row: np.ndarray, setting: np.ndarray, accel: Vector, gyro: Vector, dt: float) -> tuple[Vector, Vector]:
+    """Return a sample of a turned or displaced IMU as one of the centre of mass, in body axes."""
+    imu = SETTING.sensors + IMU * SENSOR.size
+    R_BS = matrix(setting, imu + SENSOR.R_BS)
+    accel, gyro = turn(R_BS, accel), turn(R_BS, gyro)
+    w = plus(gyro, vector(row, NOMINAL.gyro_bias), -1.0)
+    swing = arm_acceleration(w, vector(row, NOMINAL.w_WB_B), vector(setting, imu + SENSOR.p_BS), dt)
+    return plus(accel, swing, -1.0), gyro
 
 
-def _plus_three(a: Vector, values: list[float], first: int) -> Vector:
-    return a[0] + values[first], a[1] + values[first + 1], a[2] + values[first + 2]
+@portable
+def coast(row: np.ndarray, setting: np.ndarray, t_s: float) -> None:
+    """Go on without an IMU if none came for long: velocity and attitude held, their certainty fading."""
+    dt = t_s - row[NOMINAL.t]
+    if dt <= setting[SETTING.coast_after]:
+        return
+    p, v, q, _, _, f_B = reckoning(row)
+    put_reckoning(row, (plus(p, v, dt), v, q, ZERO, ZERO, f_B))
+    row[NOMINAL.t] = t_s
+    row[NOMINAL.lost_velocity] += COAST_VELOCITY_DENSITY * dt
+    row[NOMINAL.lost_turn] += COAST_TURN_DENSITY * dt
+
+
+@portable
+def grow(rows: Rows, i: int, P: np.ndarray) -> np.ndarray:
+    """Return the covariance grown over the interval of dead reckoning that ends now, and begin the next one."""
+    row, setting, layout, n = rows.nominal[i], rows.setting[i], rows.layout[i], P.shape[0]
+    dt, dt_squared = row[NOMINAL.t] - row[NOMINAL.t_start], row[NOMINAL.dt_squared]
+    if dt > 0.0:
+        turned = setting[SETTING.gyro_variance] * dt_squared + row[NOMINAL.lost_turn]
+        velocity = setting[SETTING.accel_variance] * dt_squared + row[NOMINAL.lost_velocity]
+        F, Q = np.eye(n), np.zeros((n, n))
+        write_prediction(
+            F,
+            Q,
+            rows.walk[i, :n],
+            reckoning(row),
+            vector(row, NOMINAL.v_start),
+            setting[SETTING.gravity],
+            setting[SETTING.levelling],
+            layout[LAYOUT.accel_bias] != 0,
+            (velocity, turned + setting[SETTING.tilt_density] * dt, turned),
+            dt,
+        )
+        P = predicted_covariance(P, F, Q)
+    begin_interval(row, row[NOMINAL.t])
+    return P
+
+
+@portable
+def correct(row: np.ndarray, layout: np.ndarray, gravity: float, error: np.ndarray) -> None:
+    """Put an error of the filter into the state and the biases."""
+    with_accel_bias = layout[LAYOUT.accel_bias] != 0
+    put_reckoning(row, corrected(reckoning(row), error, with_accel_bias, gravity))
+    put(row, NOMINAL.v_start, vector(row, NOMINAL.v_WB))
+    add(row, NOMINAL.p_corrected, error, 0)
+    add(row, NOMINAL.v_corrected, error, 3)
+    add(row, NOMINAL.gyro_bias, error, 9)
+    if with_accel_bias:
+        add(row, NOMINAL.accel_bias, error, 12)
+
+
+@portable
+def turn_heading(row: np.ndarray, gravity: float, angle: float) -> None:
+    """Turn the attitude about the world's z axis."""
+    q = product((math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle)), quaternion(row, NOMINAL.q_WB))
+    put_quaternion(row, NOMINAL.q_WB, q)
+    put(row, NOMINAL.a_WB, acceleration(q, vector(row, NOMINAL.f_B), gravity))
+    put(row, NOMINAL.v_start, vector(row, NOMINAL.v_WB))
+
+
+@portable
+def remember(counts: np.ndarray, history: np.ndarray, longest: int, now: Moment) -> None:
+    """Keep one more instant, not before any other."""
+    newest = counts[COUNT.newest] + 1 if counts[COUNT.kept] else 0
+    if newest == longest:
+        newest = 0
+    put_moment(history[newest], now)
+    counts[COUNT.newest] = newest
+    counts[COUNT.kept] = min(counts[COUNT.kept] + 1, longest)
+
+
+@portable
+def recall(counts: np.ndarray, history: np.ndarray, longest: int, t_s: float, now: Moment) -> Moment:
+    """Return the state at `t_s` as `now` sees it, later corrections included.
+
+    Between the history's entries and `now` it is interpolated, before all of them it is the oldest, and after `now` it
+    is reached with constant velocity and rate.
+
+    Args:
+        counts: of the drone.
+        history: its ring, (entries, MOMENT.size).
+        longest: entries that the drone uses of it.
+        t_s: instant [s].
+        now: the present state.
+    """
+    if t_s == now[0]:
+        return now
+    if t_s > now[0]:
+        return _ahead(now, t_s - now[0])
+    later = now
+    for back in range(counts[COUNT.kept]):
+        past = moment_at(history[(counts[COUNT.newest] - back + longest) % longest])
+        if past[0] <= t_s:
+            earlier = _as_seen(past, now)
+            return earlier if past[0] == t_s else _between(earlier, _as_seen(later, now), t_s)
+        later = past
+    return _as_seen(later, now)
+
+
+@portable
+def _as_seen(past: Moment, now: Moment) -> Moment:
+    """Return a past state with the corrections since then."""
+    p = plus(plus(past[1], now[5], 1.0), past[5], -1.0)
+    v = plus(plus(past[2], now[6], 1.0), past[6], -1.0)
+    return past[0], p, v, past[3], past[4], now[5], now[6]
+
+
+@portable
+def _ahead(now: Moment, dt: float) -> Moment:
+    t_s, p, v, q, w, p_corrected, v_corrected = now
+    turned = rotation_vector_quaternion((dt * w[0], dt * w[1], dt * w[2]))
+    return t_s + dt, plus(p, v, dt), v, product(q, turned), w, p_corrected, v_corrected
+
+
+@portable
+def _between(a: Moment, b: Moment, t_s: float) -> Moment:
+    """Interpolate linearly; quaternions of neighbouring instants are never opposite."""
+    part = (t_s - a[0]) / (b[0] - a[0])
+    q_a, q_b = a[3], b[3]
+    q = normalised((
+        q_a[0] + part * (q_b[0] - q_a[0]),
+        q_a[1] + part * (q_b[1] - q_a[1]),
+        q_a[2] + part * (q_b[2] - q_a[2]),
+        q_a[3] + part * (q_b[3] - q_a[3]),
+    ))  # fmt: skip
+    return t_s, _mix(a[1], b[1], part), _mix(a[2], b[2], part), q, _mix(a[4], b[4], part), b[5], b[6]
+
+
+@portable
+def _mix(a: Vector, b: Vector, part: float) -> Vector:
+    return a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1]), a[2] + part * (b[2] - a[2])

@@ -13,8 +13,7 @@ import msgspec
 
 from zsim.contract import messages
 from zsim.scenario.scenario import Mount
-from zsim_agents.estimation.madgwick import LEVEL, Rotation, madgwick_step, turn
-from zsim_agents.estimation.mount import mount_rotation
+from zsim_agents.estimation.madgwick import LEVEL, Rotation, madgwick_step, rpy_rotation, turn
 from zsim_bridges import ros_frames
 from zsim_bridges.ros_frames import Vector
 
@@ -41,7 +40,9 @@ class Onboard:
 
     def __init__(self, imu: Mount | None = None, mag: Mount | None = None) -> None:
         mounts = {messages.Imu: imu, messages.Mag: mag}
-        self._turns = {kind: mount_rotation(mount) for kind, mount in mounts.items() if mount and any(mount.rpy_deg)}
+        self._turns = {
+            kind: rpy_rotation(mount.rpy_deg) for kind, mount in mounts.items() if mount and any(mount.rpy_deg)
+        }
         self.imu: messages.Imu | None = None
         self.mag: messages.Mag | None = None
         self.baro: messages.Baro | None = None

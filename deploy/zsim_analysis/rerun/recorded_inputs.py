@@ -79,6 +79,10 @@ def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenari
     return RecordedAgents(() if why_not else processes, why_not, requests, fingerprints, sha256)
 
 
+def _by_role(process: AgentProcess) -> tuple[int, str]:
+    return [*AGENTS].index(process.name.partition(".")[0]), process.name
+
+
 def _is_ours(name: str, join: messages.Join, known: set[str]) -> bool:
     """Return whether a process was one of zsim's agents: others do not announce a numeric fingerprint."""
     return bool(join.version and join.fingerprint) and {name, *join.serves} <= known

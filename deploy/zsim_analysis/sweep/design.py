@@ -17,7 +17,8 @@ from zsim.scenario import overrides, scenario_file
 from zsim.scenario.overrides import whole_path
 from zsim.scenario.scenario import Scenario
 from zsim.scenario.scenario_file import EXAMPLE
-from zsim.schema import yaml_file
+from zsim.schema import plugin, yaml_file
+from zsim_agents.hosting import check_classes
 from zsim_analysis.sweep.axes import SEED, Axis, Draw, FieldPath, Grid, field_path, is_inside, parse, text_of
 
 PLAN = "plan.json"
@@ -137,6 +138,7 @@ class SweepDesign:
             raise ScenarioError([*faults, *error.faults]) from error
         if faults:
             raise ScenarioError(faults)
+        check_classes(scenario, self.plan.source)
         return scenario
 
     def faults(self, progress: Callable[[int, int], None] = lambda run, of: None) -> list[str]:
@@ -275,6 +277,7 @@ def read_document(path: Path, set_texts: list[str], **values: Any) -> tuple[dict
     Raises:
         ScenarioError: the file holds no map.
     """
+    plugin.search(path.parent)
     document = yaml_file.read(path, EXAMPLE, ScenarioError)
     document.update({key: value for key, value in values.items() if value is not None})
     applied = [overrides.apply(document, text, yaml_file.value) for text in set_texts]

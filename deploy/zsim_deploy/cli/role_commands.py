@@ -22,7 +22,6 @@ from zsim_deploy.options.arguments import (
     Tls,
     Wait,
     identity,
-    load_scenario,
     mode_and_rate,
 )
 from zsim_deploy.options.reach import Reach, takes_part
@@ -51,9 +50,10 @@ def world(
     host: Host = None,
 ) -> None:
     """Run the world: integrates all drones and owns simulated time."""
+    from zsim.scenario import scenario_file
     from zsim_deploy.roles import roles
 
-    loaded = load_scenario(scenario, set_, seed, duration)
+    loaded = scenario_file.load(scenario, set_ or (), seed=seed, duration_s=duration)  # it needs no class of the agents
     mode, pace = mode_and_rate(realtime, rate)
     who = identity(host, tls, insecure, access)
     roles.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who)

@@ -58,10 +58,13 @@ def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | 
 def load_scenario(
     path: Path, overrides: list[str] | None, seed: int | None = None, duration: float | None = None
 ) -> Any:
-    """Return the scenario of a file with what the command line says of it."""
+    """Return the scenario of a file with what the command line says of it, the classes that it names loaded."""
     from zsim.scenario import scenario_file
+    from zsim_agents.hosting import check_classes
 
-    return scenario_file.load(path, overrides or (), seed=seed, duration_s=duration)
+    scenario = scenario_file.load(path, overrides or (), seed=seed, duration_s=duration)
+    check_classes(scenario, path.name)
+    return scenario
 
 
 def mode_and_rate(realtime: bool, rate: float | None) -> tuple[str, float]:

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from synthetic_flight import GATE_S, Flight, Reading, estimator, feed, fly, readings, scenario
+from synthetic_flight import GATE_S, Flight, OneDrone, Reading, estimator, fly, readings, scenario
 
-from zsim_agents.estimation.drone_estimator import DroneEstimator, Estimate
-from zsim_agents.estimation.estimator_prior import LEVELLING_S, madgwick_beta
+from zsim_agents.estimation.drone_estimator import StateEstimate
+from zsim_agents.estimation.filter_setup import LEVELLING_S, madgwick_beta
+from zsim_agents.estimation.filter_state import Rows
 from zsim_agents.estimation.madgwick import levelling_time_s
 
 NAN, INF = math.nan, math.inf
@@ -44,7 +45,7 @@ def rms(error: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(error**2, axis=0))
 
 
-def covariance(estimate: Estimate) -> np.ndarray:
+def covariance(estimate: StateEstimate) -> np.ndarray:
     return np.array(estimate.covariance).reshape(6, 6)
 
 
@@ -91,26 +92,29 @@ def test_the_covariance_tells_the_truth(sections):
 
 
 def test_innovations_are_white_and_of_the_right_size():
-    of, flight = scenario(), Flight(2)
-    core = estimator(of)
-    normalised: dict[int, list[np.ndarray]] = {}
-    update = core.filter.update
-
-    def listening(*args, **kwargs):
-        update(*args, **kwargs)
-        root = np.linalg.cholesky(core.filter.S)
-        normalised.setdefault(len(core.filter.y), []).append(np.linalg.solve(root, core.filter.y))
-
-    core.filter.update = listening
-    fly(core, readings(flight, of, 2, 60.0), 60.0)
-    for rows, series in normalised.items():
-        y = np.array(series[20:])  # after the first second or so
-        if len(y) < 100:
-            continue
-        three_sigma = 3.0 * math.sqrt(2.0 / y.size)
-        assert np.mean(y**2) == pytest.approx(1.0, abs=three_sigma + 0.02), rows
-        correlation = np.mean(y[1:] * y[:-1], axis=0)
-        assert np.abs(correlation).max() < 4.0 / math.sqrt(len(y)), rows
+    """Of every fix against a twin that has not had it; each is independent of the one before."""
+    of, flight = scenario(estimation={"gate_probability": 0.999999}), Flight(2)
+    core, twin, normalised = estimator(of), estimator(of), []
+    by_gate: dict[int, list[Reading]] = {}
+    for reading in readings(flight, of, 2, 60.0):
+        by_gate.setdefault(math.ceil(reading.t_s / GATE_S - 1e-6), []).append(reading)
+    for gate in range(1, round(60.0 / GATE_S) + 1):
+        twin.bank.rows = Rows._make(array.copy() for array in core.bank.rows)
+        fixes = [reading for reading in by_gate[gate] if reading.sensor == "gps"]
+        for reading in by_gate[gate]:
+            core.feed(reading)
+            if reading not in fixes:
+                twin.feed(reading)
+        core.close(gate * GATE_S)
+        before = twin.close(gate * GATE_S)
+        for fix in fixes:
+            y = np.concatenate(fix.values[:2]) - (*before.position_m, *before.velocity_m_s)
+            S = covariance(before) + np.diag([2.0**2] * 3 + [0.43**2] * 3)
+            normalised.append(np.linalg.solve(np.linalg.cholesky(S), y))
+    y = np.array(normalised[5:])  # after the first second
+    assert len(y) == 295
+    assert np.mean(y**2) == pytest.approx(1.0, abs=3.0 * math.sqrt(2.0 / y.size) + 0.02)
+    assert np.abs(np.mean(y[1:] * y[:-1], axis=0)).max() < 4.0 / math.sqrt(len(y))
 
 
 @pytest.mark.parametrize("name", AIDING)
@@ -128,7 +132,7 @@ def test_an_outlier_is_refused_and_counted(name: str):
         coming = [r._replace(values=(0.05, True)) if r.sensor == "sonar" else r for r in coming]
     core = estimator(of)
     before = fly(core, coming, 10.0)[-1][1]
-    feed(core, Reading(10.02, name, 10.02, outlier))
+    core.feed(Reading(10.02, name, 10.02, outlier))
     after = core.close(10.02)
     assert after.sensors[name] == (before.sensors[name][0], before.sensors[name][1] + 1)
     assert after.position_m == pytest.approx(before.position_m, abs=0.01)
@@ -179,7 +183,7 @@ def test_the_order_within_a_gate_does_not_matter_much():
     core, end, waiting = estimator(of), clean[0][1], sorted(coming, key=backwards)
     for k in range(1, round(10.0 / GATE_S) + 1):
         while waiting and waiting[0].t_s <= k * GATE_S + 1e-9:
-            feed(core, waiting.pop(0))
+            core.feed(waiting.pop(0))
         end = core.close(k * GATE_S)
     assert end.position_m == pytest.approx(clean[-1][1].position_m, abs=1e-6)
 
@@ -241,20 +245,16 @@ def test_late_fixes_are_compared_with_the_past():
     of = scenario(sensors={"gps": {"latency_ms": 400.0, "position_m": {"noise": 0.05}}})
     cruise = 2.0  # m/s
     core = estimator(of)
-    start = {"position_m": (0.0, 0.0, 10.0), "velocity_m_s": (cruise, 0.0, 0.0)}
-    core.warm_start(
-        **start,
-        orientation_wxyz=(1.0, 0.0, 0.0, 0.0),
-        covariance=np.diag([1.0] * 3 + [0.01] * 3).ravel().tolist(),
-        yaw_sigma_rad=0.01,
-        gyro_bias_rad_s=(0.0, 0.0, 0.0),
-    )
+    P = np.diag([1.0] * 3 + [0.01] * 3).ravel()
+    level = (1.0, 0.0, 0.0, 0.0)
+    core.warm_start(StateEstimate((0.0, 0.0, 10.0), (cruise, 0.0, 0.0), level, 0.0, P, 0.01))
     end = core.close(0.0)
     for k in range(1, 2001):
         t = k * 0.005
-        core.imu(t, (0.0, 0.0, 9.80665), (0.0, 0.0, 0.0))
+        core.feed(Reading(t, "imu", t, ((0.0, 0.0, 9.80665), (0.0, 0.0, 0.0))))
         if k % 40 == 0 and t > 0.4:
-            core.gps(t, t - 0.4, (cruise * (t - 0.4), 0.0, 10.0), (cruise, 0.0, 0.0), 0.05, 3)
+            fix = ((cruise * (t - 0.4), 0.0, 10.0), (cruise, 0.0, 0.0), 0.05, 3)
+            core.feed(Reading(t, "gps", t - 0.4, fix))
         if k % 4 == 0:
             end = core.close(t)
     assert end.position_m == pytest.approx((cruise * 10.0, 0.0, 10.0), abs=0.02)
@@ -316,16 +316,9 @@ def test_biases_of_aiding_sensors_widen_the_covariance():
     assert low < np.mean(ends) < high
 
 
-def restart(estimate: Estimate, of) -> DroneEstimator:
+def restart(estimate: StateEstimate, of) -> OneDrone:
     core = estimator(of)
-    core.warm_start(
-        estimate.position_m,
-        estimate.velocity_m_s,
-        estimate.orientation_wxyz,
-        estimate.covariance,
-        estimate.yaw_sigma_rad,
-        estimate.gyro_bias_rad_s,
-    )
+    core.warm_start(estimate)
     return core
 
 

@@ -1,4 +1,4 @@
-"""The compiled bank says to the bit what an estimator of each drone says, whatever comes in."""
+"""A bank of drones: each as if it were alone, and sound whatever comes in."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -8,16 +8,14 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from synthetic_flight import GATE_S, Flight, Reading, readings
+from scipy.stats import chi2
+from synthetic_flight import GATE_S, Flight, Reading, feed, readings, seconds
 
-from zsim.math.compiled import COMPILES
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim_agents.estimation.drone_estimator import DroneEstimator
-from zsim_agents.estimation.estimate import Estimate
+from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.estimator_bank import EstimatorBank
 
-pytestmark = pytest.mark.skipif(not COMPILES, reason="numba is not installed: a bank is made only where it is")
 END_S = 8.0  # s, of a flight that starts at 2 s
 ASIDE = {"mount": {"position_m": [0.1, -0.05, 0.04], "rpy_deg": [10.0, -20.0, 160.0]}}
 BIASED = {"bias": 0.3, "bias_walk": 0.01}
@@ -33,32 +31,42 @@ def gates(coming: Sequence[Reading]) -> list[list[Reading]]:
     return sorted_in
 
 
-def together(of: Scenario, coming: Sequence[Sequence[Reading]]) -> None:
-    """Feed a bank of all drones and an estimator of each; all they say must be equal."""
-    cores = [DroneEstimator(d, of.environment, of.estimation, GATE_S) for d in of.drones]
-    bank = EstimatorBank(of.drones, of.environment, of.estimation, GATE_S)
-    by_gate = [gates(each) for each in coming]
-    for gate in range(1, len(by_gate[0])):
-        for i, core in enumerate(cores):
-            for reading in by_gate[i][gate]:
-                feed(core, bank, i, reading)
-        t_s = gate * GATE_S
-        assert same([core.close(t_s) for core in cores], bank.close(t_s)), f"gate {gate}"
+def bank_of(of: Scenario) -> EstimatorBank:
+    return EstimatorBank(of.drones, of.environment, of.estimation, GATE_S)
 
 
-def same(a: list[Estimate], b: list[Estimate]) -> bool:
+def fly(bank: EstimatorBank, by_gate: Sequence[Sequence[Sequence[Reading]]], span: range) -> list[list[StateEstimate]]:
+    """Return the estimates of each gate of a span, from the readings of each drone by gate."""
+    estimates = []
+    for gate in span:
+        for i, each in enumerate(by_gate):
+            for reading in each[gate]:
+                feed(bank, i, reading)
+        estimates.append(bank.estimate(seconds(gate * GATE_S)))
+    return estimates
+
+
+def same(a: list[StateEstimate], b: list[StateEstimate]) -> bool:
     """Equal to the bit; repr tells numbers apart that differ in any bit, and NaN is NaN."""
     return repr(a) == repr(b)
 
 
-def feed(core: DroneEstimator, bank: EstimatorBank, i: int, reading: Reading) -> None:
-    t_s, name, t_sample_s, values = reading
-    if name == "imu":
-        core.imu(t_sample_s, *values)
-        bank.imu(i, t_sample_s, *values)
-    else:
-        getattr(core, name)(t_s, t_sample_s, *values)
-        getattr(bank, name)(i, t_s, t_sample_s, *values)
+def as_if_alone(of: Scenario, coming: Sequence[Sequence[Reading]]) -> list[list[StateEstimate]]:
+    """Fly a bank of all drones, and one of each: the estimates must be the same. Return them by gate."""
+    by_gate, span = [gates(each) for each in coming], range(1, round(END_S / GATE_S) + 1)
+    among = fly(bank_of(of), by_gate, span)
+    for i, drone in enumerate(of.drones):
+        alone = fly(bank_of(msgspec.structs.replace(of, drones=[drone])), by_gate[i : i + 1], span)
+        assert same([each[0] for each in alone], [each[i] for each in among])
+    return among
+
+
+def nees(flight: Flight, t_s: float, estimate: StateEstimate) -> float:
+    """Return e^T P^-1 e of position and velocity."""
+    t = np.array([t_s])
+    truth = np.concatenate([flight.position(t)[0], flight.velocity(t)[0]])
+    error = truth - (*estimate.position_m, *estimate.velocity_m_s)
+    return float(error @ np.linalg.solve(np.reshape(estimate.covariance, (6, 6)), error))
 
 
 def three(preset: str = "paper", **sections: Any) -> Scenario:
@@ -76,20 +84,20 @@ def three(preset: str = "paper", **sections: Any) -> Scenario:
 
 
 @cache
+def flights(seed: int) -> list[Flight]:
+    """Return a flight of its own for each drone."""
+    return [Flight(seed + i, start_s=2.0, yaw_rate=0.3 * i) for i in range(3)]
+
+
+@cache
 def flown(seed: int, preset: str = "paper") -> list[list[Reading]]:
     """Return what each drone's sensors say of a flight of its own; vectors are tuples, as messages have them."""
     of = three(preset)
+    pairs = zip(of.drones, flights(seed), strict=True)
+    alone = [(msgspec.structs.replace(of, drones=[drone]), flight) for drone, flight in pairs]
     return [
-        [
-            _tupled(reading)
-            for reading in readings(
-                Flight(seed + i, start_s=2.0, yaw_rate=0.3 * i),
-                msgspec.structs.replace(of, drones=[drone]),
-                seed + i,
-                END_S,
-            )
-        ]
-        for i, drone in enumerate(of.drones)
+        [_tupled(reading) for reading in readings(flight, each, seed + i, END_S)]
+        for i, (each, flight) in enumerate(alone)
     ]
 
 
@@ -98,17 +106,14 @@ def _tupled(reading: Reading) -> Reading:
     return reading._replace(values=tuple(values))
 
 
-@pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("preset", ["paper", "ardrone2"])
-def test_a_bank_says_what_each_drones_estimator_says(preset: str, seed: int):
-    of = three(preset)
-    together(of, flown(seed, preset))
+def test_each_drone_is_estimated_as_if_it_were_alone(preset: str):
+    as_if_alone(three(preset), flown(1, preset))
 
 
 @pytest.mark.parametrize("settings", [{"magnetometer": False}, {"flow": False}, {"madgwick_beta": 0.1}])
 def test_with_other_settings_too(settings: dict[str, Any]):
-    of = three(estimation=settings)
-    together(of, flown(3))
+    as_if_alone(three(estimation=settings), flown(3))
 
 
 def lost(coming: list[Reading], rng: np.random.Generator) -> list[Reading]:
@@ -169,49 +174,30 @@ def _closer(reading: Reading) -> Reading:
 @pytest.mark.parametrize("change", [lost, silent_imu, shuffled, impossible, displaced, crowded])
 def test_whatever_comes_in(change: Change):
     of, rng = three(), np.random.default_rng(5)
-    together(of, [change(coming, rng) for coming in flown(4)])
+    among = as_if_alone(of, [change(coming, rng) for coming in flown(4)])
+    for estimate in among[-1]:
+        P = np.reshape(estimate.covariance, (6, 6))
+        assert np.isfinite((*estimate.position_m, *estimate.velocity_m_s, *estimate.orientation_wxyz)).all()
+        assert (P == P.T).all()
+        assert np.linalg.eigvalsh(P).min() > 0.0
+    if change is not displaced:
+        each = zip(flights(4), among[-1], strict=True)
+        assert max(nees(flight, END_S, estimate) for flight, estimate in each) < chi2.ppf(1.0 - 1e-6, 6)
 
 
 def test_a_restart_goes_on_from_what_was_published():
     of, coming = three(), flown(6)
-    first = EstimatorBank(of.drones, of.environment, of.estimation, GATE_S)
     by_gate = [gates(each) for each in coming]
-    last = estimates_of(first, by_gate, range(1, 300))[-1]
-    bank = EstimatorBank(of.drones, of.environment, of.estimation, GATE_S)
-    cores = [DroneEstimator(d, of.environment, of.estimation, GATE_S) for d in of.drones]
-    for i, (core, e) in enumerate(zip(cores, last, strict=True)):
-        known = (e.position_m, e.velocity_m_s, e.orientation_wxyz, e.covariance, e.yaw_sigma_rad, e.gyro_bias_rad_s)
-        core.warm_start(*known)
-        bank.warm_start(i, *known)
-    for gate in range(300, 400):
-        for i, core in enumerate(cores):
-            for reading in by_gate[i][gate]:
-                feed(core, bank, i, reading)
-        assert same([core.close(gate * GATE_S) for core in cores], bank.close(gate * GATE_S)), f"gate {gate}"
+    last = fly(bank_of(of), by_gate, range(1, 300))[-1]
+    bank = bank_of(of)
+    for i, estimate in enumerate(last):
+        bank.warm_start(i, estimate)
+    for flight, estimate in zip(flights(6), fly(bank, by_gate, range(300, 400))[-1], strict=True):
+        assert nees(flight, 399 * GATE_S, estimate) < chi2.ppf(1.0 - 1e-6, 6)
 
 
-def estimates_of(
-    bank: EstimatorBank, by_gate: Sequence[Sequence[Sequence[Reading]]], span: range
-) -> list[list[Estimate]]:
-    """Fly a bank by itself."""
-    told = []
-    for gate in span:
-        for i, each in enumerate(by_gate):
-            for reading in each[gate]:
-                t_s, name, t_sample_s, values = reading
-                if name == "imu":
-                    bank.imu(i, t_sample_s, *values)
-                else:
-                    getattr(bank, name)(i, t_s, t_sample_s, *values)
-        told.append(bank.close(gate * GATE_S))
-    return told
-
-
-def test_a_drone_is_estimated_alike_alone_and_among_others():
+def test_sensors_that_it_does_not_know_are_left_out():
     of = three()
-    by_gate = [gates(each) for each in flown(7)]
-    span = range(1, 200)
-    among = estimates_of(EstimatorBank(of.drones, of.environment, of.estimation, GATE_S), by_gate, span)
-    for i, drone in enumerate(of.drones):
-        alone = estimates_of(EstimatorBank([drone], of.environment, of.estimation, GATE_S), by_gate[i : i + 1], span)
-        assert same([each[0] for each in alone], [each[i] for each in among])
+    bank = bank_of(of)
+    bank.receive(0, "airspeed", object(), 0.02)
+    assert same(bank.estimate(0.02), bank_of(of).estimate(0.02))

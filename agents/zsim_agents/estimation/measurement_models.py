@@ -22,7 +22,6 @@ from zsim_agents.estimation.dead_reckoning import (
 from zsim_agents.estimation.madgwick import Rotation, Vector, compose, cross, turn, turn_back
 
 SIX = tuple[float, float, float, float, float, float]
-DOF_MAX = 6  # rows of the largest block, GPS with position and velocity
 COSINE_MIN = 0.1  # of the sonar's ray to the vertical; flatter than 84 deg it does not hit the ground below
 
 
@@ -110,42 +109,3 @@ def write_flow(H: np.ndarray, i: int, v: Vector, R: Rotation, w: Vector, arm: Ve
         H[i + 1, ATTITUDE + k] = -by_heading[k] * u[0] + c * turned[1] - s * turned[0]
         H[i + 2, ATTITUDE + k] = turned[2]
     return u
-
-
-@portable
-def within_gates(S: np.ndarray, y: np.ndarray, blocks: np.ndarray, limits: np.ndarray, distances: np.ndarray) -> bool:
-    """Write y^T S^-1 y of every block of innovations by itself, and say whether all are within their limits.
-
-    By the block's Cholesky factor; infinite where it is not positive definite or the innovation not a number.
-
-    Args:
-        S: covariance of all innovations, (m, m).
-        y: all innovations, (m,).
-        blocks: first row and number of rows of each block, (k, 2).
-        limits: by number of rows, (DOF_MAX + 1,).
-        distances: the result, (k,) or longer.
-    """
-    L = np.zeros((DOF_MAX, DOF_MAX))
-    u = np.zeros(DOF_MAX)
-    good = True
-    for block in range(blocks.shape[0]):
-        first, size = blocks[block]
-        total = 0.0
-        for i in range(size):
-            part = y[first + i]
-            for j in range(i + 1):
-                rest = S[first + i, first + j]
-                for k in range(j):
-                    rest -= L[i, k] * L[j, k]
-                if i > j:
-                    L[i, j] = rest / L[j, j]
-                    part -= L[i, j] * u[j]
-                elif rest > 0.0:
-                    L[i, i] = math.sqrt(rest)
-                else:
-                    L[i, i] = math.nan
-            u[i] = part / L[i, i]
-            total += u[i] * u[i]
-        distances[block] = total if total == total else math.inf
-        good = good and distances[block] <= limits[size]
-    return good

@@ -1,0 +1,249 @@
+"""What the estimators of N drones are: arrays with a row for each drone, and what stands in which column.
+
+Compiled code reads the columns as constants. A sensor is counted by its place in `zsim.contract.keys.SENSORS`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.contract.keys import SENSORS
+from zsim.math.columns import Field, columns
+from zsim.math.compiled import portable
+from zsim_agents.estimation.dead_reckoning import Reckoning
+from zsim_agents.estimation.madgwick import Quaternion, Rotation, Vector
+
+IMU, GPS, MAG, BARO, SONAR, FLOW = (SENSORS.index(name) for name in ("imu", "gps", "mag", "baro", "sonar", "flow"))
+SIZES = (6, 6, 3, 1, 1, 3)  # values of a reading of each sensor
+VALUES_MAX = max(SIZES)
+CHANNELS = 2  # of a sensor, at most, that have a bias of their own
+
+NOMINAL = columns(
+    "Nominal",
+    (
+        Field("t", "s"),
+        Field("p_WB", "m", 3),
+        Field("v_WB", "m/s", 3),
+        Field("q_WB", "1", 4),
+        Field("a_WB", "m/s^2", 3),
+        Field("w_WB_B", "rad/s", 3),  # of the last sample of the IMU, without its bias
+        Field("f_B", "m/s^2", 3),  # likewise
+        Field("gyro_bias", "rad/s", 3),
+        Field("accel_bias", "m/s^2", 3),
+        Field("p_corrected", "m", 3),  # by the filter, in all
+        Field("v_corrected", "m/s", 3),
+        Field("t_start", "s"),  # of the interval since the last gate, and what has happened in it
+        Field("v_start", "m/s", 3),
+        Field("dt_squared", "s^2"),  # sum of the squared steps of the IMU
+        Field("lost_velocity", "m^2/s^2"),  # variance to add for samples that are missing
+        Field("lost_turn", "rad^2"),  # likewise
+        Field("t_first_gate", "s"),  # not a number before
+        Field("t_sample", "s", len(SENSORS)),  # last reading of each sensor
+        Field("refused_since", "s", len(SENSORS)),  # not a number while a sensor is trusted
+    ),
+)
+
+SENSOR = columns(  # settings of a sensor
+    "Sensor",
+    (
+        Field("variance", "unit^2", VALUES_MAX),
+        Field("p_BS", "m", 3),
+        Field("R_BS", "1", 9),
+        Field("down_B", "1", 3),
+        Field("patience", "s"),
+    ),
+)
+
+SETTING = columns(
+    "Setting",
+    (
+        Field("gravity", "m/s^2"),
+        Field("beta", "rad/s"),  # Madgwick's gain
+        Field("period", "s"),  # of the IMU
+        Field("coast_after", "s"),
+        Field("jolt", "m/s^2"),
+        Field("age_max", "s"),  # of a reading
+        Field("set_down_yaw", "rad"),
+        Field("accel_variance", "m^2/s^4"),
+        Field("gyro_variance", "rad^2/s^2"),
+        Field("tilt_density", "rad^2/s"),
+        Field("levelling", "s"),
+        Field("field_W", "uT", 3),
+        Field("sensors", "1", len(SENSORS) * SENSOR.size),
+    ),
+)
+
+BIAS = columns("Bias", (Field("state", "1"), Field("row", "1"), Field("axes", "1")))  # state is -1 where there is none
+
+LAYOUT = columns(
+    "Layout",
+    (
+        Field("states", "1"),  # of the error state
+        Field("history", "1"),  # entries of the ring
+        Field("imu_displaced", "1"),
+        Field("accel_bias", "1"),  # whether one is estimated
+        Field("aiding_biases", "1"),  # likewise
+        Field("magnetometer", "1"),  # whether it is used
+        Field("flow", "1"),  # likewise
+        Field("biases", "1", len(SENSORS) * CHANNELS * BIAS.size),
+    ),
+)
+
+COUNT = columns(
+    "Count",
+    (
+        Field("running", "1"),  # 0 or 1, as the next
+        Field("heading_known", "1"),
+        Field("kept", "1"),  # entries of the history
+        Field("newest", "1"),  # of them
+        Field("used", "1", len(SENSORS)),  # readings
+        Field("refused", "1", len(SENSORS)),
+    ),
+)
+
+MOMENT = columns(
+    "Moment",
+    (
+        Field("t", "s"),
+        Field("p_WB", "m", 3),
+        Field("v_WB", "m/s", 3),
+        Field("q_WB", "1", 4),
+        Field("w_WB_B", "rad/s", 3),
+        Field("p_corrected", "m", 3),
+        Field("v_corrected", "m/s", 3),
+    ),
+)
+
+READING = columns(
+    "Reading",
+    (
+        Field("drone", "1"),
+        Field("sensor", "1"),
+        Field("t_arrival", "s"),
+        Field("t_sample", "s"),
+        Field("values", "unit", VALUES_MAX),
+        Field("extra", "1", 2),  # GPS: sigma [m], fix; sonar: valid; flow: quality
+    ),
+)
+
+ESTIMATE = columns(
+    "Estimate",
+    (
+        Field("p_WB", "m", 3),
+        Field("v_WB", "m/s", 3),
+        Field("q_WB", "1", 4),
+        Field("yaw", "rad"),
+        Field("covariance", "SI", 36),
+        Field("yaw_sigma", "rad"),
+        Field("gyro_bias", "rad/s", 3),
+    ),
+)
+
+Moment = tuple[float, Vector, Vector, Quaternion, Vector, Vector, Vector]
+"""t [s], p, v, q, w, and the filter's corrections of p and v in all by then."""
+
+
+class Rows(NamedTuple):
+    """All that the estimators of N drones are; n is the size of the largest error state."""
+
+    nominal: NDArray[np.float64]  # (N, NOMINAL.size)
+    counts: NDArray[np.int64]  # (N, COUNT.size)
+    covariance: NDArray[np.float64]  # (N, n, n), of the error state
+    bias: NDArray[np.float64]  # (N, n), of the aiding sensors
+    history: NDArray[np.float64]  # (N, entries, MOMENT.size), a ring of past gates
+    setting: NDArray[np.float64]  # (N, SETTING.size)
+    layout: NDArray[np.int64]  # (N, LAYOUT.size)
+    walk: NDArray[np.float64]  # (N, n), unit^2/s
+    limits: NDArray[np.float64]  # (7,), of the innovation gates by number of rows
+
+
+@portable
+def vector(row: np.ndarray, at: int) -> Vector:
+    """Return three columns."""
+    return float(row[at]), float(row[at + 1]), float(row[at + 2])
+
+
+@portable
+def put(row: np.ndarray, at: int, a: Vector) -> None:
+    """Write three columns."""
+    row[at], row[at + 1], row[at + 2] = a[0], a[1], a[2]
+
+
+@portable
+def add(row: np.ndarray, at: int, more: np.ndarray, first: int) -> None:
+    """Add three places of an array to three columns."""
+    for k in range(3):
+        row[at + k] += more[first + k]
+
+
+@portable
+def quaternion(row: np.ndarray, at: int) -> Quaternion:
+    """Return four columns."""
+    return float(row[at]), float(row[at + 1]), float(row[at + 2]), float(row[at + 3])
+
+
+@portable
+def put_quaternion(row: np.ndarray, at: int, q: Quaternion) -> None:
+    """Write four columns."""
+    row[at], row[at + 1], row[at + 2], row[at + 3] = q[0], q[1], q[2], q[3]
+
+
+@portable
+def matrix(row: np.ndarray, at: int) -> Rotation:
+    """Return nine columns."""
+    return (
+        float(row[at]), float(row[at + 1]), float(row[at + 2]),
+        float(row[at + 3]), float(row[at + 4]), float(row[at + 5]),
+        float(row[at + 6]), float(row[at + 7]), float(row[at + 8]),
+    )  # fmt: skip
+
+
+@portable
+def reckoning(row: np.ndarray) -> Reckoning:
+    """Return the nominal state."""
+    return (
+        vector(row, NOMINAL.p_WB), vector(row, NOMINAL.v_WB), quaternion(row, NOMINAL.q_WB),
+        vector(row, NOMINAL.a_WB), vector(row, NOMINAL.w_WB_B), vector(row, NOMINAL.f_B),
+    )  # fmt: skip
+
+
+@portable
+def put_reckoning(row: np.ndarray, state: Reckoning) -> None:
+    """Set the nominal state."""
+    put(row, NOMINAL.p_WB, state[0])
+    put(row, NOMINAL.v_WB, state[1])
+    put_quaternion(row, NOMINAL.q_WB, state[2])
+    put(row, NOMINAL.a_WB, state[3])
+    put(row, NOMINAL.w_WB_B, state[4])
+    put(row, NOMINAL.f_B, state[5])
+
+
+@portable
+def moment(row: np.ndarray) -> Moment:
+    """Return the present instant of the nominal state."""
+    return (
+        float(row[NOMINAL.t]), vector(row, NOMINAL.p_WB), vector(row, NOMINAL.v_WB), quaternion(row, NOMINAL.q_WB),
+        vector(row, NOMINAL.w_WB_B), vector(row, NOMINAL.p_corrected), vector(row, NOMINAL.v_corrected),
+    )  # fmt: skip
+
+
+@portable
+def put_moment(row: np.ndarray, m: Moment) -> None:
+    """Write a moment of the history."""
+    row[MOMENT.t] = m[0]
+    put(row, MOMENT.p_WB, m[1])
+    put(row, MOMENT.v_WB, m[2])
+    put_quaternion(row, MOMENT.q_WB, m[3])
+    put(row, MOMENT.w_WB_B, m[4])
+    put(row, MOMENT.p_corrected, m[5])
+    put(row, MOMENT.v_corrected, m[6])
+
+
+@portable
+def moment_at(row: np.ndarray) -> Moment:
+    """Return a moment of the history."""
+    return (
+        float(row[MOMENT.t]), vector(row, MOMENT.p_WB), vector(row, MOMENT.v_WB), quaternion(row, MOMENT.q_WB),
+        vector(row, MOMENT.w_WB_B), vector(row, MOMENT.p_corrected), vector(row, MOMENT.v_corrected),
+    )  # fmt: skip

@@ -1,0 +1,290 @@
+"""The aiding readings of a drone's gate: accepted as they come, compared with dead reckoning, used in one update.
+
+A reading is compared with the state of its own instant. Every one is judged by an innovation gate; what passes
+corrects the nominal state, the biases and the covariance.
+"""
+
+import math
+
+import numpy as np
+
+from zsim.math.compiled import portable
+from zsim_agents.estimation import strapdown
+from zsim_agents.estimation.dead_reckoning import ATTITUDE, POSITION, VELOCITY
+from zsim_agents.estimation.filter_state import (
+    BARO,
+    BIAS,
+    CHANNELS,
+    COUNT,
+    FLOW,
+    GPS,
+    LAYOUT,
+    MAG,
+    NOMINAL,
+    READING,
+    SENSOR,
+    SETTING,
+    SIZES,
+    SONAR,
+    VALUES_MAX,
+    Moment,
+    Rows,
+    matrix,
+    moment,
+    put,
+    quaternion,
+    vector,
+)
+from zsim_agents.estimation.kalman_update import ROWS_MAX, stacked_update
+from zsim_agents.estimation.madgwick import heading, rotation, turn
+from zsim_agents.estimation.measurement_models import write_baro, write_flow, write_gps, write_mag, write_sonar
+
+YAW = ATTITUDE + 2  # place in the error state
+VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and squares of more would drown the rest
+SQUARE_MAX = 1e8  # of an innovation, in its unit; more would cost the covariance its digits
+HEADING_SIGMA_RAD = 0.5  # rad: before the first reading of the magnetometer, which turns the attitude to it
+SET_DOWN_SIGMA_RAD = 0.05  # rad: how well a drone is set down by eye, where there is no magnetometer
+HEADING_WAIT_S = 1.0  # s without a magnetometer's reading, after which the heading of the scenario is taken
+
+
+@portable
+def accept(rows: Rows, i: int, reading: np.ndarray) -> bool:
+    """Whether an aiding reading is to be used at the end of the gate.
+
+    One that is out of order, too old or no number is counted as refused; a duplicate is not counted, nor is a sonar
+    without an echo, which says nothing.
+    """
+    row, counts, setting, layout = rows.nominal[i], rows.counts[i], rows.setting[i], rows.layout[i]
+    kind = int(reading[READING.sensor])
+    if (kind == MAG and not layout[LAYOUT.magnetometer]) or (kind == FLOW and not layout[LAYOUT.flow]):
+        return False
+    if kind == SONAR and reading[READING.extra] == 0.0:
+        return False
+    blind_gps = kind == GPS and not (reading[READING.extra + 1] != 0.0 and abs(reading[READING.extra]) < VALUE_MAX)
+    if blind_gps or (kind == FLOW and not reading[READING.extra] > 0.0):
+        counts[COUNT.refused + kind] += 1
+        return False
+    t_sample_s = reading[READING.t_sample]
+    if t_sample_s == row[NOMINAL.t_sample + kind]:
+        return False
+    age_s, size = reading[READING.t_arrival] - t_sample_s, 0.0
+    for k in range(SIZES[kind]):
+        size += abs(reading[READING.values + k])
+    if t_sample_s > row[NOMINAL.t_sample + kind] and 0.0 <= age_s <= setting[SETTING.age_max] and size < VALUE_MAX:
+        row[NOMINAL.t_sample + kind] = t_sample_s
+        return True
+    counts[COUNT.refused + kind] += 1
+    return False
+
+
+@portable
+def set_variance(P: np.ndarray, k: int, variance: float) -> None:
+    """Give one state a new variance without any correlation with the others."""
+    for j in range(P.shape[0]):
+        P[k, j] = P[j, k] = 0.0
+    P[k, k] = variance
+
+
+@portable
+def start_heading(
+    rows: Rows, i: int, P: np.ndarray, t_s: float, readings: np.ndarray, first: int, after: np.ndarray
+) -> None:
+    """Give the attitude its first heading: the magnetometer's, or the scenario's where there is none."""
+    row, counts, setting = rows.nominal[i], rows.counts[i], rows.setting[i]
+    if math.isnan(row[NOMINAL.t_first_gate]):
+        row[NOMINAL.t_first_gate] = t_s
+    at = first
+    while at >= 0:
+        if int(readings[at, READING.sensor]) == MAG:
+            R_BS = matrix(setting, SETTING.sensors + MAG * SENSOR.size + SENSOR.R_BS)
+            seen = turn(rotation(quaternion(row, NOMINAL.q_WB)), turn(R_BS, vector(readings[at], READING.values)))
+            field = vector(setting, SETTING.field_W)
+            angle = math.atan2(field[1], field[0]) - math.atan2(seen[1], seen[0])
+            _turn_heading(row, counts, setting[SETTING.gravity], angle)  # its certainty comes from the update
+            return
+        at = after[at]
+    if not rows.layout[i, LAYOUT.magnetometer] or t_s - row[NOMINAL.t_first_gate] > HEADING_WAIT_S:
+        angle = setting[SETTING.set_down_yaw] - heading(quaternion(row, NOMINAL.q_WB))
+        _turn_heading(row, counts, setting[SETTING.gravity], angle)
+        set_variance(P, YAW, SET_DOWN_SIGMA_RAD * SET_DOWN_SIGMA_RAD)
+
+
+@portable
+def _turn_heading(row: np.ndarray, counts: np.ndarray, gravity: float, angle: float) -> None:
+    strapdown.turn_heading(row, gravity, angle)
+    counts[COUNT.kept] = 0  # a turn makes the past meaningless
+    counts[COUNT.heading_known] = 1
+
+
+@portable
+def predict(H: np.ndarray, at: int, kind: int, setting: np.ndarray, past: Moment, lag: float, out: np.ndarray) -> None:
+    """Write what a sensor should read into out[at:], and its rows of H."""
+    aid = SETTING.sensors + kind * SENSOR.size
+    _, p, v, q, w, _, _ = past
+    R, arm = rotation(q), vector(setting, aid + SENSOR.p_BS)
+    if kind == GPS:
+        expected = write_gps(H, at, p, v, R, w, arm, lag)
+        for k in range(6):
+            out[at + k] = expected[k]
+    elif kind == MAG:
+        field = write_mag(H, at, R, matrix(setting, aid + SENSOR.R_BS), vector(setting, SETTING.field_W))
+        put(out, at, field)
+    elif kind == BARO:
+        out[at] = write_baro(H, at, p, R, arm, lag)
+    elif kind == SONAR:
+        out[at] = write_sonar(H, at, p, R, arm, vector(setting, aid + SENSOR.down_B), lag)
+    else:
+        put(out, at, write_flow(H, at, v, R, w, arm))
+
+
+@portable
+def with_biases(rows: Rows, i: int, kind: int, H: np.ndarray, at: int, out: np.ndarray) -> None:
+    """Put the sensor's biases on the prediction, their columns of H written."""
+    for channel in range(CHANNELS):
+        place = LAYOUT.biases + (kind * CHANNELS + channel) * BIAS.size
+        state, row = rows.layout[i, place + BIAS.state], at + rows.layout[i, place + BIAS.row]
+        for k in range(rows.layout[i, place + BIAS.axes] if state >= 0 else 0):
+            H[row + k, state + k] = 1.0
+            out[row + k] += rows.bias[i, state + k]
+
+
+@portable
+def inflate(row: np.ndarray, P: np.ndarray, kind: int, z: np.ndarray, expected: np.ndarray, at: int) -> None:
+    """Make the states that a long refused sensor observes as uncertain as its innovation: it is trusted again."""
+    squares, total = np.zeros(VALUES_MAX), 0.0
+    for k in range(SIZES[kind]):
+        y = z[at + k] - expected[at + k]
+        squares[k] = min(y * y, SQUARE_MAX)
+        total += squares[k]
+    if kind == GPS:
+        for k in range(6):
+            P[POSITION + k, POSITION + k] += squares[k]
+    elif kind == FLOW:
+        for k in range(3):
+            P[VELOCITY + k, VELOCITY + k] += total
+    elif kind == BARO:
+        P[POSITION + 2, POSITION + 2] += squares[0]
+    elif kind == MAG:
+        P[YAW, YAW] += HEADING_SIGMA_RAD * HEADING_SIGMA_RAD
+    row[NOMINAL.refused_since + kind] = row[NOMINAL.t]
+
+
+@portable
+def count_outcome(row: np.ndarray, counts: np.ndarray, kind: int, passed: bool) -> None:
+    """Count a reading that went through its gate, or did not."""
+    if passed:
+        counts[COUNT.used + kind] += 1
+        row[NOMINAL.refused_since + kind] = math.nan
+        return
+    counts[COUNT.refused + kind] += 1
+    if math.isnan(row[NOMINAL.refused_since + kind]):
+        row[NOMINAL.refused_since + kind] = row[NOMINAL.t]
+
+
+@portable
+def correct(
+    rows: Rows,
+    i: int,
+    P: np.ndarray,
+    H: np.ndarray,
+    z: np.ndarray,
+    expected: np.ndarray,
+    variance: np.ndarray,
+    blocks: np.ndarray,
+    kinds: np.ndarray,
+) -> np.ndarray:
+    """Use a stack of measurements, (m,) each, of which the blocks stand in `blocks` (b, 2); return the covariance.
+
+    All are tried together; those whose own innovation lies outside of its gate are then left out.
+    """
+    row, counts = rows.nominal[i], rows.counts[i]
+    y, distances = z - expected, np.zeros(ROWS_MAX)
+    used, x, P, _ = stacked_update(P, H, variance, y, blocks, rows.limits, distances)
+    kept, m = np.zeros(y.shape[0], dtype=np.int64), 0
+    for b in range(blocks.shape[0]):
+        first, size = blocks[b, 0], blocks[b, 1]
+        good = used or distances[b] <= rows.limits[size]
+        count_outcome(row, counts, kinds[b], good)
+        for k in range(size if good else 0):
+            kept[m] = first + k
+            m += 1
+    if not used and m:
+        kept = kept[:m]
+        _, x, P, _ = stacked_update(P, H[kept], variance[kept], y[kept], blocks[:0], rows.limits, distances)
+    if m:
+        strapdown.correct(row, rows.layout[i], rows.setting[i, SETTING.gravity], x)
+        if rows.layout[i, LAYOUT.aiding_biases]:
+            for k in range(P.shape[0]):
+                rows.bias[i, k] += x[k]
+    return P
+
+
+@portable
+def stack(
+    rows: Rows, i: int, reading: np.ndarray, H: np.ndarray, z: np.ndarray, expected: np.ndarray, at: int, past: Moment
+) -> None:
+    """Put a reading on a stack of measurements from row `at` on, compared with the state of its own instant, `past`."""
+    kind, setting = int(reading[READING.sensor]), rows.setting[i]
+    predict(H, at, kind, setting, past, rows.nominal[i, NOMINAL.t] - past[0], expected)
+    with_biases(rows, i, kind, H, at, expected)
+    for k in range(SIZES[kind]):
+        z[at + k] = reading[READING.values + k]
+
+
+@portable
+def write_variance(reading: np.ndarray, setting: np.ndarray, variance: np.ndarray, at: int) -> None:
+    """Write the variances of a reading's rows; a GPS receiver's own figure counts where it is worse."""
+    kind = int(reading[READING.sensor])
+    known = SETTING.sensors + kind * SENSOR.size + SENSOR.variance
+    for k in range(SIZES[kind]):
+        variance[at + k] = setting[known + k]
+    if kind == GPS:
+        for k in range(3):
+            variance[at + k] = max(reading[READING.extra] * reading[READING.extra], setting[known])
+
+
+@portable
+def fuse(rows: Rows, i: int, P: np.ndarray, readings: np.ndarray, first: int, after: np.ndarray) -> np.ndarray:
+    """Judge and use a gate's readings, in one stacked update unless they are very many; return the covariance.
+
+    Args:
+        rows: of all drones.
+        i: the drone.
+        P: its covariance, (n, n).
+        readings: of the gate, (M, READING.size).
+        first: the drone's first among them; -1 for none.
+        after: of each reading, the next one of the same drone, (M,); -1 after the last.
+    """
+    row, counts, setting, n = rows.nominal[i], rows.counts[i], rows.setting[i], P.shape[0]
+    longest = rows.layout[i, LAYOUT.history]
+    H, z, expected, variance = np.zeros((ROWS_MAX, n)), np.zeros(ROWS_MAX), np.zeros(ROWS_MAX), np.zeros(ROWS_MAX)
+    blocks, kinds = np.zeros((ROWS_MAX, 2), dtype=np.int64), np.zeros(ROWS_MAX, dtype=np.int64)
+    m, b = 0, 0
+    now = past = moment(row)
+    at = first
+    while at >= 0:
+        reading = readings[at]
+        kind, t_sample_s = int(reading[READING.sensor]), reading[READING.t_sample]
+        at = after[at]
+        if kind == FLOW and not counts[COUNT.heading_known]:
+            counts[COUNT.refused + kind] += 1
+            continue
+        size = SIZES[kind]
+        if m + size > ROWS_MAX:
+            P = correct(rows, i, P, H[:m], z[:m], expected[:m], variance[:m], blocks[:b], kinds)
+            H[:m] = 0.0
+            m, b = 0, 0
+            now = past = moment(row)
+        if past[0] != t_sample_s:
+            past = strapdown.recall(counts, rows.history[i], longest, t_sample_s, now)
+        stack(rows, i, reading, H, z, expected, m, past)
+        write_variance(reading, setting, variance, m)
+        patience_s = setting[SETTING.sensors + kind * SENSOR.size + SENSOR.patience]
+        if row[NOMINAL.t] - row[NOMINAL.refused_since + kind] > patience_s:
+            inflate(row, P, kind, z, expected, m)
+        blocks[b, 0], blocks[b, 1], kinds[b] = m, size, kind
+        m, b = m + size, b + 1
+    if m:
+        P = correct(rows, i, P, H[:m], z[:m], expected[:m], variance[:m], blocks[:b], kinds)
+    strapdown.remember(counts, rows.history[i], longest, moment(row))
+    return P

@@ -1,0 +1,156 @@
+"""The paper's estimator: Madgwick's attitude, and an extended Kalman filter that fuses dead reckoning with GPS.
+
+I. Mas, S. Curi, R. Sánchez Peña, "Open-source Multi-UAV Simulator for the ROS Environment", section III: gyroscopes and
+accelerometers give the attitude by Madgwick's filter; the position is that of dead reckoning and a GPS receiver, fused
+by an extended Kalman filter "due to the non-linear dynamics". Nothing measures the heading: it begins with the one that
+the drone was set down with, and only a moving drone's fixes tell it again.
+
+Dead reckoning goes along the velocity u that the aircraft itself gives in its heading frame:
+
+    x = (p_WB, yaw)      p' = Rz(yaw) u      yaw' = rate of Madgwick's heading      z = p_WB
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+from numpy.typing import NDArray
+
+from zsim.contract.messages import Flow, Gps, Imu
+from zsim.scenario.scenario import Drone, Environment, Estimation
+from zsim_agents.estimation.drone_estimator import StateEstimate
+from zsim_agents.estimation.madgwick import Quaternion, Vector, heading, madgwick_step, product, rpy_rotation, turn
+
+YAW = 3  # place in the state
+POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
+YAW_SIGMA_RAD = 0.05  # rad: how well a drone is set down by eye
+DRIFT_S = 1.0  # s, for which the gyroscope's bias is taken as the same; it is not estimated
+SPEED_SIGMA_M_S = 1.0  # m/s, of a drone whose own velocity is not known
+IMU_GAP_MAX_S = 0.1  # s; over a longer one no rate is integrated
+
+
+class PaperEstimator:
+    """Estimates one drone; see `zsim_agents.estimation.drone_estimator.DroneEstimator`."""
+
+    def __init__(self, drone: Drone, environment: Environment, estimation: Estimation, gate_s: float) -> None:
+        gyro, flow = drone.sensors.imu.gyro_deg_s, drone.sensors.flow
+        self._gyro_sigma, self._gyro_bias = math.radians(gyro.noise), math.radians(gyro.bias)  # rad/s
+        self._imu_period_s = 1.0 / drone.sensors.imu.rate_hz
+        beta = estimation.madgwick_beta
+        self._beta = math.sqrt(0.75) * (self._gyro_sigma + self._gyro_bias) if beta is None else beta  # Madgwick (50)
+        self._R_BS = rpy_rotation(drone.sensors.imu.mount.rpy_deg)
+        self._speed_sigma, self._flow_period_s = flow.velocity_m_s.noise, 1.0 / flow.rate_hz
+        yaw = math.radians(drone.yaw_deg)
+        self._q: Quaternion = _about_z(yaw)
+        self._t_imu_s = math.nan
+        self._velocity: Vector | None = None
+        self._fix: Gps | None = None
+        self._t_s = math.nan
+        self._used = {"imu": 0, "gps": 0, "flow": 0}
+        self._filter = DeadReckoningFilter(yaw)
+
+    def receive(self, sensor: str, message: Any) -> None:
+        """Take a reading of the IMU, the GPS receiver or the aircraft's own velocity; leave out the others."""
+        if sensor in self._used:
+            self._used[sensor] += 1
+        if sensor == "imu":
+            self._turn(message)
+        elif sensor == "flow":
+            self._take_velocity(message)
+        elif sensor == "gps" and message.fix:
+            self._fix = message
+
+    def estimate(self, t_s: float) -> StateEstimate:
+        """Predict to the end of the gate, correct by a fix, and return the estimate."""
+        dt = 0.0 if math.isnan(self._t_s) else t_s - self._t_s
+        self._t_s = t_s
+        self._filter.reckon(self._velocity or (0.0, 0.0, 0.0), heading(self._q), self._process_noise(dt), dt)
+        if self._fix:
+            self._filter.correct(self._fix)
+            self._fix = None
+        yaw = float(self._filter.x[YAW])
+        self._q = product(_about_z(yaw - heading(self._q)), self._q)
+        velocity = rotation_z(yaw) @ (self._velocity or (0.0, 0.0, 0.0))
+        return StateEstimate(
+            position_m=self._filter.x[:3],
+            velocity_m_s=velocity,
+            orientation_wxyz=self._q,
+            yaw_rad=heading(self._q),
+            covariance=self._covariance(),
+            yaw_sigma_rad=math.sqrt(self._filter.P[YAW, YAW]),
+            sensors={name: (count, 0) for name, count in self._used.items()},
+        )
+
+    def _turn(self, sample: Imu) -> None:
+        """Turn the attitude to the instant of a sample."""
+        t_s = sample.t_sample_ns * 1e-9
+        dt = t_s - self._t_imu_s
+        if dt <= 0.0:
+            return
+        if not dt < IMU_GAP_MAX_S:
+            dt = self._imu_period_s
+        self._t_imu_s = t_s
+        rate, force = turn(self._R_BS, sample.gyro_rad_s), turn(self._R_BS, sample.accel_m_s2)
+        self._q = madgwick_step(self._q, rate, force, self._beta, dt)
+
+    def _take_velocity(self, flow: Flow) -> None:
+        self._velocity = flow.velocity_m_s if flow.quality > 0.0 else None
+
+    def _velocity_variance(self) -> float:
+        """Return the variance per axis of the velocity that dead reckoning uses [m^2/s^2]."""
+        return (self._speed_sigma if self._velocity else SPEED_SIGMA_M_S) ** 2
+
+    def _process_noise(self, dt: float) -> NDArray[np.float64]:
+        """Return what an interval adds, (4, 4): each velocity errs by itself, and is held for its period."""
+        position = self._velocity_variance() * self._flow_period_s * dt
+        yaw = (self._gyro_sigma**2 * self._imu_period_s + self._gyro_bias**2 * DRIFT_S) * dt
+        return np.diag([position, position, position, yaw])
+
+    def _covariance(self) -> NDArray[np.float64]:
+        """Return the covariance of position and velocity, (6, 6)."""
+        P = np.zeros((6, 6))
+        P[:3, :3], P[3:, 3:] = self._filter.P[:3, :3], self._velocity_variance() * np.eye(3)
+        return P
+
+
+class DeadReckoningFilter(ExtendedKalmanFilter):
+    """Position and heading, (p_WB, yaw), by dead reckoning and fixes.
+
+    Args:
+        yaw: at the start [rad].
+    """
+
+    def __init__(self, yaw: float) -> None:
+        super().__init__(dim_x=4, dim_z=3)
+        self.x = np.array([0.0, 0.0, 0.0, yaw])
+        self.P = np.diag([POSITION_SIGMA_M**2] * 3 + [YAW_SIGMA_RAD**2])
+        self._next = self.x
+
+    def reckon(self, u: Vector, yaw: float, Q: NDArray[np.float64], dt: float) -> None:
+        """Go on for `dt` [s] with the velocity u [m/s; heading frame], to a heading [rad] known by its rate."""
+        step = rotation_z(yaw) @ u * dt
+        self._next = np.append(self.x[:3] + step, yaw)
+        self.F = np.eye(4)
+        self.F[:2, YAW] = -step[1], step[0]  # d(Rz(yaw) u)/d yaw
+        self.Q = Q
+        self.predict()
+
+    def predict_x(self, u: float = 0) -> None:
+        """Set the state to that of dead reckoning, which is not linear."""
+        self.x = self._next
+
+    def correct(self, fix: Gps) -> None:
+        """Use a fix of the GPS receiver."""
+        H = np.eye(3, 4)
+        self.update(np.array(fix.position_m), lambda x: H, lambda x: x[:3], R=np.eye(3) * fix.sigma_m**2)
+
+
+def rotation_z(yaw: float) -> NDArray[np.float64]:
+    """Return Rz(yaw), (3, 3)."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _about_z(angle: float) -> Quaternion:
+    return (math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle))
