@@ -10,10 +10,10 @@ from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
 from zsim.transport.session import Sample, Session
 
-ENTRIES = ("join", "restart", "superseded")  # kinds of events that tell of a process that joined
+JOIN_EVENTS = ("join", "restart", "superseded")  # kinds of events that tell of a process that joined
 
 
-class Presence:
+class ObserverProcess:
     """One run's worth of it.
 
     Args:
@@ -30,17 +30,17 @@ class Presence:
     def __init__(self, link: Session, info: messages.Info, name: str) -> None:
         self._link = link
         self._info = info
-        self._healths = 0
-        self._joins = -1
+        self._health_seq = 0
+        self._join_seq = -1
         self.name = name
         self.now_ns = 0
         self.health = HealthMeter(name.split(".", 1)[0], host=link.host)
-        self.over = ""
+        self.end_reason = ""
         self._incarnation = secrets.randbits(62)
-        self._taken_in = self._superseded = False
-        self._must_join = self._was_cut = False
+        self._admitted = self._superseded = False
+        self._must_join = self._was_link_lost = False
 
-    def enter(self) -> None:
+    def announce(self) -> None:
         """Join."""
         self._link.on_message(keys.EVENT, self._on_event)
         self._link.on_link(self._on_link)
@@ -48,14 +48,14 @@ class Presence:
         self._join()
 
     def _on_link(self, up: bool) -> None:
-        self._must_join = up and self._was_cut
-        self._was_cut = not up
+        self._must_join = up and self._was_link_lost
+        self._was_link_lost = not up
 
     def _join(self) -> None:
-        self._joins += 1
+        self._join_seq += 1
         join = messages.Join(
             t_ns=self.now_ns,
-            seq=self._joins,
+            seq=self._join_seq,
             run_id=self._info.run_id,
             incarnation=self._incarnation,
             role=self.name.split(".", 1)[0],
@@ -67,7 +67,7 @@ class Presence:
         )
         self._link.put(keys.process(self.name, "join"), join)
 
-    def heed(self, payload: bytes) -> messages.Clock | None:
+    def update_clock(self, payload: bytes) -> messages.Clock | None:
         """Follow the run by a message on `clock`; return it, None where it is none."""
         try:
             clock: messages.Clock = messages.decode(keys.CLOCK, payload)
@@ -76,20 +76,20 @@ class Presence:
             return None
         self.now_ns = clock.t_ns
         if clock.run_id != self._info.run_id:
-            self.over = "the world has begun another run"
+            self.end_reason = "the world has begun another run"
         elif clock.state == "stopped":
-            self.over = "the run ended"
+            self.end_reason = "the run ended"
         return clock
 
     def tick(self) -> None:
         """Tell of its health once a wall second; to be called more often."""
         if self._must_join:  # the world took it for dead
-            self._must_join = self._taken_in = False
+            self._must_join = self._admitted = False
             self._incarnation = secrets.randbits(62)
             self._join()
         if self.health.due():
-            health = self.health.message(self.now_ns, self._healths)
-            self._healths += 1
+            health = self.health.message(self.now_ns, self._health_seq)
+            self._health_seq += 1
             self._link.put(keys.process(self.name, "health"), health)
 
     @property
@@ -107,11 +107,11 @@ class Presence:
             event = messages.decode(keys.EVENT, sample.payload)
         except DecodeError:
             return  # somebody else's garbage
-        if event.subject != self.name or event.kind not in ENTRIES:
+        if event.subject != self.name or event.kind not in JOIN_EVENTS:
             return
         is_mine = event.data.get("incarnation") == self._incarnation
-        self._taken_in = self._taken_in or is_mine
-        if self._taken_in and not is_mine:
+        self._admitted = self._admitted or is_mine
+        if self._admitted and not is_mine:
             self._superseded = True
             who = f"{event.data.get('host')} (pid {event.data.get('pid')})"
-            self.over = f"another process of this name joined from {who}"
+            self.end_reason = f"another process of this name joined from {who}"

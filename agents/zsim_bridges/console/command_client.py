@@ -11,25 +11,25 @@ from typing import Any, NamedTuple
 from zsim.contract import keys, messages
 from zsim.errors import ZsimError
 from zsim.transport.session import Session
-from zsim_bridges.console.drone_queue import Turns
-from zsim_bridges.console.view_buffer import Eyes
+from zsim_bridges.console.drone_queue import DroneQueue
+from zsim_bridges.console.view_buffer import ViewBuffer
 
 PRIORITY = 10  # contract: of operators
 PRIORITY_EMERGENCY = 100  # contract: the highest; an operator who flies a drone must not keep others from stopping it
-HANDS = 8  # under way at once, of each kind: requests that nobody answers must not keep modes waiting
-ANSWER_S = 5.0  # the world and controllers answer within a gate
+THREADS_PER_POOL = 8  # under way at once, of each kind: requests that nobody answers must not keep modes waiting
+ANSWER_TIMEOUT_S = 5.0  # the world and controllers answer within a gate
 OVERTAKEN = "an emergency was asked for after it"
-TAKEN_S = 1.0  # how long the world may take to say that it has a command, before the drone is given back
+ACCEPTANCE_TIMEOUT_S = 1.0  # how long the world may take to say that it has a command, before the drone is given back
 
 
-class Told(NamedTuple):
+class RequestOutcome(NamedTuple):
     """What came of a request: what was asked, and why it was refused; empty where it was not."""
 
-    what: str
+    request: str
     refusal: str
 
 
-class Desk:
+class CommandClient:
     """Sends requests in the console's name.
 
     Args:
@@ -41,37 +41,37 @@ class Desk:
     """
 
     def __init__(
-        self, link: Session, name: str, eyes: Eyes, now_ns: Callable[[], int], tell: Callable[[Told], None]
+        self, link: Session, name: str, eyes: ViewBuffer, now_ns: Callable[[], int], tell: Callable[[RequestOutcome], None]
     ) -> None:
         self._link = link
         self._name = name
         self._eyes = eyes
         self._now_ns = now_ns
-        self._tell = tell
+        self._report = tell
         self._seqs: Counter[str] = Counter()  # modes sent to each drone
-        self._stops: Counter[str] = Counter()  # emergencies asked for of each drone
+        self._emergencies: Counter[str] = Counter()  # emergencies asked for of each drone
         self._lock = threading.Lock()
-        self._hands = [
-            ThreadPoolExecutor(HANDS, thread_name_prefix=f"desk-{what}") for what in ("ask", "mode", "stop", "give")
+        self._pools = [
+            ThreadPoolExecutor(THREADS_PER_POOL, thread_name_prefix=f"desk-{what}") for what in ("ask", "mode", "stop", "give")
         ]
-        self._requests, modes, stops, self._gifts = self._hands
-        self._turns = Turns(modes, stops)
+        self._requests, modes, stops, self._releases = self._pools
+        self._queue = DroneQueue(modes, stops)
 
     def close(self) -> None:
         """Wait for nobody any more."""
-        self._turns.close()
-        for hands in self._hands:
+        self._queue.close()
+        for hands in self._pools:
             hands.shutdown(wait=False, cancel_futures=True)
 
-    def world(self, op: str, **args: Any) -> None:
+    def request_world(self, op: str, **args: Any) -> None:
         """Ask the world."""
-        self._ask(keys.CONTROL, op, args, f"{op} {_listed(args)}".strip())
+        self._ask(keys.CONTROL, op, args, f"{op} {_format_arguments(args)}".strip())
 
-    def cluster(self, cluster: str, op: str, said: str = "", **args: Any) -> None:
+    def request_cluster(self, cluster: str, op: str, said: str = "", **args: Any) -> None:
         """Ask a formation's controller; `said` tells people of the arguments in units of theirs."""
-        self._ask(keys.cluster_control(cluster), op, args, f"{cluster}: {op} {said or _listed(args)}".strip())
+        self._ask(keys.cluster_control(cluster), op, args, f"{cluster}: {op} {said or _format_arguments(args)}".strip())
 
-    def mode(self, drones: Sequence[str], mode: str) -> None:
+    def send_mode(self, drones: Sequence[str], mode: str) -> None:
         """Let drones take off, land, stop at once or leave the emergency, whoever flies them.
 
         Modes of one drone are sent in the order in which they were asked for; an emergency waits for none of them,
@@ -80,37 +80,37 @@ class Desk:
         for drone in drones:
             if mode == "emergency":
                 with self._lock:
-                    self._stops[drone] += 1
-                self._do(partial(self._turns.do_at_once, drone), f"{drone}: {mode}", self._stop, drone, mode)
+                    self._emergencies[drone] += 1
+                self._submit(partial(self._queue.submit_urgent, drone), f"{drone}: {mode}", self._send_emergency, drone, mode)
             else:
-                turn, stops = partial(self._turns.do, drone), self._stops[drone]
-                self._do(turn, f"{drone}: {mode}", self._mode, drone, mode, stops)
+                turn, stops = partial(self._queue.submit, drone), self._emergencies[drone]
+                self._submit(turn, f"{drone}: {mode}", self._acquire_and_send, drone, mode, stops)
 
     def _ask(self, key: str, op: str, args: dict[str, Any], what: str) -> None:
-        self._do(self._requests.submit, what, self._request, key, op, args)
+        self._submit(self._requests.submit, what, self._request, key, op, args)
 
-    def _do(self, begin: Callable[[Callable[[], None]], Any], what: str, act: Callable[..., str], *args: Any) -> None:
+    def _submit(self, begin: Callable[[Callable[[], None]], Any], what: str, act: Callable[..., str], *args: Any) -> None:
         def done() -> None:
-            self._tell(Told(what, _refusal(act, *args)))
+            self._report(RequestOutcome(what, _refusal_of(act, *args)))
 
         try:
             begin(done)
         except RuntimeError:  # closed; a page of the run may still be open
-            self._tell(Told(what, "the run has ended"))
+            self._report(RequestOutcome(what, "the run has ended"))
 
     def _request(self, key: str, op: str, args: dict[str, Any]) -> str:
-        answer = self._link.request(key, op, self._name, args, ANSWER_S)
+        answer = self._link.request(key, op, self._name, args, ANSWER_TIMEOUT_S)
         return "" if answer.ok else answer.error or "refused without a reason"
 
-    def _mode(self, drone: str, mode: str, stops: int) -> str:
+    def _acquire_and_send(self, drone: str, mode: str, stops: int) -> str:
         """Take a drone from whoever flies it, and send the mode, unless more emergencies were asked for meanwhile."""
-        if self._stops[drone] > stops:
+        if self._emergencies[drone] > stops:
             return OVERTAKEN
         return self._acquire(drone, PRIORITY) or self._send(drone, mode, stops)
 
-    def _stop(self, drone: str, mode: str) -> str:
+    def _send_emergency(self, drone: str, mode: str) -> str:
         """Send the mode whatever becomes of the request for the drone: the world may heed it all the same."""
-        refusal = _refusal(self._acquire, drone, PRIORITY_EMERGENCY)
+        refusal = _refusal_of(self._acquire, drone, PRIORITY_EMERGENCY)
         self._send(drone, mode)
         return refusal and f"{refusal}; {mode} was sent all the same"
 
@@ -119,25 +119,25 @@ class Desk:
 
     def _send(self, drone: str, mode: str, stops: int | None = None) -> str:
         """Send a mode, unless more emergencies than `stops` were asked for; let others fly the drone afterwards."""
-        before, now_ns = self._eyes.answered(drone), self._now_ns()
+        before, now_ns = self._eyes.answered_commands(drone), self._now_ns()
         with self._lock:
-            overtaken = stops is not None and self._stops[drone] > stops
+            overtaken = stops is not None and self._emergencies[drone] > stops
             if not overtaken:
                 seq, self._seqs[drone] = self._seqs[drone], self._seqs[drone] + 1
                 said = messages.Mode(now_ns, seq, self._name, mode)  # type: ignore[arg-type]
                 self._link.put(keys.command(drone, "mode"), said)
         with suppress(RuntimeError):  # closed: who leaves a run gives back what it has
-            self._gifts.submit(self._give_back, drone, before)
+            self._releases.submit(self._release, drone, before)
         return OVERTAKEN if overtaken else ""
 
-    def _give_back(self, drone: str, before: int) -> None:
+    def _release(self, drone: str, before: int) -> None:
         """Let others fly a drone, once the world has the mode that was sent with an operator's priority."""
-        self._eyes.await_answer(drone, before, TAKEN_S)
+        self._eyes.await_answer(drone, before, ACCEPTANCE_TIMEOUT_S)
         with suppress(ZsimError):  # the run has ended
             self._request(keys.CONTROL, "release", {"drone": drone})
 
 
-def _refusal(act: Callable[..., str], *args: Any) -> str:
+def _refusal_of(act: Callable[..., str], *args: Any) -> str:
     """Return why something was not done; empty where it was."""
     try:
         return act(*args)
@@ -147,13 +147,13 @@ def _refusal(act: Callable[..., str], *args: Any) -> str:
         return f"{type(error).__name__}: {error}"
 
 
-def _listed(args: dict[str, Any]) -> str:
-    return ", ".join(f"{name} {_short(value)}" for name, value in args.items())
+def _format_arguments(args: dict[str, Any]) -> str:
+    return ", ".join(f"{name} {_format_value(value)}" for name, value in args.items())
 
 
-def _short(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:g}"
     if isinstance(value, dict):
-        return " ".join(f"{name}={_short(item)}" for name, item in value.items())[:120]
+        return " ".join(f"{name}={_format_value(item)}" for name, item in value.items())[:120]
     return str(value)[:120]

@@ -7,12 +7,12 @@ import viser
 
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
-from zsim_bridges.console.command_client import Desk, Told
+from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.forms.fault_form import FaultForm
 from zsim_bridges.console.forms.formation_form import FormationForm
 from zsim_bridges.console.forms.run_form import DroneForm, FleetForm, RunForm
-from zsim_bridges.console.forms.slider_limits import ranges
-from zsim_bridges.console.scene.plots import Plots
+from zsim_bridges.console.forms.slider_limits import slider_ranges
+from zsim_bridges.console.scene.plots import VariablePlots
 
 PANEL_PX = 350
 SWITCHES = {
@@ -22,7 +22,7 @@ SWITCHES = {
 }
 
 
-class Page:
+class ConsolePage:
     """The controls of one run, in two panels.
 
     Args:
@@ -46,8 +46,8 @@ class Page:
         gui: viser.GuiApi,
         scenario: Scenario,
         spaces: Mapping[str, ClusterSpace],
-        desk: Desk,
-        tell: Callable[[Told], None],
+        desk: CommandClient,
+        tell: Callable[[RequestOutcome], None],
         show: Callable[[str, bool], None],
         rate: float,
     ) -> None:
@@ -58,27 +58,27 @@ class Page:
         self._show = show
         self._rate = rate
         self.forms: dict[str, FormationForm] = {}
-        self.plots: dict[str, Plots] = {}
+        self.plots: dict[str, VariablePlots] = {}
         self.chosen = next(iter(spaces), "")
-        self._places: dict[str, list[viser.GuiFolderHandle]] = {}
-        self._dress(gui)
-        self._right(gui)
-        self._left(gui)
+        self._folders: dict[str, list[viser.GuiFolderHandle]] = {}
+        self._set_theme(gui)
+        self._right_panel(gui)
+        self._left_panel(gui)
 
-    def _dress(self, gui: viser.GuiApi) -> None:
+    def _set_theme(self, gui: viser.GuiApi) -> None:
         gui.reset()
         gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False)
         gui.set_panel_label(f"zsim {self._scenario.name}")
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
 
-    def _right(self, gui: viser.GuiApi) -> None:
+    def _right_panel(self, gui: viser.GuiApi) -> None:
         self.clock = gui.add_html("")
         self.phases = gui.add_html("")
         FleetForm(gui, self._desk, self._scenario)
         if len(self._spaces) > 1:
             choice = gui.add_dropdown("formation", list(self._spaces))
-            choice.on_update(lambda _: self._choose(choice.value))
+            choice.on_update(lambda _: self._show_formation(choice.value))
         tabs = gui.add_tab_group()
         if self._spaces:
             self._formation_tabs(gui, tabs)
@@ -94,16 +94,16 @@ class Page:
         fly, plots = tabs.add_tab("Fly"), tabs.add_tab("Plots")
         for cluster in self._scenario.clusters:
             name, space = cluster.name, self._spaces[cluster.name]
-            found = ranges(space, cluster, self._scenario)
+            found = slider_ranges(space, cluster, self._scenario)
             with fly, gui.add_folder(None, visible=name == self.chosen) as place:
                 self.forms[name] = FormationForm(gui, self._desk, self._tell, cluster, space, found)
             with plots, gui.add_folder(None, visible=name == self.chosen) as other:
-                self.plots[name] = Plots(gui, space, found)
-            self._places[name] = [place, other]
+                self.plots[name] = VariablePlots(gui, space, found)
+            self._folders[name] = [place, other]
 
-    def _choose(self, chosen: str) -> None:
+    def _show_formation(self, chosen: str) -> None:
         self.chosen = chosen
-        for name, places in self._places.items():
+        for name, places in self._folders.items():
             for place in places:
                 place.visible = name == chosen
 
@@ -112,7 +112,7 @@ class Page:
             switch = gui.add_checkbox(label, True)
             switch.on_update(lambda _, what=what, switch=switch: self._show(what, switch.value))
 
-    def _left(self, gui: viser.GuiApi) -> None:
+    def _left_panel(self, gui: viser.GuiApi) -> None:
         panel = gui.add_panel()
         with panel.add_tab("Drones", viser.Icon.DRONE):
             self.drones = gui.add_html("")

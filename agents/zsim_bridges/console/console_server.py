@@ -8,13 +8,13 @@ import viser
 
 from zsim.contract.messages import Info
 from zsim.transport.session import Session
-from zsim_bridges.console.forms.controls import KnownControls
-from zsim_bridges.console.http.http_proxy import Door, Inside, Place
+from zsim_bridges.console.forms.controls import PageControls
+from zsim_bridges.console.http.http_proxy import HttpProxy, ViserBackend, ListenAddress
 from zsim_bridges.console.http.page_rights import OPERATOR, VIEWER
 from zsim_bridges.console.http.private_viser import PrivateViser
-from zsim_bridges.console.run_page import Show
-from zsim_bridges.console.scene.camera_follow import Followers
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.console.run_page import RunPage
+from zsim_bridges.console.scene.camera_follow import CameraFollow
+from zsim_bridges.observer_process import ObserverProcess
 
 
 class Console:
@@ -32,18 +32,18 @@ class Console:
     """
 
     def __init__(
-        self, place: Place, name: str, token: str | None, rate_hz: float | None, say: Callable[[str], None]
+        self, place: ListenAddress, name: str, token: str | None, rate_hz: float | None, say: Callable[[str], None]
     ) -> None:
         self._name = name
         self._rate_hz = rate_hz
         self._say = say
-        self._show: Show | None = None
+        self._show: RunPage | None = None
         self._viser = PrivateViser()
-        self._followers = Followers(self._viser.server)
-        _say_on(self._viser.server.gui, "waiting for a world")
-        controls = KnownControls(self._viser.server.gui, self._followers.switches)
-        inside = Inside(self._viser.port, self._viser.secret, self._state, controls)
-        self._door = Door(place, token, inside)
+        self._followers = CameraFollow(self._viser.server)
+        _show_text(self._viser.server.gui, "waiting for a world")
+        controls = PageControls(self._viser.server.gui, self._followers.switches)
+        inside = ViserBackend(self._viser.port, self._viser.secret, self._state, controls)
+        self._door = HttpProxy(place, token, inside)
 
     @contextmanager
     def open(self) -> Iterator[None]:
@@ -54,7 +54,7 @@ class Console:
         """
         try:
             with self._door.open():
-                links = self._door.links()
+                links = self._door.urls()
                 self._say(f"{self._name}: steer at {links[OPERATOR]}")
                 self._say(f"{self._name}: look, without steering, at {links[VIEWER]}")
                 yield
@@ -62,10 +62,10 @@ class Console:
             self._viser.close()
 
     def serve(
-        self, link: Session, info: Info, presence: Presence, stopped: Callable[[], bool], say: Callable[[str], None]
+        self, link: Session, info: Info, presence: ObserverProcess, stopped: Callable[[], bool], say: Callable[[str], None]
     ) -> None:
         """Show a run until it is over, or somebody says stop."""
-        self._show = show = Show(self._viser.server, link, info, presence, self._followers, self._rate_hz)
+        self._show = show = RunPage(self._viser.server, link, info, presence, self._followers, self._rate_hz)
         try:
             show.run(stopped)
         finally:
@@ -75,7 +75,7 @@ class Console:
         return self._show.state() if self._show else {"run_id": None}
 
 
-def _say_on(gui: viser.GuiApi, text: str) -> None:
+def _show_text(gui: viser.GuiApi, text: str) -> None:
     """Put a line on pages that have no run to show."""
     gui.configure_theme(show_logo=False, show_share_button=False)
     gui.set_panel_label("zsim")

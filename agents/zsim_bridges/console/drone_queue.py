@@ -6,18 +6,18 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 
-Act = Callable[[], None]
+Task = Callable[[], None]
 
 
 @dataclass
-class _Line:
+class _DroneTasks:
     """What is under way for one drone, and what waits for that."""
 
     busy: int = 0
-    waiting: deque[Act] = field(default_factory=deque)
+    waiting: deque[Task] = field(default_factory=deque)
 
 
-class Turns:
+class DroneQueue:
     """Lines of acts, one for each name.
 
     Args:
@@ -26,9 +26,9 @@ class Turns:
     """
 
     def __init__(self, hands: Executor, urgent: Executor) -> None:
-        self._hands = hands
+        self._pool = hands
         self._urgent = urgent
-        self._lines: dict[str, _Line] = {}
+        self._tasks: dict[str, _DroneTasks] = {}
         self._lock = threading.Lock()
         self._closed = False
 
@@ -36,37 +36,37 @@ class Turns:
         """Begin nothing more."""
         with self._lock:
             self._closed = True
-            self._lines.clear()
+            self._tasks.clear()
 
-    def do(self, name: str, act: Act) -> None:
+    def submit(self, name: str, act: Task) -> None:
         """Do something after all that was asked for by that name before.
 
         Raises:
             RuntimeError: closed.
         """
         with self._lock:
-            line = self._line(name)
+            line = self._tasks_of(name)
             if line.busy:
                 line.waiting.append(act)
             else:
-                self._begin(self._hands, name, act)
+                self._start(self._pool, name, act)
 
-    def do_at_once(self, name: str, act: Act) -> None:
+    def submit_urgent(self, name: str, act: Task) -> None:
         """Do something without waiting for what was asked for before; what is asked for later waits for it.
 
         Raises:
             RuntimeError: closed.
         """
         with self._lock:
-            self._line(name)
-            self._begin(self._urgent, name, act)
+            self._tasks_of(name)
+            self._start(self._urgent, name, act)
 
-    def _line(self, name: str) -> _Line:
+    def _tasks_of(self, name: str) -> _DroneTasks:
         if self._closed:
             raise RuntimeError("closed")
-        return self._lines.setdefault(name, _Line())
+        return self._tasks.setdefault(name, _DroneTasks())
 
-    def _begin(self, hands: Executor, name: str, act: Act) -> None:
+    def _start(self, hands: Executor, name: str, act: Task) -> None:
         def done() -> None:
             try:
                 act()
@@ -74,17 +74,17 @@ class Turns:
                 self._end(name)
 
         hands.submit(done)
-        self._lines[name].busy += 1
+        self._tasks[name].busy += 1
 
     def _end(self, name: str) -> None:
         with self._lock:
-            line = self._lines.get(name)
+            line = self._tasks.get(name)
             if line is None:
                 return  # closed
             line.busy -= 1
             if line.busy:
                 return
             if line.waiting:
-                self._begin(self._hands, name, line.waiting.popleft())
+                self._start(self._pool, name, line.waiting.popleft())
             else:
-                del self._lines[name]
+                del self._tasks[name]

@@ -9,7 +9,7 @@ from zsim.contract.messages import Clock, Event
 LATE_MS = 200.0  # of an estimator: ten gates of 20 ms
 LOW_PERCENT = 20.0  # of a battery; the AR.Drone warns there
 GREY, RED, AMBER, GREEN, BLUE = "#868e96", "#e03131", "#e8890c", "#2f9e44", "#1971c2"
-COLOURS = {
+STATE_COLOURS = {
     "landed": GREY,
     "taking_off": BLUE,
     "hovering": GREEN,
@@ -17,13 +17,13 @@ COLOURS = {
     "landing": BLUE,
     "emergency": RED,
 }
-LOUD = {"refused": RED, "death": RED, "collision": RED, "fault": AMBER, "fault_end": AMBER, "fault_clear": AMBER}
+EVENT_COLOURS = {"refused": RED, "death": RED, "collision": RED, "fault": AMBER, "fault_end": AMBER, "fault_clear": AMBER}
 NO_FAULT = "no fault acts"
 FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
 STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"
 
 
-class Row(NamedTuple):
+class DroneRow(NamedTuple):
     """A drone as the table tells of it."""
 
     name: str
@@ -44,7 +44,7 @@ class SensorRow(NamedTuple):
     rate_hz: float | None
 
 
-def drones(rows: Sequence[Row]) -> str:
+def drone_table(rows: Sequence[DroneRow]) -> str:
     """Return the table of all drones."""
     head = _head(
         ("drone", ""),
@@ -54,11 +54,11 @@ def drones(rows: Sequence[Row]) -> str:
         ("GPS", "fixes that its estimator used / refused"),
         ("flown by", "who holds it: whose commands it obeys"),
     )
-    return _table(head + "".join(map(_drone, rows)))
+    return _table(head + "".join(map(_drone_cells, rows)))
 
 
-def _drone(row: Row) -> str:
-    state = _coloured(row.state.replace("_", " "), COLOURS.get(row.state, GREY))
+def _drone_cells(row: DroneRow) -> str:
+    state = _coloured(row.state.replace("_", " "), STATE_COLOURS.get(row.state, GREY))
     battery = _coloured(f"{row.battery_percent:.0f} %", RED if row.battery_percent < LOW_PERCENT else "inherit")
     lag = "–" if row.lag_ms is None else f"{row.lag_ms:.0f} ms"
     late = row.lag_ms is not None and row.lag_ms > LATE_MS
@@ -70,7 +70,7 @@ def _drone(row: Row) -> str:
     return line
 
 
-def sensors(name: str, rows: Iterable[SensorRow], sure: str) -> str:
+def sensor_table(name: str, rows: Iterable[SensorRow], sure: str) -> str:
     """Return the table of one drone's sensors, and how `sure` its estimator is."""
     told = [
         _row("td", (row.kind, row.used, row.refused, "–" if row.rate_hz is None else f"{row.rate_hz:.0f} Hz"))
@@ -86,7 +86,7 @@ def sensors(name: str, rows: Iterable[SensorRow], sure: str) -> str:
     return title + _table(head + "".join(told))
 
 
-def clusters(told: Mapping[str, tuple[str, str]]) -> str:
+def formation_lines(told: Mapping[str, tuple[str, str]]) -> str:
     """Return phase and reason of each formation by name."""
     lines = [
         f"<b>{escape(name)}</b>: {escape(phase.replace('_', ' '))}" + (f" – {escape(reason)}" if reason else "")
@@ -95,7 +95,7 @@ def clusters(told: Mapping[str, tuple[str, str]]) -> str:
     return f"<div style='{STYLE};{FEW_LINES};padding:2px 4px'>{'<br>'.join(lines) or 'no formation'}</div>"
 
 
-def clock(now: Clock | None, t_ns: int, silent_s: float = 0.0) -> str:
+def clock_line(now: Clock | None, t_ns: int, silent_s: float = 0.0) -> str:
     """Return where the run's time is, and who is waited for; or for how long the world has been `silent_s`.
 
     `t_ns` is the time of the picture, 0 before the first.
@@ -116,18 +116,18 @@ def clock(now: Clock | None, t_ns: int, silent_s: float = 0.0) -> str:
     return f"<div style='{STYLE};padding:2px 4px;font-size:14px'>{text}</div>"
 
 
-def events(told: Iterable[Event]) -> str:
+def event_table(told: Iterable[Event]) -> str:
     """Return events as they are given: newest first."""
     lines = [
         f"<tr><td style='text-align:right;color:{GREY}'>{event.t_ns / 1e9:.2f}</td>"
-        f"<td>{_coloured(event.kind, LOUD.get(event.kind, GREY))}</td><td>{escape(event.text)}</td></tr>"
+        f"<td>{_coloured(event.kind, EVENT_COLOURS.get(event.kind, GREY))}</td><td>{escape(event.text)}</td></tr>"
         for event in told
     ]
     head = _head(("t [s]", "simulated time"), ("event", ""), ("newest first", ""))
     return _table(head + "".join(lines), "overflow-wrap:anywhere")
 
 
-def acting(faults: Sequence[str]) -> str:
+def fault_lines(faults: Sequence[str]) -> str:
     """Return which faults act on anything."""
     told = "<br>".join(f"⚠ {escape(fault)}" for fault in faults)
     style = f"{STYLE};{FEW_LINES};padding:2px 4px;color:{AMBER if faults else GREY}"

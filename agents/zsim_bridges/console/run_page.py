@@ -15,33 +15,33 @@ from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import html_tables
-from zsim_bridges.console.command_client import Desk, Told
-from zsim_bridges.console.console_page import Page
-from zsim_bridges.console.http.console_state import state
-from zsim_bridges.console.scene.camera_follow import Followers
-from zsim_bridges.console.scene.picture import Drones, Shape, drones_of, ellipsoids, ghosts, shape
-from zsim_bridges.console.scene.scene_nodes import Stage
-from zsim_bridges.console.scene.trails import Trails
-from zsim_bridges.console.table_rows import Words
-from zsim_bridges.console.time_monitor import Watch
-from zsim_bridges.console.view_buffer import Eyes
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.console_page import ConsolePage
+from zsim_bridges.console.http.console_state import console_state
+from zsim_bridges.console.scene.camera_follow import CameraFollow
+from zsim_bridges.console.scene.picture import DronePoses, FormationShape, drone_poses, ellipsoids, ghosts, formation_shape
+from zsim_bridges.console.scene.scene_nodes import SceneNodes
+from zsim_bridges.console.scene.trails import DroneTrails
+from zsim_bridges.console.table_rows import TableRows
+from zsim_bridges.console.time_monitor import TimeMonitor
+from zsim_bridges.console.view_buffer import ViewBuffer
+from zsim_bridges.observer_process import ObserverProcess
 
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
 STAMPS_PER_AGE = 5.0  # a stamp is at most so small a part as old as commands may be; on its way it ages too
 EVENTS_SHOWN = 60
 NOTICE_S = 8.0  # wall; how long a refusal stays in the corner
-FEW = 20  # drones from which on pictures come half as often
+FEW_DRONES = 20  # drones from which on pictures come half as often
 RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
-FAST = 4.0  # x real time; from then on, too: no eye follows it, and the run needs the processors
+FAST_RATE = 4.0  # x real time; from then on, too: no eye follows it, and the run needs the processors
 
 
-def pictures_hz(drones: int, rate: float) -> float:
+def picture_rate_hz(drones: int, rate: float) -> float:
     """Return how many pictures a second suit so many drones, and a run that goes so many times as fast as real time."""
-    return RATE_LOW_HZ if drones >= FEW or rate >= FAST else RATE_HZ
+    return RATE_LOW_HZ if drones >= FEW_DRONES or rate >= FAST_RATE else RATE_HZ
 
 
-class Show:
+class RunPage:
     """What the page shows of one run.
 
     Args:
@@ -58,37 +58,37 @@ class Show:
         server: viser.ViserServer,
         link: Session,
         info: Info,
-        presence: Presence,
-        followers: Followers,
+        presence: ObserverProcess,
+        followers: CameraFollow,
         rate_hz: float | None,
     ) -> None:
         self._server = server
         self._info = info
         self._presence = presence
         self._followers = followers
-        followers.begin()
+        followers.restart()
         self._scenario = scenario_file.from_text(info.scenario)
         names = tuple(drone.name for drone in info.drones)
         self._rate_hz = rate_hz
         self._spaces = {c.name: scenario_space(self._scenario, c) for c in self._scenario.clusters}
         variables = {name: space.names for name, space in self._spaces.items()}
         age_s = self._scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
-        self._watch = Watch(link, presence, age_s if info.mode == "realtime" else math.inf)
-        self.eyes = Eyes(link, info, presence, variables, self._tell_refused)
-        self._desk = Desk(link, presence.name, self.eyes, self._watch.now_ns, self._tell)
+        self._watch = TimeMonitor(link, presence, age_s if info.mode == "realtime" else math.inf)
+        self.eyes = ViewBuffer(link, info, presence, variables, self._on_refused_command)
+        self._desk = CommandClient(link, presence.name, self.eyes, self._watch.now_ns, self._on_outcome)
         self._names = names
         self._members = {c.name: [names.index(d) for d in c.drones] for c in self._scenario.clusters}
-        self._trails = Trails(len(names))
-        self._words = Words(self.eyes)
-        self._shapes: dict[str, Shape | None] = {}
-        self._drones: Drones | None = None
-        self._ghosted: dict[str, Any] = {}
+        self._trails = DroneTrails(len(names))
+        self._words = TableRows(self.eyes)
+        self._shapes: dict[str, FormationShape | None] = {}
+        self._drones: DronePoses | None = None
+        self._drawn_ghosts: dict[str, Any] = {}
         self._drawn_ns = self._table_s = 0.0
         robots = sum(space.n for space in self._spaces.values())
-        self._stage = Stage(server, names, robots, len(self._spaces))
+        self._stage = SceneNodes(server, names, robots, len(self._spaces))
         self._stage.obstacles(self._scenario.environment.obstacles)
         show = self._stage.show
-        self._page = Page(server.gui, self._scenario, self._spaces, self._desk, self._tell, show, info.rate)
+        self._page = ConsolePage(server.gui, self._scenario, self._spaces, self._desk, self._on_outcome, show, info.rate)
 
     def close(self) -> None:
         """Send nothing any more."""
@@ -99,113 +99,113 @@ class Show:
         self.eyes.open()
         pause = threading.Event()
         next_s = time.monotonic()
-        with self._watch.asking():
-            while not self._presence.over and not stopped():
-                self._turn(time.monotonic())
+        with self._watch.polling():
+            while not self._presence.end_reason and not stopped():
+                self._update(time.monotonic())
                 next_s = max(next_s + self._period_s(), time.monotonic())
                 pause.wait(next_s - time.monotonic())
-        self._leave()
+        self._draw_end()
 
     def state(self) -> dict[str, Any]:
         """Return what is shown, as plain data: for programs, and for tests."""
-        return state(self._info.run_id, self.eyes, self._watch, dict(self._shapes))
+        return console_state(self._info.run_id, self.eyes, self._watch, dict(self._shapes))
 
     # A picture
 
     def _period_s(self) -> float:
         """Return the time from one to the next [wall]."""
         rate = self._watch.clock.rate if self._watch.clock is not None else 0.0
-        return 1.0 / (self._rate_hz or pictures_hz(len(self._names), rate))
+        return 1.0 / (self._rate_hz or picture_rate_hz(len(self._names), rate))
 
-    def _turn(self, wall_s: float) -> None:
+    def _update(self, wall_s: float) -> None:
         self._presence.tick()
-        new = self.eyes.look()
+        new = self.eyes.update()
         for form in self._page.forms.values():
             form.send(wall_s)
         if not self._server.get_clients():
-            self._remember(new)
+            self._store_unseen(new)
             return
         with self._server.atomic():
             if new:
                 self._draw()
             if wall_s - self._table_s >= TABLE_S:
                 self._table_s = wall_s
-                self._tell_in_words(wall_s)
+                self._update_tables(wall_s)
 
-    def _leave(self) -> None:
+    def _draw_end(self) -> None:
         """Draw how it ended: for pages that are opened between two runs."""
-        self.eyes.look()
+        self.eyes.update()
         with self._server.atomic():
             if self.eyes.drones is not None:
                 self._draw()
-            self._tell_in_words(time.monotonic())
+            self._update_tables(time.monotonic())
 
-    def _remember(self, new: bool) -> None:
+    def _store_unseen(self, new: bool) -> None:
         """Keep up what pages want to see of the time before they were opened."""
         if new and self.eyes.drones is not None:
-            self._followers.begin_at(self._followed(self._take_in(self.eyes.drones)))
+            self._followers.set_target(self._camera_targets(self._store_drones(self.eyes.drones)))
 
-    def _take_in(self, view: ViewDrones) -> Drones:
+    def _store_drones(self, view: ViewDrones) -> DronePoses:
         """Keep up with the drones; return them."""
-        drones = drones_of(view, self._names)
+        drones = drone_poses(view, self._names)
         if drones.t_ns < self._drawn_ns:
             self._trails.clear()  # a replay has gone back
         self._drones, self._drawn_ns = drones, drones.t_ns
         self._trails.add(drones.p_W)
-        self._note_shapes(drones)
+        self._update_shapes(drones)
         return drones
 
     def _draw(self) -> None:
         assert self.eyes.drones is not None
         before_ns = self._drawn_ns
-        drones = self._take_in(self.eyes.drones)
+        drones = self._store_drones(self.eyes.drones)
         dt_s = min(self._period_s(), max(0.0, (drones.t_ns - before_ns) / 1e9))
         self._stage.drones(drones, dt_s)
-        beliefs = self.eyes.beliefs().values()
+        beliefs = self.eyes.estimates().values()
         self._stage.estimates(ellipsoids([belief.estimate for belief in beliefs if belief.fresh]))
         if self._shapes:
             self._stage.shapes(list(self._shapes.values()), list(self._shapes).index(self._page.chosen))
         self._draw_ghosts()
-        self._followers.follow(self._followed(drones))
+        self._followers.follow(self._camera_targets(drones))
 
     def _draw_ghosts(self) -> None:
         """Put the ghosts anew where a formation is to be somewhere else now."""
         wanted = {name: (view.phase, view.desired) for name, view in self.eyes.clusters.items()}
-        if wanted == self._ghosted:
+        if wanted == self._drawn_ghosts:
             return
-        self._ghosted = wanted
+        self._drawn_ghosts = wanted
         found = [ghosts(self._spaces[name], view) for name, view in self.eyes.clusters.items()]
         there = [each for each in found if each is not None]
         p_W = np.concatenate([p for p, _ in there]) if there else np.zeros((0, 3))
         self._stage.ghosts(p_W, np.concatenate([q for _, q in there]) if there else np.zeros((0, 4)))
 
-    def _note_shapes(self, drones: Drones) -> None:
+    def _update_shapes(self, drones: DronePoses) -> None:
         """Find the formations as they truly stand, and keep what plots show of them."""
-        there, yaw = drones.there, frames.heading(drones.q_WB)
+        there, yaw = drones.present, frames.heading(drones.q_WB)
         for name, space in self._spaces.items():
             members = self._members[name]
             whole = bool(there[members].all())
-            self._shapes[name] = found = shape(space, drones.p_W[members], yaw[members]) if whole else None
+            self._shapes[name] = found = formation_shape(space, drones.p_W[members], yaw[members]) if whole else None
             view = self.eyes.clusters.get(name)
             if view is not None:
                 true = None if found is None else found.c
                 self._page.plots[name].history.add(drones.t_ns / 1e9, view.desired, view.value, true)
 
-    def _followed(self, drones: Drones) -> np.ndarray:
+    def _camera_targets(self, drones: DronePoses) -> np.ndarray:
         """Return the places (n, 3) of what cameras follow: the formation, or all drones where there are several."""
         members = next(iter(self._members.values())) if len(self._members) == 1 else slice(None)
-        return drones.p_W[members][drones.there[members]]
+        return drones.p_W[members][drones.present[members]]
 
     # In words
 
-    def _tell_in_words(self, wall_s: float) -> None:
+    def _update_tables(self, wall_s: float) -> None:
         page = self._page
-        page.clock.content = html_tables.clock(self._watch.clock, int(self._drawn_ns), self._watch.silent_s)
-        page.phases.content = html_tables.clusters({n: (v.phase, v.reason) for n, v in self.eyes.clusters.items()})
-        page.drones.content = html_tables.drones(self._words.rows())
-        page.sensors.content = self._words.sensors(page.drone_form.chosen)
-        page.acting.content = html_tables.acting(self._words.acting())
-        page.events.content = html_tables.events(list(self.eyes.events)[:EVENTS_SHOWN])
+        page.clock.content = html_tables.clock_line(self._watch.clock, int(self._drawn_ns), self._watch.silent_s)
+        page.phases.content = html_tables.formation_lines({n: (v.phase, v.reason) for n, v in self.eyes.clusters.items()})
+        page.drones.content = html_tables.drone_table(self._words.drone_rows())
+        page.sensors.content = self._words.sensor_table(page.drone_form.chosen)
+        page.acting.content = html_tables.fault_lines(self._words.acting())
+        page.events.content = html_tables.event_table(list(self.eyes.events)[:EVENTS_SHOWN])
         if page.chosen:
             page.forms[page.chosen].refresh(self.eyes.clusters.get(page.chosen), wall_s)
             page.plots[page.chosen].draw()
@@ -213,19 +213,19 @@ class Show:
             self._stage.trails(*self._trails.segments(self._drones.p_W))
             self._stage.wind(self._drones)
 
-    def _tell(self, told: Told) -> None:
+    def _on_outcome(self, told: RequestOutcome) -> None:
         """Show what came of a request: a refusal in the corner of every page, and among the events.
 
         Of what was done the world tells, but not of what formations were asked for.
         """
         kind, outcome = ("refused", told.refusal) if told.refusal else ("control", "done")
-        if told.refusal or told.what.partition(":")[0] in self._spaces:
-            said = f"{told.what}: {outcome}"
-            self.eyes.note(Event(self._presence.now_ns, 0, kind, self._presence.name, "", said))
+        if told.refusal or told.request.partition(":")[0] in self._spaces:
+            said = f"{told.request}: {outcome}"
+            self.eyes.add_event(Event(self._presence.now_ns, 0, kind, self._presence.name, "", said))
         if told.refusal:
-            self._notify(told.what, told.refusal)
+            self._notify(told.request, told.refusal)
 
-    def _tell_refused(self, event: Event) -> None:
+    def _on_refused_command(self, event: Event) -> None:
         """Show what the world refuses of a command that the console has sent."""
         self._notify(event.subject, str(event.data.get("reason", event.text)))
 

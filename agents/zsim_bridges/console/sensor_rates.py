@@ -7,16 +7,16 @@ SPAN_NS = 1_000_000_000  # simulated, over which at least a rate is taken
 Counts = dict[str, tuple[int, int]]
 
 
-class Rates:
+class SensorRates:
     """Rates of one drone at a time: the one that is looked at."""
 
     def __init__(self) -> None:
         self._drone = ""
         self._marks: list[tuple[int, Counts]] = []
 
-    def of(self, drone: str, t_ns: int, counts: Mapping[str, tuple[int, int]]) -> dict[str, float]:
+    def update(self, drone: str, t_ns: int, counts: Mapping[str, tuple[int, int]]) -> dict[str, float]:
         """Take the counts (used, refused) of a drone's sensors at an instant; return the rates [Hz] lately."""
-        if drone != self._drone or self._begins_anew(t_ns, counts):
+        if drone != self._drone or self._has_restarted(t_ns, counts):
             self._drone, self._marks = drone, []
         if self._marks and self._marks[-1][0] == t_ns:
             self._marks.pop()  # the run stands still
@@ -29,7 +29,7 @@ class Rates:
             return {}
         return {kind: (sum(now) - sum(before.get(kind, now))) * 1e9 / span_ns for kind, now in counts.items()}
 
-    def _begins_anew(self, t_ns: int, counts: Mapping[str, tuple[int, int]]) -> bool:
+    def _has_restarted(self, t_ns: int, counts: Mapping[str, tuple[int, int]]) -> bool:
         """Tell whether a replay has gone back, or an estimator has begun anew."""
         if not self._marks:
             return False

@@ -4,56 +4,56 @@ import math
 
 from zsim.contract.messages import EstimateView, Fault
 from zsim_bridges.console import html_tables
-from zsim_bridges.console.sensor_rates import Rates
-from zsim_bridges.console.view_buffer import Belief, Eyes
+from zsim_bridges.console.sensor_rates import SensorRates
+from zsim_bridges.console.view_buffer import ReceivedEstimate, ViewBuffer
 
 
-class Words:
+class TableRows:
     """Makes rows of tables.
 
     Args:
         eyes: has heard it.
     """
 
-    def __init__(self, eyes: Eyes) -> None:
+    def __init__(self, eyes: ViewBuffer) -> None:
         self._eyes = eyes
-        self._rates = Rates()
+        self._rates = SensorRates()
 
-    def rows(self) -> list[html_tables.Row]:
+    def drone_rows(self) -> list[html_tables.DroneRow]:
         """Return a row for each drone."""
-        view, beliefs, found = self._eyes.drones, self._eyes.beliefs(), []
+        view, beliefs, found = self._eyes.drones, self._eyes.estimates(), []
         if view is None:
             return []
-        acting = self._acting()
+        active_faults = self._active()
         for drone in view.drones:
             belief = beliefs.get(drone.name)
             gps = belief.estimate.sensors.get("gps") if belief else None
-            faults = tuple(fault.kind for fault in acting if fault.target == drone.name)
+            faults = tuple(fault.kind for fault in active_faults if fault.target == drone.name)
             told = "–" if gps is None else f"{gps[0]} / {gps[1]}"
             lag = self._lag_ms(belief, view.t_ns) if belief else None
             row = (drone.name, drone.state, drone.battery_percent, lag, drone.commander, told, faults)
-            found.append(html_tables.Row(*row))
+            found.append(html_tables.DroneRow(*row))
         return found
 
     def acting(self) -> list[str]:
         """Return which faults act, and on what."""
-        return [f"{fault.kind} of {fault.target}{_until(fault)}" for fault in self._acting()]
+        return [f"{fault.kind} of {fault.target}{_end_text(fault)}" for fault in self._active()]
 
-    def _acting(self) -> list[Fault]:
+    def _active(self) -> list[Fault]:
         now_ns = self._eyes.drones.t_ns if self._eyes.drones else 0
-        return [fault for fault in self._eyes.faults if _acts(fault, now_ns)]
+        return [fault for fault in self._eyes.faults if _is_active(fault, now_ns)]
 
-    def sensors(self, drone: str) -> str:
+    def sensor_table(self, drone: str) -> str:
         """Return the table of one drone's sensors."""
-        belief = self._eyes.beliefs().get(drone)
+        belief = self._eyes.estimates().get(drone)
         if belief is None:
-            return html_tables.sensors(drone, (), "no estimate yet")
+            return html_tables.sensor_table(drone, (), "no estimate yet")
         estimate = belief.estimate
-        rates = self._rates.of(drone, belief.t_ns, estimate.sensors) if belief.fresh else {}
+        rates = self._rates.update(drone, belief.t_ns, estimate.sensors) if belief.fresh else {}
         rows = [html_tables.SensorRow(kind, *counts, rates.get(kind)) for kind, counts in estimate.sensors.items()]
-        return html_tables.sensors(drone, rows, _certainty(belief))
+        return html_tables.sensor_table(drone, rows, _uncertainty(belief))
 
-    def _lag_ms(self, belief: Belief, now_ns: int) -> float:
+    def _lag_ms(self, belief: ReceivedEstimate, now_ns: int) -> float:
         """Return how far an estimator is behind: as it says of itself, or as its view shows where that is old."""
         health = self._eyes.healths.get(belief.process)
         if health is not None and belief.fresh:
@@ -61,15 +61,15 @@ class Words:
         return max(0, now_ns - belief.t_ns) / 1e6
 
 
-def _acts(fault: Fault, now_ns: int) -> bool:
+def _is_active(fault: Fault, now_ns: int) -> bool:
     return fault.from_ns <= now_ns and (fault.until_ns is None or fault.until_ns > now_ns)
 
 
-def _until(fault: Fault) -> str:
+def _end_text(fault: Fault) -> str:
     return "" if fault.until_ns is None else f" until {fault.until_ns / 1e9:.1f} s"
 
 
-def _certainty(belief: Belief) -> str:
+def _uncertainty(belief: ReceivedEstimate) -> str:
     """Return in words how sure an estimator is."""
     if not belief.fresh:
         return f"no estimate since {belief.t_ns / 1e9:.1f} s"

@@ -10,14 +10,14 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import EstimateView, Event, Fault, Health, Info, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError
 from zsim.transport.session import Heard, Sample, Session
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.observer_process import ObserverProcess
 
 EVENTS_KEPT = 200
-SHOWN_BUT = frozenset({"command"})  # kinds of events that say nothing which the next one does not: a mode, a refusal
+HIDDEN_EVENTS = frozenset({"command"})  # kinds of events that say nothing which the next one does not: a mode, a refusal
 FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
 
 
-class Belief(NamedTuple):
+class ReceivedEstimate(NamedTuple):
     """What is believed of a drone.
 
     Attributes:
@@ -32,7 +32,7 @@ class Belief(NamedTuple):
     fresh: bool
 
 
-class Eyes:
+class ViewBuffer:
     """Keeps the newest view of everything until the next look; what comes between two looks is never decoded.
 
     Args:
@@ -56,7 +56,7 @@ class Eyes:
         self,
         link: Session,
         info: Info,
-        presence: Presence,
+        presence: ObserverProcess,
         variables: Mapping[str, tuple[str, ...]],
         refused: Callable[[Event], None],
         wall_s: Callable[[], float] = time.monotonic,
@@ -67,7 +67,7 @@ class Eyes:
         self._variables = variables
         self._refused = refused
         self._wall_s = wall_s
-        self._taken_s: dict[str, float] = {}  # wall time by key, of views of drones and estimators
+        self._received_s: dict[str, float] = {}  # wall time by key, of views of drones and estimators
         self._new: dict[str, bytes] = {}
         self._arrived = threading.Condition()
         self._lock = threading.Lock()
@@ -82,44 +82,44 @@ class Eyes:
     def open(self) -> None:
         """Begin to hear, and learn what was said before."""
         for expression in ("view/**", keys.FAULTS, "process/*/health"):
-            self._link.hear(expression, self._keep)
+            self._link.hear(expression, self._on_publication)
         self._link.on_message(keys.EVENT, self._on_event)
         told = self._link.get(keys.FAULTS)
         with self._lock:
             for sample in told:
                 self._new.setdefault(sample.key, sample.payload)  # what was heard meanwhile is newer
 
-    def look(self) -> bool:
+    def update(self) -> bool:
         """Take in what has come since the last look; return whether drones have been seen anew."""
         with self._lock:
             new, self._new = self._new, {}
         for key, payload in new.items():
             try:
-                self._take(key, messages.decode(key, payload))
+                self._store(key, messages.decode(key, payload))
             except DecodeError:
                 self._presence.health.refused += 1
         return keys.VIEW_DRONES in new
 
-    def beliefs(self) -> dict[str, Belief]:
+    def estimates(self) -> dict[str, ReceivedEstimate]:
         """Return the newest belief of each drone by name: of two estimators, one of them dead, that of the other.
 
         What is of the future was said before a replay went back.
         """
         now_ns = self.drones.t_ns if self.drones else 0
-        found: dict[str, Belief] = {}
+        found: dict[str, ReceivedEstimate] = {}
         for process, view in sorted(self.estimators.items(), key=lambda each: each[1].t_ns):
             fresh = self._is_fresh(process, view.t_ns - now_ns)
             if fresh or view.t_ns <= now_ns:
                 names = (estimate for estimate in view.estimates if estimate.name in self._names)
-                found |= {each.name: Belief(process, view.t_ns, each, fresh) for each in names}
+                found |= {each.name: ReceivedEstimate(process, view.t_ns, each, fresh) for each in names}
         return found
 
     def _is_fresh(self, process: str, ahead_ns: int) -> bool:
         """Tell whether an estimator's view goes with that of the drones: in a fast run, both skip many gates."""
-        seen_s = self._taken_s.get(keys.VIEW_DRONES, 0.0) - self._taken_s[keys.estimates_view(process)]
+        seen_s = self._received_s.get(keys.VIEW_DRONES, 0.0) - self._received_s[keys.estimates_view(process)]
         return abs(ahead_ns) <= FRESH_S * 1e9 or abs(seen_s) <= FRESH_S
 
-    def answered(self, drone: str) -> int:
+    def answered_commands(self, drone: str) -> int:
         """Return how many commands to a drone the world has said that it took, or refused."""
         return self._answers[drone]
 
@@ -128,29 +128,29 @@ class Eyes:
         with self._arrived:
             self._arrived.wait_for(lambda: self._answers[drone] > beyond, within_s)
 
-    def note(self, event: Event) -> None:
+    def add_event(self, event: Event) -> None:
         """Add an event of the console's own."""
         self.events.appendleft(event)
 
-    def _keep(self, heard: Heard) -> None:
+    def _on_publication(self, heard: Heard) -> None:
         self._presence.health.received += 1
         with self._lock:
             self._new[heard.key] = heard.payload
 
-    def _take(self, key: str, message: Any) -> None:
+    def _store(self, key: str, message: Any) -> None:
         if isinstance(message, ViewDrones):
-            self.drones, self._taken_s[key] = message, self._wall_s()
+            self.drones, self._received_s[key] = message, self._wall_s()
         elif isinstance(message, ViewCluster):
-            self._take_cluster(key.rpartition("/")[2], message)
+            self._store_cluster(key.rpartition("/")[2], message)
         elif isinstance(message, ViewEstimates):
-            self._taken_s[key] = self._wall_s()
+            self._received_s[key] = self._wall_s()
             self.estimators[key.rpartition("/")[2]] = message
         elif isinstance(message, Health):
             self.healths[keys.thing(key)] = message
         elif isinstance(message, messages.Faults):
             self.faults = message.faults
 
-    def _take_cluster(self, cluster: str, view: ViewCluster) -> None:
+    def _store_cluster(self, cluster: str, view: ViewCluster) -> None:
         """Keep a view, unless a controller of another scenario says it."""
         if self._variables.get(cluster) == view.names and len(view.value) == len(view.desired) == len(view.names):
             self.clusters[cluster] = view
@@ -166,7 +166,7 @@ class Eyes:
             with self._arrived:
                 self._answers[_drone(event)] += 1
                 self._arrived.notify_all()
-        if event.kind not in SHOWN_BUT:
+        if event.kind not in HIDDEN_EVENTS:
             self.events.appendleft(event)
         if event.kind == "refused" and event.source == self._presence.name:
             self._refused(event)

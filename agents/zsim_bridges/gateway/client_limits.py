@@ -5,7 +5,7 @@ from collections.abc import Callable
 from zsim_bridges.gateway.http.http_errors import TooManyError
 
 
-class Bucket:
+class TokenBucket:
     """Lets `rate_hz` requests through on average, `burst` at once.
 
     Args:
@@ -21,7 +21,7 @@ class Bucket:
         self._tokens = burst
         self._last_s = wall_s()
 
-    def take(self) -> None:
+    def spend(self) -> None:
         """Take a token.
 
         Raises:
@@ -36,7 +36,7 @@ class Bucket:
         self._tokens -= 1.0
 
 
-class Turnstile:
+class ConnectionLimit:
     """Lets so many through at a time.
 
     Args:

@@ -6,7 +6,7 @@ WAITING_MAX = 256  # of a key; a world that is paused hands out nothing, and cli
 DELETED = None
 
 
-class Echoes:
+class EchoFilter:
     """Knows what is still to come back, by key, in the order in which it was said.
 
     Who says two values in a row hears the first from the world when the second is there already; who says one and
@@ -20,17 +20,17 @@ class Echoes:
         self._keys_max = keys_max
         self._waiting: dict[str, deque[int | None]] = {}
 
-    def said(self, key: str, payload: bytes) -> None:
+    def add(self, key: str, payload: bytes) -> None:
         """Note that a payload is on its way to the world."""
         if key in self._waiting or len(self._waiting) < self._keys_max:
             self._waiting.setdefault(key, deque(maxlen=WAITING_MAX)).append(hash(payload))
 
-    def deleted(self, key: str) -> None:
+    def add_deletion(self, key: str) -> None:
         """Note that what is on its way has no value any more."""
         if key in self._waiting:
             self._waiting[key].append(DELETED)
 
-    def is_old(self, key: str, payload: bytes) -> bool:
+    def is_stale(self, key: str, payload: bytes) -> bool:
         """Tell whether what the world hands out is an echo of what has been followed by something since."""
         waiting = [*self._waiting.get(key, ())]
         if hash(payload) not in waiting:

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from zsim.contract import batch, keys, messages
 from zsim.contract.bundle import Bundle, table_of, unpacked
 from zsim.errors import DecodeError
-from zsim_bridges.gateway.echo_filter import Echoes
+from zsim_bridges.gateway.echo_filter import EchoFilter
 
 OWN_BYTES_MAX = 64_000_000  # of the values on keys that are none of the contract's
 KEYS_MAX = 200_000  # kept; 1000 drones have about 12 000
 
 
-class Values:
+class LastValues:
     """Filled by the batches that the world hands out; unpacked when somebody asks.
 
     Args:
@@ -24,12 +24,12 @@ class Values:
 
     def __init__(self, drones: Sequence[str]) -> None:
         self._table = table_of(drones)
-        self._places = {key: place for place, key in enumerate(self._table)}
-        self._said: dict[str, bytes] = {}
+        self._indices = {key: place for place, key in enumerate(self._table)}
+        self._payloads: dict[str, bytes] = {}
         self._own_bytes = 0
         self._lock = threading.Lock()  # clients' thread and the world's both add to what is counted
         self._encodings: dict[str, tuple[bytes, str]] = {}
-        self._echoes = Echoes(KEYS_MAX)
+        self._echoes = EchoFilter(KEYS_MAX)
         self._bundled: dict[int, tuple[Bundle, int]] = {}
         self.refused = 0
 
@@ -38,36 +38,36 @@ class Values:
         with self._lock:
             self._add(key, payload, encoding)
 
-    def say(self, key: str, payload: bytes, encoding: str = "") -> None:
+    def add_own(self, key: str, payload: bytes, encoding: str = "") -> None:
         """Take one message that is said here, and that the world will hand out, too."""
         with self._lock:
-            self._echoes.said(key, payload)
+            self._echoes.add(key, payload)
             self._add(key, payload, encoding)
 
     def _add(self, key: str, payload: bytes, encoding: str) -> None:
         if messages.type_of(key) is None and not self._has_room(key, payload):
             self._drop(key)
-        elif key in self._said or len(self._said) < KEYS_MAX:
-            self._said[key] = payload
+        elif key in self._payloads or len(self._payloads) < KEYS_MAX:
+            self._payloads[key] = payload
             if encoding:
                 self._encodings[key] = (payload, encoding)
 
     def _has_room(self, key: str, payload: bytes) -> bool:
         """Tell whether a value of a key of somebody's own may be kept."""
-        before = len(self._said.get(key, b""))
+        before = len(self._payloads.get(key, b""))
         more = len(payload) - before
-        has = self._own_bytes + more <= OWN_BYTES_MAX and (key in self._said or len(self._said) < KEYS_MAX)
+        has = self._own_bytes + more <= OWN_BYTES_MAX and (key in self._payloads or len(self._payloads) < KEYS_MAX)
         self._own_bytes += more if has else 0
         return has
 
     def drop(self, key: str) -> None:
         """Forget the value of a key that is deleted here."""
         with self._lock:
-            self._echoes.deleted(key)
+            self._echoes.add_deletion(key)
             self._drop(key)
 
     def _drop(self, key: str) -> None:
-        gone = self._said.pop(key, b"")
+        gone = self._payloads.pop(key, b"")
         if messages.type_of(key) is None:
             self._own_bytes -= len(gone)
         self._encodings.pop(key, None)
@@ -75,7 +75,7 @@ class Values:
     def encoding(self, key: str) -> str:
         """Return the encoding of a key's last value."""
         payload, encoding = self._encodings.get(key, (None, ""))
-        return encoding if encoding and payload == self._said.get(key) else messages.encoding(key)
+        return encoding if encoding and payload == self._payloads.get(key) else messages.encoding(key)
 
     def add_batch(self, payload: bytes) -> list[tuple[str, bytes]]:
         """Take everything that passed the world since the last time; return what came beside the drones' messages."""
@@ -89,12 +89,12 @@ class Values:
             if key == batch.GATE:
                 self._add_bundle(said)
             else:
-                self._hear(key, said)
+                self._add_received(key, said)
         return alone
 
-    def _hear(self, key: str, payload: bytes) -> None:
+    def _add_received(self, key: str, payload: bytes) -> None:
         with self._lock:
-            if not self._echoes.is_old(key, payload):
+            if not self._echoes.is_stale(key, payload):
                 self._add(key, payload, "")
 
     def _add_bundle(self, payload: bytes) -> None:
@@ -109,7 +109,7 @@ class Values:
         for m, place in enumerate(bundle.which.tolist()):
             self._bundled[place] = (bundle, m)
 
-    def of(self, expression: str, prefix: str = "") -> list[tuple[str, bytes]]:
+    def matching(self, expression: str, prefix: str = "") -> list[tuple[str, bytes]]:
         """Return keys and payloads that an expression takes, in order of the keys.
 
         Args:
@@ -120,10 +120,10 @@ class Values:
             key = expression.removeprefix(prefix)
             payload = self._payload(key) if expression.startswith(prefix) else None
             return [(key, payload)] if payload is not None else []
-        known = {*self._said, *(self._table[place] for place in list(self._bundled))}  # filled in another thread
+        known = {*self._payloads, *(self._table[place] for place in list(self._bundled))}  # filled in another thread
         taken = sorted(key for key in known if keys.matches(expression, prefix + key))
         return [(key, payload) for key in taken if (payload := self._payload(key)) is not None]
 
     def _payload(self, key: str) -> bytes | None:
-        found = self._bundled.get(self._places.get(key, -1))
-        return found[0].payload(found[1]) if found else self._said.get(key)
+        found = self._bundled.get(self._indices.get(key, -1))
+        return found[0].payload(found[1]) if found else self._payloads.get(key)

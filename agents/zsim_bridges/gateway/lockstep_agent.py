@@ -9,11 +9,11 @@ from zsim.contract.messages import Info
 from zsim.errors import DecodeError
 from zsim.runtime.agent import Agent, Output
 
-SILENT_S = 10.0  # wall time after which a client that answers nothing in realtime has no seat any more
+ANSWER_TIMEOUT_S = 10.0  # wall time after which a client that answers nothing in realtime has no seat any more
 LATE_PERIODS = 2  # in realtime a gate that is older by so many is not handed over alone but with a newer one
 
 
-class Seat(Agent):
+class LockstepAgent(Agent):
     """Hands the inputs of each gate over and waits for what the client makes of them.
 
     Args:
@@ -35,7 +35,7 @@ class Seat(Agent):
     """
 
     def __init__(
-        self,
+        _send_inputs,
         name: str,
         info: Info,
         period_ns: int,
@@ -47,28 +47,28 @@ class Seat(Agent):
     ) -> None:
         super().__init__()
         _check(name, info, period_ns, gates)
-        self.name = name
-        self.period_ns = period_ns
-        self.gate_keys = tuple(gates) or closing(info, reads, name, served)
-        self.reads = _taking(reads, self.gate_keys)
-        self.counted = tuple(d.name for d in info.drones if any(_takes_sensors(each, d.name) for each in self.reads))
-        self._hand_over = hand_over
-        self._late_ns = LATE_PERIODS * period_ns if info.mode == "realtime" else None
-        self._now_ns = now_ns
-        self._inputs: list[tuple[str, Any]] = []
-        self._answers: queue.SimpleQueue[list[Output]] = queue.SimpleQueue()
-        self.gone = self.deserted = False
+        _send_inputs.name = name
+        _send_inputs.period_ns = period_ns
+        _send_inputs.gate_keys = tuple(gates) or gate_keys_of(info, reads, name, served)
+        _send_inputs.reads = _with_gate_keys(reads, _send_inputs.gate_keys)
+        _send_inputs.counted = tuple(d.name for d in info.drones if any(_takes_sensors(each, d.name) for each in _send_inputs.reads))
+        _send_inputs._hand_over = hand_over
+        _send_inputs._late_ns = LATE_PERIODS * period_ns if info.mode == "realtime" else None
+        _send_inputs._now_ns = now_ns
+        _send_inputs._inputs: list[tuple[str, Any]] = []
+        _send_inputs._answers: queue.SimpleQueue[list[Output]] = queue.SimpleQueue()
+        _send_inputs.has_left = _send_inputs.deserted = False
 
     def receive(self, key: str, message: Any) -> None:
         self._inputs.append((key, message))
 
     def step(self, t_ns: int) -> list[Output]:
-        if self.gone or (self._late_ns is not None and self._now_ns() - t_ns >= self._late_ns):
+        if self.has_left or (self._late_ns is not None and self._now_ns() - t_ns >= self._late_ns):
             return []
         inputs, self._inputs = self._inputs, []
         self._hand_over(t_ns, inputs)
         try:
-            return self._answers.get(timeout=SILENT_S if self._late_ns is not None else None)
+            return self._answers.get(timeout=ANSWER_TIMEOUT_S if self._late_ns is not None else None)
         except queue.Empty:
             self.leave(deserted=True)
             return []
@@ -79,11 +79,11 @@ class Seat(Agent):
 
     def leave(self, deserted: bool = False) -> None:
         """Let a step that waits end: the client is gone."""
-        self.gone, self.deserted = True, deserted
+        self.has_left, self.deserted = True, deserted
         self._answers.put([])
 
 
-def closing(info: Info, reads: Sequence[str], name: str, served: Collection[tuple[str, str]]) -> tuple[str, ...]:
+def gate_keys_of(info: Info, reads: Sequence[str], name: str, served: Collection[tuple[str, str]]) -> tuple[str, ...]:
     """Return the keys that come at every gate and that some expressions take; `clock` where there are none.
 
     A drone's status and truth come from the world. Its estimate, and the state of a cluster, come at every gate if the
@@ -97,7 +97,7 @@ def closing(info: Info, reads: Sequence[str], name: str, served: Collection[tupl
     return tuple(found) or (keys.CLOCK,)
 
 
-def _taking(reads: Sequence[str], gates: Sequence[str]) -> tuple[str, ...]:
+def _with_gate_keys(reads: Sequence[str], gates: Sequence[str]) -> tuple[str, ...]:
     """Return what is read, and the gate keys that are not among it: a key that two take would come twice."""
     missing = [key for key in gates if not any(keys.matches(each, key) for each in reads)]
     return tuple(dict.fromkeys((*reads, *missing)))

@@ -11,17 +11,17 @@ from zsim.contract import messages
 from zsim.errors import DecodeError
 from zsim.runtime.agent import Output
 from zsim.transport.session import check_expression
-from zsim_bridges.gateway.key_policy import is_counted
+from zsim_bridges.gateway.key_policy import is_counted_key
 from zsim_bridges.gateway.lines import stream_requests
-from zsim_bridges.gateway.lockstep_agent import Seat
-from zsim_bridges.gateway.message_defaults import Stamps
-from zsim_bridges.gateway.run_access import Flight
+from zsim_bridges.gateway.lockstep_agent import LockstepAgent
+from zsim_bridges.gateway.message_defaults import MessageDefaults
+from zsim_bridges.gateway.run_access import RunAccess
 
-NONE_NS = -1  # no gate waits for an answer
+NO_GATE_NS = -1  # no gate waits for an answer
 _encode = msgspec.json.Encoder().encode
 
 
-class Place:
+class LockstepSession:
     """What a client has from its join until it leaves.
 
     Args:
@@ -45,15 +45,15 @@ class Place:
     def __init__(
         self,
         name: str,
-        asked: stream_requests.Join,
-        flight: Flight,
+        asked: stream_requests.JoinRequest,
+        flight: RunAccess,
         loop: asyncio.AbstractEventLoop,
         send: Callable[[bytes], None],
     ) -> None:
         for key in (*asked.reads, *asked.gates):
             check_expression(key)
         period_ns = round(asked.period_s * 1e9)
-        self.seat = Seat(
+        self.agent = LockstepAgent(
             name,
             flight.info,
             period_ns,
@@ -61,48 +61,48 @@ class Place:
             asked.gates,
             hand_over=self._hand_over,
             now_ns=lambda: flight.now_ns,
-            served=flight.served,
+            served=flight.required_processes,
         )
         for key in asked.gates:
-            flight.refuse_unknown(key)
-        self.stamps = Stamps(name)
-        self.flight = flight
+            flight.check_known(key)
+        self.defaults = MessageDefaults(name)
+        self.run = flight
         self._loop = loop
         self._send = send
-        self._gate_ns = NONE_NS
+        self._gate_ns = NO_GATE_NS
 
     def _hand_over(self, t_ns: int, inputs: list[tuple[str, Any]]) -> None:
         """Send the inputs of a gate; in the seat's thread."""
         entries = [{"key": key, "value": message} for key, message in inputs]
         line = _encode({"op": "gate", "t_ns": t_ns, "inputs": entries}) + b"\n"
         with suppress(RuntimeError):  # the gateway has ended
-            self._loop.call_soon_threadsafe(self._give, t_ns, line)
+            self._loop.call_soon_threadsafe(self._send_gate, t_ns, line)
 
-    def _give(self, t_ns: int, line: bytes) -> None:
-        if not self.seat.gone:
+    def _send_gate(self, t_ns: int, line: bytes) -> None:
+        if not self.agent.has_left:
             self._gate_ns = t_ns
             self._send(line)
 
-    def done(self, asked: stream_requests.Done) -> None:
+    def answer_gate(self, asked: stream_requests.DoneRequest) -> None:
         """Answer the gate that waits; a refusal touches nothing, and the gate goes on waiting.
 
         Raises:
             DecodeError: there is no such gate, or an output is none.
             ForbiddenError: somebody else speaks on an output's key.
         """
-        if self._gate_ns == NONE_NS:
+        if self._gate_ns == NO_GATE_NS:
             raise DecodeError("done: there is no gate to answer; wait for the next")
         if asked.t_ns != self._gate_ns:
             raise DecodeError(f"done: t_ns is {asked.t_ns}; must be {self._gate_ns}, the gate that came last")
-        with self.stamps.all_or_none():
+        with self.defaults.transaction():
             said = [(each.key, self._payload(each)) for each in asked.outputs]
-            counted = [Output(key, messages.decode(key, payload)) for key, payload in said if is_counted(key)]
-        self.flight.publish([(key, payload) for key, payload in said if not is_counted(key)])
-        self._gate_ns = NONE_NS
-        self.seat.answer(counted)
+            counted = [Output(key, messages.decode(key, payload)) for key, payload in said if is_counted_key(key)]
+        self.run.publish([(key, payload) for key, payload in said if not is_counted_key(key)])
+        self._gate_ns = NO_GATE_NS
+        self.agent.answer(counted)
 
-    def _payload(self, said: stream_requests.Said) -> bytes:
+    def _payload(self, said: stream_requests.GateOutput) -> bytes:
         """Return what goes out: what a done counts in the seat's own name, the rest in the gateway's."""
-        if not is_counted(said.key):
-            self.flight.refuse_unwritable(said.key)
-        return self.flight.payload(said.key, self.stamps.filled(said.key, said.value, self._gate_ns))
+        if not is_counted_key(said.key):
+            self.run.check_writable(said.key)
+        return self.run.payload(said.key, self.defaults.fill(said.key, said.value, self._gate_ns))

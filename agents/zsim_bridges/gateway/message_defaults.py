@@ -8,7 +8,7 @@ from typing import Any
 from zsim.contract import messages
 
 
-class Stamps:
+class MessageDefaults:
     """Fills in for one client.
 
     Args:
@@ -19,7 +19,7 @@ class Stamps:
         self._source = source
         self._next: Counter[str] = Counter()
 
-    def filled(self, key: str, value: Any, now_ns: int) -> Any:
+    def fill(self, key: str, value: Any, now_ns: int) -> Any:
         """Return a value with `t_ns`, `seq` and `source` where its message has them and it does not.
 
         Args:
@@ -37,7 +37,7 @@ class Stamps:
         return {**{name: given for name, given in mine.items() if name in wanted}, **value}
 
     @contextmanager
-    def all_or_none(self) -> Iterator[None]:
+    def transaction(self) -> Iterator[None]:
         """Count what is filled in only if nothing is refused: numbers have no gaps."""
         before = self._next.copy()
         try:

@@ -12,17 +12,17 @@ from zsim.errors import DecodeError
 from zsim.scenario import rights, scenario_file
 from zsim.transport.session import Heard, Mailbox, Session, check_expression
 from zsim_bridges.gateway.http.http_errors import ForbiddenError, TooManyError, UnknownError
-from zsim_bridges.gateway.key_policy import is_control, is_spoken, refuse_others
-from zsim_bridges.gateway.last_values import Values
-from zsim_bridges.gateway.message_defaults import Stamps
-from zsim_bridges.gateway.transcoding import to_payload
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.gateway.key_policy import is_control_key, is_client_key, check_not_reserved
+from zsim_bridges.gateway.last_values import LastValues
+from zsim_bridges.gateway.message_defaults import MessageDefaults
+from zsim_bridges.gateway.transcoding import json_to_payload
+from zsim_bridges.observer_process import ObserverProcess
 
 TICK_S = 0.1  # how often health and a stop are looked at while nothing arrives
-ASKED_MAX = 64  # requests under way at once; each has a thread that waits for Zenoh
+REQUESTS_MAX = 64  # requests under way at once; each has a thread that waits for Zenoh
 
 
-class Flight:
+class RunAccess:
     """What clients need of the run that goes on.
 
     Args:
@@ -37,21 +37,21 @@ class Flight:
         served: (process, drone or cluster that it is about) of all without which the run does not start.
     """
 
-    def __init__(self, link: Session, info: Info, presence: Presence, secured: bool) -> None:
+    def __init__(self, link: Session, info: Info, presence: ObserverProcess, secured: bool) -> None:
         self.link = link
         self.info = info
-        self.values = Values([drone.name for drone in info.drones])
-        self.stamps = Stamps(presence.name)
-        self.whole = link.bare()
+        self.values = LastValues([drone.name for drone in info.drones])
+        self.defaults = MessageDefaults(presence.name)
+        self.bare_link = link.bare()
         self._presence = presence
         self._prefix = f"{link.federation}/"
-        self._threads = ThreadPoolExecutor(ASKED_MAX, thread_name_prefix="ask")
-        self._asked = 0
+        self._threads = ThreadPoolExecutor(REQUESTS_MAX, thread_name_prefix="ask")
+        self._pending = 0
         self._box: Mailbox | None = None
         scenario = scenario_file.from_text(info.scenario)
         self._may_write = rights.of(presence.name, scenario).writes if secured else None
-        self.served = [(name, name.partition(".")[2]) for name in scenario.expected()]
-        self._things = {"drone": [d.name for d in info.drones], "cluster": [c.name for c in info.clusters]}
+        self.required_processes = [(name, name.partition(".")[2]) for name in scenario.expected()]
+        self._known_names = {"drone": [d.name for d in info.drones], "cluster": [c.name for c in info.clusters]}
 
     @property
     def now_ns(self) -> int:
@@ -60,7 +60,7 @@ class Flight:
 
     # What passes the world
 
-    def enter(self) -> None:
+    def open(self) -> None:
         """Begin to hear what passes the world, and take in what was said before."""
         self._box = self.link.subscribe(batch.KEY)
         self.link.hear("view/**", lambda heard: self.values.add(heard.key, heard.payload))  # views are in no batch
@@ -68,29 +68,29 @@ class Flight:
             for sample in self.link.get(expression):
                 self.values.add(sample.key, sample.payload)
                 if sample.key == keys.CLOCK:
-                    self._presence.heed(sample.payload)
+                    self._presence.update_clock(sample.payload)
 
-    def follow(self, stopped: Callable[[], bool]) -> None:
+    def receive_until_end(self, stopped: Callable[[], bool]) -> None:
         """Take in what passes the world until the run is over, or somebody says stop."""
         assert self._box is not None
         over = threading.Event()
         ticker = threading.Thread(target=_tick, args=(self._box, over), name="tick", daemon=True)
         ticker.start()
         try:
-            while not self._presence.over and not stopped():
+            while not self._presence.end_reason and not stopped():
                 sample = self._box.receive()
                 if sample is not None:
-                    self._take_in(sample.payload)
+                    self._add_batch(sample.payload)
                 self._presence.tick()
         finally:
             over.set()
             ticker.join()
 
-    def _take_in(self, payload: bytes) -> None:
+    def _add_batch(self, payload: bytes) -> None:
         self._presence.health.received += 1
         for key, said in self.values.add_batch(payload):
             if key == keys.CLOCK:
-                self._presence.heed(said)
+                self._presence.update_clock(said)
 
     def close(self) -> None:
         """Wait for nobody any more."""
@@ -98,7 +98,7 @@ class Flight:
 
     # What clients say and ask, by keys of the federation
 
-    def put(self, key: str, value: Any, stamps: Stamps) -> None:
+    def put(self, key: str, value: Any, stamps: MessageDefaults) -> None:
         """Publish plain data on a key, checked, with what it leaves out filled in.
 
         Raises:
@@ -107,16 +107,16 @@ class Flight:
             UnknownError: the run has no such drone or cluster.
             SessionError: it is no key.
         """
-        self.refuse_unwritable(key)
-        with stamps.all_or_none():
-            payload = self.payload(key, stamps.filled(key, value, self.now_ns))
-        self.publish([(key, payload)])
+        self.check_writable(key)
+        with stamps.transaction():
+            encode = self.payload(key, stamps.fill(key, value, self.now_ns))
+        self.publish([(key, encode)])
 
     def publish(self, said: Sequence[tuple[str, bytes]]) -> None:
         """Publish payloads that have been checked."""
         for key, payload in said:
             self.link.put_as(key, payload, messages.encoding(key))
-            self.values.say(key, payload)
+            self.values.add_own(key, payload)
 
     def payload(self, key: str, value: Any) -> bytes:
         """Return plain data as the payload of a key on which a client may speak.
@@ -125,18 +125,18 @@ class Flight:
             DecodeError: names key, field, found and allowed.
             ForbiddenError: somebody else speaks there.
         """
-        self._refuse(key)
-        return to_payload(key, value)
+        self._check_key(key)
+        return json_to_payload(key, value)
 
-    def _refuse(self, key: str) -> None:
+    def _check_key(self, key: str) -> None:
         """Refuse a key of the federation on which a client may not speak, or that is none."""
-        refuse_others(key)
+        check_not_reserved(key)
         check_expression(key)
-        self.refuse_unknown(key)
-        if is_spoken(key) and messages.type_of(key) is None:
+        self.check_known(key)
+        if is_client_key(key) and messages.type_of(key) is None:
             raise DecodeError(f"{key[:80]}: is no key of the contract; see docs/protocol.md")
 
-    def refuse_unwritable(self, key: str) -> None:
+    def check_writable(self, key: str) -> None:
         """Refuse a key on which access control drops what the gateway itself says.
 
         Raises:
@@ -147,20 +147,20 @@ class Flight:
                 f"{key[:80]}: the gateway's certificate lets it speak on {', '.join(self._may_write)} only"
             )
 
-    def refuse_unknown(self, key: str) -> None:
+    def check_known(self, key: str) -> None:
         """Refuse a message of the contract about a drone or a cluster that the run does not have.
 
         Raises:
             UnknownError: with those that it has.
         """
         kind, thing, _ = keys.parts(key.removeprefix("view/"))
-        known = self._things.get(kind)
-        if known is not None and (messages.type_of(key) or is_control(key)) and thing not in known:
-            raise UnknownError(f"{key[:80]}: {kind} is {thing[:40]!r}; must be one of {', '.join(known) or 'none'}")
+        last_samples = self._known_names.get(kind)
+        if last_samples is not None and (messages.type_of(key) or is_control_key(key)) and thing not in last_samples:
+            raise UnknownError(f"{key[:80]}: {kind} is {thing[:40]!r}; must be one of {', '.join(last_samples) or 'none'}")
         if kind == "estimates" and not keys.PROCESS_NAME.fullmatch(thing):
             raise UnknownError(f"{key[:80]}: process is {thing[:60]!r}; must be 1 to 48 of a-z 0-9 _ . -")
 
-    async def ask(self, key: str, op: str, args: dict[str, Any], source: str, timeout_s: float = 5.0) -> ControlAnswer:
+    async def request(self, key: str, op: str, args: dict[str, Any], source: str, timeout_s: float = 5.0) -> ControlAnswer:
         """Ask whoever answers on a key.
 
         Raises:
@@ -169,7 +169,7 @@ class Flight:
         """
         if "*" in key:
             raise DecodeError(f"{key[:80]!r}: is no key; a request goes to one, without wildcards")
-        self.refuse_unknown(key)
+        self.check_known(key)
         return await self._in_thread(self.link.request, key, op, source, args, timeout_s)
 
     # The same by whole keys, the federation's name included: of others' keys too
@@ -178,19 +178,19 @@ class Flight:
         """Return the last values that a whole expression takes."""
         return [
             Heard("PUT", f"{self._prefix}{key}", payload, self.values.encoding(key), None)
-            for key, payload in self.values.of(expression, self._prefix)
+            for key, payload in self.values.matching(expression, self._prefix)
         ]
 
-    async def inquire(self, expression: str, parameters: str, payload: bytes, encoding: str) -> list[Heard]:
+    async def query(self, expression: str, parameters: str, payload: bytes, encoding: str) -> list[Heard]:
         """Return what is answered to a get on a whole expression.
 
         Raises:
             SessionError: it is no key expression.
             TooManyError: ASKED_MAX others ask already.
         """
-        return await self._in_thread(self.whole.inquire, expression, parameters, payload, encoding)
+        return await self._in_thread(self.bare_link.inquire, expression, parameters, payload, encoding)
 
-    def put_whole(self, key: str, payload: bytes, encoding: str) -> None:
+    def put_full_key(self, key: str, payload: bytes, encoding: str) -> None:
         """Publish a payload on a whole key.
 
         Raises:
@@ -198,26 +198,26 @@ class Flight:
             ForbiddenError: somebody else speaks there.
             SessionError: it is no key.
         """
-        own = self._own(key)
+        own = self._federation_key(key)
         if own is not None and messages.type_of(own) is not None:
             messages.decode(own, payload)
-        self.whole.put_as(key, payload, encoding)
+        self.bare_link.put_as(key, payload, encoding)
         if own is not None:
-            self.values.say(own, payload, encoding)
+            self.values.add_own(own, payload, encoding)
 
-    def delete_whole(self, key: str) -> None:
+    def delete_full_key(self, key: str) -> None:
         """Publish that a whole key has no value any more.
 
         Raises:
             ForbiddenError: somebody else speaks there.
             SessionError: it is no key.
         """
-        own = self._own(key)
-        self.whole.delete(key)
+        own = self._federation_key(key)
+        self.bare_link.delete(key)
         if own is not None:
             self.values.drop(own)
 
-    def _own(self, key: str) -> str | None:
+    def _federation_key(self, key: str) -> str | None:
         """Return a whole key without this federation's name; None for a key of nobody's.
 
         Raises:
@@ -225,21 +225,21 @@ class Flight:
         """
         own = key.removeprefix(self._prefix)
         if own != key:
-            self._refuse(own)
-            self.refuse_unwritable(own)
+            self._check_key(own)
+            self.check_writable(own)
             return own
-        refuse_others(key)
-        refuse_others(key.partition("/")[2] or key)
+        check_not_reserved(key)
+        check_not_reserved(key.partition("/")[2] or key)
         return None
 
     async def _in_thread(self, wait: Callable[..., Any], *args: Any) -> Any:
-        if self._asked >= ASKED_MAX:
-            raise TooManyError(f"{ASKED_MAX} requests wait for their answers already; ask again later")
-        self._asked += 1
+        if self._pending >= REQUESTS_MAX:
+            raise TooManyError(f"{REQUESTS_MAX} requests wait for their answers already; ask again later")
+        self._pending += 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self._threads, wait, *args)
         finally:
-            self._asked -= 1
+            self._pending -= 1
 
 
 def _tick(box: Mailbox, over: threading.Event) -> None:

@@ -11,7 +11,7 @@ from zsim.errors import DecodeError, RunError
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_bridges import ros_frames
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import conversions
 from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics
 from zsim_bridges.ros1.intake import Intake
@@ -30,7 +30,7 @@ class DismissedError(RunError):
 def serve(
     link: Session,
     info: Info,
-    presence: Presence,
+    presence: ObserverProcess,
     stopped: Callable[[], bool],
     say: Say,
     master_uri: str,
@@ -62,7 +62,7 @@ def serve(
 class Bridge:
     """One run in one ROS graph."""
 
-    def __init__(self, link: Session, info: Info, presence: Presence, node: Node, say: Say) -> None:
+    def __init__(self, link: Session, info: Info, presence: ObserverProcess, node: Node, say: Say) -> None:
         self._link = link
         self._info = info
         self._presence = presence
@@ -80,7 +80,7 @@ class Bridge:
         intake = Intake(self._link, self._info, self._presence.health, asyncio.get_running_loop())
         try:
             async with self._node.running():
-                while not (stopped() or self._presence.over or self._node.dismissed):
+                while not (stopped() or self._presence.end_reason or self._node.dismissed):
                     with contextlib.suppress(TimeoutError):
                         await asyncio.wait_for(intake.news.wait(), POLL_S)
                     await self._pass_on(intake)
@@ -122,7 +122,7 @@ class Bridge:
             return None
 
     def _on_clock(self, payload: bytes) -> None:
-        self._presence.heed(payload)
+        self._presence.update_clock(payload)
         clock = self._decoded(keys.CLOCK, payload)
         if clock is not None:
             self._clock.publish(lambda _: conversions.clock(clock))

@@ -17,7 +17,7 @@ from zsim.scenario.scenario import Scenario
 from zsim.transport import session
 from zsim.transport.identity import Identity
 from zsim.transport.session import Heard, Session
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import conversions, rmw_zenoh, sensor_frames, topics
 from zsim_bridges.ros2.callback_queue import Inbox
 from zsim_bridges.ros2.commands import Commands
@@ -60,7 +60,7 @@ class Bridge:
         wall_ns: time since 1970.
     """
 
-    def __init__(self, link: Session, info: Info, presence: Presence, say: Say, wall_ns: Callable[[], int]) -> None:
+    def __init__(self, link: Session, info: Info, presence: ObserverProcess, say: Say, wall_ns: Callable[[], int]) -> None:
         self._link = link
         self._presence = presence
         self._say = say
@@ -79,7 +79,7 @@ class Bridge:
         self._ends.append(link.hear(keys.CLOCK, self._on_clock))
 
     def _on_clock(self, heard: Heard) -> None:
-        self._inbox.act(partial(self._presence.heed, heard.payload))
+        self._inbox.act(partial(self._presence.update_clock, heard.payload))
 
     def turn(self, within_s: float) -> None:
         """Do what there is to do, waiting for something."""
@@ -193,7 +193,7 @@ def _asking(ask: Callable[..., Any], *about: str) -> Callable[[Any], Any]:
 def serve(
     link: Session,
     info: Info,
-    presence: Presence,
+    presence: ObserverProcess,
     stopped: Callable[[], bool],
     say: Say,
     door: Door,
@@ -208,7 +208,7 @@ def serve(
     with ExitStack() as stack, closing(bridge):
         ros_link = link.bare() if door.router is None else None
         entered = False
-        while not presence.over and not stopped():
+        while not presence.end_reason and not stopped():
             ros_link = ros_link or _reach(stack, door, bridge)
             if ros_link is not None and not entered:
                 bridge.enter(Participant(ros_link, door.domain, Types(), wall_ns, bridge.refuse))

@@ -8,7 +8,7 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import Mode, Velocity
 from zsim.errors import DecodeError
 from zsim.transport.session import Session
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.observer_process import ObserverProcess
 
 STATUS_S = 1.0  # how long a drone's state is waited for
 
@@ -22,7 +22,7 @@ class Commands:
         response: class of std_srvs/Trigger_Response.
     """
 
-    def __init__(self, link: Session, presence: Presence, response: Any) -> None:
+    def __init__(self, link: Session, presence: ObserverProcess, response: Any) -> None:
         self._link = link
         self._presence = presence
         self._response = response

@@ -9,7 +9,7 @@ from zsim_bridges.console.http.page_rights import Value
 EXACT_MAX = 2**53  # a number of a page is whole up to it; a larger one fits no message
 
 
-class KnownControls:
+class PageControls:
     """What viser knows of its controls, and the switches that each page has for itself.
 
     Args:
@@ -21,19 +21,19 @@ class KnownControls:
         self._gui = gui
         self._switches = switches
 
-    def harmless(self, uuid: str) -> bool:
+    def is_local(self, uuid: str) -> bool:
         """Tell whether a control changes nothing but its own page."""
         return uuid in self._switches
 
-    def fits(self, uuid: str, value: Value) -> bool:
+    def accepts(self, uuid: str, value: Value) -> bool:
         """Tell whether a control takes such a value: viser turns it into another type, and fails where it cannot."""
         if uuid in self._switches:
             return isinstance(value, bool)
         handle: Any = self._gui._gui_input_handle_from_uuid.get(uuid)  # viser has no public way to a control by its id
-        return handle is not None and _fits(handle, value)
+        return handle is not None and _accepts(handle, value)
 
 
-def _fits(handle: Any, value: Value) -> bool:
+def _accepts(handle: Any, value: Value) -> bool:
     options = getattr(handle, "options", None)
     if options is not None:
         return value in options

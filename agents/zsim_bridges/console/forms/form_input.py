@@ -7,11 +7,11 @@ from typing import Any
 from zsim.schema import yaml_file
 
 
-class TypedError(ValueError):
+class InputError(ValueError):
     """What was typed cannot be understood; the message says where and what is allowed."""
 
 
-def expressions(text: str, names: tuple[str, ...]) -> dict[str, Any]:
+def parse_expressions(text: str, names: tuple[str, ...]) -> dict[str, Any]:
     """Return the arguments of a trajectory of lines `variable = expression`; other names are constants.
 
     Raises:
@@ -23,20 +23,20 @@ def expressions(text: str, names: tuple[str, ...]) -> dict[str, Any]:
         name, sign, value = (part.strip() for part in line.partition("="))
         if not sign or not name or not value:
             allowed = "VARIABLE = EXPRESSION, such as x_c = 5*cos(0.1*t)"
-            raise TypedError(f"line {number} is {line[:40]!r}; must be {allowed}")
+            raise InputError(f"line {number} is {line[:40]!r}; must be {allowed}")
         if name in names:
             found[name] = value
         else:
             constants[name] = _number(value, f"line {number}: {name} is no variable, and as a constant")
     if not found:
-        raise TypedError("trajectory is empty; must have a line VARIABLE = EXPRESSION at least")
+        raise InputError("trajectory is empty; must have a line VARIABLE = EXPRESSION at least")
     for name in constants:
         if not any(re.search(rf"\b{re.escape(name)}\b", expression) for expression in found.values()):
-            raise TypedError(f"{name} is no variable, nor used as a constant; variables are {', '.join(names)}")
+            raise InputError(f"{name} is no variable, nor used as a constant; variables are {', '.join(names)}")
     return {"expressions": found, "constants": constants}
 
 
-def waypoints(text: str) -> dict[str, Any]:
+def parse_waypoints(text: str) -> dict[str, Any]:
     """Return the arguments of a trajectory of lines `seconds: variable = value, …`.
 
     Raises:
@@ -47,15 +47,15 @@ def waypoints(text: str) -> dict[str, Any]:
         at, colon, rest = line.partition(":")
         pairs = [pair.partition("=") for pair in rest.split(",")]
         if not colon or not all(name.strip() and sign for name, sign, _ in pairs):
-            raise TypedError(f"line {number} is {line[:40]!r}; must be SECONDS: VARIABLE = VALUE, VARIABLE = VALUE, …")
+            raise InputError(f"line {number} is {line[:40]!r}; must be SECONDS: VARIABLE = VALUE, VARIABLE = VALUE, …")
         values = {name.strip(): _number(value, f"line {number}: {name.strip()}") for name, _, value in pairs}
         found.append({"at_s": _number(at, f"line {number}: the time"), "values": values})
     if not found:
-        raise TypedError("waypoints are empty; must have a line SECONDS: VARIABLE = VALUE at least")
+        raise InputError("waypoints are empty; must have a line SECONDS: VARIABLE = VALUE at least")
     return {"waypoints": found}
 
 
-def parameters(text: str, names: Collection[str]) -> dict[str, Any]:
+def parse_parameters(text: str, names: Collection[str]) -> dict[str, Any]:
     """Return a fault's own parameters, of `name: value, name: value`.
 
     Raises:
@@ -65,12 +65,12 @@ def parameters(text: str, names: Collection[str]) -> dict[str, Any]:
     try:
         found = yaml_file.value("{" + text + "}")
     except ValueError as error:
-        raise TypedError(f"{given}: {error}; {allowed}") from None
+        raise InputError(f"{given}: {error}; {allowed}") from None
     if not isinstance(found, dict) or not all(isinstance(name, str) for name in found) or None in found.values():
-        raise TypedError(f"{given}; {allowed}")
+        raise InputError(f"{given}; {allowed}")
     for name in found:
         if name not in names:
-            raise TypedError(f"{given}; {name[:40]!r} is not known, allowed: {', '.join(names)}")
+            raise InputError(f"{given}; {name[:40]!r} is not known, allowed: {', '.join(names)}")
     return found
 
 
@@ -83,4 +83,4 @@ def _number(text: str, what: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise TypedError(f"{what} is {text.strip()[:40]!r}; must be a number") from None
+        raise InputError(f"{what} is {text.strip()[:40]!r}; must be a number") from None

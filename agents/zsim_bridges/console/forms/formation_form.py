@@ -8,13 +8,13 @@ import viser
 from zsim.contract.messages import ViewCluster
 from zsim.scenario.scenario import Cluster, Trajectory
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
-from zsim_bridges.console.command_client import Desk, Told
+from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.forms import form_input
-from zsim_bridges.console.forms.slider_limits import Range, foremost
+from zsim_bridges.console.forms.slider_limits import SliderRange, primary_variables
 from zsim_bridges.console.forms.variable_slider import VariableSlider
-from zsim_bridges.console.scene.picture import SHAPED
+from zsim_bridges.console.scene.picture import SHAPED_PHASES
 
-QUIET_S = 1.0  # wall; for so long sliders must rest before their values are sent: people type slowly
+REST_S = 1.0  # wall; for so long sliders must rest before their values are sent: people type slowly
 OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
 OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Land": "land"}
 ICONS = {
@@ -24,7 +24,7 @@ ICONS = {
     "land": viser.Icon.PLANE_ARRIVAL,
 }
 EXAMPLES = {"expressions": "x_c = 5 + 3*cos(0.1*t)", "waypoints": "0: x_c = 5, y_c = 0\n20: x_c = 5, y_c = 6"}
-Tell = Callable[[Told], None]
+Report = Callable[[RequestOutcome], None]
 
 
 class FormationForm:
@@ -40,7 +40,7 @@ class FormationForm:
     """
 
     def __init__(
-        self, gui: viser.GuiApi, desk: Desk, tell: Tell, cluster: Cluster, space: ClusterSpace, ranges: list[Range]
+        self, gui: viser.GuiApi, desk: CommandClient, tell: Report, cluster: Cluster, space: ClusterSpace, ranges: list[SliderRange]
     ) -> None:
         self._desk = desk
         self._tell = tell
@@ -51,78 +51,78 @@ class FormationForm:
             self._button(gui, label, op)
         hint = "Duration of a move; 0: as fast as the robots' limits let it"
         self._over = gui.add_number("over [s]", 0.0, min=0.0, max=OVER_MAX_S, step=0.5, hint=hint)
-        shown = foremost(space.names)
+        shown = primary_variables(space.names)
         self._sliders = {name: VariableSlider(gui, self._ranges[name]) for name in shown}
         if len(shown) < space.size:
-            self._one_of_many(gui, [name for name in space.names if name not in shown])
+            self._single_variable(gui, [name for name in space.names if name not in shown])
         self._trajectories(gui, cluster.plan.trajectory)
 
     def refresh(self, view: ViewCluster | None, wall_s: float) -> None:
         """Let the sliders that nobody moves follow the formation."""
         if view is None:
             return
-        shown = view.desired if view.phase in SHAPED else view.value
+        shown = view.desired if view.phase in SHAPED_PHASES else view.value
         for name, slider in self._sliders.items():
             slider.follow(shown[self._space.index(name)], wall_s)
 
     def send(self, wall_s: float) -> None:
         """Ask for what the sliders that have come to rest show."""
         moved_s = [slider.moved_s for slider in self._sliders.values()]
-        if wall_s - max((at_s for at_s in moved_s if at_s is not None), default=wall_s) < QUIET_S:
+        if wall_s - max((at_s for at_s in moved_s if at_s is not None), default=wall_s) < REST_S:
             return
-        moved = {name: value for name, slider in self._sliders.items() if (value := slider.take()) is not None}
-        if self.target(moved):
+        moved = {name: value for name, slider in self._sliders.items() if (value := slider.pop_value()) is not None}
+        if self.request_target(moved):
             for name in moved:
-                self._sliders[name].keep(wall_s)
+                self._sliders[name].hold(wall_s)
 
-    def target(self, shown: dict[str, float]) -> bool:
+    def request_target(self, shown: dict[str, float]) -> bool:
         """Ask for values as they are shown; return whether they could be asked for."""
         refusals = [refusal for name, value in shown.items() if (refusal := self._ranges[name].refusal(value))]
         if refusals:
-            self._tell(Told(f"{self._cluster.name}: target", "; ".join(refusals)))
+            self._tell(RequestOutcome(f"{self._cluster.name}: target", "; ".join(refusals)))
             return False
-        values = {name: self._ranges[name].meant(value) for name, value in shown.items()}
+        values = {name: self._ranges[name].to_si(value) for name, value in shown.items()}
         lasting = {"over_s": float(self._over.value)} if self._over.value > 0 else {}
         said = ", ".join(f"{name} {value:g} {self._ranges[name].unit}" for name, value in shown.items())
-        self._desk.cluster(self._cluster.name, "target", said=said, values=values, **lasting)
+        self._desk.request_cluster(self._cluster.name, "target", said=said, values=values, **lasting)
         return True
 
     def _button(self, gui: viser.GuiApi, label: str, op: str) -> None:
         button = gui.add_button(label, icon=ICONS[op], color="blue" if op in ("takeoff", "engage") else "gray")
-        button.on_click(lambda _: self._desk.cluster(self._cluster.name, op))
+        button.on_click(lambda _: self._desk.request_cluster(self._cluster.name, op))
 
-    def _one_of_many(self, gui: viser.GuiApi, names: list[str]) -> None:
+    def _single_variable(self, gui: viser.GuiApi, names: list[str]) -> None:
         with gui.add_folder("Other variables", expand_by_default=False):
             name = gui.add_dropdown("variable", names)
             value = gui.add_number("value [m or deg]", 0.0, step=0.1)
             gui.add_button("Move it").on_click(lambda _: self._move(name.value, float(value.value)))
 
     def _move(self, name: str, shown: float) -> None:
-        self.target({name: shown})
+        self.request_target({name: shown})
 
     def _trajectories(self, gui: viser.GuiApi, planned: Trajectory | None) -> None:
         with gui.add_folder("Trajectory", expand_by_default=False):
             if planned is not None:
-                gui.add_button("Fly the scenario's").on_click(lambda _: self._fly(lambda: _planned(planned)))
+                gui.add_button("Fly the scenario's").on_click(lambda _: self._fly(lambda: _planned_trajectory(planned)))
             gui.add_markdown("<sub>t in seconds, lengths in metres, angles in radians</sub>")
             text = gui.add_text("expressions", EXAMPLES["expressions"], multiline=True)
             fly = gui.add_button("Fly the expressions")
-            fly.on_click(lambda _: self._fly(lambda: form_input.expressions(text.value, self._space.names)))
+            fly.on_click(lambda _: self._fly(lambda: form_input.parse_expressions(text.value, self._space.names)))
             points = gui.add_text("waypoints", EXAMPLES["waypoints"], multiline=True)
             gui.add_button("Fly the waypoints").on_click(
-                lambda _: self._fly(lambda: form_input.waypoints(points.value))
+                lambda _: self._fly(lambda: form_input.parse_waypoints(points.value))
             )
 
     def _fly(self, read: Callable[[], dict[str, Any]]) -> None:
         try:
             args = read()
-        except form_input.TypedError as error:
-            self._tell(Told(f"{self._cluster.name}: trajectory", str(error)))
+        except form_input.InputError as error:
+            self._tell(RequestOutcome(f"{self._cluster.name}: trajectory", str(error)))
             return
-        self._desk.cluster(self._cluster.name, "trajectory", **args)
+        self._desk.request_cluster(self._cluster.name, "trajectory", **args)
 
 
-def _planned(trajectory: Trajectory) -> dict[str, Any]:
+def _planned_trajectory(trajectory: Trajectory) -> dict[str, Any]:
     if trajectory.waypoints:
         return {"waypoints": [{"at_s": point.at_s, "values": point.values} for point in trajectory.waypoints]}
     return {"expressions": trajectory.expressions, "constants": trajectory.constants}

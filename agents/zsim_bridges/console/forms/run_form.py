@@ -4,7 +4,7 @@ import viser
 
 from zsim.contract.control_limits import GATES_MAX, RATE_MAX
 from zsim.scenario.scenario import Scenario
-from zsim_bridges.console.command_client import Desk
+from zsim_bridges.console.command_client import CommandClient
 
 PINNED = """<style>
 .mantine-ScrollArea-content div:has(.icon-tabler-alert-octagon) {overflow: visible !important}
@@ -22,16 +22,16 @@ class RunForm:
         rate: that the run was started with.
     """
 
-    def __init__(self, gui: viser.GuiApi, desk: Desk, rate: float) -> None:
-        gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE).on_click(lambda _: desk.world("pause"))
-        gui.add_button("Resume", icon=viser.Icon.PLAYER_PLAY).on_click(lambda _: desk.world("resume"))
+    def __init__(self, gui: viser.GuiApi, desk: CommandClient, rate: float) -> None:
+        gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE).on_click(lambda _: desk.request_world("pause"))
+        gui.add_button("Resume", icon=viser.Icon.PLAYER_PLAY).on_click(lambda _: desk.request_world("resume"))
         gates = gui.add_number("gates", 1, min=1, max=GATES_MAX, step=1)
         step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT)
-        step.on_click(lambda _: desk.world("step", gates=int(gates.value)))
+        step.on_click(lambda _: desk.request_world("step", gates=int(gates.value)))
         wanted = gui.add_number(
             "rate", rate, min=0.0, max=RATE_MAX, step=0.5, hint="Real time is 1; 0: as fast as it goes"
         )
-        gui.add_button("Set rate").on_click(lambda _: desk.world("rate", value=float(wanted.value)))
+        gui.add_button("Set rate").on_click(lambda _: desk.request_world("rate", value=float(wanted.value)))
 
 
 class FleetForm:
@@ -45,23 +45,23 @@ class FleetForm:
         scenario: names the drones and formations.
     """
 
-    def __init__(self, gui: viser.GuiApi, desk: Desk, scenario: Scenario) -> None:
+    def __init__(self, gui: viser.GuiApi, desk: CommandClient, scenario: Scenario) -> None:
         self._desk = desk
         self._formations = [cluster.name for cluster in scenario.clusters]
         in_formation = {name for cluster in scenario.clusters for name in cluster.drones}
         everybody = [drone.name for drone in scenario.drones]
         self._single = [name for name in everybody if name not in in_formation]
         stop = gui.add_button("EMERGENCY – all rotors stop", color="red", icon=viser.Icon.ALERT_OCTAGON)
-        stop.on_click(lambda _: desk.mode(everybody, "emergency"))
+        stop.on_click(lambda _: desk.send_mode(everybody, "emergency"))
         gui.add_html(PINNED)
         both = gui.add_button_group("all drones", list(FLEET))
         both.on_click(lambda _: self._ask(FLEET[both.value]))
 
     def _ask(self, what: str) -> None:
         for name in self._formations:
-            self._desk.cluster(name, what)
+            self._desk.request_cluster(name, what)
         if self._single:
-            self._desk.mode(self._single, what)
+            self._desk.send_mode(self._single, what)
 
 
 class DroneForm:
@@ -73,7 +73,7 @@ class DroneForm:
         scenario: names the drones.
     """
 
-    def __init__(self, gui: viser.GuiApi, desk: Desk, scenario: Scenario) -> None:
+    def __init__(self, gui: viser.GuiApi, desk: CommandClient, scenario: Scenario) -> None:
         names = [drone.name for drone in scenario.drones]
         self._chosen = gui.add_dropdown("drone", names)
         for label, mode, icon in (
@@ -84,7 +84,7 @@ class DroneForm:
         ):
             colour = "red" if mode == "emergency" else "gray"
             button = gui.add_button(label, icon=icon, color=colour)
-            button.on_click(lambda _, mode=mode: desk.mode([self._chosen.value], mode))
+            button.on_click(lambda _, mode=mode: desk.send_mode([self._chosen.value], mode))
 
     @property
     def chosen(self) -> str:

@@ -7,18 +7,18 @@ from typing import NamedTuple
 from zsim.scenario.scenario import Cluster, Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, unit
 
-AWAY_M = 50.0  # of the drones' starts, sideways; chosen: as far as a page shows a formation well
+SIDEWAYS_M = 50.0  # of the drones' starts, sideways; chosen: as far as a page shows a formation well
 HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # chosen: clear of the ground, and what an AR.Drone's owner would still see
 SIDE_MAX_M = 20.0  # of a formation; chosen
-DEPART_M = 5.0  # of a robot from its place in a template; chosen
+DISPLACEMENT_M = 5.0  # of a robot from its place in a template; chosen
 TILT_MAX_DEG = 29.0  # of a formation; controllers take less than 30, reference_check.py
 CORNER_DEG = 10.0  # least angle at a corner; at 0 and at 180 degrees robots stand in line
 DIGITS = 6  # of a value as it is shown: 5.1, not 5.1000000000000005
 STEPS = {"m": 0.1, "deg": 1.0}
-FEW = 16  # variables that a page shows one by one; of more, those of the whole formation
+SHOWN_MAX = 16  # variables that a page shows one by one; of more, those of the whole formation
 
 
-class Range(NamedTuple):
+class SliderRange(NamedTuple):
     """A variable as a person moves it.
 
     Attributes:
@@ -37,12 +37,12 @@ class Range(NamedTuple):
     def label(self) -> str:
         return f"{self.name} [{self.unit}]"
 
-    def shown(self, value: float) -> float:
+    def to_display(self, value: float) -> float:
         """Return a value [m, rad] in the unit of the range, to its step, within it."""
         found = math.degrees(math.remainder(value, math.tau)) if self.unit == "deg" else value
         return min(max(round(round(found / self.step) * self.step, DIGITS), self.low), self.high)
 
-    def meant(self, shown: float) -> float:
+    def to_si(self, shown: float) -> float:
         """Return the value [m, rad] of what is shown."""
         return math.radians(shown) if self.unit == "deg" else shown
 
@@ -53,7 +53,7 @@ class Range(NamedTuple):
         return None
 
 
-def ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> list[Range]:
+def slider_ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> list[SliderRange]:
     """Return the ranges of all variables of a formation, in their order."""
     starts = [scenario.drone(name).position_m for name in cluster.drones]
     top_m = min(HEIGHT_MAX_M, *(scenario.drone(name).limits.altitude_m for name in cluster.drones))
@@ -61,8 +61,8 @@ def ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> list[Ra
     apart_m = max(cluster.gains.separation_min_m, STEPS["m"])
     side = (apart_m, max(SIDE_MAX_M, 2.0 * apart_m))
     bounds = {
-        "x_c": (round(centre[0]) - AWAY_M, round(centre[0]) + AWAY_M),
-        "y_c": (round(centre[1]) - AWAY_M, round(centre[1]) + AWAY_M),
+        "x_c": (round(centre[0]) - SIDEWAYS_M, round(centre[0]) + SIDEWAYS_M),
+        "y_c": (round(centre[1]) - SIDEWAYS_M, round(centre[1]) + SIDEWAYS_M),
         "z_c": (min(HEIGHT_MIN_M, top_m / 2.0), top_m),
         **dict.fromkeys(("p", "q", "rho"), side),
         **dict.fromkeys(("roll", "pitch", "elevation"), (-TILT_MAX_DEG, TILT_MAX_DEG)),
@@ -71,15 +71,15 @@ def ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> list[Ra
     return [_range(name, bounds) for name in space.names]
 
 
-def _range(name: str, bounds: dict[str, tuple[float, float]]) -> Range:
+def _range(name: str, bounds: dict[str, tuple[float, float]]) -> SliderRange:
     shown_in = "deg" if unit(name) == "rad" else "m"
-    whole = (-180.0, 180.0) if shown_in == "deg" else (-DEPART_M, DEPART_M)
+    whole = (-180.0, 180.0) if shown_in == "deg" else (-DISPLACEMENT_M, DISPLACEMENT_M)
     stem = name.rpartition(".")[2].rstrip("0123456789").rstrip("_")
     low, high = bounds.get(name) or bounds.get(stem) or whole
-    return Range(name, shown_in, float(low), float(high), STEPS[shown_in])
+    return SliderRange(name, shown_in, float(low), float(high), STEPS[shown_in])
 
 
-def foremost(names: Sequence[str]) -> list[str]:
+def primary_variables(names: Sequence[str]) -> list[str]:
     """Return the variables that a page shows one by one: all of few; of many, those of the whole formation."""
     whole = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw", "p", "q", "beta")
-    return list(names) if len(names) <= FEW else [name for name in names if name in whole]
+    return list(names) if len(names) <= SHOWN_MAX else [name for name in names if name in whole]

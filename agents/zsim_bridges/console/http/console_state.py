@@ -4,16 +4,16 @@ from collections.abc import Mapping
 from typing import Any
 
 from zsim.contract.messages import Fault, ViewCluster, ViewDrones
-from zsim_bridges.console.scene.picture import Shape
+from zsim_bridges.console.scene.picture import FormationShape
 from zsim_bridges.console.table_rows import sigma_m
-from zsim_bridges.console.time_monitor import Watch
-from zsim_bridges.console.view_buffer import Eyes
+from zsim_bridges.console.time_monitor import TimeMonitor
+from zsim_bridges.console.view_buffer import ViewBuffer
 
-EVENTS_TOLD = 20
+EVENTS_MAX = 20
 SILENT = "silent"  # in place of the clock's state, where the world answers nothing
 
 
-def state(run_id: str, eyes: Eyes, watch: Watch, shapes: Mapping[str, Shape | None]) -> dict[str, Any]:
+def console_state(run_id: str, eyes: ViewBuffer, watch: TimeMonitor, shapes: Mapping[str, FormationShape | None]) -> dict[str, Any]:
     """Return what is shown of a run.
 
     Args:
@@ -32,12 +32,12 @@ def state(run_id: str, eyes: Eyes, watch: Watch, shapes: Mapping[str, Shape | No
         "drones": _drones(view, eyes) if view else [],
         "clusters": [_cluster(name, each, shapes.get(name)) for name, each in clusters.items()],
         "faults": [_fault(fault) for fault in eyes.faults],
-        "events": [{"t_s": e.t_ns / 1e9, "kind": e.kind, "text": e.text} for e in list(eyes.events)[:EVENTS_TOLD]],
+        "events": [{"t_s": e.t_ns / 1e9, "kind": e.kind, "text": e.text} for e in list(eyes.events)[:EVENTS_MAX]],
     }
 
 
-def _drones(view: ViewDrones, eyes: Eyes) -> list[dict[str, Any]]:
-    sigmas = {name: sigma_m(belief.estimate) for name, belief in eyes.beliefs().items() if belief.fresh}
+def _drones(view: ViewDrones, eyes: ViewBuffer) -> list[dict[str, Any]]:
+    sigmas = {name: sigma_m(belief.estimate) for name, belief in eyes.estimates().items() if belief.fresh}
     return [
         {"name": d.name, "position_m": list(d.position_m), "state": d.state, "sigma_m": sigmas.get(d.name)}
         for d in view.drones
@@ -50,7 +50,7 @@ def _fault(fault: Fault) -> dict[str, Any]:
     return {**about, "from_s": fault.from_ns / 1e9, "until_s": until_s}
 
 
-def _cluster(name: str, view: ViewCluster, found: Shape | None) -> dict[str, Any]:
+def _cluster(name: str, view: ViewCluster, found: FormationShape | None) -> dict[str, Any]:
     return {
         "name": name,
         "phase": view.phase,

@@ -18,13 +18,13 @@ from aiohttp import ClientError, ClientSession, WSMsgType, web
 from zsim.errors import RunError
 from zsim_bridges.console.http.page_rights import (
     OPERATOR,
-    SAID_MAX,
+    MESSAGE_MAX,
     VIEW_PATH,
     VIEWER,
-    Asked,
-    Controls,
-    Guard,
-    may_pass,
+    PageRequest,
+    ControlRights,
+    PageTokens,
+    is_permitted,
 )
 from zsim_bridges.console.http.private_viser import HOST, SECRET_HEADER
 from zsim_bridges.loop_thread import opened_on
@@ -48,20 +48,20 @@ VIEW_STYLE = (
 _QUIET = logging.Logger("quiet", logging.CRITICAL + 1)  # what is no HTTP is answered, and nobody's business
 
 
-class Place(NamedTuple):
+class ListenAddress(NamedTuple):
     """Where pages are served."""
 
     host: str
     port: int
 
-    def address(self, path: str = "/", token: str | None = None) -> str:
+    def url(self, path: str = "/", token: str | None = None) -> str:
         """Return the address of a page, as others reach it where all of them may."""
         host = socket.gethostname() if self.host in EVERYWHERE else self.host
         shown = f"[{host}]" if ":" in host else host
         return f"http://{shown}:{self.port}{path}" + (f"?token={quote(token, safe='')}" if token else "")
 
 
-class Inside(NamedTuple):
+class ViserBackend(NamedTuple):
     """What stands behind the door.
 
     Attributes:
@@ -74,10 +74,10 @@ class Inside(NamedTuple):
     port: int
     secret: str
     state: Callable[[], dict[str, Any]]
-    controls: Controls
+    controls: ControlRights
 
 
-class Door:
+class HttpProxy:
     """One door.
 
     Args:
@@ -89,21 +89,21 @@ class Door:
         RunError: others could reach it, and there is no token.
     """
 
-    def __init__(self, place: Place, token: str | None, inside: Inside) -> None:
+    def __init__(self, place: ListenAddress, token: str | None, inside: ViserBackend) -> None:
         self._place = place
         self._token = token
         self._view_token = secrets.token_urlsafe(12)
-        self._guard = Guard(place.host, place.port, token, self._view_token)
-        self._inside = inside
+        self._tokens = PageTokens(place.host, place.port, token, self._view_token)
+        self._backend = inside
         self._pages = _pages()
         self._open_pages: Counter[str] = Counter()  # by role
         self._loop = asyncio.new_event_loop()
         self._client: ClientSession | None = None
 
-    def links(self) -> dict[str, str]:
+    def urls(self) -> dict[str, str]:
         """Return the addresses to be opened, by role."""
         shown = self._view_token if self._token is not None else None
-        return {OPERATOR: self._place.address("/", self._token), VIEWER: self._place.address(VIEW_PATH, shown)}
+        return {OPERATOR: self._place.url("/", self._token), VIEWER: self._place.url(VIEW_PATH, shown)}
 
     @contextmanager
     def open(self) -> Iterator[None]:
@@ -139,30 +139,30 @@ class Door:
 
     async def _page(self, request: web.Request) -> web.StreamResponse:
         """Serve the page, or the stream of what it shows."""
-        asked = _asked(request)
-        role = self._guard.role(asked)
+        asked = _page_request(request)
+        role = self._tokens.role_of(asked)
         if role is None:
-            return _refusal()
+            return _missing_token()
         if asked.token:
-            return self._welcome(asked)
+            return self._set_cookie(asked)
         if request.headers.get("Upgrade", "").lower() == "websocket":
             return await self._stream(request, role)
         body = self._pages[role]
         headers = {**HEADERS, "Content-Encoding": "gzip"}
         return web.Response(body=body, content_type="text/html", charset="utf-8", headers=headers)
 
-    def _welcome(self, asked: Asked) -> web.Response:
+    def _set_cookie(self, asked: PageRequest) -> web.Response:
         """Put the token into a cookie, and out of the address."""
         response = web.Response(status=303, headers={**HEADERS, "Location": asked.path})
-        role = self._guard.shown(asked)
+        role = self._tokens.role_of_address(asked)
         if role is not None:
-            response.set_cookie(self._guard.cookie(role), asked.token, httponly=True, samesite="Strict", path="/")
+            response.set_cookie(self._tokens.cookie(role), asked.token, httponly=True, samesite="Strict", path="/")
         return response
 
     async def _state(self, request: web.Request) -> web.Response:
-        if self._guard.role(_asked(request)) is None:
-            return _refusal()
-        body = msgspec.json.encode(self._inside.state())
+        if self._tokens.role_of(_page_request(request)) is None:
+            return _missing_token()
+        body = msgspec.json.encode(self._backend.state())
         return web.Response(body=body, content_type="application/json", headers=HEADERS)
 
     async def _stream(self, request: web.Request, role: str) -> web.StreamResponse:
@@ -170,23 +170,23 @@ class Door:
             return web.Response(status=503, text=f"{PAGES_MAX} pages are open already; close one\n", headers=HEADERS)
         self._open_pages[role] += 1
         try:
-            return await self._pass_on(request, role)
+            return await self._relay(request, role)
         finally:
             self._open_pages[role] -= 1
 
-    async def _pass_on(self, request: web.Request, role: str) -> web.WebSocketResponse:
+    async def _relay(self, request: web.Request, role: str) -> web.WebSocketResponse:
         """Pass on what both sides say, until one hangs up."""
         spoken = [part.strip() for part in request.headers.get("Sec-WebSocket-Protocol", "").split(",") if part.strip()]
-        page = web.WebSocketResponse(protocols=spoken, compress=False, max_msg_size=SAID_MAX, heartbeat=HEARTBEAT_S)
+        page = web.WebSocketResponse(protocols=spoken, compress=False, max_msg_size=MESSAGE_MAX, heartbeat=HEARTBEAT_S)
         await page.prepare(request)
         assert self._client is not None
-        address = f"ws://{HOST}:{self._inside.port}/"
-        headers = {SECRET_HEADER: self._inside.secret}
+        address = f"ws://{HOST}:{self._backend.port}/"
+        headers = {SECRET_HEADER: self._backend.secret}
         try:
             dialled = self._client.ws_connect(address, protocols=spoken, headers=headers, compress=0, max_msg_size=0)
             async with dialled as viser:
                 ways = [
-                    asyncio.ensure_future(way) for way in (_outwards(viser, page), self._inwards(page, viser, role))
+                    asyncio.ensure_future(way) for way in (_to_page(viser, page), self._to_viser(page, viser, role))
                 ]
                 await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
                 for way in ways:
@@ -197,25 +197,25 @@ class Door:
         await page.close()
         return page
 
-    async def _inwards(self, page: web.WebSocketResponse, viser: Any, role: str) -> None:
+    async def _to_viser(self, page: web.WebSocketResponse, viser: Any, role: str) -> None:
         async for said in page:
-            if said.type is WSMsgType.BINARY and may_pass(said.data, role, self._inside.controls):
+            if said.type is WSMsgType.BINARY and is_permitted(said.data, role, self._backend.controls):
                 await viser.send_bytes(said.data)
 
 
-async def _outwards(viser: Any, page: web.WebSocketResponse) -> None:
+async def _to_page(viser: Any, page: web.WebSocketResponse) -> None:
     async for shown in viser:
         if shown.type is WSMsgType.BINARY:
             await page.send_bytes(shown.data)
 
 
-def _asked(request: web.Request) -> Asked:
+def _page_request(request: web.Request) -> PageRequest:
     headers = request.headers
     token = request.query.get("token", "")
-    return Asked(request.path, headers.get("Host", ""), headers.get("Origin"), token, dict(request.cookies))
+    return PageRequest(request.path, headers.get("Host", ""), headers.get("Origin"), token, dict(request.cookies))
 
 
-def _refusal() -> web.Response:
+def _missing_token() -> web.Response:
     text = "This page needs the token of the console: open the link that it printed when it started.\n"
     return web.Response(status=401, text=text, headers=HEADERS)
 

@@ -13,7 +13,7 @@ from zsim_bridges.gateway.http.access_check import is_loopback
 
 OPERATOR, VIEWER = "operator", "viewer"
 VIEW_PATH = "/view"
-SAID_MAX = 100_000  # bytes of one thing that a page says
+MESSAGE_MAX = 100_000  # bytes of one thing that a page says
 VALUE_MAX = 2_000  # characters of a control's text: expressions of twelve variables, a line each
 
 Value = bool | messages.Number | Annotated[str, Meta(max_length=VALUE_MAX)]
@@ -33,7 +33,7 @@ class Camera(Struct, tag_field="type", tag="ViewerCameraMessage"):
     up_direction: messages.Vector3
 
 
-class Moved(Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):
+class ControlUpdate(Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):
     """What a page says when somebody moves a control."""
 
     class Updates(Struct, forbid_unknown_fields=True):
@@ -45,11 +45,11 @@ class Moved(Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fie
     updates: Updates
 
 
-_SAID = msgspec.msgpack.Decoder(Camera | Moved)
+_DECODER = msgspec.msgpack.Decoder(Camera | ControlUpdate)
 """All else is nobody's: to ask viser to show the page on the Internet, or to upload files."""
 
 
-class Asked(NamedTuple):
+class PageRequest(NamedTuple):
     """What a request over HTTP shows of itself."""
 
     path: str
@@ -59,7 +59,7 @@ class Asked(NamedTuple):
     cookies: dict[str, str]
 
 
-class Guard:
+class PageTokens:
     """Knows the tokens.
 
     Args:
@@ -83,29 +83,29 @@ class Guard:
         """Return the name of a role's cookie: a browser keeps those of all ports of a host together."""
         return f"zsim_{role}_{self._port}"
 
-    def role(self, asked: Asked) -> str | None:
+    def role_of(self, asked: PageRequest) -> str | None:
         """Return as what a page of this path may be opened, None if it may not."""
         wanted = VIEWER if asked.path.startswith(VIEW_PATH) else OPERATOR
         if self._tokens[OPERATOR] is None:
-            return wanted if _is_own(asked) else None
-        if asked.origin is not None and _site(asked.origin) != asked.host:
+            return wanted if _is_from_own_page(asked) else None
+        if asked.origin is not None and _origin_address(asked.origin) != asked.host:
             return None
         enough = (OPERATOR,) if wanted == OPERATOR else (VIEWER, OPERATOR)
-        return wanted if any(self._shows(asked, role) for role in enough) else None
+        return wanted if any(self._has_token(asked, role) for role in enough) else None
 
-    def shown(self, asked: Asked) -> str | None:
+    def role_of_address(self, asked: PageRequest) -> str | None:
         """Return the role whose token stands in the address, None if none does: it is to become a cookie."""
-        return next((role for role in (OPERATOR, VIEWER) if asked.token and self._is(asked.token, role)), None)
+        return next((role for role in (OPERATOR, VIEWER) if asked.token and self._is_token(asked.token, role)), None)
 
-    def _shows(self, asked: Asked, role: str) -> bool:
-        return self._is(asked.token, role) or self._is(asked.cookies.get(self.cookie(role), ""), role)
+    def _has_token(self, asked: PageRequest, role: str) -> bool:
+        return self._is_token(asked.token, role) or self._is_token(asked.cookies.get(self.cookie(role), ""), role)
 
-    def _is(self, shown: str, role: str) -> bool:
+    def _is_token(self, shown: str, role: str) -> bool:
         token = self._tokens[role]
         return token is not None and hmac.compare_digest(shown.encode(errors="replace"), token.encode())
 
 
-def _site(origin: str) -> str | None:
+def _origin_address(origin: str) -> str | None:
     """Return host and port of an Origin header, None where it has none that can be read."""
     try:
         return urlsplit(origin).netloc
@@ -113,7 +113,7 @@ def _site(origin: str) -> str | None:
         return None
 
 
-def _is_own(asked: Asked) -> bool:
+def _is_from_own_page(asked: PageRequest) -> bool:
     """Tell whether a request comes from this machine's own pages, by a name of this machine."""
     try:
         page = asked.host if asked.origin is None else urlsplit(asked.origin).netloc
@@ -122,19 +122,19 @@ def _is_own(asked: Asked) -> bool:
         return False
 
 
-class Controls(Protocol):
+class ControlRights(Protocol):
     """What is known of the controls of pages, by their ids."""
 
-    def harmless(self, uuid: str) -> bool:
+    def is_local(self, uuid: str) -> bool:
         """Tell whether a control changes nothing but its own page."""
         ...
 
-    def fits(self, uuid: str, value: Value) -> bool:
+    def accepts(self, uuid: str, value: Value) -> bool:
         """Tell whether a control takes such a value."""
         ...
 
 
-def may_pass(said: bytes, role: str, controls: Controls) -> bool:
+def is_permitted(said: bytes, role: str, controls: ControlRights) -> bool:
     """Tell whether something that a page says may reach the console.
 
     Args:
@@ -142,13 +142,13 @@ def may_pass(said: bytes, role: str, controls: Controls) -> bool:
         role: of the page.
         controls: of all pages.
     """
-    if len(said) > SAID_MAX:
+    if len(said) > MESSAGE_MAX:
         return False
     try:
-        message = _SAID.decode(said)
+        message = _DECODER.decode(said)
     except (msgspec.MsgspecError, ValueError, RecursionError):
         return False
     if isinstance(message, Camera):
         return True
-    permitted = role == OPERATOR or controls.harmless(message.uuid)
-    return permitted and controls.fits(message.uuid, message.updates.value)
+    permitted = role == OPERATOR or controls.is_local(message.uuid)
+    return permitted and controls.accepts(message.uuid, message.updates.value)

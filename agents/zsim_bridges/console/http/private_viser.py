@@ -55,7 +55,7 @@ class PrivateViser:
 
     def __init__(self) -> None:
         self.secret = secrets.token_urlsafe(24)
-        with _silent(), _bolted(self.secret):
+        with _silent(), _requiring_secret(self.secret):
             self.server = viser.ViserServer(host=HOST, port=0, verbose=False)
 
     @property
@@ -76,7 +76,7 @@ def _silent() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _bolted(secret: str) -> Iterator[None]:
+def _requiring_secret(secret: str) -> Iterator[None]:
     """Let servers that are started meanwhile refuse who does not show the secret: viser has no setting for it."""
     serve = websockets.asyncio.server.serve
 

@@ -8,12 +8,12 @@ import viser
 
 from zsim_bridges.console.scene.picture import Array
 
-FROM_M = np.array([-2.3, -3.9, 1.7])  # of a camera, from what it looks at, where that is not larger than EXTENT_M
+OFFSET_M = np.array([-2.3, -3.9, 1.7])  # of a camera, from what it looks at, where that is not larger than EXTENT_M
 EXTENT_M = 2.0  # from its middle
-NEAR_M = 0.25  # a shorter way of what is followed does not move the camera: pictures then need not be drawn anew
+DEADBAND_M = 0.25  # a shorter way of what is followed does not move the camera: pictures then need not be drawn anew
 
 
-class Followers:
+class CameraFollow:
     """Knows the pages that are open.
 
     Args:
@@ -30,59 +30,59 @@ class Followers:
         self._switches: dict[int, tuple[viser.ClientHandle, Any]] = {}
         self._places: dict[int, Array] = {}
         self._centre: Array = np.zeros(3)
-        self._offset: Array = FROM_M
-        self._begun = False
-        server.on_client_connect(self._come)
-        server.on_client_disconnect(self._go)
+        self._offset: Array = OFFSET_M
+        self._aimed = False
+        server.on_client_connect(self._on_connect)
+        server.on_client_disconnect(self._on_disconnect)
 
-    def begin(self) -> None:
+    def restart(self) -> None:
         """Let all cameras look at what is to be seen first: another run may fly elsewhere."""
-        self._begun = False
+        self._aimed = False
 
-    def begin_at(self, p_W: Array) -> None:
+    def set_target(self, p_W: Array) -> None:
         """Let the cameras of pages to come look at what stands at some places (n, 3) [m], unless there is nothing."""
         if not len(p_W):
             return
         self._centre = p_W.mean(axis=0)
         extent_m = float(np.linalg.norm(p_W - self._centre, axis=1).max())
-        self._offset = FROM_M * max(1.0, extent_m / EXTENT_M)
+        self._offset = OFFSET_M * max(1.0, extent_m / EXTENT_M)
 
     def follow(self, p_W: Array) -> None:
         """Move the cameras that follow what now stands at some places (n, 3) [m]."""
-        self.begin_at(p_W)
+        self.set_target(p_W)
         centre = self._centre
         with self._lock:
             switches = list(self._switches.items())
-        if not self._begun and len(p_W):
-            self._begun = True
+        if not self._aimed and len(p_W):
+            self._aimed = True
             for _, (client, _) in switches:
-                _look(client, centre, self._offset)
+                _aim(client, centre, self._offset)
         for number, (client, switch) in switches:
             if self._moves(number, switch.value, centre):
-                _look(client, centre, client.camera.position - client.camera.look_at)
+                _aim(client, centre, client.camera.position - client.camera.look_at)
 
     def _moves(self, number: int, follows: bool, centre: Array) -> bool:
         """Tell whether a page's camera goes to a place, and note that it does."""
         with self._lock:
             if not follows:
                 self._places.pop(number, None)
-            near = np.linalg.norm(centre - self._places.get(number, np.full(3, np.inf))) <= NEAR_M
+            near = np.linalg.norm(centre - self._places.get(number, np.full(3, np.inf))) <= DEADBAND_M
             if not follows or near or number not in self._switches:
                 return False
             self._places[number] = centre
             return True
 
-    def _come(self, client: viser.ClientHandle) -> None:
+    def _on_connect(self, client: viser.ClientHandle) -> None:
         with client.atomic():
-            _look(client, self._centre, self._offset)
+            _aim(client, self._centre, self._offset)
         switch = client.gui.add_checkbox("Camera follows the formation", False, order=-1.0)
         with self._lock:
             self._switches[client.client_id] = (client, switch)
             self.switches.add(switch._impl.uuid)
         if client.client_id not in self._server.get_clients():
-            self._go(client)  # it went while it came
+            self._on_disconnect(client)  # it went while it came
 
-    def _go(self, client: viser.ClientHandle) -> None:
+    def _on_disconnect(self, client: viser.ClientHandle) -> None:
         with self._lock:
             _, switch = self._switches.pop(client.client_id, (None, None))
             self._places.pop(client.client_id, None)
@@ -90,7 +90,7 @@ class Followers:
                 self.switches.discard(switch._impl.uuid)
 
 
-def _look(client: viser.ClientHandle, centre: Array, offset: Array) -> None:
+def _aim(client: viser.ClientHandle, centre: Array, offset: Array) -> None:
     with client.atomic():
         client.camera.position = centre + offset
         client.camera.look_at = centre

@@ -7,17 +7,17 @@ import viser
 from viser import uplot
 
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
-from zsim_bridges.console.forms.slider_limits import Range
-from zsim_bridges.console.scene.variable_history import SERIES, SPAN_S, History
+from zsim_bridges.console.forms.slider_limits import SliderRange
+from zsim_bridges.console.scene.variable_history import SERIES, SPAN_S, VariableHistory
 
-AT_ONCE = 3  # plots
+PLOTS_SHOWN = 3  # plots
 COLOURS = ("#868e96", "#1971c2", "#e8590c")  # of SERIES
 HEIGHT_PX = 150
 AXIS_PX = 56  # of figures such as -12.5, which would be clipped
 NONE = "none"
 
 
-class Plots:
+class VariablePlots:
     """Plots of one formation, three variables at a time.
 
     Args:
@@ -26,14 +26,14 @@ class Plots:
         ranges: of its variables.
     """
 
-    def __init__(self, gui: viser.GuiApi, space: ClusterSpace, ranges: list[Range]) -> None:
-        self.history = History(space.size)
+    def __init__(self, gui: viser.GuiApi, space: ClusterSpace, ranges: list[SliderRange]) -> None:
+        self.history = VariableHistory(space.size)
         self._ranges = ranges
         self._in_degrees = [each.unit == "deg" for each in ranges]
-        self._choices = {_title(ranges[k : k + AT_ONCE]): k for k in range(0, len(ranges), AT_ONCE)}
+        self._choices = {_title(ranges[k : k + PLOTS_SHOWN]): k for k in range(0, len(ranges), PLOTS_SHOWN)}
         self._choice = gui.add_dropdown("variables", [NONE, *self._choices], initial_value=next(iter(self._choices)))
         gui.add_markdown(f"<sub>{_legend()} over time [s], the last {SPAN_S:g} s</sub>")
-        self._plots = [_plot(gui, each) for each in ranges[:AT_ONCE]]
+        self._plots = [_plot(gui, each) for each in ranges[:PLOTS_SHOWN]]
         self._first: int | None = 0
 
     def draw(self) -> None:
@@ -50,7 +50,7 @@ class Plots:
                 plot.data = curves
 
     def _retitle(self) -> None:
-        shown = [] if self._first is None else self._ranges[self._first : self._first + AT_ONCE]
+        shown = [] if self._first is None else self._ranges[self._first : self._first + PLOTS_SHOWN]
         for place, plot in enumerate(self._plots):
             plot.visible = place < len(shown)
             if plot.visible:
@@ -58,7 +58,7 @@ class Plots:
                 plot.data = tuple(np.zeros(2) for _ in range(1 + len(SERIES)))
 
 
-def _title(ranges: list[Range]) -> str:
+def _title(ranges: list[SliderRange]) -> str:
     return ", ".join(each.name for each in ranges)
 
 
@@ -66,7 +66,7 @@ def _legend() -> str:
     return ", ".join(f"<span style='color:{c}'>{name}</span>" for name, c in zip(SERIES, COLOURS, strict=True))
 
 
-def _plot(gui: viser.GuiApi, range_: Range) -> Any:
+def _plot(gui: viser.GuiApi, range_: SliderRange) -> Any:
     curves = [uplot.Series(label=n, stroke=c, width=1.5) for n, c in zip(SERIES, COLOURS, strict=True)]
     none = tuple(np.array([0.0, 1.0]) for _ in range(1 + len(SERIES)))
     return gui.add_uplot(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from zsim.scenario.scenario import Obstacle
 from zsim_bridges.console.scene import airframe
-from zsim_bridges.console.scene.picture import Array, Balls, Drones, Shape, rotor_poses, turned
+from zsim_bridges.console.scene.picture import Array, Ellipsoids, DronePoses, FormationShape, rotor_poses, rotor_angles
 
 NAMED_MAX = 12  # drones with their names beside them; more would hide each other
 TRAIL_COLOURS = np.array(
@@ -22,14 +22,14 @@ FIELD_M = 150.0  # half a side of the ground
 GREEN = (206, 219, 196)
 WIND_M_PER_M_S = 0.5  # length of the arrow
 WIND_MIN_M_S = 0.05  # below it no arrow
-ABOVE_M = 1.5  # of the arrow over the highest drone
+WIND_ABOVE_M = 1.5  # of the arrow over the highest drone
 LABEL_B = np.array([0.0, 0.0, 0.32])  # m; of a name over its drone
 MIDDLE = "center-center"  # of a label, where it is written
 LABELS_MAX = 3  # p, q and beta
 HIDDEN = (0.0, 0.0, -1000.0)  # m; where what is not there is put, since instances cannot be hidden one by one
 
 
-class Stage:
+class SceneNodes:
     """What is drawn of a run.
 
     Args:
@@ -61,7 +61,7 @@ class Stage:
             head_length=0.22, visible=False,
         )  # fmt: skip
         self._wind_label = self._scene.add_label("/wind_speed", "", visible=False, anchor="bottom-center")
-        self._shapes = _Shapes(self._scene, clusters) if clusters else None
+        self._shapes = _FormationNodes(self._scene, clusters) if clusters else None
 
     def obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Draw what drones can run into: boxes, cylinders and spheres of the scenario."""
@@ -79,27 +79,27 @@ class Stage:
             else:
                 self._scene.add_icosphere(name, radius=each.radius_m or 0.0, position=(x, y, z), **look)
 
-    def drones(self, drones: Drones, dt_s: float) -> None:
+    def drones(self, drones: DronePoses, dt_s: float) -> None:
         """Put the drones where they are; their rotors have turned for dt_s."""
-        drones = drones._replace(p_W=np.where(drones.there[:, None], drones.p_W, HIDDEN))
+        drones = drones._replace(p_W=np.where(drones.present[:, None], drones.p_W, HIDDEN))
         self._airframes.batched_positions, self._airframes.batched_wxyzs = drones.p_W, drones.q_WB
-        self._angles = turned(self._angles, drones.rotor, dt_s)
+        self._angles = rotor_angles(self._angles, drones.rotor, dt_s)
         self._rotors.batched_positions, self._rotors.batched_wxyzs = rotor_poses(drones, self._hubs_B, self._angles)
         for label, p_W in zip(self._names, drones.p_W, strict=False):
             label.position = p_W + LABEL_B
 
-    def wind(self, drones: Drones) -> None:
+    def wind(self, drones: DronePoses) -> None:
         """Let the arrow show the wind, above the drones."""
         speed = float(np.linalg.norm(drones.wind_W))
-        there = drones.p_W[drones.there]
+        there = drones.p_W[drones.present]
         blows = speed >= WIND_MIN_M_S and len(there) > 0
         self._wind.visible = self._wind_label.visible = blows
         if blows:
-            start = np.array([*there[:, :2].mean(axis=0), there[:, 2].max() + ABOVE_M])
+            start = np.array([*there[:, :2].mean(axis=0), there[:, 2].max() + WIND_ABOVE_M])
             self._wind.points = np.array([[start, start + WIND_M_PER_M_S * drones.wind_W]])
             self._wind_label.position, self._wind_label.text = start, f"wind {speed:.1f} m/s"
 
-    def estimates(self, balls: Balls) -> None:
+    def estimates(self, balls: Ellipsoids) -> None:
         """Put the ellipsoids where estimators believe the drones to be."""
         p, q, half_m = _padded(self._count, balls.p_W, balls.wxyz)
         half_m[: len(balls.half_m)] = balls.half_m
@@ -111,7 +111,7 @@ class Stage:
             places, turns, _ = _padded(len(self._ghosts.batched_positions), p_W, q)
             self._ghosts.batched_positions, self._ghosts.batched_wxyzs = places, turns
 
-    def shapes(self, shapes: Sequence[Shape | None], chosen: int) -> None:
+    def shapes(self, shapes: Sequence[FormationShape | None], chosen: int) -> None:
         """Draw the frames and triangles of all formations, and the figures of the chosen one."""
         if self._shapes is not None:
             self._shapes.show(shapes, chosen)
@@ -161,7 +161,7 @@ class Stage:
         return [self._scene.add_label(f"/names/{name}", name, anchor="bottom-center") for name in names]
 
 
-class _Shapes:
+class _FormationNodes:
     """Frames and triangles of all formations as one node each, and the labels of one of them."""
 
     def __init__(self, scene: viser.SceneApi, count: int) -> None:
@@ -173,7 +173,7 @@ class _Shapes:
             scene.add_label(f"/formations/label{i}", "", visible=False, anchor=MIDDLE) for i in range(LABELS_MAX)
         ]
 
-    def show(self, shapes: Sequence[Shape | None], chosen: int) -> None:
+    def show(self, shapes: Sequence[FormationShape | None], chosen: int) -> None:
         there = [shape for shape in shapes if shape is not None]
         p_W, q = np.array([s.p_c for s in there]).reshape(-1, 3), np.array([s.q_WC for s in there]).reshape(-1, 4)
         self._frames.batched_positions, self._frames.batched_wxyzs, _ = _padded(len(shapes), p_W, q)
@@ -186,7 +186,7 @@ class _Shapes:
         elif len(points):
             self._lines = self._scene.add_line_segments("/formations/sides", points, SIDE, thickness=0.015)
 
-    def _write(self, shape: Shape | None) -> None:
+    def _write(self, shape: FormationShape | None) -> None:
         texts = [] if shape is None else [(s.name, s.ends_W.mean(axis=0)) for s in shape.sides if s.name]
         texts += [(shape.corner[1], shape.corner[0])] if shape is not None and shape.corner else []
         for i, label in enumerate(self._labels):

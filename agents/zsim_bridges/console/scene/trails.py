@@ -7,10 +7,10 @@ Array = NDArray[np.float64]
 
 POINTS_MAX = 6_000  # of all trails together: 144 kB for a browser each time
 POINTS_OF_ONE = 300
-APART_M = 0.08  # of two points: a sixth of a hull
+SPACING_M = 0.08  # of two points: a sixth of a hull
 
 
-class Trails:
+class DroneTrails:
     """The ways of N drones.
 
     Args:
@@ -25,7 +25,7 @@ class Trails:
     def add(self, p_W: Array) -> bool:
         """Take positions (N, 3) [m], NaN of a drone that is not there; return whether any has moved on."""
         last = self._points[np.arange(len(p_W)), np.maximum(self._lengths - 1, 0)]
-        moved = (np.linalg.norm(p_W - last, axis=1) >= APART_M) | (self._lengths == 0)
+        moved = (np.linalg.norm(p_W - last, axis=1) >= SPACING_M) | (self._lengths == 0)
         moved &= np.isfinite(p_W[:, 0])
         for i in np.flatnonzero(moved):
             if self._lengths[i] == self._room:

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SPAN_S = 180.0  # simulated
-EVERY_S = 0.25  # simulated, between two points; a formation answers within seconds
-POINTS_MAX = int(SPAN_S / EVERY_S)
+INTERVAL_S = 0.25  # simulated, between two points; a formation answers within seconds
+POINTS_MAX = int(SPAN_S / INTERVAL_S)
 SERIES = ("desired", "estimated", "true")
 
 
-class History:
+class VariableHistory:
     """Points of one formation.
 
     Args:
@@ -36,7 +36,7 @@ class History:
         if self._times and t_s < self._times[-1]:
             self._times.clear()
             self._rows.clear()
-        if self._times and t_s - self._times[-1] < EVERY_S:
+        if self._times and t_s - self._times[-1] < INTERVAL_S:
             return False
         unknown = np.full(self._size, np.nan)
         columns = (unknown if each is None else np.asarray(each, dtype=float) for each in (desired, value, true))

@@ -11,7 +11,7 @@ import msgspec
 from aiohttp import web
 
 from zsim.errors import DecodeError, NoWorldError, SessionError, ZsimError
-from zsim_bridges.gateway.client_limits import Bucket
+from zsim_bridges.gateway.client_limits import TokenBucket
 from zsim_bridges.gateway.http.http_errors import ForbiddenError, MethodError, TooManyError, UnknownError
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -30,7 +30,7 @@ STATUS: tuple[tuple[type[ZsimError], int], ...] = (
 METHODS = "GET, POST, PUT, PATCH, DELETE, OPTIONS"
 
 
-class Guard:
+class AccessCheck:
     """Lets requests through or refuses them.
 
     Args:
@@ -41,14 +41,14 @@ class Guard:
     def __init__(self, token: str | None, report: Callable[[str], None]) -> None:
         self._token = token
         self._report = report
-        self._buckets: OrderedDict[str, Bucket] = OrderedDict()
+        self._buckets: OrderedDict[str, TokenBucket] = OrderedDict()
 
     @property
-    def asks(self) -> bool:
+    def needs_token(self) -> bool:
         """Whether a token must be shown."""
         return self._token is not None
 
-    def knows(self, shown: str) -> bool:
+    def is_token(self, shown: str) -> bool:
         """Tell whether a token is the right one."""
         return self._token is None or hmac.compare_digest(_bytes(shown), _bytes(self._token))
 
@@ -65,38 +65,38 @@ class Guard:
             allowed = {"Access-Control-Allow-Methods": METHODS, "Access-Control-Allow-Headers": "*"}
             return web.Response(status=204, headers=allowed)
         try:
-            self._bucket(request.remote or "").take()
-            self._let_in(request)
+            self._bucket(request.remote or "").spend()
+            self._check_access(request)
             return await handler(request)
         except ZsimError as error:
-            status = 401 if isinstance(error, _NoTokenError) else _status(error)
-            return refusal(status, str(error), error.allowed if isinstance(error, MethodError) else ())
+            status = 401 if isinstance(error, _MissingTokenError) else _status(error)
+            return error_response(status, str(error), error.allowed if isinstance(error, MethodError) else ())
         except web.HTTPException as error:
             allowed = error.allowed_methods if isinstance(error, web.HTTPMethodNotAllowed) else ()
             text = " ".join((error.text or error.reason).split())
-            return refusal(error.status, f"{request.method} {request.path[:80]}: {text}", sorted(allowed))
+            return error_response(error.status, f"{request.method} {request.path[:80]}: {text}", sorted(allowed))
         except ConnectionError:
             raise
         except Exception as error:  # a fault of ours: the others are served on
             self._report(f"{request.method} {request.path[:80]}: {error!r}")
-            return refusal(500, f"the gateway failed ({type(error).__name__}); its terminal says more")
+            return error_response(500, f"the gateway failed ({type(error).__name__}); its terminal says more")
 
-    def _let_in(self, request: web.Request) -> None:
-        if not self.knows(_shown(request)):
-            raise _NoTokenError("no token, or a wrong one; send Authorization: Bearer TOKEN, or ?token=TOKEN")
-        if not self.asks and not _is_own(request):
+    def _check_access(self, request: web.Request) -> None:
+        if not self.is_token(_token_of(request)):
+            raise _MissingTokenError("no token, or a wrong one; send Authorization: Bearer TOKEN, or ?token=TOKEN")
+        if not self.needs_token and not _is_from_this_machine(request):
             raise ForbiddenError("a page of another site may not ask here; give the gateway a token, and ask with it")
 
-    def _bucket(self, address: str) -> Bucket:
+    def _bucket(self, address: str) -> TokenBucket:
         bucket = self._buckets.get(address)
         if bucket is None:
-            bucket = self._buckets[address] = Bucket(HTTP_RATE_HZ, HTTP_BURST, time.monotonic)
+            bucket = self._buckets[address] = TokenBucket(HTTP_RATE_HZ, HTTP_BURST, time.monotonic)
             if len(self._buckets) > ADDRESSES_MAX:
                 self._buckets.popitem(last=False)
         return bucket
 
 
-class _NoTokenError(ForbiddenError):
+class _MissingTokenError(ForbiddenError):
     """Who asks has not shown the token."""
 
 
@@ -108,14 +108,14 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def refusal(status: int, text: str, allowed: Iterable[str] = ()) -> web.Response:
+def error_response(status: int, text: str, allowed: Iterable[str] = ()) -> web.Response:
     """Return the answer that says why there is none, and with what methods there is one."""
     headers = {"Allow": ", ".join(allowed)} if allowed else None
     body = msgspec.json.encode({"error": text})
     return web.Response(status=status, body=body, content_type="application/json", headers=headers)
 
 
-def _is_own(request: web.Request) -> bool:
+def _is_from_this_machine(request: web.Request) -> bool:
     """Tell whether a request comes from a program or a page of this machine: browsers say whose page asks.
 
     The name by which we are asked counts too: a stranger's page can let its own name lead to this machine.
@@ -128,7 +128,7 @@ def _is_own(request: web.Request) -> bool:
         return False
 
 
-def _shown(request: web.Request) -> str:
+def _token_of(request: web.Request) -> str:
     kind, _, token = request.headers.get("Authorization", "").partition(" ")
     return token.strip() if kind.lower() == "bearer" else request.query.get("token", "")
 

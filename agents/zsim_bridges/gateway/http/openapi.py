@@ -8,13 +8,13 @@ import msgspec
 from zsim import __version__
 from zsim.contract import messages
 from zsim.contract.messages import ControlAnswer, ControlRequest
-from zsim_bridges.gateway.key_policy import is_spoken
+from zsim_bridges.gateway.key_policy import is_client_key
 
-FILLED = ("t_ns", "seq", "source")  # what a client may leave out
-ASKED = ("world/control", "cluster/{cluster}/control")
+DEFAULTED = ("t_ns", "seq", "source")  # what a client may leave out
+CONTROL_PATHS = ("world/control", "cluster/{cluster}/control")
 _REF = "#/components/schemas/{name}"
 _OWN_KEY = "^[A-Za-z0-9_.-]{1,64}$"  # of one's own; Zenoh takes more
-_REFUSED = {
+_ERRORS = {
     400: "a key or a value that is none",
     401: "no token, or a wrong one",
     403: "somebody else speaks there, or a page of another site asks",
@@ -32,41 +32,41 @@ def description() -> dict[str, Any]:
     shapes = messages.types_by_shape()
     kinds = dict.fromkeys([*shapes.values(), ControlRequest, ControlAnswer])
     _, found = msgspec.json.schema_components(list(kinds), ref_template=_REF)
-    schemas = _plain(found)
+    schemas = _without_prefix_items(found)
     refusal = {"type": "object", "properties": {"error": {"type": "string"}}, "required": ["error"]}
-    paths = {path: item for shape, kind in shapes.items() for path, item in [_value(shape, kind)]}
+    paths = {path: item for shape, kind in shapes.items() for path, item in [_value_path(shape, kind)]}
     return {
         "openapi": "3.1.0",
         "info": {"title": "zsim gateway", "version": __version__, "description": "See docs/gateway.md."},
-        "paths": {**paths, **dict(map(_asked, ASKED)), **_any_key(), **_zenoh()},
+        "paths": {**paths, **dict(map(_control_path, CONTROL_PATHS)), **_own_key_path(), **_zenoh_path()},
         "components": {
-            "schemas": {**schemas, **_sent(shapes, schemas), "Refusal": refusal},
+            "schemas": {**schemas, **_sent_schemas(shapes, schemas), "Refusal": refusal},
             "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
         },
         "security": [{}, {"token": []}],
     }
 
 
-def _plain(schema: Any) -> Any:
+def _without_prefix_items(schema: Any) -> Any:
     """Return a schema with vectors as arrays of one kind of entry: fewer tools know `prefixItems`."""
     if isinstance(schema, list):
-        return [_plain(entry) for entry in schema]
+        return [_without_prefix_items(entry) for entry in schema]
     if not isinstance(schema, dict):
         return schema
-    parts = {name: _plain(part) for name, part in schema.items()}
+    parts = {name: _without_prefix_items(part) for name, part in schema.items()}
     if "prefixItems" in parts:
         parts["items"] = parts.pop("prefixItems")[0]
     return parts
 
 
-def _value(shape: str, kind: type[msgspec.Struct]) -> tuple[str, dict[str, Any]]:
+def _value_path(shape: str, kind: type[msgspec.Struct]) -> tuple[str, dict[str, Any]]:
     path, parameters = _path(shape)
-    item: dict[str, Any] = {"parameters": parameters, "get": _got(kind.__name__, kind.__doc__ or "")}
-    if is_spoken(shape.replace("*", "any")):
+    item: dict[str, Any] = {"parameters": parameters, "get": _get_operation(kind.__name__, kind.__doc__ or "")}
+    if is_client_key(shape.replace("*", "any")):
         item["put"] = {
-            "summary": f"Publish a {kind.__name__}; {', '.join(FILLED)} may be left out",
-            "requestBody": _body(f"{kind.__name__}Sent"),
-            "responses": {"200": {"description": "published"}, **_refusals()},
+            "summary": f"Publish a {kind.__name__}; {', '.join(DEFAULTED)} may be left out",
+            "requestBody": _request_body(f"{kind.__name__}Sent"),
+            "responses": {"200": {"description": "published"}, **_error_responses()},
         }
     return f"/json/{path}", item
 
@@ -85,45 +85,45 @@ def _parameter(name: str) -> dict[str, Any]:
     return {"name": name, "in": "path", "required": True, "schema": schema}
 
 
-def _got(kind: str, text: str) -> dict[str, Any]:
+def _get_operation(kind: str, text: str) -> dict[str, Any]:
     return {
         "summary": f"The last {kind}, or with Accept: text/event-stream every one from now on",
         "description": text,
         "responses": {
-            "200": _answer({"$ref": _REF.format(name=kind)}),
-            **_refusals(),
+            "200": _response({"$ref": _REF.format(name=kind)}),
+            **_error_responses(),
         },
     }
 
 
-def _asked(key: str) -> tuple[str, dict[str, Any]]:
+def _control_path(key: str) -> tuple[str, dict[str, Any]]:
     parameters = [_parameter("cluster")] if "{cluster}" in key else []
     post = {
         "summary": "Ask; the answer says whether it was done",
-        "requestBody": _body("ControlRequest"),
-        "responses": {"200": _answer({"$ref": _REF.format(name="ControlAnswer")}), **_refusals()},
+        "requestBody": _request_body("ControlRequest"),
+        "responses": {"200": _response({"$ref": _REF.format(name="ControlAnswer")}), **_error_responses()},
     }
     return f"/json/{key}", {"parameters": parameters, "post": post}
 
 
-def _any_key() -> dict[str, Any]:
+def _own_key_path() -> dict[str, Any]:
     """Return the path of keys that are none of the contract's."""
     key = {"name": "key", "in": "path", "required": True, "schema": {"type": "string", "pattern": _OWN_KEY}}
     anything = {"description": "a value, or of an expression a list of key and value"}
     return {
         "/json/{key}": {
             "parameters": [key],
-            "get": {"summary": "The last value", "responses": {"200": _answer(anything), **_refusals()}},
+            "get": {"summary": "The last value", "responses": {"200": _response(anything), **_error_responses()}},
             "put": {
                 "summary": "Publish any JSON on a key of one's own",
                 "requestBody": {"required": True, "content": {"application/json": {"schema": {}}}},
-                "responses": {"200": {"description": "published"}, **_refusals()},
+                "responses": {"200": {"description": "published"}, **_error_responses()},
             },
         }
     }
 
 
-def _zenoh() -> dict[str, Any]:
+def _zenoh_path() -> dict[str, Any]:
     """Return the path of whole keys, as Zenoh's REST plugin has it."""
     named = {"federation": "zsim", "key": "world/info"}
     parameters = [
@@ -146,8 +146,8 @@ def _zenoh() -> dict[str, Any]:
             "timestamp": {"type": ["string", "null"]},
         },
     }
-    got = {"200": _answer({"type": "array", "items": entry}), **_refusals()}
-    done = {"200": {"description": "done"}, **_refusals()}
+    got = {"200": _response({"type": "array", "items": entry}), **_error_responses()}
+    done = {"200": {"description": "done"}, **_error_responses()}
     body = {"content": {"*/*": {"schema": {"type": "string", "format": "binary"}}}}
     return {
         "/{federation}/{key}": {
@@ -161,23 +161,23 @@ def _zenoh() -> dict[str, Any]:
     }
 
 
-def _sent(shapes: dict[str, type[msgspec.Struct]], schemas: dict[str, Any]) -> dict[str, Any]:
+def _sent_schemas(shapes: dict[str, type[msgspec.Struct]], schemas: dict[str, Any]) -> dict[str, Any]:
     """Return the schemas of what clients send: what is filled in is not required, what nobody knows is ignored."""
-    kinds = [kind.__name__ for shape, kind in shapes.items() if is_spoken(shape.replace("*", "any"))]
+    kinds = [kind.__name__ for shape, kind in shapes.items() if is_client_key(shape.replace("*", "any"))]
     return {
-        f"{kind}Sent": {**schemas[kind], "required": [name for name in schemas[kind]["required"] if name not in FILLED]}
+        f"{kind}Sent": {**schemas[kind], "required": [name for name in schemas[kind]["required"] if name not in DEFAULTED]}
         for kind in kinds
     }
 
 
-def _body(schema: str) -> dict[str, Any]:
+def _request_body(schema: str) -> dict[str, Any]:
     return {"required": True, "content": {"application/json": {"schema": {"$ref": _REF.format(name=schema)}}}}
 
 
-def _answer(schema: dict[str, Any], text: str = "answered") -> dict[str, Any]:
+def _response(schema: dict[str, Any], text: str = "answered") -> dict[str, Any]:
     return {"description": text, "content": {"application/json": {"schema": schema}}}
 
 
-def _refusals() -> dict[str, Any]:
+def _error_responses() -> dict[str, Any]:
     schema = {"$ref": _REF.format(name="Refusal")}
-    return {str(status): _answer(schema, text) for status, text in _REFUSED.items()}
+    return {str(status): _response(schema, text) for status, text in _ERRORS.items()}

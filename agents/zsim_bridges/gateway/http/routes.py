@@ -4,18 +4,18 @@ from collections.abc import Awaitable, Callable
 
 from aiohttp import web
 
-from zsim_bridges.gateway.http.access_check import Guard
-from zsim_bridges.gateway.http.json_tree import BELOW, JsonTree
+from zsim_bridges.gateway.http.access_check import AccessCheck
+from zsim_bridges.gateway.http.json_tree import JSON_PREFIX, JsonTree
 from zsim_bridges.gateway.http.openapi import description
 from zsim_bridges.gateway.http.zenoh_rest import RestTree
 from zsim_bridges.gateway.lines import websocket
-from zsim_bridges.gateway.lines.tcp_lines import LINE_MAX, Meet
+from zsim_bridges.gateway.lines.tcp_lines import LINE_MAX, ClientFactory
 
 STREAM, DESCRIPTION = "/stream", "/openapi.json"
 TREE = {"GET": "ask", "POST": "ask", "PUT": "put", "PATCH": "put", "DELETE": "delete"}
 
 
-def application(guard: Guard, rest: RestTree, tree: JsonTree, meet: Meet) -> web.Application:
+def application(guard: AccessCheck, rest: RestTree, tree: JsonTree, meet: ClientFactory) -> web.Application:
     """Return the web application of a gateway.
 
     Args:
@@ -29,8 +29,8 @@ def application(guard: Guard, rest: RestTree, tree: JsonTree, meet: Meet) -> web
     app.router.add_get(DESCRIPTION, _describe)
     app.router.add_get(STREAM, lambda request: websocket.serve(request, meet))
     for method in ("get", "put", "post"):
-        app.router.add_route(method.upper(), f"{BELOW}{{key:.*}}", getattr(tree, method))
-    app.router.add_route("*", f"{BELOW}{{key:.*}}", _refusing("GET", "POST", "PUT"))
+        app.router.add_route(method.upper(), f"{JSON_PREFIX}{{key:.*}}", getattr(tree, method))
+    app.router.add_route("*", f"{JSON_PREFIX}{{key:.*}}", _refusing("GET", "POST", "PUT"))
     for path in (STREAM, DESCRIPTION):
         app.router.add_route("*", path, _refusing("GET"))
     for method, handler in TREE.items():
@@ -39,7 +39,7 @@ def application(guard: Guard, rest: RestTree, tree: JsonTree, meet: Meet) -> web
 
 
 async def _index(request: web.Request) -> web.Response:
-    doors = {"description": DESCRIPTION, "json": BELOW, "stream": STREAM, "zenoh": "/FEDERATION/KEY"}
+    doors = {"description": DESCRIPTION, "json": JSON_PREFIX, "stream": STREAM, "zenoh": "/FEDERATION/KEY"}
     return web.json_response({"zsim": "gateway", **doors})
 
 

@@ -16,10 +16,10 @@ from aiohttp import web
 
 from zsim.errors import DecodeError
 from zsim.transport.session import Heard
-from zsim_bridges.gateway.http.event_stream import event, stream
-from zsim_bridges.gateway.run_access import Flight
-from zsim_bridges.gateway.subscriptions import Feed
-from zsim_bridges.gateway.transcoding import JSON, LINES_KEPT, TEXT
+from zsim_bridges.gateway.http.event_stream import event_bytes, stream_events
+from zsim_bridges.gateway.run_access import RunAccess
+from zsim_bridges.gateway.subscriptions import SharedSubscriptions
+from zsim_bridges.gateway.transcoding import JSON, CACHED_VALUES, TEXT
 
 RAW, TOKEN = "_raw", "token"
 BYTES = "zenoh/bytes"  # what the plugin says of a body without Content-Type
@@ -33,39 +33,39 @@ class RestTree:
         feed: of whole keys.
     """
 
-    def __init__(self, flight: Callable[[], Flight], feed: Feed) -> None:
-        self._flight = flight
-        self._feed = feed
+    def __init__(self, flight: Callable[[], RunAccess], feed: SharedSubscriptions) -> None:
+        self._run = flight
+        self._subscriptions = feed
 
-    async def ask(self, request: web.Request) -> web.StreamResponse:
+    async def get(self, request: web.Request) -> web.StreamResponse:
         """Answer a GET or a POST."""
         expression, accepted = key_of(request), first_accepted(request)
         if accepted == "text/event-stream":
-            return await stream(request, self._feed, expression, _event)
-        found = await self._found(request, expression)
+            return await stream_events(request, self._subscriptions, expression, _event)
+        found = await self._query(request, expression)
         if RAW in request.query:
-            return _raw(found)
+            return _as_raw(found)
         if accepted == "text/html":
-            return web.Response(text=_html(found), content_type="text/html")
-        return web.Response(text=json.dumps([described(heard) for heard in found]), content_type="application/json")
+            return web.Response(text=_as_html(found), content_type="text/html")
+        return web.Response(text=json.dumps([described_sample(heard) for heard in found]), content_type="application/json")
 
     async def put(self, request: web.Request) -> web.Response:
         """Publish a body on a key."""
         key, body = key_of(request), await request.read()
-        self._flight().put_whole(key, body, encoding_of(request))
+        self._run().put_full_key(key, body, encoding_of(request))
         return web.Response()
 
     async def delete(self, request: web.Request) -> web.Response:
         """Publish that a key has no value any more."""
-        self._flight().delete_whole(key_of(request))
+        self._run().delete_full_key(key_of(request))
         return web.Response()
 
-    async def _found(self, request: web.Request, expression: str) -> list[Heard]:
-        body, flight = await request.read(), self._flight()
+    async def _query(self, request: web.Request, expression: str) -> list[Heard]:
+        body, flight = await request.read(), self._run()
         known = [] if body else flight.known(expression)
         if known and "*" not in expression:
             return known
-        answered = await flight.inquire(expression, _parameters(request), body, encoding_of(request))
+        answered = await flight.query(expression, _zenoh_parameters(request), body, encoding_of(request))
         there = {heard.key for heard in known}
         return [*known, *(heard for heard in answered if heard.kind == "ERROR" or heard.key not in there)]
 
@@ -102,13 +102,13 @@ def first_accepted(request: web.Request) -> str:
     return request.headers.get("Accept", "application/json").split(",")[0].split(";")[0].strip()
 
 
-def described(heard: Heard) -> dict[str, Any]:
+def described_sample(heard: Heard) -> dict[str, Any]:
     """Return an answer or a publication as the plugin does."""
     key = "ERROR" if heard.kind == "ERROR" else heard.key
     return {"key": key, "value": _value(heard), "encoding": heard.encoding, "timestamp": heard.timestamp}
 
 
-def _parameters(request: web.Request) -> str:
+def _zenoh_parameters(request: web.Request) -> str:
     """Return what follows the `?` as Zenoh's parameters, without what is meant for us alone."""
     given = (part for part in request.query_string.split("&") if part.partition("=")[0] not in (TOKEN, ""))
     return ";".join(given)
@@ -128,18 +128,18 @@ def _value(heard: Heard) -> Any:
     return base64.b64encode(heard.payload).decode()
 
 
-@lru_cache(maxsize=LINES_KEPT)
+@lru_cache(maxsize=CACHED_VALUES)
 def _event(heard: Heard) -> bytes:
-    return event(heard.kind, json.dumps(described(heard)).encode())
+    return event_bytes(heard.kind, json.dumps(described_sample(heard)).encode())
 
 
-def _raw(found: list[Heard]) -> web.Response:
+def _as_raw(found: list[Heard]) -> web.Response:
     if not found:
         return web.Response()
     return web.Response(body=found[0].payload, headers={"Content-Type": found[0].encoding})
 
 
-def _html(found: Iterable[Heard]) -> str:
+def _as_html(found: Iterable[Heard]) -> str:
     texts = ((heard.key or "ERROR", heard.payload.decode(errors="replace")) for heard in found)
     shown = "\n".join(f"<dt>{html.escape(key)}</dt>\n<dd>{html.escape(text)}</dd>\n" for key, text in texts)
     return f"<dl>\n{shown}\n</dl>\n"

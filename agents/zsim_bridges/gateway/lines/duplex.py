@@ -9,7 +9,7 @@ FLUSH_S = 2.0  # how long what is left may take to be sent to a client that hang
 Half = Coroutine[Any, Any, None]
 
 
-async def converse(reading: Half, sending: Half, finish: Callable[[], None], cut: Callable[[], None]) -> None:
+async def run_duplex(reading: Half, sending: Half, finish: Callable[[], None], cut: Callable[[], None]) -> None:
     """Read and send until one of the two ends; then send what is left.
 
     Args:

@@ -16,38 +16,38 @@ Key = Annotated[str, Meta(max_length=1000)]
 Keys = Annotated[list[Key], Meta(max_length=1000)]
 
 
-class Request(Struct, tag_field="op", forbid_unknown_fields=True, kw_only=True):
+class StreamRequest(Struct, tag_field="op", forbid_unknown_fields=True, kw_only=True):
     """What all have in common: an `id` comes back with the answer."""
 
     id: Id = None
 
 
-class Hello(Request, tag="hello"):
+class HelloRequest(StreamRequest, tag="hello"):
     """Who it is; the token where one is asked for. The answer tells of the run."""
 
     name: str = ""
     token: str = ""
 
 
-class Latest(Request, tag="latest"):
+class LatestRequest(StreamRequest, tag="latest"):
     """The last values of a key, or of an expression."""
 
     key: Key
 
 
-class Subscribe(Request, tag="subscribe"):
+class SubscribeRequest(StreamRequest, tag="subscribe"):
     """Every value on a key expression from now on."""
 
     key: Key
 
 
-class Unsubscribe(Request, tag="unsubscribe"):
+class UnsubscribeRequest(StreamRequest, tag="unsubscribe"):
     """No more values on it."""
 
     key: Key
 
 
-class Put(Request, tag="put"):
+class PutRequest(StreamRequest, tag="put"):
     """A value for a key. `quiet`: an answer comes only if it is refused."""
 
     key: Key
@@ -55,7 +55,7 @@ class Put(Request, tag="put"):
     quiet: bool = False
 
 
-class Ask(Request, tag="ask"):
+class AskRequest(StreamRequest, tag="ask"):
     """A request to whoever answers on a key: world/control, cluster/*/control."""
 
     key: Key
@@ -64,7 +64,7 @@ class Ask(Request, tag="ask"):
     timeout_s: Annotated[float, Meta(gt=0, le=60)] = 5.0
 
 
-class Join(Request, tag="join"):
+class JoinRequest(StreamRequest, tag="join"):
     """A place in the lockstep: a `gate` comes every `period_s`, and time waits for its `done`.
 
     `reads` are the key expressions whose messages come with each gate; `gates` the keys that close one, of which a
@@ -77,31 +77,31 @@ class Join(Request, tag="join"):
     gates: Keys = []
 
 
-class Said(Struct, forbid_unknown_fields=True):
+class GateOutput(Struct, forbid_unknown_fields=True):
     """An output of a gate."""
 
     key: Key
     value: Any
 
 
-class Done(Request, tag="done"):
+class DoneRequest(StreamRequest, tag="done"):
     """All that it has to say to the gate t_ns."""
 
     t_ns: int
-    outputs: list[Said] = []
+    outputs: list[GateOutput] = []
 
 
-class Leave(Request, tag="leave"):
+class LeaveRequest(StreamRequest, tag="leave"):
     """Its place in the lockstep is given up."""
 
     reason: str = ""
 
 
-_decode = msgspec.json.Decoder(Hello | Latest | Subscribe | Unsubscribe | Put | Ask | Join | Done | Leave).decode
+_decode = msgspec.json.Decoder(HelloRequest | LatestRequest | SubscribeRequest | UnsubscribeRequest | PutRequest | AskRequest | JoinRequest | DoneRequest | LeaveRequest).decode
 OPS = ("hello", "latest", "subscribe", "unsubscribe", "put", "ask", "join", "done", "leave")
 
 
-def read(line: bytes) -> Request:
+def decode_request(line: bytes) -> StreamRequest:
     """Return the request in a line.
 
     Raises:

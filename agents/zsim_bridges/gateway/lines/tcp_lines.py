@@ -5,17 +5,17 @@ import socket
 from collections.abc import Callable
 from contextlib import suppress
 
-from zsim_bridges.gateway.lines.duplex import converse
+from zsim_bridges.gateway.lines.duplex import run_duplex
 from zsim_bridges.gateway.lines.outbox import Outbox
 from zsim_bridges.gateway.lines.stream_client import Client, lost_line
 
-TURN = 100  # lines after which the others have a turn
+LINES_PER_TURN = 100  # lines after which the others have a turn
 LINE_MAX = 1_000_000  # bytes of a request
-Meet = Callable[[Outbox, bool], Client]
+ClientFactory = Callable[[Outbox, bool], Client]
 """Makes the client of a connection from its outbox and whether it has shown the token; it may be refused already."""
 
 
-class Lines:
+class LineServer:
     """The door.
 
     Args:
@@ -23,35 +23,35 @@ class Lines:
         trusted: whether no token is asked for.
     """
 
-    def __init__(self, meet: Meet, trusted: bool) -> None:
-        self._meet = meet
+    def __init__(self, meet: ClientFactory, trusted: bool) -> None:
+        self._new_client = meet
         self._trusted = trusted
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve a connection until it ends."""
         outbox = Outbox(writer.transport.abort, lost_line)
-        _tune(writer)
-        client = self._meet(outbox, self._trusted)
+        _set_socket_options(writer)
+        client = self._new_client(outbox, self._trusted)
         with suppress(asyncio.CancelledError):  # the gateway ends
-            await converse(_read(client, reader), _send(outbox, writer), client.close, writer.transport.abort)
+            await run_duplex(_read(client, reader), _send(outbox, writer), client.close, writer.transport.abort)
         writer.close()
 
 
 async def _read(client: Client, reader: asyncio.StreamReader) -> None:
     """Hand over line by line; a page that makes a browser send its request here is no client."""
     is_first, lines = True, 0
-    while line := await _line(client, reader):
+    while line := await _next_line(client, reader):
         if is_first and not line.lstrip().startswith(b"{"):
-            client.say({"op": "error", "error": "request: is no JSON object a line; see docs/gateway.md"})
+            client.send({"op": "error", "error": "request: is no JSON object a line; see docs/gateway.md"})
             return
         is_first = False
-        await client.take(line)
+        await client.handle_line(line)
         lines += 1
-        if lines % TURN == 0:
+        if lines % LINES_PER_TURN == 0:
             await asyncio.sleep(0)
 
 
-async def _line(client: Client, reader: asyncio.StreamReader) -> bytes:
+async def _next_line(client: Client, reader: asyncio.StreamReader) -> bytes:
     """Return the next line, empty at the end."""
     try:
         return await reader.readuntil(b"\n")
@@ -60,7 +60,7 @@ async def _line(client: Client, reader: asyncio.StreamReader) -> bytes:
     except asyncio.IncompleteReadError as error:
         return error.partial
     except asyncio.LimitOverrunError:
-        client.say({"op": "error", "error": f"request: is longer than {LINE_MAX} bytes; the connection ends"})
+        client.send({"op": "error", "error": f"request: is longer than {LINE_MAX} bytes; the connection ends"})
         return b""
 
 
@@ -73,7 +73,7 @@ async def _send(outbox: Outbox, writer: asyncio.StreamWriter) -> None:
         return
 
 
-def _tune(writer: asyncio.StreamWriter) -> None:
+def _set_socket_options(writer: asyncio.StreamWriter) -> None:
     """Send every line when it is written, since an answer that waits for more is late; notice hosts that are gone."""
     raw = writer.get_extra_info("socket")
     for level, name, value in _OPTIONS:

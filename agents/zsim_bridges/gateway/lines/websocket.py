@@ -2,22 +2,22 @@
 
 from aiohttp import WSMsgType, web
 
-from zsim_bridges.gateway.lines.duplex import converse
+from zsim_bridges.gateway.lines.duplex import run_duplex
 from zsim_bridges.gateway.lines.outbox import Outbox
 from zsim_bridges.gateway.lines.stream_client import Client, lost_line
-from zsim_bridges.gateway.lines.tcp_lines import LINE_MAX, Meet
+from zsim_bridges.gateway.lines.tcp_lines import LINE_MAX, ClientFactory
 
 HEARTBEAT_S = 20.0  # wall time after which a browser that is gone is noticed
 
 
-async def serve(request: web.Request, meet: Meet) -> web.WebSocketResponse:
+async def serve(request: web.Request, meet: ClientFactory) -> web.WebSocketResponse:
     """Serve a WebSocket until it ends; the guard has let it in."""
     socket = web.WebSocketResponse(max_msg_size=LINE_MAX, heartbeat=HEARTBEAT_S)
     await socket.prepare(request)
     cut = request.transport.abort if request.transport is not None else lambda: None
     outbox = Outbox(cut, lost_line)
     client = meet(outbox, True)
-    await converse(_read(client, socket), _send(outbox, socket), client.close, cut)
+    await run_duplex(_read(client, socket), _send(outbox, socket), client.close, cut)
     return socket
 
 
@@ -25,7 +25,7 @@ async def _read(client: Client, socket: web.WebSocketResponse) -> None:
     async for message in socket:
         if message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
             data = message.data
-            await client.take(data.encode() if isinstance(data, str) else data)
+            await client.handle_line(data.encode() if isinstance(data, str) else data)
 
 
 async def _send(outbox: Outbox, socket: web.WebSocketResponse) -> None:

@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 from typing import Any
 
-from zsim_bridges.gateway.gateway_server import Doors, Gateway
+from zsim_bridges.gateway.gateway_server import GatewayPorts, Gateway
 
 
 class Ear:
@@ -18,15 +18,15 @@ class Ear:
 
 def test_a_world_that_goes_after_the_end_of_its_run_is_not_lost() -> None:
     ear, flight = Ear(), a_flight("first")
-    gateway = Gateway(Doors("127.0.0.1", 0, 0), "gateway.main", None, dial=never, say=print)
+    gateway = Gateway(GatewayPorts("127.0.0.1", 0, 0), "gateway.main", None, dial=never, say=print)
     gateway._clients.add(ear)  # type: ignore[arg-type]
     gateway._begin(flight)
     for state in ("lost", "back"):
-        gateway._tell_of_link(state, flight)
+        gateway._notify_link(state, flight)
     gateway._end(flight)
-    gateway._tell_of_link("lost", flight)
+    gateway._notify_link("lost", flight)
     gateway._begin(a_flight("second"))
-    gateway._tell_of_link("lost", flight)
+    gateway._notify_link("lost", flight)
     gateway.loop.close()
     assert ear.told == [
         ("begun", "first"),

@@ -15,7 +15,7 @@ from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.transport.session import Sample
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import intake as intake_module
 from zsim_bridges.ros1.bridge import Bridge, check_names
 from zsim_bridges.ros1.drone_topics import DroneTopics
@@ -140,7 +140,7 @@ def test_numbers_beyond_the_fields_of_ros_are_refused_and_told_once_and_the_next
         0, 0, 1, "run", "zsim", "lockstep", 0.0, GATE_NS, 5_000_000, GATE_NS, 1, messages.Origin(0.0, 0.0, 0.0),
         (messages.DroneInfo("quad-1", "ardrone2"),), (), scenario_file.to_text(scenario()), "", "", "",
     )  # fmt: skip
-    presence = Presence(cast(Any, FakeLink()), info, "ros1.main")
+    presence = ObserverProcess(cast(Any, FakeLink()), info, "ros1.main")
     node = Node("/zsim", "http://127.0.0.1:1", "127.0.0.1", said.append)
     bridge = Bridge(cast(Any, FakeLink()), info, presence, node, said.append)
     navdata = Ear(node, "/quad_1/ardrone/navdata")

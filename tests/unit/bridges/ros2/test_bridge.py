@@ -12,7 +12,7 @@ from zsim.contract.messages import ClusterInfo, ControlAnswer, DroneInfo, Info, 
 from zsim.scenario import scenario_file
 from zsim.transport.session import Heard, Sample
 from zsim.transport.zenoh_settings import Mode
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import rmw_zenoh
 from zsim_bridges.ros2.bridge import Bridge
 from zsim_bridges.ros2.callback_queue import Inbox
@@ -133,7 +133,7 @@ class Bench:
         )  # fmt: skip
         self.link: Any = Link()
         self.lines: list[str] = []
-        self.presence = Presence(self.link, self.info, "ros2.main")
+        self.presence = ObserverProcess(self.link, self.info, "ros2.main")
         self.bridge = Bridge(self.link, self.info, self.presence, self.lines.append, wall_ns)
         self.bridge.enter(Participant(self.link, 0, TYPES, wall_ns, self.bridge.refuse))
 

@@ -13,12 +13,12 @@ from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import KINDS
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_bridges.console.command_client import Told
-from zsim_bridges.console.console_page import SWITCHES, Page
-from zsim_bridges.console.forms.fault_form import FOR_S, GUST_M_S, LOSS, WEAK, FaultForm
-from zsim_bridges.console.forms.formation_form import QUIET_S, FormationForm
+from zsim_bridges.console.command_client import RequestOutcome
+from zsim_bridges.console.console_page import SWITCHES, ConsolePage
+from zsim_bridges.console.forms.fault_form import DURATION_S, GUST_M_S, LOSS_PROBABILITY, WEAK_THRUST_SHARE, FaultForm
+from zsim_bridges.console.forms.formation_form import REST_S, FormationForm
 from zsim_bridges.console.forms.run_form import DroneForm, FleetForm, RunForm
-from zsim_bridges.console.forms.slider_limits import ranges
+from zsim_bridges.console.forms.slider_limits import slider_ranges
 from zsim_bridges.console.forms.variable_slider import STILL_S
 
 SCENARIOS = Path(__file__).parents[5] / "scenarios"
@@ -152,14 +152,14 @@ class Bench:
     def __init__(self, scenario: str = "step") -> None:
         self.gui: Any = Gui()
         self.desk: Any = Desk()
-        self.told: list[Told] = []
+        self.told: list[RequestOutcome] = []
         self.scenario = scenario_file.load(SCENARIOS / f"{scenario}.yaml")
         self.names = tuple(drone.name for drone in self.scenario.drones)
         self.cluster = self.scenario.clusters[0]
         self.space = scenario_space(self.scenario, self.cluster)
 
     def formation(self) -> FormationForm:
-        found = ranges(self.space, self.cluster, self.scenario)
+        found = slider_ranges(self.space, self.cluster, self.scenario)
         return FormationForm(self.gui, self.desk, self.told.append, self.cluster, self.space, found)
 
     def faults(self) -> None:
@@ -242,15 +242,15 @@ def mixed() -> Scenario:
 @pytest.mark.parametrize(
     ("label", "asked"),
     [
-        ("GPS lost", {"kind": "gps_dropout", "target": "drone2", "for_s": FOR_S}),
+        ("GPS lost", {"kind": "gps_dropout", "target": "drone2", "for_s": DURATION_S}),
         (
             "Motor weak",
-            {"kind": "rotor_efficiency", "target": "drone2", "for_s": FOR_S, "rotor": "front_left", "value": WEAK},
+            {"kind": "rotor_efficiency", "target": "drone2", "for_s": DURATION_S, "rotor": "front_left", "value": WEAK_THRUST_SHARE},
         ),
-        ("Gust", {"kind": "gust", "target": "world", "for_s": FOR_S, "velocity_m_s": list(GUST_M_S)}),
+        ("Gust", {"kind": "gust", "target": "world", "for_s": DURATION_S, "velocity_m_s": list(GUST_M_S)}),
         (
             "Link loss",
-            {"kind": "link_loss", "target": "world/estimator.drone2", "for_s": FOR_S, "probability": LOSS},
+            {"kind": "link_loss", "target": "world/estimator.drone2", "for_s": DURATION_S, "probability": LOSS_PROBABILITY},
         ),
         ("Kill estimator", {"kind": "process_kill", "target": "estimator.drone2"}),
     ],
@@ -277,7 +277,7 @@ def test_any_fault_is_injected_with_what_was_typed(bench: Bench):
     bench.gui.at["target"].value = " drone3 "
     bench.gui.at["parameters"].value = "value_m: 2.5"
     bench.gui.press("Inject it")
-    asked = {"kind": "baro_bias", "target": "drone3", "for_s": FOR_S, "value_m": 2.5}
+    asked = {"kind": "baro_bias", "target": "drone3", "for_s": DURATION_S, "value_m": 2.5}
     assert bench.desk.asked == [("world", "fault_add", asked)]
 
 
@@ -334,7 +334,7 @@ def test_sliders_that_rest_are_sent_together_and_once(bench: Bench):
     form.send(0.0)  # on the wall: no rest yet
     assert bench.desk.asked == []
     form.send(LATER_S)
-    form.send(LATER_S + QUIET_S)
+    form.send(LATER_S + REST_S)
     assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0, "z_c": 4.0}})]
 
 
@@ -360,14 +360,14 @@ def test_sliders_follow_the_formation_but_for_those_that_somebody_moves(bench: B
 
 
 def test_people_are_told_of_targets_in_the_units_of_the_page(bench: Bench):
-    bench.formation().target({"p": 5.0, "yaw": 180.0})
+    bench.formation().request_target({"p": 5.0, "yaw": 180.0})
     assert bench.desk.said == ["p 5 m, yaw 180 deg"]
 
 
 def test_a_move_lasts_as_long_as_is_asked_for(bench: Bench):
     form = bench.formation()
     bench.gui.at["over [s]"].value = 20.0
-    form.target({"p": 5.0})
+    form.request_target({"p": 5.0})
     assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0}, "over_s": 20.0})]
 
 
@@ -390,7 +390,7 @@ def test_a_number_out_of_range_is_not_flown_to_the_limit_when_its_box_is_left(be
 
 
 def test_a_value_out_of_range_is_told_and_not_sent(bench: Bench):
-    bench.formation().target({"p": 0.5})
+    bench.formation().request_target({"p": 0.5})
     assert bench.desk.asked == []
     assert bench.told[0].refusal.startswith("p is 0.5 m; must be from")
 
@@ -434,7 +434,7 @@ def test_a_trajectory_that_is_none_is_told_and_not_sent(bench: Bench):
     bench.gui.at["waypoints"].value = "soon"
     bench.gui.press("Fly the waypoints")
     assert bench.desk.asked == []
-    assert bench.told[0].what == f"{bench.cluster.name}: trajectory"
+    assert bench.told[0].request == f"{bench.cluster.name}: trajectory"
 
 
 # The page
@@ -444,7 +444,7 @@ def test_emergency_stops_everybody_and_switches_change_the_scene(bench: Bench):
     shown: list[tuple[str, bool]] = []
     spaces = {bench.cluster.name: bench.space}
     show = lambda *switched: shown.append(switched)  # noqa: E731
-    page = Page(bench.gui, bench.scenario, spaces, bench.desk, bench.told.append, show, 2.0)
+    page = ConsolePage(bench.gui, bench.scenario, spaces, bench.desk, bench.told.append, show, 2.0)
     assert bench.gui.at["rate"].value == 2.0
     bench.gui.press("EMERGENCY – all rotors stop")
     assert bench.desk.asked == [(bench.names, "emergency")]
