@@ -47,11 +47,11 @@ def yaw(q_WB: Wxyz) -> float:
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-def upright(q_WB: Wxyz) -> float:
+def tilt_cosine(q_WB: Wxyz) -> float:
     """Return the cosine of the tilt: z of B's z axis in W."""
     return 1 - 2 * (q_WB[1] ** 2 + q_WB[2] ** 2)
 
 
-def graph_name(name: str) -> str:
+def ros1_name(name: str) -> str:
     """Return a name of the contract as a name of ROS, which has letters, digits and _ alone."""
     return name.replace(".", "_").replace("-", "_")

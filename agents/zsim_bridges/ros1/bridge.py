@@ -16,14 +16,14 @@ from zsim_bridges.ros1 import conversions
 from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics
 from zsim_bridges.ros1.intake import Intake
 from zsim_bridges.ros1.onboard import warm_up
-from zsim_bridges.ros1.wire.node import Node
+from zsim_bridges.ros1.wire.node import Ros1Node
 
 POLL_S = 0.1  # how often a stop is looked for
-TOLD_MAX = 1000  # refusals remembered, so that each is told once
+REPORTED_MAX = 1000  # refusals remembered, so that each is told once
 Say = Callable[[str], None]
 
 
-class DismissedError(RunError):
+class NodeShutdownError(RunError):
     """A ROS node, or the master, asked this node to stop."""
 
 
@@ -52,23 +52,23 @@ def serve(
         RunError: two drones have the same name in ROS.
     """
     warm_up()
-    node = Node(f"/{ros_frames.graph_name(info.federation)}", master_uri, host, say)
+    node = Ros1Node(f"/{ros_frames.ros1_name(info.federation)}", master_uri, host, say)
     asyncio.run(Bridge(link, info, presence, node, say).run(stopped))
-    if node.dismissed:
-        presence.leave(node.dismissed)
-        raise DismissedError(f"{presence.name}: {node.dismissed}")
+    if node.shutdown_reason:
+        presence.leave(node.shutdown_reason)
+        raise NodeShutdownError(f"{presence.name}: {node.shutdown_reason}")
 
 
 class Bridge:
     """One run in one ROS graph."""
 
-    def __init__(self, link: Session, info: Info, presence: ObserverProcess, node: Node, say: Say) -> None:
+    def __init__(self, link: Session, info: Info, presence: ObserverProcess, node: Ros1Node, say: Say) -> None:
         self._link = link
         self._info = info
         self._presence = presence
         self._node = node
         self._say = say
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._clock = node.publish("/clock", "rosgraph_msgs/Clock", QUEUE)
         tf = node.publish("/tf", "tf2_msgs/TFMessage", QUEUE * len(info.drones))
         check_names(drone.name for drone in info.drones)
@@ -80,21 +80,21 @@ class Bridge:
         intake = Intake(self._link, self._info, self._presence.health, asyncio.get_running_loop())
         try:
             async with self._node.running():
-                while not (stopped() or self._presence.end_reason or self._node.dismissed):
+                while not (stopped() or self._presence.end_reason or self._node.shutdown_reason):
                     with contextlib.suppress(TimeoutError):
                         await asyncio.wait_for(intake.news.wait(), POLL_S)
-                    await self._pass_on(intake)
+                    await self._forward_all(intake)
                     self._presence.tick()
         finally:
             intake.close()
 
-    async def _pass_on(self, intake: Intake) -> None:
+    async def _forward_all(self, intake: Intake) -> None:
         for said in intake.batches():
             for key, payload in said:
-                self.hear(key, payload)
+                self.forward(key, payload)
             await asyncio.sleep(0)  # let connections have their turn
 
-    def hear(self, key: str, payload: bytes) -> None:
+    def forward(self, key: str, payload: bytes) -> None:
         """Take what has passed the world, and pass on what follows from it."""
         kind, whose, what = keys.parts(key)
         if key == keys.CLOCK:
@@ -102,17 +102,17 @@ class Bridge:
         elif key == keys.EVENT:
             self._on_event(payload)
         elif kind == "drone" and whose in self._drones and not what.startswith("cmd/"):
-            self._hear_of(whose, key, payload)
+            self._publish(whose, key, payload)
 
-    def _hear_of(self, drone: str, key: str, payload: bytes) -> None:
+    def _publish(self, drone: str, key: str, payload: bytes) -> None:
         message = self._decoded(key, payload)
         if message is None:
             return
         try:
-            self._drones[drone].hear(message)
+            self._drones[drone].publish(message)
         except (ValueError, ArithmeticError) as error:  # finite, but beyond what a field of ROS can hold
             self._presence.health.refused += 1
-            self._tell(f"{key}: {error}")
+            self._report_once(f"{key}: {error}")
 
     def _decoded(self, key: str, payload: bytes) -> Any:
         try:
@@ -132,12 +132,12 @@ class Bridge:
         event = self._decoded(keys.EVENT, payload)
         if event is None or (event.kind, event.source) != ("refused", self._presence.name):
             return
-        self._tell(f"{event.subject}: {event.data.get('reason', event.text)}")
+        self._report_once(f"{event.subject}: {event.data.get('reason', event.text)}")
 
-    def _tell(self, reason: str) -> None:
+    def _report_once(self, reason: str) -> None:
         """Say something once."""
-        if reason not in self._told and len(self._told) < TOLD_MAX:
-            self._told.add(reason)
+        if reason not in self._reported and len(self._reported) < REPORTED_MAX:
+            self._reported.add(reason)
             self._say(f"{self._presence.name}: {reason}")
 
 
@@ -149,7 +149,7 @@ def check_names(drones: Iterable[str]) -> None:
     """
     found: dict[str, str] = {}
     for drone in drones:
-        name = ros_frames.graph_name(drone)
+        name = ros_frames.ros1_name(drone)
         if name in found:
             raise RunError(f"drones {found[name]!r} and {drone!r} are both {name!r} in ROS; rename one")
         found[name] = drone

@@ -10,8 +10,8 @@ import numpy as np
 
 from zsim.contract import messages
 from zsim_bridges import ros_frames
-from zsim_bridges.ros1.onboard import Onboard
-from zsim_bridges.ros1.wire.message_types import message
+from zsim_bridges.ros1.onboard import OnboardState
+from zsim_bridges.ros1.wire.message_types import message_class
 from zsim_bridges.ros_frames import Vector, Wxyz
 
 WORLD = "world"
@@ -22,30 +22,30 @@ NO_FIX, FIX, GPS_SERVICE = -1, 0, 1  # sensor_msgs/NavSatStatus
 DIAGONAL_KNOWN = 2  # sensor_msgs/NavSatFix
 FIX_3D = 3  # as in NMEA: with a height
 
-Time = message("builtin_interfaces/Time")
-Header = message("std_msgs/Header")
-Vector3 = message("geometry_msgs/Vector3")
-Vector3Stamped = message("geometry_msgs/Vector3Stamped")
-Point = message("geometry_msgs/Point")
-Quaternion = message("geometry_msgs/Quaternion")
-Pose = message("geometry_msgs/Pose")
-PoseWithCovariance = message("geometry_msgs/PoseWithCovariance")
-Twist = message("geometry_msgs/Twist")
-TwistWithCovariance = message("geometry_msgs/TwistWithCovariance")
-Transform = message("geometry_msgs/Transform")
-TransformStamped = message("geometry_msgs/TransformStamped")
-TFMessage = message("tf2_msgs/TFMessage")
-Imu = message("sensor_msgs/Imu")
-NavSatStatus = message("sensor_msgs/NavSatStatus")
-NavSatFix = message("sensor_msgs/NavSatFix")
-Odometry = message("nav_msgs/Odometry")
-Clock = message("rosgraph_msgs/Clock")
-Navdata = message("ardrone_autonomy/Navdata")
+Time = message_class("builtin_interfaces/Time")
+Header = message_class("std_msgs/Header")
+Vector3 = message_class("geometry_msgs/Vector3")
+Vector3Stamped = message_class("geometry_msgs/Vector3Stamped")
+Point = message_class("geometry_msgs/Point")
+Quaternion = message_class("geometry_msgs/Quaternion")
+Pose = message_class("geometry_msgs/Pose")
+PoseWithCovariance = message_class("geometry_msgs/PoseWithCovariance")
+Twist = message_class("geometry_msgs/Twist")
+TwistWithCovariance = message_class("geometry_msgs/TwistWithCovariance")
+Transform = message_class("geometry_msgs/Transform")
+TransformStamped = message_class("geometry_msgs/TransformStamped")
+TFMessage = message_class("tf2_msgs/TFMessage")
+Imu = message_class("sensor_msgs/Imu")
+NavSatStatus = message_class("sensor_msgs/NavSatStatus")
+NavSatFix = message_class("sensor_msgs/NavSatFix")
+Odometry = message_class("nav_msgs/Odometry")
+Clock = message_class("rosgraph_msgs/Clock")
+Navdata = message_class("ardrone_autonomy/Navdata")
 
 UNKNOWN_3X3, UNKNOWN_6X6 = np.zeros(9), np.zeros(36)  # a covariance of zeros says in ROS that it is not known
 
 
-class Frames:
+class DriverFrames:
     """Names of a drone's frames, those of a driver whose tf_prefix is the drone's name."""
 
     def __init__(self, drone: str) -> None:
@@ -69,7 +69,7 @@ def clock(said: messages.Clock) -> Any:
     return Clock(clock=ros_time(said.t_ns))
 
 
-def navdata(seq: int, own: Onboard, frames: Frames) -> Any:
+def navdata(seq: int, own: OnboardState, frames: DriverFrames) -> Any:
     """Return what the driver publishes as ardrone/navdata, at the newest status.
 
     rotX is positive to the right, rotY nose down, rotZ counter-clockwise [deg]; velocities x forward, y left,
@@ -119,7 +119,7 @@ def navdata(seq: int, own: Onboard, frames: Frames) -> Any:
     )
 
 
-def imu(seq: int, sample: messages.Imu, attitude: Wxyz, frames: Frames) -> Any:
+def imu(seq: int, sample: messages.Imu, attitude: Wxyz, frames: DriverFrames) -> Any:
     """Return ardrone/imu: attitude, rate and specific force in B, (0, 0, 9.8) at rest."""
     return Imu(
         header=header(seq, sample.t_sample_ns, frames.base),
@@ -132,14 +132,14 @@ def imu(seq: int, sample: messages.Imu, attitude: Wxyz, frames: Frames) -> Any:
     )
 
 
-def mag(seq: int, sample: messages.Mag, frames: Frames) -> Any:
+def mag(seq: int, sample: messages.Mag, frames: DriverFrames) -> Any:
     """Return ardrone/mag: the direction of the Earth's field in B, of length 1."""
     length = math.hypot(*sample.field_ut) or 1.0
     direction = [field / length for field in sample.field_ut]
     return Vector3Stamped(header=header(seq, sample.t_sample_ns, frames.base), vector=Vector3(*direction))
 
 
-def fix(seq: int, sample: messages.Gps, frames: Frames) -> Any:
+def fix(seq: int, sample: messages.Gps, frames: DriverFrames) -> Any:
     """Return the GPS receiver's fix; the covariance is that of a white error, equal on all axes."""
     status = NavSatStatus(status=FIX if sample.fix >= FIX_3D else NO_FIX, service=GPS_SERVICE)
     return NavSatFix(
@@ -153,7 +153,7 @@ def fix(seq: int, sample: messages.Gps, frames: Frames) -> Any:
     )
 
 
-def odometry(seq: int, own: Onboard, frames: Frames) -> Any:
+def odometry(seq: int, own: OnboardState, frames: DriverFrames) -> Any:
     """Return ardrone/odometry: what the aircraft's own velocity integrates to since the start.
 
     The velocity is that of navdata: along the level axes x forward, y left, z up.
@@ -165,7 +165,7 @@ def odometry(seq: int, own: Onboard, frames: Frames) -> Any:
     return _odometry(head, frames.base, own.position_m, own.attitude, velocity, rate)
 
 
-def ground_truth(seq: int, truth: messages.Truth, frames: Frames) -> Any:
+def ground_truth(seq: int, truth: messages.Truth, frames: DriverFrames) -> Any:
     """Return the true state as Gazebo's p3d plugin does, which hector_quadrotor and tum_simulator use: all in W."""
     q, rate = truth.orientation_wxyz, ros_frames.rotated(truth.orientation_wxyz, truth.angular_velocity_rad_s)
     head = header(seq, truth.t_ns, WORLD)
@@ -183,7 +183,7 @@ def _odometry(head: Any, child: str, position: Vector, attitude: Wxyz, velocity:
     )
 
 
-def transforms(seq: int, own: Onboard, frames: Frames) -> Any:
+def transforms(seq: int, own: OnboardState, frames: DriverFrames) -> Any:
     """Return `/tf` of a drone: odom to base as integrated, and world to odom as far as the estimator knows it."""
     assert own.status is not None
     t_ns = own.status.t_ns

@@ -22,10 +22,10 @@ BETA_RAD_S = 0.02  # of Madgwick's filter: levels within seconds, and is not led
 UNIT_SLACK = 0.01  # of a quaternion's length; an estimator of positions alone may tell zeros
 STEP_S_MAX = 0.1  # longer gaps in the IMU's samples are not integrated over
 _VECTORS = ("accel_m_s2", "gyro_rad_s", "field_ut")  # of samples in the axes of a sensor
-PLACES_KEPT = 32  # gates for which the integrated position is remembered; an estimate is some gates late at most
+POSITIONS_KEPT = 32  # gates for which the integrated position is remembered; an estimate is some gates late at most
 
 
-class Onboard:
+class OnboardState:
     """One aircraft.
 
     Args:
@@ -41,7 +41,7 @@ class Onboard:
 
     def __init__(self, imu: Mount | None = None, mag: Mount | None = None) -> None:
         mounts = {messages.Imu: imu, messages.Mag: mag}
-        self._turns = {kind: mount_rotation(mount) for kind, mount in mounts.items() if mount and any(mount.rpy_deg)}
+        self._rotations = {kind: mount_rotation(mount) for kind, mount in mounts.items() if mount and any(mount.rpy_deg)}
         self.imu: messages.Imu | None = None
         self.mag: messages.Mag | None = None
         self.baro: messages.Baro | None = None
@@ -52,14 +52,14 @@ class Onboard:
         self.altitude_m = 0.0
         self._ground_baro_m: float | None = None
         self._x_m = self._y_m = 0.0
-        self._places: deque[tuple[int, Vector]] = deque(maxlen=PLACES_KEPT)
+        self._positions: deque[tuple[int, Vector]] = deque(maxlen=POSITIONS_KEPT)
         self.origin_m: Vector | None = None
 
-    def hear(self, message: Any) -> Any:
+    def update(self, message: Any) -> Any:
         """Take what the drone's sensors or its estimator say; return it in the axes of the body."""
-        R_BS = self._turns.get(type(message))
-        message = message if R_BS is None else _turned(message, R_BS)
-        heard = self._HEARD.get(type(message))
+        R_BS = self._rotations.get(type(message))
+        message = message if R_BS is None else _rotated(message, R_BS)
+        heard = self._HANDLERS.get(type(message))
         if heard is not None:
             heard(self, message)
         return message
@@ -85,7 +85,7 @@ class Onboard:
 
     def _on_sonar(self, sonar: messages.Sonar) -> None:
         if sonar.valid:
-            self.altitude_m = sonar.range_m * max(0.0, ros_frames.upright(self.attitude))
+            self.altitude_m = sonar.range_m * max(0.0, ros_frames.tilt_cosine(self.attitude))
             self._ground_baro_m = None
         elif self._ground_baro_m is None and self.baro is not None:
             self._ground_baro_m = self.baro.altitude_m - self.altitude_m
@@ -103,16 +103,16 @@ class Onboard:
         if abs(math.hypot(*estimate.orientation_wxyz) - 1.0) < UNIT_SLACK:
             self.estimate = estimate
             self.attitude = estimate.orientation_wxyz
-        place = next((place for t_ns, place in self._places if t_ns == estimate.t_ns), None)
+        place = next((place for t_ns, place in self._positions if t_ns == estimate.t_ns), None)
         if place is not None:
             x, y, z = estimate.position_m
             self.origin_m = (x - place[0], y - place[1], z - place[2])
 
     def _on_status(self, status: messages.Status) -> None:
         self.status = status
-        self._places.append((status.t_ns, self.position_m))
+        self._positions.append((status.t_ns, self.position_m))
 
-    _HEARD: ClassVar[dict[type, Callable[["Onboard", Any], None]]] = {
+    _HANDLERS: ClassVar[dict[type, Callable[["OnboardState", Any], None]]] = {
         messages.Imu: _on_imu,
         messages.Mag: _on_mag,
         messages.Baro: _on_baro,
@@ -128,7 +128,7 @@ def warm_up() -> None:
     madgwick_step(LEVEL, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), BETA_RAD_S, STEP_S_MAX)
 
 
-def _turned(sample: Any, R_BS: Rotation) -> Any:
+def _rotated(sample: Any, R_BS: Rotation) -> Any:
     """Return a sample with its vectors in the axes of the body."""
     vectors = {name: turn(R_BS, getattr(sample, name)) for name in _VECTORS if hasattr(sample, name)}
     return msgspec.structs.replace(sample, **vectors)

@@ -12,11 +12,11 @@ from zsim.contract import keys, messages
 
 NEARLY_ZERO = 1e-6  # of a component of cmd_vel, _EPS of the driver
 REPEAT_NS = 100_000_000  # ns; silence of 0.5 s would be the commander's death, scenario `silence.hover_s`
-IN_THE_AIR = ("hovering", "flying")
-MAY_FLY = ("taking_off", *IN_THE_AIR)
+AIRBORNE = ("hovering", "flying")
+COMMANDABLE = ("taking_off", *AIRBORNE)
 
 
-class Tilt(NamedTuple):
+class TiltCommand(NamedTuple):
     """A cmd_vel within its limits: shares of the largest tilt, climb and yaw rate."""
 
     forward: float
@@ -26,7 +26,7 @@ class Tilt(NamedTuple):
     hover: bool
 
 
-class Pilot:
+class DriverCommands:
     """Of one drone.
 
     Args:
@@ -40,7 +40,7 @@ class Pilot:
         self._put = put
         self._tilt_key, self._mode_key = keys.command(drone, "ardrone"), keys.command(drone, "mode")
         self._seq = {self._tilt_key: 0, self._mode_key: 0}
-        self._tilt: Tilt | None = None
+        self._tilt: TiltCommand | None = None
         self._sent_ns: int | None = None
         self._status: messages.Status | None = None
 
@@ -51,22 +51,22 @@ class Pilot:
             ValueError: it is not finite.
         """
         tilt = tilt_of(twist)
-        if self._status is not None and self._status.state in MAY_FLY:
+        if self._status is not None and self._status.state in COMMANDABLE:
             self._tilt, self._sent_ns = tilt, None
 
     def take_off(self) -> None:
         """Take off."""
-        self._ask("takeoff")
+        self._send_mode("takeoff")
 
     def land(self) -> None:
         """Land."""
-        self._ask("land")
+        self._send_mode("land")
 
     def reset(self) -> None:
         """Stop the rotors at once; in the emergency that this is, leave it: the driver's toggle."""
-        self._ask("reset" if self._status is not None and self._status.state == "emergency" else "emergency")
+        self._send_mode("reset" if self._status is not None and self._status.state == "emergency" else "emergency")
 
-    def trim(self) -> str | None:
+    def trim_refusal(self) -> str | None:
         """Return why the drone cannot be trimmed now; it stands level, and there is nothing more to do."""
         state = self._status.state if self._status else "not there yet"
         return None if state == "landed" else f"the drone is {state}; must be landed"
@@ -74,24 +74,24 @@ class Pilot:
     def on_status(self, status: messages.Status) -> None:
         """Send what is due at a gate."""
         self._status = status
-        if status.state not in MAY_FLY:
+        if status.state not in COMMANDABLE:
             self._tilt = None
         late = self._sent_ns is None or status.t_ns - self._sent_ns >= REPEAT_NS
-        if self._tilt is not None and late and status.state in IN_THE_AIR:
+        if self._tilt is not None and late and status.state in AIRBORNE:
             self._sent_ns = status.t_ns
-            seq = self._next(self._tilt_key)
+            seq = self._next_seq(self._tilt_key)
             self._put(self._tilt_key, messages.Ardrone(status.t_ns, seq, self._source, *self._tilt))
 
-    def _ask(self, mode: Any) -> None:
+    def _send_mode(self, mode: Any) -> None:
         t_ns = self._status.t_ns if self._status else 0
-        self._put(self._mode_key, messages.Mode(t_ns, self._next(self._mode_key), self._source, mode))
+        self._put(self._mode_key, messages.Mode(t_ns, self._next_seq(self._mode_key), self._source, mode))
 
-    def _next(self, key: str) -> int:
+    def _next_seq(self, key: str) -> int:
         self._seq[key] += 1
         return self._seq[key] - 1
 
 
-def tilt_of(twist: Any) -> Tilt:
+def tilt_of(twist: Any) -> TiltCommand:
     """Return what a geometry_msgs/Twist asks of an AR.Drone.
 
     linear.x and linear.y are shares of the largest tilt, forward and to the left; linear.z of the largest climb;
@@ -105,4 +105,4 @@ def tilt_of(twist: Any) -> Tilt:
     if not all(map(math.isfinite, values)):
         raise ValueError(f"cmd_vel is {values}; must be finite")
     shares = (min(1.0, max(-1.0, share)) for share in (linear.x, linear.y, linear.z, angular.z))
-    return Tilt(*shares, hover=all(abs(value) < NEARLY_ZERO for value in values))
+    return TiltCommand(*shares, hover=all(abs(value) < NEARLY_ZERO for value in values))

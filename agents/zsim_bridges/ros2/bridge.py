@@ -19,13 +19,13 @@ from zsim.transport.identity import Identity
 from zsim.transport.session import Heard, Session
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import conversions, rmw_zenoh, sensor_frames, topics
-from zsim_bridges.ros2.callback_queue import Inbox
-from zsim_bridges.ros2.commands import Commands
-from zsim_bridges.ros2.participant import Node, Participant
+from zsim_bridges.ros2.callback_queue import CallbackQueue
+from zsim_bridges.ros2.commands import RosCommands
+from zsim_bridges.ros2.participant import Ros2Node, RosContext
 from zsim_bridges.ros2.ros_names import ros_names
-from zsim_bridges.ros2.ros_types import Types
-from zsim_bridges.ros2.source_keys import SAMPLES_MAX, Feeds, Publication
-from zsim_bridges.ros2.topics import Names, Topic
+from zsim_bridges.ros2.ros_types import RosTypes
+from zsim_bridges.ros2.source_keys import SAMPLES_MAX, SourceSubscriptions, BridgedTopic
+from zsim_bridges.ros2.topics import RosNames, Topic
 
 NODE = "zsim"
 POLL_S = 0.1  # how often a stop is looked for
@@ -35,7 +35,7 @@ CLUSTER_SERVICES = ("takeoff", "engage", "hold", "land")
 Say = Callable[[str], None]
 
 
-class Door(NamedTuple):
+class RosNetwork(NamedTuple):
     """Where ROS is.
 
     Attributes:
@@ -66,126 +66,126 @@ class Bridge:
         self._say = say
         self._wall_ns = wall_ns
         self._scenario: Scenario = scenario_file.from_text(info.scenario)
-        self._inbox = Inbox(SAMPLES_MAX)
-        self._publications: dict[str, Publication] = {}
-        self._feeds = Feeds(link, self._inbox, self._refuse, info.mode == "realtime")
-        self._said: set[str] = set()
-        self._ends: list[Callable[[], None]] = []
+        self._queue = CallbackQueue(SAMPLES_MAX)
+        self._publications: dict[str, BridgedTopic] = {}
+        self._sources = SourceSubscriptions(link, self._queue, self._count_refused, info.mode == "realtime")
+        self._reported: set[str] = set()
+        self._cleanups: list[Callable[[], None]] = []
         self._domain = 0
-        self.names = Names(
+        self.names = RosNames(
             ros_names((drone.name for drone in info.drones), "drone"),
             ros_names((cluster.name for cluster in info.clusters), "cluster"),
         )
-        self._ends.append(link.hear(keys.CLOCK, self._on_clock))
+        self._cleanups.append(link.hear(keys.CLOCK, self._on_clock))
 
     def _on_clock(self, heard: Heard) -> None:
-        self._inbox.act(partial(self._presence.update_clock, heard.payload))
+        self._queue.add_task(partial(self._presence.update_clock, heard.payload))
 
-    def turn(self, within_s: float) -> None:
+    def process(self, within_s: float) -> None:
         """Do what there is to do, waiting for something."""
-        taken = self._inbox.take(within_s)
+        taken = self._queue.pop_all(within_s)
         start_ns = self._wall_ns()
-        for act in taken.acts:
+        for act in taken.tasks:
             act()
-        passed = self._feeds.pass_on(taken.samples)
+        passed = self._sources.convert_all(taken.samples)
         health = self._presence.health
         if passed:
             health.step(self._wall_ns() - start_ns)
         health.received += passed
-        health.dropped = self._inbox.dropped + self._feeds.dropped
+        health.dropped = self._queue.dropped + self._sources.dropped
         self._presence.tick()
 
     def close(self) -> None:
         """Hear nothing any more."""
-        self._feeds.close()
-        for end in self._ends:
+        self._sources.close()
+        for end in self._cleanups:
             end()
 
-    def refuse(self, where: str, why: str) -> None:
+    def count_refused(self, where: str, why: str) -> None:
         """Count what others sent in vain, and say so once for each name; callable from any thread."""
-        self._inbox.act(partial(self._refuse, where, why))
+        self._queue.add_task(partial(self._count_refused, where, why))
 
-    def _refuse(self, where: str, why: str) -> None:
+    def _count_refused(self, where: str, why: str) -> None:
         self._presence.health.refused += 1
-        self.say_once(where, f"{where}: refused, {why}; further ones are counted in {self._presence.name}'s health")
+        self.report_once(where, f"{where}: refused, {why}; further ones are counted in {self._presence.name}'s health")
 
-    def say_once(self, about: str, text: str) -> None:
-        if about not in self._said:
-            self._said.add(about)
+    def report_once(self, about: str, text: str) -> None:
+        if about not in self._reported:
+            self._reported.add(about)
             self._say(f"{self._presence.name}: {text}")
 
     # What ROS sees
 
-    def enter(self, ros: Participant) -> None:
+    def advertise_run(self, ros: RosContext) -> None:
         """Show the run to ROS."""
         self._domain = ros.domain
         types = ros.types
-        commands = Commands(self._link, self._presence, types.of("std_srvs/srv/Trigger_Response"))
+        commands = RosCommands(self._link, self._presence, types.message_class("std_srvs/srv/Trigger_Response"))
         sensors = {drone.name: drone.sensors for drone in self._scenario.drones}
         root = ros.node("/", NODE)
-        self._offer(root, topics.of_run(self.names))
-        self._place(root)
+        self._advertise(root, topics.run_topics(self.names))
+        self._publish_static_frames(root)
         for drone, name in self.names.drones.items():
             node = ros.node(f"/{name}", NODE)
-            self._offer(node, topics.of_drone(drone, name, sensors[drone], types))
-            self._obey(node, drone, name, commands)
+            self._advertise(node, topics.drone_topics(drone, name, sensors[drone], types))
+            self._accept_commands(node, drone, name, commands)
         for cluster, name in self.names.clusters.items():
             node = ros.node(f"/cluster/{name}", NODE)
-            self._offer(node, topics.of_cluster(cluster, name, types))
+            self._advertise(node, topics.cluster_topics(cluster, name, types))
             for op in CLUSTER_SERVICES:
-                node.service(f"/cluster/{name}/{op}", TRIGGER, _asking(commands.cluster, cluster, op))
-        ros.on_subscription(lambda token, alive: self._inbox.act(partial(self._on_reader, token, alive)))
-        self._say_names()
+                node.service(f"/cluster/{name}/{op}", TRIGGER, _empty_request(commands.request_cluster, cluster, op))
+        ros.on_subscription(lambda token, alive: self._queue.add_task(partial(self._on_subscription, token, alive)))
+        self._report_names()
 
-    def _offer(self, node: Node, offered: Iterator[Topic]) -> None:
+    def _advertise(self, node: Ros2Node, offered: Iterator[Topic]) -> None:
         for topic in offered:
             publisher = node.publisher(topic.name, topic.kind, topic.qos)
-            self._publications[topic.name] = Publication(topic, publisher)
+            self._publications[topic.name] = BridgedTopic(topic, publisher)
 
-    def _obey(self, node: Node, drone: str, name: str, commands: Commands) -> None:
+    def _accept_commands(self, node: Ros2Node, drone: str, name: str, commands: RosCommands) -> None:
         """Take a drone's commands."""
         empty = "std_msgs/msg/Empty"
         taken: dict[str, tuple[str, Callable[[Any], None]]] = {
-            "cmd_vel": ("geometry_msgs/msg/Twist", partial(commands.velocity, drone)),
-            "takeoff": (empty, lambda _: commands.mode(drone, "takeoff")),
-            "land": (empty, lambda _: commands.mode(drone, "land")),
-            "reset": (empty, lambda _: commands.reset(drone)),
+            "cmd_vel": ("geometry_msgs/msg/Twist", partial(commands.send_velocity, drone)),
+            "takeoff": (empty, lambda _: commands.send_mode(drone, "takeoff")),
+            "land": (empty, lambda _: commands.send_mode(drone, "land")),
+            "reset": (empty, lambda _: commands.toggle_emergency(drone)),
         }
         for leaf, (kind, act) in taken.items():
-            self._ends.append(node.subscription(f"/{name}/{leaf}", kind, rmw_zenoh.DEFAULT, act))
-        node.service(f"/{name}/release", TRIGGER, _asking(commands.release, drone))
+            self._cleanups.append(node.subscription(f"/{name}/{leaf}", kind, rmw_zenoh.DEFAULT, act))
+        node.service(f"/{name}/release", TRIGGER, _empty_request(commands.release, drone))
 
-    def _place(self, node: Node) -> None:
+    def _publish_static_frames(self, node: Ros2Node) -> None:
         """Tell once, for all that come later too, where the frames are that never move."""
         publisher = node.publisher("/tf_static", "tf2_msgs/msg/TFMessage", rmw_zenoh.TF_STATIC)
         placed = [
-            pose for d in self._scenario.drones for pose in sensor_frames.fixed(self.names.drones[d.name], d.sensors)
+            pose for d in self._scenario.drones for pose in sensor_frames.static_frames(self.names.drones[d.name], d.sensors)
         ]
         publisher.publish(conversions.transforms(0, placed))
 
-    def _say_names(self) -> None:
+    def _report_names(self) -> None:
         for name, ros in {**self.names.drones, **self.names.clusters}.items():
             if name != ros:
-                self.say_once(name, f"{name} is {ros} in ROS, which takes no such name")
+                self.report_once(name, f"{name} is {ros} in ROS, which takes no such name")
 
     # What ROS subscribes to
 
-    def _on_reader(self, token: str, alive: bool) -> None:
+    def _on_subscription(self, token: str, alive: bool) -> None:
         endpoint = rmw_zenoh.endpoint_of(token)
         publication = self._publications.get(endpoint.name) if endpoint else None
         if endpoint is None or publication is None:
             return
         if endpoint.key(self._domain) != publication.publisher.key:
             kind = publication.topic.kind
-            self.say_once(token, f"{endpoint.name}: somebody subscribes to {endpoint.type_name}; it is {kind}")
+            self.report_once(token, f"{endpoint.name}: somebody subscribes to {endpoint.type_name}; it is {kind}")
             return
         readers, had = publication.readers, bool(publication.readers)
         readers.add(token) if alive else readers.discard(token)
         if bool(readers) != had:
-            (self._feeds.start if readers else self._feeds.end)(publication)
+            (self._sources.add if readers else self._sources.remove)(publication)
 
 
-def _asking(ask: Callable[..., Any], *about: str) -> Callable[[Any], Any]:
+def _empty_request(ask: Callable[..., Any], *about: str) -> Callable[[Any], Any]:
     """Return what answers an empty request."""
     return lambda _: ask(*about)
 
@@ -196,7 +196,7 @@ def serve(
     presence: ObserverProcess,
     stopped: Callable[[], bool],
     say: Say,
-    door: Door,
+    door: RosNetwork,
     wall_ns: Callable[[], int],
 ) -> None:
     """Bridge one run to ROS, until it is over or it is told to stop.
@@ -209,15 +209,15 @@ def serve(
         ros_link = link.bare() if door.router is None else None
         entered = False
         while not presence.end_reason and not stopped():
-            ros_link = ros_link or _reach(stack, door, bridge)
+            ros_link = ros_link or _connect(stack, door, bridge)
             if ros_link is not None and not entered:
-                bridge.enter(Participant(ros_link, door.domain, Types(), wall_ns, bridge.refuse))
+                bridge.advertise_run(RosContext(ros_link, door.domain, RosTypes(), wall_ns, bridge.count_refused))
                 say(f"{presence.name}: ROS domain {door.domain} by {door.router or 'the hub of the world'}")
                 entered = True
-            bridge.turn(POLL_S)
+            bridge.process(POLL_S)
 
 
-def _reach(stack: ExitStack, door: Door, bridge: Bridge) -> Session | None:
+def _connect(stack: ExitStack, door: RosNetwork, bridge: Bridge) -> Session | None:
     """Return a session with ROS's router, None where nobody listens yet."""
     assert door.router is not None
     try:
@@ -227,5 +227,5 @@ def _reach(stack: ExitStack, door: Door, bridge: Bridge) -> Session | None:
     except SessionError as error:
         if "nobody listens" not in str(error):
             raise
-        bridge.say_once("router", f"no router of ROS on {door.router} yet, waiting for it; start rmw_zenohd there")
+        bridge.report_once("router", f"no router of ROS on {door.router} yet, waiting for it; start rmw_zenohd there")
         return None

@@ -5,17 +5,17 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-Act = Callable[[], object]
+QueuedTask = Callable[[], object]
 
 
-class Taken(NamedTuple):
+class QueuedWork(NamedTuple):
     """What has come since the last time: acts, and samples as (key, payload)."""
 
-    acts: list[Act]
+    tasks: list[QueuedTask]
     samples: list[tuple[str, bytes]]
 
 
-class Inbox:
+class CallbackQueue:
     """A queue that never holds up who fills it: beyond `limit` samples the oldest go.
 
     Attributes:
@@ -24,32 +24,32 @@ class Inbox:
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
-        self._acts: list[Act] = []
+        self._tasks: list[QueuedTask] = []
         self._samples: deque[tuple[str, bytes]] = deque()
-        self._news = threading.Condition()
+        self._arrived = threading.Condition()
         self.dropped = 0
 
-    def act(self, act: Act) -> None:
+    def add_task(self, act: QueuedTask) -> None:
         """Have something done in the bridge's thread."""
-        with self._news:
-            self._acts.append(act)
-            self._news.notify()
+        with self._arrived:
+            self._tasks.append(act)
+            self._arrived.notify()
 
-    def sample(self, key: str, payload: bytes) -> None:
+    def add_sample(self, key: str, payload: bytes) -> None:
         """Have a sample passed on."""
-        with self._news:
+        with self._arrived:
             if len(self._samples) >= self._limit:
                 self._samples.popleft()
                 self.dropped += 1
             self._samples.append((key, payload))
-            self._news.notify()
+            self._arrived.notify()
 
-    def take(self, within_s: float) -> Taken:
+    def pop_all(self, within_s: float) -> QueuedWork:
         """Return what there is, waiting for something."""
-        with self._news:
-            if not self._acts and not self._samples:
-                self._news.wait(within_s)
-            taken = Taken(self._acts, list(self._samples))
-            self._acts = []
+        with self._arrived:
+            if not self._tasks and not self._samples:
+                self._arrived.wait(within_s)
+            taken = QueuedWork(self._tasks, list(self._samples))
+            self._tasks = []
             self._samples.clear()
         return taken

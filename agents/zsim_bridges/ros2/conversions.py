@@ -14,11 +14,11 @@ from zsim.contract import messages
 from zsim.contract.messages import Quaternion, Vector3
 from zsim.math.frames import quaternion_from_rpy
 from zsim.scenario import scenario
-from zsim_bridges.ros2.sensor_frames import UNTURNED, Pose, cluster, into_body, rows
+from zsim_bridges.ros2.sensor_frames import UNTURNED, FramePose, cluster, into_body, rotation_rows
 
 Array = NDArray[np.float64]
 Time, Header = ros.builtin_interfaces__msg__Time, ros.std_msgs__msg__Header
-Xyz, Point, Turn = ros.geometry_msgs__msg__Vector3, ros.geometry_msgs__msg__Point, ros.geometry_msgs__msg__Quaternion
+RosVector3, Point, RosQuaternion = ros.geometry_msgs__msg__Vector3, ros.geometry_msgs__msg__Point, ros.geometry_msgs__msg__Quaternion
 
 SECOND_NS = 1_000_000_000
 TESLA_PER_UT = 1e-6
@@ -49,11 +49,11 @@ def imu(message: messages.Imu, frame: str, gyro: Array, accel: Array) -> Any:
     """Return specific force and rates; it tells no attitude. `gyro` and `accel` are covariances (9,)."""
     return ros.sensor_msgs__msg__Imu(
         header(message.t_sample_ns, frame),
-        Turn(0.0, 0.0, 0.0, 1.0),
+        RosQuaternion(0.0, 0.0, 0.0, 1.0),
         UNKNOWN,
-        Xyz(*message.gyro_rad_s),
+        RosVector3(*message.gyro_rad_s),
         gyro,
-        Xyz(*message.accel_m_s2),
+        RosVector3(*message.accel_m_s2),
         accel,
     )
 
@@ -74,13 +74,13 @@ def fix(message: messages.Gps, frame: str) -> Any:
 
 def fix_velocity(message: messages.Gps, frame: str) -> Any:
     """Return the receiver's velocity in `frame`, which is ENU."""
-    twist = ros.geometry_msgs__msg__Twist(Xyz(*message.velocity_m_s), Xyz(0.0, 0.0, 0.0))
+    twist = ros.geometry_msgs__msg__Twist(RosVector3(*message.velocity_m_s), RosVector3(0.0, 0.0, 0.0))
     return ros.geometry_msgs__msg__TwistStamped(header(message.t_sample_ns, frame), twist)
 
 
 def mag(message: messages.Mag, frame: str, covariance: Array) -> Any:
     """Return the field [T]."""
-    field = Xyz(*(TESLA_PER_UT * each for each in message.field_ut))
+    field = RosVector3(*(TESLA_PER_UT * each for each in message.field_ut))
     return ros.sensor_msgs__msg__MagneticField(header(message.t_sample_ns, frame), field, covariance)
 
 
@@ -130,7 +130,7 @@ def true_odometry(message: messages.Truth, frame: str, child: str) -> Any:
 def odometry(message: messages.Estimate, frame: str, child: str, w_WB_B: Vector3) -> Any:
     """Return an estimate; twist in the body. Of the attitude only the heading has an uncertainty to tell."""
     P = np.array(message.covariance).reshape(6, 6)
-    R = np.array(rows(message.orientation_wxyz))
+    R = np.array(rotation_rows(message.orientation_wxyz))
     of_pose, of_twist = np.zeros((6, 6)), np.zeros((6, 6))
     of_pose[:3, :3], of_pose[5, 5] = P[:3, :3], message.yaw_sigma_rad**2
     of_twist[:3, :3] = R.T @ P[3:, 3:] @ R
@@ -144,38 +144,38 @@ def odometry(message: messages.Estimate, frame: str, child: str, w_WB_B: Vector3
 
 
 def _twist(linear: Vector3, angular: Vector3, covariance: Array) -> Any:
-    twist = ros.geometry_msgs__msg__Twist(Xyz(*linear), Xyz(*angular))
+    twist = ros.geometry_msgs__msg__Twist(RosVector3(*linear), RosVector3(*angular))
     return ros.geometry_msgs__msg__TwistWithCovariance(twist, covariance)
 
 
 def pose(position_m: Vector3, q: Quaternion) -> Any:
-    return ros.geometry_msgs__msg__Pose(Point(*position_m), turn(q))
+    return ros.geometry_msgs__msg__Pose(Point(*position_m), ros_quaternion(q))
 
 
-def turn(q: Quaternion) -> Any:
+def ros_quaternion(q: Quaternion) -> Any:
     """Return a quaternion in ROS's order: w last."""
     w, x, y, z = q
-    return Turn(x, y, z, w)
+    return RosQuaternion(x, y, z, w)
 
 
-def transform(t_ns: int, placed: Pose) -> Any:
-    moved = ros.geometry_msgs__msg__Transform(Xyz(*placed.position_m), turn(placed.orientation_wxyz))
+def transform(t_ns: int, placed: FramePose) -> Any:
+    moved = ros.geometry_msgs__msg__Transform(RosVector3(*placed.position_m), ros_quaternion(placed.orientation_wxyz))
     return ros.geometry_msgs__msg__TransformStamped(header(t_ns, placed.parent), placed.child, moved)
 
 
-def transforms(t_ns: int, placed: list[Pose]) -> Any:
+def transforms(t_ns: int, placed: list[FramePose]) -> Any:
     return ros.tf2_msgs__msg__TFMessage([transform(t_ns, each) for each in placed])
 
 
-def cluster_pose(message: messages.ClusterState, parent: str, name: str) -> Pose:
+def cluster_pose(message: messages.ClusterState, parent: str, name: str) -> FramePose:
     """Return where the cluster frame C is, by the estimates; a pair has no roll."""
     values = dict(zip(message.names, message.value, strict=True))
     x, y, z, roll, pitch, yaw = (values.get(each, 0.0) for each in ("x_c", "y_c", "z_c", "roll", "pitch", "yaw"))
     q = UNTURNED if not roll and not pitch and not yaw else tuple(quaternion_from_rpy((roll, pitch, yaw)).tolist())
-    return Pose(parent, cluster(name), (x, y, z), q)
+    return FramePose(parent, cluster(name), (x, y, z), q)
 
 
-def posed(t_ns: int, placed: Pose) -> Any:
+def pose_stamped(t_ns: int, placed: FramePose) -> Any:
     """Return a pose as a message."""
     where = pose(placed.position_m, placed.orientation_wxyz)
     return ros.geometry_msgs__msg__PoseStamped(header(t_ns, placed.parent), where)

@@ -15,7 +15,7 @@ STATES = {"landed": 2, "taking_off": 6, "hovering": 4, "flying": 3, "landing": 8
 NOTHING = (math.nan, math.nan, math.nan)
 
 
-class Navdata:
+class NavdataSummary:
     """Collects what a drone tells, and makes a message of it when its status comes, last of a gate.
 
     Args:
@@ -28,7 +28,7 @@ class Navdata:
         self._frame = frame
         self._last: dict[str, Any] = {}
 
-    def take(self, key: str, message: Any) -> Any | None:
+    def update(self, key: str, message: Any) -> Any | None:
         """Take in a message of the drone; return the summary if it was the status."""
         what = keys.leaf(key)
         if what != "status":
@@ -38,20 +38,20 @@ class Navdata:
             header=header(message.t_ns, self._frame),
             battery_percent=message.battery_percent,
             state=STATES[message.state],
-            **_named("mag_{}", self._of("mag", "field_ut", 1.0)),
-            pressure=self._whole("baro", "pressure_pa", 1.0),
+            **_named("mag_{}", self._scaled("mag", "field_ut", 1.0)),
+            pressure=self._rounded("baro", "pressure_pa", 1.0),
             **_named("rot_{}", self._attitude()),
-            altd=self._whole("sonar", "range_m", 1000.0),
-            **_named("v{}", self._of("flow", "velocity_m_s", 1000.0)),
-            **_named("a{}", self._of("imu", "accel_m_s2", 1.0 / G_M_S2)),
+            altd=self._rounded("sonar", "range_m", 1000.0),
+            **_named("v{}", self._scaled("flow", "velocity_m_s", 1000.0)),
+            **_named("a{}", self._scaled("imu", "accel_m_s2", 1.0 / G_M_S2)),
             tm=message.t_ns / 1000.0,
         )
 
-    def _of(self, sensor: str, field: str, factor: float) -> tuple[float, ...]:
+    def _scaled(self, sensor: str, field: str, factor: float) -> tuple[float, ...]:
         found = getattr(self._last.get(sensor), field, NOTHING)
         return tuple(factor * each for each in found)
 
-    def _whole(self, sensor: str, field: str, factor: float) -> int:
+    def _rounded(self, sensor: str, field: str, factor: float) -> int:
         return round(factor * getattr(self._last.get(sensor), field, 0.0))
 
     def _attitude(self) -> tuple[float, ...]:

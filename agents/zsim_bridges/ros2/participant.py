@@ -7,14 +7,14 @@ from typing import Any
 from zsim.transport.session import Heard, Query, Session
 from zsim_bridges.ros2 import rmw_zenoh
 from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId, Qos
-from zsim_bridges.ros2.ros_types import Types, service_parts
+from zsim_bridges.ros2.ros_types import RosTypes, service_parts
 
 CDR = "application/cdr"
-Refuse = Callable[[str, str], None]
+OnRefused = Callable[[str, str], None]
 """Told (name, why) of what others sent in vain; called in threads of Zenoh's."""
 
 
-class Participant:
+class RosContext:
     """What ROS calls a context.
 
     Args:
@@ -25,7 +25,7 @@ class Participant:
         refuse: told of what is refused.
     """
 
-    def __init__(self, link: Session, domain: int, types: Types, wall_ns: Callable[[], int], refuse: Refuse) -> None:
+    def __init__(self, link: Session, domain: int, types: RosTypes, wall_ns: Callable[[], int], refuse: OnRefused) -> None:
         self.link = link
         self.domain = domain
         self.types = types
@@ -34,9 +34,9 @@ class Participant:
         self._numbers = count()
         self._zid = link.zid()
 
-    def node(self, namespace: str, name: str) -> "Node":
+    def node(self, namespace: str, name: str) -> "Ros2Node":
         """Return a node, which others see from now on."""
-        return Node(self, NodeId(self.domain, self._zid, self.number(), namespace, name))
+        return Ros2Node(self, NodeId(self.domain, self._zid, self.number(), namespace, name))
 
     def number(self) -> int:
         """Return the number of a new node or endpoint."""
@@ -44,13 +44,13 @@ class Participant:
 
     def on_subscription(self, callback: Callable[[str, bool], None]) -> None:
         """Call back with (token, alive), in a thread of Zenoh's, for the subscriptions of all participants."""
-        self.link.on_token(rmw_zenoh.subscriptions(self.domain), callback)
+        self.link.on_token(rmw_zenoh.subscription_tokens(self.domain), callback)
 
 
-class Node:
+class Ros2Node:
     """A node of a participant."""
 
-    def __init__(self, participant: Participant, identity: NodeId) -> None:
+    def __init__(self, participant: RosContext, identity: NodeId) -> None:
         self._participant = participant
         self._identity = identity
         participant.link.declare_token(rmw_zenoh.node_token(identity))
@@ -59,7 +59,7 @@ class Node:
         """Return a publisher of a topic, given by its whole name."""
         endpoint, token = self._endpoint("MP", topic, kind, qos)
         publisher = Publisher(self._participant, endpoint, kind, qos, rmw_zenoh.gid_of(token))
-        self._show(token)
+        self._declare(token)
         return publisher
 
     def subscription(self, topic: str, kind: str, qos: Qos, callback: Callable[[Any], None]) -> Callable[[], None]:
@@ -75,7 +75,7 @@ class Node:
                 ours.refuse(topic, str(error))
 
         end = ours.link.hear(endpoint.key(ours.domain), take)
-        self._show(token)
+        self._declare(token)
         return end
 
     def service(self, name: str, kind: str, answer: Callable[[Any], Any]) -> None:
@@ -96,7 +96,7 @@ class Node:
             query.reply_as(key, ours.types.encode(said, response), beside.packed())
 
         ours.link.answer(key, reply, complete=True)
-        self._show(token)
+        self._declare(token)
 
     def _endpoint(self, how: rmw_zenoh.Kind, name: str, kind: str, qos: Qos) -> tuple[Endpoint, str]:
         """Return a new endpoint and its token."""
@@ -104,7 +104,7 @@ class Node:
         endpoint = Endpoint(how, name, rmw_zenoh.dds_name(kind), ours.types.hash(kind))
         return endpoint, rmw_zenoh.endpoint_token(self._identity, ours.number(), endpoint, qos)
 
-    def _show(self, token: str) -> None:
+    def _declare(self, token: str) -> None:
         """Let others know of an endpoint, once it works: they may use it at once."""
         self._participant.link.declare_token(token)
 
@@ -116,14 +116,14 @@ class Publisher:
         key: where its messages go.
     """
 
-    def __init__(self, participant: Participant, endpoint: Endpoint, kind: str, qos: Qos, gid: bytes) -> None:
+    def __init__(self, participant: RosContext, endpoint: Endpoint, kind: str, qos: Qos, gid: bytes) -> None:
         self._participant = participant
         self._kind = kind
         self._gid = gid
         self._sent = 0
         self.key = endpoint.key(participant.domain)
         kept = qos.transient_local
-        self._write = _keeper(participant.link, self.key) if kept else participant.link.writer(self.key, CDR)
+        self._write = _transient_writer(participant.link, self.key) if kept else participant.link.writer(self.key, CDR)
 
     def publish(self, message: Any) -> None:
         """Send a message; a subscriber that takes nothing loses it, nobody waits.
@@ -138,6 +138,6 @@ class Publisher:
         self._write(payload, beside)
 
 
-def _keeper(link: Session, key: str) -> Callable[[bytes, bytes], None]:
+def _transient_writer(link: Session, key: str) -> Callable[[bytes, bytes], None]:
     """Return what publishes for those too who come later."""
     return lambda payload, attachment: link.put_kept(key, payload, CDR, attachment)

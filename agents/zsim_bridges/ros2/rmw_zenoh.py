@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import xxhash
 
-SPACE = "@ros2_lv"  # of all tokens; `**` does not match it
+TOKEN_SPACE = "@ros2_lv"  # of all tokens; `**` does not match it
 Kind = Literal["NN", "MP", "MS", "SS", "SC"]
 """A node, a publisher, a subscription, a service, a client."""
 TOKEN_PARTS = 13  # of an endpoint's token
@@ -75,18 +75,18 @@ def data_key(domain: int, name: str, type_name: str, type_hash: str) -> str:
 
 def node_token(node: NodeId) -> str:
     """Return the token of a node."""
-    return f"{_head(node, node.number, 'NN')}"
+    return f"{_token_head(node, node.number, 'NN')}"
 
 
 def endpoint_token(node: NodeId, number: int, endpoint: Endpoint, qos: Qos) -> str:
     """Return the token of one of a node's endpoints."""
     about = f"{_mangled(endpoint.name)}/{endpoint.type_name}/{endpoint.type_hash}/{qos.text()}"
-    return f"{_head(node, number, endpoint.kind)}/{about}"
+    return f"{_token_head(node, number, endpoint.kind)}/{about}"
 
 
-def _head(node: NodeId, number: int, kind: str) -> str:
+def _token_head(node: NodeId, number: int, kind: str) -> str:
     enclave = "%"
-    place = f"{SPACE}/{node.domain}/{node.zid}/{node.number}/{number}/{kind}"
+    place = f"{TOKEN_SPACE}/{node.domain}/{node.zid}/{node.number}/{number}/{kind}"
     return f"{place}/{enclave}/{_mangled(node.namespace)}/{node.name}"
 
 
@@ -94,15 +94,15 @@ def _mangled(name: str) -> str:
     return name.replace("/", "%")
 
 
-def subscriptions(domain: int) -> str:
+def subscription_tokens(domain: int) -> str:
     """Return the expression of the tokens of all subscriptions."""
-    return f"{SPACE}/{domain}/*/*/*/MS/**"
+    return f"{TOKEN_SPACE}/{domain}/*/*/*/MS/**"
 
 
 def endpoint_of(token: str) -> Endpoint | None:
     """Return what a token tells of an endpoint; None where it is none."""
     parts = token.split("/")
-    if len(parts) != TOKEN_PARTS or parts[0] != SPACE:
+    if len(parts) != TOKEN_PARTS or parts[0] != TOKEN_SPACE:
         return None
     return Endpoint(parts[5], parts[9].replace("%", "/"), parts[10], parts[11])
 

@@ -13,7 +13,7 @@ from zsim_bridges.ros2.definitions import MESSAGES, SERVICE_EVENT_INFO, SERVICES
 MEMBERLESS = "structure_needs_at_least_one_member"  # what an empty message has in its place, a uint8
 
 
-class Types:
+class RosTypes:
     """The types of one ROS distribution; those used here are the same from Iron to Lyrical."""
 
     def __init__(self) -> None:
@@ -25,7 +25,7 @@ class Types:
                 self._store.register(get_types_from_msg(text, part))
         self._hashes: dict[str, str] = {}
 
-    def of(self, name: str) -> Any:
+    def message_class(self, name: str) -> Any:
         """Return the class of a type, by a name such as `sensor_msgs/msg/Imu` or `std_srvs/srv/Trigger_Response`."""
         return self._store.types[_stored(name)]
 
@@ -83,15 +83,15 @@ def _with_service(known: Typestore, name: str) -> Typestore:
     store.fielddefs[event] = (
         [],
         [
-            ("info", _named("service_msgs/msg/ServiceEventInfo")),
-            ("request", (Nodetype.SEQUENCE, (_named(request), 1))),
-            ("response", (Nodetype.SEQUENCE, (_named(response), 1))),
+            ("info", _type_reference("service_msgs/msg/ServiceEventInfo")),
+            ("request", (Nodetype.SEQUENCE, (_type_reference(request), 1))),
+            ("response", (Nodetype.SEQUENCE, (_type_reference(response), 1))),
         ],
     )
     members = {"request_message": request, "response_message": response, "event_message": event}
-    store.fielddefs[name] = [], [(member, _named(kind)) for member, kind in members.items()]
+    store.fielddefs[name] = [], [(member, _type_reference(kind)) for member, kind in members.items()]
     return store
 
 
-def _named(name: str) -> Any:
+def _type_reference(name: str) -> Any:
     return Nodetype.NAME, name

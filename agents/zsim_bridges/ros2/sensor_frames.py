@@ -20,7 +20,7 @@ UNTURNED: Quaternion = (1.0, 0.0, 0.0, 0.0)
 _ALONG_BEAM = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 
 
-class Pose(NamedTuple):
+class FramePose(NamedTuple):
     """Where a frame stands in another one."""
 
     parent: str
@@ -45,17 +45,17 @@ def cluster(name: str) -> str:
     return f"cluster/{name}"
 
 
-def fixed(drone: str, sensors: Sensors) -> Iterator[Pose]:
+def static_frames(drone: str, sensors: Sensors) -> Iterator[FramePose]:
     """Yield the frames of a drone that never move: its odom in map, its sensors in its body."""
-    yield Pose(MAP, odom(drone), (0.0, 0.0, 0.0), UNTURNED)
+    yield FramePose(MAP, odom(drone), (0.0, 0.0, 0.0), UNTURNED)
     for kind in ("imu", "gps", "mag", "baro"):
         mount: Mount = getattr(sensors, kind).mount
-        yield Pose(base(drone), sensor(drone, kind), mount.position_m, _turn(mount))
-    beam = quaternion_multiply(_turn(sensors.sonar.mount), _ALONG_BEAM)
-    yield Pose(base(drone), sensor(drone, "sonar"), sensors.sonar.mount.position_m, _quaternion(beam))
+        yield FramePose(base(drone), sensor(drone, kind), mount.position_m, _mount_rotation(mount))
+    beam = quaternion_multiply(_mount_rotation(sensors.sonar.mount), _ALONG_BEAM)
+    yield FramePose(base(drone), sensor(drone, "sonar"), sensors.sonar.mount.position_m, _quaternion(beam))
 
 
-def _turn(mount: Mount) -> Quaternion:
+def _mount_rotation(mount: Mount) -> Quaternion:
     """Return q_BS."""
     return _quaternion(quaternion_from_rpy(np.radians(mount.rpy_deg)))
 
@@ -68,7 +68,7 @@ def _quaternion(q: np.ndarray) -> Quaternion:
 Rows = tuple[Vector3, Vector3, Vector3]
 
 
-def rows(q_WB: Quaternion) -> Rows:
+def rotation_rows(q_WB: Quaternion) -> Rows:
     """Return R_WB row by row, in plain floats: messages come by the thousand, and small arrays cost more."""
     w, x, y, z = q_WB
     return (
@@ -80,7 +80,7 @@ def rows(q_WB: Quaternion) -> Rows:
 
 def into_body(q_WB: Quaternion, v_W: Vector3) -> Vector3:
     """Return v_B = R_WB^T v_W."""
-    (a, b, c), (d, e, f), (g, h, i) = rows(q_WB)
+    (a, b, c), (d, e, f), (g, h, i) = rotation_rows(q_WB)
     x, y, z = v_W
     return a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z
 

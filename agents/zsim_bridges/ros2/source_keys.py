@@ -7,14 +7,14 @@ from typing import Any, NamedTuple
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError
 from zsim.transport.session import Heard, Mailbox, Sample, Session
-from zsim_bridges.ros2.callback_queue import Inbox
+from zsim_bridges.ros2.callback_queue import CallbackQueue
 from zsim_bridges.ros2.participant import Publisher
 from zsim_bridges.ros2.topics import Topic
 
 SAMPLES_MAX = 2000  # of a key that wait to be converted: about a tenth of a second of work
 
 
-class Publication:
+class BridgedTopic:
     """A topic of ours, and the tokens of who subscribes to it."""
 
     def __init__(self, topic: Topic, publisher: Publisher) -> None:
@@ -23,15 +23,15 @@ class Publication:
         self.readers: set[str] = set()
 
 
-class Feed(NamedTuple):
+class SourceSubscription(NamedTuple):
     """A key that is read, for whom, and what ends it; `box` is emptied at each turn, without one it makes turns."""
 
-    readers: list[Publication]
-    end: Callable[[], None]
-    box: Mailbox | None = None
+    readers: list[BridgedTopic]
+    close: Callable[[], None]
+    mailbox: Mailbox | None = None
 
 
-class Feeds:
+class SourceSubscriptions:
     """All that is read.
 
     Args:
@@ -45,52 +45,52 @@ class Feeds:
         dropped: how many samples were too many.
     """
 
-    def __init__(self, link: Session, inbox: Inbox, refuse: Callable[[str, str], None], prompt: bool) -> None:
+    def __init__(self, link: Session, inbox: CallbackQueue, refuse: Callable[[str, str], None], prompt: bool) -> None:
         self._link = link
         self._inbox = inbox
         self._refuse = refuse
         self._prompt = prompt
-        self._feeds: dict[str, Feed] = {}
+        self._by_key: dict[str, SourceSubscription] = {}
         self.dropped = 0
 
-    def start(self, publication: Publication) -> None:
+    def add(self, publication: BridgedTopic) -> None:
         """Read what a topic is made of."""
         for key in publication.topic.sources:
-            if key not in self._feeds:
-                self._feeds[key] = self._feed(key)
-            self._feeds[key].readers.append(publication)
+            if key not in self._by_key:
+                self._by_key[key] = self._open_source(key)
+            self._by_key[key].readers.append(publication)
 
-    def _feed(self, key: str) -> Feed:
+    def _open_source(self, key: str) -> SourceSubscription:
         """Read a key: what the world says of a drone is there when its clock comes, others say theirs at any time."""
         if self._prompt and keys.leaf(key) in ("estimate", "state"):
-            return Feed([], self._link.hear(key, self._on_sample))
+            return SourceSubscription([], self._link.hear(key, self._on_sample))
         box = self._link.subscribe(key)
-        return Feed([], box.close, box)
+        return SourceSubscription([], box.close, box)
 
     def _on_sample(self, heard: Heard) -> None:
         if heard.payload:
-            self._inbox.sample(heard.key, heard.payload)
+            self._inbox.add_sample(heard.key, heard.payload)
 
-    def end(self, publication: Publication) -> None:
+    def remove(self, publication: BridgedTopic) -> None:
         """Read no more what only this topic is made of."""
         for key in publication.topic.sources:
-            feed = self._feeds[key]
+            feed = self._by_key[key]
             feed.readers.remove(publication)
             if not feed.readers:
-                feed.end()
-                del self._feeds[key]
+                feed.close()
+                del self._by_key[key]
 
     def close(self) -> None:
         """Read nothing any more."""
-        for feed in self._feeds.values():
-            feed.end()
+        for feed in self._by_key.values():
+            feed.close()
 
-    def pass_on(self, samples: Sequence[tuple[str, bytes]]) -> int:
+    def convert_all(self, samples: Sequence[tuple[str, bytes]]) -> int:
         """Publish what samples, and those in the boxes, mean in ROS, in order of time; return how many they were."""
-        boxes = [feed.box for feed in self._feeds.values() if feed.box]
+        boxes = [feed.mailbox for feed in self._by_key.values() if feed.mailbox]
         taken = [*samples, *(sample for box in boxes for sample in self._newest(box))]
-        for key, message in sorted(self._decoded(taken), key=_when):
-            for publication in self._feeds[key].readers:
+        for key, message in sorted(self._decoded(taken), key=_gate_order):
+            for publication in self._by_key[key].readers:
                 self._publish(publication, key, message)
         return len(taken)
 
@@ -103,13 +103,13 @@ class Feeds:
     def _decoded(self, samples: Iterable[tuple[str, bytes]]) -> Iterator[tuple[str, Any]]:
         """Yield the messages in samples, of keys that are read still."""
         for key, payload in samples:
-            if key in self._feeds:
+            if key in self._by_key:
                 try:
                     yield key, messages.decode(key, payload)
                 except DecodeError as error:
                     self._refuse(key, str(error))
 
-    def _publish(self, publication: Publication, key: str, message: Any) -> None:
+    def _publish(self, publication: BridgedTopic, key: str, message: Any) -> None:
         try:
             converted = publication.topic.convert(key, message)
             if converted is not None:
@@ -118,7 +118,7 @@ class Feeds:
             self._refuse(publication.topic.name, f"{key} does not fit it ({error})")
 
 
-def _when(told: tuple[str, Any]) -> tuple[int, bool]:
+def _gate_order(told: tuple[str, Any]) -> tuple[int, bool]:
     """Return what puts messages in the order in which the world tells them: status last of a gate."""
     key, message = told
     return message.t_ns, keys.is_status(key)

@@ -11,10 +11,10 @@ from zsim.contract.messages import ClusterState, Estimate, Status
 from zsim.scenario.scenario import Sensors
 from zsim_bridges.ros2 import conversions as convert
 from zsim_bridges.ros2 import rmw_zenoh, sensor_frames
-from zsim_bridges.ros2.navdata import Navdata
+from zsim_bridges.ros2.navdata import NavdataSummary
 from zsim_bridges.ros2.rmw_zenoh import Qos
-from zsim_bridges.ros2.ros_types import Types
-from zsim_bridges.ros2.sensor_frames import Pose
+from zsim_bridges.ros2.ros_types import RosTypes
+from zsim_bridges.ros2.sensor_frames import FramePose
 
 SLOW_NS = 1_000_000_000  # of battery, which changes within minutes
 Conversion = Callable[[str, Any], Any | None]
@@ -31,33 +31,33 @@ class Topic(NamedTuple):
     convert: Conversion
 
 
-class Names(NamedTuple):
+class RosNames(NamedTuple):
     """ROS names of drones and clusters by their own."""
 
     drones: dict[str, str]
     clusters: dict[str, str]
 
 
-def of_run(names: Names) -> Iterator[Topic]:
+def run_topics(names: RosNames) -> Iterator[Topic]:
     """Yield the topics that stand for the run as a whole."""
     yield Topic("/clock", "rosgraph_msgs/msg/Clock", rmw_zenoh.CLOCK, (keys.CLOCK,), lambda _, m: convert.clock(m))
     moving = (*map(keys.estimate, names.drones), *map(keys.cluster_state, names.clusters))
-    yield Topic("/tf", "tf2_msgs/msg/TFMessage", rmw_zenoh.TF, moving, partial(_moved, names))
+    yield Topic("/tf", "tf2_msgs/msg/TFMessage", rmw_zenoh.TF, moving, partial(_moving_frame, names))
 
 
-def _moved(names: Names, key: str, message: Estimate | ClusterState) -> Any:
+def _moving_frame(names: RosNames, key: str, message: Estimate | ClusterState) -> Any:
     """Return where a drone, or a cluster frame, is."""
     if isinstance(message, ClusterState):
         placed = convert.cluster_pose(message, sensor_frames.MAP, names.clusters[keys.thing(key)])
     else:
         drone = names.drones[keys.thing(key)]
-        placed = Pose(
+        placed = FramePose(
             sensor_frames.odom(drone), sensor_frames.base(drone), message.position_m, message.orientation_wxyz
         )
     return convert.transforms(message.t_ns, [placed])
 
 
-def of_drone(drone: str, ros: str, sensors: Sensors, types: Types) -> Iterator[Topic]:
+def drone_topics(drone: str, ros: str, sensors: Sensors, types: RosTypes) -> Iterator[Topic]:
     """Yield a drone's topics.
 
     Args:
@@ -66,24 +66,24 @@ def of_drone(drone: str, ros: str, sensors: Sensors, types: Types) -> Iterator[T
         sensors: for their limits and errors.
         types: for messages of our own.
     """
-    yield from _of_sensors(drone, ros, sensors)
+    yield from _sensor_topics(drone, ros, sensors)
     estimate, status, base = keys.estimate(drone), keys.status(drone), sensor_frames.base(ros)
-    odometry = Odometry(sensor_frames.odom(ros), base)
+    odometry = OdometryTopic(sensor_frames.odom(ros), base)
     truth = keys.truth(drone)
     yield Topic(f"/{ros}/odometry", "nav_msgs/msg/Odometry", rmw_zenoh.DEFAULT, (estimate,), odometry.take)
     yield Topic(
         f"/{ros}/ground_truth", "nav_msgs/msg/Odometry", rmw_zenoh.DEFAULT, (truth,),
         lambda _, m: convert.true_odometry(m, sensor_frames.MAP, base),
     )  # fmt: skip
-    level = Slowly(partial(convert.battery, frame=base))
+    level = EverySecond(partial(convert.battery, frame=base))
     yield Topic(f"/{ros}/battery", "sensor_msgs/msg/BatteryState", rmw_zenoh.DEFAULT, (status,), level.take)
     yield Topic(f"/{ros}/state", "std_msgs/msg/String", rmw_zenoh.DEFAULT, (status,), OnChange(convert.state).take)
-    summary = Navdata(types.of("zsim_msgs/msg/Navdata"), base)
+    summary = NavdataSummary(types.message_class("zsim_msgs/msg/Navdata"), base)
     told = (*(keys.sensor(drone, kind) for kind in keys.SENSORS if kind != "gps"), estimate, status)
-    yield Topic(f"/{ros}/navdata", "zsim_msgs/msg/Navdata", rmw_zenoh.SENSOR, told, summary.take)
+    yield Topic(f"/{ros}/navdata", "zsim_msgs/msg/Navdata", rmw_zenoh.SENSOR, told, summary.update)
 
 
-def _of_sensors(drone: str, ros: str, sensors: Sensors) -> Iterator[Topic]:
+def _sensor_topics(drone: str, ros: str, sensors: Sensors) -> Iterator[Topic]:
     """Yield the topics that are a sensor each; stamped with the time for which a sample holds."""
     imu, mag, sonar = sensors.imu, sensors.mag, sensors.sonar
     gyro = convert.diagonal(np.radians(1.0) ** 2 * convert.variance(imu.gyro_deg_s, imu.rate_hz))
@@ -104,21 +104,21 @@ def _of_sensors(drone: str, ros: str, sensors: Sensors) -> Iterator[Topic]:
     yield of("range", "sensor_msgs/msg/Range", "sonar", lambda m, f: convert.sonar_range(m, f, sonar, spread))
 
 
-def of_cluster(cluster: str, ros: str, types: Types) -> Iterator[Topic]:
+def cluster_topics(cluster: str, ros: str, types: RosTypes) -> Iterator[Topic]:
     """Yield a cluster's topics."""
     source = (keys.cluster_state(cluster),)
-    kind = types.of("zsim_msgs/msg/ClusterState")
+    kind = types.message_class("zsim_msgs/msg/ClusterState")
     yield Topic(
         f"/cluster/{ros}/state", "zsim_msgs/msg/ClusterState", rmw_zenoh.DEFAULT, source,
         lambda _, m: convert.cluster_state(kind, m, sensor_frames.MAP),
     )  # fmt: skip
     yield Topic(
         f"/cluster/{ros}/pose", "geometry_msgs/msg/PoseStamped", rmw_zenoh.DEFAULT, source,
-        lambda _, m: convert.posed(m.t_ns, convert.cluster_pose(m, sensor_frames.MAP, ros)),
+        lambda _, m: convert.pose_stamped(m.t_ns, convert.cluster_pose(m, sensor_frames.MAP, ros)),
     )  # fmt: skip
 
 
-class Odometry:
+class OdometryTopic:
     """Makes an Odometry of each estimate; its rates are the mean ones since the estimate before."""
 
     def __init__(self, frame: str, child: str) -> None:
@@ -136,7 +136,7 @@ class Odometry:
         return convert.odometry(message, self._frame, self._child, rate)
 
 
-class Slowly:
+class EverySecond:
     """Passes one message of a simulated second."""
 
     def __init__(self, make: Callable[[Status], Any]) -> None:

@@ -34,7 +34,7 @@ def ros2(
         return
     from zsim.transport.identity import Identity
     from zsim.transport.tls import is_tls
-    from zsim_bridges.ros2.bridge import Door, serve
+    from zsim_bridges.ros2.bridge import RosNetwork, serve
     from zsim_deploy.roles.priority import give_way
     from zsim_deploy.roles.service_loop import named, visit
 
@@ -44,7 +44,7 @@ def ros2(
     give_way()
     who = reach.who
     to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
-    door = Door(domain, router, to_router)
+    door = RosNetwork(domain, router, to_router)
     mine = named("ros2", name, reach.tls)
     visit(mine, partial(serve, door=door, wall_ns=time.time_ns), reach)
 

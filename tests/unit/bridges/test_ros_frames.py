@@ -26,7 +26,7 @@ def test_rotations_agree_with_scipy():
         yaw, pitch, roll = rotation.as_euler("ZYX")
         assert ros_frames.rpy(q) == pytest.approx((roll, pitch, yaw), abs=1e-9)
         assert ros_frames.rotated(q, tuple(v)) == pytest.approx(rotation.apply(v), abs=1e-12)
-        assert ros_frames.upright(q) == pytest.approx(rotation.as_matrix()[2, 2], abs=1e-12)
+        assert ros_frames.tilt_cosine(q) == pytest.approx(rotation.as_matrix()[2, 2], abs=1e-12)
         assert ros_frames.xyzw(q) == pytest.approx(rotation.as_quat(), abs=1e-15)
 
 
@@ -36,4 +36,4 @@ def test_a_nose_to_the_north_has_a_yaw_of_90_degrees():
 
 
 def test_names_have_letters_digits_and_underscores():
-    assert ros_frames.graph_name("drone-1.a") == "drone_1_a"
+    assert ros_frames.ros1_name("drone-1.a") == "drone_1_a"

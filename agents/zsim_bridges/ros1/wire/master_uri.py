@@ -11,7 +11,7 @@ DEFAULT_MASTER = "http://127.0.0.1:11311"  # ROS's own
 DEFAULT_PORT = 11311
 
 
-def reachable_as(master_uri: str, environment: Mapping[str, str] = os.environ) -> str:
+def own_address(master_uri: str, environment: Mapping[str, str] = os.environ) -> str:
     """Return the name or address under which nodes of a master's graph reach this host.
 
     ROS's own variables come first, then the address from which this host reaches the master.

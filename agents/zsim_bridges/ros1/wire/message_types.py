@@ -5,7 +5,7 @@ from typing import Any
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from zsim_bridges.ros1.wire.tcpros import Offer
+from zsim_bridges.ros1.wire.tcpros import TopicType
 
 NAVDATA = """
 Header header
@@ -43,26 +43,26 @@ float32[] tags_orientation
 float32[] tags_distance
 float32 tm              # us
 """  # fields of ardrone_autonomy 1.4.1, msg/Navdata.msg; the MD5 sum leaves comments out
-MORE = {
+DEFINITIONS = {
     "ardrone_autonomy/msg/Navdata": NAVDATA,
     "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
 }
-EMPTY_SERVICE = Offer("", "std_srvs/Empty", "d41d8cd98f00b204e9800998ecf8427e", "")  # MD5 of no text at all
+EMPTY_SERVICE = TopicType("", "std_srvs/Empty", "d41d8cd98f00b204e9800998ecf8427e", "")  # MD5 of no text at all
 
 _store = get_typestore(Stores.ROS1_NOETIC)
-for _name, _text in MORE.items():
+for _name, _text in DEFINITIONS.items():
     _store.register(get_types_from_msg(_text, _name))
 
 
-def offer(topic: str, kind: str) -> Offer:
+def topic_type(topic: str, kind: str) -> TopicType:
     """Return a topic of a type such as "sensor_msgs/Imu"."""
-    definition, md5 = _store.generate_msgdef(_long(kind), ros_version=1)
-    return Offer(topic, kind, md5, definition)
+    definition, md5 = _store.generate_msgdef(_full_name(kind), ros_version=1)
+    return TopicType(topic, kind, md5, definition)
 
 
-def message(kind: str) -> Callable[..., Any]:
+def message_class(kind: str) -> Callable[..., Any]:
     """Return the class of a type's messages."""
-    return _store.types[_long(kind)]
+    return _store.types[_full_name(kind)]
 
 
 def serialize(kind: str, what: Any) -> bytes:
@@ -72,7 +72,7 @@ def serialize(kind: str, what: Any) -> bytes:
         ValueError: a number does not go into its field.
     """
     try:
-        return bytes(_store.serialize_ros1(what, _long(kind)))
+        return bytes(_store.serialize_ros1(what, _full_name(kind)))
     except Exception as error:  # whatever the generated writer meets in numbers of somebody else's
         raise ValueError(f"is no {kind}: {error}") from error
 
@@ -84,10 +84,10 @@ def deserialize(kind: str, data: bytes) -> Any:
         ValueError: they are no such message.
     """
     try:
-        return _store.deserialize_ros1(data, _long(kind))
+        return _store.deserialize_ros1(data, _full_name(kind))
     except Exception as error:  # whatever the generated reader meets in bytes of somebody else's
         raise ValueError(f"{len(data)} bytes are no {kind}") from error
 
 
-def _long(kind: str) -> str:
+def _full_name(kind: str) -> str:
     return kind.replace("/", "/msg/")

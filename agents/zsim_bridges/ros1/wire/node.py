@@ -8,18 +8,18 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any
 
 from zsim_bridges.ros1.wire import message_types, tcpros_streams, xmlrpc
-from zsim_bridges.ros1.wire.publisher import Publication
-from zsim_bridges.ros1.wire.registration import Place, Registration
-from zsim_bridges.ros1.wire.service import Service
+from zsim_bridges.ros1.wire.publisher import PublishedTopic
+from zsim_bridges.ros1.wire.registration import GraphEntry, Registration
+from zsim_bridges.ros1.wire.service import EmptyService
 from zsim_bridges.ros1.wire.slave_api import SlaveApi
-from zsim_bridges.ros1.wire.subscriber import Subscription
+from zsim_bridges.ros1.wire.subscriber import SubscribedTopic
 
 EVERYWHERE, LOOPBACK = "0.0.0.0", "127.0.0.1"
 STOP_POLL_S = 0.1  # how soon the XML-RPC server ends
 Say = Callable[[str], None]
 
 
-class Node:
+class Ros1Node:
     """One node; all but its slave API lives in one asyncio loop.
 
     Args:
@@ -34,35 +34,35 @@ class Node:
 
     def __init__(self, name: str, master_uri: str, host: str, say: Say) -> None:
         self.name = name
-        self.dismissed = ""
+        self.shutdown_reason = ""
         self._master_uri = master_uri
         self._host = host
         self._say = say
-        self._published: dict[str, Publication] = {}
-        self._subscribed: dict[str, Subscription] = {}
-        self._services: dict[str, Service] = {}
+        self._published: dict[str, PublishedTopic] = {}
+        self._subscribed: dict[str, SubscribedTopic] = {}
+        self._services: dict[str, EmptyService] = {}
         self._connections: set[asyncio.Task[Any]] = set()
 
-    def publish(self, topic: str, kind: str, queue_size: int) -> Publication:
+    def publish(self, topic: str, kind: str, queue_size: int) -> PublishedTopic:
         """Offer a topic; before `running`."""
-        made = self._published[topic] = Publication(message_types.offer(topic, kind), queue_size)
+        made = self._published[topic] = PublishedTopic(message_types.topic_type(topic, kind), queue_size)
         return made
 
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
         """Take a topic; before `running`. `take` raises ValueError for a message that it refuses."""
-        self._subscribed[topic] = Subscription(message_types.offer(topic, kind), self.name, take, self._say)
+        self._subscribed[topic] = SubscribedTopic(message_types.topic_type(topic, kind), self.name, take, self._say)
 
     def serve(self, name: str, act: Callable[[], str | None]) -> None:
         """Offer a std_srvs/Empty service; before `running`. `act` returns why it fails, None where it is done."""
-        self._services[name] = Service(message_types.EMPTY_SERVICE._replace(name=name), act)
+        self._services[name] = EmptyService(message_types.EMPTY_SERVICE._replace(name=name), act)
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
         """Be in the ROS graph."""
         bound = LOOPBACK if _is_loopback(self._host) else EVERYWHERE
-        doors = await asyncio.start_server(self._meet, bound, 0)
+        doors = await asyncio.start_server(self._on_connection, bound, 0)
         port: int = doors.sockets[0].getsockname()[1]
-        api = xmlrpc.Server(bound, self._slave_api(port))
+        api = xmlrpc.XmlRpcServer(bound, self._slave_api(port))
         threading.Thread(target=api.serve_forever, args=(STOP_POLL_S,), name="slave API", daemon=True).start()
         registration = self._registration(api.server_address[1], port)
         registration.start()
@@ -73,7 +73,7 @@ class Node:
             doors.close()
             await asyncio.to_thread(api.shutdown)
             api.server_close()
-            await self._hang_up()
+            await self._close_connections()
 
     def _slave_api(self, port: int) -> SlaveApi:
         loop = asyncio.get_running_loop()
@@ -83,13 +83,13 @@ class Node:
             (self._host, port),
             self._published,
             self._subscribed,
-            lambda topic, uris: _later(loop, self._subscribed[topic].update, uris),
-            self._dismiss,
+            lambda topic, uris: _call_in_loop(loop, self._subscribed[topic].update, uris),
+            self._request_shutdown,
         )
 
     def _registration(self, api_port: int, port: int) -> Registration:
         loop = asyncio.get_running_loop()
-        place = Place(
+        place = GraphEntry(
             self.name,
             f"http://{self._host}:{api_port}/",
             f"rosrpc://{self._host}:{port}",
@@ -100,21 +100,21 @@ class Node:
         return Registration(
             self._master_uri,
             place,
-            lambda topic, uris: _later(loop, self._subscribed[topic].update, uris, False),
-            self._dismiss,
+            lambda topic, uris: _call_in_loop(loop, self._subscribed[topic].update, uris, False),
+            self._request_shutdown,
             self._say,
         )
 
-    def _dismiss(self, reason: str) -> None:
-        self.dismissed = self.dismissed or reason
+    def _request_shutdown(self, reason: str) -> None:
+        self.shutdown_reason = self.shutdown_reason or reason
 
-    async def _meet(self, reader: StreamReader, writer: StreamWriter) -> None:
+    async def _on_connection(self, reader: StreamReader, writer: StreamWriter) -> None:
         """Serve one connection until it ends, whatever it is."""
         task = asyncio.current_task()
         assert task is not None
         self._connections.add(task)
         try:
-            with contextlib.suppress(*tcpros_streams.BROKEN):
+            with contextlib.suppress(*tcpros_streams.CONNECTION_ERRORS):
                 header = await tcpros_streams.read_header(reader)
                 await self._serve(reader, writer, header)
         except asyncio.CancelledError:
@@ -128,11 +128,11 @@ class Node:
         name = header.get("service") or header.get("topic", "")
         wanted = offered.get(name)
         if wanted is None:
-            await tcpros_streams.say_error(writer, f"[{self.name}] has no topic or service [{name[:200]}]")
+            await tcpros_streams.send_error(writer, f"[{self.name}] has no topic or service [{name[:200]}]")
             return
         await wanted.serve(reader, writer, header, self.name)
 
-    async def _hang_up(self) -> None:
+    async def _close_connections(self) -> None:
         """End all connections."""
         for subscription in self._subscribed.values():
             await subscription.close()
@@ -141,7 +141,7 @@ class Node:
         await asyncio.gather(*self._connections, return_exceptions=True)
 
 
-def _later(loop: asyncio.AbstractEventLoop, act: Callable[..., None], *arguments: Any) -> None:
+def _call_in_loop(loop: asyncio.AbstractEventLoop, act: Callable[..., None], *arguments: Any) -> None:
     """Act in the loop, unless it is over."""
     with contextlib.suppress(RuntimeError):
         loop.call_soon_threadsafe(act, *arguments)

@@ -10,7 +10,7 @@ from typing import Any
 from zsim_bridges.ros1.wire import message_types, tcpros, tcpros_streams
 
 
-class Outlet:
+class SubscriberLink:
     """One subscriber's connection; a full queue loses the oldest.
 
     Attributes:
@@ -35,7 +35,7 @@ class Outlet:
 
     async def run(self) -> None:
         """Send what is put, until the connection ends."""
-        with contextlib.suppress(*tcpros_streams.BROKEN):
+        with contextlib.suppress(*tcpros_streams.CONNECTION_ERRORS):
             while True:
                 await self._news.wait()
                 self._news.clear()
@@ -46,7 +46,7 @@ class Outlet:
                     self.sent += len(framed)
 
 
-class Publication:
+class PublishedTopic:
     """One topic.
 
     Args:
@@ -58,35 +58,35 @@ class Publication:
         count: messages published.
     """
 
-    def __init__(self, offer: tcpros.Offer, queue_size: int) -> None:
+    def __init__(self, offer: tcpros.TopicType, queue_size: int) -> None:
         self.offer = offer
         self._queue_size = queue_size
-        self.outlets: list[Outlet] = []
-        self.count = 0
+        self.links: list[SubscriberLink] = []
+        self.sent = 0
 
     def publish(self, make: Callable[[int], Any]) -> None:
         """Send the message that `make` returns for a sequence number; it is asked only where somebody listens."""
-        if not self.outlets:
+        if not self.links:
             return
-        framed = tcpros.frame(message_types.serialize(self.offer.type, make(self.count)))
-        self.count += 1
-        for outlet in self.outlets:
+        framed = tcpros.frame(message_types.serialize(self.offer.type, make(self.sent)))
+        self.sent += 1
+        for outlet in self.links:
             outlet.put(framed)
 
     async def serve(self, reader: StreamReader, writer: StreamWriter, header: Mapping[str, str], caller: str) -> None:
         """Serve a subscriber whose header has come until it goes; `caller` is this node's name."""
-        refusal = tcpros.refusal(self.offer, header, caller)
+        refusal = tcpros.mismatch(self.offer, header, caller)
         if refusal:
-            await tcpros_streams.say_error(writer, refusal)
+            await tcpros_streams.send_error(writer, refusal)
             return
         tcpros_streams.configure(writer, header.get("tcp_nodelay") == "1")
         writer.write(tcpros.encode_header(tcpros.publisher_header(self.offer, caller)))
-        outlet = Outlet(writer, header["callerid"], self._queue_size)
+        outlet = SubscriberLink(writer, header["callerid"], self._queue_size)
         sender = asyncio.create_task(outlet.run())
-        self.outlets.append(outlet)
+        self.links.append(outlet)
         try:
             while await reader.read(4096):
                 pass  # a subscriber has nothing more to say
         finally:
-            self.outlets.remove(outlet)
+            self.links.remove(outlet)
             sender.cancel()

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 from zsim_bridges.ros1.wire import xmlrpc
 
-LOOK_S = 1.0  # wall time between two looks whether the master still knows us
-FAREWELL_S = 2.0  # in which to take leave of a master
+CHECK_S = 1.0  # wall time between two looks whether the master still knows us
+UNREGISTER_S = 2.0  # in which to take leave of a master
 
 
-class Place(NamedTuple):
+class GraphEntry(NamedTuple):
     """What a node is to be known for.
 
     Attributes:
@@ -44,15 +44,15 @@ class Registration:
     def __init__(
         self,
         master_uri: str,
-        place: Place,
+        place: GraphEntry,
         found: Callable[[str, list[str]], None],
         displaced: Callable[[str], None],
         say: Callable[[str], None],
     ) -> None:
         self._uri = master_uri
-        self._place = place
-        self._found = found
-        self._displaced = displaced
+        self._entry = place
+        self._on_publishers = found
+        self._on_displaced = displaced
         self._say = say
         self._known = False
         self._was_known = False
@@ -69,23 +69,23 @@ class Registration:
         self._closed.set()
         self._thread.join(2 * xmlrpc.TIMEOUT_S)
         if self._may_be_known:
-            self._unregister(time.monotonic() + FAREWELL_S)
+            self._unregister(time.monotonic() + UNREGISTER_S)
 
     def _run(self) -> None:
         since_s, next_say_s = time.monotonic(), 0.0
         while not self._closed.is_set():
             try:
-                self._look()
+                self._check()
                 since_s, next_say_s = time.monotonic(), 0.0
-            except xmlrpc.FAULTS as error:
+            except xmlrpc.CALL_ERRORS as error:
                 self._known = False
                 waited_s = time.monotonic() - since_s
                 if waited_s >= next_say_s:
                     next_say_s = max(2 * next_say_s, 1.0)
                     self._say(f"waiting for a ROS master on {self._uri} ({waited_s:.0f} s): {error}")
-            self._closed.wait(LOOK_S)
+            self._closed.wait(CHECK_S)
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         """Register, or see whether the master still knows us."""
         if self._known and not self._is_known():
             self._known = False
@@ -94,29 +94,29 @@ class Registration:
             self._known = True
             again = "registered again" if self._was_known else "registered"
             self._was_known = True
-            self._say(f"{self._place.caller}: {again} with the ROS master on {self._uri}")
+            self._say(f"{self._entry.caller}: {again} with the ROS master on {self._uri}")
 
     def _is_known(self) -> bool:
         try:
-            uri = self._call("lookupNode", self._place.caller)
+            uri = self._call("lookupNode", self._entry.caller)
         except xmlrpc.ApiError:
             return False
-        if uri != self._place.slave_uri:
+        if uri != self._entry.slave_uri:
             self._closed.set()
-            self._displaced(f"another node of this name is on {uri}")
+            self._on_displaced(f"another node of this name is on {uri}")
         return True
 
     def _register(self) -> None:
-        place, self._may_be_known = self._place, True
+        place, self._may_be_known = self._entry, True
         for topic, kind in place.published:
             self._call("registerPublisher", topic, kind, place.slave_uri)
         for service in place.services:
             self._call("registerService", service, place.service_uri, place.slave_uri)
         for topic, kind in place.subscribed:
-            self._found(topic, self._call("registerSubscriber", topic, kind, place.slave_uri))
+            self._on_publishers(topic, self._call("registerSubscriber", topic, kind, place.slave_uri))
 
     def _unregister(self, until_s: float) -> None:
-        place = self._place
+        place = self._entry
         calls = [("unregisterService", service, place.service_uri) for service in place.services]
         calls += [("unregisterSubscriber", topic, place.slave_uri) for topic, _ in place.subscribed]
         calls += [("unregisterPublisher", topic, place.slave_uri) for topic, _ in place.published]
@@ -127,8 +127,8 @@ class Registration:
                 self._call(*call)
             except xmlrpc.ApiError:
                 continue
-            except xmlrpc.FAULTS:
+            except xmlrpc.CALL_ERRORS:
                 return  # the master is gone, and with it what it knew
 
     def _call(self, method: str, *arguments: Any) -> Any:
-        return xmlrpc.call(self._uri, method, self._place.caller, *arguments)
+        return xmlrpc.call_api(self._uri, method, self._entry.caller, *arguments)

@@ -8,7 +8,7 @@ from zsim_bridges.ros1.wire import tcpros, tcpros_streams
 DONE, FAILED = b"\x01", b"\x00"
 
 
-class Service:
+class EmptyService:
     """One service of type std_srvs/Empty.
 
     Args:
@@ -16,15 +16,15 @@ class Service:
         act: does what is asked for; returns why not, None where it is done.
     """
 
-    def __init__(self, offer: tcpros.Offer, act: Callable[[], str | None]) -> None:
+    def __init__(self, offer: tcpros.TopicType, act: Callable[[], str | None]) -> None:
         self.offer = offer
         self._act = act
 
     async def serve(self, reader: StreamReader, writer: StreamWriter, header: Mapping[str, str], caller: str) -> None:
         """Serve a client whose header has come until it goes; `caller` is this node's name."""
-        refusal = tcpros.refusal(self.offer, header, caller)
+        refusal = tcpros.mismatch(self.offer, header, caller)
         if refusal:
-            await tcpros_streams.say_error(writer, refusal)
+            await tcpros_streams.send_error(writer, refusal)
             return
         tcpros_streams.configure(writer, True)
         writer.write(tcpros.encode_header(tcpros.service_header(self.offer, caller)))

@@ -4,8 +4,8 @@ import os
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from zsim_bridges.ros1.wire.publisher import Publication
-from zsim_bridges.ros1.wire.subscriber import Subscription
+from zsim_bridges.ros1.wire.publisher import PublishedTopic
+from zsim_bridges.ros1.wire.subscriber import SubscribedTopic
 
 Answer = list[Any]
 OK, ERROR, REFUSED = 1, -1, 0
@@ -28,8 +28,8 @@ class SlaveApi:
         name: str,
         master_uri: str,
         door: tuple[str, int],
-        published: Mapping[str, Publication],
-        subscribed: Mapping[str, Subscription],
+        published: Mapping[str, PublishedTopic],
+        subscribed: Mapping[str, SubscribedTopic],
         update: Callable[[str, list[str]], None],
         shutdown: Callable[[str], None],
     ) -> None:
@@ -39,7 +39,7 @@ class SlaveApi:
         self._subscribed = subscribed
         self._update = update
         self._shutdown = shutdown
-        self._door = door
+        self._tcpros_address = door
 
     def getName(self, caller: str) -> Answer:
         return [OK, "", self._name]
@@ -58,7 +58,7 @@ class SlaveApi:
 
     def getBusInfo(self, caller: str) -> Answer:
         """Answer all connections: number, other end, direction, transport, topic, whether it is up."""
-        links = [(outlet.caller, "o", topic) for topic, p in self._published.items() for outlet in list(p.outlets)]
+        links = [(outlet.caller, "o", topic) for topic, p in self._published.items() for outlet in list(p.links)]
         links += [(uri, "i", topic) for topic, s in self._subscribed.items() for uri in list(s.connected)]
         return [OK, "", [[n, other, way, "TCPROS", topic, True] for n, (other, way, topic) in enumerate(links)]]
 
@@ -73,7 +73,7 @@ class SlaveApi:
             return [ERROR, f"{self._name} does not publish {topic}", 0]
         if not any(protocol and protocol[0] == "TCPROS" for protocol in protocols):
             return [REFUSED, "must be TCPROS", []]
-        return [OK, "", ["TCPROS", *self._door]]
+        return [OK, "", ["TCPROS", *self._tcpros_address]]
 
     def publisherUpdate(self, caller: str, topic: str, publishers: list[str]) -> Answer:
         """Take note of who publishes a topic that we take."""
@@ -90,8 +90,8 @@ class SlaveApi:
         return [OK, "", 0]
 
 
-def _statistics(topic: str, published: Publication) -> list[Any]:
+def _statistics(topic: str, published: PublishedTopic) -> list[Any]:
     """Return a topic, the bytes sent on it, and for each connection its number, bytes, messages, whether it is up."""
-    outlets = list(published.outlets)
-    links = [[n, outlet.sent, published.count, True] for n, outlet in enumerate(outlets)]
+    outlets = list(published.links)
+    links = [[n, outlet.sent, published.sent, True] for n, outlet in enumerate(outlets)]
     return [topic, sum(outlet.sent for outlet in outlets), links]

@@ -9,14 +9,14 @@ from typing import Any
 from zsim.errors import ZsimError
 from zsim_bridges.ros1.wire import message_types, tcpros, tcpros_streams, xmlrpc
 
-AGAIN_S, AGAIN_MAX_S = 0.5, 8.0  # wall time between attempts, doubling
+RETRY_S, RETRY_MAX_S = 0.5, 8.0  # wall time between attempts, doubling
 
 
 class RefusedError(ValueError):
     """A publisher that speaks of something else."""
 
 
-class Subscription:
+class SubscribedTopic:
     """One topic.
 
     Args:
@@ -31,15 +31,15 @@ class Subscription:
     """
 
     def __init__(
-        self, offer: tcpros.Offer, caller: str, take: Callable[[Any], None], say: Callable[[str], None]
+        self, offer: tcpros.TopicType, caller: str, take: Callable[[Any], None], say: Callable[[str], None]
     ) -> None:
         self.offer = offer
         self._caller = caller
-        self._take = take
+        self._callback = take
         self._say = say
         self._wanted: set[str] = set()
         self._tasks: dict[str, Task[None]] = {}
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self.connected: dict[str, str] = {}
         self.refused = 0
 
@@ -62,26 +62,26 @@ class Subscription:
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _follow(self, uri: str) -> None:
-        pause_s = AGAIN_S
+        pause_s = RETRY_S
         while uri in self._wanted:
             try:
                 async with self._connection(uri) as reader:
-                    pause_s = AGAIN_S
+                    pause_s = RETRY_S
                     await self._receive(reader, uri)
             except RefusedError as error:
-                self._tell(uri, str(error))
+                self._report_once(uri, str(error))
                 return
-            except (*tcpros_streams.BROKEN, *xmlrpc.FAULTS):
+            except (*tcpros_streams.CONNECTION_ERRORS, *xmlrpc.CALL_ERRORS):
                 if uri in self._wanted:
                     await asyncio.sleep(pause_s)
-                pause_s = min(2 * pause_s, AGAIN_MAX_S)
+                pause_s = min(2 * pause_s, RETRY_MAX_S)
         del self._tasks[uri]
 
     @contextlib.asynccontextmanager
     async def _connection(self, uri: str) -> AsyncIterator[StreamReader]:
         """Yield what a publisher sends after its header."""
         ask = [self._caller, self.offer.name, [["TCPROS"]]]
-        answer = await asyncio.to_thread(xmlrpc.call, uri, "requestTopic", *ask)
+        answer = await asyncio.to_thread(xmlrpc.call_api, uri, "requestTopic", *ask)
         protocol, host, port = answer
         if protocol != "TCPROS":
             raise RefusedError(f"speaks {str(protocol)[:20]!r}; must be TCPROS")
@@ -98,7 +98,7 @@ class Subscription:
         tcpros_streams.configure(writer, True)
         writer.write(tcpros.encode_header(tcpros.subscriber_header(self.offer, self._caller)))
         header = await tcpros_streams.read_header(reader)
-        error = header.get("error") or tcpros.refusal(self.offer, {"callerid": "?", **header}, self._caller)
+        error = header.get("error") or tcpros.mismatch(self.offer, {"callerid": "?", **header}, self._caller)
         if error:
             raise RefusedError(error[:300])
         return header.get("callerid", "?")
@@ -107,12 +107,12 @@ class Subscription:
         while True:
             data = await tcpros_streams.read_frame(reader)
             try:
-                self._take(message_types.deserialize(self.offer.type, data))
+                self._callback(message_types.deserialize(self.offer.type, data))
             except (ValueError, ZsimError) as error:
                 self.refused += 1
-                self._tell(uri, str(error))
+                self._report_once(uri, str(error))
 
-    def _tell(self, uri: str, what: str) -> None:
-        if uri not in self._told:
-            self._told.add(uri)
+    def _report_once(self, uri: str, what: str) -> None:
+        if uri not in self._reported:
+            self._reported.add(uri)
             self._say(f"{self.offer.name}: what {self.connected.get(uri, uri)} sends is refused: {what}")

@@ -9,12 +9,12 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 HEADER_MAX = 1_000_000  # bytes; definitions of the largest messages have some 10 000
-ANY = "*"  # md5sum or type of who takes whatever comes
+ANY_TYPE = "*"  # md5sum or type of who takes whatever comes
 _LENGTH = struct.Struct("<I")
 LENGTH_SIZE = _LENGTH.size
 
 
-class Offer(NamedTuple):
+class TopicType(NamedTuple):
     """A topic or service as both sides must know it."""
 
     name: str
@@ -62,7 +62,7 @@ def decode_header(body: bytes) -> dict[str, str]:
     return fields
 
 
-def publisher_header(offer: Offer, caller: str) -> dict[str, str]:
+def publisher_header(offer: TopicType, caller: str) -> dict[str, str]:
     """Return what a publisher answers to a subscriber that it takes."""
     return {
         "callerid": caller,
@@ -74,14 +74,14 @@ def publisher_header(offer: Offer, caller: str) -> dict[str, str]:
     }
 
 
-def subscriber_header(offer: Offer, caller: str) -> dict[str, str]:
+def subscriber_header(offer: TopicType, caller: str) -> dict[str, str]:
     """Return what a subscriber says to a publisher."""
     header = publisher_header(offer, caller) | {"tcp_nodelay": "1"}
     del header["latching"]
     return header
 
 
-def service_header(offer: Offer, caller: str) -> dict[str, str]:
+def service_header(offer: TopicType, caller: str) -> dict[str, str]:
     """Return what a service answers to a client that it takes."""
     return {
         "callerid": caller,
@@ -92,12 +92,12 @@ def service_header(offer: Offer, caller: str) -> dict[str, str]:
     }
 
 
-def refusal(offer: Offer, header: Mapping[str, str], caller: str) -> str | None:
+def mismatch(offer: TopicType, header: Mapping[str, str], caller: str) -> str | None:
     """Return why the sender of a header and `caller` do not understand each other; None where they do."""
     missing = [field for field in ("callerid", "md5sum") if field not in header]
     if missing:
         return f"missing required {missing[0]!r} field"
-    if header["md5sum"] in (ANY, offer.md5):
+    if header["md5sum"] in (ANY_TYPE, offer.md5):
         return None
     wanted = f"{header.get('type', offer.type)}/{header['md5sum']}"
     return (

@@ -8,7 +8,7 @@ from zsim_bridges.ros1.wire import tcpros
 
 HANDSHAKE_S = 10.0  # within which a header must come
 FRAME_MAX = 1_000_000  # bytes; what we take in are commands
-BROKEN = (OSError, IncompleteReadError, TimeoutError, ValueError, OverflowError)
+CONNECTION_ERRORS = (OSError, IncompleteReadError, TimeoutError, ValueError, OverflowError)
 """What a connection ends with: gone, silent, or none that we understand."""
 
 
@@ -36,7 +36,7 @@ async def read_header(reader: StreamReader) -> dict[str, str]:
     return tcpros.decode_header(body)
 
 
-async def say_error(writer: StreamWriter, reason: str) -> None:
+async def send_error(writer: StreamWriter, reason: str) -> None:
     """Refuse a connection as ROS does: with a header that has a reason."""
     writer.write(tcpros.encode_header({"error": reason}))
     await writer.drain()

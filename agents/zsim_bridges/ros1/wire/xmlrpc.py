@@ -16,7 +16,7 @@ class ApiError(Exception):
     """An answer that refuses, or is none of ROS."""
 
 
-FAULTS = (OSError, http.client.HTTPException, xmlrpc.client.Error, ExpatError, ValueError, TypeError, ApiError)
+CALL_ERRORS = (OSError, http.client.HTTPException, xmlrpc.client.Error, ExpatError, ValueError, TypeError, ApiError)
 """What a call ends with where it is not answered."""
 
 
@@ -27,7 +27,7 @@ class _Transport(xmlrpc.client.Transport):
         return connection
 
 
-def call(uri: str, method: str, *arguments: Any) -> Any:
+def call_api(uri: str, method: str, *arguments: Any) -> Any:
     """Return the value that a master or a node answers.
 
     Raises:
@@ -59,7 +59,7 @@ class _Handler(SimpleXMLRPCRequestHandler):
         super().do_POST()
 
 
-class Server(ThreadingMixIn, SimpleXMLRPCServer):
+class XmlRpcServer(ThreadingMixIn, SimpleXMLRPCServer):
     """Answers calls on an object's methods, each connection in a thread of its own."""
 
     daemon_threads = True

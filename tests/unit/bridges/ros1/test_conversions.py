@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from zsim.contract import messages
 from zsim_bridges.ros1 import conversions
-from zsim_bridges.ros1.conversions import Frames
-from zsim_bridges.ros1.onboard import Onboard
+from zsim_bridges.ros1.conversions import DriverFrames
+from zsim_bridges.ros1.onboard import OnboardState
 from zsim_bridges.ros1.wire import message_types
 
 T_NS = 61_040_000_000
-FRAMES = Frames("drone1")
+FRAMES = DriverFrames("drone1")
 ZERO, STILL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
 
 
@@ -23,22 +23,22 @@ def attitude(roll_deg: float = 0.0, pitch_deg: float = 0.0, yaw_deg: float = 0.0
     return float(w), float(x), float(y), float(z)
 
 
-def aircraft(state: Any = "hovering", **angles: float) -> Onboard:
+def aircraft(state: Any = "hovering", **angles: float) -> OnboardState:
     """An aircraft 1.234 m over the ground, on its way forward, left and up."""
-    own = Onboard()
-    own.hear(
+    own = OnboardState()
+    own.update(
         messages.Estimate(
             T_NS, 0, (5.0, 6.0, 7.0), ZERO, attitude(**angles), 0.0, (0.0,) * 36, 0.0, ZERO, {}
         )
     )  # fmt: skip
     own.attitude = attitude()
-    own.hear(messages.Sonar(T_NS, 0, T_NS, 1.234, True))
+    own.update(messages.Sonar(T_NS, 0, T_NS, 1.234, True))
     own.attitude = attitude(**angles)
-    own.hear(messages.Imu(T_NS, 0, T_NS, (0.0, 0.0, 9.80665), (0.1, 0.2, 0.3)))
-    own.hear(messages.Mag(T_NS, 0, T_NS, (3.0, 0.0, -4.0)))
-    own.hear(messages.Baro(T_NS, 0, T_NS, 101_325.4, 0.0))
-    own.hear(messages.Flow(T_NS, 0, T_NS, (1.0, 0.25, 0.5), 1.0))
-    own.hear(messages.Status(T_NS, 0, state, 87.5, False, None, 1))
+    own.update(messages.Imu(T_NS, 0, T_NS, (0.0, 0.0, 9.80665), (0.1, 0.2, 0.3)))
+    own.update(messages.Mag(T_NS, 0, T_NS, (3.0, 0.0, -4.0)))
+    own.update(messages.Baro(T_NS, 0, T_NS, 101_325.4, 0.0))
+    own.update(messages.Flow(T_NS, 0, T_NS, (1.0, 0.25, 0.5), 1.0))
+    own.update(messages.Status(T_NS, 0, state, 87.5, False, None, 1))
     return own
 
 
@@ -86,8 +86,8 @@ def test_states_have_the_numbers_of_the_sdk(state, number):
 
 
 def test_an_aircraft_that_has_said_little_has_navdata_too():
-    own = Onboard()
-    own.hear(messages.Status(0, 0, "landed", 100.0, False, None, 1))
+    own = OnboardState()
+    own.update(messages.Status(0, 0, "landed", 100.0, False, None, 1))
     said = conversions.navdata(0, own, FRAMES)
     assert (said.altd, said.vx, said.pressure, said.az) == (0, 0.0, 0, 0.0)
     message_types.serialize("ardrone_autonomy/Navdata", said)
@@ -154,7 +154,7 @@ def test_ground_truth_is_in_the_world():
 
 def test_transforms_lead_from_the_world_to_where_the_estimator_believes_it_to_be():
     own = aircraft(yaw_deg=30.0)
-    own.hear(messages.Estimate(T_NS, 1, (5.0, 6.0, 7.0), ZERO, attitude(yaw_deg=30.0), 0.0, (0.0,) * 36, 0.0, ZERO, {}))  # fmt: skip
+    own.update(messages.Estimate(T_NS, 1, (5.0, 6.0, 7.0), ZERO, attitude(yaw_deg=30.0), 0.0, (0.0,) * 36, 0.0, ZERO, {}))  # fmt: skip
     to_base, to_odom = conversions.transforms(0, own, FRAMES).transforms
     assert (to_odom.header.frame_id, to_odom.child_frame_id) == ("world", "drone1/odom")
     assert (to_base.header.frame_id, to_base.child_frame_id) == ("drone1/odom", "drone1/ardrone_base_link")
@@ -164,8 +164,8 @@ def test_transforms_lead_from_the_world_to_where_the_estimator_believes_it_to_be
 
 
 def test_transforms_without_an_estimator_end_at_odom():
-    own = Onboard()
-    own.hear(messages.Status(0, 0, "landed", 100.0, False, None, 1))
+    own = OnboardState()
+    own.update(messages.Status(0, 0, "landed", 100.0, False, None, 1))
     (only,) = conversions.transforms(0, own, FRAMES).transforms
     assert only.header.frame_id == "drone1/odom"
 

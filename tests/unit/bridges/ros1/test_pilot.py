@@ -6,15 +6,15 @@ from typing import Any
 import pytest
 
 from zsim.contract import messages
-from zsim_bridges.ros1.pilot import REPEAT_NS, Pilot, Tilt, tilt_of
+from zsim_bridges.ros1.pilot import REPEAT_NS, DriverCommands, TiltCommand, tilt_of
 from zsim_bridges.ros1.wire import message_types
 
 GATE_NS = 20_000_000
-Vector3 = message_types.message("geometry_msgs/Vector3")
+Vector3 = message_types.message_class("geometry_msgs/Vector3")
 
 
 def twist(*, x: float = 0.0, y: float = 0.0, z: float = 0.0, wx: float = 0.0, wy: float = 0.0, wz: float = 0.0) -> Any:
-    return message_types.message("geometry_msgs/Twist")(linear=Vector3(x, y, z), angular=Vector3(wx, wy, wz))
+    return message_types.message_class("geometry_msgs/Twist")(linear=Vector3(x, y, z), angular=Vector3(wx, wy, wz))
 
 
 def status(state: Any, gate: int) -> messages.Status:
@@ -26,7 +26,7 @@ class Drone:
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, Any]] = []
-        self.pilot = Pilot("drone1", "ros1.main", lambda key, message: self.sent.append((key, message)))
+        self.pilot = DriverCommands("drone1", "ros1.main", lambda key, message: self.sent.append((key, message)))
 
     def gates(self, state: Any, first: int, count: int) -> list[Any]:
         """Let some gates pass; return what is sent meanwhile."""
@@ -37,11 +37,11 @@ class Drone:
 
 
 def test_forward_left_up_and_counter_clockwise_are_positive():
-    assert tilt_of(twist(x=0.1, y=0.2, z=0.3, wz=0.4)) == Tilt(0.1, 0.2, 0.3, 0.4, False)
+    assert tilt_of(twist(x=0.1, y=0.2, z=0.3, wz=0.4)) == TiltCommand(0.1, 0.2, 0.3, 0.4, False)
 
 
 def test_shares_end_at_one():
-    assert tilt_of(twist(x=3.0, y=-7.0, z=1.5, wz=-1.5)) == Tilt(1.0, -1.0, 1.0, -1.0, False)
+    assert tilt_of(twist(x=3.0, y=-7.0, z=1.5, wz=-1.5)) == TiltCommand(1.0, -1.0, 1.0, -1.0, False)
 
 
 def test_all_zero_is_hovering():
@@ -52,7 +52,7 @@ def test_all_zero_is_hovering():
 
 @pytest.mark.parametrize("components", [{"wx": 1.0}, {"wy": -0.5}])
 def test_a_tilt_rate_of_any_size_only_switches_hovering_off(components):
-    assert tilt_of(twist(**components)) == Tilt(0.0, 0.0, 0.0, 0.0, False)
+    assert tilt_of(twist(**components)) == TiltCommand(0.0, 0.0, 0.0, 0.0, False)
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
@@ -130,8 +130,8 @@ def test_reset_toggles_the_emergency(state, mode):
 
 def test_only_a_drone_that_stands_is_trimmed():
     drone = Drone()
-    assert "not there" in (drone.pilot.trim() or "")
+    assert "not there" in (drone.pilot.trim_refusal() or "")
     drone.gates("flying", 0, 1)
-    assert "must be landed" in (drone.pilot.trim() or "")
+    assert "must be landed" in (drone.pilot.trim_refusal() or "")
     drone.gates("landed", 1, 1)
-    assert drone.pilot.trim() is None
+    assert drone.pilot.trim_refusal() is None

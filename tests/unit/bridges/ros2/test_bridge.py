@@ -15,13 +15,13 @@ from zsim.transport.zenoh_settings import Mode
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import rmw_zenoh
 from zsim_bridges.ros2.bridge import Bridge
-from zsim_bridges.ros2.callback_queue import Inbox
-from zsim_bridges.ros2.participant import Participant
+from zsim_bridges.ros2.callback_queue import CallbackQueue
+from zsim_bridges.ros2.participant import RosContext
 from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId
-from zsim_bridges.ros2.ros_types import Types
+from zsim_bridges.ros2.ros_types import RosTypes
 from zsim_bridges.ros2.source_keys import SAMPLES_MAX
 
-TYPES = Types()
+TYPES = RosTypes()
 READER = NodeId(0, "abc", 1, "/", "reader")
 WALL_NS = 1_700_000_000_000_000_000
 BESIDE = Attachment(7, 1, bytes(range(16))).packed()
@@ -135,10 +135,10 @@ class Bench:
         self.lines: list[str] = []
         self.presence = ObserverProcess(self.link, self.info, "ros2.main")
         self.bridge = Bridge(self.link, self.info, self.presence, self.lines.append, wall_ns)
-        self.bridge.enter(Participant(self.link, 0, TYPES, wall_ns, self.bridge.refuse))
+        self.bridge.advertise_run(RosContext(self.link, 0, TYPES, wall_ns, self.bridge.count_refused))
 
     def turn(self) -> None:
-        self.bridge.turn(0.0)
+        self.bridge.process(0.0)
 
     def reader(self, topic: str, kind: str, alive: bool = True) -> None:
         """Let a subscription come or go."""
@@ -167,8 +167,8 @@ def wall_ns() -> int:
 
 
 def twist(*numbers: float) -> Any:
-    vector = TYPES.of("geometry_msgs/msg/Vector3")
-    return TYPES.of(TWIST)(vector(*numbers[:3]), vector(*numbers[3:]))
+    vector = TYPES.message_class("geometry_msgs/msg/Vector3")
+    return TYPES.message_class(TWIST)(vector(*numbers[:3]), vector(*numbers[3:]))
 
 
 def imu(t_ns: int) -> bytes:
@@ -236,7 +236,7 @@ def test_a_twist_becomes_a_velocity_in_the_heading_frame_at_the_newest_gate() ->
 
 
 def test_modes_and_the_emergency_button() -> None:
-    bench, empty = Bench(), TYPES.of(EMPTY)()
+    bench, empty = Bench(), TYPES.message_class(EMPTY)()
     status = keys.status("drone-1")
     bench.publish("/drone_1/takeoff", EMPTY, empty)
     bench.publish("/drone_1/land", EMPTY, empty)
@@ -337,16 +337,16 @@ def test_closed_it_hears_nothing() -> None:
 
 
 def test_samples_that_nobody_takes_go_the_oldest_first_and_acts_never() -> None:
-    inbox, done = Inbox(3), []
+    inbox, done = CallbackQueue(3), []
     for k in range(5):
-        inbox.sample("key", bytes([k]))
-        inbox.act(lambda k=k: done.append(k))
-    taken = inbox.take(0.0)
-    for act in taken.acts:
+        inbox.add_sample("key", bytes([k]))
+        inbox.add_task(lambda k=k: done.append(k))
+    taken = inbox.pop_all(0.0)
+    for act in taken.tasks:
         act()
     assert [payload for _, payload in taken.samples] == [b"\2", b"\3", b"\4"]
     assert (done, inbox.dropped) == ([0, 1, 2, 3, 4], 2)
-    assert inbox.take(0.0) == ([], [])
+    assert inbox.pop_all(0.0) == ([], [])
 
 
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])

@@ -11,16 +11,16 @@ from ros1_master import Master
 
 from zsim.errors import RunError
 from zsim_bridges.ros1.wire import message_types, registration, tcpros, tcpros_streams
-from zsim_bridges.ros1.wire.master_uri import master_address, reachable_as
-from zsim_bridges.ros1.wire.node import Node
+from zsim_bridges.ros1.wire.master_uri import master_address, own_address
+from zsim_bridges.ros1.wire.node import Ros1Node
 
 PATIENCE_S = 20.0
 TWIST, EMPTY = "geometry_msgs/Twist", "std_msgs/Empty"
-Vector3 = message_types.message("geometry_msgs/Vector3")
+Vector3 = message_types.message_class("geometry_msgs/Vector3")
 
 
 def twist(x: float) -> Any:
-    return message_types.message(TWIST)(linear=Vector3(x, 0.0, 0.0), angular=Vector3(0.0, 0.0, 0.0))
+    return message_types.message_class(TWIST)(linear=Vector3(x, 0.0, 0.0), angular=Vector3(0.0, 0.0, 0.0))
 
 
 class Graph:
@@ -30,8 +30,8 @@ class Graph:
         self.master = Master()
         self.said: list[str] = []
 
-    def node(self, name: str) -> Node:
-        return Node(name, self.master.uri, "127.0.0.1", self.said.append)
+    def node(self, name: str) -> Ros1Node:
+        return Ros1Node(name, self.master.uri, "127.0.0.1", self.said.append)
 
     def restart(self) -> None:
         """Let the master forget everything."""
@@ -191,7 +191,7 @@ def test_garbage_ends_its_own_connection_only(graph, garbage):
 
 
 def test_a_subscriber_that_does_not_read_loses_the_oldest_and_holds_up_nobody(graph):
-    text, string = "x" * 100_000, message_types.message("std_msgs/String")
+    text, string = "x" * 100_000, message_types.message_class("std_msgs/String")
 
     async def run() -> None:
         a = graph.node("/a")
@@ -230,7 +230,7 @@ def test_a_publisher_that_sends_garbage_is_told_of_once_and_heard_again(graph):
 
         async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             await tcpros_streams.read_header(reader)
-            writer.write(tcpros.encode_header(tcpros.publisher_header(message_types.offer("/t", TWIST), "/bad")))
+            writer.write(tcpros.encode_header(tcpros.publisher_header(message_types.topic_type("/t", TWIST), "/bad")))
             negative, good = (message_types.serialize(TWIST, twist(x)) for x in (-1.0, 5.0))
             for payload in (b"short", negative, b"x" * 49, good):
                 writer.write(tcpros.frame(payload))
@@ -337,7 +337,7 @@ def test_what_a_node_said_just_before_it_left_is_heard(graph):
 
         async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             await tcpros_streams.read_header(reader)
-            writer.write(tcpros.encode_header(tcpros.publisher_header(message_types.offer("/t", TWIST), "/a")))
+            writer.write(tcpros.encode_header(tcpros.publisher_header(message_types.topic_type("/t", TWIST), "/a")))
             await left.wait()
             writer.write(tcpros.frame(message_types.serialize(TWIST, twist(3.0))))
             writer.close()
@@ -510,7 +510,7 @@ def test_what_is_no_master_is_refused(uri):
 
 
 def test_we_are_reached_as_ros_s_own_variables_say_or_from_where_we_reach_the_master():
-    assert reachable_as("http://127.0.0.1:11311", {}) == "127.0.0.1"
-    assert reachable_as("http://127.0.0.1", {"ROS_IP": "10.0.0.7"}) == "10.0.0.7"
+    assert own_address("http://127.0.0.1:11311", {}) == "127.0.0.1"
+    assert own_address("http://127.0.0.1", {"ROS_IP": "10.0.0.7"}) == "10.0.0.7"
     both = {"ROS_IP": "10.0.0.7", "ROS_HOSTNAME": "lab"}
-    assert reachable_as("http://127.0.0.1", both) == "lab"
+    assert own_address("http://127.0.0.1", both) == "lab"

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zsim_bridges.ros1.wire import tcpros
-from zsim_bridges.ros1.wire.tcpros import HeaderError, Offer
+from zsim_bridges.ros1.wire.tcpros import HeaderError, TopicType
 
-TWIST = Offer("/drone1/cmd_vel", "geometry_msgs/Twist", "9f195f881246fdfa2798d1d3eebca84a", "float64 x\n")
+TWIST = TopicType("/drone1/cmd_vel", "geometry_msgs/Twist", "9f195f881246fdfa2798d1d3eebca84a", "float64 x\n")
 
 
 def test_a_header_is_its_length_and_fields_behind_their_lengths():
@@ -52,12 +52,12 @@ def test_what_is_encoded_is_decoded(fields):
 
 @pytest.mark.parametrize("md5", ["*", TWIST.md5])
 def test_who_means_the_same_message_is_taken(md5):
-    assert tcpros.refusal(TWIST, {"callerid": "/me", "md5sum": md5}, "/zsim") is None
+    assert tcpros.mismatch(TWIST, {"callerid": "/me", "md5sum": md5}, "/zsim") is None
 
 
 def test_who_means_another_message_is_told_both():
     header = {"callerid": "/me", "md5sum": "0" * 32, "type": "geometry_msgs/Pose"}
-    said = tcpros.refusal(TWIST, header, "/zsim")
+    said = tcpros.mismatch(TWIST, header, "/zsim")
     assert said is not None
     assert "geometry_msgs/Pose" in said
     assert "geometry_msgs/Twist" in said
@@ -65,13 +65,13 @@ def test_who_means_another_message_is_told_both():
 
 @pytest.mark.parametrize("header", [{}, {"callerid": "/me"}, {"md5sum": "*"}])
 def test_who_does_not_say_who_and_what_is_refused(header):
-    assert "missing" in (tcpros.refusal(TWIST, header, "/zsim") or "")
+    assert "missing" in (tcpros.mismatch(TWIST, header, "/zsim") or "")
 
 
 def test_both_sides_of_our_own_connections_understand_each_other():
     subscriber = tcpros.subscriber_header(TWIST, "/a")
     publisher = tcpros.publisher_header(TWIST, "/b")
-    assert tcpros.refusal(TWIST, subscriber, "/b") is None
-    assert tcpros.refusal(TWIST, publisher, "/a") is None
+    assert tcpros.mismatch(TWIST, subscriber, "/b") is None
+    assert tcpros.mismatch(TWIST, publisher, "/a") is None
     assert subscriber["tcp_nodelay"] == "1"
     assert publisher["latching"] == "0"
