@@ -1,4 +1,4 @@
-"""A process that looks and commands without gating, among the others of a run: joins, tells of its health, says bye."""
+"""A process of a run that shows and commands but never gates: its join, health and bye."""
 
 import os
 import secrets
@@ -10,11 +10,11 @@ from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
 from zsim.transport.session import Sample, Session
 
-JOIN_EVENTS = ("join", "restart", "superseded")  # kinds of events that tell of a process that joined
+JOIN_EVENTS = ("join", "restart", "superseded")  # kinds of events that report a process that joined
 
 
 class ObserverProcess:
-    """One run's worth of it.
+    """The process in one run.
 
     Args:
         link: an open session.
@@ -22,9 +22,9 @@ class ObserverProcess:
         name: process name, role.thing.
 
     Attributes:
-        now_ns: simulated time of the newest clock that it was shown.
-        health: counters that it tells.
-        over: why there is nothing left to do in this run; empty while there is.
+        now_ns: simulated time of the newest clock received.
+        health: counters that it publishes.
+        end_reason: why the process has nothing left to do in this run; empty while it goes on.
     """
 
     def __init__(self, link: Session, info: messages.Info, name: str) -> None:
@@ -41,7 +41,7 @@ class ObserverProcess:
         self._must_join = self._was_link_lost = False
 
     def announce(self) -> None:
-        """Join."""
+        """Join the run."""
         self._link.on_message(keys.EVENT, self._on_event)
         self._link.on_link(self._on_link)
         self._link.declare_token(keys.token(self.name))
@@ -68,7 +68,7 @@ class ObserverProcess:
         self._link.put(keys.process(self.name, "join"), join)
 
     def update_clock(self, payload: bytes) -> messages.Clock | None:
-        """Follow the run by a message on `clock`; return it, None where it is none."""
+        """Follow the run by a message on `clock`; return it, None where it cannot be decoded."""
         try:
             clock: messages.Clock = messages.decode(keys.CLOCK, payload)
         except DecodeError:
@@ -82,7 +82,7 @@ class ObserverProcess:
         return clock
 
     def tick(self) -> None:
-        """Tell of its health once a wall second; to be called more often."""
+        """Publish health once a wall second; to be called more often."""
         if self._must_join:  # the world took it for dead
             self._must_join = self._admitted = False
             self._incarnation = secrets.randbits(62)
@@ -98,7 +98,7 @@ class ObserverProcess:
         return self._superseded
 
     def leave(self, reason: str) -> None:
-        """Say bye, unless another has taken over the name."""
+        """Publish bye, unless another process has taken over the name."""
         if not self._superseded:
             self._link.put(keys.process(self.name, "bye"), messages.Bye(self.now_ns, 0, reason))
 
@@ -106,12 +106,12 @@ class ObserverProcess:
         try:
             event = messages.decode(keys.EVENT, sample.payload)
         except DecodeError:
-            return  # somebody else's garbage
+            return  # not an event of the world
         if event.subject != self.name or event.kind not in JOIN_EVENTS:
             return
-        is_mine = event.data.get("incarnation") == self._incarnation
-        self._admitted = self._admitted or is_mine
-        if self._admitted and not is_mine:
+        is_own = event.data.get("incarnation") == self._incarnation
+        self._admitted = self._admitted or is_own
+        if self._admitted and not is_own:
             self._superseded = True
-            who = f"{event.data.get('host')} (pid {event.data.get('pid')})"
-            self.end_reason = f"another process of this name joined from {who}"
+            address = f"{event.data.get('host')} (pid {event.data.get('pid')})"
+            self.end_reason = f"another process of this name joined from {address}"

@@ -1,18 +1,105 @@
-"""What an operator asks for, sent to whoever answers it, off the page's threads; what comes of it is told."""
+"""What is asked for each drone, done in the order in which it was asked for, while others' waits for nothing.
+
+What an operator asks for, sent to whoever answers it, off the page's threads; what comes of it is told.
+"""
 
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
 from zsim.errors import ZsimError
 from zsim.transport.session import Session
-from zsim_bridges.console.drone_queue import DroneQueue
 from zsim_bridges.console.view_buffer import ViewBuffer
+
+Task = Callable[[], None]
+
+
+@dataclass
+class _DroneTasks:
+    """What is under way for one drone, and what waits for that."""
+
+    busy: int = 0
+    waiting: deque[Task] = field(default_factory=deque)
+
+
+class DroneQueue:
+    """Lines of acts, one for each name.
+
+    Args:
+        hands: do what has its turn.
+        urgent: do what waits for no turn.
+    """
+
+    def __init__(self, hands: Executor, urgent: Executor) -> None:
+        self._pool = hands
+        self._urgent = urgent
+        self._tasks: dict[str, _DroneTasks] = {}
+        self._lock = threading.Lock()
+        self._closed = False
+
+    def close(self) -> None:
+        """Begin nothing more."""
+        with self._lock:
+            self._closed = True
+            self._tasks.clear()
+
+    def submit(self, name: str, act: Task) -> None:
+        """Do something after all that was asked for by that name before.
+
+        Raises:
+            RuntimeError: closed.
+        """
+        with self._lock:
+            line = self._tasks_of(name)
+            if line.busy:
+                line.waiting.append(act)
+            else:
+                self._start(self._pool, name, act)
+
+    def submit_urgent(self, name: str, act: Task) -> None:
+        """Do something without waiting for what was asked for before; what is asked for later waits for it.
+
+        Raises:
+            RuntimeError: closed.
+        """
+        with self._lock:
+            self._tasks_of(name)
+            self._start(self._urgent, name, act)
+
+    def _tasks_of(self, name: str) -> _DroneTasks:
+        if self._closed:
+            raise RuntimeError("closed")
+        return self._tasks.setdefault(name, _DroneTasks())
+
+    def _start(self, hands: Executor, name: str, act: Task) -> None:
+        def done() -> None:
+            try:
+                act()
+            finally:
+                self._end(name)
+
+        hands.submit(done)
+        self._tasks[name].busy += 1
+
+    def _end(self, name: str) -> None:
+        with self._lock:
+            line = self._tasks.get(name)
+            if line is None:
+                return  # closed
+            line.busy -= 1
+            if line.busy:
+                return
+            if line.waiting:
+                self._start(self._pool, name, line.waiting.popleft())
+            else:
+                del self._tasks[name]
+
 
 PRIORITY = 10  # contract: of operators
 PRIORITY_EMERGENCY = 100  # contract: the highest; an operator who flies a drone must not keep others from stopping it
@@ -35,24 +122,30 @@ class CommandClient:
     Args:
         link: an open session.
         name: of the console's process.
-        eyes: hears when a command has been taken.
+        views: hears when a command has been taken.
         now_ns: simulated time for a stamp; may ask for it.
-        tell: told what came of each request, in any thread.
+        report: told what came of each request, in any thread.
     """
 
     def __init__(
-        self, link: Session, name: str, eyes: ViewBuffer, now_ns: Callable[[], int], tell: Callable[[RequestOutcome], None]
+        self,
+        link: Session,
+        name: str,
+        views: ViewBuffer,
+        now_ns: Callable[[], int],
+        report: Callable[[RequestOutcome], None],
     ) -> None:
         self._link = link
         self._name = name
-        self._eyes = eyes
+        self._views = views
         self._now_ns = now_ns
-        self._report = tell
+        self._report = report
         self._seqs: Counter[str] = Counter()  # modes sent to each drone
         self._emergencies: Counter[str] = Counter()  # emergencies asked for of each drone
         self._lock = threading.Lock()
         self._pools = [
-            ThreadPoolExecutor(THREADS_PER_POOL, thread_name_prefix=f"desk-{what}") for what in ("ask", "mode", "stop", "give")
+            ThreadPoolExecutor(THREADS_PER_POOL, thread_name_prefix=f"desk-{what}")
+            for what in ("ask", "mode", "stop", "give")
         ]
         self._requests, modes, stops, self._releases = self._pools
         self._queue = DroneQueue(modes, stops)
@@ -81,7 +174,9 @@ class CommandClient:
             if mode == "emergency":
                 with self._lock:
                     self._emergencies[drone] += 1
-                self._submit(partial(self._queue.submit_urgent, drone), f"{drone}: {mode}", self._send_emergency, drone, mode)
+                self._submit(
+                    partial(self._queue.submit_urgent, drone), f"{drone}: {mode}", self._send_emergency, drone, mode
+                )
             else:
                 turn, stops = partial(self._queue.submit, drone), self._emergencies[drone]
                 self._submit(turn, f"{drone}: {mode}", self._acquire_and_send, drone, mode, stops)
@@ -89,7 +184,9 @@ class CommandClient:
     def _ask(self, key: str, op: str, args: dict[str, Any], what: str) -> None:
         self._submit(self._requests.submit, what, self._request, key, op, args)
 
-    def _submit(self, begin: Callable[[Callable[[], None]], Any], what: str, act: Callable[..., str], *args: Any) -> None:
+    def _submit(
+        self, begin: Callable[[Callable[[], None]], Any], what: str, act: Callable[..., str], *args: Any
+    ) -> None:
         def done() -> None:
             self._report(RequestOutcome(what, _refusal_of(act, *args)))
 
@@ -119,7 +216,7 @@ class CommandClient:
 
     def _send(self, drone: str, mode: str, stops: int | None = None) -> str:
         """Send a mode, unless more emergencies than `stops` were asked for; let others fly the drone afterwards."""
-        before, now_ns = self._eyes.answered_commands(drone), self._now_ns()
+        before, now_ns = self._views.answered_commands(drone), self._now_ns()
         with self._lock:
             overtaken = stops is not None and self._emergencies[drone] > stops
             if not overtaken:
@@ -132,7 +229,7 @@ class CommandClient:
 
     def _release(self, drone: str, before: int) -> None:
         """Let others fly a drone, once the world has the mode that was sent with an operator's priority."""
-        self._eyes.await_answer(drone, before, ACCEPTANCE_TIMEOUT_S)
+        self._views.await_answer(drone, before, ACCEPTANCE_TIMEOUT_S)
         with suppress(ZsimError):  # the run has ended
             self._request(keys.CONTROL, "release", {"drone": drone})
 

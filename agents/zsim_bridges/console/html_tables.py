@@ -17,7 +17,14 @@ STATE_COLOURS = {
     "landing": BLUE,
     "emergency": RED,
 }
-EVENT_COLOURS = {"refused": RED, "death": RED, "collision": RED, "fault": AMBER, "fault_end": AMBER, "fault_clear": AMBER}
+EVENT_COLOURS = {
+    "refused": RED,
+    "death": RED,
+    "collision": RED,
+    "fault": AMBER,
+    "fault_end": AMBER,
+    "fault_clear": AMBER,
+}
 NO_FAULT = "no fault acts"
 FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
 STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"

@@ -16,13 +16,18 @@ from zsim.transport.session import Session
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import html_tables
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
-from zsim_bridges.console.console_page import ConsolePage
-from zsim_bridges.console.http.console_state import console_state
-from zsim_bridges.console.scene.camera_follow import CameraFollow
-from zsim_bridges.console.scene.picture import DronePoses, FormationShape, drone_poses, ellipsoids, ghosts, formation_shape
-from zsim_bridges.console.scene.scene_nodes import SceneNodes
-from zsim_bridges.console.scene.trails import DroneTrails
-from zsim_bridges.console.table_rows import TableRows
+from zsim_bridges.console.page.console_page import ConsolePage
+from zsim_bridges.console.page.picture import (
+    DronePoses,
+    DroneTrails,
+    FormationShape,
+    drone_poses,
+    ellipsoids,
+    formation_shape,
+    ghosts,
+)
+from zsim_bridges.console.page.scene_nodes import CameraFollow, SceneNodes
+from zsim_bridges.console.table_rows import TableRows, console_state
 from zsim_bridges.console.time_monitor import TimeMonitor
 from zsim_bridges.console.view_buffer import ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
@@ -48,8 +53,8 @@ class RunPage:
         server: viser's; whatever another run has left on it goes.
         link: an open session.
         info: of the run.
-        presence: of the console in it.
-        followers: knows whose cameras go with the formation.
+        observer: of the console in it.
+        camera_follow: knows whose cameras go with the formation.
         rate_hz: pictures a second; None: fewer where there are many drones, or time flies.
     """
 
@@ -58,49 +63,51 @@ class RunPage:
         server: viser.ViserServer,
         link: Session,
         info: Info,
-        presence: ObserverProcess,
-        followers: CameraFollow,
+        observer: ObserverProcess,
+        camera_follow: CameraFollow,
         rate_hz: float | None,
     ) -> None:
         self._server = server
         self._info = info
-        self._presence = presence
-        self._followers = followers
-        followers.restart()
+        self._observer = observer
+        self._camera_follow = camera_follow
+        camera_follow.restart()
         self._scenario = scenario_file.from_text(info.scenario)
         names = tuple(drone.name for drone in info.drones)
         self._rate_hz = rate_hz
         self._spaces = {c.name: scenario_space(self._scenario, c) for c in self._scenario.clusters}
         variables = {name: space.names for name, space in self._spaces.items()}
         age_s = self._scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
-        self._watch = TimeMonitor(link, presence, age_s if info.mode == "realtime" else math.inf)
-        self.eyes = ViewBuffer(link, info, presence, variables, self._on_refused_command)
-        self._desk = CommandClient(link, presence.name, self.eyes, self._watch.now_ns, self._on_outcome)
+        self._time_monitor = TimeMonitor(link, observer, age_s if info.mode == "realtime" else math.inf)
+        self.views = ViewBuffer(link, info, observer, variables, self._on_refused_command)
+        self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
         self._names = names
         self._members = {c.name: [names.index(d) for d in c.drones] for c in self._scenario.clusters}
         self._trails = DroneTrails(len(names))
-        self._words = TableRows(self.eyes)
+        self._table_rows = TableRows(self.views)
         self._shapes: dict[str, FormationShape | None] = {}
         self._drones: DronePoses | None = None
         self._drawn_ghosts: dict[str, Any] = {}
         self._drawn_ns = self._table_s = 0.0
         robots = sum(space.n for space in self._spaces.values())
-        self._stage = SceneNodes(server, names, robots, len(self._spaces))
-        self._stage.obstacles(self._scenario.environment.obstacles)
-        show = self._stage.show
-        self._page = ConsolePage(server.gui, self._scenario, self._spaces, self._desk, self._on_outcome, show, info.rate)
+        self._scene = SceneNodes(server, names, robots, len(self._spaces))
+        self._scene.obstacles(self._scenario.environment.obstacles)
+        show = self._scene.show
+        self._page = ConsolePage(
+            server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate
+        )
 
     def close(self) -> None:
         """Send nothing any more."""
-        self._desk.close()
+        self._client.close()
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Draw pictures until the run is over, or somebody says stop."""
-        self.eyes.open()
+        self.views.open()
         pause = threading.Event()
         next_s = time.monotonic()
-        with self._watch.polling():
-            while not self._presence.end_reason and not stopped():
+        with self._time_monitor.polling():
+            while not self._observer.end_reason and not stopped():
                 self._update(time.monotonic())
                 next_s = max(next_s + self._period_s(), time.monotonic())
                 pause.wait(next_s - time.monotonic())
@@ -108,18 +115,18 @@ class RunPage:
 
     def state(self) -> dict[str, Any]:
         """Return what is shown, as plain data: for programs, and for tests."""
-        return console_state(self._info.run_id, self.eyes, self._watch, dict(self._shapes))
+        return console_state(self._info.run_id, self.views, self._time_monitor, dict(self._shapes))
 
     # A picture
 
     def _period_s(self) -> float:
         """Return the time from one to the next [wall]."""
-        rate = self._watch.clock.rate if self._watch.clock is not None else 0.0
+        rate = self._time_monitor.clock.rate if self._time_monitor.clock is not None else 0.0
         return 1.0 / (self._rate_hz or picture_rate_hz(len(self._names), rate))
 
     def _update(self, wall_s: float) -> None:
-        self._presence.tick()
-        new = self.eyes.update()
+        self._observer.tick()
+        new = self.views.update()
         for form in self._page.forms.values():
             form.send(wall_s)
         if not self._server.get_clients():
@@ -134,16 +141,16 @@ class RunPage:
 
     def _draw_end(self) -> None:
         """Draw how it ended: for pages that are opened between two runs."""
-        self.eyes.update()
+        self.views.update()
         with self._server.atomic():
-            if self.eyes.drones is not None:
+            if self.views.drones is not None:
                 self._draw()
             self._update_tables(time.monotonic())
 
     def _store_unseen(self, new: bool) -> None:
         """Keep up what pages want to see of the time before they were opened."""
-        if new and self.eyes.drones is not None:
-            self._followers.set_target(self._camera_targets(self._store_drones(self.eyes.drones)))
+        if new and self.views.drones is not None:
+            self._camera_follow.set_target(self._camera_targets(self._store_drones(self.views.drones)))
 
     def _store_drones(self, view: ViewDrones) -> DronePoses:
         """Keep up with the drones; return them."""
@@ -156,28 +163,28 @@ class RunPage:
         return drones
 
     def _draw(self) -> None:
-        assert self.eyes.drones is not None
+        assert self.views.drones is not None
         before_ns = self._drawn_ns
-        drones = self._store_drones(self.eyes.drones)
+        drones = self._store_drones(self.views.drones)
         dt_s = min(self._period_s(), max(0.0, (drones.t_ns - before_ns) / 1e9))
-        self._stage.drones(drones, dt_s)
-        beliefs = self.eyes.estimates().values()
-        self._stage.estimates(ellipsoids([belief.estimate for belief in beliefs if belief.fresh]))
+        self._scene.drones(drones, dt_s)
+        beliefs = self.views.estimates().values()
+        self._scene.estimates(ellipsoids([belief.estimate for belief in beliefs if belief.fresh]))
         if self._shapes:
-            self._stage.shapes(list(self._shapes.values()), list(self._shapes).index(self._page.chosen))
+            self._scene.shapes(list(self._shapes.values()), list(self._shapes).index(self._page.chosen))
         self._draw_ghosts()
-        self._followers.follow(self._camera_targets(drones))
+        self._camera_follow.follow(self._camera_targets(drones))
 
     def _draw_ghosts(self) -> None:
         """Put the ghosts anew where a formation is to be somewhere else now."""
-        wanted = {name: (view.phase, view.desired) for name, view in self.eyes.clusters.items()}
+        wanted = {name: (view.phase, view.desired) for name, view in self.views.clusters.items()}
         if wanted == self._drawn_ghosts:
             return
         self._drawn_ghosts = wanted
-        found = [ghosts(self._spaces[name], view) for name, view in self.eyes.clusters.items()]
+        found = [ghosts(self._spaces[name], view) for name, view in self.views.clusters.items()]
         there = [each for each in found if each is not None]
         p_W = np.concatenate([p for p, _ in there]) if there else np.zeros((0, 3))
-        self._stage.ghosts(p_W, np.concatenate([q for _, q in there]) if there else np.zeros((0, 4)))
+        self._scene.ghosts(p_W, np.concatenate([q for _, q in there]) if there else np.zeros((0, 4)))
 
     def _update_shapes(self, drones: DronePoses) -> None:
         """Find the formations as they truly stand, and keep what plots show of them."""
@@ -186,7 +193,7 @@ class RunPage:
             members = self._members[name]
             whole = bool(there[members].all())
             self._shapes[name] = found = formation_shape(space, drones.p_W[members], yaw[members]) if whole else None
-            view = self.eyes.clusters.get(name)
+            view = self.views.clusters.get(name)
             if view is not None:
                 true = None if found is None else found.c
                 self._page.plots[name].history.add(drones.t_ns / 1e9, view.desired, view.value, true)
@@ -200,18 +207,22 @@ class RunPage:
 
     def _update_tables(self, wall_s: float) -> None:
         page = self._page
-        page.clock.content = html_tables.clock_line(self._watch.clock, int(self._drawn_ns), self._watch.silent_s)
-        page.phases.content = html_tables.formation_lines({n: (v.phase, v.reason) for n, v in self.eyes.clusters.items()})
-        page.drones.content = html_tables.drone_table(self._words.drone_rows())
-        page.sensors.content = self._words.sensor_table(page.drone_form.chosen)
-        page.acting.content = html_tables.fault_lines(self._words.acting())
-        page.events.content = html_tables.event_table(list(self.eyes.events)[:EVENTS_SHOWN])
+        page.clock.content = html_tables.clock_line(
+            self._time_monitor.clock, int(self._drawn_ns), self._time_monitor.silent_s
+        )
+        page.phases.content = html_tables.formation_lines(
+            {n: (v.phase, v.reason) for n, v in self.views.clusters.items()}
+        )
+        page.drones.content = html_tables.drone_table(self._table_rows.drone_rows())
+        page.sensors.content = self._table_rows.sensor_table(page.drone_form.chosen)
+        page.acting.content = html_tables.fault_lines(self._table_rows.acting())
+        page.events.content = html_tables.event_table(list(self.views.events)[:EVENTS_SHOWN])
         if page.chosen:
-            page.forms[page.chosen].refresh(self.eyes.clusters.get(page.chosen), wall_s)
+            page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
             page.plots[page.chosen].draw()
         if self._drones is not None:
-            self._stage.trails(*self._trails.segments(self._drones.p_W))
-            self._stage.wind(self._drones)
+            self._scene.trails(*self._trails.segments(self._drones.p_W))
+            self._scene.wind(self._drones)
 
     def _on_outcome(self, told: RequestOutcome) -> None:
         """Show what came of a request: a refusal in the corner of every page, and among the events.
@@ -221,7 +232,7 @@ class RunPage:
         kind, outcome = ("refused", told.refusal) if told.refusal else ("control", "done")
         if told.refusal or told.request.partition(":")[0] in self._spaces:
             said = f"{told.request}: {outcome}"
-            self.eyes.add_event(Event(self._presence.now_ns, 0, kind, self._presence.name, "", said))
+            self.views.add_event(Event(self._observer.now_ns, 0, kind, self._observer.name, "", said))
         if told.refusal:
             self._notify(told.request, told.refusal)
 

@@ -22,7 +22,7 @@ class TimeMonitor:
 
     Args:
         link: an open session.
-        presence: of the console in the run; it follows the run's clock.
+        observer: of the console in the run; it follows the run's clock.
         stamp_age_s: simulated; how old the time of a stamp may be.
         wall_s: monotonic.
 
@@ -33,12 +33,12 @@ class TimeMonitor:
     def __init__(
         self,
         link: Session,
-        presence: ObserverProcess,
+        observer: ObserverProcess,
         stamp_age_s: float = math.inf,
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._link = link
-        self._presence = presence
+        self._observer = observer
         self._stamp_age_s = stamp_age_s
         self._wall_s = wall_s
         self._one = threading.Lock()
@@ -72,7 +72,7 @@ class TimeMonitor:
             with self._one:
                 if self._is_old():  # others that waited too have been told
                     self._poll()
-        return self._presence.now_ns
+        return self._observer.now_ns
 
     @property
     def silent_s(self) -> float:
@@ -96,6 +96,6 @@ class TimeMonitor:
         except ZsimError:
             return  # the link is lost, and comes back
         for sample in samples:
-            clock = self._presence.update_clock(sample.payload)
+            clock = self._observer.update_clock(sample.payload)
             if clock is not None:
                 self.clock, self._known_s, self._answered_s = clock, asked_s, self._wall_s()

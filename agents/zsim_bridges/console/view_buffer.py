@@ -13,7 +13,9 @@ from zsim.transport.session import Heard, Sample, Session
 from zsim_bridges.observer_process import ObserverProcess
 
 EVENTS_KEPT = 200
-HIDDEN_EVENTS = frozenset({"command"})  # kinds of events that say nothing which the next one does not: a mode, a refusal
+HIDDEN_EVENTS = frozenset(
+    {"command"}
+)  # kinds of events that say nothing which the next one does not: a mode, a refusal
 FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
 
 
@@ -38,7 +40,7 @@ class ViewBuffer:
     Args:
         link: an open session.
         info: of the run.
-        presence: of the console in it.
+        observer: of the console in it.
         variables: names of each formation's variables: of another formation, or with others, no view is taken.
         refused: told, in a thread of Zenoh's, of what the world refuses of the console's own commands.
         wall_s: monotonic.
@@ -56,14 +58,14 @@ class ViewBuffer:
         self,
         link: Session,
         info: Info,
-        presence: ObserverProcess,
+        observer: ObserverProcess,
         variables: Mapping[str, tuple[str, ...]],
         refused: Callable[[Event], None],
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._link = link
         self._names = frozenset(drone.name for drone in info.drones)
-        self._presence = presence
+        self._observer = observer
         self._variables = variables
         self._refused = refused
         self._wall_s = wall_s
@@ -97,7 +99,7 @@ class ViewBuffer:
             try:
                 self._store(key, messages.decode(key, payload))
             except DecodeError:
-                self._presence.health.refused += 1
+                self._observer.health.refused += 1
         return keys.VIEW_DRONES in new
 
     def estimates(self) -> dict[str, ReceivedEstimate]:
@@ -133,7 +135,7 @@ class ViewBuffer:
         self.events.appendleft(event)
 
     def _on_publication(self, heard: Heard) -> None:
-        self._presence.health.received += 1
+        self._observer.health.received += 1
         with self._lock:
             self._new[heard.key] = heard.payload
 
@@ -155,7 +157,7 @@ class ViewBuffer:
         if self._variables.get(cluster) == view.names and len(view.value) == len(view.desired) == len(view.names):
             self.clusters[cluster] = view
         else:
-            self._presence.health.refused += 1
+            self._observer.health.refused += 1
 
     def _on_event(self, sample: Sample) -> None:
         try:
@@ -168,7 +170,7 @@ class ViewBuffer:
                 self._arrived.notify_all()
         if event.kind not in HIDDEN_EVENTS:
             self.events.appendleft(event)
-        if event.kind == "refused" and event.source == self._presence.name:
+        if event.kind == "refused" and event.source == self._observer.name:
             self._refused(event)
 
 

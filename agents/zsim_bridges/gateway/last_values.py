@@ -1,19 +1,59 @@
-"""The last value of every key, as far as it passed the world. Pure."""
+"""The last value of every key that has passed the world, or was published by clients here. Pure."""
 
 import threading
+from collections import deque
 from collections.abc import Sequence
 
 from zsim.contract import batch, keys, messages
 from zsim.contract.bundle import Bundle, table_of, unpacked
 from zsim.errors import DecodeError
-from zsim_bridges.gateway.echo_filter import EchoFilter
 
-OWN_BYTES_MAX = 64_000_000  # of the values on keys that are none of the contract's
+WAITING_MAX = 256  # echoes of a key; a paused world returns none, and clients may go on
+DELETED = None
+
+
+class EchoFilter:
+    """Recognises values of clients that come back from the world after a newer value, by key.
+
+    After two values in a row the first comes back when the second is there already; after a value and its deletion
+    the value comes back. An echo that never comes is forgotten with the next of its key.
+
+    Args:
+        keys_max: number of keys with echoes that are waited for.
+    """
+
+    def __init__(self, keys_max: int) -> None:
+        self._keys_max = keys_max
+        self._waiting: dict[str, deque[int | None]] = {}
+
+    def add(self, key: str, payload: bytes) -> None:
+        """Expect the echo of a payload that is on its way to the world."""
+        if key in self._waiting or len(self._waiting) < self._keys_max:
+            self._waiting.setdefault(key, deque(maxlen=WAITING_MAX)).append(hash(payload))
+
+    def add_deletion(self, key: str) -> None:
+        """Note that a key whose echoes are expected has no value any more."""
+        if key in self._waiting:
+            self._waiting[key].append(DELETED)
+
+    def is_stale(self, key: str, payload: bytes) -> bool:
+        """Return whether a payload from the world is an echo that a newer value or deletion has followed."""
+        waiting = [*self._waiting.get(key, ())]
+        if hash(payload) not in waiting:
+            return False
+        del self._waiting[key]
+        newer = waiting[waiting.index(hash(payload)) + 1 :]
+        if any(mark is not DELETED for mark in newer):
+            self._waiting[key] = deque(newer, maxlen=WAITING_MAX)
+        return bool(newer)
+
+
+OWN_BYTES_MAX = 64_000_000  # of the values on clients' own keys
 KEYS_MAX = 200_000  # kept; 1000 drones have about 12 000
 
 
 class LastValues:
-    """Filled by the batches that the world hands out; unpacked when somebody asks.
+    """Filled by the batches that the world publishes; payloads are unpacked when they are read.
 
     Args:
         drones: their names, as `world/info` gives them.
@@ -24,7 +64,7 @@ class LastValues:
 
     def __init__(self, drones: Sequence[str]) -> None:
         self._table = table_of(drones)
-        self._indices = {key: place for place, key in enumerate(self._table)}
+        self._indices = {key: index for index, key in enumerate(self._table)}
         self._payloads: dict[str, bytes] = {}
         self._own_bytes = 0
         self._lock = threading.Lock()  # clients' thread and the world's both add to what is counted
@@ -34,12 +74,12 @@ class LastValues:
         self.refused = 0
 
     def add(self, key: str, payload: bytes, encoding: str = "") -> None:
-        """Take one message; of an encoding that is not its key's where one is given."""
+        """Store a message; of an encoding that is not its key's where one is given."""
         with self._lock:
             self._add(key, payload, encoding)
 
     def add_own(self, key: str, payload: bytes, encoding: str = "") -> None:
-        """Take one message that is said here, and that the world will hand out, too."""
+        """Store a message of a client here, which the world will return, too."""
         with self._lock:
             self._echoes.add(key, payload)
             self._add(key, payload, encoding)
@@ -53,12 +93,12 @@ class LastValues:
                 self._encodings[key] = (payload, encoding)
 
     def _has_room(self, key: str, payload: bytes) -> bool:
-        """Tell whether a value of a key of somebody's own may be kept."""
+        """Return whether a value of a client's own key may be kept, and count its bytes."""
         before = len(self._payloads.get(key, b""))
         more = len(payload) - before
-        has = self._own_bytes + more <= OWN_BYTES_MAX and (key in self._payloads or len(self._payloads) < KEYS_MAX)
-        self._own_bytes += more if has else 0
-        return has
+        fits = self._own_bytes + more <= OWN_BYTES_MAX and (key in self._payloads or len(self._payloads) < KEYS_MAX)
+        self._own_bytes += more if fits else 0
+        return fits
 
     def drop(self, key: str) -> None:
         """Forget the value of a key that is deleted here."""
@@ -67,9 +107,9 @@ class LastValues:
             self._drop(key)
 
     def _drop(self, key: str) -> None:
-        gone = self._payloads.pop(key, b"")
+        dropped = self._payloads.pop(key, b"")
         if messages.type_of(key) is None:
-            self._own_bytes -= len(gone)
+            self._own_bytes -= len(dropped)
         self._encodings.pop(key, None)
 
     def encoding(self, key: str) -> str:
@@ -110,7 +150,7 @@ class LastValues:
             self._bundled[place] = (bundle, m)
 
     def matching(self, expression: str, prefix: str = "") -> list[tuple[str, bytes]]:
-        """Return keys and payloads that an expression takes, in order of the keys.
+        """Return keys and payloads that an expression matches, in order of the keys.
 
         Args:
             expression: of keys with the prefix.
@@ -121,8 +161,8 @@ class LastValues:
             payload = self._payload(key) if expression.startswith(prefix) else None
             return [(key, payload)] if payload is not None else []
         known = {*self._payloads, *(self._table[place] for place in list(self._bundled))}  # filled in another thread
-        taken = sorted(key for key in known if keys.matches(expression, prefix + key))
-        return [(key, payload) for key in taken if (payload := self._payload(key)) is not None]
+        matching = sorted(key for key in known if keys.matches(expression, prefix + key))
+        return [(key, payload) for key in matching if (payload := self._payload(key)) is not None]
 
     def _payload(self, key: str) -> bytes | None:
         found = self._bundled.get(self._indices.get(key, -1))

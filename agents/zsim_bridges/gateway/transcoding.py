@@ -10,8 +10,8 @@ from zsim.contract import messages
 from zsim.errors import DecodeError
 from zsim.transport.session import Heard
 
-CACHED_VALUES = 256  # one value goes to many clients, and is written once
-INTEGER_MAX = 2.0**63  # a double above it is no whole number of 64 bits
+CACHED_VALUES = 256  # values; one goes to many clients, and is encoded once
+INTEGER_MAX = 2.0**63  # a double above it is no integer of 64 bits
 JSON = ("application/json", "text/json", "text/json5")
 TEXT = ("text/plain", "zenoh/string")
 _to_json = msgspec.json.Encoder().encode
@@ -20,12 +20,12 @@ _to_json = msgspec.json.Encoder().encode
 def payload_to_json(key: str, payload: bytes, encoding: str = "") -> bytes:
     """Return a payload as JSON.
 
-    A message of the contract comes with all of its fields; JSON, text and msgpack on other keys as what they say, bytes
+    A message of the contract comes with all of its fields; JSON, text and msgpack on other keys as their value, bytes
     within as base64; anything else as base64 of the whole.
 
     Args:
-        key: where it was said.
-        payload: as said.
+        key: on which it was published.
+        payload: as published.
         encoding: Zenoh's, where it is known.
     """
     try:
@@ -35,7 +35,7 @@ def payload_to_json(key: str, payload: bytes, encoding: str = "") -> bytes:
 
 
 def decode_foreign(payload: bytes, encoding: str) -> Any:
-    """Return what a payload that is no message of the contract says, as JSON can say it."""
+    """Return the value of a payload that is no message of the contract, as JSON can write it."""
     kind = encoding.partition(";")[0]
     try:
         if kind in JSON:
@@ -48,7 +48,7 @@ def decode_foreign(payload: bytes, encoding: str) -> Any:
 
 
 def json_value(value: Any) -> Any:
-    """Return what a payload held if JSON can say it, otherwise its msgpack as base64."""
+    """Return a value if JSON can write it, otherwise its msgpack as base64."""
     try:
         _to_json(value)
     except messages.REFUSALS:
@@ -57,9 +57,9 @@ def json_value(value: Any) -> Any:
 
 
 def json_to_payload(key: str, value: Any) -> bytes:
-    """Return plain data, as JSON gave it, as the payload of a key.
+    """Return plain data, as decoded from JSON, as the payload of a key.
 
-    Where a whole number is wanted 20000000.0 will do: languages that know only doubles write it so.
+    Where a field is an integer, 20000000.0 will do: languages that have only doubles write it so.
 
     Raises:
         DecodeError: names key, field, found and allowed; a key outside of the contract takes anything.
@@ -103,7 +103,7 @@ def json_entry(key: str, payload: bytes, encoding: str = "") -> dict[str, Any]:
 
 
 @lru_cache(maxsize=CACHED_VALUES)
-def value_line(heard: Heard) -> bytes:
-    """Return the line that tells a client of a value; null for a key that was deleted."""
-    value = payload_to_json(heard.key, heard.payload, heard.encoding) if heard.payload else b"null"
-    return b'{"op":"value","key":%b,"value":%b}\n' % (_to_json(heard.key), value)
+def value_line(sample: Heard) -> bytes:
+    """Return the line of a value for a client; null for a key that was deleted."""
+    value = payload_to_json(sample.key, sample.payload, sample.encoding) if sample.payload else b"null"
+    return b'{"op":"value","key":%b,"value":%b}\n' % (_to_json(sample.key), value)

@@ -15,8 +15,8 @@ from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import conversions
 from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics
 from zsim_bridges.ros1.intake import Intake
+from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.onboard import warm_up
-from zsim_bridges.ros1.wire.node import Ros1Node
 
 POLL_S = 0.1  # how often a stop is looked for
 REPORTED_MAX = 1000  # refusals remembered, so that each is told once
@@ -30,7 +30,7 @@ class NodeShutdownError(RunError):
 def serve(
     link: Session,
     info: Info,
-    presence: ObserverProcess,
+    observer: ObserverProcess,
     stopped: Callable[[], bool],
     say: Say,
     master_uri: str,
@@ -41,7 +41,7 @@ def serve(
     Args:
         link: an open session.
         info: of the run.
-        presence: of this process in it.
+        observer: of this process in it.
         stopped: asked now and then; True ends it.
         say: told what a person should know.
         master_uri: of the ROS master.
@@ -53,19 +53,19 @@ def serve(
     """
     warm_up()
     node = Ros1Node(f"/{ros_frames.ros1_name(info.federation)}", master_uri, host, say)
-    asyncio.run(Bridge(link, info, presence, node, say).run(stopped))
+    asyncio.run(Bridge(link, info, observer, node, say).run(stopped))
     if node.shutdown_reason:
-        presence.leave(node.shutdown_reason)
-        raise NodeShutdownError(f"{presence.name}: {node.shutdown_reason}")
+        observer.leave(node.shutdown_reason)
+        raise NodeShutdownError(f"{observer.name}: {node.shutdown_reason}")
 
 
 class Bridge:
     """One run in one ROS graph."""
 
-    def __init__(self, link: Session, info: Info, presence: ObserverProcess, node: Ros1Node, say: Say) -> None:
+    def __init__(self, link: Session, info: Info, observer: ObserverProcess, node: Ros1Node, say: Say) -> None:
         self._link = link
         self._info = info
-        self._presence = presence
+        self._observer = observer
         self._node = node
         self._say = say
         self._reported: set[str] = set()
@@ -73,18 +73,18 @@ class Bridge:
         tf = node.publish("/tf", "tf2_msgs/TFMessage", QUEUE * len(info.drones))
         check_names(drone.name for drone in info.drones)
         drones = scenario_file.from_text(info.scenario).drones
-        self._drones = {drone.name: DroneTopics(node, drone, presence.name, link.put, tf) for drone in drones}
+        self._drones = {drone.name: DroneTopics(node, drone, observer.name, link.put, tf) for drone in drones}
 
     async def run(self, stopped: Callable[[], bool]) -> None:
         """Pass on both ways until the run is over, or we are to stop."""
-        intake = Intake(self._link, self._info, self._presence.health, asyncio.get_running_loop())
+        intake = Intake(self._link, self._info, self._observer.health, asyncio.get_running_loop())
         try:
             async with self._node.running():
-                while not (stopped() or self._presence.end_reason or self._node.shutdown_reason):
+                while not (stopped() or self._observer.end_reason or self._node.shutdown_reason):
                     with contextlib.suppress(TimeoutError):
                         await asyncio.wait_for(intake.news.wait(), POLL_S)
                     await self._forward_all(intake)
-                    self._presence.tick()
+                    self._observer.tick()
         finally:
             intake.close()
 
@@ -111,18 +111,18 @@ class Bridge:
         try:
             self._drones[drone].publish(message)
         except (ValueError, ArithmeticError) as error:  # finite, but beyond what a field of ROS can hold
-            self._presence.health.refused += 1
+            self._observer.health.refused += 1
             self._report_once(f"{key}: {error}")
 
     def _decoded(self, key: str, payload: bytes) -> Any:
         try:
             return messages.decode(key, payload)
         except DecodeError:
-            self._presence.health.refused += 1
+            self._observer.health.refused += 1
             return None
 
     def _on_clock(self, payload: bytes) -> None:
-        self._presence.update_clock(payload)
+        self._observer.update_clock(payload)
         clock = self._decoded(keys.CLOCK, payload)
         if clock is not None:
             self._clock.publish(lambda _: conversions.clock(clock))
@@ -130,7 +130,7 @@ class Bridge:
     def _on_event(self, payload: bytes) -> None:
         """Tell what the world refuses of what ROS nodes ask."""
         event = self._decoded(keys.EVENT, payload)
-        if event is None or (event.kind, event.source) != ("refused", self._presence.name):
+        if event is None or (event.kind, event.source) != ("refused", self._observer.name):
             return
         self._report_once(f"{event.subject}: {event.data.get('reason', event.text)}")
 
@@ -138,7 +138,7 @@ class Bridge:
         """Say something once."""
         if reason not in self._reported and len(self._reported) < REPORTED_MAX:
             self._reported.add(reason)
-            self._say(f"{self._presence.name}: {reason}")
+            self._say(f"{self._observer.name}: {reason}")
 
 
 def check_names(drones: Iterable[str]) -> None:

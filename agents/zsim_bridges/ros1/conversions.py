@@ -11,7 +11,7 @@ import numpy as np
 from zsim.contract import messages
 from zsim_bridges import ros_frames
 from zsim_bridges.ros1.onboard import OnboardState
-from zsim_bridges.ros1.wire.message_types import message_class
+from zsim_bridges.ros1.tcpros import message_class
 from zsim_bridges.ros_frames import Vector, Wxyz
 
 WORLD = "world"

@@ -1,18 +1,123 @@
-"""One drone in the ROS graph, as ardrone_autonomy's driver in the namespace of that name."""
+"""What ROS nodes ask of a drone, and what is sent to it for that: the driver's rules of cmd_vel. Pure.
 
+Source: ardrone_autonomy 1.4.1, src/teleop_twist.cpp. The driver repeats the last cmd_vel until there is another; so
+do we, but forget it when the drone comes down.
+
+
+One drone in the ROS graph, as ardrone_autonomy's driver in the namespace of that name.
+"""
+
+import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
-from zsim.contract import messages
+from zsim.contract import keys, messages
 from zsim.scenario.scenario import Drone
 from zsim_bridges import ros_frames
 from zsim_bridges.ros1 import conversions
+from zsim_bridges.ros1.connections import PublishedTopic
 from zsim_bridges.ros1.conversions import DriverFrames
+from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.onboard import OnboardState
-from zsim_bridges.ros1.pilot import DriverCommands
-from zsim_bridges.ros1.wire.node import Ros1Node
-from zsim_bridges.ros1.wire.publisher import PublishedTopic
+
+NEARLY_ZERO = 1e-6  # of a component of cmd_vel, _EPS of the driver
+REPEAT_NS = 100_000_000  # ns; silence of 0.5 s would be the commander's death, scenario `silence.hover_s`
+AIRBORNE = ("hovering", "flying")
+COMMANDABLE = ("taking_off", *AIRBORNE)
+
+
+class TiltCommand(NamedTuple):
+    """A cmd_vel within its limits: shares of the largest tilt, climb and yaw rate."""
+
+    forward: float
+    left: float
+    up: float
+    yaw_left: float
+    hover: bool
+
+
+class DriverCommands:
+    """Of one drone.
+
+    Args:
+        drone: its name.
+        source: process name under which commands are sent.
+        put: publishes a message on a key.
+    """
+
+    def __init__(self, drone: str, source: str, put: Callable[[str, Any], None]) -> None:
+        self._source = source
+        self._put = put
+        self._tilt_key, self._mode_key = keys.command(drone, "ardrone"), keys.command(drone, "mode")
+        self._seq = {self._tilt_key: 0, self._mode_key: 0}
+        self._tilt: TiltCommand | None = None
+        self._sent_ns: int | None = None
+        self._status: messages.Status | None = None
+
+    def on_cmd_vel(self, twist: Any) -> None:
+        """Fly a geometry_msgs/Twist from the next gate on.
+
+        Raises:
+            ValueError: it is not finite.
+        """
+        tilt = tilt_of(twist)
+        if self._status is not None and self._status.state in COMMANDABLE:
+            self._tilt, self._sent_ns = tilt, None
+
+    def take_off(self) -> None:
+        """Take off."""
+        self._send_mode("takeoff")
+
+    def land(self) -> None:
+        """Land."""
+        self._send_mode("land")
+
+    def reset(self) -> None:
+        """Stop the rotors at once; in the emergency that this is, leave it: the driver's toggle."""
+        self._send_mode("reset" if self._status is not None and self._status.state == "emergency" else "emergency")
+
+    def trim_refusal(self) -> str | None:
+        """Return why the drone cannot be trimmed now; it stands level, and there is nothing more to do."""
+        state = self._status.state if self._status else "not there yet"
+        return None if state == "landed" else f"the drone is {state}; must be landed"
+
+    def on_status(self, status: messages.Status) -> None:
+        """Send what is due at a gate."""
+        self._status = status
+        if status.state not in COMMANDABLE:
+            self._tilt = None
+        late = self._sent_ns is None or status.t_ns - self._sent_ns >= REPEAT_NS
+        if self._tilt is not None and late and status.state in AIRBORNE:
+            self._sent_ns = status.t_ns
+            seq = self._next_seq(self._tilt_key)
+            self._put(self._tilt_key, messages.Ardrone(status.t_ns, seq, self._source, *self._tilt))
+
+    def _send_mode(self, mode: Any) -> None:
+        t_ns = self._status.t_ns if self._status else 0
+        self._put(self._mode_key, messages.Mode(t_ns, self._next_seq(self._mode_key), self._source, mode))
+
+    def _next_seq(self, key: str) -> int:
+        self._seq[key] += 1
+        return self._seq[key] - 1
+
+
+def tilt_of(twist: Any) -> TiltCommand:
+    """Return what a geometry_msgs/Twist asks of an AR.Drone.
+
+    linear.x and linear.y are shares of the largest tilt, forward and to the left; linear.z of the largest climb;
+    angular.z of the largest yaw rate, counter-clockwise. All six zero is hovering in place.
+
+    Raises:
+        ValueError: it is not finite.
+    """
+    linear, angular = twist.linear, twist.angular
+    values = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+    if not all(map(math.isfinite, values)):
+        raise ValueError(f"cmd_vel is {values}; must be finite")
+    shares = (min(1.0, max(-1.0, share)) for share in (linear.x, linear.y, linear.z, angular.z))
+    return TiltCommand(*shares, hover=all(abs(value) < NEARLY_ZERO for value in values))
+
 
 DRIVER_QUEUE = 200  # messages, of the driver's publishers
 QUEUE = 100  # messages
@@ -29,7 +134,9 @@ class DroneTopics:
         tf: the topic that all drones share.
     """
 
-    def __init__(self, node: Ros1Node, drone: Drone, source: str, put: Callable[[str, Any], None], tf: PublishedTopic) -> None:
+    def __init__(
+        self, node: Ros1Node, drone: Drone, source: str, put: Callable[[str, Any], None], tf: PublishedTopic
+    ) -> None:
         self._tf = tf
         name = ros_frames.ros1_name(drone.name)
         self._state, self._frames = OnboardState(drone.sensors.imu.mount, drone.sensors.mag.mount), DriverFrames(name)

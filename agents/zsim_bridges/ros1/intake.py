@@ -51,7 +51,7 @@ class Intake:
         """Yield what has come until now, batch by batch, as keys and payloads."""
         self.news.clear()
         for _ in range(len(self._backlog)):
-            yield self._expanded(self._backlog.popleft())
+            yield self._opened(self._backlog.popleft())
 
     def _run(self) -> None:
         while True:
@@ -66,7 +66,7 @@ class Intake:
                 with contextlib.suppress(RuntimeError):  # the reader is gone
                     self._loop.call_soon_threadsafe(self.news.set)
 
-    def _expanded(self, payload: bytes) -> list[tuple[str, bytes]]:
+    def _opened(self, payload: bytes) -> list[tuple[str, bytes]]:
         """Return keys and payloads; those of our drones are packed in a bundle."""
         found: list[tuple[str, bytes]] = []
         try:

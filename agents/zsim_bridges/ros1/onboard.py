@@ -41,7 +41,9 @@ class OnboardState:
 
     def __init__(self, imu: Mount | None = None, mag: Mount | None = None) -> None:
         mounts = {messages.Imu: imu, messages.Mag: mag}
-        self._rotations = {kind: mount_rotation(mount) for kind, mount in mounts.items() if mount and any(mount.rpy_deg)}
+        self._rotations = {
+            kind: mount_rotation(mount) for kind, mount in mounts.items() if mount and any(mount.rpy_deg)
+        }
         self.imu: messages.Imu | None = None
         self.mag: messages.Mag | None = None
         self.baro: messages.Baro | None = None

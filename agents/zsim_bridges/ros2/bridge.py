@@ -18,13 +18,12 @@ from zsim.transport import session
 from zsim.transport.identity import Identity
 from zsim.transport.session import Heard, Session
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.ros2 import conversions, rmw_zenoh, sensor_frames, topics
-from zsim_bridges.ros2.callback_queue import CallbackQueue
+from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
 from zsim_bridges.ros2.commands import RosCommands
-from zsim_bridges.ros2.participant import Ros2Node, RosContext
-from zsim_bridges.ros2.ros_names import ros_names
+from zsim_bridges.ros2.rmw_zenoh import ros_names
+from zsim_bridges.ros2.ros_context import Ros2Node, RosContext
 from zsim_bridges.ros2.ros_types import RosTypes
-from zsim_bridges.ros2.source_keys import SAMPLES_MAX, SourceSubscriptions, BridgedTopic
+from zsim_bridges.ros2.source_keys import SAMPLES_MAX, BridgedTopic, CallbackQueue, SourceSubscriptions
 from zsim_bridges.ros2.topics import RosNames, Topic
 
 NODE = "zsim"
@@ -55,14 +54,16 @@ class Bridge:
     Args:
         link: to the world.
         info: of the run.
-        presence: of this process in the run.
+        observer: of this process in the run.
         say: told what a person should know, each thing once.
         wall_ns: time since 1970.
     """
 
-    def __init__(self, link: Session, info: Info, presence: ObserverProcess, say: Say, wall_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, link: Session, info: Info, observer: ObserverProcess, say: Say, wall_ns: Callable[[], int]
+    ) -> None:
         self._link = link
-        self._presence = presence
+        self._observer = observer
         self._say = say
         self._wall_ns = wall_ns
         self._scenario: Scenario = scenario_file.from_text(info.scenario)
@@ -79,7 +80,7 @@ class Bridge:
         self._cleanups.append(link.hear(keys.CLOCK, self._on_clock))
 
     def _on_clock(self, heard: Heard) -> None:
-        self._queue.add_task(partial(self._presence.update_clock, heard.payload))
+        self._queue.add_task(partial(self._observer.update_clock, heard.payload))
 
     def process(self, within_s: float) -> None:
         """Do what there is to do, waiting for something."""
@@ -88,12 +89,12 @@ class Bridge:
         for act in taken.tasks:
             act()
         passed = self._sources.convert_all(taken.samples)
-        health = self._presence.health
+        health = self._observer.health
         if passed:
             health.step(self._wall_ns() - start_ns)
         health.received += passed
         health.dropped = self._queue.dropped + self._sources.dropped
-        self._presence.tick()
+        self._observer.tick()
 
     def close(self) -> None:
         """Hear nothing any more."""
@@ -106,13 +107,13 @@ class Bridge:
         self._queue.add_task(partial(self._count_refused, where, why))
 
     def _count_refused(self, where: str, why: str) -> None:
-        self._presence.health.refused += 1
-        self.report_once(where, f"{where}: refused, {why}; further ones are counted in {self._presence.name}'s health")
+        self._observer.health.refused += 1
+        self.report_once(where, f"{where}: refused, {why}; further ones are counted in {self._observer.name}'s health")
 
     def report_once(self, about: str, text: str) -> None:
         if about not in self._reported:
             self._reported.add(about)
-            self._say(f"{self._presence.name}: {text}")
+            self._say(f"{self._observer.name}: {text}")
 
     # What ROS sees
 
@@ -120,7 +121,7 @@ class Bridge:
         """Show the run to ROS."""
         self._domain = ros.domain
         types = ros.types
-        commands = RosCommands(self._link, self._presence, types.message_class("std_srvs/srv/Trigger_Response"))
+        commands = RosCommands(self._link, self._observer, types.message_class("std_srvs/srv/Trigger_Response"))
         sensors = {drone.name: drone.sensors for drone in self._scenario.drones}
         root = ros.node("/", NODE)
         self._advertise(root, topics.run_topics(self.names))
@@ -159,7 +160,9 @@ class Bridge:
         """Tell once, for all that come later too, where the frames are that never move."""
         publisher = node.publisher("/tf_static", "tf2_msgs/msg/TFMessage", rmw_zenoh.TF_STATIC)
         placed = [
-            pose for d in self._scenario.drones for pose in sensor_frames.static_frames(self.names.drones[d.name], d.sensors)
+            pose
+            for d in self._scenario.drones
+            for pose in conversions.static_frames(self.names.drones[d.name], d.sensors)
         ]
         publisher.publish(conversions.transforms(0, placed))
 
@@ -193,7 +196,7 @@ def _empty_request(ask: Callable[..., Any], *about: str) -> Callable[[Any], Any]
 def serve(
     link: Session,
     info: Info,
-    presence: ObserverProcess,
+    observer: ObserverProcess,
     stopped: Callable[[], bool],
     say: Say,
     door: RosNetwork,
@@ -204,15 +207,15 @@ def serve(
     Raises:
         SessionError: the router's endpoint is malformed.
     """
-    bridge = Bridge(link, info, presence, say, wall_ns)
+    bridge = Bridge(link, info, observer, say, wall_ns)
     with ExitStack() as stack, closing(bridge):
         ros_link = link.bare() if door.router is None else None
         entered = False
-        while not presence.end_reason and not stopped():
+        while not observer.end_reason and not stopped():
             ros_link = ros_link or _connect(stack, door, bridge)
             if ros_link is not None and not entered:
                 bridge.advertise_run(RosContext(ros_link, door.domain, RosTypes(), wall_ns, bridge.count_refused))
-                say(f"{presence.name}: ROS domain {door.domain} by {door.router or 'the hub of the world'}")
+                say(f"{observer.name}: ROS domain {door.domain} by {door.router or 'the hub of the world'}")
                 entered = True
             bridge.process(POLL_S)
 

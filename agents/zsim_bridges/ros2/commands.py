@@ -18,13 +18,13 @@ class RosCommands:
 
     Args:
         link: to the world.
-        presence: for the name, and the time of the newest gate.
+        observer: for the name, and the time of the newest gate.
         response: class of std_srvs/Trigger_Response.
     """
 
-    def __init__(self, link: Session, presence: ObserverProcess, response: Any) -> None:
+    def __init__(self, link: Session, observer: ObserverProcess, response: Any) -> None:
         self._link = link
-        self._presence = presence
+        self._observer = observer
         self._response = response
         self._seq: dict[str, int] = {}
         self._lock = Lock()
@@ -41,13 +41,13 @@ class RosCommands:
             raise ValueError(f"the velocity is {(*v, turn)}; must be finite")
         key = keys.command(drone, "velocity")
         with self._lock:
-            self._link.put(key, Velocity(*self._next_stamp(key), self._presence.name, v, float(turn)))
+            self._link.put(key, Velocity(*self._next_stamp(key), self._observer.name, v, float(turn)))
 
     def send_mode(self, drone: str, mode: Any) -> None:
         """Ask a drone to take off, land, stop at once or leave the emergency."""
         key = keys.command(drone, "mode")
         with self._lock:
-            self._link.put(key, Mode(*self._next_stamp(key), self._presence.name, mode))
+            self._link.put(key, Mode(*self._next_stamp(key), self._observer.name, mode))
 
     def toggle_emergency(self, drone: str) -> None:
         """Stop the rotors at once, or, where that has happened, make ready to fly: the aircraft's emergency button.
@@ -70,7 +70,7 @@ class RosCommands:
         """Return t_ns and seq of the next command on a key."""
         seq = self._seq.get(key, 0)
         self._seq[key] = seq + 1
-        return self._presence.now_ns, seq
+        return self._observer.now_ns, seq
 
     def request_cluster(self, cluster: str, op: str) -> Any:
         """Ask a cluster's controller; return the response."""
@@ -81,5 +81,5 @@ class RosCommands:
         return self._request(keys.CONTROL, "release", {"drone": drone})
 
     def _request(self, key: str, op: str, args: dict[str, Any]) -> Any:
-        answer = self._link.request(key, op, self._presence.name, args)
+        answer = self._link.request(key, op, self._observer.name, args)
         return self._response(answer.ok, answer.error)

@@ -1,15 +1,69 @@
-"""What is read of the run for whom in ROS: each key once, while somebody subscribes to a topic that is made of it."""
+"""What threads of Zenoh hand to the bridge's own: acts, none of which is lost, and samples, the newest of them.
+
+What is read of the run for whom in ROS: each key once, while somebody subscribes to a topic that is made of it.
+"""
 
 import struct
+import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError
 from zsim.transport.session import Heard, Mailbox, Sample, Session
-from zsim_bridges.ros2.callback_queue import CallbackQueue
-from zsim_bridges.ros2.participant import Publisher
+from zsim_bridges.ros2.ros_context import Publisher
 from zsim_bridges.ros2.topics import Topic
+
+QueuedTask = Callable[[], object]
+
+
+class QueuedWork(NamedTuple):
+    """What has come since the last time: acts, and samples as (key, payload)."""
+
+    tasks: list[QueuedTask]
+    samples: list[tuple[str, bytes]]
+
+
+class CallbackQueue:
+    """A queue that never holds up who fills it: beyond `limit` samples the oldest go.
+
+    Attributes:
+        dropped: how many went.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._tasks: list[QueuedTask] = []
+        self._samples: deque[tuple[str, bytes]] = deque()
+        self._arrived = threading.Condition()
+        self.dropped = 0
+
+    def add_task(self, act: QueuedTask) -> None:
+        """Have something done in the bridge's thread."""
+        with self._arrived:
+            self._tasks.append(act)
+            self._arrived.notify()
+
+    def add_sample(self, key: str, payload: bytes) -> None:
+        """Have a sample passed on."""
+        with self._arrived:
+            if len(self._samples) >= self._limit:
+                self._samples.popleft()
+                self.dropped += 1
+            self._samples.append((key, payload))
+            self._arrived.notify()
+
+    def pop_all(self, within_s: float) -> QueuedWork:
+        """Return what there is, waiting for something."""
+        with self._arrived:
+            if not self._tasks and not self._samples:
+                self._arrived.wait(within_s)
+            taken = QueuedWork(self._tasks, list(self._samples))
+            self._tasks = []
+            self._samples.clear()
+        return taken
+
 
 SAMPLES_MAX = 2000  # of a key that wait to be converted: about a tenth of a second of work
 

@@ -1,5 +1,9 @@
-"""What a run looks like in ROS: every topic with its type, quality of service, source keys, and conversion."""
+"""The summary that ardrone_autonomy calls navdata: what a drone's sensors told last, in that driver's units.
 
+What a run looks like in ROS: every topic with its type, quality of service, source keys, and conversion.
+"""
+
+import math
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
@@ -8,13 +12,67 @@ import numpy as np
 
 from zsim.contract import keys
 from zsim.contract.messages import ClusterState, Estimate, Status
+from zsim.math.frames import rpy_from_quaternion
 from zsim.scenario.scenario import Sensors
+from zsim.scenario.sensor_presets import G_M_S2
+from zsim_bridges.ros2 import conversions, rmw_zenoh
 from zsim_bridges.ros2 import conversions as convert
-from zsim_bridges.ros2 import rmw_zenoh, sensor_frames
-from zsim_bridges.ros2.navdata import NavdataSummary
+from zsim_bridges.ros2.conversions import FramePose, header
 from zsim_bridges.ros2.rmw_zenoh import Qos
 from zsim_bridges.ros2.ros_types import RosTypes
-from zsim_bridges.ros2.sensor_frames import FramePose
+
+STATES = {"landed": 2, "taking_off": 6, "hovering": 4, "flying": 3, "landing": 8, "emergency": 0}
+"""ardrone_autonomy's numbers; an emergency it shows as unknown."""
+NOTHING = (math.nan, math.nan, math.nan)
+
+
+class NavdataSummary:
+    """Collects what a drone tells, and makes a message of it when its status comes, last of a gate.
+
+    Args:
+        kind: class of zsim_msgs/Navdata.
+        frame: of the message.
+    """
+
+    def __init__(self, kind: Any, frame: str) -> None:
+        self._kind = kind
+        self._frame = frame
+        self._last: dict[str, Any] = {}
+
+    def update(self, key: str, message: Any) -> Any | None:
+        """Take in a message of the drone; return the summary if it was the status."""
+        what = keys.leaf(key)
+        if what != "status":
+            self._last[what] = message
+            return None
+        return self._kind(
+            header=header(message.t_ns, self._frame),
+            battery_percent=message.battery_percent,
+            state=STATES[message.state],
+            **_named("mag_{}", self._scaled("mag", "field_ut", 1.0)),
+            pressure=self._rounded("baro", "pressure_pa", 1.0),
+            **_named("rot_{}", self._attitude()),
+            altd=self._rounded("sonar", "range_m", 1000.0),
+            **_named("v{}", self._scaled("flow", "velocity_m_s", 1000.0)),
+            **_named("a{}", self._scaled("imu", "accel_m_s2", 1.0 / G_M_S2)),
+            tm=message.t_ns / 1000.0,
+        )
+
+    def _scaled(self, sensor: str, field: str, factor: float) -> tuple[float, ...]:
+        found = getattr(self._last.get(sensor), field, NOTHING)
+        return tuple(factor * each for each in found)
+
+    def _rounded(self, sensor: str, field: str, factor: float) -> int:
+        return round(factor * getattr(self._last.get(sensor), field, 0.0))
+
+    def _attitude(self) -> tuple[float, ...]:
+        estimate = self._last.get("estimate")
+        return tuple(np.degrees(rpy_from_quaternion(estimate.orientation_wxyz))) if estimate else NOTHING
+
+
+def _named(pattern: str, values: tuple[float, ...]) -> dict[str, float]:
+    return {pattern.format(axis): value for axis, value in zip("xyz", values, strict=True)}
+
 
 SLOW_NS = 1_000_000_000  # of battery, which changes within minutes
 Conversion = Callable[[str, Any], Any | None]
@@ -48,11 +106,11 @@ def run_topics(names: RosNames) -> Iterator[Topic]:
 def _moving_frame(names: RosNames, key: str, message: Estimate | ClusterState) -> Any:
     """Return where a drone, or a cluster frame, is."""
     if isinstance(message, ClusterState):
-        placed = convert.cluster_pose(message, sensor_frames.MAP, names.clusters[keys.thing(key)])
+        placed = convert.cluster_pose(message, conversions.MAP, names.clusters[keys.thing(key)])
     else:
         drone = names.drones[keys.thing(key)]
         placed = FramePose(
-            sensor_frames.odom(drone), sensor_frames.base(drone), message.position_m, message.orientation_wxyz
+            conversions.odom(drone), conversions.base(drone), message.position_m, message.orientation_wxyz
         )
     return convert.transforms(message.t_ns, [placed])
 
@@ -67,13 +125,13 @@ def drone_topics(drone: str, ros: str, sensors: Sensors, types: RosTypes) -> Ite
         types: for messages of our own.
     """
     yield from _sensor_topics(drone, ros, sensors)
-    estimate, status, base = keys.estimate(drone), keys.status(drone), sensor_frames.base(ros)
-    odometry = OdometryTopic(sensor_frames.odom(ros), base)
+    estimate, status, base = keys.estimate(drone), keys.status(drone), conversions.base(ros)
+    odometry = OdometryTopic(conversions.odom(ros), base)
     truth = keys.truth(drone)
     yield Topic(f"/{ros}/odometry", "nav_msgs/msg/Odometry", rmw_zenoh.DEFAULT, (estimate,), odometry.take)
     yield Topic(
         f"/{ros}/ground_truth", "nav_msgs/msg/Odometry", rmw_zenoh.DEFAULT, (truth,),
-        lambda _, m: convert.true_odometry(m, sensor_frames.MAP, base),
+        lambda _, m: convert.true_odometry(m, conversions.MAP, base),
     )  # fmt: skip
     level = EverySecond(partial(convert.battery, frame=base))
     yield Topic(f"/{ros}/battery", "sensor_msgs/msg/BatteryState", rmw_zenoh.DEFAULT, (status,), level.take)
@@ -92,13 +150,13 @@ def _sensor_topics(drone: str, ros: str, sensors: Sensors) -> Iterator[Topic]:
     spread = convert.variance(sonar.range_m, sonar.rate_hz)
 
     def of(name: str, kind: str, sensor: str, make: Callable[[Any, str], Any], frame: str = "") -> Topic:
-        frame = frame or sensor_frames.sensor(ros, sensor)
+        frame = frame or conversions.sensor(ros, sensor)
         key = keys.sensor(drone, sensor)
         return Topic(f"/{ros}/{name}", kind, rmw_zenoh.SENSOR, (key,), lambda _, m: make(m, frame))
 
     yield of("imu", "sensor_msgs/msg/Imu", "imu", lambda m, frame: convert.imu(m, frame, gyro, accel))
     yield of("fix", "sensor_msgs/msg/NavSatFix", "gps", convert.fix)
-    yield of("fix_velocity", "geometry_msgs/msg/TwistStamped", "gps", convert.fix_velocity, sensor_frames.MAP)
+    yield of("fix_velocity", "geometry_msgs/msg/TwistStamped", "gps", convert.fix_velocity, conversions.MAP)
     yield of("mag", "sensor_msgs/msg/MagneticField", "mag", lambda m, frame: convert.mag(m, frame, field))
     yield of("pressure", "sensor_msgs/msg/FluidPressure", "baro", convert.pressure)
     yield of("range", "sensor_msgs/msg/Range", "sonar", lambda m, f: convert.sonar_range(m, f, sonar, spread))
@@ -110,11 +168,11 @@ def cluster_topics(cluster: str, ros: str, types: RosTypes) -> Iterator[Topic]:
     kind = types.message_class("zsim_msgs/msg/ClusterState")
     yield Topic(
         f"/cluster/{ros}/state", "zsim_msgs/msg/ClusterState", rmw_zenoh.DEFAULT, source,
-        lambda _, m: convert.cluster_state(kind, m, sensor_frames.MAP),
+        lambda _, m: convert.cluster_state(kind, m, conversions.MAP),
     )  # fmt: skip
     yield Topic(
         f"/cluster/{ros}/pose", "geometry_msgs/msg/PoseStamped", rmw_zenoh.DEFAULT, source,
-        lambda _, m: convert.pose_stamped(m.t_ns, convert.cluster_pose(m, sensor_frames.MAP, ros)),
+        lambda _, m: convert.pose_stamped(m.t_ns, convert.cluster_pose(m, conversions.MAP, ros)),
     )  # fmt: skip
 
 
@@ -132,7 +190,7 @@ class OdometryTopic:
         if before is None or dt_ns <= 0:
             rate = (0.0, 0.0, 0.0)
         else:
-            rate = sensor_frames.mean_rate(before.orientation_wxyz, message.orientation_wxyz, dt_ns / convert.SECOND_NS)
+            rate = conversions.mean_rate(before.orientation_wxyz, message.orientation_wxyz, dt_ns / convert.SECOND_NS)
         return convert.odometry(message, self._frame, self._child, rate)
 
 

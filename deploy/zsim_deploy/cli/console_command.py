@@ -40,7 +40,7 @@ def console(
     check()
     from zsim.runtime.progress import Teller
     from zsim_bridges.console.console_server import Console
-    from zsim_bridges.console.http.http_proxy import ListenAddress
+    from zsim_bridges.console.http_proxy import ListenAddress
     from zsim_deploy.roles.priority import give_way
     from zsim_deploy.roles.roles import speaker
     from zsim_deploy.roles.service_loop import named, visit

@@ -34,7 +34,7 @@ def gateway(
 ) -> None:
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
     from zsim.transport.connection import find_world
-    from zsim_bridges.gateway.gateway_server import GatewayPorts, Gateway
+    from zsim_bridges.gateway.gateway_server import Gateway, GatewayPorts
     from zsim_deploy.roles.priority import give_way
     from zsim_deploy.roles.roles import speaker
     from zsim_deploy.roles.service_loop import named, visit

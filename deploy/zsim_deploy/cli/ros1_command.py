@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from zsim_bridges.ros1.wire.master_uri import DEFAULT_MASTER, own_address
+from zsim_bridges.ros1.master_api import DEFAULT_MASTER, own_address
 from zsim_deploy.options.reach import Reach, takes_part
 
 PANEL = "Others come in"

@@ -56,7 +56,7 @@ def _write_package(folder: Path) -> None:
         RunError: the folder cannot be written.
     """
     from zsim.errors import RunError
-    from zsim_bridges.ros2.definitions import PACKAGE
+    from zsim_bridges.ros2.ros_types import PACKAGE
 
     try:
         for name, text in PACKAGE.items():

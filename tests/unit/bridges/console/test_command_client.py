@@ -9,7 +9,14 @@ import pytest
 
 from zsim.contract.messages import ControlAnswer
 from zsim.errors import SessionError
-from zsim_bridges.console.command_client import THREADS_PER_POOL, OVERTAKEN, PRIORITY, PRIORITY_EMERGENCY, CommandClient, RequestOutcome
+from zsim_bridges.console.command_client import (
+    OVERTAKEN,
+    PRIORITY,
+    PRIORITY_EMERGENCY,
+    THREADS_PER_POOL,
+    CommandClient,
+    RequestOutcome,
+)
 
 PATIENCE_S = 10.0
 
@@ -51,10 +58,10 @@ class Link:
         self.said.append((key, message))
 
 
-class Eyes:
+class FakeViewBuffer:
     """Hears at once that a command was taken."""
 
-    def answered(self, drone: str) -> int:
+    def answered_commands(self, drone: str) -> int:
         return 0
 
     def await_answer(self, drone: str, beyond: int, within_s: float) -> None:
@@ -67,7 +74,7 @@ class Table:
     def __init__(self) -> None:
         self.link = Link()
         self.told: SimpleQueue[RequestOutcome] = SimpleQueue()
-        self.eyes = Eyes()
+        self.eyes = FakeViewBuffer()
         self.desk = CommandClient(self.link, "console.1", self.eyes, lambda: 7, self.told.put)  # type: ignore[arg-type]
 
 

@@ -17,15 +17,29 @@ from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.cluster_space import cluster_space
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import html_tables
-from zsim_bridges.console.forms import form_input
-from zsim_bridges.console.forms.controls import PageControls
-from zsim_bridges.console.forms.slider_limits import primary_variables, slider_ranges
-from zsim_bridges.console.http.http_proxy import ListenAddress
-from zsim_bridges.console.http.page_rights import OPERATOR, VIEWER, PageRequest, Camera, PageTokens, is_permitted
-from zsim_bridges.console.scene import picture as pic
-from zsim_bridges.console.scene.trails import SPACING_M, POINTS_OF_ONE, DroneTrails
-from zsim_bridges.console.scene.variable_history import INTERVAL_S, POINTS_MAX, SPAN_S, VariableHistory
-from zsim_bridges.console.sensor_rates import SensorRates
+from zsim_bridges.console.http_proxy import ListenAddress
+from zsim_bridges.console.page import operator_input
+from zsim_bridges.console.page import picture as pic
+from zsim_bridges.console.page.operator_input import primary_variables, slider_ranges
+from zsim_bridges.console.page.picture import (
+    HISTORY_POINTS_MAX,
+    INTERVAL_S,
+    POINTS_OF_ONE,
+    SPACING_M,
+    SPAN_S,
+    DroneTrails,
+    VariableHistory,
+)
+from zsim_bridges.console.page_rights import (
+    OPERATOR,
+    VIEWER,
+    Camera,
+    PageControls,
+    PageRequest,
+    PageTokens,
+    is_permitted,
+)
+from zsim_bridges.console.table_rows import SensorRates
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -183,11 +197,11 @@ def test_many_trails_are_short():
 
 def test_curves_keep_the_last_minutes():
     history = VariableHistory(2)
-    for k in range(POINTS_MAX + 10):
+    for k in range(HISTORY_POINTS_MAX + 10):
         assert history.add(k * INTERVAL_S, (1.0, 0.0), (2.0, 0.0), np.array([3.0, 0.0]))
-    assert not history.add((POINTS_MAX + 9.5) * INTERVAL_S, (1.0, 0.0), (2.0, 0.0), None)
+    assert not history.add((HISTORY_POINTS_MAX + 9.5) * INTERVAL_S, (1.0, 0.0), (2.0, 0.0), None)
     t, desired, estimated, true = history.curves(0, angular=False)
-    assert len(t) == POINTS_MAX
+    assert len(t) == HISTORY_POINTS_MAX
     assert (desired[-1], estimated[-1], true[-1]) == (1.0, 2.0, 3.0)
     history.add(0.0, (1.0, 0.0), (2.0, 0.0), None)
     t, _, _, true = history.curves(0, angular=False)
@@ -289,26 +303,26 @@ def test_of_many_variables_those_of_the_whole_are_shown():
 
 def test_expressions_are_read_with_their_constants():
     text = "# a circle\nx_c = R*cos(0.1*t)\n\ny_c = R*sin(0.1*t)\nR = 5"
-    assert form_input.parse_expressions(text, ("x_c", "y_c")) == {
+    assert operator_input.parse_expressions(text, ("x_c", "y_c")) == {
         "expressions": {"x_c": "R*cos(0.1*t)", "y_c": "R*sin(0.1*t)"},
         "constants": {"R": 5.0},
     }
 
 
 def test_waypoints_are_read():
-    assert form_input.parse_waypoints("0: x_c = 1, p=4\n20.5: x_c=2") == {
+    assert operator_input.parse_waypoints("0: x_c = 1, p=4\n20.5: x_c=2") == {
         "waypoints": [{"at_s": 0.0, "values": {"x_c": 1.0, "p": 4.0}}, {"at_s": 20.5, "values": {"x_c": 2.0}}]
     }
 
 
 def test_parameters_are_read():
     names = ("rotor", "value", "velocity_m_s")
-    assert form_input.parse_parameters("rotor: all, value: 1e3, velocity_m_s: [1, 2, 3]", names) == {
+    assert operator_input.parse_parameters("rotor: all, value: 1e3, velocity_m_s: [1, 2, 3]", names) == {
         "rotor": "all",
         "value": 1000.0,
         "velocity_m_s": [1, 2, 3],
     }
-    assert form_input.parse_parameters("", names) == {}
+    assert operator_input.parse_parameters("", names) == {}
 
 
 @pytest.mark.parametrize(
@@ -321,14 +335,14 @@ def test_parameters_are_read():
     ],
 )
 def test_an_expression_that_is_none_is_refused_in_words(text: str, said: str):
-    with pytest.raises(form_input.InputError, match=said):
-        form_input.parse_expressions(text, ("x_c",))
+    with pytest.raises(operator_input.InputError, match=said):
+        operator_input.parse_expressions(text, ("x_c",))
 
 
 @pytest.mark.parametrize("text", ["x_c = 1", "0 x_c=1", "0: 5", "a: x_c = 1", ""])
 def test_a_waypoint_that_is_none_is_refused_in_words(text: str):
-    with pytest.raises(form_input.InputError, match=r"must (be|have)"):
-        form_input.parse_waypoints(text)
+    with pytest.raises(operator_input.InputError, match=r"must (be|have)"):
+        operator_input.parse_waypoints(text)
 
 
 @pytest.mark.parametrize(
@@ -346,13 +360,13 @@ def test_a_waypoint_that_is_none_is_refused_in_words(text: str):
     ids=lambda text: text[:20],
 )
 def test_parameters_that_are_none_are_refused_in_words(text: str):
-    with pytest.raises(form_input.InputError, match="must be NAME: VALUE"):
-        form_input.parse_parameters(text, ("value",))
+    with pytest.raises(operator_input.InputError, match="must be NAME: VALUE"):
+        operator_input.parse_parameters(text, ("value",))
 
 
 def test_a_parameter_that_is_not_known_is_refused_by_its_name():
-    with pytest.raises(form_input.InputError, match="'target' is not known, allowed: at_s, value"):
-        form_input.parse_parameters("value: 2, target: drone2", ("at_s", "value"))
+    with pytest.raises(operator_input.InputError, match="'target' is not known, allowed: at_s, value"):
+        operator_input.parse_parameters("value: 2, target: drone2", ("at_s", "value"))
 
 
 # Who may pass

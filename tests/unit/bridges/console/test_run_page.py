@@ -13,11 +13,11 @@ from zsim.contract.messages import ControlAnswer, DroneView, EstimateView, Event
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
-from zsim_bridges.console.http.private_viser import PrivateViser
+from zsim_bridges.console.console_server import PrivateViser
+from zsim_bridges.console.page import scene_nodes as stages
+from zsim_bridges.console.page.picture import drone_poses
+from zsim_bridges.console.page.scene_nodes import CameraFollow
 from zsim_bridges.console.run_page import RunPage, picture_rate_hz
-from zsim_bridges.console.scene import scene_nodes as stages
-from zsim_bridges.console.scene.camera_follow import CameraFollow
-from zsim_bridges.console.scene.picture import drone_poses
 from zsim_bridges.console.time_monitor import TimeMonitor
 
 STEP = Path(__file__).parents[4] / "scenarios" / "step.yaml"
@@ -70,14 +70,14 @@ class Seen:
     def __init__(self, server: Any, watched: bool) -> None:
         self.link: Any = Link()
         health = SimpleNamespace(received=0, refused=0)
-        self.presence: Any = SimpleNamespace(
-            name="console.1", now_ns=0, over="", health=health, heed=lambda _: None, tick=lambda: None
+        self.observer: Any = SimpleNamespace(
+            name="console.1", now_ns=0, end_reason="", health=health, update_clock=lambda _: None, tick=lambda: None
         )
         drones = [SimpleNamespace(name=name) for name in NAMES]
         scenario = STEP.read_text()
         info: Any = SimpleNamespace(run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario)
         server.get_clients = lambda: {0: None} if watched else {}
-        self.show = RunPage(server, self.link, info, self.presence, CameraFollow(server), 1000.0)
+        self.show = RunPage(server, self.link, info, self.observer, CameraFollow(server), 1000.0)
 
     def draw(self, *said: tuple[str, Any]) -> dict[str, Any]:
         """Say something, draw a picture, and return what is shown."""
@@ -169,7 +169,7 @@ def test_views_of_another_controller_are_left_out(seen: Seen):
     fewer = SPACE.names[:-1]
     state = seen.draw(drones(*NAMES), cluster(names=fewer), cluster("strange"))
     assert state["clusters"] == []
-    assert seen.presence.health.refused == 2
+    assert seen.observer.health.refused == 2
     assert [each["name"] for each in seen.draw(cluster())["clusters"]] == [CLUSTER]
 
 
@@ -213,7 +213,7 @@ def test_what_the_world_refuses_of_the_console_s_commands_is_shown_in_the_corner
         event = Event(0, 0, "refused", source, subject, f"{subject}: {reason}", {"reason": reason})
         seen.link.tell(SimpleNamespace(key=keys.EVENT, payload=messages.encode(event)))
     assert shown == [(f"Refused: {subject}", reason)]
-    assert [event.kind for event in seen.show.eyes.events] == ["refused", "refused"]
+    assert [event.kind for event in seen.show.views.events] == ["refused", "refused"]
 
 
 def test_a_world_that_is_gone_is_told_on_the_page(seen: Seen, monkeypatch: pytest.MonkeyPatch):
@@ -315,7 +315,11 @@ def test_cameras_follow_where_their_page_says_so():
 
 def test_what_formations_were_asked_for_is_among_the_events_and_refusals_on_every_page(seen: Seen):
     seen.show._server.get_clients = dict  # type: ignore[assignment]  # nobody looks
-    for told in (RequestOutcome("main: takeoff", ""), RequestOutcome("rate value 2", ""), RequestOutcome("main: engage", "not yet")):
+    for told in (
+        RequestOutcome("main: takeoff", ""),
+        RequestOutcome("rate value 2", ""),
+        RequestOutcome("main: engage", "not yet"),
+    ):
         seen.show._on_outcome(told)
-    found = [(event.kind, event.text) for event in seen.show.eyes.events]
+    found = [(event.kind, event.text) for event in seen.show.views.events]
     assert found == [("refused", "main: engage: not yet"), ("control", "main: takeoff: done")]

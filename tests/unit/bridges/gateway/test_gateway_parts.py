@@ -17,20 +17,16 @@ from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin, St
 from zsim.errors import DecodeError, NoWorldError
 from zsim.transport.session import Heard
 from zsim_bridges.gateway import last_values as values_module
-from zsim_bridges.gateway.client_limits import TokenBucket, ConnectionLimit
-from zsim_bridges.gateway.echo_filter import EchoFilter
-from zsim_bridges.gateway.http.http_errors import TooManyError
-from zsim_bridges.gateway.http.json_tree import methods_of
-from zsim_bridges.gateway.http.openapi import description
-from zsim_bridges.gateway.http.zenoh_rest import described_sample
-from zsim_bridges.gateway.key_policy import is_control_key, is_reserved
-from zsim_bridges.gateway.last_values import LastValues
-from zsim_bridges.gateway.lines import stream_requests
-from zsim_bridges.gateway.lines.outbox import Outbox
-from zsim_bridges.gateway.lines.stream_client import Client
-from zsim_bridges.gateway.lockstep_agent import LockstepAgent, gate_keys_of
-from zsim_bridges.gateway.message_defaults import MessageDefaults
-from zsim_bridges.gateway.transcoding import json_value, payload_to_json, json_to_payload, value_line
+from zsim_bridges.gateway import stream_requests
+from zsim_bridges.gateway.access_check import ConnectionLimit, TokenBucket
+from zsim_bridges.gateway.client_streams import Outbox
+from zsim_bridges.gateway.http_routes import description
+from zsim_bridges.gateway.http_trees import described_sample, methods_of
+from zsim_bridges.gateway.key_policy import MessageDefaults, TooManyError, is_control_key, is_reserved
+from zsim_bridges.gateway.last_values import EchoFilter, LastValues
+from zsim_bridges.gateway.lockstep_session import LockstepAgent, gate_keys_of
+from zsim_bridges.gateway.stream_client import Client
+from zsim_bridges.gateway.transcoding import json_to_payload, json_value, payload_to_json, value_line
 
 VELOCITY = "drone/drone1/cmd/velocity"
 GATE_NS = 20_000_000
@@ -97,22 +93,22 @@ def test_a_deleted_key_has_the_value_null():
 
 
 def test_time_number_and_source_are_filled_in_where_they_are_left_out():
-    stamps = MessageDefaults("client.a")
-    first = stamps.fill(VELOCITY, {"velocity_m_s": [0, 0, 0]}, 40)
+    defaults = MessageDefaults("client.a")
+    first = defaults.fill(VELOCITY, {"velocity_m_s": [0, 0, 0]}, 40)
     assert first == {"t_ns": 40, "seq": 0, "source": "client.a", "velocity_m_s": [0, 0, 0]}
-    assert stamps.fill(VELOCITY, {"seq": 7, "source": "b"}, 40) == {"t_ns": 40, "seq": 7, "source": "b"}
-    assert stamps.fill(VELOCITY, {"seq": 2**63 - 1}, 40)["seq"] == 2**63 - 1
-    assert stamps.fill(VELOCITY, {}, 60)["seq"] == 1  # one's own count goes on
-    assert stamps.fill("drone/drone1/cmd/mode", {}, 60)["seq"] == 0
-    assert stamps.fill("my/key", {}, 60) == {}
-    assert stamps.fill(VELOCITY, [1], 60) == [1]
+    assert defaults.fill(VELOCITY, {"seq": 7, "source": "b"}, 40) == {"t_ns": 40, "seq": 7, "source": "b"}
+    assert defaults.fill(VELOCITY, {"seq": 2**63 - 1}, 40)["seq"] == 2**63 - 1
+    assert defaults.fill(VELOCITY, {}, 60)["seq"] == 1  # one's own count goes on
+    assert defaults.fill("drone/drone1/cmd/mode", {}, 60)["seq"] == 0
+    assert defaults.fill("my/key", {}, 60) == {}
+    assert defaults.fill(VELOCITY, [1], 60) == [1]
 
 
 def test_what_is_refused_takes_no_number():
-    stamps = MessageDefaults("a")
-    with suppress(ZeroDivisionError), stamps.transaction():
-        stamps.fill(VELOCITY, {}, 1 // 0 if stamps.fill(VELOCITY, {}, 0) else 0)
-    assert stamps.fill(VELOCITY, {}, 0)["seq"] == 0
+    defaults = MessageDefaults("a")
+    with suppress(ZeroDivisionError), defaults.transaction():
+        defaults.fill(VELOCITY, {}, 1 // 0 if defaults.fill(VELOCITY, {}, 0) else 0)
+    assert defaults.fill(VELOCITY, {}, 0)["seq"] == 0
 
 
 # Last values
@@ -279,13 +275,13 @@ def test_a_turnstile_lets_so_many_in():
     turnstile.enter()
 
 
-class House:
+class FakeGateway:
     """Of one client, without a run."""
 
     def __init__(self) -> None:
         self.reported: list[str] = []
 
-    def flight(self) -> Any:
+    def run(self) -> Any:
         raise NoWorldError("there is no run now")
 
     name = "gateway.main"
@@ -297,7 +293,7 @@ class House:
 def test_a_client_that_floods_is_slowed_down_and_told():
     async def flood() -> list[bytes]:
         outbox = Outbox(pytest.fail, lambda lost: b"")
-        client = Client(House(), outbox, "client.a", True, TokenBucket(1.0, 3.0, lambda: 0.0))  # type: ignore[arg-type]
+        client = Client(FakeGateway(), outbox, "client.a", True, TokenBucket(1.0, 3.0, lambda: 0.0))  # type: ignore[arg-type]
         for _ in range(4):
             await client.handle_line(b'{"op": "hello"}')
         return await outbox.take()
@@ -308,23 +304,23 @@ def test_a_client_that_floods_is_slowed_down_and_told():
 
 
 def test_a_fault_of_ours_is_an_answer_and_a_line_for_a_person():
-    async def ask(house: House) -> list[bytes]:
+    async def ask(gateway: FakeGateway) -> list[bytes]:
         outbox = Outbox(pytest.fail, lambda lost: b"")
-        client = Client(house, outbox, "client.a", True, TokenBucket(1.0, 3.0, lambda: 0.0))  # type: ignore[arg-type]
-        await client.handle_line(b'{"op": "subscribe", "key": "a"}')  # this house has no feed
+        client = Client(gateway, outbox, "client.a", True, TokenBucket(1.0, 3.0, lambda: 0.0))  # type: ignore[arg-type]
+        await client.handle_line(b'{"op": "subscribe", "key": "a"}')  # this gateway has no feed
         return await outbox.take()
 
-    house = House()
-    (line,) = asyncio.run(ask(house))
+    gateway = FakeGateway()
+    (line,) = asyncio.run(ask(gateway))
     assert json.loads(line)["error"].startswith("the gateway failed (AttributeError)")
-    assert house.reported[0].startswith("client.a: b")
+    assert gateway.reported[0].startswith("client.a: b")
 
 
 def test_a_full_outbox_loses_the_oldest_values_and_says_so():
     async def fill() -> list[bytes]:
         outbox = Outbox(pytest.fail, lambda lost: b"lost %d\n" % lost, bytes_max=10)
         for number in range(5):
-            outbox.put(b"abc%d" % number, may_go=True)
+            outbox.put(b"abc%d" % number, droppable=True)
         return await outbox.take()
 
     assert asyncio.run(fill()) == [b"lost 3\n", b"abc3", b"abc4"]
@@ -356,9 +352,9 @@ def seat(**given: Any) -> LockstepAgent:
         "reads": ["drone/*/estimate"],
         "gates": (),
         "now_ns": lambda: 0,
-        "served": SERVED,
+        "required": SERVED,
     }
-    made = LockstepAgent(**{**values, **given}, hand_over=lambda t_ns, inputs: handed.append((t_ns, inputs)))
+    made = LockstepAgent(**{**values, **given}, send_inputs=lambda t_ns, inputs: handed.append((t_ns, inputs)))
     made.handed = handed  # type: ignore[attr-defined]
     return made
 
@@ -367,14 +363,18 @@ def test_what_closes_the_gates_of_a_seat_comes_at_every_gate_and_is_not_its_own(
     estimates = ("drone/drone1/estimate", "drone/drone2/estimate")
     assert gate_keys_of(info(), ["drone/*/estimate"], "matlab.main", SERVED) == estimates
     assert (
-        gate_keys_of(info(), ["drone/*/estimate"], "mine.drone1", {("mine.drone1", "drone1"), *SERVED[1:]}) == estimates[1:]
+        gate_keys_of(info(), ["drone/*/estimate"], "mine.drone1", {("mine.drone1", "drone1"), *SERVED[1:]})
+        == estimates[1:]
     )
     assert gate_keys_of(info(), ["cluster/*/state", "view/drones"], "matlab.main", SERVED) == ("clock",)
     assert gate_keys_of(info(), ["cluster/*/state"], "eye.one", SERVED) == ("cluster/main/state",)
     assert gate_keys_of(info(), [], "eye.one", SERVED) == ("clock",)
     truths = ("drone/drone1/truth", "drone/drone2/truth")
     statuses = ("drone/drone1/sensor/status", "drone/drone2/sensor/status")
-    assert set(gate_keys_of(info(), ["**"], "eye.one", ())) == {*truths, *statuses}  # nobody estimates: nothing to wait for
+    assert set(gate_keys_of(info(), ["**"], "eye.one", ())) == {
+        *truths,
+        *statuses,
+    }  # nobody estimates: nothing to wait for
 
 
 def test_a_seat_reads_what_closes_its_gates_and_counts_the_sensors_that_it_takes():

@@ -17,11 +17,11 @@ from zsim.scenario.scenario import Scenario
 from zsim.transport.session import Sample
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import intake as intake_module
+from zsim_bridges.ros1 import tcpros
 from zsim_bridges.ros1.bridge import Bridge, check_names
 from zsim_bridges.ros1.drone_topics import DroneTopics
 from zsim_bridges.ros1.intake import Intake
-from zsim_bridges.ros1.wire import message_types
-from zsim_bridges.ros1.wire.node import Ros1Node
+from zsim_bridges.ros1.node import Ros1Node
 
 GATE_NS = 20_000_000
 SCENARIO = """
@@ -47,7 +47,7 @@ class Ear:
         published.links.append(cast(Any, self))
 
     def put(self, framed: bytes) -> None:
-        self.heard.append(message_types.deserialize(self._kind, framed[4:]))
+        self.heard.append(tcpros.deserialize(self._kind, framed[4:]))
 
 
 class Drone:
@@ -121,7 +121,7 @@ def test_truth_is_on_ground_truth_alone():
 def test_a_take_off_that_a_node_publishes_is_sent_to_the_drone():
     drone = Drone()
     drone.hear(status(GATE_NS))
-    drone.node._subscribed["/quad_1/ardrone/takeoff"]._callback(message_types.message_class("std_msgs/Empty")())
+    drone.node._subscribed["/quad_1/ardrone/takeoff"]._callback(tcpros.message_class("std_msgs/Empty")())
     ((key, said),) = drone.sent
     assert key == "drone/quad-1/cmd/mode"
     assert (said.mode, said.source, said.t_ns) == ("takeoff", "ros1.main", GATE_NS)
@@ -140,9 +140,9 @@ def test_numbers_beyond_the_fields_of_ros_are_refused_and_told_once_and_the_next
         0, 0, 1, "run", "zsim", "lockstep", 0.0, GATE_NS, 5_000_000, GATE_NS, 1, messages.Origin(0.0, 0.0, 0.0),
         (messages.DroneInfo("quad-1", "ardrone2"),), (), scenario_file.to_text(scenario()), "", "", "",
     )  # fmt: skip
-    presence = ObserverProcess(cast(Any, FakeLink()), info, "ros1.main")
+    observer = ObserverProcess(cast(Any, FakeLink()), info, "ros1.main")
     node = Ros1Node("/zsim", "http://127.0.0.1:1", "127.0.0.1", said.append)
-    bridge = Bridge(cast(Any, FakeLink()), info, presence, node, said.append)
+    bridge = Bridge(cast(Any, FakeLink()), info, observer, node, said.append)
     navdata = Ear(node, "/quad_1/ardrone/navdata")
 
     def gate(n: int, range_m: float) -> None:
@@ -156,7 +156,7 @@ def test_numbers_beyond_the_fields_of_ros_are_refused_and_told_once_and_the_next
     bridge.forward(keys.status("quad-1"), b"garbage")
     gate(3, 1.5)
     assert [message.altd for message in navdata.heard] == [1500]
-    assert presence.health.refused == 3
+    assert observer.health.refused == 3
     assert len(said) == 1
     assert "drone/quad-1/sensor/status" in said[0]
 

@@ -8,10 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from zsim.contract import messages
-from zsim_bridges.ros1 import conversions
+from zsim_bridges.ros1 import conversions, tcpros
 from zsim_bridges.ros1.conversions import DriverFrames
 from zsim_bridges.ros1.onboard import OnboardState
-from zsim_bridges.ros1.wire import message_types
 
 T_NS = 61_040_000_000
 FRAMES = DriverFrames("drone1")
@@ -46,7 +45,7 @@ def navdata(state: Any = "hovering", **angles: float) -> Any:
     """Navdata as a node reads it, bytes in between."""
     made = conversions.navdata(3, aircraft(state, **angles), FRAMES)
     kind = "ardrone_autonomy/Navdata"
-    return message_types.deserialize(kind, message_types.serialize(kind, made))
+    return tcpros.deserialize(kind, tcpros.serialize(kind, made))
 
 
 def test_navdata_has_the_units_of_the_driver():
@@ -90,7 +89,7 @@ def test_an_aircraft_that_has_said_little_has_navdata_too():
     own.update(messages.Status(0, 0, "landed", 100.0, False, None, 1))
     said = conversions.navdata(0, own, FRAMES)
     assert (said.altd, said.vx, said.pressure, said.az) == (0, 0.0, 0, 0.0)
-    message_types.serialize("ardrone_autonomy/Navdata", said)
+    tcpros.serialize("ardrone_autonomy/Navdata", said)
 
 
 def test_an_imu_tells_specific_force_rate_and_attitude():
@@ -100,7 +99,7 @@ def test_an_imu_tells_specific_force_rate_and_attitude():
     assert said.linear_acceleration.z == pytest.approx(9.80665)
     assert (said.angular_velocity.x, said.angular_velocity.y, said.angular_velocity.z) == (0.1, 0.2, 0.3)
     assert (said.orientation.w, said.orientation.z) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
-    assert message_types.serialize("sensor_msgs/Imu", said)
+    assert tcpros.serialize("sensor_msgs/Imu", said)
 
 
 def test_the_magnetic_field_is_a_direction():
@@ -125,7 +124,7 @@ def test_a_fix_is_where_and_how_well():
     assert (said.latitude, said.longitude, said.altitude) == (-34.6, -58.4, 31.0)
     assert said.status.status == 0
     assert said.position_covariance.tolist() == [4.0, 0, 0, 0, 4.0, 0, 0, 0, 4.0]
-    assert message_types.serialize("sensor_msgs/NavSatFix", said)
+    assert tcpros.serialize("sensor_msgs/NavSatFix", said)
 
 
 def test_no_fix_is_said():
@@ -137,7 +136,7 @@ def test_odometry_is_the_aircraft_s_own():
     assert (said.header.frame_id, said.child_frame_id) == ("drone1/odom", "drone1/ardrone_base_link")
     assert said.pose.pose.position.z == pytest.approx(1.234)
     assert (said.twist.twist.linear.x, said.twist.twist.linear.y) == (1.0, 0.25)
-    assert message_types.serialize("nav_msgs/Odometry", said)
+    assert tcpros.serialize("nav_msgs/Odometry", said)
 
 
 def test_ground_truth_is_in_the_world():
@@ -160,7 +159,7 @@ def test_transforms_lead_from_the_world_to_where_the_estimator_believes_it_to_be
     assert (to_base.header.frame_id, to_base.child_frame_id) == ("drone1/odom", "drone1/ardrone_base_link")
     place = [[getattr(t.transform.translation, axis) for axis in "xyz"] for t in (to_odom, to_base)]
     assert np.sum(place, axis=0) == pytest.approx([5.0, 6.0, 7.0])
-    assert message_types.serialize("tf2_msgs/TFMessage", conversions.transforms(0, own, FRAMES))
+    assert tcpros.serialize("tf2_msgs/TFMessage", conversions.transforms(0, own, FRAMES))
 
 
 def test_transforms_without_an_estimator_end_at_odom():

@@ -6,15 +6,15 @@ from typing import Any
 import pytest
 
 from zsim.contract import messages
-from zsim_bridges.ros1.pilot import REPEAT_NS, DriverCommands, TiltCommand, tilt_of
-from zsim_bridges.ros1.wire import message_types
+from zsim_bridges.ros1 import tcpros
+from zsim_bridges.ros1.drone_topics import REPEAT_NS, DriverCommands, TiltCommand, tilt_of
 
 GATE_NS = 20_000_000
-Vector3 = message_types.message_class("geometry_msgs/Vector3")
+Vector3 = tcpros.message_class("geometry_msgs/Vector3")
 
 
 def twist(*, x: float = 0.0, y: float = 0.0, z: float = 0.0, wx: float = 0.0, wy: float = 0.0, wz: float = 0.0) -> Any:
-    return message_types.message_class("geometry_msgs/Twist")(linear=Vector3(x, y, z), angular=Vector3(wx, wy, wz))
+    return tcpros.message_class("geometry_msgs/Twist")(linear=Vector3(x, y, z), angular=Vector3(wx, wy, wz))
 
 
 def status(state: Any, gate: int) -> messages.Status:

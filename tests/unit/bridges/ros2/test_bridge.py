@@ -15,11 +15,10 @@ from zsim.transport.zenoh_settings import Mode
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import rmw_zenoh
 from zsim_bridges.ros2.bridge import Bridge
-from zsim_bridges.ros2.callback_queue import CallbackQueue
-from zsim_bridges.ros2.participant import RosContext
 from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId
+from zsim_bridges.ros2.ros_context import RosContext
 from zsim_bridges.ros2.ros_types import RosTypes
-from zsim_bridges.ros2.source_keys import SAMPLES_MAX
+from zsim_bridges.ros2.source_keys import SAMPLES_MAX, CallbackQueue
 
 TYPES = RosTypes()
 READER = NodeId(0, "abc", 1, "/", "reader")
@@ -133,8 +132,8 @@ class Bench:
         )  # fmt: skip
         self.link: Any = Link()
         self.lines: list[str] = []
-        self.presence = ObserverProcess(self.link, self.info, "ros2.main")
-        self.bridge = Bridge(self.link, self.info, self.presence, self.lines.append, wall_ns)
+        self.observer = ObserverProcess(self.link, self.info, "ros2.main")
+        self.bridge = Bridge(self.link, self.info, self.observer, self.lines.append, wall_ns)
         self.bridge.advertise_run(RosContext(self.link, 0, TYPES, wall_ns, self.bridge.count_refused))
 
     def turn(self) -> None:
@@ -250,7 +249,7 @@ def test_modes_and_the_emergency_button() -> None:
         ("emergency", 2),
         ("reset", 3),
     ]
-    assert bench.presence.health.refused == 1
+    assert bench.observer.health.refused == 1
 
 
 @pytest.mark.parametrize(
@@ -268,7 +267,7 @@ def test_garbage_is_refused_counted_and_told_once(message: Any, attachment: byte
     for _ in range(3):
         bench.publish("/drone_1/cmd_vel", TWIST, message, attachment)
     assert bench.link.said == []
-    assert bench.presence.health.refused == 3
+    assert bench.observer.health.refused == 3
     told = [line for line in bench.lines if "refused" in line]
     assert len(told) == 1
     assert why in told[0]
@@ -282,7 +281,7 @@ def test_what_does_not_fit_a_ros_type_is_refused() -> None:
     bench.link.deliver(key, b"garbage")
     bench.turn()
     assert bench.link.sent == []
-    assert bench.presence.health.refused == 2
+    assert bench.observer.health.refused == 2
 
 
 def test_a_service_asks_the_controller_and_echoes_who_asked() -> None:
@@ -302,7 +301,7 @@ def test_a_request_that_is_none_ends_without_a_reply() -> None:
         assert query.ended
         assert query.replies == []
     assert bench.link.asked == []
-    assert bench.presence.health.refused == 2
+    assert bench.observer.health.refused == 2
 
 
 def test_a_summary_of_a_gate_has_what_was_told_up_to_it() -> None:
@@ -359,4 +358,4 @@ def test_what_is_dropped_is_told_in_health(mode: Mode) -> None:
         bench.link.deliver(estimate, b"estimate")
     bench.turn()
     assert len(bench.link.sent) == SAMPLES_MAX
-    assert bench.presence.health.dropped == 20
+    assert bench.observer.health.dropped == 20

@@ -13,9 +13,9 @@ from zsim.contract.messages import Quaternion, Vector3
 from zsim.math.frames import quaternion_from_rpy, rotate
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import ErrorModel, Mount, Sensors
-from zsim_bridges.ros2 import conversions, rmw_zenoh, sensor_frames, topics
-from zsim_bridges.ros2.navdata import NavdataSummary
+from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
 from zsim_bridges.ros2.ros_types import RosTypes
+from zsim_bridges.ros2.topics import NavdataSummary
 
 TYPES = RosTypes()
 SENSORS = scenario_file.from_text(ONE).drones[0].sensors
@@ -126,7 +126,7 @@ def test_odometry_turns_as_its_attitudes_do(rate: Vector3) -> None:
     angle = math.hypot(*half)
     first = quaternion(0.1, -0.2, 3.0)
     turn = [math.cos(angle), *(math.sin(angle) / angle * each if angle else 0.0 for each in half)]
-    second = sensor_frames.quaternion_multiply(first, turn)
+    second = conversions.quaternion_multiply(first, turn)
     maker.take("", estimate(T_NS, first))
     for q in (second, -second):
         maker.take("", estimate(T_NS, first))
@@ -136,14 +136,14 @@ def test_odometry_turns_as_its_attitudes_do(rate: Vector3) -> None:
 
 def test_into_body_is_the_inverse_of_the_frames_rotation() -> None:
     q = quaternion(0.3, -0.4, 2.0)
-    assert rotate(q, sensor_frames.into_body(q, (1.0, 2.0, 3.0))) == pytest.approx([1.0, 2.0, 3.0])
+    assert rotate(q, conversions.into_body(q, (1.0, 2.0, 3.0))) == pytest.approx([1.0, 2.0, 3.0])
 
 
 def test_sonar_frame_looks_along_the_beam_of_a_turned_mount() -> None:
     """ROS's range finders look along x; this sonar is tilted by 30 deg about y, its beam from down to the front."""
     mount = Mount(position_m=(0.1, 0.0, -0.02), rpy_deg=(0.0, -30.0, 0.0))
     spec = _with_sonar(mount)
-    placed = {pose.child: pose for pose in sensor_frames.static_frames("drone1", spec)}
+    placed = {pose.child: pose for pose in conversions.static_frames("drone1", spec)}
     sonar = placed["drone1/sonar_link"]
     assert sonar.position_m == (0.1, 0.0, -0.02)
     beam = rotate(sonar.orientation_wxyz, (1.0, 0.0, 0.0))

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zsim_bridges.ros2 import rmw_zenoh
-from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId, Qos
-from zsim_bridges.ros2.ros_names import ros_name, ros_names
+from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId, Qos, ros_name, ros_names
 
 ZID = "f4b2a1c09d8e7f60"
 TF_HASH = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"

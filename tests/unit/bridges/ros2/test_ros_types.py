@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsim_bridges.ros2.definitions import MESSAGES
-from zsim_bridges.ros2.ros_types import RosTypes
+from zsim_bridges.ros2.ros_types import MESSAGES, RosTypes
 
 TYPES = RosTypes()
 

@@ -7,8 +7,7 @@ import typer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from zsim.errors import RunError
-from zsim_bridges.ros2.definitions import MESSAGES
-from zsim_bridges.ros2.ros_types import RosTypes
+from zsim_bridges.ros2.ros_types import MESSAGES, RosTypes
 from zsim_deploy.cli.ros2_command import ros2
 
 

@@ -14,12 +14,19 @@ from zsim.scenario.fault_kinds import KINDS
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
-from zsim_bridges.console.console_page import SWITCHES, ConsolePage
-from zsim_bridges.console.forms.fault_form import DURATION_S, GUST_M_S, LOSS_PROBABILITY, WEAK_THRUST_SHARE, FaultForm
-from zsim_bridges.console.forms.formation_form import REST_S, FormationForm
-from zsim_bridges.console.forms.run_form import DroneForm, FleetForm, RunForm
-from zsim_bridges.console.forms.slider_limits import slider_ranges
-from zsim_bridges.console.forms.variable_slider import STILL_S
+from zsim_bridges.console.page.console_page import SWITCHES, ConsolePage
+from zsim_bridges.console.page.formation_form import REST_S, STILL_S, FormationForm
+from zsim_bridges.console.page.operator_input import slider_ranges
+from zsim_bridges.console.page.run_forms import (
+    DURATION_S,
+    GUST_M_S,
+    LOSS_PROBABILITY,
+    WEAK_THRUST_SHARE,
+    DroneForm,
+    FaultForm,
+    FleetForm,
+    RunForm,
+)
 
 SCENARIOS = Path(__file__).parents[5] / "scenarios"
 PERSON, NOBODY = 1, None  # who moved a slider
@@ -128,21 +135,21 @@ class Gui:
         self.at[label].put(None)
 
 
-class Desk:
+class FakeCommandClient:
     """Notes what is asked for."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[Any, ...]] = []
         self.said: list[str] = []
 
-    def world(self, op: str, **args: Any) -> None:
+    def request_world(self, op: str, **args: Any) -> None:
         self.asked.append(("world", op, args))
 
-    def cluster(self, cluster: str, op: str, said: str = "", **args: Any) -> None:
+    def request_cluster(self, cluster: str, op: str, said: str = "", **args: Any) -> None:
         self.said.append(said)
         self.asked.append((cluster, op, args))
 
-    def mode(self, drones: list[str], mode: str) -> None:
+    def send_mode(self, drones: list[str], mode: str) -> None:
         self.asked.append((tuple(drones), mode))
 
 
@@ -151,7 +158,7 @@ class Bench:
 
     def __init__(self, scenario: str = "step") -> None:
         self.gui: Any = Gui()
-        self.desk: Any = Desk()
+        self.desk: Any = FakeCommandClient()
         self.told: list[RequestOutcome] = []
         self.scenario = scenario_file.load(SCENARIOS / f"{scenario}.yaml")
         self.names = tuple(drone.name for drone in self.scenario.drones)
@@ -245,12 +252,23 @@ def mixed() -> Scenario:
         ("GPS lost", {"kind": "gps_dropout", "target": "drone2", "for_s": DURATION_S}),
         (
             "Motor weak",
-            {"kind": "rotor_efficiency", "target": "drone2", "for_s": DURATION_S, "rotor": "front_left", "value": WEAK_THRUST_SHARE},
+            {
+                "kind": "rotor_efficiency",
+                "target": "drone2",
+                "for_s": DURATION_S,
+                "rotor": "front_left",
+                "value": WEAK_THRUST_SHARE,
+            },
         ),
         ("Gust", {"kind": "gust", "target": "world", "for_s": DURATION_S, "velocity_m_s": list(GUST_M_S)}),
         (
             "Link loss",
-            {"kind": "link_loss", "target": "world/estimator.drone2", "for_s": DURATION_S, "probability": LOSS_PROBABILITY},
+            {
+                "kind": "link_loss",
+                "target": "world/estimator.drone2",
+                "for_s": DURATION_S,
+                "probability": LOSS_PROBABILITY,
+            },
         ),
         ("Kill estimator", {"kind": "process_kill", "target": "estimator.drone2"}),
     ],

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsim_bridges.ros1.wire import message_types
+from zsim_bridges.ros1 import tcpros
 
 MD5 = {  # as `rosmsg md5` of Noetic prints them; of Navdata as ardrone_autonomy's generated code has it
     "std_msgs/String": "992ce8a1687cec8c8bd883ec73ca41d1",
@@ -22,33 +22,33 @@ MD5 = {  # as `rosmsg md5` of Noetic prints them; of Navdata as ardrone_autonomy
 
 @pytest.mark.parametrize(("kind", "md5"), MD5.items())
 def test_md5_sums_are_those_of_ros(kind, md5):
-    assert message_types.topic_type("/topic", kind)[2] == md5
+    assert tcpros.topic_type("/topic", kind)[2] == md5
 
 
 def test_a_definition_brings_those_of_its_fields():
-    definition = message_types.topic_type("/topic", "ardrone_autonomy/Navdata").definition
+    definition = tcpros.topic_type("/topic", "ardrone_autonomy/Navdata").definition
     assert "float32 batteryPercent\n" in definition
     assert "MSG: std_msgs/Header" in definition
 
 
 def test_a_twist_is_six_doubles():
-    vector = message_types.message_class("geometry_msgs/Vector3")
-    twist = message_types.message_class("geometry_msgs/Twist")(linear=vector(1.0, 0.0, 0.0), angular=vector(0.0, 0.0, -2.0))
-    data = message_types.serialize("geometry_msgs/Twist", twist)
+    vector = tcpros.message_class("geometry_msgs/Vector3")
+    twist = tcpros.message_class("geometry_msgs/Twist")(linear=vector(1.0, 0.0, 0.0), angular=vector(0.0, 0.0, -2.0))
+    data = tcpros.serialize("geometry_msgs/Twist", twist)
     assert data == bytes.fromhex("000000000000f03f" + "00" * 32 + "00000000000000c0")
-    assert message_types.deserialize("geometry_msgs/Twist", data) == twist
+    assert tcpros.deserialize("geometry_msgs/Twist", data) == twist
 
 
 def test_a_number_that_does_not_go_into_its_field_is_refused():
-    point = message_types.message_class("geometry_msgs/Point32")(x=1e300, y=0.0, z=0.0)
+    point = tcpros.message_class("geometry_msgs/Point32")(x=1e300, y=0.0, z=0.0)
     with pytest.raises(ValueError, match="is no geometry_msgs/Point32"):
-        message_types.serialize("geometry_msgs/Point32", point)
+        tcpros.serialize("geometry_msgs/Point32", point)
 
 
 def test_an_empty_message_has_no_bytes():
-    empty = message_types.message_class("std_msgs/Empty")()
-    assert message_types.serialize("std_msgs/Empty", empty) == b""
-    message_types.deserialize("std_msgs/Empty", b"")
+    empty = tcpros.message_class("std_msgs/Empty")()
+    assert tcpros.serialize("std_msgs/Empty", empty) == b""
+    tcpros.deserialize("std_msgs/Empty", b"")
 
 
 @pytest.mark.parametrize("kind", ["geometry_msgs/Twist", "std_msgs/Empty", "std_msgs/String"])
@@ -57,4 +57,4 @@ def test_other_bytes_are_refused(kind, data):
     if kind == "std_msgs/String" and len(data) - 4 == int.from_bytes(data[:4], "little"):
         return
     with pytest.raises(ValueError, match="bytes are no"):
-        message_types.deserialize(kind, data)
+        tcpros.deserialize(kind, data)

@@ -10,17 +10,17 @@ import pytest
 from ros1_master import Master
 
 from zsim.errors import RunError
-from zsim_bridges.ros1.wire import message_types, registration, tcpros, tcpros_streams
-from zsim_bridges.ros1.wire.master_uri import master_address, own_address
-from zsim_bridges.ros1.wire.node import Ros1Node
+from zsim_bridges.ros1 import master_api, tcpros
+from zsim_bridges.ros1.master_api import master_address, own_address
+from zsim_bridges.ros1.node import Ros1Node
 
 PATIENCE_S = 20.0
 TWIST, EMPTY = "geometry_msgs/Twist", "std_msgs/Empty"
-Vector3 = message_types.message_class("geometry_msgs/Vector3")
+Vector3 = tcpros.message_class("geometry_msgs/Vector3")
 
 
 def twist(x: float) -> Any:
-    return message_types.message_class(TWIST)(linear=Vector3(x, 0.0, 0.0), angular=Vector3(0.0, 0.0, 0.0))
+    return tcpros.message_class(TWIST)(linear=Vector3(x, 0.0, 0.0), angular=Vector3(0.0, 0.0, 0.0))
 
 
 class Graph:
@@ -72,7 +72,7 @@ async def until(true: Callable[[], bool]) -> None:
 
 @pytest.fixture
 def graph(monkeypatch: pytest.MonkeyPatch) -> Iterator[Graph]:
-    monkeypatch.setattr(registration, "LOOK_S", 0.05)
+    monkeypatch.setattr(master_api, "CHECK_S", 0.05)
     made = Graph()
     yield made
     made.master.stop()
@@ -95,7 +95,7 @@ def test_what_one_publishes_the_other_takes(graph):
         b.subscribe("/t", TWIST, lambda message: heard.append(message.linear.x))
         topic = a.publish("/t", TWIST, 10)
         async with b.running(), a.running():
-            await until(lambda: len(topic.outlets) == 1)
+            await until(lambda: len(topic.links) == 1)
             for n in range(5):
                 topic.publish(lambda _, n=n: twist(float(n)))
             await until(lambda: len(heard) == 5)
@@ -109,7 +109,7 @@ def test_what_one_publishes_the_other_takes(graph):
 def test_nothing_is_made_where_nobody_listens(graph):
     topic = graph.node("/a").publish("/t", TWIST, 10)
     topic.publish(lambda _: pytest.fail("made"))
-    assert topic.count == 0
+    assert topic.sent == 0
 
 
 def test_sequence_numbers_count_what_was_published(graph):
@@ -119,7 +119,7 @@ def test_sequence_numbers_count_what_was_published(graph):
         topic = a.publish("/t", TWIST, 10)
         async with a.running():
             _, writer = await connect(await graph.port("/t"), subscriber("/t"))
-            await until(lambda: len(topic.outlets) == 1)
+            await until(lambda: len(topic.links) == 1)
             for _ in range(3):
                 topic.publish(lambda seq: asked.append(seq) or twist(0.0))
             writer.close()
@@ -134,7 +134,7 @@ def test_a_subscriber_is_told_type_and_definition(graph):
         a.publish("/t", TWIST, 10)
         async with a.running():
             reader, writer = await connect(await graph.port("/t"), subscriber("/t"))
-            header = await tcpros_streams.read_header(reader)
+            header = await tcpros.read_header(reader)
             writer.close()
             return header
 
@@ -161,7 +161,7 @@ def test_who_wants_something_else_is_refused_as_ros_does(graph, header, reason):
         a.publish("/t", TWIST, 10)
         async with a.running():
             reader, writer = await connect(await graph.port("/t"), header)
-            answer = await tcpros_streams.read_header(reader)
+            answer = await tcpros.read_header(reader)
             assert await reader.read() == b""  # and hung up
             writer.close()
             return answer["error"]
@@ -177,21 +177,21 @@ def test_garbage_ends_its_own_connection_only(graph, garbage):
         async with a.running():
             port = await graph.port("/t")
             reader, writer = await connect(port, subscriber("/t"))
-            await tcpros_streams.read_header(reader)
+            await tcpros.read_header(reader)
             other, nonsense = await asyncio.open_connection("127.0.0.1", port)
             nonsense.write(garbage)
             nonsense.write_eof()
             await other.read()
             nonsense.close()
             topic.publish(lambda _: twist(7.0))
-            assert message_types.deserialize(TWIST, await tcpros_streams.read_frame(reader)).linear.x == 7.0
+            assert tcpros.deserialize(TWIST, await tcpros.read_frame(reader)).linear.x == 7.0
             writer.close()
 
     asyncio.run(run())
 
 
 def test_a_subscriber_that_does_not_read_loses_the_oldest_and_holds_up_nobody(graph):
-    text, string = "x" * 100_000, message_types.message_class("std_msgs/String")
+    text, string = "x" * 100_000, tcpros.message_class("std_msgs/String")
 
     async def run() -> None:
         a = graph.node("/a")
@@ -201,16 +201,16 @@ def test_a_subscriber_that_does_not_read_loses_the_oldest_and_holds_up_nobody(gr
             lazy = socket.create_connection(("127.0.0.1", port))
             lazy.sendall(tcpros.encode_header(subscriber("/t")))
             reader, writer = await connect(port, subscriber("/t"))
-            await tcpros_streams.read_header(reader)
-            await until(lambda: len(topic.outlets) == 2)
+            await tcpros.read_header(reader)
+            await until(lambda: len(topic.links) == 2)
             for n in range(200):
                 topic.publish(lambda _, n=n: string(data=f"{n:04d}{text}"))
-                assert (await tcpros_streams.read_frame(reader))[4:8] == b"%04d" % n
-            stuck = max(topic.outlets, key=lambda outlet: outlet.lost)
+                assert (await tcpros.read_frame(reader))[4:8] == b"%04d" % n
+            stuck = max(topic.links, key=lambda outlet: outlet.lost)
             assert stuck.lost > 0
-            assert sum(outlet.lost for outlet in topic.outlets) == stuck.lost  # the other lost nothing
+            assert sum(outlet.lost for outlet in topic.links) == stuck.lost  # the other lost nothing
             lazy.close()
-            await until(lambda: len(topic.outlets) == 1)
+            await until(lambda: len(topic.links) == 1)
             writer.close()
 
     asyncio.run(run())
@@ -229,9 +229,9 @@ def test_a_publisher_that_sends_garbage_is_told_of_once_and_heard_again(graph):
         node.subscribe("/t", TWIST, take)
 
         async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            await tcpros_streams.read_header(reader)
-            writer.write(tcpros.encode_header(tcpros.publisher_header(message_types.topic_type("/t", TWIST), "/bad")))
-            negative, good = (message_types.serialize(TWIST, twist(x)) for x in (-1.0, 5.0))
+            await tcpros.read_header(reader)
+            writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type("/t", TWIST), "/bad")))
+            negative, good = (tcpros.serialize(TWIST, twist(x)) for x in (-1.0, 5.0))
             for payload in (b"short", negative, b"x" * 49, good):
                 writer.write(tcpros.frame(payload))
             await writer.drain()
@@ -299,12 +299,12 @@ def test_connections_outlive_a_master(graph):
         topic = a.publish("/t", TWIST, 10)
         b.subscribe("/t", TWIST, lambda message: heard.append(message.linear.x))
         async with a.running(), b.running():
-            await until(lambda: len(topic.outlets) == 1)
+            await until(lambda: len(topic.links) == 1)
             graph.restart()
             await until(lambda: sum("registered again" in line for line in graph.said) == 2)
             topic.publish(lambda _: twist(1.0))
             await until(lambda: heard == [1.0])
-            assert len(topic.outlets) == 1
+            assert len(topic.links) == 1
 
     asyncio.run(run())
 
@@ -319,7 +319,7 @@ def test_a_publisher_that_went_and_came_back_is_heard_again(graph):
                 a = graph.node("/a")
                 topic = a.publish("/t", TWIST, 10)
                 async with a.running():
-                    await until(lambda topic=topic: len(topic.outlets) == 1)
+                    await until(lambda topic=topic: len(topic.links) == 1)
                     topic.publish(lambda _, n=n: twist(float(n)))
                     await until(lambda n=n: len(heard) == n + 1)
 
@@ -336,10 +336,10 @@ def test_what_a_node_said_just_before_it_left_is_heard(graph):
         left = asyncio.Event()
 
         async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            await tcpros_streams.read_header(reader)
-            writer.write(tcpros.encode_header(tcpros.publisher_header(message_types.topic_type("/t", TWIST), "/a")))
+            await tcpros.read_header(reader)
+            writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type("/t", TWIST), "/a")))
             await left.wait()
-            writer.write(tcpros.frame(message_types.serialize(TWIST, twist(3.0))))
+            writer.write(tcpros.frame(tcpros.serialize(TWIST, twist(3.0))))
             writer.close()
 
         server = await asyncio.start_server(publish, "127.0.0.1", 0)
@@ -375,10 +375,10 @@ def test_a_service_answers_and_refuses(graph):
 
     async def ask(port: int, request: bytes = b"") -> tuple[int, bytes]:
         reader, writer = await connect(port, {"callerid": "/tester", "service": "/s", "md5sum": "*"})
-        assert (await tcpros_streams.read_header(reader))["type"] == "std_srvs/Empty"
+        assert (await tcpros.read_header(reader))["type"] == "std_srvs/Empty"
         writer.write(tcpros.frame(request))
         (ok,) = await reader.readexactly(1)
-        answer = await tcpros_streams.read_frame(reader)
+        answer = await tcpros.read_frame(reader)
         assert await reader.read() == b""
         writer.close()
         return ok, answer
@@ -406,11 +406,11 @@ def test_a_service_can_be_asked_for_its_type_and_asked_again_and_again(graph):
             port = int(graph.master.graph.services["/s"].rsplit(":", 1)[1])
             asked = {"callerid": "/tester", "service": "/s", "md5sum": "*"}
             reader, writer = await connect(port, asked | {"probe": "1"})
-            assert (await tcpros_streams.read_header(reader))["request_type"] == "std_srvs/EmptyRequest"
+            assert (await tcpros.read_header(reader))["request_type"] == "std_srvs/EmptyRequest"
             assert await reader.read() == b""
             writer.close()
             reader, writer = await connect(port, asked | {"persistent": "1"})
-            await tcpros_streams.read_header(reader)
+            await tcpros.read_header(reader)
             for _ in range(3):
                 writer.write(tcpros.frame(b""))
                 assert await reader.readexactly(5) == b"\x01\0\0\0\0"
@@ -427,10 +427,10 @@ def test_the_slave_api_tells_what_ros_s_tools_ask(graph):
         async with a.running():
             uri = await graph.uri("/t")
             reader, writer = await connect(await graph.port("/t"), subscriber("/t"))
-            await tcpros_streams.read_header(reader)
+            await tcpros.read_header(reader)
             topic.publish(lambda _: twist(1.0))
-            await tcpros_streams.read_frame(reader)
-            await until(lambda: topic.outlets[0].sent > 0)
+            await tcpros.read_frame(reader)
+            await until(lambda: topic.links[0].sent > 0)
             assert (await call(uri, "getPublications"))[2] == [["/t", TWIST]]
             assert (await call(uri, "getSubscriptions"))[2] == [["/in", EMPTY]]
             assert (await call(uri, "getBusInfo"))[2] == [[0, "/tester", "o", "TCPROS", "/t", True]]
@@ -485,7 +485,7 @@ def test_a_node_that_is_asked_to_stop_says_by_whom(graph):
         a.publish("/t", TWIST, 10)
         async with a.running():
             await call(await graph.uri("/t"), "shutdown", "user request")
-            return a.dismissed
+            return a.shutdown_reason
 
     assert asyncio.run(run()) == "/tester asks us to stop: user request"
 
@@ -497,8 +497,8 @@ def test_a_node_whose_name_is_taken_ends_and_leaves_the_other_registered(graph):
         async with a.running():
             await until(lambda: "/a" in graph.master.graph.nodes)
             graph.master.graph.nodes["/a"] = "http://127.0.0.1:1/"
-            await until(lambda: a.dismissed != "")
-        return a.dismissed
+            await until(lambda: a.shutdown_reason != "")
+        return a.shutdown_reason
 
     assert "another node of this name is on http://127.0.0.1:1/" in asyncio.run(run())
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsim_bridges.ros1.wire import tcpros
-from zsim_bridges.ros1.wire.tcpros import HeaderError, TopicType
+from zsim_bridges.ros1 import tcpros
+from zsim_bridges.ros1.tcpros import HeaderError, TopicType
 
 TWIST = TopicType("/drone1/cmd_vel", "geometry_msgs/Twist", "9f195f881246fdfa2798d1d3eebca84a", "float64 x\n")
 
