@@ -1,7 +1,4 @@
-"""What is asked for each drone, done in the order in which it was asked for, while others' waits for nothing.
-
-What an operator asks for, sent to whoever answers it, off the page's threads; what comes of it is told.
-"""
+"""Requests and modes of an operator, sent off the page's threads; the outcome of each is reported."""
 
 import threading
 from collections import Counter, deque
@@ -22,18 +19,18 @@ Task = Callable[[], None]
 
 @dataclass
 class _DroneTasks:
-    """What is under way for one drone, and what waits for that."""
+    """Tasks of one drone: how many run, and which wait for them."""
 
     busy: int = 0
     waiting: deque[Task] = field(default_factory=deque)
 
 
 class DroneQueue:
-    """Lines of acts, one for each name.
+    """Runs tasks in order of submission for each drone; drones do not wait for each other.
 
     Args:
-        hands: do what has its turn.
-        urgent: do what waits for no turn.
+        pool: runs tasks in their order.
+        urgent: runs tasks that wait for no other.
     """
 
     def __init__(self, hands: Executor, urgent: Executor) -> None:
@@ -44,13 +41,13 @@ class DroneQueue:
         self._closed = False
 
     def close(self) -> None:
-        """Begin nothing more."""
+        """Start no more tasks."""
         with self._lock:
             self._closed = True
             self._tasks.clear()
 
     def submit(self, name: str, act: Task) -> None:
-        """Do something after all that was asked for by that name before.
+        """Run a task after all that were submitted for that name before.
 
         Raises:
             RuntimeError: closed.
@@ -63,7 +60,7 @@ class DroneQueue:
                 self._start(self._pool, name, act)
 
     def submit_urgent(self, name: str, act: Task) -> None:
-        """Do something without waiting for what was asked for before; what is asked for later waits for it.
+        """Run a task without waiting for earlier ones; later ones wait for it.
 
         Raises:
             RuntimeError: closed.
@@ -103,14 +100,14 @@ class DroneQueue:
 
 PRIORITY = 10  # contract: of operators
 PRIORITY_EMERGENCY = 100  # contract: the highest; an operator who flies a drone must not keep others from stopping it
-THREADS_PER_POOL = 8  # under way at once, of each kind: requests that nobody answers must not keep modes waiting
+THREADS_PER_POOL = 8  # in each pool: requests without an answer must not delay modes
 ANSWER_TIMEOUT_S = 5.0  # the world and controllers answer within a gate
 OVERTAKEN = "an emergency was asked for after it"
-ACCEPTANCE_TIMEOUT_S = 1.0  # how long the world may take to say that it has a command, before the drone is given back
+ACCEPTANCE_TIMEOUT_S = 1.0  # how long the world may take to accept a command, before the drone is released
 
 
 class RequestOutcome(NamedTuple):
-    """What came of a request: what was asked, and why it was refused; empty where it was not."""
+    """A request in words, and why it was refused; empty where it was not."""
 
     request: str
     refusal: str
@@ -122,9 +119,9 @@ class CommandClient:
     Args:
         link: an open session.
         name: of the console's process.
-        views: hears when a command has been taken.
+        views: receives when a command has been accepted.
         now_ns: simulated time for a stamp; may ask for it.
-        report: told what came of each request, in any thread.
+        report: called with the outcome of each request, in any thread.
     """
 
     def __init__(
@@ -141,34 +138,36 @@ class CommandClient:
         self._now_ns = now_ns
         self._report = report
         self._seqs: Counter[str] = Counter()  # modes sent to each drone
-        self._emergencies: Counter[str] = Counter()  # emergencies asked for of each drone
+        self._emergencies: Counter[str] = Counter()  # emergencies requested of each drone
         self._lock = threading.Lock()
         self._pools = [
-            ThreadPoolExecutor(THREADS_PER_POOL, thread_name_prefix=f"desk-{what}")
-            for what in ("ask", "mode", "stop", "give")
+            ThreadPoolExecutor(THREADS_PER_POOL, thread_name_prefix=f"console-{kind}")
+            for kind in ("request", "mode", "emergency", "release")
         ]
         self._requests, modes, stops, self._releases = self._pools
         self._queue = DroneQueue(modes, stops)
 
     def close(self) -> None:
-        """Wait for nobody any more."""
+        """Give up requests that wait."""
         self._queue.close()
         for hands in self._pools:
             hands.shutdown(wait=False, cancel_futures=True)
 
     def request_world(self, op: str, **args: Any) -> None:
-        """Ask the world."""
+        """Request an operation of the world."""
         self._ask(keys.CONTROL, op, args, f"{op} {_format_arguments(args)}".strip())
 
-    def request_cluster(self, cluster: str, op: str, said: str = "", **args: Any) -> None:
-        """Ask a formation's controller; `said` tells people of the arguments in units of theirs."""
-        self._ask(keys.cluster_control(cluster), op, args, f"{cluster}: {op} {said or _format_arguments(args)}".strip())
+    def request_cluster(self, cluster: str, op: str, shown: str = "", **args: Any) -> None:
+        """Request an operation of a formation's controller; `shown` is the arguments as the page shows them."""
+        self._ask(
+            keys.cluster_control(cluster), op, args, f"{cluster}: {op} {shown or _format_arguments(args)}".strip()
+        )
 
     def send_mode(self, drones: Sequence[str], mode: str) -> None:
-        """Let drones take off, land, stop at once or leave the emergency, whoever flies them.
+        """Let drones take off, land, stop at once or leave the emergency, whoever commands them.
 
-        Modes of one drone are sent in the order in which they were asked for; an emergency waits for none of them,
-        and none that was asked for before it is sent after it.
+        Modes of one drone are sent in the order of the requests; an emergency waits for none of them, and none that
+        was requested before it is sent after it.
         """
         for drone in drones:
             if mode == "emergency":
@@ -200,13 +199,13 @@ class CommandClient:
         return "" if answer.ok else answer.error or "refused without a reason"
 
     def _acquire_and_send(self, drone: str, mode: str, stops: int) -> str:
-        """Take a drone from whoever flies it, and send the mode, unless more emergencies were asked for meanwhile."""
+        """Acquire a drone and send the mode, unless more emergencies were requested meanwhile."""
         if self._emergencies[drone] > stops:
             return OVERTAKEN
         return self._acquire(drone, PRIORITY) or self._send(drone, mode, stops)
 
     def _send_emergency(self, drone: str, mode: str) -> str:
-        """Send the mode whatever becomes of the request for the drone: the world may heed it all the same."""
+        """Send the mode even if the drone could not be acquired: the world may accept it all the same."""
         refusal = _refusal_of(self._acquire, drone, PRIORITY_EMERGENCY)
         self._send(drone, mode)
         return refusal and f"{refusal}; {mode} was sent all the same"
@@ -215,20 +214,20 @@ class CommandClient:
         return self._request(keys.CONTROL, "acquire", {"drone": drone, "priority": priority})
 
     def _send(self, drone: str, mode: str, stops: int | None = None) -> str:
-        """Send a mode, unless more emergencies than `stops` were asked for; let others fly the drone afterwards."""
+        """Send a mode, unless more emergencies than `stops` were requested; release the drone afterwards."""
         before, now_ns = self._views.answered_commands(drone), self._now_ns()
         with self._lock:
             overtaken = stops is not None and self._emergencies[drone] > stops
             if not overtaken:
                 seq, self._seqs[drone] = self._seqs[drone], self._seqs[drone] + 1
-                said = messages.Mode(now_ns, seq, self._name, mode)  # type: ignore[arg-type]
-                self._link.put(keys.command(drone, "mode"), said)
+                message = messages.Mode(now_ns, seq, self._name, mode)  # type: ignore[arg-type]
+                self._link.put(keys.command(drone, "mode"), message)
         with suppress(RuntimeError):  # closed: who leaves a run gives back what it has
             self._releases.submit(self._release, drone, before)
         return OVERTAKEN if overtaken else ""
 
     def _release(self, drone: str, before: int) -> None:
-        """Let others fly a drone, once the world has the mode that was sent with an operator's priority."""
+        """Release a drone, once the world has the mode that was sent with an operator's priority."""
         self._views.await_answer(drone, before, ACCEPTANCE_TIMEOUT_S)
         with suppress(ZsimError):  # the run has ended
             self._request(keys.CONTROL, "release", {"drone": drone})
@@ -240,7 +239,7 @@ def _refusal_of(act: Callable[..., str], *args: Any) -> str:
         return act(*args)
     except ZsimError as error:
         return str(error)
-    except Exception as error:  # nobody asks a thread of a pool how it ended
+    except Exception as error:  # a pool's thread reports no exception itself
         return f"{type(error).__name__}: {error}"
 
 

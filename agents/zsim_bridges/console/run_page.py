@@ -1,4 +1,4 @@
-"""One run on the page: what has been heard becomes pictures, tables and plots; what is asked for is sent."""
+"""One run on the page: draws its views as pictures, tables and plots, and sends the operator's requests."""
 
 import math
 import threading
@@ -33,12 +33,12 @@ from zsim_bridges.console.view_buffer import ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
-STAMPS_PER_AGE = 5.0  # a stamp is at most so small a part as old as commands may be; on its way it ages too
+STAMPS_PER_AGE = 5.0  # a stamp is at most this fraction of a command's largest age old; it ages on its way
 EVENTS_SHOWN = 60
 NOTICE_S = 8.0  # wall; how long a refusal stays in the corner
 FEW_DRONES = 20  # drones from which on pictures come half as often
 RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
-FAST_RATE = 4.0  # x real time; from then on, too: no eye follows it, and the run needs the processors
+FAST_RATE = 4.0  # x real time; from then on the rate is halved, too: the run needs the processors
 
 
 def picture_rate_hz(drones: int, rate: float) -> float:
@@ -47,14 +47,14 @@ def picture_rate_hz(drones: int, rate: float) -> float:
 
 
 class RunPage:
-    """What the page shows of one run.
+    """The page of one run.
 
     Args:
-        server: viser's; whatever another run has left on it goes.
+        server: viser's; what another run has left on it is removed.
         link: an open session.
         info: of the run.
         observer: of the console in it.
-        camera_follow: knows whose cameras go with the formation.
+        camera_follow: moves the cameras that follow the formation.
         rate_hz: pictures a second; None: fewer where there are many drones, or time flies.
     """
 
@@ -102,7 +102,7 @@ class RunPage:
         self._client.close()
 
     def run(self, stopped: Callable[[], bool]) -> None:
-        """Draw pictures until the run is over, or somebody says stop."""
+        """Draw pictures until the run is over or `stopped` returns true."""
         self.views.open()
         pause = threading.Event()
         next_s = time.monotonic()
@@ -140,7 +140,7 @@ class RunPage:
                 self._update_tables(wall_s)
 
     def _draw_end(self) -> None:
-        """Draw how it ended: for pages that are opened between two runs."""
+        """Draw the end of the run, for pages that are opened between two runs."""
         self.views.update()
         with self._server.atomic():
             if self.views.drones is not None:
@@ -148,12 +148,12 @@ class RunPage:
             self._update_tables(time.monotonic())
 
     def _store_unseen(self, new: bool) -> None:
-        """Keep up what pages want to see of the time before they were opened."""
+        """Store what pages show of the time before they were opened."""
         if new and self.views.drones is not None:
             self._camera_follow.set_target(self._camera_targets(self._store_drones(self.views.drones)))
 
     def _store_drones(self, view: ViewDrones) -> DronePoses:
-        """Keep up with the drones; return them."""
+        """Store the drones' newest poses, and return them."""
         drones = drone_poses(view, self._names)
         if drones.t_ns < self._drawn_ns:
             self._trails.clear()  # a replay has gone back
@@ -168,42 +168,44 @@ class RunPage:
         drones = self._store_drones(self.views.drones)
         dt_s = min(self._period_s(), max(0.0, (drones.t_ns - before_ns) / 1e9))
         self._scene.drones(drones, dt_s)
-        beliefs = self.views.estimates().values()
-        self._scene.estimates(ellipsoids([belief.estimate for belief in beliefs if belief.fresh]))
+        estimates = self.views.estimates().values()
+        self._scene.estimates(ellipsoids([each.estimate for each in estimates if each.fresh]))
         if self._shapes:
             self._scene.shapes(list(self._shapes.values()), list(self._shapes).index(self._page.chosen))
         self._draw_ghosts()
         self._camera_follow.follow(self._camera_targets(drones))
 
     def _draw_ghosts(self) -> None:
-        """Put the ghosts anew where a formation is to be somewhere else now."""
+        """Move the ghosts where a formation's desired shape has changed."""
         wanted = {name: (view.phase, view.desired) for name, view in self.views.clusters.items()}
         if wanted == self._drawn_ghosts:
             return
         self._drawn_ghosts = wanted
-        found = [ghosts(self._spaces[name], view) for name, view in self.views.clusters.items()]
-        there = [each for each in found if each is not None]
-        p_W = np.concatenate([p for p, _ in there]) if there else np.zeros((0, 3))
-        self._scene.ghosts(p_W, np.concatenate([q for _, q in there]) if there else np.zeros((0, 4)))
+        poses = [ghosts(self._spaces[name], view) for name, view in self.views.clusters.items()]
+        shown = [each for each in poses if each is not None]
+        p_W = np.concatenate([p for p, _ in shown]) if shown else np.zeros((0, 3))
+        self._scene.ghosts(p_W, np.concatenate([q for _, q in shown]) if shown else np.zeros((0, 4)))
 
     def _update_shapes(self, drones: DronePoses) -> None:
-        """Find the formations as they truly stand, and keep what plots show of them."""
+        """Compute the formations' true shapes, and add them to the plots."""
         there, yaw = drones.present, frames.heading(drones.q_WB)
         for name, space in self._spaces.items():
             members = self._members[name]
             whole = bool(there[members].all())
-            self._shapes[name] = found = formation_shape(space, drones.p_W[members], yaw[members]) if whole else None
+            self._shapes[name] = true_shape = (
+                formation_shape(space, drones.p_W[members], yaw[members]) if whole else None
+            )
             view = self.views.clusters.get(name)
             if view is not None:
-                true = None if found is None else found.c
-                self._page.plots[name].history.add(drones.t_ns / 1e9, view.desired, view.value, true)
+                true_c = None if true_shape is None else true_shape.c
+                self._page.plots[name].history.add(drones.t_ns / 1e9, view.desired, view.value, true_c)
 
     def _camera_targets(self, drones: DronePoses) -> np.ndarray:
-        """Return the places (n, 3) of what cameras follow: the formation, or all drones where there are several."""
+        """Return the positions (n, 3) that cameras follow: of the formation, or of all drones where there are several."""
         members = next(iter(self._members.values())) if len(self._members) == 1 else slice(None)
         return drones.p_W[members][drones.present[members]]
 
-    # In words
+    # Tables
 
     def _update_tables(self, wall_s: float) -> None:
         page = self._page
@@ -215,7 +217,7 @@ class RunPage:
         )
         page.drones.content = html_tables.drone_table(self._table_rows.drone_rows())
         page.sensors.content = self._table_rows.sensor_table(page.drone_form.chosen)
-        page.acting.content = html_tables.fault_lines(self._table_rows.acting())
+        page.acting.content = html_tables.fault_lines(self._table_rows.active_faults())
         page.events.content = html_tables.event_table(list(self.views.events)[:EVENTS_SHOWN])
         if page.chosen:
             page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
@@ -224,20 +226,20 @@ class RunPage:
             self._scene.trails(*self._trails.segments(self._drones.p_W))
             self._scene.wind(self._drones)
 
-    def _on_outcome(self, told: RequestOutcome) -> None:
-        """Show what came of a request: a refusal in the corner of every page, and among the events.
+    def _on_outcome(self, outcome: RequestOutcome) -> None:
+        """Show the outcome of a request: a refusal in the corner of every page, and among the events.
 
-        Of what was done the world tells, but not of what formations were asked for.
+        The world publishes an event of what it has done, but not of requests to formations.
         """
-        kind, outcome = ("refused", told.refusal) if told.refusal else ("control", "done")
-        if told.refusal or told.request.partition(":")[0] in self._spaces:
-            said = f"{told.request}: {outcome}"
-            self.views.add_event(Event(self._observer.now_ns, 0, kind, self._observer.name, "", said))
-        if told.refusal:
-            self._notify(told.request, told.refusal)
+        kind, result = ("refused", outcome.refusal) if outcome.refusal else ("control", "done")
+        if outcome.refusal or outcome.request.partition(":")[0] in self._spaces:
+            text = f"{outcome.request}: {result}"
+            self.views.add_event(Event(self._observer.now_ns, 0, kind, self._observer.name, "", text))
+        if outcome.refusal:
+            self._notify(outcome.request, outcome.refusal)
 
     def _on_refused_command(self, event: Event) -> None:
-        """Show what the world refuses of a command that the console has sent."""
+        """Show that the world has refused a command of the console's."""
         self._notify(event.subject, str(event.data.get("reason", event.text)))
 
     def _notify(self, what: str, refusal: str) -> None:

@@ -1,9 +1,4 @@
-"""How often sensors come, from counts that are seen now and then. Pure.
-
-What the tables tell of drones and their sensors, from what has been heard.
-
-What the console shows, as plain data: for programs, and for tests. Read in another thread than that which draws.
-"""
+"""What the console shows, as rows of tables and as plain data for programs, from the newest views."""
 
 import math
 from collections.abc import Mapping
@@ -21,32 +16,32 @@ Counts = dict[str, tuple[int, int]]
 
 
 class SensorRates:
-    """Rates of one drone at a time: the one that is looked at."""
+    """Sensor rates of one drone at a time, from counts that are sampled now and then."""
 
     def __init__(self) -> None:
         self._drone = ""
-        self._marks: list[tuple[int, Counts]] = []
+        self._samples: list[tuple[int, Counts]] = []
 
     def update(self, drone: str, t_ns: int, counts: Mapping[str, tuple[int, int]]) -> dict[str, float]:
-        """Take the counts (used, refused) of a drone's sensors at an instant; return the rates [Hz] lately."""
+        """Add the counts (used, refused) of a drone's sensors at an instant; return the latest rates [Hz]."""
         if drone != self._drone or self._has_restarted(t_ns, counts):
-            self._drone, self._marks = drone, []
-        if self._marks and self._marks[-1][0] == t_ns:
-            self._marks.pop()  # the run stands still
-        self._marks.append((t_ns, dict(counts)))
-        while len(self._marks) > 2 and t_ns - self._marks[1][0] >= SPAN_NS:
-            self._marks.pop(0)
-        since_ns, before = self._marks[0]
+            self._drone, self._samples = drone, []
+        if self._samples and self._samples[-1][0] == t_ns:
+            self._samples.pop()  # the run stands still
+        self._samples.append((t_ns, dict(counts)))
+        while len(self._samples) > 2 and t_ns - self._samples[1][0] >= SPAN_NS:
+            self._samples.pop(0)
+        since_ns, before = self._samples[0]
         span_ns = t_ns - since_ns
         if span_ns <= 0:
             return {}
         return {kind: (sum(now) - sum(before.get(kind, now))) * 1e9 / span_ns for kind, now in counts.items()}
 
     def _has_restarted(self, t_ns: int, counts: Mapping[str, tuple[int, int]]) -> bool:
-        """Tell whether a replay has gone back, or an estimator has begun anew."""
-        if not self._marks:
+        """Return whether a replay has gone back, or an estimator has restarted."""
+        if not self._samples:
             return False
-        last_ns, last = self._marks[-1]
+        last_ns, last = self._samples[-1]
         return t_ns < last_ns or any(sum(counts.get(kind, (0, 0))) < sum(before) for kind, before in last.items())
 
 
@@ -54,7 +49,7 @@ class TableRows:
     """Makes rows of tables.
 
     Args:
-        views: has heard it.
+        views: the newest ones.
     """
 
     def __init__(self, views: ViewBuffer) -> None:
@@ -63,22 +58,22 @@ class TableRows:
 
     def drone_rows(self) -> list[html_tables.DroneRow]:
         """Return a row for each drone."""
-        view, beliefs, found = self._views.drones, self._views.estimates(), []
+        view, estimates, rows = self._views.drones, self._views.estimates(), []
         if view is None:
             return []
-        active_faults = self._active()
+        faults = self._active()
         for drone in view.drones:
-            belief = beliefs.get(drone.name)
-            gps = belief.estimate.sensors.get("gps") if belief else None
-            faults = tuple(fault.kind for fault in active_faults if fault.target == drone.name)
-            told = "–" if gps is None else f"{gps[0]} / {gps[1]}"
-            lag = self._lag_ms(belief, view.t_ns) if belief else None
-            row = (drone.name, drone.state, drone.battery_percent, lag, drone.commander, told, faults)
-            found.append(html_tables.DroneRow(*row))
-        return found
+            received = estimates.get(drone.name)
+            gps = received.estimate.sensors.get("gps") if received else None
+            own_faults = tuple(fault.kind for fault in faults if fault.target == drone.name)
+            fixes = "–" if gps is None else f"{gps[0]} / {gps[1]}"
+            lag = self._lag_ms(received, view.t_ns) if received else None
+            row = (drone.name, drone.state, drone.battery_percent, lag, drone.commander, fixes, own_faults)
+            rows.append(html_tables.DroneRow(*row))
+        return rows
 
-    def acting(self) -> list[str]:
-        """Return which faults act, and on what."""
+    def active_faults(self) -> list[str]:
+        """Return kind and target of each active fault."""
         return [f"{fault.kind} of {fault.target}{_end_text(fault)}" for fault in self._active()]
 
     def _active(self) -> list[Fault]:
@@ -87,20 +82,20 @@ class TableRows:
 
     def sensor_table(self, drone: str) -> str:
         """Return the table of one drone's sensors."""
-        belief = self._views.estimates().get(drone)
-        if belief is None:
+        received = self._views.estimates().get(drone)
+        if received is None:
             return html_tables.sensor_table(drone, (), "no estimate yet")
-        estimate = belief.estimate
-        rates = self._rates.update(drone, belief.t_ns, estimate.sensors) if belief.fresh else {}
+        estimate = received.estimate
+        rates = self._rates.update(drone, received.t_ns, estimate.sensors) if received.fresh else {}
         rows = [html_tables.SensorRow(kind, *counts, rates.get(kind)) for kind, counts in estimate.sensors.items()]
-        return html_tables.sensor_table(drone, rows, _uncertainty(belief))
+        return html_tables.sensor_table(drone, rows, _uncertainty(received))
 
-    def _lag_ms(self, belief: ReceivedEstimate, now_ns: int) -> float:
-        """Return how far an estimator is behind: as it says of itself, or as its view shows where that is old."""
-        health = self._views.healths.get(belief.process)
-        if health is not None and belief.fresh:
+    def _lag_ms(self, received: ReceivedEstimate, now_ns: int) -> float:
+        """Return how far an estimator is behind: by its health, or by its view where that is old."""
+        health = self._views.healths.get(received.process)
+        if health is not None and received.fresh:
             return health.lag_ns / 1e6
-        return max(0, now_ns - belief.t_ns) / 1e6
+        return max(0, now_ns - received.t_ns) / 1e6
 
 
 def _is_active(fault: Fault, now_ns: int) -> bool:
@@ -111,12 +106,12 @@ def _end_text(fault: Fault) -> str:
     return "" if fault.until_ns is None else f" until {fault.until_ns / 1e9:.1f} s"
 
 
-def _uncertainty(belief: ReceivedEstimate) -> str:
-    """Return in words how sure an estimator is."""
-    if not belief.fresh:
-        return f"no estimate since {belief.t_ns / 1e9:.1f} s"
-    heading_deg = math.degrees(belief.estimate.yaw_sigma_rad)
-    return f"σ of position {sigma_m(belief.estimate):.2f} m, of heading {heading_deg:.1f}°"
+def _uncertainty(received: ReceivedEstimate) -> str:
+    """Return an estimator's uncertainty in words."""
+    if not received.fresh:
+        return f"no estimate since {received.t_ns / 1e9:.1f} s"
+    heading_deg = math.degrees(received.estimate.yaw_sigma_rad)
+    return f"σ of position {sigma_m(received.estimate):.2f} m, of heading {heading_deg:.1f}°"
 
 
 def sigma_m(estimate: EstimateView) -> float:
@@ -132,12 +127,12 @@ SILENT = "silent"  # in place of the clock's state, where the world answers noth
 def console_state(
     run_id: str, views: ViewBuffer, time_monitor: TimeMonitor, shapes: Mapping[str, FormationShape | None]
 ) -> dict[str, Any]:
-    """Return what is shown of a run.
+    """Return what is shown of a run, as plain data; called in another thread than that which draws.
 
     Args:
         run_id: of the run.
-        views: have heard it.
-        time_monitor: knows how its time goes.
+        views: the newest ones.
+        time_monitor: of the run's clock.
         shapes: the formations as they truly stand.
     """
     view, clock, clusters = views.drones, time_monitor.clock, dict(views.clusters)
@@ -155,7 +150,7 @@ def console_state(
 
 
 def _drones(view: ViewDrones, views: ViewBuffer) -> list[dict[str, Any]]:
-    sigmas = {name: sigma_m(belief.estimate) for name, belief in views.estimates().items() if belief.fresh}
+    sigmas = {name: sigma_m(received.estimate) for name, received in views.estimates().items() if received.fresh}
     return [
         {"name": d.name, "position_m": list(d.position_m), "state": d.state, "sigma_m": sigmas.get(d.name)}
         for d in view.drones
@@ -168,12 +163,12 @@ def _fault(fault: Fault) -> dict[str, Any]:
     return {**about, "from_s": fault.from_ns / 1e9, "until_s": until_s}
 
 
-def _cluster(name: str, view: ViewCluster, found: FormationShape | None) -> dict[str, Any]:
+def _cluster(name: str, view: ViewCluster, true_shape: FormationShape | None) -> dict[str, Any]:
     return {
         "name": name,
         "phase": view.phase,
         "reason": view.reason,
         "desired": dict(zip(view.names, view.desired, strict=True)),
         "value": dict(zip(view.names, view.value, strict=True)),
-        "true": {} if found is None else dict(zip(view.names, found.c.tolist(), strict=True)),
+        "true": {} if true_shape is None else dict(zip(view.names, true_shape.c.tolist(), strict=True)),
     }

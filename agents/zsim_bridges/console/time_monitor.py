@@ -1,4 +1,4 @@
-"""How the run's time goes: asked of the world now and then; and since when the world answers nothing."""
+"""The run's clock, polled from the world now and then; and for how long the world has not answered."""
 
 import math
 import threading
@@ -12,13 +12,13 @@ from zsim.errors import ZsimError
 from zsim.transport.session import Session
 from zsim_bridges.observer_process import ObserverProcess
 
-POLL_S = 0.25  # wall; rarely, since to be told of each gate costs those that make it
+POLL_S = 0.25  # wall; rarely, since a message of each gate costs the world time
 ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
 SILENT_S = 2.0  # wall; without an answer for so long, what is shown may be long past
 
 
 class TimeMonitor:
-    """Follows the run's time, in a thread of its own: whoever draws waits for no answer.
+    """Polls the run's clock, in a thread of its own: drawing waits for no answer.
 
     Args:
         link: an open session.
@@ -49,7 +49,7 @@ class TimeMonitor:
 
     @contextmanager
     def polling(self) -> Iterator[None]:
-        """Ask again and again meanwhile."""
+        """Poll again and again meanwhile."""
         over = threading.Event()
         thread = threading.Thread(target=self._poll_repeatedly, args=(over,), name="watch", daemon=True)
         self._answered_s, self._is_polling = self._wall_s(), True
@@ -62,21 +62,21 @@ class TimeMonitor:
             thread.join(ANSWER_TIMEOUT_S)
 
     def poll(self) -> None:
-        """Ask once; one question at a time is under way."""
+        """Poll once; one poll runs at a time."""
         with self._one:
             self._poll()
 
     def now_ns(self) -> int:
-        """Return simulated time for a stamp, asking where what is known may be too old; within 2 ANSWER_S."""
+        """Return simulated time for a stamp, polling where it may be too old; within 2 ANSWER_TIMEOUT_S."""
         if self._is_old():
             with self._one:
-                if self._is_old():  # others that waited too have been told
+                if self._is_old():  # another thread has polled meanwhile
                     self._poll()
         return self._observer.now_ns
 
     @property
     def silent_s(self) -> float:
-        """For how long the world, though asked, has answered nothing; 0 where that is not long [s, wall]."""
+        """For how long the world has not answered; 0 where that is not long [s, wall]."""
         silent_s = self._wall_s() - self._answered_s
         return silent_s if self._is_polling and silent_s >= SILENT_S else 0.0
 

@@ -1,4 +1,4 @@
-"""What the console hears of a run, kept until the next picture is drawn."""
+"""The newest views of a run, kept until the next picture is drawn."""
 
 import threading
 import time
@@ -13,19 +13,17 @@ from zsim.transport.session import Heard, Sample, Session
 from zsim_bridges.observer_process import ObserverProcess
 
 EVENTS_KEPT = 200
-HIDDEN_EVENTS = frozenset(
-    {"command"}
-)  # kinds of events that say nothing which the next one does not: a mode, a refusal
+HIDDEN_EVENTS = frozenset({"command"})  # an event of a mode or of a refusal follows and says more
 FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
 
 
 class ReceivedEstimate(NamedTuple):
-    """What is believed of a drone.
+    """A drone's estimate, as last received.
 
     Attributes:
         process: the estimator.
         t_ns: simulated.
-        fresh: whether it is of the present.
+        fresh: whether it is of the same time as the drones' view.
     """
 
     process: str
@@ -35,21 +33,21 @@ class ReceivedEstimate(NamedTuple):
 
 
 class ViewBuffer:
-    """Keeps the newest view of everything until the next look; what comes between two looks is never decoded.
+    """Keeps the newest message of each key until the next update; those in between are never decoded.
 
     Args:
         link: an open session.
         info: of the run.
         observer: of the console in it.
-        variables: names of each formation's variables: of another formation, or with others, no view is taken.
-        refused: told, in a thread of Zenoh's, of what the world refuses of the console's own commands.
+        variables: names of each formation's variables; views of other formations or variables are refused.
+        refused: called, in a thread of Zenoh's, with the event of a command of the console's that the world refused.
         wall_s: monotonic.
 
     Attributes:
         drones: the newest view of the drones.
         clusters: the newest view of each formation.
         estimators: the newest view of each estimator, by its process.
-        healths: what each process said of itself last.
+        healths: the newest of each process.
         faults: injected ones, planned and active.
         events: newest first.
     """
@@ -82,17 +80,17 @@ class ViewBuffer:
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
 
     def open(self) -> None:
-        """Begin to hear, and learn what was said before."""
+        """Subscribe, and read the last values of before."""
         for expression in ("view/**", keys.FAULTS, "process/*/health"):
             self._link.hear(expression, self._on_publication)
         self._link.on_message(keys.EVENT, self._on_event)
-        told = self._link.get(keys.FAULTS)
+        samples = self._link.get(keys.FAULTS)
         with self._lock:
-            for sample in told:
-                self._new.setdefault(sample.key, sample.payload)  # what was heard meanwhile is newer
+            for sample in samples:
+                self._new.setdefault(sample.key, sample.payload)  # what has arrived meanwhile is newer
 
     def update(self) -> bool:
-        """Take in what has come since the last look; return whether drones have been seen anew."""
+        """Decode what has come since the last update; return whether there is a new view of the drones."""
         with self._lock:
             new, self._new = self._new, {}
         for key, payload in new.items():
@@ -103,26 +101,26 @@ class ViewBuffer:
         return keys.VIEW_DRONES in new
 
     def estimates(self) -> dict[str, ReceivedEstimate]:
-        """Return the newest belief of each drone by name: of two estimators, one of them dead, that of the other.
+        """Return the newest estimate of each drone by name: of two estimators, one of them dead, that of the other.
 
-        What is of the future was said before a replay went back.
+        Estimates of the future are from before a replay went back.
         """
         now_ns = self.drones.t_ns if self.drones else 0
-        found: dict[str, ReceivedEstimate] = {}
+        newest: dict[str, ReceivedEstimate] = {}
         for process, view in sorted(self.estimators.items(), key=lambda each: each[1].t_ns):
             fresh = self._is_fresh(process, view.t_ns - now_ns)
             if fresh or view.t_ns <= now_ns:
                 names = (estimate for estimate in view.estimates if estimate.name in self._names)
-                found |= {each.name: ReceivedEstimate(process, view.t_ns, each, fresh) for each in names}
-        return found
+                newest |= {each.name: ReceivedEstimate(process, view.t_ns, each, fresh) for each in names}
+        return newest
 
     def _is_fresh(self, process: str, ahead_ns: int) -> bool:
-        """Tell whether an estimator's view goes with that of the drones: in a fast run, both skip many gates."""
+        """Return whether an estimator's view is of the time of the drones' view: in a fast run, both skip many gates."""
         seen_s = self._received_s.get(keys.VIEW_DRONES, 0.0) - self._received_s[keys.estimates_view(process)]
         return abs(ahead_ns) <= FRESH_S * 1e9 or abs(seen_s) <= FRESH_S
 
     def answered_commands(self, drone: str) -> int:
-        """Return how many commands to a drone the world has said that it took, or refused."""
+        """Return how many commands to a drone the world has accepted or refused."""
         return self._answers[drone]
 
     def await_answer(self, drone: str, beyond: int, within_s: float) -> None:
@@ -134,10 +132,10 @@ class ViewBuffer:
         """Add an event of the console's own."""
         self.events.appendleft(event)
 
-    def _on_publication(self, heard: Heard) -> None:
+    def _on_publication(self, sample: Heard) -> None:
         self._observer.health.received += 1
         with self._lock:
-            self._new[heard.key] = heard.payload
+            self._new[sample.key] = sample.payload
 
     def _store(self, key: str, message: Any) -> None:
         if isinstance(message, ViewDrones):
@@ -153,7 +151,7 @@ class ViewBuffer:
             self.faults = message.faults
 
     def _store_cluster(self, cluster: str, view: ViewCluster) -> None:
-        """Keep a view, unless a controller of another scenario says it."""
+        """Store a view, unless it is from a controller of another scenario."""
         if self._variables.get(cluster) == view.names and len(view.value) == len(view.desired) == len(view.names):
             self.clusters[cluster] = view
         else:
@@ -163,7 +161,7 @@ class ViewBuffer:
         try:
             event = messages.decode(keys.EVENT, sample.payload)
         except DecodeError:
-            return  # somebody else's garbage
+            return  # not an event of the world
         if event.kind in ("command", "refused"):
             with self._arrived:
                 self._answers[_drone(event)] += 1

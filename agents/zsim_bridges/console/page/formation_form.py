@@ -166,8 +166,8 @@ class FormationForm:
             return False
         values = {name: self._ranges[name].to_si(value) for name, value in shown.items()}
         lasting = {"over_s": float(self._over.value)} if self._over.value > 0 else {}
-        said = ", ".join(f"{name} {value:g} {self._ranges[name].unit}" for name, value in shown.items())
-        self._client.request_cluster(self._cluster.name, "target", said=said, values=values, **lasting)
+        text = ", ".join(f"{name} {value:g} {self._ranges[name].unit}" for name, value in shown.items())
+        self._client.request_cluster(self._cluster.name, "target", shown=text, values=values, **lasting)
         return True
 
     def _button(self, gui: viser.GuiApi, label: str, op: str) -> None:

@@ -239,7 +239,7 @@ def test_a_run_that_stands_still_adds_nothing_to_the_rates():
     rates.update("d1", 0, {"gps": (0, 0)})
     for _ in range(1000):
         assert rates.update("d1", 500_000_000, {"gps": (5, 0)})["gps"] == pytest.approx(10.0)
-    assert len(rates._marks) == 2
+    assert len(rates._samples) == 2
 
 
 def test_rates_begin_anew_with_a_fresh_estimator():

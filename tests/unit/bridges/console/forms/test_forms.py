@@ -140,13 +140,13 @@ class FakeCommandClient:
 
     def __init__(self) -> None:
         self.asked: list[tuple[Any, ...]] = []
-        self.said: list[str] = []
+        self.shown: list[str] = []
 
     def request_world(self, op: str, **args: Any) -> None:
         self.asked.append(("world", op, args))
 
-    def request_cluster(self, cluster: str, op: str, said: str = "", **args: Any) -> None:
-        self.said.append(said)
+    def request_cluster(self, cluster: str, op: str, shown: str = "", **args: Any) -> None:
+        self.shown.append(shown)
         self.asked.append((cluster, op, args))
 
     def send_mode(self, drones: list[str], mode: str) -> None:
@@ -379,7 +379,7 @@ def test_sliders_follow_the_formation_but_for_those_that_somebody_moves(bench: B
 
 def test_people_are_told_of_targets_in_the_units_of_the_page(bench: Bench):
     bench.formation().request_target({"p": 5.0, "yaw": 180.0})
-    assert bench.desk.said == ["p 5 m, yaw 180 deg"]
+    assert bench.desk.shown == ["p 5 m, yaw 180 deg"]
 
 
 def test_a_move_lasts_as_long_as_is_asked_for(bench: Bench):
