@@ -201,7 +201,7 @@ class RunPage:
                 self._page.plots[name].history.add(drones.t_ns / 1e9, view.desired, view.value, true_c)
 
     def _camera_targets(self, drones: DronePoses) -> np.ndarray:
-        """Return the positions (n, 3) that cameras follow: of the formation, or of all drones where there are several."""
+        """Return the positions (n, 3) that cameras follow: of the formation, or of all drones."""
         members = next(iter(self._members.values())) if len(self._members) == 1 else slice(None)
         return drones.p_W[members][drones.present[members]]
 
@@ -217,7 +217,7 @@ class RunPage:
         )
         page.drones.content = html_tables.drone_table(self._table_rows.drone_rows())
         page.sensors.content = self._table_rows.sensor_table(page.drone_form.chosen)
-        page.acting.content = html_tables.fault_lines(self._table_rows.active_faults())
+        page.faults.content = html_tables.fault_lines(self._table_rows.active_faults())
         page.events.content = html_tables.event_table(list(self.views.events)[:EVENTS_SHOWN])
         if page.chosen:
             page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)

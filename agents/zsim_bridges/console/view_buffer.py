@@ -115,7 +115,7 @@ class ViewBuffer:
         return newest
 
     def _is_fresh(self, process: str, ahead_ns: int) -> bool:
-        """Return whether an estimator's view is of the time of the drones' view: in a fast run, both skip many gates."""
+        """Return whether an estimator's view is of the time of the drones' view; both skip gates."""
         seen_s = self._received_s.get(keys.VIEW_DRONES, 0.0) - self._received_s[keys.estimates_view(process)]
         return abs(ahead_ns) <= FRESH_S * 1e9 or abs(seen_s) <= FRESH_S
 

@@ -1,6 +1,6 @@
 """The AR.Drone as meshes, made of simple solids; B is x ahead, y left, z up, its origin at the centre of mass.
 
-Lengths are in metres; those that have no name are drawn by eye, and nothing is reckoned with them.
+Lengths are in metres; those that have no name are chosen for the looks, and used in no computation.
 """
 
 import math

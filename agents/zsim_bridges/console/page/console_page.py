@@ -1,7 +1,4 @@
-"""Curves of a formation's variables on the page: desired, estimated, true; only those that are chosen are sent.
-
-The page's controls and tables, each in its place.
-"""
+"""The page's panels: plots, forms and tables of one run."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -29,7 +26,7 @@ class VariablePlots:
     """Plots of one formation, three variables at a time.
 
     Args:
-        gui: viser's, in the place where they are to be.
+        gui: viser's, in the folder where they are to be.
         space: of the formation.
         ranges: of its variables.
     """
@@ -52,17 +49,17 @@ class VariablePlots:
             self._retitle()
         if first is None:
             return
-        for place, plot in enumerate(self._plots[: len(self._ranges) - first], start=first):
-            curves = self.history.curves(place, self._in_degrees[place])
+        for index, plot in enumerate(self._plots[: len(self._ranges) - first], start=first):
+            curves = self.history.curves(index, self._in_degrees[index])
             if len(curves[0]) > 1:
                 plot.data = curves
 
     def _retitle(self) -> None:
         shown = [] if self._first is None else self._ranges[self._first : self._first + PLOTS_SHOWN]
-        for place, plot in enumerate(self._plots):
-            plot.visible = place < len(shown)
+        for index, plot in enumerate(self._plots):
+            plot.visible = index < len(shown)
             if plot.visible:
-                plot.title = shown[place].label
+                plot.title = shown[index].label
                 plot.data = tuple(np.zeros(2) for _ in range(1 + len(SERIES)))
 
 
@@ -76,9 +73,9 @@ def _legend() -> str:
 
 def _plot(gui: viser.GuiApi, range_: SliderRange) -> Any:
     curves = [uplot.Series(label=n, stroke=c, width=1.5) for n, c in zip(SERIES, COLOURS, strict=True)]
-    none = tuple(np.array([0.0, 1.0]) for _ in range(1 + len(SERIES)))
+    empty = tuple(np.array([0.0, 1.0]) for _ in range(1 + len(SERIES)))
     return gui.add_uplot(
-        none,
+        empty,
         (uplot.Series(label="t [s]"), *curves),
         title=range_.label,
         height=HEIGHT_PX,
@@ -100,19 +97,19 @@ class ConsolePage:
     """The controls of one run, in two panels.
 
     Args:
-        gui: viser's; whatever another run has left on it goes.
+        gui: viser's; what another run has left on it is removed.
         scenario: names what there is.
         spaces: of its formations.
-        client: sends what is asked for.
-        report: told what is refused already here.
+        client: sends requests.
+        report: called with requests that are refused without being sent.
         show: shows or hides one of `SWITCHES` in the scene.
         rate: that the run was started with.
 
     Attributes:
-        clock, phases, drones, sensors, acting, events: what is told in words.
+        clock, phases, drones, sensors, faults, events: the tables.
         forms, plots: of each formation.
         chosen: the formation that is shown; empty where there is none.
-        drone_form: knows the drone that is chosen.
+        drone_form: has the chosen drone.
     """
 
     def __init__(
@@ -157,29 +154,29 @@ class ConsolePage:
         if self._spaces:
             self._formation_tabs(gui, tabs)
         with tabs.add_tab("Faults"):
-            self.acting = gui.add_html("")
+            self.faults = gui.add_html("")
             FaultForm(gui, self._client, self._report, self._scenario)
         with tabs.add_tab("Run"):
             RunForm(gui, self._client, self._rate)
             self._switches(gui)
 
     def _formation_tabs(self, gui: viser.GuiApi, tabs: Any) -> None:
-        """Give every formation its place in two tabs; only that of the chosen one is seen."""
+        """Give every formation a folder in two tabs; only that of the chosen one is visible."""
         fly, plots = tabs.add_tab("Fly"), tabs.add_tab("Plots")
         for cluster in self._scenario.clusters:
             name, space = cluster.name, self._spaces[cluster.name]
-            found = slider_ranges(space, cluster, self._scenario)
-            with fly, gui.add_folder(None, visible=name == self.chosen) as place:
-                self.forms[name] = FormationForm(gui, self._client, self._report, cluster, space, found)
-            with plots, gui.add_folder(None, visible=name == self.chosen) as other:
-                self.plots[name] = VariablePlots(gui, space, found)
-            self._folders[name] = [place, other]
+            limits = slider_ranges(space, cluster, self._scenario)
+            with fly, gui.add_folder(None, visible=name == self.chosen) as form_folder:
+                self.forms[name] = FormationForm(gui, self._client, self._report, cluster, space, limits)
+            with plots, gui.add_folder(None, visible=name == self.chosen) as plot_folder:
+                self.plots[name] = VariablePlots(gui, space, limits)
+            self._folders[name] = [form_folder, plot_folder]
 
     def _show_formation(self, chosen: str) -> None:
         self.chosen = chosen
-        for name, places in self._folders.items():
-            for place in places:
-                place.visible = name == chosen
+        for name, folders in self._folders.items():
+            for folder in folders:
+                folder.visible = name == chosen
 
     def _switches(self, gui: viser.GuiApi) -> None:
         for what, label in SWITCHES.items():

@@ -1,7 +1,4 @@
-"""A slider of a cluster variable: people move it, and the formation moves it along when nobody does.
-
-Steering of one formation: phases, sliders of its variables, trajectories.
-"""
+"""Controls of one formation: phases, sliders of its variables, trajectories."""
 
 import threading
 import time
@@ -18,11 +15,11 @@ from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page.operator_input import SliderRange, primary_variables
 from zsim_bridges.console.page.picture import SHAPED_PHASES
 
-STILL_S = 2.0  # wall; a formation whose goal has not moved for so long goes nowhere: the slider shows where it is to be
+STILL_S = 2.0  # wall; a formation whose goal has not changed for so long is not on its way: the slider shows its goal
 
 
 class _HeldValue(NamedTuple):
-    """Where a slider was put, where the formation was to be when that last changed, and when on the wall it did."""
+    """Value of a slider that was moved, the formation's newest goal, and since when it is the goal [s, wall]."""
 
     value: float
     goal: float
@@ -30,10 +27,10 @@ class _HeldValue(NamedTuple):
 
 
 class VariableSlider:
-    """One variable.
+    """A slider of one cluster variable, which follows the formation while the operator does not move it.
 
     Args:
-        gui: viser's, in the place where it is to be.
+        gui: viser's, in the folder where it is to be.
         range_: of the variable, in whose unit all values here are.
     """
 
@@ -48,22 +45,22 @@ class VariableSlider:
 
     @property
     def moved_s(self) -> float | None:
-        """When on the wall somebody moved it last, None once that has been taken."""
+        """When an operator moved it last [s, wall], None once the value has been popped."""
         moved = self._moved
         return None if moved is None else moved[1]
 
     def pop_value(self) -> float | None:
-        """Return where it was moved to, once; None where nobody has moved it."""
+        """Return the value to which it was moved, once; None where it was not moved."""
         with self._lock:
             moved, self._moved = self._moved, None
         return None if moved is None else moved[0]
 
     def hold(self, wall_s: float) -> None:
-        """Leave it where it was put while the formation goes there."""
+        """Keep its value while the formation goes there."""
         self._held = _HeldValue(float(self._slider.value), float("nan"), wall_s)
 
     def follow(self, goal: float, wall_s: float) -> None:
-        """Show where the formation is to be, a value [m, rad], unless it was moved and the formation is on its way."""
+        """Show the formation's goal [m, rad], unless it was moved and the formation is on its way."""
         shown = self.range.to_display(goal)
         if self._moved is None and not self._is_held(shown, wall_s):
             self._slider.value = shown
@@ -80,10 +77,10 @@ class VariableSlider:
 
     def _on_update(self, event: viser.GuiEvent[Any]) -> None:
         if event.client_id is None:
-            return  # by `follow`
+            return  # set by `follow`
         value = float(self._slider.value)
         with self._lock:
-            # A page takes a number from beyond the limits, and puts it to the nearest limit when its box is left.
+            # A page accepts a number beyond the limits, and sets it to the nearest limit when its field loses the focus.
             if self._out_of_range and value in (self.range.low, self.range.high):
                 self._out_of_range = False
                 return
@@ -91,7 +88,7 @@ class VariableSlider:
             self._moved = (value, time.monotonic())
 
 
-REST_S = 1.0  # wall; for so long sliders must rest before their values are sent: people type slowly
+REST_S = 1.0  # wall; sliders must rest for so long before their values are sent: people type slowly
 OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
 OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Land": "land"}
 ICONS = {
@@ -108,9 +105,9 @@ class FormationForm:
     """Controls of one formation.
 
     Args:
-        gui: viser's, in the place where they are to be.
-        client: sends what is asked for.
-        report: told what is refused already here.
+        gui: viser's, in the folder where they are to be.
+        client: sends requests.
+        report: called with requests that are refused without being sent.
         cluster: of the scenario.
         space: of the formation.
         ranges: of its variables.
@@ -141,7 +138,7 @@ class FormationForm:
         self._trajectories(gui, cluster.plan.trajectory)
 
     def refresh(self, view: ViewCluster | None, wall_s: float) -> None:
-        """Let the sliders that nobody moves follow the formation."""
+        """Let the sliders that were not moved follow the formation."""
         if view is None:
             return
         shown = view.desired if view.phase in SHAPED_PHASES else view.value
@@ -149,7 +146,7 @@ class FormationForm:
             slider.follow(shown[self._space.index(name)], wall_s)
 
     def send(self, wall_s: float) -> None:
-        """Ask for what the sliders that have come to rest show."""
+        """Request the values of the sliders that were moved, once all have come to rest."""
         moved_s = [slider.moved_s for slider in self._sliders.values()]
         if wall_s - max((at_s for at_s in moved_s if at_s is not None), default=wall_s) < REST_S:
             return
@@ -159,7 +156,7 @@ class FormationForm:
                 self._sliders[name].hold(wall_s)
 
     def request_target(self, shown: dict[str, float]) -> bool:
-        """Ask for values as they are shown; return whether they could be asked for."""
+        """Request values in the units of the page; return whether they are within their ranges."""
         refusals = [refusal for name, value in shown.items() if (refusal := self._ranges[name].refusal(value))]
         if refusals:
             self._report(RequestOutcome(f"{self._cluster.name}: target", "; ".join(refusals)))

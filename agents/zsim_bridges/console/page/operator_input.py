@@ -1,7 +1,4 @@
-"""How far each cluster variable may be moved by hand, and in what unit a person reads it. Pure.
-
-What an operator types into the page, as requests: trajectories, waypoints, parameters of a fault. Pure.
-"""
+"""Input of an operator: ranges of cluster variables, texts of trajectories, waypoints, fault parameters. Pure."""
 
 import math
 import re
@@ -13,7 +10,7 @@ from zsim.schema import yaml_file
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, unit
 
 SIDEWAYS_M = 50.0  # of the drones' starts, sideways; chosen: as far as a page shows a formation well
-HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # chosen: clear of the ground, and what an AR.Drone's owner would still see
+HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # chosen: clear of the ground, and within sight
 SIDE_MAX_M = 20.0  # of a formation; chosen
 DISPLACEMENT_M = 5.0  # of a robot from its place in a template; chosen
 TILT_MAX_DEG = 29.0  # of a formation; controllers take less than 30, reference_check.py
@@ -24,7 +21,7 @@ SHOWN_MAX = 16  # variables that a page shows one by one; of more, those of the 
 
 
 class SliderRange(NamedTuple):
-    """A variable as a person moves it.
+    """A cluster variable on a slider.
 
     Attributes:
         name: of the variable.
@@ -44,15 +41,15 @@ class SliderRange(NamedTuple):
 
     def to_display(self, value: float) -> float:
         """Return a value [m, rad] in the unit of the range, to its step, within it."""
-        found = math.degrees(math.remainder(value, math.tau)) if self.unit == "deg" else value
-        return min(max(round(round(found / self.step) * self.step, DIGITS), self.low), self.high)
+        shown = math.degrees(math.remainder(value, math.tau)) if self.unit == "deg" else value
+        return min(max(round(round(shown / self.step) * self.step, DIGITS), self.low), self.high)
 
     def to_si(self, shown: float) -> float:
-        """Return the value [m, rad] of what is shown."""
+        """Return a value in the unit of the range as [m, rad]."""
         return math.radians(shown) if self.unit == "deg" else shown
 
     def refusal(self, shown: float) -> str | None:
-        """Return why a value may not be asked for, None if it may."""
+        """Return why a value may not be requested, None if it may."""
         if not self.low <= shown <= self.high:
             return f"{self.name} is {shown:g} {self.unit}; must be from {self.low:g} to {self.high:g}"
         return None
@@ -91,7 +88,7 @@ def primary_variables(names: Sequence[str]) -> list[str]:
 
 
 class InputError(ValueError):
-    """What was typed cannot be understood; the message says where and what is allowed."""
+    """A text of the operator that cannot be parsed; the message says where and what is allowed."""
 
 
 def parse_expressions(text: str, names: tuple[str, ...]) -> dict[str, Any]:
@@ -100,7 +97,7 @@ def parse_expressions(text: str, names: tuple[str, ...]) -> dict[str, Any]:
     Raises:
         TypedError: a line is neither.
     """
-    found: dict[str, str] = {}
+    by_variable: dict[str, str] = {}
     constants: dict[str, float] = {}
     for number, line in _lines(text):
         name, sign, value = (part.strip() for part in line.partition("="))
@@ -108,15 +105,15 @@ def parse_expressions(text: str, names: tuple[str, ...]) -> dict[str, Any]:
             allowed = "VARIABLE = EXPRESSION, such as x_c = 5*cos(0.1*t)"
             raise InputError(f"line {number} is {line[:40]!r}; must be {allowed}")
         if name in names:
-            found[name] = value
+            by_variable[name] = value
         else:
             constants[name] = _number(value, f"line {number}: {name} is no variable, and as a constant")
-    if not found:
+    if not by_variable:
         raise InputError("trajectory is empty; must have a line VARIABLE = EXPRESSION at least")
     for name in constants:
-        if not any(re.search(rf"\b{re.escape(name)}\b", expression) for expression in found.values()):
+        if not any(re.search(rf"\b{re.escape(name)}\b", expression) for expression in by_variable.values()):
             raise InputError(f"{name} is no variable, nor used as a constant; variables are {', '.join(names)}")
-    return {"expressions": found, "constants": constants}
+    return {"expressions": by_variable, "constants": constants}
 
 
 def parse_waypoints(text: str) -> dict[str, Any]:
@@ -125,17 +122,17 @@ def parse_waypoints(text: str) -> dict[str, Any]:
     Raises:
         TypedError: a line is none.
     """
-    found = []
+    points = []
     for number, line in _lines(text):
         at, colon, rest = line.partition(":")
         pairs = [pair.partition("=") for pair in rest.split(",")]
         if not colon or not all(name.strip() and sign for name, sign, _ in pairs):
             raise InputError(f"line {number} is {line[:40]!r}; must be SECONDS: VARIABLE = VALUE, VARIABLE = VALUE, …")
         values = {name.strip(): _number(value, f"line {number}: {name.strip()}") for name, _, value in pairs}
-        found.append({"at_s": _number(at, f"line {number}: the time"), "values": values})
-    if not found:
+        points.append({"at_s": _number(at, f"line {number}: the time"), "values": values})
+    if not points:
         raise InputError("waypoints are empty; must have a line SECONDS: VARIABLE = VALUE at least")
-    return {"waypoints": found}
+    return {"waypoints": points}
 
 
 def parse_parameters(text: str, names: Collection[str]) -> dict[str, Any]:
@@ -144,17 +141,17 @@ def parse_parameters(text: str, names: Collection[str]) -> dict[str, Any]:
     Raises:
         TypedError: it is no such list, or names something that is not among `names`.
     """
-    given, allowed = f"parameters are {text[:40]!r}", "must be NAME: VALUE, NAME: VALUE, …"
+    where, allowed = f"parameters are {text[:40]!r}", "must be NAME: VALUE, NAME: VALUE, …"
     try:
-        found = yaml_file.value("{" + text + "}")
+        values = yaml_file.value("{" + text + "}")
     except ValueError as error:
-        raise InputError(f"{given}: {error}; {allowed}") from None
-    if not isinstance(found, dict) or not all(isinstance(name, str) for name in found) or None in found.values():
-        raise InputError(f"{given}; {allowed}")
-    for name in found:
+        raise InputError(f"{where}: {error}; {allowed}") from None
+    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values) or None in values.values():
+        raise InputError(f"{where}; {allowed}")
+    for name in values:
         if name not in names:
-            raise InputError(f"{given}; {name[:40]!r} is not known, allowed: {', '.join(names)}")
-    return found
+            raise InputError(f"{where}; {name[:40]!r} is not known, allowed: {', '.join(names)}")
+    return values
 
 
 def _lines(text: str) -> list[tuple[int, str]]:

@@ -1,11 +1,7 @@
-"""Where everything stands in a picture of the run: arrays from what eyes were told. Pure, without a page.
+"""The picture of a run as arrays: poses, ellipsoids, formations, trails and histories, from the newest views. Pure.
 
 Axes, units and quaternions as everywhere: W east, north, up; quaternions w first, body to world.
 
-
-Where drones have been: the last stretch of each one's way, as line segments. Pure.
-
-The cluster variables of the last minutes: desired, estimated and true, for plots. Pure.
 """
 
 import math
@@ -40,14 +36,14 @@ class DronePoses(NamedTuple):
 
     t_ns: int
     names: tuple[str, ...]
-    p_W: Array  # (N, 3) m; NaN of a drone of which nothing is said
+    p_W: Array  # (N, 3) m; NaN of a drone that is not in the view
     q_WB: Array  # (N, 4)
     rotor: Array  # (N, 4) rad/s
     wind_W: Array  # (3,) m/s, the mean over the drones
 
     @property
     def present(self) -> NDArray[np.bool_]:
-        """Return which drones are there, (N,)."""
+        """Return which drones are in the view, (N,)."""
         return np.isfinite(self.p_W[:, 0])
 
 
@@ -67,7 +63,7 @@ class FormationSide(NamedTuple):
 
 
 class FormationShape(NamedTuple):
-    """A formation as it truly stands."""
+    """A formation's true shape."""
 
     c: Array  # (4n,)
     p_c: Array  # (3,) m, its origin in W
@@ -80,9 +76,9 @@ def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
     """Return a view as arrays of the drones of those names, which may not all be in it: a replay has some alone."""
     count = len(names)
     p_W, q_WB, rotor = np.full((count, 3), np.nan), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1)), np.zeros((count, 4))
-    places = {name: i for i, name in enumerate(names)}
+    indices = {name: i for i, name in enumerate(names)}
     for drone in view.drones:
-        i = places.get(drone.name)
+        i = indices.get(drone.name)
         if i is not None:
             p_W[i], q_WB[i], rotor[i] = drone.position_m, drone.orientation_wxyz, drone.rotor_rad_s
     wind = np.mean(view.wind_m_s, axis=0) if view.wind_m_s else np.zeros(3)
@@ -90,7 +86,7 @@ def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
 
 
 def rotor_angles(angles: Array, rotor: Array, dt_s: float) -> Array:
-    """Return the angles (N, 4) [rad] to which rotors are drawn dt_s later: slowed down, so that eyes can follow."""
+    """Return the angles (N, 4) [rad] to which rotors are drawn dt_s later: slowed down to be visible."""
     return (angles + SPIN * rotor * (dt_s / ROTOR_SLOWDOWN)) % math.tau
 
 
@@ -111,7 +107,7 @@ def rotor_poses(drones: DronePoses, hubs_B: Array, angles: Array) -> tuple[Array
 
 
 def ellipsoids(estimates: Sequence[EstimateView]) -> Ellipsoids:
-    """Return where estimates believe their drones to be: ellipsoids of 2 sigma."""
+    """Return the ellipsoids of 2 sigma of estimates of position."""
     p = np.array([estimate.position_m for estimate in estimates]).reshape(-1, 3)
     P = np.array([estimate.covariance_m2 for estimate in estimates]).reshape(-1, 6)
     sigma_m, q = frames.principal_axes(P[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
@@ -155,24 +151,24 @@ SPACING_M = 0.08  # of two points: a sixth of a hull
 
 
 class DroneTrails:
-    """The ways of N drones.
+    """The trails of N drones: the last stretch of each one's path.
 
     Args:
         count: how many drones.
     """
 
     def __init__(self, count: int) -> None:
-        self._room = min(POINTS_OF_ONE, max(2, TRAIL_POINTS_MAX // count))
-        self._points = np.zeros((count, self._room, 3))
+        self._capacity = min(POINTS_OF_ONE, max(2, TRAIL_POINTS_MAX // count))
+        self._points = np.zeros((count, self._capacity, 3))
         self._lengths = np.zeros(count, dtype=np.int64)
 
     def add(self, p_W: Array) -> bool:
-        """Take positions (N, 3) [m], NaN of a drone that is not there; return whether any has moved on."""
+        """Add positions (N, 3) [m], NaN of a drone that is not in the view; return whether any has moved on."""
         last = self._points[np.arange(len(p_W)), np.maximum(self._lengths - 1, 0)]
         moved = (np.linalg.norm(p_W - last, axis=1) >= SPACING_M) | (self._lengths == 0)
         moved &= np.isfinite(p_W[:, 0])
         for i in np.flatnonzero(moved):
-            if self._lengths[i] == self._room:
+            if self._lengths[i] == self._capacity:
                 self._points[i, :-1] = self._points[i, 1:]
             else:
                 self._lengths[i] += 1
@@ -180,19 +176,19 @@ class DroneTrails:
         return bool(moved.any())
 
     def segments(self, p_W: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Return segments (M, 2, 3) up to where the drones are now, (N, 3), and whose each is (M,)."""
-        lines, whose = [np.zeros((0, 2, 3))], [np.zeros(0, dtype=np.int64)]
-        there = np.isfinite(p_W[:, 0])
+        """Return segments (M, 2, 3) up to where the drones are now, (N, 3), and the index of its drone, (M,)."""
+        lines, owners = [np.zeros((0, 2, 3))], [np.zeros(0, dtype=np.int64)]
+        present = np.isfinite(p_W[:, 0])
         for i, length in enumerate(self._lengths):
-            if not length or not there[i]:
+            if not length or not present[i]:
                 continue
             way = np.vstack((self._points[i, :length], p_W[i]))
             lines.append(np.stack((way[:-1], way[1:]), axis=1))
-            whose.append(np.full(len(way) - 1, i))
-        return np.concatenate(lines), np.concatenate(whose)
+            owners.append(np.full(len(way) - 1, i))
+        return np.concatenate(lines), np.concatenate(owners)
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Remove all points."""
         self._lengths[:] = 0
 
 
@@ -215,10 +211,10 @@ class VariableHistory:
         self._rows: deque[Array] = deque(maxlen=HISTORY_POINTS_MAX)
 
     def add(self, t_s: float, desired: Sequence[float] | None, value: Sequence[float], true: Array | None) -> bool:
-        """Take a point, unless the last one is hardly older; return whether it was taken.
+        """Add a point, unless the last one is hardly older; return whether it was added.
 
         Args:
-            t_s: simulated time; back in time, as a replay may go, everything is forgotten.
+            t_s: simulated time; back in time, as a replay may go, all points are removed.
             desired, value, true: (size,) each, m and rad; None for what is not known.
         """
         if self._times and t_s < self._times[-1]:
@@ -235,13 +231,13 @@ class VariableHistory:
             self._rows.popleft()
         return True
 
-    def curves(self, place: int, angular: bool) -> tuple[Array, ...]:
+    def curves(self, index: int, angular: bool) -> tuple[Array, ...]:
         """Return the times (M,) and the three curves (M,) of a variable, as `SERIES`; angles in degrees, wrapped.
 
         A curve is broken (NaN) where an angle goes round.
         """
         t = np.array(self._times)
-        table = np.array(self._rows)[:, :, place] if self._rows else np.zeros((0, 3))
+        table = np.array(self._rows)[:, :, index] if self._rows else np.zeros((0, 3))
         if angular:
             table = np.degrees(np.arctan2(np.sin(table), np.cos(table)))
             around = np.abs(np.diff(table, axis=0, prepend=table[:1])) > 180.0

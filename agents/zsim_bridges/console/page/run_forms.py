@@ -1,7 +1,4 @@
-"""Injecting faults, and clearing them: common ones by a button, all by their kind.
-
-Steering of the run's time, and of drones one by one or all together.
-"""
+"""Controls of the run's time, of drones one by one or all together, and of injected faults."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,17 +15,17 @@ DURATION_S = 30.0  # of a fault, unless another time is typed
 WEAK_THRUST_SHARE = 0.7  # share of thrust of a weak motor: less, and the aircraft cannot be held level
 GUST_M_S = (4.0, 0.0, 0.0)  # about what the drones of the formation can still hold against
 LOSS_PROBABILITY = 0.3
-TIME_PARAMETERS = ("at_s", "for_s")  # s, simulated; what any fault may be given beside its own parameters
+TIME_PARAMETERS = ("at_s", "for_s")  # s, simulated; of any fault, beside its own parameters
 
 
 class FaultForm:
     """Controls of faults.
 
     Args:
-        gui: viser's, in the place where they are to be.
-        client: sends what is asked for.
-        report: told what is refused already here.
-        scenario: names what there is.
+        gui: viser's, in the folder where they are to be.
+        client: sends requests.
+        report: called with requests that are refused without being sent.
+        scenario: has the drones and processes.
     """
 
     def __init__(
@@ -61,8 +58,8 @@ class FaultForm:
         self._add(kind, self._drone.value, **parameters)
 
     def _add(self, kind: str, target: str, **parameters: Any) -> None:
-        lasting = {"for_s": float(self._for.value)} if self._for.value > 0 and KINDS[kind].lasts != "once" else {}
-        self._client.request_world("fault_add", kind=kind, target=target, **{**lasting, **parameters})
+        duration = {"for_s": float(self._for.value)} if self._for.value > 0 and KINDS[kind].lasts != "once" else {}
+        self._client.request_world("fault_add", kind=kind, target=target, **{**duration, **parameters})
 
     def _any_fault(self, gui: viser.GuiApi, names: list[str]) -> None:
         with gui.add_folder("Any fault", expand_by_default=False):
@@ -87,10 +84,10 @@ class FaultForm:
 
 
 def _help(kind: str) -> str:
-    """Return what a kind does and takes."""
-    found = KINDS[kind]
-    lines = [f"`{p.name}` {p.said}{f' [{p.unit}]' if p.unit else ''}" for p in found.parameters]
-    return f"<sub>{found.said}; strikes a {found.strikes}. {'; '.join(lines)}</sub>"
+    """Return a kind's effect and parameters."""
+    fault = KINDS[kind]
+    lines = [f"`{p.name}` {p.said}{f' [{p.unit}]' if p.unit else ''}" for p in fault.parameters]
+    return f"<sub>{fault.said}; strikes a {fault.strikes}. {'; '.join(lines)}</sub>"
 
 
 PINNED = """<style>
@@ -101,11 +98,11 @@ FLEET = {"Take off all": "takeoff", "Land all": "land"}  # an operation of a for
 
 
 class RunForm:
-    """Pause, go on, single steps, rate.
+    """Pause, resume, single steps, rate.
 
     Args:
-        gui: viser's, in the place where they are to be.
-        client: sends what is asked for.
+        gui: viser's, in the folder where they are to be.
+        client: sends requests.
         rate: that the run was started with.
     """
 
@@ -127,8 +124,8 @@ class FleetForm:
     Formations take off and land by their controllers, drones of none each by itself.
 
     Args:
-        gui: viser's, in the place where they are to be.
-        client: sends what is asked for.
+        gui: viser's, in the folder where they are to be.
+        client: sends requests.
         scenario: names the drones and formations.
     """
 
@@ -136,27 +133,27 @@ class FleetForm:
         self._client = client
         self._formations = [cluster.name for cluster in scenario.clusters]
         in_formation = {name for cluster in scenario.clusters for name in cluster.drones}
-        everybody = [drone.name for drone in scenario.drones]
-        self._single = [name for name in everybody if name not in in_formation]
+        drones = [drone.name for drone in scenario.drones]
+        self._single = [name for name in drones if name not in in_formation]
         stop = gui.add_button("EMERGENCY – all rotors stop", color="red", icon=viser.Icon.ALERT_OCTAGON)
-        stop.on_click(lambda _: client.send_mode(everybody, "emergency"))
+        stop.on_click(lambda _: client.send_mode(drones, "emergency"))
         gui.add_html(PINNED)
         both = gui.add_button_group("all drones", list(FLEET))
-        both.on_click(lambda _: self._ask(FLEET[both.value]))
+        both.on_click(lambda _: self._request_all(FLEET[both.value]))
 
-    def _ask(self, what: str) -> None:
+    def _request_all(self, operation: str) -> None:
         for name in self._formations:
-            self._client.request_cluster(name, what)
+            self._client.request_cluster(name, operation)
         if self._single:
-            self._client.send_mode(self._single, what)
+            self._client.send_mode(self._single, operation)
 
 
 class DroneForm:
     """Take-off, landing and emergency of one drone.
 
     Args:
-        gui: viser's, in the place where they are to be.
-        client: sends what is asked for.
+        gui: viser's, in the folder where they are to be.
+        client: sends requests.
         scenario: names the drones.
     """
 

@@ -1,7 +1,4 @@
-"""Cameras: where they begin, and those that go with the formation, each as its own page wants it.
-
-The scene of the page: nodes of viser, and what is pushed into them; only what has changed is pushed.
-"""
+"""The scene of the page: viser's nodes and cameras; only what has changed is sent."""
 
 import math
 import threading
@@ -17,12 +14,12 @@ from zsim_bridges.console.page import airframe
 from zsim_bridges.console.page.picture import Array, DronePoses, Ellipsoids, FormationShape, rotor_angles, rotor_poses
 
 OFFSET_M = np.array([-2.3, -3.9, 1.7])  # of a camera, from what it looks at, where that is not larger than EXTENT_M
-EXTENT_M = 2.0  # from its middle
-DEADBAND_M = 0.25  # a shorter way of what is followed does not move the camera: pictures then need not be drawn anew
+EXTENT_M = 2.0  # from its centre
+DEADBAND_M = 0.25  # a shorter move does not move the camera: pictures then need not be drawn anew
 
 
 class CameraFollow:
-    """Knows the pages that are open.
+    """Cameras of all pages: where they begin, and which follow the formation, as each page chooses.
 
     Args:
         server: viser's.
@@ -36,7 +33,7 @@ class CameraFollow:
         self._server = server
         self._lock = threading.Lock()
         self._switches: dict[int, tuple[viser.ClientHandle, Any]] = {}
-        self._places: dict[int, Array] = {}
+        self._targets: dict[int, Array] = {}
         self._centre: Array = np.zeros(3)
         self._offset: Array = OFFSET_M
         self._aimed = False
@@ -44,11 +41,11 @@ class CameraFollow:
         server.on_client_disconnect(self._on_disconnect)
 
     def restart(self) -> None:
-        """Let all cameras look at what is to be seen first: another run may fly elsewhere."""
+        """Aim all cameras anew at the first picture: another run may fly elsewhere."""
         self._aimed = False
 
     def set_target(self, p_W: Array) -> None:
-        """Let the cameras of pages to come look at what stands at some places (n, 3) [m], unless there is nothing."""
+        """Aim the cameras of later pages at positions (n, 3) [m], unless there are none."""
         if not len(p_W):
             return
         self._centre = p_W.mean(axis=0)
@@ -56,7 +53,7 @@ class CameraFollow:
         self._offset = OFFSET_M * max(1.0, extent_m / EXTENT_M)
 
     def follow(self, p_W: Array) -> None:
-        """Move the cameras that follow what now stands at some places (n, 3) [m]."""
+        """Move the cameras that follow the positions (n, 3) [m]."""
         self.set_target(p_W)
         centre = self._centre
         with self._lock:
@@ -70,14 +67,14 @@ class CameraFollow:
                 _aim(client, centre, client.camera.position - client.camera.look_at)
 
     def _moves(self, number: int, follows: bool, centre: Array) -> bool:
-        """Tell whether a page's camera goes to a place, and note that it does."""
+        """Return whether a page's camera has to move, and store where to."""
         with self._lock:
             if not follows:
-                self._places.pop(number, None)
-            near = np.linalg.norm(centre - self._places.get(number, np.full(3, np.inf))) <= DEADBAND_M
+                self._targets.pop(number, None)
+            near = np.linalg.norm(centre - self._targets.get(number, np.full(3, np.inf))) <= DEADBAND_M
             if not follows or near or number not in self._switches:
                 return False
-            self._places[number] = centre
+            self._targets[number] = centre
             return True
 
     def _on_connect(self, client: viser.ClientHandle) -> None:
@@ -88,12 +85,12 @@ class CameraFollow:
             self._switches[client.client_id] = (client, switch)
             self.switches.add(switch._impl.uuid)
         if client.client_id not in self._server.get_clients():
-            self._on_disconnect(client)  # it went while it came
+            self._on_disconnect(client)  # it has disconnected meanwhile
 
     def _on_disconnect(self, client: viser.ClientHandle) -> None:
         with self._lock:
             _, switch = self._switches.pop(client.client_id, (None, None))
-            self._places.pop(client.client_id, None)
+            self._targets.pop(client.client_id, None)
             if switch is not None:
                 self.switches.discard(switch._impl.uuid)
 
@@ -109,23 +106,23 @@ TRAIL_COLOURS = np.array(
     [(25, 113, 194), (232, 137, 12), (47, 158, 68), (156, 54, 181), (224, 49, 49), (12, 133, 153)], np.uint8
 )
 SOLID = (134, 142, 150)
-GHOST, BALL, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
+GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
 FIELD_M = 150.0  # half a side of the ground
 GREEN = (206, 219, 196)
 WIND_M_PER_M_S = 0.5  # length of the arrow
 WIND_MIN_M_S = 0.05  # below it no arrow
 WIND_ABOVE_M = 1.5  # of the arrow over the highest drone
 LABEL_B = np.array([0.0, 0.0, 0.32])  # m; of a name over its drone
-MIDDLE = "center-center"  # of a label, where it is written
+MIDDLE = "center-center"  # of a label
 LABELS_MAX = 3  # p, q and beta
-HIDDEN = (0.0, 0.0, -1000.0)  # m; where what is not there is put, since instances cannot be hidden one by one
+HIDDEN = (0.0, 0.0, -1000.0)  # m; position of instances that are not shown, since they cannot be hidden one by one
 
 
 class SceneNodes:
-    """What is drawn of a run.
+    """The nodes of one run.
 
     Args:
-        server: viser's.
+        server: viser's; what another run has left on it is removed.
         names: of the drones.
         robots: how many drones are in formations, and so have a ghost.
         clusters: how many formations there are.
@@ -146,7 +143,7 @@ class SceneNodes:
         self._airframes: Any = self._scene.add_batched_glb("/drones", airframe.coloured(), q, p, lod="off")
         self._rotors = self._batch("/rotors", airframe.rotor(), 4 * len(names), airframe.COLOURS["rotor"])
         self._ghosts = self._batch("/ghosts", airframe.whole(), robots, GHOST, opacity=0.5) if robots else None
-        self._balls = self._batch("/estimates", airframe.ball(), len(names), BALL, opacity=0.35)
+        self._ellipsoids = self._batch("/estimates", airframe.ball(), len(names), ELLIPSOID, opacity=0.35)
         self._names = self._labels(names)
         self._wind = self._scene.add_arrows(
             "/wind", np.array([[(0, 0, 0), (1, 0, 0)]], float), WIND, shaft_radius=0.035, head_radius=0.1,
@@ -156,7 +153,7 @@ class SceneNodes:
         self._shapes = _FormationNodes(self._scene, clusters) if clusters else None
 
     def obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Draw what drones can run into: boxes, cylinders and spheres of the scenario."""
+        """Draw the obstacles of the scenario: boxes, cylinders and spheres."""
         for each in obstacles:
             x, y, z = each.position_m
             turn = math.radians(each.yaw_deg) / 2
@@ -172,7 +169,7 @@ class SceneNodes:
                 self._scene.add_icosphere(name, radius=each.radius_m or 0.0, position=(x, y, z), **look)
 
     def drones(self, drones: DronePoses, dt_s: float) -> None:
-        """Put the drones where they are; their rotors have turned for dt_s."""
+        """Move the drones; their rotors have turned for dt_s."""
         drones = drones._replace(p_W=np.where(drones.present[:, None], drones.p_W, HIDDEN))
         self._airframes.batched_positions, self._airframes.batched_wxyzs = drones.p_W, drones.q_WB
         self._angles = rotor_angles(self._angles, drones.rotor, dt_s)
@@ -181,38 +178,42 @@ class SceneNodes:
             label.position = p_W + LABEL_B
 
     def wind(self, drones: DronePoses) -> None:
-        """Let the arrow show the wind, above the drones."""
+        """Set the arrow of the wind, above the drones."""
         speed = float(np.linalg.norm(drones.wind_W))
-        there = drones.p_W[drones.present]
-        blows = speed >= WIND_MIN_M_S and len(there) > 0
+        present = drones.p_W[drones.present]
+        blows = speed >= WIND_MIN_M_S and len(present) > 0
         self._wind.visible = self._wind_label.visible = blows
         if blows:
-            start = np.array([*there[:, :2].mean(axis=0), there[:, 2].max() + WIND_ABOVE_M])
+            start = np.array([*present[:, :2].mean(axis=0), present[:, 2].max() + WIND_ABOVE_M])
             self._wind.points = np.array([[start, start + WIND_M_PER_M_S * drones.wind_W]])
             self._wind_label.position, self._wind_label.text = start, f"wind {speed:.1f} m/s"
 
-    def estimates(self, balls: Ellipsoids) -> None:
-        """Put the ellipsoids where estimators believe the drones to be."""
-        p, q, half_m = _padded(self._count, balls.p_W, balls.wxyz)
-        half_m[: len(balls.half_m)] = balls.half_m
-        self._balls.batched_positions, self._balls.batched_wxyzs, self._balls.batched_scales = p, q, half_m
+    def estimates(self, ellipsoids: Ellipsoids) -> None:
+        """Move the ellipsoids of the estimates."""
+        p, q, half_m = _padded(self._count, ellipsoids.p_W, ellipsoids.wxyz)
+        half_m[: len(ellipsoids.half_m)] = ellipsoids.half_m
+        self._ellipsoids.batched_positions, self._ellipsoids.batched_wxyzs, self._ellipsoids.batched_scales = (
+            p,
+            q,
+            half_m,
+        )
 
     def ghosts(self, p_W: Array, q: Array) -> None:
-        """Put the ghosts of the formations where they are to be; what is missing is hidden."""
+        """Move the ghosts of the formations to their desired positions; missing ones are hidden."""
         if self._ghosts is not None:
-            places, turns, _ = _padded(len(self._ghosts.batched_positions), p_W, q)
-            self._ghosts.batched_positions, self._ghosts.batched_wxyzs = places, turns
+            positions, attitudes, _ = _padded(len(self._ghosts.batched_positions), p_W, q)
+            self._ghosts.batched_positions, self._ghosts.batched_wxyzs = positions, attitudes
 
     def shapes(self, shapes: Sequence[FormationShape | None], chosen: int) -> None:
         """Draw the frames and triangles of all formations, and the figures of the chosen one."""
         if self._shapes is not None:
             self._shapes.show(shapes, chosen)
 
-    def trails(self, segments: Array, whose: NDArray[np.int64]) -> None:
-        """Draw the ways of the drones."""
-        if not len(segments):  # after a replay went back, the old ones must go
-            segments, whose = np.tile(HIDDEN, (1, 2, 1)), np.zeros(1, dtype=np.int64)
-        colours = np.repeat(TRAIL_COLOURS[whose % len(TRAIL_COLOURS)][:, None], 2, axis=1)
+    def trails(self, segments: Array, owners: NDArray[np.int64]) -> None:
+        """Draw the drones' trails."""
+        if not len(segments):  # after a replay went back, the old ones must be removed
+            segments, owners = np.tile(HIDDEN, (1, 2, 1)), np.zeros(1, dtype=np.int64)
+        colours = np.repeat(TRAIL_COLOURS[owners % len(TRAIL_COLOURS)][:, None], 2, axis=1)
         if self._trail_node is None:
             self._trail_node = self._scene.add_line_segments(
                 "/trails", segments, colours, thickness=2.0, thickness_units="screen", visible=self._trails_shown
@@ -223,7 +224,7 @@ class SceneNodes:
     def show(self, what: str, visible: bool) -> None:
         """Show or hide ghosts, estimates or trails."""
         self._trails_shown = visible if what == "trails" else self._trails_shown
-        node = {"ghosts": self._ghosts, "estimates": self._balls, "trails": self._trail_node}[what]
+        node = {"ghosts": self._ghosts, "estimates": self._ellipsoids, "trails": self._trail_node}[what]
         if node is not None:
             node.visible = visible
 
@@ -266,10 +267,10 @@ class _FormationNodes:
         ]
 
     def show(self, shapes: Sequence[FormationShape | None], chosen: int) -> None:
-        there = [shape for shape in shapes if shape is not None]
-        p_W, q = np.array([s.p_c for s in there]).reshape(-1, 3), np.array([s.q_WC for s in there]).reshape(-1, 4)
+        shown = [shape for shape in shapes if shape is not None]
+        p_W, q = np.array([s.p_c for s in shown]).reshape(-1, 3), np.array([s.q_WC for s in shown]).reshape(-1, 4)
         self._frames.batched_positions, self._frames.batched_wxyzs, _ = _padded(len(shapes), p_W, q)
-        self._draw(np.array([side.ends_W for shape in there for side in shape.sides]).reshape(-1, 2, 3))
+        self._draw(np.array([side.ends_W for shape in shown for side in shape.sides]).reshape(-1, 2, 3))
         self._write(shapes[chosen])
 
     def _draw(self, points: Array) -> None:
@@ -288,7 +289,7 @@ class _FormationNodes:
 
 
 def _padded(count: int, p_W: Array, q: Array) -> tuple[Array, Array, Array]:
-    """Return places (count, 3), attitudes (count, 4) and scales (count, 3) of which the first are as given."""
-    places, turns = np.tile(np.array(HIDDEN), (count, 1)), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
-    places[: len(p_W)], turns[: len(q)] = p_W, q
-    return places, turns, np.ones((count, 3))
+    """Return positions (count, 3), attitudes (count, 4) and scales (count, 3); beyond p_W and q they are hidden."""
+    positions, attitudes = np.tile(np.array(HIDDEN), (count, 1)), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
+    positions[: len(p_W)], attitudes[: len(q)] = p_W, q
+    return positions, attitudes, np.ones((count, 3))

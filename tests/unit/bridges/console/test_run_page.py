@@ -289,7 +289,7 @@ def test_a_page_that_went_before_it_was_known_is_forgotten():
     assert followers.switches == set()
     gone.switch.value = True
     followers.follow(np.array([(10.0, 0.0, 2.0)]))
-    assert followers._places == {}
+    assert followers._targets == {}
 
 
 def test_cameras_follow_where_their_page_says_so():
@@ -310,7 +310,7 @@ def test_cameras_follow_where_their_page_says_so():
     assert other.camera.look_at.tolist() == [30.0, 0.0, 2.0]
     calls["go"](one)
     assert followers.switches == {"u2"}
-    assert followers._places == {}
+    assert followers._targets == {}
 
 
 def test_what_formations_were_asked_for_is_among_the_events_and_refusals_on_every_page(seen: Seen):
