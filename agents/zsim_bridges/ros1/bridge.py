@@ -19,12 +19,12 @@ from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.onboard import warm_up
 
 POLL_S = 0.1  # how often a stop is looked for
-REPORTED_MAX = 1000  # refusals remembered, so that each is told once
+REPORTED_MAX = 1000  # texts remembered, so that each is printed once
 Say = Callable[[str], None]
 
 
 class NodeShutdownError(RunError):
-    """A ROS node, or the master, asked this node to stop."""
+    """A ROS node, or the master, has asked this node to stop."""
 
 
 def serve(
@@ -42,13 +42,13 @@ def serve(
         link: an open session.
         info: of the run.
         observer: of this process in it.
-        stopped: asked now and then; True ends it.
-        say: told what a person should know.
+        stopped: called now and then; True ends the run.
+        say: prints a line.
         master_uri: of the ROS master.
-        host: name or address under which ROS nodes reach us.
+        host: name or address under which ROS nodes reach this host.
 
     Raises:
-        DismissedError: ROS asked this node to stop.
+        NodeShutdownError: ROS asked this node to stop.
         RunError: two drones have the same name in ROS.
     """
     warm_up()
@@ -76,7 +76,7 @@ class Bridge:
         self._drones = {drone.name: DroneTopics(node, drone, observer.name, link.put, tf) for drone in drones}
 
     async def run(self, stopped: Callable[[], bool]) -> None:
-        """Pass on both ways until the run is over, or we are to stop."""
+        """Forward messages both ways until the run is over or a stop is requested."""
         intake = Intake(self._link, self._info, self._observer.health, asyncio.get_running_loop())
         try:
             async with self._node.running():
@@ -95,14 +95,14 @@ class Bridge:
             await asyncio.sleep(0)  # let connections have their turn
 
     def forward(self, key: str, payload: bytes) -> None:
-        """Take what has passed the world, and pass on what follows from it."""
-        kind, whose, what = keys.parts(key)
+        """Convert and publish a message that has passed the world."""
+        kind, thing, leaf = keys.parts(key)
         if key == keys.CLOCK:
             self._on_clock(payload)
         elif key == keys.EVENT:
             self._on_event(payload)
-        elif kind == "drone" and whose in self._drones and not what.startswith("cmd/"):
-            self._publish(whose, key, payload)
+        elif kind == "drone" and thing in self._drones and not leaf.startswith("cmd/"):
+            self._publish(thing, key, payload)
 
     def _publish(self, drone: str, key: str, payload: bytes) -> None:
         message = self._decoded(key, payload)
@@ -122,34 +122,33 @@ class Bridge:
             return None
 
     def _on_clock(self, payload: bytes) -> None:
-        self._observer.update_clock(payload)
-        clock = self._decoded(keys.CLOCK, payload)
+        clock = self._observer.update_clock(payload)
         if clock is not None:
             self._clock.publish(lambda _: conversions.clock(clock))
 
     def _on_event(self, payload: bytes) -> None:
-        """Tell what the world refuses of what ROS nodes ask."""
+        """Print which commands of ROS nodes the world refuses."""
         event = self._decoded(keys.EVENT, payload)
         if event is None or (event.kind, event.source) != ("refused", self._observer.name):
             return
         self._report_once(f"{event.subject}: {event.data.get('reason', event.text)}")
 
     def _report_once(self, reason: str) -> None:
-        """Say something once."""
+        """Print a reason, once."""
         if reason not in self._reported and len(self._reported) < REPORTED_MAX:
             self._reported.add(reason)
             self._say(f"{self._observer.name}: {reason}")
 
 
 def check_names(drones: Iterable[str]) -> None:
-    """Refuse drones that ROS cannot tell from each other.
+    """Refuse drones that would have the same name in ROS.
 
     Raises:
-        RunError: two have the same name there.
+        RunError: two have the same name in ROS.
     """
-    found: dict[str, str] = {}
+    drone_of: dict[str, str] = {}
     for drone in drones:
         name = ros_frames.ros1_name(drone)
-        if name in found:
-            raise RunError(f"drones {found[name]!r} and {drone!r} are both {name!r} in ROS; rename one")
-        found[name] = drone
+        if name in drone_of:
+            raise RunError(f"drones {drone_of[name]!r} and {drone!r} are both {name!r} in ROS; rename one")
+        drone_of[name] = drone

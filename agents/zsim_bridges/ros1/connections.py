@@ -1,9 +1,4 @@
-"""A topic that we publish: each subscriber has a bounded queue of its own.
-
-A topic that we take: a connection to every node that publishes it, made again when it breaks.
-
-A service without arguments that we offer.
-"""
+"""TCPROS connections of a node: topics that it publishes, topics that it subscribes to, and services."""
 
 import asyncio
 import contextlib
@@ -17,7 +12,7 @@ from zsim_bridges.ros1 import master_api, tcpros
 
 
 class SubscriberLink:
-    """One subscriber's connection; a full queue loses the oldest.
+    """The connection of one subscriber; a full queue loses the oldest message.
 
     Attributes:
         caller: name of the subscriber's node.
@@ -34,13 +29,13 @@ class SubscriberLink:
         self.lost = 0
 
     def put(self, framed: bytes) -> None:
-        """Take a message; never waits."""
+        """Queue a message; never waits."""
         self.lost += len(self._queue) == self._queue.maxlen
         self._queue.append(framed)
         self._news.set()
 
     async def run(self) -> None:
-        """Send what is put, until the connection ends."""
+        """Send queued messages, until the connection ends."""
         with contextlib.suppress(*tcpros.CONNECTION_ERRORS):
             while True:
                 await self._news.wait()
@@ -53,48 +48,48 @@ class SubscriberLink:
 
 
 class PublishedTopic:
-    """One topic.
+    """A topic that the node publishes.
 
     Args:
-        offer: name, type and definition.
+        topic_type: name, type and definition.
         queue_size: messages that a slow subscriber may be behind.
 
     Attributes:
-        outlets: who subscribes.
-        count: messages published.
+        links: its subscribers.
+        sent: messages published.
     """
 
-    def __init__(self, offer: tcpros.TopicType, queue_size: int) -> None:
-        self.offer = offer
+    def __init__(self, topic_type: tcpros.TopicType, queue_size: int) -> None:
+        self.topic_type = topic_type
         self._queue_size = queue_size
         self.links: list[SubscriberLink] = []
         self.sent = 0
 
     def publish(self, make: Callable[[int], Any]) -> None:
-        """Send the message that `make` returns for a sequence number; it is asked only where somebody listens."""
+        """Send the message that `make` returns for a sequence number; it is called only where there are subscribers."""
         if not self.links:
             return
-        framed = tcpros.frame(tcpros.serialize(self.offer.type, make(self.sent)))
+        framed = tcpros.frame(tcpros.serialize(self.topic_type.type, make(self.sent)))
         self.sent += 1
-        for outlet in self.links:
-            outlet.put(framed)
+        for link in self.links:
+            link.put(framed)
 
     async def serve(self, reader: StreamReader, writer: StreamWriter, header: Mapping[str, str], caller: str) -> None:
         """Serve a subscriber whose header has come until it goes; `caller` is this node's name."""
-        refusal = tcpros.mismatch(self.offer, header, caller)
+        refusal = tcpros.mismatch(self.topic_type, header, caller)
         if refusal:
             await tcpros.send_error(writer, refusal)
             return
         tcpros.configure(writer, header.get("tcp_nodelay") == "1")
-        writer.write(tcpros.encode_header(tcpros.publisher_header(self.offer, caller)))
-        outlet = SubscriberLink(writer, header["callerid"], self._queue_size)
-        sender = asyncio.create_task(outlet.run())
-        self.links.append(outlet)
+        writer.write(tcpros.encode_header(tcpros.publisher_header(self.topic_type, caller)))
+        link = SubscriberLink(writer, header["callerid"], self._queue_size)
+        sender = asyncio.create_task(link.run())
+        self.links.append(link)
         try:
             while await reader.read(4096):
-                pass  # a subscriber has nothing more to say
+                pass  # a subscriber sends nothing more
         finally:
-            self.links.remove(outlet)
+            self.links.remove(link)
             sender.cancel()
 
 
@@ -102,29 +97,29 @@ RETRY_S, RETRY_MAX_S = 0.5, 8.0  # wall time between attempts, doubling
 
 
 class RefusedError(ValueError):
-    """A publisher that speaks of something else."""
+    """A publisher of another type."""
 
 
 class SubscribedTopic:
-    """One topic.
+    """A topic that the node subscribes to: a connection to each publisher, made again when it breaks.
 
     Args:
-        offer: name, type and definition.
+        topic_type: name, type and definition.
         caller: this node's name.
-        take: takes each message; raises ValueError for one that it refuses.
-        say: told of every publisher once that it is refused.
+        callback: called with each message; raises ValueError for one that it refuses.
+        say: prints once for each publisher that it is refused.
 
     Attributes:
-        connected: callers that publish, by their slave API's URI.
+        connected: names of connected publishers, by their slave API's URI.
         refused: messages.
     """
 
     def __init__(
-        self, offer: tcpros.TopicType, caller: str, take: Callable[[Any], None], say: Callable[[str], None]
+        self, topic_type: tcpros.TopicType, caller: str, callback: Callable[[Any], None], say: Callable[[str], None]
     ) -> None:
-        self.offer = offer
+        self.topic_type = topic_type
         self._caller = caller
-        self._callback = take
+        self._callback = callback
         self._say = say
         self._wanted: set[str] = set()
         self._tasks: dict[str, Task[None]] = {}
@@ -135,7 +130,8 @@ class SubscribedTopic:
     def update(self, publishers: Iterable[str], only: bool = True) -> None:
         """Follow these publishers, given by the URIs of their slave APIs; `only` them, or these too.
 
-        What a publisher said before it left the graph may still be on its way, so its connection is read to the end.
+        A publisher's messages from before it left the graph may still be on their way, so its connection is read to the
+        end.
         """
         self._wanted = set(publishers) | (set() if only else self._wanted)
         for uri in self._wanted - set(self._tasks):
@@ -144,7 +140,7 @@ class SubscribedTopic:
             self._tasks.pop(uri).cancel()
 
     async def close(self) -> None:
-        """Follow nobody any more."""
+        """Close all connections."""
         tasks = list(self._tasks.values())
         for task in tasks:
             task.cancel()
@@ -168,9 +164,9 @@ class SubscribedTopic:
 
     @contextlib.asynccontextmanager
     async def _connection(self, uri: str) -> AsyncIterator[StreamReader]:
-        """Yield what a publisher sends after its header."""
-        ask = [self._caller, self.offer.name, [["TCPROS"]]]
-        answer = await asyncio.to_thread(master_api.call_api, uri, "requestTopic", *ask)
+        """Yield the stream of a publisher after its header."""
+        arguments = [self._caller, self.topic_type.name, [["TCPROS"]]]
+        answer = await asyncio.to_thread(master_api.call_api, uri, "requestTopic", *arguments)
         protocol, host, port = answer
         if protocol != "TCPROS":
             raise RefusedError(f"speaks {str(protocol)[:20]!r}; must be TCPROS")
@@ -185,9 +181,9 @@ class SubscribedTopic:
     async def _shake_hands(self, reader: StreamReader, writer: StreamWriter) -> str:
         """Exchange headers; return the publisher's name."""
         tcpros.configure(writer, True)
-        writer.write(tcpros.encode_header(tcpros.subscriber_header(self.offer, self._caller)))
+        writer.write(tcpros.encode_header(tcpros.subscriber_header(self.topic_type, self._caller)))
         header = await tcpros.read_header(reader)
-        error = header.get("error") or tcpros.mismatch(self.offer, {"callerid": "?", **header}, self._caller)
+        error = header.get("error") or tcpros.mismatch(self.topic_type, {"callerid": "?", **header}, self._caller)
         if error:
             raise RefusedError(error[:300])
         return header.get("callerid", "?")
@@ -196,47 +192,47 @@ class SubscribedTopic:
         while True:
             data = await tcpros.read_frame(reader)
             try:
-                self._callback(tcpros.deserialize(self.offer.type, data))
+                self._callback(tcpros.deserialize(self.topic_type.type, data))
             except (ValueError, ZsimError) as error:
                 self.refused += 1
                 self._report_once(uri, str(error))
 
-    def _report_once(self, uri: str, what: str) -> None:
+    def _report_once(self, uri: str, reason: str) -> None:
         if uri not in self._reported:
             self._reported.add(uri)
-            self._say(f"{self.offer.name}: what {self.connected.get(uri, uri)} sends is refused: {what}")
+            self._say(f"{self.topic_type.name}: what {self.connected.get(uri, uri)} sends is refused: {reason}")
 
 
 DONE, FAILED = b"\x01", b"\x00"
 
 
 class EmptyService:
-    """One service of type std_srvs/Empty.
+    """A service of the node of type std_srvs/Empty.
 
     Args:
-        offer: name and type.
-        act: does what is asked for; returns why not, None where it is done.
+        topic_type: name and type.
+        act: executes a request; returns why it failed, None where it did not.
     """
 
-    def __init__(self, offer: tcpros.TopicType, act: Callable[[], str | None]) -> None:
-        self.offer = offer
+    def __init__(self, topic_type: tcpros.TopicType, act: Callable[[], str | None]) -> None:
+        self.topic_type = topic_type
         self._act = act
 
     async def serve(self, reader: StreamReader, writer: StreamWriter, header: Mapping[str, str], caller: str) -> None:
         """Serve a client whose header has come until it goes; `caller` is this node's name."""
-        refusal = tcpros.mismatch(self.offer, header, caller)
+        refusal = tcpros.mismatch(self.topic_type, header, caller)
         if refusal:
             await tcpros.send_error(writer, refusal)
             return
         tcpros.configure(writer, True)
-        writer.write(tcpros.encode_header(tcpros.service_header(self.offer, caller)))
+        writer.write(tcpros.encode_header(tcpros.service_header(self.topic_type, caller)))
         await writer.drain()
-        asks = header.get("probe") != "1"
-        while asks:
+        expects_request = header.get("probe") != "1"
+        while expects_request:
             request = await tcpros.read_frame(reader)
             writer.write(self._answer(request))
             await writer.drain()
-            asks = header.get("persistent") == "1"
+            expects_request = header.get("persistent") == "1"
 
     def _answer(self, request: bytes) -> bytes:
         reason = f"the request has {len(request)} bytes; must have none" if request else self._act()

@@ -1,4 +1,4 @@
-"""Our messages as those of ROS 1, with the units, signs and frames of ardrone_autonomy. Pure.
+"""Messages of the contract as those of ROS 1, with the units, signs and frames of ardrone_autonomy. Pure.
 
 Sources: ardrone_autonomy 1.4.1, src/ardrone_driver.cpp (PublishNavdata, PublishOdometry); REP 103 and 105.
 """
@@ -42,7 +42,7 @@ Odometry = message_class("nav_msgs/Odometry")
 Clock = message_class("rosgraph_msgs/Clock")
 Navdata = message_class("ardrone_autonomy/Navdata")
 
-UNKNOWN_3X3, UNKNOWN_6X6 = np.zeros(9), np.zeros(36)  # a covariance of zeros says in ROS that it is not known
+UNKNOWN_3X3, UNKNOWN_6X6 = np.zeros(9), np.zeros(36)  # zeros mean in ROS that the covariance is not known
 
 
 class DriverFrames:
@@ -55,7 +55,7 @@ class DriverFrames:
 
 
 def ros_time(t_ns: int) -> Any:
-    """Return simulated time [ns] as ROS says it: seconds, and nanoseconds."""
+    """Return simulated time [ns] as ROS writes it: seconds, and nanoseconds."""
     return Time(*ros_frames.stamp(t_ns))
 
 
@@ -64,31 +64,31 @@ def header(seq: int, t_ns: int, frame: str) -> Any:
     return Header(seq, ros_time(t_ns), frame)
 
 
-def clock(said: messages.Clock) -> Any:
+def clock(message: messages.Clock) -> Any:
     """Return the time of `/clock`."""
-    return Clock(clock=ros_time(said.t_ns))
+    return Clock(clock=ros_time(message.t_ns))
 
 
-def navdata(seq: int, own: OnboardState, frames: DriverFrames) -> Any:
+def navdata(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
     """Return what the driver publishes as ardrone/navdata, at the newest status.
 
     rotX is positive to the right, rotY nose down, rotZ counter-clockwise [deg]; velocities x forward, y left,
     z up [mm/s]; accelerations [g], az 1 at rest; altd [mm]; tm since the start [us].
     """
-    assert own.status is not None
-    roll, pitch, yaw = (math.degrees(angle) for angle in ros_frames.rpy(own.attitude))
-    mag = [round(field * MAG_LSB_PER_UT) for field in own.mag.field_ut] if own.mag else [0, 0, 0]
-    v = [1e3 * speed for speed in own.flow.velocity_m_s] if own.flow else [0.0, 0.0, 0.0]
-    f = [accel / G_M_S2 for accel in own.imu.accel_m_s2] if own.imu else [0.0, 0.0, 0.0]
-    nobody = np.zeros(0, np.uint32)
+    assert state.status is not None
+    roll, pitch, yaw = (math.degrees(angle) for angle in ros_frames.rpy(state.attitude))
+    mag = [round(field * MAG_LSB_PER_UT) for field in state.mag.field_ut] if state.mag else [0, 0, 0]
+    v = [1e3 * speed for speed in state.flow.velocity_m_s] if state.flow else [0.0, 0.0, 0.0]
+    f = [accel / G_M_S2 for accel in state.imu.accel_m_s2] if state.imu else [0.0, 0.0, 0.0]
+    none = np.zeros(0, np.uint32)
     return Navdata(
-        header=header(seq, own.status.t_ns, frames.base),
-        batteryPercent=own.status.battery_percent,
-        state=STATES[own.status.state],
+        header=header(seq, state.status.t_ns, frames.base),
+        batteryPercent=state.status.battery_percent,
+        state=STATES[state.status.state],
         magX=mag[0],
         magY=mag[1],
         magZ=mag[2],
-        pressure=round(own.baro.pressure_pa) if own.baro else 0,
+        pressure=round(state.baro.pressure_pa) if state.baro else 0,
         temp=0,
         wind_speed=0.0,
         wind_angle=0.0,
@@ -96,7 +96,7 @@ def navdata(seq: int, own: OnboardState, frames: DriverFrames) -> Any:
         rotX=roll,
         rotY=pitch,
         rotZ=yaw,
-        altd=round(1e3 * own.altitude_m),
+        altd=round(1e3 * state.altitude_m),
         vx=v[0],
         vy=v[1],
         vz=v[2],
@@ -108,14 +108,14 @@ def navdata(seq: int, own: OnboardState, frames: DriverFrames) -> Any:
         motor3=0,
         motor4=0,
         tags_count=0,
-        tags_type=nobody,
-        tags_xc=nobody,
-        tags_yc=nobody,
-        tags_width=nobody,
-        tags_height=nobody,
+        tags_type=none,
+        tags_xc=none,
+        tags_yc=none,
+        tags_width=none,
+        tags_height=none,
         tags_orientation=np.zeros(0, np.float32),
         tags_distance=np.zeros(0, np.float32),
-        tm=own.status.t_ns / 1e3,
+        tm=state.status.t_ns / 1e3,
     )
 
 
@@ -153,16 +153,16 @@ def fix(seq: int, sample: messages.Gps, frames: DriverFrames) -> Any:
     )
 
 
-def odometry(seq: int, own: OnboardState, frames: DriverFrames) -> Any:
+def odometry(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
     """Return ardrone/odometry: what the aircraft's own velocity integrates to since the start.
 
     The velocity is that of navdata: along the level axes x forward, y left, z up.
     """
-    assert own.status is not None
-    velocity = own.flow.velocity_m_s if own.flow else (0.0, 0.0, 0.0)
-    rate = own.imu.gyro_rad_s if own.imu else (0.0, 0.0, 0.0)
-    head = header(seq, own.status.t_ns, frames.odom)
-    return _odometry(head, frames.base, own.position_m, own.attitude, velocity, rate)
+    assert state.status is not None
+    velocity = state.flow.velocity_m_s if state.flow else (0.0, 0.0, 0.0)
+    rate = state.imu.gyro_rad_s if state.imu else (0.0, 0.0, 0.0)
+    head = header(seq, state.status.t_ns, frames.odom)
+    return _odometry(head, frames.base, state.position_m, state.attitude, velocity, rate)
 
 
 def ground_truth(seq: int, truth: messages.Truth, frames: DriverFrames) -> Any:
@@ -183,18 +183,18 @@ def _odometry(head: Any, child: str, position: Vector, attitude: Wxyz, velocity:
     )
 
 
-def transforms(seq: int, own: OnboardState, frames: DriverFrames) -> Any:
+def transforms(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
     """Return `/tf` of a drone: odom to base as integrated, and world to odom as far as the estimator knows it."""
-    assert own.status is not None
-    t_ns = own.status.t_ns
-    found = [_transform(seq, t_ns, frames.odom, frames.base, own.position_m, own.attitude)]
-    if own.origin_m is not None:
-        found.append(_transform(seq, t_ns, WORLD, frames.odom, own.origin_m, (1.0, 0.0, 0.0, 0.0)))
-    return TFMessage(transforms=found)
+    assert state.status is not None
+    t_ns = state.status.t_ns
+    poses = [_transform(seq, t_ns, frames.odom, frames.base, state.position_m, state.attitude)]
+    if state.origin_m is not None:
+        poses.append(_transform(seq, t_ns, WORLD, frames.odom, state.origin_m, (1.0, 0.0, 0.0, 0.0)))
+    return TFMessage(transforms=poses)
 
 
-def _transform(seq: int, t_ns: int, parent: str, child: str, place: Vector, attitude: Wxyz) -> Any:
-    transform = Transform(translation=Vector3(*place), rotation=quaternion(attitude))
+def _transform(seq: int, t_ns: int, parent: str, child: str, position: Vector, attitude: Wxyz) -> Any:
+    transform = Transform(translation=Vector3(*position), rotation=quaternion(attitude))
     return TransformStamped(header=header(seq, t_ns, parent), child_frame_id=child, transform=transform)
 
 

@@ -1,10 +1,7 @@
-"""What ROS nodes ask of a drone, and what is sent to it for that: the driver's rules of cmd_vel. Pure.
+"""One drone in the ROS graph, as ardrone_autonomy's driver in the namespace of that name: topics and commands.
 
-Source: ardrone_autonomy 1.4.1, src/teleop_twist.cpp. The driver repeats the last cmd_vel until there is another; so
-do we, but forget it when the drone comes down.
-
-
-One drone in the ROS graph, as ardrone_autonomy's driver in the namespace of that name.
+Source of the rules of cmd_vel: ardrone_autonomy 1.4.1, src/teleop_twist.cpp. The driver repeats the last cmd_vel until
+there is another; so do the commands here, until the drone comes down.
 """
 
 import math
@@ -22,7 +19,7 @@ from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.onboard import OnboardState
 
 NEARLY_ZERO = 1e-6  # of a component of cmd_vel, _EPS of the driver
-REPEAT_NS = 100_000_000  # ns; silence of 0.5 s would be the commander's death, scenario `silence.hover_s`
+REPEAT_NS = 100_000_000  # ns; a commander that is silent for 0.5 s counts as dead, scenario `silence.hover_s`
 AIRBORNE = ("hovering", "flying")
 COMMANDABLE = ("taking_off", *AIRBORNE)
 
@@ -38,7 +35,7 @@ class TiltCommand(NamedTuple):
 
 
 class DriverCommands:
-    """Of one drone.
+    """Commands of ROS nodes to one drone, by the driver's rules. Pure.
 
     Args:
         drone: its name.
@@ -78,12 +75,12 @@ class DriverCommands:
         self._send_mode("reset" if self._status is not None and self._status.state == "emergency" else "emergency")
 
     def trim_refusal(self) -> str | None:
-        """Return why the drone cannot be trimmed now; it stands level, and there is nothing more to do."""
+        """Return why the drone cannot be trimmed now; a landed one stands level, and nothing more is to be done."""
         state = self._status.state if self._status else "not there yet"
         return None if state == "landed" else f"the drone is {state}; must be landed"
 
     def on_status(self, status: messages.Status) -> None:
-        """Send what is due at a gate."""
+        """Send the command that is due at a gate."""
         self._status = status
         if status.state not in COMMANDABLE:
             self._tilt = None
@@ -103,7 +100,7 @@ class DriverCommands:
 
 
 def tilt_of(twist: Any) -> TiltCommand:
-    """Return what a geometry_msgs/Twist asks of an AR.Drone.
+    """Return the AR.Drone's command for a geometry_msgs/Twist.
 
     linear.x and linear.y are shares of the largest tilt, forward and to the left; linear.z of the largest climb;
     angular.z of the largest yaw rate, counter-clockwise. All six zero is hovering in place.
@@ -144,29 +141,29 @@ class DroneTopics:
         self._advertise(node, f"/{name}")
         self._subscribe(node, f"/{name}")
 
-    def _advertise(self, node: Ros1Node, space: str) -> None:
-        self._navdata = node.publish(f"{space}/ardrone/navdata", "ardrone_autonomy/Navdata", DRIVER_QUEUE)
-        self._imu = node.publish(f"{space}/ardrone/imu", "sensor_msgs/Imu", DRIVER_QUEUE)
-        self._mag = node.publish(f"{space}/ardrone/mag", "geometry_msgs/Vector3Stamped", DRIVER_QUEUE)
-        self._odometry = node.publish(f"{space}/ardrone/odometry", "nav_msgs/Odometry", DRIVER_QUEUE)
-        self._fix = node.publish(f"{space}/fix", "sensor_msgs/NavSatFix", QUEUE)
-        self._truth = node.publish(f"{space}/ground_truth/state", "nav_msgs/Odometry", QUEUE)
+    def _advertise(self, node: Ros1Node, namespace: str) -> None:
+        self._navdata = node.publish(f"{namespace}/ardrone/navdata", "ardrone_autonomy/Navdata", DRIVER_QUEUE)
+        self._imu = node.publish(f"{namespace}/ardrone/imu", "sensor_msgs/Imu", DRIVER_QUEUE)
+        self._mag = node.publish(f"{namespace}/ardrone/mag", "geometry_msgs/Vector3Stamped", DRIVER_QUEUE)
+        self._odometry = node.publish(f"{namespace}/ardrone/odometry", "nav_msgs/Odometry", DRIVER_QUEUE)
+        self._fix = node.publish(f"{namespace}/fix", "sensor_msgs/NavSatFix", QUEUE)
+        self._truth = node.publish(f"{namespace}/ground_truth/state", "nav_msgs/Odometry", QUEUE)
 
-    def _subscribe(self, node: Ros1Node, space: str) -> None:
+    def _subscribe(self, node: Ros1Node, namespace: str) -> None:
         pilot = self._commands
-        node.subscribe(f"{space}/cmd_vel", "geometry_msgs/Twist", pilot.on_cmd_vel)
-        node.subscribe(f"{space}/ardrone/takeoff", "std_msgs/Empty", lambda _: pilot.take_off())
-        node.subscribe(f"{space}/ardrone/land", "std_msgs/Empty", lambda _: pilot.land())
-        node.subscribe(f"{space}/ardrone/reset", "std_msgs/Empty", lambda _: pilot.reset())
-        node.serve(f"{space}/ardrone/flattrim", pilot.trim_refusal)
+        node.subscribe(f"{namespace}/cmd_vel", "geometry_msgs/Twist", pilot.on_cmd_vel)
+        node.subscribe(f"{namespace}/ardrone/takeoff", "std_msgs/Empty", lambda _: pilot.take_off())
+        node.subscribe(f"{namespace}/ardrone/land", "std_msgs/Empty", lambda _: pilot.land())
+        node.subscribe(f"{namespace}/ardrone/reset", "std_msgs/Empty", lambda _: pilot.reset())
+        node.serve(f"{namespace}/ardrone/flattrim", pilot.trim_refusal)
 
     def publish(self, message: Any) -> None:
-        """Take a message of the drone, or of its estimator, and publish what follows from it."""
-        own, frames = self._state, self._frames
-        message = own.update(message)
+        """Publish what follows from a message of the drone or of its estimator."""
+        state, frames = self._state, self._frames
+        message = state.update(message)
         match message:
             case messages.Imu():
-                self._imu.publish(partial(conversions.imu, sample=message, attitude=own.attitude, frames=frames))
+                self._imu.publish(partial(conversions.imu, sample=message, attitude=state.attitude, frames=frames))
             case messages.Mag():
                 self._mag.publish(partial(conversions.mag, sample=message, frames=frames))
             case messages.Gps():
@@ -177,8 +174,8 @@ class DroneTopics:
                 self._publish_status(message)
 
     def _publish_status(self, status: messages.Status) -> None:
-        own, frames = self._state, self._frames
+        state, frames = self._state, self._frames
         self._commands.on_status(status)
-        self._navdata.publish(partial(conversions.navdata, own=own, frames=frames))
-        self._odometry.publish(partial(conversions.odometry, own=own, frames=frames))
-        self._tf.publish(partial(conversions.transforms, own=own, frames=frames))
+        self._navdata.publish(partial(conversions.navdata, state=state, frames=frames))
+        self._odometry.publish(partial(conversions.odometry, state=state, frames=frames))
+        self._tf.publish(partial(conversions.transforms, state=state, frames=frames))

@@ -1,9 +1,4 @@
-"""XML-RPC as ROS 1 uses it: calls that answer [code, text, value], and a server of them.
-
-Where a ROS master is, and under which address it and its nodes reach us.
-
-A node's place at its ROS master, taken again when the master has been restarted.
-"""
+"""A node at its ROS master: XML-RPC calls, addresses, and a registration that outlives a restart of the master."""
 
 import http.client
 import os
@@ -26,11 +21,11 @@ DONE = 1  # code of an answer
 
 
 class ApiError(Exception):
-    """An answer that refuses, or is none of ROS."""
+    """An answer that is an error, or not of ROS's form."""
 
 
 CALL_ERRORS = (OSError, http.client.HTTPException, xmlrpc.client.Error, ExpatError, ValueError, TypeError, ApiError)
-"""What a call ends with where it is not answered."""
+"""Errors of a call without an answer."""
 
 
 class _Transport(xmlrpc.client.Transport):
@@ -57,11 +52,11 @@ def call_api(uri: str, method: str, *arguments: Any) -> Any:
 
 
 class _Handler(SimpleXMLRPCRequestHandler):
-    timeout = 10.0  # s, of a client that is silent
+    timeout = 10.0  # s, of a client that sends nothing
     protocol_version = "HTTP/1.1"
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing of clients that are silent or talk nonsense."""
+        """Log nothing of clients that are silent or send no XML-RPC."""
 
     def do_POST(self) -> None:
         size = self.headers.get("content-length", "")
@@ -73,7 +68,7 @@ class _Handler(SimpleXMLRPCRequestHandler):
 
 
 class XmlRpcServer(ThreadingMixIn, SimpleXMLRPCServer):
-    """Answers calls on an object's methods, each connection in a thread of its own."""
+    """Serves calls of an object's methods, each connection in a thread of its own."""
 
     daemon_threads = True
 
@@ -82,7 +77,7 @@ class XmlRpcServer(ThreadingMixIn, SimpleXMLRPCServer):
         self.register_instance(api)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of a client that broke off."""
+        """Log nothing of a client that disconnected."""
 
 
 DEFAULT_MASTER = "http://127.0.0.1:11311"  # ROS's own
@@ -98,9 +93,9 @@ def own_address(master_uri: str, environment: Mapping[str, str] = os.environ) ->
         RunError: the URI is none, or its host is unknown.
     """
     host, port = master_address(master_uri)
-    given = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP")
-    if given:
-        return given
+    configured = environment.get("ROS_HOSTNAME") or environment.get("ROS_IP")
+    if configured:
+        return configured
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.connect((host, port))
@@ -127,12 +122,12 @@ def master_address(uri: str) -> tuple[str, int]:
     return host, port
 
 
-CHECK_S = 1.0  # wall time between two looks whether the master still knows us
-UNREGISTER_S = 2.0  # in which to take leave of a master
+CHECK_S = 1.0  # wall time between two checks whether the master still has the registration
+UNREGISTER_S = 2.0  # in which to unregister
 
 
 class GraphEntry(NamedTuple):
-    """What a node is to be known for.
+    """What a node registers.
 
     Attributes:
         caller: its name.
@@ -151,44 +146,44 @@ class GraphEntry(NamedTuple):
 
 
 class Registration:
-    """Runs in a thread of its own.
+    """Keeps a node registered, in a thread of its own.
 
     Args:
         master_uri: of the master.
-        place: what to be known for.
-        found: takes a topic and those who publish it, whenever we have registered.
-        displaced: called once when another node has taken our name.
-        say: told what a person should know.
+        entry: what to register.
+        on_publishers: called with a topic and its publishers, whenever the node has registered.
+        on_displaced: called once when another node has taken the name.
+        say: prints a line.
     """
 
     def __init__(
         self,
         master_uri: str,
-        place: GraphEntry,
-        found: Callable[[str, list[str]], None],
-        displaced: Callable[[str], None],
+        entry: GraphEntry,
+        on_publishers: Callable[[str, list[str]], None],
+        on_displaced: Callable[[str], None],
         say: Callable[[str], None],
     ) -> None:
         self._uri = master_uri
-        self._entry = place
-        self._on_publishers = found
-        self._on_displaced = displaced
+        self._entry = entry
+        self._on_publishers = on_publishers
+        self._on_displaced = on_displaced
         self._say = say
-        self._known = False
-        self._was_known = False
-        self._may_be_known = False
+        self._registered = False
+        self._was_registered = False
+        self._may_be_registered = False
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="registration", daemon=True)
 
     def start(self) -> None:
-        """Begin to look for the master."""
+        """Begin to register."""
         self._thread.start()
 
     def close(self) -> None:
-        """Take leave of the master, if it is there."""
+        """Unregister, if the master is there."""
         self._closed.set()
         self._thread.join(2 * TIMEOUT_S)
-        if self._may_be_known:
+        if self._may_be_registered:
             self._unregister(time.monotonic() + UNREGISTER_S)
 
     def _run(self) -> None:
@@ -198,7 +193,7 @@ class Registration:
                 self._check()
                 since_s, next_say_s = time.monotonic(), 0.0
             except CALL_ERRORS as error:
-                self._known = False
+                self._registered = False
                 waited_s = time.monotonic() - since_s
                 if waited_s >= next_say_s:
                     next_say_s = max(2 * next_say_s, 1.0)
@@ -206,17 +201,17 @@ class Registration:
             self._closed.wait(CHECK_S)
 
     def _check(self) -> None:
-        """Register, or see whether the master still knows us."""
-        if self._known and not self._is_known():
-            self._known = False
-        if not self._known and not self._closed.is_set():
+        """Register, or check whether the master still has the registration."""
+        if self._registered and not self._is_registered():
+            self._registered = False
+        if not self._registered and not self._closed.is_set():
             self._register()
-            self._known = True
-            again = "registered again" if self._was_known else "registered"
-            self._was_known = True
+            self._registered = True
+            again = "registered again" if self._was_registered else "registered"
+            self._was_registered = True
             self._say(f"{self._entry.caller}: {again} with the ROS master on {self._uri}")
 
-    def _is_known(self) -> bool:
+    def _is_registered(self) -> bool:
         try:
             uri = self._call("lookupNode", self._entry.caller)
         except ApiError:
@@ -227,19 +222,19 @@ class Registration:
         return True
 
     def _register(self) -> None:
-        place, self._may_be_known = self._entry, True
-        for topic, kind in place.published:
-            self._call("registerPublisher", topic, kind, place.slave_uri)
-        for service in place.services:
-            self._call("registerService", service, place.service_uri, place.slave_uri)
-        for topic, kind in place.subscribed:
-            self._on_publishers(topic, self._call("registerSubscriber", topic, kind, place.slave_uri))
+        entry, self._may_be_registered = self._entry, True
+        for topic, kind in entry.published:
+            self._call("registerPublisher", topic, kind, entry.slave_uri)
+        for service in entry.services:
+            self._call("registerService", service, entry.service_uri, entry.slave_uri)
+        for topic, kind in entry.subscribed:
+            self._on_publishers(topic, self._call("registerSubscriber", topic, kind, entry.slave_uri))
 
     def _unregister(self, until_s: float) -> None:
-        place = self._entry
-        calls = [("unregisterService", service, place.service_uri) for service in place.services]
-        calls += [("unregisterSubscriber", topic, place.slave_uri) for topic, _ in place.subscribed]
-        calls += [("unregisterPublisher", topic, place.slave_uri) for topic, _ in place.published]
+        entry = self._entry
+        calls = [("unregisterService", service, entry.service_uri) for service in entry.services]
+        calls += [("unregisterSubscriber", topic, entry.slave_uri) for topic, _ in entry.subscribed]
+        calls += [("unregisterPublisher", topic, entry.slave_uri) for topic, _ in entry.published]
         for call in calls:
             if time.monotonic() > until_s:
                 return
@@ -248,7 +243,7 @@ class Registration:
             except ApiError:
                 continue
             except CALL_ERRORS:
-                return  # the master is gone, and with it what it knew
+                return  # the master is gone, and its registrations with it
 
     def _call(self, method: str, *arguments: Any) -> Any:
         return call_api(self._uri, method, self._entry.caller, *arguments)

@@ -1,4 +1,4 @@
-"""What the aircraft knows of itself: its sensors' newest samples, and what its firmware makes of them. Pure.
+"""The state that ardrone_autonomy's driver reports: newest sensor samples, attitude, altitude, odometry. Pure.
 
 Attitude is that of the drone's estimator; where there is none, Madgwick's filter on the drone's own IMU, whose heading
 is 0 where it begins, as that of the aircraft at power-on. Position is integrated from the optical flow.
@@ -19,7 +19,7 @@ from zsim_bridges import ros_frames
 from zsim_bridges.ros_frames import Vector
 
 BETA_RAD_S = 0.02  # of Madgwick's filter: levels within seconds, and is not led astray by a manoeuvre
-UNIT_SLACK = 0.01  # of a quaternion's length; an estimator of positions alone may tell zeros
+UNIT_SLACK = 0.01  # of a quaternion's length; an estimator of positions alone may publish zeros
 STEP_S_MAX = 0.1  # longer gaps in the IMU's samples are not integrated over
 _VECTORS = ("accel_m_s2", "gyro_rad_s", "field_ut")  # of samples in the axes of a sensor
 POSITIONS_KEPT = 32  # gates for which the integrated position is remembered; an estimate is some gates late at most
@@ -58,12 +58,12 @@ class OnboardState:
         self.origin_m: Vector | None = None
 
     def update(self, message: Any) -> Any:
-        """Take what the drone's sensors or its estimator say; return it in the axes of the body."""
+        """Update by a message of the drone or of its estimator; return it in the axes of the body."""
         R_BS = self._rotations.get(type(message))
         message = message if R_BS is None else _rotated(message, R_BS)
-        heard = self._HANDLERS.get(type(message))
-        if heard is not None:
-            heard(self, message)
+        handler = self._HANDLERS.get(type(message))
+        if handler is not None:
+            handler(self, message)
         return message
 
     @property
@@ -105,10 +105,10 @@ class OnboardState:
         if abs(math.hypot(*estimate.orientation_wxyz) - 1.0) < UNIT_SLACK:
             self.estimate = estimate
             self.attitude = estimate.orientation_wxyz
-        place = next((place for t_ns, place in self._positions if t_ns == estimate.t_ns), None)
-        if place is not None:
+        position = next((position for t_ns, position in self._positions if t_ns == estimate.t_ns), None)
+        if position is not None:
             x, y, z = estimate.position_m
-            self.origin_m = (x - place[0], y - place[1], z - place[2])
+            self.origin_m = (x - position[0], y - position[1], z - position[2])
 
     def _on_status(self, status: messages.Status) -> None:
         self.status = status
@@ -126,7 +126,7 @@ class OnboardState:
 
 
 def warm_up() -> None:
-    """Compile, or load, what would otherwise hold up the first gates."""
+    """Compile, or load, the kernels before the first gate."""
     madgwick_step(LEVEL, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), BETA_RAD_S, STEP_S_MAX)
 
 

@@ -1,12 +1,7 @@
-"""TCPROS, the wire format of ROS 1's topics and services: connection headers and frames. Pure.
+"""TCPROS, the wire format of ROS 1's topics and services: connection headers, frames and messages.
 
 A connection begins with a header of each side; then come frames: a length and so many bytes. All lengths are
 little-endian uint32. Sources: wiki.ros.org/ROS/TCPROS and wiki.ros.org/ROS/Connection Header.
-
-
-Headers and frames on asyncio's streams.
-
-The messages of ROS 1 that we speak: their classes, definitions, MD5 sums and bytes.
 """
 
 import asyncio
@@ -19,13 +14,13 @@ from typing import Any, NamedTuple
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 HEADER_MAX = 1_000_000  # bytes; definitions of the largest messages have some 10 000
-ANY_TYPE = "*"  # md5sum or type of who takes whatever comes
+ANY_TYPE = "*"  # md5sum or type of a node that takes any
 _LENGTH = struct.Struct("<I")
 LENGTH_SIZE = _LENGTH.size
 
 
 class TopicType(NamedTuple):
-    """A topic or service as both sides must know it."""
+    """Name, type, MD5 sum and definition of a topic or service, which must agree on both sides."""
 
     name: str
     type: str
@@ -43,7 +38,7 @@ def frame(payload: bytes) -> bytes:
 
 
 def length(head: bytes | memoryview) -> int:
-    """Return the length that four bytes say."""
+    """Return the length that four bytes encode."""
     return _LENGTH.unpack(head)[0]
 
 
@@ -64,62 +59,62 @@ def decode_header(body: bytes) -> dict[str, str]:
         if len(rest) < LENGTH_SIZE or length(rest[:LENGTH_SIZE]) > len(rest) - LENGTH_SIZE:
             raise HeaderError("a field is longer than the header")
         end = LENGTH_SIZE + length(rest[:LENGTH_SIZE])
-        key, found, value = bytes(rest[LENGTH_SIZE:end]).decode(errors="replace").partition("=")
-        if not found:
+        key, separator, value = bytes(rest[LENGTH_SIZE:end]).decode(errors="replace").partition("=")
+        if not separator:
             raise HeaderError(f"a field is {key[:40]!r}; must be key=value")
         fields[key] = value
         rest = rest[end:]
     return fields
 
 
-def publisher_header(offer: TopicType, caller: str) -> dict[str, str]:
-    """Return what a publisher answers to a subscriber that it takes."""
+def publisher_header(topic_type: TopicType, caller: str) -> dict[str, str]:
+    """Return the header that a publisher answers to a subscriber."""
     return {
         "callerid": caller,
         "latching": "0",
-        "md5sum": offer.md5,
-        "message_definition": offer.definition,
-        "topic": offer.name,
-        "type": offer.type,
+        "md5sum": topic_type.md5,
+        "message_definition": topic_type.definition,
+        "topic": topic_type.name,
+        "type": topic_type.type,
     }
 
 
-def subscriber_header(offer: TopicType, caller: str) -> dict[str, str]:
-    """Return what a subscriber says to a publisher."""
-    header = publisher_header(offer, caller) | {"tcp_nodelay": "1"}
+def subscriber_header(topic_type: TopicType, caller: str) -> dict[str, str]:
+    """Return the header that a subscriber sends to a publisher."""
+    header = publisher_header(topic_type, caller) | {"tcp_nodelay": "1"}
     del header["latching"]
     return header
 
 
-def service_header(offer: TopicType, caller: str) -> dict[str, str]:
-    """Return what a service answers to a client that it takes."""
+def service_header(topic_type: TopicType, caller: str) -> dict[str, str]:
+    """Return the header that a service answers to a client."""
     return {
         "callerid": caller,
-        "md5sum": offer.md5,
-        "request_type": f"{offer.type}Request",
-        "response_type": f"{offer.type}Response",
-        "type": offer.type,
+        "md5sum": topic_type.md5,
+        "request_type": f"{topic_type.type}Request",
+        "response_type": f"{topic_type.type}Response",
+        "type": topic_type.type,
     }
 
 
-def mismatch(offer: TopicType, header: Mapping[str, str], caller: str) -> str | None:
-    """Return why the sender of a header and `caller` do not understand each other; None where they do."""
+def mismatch(topic_type: TopicType, header: Mapping[str, str], caller: str) -> str | None:
+    """Return why the type of a header is not that of `caller`; None where it is."""
     missing = [field for field in ("callerid", "md5sum") if field not in header]
     if missing:
         return f"missing required {missing[0]!r} field"
-    if header["md5sum"] in (ANY_TYPE, offer.md5):
+    if header["md5sum"] in (ANY_TYPE, topic_type.md5):
         return None
-    wanted = f"{header.get('type', offer.type)}/{header['md5sum']}"
+    requested = f"{header.get('type', topic_type.type)}/{header['md5sum']}"
     return (
-        f"[{header['callerid']}] wants [{offer.name}] to have datatype/md5sum [{wanted}], "
-        f"but [{caller}] has [{offer.type}/{offer.md5}]"
+        f"[{header['callerid']}] wants [{topic_type.name}] to have datatype/md5sum [{requested}], "
+        f"but [{caller}] has [{topic_type.type}/{topic_type.md5}]"
     )
 
 
 HANDSHAKE_S = 10.0  # within which a header must come
-FRAME_MAX = 1_000_000  # bytes; what we take in are commands
+FRAME_MAX = 1_000_000  # bytes; nodes send commands alone
 CONNECTION_ERRORS = (OSError, IncompleteReadError, TimeoutError, ValueError, OverflowError)
-"""What a connection ends with: gone, silent, or none that we understand."""
+"""Errors that end a connection: it is gone, silent, or not TCPROS."""
 
 
 async def read_frame(reader: StreamReader, limit: int = FRAME_MAX) -> bytes:
@@ -140,20 +135,20 @@ async def read_header(reader: StreamReader) -> dict[str, str]:
 
     Raises:
         HeaderError: it is none.
-        TimeoutError: it does not come.
+        TimeoutError: it does not arrive.
     """
     body = await asyncio.wait_for(read_frame(reader, HEADER_MAX), HANDSHAKE_S)
     return decode_header(body)
 
 
 async def send_error(writer: StreamWriter, reason: str) -> None:
-    """Refuse a connection as ROS does: with a header that has a reason."""
+    """Refuse a connection as ROS does: by a header with the reason."""
     writer.write(encode_header({"error": reason}))
     await writer.drain()
 
 
 def configure(writer: StreamWriter, nodelay: bool) -> None:
-    """Let small messages wait for each other or not, and notice a host that has died."""
+    """Set whether small messages are sent at once, and notice a host that is gone."""
     raw: socket.socket = writer.get_extra_info("socket")
     raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, nodelay)
     raw.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -206,7 +201,7 @@ for _name, _text in DEFINITIONS.items():
     _store.register(get_types_from_msg(_text, _name))
 
 
-def topic_type(topic: str, kind: str) -> TopicType:
+def topic_type_of(topic: str, kind: str) -> TopicType:
     """Return a topic of a type such as "sensor_msgs/Imu"."""
     definition, md5 = _store.generate_msgdef(_full_name(kind), ros_version=1)
     return TopicType(topic, kind, md5, definition)
@@ -225,7 +220,7 @@ def serialize(kind: str, what: Any) -> bytes:
     """
     try:
         return bytes(_store.serialize_ros1(what, _full_name(kind)))
-    except Exception as error:  # whatever the generated writer meets in numbers of somebody else's
+    except Exception as error:  # the generated writer raises anything for invalid numbers
         raise ValueError(f"is no {kind}: {error}") from error
 
 
@@ -237,7 +232,7 @@ def deserialize(kind: str, data: bytes) -> Any:
     """
     try:
         return _store.deserialize_ros1(data, _full_name(kind))
-    except Exception as error:  # whatever the generated reader meets in bytes of somebody else's
+    except Exception as error:  # the generated reader raises anything for invalid bytes
         raise ValueError(f"{len(data)} bytes are no {kind}") from error
 
 

@@ -80,7 +80,7 @@ class VariableSlider:
             return  # set by `follow`
         value = float(self._slider.value)
         with self._lock:
-            # A page accepts a number beyond the limits, and sets it to the nearest limit when its field loses the focus.
+            # A page accepts numbers beyond the limits, and sets them to the nearest limit when the field loses focus.
             if self._out_of_range and value in (self.range.low, self.range.high):
                 self._out_of_range = False
                 return

@@ -1,7 +1,6 @@
 """The picture of a run as arrays: poses, ellipsoids, formations, trails and histories, from the newest views. Pure.
 
 Axes, units and quaternions as everywhere: W east, north, up; quaternions w first, body to world.
-
 """
 
 import math

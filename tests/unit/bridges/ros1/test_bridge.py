@@ -42,7 +42,7 @@ class Ear:
 
     def __init__(self, node: Ros1Node, topic: str) -> None:
         published = node._published[topic]
-        self._kind = published.offer.type
+        self._kind = published.topic_type.type
         self.heard: list[Any] = []
         published.links.append(cast(Any, self))
 

@@ -22,11 +22,11 @@ MD5 = {  # as `rosmsg md5` of Noetic prints them; of Navdata as ardrone_autonomy
 
 @pytest.mark.parametrize(("kind", "md5"), MD5.items())
 def test_md5_sums_are_those_of_ros(kind, md5):
-    assert tcpros.topic_type("/topic", kind)[2] == md5
+    assert tcpros.topic_type_of("/topic", kind)[2] == md5
 
 
 def test_a_definition_brings_those_of_its_fields():
-    definition = tcpros.topic_type("/topic", "ardrone_autonomy/Navdata").definition
+    definition = tcpros.topic_type_of("/topic", "ardrone_autonomy/Navdata").definition
     assert "float32 batteryPercent\n" in definition
     assert "MSG: std_msgs/Header" in definition
 

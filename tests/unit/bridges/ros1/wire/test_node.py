@@ -230,7 +230,7 @@ def test_a_publisher_that_sends_garbage_is_told_of_once_and_heard_again(graph):
 
         async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             await tcpros.read_header(reader)
-            writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type("/t", TWIST), "/bad")))
+            writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type_of("/t", TWIST), "/bad")))
             negative, good = (tcpros.serialize(TWIST, twist(x)) for x in (-1.0, 5.0))
             for payload in (b"short", negative, b"x" * 49, good):
                 writer.write(tcpros.frame(payload))
@@ -337,7 +337,7 @@ def test_what_a_node_said_just_before_it_left_is_heard(graph):
 
         async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             await tcpros.read_header(reader)
-            writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type("/t", TWIST), "/a")))
+            writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type_of("/t", TWIST), "/a")))
             await left.wait()
             writer.write(tcpros.frame(tcpros.serialize(TWIST, twist(3.0))))
             writer.close()
