@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from zsim.contract import messages
+from zsim.scenario.sensor_presets import G_M_S2
 from zsim_bridges import ros_frames
 from zsim_bridges.ros1.onboard import OnboardState
 from zsim_bridges.ros1.tcpros import message_class
 from zsim_bridges.ros_frames import Vector, Wxyz
 
 WORLD = "world"
-STATES = {"landed": 2, "taking_off": 6, "hovering": 4, "flying": 3, "landing": 8, "emergency": 0}  # ctrl_state >> 16
-G_M_S2 = 9.80665  # m/s^2 per g, ISO 80000-3
 MAG_LSB_PER_UT = 1 / 0.3  # AK8975 datasheet, 0.3 uT per LSB: the AR.Drone 2.0's
 NO_FIX, FIX, GPS_SERVICE = -1, 0, 1  # sensor_msgs/NavSatStatus
 DIAGONAL_KNOWN = 2  # sensor_msgs/NavSatFix
@@ -56,7 +55,7 @@ class DriverFrames:
 
 def ros_time(t_ns: int) -> Any:
     """Return simulated time [ns] as ROS writes it: seconds, and nanoseconds."""
-    return Time(*ros_frames.stamp(t_ns))
+    return Time(*ros_frames.ros1_stamp(t_ns))
 
 
 def header(seq: int, t_ns: int, frame: str) -> Any:
@@ -84,7 +83,7 @@ def navdata(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
     return Navdata(
         header=header(seq, state.status.t_ns, frames.base),
         batteryPercent=state.status.battery_percent,
-        state=STATES[state.status.state],
+        state=ros_frames.NAVDATA_STATES[state.status.state],
         magX=mag[0],
         magY=mag[1],
         magZ=mag[2],

@@ -1,7 +1,7 @@
-"""The bridge between a run and ROS 2: topics of what is told, subscriptions and services for what is asked.
+"""The bridge between a run and ROS 2: topics, and subscriptions and services for commands.
 
 A topic is converted only while a ROS node subscribes to it, and only then is its source read: a run without ROS nodes
-pays for its clock alone. Nothing here is waited for.
+costs its clock alone. The bridge never makes the world wait.
 """
 
 from collections.abc import Callable, Iterator
@@ -27,7 +27,7 @@ from zsim_bridges.ros2.source_keys import SAMPLES_MAX, BridgedTopic, CallbackQue
 from zsim_bridges.ros2.topics import RosNames, Topic
 
 NODE = "zsim"
-POLL_S = 0.1  # how often a stop is looked for
+POLL_S = 0.1  # how often a stop is checked
 ATTEMPT_S = 1.0  # of connecting to ROS's router
 TRIGGER = "std_srvs/srv/Trigger"
 CLUSTER_SERVICES = ("takeoff", "engage", "hold", "land")
@@ -35,7 +35,7 @@ Say = Callable[[str], None]
 
 
 class RosNetwork(NamedTuple):
-    """Where ROS is.
+    """How to reach ROS.
 
     Attributes:
         domain: ROS_DOMAIN_ID.
@@ -49,13 +49,13 @@ class RosNetwork(NamedTuple):
 
 
 class Bridge:
-    """One run's worth of it; everything but commands and services happens in the thread that calls `turn`.
+    """The bridge of one run; everything but commands and services happens in the thread that calls `process`.
 
     Args:
         link: to the world.
         info: of the run.
         observer: of this process in the run.
-        say: told what a person should know, each thing once.
+        say: prints a line, each once.
         wall_ns: time since 1970.
     """
 
@@ -79,46 +79,46 @@ class Bridge:
         )
         self._cleanups.append(link.hear(keys.CLOCK, self._on_clock))
 
-    def _on_clock(self, heard: Heard) -> None:
-        self._queue.add_task(partial(self._observer.update_clock, heard.payload))
+    def _on_clock(self, sample: Heard) -> None:
+        self._queue.add_task(partial(self._observer.update_clock, sample.payload))
 
     def process(self, within_s: float) -> None:
-        """Do what there is to do, waiting for something."""
-        taken = self._queue.pop_all(within_s)
+        """Execute queued tasks and convert samples; wait for some."""
+        work = self._queue.pop_all(within_s)
         start_ns = self._wall_ns()
-        for act in taken.tasks:
-            act()
-        passed = self._sources.convert_all(taken.samples)
+        for task in work.tasks:
+            task()
+        converted = self._sources.convert_all(work.samples)
         health = self._observer.health
-        if passed:
+        if converted:
             health.step(self._wall_ns() - start_ns)
-        health.received += passed
+        health.received += converted
         health.dropped = self._queue.dropped + self._sources.dropped
         self._observer.tick()
 
     def close(self) -> None:
-        """Hear nothing any more."""
+        """Close all subscriptions."""
         self._sources.close()
-        for end in self._cleanups:
-            end()
+        for close in self._cleanups:
+            close()
 
-    def count_refused(self, where: str, why: str) -> None:
-        """Count what others sent in vain, and say so once for each name; callable from any thread."""
-        self._queue.add_task(partial(self._count_refused, where, why))
+    def count_refused(self, name: str, reason: str) -> None:
+        """Count a message that is refused, and report it once for each name; callable from any thread."""
+        self._queue.add_task(partial(self._count_refused, name, reason))
 
-    def _count_refused(self, where: str, why: str) -> None:
+    def _count_refused(self, name: str, reason: str) -> None:
         self._observer.health.refused += 1
-        self.report_once(where, f"{where}: refused, {why}; further ones are counted in {self._observer.name}'s health")
+        self.report_once(name, f"{name}: refused, {reason}; further ones are counted in {self._observer.name}'s health")
 
-    def report_once(self, about: str, text: str) -> None:
-        if about not in self._reported:
-            self._reported.add(about)
+    def report_once(self, subject: str, text: str) -> None:
+        if subject not in self._reported:
+            self._reported.add(subject)
             self._say(f"{self._observer.name}: {text}")
 
-    # What ROS sees
+    # Advertised to ROS
 
     def advertise_run(self, ros: RosContext) -> None:
-        """Show the run to ROS."""
+        """Advertise the run's topics and services."""
         self._domain = ros.domain
         types = ros.types
         commands = RosCommands(self._link, self._observer, types.message_class("std_srvs/srv/Trigger_Response"))
@@ -138,40 +138,40 @@ class Bridge:
         ros.on_subscription(lambda token, alive: self._queue.add_task(partial(self._on_subscription, token, alive)))
         self._report_names()
 
-    def _advertise(self, node: Ros2Node, offered: Iterator[Topic]) -> None:
-        for topic in offered:
+    def _advertise(self, node: Ros2Node, run_topics: Iterator[Topic]) -> None:
+        for topic in run_topics:
             publisher = node.publisher(topic.name, topic.kind, topic.qos)
             self._publications[topic.name] = BridgedTopic(topic, publisher)
 
     def _accept_commands(self, node: Ros2Node, drone: str, name: str, commands: RosCommands) -> None:
-        """Take a drone's commands."""
+        """Subscribe to a drone's commands."""
         empty = "std_msgs/msg/Empty"
-        taken: dict[str, tuple[str, Callable[[Any], None]]] = {
+        callbacks: dict[str, tuple[str, Callable[[Any], None]]] = {
             "cmd_vel": ("geometry_msgs/msg/Twist", partial(commands.send_velocity, drone)),
             "takeoff": (empty, lambda _: commands.send_mode(drone, "takeoff")),
             "land": (empty, lambda _: commands.send_mode(drone, "land")),
             "reset": (empty, lambda _: commands.toggle_emergency(drone)),
         }
-        for leaf, (kind, act) in taken.items():
+        for leaf, (kind, act) in callbacks.items():
             self._cleanups.append(node.subscription(f"/{name}/{leaf}", kind, rmw_zenoh.DEFAULT, act))
         node.service(f"/{name}/release", TRIGGER, _empty_request(commands.release, drone))
 
     def _publish_static_frames(self, node: Ros2Node) -> None:
-        """Tell once, for all that come later too, where the frames are that never move."""
+        """Publish the frames that never move, once for all, later subscribers too."""
         publisher = node.publisher("/tf_static", "tf2_msgs/msg/TFMessage", rmw_zenoh.TF_STATIC)
-        placed = [
+        poses = [
             pose
             for d in self._scenario.drones
             for pose in conversions.static_frames(self.names.drones[d.name], d.sensors)
         ]
-        publisher.publish(conversions.transforms(0, placed))
+        publisher.publish(conversions.transforms(0, poses))
 
     def _report_names(self) -> None:
         for name, ros in {**self.names.drones, **self.names.clusters}.items():
             if name != ros:
                 self.report_once(name, f"{name} is {ros} in ROS, which takes no such name")
 
-    # What ROS subscribes to
+    # Subscriptions of ROS nodes
 
     def _on_subscription(self, token: str, alive: bool) -> None:
         endpoint = rmw_zenoh.endpoint_of(token)
@@ -182,15 +182,15 @@ class Bridge:
             kind = publication.topic.kind
             self.report_once(token, f"{endpoint.name}: somebody subscribes to {endpoint.type_name}; it is {kind}")
             return
-        readers, had = publication.readers, bool(publication.readers)
+        readers, had_readers = publication.readers, bool(publication.readers)
         readers.add(token) if alive else readers.discard(token)
-        if bool(readers) != had:
+        if bool(readers) != had_readers:
             (self._sources.add if readers else self._sources.remove)(publication)
 
 
-def _empty_request(ask: Callable[..., Any], *about: str) -> Callable[[Any], Any]:
-    """Return what answers an empty request."""
-    return lambda _: ask(*about)
+def _empty_request(act: Callable[..., Any], *args: str) -> Callable[[Any], Any]:
+    """Return the callback of a service without arguments."""
+    return lambda _: act(*args)
 
 
 def serve(
@@ -199,36 +199,38 @@ def serve(
     observer: ObserverProcess,
     stopped: Callable[[], bool],
     say: Say,
-    door: RosNetwork,
+    network: RosNetwork,
     wall_ns: Callable[[], int],
 ) -> None:
-    """Bridge one run to ROS, until it is over or it is told to stop.
+    """Bridge one run to ROS, until it is over or `stopped` returns true.
 
     Raises:
         SessionError: the router's endpoint is malformed.
     """
     bridge = Bridge(link, info, observer, say, wall_ns)
     with ExitStack() as stack, closing(bridge):
-        ros_link = link.bare() if door.router is None else None
+        ros_link = link.bare() if network.router is None else None
         entered = False
         while not observer.end_reason and not stopped():
-            ros_link = ros_link or _connect(stack, door, bridge)
+            ros_link = ros_link or _connect(stack, network, bridge)
             if ros_link is not None and not entered:
-                bridge.advertise_run(RosContext(ros_link, door.domain, RosTypes(), wall_ns, bridge.count_refused))
-                say(f"{observer.name}: ROS domain {door.domain} by {door.router or 'the hub of the world'}")
+                bridge.advertise_run(RosContext(ros_link, network.domain, RosTypes(), wall_ns, bridge.count_refused))
+                say(f"{observer.name}: ROS domain {network.domain} by {network.router or 'the hub of the world'}")
                 entered = True
             bridge.process(POLL_S)
 
 
-def _connect(stack: ExitStack, door: RosNetwork, bridge: Bridge) -> Session | None:
-    """Return a session with ROS's router, None where nobody listens yet."""
-    assert door.router is not None
+def _connect(stack: ExitStack, network: RosNetwork, bridge: Bridge) -> Session | None:
+    """Return a session with ROS's router, None where it does not listen yet."""
+    assert network.router is not None
     try:
         return stack.enter_context(
-            session.connect(door.router, "", wait_s=ATTEMPT_S, reader=True, identity=door.identity)
+            session.connect(network.router, "", wait_s=ATTEMPT_S, reader=True, identity=network.identity)
         )
     except SessionError as error:
         if "nobody listens" not in str(error):
             raise
-        bridge.report_once("router", f"no router of ROS on {door.router} yet, waiting for it; start rmw_zenohd there")
+        bridge.report_once(
+            "router", f"no router of ROS on {network.router} yet, waiting for it; start rmw_zenohd there"
+        )
         return None

@@ -1,4 +1,4 @@
-"""What ROS asks of drones and clusters, on its way to the keys that do it."""
+"""Commands and requests of ROS nodes to drones and clusters, published on the keys of the contract."""
 
 import math
 from threading import Lock
@@ -14,7 +14,7 @@ STATUS_S = 1.0  # how long a drone's state is waited for
 
 
 class RosCommands:
-    """Sends commands under the bridge's name; called in several threads.
+    """Sends commands in the bridge's name; called in several threads.
 
     Args:
         link: to the world.
@@ -44,7 +44,7 @@ class RosCommands:
             self._link.put(key, Velocity(*self._next_stamp(key), self._observer.name, v, float(turn)))
 
     def send_mode(self, drone: str, mode: Any) -> None:
-        """Ask a drone to take off, land, stop at once or leave the emergency."""
+        """Let a drone take off, land, stop at once or leave the emergency."""
         key = keys.command(drone, "mode")
         with self._lock:
             self._link.put(key, Mode(*self._next_stamp(key), self._observer.name, mode))
@@ -53,7 +53,7 @@ class RosCommands:
         """Stop the rotors at once, or, where that has happened, make ready to fly: the aircraft's emergency button.
 
         Raises:
-            ValueError: the world does not tell which of the two.
+            ValueError: the drone's state is not known.
         """
         self.send_mode(drone, "reset" if self._state(drone) == "emergency" else "emergency")
 
@@ -73,11 +73,11 @@ class RosCommands:
         return self._observer.now_ns, seq
 
     def request_cluster(self, cluster: str, op: str) -> Any:
-        """Ask a cluster's controller; return the response."""
+        """Request an operation of a cluster's controller; return the response."""
         return self._request(keys.cluster_control(cluster), op, {})
 
     def release(self, drone: str) -> Any:
-        """Let others fly a drone; return the response."""
+        """Let others command a drone; return the response."""
         return self._request(keys.CONTROL, "release", {"drone": drone})
 
     def _request(self, key: str, op: str, args: dict[str, Any]) -> Any:

@@ -1,12 +1,9 @@
-"""Frames as REP-103 and REP-105 have them, and where a drone's sensors stand in its body.
+"""From zsim's messages to those of ROS 2: SI units and ENU/FLU frames on both sides, so mostly names change. Pure.
 
-map is W (east, north, up). Of each drone: `NAME/odom`, in which its estimate is told (it lies on map, since the
-estimate is of W), `NAME/base_link` (forward, left, up), and a frame for each sensor. Quaternions are w first.
-
-
-From zsim's messages to those of ROS: SI units and ENU/FLU frames on both sides, so mostly names change. All pure.
-
-Covariances are row-major; what nobody tells is zero in them, unless the message's definition has a sign for it.
+Frames as REP-103 and REP-105 have them: map is W (east, north, up); of each drone `NAME/odom`, the frame of its
+estimate (it lies on map, since the estimate is of W), `NAME/base_link` (forward, left, up), and a frame for each
+sensor. Quaternions are w first. Covariances are row-major; unknown ones are zero, unless the message's definition has
+a sign for it.
 """
 
 import math
@@ -22,6 +19,7 @@ from zsim.contract.messages import Quaternion, Vector3
 from zsim.math.frames import quaternion_from_rpy, quaternion_multiply
 from zsim.scenario import scenario
 from zsim.scenario.scenario import Mount, Sensors
+from zsim_bridges import ros_frames
 
 MAP = "map"
 UNTURNED: Quaternion = (1.0, 0.0, 0.0, 0.0)
@@ -30,7 +28,7 @@ _ALONG_BEAM = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 
 
 class FramePose(NamedTuple):
-    """Where a frame stands in another one."""
+    """The pose of a frame in another one."""
 
     parent: str
     child: str
@@ -74,41 +72,6 @@ def _quaternion(q: np.ndarray) -> Quaternion:
     return w, x, y, z
 
 
-Rows = tuple[Vector3, Vector3, Vector3]
-
-
-def rotation_rows(q_WB: Quaternion) -> Rows:
-    """Return R_WB row by row, in plain floats: messages come by the thousand, and small arrays cost more."""
-    w, x, y, z = q_WB
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-
-
-def into_body(q_WB: Quaternion, v_W: Vector3) -> Vector3:
-    """Return v_B = R_WB^T v_W."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation_rows(q_WB)
-    x, y, z = v_W
-    return a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z
-
-
-def mean_rate(q_WB1: Quaternion, q_WB2: Quaternion, dt_s: float) -> Vector3:
-    """Return the constant w_WB_B [rad/s] that turns one attitude into the next within dt_s."""
-    w1, x1, y1, z1 = q_WB1
-    w2, x2, y2, z2 = q_WB2
-    w = w1 * w2 + x1 * x2 + y1 * y2 + z1 * z2
-    x = w1 * x2 - x1 * w2 - y1 * z2 + z1 * y2
-    y = w1 * y2 + x1 * z2 - y1 * w2 - z1 * x2
-    z = w1 * z2 - x1 * y2 + y1 * x2 - z1 * w2
-    sine = math.sqrt(x * x + y * y + z * z)
-    if sine == 0.0:
-        return 0.0, 0.0, 0.0
-    gain = math.copysign(2.0, w) * math.atan2(sine, abs(w)) / (sine * dt_s)
-    return gain * x, gain * y, gain * z
-
-
 Array = NDArray[np.float64]
 Time, Header = ros.builtin_interfaces__msg__Time, ros.std_msgs__msg__Header
 RosVector3, Point, RosQuaternion = (
@@ -117,9 +80,8 @@ RosVector3, Point, RosQuaternion = (
     ros.geometry_msgs__msg__Quaternion,
 )
 
-SECOND_NS = 1_000_000_000
 TESLA_PER_UT = 1e-6
-UNKNOWN = np.array([-1.0, *[0.0] * 8])  # what sensor_msgs/Imu asks for where there is no attitude
+UNKNOWN = np.array([-1.0, *[0.0] * 8])  # of sensor_msgs/Imu without an attitude
 GPS_SERVICE = 1  # sensor_msgs/NavSatStatus.SERVICE_GPS
 KNOWN_DIAGONAL = 2  # sensor_msgs/NavSatFix.COVARIANCE_TYPE_DIAGONAL_KNOWN
 ULTRASOUND = 0  # sensor_msgs/Range
@@ -131,7 +93,7 @@ NAN = math.nan
 
 def stamp(t_ns: int) -> Any:
     """Return simulated time as ROS writes it."""
-    return Time(t_ns // SECOND_NS, t_ns % SECOND_NS)
+    return Time(*divmod(t_ns, ros_frames.NS_PER_S))
 
 
 def header(t_ns: int, frame: str) -> Any:
@@ -143,7 +105,7 @@ def clock(message: messages.Clock) -> Any:
 
 
 def imu(message: messages.Imu, frame: str, gyro: Array, accel: Array) -> Any:
-    """Return specific force and rates; it tells no attitude. `gyro` and `accel` are covariances (9,)."""
+    """Return specific force and rates, without an attitude. `gyro` and `accel` are covariances (9,)."""
     return ros.sensor_msgs__msg__Imu(
         header(message.t_sample_ns, frame),
         RosQuaternion(0.0, 0.0, 0.0, 1.0),
@@ -219,15 +181,15 @@ def true_odometry(message: messages.Truth, frame: str, child: str) -> Any:
     return ros.nav_msgs__msg__Odometry(
         header(message.t_ns, frame),
         child,
-        ros.geometry_msgs__msg__PoseWithCovariance(pose(message.position_m, q), nothing),
-        _twist(into_body(q, message.velocity_m_s), message.angular_velocity_rad_s, nothing),
+        ros.geometry_msgs__msg__PoseWithCovariance(ros_pose(message.position_m, q), nothing),
+        _twist(ros_frames.into_body(q, message.velocity_m_s), message.angular_velocity_rad_s, nothing),
     )
 
 
 def odometry(message: messages.Estimate, frame: str, child: str, w_WB_B: Vector3) -> Any:
-    """Return an estimate; twist in the body. Of the attitude only the heading has an uncertainty to tell."""
+    """Return an estimate; twist in the body. Of the attitude only the heading has an uncertainty."""
     P = np.array(message.covariance).reshape(6, 6)
-    R = np.array(rotation_rows(message.orientation_wxyz))
+    R = np.array(ros_frames.rotation_rows(message.orientation_wxyz))
     of_pose, of_twist = np.zeros((6, 6)), np.zeros((6, 6))
     of_pose[:3, :3], of_pose[5, 5] = P[:3, :3], message.yaw_sigma_rad**2
     of_twist[:3, :3] = R.T @ P[3:, 3:] @ R
@@ -235,8 +197,8 @@ def odometry(message: messages.Estimate, frame: str, child: str, w_WB_B: Vector3
     return ros.nav_msgs__msg__Odometry(
         header(message.t_ns, frame),
         child,
-        ros.geometry_msgs__msg__PoseWithCovariance(pose(message.position_m, q), of_pose.ravel()),
-        _twist(into_body(q, message.velocity_m_s), w_WB_B, of_twist.ravel()),
+        ros.geometry_msgs__msg__PoseWithCovariance(ros_pose(message.position_m, q), of_pose.ravel()),
+        _twist(ros_frames.into_body(q, message.velocity_m_s), w_WB_B, of_twist.ravel()),
     )
 
 
@@ -245,37 +207,36 @@ def _twist(linear: Vector3, angular: Vector3, covariance: Array) -> Any:
     return ros.geometry_msgs__msg__TwistWithCovariance(twist, covariance)
 
 
-def pose(position_m: Vector3, q: Quaternion) -> Any:
+def ros_pose(position_m: Vector3, q: Quaternion) -> Any:
     return ros.geometry_msgs__msg__Pose(Point(*position_m), ros_quaternion(q))
 
 
 def ros_quaternion(q: Quaternion) -> Any:
     """Return a quaternion in ROS's order: w last."""
-    w, x, y, z = q
-    return RosQuaternion(x, y, z, w)
+    return RosQuaternion(*ros_frames.xyzw(q))
 
 
-def transform(t_ns: int, placed: FramePose) -> Any:
-    moved = ros.geometry_msgs__msg__Transform(RosVector3(*placed.position_m), ros_quaternion(placed.orientation_wxyz))
-    return ros.geometry_msgs__msg__TransformStamped(header(t_ns, placed.parent), placed.child, moved)
+def transform(t_ns: int, pose: FramePose) -> Any:
+    moved = ros.geometry_msgs__msg__Transform(RosVector3(*pose.position_m), ros_quaternion(pose.orientation_wxyz))
+    return ros.geometry_msgs__msg__TransformStamped(header(t_ns, pose.parent), pose.child, moved)
 
 
-def transforms(t_ns: int, placed: list[FramePose]) -> Any:
-    return ros.tf2_msgs__msg__TFMessage([transform(t_ns, each) for each in placed])
+def transforms(t_ns: int, poses: list[FramePose]) -> Any:
+    return ros.tf2_msgs__msg__TFMessage([transform(t_ns, each) for each in poses])
 
 
 def cluster_pose(message: messages.ClusterState, parent: str, name: str) -> FramePose:
-    """Return where the cluster frame C is, by the estimates; a pair has no roll."""
+    """Return the pose of the cluster frame C by the estimates; a pair has no roll."""
     values = dict(zip(message.names, message.value, strict=True))
     x, y, z, roll, pitch, yaw = (values.get(each, 0.0) for each in ("x_c", "y_c", "z_c", "roll", "pitch", "yaw"))
     q = UNTURNED if not roll and not pitch and not yaw else tuple(quaternion_from_rpy((roll, pitch, yaw)).tolist())
     return FramePose(parent, cluster(name), (x, y, z), q)
 
 
-def pose_stamped(t_ns: int, placed: FramePose) -> Any:
+def pose_stamped(t_ns: int, pose: FramePose) -> Any:
     """Return a pose as a message."""
-    where = pose(placed.position_m, placed.orientation_wxyz)
-    return ros.geometry_msgs__msg__PoseStamped(header(t_ns, placed.parent), where)
+    message = ros_pose(pose.position_m, pose.orientation_wxyz)
+    return ros.geometry_msgs__msg__PoseStamped(header(t_ns, pose.parent), message)
 
 
 def cluster_state(kind: Any, message: messages.ClusterState, frame: str) -> Any:

@@ -1,6 +1,4 @@
-"""ROS names of what has a name of the contract's, which allows more: `-`, `.`, and a digit at the beginning.
-
-What rmw_zenoh writes on the wire: keys, liveliness tokens, quality of service, attachments, identities. All pure.
+"""The wire of rmw_zenoh: names, keys, liveliness tokens, quality of service, attachments, identities. Pure.
 
 Of ros2/rmw_zenoh as Jazzy (from 0.2.4), Kilted and Rolling ship it: `liveliness_utils.cpp` for tokens and quality of
 service, `attachment_helpers.cpp` for attachments. Humble's has neither type hashes nor this attachment.
@@ -24,16 +22,16 @@ def ros_name(name: str, what: str) -> str:
 
 def ros_names(names: Iterable[str], what: str) -> dict[str, str]:
     """Return the ROS name of each; where two would have the same, the later ones get a number."""
-    found: dict[str, str] = {}
-    taken: set[str] = set()
+    ros_name_of: dict[str, str] = {}
+    used: set[str] = set()
     for name in names:
         first = chosen = ros_name(name, what)
         number = 2
-        while chosen in taken:
+        while chosen in used:
             chosen, number = f"{first.rstrip('_')}_{number}", number + 1
-        taken.add(chosen)
-        found[name] = chosen
-    return found
+        used.add(chosen)
+        ros_name_of[name] = chosen
+    return ros_name_of
 
 
 TOKEN_SPACE = "@ros2_lv"  # of all tokens; `**` does not match it
@@ -46,7 +44,7 @@ ATTACHMENT_BYTES = _HEAD.size + GID_BYTES
 
 
 class Qos(NamedTuple):
-    """What an endpoint promises or asks for; the last `depth` messages are kept."""
+    """Quality of service that an endpoint offers or requests; the last `depth` messages are kept."""
 
     depth: int = 10
     best_effort: bool = False
@@ -77,7 +75,7 @@ class NodeId(NamedTuple):
 
 
 class Endpoint(NamedTuple):
-    """What a token tells of a publisher, subscription, service or client that is about us."""
+    """A publisher, subscription, service or client, as its token describes it."""
 
     kind: str
     name: str
@@ -85,7 +83,7 @@ class Endpoint(NamedTuple):
     type_hash: str
 
     def key(self, domain: int) -> str:
-        """Return where its messages or requests go."""
+        """Return the key of its messages or requests."""
         return data_key(domain, self.name, self.type_name, self.type_hash)
 
 
@@ -107,14 +105,14 @@ def node_token(node: NodeId) -> str:
 
 def endpoint_token(node: NodeId, number: int, endpoint: Endpoint, qos: Qos) -> str:
     """Return the token of one of a node's endpoints."""
-    about = f"{_mangled(endpoint.name)}/{endpoint.type_name}/{endpoint.type_hash}/{qos.text()}"
-    return f"{_token_head(node, number, endpoint.kind)}/{about}"
+    endpoint_part = f"{_mangled(endpoint.name)}/{endpoint.type_name}/{endpoint.type_hash}/{qos.text()}"
+    return f"{_token_head(node, number, endpoint.kind)}/{endpoint_part}"
 
 
 def _token_head(node: NodeId, number: int, kind: str) -> str:
     enclave = "%"
-    place = f"{TOKEN_SPACE}/{node.domain}/{node.zid}/{node.number}/{number}/{kind}"
-    return f"{place}/{enclave}/{_mangled(node.namespace)}/{node.name}"
+    prefix = f"{TOKEN_SPACE}/{node.domain}/{node.zid}/{node.number}/{number}/{kind}"
+    return f"{prefix}/{enclave}/{_mangled(node.namespace)}/{node.name}"
 
 
 def _mangled(name: str) -> str:
@@ -127,7 +125,7 @@ def subscription_tokens(domain: int) -> str:
 
 
 def endpoint_of(token: str) -> Endpoint | None:
-    """Return what a token tells of an endpoint; None where it is none."""
+    """Return the endpoint of a token; None where it is no endpoint's."""
     parts = token.split("/")
     if len(parts) != TOKEN_PARTS or parts[0] != TOKEN_SPACE:
         return None
@@ -141,7 +139,7 @@ def gid_of(token: str) -> bytes:
 
 
 class Attachment(NamedTuple):
-    """What goes beside every message, request and reply: its number (from 1), its wall time, and who sent it."""
+    """The attachment of every message, request and reply: its number (from 1), its wall time, and its sender."""
 
     sequence: int
     wall_ns: int
@@ -152,7 +150,7 @@ class Attachment(NamedTuple):
 
 
 def attachment_of(data: bytes) -> Attachment:
-    """Return what an attachment says.
+    """Return a decoded attachment.
 
     Raises:
         ValueError: it is none of rmw_zenoh's.

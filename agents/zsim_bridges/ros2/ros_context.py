@@ -1,4 +1,4 @@
-"""A ROS 2 participant by rmw_zenoh's wire: nodes with publishers, subscriptions and services, over a Zenoh session."""
+"""A ROS 2 context on rmw_zenoh's wire: nodes with publishers, subscriptions and services, over a Zenoh session."""
 
 from collections.abc import Callable
 from itertools import count
@@ -11,18 +11,18 @@ from zsim_bridges.ros2.ros_types import RosTypes, service_parts
 
 CDR = "application/cdr"
 OnRefused = Callable[[str, str], None]
-"""Told (name, why) of what others sent in vain; called in threads of Zenoh's."""
+"""Called with (name, reason) of a message that is refused, in threads of Zenoh's."""
 
 
 class RosContext:
-    """What ROS calls a context.
+    """A context in the sense of ROS: the nodes of one process.
 
     Args:
-        link: a session by whole keys, without a federation.
+        link: a session by full keys, without a federation.
         domain: ROS_DOMAIN_ID.
         types: of messages and services.
         wall_ns: time since 1970.
-        refuse: told of what is refused.
+        refuse: see OnRefused.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class RosContext:
         self._zid = link.zid()
 
     def node(self, namespace: str, name: str) -> "Ros2Node":
-        """Return a node, which others see from now on."""
+        """Return a new node, which other nodes see from now on."""
         return Ros2Node(self, NodeId(self.domain, self._zid, self.number(), namespace, name))
 
     def number(self) -> int:
@@ -45,70 +45,70 @@ class RosContext:
         return next(self._numbers)
 
     def on_subscription(self, callback: Callable[[str, bool], None]) -> None:
-        """Call back with (token, alive), in a thread of Zenoh's, for the subscriptions of all participants."""
+        """Call back with (token, alive), in a thread of Zenoh's, for the subscriptions of all contexts."""
         self.link.on_token(rmw_zenoh.subscription_tokens(self.domain), callback)
 
 
 class Ros2Node:
-    """A node of a participant."""
+    """A node of a context."""
 
-    def __init__(self, participant: RosContext, identity: NodeId) -> None:
-        self._participant = participant
+    def __init__(self, context: RosContext, identity: NodeId) -> None:
+        self._context = context
         self._identity = identity
-        participant.link.declare_token(rmw_zenoh.node_token(identity))
+        context.link.declare_token(rmw_zenoh.node_token(identity))
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> "Publisher":
-        """Return a publisher of a topic, given by its whole name."""
+        """Return a publisher of a topic, given by its full name."""
         endpoint, token = self._endpoint("MP", topic, kind, qos)
-        publisher = Publisher(self._participant, endpoint, kind, qos, rmw_zenoh.gid_of(token))
+        publisher = Publisher(self._context, endpoint, kind, qos, rmw_zenoh.gid_of(token))
         self._declare(token)
         return publisher
 
     def subscription(self, topic: str, kind: str, qos: Qos, callback: Callable[[Any], None]) -> Callable[[], None]:
         """Call back with every message on a topic, in a thread of Zenoh's, until the returned function is called."""
-        ours = self._participant
+        context = self._context
         endpoint, token = self._endpoint("MS", topic, kind, qos)
 
-        def take(heard: Heard) -> None:
+        def on_publication(sample: Heard) -> None:
             try:
-                rmw_zenoh.attachment_of(heard.attachment)
-                callback(ours.types.decode(heard.payload, kind))
+                rmw_zenoh.attachment_of(sample.attachment)
+                callback(context.types.decode(sample.payload, kind))
             except ValueError as error:
-                ours.refuse(topic, str(error))
+                context.refuse(topic, str(error))
 
-        end = ours.link.hear(endpoint.key(ours.domain), take)
+        undeclare = context.link.hear(endpoint.key(context.domain), on_publication)
         self._declare(token)
-        return end
+        return undeclare
 
     def service(self, name: str, kind: str, answer: Callable[[Any], Any]) -> None:
         """Answer a service's requests, each with what `answer` returns, in a thread of Zenoh's."""
-        ours = self._participant
+        context = self._context
         endpoint, token = self._endpoint("SS", name, kind, rmw_zenoh.DEFAULT)
-        key, (request, response) = endpoint.key(ours.domain), service_parts(kind)
+        key, (request_type, response_type) = endpoint.key(context.domain), service_parts(kind)
 
         def reply(query: Query) -> None:
             try:
-                asked = rmw_zenoh.attachment_of(query.attachment)
-                said = answer(ours.types.decode(query.payload, request))
+                received = rmw_zenoh.attachment_of(query.attachment)
+                response = answer(context.types.decode(query.payload, request_type))
             except ValueError as error:
                 query.end()
-                ours.refuse(name, str(error))
+                context.refuse(name, str(error))
                 return
-            beside = Attachment(asked.sequence, ours.wall_ns(), asked.gid)
-            query.reply_as(key, ours.types.encode(said, response), beside.packed())
+            attachment = Attachment(received.sequence, context.wall_ns(), received.gid)
+            query.reply_as(key, context.types.encode(response, response_type), attachment.packed())
 
-        ours.link.answer(key, reply, complete=True)
+        context.link.answer(key, reply, complete=True)
         self._declare(token)
 
     def _endpoint(self, how: rmw_zenoh.Kind, name: str, kind: str, qos: Qos) -> tuple[Endpoint, str]:
         """Return a new endpoint and its token."""
-        ours = self._participant
-        endpoint = Endpoint(how, name, rmw_zenoh.dds_name(kind), ours.types.hash(kind))
-        return endpoint, rmw_zenoh.endpoint_token(self._identity, ours.number(), endpoint, qos)
+        context = self._context
+        endpoint = Endpoint(how, name, rmw_zenoh.dds_name(kind), context.types.hash(kind))
+        return endpoint, rmw_zenoh.endpoint_token(self._identity, context.number(), endpoint, qos)
 
     def _declare(self, token: str) -> None:
-        """Let others know of an endpoint, once it works: they may use it at once."""
-        self._participant.link.declare_token(token)
+        """Declare an endpoint once it works: others may use it at once."""
+        self._context.link.declare_token(token)
 
 
 class Publisher:
@@ -118,28 +118,28 @@ class Publisher:
         key: where its messages go.
     """
 
-    def __init__(self, participant: RosContext, endpoint: Endpoint, kind: str, qos: Qos, gid: bytes) -> None:
-        self._participant = participant
+    def __init__(self, context: RosContext, endpoint: Endpoint, kind: str, qos: Qos, gid: bytes) -> None:
+        self._context = context
         self._kind = kind
         self._gid = gid
         self._sent = 0
-        self.key = endpoint.key(participant.domain)
+        self.key = endpoint.key(context.domain)
         kept = qos.transient_local
-        self._write = _transient_writer(participant.link, self.key) if kept else participant.link.writer(self.key, CDR)
+        self._write = _transient_writer(context.link, self.key) if kept else context.link.writer(self.key, CDR)
 
     def publish(self, message: Any) -> None:
-        """Send a message; a subscriber that takes nothing loses it, nobody waits.
+        """Send a message; a subscriber that is too slow loses it, the publisher never waits.
 
         Raises:
             ValueError: the message does not fit its type.
         """
-        ours = self._participant
-        payload = ours.types.encode(message, self._kind)
+        context = self._context
+        payload = context.types.encode(message, self._kind)
         self._sent += 1
-        beside = Attachment(self._sent, ours.wall_ns(), self._gid).packed()
-        self._write(payload, beside)
+        attachment = Attachment(self._sent, context.wall_ns(), self._gid).packed()
+        self._write(payload, attachment)
 
 
 def _transient_writer(link: Session, key: str) -> Callable[[bytes, bytes], None]:
-    """Return what publishes for those too who come later."""
+    """Return a writer whose last message later subscribers receive, too."""
     return lambda payload, attachment: link.put_kept(key, payload, CDR, attachment)

@@ -1,7 +1,4 @@
-"""The texts of the messages and services that rosbags does not bring.
-
-ROS types: their classes, their CDR, and the hashes by which rmw_zenoh keeps different types of one name apart.
-"""
+"""ROS 2 types: classes, CDR, definitions that rosbags lacks, and the hashes of REP-2011 in rmw_zenoh's keys."""
 
 from functools import cache
 from typing import Any
@@ -32,8 +29,8 @@ string reason
 """
 
 NAVDATA = """\
-# What ardrone_autonomy's Navdata tells, in its units and signs (x forward, y left, z up), with names as ROS 2 wants
-# them. What nobody has told yet is NaN, or 0 where it is a whole number.
+# The fields of ardrone_autonomy's Navdata, in its units and signs (x forward, y left, z up), with names as ROS 2 wants
+# them. Fields without a sample yet are NaN, or 0 in integers.
 std_msgs/Header header
 # [%]
 float32 battery_percent

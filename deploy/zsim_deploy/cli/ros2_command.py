@@ -44,9 +44,9 @@ def ros2(
     give_way()
     who = reach.who
     to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
-    door = RosNetwork(domain, router, to_router)
+    network = RosNetwork(domain, router, to_router)
     mine = named("ros2", name, reach.tls)
-    visit(mine, partial(serve, door=door, wall_ns=time.time_ns), reach)
+    visit(mine, partial(serve, network=network, wall_ns=time.time_ns), reach)
 
 
 def _write_package(folder: Path) -> None:

@@ -10,12 +10,12 @@ from zsim_bridges import ros_frames
 
 
 def test_a_time_is_seconds_and_nanoseconds():
-    assert ros_frames.stamp(12_340_000_005) == (12, 340_000_005)
-    assert ros_frames.stamp(0) == (0, 0)
+    assert ros_frames.ros1_stamp(12_340_000_005) == (12, 340_000_005)
+    assert ros_frames.ros1_stamp(0) == (0, 0)
 
 
 def test_there_is_no_time_before_the_start():
-    assert ros_frames.stamp(-5_000_000) == (0, 0)
+    assert ros_frames.ros1_stamp(-5_000_000) == (0, 0)
 
 
 def test_rotations_agree_with_scipy():
