@@ -208,7 +208,7 @@ class LockstepSession:
         self._gate_ns = NO_GATE_NS
         self.agent.answer(counted)
 
-    def _payload(self, output: stream_requests.GateOutput) -> bytes:
+    def _payload(self, output: stream_requests.LockstepOutput) -> bytes:
         """Return an output as a payload: what a done counts goes out by the agent, the rest by the gateway."""
         if not is_counted_key(output.key):
             self.run.check_writable(output.key)

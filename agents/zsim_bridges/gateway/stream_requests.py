@@ -77,7 +77,7 @@ class JoinRequest(StreamRequest, tag="join"):
     gates: Keys = []
 
 
-class GateOutput(Struct, forbid_unknown_fields=True):
+class LockstepOutput(Struct, forbid_unknown_fields=True):
     """An output of a gate."""
 
     key: Key
@@ -88,7 +88,7 @@ class DoneRequest(StreamRequest, tag="done"):
     """All outputs of the gate t_ns."""
 
     t_ns: int
-    outputs: list[GateOutput] = []
+    outputs: list[LockstepOutput] = []
 
 
 class LeaveRequest(StreamRequest, tag="leave"):

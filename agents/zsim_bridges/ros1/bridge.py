@@ -12,7 +12,7 @@ from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_bridges import ros_frames
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.ros1 import conversions
+from zsim_bridges.ros1 import driver_messages
 from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics
 from zsim_bridges.ros1.intake import Intake
 from zsim_bridges.ros1.node import Ros1Node
@@ -124,7 +124,7 @@ class Bridge:
     def _on_clock(self, payload: bytes) -> None:
         clock = self._observer.update_clock(payload)
         if clock is not None:
-            self._clock.publish(lambda _: conversions.clock(clock))
+            self._clock.publish(lambda _: driver_messages.clock(clock))
 
     def _on_event(self, payload: bytes) -> None:
         """Print which commands of ROS nodes the world refuses."""

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 from zsim.contract import keys, messages
 from zsim.scenario.scenario import Drone
 from zsim_bridges import ros_frames
-from zsim_bridges.ros1 import conversions
+from zsim_bridges.ros1 import driver_messages
 from zsim_bridges.ros1.connections import PublishedTopic
-from zsim_bridges.ros1.conversions import DriverFrames
+from zsim_bridges.ros1.driver_messages import DriverFrames
 from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.onboard import OnboardState
 
@@ -163,19 +163,19 @@ class DroneTopics:
         message = state.update(message)
         match message:
             case messages.Imu():
-                self._imu.publish(partial(conversions.imu, sample=message, attitude=state.attitude, frames=frames))
+                self._imu.publish(partial(driver_messages.imu, sample=message, attitude=state.attitude, frames=frames))
             case messages.Mag():
-                self._mag.publish(partial(conversions.mag, sample=message, frames=frames))
+                self._mag.publish(partial(driver_messages.mag, sample=message, frames=frames))
             case messages.Gps():
-                self._fix.publish(partial(conversions.fix, sample=message, frames=frames))
+                self._fix.publish(partial(driver_messages.fix, sample=message, frames=frames))
             case messages.Truth():
-                self._truth.publish(partial(conversions.ground_truth, truth=message, frames=frames))
+                self._truth.publish(partial(driver_messages.ground_truth, truth=message, frames=frames))
             case messages.Status():
                 self._publish_status(message)
 
     def _publish_status(self, status: messages.Status) -> None:
         state, frames = self._state, self._frames
         self._commands.on_status(status)
-        self._navdata.publish(partial(conversions.navdata, state=state, frames=frames))
-        self._odometry.publish(partial(conversions.odometry, state=state, frames=frames))
-        self._tf.publish(partial(conversions.transforms, state=state, frames=frames))
+        self._navdata.publish(partial(driver_messages.navdata, state=state, frames=frames))
+        self._odometry.publish(partial(driver_messages.odometry, state=state, frames=frames))
+        self._tf.publish(partial(driver_messages.transforms, state=state, frames=frames))

@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from zsim.contract import messages
-from zsim_bridges.ros1 import conversions, tcpros
-from zsim_bridges.ros1.conversions import DriverFrames
+from zsim_bridges.ros1 import driver_messages, tcpros
+from zsim_bridges.ros1.driver_messages import DriverFrames
 from zsim_bridges.ros1.onboard import OnboardState
 
 T_NS = 61_040_000_000
@@ -43,7 +43,7 @@ def aircraft(state: Any = "hovering", **angles: float) -> OnboardState:
 
 def navdata(state: Any = "hovering", **angles: float) -> Any:
     """Navdata as a node reads it, bytes in between."""
-    made = conversions.navdata(3, aircraft(state, **angles), FRAMES)
+    made = driver_messages.navdata(3, aircraft(state, **angles), FRAMES)
     kind = "ardrone_autonomy/Navdata"
     return tcpros.deserialize(kind, tcpros.serialize(kind, made))
 
@@ -87,7 +87,7 @@ def test_states_have_the_numbers_of_the_sdk(state, number):
 def test_an_aircraft_that_has_said_little_has_navdata_too():
     own = OnboardState()
     own.update(messages.Status(0, 0, "landed", 100.0, False, None, 1))
-    said = conversions.navdata(0, own, FRAMES)
+    said = driver_messages.navdata(0, own, FRAMES)
     assert (said.altd, said.vx, said.pressure, said.az) == (0, 0.0, 0, 0.0)
     tcpros.serialize("ardrone_autonomy/Navdata", said)
 
@@ -95,7 +95,7 @@ def test_an_aircraft_that_has_said_little_has_navdata_too():
 def test_an_imu_tells_specific_force_rate_and_attitude():
     own = aircraft(yaw_deg=90.0)
     assert own.imu is not None
-    said = conversions.imu(0, own.imu, own.attitude, FRAMES)
+    said = driver_messages.imu(0, own.imu, own.attitude, FRAMES)
     assert said.linear_acceleration.z == pytest.approx(9.80665)
     assert (said.angular_velocity.x, said.angular_velocity.y, said.angular_velocity.z) == (0.1, 0.2, 0.3)
     assert (said.orientation.w, said.orientation.z) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
@@ -103,13 +103,13 @@ def test_an_imu_tells_specific_force_rate_and_attitude():
 
 
 def test_the_magnetic_field_is_a_direction():
-    said = conversions.mag(0, messages.Mag(T_NS, 0, T_NS - 5_000_000, (3.0, 0.0, -4.0)), FRAMES)
+    said = driver_messages.mag(0, messages.Mag(T_NS, 0, T_NS - 5_000_000, (3.0, 0.0, -4.0)), FRAMES)
     assert (said.vector.x, said.vector.y, said.vector.z) == pytest.approx((0.6, 0.0, -0.8))
     assert said.header.stamp.nanosec == 35_000_000  # of the sample, not of its arrival
 
 
 def test_no_magnetic_field_is_no_direction():
-    said = conversions.mag(0, messages.Mag(0, 0, 0, (0.0, 0.0, 0.0)), FRAMES)
+    said = driver_messages.mag(0, messages.Mag(0, 0, 0, (0.0, 0.0, 0.0)), FRAMES)
     assert (said.vector.x, said.vector.y, said.vector.z) == (0.0, 0.0, 0.0)
 
 
@@ -120,7 +120,7 @@ def gps(fix: int) -> messages.Gps:
 
 
 def test_a_fix_is_where_and_how_well():
-    said = conversions.fix(0, gps(3), FRAMES)
+    said = driver_messages.fix(0, gps(3), FRAMES)
     assert (said.latitude, said.longitude, said.altitude) == (-34.6, -58.4, 31.0)
     assert said.status.status == 0
     assert said.position_covariance.tolist() == [4.0, 0, 0, 0, 4.0, 0, 0, 0, 4.0]
@@ -128,11 +128,11 @@ def test_a_fix_is_where_and_how_well():
 
 
 def test_no_fix_is_said():
-    assert conversions.fix(0, gps(0), FRAMES).status.status == -1
+    assert driver_messages.fix(0, gps(0), FRAMES).status.status == -1
 
 
 def test_odometry_is_the_aircraft_s_own():
-    said = conversions.odometry(0, aircraft(), FRAMES)
+    said = driver_messages.odometry(0, aircraft(), FRAMES)
     assert (said.header.frame_id, said.child_frame_id) == ("drone1/odom", "drone1/ardrone_base_link")
     assert said.pose.pose.position.z == pytest.approx(1.234)
     assert (said.twist.twist.linear.x, said.twist.twist.linear.y) == (1.0, 0.25)
@@ -143,7 +143,7 @@ def test_ground_truth_is_in_the_world():
     truth = messages.Truth(
         T_NS, 0, (1.0, 2.0, 3.0), (0.0, 4.0, 0.0), attitude(yaw_deg=90.0), (1.0, 0.0, 0.5), ZERO, STILL
     )  # fmt: skip
-    said = conversions.ground_truth(0, truth, FRAMES)
+    said = driver_messages.ground_truth(0, truth, FRAMES)
     assert said.header.frame_id == "world"
     assert (said.pose.pose.position.x, said.pose.pose.position.y, said.pose.pose.position.z) == (1.0, 2.0, 3.0)
     assert (said.twist.twist.linear.x, said.twist.twist.linear.y) == (0.0, 4.0)
@@ -154,21 +154,21 @@ def test_ground_truth_is_in_the_world():
 def test_transforms_lead_from_the_world_to_where_the_estimator_believes_it_to_be():
     own = aircraft(yaw_deg=30.0)
     own.update(messages.Estimate(T_NS, 1, (5.0, 6.0, 7.0), ZERO, attitude(yaw_deg=30.0), 0.0, (0.0,) * 36, 0.0, ZERO, {}))  # fmt: skip
-    to_base, to_odom = conversions.transforms(0, own, FRAMES).transforms
+    to_base, to_odom = driver_messages.transforms(0, own, FRAMES).transforms
     assert (to_odom.header.frame_id, to_odom.child_frame_id) == ("world", "drone1/odom")
     assert (to_base.header.frame_id, to_base.child_frame_id) == ("drone1/odom", "drone1/ardrone_base_link")
     place = [[getattr(t.transform.translation, axis) for axis in "xyz"] for t in (to_odom, to_base)]
     assert np.sum(place, axis=0) == pytest.approx([5.0, 6.0, 7.0])
-    assert tcpros.serialize("tf2_msgs/TFMessage", conversions.transforms(0, own, FRAMES))
+    assert tcpros.serialize("tf2_msgs/TFMessage", driver_messages.transforms(0, own, FRAMES))
 
 
 def test_transforms_without_an_estimator_end_at_odom():
     own = OnboardState()
     own.update(messages.Status(0, 0, "landed", 100.0, False, None, 1))
-    (only,) = conversions.transforms(0, own, FRAMES).transforms
+    (only,) = driver_messages.transforms(0, own, FRAMES).transforms
     assert only.header.frame_id == "drone1/odom"
 
 
 def test_the_clock_is_simulated_time():
-    said = conversions.clock(messages.Clock(T_NS, 0, "run", 3052, "running", 1.0))
+    said = driver_messages.clock(messages.Clock(T_NS, 0, "run", 3052, "running", 1.0))
     assert (said.clock.sec, said.clock.nanosec) == (61, 40_000_000)
