@@ -41,7 +41,7 @@ def test_a_twist_is_six_doubles():
 
 def test_a_number_that_does_not_go_into_its_field_is_refused():
     point = tcpros.message_class("geometry_msgs/Point32")(x=1e300, y=0.0, z=0.0)
-    with pytest.raises(ValueError, match="is no geometry_msgs/Point32"):
+    with pytest.raises(ValueError, match="geometry_msgs/Point32"):
         tcpros.serialize("geometry_msgs/Point32", point)
 
 
@@ -56,5 +56,5 @@ def test_an_empty_message_has_no_bytes():
 def test_other_bytes_are_refused(kind, data):
     if kind == "std_msgs/String" and len(data) - 4 == int.from_bytes(data[:4], "little"):
         return
-    with pytest.raises(ValueError, match="bytes are no"):
+    with pytest.raises(ValueError, match=kind):
         tcpros.deserialize(kind, data)

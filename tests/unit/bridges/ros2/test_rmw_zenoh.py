@@ -61,7 +61,7 @@ def test_attachment_is_33_bytes() -> None:
 
 @pytest.mark.parametrize("data", [b"", bytes(32), bytes(34), bytes(33), b"\x0fsequence_number" + bytes(17)])
 def test_other_attachments_are_refused(data: bytes) -> None:
-    with pytest.raises(ValueError, match="must have 33"):
+    with pytest.raises(ValueError, match="33"):
         rmw_zenoh.attachment_of(data)
 
 

@@ -410,7 +410,7 @@ def test_a_number_out_of_range_is_not_flown_to_the_limit_when_its_box_is_left(be
 def test_a_value_out_of_range_is_told_and_not_sent(bench: Bench):
     bench.formation().request_target({"p": 0.5})
     assert bench.desk.asked == []
-    assert bench.told[0].refusal.startswith("p is 0.5 m; must be from")
+    assert bench.told[0].refusal.startswith("p is 0.5 m")
 
 
 def test_of_many_variables_the_others_are_moved_one_at_a_time():
