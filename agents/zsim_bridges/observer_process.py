@@ -1,4 +1,4 @@
-"""A process that looks and commands without gating, among the others of a run: joins, tells of its health, says bye."""
+"""A process of a run that shows and commands but never gates: its join, health and bye."""
 
 import os
 import secrets
@@ -10,11 +10,11 @@ from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
 from zsim.transport.session import Sample, Session
 
-ENTRIES = ("join", "restart", "superseded")  # kinds of events that tell of a process that joined
+JOIN_EVENTS = ("join", "restart", "superseded")  # kinds of events that report a process that joined
 
 
-class Presence:
-    """One run's worth of it.
+class ObserverProcess:
+    """The process in one run.
 
     Args:
         link: an open session.
@@ -22,40 +22,40 @@ class Presence:
         name: process name, role.thing.
 
     Attributes:
-        now_ns: simulated time of the newest clock that it was shown.
-        health: counters that it tells.
-        over: why there is nothing left to do in this run; empty while there is.
+        now_ns: simulated time of the newest clock received.
+        health: counters that it publishes.
+        end_reason: why the process has nothing left to do in this run; empty while it goes on.
     """
 
     def __init__(self, link: Session, info: messages.Info, name: str) -> None:
         self._link = link
         self._info = info
-        self._healths = 0
-        self._joins = -1
+        self._health_seq = 0
+        self._join_seq = -1
         self.name = name
         self.now_ns = 0
         self.health = HealthMeter(name.split(".", 1)[0], host=link.host)
-        self.over = ""
+        self.end_reason = ""
         self._incarnation = secrets.randbits(62)
-        self._taken_in = self._superseded = False
-        self._must_join = self._was_cut = False
+        self._admitted = self._superseded = False
+        self._must_join = self._was_link_lost = False
 
-    def enter(self) -> None:
-        """Join."""
+    def announce(self) -> None:
+        """Join the run."""
         self._link.on_message(keys.EVENT, self._on_event)
         self._link.on_link(self._on_link)
         self._link.declare_token(keys.token(self.name))
         self._join()
 
     def _on_link(self, up: bool) -> None:
-        self._must_join = up and self._was_cut
-        self._was_cut = not up
+        self._must_join = up and self._was_link_lost
+        self._was_link_lost = not up
 
     def _join(self) -> None:
-        self._joins += 1
+        self._join_seq += 1
         join = messages.Join(
             t_ns=self.now_ns,
-            seq=self._joins,
+            seq=self._join_seq,
             run_id=self._info.run_id,
             incarnation=self._incarnation,
             role=self.name.split(".", 1)[0],
@@ -67,8 +67,8 @@ class Presence:
         )
         self._link.put(keys.process(self.name, "join"), join)
 
-    def heed(self, payload: bytes) -> messages.Clock | None:
-        """Follow the run by a message on `clock`; return it, None where it is none."""
+    def update_clock(self, payload: bytes) -> messages.Clock | None:
+        """Follow the run by a message on `clock`; return it, None where it cannot be decoded."""
         try:
             clock: messages.Clock = messages.decode(keys.CLOCK, payload)
         except DecodeError:
@@ -76,20 +76,20 @@ class Presence:
             return None
         self.now_ns = clock.t_ns
         if clock.run_id != self._info.run_id:
-            self.over = "the world has begun another run"
+            self.end_reason = "the world has begun another run"
         elif clock.state == "stopped":
-            self.over = "the run ended"
+            self.end_reason = "the run ended"
         return clock
 
     def tick(self) -> None:
-        """Tell of its health once a wall second; to be called more often."""
+        """Publish health once a wall second; to be called more often."""
         if self._must_join:  # the world took it for dead
-            self._must_join = self._taken_in = False
+            self._must_join = self._admitted = False
             self._incarnation = secrets.randbits(62)
             self._join()
         if self.health.due():
-            health = self.health.message(self.now_ns, self._healths)
-            self._healths += 1
+            health = self.health.message(self.now_ns, self._health_seq)
+            self._health_seq += 1
             self._link.put(keys.process(self.name, "health"), health)
 
     @property
@@ -98,7 +98,7 @@ class Presence:
         return self._superseded
 
     def leave(self, reason: str) -> None:
-        """Say bye, unless another has taken over the name."""
+        """Publish bye, unless another process has taken over the name."""
         if not self._superseded:
             self._link.put(keys.process(self.name, "bye"), messages.Bye(self.now_ns, 0, reason))
 
@@ -106,12 +106,12 @@ class Presence:
         try:
             event = messages.decode(keys.EVENT, sample.payload)
         except DecodeError:
-            return  # somebody else's garbage
-        if event.subject != self.name or event.kind not in ENTRIES:
+            return  # not an event of the world
+        if event.subject != self.name or event.kind not in JOIN_EVENTS:
             return
-        is_mine = event.data.get("incarnation") == self._incarnation
-        self._taken_in = self._taken_in or is_mine
-        if self._taken_in and not is_mine:
+        is_own = event.data.get("incarnation") == self._incarnation
+        self._admitted = self._admitted or is_own
+        if self._admitted and not is_own:
             self._superseded = True
-            who = f"{event.data.get('host')} (pid {event.data.get('pid')})"
-            self.over = f"another process of this name joined from {who}"
+            address = f"{event.data.get('host')} (pid {event.data.get('pid')})"
+            self.end_reason = f"another process of this name joined from {address}"

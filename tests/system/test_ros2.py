@@ -20,7 +20,7 @@ from secured import Certificates, tls_endpoint
 
 from zsim.scenario import scenario_file
 from zsim_bridges.ros2 import rmw_zenoh
-from zsim_bridges.ros2.ros_types import Types
+from zsim_bridges.ros2.ros_types import RosTypes
 from zsim_deploy.security.access_control import access_control
 
 TWIST, EMPTY = "geometry_msgs/msg/Twist", "std_msgs/msg/Empty"
@@ -265,11 +265,11 @@ def test_wire_of_what_we_send_and_what_we_refuse(federation: Federation, ros: RO
     stamps = [seconds(message["header"]) for message in node.heard["/drone1/imu"]]
     assert [after - before for before, after in pairwise(stamps)] == pytest.approx([0.005] * (len(stamps) - 1))
 
-    types = Types()
+    types = RosTypes()
     key = rmw_zenoh.data_key(0, "/drone1/cmd_vel", rmw_zenoh.dds_name(TWIST), types.hash(TWIST))
-    vector = types.of("geometry_msgs/msg/Vector3")
-    good = types.encode(types.of(TWIST)(vector(1.0, 0.0, 0.0), vector(0.0, 0.0, 0.0)), TWIST)
-    bad = types.encode(types.of(TWIST)(vector(math.nan, 0.0, 0.0), vector(0.0, 0.0, 0.0)), TWIST)
+    vector = types.message_class("geometry_msgs/msg/Vector3")
+    good = types.encode(types.message_class(TWIST)(vector(1.0, 0.0, 0.0), vector(0.0, 0.0, 0.0)), TWIST)
+    bad = types.encode(types.message_class(TWIST)(vector(math.nan, 0.0, 0.0), vector(0.0, 0.0, 0.0)), TWIST)
     beside = rmw_zenoh.Attachment(1, 1, bytes(16)).packed()
     for payload, attachment in ((b"\x00\x01\x00\x00garbage", beside), (good, b""), (good, beside[:-1]), (bad, beside)):
         raw.session.put(key, payload, attachment=attachment)

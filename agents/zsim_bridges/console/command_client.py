@@ -1,116 +1,212 @@
-"""What an operator asks for, sent to whoever answers it, off the page's threads; what comes of it is told."""
+"""Requests and modes of an operator, sent off the page's threads; the outcome of each is reported."""
 
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
 from zsim.errors import ZsimError
 from zsim.transport.session import Session
-from zsim_bridges.console.drone_queue import Turns
-from zsim_bridges.console.view_buffer import Eyes
+from zsim_bridges.console.view_buffer import ViewBuffer
+
+Task = Callable[[], None]
+
+
+@dataclass
+class _DroneTasks:
+    """Tasks of one drone: how many run, and which wait for them."""
+
+    busy: int = 0
+    waiting: deque[Task] = field(default_factory=deque)
+
+
+class DroneQueue:
+    """Runs tasks in order of submission for each drone; drones do not wait for each other.
+
+    Args:
+        pool: runs tasks in their order.
+        urgent: runs tasks that wait for no other.
+    """
+
+    def __init__(self, hands: Executor, urgent: Executor) -> None:
+        self._pool = hands
+        self._urgent = urgent
+        self._tasks: dict[str, _DroneTasks] = {}
+        self._lock = threading.Lock()
+        self._closed = False
+
+    def close(self) -> None:
+        """Start no more tasks."""
+        with self._lock:
+            self._closed = True
+            self._tasks.clear()
+
+    def submit(self, name: str, act: Task) -> None:
+        """Run a task after all that were submitted for that name before.
+
+        Raises:
+            RuntimeError: closed.
+        """
+        with self._lock:
+            line = self._tasks_of(name)
+            if line.busy:
+                line.waiting.append(act)
+            else:
+                self._start(self._pool, name, act)
+
+    def submit_urgent(self, name: str, act: Task) -> None:
+        """Run a task without waiting for earlier ones; later ones wait for it.
+
+        Raises:
+            RuntimeError: closed.
+        """
+        with self._lock:
+            self._tasks_of(name)
+            self._start(self._urgent, name, act)
+
+    def _tasks_of(self, name: str) -> _DroneTasks:
+        if self._closed:
+            raise RuntimeError("closed")
+        return self._tasks.setdefault(name, _DroneTasks())
+
+    def _start(self, hands: Executor, name: str, act: Task) -> None:
+        def done() -> None:
+            try:
+                act()
+            finally:
+                self._end(name)
+
+        hands.submit(done)
+        self._tasks[name].busy += 1
+
+    def _end(self, name: str) -> None:
+        with self._lock:
+            line = self._tasks.get(name)
+            if line is None:
+                return  # closed
+            line.busy -= 1
+            if line.busy:
+                return
+            if line.waiting:
+                self._start(self._pool, name, line.waiting.popleft())
+            else:
+                del self._tasks[name]
+
 
 PRIORITY = 10  # contract: of operators
 PRIORITY_EMERGENCY = 100  # contract: the highest; an operator who flies a drone must not keep others from stopping it
-HANDS = 8  # under way at once, of each kind: requests that nobody answers must not keep modes waiting
-ANSWER_S = 5.0  # the world and controllers answer within a gate
+THREADS_PER_POOL = 8  # in each pool: requests without an answer must not delay modes
+ANSWER_TIMEOUT_S = 5.0  # the world and controllers answer within a gate
 OVERTAKEN = "an emergency was asked for after it"
-TAKEN_S = 1.0  # how long the world may take to say that it has a command, before the drone is given back
+ACCEPTANCE_TIMEOUT_S = 1.0  # how long the world may take to accept a command, before the drone is released
 
 
-class Told(NamedTuple):
-    """What came of a request: what was asked, and why it was refused; empty where it was not."""
+class RequestOutcome(NamedTuple):
+    """A request in words, and why it was refused; empty where it was not."""
 
-    what: str
+    request: str
     refusal: str
 
 
-class Desk:
+class CommandClient:
     """Sends requests in the console's name.
 
     Args:
         link: an open session.
         name: of the console's process.
-        eyes: hears when a command has been taken.
+        views: receives when a command has been accepted.
         now_ns: simulated time for a stamp; may ask for it.
-        tell: told what came of each request, in any thread.
+        report: called with the outcome of each request, in any thread.
     """
 
     def __init__(
-        self, link: Session, name: str, eyes: Eyes, now_ns: Callable[[], int], tell: Callable[[Told], None]
+        self,
+        link: Session,
+        name: str,
+        views: ViewBuffer,
+        now_ns: Callable[[], int],
+        report: Callable[[RequestOutcome], None],
     ) -> None:
         self._link = link
         self._name = name
-        self._eyes = eyes
+        self._views = views
         self._now_ns = now_ns
-        self._tell = tell
+        self._report = report
         self._seqs: Counter[str] = Counter()  # modes sent to each drone
-        self._stops: Counter[str] = Counter()  # emergencies asked for of each drone
+        self._emergencies: Counter[str] = Counter()  # emergencies requested of each drone
         self._lock = threading.Lock()
-        self._hands = [
-            ThreadPoolExecutor(HANDS, thread_name_prefix=f"desk-{what}") for what in ("ask", "mode", "stop", "give")
+        self._pools = [
+            ThreadPoolExecutor(THREADS_PER_POOL, thread_name_prefix=f"console-{kind}")
+            for kind in ("request", "mode", "emergency", "release")
         ]
-        self._requests, modes, stops, self._gifts = self._hands
-        self._turns = Turns(modes, stops)
+        self._requests, modes, stops, self._releases = self._pools
+        self._queue = DroneQueue(modes, stops)
 
     def close(self) -> None:
-        """Wait for nobody any more."""
-        self._turns.close()
-        for hands in self._hands:
+        """Give up requests that wait."""
+        self._queue.close()
+        for hands in self._pools:
             hands.shutdown(wait=False, cancel_futures=True)
 
-    def world(self, op: str, **args: Any) -> None:
-        """Ask the world."""
-        self._ask(keys.CONTROL, op, args, f"{op} {_listed(args)}".strip())
+    def request_world(self, op: str, **args: Any) -> None:
+        """Request an operation of the world."""
+        self._ask(keys.CONTROL, op, args, f"{op} {_format_arguments(args)}".strip())
 
-    def cluster(self, cluster: str, op: str, said: str = "", **args: Any) -> None:
-        """Ask a formation's controller; `said` tells people of the arguments in units of theirs."""
-        self._ask(keys.cluster_control(cluster), op, args, f"{cluster}: {op} {said or _listed(args)}".strip())
+    def request_cluster(self, cluster: str, op: str, shown: str = "", **args: Any) -> None:
+        """Request an operation of a formation's controller; `shown` is the arguments as the page shows them."""
+        self._ask(
+            keys.cluster_control(cluster), op, args, f"{cluster}: {op} {shown or _format_arguments(args)}".strip()
+        )
 
-    def mode(self, drones: Sequence[str], mode: str) -> None:
-        """Let drones take off, land, stop at once or leave the emergency, whoever flies them.
+    def send_mode(self, drones: Sequence[str], mode: str) -> None:
+        """Let drones take off, land, stop at once or leave the emergency, whoever commands them.
 
-        Modes of one drone are sent in the order in which they were asked for; an emergency waits for none of them,
-        and none that was asked for before it is sent after it.
+        Modes of one drone are sent in the order of the requests; an emergency waits for none of them, and none that
+        was requested before it is sent after it.
         """
         for drone in drones:
             if mode == "emergency":
                 with self._lock:
-                    self._stops[drone] += 1
-                self._do(partial(self._turns.do_at_once, drone), f"{drone}: {mode}", self._stop, drone, mode)
+                    self._emergencies[drone] += 1
+                self._submit(
+                    partial(self._queue.submit_urgent, drone), f"{drone}: {mode}", self._send_emergency, drone, mode
+                )
             else:
-                turn, stops = partial(self._turns.do, drone), self._stops[drone]
-                self._do(turn, f"{drone}: {mode}", self._mode, drone, mode, stops)
+                turn, stops = partial(self._queue.submit, drone), self._emergencies[drone]
+                self._submit(turn, f"{drone}: {mode}", self._acquire_and_send, drone, mode, stops)
 
     def _ask(self, key: str, op: str, args: dict[str, Any], what: str) -> None:
-        self._do(self._requests.submit, what, self._request, key, op, args)
+        self._submit(self._requests.submit, what, self._request, key, op, args)
 
-    def _do(self, begin: Callable[[Callable[[], None]], Any], what: str, act: Callable[..., str], *args: Any) -> None:
+    def _submit(
+        self, begin: Callable[[Callable[[], None]], Any], what: str, act: Callable[..., str], *args: Any
+    ) -> None:
         def done() -> None:
-            self._tell(Told(what, _refusal(act, *args)))
+            self._report(RequestOutcome(what, _refusal_of(act, *args)))
 
         try:
             begin(done)
         except RuntimeError:  # closed; a page of the run may still be open
-            self._tell(Told(what, "the run has ended"))
+            self._report(RequestOutcome(what, "the run has ended"))
 
     def _request(self, key: str, op: str, args: dict[str, Any]) -> str:
-        answer = self._link.request(key, op, self._name, args, ANSWER_S)
+        answer = self._link.request(key, op, self._name, args, ANSWER_TIMEOUT_S)
         return "" if answer.ok else answer.error or "refused without a reason"
 
-    def _mode(self, drone: str, mode: str, stops: int) -> str:
-        """Take a drone from whoever flies it, and send the mode, unless more emergencies were asked for meanwhile."""
-        if self._stops[drone] > stops:
+    def _acquire_and_send(self, drone: str, mode: str, stops: int) -> str:
+        """Acquire a drone and send the mode, unless more emergencies were requested meanwhile."""
+        if self._emergencies[drone] > stops:
             return OVERTAKEN
         return self._acquire(drone, PRIORITY) or self._send(drone, mode, stops)
 
-    def _stop(self, drone: str, mode: str) -> str:
-        """Send the mode whatever becomes of the request for the drone: the world may heed it all the same."""
-        refusal = _refusal(self._acquire, drone, PRIORITY_EMERGENCY)
+    def _send_emergency(self, drone: str, mode: str) -> str:
+        """Send the mode even if the drone could not be acquired: the world may accept it all the same."""
+        refusal = _refusal_of(self._acquire, drone, PRIORITY_EMERGENCY)
         self._send(drone, mode)
         return refusal and f"{refusal}; {mode} was sent all the same"
 
@@ -118,42 +214,42 @@ class Desk:
         return self._request(keys.CONTROL, "acquire", {"drone": drone, "priority": priority})
 
     def _send(self, drone: str, mode: str, stops: int | None = None) -> str:
-        """Send a mode, unless more emergencies than `stops` were asked for; let others fly the drone afterwards."""
-        before, now_ns = self._eyes.answered(drone), self._now_ns()
+        """Send a mode, unless more emergencies than `stops` were requested; release the drone afterwards."""
+        before, now_ns = self._views.answered_commands(drone), self._now_ns()
         with self._lock:
-            overtaken = stops is not None and self._stops[drone] > stops
+            overtaken = stops is not None and self._emergencies[drone] > stops
             if not overtaken:
                 seq, self._seqs[drone] = self._seqs[drone], self._seqs[drone] + 1
-                said = messages.Mode(now_ns, seq, self._name, mode)  # type: ignore[arg-type]
-                self._link.put(keys.command(drone, "mode"), said)
+                message = messages.Mode(now_ns, seq, self._name, mode)  # type: ignore[arg-type]
+                self._link.put(keys.command(drone, "mode"), message)
         with suppress(RuntimeError):  # closed: who leaves a run gives back what it has
-            self._gifts.submit(self._give_back, drone, before)
+            self._releases.submit(self._release, drone, before)
         return OVERTAKEN if overtaken else ""
 
-    def _give_back(self, drone: str, before: int) -> None:
-        """Let others fly a drone, once the world has the mode that was sent with an operator's priority."""
-        self._eyes.await_answer(drone, before, TAKEN_S)
+    def _release(self, drone: str, before: int) -> None:
+        """Release a drone, once the world has the mode that was sent with an operator's priority."""
+        self._views.await_answer(drone, before, ACCEPTANCE_TIMEOUT_S)
         with suppress(ZsimError):  # the run has ended
             self._request(keys.CONTROL, "release", {"drone": drone})
 
 
-def _refusal(act: Callable[..., str], *args: Any) -> str:
+def _refusal_of(act: Callable[..., str], *args: Any) -> str:
     """Return why something was not done; empty where it was."""
     try:
         return act(*args)
     except ZsimError as error:
         return str(error)
-    except Exception as error:  # nobody asks a thread of a pool how it ended
+    except Exception as error:  # a pool's thread reports no exception itself
         return f"{type(error).__name__}: {error}"
 
 
-def _listed(args: dict[str, Any]) -> str:
-    return ", ".join(f"{name} {_short(value)}" for name, value in args.items())
+def _format_arguments(args: dict[str, Any]) -> str:
+    return ", ".join(f"{name} {_format_value(value)}" for name, value in args.items())
 
 
-def _short(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:g}"
     if isinstance(value, dict):
-        return " ".join(f"{name}={_short(item)}" for name, item in value.items())[:120]
+        return " ".join(f"{name}={_format_value(item)}" for name, item in value.items())[:120]
     return str(value)[:120]

@@ -1,82 +1,171 @@
-"""The console: one page after the other's run, behind one door."""
+"""The console: shows one run after the other on a viser server that only its own HTTP proxy can reach."""
 
+import asyncio
+import contextlib
+import http
+import io
+import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import viser
+import viser.infra._infra
+import websockets.asyncio.server
+from viser.infra._async_message_buffer import AsyncMessageBuffer
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
 
 from zsim.contract.messages import Info
 from zsim.transport.session import Session
-from zsim_bridges.console.forms.controls import KnownControls
-from zsim_bridges.console.http.http_proxy import Door, Inside, Place
-from zsim_bridges.console.http.page_rights import OPERATOR, VIEWER
-from zsim_bridges.console.http.private_viser import PrivateViser
-from zsim_bridges.console.run_page import Show
-from zsim_bridges.console.scene.camera_follow import Followers
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.console.http_proxy import BACKEND_HOST, SECRET_HEADER, HttpProxy, ListenAddress, ViserBackend
+from zsim_bridges.console.page.scene_nodes import CameraFollow
+from zsim_bridges.console.page_rights import OPERATOR, VIEWER, PageControls
+from zsim_bridges.console.run_page import RunPage
+from zsim_bridges.observer_process import ObserverProcess
+
+
+class AnyThreadEvent(asyncio.Event):
+    """An event that other threads may set; the loop's own `set` wakes the tasks that wait.
+
+    An asyncio.Event iterates over its waiters, and fails when the loop changes them meanwhile.
+    """
+
+    def set(self) -> None:
+        """Set it; on the loop, wake the waiters even if another thread has set it before."""
+        if asyncio._get_running_loop() is None:
+            self._value = True
+        else:
+            self._value = False
+            super().set()
+
+
+class _Buffer(AsyncMessageBuffer):
+    """A buffer of viser's, which sets its event from every thread, and once more on the loop."""
+
+    def __init__(self, *args: Any, **more: Any) -> None:
+        super().__init__(*args, **more)
+        self.message_event = AnyThreadEvent()
+
+
+viser.infra._infra.AsyncMessageBuffer = _Buffer  # type: ignore[misc]
+
+
+class PrivateViser:
+    """A viser server on a port of loopback that refuses connections without the secret.
+
+    Attributes:
+        server: viser's.
+        secret: to be sent in SECRET_HEADER.
+    """
+
+    def __init__(self) -> None:
+        self.secret = secrets.token_urlsafe(24)
+        with _silent(), _requiring_secret(self.secret):
+            self.server = viser.ViserServer(host=BACKEND_HOST, port=0, verbose=False)
+
+    @property
+    def port(self) -> int:
+        return self.server.get_port()
+
+    def close(self) -> None:
+        """Stop it."""
+        with _silent():
+            self.server.stop()
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Keep viser from printing an address that is of no use to a person."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
+
+
+@contextlib.contextmanager
+def _requiring_secret(secret: str) -> Iterator[None]:
+    """Let servers that are started meanwhile refuse connections without the secret: viser has no setting for it."""
+    serve = websockets.asyncio.server.serve
+
+    def serve_checked(*args: Any, process_request: Callable[..., Any] | None = None, **more: Any) -> Any:
+        def check(connection: Any, request: Request) -> Response | None:
+            if not secrets.compare_digest(request.headers.get(SECRET_HEADER, ""), secret):
+                return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", Headers(), b"")
+            return None
+
+        return serve(*args, process_request=check, **more)
+
+    websockets.asyncio.server.serve = serve_checked  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
 class Console:
     """One console.
 
     Args:
-        place: where pages are served.
+        address: where pages are served.
         name: process name.
         token: of operators; None on this machine alone.
         rate_hz: pictures a second; None: as many as suit the number of drones.
-        say: told what a person should know.
+        say: prints a line.
 
     Raises:
         RunError: others could reach it, and there is no token.
     """
 
     def __init__(
-        self, place: Place, name: str, token: str | None, rate_hz: float | None, say: Callable[[str], None]
+        self, address: ListenAddress, name: str, token: str | None, rate_hz: float | None, say: Callable[[str], None]
     ) -> None:
         self._name = name
         self._rate_hz = rate_hz
         self._say = say
-        self._show: Show | None = None
+        self._run_page: RunPage | None = None
         self._viser = PrivateViser()
-        self._followers = Followers(self._viser.server)
-        _say_on(self._viser.server.gui, "waiting for a world")
-        controls = KnownControls(self._viser.server.gui, self._followers.switches)
-        inside = Inside(self._viser.port, self._viser.secret, self._state, controls)
-        self._door = Door(place, token, inside)
+        self._camera_follow = CameraFollow(self._viser.server)
+        _show_text(self._viser.server.gui, "waiting for a world")
+        controls = PageControls(self._viser.server.gui, self._camera_follow.switches)
+        backend = ViserBackend(self._viser.port, self._viser.secret, self._state, controls)
+        self._proxy = HttpProxy(address, token, backend)
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Let pages in.
+        """Serve pages.
 
         Raises:
             RunError: the port is taken.
         """
         try:
-            with self._door.open():
-                links = self._door.links()
-                self._say(f"{self._name}: steer at {links[OPERATOR]}")
-                self._say(f"{self._name}: look, without steering, at {links[VIEWER]}")
+            with self._proxy.open():
+                urls = self._proxy.urls()
+                self._say(f"{self._name}: steer at {urls[OPERATOR]}")
+                self._say(f"{self._name}: look, without steering, at {urls[VIEWER]}")
                 yield
         finally:
             self._viser.close()
 
     def serve(
-        self, link: Session, info: Info, presence: Presence, stopped: Callable[[], bool], say: Callable[[str], None]
+        self,
+        link: Session,
+        info: Info,
+        observer: ObserverProcess,
+        stopped: Callable[[], bool],
+        say: Callable[[str], None],
     ) -> None:
-        """Show a run until it is over, or somebody says stop."""
-        self._show = show = Show(self._viser.server, link, info, presence, self._followers, self._rate_hz)
+        """Show a run until it is over or `stopped` returns true."""
+        self._run_page = page = RunPage(self._viser.server, link, info, observer, self._camera_follow, self._rate_hz)
         try:
-            show.run(stopped)
+            page.run(stopped)
         finally:
-            show.close()
+            page.close()
 
     def _state(self) -> dict[str, Any]:
-        return self._show.state() if self._show else {"run_id": None}
+        return self._run_page.state() if self._run_page else {"run_id": None}
 
 
-def _say_on(gui: viser.GuiApi, text: str) -> None:
-    """Put a line on pages that have no run to show."""
+def _show_text(gui: viser.GuiApi, text: str) -> None:
+    """Show a line on pages without a run."""
     gui.configure_theme(show_logo=False, show_share_button=False)
     gui.set_panel_label("zsim")
     gui.add_markdown(text)

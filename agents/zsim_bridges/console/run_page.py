@@ -1,4 +1,4 @@
-"""One run on the page: what has been heard becomes pictures, tables and plots; what is asked for is sent."""
+"""One run on the page: draws its views as pictures, tables and plots, and sends the operator's requests."""
 
 import math
 import threading
@@ -16,41 +16,46 @@ from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import html_tables
-from zsim_bridges.console.command_client import Desk, Told
-from zsim_bridges.console.console_page import Page
-from zsim_bridges.console.http.console_state import state
-from zsim_bridges.console.scene.camera_follow import Followers
-from zsim_bridges.console.scene.picture import Drones, Shape, drones_of, ellipsoids, ghosts, shape
-from zsim_bridges.console.scene.scene_nodes import Stage
-from zsim_bridges.console.scene.trails import Trails
-from zsim_bridges.console.table_rows import Words
-from zsim_bridges.console.time_monitor import Watch
-from zsim_bridges.console.view_buffer import Eyes
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.page.console_page import ConsolePage
+from zsim_bridges.console.page.picture import (
+    DronePoses,
+    DroneTrails,
+    FormationShape,
+    drone_poses,
+    ellipsoids,
+    formation_shape,
+    ghosts,
+)
+from zsim_bridges.console.page.scene_nodes import CameraFollow, SceneNodes
+from zsim_bridges.console.table_rows import TableRows, console_state
+from zsim_bridges.console.time_monitor import TimeMonitor
+from zsim_bridges.console.view_buffer import ViewBuffer
+from zsim_bridges.observer_process import ObserverProcess
 
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
-STAMPS_PER_AGE = 5.0  # a stamp is at most so small a part as old as commands may be; on its way it ages too
+STAMPS_PER_AGE = 5.0  # a stamp is at most this fraction of a command's largest age old; it ages on its way
 EVENTS_SHOWN = 60
 NOTICE_S = 8.0  # wall; how long a refusal stays in the corner
-FEW = 20  # drones from which on pictures come half as often
+FEW_DRONES = 20  # drones from which on pictures come half as often
 RATE_HZ, RATE_LOW_HZ = 20.0, 10.0
-FAST = 4.0  # x real time; from then on, too: no eye follows it, and the run needs the processors
+FAST_RATE = 4.0  # x real time; from then on the rate is halved, too: the run needs the processors
 
 
-def pictures_hz(drones: int, rate: float) -> float:
+def picture_rate_hz(drones: int, rate: float) -> float:
     """Return how many pictures a second suit so many drones, and a run that goes so many times as fast as real time."""
-    return RATE_LOW_HZ if drones >= FEW or rate >= FAST else RATE_HZ
+    return RATE_LOW_HZ if drones >= FEW_DRONES or rate >= FAST_RATE else RATE_HZ
 
 
-class Show:
-    """What the page shows of one run.
+class RunPage:
+    """The page of one run.
 
     Args:
-        server: viser's; whatever another run has left on it goes.
+        server: viser's; what another run has left on it is removed.
         link: an open session.
         info: of the run.
-        presence: of the console in it.
-        followers: knows whose cameras go with the formation.
+        observer: of the console in it.
+        camera_follow: moves the cameras that follow the formation.
         rate_hz: pictures a second; None: fewer where there are many drones, or time flies.
     """
 
@@ -59,15 +64,15 @@ class Show:
         server: viser.ViserServer,
         link: Session,
         info: Info,
-        presence: Presence,
-        followers: Followers,
+        observer: ObserverProcess,
+        camera_follow: CameraFollow,
         rate_hz: float | None,
     ) -> None:
         self._server = server
         self._info = info
-        self._presence = presence
-        self._followers = followers
-        followers.begin()
+        self._observer = observer
+        self._camera_follow = camera_follow
+        camera_follow.restart()
         self._scenario = scenario_file.from_text(info.scenario)
         names = tuple(drone.name for drone in info.drones)
         self._rate_hz = rate_hz
@@ -77,160 +82,168 @@ class Show:
             raise RunError(f"console: {error}") from error
         variables = {name: space.names for name, space in self._spaces.items()}
         age_s = self._scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
-        self._watch = Watch(link, presence, age_s if info.mode == "realtime" else math.inf)
-        self.eyes = Eyes(link, info, presence, variables, self._tell_refused)
-        self._desk = Desk(link, presence.name, self.eyes, self._watch.now_ns, self._tell)
+        self._time_monitor = TimeMonitor(link, observer, age_s if info.mode == "realtime" else math.inf)
+        self.views = ViewBuffer(link, info, observer, variables, self._on_refused_command)
+        self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
         self._names = names
         self._members = {c.name: [names.index(d) for d in c.drones] for c in self._scenario.clusters}
-        self._trails = Trails(len(names))
-        self._words = Words(self.eyes)
-        self._shapes: dict[str, Shape | None] = {}
-        self._drones: Drones | None = None
-        self._ghosted: dict[str, Any] = {}
+        self._trails = DroneTrails(len(names))
+        self._table_rows = TableRows(self.views)
+        self._shapes: dict[str, FormationShape | None] = {}
+        self._drones: DronePoses | None = None
+        self._drawn_ghosts: dict[str, Any] = {}
         self._drawn_ns = self._table_s = 0.0
         robots = sum(space.n for space in self._spaces.values())
-        self._stage = Stage(server, names, robots, len(self._spaces))
-        self._stage.obstacles(self._scenario.environment.obstacles)
-        show = self._stage.show
-        self._page = Page(server.gui, self._scenario, self._spaces, self._desk, self._tell, show, info.rate)
+        self._scene = SceneNodes(server, names, robots, len(self._spaces))
+        self._scene.obstacles(self._scenario.environment.obstacles)
+        show = self._scene.show
+        self._page = ConsolePage(
+            server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate
+        )
 
     def close(self) -> None:
         """Send nothing any more."""
-        self._desk.close()
+        self._client.close()
 
     def run(self, stopped: Callable[[], bool]) -> None:
-        """Draw pictures until the run is over, or somebody says stop."""
-        self.eyes.open()
+        """Draw pictures until the run is over or `stopped` returns true."""
+        self.views.open()
         pause = threading.Event()
         next_s = time.monotonic()
-        with self._watch.asking():
-            while not self._presence.over and not stopped():
-                self._turn(time.monotonic())
+        with self._time_monitor.polling():
+            while not self._observer.end_reason and not stopped():
+                self._update(time.monotonic())
                 next_s = max(next_s + self._period_s(), time.monotonic())
                 pause.wait(next_s - time.monotonic())
-        self._leave()
+        self._draw_end()
 
     def state(self) -> dict[str, Any]:
         """Return what is shown, as plain data: for programs, and for tests."""
-        return state(self._info.run_id, self.eyes, self._watch, dict(self._shapes))
+        return console_state(self._info.run_id, self.views, self._time_monitor, dict(self._shapes))
 
     # A picture
 
     def _period_s(self) -> float:
         """Return the time from one to the next [wall]."""
-        rate = self._watch.clock.rate if self._watch.clock is not None else 0.0
-        return 1.0 / (self._rate_hz or pictures_hz(len(self._names), rate))
+        rate = self._time_monitor.clock.rate if self._time_monitor.clock is not None else 0.0
+        return 1.0 / (self._rate_hz or picture_rate_hz(len(self._names), rate))
 
-    def _turn(self, wall_s: float) -> None:
-        self._presence.tick()
-        new = self.eyes.look()
+    def _update(self, wall_s: float) -> None:
+        self._observer.tick()
+        new = self.views.update()
         for form in self._page.forms.values():
             form.send(wall_s)
         if not self._server.get_clients():
-            self._remember(new)
+            self._store_unseen(new)
             return
         with self._server.atomic():
             if new:
                 self._draw()
             if wall_s - self._table_s >= TABLE_S:
                 self._table_s = wall_s
-                self._tell_in_words(wall_s)
+                self._update_tables(wall_s)
 
-    def _leave(self) -> None:
-        """Draw how it ended: for pages that are opened between two runs."""
-        self.eyes.look()
+    def _draw_end(self) -> None:
+        """Draw the end of the run, for pages that are opened between two runs."""
+        self.views.update()
         with self._server.atomic():
-            if self.eyes.drones is not None:
+            if self.views.drones is not None:
                 self._draw()
-            self._tell_in_words(time.monotonic())
+            self._update_tables(time.monotonic())
 
-    def _remember(self, new: bool) -> None:
-        """Keep up what pages want to see of the time before they were opened."""
-        if new and self.eyes.drones is not None:
-            self._followers.begin_at(self._followed(self._take_in(self.eyes.drones)))
+    def _store_unseen(self, new: bool) -> None:
+        """Store what pages show of the time before they were opened."""
+        if new and self.views.drones is not None:
+            self._camera_follow.set_target(self._camera_targets(self._store_drones(self.views.drones)))
 
-    def _take_in(self, view: ViewDrones) -> Drones:
-        """Keep up with the drones; return them."""
-        drones = drones_of(view, self._names)
+    def _store_drones(self, view: ViewDrones) -> DronePoses:
+        """Store the drones' newest poses, and return them."""
+        drones = drone_poses(view, self._names)
         if drones.t_ns < self._drawn_ns:
             self._trails.clear()  # a replay has gone back
         self._drones, self._drawn_ns = drones, drones.t_ns
         self._trails.add(drones.p_W)
-        self._note_shapes(drones)
+        self._update_shapes(drones)
         return drones
 
     def _draw(self) -> None:
-        assert self.eyes.drones is not None
+        assert self.views.drones is not None
         before_ns = self._drawn_ns
-        drones = self._take_in(self.eyes.drones)
+        drones = self._store_drones(self.views.drones)
         dt_s = min(self._period_s(), max(0.0, (drones.t_ns - before_ns) / 1e9))
-        self._stage.drones(drones, dt_s)
-        beliefs = self.eyes.beliefs().values()
-        self._stage.estimates(ellipsoids([belief.estimate for belief in beliefs if belief.fresh]))
+        self._scene.drones(drones, dt_s)
+        estimates = self.views.estimates().values()
+        self._scene.estimates(ellipsoids([each.estimate for each in estimates if each.fresh]))
         if self._shapes:
-            self._stage.shapes(list(self._shapes.values()), list(self._shapes).index(self._page.chosen))
+            self._scene.shapes(list(self._shapes.values()), list(self._shapes).index(self._page.chosen))
         self._draw_ghosts()
-        self._followers.follow(self._followed(drones))
+        self._camera_follow.follow(self._camera_targets(drones))
 
     def _draw_ghosts(self) -> None:
-        """Put the ghosts anew where a formation is to be somewhere else now."""
-        wanted = {name: (view.phase, view.desired) for name, view in self.eyes.clusters.items()}
-        if wanted == self._ghosted:
+        """Move the ghosts where a formation's desired shape has changed."""
+        wanted = {name: (view.phase, view.desired) for name, view in self.views.clusters.items()}
+        if wanted == self._drawn_ghosts:
             return
-        self._ghosted = wanted
-        found = [ghosts(self._spaces[name], view) for name, view in self.eyes.clusters.items()]
-        there = [each for each in found if each is not None]
-        p_W = np.concatenate([p for p, _ in there]) if there else np.zeros((0, 3))
-        self._stage.ghosts(p_W, np.concatenate([q for _, q in there]) if there else np.zeros((0, 4)))
+        self._drawn_ghosts = wanted
+        poses = [ghosts(self._spaces[name], view) for name, view in self.views.clusters.items()]
+        shown = [each for each in poses if each is not None]
+        p_W = np.concatenate([p for p, _ in shown]) if shown else np.zeros((0, 3))
+        self._scene.ghosts(p_W, np.concatenate([q for _, q in shown]) if shown else np.zeros((0, 4)))
 
-    def _note_shapes(self, drones: Drones) -> None:
-        """Find the formations as they truly stand, and keep what plots show of them."""
-        there, yaw = drones.there, frames.heading(drones.q_WB)
+    def _update_shapes(self, drones: DronePoses) -> None:
+        """Compute the formations' true shapes, and add them to the plots."""
+        there, yaw = drones.present, frames.heading(drones.q_WB)
         for name, space in self._spaces.items():
             members = self._members[name]
             whole = bool(there[members].all())
-            self._shapes[name] = found = shape(space, drones.p_W[members], yaw[members]) if whole else None
-            view = self.eyes.clusters.get(name)
+            self._shapes[name] = true_shape = (
+                formation_shape(space, drones.p_W[members], yaw[members]) if whole else None
+            )
+            view = self.views.clusters.get(name)
             if view is not None:
-                true = None if found is None else found.c
-                self._page.plots[name].history.add(drones.t_ns / 1e9, view.desired, view.value, true)
+                true_c = None if true_shape is None else true_shape.c
+                self._page.plots[name].history.add(drones.t_ns / 1e9, view.desired, view.value, true_c)
 
-    def _followed(self, drones: Drones) -> np.ndarray:
-        """Return the places (n, 3) of what cameras follow: the formation, or all drones where there are several."""
+    def _camera_targets(self, drones: DronePoses) -> np.ndarray:
+        """Return the positions (n, 3) that cameras follow: of the formation, or of all drones."""
         members = next(iter(self._members.values())) if len(self._members) == 1 else slice(None)
-        return drones.p_W[members][drones.there[members]]
+        return drones.p_W[members][drones.present[members]]
 
-    # In words
+    # Tables
 
-    def _tell_in_words(self, wall_s: float) -> None:
+    def _update_tables(self, wall_s: float) -> None:
         page = self._page
-        page.clock.content = html_tables.clock(self._watch.clock, int(self._drawn_ns), self._watch.silent_s)
-        page.phases.content = html_tables.clusters({n: (v.phase, v.reason) for n, v in self.eyes.clusters.items()})
-        page.drones.content = html_tables.drones(self._words.rows())
-        page.sensors.content = self._words.sensors(page.drone_form.chosen)
-        page.acting.content = html_tables.acting(self._words.acting())
-        page.events.content = html_tables.events(list(self.eyes.events)[:EVENTS_SHOWN])
+        page.clock.content = html_tables.clock_line(
+            self._time_monitor.clock, int(self._drawn_ns), self._time_monitor.silent_s
+        )
+        page.phases.content = html_tables.formation_lines(
+            {n: (v.phase, v.reason) for n, v in self.views.clusters.items()}
+        )
+        page.drones.content = html_tables.drone_table(self._table_rows.drone_rows())
+        page.sensors.content = self._table_rows.sensor_table(page.drone_form.chosen)
+        page.faults.content = html_tables.fault_lines(self._table_rows.active_faults())
+        page.events.content = html_tables.event_table(list(self.views.events)[:EVENTS_SHOWN])
         if page.chosen:
-            page.forms[page.chosen].refresh(self.eyes.clusters.get(page.chosen), wall_s)
+            page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
             page.plots[page.chosen].draw()
         if self._drones is not None:
-            self._stage.trails(*self._trails.segments(self._drones.p_W))
-            self._stage.wind(self._drones)
+            self._scene.trails(*self._trails.segments(self._drones.p_W))
+            self._scene.wind(self._drones)
 
-    def _tell(self, told: Told) -> None:
-        """Show what came of a request: a refusal in the corner of every page, and among the events.
+    def _on_outcome(self, outcome: RequestOutcome) -> None:
+        """Show the outcome of a request: a refusal in the corner of every page, and among the events.
 
-        Of what was done the world tells, but not of what formations were asked for.
+        The world publishes an event of what it has done, but not of requests to formations.
         """
-        kind, outcome = ("refused", told.refusal) if told.refusal else ("control", "done")
-        if told.refusal or told.what.partition(":")[0] in self._spaces:
-            said = f"{told.what}: {outcome}"
-            self.eyes.note(Event(self._presence.now_ns, 0, kind, self._presence.name, "", said))
-        if told.refusal:
-            self._notify(told.what, told.refusal)
+        kind, result = ("refused", outcome.refusal) if outcome.refusal else ("control", "done")
+        if outcome.refusal or outcome.request.partition(":")[0] in self._spaces:
+            text = f"{outcome.request}: {result}"
+            self.views.add_event(Event(self._observer.now_ns, 0, kind, self._observer.name, "", text))
+        if outcome.refusal:
+            self._notify(outcome.request, outcome.refusal)
 
-    def _tell_refused(self, event: Event) -> None:
-        """Show what the world refuses of a command that the console has sent."""
+    def _on_refused_command(self, event: Event) -> None:
+        """Show that the world has refused a command of the console's."""
         self._notify(event.subject, str(event.data.get("reason", event.text)))
 
     def _notify(self, what: str, refusal: str) -> None:

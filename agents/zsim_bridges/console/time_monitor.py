@@ -1,4 +1,4 @@
-"""How the run's time goes: asked of the world now and then; and since when the world answers nothing."""
+"""The run's clock, polled from the world now and then; and for how long the world has not answered."""
 
 import math
 import threading
@@ -10,19 +10,19 @@ from zsim.contract import keys
 from zsim.contract.messages import Clock
 from zsim.errors import ZsimError
 from zsim.transport.session import Session
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.observer_process import ObserverProcess
 
-ASK_S = 0.25  # wall; rarely, since to be told of each gate costs those that make it
-ANSWER_S = 1.0  # wall; the world answers within milliseconds
+POLL_S = 0.25  # wall; rarely, since a message of each gate costs the world time
+ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
 SILENT_S = 2.0  # wall; without an answer for so long, what is shown may be long past
 
 
-class Watch:
-    """Follows the run's time, in a thread of its own: whoever draws waits for no answer.
+class TimeMonitor:
+    """Polls the run's clock, in a thread of its own: drawing waits for no answer.
 
     Args:
         link: an open session.
-        presence: of the console in the run; it follows the run's clock.
+        observer: of the console in the run; it follows the run's clock.
         stamp_age_s: simulated; how old the time of a stamp may be.
         wall_s: monotonic.
 
@@ -33,69 +33,69 @@ class Watch:
     def __init__(
         self,
         link: Session,
-        presence: Presence,
+        observer: ObserverProcess,
         stamp_age_s: float = math.inf,
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._link = link
-        self._presence = presence
+        self._observer = observer
         self._stamp_age_s = stamp_age_s
         self._wall_s = wall_s
         self._one = threading.Lock()
-        self._asking = False
+        self._is_polling = False
         self._answered_s = wall_s()
         self._known_s = -math.inf
         self.clock: Clock | None = None
 
     @contextmanager
-    def asking(self) -> Iterator[None]:
-        """Ask again and again meanwhile."""
+    def polling(self) -> Iterator[None]:
+        """Poll again and again meanwhile."""
         over = threading.Event()
-        thread = threading.Thread(target=self._go_on, args=(over,), name="watch", daemon=True)
-        self._answered_s, self._asking = self._wall_s(), True
+        thread = threading.Thread(target=self._poll_repeatedly, args=(over,), name="watch", daemon=True)
+        self._answered_s, self._is_polling = self._wall_s(), True
         thread.start()
         try:
             yield
         finally:
-            self._asking = False
+            self._is_polling = False
             over.set()
-            thread.join(ANSWER_S)
+            thread.join(ANSWER_TIMEOUT_S)
 
-    def ask(self) -> None:
-        """Ask once; one question at a time is under way."""
+    def poll(self) -> None:
+        """Poll once; one poll runs at a time."""
         with self._one:
-            self._ask()
+            self._poll()
 
     def now_ns(self) -> int:
-        """Return simulated time for a stamp, asking where what is known may be too old; within 2 ANSWER_S."""
+        """Return simulated time for a stamp, polling where it may be too old; within 2 ANSWER_TIMEOUT_S."""
         if self._is_old():
             with self._one:
-                if self._is_old():  # others that waited too have been told
-                    self._ask()
-        return self._presence.now_ns
+                if self._is_old():  # another thread has polled meanwhile
+                    self._poll()
+        return self._observer.now_ns
 
     @property
     def silent_s(self) -> float:
-        """For how long the world, though asked, has answered nothing; 0 where that is not long [s, wall]."""
+        """For how long the world has not answered; 0 where that is not long [s, wall]."""
         silent_s = self._wall_s() - self._answered_s
-        return silent_s if self._asking and silent_s >= SILENT_S else 0.0
+        return silent_s if self._is_polling and silent_s >= SILENT_S else 0.0
 
-    def _go_on(self, over: threading.Event) -> None:
+    def _poll_repeatedly(self, over: threading.Event) -> None:
         while not over.is_set():
-            self.ask()
-            over.wait(ASK_S)
+            self.poll()
+            over.wait(POLL_S)
 
     def _is_old(self) -> bool:
         rate = max(1.0, self.clock.rate) if self.clock else 1.0  # as measured: of a run that has just begun, 0
         return (self._wall_s() - self._known_s) * rate > self._stamp_age_s
 
-    def _ask(self) -> None:
+    def _poll(self) -> None:
         asked_s = self._wall_s()
         try:
-            samples = self._link.get(keys.CLOCK, timeout_s=ANSWER_S)
+            samples = self._link.get(keys.CLOCK, timeout_s=ANSWER_TIMEOUT_S)
         except ZsimError:
             return  # the link is lost, and comes back
         for sample in samples:
-            clock = self._presence.heed(sample.payload)
+            clock = self._observer.update_clock(sample.payload)
             if clock is not None:
                 self.clock, self._known_s, self._answered_s = clock, asked_s, self._wall_s()

@@ -1,4 +1,4 @@
-"""What the console hears of a run, kept until the next picture is drawn."""
+"""The newest views of a run, kept until the next picture is drawn."""
 
 import threading
 import time
@@ -10,20 +10,20 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import EstimateView, Event, Fault, Health, Info, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError
 from zsim.transport.session import Heard, Sample, Session
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.observer_process import ObserverProcess
 
 EVENTS_KEPT = 200
-SHOWN_BUT = frozenset({"command"})  # kinds of events that say nothing which the next one does not: a mode, a refusal
+HIDDEN_EVENTS = frozenset({"command"})  # an event of a mode or of a refusal follows and says more
 FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
 
 
-class Belief(NamedTuple):
-    """What is believed of a drone.
+class ReceivedEstimate(NamedTuple):
+    """A drone's estimate, as last received.
 
     Attributes:
         process: the estimator.
         t_ns: simulated.
-        fresh: whether it is of the present.
+        fresh: whether it is of the same time as the drones' view.
     """
 
     process: str
@@ -32,22 +32,22 @@ class Belief(NamedTuple):
     fresh: bool
 
 
-class Eyes:
-    """Keeps the newest view of everything until the next look; what comes between two looks is never decoded.
+class ViewBuffer:
+    """Keeps the newest message of each key until the next update; those in between are never decoded.
 
     Args:
         link: an open session.
         info: of the run.
-        presence: of the console in it.
-        variables: names of each formation's variables: of another formation, or with others, no view is taken.
-        refused: told, in a thread of Zenoh's, of what the world refuses of the console's own commands.
+        observer: of the console in it.
+        variables: names of each formation's variables; views of other formations or variables are refused.
+        refused: called, in a thread of Zenoh's, with the event of a command of the console's that the world refused.
         wall_s: monotonic.
 
     Attributes:
         drones: the newest view of the drones.
         clusters: the newest view of each formation.
         estimators: the newest view of each estimator, by its process.
-        healths: what each process said of itself last.
+        healths: the newest of each process.
         faults: injected ones, planned and active.
         events: newest first.
     """
@@ -56,18 +56,18 @@ class Eyes:
         self,
         link: Session,
         info: Info,
-        presence: Presence,
+        observer: ObserverProcess,
         variables: Mapping[str, tuple[str, ...]],
         refused: Callable[[Event], None],
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._link = link
         self._names = frozenset(drone.name for drone in info.drones)
-        self._presence = presence
+        self._observer = observer
         self._variables = variables
         self._refused = refused
         self._wall_s = wall_s
-        self._taken_s: dict[str, float] = {}  # wall time by key, of views of drones and estimators
+        self._received_s: dict[str, float] = {}  # wall time by key, of views of drones and estimators
         self._new: dict[str, bytes] = {}
         self._arrived = threading.Condition()
         self._lock = threading.Lock()
@@ -80,47 +80,47 @@ class Eyes:
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
 
     def open(self) -> None:
-        """Begin to hear, and learn what was said before."""
+        """Subscribe, and read the last values of before."""
         for expression in ("view/**", keys.FAULTS, "process/*/health"):
-            self._link.hear(expression, self._keep)
+            self._link.hear(expression, self._on_publication)
         self._link.on_message(keys.EVENT, self._on_event)
-        told = self._link.get(keys.FAULTS)
+        samples = self._link.get(keys.FAULTS)
         with self._lock:
-            for sample in told:
-                self._new.setdefault(sample.key, sample.payload)  # what was heard meanwhile is newer
+            for sample in samples:
+                self._new.setdefault(sample.key, sample.payload)  # what has arrived meanwhile is newer
 
-    def look(self) -> bool:
-        """Take in what has come since the last look; return whether drones have been seen anew."""
+    def update(self) -> bool:
+        """Decode what has come since the last update; return whether there is a new view of the drones."""
         with self._lock:
             new, self._new = self._new, {}
         for key, payload in new.items():
             try:
-                self._take(key, messages.decode(key, payload))
+                self._store(key, messages.decode(key, payload))
             except DecodeError:
-                self._presence.health.refused += 1
+                self._observer.health.refused += 1
         return keys.VIEW_DRONES in new
 
-    def beliefs(self) -> dict[str, Belief]:
-        """Return the newest belief of each drone by name: of two estimators, one of them dead, that of the other.
+    def estimates(self) -> dict[str, ReceivedEstimate]:
+        """Return the newest estimate of each drone by name: of two estimators, one of them dead, that of the other.
 
-        What is of the future was said before a replay went back.
+        Estimates of the future are from before a replay went back.
         """
         now_ns = self.drones.t_ns if self.drones else 0
-        found: dict[str, Belief] = {}
+        newest: dict[str, ReceivedEstimate] = {}
         for process, view in sorted(self.estimators.items(), key=lambda each: each[1].t_ns):
             fresh = self._is_fresh(process, view.t_ns - now_ns)
             if fresh or view.t_ns <= now_ns:
                 names = (estimate for estimate in view.estimates if estimate.name in self._names)
-                found |= {each.name: Belief(process, view.t_ns, each, fresh) for each in names}
-        return found
+                newest |= {each.name: ReceivedEstimate(process, view.t_ns, each, fresh) for each in names}
+        return newest
 
     def _is_fresh(self, process: str, ahead_ns: int) -> bool:
-        """Tell whether an estimator's view goes with that of the drones: in a fast run, both skip many gates."""
-        seen_s = self._taken_s.get(keys.VIEW_DRONES, 0.0) - self._taken_s[keys.estimates_view(process)]
+        """Return whether an estimator's view is of the time of the drones' view; both skip gates."""
+        seen_s = self._received_s.get(keys.VIEW_DRONES, 0.0) - self._received_s[keys.estimates_view(process)]
         return abs(ahead_ns) <= FRESH_S * 1e9 or abs(seen_s) <= FRESH_S
 
-    def answered(self, drone: str) -> int:
-        """Return how many commands to a drone the world has said that it took, or refused."""
+    def answered_commands(self, drone: str) -> int:
+        """Return how many commands to a drone the world has accepted or refused."""
         return self._answers[drone]
 
     def await_answer(self, drone: str, beyond: int, within_s: float) -> None:
@@ -128,47 +128,47 @@ class Eyes:
         with self._arrived:
             self._arrived.wait_for(lambda: self._answers[drone] > beyond, within_s)
 
-    def note(self, event: Event) -> None:
+    def add_event(self, event: Event) -> None:
         """Add an event of the console's own."""
         self.events.appendleft(event)
 
-    def _keep(self, heard: Heard) -> None:
-        self._presence.health.received += 1
+    def _on_publication(self, sample: Heard) -> None:
+        self._observer.health.received += 1
         with self._lock:
-            self._new[heard.key] = heard.payload
+            self._new[sample.key] = sample.payload
 
-    def _take(self, key: str, message: Any) -> None:
+    def _store(self, key: str, message: Any) -> None:
         if isinstance(message, ViewDrones):
-            self.drones, self._taken_s[key] = message, self._wall_s()
+            self.drones, self._received_s[key] = message, self._wall_s()
         elif isinstance(message, ViewCluster):
-            self._take_cluster(key.rpartition("/")[2], message)
+            self._store_cluster(key.rpartition("/")[2], message)
         elif isinstance(message, ViewEstimates):
-            self._taken_s[key] = self._wall_s()
+            self._received_s[key] = self._wall_s()
             self.estimators[key.rpartition("/")[2]] = message
         elif isinstance(message, Health):
             self.healths[keys.thing(key)] = message
         elif isinstance(message, messages.Faults):
             self.faults = message.faults
 
-    def _take_cluster(self, cluster: str, view: ViewCluster) -> None:
-        """Keep a view, unless a controller of another scenario says it."""
+    def _store_cluster(self, cluster: str, view: ViewCluster) -> None:
+        """Store a view, unless it is from a controller of another scenario."""
         if self._variables.get(cluster) == view.names and len(view.value) == len(view.desired) == len(view.names):
             self.clusters[cluster] = view
         else:
-            self._presence.health.refused += 1
+            self._observer.health.refused += 1
 
     def _on_event(self, sample: Sample) -> None:
         try:
             event = messages.decode(keys.EVENT, sample.payload)
         except DecodeError:
-            return  # somebody else's garbage
+            return  # not an event of the world
         if event.kind in ("command", "refused"):
             with self._arrived:
                 self._answers[_drone(event)] += 1
                 self._arrived.notify_all()
-        if event.kind not in SHOWN_BUT:
+        if event.kind not in HIDDEN_EVENTS:
             self.events.appendleft(event)
-        if event.kind == "refused" and event.source == self._presence.name:
+        if event.kind == "refused" and event.source == self._observer.name:
             self._refused(event)
 
 

@@ -1,1 +1,1 @@
-"""The gateway: the keys of a federation over HTTP, WebSocket and lines of JSON."""
+"""The gateway: the keys of a federation over HTTP, WebSocket and lines of JSON. Imports aiohttp."""

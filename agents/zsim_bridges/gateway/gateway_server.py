@@ -1,7 +1,6 @@
-"""The gateway's doors: HTTP, WebSocket and lines of JSON, in front of one run after the other."""
+"""The gateway: serves HTTP, WebSocket and lines of JSON, for one run after the other."""
 
 import asyncio
-import logging
 import secrets
 import threading
 import time
@@ -16,35 +15,31 @@ from zsim.contract.messages import Info
 from zsim.errors import NoWorldError, RunError, ZsimError
 from zsim.runtime.runner import Runner
 from zsim.transport.session import Session
-from zsim_bridges.gateway.client_limits import Bucket, Turnstile
-from zsim_bridges.gateway.http.access_check import Guard, is_loopback
-from zsim_bridges.gateway.http.http_errors import TooManyError
-from zsim_bridges.gateway.http.json_tree import JsonTree
-from zsim_bridges.gateway.http.routes import application
-from zsim_bridges.gateway.http.zenoh_rest import RestTree
-from zsim_bridges.gateway.lines.outbox import Outbox
-from zsim_bridges.gateway.lines.stream_client import Client
-from zsim_bridges.gateway.lines.tcp_lines import LINE_MAX, Lines
-from zsim_bridges.gateway.lockstep_agent import Seat
-from zsim_bridges.gateway.run_access import Flight
-from zsim_bridges.gateway.subscriptions import Feed
-from zsim_bridges.loop_thread import opened_on
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.gateway.access_check import AccessCheck, ConnectionLimit, TokenBucket
+from zsim_bridges.gateway.client_streams import LINE_MAX, LineServer, Outbox
+from zsim_bridges.gateway.http_routes import application
+from zsim_bridges.gateway.http_trees import JsonTree, RestTree
+from zsim_bridges.gateway.key_policy import TooManyError
+from zsim_bridges.gateway.lockstep_session import LockstepAgent
+from zsim_bridges.gateway.run_access import RunAccess
+from zsim_bridges.gateway.stream_client import Client
+from zsim_bridges.gateway.subscriptions import SharedSubscriptions
+from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.web_server import cancel_other_tasks, check_token, open_on_thread, start_site, url_host
 
 CLIENTS_MAX = 500  # streams at once
-STRANGERS_MAX = 100  # connections at once that have not shown the token yet
-HELLO_S = 5.0  # how long one may take to show it
-DRAIN_S = 2.0  # after the end of a run, how long seats may still answer their last gates
-FAULTS_MAX = 100  # told
-RELEASE_S = 1.0  # the world answers within milliseconds
+UNAUTHENTICATED_MAX = 100  # connections at once that have not shown the token yet
+HELLO_TIMEOUT_S = 5.0  # how long a client may take to show it
+DRAIN_S = 2.0  # after the end of a run, how long agents may still answer their last gates
+FAULTS_REPORTED_MAX = 100
+RELEASE_TIMEOUT_S = 1.0  # the world answers within milliseconds
 STREAM_RATE_HZ = 5_000.0  # requests per wall second of one stream; a loop at the speed of the fastest run has 2 500
 STREAM_BURST = 10_000.0
-BYES_S = 2.0  # how long the end waits for the byes of the seats
-_QUIET = logging.Logger("quiet", logging.CRITICAL + 1)  # what is no HTTP is answered, and nobody's business
+BYE_TIMEOUT_S = 2.0  # how long the end waits for the byes of the agents
 
 
-class Doors(NamedTuple):
-    """Where clients come in."""
+class GatewayPorts(NamedTuple):
+    """Where the gateway listens."""
 
     host: str
     http_port: int
@@ -55,12 +50,12 @@ class Gateway:
     """One gateway.
 
     Args:
-        doors: where clients come in.
+        ports: where it listens.
         name: process name.
         token: that clients must show; None on this machine alone.
         dial: opens a session to the world for a process of a name.
-        say: told what a person should know.
-        secured: whether access control decides what it may do.
+        say: prints a line.
+        secured: whether access control decides where it may publish.
 
     Raises:
         RunError: others could reach it, and there is no token.
@@ -68,101 +63,100 @@ class Gateway:
 
     def __init__(
         self,
-        doors: Doors,
+        ports: GatewayPorts,
         name: str,
         token: str | None,
         dial: Callable[[str], AbstractContextManager[tuple[Session, Info]]],
         say: Callable[[str], None],
         secured: bool = False,
     ) -> None:
-        if token == "":
-            raise RunError("gateway: the token is empty; give it one, or leave --token and ZSIM_TOKEN away")
-        if token is None and not is_loopback(doors.host):
-            raise RunError(f"gateway: {doors.host} can be reached by others; give it a --token, or --listen 127.0.0.1")
+        check_token("gateway", ports.host, token)
         self.loop = asyncio.new_event_loop()
-        self.loop.set_exception_handler(self._on_fault)
-        self._turnstile = Turnstile(CLIENTS_MAX, "clients")
-        self._strangers = Turnstile(STRANGERS_MAX, "connections that have shown no token")
-        self.feed = Feed(self.loop, self._turnstile)
-        self._whole = Feed(self.loop, self._turnstile)
-        self._doors = doors
+        self.loop.set_exception_handler(self._on_loop_error)
+        self._client_limit = ConnectionLimit(CLIENTS_MAX, "clients")
+        self._unauthenticated_limit = ConnectionLimit(UNAUTHENTICATED_MAX, "connections that have shown no token")
+        self.subscriptions = SharedSubscriptions(self.loop, self._client_limit)
+        self._full_key_subscriptions = SharedSubscriptions(self.loop, self._client_limit)
+        self._ports = ports
         self._name = name
-        self._guard = Guard(token, self.report)
+        self._access_check = AccessCheck(token, self.report)
         self._dial = dial
         self._secured = secured
         self._say = say
-        self._flight: Flight | None = None
-        self._faults: set[str] = set()
+        self._run: RunAccess | None = None
+        self._reported_faults: set[str] = set()
         self._clients: set[Client] = set()
-        self._seats: set[threading.Thread] = set()
+        self._lockstep_threads: set[threading.Thread] = set()
 
-    # What clients need of it
+    # For clients
 
     @property
     def name(self) -> str:
         """Its process name."""
         return self._name
 
-    def flight(self) -> Flight:
-        """Return the run that goes on.
+    def run(self) -> RunAccess:
+        """Return the current run.
 
         Raises:
             NoWorldError: there is none.
         """
-        if self._flight is None:
+        if self._run is None:
             raise NoWorldError("there is no run now; the gateway waits for the next")
-        return self._flight
+        return self._run
 
-    def knows(self, token: str) -> bool:
-        """Tell whether a token is the right one."""
-        return self._guard.knows(token)
+    def is_token(self, token: str) -> bool:
+        """Return whether a token is the right one."""
+        return self._access_check.is_token(token)
 
-    def sit(self, seat: Seat, lost: Callable[[str], None]) -> None:
-        """Run a seat, on a session of its own, until it is left; tell why there is none any more."""
+    def start_lockstep(self, agent: LockstepAgent, ended: Callable[[str], None]) -> None:
+        """Run an agent, on a session of its own, until it leaves; `ended` is called with the reason."""
         for client in self._clients:
-            client.lose_seat(seat.name, "another client took the name", but=seat)
-        thread = threading.Thread(target=self._sit, args=(seat, lost), name=seat.name, daemon=True)
-        self._seats.add(thread)
+            client.lose_lockstep(agent.name, "another client took the name", but=agent)
+        thread = threading.Thread(target=self._run_lockstep, args=(agent, ended), name=agent.name, daemon=True)
+        self._lockstep_threads.add(thread)
         thread.start()
 
     def report(self, text: str) -> None:
-        """Tell a person of a fault of ours."""
+        """Print a fault of the gateway itself."""
         self._say(f"{self._name}: {text}")
 
-    def part(self, client: Client) -> None:
-        """Forget a client that is gone, and let others fly the drones that it flew."""
+    def remove(self, client: Client) -> None:
+        """Forget a client that is gone, and release the drones that it commanded."""
         if client not in self._clients:
             return
         self._clients.discard(client)
-        (self._turnstile if client.trusted else self._strangers).leave()
+        (self._client_limit if client.authenticated else self._unauthenticated_limit).leave()
         others = {other.source for other in self._clients}
-        left = [(source, drone) for source, drone in client.flown if source not in others]
-        if self._flight is not None and left:
-            self.loop.run_in_executor(None, _release, self._flight.link, left)
+        released = [(source, drone) for source, drone in client.commanded if source not in others]
+        if self._run is not None and released:
+            self.loop.run_in_executor(None, _release_drones, self._run.link, released)
 
-    def trust(self, client: Client) -> None:
-        """Count a client that has shown the token among those who have.
+    def admit(self, client: Client) -> None:
+        """Count a client that has shown the token among those that have.
 
         Raises:
-            TooManyError: there are as many of them as may be.
+            TooManyError: the limit of clients is reached.
         """
-        self._turnstile.enter()
-        self._strangers.leave()
+        self._client_limit.enter()
+        self._unauthenticated_limit.leave()
 
-    def _sit(self, seat: Seat, lost: Callable[[str], None]) -> None:
+    def _run_lockstep(self, agent: LockstepAgent, ended: Callable[[str], None]) -> None:
         reason = "the gateway failed"
         try:
-            with self._dial(seat.name) as (link, info):
-                reason = Runner(link, info, seat, lambda: seat.gone, self._say, lambda: seat.deserted).run()
+            with self._dial(agent.name) as (link, info):
+                reason = Runner(
+                    link, info, agent, lambda: agent.has_left, self._say, lambda: agent.connection_lost
+                ).run()
         except ZsimError as error:
             reason = str(error)
-        except Exception as error:  # a fault of ours: the client is not to wait for ever
-            self.report(f"{seat.name}: {error!r}")
+        except Exception as error:  # a fault of the gateway: the client is not to wait for ever
+            self.report(f"{agent.name}: {error!r}")
         finally:
-            self._say(f"{seat.name}: left, {'its client is gone' if seat.deserted else reason}")
-            self._seats.discard(threading.current_thread())
+            self._say(f"{agent.name}: left, {'its client is gone' if agent.connection_lost else reason}")
+            self._lockstep_threads.discard(threading.current_thread())
             with suppress(RuntimeError):  # the gateway has ended
-                self.loop.call_soon_threadsafe(lost, reason)
+                self.loop.call_soon_threadsafe(ended, reason)
 
     # A run
 
@@ -170,155 +164,149 @@ class Gateway:
         self,
         link: Session,
         info: Info,
-        presence: Presence,
+        observer: ObserverProcess,
         stopped: Callable[[], bool],
         say: Callable[[str], None],
     ) -> None:
-        """Serve a run until it is over, or somebody says stop."""
-        flight = Flight(link, info, presence, self._secured)
-        flight.enter()
-        self._on_loop(self._begin, flight)
+        """Serve a run until it is over or `stopped` returns true."""
+        run = RunAccess(link, info, observer, self._secured)
+        run.open()
+        self._call_on_loop(self._begin, run)
         say(f"{self._name}: clients are let into run {info.run_id}")
-        link.on_link(_Link(lambda state: self.loop.call_soon_threadsafe(self._tell_of_link, state, flight)).note)
+        monitor = _LinkMonitor(lambda state: self.loop.call_soon_threadsafe(self._notify_link, state, run))
+        link.on_link(monitor.on_link)
         try:
-            flight.follow(stopped)
+            run.receive_until_end(stopped)
         finally:
-            if not presence.over:
-                self._release_all(link)
-            self._on_loop(self._end, flight)
-            flight.close()
+            if not observer.end_reason:  # the gateway goes, and the run goes on
+                for client in list(self._clients):
+                    _release_drones(link, client.commanded)
+            self._call_on_loop(self._end, run)
+            run.close()
 
-    def _release_all(self, link: Session) -> None:
-        """Let others fly what our clients fly: this gateway goes, and the run goes on."""
-        for client in list(self._clients):
-            _release(link, client.flown)
+    def _begin(self, run: RunAccess) -> None:
+        self._run = run
+        self.subscriptions.attach(run.link)
+        self._full_key_subscriptions.attach(run.bare_link)
+        self._notify_clients("begun", run)
 
-    def _begin(self, flight: Flight) -> None:
-        self._flight = flight
-        self.feed.attach(flight.link)
-        self._whole.attach(flight.whole)
-        self._tell("begun", flight)
+    def _end(self, run: RunAccess) -> None:
+        self._run = None
+        self.subscriptions.detach()
+        self._full_key_subscriptions.detach()
+        self._notify_clients("ended", run)
+        self.loop.call_later(DRAIN_S, self._end_lockstep_sessions, run)
 
-    def _end(self, flight: Flight) -> None:
-        self._flight = None
-        self.feed.detach()
-        self._whole.detach()
-        self._tell("ended", flight)
-        self.loop.call_later(DRAIN_S, self._end_seats, flight)
-
-    def _end_seats(self, flight: Flight) -> None:
-        """End the seats of a run that is over: the last gates of those that still answer are out by now."""
+    def _end_lockstep_sessions(self, run: RunAccess) -> None:
         for client in self._clients:
-            client.end_seat(flight, "the run ended")
+            client.end_lockstep(run, "the run ended")
 
-    def _on_fault(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """Say what no client can be told, once: a flood of connections makes a flood of these."""
+    def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Print what reaches no client, each text once: a flood of connections makes a flood of these."""
         text = f"{context.get('message')}: {context.get('exception')!r}"
-        if text not in self._faults and len(self._faults) < FAULTS_MAX:
-            self._faults.add(text)
+        if text not in self._reported_faults and len(self._reported_faults) < FAULTS_REPORTED_MAX:
+            self._reported_faults.add(text)
             self.report(text)
 
-    def _tell(self, state: str, flight: Flight) -> None:
+    def _notify_clients(self, state: str, run: RunAccess) -> None:
         for client in self._clients:
-            client.tell_of_run(state, flight.info.run_id)
+            client.notify_run(state, run.info.run_id)
 
-    def _tell_of_link(self, state: str, flight: Flight) -> None:
-        """Tell of a link that is lost or back, but not when its world goes after the end of its run."""
-        if flight is self._flight:
-            self._tell(state, flight)
+    def _notify_link(self, state: str, run: RunAccess) -> None:
+        """Notify clients of a link that is lost or back, but not when the world goes after the end of its run."""
+        if run is self._run:
+            self._notify_clients(state, run)
 
-    def _on_loop(self, do: Callable[..., None], *args: Any) -> None:
+    def _call_on_loop(self, act: Callable[..., None], *args: Any) -> None:
         async def call() -> None:
-            do(*args)
+            act(*args)
 
         asyncio.run_coroutine_threadsafe(call(), self.loop).result()
 
-    # The doors
+    # Servers
 
     @contextmanager
     def open(self) -> Iterator[None]:
-        """Let clients in, on a thread of its own.
+        """Serve clients, on a thread of its own.
 
         Raises:
             RunError: a port is taken.
         """
-        with opened_on(self.loop, "doors", self._open, lambda opened: self._close(*opened)):
+        with open_on_thread(self.loop, "gateway servers", self._open, lambda servers: self._close(*servers)):
             yield
 
     async def _open(self) -> tuple[web.AppRunner, asyncio.Server]:
-        host, http_port, lines_port = self._doors
-        runner = web.AppRunner(self._application(), access_log=None, logger=_QUIET, shutdown_timeout=1.0)
-        await runner.setup()
-        door = Lines(self._meet, trusted=not self._guard.asks)
+        host, http_port, lines_port = self._ports
+        line_server = LineServer(self._new_client, authenticated=not self._access_check.needs_token)
         try:
-            await web.TCPSite(runner, host, http_port).start()
-            lines = await asyncio.start_server(door.serve, host, lines_port, limit=LINE_MAX)
+            site = await start_site(self._application(), host, http_port, shutdown_s=1.0)
+            try:
+                lines = await asyncio.start_server(line_server.serve, host, lines_port, limit=LINE_MAX)
+            except OSError:
+                await site.cleanup()
+                raise
         except OSError as error:
-            await runner.cleanup()
             ports = f"{host}, ports {http_port} and {lines_port}"
             raise RunError(f"gateway: cannot listen on {ports} ({error.strerror}); say --http and --lines") from error
-        shown = f"[{host}]" if ":" in host else host
-        self._say(f"{self._name}: HTTP and WebSocket on http://{shown}:{http_port}, lines on port {lines_port}")
-        return runner, lines
+        address = f"http://{url_host(host)}:{http_port}"
+        self._say(f"{self._name}: HTTP and WebSocket on {address}, lines on port {lines_port}")
+        return site, lines
 
-    async def _close(self, runner: web.AppRunner, lines: asyncio.Server) -> None:
+    async def _close(self, site: web.AppRunner, lines: asyncio.Server) -> None:
         lines.close()
         for client in list(self._clients):
-            client.close(deserted=False)
-        await asyncio.to_thread(_await_all, list(self._seats), BYES_S)
-        here = asyncio.current_task()
-        tasks = [task for task in asyncio.all_tasks() if task is not here]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        await runner.cleanup()
+            client.close(connection_lost=False)
+        await asyncio.to_thread(_join_all, list(self._lockstep_threads), BYE_TIMEOUT_S)
+        await cancel_other_tasks()
+        await site.cleanup()
 
     def _application(self) -> web.Application:
-        rest, tree = RestTree(self.flight, self._whole), JsonTree(self.flight, self.feed, self._name)
-        return application(self._guard, rest, tree, self._meet)
+        rest = RestTree(self.run, self._full_key_subscriptions)
+        tree = JsonTree(self.run, self.subscriptions, self._name)
+        return application(self._access_check, rest, tree, self._new_client)
 
-    def _meet(self, outbox: Outbox, trusted: bool) -> Client:
-        bucket = Bucket(STREAM_RATE_HZ, STREAM_BURST, time.monotonic)
-        client = Client(self, outbox, f"client.{secrets.token_hex(3)}", trusted, bucket)
+    def _new_client(self, outbox: Outbox, authenticated: bool) -> Client:
+        bucket = TokenBucket(STREAM_RATE_HZ, STREAM_BURST, time.monotonic)
+        client = Client(self, outbox, f"client.{secrets.token_hex(3)}", authenticated, bucket)
         try:
-            (self._turnstile if trusted else self._strangers).enter()
+            (self._client_limit if authenticated else self._unauthenticated_limit).enter()
         except TooManyError as error:
             client.refuse(str(error))
             return client
         self._clients.add(client)
-        if not trusted:
-            self.loop.call_later(HELLO_S, client.expire)
+        if not authenticated:
+            self.loop.call_later(HELLO_TIMEOUT_S, client.expire)
         return client
 
 
-class _Link:
-    """Tells of a link that is lost, and of one that is back; not of the first.
+class _LinkMonitor:
+    """Notices a link that is lost, and one that is back, but not the first one.
 
     Args:
-        tell: told `lost` or `back`.
+        notify: called with `lost` or `back`.
     """
 
-    def __init__(self, tell: Callable[[str], object]) -> None:
-        self._tell = tell
+    def __init__(self, notify: Callable[[str], object]) -> None:
+        self._notify = notify
         self._lost = False
 
-    def note(self, up: bool) -> None:
-        """Take what the session says of its link."""
+    def on_link(self, up: bool) -> None:
+        """Take the state of the session's link."""
         if up != self._lost:
             return
         self._lost = not up
         with suppress(RuntimeError):  # the gateway has ended
-            self._tell("back" if up else "lost")
+            self._notify("back" if up else "lost")
 
 
-def _release(link: Session, flown: Iterable[tuple[str, str]]) -> None:
-    """Let others fly drones, each given with its source; whether they were flown by it the world knows."""
+def _release_drones(link: Session, commanded: Iterable[tuple[str, str]]) -> None:
+    """Let others command drones, each with the source that did; the world knows whether it holds them still."""
     with suppress(ZsimError):
-        for source, drone in flown:
-            link.request(keys.CONTROL, "release", source, {"drone": drone}, RELEASE_S)
+        for source, drone in commanded:
+            link.request(keys.CONTROL, "release", source, {"drone": drone}, RELEASE_TIMEOUT_S)
 
 
-def _await_all(threads: list[threading.Thread], patience_s: float) -> None:
-    end_s = time.monotonic() + patience_s
+def _join_all(threads: list[threading.Thread], timeout_s: float) -> None:
+    end_s = time.monotonic() + timeout_s
     for thread in threads:
         thread.join(max(0.0, end_s - time.monotonic()))

@@ -1,19 +1,59 @@
-"""The last value of every key, as far as it passed the world. Pure."""
+"""The last value of every key that has passed the world, or was published by clients here. Pure."""
 
 import threading
+from collections import deque
 from collections.abc import Sequence
 
 from zsim.contract import batch, keys, messages
 from zsim.contract.bundle import Bundle, table_of, unpacked
 from zsim.errors import DecodeError
-from zsim_bridges.gateway.echo_filter import Echoes
 
-OWN_BYTES_MAX = 64_000_000  # of the values on keys that are none of the contract's
+WAITING_MAX = 256  # echoes of a key; a paused world returns none, and clients may go on
+DELETED = None
+
+
+class EchoFilter:
+    """Recognises values of clients that come back from the world after a newer value, by key.
+
+    After two values in a row the first comes back when the second is there already; after a value and its deletion
+    the value comes back. An echo that never comes is forgotten with the next of its key.
+
+    Args:
+        keys_max: number of keys with echoes that are waited for.
+    """
+
+    def __init__(self, keys_max: int) -> None:
+        self._keys_max = keys_max
+        self._waiting: dict[str, deque[int | None]] = {}
+
+    def add(self, key: str, payload: bytes) -> None:
+        """Expect the echo of a payload that is on its way to the world."""
+        if key in self._waiting or len(self._waiting) < self._keys_max:
+            self._waiting.setdefault(key, deque(maxlen=WAITING_MAX)).append(hash(payload))
+
+    def add_deletion(self, key: str) -> None:
+        """Note that a key whose echoes are expected has no value any more."""
+        if key in self._waiting:
+            self._waiting[key].append(DELETED)
+
+    def is_stale(self, key: str, payload: bytes) -> bool:
+        """Return whether a payload from the world is an echo that a newer value or deletion has followed."""
+        waiting = [*self._waiting.get(key, ())]
+        if hash(payload) not in waiting:
+            return False
+        del self._waiting[key]
+        newer = waiting[waiting.index(hash(payload)) + 1 :]
+        if any(mark is not DELETED for mark in newer):
+            self._waiting[key] = deque(newer, maxlen=WAITING_MAX)
+        return bool(newer)
+
+
+OWN_BYTES_MAX = 64_000_000  # of the values on clients' own keys
 KEYS_MAX = 200_000  # kept; 1000 drones have about 12 000
 
 
-class Values:
-    """Filled by the batches that the world hands out; unpacked when somebody asks.
+class LastValues:
+    """Filled by the batches that the world publishes; payloads are unpacked when they are read.
 
     Args:
         drones: their names, as `world/info` gives them.
@@ -24,58 +64,58 @@ class Values:
 
     def __init__(self, drones: Sequence[str]) -> None:
         self._table = table_of(drones)
-        self._places = {key: place for place, key in enumerate(self._table)}
-        self._said: dict[str, bytes] = {}
+        self._indices = {key: index for index, key in enumerate(self._table)}
+        self._payloads: dict[str, bytes] = {}
         self._own_bytes = 0
         self._lock = threading.Lock()  # clients' thread and the world's both add to what is counted
         self._encodings: dict[str, tuple[bytes, str]] = {}
-        self._echoes = Echoes(KEYS_MAX)
+        self._echoes = EchoFilter(KEYS_MAX)
         self._bundled: dict[int, tuple[Bundle, int]] = {}
         self.refused = 0
 
     def add(self, key: str, payload: bytes, encoding: str = "") -> None:
-        """Take one message; of an encoding that is not its key's where one is given."""
+        """Store a message; of an encoding that is not its key's where one is given."""
         with self._lock:
             self._add(key, payload, encoding)
 
-    def say(self, key: str, payload: bytes, encoding: str = "") -> None:
-        """Take one message that is said here, and that the world will hand out, too."""
+    def add_own(self, key: str, payload: bytes, encoding: str = "") -> None:
+        """Store a message of a client here, which the world will return, too."""
         with self._lock:
-            self._echoes.said(key, payload)
+            self._echoes.add(key, payload)
             self._add(key, payload, encoding)
 
     def _add(self, key: str, payload: bytes, encoding: str) -> None:
         if messages.type_of(key) is None and not self._has_room(key, payload):
             self._drop(key)
-        elif key in self._said or len(self._said) < KEYS_MAX:
-            self._said[key] = payload
+        elif key in self._payloads or len(self._payloads) < KEYS_MAX:
+            self._payloads[key] = payload
             if encoding:
                 self._encodings[key] = (payload, encoding)
 
     def _has_room(self, key: str, payload: bytes) -> bool:
-        """Tell whether a value of a key of somebody's own may be kept."""
-        before = len(self._said.get(key, b""))
+        """Return whether a value of a client's own key may be kept, and count its bytes."""
+        before = len(self._payloads.get(key, b""))
         more = len(payload) - before
-        has = self._own_bytes + more <= OWN_BYTES_MAX and (key in self._said or len(self._said) < KEYS_MAX)
-        self._own_bytes += more if has else 0
-        return has
+        fits = self._own_bytes + more <= OWN_BYTES_MAX and (key in self._payloads or len(self._payloads) < KEYS_MAX)
+        self._own_bytes += more if fits else 0
+        return fits
 
     def drop(self, key: str) -> None:
         """Forget the value of a key that is deleted here."""
         with self._lock:
-            self._echoes.deleted(key)
+            self._echoes.add_deletion(key)
             self._drop(key)
 
     def _drop(self, key: str) -> None:
-        gone = self._said.pop(key, b"")
+        dropped = self._payloads.pop(key, b"")
         if messages.type_of(key) is None:
-            self._own_bytes -= len(gone)
+            self._own_bytes -= len(dropped)
         self._encodings.pop(key, None)
 
     def encoding(self, key: str) -> str:
         """Return the encoding of a key's last value."""
         payload, encoding = self._encodings.get(key, (None, ""))
-        return encoding if encoding and payload == self._said.get(key) else messages.encoding(key)
+        return encoding if encoding and payload == self._payloads.get(key) else messages.encoding(key)
 
     def add_batch(self, payload: bytes) -> list[tuple[str, bytes]]:
         """Take everything that passed the world since the last time; return what came beside the drones' messages."""
@@ -89,12 +129,12 @@ class Values:
             if key == batch.GATE:
                 self._add_bundle(said)
             else:
-                self._hear(key, said)
+                self._add_received(key, said)
         return alone
 
-    def _hear(self, key: str, payload: bytes) -> None:
+    def _add_received(self, key: str, payload: bytes) -> None:
         with self._lock:
-            if not self._echoes.is_old(key, payload):
+            if not self._echoes.is_stale(key, payload):
                 self._add(key, payload, "")
 
     def _add_bundle(self, payload: bytes) -> None:
@@ -109,8 +149,8 @@ class Values:
         for m, place in enumerate(bundle.which.tolist()):
             self._bundled[place] = (bundle, m)
 
-    def of(self, expression: str, prefix: str = "") -> list[tuple[str, bytes]]:
-        """Return keys and payloads that an expression takes, in order of the keys.
+    def matching(self, expression: str, prefix: str = "") -> list[tuple[str, bytes]]:
+        """Return keys and payloads that an expression matches, in order of the keys.
 
         Args:
             expression: of keys with the prefix.
@@ -120,10 +160,10 @@ class Values:
             key = expression.removeprefix(prefix)
             payload = self._payload(key) if expression.startswith(prefix) else None
             return [(key, payload)] if payload is not None else []
-        known = {*self._said, *(self._table[place] for place in list(self._bundled))}  # filled in another thread
-        taken = sorted(key for key in known if keys.matches(expression, prefix + key))
-        return [(key, payload) for key in taken if (payload := self._payload(key)) is not None]
+        known = {*self._payloads, *(self._table[place] for place in list(self._bundled))}  # filled in another thread
+        matching = sorted(key for key in known if keys.matches(expression, prefix + key))
+        return [(key, payload) for key in matching if (payload := self._payload(key)) is not None]
 
     def _payload(self, key: str) -> bytes | None:
-        found = self._bundled.get(self._places.get(key, -1))
-        return found[0].payload(found[1]) if found else self._said.get(key)
+        found = self._bundled.get(self._indices.get(key, -1))
+        return found[0].payload(found[1]) if found else self._payloads.get(key)

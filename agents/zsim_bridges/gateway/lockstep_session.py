@@ -1,108 +1,215 @@
-"""A client's place in the lockstep: the seat, the gate that waits for an answer, and how it is answered."""
+"""A client that takes part in the lockstep: an agent whose step is executed at the other end of a socket."""
 
 import asyncio
-from collections.abc import Callable
+import queue
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from typing import Any
 
 import msgspec
 
-from zsim.contract import messages
+from zsim.contract import keys, messages
+from zsim.contract.messages import Info
 from zsim.errors import DecodeError
-from zsim.runtime.agent import Output
+from zsim.runtime.agent import Agent, Output
 from zsim.transport.session import check_expression
-from zsim_bridges.gateway.key_policy import is_counted
-from zsim_bridges.gateway.lines import stream_requests
-from zsim_bridges.gateway.lockstep_agent import Seat
-from zsim_bridges.gateway.message_defaults import Stamps
-from zsim_bridges.gateway.run_access import Flight
+from zsim_bridges.gateway import stream_requests
+from zsim_bridges.gateway.key_policy import MessageDefaults, is_counted_key
+from zsim_bridges.gateway.run_access import RunAccess
 
-NONE_NS = -1  # no gate waits for an answer
-_encode = msgspec.json.Encoder().encode
+ANSWER_TIMEOUT_S = 10.0  # wall time after which a client that answers nothing in realtime leaves the lockstep
+LATE_PERIODS = 2  # in realtime a gate that is older by so many is sent together with a newer one
 
 
-class Place:
-    """What a client has from its join until it leaves.
+class LockstepAgent(Agent):
+    """Sends the inputs of each gate to the client and waits for its outputs.
 
     Args:
-        name: process name of the participant.
-        asked: what it joined with.
-        flight: the run that it sits in.
-        loop: of the client.
-        send: takes the line of a gate, on the loop.
+        name: of the participant, role.thing.
+        info: of the run.
+        period_ns: multiple of the gate.
+        reads: key expressions of its inputs.
+        gates: keys that close a gate; empty: all keys of `reads` that come at every gate.
+        send_inputs: called with (t_ns, inputs) at each period, in the thread that steps.
+        now_ns: newest gate of the run.
+        required: (process, drone or cluster that it serves) of those without which the run does not start.
 
     Attributes:
-        flight: the run that it sits in.
-        seat: the agent that keeps the lockstep.
-        stamps: of what it says.
+        has_left: whether it has ended.
+        connection_lost: whether its client went without leaving, so that its process counts as dead.
 
     Raises:
-        DecodeError: name, period or a gate key is none.
-        UnknownError: a gate key is about a drone or a cluster that the run does not have.
-        SessionError: what it reads is no key expression.
+        DecodeError: name, period or a gate key is invalid.
     """
 
     def __init__(
         self,
         name: str,
-        asked: stream_requests.Join,
-        flight: Flight,
+        info: Info,
+        period_ns: int,
+        reads: Sequence[str],
+        gates: Sequence[str],
+        send_inputs: Callable[[int, list[tuple[str, Any]]], None],
+        now_ns: Callable[[], int],
+        required: Collection[tuple[str, str]],
+    ) -> None:
+        super().__init__()
+        _check(name, info, period_ns, gates)
+        self.name = name
+        self.period_ns = period_ns
+        self.gate_keys = tuple(gates) or gate_keys_of(info, reads, name, required)
+        self.reads = _with_gate_keys(reads, self.gate_keys)
+        self.counted = tuple(d.name for d in info.drones if any(_matches_sensors(each, d.name) for each in self.reads))
+        self._send_inputs = send_inputs
+        self._late_ns = LATE_PERIODS * period_ns if info.mode == "realtime" else None
+        self._now_ns = now_ns
+        self._inputs: list[tuple[str, Any]] = []
+        self._answers: queue.SimpleQueue[list[Output]] = queue.SimpleQueue()
+        self.has_left = self.connection_lost = False
+
+    def receive(self, key: str, message: Any) -> None:
+        self._inputs.append((key, message))
+
+    def step(self, t_ns: int) -> list[Output]:
+        if self.has_left or (self._late_ns is not None and self._now_ns() - t_ns >= self._late_ns):
+            return []
+        inputs, self._inputs = self._inputs, []
+        self._send_inputs(t_ns, inputs)
+        try:
+            return self._answers.get(timeout=ANSWER_TIMEOUT_S if self._late_ns is not None else None)
+        except queue.Empty:
+            self.leave(connection_lost=True)
+            return []
+
+    def answer(self, outputs: list[Output]) -> None:
+        """Set the client's outputs for the gate that was sent last."""
+        self._answers.put(outputs)
+
+    def leave(self, connection_lost: bool = False) -> None:
+        """End a step that waits: the client is gone."""
+        self.has_left, self.connection_lost = True, connection_lost
+        self._answers.put([])
+
+
+def gate_keys_of(info: Info, reads: Sequence[str], name: str, required: Collection[tuple[str, str]]) -> tuple[str, ...]:
+    """Return the keys that come at every gate and match some expression; `clock` where there are none.
+
+    A drone's status and truth come from the world. Its estimate, and the state of a cluster, come at every gate if the
+    run does not start without a process for it, other than the one that joins.
+    """
+    served = {thing for process, thing in required if process != name}
+    of_world = [key(drone.name) for drone in info.drones for key in (keys.status, keys.truth)]
+    estimates = [keys.estimate(drone.name) for drone in info.drones if drone.name in served]
+    states = [keys.cluster_state(cluster.name) for cluster in info.clusters if cluster.name in served]
+    gate_keys = [key for key in (*of_world, *estimates, *states) if any(keys.matches(each, key) for each in reads)]
+    return tuple(gate_keys) or (keys.CLOCK,)
+
+
+def _with_gate_keys(reads: Sequence[str], gates: Sequence[str]) -> tuple[str, ...]:
+    """Add the gate keys that no expression matches: a key that two expressions match would come twice."""
+    missing = [key for key in gates if not any(keys.matches(each, key) for each in reads)]
+    return tuple(dict.fromkeys((*reads, *missing)))
+
+
+def _matches_sensors(expression: str, drone: str) -> bool:
+    return all(keys.matches(expression, keys.sensor(drone, kind)) for kind in (*keys.SENSORS, "status"))
+
+
+def _check(name: str, info: Info, period_ns: int, gates: Sequence[str]) -> None:
+    if not keys.PROCESS_NAME.fullmatch(name) or "." not in name.strip("."):
+        raise DecodeError(f"join: name is {name[:60]!r}; must be a role, a dot and a name of a-z 0-9 _ . -")
+    if period_ns <= 0 or period_ns % info.gate_ns:
+        raise DecodeError(f"join: period_s is {period_ns / 1e9:g}; must be a multiple of {info.gate_ns / 1e9:g}")
+    if any("*" in key for key in gates):
+        raise DecodeError("join: gates has a wildcard; must be keys, of each of which a message comes at every gate")
+
+
+NO_GATE_NS = -1  # no gate waits for an answer
+_encode = msgspec.json.Encoder().encode
+
+
+class LockstepSession:
+    """A client's part in the lockstep, from its join until it leaves.
+
+    Args:
+        name: process name of the participant.
+        request: with which it joined.
+        run: that it joined.
+        loop: of the client.
+        send: sends the line of a gate; called on the loop.
+
+    Attributes:
+        run: that it joined.
+        agent: keeps the lockstep.
+        defaults: of its messages.
+
+    Raises:
+        DecodeError: name, period or a gate key is invalid.
+        UnknownError: a gate key is about a drone or a cluster that the run does not have.
+        SessionError: an entry of `reads` is no key expression.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        request: stream_requests.JoinRequest,
+        run: RunAccess,
         loop: asyncio.AbstractEventLoop,
         send: Callable[[bytes], None],
     ) -> None:
-        for key in (*asked.reads, *asked.gates):
+        for key in (*request.reads, *request.gates):
             check_expression(key)
-        period_ns = round(asked.period_s * 1e9)
-        self.seat = Seat(
+        period_ns = round(request.period_s * 1e9)
+        self.agent = LockstepAgent(
             name,
-            flight.info,
+            run.info,
             period_ns,
-            asked.reads,
-            asked.gates,
-            hand_over=self._hand_over,
-            now_ns=lambda: flight.now_ns,
-            served=flight.served,
+            request.reads,
+            request.gates,
+            send_inputs=self._send_inputs,
+            now_ns=lambda: run.now_ns,
+            required=run.required_processes,
         )
-        for key in asked.gates:
-            flight.refuse_unknown(key)
-        self.stamps = Stamps(name)
-        self.flight = flight
+        for key in request.gates:
+            run.check_known(key)
+        self.defaults = MessageDefaults(name)
+        self.run = run
         self._loop = loop
         self._send = send
-        self._gate_ns = NONE_NS
+        self._gate_ns = NO_GATE_NS
 
-    def _hand_over(self, t_ns: int, inputs: list[tuple[str, Any]]) -> None:
-        """Send the inputs of a gate; in the seat's thread."""
+    def _send_inputs(self, t_ns: int, inputs: list[tuple[str, Any]]) -> None:
+        """Send the inputs of a gate; in the agent's thread."""
         entries = [{"key": key, "value": message} for key, message in inputs]
         line = _encode({"op": "gate", "t_ns": t_ns, "inputs": entries}) + b"\n"
         with suppress(RuntimeError):  # the gateway has ended
-            self._loop.call_soon_threadsafe(self._give, t_ns, line)
+            self._loop.call_soon_threadsafe(self._send_gate, t_ns, line)
 
-    def _give(self, t_ns: int, line: bytes) -> None:
-        if not self.seat.gone:
+    def _send_gate(self, t_ns: int, line: bytes) -> None:
+        if not self.agent.has_left:
             self._gate_ns = t_ns
             self._send(line)
 
-    def done(self, asked: stream_requests.Done) -> None:
-        """Answer the gate that waits; a refusal touches nothing, and the gate goes on waiting.
+    def answer_gate(self, request: stream_requests.DoneRequest) -> None:
+        """Answer the gate that waits; an error changes nothing, and the gate goes on waiting.
 
         Raises:
-            DecodeError: there is no such gate, or an output is none.
-            ForbiddenError: somebody else speaks on an output's key.
+            DecodeError: there is no such gate, or an output is no message of its key.
+            ForbiddenError: an output's key is reserved.
         """
-        if self._gate_ns == NONE_NS:
+        if self._gate_ns == NO_GATE_NS:
             raise DecodeError("done: there is no gate to answer; wait for the next")
-        if asked.t_ns != self._gate_ns:
-            raise DecodeError(f"done: t_ns is {asked.t_ns}; must be {self._gate_ns}, the gate that came last")
-        with self.stamps.all_or_none():
-            said = [(each.key, self._payload(each)) for each in asked.outputs]
-            counted = [Output(key, messages.decode(key, payload)) for key, payload in said if is_counted(key)]
-        self.flight.publish([(key, payload) for key, payload in said if not is_counted(key)])
-        self._gate_ns = NONE_NS
-        self.seat.answer(counted)
+        if request.t_ns != self._gate_ns:
+            raise DecodeError(f"done: t_ns is {request.t_ns}; must be {self._gate_ns}, the gate that came last")
+        with self.defaults.transaction():
+            payloads = [(each.key, self._payload(each)) for each in request.outputs]
+            counted = [Output(key, messages.decode(key, payload)) for key, payload in payloads if is_counted_key(key)]
+        self.run.publish([(key, payload) for key, payload in payloads if not is_counted_key(key)])
+        self._gate_ns = NO_GATE_NS
+        self.agent.answer(counted)
 
-    def _payload(self, said: stream_requests.Said) -> bytes:
-        """Return what goes out: what a done counts in the seat's own name, the rest in the gateway's."""
-        if not is_counted(said.key):
-            self.flight.refuse_unwritable(said.key)
-        return self.flight.payload(said.key, self.stamps.filled(said.key, said.value, self._gate_ns))
+    def _payload(self, output: stream_requests.LockstepOutput) -> bytes:
+        """Return an output as a payload: what a done counts goes out by the agent, the rest by the gateway."""
+        if not is_counted_key(output.key):
+            self.run.check_writable(output.key)
+        return self.run.encode(output.key, self.defaults.fill(output.key, output.value, self._gate_ns))

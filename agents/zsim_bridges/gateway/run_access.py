@@ -1,4 +1,4 @@
-"""A run as the gateway's clients meet it: last values, what they say, what they ask, whose time it is."""
+"""What the gateway's clients can do in a run: read last values, publish, and send requests."""
 
 import asyncio
 import threading
@@ -11,133 +11,139 @@ from zsim.contract.messages import ControlAnswer, Info
 from zsim.errors import DecodeError
 from zsim.scenario import rights, scenario_file
 from zsim.transport.session import Heard, Mailbox, Session, check_expression
-from zsim_bridges.gateway.http.http_errors import ForbiddenError, TooManyError, UnknownError
-from zsim_bridges.gateway.key_policy import is_control, is_spoken, refuse_others
-from zsim_bridges.gateway.last_values import Values
-from zsim_bridges.gateway.message_defaults import Stamps
-from zsim_bridges.gateway.transcoding import to_payload
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.gateway.key_policy import (
+    ForbiddenError,
+    MessageDefaults,
+    TooManyError,
+    UnknownError,
+    check_not_reserved,
+    is_client_key,
+    is_control_key,
+)
+from zsim_bridges.gateway.last_values import LastValues
+from zsim_bridges.gateway.transcoding import json_to_payload
+from zsim_bridges.observer_process import ObserverProcess
 
-TICK_S = 0.1  # how often health and a stop are looked at while nothing arrives
-ASKED_MAX = 64  # requests under way at once; each has a thread that waits for Zenoh
+TICK_S = 0.1  # how often health is published and a stop is noticed while nothing arrives
+REQUESTS_MAX = 64  # requests under way at once; each has a thread that waits for Zenoh
 
 
-class Flight:
-    """What clients need of the run that goes on.
+class RunAccess:
+    """Access to the current run.
 
     Args:
         link: an open session.
         info: of the run.
-        presence: of the gateway in it.
+        observer: of the gateway in it.
         secured: whether access control decides what it may do.
 
     Attributes:
         values: last ones.
-        stamps: of what is said in the gateway's own name.
-        served: (process, drone or cluster that it is about) of all without which the run does not start.
+        defaults: of messages in the gateway's own name.
+        required_processes: (process, drone or cluster that it serves) of all without which the run does not start.
     """
 
-    def __init__(self, link: Session, info: Info, presence: Presence, secured: bool) -> None:
+    def __init__(self, link: Session, info: Info, observer: ObserverProcess, secured: bool) -> None:
         self.link = link
         self.info = info
-        self.values = Values([drone.name for drone in info.drones])
-        self.stamps = Stamps(presence.name)
-        self.whole = link.bare()
-        self._presence = presence
+        self.values = LastValues([drone.name for drone in info.drones])
+        self.defaults = MessageDefaults(observer.name)
+        self.bare_link = link.bare()
+        self._observer = observer
         self._prefix = f"{link.federation}/"
-        self._threads = ThreadPoolExecutor(ASKED_MAX, thread_name_prefix="ask")
-        self._asked = 0
+        self._threads = ThreadPoolExecutor(REQUESTS_MAX, thread_name_prefix="ask")
+        self._pending = 0
         self._box: Mailbox | None = None
         scenario = scenario_file.from_text(info.scenario)
-        self._may_write = rights.of(presence.name, scenario).writes if secured else None
-        self.served = [(name, name.partition(".")[2]) for name in scenario.expected()]
-        self._things = {"drone": [d.name for d in info.drones], "cluster": [c.name for c in info.clusters]}
+        self._may_write = rights.of(observer.name, scenario).writes if secured else None
+        self.required_processes = [(name, name.partition(".")[2]) for name in scenario.expected()]
+        self._known_names = {"drone": [d.name for d in info.drones], "cluster": [c.name for c in info.clusters]}
 
     @property
     def now_ns(self) -> int:
         """Simulated time of the newest gate."""
-        return self._presence.now_ns
+        return self._observer.now_ns
 
     # What passes the world
 
-    def enter(self) -> None:
-        """Begin to hear what passes the world, and take in what was said before."""
+    def open(self) -> None:
+        """Subscribe to what passes the world, and read the last values of before."""
         self._box = self.link.subscribe(batch.KEY)
-        self.link.hear("view/**", lambda heard: self.values.add(heard.key, heard.payload))  # views are in no batch
+        self.link.hear("view/**", lambda sample: self.values.add(sample.key, sample.payload))  # views are in no batch
         for expression in rights.LAST_VALUES:
             for sample in self.link.get(expression):
                 self.values.add(sample.key, sample.payload)
                 if sample.key == keys.CLOCK:
-                    self._presence.heed(sample.payload)
+                    self._observer.update_clock(sample.payload)
 
-    def follow(self, stopped: Callable[[], bool]) -> None:
-        """Take in what passes the world until the run is over, or somebody says stop."""
+    def receive_until_end(self, stopped: Callable[[], bool]) -> None:
+        """Store what passes the world until the run is over or `stopped` returns true."""
         assert self._box is not None
         over = threading.Event()
         ticker = threading.Thread(target=_tick, args=(self._box, over), name="tick", daemon=True)
         ticker.start()
         try:
-            while not self._presence.over and not stopped():
+            while not self._observer.end_reason and not stopped():
                 sample = self._box.receive()
                 if sample is not None:
-                    self._take_in(sample.payload)
-                self._presence.tick()
+                    self._add_batch(sample.payload)
+                self._observer.tick()
         finally:
             over.set()
             ticker.join()
 
-    def _take_in(self, payload: bytes) -> None:
-        self._presence.health.received += 1
+    def _add_batch(self, payload: bytes) -> None:
+        self._observer.health.received += 1
         for key, said in self.values.add_batch(payload):
             if key == keys.CLOCK:
-                self._presence.heed(said)
+                self._observer.update_clock(said)
 
     def close(self) -> None:
-        """Wait for nobody any more."""
+        """Give up requests that wait."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
-    # What clients say and ask, by keys of the federation
+    # By keys without the federation's name
 
-    def put(self, key: str, value: Any, stamps: Stamps) -> None:
+    def put(self, key: str, value: Any, defaults: MessageDefaults) -> None:
         """Publish plain data on a key, checked, with what it leaves out filled in.
 
         Raises:
             DecodeError: names key, field, found and allowed.
-            ForbiddenError: somebody else speaks there.
+            ForbiddenError: the key is reserved.
             UnknownError: the run has no such drone or cluster.
             SessionError: it is no key.
         """
-        self.refuse_unwritable(key)
-        with stamps.all_or_none():
-            payload = self.payload(key, stamps.filled(key, value, self.now_ns))
+        self.check_writable(key)
+        with defaults.transaction():
+            payload = self.encode(key, defaults.fill(key, value, self.now_ns))
         self.publish([(key, payload)])
 
-    def publish(self, said: Sequence[tuple[str, bytes]]) -> None:
+    def publish(self, checked: Sequence[tuple[str, bytes]]) -> None:
         """Publish payloads that have been checked."""
-        for key, payload in said:
+        for key, payload in checked:
             self.link.put_as(key, payload, messages.encoding(key))
-            self.values.say(key, payload)
+            self.values.add_own(key, payload)
 
-    def payload(self, key: str, value: Any) -> bytes:
-        """Return plain data as the payload of a key on which a client may speak.
+    def encode(self, key: str, value: Any) -> bytes:
+        """Return plain data as the payload of a key on which clients may publish.
 
         Raises:
             DecodeError: names key, field, found and allowed.
-            ForbiddenError: somebody else speaks there.
+            ForbiddenError: the key is reserved.
         """
-        self._refuse(key)
-        return to_payload(key, value)
+        self._check_key(key)
+        return json_to_payload(key, value)
 
-    def _refuse(self, key: str) -> None:
-        """Refuse a key of the federation on which a client may not speak, or that is none."""
-        refuse_others(key)
+    def _check_key(self, key: str) -> None:
+        """Refuse a key of the federation that is reserved, or is no key."""
+        check_not_reserved(key)
         check_expression(key)
-        self.refuse_unknown(key)
-        if is_spoken(key) and messages.type_of(key) is None:
+        self.check_known(key)
+        if is_client_key(key) and messages.type_of(key) is None:
             raise DecodeError(f"{key[:80]}: is no key of the contract; see docs/protocol.md")
 
-    def refuse_unwritable(self, key: str) -> None:
-        """Refuse a key on which access control drops what the gateway itself says.
+    def check_writable(self, key: str) -> None:
+        """Refuse a key on which access control drops the gateway's messages.
 
         Raises:
             ForbiddenError: with those on which it does not.
@@ -147,99 +153,101 @@ class Flight:
                 f"{key[:80]}: the gateway's certificate lets it speak on {', '.join(self._may_write)} only"
             )
 
-    def refuse_unknown(self, key: str) -> None:
+    def check_known(self, key: str) -> None:
         """Refuse a message of the contract about a drone or a cluster that the run does not have.
 
         Raises:
             UnknownError: with those that it has.
         """
         kind, thing, _ = keys.parts(key.removeprefix("view/"))
-        known = self._things.get(kind)
-        if known is not None and (messages.type_of(key) or is_control(key)) and thing not in known:
-            raise UnknownError(f"{key[:80]}: {kind} is {thing[:40]!r}; must be one of {', '.join(known) or 'none'}")
+        names = self._known_names.get(kind)
+        if names is not None and (messages.type_of(key) or is_control_key(key)) and thing not in names:
+            raise UnknownError(f"{key[:80]}: {kind} is {thing[:40]!r}; must be one of {', '.join(names) or 'none'}")
         if kind == "estimates" and not keys.PROCESS_NAME.fullmatch(thing):
             raise UnknownError(f"{key[:80]}: process is {thing[:60]!r}; must be 1 to 48 of a-z 0-9 _ . -")
 
-    async def ask(self, key: str, op: str, args: dict[str, Any], source: str, timeout_s: float = 5.0) -> ControlAnswer:
-        """Ask whoever answers on a key.
+    async def request(
+        self, key: str, op: str, args: dict[str, Any], source: str, timeout_s: float = 5.0
+    ) -> ControlAnswer:
+        """Send a control request to whoever answers on a key.
 
         Raises:
             SessionError: it is no key.
-            TooManyError: ASKED_MAX others ask already.
+            TooManyError: REQUESTS_MAX others wait already.
         """
         if "*" in key:
             raise DecodeError(f"{key[:80]!r}: is no key; a request goes to one, without wildcards")
-        self.refuse_unknown(key)
+        self.check_known(key)
         return await self._in_thread(self.link.request, key, op, source, args, timeout_s)
 
-    # The same by whole keys, the federation's name included: of others' keys too
+    # By full keys, with the federation's name; keys of other federations too
 
-    def known(self, expression: str) -> list[Heard]:
-        """Return the last values that a whole expression takes."""
+    def last_samples(self, expression: str) -> list[Heard]:
+        """Return the last values that a full expression matches."""
         return [
             Heard("PUT", f"{self._prefix}{key}", payload, self.values.encoding(key), None)
-            for key, payload in self.values.of(expression, self._prefix)
+            for key, payload in self.values.matching(expression, self._prefix)
         ]
 
-    async def inquire(self, expression: str, parameters: str, payload: bytes, encoding: str) -> list[Heard]:
-        """Return what is answered to a get on a whole expression.
+    async def query(self, expression: str, parameters: str, payload: bytes, encoding: str) -> list[Heard]:
+        """Return the answers to a Zenoh get on a full expression.
 
         Raises:
             SessionError: it is no key expression.
-            TooManyError: ASKED_MAX others ask already.
+            TooManyError: REQUESTS_MAX others wait already.
         """
-        return await self._in_thread(self.whole.inquire, expression, parameters, payload, encoding)
+        return await self._in_thread(self.bare_link.inquire, expression, parameters, payload, encoding)
 
-    def put_whole(self, key: str, payload: bytes, encoding: str) -> None:
-        """Publish a payload on a whole key.
+    def put_full_key(self, key: str, payload: bytes, encoding: str) -> None:
+        """Publish a payload on a full key.
 
         Raises:
-            DecodeError: it is none of the message that the contract puts there.
-            ForbiddenError: somebody else speaks there.
+            DecodeError: it is not the message that the contract puts there.
+            ForbiddenError: the key is reserved.
             SessionError: it is no key.
         """
-        own = self._own(key)
+        own = self._federation_key(key)
         if own is not None and messages.type_of(own) is not None:
             messages.decode(own, payload)
-        self.whole.put_as(key, payload, encoding)
+        self.bare_link.put_as(key, payload, encoding)
         if own is not None:
-            self.values.say(own, payload, encoding)
+            self.values.add_own(own, payload, encoding)
 
-    def delete_whole(self, key: str) -> None:
-        """Publish that a whole key has no value any more.
+    def delete_full_key(self, key: str) -> None:
+        """Publish that a full key has no value any more.
 
         Raises:
-            ForbiddenError: somebody else speaks there.
+            ForbiddenError: the key is reserved.
             SessionError: it is no key.
         """
-        own = self._own(key)
-        self.whole.delete(key)
+        own = self._federation_key(key)
+        self.bare_link.delete(key)
         if own is not None:
             self.values.drop(own)
 
-    def _own(self, key: str) -> str | None:
-        """Return a whole key without this federation's name; None for a key of nobody's.
+    def _federation_key(self, key: str) -> str | None:
+        """Return a full key without this federation's name; None for a key of no federation or of another one.
 
         Raises:
-            DecodeError, ForbiddenError, UnknownError: it is no key on which a client may speak, in any federation.
+            DecodeError, ForbiddenError, UnknownError: clients may not publish there, in any federation.
         """
         own = key.removeprefix(self._prefix)
         if own != key:
-            self._refuse(own)
-            self.refuse_unwritable(own)
+            self._check_key(own)
+            self.check_writable(own)
             return own
-        refuse_others(key)
-        refuse_others(key.partition("/")[2] or key)
+        check_not_reserved(key)
+        check_not_reserved(key.partition("/")[2] or key)
         return None
 
     async def _in_thread(self, wait: Callable[..., Any], *args: Any) -> Any:
-        if self._asked >= ASKED_MAX:
-            raise TooManyError(f"{ASKED_MAX} requests wait for their answers already; ask again later")
-        self._asked += 1
+        if self._pending >= REQUESTS_MAX:
+            raise TooManyError(f"{REQUESTS_MAX} requests wait for their answers already; ask again later")
+        self._pending += 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self._threads, wait, *args)
         finally:
-            self._asked -= 1
+            self._pending -= 1
 
 
 def _tick(box: Mailbox, over: threading.Event) -> None:

@@ -1,123 +1,123 @@
-"""From Zenoh's threads onto the loop: publications to whoever wants them, one subscription for each expression."""
+"""Subscriptions that clients share, one for each expression; publications pass from Zenoh's threads to the loop."""
 
 import asyncio
 from collections import deque
 from collections.abc import Callable
 
 from zsim.transport.session import Heard, Session, check_expression
-from zsim_bridges.gateway.client_limits import Turnstile
-from zsim_bridges.gateway.http.http_errors import TooManyError
+from zsim_bridges.gateway.access_check import ConnectionLimit
+from zsim_bridges.gateway.key_policy import TooManyError
 
-Taker = Callable[[Heard], None]
-CAME_MAX = 50_000  # messages of an expression that wait for the loop; then the oldest go
-AT_ONCE = 500  # messages handed over before anybody else on the loop has a turn
-EXPRESSIONS_MAX = 2_000  # of all clients together; each is a subscription that the world's hub looks at
+Subscriber = Callable[[Heard], None]
+WAITING_MAX = 50_000  # messages of an expression that wait for the loop; then the oldest go
+DELIVER_MAX = 500  # messages delivered before the other tasks of the loop run
+EXPRESSIONS_MAX = 2_000  # of all clients together; each is a subscription that the world's session checks
 
 
-class Feed:
+class SharedSubscriptions:
     """Subscriptions that clients share, and that outlast the session of a run.
 
     Args:
-        loop: on which everything but what Zenoh says is called.
-        turnstile: through which streams come that are nothing but one subscription.
+        loop: on which everything but Zenoh's callbacks is called.
+        limit: of connections, in which streams count that are nothing but one subscription.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, turnstile: Turnstile) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, limit: ConnectionLimit) -> None:
         self._loop = loop
-        self._turnstile = turnstile
+        self._limit = limit
         self._link: Session | None = None
-        self._shared: dict[str, _Shared] = {}
+        self._by_expression: dict[str, _SharedSubscription] = {}
 
     def attach(self, link: Session) -> None:
-        """Hear what is said on a session."""
+        """Subscribe on a session."""
         self._link = link
-        for expression, shared in self._shared.items():
-            shared.undeclare = link.hear(expression, shared.hear)
+        for expression, shared in self._by_expression.items():
+            shared.undeclare = link.hear(expression, shared.on_publication)
 
     def detach(self) -> None:
-        """Hear nothing until there is a session again: the one that there was goes."""
+        """Receive nothing until the next `attach`: the session closes."""
         self._link = None
-        for shared in self._shared.values():
-            shared.undeclare = _nothing
+        for shared in self._by_expression.values():
+            shared.undeclare = _do_nothing
 
-    def subscribe(self, expression: str, taker: Taker) -> Callable[[], None]:
-        """Hand everything on an expression to a taker until the returned function is called.
+    def subscribe(self, expression: str, subscriber: Subscriber) -> Callable[[], None]:
+        """Call a subscriber with every publication on an expression until the returned function is called.
 
         Raises:
             SessionError: it is no key expression.
             TooManyError: there are EXPRESSIONS_MAX others.
         """
-        shared = self._shared.get(expression)
+        shared = self._by_expression.get(expression)
         if shared is None:
             check_expression(expression)
-            if len(self._shared) >= EXPRESSIONS_MAX:
+            if len(self._by_expression) >= EXPRESSIONS_MAX:
                 raise TooManyError(f"subscribe: there are {EXPRESSIONS_MAX} expressions already; take one of them")
-            shared = self._shared[expression] = _Shared(self._loop)
+            shared = self._by_expression[expression] = _SharedSubscription(self._loop)
             if self._link is not None:
-                shared.undeclare = self._link.hear(expression, shared.hear)
-        shared.takers[taker] = None
-        return lambda: self._leave(expression, taker)
+                shared.undeclare = self._link.hear(expression, shared.on_publication)
+        shared.subscribers[subscriber] = None
+        return lambda: self._unsubscribe(expression, subscriber)
 
-    def stream(self, expression: str, taker: Taker) -> Callable[[], None]:
-        """Do as `subscribe` for a connection that has nothing else, and count it among the clients.
+    def subscribe_stream(self, expression: str, subscriber: Subscriber) -> Callable[[], None]:
+        """Subscribe for a connection that has nothing else, and count it among the clients.
 
         Raises:
             SessionError: it is no key expression.
-            TooManyError: there are as many clients, or expressions, as may be.
+            TooManyError: the limit of clients or of expressions is reached.
         """
-        self._turnstile.enter()
+        self._limit.enter()
         try:
-            end = self.subscribe(expression, taker)
+            unsubscribe = self.subscribe(expression, subscriber)
         except BaseException:
-            self._turnstile.leave()
+            self._limit.leave()
             raise
 
         def leave() -> None:
-            end()
-            self._turnstile.leave()
+            unsubscribe()
+            self._limit.leave()
 
         return leave
 
-    def _leave(self, expression: str, taker: Taker) -> None:
-        shared = self._shared.get(expression)
+    def _unsubscribe(self, expression: str, subscriber: Subscriber) -> None:
+        shared = self._by_expression.get(expression)
         if shared is None:
             return
-        shared.takers.pop(taker, None)
-        if not shared.takers:
-            del self._shared[expression]
+        shared.subscribers.pop(subscriber, None)
+        if not shared.subscribers:
+            del self._by_expression[expression]
             shared.undeclare()
 
 
-class _Shared:
-    """One subscription: what comes in a rush is handed over together."""
+class _SharedSubscription:
+    """One subscription: publications that arrive close together are delivered together."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
-        self._came: deque[Heard] = deque(maxlen=CAME_MAX)
-        self._due = False
-        self.takers: dict[Taker, None] = {}
-        self.undeclare: Callable[[], None] = _nothing
+        self._waiting: deque[Heard] = deque(maxlen=WAITING_MAX)
+        self._scheduled = False
+        self.subscribers: dict[Subscriber, None] = {}
+        self.undeclare: Callable[[], None] = _do_nothing
 
-    def hear(self, heard: Heard) -> None:
-        """Take a publication, in a thread of Zenoh's."""
-        self._came.append(heard)
-        if not self._due:
-            self._due = True
+    def on_publication(self, sample: Heard) -> None:
+        """Store a publication, in a thread of Zenoh's."""
+        self._waiting.append(sample)
+        if not self._scheduled:
+            self._scheduled = True
             try:
-                self._loop.call_soon_threadsafe(self._hand_over)
+                self._loop.call_soon_threadsafe(self._deliver)
             except RuntimeError:
-                return  # the loop is closed: nobody listens any more
+                return  # the loop is closed
 
-    def _hand_over(self) -> None:
-        self._due = False
-        for _ in range(min(AT_ONCE, len(self._came))):
-            heard = self._came.popleft()
-            for taker in list(self.takers):
-                taker(heard)
-        if self._came and not self._due:
-            self._due = True
-            self._loop.call_soon(self._hand_over)
+    def _deliver(self) -> None:
+        self._scheduled = False
+        for _ in range(min(DELIVER_MAX, len(self._waiting))):
+            sample = self._waiting.popleft()
+            for subscriber in list(self.subscribers):
+                subscriber(sample)
+        if self._waiting and not self._scheduled:
+            self._scheduled = True
+            self._loop.call_soon(self._deliver)
 
 
-def _nothing() -> None:
+def _do_nothing() -> None:
     return

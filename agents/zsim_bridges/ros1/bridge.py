@@ -11,26 +11,26 @@ from zsim.errors import DecodeError, RunError
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_bridges import ros_frames
-from zsim_bridges.observer_process import Presence
-from zsim_bridges.ros1 import conversions
+from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.ros1 import driver_messages
 from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics
 from zsim_bridges.ros1.intake import Intake
+from zsim_bridges.ros1.node import Ros1Node
 from zsim_bridges.ros1.onboard import warm_up
-from zsim_bridges.ros1.wire.node import Node
 
 POLL_S = 0.1  # how often a stop is looked for
-TOLD_MAX = 1000  # refusals remembered, so that each is told once
+REPORTED_MAX = 1000  # texts remembered, so that each is printed once
 Say = Callable[[str], None]
 
 
-class DismissedError(RunError):
-    """A ROS node, or the master, asked this node to stop."""
+class NodeShutdownError(RunError):
+    """A ROS node, or the master, has asked this node to stop."""
 
 
 def serve(
     link: Session,
     info: Info,
-    presence: Presence,
+    observer: ObserverProcess,
     stopped: Callable[[], bool],
     say: Say,
     master_uri: str,
@@ -41,115 +41,114 @@ def serve(
     Args:
         link: an open session.
         info: of the run.
-        presence: of this process in it.
-        stopped: asked now and then; True ends it.
-        say: told what a person should know.
+        observer: of this process in it.
+        stopped: called now and then; True ends the run.
+        say: prints a line.
         master_uri: of the ROS master.
-        host: name or address under which ROS nodes reach us.
+        host: name or address under which ROS nodes reach this host.
 
     Raises:
-        DismissedError: ROS asked this node to stop.
+        NodeShutdownError: ROS asked this node to stop.
         RunError: two drones have the same name in ROS.
     """
     warm_up()
-    node = Node(f"/{ros_frames.graph_name(info.federation)}", master_uri, host, say)
-    asyncio.run(Bridge(link, info, presence, node, say).run(stopped))
-    if node.dismissed:
-        presence.leave(node.dismissed)
-        raise DismissedError(f"{presence.name}: {node.dismissed}")
+    node = Ros1Node(f"/{ros_frames.ros1_name(info.federation)}", master_uri, host, say)
+    asyncio.run(Bridge(link, info, observer, node, say).run(stopped))
+    if node.shutdown_reason:
+        observer.leave(node.shutdown_reason)
+        raise NodeShutdownError(f"{observer.name}: {node.shutdown_reason}")
 
 
 class Bridge:
     """One run in one ROS graph."""
 
-    def __init__(self, link: Session, info: Info, presence: Presence, node: Node, say: Say) -> None:
+    def __init__(self, link: Session, info: Info, observer: ObserverProcess, node: Ros1Node, say: Say) -> None:
         self._link = link
         self._info = info
-        self._presence = presence
+        self._observer = observer
         self._node = node
         self._say = say
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._clock = node.publish("/clock", "rosgraph_msgs/Clock", QUEUE)
         tf = node.publish("/tf", "tf2_msgs/TFMessage", QUEUE * len(info.drones))
         check_names(drone.name for drone in info.drones)
         drones = scenario_file.from_text(info.scenario).drones
-        self._drones = {drone.name: DroneTopics(node, drone, presence.name, link.put, tf) for drone in drones}
+        self._drones = {drone.name: DroneTopics(node, drone, observer.name, link.put, tf) for drone in drones}
 
     async def run(self, stopped: Callable[[], bool]) -> None:
-        """Pass on both ways until the run is over, or we are to stop."""
-        intake = Intake(self._link, self._info, self._presence.health, asyncio.get_running_loop())
+        """Forward messages both ways until the run is over or a stop is requested."""
+        intake = Intake(self._link, self._info, self._observer.health, asyncio.get_running_loop())
         try:
             async with self._node.running():
-                while not (stopped() or self._presence.over or self._node.dismissed):
+                while not (stopped() or self._observer.end_reason or self._node.shutdown_reason):
                     with contextlib.suppress(TimeoutError):
                         await asyncio.wait_for(intake.news.wait(), POLL_S)
-                    await self._pass_on(intake)
-                    self._presence.tick()
+                    await self._forward_all(intake)
+                    self._observer.tick()
         finally:
             intake.close()
 
-    async def _pass_on(self, intake: Intake) -> None:
+    async def _forward_all(self, intake: Intake) -> None:
         for said in intake.batches():
             for key, payload in said:
-                self.hear(key, payload)
+                self.forward(key, payload)
             await asyncio.sleep(0)  # let connections have their turn
 
-    def hear(self, key: str, payload: bytes) -> None:
-        """Take what has passed the world, and pass on what follows from it."""
-        kind, whose, what = keys.parts(key)
+    def forward(self, key: str, payload: bytes) -> None:
+        """Convert and publish a message that has passed the world."""
+        kind, thing, leaf = keys.parts(key)
         if key == keys.CLOCK:
             self._on_clock(payload)
         elif key == keys.EVENT:
             self._on_event(payload)
-        elif kind == "drone" and whose in self._drones and not what.startswith("cmd/"):
-            self._hear_of(whose, key, payload)
+        elif kind == "drone" and thing in self._drones and not leaf.startswith("cmd/"):
+            self._publish(thing, key, payload)
 
-    def _hear_of(self, drone: str, key: str, payload: bytes) -> None:
+    def _publish(self, drone: str, key: str, payload: bytes) -> None:
         message = self._decoded(key, payload)
         if message is None:
             return
         try:
-            self._drones[drone].hear(message)
+            self._drones[drone].publish(message)
         except (ValueError, ArithmeticError) as error:  # finite, but beyond what a field of ROS can hold
-            self._presence.health.refused += 1
-            self._tell(f"{key}: {error}")
+            self._observer.health.refused += 1
+            self._report_once(f"{key}: {error}")
 
     def _decoded(self, key: str, payload: bytes) -> Any:
         try:
             return messages.decode(key, payload)
         except DecodeError:
-            self._presence.health.refused += 1
+            self._observer.health.refused += 1
             return None
 
     def _on_clock(self, payload: bytes) -> None:
-        self._presence.heed(payload)
-        clock = self._decoded(keys.CLOCK, payload)
+        clock = self._observer.update_clock(payload)
         if clock is not None:
-            self._clock.publish(lambda _: conversions.clock(clock))
+            self._clock.publish(lambda _: driver_messages.clock(clock))
 
     def _on_event(self, payload: bytes) -> None:
-        """Tell what the world refuses of what ROS nodes ask."""
+        """Print which commands of ROS nodes the world refuses."""
         event = self._decoded(keys.EVENT, payload)
-        if event is None or (event.kind, event.source) != ("refused", self._presence.name):
+        if event is None or (event.kind, event.source) != ("refused", self._observer.name):
             return
-        self._tell(f"{event.subject}: {event.data.get('reason', event.text)}")
+        self._report_once(f"{event.subject}: {event.data.get('reason', event.text)}")
 
-    def _tell(self, reason: str) -> None:
-        """Say something once."""
-        if reason not in self._told and len(self._told) < TOLD_MAX:
-            self._told.add(reason)
-            self._say(f"{self._presence.name}: {reason}")
+    def _report_once(self, reason: str) -> None:
+        """Print a reason, once."""
+        if reason not in self._reported and len(self._reported) < REPORTED_MAX:
+            self._reported.add(reason)
+            self._say(f"{self._observer.name}: {reason}")
 
 
 def check_names(drones: Iterable[str]) -> None:
-    """Refuse drones that ROS cannot tell from each other.
+    """Refuse drones that would have the same name in ROS.
 
     Raises:
-        RunError: two have the same name there.
+        RunError: two have the same name in ROS.
     """
-    found: dict[str, str] = {}
+    drone_of: dict[str, str] = {}
     for drone in drones:
-        name = ros_frames.graph_name(drone)
-        if name in found:
-            raise RunError(f"drones {found[name]!r} and {drone!r} are both {name!r} in ROS; rename one")
-        found[name] = drone
+        name = ros_frames.ros1_name(drone)
+        if name in drone_of:
+            raise RunError(f"drones {drone_of[name]!r} and {drone!r} are both {name!r} in ROS; rename one")
+        drone_of[name] = drone

@@ -1,4 +1,4 @@
-"""What the aircraft knows of itself: its sensors' newest samples, and what its firmware makes of them. Pure.
+"""The state that ardrone_autonomy's driver reports: newest sensor samples, attitude, altitude, odometry. Pure.
 
 Attitude is that of the drone's estimator; where there is none, Madgwick's filter on the drone's own IMU, whose heading
 is 0 where it begins, as that of the aircraft at power-on. Position is integrated from the optical flow.
@@ -13,18 +13,18 @@ import msgspec
 
 from zsim.contract import messages
 from zsim.scenario.scenario import Mount
-from zsim_agents.estimation.madgwick import LEVEL, Rotation, madgwick_step, rpy_rotation, turn
+from zsim_agents.estimation.madgwick import LEVEL, Rotation, madgwick_step, turn
 from zsim_bridges import ros_frames
 from zsim_bridges.ros_frames import Vector
 
 BETA_RAD_S = 0.02  # of Madgwick's filter: levels within seconds, and is not led astray by a manoeuvre
-UNIT_SLACK = 0.01  # of a quaternion's length; an estimator of positions alone may tell zeros
+UNIT_SLACK = 0.01  # of a quaternion's length; an estimator of positions alone may publish zeros
 STEP_S_MAX = 0.1  # longer gaps in the IMU's samples are not integrated over
 _VECTORS = ("accel_m_s2", "gyro_rad_s", "field_ut")  # of samples in the axes of a sensor
-PLACES_KEPT = 32  # gates for which the integrated position is remembered; an estimate is some gates late at most
+POSITIONS_KEPT = 32  # gates for which the integrated position is remembered; an estimate is some gates late at most
 
 
-class Onboard:
+class OnboardState:
     """One aircraft.
 
     Args:
@@ -40,7 +40,7 @@ class Onboard:
 
     def __init__(self, imu: Mount | None = None, mag: Mount | None = None) -> None:
         mounts = {messages.Imu: imu, messages.Mag: mag}
-        self._turns = {
+        self._rotations = {
             kind: rpy_rotation(mount.rpy_deg) for kind, mount in mounts.items() if mount and any(mount.rpy_deg)
         }
         self.imu: messages.Imu | None = None
@@ -53,16 +53,16 @@ class Onboard:
         self.altitude_m = 0.0
         self._ground_baro_m: float | None = None
         self._x_m = self._y_m = 0.0
-        self._places: deque[tuple[int, Vector]] = deque(maxlen=PLACES_KEPT)
+        self._positions: deque[tuple[int, Vector]] = deque(maxlen=POSITIONS_KEPT)
         self.origin_m: Vector | None = None
 
-    def hear(self, message: Any) -> Any:
-        """Take what the drone's sensors or its estimator say; return it in the axes of the body."""
-        R_BS = self._turns.get(type(message))
-        message = message if R_BS is None else _turned(message, R_BS)
-        heard = self._HEARD.get(type(message))
-        if heard is not None:
-            heard(self, message)
+    def update(self, message: Any) -> Any:
+        """Update by a message of the drone or of its estimator; return it in the axes of the body."""
+        R_BS = self._rotations.get(type(message))
+        message = message if R_BS is None else _rotated(message, R_BS)
+        handler = self._HANDLERS.get(type(message))
+        if handler is not None:
+            handler(self, message)
         return message
 
     @property
@@ -86,7 +86,7 @@ class Onboard:
 
     def _on_sonar(self, sonar: messages.Sonar) -> None:
         if sonar.valid:
-            self.altitude_m = sonar.range_m * max(0.0, ros_frames.upright(self.attitude))
+            self.altitude_m = sonar.range_m * max(0.0, ros_frames.tilt_cosine(self.attitude))
             self._ground_baro_m = None
         elif self._ground_baro_m is None and self.baro is not None:
             self._ground_baro_m = self.baro.altitude_m - self.altitude_m
@@ -104,16 +104,16 @@ class Onboard:
         if abs(math.hypot(*estimate.orientation_wxyz) - 1.0) < UNIT_SLACK:
             self.estimate = estimate
             self.attitude = estimate.orientation_wxyz
-        place = next((place for t_ns, place in self._places if t_ns == estimate.t_ns), None)
-        if place is not None:
+        position = next((position for t_ns, position in self._positions if t_ns == estimate.t_ns), None)
+        if position is not None:
             x, y, z = estimate.position_m
-            self.origin_m = (x - place[0], y - place[1], z - place[2])
+            self.origin_m = (x - position[0], y - position[1], z - position[2])
 
     def _on_status(self, status: messages.Status) -> None:
         self.status = status
-        self._places.append((status.t_ns, self.position_m))
+        self._positions.append((status.t_ns, self.position_m))
 
-    _HEARD: ClassVar[dict[type, Callable[["Onboard", Any], None]]] = {
+    _HANDLERS: ClassVar[dict[type, Callable[["OnboardState", Any], None]]] = {
         messages.Imu: _on_imu,
         messages.Mag: _on_mag,
         messages.Baro: _on_baro,
@@ -125,11 +125,11 @@ class Onboard:
 
 
 def warm_up() -> None:
-    """Compile, or load, what would otherwise hold up the first gates."""
+    """Compile, or load, the kernels before the first gate."""
     madgwick_step(LEVEL, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), BETA_RAD_S, STEP_S_MAX)
 
 
-def _turned(sample: Any, R_BS: Rotation) -> Any:
+def _rotated(sample: Any, R_BS: Rotation) -> Any:
     """Return a sample with its vectors in the axes of the body."""
     vectors = {name: turn(R_BS, getattr(sample, name)) for name in _VECTORS if hasattr(sample, name)}
     return msgspec.structs.replace(sample, **vectors)

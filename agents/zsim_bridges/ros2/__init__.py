@@ -1,1 +1,1 @@
-"""ROS 2 by rmw_zenoh's wire: the drones as topics and services, with nothing of ROS installed."""
+"""The drones as ROS 2 topics and services, on the wire of rmw_zenoh, without ROS on this host."""

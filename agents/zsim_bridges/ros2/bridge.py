@@ -1,7 +1,7 @@
-"""The bridge between a run and ROS 2: topics of what is told, subscriptions and services for what is asked.
+"""The bridge between a run and ROS 2: topics, and subscriptions and services for commands.
 
 A topic is converted only while a ROS node subscribes to it, and only then is its source read: a run without ROS nodes
-pays for its clock alone. Nothing here is waited for.
+costs its clock alone. The bridge never makes the world wait.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,26 +17,25 @@ from zsim.scenario.scenario import Scenario
 from zsim.transport import session
 from zsim.transport.identity import Identity
 from zsim.transport.session import Heard, Session
-from zsim_bridges.observer_process import Presence
-from zsim_bridges.ros2 import conversions, rmw_zenoh, sensor_frames, topics
-from zsim_bridges.ros2.callback_queue import Inbox
-from zsim_bridges.ros2.commands import Commands
-from zsim_bridges.ros2.participant import Node, Participant
-from zsim_bridges.ros2.ros_names import ros_names
-from zsim_bridges.ros2.ros_types import Types
-from zsim_bridges.ros2.source_keys import SAMPLES_MAX, Feeds, Publication
-from zsim_bridges.ros2.topics import Names, Topic
+from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
+from zsim_bridges.ros2.commands import RosCommands
+from zsim_bridges.ros2.rmw_zenoh import ros_names
+from zsim_bridges.ros2.ros_context import Ros2Node, RosContext
+from zsim_bridges.ros2.ros_types import RosTypes
+from zsim_bridges.ros2.source_keys import SAMPLES_MAX, BridgedTopic, CallbackQueue, SourceSubscriptions
+from zsim_bridges.ros2.topics import RosNames, Topic
 
 NODE = "zsim"
-POLL_S = 0.1  # how often a stop is looked for
+POLL_S = 0.1  # how often a stop is checked
 ATTEMPT_S = 1.0  # of connecting to ROS's router
 TRIGGER = "std_srvs/srv/Trigger"
 CLUSTER_SERVICES = ("takeoff", "engage", "hold", "land")
 Say = Callable[[str], None]
 
 
-class Door(NamedTuple):
-    """Where ROS is.
+class RosNetwork(NamedTuple):
+    """How to reach ROS.
 
     Attributes:
         domain: ROS_DOMAIN_ID.
@@ -50,182 +49,188 @@ class Door(NamedTuple):
 
 
 class Bridge:
-    """One run's worth of it; everything but commands and services happens in the thread that calls `turn`.
+    """The bridge of one run; everything but commands and services happens in the thread that calls `process`.
 
     Args:
         link: to the world.
         info: of the run.
-        presence: of this process in the run.
-        say: told what a person should know, each thing once.
+        observer: of this process in the run.
+        say: prints a line, each once.
         wall_ns: time since 1970.
     """
 
-    def __init__(self, link: Session, info: Info, presence: Presence, say: Say, wall_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, link: Session, info: Info, observer: ObserverProcess, say: Say, wall_ns: Callable[[], int]
+    ) -> None:
         self._link = link
-        self._presence = presence
+        self._observer = observer
         self._say = say
         self._wall_ns = wall_ns
         self._scenario: Scenario = scenario_file.from_text(info.scenario)
-        self._inbox = Inbox(SAMPLES_MAX)
-        self._publications: dict[str, Publication] = {}
-        self._feeds = Feeds(link, self._inbox, self._refuse, info.mode == "realtime")
-        self._said: set[str] = set()
-        self._ends: list[Callable[[], None]] = []
+        self._queue = CallbackQueue(SAMPLES_MAX)
+        self._publications: dict[str, BridgedTopic] = {}
+        self._sources = SourceSubscriptions(link, self._queue, self._count_refused, info.mode == "realtime")
+        self._reported: set[str] = set()
+        self._cleanups: list[Callable[[], None]] = []
         self._domain = 0
-        self.names = Names(
+        self.names = RosNames(
             ros_names((drone.name for drone in info.drones), "drone"),
             ros_names((cluster.name for cluster in info.clusters), "cluster"),
         )
-        self._ends.append(link.hear(keys.CLOCK, self._on_clock))
+        self._cleanups.append(link.hear(keys.CLOCK, self._on_clock))
 
-    def _on_clock(self, heard: Heard) -> None:
-        self._inbox.act(partial(self._presence.heed, heard.payload))
+    def _on_clock(self, sample: Heard) -> None:
+        self._queue.add_task(partial(self._observer.update_clock, sample.payload))
 
-    def turn(self, within_s: float) -> None:
-        """Do what there is to do, waiting for something."""
-        taken = self._inbox.take(within_s)
+    def process(self, within_s: float) -> None:
+        """Execute queued tasks and convert samples; wait for some."""
+        work = self._queue.pop_all(within_s)
         start_ns = self._wall_ns()
-        for act in taken.acts:
-            act()
-        passed = self._feeds.pass_on(taken.samples)
-        health = self._presence.health
-        if passed:
+        for task in work.tasks:
+            task()
+        converted = self._sources.convert_all(work.samples)
+        health = self._observer.health
+        if converted:
             health.step(self._wall_ns() - start_ns)
-        health.received += passed
-        health.dropped = self._inbox.dropped + self._feeds.dropped
-        self._presence.tick()
+        health.received += converted
+        health.dropped = self._queue.dropped + self._sources.dropped
+        self._observer.tick()
 
     def close(self) -> None:
-        """Hear nothing any more."""
-        self._feeds.close()
-        for end in self._ends:
-            end()
+        """Close all subscriptions."""
+        self._sources.close()
+        for close in self._cleanups:
+            close()
 
-    def refuse(self, where: str, why: str) -> None:
-        """Count what others sent in vain, and say so once for each name; callable from any thread."""
-        self._inbox.act(partial(self._refuse, where, why))
+    def count_refused(self, name: str, reason: str) -> None:
+        """Count a message that is refused, and report it once for each name; callable from any thread."""
+        self._queue.add_task(partial(self._count_refused, name, reason))
 
-    def _refuse(self, where: str, why: str) -> None:
-        self._presence.health.refused += 1
-        self.say_once(where, f"{where}: refused, {why}; further ones are counted in {self._presence.name}'s health")
+    def _count_refused(self, name: str, reason: str) -> None:
+        self._observer.health.refused += 1
+        self.report_once(name, f"{name}: refused, {reason}; further ones are counted in {self._observer.name}'s health")
 
-    def say_once(self, about: str, text: str) -> None:
-        if about not in self._said:
-            self._said.add(about)
-            self._say(f"{self._presence.name}: {text}")
+    def report_once(self, subject: str, text: str) -> None:
+        if subject not in self._reported:
+            self._reported.add(subject)
+            self._say(f"{self._observer.name}: {text}")
 
-    # What ROS sees
+    # Advertised to ROS
 
-    def enter(self, ros: Participant) -> None:
-        """Show the run to ROS."""
+    def advertise_run(self, ros: RosContext) -> None:
+        """Advertise the run's topics and services."""
         self._domain = ros.domain
         types = ros.types
-        commands = Commands(self._link, self._presence, types.of("std_srvs/srv/Trigger_Response"))
+        commands = RosCommands(self._link, self._observer, types.message_class("std_srvs/srv/Trigger_Response"))
         sensors = {drone.name: drone.sensors for drone in self._scenario.drones}
         root = ros.node("/", NODE)
-        self._offer(root, topics.of_run(self.names))
-        self._place(root)
+        self._advertise(root, topics.run_topics(self.names))
+        self._publish_static_frames(root)
         for drone, name in self.names.drones.items():
             node = ros.node(f"/{name}", NODE)
-            self._offer(node, topics.of_drone(drone, name, sensors[drone], types))
-            self._obey(node, drone, name, commands)
+            self._advertise(node, topics.drone_topics(drone, name, sensors[drone], types))
+            self._accept_commands(node, drone, name, commands)
         for cluster, name in self.names.clusters.items():
             node = ros.node(f"/cluster/{name}", NODE)
-            self._offer(node, topics.of_cluster(cluster, name, types))
+            self._advertise(node, topics.cluster_topics(cluster, name, types))
             for op in CLUSTER_SERVICES:
-                node.service(f"/cluster/{name}/{op}", TRIGGER, _asking(commands.cluster, cluster, op))
-        ros.on_subscription(lambda token, alive: self._inbox.act(partial(self._on_reader, token, alive)))
-        self._say_names()
+                node.service(f"/cluster/{name}/{op}", TRIGGER, _empty_request(commands.request_cluster, cluster, op))
+        ros.on_subscription(lambda token, alive: self._queue.add_task(partial(self._on_subscription, token, alive)))
+        self._report_names()
 
-    def _offer(self, node: Node, offered: Iterator[Topic]) -> None:
-        for topic in offered:
+    def _advertise(self, node: Ros2Node, run_topics: Iterator[Topic]) -> None:
+        for topic in run_topics:
             publisher = node.publisher(topic.name, topic.kind, topic.qos)
-            self._publications[topic.name] = Publication(topic, publisher)
+            self._publications[topic.name] = BridgedTopic(topic, publisher)
 
-    def _obey(self, node: Node, drone: str, name: str, commands: Commands) -> None:
-        """Take a drone's commands."""
+    def _accept_commands(self, node: Ros2Node, drone: str, name: str, commands: RosCommands) -> None:
+        """Subscribe to a drone's commands."""
         empty = "std_msgs/msg/Empty"
-        taken: dict[str, tuple[str, Callable[[Any], None]]] = {
-            "cmd_vel": ("geometry_msgs/msg/Twist", partial(commands.velocity, drone)),
-            "takeoff": (empty, lambda _: commands.mode(drone, "takeoff")),
-            "land": (empty, lambda _: commands.mode(drone, "land")),
-            "reset": (empty, lambda _: commands.reset(drone)),
+        callbacks: dict[str, tuple[str, Callable[[Any], None]]] = {
+            "cmd_vel": ("geometry_msgs/msg/Twist", partial(commands.send_velocity, drone)),
+            "takeoff": (empty, lambda _: commands.send_mode(drone, "takeoff")),
+            "land": (empty, lambda _: commands.send_mode(drone, "land")),
+            "reset": (empty, lambda _: commands.toggle_emergency(drone)),
         }
-        for leaf, (kind, act) in taken.items():
-            self._ends.append(node.subscription(f"/{name}/{leaf}", kind, rmw_zenoh.DEFAULT, act))
-        node.service(f"/{name}/release", TRIGGER, _asking(commands.release, drone))
+        for leaf, (kind, act) in callbacks.items():
+            self._cleanups.append(node.subscription(f"/{name}/{leaf}", kind, rmw_zenoh.DEFAULT, act))
+        node.service(f"/{name}/release", TRIGGER, _empty_request(commands.release, drone))
 
-    def _place(self, node: Node) -> None:
-        """Tell once, for all that come later too, where the frames are that never move."""
+    def _publish_static_frames(self, node: Ros2Node) -> None:
+        """Publish the frames that never move, once for all, later subscribers too."""
         publisher = node.publisher("/tf_static", "tf2_msgs/msg/TFMessage", rmw_zenoh.TF_STATIC)
-        placed = [
-            pose for d in self._scenario.drones for pose in sensor_frames.fixed(self.names.drones[d.name], d.sensors)
+        poses = [
+            pose
+            for d in self._scenario.drones
+            for pose in conversions.static_frames(self.names.drones[d.name], d.sensors)
         ]
-        publisher.publish(conversions.transforms(0, placed))
+        publisher.publish(conversions.transforms(0, poses))
 
-    def _say_names(self) -> None:
+    def _report_names(self) -> None:
         for name, ros in {**self.names.drones, **self.names.clusters}.items():
             if name != ros:
-                self.say_once(name, f"{name} is {ros} in ROS, which takes no such name")
+                self.report_once(name, f"{name} is {ros} in ROS, which takes no such name")
 
-    # What ROS subscribes to
+    # Subscriptions of ROS nodes
 
-    def _on_reader(self, token: str, alive: bool) -> None:
+    def _on_subscription(self, token: str, alive: bool) -> None:
         endpoint = rmw_zenoh.endpoint_of(token)
         publication = self._publications.get(endpoint.name) if endpoint else None
         if endpoint is None or publication is None:
             return
         if endpoint.key(self._domain) != publication.publisher.key:
             kind = publication.topic.kind
-            self.say_once(token, f"{endpoint.name}: somebody subscribes to {endpoint.type_name}; it is {kind}")
+            self.report_once(token, f"{endpoint.name}: somebody subscribes to {endpoint.type_name}; it is {kind}")
             return
-        readers, had = publication.readers, bool(publication.readers)
+        readers, had_readers = publication.readers, bool(publication.readers)
         readers.add(token) if alive else readers.discard(token)
-        if bool(readers) != had:
-            (self._feeds.start if readers else self._feeds.end)(publication)
+        if bool(readers) != had_readers:
+            (self._sources.add if readers else self._sources.remove)(publication)
 
 
-def _asking(ask: Callable[..., Any], *about: str) -> Callable[[Any], Any]:
-    """Return what answers an empty request."""
-    return lambda _: ask(*about)
+def _empty_request(act: Callable[..., Any], *args: str) -> Callable[[Any], Any]:
+    """Return the callback of a service without arguments."""
+    return lambda _: act(*args)
 
 
 def serve(
     link: Session,
     info: Info,
-    presence: Presence,
+    observer: ObserverProcess,
     stopped: Callable[[], bool],
     say: Say,
-    door: Door,
+    network: RosNetwork,
     wall_ns: Callable[[], int],
 ) -> None:
-    """Bridge one run to ROS, until it is over or it is told to stop.
+    """Bridge one run to ROS, until it is over or `stopped` returns true.
 
     Raises:
         SessionError: the router's endpoint is malformed.
     """
-    bridge = Bridge(link, info, presence, say, wall_ns)
+    bridge = Bridge(link, info, observer, say, wall_ns)
     with ExitStack() as stack, closing(bridge):
-        ros_link = link.bare() if door.router is None else None
+        ros_link = link.bare() if network.router is None else None
         entered = False
-        while not presence.over and not stopped():
-            ros_link = ros_link or _reach(stack, door, bridge)
+        while not observer.end_reason and not stopped():
+            ros_link = ros_link or _connect(stack, network, bridge)
             if ros_link is not None and not entered:
-                bridge.enter(Participant(ros_link, door.domain, Types(), wall_ns, bridge.refuse))
-                say(f"{presence.name}: ROS domain {door.domain} by {door.router or 'the hub of the world'}")
+                bridge.advertise_run(RosContext(ros_link, network.domain, RosTypes(), wall_ns, bridge.count_refused))
+                say(f"{observer.name}: ROS domain {network.domain} by {network.router or 'the hub of the world'}")
                 entered = True
-            bridge.turn(POLL_S)
+            bridge.process(POLL_S)
 
 
-def _reach(stack: ExitStack, door: Door, bridge: Bridge) -> Session | None:
-    """Return a session with ROS's router, None where nobody listens yet."""
-    assert door.router is not None
+def _connect(stack: ExitStack, network: RosNetwork, bridge: Bridge) -> Session | None:
+    """Return a session with ROS's router, None where it does not listen yet."""
+    assert network.router is not None
     try:
         return stack.enter_context(
-            session.connect(door.router, "", wait_s=ATTEMPT_S, reader=True, identity=door.identity)
+            session.connect(network.router, "", wait_s=ATTEMPT_S, reader=True, identity=network.identity)
         )
     except SessionError as error:
         if "nobody listens" not in str(error):
             raise
-        bridge.say_once("router", f"no router of ROS on {door.router} yet, waiting for it; start rmw_zenohd there")
+        bridge.report_once(
+            "router", f"no router of ROS on {network.router} yet, waiting for it; start rmw_zenohd there"
+        )
         return None

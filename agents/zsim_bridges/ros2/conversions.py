@@ -1,10 +1,14 @@
-"""From zsim's messages to those of ROS: SI units and ENU/FLU frames on both sides, so mostly names change. All pure.
+"""From zsim's messages to those of ROS 2: SI units and ENU/FLU frames on both sides, so mostly names change. Pure.
 
-Covariances are row-major; what nobody tells is zero in them, unless the message's definition has a sign for it.
+Frames as REP-103 and REP-105 have them: map is W (east, north, up); of each drone `NAME/odom`, the frame of its
+estimate (it lies on map, since the estimate is of W), `NAME/base_link` (forward, left, up), and a frame for each
+sensor. Quaternions are w first. Covariances are row-major; unknown ones are zero, unless the message's definition has
+a sign for it.
 """
 
 import math
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,17 +16,72 @@ from rosbags.typesys.stores import ros2_jazzy as ros
 
 from zsim.contract import messages
 from zsim.contract.messages import Quaternion, Vector3
-from zsim.math.frames import quaternion_from_rpy
+from zsim.math.frames import quaternion_from_rpy, quaternion_multiply
 from zsim.scenario import scenario
-from zsim_bridges.ros2.sensor_frames import UNTURNED, Pose, cluster, into_body, rows
+from zsim.scenario.scenario import Mount, Sensors
+from zsim_bridges import ros_frames
+
+MAP = "map"
+UNTURNED: Quaternion = (1.0, 0.0, 0.0, 0.0)
+# A sonar looks along -z of its sensor frame; the x axis of a ROS range finder is its beam: turned by 90 deg about y.
+_ALONG_BEAM = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
+
+
+class FramePose(NamedTuple):
+    """The pose of a frame in another one."""
+
+    parent: str
+    child: str
+    position_m: Vector3
+    orientation_wxyz: Quaternion
+
+
+def odom(drone: str) -> str:
+    return f"{drone}/odom"
+
+
+def base(drone: str) -> str:
+    return f"{drone}/base_link"
+
+
+def sensor(drone: str, kind: str) -> str:
+    return f"{drone}/{kind}_link"
+
+
+def cluster(name: str) -> str:
+    return f"cluster/{name}"
+
+
+def static_frames(drone: str, sensors: Sensors) -> Iterator[FramePose]:
+    """Yield the frames of a drone that never move: its odom in map, its sensors in its body."""
+    yield FramePose(MAP, odom(drone), (0.0, 0.0, 0.0), UNTURNED)
+    for kind in ("imu", "gps", "mag", "baro"):
+        mount: Mount = getattr(sensors, kind).mount
+        yield FramePose(base(drone), sensor(drone, kind), mount.position_m, _mount_rotation(mount))
+    beam = quaternion_multiply(_mount_rotation(sensors.sonar.mount), _ALONG_BEAM)
+    yield FramePose(base(drone), sensor(drone, "sonar"), sensors.sonar.mount.position_m, _quaternion(beam))
+
+
+def _mount_rotation(mount: Mount) -> Quaternion:
+    """Return q_BS."""
+    return _quaternion(quaternion_from_rpy(np.radians(mount.rpy_deg)))
+
+
+def _quaternion(q: np.ndarray) -> Quaternion:
+    w, x, y, z = q.tolist()
+    return w, x, y, z
+
 
 Array = NDArray[np.float64]
 Time, Header = ros.builtin_interfaces__msg__Time, ros.std_msgs__msg__Header
-Xyz, Point, Turn = ros.geometry_msgs__msg__Vector3, ros.geometry_msgs__msg__Point, ros.geometry_msgs__msg__Quaternion
+RosVector3, Point, RosQuaternion = (
+    ros.geometry_msgs__msg__Vector3,
+    ros.geometry_msgs__msg__Point,
+    ros.geometry_msgs__msg__Quaternion,
+)
 
-SECOND_NS = 1_000_000_000
 TESLA_PER_UT = 1e-6
-UNKNOWN = np.array([-1.0, *[0.0] * 8])  # what sensor_msgs/Imu asks for where there is no attitude
+UNKNOWN = np.array([-1.0, *[0.0] * 8])  # of sensor_msgs/Imu without an attitude
 GPS_SERVICE = 1  # sensor_msgs/NavSatStatus.SERVICE_GPS
 KNOWN_DIAGONAL = 2  # sensor_msgs/NavSatFix.COVARIANCE_TYPE_DIAGONAL_KNOWN
 ULTRASOUND = 0  # sensor_msgs/Range
@@ -34,7 +93,7 @@ NAN = math.nan
 
 def stamp(t_ns: int) -> Any:
     """Return simulated time as ROS writes it."""
-    return Time(t_ns // SECOND_NS, t_ns % SECOND_NS)
+    return Time(*divmod(t_ns, ros_frames.NS_PER_S))
 
 
 def header(t_ns: int, frame: str) -> Any:
@@ -46,14 +105,14 @@ def clock(message: messages.Clock) -> Any:
 
 
 def imu(message: messages.Imu, frame: str, gyro: Array, accel: Array) -> Any:
-    """Return specific force and rates; it tells no attitude. `gyro` and `accel` are covariances (9,)."""
+    """Return specific force and rates, without an attitude. `gyro` and `accel` are covariances (9,)."""
     return ros.sensor_msgs__msg__Imu(
         header(message.t_sample_ns, frame),
-        Turn(0.0, 0.0, 0.0, 1.0),
+        RosQuaternion(0.0, 0.0, 0.0, 1.0),
         UNKNOWN,
-        Xyz(*message.gyro_rad_s),
+        RosVector3(*message.gyro_rad_s),
         gyro,
-        Xyz(*message.accel_m_s2),
+        RosVector3(*message.accel_m_s2),
         accel,
     )
 
@@ -74,13 +133,13 @@ def fix(message: messages.Gps, frame: str) -> Any:
 
 def fix_velocity(message: messages.Gps, frame: str) -> Any:
     """Return the receiver's velocity in `frame`, which is ENU."""
-    twist = ros.geometry_msgs__msg__Twist(Xyz(*message.velocity_m_s), Xyz(0.0, 0.0, 0.0))
+    twist = ros.geometry_msgs__msg__Twist(RosVector3(*message.velocity_m_s), RosVector3(0.0, 0.0, 0.0))
     return ros.geometry_msgs__msg__TwistStamped(header(message.t_sample_ns, frame), twist)
 
 
 def mag(message: messages.Mag, frame: str, covariance: Array) -> Any:
     """Return the field [T]."""
-    field = Xyz(*(TESLA_PER_UT * each for each in message.field_ut))
+    field = RosVector3(*(TESLA_PER_UT * each for each in message.field_ut))
     return ros.sensor_msgs__msg__MagneticField(header(message.t_sample_ns, frame), field, covariance)
 
 
@@ -122,15 +181,15 @@ def true_odometry(message: messages.Truth, frame: str, child: str) -> Any:
     return ros.nav_msgs__msg__Odometry(
         header(message.t_ns, frame),
         child,
-        ros.geometry_msgs__msg__PoseWithCovariance(pose(message.position_m, q), nothing),
-        _twist(into_body(q, message.velocity_m_s), message.angular_velocity_rad_s, nothing),
+        ros.geometry_msgs__msg__PoseWithCovariance(ros_pose(message.position_m, q), nothing),
+        _twist(ros_frames.into_body(q, message.velocity_m_s), message.angular_velocity_rad_s, nothing),
     )
 
 
 def odometry(message: messages.Estimate, frame: str, child: str, w_WB_B: Vector3) -> Any:
-    """Return an estimate; twist in the body. Of the attitude only the heading has an uncertainty to tell."""
+    """Return an estimate; twist in the body. Of the attitude only the heading has an uncertainty."""
     P = np.array(message.covariance).reshape(6, 6)
-    R = np.array(rows(message.orientation_wxyz))
+    R = np.array(ros_frames.rotation_rows(message.orientation_wxyz))
     of_pose, of_twist = np.zeros((6, 6)), np.zeros((6, 6))
     of_pose[:3, :3], of_pose[5, 5] = P[:3, :3], message.yaw_sigma_rad**2
     of_twist[:3, :3] = R.T @ P[3:, 3:] @ R
@@ -138,47 +197,46 @@ def odometry(message: messages.Estimate, frame: str, child: str, w_WB_B: Vector3
     return ros.nav_msgs__msg__Odometry(
         header(message.t_ns, frame),
         child,
-        ros.geometry_msgs__msg__PoseWithCovariance(pose(message.position_m, q), of_pose.ravel()),
-        _twist(into_body(q, message.velocity_m_s), w_WB_B, of_twist.ravel()),
+        ros.geometry_msgs__msg__PoseWithCovariance(ros_pose(message.position_m, q), of_pose.ravel()),
+        _twist(ros_frames.into_body(q, message.velocity_m_s), w_WB_B, of_twist.ravel()),
     )
 
 
 def _twist(linear: Vector3, angular: Vector3, covariance: Array) -> Any:
-    twist = ros.geometry_msgs__msg__Twist(Xyz(*linear), Xyz(*angular))
+    twist = ros.geometry_msgs__msg__Twist(RosVector3(*linear), RosVector3(*angular))
     return ros.geometry_msgs__msg__TwistWithCovariance(twist, covariance)
 
 
-def pose(position_m: Vector3, q: Quaternion) -> Any:
-    return ros.geometry_msgs__msg__Pose(Point(*position_m), turn(q))
+def ros_pose(position_m: Vector3, q: Quaternion) -> Any:
+    return ros.geometry_msgs__msg__Pose(Point(*position_m), ros_quaternion(q))
 
 
-def turn(q: Quaternion) -> Any:
+def ros_quaternion(q: Quaternion) -> Any:
     """Return a quaternion in ROS's order: w last."""
-    w, x, y, z = q
-    return Turn(x, y, z, w)
+    return RosQuaternion(*ros_frames.xyzw(q))
 
 
-def transform(t_ns: int, placed: Pose) -> Any:
-    moved = ros.geometry_msgs__msg__Transform(Xyz(*placed.position_m), turn(placed.orientation_wxyz))
-    return ros.geometry_msgs__msg__TransformStamped(header(t_ns, placed.parent), placed.child, moved)
+def transform(t_ns: int, pose: FramePose) -> Any:
+    moved = ros.geometry_msgs__msg__Transform(RosVector3(*pose.position_m), ros_quaternion(pose.orientation_wxyz))
+    return ros.geometry_msgs__msg__TransformStamped(header(t_ns, pose.parent), pose.child, moved)
 
 
-def transforms(t_ns: int, placed: list[Pose]) -> Any:
-    return ros.tf2_msgs__msg__TFMessage([transform(t_ns, each) for each in placed])
+def transforms(t_ns: int, poses: list[FramePose]) -> Any:
+    return ros.tf2_msgs__msg__TFMessage([transform(t_ns, each) for each in poses])
 
 
-def cluster_pose(message: messages.ClusterState, parent: str, name: str) -> Pose:
-    """Return where the cluster frame C is, by the estimates; a pair has no roll."""
+def cluster_pose(message: messages.ClusterState, parent: str, name: str) -> FramePose:
+    """Return the pose of the cluster frame C by the estimates; a pair has no roll."""
     values = dict(zip(message.names, message.value, strict=True))
     x, y, z, roll, pitch, yaw = (values.get(each, 0.0) for each in ("x_c", "y_c", "z_c", "roll", "pitch", "yaw"))
     q = UNTURNED if not roll and not pitch and not yaw else tuple(quaternion_from_rpy((roll, pitch, yaw)).tolist())
-    return Pose(parent, cluster(name), (x, y, z), q)
+    return FramePose(parent, cluster(name), (x, y, z), q)
 
 
-def posed(t_ns: int, placed: Pose) -> Any:
+def pose_stamped(t_ns: int, pose: FramePose) -> Any:
     """Return a pose as a message."""
-    where = pose(placed.position_m, placed.orientation_wxyz)
-    return ros.geometry_msgs__msg__PoseStamped(header(t_ns, placed.parent), where)
+    message = ros_pose(pose.position_m, pose.orientation_wxyz)
+    return ros.geometry_msgs__msg__PoseStamped(header(t_ns, pose.parent), message)
 
 
 def cluster_state(kind: Any, message: messages.ClusterState, frame: str) -> Any:

@@ -1,15 +1,40 @@
-"""What rmw_zenoh writes on the wire: keys, liveliness tokens, quality of service, attachments, identities. All pure.
+"""The wire of rmw_zenoh: names, keys, liveliness tokens, quality of service, attachments, identities. Pure.
 
 Of ros2/rmw_zenoh as Jazzy (from 0.2.4), Kilted and Rolling ship it: `liveliness_utils.cpp` for tokens and quality of
 service, `attachment_helpers.cpp` for attachments. Humble's has neither type hashes nor this attachment.
 """
 
+import re
 import struct
+from collections.abc import Iterable
 from typing import Literal, NamedTuple
 
 import xxhash
 
-SPACE = "@ros2_lv"  # of all tokens; `**` does not match it
+_OTHERS = re.compile(r"[^a-z0-9]+")  # and no two underscores in a row, which ROS reserves
+
+
+def ros_name(name: str, what: str) -> str:
+    """Return the nearest name that ROS takes: `quad-1.a` is `quad_1_a`, and a drone `7` is `drone_7`."""
+    bare = _OTHERS.sub("_", name)
+    return f"{what}_{bare}" if bare[0].isdigit() else bare
+
+
+def ros_names(names: Iterable[str], what: str) -> dict[str, str]:
+    """Return the ROS name of each; where two would have the same, the later ones get a number."""
+    ros_name_of: dict[str, str] = {}
+    used: set[str] = set()
+    for name in names:
+        first = chosen = ros_name(name, what)
+        number = 2
+        while chosen in used:
+            chosen, number = f"{first.rstrip('_')}_{number}", number + 1
+        used.add(chosen)
+        ros_name_of[name] = chosen
+    return ros_name_of
+
+
+TOKEN_SPACE = "@ros2_lv"  # of all tokens; `**` does not match it
 Kind = Literal["NN", "MP", "MS", "SS", "SC"]
 """A node, a publisher, a subscription, a service, a client."""
 TOKEN_PARTS = 13  # of an endpoint's token
@@ -19,7 +44,7 @@ ATTACHMENT_BYTES = _HEAD.size + GID_BYTES
 
 
 class Qos(NamedTuple):
-    """What an endpoint promises or asks for; the last `depth` messages are kept."""
+    """Quality of service that an endpoint offers or requests; the last `depth` messages are kept."""
 
     depth: int = 10
     best_effort: bool = False
@@ -50,7 +75,7 @@ class NodeId(NamedTuple):
 
 
 class Endpoint(NamedTuple):
-    """What a token tells of a publisher, subscription, service or client that is about us."""
+    """A publisher, subscription, service or client, as its token describes it."""
 
     kind: str
     name: str
@@ -58,7 +83,7 @@ class Endpoint(NamedTuple):
     type_hash: str
 
     def key(self, domain: int) -> str:
-        """Return where its messages or requests go."""
+        """Return the key of its messages or requests."""
         return data_key(domain, self.name, self.type_name, self.type_hash)
 
 
@@ -75,34 +100,34 @@ def data_key(domain: int, name: str, type_name: str, type_hash: str) -> str:
 
 def node_token(node: NodeId) -> str:
     """Return the token of a node."""
-    return f"{_head(node, node.number, 'NN')}"
+    return f"{_token_head(node, node.number, 'NN')}"
 
 
 def endpoint_token(node: NodeId, number: int, endpoint: Endpoint, qos: Qos) -> str:
     """Return the token of one of a node's endpoints."""
-    about = f"{_mangled(endpoint.name)}/{endpoint.type_name}/{endpoint.type_hash}/{qos.text()}"
-    return f"{_head(node, number, endpoint.kind)}/{about}"
+    endpoint_part = f"{_mangled(endpoint.name)}/{endpoint.type_name}/{endpoint.type_hash}/{qos.text()}"
+    return f"{_token_head(node, number, endpoint.kind)}/{endpoint_part}"
 
 
-def _head(node: NodeId, number: int, kind: str) -> str:
+def _token_head(node: NodeId, number: int, kind: str) -> str:
     enclave = "%"
-    place = f"{SPACE}/{node.domain}/{node.zid}/{node.number}/{number}/{kind}"
-    return f"{place}/{enclave}/{_mangled(node.namespace)}/{node.name}"
+    prefix = f"{TOKEN_SPACE}/{node.domain}/{node.zid}/{node.number}/{number}/{kind}"
+    return f"{prefix}/{enclave}/{_mangled(node.namespace)}/{node.name}"
 
 
 def _mangled(name: str) -> str:
     return name.replace("/", "%")
 
 
-def subscriptions(domain: int) -> str:
+def subscription_tokens(domain: int) -> str:
     """Return the expression of the tokens of all subscriptions."""
-    return f"{SPACE}/{domain}/*/*/*/MS/**"
+    return f"{TOKEN_SPACE}/{domain}/*/*/*/MS/**"
 
 
 def endpoint_of(token: str) -> Endpoint | None:
-    """Return what a token tells of an endpoint; None where it is none."""
+    """Return the endpoint of a token; None where it is no endpoint's."""
     parts = token.split("/")
-    if len(parts) != TOKEN_PARTS or parts[0] != SPACE:
+    if len(parts) != TOKEN_PARTS or parts[0] != TOKEN_SPACE:
         return None
     return Endpoint(parts[5], parts[9].replace("%", "/"), parts[10], parts[11])
 
@@ -114,7 +139,7 @@ def gid_of(token: str) -> bytes:
 
 
 class Attachment(NamedTuple):
-    """What goes beside every message, request and reply: its number (from 1), its wall time, and who sent it."""
+    """The attachment of every message, request and reply: its number (from 1), its wall time, and its sender."""
 
     sequence: int
     wall_ns: int
@@ -125,7 +150,7 @@ class Attachment(NamedTuple):
 
 
 def attachment_of(data: bytes) -> Attachment:
-    """Return what an attachment says.
+    """Return a decoded attachment.
 
     Raises:
         ValueError: it is none of rmw_zenoh's.

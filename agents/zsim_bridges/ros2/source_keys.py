@@ -1,21 +1,72 @@
-"""What is read of the run for whom in ROS: each key once, while somebody subscribes to a topic that is made of it."""
+"""The run's keys that are read for ROS: each once, while a ROS node subscribes to a topic that is made of it."""
 
 import struct
+import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError
 from zsim.transport.session import Heard, Mailbox, Sample, Session
-from zsim_bridges.ros2.callback_queue import Inbox
-from zsim_bridges.ros2.participant import Publisher
+from zsim_bridges.ros2.ros_context import Publisher
 from zsim_bridges.ros2.topics import Topic
+
+QueuedTask = Callable[[], object]
+
+
+class QueuedWork(NamedTuple):
+    """Contents of the queue: tasks, and samples as (key, payload)."""
+
+    tasks: list[QueuedTask]
+    samples: list[tuple[str, bytes]]
+
+
+class CallbackQueue:
+    """From Zenoh's threads to the bridge's: all tasks, and the newest `limit` samples; filling it never waits.
+
+    Attributes:
+        dropped: samples that were lost.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._tasks: list[QueuedTask] = []
+        self._samples: deque[tuple[str, bytes]] = deque()
+        self._arrived = threading.Condition()
+        self.dropped = 0
+
+    def add_task(self, act: QueuedTask) -> None:
+        """Queue a task for the bridge's thread."""
+        with self._arrived:
+            self._tasks.append(act)
+            self._arrived.notify()
+
+    def add_sample(self, key: str, payload: bytes) -> None:
+        """Queue a sample."""
+        with self._arrived:
+            if len(self._samples) >= self._limit:
+                self._samples.popleft()
+                self.dropped += 1
+            self._samples.append((key, payload))
+            self._arrived.notify()
+
+    def pop_all(self, within_s: float) -> QueuedWork:
+        """Return the contents, waiting for some."""
+        with self._arrived:
+            if not self._tasks and not self._samples:
+                self._arrived.wait(within_s)
+            work = QueuedWork(self._tasks, list(self._samples))
+            self._tasks = []
+            self._samples.clear()
+        return work
+
 
 SAMPLES_MAX = 2000  # of a key that wait to be converted: about a tenth of a second of work
 
 
-class Publication:
-    """A topic of ours, and the tokens of who subscribes to it."""
+class BridgedTopic:
+    """A topic of the bridge, and the tokens of its subscribers."""
 
     def __init__(self, topic: Topic, publisher: Publisher) -> None:
         self.topic = topic
@@ -23,93 +74,93 @@ class Publication:
         self.readers: set[str] = set()
 
 
-class Feed(NamedTuple):
-    """A key that is read, for whom, and what ends it; `box` is emptied at each turn, without one it makes turns."""
+class SourceSubscription(NamedTuple):
+    """The subscription to a key, and its topics; without a mailbox each sample is queued as it comes."""
 
-    readers: list[Publication]
-    end: Callable[[], None]
-    box: Mailbox | None = None
+    readers: list[BridgedTopic]
+    close: Callable[[], None]
+    mailbox: Mailbox | None = None
 
 
-class Feeds:
-    """All that is read.
+class SourceSubscriptions:
+    """All subscriptions to the run's keys.
 
     Args:
         link: to the world.
-        inbox: where samples wait that have no box.
-        refuse: told (name, why) of what cannot be converted.
-        prompt: whether estimates and cluster states are passed on as they come, rather than with the next clock: a
+        queue: of samples without a mailbox.
+        refuse: called with (name, reason) of a message that cannot be converted.
+        prompt: whether estimates and cluster states are converted as they come, rather than with the next clock: a
             turn for each of them costs more than to convert it, and only in realtime is a gate a long time.
 
     Attributes:
-        dropped: how many samples were too many.
+        dropped: samples that were lost.
     """
 
-    def __init__(self, link: Session, inbox: Inbox, refuse: Callable[[str, str], None], prompt: bool) -> None:
+    def __init__(self, link: Session, queue: CallbackQueue, refuse: Callable[[str, str], None], prompt: bool) -> None:
         self._link = link
-        self._inbox = inbox
+        self._queue = queue
         self._refuse = refuse
         self._prompt = prompt
-        self._feeds: dict[str, Feed] = {}
+        self._by_key: dict[str, SourceSubscription] = {}
         self.dropped = 0
 
-    def start(self, publication: Publication) -> None:
-        """Read what a topic is made of."""
+    def add(self, publication: BridgedTopic) -> None:
+        """Subscribe to a topic's source keys."""
         for key in publication.topic.sources:
-            if key not in self._feeds:
-                self._feeds[key] = self._feed(key)
-            self._feeds[key].readers.append(publication)
+            if key not in self._by_key:
+                self._by_key[key] = self._open_source(key)
+            self._by_key[key].readers.append(publication)
 
-    def _feed(self, key: str) -> Feed:
-        """Read a key: what the world says of a drone is there when its clock comes, others say theirs at any time."""
+    def _open_source(self, key: str) -> SourceSubscription:
+        """Subscribe to a key: the world's messages are there when its clock comes, those of others come at any time."""
         if self._prompt and keys.leaf(key) in ("estimate", "state"):
-            return Feed([], self._link.hear(key, self._on_sample))
+            return SourceSubscription([], self._link.hear(key, self._on_sample))
         box = self._link.subscribe(key)
-        return Feed([], box.close, box)
+        return SourceSubscription([], box.close, box)
 
-    def _on_sample(self, heard: Heard) -> None:
-        if heard.payload:
-            self._inbox.sample(heard.key, heard.payload)
+    def _on_sample(self, sample: Heard) -> None:
+        if sample.payload:
+            self._queue.add_sample(sample.key, sample.payload)
 
-    def end(self, publication: Publication) -> None:
-        """Read no more what only this topic is made of."""
+    def remove(self, publication: BridgedTopic) -> None:
+        """Unsubscribe from keys that only this topic is made of."""
         for key in publication.topic.sources:
-            feed = self._feeds[key]
-            feed.readers.remove(publication)
-            if not feed.readers:
-                feed.end()
-                del self._feeds[key]
+            source = self._by_key[key]
+            source.readers.remove(publication)
+            if not source.readers:
+                source.close()
+                del self._by_key[key]
 
     def close(self) -> None:
-        """Read nothing any more."""
-        for feed in self._feeds.values():
-            feed.end()
+        """Close all subscriptions."""
+        for source in self._by_key.values():
+            source.close()
 
-    def pass_on(self, samples: Sequence[tuple[str, bytes]]) -> int:
-        """Publish what samples, and those in the boxes, mean in ROS, in order of time; return how many they were."""
-        boxes = [feed.box for feed in self._feeds.values() if feed.box]
-        taken = [*samples, *(sample for box in boxes for sample in self._newest(box))]
-        for key, message in sorted(self._decoded(taken), key=_when):
-            for publication in self._feeds[key].readers:
+    def convert_all(self, samples: Sequence[tuple[str, bytes]]) -> int:
+        """Convert and publish samples and those in the mailboxes, in order of time; return how many they were."""
+        boxes = [source.mailbox for source in self._by_key.values() if source.mailbox]
+        arrived = [*samples, *(sample for box in boxes for sample in self._newest(box))]
+        for key, message in sorted(self._decoded(arrived), key=_gate_order):
+            for publication in self._by_key[key].readers:
                 self._publish(publication, key, message)
-        return len(taken)
+        return len(arrived)
 
     def _newest(self, box: Mailbox) -> list[Sample]:
-        """Return what is in a box, the newest of it if that is too much."""
+        """Return the samples in a mailbox, the newest of them if there are too many."""
         samples = list(box.drain())
         self.dropped += max(0, len(samples) - SAMPLES_MAX)
         return samples[-SAMPLES_MAX:]
 
     def _decoded(self, samples: Iterable[tuple[str, bytes]]) -> Iterator[tuple[str, Any]]:
-        """Yield the messages in samples, of keys that are read still."""
+        """Yield the messages in samples, of keys that are still subscribed to."""
         for key, payload in samples:
-            if key in self._feeds:
+            if key in self._by_key:
                 try:
                     yield key, messages.decode(key, payload)
                 except DecodeError as error:
                     self._refuse(key, str(error))
 
-    def _publish(self, publication: Publication, key: str, message: Any) -> None:
+    def _publish(self, publication: BridgedTopic, key: str, message: Any) -> None:
         try:
             converted = publication.topic.convert(key, message)
             if converted is not None:
@@ -118,7 +169,7 @@ class Feeds:
             self._refuse(publication.topic.name, f"{key} does not fit it ({error})")
 
 
-def _when(told: tuple[str, Any]) -> tuple[int, bool]:
-    """Return what puts messages in the order in which the world tells them: status last of a gate."""
-    key, message = told
+def _gate_order(entry: tuple[str, Any]) -> tuple[int, bool]:
+    """Return the sorting key for the order in which the world publishes: status last of a gate."""
+    key, message = entry
     return message.t_ns, keys.is_status(key)

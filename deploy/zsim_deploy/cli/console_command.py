@@ -40,7 +40,7 @@ def console(
     check()
     from zsim.runtime.progress import Teller
     from zsim_bridges.console.console_server import Console
-    from zsim_bridges.console.http.http_proxy import Place
+    from zsim_bridges.console.http_proxy import ListenAddress
     from zsim_deploy.roles.priority import give_way
     from zsim_deploy.roles.roles import speaker
     from zsim_deploy.roles.service_loop import named, visit
@@ -48,7 +48,7 @@ def console(
     give_way(for_eyes=True)
     mine = named("console", name, reach.tls, "*")
     say = Teller().say if reach.launched else speaker(False)
-    shown = Console(Place(listen, port), mine.removesuffix(".*"), token, rate_hz, say)
+    shown = Console(ListenAddress(listen, port), mine.removesuffix(".*"), token, rate_hz, say)
     with shown.open():
         visit(mine, shown.serve, reach)
 

@@ -34,7 +34,7 @@ def gateway(
 ) -> None:
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
     from zsim.transport.connection import find_world
-    from zsim_bridges.gateway.gateway_server import Doors, Gateway
+    from zsim_bridges.gateway.gateway_server import Gateway, GatewayPorts
     from zsim_deploy.roles.priority import give_way
     from zsim_deploy.roles.roles import speaker
     from zsim_deploy.roles.service_loop import named, visit
@@ -46,7 +46,7 @@ def gateway(
     def dial(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
         return find_world(reach.endpoint, reach.federation, LOOK_S, identity=_of_seat(who, process))
 
-    doors = Doors(listen, http, lines)
+    doors = GatewayPorts(listen, http, lines)
     gate = Gateway(doors, mine, token, dial, speaker(reach.launched is not None), secured=reach.tls is not None)
     with gate.open():
         visit(mine, gate.serve, reach)

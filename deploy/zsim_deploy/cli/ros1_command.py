@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from zsim_bridges.ros1.wire.master_uri import DEFAULT_MASTER, reachable_as
+from zsim_bridges.ros1.master_api import DEFAULT_MASTER, own_address
 from zsim_deploy.options.reach import Reach, takes_part
 
 PANEL = "Others come in"
@@ -29,14 +29,14 @@ def ros1(
     name: Annotated[str, typer.Option(help="Process name (default ros1.main, or the certificate's).")] = "",
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
-    from zsim_bridges.ros1.bridge import DismissedError, serve
+    from zsim_bridges.ros1.bridge import NodeShutdownError, serve
     from zsim_deploy.roles.priority import give_way
     from zsim_deploy.roles.service_loop import named, visit
 
     give_way()
     mine = named("ros1", name, reach.tls)
-    bridge = partial(serve, master_uri=master, host=ros_host or reachable_as(master))
+    bridge = partial(serve, master_uri=master, host=ros_host or own_address(master))
     try:
         visit(mine, bridge, reach)
-    except DismissedError as error:
+    except NodeShutdownError as error:
         print(error)

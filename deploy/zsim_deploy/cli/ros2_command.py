@@ -34,7 +34,7 @@ def ros2(
         return
     from zsim.transport.identity import Identity
     from zsim.transport.tls import is_tls
-    from zsim_bridges.ros2.bridge import Door, serve
+    from zsim_bridges.ros2.bridge import RosNetwork, serve
     from zsim_deploy.roles.priority import give_way
     from zsim_deploy.roles.service_loop import named, visit
 
@@ -44,9 +44,9 @@ def ros2(
     give_way()
     who = reach.who
     to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
-    door = Door(domain, router, to_router)
+    network = RosNetwork(domain, router, to_router)
     mine = named("ros2", name, reach.tls)
-    visit(mine, partial(serve, door=door, wall_ns=time.time_ns), reach)
+    visit(mine, partial(serve, network=network, wall_ns=time.time_ns), reach)
 
 
 def _write_package(folder: Path) -> None:
@@ -56,7 +56,7 @@ def _write_package(folder: Path) -> None:
         RunError: the folder cannot be written.
     """
     from zsim.errors import RunError
-    from zsim_bridges.ros2.definitions import PACKAGE
+    from zsim_bridges.ros2.ros_types import PACKAGE
 
     try:
         for name, text in PACKAGE.items():

@@ -10,7 +10,7 @@ from zsim.contract.messages import Info
 from zsim.errors import NoWorldError, SupersededError
 from zsim.transport.connection import find_world
 from zsim.transport.session import Session
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.observer_process import ObserverProcess
 from zsim_deploy.options.reach import Reach
 from zsim_deploy.roles.roles import speaker
 from zsim_deploy.roles.stop_channel import Leash
@@ -21,7 +21,7 @@ PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits
 
 Stopped = Callable[[], bool]
 Say = Callable[[str], None]
-Serve = Callable[[Session, Info, Presence, Stopped, Say], None]
+Serve = Callable[[Session, Info, ObserverProcess, Stopped, Say], None]
 """Serves one run with (session, info, presence, stopped, say), until its presence is over or it is stopped."""
 
 
@@ -49,7 +49,7 @@ def visit(name: str, serve: Serve, reach: Reach) -> None:
             ):
                 if info.run_id != served:
                     mine = _free(link, mine)
-                    presence = Presence(link, info, mine)
+                    presence = ObserverProcess(link, info, mine)
                     _serve(serve, link, presence, info, leash, say)
                     served = info.run_id
                     if presence.superseded:
@@ -79,7 +79,7 @@ def _free(link: Session, name: str) -> str:
     return next(free for i in count(1) if keys.token(free := f"{role}.{i}") not in taken)
 
 
-def _next(name: str, presence: Presence) -> str:
+def _next(name: str, presence: ObserverProcess) -> str:
     """Return the name under which to come in again; two that were to choose a number may have chosen the same one.
 
     Raises:
@@ -87,14 +87,14 @@ def _next(name: str, presence: Presence) -> str:
     """
     role, _, thing = name.partition(".")
     if thing != ANY:
-        raise SupersededError(f"{name}: {presence.over}; this one ends")
+        raise SupersededError(f"{name}: {presence.end_reason}; this one ends")
     return f"{role}.{int(presence.name.rpartition('.')[2]) + 1}"
 
 
-def _serve(serve: Serve, link: Session, presence: Presence, info: Info, leash: Leash, say: Say) -> None:
-    presence.enter()
+def _serve(serve: Serve, link: Session, presence: ObserverProcess, info: Info, leash: Leash, say: Say) -> None:
+    presence.announce()
     say(f"{presence.name}: in run {info.run_id}")
     serve(link, info, presence, leash.pulled, say)
-    reason = presence.over or leash.reason() or "stopped"
+    reason = presence.end_reason or leash.reason() or "stopped"
     presence.leave(reason)
     say(f"{presence.name}: left, {reason}")

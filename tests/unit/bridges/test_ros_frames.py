@@ -10,12 +10,12 @@ from zsim_bridges import ros_frames
 
 
 def test_a_time_is_seconds_and_nanoseconds():
-    assert ros_frames.stamp(12_340_000_005) == (12, 340_000_005)
-    assert ros_frames.stamp(0) == (0, 0)
+    assert ros_frames.ros1_stamp(12_340_000_005) == (12, 340_000_005)
+    assert ros_frames.ros1_stamp(0) == (0, 0)
 
 
 def test_there_is_no_time_before_the_start():
-    assert ros_frames.stamp(-5_000_000) == (0, 0)
+    assert ros_frames.ros1_stamp(-5_000_000) == (0, 0)
 
 
 def test_rotations_agree_with_scipy():
@@ -26,7 +26,7 @@ def test_rotations_agree_with_scipy():
         yaw, pitch, roll = rotation.as_euler("ZYX")
         assert ros_frames.rpy(q) == pytest.approx((roll, pitch, yaw), abs=1e-9)
         assert ros_frames.rotated(q, tuple(v)) == pytest.approx(rotation.apply(v), abs=1e-12)
-        assert ros_frames.upright(q) == pytest.approx(rotation.as_matrix()[2, 2], abs=1e-12)
+        assert ros_frames.tilt_cosine(q) == pytest.approx(rotation.as_matrix()[2, 2], abs=1e-12)
         assert ros_frames.xyzw(q) == pytest.approx(rotation.as_quat(), abs=1e-15)
 
 
@@ -36,4 +36,4 @@ def test_a_nose_to_the_north_has_a_yaw_of_90_degrees():
 
 
 def test_names_have_letters_digits_and_underscores():
-    assert ros_frames.graph_name("drone-1.a") == "drone_1_a"
+    assert ros_frames.ros1_name("drone-1.a") == "drone_1_a"

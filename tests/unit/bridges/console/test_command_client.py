@@ -9,7 +9,14 @@ import pytest
 
 from zsim.contract.messages import ControlAnswer
 from zsim.errors import SessionError
-from zsim_bridges.console.command_client import HANDS, OVERTAKEN, PRIORITY, PRIORITY_EMERGENCY, Desk, Told
+from zsim_bridges.console.command_client import (
+    OVERTAKEN,
+    PRIORITY,
+    PRIORITY_EMERGENCY,
+    THREADS_PER_POOL,
+    CommandClient,
+    RequestOutcome,
+)
 
 PATIENCE_S = 10.0
 
@@ -51,10 +58,10 @@ class Link:
         self.said.append((key, message))
 
 
-class Eyes:
+class FakeViewBuffer:
     """Hears at once that a command was taken."""
 
-    def answered(self, drone: str) -> int:
+    def answered_commands(self, drone: str) -> int:
         return 0
 
     def await_answer(self, drone: str, beyond: int, within_s: float) -> None:
@@ -66,9 +73,9 @@ class Table:
 
     def __init__(self) -> None:
         self.link = Link()
-        self.told: SimpleQueue[Told] = SimpleQueue()
-        self.eyes = Eyes()
-        self.desk = Desk(self.link, "console.1", self.eyes, lambda: 7, self.told.put)  # type: ignore[arg-type]
+        self.told: SimpleQueue[RequestOutcome] = SimpleQueue()
+        self.eyes = FakeViewBuffer()
+        self.desk = CommandClient(self.link, "console.1", self.eyes, lambda: 7, self.told.put)  # type: ignore[arg-type]
 
 
 @pytest.fixture
@@ -79,40 +86,40 @@ def table() -> Iterator[Table]:
 
 
 def test_a_request_goes_out_in_the_console_s_name(table: Table):
-    table.desk.cluster("main", "target", values={"p": 4.0}, over_s=5.0)
-    assert table.told.get(timeout=PATIENCE_S) == Told("main: target values p=4, over_s 5", "")
+    table.desk.request_cluster("main", "target", values={"p": 4.0}, over_s=5.0)
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("main: target values p=4, over_s 5", "")
     args = {"values": {"p": 4.0}, "over_s": 5.0}
     assert table.link.said == [("cluster/main/control", "target", "console.1", args)]
 
 
 def test_a_refusal_is_told_with_its_reason(table: Table):
     table.link.refusals["pause"] = "the run is paused; pause needs a running one"
-    table.desk.world("pause")
-    assert table.told.get(timeout=PATIENCE_S) == Told("pause", "the run is paused; pause needs a running one")
+    table.desk.request_world("pause")
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("pause", "the run is paused; pause needs a running one")
 
 
 def test_a_session_that_fails_is_a_refusal(table: Table):
-    table.desk.world("broken")
+    table.desk.request_world("broken")
     assert table.told.get(timeout=PATIENCE_S).refusal == "the session is closed"
 
 
 def test_whatever_goes_wrong_is_told(table: Table):
-    table.desk.world("wrong")
+    table.desk.request_world("wrong")
     assert table.told.get(timeout=PATIENCE_S).refusal == "ValueError: no such thing"
 
 
 def test_a_page_that_outlives_its_run_is_told_so(table: Table):
     table.desk.close()
-    table.desk.world("pause")
-    table.desk.mode(["drone1"], "land")
-    assert table.told.get(timeout=PATIENCE_S) == Told("pause", "the run has ended")
-    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: land", "the run has ended")
+    table.desk.request_world("pause")
+    table.desk.send_mode(["drone1"], "land")
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("pause", "the run has ended")
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: land", "the run has ended")
     assert table.link.said == []
 
 
 def test_a_drone_is_taken_told_and_given_back(table: Table):
-    table.desk.mode(["drone1"], "land")
-    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: land", "")
+    table.desk.send_mode(["drone1"], "land")
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: land", "")
     assert table.link.given_back.wait(PATIENCE_S)
     acquire, (key, mode), release = table.link.said
     assert acquire == ("world/control", "acquire", "console.1", {"drone": "drone1", "priority": PRIORITY})
@@ -122,30 +129,30 @@ def test_a_drone_is_taken_told_and_given_back(table: Table):
 
 def test_a_drone_that_another_operator_has_is_not_commanded(table: Table):
     table.link.refusals["acquire"] = "drone1 is flown by 'console.2' with priority 10"
-    table.desk.mode(["drone1"], "takeoff")
+    table.desk.send_mode(["drone1"], "takeoff")
     assert table.told.get(timeout=PATIENCE_S).refusal == "drone1 is flown by 'console.2' with priority 10"
     assert [said[1] for said in table.link.said] == ["acquire"]
 
 
 def test_an_emergency_reaches_every_drone(table: Table):
     names = [f"drone{i}" for i in range(30)]
-    table.desk.mode(names, "emergency")
+    table.desk.send_mode(names, "emergency")
     told = {table.told.get(timeout=PATIENCE_S) for _ in names}
-    assert told == {Told(f"{name}: emergency", "") for name in names}
+    assert told == {RequestOutcome(f"{name}: emergency", "") for name in names}
     modes = [said for said in table.link.said if len(said) == 2]
     assert {key for key, _ in modes} == {f"drone/{name}/cmd/mode" for name in names}
 
 
 def test_an_emergency_comes_before_whoever_flies(table: Table):
-    table.desk.mode(["drone1"], "emergency")
-    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: emergency", "")
+    table.desk.send_mode(["drone1"], "emergency")
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: emergency", "")
     args = {"drone": "drone1", "priority": PRIORITY_EMERGENCY}
     assert table.link.said[0] == ("world/control", "acquire", "console.1", args)
 
 
 def test_an_emergency_is_sent_even_where_the_drone_is_refused(table: Table):
     table.link.refusals["acquire"] = "drone1 is flown by 'console.2' with priority 100"
-    table.desk.mode(["drone1"], "emergency")
+    table.desk.send_mode(["drone1"], "emergency")
     told = table.told.get(timeout=PATIENCE_S)
     assert told.refusal == "drone1 is flown by 'console.2' with priority 100; emergency was sent all the same"
     (mode,) = [said[1] for said in table.link.said if len(said) == 2]
@@ -153,10 +160,10 @@ def test_an_emergency_is_sent_even_where_the_drone_is_refused(table: Table):
 
 
 def test_an_emergency_does_not_wait_for_those_who_do_not_answer(table: Table):
-    for _ in range(3 * HANDS):
-        table.desk.cluster("main", "hangs")
-    table.desk.mode(["drone1"], "emergency")
-    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: emergency", "")
+    for _ in range(3 * THREADS_PER_POOL):
+        table.desk.request_cluster("main", "hangs")
+    table.desk.send_mode(["drone1"], "emergency")
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: emergency", "")
     assert not table.link.answers.is_set()
     table.link.answers.set()
 
@@ -164,24 +171,24 @@ def test_an_emergency_does_not_wait_for_those_who_do_not_answer(table: Table):
 def test_what_is_given_back_keeps_no_emergency_waiting(table: Table):
     heard = threading.Event()
     table.eyes.await_answer = lambda *_: heard.wait(PATIENCE_S)  # type: ignore[method-assign, assignment]
-    names = [f"drone{i}" for i in range(3 * HANDS)]
-    table.desk.mode(names, "land")
-    assert {table.told.get(timeout=PATIENCE_S).what for _ in names} == {f"{name}: land" for name in names}
-    table.desk.mode(names, "emergency")
-    assert {table.told.get(timeout=PATIENCE_S).what for _ in names} == {f"{name}: emergency" for name in names}
+    names = [f"drone{i}" for i in range(3 * THREADS_PER_POOL)]
+    table.desk.send_mode(names, "land")
+    assert {table.told.get(timeout=PATIENCE_S).request for _ in names} == {f"{name}: land" for name in names}
+    table.desk.send_mode(names, "emergency")
+    assert {table.told.get(timeout=PATIENCE_S).request for _ in names} == {f"{name}: emergency" for name in names}
     heard.set()
 
 
 def test_modes_of_one_drone_go_out_in_the_order_of_the_clicks(table: Table):
     table.link.held[PRIORITY] = threading.Event()
     for mode in ("reset", "takeoff", "land"):
-        table.desk.mode(["drone1"], mode)
+        table.desk.send_mode(["drone1"], mode)
     assert table.link.acquiring.get(timeout=PATIENCE_S) == PRIORITY
-    table.desk.mode(["drone2"], "land")
+    table.desk.send_mode(["drone2"], "land")
     table.link.acquiring.get(timeout=PATIENCE_S)
     assert [said[3]["drone"] for said in table.link.said] == ["drone1", "drone2"]
     table.link.held[PRIORITY].set()
-    told = [table.told.get(timeout=PATIENCE_S).what for _ in range(4)]
+    told = [table.told.get(timeout=PATIENCE_S).request for _ in range(4)]
     assert [what for what in told if "drone1" in what] == ["drone1: reset", "drone1: takeoff", "drone1: land"]
     sent = [said[1].mode for said in table.link.said if said[0] == "drone/drone1/cmd/mode"]
     assert sent == ["reset", "takeoff", "land"]
@@ -189,34 +196,34 @@ def test_modes_of_one_drone_go_out_in_the_order_of_the_clicks(table: Table):
 
 def test_nothing_that_was_asked_for_before_an_emergency_is_sent_after_it(table: Table):
     table.link.held[PRIORITY] = threading.Event()
-    table.desk.mode(["drone1"], "takeoff")
+    table.desk.send_mode(["drone1"], "takeoff")
     assert table.link.acquiring.get(timeout=PATIENCE_S) == PRIORITY
-    table.desk.mode(["drone1"], "land")
-    table.desk.mode(["drone1"], "emergency")
-    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: emergency", "")
+    table.desk.send_mode(["drone1"], "land")
+    table.desk.send_mode(["drone1"], "emergency")
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: emergency", "")
     table.link.held[PRIORITY].set()
-    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: takeoff", OVERTAKEN)
-    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: land", OVERTAKEN)
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: takeoff", OVERTAKEN)
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: land", OVERTAKEN)
     assert table.link.modes == ["emergency"]
 
 
 def test_the_end_of_an_emergency_comes_after_it(table: Table):
     table.link.held[PRIORITY_EMERGENCY] = threading.Event()
-    table.desk.mode(["drone1"], "emergency")
+    table.desk.send_mode(["drone1"], "emergency")
     assert table.link.acquiring.get(timeout=PATIENCE_S) == PRIORITY_EMERGENCY
-    table.desk.mode(["drone1"], "reset")
-    table.desk.mode(["drone2"], "land")
-    assert table.told.get(timeout=PATIENCE_S) == Told("drone2: land", "")
+    table.desk.send_mode(["drone1"], "reset")
+    table.desk.send_mode(["drone2"], "land")
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone2: land", "")
     table.link.held[PRIORITY_EMERGENCY].set()
-    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: emergency", "")
-    assert table.told.get(timeout=PATIENCE_S) == Told("drone1: reset", "")
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: emergency", "")
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: reset", "")
     assert table.link.modes == ["land", "emergency", "reset"]
 
 
 def test_who_presses_emergency_again_and_again_does_not_keep_it_from_being_sent(table: Table):
     table.link.held[PRIORITY_EMERGENCY] = threading.Event()
     for _ in range(3):
-        table.desk.mode(["drone1"], "emergency")
+        table.desk.send_mode(["drone1"], "emergency")
     table.link.held[PRIORITY_EMERGENCY].set()
-    assert {table.told.get(timeout=PATIENCE_S) for _ in range(3)} == {Told("drone1: emergency", "")}
+    assert {table.told.get(timeout=PATIENCE_S) for _ in range(3)} == {RequestOutcome("drone1: emergency", "")}
     assert table.link.modes == ["emergency"] * 3

@@ -12,13 +12,13 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import ControlAnswer, DroneView, EstimateView, Event, ViewCluster, ViewDrones, ViewEstimates
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_bridges.console.command_client import Told
-from zsim_bridges.console.http.private_viser import PrivateViser
-from zsim_bridges.console.run_page import Show, pictures_hz
-from zsim_bridges.console.scene import scene_nodes as stages
-from zsim_bridges.console.scene.camera_follow import Followers
-from zsim_bridges.console.scene.picture import drones_of
-from zsim_bridges.console.time_monitor import Watch
+from zsim_bridges.console.command_client import RequestOutcome
+from zsim_bridges.console.console_server import PrivateViser
+from zsim_bridges.console.page import scene_nodes as stages
+from zsim_bridges.console.page.picture import drone_poses
+from zsim_bridges.console.page.scene_nodes import CameraFollow
+from zsim_bridges.console.run_page import RunPage, picture_rate_hz
+from zsim_bridges.console.time_monitor import TimeMonitor
 
 STEP = Path(__file__).parents[4] / "scenarios" / "step.yaml"
 SCENARIO = scenario_file.load(STEP)
@@ -70,14 +70,14 @@ class Seen:
     def __init__(self, server: Any, watched: bool) -> None:
         self.link: Any = Link()
         health = SimpleNamespace(received=0, refused=0)
-        self.presence: Any = SimpleNamespace(
-            name="console.1", now_ns=0, over="", health=health, heed=lambda _: None, tick=lambda: None
+        self.observer: Any = SimpleNamespace(
+            name="console.1", now_ns=0, end_reason="", health=health, update_clock=lambda _: None, tick=lambda: None
         )
         drones = [SimpleNamespace(name=name) for name in NAMES]
         scenario = STEP.read_text()
         info: Any = SimpleNamespace(run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario)
         server.get_clients = lambda: {0: None} if watched else {}
-        self.show = Show(server, self.link, info, self.presence, Followers(server), 1000.0)
+        self.show = RunPage(server, self.link, info, self.observer, CameraFollow(server), 1000.0)
 
     def draw(self, *said: tuple[str, Any]) -> dict[str, Any]:
         """Say something, draw a picture, and return what is shown."""
@@ -121,7 +121,7 @@ def cluster(name: str = CLUSTER, names: tuple[str, ...] = SPACE.names) -> tuple[
 
 @pytest.mark.parametrize(("drones", "rate", "hz"), [(3, 1.0, 20.0), (50, 1.0, 10.0), (3, 25.0, 10.0), (3, 0.0, 20.0)])
 def test_pictures_are_as_many_as_an_eye_can_follow(drones: int, rate: float, hz: float):
-    assert pictures_hz(drones, rate) == hz
+    assert picture_rate_hz(drones, rate) == hz
 
 
 def test_a_whole_formation_is_shown(seen: Seen):
@@ -152,8 +152,8 @@ def test_a_run_that_nobody_watched_leaves_its_last_picture(viser: PrivateViser):
 
 
 def test_a_drone_that_is_missing_is_hidden_and_the_others_keep_their_places(viser: PrivateViser):
-    stage = stages.Stage(viser.server, NAMES, 3, 1)
-    found = drones_of(drones(NAMES[2])[1], NAMES)
+    stage = stages.SceneNodes(viser.server, NAMES, 3, 1)
+    found = drone_poses(drones(NAMES[2])[1], NAMES)
     stage.drones(found, 0.05)
     stage.wind(found)
     p_W = np.asarray(stage._airframes.batched_positions)
@@ -161,7 +161,7 @@ def test_a_drone_that_is_missing_is_hidden_and_the_others_keep_their_places(vise
     assert p_W[0].tolist() == p_W[1].tolist() == list(stages.HIDDEN)
     assert np.isfinite(stage._rotors.batched_positions).all()
     assert stage._wind.visible
-    stage.wind(drones_of(drones()[1], NAMES))
+    stage.wind(drone_poses(drones()[1], NAMES))
     assert not stage._wind.visible
 
 
@@ -169,7 +169,7 @@ def test_views_of_another_controller_are_left_out(seen: Seen):
     fewer = SPACE.names[:-1]
     state = seen.draw(drones(*NAMES), cluster(names=fewer), cluster("strange"))
     assert state["clusters"] == []
-    assert seen.presence.health.refused == 2
+    assert seen.observer.health.refused == 2
     assert [each["name"] for each in seen.draw(cluster())["clusters"]] == [CLUSTER]
 
 
@@ -182,7 +182,7 @@ def test_estimates_of_strangers_are_left_out(seen: Seen):
 
 
 def test_trails_go_when_a_replay_goes_back(viser: PrivateViser):
-    stage = stages.Stage(viser.server, NAMES, 3, 1)
+    stage = stages.SceneNodes(viser.server, NAMES, 3, 1)
     stage.trails(np.ones((2, 2, 3)), np.array([0, 1]))
     stage.trails(np.zeros((0, 2, 3)), np.zeros(0, dtype=np.int64))
     assert (np.asarray(stage._trail_node.points)[..., 2] < -100.0).all()
@@ -213,11 +213,11 @@ def test_what_the_world_refuses_of_the_console_s_commands_is_shown_in_the_corner
         event = Event(0, 0, "refused", source, subject, f"{subject}: {reason}", {"reason": reason})
         seen.link.tell(SimpleNamespace(key=keys.EVENT, payload=messages.encode(event)))
     assert shown == [(f"Refused: {subject}", reason)]
-    assert [event.kind for event in seen.show.eyes.events] == ["refused", "refused"]
+    assert [event.kind for event in seen.show.views.events] == ["refused", "refused"]
 
 
 def test_a_world_that_is_gone_is_told_on_the_page(seen: Seen, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(Watch, "silent_s", 12.0)
+    monkeypatch.setattr(TimeMonitor, "silent_s", 12.0)
     state = seen.draw(drones(*NAMES))
     assert (state["clock"], state["silent_s"]) == ("silent", 12.0)
     assert "no answer from the world for 12 s" in seen.show._page.clock.content
@@ -227,7 +227,7 @@ def test_obstacles_stand_where_the_scenario_says(viser: PrivateViser):
     obstacles = scenario_file.from_text(OBSTACLES).environment.obstacles
     added: dict[str, Any] = {}
     scene: Any = viser.server.scene
-    stage = stages.Stage(viser.server, NAMES, 3, 1)
+    stage = stages.SceneNodes(viser.server, NAMES, 3, 1)
     for shape in ("box", "cylinder", "icosphere"):
         setattr(scene, f"add_{shape}", lambda name, **look: added.update({name: look["position"]}))
     try:
@@ -282,19 +282,19 @@ def cameras(calls: dict[str, Any], there: set[int]) -> Any:
 
 def test_a_page_that_went_before_it_was_known_is_forgotten():
     calls: dict[str, Any] = {}
-    followers = Followers(cameras(calls, set()))
+    followers = CameraFollow(cameras(calls, set()))
     gone = Page(1)
     calls["go"](gone)
     calls["come"](gone)
     assert followers.switches == set()
     gone.switch.value = True
     followers.follow(np.array([(10.0, 0.0, 2.0)]))
-    assert followers._places == {}
+    assert followers._targets == {}
 
 
 def test_cameras_follow_where_their_page_says_so():
     calls: dict[str, Any] = {}
-    followers = Followers(cameras(calls, {1, 2}))
+    followers = CameraFollow(cameras(calls, {1, 2}))
     one, other = Page(1), Page(2)
     calls["come"](one)
     calls["come"](other)
@@ -305,17 +305,21 @@ def test_cameras_follow_where_their_page_says_so():
     followers.follow(np.zeros((0, 3)))
     assert one.camera.look_at.tolist() == [11.0, 0.0, 2.0]
     assert other.camera.look_at.tolist() == [1.0, 0.0, 2.0]
-    followers.begin()  # another run
+    followers.restart()  # another run
     followers.follow(np.array([(30.0, 0.0, 2.0)]))
     assert other.camera.look_at.tolist() == [30.0, 0.0, 2.0]
     calls["go"](one)
     assert followers.switches == {"u2"}
-    assert followers._places == {}
+    assert followers._targets == {}
 
 
 def test_what_formations_were_asked_for_is_among_the_events_and_refusals_on_every_page(seen: Seen):
     seen.show._server.get_clients = dict  # type: ignore[assignment]  # nobody looks
-    for told in (Told("main: takeoff", ""), Told("rate value 2", ""), Told("main: engage", "not yet")):
-        seen.show._tell(told)
-    found = [(event.kind, event.text) for event in seen.show.eyes.events]
+    for told in (
+        RequestOutcome("main: takeoff", ""),
+        RequestOutcome("rate value 2", ""),
+        RequestOutcome("main: engage", "not yet"),
+    ):
+        seen.show._on_outcome(told)
+    found = [(event.kind, event.text) for event in seen.show.views.events]
     assert found == [("refused", "main: engage: not yet"), ("control", "main: takeoff: done")]

@@ -19,11 +19,10 @@ from zsim.contract.messages import (
     ViewEstimates,
 )
 from zsim_bridges.console import html_tables
-from zsim_bridges.console.http.console_state import state
-from zsim_bridges.console.table_rows import Words, sigma_m
-from zsim_bridges.console.time_monitor import SILENT_S, Watch
-from zsim_bridges.console.view_buffer import Eyes
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.console.table_rows import TableRows, console_state, sigma_m
+from zsim_bridges.console.time_monitor import SILENT_S, TimeMonitor
+from zsim_bridges.console.view_buffer import ViewBuffer
+from zsim_bridges.observer_process import ObserverProcess
 
 S = 1_000_000_000  # ns
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -68,16 +67,16 @@ class Ears:
         self.refused: list[Event] = []
         names = ("drone1", "drone2")
         info: Any = SimpleNamespace(run_id="r1", drones=[SimpleNamespace(name=name) for name in names])
-        self.presence = Presence(self.link, info, "console.1")
-        self.watch = Watch(self.link, self.presence, stamp_age_s, lambda: self.wall_s)
-        self.eyes = Eyes(self.link, info, self.presence, {}, self.refused.append, lambda: self.wall_s)
-        self.words = Words(self.eyes)
-        self.eyes.open()
+        self.observer = ObserverProcess(self.link, info, "console.1")
+        self.watch = TimeMonitor(self.link, self.observer, stamp_age_s, lambda: self.wall_s)
+        self.views = ViewBuffer(self.link, info, self.observer, {}, self.refused.append, lambda: self.wall_s)
+        self.words = TableRows(self.views)
+        self.views.open()
 
     def hear(self, *said: tuple[str, Any]) -> None:
         for key, message in said:
             self.link.say(sample(key, message))
-        self.eyes.look()
+        self.views.update()
 
 
 def sample(key: str, message: Any) -> Any:
@@ -127,7 +126,7 @@ def test_where_no_stamp_is_too_old_nobody_is_asked():
 def test_a_stamp_is_given_also_where_the_world_answers_nothing():
     ears = Ears()
     ears.link.now = clock(1 * S)
-    ears.watch.ask()
+    ears.watch.poll()
     ears.link.now = None
     ears.wall_s += 60.0
     assert ears.watch.now_ns() == 1 * S
@@ -137,13 +136,13 @@ def test_a_stamp_is_given_also_where_the_world_answers_nothing():
 def test_a_foreign_answer_is_no_clock(garbage: bytes):
     ears = Ears()
     ears.link.now = garbage
-    ears.watch.ask()
+    ears.watch.poll()
     assert ears.watch.clock is None
-    assert ears.presence.health.refused == 1
+    assert ears.observer.health.refused == 1
     ears.link.now = clock(3 * S)
-    ears.watch.ask()
+    ears.watch.poll()
     ears.link.now = garbage
-    ears.watch.ask()
+    ears.watch.poll()
     assert ears.watch.clock == clock(3 * S)
 
 
@@ -151,32 +150,32 @@ def test_the_end_of_a_run_is_heard():
     for now, over in ((clock(0, run_id="r2"), "another run"), (clock(0, state="stopped"), "the run ended")):
         ears = Ears()
         ears.link.now = now
-        ears.watch.ask()
-        assert over in ears.presence.over
+        ears.watch.poll()
+        assert over in ears.observer.end_reason
 
 
 def test_silence_of_the_world_is_told_and_for_how_long():
     ears = Ears()
-    with ears.watch.asking():
+    with ears.watch.polling():
         ears.wall_s += SILENT_S - 0.1
         assert ears.watch.silent_s == 0.0
         ears.wall_s += 10.0
         assert ears.watch.silent_s == pytest.approx(SILENT_S + 9.9)
         ears.link.now = clock(1 * S)
-        ears.watch.ask()
+        ears.watch.poll()
         assert ears.watch.silent_s == 0.0
         ears.link.now = None
-        ears.watch.ask()
+        ears.watch.poll()
         ears.wall_s += 5.0
-        told = state("r1", ears.eyes, ears.watch, {})
+        told = console_state("r1", ears.views, ears.watch, {})
         assert told["clock"] == "silent"
         assert told["silent_s"] >= 5.0
     assert ears.watch.silent_s == 0.0  # nobody is asked any more
-    assert state("r1", ears.eyes, ears.watch, {})["clock"] == "running"
+    assert console_state("r1", ears.views, ears.watch, {})["clock"] == "running"
 
 
 def test_a_silent_world_is_not_called_running():
-    told = html_tables.clock(clock(7 * S), 7 * S, 12.3)
+    told = html_tables.clock_line(clock(7 * S), 7 * S, 12.3)
     assert "no answer from the world for 12 s" in told
     assert html_tables.RED in told
     assert "running" not in told
@@ -189,18 +188,18 @@ def test_a_dead_estimator_is_not_shown_as_a_healthy_one():
     ears = Ears()
     for second in range(3):
         ears.hear(drones(second * S), estimate(second * S, used=5 * second), health())
-        ears.words.sensors("drone1")
+        ears.words.sensor_table("drone1")
         ears.wall_s += 1.0
-    assert "5 Hz" in ears.words.sensors("drone1")
-    assert ears.words.rows()[0].lag_ms == 0.0
+    assert "5 Hz" in ears.words.sensor_table("drone1")
+    assert ears.words.drone_rows()[0].lag_ms == 0.0
     ears.wall_s += 8.0
     ears.hear(drones(10 * S))
-    assert ears.words.rows()[0].lag_ms == 8000.0
-    told = ears.words.sensors("drone1")
+    assert ears.words.drone_rows()[0].lag_ms == 8000.0
+    told = ears.words.sensor_table("drone1")
     assert "no estimate since 2.0 s" in told
     assert "Hz" not in told
-    assert not ears.eyes.beliefs()["drone1"].fresh
-    assert state("r1", ears.eyes, ears.watch, {})["drones"][0]["sigma_m"] is None
+    assert not ears.views.estimates()["drone1"].fresh
+    assert console_state("r1", ears.views, ears.watch, {})["drones"][0]["sigma_m"] is None
 
 
 def test_in_a_fast_run_a_view_may_be_seconds_older_than_another():
@@ -208,8 +207,8 @@ def test_in_a_fast_run_a_view_may_be_seconds_older_than_another():
     ears.hear(estimate(1 * S), health())
     ears.wall_s += 0.05
     ears.hear(drones(9 * S))
-    assert ears.eyes.beliefs()["drone1"].fresh
-    assert ears.words.rows()[0].lag_ms == 0.0
+    assert ears.views.estimates()["drone1"].fresh
+    assert ears.words.drone_rows()[0].lag_ms == 0.0
 
 
 def test_in_a_slow_run_a_view_may_be_seconds_old():
@@ -217,7 +216,7 @@ def test_in_a_slow_run_a_view_may_be_seconds_old():
     ears.hear(estimate(1 * S))
     ears.wall_s += 9.0
     ears.hear(drones(1 * S + S // 2))
-    assert ears.eyes.beliefs()["drone1"].fresh
+    assert ears.views.estimates()["drone1"].fresh
 
 
 def test_what_was_believed_before_a_replay_went_back_is_left_out():
@@ -225,7 +224,7 @@ def test_what_was_believed_before_a_replay_went_back_is_left_out():
     ears.hear(drones(60 * S), estimate(60 * S))
     ears.wall_s += 5.0
     ears.hear(drones(10 * S))
-    assert ears.eyes.beliefs() == {}
+    assert ears.views.estimates() == {}
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
@@ -233,10 +232,10 @@ def test_of_two_estimators_of_one_drone_the_later_is_shown(order: tuple[int, int
     ears = Ears()
     said = (estimate(1 * S, "estimator.old", used=1), estimate(2 * S, "estimator.new", used=2))
     ears.hear(drones(2 * S), *(said[i] for i in order), health("estimator.new", 3_000_000), health("estimator.old"))
-    assert ears.eyes.beliefs()["drone1"].process == "estimator.new"
-    assert ears.words.rows()[0].gps == "2 / 0"
-    assert ears.words.rows()[0].lag_ms == 3.0
-    assert "<td align=left>2</td>" in ears.words.sensors("drone1")
+    assert ears.views.estimates()["drone1"].process == "estimator.new"
+    assert ears.words.drone_rows()[0].gps == "2 / 0"
+    assert ears.words.drone_rows()[0].lag_ms == 3.0
+    assert "<td align=left>2</td>" in ears.words.sensor_table("drone1")
 
 
 def test_a_covariance_that_is_none_has_no_sigma():
@@ -252,9 +251,9 @@ def test_faults_are_shown_on_a_drone_while_they_act():
     ended = Fault(3, "motor", "drone1", {}, 0, 10 * S)
     ears = Ears()
     ears.hear(drones(10 * S), (keys.FAULTS, Faults(0, 0, (planned, acting, ended))))
-    assert ears.words.rows()[0].faults == ("gps_dropout",)
-    assert ears.words.rows()[1].faults == ()
-    told = state("r1", ears.eyes, ears.watch, {})["faults"]
+    assert ears.words.drone_rows()[0].faults == ("gps_dropout",)
+    assert ears.words.drone_rows()[1].faults == ()
+    told = console_state("r1", ears.views, ears.watch, {})["faults"]
     assert [(fault["from_s"], fault["until_s"]) for fault in told] == [(20.0, None), (5.0, 15.0), (0.0, 10.0)]
 
 
@@ -262,9 +261,9 @@ def test_faults_that_were_heard_are_not_replaced_by_an_older_answer():
     ears = Ears()
     newer = Fault(2, "gps_dropout", "drone1", {}, 0)
     ears.link.last, ears.link.meanwhile = Faults(0, 0, ()), Faults(0, 1, (newer,))
-    ears.eyes.open()
-    ears.eyes.look()
-    assert ears.eyes.faults == (newer,)
+    ears.views.open()
+    ears.views.update()
+    assert ears.views.faults == (newer,)
 
 
 def test_the_console_hears_what_is_refused_of_its_own():
@@ -273,4 +272,4 @@ def test_the_console_hears_what_is_refused_of_its_own():
         event = Event(0, 0, kind, source, "drone/drone1/cmd/mode", "no")
         ears.link.tell(sample(keys.EVENT, event))
     assert [(event.kind, event.source) for event in ears.refused] == [("refused", "console.1")]
-    assert ears.eyes.answered("drone1") == 2
+    assert ears.views.answered_commands("drone1") == 2

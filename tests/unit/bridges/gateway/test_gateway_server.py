@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 from typing import Any
 
-from zsim_bridges.gateway.gateway_server import Doors, Gateway
+from zsim_bridges.gateway.gateway_server import Gateway, GatewayPorts
 
 
 class Ear:
@@ -12,21 +12,21 @@ class Ear:
     def __init__(self) -> None:
         self.told: list[tuple[str, str]] = []
 
-    def tell_of_run(self, state: str, run_id: str) -> None:
+    def notify_run(self, state: str, run_id: str) -> None:
         self.told.append((state, run_id))
 
 
 def test_a_world_that_goes_after_the_end_of_its_run_is_not_lost() -> None:
     ear, flight = Ear(), a_flight("first")
-    gateway = Gateway(Doors("127.0.0.1", 0, 0), "gateway.main", None, dial=never, say=print)
+    gateway = Gateway(GatewayPorts("127.0.0.1", 0, 0), "gateway.main", None, dial=never, say=print)
     gateway._clients.add(ear)  # type: ignore[arg-type]
     gateway._begin(flight)
     for state in ("lost", "back"):
-        gateway._tell_of_link(state, flight)
+        gateway._notify_link(state, flight)
     gateway._end(flight)
-    gateway._tell_of_link("lost", flight)
+    gateway._notify_link("lost", flight)
     gateway._begin(a_flight("second"))
-    gateway._tell_of_link("lost", flight)
+    gateway._notify_link("lost", flight)
     gateway.loop.close()
     assert ear.told == [
         ("begun", "first"),
@@ -38,7 +38,7 @@ def test_a_world_that_goes_after_the_end_of_its_run_is_not_lost() -> None:
 
 
 def a_flight(run_id: str) -> Any:
-    return SimpleNamespace(link=None, whole=None, info=SimpleNamespace(run_id=run_id))
+    return SimpleNamespace(link=None, bare_link=None, info=SimpleNamespace(run_id=run_id))
 
 
 def never(_: str) -> Any:

@@ -12,16 +12,15 @@ from zsim.contract.messages import ClusterInfo, ControlAnswer, DroneInfo, Info, 
 from zsim.scenario import scenario_file
 from zsim.transport.session import Heard, Sample
 from zsim.transport.zenoh_settings import Mode
-from zsim_bridges.observer_process import Presence
+from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import rmw_zenoh
 from zsim_bridges.ros2.bridge import Bridge
-from zsim_bridges.ros2.callback_queue import Inbox
-from zsim_bridges.ros2.participant import Participant
 from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId
-from zsim_bridges.ros2.ros_types import Types
-from zsim_bridges.ros2.source_keys import SAMPLES_MAX
+from zsim_bridges.ros2.ros_context import RosContext
+from zsim_bridges.ros2.ros_types import RosTypes
+from zsim_bridges.ros2.source_keys import SAMPLES_MAX, CallbackQueue
 
-TYPES = Types()
+TYPES = RosTypes()
 READER = NodeId(0, "abc", 1, "/", "reader")
 WALL_NS = 1_700_000_000_000_000_000
 BESIDE = Attachment(7, 1, bytes(range(16))).packed()
@@ -133,12 +132,12 @@ class Bench:
         )  # fmt: skip
         self.link: Any = Link()
         self.lines: list[str] = []
-        self.presence = Presence(self.link, self.info, "ros2.main")
-        self.bridge = Bridge(self.link, self.info, self.presence, self.lines.append, wall_ns)
-        self.bridge.enter(Participant(self.link, 0, TYPES, wall_ns, self.bridge.refuse))
+        self.observer = ObserverProcess(self.link, self.info, "ros2.main")
+        self.bridge = Bridge(self.link, self.info, self.observer, self.lines.append, wall_ns)
+        self.bridge.advertise_run(RosContext(self.link, 0, TYPES, wall_ns, self.bridge.count_refused))
 
     def turn(self) -> None:
-        self.bridge.turn(0.0)
+        self.bridge.process(0.0)
 
     def reader(self, topic: str, kind: str, alive: bool = True) -> None:
         """Let a subscription come or go."""
@@ -167,8 +166,8 @@ def wall_ns() -> int:
 
 
 def twist(*numbers: float) -> Any:
-    vector = TYPES.of("geometry_msgs/msg/Vector3")
-    return TYPES.of(TWIST)(vector(*numbers[:3]), vector(*numbers[3:]))
+    vector = TYPES.message_class("geometry_msgs/msg/Vector3")
+    return TYPES.message_class(TWIST)(vector(*numbers[:3]), vector(*numbers[3:]))
 
 
 def imu(t_ns: int) -> bytes:
@@ -236,7 +235,7 @@ def test_a_twist_becomes_a_velocity_in_the_heading_frame_at_the_newest_gate() ->
 
 
 def test_modes_and_the_emergency_button() -> None:
-    bench, empty = Bench(), TYPES.of(EMPTY)()
+    bench, empty = Bench(), TYPES.message_class(EMPTY)()
     status = keys.status("drone-1")
     bench.publish("/drone_1/takeoff", EMPTY, empty)
     bench.publish("/drone_1/land", EMPTY, empty)
@@ -250,7 +249,7 @@ def test_modes_and_the_emergency_button() -> None:
         ("emergency", 2),
         ("reset", 3),
     ]
-    assert bench.presence.health.refused == 1
+    assert bench.observer.health.refused == 1
 
 
 @pytest.mark.parametrize(
@@ -268,7 +267,7 @@ def test_garbage_is_refused_counted_and_told_once(message: Any, attachment: byte
     for _ in range(3):
         bench.publish("/drone_1/cmd_vel", TWIST, message, attachment)
     assert bench.link.said == []
-    assert bench.presence.health.refused == 3
+    assert bench.observer.health.refused == 3
     told = [line for line in bench.lines if "refused" in line]
     assert len(told) == 1
     assert why in told[0]
@@ -282,7 +281,7 @@ def test_what_does_not_fit_a_ros_type_is_refused() -> None:
     bench.link.deliver(key, b"garbage")
     bench.turn()
     assert bench.link.sent == []
-    assert bench.presence.health.refused == 2
+    assert bench.observer.health.refused == 2
 
 
 def test_a_service_asks_the_controller_and_echoes_who_asked() -> None:
@@ -302,7 +301,7 @@ def test_a_request_that_is_none_ends_without_a_reply() -> None:
         assert query.ended
         assert query.replies == []
     assert bench.link.asked == []
-    assert bench.presence.health.refused == 2
+    assert bench.observer.health.refused == 2
 
 
 def test_a_summary_of_a_gate_has_what_was_told_up_to_it() -> None:
@@ -337,16 +336,16 @@ def test_closed_it_hears_nothing() -> None:
 
 
 def test_samples_that_nobody_takes_go_the_oldest_first_and_acts_never() -> None:
-    inbox, done = Inbox(3), []
+    inbox, done = CallbackQueue(3), []
     for k in range(5):
-        inbox.sample("key", bytes([k]))
-        inbox.act(lambda k=k: done.append(k))
-    taken = inbox.take(0.0)
-    for act in taken.acts:
+        inbox.add_sample("key", bytes([k]))
+        inbox.add_task(lambda k=k: done.append(k))
+    taken = inbox.pop_all(0.0)
+    for act in taken.tasks:
         act()
     assert [payload for _, payload in taken.samples] == [b"\2", b"\3", b"\4"]
     assert (done, inbox.dropped) == ([0, 1, 2, 3, 4], 2)
-    assert inbox.take(0.0) == ([], [])
+    assert inbox.pop_all(0.0) == ([], [])
 
 
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
@@ -359,4 +358,4 @@ def test_what_is_dropped_is_told_in_health(mode: Mode) -> None:
         bench.link.deliver(estimate, b"estimate")
     bench.turn()
     assert len(bench.link.sent) == SAMPLES_MAX
-    assert bench.presence.health.dropped == 20
+    assert bench.observer.health.dropped == 20

@@ -13,11 +13,12 @@ from zsim.contract.messages import Quaternion, Vector3
 from zsim.math.frames import quaternion_from_rpy, rotate
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import ErrorModel, Mount, Sensors
-from zsim_bridges.ros2 import conversions, rmw_zenoh, sensor_frames, topics
-from zsim_bridges.ros2.navdata import Navdata
-from zsim_bridges.ros2.ros_types import Types
+from zsim_bridges import ros_frames
+from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
+from zsim_bridges.ros2.ros_types import RosTypes
+from zsim_bridges.ros2.topics import NavdataSummary
 
-TYPES = Types()
+TYPES = RosTypes()
 SENSORS = scenario_file.from_text(ONE).drones[0].sensors
 T_NS = 3_020_000_000
 NORTH: Quaternion = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))  # x forward is north
@@ -46,9 +47,9 @@ def xyz(vector: Any) -> list[float]:
 
 
 def all_topics() -> dict[str, topics.Topic]:
-    drone = topics.of_drone("drone1", "drone1", SENSORS, TYPES)
-    cluster = topics.of_cluster("main", "main", TYPES)
-    run = topics.of_run(topics.Names({"drone1": "drone1"}, {"main": "main"}))
+    drone = topics.drone_topics("drone1", "drone1", SENSORS, TYPES)
+    cluster = topics.cluster_topics("main", "main", TYPES)
+    run = topics.run_topics(topics.RosNames({"drone1": "drone1"}, {"main": "main"}))
     return {topic.name: topic for topic in (*run, *drone, *cluster)}
 
 
@@ -121,29 +122,29 @@ def test_odometry_has_the_estimates_covariance_where_it_belongs() -> None:
 @pytest.mark.parametrize("rate", [(0.0, 0.0, 0.5), (0.0, 0.0, -0.5), (2.0, -1.0, 0.3), (0.0, 0.0, 0.0)])
 def test_odometry_turns_as_its_attitudes_do(rate: Vector3) -> None:
     """Two attitudes 20 ms apart, the second turned by the body rate; also where the quaternion changes its sign."""
-    maker = topics.Odometry("odom", "base")
+    maker = topics.OdometryTopic("odom", "base")
     half = [0.01 * each for each in rate]
     angle = math.hypot(*half)
     first = quaternion(0.1, -0.2, 3.0)
     turn = [math.cos(angle), *(math.sin(angle) / angle * each if angle else 0.0 for each in half)]
-    second = sensor_frames.quaternion_multiply(first, turn)
-    maker.take("", estimate(T_NS, first))
+    second = conversions.quaternion_multiply(first, turn)
+    maker.update("", estimate(T_NS, first))
     for q in (second, -second):
-        maker.take("", estimate(T_NS, first))
-        odometry = maker.take("", estimate(T_NS + 20_000_000, tuple(q.tolist())))
+        maker.update("", estimate(T_NS, first))
+        odometry = maker.update("", estimate(T_NS + 20_000_000, tuple(q.tolist())))
         assert xyz(odometry.twist.twist.angular) == pytest.approx(rate, abs=1e-9)
 
 
 def test_into_body_is_the_inverse_of_the_frames_rotation() -> None:
     q = quaternion(0.3, -0.4, 2.0)
-    assert rotate(q, sensor_frames.into_body(q, (1.0, 2.0, 3.0))) == pytest.approx([1.0, 2.0, 3.0])
+    assert rotate(q, ros_frames.into_body(q, (1.0, 2.0, 3.0))) == pytest.approx([1.0, 2.0, 3.0])
 
 
 def test_sonar_frame_looks_along_the_beam_of_a_turned_mount() -> None:
     """ROS's range finders look along x; this sonar is tilted by 30 deg about y, its beam from down to the front."""
     mount = Mount(position_m=(0.1, 0.0, -0.02), rpy_deg=(0.0, -30.0, 0.0))
     spec = _with_sonar(mount)
-    placed = {pose.child: pose for pose in sensor_frames.fixed("drone1", spec)}
+    placed = {pose.child: pose for pose in conversions.static_frames("drone1", spec)}
     sonar = placed["drone1/sonar_link"]
     assert sonar.position_m == (0.1, 0.0, -0.02)
     beam = rotate(sonar.orientation_wxyz, (1.0, 0.0, 0.0))
@@ -201,7 +202,7 @@ def test_battery_comes_each_second_and_state_when_it_changes_too() -> None:
 
 def test_navdata_is_in_the_drivers_units_and_signs() -> None:
     """Right side down, nose down and counter-clockwise are positive; g, mm, mm/s, deg, Pa, us."""
-    navdata = Navdata(TYPES.of("zsim_msgs/msg/Navdata"), "base")
+    navdata = NavdataSummary(TYPES.message_class("zsim_msgs/msg/Navdata"), "base")
     told: dict[str, Any] = {
         "imu": messages.Imu(T_NS, 0, T_NS, (0.0, -4.903325, 9.80665), (0.0, 0.0, 0.0)),
         "baro": messages.Baro(T_NS, 0, T_NS, 101_325.4, 0.0),
@@ -210,9 +211,9 @@ def test_navdata_is_in_the_drivers_units_and_signs() -> None:
         "mag": messages.Mag(T_NS, 0, T_NS, (1.0, 2.0, 3.0)),
     }
     for kind, message in told.items():
-        assert navdata.take(f"drone/drone1/sensor/{kind}", message) is None
-    navdata.take("drone/drone1/estimate", estimate(T_NS, quaternion(0.1, 0.2, 0.3)))
-    made: Any = navdata.take("drone/drone1/sensor/status", status(T_NS))
+        assert navdata.update(f"drone/drone1/sensor/{kind}", message) is None
+    navdata.update("drone/drone1/estimate", estimate(T_NS, quaternion(0.1, 0.2, 0.3)))
+    made: Any = navdata.update("drone/drone1/sensor/status", status(T_NS))
     assert (made.state, made.battery_percent, made.pressure, made.altd) == (3, 62.5, 101_325, 1235)
     assert (made.rot_x, made.rot_y, made.rot_z) == pytest.approx(tuple(np.degrees([0.1, 0.2, 0.3])))
     assert (made.ax, made.ay, made.az) == pytest.approx((0.0, -0.5, 1.0))
@@ -221,8 +222,8 @@ def test_navdata_is_in_the_drivers_units_and_signs() -> None:
 
 
 def test_navdata_of_a_drone_that_has_told_nothing_yet() -> None:
-    navdata = Navdata(TYPES.of("zsim_msgs/msg/Navdata"), "base")
-    made: Any = navdata.take("drone/drone1/sensor/status", status(0, "emergency"))
+    navdata = NavdataSummary(TYPES.message_class("zsim_msgs/msg/Navdata"), "base")
+    made: Any = navdata.update("drone/drone1/sensor/status", status(0, "emergency"))
     assert (made.state, made.pressure, made.altd) == (0, 0, 0)
     assert math.isnan(made.rot_x)
     assert math.isnan(made.az)

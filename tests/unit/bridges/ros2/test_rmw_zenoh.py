@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zsim_bridges.ros2 import rmw_zenoh
-from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId, Qos
-from zsim_bridges.ros2.ros_names import ros_name, ros_names
+from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId, Qos, ros_name, ros_names
 
 ZID = "f4b2a1c09d8e7f60"
 TF_HASH = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
@@ -62,7 +61,7 @@ def test_attachment_is_33_bytes() -> None:
 
 @pytest.mark.parametrize("data", [b"", bytes(32), bytes(34), bytes(33), b"\x0fsequence_number" + bytes(17)])
 def test_other_attachments_are_refused(data: bytes) -> None:
-    with pytest.raises(ValueError, match="must have 33"):
+    with pytest.raises(ValueError, match="33"):
         rmw_zenoh.attachment_of(data)
 
 

@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsim_bridges.ros2.definitions import MESSAGES
-from zsim_bridges.ros2.ros_types import Types
+from zsim_bridges.ros2.ros_types import MESSAGES, RosTypes
 
-TYPES = Types()
+TYPES = RosTypes()
 
 
 @pytest.mark.parametrize(
@@ -62,7 +61,7 @@ class Cdr:
 
 
 def of(name: str, *values: Any) -> Any:
-    return TYPES.of(name)(*values)
+    return TYPES.message_class(name)(*values)
 
 
 def vector(x: float, y: float, z: float) -> Any:
@@ -109,7 +108,7 @@ def test_cdr_of_our_cluster_state() -> None:
 
 def test_what_is_empty_has_one_byte_on_the_wire() -> None:
     for name in ("std_msgs/msg/Empty", "std_srvs/srv/Trigger_Request"):
-        assert TYPES.encode(TYPES.of(name)(), name) == bytes.fromhex("0001000000")
+        assert TYPES.encode(TYPES.message_class(name)(), name) == bytes.fromhex("0001000000")
 
 
 def test_cdr_of_a_trigger_response() -> None:
@@ -122,4 +121,4 @@ def test_cdr_of_a_trigger_response() -> None:
 @given(data=st.binary(max_size=80), head=st.sampled_from([b"", b"\x00\x01\x00\x00", b"\x00\x00\x00\x00"]))
 def test_garbage_is_a_message_or_a_refusal(name: str, data: bytes, head: bytes) -> None:
     with suppress(ValueError):
-        assert isinstance(TYPES.decode(head + data, name), TYPES.of(name))
+        assert isinstance(TYPES.decode(head + data, name), TYPES.message_class(name))

@@ -7,8 +7,7 @@ import typer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from zsim.errors import RunError
-from zsim_bridges.ros2.definitions import MESSAGES
-from zsim_bridges.ros2.ros_types import Types
+from zsim_bridges.ros2.ros_types import MESSAGES, RosTypes
 from zsim_deploy.cli.ros2_command import ros2
 
 
@@ -16,7 +15,7 @@ def test_the_package_has_the_types_that_go_over_the_wire(tmp_path: Path, capsys:
     ros2(write_package=tmp_path)
     package = tmp_path / "zsim_msgs"
     assert capsys.readouterr().out == f"wrote {package}; build it with colcon in a ROS workspace\n"
-    store, types = get_typestore(Stores.ROS2_KILTED), Types()
+    store, types = get_typestore(Stores.ROS2_KILTED), RosTypes()
     for path in package.glob("msg/*.msg"):
         name = f"zsim_msgs/msg/{path.stem}"
         store.register(get_types_from_msg(path.read_text(), name))

@@ -1,0 +1,228 @@
+"""The console's HTTP server: serves the page, and relays what viser and the page send each other if it is permitted."""
+
+import asyncio
+import gzip
+import importlib.resources
+import secrets
+import socket
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+from urllib.parse import quote
+
+import msgspec
+from aiohttp import ClientError, ClientSession, WSMsgType, web
+
+from zsim.errors import RunError
+from zsim_bridges.console.page_rights import (
+    MESSAGE_MAX,
+    OPERATOR,
+    VIEW_PATH,
+    VIEWER,
+    PageControls,
+    PageRequest,
+    PageTokens,
+    is_permitted,
+)
+from zsim_bridges.web_server import open_on_thread, start_site, url_host
+
+BACKEND_HOST = "127.0.0.1"  # where viser listens
+SECRET_HEADER = "X-Zsim-Console"  # which viser's server asks for
+ALL_ADDRESSES = ("0.0.0.0", "::")
+PAGES_MAX = 50  # open at once, of operators and of viewers: viewers keep no operator out
+HEARTBEAT_S = 20.0  # after which a page on a machine that is gone is noticed
+CLOSE_S = 1.0
+POLICY = "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; frame-ancestors 'none'; form-action 'none'"
+HEADERS = {
+    "Content-Security-Policy": POLICY,  # the page is one file, and nothing it shows comes from elsewhere
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+VIEW_STYLE = (
+    "<style>body::before{content:'view only';position:fixed;top:8px;left:50%;transform:translateX(-50%);z-index:9999;"
+    "background:#1971c2;color:#fff;font:600 13px sans-serif;padding:3px 14px;border-radius:10px}"
+    ".mantine-Button-root,.mantine-Slider-root,.mantine-Input-input{pointer-events:none;opacity:.4}</style>"
+)
+
+
+class ListenAddress(NamedTuple):
+    """Where pages are served."""
+
+    host: str
+    port: int
+
+    def url(self, path: str = "/", token: str | None = None) -> str:
+        """Return the URL of a page; by the name of this machine where it listens on all addresses."""
+        host = socket.gethostname() if self.host in ALL_ADDRESSES else self.host
+        query = f"?token={quote(token, safe='')}" if token else ""
+        return f"http://{url_host(host)}:{self.port}{path}{query}"
+
+
+class ViserBackend(NamedTuple):
+    """The viser server behind the proxy.
+
+    Attributes:
+        port: on BACKEND_HOST.
+        secret: that it asks for in SECRET_HEADER.
+        state: returns what the console shows, as plain data.
+        controls: of all pages.
+    """
+
+    port: int
+    secret: str
+    state: Callable[[], dict[str, Any]]
+    controls: PageControls
+
+
+class HttpProxy:
+    """One server of pages.
+
+    Args:
+        address: where pages are served.
+        token: of operators; None where only this machine can connect.
+        backend: see ViserBackend.
+
+    Raises:
+        RunError: others could reach it, and there is no token.
+    """
+
+    def __init__(self, address: ListenAddress, token: str | None, backend: ViserBackend) -> None:
+        self._address = address
+        self._token = token
+        self._view_token = secrets.token_urlsafe(12)
+        self._tokens = PageTokens(address.host, address.port, token, self._view_token)
+        self._backend = backend
+        self._pages = _pages()
+        self._open_pages: Counter[str] = Counter()  # by role
+        self._loop = asyncio.new_event_loop()
+        self._client: ClientSession | None = None
+
+    def urls(self) -> dict[str, str]:
+        """Return the URLs to be opened, by role."""
+        view_token = self._view_token if self._token is not None else None
+        return {OPERATOR: self._address.url("/", self._token), VIEWER: self._address.url(VIEW_PATH, view_token)}
+
+    @contextmanager
+    def open(self) -> Iterator[None]:
+        """Serve pages, on a thread of its own.
+
+        Raises:
+            RunError: the port is taken.
+        """
+        with open_on_thread(self._loop, "console server", self._open, self._close):
+            yield
+
+    async def _open(self) -> web.AppRunner:
+        app = web.Application()
+        app.add_routes([web.get(path, self._page) for path in ("/", VIEW_PATH)])
+        app.add_routes([web.get(path, self._state) for path in ("/state", f"{VIEW_PATH}/state")])
+        try:
+            site = await start_site(app, *self._address, shutdown_s=CLOSE_S)
+        except OSError as error:
+            address = f"{self._address.host}, port {self._address.port}"
+            raise RunError(f"console: cannot listen on {address} ({error.strerror}); say --port") from error
+        self._client = ClientSession()
+        return site
+
+    async def _close(self, site: web.AppRunner) -> None:
+        assert self._client is not None
+        await self._client.close()
+        await site.cleanup()
+
+    # Requests
+
+    async def _page(self, request: web.Request) -> web.StreamResponse:
+        """Serve the page, or its WebSocket."""
+        page_request = _page_request(request)
+        role = self._tokens.role_of(page_request)
+        if role is None:
+            return _missing_token()
+        if page_request.token:
+            return self._set_cookie(page_request)
+        if request.headers.get("Upgrade", "").lower() == "websocket":
+            return await self._stream(request, role)
+        headers = {**HEADERS, "Content-Encoding": "gzip"}
+        return web.Response(body=self._pages[role], content_type="text/html", charset="utf-8", headers=headers)
+
+    def _set_cookie(self, page_request: PageRequest) -> web.Response:
+        """Put the token into a cookie, and out of the address."""
+        response = web.Response(status=303, headers={**HEADERS, "Location": page_request.path})
+        role = self._tokens.role_of_address(page_request)
+        if role is not None:
+            name = self._tokens.cookie(role)
+            response.set_cookie(name, page_request.token, httponly=True, samesite="Strict", path="/")
+        return response
+
+    async def _state(self, request: web.Request) -> web.Response:
+        if self._tokens.role_of(_page_request(request)) is None:
+            return _missing_token()
+        body = msgspec.json.encode(self._backend.state())
+        return web.Response(body=body, content_type="application/json", headers=HEADERS)
+
+    async def _stream(self, request: web.Request, role: str) -> web.StreamResponse:
+        if self._open_pages[role] >= PAGES_MAX:
+            return web.Response(status=503, text=f"{PAGES_MAX} pages are open already; close one\n", headers=HEADERS)
+        self._open_pages[role] += 1
+        try:
+            return await self._relay(request, role)
+        finally:
+            self._open_pages[role] -= 1
+
+    async def _relay(self, request: web.Request, role: str) -> web.WebSocketResponse:
+        """Relay messages both ways, until one side closes."""
+        header = request.headers.get("Sec-WebSocket-Protocol", "")
+        protocols = [part.strip() for part in header.split(",") if part.strip()]
+        page = web.WebSocketResponse(
+            protocols=protocols, compress=False, max_msg_size=MESSAGE_MAX, heartbeat=HEARTBEAT_S
+        )
+        await page.prepare(request)
+        assert self._client is not None
+        url = f"ws://{BACKEND_HOST}:{self._backend.port}/"
+        headers = {SECRET_HEADER: self._backend.secret}
+        try:
+            connecting = self._client.ws_connect(url, protocols=protocols, headers=headers, compress=0, max_msg_size=0)
+            async with connecting as viser:
+                ways = [
+                    asyncio.ensure_future(way) for way in (_to_page(viser, page), self._to_viser(page, viser, role))
+                ]
+                await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+                for way in ways:
+                    way.cancel()
+                await asyncio.gather(*ways, return_exceptions=True)
+        except ClientError:
+            pass  # viser ends, or has ended
+        await page.close()
+        return page
+
+    async def _to_viser(self, page: web.WebSocketResponse, viser: Any, role: str) -> None:
+        async for message in page:
+            if message.type is WSMsgType.BINARY and is_permitted(message.data, role, self._backend.controls):
+                await viser.send_bytes(message.data)
+
+
+async def _to_page(viser: Any, page: web.WebSocketResponse) -> None:
+    async for message in viser:
+        if message.type is WSMsgType.BINARY:
+            await page.send_bytes(message.data)
+
+
+def _page_request(request: web.Request) -> PageRequest:
+    headers = request.headers
+    token = request.query.get("token", "")
+    return PageRequest(request.path, headers.get("Host", ""), headers.get("Origin"), token, dict(request.cookies))
+
+
+def _missing_token() -> web.Response:
+    text = "This page needs the token of the console: open the link that it printed when it started.\n"
+    return web.Response(status=401, text=text, headers=HEADERS)
+
+
+def _pages() -> dict[str, bytes]:
+    """Return viser's page, compressed, by role; that of viewers shows its controls disabled."""
+    html = importlib.resources.files("viser").joinpath("client/build/index.html").read_text()
+    styles = {OPERATOR: "", VIEWER: VIEW_STYLE}
+    return {
+        role: gzip.compress(html.replace("</head>", f"{style}</head>", 1).encode()) for role, style in styles.items()
+    }

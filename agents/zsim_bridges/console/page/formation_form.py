@@ -1,0 +1,208 @@
+"""Controls of one formation: phases, sliders of its variables, trajectories."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import viser
+
+from zsim.contract.messages import ViewCluster
+from zsim.scenario.scenario import Cluster, Trajectory
+from zsim_agents.formation.spaces.cluster_space import ClusterSpace
+from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.page import operator_input
+from zsim_bridges.console.page.operator_input import SliderRange, primary_variables
+from zsim_bridges.console.page.picture import SHAPED_PHASES
+
+STILL_S = 2.0  # wall; a formation whose goal has not changed for so long is not on its way: the slider shows its goal
+
+
+class _HeldValue(NamedTuple):
+    """Value of a slider that was moved, the formation's newest goal, and since when it is the goal [s, wall]."""
+
+    value: float
+    goal: float
+    since_s: float
+
+
+class VariableSlider:
+    """A slider of one cluster variable, which follows the formation while the operator does not move it.
+
+    Args:
+        gui: viser's, in the folder where it is to be.
+        range_: of the variable, in whose unit all values here are.
+    """
+
+    def __init__(self, gui: viser.GuiApi, range_: SliderRange) -> None:
+        self.range = range_
+        self._lock = threading.Lock()
+        self._moved: tuple[float, float] | None = None
+        self._out_of_range = False
+        self._held: _HeldValue | None = None
+        self._slider: Any = gui.add_slider(range_.label, range_.low, range_.high, range_.step, range_.to_display(0.0))
+        self._slider.on_update(self._on_update)
+
+    @property
+    def moved_s(self) -> float | None:
+        """When an operator moved it last [s, wall], None once the value has been popped."""
+        moved = self._moved
+        return None if moved is None else moved[1]
+
+    def pop_value(self) -> float | None:
+        """Return the value to which it was moved, once; None where it was not moved."""
+        with self._lock:
+            moved, self._moved = self._moved, None
+        return None if moved is None else moved[0]
+
+    def hold(self, wall_s: float) -> None:
+        """Keep its value while the formation goes there."""
+        self._held = _HeldValue(float(self._slider.value), float("nan"), wall_s)
+
+    def follow(self, goal: float, wall_s: float) -> None:
+        """Show the formation's goal [m, rad], unless it was moved and the formation is on its way."""
+        shown = self.range.to_display(goal)
+        if self._moved is None and not self._is_held(shown, wall_s):
+            self._slider.value = shown
+
+    def _is_held(self, goal: float, wall_s: float) -> bool:
+        kept = self._held
+        if kept is None:
+            return False
+        if goal != kept.goal:
+            self._held = kept._replace(goal=goal, since_s=wall_s)
+        elif goal == kept.value or wall_s - kept.since_s > STILL_S:
+            self._held = None
+        return self._held is not None
+
+    def _on_update(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client_id is None:
+            return  # set by `follow`
+        value = float(self._slider.value)
+        with self._lock:
+            # A page accepts numbers beyond the limits, and sets them to the nearest limit when the field loses focus.
+            if self._out_of_range and value in (self.range.low, self.range.high):
+                self._out_of_range = False
+                return
+            self._out_of_range = self.range.refusal(value) is not None
+            self._moved = (value, time.monotonic())
+
+
+REST_S = 1.0  # wall; sliders must rest for so long before their values are sent: people type slowly
+OVER_MAX_S = 3600.0  # simulated; of a move, as controllers take it
+OPERATIONS = {"Take off": "takeoff", "Engage": "engage", "Hold": "hold", "Land": "land"}
+ICONS = {
+    "takeoff": viser.Icon.PLANE_DEPARTURE,
+    "engage": viser.Icon.TRIANGLE,
+    "hold": viser.Icon.HAND_STOP,
+    "land": viser.Icon.PLANE_ARRIVAL,
+}
+EXAMPLES = {"expressions": "x_c = 5 + 3*cos(0.1*t)", "waypoints": "0: x_c = 5, y_c = 0\n20: x_c = 5, y_c = 6"}
+Report = Callable[[RequestOutcome], None]
+
+
+class FormationForm:
+    """Controls of one formation.
+
+    Args:
+        gui: viser's, in the folder where they are to be.
+        client: sends requests.
+        report: called with requests that are refused without being sent.
+        cluster: of the scenario.
+        space: of the formation.
+        ranges: of its variables.
+    """
+
+    def __init__(
+        self,
+        gui: viser.GuiApi,
+        client: CommandClient,
+        report: Report,
+        cluster: Cluster,
+        space: ClusterSpace,
+        ranges: list[SliderRange],
+    ) -> None:
+        self._client = client
+        self._report = report
+        self._cluster = cluster
+        self._space = space
+        self._ranges = {each.name: each for each in ranges}
+        for label, op in OPERATIONS.items():
+            self._button(gui, label, op)
+        hint = "Duration of a move; 0: as fast as the robots' limits let it"
+        self._over = gui.add_number("over [s]", 0.0, min=0.0, max=OVER_MAX_S, step=0.5, hint=hint)
+        shown = primary_variables(space.names)
+        self._sliders = {name: VariableSlider(gui, self._ranges[name]) for name in shown}
+        if len(shown) < space.size:
+            self._single_variable(gui, [name for name in space.names if name not in shown])
+        self._trajectories(gui, cluster.plan.trajectory)
+
+    def refresh(self, view: ViewCluster | None, wall_s: float) -> None:
+        """Let the sliders that were not moved follow the formation."""
+        if view is None:
+            return
+        shown = view.desired if view.phase in SHAPED_PHASES else view.value
+        for name, slider in self._sliders.items():
+            slider.follow(shown[self._space.index(name)], wall_s)
+
+    def send(self, wall_s: float) -> None:
+        """Request the values of the sliders that were moved, once all have come to rest."""
+        moved_s = [slider.moved_s for slider in self._sliders.values()]
+        if wall_s - max((at_s for at_s in moved_s if at_s is not None), default=wall_s) < REST_S:
+            return
+        moved = {name: value for name, slider in self._sliders.items() if (value := slider.pop_value()) is not None}
+        if self.request_target(moved):
+            for name in moved:
+                self._sliders[name].hold(wall_s)
+
+    def request_target(self, shown: dict[str, float]) -> bool:
+        """Request values in the units of the page; return whether they are within their ranges."""
+        refusals = [refusal for name, value in shown.items() if (refusal := self._ranges[name].refusal(value))]
+        if refusals:
+            self._report(RequestOutcome(f"{self._cluster.name}: target", "; ".join(refusals)))
+            return False
+        values = {name: self._ranges[name].to_si(value) for name, value in shown.items()}
+        lasting = {"over_s": float(self._over.value)} if self._over.value > 0 else {}
+        text = ", ".join(f"{name} {value:g} {self._ranges[name].unit}" for name, value in shown.items())
+        self._client.request_cluster(self._cluster.name, "target", shown=text, values=values, **lasting)
+        return True
+
+    def _button(self, gui: viser.GuiApi, label: str, op: str) -> None:
+        button = gui.add_button(label, icon=ICONS[op], color="blue" if op in ("takeoff", "engage") else "gray")
+        button.on_click(lambda _: self._client.request_cluster(self._cluster.name, op))
+
+    def _single_variable(self, gui: viser.GuiApi, names: list[str]) -> None:
+        with gui.add_folder("Other variables", expand_by_default=False):
+            name = gui.add_dropdown("variable", names)
+            value = gui.add_number("value [m or deg]", 0.0, step=0.1)
+            gui.add_button("Move it").on_click(lambda _: self._move(name.value, float(value.value)))
+
+    def _move(self, name: str, shown: float) -> None:
+        self.request_target({name: shown})
+
+    def _trajectories(self, gui: viser.GuiApi, planned: Trajectory | None) -> None:
+        with gui.add_folder("Trajectory", expand_by_default=False):
+            if planned is not None:
+                gui.add_button("Fly the scenario's").on_click(lambda _: self._fly(lambda: _planned_trajectory(planned)))
+            gui.add_markdown("<sub>t in seconds, lengths in metres, angles in radians</sub>")
+            text = gui.add_text("expressions", EXAMPLES["expressions"], multiline=True)
+            fly = gui.add_button("Fly the expressions")
+            fly.on_click(lambda _: self._fly(lambda: operator_input.parse_expressions(text.value, self._space.names)))
+            points = gui.add_text("waypoints", EXAMPLES["waypoints"], multiline=True)
+            gui.add_button("Fly the waypoints").on_click(
+                lambda _: self._fly(lambda: operator_input.parse_waypoints(points.value))
+            )
+
+    def _fly(self, read: Callable[[], dict[str, Any]]) -> None:
+        try:
+            args = read()
+        except operator_input.InputError as error:
+            self._report(RequestOutcome(f"{self._cluster.name}: trajectory", str(error)))
+            return
+        self._client.request_cluster(self._cluster.name, "trajectory", **args)
+
+
+def _planned_trajectory(trajectory: Trajectory) -> dict[str, Any]:
+    if trajectory.waypoints:
+        return {"waypoints": [{"at_s": point.at_s, "values": point.values} for point in trajectory.waypoints]}
+    return {"expressions": trajectory.expressions, "constants": trajectory.constants}

@@ -1,0 +1,166 @@
+"""Input of an operator: ranges of cluster variables, texts of trajectories, waypoints, fault parameters. Pure."""
+
+import math
+import re
+from collections.abc import Collection, Sequence
+from typing import Any, NamedTuple
+
+from zsim.scenario.scenario import Cluster, Scenario
+from zsim.schema import yaml_file
+from zsim_agents.formation.spaces.cluster_space import ClusterSpace, unit
+
+SIDEWAYS_M = 50.0  # of the drones' starts, sideways; chosen: as far as a page shows a formation well
+HEIGHT_MIN_M, HEIGHT_MAX_M = 1.0, 30.0  # chosen: clear of the ground, and within sight
+SIDE_MAX_M = 20.0  # of a formation; chosen
+DISPLACEMENT_M = 5.0  # of a robot from its place in a template; chosen
+TILT_MAX_DEG = 29.0  # of a formation; controllers take less than 30, flight_data.py
+CORNER_DEG = 10.0  # least angle at a corner; at 0 and at 180 degrees robots stand in line
+DIGITS = 6  # of a value as it is shown: 5.1, not 5.1000000000000005
+STEPS = {"m": 0.1, "deg": 1.0}
+SHOWN_MAX = 16  # variables that a page shows one by one; of more, those of the whole formation
+
+
+class SliderRange(NamedTuple):
+    """A cluster variable on a slider.
+
+    Attributes:
+        name: of the variable.
+        unit: m or deg.
+        low, high, step: in that unit.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    step: float
+
+    @property
+    def label(self) -> str:
+        return f"{self.name} [{self.unit}]"
+
+    def to_display(self, value: float) -> float:
+        """Return a value [m, rad] in the unit of the range, to its step, within it."""
+        shown = math.degrees(math.remainder(value, math.tau)) if self.unit == "deg" else value
+        return min(max(round(round(shown / self.step) * self.step, DIGITS), self.low), self.high)
+
+    def to_si(self, shown: float) -> float:
+        """Return a value in the unit of the range as [m, rad]."""
+        return math.radians(shown) if self.unit == "deg" else shown
+
+    def refusal(self, shown: float) -> str | None:
+        """Return why a value may not be requested, None if it may."""
+        if not self.low <= shown <= self.high:
+            return f"{self.name} is {shown:g} {self.unit}; must be from {self.low:g} to {self.high:g}"
+        return None
+
+
+def slider_ranges(space: ClusterSpace, cluster: Cluster, scenario: Scenario) -> list[SliderRange]:
+    """Return the ranges of all variables of a formation, in their order."""
+    starts = [scenario.drone(name).position_m for name in cluster.drones]
+    top_m = min(HEIGHT_MAX_M, *(scenario.drone(name).limits.altitude_m for name in cluster.drones))
+    centre = [sum(p[axis] for p in starts) / len(starts) for axis in range(2)]
+    apart_m = max(cluster.gains.separation_min_m, STEPS["m"])
+    side = (apart_m, max(SIDE_MAX_M, 2.0 * apart_m))
+    bounds = {
+        "x_c": (round(centre[0]) - SIDEWAYS_M, round(centre[0]) + SIDEWAYS_M),
+        "y_c": (round(centre[1]) - SIDEWAYS_M, round(centre[1]) + SIDEWAYS_M),
+        "z_c": (min(HEIGHT_MIN_M, top_m / 2.0), top_m),
+        **dict.fromkeys(("p", "q", "rho"), side),
+        **dict.fromkeys(("roll", "pitch", "elevation"), (-TILT_MAX_DEG, TILT_MAX_DEG)),
+        "beta": (CORNER_DEG, 180.0 - CORNER_DEG),
+    }
+    return [_range(name, bounds) for name in space.names]
+
+
+def _range(name: str, bounds: dict[str, tuple[float, float]]) -> SliderRange:
+    shown_in = "deg" if unit(name) == "rad" else "m"
+    whole = (-180.0, 180.0) if shown_in == "deg" else (-DISPLACEMENT_M, DISPLACEMENT_M)
+    stem = name.rpartition(".")[2].rstrip("0123456789").rstrip("_")
+    low, high = bounds.get(name) or bounds.get(stem) or whole
+    return SliderRange(name, shown_in, float(low), float(high), STEPS[shown_in])
+
+
+def primary_variables(names: Sequence[str]) -> list[str]:
+    """Return the variables that a page shows one by one: all of few; of many, those of the whole formation."""
+    whole = ("x_c", "y_c", "z_c", "roll", "pitch", "yaw", "p", "q", "beta")
+    return list(names) if len(names) <= SHOWN_MAX else [name for name in names if name in whole]
+
+
+class InputError(ValueError):
+    """A text of the operator that cannot be parsed; the message says where and what is allowed."""
+
+
+def parse_expressions(text: str, names: tuple[str, ...]) -> dict[str, Any]:
+    """Return the arguments of a trajectory of lines `variable = expression`; other names are constants.
+
+    Raises:
+        TypedError: a line is neither.
+    """
+    by_variable: dict[str, str] = {}
+    constants: dict[str, float] = {}
+    for number, line in _lines(text):
+        name, sign, value = (part.strip() for part in line.partition("="))
+        if not sign or not name or not value:
+            allowed = "VARIABLE = EXPRESSION, such as x_c = 5*cos(0.1*t)"
+            raise InputError(f"line {number} is {line[:40]!r}; must be {allowed}")
+        if name in names:
+            by_variable[name] = value
+        else:
+            constants[name] = _number(value, f"line {number}: {name} is no variable, and as a constant")
+    if not by_variable:
+        raise InputError("trajectory is empty; must have a line VARIABLE = EXPRESSION at least")
+    for name in constants:
+        if not any(re.search(rf"\b{re.escape(name)}\b", expression) for expression in by_variable.values()):
+            raise InputError(f"{name} is no variable, nor used as a constant; variables are {', '.join(names)}")
+    return {"expressions": by_variable, "constants": constants}
+
+
+def parse_waypoints(text: str) -> dict[str, Any]:
+    """Return the arguments of a trajectory of lines `seconds: variable = value, …`.
+
+    Raises:
+        TypedError: a line is none.
+    """
+    points = []
+    for number, line in _lines(text):
+        at, colon, rest = line.partition(":")
+        pairs = [pair.partition("=") for pair in rest.split(",")]
+        if not colon or not all(name.strip() and sign for name, sign, _ in pairs):
+            raise InputError(f"line {number} is {line[:40]!r}; must be SECONDS: VARIABLE = VALUE, VARIABLE = VALUE, …")
+        values = {name.strip(): _number(value, f"line {number}: {name.strip()}") for name, _, value in pairs}
+        points.append({"at_s": _number(at, f"line {number}: the time"), "values": values})
+    if not points:
+        raise InputError("waypoints are empty; must have a line SECONDS: VARIABLE = VALUE at least")
+    return {"waypoints": points}
+
+
+def parse_parameters(text: str, names: Collection[str]) -> dict[str, Any]:
+    """Return a fault's own parameters, of `name: value, name: value`.
+
+    Raises:
+        TypedError: it is no such list, or names something that is not among `names`.
+    """
+    where, allowed = f"parameters are {text[:40]!r}", "must be NAME: VALUE, NAME: VALUE, …"
+    try:
+        values = yaml_file.value("{" + text + "}")
+    except ValueError as error:
+        raise InputError(f"{where}: {error}; {allowed}") from None
+    if not isinstance(values, dict) or not all(isinstance(name, str) for name in values) or None in values.values():
+        raise InputError(f"{where}; {allowed}")
+    for name in values:
+        if name not in names:
+            raise InputError(f"{where}; {name[:40]!r} is not known, allowed: {', '.join(names)}")
+    return values
+
+
+def _lines(text: str) -> list[tuple[int, str]]:
+    numbered = enumerate(text.splitlines(), start=1)
+    return [(number, line.strip()) for number, line in numbered if line.strip() and not line.lstrip().startswith("#")]
+
+
+def _number(text: str, what: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"{what} is {text.strip()[:40]!r}; must be a number") from None

@@ -1,0 +1,244 @@
+"""The picture of a run as arrays: poses, ellipsoids, formations, trails and histories, from the newest views. Pure.
+
+Axes, units and quaternions as everywhere: W east, north, up; quaternions w first, body to world.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zsim.contract.messages import EstimateView, ViewCluster, ViewDrones
+from zsim.math import frames
+from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
+
+Array = NDArray[np.float64]
+
+ROTOR_SLOWDOWN = 50.0  # of the rotors' speed: at 10 pictures/s the fastest turn by 57 degrees, so not seen as backwards
+SIGMAS = 2.0  # of an ellipsoid
+SHARE_WITHIN = 1 - math.erfc(SIGMAS / math.sqrt(2)) - math.sqrt(2 / math.pi) * SIGMAS * math.exp(-(SIGMAS**2) / 2)
+"""Of a Gaussian in three dimensions, within 2 sigma: chi-squared of three degrees of freedom at 4, 0.739."""
+RADIUS_MAX_M = 60.0  # of an ellipsoid: before the first fix nothing is known, and the page would be inside of it
+SPIN = np.array([-1.0, 1.0, -1.0, 1.0])  # against the drag torque of each rotor, zsim_world/rotors.py
+SHAPED_PHASES = frozenset({"assembling", "engaged", "held"})  # phases in which a formation has somewhere to be
+CORNER_SHARE = (
+    0.25  # of the way from a corner to the opposite side; there its angle is written, clear of names and sides
+)
+SIDES = {"p": (0, 1), "q": (0, 2)}  # robots at their ends; docs/conventions.md
+
+
+class DronePoses(NamedTuple):
+    """N drones at one instant, those of a run in its order."""
+
+    t_ns: int
+    names: tuple[str, ...]
+    p_W: Array  # (N, 3) m; NaN of a drone that is not in the view
+    q_WB: Array  # (N, 4)
+    rotor: Array  # (N, 4) rad/s
+    wind_W: Array  # (3,) m/s, the mean over the drones
+
+    @property
+    def present(self) -> NDArray[np.bool_]:
+        """Return which drones are in the view, (N,)."""
+        return np.isfinite(self.p_W[:, 0])
+
+
+class Ellipsoids(NamedTuple):
+    """Ellipsoids: centres, attitudes and half axes."""
+
+    p_W: Array  # (M, 3) m
+    wxyz: Array  # (M, 4)
+    half_m: Array  # (M, 3)
+
+
+class FormationSide(NamedTuple):
+    """A side of a formation's triangle, or of its pair."""
+
+    name: str
+    ends_W: Array  # (2, 3) m
+
+
+class FormationShape(NamedTuple):
+    """A formation's true shape."""
+
+    c: Array  # (4n,)
+    p_c: Array  # (3,) m, its origin in W
+    q_WC: Array  # (4,)
+    sides: tuple[FormationSide, ...]
+    corner: tuple[Array, str] | None  # where beta is written
+
+
+def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
+    """Return a view as arrays of the drones of those names, which may not all be in it: a replay has some alone."""
+    count = len(names)
+    p_W, q_WB, rotor = np.full((count, 3), np.nan), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1)), np.zeros((count, 4))
+    indices = {name: i for i, name in enumerate(names)}
+    for drone in view.drones:
+        i = indices.get(drone.name)
+        if i is not None:
+            p_W[i], q_WB[i], rotor[i] = drone.position_m, drone.orientation_wxyz, drone.rotor_rad_s
+    wind = np.mean(view.wind_m_s, axis=0) if view.wind_m_s else np.zeros(3)
+    return DronePoses(view.t_ns, tuple(names), p_W, q_WB, rotor, wind)
+
+
+def rotor_angles(angles: Array, rotor: Array, dt_s: float) -> Array:
+    """Return the angles (N, 4) [rad] to which rotors are drawn dt_s later: slowed down to be visible."""
+    return (angles + SPIN * rotor * (dt_s / ROTOR_SLOWDOWN)) % math.tau
+
+
+def rotor_poses(drones: DronePoses, hubs_B: Array, angles: Array) -> tuple[Array, Array]:
+    """Return centres (4N, 3) and quaternions (4N, 4) of the rotors.
+
+    Args:
+        drones: N of them.
+        hubs_B: (4, 3) m.
+        angles: (N, 4) rad.
+    """
+    R_WB = frames.rotation_matrix(drones.q_WB)
+    p = drones.p_W[:, None] + np.einsum("nij,kj->nki", R_WB, hubs_B)
+    w, x, y, z = (part[:, None] for part in drones.q_WB.T)
+    c, s = np.cos(angles / 2), np.sin(angles / 2)
+    q = np.stack((w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s), axis=-1)
+    return p.reshape(-1, 3), q.reshape(-1, 4)
+
+
+def ellipsoids(estimates: Sequence[EstimateView]) -> Ellipsoids:
+    """Return the ellipsoids of 2 sigma of estimates of position."""
+    p = np.array([estimate.position_m for estimate in estimates]).reshape(-1, 3)
+    P = np.array([estimate.covariance_m2 for estimate in estimates]).reshape(-1, 6)
+    sigma_m, q = frames.principal_axes(P[:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]])
+    return Ellipsoids(p, q, np.clip(SIGMAS * sigma_m, 0.01, RADIUS_MAX_M))
+
+
+def ghosts(space: ClusterSpace, view: ViewCluster) -> tuple[Array, Array] | None:
+    """Return positions (n, 3) and quaternions (n, 4) of the robots as the formation is to stand, None without one."""
+    if view.phase not in SHAPED_PHASES:
+        return None
+    try:
+        p_W, yaw = space.inverse(np.array(view.desired))
+    except SingularClusterError:
+        return None
+    return p_W, frames.quaternion_from_heading(yaw)
+
+
+def formation_shape(space: ClusterSpace, p_W: Array, yaw: Array) -> FormationShape | None:
+    """Return the formation of robots at p_W (n, 3) with headings yaw (n,), None where it has no frame."""
+    try:
+        c = space.forward(p_W, yaw)
+    except SingularClusterError:
+        return None
+    roll, pitch, turn = (c[space.index(name)] if name in space.names else 0.0 for name in ("roll", "pitch", "yaw"))
+    of_groups = any("." in name for name in space.names)  # p and q are then between groups
+    known = [name for name in SIDES if name in space.names and not of_groups]
+    sides = [FormationSide(f"{name} {c[space.index(name)]:.2f} m", p_W[list(SIDES[name])]) for name in known]
+    corner = None
+    if "beta" in space.names and len(known) == 2:
+        sides.append(FormationSide("", p_W[[1, 2]]))
+        corner = (
+            p_W[0] + CORNER_SHARE * (p_W[1:].mean(axis=0) - p_W[0]),
+            f"β {math.degrees(c[space.index('beta')]):.1f}°",
+        )
+    return FormationShape(c, c[:3], frames.quaternion_from_rpy((roll, pitch, turn)), tuple(sides), corner)
+
+
+TRAIL_POINTS_MAX = 6_000  # of all trails together: 144 kB for a browser each time
+POINTS_OF_ONE = 300
+SPACING_M = 0.08  # of two points: a sixth of a hull
+
+
+class DroneTrails:
+    """The trails of N drones: the last stretch of each one's path.
+
+    Args:
+        count: how many drones.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._capacity = min(POINTS_OF_ONE, max(2, TRAIL_POINTS_MAX // count))
+        self._points = np.zeros((count, self._capacity, 3))
+        self._lengths = np.zeros(count, dtype=np.int64)
+
+    def add(self, p_W: Array) -> bool:
+        """Add positions (N, 3) [m], NaN of a drone that is not in the view; return whether any has moved on."""
+        last = self._points[np.arange(len(p_W)), np.maximum(self._lengths - 1, 0)]
+        moved = (np.linalg.norm(p_W - last, axis=1) >= SPACING_M) | (self._lengths == 0)
+        moved &= np.isfinite(p_W[:, 0])
+        for i in np.flatnonzero(moved):
+            if self._lengths[i] == self._capacity:
+                self._points[i, :-1] = self._points[i, 1:]
+            else:
+                self._lengths[i] += 1
+            self._points[i, self._lengths[i] - 1] = p_W[i]
+        return bool(moved.any())
+
+    def segments(self, p_W: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Return segments (M, 2, 3) up to where the drones are now, (N, 3), and the index of its drone, (M,)."""
+        lines, owners = [np.zeros((0, 2, 3))], [np.zeros(0, dtype=np.int64)]
+        present = np.isfinite(p_W[:, 0])
+        for i, length in enumerate(self._lengths):
+            if not length or not present[i]:
+                continue
+            way = np.vstack((self._points[i, :length], p_W[i]))
+            lines.append(np.stack((way[:-1], way[1:]), axis=1))
+            owners.append(np.full(len(way) - 1, i))
+        return np.concatenate(lines), np.concatenate(owners)
+
+    def clear(self) -> None:
+        """Remove all points."""
+        self._lengths[:] = 0
+
+
+SPAN_S = 180.0  # simulated
+INTERVAL_S = 0.25  # simulated, between two points; a formation answers within seconds
+HISTORY_POINTS_MAX = int(SPAN_S / INTERVAL_S)
+SERIES = ("desired", "estimated", "true")
+
+
+class VariableHistory:
+    """Points of one formation.
+
+    Args:
+        size: number of variables.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._times: deque[float] = deque(maxlen=HISTORY_POINTS_MAX)
+        self._rows: deque[Array] = deque(maxlen=HISTORY_POINTS_MAX)
+
+    def add(self, t_s: float, desired: Sequence[float] | None, value: Sequence[float], true: Array | None) -> bool:
+        """Add a point, unless the last one is hardly older; return whether it was added.
+
+        Args:
+            t_s: simulated time; back in time, as a replay may go, all points are removed.
+            desired, value, true: (size,) each, m and rad; None for what is not known.
+        """
+        if self._times and t_s < self._times[-1]:
+            self._times.clear()
+            self._rows.clear()
+        if self._times and t_s - self._times[-1] < INTERVAL_S:
+            return False
+        unknown = np.full(self._size, np.nan)
+        columns = (unknown if each is None else np.asarray(each, dtype=float) for each in (desired, value, true))
+        self._times.append(t_s)
+        self._rows.append(np.array(list(columns)))
+        while t_s - self._times[0] > SPAN_S:  # points of a fast run are far apart
+            self._times.popleft()
+            self._rows.popleft()
+        return True
+
+    def curves(self, index: int, angular: bool) -> tuple[Array, ...]:
+        """Return the times (M,) and the three curves (M,) of a variable, as `SERIES`; angles in degrees, wrapped.
+
+        A curve is broken (NaN) where an angle goes round.
+        """
+        t = np.array(self._times)
+        table = np.array(self._rows)[:, :, index] if self._rows else np.zeros((0, 3))
+        if angular:
+            table = np.degrees(np.arctan2(np.sin(table), np.cos(table)))
+            around = np.abs(np.diff(table, axis=0, prepend=table[:1])) > 180.0
+            table = np.where(around, np.nan, table)
+        return t, *table.T

@@ -1,0 +1,176 @@
+"""Controls of the run's time, of drones one by one or all together, and of injected faults."""
+
+from collections.abc import Callable
+from typing import Any
+
+import viser
+
+from zsim.contract.control_limits import GATES_MAX, RATE_MAX
+from zsim.scenario.fault_kinds import KINDS, PROCESS_KILL
+from zsim.scenario.scenario import Scenario
+from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.page import operator_input
+
+DURATION_S = 30.0  # of a fault, unless another time is typed
+WEAK_THRUST_SHARE = 0.7  # share of thrust of a weak motor: less, and the aircraft cannot be held level
+GUST_M_S = (4.0, 0.0, 0.0)  # about what the drones of the formation can still hold against
+LOSS_PROBABILITY = 0.3
+TIME_PARAMETERS = ("at_s", "for_s")  # s, simulated; of any fault, beside its own parameters
+
+
+class FaultForm:
+    """Controls of faults.
+
+    Args:
+        gui: viser's, in the folder where they are to be.
+        client: sends requests.
+        report: called with requests that are refused without being sent.
+        scenario: has the drones and processes.
+    """
+
+    def __init__(
+        self, gui: viser.GuiApi, client: CommandClient, report: Callable[[RequestOutcome], None], scenario: Scenario
+    ) -> None:
+        self._client = client
+        self._report = report
+        names = [drone.name for drone in scenario.drones]
+        self._drone = gui.add_dropdown("drone", names)
+        self._for = gui.add_number("for [s]", DURATION_S, min=0.0, max=1e5, step=1.0, hint="0: until it is cleared")
+        self._button(gui, "GPS lost", lambda: self._on_drone("gps_dropout"))
+        self._button(
+            gui, "Motor weak", lambda: self._on_drone("rotor_efficiency", rotor="front_left", value=WEAK_THRUST_SHARE)
+        )
+        self._button(gui, "Gust", lambda: self._add("gust", "world", velocity_m_s=list(GUST_M_S)))
+        self._button(
+            gui, "Link loss", lambda: self._add("link_loss", f"world/{self._estimator()}", probability=LOSS_PROBABILITY)
+        )
+        self._button(gui, "Kill estimator", lambda: self._add(PROCESS_KILL, self._estimator()))
+        self._any_fault(gui, names)
+        gui.add_button("Clear all faults", color="green").on_click(lambda _: client.request_world("fault_clear"))
+
+    def _button(self, gui: viser.GuiApi, label: str, act: Callable[[], None]) -> None:
+        gui.add_button(label, color="orange").on_click(lambda _: act())
+
+    def _estimator(self) -> str:
+        return f"estimator.{self._drone.value}"
+
+    def _on_drone(self, kind: str, **parameters: Any) -> None:
+        self._add(kind, self._drone.value, **parameters)
+
+    def _add(self, kind: str, target: str, **parameters: Any) -> None:
+        duration = {"for_s": float(self._for.value)} if self._for.value > 0 and KINDS[kind].lasts != "once" else {}
+        self._client.request_world("fault_add", kind=kind, target=target, **{**duration, **parameters})
+
+    def _any_fault(self, gui: viser.GuiApi, names: list[str]) -> None:
+        with gui.add_folder("Any fault", expand_by_default=False):
+            kind = gui.add_dropdown("kind", list(KINDS))
+            target = gui.add_text("target", names[0], hint="drone, world, process, or link A/B")
+            help_ = gui.add_markdown(_help(kind.value))
+            text = gui.add_text("parameters", "", hint="NAME: VALUE, NAME: VALUE, …; at_s and for_s too")
+            kind.on_update(lambda _: setattr(help_, "content", _help(kind.value)))
+            gui.add_button("Inject it", color="orange").on_click(
+                lambda _: self._inject(kind.value, target.value, text.value)
+            )
+
+    def _inject(self, kind: str, target: str, text: str) -> None:
+        try:
+            parameters = operator_input.parse_parameters(
+                text, [*TIME_PARAMETERS, *(p.name for p in KINDS[kind].parameters)]
+            )
+        except operator_input.InputError as error:
+            self._report(RequestOutcome("fault_add", str(error)))
+            return
+        self._add(kind, target.strip(), **parameters)
+
+
+def _help(kind: str) -> str:
+    """Return a kind's effect and parameters."""
+    fault = KINDS[kind]
+    lines = [f"`{p.name}` {p.said}{f' [{p.unit}]' if p.unit else ''}" for p in fault.parameters]
+    return f"<sub>{fault.said}; strikes a {fault.strikes}. {'; '.join(lines)}</sub>"
+
+
+PINNED = """<style>
+.mantine-ScrollArea-content div:has(.icon-tabler-alert-octagon) {overflow: visible !important}
+div:has(> button .icon-tabler-alert-octagon) {position: sticky; top: 0; z-index: 10}
+</style>"""  # the button of that icon is seen however far a page is scrolled: no box around it may clip
+FLEET = {"Take off all": "takeoff", "Land all": "land"}  # an operation of a formation, and a mode of a drone
+
+
+class RunForm:
+    """Pause, resume, single steps, rate.
+
+    Args:
+        gui: viser's, in the folder where they are to be.
+        client: sends requests.
+        rate: that the run was started with.
+    """
+
+    def __init__(self, gui: viser.GuiApi, client: CommandClient, rate: float) -> None:
+        gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE).on_click(lambda _: client.request_world("pause"))
+        gui.add_button("Resume", icon=viser.Icon.PLAYER_PLAY).on_click(lambda _: client.request_world("resume"))
+        gates = gui.add_number("gates", 1, min=1, max=GATES_MAX, step=1)
+        step = gui.add_button("Step", icon=viser.Icon.PLAYER_TRACK_NEXT)
+        step.on_click(lambda _: client.request_world("step", gates=int(gates.value)))
+        wanted = gui.add_number(
+            "rate", rate, min=0.0, max=RATE_MAX, step=0.5, hint="Real time is 1; 0: as fast as it goes"
+        )
+        gui.add_button("Set rate").on_click(lambda _: client.request_world("rate", value=float(wanted.value)))
+
+
+class FleetForm:
+    """Emergency, take-off and landing of all drones.
+
+    Formations take off and land by their controllers, drones of none each by itself.
+
+    Args:
+        gui: viser's, in the folder where they are to be.
+        client: sends requests.
+        scenario: names the drones and formations.
+    """
+
+    def __init__(self, gui: viser.GuiApi, client: CommandClient, scenario: Scenario) -> None:
+        self._client = client
+        self._formations = [cluster.name for cluster in scenario.clusters]
+        in_formation = {name for cluster in scenario.clusters for name in cluster.drones}
+        drones = [drone.name for drone in scenario.drones]
+        self._single = [name for name in drones if name not in in_formation]
+        stop = gui.add_button("EMERGENCY – all rotors stop", color="red", icon=viser.Icon.ALERT_OCTAGON)
+        stop.on_click(lambda _: client.send_mode(drones, "emergency"))
+        gui.add_html(PINNED)
+        both = gui.add_button_group("all drones", list(FLEET))
+        both.on_click(lambda _: self._request_all(FLEET[both.value]))
+
+    def _request_all(self, operation: str) -> None:
+        for name in self._formations:
+            self._client.request_cluster(name, operation)
+        if self._single:
+            self._client.send_mode(self._single, operation)
+
+
+class DroneForm:
+    """Take-off, landing and emergency of one drone.
+
+    Args:
+        gui: viser's, in the folder where they are to be.
+        client: sends requests.
+        scenario: names the drones.
+    """
+
+    def __init__(self, gui: viser.GuiApi, client: CommandClient, scenario: Scenario) -> None:
+        names = [drone.name for drone in scenario.drones]
+        self._chosen = gui.add_dropdown("drone", names)
+        for label, mode, icon in (
+            ("Take off drone", "takeoff", viser.Icon.PLANE_DEPARTURE),
+            ("Land drone", "land", viser.Icon.PLANE_ARRIVAL),
+            ("Emergency drone", "emergency", viser.Icon.ALERT_TRIANGLE),
+            ("Reset drone", "reset", viser.Icon.REFRESH),
+        ):
+            colour = "red" if mode == "emergency" else "gray"
+            button = gui.add_button(label, icon=icon, color=colour)
+            button.on_click(lambda _, mode=mode: client.send_mode([self._chosen.value], mode))
+
+    @property
+    def chosen(self) -> str:
+        """Name of the drone that is chosen."""
+        return self._chosen.value

@@ -1,0 +1,295 @@
+"""The scene of the page: viser's nodes and cameras; only what has changed is sent."""
+
+import math
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from zsim.scenario.scenario import Obstacle
+from zsim_bridges.console.page import airframe
+from zsim_bridges.console.page.picture import Array, DronePoses, Ellipsoids, FormationShape, rotor_angles, rotor_poses
+
+OFFSET_M = np.array([-2.3, -3.9, 1.7])  # of a camera, from what it looks at, where that is not larger than EXTENT_M
+EXTENT_M = 2.0  # from its centre
+DEADBAND_M = 0.25  # a shorter move does not move the camera: pictures then need not be drawn anew
+
+
+class CameraFollow:
+    """Cameras of all pages: where they begin, and which follow the formation, as each page chooses.
+
+    Args:
+        server: viser's.
+
+    Attributes:
+        switches: ids of the controls by which each page chooses for itself.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.switches: set[str] = set()
+        self._server = server
+        self._lock = threading.Lock()
+        self._switches: dict[int, tuple[viser.ClientHandle, Any]] = {}
+        self._targets: dict[int, Array] = {}
+        self._centre: Array = np.zeros(3)
+        self._offset: Array = OFFSET_M
+        self._aimed = False
+        server.on_client_connect(self._on_connect)
+        server.on_client_disconnect(self._on_disconnect)
+
+    def restart(self) -> None:
+        """Aim all cameras anew at the first picture: another run may fly elsewhere."""
+        self._aimed = False
+
+    def set_target(self, p_W: Array) -> None:
+        """Aim the cameras of later pages at positions (n, 3) [m], unless there are none."""
+        if not len(p_W):
+            return
+        self._centre = p_W.mean(axis=0)
+        extent_m = float(np.linalg.norm(p_W - self._centre, axis=1).max())
+        self._offset = OFFSET_M * max(1.0, extent_m / EXTENT_M)
+
+    def follow(self, p_W: Array) -> None:
+        """Move the cameras that follow the positions (n, 3) [m]."""
+        self.set_target(p_W)
+        centre = self._centre
+        with self._lock:
+            switches = list(self._switches.items())
+        if not self._aimed and len(p_W):
+            self._aimed = True
+            for _, (client, _) in switches:
+                _aim(client, centre, self._offset)
+        for number, (client, switch) in switches:
+            if self._moves(number, switch.value, centre):
+                _aim(client, centre, client.camera.position - client.camera.look_at)
+
+    def _moves(self, number: int, follows: bool, centre: Array) -> bool:
+        """Return whether a page's camera has to move, and store where to."""
+        with self._lock:
+            if not follows:
+                self._targets.pop(number, None)
+            near = np.linalg.norm(centre - self._targets.get(number, np.full(3, np.inf))) <= DEADBAND_M
+            if not follows or near or number not in self._switches:
+                return False
+            self._targets[number] = centre
+            return True
+
+    def _on_connect(self, client: viser.ClientHandle) -> None:
+        with client.atomic():
+            _aim(client, self._centre, self._offset)
+        switch = client.gui.add_checkbox("Camera follows the formation", False, order=-1.0)
+        with self._lock:
+            self._switches[client.client_id] = (client, switch)
+            self.switches.add(switch._impl.uuid)
+        if client.client_id not in self._server.get_clients():
+            self._on_disconnect(client)  # it has disconnected meanwhile
+
+    def _on_disconnect(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            _, switch = self._switches.pop(client.client_id, (None, None))
+            self._targets.pop(client.client_id, None)
+            if switch is not None:
+                self.switches.discard(switch._impl.uuid)
+
+
+def _aim(client: viser.ClientHandle, centre: Array, offset: Array) -> None:
+    with client.atomic():
+        client.camera.position = centre + offset
+        client.camera.look_at = centre
+
+
+NAMED_MAX = 12  # drones with their names beside them; more would hide each other
+TRAIL_COLOURS = np.array(
+    [(25, 113, 194), (232, 137, 12), (47, 158, 68), (156, 54, 181), (224, 49, 49), (12, 133, 153)], np.uint8
+)
+SOLID = (134, 142, 150)
+GHOST, ELLIPSOID, WIND, SIDE = (77, 171, 247), (250, 176, 5), (21, 170, 191), (226, 0, 134)
+FIELD_M = 150.0  # half a side of the ground
+GREEN = (206, 219, 196)
+WIND_M_PER_M_S = 0.5  # length of the arrow
+WIND_MIN_M_S = 0.05  # below it no arrow
+WIND_ABOVE_M = 1.5  # of the arrow over the highest drone
+LABEL_B = np.array([0.0, 0.0, 0.32])  # m; of a name over its drone
+MIDDLE = "center-center"  # of a label
+LABELS_MAX = 3  # p, q and beta
+HIDDEN = (0.0, 0.0, -1000.0)  # m; position of instances that are not shown, since they cannot be hidden one by one
+
+
+class SceneNodes:
+    """The nodes of one run.
+
+    Args:
+        server: viser's; what another run has left on it is removed.
+        names: of the drones.
+        robots: how many drones are in formations, and so have a ghost.
+        clusters: how many formations there are.
+    """
+
+    def __init__(self, server: viser.ViserServer, names: tuple[str, ...], robots: int, clusters: int) -> None:
+        self._server = server
+        self._scene = server.scene
+        self._count = len(names)
+        self._angles = np.zeros((len(names), 4))
+        self._hubs_B = np.column_stack((airframe.HUBS_B, np.full(4, airframe.ROTOR_Z_M)))
+        self._trail_node: Any = None
+        self._trails_shown = True
+        server.scene.reset()
+        server.scene.set_up_direction("+z")
+        self._ground()
+        p, q, _ = _padded(len(names), np.zeros((0, 3)), np.zeros((0, 4)))
+        self._airframes: Any = self._scene.add_batched_glb("/drones", airframe.coloured(), q, p, lod="off")
+        self._rotors = self._batch("/rotors", airframe.rotor(), 4 * len(names), airframe.COLOURS["rotor"])
+        self._ghosts = self._batch("/ghosts", airframe.whole(), robots, GHOST, opacity=0.5) if robots else None
+        self._ellipsoids = self._batch("/estimates", airframe.ball(), len(names), ELLIPSOID, opacity=0.35)
+        self._names = self._labels(names)
+        self._wind = self._scene.add_arrows(
+            "/wind", np.array([[(0, 0, 0), (1, 0, 0)]], float), WIND, shaft_radius=0.035, head_radius=0.1,
+            head_length=0.22, visible=False,
+        )  # fmt: skip
+        self._wind_label = self._scene.add_label("/wind_speed", "", visible=False, anchor="bottom-center")
+        self._shapes = _FormationNodes(self._scene, clusters) if clusters else None
+
+    def obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        """Draw the obstacles of the scenario: boxes, cylinders and spheres."""
+        for each in obstacles:
+            x, y, z = each.position_m
+            turn = math.radians(each.yaw_deg) / 2
+            look: Any = {"wxyz": (math.cos(turn), 0.0, 0.0, math.sin(turn)), "color": SOLID}
+            name = f"/obstacles/{each.name}"
+            height_m = each.height_m or 0.0
+            if each.size_m is not None:
+                self._scene.add_box(name, dimensions=each.size_m, position=(x, y, z + each.size_m[2] / 2), **look)
+            elif each.shape == "cylinder":
+                centre = (x, y, z + height_m / 2)
+                self._scene.add_cylinder(name, radius=each.radius_m or 0.0, height=height_m, position=centre, **look)
+            else:
+                self._scene.add_icosphere(name, radius=each.radius_m or 0.0, position=(x, y, z), **look)
+
+    def drones(self, drones: DronePoses, dt_s: float) -> None:
+        """Move the drones; their rotors have turned for dt_s."""
+        drones = drones._replace(p_W=np.where(drones.present[:, None], drones.p_W, HIDDEN))
+        self._airframes.batched_positions, self._airframes.batched_wxyzs = drones.p_W, drones.q_WB
+        self._angles = rotor_angles(self._angles, drones.rotor, dt_s)
+        self._rotors.batched_positions, self._rotors.batched_wxyzs = rotor_poses(drones, self._hubs_B, self._angles)
+        for label, p_W in zip(self._names, drones.p_W, strict=False):
+            label.position = p_W + LABEL_B
+
+    def wind(self, drones: DronePoses) -> None:
+        """Set the arrow of the wind, above the drones."""
+        speed = float(np.linalg.norm(drones.wind_W))
+        present = drones.p_W[drones.present]
+        blows = speed >= WIND_MIN_M_S and len(present) > 0
+        self._wind.visible = self._wind_label.visible = blows
+        if blows:
+            start = np.array([*present[:, :2].mean(axis=0), present[:, 2].max() + WIND_ABOVE_M])
+            self._wind.points = np.array([[start, start + WIND_M_PER_M_S * drones.wind_W]])
+            self._wind_label.position, self._wind_label.text = start, f"wind {speed:.1f} m/s"
+
+    def estimates(self, ellipsoids: Ellipsoids) -> None:
+        """Move the ellipsoids of the estimates."""
+        p, q, half_m = _padded(self._count, ellipsoids.p_W, ellipsoids.wxyz)
+        half_m[: len(ellipsoids.half_m)] = ellipsoids.half_m
+        self._ellipsoids.batched_positions, self._ellipsoids.batched_wxyzs, self._ellipsoids.batched_scales = (
+            p,
+            q,
+            half_m,
+        )
+
+    def ghosts(self, p_W: Array, q: Array) -> None:
+        """Move the ghosts of the formations to their desired positions; missing ones are hidden."""
+        if self._ghosts is not None:
+            positions, attitudes, _ = _padded(len(self._ghosts.batched_positions), p_W, q)
+            self._ghosts.batched_positions, self._ghosts.batched_wxyzs = positions, attitudes
+
+    def shapes(self, shapes: Sequence[FormationShape | None], chosen: int) -> None:
+        """Draw the frames and triangles of all formations, and the figures of the chosen one."""
+        if self._shapes is not None:
+            self._shapes.show(shapes, chosen)
+
+    def trails(self, segments: Array, owners: NDArray[np.int64]) -> None:
+        """Draw the drones' trails."""
+        if not len(segments):  # after a replay went back, the old ones must be removed
+            segments, owners = np.tile(HIDDEN, (1, 2, 1)), np.zeros(1, dtype=np.int64)
+        colours = np.repeat(TRAIL_COLOURS[owners % len(TRAIL_COLOURS)][:, None], 2, axis=1)
+        if self._trail_node is None:
+            self._trail_node = self._scene.add_line_segments(
+                "/trails", segments, colours, thickness=2.0, thickness_units="screen", visible=self._trails_shown
+            )
+        else:
+            self._trail_node.points, self._trail_node.colors = segments, colours
+
+    def show(self, what: str, visible: bool) -> None:
+        """Show or hide ghosts, estimates or trails."""
+        self._trails_shown = visible if what == "trails" else self._trails_shown
+        node = {"ghosts": self._ghosts, "estimates": self._ellipsoids, "trails": self._trail_node}[what]
+        if node is not None:
+            node.visible = visible
+
+    def _ground(self) -> None:
+        # Opaque, and no background image: what viser draws of a grid's plane or of a sky hides whatever is transparent.
+        self._scene.add_box(
+            "/field", GREEN, (2 * FIELD_M, 2 * FIELD_M, 0.02), position=(0.0, 0.0, -0.015), cast_shadow=False
+        )
+        self._scene.add_grid(
+            "/ground", 2 * FIELD_M, 2 * FIELD_M, cell_size=1.0, section_size=5.0, cell_color=(190, 200, 184),
+            section_color=(138, 150, 132), fade_distance=80.0, shadow_opacity=0.0,
+        )  # fmt: skip
+        self._scene.add_frame("/origin", axes_length=1.0, axes_radius=0.02, position=(0.0, 0.0, 0.01))
+        self._scene.add_label("/origin/e", "east", position=(1.1, 0.0, 0.0))
+        self._scene.add_label("/origin/n", "north", position=(0.0, 1.1, 0.0))
+
+    def _batch(self, name: str, mesh: airframe.Mesh, count: int, colour: Any, opacity: float | None = None) -> Any:
+        p, q, scales = _padded(count, np.zeros((0, 3)), np.zeros((0, 4)))
+        return self._scene.add_batched_meshes_simple(
+            name, mesh.vertices, mesh.faces, q, p, batched_scales=scales, batched_colors=colour, opacity=opacity,
+            lod="off", flat_shading=opacity is None, cast_shadow=opacity is None, receive_shadow=False,
+        )  # fmt: skip
+
+    def _labels(self, names: tuple[str, ...]) -> list[Any]:
+        if len(names) > NAMED_MAX:
+            return []
+        return [self._scene.add_label(f"/names/{name}", name, anchor="bottom-center") for name in names]
+
+
+class _FormationNodes:
+    """Frames and triangles of all formations as one node each, and the labels of one of them."""
+
+    def __init__(self, scene: viser.SceneApi, count: int) -> None:
+        self._scene = scene
+        p, q, _ = _padded(count, np.zeros((0, 3)), np.zeros((0, 4)))
+        self._frames: Any = scene.add_batched_axes("/formations/frames", q, p, axes_length=0.7, axes_radius=0.02)
+        self._lines: Any = None
+        self._labels = [
+            scene.add_label(f"/formations/label{i}", "", visible=False, anchor=MIDDLE) for i in range(LABELS_MAX)
+        ]
+
+    def show(self, shapes: Sequence[FormationShape | None], chosen: int) -> None:
+        shown = [shape for shape in shapes if shape is not None]
+        p_W, q = np.array([s.p_c for s in shown]).reshape(-1, 3), np.array([s.q_WC for s in shown]).reshape(-1, 4)
+        self._frames.batched_positions, self._frames.batched_wxyzs, _ = _padded(len(shapes), p_W, q)
+        self._draw(np.array([side.ends_W for shape in shown for side in shape.sides]).reshape(-1, 2, 3))
+        self._write(shapes[chosen])
+
+    def _draw(self, points: Array) -> None:
+        if self._lines is not None:
+            self._lines.points = points
+        elif len(points):
+            self._lines = self._scene.add_line_segments("/formations/sides", points, SIDE, thickness=0.015)
+
+    def _write(self, shape: FormationShape | None) -> None:
+        texts = [] if shape is None else [(s.name, s.ends_W.mean(axis=0)) for s in shape.sides if s.name]
+        texts += [(shape.corner[1], shape.corner[0])] if shape is not None and shape.corner else []
+        for i, label in enumerate(self._labels):
+            label.visible = i < len(texts)
+            if label.visible:
+                label.text, label.position = texts[i]
+
+
+def _padded(count: int, p_W: Array, q: Array) -> tuple[Array, Array, Array]:
+    """Return positions (count, 3), attitudes (count, 4) and scales (count, 3); beyond p_W and q they are hidden."""
+    positions, attitudes = np.tile(np.array(HIDDEN), (count, 1)), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
+    positions[: len(p_W)], attitudes[: len(q)] = p_W, q
+    return positions, attitudes, np.ones((count, 3))

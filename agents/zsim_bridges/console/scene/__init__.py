@@ -1,1 +1,0 @@
-"""What the console draws: aircraft, trails, formation, wind, plots. Imports zsim alone."""

@@ -1,1 +1,0 @@
-"""The gateway's streams: lines of JSON on TCP and on a WebSocket, and the clients on them."""

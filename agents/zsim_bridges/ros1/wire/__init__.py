@@ -1,1 +1,0 @@
-"""ROS 1 on the wire without ROS: master, TCPROS, XML-RPC, message types. Imports nothing of a run."""

@@ -1,0 +1,110 @@
+"""What the web servers of console and gateway share: event loop thread, listening, and who may reach them."""
+
+import asyncio
+import hmac
+import logging
+import threading
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
+from ipaddress import ip_address
+from typing import Any, TypeVar
+from urllib.parse import urlsplit
+
+from aiohttp import web
+
+from zsim.errors import RunError
+
+Resource = TypeVar("Resource")
+_NO_LOG = logging.Logger("quiet", logging.CRITICAL + 1)  # requests that are not HTTP are answered, not logged
+
+
+async def start_site(app: web.Application, host: str, port: int, shutdown_s: float) -> web.AppRunner:
+    """Serve an application on a port.
+
+    Raises:
+        OSError: the port cannot be opened.
+    """
+    runner = web.AppRunner(app, access_log=None, logger=_NO_LOG, shutdown_timeout=shutdown_s)
+    await runner.setup()
+    try:
+        await web.TCPSite(runner, host, port).start()
+    except OSError:
+        await runner.cleanup()
+        raise
+    return runner
+
+
+def check_token(process: str, host: str, token: str | None) -> None:
+    """Refuse to listen where others could connect without a token.
+
+    Raises:
+        RunError: the token is empty, or there is none and the host is not loopback.
+    """
+    if token == "":
+        raise RunError(f"{process}: the token is empty; give it one, or leave --token and ZSIM_TOKEN away")
+    if token is None and not is_loopback(host):
+        raise RunError(f"{process}: {host} can be reached by others; give it a --token, or --listen 127.0.0.1")
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host name or address is this machine alone."""
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def is_loopback_authority(authority: str) -> bool:
+    """Return whether a Host header, or the host and port of an origin, name this machine alone.
+
+    Raises:
+        ValueError: it cannot be parsed.
+    """
+    return is_loopback(urlsplit(f"//{authority}").hostname or "")
+
+
+def tokens_match(received: str, token: str) -> bool:
+    """Compare in constant time; what was received may hold any bytes of a header."""
+    return hmac.compare_digest(received.encode(errors="surrogatepass"), token.encode(errors="surrogatepass"))
+
+
+def url_host(host: str) -> str:
+    """Return a host as URLs write it: an IPv6 address in brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
+@contextmanager
+def open_on_thread(
+    loop: asyncio.AbstractEventLoop,
+    name: str,
+    enter: Callable[[], Coroutine[Any, Any, Resource]],
+    leave: Callable[[Resource], Coroutine[Any, Any, None]],
+) -> Iterator[None]:
+    """Run an event loop on a thread of its own, open a resource on it, and close both at the end.
+
+    Args:
+        loop: is closed at the end.
+        name: of the thread.
+        enter, leave: open and close the resource; exceptions of `enter` are raised here.
+    """
+    thread = threading.Thread(target=loop.run_forever, name=name, daemon=True)
+    thread.start()
+    try:
+        resource = asyncio.run_coroutine_threadsafe(enter(), loop).result()
+        try:
+            yield
+        finally:
+            asyncio.run_coroutine_threadsafe(leave(resource), loop).result()
+    finally:
+        asyncio.run_coroutine_threadsafe(cancel_other_tasks(), loop).result()
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
+
+
+async def cancel_other_tasks() -> None:
+    """Cancel all other tasks of the loop and wait for them: a loop that closes over a task complains of it."""
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in others:
+        task.cancel()
+    await asyncio.gather(*others, return_exceptions=True)

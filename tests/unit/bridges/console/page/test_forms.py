@@ -1,0 +1,472 @@
+"""The console's forms: what each control of the page asks for. The page is one that notes its controls."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+
+from zsim.contract.messages import ViewCluster
+from zsim.scenario import scenario_file
+from zsim.scenario.fault_kinds import KINDS
+from zsim.scenario.scenario import Scenario
+from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_bridges.console.command_client import RequestOutcome
+from zsim_bridges.console.page.console_page import SWITCHES, ConsolePage
+from zsim_bridges.console.page.formation_form import REST_S, STILL_S, FormationForm
+from zsim_bridges.console.page.operator_input import slider_ranges
+from zsim_bridges.console.page.run_forms import (
+    DURATION_S,
+    GUST_M_S,
+    LOSS_PROBABILITY,
+    WEAK_THRUST_SHARE,
+    DroneForm,
+    FaultForm,
+    FleetForm,
+    RunForm,
+)
+
+SCENARIOS = Path(__file__).parents[5] / "scenarios"
+PERSON, NOBODY = 1, None  # who moved a slider
+LATER_S = 1e9  # on the wall: long after any move
+
+
+class Control:
+    """A control: its value, and what happens when somebody uses it."""
+
+    def __init__(self, value: Any = None) -> None:
+        self.value = value
+        self.content = ""
+        self.visible = True
+        self.acts: list[Callable[[Any], None]] = []
+
+    def __enter__(self) -> "Control":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+    def on_click(self, act: Callable[[Any], None]) -> None:
+        self.acts.append(act)
+
+    on_update = on_click
+
+    def put(self, value: Any, client_id: int | None = PERSON) -> None:
+        """Change the value as a page does, or as the console itself does."""
+        self.value = value
+        for act in self.acts:
+            act(SimpleNamespace(client_id=client_id))
+
+    def add_tab(self, label: str, icon: Any = None) -> "Control":
+        return Control()
+
+    def dock_left(self) -> None:
+        return
+
+    dock_right = dock_left
+
+    def set_width(self, _: float) -> None:
+        return
+
+
+class Gui:
+    """A page that notes its controls by their label."""
+
+    def __init__(self) -> None:
+        self.main_panel = Control()
+        self.at: dict[str, Control] = {}
+
+    def _add(self, label: str | None, value: Any = None) -> Control:
+        control = Control(value)
+        if label is not None:
+            assert label not in self.at, f"two controls are called {label!r}"
+            self.at[label] = control
+        return control
+
+    def add_button(self, label: str, **_: Any) -> Control:
+        return self._add(label)
+
+    def add_button_group(self, label: str, options: list[str]) -> Control:
+        return self._add(label, options[0])
+
+    def add_dropdown(self, label: str, options: list[str], initial_value: str | None = None) -> Control:
+        return self._add(None if label in self.at else label, initial_value or options[0])
+
+    def add_number(self, label: str, value: float, **_: Any) -> Control:
+        return self._add(label, value)
+
+    def add_slider(self, label: str, low: float, high: float, step: float, value: float) -> Control:
+        return self._add(label, value)
+
+    def add_text(self, label: str, value: str, **_: Any) -> Control:
+        return self._add(label, value)
+
+    def add_checkbox(self, label: str, value: bool, **_: Any) -> Control:
+        return self._add(label, value)
+
+    def add_folder(self, label: str | None, **_: Any) -> Control:
+        return Control()
+
+    def add_html(self, _: str) -> Control:
+        return Control()
+
+    def add_uplot(self, *_: Any, **__: Any) -> Control:
+        return Control()
+
+    add_markdown = add_html
+
+    def add_tab_group(self) -> Control:
+        return Control()
+
+    add_panel = add_tab_group
+
+    def reset(self) -> None:
+        return
+
+    def configure_theme(self, **_: Any) -> None:
+        return
+
+    def set_panel_label(self, _: str) -> None:
+        return
+
+    def press(self, label: str) -> None:
+        self.at[label].put(None)
+
+
+class FakeCommandClient:
+    """Notes what is asked for."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Any, ...]] = []
+        self.shown: list[str] = []
+
+    def request_world(self, op: str, **args: Any) -> None:
+        self.asked.append(("world", op, args))
+
+    def request_cluster(self, cluster: str, op: str, shown: str = "", **args: Any) -> None:
+        self.shown.append(shown)
+        self.asked.append((cluster, op, args))
+
+    def send_mode(self, drones: list[str], mode: str) -> None:
+        self.asked.append((tuple(drones), mode))
+
+
+class Bench:
+    """A page, its desk, and what was refused already here."""
+
+    def __init__(self, scenario: str = "step") -> None:
+        self.gui: Any = Gui()
+        self.desk: Any = FakeCommandClient()
+        self.told: list[RequestOutcome] = []
+        self.scenario = scenario_file.load(SCENARIOS / f"{scenario}.yaml")
+        self.names = tuple(drone.name for drone in self.scenario.drones)
+        self.cluster = self.scenario.clusters[0]
+        self.space = scenario_space(self.scenario, self.cluster)
+
+    def formation(self) -> FormationForm:
+        found = slider_ranges(self.space, self.cluster, self.scenario)
+        return FormationForm(self.gui, self.desk, self.told.append, self.cluster, self.space, found)
+
+    def faults(self) -> None:
+        FaultForm(self.gui, self.desk, self.told.append, self.scenario)
+
+    def view(self, **values: float) -> ViewCluster:
+        c = [values.get(name, 0.0) for name in self.space.names]
+        return ViewCluster(0, 0, "engaged", self.space.names, tuple(c), tuple(c), "")
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+# The run, and drones one by one
+
+
+@pytest.mark.parametrize(
+    ("label", "asked"),
+    [
+        ("Pause", ("pause", {})),
+        ("Resume", ("resume", {})),
+        ("Step", ("step", {"gates": 7})),
+        ("Set rate", ("rate", {"value": 2.5})),
+    ],
+)
+def test_the_run_is_asked_for_what_the_button_says(bench: Bench, label: str, asked: tuple[Any, ...]):
+    RunForm(bench.gui, bench.desk, 1.0)
+    bench.gui.at["gates"].value, bench.gui.at["rate"].value = 7.0, 2.5
+    bench.gui.press(label)
+    assert bench.desk.asked == [("world", *asked)]
+    assert all(isinstance(gates, int) for gates in bench.desk.asked[0][2].values() if asked[0] == "step")
+
+
+@pytest.mark.parametrize(
+    ("label", "mode"),
+    [
+        ("Take off drone", "takeoff"),
+        ("Land drone", "land"),
+        ("Emergency drone", "emergency"),
+        ("Reset drone", "reset"),
+    ],
+)
+def test_the_chosen_drone_alone_gets_its_mode(bench: Bench, label: str, mode: str):
+    form = DroneForm(bench.gui, bench.desk, bench.scenario)
+    bench.gui.at["drone"].value = bench.names[1]
+    bench.gui.press(label)
+    assert form.chosen == bench.names[1]
+    assert bench.desk.asked == [((bench.names[1],), mode)]
+
+
+@pytest.mark.parametrize(("label", "what"), [("Take off all", "takeoff"), ("Land all", "land")])
+def test_all_formations_and_all_drones_of_none_take_off_and_land(bench: Bench, label: str, what: str):
+    FleetForm(bench.gui, bench.desk, mixed())
+    bench.gui.at["all drones"].put(label)
+    assert bench.desk.asked == [("main", what, {}), ("other", what, {}), (("d5", "d6"), what)]
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_all_drones_are_in_formations_or_none_is(bench: Bench, alone: bool):
+    scenario = mixed()
+    clusters, drones = ([], scenario.drones[4:]) if alone else (scenario.clusters, scenario.drones[:4])
+    FleetForm(bench.gui, bench.desk, msgspec.structs.replace(scenario, clusters=clusters, drones=drones))
+    bench.gui.at["all drones"].put("Land all")
+    formations = [("main", "land", {}), ("other", "land", {})]
+    assert bench.desk.asked == ([(("d5", "d6"), "land")] if alone else formations)
+
+
+def mixed() -> Scenario:
+    """Return two formations, and two drones of none."""
+    drones = [{"name": f"d{k}", "position_m": [3 * k, 0, 0]} for k in range(1, 7)]
+    clusters = [{"name": "main", "drones": ["d1", "d2"]}, {"name": "other", "drones": ["d3", "d4"]}]
+    return scenario_file.resolve({"name": "t", "duration_s": 1, "drones": drones, "clusters": clusters}, "mixed.yaml")
+
+
+# Faults
+
+
+@pytest.mark.parametrize(
+    ("label", "asked"),
+    [
+        ("GPS lost", {"kind": "gps_dropout", "target": "drone2", "for_s": DURATION_S}),
+        (
+            "Motor weak",
+            {
+                "kind": "rotor_efficiency",
+                "target": "drone2",
+                "for_s": DURATION_S,
+                "rotor": "front_left",
+                "value": WEAK_THRUST_SHARE,
+            },
+        ),
+        ("Gust", {"kind": "gust", "target": "world", "for_s": DURATION_S, "velocity_m_s": list(GUST_M_S)}),
+        (
+            "Link loss",
+            {
+                "kind": "link_loss",
+                "target": "world/estimator.drone2",
+                "for_s": DURATION_S,
+                "probability": LOSS_PROBABILITY,
+            },
+        ),
+        ("Kill estimator", {"kind": "process_kill", "target": "estimator.drone2"}),
+    ],
+)
+def test_a_common_fault_strikes_the_chosen_drone(bench: Bench, label: str, asked: dict[str, Any]):
+    bench.faults()
+    bench.gui.at["drone"].value = "drone2"
+    bench.gui.press(label)
+    assert bench.desk.asked == [("world", "fault_add", asked)]
+
+
+def test_a_fault_of_no_duration_lasts_until_it_is_cleared(bench: Bench):
+    bench.faults()
+    bench.gui.at["for [s]"].value = 0.0
+    bench.gui.press("GPS lost")
+    bench.gui.press("Clear all faults")
+    lasting = {"kind": "gps_dropout", "target": bench.names[0]}
+    assert bench.desk.asked == [("world", "fault_add", lasting), ("world", "fault_clear", {})]
+
+
+def test_any_fault_is_injected_with_what_was_typed(bench: Bench):
+    bench.faults()
+    bench.gui.at["kind"].put("baro_bias")
+    bench.gui.at["target"].value = " drone3 "
+    bench.gui.at["parameters"].value = "value_m: 2.5"
+    bench.gui.press("Inject it")
+    asked = {"kind": "baro_bias", "target": "drone3", "for_s": DURATION_S, "value_m": 2.5}
+    assert bench.desk.asked == [("world", "fault_add", asked)]
+
+
+def test_a_time_among_the_parameters_is_the_one_that_is_sent(bench: Bench):
+    bench.faults()
+    bench.gui.at["parameters"].value = "for_s: 5, at_s: 40"
+    bench.gui.press("Inject it")
+    asked = {"kind": next(iter(KINDS)), "target": bench.names[0], "for_s": 5, "at_s": 40}
+    assert bench.desk.asked == [("world", "fault_add", asked)]
+
+
+def test_a_kill_by_its_kind_is_sent_without_a_duration(bench: Bench):
+    bench.faults()
+    bench.gui.at["kind"].put("process_kill")
+    bench.gui.at["target"].value = "estimator.drone1"
+    bench.gui.press("Inject it")
+    assert bench.desk.asked == [("world", "fault_add", {"kind": "process_kill", "target": "estimator.drone1"})]
+
+
+@pytest.mark.parametrize("text", ["value", "a: 2024-13-45", "[" * 2000, "probability: 1, probability: 0"])
+def test_parameters_that_are_none_are_told_and_not_sent(bench: Bench, text: str):
+    bench.faults()
+    bench.gui.at["parameters"].value = text
+    bench.gui.press("Inject it")
+    assert bench.desk.asked == []
+    assert "must be NAME: VALUE" in bench.told[0].refusal
+
+
+@pytest.mark.parametrize("name", ["kind", "target", "op", "self", "value"])
+def test_a_parameter_that_a_kind_has_not_is_told_and_not_sent(bench: Bench, name: str):
+    bench.faults()
+    bench.gui.at["parameters"].value = f"{name}: x"
+    bench.gui.press("Inject it")
+    assert bench.desk.asked == []
+    assert bench.told[0].refusal.endswith(f"{name!r} is not known, allowed: at_s, for_s, probability")
+
+
+# A formation
+
+
+@pytest.mark.parametrize(
+    ("label", "op"), [("Take off", "takeoff"), ("Engage", "engage"), ("Hold", "hold"), ("Land", "land")]
+)
+def test_a_formation_is_asked_for_its_phase(bench: Bench, label: str, op: str):
+    bench.formation()
+    bench.gui.press(label)
+    assert bench.desk.asked == [(bench.cluster.name, op, {})]
+
+
+def test_sliders_that_rest_are_sent_together_and_once(bench: Bench):
+    form = bench.formation()
+    bench.gui.at["p [m]"].put(5.0)
+    bench.gui.at["z_c [m]"].put(4.0)
+    form.send(0.0)  # on the wall: no rest yet
+    assert bench.desk.asked == []
+    form.send(LATER_S)
+    form.send(LATER_S + REST_S)
+    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0, "z_c": 4.0}})]
+
+
+def test_a_slider_that_the_console_moves_asks_for_nothing(bench: Bench):
+    form = bench.formation()
+    bench.gui.at["p [m]"].put(5.0, NOBODY)
+    form.send(LATER_S)
+    assert bench.desk.asked == []
+
+
+def test_sliders_follow_the_formation_but_for_those_that_somebody_moves(bench: Bench):
+    form = bench.formation()
+    bench.gui.at["p [m]"].put(5.0)
+    form.refresh(bench.view(p=7.0, q=8.0), LATER_S)
+    assert bench.gui.at["p [m]"].value == 5.0
+    assert bench.gui.at["q [m]"].value == 8.0
+    form.send(LATER_S)
+    for step in range(1, 20):
+        form.refresh(bench.view(p=7.0 - 0.1 * step), LATER_S + step)
+        assert bench.gui.at["p [m]"].value == 5.0  # the formation is on its way there
+    form.refresh(bench.view(p=5.1), LATER_S + 19.0 + 2 * STILL_S)  # it was held
+    assert bench.gui.at["p [m]"].value == 5.1
+
+
+def test_people_are_told_of_targets_in_the_units_of_the_page(bench: Bench):
+    bench.formation().request_target({"p": 5.0, "yaw": 180.0})
+    assert bench.desk.shown == ["p 5 m, yaw 180 deg"]
+
+
+def test_a_move_lasts_as_long_as_is_asked_for(bench: Bench):
+    form = bench.formation()
+    bench.gui.at["over [s]"].value = 20.0
+    form.request_target({"p": 5.0})
+    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0}, "over_s": 20.0})]
+
+
+@pytest.mark.parametrize("left_s", [0.0, LATER_S])
+def test_a_number_out_of_range_is_not_flown_to_the_limit_when_its_box_is_left(bench: Bench, left_s: float):
+    form = bench.formation()
+    box = bench.gui.at["y_c [m]"]
+    limit = form._ranges["y_c"].high
+    box.put(500.0)
+    form.send(left_s)
+    box.put(limit)  # the page does, when its box is left
+    form.send(LATER_S)
+    assert bench.desk.asked == []
+    assert [told.refusal.partition(";")[0] for told in bench.told] == ["y_c is 500 m"]
+    form.refresh(bench.view(y_c=-5.0), LATER_S)
+    assert box.value == -5.0
+    box.put(limit)  # somebody means it
+    form.send(LATER_S)
+    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {"y_c": limit}})]
+
+
+def test_a_value_out_of_range_is_told_and_not_sent(bench: Bench):
+    bench.formation().request_target({"p": 0.5})
+    assert bench.desk.asked == []
+    assert bench.told[0].refusal.startswith("p is 0.5 m")
+
+
+def test_of_many_variables_the_others_are_moved_one_at_a_time():
+    bench = Bench("grid30")
+    bench.formation()
+    hidden = next(name for name in bench.space.names if f"{name} [m]" not in bench.gui.at and name.startswith("w"))
+    bench.gui.at["variable"].value = hidden
+    bench.gui.at["value [m or deg]"].value = 0.5
+    bench.gui.press("Move it")
+    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {hidden: 0.5}})]
+
+
+def test_trajectories_are_flown_as_they_are_typed(bench: Bench):
+    bench.formation()
+    bench.gui.at["expressions"].value = "x_c = R*cos(0.1*t)\nR = 5"
+    bench.gui.press("Fly the expressions")
+    bench.gui.at["waypoints"].value = "20: x_c = 5"
+    bench.gui.press("Fly the waypoints")
+    name = bench.cluster.name
+    assert bench.desk.asked == [
+        (name, "trajectory", {"expressions": {"x_c": "R*cos(0.1*t)"}, "constants": {"R": 5.0}}),
+        (name, "trajectory", {"waypoints": [{"at_s": 20.0, "values": {"x_c": 5.0}}]}),
+    ]
+
+
+def test_the_trajectory_of_the_scenario_is_flown_as_it_stands_there():
+    bench = Bench("trajectory")
+    bench.formation()
+    bench.gui.press("Fly the scenario's")
+    planned = bench.cluster.plan.trajectory
+    assert planned is not None
+    asked = {"expressions": planned.expressions, "constants": planned.constants}
+    assert planned.expressions
+    assert bench.desk.asked == [(bench.cluster.name, "trajectory", asked)]
+
+
+def test_a_trajectory_that_is_none_is_told_and_not_sent(bench: Bench):
+    bench.formation()
+    bench.gui.at["waypoints"].value = "soon"
+    bench.gui.press("Fly the waypoints")
+    assert bench.desk.asked == []
+    assert bench.told[0].request == f"{bench.cluster.name}: trajectory"
+
+
+# The page
+
+
+def test_emergency_stops_everybody_and_switches_change_the_scene(bench: Bench):
+    shown: list[tuple[str, bool]] = []
+    spaces = {bench.cluster.name: bench.space}
+    show = lambda *switched: shown.append(switched)  # noqa: E731
+    page = ConsolePage(bench.gui, bench.scenario, spaces, bench.desk, bench.told.append, show, 2.0)
+    assert bench.gui.at["rate"].value == 2.0
+    bench.gui.press("EMERGENCY – all rotors stop")
+    assert bench.desk.asked == [(bench.names, "emergency")]
+    assert page.chosen == bench.cluster.name
+    for what, label in SWITCHES.items():
+        bench.gui.at[label].put(False)
+        assert shown[-1] == (what, False)

@@ -1,0 +1,516 @@
+"""Nodes of ours among each other, and among those that talk nonsense, at a master in this process."""
+
+import asyncio
+import socket
+import xmlrpc.client
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from ros1_master import Master
+
+from zsim.errors import RunError
+from zsim_bridges.ros1 import master_api, tcpros
+from zsim_bridges.ros1.master_api import master_address, own_address
+from zsim_bridges.ros1.node import Ros1Node
+
+PATIENCE_S = 20.0
+TWIST, EMPTY = "geometry_msgs/Twist", "std_msgs/Empty"
+Vector3 = tcpros.message_class("geometry_msgs/Vector3")
+
+
+def twist(x: float) -> Any:
+    return tcpros.message_class(TWIST)(linear=Vector3(x, 0.0, 0.0), angular=Vector3(0.0, 0.0, 0.0))
+
+
+class Graph:
+    """A master, nodes at it, and what they say to people."""
+
+    def __init__(self) -> None:
+        self.master = Master()
+        self.said: list[str] = []
+
+    def node(self, name: str) -> Ros1Node:
+        return Ros1Node(name, self.master.uri, "127.0.0.1", self.said.append)
+
+    def restart(self) -> None:
+        """Let the master forget everything."""
+        self.master.stop()
+        self.master = Master(self.master.port)
+
+    async def uri(self, topic: str) -> str:
+        """Return the URI of the slave API of who publishes a topic."""
+        await until(lambda: self.master.graph.publishers[topic] != [])
+        return self.master.graph.publishers[topic][-1]
+
+    async def port(self, topic: str) -> int:
+        """Return where a topic is to be had."""
+        code, _, door = await call(await self.uri(topic), "requestTopic", topic, [["TCPROS"]])
+        assert (code, door[:2]) == (1, ["TCPROS", "127.0.0.1"])
+        return door[2]
+
+    def told(self, what: str) -> bool:
+        return any(what in line for line in self.said)
+
+
+async def call(uri: str, method: str, *arguments: Any) -> Any:
+    """Ask a node."""
+
+    def ask() -> Any:
+        with xmlrpc.client.ServerProxy(uri) as proxy:
+            return getattr(proxy, method)("/tester", *arguments)
+
+    return await asyncio.to_thread(ask)
+
+
+async def until(true: Callable[[], bool]) -> None:
+    """Wait for what other tasks and threads are to bring about."""
+    async with asyncio.timeout(PATIENCE_S):
+        while not true():
+            await asyncio.sleep(0.005)
+
+
+@pytest.fixture
+def graph(monkeypatch: pytest.MonkeyPatch) -> Iterator[Graph]:
+    monkeypatch.setattr(master_api, "CHECK_S", 0.05)
+    made = Graph()
+    yield made
+    made.master.stop()
+
+
+async def connect(port: int, header: dict[str, str]) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    writer.write(tcpros.encode_header(header))
+    return reader, writer
+
+
+def subscriber(topic: str, md5: str = "*") -> dict[str, str]:
+    return {"callerid": "/tester", "topic": topic, "md5sum": md5, "type": TWIST, "tcp_nodelay": "1"}
+
+
+def test_what_one_publishes_the_other_takes(graph):
+    async def run() -> list[float]:
+        heard: list[float] = []
+        a, b = graph.node("/a"), graph.node("/b")
+        b.subscribe("/t", TWIST, lambda message: heard.append(message.linear.x))
+        topic = a.publish("/t", TWIST, 10)
+        async with b.running(), a.running():
+            await until(lambda: len(topic.links) == 1)
+            for n in range(5):
+                topic.publish(lambda _, n=n: twist(float(n)))
+            await until(lambda: len(heard) == 5)
+        return heard
+
+    assert asyncio.run(run()) == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert graph.master.graph.publishers["/t"] == []
+    assert graph.master.graph.subscribers["/t"] == []
+
+
+def test_nothing_is_made_where_nobody_listens(graph):
+    topic = graph.node("/a").publish("/t", TWIST, 10)
+    topic.publish(lambda _: pytest.fail("made"))
+    assert topic.sent == 0
+
+
+def test_sequence_numbers_count_what_was_published(graph):
+    async def run() -> list[int]:
+        asked: list[int] = []
+        a = graph.node("/a")
+        topic = a.publish("/t", TWIST, 10)
+        async with a.running():
+            _, writer = await connect(await graph.port("/t"), subscriber("/t"))
+            await until(lambda: len(topic.links) == 1)
+            for _ in range(3):
+                topic.publish(lambda seq: asked.append(seq) or twist(0.0))
+            writer.close()
+        return asked
+
+    assert asyncio.run(run()) == [0, 1, 2]
+
+
+def test_a_subscriber_is_told_type_and_definition(graph):
+    async def run() -> dict[str, str]:
+        a = graph.node("/a")
+        a.publish("/t", TWIST, 10)
+        async with a.running():
+            reader, writer = await connect(await graph.port("/t"), subscriber("/t"))
+            header = await tcpros.read_header(reader)
+            writer.close()
+            return header
+
+    header = asyncio.run(run())
+    assert header["type"] == TWIST
+    assert header["md5sum"] == "9f195f881246fdfa2798d1d3eebca84a"
+    assert header["callerid"] == "/a"
+    assert "MSG: geometry_msgs/Vector3" in header["message_definition"]
+
+
+@pytest.mark.parametrize(
+    ("header", "reason"),
+    [
+        (subscriber("/t", "0" * 32), "datatype/md5sum"),
+        (subscriber("/nobody's"), "has no topic"),
+        ({"callerid": "/tester"}, "has no topic"),
+        ({"topic": "/t", "md5sum": "*"}, "missing"),
+        ({"service": "/none", "callerid": "/tester", "md5sum": "*"}, "has no topic or service"),
+    ],
+)
+def test_who_wants_something_else_is_refused_as_ros_does(graph, header, reason):
+    async def run() -> str:
+        a = graph.node("/a")
+        a.publish("/t", TWIST, 10)
+        async with a.running():
+            reader, writer = await connect(await graph.port("/t"), header)
+            answer = await tcpros.read_header(reader)
+            assert await reader.read() == b""  # and hung up
+            writer.close()
+            return answer["error"]
+
+    assert reason in asyncio.run(run())
+
+
+@pytest.mark.parametrize("garbage", [b"GET / HTTP/1.1\r\n\r\n", b"\xff" * 64, b"\x04\0\0\0\x00\x00\x00\x00", b"\x00"])
+def test_garbage_ends_its_own_connection_only(graph, garbage):
+    async def run() -> None:
+        a = graph.node("/a")
+        topic = a.publish("/t", TWIST, 10)
+        async with a.running():
+            port = await graph.port("/t")
+            reader, writer = await connect(port, subscriber("/t"))
+            await tcpros.read_header(reader)
+            other, nonsense = await asyncio.open_connection("127.0.0.1", port)
+            nonsense.write(garbage)
+            nonsense.write_eof()
+            await other.read()
+            nonsense.close()
+            topic.publish(lambda _: twist(7.0))
+            assert tcpros.deserialize(TWIST, await tcpros.read_frame(reader)).linear.x == 7.0
+            writer.close()
+
+    asyncio.run(run())
+
+
+def test_a_subscriber_that_does_not_read_loses_the_oldest_and_holds_up_nobody(graph):
+    text, string = "x" * 100_000, tcpros.message_class("std_msgs/String")
+
+    async def run() -> None:
+        a = graph.node("/a")
+        topic = a.publish("/t", "std_msgs/String", 5)
+        async with a.running():
+            port = await graph.port("/t")
+            lazy = socket.create_connection(("127.0.0.1", port))
+            lazy.sendall(tcpros.encode_header(subscriber("/t")))
+            reader, writer = await connect(port, subscriber("/t"))
+            await tcpros.read_header(reader)
+            await until(lambda: len(topic.links) == 2)
+            for n in range(200):
+                topic.publish(lambda _, n=n: string(data=f"{n:04d}{text}"))
+                assert (await tcpros.read_frame(reader))[4:8] == b"%04d" % n
+            stuck = max(topic.links, key=lambda outlet: outlet.lost)
+            assert stuck.lost > 0
+            assert sum(outlet.lost for outlet in topic.links) == stuck.lost  # the other lost nothing
+            lazy.close()
+            await until(lambda: len(topic.links) == 1)
+            writer.close()
+
+    asyncio.run(run())
+
+
+def test_a_publisher_that_sends_garbage_is_told_of_once_and_heard_again(graph):
+    async def run() -> list[Any]:
+        heard: list[Any] = []
+
+        def take(message: Any) -> None:
+            if message.linear.x < 0:
+                raise ValueError("negative")
+            heard.append(message.linear.x)
+
+        node, server = graph.node("/b"), None
+        node.subscribe("/t", TWIST, take)
+
+        async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await tcpros.read_header(reader)
+            writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type_of("/t", TWIST), "/bad")))
+            negative, good = (tcpros.serialize(TWIST, twist(x)) for x in (-1.0, 5.0))
+            for payload in (b"short", negative, b"x" * 49, good):
+                writer.write(tcpros.frame(payload))
+            await writer.drain()
+            await reader.read()
+            writer.close()
+
+        server = await asyncio.start_server(publish, "127.0.0.1", 0)
+        port = server.sockets[0].getsockname()[1]
+        with Slave(port) as uri:
+            graph.master.graph.publishers["/t"].append(uri)
+            async with node.running():
+                await until(lambda: heard == [5.0])
+        server.close()
+        return graph.said
+
+    said = [line for line in asyncio.run(run()) if "is refused" in line]
+    assert len(said) == 1
+    assert "/bad" in said[0]
+
+
+class Slave(Master):
+    """A publisher's slave API, whose only answer is where its topics are to be had."""
+
+    def __init__(self, port: int) -> None:
+        super().__init__()
+        self._server.register_function(lambda *_: [1, "", ["TCPROS", "127.0.0.1", port]], "requestTopic")
+
+    def __enter__(self) -> Any:
+        return self.uri
+
+
+def test_another_type_under_the_same_name_is_refused_and_told(graph):
+    async def run() -> None:
+        a, b = graph.node("/a"), graph.node("/b")
+        a.publish("/t", EMPTY, 10)
+        b.subscribe("/t", TWIST, lambda _: pytest.fail("taken"))
+        async with a.running(), b.running():
+            await until(lambda: graph.told("/t: what"))
+
+    asyncio.run(run())
+    assert graph.told("datatype/md5sum")
+
+
+def test_a_node_waits_for_its_master_and_registers_again_with_one_that_forgot(graph):
+    async def run() -> None:
+        node = graph.node("/a")
+        node.publish("/t", TWIST, 10)
+        graph.master.stop()
+        async with node.running():
+            await until(lambda: graph.told("waiting for a ROS master"))
+            graph.master = Master(graph.master.port)
+            await until(lambda: "/a" in graph.master.graph.nodes)
+            await until(lambda: graph.told("/a: registered with"))
+            graph.restart()
+            await until(lambda: graph.told("/a: registered again"))
+            assert len(graph.master.graph.publishers["/t"]) == 1
+
+    asyncio.run(run())
+
+
+def test_connections_outlive_a_master(graph):
+    async def run() -> None:
+        heard: list[float] = []
+        a, b = graph.node("/a"), graph.node("/b")
+        topic = a.publish("/t", TWIST, 10)
+        b.subscribe("/t", TWIST, lambda message: heard.append(message.linear.x))
+        async with a.running(), b.running():
+            await until(lambda: len(topic.links) == 1)
+            graph.restart()
+            await until(lambda: sum("registered again" in line for line in graph.said) == 2)
+            topic.publish(lambda _: twist(1.0))
+            await until(lambda: heard == [1.0])
+            assert len(topic.links) == 1
+
+    asyncio.run(run())
+
+
+def test_a_publisher_that_went_and_came_back_is_heard_again(graph):
+    async def run() -> None:
+        heard: list[float] = []
+        b = graph.node("/b")
+        b.subscribe("/t", TWIST, lambda message: heard.append(message.linear.x))
+        async with b.running():
+            for n in range(2):
+                a = graph.node("/a")
+                topic = a.publish("/t", TWIST, 10)
+                async with a.running():
+                    await until(lambda topic=topic: len(topic.links) == 1)
+                    topic.publish(lambda _, n=n: twist(float(n)))
+                    await until(lambda n=n: len(heard) == n + 1)
+
+    asyncio.run(run())
+
+
+def test_what_a_node_said_just_before_it_left_is_heard(graph):
+    """A node that publishes a landing and ends has left the graph before its bytes have been read."""
+
+    async def run() -> None:
+        heard: list[float] = []
+        node = graph.node("/b")
+        node.subscribe("/t", TWIST, lambda message: heard.append(message.linear.x))
+        left = asyncio.Event()
+
+        async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await tcpros.read_header(reader)
+            writer.write(tcpros.encode_header(tcpros.publisher_header(tcpros.topic_type_of("/t", TWIST), "/a")))
+            await left.wait()
+            writer.write(tcpros.frame(tcpros.serialize(TWIST, twist(3.0))))
+            writer.close()
+
+        server = await asyncio.start_server(publish, "127.0.0.1", 0)
+        with Slave(server.sockets[0].getsockname()[1]) as uri:
+            graph.master.graph.publishers["/t"].append(uri)
+            async with node.running():
+                subscription = node._subscribed["/t"]
+                await until(lambda: subscription.connected != {})
+                await call(graph.master.graph.nodes["/b"], "publisherUpdate", "/t", [])
+                left.set()
+                await until(lambda: heard == [3.0])
+                await until(lambda: subscription._tasks == {})
+        server.close()
+
+    asyncio.run(run())
+
+
+def test_a_node_that_ends_while_it_registers_leaves_nothing_behind(graph):
+    async def run() -> None:
+        node = graph.node("/a")
+        topics = [f"/t{n}" for n in range(50)]
+        for topic in topics:
+            node.publish(topic, TWIST, 10)
+        async with node.running():
+            await until(lambda: graph.master.graph.publishers[topics[0]] != [])
+        assert [topic for topic in topics if graph.master.graph.publishers[topic]] == []
+
+    asyncio.run(run())
+
+
+def test_a_service_answers_and_refuses(graph):
+    reasons = iter([None, "the drone flies"])
+
+    async def ask(port: int, request: bytes = b"") -> tuple[int, bytes]:
+        reader, writer = await connect(port, {"callerid": "/tester", "service": "/s", "md5sum": "*"})
+        assert (await tcpros.read_header(reader))["type"] == "std_srvs/Empty"
+        writer.write(tcpros.frame(request))
+        (ok,) = await reader.readexactly(1)
+        answer = await tcpros.read_frame(reader)
+        assert await reader.read() == b""
+        writer.close()
+        return ok, answer
+
+    async def run() -> None:
+        a = graph.node("/a")
+        a.serve("/s", lambda: next(reasons))
+        async with a.running():
+            await until(lambda: "/s" in graph.master.graph.services)
+            port = int(graph.master.graph.services["/s"].rsplit(":", 1)[1])
+            assert await ask(port, b"too much") == (0, b"the request has 8 bytes; must have none")
+            assert await ask(port) == (1, b"")
+            assert await ask(port) == (0, b"the drone flies")
+
+    asyncio.run(run())
+    assert graph.master.graph.services == {}
+
+
+def test_a_service_can_be_asked_for_its_type_and_asked_again_and_again(graph):
+    async def run() -> None:
+        a = graph.node("/a")
+        a.serve("/s", lambda: None)
+        async with a.running():
+            await until(lambda: "/s" in graph.master.graph.services)
+            port = int(graph.master.graph.services["/s"].rsplit(":", 1)[1])
+            asked = {"callerid": "/tester", "service": "/s", "md5sum": "*"}
+            reader, writer = await connect(port, asked | {"probe": "1"})
+            assert (await tcpros.read_header(reader))["request_type"] == "std_srvs/EmptyRequest"
+            assert await reader.read() == b""
+            writer.close()
+            reader, writer = await connect(port, asked | {"persistent": "1"})
+            await tcpros.read_header(reader)
+            for _ in range(3):
+                writer.write(tcpros.frame(b""))
+                assert await reader.readexactly(5) == b"\x01\0\0\0\0"
+            writer.close()
+
+    asyncio.run(run())
+
+
+def test_the_slave_api_tells_what_ros_s_tools_ask(graph):
+    async def run() -> None:
+        a = graph.node("/a")
+        topic = a.publish("/t", TWIST, 10)
+        a.subscribe("/in", EMPTY, lambda _: None)
+        async with a.running():
+            uri = await graph.uri("/t")
+            reader, writer = await connect(await graph.port("/t"), subscriber("/t"))
+            await tcpros.read_header(reader)
+            topic.publish(lambda _: twist(1.0))
+            await tcpros.read_frame(reader)
+            await until(lambda: topic.links[0].sent > 0)
+            assert (await call(uri, "getPublications"))[2] == [["/t", TWIST]]
+            assert (await call(uri, "getSubscriptions"))[2] == [["/in", EMPTY]]
+            assert (await call(uri, "getBusInfo"))[2] == [[0, "/tester", "o", "TCPROS", "/t", True]]
+            assert (await call(uri, "getBusStats"))[2] == [[["/t", 52, [[0, 52, 1, True]]]], [], []]
+            assert (await call(uri, "getMasterUri"))[2] == graph.master.uri
+            assert (await call(uri, "getName"))[2] == "/a"
+            assert (await call(uri, "getPid"))[0] == 1
+            assert (await call(uri, "requestTopic", "/none", [["TCPROS"]]))[0] == -1
+            assert (await call(uri, "requestTopic", "/t", [["UDPROS"]]))[0] == 0
+            assert (await call(uri, "paramUpdate", "/use_sim_time", True))[0] == -1
+            assert (await call(uri, "publisherUpdate", "/none", []))[0] == 1
+            with pytest.raises(xmlrpc.client.Fault):
+                await call(uri, "requestTopic")
+            with pytest.raises(xmlrpc.client.Fault):
+                await call(uri, "_update", "/in", [])
+            writer.close()
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        b"\xff\x00" * 50,
+        b"POST / HTTP/1.1\r\ncontent-length: 99999999999\r\n\r\n",
+        b"POST / HTTP/1.1\r\ncontent-length: many\r\n\r\n",
+        b"POST / HTTP/1.1\r\n\r\n",
+        b"POST / HTTP/1.1\r\ncontent-length: 9\r\n\r\n<nothing>",
+        b"GET / HTTP/1.1\r\n\r\n",
+    ],
+)
+def test_garbage_at_the_slave_api_is_answered_or_not_and_that_is_all(graph, garbage, capfd):
+    async def run() -> None:
+        a = graph.node("/a")
+        a.publish("/t", TWIST, 10)
+        async with a.running():
+            uri = await graph.uri("/t")
+            reader, writer = await asyncio.open_connection("127.0.0.1", int(uri.strip("/").rsplit(":", 1)[1]))
+            writer.write(garbage)
+            writer.write_eof()
+            await reader.read()
+            writer.close()
+            assert (await call(uri, "getName"))[2] == "/a"
+
+    asyncio.run(run())
+    assert capfd.readouterr().err == ""
+
+
+def test_a_node_that_is_asked_to_stop_says_by_whom(graph):
+    async def run() -> str:
+        a = graph.node("/a")
+        a.publish("/t", TWIST, 10)
+        async with a.running():
+            await call(await graph.uri("/t"), "shutdown", "user request")
+            return a.shutdown_reason
+
+    assert asyncio.run(run()) == "/tester asks us to stop: user request"
+
+
+def test_a_node_whose_name_is_taken_ends_and_leaves_the_other_registered(graph):
+    async def run() -> str:
+        a = graph.node("/a")
+        a.publish("/t", TWIST, 10)
+        async with a.running():
+            await until(lambda: "/a" in graph.master.graph.nodes)
+            graph.master.graph.nodes["/a"] = "http://127.0.0.1:1/"
+            await until(lambda: a.shutdown_reason != "")
+        return a.shutdown_reason
+
+    assert "another node of this name is on http://127.0.0.1:1/" in asyncio.run(run())
+
+
+@pytest.mark.parametrize("uri", ["127.0.0.1:11311", "https://x:1", "http://", "http://x:99999", ""])
+def test_what_is_no_master_is_refused(uri):
+    with pytest.raises(RunError, match=repr(uri)):
+        master_address(uri)
+
+
+def test_we_are_reached_as_ros_s_own_variables_say_or_from_where_we_reach_the_master():
+    assert own_address("http://127.0.0.1:11311", {}) == "127.0.0.1"
+    assert own_address("http://127.0.0.1", {"ROS_IP": "10.0.0.7"}) == "10.0.0.7"
+    both = {"ROS_IP": "10.0.0.7", "ROS_HOSTNAME": "lab"}
+    assert own_address("http://127.0.0.1", both) == "lab"
