@@ -7,7 +7,7 @@ from zsim.contract import keys, messages
 from zsim.errors import DecodeError
 from zsim.record import RecordReader
 from zsim.scenario.fault_kinds import PROCESS_KILL
-from zsim.scenario.roles import AGENTS
+from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import agents_of
 

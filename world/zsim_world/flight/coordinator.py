@@ -13,7 +13,7 @@ from typing import Any
 from zsim.contract import keys, messages
 from zsim.errors import RunError
 from zsim.runtime.agent import Output
-from zsim.scenario.roles import on_death
+from zsim.scenario.role_table import on_death
 from zsim.scenario.scenario import Scenario
 from zsim_world.flight.admission import data_of, warnings
 from zsim_world.flight.barrier import Barrier, Participant
