@@ -7,7 +7,7 @@ from zsim.contract.messages import Info
 from zsim.errors import DocumentError, RunError, ScenarioError
 from zsim.runtime.agent import Agent
 from zsim.runtime.group import Group
-from zsim.scenario.roles import AGENTS, agent_names
+from zsim.scenario.role_table import AGENTS, agent_names
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
 

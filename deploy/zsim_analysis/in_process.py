@@ -14,7 +14,7 @@ from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
 from zsim.runtime.progress import Reasons, Screen, Throttle
-from zsim.scenario.roles import agent_names
+from zsim.scenario.role_table import agent_names
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
 from zsim_world.flight.world import World

@@ -12,7 +12,7 @@ import numpy as np
 
 from zsim.scenario import fault_check
 from zsim.scenario.obstacle import nearest, row_of
-from zsim.scenario.roles import AGENTS
+from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import ESTIMATORS, SEA_HEIGHT_MAX_M, space_name
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 from zsim.schema.checker import Fault, show

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from zsim.contract import keys
 from zsim.scenario.fault_kinds import KINDS, Kind, Parameter, expected
-from zsim.scenario.roles import AGENTS
+from zsim.scenario.role_table import AGENTS
 from zsim.schema.checker import Fault as Flaw
 from zsim.schema.checker import show
 

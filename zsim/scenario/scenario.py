@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
-from zsim.scenario.roles import OnDeath, agent_names
+from zsim.scenario.role_table import OnDeath, agent_names
 from zsim.scenario.sensor_presets import G_M_S2, SEA_LEVEL_KG_M3
 from zsim.schema.plugin import CLASS_NAME
 

@@ -13,7 +13,7 @@ import msgspec
 
 from zsim.contract import messages
 from zsim.scenario.scenario import Mount
-from zsim_agents.estimation.madgwick import LEVEL, Rotation, madgwick_step, turn
+from zsim_agents.estimation.madgwick import LEVEL, Rotation, madgwick_step, rpy_rotation, turn
 from zsim_bridges import ros_frames
 from zsim_bridges.ros_frames import Vector
 

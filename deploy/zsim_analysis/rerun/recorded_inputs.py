@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from zsim.contract import keys, messages
 from zsim.record import Recorded, RecordReader
 from zsim.scenario.fault_kinds import PROCESS_KILL
-from zsim.scenario.roles import AGENTS
+from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import agents_of
 from zsim_analysis.reading.recorded_run import decode_or_none

@@ -4,7 +4,7 @@ import importlib.metadata
 from collections.abc import Iterable
 
 from zsim.scenario.rights import RECORDER, WORLD
-from zsim.scenario.roles import AGENTS, ROLES
+from zsim.scenario.role_table import AGENTS, ROLES
 from zsim_deploy.inventory.inventory import Inventory, hosts_of, spread
 
 PROJECT = "zsim"

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from zsim.errors import RunError
 from zsim.runtime.progress import Show
-from zsim.scenario.roles import on_death
+from zsim.scenario.role_table import on_death
 from zsim.scenario.scenario import OnDeath
 from zsim_deploy.terminal.interrupts import IMPATIENT, REASONS, handled_by
 

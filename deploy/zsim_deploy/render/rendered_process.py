@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
-from zsim.scenario.roles import agent_names, on_death
+from zsim.scenario.role_table import agent_names, on_death
 from zsim.scenario.scenario import OnDeath, Scenario
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.extras import KINDS, NAMED

@@ -19,7 +19,7 @@ from zsim.runtime.group import Group
 from zsim.runtime.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
-from zsim.scenario.roles import AGENTS, things
+from zsim.scenario.role_table import AGENTS, things
 from zsim.scenario.scenario import Scenario
 from zsim.transport import session, tls
 from zsim.transport.connection import find_world

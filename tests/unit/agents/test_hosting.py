@@ -7,7 +7,7 @@ import pytest
 from zsim.errors import RunError
 from zsim.runtime.group import Group
 from zsim.scenario import rights, scenario_file
-from zsim.scenario.roles import AGENTS, Role
+from zsim.scenario.role_table import AGENTS, Role
 from zsim.transport.identity import Identity
 from zsim_agents.hosting import agents_of, chosen, hosted
 from zsim_deploy.roles import roles

@@ -17,7 +17,7 @@ from zsim.contract.messages import ControlAnswer, ControlRequest
 from zsim.errors import RunError
 from zsim.runtime.agent import Output
 from zsim.scenario.rights import WORLD
-from zsim.scenario.roles import on_death
+from zsim.scenario.role_table import on_death
 from zsim.scenario.scenario import Scenario
 from zsim_world.flight.barrier import Barrier, RunParticipant
 from zsim_world.flight.run_clock import Operation, RunClock, number
