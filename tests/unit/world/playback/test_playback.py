@@ -133,8 +133,8 @@ def on(key: str, published: list[tuple[str, bytes]]) -> list[Any]:
 def gates_of(recorded: list[KeyedMessage], tmp_path: Path, delay_gates: int = 1) -> dict[int, list[tuple[str, int]]]:
     """Return (key, t_ns) of what is played with each gate."""
     with write(tmp_path, recorded) as reader:
-        recorded = RecordedGates(reader, GATE_NS, delay_gates * GATE_NS, set(reader.topics()))
-        return {g.t_ns // GATE_NS: [(m.key, m.t_ns) for m in g.messages] for g in recorded.gates()}
+        gates = RecordedGates(reader, GATE_NS, delay_gates * GATE_NS, set(reader.topics())).gates()
+        return {g.t_ns // GATE_NS: [(m.key, m.t_ns) for m in g.messages] for g in gates}
 
 
 @pytest.mark.parametrize("late", [0, 1, 2, 4])
