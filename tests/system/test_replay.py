@@ -9,6 +9,7 @@ import msgpack
 import pytest
 import zenoh
 from federation import PAIR, PAIR_ROLES, Federation, Role
+from refused import parts
 from wire import Client
 
 from zsim.record import RecordReader
@@ -197,8 +198,8 @@ def test_what_may_be_asked(federation: Federation, flown: Path) -> None:
     assert client.ask("world/control", "step")["ok"]
     clock.until(lambda m: m["t_ns"] == 8_000_000_000)
     assert client.get("drone/drone1/truth")["drone/drone1/truth"]["t_ns"] == 8_000_000_000
-    assert "must be a time on record" in client.ask("world/control", "seek", t_s=99)["error"]
-    assert "must be a number of seconds" in client.ask("world/control", "seek", t_s="noon")["error"]
+    for t_s in (99, "noon"):
+        assert parts(client.ask("world/control", "seek", t_s=t_s)["error"]) == ("t_s", repr(t_s))
     for key, op, args in (
         ("world/control", "acquire", {"drone": "drone1", "priority": 10}),
         ("world/control", "fault_add", {"kind": "gps_dropout", "target": "drone1"}),

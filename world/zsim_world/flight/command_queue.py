@@ -47,11 +47,6 @@ class CommandQueue:
         self._queued: dict[int, list[QueuedCommand]] = {}  # by the instant at which they take effect
         self._recent: dict[tuple[int, str, int, str, int], Any] = {}  # messages by those fields that compare quickly
 
-    def commander(self, drone: int) -> str | None:
-        """Return the name of a drone's commander."""
-        commander = self._commanders[drone]
-        return commander.source if commander else None
-
     def commanders(self) -> list[str | None]:
         """Return the name of each drone's commander."""
         return [commander.source if commander else None for commander in self._commanders]

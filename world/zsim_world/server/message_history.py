@@ -4,7 +4,7 @@ Everything passes here, the world's own messages and those of the participants; 
 """
 
 from collections import deque
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import msgspec
@@ -115,10 +115,6 @@ class MessageHistory:
             passed.append((key, payload))
         return passed, None
 
-    def at(self, stamps: Container[tuple[str, int]]) -> list[tuple[str, bytes]]:
-        """Return (key, payload) of the messages with any of some (key, t_ns), as far as a replay reaches back."""
-        return [(key, payload) for t_ns, key, payload in self._each() if (key, t_ns) in stamps]
-
     def _each(self) -> Iterator[tuple[int, str, bytes]]:
         for entry in self._recent:
             for key, payload in entry.messages:
@@ -159,8 +155,10 @@ class MessageHistory:
             identity = _identity(key, payload)
             if identity is not None and identity[1] <= done_ns:
                 outputs[identity] = Sample(key, payload)
-        for key, payload in self.at({(key, t_ns) for key, t_ns, _, _ in outputs}):
-            outputs.pop(_identity(key, payload), None)
+        stamps = {(key, t_ns) for key, t_ns, _, _ in outputs}
+        for t_ns, key, payload in self._each():
+            if (key, t_ns) in stamps:
+                outputs.pop(_identity(key, payload), None)
         return list(outputs.values())
 
 

@@ -124,10 +124,10 @@ def test_what_is_remembered_of_commands_is_bounded():
 
 def test_the_first_setpoint_makes_the_commander():
     made = queue()
-    assert made.commander(D1) is None
+    assert made.commanders()[D1] is None
     assert send(made, D1, "controller.main") is None
-    assert made.commander(D1) == "controller.main"
-    assert made.commander(D2) is None
+    assert made.commanders()[D1] == "controller.main"
+    assert made.commanders()[D2] is None
 
 
 def test_others_are_refused_with_the_commander_s_name():
@@ -136,7 +136,7 @@ def test_others_are_refused_with_the_commander_s_name():
     reason = send(made, D1, "console.1")
     assert reason is not None
     assert reason[:2] == ("drone1", "flown by 'controller.main' (priority 0)")
-    assert made.commander(D1) == "controller.main"
+    assert made.commanders()[D1] == "controller.main"
     assert send(made, D2, "console.1") is None
 
 
@@ -154,10 +154,10 @@ def test_a_drone_is_acquired_with_a_higher_priority_only():
     assert refusal is not None
     assert refusal[:2] == ("drone1", "flown by 'controller.main' with priority 0")
     assert made.acquire(D1, "console.1", OPERATOR) is None
-    assert made.commander(D1) == "console.1"
+    assert made.commanders()[D1] == "console.1"
     assert made.acquire(D1, "console.2", OPERATOR) is not None
     assert made.acquire(D1, "console.2", OPERATOR + 1) is None
-    assert made.commander(D1) == "console.2"
+    assert made.commanders()[D1] == "console.2"
 
 
 def test_the_commander_may_change_its_own_priority():
@@ -171,7 +171,7 @@ def test_a_released_drone_is_free_and_the_priority_is_gone():
     made = queue()
     made.acquire(D1, "console.1", OPERATOR)
     assert made.release(D1, "console.1") is None
-    assert made.commander(D1) is None
+    assert made.commanders()[D1] is None
     send(made, D1, "console.1")
     assert made.acquire(D1, "other", PROGRAM + 1) is None
 
@@ -184,7 +184,7 @@ def test_only_the_commander_releases(holder: str | None, who: str):
     refusal = made.release(D1, "b")
     assert refusal is not None
     assert refusal[:2] == ("drone1", f"flown by {who}, not by 'b'")
-    assert made.commander(D1) == holder
+    assert made.commanders()[D1] == holder
 
 
 def test_a_setpoint_on_its_way_does_not_undo_a_release():
@@ -195,8 +195,8 @@ def test_a_setpoint_on_its_way_does_not_undo_a_release():
     made.push(D2, "velocity", velocity("a", 1), GATE_NS)
     made.release(D1, "a")
     assert [(command.drone, command.kind) for command, _ in fly(made, GATE_NS)] == [(D1, "mode"), (D2, "velocity")]
-    assert made.commander(D1) is None
-    assert made.commander(D2) == "a"
+    assert made.commanders()[D1] is None
+    assert made.commanders()[D2] == "a"
 
 
 def test_who_is_gone_flies_nothing_any_more():
@@ -208,7 +208,7 @@ def test_who_is_gone_flies_nothing_any_more():
     made.push(D2, "velocity", velocity("b", 1), GATE_NS)
     assert made.remove_source("a") == [D1, D2]
     assert made.remove_source("a") == []
-    assert made.commander(D1) is None
+    assert made.commanders()[D1] is None
     assert [(command.source, command.kind) for command in made.pop(GATE_NS)] == [("a", "mode"), ("b", "velocity")]
 
 
@@ -241,7 +241,7 @@ def test_any_program_may_land_what_a_program_flies():
     made.push(D1, "mode", mode("other", "land"), 0)
     ((_, reason),) = fly(made, 0)
     assert reason is None
-    assert made.commander(D1) == "controller.main"
+    assert made.commanders()[D1] == "controller.main"
 
 
 def test_modes_are_open_to_all_while_nobody_flies():
@@ -249,4 +249,4 @@ def test_modes_are_open_to_all_while_nobody_flies():
     made.push(D1, "mode", mode("anyone", "takeoff"), 0)
     ((_, reason),) = fly(made, 0)
     assert reason is None
-    assert made.commander(D1) is None
+    assert made.commanders()[D1] is None

@@ -131,14 +131,6 @@ def test_a_page_goes_on_where_the_last_one_ended_when_the_oldest_is_forgotten_me
     assert [payload[0] for _, payload in (*passed, *history.page(-1, lambda key: True, more)[0])] == [*range(8)]
 
 
-def test_messages_are_found_by_key_and_stamp():
-    history = MessageHistory()
-    for t_ns, payload in ((1, b"a"), (2, b"b"), (2, b"c"), (3, b"d")):
-        history.add(IMU, payload, t_ns)
-        history.add("drone/d2/truth", b"x", t_ns)
-    assert history.at({(IMU, 2), (IMU, 3), (IMU, 4)}) == [(IMU, b"b"), (IMU, b"c"), (IMU, b"d")]
-
-
 # Outputs that were lost
 
 
