@@ -178,7 +178,7 @@ def cluster_frame(names: Sequence[str], values: Sequence[float]) -> tuple[Values
 
 
 def location_fix(gps: Gps, drone: str, index: int) -> LocationFix:
-    """Return where a drone's GPS says it is, in the colour of the scenario's drone `index`."""
+    """Return the position that a drone's GPS measured, in the colour of the scenario's drone `index`."""
     variance = gps.sigma_m**2
     return LocationFix(
         timestamp=timestamp(max(0, gps.t_sample_ns)),

@@ -6,12 +6,13 @@ it needs no module of an extra.
 
 import json
 import os
+import secrets
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from zsim.errors import ReportError, RunError
 
@@ -120,11 +121,12 @@ def placed(*targets: Path) -> Iterator[tuple[Path, ...]]:
 def _beside(target: Path) -> Iterator[Path]:
     """Yield a new folder beside a target; it is removed at the end, as are parents that were made and are empty."""
     made = [parent for parent in target.parents if not parent.exists()]
+    folder = target.parent / f".export-{secrets.token_hex(4)}"  # TemporaryDirectory leaves it if Ctrl-C comes within
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=target.parent, prefix=".export-", ignore_cleanup_errors=True) as folder:
-            yield Path(folder)
+        folder.mkdir(parents=True)
+        yield folder
     finally:
+        shutil.rmtree(folder, ignore_errors=True)
         with suppress(OSError):  # one that is not empty stays, and with it those above
             for parent in made:
                 parent.rmdir()

@@ -113,7 +113,7 @@ class _Layout:
         head += [[message.seq for message in batch.messages]] if self._has_seq else []
         own = [column for field in self._fields for column in _columns(field, batch.messages)]
         wall_ns = np.array(batch.wall_ns, np.uint64).astype(np.int64)
-        arrays = [  # no message holds NaN: where it stands, there is no value
+        arrays = [  # no message holds NaN: it stands for a missing value
             pa.array(column, entry.type, from_pandas=True)
             for column, entry in zip([*head, *own, wall_ns], self.schema, strict=True)
         ]

@@ -26,11 +26,11 @@ class TruthHash(Struct, frozen=True):
 
 
 def truth_hash(tracks: list[Track], gate_ns: int | None, first_ns: int, last_ns: int) -> TruthHash:
-    """Return the hash of drones given in scenario order.
+    """Return the hash of the truth of drones in scenario order.
 
     Args:
         tracks: the drones.
-        gate_ns: spacing of truth; None: unknown, nothing can be missed.
+        gate_ns: spacing of truth; None: unknown, then none is missing.
         first_ns: the first instant of the run.
         last_ns: the last instant of the run as far as it is known.
     """

@@ -29,7 +29,7 @@ GREEK = {"phi": "\\phi", "rho": "\\rho"}
 
 
 def label(name: str) -> str:
-    """Return a parameter as it stands at an axis, with its unit."""
+    """Return the label of a parameter at an axis, with its unit."""
     stem, _, number = name.partition("_")
     greek = f"${GREEK[stem]}_{{{number}}}$" if stem in GREEK else name
     return f"{SYMBOLS.get(name, greek)} ({unit(name)})"

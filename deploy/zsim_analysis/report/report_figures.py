@@ -101,7 +101,7 @@ def _draw_outlines(axes: Axes, formation: Formation, tracks: Sequence[Track]) ->
 
 
 def outlines(members: Sequence[Track]) -> Iterator[tuple[float, Array]]:
-    """Yield times [s] and positions (n, 2) [m] at which a formation stands clear of the outlines before."""
+    """Yield times [s] and positions (n, 2) [m] at which the outlines of a formation do not cover each other."""
     t_ns, places = common_instants(list(members))
     if not len(t_ns):
         return

@@ -186,7 +186,7 @@ def make_plan(
         earlier_faults: of the overrides, reported with the others.
 
     Raises:
-        ScenarioError: with every fault of the variations and of what comes of them, a line each.
+        ScenarioError: with every fault of the variations and of the scenarios that result, a line each.
     """
     texts, vary_faults = _parsed(vary, document)
     faults = [*earlier_faults, *vary_faults]

@@ -85,7 +85,7 @@ class GridPoint(Struct, frozen=True):
     """One combination of the grid's values.
 
     Attributes:
-        values: by path; empty where nothing but seeds and draws varies.
+        values: by path; empty where only seeds and drawn values vary.
         runs: finished ones.
         ended_well: share of them; None without a run.
         without_collision: share of those that ended well.

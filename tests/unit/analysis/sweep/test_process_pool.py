@@ -116,7 +116,7 @@ def test_a_run_that_is_fatal_to_every_worker_is_a_row() -> None:
 
 def test_workers_that_cannot_start_end_the_sweep() -> None:
     FakeWorker.stillborn = 99
-    with pytest.raises(RunError, match="die before they are ready"):
+    with pytest.raises(RunError, match="killed by SIGKILL"):
         rows(5, [])
 
 

@@ -37,7 +37,7 @@ def test_a_journal_keeps_what_was_finished_and_drops_a_cut_line(tmp_path: Path) 
 
 
 def test_a_journal_that_cannot_be_written(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"nowhere/journal\.jsonl: cannot be written \(No such file or directory\)"):
+    with pytest.raises(RunError, match=r"nowhere/journal\.jsonl: .*No such file or directory"):
         Journal(tmp_path / "nowhere/journal.jsonl")
 
 
@@ -73,7 +73,7 @@ def test_the_table_has_a_typed_column_for_all_that_is_known(tmp_path: Path) -> N
 def test_a_table_that_is_none(tmp_path: Path) -> None:
     path = tmp_path / "sweep.parquet"
     path.write_bytes(b"PAR1")
-    with pytest.raises(ReportError, match=r"sweep\.parquet: cannot be read"):
+    with pytest.raises(ReportError, match=r"sweep\.parquet: "):
         read_table(path)
 
 
@@ -83,7 +83,7 @@ def test_a_folder_goes_on_with_its_own_plan_and_refuses_any_other(tmp_path: Path
     with locked(out, of) as folder:
         with folder.journal() as book:
             book.append(well(of, 2))
-        with pytest.raises(RunError, match="another sweep is at work there"), locked(out, of):
+        with pytest.raises(RunError, match=f"^{out}: "), locked(out, of):
             pass
         assert [each["run"] for each in folder.compact()] == [2]
         with folder.journal() as book:
@@ -95,16 +95,16 @@ def test_a_folder_goes_on_with_its_own_plan_and_refuses_any_other(tmp_path: Path
     assert load(out).plan == longer
     for other in (of, plan("seed", runs=6, duration_s=3), plan(runs=6)):
         with (
-            pytest.raises(RunError, match=r"sweep: holds another sweep \(.*\); give --out another folder"),
+            pytest.raises(RunError, match=r"sweep: .*--out"),
             locked(out, other),
         ):
             pass
     (tmp_path / "run").mkdir()
     (tmp_path / "run/run.mcap").touch()
-    with pytest.raises(RunError, match="holds something else already"), locked(tmp_path / "run", of):
+    with pytest.raises(RunError, match=r"run: .*--out"), locked(tmp_path / "run", of):
         pass
     (out / "plan.json").write_text("{}")
-    with pytest.raises(RunError, match=r"plan\.json: cannot be read"):
+    with pytest.raises(RunError, match=r"plan\.json: "):
         load(out)
 
 
@@ -113,13 +113,13 @@ def test_a_sweep_of_which_nothing_is_finished_claims_no_folder(tmp_path: Path) -
         folder.compact()
     with locked(tmp_path, plan("seed", "duration_s=1,2", runs=4)) as folder, folder.journal() as book:
         book.append(well(folder.plan, 1))
-    with pytest.raises(RunError, match="holds another sweep"), locked(tmp_path, plan("seed", runs=4)):
+    with pytest.raises(RunError, match=f"^{tmp_path}: .*--out"), locked(tmp_path, plan("seed", runs=4)):
         pass
 
 
 def test_a_plan_that_is_no_text_is_refused_in_a_line(tmp_path: Path) -> None:
     with (
-        pytest.raises(RunError, match=r"plan\.json: cannot be written \('\\udcfc' is no character\)"),
+        pytest.raises(RunError, match=r"plan\.json: .*'\\udcfc'"),
         locked(tmp_path, plan("name=a\udcfc")),
     ):
         pass

@@ -145,7 +145,7 @@ def test_a_full_disk_is_the_sweep_s_end_and_no_fault_of_the_run(
     monkeypatch.setattr(record_writer, "CHUNK_BYTES", 1000)
     monkeypatch.setattr(record_writer, "write_all", full_after(2, record_writer.write_all, full))
     part = tmp_path / "000007.part"
-    with pytest.raises(RecordError, match=r"000007\.part/run\.mcap: cannot be written any further \(No space left"):
+    with pytest.raises(RecordError, match=r"000007\.part/run\.mcap: .*No space left"):
         fly(task(record=tmp_path / "000007"))
     assert [path.name for path in tmp_path.iterdir()] == [part.name]
     monkeypatch.undo()
@@ -161,7 +161,7 @@ def full_after(count: int, write: Callable[..., None], full: Callable[..., None]
 
 def test_a_folder_of_records_that_cannot_be_made_is_told_in_a_line(tmp_path: Path) -> None:
     (tmp_path / "runs").touch()
-    with pytest.raises(RecordError, match=r"runs/000007\.part: cannot be written \(Not a directory\); make room"):
+    with pytest.raises(RecordError, match=r"runs/000007\.part: .*Not a directory"):
         fly(task(record=tmp_path / "runs/000007"))
 
 
