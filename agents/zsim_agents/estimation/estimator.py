@@ -63,7 +63,7 @@ class Estimator(Agent):
         if key == batch.GATE:
             self._receive_bundle(message)
         elif not isinstance(message, messages.Status):
-            # when a slow link brings it, it came not before the last gate, whatever it says
+            # what a slow link brings has not arrived before the last gate, whatever stamp it bears
             t_arrival_s = max(message.t_ns, self._since_ns) * 1e-9
             _, drone, what = keys.parts(key)
             self._estimators.receive(self._index[drone], what.removeprefix("sensor/"), message, t_arrival_s)

@@ -41,8 +41,8 @@ class GateReader:
         self._floats = np.zeros(layouts.floats)
         self._bits = self._floats.view(np.uint64)
 
-    def take(self, bundle: Bundle, readings: NDArray[np.float64], came: int) -> int:
-        """Write readings from row `came` on; return how many rows there are then, -1 if a message must be decoded.
+    def take(self, bundle: Bundle, readings: NDArray[np.float64], count: int) -> int:
+        """Write readings from row `count` on; return how many rows there are then, -1 if a message must be decoded.
 
         Args:
             readings: (M, READING.size), with room for all messages of the bundle.
@@ -53,7 +53,7 @@ class GateReader:
         for array in (bundle.which, bundle.ends, data):
             array.setflags(write=False)  # as off the wire: what may be written is compiled anew
         row = (self._ints, self._floats, self._bits)
-        return collect(self._program, self._owner, bundle.which, bundle.ends, data, row, readings, came)
+        return collect(self._program, self._owner, bundle.which, bundle.ends, data, row, readings, count)
 
     def _learn(self, table: Sequence[str]) -> None:
         self._table = table
@@ -69,11 +69,11 @@ def collect(
     data: NDArray,
     row: tuple[NDArray, NDArray, NDArray],
     readings: NDArray,
-    came: int,
+    count: int,
 ) -> int:
     """Write what a bundle has of sensors as readings, of each drone by time and name; see GateReader.take."""
     ints, floats, bits = row
-    start, first = 0, came
+    start, first = 0, count
     marks = np.empty(which.shape[0], np.int64)
     for m in range(which.shape[0]):
         if not (0 <= which[m] < owner.shape[0] and start + GAP <= ends[m] <= data.shape[0]):
@@ -82,16 +82,16 @@ def collect(
         if i >= 0:
             if not read(program, kind, data, start + GAP, ends[m], ints, bits):
                 return -1
-            place = came
+            place = count
             mark = ints[0] * len(RANK) + RANK[kind]
             while place > first and readings[place - 1, READING.drone] == i and marks[place - 1 - first] > mark:
                 readings[place], marks[place - first] = readings[place - 1], marks[place - 1 - first]
                 place -= 1
             fill(readings[place], i, kind, ints, floats)
             marks[place - first] = mark
-            came += 1
+            count += 1
         start = ends[m]
-    return came
+    return count
 
 
 @portable
