@@ -35,7 +35,7 @@ import warm
 from wire import PATIENCE_S, Client
 
 from zsim.record import RecordReader, repair
-from zsim_deploy.forkserver.role_launcher import Process
+from zsim_deploy.launch.role_launcher import Process
 
 ROOT = Path(__file__).parents[2]
 ZSIM = (sys.executable, "-m", "zsim_deploy.cli")

@@ -25,8 +25,7 @@ from zsim.scenario import scenario_file
 from zsim.transport import session
 from zsim.transport.identity import Identity
 from zsim_deploy.security import certificates
-from zsim_deploy.security.access_control import access_control
-from zsim_deploy.security.enrolment import Wanted
+from zsim_deploy.security.enrolment import Wanted, access_control
 
 HOST = "lab"
 SITE = "router.site"

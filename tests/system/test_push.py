@@ -17,12 +17,12 @@ from federation import ZSIM
 from lab import LAUNCHER, Lab
 
 from zsim import __version__
-from zsim_deploy.inventory import extras, inventory
+from zsim_deploy.inventory import inventory, processes
 from zsim_deploy.push import on_host
 from zsim_deploy.push.installer import installer
-from zsim_deploy.push.target import chosen, interpreters, question, target
+from zsim_deploy.push.package_index import chosen, interpreters, question, target
 from zsim_deploy.push.wheelhouse import House, Wheelhouse
-from zsim_deploy.ssh import shell
+from zsim_deploy.ssh.connection import shell_line
 from zsim_deploy.ssh.host_link import HostLink
 
 CACHE = Path(tempfile.gettempdir()) / "zsim-tests-cache"  # kept between runs, as a user's is
@@ -48,7 +48,7 @@ def over_ssh(lab: Lab, hosts: Path, name: str, *command: str, given: str = "") -
     async def work() -> bytes:
         link = HostLink(name, placed.inventory.hosts[name], placed.folder)
         try:
-            return await link.run(shell.line(command), given.encode(), timeout_s=60.0)
+            return await link.run(shell_line(command), given.encode(), timeout_s=60.0)
         finally:
             await link.close()
 
@@ -74,7 +74,7 @@ def look(lab: Lab, hosts: Path, name: str, python: str) -> dict[str, Any]:
 
 def gather(lab: Lab, hosts: Path, *names: str) -> dict[str, House]:
     """Gather, outside of the lab where there is an index, what `zsim push` needs inside."""
-    wanted = extras.needed(inventory.load(hosts).inventory)
+    wanted = processes.needed_extras(inventory.load(hosts).inventory)
     found = interpreters(over_ssh(lab, hosts, names[0], "sh", "-c", question()))
     python = chosen(names[0], found, sys.version_info[:2]).path
     said = look(lab, hosts, names[0], python)

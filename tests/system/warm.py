@@ -10,7 +10,7 @@ import resource
 from functools import cache
 from typing import IO, Any
 
-from zsim_deploy.forkserver.role_launcher import Nursery, Process
+from zsim_deploy.launch.role_launcher import Nursery, Process
 
 ROLES = ("world", "estimator", "controller", "record", "gateway", "console")
 LIMITS = (resource.RLIMIT_NOFILE, resource.RLIMIT_FSIZE, resource.RLIMIT_AS)

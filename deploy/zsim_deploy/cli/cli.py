@@ -13,20 +13,13 @@ from typer.main import get_command
 from zsim import __version__
 from zsim.errors import BehindError, SupersededError, ZsimError
 from zsim_deploy.cli import (
-    certs_commands,
-    console_command,
-    export_command,
-    fault_commands,
-    gateway_command,
+    bridge_commands,
+    federation_commands,
     hosts_commands,
-    look_commands,
-    render_commands,
-    replay_command,
+    inventory_commands,
+    record_commands,
     report_commands,
     role_commands,
-    ros1_command,
-    ros2_command,
-    sweep_commands,
 )
 from zsim_deploy.options.arguments import (
     HOSTS,
@@ -41,7 +34,7 @@ from zsim_deploy.options.arguments import (
     load_scenario,
     mode_and_rate,
 )
-from zsim_deploy.terminal.interrupts import INTERRUPTED
+from zsim_deploy.options.terminal import INTERRUPTED
 
 app = typer.Typer(
     name="zsim",
@@ -84,12 +77,12 @@ def run(
     from zsim.runtime.progress import Screen
     from zsim_deploy.launch.run import Options, check_endpoint, make_directory, run_in_process, run_processes
     from zsim_deploy.launch.supervisor import Outcome
-    from zsim_deploy.terminal.interrupts import REASONS
+    from zsim_deploy.options.terminal import REASONS
 
     if in_process:
         _refuse_with_others(realtime, rate, listen, hosted, console)
     if console:
-        console_command.check()
+        bridge_commands.check_console_installed()
     check_endpoint(listen, insecure)
     loaded = load_scenario(scenario, set_, seed, duration)
     mode, pace = mode_and_rate(realtime, rate)
@@ -131,22 +124,18 @@ def _version(asked: bool) -> None:
         raise typer.Exit
 
 
-for part in (
+for family in (
     report_commands,
     role_commands,
     hosts_commands,
-    sweep_commands,
-    export_command,
-    replay_command,
-    look_commands,
-    console_command,
-    gateway_command,
-    ros1_command,
-    ros2_command,
+    record_commands,
+    federation_commands,
+    bridge_commands,
 ):
-    app.add_typer(part.app)
-for group, panel in ((fault_commands, look_commands.PANEL), (certs_commands, HOSTS), (render_commands, HOSTS)):
-    app.add_typer(group.app, rich_help_panel=panel)
+    app.add_typer(family.app)
+app.add_typer(federation_commands.faults, rich_help_panel=federation_commands.PANEL)
+for group in (inventory_commands.certs, inventory_commands.rendering):
+    app.add_typer(group, rich_help_panel=HOSTS)
 
 
 @app.callback()

@@ -1,4 +1,6 @@
-"""The commands of a run on several hosts."""
+"""The commands of a run on several hosts.
+
+TODO The command `zsim push`."""
 
 import codecs
 import contextlib
@@ -11,7 +13,6 @@ from typing import Annotated, Any
 
 import typer
 
-from zsim_deploy.cli.push_command import push
 from zsim_deploy.options.arguments import (
     HOSTS,
     Duration,
@@ -48,8 +49,8 @@ def up(
 ) -> None:
     """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything."""
     from zsim_deploy.cli.report_commands import conclude
-    from zsim_deploy.control.status_table import Board
-    from zsim_deploy.hosts.up import Options, Up
+    from zsim_deploy.hosts.host_run import Options, Up
+    from zsim_deploy.hosts.status_table import Board
     from zsim_deploy.inventory import inventory
 
     loaded = load_scenario(scenario, set_, seed, duration)
@@ -80,7 +81,7 @@ def _folder(out: Path | None, scenario: Any) -> Iterator[Path]:
 
 def down(federation: Federation = "zsim") -> None:
     """End the run that is up, on all hosts."""
-    from zsim_deploy.control import control_socket
+    from zsim_deploy.hosts import control_socket
 
     control_socket.ask(federation, "down")
 
@@ -92,8 +93,8 @@ def ps(
     """Show the processes of the run that is up: role, host, pid, state, lag, messages/s, round trip, restarts."""
     from rich.console import Console
 
-    from zsim_deploy.control import control_socket
-    from zsim_deploy.control.status_table import table
+    from zsim_deploy.hosts import control_socket
+    from zsim_deploy.hosts.status_table import table
 
     found = control_socket.ask(federation, "ps")
     if as_json:
@@ -109,7 +110,7 @@ def logs(
 ) -> None:
     """Print what a process of the run that is up has said; what the world tells is shown by `zsim up` itself."""
     from zsim.errors import RunError
-    from zsim_deploy.control import control_socket
+    from zsim_deploy.hosts import control_socket
 
     where = control_socket.ask(federation, "where")
     if role not in where["roles"]:
@@ -151,7 +152,7 @@ def _silent(role: str) -> str:
 def _is_up(federation: str, out: str) -> bool:
     """Tell whether the launcher of a federation still has the run of this folder."""
     from zsim.errors import RunError
-    from zsim_deploy.control import control_socket
+    from zsim_deploy.hosts import control_socket
 
     try:
         return control_socket.ask(federation, "where")["out"] == out
@@ -161,7 +162,7 @@ def _is_up(federation: str, out: str) -> bool:
 
 def restart(role: Role, federation: Federation = "zsim") -> None:
     """Start a process of the run anew where it is; it takes over from its former self."""
-    from zsim_deploy.control import control_socket
+    from zsim_deploy.hosts import control_socket
 
     print(f"restarting {control_socket.ask(federation, 'restart', role=role)}")
 
@@ -172,7 +173,7 @@ def move(
     federation: Federation = "zsim",
 ) -> None:
     """Let another host run a process of the run from now on."""
-    from zsim_deploy.control import control_socket
+    from zsim_deploy.hosts import control_socket
 
     print(f"moving {control_socket.ask(federation, 'move', role=role, host=host)}")
 
@@ -185,7 +186,7 @@ def doctor(
     from rich.console import Console
 
     from zsim.errors import HostsError
-    from zsim_deploy.doctor.check_up import check_up
+    from zsim_deploy.hosts.check_up import check_up
     from zsim_deploy.inventory import inventory
 
     placed = inventory.load(hosts)
@@ -205,6 +206,27 @@ def _placement(placed: Any, scenario: Path | None) -> dict[str, str] | None:
     from zsim_deploy.inventory import inventory
 
     return inventory.placement(placed, scenario_file.load(scenario)) if scenario else None
+
+
+def push(
+    hosts: Annotated[Path, typer.Option("--hosts", help="Inventory (YAML): which hosts, which role where.")],
+    host: Annotated[list[str] | None, typer.Option("--host", help="Only this host. Repeatable.")] = None,
+    extra: Annotated[
+        list[str] | None, typer.Option("--extra", help="An extra beside those of the host's roles. Repeatable.")
+    ] = None,
+) -> None:
+    """Install zsim on the hosts, each with the extras that its roles need; they need ssh and Python, no internet."""
+    import asyncio
+
+    from zsim_deploy.inventory import inventory
+    from zsim_deploy.push.push import Stages, default_cache
+    from zsim_deploy.push.push import push as push_to
+
+    placed = inventory.load(hosts)
+    with Stages() as stages:
+        done = asyncio.run(push_to(placed, host or [], extra or [], stages.tell, default_cache()))
+    changed = sum(done.values())
+    print(f"installed on {changed} of {len(done)} hosts" if changed else "nothing to do; all hosts have what they need")
 
 
 for _command in (push, doctor, up, ps, logs, restart, move, down):

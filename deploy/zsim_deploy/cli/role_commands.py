@@ -15,6 +15,7 @@ from zsim_deploy.options.arguments import (
     Insecure,
     Launched,
     RateOption,
+    Reach,
     Realtime,
     ScenarioPath,
     Seed,
@@ -24,8 +25,8 @@ from zsim_deploy.options.arguments import (
     identity,
     load_scenario,
     mode_and_rate,
+    takes_part,
 )
-from zsim_deploy.options.reach import Reach, takes_part
 
 ROLES = "Roles, started by hand, on any machine, in any order"
 
@@ -51,12 +52,12 @@ def world(
     host: Host = None,
 ) -> None:
     """Run the world: integrates all drones and owns simulated time."""
-    from zsim_deploy.roles import roles
+    from zsim_deploy.roles import world_role
 
     loaded = load_scenario(scenario, set_, seed, duration)
     mode, pace = mode_and_rate(realtime, rate)
     who = identity(host, tls, insecure, access)
-    roles.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who)
+    world_role.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who)
 
 
 @app.command(rich_help_panel=ROLES)
@@ -113,7 +114,9 @@ def record(
 ) -> None:
     """Record every message of a federation into run.mcap."""
     from zsim_deploy.roles import roles
+    from zsim_deploy.roles.service_loop import give_way
 
+    give_way()
     roles.recorder(out / "run.mcap", reach)
 
 

@@ -15,10 +15,10 @@ from zsim.transport.identity import CERTIFICATES
 from zsim_deploy.hosts.leftover_runs import RECORD, runs_folder, scp
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import Placed
-from zsim_deploy.render.rendered_process import MODULE, Files, access_file, command, own_programs, processes
-from zsim_deploy.security import credentials
+from zsim_deploy.inventory.processes import MODULE, Files, access_file, command, own_programs, processes
+from zsim_deploy.roles.stop_channel import FOLDER
+from zsim_deploy.security import certificate_check
 from zsim_deploy.security.enrolment import folder_of, init_command
-from zsim_deploy.security.key_lease import FOLDER
 
 ACCESS = "access.json"
 
@@ -99,11 +99,11 @@ class Plan:
 
     def lacks(self, now: datetime) -> list[str]:
         """Return what of the certificates is missing or of no use at a time, a line for each fault."""
-        return credentials.lacks(self._placed, {name: self.host(name) for name in self.processes}, now)
+        return certificate_check.lacks(self._placed, {name: self.host(name) for name in self.processes}, now)
 
     def exposed(self) -> str | None:
         """Return a warning of private keys here that others can read, if there are any."""
-        return credentials.exposed(self._placed)
+        return certificate_check.exposed(self._placed)
 
     def python(self, host: str) -> str:
         """Return the interpreter of a host that has zsim."""

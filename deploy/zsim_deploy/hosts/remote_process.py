@@ -2,7 +2,9 @@
 
 The process has our end of the ssh channel as standard input. It ends when that closes, which sshd does when the
 launcher dies; and when it has heard nothing on it for ORPHAN_S, as when the launcher's host is gone (leash.py).
-"""
+
+
+TODO What a process on another host says, kept in a file here."""
 
 import asyncio
 import contextlib
@@ -11,15 +13,15 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Any
 
 import asyncssh
 
 from zsim.errors import HostsError
-from zsim_deploy.forkserver.role_launcher import SINGLE_THREADED
-from zsim_deploy.ssh import shell
+from zsim_deploy.launch.role_launcher import SINGLE_THREADED
+from zsim_deploy.ssh.connection import shell_line
 from zsim_deploy.ssh.host_link import HostLink, Loop
-from zsim_deploy.ssh.remote_log import Log
 
 BEAT_S = 1.0  # how often the launcher shows that it lives
 ORPHAN_S = 60.0  # without a beat a process ends itself; a link may be cut for shorter than that
@@ -27,6 +29,35 @@ LEND_S = 60.0  # how long its files may take to reach the host again; as long as
 KILL_S = 5.0  # how long a kill may take to reach the host: a few round trips
 LOST = -1000  # code of a process of which nobody knows how it ended
 PID = "zsim-pid "  # begins the line with its process id; a login shell may say something before
+
+
+class Log:
+    """A file of lines; where it cannot be written, that is said once, and only the last line is kept.
+
+    Args:
+        path: of the file, named after the process.
+        say: told when it cannot be written.
+
+    Attributes:
+        last: line that is not empty.
+    """
+
+    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+        self.last = ""
+        self._path = path
+        self._say = say
+        self._is_whole = True
+
+    def write(self, line: str) -> None:
+        """Add a line, which ends in a line feed."""
+        self.last = line.strip() or self.last
+        try:
+            with self._path.open("a", errors="replace") as file:
+                file.write(line)
+        except OSError as error:
+            if self._is_whole:
+                self._is_whole = False
+                self._say(f"{self._path}: cannot be written ({error.strerror}); what it would say there is lost")
 
 
 class Remote:
@@ -137,7 +168,7 @@ class Remote:
     def _command(self) -> str:
         words = [self._python, "-m", "zsim_deploy.cli", *self._arguments]
         settings = " ".join(f"{name}={value}" for name, value in SINGLE_THREADED.items())
-        return f"echo {PID}$$; exec env {settings} {shell.line(words)}"
+        return f"echo {PID}$$; exec env {settings} {shell_line(words)}"
 
     async def _read_lines(self, stream: Any, on_line: Callable[[str], None] | None = None) -> None:
         async for line in stream:

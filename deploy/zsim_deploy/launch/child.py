@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from zsim_deploy.forkserver.role_launcher import Nursery, Process
+from zsim_deploy.launch.role_launcher import Nursery, Process
 
 
 class Child:

@@ -15,15 +15,15 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.transport.identity import Identity
 from zsim_agents.hosting import agents_of
-from zsim_deploy.cli import console_command
-from zsim_deploy.forkserver.role_launcher import Nursery
 from zsim_deploy.launch.child import Child
+from zsim_deploy.launch.role_launcher import Nursery
 from zsim_deploy.launch.supervisor import Outcome, Watch
-from zsim_deploy.options.arguments import pace_options
+from zsim_deploy.options.arguments import CONSOLE_PORT, pace_options
+from zsim_deploy.options.terminal import REASONS, handled_by
 from zsim_deploy.roles.stop_channel import Leash
-from zsim_deploy.terminal.interrupts import REASONS, handled_by
 
 DEFAULT_PORT = 7447  # Zenoh's own
+CONSOLE = "console.run"  # the one that a run starts: not to be taken over by the first that is started by hand
 PORTS_TRIED = 5  # when other runs that start at this moment take each before our world listens
 
 
@@ -62,8 +62,8 @@ def _children(options: Options, endpoint: str, watch: Watch, nursery: Nursery) -
         split = [name.partition(".") for name in names]
         children += [Child(f"{role}.{thing}", [role, *reach, "--", thing], logs, nursery) for role, _, thing in split]
     if options.console:
-        show = ["console", "--name", console_command.OF_A_RUN, "--port", str(_page_port()), *reach]
-        children.append(Child(console_command.OF_A_RUN, show, logs, nursery, watch.take_line))
+        show = ["console", "--name", CONSOLE, "--port", str(_page_port()), *reach]
+        children.append(Child(CONSOLE, show, logs, nursery, watch.take_line))
     rank = {name: i for i, name in enumerate(options.order)}
     return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
 
@@ -95,7 +95,7 @@ def _is_free(port: int) -> bool:
 
 def _page_port() -> int:
     """Return the console's port, or another free one where that is taken."""
-    return console_command.PORT if _is_free(console_command.PORT) else _any_port()
+    return CONSOLE_PORT if _is_free(CONSOLE_PORT) else _any_port()
 
 
 def _any_port() -> int:

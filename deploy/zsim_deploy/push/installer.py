@@ -13,9 +13,8 @@ import asyncssh
 
 from zsim.errors import HostsError
 from zsim_deploy.push import on_host
-from zsim_deploy.ssh import shell
+from zsim_deploy.ssh.connection import json_answer, shell_line
 from zsim_deploy.ssh.host_link import HostLink
-from zsim_deploy.ssh.json_answer import answer
 
 START_S = 30.0  # wall time to start a Python on a small computer, over a poor link
 BEAT_S = 5.0  # how often the launcher shows that it lives
@@ -77,7 +76,7 @@ class Installer:
         try:
             async with asyncio.timeout(timeout_s):
                 while line := await self._process.stdout.readline():  # a greeting of the login shell is passed over
-                    if said := answer([line]):
+                    if said := json_answer([line]):
                         return said
                 last = (await self._process.stderr.read()).strip().splitlines() or ["says nothing; does it run there?"]
         except TimeoutError as error:
@@ -100,7 +99,7 @@ async def installer(link: HostLink, python: str, folder: str, told: Callable[[st
     script = Path(on_host.__file__).read_bytes()
     start = f"import sys; exec(sys.stdin.buffer.read({len(script)}))"  # not to the end: that means to end
     who = f"{getpass.getuser()}@{socket.gethostname()}"
-    command = shell.line([python, "-P", "-c", start, folder, who, f"{SILENT_S:g}"])
+    command = shell_line([python, "-P", "-c", start, folder, who, f"{SILENT_S:g}"])
     try:
         async with link.channel() as connection:
             process = await connection.create_process(command, encoding="utf-8", errors="replace")

@@ -1,7 +1,10 @@
-"""`zsim push`: install zsim on the hosts of an inventory, over ssh alone; the hosts need no internet."""
+"""`zsim push`: install zsim on the hosts of an inventory, over ssh alone; the hosts need no internet.
+
+TODO What is being done to each host: a line per host that changes on a terminal, a line per stage elsewhere."""
 
 import asyncio
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -9,16 +12,20 @@ from pathlib import Path
 from typing import Any
 
 import asyncssh
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 
 from zsim import __version__
 from zsim.errors import HostsError, InventoryError
-from zsim_deploy.inventory import extras
 from zsim_deploy.inventory.inventory import Host, Placed
+from zsim_deploy.inventory.processes import MODULES, known_extras, needed_extras
 from zsim_deploy.push.installer import Installer, installer
-from zsim_deploy.push.target import chosen, interpreters, question, target
+from zsim_deploy.push.package_index import chosen, interpreters, question, target
 from zsim_deploy.push.wheelhouse import House, Wheel, Wheelhouse
 from zsim_deploy.roles import warm_up
-from zsim_deploy.ssh import shell
+from zsim_deploy.ssh.connection import shell_line
 from zsim_deploy.ssh.host_link import HostLink
 
 LAUNCHER = "launcher"  # how this machine is called among the hosts, in what is told
@@ -49,11 +56,11 @@ async def push(placed: Placed, names: Sequence[str], more: Iterable[str], told: 
     hosts = placed.inventory.hosts
     more = list(more)
     unknown = [f"--host {name}: must be one of {', '.join(hosts)}" for name in names if name not in hosts]
-    known = extras.known()
+    known = known_extras()
     unknown += [f"--extra {name}: must be one of {', '.join(known)}" for name in more if name not in known]
     if unknown:
         raise InventoryError(unknown)
-    wanted = extras.needed(placed.inventory, more)
+    wanted = needed_extras(placed.inventory, more)
     house = Wheelhouse(cache, lambda text: told(LAUNCHER, text))
     chosen_names = list(dict.fromkeys(names)) or list(hosts)
     work = [_one(name, hosts[name], placed.folder, wanted[name], house, told) for name in chosen_names]
@@ -91,7 +98,7 @@ async def _one(name: str, host: Host, base: Path, wanted: frozenset[str], house:
 
 async def _python(link: HostLink) -> str:
     """Return the Python of a host to install for."""
-    said = await link.run(shell.line(["sh", "-c", question()]), timeout_s=ASK_S)
+    said = await link.run(shell_line(["sh", "-c", question()]), timeout_s=ASK_S)
     return chosen(link.name, interpreters(said.decode(errors="replace")), sys.version_info[:2]).path
 
 
@@ -151,7 +158,7 @@ class There:
             "pip": house.pip.path.name,
             "wheels": [wheel.path.name for wheel in _new(house, self.found["installed"])],
             "extras": house.extras,
-            "modules": [extras.MODULES[extra] for extra in ("", *house.extras) if extra in extras.MODULES],
+            "modules": [MODULES[extra] for extra in ("", *house.extras) if extra in MODULES],
             "note": house.note(),
         }
         await self._program.ask("install", INSTALL_S, **order)
@@ -191,3 +198,34 @@ class There:
 def default_cache() -> Path:
     """Return the folder of the wheelhouse on this machine (XDG Base Directory Specification)."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zsim"
+
+
+class Stages:
+    """Shows the stage of each host while it is entered."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console or Console(stderr=True)
+        self._now: dict[str, str] = {}
+        self._live = Live(console=self._console, get_renderable=self._table, refresh_per_second=5)
+
+    def __enter__(self) -> "Stages":
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+
+    def tell(self, host: str, text: str) -> None:
+        """Show what is being done at a host."""
+        kind, last = (re.sub(r"\d+ of", "", each) for each in (text, self._now.get(host, "")))
+        self._now[host] = text
+        if not self._console.is_terminal and kind != last:
+            self._console.print(f"{host}: {text}", highlight=False, markup=False, soft_wrap=True)
+
+    def _table(self) -> Table:
+        table = Table.grid(padding=(0, 2))
+        for host, text in self._now.items():
+            table.add_row(Text(host, style="bold"), Text(text))
+        return table

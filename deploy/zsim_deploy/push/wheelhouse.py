@@ -23,8 +23,7 @@ from urllib.parse import urldefrag
 
 import zsim
 from zsim.errors import HostsError
-from zsim_deploy.push.package_index import PipError, Told, UnreachableError, gather, pip
-from zsim_deploy.push.target import Target
+from zsim_deploy.push.package_index import PipError, Target, Told, UnreachableError, gather, pip
 
 PROJECT = "zsim"
 KEY_DIGITS = 16  # 64 bits of a SHA-256; what one person builds never collides

@@ -11,10 +11,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.inventory.inventory import Placed
-from zsim_deploy.launch.supervisor import RESTARTS_MAX
-from zsim_deploy.render import container
-from zsim_deploy.render.container import ACCESS, CACHE, CERTIFICATES, RUNS, SCENARIO, USER
-from zsim_deploy.render.rendered_process import (
+from zsim_deploy.inventory.processes import (
     STOP_S,
     Files,
     Process,
@@ -27,7 +24,19 @@ from zsim_deploy.render.rendered_process import (
     processes,
     used_hosts,
 )
-from zsim_deploy.render.yaml_text import document
+from zsim_deploy.launch.supervisor import RESTARTS_MAX
+from zsim_deploy.render.rendered_files import (
+    ACCESS,
+    CACHE,
+    CERTIFICATES,
+    ENVIRONMENT,
+    RUNS,
+    SCENARIO,
+    USER,
+    dockerfile,
+    document,
+    unused,
+)
 
 CACHE_VOLUME = "cache"
 
@@ -48,7 +57,7 @@ def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = ()) -> Rend
     for host in used_hosts(found):
         here = on_host(found, host)
         texts[f"{host}/compose.yaml"] = document(_project(scenario, here), _remarks(placed, scenario, host))
-        texts[f"{host}/Dockerfile"] = container.dockerfile(extras([process.name for process in here]))
+        texts[f"{host}/Dockerfile"] = dockerfile(extras([process.name for process in here]))
         if any(process.name == WORLD for process in here):
             texts[f"{host}/scenario.yaml"] = scenario_file.to_text(scenario)
     return texts
@@ -61,7 +70,7 @@ def _remarks(placed: Placed, scenario: Scenario, host: str) -> list[str]:
         "a new name each time, as a record is never overwritten.",
         "Compose does not tell exit codes apart: a role whose name another process took is started again too,",
         f"{RESTARTS_MAX} times.",
-        *container.unused(placed, host),
+        *unused(placed, host),
         *own_programs(placed, scenario, host),
     ]
 
@@ -79,7 +88,7 @@ def _service(scenario: Scenario, process: Process) -> dict[str, Any]:
         "image": f"zsim:{__version__}-{process.host}",
         "build": ".",
         "command": _words(scenario, process),
-        "environment": dict(container.ENVIRONMENT),
+        "environment": dict(ENVIRONMENT),
         "network_mode": "host",
         "user": f"${{ZSIM_USER:-{USER}:{USER}}}",
         "init": True,

@@ -14,10 +14,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.rights import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.inventory.inventory import Placed
-from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT
-from zsim_deploy.render import container, pod
-from zsim_deploy.render.container import RUNS
-from zsim_deploy.render.rendered_process import (
+from zsim_deploy.inventory.processes import (
     Process,
     Rendered,
     access_file,
@@ -26,7 +23,9 @@ from zsim_deploy.render.rendered_process import (
     processes,
     used_hosts,
 )
-from zsim_deploy.render.yaml_text import document, documents
+from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT
+from zsim_deploy.render import pod
+from zsim_deploy.render.rendered_files import RUNS, dockerfile, document, documents, unused
 
 IMAGE = f"zsim:{__version__}"
 CONFIG_BYTES_MAX = 1_048_576  # of a ConfigMap; Kubernetes, "ConfigMaps"
@@ -58,7 +57,7 @@ def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = (), image: 
         "namespace.yaml": documents([_namespace(space), _records_claim(space)], NAMESPACE_REMARKS),
         "zsim.yaml": documents(_run(space, scenario, text, found, image), _remarks(placed, scenario, found)),
         "records.yaml": document(_records_pod(space, image), ["Mounts the records, for `kubectl cp`."]),
-        "Dockerfile": container.dockerfile(extras([process.name for process in found])),
+        "Dockerfile": dockerfile(extras([process.name for process in found])),
     }
     if not placed.inventory.security.insecure:
         texts["secrets.sh"] = _secrets(space, found)
@@ -88,7 +87,7 @@ def _remarks(placed: Placed, scenario: Scenario, found: Sequence[Process]) -> li
         "Rendered by `zsim render kubernetes`; render again instead of editing.",
         "A Job starts a dead role again after 10 s, then after 20 s, and so on; `zsim run` does so at once.",
         *_service_remark(placed, found),
-        *(line for host in used_hosts(found) for line in container.unused(placed, host)),
+        *(line for host in used_hosts(found) for line in unused(placed, host)),
         *own_programs(placed, scenario),
     ]
 

@@ -6,8 +6,8 @@ from typing import Any
 
 from zsim.scenario.rights import RECORDER, WORLD
 from zsim.transport.identity import CERTIFICATES as IDENTITY_FILES
-from zsim_deploy.render.container import ACCESS, CACHE, CERTIFICATES, ENVIRONMENT, RUNS, SCENARIO, USER
-from zsim_deploy.render.rendered_process import STOP_S, Files, Process, command
+from zsim_deploy.inventory.processes import STOP_S, Files, Process, command
+from zsim_deploy.render.rendered_files import ACCESS, CACHE, CERTIFICATES, ENVIRONMENT, RUNS, SCENARIO, USER
 
 NAME_MAX = 63  # RFC 1123 label
 CPU = "250m"  # to find a node by; in lockstep a role takes what there is

@@ -12,11 +12,9 @@ from zsim.scenario import scenario_file
 from zsim.scenario.rights import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.schema.checker import show
-from zsim_deploy.forkserver.role_launcher import SINGLE_THREADED
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import Host, Placed
-from zsim_deploy.launch.supervisor import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED, USER_FAULT
-from zsim_deploy.render.rendered_process import (
+from zsim_deploy.inventory.processes import (
     STOP_S,
     Files,
     Process,
@@ -28,6 +26,8 @@ from zsim_deploy.render.rendered_process import (
     processes,
     used_hosts,
 )
+from zsim_deploy.launch.role_launcher import SINGLE_THREADED
+from zsim_deploy.launch.supervisor import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED, USER_FAULT
 
 TARGET = "zsim.target"
 STATE = "/var/lib/zsim"  # StateDirectory=zsim

@@ -1,21 +1,16 @@
-"""The roles as processes: what `zsim world`, `estimator`, `controller`, `record` and `router` do."""
+"""The roles as processes: what `zsim estimator`, `controller`, `host`, `record` and `router` do."""
 
 import gc
 import os
 import signal
 import sys
-import threading
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from zsim.contract import messages
 from zsim.errors import RecordError, RunError, SessionError
 from zsim.runtime.agent import Agent
-from zsim.runtime.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
@@ -23,106 +18,11 @@ from zsim.transport import session, tls
 from zsim.transport.connection import find_world
 from zsim.transport.identity import Identity
 from zsim_agents.hosting import chosen, hosted
-from zsim_deploy.options.reach import Reach
-from zsim_deploy.roles.priority import give_way
-from zsim_deploy.roles.stop_channel import Leash
-from zsim_deploy.security.key_lease import lent
+from zsim_deploy.options.arguments import Reach
+from zsim_deploy.roles.stop_channel import Leash, lent
 
 TICK_S = 0.1  # how often a router looks for a stop
 PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
-PATIENCE_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
-SHOWN_EVENTS = 2000  # events told per run besides those below; all of them are in the record
-HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but anybody can publish more
-VITAL = frozenset({"death", "doubled", "end"})  # how a run ends, and why; and what is wrong with who takes part
-
-
-def world(
-    scenario: Scenario,
-    mode: str,
-    rate: float,
-    endpoints: list[str],
-    launched: str | None,
-    expect: list[str] | None,
-    identity: Identity,
-) -> None:
-    """Run the world of a scenario on the endpoints until the scenario ends or somebody stops it."""
-    from zsim_world.flight.world import World
-    from zsim_world.server.world_process import run
-
-    leash = Leash(launched is not None, lent(identity, launched))
-    with _patience(Teller() if launched else None):
-        run_world = World(scenario, mode, rate, time.monotonic_ns, launched)
-    for name in expect or ():
-        run_world.barrier.expect(name)
-    gc.collect()
-    gc.freeze()
-    if launched:
-        run(run_world, endpoints, leash.reason, told(Teller()), identity=identity)
-        leash.account()
-        return
-    with Screen(scenario.duration_s) as screen:
-        listening = f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run"
-        run(run_world, endpoints, leash.reason, told(screen), lambda: screen.say(listening), identity)
-        screen.say(f"ended: {run_world.ended}")
-
-
-@contextmanager
-def _patience(teller: Teller | None) -> Iterator[None]:
-    """Say what takes so long the first time that a machine runs the world."""
-    from zsim.math.compiled import is_kept
-    from zsim_world.fleet.kernel import advance
-
-    text = "compiling the world's kernel; later runs on this machine find it compiled"
-    if is_kept(advance):
-        text = "loading the world's kernel; this machine is busy"
-    timer = threading.Timer(PATIENCE_S, teller.say if teller else print, args=(text,))
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
-
-
-def told(show: Show) -> Callable[[str, Any, str], None]:
-    """Return what the world calls with its clocks, its events, and what passes it."""
-    throttle, reasons = Throttle(), Reasons()
-    told = [0]
-    healths: defaultdict[str, Throttle] = defaultdict(lambda: Throttle(HEALTH_PERIOD_S))
-
-    def tell(kind: str, message: Any, about: str) -> None:
-        if kind == "clock" and (throttle.passes() or message.state == "stopped"):
-            show.clock(_clock_line(message, about))
-        elif kind == "state" and (line := reasons.line(about, message)):
-            show.say(line)
-        elif kind == "health" and healths[about].passes():
-            show.health({"name": about, "lag_ns": message.lag_ns, "received": message.received})
-        elif kind == "event" and (message.kind in VITAL or told[0] < SHOWN_EVENTS):
-            told[0] += message.kind not in QUIET
-            show.event(_event_line(message))
-
-    return tell
-
-
-def _clock_line(clock: messages.Clock, phase: str) -> dict[str, Any]:
-    waiting = [{"name": w.name, "host": w.host, "since_wall_s": round(w.since_wall_s, 1)} for w in clock.waiting_for]
-    return {
-        "t_s": clock.t_ns / 1e9,
-        "rate": clock.rate,
-        "state": clock.state,
-        "phase": phase,
-        "waiting_for": waiting,
-    }
-
-
-def _event_line(event: messages.Event) -> dict[str, Any]:
-    data = event.data if event.kind in ("end", "death") else {}
-    return {
-        "t_s": event.t_ns / 1e9,
-        "kind": event.kind,
-        "subject": event.subject,
-        "text": event.text,
-        "data": data,
-    }
 
 
 def agent(build: Callable[[messages.Info, Scenario], Agent], reach: Reach) -> None:
@@ -190,7 +90,6 @@ def recorder(path: Path, reach: Reach) -> None:
     """Record the run of a world into a file."""
     from zsim_agents.recorder import record
 
-    give_way()
     launched, who = reach.launched, reach.who
     leash = Leash(launched is not None, lent(who, launched))
     say = speaker(launched is not None)

@@ -1,7 +1,12 @@
-"""Processes that let others in: they stay when a run ends, and serve the next."""
+"""Processes that let others in: they stay when a run ends, and serve the next.
 
+TODO Who goes first where two processes want the same processor: those for whom a gate waits."""
+
+import os
+import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 
@@ -11,10 +16,9 @@ from zsim.errors import NoWorldError, SupersededError
 from zsim.transport.connection import find_world
 from zsim.transport.session import Session
 from zsim_bridges.observer_process import Presence
-from zsim_deploy.options.reach import Reach
+from zsim_deploy.options.arguments import Reach
 from zsim_deploy.roles.roles import speaker
-from zsim_deploy.roles.stop_channel import Leash
-from zsim_deploy.security.key_lease import lent
+from zsim_deploy.roles.stop_channel import Leash, lent
 
 ANY = "*"  # in a name, for a number
 PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits for byes
@@ -23,6 +27,11 @@ Stopped = Callable[[], bool]
 Say = Callable[[str], None]
 Serve = Callable[[Session, Info, Presence, Stopped, Say], None]
 """Serves one run with (session, info, presence, stopped, say), until its presence is over or it is stopped."""
+NICE = 5  # of processes for which no gate waits
+NICE_FOR_EYES = 10  # of those that only people look at: a picture may come later, a gate may not
+AUTOGROUP = Path("/proc/self/autogroup")  # sched(7)
+TRIES = 5
+AGAIN_S = 0.12  # the kernel lets ordinary users write there ten times a second, all of them together
 
 
 def visit(name: str, serve: Serve, reach: Reach) -> None:
@@ -98,3 +107,38 @@ def _serve(serve: Serve, link: Session, presence: Presence, info: Info, leash: L
     reason = presence.over or leash.reason() or "stopped"
     presence.leave(reason)
     say(f"{presence.name}: left, {reason}")
+
+
+def give_way(for_eyes: bool = False) -> None:
+    """Let the world go first. Threads to come, too.
+
+    Args:
+        for_eyes: a person alone waits; then it does not interrupt others when it wakes up either (SCHED_BATCH).
+    """
+    lower(NICE_FOR_EYES if for_eyes else NICE)
+    if for_eyes and sys.platform == "linux":
+        with suppress(OSError):  # it may be in a class from which one does not come back
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+def lower(niceness: int) -> None:
+    """Make this process nicer, and with it the session that it leads, if it does.
+
+    Where Linux shares processors between sessions, niceness counts within each of them only.
+    """
+    if hasattr(os, "nice"):
+        os.nice(niceness)
+    if sys.platform == "linux" and os.getsid(0) == os.getpid():
+        _lower_session(niceness)
+
+
+def _lower_session(niceness: int) -> None:
+    for _ in range(TRIES):
+        try:
+            AUTOGROUP.write_text(str(niceness))
+        except BlockingIOError:
+            time.sleep(AGAIN_S)
+        except OSError:
+            return  # not shared that way here, or not for us to say
+        else:
+            return

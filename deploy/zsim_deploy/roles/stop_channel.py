@@ -4,19 +4,44 @@ A launched process has a pipe from its launcher as standard input. The launcher 
 the pipe ends. So nothing outlives its launcher, on any system, also after kill -9. A launcher on another host writes
 "orphan-after SECONDS" and then a "beat" every second: a host that vanishes closes no pipe. A launched process that is
 sent SIGTERM instead ends well, too, but counts as dead: its launcher did not want it.
-"""
 
+
+TODO The private key that `zsim up` lends to a process on another host: it goes from there with the process."""
+
+import atexit
+import contextlib
 import os
 import signal
 import sys
 import threading
 import time
+from pathlib import Path
 
-from zsim_deploy.security.key_lease import Lent
-from zsim_deploy.terminal.interrupts import IMPATIENT, INTERRUPTED, REASONS
+from zsim.transport.identity import KEY, Identity
+from zsim_deploy.options.terminal import IMPATIENT, INTERRUPTED, REASONS
 
 TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it
 GRACE_S = 4.0  # a role that was told to stop and hangs is ended; the world waits 5 s for byes only if unstopped
+FOLDER = "identity"  # in the folder of a run on a host; the certificates of its processes are below
+
+
+class Lent:
+    """A key that was brought for this process; it is given back when the process ends, however that comes.
+
+    Args:
+        folder: with the key.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._key = folder / KEY
+        self._stamp = _stamp(self._key)
+        atexit.register(self.give_back)
+
+    def give_back(self) -> None:
+        """Remove the key, but not one that was brought to its place since, for whoever takes over."""
+        with contextlib.suppress(OSError):
+            if _stamp(self._key) == self._stamp:
+                self._key.unlink(missing_ok=True)
 
 
 class Leash:
@@ -104,3 +129,20 @@ class Leash:
         self._stop(reason)
         time.sleep(GRACE_S)
         os._exit(1)
+
+
+def lent(identity: Identity, launched: str | None) -> Lent | None:
+    """Return the key that the launcher of a run has lent; None if the key is this host's own, or there is none."""
+    folder = identity.tls
+    if launched is None or folder is None or folder.parts[-3:-1] != (launched, FOLDER):
+        return None
+    return Lent(folder)
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """Return what tells a file from another one at its place."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_ctime_ns

@@ -19,8 +19,7 @@ import asyncssh
 
 from zsim.errors import HostsError
 from zsim_deploy.inventory.inventory import Host
-from zsim_deploy.ssh import shell
-from zsim_deploy.ssh.ssh import connect
+from zsim_deploy.ssh.connection import connect, shell_word
 
 ECHO_S = 0.5  # how often a word goes to the host and back
 RETRY_S = 0.5  # between two attempts to connect again
@@ -195,7 +194,7 @@ class HostLink:
             HostsError: they could not be written.
         """
         content = archive(files)
-        into = shell.word(folder)
+        into = shell_word(folder)
         part = f"{into}/.part.$$"  # others may be writing there at the same time
         is_whole = f"[ $(wc -c < {part}) -eq {len(content)} ] || {{ echo it came in part >&2; false; }}"
         unpack = f"cat > {part} && {{ {is_whole}; }} && tar -xof {part} -C {into}"

@@ -10,7 +10,7 @@ import yaml
 from zsim.errors import HostsError, RunError
 from zsim.scenario import scenario_file
 from zsim_deploy.cli import hosts_commands
-from zsim_deploy.control.control_socket import Intercom
+from zsim_deploy.hosts.control_socket import Intercom
 from zsim_deploy.hosts.host_plan import Plan
 from zsim_deploy.inventory import inventory
 from zsim_deploy.security import certificates

@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy.control.orders import _refuse_unless_able
-from zsim_deploy.hosts.leftover_runs import earlier, scp, told
-from zsim_deploy.inventory import ports
+from zsim_deploy.hosts.control_requests import _refuse_unless_able
+from zsim_deploy.hosts.leftover_runs import earlier, port_faults, scp, told
 from zsim_deploy.inventory.inventory import Host
 from zsim_deploy.ssh.host_link import HostLink
 
@@ -81,10 +80,10 @@ def test_a_port_on_which_somebody_listens_is_a_line(free_ports: list[Any]) -> No
     link = local(Path("/z"))
     numbers = [found.getsockname()[1] for found in (taken, free)]
     free.close()
-    (line,) = asyncio.run(ports.faults(link, sys.executable, numbers))
+    (line,) = asyncio.run(port_faults(link, sys.executable, numbers))
     assert line.startswith(f"h1: port {numbers[0]} is in use there")
-    assert asyncio.run(ports.faults(link, sys.executable, numbers[1:])) == []
-    assert asyncio.run(ports.faults(link, "/no/python", [])) == []
+    assert asyncio.run(port_faults(link, sys.executable, numbers[1:])) == []
+    assert asyncio.run(port_faults(link, "/no/python", [])) == []
 
 
 @pytest.fixture

@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy.hosts.remote_process import LOST, Remote
+from zsim_deploy.hosts.remote_process import LOST, Log, Remote
 from zsim_deploy.ssh.host_link import Loop
-from zsim_deploy.ssh.remote_log import Log
 
 FILES = {"identity/estimator.d1/key.pem": b"secret"}
 PATIENCE_S = 20.0  # after which a test that waits for ever fails

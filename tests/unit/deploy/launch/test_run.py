@@ -8,8 +8,8 @@ from synthetic_record import SCENARIOS
 
 from zsim.errors import RunError, SessionError
 from zsim.scenario import scenario_file
-from zsim_deploy.forkserver.role_launcher import Nursery
 from zsim_deploy.launch import run
+from zsim_deploy.launch.role_launcher import Nursery
 from zsim_deploy.launch.run import Options
 from zsim_deploy.launch.supervisor import Outcome
 

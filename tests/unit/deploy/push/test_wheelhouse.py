@@ -16,8 +16,7 @@ import pytest
 
 from zsim.errors import HostsError
 from zsim_deploy.push import package_index, wheelhouse
-from zsim_deploy.push.package_index import PipError, gather, pip
-from zsim_deploy.push.target import Target, target
+from zsim_deploy.push.package_index import PipError, Target, gather, pip, target
 from zsim_deploy.push.wheelhouse import House, Wheelhouse, requirement
 
 BACKEND = """

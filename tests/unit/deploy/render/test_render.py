@@ -16,12 +16,12 @@ from typer.testing import CliRunner
 from zsim.errors import InventoryError, RunError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim_deploy.cli import render_commands
+from zsim_deploy.cli import inventory_commands
 from zsim_deploy.cli.cli import app
 from zsim_deploy.inventory import inventory
 from zsim_deploy.inventory.inventory import Placed
 from zsim_deploy.render import compose, kubernetes, systemd
-from zsim_deploy.render.render_folder import write
+from zsim_deploy.render.rendered_files import write
 
 ROOT = Path(__file__).parents[4]
 STEP = ROOT / "scenarios/step.yaml"
@@ -511,7 +511,7 @@ def test_a_scenario_beyond_a_config_map_is_refused(tmp_path: Path) -> None:
 
 def call(folder: Path, target: str, *options: str) -> Any:
     where = ["--hosts", str(folder / "hosts.yaml"), "--out", str(folder / "out")]
-    return CliRunner().invoke(render_commands.app, [target, str(STEP), *where, *options])
+    return CliRunner().invoke(inventory_commands.rendering, [target, str(STEP), *where, *options])
 
 
 @ALL

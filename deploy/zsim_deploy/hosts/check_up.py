@@ -1,0 +1,105 @@
+"""A check-up of all hosts of an inventory at once: what each says, how each reaches the others, as tables."""
+
+import asyncio
+import shlex
+from datetime import UTC, datetime
+from typing import Any, NamedTuple
+
+from rich.table import Table
+from rich.text import Text
+
+from zsim.errors import ZsimError
+from zsim_deploy.hosts import doctor
+from zsim_deploy.hosts.leftover_runs import earlier
+from zsim_deploy.inventory import inventory as inv
+from zsim_deploy.inventory.inventory import Placed
+from zsim_deploy.security import certificate_check
+from zsim_deploy.ssh.host_link import HostLink
+
+
+class CheckUp(NamedTuple):
+    """What was found."""
+
+    tables: list[Table]
+    faults: list[str]
+    warnings: list[str]
+
+
+def check_up(placed: Placed, places: dict[str, str] | None) -> CheckUp:
+    """Check certificates and hosts; with a placement also the paths to where the world and the routers listen."""
+    found = asyncio.run(_check_up(placed, places))
+    lacks = certificate_check.lacks(placed, places, datetime.now(UTC))
+    warning = certificate_check.exposed(placed)
+    return found._replace(faults=[*lacks, *found.faults], warnings=[*found.warnings, *([warning] if warning else [])])
+
+
+async def _check_up(placed: Placed, places: dict[str, str] | None) -> CheckUp:
+    links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
+    pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
+    hosts = shlex.quote(str(placed.folder / placed.source))
+    try:
+        asked = await asyncio.gather(
+            *(doctor.about(link, pythons[name], hosts) for name, link in links.items()), return_exceptions=True
+        )
+        reports: dict[str, doctor.Report] = {}
+        faults: list[str] = []
+        for name, result in zip(links, asked, strict=True):
+            if isinstance(result, doctor.Report):
+                reports[name] = result
+            elif isinstance(result, ZsimError):
+                faults.append(str(result))
+            else:
+                raise result
+        wrong, warnings = doctor.compared(reports)
+        paths = await _paths(placed, places, links, pythons, set(reports)) if places else []
+        cut, slow = doctor.path_faults(paths)
+        left = await asyncio.gather(*(earlier(links[name], placed.folder) for name in reports))
+        tables = [_hosts_table(reports), *([_paths_table(paths)] if paths else [])]
+        return CheckUp(tables, [*faults, *wrong, *cut], [*warnings, *slow, *(line for lines in left for line in lines)])
+    finally:
+        for link in links.values():
+            await link.close()
+
+
+async def _paths(
+    placed: Placed, places: dict[str, str], links: dict[str, HostLink], pythons: dict[str, str], there: set[str]
+) -> list[doctor.NetworkPath]:
+    """Return how the hosts reach what their roles and routers connect to, one path after the other."""
+    found: list[doctor.NetworkPath] = []
+    for (target, port), sources in inv.connections(placed, places).items():
+        if target in there:
+            chosen = [links[name] for name in sorted(sources & there)]
+            found += await doctor.reached(chosen, links[target], pythons, port)
+    return found
+
+
+def _hosts_table(reports: dict[str, doctor.Report]) -> Table:
+    shown = Table("host", "python", "zsim", "round trip", "clock", "load", "cores", "governor", "fingerprint", box=None)
+    for name, report in reports.items():
+        said = report.said
+        cells = (
+            name,
+            said["python"],
+            said["zsim"],
+            f"{1e3 * report.round_trip_s:.1f} ms",
+            f"{1e3 * report.clock_offset_s:+.1f} ms",
+            f"{said['load']:.2f}",
+            str(said["cores"]),
+            ", ".join(said["governors"]) or "-",
+            said["fingerprint"][:8],
+        )
+        shown.add_row(*map(Text, cells))  # what a host says may have brackets
+    return shown
+
+
+def _paths_table(paths: list[doctor.NetworkPath]) -> Table:
+    shown = Table("from", "to", "port", "round trip", "bandwidth", box=None)
+    for path in paths:
+        shown.add_row(*map(Text, (path.source, path.target, str(path.port), *_path_figures(path.found))))
+    return shown
+
+
+def _path_figures(found: dict[str, Any]) -> tuple[str, str]:
+    if "error" in found:
+        return found["error"], "-"
+    return f"{1e3 * found['round_trip_s']:.2f} ms", f"{found['bits_per_s'] / 1e6:.0f} Mbit/s"

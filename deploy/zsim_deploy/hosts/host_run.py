@@ -1,0 +1,211 @@
+"""A run on several hosts: checked, prepared, started over ssh, watched, ended, and its record brought home."""
+
+import contextlib
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from zsim.errors import HostsError, RunError, ZsimError
+from zsim.record import repair
+from zsim.scenario import scenario_file
+from zsim.scenario.rights import RECORDER, WORLD
+from zsim.scenario.scenario import Scenario
+from zsim_deploy.hosts.control_requests import Orders
+from zsim_deploy.hosts.control_socket import Intercom
+from zsim_deploy.hosts.doctor import Report, about, compared
+from zsim_deploy.hosts.host_plan import Plan
+from zsim_deploy.hosts.leftover_runs import RECORD, earlier, port_faults
+from zsim_deploy.hosts.remote_process import Log, Remote
+from zsim_deploy.hosts.status_table import Board
+from zsim_deploy.inventory.inventory import Placed
+from zsim_deploy.launch.supervisor import Outcome, Watch
+from zsim_deploy.options.arguments import pace_options
+from zsim_deploy.options.terminal import CLOSED, Signals
+from zsim_deploy.ssh.connection import shell_word
+from zsim_deploy.ssh.host_link import HostLink, Loop
+from zsim_deploy.ssh.host_links import Links, fetch
+
+CONNECT_S = 30.0  # how long all hosts together may take to let us in, …
+CHECK_S = 60.0  # … to be checked: a small computer takes 5 s to import numpy, a poor link adds a dozen round trips, …
+PREPARE_S = 30.0  # … and to take their files
+CLEAN_S = 5.0  # how long a host may take to remove the run's folder; one that was lost holds nobody up for longer
+
+
+@dataclass
+class Options:
+    """How to run a scenario on the hosts of an inventory."""
+
+    scenario: Scenario
+    placed: Placed
+    out: Path
+    mode: str = "lockstep"
+    rate: float = 0.0
+    run_id: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
+
+    def pace(self) -> list[str]:
+        """Return that as options of the world."""
+        return pace_options(self.mode, self.rate)
+
+
+class Look(NamedTuple):
+    """What a look at a host has found: what it says, ports that are taken, and what earlier runs have left."""
+
+    report: Report
+    taken: list[str]
+    left: list[str]
+
+
+class Up:
+    """One run on several hosts.
+
+    Args:
+        options: what to run where.
+        board: takes progress.
+
+    Raises:
+        InventoryError: a process has no place.
+    """
+
+    def __init__(self, options: Options, board: Board) -> None:
+        self._options = options
+        self._board = board
+        self._logs = options.out / "logs"
+        self._plan = Plan(options.placed, options.scenario, options.run_id, options.pace())
+        self._watch = Watch(options.scenario.processes.on_death, board)
+        self._loop = Loop()
+        self._links = Links(options.placed, self._plan.hosts(), self._loop)
+        self._record_stays = False
+
+    def go(self) -> Outcome:
+        """Run to the end; whatever happens, no process or key of it is left on any host that can be reached.
+
+        Raises:
+            RunError: the federation is up already on this machine.
+            HostsError: with a line for every certificate that is missing, or every host that cannot take part.
+        """
+        try:
+            with Signals(self._options.out / "up.log", self._hang_up), self._intercom():
+                self._refuse_unless_certified()
+                self._timed("connect", lambda: self._links.on_all(HostLink.open, CONNECT_S))
+                self._timed("check", self._check)
+                with self._cleaned():
+                    self._timed("prepare", lambda: self._links.on_all(self._prepare, PREPARE_S))
+                    return self._fly()
+        finally:
+            with contextlib.suppress(HostsError):
+                self._links.close()
+            self._loop.close()
+
+    def _hang_up(self) -> None:
+        self._board.hang_up()
+        self._watch.interrupt(CLOSED)
+
+    def _refuse_unless_certified(self) -> None:
+        if faults := self._plan.lacks(datetime.now(UTC)):
+            raise HostsError("\n".join(faults))
+        if warning := self._plan.exposed():
+            self._board.say(f"warning: {warning}")
+
+    def _intercom(self) -> Intercom:
+        orders = Orders(self._plan, self._links, self._loop, self._watch, self._board, self._options.out, self._remote)
+        return Intercom(self._options.scenario.federation, orders.acts())
+
+    def _timed(self, what: str, act: Callable[[], Any]) -> None:
+        start_s = time.monotonic()
+        act()
+        self._board.stages_s[what] = time.monotonic() - start_s
+
+    def _check(self) -> None:
+        looks = self._links.on_all(self._look, CHECK_S)
+        faults, warnings = compared({name: look.report for name, look in looks.items()})
+        for warning in [*warnings, *(line for look in looks.values() for line in look.left)]:
+            self._board.say(f"warning: {warning}")
+        if faults := [*faults, *(line for look in looks.values() for line in look.taken)]:
+            raise HostsError("\n".join(faults))
+
+    async def _look(self, link: HostLink) -> Look:
+        python = self._plan.python(link.name)
+        report = await about(link, python, self._plan.source())
+        taken = await port_faults(link, python, self._plan.ports(link.name))
+        return Look(report, taken, await earlier(link, self._plan.base()))
+
+    async def _prepare(self, link: HostLink) -> None:
+        """Put the scenario, and the certificates where there are any, on a host."""
+        if files := self._plan.files(link.name):
+            await link.put_files(self._plan.folder(link.name), files, PREPARE_S)
+
+    def _fly(self) -> Outcome:
+        self._make_logs()
+        for remark in self._plan.remarks:
+            self._board.say(remark)
+        self._watch.members = [self._remote(self._plan, name) for name in self._plan.processes]
+        self._board.members, self._board.links = self._watch.members, self._links.by_name
+        self._links.listen()
+        self._record_stays = True
+        try:
+            outcome = self._watch.go(self._board.look)
+            fault = self._fetch()
+        except KeyboardInterrupt:
+            where = self._plan.way_to_record()
+            self._board.say(f"the record was not fetched; what there is of it is at {where}")
+            raise
+        if fault and not outcome.failed and not outcome.interrupted:
+            return replace(outcome, reason=fault, failed=True)
+        if fault:
+            self._board.say(fault)
+        return outcome
+
+    def _make_logs(self) -> None:
+        out = self._options.out
+        try:
+            self._logs.mkdir(parents=True)
+            (out / "scenario.yaml").write_text(scenario_file.to_text(self._options.scenario))
+        except OSError as error:
+            raise RunError(f"{out}: cannot be written ({error.strerror}); give --out another folder") from error
+
+    def _remote(self, plan: Plan, name: str) -> Remote:
+        host = plan.host(name)
+        log = Log(self._logs / f"{name}.log", self._board.say)
+        on_line = self._watch.take_line if name == WORLD else None
+        link = self._links.by_name[host]
+        more = (on_line, plan.folder(host), plan.identity(name))
+        return Remote(name, plan.arguments(name), link, plan.python(host), self._loop, log, *more)
+
+    def _fetch(self) -> str:
+        """Bring the record home; return why it is not here, empty if it is."""
+        host, into = self._plan.host(RECORDER), self._options.out / RECORD
+        self._board.say(f"fetching the record from {host}:{self._plan.record()} …")
+        try:
+            found = self._loop.call(fetch(self._links.by_name[host], self._plan.record(), into))
+            if found:
+                repair(into)
+        except (ZsimError, OSError) as error:
+            where = self._plan.way_to_record()
+            return f"the record could not be fetched ({error}); what there is of it is at {where}"
+        self._record_stays = False
+        return "" if found else "nothing was recorded"
+
+    @contextlib.contextmanager
+    def _cleaned(self) -> Any:
+        """Leave nothing of the run on the hosts in the end, but a record that could not be fetched."""
+        try:
+            yield
+        finally:
+            try:
+                self._links.on_all(self._clean, 2 * CLEAN_S)
+            except HostsError as error:
+                self._board.say(f"{error}\nkeys of this run may be left there; remove its folder")
+            except KeyboardInterrupt:
+                self._board.say("keys of this run may be left on its hosts; the next `zsim up` or `zsim doctor` tells")
+                raise
+
+    async def _clean(self, link: HostLink) -> None:
+        folder, keys = shell_word(self._plan.folder(link.name)), shell_word(self._plan.keys(link.name))
+        command = f"rm -rf {folder}"
+        if self._record_stays and link.name == self._plan.host(RECORDER):
+            command = f"rm -rf {keys}; [ -e {shell_word(self._plan.record())} ] || {command}"
+        await link.run(command, timeout_s=CLEAN_S, what=f"removing {self._plan.folder(link.name)}")

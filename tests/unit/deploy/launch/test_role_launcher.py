@@ -1,0 +1,220 @@
+"""Roles that are forked: what a launcher sees of them is what it sees of any program that it starts."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from zsim import __version__
+from zsim_deploy.launch import role_launcher as nursery_module
+from zsim_deploy.launch.role_launcher import Forked, Nursery, Process
+
+LINUX = pytest.mark.skipif(sys.platform != "linux", reason="roles are forked on Linux alone")
+WAITING = ["record", "--connect", "tcp/127.0.0.1:1", "--launched", "0", "--wait", "100"]  # for a world that never comes
+END_S = 30.0
+LOOK_S = 0.02
+
+
+def quiet(_: str) -> None:
+    """Say nothing."""
+
+
+@pytest.fixture(scope="module")
+def nursery() -> Iterator[Nursery]:
+    with Nursery(quiet, "a run") as made:
+        yield made
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return tmp_path / "role.log"
+
+
+def start(nursery: Nursery, log: Path, *arguments: str, listened: bool = False) -> Process:
+    with log.open("a") as file:
+        return nursery.start([*arguments], file, listened)
+
+
+def await_words(log: Path) -> None:
+    """Wait until a role has begun to do what it is for."""
+    until_s = time.monotonic() + END_S
+    while not log.read_text() and time.monotonic() < until_s:
+        time.sleep(LOOK_S)
+
+
+def end(*roles: Process) -> None:
+    for role in roles:
+        role.kill()
+        role.wait(END_S)
+        for pipe in (role.stdin, role.stdout):
+            if pipe is not None:
+                pipe.close()
+
+
+def test_what_a_role_prints_and_its_exit_code_come_back(nursery: Nursery, log: Path) -> None:
+    role = start(nursery, log, "--version", listened=True)
+    assert role.stdout is not None
+    assert role.stdout.read() == f"zsim {__version__}\n"
+    assert role.wait(END_S) == role.poll() == 0
+    assert log.read_text() == ""
+    end(role)
+
+
+def test_what_is_wrong_is_in_its_log(nursery: Nursery, log: Path) -> None:
+    role = start(nursery, log, "estimator")
+    assert role.wait(END_S) == 2
+    assert "missing argument" in log.read_text()
+    end(role)
+
+
+def test_without_a_reader_what_it_prints_goes_to_the_log(nursery: Nursery, log: Path) -> None:
+    role = start(nursery, log, "--version")
+    role.wait(END_S)
+    assert role.stdout is None
+    assert log.read_text() == f"zsim {__version__}\n"
+    end(role)
+
+
+def test_a_role_that_is_killed_says_so_by_its_code(nursery: Nursery, log: Path) -> None:
+    role = start(nursery, log, *WAITING)
+    assert role.poll() is None
+    with pytest.raises(subprocess.TimeoutExpired):
+        role.wait(0.0)
+    role.kill()
+    assert role.wait(END_S) == -9
+    role.kill()
+    end(role)
+
+
+def test_it_is_a_child_of_its_own_session_under_its_own_name(nursery: Nursery, log: Path) -> None:
+    role = start(nursery, log, *WAITING)
+    await_words(log)
+    seen = psutil.Process(role.pid)
+    assert seen.ppid() == psutil.Process().pid
+    assert [word for word in seen.cmdline() if word] == [sys.executable, "-m", "zsim_deploy.cli", *WAITING]
+    end(role)
+
+
+def test_no_role_holds_the_pipes_of_another(nursery: Nursery, log: Path) -> None:
+    first, second = (start(nursery, log, *WAITING, listened=True) for _ in range(2))
+    assert first.stdin is not None
+    assert first.stdout is not None
+    first.stdin.close()
+    first.wait(END_S)
+    assert first.stdout.read() == ""  # it ends, so nobody can write to it any more
+    assert second.poll() is None
+    end(first, second)
+
+
+def test_it_heeds_what_it_is_told(nursery: Nursery, log: Path) -> None:
+    role = start(nursery, log, *WAITING)
+    await_words(log)
+    assert role.stdin is not None
+    role.stdin.write("stop it is enough\n")
+    role.stdin.flush()
+    role.wait(END_S)
+    assert "stopped while waiting for a world" in log.read_text()
+    end(role)
+
+
+def test_where_its_cradle_fails_a_role_is_started_as_a_program(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nursery_module, "CRADLE", (sys.executable, "-c", "pass"))
+    with Nursery(quiet) as nursery:
+        roles = [start(nursery, log, "--version") for _ in range(2)]
+        assert all(isinstance(role, subprocess.Popen) for role in roles)
+        assert [role.wait(END_S) for role in roles] == [0, 0]
+        end(*roles)
+    assert log.read_text() == 2 * f"zsim {__version__}\n"
+
+
+@LINUX
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_cradle_that_dies_or_stands_is_done_without(number: int, log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nursery_module, "ANSWER_S", 0.2)
+    with Nursery(quiet) as nursery:
+        assert nursery._cradle is not None
+        os.kill(nursery._cradle.pid, number)
+        role = start(nursery, log, "--version", listened=True)
+        assert isinstance(role, subprocess.Popen)
+        assert role.wait(END_S) == 0
+        assert nursery._cradle.poll() is not None
+        end(role)
+
+
+@LINUX
+def test_a_role_of_which_the_launcher_does_not_know_never_begins(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Nursery(quiet) as nursery:
+        monkeypatch.setattr(nursery, "_heard", lambda: b"")
+        role = start(nursery, log, "--version")
+        assert role.wait(END_S) == 0
+        end(role)
+    assert log.read_text() == f"zsim {__version__}\n"  # once: the one that was forked has printed nothing
+
+
+@LINUX
+def test_a_command_that_is_too_long_for_a_packet_is_no_matter(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Nursery(quiet) as nursery:
+        monkeypatch.setattr(nursery_module, "PACKET_MAX", 5)
+        role = start(nursery, log, "--version")
+        monkeypatch.undo()
+        again = start(nursery, log, "--version")
+        assert [isinstance(each, Forked) for each in (role, again)] == [False, True]
+        assert [each.wait(END_S) for each in (role, again)] == [0, 0]
+        end(role, again)
+
+
+@LINUX
+def test_one_within_another_leaves_it_its_children(log: Path) -> None:
+    with Nursery(quiet) as outer:
+        with Nursery(quiet) as inner:
+            assert inner._cradle is not None
+        assert inner._cradle.poll() is not None
+        role = start(outer, log, "estimator")
+        assert role.wait(END_S) == 2
+        end(role)
+
+
+@LINUX
+def test_a_cradle_ends_with_its_launcher() -> None:
+    code = "import time\nfrom zsim_deploy.launch.role_launcher import Nursery\n"
+    code += "with Nursery(lambda _: None) as nursery: print(nursery._cradle.pid, flush=True); time.sleep(100)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as launcher:
+        assert launcher.stdout is not None
+        cradle = psutil.Process(int(launcher.stdout.readline()))
+        launcher.kill()
+    cradle.wait(END_S)
+
+
+def test_what_takes_long_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(nursery_module, "PATIENCE_S", 0.0)
+    with Nursery(said.append):
+        assert said == [nursery_module.PATIENCE] or sys.platform != "linux"
+
+
+@LINUX
+def test_ctrl_c_while_it_loads_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(_: Nursery) -> bytes:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Nursery, "_heard", interrupt)
+    nursery = Nursery(quiet)
+    with pytest.raises(KeyboardInterrupt), nursery:
+        pass
+    assert nursery._cradle is not None
+    assert nursery._cradle.poll() is not None
+
+
+def test_an_exit_code_that_somebody_else_took_is_no_error() -> None:
+    with subprocess.Popen([sys.executable, "-c", "pass"], stdin=subprocess.PIPE, text=True) as child:
+        child.wait()
+        assert child.stdin is not None
+        gone = Forked(child.pid, child.stdin, None)
+        assert gone.poll() == 0
+        gone.kill()
