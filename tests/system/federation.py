@@ -35,7 +35,7 @@ import warm
 from wire import PATIENCE_S, Client
 
 from zsim.record import RecordReader, repair
-from zsim_deploy.launch.role_launcher import Process
+from zsim_deploy.launch.role_launcher import RoleProcess
 
 ROOT = Path(__file__).parents[2]
 ZSIM = (sys.executable, "-m", "zsim_deploy.cli")
@@ -98,7 +98,7 @@ class Role:
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
-    def _start_cold(self, command: list[str], environment: dict[str, str]) -> tuple[Process, IO[str]]:
+    def _start_cold(self, command: list[str], environment: dict[str, str]) -> tuple[RoleProcess, IO[str]]:
         process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,

@@ -10,13 +10,13 @@ import resource
 from functools import cache
 from typing import IO, Any
 
-from zsim_deploy.launch.role_launcher import Nursery, Process
+from zsim_deploy.launch.role_launcher import RoleLauncher, RoleProcess
 
 ROLES = ("world", "estimator", "controller", "record", "gateway", "console")
 LIMITS = (resource.RLIMIT_NOFILE, resource.RLIMIT_FSIZE, resource.RLIMIT_AS)
 
 
-def start(arguments: list[str], root: str, environment: dict[str, str]) -> tuple[Process, IO[str]] | None:
+def start(arguments: list[str], root: str, environment: dict[str, str]) -> tuple[RoleProcess, IO[str]] | None:
     """Start a role in a folder; return it and what it prints, None where it has to be started cold."""
     if arguments[0] not in ROLES or _inherited() != FIRST or os.getcwd() != root:
         return None
@@ -38,11 +38,11 @@ FIRST = _inherited()
 
 
 @cache
-def _nursery(environment: tuple[tuple[str, str], ...]) -> Nursery:
+def _nursery(environment: tuple[tuple[str, str], ...]) -> RoleLauncher:
     former = dict(os.environ)
     os.environ.update(environment)
     try:
-        made = Nursery(print, "of tests").__enter__()
+        made = RoleLauncher(print, "of tests").__enter__()
     finally:
         os.environ.clear()
         os.environ.update(former)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsim_deploy.options.arguments import CONSOLE_PORT, LOOK_S, Reach, positive, takes_part
+from zsim_deploy.options.arguments import CONSOLE_PORT, LOOK_S, WorldAccess, positive, participant_options
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -26,9 +26,9 @@ app = typer.Typer()
 
 
 @app.command(rich_help_panel=OPERATE)
-@takes_part
+@participant_options
 def console(
-    reach: Reach,
+    reach: WorldAccess,
     listen: Annotated[str, typer.Option(help="Address on which the page is served.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port of the page.", min=1, max=65535)] = CONSOLE_PORT,
     token: Annotated[
@@ -50,15 +50,15 @@ def console(
     from zsim.runtime.progress import Teller
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.http.http_proxy import Place
-    from zsim_deploy.roles.roles import speaker
-    from zsim_deploy.roles.service_loop import give_way, named, visit
+    from zsim_deploy.roles.roles import log_printer
+    from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
 
     give_way(for_eyes=True)
-    mine = named("console", name, reach.tls, "*")
-    say = Teller().say if reach.launched else speaker(False)
+    mine = process_name("console", name, reach.tls, "*")
+    say = Teller().say if reach.launched else log_printer(False)
     shown = Console(Place(listen, port), mine.removesuffix(".*"), token, rate_hz, say)
     with shown.open():
-        visit(mine, shown.serve, reach)
+        serve_runs(mine, shown.serve, reach)
 
 
 def check_console_installed() -> None:
@@ -77,9 +77,9 @@ def check_console_installed() -> None:
 
 
 @app.command(rich_help_panel=TRANSLATE)
-@takes_part
+@participant_options
 def gateway(
-    reach: Reach,
+    reach: WorldAccess,
     listen: Annotated[str, typer.Option(help="Address on which clients come in.")] = "127.0.0.1",
     http: Annotated[int, typer.Option(help="Port of HTTP and WebSocket.", min=1, max=65535)] = 8000,
     lines: Annotated[int, typer.Option(help="Port of JSON lines on TCP.", min=1, max=65535)] = 7470,
@@ -91,20 +91,20 @@ def gateway(
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
     from zsim.transport.connection import find_world
     from zsim_bridges.gateway.gateway_server import Doors, Gateway
-    from zsim_deploy.roles.roles import speaker
-    from zsim_deploy.roles.service_loop import give_way, named, visit
+    from zsim_deploy.roles.roles import log_printer
+    from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
 
     give_way()
     who = reach.who
-    mine = named("gateway", name, reach.tls)
+    mine = process_name("gateway", name, reach.tls)
 
     def dial(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
         return find_world(reach.endpoint, reach.federation, LOOK_S, identity=_of_seat(who, process))
 
     doors = Doors(listen, http, lines)
-    gate = Gateway(doors, mine, token, dial, speaker(reach.launched is not None), secured=reach.tls is not None)
+    gate = Gateway(doors, mine, token, dial, log_printer(reach.launched is not None), secured=reach.tls is not None)
     with gate.open():
-        visit(mine, gate.serve, reach)
+        serve_runs(mine, gate.serve, reach)
 
 
 def _of_seat(who: "Identity", process: str) -> "Identity":
@@ -122,9 +122,9 @@ def _of_seat(who: "Identity", process: str) -> "Identity":
 
 
 @app.command(rich_help_panel=TRANSLATE)
-@takes_part
+@participant_options
 def ros1(
-    reach: Reach,
+    reach: WorldAccess,
     master: Annotated[str, typer.Option(envvar="ROS_MASTER_URI", help="The ROS master.")] = DEFAULT_MASTER,
     ros_host: Annotated[
         str | None,
@@ -138,21 +138,21 @@ def ros1(
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
     from zsim_bridges.ros1.bridge import DismissedError, serve
-    from zsim_deploy.roles.service_loop import give_way, named, visit
+    from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
 
     give_way()
-    mine = named("ros1", name, reach.tls)
+    mine = process_name("ros1", name, reach.tls)
     bridge = partial(serve, master_uri=master, host=ros_host or reachable_as(master))
     try:
-        visit(mine, bridge, reach)
+        serve_runs(mine, bridge, reach)
     except DismissedError as error:
         print(error)
 
 
 @app.command(rich_help_panel=TRANSLATE)
-@takes_part
+@participant_options
 def ros2(
-    reach: Reach,
+    reach: WorldAccess,
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=DOMAIN_MAX, help="ROS_DOMAIN_ID.")] = 0,
     router: Annotated[
         str | None, typer.Option(help="Where ROS's own router (rmw_zenohd) listens; the world's hub if not given.")
@@ -169,7 +169,7 @@ def ros2(
     from zsim.transport.identity import Identity
     from zsim.transport.tls import is_tls
     from zsim_bridges.ros2.bridge import Door, serve
-    from zsim_deploy.roles.service_loop import give_way, named, visit
+    from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
 
     if reach.tls and router is None:
         why = "the world's access control lets no ROS keys pass"
@@ -178,8 +178,8 @@ def ros2(
     who = reach.who
     to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
     door = Door(domain, router, to_router)
-    mine = named("ros2", name, reach.tls)
-    visit(mine, partial(serve, door=door, wall_ns=time.time_ns), reach)
+    mine = process_name("ros2", name, reach.tls)
+    serve_runs(mine, partial(serve, door=door, wall_ns=time.time_ns), reach)
 
 
 def _write_package(folder: Path) -> None:

@@ -75,7 +75,7 @@ def run(
 ) -> None:
     """Fly a scenario: start every process, show progress, record, report."""
     from zsim.runtime.progress import Screen
-    from zsim_deploy.launch.run import Options, check_endpoint, make_directory, run_in_process, run_processes
+    from zsim_deploy.launch.run import RunOptions, check_endpoint, make_directory, run_in_process, run_processes
     from zsim_deploy.launch.supervisor import Outcome
     from zsim_deploy.options.terminal import REASONS
 
@@ -87,7 +87,7 @@ def run(
     loaded = load_scenario(scenario, set_, seed, duration)
     mode, pace = mode_and_rate(realtime, rate)
     folder, first = make_directory(out, loaded), [name for name in order.split(",") if name]
-    options = Options(loaded, folder, mode, pace, listen, insecure, hosted, first, console)
+    options = RunOptions(loaded, folder, mode, pace, listen, insecure, hosted, first, console)
     with Screen(loaded.duration_s) as screen:
         try:
             outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from zsim_deploy.options.arguments import Reach, looks, positive
+from zsim_deploy.options.arguments import WorldAccess, observer_options, positive
 
 if TYPE_CHECKING:
     from zsim.contract.messages import Info
@@ -38,22 +38,22 @@ GIVEN_BY = {"target": "the argument TARGET", "kind": "the argument KIND", "for_s
 
 
 @app.command(rich_help_panel=PANEL)
-@looks
+@observer_options
 def keys(
-    reach: Reach,
+    reach: WorldAccess,
 ) -> None:
     """List the keys that speak, with their message and how many came in a second."""
     from zsim_deploy.cli import inspection
 
-    with linked(reach) as (link, _):
+    with connected(reach) as (link, _):
         for key, kind, count in inspection.list_keys(link):
             print(f"{key:<36} {kind:<14} {count:>6}")
 
 
 @app.command(rich_help_panel=PANEL)
-@looks
+@observer_options
 def echo(
-    reach: Reach,
+    reach: WorldAccess,
     key: Annotated[str, typer.Argument(help="Key or expression, e.g. drone/drone1/sensor/imu or 'drone/*/truth'.")],
     count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after so many messages.")] = None,
     raw: Annotated[bool, typer.Option("--raw", help="Payload as hexadecimal digits.")] = False,
@@ -64,14 +64,14 @@ def echo(
     def emit(name: str, message: Any) -> None:
         print(json.dumps({"key": name, "message": message}), flush=True)
 
-    with linked(reach) as (link, _):
+    with connected(reach) as (link, _):
         inspection.echo(link, key, count, emit, raw)
 
 
 @app.command(rich_help_panel=PANEL)
-@looks
+@observer_options
 def hz(
-    reach: Reach,
+    reach: WorldAccess,
     key: Annotated[str, typer.Argument(help="Key or expression.")],
     window: Annotated[int, typer.Option(help="Messages that the rate is taken over.", min=2, max=1_000_000)] = 1000,
     seconds: Annotated[float | None, typer.Option(callback=positive, help="Stop after so many seconds.")] = None,
@@ -79,14 +79,14 @@ def hz(
     """Print how often messages come on a key, in wall and in simulated time."""
     from zsim_deploy.cli import inspection
 
-    with linked(reach) as (link, _):
+    with connected(reach) as (link, _):
         inspection.hz(link, key, window, seconds or math.inf, lambda line: print(line, flush=True))
 
 
 @app.command(rich_help_panel=PANEL)
-@looks
+@observer_options
 def pub(
-    reach: Reach,
+    reach: WorldAccess,
     key: Annotated[str, typer.Argument(help="Key, e.g. drone/drone1/cmd/velocity.")],
     message: Annotated[str, typer.Argument(help='JSON, e.g. \'{"velocity_m_s": [1, 0, 0], "yaw_rate_rad_s": 0}\'.')],
     count: Annotated[int, typer.Option("--count", "-n", min=1, help="How many times.")] = 1,
@@ -95,15 +95,15 @@ def pub(
     """Send a command to a drone; t_ns, seq and source are filled in."""
     from zsim_deploy.cli import inspection
 
-    with linked(reach) as (link, info):
+    with connected(reach) as (link, info):
         sent = inspection.publish(link, info, key, message, count, rate_hz)
     print(f"published {sent} on {key}")
 
 
 @app.command(rich_help_panel=PANEL)
-@looks
+@observer_options
 def ask(
-    reach: Reach,
+    reach: WorldAccess,
     key: Annotated[str, typer.Argument(help="world/control or cluster/NAME/control.")],
     op: Annotated[str, typer.Argument(help="E.g. pause, resume, step, stop; engage, hold, land, target.")],
     args: Annotated[str, typer.Argument(help="JSON map, e.g. '{\"gates\": 50}'.")] = "{}",
@@ -111,13 +111,13 @@ def ask(
     """Send a request to the world or a controller and print the answer."""
     from zsim_deploy.cli import inspection
 
-    with linked(reach) as (link, _):
+    with connected(reach) as (link, _):
         result = inspection.ask(link, key, op, args)
     print("ok" if result is None else json.dumps(result))
 
 
 @contextmanager
-def linked(reach: Reach) -> Iterator[tuple["Session", "Info"]]:
+def connected(reach: WorldAccess) -> Iterator[tuple["Session", "Info"]]:
     """Yield a session to the federation's hub, and what its world says of the run."""
     from zsim.transport.connection import find_world
 
@@ -156,9 +156,9 @@ At = Annotated[
 
 
 @faults.command()
-@looks
+@observer_options
 def add(
-    reach: Reach,
+    reach: WorldAccess,
     target: Annotated[
         str, typer.Argument(help="Drone, link (a/b), process, cluster, or world: as the kind asks.", show_default=False)
     ],
@@ -172,33 +172,33 @@ def add(
     """Inject a fault, e.g. `zsim fault add drone2 gps_dropout --for 10s`."""
     times = {"for_s": seconds(for_), "at_s": seconds(at)}
     args = {"kind": kind, "target": target, **times, **_values(parameters or ())}
-    with linked(reach) as (link, _):
+    with connected(reach) as (link, _):
         done = _ask(link, "fault_add", args)
     until = "until it is cleared" if done["until_ns"] is None else f"to {done['until_ns'] / 1e9:.2f} s"
     print(f"fault {done['id']}: {kind} of {target} from {done['from_ns'] / 1e9:.2f} s {until}")
 
 
 @faults.command()
-@looks
+@observer_options
 def clear(
-    reach: Reach,
+    reach: WorldAccess,
     which: Annotated[str, typer.Argument(help="Number, target or kind of faults, or all.")] = ALL,
 ) -> None:
     """End faults: all, or those of a number, a target or a kind."""
-    with linked(reach) as (link, _):
+    with connected(reach) as (link, _):
         done = _ask(link, "fault_clear", selector(which))
     print(f"cleared {', '.join(map(str, done['cleared'])) or 'nothing: no fault was planned or acting'}")
 
 
 @faults.command("list")
-@looks
+@observer_options
 def list_(
-    reach: Reach,
+    reach: WorldAccess,
 ) -> None:
     """List the faults that are planned or act."""
     from zsim.contract import keys, messages
 
-    with linked(reach) as (link, _):
+    with connected(reach) as (link, _):
         now_ns = max((messages.decode(keys.CLOCK, s.payload).t_ns for s in link.get(keys.CLOCK)), default=0)
         told = [messages.decode(keys.FAULTS, sample.payload) for sample in link.get(keys.FAULTS)]
     rows = [row(fault, now_ns) for message in told for fault in message.faults if not _is_over(fault, now_ns)]

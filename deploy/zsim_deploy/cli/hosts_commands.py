@@ -49,8 +49,8 @@ def up(
 ) -> None:
     """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything."""
     from zsim_deploy.cli.report_commands import conclude
-    from zsim_deploy.hosts.host_run import Options, Up
-    from zsim_deploy.hosts.status_table import Board
+    from zsim_deploy.hosts.host_run import HostRunOptions, HostRun
+    from zsim_deploy.hosts.status_table import StatusTable
     from zsim_deploy.inventory import inventory
 
     loaded = load_scenario(scenario, set_, seed, duration)
@@ -59,8 +59,8 @@ def up(
     inventory.placement(placed, loaded)
     mode, pace = mode_and_rate(realtime, rate)
     with _folder(out, loaded) as folder:
-        with Board(loaded.duration_s) as board:
-            outcome = Up(Options(loaded, placed, folder, mode, pace), board).go()
+        with StatusTable(loaded.duration_s) as board:
+            outcome = HostRun(HostRunOptions(loaded, placed, folder, mode, pace), board).run()
         conclude(outcome, folder, report)
 
 
@@ -186,11 +186,11 @@ def doctor(
     from rich.console import Console
 
     from zsim.errors import HostsError
-    from zsim_deploy.hosts.check_up import check_up
+    from zsim_deploy.hosts.host_check import check_hosts
     from zsim_deploy.inventory import inventory
 
     placed = inventory.load(hosts)
-    result = check_up(placed, _placement(placed, scenario))
+    result = check_hosts(placed, _placement(placed, scenario))
     console = Console()
     for shown in result.tables:
         console.print(shown)
@@ -219,12 +219,12 @@ def push(
     import asyncio
 
     from zsim_deploy.inventory import inventory
-    from zsim_deploy.push.push import Stages, default_cache
+    from zsim_deploy.push.push import PushProgress, default_cache
     from zsim_deploy.push.push import push as push_to
 
     placed = inventory.load(hosts)
-    with Stages() as stages:
-        done = asyncio.run(push_to(placed, host or [], extra or [], stages.tell, default_cache()))
+    with PushProgress() as stages:
+        done = asyncio.run(push_to(placed, host or [], extra or [], stages.update, default_cache()))
     changed = sum(done.values())
     print(f"installed on {changed} of {len(done)} hosts" if changed else "nothing to do; all hosts have what they need")
 

@@ -61,7 +61,7 @@ def _plain(value: Any) -> Any:
         return repr(value)
 
 
-class Rate:
+class MessageRate:
     """How often messages come, in wall and in simulated time, over a window of messages."""
 
     def __init__(self, window: int) -> None:
@@ -105,7 +105,7 @@ def hz(link: Session, expression: str, window: int, seconds: float, emit: Callab
             arrived.append((time.monotonic(), sample.payload))
 
     link.on_message(expression, arrive)
-    rate, head = Rate(window), msgspec.msgpack.Decoder(_Stamp)
+    rate, head = MessageRate(window), msgspec.msgpack.Decoder(_Stamp)
     until_s = time.monotonic() + seconds
     while (now_s := time.monotonic()) < until_s:
         time.sleep(min(LINE_S, until_s - now_s))

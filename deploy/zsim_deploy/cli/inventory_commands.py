@@ -12,8 +12,8 @@ from zsim.transport.identity import DAYS
 from zsim_deploy.options.arguments import Set, load_scenario
 
 if TYPE_CHECKING:
-    from zsim_deploy.inventory.inventory import Placed
-    from zsim_deploy.security.certificates import Shown
+    from zsim_deploy.inventory.inventory import InventoryFile
+    from zsim_deploy.security.certificates import CertificateStatus
     from zsim_deploy.security.enrolment import Enrolment
 from collections.abc import Mapping
 from typing import Any
@@ -114,21 +114,21 @@ def _issue_all(folder: Path, enrolment: "Enrolment", days: float, renew: bool, f
     now = datetime.now(UTC)
     signer = certificates.authority(folder, now, force)
     wanted = enrolment.certificates()
-    lacking = [each for each in wanted if renew or certificates.due(folder, signer.certificate, each, now)]
+    lacking = [each for each in wanted if renew or certificates.renewal_reason(folder, signer.certificate, each, now)]
     for each in lacking:
         certificates.issue(folder, signer, each, now, days)
     return len(lacking), len(wanted) - len(lacking)
 
 
-def _soon(shown: "Shown", now: datetime) -> str:
+def _soon(shown: "CertificateStatus", now: datetime) -> str:
     return "ends soon" if shown.until - now < WARN else ""
 
 
-def _warn(placed: "Placed") -> None:
+def _warn(placed: "InventoryFile") -> None:
     """Say which private keys others can read."""
-    from zsim_deploy.security.certificate_check import exposed
+    from zsim_deploy.security.certificate_check import exposed_keys
 
-    if warning := exposed(placed):
+    if warning := exposed_keys(placed):
         print(f"warning: {warning}", file=sys.stderr)
 
 

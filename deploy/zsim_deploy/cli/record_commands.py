@@ -118,14 +118,14 @@ def replay(
 ) -> None:
     """Play a record back onto the keys: for a console, an estimator under test, any client; nobody can be flown."""
     _check("replay", REPLAY_NEEDS)
-    from zsim_deploy.roles.world_role import Wish, play
+    from zsim_deploy.roles.world_role import ReplayOptions, play
     from zsim_world.playback.playback import Choice
 
     if to is not None and to < from_:
         raise typer.BadParameter(f"--to is {to:g}, before --from {from_:g}; must be at or after it")
     to_ns = None if to is None else round(to * 1e9)
     choice = Choice(round(from_ * 1e9), to_ns, tuple(keys or ["**"]), paused)
-    wish = Wish(choice, rate, tuple(expect or ()), tuple(listen or [DEFAULT_ENDPOINT]), federation)
+    wish = ReplayOptions(choice, rate, tuple(expect or ()), tuple(listen or [DEFAULT_ENDPOINT]), federation)
     play(directory, wish, identity(host, tls, insecure, access))
 
 

@@ -15,7 +15,7 @@ from zsim_deploy.options.arguments import (
     Insecure,
     Launched,
     RateOption,
-    Reach,
+    WorldAccess,
     Realtime,
     ScenarioPath,
     Seed,
@@ -25,7 +25,7 @@ from zsim_deploy.options.arguments import (
     identity,
     load_scenario,
     mode_and_rate,
-    takes_part,
+    participant_options,
 )
 
 ROLES = "Roles, started by hand, on any machine, in any order"
@@ -61,9 +61,9 @@ def world(
 
 
 @app.command(rich_help_panel=ROLES)
-@takes_part
+@participant_options
 def estimator(
-    reach: Reach,
+    reach: WorldAccess,
     drones: Annotated[
         list[str],
         typer.Argument(metavar="DRONE...", help="Drones, or patterns: 'drone*'.", show_default=False),
@@ -76,9 +76,9 @@ def estimator(
 
 
 @app.command(rich_help_panel=ROLES)
-@takes_part
+@participant_options
 def controller(
-    reach: Reach,
+    reach: WorldAccess,
     cluster: Annotated[str, typer.Argument(help="Name of the cluster.")] = "main",
 ) -> None:
     """Run the cluster-space controller of one cluster."""
@@ -103,13 +103,13 @@ def host_agents(
     """Run several estimators and controllers in one process, which is faster."""
     from zsim_deploy.roles import roles
 
-    roles.agent(roles.host(names), Reach(connect, federation, wait, None, insecure, host, launched))
+    roles.agent(roles.host(names), WorldAccess(connect, federation, wait, None, insecure, host, launched))
 
 
 @app.command(rich_help_panel=ROLES)
-@takes_part
+@participant_options
 def record(
-    reach: Reach,
+    reach: WorldAccess,
     out: Annotated[Path, typer.Option(help="Folder for run.mcap.")] = Path("."),
 ) -> None:
     """Record every message of a federation into run.mcap."""

@@ -33,7 +33,7 @@ def place(federation: str) -> Path:
     return folder / f"{federation}.sock"
 
 
-class Intercom:
+class ControlSocket:
     """The launcher's end.
 
     Args:
@@ -104,7 +104,7 @@ class Intercom:
         self._thread.join(1.0)
         os.close(self._lock)
 
-    def __enter__(self) -> "Intercom":
+    def __enter__(self) -> "ControlSocket":
         return self
 
     def __exit__(self, *_: object) -> None:

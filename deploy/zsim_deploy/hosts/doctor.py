@@ -11,8 +11,8 @@ import asyncssh
 
 from zsim import __version__
 from zsim.errors import HostsError
-from zsim_deploy.ssh.connection import json_answer, shell_line, shell_word
 from zsim_deploy.ssh.host_link import HostLink
+from zsim_deploy.ssh.ssh_connection import json_answer, shell_line, shell_word
 
 CLOCK_OFFSET_MAX_S = 1.0  # certificates are back-dated by a day and logs are compared; time on the wire is simulated
 LOAD_MAX = 0.5  # of the cores; what is busy already slows everybody in lockstep
@@ -28,7 +28,7 @@ NO_PROGRAM_CODES = (126, 127)  # … and the codes with which they end; POSIX, 2
 OFFSET_ASKS = 3  # the answer with the shortest round trip says the clock's offset best
 
 
-class Report(NamedTuple):
+class HostReport(NamedTuple):
     """What a host says of itself, and what asking it showed."""
 
     said: dict[str, Any]
@@ -48,7 +48,7 @@ class NetworkPath(NamedTuple):
     found: dict[str, Any]
 
 
-async def about(link: HostLink, python: str, hosts: str = "FILE") -> Report:
+async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostReport:
     """Ask a host about itself.
 
     Args:
@@ -66,7 +66,7 @@ async def about(link: HostLink, python: str, hosts: str = "FILE") -> Report:
     except _EndedError as error:
         fault = _no_zsim(link, python, remedy, error) or f"{python}: {error}; is it a Python that has zsim?"
         raise HostsError(f"{link.name}: {fault}") from error
-    return Report(said, round_trip_s, offset_s, remedy)
+    return HostReport(said, round_trip_s, offset_s, remedy)
 
 
 def _remedy(link: HostLink, hosts: str) -> str:
@@ -165,7 +165,7 @@ async def _offset(probe: _Probe) -> tuple[float, float]:
     return took_s, there_s - (start_s + took_s / 2)
 
 
-def compared(reports: dict[str, Report]) -> tuple[list[str], list[str]]:
+def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str]]:
     """Return what keeps the hosts from flying together, and what is only worth knowing, a line each."""
     faults = [line for name, report in reports.items() for line in _faults(name, report)]
     warnings = [line for name, report in reports.items() for line in _warnings(name, report)]
@@ -176,7 +176,7 @@ def compared(reports: dict[str, Report]) -> tuple[list[str], list[str]]:
     return faults, warnings
 
 
-def _faults(name: str, report: Report) -> Iterator[str]:
+def _faults(name: str, report: HostReport) -> Iterator[str]:
     said = report.said
     if said["zsim"] != __version__:
         yield f"{name}: zsim is {said['zsim']}; must be {__version__} as here; {report.remedy}"
@@ -187,7 +187,7 @@ def _faults(name: str, report: Report) -> Iterator[str]:
         yield f"{name}: its folder cannot be used ({said['unwritable']}); correct hosts.{name}.folder, or make it there"
 
 
-def _warnings(name: str, report: Report) -> Iterator[str]:
+def _warnings(name: str, report: HostReport) -> Iterator[str]:
     said = report.said
     if abs(report.clock_offset_s) > CLOCK_OFFSET_MAX_S + report.round_trip_s:
         yield f"{name}: its clock is {report.clock_offset_s:+.1f} s off; set it with chrony or ntp"
@@ -200,7 +200,7 @@ def _warnings(name: str, report: Report) -> Iterator[str]:
         yield f"{name}: {said['free_bytes'] / 1e9:.1f} GB are free on its disk; a record of an hour takes about 1 GB"
 
 
-async def reached(links: Sequence[HostLink], target: HostLink, python: dict[str, str], port: int) -> list[NetworkPath]:
+async def network_paths(links: Sequence[HostLink], target: HostLink, python: dict[str, str], port: int) -> list[NetworkPath]:
     """Return how the hosts reach a port of another, on which nothing else may listen."""
     try:
         async with AsyncExitStack() as stack:

@@ -14,20 +14,20 @@ from zsim.record import repair
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, WORLD
 from zsim.scenario.scenario import Scenario
-from zsim_deploy.hosts.control_requests import Orders
-from zsim_deploy.hosts.control_socket import Intercom
-from zsim_deploy.hosts.doctor import Report, about, compared
-from zsim_deploy.hosts.host_plan import Plan
-from zsim_deploy.hosts.leftover_runs import RECORD, earlier, port_faults
-from zsim_deploy.hosts.remote_process import Log, Remote
-from zsim_deploy.hosts.status_table import Board
-from zsim_deploy.inventory.inventory import Placed
-from zsim_deploy.launch.supervisor import Outcome, Watch
+from zsim_deploy.hosts.control_socket import ControlSocket
+from zsim_deploy.hosts.doctor import HostReport, host_report, compare_reports
+from zsim_deploy.hosts.host_plan import HostPlan
+from zsim_deploy.hosts.launcher_requests import LauncherRequests
+from zsim_deploy.hosts.leftover_runs import RECORD, leftovers, port_faults
+from zsim_deploy.hosts.remote_process import ProcessLog, RemoteProcess
+from zsim_deploy.hosts.status_table import StatusTable
+from zsim_deploy.inventory.inventory import InventoryFile
+from zsim_deploy.launch.supervisor import Outcome, Supervisor
 from zsim_deploy.options.arguments import pace_options
-from zsim_deploy.options.terminal import CLOSED, Signals
-from zsim_deploy.ssh.connection import shell_word
-from zsim_deploy.ssh.host_link import HostLink, Loop
-from zsim_deploy.ssh.host_links import Links, fetch
+from zsim_deploy.options.terminal import CLOSED, EndSignals
+from zsim_deploy.ssh.host_link import HostLink, EventLoopThread
+from zsim_deploy.ssh.host_links import HostLinks, fetch
+from zsim_deploy.ssh.ssh_connection import shell_word
 
 CONNECT_S = 30.0  # how long all hosts together may take to let us in, …
 CHECK_S = 60.0  # … to be checked: a small computer takes 5 s to import numpy, a poor link adds a dozen round trips, …
@@ -36,11 +36,11 @@ CLEAN_S = 5.0  # how long a host may take to remove the run's folder; one that w
 
 
 @dataclass
-class Options:
+class HostRunOptions:
     """How to run a scenario on the hosts of an inventory."""
 
     scenario: Scenario
-    placed: Placed
+    placed: InventoryFile
     out: Path
     mode: str = "lockstep"
     rate: float = 0.0
@@ -51,15 +51,15 @@ class Options:
         return pace_options(self.mode, self.rate)
 
 
-class Look(NamedTuple):
+class HostInspection(NamedTuple):
     """What a look at a host has found: what it says, ports that are taken, and what earlier runs have left."""
 
-    report: Report
+    report: HostReport
     taken: list[str]
     left: list[str]
 
 
-class Up:
+class HostRun:
     """One run on several hosts.
 
     Args:
@@ -70,17 +70,17 @@ class Up:
         InventoryError: a process has no place.
     """
 
-    def __init__(self, options: Options, board: Board) -> None:
+    def __init__(self, options: HostRunOptions, board: StatusTable) -> None:
         self._options = options
         self._board = board
         self._logs = options.out / "logs"
-        self._plan = Plan(options.placed, options.scenario, options.run_id, options.pace())
-        self._watch = Watch(options.scenario.processes.on_death, board)
-        self._loop = Loop()
-        self._links = Links(options.placed, self._plan.hosts(), self._loop)
+        self._plan = HostPlan(options.placed, options.scenario, options.run_id, options.pace())
+        self._watch = Supervisor(options.scenario.processes.on_death, board)
+        self._loop = EventLoopThread()
+        self._links = HostLinks(options.placed, self._plan.hosts(), self._loop)
         self._record_stays = False
 
-    def go(self) -> Outcome:
+    def run(self) -> Outcome:
         """Run to the end; whatever happens, no process or key of it is left on any host that can be reached.
 
         Raises:
@@ -88,7 +88,7 @@ class Up:
             HostsError: with a line for every certificate that is missing, or every host that cannot take part.
         """
         try:
-            with Signals(self._options.out / "up.log", self._hang_up), self._intercom():
+            with EndSignals(self._options.out / "up.log", self._hang_up), self._intercom():
                 self._refuse_unless_certified()
                 self._timed("connect", lambda: self._links.on_all(HostLink.open, CONNECT_S))
                 self._timed("check", self._check)
@@ -105,14 +105,14 @@ class Up:
         self._watch.interrupt(CLOSED)
 
     def _refuse_unless_certified(self) -> None:
-        if faults := self._plan.lacks(datetime.now(UTC)):
+        if faults := self._plan.certificate_faults(datetime.now(UTC)):
             raise HostsError("\n".join(faults))
-        if warning := self._plan.exposed():
+        if warning := self._plan.exposed_keys():
             self._board.say(f"warning: {warning}")
 
-    def _intercom(self) -> Intercom:
-        orders = Orders(self._plan, self._links, self._loop, self._watch, self._board, self._options.out, self._remote)
-        return Intercom(self._options.scenario.federation, orders.acts())
+    def _intercom(self) -> ControlSocket:
+        orders = LauncherRequests(self._plan, self._links, self._loop, self._watch, self._board, self._options.out, self._remote)
+        return ControlSocket(self._options.scenario.federation, orders.handlers())
 
     def _timed(self, what: str, act: Callable[[], Any]) -> None:
         start_s = time.monotonic()
@@ -121,17 +121,17 @@ class Up:
 
     def _check(self) -> None:
         looks = self._links.on_all(self._look, CHECK_S)
-        faults, warnings = compared({name: look.report for name, look in looks.items()})
+        faults, warnings = compare_reports({name: look.report for name, look in looks.items()})
         for warning in [*warnings, *(line for look in looks.values() for line in look.left)]:
             self._board.say(f"warning: {warning}")
         if faults := [*faults, *(line for look in looks.values() for line in look.taken)]:
             raise HostsError("\n".join(faults))
 
-    async def _look(self, link: HostLink) -> Look:
+    async def _look(self, link: HostLink) -> HostInspection:
         python = self._plan.python(link.name)
-        report = await about(link, python, self._plan.source())
+        report = await host_report(link, python, self._plan.source())
         taken = await port_faults(link, python, self._plan.ports(link.name))
-        return Look(report, taken, await earlier(link, self._plan.base()))
+        return HostInspection(report, taken, await leftovers(link, self._plan.base()))
 
     async def _prepare(self, link: HostLink) -> None:
         """Put the scenario, and the certificates where there are any, on a host."""
@@ -147,7 +147,7 @@ class Up:
         self._links.listen()
         self._record_stays = True
         try:
-            outcome = self._watch.go(self._board.look)
+            outcome = self._watch.run(self._board.report_silent_hosts)
             fault = self._fetch()
         except KeyboardInterrupt:
             where = self._plan.way_to_record()
@@ -167,13 +167,13 @@ class Up:
         except OSError as error:
             raise RunError(f"{out}: cannot be written ({error.strerror}); give --out another folder") from error
 
-    def _remote(self, plan: Plan, name: str) -> Remote:
+    def _remote(self, plan: HostPlan, name: str) -> RemoteProcess:
         host = plan.host(name)
-        log = Log(self._logs / f"{name}.log", self._board.say)
+        log = ProcessLog(self._logs / f"{name}.log", self._board.say)
         on_line = self._watch.take_line if name == WORLD else None
         link = self._links.by_name[host]
         more = (on_line, plan.folder(host), plan.identity(name))
-        return Remote(name, plan.arguments(name), link, plan.python(host), self._loop, log, *more)
+        return RemoteProcess(name, plan.arguments(name), link, plan.python(host), self._loop, log, *more)
 
     def _fetch(self) -> str:
         """Bring the record home; return why it is not here, empty if it is."""

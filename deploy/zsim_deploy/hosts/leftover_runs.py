@@ -10,8 +10,8 @@ from zsim.transport.identity import KEY
 from zsim_deploy.hosts.doctor import NetworkPath, path_faults
 from zsim_deploy.inventory.inventory import SSH_PORT, Host
 from zsim_deploy.roles.stop_channel import FOLDER
-from zsim_deploy.ssh.connection import json_answer, shell_line, shell_word
 from zsim_deploy.ssh.host_link import HostLink
+from zsim_deploy.ssh.ssh_connection import json_answer, shell_line, shell_word
 
 RECORD = "run.mcap"
 RUNS = "runs"  # below the folder of zsim on a host: a folder per run
@@ -49,7 +49,7 @@ def runs_folder(host: Host) -> str:
     return f"{home}{host.folder}/{RUNS}"
 
 
-async def earlier(link: HostLink, base: Path) -> list[str]:
+async def leftovers(link: HostLink, base: Path) -> list[str]:
     """Return what earlier runs have left on a host: at most a line on records, and one on private keys.
 
     Args:
@@ -62,10 +62,10 @@ async def earlier(link: HostLink, base: Path) -> list[str]:
     folder = runs_folder(link.host)
     script = f"cd {shell_word(folder)} 2>/dev/null || exit 0{LIST_RUNS}"
     said = (await link.run(script, what=f"looking into {folder}")).decode(errors="replace")
-    return told(link.name, link.host, base, said.splitlines())
+    return leftover_lines(link.name, link.host, base, said.splitlines())
 
 
-def told(name: str, host: Host, base: Path, said: Iterable[str]) -> list[str]:
+def leftover_lines(name: str, host: Host, base: Path, said: Iterable[str]) -> list[str]:
     """Return lines for a person from what LIST_RUNS prints; a greeting of the login shell is passed over."""
     folder = runs_folder(host)
     words = [line.split(" ", 1) for line in said]

@@ -20,8 +20,8 @@ import asyncssh
 
 from zsim.errors import HostsError
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED
-from zsim_deploy.ssh.connection import shell_line
-from zsim_deploy.ssh.host_link import HostLink, Loop
+from zsim_deploy.ssh.host_link import HostLink, EventLoopThread
+from zsim_deploy.ssh.ssh_connection import shell_line
 
 BEAT_S = 1.0  # how often the launcher shows that it lives
 ORPHAN_S = 60.0  # without a beat a process ends itself; a link may be cut for shorter than that
@@ -31,7 +31,7 @@ LOST = -1000  # code of a process of which nobody knows how it ended
 PID = "zsim-pid "  # begins the line with its process id; a login shell may say something before
 
 
-class Log:
+class ProcessLog:
     """A file of lines; where it cannot be written, that is said once, and only the last line is kept.
 
     Args:
@@ -60,7 +60,7 @@ class Log:
                 self._say(f"{self._path}: cannot be written ({error.strerror}); what it would say there is lost")
 
 
-class Remote:
+class RemoteProcess:
     """A role on another host.
 
     Args:
@@ -81,8 +81,8 @@ class Remote:
         arguments: list[str],
         link: HostLink,
         python: str,
-        loop: Loop,
-        log: Log,
+        loop: EventLoopThread,
+        log: ProcessLog,
         on_line: Callable[[str], None] | None = None,
         folder: str = "",
         files: Mapping[str, bytes] | None = None,
@@ -201,7 +201,7 @@ class Remote:
     def tell_stop(self, reason: str) -> None:
         """Ask it to leave; harmless when it is gone, remembered when it is still on its way."""
         self._stop = reason
-        self._loop.tell(self._send, f"stop {reason}\n")
+        self._loop.call_soon(self._send, f"stop {reason}\n")
 
     def _send(self, line: str) -> None:
         if self._process is not None:

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from zsim.runtime.progress import Screen, describe
-from zsim_deploy.hosts.remote_process import Remote
+from zsim_deploy.hosts.remote_process import RemoteProcess
 from zsim_deploy.ssh.host_link import HostLink
 
 FIRST_S = 1.0  # simulated; from then on it flies
@@ -21,7 +21,7 @@ STALE_S = 3.0  # health comes once a second; older figures say nothing of now
 COLUMNS = ("role", "host", "pid", "state", "lag", "messages/s", "round trip", "restarts")
 
 
-class Board:
+class StatusTable:
     """Progress of a run on several hosts; a table on a terminal, lines elsewhere.
 
     Attributes:
@@ -45,7 +45,7 @@ class Board:
         self._silent: set[str] = set()
         self._live = Live(get_renderable=self._render, console=self.console, refresh_per_second=4, transient=True)
 
-    def __enter__(self) -> "Board":
+    def __enter__(self) -> "StatusTable":
         if self._is_live:
             self._live.start()
         return self
@@ -92,7 +92,7 @@ class Board:
             rate = (line["received"] - former["received"]) / (now_s - former["wall_s"])
         self._health[line["name"]] = {**line, "wall_s": now_s, "per_s": rate}
 
-    def look(self) -> None:
+    def report_silent_hosts(self) -> None:
         """Say once which host has fallen silent, and that it is back."""
         for name, link in self.links.items():
             silent_s = link.silent_s()
@@ -112,7 +112,7 @@ class Board:
         """Return one row per process, for the table and for `zsim ps`."""
         return [self._row(member) for member in self.members]
 
-    def _row(self, member: Remote) -> dict[str, Any]:
+    def _row(self, member: RemoteProcess) -> dict[str, Any]:
         link, health = self.links[member.host], self._health.get(member.name)
         fresh = health is not None and time.monotonic() - health["wall_s"] < STALE_S
         return {
@@ -122,11 +122,11 @@ class Board:
             "state": self._state(member, link),
             "lag_ms": health["lag_ns"] / 1e6 if health and fresh else None,
             "messages_per_s": health["per_s"] if health and fresh else None,
-            "round_trip_ms": 1e3 * link.round_trip_s if link.heard_s and not _is_silent(link) else None,
+            "round_trip_ms": 1e3 * link.round_trip_s if link.answered_s and not _is_silent(link) else None,
             "restarts": member.restarts,
         }
 
-    def _state(self, member: Remote, link: HostLink) -> str:
+    def _state(self, member: RemoteProcess, link: HostLink) -> str:
         if member.state == "running" and _is_silent(link):
             return f"host silent {link.silent_s():.0f} s"
         waited = [w for w in (self._clock or {}).get("waiting_for", ()) if w["name"] == member.name]

@@ -77,7 +77,7 @@ class Inventory(Spec, frozen=True, kw_only=True):
     security: Security = Security()
 
 
-class Placed(NamedTuple):
+class InventoryFile(NamedTuple):
     """An inventory on disk: relative paths in it count from its folder."""
 
     inventory: Inventory
@@ -85,7 +85,7 @@ class Placed(NamedTuple):
     source: str
 
 
-def load(path: Path) -> Placed:
+def load(path: Path) -> InventoryFile:
     """Return the inventory of a YAML file.
 
     Raises:
@@ -95,10 +95,10 @@ def load(path: Path) -> Placed:
     found = [*faults(document, Inventory), *_cross_faults(sound(document, Inventory), document)]
     if found:
         raise InventoryError([f"{path.name}: {where} {text}" for where, text in found])
-    return Placed(msgspec.convert(document, Inventory), path.resolve().parent, path.name)
+    return InventoryFile(msgspec.convert(document, Inventory), path.resolve().parent, path.name)
 
 
-def insecure(placed: Placed) -> Placed:
+def insecure(placed: InventoryFile) -> InventoryFile:
     """Return an inventory as if it said `security: {insecure: true}`."""
     security = msgspec.structs.replace(placed.inventory.security, insecure=True)
     return placed._replace(inventory=msgspec.structs.replace(placed.inventory, security=security))
@@ -154,7 +154,7 @@ def roles(scenario: Scenario) -> list[str]:
     return [WORLD, RECORDER, *(name for name in scenario.expected() if name != RECORDER)]
 
 
-def placement(placed: Placed, scenario: Scenario) -> dict[str, str]:
+def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:
     """Return the host of every process of a scenario, as `spread` says.
 
     Raises:
@@ -212,17 +212,17 @@ def _port_faults(inventory: Inventory, world: str) -> Iterator[str]:
             yield f"routers.{name}.port is {router.port}, on which {other} listens on {router.host}; give another"
 
 
-def endpoint(placed: Placed, places: dict[str, str], host: str) -> str:
+def endpoint(placed: InventoryFile, places: dict[str, str], host: str) -> str:
     """Return where the roles of a host find the federation: their router, or the world."""
     return _at(placed.inventory, *_listener(placed.inventory, places, placed.inventory.hosts[host].router))
 
 
-def upstream(placed: Placed, places: dict[str, str], router: str) -> str:
+def upstream(placed: InventoryFile, places: dict[str, str], router: str) -> str:
     """Return what a router connects to."""
     return _at(placed.inventory, *_listener(placed.inventory, places, placed.inventory.routers[router].upstream))
 
 
-def connections(placed: Placed, places: dict[str, str]) -> dict[tuple[str, int], set[str]]:
+def connections(placed: InventoryFile, places: dict[str, str]) -> dict[tuple[str, int], set[str]]:
     """Return host and port of what listens, with the other hosts whose roles and routers connect to it."""
     inventory = placed.inventory
     ways = [(host, inventory.hosts[host].router) for name, host in places.items() if name != WORLD]
@@ -242,7 +242,7 @@ def _listener(inventory: Inventory, places: dict[str, str], router: str | None) 
     return inventory.routers[router].host, inventory.routers[router].port
 
 
-def listening(placed: Placed, host: str, port: int) -> str:
+def listening(placed: InventoryFile, host: str, port: int) -> str:
     """Return the endpoint on which a process of a host listens: its own address, reached from outside."""
     return _at(placed.inventory, host, port)
 

@@ -10,7 +10,7 @@ from zsim.scenario.on_death import on_death
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import OnDeath, Scenario
 from zsim_deploy.inventory import inventory as inv
-from zsim_deploy.inventory.inventory import Inventory, Placed, hosts_of, spread
+from zsim_deploy.inventory.inventory import Inventory, InventoryFile, hosts_of, spread
 from zsim_deploy.options.arguments import REALTIME
 
 MODULE = ("-m", "zsim_deploy.cli")  # after the interpreter
@@ -29,7 +29,7 @@ MODULES = {  # what proves that an extra is whole, the installation without extr
 }
 
 
-class Process(NamedTuple):
+class PlannedProcess(NamedTuple):
     """One process of a run.
 
     Attributes:
@@ -55,7 +55,7 @@ class Process(NamedTuple):
         return self.name.partition(".")[0]
 
 
-class Files(NamedTuple):
+class ProcessFiles(NamedTuple):
     """Where a process finds its files, as its command line says it.
 
     Attributes:
@@ -71,7 +71,7 @@ class Files(NamedTuple):
     out: str
 
 
-def processes(placed: Placed, scenario: Scenario, pace: Sequence[str] = ()) -> list[Process]:
+def processes(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> list[PlannedProcess]:
     """Return the processes that zsim can start: the world, the recorder, estimators, controllers, then routers.
 
     Args:
@@ -90,7 +90,7 @@ def processes(placed: Placed, scenario: Scenario, pace: Sequence[str] = ()) -> l
     ]
 
 
-def own_programs(placed: Placed, scenario: Scenario, host: str | None = None) -> list[str]:
+def own_programs(placed: InventoryFile, scenario: Scenario, host: str | None = None) -> list[str]:
     """Return a remark on each expected process that is a program of the user's own, on one host or on all."""
     places = inv.placement(placed, scenario)
     return [
@@ -100,7 +100,7 @@ def own_programs(placed: Placed, scenario: Scenario, host: str | None = None) ->
     ]
 
 
-def command(process: Process, files: Files) -> list[str]:
+def command(process: PlannedProcess, files: ProcessFiles) -> list[str]:
     """Return the arguments of the interpreter that run a process."""
     words = [*MODULE, *process.words, "--host", process.host]
     if process.name == RECORDER:
@@ -112,7 +112,7 @@ def command(process: Process, files: Files) -> list[str]:
     return [*words, "--", given] if given is not None else words  # a name may begin with a dash
 
 
-def access_file(process: Process) -> str:
+def access_file(process: PlannedProcess) -> str:
     """Return the file with a listening process's access control, in the certificates folder of its host."""
     return f"{process.name}.access.json"
 
@@ -123,11 +123,11 @@ def extras(names: Sequence[str]) -> list[str]:
     return sorted(named | {extra for name in names for kind, extra in KINDS.items() if name.startswith(kind)})
 
 
-def on_host(found: Sequence[Process], host: str) -> list[Process]:
+def on_host(found: Sequence[PlannedProcess], host: str) -> list[PlannedProcess]:
     return [process for process in found if process.host == host]
 
 
-def used_hosts(found: Sequence[Process]) -> list[str]:
+def used_hosts(found: Sequence[PlannedProcess]) -> list[str]:
     """Return the hosts on which something runs, in the order of the processes."""
     return list(dict.fromkeys(process.host for process in found))
 
@@ -143,8 +143,8 @@ def _known(name: str, scenario: Scenario) -> bool:
 
 
 def _role(
-    placed: Placed, scenario: Scenario, places: dict[str, str], name: str, host: str, pace: Sequence[str]
-) -> Process:
+    placed: InventoryFile, scenario: Scenario, places: dict[str, str], name: str, host: str, pace: Sequence[str]
+) -> PlannedProcess:
     inventory = placed.inventory
     role, _, thing = name.partition(".")
     port = inventory.port if name == WORLD else None
@@ -155,10 +155,10 @@ def _role(
         start = "record" if name == RECORDER else role
         words = (start, "--connect", inv.endpoint(placed, places, host), "--federation", scenario.federation)
     secure = not inventory.security.insecure
-    return Process(name, host, words, thing or None, port, secure, on_death(scenario.processes.on_death, name))
+    return PlannedProcess(name, host, words, thing or None, port, secure, on_death(scenario.processes.on_death, name))
 
 
-def _router(placed: Placed, scenario: Scenario, places: dict[str, str], name: str, pace: Sequence[str]) -> Process:
+def _router(placed: InventoryFile, scenario: Scenario, places: dict[str, str], name: str, pace: Sequence[str]) -> PlannedProcess:
     inventory = placed.inventory
     router = inventory.routers[name]
     listen = inv.listening(placed, router.host, router.port)
@@ -166,7 +166,7 @@ def _router(placed: Placed, scenario: Scenario, places: dict[str, str], name: st
     realtime = (REALTIME,) if REALTIME in pace else ()
     words = (ROUTER, "--listen", listen, *reach, *realtime)
     called, secure = f"{ROUTER}.{name}", not inventory.security.insecure
-    return Process(called, router.host, words, name, router.port, secure, on_death(scenario.processes.on_death, called))
+    return PlannedProcess(called, router.host, words, name, router.port, secure, on_death(scenario.processes.on_death, called))
 
 
 def known_extras() -> list[str]:

@@ -26,12 +26,12 @@ SINGLE_THREADED = {
     "MKL_NUM_THREADS": "1",
     "NUMBA_NUM_THREADS": "1",
 }  # matrices of a dozen rows: threads only cost, and would compete with the other roles
-CRADLE = (sys.executable, "-m", "zsim_deploy.cli.forkserver")
-ROLE = (sys.executable, "-m", "zsim_deploy.cli")
+FORKSERVER = (sys.executable, "-m", "zsim_deploy.cli.forkserver")
+COMMAND = (sys.executable, "-m", "zsim_deploy.cli")
 ROOM = " " * 1024  # behind the cradle's command line: each role writes its own there
 PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # linux/prctl.h
 PACKET_MAX = 1 << 17  # bytes, of a command line; a thousand names of drones are half of it
-SAID_MAX = 32  # bytes, of what a cradle says: that it is ready, and then process numbers
+REPLY_MAX = 32  # bytes, of what a cradle says: that it is ready, and then process numbers
 ANSWER_S = 5.0  # a cradle that is ready answers within 20 ms, unless it is stopped
 PATIENCE_S = 3.0  # what is compiled is loaded within two, unless the machine is busy
 PATIENCE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
@@ -39,7 +39,7 @@ POLL_S = 0.01  # how often one looks whether it has ended
 UNKNOWN = 0  # exit code, as of Popen, where somebody else has taken it
 
 
-class Process(Protocol):
+class RoleProcess(Protocol):
     """A role that was started, as of `subprocess.Popen`."""
 
     pid: int
@@ -51,7 +51,7 @@ class Process(Protocol):
     def kill(self) -> None: ...
 
 
-class Forked:
+class ForkedProcess:
     """A child of this process.
 
     Args:
@@ -108,7 +108,7 @@ class _Pipe(NamedTuple):
     write: int
 
 
-class Nursery:
+class RoleLauncher:
     """Starts roles. To be entered by the main thread, which then waits until they can be started.
 
     Args:
@@ -119,26 +119,26 @@ class Nursery:
     def __init__(self, say: Callable[[str], None], run: str = "") -> None:
         self._say = say
         self._run = run
-        self._cradle: subprocess.Popen[bytes] | None = None
+        self._forkserver: subprocess.Popen[bytes] | None = None
         self._line: socket.socket | None = None
         self._lock = threading.Lock()
 
-    def __enter__(self) -> "Nursery":
+    def __enter__(self) -> "RoleLauncher":
         if sys.platform == "linux":
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # whoever started this may not have wanted to know exit codes
             try:
-                self._make_cradle()
+                self._start_forkserver()
             except BaseException:  # Ctrl-C, too
-                self._give_up()
+                self._stop_forkserver()
                 raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._give_up()
+        self._stop_forkserver()
 
-    def start(self, arguments: Sequence[str], log: IO[str], listened: bool) -> Process:
+    def start(self, arguments: Sequence[str], log: IO[str], listened: bool) -> RoleProcess:
         """Start a `zsim` command, its standard input a pipe.
 
         Args:
@@ -147,25 +147,25 @@ class Nursery:
             listened: whether its standard output is a pipe too; else that goes to the log.
         """
         with self._lock:
-            return self._forked(arguments, log, listened) or _started(arguments, log, listened)
+            return self._fork(arguments, log, listened) or _spawn(arguments, log, listened)
 
-    def _make_cradle(self) -> None:
+    def _start_forkserver(self) -> None:
         """Start the cradle, and wait until it has loaded everything."""
         self._line, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with other:
             quiet, environment = subprocess.DEVNULL, {**SINGLE_THREADED, **os.environ}
-            self._cradle = subprocess.Popen(
-                [*CRADLE, self._run, ROOM], stdin=other.fileno(), stdout=quiet, stderr=quiet, env=environment,
+            self._forkserver = subprocess.Popen(
+                [*FORKSERVER, self._run, ROOM], stdin=other.fileno(), stdout=quiet, stderr=quiet, env=environment,
                 start_new_session=True,
             )  # fmt: skip
         timer = threading.Timer(PATIENCE_S, self._say, args=(PATIENCE,))
         timer.start()
         try:
-            self._heard()
+            self._receive()
         finally:
             timer.cancel()
 
-    def _forked(self, arguments: Sequence[str], log: IO[str], listened: bool) -> Forked | None:
+    def _fork(self, arguments: Sequence[str], log: IO[str], listened: bool) -> ForkedProcess | None:
         """Return None where the cradle cannot do it."""
         packet = json.dumps(list(arguments)).encode()
         if self._line is None or len(packet) > PACKET_MAX:
@@ -173,7 +173,7 @@ class Nursery:
         go, stdin = _Pipe(*os.pipe()), _Pipe(*os.pipe())
         stdout = _Pipe(*os.pipe()) if listened else None
         theirs = [stdin.read, stdout.write if stdout else log.fileno(), log.fileno(), go.read]
-        pid = self._asked(packet, theirs)
+        pid = self._request_fork(packet, theirs)
         _close(go.read, stdin.read, *([stdout.write] if stdout else []))
         if pid is None:
             _close(go.write, stdin.write, *([stdout.read] if stdout else []))
@@ -181,43 +181,43 @@ class Nursery:
         with suppress(BrokenPipeError):  # killed already
             os.write(go.write, b"!")
         os.close(go.write)
-        return Forked(pid, os.fdopen(stdin.write, "w"), os.fdopen(stdout.read) if stdout else None)
+        return ForkedProcess(pid, os.fdopen(stdin.write, "w"), os.fdopen(stdout.read) if stdout else None)
 
-    def _asked(self, packet: bytes, files: Sequence[int]) -> int | None:
+    def _request_fork(self, packet: bytes, files: Sequence[int]) -> int | None:
         """Return the number of the process that the cradle has forked; it lives only when it is told to go."""
         assert self._line is not None
         self._line.settimeout(ANSWER_S)
-        with _inheriting():
+        with _subreaper():
             try:
                 socket.send_fds(self._line, [packet], files)
             except OSError:
-                self._give_up()
+                self._stop_forkserver()
                 return None
-            heard = self._heard()
+            heard = self._receive()
         return int(heard) if heard else None
 
-    def _heard(self) -> bytes:
+    def _receive(self) -> bytes:
         """Return what the cradle says; nothing where it is gone or silent, and then it is asked no more."""
         heard = b""
         if self._line is not None:
             with suppress(OSError):
-                heard = self._line.recv(SAID_MAX)
+                heard = self._line.recv(REPLY_MAX)
         if not heard:
-            self._give_up()
+            self._stop_forkserver()
         return heard
 
-    def _give_up(self) -> None:
+    def _stop_forkserver(self) -> None:
         """Do without a cradle."""
         if self._line is not None:
             self._line.close()
             self._line = None
-        if self._cradle is not None:
-            self._cradle.kill()  # it may be importing, or stopped
-            self._cradle.wait()
+        if self._forkserver is not None:
+            self._forkserver.kill()  # it may be importing, or stopped
+            self._forkserver.wait()
 
 
 @contextmanager
-def _inheriting() -> Iterator[None]:
+def _subreaper() -> Iterator[None]:
     """Become, for as long as it takes, the parent of what descendants leave behind."""
     libc, former = ctypes.CDLL(None), ctypes.c_int()
     libc.prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(former), 0, 0, 0)
@@ -233,9 +233,9 @@ def _close(*files: int) -> None:
         os.close(file)
 
 
-def _started(arguments: Sequence[str], log: IO[str], listened: bool) -> "subprocess.Popen[str]":
+def _spawn(arguments: Sequence[str], log: IO[str], listened: bool) -> "subprocess.Popen[str]":
     return subprocess.Popen(
-        [*ROLE, *arguments],
+        [*COMMAND, *arguments],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE if listened else log,
         stderr=log,

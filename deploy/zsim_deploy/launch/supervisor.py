@@ -30,7 +30,7 @@ USER_FAULT = 2  # exit code of a role that refuses its arguments or cannot run a
 SUPERSEDED = 3  # exit code of a role whose place another process of its name has taken
 
 
-class Member(Protocol):
+class RunProcess(Protocol):
     """A process of a run."""
 
     name: str
@@ -60,7 +60,7 @@ class Outcome:
     interrupted: bool = False
 
 
-class Watch:
+class Supervisor:
     """Starts the processes of a run, watches them, and leaves nothing behind.
 
     Args:
@@ -72,7 +72,7 @@ class Watch:
     """
 
     def __init__(self, on_death: dict[str, OnDeath], show: Show) -> None:
-        self.members: list[Member] = []
+        self.members: list[RunProcess] = []
         self._given = on_death
         self._show = show
         self._reason = ""
@@ -81,11 +81,11 @@ class Watch:
         self._until_s: float | None = None
         self._dead: set[str] = set()
         self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
-        self._leaving: dict[str, tuple[Member, float]] = {}  # whose place was taken, and since when (monotonic, s)
-        self._gone: list[Member] = []  # nobody waits for them any more
+        self._leaving: dict[str, tuple[RunProcess, float]] = {}  # whose place was taken, and since when (monotonic, s)
+        self._gone: list[RunProcess] = []  # nobody waits for them any more
         self._orders: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
-    def go(self, look: Callable[[], None] = lambda: None) -> Outcome:
+    def run(self, look: Callable[[], None] = lambda: None) -> Outcome:
         """Start everything, watch it to its end, leave nothing behind.
 
         Args:
@@ -159,7 +159,7 @@ class Watch:
         if world.code != 0:
             self._fail(f"the world died: {world.outcome()}")
 
-    def order(self, act: Callable[[], Any]) -> Future[Any]:
+    def submit(self, act: Callable[[], Any]) -> Future[Any]:
         """Let the watch do something between two looks at the processes; callable from any thread.
 
         Returns:
@@ -173,14 +173,14 @@ class Watch:
         """End the run for everybody, as Ctrl-C does."""
         self._interrupted = self._interrupted or reason
 
-    def replace(self, new: Member) -> None:
+    def replace(self, new: RunProcess) -> None:
         """Start a process that takes the place of the one of its name, which then leaves or is killed.
 
         Raises:
             RunError: another one is taking that place at this moment; the last to come would not be the last to join.
         """
         self._see_off()
-        if self.is_taken_over(new.name):
+        if self.is_being_replaced(new.name):
             raise RunError(f"{new.name} is being taken over already; try again when its former process has ended")
         index = next(i for i, child in enumerate(self.members) if child.name == new.name)
         old, self.members[index] = self.members[index], new
@@ -191,7 +191,7 @@ class Watch:
             old.kill()  # it waits for its host, and must not take the name back when that is there
         new.start()
 
-    def is_taken_over(self, name: str) -> bool:
+    def is_being_replaced(self, name: str) -> bool:
         """Tell whether a process is taking the place of another that has not left yet; callable from any thread."""
         return name in self._leaving
 
@@ -216,7 +216,7 @@ class Watch:
         while not self._orders.empty():
             self._orders.get()[1].cancel()
 
-    def _on_exit(self, child: Member, world: Member) -> None:
+    def _on_exit(self, child: RunProcess, world: RunProcess) -> None:
         """Do what on_death says of a role that ended while the world runs."""
         if child.code in (0, SUPERSEDED):
             self._dead.add(child.name)
@@ -236,7 +236,7 @@ class Watch:
             self._fail(f"{child.name} ended: {child.outcome()}")
             world.tell_stop(self._reason)
 
-    def _too_often(self, child: Member) -> bool:
+    def _too_often(self, child: RunProcess) -> bool:
         """Note a death; tell whether there were more of them in a row than a restart heals."""
         deaths = self._deaths[child.name]
         deaths.append(time.monotonic())
@@ -273,7 +273,7 @@ def _settle(outcome: Future[Any], act: Callable[[], Any]) -> None:
         outcome.set_exception(error)
 
 
-def _close(members: Sequence[Member]) -> None:
+def _close(members: Sequence[RunProcess]) -> None:
     """End all of them at once: one that cannot be reached keeps nobody waiting."""
     with ThreadPoolExecutor(len(members)) as pool:
         for closed in [pool.submit(member.close) for member in members]:

@@ -88,7 +88,7 @@ def pace_options(mode: str, rate: float) -> list[str]:
     return [*([REALTIME] if mode == "realtime" else []), *(["--rate", str(rate)] if rate else [])]
 
 
-class Reach(NamedTuple):
+class WorldAccess(NamedTuple):
     """Where a world is, and who comes.
 
     Attributes:
@@ -125,12 +125,12 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {  # annotation and default, in the order
 }
 
 
-def looks(command: Callable[..., None]) -> Callable[..., None]:
+def observer_options(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command that a person types the options of its argument `reach`."""
     return _with_options(command, _OPTIONS)
 
 
-def takes_part(command: Callable[..., None]) -> Callable[..., None]:
+def participant_options(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command that runs a process of a federation the options of its argument `reach`: it waits for a world."""
     return _with_options(command, {**_OPTIONS, "wait": (Wait, None), "launched": (Launched, None)})
 
@@ -140,7 +140,7 @@ def _with_options(command: Callable[..., None], options: dict[str, tuple[Any, An
 
     @wraps(command)
     def given(**values: Any) -> None:
-        reach = Reach(*(values.pop(name, default) for name, (_, default) in options.items()))
+        reach = WorldAccess(*(values.pop(name, default) for name, (_, default) in options.items()))
         command(**values, **{NAME: reach})
 
     signature = inspect.signature(command, eval_str=True)

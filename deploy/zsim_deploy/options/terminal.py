@@ -51,7 +51,7 @@ def interruptible() -> Iterator[None]:
             raise
 
 
-class Signals:
+class EndSignals:
     """Takes SIGTERM and SIGHUP for as long as it is entered; SIGHUP stays ignored under nohup.
 
     Nothing is raised for a closed terminal, as shells send that signal more than once: whoever runs is told to end, and
@@ -66,7 +66,7 @@ class Signals:
         self._log = log
         self._hung_up = hung_up
 
-    def __enter__(self) -> "Signals":
+    def __enter__(self) -> "EndSignals":
         wanted = {signal.SIGTERM: signal.default_int_handler, signal.SIGHUP: self._on_hangup}
         self._former = {number: signal.getsignal(number) for number in wanted}
         for number, handler in wanted.items():
@@ -79,11 +79,11 @@ class Signals:
             signal.signal(number, handler)
 
     def _on_hangup(self, *_: object) -> None:
-        divert(self._log)
+        redirect_output(self._log)
         self._hung_up()
 
 
-def divert(log: Path) -> None:
+def redirect_output(log: Path) -> None:
     """Send to a file what is said from now on to a terminal or a pipe, which may take nothing any more."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
     try:
@@ -93,12 +93,12 @@ def divert(log: Path) -> None:
     for stream in STREAMS:
         with contextlib.suppress(OSError):
             if not stat.S_ISREG(os.fstat(stream).st_mode):
-                _tell(stream, log)
+                _announce(stream, log)
                 os.dup2(into, stream)
     os.close(into)
 
 
-def _tell(stream: int, log: Path) -> None:
+def _announce(stream: int, log: Path) -> None:
     if stream == STREAMS[-1]:
         with contextlib.suppress(OSError):
             os.write(stream, f"{CLOSED}; what there is still to say is in {log}\n".encode())

@@ -13,8 +13,8 @@ import asyncssh
 
 from zsim.errors import HostsError
 from zsim_deploy.push import on_host
-from zsim_deploy.ssh.connection import json_answer, shell_line
 from zsim_deploy.ssh.host_link import HostLink
+from zsim_deploy.ssh.ssh_connection import json_answer, shell_line
 
 START_S = 30.0  # wall time to start a Python on a small computer, over a poor link
 BEAT_S = 5.0  # how often the launcher shows that it lives
@@ -85,7 +85,7 @@ class Installer:
 
 
 @contextlib.asynccontextmanager
-async def installer(link: HostLink, python: str, folder: str, told: Callable[[str], None]) -> AsyncIterator[Installer]:
+async def open_installer(link: HostLink, python: str, folder: str, told: Callable[[str], None]) -> AsyncIterator[Installer]:
     """Let the program run on a host as long as the block lasts; it alone installs there.
 
     Args:

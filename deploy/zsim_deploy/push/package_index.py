@@ -38,7 +38,7 @@ class Interpreter(NamedTuple):
     path: str
 
 
-class Target(NamedTuple):
+class WheelTarget(NamedTuple):
     """What wheels must fit."""
 
     version: tuple[int, int]
@@ -69,7 +69,7 @@ def _hush(_text: str) -> None:
     """Hear what is being done, and tell nobody."""
 
 
-async def gather(wanted: Sequence[str], target: Target, into: Path, held: Sequence[str], told: Told = _hush) -> bool:
+async def download_wheels(wanted: Sequence[str], target: WheelTarget, into: Path, held: Sequence[str], told: Told = _hush) -> bool:
     """Download wheels for a target; where a project has only sources, build them here.
 
     The versions are those of this machine where there are such wheels for the target, because equal versions are a
@@ -158,20 +158,20 @@ def _reason(error: str) -> str:
     return re.sub(r"\[Errno -?\d+\] ", "", last) + (")" if "(" in last else "")
 
 
-def question() -> str:
+def interpreter_query() -> str:
     """Return a line of POSIX shell that prints command, version and path of every Python of a host."""
     names = [PLAIN, *(f"python3.{minor}" for minor in range(NEWEST_MINOR, OLDEST[1] - 1, -1))]
     say = 'import sys; print("%d.%d.%d" % sys.version_info[:3], sys.executable)'
     return f"for p in {' '.join(names)}; do said=$($p -c '{say}' 2>/dev/null) && echo $p $said; done; true"
 
 
-def interpreters(answer: str) -> list[Interpreter]:
+def parse_interpreters(answer: str) -> list[Interpreter]:
     """Return what `question` printed; a greeting of the login shell is passed over."""
     found = filter(None, map(ANSWER.fullmatch, answer.splitlines()))
     return [Interpreter(each[1], (int(each[2]), int(each[3]), int(each[4])), each[5]) for each in found]
 
 
-def chosen(name: str, found: Sequence[Interpreter], here: tuple[int, int]) -> Interpreter:
+def choose_interpreter(name: str, found: Sequence[Interpreter], here: tuple[int, int]) -> Interpreter:
     """Return the Python to install for: the launcher's minor version if it is there, else `python3`, else the newest.
 
     Raises:
@@ -187,7 +187,7 @@ def chosen(name: str, found: Sequence[Interpreter], here: tuple[int, int]) -> In
     raise HostsError(f"{name}: {found[0].command} is {version}; must be >= {least}; install a newer one beside it")
 
 
-def target(name: str, said: Mapping[str, Any]) -> Target:
+def wheel_target(name: str, said: Mapping[str, Any]) -> WheelTarget:
     """Return what wheels for a host must fit.
 
     Args:
@@ -204,7 +204,7 @@ def target(name: str, said: Mapping[str, Any]) -> Target:
     if not platforms:
         shown = " ".join(filter(None, (said["platform"], *said["libc"])))
         raise HostsError(f"{name}: is {shown}; must be Linux with glibc, or macOS; install zsim by hand there")
-    return Target((major, minor), f"cp{major}{minor}{'t' if said['free_threaded'] else ''}", tuple(platforms))
+    return WheelTarget((major, minor), f"cp{major}{minor}{'t' if said['free_threaded'] else ''}", tuple(platforms))
 
 
 def _platforms(system: str, libc: Sequence[str]) -> list[str]:

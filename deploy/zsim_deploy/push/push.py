@@ -19,14 +19,14 @@ from rich.text import Text
 
 from zsim import __version__
 from zsim.errors import HostsError, InventoryError
-from zsim_deploy.inventory.inventory import Host, Placed
+from zsim_deploy.inventory.inventory import Host, InventoryFile
 from zsim_deploy.inventory.processes import MODULES, known_extras, needed_extras
-from zsim_deploy.push.installer import Installer, installer
-from zsim_deploy.push.package_index import chosen, interpreters, question, target
-from zsim_deploy.push.wheelhouse import House, Wheel, Wheelhouse
+from zsim_deploy.push.installer import Installer, open_installer
+from zsim_deploy.push.package_index import choose_interpreter, parse_interpreters, interpreter_query, wheel_target
+from zsim_deploy.push.wheelhouse import WheelSet, Wheel, Wheelhouse
 from zsim_deploy.roles import warm_up
-from zsim_deploy.ssh.connection import shell_line
 from zsim_deploy.ssh.host_link import HostLink
+from zsim_deploy.ssh.ssh_connection import shell_line
 
 LAUNCHER = "launcher"  # how this machine is called among the hosts, in what is told
 ASK_S = 30.0  # wall time for a host to start a few Pythons; a small computer takes seconds
@@ -37,7 +37,7 @@ COPIES = 4  # files under way to one host at a time
 Told = Callable[[str, str], None]  # host, what is being done there
 
 
-async def push(placed: Placed, names: Sequence[str], more: Iterable[str], told: Told, cache: Path) -> dict[str, bool]:
+async def push(placed: InventoryFile, names: Sequence[str], more: Iterable[str], told: Told, cache: Path) -> dict[str, bool]:
     """Install on hosts what their roles need.
 
     Args:
@@ -87,8 +87,8 @@ async def _one(name: str, host: Host, base: Path, wanted: frozenset[str], house:
     try:
         told(name, "looking what is there")
         python = await _python(link)
-        async with installer(link, python, host.folder, partial(told, name)) as program:
-            return await _install(There(link, program), wanted, house, partial(told, name))
+        async with open_installer(link, python, host.folder, partial(told, name)) as program:
+            return await _install(HostInstallation(link, program), wanted, house, partial(told, name))
     except HostsError:
         told(name, "failed")
         raise
@@ -98,16 +98,16 @@ async def _one(name: str, host: Host, base: Path, wanted: frozenset[str], house:
 
 async def _python(link: HostLink) -> str:
     """Return the Python of a host to install for."""
-    said = await link.run(shell_line(["sh", "-c", question()]), timeout_s=ASK_S)
-    return chosen(link.name, interpreters(said.decode(errors="replace")), sys.version_info[:2]).path
+    said = await link.run(shell_line(["sh", "-c", interpreter_query()]), timeout_s=ASK_S)
+    return choose_interpreter(link.name, parse_interpreters(said.decode(errors="replace")), sys.version_info[:2]).path
 
 
-async def _install(there: "There", wanted: frozenset[str], house: Wheelhouse, told: Callable[[str], None]) -> bool:
+async def _install(there: "HostInstallation", wanted: frozenset[str], house: Wheelhouse, told: Callable[[str], None]) -> bool:
     """Install what is wanted; return whether anything had to be done."""
     await there.look()
-    needed = await house.house(there.name, target(there.name, there.found), wanted)
+    needed = await house.wheel_set(there.name, wheel_target(there.name, there.found), wanted)
     described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
-    if is_there(needed, there.found["installed"]):
+    if is_installed(needed, there.found["installed"]):
         told(f"{described} is there")
         return False
     await there.copy(missing(needed, there.found), told)
@@ -120,27 +120,27 @@ async def _install(there: "There", wanted: frozenset[str], house: Wheelhouse, to
     return True
 
 
-def is_there(house: House, installed: dict[str, Any] | None) -> bool:
+def is_installed(house: WheelSet, installed: dict[str, Any] | None) -> bool:
     """Tell whether a host has what it needs, by the note of the last push: perhaps more, but nothing else."""
     if installed is None or installed["project"] != house.project.sha256:
         return False
     return set(house.extras) <= set(installed["extras"]) and not _new(house, installed)
 
 
-def _new(house: House, installed: dict[str, Any] | None) -> list[Wheel]:
+def _new(house: WheelSet, installed: dict[str, Any] | None) -> list[Wheel]:
     """Return the wheels of other projects that are not installed yet."""
     known = installed["wheels"] if installed else {}
     return [wheel for wheel in house.others if known.get(wheel.path.name) != wheel.sha256]
 
 
-def missing(house: House, found: dict[str, Any]) -> list[Wheel]:
+def missing(house: WheelSet, found: dict[str, Any]) -> list[Wheel]:
     """Return the wheels that must be copied to a host, small ones last so that progress is smooth."""
     needed = [house.project, house.pip, *_new(house, found["installed"])]
     lacking = [wheel for wheel in needed if found["wheels"].get(wheel.path.name) != wheel.sha256]
     return sorted(lacking, key=lambda wheel: -wheel.size_bytes)
 
 
-class There:
+class HostInstallation:
     """What is on a host, and what is done to it."""
 
     def __init__(self, link: HostLink, program: Installer) -> None:
@@ -152,14 +152,14 @@ class There:
         """Find what is installed."""
         self.found = await self._program.ask("look", ASK_S)
 
-    async def install(self, house: House) -> None:
+    async def install(self, house: WheelSet) -> None:
         order = {
             "project": house.project.path.name,
             "pip": house.pip.path.name,
             "wheels": [wheel.path.name for wheel in _new(house, self.found["installed"])],
             "extras": house.extras,
             "modules": [MODULES[extra] for extra in ("", *house.extras) if extra in MODULES],
-            "note": house.note(),
+            "note": house.manifest(),
         }
         await self._program.ask("install", INSTALL_S, **order)
 
@@ -200,7 +200,7 @@ def default_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zsim"
 
 
-class Stages:
+class PushProgress:
     """Shows the stage of each host while it is entered."""
 
     def __init__(self, console: Console | None = None) -> None:
@@ -208,7 +208,7 @@ class Stages:
         self._now: dict[str, str] = {}
         self._live = Live(console=self._console, get_renderable=self._table, refresh_per_second=5)
 
-    def __enter__(self) -> "Stages":
+    def __enter__(self) -> "PushProgress":
         if self._console.is_terminal:
             self._live.start()
         return self
@@ -217,7 +217,7 @@ class Stages:
         if self._console.is_terminal:
             self._live.stop()
 
-    def tell(self, host: str, text: str) -> None:
+    def update(self, host: str, text: str) -> None:
         """Show what is being done at a host."""
         kind, last = (re.sub(r"\d+ of", "", each) for each in (text, self._now.get(host, "")))
         self._now[host] = text

@@ -23,7 +23,7 @@ from urllib.parse import urldefrag
 
 import zsim
 from zsim.errors import HostsError
-from zsim_deploy.push.package_index import PipError, Target, Told, UnreachableError, gather, pip
+from zsim_deploy.push.package_index import PipError, WheelTarget, Told, UnreachableError, download_wheels, pip
 
 PROJECT = "zsim"
 KEY_DIGITS = 16  # 64 bits of a SHA-256; what one person builds never collides
@@ -36,7 +36,7 @@ class Wheel(NamedTuple):
     size_bytes: int
 
 
-class House(NamedTuple):
+class WheelSet(NamedTuple):
     """What one host needs."""
 
     project: Wheel
@@ -47,7 +47,7 @@ class House(NamedTuple):
     def wheels(self) -> tuple[Wheel, ...]:
         return (self.project, self.pip, *self.others)
 
-    def note(self) -> dict[str, Any]:
+    def manifest(self) -> dict[str, Any]:
         """Return what a host keeps of it."""
         wheels = {wheel.path.name: wheel.sha256 for wheel in self.others}
         return {"project": self.project.sha256, "extras": list(self.extras), "wheels": wheels}
@@ -69,7 +69,7 @@ class Wheelhouse:
         for made in (self._wheels, folder / "houses"):
             made.mkdir(parents=True, exist_ok=True)
 
-    async def house(self, host: str, target: Target, extras: Iterable[str]) -> House:
+    async def wheel_set(self, host: str, target: WheelTarget, extras: Iterable[str]) -> WheelSet:
         """Return what a host needs.
 
         Args:
@@ -94,7 +94,7 @@ class Wheelhouse:
                 raise HostsError(self._unreachable) from error
         wheels = [_wheel(self._wheels / name) for name in names]
         pip = next(wheel for wheel in wheels if wheel.path.name.startswith(f"{PIP}-"))
-        return House(_wheel(project), pip, tuple(wheel for wheel in wheels if wheel is not pip), wanted)
+        return WheelSet(_wheel(project), pip, tuple(wheel for wheel in wheels if wheel is not pip), wanted)
 
     async def _project(self) -> Path:
         """Return the wheel of this project: of the checkout, or of what is installed."""
@@ -120,12 +120,12 @@ class Wheelhouse:
         names = json.loads(note.read_text()) if note.exists() else []
         return names if all((self._wheels / name).exists() for name in names) else []
 
-    async def _gather(self, host: str, key: str, project: Path, extras: Sequence[str], target: Target) -> list[str]:
+    async def _gather(self, host: str, key: str, project: Path, extras: Sequence[str], target: WheelTarget) -> list[str]:
         self._told(f"gathering the wheels for {target}" + (f" with {', '.join(extras)}" if extras else ""))
         wanted = f"{project}[{','.join(extras)}]" if extras else str(project)
         with tempfile.TemporaryDirectory(dir=self._folder) as made:
             try:
-                other_versions = await gather([wanted, PIP], target, Path(made), constraints(), self._told)
+                other_versions = await download_wheels([wanted, PIP], target, Path(made), constraints(), self._told)
             except UnreachableError:
                 raise
             except PipError as error:
@@ -141,7 +141,7 @@ class Wheelhouse:
         return names
 
 
-def _lacking(error: PipError, target: Target) -> str:
+def _lacking(error: PipError, target: WheelTarget) -> str:
     """Return in a line which wheel does not exist, from what pip says."""
     found = re.search(r"satisfies the requirement ([\w.-]+)", str(error))
     if found is None:

@@ -10,11 +10,11 @@ from zsim import __version__
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, WORLD
 from zsim.scenario.scenario import Scenario
-from zsim_deploy.inventory.inventory import Placed
+from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.inventory.processes import (
     STOP_S,
-    Files,
-    Process,
+    ProcessFiles,
+    PlannedProcess,
     Rendered,
     access_file,
     command,
@@ -41,7 +41,7 @@ from zsim_deploy.render.rendered_files import (
 CACHE_VOLUME = "cache"
 
 
-def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
+def render(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
     """Return `HOST/compose.yaml`, `HOST/Dockerfile`, and the scenario for the world's host.
 
     Args:
@@ -63,7 +63,7 @@ def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = ()) -> Rend
     return texts
 
 
-def _remarks(placed: Placed, scenario: Scenario, host: str) -> list[str]:
+def _remarks(placed: InventoryFile, scenario: Scenario, host: str) -> list[str]:
     return [
         "Rendered by `zsim render compose`; render again instead of editing.",
         "ZSIM_USER: user:group that owns the files beside this one. ZSIM_RUN: folder of the next record below runs/,",
@@ -75,7 +75,7 @@ def _remarks(placed: Placed, scenario: Scenario, host: str) -> list[str]:
     ]
 
 
-def _project(scenario: Scenario, here: Sequence[Process]) -> dict[str, Any]:
+def _project(scenario: Scenario, here: Sequence[PlannedProcess]) -> dict[str, Any]:
     return {
         "name": scenario.federation.replace(".", "-").lstrip("-_") or "zsim",  # Compose takes a-z, 0-9, - and _
         "services": {process.name: _service(scenario, process) for process in here},
@@ -83,7 +83,7 @@ def _project(scenario: Scenario, here: Sequence[Process]) -> dict[str, Any]:
     }
 
 
-def _service(scenario: Scenario, process: Process) -> dict[str, Any]:
+def _service(scenario: Scenario, process: PlannedProcess) -> dict[str, Any]:
     return {
         "image": f"zsim:{__version__}-{process.host}",
         "build": ".",
@@ -104,14 +104,14 @@ def _service(scenario: Scenario, process: Process) -> dict[str, Any]:
     }
 
 
-def _words(scenario: Scenario, process: Process) -> list[str]:
+def _words(scenario: Scenario, process: PlannedProcess) -> list[str]:
     """Return the command, `$` doubled where Compose is to leave it alone."""
     out = f"{RUNS}/${{ZSIM_RUN:-{scenario.name}}}"
-    words = command(process, Files(SCENARIO, CERTIFICATES, ACCESS, out))
+    words = command(process, ProcessFiles(SCENARIO, CERTIFICATES, ACCESS, out))
     return [word if word == out else word.replace("$", "$$") for word in words]
 
 
-def _volumes(process: Process) -> list[dict[str, Any]]:
+def _volumes(process: PlannedProcess) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = [{"type": "volume", "source": CACHE_VOLUME, "target": CACHE}]
     if process.name == WORLD:
         found.append(_bind("./scenario.yaml", SCENARIO))

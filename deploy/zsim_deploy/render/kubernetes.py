@@ -13,16 +13,8 @@ from zsim.errors import InventoryError
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
-from zsim_deploy.inventory.inventory import Placed
-from zsim_deploy.inventory.processes import (
-    Process,
-    Rendered,
-    access_file,
-    extras,
-    own_programs,
-    processes,
-    used_hosts,
-)
+from zsim_deploy.inventory.inventory import InventoryFile
+from zsim_deploy.inventory.processes import PlannedProcess, Rendered, access_file, extras, own_programs, processes, used_hosts
 from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT
 from zsim_deploy.render import pod
 from zsim_deploy.render.rendered_files import RUNS, dockerfile, document, documents, unused
@@ -37,7 +29,7 @@ NAMESPACE_REMARKS = (
 )
 
 
-def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = (), image: str = IMAGE) -> Rendered:
+def render(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (), image: str = IMAGE) -> Rendered:
     """Return `namespace.yaml`, `secrets.sh`, `zsim.yaml`, `records.yaml` and a Dockerfile.
 
     Args:
@@ -64,7 +56,7 @@ def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = (), image: 
     return texts
 
 
-def _refuse(placed: Placed, found: Sequence[Process], text: str) -> None:
+def _refuse(placed: InventoryFile, found: Sequence[PlannedProcess], text: str) -> None:
     """Raise an error with a line for everything that Kubernetes cannot do."""
     lines = [
         f"hosts.{host} is no name of a node; must be letters, digits, - and ., as `kubectl get nodes` says"
@@ -82,7 +74,7 @@ def _refuse(placed: Placed, found: Sequence[Process], text: str) -> None:
         raise InventoryError([f"{placed.source}: {line}" for line in lines])
 
 
-def _remarks(placed: Placed, scenario: Scenario, found: Sequence[Process]) -> list[str]:
+def _remarks(placed: InventoryFile, scenario: Scenario, found: Sequence[PlannedProcess]) -> list[str]:
     return [
         "Rendered by `zsim render kubernetes`; render again instead of editing.",
         "A Job starts a dead role again after 10 s, then after 20 s, and so on; `zsim run` does so at once.",
@@ -92,7 +84,7 @@ def _remarks(placed: Placed, scenario: Scenario, found: Sequence[Process]) -> li
     ]
 
 
-def _service_remark(placed: Placed, found: Sequence[Process]) -> list[str]:
+def _service_remark(placed: InventoryFile, found: Sequence[PlannedProcess]) -> list[str]:
     world = next(process for process in found if process.name == WORLD)
     address = placed.inventory.hosts[world.host].address
     certified = f"The world's certificate is for {address}: over TLS that is its name, and not the Service's."
@@ -116,7 +108,7 @@ def _records_claim(space: str) -> dict[str, Any]:
     }
 
 
-def _secrets(space: str, found: Sequence[Process]) -> str:
+def _secrets(space: str, found: Sequence[PlannedProcess]) -> str:
     """Return a script that puts certificates from where `zsim certs init` left them into the cluster."""
     lines = [
         "#!/bin/sh",
@@ -157,7 +149,7 @@ def _records_pod(space: str, image: str) -> dict[str, Any]:
 # A run
 
 
-def _run(space: str, scenario: Scenario, text: str, found: Sequence[Process], image: str) -> list[dict[str, Any]]:
+def _run(space: str, scenario: Scenario, text: str, found: Sequence[PlannedProcess], image: str) -> list[dict[str, Any]]:
     return [
         _config(space, text),
         *(_service(space, process) for process in found if process.name == WORLD),
@@ -170,7 +162,7 @@ def _config(space: str, text: str) -> dict[str, Any]:
     return {"apiVersion": "v1", "kind": "ConfigMap", "metadata": meta, "data": {"scenario.yaml": text}}
 
 
-def _service(space: str, world: Process) -> dict[str, Any]:
+def _service(space: str, world: PlannedProcess) -> dict[str, Any]:
     """Return the world's name in the cluster, for `zsim echo` and programs in Pods of their own."""
     port = {"name": "zenoh", "port": world.port, "targetPort": "zenoh", "protocol": "TCP"}
     return {
@@ -181,7 +173,7 @@ def _service(space: str, world: Process) -> dict[str, Any]:
     }
 
 
-def _job(space: str, process: Process, image: str) -> dict[str, Any]:
+def _job(space: str, process: PlannedProcess, image: str) -> dict[str, Any]:
     """Return a Job: a fault of the call, and a name that another has taken, are not healed by a new Pod."""
     codes = {"operator": "In", "values": [USER_FAULT, SUPERSEDED]}
     spec = {
@@ -193,7 +185,7 @@ def _job(space: str, process: Process, image: str) -> dict[str, Any]:
     return {"apiVersion": "batch/v1", "kind": "Job", "metadata": _meta(space, process), "spec": spec}
 
 
-def _deployment(space: str, process: Process, image: str) -> dict[str, Any]:
+def _deployment(space: str, process: PlannedProcess, image: str) -> dict[str, Any]:
     """Return a Deployment; the old Pod goes before the new one comes, they have the same port."""
     spec = {
         "replicas": 1,
@@ -204,5 +196,5 @@ def _deployment(space: str, process: Process, image: str) -> dict[str, Any]:
     return {"apiVersion": "apps/v1", "kind": "Deployment", "metadata": _meta(space, process), "spec": spec}
 
 
-def _meta(space: str, process: Process) -> dict[str, Any]:
+def _meta(space: str, process: PlannedProcess) -> dict[str, Any]:
     return {"name": pod.label(process.name), "namespace": space, "labels": pod.labels(process)}

@@ -6,7 +6,7 @@ from typing import Any
 
 from zsim.scenario.rights import RECORDER, WORLD
 from zsim.transport.identity import CERTIFICATES as IDENTITY_FILES
-from zsim_deploy.inventory.processes import STOP_S, Files, Process, command
+from zsim_deploy.inventory.processes import STOP_S, ProcessFiles, PlannedProcess, command
 from zsim_deploy.render.rendered_files import ACCESS, CACHE, CERTIFICATES, ENVIRONMENT, RUNS, SCENARIO, USER
 
 NAME_MAX = 63  # RFC 1123 label
@@ -20,7 +20,7 @@ def label(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name).strip("-")[:NAME_MAX].rstrip("-") or "zsim"
 
 
-def labels(process: Process) -> dict[str, str]:
+def labels(process: PlannedProcess) -> dict[str, str]:
     return {
         "app.kubernetes.io/name": "zsim",
         "app.kubernetes.io/component": process.role,
@@ -28,11 +28,11 @@ def labels(process: Process) -> dict[str, str]:
     }
 
 
-def secret(process: Process) -> str:
+def secret(process: PlannedProcess) -> str:
     return f"certs-{label(process.name)}"
 
 
-def template(process: Process, image: str, restart: str) -> dict[str, Any]:
+def template(process: PlannedProcess, image: str, restart: str) -> dict[str, Any]:
     spec = {
         "nodeSelector": {"kubernetes.io/hostname": process.host},
         "hostNetwork": True,
@@ -48,9 +48,9 @@ def template(process: Process, image: str, restart: str) -> dict[str, Any]:
     return {"metadata": {"labels": labels(process)}, "spec": spec}
 
 
-def _box(process: Process, image: str) -> dict[str, Any]:
+def _box(process: PlannedProcess, image: str) -> dict[str, Any]:
     name = {"name": "POD_NAME", "valueFrom": {"fieldRef": {"fieldPath": "metadata.name"}}}
-    files = Files(SCENARIO, CERTIFICATES, ACCESS, f"{RUNS}/$(POD_NAME)")
+    files = ProcessFiles(SCENARIO, CERTIFICATES, ACCESS, f"{RUNS}/$(POD_NAME)")
     box = {
         "name": process.role,
         "image": image,
@@ -81,7 +81,7 @@ def locked() -> dict[str, Any]:
     }
 
 
-def _mounts(process: Process) -> list[dict[str, Any]]:
+def _mounts(process: PlannedProcess) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = [{"name": "cache", "mountPath": CACHE}, {"name": "tmp", "mountPath": "/tmp"}]
     if process.name == WORLD:
         found.append({"name": "scenario", "mountPath": SCENARIO.rpartition("/")[0], "readOnly": True})
@@ -94,7 +94,7 @@ def _mounts(process: Process) -> list[dict[str, Any]]:
     return found
 
 
-def _volumes(process: Process) -> list[dict[str, Any]]:
+def _volumes(process: PlannedProcess) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = [{"name": "cache", "emptyDir": {}}, {"name": "tmp", "emptyDir": {}}]
     if process.name == WORLD:
         found.append({"name": "scenario", "configMap": {"name": "scenario"}})
@@ -107,7 +107,7 @@ def _volumes(process: Process) -> list[dict[str, Any]]:
     return found
 
 
-def _secret_volume(name: str, process: Process, keys: Sequence[str]) -> dict[str, Any]:
+def _secret_volume(name: str, process: PlannedProcess, keys: Sequence[str]) -> dict[str, Any]:
     items = [{"key": key, "path": key} for key in keys]
     return {"name": name, "secret": {"secretName": secret(process), "defaultMode": 0o440, "items": items}}
 

@@ -18,7 +18,7 @@ import yaml
 
 from zsim import __version__
 from zsim.errors import RunError
-from zsim_deploy.inventory.inventory import Host, Placed
+from zsim_deploy.inventory.inventory import Host, InventoryFile
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED
 
 BASE = "python:3.11-slim"  # the oldest Python that zsim runs on
@@ -162,7 +162,7 @@ ENTRYPOINT ["python"]
 """
 
 
-def unused(placed: Placed, host: str) -> list[str]:
+def unused(placed: InventoryFile, host: str) -> list[str]:
     """Return a remark on what the inventory says of a host and containers do not need."""
     given = placed.inventory.hosts[host]
     defaults = Host(address=given.address)

@@ -13,11 +13,11 @@ from zsim.scenario.rights import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.schema.checker import show
 from zsim_deploy.inventory import inventory as inv
-from zsim_deploy.inventory.inventory import Host, Placed
+from zsim_deploy.inventory.inventory import Host, InventoryFile
 from zsim_deploy.inventory.processes import (
     STOP_S,
-    Files,
-    Process,
+    ProcessFiles,
+    PlannedProcess,
     Rendered,
     access_file,
     command,
@@ -59,7 +59,7 @@ HARDENING = (
 )
 
 
-def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
+def render(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
     """Return `HOST/zsim-PROCESS.service`, `HOST/zsim.target`, and the scenario for the world's host.
 
     Args:
@@ -83,7 +83,7 @@ def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = ()) -> Rend
     return texts
 
 
-def _refuse(placed: Placed, hosts: Iterable[str]) -> None:
+def _refuse(placed: InventoryFile, hosts: Iterable[str]) -> None:
     """Raise an error with a line for everything that a unit needs and the inventory does not say."""
     lines = [f"{placed.source}: hosts.{name}.{text}" for name in hosts for text in _lacks(placed.inventory.hosts[name])]
     if lines:
@@ -123,7 +123,7 @@ def unit_name(process: str) -> str:
     return f"zsim-{process}.service"
 
 
-def _service(placed: Placed, scenario: Scenario, process: Process, here: Sequence[Process]) -> str:
+def _service(placed: InventoryFile, scenario: Scenario, process: PlannedProcess, here: Sequence[PlannedProcess]) -> str:
     host = placed.inventory.hosts[process.host]
     return _text(
         {
@@ -135,7 +135,7 @@ def _service(placed: Placed, scenario: Scenario, process: Process, here: Sequenc
     )
 
 
-def _unit(scenario: Scenario, process: Process, here: Sequence[Process]) -> list[str]:
+def _unit(scenario: Scenario, process: PlannedProcess, here: Sequence[PlannedProcess]) -> list[str]:
     """Return the order: what is started later is stopped first, so the world ends the run for all, routers go last."""
     order = ["network-online.target", *(unit_name(other.name) for other in here if _rank(other) < _rank(process))]
     return [
@@ -148,13 +148,13 @@ def _unit(scenario: Scenario, process: Process, here: Sequence[Process]) -> list
     ]
 
 
-def _rank(process: Process) -> int:
+def _rank(process: PlannedProcess) -> int:
     return {ROUTER: 0, WORLD: 2}.get(process.role, 1)
 
 
-def _run(scenario: Scenario, process: Process, host: Host) -> list[str]:
+def _run(scenario: Scenario, process: PlannedProcess, host: Host) -> list[str]:
     here = folder(host)
-    files = Files(
+    files = ProcessFiles(
         scenario=f"{here}/scenario.yaml",
         identity=f"{here}/certs/{process.name}",
         access=f"{here}/certs/{access_file(process)}",
@@ -182,7 +182,7 @@ def _word(text: str) -> str:
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
-def _life(process: Process) -> list[str]:
+def _life(process: PlannedProcess) -> list[str]:
     """Return when a process is started again, and how it is ended."""
     restart = "on-failure" if process.on_death == "restart" else "no"
     return [
@@ -193,7 +193,7 @@ def _life(process: Process) -> list[str]:
     ]
 
 
-def _target(scenario: Scenario, here: Sequence[Process], remarks: Sequence[str]) -> str:
+def _target(scenario: Scenario, here: Sequence[PlannedProcess], remarks: Sequence[str]) -> str:
     return _text(
         {
             "Unit": [
@@ -206,7 +206,7 @@ def _target(scenario: Scenario, here: Sequence[Process], remarks: Sequence[str])
     )
 
 
-def _remarks(process: Process, host: Host) -> list[str]:
+def _remarks(process: PlannedProcess, host: Host) -> list[str]:
     """Return what a reader has to know that the options do not say."""
     found = []
     if not host.folder.startswith("/"):

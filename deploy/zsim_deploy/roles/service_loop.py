@@ -16,9 +16,9 @@ from zsim.errors import NoWorldError, SupersededError
 from zsim.transport.connection import find_world
 from zsim.transport.session import Session
 from zsim_bridges.observer_process import Presence
-from zsim_deploy.options.arguments import Reach
-from zsim_deploy.roles.roles import speaker
-from zsim_deploy.roles.stop_channel import Leash, lent
+from zsim_deploy.options.arguments import WorldAccess
+from zsim_deploy.roles.roles import log_printer
+from zsim_deploy.roles.stop_channel import StopChannel, key_lease
 
 ANY = "*"  # in a name, for a number
 PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits for byes
@@ -34,7 +34,7 @@ TRIES = 5
 AGAIN_S = 0.12  # the kernel lets ordinary users write there ten times a second, all of them together
 
 
-def visit(name: str, serve: Serve, reach: Reach) -> None:
+def serve_runs(name: str, serve: Serve, reach: WorldAccess) -> None:
     """Serve one run after the other of the world on an endpoint, until it is told to stop; launched, only one.
 
     Args:
@@ -47,12 +47,12 @@ def visit(name: str, serve: Serve, reach: Reach) -> None:
         SupersededError: another process of the name that was given has taken over.
     """
     launched, wait_s, who = reach.launched, reach.wait_s, reach.who
-    leash = Leash(launched is not None, lent(who, launched))
-    say = speaker(launched is not None)
+    leash = StopChannel(launched is not None, key_lease(who, launched))
+    say = log_printer(launched is not None)
     mine, served = name, ""
     try:
-        while not leash.pulled():
-            with find_world(reach.endpoint, reach.federation, wait_s, say, leash.pulled, True, launched, who) as (
+        while not leash.stopped():
+            with find_world(reach.endpoint, reach.federation, wait_s, say, leash.stopped, True, launched, who) as (
                 link,
                 info,
             ):
@@ -66,15 +66,15 @@ def visit(name: str, serve: Serve, reach: Reach) -> None:
                 else:
                     time.sleep(PAUSE_S)
             if launched:
-                leash.account()
+                leash.exit_if_terminated()
                 return
             wait_s = None
     except NoWorldError:
-        if not leash.pulled():
+        if not leash.stopped():
             raise
 
 
-def named(role: str, name: str, tls: Path | None, thing: str = "main") -> str:
+def process_name(role: str, name: str, tls: Path | None, thing: str = "main") -> str:
     """Return a process's name: as told, or its certificate's, or the role's first."""
     return name or (tls.name if tls else f"{role}.{thing}")
 
@@ -100,10 +100,10 @@ def _next(name: str, presence: Presence) -> str:
     return f"{role}.{int(presence.name.rpartition('.')[2]) + 1}"
 
 
-def _serve(serve: Serve, link: Session, presence: Presence, info: Info, leash: Leash, say: Say) -> None:
+def _serve(serve: Serve, link: Session, presence: Presence, info: Info, leash: StopChannel, say: Say) -> None:
     presence.enter()
     say(f"{presence.name}: in run {info.run_id}")
-    serve(link, info, presence, leash.pulled, say)
+    serve(link, info, presence, leash.stopped, say)
     reason = presence.over or leash.reason() or "stopped"
     presence.leave(reason)
     say(f"{presence.name}: left, {reason}")

@@ -25,7 +25,7 @@ GRACE_S = 4.0  # a role that was told to stop and hangs is ended; the world wait
 FOLDER = "identity"  # in the folder of a run on a host; the certificates of its processes are below
 
 
-class Lent:
+class KeyLease:
     """A key that was brought for this process; it is given back when the process ends, however that comes.
 
     Args:
@@ -35,16 +35,16 @@ class Lent:
     def __init__(self, folder: Path) -> None:
         self._key = folder / KEY
         self._stamp = _stamp(self._key)
-        atexit.register(self.give_back)
+        atexit.register(self.release)
 
-    def give_back(self) -> None:
+    def release(self) -> None:
         """Remove the key, but not one that was brought to its place since, for whoever takes over."""
         with contextlib.suppress(OSError):
             if _stamp(self._key) == self._stamp:
                 self._key.unlink(missing_ok=True)
 
 
-class Leash:
+class StopChannel:
     """The reason to stop, once there is one.
 
     Args:
@@ -52,7 +52,7 @@ class Leash:
         lent: key that goes back as soon as the launcher is gone.
     """
 
-    def __init__(self, launched: bool, lent: Lent | None = None) -> None:
+    def __init__(self, launched: bool, lent: KeyLease | None = None) -> None:
         self._lent = lent
         self._reason: str | None = None
         self._deserted = self._terminated = False
@@ -70,15 +70,15 @@ class Leash:
         """Return why to stop, None to go on."""
         return self._reason
 
-    def pulled(self) -> bool:
+    def stopped(self) -> bool:
         """Tell whether to stop."""
         return self._reason is not None
 
-    def deserted(self) -> bool:
+    def orphaned(self) -> bool:
         """Tell whether the launcher is gone, or does not want this end: for all others it is a death, no leave."""
         return self._deserted
 
-    def account(self) -> None:
+    def exit_if_terminated(self) -> None:
         """Tell the launcher, by the exit code, that somebody else has ended this process; to be called last.
 
         Raises:
@@ -87,7 +87,7 @@ class Leash:
         if self._terminated:
             raise SystemExit(TERMINATED)
 
-    def let_go(self) -> None:
+    def restore_signals(self) -> None:
         """Take no signals any more: what is left to do may be interrupted as anything."""
         for number, handler in self._former.items():
             signal.signal(number, handler)
@@ -125,18 +125,18 @@ class Leash:
     def _leave(self, reason: str) -> None:
         self._deserted = True
         if self._lent is not None:
-            self._lent.give_back()
+            self._lent.release()
         self._stop(reason)
         time.sleep(GRACE_S)
         os._exit(1)
 
 
-def lent(identity: Identity, launched: str | None) -> Lent | None:
+def key_lease(identity: Identity, launched: str | None) -> KeyLease | None:
     """Return the key that the launcher of a run has lent; None if the key is this host's own, or there is none."""
     folder = identity.tls
     if launched is None or folder is None or folder.parts[-3:-1] != (launched, FOLDER):
         return None
-    return Lent(folder)
+    return KeyLease(folder)
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:

@@ -17,7 +17,7 @@ from zsim.runtime.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
 from zsim.scenario.scenario import Scenario
 from zsim.transport import session
 from zsim.transport.identity import Identity
-from zsim_deploy.roles.stop_channel import Leash, lent
+from zsim_deploy.roles.stop_channel import StopChannel, key_lease
 
 if TYPE_CHECKING:
     from zsim.record import RecordReader
@@ -42,7 +42,7 @@ def world(
     from zsim_world.flight.world import World
     from zsim_world.server.world_process import run
 
-    leash = Leash(launched is not None, lent(identity, launched))
+    leash = StopChannel(launched is not None, key_lease(identity, launched))
     with _patience(Teller() if launched else None):
         run_world = World(scenario, mode, rate, time.monotonic_ns, launched)
     for name in expect or ():
@@ -50,12 +50,12 @@ def world(
     gc.collect()
     gc.freeze()
     if launched:
-        run(run_world, endpoints, leash.reason, told(Teller()), identity=identity)
-        leash.account()
+        run(run_world, endpoints, leash.reason, world_progress(Teller()), identity=identity)
+        leash.exit_if_terminated()
         return
     with Screen(scenario.duration_s) as screen:
         listening = f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run"
-        run(run_world, endpoints, leash.reason, told(screen), lambda: screen.say(listening), identity)
+        run(run_world, endpoints, leash.reason, world_progress(screen), lambda: screen.say(listening), identity)
         screen.say(f"ended: {run_world.ended}")
 
 
@@ -76,7 +76,7 @@ def _patience(teller: Teller | None) -> Iterator[None]:
         timer.cancel()
 
 
-def told(show: Show) -> Callable[[str, Any, str], None]:
+def world_progress(show: Show) -> Callable[[str, Any, str], None]:
     """Return what the world calls with its clocks, its events, and what passes it."""
     throttle, reasons = Throttle(), Reasons()
     told = [0]
@@ -118,7 +118,7 @@ def _event_line(event: messages.Event) -> dict[str, Any]:
     }
 
 
-class Wish(NamedTuple):
+class ReplayOptions(NamedTuple):
     """How a record is to be played.
 
     Attributes:
@@ -136,7 +136,7 @@ class Wish(NamedTuple):
     federation: str | None = None
 
 
-def play(place: Path, wish: Wish, who: Identity) -> None:
+def play(place: Path, wish: ReplayOptions, who: Identity) -> None:
     """Play a record until it is over or somebody stops it.
 
     Raises:
@@ -150,7 +150,7 @@ def play(place: Path, wish: Wish, who: Identity) -> None:
 
     for expression in wish.choice.keys:
         session.check_expression(expression)
-    leash = Leash(False, lent(who, None))
+    leash = StopChannel(False, key_lease(who, None))
     with opened(place) as (reader, info, scenario):
         _check(wish.choice.keys, reader)
         if wish.federation is not None:
@@ -162,7 +162,7 @@ def play(place: Path, wish: Wish, who: Identity) -> None:
         with Screen(scenario.duration_s) as screen:
             where = f"{scenario.federation!r} on {', '.join(wish.endpoints)}"
             text = f"replay of run {info.run_id} as {where}; Ctrl-C ends it"
-            run(playback, wish.endpoints, leash.reason, told(screen), lambda: screen.say(text), who)
+            run(playback, wish.endpoints, leash.reason, world_progress(screen), lambda: screen.say(text), who)
             for note in record_notes(reader.complete, reader.damaged):
                 screen.say(note)
             screen.say(f"ended: {playback.ended}")

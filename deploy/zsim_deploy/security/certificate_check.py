@@ -10,15 +10,15 @@ from zsim.errors import RunError
 from zsim.scenario.rights import ROUTER, WORLD
 from zsim.transport.identity import AUTHORITY, KEY
 from zsim_deploy.inventory import inventory as inv
-from zsim_deploy.inventory.inventory import Placed
+from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.security import certificates
-from zsim_deploy.security.enrolment import Wanted, folder_of, init_command
+from zsim_deploy.security.enrolment import CertificateRequest, folder_of, init_command
 
 SHOWN_MAX = 4  # names in a line; all of them are missing together as a rule
 READABLE_BY_OTHERS = stat.S_IRGRP | stat.S_IROTH
 
 
-def lacks(placed: Placed, places: Mapping[str, str] | None, now: datetime) -> list[str]:
+def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, now: datetime) -> list[str]:
     """Return what of the certificates and access control of a run is missing or of no use, a line for each fault.
 
     Args:
@@ -42,7 +42,7 @@ def lacks(placed: Placed, places: Mapping[str, str] | None, now: datetime) -> li
     return [f"{folder}: {fault}: {_names(who)}; {_mend(placed, fault)}" for fault, who in by_fault.items()]
 
 
-def exposed(placed: Placed) -> str | None:
+def exposed_keys(placed: InventoryFile) -> str | None:
     """Return a warning of private keys that others than their owner can read; None if there are none."""
     if placed.inventory.security.insecure:
         return None
@@ -54,23 +54,23 @@ def exposed(placed: Placed) -> str | None:
     return f"{keys[0]}{more} can be read by others on this machine; chmod -R go= {shlex.quote(str(folder))}"
 
 
-def _by_fault(placed: Placed, folder: Path, places: Mapping[str, str] | None, now: datetime) -> dict[str, list[str]]:
+def _by_fault(placed: InventoryFile, folder: Path, places: Mapping[str, str] | None, now: datetime) -> dict[str, list[str]]:
     """Return what is wrong, and with whose certificates, `NAME on HOST`."""
     given = inv.spread(placed.inventory.roles, [WORLD]) if places is None else places
     routers = {f"{ROUTER}.{name}": router.host for name, router in placed.inventory.routers.items()}
     root = certificates.root(folder)
     found: dict[str, list[str]] = {}
     for name, host in {**given, **routers}.items():
-        wanted = Wanted(host, name, (placed.inventory.hosts[host].address,))
+        wanted = CertificateRequest(host, name, (placed.inventory.hosts[host].address,))
         if fault := _fault(folder, root, wanted, now):
             found.setdefault(fault, []).append(f"{name} on {host}")
     return found
 
 
-def _fault(folder: Path, root: certificates.Root, wanted: Wanted, now: datetime) -> str | None:
+def _fault(folder: Path, root: certificates.Root, wanted: CertificateRequest, now: datetime) -> str | None:
     """Return what is wrong with a certificate, and with the access control beside it; None if nothing is."""
     listens = wanted.process == WORLD or wanted.process.startswith(f"{ROUTER}.")
-    why = certificates.due(folder, root, wanted, now)
+    why = certificates.renewal_reason(folder, root, wanted, now)
     if why == "new":
         return "certificate missing"
     if why == "other addresses":
@@ -81,7 +81,7 @@ def _fault(folder: Path, root: certificates.Root, wanted: Wanted, now: datetime)
     return None if there or not listens else "access control missing"
 
 
-def _mend(placed: Placed, fault: str = "") -> str:
+def _mend(placed: InventoryFile, fault: str = "") -> str:
     return f"make them with `{init_command(placed, renew=certificates.EXPIRED in fault)}`"
 
 

@@ -20,7 +20,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from zsim.errors import RunError
 from zsim.scenario.rights import OPERATOR
 from zsim.transport.identity import AUTHORITY, CERTIFICATE, CERTIFICATES, DAYS, KEY
-from zsim_deploy.security.enrolment import OPERATORS, Wanted
+from zsim_deploy.security.enrolment import OPERATORS, CertificateRequest
 
 AUTHORITY_DAYS = 1825  # 5 years; its key never leaves the machine that made it
 BACK = timedelta(days=1)  # hosts in the field have clocks that are hours off
@@ -32,7 +32,7 @@ Root = x509.Certificate
 """The certificate of an authority."""
 
 
-class Shown(NamedTuple):
+class CertificateStatus(NamedTuple):
     """A certificate that is there."""
 
     host: str
@@ -72,7 +72,7 @@ def authority(folder: Path, now: datetime, force: bool = False) -> Authority:
     return found
 
 
-def issue(folder: Path, signer: Authority, wanted: Wanted, now: datetime, days: float = DAYS) -> Path:
+def issue(folder: Path, signer: Authority, wanted: CertificateRequest, now: datetime, days: float = DAYS) -> Path:
     """Make key and certificate of a process on a host; return the folder that they are in.
 
     Raises:
@@ -103,7 +103,7 @@ def root(folder: Path) -> Root:
     return _load(folder / AUTHORITY)
 
 
-def due(folder: Path, signer: Root, wanted: Wanted, now: datetime) -> str | None:
+def renewal_reason(folder: Path, signer: Root, wanted: CertificateRequest, now: datetime) -> str | None:
     """Return why a certificate has to be made, None if the one that is there will do, with its key."""
     place = folder / wanted.host / wanted.process
     if not all((place / name).exists() for name in CERTIFICATES):
@@ -120,7 +120,7 @@ def due(folder: Path, signer: Root, wanted: Wanted, now: datetime) -> str | None
     return None
 
 
-def show(folder: Path, now: datetime) -> list[Shown]:
+def show(folder: Path, now: datetime) -> list[CertificateStatus]:
     """Return every certificate in a folder, with what is wrong with it."""
     paths = sorted(folder.glob(f"*/*/{CERTIFICATE}"))
     if not paths:
@@ -137,10 +137,10 @@ def operators(folder: Path, hosts: Iterable[str]) -> Iterator[str]:
             yield name if host == OPERATORS else f"{name}@{host}"
 
 
-def _shown(place: Path, signer: Root, now: datetime) -> Shown:
+def _shown(place: Path, signer: Root, now: datetime) -> CertificateStatus:
     found = _load(place / CERTIFICATE)
     fault = _fault(place, found, signer, now) or ""
-    return Shown(place.parent.name, place.name, _addresses(found), found.not_valid_after_utc, fault)
+    return CertificateStatus(place.parent.name, place.name, _addresses(found), found.not_valid_after_utc, fault)
 
 
 def _fault(place: Path, found: x509.Certificate, signer: Root, now: datetime) -> str | None:

@@ -18,7 +18,7 @@ from zsim.scenario import rights
 from zsim.scenario.rights import OPERATOR, ROUTER, WORLD, Rights
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.inventory import inventory as inv
-from zsim_deploy.inventory.inventory import Placed
+from zsim_deploy.inventory.inventory import InventoryFile
 
 OPERATORS = "operators"  # folder of the operators that are at no host of the inventory
 # (flow, messages, whose keys): what a right is on the wire, seen from the process that listens
@@ -39,18 +39,18 @@ _TOLD = ("declare_subscriber", "declare_queryable", "liveliness_query", "declare
 _MESSAGES = (*_TOLD, "put", "delete", "query", "reply", "liveliness_token")
 
 
-def folder_of(placed: Placed) -> Path:
+def folder_of(placed: InventoryFile) -> Path:
     """Return the folder of an inventory's certificates."""
     return placed.folder / Path(placed.inventory.security.certificates).expanduser()
 
 
-def init_command(placed: Placed, renew: bool = False) -> str:
+def init_command(placed: InventoryFile, renew: bool = False) -> str:
     """Return the command that makes an inventory's certificates, as a person is told to type it."""
     words = ["zsim", "certs", "init", str(placed.folder / placed.source)]
     return " ".join([shlex.join(words), "--scenario FILE", *(["--renew"] if renew else [])])
 
 
-class Wanted(NamedTuple):
+class CertificateRequest(NamedTuple):
     """A certificate that is to be there.
 
     Attributes:
@@ -78,19 +78,19 @@ class Enrolment:
         BadNameError: an operator's name is none of the contract.
     """
 
-    def __init__(self, placed: Placed, scenario: Scenario, operators: Sequence[str] = ()) -> None:
+    def __init__(self, placed: InventoryFile, scenario: Scenario, operators: Sequence[str] = ()) -> None:
         self._inventory = placed.inventory
         self._scenario = scenario
         self._places = inv.placement(placed, scenario)
         self._operators = list(dict.fromkeys(self._read_operator(text, placed.source) for text in operators))
 
-    def certificates(self) -> list[Wanted]:
+    def certificates(self) -> list[CertificateRequest]:
         """Return the certificates; a role has one for every host, so that it can be moved there during a run."""
         fixed = [(self._places[WORLD], WORLD)]
         fixed += [(router.host, f"{ROUTER}.{name}") for name, router in self._inventory.routers.items()]
         movable = [(host, name) for name in self._movable() for host in self._inventory.hosts]
         operators = [(host or OPERATORS, name) for name, host in self._operators]
-        return [Wanted(host, name, self._addresses(host)) for host, name in [*fixed, *movable, *operators]]
+        return [CertificateRequest(host, name, self._addresses(host)) for host, name in [*fixed, *movable, *operators]]
 
     def access(self) -> Iterator[tuple[str, str, dict[str, Any]]]:
         """Yield (host, process, access control) of every process that listens."""

@@ -10,15 +10,15 @@ from typing import Any
 import asyncssh
 
 from zsim.errors import HostsError, ZsimError
-from zsim_deploy.inventory.inventory import Placed
-from zsim_deploy.ssh.host_link import CLOSE_S, HostLink, Loop
+from zsim_deploy.inventory.inventory import InventoryFile
+from zsim_deploy.ssh.host_link import CLOSE_S, HostLink, EventLoopThread
 
 OPEN_S = 10.0  # until the host lets us read; a few round trips of a poor link
 STALL_S = 20.0  # without anything more the host is taken for lost; TCP repeats within that what a poor link loses
 BLOCK_BYTES = 32_768  # asked for at once; even at 100 kbit/s one comes within 3 s
 
 
-class Links:
+class HostLinks:
     """A link to each host that takes part.
 
     Args:
@@ -30,7 +30,7 @@ class Links:
         by_name: the links; a new dictionary when there is one more, for others look at it meanwhile.
     """
 
-    def __init__(self, placed: Placed, names: Iterable[str], loop: Loop) -> None:
+    def __init__(self, placed: InventoryFile, names: Iterable[str], loop: EventLoopThread) -> None:
         self._placed = placed
         self._loop = loop
         self.by_name = {name: self.to(name) for name in names}
@@ -42,12 +42,12 @@ class Links:
     def add(self, link: HostLink) -> None:
         """Keep one more link."""
         self.by_name = {**self.by_name, link.name: link}
-        self._loop.spawn(link.echo())
+        self._loop.spawn(link.measure_round_trips())
 
     def listen(self) -> None:
         """Notice from now on when a host falls silent."""
         for link in self.by_name.values():
-            self._loop.spawn(link.echo())
+            self._loop.spawn(link.measure_round_trips())
 
     def on_all(self, work: Callable[[HostLink], Coroutine[Any, Any, Any]], within_s: float) -> dict[str, Any]:
         """Do the same on all hosts at once, and return what comes of it.

@@ -9,7 +9,7 @@ import pytest
 from zsim.errors import RunError
 from zsim_deploy.cli import hosts_commands
 from zsim_deploy.cli.hosts_commands import logs
-from zsim_deploy.hosts.control_socket import Intercom
+from zsim_deploy.hosts.control_socket import ControlSocket
 
 ROLES = ["world", "recorder", "estimator.d1"]
 
@@ -22,7 +22,7 @@ class Run:
         self.asked = threading.Event()
         self.is_over = False
         (out / "logs").mkdir(parents=True)
-        self.intercom = Intercom("zsim", {"where": self._where})
+        self.intercom = ControlSocket("zsim", {"where": self._where})
 
     def _where(self) -> dict[str, object]:
         self.asked.set()

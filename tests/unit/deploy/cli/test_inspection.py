@@ -87,7 +87,7 @@ def test_a_rate_of_what_is_no_key_is_refused():
 
 
 def test_a_key_that_fell_silent_is_told():
-    rate = inspection.Rate(10)
+    rate = inspection.MessageRate(10)
     for number in range(5):
         rate.add(10 + 0.02 * number, 20_000_000 * number)
     assert rate.line(10.1).startswith("50.0 Hz wall (gap 20.0 to 20.0 ms), 50.0 Hz simulated")
@@ -95,7 +95,7 @@ def test_a_key_that_fell_silent_is_told():
 
 
 def test_a_key_that_speaks_seldom_is_not_called_silent():
-    rate = inspection.Rate(10)
+    rate = inspection.MessageRate(10)
     for wall_s in (0.0, 3.0, 6.0):
         rate.add(wall_s, None)
     assert rate.line(11.0).startswith("0.3 Hz wall")

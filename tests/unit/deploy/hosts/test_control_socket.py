@@ -8,7 +8,7 @@ import pytest
 
 from zsim.errors import HostsError, RunError
 from zsim_deploy.hosts import control_socket
-from zsim_deploy.hosts.control_socket import Intercom
+from zsim_deploy.hosts.control_socket import ControlSocket
 
 
 @pytest.fixture(autouse=True)
@@ -29,7 +29,7 @@ def line():
         raise TimeoutError
 
     acts = {"add": lambda a, b: a + b, "refuse": refuse, "lack": lack, "hang": hang, "fail": lambda: [].index(1)}
-    found = Intercom("zsim", acts)
+    found = ControlSocket("zsim", acts)
     yield found
     found.close()
 
@@ -68,7 +68,7 @@ def test_garbage_is_answered_and_the_next_one_served():
 @pytest.mark.usefixtures("line")
 def test_a_federation_is_up_only_once():
     with pytest.raises(RunError, match=r"is up already .*`zsim down --federation zsim`.* --set federation=NAME$"):
-        Intercom("zsim", {})
+        ControlSocket("zsim", {})
 
 
 def test_nobody_is_up():
@@ -81,7 +81,7 @@ def test_the_socket_of_a_killed_launcher_is_no_hindrance():
     place.parent.mkdir(mode=0o700)
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(place))
-    found = Intercom("zsim", {"add": lambda a, b: a + b})
+    found = ControlSocket("zsim", {"add": lambda a, b: a + b})
     assert control_socket.ask("zsim", "add", a=1, b=2) == 3
     found.close()
     assert not place.exists()
@@ -108,14 +108,14 @@ def test_a_folder_in_which_others_may_write_or_read_is_refused(mode):
     folder.mkdir()
     folder.chmod(mode)
     with pytest.raises(RunError, match=f"is not a folder that is yours alone .* mode {mode:o}"):
-        Intercom("zsim", {})
+        ControlSocket("zsim", {})
 
 
 def test_a_link_to_somewhere_else_is_refused(tmp_path):
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     control_socket.place("zsim").parent.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(RunError, match="is not a folder that is yours alone"):
-        Intercom("zsim", {})
+        ControlSocket("zsim", {})
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
@@ -124,7 +124,7 @@ def test_a_folder_of_another_user_is_refused():
     folder.mkdir(mode=0o700)
     os.chown(folder, 12345, 12345)
     with pytest.raises(RunError, match="owner 12345"):
-        Intercom("zsim", {})
+        ControlSocket("zsim", {})
 
 
 def test_a_path_that_is_too_long_is_a_line(tmp_path, monkeypatch):
@@ -132,7 +132,7 @@ def test_a_path_that_is_too_long_is_a_line(tmp_path, monkeypatch):
     long.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(long))
     with pytest.raises(RunError, match="longer than 107 bytes; set XDG_RUNTIME_DIR or TMPDIR"):
-        Intercom("zsim", {})
+        ControlSocket("zsim", {})
     with pytest.raises(RunError, match="no `zsim up` of federation"):
         control_socket.ask("zsim", "ps")
 

@@ -18,11 +18,11 @@ import pytest
 from zsim import __version__
 from zsim.errors import HostsError
 from zsim_deploy.hosts import doctor, probe
-from zsim_deploy.hosts.check_up import CheckUp, check_up
-from zsim_deploy.hosts.doctor import NetworkPath, Report, compared, path_faults
-from zsim_deploy.inventory.inventory import Host, Inventory, Placed
+from zsim_deploy.hosts.doctor import NetworkPath, HostReport, compare_reports, path_faults
+from zsim_deploy.hosts.host_check import CheckResult, check_hosts
+from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
 from zsim_deploy.security import certificates
-from zsim_deploy.security.enrolment import Wanted
+from zsim_deploy.security.enrolment import CertificateRequest
 from zsim_deploy.ssh.host_link import HostLink
 
 SOUND = {
@@ -37,12 +37,12 @@ SOUND = {
 }
 
 
-def report(offset_s: float = 0.0, **changes) -> Report:
-    return Report({**SOUND, **changes}, round_trip_s=0.01, clock_offset_s=offset_s)
+def report(offset_s: float = 0.0, **changes) -> HostReport:
+    return HostReport({**SOUND, **changes}, round_trip_s=0.01, clock_offset_s=offset_s)
 
 
 def test_sound_hosts_raise_nothing():
-    assert compared({"h1": report(), "h2": report()}) == ([], [])
+    assert compare_reports({"h1": report(), "h2": report()}) == ([], [])
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_sound_hosts_raise_nothing():
     ],
 )
 def test_another_version_or_a_folder_that_cannot_be_used_is_a_fault(changes, says):
-    faults, _ = compared({"h1": report(**changes), "h2": report()})
+    faults, _ = compare_reports({"h1": report(**changes), "h2": report()})
     assert [line.startswith(says) for line in faults] == [True]
 
 
@@ -75,7 +75,7 @@ def test_another_version_or_a_folder_that_cannot_be_used_is_a_fault(changes, say
     ],
 )
 def test_what_slows_or_differs_is_a_warning(found, says):
-    faults, warnings = compared({"h1": found, "h2": report()})
+    faults, warnings = compare_reports({"h1": found, "h2": report()})
     assert faults == []
     assert [line.startswith(says) for line in warnings] == [True]
 
@@ -108,14 +108,14 @@ def test_a_path_that_is_not_there_is_a_fault_and_a_slow_one_a_warning():
     ],
 )
 def test_a_port_on_which_nothing_can_listen_is_not_called_unreachable(found, line):
-    (path,) = asyncio.run(doctor.reached([Silent()], Silent(json.dumps(found) + "\n"), {"h1": "python"}, 7447))
+    (path,) = asyncio.run(doctor.network_paths([Silent()], Silent(json.dumps(found) + "\n"), {"h1": "python"}, 7447))
     assert path_faults([path]) == ([line], [])
 
 
-def checked_up(folder: pathlib.Path) -> CheckUp:
+def checked_up(folder: pathlib.Path) -> CheckResult:
     """Check up a host that does not answer, of an inventory in a folder."""
     host = Host(address="127.0.0.1", port=1, user="nobody")  # tcpmux; nobody has it
-    return check_up(Placed(Inventory(hosts={"h1": host}, roles={"world": "h1"}), folder, "lab.yaml"), None)
+    return check_hosts(InventoryFile(Inventory(hosts={"h1": host}, roles={"world": "h1"}), folder, "lab.yaml"), None)
 
 
 def test_certificates_that_are_missing_or_expired_are_faults_and_open_keys_a_warning(tmp_path):
@@ -125,7 +125,7 @@ def test_certificates_that_are_missing_or_expired_are_faults_and_open_keys_a_war
     )
     then = datetime.now(UTC) - timedelta(days=60)
     signer = certificates.authority(tmp_path / "certs", then)
-    place = certificates.issue(tmp_path / "certs", signer, Wanted("h1", "world", ("127.0.0.1",)), then)
+    place = certificates.issue(tmp_path / "certs", signer, CertificateRequest("h1", "world", ("127.0.0.1",)), then)
     (place.parent / "world.access.json").touch()
     (place / "key.pem").chmod(0o644)
     found = checked_up(tmp_path)
@@ -184,15 +184,15 @@ class Text:
 def test_a_greeting_of_the_login_shell_is_passed_over():
     clocks = [json.dumps({"time_ns": 10**18})] * doctor.OFFSET_ASKS
     said = "\n".join(["Welcome to lab", "17", json.dumps(SOUND), *clocks, ""])
-    assert asyncio.run(doctor.about(Silent(said), "python")).said == SOUND
+    assert asyncio.run(doctor.host_report(Silent(said), "python")).said == SOUND
 
 
 def test_a_host_that_says_nothing_is_a_line(monkeypatch):
     monkeypatch.setattr(doctor, "ABOUT_S", 0.01)
     monkeypatch.setattr(doctor, "READY_S", 0.01)
     with pytest.raises(HostsError, match=r"^h1: no answer within 0\.01 s; "):
-        asyncio.run(doctor.about(Silent(), "python"))
-    (path,) = asyncio.run(doctor.reached([Silent()], Silent(), {"h1": "python"}, 7447))
+        asyncio.run(doctor.host_report(Silent(), "python"))
+    (path,) = asyncio.run(doctor.network_paths([Silent()], Silent(), {"h1": "python"}, 7447))
     assert path.found["error"].startswith("h1: no answer within 0.01 s; ")
 
 
@@ -230,7 +230,7 @@ OR_PUSH = f"leave hosts.h1.python out and {PUSH}"
 )
 def test_a_host_without_zsim_is_told_from_one_with_another_fault(python, code, error, line):
     with pytest.raises(HostsError) as caught:
-        asyncio.run(doctor.about(Silent("Welcome to lab\n", error, code, python), "PYTHON", "lab.yaml"))
+        asyncio.run(doctor.host_report(Silent("Welcome to lab\n", error, code, python), "PYTHON", "lab.yaml"))
     assert str(caught.value) == f"h1: {line}"
 
 

@@ -12,8 +12,8 @@ from rich.console import Console
 from zsim.errors import HostsError
 from zsim.scenario import scenario_file
 from zsim_deploy.hosts import host_run as module
-from zsim_deploy.hosts.host_run import Options, Up
-from zsim_deploy.hosts.status_table import Board
+from zsim_deploy.hosts.host_run import HostRunOptions, HostRun
+from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory import inventory
 from zsim_deploy.launch.supervisor import Outcome
 
@@ -26,7 +26,7 @@ HOSTS = {
 AT = r"h1:~/\.zsim/runs/abc/run\.mcap \(fetch it with `scp pi@10\.0\.0\.1:\.zsim/runs/abc/run\.mcap \.`\)"
 
 
-class Said(Board):
+class Said(StatusTable):
     """A board without a terminal."""
 
     def __init__(self) -> None:
@@ -48,8 +48,8 @@ def up(board: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     scenario, hosts = tmp_path / "one.yaml", tmp_path / "hosts.yaml"
     scenario.write_text(SCENARIO)
     hosts.write_text(yaml.safe_dump(HOSTS))
-    options = Options(scenario_file.load(scenario), inventory.load(hosts), tmp_path / "out", run_id="abc")
-    found = Up(options, board)
+    options = HostRunOptions(scenario_file.load(scenario), inventory.load(hosts), tmp_path / "out", run_id="abc")
+    found = HostRun(options, board)
     monkeypatch.setattr(found._links, "listen", lambda: None)
     yield found
     found._loop.close()

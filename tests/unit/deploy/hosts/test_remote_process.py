@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy.hosts.remote_process import LOST, Log, Remote
-from zsim_deploy.ssh.host_link import Loop
+from zsim_deploy.hosts.remote_process import LOST, ProcessLog, RemoteProcess
+from zsim_deploy.ssh.host_link import EventLoopThread
 
 FILES = {"identity/estimator.d1/key.pem": b"secret"}
 PATIENCE_S = 20.0  # after which a test that waits for ever fails
@@ -84,16 +84,16 @@ class Absent(Link):
         yield self
 
 
-Start = Callable[..., Remote]
+Start = Callable[..., RemoteProcess]
 
 
 @pytest.fixture
 def started(tmp_path: Path) -> Iterator[Start]:
-    loop = Loop()
+    loop = EventLoopThread()
 
-    def start(link: Any, on_line: Any = None, log: Log | None = None) -> Remote:
-        log = log or Log(tmp_path / "estimator.d1.log", lambda text: None)
-        remote = Remote("estimator.d1", ["estimator"], link, "python3", loop, log, on_line, "/z/runs/1", FILES)
+    def start(link: Any, on_line: Any = None, log: ProcessLog | None = None) -> RemoteProcess:
+        log = log or ProcessLog(tmp_path / "estimator.d1.log", lambda text: None)
+        remote = RemoteProcess("estimator.d1", ["estimator"], link, "python3", loop, log, on_line, "/z/runs/1", FILES)
         remote.start()
         return remote
 
@@ -129,7 +129,7 @@ def test_a_link_that_breaks_is_said(started: Start) -> None:
 
 def test_a_log_that_cannot_be_written_is_said_once_and_the_process_goes_on(started: Start, tmp_path: Path) -> None:
     said: list[str] = []
-    log = Log(tmp_path / "gone" / "estimator.d1.log", said.append)
+    log = ProcessLog(tmp_path / "gone" / "estimator.d1.log", said.append)
     remote = started(Link(Process("zsim-pid 77\n", complains=("one\n", "two\n"))), log=log)
     assert remote.wait(PATIENCE_S)
     assert (remote.code, remote.last_words()) == (0, "two")

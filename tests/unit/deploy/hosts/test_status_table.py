@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from zsim_deploy.hosts.status_table import Board, table
+from zsim_deploy.hosts.status_table import StatusTable, table
 
 
 class Link:
@@ -21,7 +21,7 @@ class Link:
 
 @pytest.fixture
 def board():
-    made = Board(10.0, Console(file=io.StringIO(), width=200))
+    made = StatusTable(10.0, Console(file=io.StringIO(), width=200))
     member: Any = SimpleNamespace(
         name="estimator.d1", host="h1", pid=7, state="running", code=None, restarts=1, outcome=lambda: "exit code 2"
     )
@@ -29,7 +29,7 @@ def board():
     return made
 
 
-def said(board: Board) -> str:
+def said(board: StatusTable) -> str:
     return board.console.file.getvalue()  # type: ignore[attr-defined]
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from zsim import __version__
 from zsim_deploy.launch import role_launcher as nursery_module
-from zsim_deploy.launch.role_launcher import Forked, Nursery, Process
+from zsim_deploy.launch.role_launcher import ForkedProcess, RoleLauncher, RoleProcess
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="roles are forked on Linux alone")
 WAITING = ["record", "--connect", "tcp/127.0.0.1:1", "--launched", "0", "--wait", "100"]  # for a world that never comes
@@ -26,8 +26,8 @@ def quiet(_: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def nursery() -> Iterator[Nursery]:
-    with Nursery(quiet, "a run") as made:
+def nursery() -> Iterator[RoleLauncher]:
+    with RoleLauncher(quiet, "a run") as made:
         yield made
 
 
@@ -36,7 +36,7 @@ def log(tmp_path: Path) -> Path:
     return tmp_path / "role.log"
 
 
-def start(nursery: Nursery, log: Path, *arguments: str, listened: bool = False) -> Process:
+def start(nursery: RoleLauncher, log: Path, *arguments: str, listened: bool = False) -> RoleProcess:
     with log.open("a") as file:
         return nursery.start([*arguments], file, listened)
 
@@ -48,7 +48,7 @@ def await_words(log: Path) -> None:
         time.sleep(LOOK_S)
 
 
-def end(*roles: Process) -> None:
+def end(*roles: RoleProcess) -> None:
     for role in roles:
         role.kill()
         role.wait(END_S)
@@ -57,7 +57,7 @@ def end(*roles: Process) -> None:
                 pipe.close()
 
 
-def test_what_a_role_prints_and_its_exit_code_come_back(nursery: Nursery, log: Path) -> None:
+def test_what_a_role_prints_and_its_exit_code_come_back(nursery: RoleLauncher, log: Path) -> None:
     role = start(nursery, log, "--version", listened=True)
     assert role.stdout is not None
     assert role.stdout.read() == f"zsim {__version__}\n"
@@ -66,14 +66,14 @@ def test_what_a_role_prints_and_its_exit_code_come_back(nursery: Nursery, log: P
     end(role)
 
 
-def test_what_is_wrong_is_in_its_log(nursery: Nursery, log: Path) -> None:
+def test_what_is_wrong_is_in_its_log(nursery: RoleLauncher, log: Path) -> None:
     role = start(nursery, log, "estimator")
     assert role.wait(END_S) == 2
     assert "missing argument" in log.read_text()
     end(role)
 
 
-def test_without_a_reader_what_it_prints_goes_to_the_log(nursery: Nursery, log: Path) -> None:
+def test_without_a_reader_what_it_prints_goes_to_the_log(nursery: RoleLauncher, log: Path) -> None:
     role = start(nursery, log, "--version")
     role.wait(END_S)
     assert role.stdout is None
@@ -81,7 +81,7 @@ def test_without_a_reader_what_it_prints_goes_to_the_log(nursery: Nursery, log: 
     end(role)
 
 
-def test_a_role_that_is_killed_says_so_by_its_code(nursery: Nursery, log: Path) -> None:
+def test_a_role_that_is_killed_says_so_by_its_code(nursery: RoleLauncher, log: Path) -> None:
     role = start(nursery, log, *WAITING)
     assert role.poll() is None
     with pytest.raises(subprocess.TimeoutExpired):
@@ -92,7 +92,7 @@ def test_a_role_that_is_killed_says_so_by_its_code(nursery: Nursery, log: Path) 
     end(role)
 
 
-def test_it_is_a_child_of_its_own_session_under_its_own_name(nursery: Nursery, log: Path) -> None:
+def test_it_is_a_child_of_its_own_session_under_its_own_name(nursery: RoleLauncher, log: Path) -> None:
     role = start(nursery, log, *WAITING)
     await_words(log)
     seen = psutil.Process(role.pid)
@@ -101,7 +101,7 @@ def test_it_is_a_child_of_its_own_session_under_its_own_name(nursery: Nursery, l
     end(role)
 
 
-def test_no_role_holds_the_pipes_of_another(nursery: Nursery, log: Path) -> None:
+def test_no_role_holds_the_pipes_of_another(nursery: RoleLauncher, log: Path) -> None:
     first, second = (start(nursery, log, *WAITING, listened=True) for _ in range(2))
     assert first.stdin is not None
     assert first.stdout is not None
@@ -112,7 +112,7 @@ def test_no_role_holds_the_pipes_of_another(nursery: Nursery, log: Path) -> None
     end(first, second)
 
 
-def test_it_heeds_what_it_is_told(nursery: Nursery, log: Path) -> None:
+def test_it_heeds_what_it_is_told(nursery: RoleLauncher, log: Path) -> None:
     role = start(nursery, log, *WAITING)
     await_words(log)
     assert role.stdin is not None
@@ -125,7 +125,7 @@ def test_it_heeds_what_it_is_told(nursery: Nursery, log: Path) -> None:
 
 def test_where_its_cradle_fails_a_role_is_started_as_a_program(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(nursery_module, "CRADLE", (sys.executable, "-c", "pass"))
-    with Nursery(quiet) as nursery:
+    with RoleLauncher(quiet) as nursery:
         roles = [start(nursery, log, "--version") for _ in range(2)]
         assert all(isinstance(role, subprocess.Popen) for role in roles)
         assert [role.wait(END_S) for role in roles] == [0, 0]
@@ -137,19 +137,19 @@ def test_where_its_cradle_fails_a_role_is_started_as_a_program(log: Path, monkey
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_cradle_that_dies_or_stands_is_done_without(number: int, log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(nursery_module, "ANSWER_S", 0.2)
-    with Nursery(quiet) as nursery:
-        assert nursery._cradle is not None
-        os.kill(nursery._cradle.pid, number)
+    with RoleLauncher(quiet) as nursery:
+        assert nursery._forkserver is not None
+        os.kill(nursery._forkserver.pid, number)
         role = start(nursery, log, "--version", listened=True)
         assert isinstance(role, subprocess.Popen)
         assert role.wait(END_S) == 0
-        assert nursery._cradle.poll() is not None
+        assert nursery._forkserver.poll() is not None
         end(role)
 
 
 @LINUX
 def test_a_role_of_which_the_launcher_does_not_know_never_begins(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with Nursery(quiet) as nursery:
+    with RoleLauncher(quiet) as nursery:
         monkeypatch.setattr(nursery, "_heard", lambda: b"")
         role = start(nursery, log, "--version")
         assert role.wait(END_S) == 0
@@ -159,22 +159,22 @@ def test_a_role_of_which_the_launcher_does_not_know_never_begins(log: Path, monk
 
 @LINUX
 def test_a_command_that_is_too_long_for_a_packet_is_no_matter(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with Nursery(quiet) as nursery:
+    with RoleLauncher(quiet) as nursery:
         monkeypatch.setattr(nursery_module, "PACKET_MAX", 5)
         role = start(nursery, log, "--version")
         monkeypatch.undo()
         again = start(nursery, log, "--version")
-        assert [isinstance(each, Forked) for each in (role, again)] == [False, True]
+        assert [isinstance(each, ForkedProcess) for each in (role, again)] == [False, True]
         assert [each.wait(END_S) for each in (role, again)] == [0, 0]
         end(role, again)
 
 
 @LINUX
 def test_one_within_another_leaves_it_its_children(log: Path) -> None:
-    with Nursery(quiet) as outer:
-        with Nursery(quiet) as inner:
-            assert inner._cradle is not None
-        assert inner._cradle.poll() is not None
+    with RoleLauncher(quiet) as outer:
+        with RoleLauncher(quiet) as inner:
+            assert inner._forkserver is not None
+        assert inner._forkserver.poll() is not None
         role = start(outer, log, "estimator")
         assert role.wait(END_S) == 2
         end(role)
@@ -194,27 +194,27 @@ def test_a_cradle_ends_with_its_launcher() -> None:
 def test_what_takes_long_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setattr(nursery_module, "PATIENCE_S", 0.0)
-    with Nursery(said.append):
+    with RoleLauncher(said.append):
         assert said == [nursery_module.PATIENCE] or sys.platform != "linux"
 
 
 @LINUX
 def test_ctrl_c_while_it_loads_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(_: Nursery) -> bytes:
+    def interrupt(_: RoleLauncher) -> bytes:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Nursery, "_heard", interrupt)
-    nursery = Nursery(quiet)
+    monkeypatch.setattr(RoleLauncher, "_heard", interrupt)
+    nursery = RoleLauncher(quiet)
     with pytest.raises(KeyboardInterrupt), nursery:
         pass
-    assert nursery._cradle is not None
-    assert nursery._cradle.poll() is not None
+    assert nursery._forkserver is not None
+    assert nursery._forkserver.poll() is not None
 
 
 def test_an_exit_code_that_somebody_else_took_is_no_error() -> None:
     with subprocess.Popen([sys.executable, "-c", "pass"], stdin=subprocess.PIPE, text=True) as child:
         child.wait()
         assert child.stdin is not None
-        gone = Forked(child.pid, child.stdin, None)
+        gone = ForkedProcess(child.pid, child.stdin, None)
         assert gone.poll() == 0
         gone.kill()

@@ -9,8 +9,8 @@ from synthetic_record import SCENARIOS
 from zsim.errors import RunError, SessionError
 from zsim.scenario import scenario_file
 from zsim_deploy.launch import run
-from zsim_deploy.launch.role_launcher import Nursery
-from zsim_deploy.launch.run import Options
+from zsim_deploy.launch.role_launcher import RoleLauncher
+from zsim_deploy.launch.run import RunOptions
 from zsim_deploy.launch.supervisor import Outcome
 
 TAKEN = "the world died: exit code 2: cannot listen on tcp/127.0.0.1:{port} (Address already in use)"
@@ -41,10 +41,10 @@ class FakeWatch:
         return Outcome(reason, failed=reason != "ended")
 
 
-class NoNursery(Nursery):
+class NoNursery(RoleLauncher):
     """A nursery that starts nothing."""
 
-    def __enter__(self) -> Nursery:
+    def __enter__(self) -> RoleLauncher:
         return self
 
     def __exit__(self, *_: object) -> None: ...
@@ -59,9 +59,9 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> type[FakeWatch]:
     return FakeWatch
 
 
-def options(out: Path, *overrides: str, **others: Any) -> Options:
+def options(out: Path, *overrides: str, **others: Any) -> RunOptions:
     out.mkdir(exist_ok=True)
-    return Options(scenario_file.load(SCENARIOS / "step.yaml", overrides), out, **others)
+    return RunOptions(scenario_file.load(SCENARIOS / "step.yaml", overrides), out, **others)
 
 
 def test_a_port_taken_in_between_is_another_port(watched: type[FakeWatch], tmp_path: Path):

@@ -48,7 +48,7 @@ def test_a_diverged_run_in_one_process_has_failed_and_has_its_record(tmp_path: P
 
     monkeypatch.setattr(Fleet, "advance", diverge)
     monkeypatch.setattr(run, "Leash", NoLeash)
-    options = run.Options(scenario_file.from_text(SCENARIO), tmp_path)
+    options = run.RunOptions(scenario_file.from_text(SCENARIO), tmp_path)
     outcome = run.run_in_process(options, Screen(1.0, Console(file=io.StringIO())))
     assert outcome.failed
     assert outcome.reason.startswith("d1 at 0.120 s: the state is no longer finite")

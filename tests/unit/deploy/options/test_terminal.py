@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from zsim_deploy.options.terminal import Signals, interruptible
+from zsim_deploy.options.terminal import EndSignals, interruptible
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -84,7 +84,7 @@ def test_a_terminal_that_is_there_still_is_told_where_the_rest_is(tmp_path: Path
 def test_under_nohup_nothing_happens(tmp_path: Path) -> None:
     former = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with Signals(tmp_path / "up.log", lambda: pytest.fail("hung up")):
+        with EndSignals(tmp_path / "up.log", lambda: pytest.fail("hung up")):
             os.kill(os.getpid(), signal.SIGHUP)
             assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
@@ -93,6 +93,6 @@ def test_under_nohup_nothing_happens(tmp_path: Path) -> None:
 
 def test_sigterm_is_as_ctrl_c_wherever_it_comes(tmp_path: Path) -> None:
     former = signal.getsignal(signal.SIGTERM)
-    with Signals(tmp_path / "up.log", lambda: None), pytest.raises(KeyboardInterrupt):
+    with EndSignals(tmp_path / "up.log", lambda: None), pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) is former

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from zsim.transport.identity import Identity
-from zsim_deploy.roles.stop_channel import Lent, lent
+from zsim_deploy.roles.stop_channel import KeyLease, key_lease
 
 ROLE = """
 import os, sys, time
@@ -57,18 +57,18 @@ def test_a_process_that_is_told_to_stop_keeps_its_key_to_its_end(key: Path) -> N
 
 
 def test_a_key_that_was_brought_for_a_successor_stays(key: Path) -> None:
-    old = Lent(key.parent)
+    old = KeyLease(key.parent)
     key.unlink()
     key.write_text("another")
-    old.give_back()
+    old.release()
     assert key.read_text() == "another"
-    Lent(key.parent).give_back()
+    KeyLease(key.parent).release()
     assert not key.exists()
-    old.give_back()
+    old.release()
 
 
 def test_a_key_of_the_hosts_own_is_not_lent(key: Path) -> None:
     certs = Path("certs/h1/estimator.d1")
     for tls, launched in ((None, "run1"), (key.parent, None), (key.parent, "run2"), (certs, "run1")):
-        assert lent(Identity(tls=tls), launched) is None
-    assert lent(Identity(tls=key.parent), "run1") is not None
+        assert key_lease(Identity(tls=tls), launched) is None
+    assert key_lease(Identity(tls=key.parent), "run1") is not None

@@ -13,12 +13,12 @@ from typer.testing import CliRunner
 from zsim.errors import RunError
 from zsim.scenario import scenario_file
 from zsim_deploy.cli.cli import app
-from zsim_deploy.hosts.check_up import check_up
+from zsim_deploy.hosts.host_check import check_hosts
 from zsim_deploy.inventory import inventory
 from zsim_deploy.security import certificates
-from zsim_deploy.security.certificate_check import exposed, lacks
+from zsim_deploy.security.certificate_check import exposed_keys, certificate_faults
 from zsim_deploy.security.certificates import issue
-from zsim_deploy.security.enrolment import Wanted
+from zsim_deploy.security.enrolment import CertificateRequest
 
 SCENARIO = """
 name: pair
@@ -62,7 +62,7 @@ def lacking(folder: Path, now: datetime | None = None) -> list[str]:
     """Return what the scenario of a folder lacks, without the folder of the certificates that each line begins with."""
     placed = inventory.load(folder / "hosts.yaml")
     places = inventory.placement(placed, scenario_file.load(folder / "scenario.yaml"))
-    found = lacks(placed, places, now or datetime.now(UTC))
+    found = certificate_faults(placed, places, now or datetime.now(UTC))
     assert all(line.startswith(f"{folder / 'certs'}: ") and "\n" not in line for line in found)
     return [line.removeprefix(f"{folder / 'certs'}: ") for line in found]
 
@@ -149,7 +149,7 @@ def test_an_authority_that_is_none_is_a_line(folder: Path) -> None:
     init(folder)
     (folder / "certs/ca.pem").write_text("")
     placed = inventory.load(folder / "hosts.yaml")
-    (line,) = lacks(placed, None, datetime.now(UTC))
+    (line,) = certificate_faults(placed, None, datetime.now(UTC))
     assert line.startswith(f"{folder}/certs/ca.pem: is no certificate")
 
 
@@ -163,16 +163,16 @@ def test_the_doctor_tells_of_certificates_with_and_without_a_scenario(folder: Pa
     placed = inventory.load(folder / "hosts.yaml")
     places = inventory.placement(placed, scenario_file.load(folder / "scenario.yaml"))
     for given in (None, places):
-        assert any("has no certificates; make them with" in line for line in check_up(placed, given).faults)
+        assert any("has no certificates; make them with" in line for line in check_hosts(placed, given).faults)
     init(folder)
     (folder / "certs/h1/world/key.pem").chmod(0o644)
     for given in (None, places):
-        found = check_up(placed, given)
+        found = check_hosts(placed, given)
         assert [line for line in found.faults if "certificate" in line] == []
         assert any("can be read by others" in line for line in found.warnings)
     shutil.rmtree(folder / "certs/h1/world")
     for given in (None, places):
-        assert any("certificate missing: world on h1" in line for line in check_up(placed, given).faults)
+        assert any("certificate missing: world on h1" in line for line in check_hosts(placed, given).faults)
 
 
 # The commands
@@ -201,7 +201,7 @@ def test_show_advises_a_command_that_mends(folder: Path) -> None:
     signer = certificates.authority(folder / "certs", now)
     assert run("show", folder / "hosts.yaml").stderr == ""
     for days, state in ((-0.5, "expired on "), (1.0, "ends soon")):
-        issue(folder / "certs", signer, Wanted("h1", "world", ("127.0.0.1",)), now, days)
+        issue(folder / "certs", signer, CertificateRequest("h1", "world", ("127.0.0.1",)), now, days)
         shown = run("show", folder / "hosts.yaml")
         (row,) = [line for line in shown.stdout.splitlines() if state in line]
         assert "world" in row
@@ -214,14 +214,14 @@ def test_show_advises_a_command_that_mends(folder: Path) -> None:
 def test_private_keys_that_others_can_read_are_warned_of_in_a_line(folder: Path, mode: int) -> None:
     assert init(folder).stderr == ""
     placed = inventory.load(folder / "hosts.yaml")
-    assert exposed(placed) is None
+    assert exposed_keys(placed) is None
     for path in ("ca.key", "h1/world/key.pem", "h2/router.field/key.pem"):
         (folder / "certs" / path).chmod(mode)
     (folder / "certs/ca.pem").chmod(0o644)
-    assert exposed(placed) == (
+    assert exposed_keys(placed) == (
         f"{folder}/certs/ca.key and 2 private keys more can be read by others on this machine; "
         f"chmod -R go= '{folder}/certs'"
     )
     for done in (init(folder), run("show", folder / "hosts.yaml")):
         assert done.exit_code == 0
-        assert done.stderr == f"warning: {exposed(placed)}\n"
+        assert done.stderr == f"warning: {exposed_keys(placed)}\n"

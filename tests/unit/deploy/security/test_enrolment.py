@@ -16,7 +16,7 @@ from zsim.errors import BadNameError, InventoryError, RunError
 from zsim.scenario import rights, scenario_file
 from zsim_deploy.cli.cli import app
 from zsim_deploy.inventory import inventory
-from zsim_deploy.security.enrolment import Enrolment, Wanted, access_control
+from zsim_deploy.security.enrolment import Enrolment, CertificateRequest, access_control
 
 SCENARIO = """
 name: enrolled
@@ -56,18 +56,18 @@ def enrolment(folder: Path, *operators: str) -> Enrolment:
 
 def test_world_and_routers_have_one_certificate_and_who_may_move_has_one_for_every_host(folder: Path) -> None:
     wanted = enrolment(folder, "main", "anna@hut").certificates()
-    assert [each for each in wanted if each.process == "world"] == [Wanted("lab", "world", ("10.0.0.1",))]
-    assert [each for each in wanted if each.process == "router.hill"] == [Wanted("hut", "router.hill", ("hut.local",))]
+    assert [each for each in wanted if each.process == "world"] == [CertificateRequest("lab", "world", ("10.0.0.1",))]
+    assert [each for each in wanted if each.process == "router.hill"] == [CertificateRequest("hut", "router.hill", ("hut.local",))]
     for process in ("recorder", "estimator.drone1", "estimator.drone2", "controller.main"):
         assert [each for each in wanted if each.process == process] == [
-            Wanted("lab", process, ("10.0.0.1",)),
-            Wanted("onboard1", process, ("10.1.0.1",)),
-            Wanted("onboard2", process, ("10.1.0.2",)),
-            Wanted("hut", process, ("hut.local",)),
+            CertificateRequest("lab", process, ("10.0.0.1",)),
+            CertificateRequest("onboard1", process, ("10.1.0.1",)),
+            CertificateRequest("onboard2", process, ("10.1.0.2",)),
+            CertificateRequest("hut", process, ("hut.local",)),
         ]
     assert [each for each in wanted if each.process.startswith("operator.")] == [
-        Wanted("operators", "operator.main"),
-        Wanted("hut", "operator.anna", ("hut.local",)),
+        CertificateRequest("operators", "operator.main"),
+        CertificateRequest("hut", "operator.anna", ("hut.local",)),
     ]
 
 

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from zsim_deploy.launch.role_launcher import Nursery, Process
+from zsim_deploy.launch.role_launcher import RoleLauncher, RoleProcess
 
 
-class Child:
+class ChildProcess:
     """A role as a child process.
 
     Args:
@@ -25,7 +25,7 @@ class Child:
         name: str,
         arguments: list[str],
         logs: Path,
-        nursery: Nursery,
+        nursery: RoleLauncher,
         on_line: Callable[[str], None] | None = None,
     ) -> None:
         self.name = name
@@ -37,7 +37,7 @@ class Child:
         self._nursery = nursery
         self._on_line = on_line
         self._reader: threading.Thread | None = None
-        self._process: Process | None = None
+        self._process: RoleProcess | None = None
 
     def start(self) -> None:
         """Start it, or start it again."""
@@ -49,7 +49,7 @@ class Child:
             self._reader.start()
 
     @staticmethod
-    def _read(process: Process, on_line: Callable[[str], None]) -> None:
+    def _read(process: RoleProcess, on_line: Callable[[str], None]) -> None:
         assert process.stdout is not None
         for line in process.stdout:
             on_line(line)

@@ -10,15 +10,15 @@ from typing import Any
 
 from zsim.errors import HostsError, RunError
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
-from zsim_deploy.hosts.doctor import about, compared
-from zsim_deploy.hosts.host_plan import Plan
-from zsim_deploy.hosts.remote_process import Remote
-from zsim_deploy.hosts.status_table import Board
+from zsim_deploy.hosts.doctor import host_report, compare_reports
+from zsim_deploy.hosts.host_plan import HostPlan
+from zsim_deploy.hosts.remote_process import RemoteProcess
+from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory.processes import MODULES, extras
-from zsim_deploy.launch.supervisor import Watch
-from zsim_deploy.ssh.connection import shell_word
-from zsim_deploy.ssh.host_link import HostLink, Loop
-from zsim_deploy.ssh.host_links import Links
+from zsim_deploy.launch.supervisor import Supervisor
+from zsim_deploy.ssh.host_link import HostLink, EventLoopThread
+from zsim_deploy.ssh.host_links import HostLinks
+from zsim_deploy.ssh.ssh_connection import shell_word
 
 JOIN_S = 60.0  # until a host that was not used so far is connected and has said that it fits
 IMPORT_S = 20.0  # until a Python has shown that it can run a role; a small computer takes 5 s
@@ -28,7 +28,7 @@ LOOK_S = 0.1  # between two looks whether it has
 ORDER_S = 5.0  # until the watch, which looks every 50 ms, carries out an order
 
 
-class Orders:
+class LauncherRequests:
     """Answers what is asked, each in a thread of the intercom's.
 
     Args:
@@ -43,13 +43,13 @@ class Orders:
 
     def __init__(
         self,
-        plan: Plan,
-        links: Links,
-        loop: Loop,
-        watch: Watch,
-        board: Board,
+        plan: HostPlan,
+        links: HostLinks,
+        loop: EventLoopThread,
+        watch: Supervisor,
+        board: StatusTable,
         out: Path,
-        remote: Callable[[Plan, str], Remote],
+        remote: Callable[[HostPlan, str], RemoteProcess],
     ) -> None:
         self._plan = plan
         self._links = links
@@ -60,7 +60,7 @@ class Orders:
         self._remote = remote
         self._one_at_a_time = threading.Lock()
 
-    def acts(self) -> dict[str, Callable[..., Any]]:
+    def handlers(self) -> dict[str, Callable[..., Any]]:
         """Return what can be asked, by name."""
         looks = {"ps": self._ps, "where": self._say_where}
         return {**looks, "down": self._down, "restart": self._restart, "move": self._move}
@@ -90,14 +90,14 @@ class Orders:
             raise RunError(f"host is {host!r}; must be one of {', '.join(self._plan.known_hosts())}")
         with self._one_at_a_time:
             plan = self._plan.moved(role, host)
-            if faults := plan.lacks(datetime.now(UTC)):
+            if faults := plan.certificate_faults(datetime.now(UTC)):
                 raise HostsError("\n".join(faults))
             link = self._links.by_name.get(host) or self._join(host)
             self._loop.call(_refuse_unless_able(link, plan.python(host), role))
             self._bring(plan, role)
             return self._take_over(plan, role)
 
-    def _bring(self, plan: Plan, role: str) -> None:
+    def _bring(self, plan: HostPlan, role: str) -> None:
         """Put the certificate of a process on its host."""
         link = self._links.by_name[plan.host(role)]
         if files := plan.identity(role):
@@ -113,8 +113,8 @@ class Orders:
         """Return a link to a host that was not used so far, if it fits."""
         link = self._links.to(host)
         try:
-            report = self._loop.call(about(link, self._plan.python(host)), JOIN_S)
-            faults, warnings = compared({host: report})
+            report = self._loop.call(host_report(link, self._plan.python(host)), JOIN_S)
+            faults, warnings = compare_reports({host: report})
             if faults:
                 raise HostsError("\n".join(faults))
         except BaseException:
@@ -126,10 +126,10 @@ class Orders:
         self._board.links = self._links.by_name
         return link
 
-    def _take_over(self, plan: Plan, role: str) -> str:
+    def _take_over(self, plan: HostPlan, role: str) -> str:
         """Start a process that takes over the name of another, which leaves by itself, or is killed if it hangs."""
         until_s = time.monotonic() + LEAVE_S
-        while self._watch.is_taken_over(role) and time.monotonic() < until_s:
+        while self._watch.is_being_replaced(role) and time.monotonic() < until_s:
             time.sleep(LOOK_S)
         new = self._remote(plan, role)
 
@@ -137,7 +137,7 @@ class Orders:
             self._watch.replace(new)
             self._plan = plan
 
-        carried_out = self._watch.order(take)
+        carried_out = self._watch.submit(take)
         wait([carried_out], ORDER_S)
         carried_out.cancel()  # changes nothing where it is being carried out
         try:

@@ -10,14 +10,14 @@ from rich.text import Text
 
 from zsim.errors import ZsimError
 from zsim_deploy.hosts import doctor
-from zsim_deploy.hosts.leftover_runs import earlier
+from zsim_deploy.hosts.leftover_runs import leftovers
 from zsim_deploy.inventory import inventory as inv
-from zsim_deploy.inventory.inventory import Placed
+from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.security import certificate_check
 from zsim_deploy.ssh.host_link import HostLink
 
 
-class CheckUp(NamedTuple):
+class CheckResult(NamedTuple):
     """What was found."""
 
     tables: list[Table]
@@ -25,55 +25,55 @@ class CheckUp(NamedTuple):
     warnings: list[str]
 
 
-def check_up(placed: Placed, places: dict[str, str] | None) -> CheckUp:
+def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
     """Check certificates and hosts; with a placement also the paths to where the world and the routers listen."""
     found = asyncio.run(_check_up(placed, places))
-    lacks = certificate_check.lacks(placed, places, datetime.now(UTC))
-    warning = certificate_check.exposed(placed)
+    lacks = certificate_check.certificate_faults(placed, places, datetime.now(UTC))
+    warning = certificate_check.exposed_keys(placed)
     return found._replace(faults=[*lacks, *found.faults], warnings=[*found.warnings, *([warning] if warning else [])])
 
 
-async def _check_up(placed: Placed, places: dict[str, str] | None) -> CheckUp:
+async def _check_up(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
     links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
     pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
     hosts = shlex.quote(str(placed.folder / placed.source))
     try:
         asked = await asyncio.gather(
-            *(doctor.about(link, pythons[name], hosts) for name, link in links.items()), return_exceptions=True
+            *(doctor.host_report(link, pythons[name], hosts) for name, link in links.items()), return_exceptions=True
         )
-        reports: dict[str, doctor.Report] = {}
+        reports: dict[str, doctor.HostReport] = {}
         faults: list[str] = []
         for name, result in zip(links, asked, strict=True):
-            if isinstance(result, doctor.Report):
+            if isinstance(result, doctor.HostReport):
                 reports[name] = result
             elif isinstance(result, ZsimError):
                 faults.append(str(result))
             else:
                 raise result
-        wrong, warnings = doctor.compared(reports)
+        wrong, warnings = doctor.compare_reports(reports)
         paths = await _paths(placed, places, links, pythons, set(reports)) if places else []
         cut, slow = doctor.path_faults(paths)
-        left = await asyncio.gather(*(earlier(links[name], placed.folder) for name in reports))
+        left = await asyncio.gather(*(leftovers(links[name], placed.folder) for name in reports))
         tables = [_hosts_table(reports), *([_paths_table(paths)] if paths else [])]
-        return CheckUp(tables, [*faults, *wrong, *cut], [*warnings, *slow, *(line for lines in left for line in lines)])
+        return CheckResult(tables, [*faults, *wrong, *cut], [*warnings, *slow, *(line for lines in left for line in lines)])
     finally:
         for link in links.values():
             await link.close()
 
 
 async def _paths(
-    placed: Placed, places: dict[str, str], links: dict[str, HostLink], pythons: dict[str, str], there: set[str]
+    placed: InventoryFile, places: dict[str, str], links: dict[str, HostLink], pythons: dict[str, str], there: set[str]
 ) -> list[doctor.NetworkPath]:
     """Return how the hosts reach what their roles and routers connect to, one path after the other."""
     found: list[doctor.NetworkPath] = []
     for (target, port), sources in inv.connections(placed, places).items():
         if target in there:
             chosen = [links[name] for name in sorted(sources & there)]
-            found += await doctor.reached(chosen, links[target], pythons, port)
+            found += await doctor.network_paths(chosen, links[target], pythons, port)
     return found
 
 
-def _hosts_table(reports: dict[str, doctor.Report]) -> Table:
+def _hosts_table(reports: dict[str, doctor.HostReport]) -> Table:
     shown = Table("host", "python", "zsim", "round trip", "clock", "load", "cores", "governor", "fingerprint", box=None)
     for name, report in reports.items():
         said = report.said

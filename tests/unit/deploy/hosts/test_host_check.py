@@ -5,8 +5,8 @@ import io
 import pytest
 from rich.console import Console
 
-from zsim_deploy.hosts.check_up import _hosts_table, _paths_table
-from zsim_deploy.hosts.doctor import NetworkPath, Report
+from zsim_deploy.hosts.doctor import NetworkPath, HostReport
+from zsim_deploy.hosts.host_check import _hosts_table, _paths_table
 
 SAID = {"python": "3.11.2", "zsim": "1", "fingerprint": "abc", "cores": 2, "load": 0.1, "governors": ["[/x]"]}
 
@@ -15,7 +15,7 @@ SAID = {"python": "3.11.2", "zsim": "1", "fingerprint": "abc", "cores": 2, "load
     ("table", "shows"),
     [
         (_paths_table([NetworkPath("h2", "h1", 7447, {"error": "cannot open [/tmp/x]"})]), "cannot open [/tmp/x]"),
-        (_hosts_table({"h1": Report(SAID, 0.001, 0.0)}), "[/x]"),
+        (_hosts_table({"h1": HostReport(SAID, 0.001, 0.0)}), "[/x]"),
     ],
 )
 def test_brackets_are_no_markup(table, shows):
