@@ -258,7 +258,7 @@ class Federation:
                 line = (entry / "cmdline").read_bytes()
             except OSError:
                 continue  # it has just ended
-            if b"zsim_deploy." in line and any(mark in line for mark in marks):  # a role, or the cradle of some
+            if b"zsim_deploy." in line and any(mark in line for mark in marks):  # a role, or the fork server of some
                 yield int(entry.name), line.decode(errors="replace").rstrip("\0").split("\0")
 
     def __enter__(self) -> "Federation":

@@ -20,8 +20,8 @@ from zsim import __version__
 from zsim_deploy.inventory import inventory, processes
 from zsim_deploy.push import on_host
 from zsim_deploy.push.installer import open_installer
-from zsim_deploy.push.package_index import choose_interpreter, parse_interpreters, interpreter_query, wheel_target
-from zsim_deploy.push.wheelhouse import WheelSet, Wheelhouse
+from zsim_deploy.push.package_index import choose_interpreter, interpreter_query, parse_interpreters, wheel_target
+from zsim_deploy.push.wheelhouse import Wheelhouse, WheelSet
 from zsim_deploy.ssh.host_link import HostLink
 from zsim_deploy.ssh.ssh_connection import shell_line
 

@@ -22,7 +22,7 @@ def start(arguments: list[str], root: str, environment: dict[str, str]) -> tuple
         return None
     read, write = os.pipe()
     with os.fdopen(write, "w") as log:
-        process = _nursery(tuple(environment.items())).start(arguments, log, listened=False)
+        process = _launcher(tuple(environment.items())).start(arguments, log, listened=False)
     assert process.stdin is not None
     process.stdin.close()
     return process, os.fdopen(read)
@@ -38,7 +38,7 @@ FIRST = _inherited()
 
 
 @cache
-def _nursery(environment: tuple[tuple[str, str], ...]) -> RoleLauncher:
+def _launcher(environment: tuple[tuple[str, str], ...]) -> RoleLauncher:
     former = dict(os.environ)
     os.environ.update(environment)
     try:

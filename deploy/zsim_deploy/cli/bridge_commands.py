@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsim_deploy.options.arguments import CONSOLE_PORT, LOOK_S, WorldAccess, positive, participant_options
+from zsim_deploy.options.arguments import CONSOLE_PORT, LOOK_S, WorldAccess, participant_options, positive
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -54,11 +54,11 @@ def console(
     from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
 
     give_way(for_eyes=True)
-    mine = process_name("console", name, reach.tls, "*")
-    say = Teller().say if reach.launched else log_printer(False)
-    shown = Console(Place(listen, port), mine.removesuffix(".*"), token, rate_hz, say)
+    own_name = process_name("console", name, reach.tls, "*")
+    say = Teller().say if reach.launched else log_printer(None)
+    shown = Console(Place(listen, port), own_name.removesuffix(".*"), token, rate_hz, say)
     with shown.open():
-        serve_runs(mine, shown.serve, reach)
+        serve_runs(own_name, shown.serve, reach)
 
 
 def check_console_installed() -> None:
@@ -96,15 +96,15 @@ def gateway(
 
     give_way()
     who = reach.who
-    mine = process_name("gateway", name, reach.tls)
+    own_name = process_name("gateway", name, reach.tls)
 
     def dial(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
         return find_world(reach.endpoint, reach.federation, LOOK_S, identity=_of_seat(who, process))
 
     doors = Doors(listen, http, lines)
-    gate = Gateway(doors, mine, token, dial, log_printer(reach.launched is not None), secured=reach.tls is not None)
+    gate = Gateway(doors, own_name, token, dial, log_printer(reach.launched), secured=reach.tls is not None)
     with gate.open():
-        serve_runs(mine, gate.serve, reach)
+        serve_runs(own_name, gate.serve, reach)
 
 
 def _of_seat(who: "Identity", process: str) -> "Identity":
@@ -141,10 +141,10 @@ def ros1(
     from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
 
     give_way()
-    mine = process_name("ros1", name, reach.tls)
+    own_name = process_name("ros1", name, reach.tls)
     bridge = partial(serve, master_uri=master, host=ros_host or reachable_as(master))
     try:
-        serve_runs(mine, bridge, reach)
+        serve_runs(own_name, bridge, reach)
     except DismissedError as error:
         print(error)
 
@@ -178,8 +178,8 @@ def ros2(
     who = reach.who
     to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
     door = Door(domain, router, to_router)
-    mine = process_name("ros2", name, reach.tls)
-    serve_runs(mine, partial(serve, door=door, wall_ns=time.time_ns), reach)
+    own_name = process_name("ros2", name, reach.tls)
+    serve_runs(own_name, partial(serve, door=door, wall_ns=time.time_ns), reach)
 
 
 def _write_package(folder: Path) -> None:

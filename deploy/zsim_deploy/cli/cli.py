@@ -98,14 +98,14 @@ def run(
 
 def _refuse_with_others(realtime: bool, rate: float | None, listen: str | None, hosted: bool, console: bool) -> None:
     """Refuse what says nothing to a run in one process."""
-    given = {
+    options = {
         "--realtime": realtime,
         "--rate": rate is not None,
         "--listen": listen is not None,
         "--hosted": hosted,
         "--console": console,
     }
-    useless = " and ".join(name for name, is_given in given.items() if is_given)
+    useless = " and ".join(name for name, is_given in options.items() if is_given)
     if useless:
         raise typer.BadParameter(f"--in-process is lockstep, unpaced, without Zenoh; leave out {useless}, or it")
 
@@ -118,8 +118,8 @@ def validate(scenario: ScenarioPath, set_: Set = None) -> None:
     print(scenario_file.to_text(load_scenario(scenario, set_)), end="")
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _version(wanted: bool) -> None:
+    if wanted:
         print(f"zsim {__version__}")
         raise typer.Exit
 
@@ -179,12 +179,12 @@ def _say_anything() -> None:
 def _show_usage(error: Any) -> None:
     """Print what was wrong with a command line in one line; after a bare `zsim` the help has been printed."""
     if isinstance(error, typer.BadParameter) and error.param is None:
-        said = error.message
+        text = error.message
     else:
-        said = " ".join(error.format_message().split()).replace("Value error, ", "")  # newer typers ask pydantic
+        text = " ".join(error.format_message().split()).replace("Value error, ", "")  # newer typers ask pydantic
     command = error.ctx.command_path if error.ctx else "zsim"
-    if said:
-        print(f"{command}: {said[0].lower()}{said[1:].rstrip('.')}; see `{command} --help`", file=sys.stderr)
+    if text:
+        print(f"{command}: {text[0].lower()}{text[1:].rstrip('.')}; see `{command} --help`", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -133,10 +133,10 @@ def seconds(text: str | None) -> float | None:
     """Return the duration in a text such as 10s, 500ms or 2min."""
     if text is None:
         return None
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(ms|s|min|)", text.strip())
-    if not found:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(ms|s|min|)", text.strip())
+    if not match:
         raise typer.BadParameter(f"is {text!r}; must be a duration such as 10s, 500ms or 2min")
-    return float(found[1]) * UNITS[found[2]]
+    return float(match[1]) * UNITS[match[2]]
 
 
 def _duration(text: str | None) -> str | None:
@@ -200,8 +200,8 @@ def list_(
 
     with connected(reach) as (link, _):
         now_ns = max((messages.decode(keys.CLOCK, s.payload).t_ns for s in link.get(keys.CLOCK)), default=0)
-        told = [messages.decode(keys.FAULTS, sample.payload) for sample in link.get(keys.FAULTS)]
-    rows = [row(fault, now_ns) for message in told for fault in message.faults if not _is_over(fault, now_ns)]
+        answers = [messages.decode(keys.FAULTS, sample.payload) for sample in link.get(keys.FAULTS)]
+    rows = [row(fault, now_ns) for message in answers for fault in message.faults if not _is_over(fault, now_ns)]
     for cells in rows:
         print("  ".join(cells))
     if not rows:
@@ -232,9 +232,9 @@ def row(fault: "Fault", now_ns: int) -> tuple[str, ...]:
     """Return the cells that a fault has in a list."""
     until = "..." if fault.until_ns is None else f"{fault.until_ns / 1e9:.2f}"
     state = "acts" if fault.from_ns <= now_ns else "planned"
-    told = " ".join(f"{name}={value}" for name, value in fault.parameters.items() if value is not None)
+    parameters = " ".join(f"{name}={value}" for name, value in fault.parameters.items() if value is not None)
     times = f"{fault.from_ns / 1e9:.2f} to {until} s"
-    return (f"{fault.id:>3}", f"{state:<7}", f"{fault.target:<16}", f"{fault.kind:<17}", f"{times:<20}", told)
+    return (f"{fault.id:>3}", f"{state:<7}", f"{fault.target:<16}", f"{fault.kind:<17}", f"{times:<20}", parameters)
 
 
 def _is_over(fault: "Fault", now_ns: int) -> bool:
@@ -244,8 +244,8 @@ def _is_over(fault: "Fault", now_ns: int) -> bool:
 def _parameters(kind: "Kind") -> list[str]:
     from zsim.scenario.fault_kinds import expected
 
-    told = [f"{p.name}: {expected(p)}{'' if p.required else ' (may be left out)'}" for p in kind.parameters]
-    return [*told, *(["--for is needed"] if kind.lasts == "ends" else [])]
+    parameters = [f"{p.name}: {expected(p)}{'' if p.required else ' (may be left out)'}" for p in kind.parameters]
+    return [*parameters, *(["--for is needed"] if kind.lasts == "ends" else [])]
 
 
 def _values(parameters: Sequence[str]) -> dict[str, Any]:
@@ -254,7 +254,7 @@ def _values(parameters: Sequence[str]) -> dict[str, Any]:
 
     values: dict[str, Any] = {}
     for text in parameters:
-        name, equals, given = text.partition("=")
+        name, equals, value = text.partition("=")
         if not equals or not re.fullmatch("[a-z][a-z0-9_]*", name):
             raise typer.BadParameter(f"{text[:40]!r} is no parameter; must be NAME=VALUE, see `zsim fault kinds`")
         if name in GIVEN_BY:
@@ -262,7 +262,7 @@ def _values(parameters: Sequence[str]) -> dict[str, Any]:
         if name in values:
             raise typer.BadParameter(f"{name} is given twice; must be given once")
         try:
-            values[name] = yaml_file.value(given)
+            values[name] = yaml_file.value(value)
         except ValueError as error:
             raise typer.BadParameter(f"{name} {error}") from None
     return values

@@ -62,21 +62,21 @@ def _prepare() -> None:
 def _fork() -> int:
     """Return the number of a new process whose parent is the launcher, and in that process 0.
 
-    The one between ends at once; the launcher has asked to inherit what its descendants leave (PR_SET_CHILD_SUBREAPER).
+    The process between them ends at once; the launcher inherits its child (PR_SET_CHILD_SUBREAPER).
     """
-    ear, mouth = os.pipe()
-    between = os.fork()
-    if between:
-        os.close(mouth)
-        os.waitpid(between, 0)
-        with open(ear) as told:
-            return int(told.read())
-    born = os.fork()
-    if born:
-        os.write(mouth, str(born).encode())
+    reader, writer = os.pipe()
+    intermediate = os.fork()
+    if intermediate:
+        os.close(writer)
+        os.waitpid(intermediate, 0)
+        with open(reader) as pid_pipe:
+            return int(pid_pipe.read())
+    pid = os.fork()
+    if pid:
+        os.write(writer, str(pid).encode())
         os._exit(0)
-    os.close(ear)
-    os.close(mouth)
+    os.close(reader)
+    os.close(writer)
     return 0
 
 

@@ -49,7 +49,7 @@ def up(
 ) -> None:
     """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything."""
     from zsim_deploy.cli.report_commands import conclude
-    from zsim_deploy.hosts.host_run import HostRunOptions, HostRun
+    from zsim_deploy.hosts.host_run import HostRun, HostRunOptions
     from zsim_deploy.hosts.status_table import StatusTable
     from zsim_deploy.inventory import inventory
 
@@ -59,8 +59,8 @@ def up(
     inventory.placement(placed, loaded)
     mode, pace = mode_and_rate(realtime, rate)
     with _folder(out, loaded) as folder:
-        with StatusTable(loaded.duration_s) as board:
-            outcome = HostRun(HostRunOptions(loaded, placed, folder, mode, pace), board).run()
+        with StatusTable(loaded.duration_s) as status:
+            outcome = HostRun(HostRunOptions(loaded, placed, folder, mode, pace), status).run()
         conclude(outcome, folder, report)
 
 
@@ -96,11 +96,11 @@ def ps(
     from zsim_deploy.hosts import control_socket
     from zsim_deploy.hosts.status_table import table
 
-    found = control_socket.ask(federation, "ps")
+    status = control_socket.ask(federation, "ps")
     if as_json:
-        print(json.dumps(found))
+        print(json.dumps(status))
     else:
-        Console().print(table(found["rows"]))
+        Console().print(table(status["rows"]))
 
 
 def logs(

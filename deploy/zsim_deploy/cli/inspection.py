@@ -23,14 +23,14 @@ COMMANDS = "drone/*/cmd/*"
 
 
 def list_keys(link: Session, listen_s: float = LISTEN_S) -> list[tuple[str, str, int]]:
-    """Return (key, message, messages heard) of everything that speaks or answers within `listen_s`."""
-    heard: Counter[str] = Counter()
+    """Return (key, message, messages received) of everything that speaks or answers within `listen_s`."""
+    counts: Counter[str] = Counter()
     for expression in (keys.INFO, keys.CLOCK, "drone/*/truth", "drone/*/estimate", "cluster/*/state"):
-        heard.update({sample.key: 0 for sample in link.get(expression)})
+        counts.update({sample.key: 0 for sample in link.get(expression)})
     box = link.subscribe("**")
     for sample in _samples(box, time.monotonic() + listen_s):
-        heard[sample.key] += 1
-    return [(key, _kind(key), count) for key, count in sorted(heard.items())]
+        counts[sample.key] += 1
+    return [(key, _kind(key), count) for key, count in sorted(counts.items())]
 
 
 def echo(link: Session, expression: str, count: int | None, emit: Callable[[str, Any], None], raw: bool) -> None:

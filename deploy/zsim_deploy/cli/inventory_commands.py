@@ -93,16 +93,16 @@ def show(hosts: Inventory) -> None:
 
     placed, now = inventory.load(hosts), datetime.now(UTC)
     folder = folder_of(placed)
-    found = certificates.show(folder, now)
-    if not found:
+    statuses = certificates.show(folder, now)
+    if not statuses:
         raise RunError(f"{folder}: has no certificates; make them with `{init_command(placed)}`")
-    for shown in found:
-        until = f"{shown.until:%Y-%m-%d %H:%M}Z"
-        where = ", ".join(shown.addresses)
-        state = shown.fault or _soon(shown, now)
-        print(f"{shown.host:<16} {shown.process:<32} {until:<18} {where:<40} {state}".rstrip())
-    over = any(_soon(shown, now) or certificates.EXPIRED in shown.fault for shown in found)
-    if over or any(shown.fault for shown in found):
+    for status in statuses:
+        until = f"{status.until:%Y-%m-%d %H:%M}Z"
+        where = ", ".join(status.addresses)
+        state = status.fault or _soon(status, now)
+        print(f"{status.host:<16} {status.process:<32} {until:<18} {where:<40} {state}".rstrip())
+    over = any(_soon(status, now) or certificates.EXPIRED in status.fault for status in statuses)
+    if over or any(status.fault for status in statuses):
         print(f"make them anew with `{init_command(placed, renew=over)}`", file=sys.stderr)
     _warn(placed)
 
@@ -120,8 +120,8 @@ def _issue_all(folder: Path, enrolment: "Enrolment", days: float, renew: bool, f
     return len(lacking), len(wanted) - len(lacking)
 
 
-def _soon(shown: "CertificateStatus", now: datetime) -> str:
-    return "ends soon" if shown.until - now < WARN else ""
+def _soon(status: "CertificateStatus", now: datetime) -> str:
+    return "ends soon" if status.until - now < WARN else ""
 
 
 def _warn(placed: "InventoryFile") -> None:

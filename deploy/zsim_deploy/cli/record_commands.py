@@ -125,8 +125,8 @@ def replay(
         raise typer.BadParameter(f"--to is {to:g}, before --from {from_:g}; must be at or after it")
     to_ns = None if to is None else round(to * 1e9)
     choice = Choice(round(from_ * 1e9), to_ns, tuple(keys or ["**"]), paused)
-    wish = ReplayOptions(choice, rate, tuple(expect or ()), tuple(listen or [DEFAULT_ENDPOINT]), federation)
-    play(directory, wish, identity(host, tls, insecure, access))
+    options = ReplayOptions(choice, rate, tuple(expect or ()), tuple(listen or [DEFAULT_ENDPOINT]), federation)
+    play(directory, options, identity(host, tls, insecure, access))
 
 
 @app.command(rich_help_panel=RUN)

@@ -28,8 +28,8 @@ Act = Callable[..., Any]
 
 def place(federation: str) -> Path:
     """Return where the launcher of a federation listens; only its user may come in."""
-    given = os.environ.get("XDG_RUNTIME_DIR")
-    folder = Path(given) / "zsim" if given else Path(tempfile.gettempdir()) / f"zsim-{os.getuid()}"
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    folder = Path(runtime) / "zsim" if runtime else Path(tempfile.gettempdir()) / f"zsim-{os.getuid()}"
     return folder / f"{federation}.sock"
 
 
@@ -72,8 +72,8 @@ class ControlSocket:
     def _answer(self, connection: socket.socket) -> None:
         with connection, contextlib.suppress(OSError):
             connection.settimeout(REQUEST_S)
-            with connection.makefile("rb") as asked:
-                line = asked.readline(LINE_MAX)
+            with connection.makefile("rb") as request:
+                line = request.readline(LINE_MAX)
             connection.sendall(json.dumps(self._carry_out(line)).encode() + b"\n")
 
     def _carry_out(self, line: bytes) -> dict[str, Any]:
@@ -128,10 +128,10 @@ def _refuse_if_foreign(folder: Path) -> None:
     Raises:
         RunError: it belongs to somebody else, others may write in it, or it is none.
     """
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
         raise RunError(
-            f"{folder}: is not a folder that is yours alone (owner {found.st_uid}, mode {found.st_mode & 0o777:o}); "
+            f"{folder}: is not a folder that is yours alone (owner {status.st_uid}, mode {status.st_mode & 0o777:o}); "
             f"must be of user {os.getuid()} with mode 700; remove it, or set XDG_RUNTIME_DIR to a folder of yours"
         )
 
@@ -168,8 +168,8 @@ def ask(federation: str, op: str, **args: Any) -> Any:
     with _reached(federation) as line:
         try:
             line.sendall(json.dumps({"op": op, "args": args}).encode() + b"\n")
-            with line.makefile("rb") as answered:
-                answer = json.loads(answered.readline())
+            with line.makefile("rb") as stream:
+                answer = json.loads(stream.readline())
         except TimeoutError as error:
             raise RunError(f"`zsim up` has not answered {op} within {ANSWER_S:g} s; look at its terminal") from error
         except (OSError, ValueError) as error:

@@ -31,7 +31,7 @@ OFFSET_ASKS = 3  # the answer with the shortest round trip says the clock's offs
 class HostReport(NamedTuple):
     """What a host says of itself, and what asking it showed."""
 
-    said: dict[str, Any]
+    facts: dict[str, Any]
     round_trip_s: float
     clock_offset_s: float
     """Its wall clock minus ours, good to half the round trip."""
@@ -45,7 +45,7 @@ class NetworkPath(NamedTuple):
     source: str
     target: str
     port: int
-    found: dict[str, Any]
+    figures: dict[str, Any]
 
 
 async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostReport:
@@ -61,12 +61,12 @@ async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostR
     remedy = _remedy(link, hosts)
     try:
         async with _within(link, ABOUT_S), _probe(link, python, "about", link.host.folder) as there:
-            said = await there.answer()
+            facts = await there.answer()
             round_trip_s, offset_s = min([await _offset(there) for _ in range(OFFSET_ASKS)])
     except _EndedError as error:
         fault = _no_zsim(link, python, remedy, error) or f"{python}: {error}; is it a Python that has zsim?"
         raise HostsError(f"{link.name}: {fault}") from error
-    return HostReport(said, round_trip_s, offset_s, remedy)
+    return HostReport(facts, round_trip_s, offset_s, remedy)
 
 
 def _remedy(link: HostLink, hosts: str) -> str:
@@ -77,10 +77,10 @@ def _remedy(link: HostLink, hosts: str) -> str:
 
 def _no_zsim(link: HostLink, python: str, remedy: str, error: "_EndedError") -> str:
     """Return what a host lacks, from how its probe ended; empty if it is something else."""
-    said = error.last.lower()
-    if NO_MODULE in said:
+    text = error.last.lower()
+    if NO_MODULE in text:
         return f"{python} has no zsim {__version__}; {remedy}"
-    if error.status not in NO_PROGRAM_CODES and not any(text in said for text in NO_PROGRAM):
+    if error.status not in NO_PROGRAM_CODES and not any(sign in text for sign in NO_PROGRAM):
         return ""
     if link.host.python:
         return f"python {python} is no program there ({error.last}); correct hosts.{link.name}.python, or {remedy}"
@@ -113,9 +113,9 @@ class _Probe:
             _EndedError: it has ended.
         """
         while line := await self._process.stdout.readline():
-            if said := json_answer([line]):
-                return said
-        last = (await self._process.stderr.read()).strip().splitlines() or ["it said nothing"]
+            if message := json_answer([line]):
+                return message
+        last = (await self._process.stderr.read()).strip().splitlines() or ["it printed nothing"]
         await self._process.wait_closed()
         raise _EndedError(self._process.exit_status, last[-1][:200])
 
@@ -169,7 +169,7 @@ def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str
     """Return what keeps the hosts from flying together, and what is only worth knowing, a line each."""
     faults = [line for name, report in reports.items() for line in _faults(name, report)]
     warnings = [line for name, report in reports.items() for line in _warnings(name, report)]
-    prints = {name: report.said["fingerprint"] for name, report in reports.items()}
+    prints = {name: report.facts["fingerprint"] for name, report in reports.items()}
     if len(set(prints.values())) > 1:
         shown = ", ".join(f"{name} {text[:8]}" for name, text in prints.items())
         warnings.append(f"the hosts compute with different numeric fingerprints ({shown}); same bits are not promised")
@@ -177,38 +177,41 @@ def compare_reports(reports: dict[str, HostReport]) -> tuple[list[str], list[str
 
 
 def _faults(name: str, report: HostReport) -> Iterator[str]:
-    said = report.said
-    if said["zsim"] != __version__:
-        yield f"{name}: zsim is {said['zsim']}; must be {__version__} as here; {report.remedy}"
+    facts = report.facts
+    if facts["zsim"] != __version__:
+        yield f"{name}: zsim is {facts['zsim']}; must be {__version__} as here; {report.remedy}"
     ours = platform.python_version_tuple()[:2]
-    if tuple(said["python"].split(".")[:2]) != ours:
-        yield f"{name}: Python is {said['python']}; must be {'.'.join(ours)} as here, for the same bits"
-    if said["unwritable"]:
-        yield f"{name}: its folder cannot be used ({said['unwritable']}); correct hosts.{name}.folder, or make it there"
+    if tuple(facts["python"].split(".")[:2]) != ours:
+        yield f"{name}: Python is {facts['python']}; must be {'.'.join(ours)} as here, for the same bits"
+    if facts["unwritable"]:
+        why = facts["unwritable"]
+        yield f"{name}: its folder cannot be used ({why}); correct hosts.{name}.folder, or make it there"
 
 
 def _warnings(name: str, report: HostReport) -> Iterator[str]:
-    said = report.said
+    facts = report.facts
     if abs(report.clock_offset_s) > CLOCK_OFFSET_MAX_S + report.round_trip_s:
         yield f"{name}: its clock is {report.clock_offset_s:+.1f} s off; set it with chrony or ntp"
-    if said["load"] > LOAD_MAX * said["cores"]:
-        yield f"{name}: load is {said['load']:.1f} on {said['cores']} cores; lockstep goes at the pace of the slowest"
-    slow = set(said["governors"]) - PERFORMANCE
+    if facts["load"] > LOAD_MAX * facts["cores"]:
+        yield f"{name}: load is {facts['load']:.1f} on {facts['cores']} cores; lockstep goes at the pace of the slowest"
+    slow = set(facts["governors"]) - PERFORMANCE
     if slow:
         yield f"{name}: the CPU governor is {', '.join(sorted(slow))}; performance is steadier (cpupower frequency-set)"
-    if said["free_bytes"] < FREE_MIN_BYTES:
-        yield f"{name}: {said['free_bytes'] / 1e9:.1f} GB are free on its disk; a record of an hour takes about 1 GB"
+    if facts["free_bytes"] < FREE_MIN_BYTES:
+        yield f"{name}: {facts['free_bytes'] / 1e9:.1f} GB are free on its disk; a record of an hour takes about 1 GB"
 
 
-async def network_paths(links: Sequence[HostLink], target: HostLink, python: dict[str, str], port: int) -> list[NetworkPath]:
+async def network_paths(
+    links: Sequence[HostLink], target: HostLink, python: dict[str, str], port: int
+) -> list[NetworkPath]:
     """Return how the hosts reach a port of another, on which nothing else may listen."""
     try:
         async with AsyncExitStack() as stack:
             async with _within(target, READY_S):
                 server = await stack.enter_async_context(_probe(target, python[target.name], "serve", str(port)))
-                said = await server.answer()
-            if "error" in said:
-                return [NetworkPath(target.name, target.name, port, said)]
+                message = await server.answer()
+            if "error" in message:
+                return [NetworkPath(target.name, target.name, port, message)]
             return [
                 NetworkPath(link.name, target.name, port, await _reach(link, target, python, port)) for link in links
             ]
@@ -227,19 +230,19 @@ async def _reach(link: HostLink, target: HostLink, python: dict[str, str], port:
 
 def path_faults(paths: Sequence[NetworkPath]) -> tuple[list[str], list[str]]:
     """Return the paths that do not exist, and those that are slow, a line each."""
-    faults = [_path_fault(path) for path in paths if "error" in path.found]
+    faults = [_path_fault(path) for path in paths if "error" in path.figures]
     slow = [
-        f"{path.source} reaches {path.target} at {path.found['bits_per_s'] / 1e6:.1f} Mbit/s only"
+        f"{path.source} reaches {path.target} at {path.figures['bits_per_s'] / 1e6:.1f} Mbit/s only"
         for path in paths
-        if path.found.get("bits_per_s", BITS_PER_S_MIN) < BITS_PER_S_MIN
+        if path.figures.get("bits_per_s", BITS_PER_S_MIN) < BITS_PER_S_MIN
     ]
     return faults, slow
 
 
 def _path_fault(path: NetworkPath) -> str:
-    why = path.found["error"]
+    why = path.figures["error"]
     another = "give another port in the inventory"
-    match path.found.get("taken"):
+    match path.figures.get("taken"):
         case True:
             what = f"in use there, perhaps by another run; end that (`ss -ltnp` there tells who), or {another}"
             return f"{path.target}: port {path.port} is {what}"

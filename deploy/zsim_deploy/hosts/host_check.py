@@ -27,10 +27,12 @@ class CheckResult(NamedTuple):
 
 def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
     """Check certificates and hosts; with a placement also the paths to where the world and the routers listen."""
-    found = asyncio.run(_check_up(placed, places))
+    result = asyncio.run(_check_up(placed, places))
     lacks = certificate_check.certificate_faults(placed, places, datetime.now(UTC))
     warning = certificate_check.exposed_keys(placed)
-    return found._replace(faults=[*lacks, *found.faults], warnings=[*found.warnings, *([warning] if warning else [])])
+    return result._replace(
+        faults=[*lacks, *result.faults], warnings=[*result.warnings, *([warning] if warning else [])]
+    )
 
 
 async def _check_up(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
@@ -38,12 +40,12 @@ async def _check_up(placed: InventoryFile, places: dict[str, str] | None) -> Che
     pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
     hosts = shlex.quote(str(placed.folder / placed.source))
     try:
-        asked = await asyncio.gather(
+        results = await asyncio.gather(
             *(doctor.host_report(link, pythons[name], hosts) for name, link in links.items()), return_exceptions=True
         )
         reports: dict[str, doctor.HostReport] = {}
         faults: list[str] = []
-        for name, result in zip(links, asked, strict=True):
+        for name, result in zip(links, results, strict=True):
             if isinstance(result, doctor.HostReport):
                 reports[name] = result
             elif isinstance(result, ZsimError):
@@ -55,7 +57,9 @@ async def _check_up(placed: InventoryFile, places: dict[str, str] | None) -> Che
         cut, slow = doctor.path_faults(paths)
         left = await asyncio.gather(*(leftovers(links[name], placed.folder) for name in reports))
         tables = [_hosts_table(reports), *([_paths_table(paths)] if paths else [])]
-        return CheckResult(tables, [*faults, *wrong, *cut], [*warnings, *slow, *(line for lines in left for line in lines)])
+        return CheckResult(
+            tables, [*faults, *wrong, *cut], [*warnings, *slow, *(line for lines in left for line in lines)]
+        )
     finally:
         for link in links.values():
             await link.close()
@@ -65,28 +69,28 @@ async def _paths(
     placed: InventoryFile, places: dict[str, str], links: dict[str, HostLink], pythons: dict[str, str], there: set[str]
 ) -> list[doctor.NetworkPath]:
     """Return how the hosts reach what their roles and routers connect to, one path after the other."""
-    found: list[doctor.NetworkPath] = []
+    paths: list[doctor.NetworkPath] = []
     for (target, port), sources in inv.connections(placed, places).items():
         if target in there:
             chosen = [links[name] for name in sorted(sources & there)]
-            found += await doctor.network_paths(chosen, links[target], pythons, port)
-    return found
+            paths += await doctor.network_paths(chosen, links[target], pythons, port)
+    return paths
 
 
 def _hosts_table(reports: dict[str, doctor.HostReport]) -> Table:
     shown = Table("host", "python", "zsim", "round trip", "clock", "load", "cores", "governor", "fingerprint", box=None)
     for name, report in reports.items():
-        said = report.said
+        facts = report.facts
         cells = (
             name,
-            said["python"],
-            said["zsim"],
+            facts["python"],
+            facts["zsim"],
             f"{1e3 * report.round_trip_s:.1f} ms",
             f"{1e3 * report.clock_offset_s:+.1f} ms",
-            f"{said['load']:.2f}",
-            str(said["cores"]),
-            ", ".join(said["governors"]) or "-",
-            said["fingerprint"][:8],
+            f"{facts['load']:.2f}",
+            str(facts["cores"]),
+            ", ".join(facts["governors"]) or "-",
+            facts["fingerprint"][:8],
         )
         shown.add_row(*map(Text, cells))  # what a host says may have brackets
     return shown
@@ -95,11 +99,11 @@ def _hosts_table(reports: dict[str, doctor.HostReport]) -> Table:
 def _paths_table(paths: list[doctor.NetworkPath]) -> Table:
     shown = Table("from", "to", "port", "round trip", "bandwidth", box=None)
     for path in paths:
-        shown.add_row(*map(Text, (path.source, path.target, str(path.port), *_path_figures(path.found))))
+        shown.add_row(*map(Text, (path.source, path.target, str(path.port), *_path_figures(path.figures))))
     return shown
 
 
-def _path_figures(found: dict[str, Any]) -> tuple[str, str]:
-    if "error" in found:
-        return found["error"], "-"
-    return f"{1e3 * found['round_trip_s']:.2f} ms", f"{found['bits_per_s'] / 1e6:.0f} Mbit/s"
+def _path_figures(figures: dict[str, Any]) -> tuple[str, str]:
+    if "error" in figures:
+        return figures["error"], "-"
+    return f"{1e3 * figures['round_trip_s']:.2f} ms", f"{figures['bits_per_s'] / 1e6:.0f} Mbit/s"

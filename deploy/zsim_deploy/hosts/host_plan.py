@@ -45,8 +45,8 @@ class HostPlan:
         self._scenario = scenario
         self._run_id = run_id
         self._pace = pace
-        found = sorted(processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
-        self.processes = {process.name: process for process in found}
+        in_order = sorted(processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
+        self.processes = {process.name: process for process in in_order}
         self.remarks = own_programs(placed, scenario)
 
     def moved(self, name: str, host: str) -> "HostPlan":
@@ -99,7 +99,9 @@ class HostPlan:
 
     def certificate_faults(self, now: datetime) -> list[str]:
         """Return what of the certificates is missing or of no use at a time, a line for each fault."""
-        return certificate_check.certificate_faults(self._placed, {name: self.host(name) for name in self.processes}, now)
+        return certificate_check.certificate_faults(
+            self._placed, {name: self.host(name) for name in self.processes}, now
+        )
 
     def exposed_keys(self) -> str | None:
         """Return a warning of private keys here that others can read, if there are any."""
@@ -123,13 +125,13 @@ class HostPlan:
         Raises:
             HostsError: a certificate is not there.
         """
-        found: dict[str, bytes] = {}
+        contents: dict[str, bytes] = {}
         for name, process in self.processes.items():
             if process.host == host:
-                found |= self.identity(name)
+                contents |= self.identity(name)
         if self.host(WORLD) == host:
-            found["scenario.yaml"] = scenario_file.to_text(self._scenario).encode()
-        return found
+            contents["scenario.yaml"] = scenario_file.to_text(self._scenario).encode()
+        return contents
 
     def identity(self, name: str) -> dict[str, bytes]:
         """Return certificate, key and access control of a process, by path below the run's folder."""

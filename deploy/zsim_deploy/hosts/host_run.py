@@ -15,7 +15,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.hosts.control_socket import ControlSocket
-from zsim_deploy.hosts.doctor import HostReport, host_report, compare_reports
+from zsim_deploy.hosts.doctor import HostReport, compare_reports, host_report
 from zsim_deploy.hosts.host_plan import HostPlan
 from zsim_deploy.hosts.launcher_requests import LauncherRequests
 from zsim_deploy.hosts.leftover_runs import RECORD, leftovers, port_faults
@@ -25,7 +25,7 @@ from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.launch.supervisor import Outcome, Supervisor
 from zsim_deploy.options.arguments import pace_options
 from zsim_deploy.options.terminal import CLOSED, EndSignals
-from zsim_deploy.ssh.host_link import HostLink, EventLoopThread
+from zsim_deploy.ssh.host_link import EventLoopThread, HostLink
 from zsim_deploy.ssh.host_links import HostLinks, fetch
 from zsim_deploy.ssh.ssh_connection import shell_word
 
@@ -64,18 +64,18 @@ class HostRun:
 
     Args:
         options: what to run where.
-        board: takes progress.
+        status: takes progress.
 
     Raises:
         InventoryError: a process has no place.
     """
 
-    def __init__(self, options: HostRunOptions, board: StatusTable) -> None:
+    def __init__(self, options: HostRunOptions, status: StatusTable) -> None:
         self._options = options
-        self._board = board
+        self._status = status
         self._logs = options.out / "logs"
         self._plan = HostPlan(options.placed, options.scenario, options.run_id, options.pace())
-        self._watch = Supervisor(options.scenario.processes.on_death, board)
+        self._supervisor = Supervisor(options.scenario.processes.on_death, status)
         self._loop = EventLoopThread()
         self._links = HostLinks(options.placed, self._plan.hosts(), self._loop)
         self._record_stays = False
@@ -88,7 +88,7 @@ class HostRun:
             HostsError: with a line for every certificate that is missing, or every host that cannot take part.
         """
         try:
-            with EndSignals(self._options.out / "up.log", self._hang_up), self._intercom():
+            with EndSignals(self._options.out / "up.log", self._hang_up), self._control_socket():
                 self._refuse_unless_certified()
                 self._timed("connect", lambda: self._links.on_all(HostLink.open, CONNECT_S))
                 self._timed("check", self._check)
@@ -101,29 +101,31 @@ class HostRun:
             self._loop.close()
 
     def _hang_up(self) -> None:
-        self._board.hang_up()
-        self._watch.interrupt(CLOSED)
+        self._status.hang_up()
+        self._supervisor.interrupt(CLOSED)
 
     def _refuse_unless_certified(self) -> None:
         if faults := self._plan.certificate_faults(datetime.now(UTC)):
             raise HostsError("\n".join(faults))
         if warning := self._plan.exposed_keys():
-            self._board.say(f"warning: {warning}")
+            self._status.say(f"warning: {warning}")
 
-    def _intercom(self) -> ControlSocket:
-        orders = LauncherRequests(self._plan, self._links, self._loop, self._watch, self._board, self._options.out, self._remote)
-        return ControlSocket(self._options.scenario.federation, orders.handlers())
+    def _control_socket(self) -> ControlSocket:
+        requests = LauncherRequests(
+            self._plan, self._links, self._loop, self._supervisor, self._status, self._options.out, self._remote
+        )
+        return ControlSocket(self._options.scenario.federation, requests.handlers())
 
     def _timed(self, what: str, act: Callable[[], Any]) -> None:
         start_s = time.monotonic()
         act()
-        self._board.stages_s[what] = time.monotonic() - start_s
+        self._status.stages_s[what] = time.monotonic() - start_s
 
     def _check(self) -> None:
         looks = self._links.on_all(self._look, CHECK_S)
         faults, warnings = compare_reports({name: look.report for name, look in looks.items()})
         for warning in [*warnings, *(line for look in looks.values() for line in look.left)]:
-            self._board.say(f"warning: {warning}")
+            self._status.say(f"warning: {warning}")
         if faults := [*faults, *(line for look in looks.values() for line in look.taken)]:
             raise HostsError("\n".join(faults))
 
@@ -141,22 +143,22 @@ class HostRun:
     def _fly(self) -> Outcome:
         self._make_logs()
         for remark in self._plan.remarks:
-            self._board.say(remark)
-        self._watch.members = [self._remote(self._plan, name) for name in self._plan.processes]
-        self._board.members, self._board.links = self._watch.members, self._links.by_name
+            self._status.say(remark)
+        self._supervisor.members = [self._remote(self._plan, name) for name in self._plan.processes]
+        self._status.members, self._status.links = self._supervisor.members, self._links.by_name
         self._links.listen()
         self._record_stays = True
         try:
-            outcome = self._watch.run(self._board.report_silent_hosts)
+            outcome = self._supervisor.run(self._status.report_silent_hosts)
             fault = self._fetch()
         except KeyboardInterrupt:
             where = self._plan.way_to_record()
-            self._board.say(f"the record was not fetched; what there is of it is at {where}")
+            self._status.say(f"the record was not fetched; what there is of it is at {where}")
             raise
         if fault and not outcome.failed and not outcome.interrupted:
             return replace(outcome, reason=fault, failed=True)
         if fault:
-            self._board.say(fault)
+            self._status.say(fault)
         return outcome
 
     def _make_logs(self) -> None:
@@ -169,8 +171,8 @@ class HostRun:
 
     def _remote(self, plan: HostPlan, name: str) -> RemoteProcess:
         host = plan.host(name)
-        log = ProcessLog(self._logs / f"{name}.log", self._board.say)
-        on_line = self._watch.take_line if name == WORLD else None
+        log = ProcessLog(self._logs / f"{name}.log", self._status.say)
+        on_line = self._supervisor.handle_line if name == WORLD else None
         link = self._links.by_name[host]
         more = (on_line, plan.folder(host), plan.identity(name))
         return RemoteProcess(name, plan.arguments(name), link, plan.python(host), self._loop, log, *more)
@@ -178,16 +180,16 @@ class HostRun:
     def _fetch(self) -> str:
         """Bring the record home; return why it is not here, empty if it is."""
         host, into = self._plan.host(RECORDER), self._options.out / RECORD
-        self._board.say(f"fetching the record from {host}:{self._plan.record()} …")
+        self._status.say(f"fetching the record from {host}:{self._plan.record()} …")
         try:
-            found = self._loop.call(fetch(self._links.by_name[host], self._plan.record(), into))
-            if found:
+            is_there = self._loop.call(fetch(self._links.by_name[host], self._plan.record(), into))
+            if is_there:
                 repair(into)
         except (ZsimError, OSError) as error:
             where = self._plan.way_to_record()
             return f"the record could not be fetched ({error}); what there is of it is at {where}"
         self._record_stays = False
-        return "" if found else "nothing was recorded"
+        return "" if is_there else "nothing was recorded"
 
     @contextlib.contextmanager
     def _cleaned(self) -> Any:
@@ -198,9 +200,9 @@ class HostRun:
             try:
                 self._links.on_all(self._clean, 2 * CLEAN_S)
             except HostsError as error:
-                self._board.say(f"{error}\nkeys of this run may be left there; remove its folder")
+                self._status.say(f"{error}\nkeys of this run may be left there; remove its folder")
             except KeyboardInterrupt:
-                self._board.say("keys of this run may be left on its hosts; the next `zsim up` or `zsim doctor` tells")
+                self._status.say("keys of this run may be left on its hosts; the next `zsim up` or `zsim doctor` tells")
                 raise
 
     async def _clean(self, link: HostLink) -> None:

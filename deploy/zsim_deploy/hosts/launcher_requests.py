@@ -10,13 +10,13 @@ from typing import Any
 
 from zsim.errors import HostsError, RunError
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
-from zsim_deploy.hosts.doctor import host_report, compare_reports
+from zsim_deploy.hosts.doctor import compare_reports, host_report
 from zsim_deploy.hosts.host_plan import HostPlan
 from zsim_deploy.hosts.remote_process import RemoteProcess
 from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory.processes import MODULES, extras
 from zsim_deploy.launch.supervisor import Supervisor
-from zsim_deploy.ssh.host_link import HostLink, EventLoopThread
+from zsim_deploy.ssh.host_link import EventLoopThread, HostLink
 from zsim_deploy.ssh.host_links import HostLinks
 from zsim_deploy.ssh.ssh_connection import shell_word
 
@@ -25,7 +25,7 @@ IMPORT_S = 20.0  # until a Python has shown that it can run a role; a small comp
 BRING_S = 30.0  # until a certificate is on a host
 LEAVE_S = 20.0  # until a process whose place was taken a moment ago has ended, which takes a second
 LOOK_S = 0.1  # between two looks whether it has
-ORDER_S = 5.0  # until the watch, which looks every 50 ms, carries out an order
+ORDER_S = 5.0  # until the supervisor, which looks every 50 ms, carries out an order
 
 
 class LauncherRequests:
@@ -35,8 +35,8 @@ class LauncherRequests:
         plan: where everything is at first.
         links: to the hosts.
         loop: on which they live.
-        watch: over the processes.
-        board: with the rows of `ps`.
+        supervisor: over the processes.
+        status: with the rows of `ps`.
         out: folder of the run here.
         remote: makes a process of a plan.
     """
@@ -46,16 +46,16 @@ class LauncherRequests:
         plan: HostPlan,
         links: HostLinks,
         loop: EventLoopThread,
-        watch: Supervisor,
-        board: StatusTable,
+        supervisor: Supervisor,
+        status: StatusTable,
         out: Path,
         remote: Callable[[HostPlan, str], RemoteProcess],
     ) -> None:
         self._plan = plan
         self._links = links
         self._loop = loop
-        self._watch = watch
-        self._board = board
+        self._supervisor = supervisor
+        self._status = status
         self._out = out
         self._remote = remote
         self._one_at_a_time = threading.Lock()
@@ -66,13 +66,13 @@ class LauncherRequests:
         return {**looks, "down": self._down, "restart": self._restart, "move": self._move}
 
     def _ps(self) -> dict[str, Any]:
-        return {"rows": self._board.rows(), "clock": self._board.clock_now(), **self._say_where()}
+        return {"rows": self._status.rows(), "clock": self._status.clock_now(), **self._say_where()}
 
     def _say_where(self) -> dict[str, Any]:
         return {"out": str(self._out.absolute()), "roles": list(self._plan.processes)}
 
     def _down(self) -> None:
-        self._watch.interrupt("ended by zsim down")
+        self._supervisor.interrupt("ended by zsim down")
 
     def _restart(self, role: str) -> str:
         self._refuse_unless_runs(role)
@@ -104,7 +104,7 @@ class LauncherRequests:
             self._loop.call(link.put_files(plan.folder(link.name), files, BRING_S))
 
     def _refuse_unless_runs(self, role: str) -> None:
-        if not self._watch.members:
+        if not self._supervisor.members:
             raise RunError("the run has not started yet; try again when it flies")
         if role not in self._plan.processes:
             raise RunError(f"role is {role!r}; must be one of {', '.join(self._plan.processes)}")
@@ -121,23 +121,23 @@ class LauncherRequests:
             self._loop.spawn(link.close())
             raise
         for warning in warnings:
-            self._board.say(f"warning: {warning}")
+            self._status.say(f"warning: {warning}")
         self._links.add(link)
-        self._board.links = self._links.by_name
+        self._status.links = self._links.by_name
         return link
 
     def _take_over(self, plan: HostPlan, role: str) -> str:
         """Start a process that takes over the name of another, which leaves by itself, or is killed if it hangs."""
         until_s = time.monotonic() + LEAVE_S
-        while self._watch.is_being_replaced(role) and time.monotonic() < until_s:
+        while self._supervisor.is_being_replaced(role) and time.monotonic() < until_s:
             time.sleep(LOOK_S)
         new = self._remote(plan, role)
 
         def take() -> None:
-            self._watch.replace(new)
+            self._supervisor.replace(new)
             self._plan = plan
 
-        carried_out = self._watch.submit(take)
+        carried_out = self._supervisor.submit(take)
         wait([carried_out], ORDER_S)
         carried_out.cancel()  # changes nothing where it is being carried out
         try:

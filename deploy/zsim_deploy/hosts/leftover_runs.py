@@ -61,22 +61,22 @@ async def leftovers(link: HostLink, base: Path) -> list[str]:
     """
     folder = runs_folder(link.host)
     script = f"cd {shell_word(folder)} 2>/dev/null || exit 0{LIST_RUNS}"
-    said = (await link.run(script, what=f"looking into {folder}")).decode(errors="replace")
-    return leftover_lines(link.name, link.host, base, said.splitlines())
+    output = (await link.run(script, what=f"looking into {folder}")).decode(errors="replace")
+    return leftover_lines(link.name, link.host, base, output.splitlines())
 
 
-def leftover_lines(name: str, host: Host, base: Path, said: Iterable[str]) -> list[str]:
+def leftover_lines(name: str, host: Host, base: Path, output: Iterable[str]) -> list[str]:
     """Return lines for a person from what LIST_RUNS prints; a greeting of the login shell is passed over."""
     folder = runs_folder(host)
-    words = [line.split(" ", 1) for line in said]
-    found = {kind: [word[1] for word in words if word[0] == kind and len(word) > 1] for kind in (RECORD, KEY)}
+    words = [line.split(" ", 1) for line in output]
+    runs = {kind: [word[1] for word in words if word[0] == kind and len(word) > 1] for kind in (RECORD, KEY)}
     lines = []
-    if records := [f"{folder}/{run}/{RECORD}" for run in found[RECORD]]:
+    if records := [f"{folder}/{run}/{RECORD}" for run in runs[RECORD]]:
         lines.append(
             f"{name}: records of earlier runs were not fetched: {', '.join(f'{name}:{path}' for path in records)}; "
             f"fetch with `{scp(host, base, records[0])}`, then remove the folder of the run there"
         )
-    if keys := [f"{folder}/{run}/{FOLDER}" for run in found[KEY]]:
+    if keys := [f"{folder}/{run}/{FOLDER}" for run in runs[KEY]]:
         lines.append(
             f"{name}: private keys of earlier runs were left: {', '.join(f'{name}:{path}' for path in keys)}; "
             f"remove them there with `rm -r {shell_line(keys)}`"
@@ -105,6 +105,6 @@ async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list
     if not ports:
         return []
     command = f"{shell_word(python)} - {shell_line([link.host.address, *map(str, ports)])}"
-    said = await link.run(command, TRY_PORTS.encode(), TRY_PORTS_S, "looking for free ports")
-    taken = (json_answer(said.decode(errors="replace").splitlines()) or {}).get("taken", [])
+    output = await link.run(command, TRY_PORTS.encode(), TRY_PORTS_S, "looking for free ports")
+    taken = (json_answer(output.decode(errors="replace").splitlines()) or {}).get("taken", [])
     return path_faults([NetworkPath(link.name, link.name, port, {"error": "", "taken": True}) for port in taken])[0]

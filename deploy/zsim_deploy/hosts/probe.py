@@ -63,21 +63,21 @@ def _nearest(folder: Path) -> Path:
     return next(path for path in (folder, *folder.parents) if os.path.exists(path))
 
 
-def clock(said: TextIO) -> None:
+def clock(requests: TextIO) -> None:
     """Tell the wall clock for each line that comes."""
-    for _ in said:
+    for _ in requests:
         print(json.dumps({"time_ns": time.time_ns()}), flush=True)
 
 
 def governors(folder: Path) -> list[str]:
     """Return the CPU governors in use; none where the system does not tell."""
-    found = set()
+    names = set()
     for path in folder.glob("cpu[0-9]*/cpufreq/scaling_governor"):
         try:
-            found.add(path.read_text().strip())
+            names.add(path.read_text().strip())
         except OSError:
             continue
-    return sorted(found)
+    return sorted(names)
 
 
 def serve(port: int) -> None:
@@ -131,13 +131,13 @@ def reach(address: str, port: int) -> dict[str, Any]:
 
 def _bits_per_s(link: socket.socket, round_trip_s: float) -> float:
     """Return the bandwidth by the first bulk that takes a while, so that a slow link is not kept busy for minutes."""
-    found = 0.0
+    bits_per_s = 0.0
     for size in BULKS_BYTES:
         took_s = max(_send_s(link, size) - round_trip_s, SHORTEST_S)
-        found = 8 * size / took_s
+        bits_per_s = 8 * size / took_s
         if took_s >= BULK_S:
             break
-    return found
+    return bits_per_s
 
 
 def _send_s(link: socket.socket, size: int) -> float:

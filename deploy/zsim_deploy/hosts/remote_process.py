@@ -20,7 +20,7 @@ import asyncssh
 
 from zsim.errors import HostsError
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED
-from zsim_deploy.ssh.host_link import HostLink, EventLoopThread
+from zsim_deploy.ssh.host_link import EventLoopThread, HostLink
 from zsim_deploy.ssh.ssh_connection import shell_line
 
 BEAT_S = 1.0  # how often the launcher shows that it lives
@@ -191,14 +191,14 @@ class RemoteProcess:
             return self._fault or f"the connection to {self.host} broke"
         if code is not None and code < 0:
             return f"killed by signal {-code}"
-        last = self.last_words()
+        last = self.last_log_line()
         return f"exit code {code}" + (f": {last}" if last else "")
 
-    def last_words(self) -> str:
+    def last_log_line(self) -> str:
         """Return the last line that it wrote to its log."""
         return self._log.last
 
-    def tell_stop(self, reason: str) -> None:
+    def request_stop(self, reason: str) -> None:
         """Ask it to leave; harmless when it is gone, remembered when it is still on its way."""
         self._stop = reason
         self._loop.call_soon(self._send, f"stop {reason}\n")
@@ -232,9 +232,9 @@ class RemoteProcess:
             self._ended.wait(KILL_S)
 
 
-async def _pid(said: "asyncssh.SSHReader[str]") -> int:
+async def _pid(output: "asyncssh.SSHReader[str]") -> int:
     """Return the process id that the shell says, 0 if it ends without."""
-    async for line in said:
+    async for line in output:
         if line.startswith(PID):
             return int(line.removeprefix(PID))
     return 0

@@ -108,8 +108,8 @@ def command(process: PlannedProcess, files: ProcessFiles) -> list[str]:
     words += ["--tls", files.identity] if process.secure else ["--insecure"]
     if process.secure and process.port is not None:
         words += ["--access", files.access]
-    given = files.scenario if process.name == WORLD else process.thing
-    return [*words, "--", given] if given is not None else words  # a name may begin with a dash
+    argument = files.scenario if process.name == WORLD else process.thing
+    return [*words, "--", argument] if argument is not None else words  # a name may begin with a dash
 
 
 def access_file(process: PlannedProcess) -> str:
@@ -123,13 +123,13 @@ def extras(names: Sequence[str]) -> list[str]:
     return sorted(named | {extra for name in names for kind, extra in KINDS.items() if name.startswith(kind)})
 
 
-def on_host(found: Sequence[PlannedProcess], host: str) -> list[PlannedProcess]:
-    return [process for process in found if process.host == host]
+def on_host(planned: Sequence[PlannedProcess], host: str) -> list[PlannedProcess]:
+    return [process for process in planned if process.host == host]
 
 
-def used_hosts(found: Sequence[PlannedProcess]) -> list[str]:
+def used_hosts(planned: Sequence[PlannedProcess]) -> list[str]:
     """Return the hosts on which something runs, in the order of the processes."""
-    return list(dict.fromkeys(process.host for process in found))
+    return list(dict.fromkeys(process.host for process in planned))
 
 
 def _known(name: str, scenario: Scenario) -> bool:
@@ -158,7 +158,9 @@ def _role(
     return PlannedProcess(name, host, words, thing or None, port, secure, on_death(scenario.processes.on_death, name))
 
 
-def _router(placed: InventoryFile, scenario: Scenario, places: dict[str, str], name: str, pace: Sequence[str]) -> PlannedProcess:
+def _router(
+    placed: InventoryFile, scenario: Scenario, places: dict[str, str], name: str, pace: Sequence[str]
+) -> PlannedProcess:
     inventory = placed.inventory
     router = inventory.routers[name]
     listen = inv.listening(placed, router.host, router.port)
@@ -166,7 +168,9 @@ def _router(placed: InventoryFile, scenario: Scenario, places: dict[str, str], n
     realtime = (REALTIME,) if REALTIME in pace else ()
     words = (ROUTER, "--listen", listen, *reach, *realtime)
     called, secure = f"{ROUTER}.{name}", not inventory.security.insecure
-    return PlannedProcess(called, router.host, words, name, router.port, secure, on_death(scenario.processes.on_death, called))
+    return PlannedProcess(
+        called, router.host, words, name, router.port, secure, on_death(scenario.processes.on_death, called)
+    )
 
 
 def known_extras() -> list[str]:
@@ -183,14 +187,14 @@ def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, f
     Args:
         more: extras for every host, beside those of its roles.
     """
-    given = inventory.roles
-    found: dict[str, set[str]] = {name: set(more) for name in inventory.hosts}
-    for process, host in spread(given, NAMED).items():
-        found[host].add(NAMED[process])
-    for entry in given:
-        for host in hosts_of(given, entry):
-            found[host].update(extra for kind, extra in KINDS.items() if _can_match(entry, kind))
-    return {name: frozenset(extras) for name, extras in found.items()}
+    roles = inventory.roles
+    extras_by_host: dict[str, set[str]] = {name: set(more) for name in inventory.hosts}
+    for process, host in spread(roles, NAMED).items():
+        extras_by_host[host].add(NAMED[process])
+    for entry in roles:
+        for host in hosts_of(roles, entry):
+            extras_by_host[host].update(extra for kind, extra in KINDS.items() if _can_match(entry, kind))
+    return {name: frozenset(extras) for name, extras in extras_by_host.items()}
 
 
 def _can_match(entry: str, kind: str) -> bool:

@@ -16,7 +16,7 @@ class ChildProcess:
         name: process name `role.thing`.
         arguments: of the `zsim` command.
         logs: folder for its standard error.
-        nursery: where it is started.
+        launcher: where it is started.
         on_line: told every line of its standard output; None sends that to the log too.
     """
 
@@ -25,7 +25,7 @@ class ChildProcess:
         name: str,
         arguments: list[str],
         logs: Path,
-        nursery: RoleLauncher,
+        launcher: RoleLauncher,
         on_line: Callable[[str], None] | None = None,
     ) -> None:
         self.name = name
@@ -34,7 +34,7 @@ class ChildProcess:
         self.started_s = 0.0
         self._arguments = arguments
         self._log = logs / f"{name}.log"
-        self._nursery = nursery
+        self._launcher = launcher
         self._on_line = on_line
         self._reader: threading.Thread | None = None
         self._process: RoleProcess | None = None
@@ -42,7 +42,7 @@ class ChildProcess:
     def start(self) -> None:
         """Start it, or start it again."""
         with self._log.open("a") as log:
-            self._process = self._nursery.start(self._arguments, log, listened=self._on_line is not None)
+            self._process = self._launcher.start(self._arguments, log, listened=self._on_line is not None)
         self.started_s = time.monotonic()
         if self._on_line:
             self._reader = threading.Thread(target=self._read, args=(self._process, self._on_line), daemon=True)
@@ -68,10 +68,10 @@ class ChildProcess:
         code = self.code
         if code is not None and code < 0:
             return f"killed by signal {-code}"
-        last = self.last_words()
+        last = self.last_log_line()
         return f"exit code {code}" + (f": {last}" if last else "")
 
-    def last_words(self) -> str:
+    def last_log_line(self) -> str:
         """Return the last line that it wrote to its log."""
         try:
             lines = self._log.read_text(errors="replace").strip().splitlines()
@@ -79,7 +79,7 @@ class ChildProcess:
             return ""
         return lines[-1] if lines else ""
 
-    def tell_stop(self, reason: str) -> None:
+    def request_stop(self, reason: str) -> None:
         """Ask it to leave; harmless when it is gone."""
         if self._process is None or self._process.stdin is None or self._process.stdin.closed:
             return

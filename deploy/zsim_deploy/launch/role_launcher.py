@@ -74,11 +74,11 @@ class ForkedProcess:
     def _poll(self) -> int | None:
         if self._code is None:
             try:
-                found, status = os.waitpid(self.pid, os.WNOHANG)
+                pid, status = os.waitpid(self.pid, os.WNOHANG)
             except ChildProcessError:
                 self._code = UNKNOWN
             else:
-                self._code = os.waitstatus_to_exitcode(status) if found else None
+                self._code = os.waitstatus_to_exitcode(status) if pid else None
         return self._code
 
     def wait(self, timeout: float | None = None) -> int:
@@ -193,18 +193,18 @@ class RoleLauncher:
             except OSError:
                 self._stop_forkserver()
                 return None
-            heard = self._receive()
-        return int(heard) if heard else None
+            reply = self._receive()
+        return int(reply) if reply else None
 
     def _receive(self) -> bytes:
         """Return what the cradle says; nothing where it is gone or silent, and then it is asked no more."""
-        heard = b""
+        reply = b""
         if self._line is not None:
             with suppress(OSError):
-                heard = self._line.recv(REPLY_MAX)
-        if not heard:
+                reply = self._line.recv(REPLY_MAX)
+        if not reply:
             self._stop_forkserver()
-        return heard
+        return reply
 
     def _stop_forkserver(self) -> None:
         """Do without a cradle."""

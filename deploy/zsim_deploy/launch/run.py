@@ -42,7 +42,7 @@ class RunOptions:
     console: bool = False
 
 
-def _children(options: RunOptions, endpoint: str, watch: Supervisor, nursery: RoleLauncher) -> list[ChildProcess]:
+def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launcher: RoleLauncher) -> list[ChildProcess]:
     """Return the processes of a run, not started."""
     logs, file = options.out / "logs", options.out / "scenario.yaml"
     scenario, federation = options.scenario, options.scenario.federation
@@ -52,18 +52,23 @@ def _children(options: RunOptions, endpoint: str, watch: Supervisor, nursery: Ro
     pace = pace_options(options.mode, options.rate)
     world = ["world", str(file), "--listen", endpoint, "--expect", "recorder", *pace, *launched]
     record = ["record", "--out", str(options.out), *reach]
-    children = [ChildProcess("world", world, logs, nursery, watch.take_line), ChildProcess("recorder", record, logs, nursery)]
+    children = [
+        ChildProcess("world", world, logs, launcher, supervisor.handle_line),
+        ChildProcess("recorder", record, logs, launcher),
+    ]
     wanted = scenario.processes.expect
     names = [name for name in agents_of(scenario) if wanted is None or name in wanted]
     if options.hosted and names:
-        children.append(ChildProcess(names[-1], ["host", *reach, "--", *names], logs, nursery))
+        children.append(ChildProcess(names[-1], ["host", *reach, "--", *names], logs, launcher))
     else:
         # a name of the contract may begin with -
         split = [name.partition(".") for name in names]
-        children += [ChildProcess(f"{role}.{thing}", [role, *reach, "--", thing], logs, nursery) for role, _, thing in split]
+        children += [
+            ChildProcess(f"{role}.{thing}", [role, *reach, "--", thing], logs, launcher) for role, _, thing in split
+        ]
     if options.console:
         show = ["console", "--name", CONSOLE, "--port", str(_page_port()), *reach]
-        children.append(ChildProcess(CONSOLE, show, logs, nursery, watch.take_line))
+        children.append(ChildProcess(CONSOLE, show, logs, launcher, supervisor.handle_line))
     rank = {name: i for i, name in enumerate(options.order)}
     return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
 
@@ -157,26 +162,26 @@ def _run(options: RunOptions, screen: Screen) -> Outcome:
     scenario, listen = options.scenario, options.listen
     _write_scenario(options, logs=True)
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
-    with RoleLauncher(screen.say, str(options.out)) as nursery:
-        return _run_on(options, listen, screen, nursery) if listen else _run_on_free_port(options, screen, nursery)
+    with RoleLauncher(screen.say, str(options.out)) as launcher:
+        return _run_on(options, listen, screen, launcher) if listen else _run_on_free_port(options, screen, launcher)
 
 
 def _interrupt(number: int, _: object) -> None:
     raise KeyboardInterrupt(REASONS[number])
 
 
-def _run_on(options: RunOptions, endpoint: str, screen: Screen, nursery: RoleLauncher) -> Outcome:
-    watch = Supervisor(options.scenario.processes.on_death, screen)
-    watch.members = [*_children(options, endpoint, watch, nursery)]
-    return watch.run()
+def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLauncher) -> Outcome:
+    supervisor = Supervisor(options.scenario.processes.on_death, screen)
+    supervisor.members = [*_children(options, endpoint, supervisor, launcher)]
+    return supervisor.run()
 
 
-def _run_on_free_port(options: RunOptions, screen: Screen, nursery: RoleLauncher, tries: int = PORTS_TRIED) -> Outcome:
+def _run_on_free_port(options: RunOptions, screen: Screen, launcher: RoleLauncher, tries: int = PORTS_TRIED) -> Outcome:
     port = free_port(screen)
     endpoint = f"tcp/127.0.0.1:{port}"
-    outcome = _run_on(options, endpoint, screen, nursery)
+    outcome = _run_on(options, endpoint, screen, launcher)
     if tries > 1 and _lost_port(outcome, endpoint, port):
-        return _run_on_free_port(options, screen, nursery, tries - 1)
+        return _run_on_free_port(options, screen, launcher, tries - 1)
     return outcome
 
 
@@ -205,11 +210,11 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
     from zsim_world.fleet.fleet import DivergedError
 
     _write_scenario(options, logs=False)
-    leash = StopChannel(launched=False)
+    stop = StopChannel()
     try:
-        reason = fly(options.scenario, options.out / "run.mcap", leash.reason, screen)
+        reason = fly(options.scenario, options.out / "run.mcap", stop.reason, screen)
     except DivergedError as error:
         return Outcome(str(error), failed=True)
     finally:
-        leash.restore_signals()
-    return Outcome(reason, interrupted=leash.stopped())
+        stop.restore_signals()
+    return Outcome(reason, interrupted=stop.stopped())

@@ -44,8 +44,8 @@ class RunProcess(Protocol):
     def code(self) -> int | None: ...
     def start(self) -> None: ...
     def outcome(self) -> str: ...
-    def last_words(self) -> str: ...
-    def tell_stop(self, reason: str) -> None: ...
+    def last_log_line(self) -> str: ...
+    def request_stop(self, reason: str) -> None: ...
     def wait(self, timeout_s: float) -> bool: ...
     def kill(self) -> None: ...
     def close(self) -> None: ...
@@ -73,7 +73,7 @@ class Supervisor:
 
     def __init__(self, on_death: dict[str, OnDeath], show: Show) -> None:
         self.members: list[RunProcess] = []
-        self._given = on_death
+        self._on_death = on_death
         self._show = show
         self._reason = ""
         self._failed = False
@@ -83,7 +83,7 @@ class Supervisor:
         self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
         self._leaving: dict[str, tuple[RunProcess, float]] = {}  # whose place was taken, and since when (monotonic, s)
         self._gone: list[RunProcess] = []  # nobody waits for them any more
-        self._orders: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
+        self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
     def run(self, look: Callable[[], None] = lambda: None) -> Outcome:
         """Start everything, watch it to its end, leave nothing behind.
@@ -100,7 +100,7 @@ class Supervisor:
                 self._watch(look)
                 self._finish()
             finally:
-                self._refuse_orders()
+                self._cancel_requests()
                 _close([*self.members, *(child for child, _ in self._leaving.values()), *self._gone])
         return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
 
@@ -114,7 +114,7 @@ class Supervisor:
 
         return handled_by(on_signal)
 
-    def take_line(self, text: str) -> None:
+    def handle_line(self, text: str) -> None:
         """Take a line of the world's progress."""
         try:
             line = json.loads(text)
@@ -146,13 +146,13 @@ class Supervisor:
         while world.code is None:
             if self._interrupted:
                 self._reason = self._interrupted
-                world.tell_stop(self._reason)
+                world.request_stop(self._reason)
                 world.wait(min(WORLD_FIRST_S, self._left_s()))
                 return
             for child in self.members:
                 if child is not world and child.code is not None and child.name not in self._dead:
                     self._on_exit(child, world)
-            self._carry_out_orders()
+            self._carry_out_requests()
             self._see_off()
             look()
             world.wait(POLL_S)
@@ -166,7 +166,7 @@ class Supervisor:
             what comes of it, also if it fails; cancelled when the run ends before.
         """
         outcome: Future[Any] = Future()
-        self._orders.put((act, outcome))
+        self._requests.put((act, outcome))
         return outcome
 
     def interrupt(self, reason: str) -> None:
@@ -206,24 +206,24 @@ class Supervisor:
                 del self._leaving[name]
                 self._gone.append(child)
 
-    def _carry_out_orders(self) -> None:
-        while not self._orders.empty():
-            act, outcome = self._orders.get()
+    def _carry_out_requests(self) -> None:
+        while not self._requests.empty():
+            act, outcome = self._requests.get()
             if outcome.set_running_or_notify_cancel():
                 _settle(outcome, act)
 
-    def _refuse_orders(self) -> None:
-        while not self._orders.empty():
-            self._orders.get()[1].cancel()
+    def _cancel_requests(self) -> None:
+        while not self._requests.empty():
+            self._requests.get()[1].cancel()
 
     def _on_exit(self, child: RunProcess, world: RunProcess) -> None:
         """Do what on_death says of a role that ended while the world runs."""
         if child.code in (0, SUPERSEDED):
             self._dead.add(child.name)
             if child.code == SUPERSEDED:
-                self._show.say(child.last_words())
+                self._show.say(child.last_log_line())
             return
-        what = on_death(self._given, child.name)
+        what = on_death(self._on_death, child.name)
         if child.code == USER_FAULT or (what == "restart" and self._too_often(child)):
             what = "end"
         self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; on_death: {what}")
@@ -234,7 +234,7 @@ class Supervisor:
         self._dead.add(child.name)
         if what == "end":
             self._fail(f"{child.name} ended: {child.outcome()}")
-            world.tell_stop(self._reason)
+            world.request_stop(self._reason)
 
     def _too_often(self, child: RunProcess) -> bool:
         """Note a death; tell whether there were more of them in a row than a restart heals."""
@@ -249,7 +249,7 @@ class Supervisor:
         """Let everybody leave; the recorder leaves last, by itself."""
         for child in self.members:
             if self._failed or self._interrupted or child.role != "recorder":
-                child.tell_stop(self._reason)
+                child.request_stop(self._reason)
         for child in self.members:
             while not child.wait(min(POLL_S, self._left_s())) and self._left_s() > 0:
                 continue

@@ -63,8 +63,8 @@ def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | 
     """Return who this process is on the network."""
     from zsim.transport.identity import Identity
 
-    found = Identity(tls=tls, access=access, insecure=insecure)
-    return found._replace(host=host) if host else found
+    plain = Identity(tls=tls, access=access, insecure=insecure)
+    return plain._replace(host=host) if host else plain
 
 
 def load_scenario(
@@ -139,7 +139,7 @@ def _with_options(command: Callable[..., None], options: dict[str, tuple[Any, An
     """Return the command as typer is to see it: the options in place of `reach`."""
 
     @wraps(command)
-    def given(**values: Any) -> None:
+    def with_options(**values: Any) -> None:
         reach = WorldAccess(*(values.pop(name, default) for name, (_, default) in options.items()))
         command(**values, **{NAME: reach})
 
@@ -149,5 +149,5 @@ def _with_options(command: Callable[..., None], options: dict[str, tuple[Any, An
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
         for name, (annotation, default) in options.items()
     ]
-    given.__signature__ = signature.replace(parameters=[*own, *more])  # type: ignore[attr-defined]
-    return given
+    with_options.__signature__ = signature.replace(parameters=[*own, *more])  # type: ignore[attr-defined]
+    return with_options

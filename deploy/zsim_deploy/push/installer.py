@@ -34,21 +34,21 @@ class Installer:
     def __init__(self, name: str, python: str, process: "asyncssh.SSHClientProcess[str]") -> None:
         self._name, self._python, self._process = name, python, process
 
-    async def lock(self, told: Callable[[str], None]) -> None:
+    async def lock(self, progress: Callable[[str], None]) -> None:
         """Wait until nobody else installs there.
 
         Args:
-            told: hears who does.
+            progress: hears who does.
 
         Raises:
             HostsError: the folder cannot be used, or somebody installs for too long.
         """
-        said = await self._answer(START_S)
-        if holder := said.get("waits"):
-            told(f"waiting for the push of {holder}")
+        message = await self._answer(START_S)
+        if holder := message.get("waits"):
+            progress(f"waiting for the push of {holder}")
             advice = f"{holder} is pushing to it; wait for that to end, or end it there"
-            said = await self._answer(WAIT_S, advice)
-        if why := said.get("unwritable"):
+            message = await self._answer(WAIT_S, advice)
+        if why := message.get("unwritable"):
             raise HostsError(
                 f"{self._name}: its folder cannot be used ({why}); correct hosts.{self._name}.folder, or make it there"
             )
@@ -60,10 +60,10 @@ class Installer:
             HostsError: it failed, took longer, or the host is gone.
         """
         self._process.stdin.write(json.dumps({"act": act, **order}) + "\n")
-        said = await self._answer(timeout_s, f"to {act} took longer than {timeout_s:g} s; is it busy?")
-        if "error" in said:
-            raise HostsError(f"{self._name}: {said['error'][:300]}")
-        return said
+        message = await self._answer(timeout_s, f"to {act} took longer than {timeout_s:g} s; is it busy?")
+        if "error" in message:
+            raise HostsError(f"{self._name}: {message['error'][:300]}")
+        return message
 
     async def beat(self) -> None:
         """Show for ever that we live."""
@@ -76,8 +76,8 @@ class Installer:
         try:
             async with asyncio.timeout(timeout_s):
                 while line := await self._process.stdout.readline():  # a greeting of the login shell is passed over
-                    if said := json_answer([line]):
-                        return said
+                    if message := json_answer([line]):
+                        return message
                 last = (await self._process.stderr.read()).strip().splitlines() or ["says nothing; does it run there?"]
         except TimeoutError as error:
             raise HostsError(f"{self._name}: {late or f'no answer within {timeout_s:g} s; is it busy?'}") from error
@@ -85,13 +85,15 @@ class Installer:
 
 
 @contextlib.asynccontextmanager
-async def open_installer(link: HostLink, python: str, folder: str, told: Callable[[str], None]) -> AsyncIterator[Installer]:
+async def open_installer(
+    link: HostLink, python: str, folder: str, progress: Callable[[str], None]
+) -> AsyncIterator[Installer]:
     """Let the program run on a host as long as the block lasts; it alone installs there.
 
     Args:
         python: that runs it.
         folder: of zsim over there.
-        told: hears who is waited for.
+        progress: hears who is waited for.
 
     Raises:
         HostsError: the host cannot be reached, its folder not be used, or the connection breaks.
@@ -108,7 +110,7 @@ async def open_installer(link: HostLink, python: str, folder: str, told: Callabl
                 there = Installer(link.name, python, process)
                 beats = asyncio.create_task(there.beat())
                 try:
-                    await there.lock(told)
+                    await there.lock(progress)
                     yield there
                 finally:
                     beats.cancel()

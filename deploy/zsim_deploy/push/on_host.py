@@ -60,7 +60,7 @@ def _sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-class CommandError(Exception):  # noqa: N818
+class CommandError(Exception):
     """What a command says is wrong."""
 
 
@@ -167,10 +167,10 @@ def execute(folder: Path, order: dict, children: CommandRunner) -> dict:
         return {"error": str(error) if isinstance(error, (CommandError, OSError)) else repr(error)}
 
 
-def read_orders(lines: Iterable, orders: queue.SimpleQueue, heard: threading.Event) -> None:
+def read_orders(lines: Iterable, orders: queue.SimpleQueue, received: threading.Event) -> None:
     """Pass on the orders that come, and note that something came."""
     for line in lines:
-        heard.set()
+        received.set()
         if line.strip():
             orders.put(json.loads(line))
 
@@ -181,24 +181,24 @@ def exit_now(children: CommandRunner) -> None:
     os._exit(0)
 
 
-def wait_for_silence(heard: threading.Event, silent_s: float) -> None:
-    """Return when nothing was heard for so long."""
-    while heard.wait(silent_s):
-        heard.clear()
+def wait_for_silence(received: threading.Event, silent_s: float) -> None:
+    """Return when nothing was received for so long."""
+    while received.wait(silent_s):
+        received.clear()
 
 
 def main(folder: Path, who: str, silent_s: float) -> None:
     """Obey until standard input ends, or nothing has come on it for some seconds."""
-    orders, children, heard = queue.SimpleQueue(), CommandRunner(), threading.Event()
+    orders, children, received = queue.SimpleQueue(), CommandRunner(), threading.Event()
 
     def follow() -> None:
         try:
-            read_orders(sys.stdin.buffer, orders, heard)
+            read_orders(sys.stdin.buffer, orders, received)
         finally:
             exit_now(children)
 
     def watch() -> None:
-        wait_for_silence(heard, silent_s)
+        wait_for_silence(received, silent_s)
         exit_now(children)
 
     for each in (follow, watch):

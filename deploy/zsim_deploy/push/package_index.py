@@ -69,7 +69,9 @@ def _hush(_text: str) -> None:
     """Hear what is being done, and tell nobody."""
 
 
-async def download_wheels(wanted: Sequence[str], target: WheelTarget, into: Path, held: Sequence[str], told: Told = _hush) -> bool:
+async def download_wheels(
+    wanted: Sequence[str], target: WheelTarget, into: Path, held: Sequence[str], progress: Told = _hush
+) -> bool:
     """Download wheels for a target; where a project has only sources, build them here.
 
     The versions are those of this machine where there are such wheels for the target, because equal versions are a
@@ -79,7 +81,7 @@ async def download_wheels(wanted: Sequence[str], target: WheelTarget, into: Path
         wanted: requirements, as for pip.
         into: folder, for the wheels only.
         held: constraints, as for pip.
-        told: called with what is being done.
+        progress: called with what is being done.
 
     Returns:
         Whether the versions had to differ from the held ones.
@@ -93,33 +95,33 @@ async def download_wheels(wanted: Sequence[str], target: WheelTarget, into: Path
         limits = Path(aside, "constraints.txt")
         limits.write_text("\n".join(held))
         try:
-            await _fetch(fit, (*wanted, "--constraint", str(limits)), f"{aside}/same", told)
+            await _fetch(fit, (*wanted, "--constraint", str(limits)), f"{aside}/same", progress)
             return False
         except UnreachableError:
             raise
         except PipError:
-            told("looking for other versions than those here")
-            await _fetch(fit, wanted, f"{aside}/other", told)
+            progress("looking for other versions than those here")
+            await _fetch(fit, wanted, f"{aside}/other", progress)
             return True
 
 
-async def _fetch(fit: Sequence[str], wanted: Sequence[str], built: str, told: Told) -> None:
+async def _fetch(fit: Sequence[str], wanted: Sequence[str], built: str, progress: Told) -> None:
     """Download wheels; if that fails, build what has only sources into a folder, and take it from there."""
     try:
-        await pip(*fit, *wanted, told=told)
+        await pip(*fit, *wanted, progress=progress)
     except UnreachableError:
         raise
     except PipError:
-        told("building here what has only sources")
-        await pip("wheel", "--wheel-dir", built, *wanted, told=told)
-        await pip(*fit, "--find-links", built, *wanted, told=told)
+        progress("building here what has only sources")
+        await pip("wheel", "--wheel-dir", built, *wanted, progress=progress)
+        await pip(*fit, "--find-links", built, *wanted, progress=progress)
 
 
-async def pip(*arguments: str, told: Told = _hush) -> None:
+async def pip(*arguments: str, progress: Told = _hush) -> None:
     """Run pip of this Python, as the user has configured it but for how often it tries again.
 
     Args:
-        told: hears when an index does not answer.
+        progress: hears when an index does not answer.
 
     Raises:
         PipError: with its last word.
@@ -137,9 +139,9 @@ async def pip(*arguments: str, told: Told = _hush) -> None:
     try:
         async for line in process.stdout:
             lines.append(line.decode(errors="replace").strip())
-            if (found := NO_INDEX.search(lines[-1])) and not unanswered:
-                unanswered = _reason(found[1])
-                told(f"the package index does not answer ({unanswered}); asking once more")
+            if (match := NO_INDEX.search(lines[-1])) and not unanswered:
+                unanswered = _reason(match[1])
+                progress(f"the package index does not answer ({unanswered}); asking once more")
         await process.wait()
     finally:
         if process.returncode is None:
@@ -167,44 +169,46 @@ def interpreter_query() -> str:
 
 def parse_interpreters(answer: str) -> list[Interpreter]:
     """Return what `question` printed; a greeting of the login shell is passed over."""
-    found = filter(None, map(ANSWER.fullmatch, answer.splitlines()))
-    return [Interpreter(each[1], (int(each[2]), int(each[3]), int(each[4])), each[5]) for each in found]
+    matches = filter(None, map(ANSWER.fullmatch, answer.splitlines()))
+    return [Interpreter(each[1], (int(each[2]), int(each[3]), int(each[4])), each[5]) for each in matches]
 
 
-def choose_interpreter(name: str, found: Sequence[Interpreter], here: tuple[int, int]) -> Interpreter:
+def choose_interpreter(name: str, interpreters: Sequence[Interpreter], here: tuple[int, int]) -> Interpreter:
     """Return the Python to install for: the launcher's minor version if it is there, else `python3`, else the newest.
 
     Raises:
         HostsError: none is new enough.
     """
-    fit = [each for each in found if each.version[:2] >= OLDEST]
+    fit = [each for each in interpreters if each.version[:2] >= OLDEST]
     if fit:
         return max(fit, key=lambda each: (each.version[:2] == here, each.command == PLAIN, each.version))
     least = ".".join(map(str, OLDEST))
-    if not found:
+    if not interpreters:
         raise HostsError(f"{name}: has no python3; must be >= {least}; install it there")
-    version = ".".join(map(str, found[0].version))
-    raise HostsError(f"{name}: {found[0].command} is {version}; must be >= {least}; install a newer one beside it")
+    version = ".".join(map(str, interpreters[0].version))
+    raise HostsError(
+        f"{name}: {interpreters[0].command} is {version}; must be >= {least}; install a newer one beside it"
+    )
 
 
-def wheel_target(name: str, said: Mapping[str, Any]) -> WheelTarget:
+def wheel_target(name: str, facts: Mapping[str, Any]) -> WheelTarget:
     """Return what wheels for a host must fit.
 
     Args:
         name: of the host, for errors.
-        said: as on_host.py says it.
+        facts: as on_host.py says it.
 
     Raises:
         HostsError: wheels are not made for such a system.
     """
-    major, minor = said["version"]
-    if said["implementation"] != "cpython":
-        raise HostsError(f"{name}: its Python is {said['implementation']}; must be CPython; install that there")
-    platforms = _platforms(said["platform"], said["libc"])
+    major, minor = facts["version"]
+    if facts["implementation"] != "cpython":
+        raise HostsError(f"{name}: its Python is {facts['implementation']}; must be CPython; install that there")
+    platforms = _platforms(facts["platform"], facts["libc"])
     if not platforms:
-        shown = " ".join(filter(None, (said["platform"], *said["libc"])))
+        shown = " ".join(filter(None, (facts["platform"], *facts["libc"])))
         raise HostsError(f"{name}: is {shown}; must be Linux with glibc, or macOS; install zsim by hand there")
-    return WheelTarget((major, minor), f"cp{major}{minor}{'t' if said['free_threaded'] else ''}", tuple(platforms))
+    return WheelTarget((major, minor), f"cp{major}{minor}{'t' if facts['free_threaded'] else ''}", tuple(platforms))
 
 
 def _platforms(system: str, libc: Sequence[str]) -> list[str]:

@@ -22,8 +22,8 @@ from zsim.errors import HostsError, InventoryError
 from zsim_deploy.inventory.inventory import Host, InventoryFile
 from zsim_deploy.inventory.processes import MODULES, known_extras, needed_extras
 from zsim_deploy.push.installer import Installer, open_installer
-from zsim_deploy.push.package_index import choose_interpreter, parse_interpreters, interpreter_query, wheel_target
-from zsim_deploy.push.wheelhouse import WheelSet, Wheel, Wheelhouse
+from zsim_deploy.push.package_index import choose_interpreter, interpreter_query, parse_interpreters, wheel_target
+from zsim_deploy.push.wheelhouse import Wheel, Wheelhouse, WheelSet
 from zsim_deploy.roles import warm_up
 from zsim_deploy.ssh.host_link import HostLink
 from zsim_deploy.ssh.ssh_connection import shell_line
@@ -37,13 +37,15 @@ COPIES = 4  # files under way to one host at a time
 Told = Callable[[str, str], None]  # host, what is being done there
 
 
-async def push(placed: InventoryFile, names: Sequence[str], more: Iterable[str], told: Told, cache: Path) -> dict[str, bool]:
+async def push(
+    placed: InventoryFile, names: Sequence[str], more: Iterable[str], progress: Told, cache: Path
+) -> dict[str, bool]:
     """Install on hosts what their roles need.
 
     Args:
         names: of the hosts; all of the inventory if empty.
         more: extras for each of them beside those of its roles.
-        told: hears what is being done.
+        progress: hears what is being done.
         cache: folder of the wheelhouse.
 
     Returns:
@@ -61,9 +63,9 @@ async def push(placed: InventoryFile, names: Sequence[str], more: Iterable[str],
     if unknown:
         raise InventoryError(unknown)
     wanted = needed_extras(placed.inventory, more)
-    house = Wheelhouse(cache, lambda text: told(LAUNCHER, text))
+    house = Wheelhouse(cache, lambda text: progress(LAUNCHER, text))
     chosen_names = list(dict.fromkeys(names)) or list(hosts)
-    work = [_one(name, hosts[name], placed.folder, wanted[name], house, told) for name in chosen_names]
+    work = [_one(name, hosts[name], placed.folder, wanted[name], house, progress) for name in chosen_names]
     results = await asyncio.gather(*work, return_exceptions=True)
     _raise_all(results)
     return {name: result is True for name, result in zip(chosen_names, results, strict=True)}
@@ -78,19 +80,19 @@ def _raise_all(results: Sequence[Any]) -> None:
         raise HostsError("\n".join(lines))
 
 
-async def _one(name: str, host: Host, base: Path, wanted: frozenset[str], house: Wheelhouse, told: Told) -> bool:
+async def _one(name: str, host: Host, base: Path, wanted: frozenset[str], house: Wheelhouse, progress: Told) -> bool:
     """Install on one host; return whether anything had to be done."""
     if host.python:
-        told(name, f"has zsim of its own in {host.python}")
+        progress(name, f"has zsim of its own in {host.python}")
         return False
     link = HostLink(name, host, base)
     try:
-        told(name, "looking what is there")
+        progress(name, "looking what is there")
         python = await _python(link)
-        async with open_installer(link, python, host.folder, partial(told, name)) as program:
-            return await _install(HostInstallation(link, program), wanted, house, partial(told, name))
+        async with open_installer(link, python, host.folder, partial(progress, name)) as program:
+            return await _install(HostInstallation(link, program), wanted, house, partial(progress, name))
     except HostsError:
-        told(name, "failed")
+        progress(name, "failed")
         raise
     finally:
         await link.close()
@@ -98,25 +100,27 @@ async def _one(name: str, host: Host, base: Path, wanted: frozenset[str], house:
 
 async def _python(link: HostLink) -> str:
     """Return the Python of a host to install for."""
-    said = await link.run(shell_line(["sh", "-c", interpreter_query()]), timeout_s=ASK_S)
-    return choose_interpreter(link.name, parse_interpreters(said.decode(errors="replace")), sys.version_info[:2]).path
+    output = await link.run(shell_line(["sh", "-c", interpreter_query()]), timeout_s=ASK_S)
+    return choose_interpreter(link.name, parse_interpreters(output.decode(errors="replace")), sys.version_info[:2]).path
 
 
-async def _install(there: "HostInstallation", wanted: frozenset[str], house: Wheelhouse, told: Callable[[str], None]) -> bool:
+async def _install(
+    there: "HostInstallation", wanted: frozenset[str], house: Wheelhouse, progress: Callable[[str], None]
+) -> bool:
     """Install what is wanted; return whether anything had to be done."""
     await there.look()
-    needed = await house.wheel_set(there.name, wheel_target(there.name, there.found), wanted)
+    needed = await house.wheel_set(there.name, wheel_target(there.name, there.facts), wanted)
     described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
-    if is_installed(needed, there.found["installed"]):
-        told(f"{described} is there")
+    if is_installed(needed, there.facts["installed"]):
+        progress(f"{described} is there")
         return False
-    await there.copy(missing(needed, there.found), told)
-    told("installing")
+    await there.copy(missing(needed, there.facts), progress)
+    progress("installing")
     await there.install(needed)
     if any(wheel.path.name.startswith("numba-") for wheel in needed.others):
-        told("compiling what flies")
+        progress("compiling what flies")
         await there.warm_up()
-    told(f"{described} installed")
+    progress(f"{described} installed")
     return True
 
 
@@ -133,10 +137,10 @@ def _new(house: WheelSet, installed: dict[str, Any] | None) -> list[Wheel]:
     return [wheel for wheel in house.others if known.get(wheel.path.name) != wheel.sha256]
 
 
-def missing(house: WheelSet, found: dict[str, Any]) -> list[Wheel]:
+def missing(house: WheelSet, facts: dict[str, Any]) -> list[Wheel]:
     """Return the wheels that must be copied to a host, small ones last so that progress is smooth."""
-    needed = [house.project, house.pip, *_new(house, found["installed"])]
-    lacking = [wheel for wheel in needed if found["wheels"].get(wheel.path.name) != wheel.sha256]
+    needed = [house.project, house.pip, *_new(house, facts["installed"])]
+    lacking = [wheel for wheel in needed if facts["wheels"].get(wheel.path.name) != wheel.sha256]
     return sorted(lacking, key=lambda wheel: -wheel.size_bytes)
 
 
@@ -146,17 +150,17 @@ class HostInstallation:
     def __init__(self, link: HostLink, program: Installer) -> None:
         self.name = link.name
         self._link, self._program = link, program
-        self.found: dict[str, Any] = {}
+        self.facts: dict[str, Any] = {}
 
     async def look(self) -> None:
         """Find what is installed."""
-        self.found = await self._program.ask("look", ASK_S)
+        self.facts = await self._program.ask("look", ASK_S)
 
     async def install(self, house: WheelSet) -> None:
         order = {
             "project": house.project.path.name,
             "pip": house.pip.path.name,
-            "wheels": [wheel.path.name for wheel in _new(house, self.found["installed"])],
+            "wheels": [wheel.path.name for wheel in _new(house, self.facts["installed"])],
             "extras": house.extras,
             "modules": [MODULES[extra] for extra in ("", *house.extras) if extra in MODULES],
             "note": house.manifest(),
@@ -166,9 +170,9 @@ class HostInstallation:
     async def warm_up(self) -> None:
         await self._program.ask("warm_up", COMPILE_S, module=warm_up.__name__)
 
-    async def copy(self, wheels: Sequence[Wheel], told: Callable[[str], None]) -> None:
+    async def copy(self, wheels: Sequence[Wheel], progress: Callable[[str], None]) -> None:
         """Copy wheels to the host; what broke off is not mistaken for a wheel."""
-        folder = f"{self.found['folder']}/wheels"
+        folder = f"{self.facts['folder']}/wheels"
         total, done = sum(wheel.size_bytes for wheel in wheels), 0
         gate = asyncio.Semaphore(COPIES)
 
@@ -176,13 +180,13 @@ class HostInstallation:
             nonlocal done
             part, seen = f"{folder}/{wheel.path.name}.part", 0
 
-            def progress(_source: bytes, _target: bytes, copied: int, _size: int) -> None:
+            def on_copied(_source: bytes, _target: bytes, copied: int, _size: int) -> None:
                 nonlocal done, seen
                 done, seen = done + copied - seen, copied
-                told(f"copying {done / 1e6:.0f} of {total / 1e6:.0f} MB")
+                progress(f"copying {done / 1e6:.0f} of {total / 1e6:.0f} MB")
 
             async with gate:
-                await sftp.put(str(wheel.path), part, progress_handler=progress)
+                await sftp.put(str(wheel.path), part, progress_handler=on_copied)
                 await sftp.posix_rename(part, part.removesuffix(".part"))
 
         try:

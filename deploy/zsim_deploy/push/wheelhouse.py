@@ -23,7 +23,7 @@ from urllib.parse import urldefrag
 
 import zsim
 from zsim.errors import HostsError
-from zsim_deploy.push.package_index import PipError, WheelTarget, Told, UnreachableError, download_wheels, pip
+from zsim_deploy.push.package_index import PipError, Told, UnreachableError, WheelTarget, download_wheels, pip
 
 PROJECT = "zsim"
 KEY_DIGITS = 16  # 64 bits of a SHA-256; what one person builds never collides
@@ -58,11 +58,11 @@ class Wheelhouse:
 
     Args:
         folder: of the cache.
-        told: called with what is being done.
+        progress: called with what is being done.
     """
 
-    def __init__(self, folder: Path, told: Told) -> None:
-        self._folder, self._told = folder, told
+    def __init__(self, folder: Path, progress: Told) -> None:
+        self._folder, self._progress = folder, progress
         self._unreachable = ""
         self._lock = asyncio.Lock()
         self._wheels = folder / "wheels"
@@ -102,10 +102,10 @@ class Wheelhouse:
         source = str(checkout) if checkout else requirement(importlib.metadata.distribution(PROJECT))
         folder = self._folder / PROJECT / _key(_sources(checkout) if checkout else source)
         if not folder.is_dir():
-            self._told(f"building the wheel of {PROJECT}")
+            self._progress(f"building the wheel of {PROJECT}")
             with tempfile.TemporaryDirectory(dir=self._folder) as made:
                 try:
-                    await pip("wheel", "--no-deps", "--wheel-dir", f"{made}/wheel", source, told=self._told)
+                    await pip("wheel", "--no-deps", "--wheel-dir", f"{made}/wheel", source, progress=self._progress)
                 except UnreachableError:
                     raise
                 except PipError as error:
@@ -120,12 +120,14 @@ class Wheelhouse:
         names = json.loads(note.read_text()) if note.exists() else []
         return names if all((self._wheels / name).exists() for name in names) else []
 
-    async def _gather(self, host: str, key: str, project: Path, extras: Sequence[str], target: WheelTarget) -> list[str]:
-        self._told(f"gathering the wheels for {target}" + (f" with {', '.join(extras)}" if extras else ""))
+    async def _gather(
+        self, host: str, key: str, project: Path, extras: Sequence[str], target: WheelTarget
+    ) -> list[str]:
+        self._progress(f"gathering the wheels for {target}" + (f" with {', '.join(extras)}" if extras else ""))
         wanted = f"{project}[{','.join(extras)}]" if extras else str(project)
         with tempfile.TemporaryDirectory(dir=self._folder) as made:
             try:
-                other_versions = await download_wheels([wanted, PIP], target, Path(made), constraints(), self._told)
+                other_versions = await download_wheels([wanted, PIP], target, Path(made), constraints(), self._progress)
             except UnreachableError:
                 raise
             except PipError as error:
@@ -134,7 +136,7 @@ class Wheelhouse:
             for name in names:
                 os.replace(Path(made, name), self._wheels / name)
         if other_versions:
-            self._told(f"{host}: {target} gets other versions of packages than are here: not the same bits")
+            self._progress(f"{host}: {target} gets other versions of packages than are here: not the same bits")
         note = self._folder / "houses" / f"{key}.json"
         note.with_suffix(".part").write_text(json.dumps(names))
         os.replace(note.with_suffix(".part"), note)
@@ -143,11 +145,11 @@ class Wheelhouse:
 
 def _lacking(error: PipError, target: WheelTarget) -> str:
     """Return in a line which wheel does not exist, from what pip says."""
-    found = re.search(r"satisfies the requirement ([\w.-]+)", str(error))
-    if found is None:
+    match = re.search(r"satisfies the requirement ([\w.-]+)", str(error))
+    if match is None:
         return f"no wheels for {target}: {error}"
     other = "take another Python there, or build it there and give its folder to pip here (PIP_FIND_LINKS)"
-    return f"no wheel of {found[1]} for {target}; {other}"
+    return f"no wheel of {match[1]} for {target}; {other}"
 
 
 def requirements(project: Path) -> list[str]:
@@ -169,12 +171,12 @@ def requirement(installed: importlib.metadata.Distribution) -> str:
 @cache
 def constraints() -> list[str]:
     """Return the versions of what is installed here from an index."""
-    found = set()
+    versions = set()
     for each in importlib.metadata.distributions():
         name = each.metadata["Name"].lower()
         if name not in (PROJECT, PIP) and "+" not in each.version and not each.read_text("direct_url.json"):
-            found.add(f"{name}=={each.version}")
-    return sorted(found)
+            versions.add(f"{name}=={each.version}")
+    return sorted(versions)
 
 
 def _checkout() -> Path | None:

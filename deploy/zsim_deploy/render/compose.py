@@ -13,8 +13,8 @@ from zsim.scenario.scenario import Scenario
 from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.inventory.processes import (
     STOP_S,
-    ProcessFiles,
     PlannedProcess,
+    ProcessFiles,
     Rendered,
     access_file,
     command,
@@ -52,10 +52,10 @@ def render(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) 
     Raises:
         InventoryError: a process has no place, or nothing matches a pattern.
     """
-    found = processes(placed, scenario, pace)
+    planned = processes(placed, scenario, pace)
     texts: Rendered = {}
-    for host in used_hosts(found):
-        here = on_host(found, host)
+    for host in used_hosts(planned):
+        here = on_host(planned, host)
         texts[f"{host}/compose.yaml"] = document(_project(scenario, here), _remarks(placed, scenario, host))
         texts[f"{host}/Dockerfile"] = dockerfile(extras([process.name for process in here]))
         if any(process.name == WORLD for process in here):
@@ -112,16 +112,16 @@ def _words(scenario: Scenario, process: PlannedProcess) -> list[str]:
 
 
 def _volumes(process: PlannedProcess) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = [{"type": "volume", "source": CACHE_VOLUME, "target": CACHE}]
+    volumes: list[dict[str, Any]] = [{"type": "volume", "source": CACHE_VOLUME, "target": CACHE}]
     if process.name == WORLD:
-        found.append(_bind("./scenario.yaml", SCENARIO))
+        volumes.append(_bind("./scenario.yaml", SCENARIO))
     if process.name == RECORDER:
-        found.append(_bind("./runs", RUNS, read_only=False))
+        volumes.append(_bind("./runs", RUNS, read_only=False))
     if process.secure:
-        found.append(_bind(f"./certs/{process.name}", CERTIFICATES))
+        volumes.append(_bind(f"./certs/{process.name}", CERTIFICATES))
     if process.secure and process.port is not None:
-        found.append(_bind(f"./certs/{access_file(process)}", ACCESS))
-    return found
+        volumes.append(_bind(f"./certs/{access_file(process)}", ACCESS))
+    return volumes
 
 
 def _bind(source: str, target: str, read_only: bool = True) -> dict[str, Any]:

@@ -14,7 +14,15 @@ from zsim.scenario import scenario_file
 from zsim.scenario.rights import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.inventory.inventory import InventoryFile
-from zsim_deploy.inventory.processes import PlannedProcess, Rendered, access_file, extras, own_programs, processes, used_hosts
+from zsim_deploy.inventory.processes import (
+    PlannedProcess,
+    Rendered,
+    access_file,
+    extras,
+    own_programs,
+    processes,
+    used_hosts,
+)
 from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT
 from zsim_deploy.render import pod
 from zsim_deploy.render.rendered_files import RUNS, dockerfile, document, documents, unused
@@ -41,30 +49,30 @@ def render(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (), 
     Raises:
         InventoryError: a process has no place, a name is none that Kubernetes takes, or the scenario is too large.
     """
-    found = processes(placed, scenario, pace)
+    planned = processes(placed, scenario, pace)
     text = scenario_file.to_text(scenario)
-    _refuse(placed, found, text)
+    _refuse(placed, planned, text)
     space = pod.label(scenario.federation)
     texts = {
         "namespace.yaml": documents([_namespace(space), _records_claim(space)], NAMESPACE_REMARKS),
-        "zsim.yaml": documents(_run(space, scenario, text, found, image), _remarks(placed, scenario, found)),
+        "zsim.yaml": documents(_run(space, scenario, text, planned, image), _remarks(placed, scenario, planned)),
         "records.yaml": document(_records_pod(space, image), ["Mounts the records, for `kubectl cp`."]),
-        "Dockerfile": dockerfile(extras([process.name for process in found])),
+        "Dockerfile": dockerfile(extras([process.name for process in planned])),
     }
     if not placed.inventory.security.insecure:
-        texts["secrets.sh"] = _secrets(space, found)
+        texts["secrets.sh"] = _secrets(space, planned)
     return texts
 
 
-def _refuse(placed: InventoryFile, found: Sequence[PlannedProcess], text: str) -> None:
+def _refuse(placed: InventoryFile, planned: Sequence[PlannedProcess], text: str) -> None:
     """Raise an error with a line for everything that Kubernetes cannot do."""
     lines = [
         f"hosts.{host} is no name of a node; must be letters, digits, - and ., as `kubectl get nodes` says"
-        for host in used_hosts(found)
+        for host in used_hosts(planned)
         if not re.fullmatch(r"[a-z0-9]([a-z0-9.-]*[a-z0-9])?", host)
     ]
     first: dict[str, str] = {}
-    for process in found:
+    for process in planned:
         other = first.setdefault(pod.label(process.name), process.name)
         if other != process.name:
             lines.append(f"{process.name} and {other} have the same name in Kubernetes; rename a drone or cluster")
@@ -74,18 +82,18 @@ def _refuse(placed: InventoryFile, found: Sequence[PlannedProcess], text: str) -
         raise InventoryError([f"{placed.source}: {line}" for line in lines])
 
 
-def _remarks(placed: InventoryFile, scenario: Scenario, found: Sequence[PlannedProcess]) -> list[str]:
+def _remarks(placed: InventoryFile, scenario: Scenario, planned: Sequence[PlannedProcess]) -> list[str]:
     return [
         "Rendered by `zsim render kubernetes`; render again instead of editing.",
         "A Job starts a dead role again after 10 s, then after 20 s, and so on; `zsim run` does so at once.",
-        *_service_remark(placed, found),
-        *(line for host in used_hosts(found) for line in unused(placed, host)),
+        *_service_remark(placed, planned),
+        *(line for host in used_hosts(planned) for line in unused(placed, host)),
         *own_programs(placed, scenario),
     ]
 
 
-def _service_remark(placed: InventoryFile, found: Sequence[PlannedProcess]) -> list[str]:
-    world = next(process for process in found if process.name == WORLD)
+def _service_remark(placed: InventoryFile, planned: Sequence[PlannedProcess]) -> list[str]:
+    world = next(process for process in planned if process.name == WORLD)
     address = placed.inventory.hosts[world.host].address
     certified = f"The world's certificate is for {address}: over TLS that is its name, and not the Service's."
     return [certified] if world.secure else []
@@ -108,7 +116,7 @@ def _records_claim(space: str) -> dict[str, Any]:
     }
 
 
-def _secrets(space: str, found: Sequence[PlannedProcess]) -> str:
+def _secrets(space: str, planned: Sequence[PlannedProcess]) -> str:
     """Return a script that puts certificates from where `zsim certs init` left them into the cluster."""
     lines = [
         "#!/bin/sh",
@@ -119,7 +127,7 @@ def _secrets(space: str, found: Sequence[PlannedProcess]) -> str:
         f'    kubectl -n {space} create secret generic "$@" --dry-run=client -o yaml | kubectl apply -f -',
         "}",
     ]
-    for process in found:
+    for process in planned:
         files = [f'--from-file="$certs/{process.host}/{process.name}"']
         if process.port is not None:
             files.append(f'--from-file=access.json="$certs/{process.host}/{access_file(process)}"')
@@ -149,11 +157,13 @@ def _records_pod(space: str, image: str) -> dict[str, Any]:
 # A run
 
 
-def _run(space: str, scenario: Scenario, text: str, found: Sequence[PlannedProcess], image: str) -> list[dict[str, Any]]:
+def _run(
+    space: str, scenario: Scenario, text: str, planned: Sequence[PlannedProcess], image: str
+) -> list[dict[str, Any]]:
     return [
         _config(space, text),
-        *(_service(space, process) for process in found if process.name == WORLD),
-        *((_deployment if p.role == ROUTER else _job)(space, p, image) for p in found),
+        *(_service(space, process) for process in planned if process.name == WORLD),
+        *((_deployment if p.role == ROUTER else _job)(space, p, image) for p in planned),
     ]
 
 

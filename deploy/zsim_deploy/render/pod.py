@@ -6,7 +6,7 @@ from typing import Any
 
 from zsim.scenario.rights import RECORDER, WORLD
 from zsim.transport.identity import CERTIFICATES as IDENTITY_FILES
-from zsim_deploy.inventory.processes import STOP_S, ProcessFiles, PlannedProcess, command
+from zsim_deploy.inventory.processes import STOP_S, PlannedProcess, ProcessFiles, command
 from zsim_deploy.render.rendered_files import ACCESS, CACHE, CERTIFICATES, ENVIRONMENT, RUNS, SCENARIO, USER
 
 NAME_MAX = 63  # RFC 1123 label
@@ -82,29 +82,29 @@ def locked() -> dict[str, Any]:
 
 
 def _mounts(process: PlannedProcess) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = [{"name": "cache", "mountPath": CACHE}, {"name": "tmp", "mountPath": "/tmp"}]
+    mounts: list[dict[str, Any]] = [{"name": "cache", "mountPath": CACHE}, {"name": "tmp", "mountPath": "/tmp"}]
     if process.name == WORLD:
-        found.append({"name": "scenario", "mountPath": SCENARIO.rpartition("/")[0], "readOnly": True})
+        mounts.append({"name": "scenario", "mountPath": SCENARIO.rpartition("/")[0], "readOnly": True})
     if process.name == RECORDER:
-        found.append({"name": "runs", "mountPath": RUNS})
+        mounts.append({"name": "runs", "mountPath": RUNS})
     if process.secure:
-        found.append({"name": "certs", "mountPath": CERTIFICATES, "readOnly": True})
+        mounts.append({"name": "certs", "mountPath": CERTIFICATES, "readOnly": True})
     if process.secure and process.port is not None:
-        found.append({"name": "access", "mountPath": ACCESS.rpartition("/")[0], "readOnly": True})
-    return found
+        mounts.append({"name": "access", "mountPath": ACCESS.rpartition("/")[0], "readOnly": True})
+    return mounts
 
 
 def _volumes(process: PlannedProcess) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = [{"name": "cache", "emptyDir": {}}, {"name": "tmp", "emptyDir": {}}]
+    volumes: list[dict[str, Any]] = [{"name": "cache", "emptyDir": {}}, {"name": "tmp", "emptyDir": {}}]
     if process.name == WORLD:
-        found.append({"name": "scenario", "configMap": {"name": "scenario"}})
+        volumes.append({"name": "scenario", "configMap": {"name": "scenario"}})
     if process.name == RECORDER:
-        found.append(runs_volume())
+        volumes.append(runs_volume())
     if process.secure:
-        found.append(_secret_volume("certs", process, IDENTITY_FILES))
+        volumes.append(_secret_volume("certs", process, IDENTITY_FILES))
     if process.secure and process.port is not None:
-        found.append(_secret_volume("access", process, ("access.json",)))
-    return found
+        volumes.append(_secret_volume("access", process, ("access.json",)))
+    return volumes
 
 
 def _secret_volume(name: str, process: PlannedProcess, keys: Sequence[str]) -> dict[str, Any]:

@@ -60,14 +60,14 @@ def listing(target: str) -> str:
 
 def _stale(root: Path, former: Mapping[str, str], texts: Mapping[str, str]) -> list[str]:
     """Return what was rendered before, is there as it was written, and is none of the texts."""
-    found = [name for name in former if name not in texts and _inside(root, name) and (root / name).is_file()]
-    for name in found:
+    names = [name for name in former if name not in texts and _inside(root, name) and (root / name).is_file()]
+    for name in names:
         if not _is(root / name, former[name]):
             raise RunError(
                 f"{root / name}: an earlier rendering wrote it and it was changed since; "
                 "remove it, or give --out another folder"
             )
-    return found
+    return names
 
 
 def _inside(root: Path, name: str) -> bool:
@@ -164,7 +164,7 @@ ENTRYPOINT ["python"]
 
 def unused(placed: InventoryFile, host: str) -> list[str]:
     """Return a remark on what the inventory says of a host and containers do not need."""
-    given = placed.inventory.hosts[host]
-    defaults = Host(address=given.address)
-    names = [name for name in ("folder", "python") if getattr(given, name) != getattr(defaults, name)]
+    described = placed.inventory.hosts[host]
+    defaults = Host(address=described.address)
+    names = [name for name in ("folder", "python") if getattr(described, name) != getattr(defaults, name)]
     return [f"hosts.{host}: {', '.join(names)} not used, the image has its own"] if names else []

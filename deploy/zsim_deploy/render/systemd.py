@@ -16,8 +16,8 @@ from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import Host, InventoryFile
 from zsim_deploy.inventory.processes import (
     STOP_S,
-    ProcessFiles,
     PlannedProcess,
+    ProcessFiles,
     Rendered,
     access_file,
     command,
@@ -70,11 +70,11 @@ def render(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) 
     Raises:
         InventoryError: a process has no place, or a host has no user or no absolute path to its interpreter.
     """
-    found = processes(placed, scenario, pace)
-    _refuse(placed, used_hosts(found))
+    planned = processes(placed, scenario, pace)
+    _refuse(placed, used_hosts(planned))
     texts: Rendered = {}
-    for host in used_hosts(found):
-        here = on_host(found, host)
+    for host in used_hosts(planned):
+        here = on_host(planned, host)
         for process in here:
             texts[f"{host}/{unit_name(process.name)}"] = _service(placed, scenario, process, here)
         texts[f"{host}/{TARGET}"] = _target(scenario, here, own_programs(placed, scenario, host))
@@ -208,12 +208,12 @@ def _target(scenario: Scenario, here: Sequence[PlannedProcess], remarks: Sequenc
 
 def _remarks(process: PlannedProcess, host: Host) -> list[str]:
     """Return what a reader has to know that the options do not say."""
-    found = []
+    remarks = []
     if not host.folder.startswith("/"):
-        found.append(f"folder {host.folder} is taken to be in {_home(host.user or '')}; else give an absolute folder")
+        remarks.append(f"folder {host.folder} is taken to be in {_home(host.user or '')}; else give an absolute folder")
     if process.on_death == "wait":
-        found.append("on_death is wait: systemd does not start it again, time stands still until somebody does")
-    return found
+        remarks.append("on_death is wait: systemd does not start it again, time stands still until somebody does")
+    return remarks
 
 
 def _text(sections: dict[str, list[str]], remarks: Sequence[str]) -> str:

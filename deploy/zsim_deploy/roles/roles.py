@@ -19,7 +19,7 @@ from zsim.transport.connection import find_world
 from zsim.transport.identity import Identity
 from zsim_agents.hosting import chosen, hosted
 from zsim_deploy.options.arguments import WorldAccess
-from zsim_deploy.roles.stop_channel import StopChannel, key_lease
+from zsim_deploy.roles.stop_channel import StopChannel
 
 TICK_S = 0.1  # how often a router looks for a stop
 PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
@@ -28,21 +28,23 @@ PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
 def agent(build: Callable[[messages.Info, Scenario], Agent], reach: WorldAccess) -> None:
     """Run one agent against a world."""
     launched, who = reach.launched, reach.who
-    leash = StopChannel(launched is not None, key_lease(who, launched))
-    say = log_printer(launched is not None)
-    found = find_world(reach.endpoint, reach.federation, reach.wait_s, say, leash.stopped, run_id=launched, identity=who)
-    with found as (link, info):
+    stop = StopChannel(launched, who)
+    say = log_printer(launched)
+    connection = find_world(
+        reach.endpoint, reach.federation, reach.wait_s, say, stop.stopped, run_id=launched, identity=who
+    )
+    with connection as (link, info):
         made = build(info, scenario_file.from_text(info.scenario))
         check_certificate(made, who)
         say(f"{made.name}: in run {info.run_id}{_also(made)}")
         gc.collect()
         gc.freeze()
-        runner = Runner(link, info, made, leash.stopped, say, leash.orphaned)
+        runner = Runner(link, info, made, stop.stopped, say, stop.orphaned)
         reason = runner.run()
     say(f"{made.name}: left, {reason}")
     if runner.killed:
         _die()
-    leash.exit_if_terminated()
+    stop.exit_if_terminated()
 
 
 def _die() -> None:
@@ -91,18 +93,18 @@ def recorder(path: Path, reach: WorldAccess) -> None:
     from zsim_agents.recorder import record
 
     launched, who = reach.launched, reach.who
-    leash = StopChannel(launched is not None, key_lease(who, launched))
-    say = log_printer(launched is not None)
+    stop = StopChannel(launched, who)
+    say = log_printer(launched)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RecordError(f"{path.parent}: cannot be made ({error.strerror}); give --out another folder") from error
-    found = find_world(reach.endpoint, reach.federation, reach.wait_s, say, leash.stopped, True, launched, who)
-    with found as (link, info):
+    connection = find_world(reach.endpoint, reach.federation, reach.wait_s, say, stop.stopped, True, launched, who)
+    with connection as (link, info):
         say(f"recorder: run {info.run_id} into {path}")
-        reason = record(link, info, path, stopped=leash.stopped, say=say)
+        reason = record(link, info, path, stopped=stop.stopped, say=say)
     say(f"recorder: {path} is complete, {reason}")
-    leash.exit_if_terminated()
+    stop.exit_if_terminated()
 
 
 def router(
@@ -119,18 +121,18 @@ def router(
     Raises:
         SessionError: the port is taken, or a certificate, here or upstream, is refused.
     """
-    leash = StopChannel(launched is not None, key_lease(identity, launched))
-    say = log_printer(launched is not None)
+    stop = StopChannel(launched, identity)
+    say = log_printer(launched)
     with session.route(endpoint, upstream, federation, mode, identity) as link:
         say(f"router.{name}: {endpoint} leads to {upstream}")
         probe_s = 0.0
-        while not leash.stopped():
+        while not stop.stopped():
             if time.monotonic() >= probe_s and not link.links():
                 _refuse(tls.peer_fault(identity, upstream), upstream)
                 probe_s = time.monotonic() + PROBE_S
             time.sleep(TICK_S)
-    say(f"router.{name}: left, {leash.reason()}")
-    leash.exit_if_terminated()
+    say(f"router.{name}: left, {stop.reason()}")
+    stop.exit_if_terminated()
 
 
 def _refuse(fault: str | None, upstream: str) -> None:
@@ -138,11 +140,11 @@ def _refuse(fault: str | None, upstream: str) -> None:
         raise SessionError(f"cannot connect to {upstream}: {fault}")
 
 
-def log_printer(launched: bool) -> Callable[[str], None]:
+def log_printer(launched: str | None) -> Callable[[str], None]:
     """Return how a role speaks to a person: plain lines on standard error, which a launcher keeps as its log."""
 
     def say(text: str) -> None:
-        if launched:
+        if launched is not None:
             text = f"{time.strftime('%H:%M:%S')} {text}"
         print(text, file=sys.stderr, flush=True)
 

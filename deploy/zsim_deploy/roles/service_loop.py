@@ -18,7 +18,7 @@ from zsim.transport.session import Session
 from zsim_bridges.observer_process import Presence
 from zsim_deploy.options.arguments import WorldAccess
 from zsim_deploy.roles.roles import log_printer
-from zsim_deploy.roles.stop_channel import StopChannel, key_lease
+from zsim_deploy.roles.stop_channel import StopChannel
 
 ANY = "*"  # in a name, for a number
 PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits for byes
@@ -47,30 +47,30 @@ def serve_runs(name: str, serve: Serve, reach: WorldAccess) -> None:
         SupersededError: another process of the name that was given has taken over.
     """
     launched, wait_s, who = reach.launched, reach.wait_s, reach.who
-    leash = StopChannel(launched is not None, key_lease(who, launched))
-    say = log_printer(launched is not None)
-    mine, served = name, ""
+    stop = StopChannel(launched, who)
+    say = log_printer(launched)
+    own_name, served = name, ""
     try:
-        while not leash.stopped():
-            with find_world(reach.endpoint, reach.federation, wait_s, say, leash.stopped, True, launched, who) as (
+        while not stop.stopped():
+            with find_world(reach.endpoint, reach.federation, wait_s, say, stop.stopped, True, launched, who) as (
                 link,
                 info,
             ):
                 if info.run_id != served:
-                    mine = _free(link, mine)
-                    presence = Presence(link, info, mine)
-                    _serve(serve, link, presence, info, leash, say)
+                    own_name = _free(link, own_name)
+                    presence = Presence(link, info, own_name)
+                    _serve(serve, link, presence, info, stop, say)
                     served = info.run_id
                     if presence.superseded:
-                        mine, served = _next(name, presence), ""
+                        own_name, served = _next(name, presence), ""
                 else:
                     time.sleep(PAUSE_S)
             if launched:
-                leash.exit_if_terminated()
+                stop.exit_if_terminated()
                 return
             wait_s = None
     except NoWorldError:
-        if not leash.stopped():
+        if not stop.stopped():
             raise
 
 
@@ -100,11 +100,11 @@ def _next(name: str, presence: Presence) -> str:
     return f"{role}.{int(presence.name.rpartition('.')[2]) + 1}"
 
 
-def _serve(serve: Serve, link: Session, presence: Presence, info: Info, leash: StopChannel, say: Say) -> None:
+def _serve(serve: Serve, link: Session, presence: Presence, info: Info, stop: StopChannel, say: Say) -> None:
     presence.enter()
     say(f"{presence.name}: in run {info.run_id}")
-    serve(link, info, presence, leash.stopped, say)
-    reason = presence.over or leash.reason() or "stopped"
+    serve(link, info, presence, stop.stopped, say)
+    reason = presence.over or stop.reason() or "stopped"
     presence.leave(reason)
     say(f"{presence.name}: left, {reason}")
 

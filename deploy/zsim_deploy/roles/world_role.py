@@ -17,7 +17,7 @@ from zsim.runtime.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
 from zsim.scenario.scenario import Scenario
 from zsim.transport import session
 from zsim.transport.identity import Identity
-from zsim_deploy.roles.stop_channel import StopChannel, key_lease
+from zsim_deploy.roles.stop_channel import StopChannel
 
 if TYPE_CHECKING:
     from zsim.record import RecordReader
@@ -42,7 +42,7 @@ def world(
     from zsim_world.flight.world import World
     from zsim_world.server.world_process import run
 
-    leash = StopChannel(launched is not None, key_lease(identity, launched))
+    stop = StopChannel(launched, identity)
     with _patience(Teller() if launched else None):
         run_world = World(scenario, mode, rate, time.monotonic_ns, launched)
     for name in expect or ():
@@ -50,12 +50,12 @@ def world(
     gc.collect()
     gc.freeze()
     if launched:
-        run(run_world, endpoints, leash.reason, world_progress(Teller()), identity=identity)
-        leash.exit_if_terminated()
+        run(run_world, endpoints, stop.reason, world_progress(Teller()), identity=identity)
+        stop.exit_if_terminated()
         return
     with Screen(scenario.duration_s) as screen:
         listening = f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run"
-        run(run_world, endpoints, leash.reason, world_progress(screen), lambda: screen.say(listening), identity)
+        run(run_world, endpoints, stop.reason, world_progress(screen), lambda: screen.say(listening), identity)
         screen.say(f"ended: {run_world.ended}")
 
 
@@ -79,21 +79,21 @@ def _patience(teller: Teller | None) -> Iterator[None]:
 def world_progress(show: Show) -> Callable[[str, Any, str], None]:
     """Return what the world calls with its clocks, its events, and what passes it."""
     throttle, reasons = Throttle(), Reasons()
-    told = [0]
+    shown = [0]
     healths: defaultdict[str, Throttle] = defaultdict(lambda: Throttle(HEALTH_PERIOD_S))
 
-    def tell(kind: str, message: Any, about: str) -> None:
+    def show_line(kind: str, message: Any, about: str) -> None:
         if kind == "clock" and (throttle.passes() or message.state == "stopped"):
             show.clock(_clock_line(message, about))
         elif kind == "state" and (line := reasons.line(about, message)):
             show.say(line)
         elif kind == "health" and healths[about].passes():
             show.health({"name": about, "lag_ns": message.lag_ns, "received": message.received})
-        elif kind == "event" and (message.kind in VITAL or told[0] < SHOWN_EVENTS):
-            told[0] += message.kind not in QUIET
+        elif kind == "event" and (message.kind in VITAL or shown[0] < SHOWN_EVENTS):
+            shown[0] += message.kind not in QUIET
             show.event(_event_line(message))
 
-    return tell
+    return show_line
 
 
 def _clock_line(clock: messages.Clock, phase: str) -> dict[str, Any]:
@@ -136,7 +136,7 @@ class ReplayOptions(NamedTuple):
     federation: str | None = None
 
 
-def play(place: Path, wish: ReplayOptions, who: Identity) -> None:
+def play(place: Path, options: ReplayOptions, who: Identity) -> None:
     """Play a record until it is over or somebody stops it.
 
     Raises:
@@ -148,21 +148,21 @@ def play(place: Path, wish: ReplayOptions, who: Identity) -> None:
     from zsim_world.playback.playback import Playback
     from zsim_world.server.world_process import run
 
-    for expression in wish.choice.keys:
+    for expression in options.choice.keys:
         session.check_expression(expression)
-    leash = StopChannel(False, key_lease(who, None))
+    stop = StopChannel()
     with opened(place) as (reader, info, scenario):
-        _check(wish.choice.keys, reader)
-        if wish.federation is not None:
-            federation = keys.name(wish.federation, "federation")
+        _check(options.choice.keys, reader)
+        if options.federation is not None:
+            federation = keys.name(options.federation, "federation")
             scenario = msgspec.structs.replace(scenario, federation=federation)
-        playback = Playback(reader, scenario, info, wish.choice, wish.rate, time.monotonic_ns)
-        for name in wish.expect:
+        playback = Playback(reader, scenario, info, options.choice, options.rate, time.monotonic_ns)
+        for name in options.expect:
             playback.barrier.expect(name)
         with Screen(scenario.duration_s) as screen:
-            where = f"{scenario.federation!r} on {', '.join(wish.endpoints)}"
+            where = f"{scenario.federation!r} on {', '.join(options.endpoints)}"
             text = f"replay of run {info.run_id} as {where}; Ctrl-C ends it"
-            run(playback, wish.endpoints, leash.reason, world_progress(screen), lambda: screen.say(text), who)
+            run(playback, options.endpoints, stop.reason, world_progress(screen), lambda: screen.say(text), who)
             for note in record_notes(reader.complete, reader.damaged):
                 screen.say(note)
             screen.say(f"ended: {playback.ended}")

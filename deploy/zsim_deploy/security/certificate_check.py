@@ -54,17 +54,19 @@ def exposed_keys(placed: InventoryFile) -> str | None:
     return f"{keys[0]}{more} can be read by others on this machine; chmod -R go= {shlex.quote(str(folder))}"
 
 
-def _by_fault(placed: InventoryFile, folder: Path, places: Mapping[str, str] | None, now: datetime) -> dict[str, list[str]]:
+def _by_fault(
+    placed: InventoryFile, folder: Path, places: Mapping[str, str] | None, now: datetime
+) -> dict[str, list[str]]:
     """Return what is wrong, and with whose certificates, `NAME on HOST`."""
-    given = inv.spread(placed.inventory.roles, [WORLD]) if places is None else places
+    places_or_world = inv.spread(placed.inventory.roles, [WORLD]) if places is None else places
     routers = {f"{ROUTER}.{name}": router.host for name, router in placed.inventory.routers.items()}
     root = certificates.root(folder)
-    found: dict[str, list[str]] = {}
-    for name, host in {**given, **routers}.items():
+    names: dict[str, list[str]] = {}
+    for name, host in {**places_or_world, **routers}.items():
         wanted = CertificateRequest(host, name, (placed.inventory.hosts[host].address,))
         if fault := _fault(folder, root, wanted, now):
-            found.setdefault(fault, []).append(f"{name} on {host}")
-    return found
+            names.setdefault(fault, []).append(f"{name} on {host}")
+    return names
 
 
 def _fault(folder: Path, root: certificates.Root, wanted: CertificateRequest, now: datetime) -> str | None:

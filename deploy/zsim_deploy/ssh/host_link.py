@@ -151,13 +151,13 @@ class HostLink:
         return self._lines[-1]
 
     async def run(
-        self, command: str, given: bytes = b"", timeout_s: float = ANSWER_S, what: str = "", patient: bool = False
+        self, command: str, stdin: bytes = b"", timeout_s: float = ANSWER_S, what: str = "", patient: bool = False
     ) -> bytes:
         """Return what a command prints.
 
         Args:
             command: line of a POSIX shell.
-            given: its standard input.
+            stdin: its standard input.
             timeout_s: how long it may take.
             what: it does, for errors; its first word if not given.
             patient: try until the host is there; the time counts from then.
@@ -167,7 +167,7 @@ class HostLink:
         """
         async with self.channel(patient) as connection:
             try:
-                done = await asyncio.wait_for(connection.run(command, input=given, encoding=None), timeout_s)
+                done = await asyncio.wait_for(connection.run(command, input=stdin, encoding=None), timeout_s)
             except TimeoutError as error:
                 said = what or repr(command[:60])
                 raise HostsError(f"{self.name}: no answer within {timeout_s:g} s to {said}") from error

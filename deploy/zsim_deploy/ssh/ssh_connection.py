@@ -81,8 +81,8 @@ def _open(host: Host, base: Path, client: _Client) -> Any:
     )
 
 
-def _path(base: Path, given: str) -> Path:
-    return base / Path(given).expanduser()
+def _path(base: Path, path: str) -> Path:
+    return base / Path(path).expanduser()
 
 
 def _known_hosts(host: Host, base: Path) -> Path:
@@ -169,9 +169,9 @@ def json_answer(lines: Iterable[str]) -> dict[str, Any] | None:
     """Return the first JSON object among lines; None if there is none."""
     for line in lines:
         try:
-            found = json.loads(line)
+            value = json.loads(line)
         except ValueError:
             continue
-        if isinstance(found, dict):
-            return found
+        if isinstance(value, dict):
+            return value
     return None

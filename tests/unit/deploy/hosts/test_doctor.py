@@ -18,7 +18,7 @@ import pytest
 from zsim import __version__
 from zsim.errors import HostsError
 from zsim_deploy.hosts import doctor, probe
-from zsim_deploy.hosts.doctor import NetworkPath, HostReport, compare_reports, path_faults
+from zsim_deploy.hosts.doctor import HostReport, NetworkPath, compare_reports, path_faults
 from zsim_deploy.hosts.host_check import CheckResult, check_hosts
 from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
 from zsim_deploy.security import certificates
@@ -184,7 +184,7 @@ class Text:
 def test_a_greeting_of_the_login_shell_is_passed_over():
     clocks = [json.dumps({"time_ns": 10**18})] * doctor.OFFSET_ASKS
     said = "\n".join(["Welcome to lab", "17", json.dumps(SOUND), *clocks, ""])
-    assert asyncio.run(doctor.host_report(Silent(said), "python")).said == SOUND
+    assert asyncio.run(doctor.host_report(Silent(said), "python")).facts == SOUND
 
 
 def test_a_host_that_says_nothing_is_a_line(monkeypatch):
@@ -193,7 +193,7 @@ def test_a_host_that_says_nothing_is_a_line(monkeypatch):
     with pytest.raises(HostsError, match=r"^h1: no answer within 0\.01 s; "):
         asyncio.run(doctor.host_report(Silent(), "python"))
     (path,) = asyncio.run(doctor.network_paths([Silent()], Silent(), {"h1": "python"}, 7447))
-    assert path.found["error"].startswith("h1: no answer within 0.01 s; ")
+    assert path.figures["error"].startswith("h1: no answer within 0.01 s; ")
 
 
 PUSH = "run `zsim push --hosts lab.yaml`"
@@ -225,7 +225,7 @@ OR_PUSH = f"leave hosts.h1.python out and {PUSH}"
             "Traceback (most recent call last):\nMemoryError",
             "PYTHON: the probe ended with code 1 (MemoryError); is it a Python that has zsim?",
         ),
-        (None, 0, "", "PYTHON: the probe ended with code 0 (it said nothing); is it a Python that has zsim?"),
+        (None, 0, "", "PYTHON: the probe ended with code 0 (it printed nothing); is it a Python that has zsim?"),
     ],
 )
 def test_a_host_without_zsim_is_told_from_one_with_another_fault(python, code, error, line):

@@ -12,7 +12,7 @@ from rich.console import Console
 from zsim.errors import HostsError
 from zsim.scenario import scenario_file
 from zsim_deploy.hosts import host_run as module
-from zsim_deploy.hosts.host_run import HostRunOptions, HostRun
+from zsim_deploy.hosts.host_run import HostRun, HostRunOptions
 from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory import inventory
 from zsim_deploy.launch.supervisor import Outcome
@@ -67,12 +67,12 @@ def fetching(found: Any) -> Any:
 
 
 def ends_as(up: Any, outcome: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    def go(_: Any) -> Outcome:
+    def run(_: Any) -> Outcome:
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome
 
-    monkeypatch.setattr(up._watch, "go", go)
+    monkeypatch.setattr(up._supervisor, "run", run)
 
 
 @pytest.mark.parametrize("when", ["while the processes end", "while the record is fetched"])
@@ -122,6 +122,6 @@ def test_a_record_that_stays_away_fails_a_run_that_ended_well(
 def test_a_closed_terminal_ends_the_run_and_lines_are_shown_from_then_on(up: Any, board: Said) -> None:
     with board:
         up._hang_up()
-        assert up._watch.go().reason == "the terminal was closed"
+        assert up._supervisor.run().reason == "the terminal was closed"
         board.say("fetching")
     assert board.text() == "fetching\n"

@@ -11,7 +11,7 @@ import pytest
 
 from zsim.errors import HostsError
 from zsim_deploy.hosts.launcher_requests import _refuse_unless_able
-from zsim_deploy.hosts.leftover_runs import leftovers, port_faults, scp, leftover_lines
+from zsim_deploy.hosts.leftover_runs import leftover_lines, leftovers, port_faults, scp
 from zsim_deploy.inventory.inventory import Host
 from zsim_deploy.ssh.host_link import HostLink
 

@@ -107,7 +107,7 @@ def test_what_a_process_says_is_kept_and_a_greeting_of_the_shell_is_not_its_id(s
     remote = started(link, said.append)
     assert remote.wait(PATIENCE_S)
     assert (remote.pid, remote.code, said) == (77, 0, ['{"say": 1}\n'])
-    assert remote.last_words() == "here"
+    assert remote.last_log_line() == "here"
     assert (tmp_path / "estimator.d1.log").read_text() == "here\n\n"
 
 
@@ -124,7 +124,7 @@ def test_a_fault_of_whoever_takes_its_lines_ends_it(started: Start) -> None:
 def test_a_link_that_breaks_is_said(started: Start) -> None:
     remote = started(Absent(HostsError("h1: gone")))
     assert remote.wait(PATIENCE_S)
-    assert remote.outcome() == remote.last_words() == "the connection to h1 broke (h1: gone)"
+    assert remote.outcome() == remote.last_log_line() == "the connection to h1 broke (h1: gone)"
 
 
 def test_a_log_that_cannot_be_written_is_said_once_and_the_process_goes_on(started: Start, tmp_path: Path) -> None:
@@ -132,7 +132,7 @@ def test_a_log_that_cannot_be_written_is_said_once_and_the_process_goes_on(start
     log = ProcessLog(tmp_path / "gone" / "estimator.d1.log", said.append)
     remote = started(Link(Process("zsim-pid 77\n", complains=("one\n", "two\n"))), log=log)
     assert remote.wait(PATIENCE_S)
-    assert (remote.code, remote.last_words()) == (0, "two")
+    assert (remote.code, remote.last_log_line()) == (0, "two")
     assert [text.split(": ", 1)[1] for text in said] == [
         "cannot be written (No such file or directory); what it would say there is lost"
     ]

@@ -13,7 +13,7 @@ from zsim_deploy.hosts.status_table import StatusTable, table
 
 class Link:
     def __init__(self) -> None:
-        self.round_trip_s, self.heard_s, self.silent = 0.004, 1.0, 0.0
+        self.round_trip_s, self.answered_s, self.silent = 0.004, 1.0, 0.0
 
     def silent_s(self) -> float:
         return self.silent
@@ -65,23 +65,23 @@ def test_who_is_waited_for_is_said(board):
 
 def test_a_silent_host_is_named_once_with_its_roles_and_once_when_it_is_back(board):
     board.links["h1"].silent = 1.5
-    board.look()
-    board.look()
+    board.report_silent_hosts()
+    board.report_silent_hosts()
     assert said(board).count("host h1 does not answer (since 1.5 s); on it: estimator.d1") == 1
     assert board.rows()[0]["state"] == "host silent 2 s"
     assert board.rows()[0]["round_trip_ms"] is None
     board.links["h1"].silent = 0.0
-    board.look()
+    board.report_silent_hosts()
     assert said(board).count("host h1 answers again") == 1
 
 
 def test_what_always_answers_late_is_not_silent(board):
     board.links["h1"].round_trip_s, board.links["h1"].silent = 1.2, 1.2
-    board.look()
+    board.report_silent_hosts()
     assert "does not answer" not in said(board)
     assert board.rows()[0]["state"] == "running"
     board.links["h1"].silent = 4.0
-    board.look()
+    board.report_silent_hosts()
     assert "host h1 does not answer (since 4.0 s)" in said(board)
 
 

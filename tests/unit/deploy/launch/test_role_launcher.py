@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from zsim import __version__
-from zsim_deploy.launch import role_launcher as nursery_module
+from zsim_deploy.launch import role_launcher as module
 from zsim_deploy.launch.role_launcher import ForkedProcess, RoleLauncher, RoleProcess
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="roles are forked on Linux alone")
@@ -26,7 +26,7 @@ def quiet(_: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def nursery() -> Iterator[RoleLauncher]:
+def role_launcher() -> Iterator[RoleLauncher]:
     with RoleLauncher(quiet, "a run") as made:
         yield made
 
@@ -36,9 +36,9 @@ def log(tmp_path: Path) -> Path:
     return tmp_path / "role.log"
 
 
-def start(nursery: RoleLauncher, log: Path, *arguments: str, listened: bool = False) -> RoleProcess:
+def start(role_launcher: RoleLauncher, log: Path, *arguments: str, listened: bool = False) -> RoleProcess:
     with log.open("a") as file:
-        return nursery.start([*arguments], file, listened)
+        return role_launcher.start([*arguments], file, listened)
 
 
 def await_words(log: Path) -> None:
@@ -57,8 +57,8 @@ def end(*roles: RoleProcess) -> None:
                 pipe.close()
 
 
-def test_what_a_role_prints_and_its_exit_code_come_back(nursery: RoleLauncher, log: Path) -> None:
-    role = start(nursery, log, "--version", listened=True)
+def test_what_a_role_prints_and_its_exit_code_come_back(role_launcher: RoleLauncher, log: Path) -> None:
+    role = start(role_launcher, log, "--version", listened=True)
     assert role.stdout is not None
     assert role.stdout.read() == f"zsim {__version__}\n"
     assert role.wait(END_S) == role.poll() == 0
@@ -66,23 +66,23 @@ def test_what_a_role_prints_and_its_exit_code_come_back(nursery: RoleLauncher, l
     end(role)
 
 
-def test_what_is_wrong_is_in_its_log(nursery: RoleLauncher, log: Path) -> None:
-    role = start(nursery, log, "estimator")
+def test_what_is_wrong_is_in_its_log(role_launcher: RoleLauncher, log: Path) -> None:
+    role = start(role_launcher, log, "estimator")
     assert role.wait(END_S) == 2
     assert "missing argument" in log.read_text()
     end(role)
 
 
-def test_without_a_reader_what_it_prints_goes_to_the_log(nursery: RoleLauncher, log: Path) -> None:
-    role = start(nursery, log, "--version")
+def test_without_a_reader_what_it_prints_goes_to_the_log(role_launcher: RoleLauncher, log: Path) -> None:
+    role = start(role_launcher, log, "--version")
     role.wait(END_S)
     assert role.stdout is None
     assert log.read_text() == f"zsim {__version__}\n"
     end(role)
 
 
-def test_a_role_that_is_killed_says_so_by_its_code(nursery: RoleLauncher, log: Path) -> None:
-    role = start(nursery, log, *WAITING)
+def test_a_role_that_is_killed_says_so_by_its_code(role_launcher: RoleLauncher, log: Path) -> None:
+    role = start(role_launcher, log, *WAITING)
     assert role.poll() is None
     with pytest.raises(subprocess.TimeoutExpired):
         role.wait(0.0)
@@ -92,8 +92,8 @@ def test_a_role_that_is_killed_says_so_by_its_code(nursery: RoleLauncher, log: P
     end(role)
 
 
-def test_it_is_a_child_of_its_own_session_under_its_own_name(nursery: RoleLauncher, log: Path) -> None:
-    role = start(nursery, log, *WAITING)
+def test_it_is_a_child_of_its_own_session_under_its_own_name(role_launcher: RoleLauncher, log: Path) -> None:
+    role = start(role_launcher, log, *WAITING)
     await_words(log)
     seen = psutil.Process(role.pid)
     assert seen.ppid() == psutil.Process().pid
@@ -101,8 +101,8 @@ def test_it_is_a_child_of_its_own_session_under_its_own_name(nursery: RoleLaunch
     end(role)
 
 
-def test_no_role_holds_the_pipes_of_another(nursery: RoleLauncher, log: Path) -> None:
-    first, second = (start(nursery, log, *WAITING, listened=True) for _ in range(2))
+def test_no_role_holds_the_pipes_of_another(role_launcher: RoleLauncher, log: Path) -> None:
+    first, second = (start(role_launcher, log, *WAITING, listened=True) for _ in range(2))
     assert first.stdin is not None
     assert first.stdout is not None
     first.stdin.close()
@@ -112,8 +112,8 @@ def test_no_role_holds_the_pipes_of_another(nursery: RoleLauncher, log: Path) ->
     end(first, second)
 
 
-def test_it_heeds_what_it_is_told(nursery: RoleLauncher, log: Path) -> None:
-    role = start(nursery, log, *WAITING)
+def test_it_heeds_what_it_is_told(role_launcher: RoleLauncher, log: Path) -> None:
+    role = start(role_launcher, log, *WAITING)
     await_words(log)
     assert role.stdin is not None
     role.stdin.write("stop it is enough\n")
@@ -123,10 +123,10 @@ def test_it_heeds_what_it_is_told(nursery: RoleLauncher, log: Path) -> None:
     end(role)
 
 
-def test_where_its_cradle_fails_a_role_is_started_as_a_program(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(nursery_module, "CRADLE", (sys.executable, "-c", "pass"))
-    with RoleLauncher(quiet) as nursery:
-        roles = [start(nursery, log, "--version") for _ in range(2)]
+def test_where_the_fork_server_fails_a_role_is_started_as_a_program(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "FORKSERVER", (sys.executable, "-c", "pass"))
+    with RoleLauncher(quiet) as role_launcher:
+        roles = [start(role_launcher, log, "--version") for _ in range(2)]
         assert all(isinstance(role, subprocess.Popen) for role in roles)
         assert [role.wait(END_S) for role in roles] == [0, 0]
         end(*roles)
@@ -135,23 +135,25 @@ def test_where_its_cradle_fails_a_role_is_started_as_a_program(log: Path, monkey
 
 @LINUX
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_cradle_that_dies_or_stands_is_done_without(number: int, log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(nursery_module, "ANSWER_S", 0.2)
-    with RoleLauncher(quiet) as nursery:
-        assert nursery._forkserver is not None
-        os.kill(nursery._forkserver.pid, number)
-        role = start(nursery, log, "--version", listened=True)
+def test_a_fork_server_that_dies_or_stands_is_done_without(
+    number: int, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "ANSWER_S", 0.2)
+    with RoleLauncher(quiet) as role_launcher:
+        assert role_launcher._forkserver is not None
+        os.kill(role_launcher._forkserver.pid, number)
+        role = start(role_launcher, log, "--version", listened=True)
         assert isinstance(role, subprocess.Popen)
         assert role.wait(END_S) == 0
-        assert nursery._forkserver.poll() is not None
+        assert role_launcher._forkserver.poll() is not None
         end(role)
 
 
 @LINUX
 def test_a_role_of_which_the_launcher_does_not_know_never_begins(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with RoleLauncher(quiet) as nursery:
-        monkeypatch.setattr(nursery, "_heard", lambda: b"")
-        role = start(nursery, log, "--version")
+    with RoleLauncher(quiet) as role_launcher:
+        monkeypatch.setattr(role_launcher, "_receive", lambda: b"")
+        role = start(role_launcher, log, "--version")
         assert role.wait(END_S) == 0
         end(role)
     assert log.read_text() == f"zsim {__version__}\n"  # once: the one that was forked has printed nothing
@@ -159,11 +161,11 @@ def test_a_role_of_which_the_launcher_does_not_know_never_begins(log: Path, monk
 
 @LINUX
 def test_a_command_that_is_too_long_for_a_packet_is_no_matter(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with RoleLauncher(quiet) as nursery:
-        monkeypatch.setattr(nursery_module, "PACKET_MAX", 5)
-        role = start(nursery, log, "--version")
+    with RoleLauncher(quiet) as role_launcher:
+        monkeypatch.setattr(module, "PACKET_MAX", 5)
+        role = start(role_launcher, log, "--version")
         monkeypatch.undo()
-        again = start(nursery, log, "--version")
+        again = start(role_launcher, log, "--version")
         assert [isinstance(each, ForkedProcess) for each in (role, again)] == [False, True]
         assert [each.wait(END_S) for each in (role, again)] == [0, 0]
         end(role, again)
@@ -181,21 +183,21 @@ def test_one_within_another_leaves_it_its_children(log: Path) -> None:
 
 
 @LINUX
-def test_a_cradle_ends_with_its_launcher() -> None:
-    code = "import time\nfrom zsim_deploy.launch.role_launcher import Nursery\n"
-    code += "with Nursery(lambda _: None) as nursery: print(nursery._cradle.pid, flush=True); time.sleep(100)"
+def test_the_fork_server_ends_with_its_launcher() -> None:
+    code = "import time\nfrom zsim_deploy.launch.role_launcher import RoleLauncher\n"
+    code += "with RoleLauncher(lambda _: None) as roles: print(roles._forkserver.pid, flush=True); time.sleep(100)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as launcher:
         assert launcher.stdout is not None
-        cradle = psutil.Process(int(launcher.stdout.readline()))
+        forkserver = psutil.Process(int(launcher.stdout.readline()))
         launcher.kill()
-    cradle.wait(END_S)
+    forkserver.wait(END_S)
 
 
 def test_what_takes_long_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
-    monkeypatch.setattr(nursery_module, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
     with RoleLauncher(said.append):
-        assert said == [nursery_module.PATIENCE] or sys.platform != "linux"
+        assert said == [module.PATIENCE] or sys.platform != "linux"
 
 
 @LINUX
@@ -203,12 +205,12 @@ def test_ctrl_c_while_it_loads_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -
     def interrupt(_: RoleLauncher) -> bytes:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(RoleLauncher, "_heard", interrupt)
-    nursery = RoleLauncher(quiet)
-    with pytest.raises(KeyboardInterrupt), nursery:
+    monkeypatch.setattr(RoleLauncher, "_receive", interrupt)
+    role_launcher = RoleLauncher(quiet)
+    with pytest.raises(KeyboardInterrupt), role_launcher:
         pass
-    assert nursery._forkserver is not None
-    assert nursery._forkserver.poll() is not None
+    assert role_launcher._forkserver is not None
+    assert role_launcher._forkserver.poll() is not None
 
 
 def test_an_exit_code_that_somebody_else_took_is_no_error() -> None:

@@ -50,10 +50,10 @@ class Member:
     def outcome(self) -> str:
         return f"exit code {self.code}"
 
-    def last_words(self) -> str:
+    def last_log_line(self) -> str:
         return f"{self.name}: last words"
 
-    def tell_stop(self, reason: str) -> None:
+    def request_stop(self, reason: str) -> None:
         self.stopped_for = reason
 
     def kill(self) -> None:
@@ -199,7 +199,7 @@ def test_an_order_that_comes_too_late_is_not_carried_out():
     team = Team(Member("estimator.d1"))
     done = []
     late = []
-    team.recorder.tell_stop = team.others[0].tell_stop = lambda reason: late.append(
+    team.recorder.request_stop = team.others[0].request_stop = lambda reason: late.append(
         team.watch.submit(lambda: done.append(1))
     )  # type: ignore[method-assign]
     team.go(lambda: team.watch.interrupt("ended by zsim down"))
@@ -253,5 +253,5 @@ def test_a_run_that_is_ended_before_it_starts_starts_nobody():
 @pytest.mark.parametrize("text", ["1234\n", "[1]\n", "null\n", "Welcome\n"])
 def test_what_is_no_progress_is_passed_over(text):
     team = Team()
-    team.watch.take_line(text)
+    team.watch.handle_line(text)
     assert team.show.said == []

@@ -24,7 +24,11 @@ def given(decorate: Any, *arguments: str) -> tuple[WorldAccess, str, int]:
 
 
 def test_a_command_that_looks_waits_a_little_and_one_that_takes_part_for_ever():
-    assert given(observer_options, "clock") == (WorldAccess(DEFAULT_ENDPOINT, "zsim", LOOK_S, None, False, None), "clock", 1)
+    assert given(observer_options, "clock") == (
+        WorldAccess(DEFAULT_ENDPOINT, "zsim", LOOK_S, None, False, None),
+        "clock",
+        1,
+    )
     assert given(participant_options, "clock", "--count", "3")[0].wait_s is None
 
 

@@ -39,9 +39,9 @@ TALKS = """
 import signal, sys
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever runs the tests may be under nohup
 from pathlib import Path
-from zsim_deploy.options.terminal import Signals
+from zsim_deploy.options.terminal import EndSignals
 told = []
-with Signals(Path(sys.argv[1]), lambda: told.append(1)):
+with EndSignals(Path(sys.argv[1]), lambda: told.append(1)):
     print("ready", flush=True)
     while not told:
         sys.stdin.readline()

@@ -5,7 +5,13 @@ import subprocess
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy.push.package_index import Interpreter, choose_interpreter, parse_interpreters, interpreter_query, wheel_target
+from zsim_deploy.push.package_index import (
+    Interpreter,
+    choose_interpreter,
+    interpreter_query,
+    parse_interpreters,
+    wheel_target,
+)
 
 HERE = (3, 11)
 SAID = {
@@ -24,9 +30,15 @@ def found(**versions: str) -> list[Interpreter]:
 
 
 def test_the_launchers_minor_version_is_taken_then_python3_then_the_newest() -> None:
-    assert choose_interpreter("h", found(python3="3.13.2", python3_12="3.12.1", python3_11="3.11.9"), HERE).command == "python3.11"
+    assert (
+        choose_interpreter("h", found(python3="3.13.2", python3_12="3.12.1", python3_11="3.11.9"), HERE).command
+        == "python3.11"
+    )
     assert choose_interpreter("h", found(python3="3.12.1", python3_13="3.13.0"), HERE).command == "python3"
-    assert choose_interpreter("h", found(python3="3.9.2", python3_12="3.12.1", python3_13="3.13.0"), HERE).command == "python3.13"
+    assert (
+        choose_interpreter("h", found(python3="3.9.2", python3_12="3.12.1", python3_13="3.13.0"), HERE).command
+        == "python3.13"
+    )
 
 
 def test_a_python_that_is_too_old_is_a_line() -> None:

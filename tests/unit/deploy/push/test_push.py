@@ -20,7 +20,7 @@ from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
 from zsim_deploy.push import on_host
 from zsim_deploy.push.installer import open_installer
 from zsim_deploy.push.push import ASK_S, is_installed, missing, push
-from zsim_deploy.push.wheelhouse import WheelSet, Wheel
+from zsim_deploy.push.wheelhouse import Wheel, WheelSet
 from zsim_deploy.ssh.host_link import HostLink
 
 

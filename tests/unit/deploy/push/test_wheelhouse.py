@@ -17,7 +17,7 @@ import pytest
 from zsim.errors import HostsError
 from zsim_deploy.push import package_index, wheelhouse
 from zsim_deploy.push.package_index import PipError, WheelTarget, download_wheels, pip, wheel_target
-from zsim_deploy.push.wheelhouse import WheelSet, Wheelhouse, requirement
+from zsim_deploy.push.wheelhouse import Wheelhouse, WheelSet, requirement
 
 BACKEND = """
 # A build backend without dependencies: a wheel with one module.

@@ -187,7 +187,9 @@ def test_certificates_are_for_who_has_tls_and_access_control_for_who_listens(
 
 
 @ALL
-def test_the_pace_is_the_world_s_and_routers_know_of_realtime(target: str, hosts: InventoryFile, step: Scenario) -> None:
+def test_the_pace_is_the_world_s_and_routers_know_of_realtime(
+    target: str, hosts: InventoryFile, step: Scenario
+) -> None:
     found = READ[target](TARGETS[target](hosts, step, ["--realtime", "--rate", "2.0"]))
     assert {name for name, (_, words) in found.items() if "--realtime" in words} == {"world", "router.yard"}
     assert {name: option(words, "--rate") for name, (_, words) in found.items() if "--rate" in words} == {
@@ -196,7 +198,9 @@ def test_the_pace_is_the_world_s_and_routers_know_of_realtime(target: str, hosts
 
 
 @ALL
-def test_the_world_has_the_scenario_and_waits_for_the_recorder(target: str, hosts: InventoryFile, step: Scenario) -> None:
+def test_the_world_has_the_scenario_and_waits_for_the_recorder(
+    target: str, hosts: InventoryFile, step: Scenario
+) -> None:
     texts = TARGETS[target](hosts, step)
     words = READ[target](texts)["world"][1]
     assert words[0] == "world"
@@ -531,7 +535,9 @@ def files(out: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("target", ["systemd", "compose"])
-def test_nothing_of_an_earlier_rendering_is_left(target: str, hosts: InventoryFile, step: Scenario, tmp_path: Path) -> None:
+def test_nothing_of_an_earlier_rendering_is_left(
+    target: str, hosts: InventoryFile, step: Scenario, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     call(tmp_path, target)
     former = set(files(out))

@@ -13,15 +13,14 @@ ROLE = """
 import os, sys, time
 from pathlib import Path
 from zsim.transport.identity import Identity
-from zsim_deploy.roles.stop_channel import Leash
-from zsim_deploy.roles.stop_channel import lent
+from zsim_deploy.roles.stop_channel import StopChannel
 folder = Path(sys.argv[1])
-leash = Leash(True, lent(Identity(tls=folder), "run1"))
+stop = StopChannel("run1", Identity(tls=folder))
 print("ready", flush=True)
-while not leash.pulled():
+while not stop.stopped():
     time.sleep(0.001)
-print(leash.deserted(), (folder / "key.pem").exists(), flush=True)
-os._exit(0) if leash.deserted() else sys.exit(0)
+print(stop.orphaned(), (folder / "key.pem").exists(), flush=True)
+os._exit(0) if stop.orphaned() else sys.exit(0)
 """
 
 
@@ -34,7 +33,7 @@ def key(tmp_path: Path) -> Path:
 
 
 def role(key: Path, given: str) -> list[str]:
-    """Run a process that lives until it is told to stop, or deserted; return what it says."""
+    """Run a process that lives until it is stopped, or orphaned; return what it prints."""
     command = [sys.executable, "-c", ROLE, str(key.parent)]
     done = subprocess.run(command, input=given, capture_output=True, text=True, timeout=60.0, check=True)
     return done.stdout.split()

@@ -16,7 +16,7 @@ from zsim_deploy.cli.cli import app
 from zsim_deploy.hosts.host_check import check_hosts
 from zsim_deploy.inventory import inventory
 from zsim_deploy.security import certificates
-from zsim_deploy.security.certificate_check import exposed_keys, certificate_faults
+from zsim_deploy.security.certificate_check import certificate_faults, exposed_keys
 from zsim_deploy.security.certificates import issue
 from zsim_deploy.security.enrolment import CertificateRequest
 

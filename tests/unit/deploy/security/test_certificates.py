@@ -16,7 +16,7 @@ from zsim.errors import RunError
 from zsim.transport.identity import Identity
 from zsim.transport.tls import own_fault
 from zsim_deploy.security import certificates
-from zsim_deploy.security.certificates import DAYS, renewal_reason, issue
+from zsim_deploy.security.certificates import DAYS, issue, renewal_reason
 from zsim_deploy.security.enrolment import CertificateRequest
 
 NOW = datetime(2026, 11, 1, 12, tzinfo=UTC)
@@ -33,7 +33,9 @@ def read(path: Path) -> x509.Certificate:
 
 
 def test_a_certificate_names_process_and_addresses_and_is_good_for_a_month(tmp_path: Path, signer) -> None:
-    made = read(issue(tmp_path, signer, CertificateRequest("h1", "world", ("10.0.0.1", "lab.local")), NOW) / "certificate.pem")
+    made = read(
+        issue(tmp_path, signer, CertificateRequest("h1", "world", ("10.0.0.1", "lab.local")), NOW) / "certificate.pem"
+    )
     names = made.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value == "world"
     assert [str(name) for name in names.get_values_for_type(x509.IPAddress)] == ["10.0.0.1", "127.0.0.1", "::1"]
@@ -96,8 +98,13 @@ def test_a_certificate_is_made_anew_when_it_would_not_do(tmp_path: Path, signer)
     assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW) == "new"
     place = issue(tmp_path, signer, ESTIMATOR, NOW)
     assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW) is None
-    assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR._replace(addresses=("10.0.0.2",)), NOW) == "other addresses"
-    assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW + timedelta(days=DAYS)) == "expired on 2026-12-01"
+    assert (
+        renewal_reason(tmp_path, signer.certificate, ESTIMATOR._replace(addresses=("10.0.0.2",)), NOW)
+        == "other addresses"
+    )
+    assert (
+        renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW + timedelta(days=DAYS)) == "expired on 2026-12-01"
+    )
     (place / "certificate.pem").write_text("nothing")
     assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW) == "cannot be read"
 

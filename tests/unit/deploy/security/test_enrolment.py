@@ -16,7 +16,7 @@ from zsim.errors import BadNameError, InventoryError, RunError
 from zsim.scenario import rights, scenario_file
 from zsim_deploy.cli.cli import app
 from zsim_deploy.inventory import inventory
-from zsim_deploy.security.enrolment import Enrolment, CertificateRequest, access_control
+from zsim_deploy.security.enrolment import CertificateRequest, Enrolment, access_control
 
 SCENARIO = """
 name: enrolled
@@ -57,7 +57,9 @@ def enrolment(folder: Path, *operators: str) -> Enrolment:
 def test_world_and_routers_have_one_certificate_and_who_may_move_has_one_for_every_host(folder: Path) -> None:
     wanted = enrolment(folder, "main", "anna@hut").certificates()
     assert [each for each in wanted if each.process == "world"] == [CertificateRequest("lab", "world", ("10.0.0.1",))]
-    assert [each for each in wanted if each.process == "router.hill"] == [CertificateRequest("hut", "router.hill", ("hut.local",))]
+    assert [each for each in wanted if each.process == "router.hill"] == [
+        CertificateRequest("hut", "router.hill", ("hut.local",))
+    ]
     for process in ("recorder", "estimator.drone1", "estimator.drone2", "controller.main"):
         assert [each for each in wanted if each.process == process] == [
             CertificateRequest("lab", process, ("10.0.0.1",)),

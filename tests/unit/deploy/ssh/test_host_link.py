@@ -13,7 +13,7 @@ import pytest
 from zsim.errors import HostsError
 from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
 from zsim_deploy.ssh import host_link
-from zsim_deploy.ssh.host_link import CHANNELS, HostLink, EventLoopThread
+from zsim_deploy.ssh.host_link import CHANNELS, EventLoopThread, HostLink
 from zsim_deploy.ssh.host_links import HostLinks
 
 FILES = {"identity/world/key.pem": b"secret\n", "scenario.yaml": b"name: one\n" * 5000}
