@@ -1,10 +1,10 @@
-"""The process from which roles are forked: it has imported what they need, and loaded what is compiled.
+"""The fork server: it has imported what roles need and loaded what is compiled, and forks a role for each request.
 
-Standard input is a socket of sequenced packets from the launcher. When all is loaded this process says so in a packet.
-From then on each packet from the launcher is the arguments of a `zsim` command as a JSON list, with four open files:
-the role's standard input, output and error, and one from which it reads a byte before it begins. The answer is the
-role's process number. The role is a child of the launcher, not of this process, which ends as soon as the launcher
-closes the socket, or dies. A role that the launcher has not heard of is never told to begin, and ends too.
+Standard input is a socket of sequenced packets from the launcher. When all is loaded the fork server sends READY. From
+then on each packet from the launcher is the arguments of a `zsim` command as a JSON list, with four open files: the
+role's standard input, output and error, and one from which it reads a byte before it begins. The answer is the role's
+process number. The role is a child of the launcher, not of this process, which ends as soon as the launcher closes the
+socket, or dies. A role whose number has not reached the launcher never gets that byte, and ends too.
 """
 
 import ctypes
@@ -20,7 +20,7 @@ from typing import Any
 
 READY = b"ready"
 PACKET_MAX = 1 << 17  # bytes, of a command line
-FILES = 4  # standard input, output, error, and the word to go
+FILES = 4  # standard input, output, error, and the byte to begin
 ARG_START, ARG_END = 47, 48  # fields of /proc/self/stat, proc(5), counted from 0
 PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15  # linux/prctl.h
 
@@ -29,7 +29,7 @@ def main() -> int | None:
     """Fork roles until the launcher has no more to ask; in a role, run it."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # not inherited by what is forked
-    _show_as("cradle", [sys.executable, "-m", "zsim_deploy.cli.forkserver", *sys.argv[1:2]])
+    _show_as("forkserver", [sys.executable, "-m", "zsim_deploy.cli.forkserver", *sys.argv[1:2]])
     launcher = socket.socket(fileno=os.dup(0))
     _prepare()
     launcher.send(READY)
@@ -40,14 +40,14 @@ def main() -> int | None:
         pid = _fork()
         if not pid:
             launcher.close()
-            return _live(json.loads(packet), files)
+            return _run_role(json.loads(packet), files)
         for file in files:
             os.close(file)
         launcher.send(str(pid).encode())
 
 
 def _prepare() -> None:
-    """Import what roles import, and load what they run: who cannot, says why when it is started."""
+    """Import what roles import, and load what they run; a role for which that fails reports it when it is started."""
     with suppress(Exception):
         import zsim_agents.recorder  # noqa: F401
         from zsim_deploy.cli import cli
@@ -80,8 +80,8 @@ def _fork() -> int:
     return 0
 
 
-def _live(arguments: list[str], files: list[int]) -> int | None:
-    """Be the role, once the launcher knows of it."""
+def _run_role(arguments: list[str], files: list[int]) -> int | None:
+    """Run the role, once the launcher has its number."""
     *standard, go = files
     if not os.read(go, 1):
         return None
@@ -99,7 +99,7 @@ def _live(arguments: list[str], files: list[int]) -> int | None:
 
 
 def _renew_streams() -> None:
-    """Let Python find out what kind of files its standard streams are now."""
+    """Open Python's standard streams again: their files are others now."""
     how: dict[str, Any] = {"encoding": sys.stdout.encoding, "closefd": False}
     sys.stdin = os.fdopen(0, errors=sys.stdin.errors, **how)
     sys.stdout = os.fdopen(1, "w", errors=sys.stdout.errors, **how)
@@ -107,7 +107,7 @@ def _renew_streams() -> None:
 
 
 def _show_as(name: str, command: list[str]) -> None:
-    """Let `ps` and `pgrep -f` show a command line, as far as there is room for it: that of this process was longer."""
+    """Let `ps` and `pgrep -f` show a command line, cut to the length of the one of this process."""
     with suppress(OSError, ValueError, IndexError):
         fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         start, end = (int(fields[i - 2]) for i in (ARG_START, ARG_END))

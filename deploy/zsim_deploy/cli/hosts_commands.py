@@ -1,6 +1,4 @@
-"""The commands of a run on several hosts.
-
-TODO The command `zsim push`."""
+"""The commands of a run on several hosts: push, doctor, up, ps, logs, restart, move, down."""
 
 import codecs
 import contextlib

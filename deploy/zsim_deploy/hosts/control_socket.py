@@ -58,7 +58,7 @@ class ControlSocket:
             self._socket.close()
             os.close(self._lock)
             raise RunError(f"{self._path}: cannot listen there ({_reason(error, self._path)})") from error
-        self._thread = threading.Thread(target=self._serve, name="intercom", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name="control socket", daemon=True)
         self._thread.start()
 
     def _serve(self) -> None:
@@ -67,7 +67,7 @@ class ControlSocket:
                 connection, _ = self._socket.accept()
             except OSError:
                 return
-            threading.Thread(target=self._answer, args=(connection,), name="intercom answer", daemon=True).start()
+            threading.Thread(target=self._answer, args=(connection,), name="control answer", daemon=True).start()
 
     def _answer(self, connection: socket.socket) -> None:
         with connection, contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""What `zsim ps`, `logs`, `restart`, `move` and `down` ask of the `zsim up` that runs."""
+"""The requests of `zsim ps`, `logs`, `restart`, `move` and `down`, carried out by the `zsim up` that runs."""
 
 import threading
 import time
@@ -29,7 +29,7 @@ ORDER_S = 5.0  # until the supervisor, which looks every 50 ms, carries out an o
 
 
 class LauncherRequests:
-    """Answers what is asked, each in a thread of the intercom's.
+    """Carries out requests, each in a thread of the control socket.
 
     Args:
         plan: where everything is at first.

@@ -1,6 +1,4 @@
-"""What runs whose launcher was killed, or could not fetch their record, have left on a host.
-
-TODO Whether the ports on which a run listens are free on a host, before anything is started there."""
+"""What other runs have left on a host: records and keys of runs that were cut short, and ports still in use."""
 
 import shlex
 from collections.abc import Iterable, Sequence

@@ -1,10 +1,8 @@
-"""One process of a run on another host, over ssh: started, watched, told to stop, its last words kept.
+"""One process of a run on another host, over ssh: started, watched, stopped, its output kept in a file here.
 
 The process has our end of the ssh channel as standard input. It ends when that closes, which sshd does when the
-launcher dies; and when it has heard nothing on it for ORPHAN_S, as when the launcher's host is gone (leash.py).
-
-
-TODO What a process on another host says, kept in a file here."""
+launcher dies; and when nothing came on it for ORPHAN_S, as when the launcher's host is gone (roles/stop_channel.py).
+"""
 
 import asyncio
 import contextlib

@@ -1,6 +1,4 @@
-"""What all targets share: which processes a run has, where each one runs, and its command line.
-
-TODO Which extras of the distribution a host needs for the roles that an inventory gives it."""
+"""The processes of a run on the hosts of an inventory: where each runs, its command line, the extras that it needs."""
 
 import importlib.metadata
 from collections.abc import Iterable, Sequence

@@ -1,10 +1,8 @@
-"""Where the roles of a run come from: forked from one process that has everything imported, which is far cheaper.
+"""The roles of a run as child processes: forked from a process that has everything imported, which is far cheaper.
 
-Roles are children of this process either way. Only Linux can do it; elsewhere, and if that process is gone or does not
-answer, a role is started as any other program.
-
-
-TODO A role that a cradle has forked for this process, with the face of a `subprocess.Popen`."""
+Roles are children of this process either way. Only Linux can do it; elsewhere, and if the fork server is gone or does
+not answer, a role is started as any other program.
+"""
 
 import ctypes
 import json
@@ -28,11 +26,11 @@ SINGLE_THREADED = {
 }  # matrices of a dozen rows: threads only cost, and would compete with the other roles
 FORKSERVER = (sys.executable, "-m", "zsim_deploy.cli.forkserver")
 COMMAND = (sys.executable, "-m", "zsim_deploy.cli")
-ROOM = " " * 1024  # behind the cradle's command line: each role writes its own there
+ROOM = " " * 1024  # behind the fork server's command line: each role writes its own there
 PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # linux/prctl.h
 PACKET_MAX = 1 << 17  # bytes, of a command line; a thousand names of drones are half of it
-REPLY_MAX = 32  # bytes, of what a cradle says: that it is ready, and then process numbers
-ANSWER_S = 5.0  # a cradle that is ready answers within 20 ms, unless it is stopped
+REPLY_MAX = 32  # bytes, of an answer: READY, or a process number
+ANSWER_S = 5.0  # the fork server answers within 20 ms, unless it is stopped
 PATIENCE_S = 3.0  # what is compiled is loaded within two, unless the machine is busy
 PATIENCE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
 POLL_S = 0.01  # how often one looks whether it has ended
@@ -112,8 +110,8 @@ class RoleLauncher:
     """Starts roles. To be entered by the main thread, which then waits until they can be started.
 
     Args:
-        say: told what takes long.
-        run: what the run is known by, shown beside the cradle in lists of processes.
+        say: takes a line on what takes long.
+        run: what the run is known by, shown by `ps` for the fork server.
     """
 
     def __init__(self, say: Callable[[str], None], run: str = "") -> None:
@@ -150,7 +148,7 @@ class RoleLauncher:
             return self._fork(arguments, log, listened) or _spawn(arguments, log, listened)
 
     def _start_forkserver(self) -> None:
-        """Start the cradle, and wait until it has loaded everything."""
+        """Start the fork server, and wait until it has loaded everything."""
         self._line, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with other:
             quiet, environment = subprocess.DEVNULL, {**SINGLE_THREADED, **os.environ}
@@ -166,7 +164,7 @@ class RoleLauncher:
             timer.cancel()
 
     def _fork(self, arguments: Sequence[str], log: IO[str], listened: bool) -> ForkedProcess | None:
-        """Return None where the cradle cannot do it."""
+        """Return None where the fork server cannot do it."""
         packet = json.dumps(list(arguments)).encode()
         if self._line is None or len(packet) > PACKET_MAX:
             return None
@@ -184,7 +182,7 @@ class RoleLauncher:
         return ForkedProcess(pid, os.fdopen(stdin.write, "w"), os.fdopen(stdout.read) if stdout else None)
 
     def _request_fork(self, packet: bytes, files: Sequence[int]) -> int | None:
-        """Return the number of the process that the cradle has forked; it lives only when it is told to go."""
+        """Return the number of the process that was forked; it waits for a byte before it begins."""
         assert self._line is not None
         self._line.settimeout(ANSWER_S)
         with _subreaper():
@@ -197,7 +195,7 @@ class RoleLauncher:
         return int(reply) if reply else None
 
     def _receive(self) -> bytes:
-        """Return what the cradle says; nothing where it is gone or silent, and then it is asked no more."""
+        """Return an answer; empty where the fork server is gone or silent, and then it is stopped."""
         reply = b""
         if self._line is not None:
             with suppress(OSError):
@@ -207,7 +205,7 @@ class RoleLauncher:
         return reply
 
     def _stop_forkserver(self) -> None:
-        """Do without a cradle."""
+        """End the fork server; roles are started as programs from now on."""
         if self._line is not None:
             self._line.close()
             self._line = None

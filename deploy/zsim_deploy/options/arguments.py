@@ -1,6 +1,4 @@
-"""Options that several commands share.
-
-TODO The options by which a command reaches a world, the same for all that do."""
+"""Options that several commands share, and those by which a command connects to a world."""
 
 import math
 from pathlib import Path

@@ -1,8 +1,4 @@
-"""The signals by which a person or a system asks for an end, and what is said of them.
-
-TODO What ends `zsim up` from outside, in whatever it does: SIGTERM as Ctrl-C, and a terminal that is closed.
-
-TODO A report made while the terminal says how far it is, and its table."""
+"""The terminal of a command: signals that end it, a terminal that is closed, a report made under a progress line."""
 
 import contextlib
 import os

@@ -1,6 +1,7 @@
-"""Wheels from a package index, by pip as the user has configured it on the launcher's machine.
+"""Wheels for a host from a package index: which Python and platform they must fit, and pip run to download them.
 
-TODO Which Python of a host zsim is installed for, and what pip is asked for then. Pure."""
+pip runs on the launcher's machine, as the user has configured it there.
+"""
 
 import asyncio
 import os

@@ -1,6 +1,4 @@
-"""`zsim push`: install zsim on the hosts of an inventory, over ssh alone; the hosts need no internet.
-
-TODO What is being done to each host: a line per host that changes on a terminal, a line per stage elsewhere."""
+"""`zsim push`: install zsim on the hosts of an inventory, over ssh alone; the hosts need no internet."""
 
 import asyncio
 import os

@@ -1,12 +1,8 @@
-"""The folder that a rendering is written into: what an earlier one left there goes, and nothing else does.
+"""What all renderings share: the folder that they are written into, YAML for people, and the image of a container.
 
-A list beside the files says which ones a rendering wrote, as `sha256sum` does: a file that somebody has put there or
-has changed since is never removed.
-
-
-TODO YAML that people read: block style, fields in the order given, long texts as they stand, remarks on top.
-
-TODO What Compose and Kubernetes share: the image, and where a process finds its files in it."""
+A list beside the files holds their digests, as `sha256sum` prints them: a later rendering removes what an earlier one
+wrote, and never a file that somebody else put there or has changed since.
+"""
 
 import contextlib
 import hashlib

@@ -1,6 +1,4 @@
-"""Processes that let others in: they stay when a run ends, and serve the next.
-
-TODO Who goes first where two processes want the same processor: those for whom a gate waits."""
+"""Processes that serve one run after the other, such as the console and the gateway, and their priority."""
 
 import os
 import sys

@@ -21,7 +21,7 @@ from zsim.transport.identity import KEY, Identity
 from zsim_deploy.options.terminal import IMPATIENT, INTERRUPTED, REASONS
 
 TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it
-GRACE_S = 4.0  # a role that was told to stop and hangs is ended; the world waits 5 s for byes only if unstopped
+GRACE_S = 4.0  # a role that hangs after a request to stop is ended; the world waits 5 s for byes only if unstopped
 FOLDER = "identity"  # in the folder of a run on a host; the certificates of its processes are below
 
 

@@ -1,6 +1,4 @@
-"""Who needs a certificate, and whom each listening process lets in: from an inventory and a scenario. Pure.
-
-TODO Zenoh's access control out of the rights of roles. Pure.
+"""Who needs a certificate, and which rights each listening process grants: from an inventory and a scenario. Pure.
 
 Zenoh judges at the process that listens (the world, a router), by the common name in the certificate of the other
 side, both ways: what comes in from it and what goes out to it. An expression is allowed if a rule's includes it.
@@ -34,9 +32,9 @@ _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("ingress", ("liveliness_query", "declare_liveliness_subscriber"), "watches"),
     ("egress", ("liveliness_token",), "watches"),
 )
-# That somebody listens or answers is told to all: without it nothing is sent. What is said is not in it.
-_TOLD = ("declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
-_MESSAGES = (*_TOLD, "put", "delete", "query", "reply", "liveliness_token")
+# Declarations go to all, for without them nothing is sent; they hold no payload.
+_DECLARATIONS = ("declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
+_MESSAGES = (*_DECLARATIONS, "put", "delete", "query", "reply", "liveliness_token")
 
 
 def folder_of(placed: InventoryFile) -> Path:
@@ -173,7 +171,7 @@ def _rules(name: str, right: Rights, federation: str) -> Iterator[dict[str, Any]
         expressions = getattr(right, field)
         if expressions:
             yield _rule(name, (flow,), messages, expressions, federation)
-    yield _rule(name, ("egress",), _TOLD, rights.EVERYTHING, federation)
+    yield _rule(name, ("egress",), _DECLARATIONS, rights.EVERYTHING, federation)
 
 
 def _rule(

@@ -1,6 +1,4 @@
-"""The launcher's ways to all hosts of a run.
-
-TODO A file brought home from a host, for as long as something comes."""
+"""The ssh links to all hosts of a run, and a file copied from a host to here."""
 
 import asyncio
 from collections.abc import Callable, Coroutine, Iterable

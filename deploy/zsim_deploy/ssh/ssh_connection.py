@@ -1,8 +1,7 @@
 """Connections to the hosts of an inventory over ssh; every failure is one line: host, what failed, what to do.
 
-TODO Words for a POSIX shell on another host.
-
-TODO What a program of ours says on a host as a JSON line, among what the login shell there may say. Pure."""
+Beside them the words of a command line for the shell over there, and the JSON line that a program of ours answers.
+"""
 
 import asyncio
 import getpass
