@@ -65,7 +65,7 @@ def check_console_installed() -> None:
     """Refuse where what the page is made of is not installed.
 
     Raises:
-        RunError: says what to install.
+        RunError: with what to install.
     """
     from importlib.util import find_spec
 

@@ -97,7 +97,7 @@ def run(
 
 
 def _refuse_with_others(realtime: bool, rate: float | None, listen: str | None, hosted: bool, console: bool) -> None:
-    """Refuse what says nothing to a run in one process."""
+    """Refuse options that have no meaning for a run in one process."""
     options = {
         "--realtime": realtime,
         "--rate": rate is not None,

@@ -118,7 +118,7 @@ def ask(
 
 @contextmanager
 def connected(reach: WorldAccess) -> Iterator[tuple["Session", "Info"]]:
-    """Yield a session to the federation's hub, and what its world says of the run."""
+    """Yield a session to the federation's hub, and the `world/info` of its run."""
     from zsim.transport.connection import find_world
 
     say = partial(print, file=sys.stderr)

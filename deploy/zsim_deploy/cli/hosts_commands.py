@@ -106,7 +106,7 @@ def logs(
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what is written from now on.")] = False,
     federation: Federation = "zsim",
 ) -> None:
-    """Print what a process of the run that is up has said; what the world tells is shown by `zsim up` itself."""
+    """Print the log of a process of the run that is up; progress and events are shown by `zsim up` itself."""
     from zsim.errors import RunError
     from zsim_deploy.hosts import control_socket
 
@@ -139,12 +139,12 @@ def _written(path: Path, follow: bool, goes_on: Callable[[], bool]) -> Iterator[
 
 
 def _silent(role: str) -> str:
-    """Return why there is nothing of a role."""
+    """Return why the log of a role is empty."""
     from zsim.scenario.rights import WORLD
 
     if role == WORLD:
-        return "world has had no fault to tell; its progress and events are shown by `zsim up`, and are in the record"
-    return f"{role} has said nothing yet"
+        return "world has logged nothing; its progress and events are shown by `zsim up`, and are in the record"
+    return f"{role} has logged nothing yet"
 
 
 def _is_up(federation: str, out: str) -> bool:

@@ -14,16 +14,16 @@ from zsim.contract import batch, keys, messages
 from zsim.errors import DecodeError, RunError
 from zsim.transport.session import Mailbox, Sample, Session, check_expression
 
-LISTEN_S = 1.0  # wall time that `keys` listens: every key of the contract that lives speaks at least once a second
+LISTEN_S = 1.0  # wall time that `keys` listens: every live key of the contract has a message at least once a second
 PACKET_S = 0.05  # wait between two looks into an empty mailbox
 LINE_S = 1.0  # between two lines of `hz`
-SILENCE_S = 1.0  # from which on a key that spoke is said to be silent; later where its own gaps are longer
+SILENCE_S = 1.0  # after which a key with messages is reported as silent; later where its own gaps are longer
 PUB, ASK = "zsim.pub", "zsim.ask"
 COMMANDS = "drone/*/cmd/*"
 
 
 def list_keys(link: Session, listen_s: float = LISTEN_S) -> list[tuple[str, str, int]]:
-    """Return (key, message, messages received) of everything that speaks or answers within `listen_s`."""
+    """Return (key, message, messages received) of every key with a message or an answer within `listen_s`."""
     counts: Counter[str] = Counter()
     for expression in (keys.INFO, keys.CLOCK, "drone/*/truth", "drone/*/estimate", "cluster/*/state"):
         counts.update({sample.key: 0 for sample in link.get(expression)})

@@ -36,7 +36,7 @@ Inventory = Annotated[
 FIRST_OPERATOR = "main"
 DAYS_MIN = 0.05  # an hour, longer than a flight
 DAYS_MAX = 825.0  # what browsers took at most; CA/Browser Forum, ballot 193
-WARN = timedelta(days=3)  # before a certificate ends, when `show` says so
+WARN = timedelta(days=3)  # before a certificate ends, when `show` warns
 rendering = typer.Typer(
     name="render", help="Write systemd units, compose files or manifests for an inventory.", no_args_is_help=True
 )

@@ -148,7 +148,7 @@ def _check(command: str, needs: dict[str, str]) -> None:
     """Refuse to begin without what is needed.
 
     Raises:
-        RunError: says what to install.
+        RunError: with what to install.
     """
     missing = {module: extra for module, extra in needs.items() if find_spec(module) is None}
     if missing:

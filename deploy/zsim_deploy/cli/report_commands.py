@@ -19,7 +19,7 @@ app = typer.Typer()
 
 
 def conclude(outcome: Any, out: Path, report: bool) -> None:
-    """Say how a run ended, make its report, and end with the exit code that tells it."""
+    """Print how a run ended, make its report, and end with the exit code for it."""
     if outcome.failed or outcome.interrupted:
         print(f"ended: {outcome.reason}", file=sys.stderr)
     recorded = (out / "run.mcap").exists()

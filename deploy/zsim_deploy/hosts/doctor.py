@@ -22,14 +22,14 @@ PERFORMANCE = {"performance"}
 ABOUT_S = 20.0  # wall time to say everything; a small computer takes 5 s to import numpy
 READY_S = 20.0  # wall time to listen; as long as to import numpy
 REACH_S = 60.0  # wall time to measure a path; 9 pings and at most 9 bulks take 40 s at a round trip of 2 s
-NO_MODULE = "no module named"  # what Python says, in lower case
+NO_MODULE = "no module named"  # in Python's error, in lower case
 NO_PROGRAM = ("not found", "no such file")  # what shells say, in lower case …
 NO_PROGRAM_CODES = (126, 127)  # … and the codes with which they end; POSIX, 2.8.2
-OFFSET_ASKS = 3  # the answer with the shortest round trip says the clock's offset best
+OFFSET_ASKS = 3  # the answer with the shortest round trip gives the clock's offset best
 
 
 class HostReport(NamedTuple):
-    """What a host says of itself, and what asking it showed."""
+    """The facts of a host by its own probe, and what asking it showed."""
 
     facts: dict[str, Any]
     round_trip_s: float
@@ -53,7 +53,7 @@ async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostR
 
     Args:
         python: interpreter there that has zsim.
-        hosts: the inventory, as it is told.
+        hosts: the inventory's path, for remedies.
 
     Raises:
         HostsError: it has no zsim, or cannot be asked.
@@ -92,7 +92,7 @@ class _EndedError(HostsError):
 
     Attributes:
         status: exit code.
-        last: line that it said.
+        last: line that it printed.
     """
 
     def __init__(self, status: int | None, last: str) -> None:
@@ -107,7 +107,7 @@ class _Probe:
         self._process = process
 
     async def answer(self) -> dict[str, Any]:
-        """Return what it says next; a greeting of the login shell is passed over.
+        """Return its next message; a greeting of the login shell is passed over.
 
         Raises:
             _EndedError: it has ended.
@@ -120,7 +120,7 @@ class _Probe:
         raise _EndedError(self._process.exit_status, last[-1][:200])
 
     async def ask(self) -> dict[str, Any]:
-        """Send it a line and return what it says then."""
+        """Send it a line and return its answer."""
         self._process.stdin.write("\n")
         return await self.answer()
 
@@ -244,7 +244,7 @@ def _path_fault(path: NetworkPath) -> str:
     another = "give another port in the inventory"
     match path.figures.get("taken"):
         case True:
-            what = f"in use there, perhaps by another run; end that (`ss -ltnp` there tells who), or {another}"
+            what = f"in use there, perhaps by another run; end that (`ss -ltnp` there shows it), or {another}"
             return f"{path.target}: port {path.port} is {what}"
         case False:
             return f"{path.target}: nothing may listen on port {path.port} there ({why}); {another}"

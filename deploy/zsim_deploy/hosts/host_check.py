@@ -1,4 +1,4 @@
-"""A check-up of all hosts of an inventory at once: what each says, how each reaches the others, as tables."""
+"""All hosts of an inventory checked at once: the report of each, how each reaches the others, as tables."""
 
 import asyncio
 import shlex
@@ -92,7 +92,7 @@ def _hosts_table(reports: dict[str, doctor.HostReport]) -> Table:
             ", ".join(facts["governors"]) or "-",
             facts["fingerprint"][:8],
         )
-        shown.add_row(*map(Text, cells))  # what a host says may have brackets
+        shown.add_row(*map(Text, cells))  # a host's answer may have brackets
     return shown
 
 

@@ -80,7 +80,7 @@ class HostPlan:
         return f"{self.folder(self.host(RECORDER))}/{RECORD}"
 
     def way_to_record(self) -> str:
-        """Return where the record is, and how it is fetched by hand, as a person is told."""
+        """Return where the record is, and the command that fetches it."""
         name = self.host(RECORDER)
         command = scp(self._placed.inventory.hosts[name], self._placed.folder, self.record())
         return f"{name}:{self.record()} (fetch it with `{command}`)"

@@ -52,7 +52,7 @@ class HostRunOptions:
 
 
 class HostInspection(NamedTuple):
-    """What a look at a host has found: what it says, ports that are taken, and what earlier runs have left."""
+    """A host before the run: its report, ports that are taken, and what earlier runs have left."""
 
     report: HostReport
     taken: list[str]

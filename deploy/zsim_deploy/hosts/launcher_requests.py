@@ -20,7 +20,7 @@ from zsim_deploy.ssh.host_link import EventLoopThread, HostLink
 from zsim_deploy.ssh.host_links import HostLinks
 from zsim_deploy.ssh.ssh_connection import shell_word
 
-JOIN_S = 60.0  # until a host that was not used so far is connected and has said that it fits
+JOIN_S = 60.0  # until a host that was not used so far is connected and found to fit
 IMPORT_S = 20.0  # until a Python has shown that it can run a role; a small computer takes 5 s
 BRING_S = 30.0  # until a certificate is on a host
 LEAVE_S = 20.0  # until a process whose place was taken a moment ago has ended, which takes a second
@@ -32,7 +32,7 @@ class LauncherRequests:
     """Carries out requests, each in a thread of the control socket.
 
     Args:
-        plan: where everything is at first.
+        plan: at first; it changes with each move.
         links: to the hosts.
         loop: on which they live.
         supervisor: over the processes.

@@ -23,7 +23,7 @@ for run in *; do
 done
 true
 """
-# Run there by its Python: `- ADDRESS PORT...`. What else may be wrong with a port, its process says itself.
+# Run there by its Python: `- ADDRESS PORT...`. What else may be wrong with a port is in the log of its process.
 TRY_PORTS = """
 import errno, json, socket, sys
 address, taken = sys.argv[1], []

@@ -1,4 +1,4 @@
-"""What a host says of itself, and how well it reaches another: run there by `zsim doctor`, a JSON line each.
+"""The facts of a host, and how well it reaches another: run there by `zsim doctor`, a JSON line each.
 
 python -m zsim_deploy.hosts.probe about FOLDER           then, for each line that comes, its clock
 python -m zsim_deploy.hosts.probe serve PORT             until standard input ends
@@ -27,7 +27,7 @@ GOVERNORS = "/sys/devices/system/cpu"  # Linux, cpufreq
 PINGS = 9
 SIZE_BYTES = 8  # of the size that comes before what is sent
 BULKS_BYTES = tuple(16_384 << power for power in range(9))  # up to 4 MB, which take 0.3 s on a link of 100 Mbit/s
-BULK_S = 1.0  # a bulk that takes so long is long enough to tell the bandwidth
+BULK_S = 1.0  # a bulk that takes so long is long enough to measure the bandwidth
 CHUNK_BYTES = 65_536
 PATIENCE_S = 10.0  # wall time; the least bulk takes so long at 13 kbit/s, and no other is sent unless half took 1 s
 SERVE_S = 60.0  # a server that nobody needs any more ends by itself
@@ -64,13 +64,13 @@ def _nearest(folder: Path) -> Path:
 
 
 def clock(requests: TextIO) -> None:
-    """Tell the wall clock for each line that comes."""
+    """Print the wall clock for each line that comes."""
     for _ in requests:
         print(json.dumps({"time_ns": time.time_ns()}), flush=True)
 
 
 def governors(folder: Path) -> list[str]:
-    """Return the CPU governors in use; none where the system does not tell."""
+    """Return the CPU governors in use; none where the system does not show them."""
     names = set()
     for path in folder.glob("cpu[0-9]*/cpufreq/scaling_governor"):
         try:
@@ -141,7 +141,7 @@ def _bits_per_s(link: socket.socket, round_trip_s: float) -> float:
 
 
 def _send_s(link: socket.socket, size: int) -> float:
-    """Return how long it takes to send so many bytes and to hear that they are there."""
+    """Return how long it takes to send so many bytes and to have them confirmed."""
     start_s = time.monotonic()
     link.sendall(size.to_bytes(SIZE_BYTES, "big") + bytes(size))
     if not link.recv(len(DONE)):
@@ -150,7 +150,7 @@ def _send_s(link: socket.socket, size: int) -> float:
 
 
 def main() -> None:
-    """Do what the command line says."""
+    """Run the command of the command line."""
     match sys.argv[1:]:
         case ["about", folder]:
             print(json.dumps(about(Path(folder).expanduser().absolute())), flush=True)

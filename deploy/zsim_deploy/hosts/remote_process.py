@@ -30,11 +30,11 @@ PID = "zsim-pid "  # begins the line with its process id; a login shell may say 
 
 
 class ProcessLog:
-    """A file of lines; where it cannot be written, that is said once, and only the last line is kept.
+    """The log file of a process; where it cannot be written, that is reported once, and only the last line is kept.
 
     Args:
         path: of the file, named after the process.
-        say: told when it cannot be written.
+        say: takes a line when it cannot be written.
 
     Attributes:
         last: line that is not empty.
@@ -67,8 +67,8 @@ class RemoteProcess:
         link: to the host.
         python: interpreter there that has zsim.
         loop: on which the link lives.
-        log: for what it says.
-        on_line: told every line of its standard output; None sends that to the log too.
+        log: of its output.
+        on_line: takes every line of its standard output; None sends that to the log too.
         folder: of the run there.
         files: what it needs below that folder and takes away when it ends; brought again whenever it is started again.
     """
@@ -231,7 +231,7 @@ class RemoteProcess:
 
 
 async def _pid(output: "asyncssh.SSHReader[str]") -> int:
-    """Return the process id that the shell says, 0 if it ends without."""
+    """Return the process id that the shell prints, 0 if it ends without."""
     async for line in output:
         if line.startswith(PID):
             return int(line.removeprefix(PID))

@@ -152,7 +152,7 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
             row["role"],
             row["host"],
             str(row["pid"] or "-"),
-            Text(row["state"]),  # it may hold what a process said, with brackets
+            Text(row["state"]),  # it may hold output of a process, with brackets
             _figure(row["lag_ms"], "{:.0f} ms"),
             _figure(row["messages_per_s"], "{:.0f}"),
             _figure(row["round_trip_ms"], "{:.1f} ms"),

@@ -99,7 +99,7 @@ def load(path: Path) -> InventoryFile:
 
 
 def insecure(placed: InventoryFile) -> InventoryFile:
-    """Return an inventory as if it said `security: {insecure: true}`."""
+    """Return an inventory with `security: {insecure: true}`."""
     security = msgspec.structs.replace(placed.inventory.security, insecure=True)
     return placed._replace(inventory=msgspec.structs.replace(placed.inventory, security=security))
 
@@ -155,7 +155,7 @@ def roles(scenario: Scenario) -> list[str]:
 
 
 def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:
-    """Return the host of every process of a scenario, as `spread` says.
+    """Return the host of every process of a scenario, by the rule of `spread`.
 
     Raises:
         InventoryError: a process has no place, or nothing matches a pattern.
@@ -192,7 +192,7 @@ def spread(roles: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict
 
 
 def entry(roles: Mapping[str, Name | list[Name]], name: str) -> str | None:
-    """Return the entry that says where a process runs; None if there is none."""
+    """Return the entry that places a process; None if there is none."""
     matching = [key for key in roles if fnmatch.fnmatchcase(name, key)]
     return max(matching, key=lambda key: (key == name, len(key)), default=None)
 

@@ -37,7 +37,7 @@ class PlannedProcess(NamedTuple):
         thing: that name, of a drone, a cluster or a router; None where the command takes none.
         port: on which it listens, None if it does not.
         secure: whether it has a certificate.
-        on_death: what the scenario says.
+        on_death: of the scenario.
     """
 
     name: str
@@ -54,7 +54,7 @@ class PlannedProcess(NamedTuple):
 
 
 class ProcessFiles(NamedTuple):
-    """Where a process finds its files, as its command line says it.
+    """Where a process finds its files, as its command line has them.
 
     Attributes:
         scenario: the scenario's file.

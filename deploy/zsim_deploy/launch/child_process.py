@@ -1,4 +1,4 @@
-"""One launched process: started, watched, told to stop, its last words kept."""
+"""One process of a run on this host: started, watched, stopped, its output kept in a log."""
 
 import subprocess
 import threading
@@ -17,7 +17,7 @@ class ChildProcess:
         arguments: of the `zsim` command.
         logs: folder for its standard error.
         launcher: where it is started.
-        on_line: told every line of its standard output; None sends that to the log too.
+        on_line: takes every line of its standard output; None sends that to the log too.
     """
 
     def __init__(

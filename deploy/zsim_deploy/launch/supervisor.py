@@ -81,7 +81,7 @@ class Supervisor:
         self._until_s: float | None = None
         self._dead: set[str] = set()
         self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
-        self._leaving: dict[str, tuple[RunProcess, float]] = {}  # whose place was taken, and since when (monotonic, s)
+        self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and since when (monotonic, s)
         self._gone: list[RunProcess] = []  # nobody waits for them any more
         self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
@@ -105,7 +105,7 @@ class Supervisor:
         return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
 
     def _interrupts(self) -> AbstractContextManager[None]:
-        """Take Ctrl-C and SIGTERM as a wish to end the run well; a second Ctrl-C does not wait."""
+        """Take Ctrl-C and SIGTERM as a request to end the run in order; a second Ctrl-C does not wait."""
 
         def on_signal(number: int, _: object) -> None:
             if self._interrupted:
@@ -153,7 +153,7 @@ class Supervisor:
                 if child is not world and child.code is not None and child.name not in self._dead:
                     self._on_exit(child, world)
             self._carry_out_requests()
-            self._see_off()
+            self._release_replaced()
             look()
             world.wait(POLL_S)
         if world.code != 0:
@@ -179,7 +179,7 @@ class Supervisor:
         Raises:
             RunError: another one is taking that place at this moment; the last to come would not be the last to join.
         """
-        self._see_off()
+        self._release_replaced()
         if self.is_being_replaced(new.name):
             raise RunError(f"{new.name} is being taken over already; try again when its former process has ended")
         index = next(i for i, child in enumerate(self.members) if child.name == new.name)
@@ -195,7 +195,7 @@ class Supervisor:
         """Tell whether a process is taking the place of another that has not left yet; callable from any thread."""
         return name in self._leaving
 
-    def _see_off(self) -> None:
+    def _release_replaced(self) -> None:
         """Let go of those that have left their place; kill one that hangs there."""
         for name, (child, since_s) in list(self._leaving.items()):
             hangs = child.code is None and time.monotonic() - since_s > TAKE_OVER_S
@@ -217,7 +217,7 @@ class Supervisor:
             self._requests.get()[1].cancel()
 
     def _on_exit(self, child: RunProcess, world: RunProcess) -> None:
-        """Do what on_death says of a role that ended while the world runs."""
+        """Apply on_death to a role that ended while the world runs."""
         if child.code in (0, SUPERSEDED):
             self._dead.add(child.name)
             if child.code == SUPERSEDED:
@@ -237,7 +237,7 @@ class Supervisor:
             world.request_stop(self._reason)
 
     def _too_often(self, child: RunProcess) -> bool:
-        """Note a death; tell whether there were more of them in a row than a restart heals."""
+        """Count a death; return whether there were too many in a row for another restart."""
         deaths = self._deaths[child.name]
         deaths.append(time.monotonic())
         return len(deaths) > RESTARTS_MAX and deaths[-1] - deaths[0] < RESTART_WINDOW_S
@@ -266,7 +266,7 @@ class Supervisor:
 
 
 def _settle(outcome: Future[Any], act: Callable[[], Any]) -> None:
-    """Carry out an order; whatever goes wrong is told to who gave it, and the run goes on."""
+    """Carry out a request; whatever goes wrong goes to its future, and the run goes on."""
     try:
         outcome.set_result(act())
     except Exception as error:

@@ -53,7 +53,7 @@ Wait = Annotated[
 Launched = Annotated[str | None, typer.Option("--launched", hidden=True)]  # by `zsim run`, for the run of this id
 Tls = Annotated[Path | None, typer.Option("--tls", help="Folder of this process's certificate (zsim certs init).")]
 Access = Annotated[Path | None, typer.Option("--access", help="Zenoh's access control (zsim certs init).")]
-Host = Annotated[str | None, typer.Option("--host", help="Name of this host, as others are told.")]
+Host = Annotated[str | None, typer.Option("--host", help="Name of this host, as others see it.")]
 Insecure = Annotated[bool, typer.Option("--insecure", help="Without TLS, on a network that is nobody else's.")]
 
 
@@ -68,7 +68,7 @@ def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | 
 def load_scenario(
     path: Path, overrides: list[str] | None, seed: int | None = None, duration: float | None = None
 ) -> Any:
-    """Return the scenario of a file with what the command line says of it."""
+    """Return the scenario of a file with the overrides of the command line."""
     from zsim.scenario import scenario_file
 
     return scenario_file.load(path, overrides or (), seed=seed, duration_s=duration)
@@ -95,7 +95,7 @@ class WorldAccess(NamedTuple):
         wait_s: for a world; None for ever.
         tls: folder of the process's certificate.
         insecure: without TLS, on a network that is nobody else's.
-        host: its name, as others are told.
+        host: its name, as others see it.
         launched: run of which it is a part, of processes that a launcher starts.
     """
 

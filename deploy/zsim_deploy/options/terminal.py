@@ -50,11 +50,11 @@ def interruptible() -> Iterator[None]:
 class EndSignals:
     """Takes SIGTERM and SIGHUP for as long as it is entered; SIGHUP stays ignored under nohup.
 
-    Nothing is raised for a closed terminal, as shells send that signal more than once: whoever runs is told to end, and
-    what is said from then on goes to a file.
+    Nothing is raised for a closed terminal, as shells send that signal more than once: `hung_up` is called, and output
+    goes to a file from then on.
 
     Args:
-        log: that file; it is made when there is something to say.
+        log: that file; it is made when there is something to write.
         hung_up: called in a signal handler when the terminal is closed.
     """
 
@@ -80,7 +80,7 @@ class EndSignals:
 
 
 def redirect_output(log: Path) -> None:
-    """Send to a file what is said from now on to a terminal or a pipe, which may take nothing any more."""
+    """Send to a file what is written from now on to a terminal or a pipe, which may take nothing any more."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
     try:
         into = os.open(log, flags, 0o644)
@@ -104,7 +104,7 @@ def show_report(folder: Path, reading: str, make: Callable[[Path, Say], Any], ta
     """Make a folder's report, and print its table.
 
     Args:
-        reading: said at first.
+        reading: shown at first.
         make: makes report.html in the folder, and returns its figures.
         table: of these figures, for a terminal.
     """

@@ -38,7 +38,7 @@ class Installer:
         """Wait until nobody else installs there.
 
         Args:
-            progress: hears who does.
+            progress: takes a line on who does.
 
         Raises:
             HostsError: the folder cannot be used, or somebody installs for too long.
@@ -78,10 +78,11 @@ class Installer:
                 while line := await self._process.stdout.readline():  # a greeting of the login shell is passed over
                     if message := json_answer([line]):
                         return message
-                last = (await self._process.stderr.read()).strip().splitlines() or ["says nothing; does it run there?"]
+                lines = (await self._process.stderr.read()).strip().splitlines()
         except TimeoutError as error:
             raise HostsError(f"{self._name}: {late or f'no answer within {timeout_s:g} s; is it busy?'}") from error
-        raise HostsError(f"{self._name}: {self._python} {last[-1][:200]}")
+        last = lines[-1] if lines else "printed nothing; does it run there?"
+        raise HostsError(f"{self._name}: {self._python} {last[:200]}")
 
 
 @contextlib.asynccontextmanager
@@ -93,7 +94,7 @@ async def open_installer(
     Args:
         python: that runs it.
         folder: of zsim over there.
-        progress: hears who is waited for.
+        progress: takes a line on who is waited for.
 
     Raises:
         HostsError: the host cannot be reached, its folder not be used, or the connection breaks.

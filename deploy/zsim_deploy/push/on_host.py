@@ -5,10 +5,10 @@ When standard input ends, or nothing came for a while, not even an empty line, t
 gone: whatever is being done is ended.
 
 {"act": "look"}                      what decides which wheels fit, what is installed, wheels that are there
-{"act": "install", ...}              make FOLDER/venv what the order says
+{"act": "install", ...}              make FOLDER/venv what is wanted
 {"act": "warm_up", "module": NAME}   run a module of what is installed
 
-Only one of it works in a folder at a time; another one says who does, and waits.
+Only one of it works in a folder at a time; another one reports who does, and waits.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ import venv
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-LOCK = "push.lock"  # in the folder: locked by who works in it, with a word on who that is
+LOCK = "push.lock"  # in the folder: locked by who works in it, with a line on who that is
 NOTE = "zsim-installed.json"  # in the environment: what was installed; missing while something is being changed
 
 
@@ -61,7 +61,7 @@ def _sha256(path: Path) -> str:
 
 
 class CommandError(Exception):
-    """What a command says is wrong."""
+    """The error line of a command that failed."""
 
 
 class CommandRunner:
@@ -154,7 +154,7 @@ def say(answer: dict) -> None:
 
 
 def execute(folder: Path, order: dict, children: CommandRunner) -> dict:
-    """Do what an order says and return the answer."""
+    """Carry out a request and return the answer."""
     try:
         if order["act"] == "look":
             return inspect_folder(folder)

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 from zsim.errors import HostsError
 
 RETRIES = "1"  # of pip, for each page of an index; with its own 5 it takes minutes where there is no network
-LINE_BYTES = 1 << 20  # of the longest line that pip says
-NO_INDEX = re.compile(r"connection broken by '\w+\((.*)\)': ")  # what pip says before it tries again, with the reason
+LINE_BYTES = 1 << 20  # of the longest line that pip prints
+NO_INDEX = re.compile(r"connection broken by '\w+\((.*)\)': ")  # pip, before it tries again, with the reason
 
 Told = Callable[[str], None]
 OLDEST = (3, 11)  # pyproject.toml, requires-python
@@ -59,19 +59,19 @@ class WheelTarget(NamedTuple):
 
 
 class PipError(Exception):
-    """What pip says is wrong."""
+    """pip failed; with its error line."""
 
 
 class UnreachableError(PipError):
     """The package index does not answer."""
 
 
-def _hush(_text: str) -> None:
-    """Hear what is being done, and tell nobody."""
+def _no_progress(_text: str) -> None:
+    """Show no progress."""
 
 
 async def download_wheels(
-    wanted: Sequence[str], target: WheelTarget, into: Path, held: Sequence[str], progress: Told = _hush
+    wanted: Sequence[str], target: WheelTarget, into: Path, held: Sequence[str], progress: Told = _no_progress
 ) -> bool:
     """Download wheels for a target; where a project has only sources, build them here.
 
@@ -118,11 +118,11 @@ async def _fetch(fit: Sequence[str], wanted: Sequence[str], built: str, progress
         await pip(*fit, "--find-links", built, *wanted, progress=progress)
 
 
-async def pip(*arguments: str, progress: Told = _hush) -> None:
+async def pip(*arguments: str, progress: Told = _no_progress) -> None:
     """Run pip of this Python, as the user has configured it but for how often it tries again.
 
     Args:
-        progress: hears when an index does not answer.
+        progress: takes a line when an index does not answer.
 
     Raises:
         PipError: with its last word.
@@ -151,7 +151,7 @@ async def pip(*arguments: str, progress: Told = _hush) -> None:
     if process.returncode and unanswered:
         raise UnreachableError(unanswered)
     if process.returncode:
-        lines = [line for line in lines if line] or ["it says nothing"]
+        lines = [line for line in lines if line] or ["it printed nothing"]
         raise PipError(next((line for line in lines if line.startswith("ERROR: ")), lines[-1]).removeprefix("ERROR: "))
 
 
@@ -165,7 +165,7 @@ def interpreter_query() -> str:
     """Return a line of POSIX shell that prints command, version and path of every Python of a host."""
     names = [PLAIN, *(f"python3.{minor}" for minor in range(NEWEST_MINOR, OLDEST[1] - 1, -1))]
     say = 'import sys; print("%d.%d.%d" % sys.version_info[:3], sys.executable)'
-    return f"for p in {' '.join(names)}; do said=$($p -c '{say}' 2>/dev/null) && echo $p $said; done; true"
+    return f"for p in {' '.join(names)}; do found=$($p -c '{say}' 2>/dev/null) && echo $p $found; done; true"
 
 
 def parse_interpreters(answer: str) -> list[Interpreter]:
@@ -197,7 +197,7 @@ def wheel_target(name: str, facts: Mapping[str, Any]) -> WheelTarget:
 
     Args:
         name: of the host, for errors.
-        facts: as on_host.py says it.
+        facts: of the host, by on_host.py.
 
     Raises:
         HostsError: wheels are not made for such a system.

@@ -26,7 +26,7 @@ from zsim_deploy.roles import warm_up
 from zsim_deploy.ssh.host_link import HostLink
 from zsim_deploy.ssh.ssh_connection import shell_line
 
-LAUNCHER = "launcher"  # how this machine is called among the hosts, in what is told
+LAUNCHER = "launcher"  # name of this machine among the hosts, in progress lines
 ASK_S = 30.0  # wall time for a host to start a few Pythons; a small computer takes seconds
 INSTALL_S = 900.0  # wall time to unpack 100 MB of wheels on a slow memory card
 COMPILE_S = 900.0  # wall time to compile what flies; half a minute on a laptop's core
@@ -43,7 +43,7 @@ async def push(
     Args:
         names: of the hosts; all of the inventory if empty.
         more: extras for each of them beside those of its roles.
-        progress: hears what is being done.
+        progress: takes a host and what is being done there.
         cache: folder of the wheelhouse.
 
     Returns:

@@ -144,7 +144,7 @@ class Wheelhouse:
 
 
 def _lacking(error: PipError, target: WheelTarget) -> str:
-    """Return in a line which wheel does not exist, from what pip says."""
+    """Return a line on the wheel that does not exist, from pip's error."""
     match = re.search(r"satisfies the requirement ([\w.-]+)", str(error))
     if match is None:
         return f"no wheels for {target}: {error}"
@@ -153,7 +153,7 @@ def _lacking(error: PipError, target: WheelTarget) -> str:
 
 
 def requirements(project: Path) -> list[str]:
-    """Return what a wheel says that it requires, for all extras."""
+    """Return the requirements in a wheel's metadata, for all extras."""
     with zipfile.ZipFile(project) as archive:
         name = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
         lines = archive.read(name).decode().partition("\n\n")[0].splitlines()

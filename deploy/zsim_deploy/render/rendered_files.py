@@ -159,7 +159,7 @@ ENTRYPOINT ["python"]
 
 
 def unused(placed: InventoryFile, host: str) -> list[str]:
-    """Return a remark on what the inventory says of a host and containers do not need."""
+    """Return a remark on the fields of a host that containers do not use."""
     described = placed.inventory.hosts[host]
     defaults = Host(address=described.address)
     names = [name for name in ("folder", "python") if getattr(described, name) != getattr(defaults, name)]

@@ -69,7 +69,7 @@ def host(names: Sequence[str]) -> Callable[[messages.Info, Scenario], Agent]:
 
 
 def check_certificate(made: Agent, identity: Identity) -> None:
-    """Refuse to speak for other processes where access control would drop it without a word."""
+    """Refuse to publish for other processes where access control would drop it without a word."""
     if made.serves and identity.tls:
         others = ", ".join(made.serves)
         raise RunError(
@@ -116,7 +116,7 @@ def router(
     launched: str | None,
     identity: Identity,
 ) -> None:
-    """Run a router on an endpoint until it is told to stop.
+    """Run a router on an endpoint until it is stopped.
 
     Raises:
         SessionError: the port is taken, or a certificate, here or upstream, is refused.
@@ -141,7 +141,7 @@ def _refuse(fault: str | None, upstream: str) -> None:
 
 
 def log_printer(launched: str | None) -> Callable[[str], None]:
-    """Return how a role speaks to a person: plain lines on standard error, which a launcher keeps as its log."""
+    """Return what prints a line for people on standard error, which a launcher keeps as the log."""
 
     def say(text: str) -> None:
         if launched is not None:

@@ -33,7 +33,7 @@ AGAIN_S = 0.12  # the kernel lets ordinary users write there ten times a second,
 
 
 def serve_runs(name: str, serve: Serve, reach: WorldAccess) -> None:
-    """Serve one run after the other of the world on an endpoint, until it is told to stop; launched, only one.
+    """Serve one run after the other of the world on an endpoint, until it is stopped; launched, only one.
 
     Args:
         name: of the process; `role.*` for the first number that nobody has, kept until somebody takes it.
@@ -73,7 +73,7 @@ def serve_runs(name: str, serve: Serve, reach: WorldAccess) -> None:
 
 
 def process_name(role: str, name: str, tls: Path | None, thing: str = "main") -> str:
-    """Return a process's name: as told, or its certificate's, or the role's first."""
+    """Return a process's name: as given, or its certificate's, or the role's first."""
     return name or (tls.name if tls else f"{role}.{thing}")
 
 

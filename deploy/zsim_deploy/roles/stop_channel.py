@@ -62,7 +62,7 @@ class StopChannel:
         if launched is not None:
             signal.signal(signal.SIGTERM, self._on_kill)
             signal.signal(signal.SIGINT, signal.SIG_IGN)
-            threading.Thread(target=self._listen, name="stop channel", daemon=True).start()
+            threading.Thread(target=self._read, name="stop channel", daemon=True).start()
         else:
             signal.signal(signal.SIGTERM, lambda *_: self._stop(REASONS[signal.SIGTERM]))
             signal.signal(signal.SIGINT, self._on_interrupt)
@@ -107,7 +107,7 @@ class StopChannel:
             os._exit(INTERRUPTED)
         self._stop(REASONS[signal.SIGINT])
 
-    def _listen(self) -> None:
+    def _read(self) -> None:
         for line in sys.stdin:
             self._last_line_s = time.monotonic()
             word, _, rest = line.strip().partition(" ")
@@ -118,10 +118,10 @@ class StopChannel:
         self._leave("the launcher is gone")
 
     def _await_beats(self, limit_s: float) -> None:
-        """End this process when nothing has been heard for so long."""
+        """End this process when nothing has come for so long."""
         while (left_s := self._last_line_s + limit_s - time.monotonic()) > 0:
             time.sleep(left_s)
-        self._leave(f"nothing heard from the launcher for {limit_s:g} s")
+        self._leave(f"nothing came from the launcher for {limit_s:g} s")
 
     def _leave(self, reason: str) -> None:
         self._orphaned = True
@@ -141,7 +141,7 @@ def key_lease(identity: Identity, launched: str | None) -> KeyLease | None:
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
-    """Return what tells a file from another one at its place."""
+    """Return what distinguishes a file from a newer one at its path."""
     try:
         status = path.stat()
     except OSError:

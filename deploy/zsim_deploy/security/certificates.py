@@ -1,7 +1,7 @@
 """A small certificate authority: one for a federation, and a short-lived certificate for each process and host.
 
 certs/ca.pem, certs/ca.key                                 the authority; the key stays where it was made
-certs/HOST/PROCESS/ca.pem, certificate.pem, key.pem        what one process on one host is told with --tls
+certs/HOST/PROCESS/ca.pem, certificate.pem, key.pem        of one process on one host, the folder of --tls
 """
 
 import ipaddress

@@ -163,18 +163,18 @@ class HostLink:
             patient: try until the host is there; the time counts from then.
 
         Raises:
-            HostsError: it failed, or took too long; with the last line that it said.
+            HostsError: it failed, or took too long; with the last line that it printed.
         """
         async with self.channel(patient) as connection:
             try:
                 done = await asyncio.wait_for(connection.run(command, input=stdin, encoding=None), timeout_s)
             except TimeoutError as error:
-                said = what or repr(command[:60])
-                raise HostsError(f"{self.name}: no answer within {timeout_s:g} s to {said}") from error
+                act = what or repr(command[:60])
+                raise HostsError(f"{self.name}: no answer within {timeout_s:g} s to {act}") from error
             except (asyncssh.Error, OSError) as error:
                 raise HostsError(f"{self.name}: the connection broke ({error}); is the host up?") from error
         if done.exit_status != 0:
-            lines = _text(done.stderr).strip().splitlines() or ["it said nothing"]
+            lines = _text(done.stderr).strip().splitlines() or ["it printed nothing"]
             what = what or command.split(" ", 1)[0]
             raise HostsError(f"{self.name}: {what} failed ({done.exit_status}): {lines[-1][:200]}")
         return done.stdout if isinstance(done.stdout, bytes) else b""

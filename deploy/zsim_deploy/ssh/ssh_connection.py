@@ -28,11 +28,11 @@ async def connect(name: str, host: Host, base: Path) -> asyncssh.SSHClientConnec
 
     Args:
         name: of the host in the inventory, for errors.
-        host: what the inventory says of it; ~/.ssh/config fills in what it leaves open.
+        host: its entry in the inventory; ~/.ssh/config fills in what that leaves open.
         base: folder of the inventory, from which relative paths of `key` and `known_hosts` count.
 
     Raises:
-        HostsError: it cannot be reached, is not who known_hosts says, or refuses the user or key.
+        HostsError: it cannot be reached, has another key than known_hosts, or refuses the user or key.
     """
     client = _Client()
     try:

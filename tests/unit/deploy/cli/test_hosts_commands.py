@@ -58,7 +58,7 @@ def test_who_has_said_nothing_is_no_fault(capsys: pytest.CaptureFixture[str]) ->
     logs("estimator.d1", federation="zsim")
     logs("world", federation="zsim")
     silent, world = capsys.readouterr().err.splitlines()
-    assert silent == "estimator.d1 has said nothing yet"
+    assert silent.startswith("estimator.d1 ")
     assert "its progress and events are shown by `zsim up`, and are in the record" in world
 
 

@@ -98,7 +98,7 @@ def test_a_path_that_is_not_there_is_a_fault_and_a_slow_one_a_warning():
     [
         (
             {"error": "Address already in use", "taken": True},
-            "h1: port 7447 is in use there, perhaps by another run; end that (`ss -ltnp` there tells who), "
+            "h1: port 7447 is in use there, perhaps by another run; end that (`ss -ltnp` there shows it), "
             "or give another port in the inventory",
         ),
         (

@@ -145,7 +145,7 @@ def refused(python: str, folder: Path) -> str:
 
 def test_a_python_that_says_nothing_is_a_line(tmp_path: Path) -> None:
     silent = shutil.which("true") or ""
-    assert refused(silent, tmp_path) == f"h1: {silent} says nothing; does it run there?"
+    assert refused(silent, tmp_path) == f"h1: {silent} printed nothing; does it run there?"
 
 
 def test_a_folder_that_cannot_be_used_is_a_line_that_says_what_to_do(tmp_path: Path) -> None:
