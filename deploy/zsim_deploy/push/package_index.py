@@ -18,7 +18,7 @@ RETRIES = "1"  # of pip, for each page of an index; with its own 5 it takes minu
 LINE_BYTES = 1 << 20  # of the longest line that pip prints
 NO_INDEX = re.compile(r"connection broken by '\w+\((.*)\)': ")  # pip, before it tries again, with the reason
 
-Told = Callable[[str], None]
+Progress = Callable[[str], None]
 OLDEST = (3, 11)  # pyproject.toml, requires-python
 NEWEST_MINOR = 14  # the last Python whose name is tried
 PLAIN = "python3"
@@ -71,7 +71,7 @@ def _no_progress(_text: str) -> None:
 
 
 async def download_wheels(
-    wanted: Sequence[str], target: WheelTarget, into: Path, held: Sequence[str], progress: Told = _no_progress
+    wanted: Sequence[str], target: WheelTarget, into: Path, held: Sequence[str], progress: Progress = _no_progress
 ) -> bool:
     """Download wheels for a target; where a project has only sources, build them here.
 
@@ -106,7 +106,7 @@ async def download_wheels(
             return True
 
 
-async def _fetch(fit: Sequence[str], wanted: Sequence[str], built: str, progress: Told) -> None:
+async def _fetch(fit: Sequence[str], wanted: Sequence[str], built: str, progress: Progress) -> None:
     """Download wheels; if that fails, build what has only sources into a folder, and take it from there."""
     try:
         await pip(*fit, *wanted, progress=progress)
@@ -118,7 +118,7 @@ async def _fetch(fit: Sequence[str], wanted: Sequence[str], built: str, progress
         await pip(*fit, "--find-links", built, *wanted, progress=progress)
 
 
-async def pip(*arguments: str, progress: Told = _no_progress) -> None:
+async def pip(*arguments: str, progress: Progress = _no_progress) -> None:
     """Run pip of this Python, as the user has configured it but for how often it tries again.
 
     Args:

@@ -32,11 +32,11 @@ INSTALL_S = 900.0  # wall time to unpack 100 MB of wheels on a slow memory card
 COMPILE_S = 900.0  # wall time to compile what flies; half a minute on a laptop's core
 COPIES = 4  # files under way to one host at a time
 
-Told = Callable[[str, str], None]  # host, what is being done there
+Progress = Callable[[str, str], None]  # host, what is being done there
 
 
 async def push(
-    placed: InventoryFile, names: Sequence[str], more: Iterable[str], progress: Told, cache: Path
+    placed: InventoryFile, names: Sequence[str], more: Iterable[str], progress: Progress, cache: Path
 ) -> dict[str, bool]:
     """Install on hosts what their roles need.
 
@@ -78,7 +78,9 @@ def _raise_all(results: Sequence[Any]) -> None:
         raise HostsError("\n".join(lines))
 
 
-async def _one(name: str, host: Host, base: Path, wanted: frozenset[str], house: Wheelhouse, progress: Told) -> bool:
+async def _one(
+    name: str, host: Host, base: Path, wanted: frozenset[str], house: Wheelhouse, progress: Progress
+) -> bool:
     """Install on one host; return whether anything had to be done."""
     if host.python:
         progress(name, f"has zsim of its own in {host.python}")

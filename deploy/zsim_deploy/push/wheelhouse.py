@@ -23,7 +23,7 @@ from urllib.parse import urldefrag
 
 import zsim
 from zsim.errors import HostsError
-from zsim_deploy.push.package_index import PipError, Told, UnreachableError, WheelTarget, download_wheels, pip
+from zsim_deploy.push.package_index import PipError, Progress, UnreachableError, WheelTarget, download_wheels, pip
 
 PROJECT = "zsim"
 KEY_DIGITS = 16  # 64 bits of a SHA-256; what one person builds never collides
@@ -61,7 +61,7 @@ class Wheelhouse:
         progress: called with what is being done.
     """
 
-    def __init__(self, folder: Path, progress: Told) -> None:
+    def __init__(self, folder: Path, progress: Progress) -> None:
         self._folder, self._progress = folder, progress
         self._unreachable = ""
         self._lock = asyncio.Lock()

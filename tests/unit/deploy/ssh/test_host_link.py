@@ -101,7 +101,7 @@ def test_of_files_that_come_in_part_none_is_seen(tmp_path: Path, takes: int) -> 
     assert [path.name for path in tmp_path.rglob("*")] == ["run"]
 
 
-class Told(HostLink):
+class Progress(HostLink):
     """A host that does nothing; it keeps the commands that it is given, each with its input."""
 
     async def run(self, command: str, given: bytes = b"", *_: Any, **__: Any) -> bytes:
@@ -110,7 +110,7 @@ class Told(HostLink):
 
 
 def test_two_that_write_into_one_folder_do_not_disturb_each_other(tmp_path: Path) -> None:
-    host = Told("h1", Host(address="127.0.0.1"), Path())
+    host = Progress("h1", Host(address="127.0.0.1"), Path())
     for name in ("one", "two"):
         asyncio.run(host.put_files(str(tmp_path / "run"), {name: name.encode() * 9000}))
     (one, first), (two, second) = host.commands
