@@ -64,9 +64,9 @@ def _cpu_by_role(launcher: int) -> dict[str, float]:
 
 
 def _role(words: list[str]) -> str:
-    """Return `role.thing` of a child's command line; that from which roles are forked is the cradle."""
+    """Return `role.thing` of a child's command line; that from which roles are forked is the fork server."""
     if words[2:3] != ["zsim_deploy.cli"]:
-        return "cradle"
+        return "forkserver"
     words = words[3:]
     thing = words[words.index("--") + 1 :] if "--" in words else []
     return ".".join([*words[:1], *thing])

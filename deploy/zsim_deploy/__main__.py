@@ -3,17 +3,17 @@
 import os
 import signal
 
-from zsim_deploy.terminal.interrupts import INTERRUPTED
+from zsim_deploy.options.terminal import INTERRUPTED
 
 
 def main() -> None:
     """Load the command line, and run it."""
-    heeded = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where a shell has it ignored
-    if heeded:
+    takes_interrupts = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not where a shell has it ignored
+    if takes_interrupts:
         signal.signal(signal.SIGINT, _leave)
     from zsim_deploy.cli import cli
 
-    if heeded:
+    if takes_interrupts:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     cli.main()
 

@@ -35,7 +35,7 @@ import warm
 from wire import PATIENCE_S, Client
 
 from zsim.record import RecordReader, repair
-from zsim_deploy.forkserver.role_launcher import Process
+from zsim_deploy.launch.role_launcher import RoleProcess
 
 ROOT = Path(__file__).parents[2]
 ZSIM = (sys.executable, "-m", "zsim_deploy.cli")
@@ -98,7 +98,7 @@ class Role:
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
-    def _start_cold(self, command: list[str], environment: dict[str, str]) -> tuple[Process, IO[str]]:
+    def _start_cold(self, command: list[str], environment: dict[str, str]) -> tuple[RoleProcess, IO[str]]:
         process = subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
@@ -258,7 +258,7 @@ class Federation:
                 line = (entry / "cmdline").read_bytes()
             except OSError:
                 continue  # it has just ended
-            if b"zsim_deploy." in line and any(mark in line for mark in marks):  # a role, or the cradle of some
+            if b"zsim_deploy." in line and any(mark in line for mark in marks):  # a role, or the fork server of some
                 yield int(entry.name), line.decode(errors="replace").rstrip("\0").split("\0")
 
     def __enter__(self) -> "Federation":

@@ -25,8 +25,7 @@ from zsim.scenario import scenario_file
 from zsim.transport import session
 from zsim.transport.identity import Identity
 from zsim_deploy.security import certificates
-from zsim_deploy.security.access_control import access_control
-from zsim_deploy.security.enrolment import Wanted
+from zsim_deploy.security.enrolment import CertificateRequest, access_control
 
 HOST = "lab"
 SITE = "router.site"
@@ -47,7 +46,7 @@ class Certificates:
 
     def of(self, process: str, days: float = certificates.DAYS, host: str = HOST) -> Path:
         """Return the folder with the certificate of a process, made anew."""
-        return certificates.issue(self.folder, self._authority, Wanted(host, process), self._now, days)
+        return certificates.issue(self.folder, self._authority, CertificateRequest(host, process), self._now, days)
 
     def identity(self, process: str, rules: dict[str, Any] | None = None) -> Identity:
         """Return the identity of a process that listens under some access control."""

@@ -17,13 +17,13 @@ from federation import ZSIM
 from lab import LAUNCHER, Lab
 
 from zsim import __version__
-from zsim_deploy.inventory import extras, inventory
+from zsim_deploy.inventory import inventory, processes
 from zsim_deploy.push import on_host
-from zsim_deploy.push.installer import installer
-from zsim_deploy.push.target import chosen, interpreters, question, target
-from zsim_deploy.push.wheelhouse import House, Wheelhouse
-from zsim_deploy.ssh import shell
+from zsim_deploy.push.installer import open_installer
+from zsim_deploy.push.package_index import choose_interpreter, interpreter_query, parse_interpreters, wheel_target
+from zsim_deploy.push.wheelhouse import Wheelhouse, WheelSet
 from zsim_deploy.ssh.host_link import HostLink
+from zsim_deploy.ssh.ssh_connection import shell_line
 
 CACHE = Path(tempfile.gettempdir()) / "zsim-tests-cache"  # kept between runs, as a user's is
 PUSH_S = 180.0  # wall time for two installations on a loaded machine
@@ -48,7 +48,7 @@ def over_ssh(lab: Lab, hosts: Path, name: str, *command: str, given: str = "") -
     async def work() -> bytes:
         link = HostLink(name, placed.inventory.hosts[name], placed.folder)
         try:
-            return await link.run(shell.line(command), given.encode(), timeout_s=60.0)
+            return await link.run(shell_line(command), given.encode(), timeout_s=60.0)
         finally:
             await link.close()
 
@@ -63,7 +63,7 @@ def look(lab: Lab, hosts: Path, name: str, python: str) -> dict[str, Any]:
     async def work() -> dict[str, Any]:
         link = HostLink(name, placed.inventory.hosts[name], placed.folder)
         try:
-            async with installer(link, python, str(lab.folder / "aside"), print) as program:
+            async with open_installer(link, python, str(lab.folder / "aside"), print) as program:
                 return await program.ask("look", PUSH_S)
         finally:
             await link.close()
@@ -72,16 +72,16 @@ def look(lab: Lab, hosts: Path, name: str, python: str) -> dict[str, Any]:
         return asyncio.run(work())
 
 
-def gather(lab: Lab, hosts: Path, *names: str) -> dict[str, House]:
+def gather(lab: Lab, hosts: Path, *names: str) -> dict[str, WheelSet]:
     """Gather, outside of the lab where there is an index, what `zsim push` needs inside."""
-    wanted = extras.needed(inventory.load(hosts).inventory)
-    found = interpreters(over_ssh(lab, hosts, names[0], "sh", "-c", question()))
-    python = chosen(names[0], found, sys.version_info[:2]).path
+    wanted = processes.needed_extras(inventory.load(hosts).inventory)
+    found = parse_interpreters(over_ssh(lab, hosts, names[0], "sh", "-c", interpreter_query()))
+    python = choose_interpreter(names[0], found, sys.version_info[:2]).path
     said = look(lab, hosts, names[0], python)
     wheelhouse = Wheelhouse(CACHE / "zsim", print)
 
-    async def work() -> dict[str, House]:
-        return {name: await wheelhouse.house(name, target(name, said), wanted[name]) for name in names}
+    async def work() -> dict[str, WheelSet]:
+        return {name: await wheelhouse.wheel_set(name, wheel_target(name, said), wanted[name]) for name in names}
 
     return asyncio.run(work())
 
@@ -184,28 +184,28 @@ def test_another_build_of_the_same_version_takes_the_place_of_the_first(lab: Lab
     for text in ("BUILD = 1", "BUILD = 2"):
         order = {"project": write_wheel(tmp_path / "wheels", text), "pip": pip.name, "wheels": [], "extras": []}
         shutil.copy(pip, tmp_path / "wheels")
-        on_host.install(tmp_path, {**order, "modules": ["zsim"], "note": {"project": text}}, on_host.Children())
+        on_host.install(tmp_path, {**order, "modules": ["zsim"], "note": {"project": text}}, on_host.CommandRunner())
         said = subprocess.run(
             [tmp_path / "venv/bin/python", "-c", "import zsim; print(zsim.__file__, zsim.BUILD)"],
             cwd=tmp_path, capture_output=True, text=True, check=True,
         )  # fmt: skip
         assert said.stdout.startswith(str(tmp_path / "venv"))
         assert said.stdout.endswith(f"{text[-1]}\n")
-    found = on_host.look(tmp_path)
+    found = on_host.inspect_folder(tmp_path)
     assert found["installed"]["project"] == "BUILD = 2"
     assert found["wheels"] == {}
 
 
 def test_an_installation_that_broke_off_counts_as_none(tmp_path: Path) -> None:
-    assert on_host.look(tmp_path)["installed"] is None
+    assert on_host.inspect_folder(tmp_path)["installed"] is None
     (tmp_path / "venv/bin").mkdir(parents=True)
     (tmp_path / "venv/bin/python").symlink_to(sys.executable)
-    assert on_host.look(tmp_path)["installed"] is None
+    assert on_host.inspect_folder(tmp_path)["installed"] is None
     note = tmp_path / "venv" / on_host.NOTE
     note.write_text(json.dumps({"python": [3, 10]}))
-    assert on_host.look(tmp_path)["installed"] is None
+    assert on_host.inspect_folder(tmp_path)["installed"] is None
     note.write_text(json.dumps({"python": list(sys.version_info[:2])}))
-    assert on_host.look(tmp_path)["installed"] is not None
+    assert on_host.inspect_folder(tmp_path)["installed"] is not None
 
 
 def write_wheel(folder: Path, text: str) -> str:

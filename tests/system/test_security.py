@@ -23,7 +23,7 @@ from zsim.scenario.rights import permits
 from zsim.transport import session
 from zsim.transport.identity import Identity
 from zsim.transport.tls import peer_fault
-from zsim_deploy.security.access_control import access_control
+from zsim_deploy.security.enrolment import access_control
 
 WAYS = ("at the world", "through a router")
 TOKENS = tuple(key for key in KEYS if key.startswith("process/") and key.count("/") == 1)

@@ -11,19 +11,19 @@ from functools import cache
 from typing import IO, Any
 
 from zsim.schema.plugin import FOLDERS
-from zsim_deploy.forkserver.role_launcher import Nursery, Process
+from zsim_deploy.launch.role_launcher import RoleLauncher, RoleProcess
 
 ROLES = ("world", "estimator", "controller", "record", "gateway", "console")
 LIMITS = (resource.RLIMIT_NOFILE, resource.RLIMIT_FSIZE, resource.RLIMIT_AS)
 
 
-def start(arguments: list[str], root: str, environment: dict[str, str]) -> tuple[Process, IO[str]] | None:
+def start(arguments: list[str], root: str, environment: dict[str, str]) -> tuple[RoleProcess, IO[str]] | None:
     """Start a role in a folder; return it and what it prints, None where it has to be started cold."""
     if arguments[0] not in ROLES or _inherited() != FIRST or os.getcwd() != root:
         return None
     read, write = os.pipe()
     with os.fdopen(write, "w") as log:
-        process = _nursery(tuple(environment.items())).start(arguments, log, listened=False)
+        process = _launcher(tuple(environment.items())).start(arguments, log, listened=False)
     assert process.stdin is not None
     process.stdin.close()
     return process, os.fdopen(read)
@@ -39,11 +39,11 @@ FIRST = _inherited()
 
 
 @cache
-def _nursery(environment: tuple[tuple[str, str], ...]) -> Nursery:
+def _launcher(environment: tuple[tuple[str, str], ...]) -> RoleLauncher:
     former = dict(os.environ)
     os.environ.update(environment)
     try:
-        made = Nursery(print, "of tests").__enter__()
+        made = RoleLauncher(print, "of tests").__enter__()
     finally:
         os.environ.clear()
         os.environ.update(former)

@@ -85,7 +85,7 @@ class Teller:
             sys.stdout.write(json.dumps(line) + "\n")
             sys.stdout.flush()
         except (BrokenPipeError, ValueError):
-            return  # the launcher is gone; the leash ends this process
+            return  # the launcher is gone; its stop channel ends this process
 
 
 class Screen:

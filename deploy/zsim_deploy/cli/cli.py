@@ -13,20 +13,13 @@ from typer.main import get_command
 from zsim import __version__
 from zsim.errors import BehindError, SupersededError, ZsimError
 from zsim_deploy.cli import (
-    certs_commands,
-    console_command,
-    export_command,
-    fault_commands,
-    gateway_command,
+    bridge_commands,
+    federation_commands,
     hosts_commands,
-    look_commands,
-    render_commands,
-    replay_command,
+    inventory_commands,
+    record_commands,
     report_commands,
     role_commands,
-    ros1_command,
-    ros2_command,
-    sweep_commands,
 )
 from zsim_deploy.options.arguments import (
     HOSTS,
@@ -41,7 +34,7 @@ from zsim_deploy.options.arguments import (
     load_scenario,
     mode_and_rate,
 )
-from zsim_deploy.terminal.interrupts import INTERRUPTED
+from zsim_deploy.options.terminal import INTERRUPTED
 
 app = typer.Typer(
     name="zsim",
@@ -82,19 +75,19 @@ def run(
 ) -> None:
     """Fly a scenario: start every process, show progress, record, report."""
     from zsim.runtime.progress import Screen
-    from zsim_deploy.launch.run import Options, check_endpoint, make_directory, run_in_process, run_processes
+    from zsim_deploy.launch.run import RunOptions, check_endpoint, make_directory, run_in_process, run_processes
     from zsim_deploy.launch.supervisor import Outcome
-    from zsim_deploy.terminal.interrupts import REASONS
+    from zsim_deploy.options.terminal import REASONS
 
     if in_process:
         _refuse_with_others(realtime, rate, listen, hosted, console)
     if console:
-        console_command.check()
+        bridge_commands.check_console_installed()
     check_endpoint(listen, insecure)
     loaded = load_scenario(scenario, set_, seed, duration)
     mode, pace = mode_and_rate(realtime, rate)
     folder, first = make_directory(out, loaded), [name for name in order.split(",") if name]
-    options = Options(loaded, folder, mode, pace, listen, insecure, hosted, first, console)
+    options = RunOptions(loaded, folder, mode, pace, listen, insecure, hosted, first, console)
     with Screen(loaded.duration_s) as screen:
         try:
             outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)
@@ -104,15 +97,15 @@ def run(
 
 
 def _refuse_with_others(realtime: bool, rate: float | None, listen: str | None, hosted: bool, console: bool) -> None:
-    """Refuse what says nothing to a run in one process."""
-    given = {
+    """Refuse options that have no meaning for a run in one process."""
+    options = {
         "--realtime": realtime,
         "--rate": rate is not None,
         "--listen": listen is not None,
         "--hosted": hosted,
         "--console": console,
     }
-    useless = " and ".join(name for name, is_given in given.items() if is_given)
+    useless = " and ".join(name for name, is_given in options.items() if is_given)
     if useless:
         raise typer.BadParameter(f"--in-process is lockstep, unpaced, without Zenoh; leave out {useless}, or it")
 
@@ -125,28 +118,24 @@ def validate(scenario: ScenarioPath, set_: Set = None) -> None:
     print(scenario_file.to_text(load_scenario(scenario, set_)), end="")
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _version(wanted: bool) -> None:
+    if wanted:
         print(f"zsim {__version__}")
         raise typer.Exit
 
 
-for part in (
+for family in (
     report_commands,
     role_commands,
     hosts_commands,
-    sweep_commands,
-    export_command,
-    replay_command,
-    look_commands,
-    console_command,
-    gateway_command,
-    ros1_command,
-    ros2_command,
+    record_commands,
+    federation_commands,
+    bridge_commands,
 ):
-    app.add_typer(part.app)
-for group, panel in ((fault_commands, look_commands.PANEL), (certs_commands, HOSTS), (render_commands, HOSTS)):
-    app.add_typer(group.app, rich_help_panel=panel)
+    app.add_typer(family.app)
+app.add_typer(federation_commands.faults, rich_help_panel=federation_commands.PANEL)
+for group in (inventory_commands.certs, inventory_commands.rendering):
+    app.add_typer(group, rich_help_panel=HOSTS)
 
 
 @app.callback()
@@ -190,12 +179,12 @@ def _say_anything() -> None:
 def _show_usage(error: Any) -> None:
     """Print what was wrong with a command line in one line; after a bare `zsim` the help has been printed."""
     if isinstance(error, typer.BadParameter) and error.param is None:
-        said = error.message
+        text = error.message
     else:
-        said = " ".join(error.format_message().split()).replace("Value error, ", "")  # newer typers ask pydantic
+        text = " ".join(error.format_message().split()).replace("Value error, ", "")  # newer typers ask pydantic
     command = error.ctx.command_path if error.ctx else "zsim"
-    if said:
-        print(f"{command}: {said[0].lower()}{said[1:].rstrip('.')}; see `{command} --help`", file=sys.stderr)
+    if text:
+        print(f"{command}: {text[0].lower()}{text[1:].rstrip('.')}; see `{command} --help`", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The commands of a run on several hosts."""
+"""The commands of a run on several hosts: push, doctor, up, ps, logs, restart, move, down."""
 
 import codecs
 import contextlib
@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import typer
 
-from zsim_deploy.cli.push_command import push
 from zsim_deploy.options.arguments import (
     HOSTS,
     Duration,
@@ -48,8 +47,8 @@ def up(
 ) -> None:
     """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything."""
     from zsim_deploy.cli.report_commands import conclude
-    from zsim_deploy.control.status_table import Board
-    from zsim_deploy.hosts.up import Options, Up
+    from zsim_deploy.hosts.host_run import HostRun, HostRunOptions
+    from zsim_deploy.hosts.status_table import StatusTable
     from zsim_deploy.inventory import inventory
 
     loaded = load_scenario(scenario, set_, seed, duration)
@@ -58,8 +57,8 @@ def up(
     inventory.placement(placed, loaded)
     mode, pace = mode_and_rate(realtime, rate)
     with _folder(out, loaded) as folder:
-        with Board(loaded.duration_s) as board:
-            outcome = Up(Options(loaded, placed, folder, mode, pace), board).go()
+        with StatusTable(loaded.duration_s) as status:
+            outcome = HostRun(HostRunOptions(loaded, placed, folder, mode, pace), status).run()
         conclude(outcome, folder, report)
 
 
@@ -80,7 +79,7 @@ def _folder(out: Path | None, scenario: Any) -> Iterator[Path]:
 
 def down(federation: Federation = "zsim") -> None:
     """End the run that is up, on all hosts."""
-    from zsim_deploy.control import control_socket
+    from zsim_deploy.hosts import control_socket
 
     control_socket.ask(federation, "down")
 
@@ -92,14 +91,14 @@ def ps(
     """Show the processes of the run that is up: role, host, pid, state, lag, messages/s, round trip, restarts."""
     from rich.console import Console
 
-    from zsim_deploy.control import control_socket
-    from zsim_deploy.control.status_table import table
+    from zsim_deploy.hosts import control_socket
+    from zsim_deploy.hosts.status_table import table
 
-    found = control_socket.ask(federation, "ps")
+    status = control_socket.ask(federation, "ps")
     if as_json:
-        print(json.dumps(found))
+        print(json.dumps(status))
     else:
-        Console().print(table(found["rows"]))
+        Console().print(table(status["rows"]))
 
 
 def logs(
@@ -107,9 +106,9 @@ def logs(
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what is written from now on.")] = False,
     federation: Federation = "zsim",
 ) -> None:
-    """Print what a process of the run that is up has said; what the world tells is shown by `zsim up` itself."""
+    """Print the log of a process of the run that is up; progress and events are shown by `zsim up` itself."""
     from zsim.errors import RunError
-    from zsim_deploy.control import control_socket
+    from zsim_deploy.hosts import control_socket
 
     where = control_socket.ask(federation, "where")
     if role not in where["roles"]:
@@ -140,18 +139,18 @@ def _written(path: Path, follow: bool, goes_on: Callable[[], bool]) -> Iterator[
 
 
 def _silent(role: str) -> str:
-    """Return why there is nothing of a role."""
+    """Return why the log of a role is empty."""
     from zsim.scenario.rights import WORLD
 
     if role == WORLD:
-        return "world has had no fault to tell; its progress and events are shown by `zsim up`, and are in the record"
-    return f"{role} has said nothing yet"
+        return "world has logged nothing; its progress and events are shown by `zsim up`, and are in the record"
+    return f"{role} has logged nothing yet"
 
 
 def _is_up(federation: str, out: str) -> bool:
     """Tell whether the launcher of a federation still has the run of this folder."""
     from zsim.errors import RunError
-    from zsim_deploy.control import control_socket
+    from zsim_deploy.hosts import control_socket
 
     try:
         return control_socket.ask(federation, "where")["out"] == out
@@ -161,7 +160,7 @@ def _is_up(federation: str, out: str) -> bool:
 
 def restart(role: Role, federation: Federation = "zsim") -> None:
     """Start a process of the run anew where it is; it takes over from its former self."""
-    from zsim_deploy.control import control_socket
+    from zsim_deploy.hosts import control_socket
 
     print(f"restarting {control_socket.ask(federation, 'restart', role=role)}")
 
@@ -172,7 +171,7 @@ def move(
     federation: Federation = "zsim",
 ) -> None:
     """Let another host run a process of the run from now on."""
-    from zsim_deploy.control import control_socket
+    from zsim_deploy.hosts import control_socket
 
     print(f"moving {control_socket.ask(federation, 'move', role=role, host=host)}")
 
@@ -185,11 +184,11 @@ def doctor(
     from rich.console import Console
 
     from zsim.errors import HostsError
-    from zsim_deploy.doctor.check_up import check_up
+    from zsim_deploy.hosts.host_check import check_hosts
     from zsim_deploy.inventory import inventory
 
     placed = inventory.load(hosts)
-    result = check_up(placed, _placement(placed, scenario))
+    result = check_hosts(placed, _placement(placed, scenario))
     console = Console()
     for shown in result.tables:
         console.print(shown)
@@ -205,6 +204,27 @@ def _placement(placed: Any, scenario: Path | None) -> dict[str, str] | None:
     from zsim_deploy.inventory import inventory
 
     return inventory.placement(placed, scenario_file.load(scenario)) if scenario else None
+
+
+def push(
+    hosts: Annotated[Path, typer.Option("--hosts", help="Inventory (YAML): which hosts, which role where.")],
+    host: Annotated[list[str] | None, typer.Option("--host", help="Only this host. Repeatable.")] = None,
+    extra: Annotated[
+        list[str] | None, typer.Option("--extra", help="An extra beside those of the host's roles. Repeatable.")
+    ] = None,
+) -> None:
+    """Install zsim on the hosts, each with the extras that its roles need; they need ssh and Python, no internet."""
+    import asyncio
+
+    from zsim_deploy.inventory import inventory
+    from zsim_deploy.push.push import PushProgress, default_cache
+    from zsim_deploy.push.push import push as push_to
+
+    placed = inventory.load(hosts)
+    with PushProgress() as stages:
+        done = asyncio.run(push_to(placed, host or [], extra or [], stages.update, default_cache()))
+    changed = sum(done.values())
+    print(f"installed on {changed} of {len(done)} hosts" if changed else "nothing to do; all hosts have what they need")
 
 
 for _command in (push, doctor, up, ps, logs, restart, move, down):

@@ -21,10 +21,11 @@ from zsim_deploy.options.arguments import (
     Set,
     Tls,
     Wait,
+    WorldAccess,
     identity,
     mode_and_rate,
+    participant_options,
 )
-from zsim_deploy.options.reach import Reach, takes_part
 
 ROLES = "Roles, started by hand, on any machine, in any order"
 
@@ -51,18 +52,18 @@ def world(
 ) -> None:
     """Run the world: integrates all drones and owns simulated time."""
     from zsim.scenario import scenario_file
-    from zsim_deploy.roles import roles
+    from zsim_deploy.roles import world_role
 
     loaded = scenario_file.load(scenario, set_ or (), seed=seed, duration_s=duration)  # it needs no class of the agents
     mode, pace = mode_and_rate(realtime, rate)
     who = identity(host, tls, insecure, access)
-    roles.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who)
+    world_role.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who)
 
 
 @app.command(rich_help_panel=ROLES)
-@takes_part
+@participant_options
 def estimator(
-    reach: Reach,
+    reach: WorldAccess,
     drones: Annotated[
         list[str],
         typer.Argument(metavar="DRONE...", help="Drones, or patterns: 'drone*'.", show_default=False),
@@ -75,9 +76,9 @@ def estimator(
 
 
 @app.command(rich_help_panel=ROLES)
-@takes_part
+@participant_options
 def controller(
-    reach: Reach,
+    reach: WorldAccess,
     cluster: Annotated[str, typer.Argument(help="Name of the cluster.")] = "main",
 ) -> None:
     """Run the cluster-space controller of one cluster."""
@@ -102,18 +103,20 @@ def host_agents(
     """Run several estimators and controllers in one process, which is faster."""
     from zsim_deploy.roles import roles
 
-    roles.agent(roles.host(names), Reach(connect, federation, wait, None, insecure, host, launched))
+    roles.agent(roles.host(names), WorldAccess(connect, federation, wait, None, insecure, host, launched))
 
 
 @app.command(rich_help_panel=ROLES)
-@takes_part
+@participant_options
 def record(
-    reach: Reach,
+    reach: WorldAccess,
     out: Annotated[Path, typer.Option(help="Folder for run.mcap.")] = Path("."),
 ) -> None:
     """Record every message of a federation into run.mcap."""
     from zsim_deploy.roles import roles
+    from zsim_deploy.roles.service_loop import give_way
 
+    give_way()
     roles.recorder(out / "run.mcap", reach)
 
 

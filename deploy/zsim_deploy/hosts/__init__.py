@@ -1,4 +1,4 @@
-"""A run on several hosts: planned, started over ssh, watched, its record brought home.
+"""A run on several hosts: checked by `zsim doctor`, planned, started over ssh, watched, its record brought home.
 
-Imports ssh, security, launch.
+Imports launch, roles, ssh, security, inventory.
 """

@@ -14,16 +14,16 @@ from zsim.scenario.scenario import Scenario
 from zsim.transport.identity import CERTIFICATES
 from zsim_deploy.hosts.leftover_runs import RECORD, runs_folder, scp
 from zsim_deploy.inventory import inventory as inv
-from zsim_deploy.inventory.inventory import Placed
-from zsim_deploy.render.rendered_process import MODULE, Files, access_file, command, own_programs, processes
-from zsim_deploy.security import credentials
+from zsim_deploy.inventory.inventory import InventoryFile
+from zsim_deploy.inventory.processes import MODULE, ProcessFiles, access_file, command, own_programs, processes
+from zsim_deploy.roles.stop_channel import FOLDER
+from zsim_deploy.security import certificate_check
 from zsim_deploy.security.enrolment import folder_of, init_command
-from zsim_deploy.security.key_lease import FOLDER
 
 ACCESS = "access.json"
 
 
-class Plan:
+class HostPlan:
     """The processes of one run that zsim starts, and where; it does not change.
 
     Args:
@@ -40,20 +40,20 @@ class Plan:
         InventoryError: a process has no place.
     """
 
-    def __init__(self, placed: Placed, scenario: Scenario, run_id: str, pace: Sequence[str] = ()) -> None:
+    def __init__(self, placed: InventoryFile, scenario: Scenario, run_id: str, pace: Sequence[str] = ()) -> None:
         self._placed = placed
         self._scenario = scenario
         self._run_id = run_id
         self._pace = pace
-        found = sorted(processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
-        self.processes = {process.name: process for process in found}
+        in_order = sorted(processes(placed, scenario, pace), key=lambda process: process.role != ROUTER)
+        self.processes = {process.name: process for process in in_order}
         self.remarks = own_programs(placed, scenario)
 
-    def moved(self, name: str, host: str) -> "Plan":
+    def moved(self, name: str, host: str) -> "HostPlan":
         """Return the same plan but for the host of one process."""
         places = {**inv.placement(self._placed, self._scenario), name: host}
         placed = self._placed._replace(inventory=msgspec.structs.replace(self._placed.inventory, roles=places))
-        return Plan(placed, self._scenario, self._run_id, self._pace)
+        return HostPlan(placed, self._scenario, self._run_id, self._pace)
 
     def known_hosts(self) -> list[str]:
         """Return the hosts of the inventory."""
@@ -80,7 +80,7 @@ class Plan:
         return f"{self.folder(self.host(RECORDER))}/{RECORD}"
 
     def way_to_record(self) -> str:
-        """Return where the record is, and how it is fetched by hand, as a person is told."""
+        """Return where the record is, and the command that fetches it."""
         name = self.host(RECORDER)
         command = scp(self._placed.inventory.hosts[name], self._placed.folder, self.record())
         return f"{name}:{self.record()} (fetch it with `{command}`)"
@@ -97,13 +97,15 @@ class Plan:
         """Return the ports of a host on which processes of the run will listen."""
         return [process.port for process in self.processes.values() if process.host == host and process.port]
 
-    def lacks(self, now: datetime) -> list[str]:
+    def certificate_faults(self, now: datetime) -> list[str]:
         """Return what of the certificates is missing or of no use at a time, a line for each fault."""
-        return credentials.lacks(self._placed, {name: self.host(name) for name in self.processes}, now)
+        return certificate_check.certificate_faults(
+            self._placed, {name: self.host(name) for name in self.processes}, now
+        )
 
-    def exposed(self) -> str | None:
+    def exposed_keys(self) -> str | None:
         """Return a warning of private keys here that others can read, if there are any."""
-        return credentials.exposed(self._placed)
+        return certificate_check.exposed_keys(self._placed)
 
     def python(self, host: str) -> str:
         """Return the interpreter of a host that has zsim."""
@@ -113,7 +115,7 @@ class Plan:
         """Return the arguments of `zsim` that start a process."""
         process, folder = self.processes[name], self.folder(self.host(name))
         identity = f"{self.keys(process.host)}/{name}"
-        files = Files(f"{folder}/scenario.yaml", identity, f"{identity}/{ACCESS}", folder)
+        files = ProcessFiles(f"{folder}/scenario.yaml", identity, f"{identity}/{ACCESS}", folder)
         role, *options = command(process, files)[len(MODULE) :]
         return [role, "--launched", self._run_id, *options]
 
@@ -123,13 +125,13 @@ class Plan:
         Raises:
             HostsError: a certificate is not there.
         """
-        found: dict[str, bytes] = {}
+        contents: dict[str, bytes] = {}
         for name, process in self.processes.items():
             if process.host == host:
-                found |= self.identity(name)
+                contents |= self.identity(name)
         if self.host(WORLD) == host:
-            found["scenario.yaml"] = scenario_file.to_text(self._scenario).encode()
-        return found
+            contents["scenario.yaml"] = scenario_file.to_text(self._scenario).encode()
+        return contents
 
     def identity(self, name: str) -> dict[str, bytes]:
         """Return certificate, key and access control of a process, by path below the run's folder."""

@@ -1,19 +1,20 @@
-"""What runs whose launcher was killed, or could not fetch their record, have left on a host."""
+"""What other runs have left on a host: records and keys of runs that were cut short, and ports still in use."""
 
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from zsim.transport.identity import KEY
+from zsim_deploy.hosts.doctor import NetworkPath, path_faults
 from zsim_deploy.inventory.inventory import SSH_PORT, Host
-from zsim_deploy.security.key_lease import FOLDER
-from zsim_deploy.ssh import shell
+from zsim_deploy.roles.stop_channel import FOLDER
 from zsim_deploy.ssh.host_link import HostLink
+from zsim_deploy.ssh.ssh_connection import json_answer, shell_line, shell_word
 
 RECORD = "run.mcap"
 RUNS = "runs"  # below the folder of zsim on a host: a folder per run
 # Whose processes still run is no earlier run; where there is no ps, nobody is known to.
-LOOK = f"""
+LIST_RUNS = f"""
 alive=$(ps -A -ww -o args 2>/dev/null || ps -A -o args 2>/dev/null)
 for run in *; do
   case "$alive" in *"--launched $run "*) continue;; esac
@@ -22,6 +23,22 @@ for run in *; do
 done
 true
 """
+# Run there by its Python: `- ADDRESS PORT...`. What else may be wrong with a port is in the log of its process.
+TRY_PORTS = """
+import errno, json, socket, sys
+address, taken = sys.argv[1], []
+for port in map(int, sys.argv[2:]):
+    family, kind, _, _, place = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)[0]
+    with socket.socket(family, kind) as tried:
+        tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            tried.bind(place)
+            tried.listen()
+        except OSError as error:
+            taken += [port] if error.errno == errno.EADDRINUSE else []
+print(json.dumps({"taken": taken}))
+"""
+TRY_PORTS_S = 20.0  # wall time to start Python on a small computer
 
 
 def runs_folder(host: Host) -> str:
@@ -30,7 +47,7 @@ def runs_folder(host: Host) -> str:
     return f"{home}{host.folder}/{RUNS}"
 
 
-async def earlier(link: HostLink, base: Path) -> list[str]:
+async def leftovers(link: HostLink, base: Path) -> list[str]:
     """Return what earlier runs have left on a host: at most a line on records, and one on private keys.
 
     Args:
@@ -41,26 +58,26 @@ async def earlier(link: HostLink, base: Path) -> list[str]:
         HostsError: it could not be asked.
     """
     folder = runs_folder(link.host)
-    script = f"cd {shell.word(folder)} 2>/dev/null || exit 0{LOOK}"
-    said = (await link.run(script, what=f"looking into {folder}")).decode(errors="replace")
-    return told(link.name, link.host, base, said.splitlines())
+    script = f"cd {shell_word(folder)} 2>/dev/null || exit 0{LIST_RUNS}"
+    output = (await link.run(script, what=f"looking into {folder}")).decode(errors="replace")
+    return leftover_lines(link.name, link.host, base, output.splitlines())
 
 
-def told(name: str, host: Host, base: Path, said: Iterable[str]) -> list[str]:
-    """Return lines for a person from what LOOK says; a greeting of the login shell is passed over."""
+def leftover_lines(name: str, host: Host, base: Path, output: Iterable[str]) -> list[str]:
+    """Return lines for a person from what LIST_RUNS prints; a greeting of the login shell is passed over."""
     folder = runs_folder(host)
-    words = [line.split(" ", 1) for line in said]
-    found = {kind: [word[1] for word in words if word[0] == kind and len(word) > 1] for kind in (RECORD, KEY)}
+    words = [line.split(" ", 1) for line in output]
+    runs = {kind: [word[1] for word in words if word[0] == kind and len(word) > 1] for kind in (RECORD, KEY)}
     lines = []
-    if records := [f"{folder}/{run}/{RECORD}" for run in found[RECORD]]:
+    if records := [f"{folder}/{run}/{RECORD}" for run in runs[RECORD]]:
         lines.append(
             f"{name}: records of earlier runs were not fetched: {', '.join(f'{name}:{path}' for path in records)}; "
             f"fetch with `{scp(host, base, records[0])}`, then remove the folder of the run there"
         )
-    if keys := [f"{folder}/{run}/{FOLDER}" for run in found[KEY]]:
+    if keys := [f"{folder}/{run}/{FOLDER}" for run in runs[KEY]]:
         lines.append(
             f"{name}: private keys of earlier runs were left: {', '.join(f'{name}:{path}' for path in keys)}; "
-            f"remove them there with `rm -r {shell.line(keys)}`"
+            f"remove them there with `rm -r {shell_line(keys)}`"
         )
     return lines
 
@@ -75,3 +92,17 @@ def scp(host: Host, base: Path, path: str) -> str:
     words += ["-o", known] if known else []
     user = f"{host.user}@" if host.user else ""
     return shlex.join([*words, f"{user}{shown}:{path.removeprefix('~/')}", "."])
+
+
+async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list[str]:
+    """Return a line for each port of a host on which somebody else listens.
+
+    Raises:
+        HostsError: it could not be asked.
+    """
+    if not ports:
+        return []
+    command = f"{shell_word(python)} - {shell_line([link.host.address, *map(str, ports)])}"
+    output = await link.run(command, TRY_PORTS.encode(), TRY_PORTS_S, "looking for free ports")
+    taken = (json_answer(output.decode(errors="replace").splitlines()) or {}).get("taken", [])
+    return path_faults([NetworkPath(link.name, link.name, port, {"error": "", "taken": True}) for port in taken])[0]

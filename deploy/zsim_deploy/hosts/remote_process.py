@@ -1,7 +1,7 @@
-"""One process of a run on another host, over ssh: started, watched, told to stop, its last words kept.
+"""One process of a run on another host, over ssh: started, watched, stopped, its output kept in a file here.
 
 The process has our end of the ssh channel as standard input. It ends when that closes, which sshd does when the
-launcher dies; and when it has heard nothing on it for ORPHAN_S, as when the launcher's host is gone (leash.py).
+launcher dies; and when nothing came on it for ORPHAN_S, as when the launcher's host is gone (roles/stop_channel.py).
 """
 
 import asyncio
@@ -11,15 +11,15 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Any
 
 import asyncssh
 
 from zsim.errors import HostsError
-from zsim_deploy.forkserver.role_launcher import SINGLE_THREADED
-from zsim_deploy.ssh import shell
-from zsim_deploy.ssh.host_link import HostLink, Loop
-from zsim_deploy.ssh.remote_log import Log
+from zsim_deploy.launch.role_launcher import SINGLE_THREADED
+from zsim_deploy.ssh.host_link import EventLoopThread, HostLink
+from zsim_deploy.ssh.ssh_connection import shell_line
 
 BEAT_S = 1.0  # how often the launcher shows that it lives
 ORPHAN_S = 60.0  # without a beat a process ends itself; a link may be cut for shorter than that
@@ -29,7 +29,36 @@ LOST = -1000  # code of a process of which nobody knows how it ended
 PID = "zsim-pid "  # begins the line with its process id; a login shell may say something before
 
 
-class Remote:
+class ProcessLog:
+    """The log file of a process; where it cannot be written, that is reported once, and only the last line is kept.
+
+    Args:
+        path: of the file, named after the process.
+        say: takes a line when it cannot be written.
+
+    Attributes:
+        last: line that is not empty.
+    """
+
+    def __init__(self, path: Path, say: Callable[[str], None]) -> None:
+        self.last = ""
+        self._path = path
+        self._say = say
+        self._is_whole = True
+
+    def write(self, line: str) -> None:
+        """Add a line, which ends in a line feed."""
+        self.last = line.strip() or self.last
+        try:
+            with self._path.open("a", errors="replace") as file:
+                file.write(line)
+        except OSError as error:
+            if self._is_whole:
+                self._is_whole = False
+                self._say(f"{self._path}: cannot be written ({error.strerror}); what it would say there is lost")
+
+
+class RemoteProcess:
     """A role on another host.
 
     Args:
@@ -38,8 +67,8 @@ class Remote:
         link: to the host.
         python: interpreter there that has zsim.
         loop: on which the link lives.
-        log: for what it says.
-        on_line: told every line of its standard output; None sends that to the log too.
+        log: of its output.
+        on_line: takes every line of its standard output; None sends that to the log too.
         folder: of the run there.
         files: what it needs below that folder and takes away when it ends; brought again whenever it is started again.
     """
@@ -50,8 +79,8 @@ class Remote:
         arguments: list[str],
         link: HostLink,
         python: str,
-        loop: Loop,
-        log: Log,
+        loop: EventLoopThread,
+        log: ProcessLog,
         on_line: Callable[[str], None] | None = None,
         folder: str = "",
         files: Mapping[str, bytes] | None = None,
@@ -137,7 +166,7 @@ class Remote:
     def _command(self) -> str:
         words = [self._python, "-m", "zsim_deploy.cli", *self._arguments]
         settings = " ".join(f"{name}={value}" for name, value in SINGLE_THREADED.items())
-        return f"echo {PID}$$; exec env {settings} {shell.line(words)}"
+        return f"echo {PID}$$; exec env {settings} {shell_line(words)}"
 
     async def _read_lines(self, stream: Any, on_line: Callable[[str], None] | None = None) -> None:
         async for line in stream:
@@ -160,17 +189,17 @@ class Remote:
             return self._fault or f"the connection to {self.host} broke"
         if code is not None and code < 0:
             return f"killed by signal {-code}"
-        last = self.last_words()
+        last = self.last_log_line()
         return f"exit code {code}" + (f": {last}" if last else "")
 
-    def last_words(self) -> str:
+    def last_log_line(self) -> str:
         """Return the last line that it wrote to its log."""
         return self._log.last
 
-    def tell_stop(self, reason: str) -> None:
+    def request_stop(self, reason: str) -> None:
         """Ask it to leave; harmless when it is gone, remembered when it is still on its way."""
         self._stop = reason
-        self._loop.tell(self._send, f"stop {reason}\n")
+        self._loop.call_soon(self._send, f"stop {reason}\n")
 
     def _send(self, line: str) -> None:
         if self._process is not None:
@@ -201,9 +230,9 @@ class Remote:
             self._ended.wait(KILL_S)
 
 
-async def _pid(said: "asyncssh.SSHReader[str]") -> int:
-    """Return the process id that the shell says, 0 if it ends without."""
-    async for line in said:
+async def _pid(output: "asyncssh.SSHReader[str]") -> int:
+    """Return the process id that the shell prints, 0 if it ends without."""
+    async for line in output:
         if line.startswith(PID):
             return int(line.removeprefix(PID))
     return 0

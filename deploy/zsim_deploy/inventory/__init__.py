@@ -1,1 +1,1 @@
-"""The inventory: hosts, how to reach them, which role runs where, what they need. Imports zsim.schema."""
+"""The inventory: hosts, how to reach them, which process runs where and what it needs. Imports options."""

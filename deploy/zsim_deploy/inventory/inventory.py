@@ -77,7 +77,7 @@ class Inventory(Spec, frozen=True, kw_only=True):
     security: Security = Security()
 
 
-class Placed(NamedTuple):
+class InventoryFile(NamedTuple):
     """An inventory on disk: relative paths in it count from its folder."""
 
     inventory: Inventory
@@ -85,21 +85,21 @@ class Placed(NamedTuple):
     source: str
 
 
-def load(path: Path) -> Placed:
+def load(path: Path) -> InventoryFile:
     """Return the inventory of a YAML file.
 
     Raises:
-        InventoryError: with every fault found, a line each.
+        InventoryError: with every fault, a line each.
     """
     document = yaml_file.read(path, EXAMPLE, InventoryError)
-    found = [*faults(document, Inventory), *_cross_faults(sound(document, Inventory), document)]
-    if found:
-        raise InventoryError([f"{path.name}: {where} {text}" for where, text in found])
-    return Placed(msgspec.convert(document, Inventory), path.resolve().parent, path.name)
+    lines = [*faults(document, Inventory), *_cross_faults(sound(document, Inventory), document)]
+    if lines:
+        raise InventoryError([f"{path.name}: {where} {text}" for where, text in lines])
+    return InventoryFile(msgspec.convert(document, Inventory), path.resolve().parent, path.name)
 
 
-def insecure(placed: Placed) -> Placed:
-    """Return an inventory as if it said `security: {insecure: true}`."""
+def insecure(placed: InventoryFile) -> InventoryFile:
+    """Return an inventory with `security: {insecure: true}`."""
     security = msgspec.structs.replace(placed.inventory.security, insecure=True)
     return placed._replace(inventory=msgspec.structs.replace(placed.inventory, security=security))
 
@@ -127,8 +127,8 @@ def _cross_faults(inventory: Any, document: dict[str, Any]) -> Iterator[Fault]:
 
 
 def _map(document: dict[str, Any], name: str) -> list[tuple[Any, Any]]:
-    found = document.get(name)
-    return list(found.items()) if isinstance(found, dict) else []
+    value = document.get(name)
+    return list(value.items()) if isinstance(value, dict) else []
 
 
 def _unknown(path: str, name: Any, known: list[Any], what: str) -> Iterator[Fault]:
@@ -138,8 +138,8 @@ def _unknown(path: str, name: Any, known: list[Any], what: str) -> Iterator[Faul
 
 def _circles(document: dict[str, Any]) -> Iterator[Fault]:
     """Yield routers whose way up never comes to the world."""
-    given = {key: router.get("upstream") for key, router in _map(document, "routers") if isinstance(router, dict)}
-    upstream = {key: above for key, above in given.items() if isinstance(above, str)}
+    above = {key: router.get("upstream") for key, router in _map(document, "routers") if isinstance(router, dict)}
+    upstream = {key: above for key, above in above.items() if isinstance(above, str)}
     for start in upstream:
         seen, at = {start}, upstream[start]
         while at in upstream and at not in seen:
@@ -154,17 +154,17 @@ def roles(scenario: Scenario) -> list[str]:
     return [WORLD, RECORDER, *(name for name in scenario.expected() if name != RECORDER)]
 
 
-def placement(placed: Placed, scenario: Scenario) -> dict[str, str]:
-    """Return the host of every process of a scenario, as `spread` says.
+def placement(placed: InventoryFile, scenario: Scenario) -> dict[str, str]:
+    """Return the host of every process of a scenario, by the rule of `spread`.
 
     Raises:
         InventoryError: a process has no place, or nothing matches a pattern.
     """
-    given = placed.inventory.roles
     names = roles(scenario)
-    places = spread(given, names)
+    entries = placed.inventory.roles
+    places = spread(entries, names)
     lines = [f"roles has no place for {name}; add {name!r}" for name in names if name not in places]
-    unused = [key for key in given if not any(fnmatch.fnmatchcase(name, key) for name in names)]
+    unused = [key for key in entries if not any(fnmatch.fnmatchcase(name, key) for name in names)]
     lines += [f"roles.{key} matches no process of {scenario.name!r}; it has {', '.join(names)}" for key in unused]
     if WORLD in places:
         lines += _port_faults(placed.inventory, places[WORLD])
@@ -173,33 +173,33 @@ def placement(placed: Placed, scenario: Scenario) -> dict[str, str]:
     return places
 
 
-def spread(given: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict[str, str]:
+def spread(roles: Mapping[str, Name | list[Name]], names: Iterable[str]) -> dict[str, str]:
     """Return the hosts of processes, without those that have no place; an entry's hosts take turns.
 
     A name counts more than a pattern, a longer pattern more. The recorder is at the world's host unless it is placed.
     """
-    found: dict[str, str] = {}
+    hosts_by_name: dict[str, str] = {}
     turns: Counter[str] = Counter()
     for name in names:
-        key = entry(given, name)
+        key = entry(roles, name)
         if key is not None:
-            hosts = hosts_of(given, key)
-            found[name] = hosts[turns[key] % len(hosts)]
+            hosts = hosts_of(roles, key)
+            hosts_by_name[name] = hosts[turns[key] % len(hosts)]
             turns[key] += 1
-        elif name == RECORDER and WORLD in found:
-            found[name] = found[WORLD]
-    return found
+        elif name == RECORDER and WORLD in hosts_by_name:
+            hosts_by_name[name] = hosts_by_name[WORLD]
+    return hosts_by_name
 
 
-def entry(given: Mapping[str, Name | list[Name]], name: str) -> str | None:
-    """Return the entry that says where a process runs; None if there is none."""
-    matching = [key for key in given if fnmatch.fnmatchcase(name, key)]
+def entry(roles: Mapping[str, Name | list[Name]], name: str) -> str | None:
+    """Return the entry that places a process; None if there is none."""
+    matching = [key for key in roles if fnmatch.fnmatchcase(name, key)]
     return max(matching, key=lambda key: (key == name, len(key)), default=None)
 
 
-def hosts_of(given: Mapping[str, Name | list[Name]], key: str) -> list[str]:
+def hosts_of(roles: Mapping[str, Name | list[Name]], key: str) -> list[str]:
     """Return the hosts that an entry names."""
-    hosts = given[key]
+    hosts = roles[key]
     return [hosts] if isinstance(hosts, str) else hosts
 
 
@@ -212,27 +212,27 @@ def _port_faults(inventory: Inventory, world: str) -> Iterator[str]:
             yield f"routers.{name}.port is {router.port}, on which {other} listens on {router.host}; give another"
 
 
-def endpoint(placed: Placed, places: dict[str, str], host: str) -> str:
+def endpoint(placed: InventoryFile, places: dict[str, str], host: str) -> str:
     """Return where the roles of a host find the federation: their router, or the world."""
     return _at(placed.inventory, *_listener(placed.inventory, places, placed.inventory.hosts[host].router))
 
 
-def upstream(placed: Placed, places: dict[str, str], router: str) -> str:
+def upstream(placed: InventoryFile, places: dict[str, str], router: str) -> str:
     """Return what a router connects to."""
     return _at(placed.inventory, *_listener(placed.inventory, places, placed.inventory.routers[router].upstream))
 
 
-def connections(placed: Placed, places: dict[str, str]) -> dict[tuple[str, int], set[str]]:
+def connections(placed: InventoryFile, places: dict[str, str]) -> dict[tuple[str, int], set[str]]:
     """Return host and port of what listens, with the other hosts whose roles and routers connect to it."""
     inventory = placed.inventory
     ways = [(host, inventory.hosts[host].router) for name, host in places.items() if name != WORLD]
     ways += [(router.host, router.upstream) for router in inventory.routers.values()]
-    found: dict[tuple[str, int], set[str]] = {}
+    sources: dict[tuple[str, int], set[str]] = {}
     for source, above in ways:
         target = _listener(inventory, places, above)
         if target[0] != source:
-            found.setdefault(target, set()).add(source)
-    return found
+            sources.setdefault(target, set()).add(source)
+    return sources
 
 
 def _listener(inventory: Inventory, places: dict[str, str], router: str | None) -> tuple[str, int]:
@@ -242,7 +242,7 @@ def _listener(inventory: Inventory, places: dict[str, str], router: str | None) 
     return inventory.routers[router].host, inventory.routers[router].port
 
 
-def listening(placed: Placed, host: str, port: int) -> str:
+def listening(placed: InventoryFile, host: str, port: int) -> str:
     """Return the endpoint on which a process of a host listens: its own address, reached from outside."""
     return _at(placed.inventory, host, port)
 

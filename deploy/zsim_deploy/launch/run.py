@@ -15,20 +15,20 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.transport.identity import Identity
 from zsim_agents.hosting import agents_of
-from zsim_deploy.cli import console_command
-from zsim_deploy.forkserver.role_launcher import Nursery
-from zsim_deploy.launch.child import Child
-from zsim_deploy.launch.supervisor import Outcome, Watch
-from zsim_deploy.options.arguments import pace_options
-from zsim_deploy.roles.stop_channel import Leash
-from zsim_deploy.terminal.interrupts import REASONS, handled_by
+from zsim_deploy.launch.child_process import ChildProcess
+from zsim_deploy.launch.role_launcher import RoleLauncher
+from zsim_deploy.launch.supervisor import Outcome, Supervisor
+from zsim_deploy.options.arguments import CONSOLE_PORT, pace_options
+from zsim_deploy.options.terminal import REASONS, handled_by
+from zsim_deploy.roles.stop_channel import StopChannel
 
 DEFAULT_PORT = 7447  # Zenoh's own
+CONSOLE = "console.run"  # the one that a run starts: not to be taken over by the first that is started by hand
 PORTS_TRIED = 5  # when other runs that start at this moment take each before our world listens
 
 
 @dataclass
-class Options:
+class RunOptions:
     """How to run a scenario."""
 
     scenario: Scenario
@@ -42,7 +42,7 @@ class Options:
     console: bool = False
 
 
-def _children(options: Options, endpoint: str, watch: Watch, nursery: Nursery) -> list[Child]:
+def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launcher: RoleLauncher) -> list[ChildProcess]:
     """Return the processes of a run, not started."""
     logs, file = options.out / "logs", options.out / "scenario.yaml"
     scenario, federation = options.scenario, options.scenario.federation
@@ -52,18 +52,23 @@ def _children(options: Options, endpoint: str, watch: Watch, nursery: Nursery) -
     pace = pace_options(options.mode, options.rate)
     world = ["world", str(file), "--listen", endpoint, "--expect", "recorder", *pace, *launched]
     record = ["record", "--out", str(options.out), *reach]
-    children = [Child("world", world, logs, nursery, watch.take_line), Child("recorder", record, logs, nursery)]
+    children = [
+        ChildProcess("world", world, logs, launcher, supervisor.handle_line),
+        ChildProcess("recorder", record, logs, launcher),
+    ]
     wanted = scenario.processes.expect
     names = [name for name in agents_of(scenario) if wanted is None or name in wanted]
     if options.hosted and names:
-        children.append(Child(names[-1], ["host", *reach, "--", *names], logs, nursery))
+        children.append(ChildProcess(names[-1], ["host", *reach, "--", *names], logs, launcher))
     else:
         # a name of the contract may begin with -
         split = [name.partition(".") for name in names]
-        children += [Child(f"{role}.{thing}", [role, *reach, "--", thing], logs, nursery) for role, _, thing in split]
+        children += [
+            ChildProcess(f"{role}.{thing}", [role, *reach, "--", thing], logs, launcher) for role, _, thing in split
+        ]
     if options.console:
-        show = ["console", "--name", console_command.OF_A_RUN, "--port", str(_page_port()), *reach]
-        children.append(Child(console_command.OF_A_RUN, show, logs, nursery, watch.take_line))
+        show = ["console", "--name", CONSOLE, "--port", str(_page_port()), *reach]
+        children.append(ChildProcess(CONSOLE, show, logs, launcher, supervisor.handle_line))
     rank = {name: i for i, name in enumerate(options.order)}
     return sorted(children, key=lambda child: rank.get(child.name, len(rank)))
 
@@ -95,7 +100,7 @@ def _is_free(port: int) -> bool:
 
 def _page_port() -> int:
     """Return the console's port, or another free one where that is taken."""
-    return console_command.PORT if _is_free(console_command.PORT) else _any_port()
+    return CONSOLE_PORT if _is_free(CONSOLE_PORT) else _any_port()
 
 
 def _any_port() -> int:
@@ -135,7 +140,7 @@ def _fresh(folder: Path) -> Path:
     return next(name for name in names if not name.exists())
 
 
-def run_processes(options: Options, screen: Screen) -> Outcome:
+def run_processes(options: RunOptions, screen: Screen) -> Outcome:
     """Run a scenario as real processes; the record is finished whatever happens.
 
     Raises:
@@ -153,39 +158,39 @@ def run_processes(options: Options, screen: Screen) -> Outcome:
     return outcome
 
 
-def _run(options: Options, screen: Screen) -> Outcome:
+def _run(options: RunOptions, screen: Screen) -> Outcome:
     scenario, listen = options.scenario, options.listen
     _write_scenario(options, logs=True)
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
-    with Nursery(screen.say, str(options.out)) as nursery:
-        return _go(options, listen, screen, nursery) if listen else _go_on_a_free_port(options, screen, nursery)
+    with RoleLauncher(screen.say, str(options.out)) as launcher:
+        return _run_on(options, listen, screen, launcher) if listen else _run_on_free_port(options, screen, launcher)
 
 
 def _interrupt(number: int, _: object) -> None:
     raise KeyboardInterrupt(REASONS[number])
 
 
-def _go(options: Options, endpoint: str, screen: Screen, nursery: Nursery) -> Outcome:
-    watch = Watch(options.scenario.processes.on_death, screen)
-    watch.members = [*_children(options, endpoint, watch, nursery)]
-    return watch.go()
+def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLauncher) -> Outcome:
+    supervisor = Supervisor(options.scenario.processes.on_death, screen)
+    supervisor.members = [*_children(options, endpoint, supervisor, launcher)]
+    return supervisor.run()
 
 
-def _go_on_a_free_port(options: Options, screen: Screen, nursery: Nursery, tries: int = PORTS_TRIED) -> Outcome:
+def _run_on_free_port(options: RunOptions, screen: Screen, launcher: RoleLauncher, tries: int = PORTS_TRIED) -> Outcome:
     port = free_port(screen)
     endpoint = f"tcp/127.0.0.1:{port}"
-    outcome = _go(options, endpoint, screen, nursery)
-    if tries > 1 and _was_too_late(outcome, endpoint, port):
-        return _go_on_a_free_port(options, screen, nursery, tries - 1)
+    outcome = _run_on(options, endpoint, screen, launcher)
+    if tries > 1 and _lost_port(outcome, endpoint, port):
+        return _run_on_free_port(options, screen, launcher, tries - 1)
     return outcome
 
 
-def _was_too_late(outcome: Outcome, endpoint: str, port: int) -> bool:
+def _lost_port(outcome: Outcome, endpoint: str, port: int) -> bool:
     """Tell whether somebody else took the port between our look at it and our world's start."""
     return outcome.failed and f"cannot listen on {endpoint}" in outcome.reason and not _is_free(port)
 
 
-def _write_scenario(options: Options, logs: bool) -> None:
+def _write_scenario(options: RunOptions, logs: bool) -> None:
     """Put what is to be flown into the run's folder.
 
     Raises:
@@ -199,17 +204,17 @@ def _write_scenario(options: Options, logs: bool) -> None:
         raise RunError(f"{options.out}: cannot be written ({error.strerror}); give --out another folder") from error
 
 
-def run_in_process(options: Options, screen: Screen) -> Outcome:
+def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
     """Run a scenario in this process: the same bits, without Zenoh."""
     from zsim_analysis.in_process import fly
     from zsim_world.fleet.fleet import DivergedError
 
     _write_scenario(options, logs=False)
-    leash = Leash(launched=False)
+    stop = StopChannel()
     try:
-        reason = fly(options.scenario, options.out / "run.mcap", leash.reason, screen)
+        reason = fly(options.scenario, options.out / "run.mcap", stop.reason, screen)
     except DivergedError as error:
         return Outcome(str(error), failed=True)
     finally:
-        leash.let_go()
-    return Outcome(reason, interrupted=leash.pulled())
+        stop.restore_signals()
+    return Outcome(reason, interrupted=stop.stopped())

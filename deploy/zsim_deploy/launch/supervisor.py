@@ -17,7 +17,7 @@ from zsim.errors import RunError
 from zsim.runtime.progress import Show
 from zsim.scenario.role_table import on_death
 from zsim.scenario.scenario import OnDeath
-from zsim_deploy.terminal.interrupts import IMPATIENT, REASONS, handled_by
+from zsim_deploy.options.terminal import IMPATIENT, REASONS, handled_by
 
 POLL_S = 0.05  # how often the processes are looked at
 END_S = 8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for
@@ -30,7 +30,7 @@ USER_FAULT = 2  # exit code of a role that refuses its arguments or cannot run a
 SUPERSEDED = 3  # exit code of a role whose place another process of its name has taken
 
 
-class Member(Protocol):
+class RunProcess(Protocol):
     """A process of a run."""
 
     name: str
@@ -44,8 +44,8 @@ class Member(Protocol):
     def code(self) -> int | None: ...
     def start(self) -> None: ...
     def outcome(self) -> str: ...
-    def last_words(self) -> str: ...
-    def tell_stop(self, reason: str) -> None: ...
+    def last_log_line(self) -> str: ...
+    def request_stop(self, reason: str) -> None: ...
     def wait(self, timeout_s: float) -> bool: ...
     def kill(self) -> None: ...
     def close(self) -> None: ...
@@ -60,7 +60,7 @@ class Outcome:
     interrupted: bool = False
 
 
-class Watch:
+class Supervisor:
     """Starts the processes of a run, watches them, and leaves nothing behind.
 
     Args:
@@ -72,8 +72,8 @@ class Watch:
     """
 
     def __init__(self, on_death: dict[str, OnDeath], show: Show) -> None:
-        self.members: list[Member] = []
-        self._given = on_death
+        self.members: list[RunProcess] = []
+        self._on_death = on_death
         self._show = show
         self._reason = ""
         self._failed = False
@@ -81,11 +81,11 @@ class Watch:
         self._until_s: float | None = None
         self._dead: set[str] = set()
         self._deaths: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=RESTARTS_MAX + 1))
-        self._leaving: dict[str, tuple[Member, float]] = {}  # whose place was taken, and since when (monotonic, s)
-        self._gone: list[Member] = []  # nobody waits for them any more
-        self._orders: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
+        self._leaving: dict[str, tuple[RunProcess, float]] = {}  # replaced processes, and since when (monotonic, s)
+        self._gone: list[RunProcess] = []  # nobody waits for them any more
+        self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
 
-    def go(self, look: Callable[[], None] = lambda: None) -> Outcome:
+    def run(self, look: Callable[[], None] = lambda: None) -> Outcome:
         """Start everything, watch it to its end, leave nothing behind.
 
         Args:
@@ -100,12 +100,12 @@ class Watch:
                 self._watch(look)
                 self._finish()
             finally:
-                self._refuse_orders()
+                self._cancel_requests()
                 _close([*self.members, *(child for child, _ in self._leaving.values()), *self._gone])
         return Outcome(self._reason or "ended", self._failed, self._interrupted is not None)
 
     def _interrupts(self) -> AbstractContextManager[None]:
-        """Take Ctrl-C and SIGTERM as a wish to end the run well; a second Ctrl-C does not wait."""
+        """Take Ctrl-C and SIGTERM as a request to end the run in order; a second Ctrl-C does not wait."""
 
         def on_signal(number: int, _: object) -> None:
             if self._interrupted:
@@ -114,7 +114,7 @@ class Watch:
 
         return handled_by(on_signal)
 
-    def take_line(self, text: str) -> None:
+    def handle_line(self, text: str) -> None:
         """Take a line of the world's progress."""
         try:
             line = json.loads(text)
@@ -146,41 +146,41 @@ class Watch:
         while world.code is None:
             if self._interrupted:
                 self._reason = self._interrupted
-                world.tell_stop(self._reason)
+                world.request_stop(self._reason)
                 world.wait(min(WORLD_FIRST_S, self._left_s()))
                 return
             for child in self.members:
                 if child is not world and child.code is not None and child.name not in self._dead:
                     self._on_exit(child, world)
-            self._carry_out_orders()
-            self._see_off()
+            self._carry_out_requests()
+            self._release_replaced()
             look()
             world.wait(POLL_S)
         if world.code != 0:
             self._fail(f"the world died: {world.outcome()}")
 
-    def order(self, act: Callable[[], Any]) -> Future[Any]:
+    def submit(self, act: Callable[[], Any]) -> Future[Any]:
         """Let the watch do something between two looks at the processes; callable from any thread.
 
         Returns:
             what comes of it, also if it fails; cancelled when the run ends before.
         """
         outcome: Future[Any] = Future()
-        self._orders.put((act, outcome))
+        self._requests.put((act, outcome))
         return outcome
 
     def interrupt(self, reason: str) -> None:
         """End the run for everybody, as Ctrl-C does."""
         self._interrupted = self._interrupted or reason
 
-    def replace(self, new: Member) -> None:
+    def replace(self, new: RunProcess) -> None:
         """Start a process that takes the place of the one of its name, which then leaves or is killed.
 
         Raises:
             RunError: another one is taking that place at this moment; the last to come would not be the last to join.
         """
-        self._see_off()
-        if self.is_taken_over(new.name):
+        self._release_replaced()
+        if self.is_being_replaced(new.name):
             raise RunError(f"{new.name} is being taken over already; try again when its former process has ended")
         index = next(i for i, child in enumerate(self.members) if child.name == new.name)
         old, self.members[index] = self.members[index], new
@@ -191,11 +191,11 @@ class Watch:
             old.kill()  # it waits for its host, and must not take the name back when that is there
         new.start()
 
-    def is_taken_over(self, name: str) -> bool:
+    def is_being_replaced(self, name: str) -> bool:
         """Tell whether a process is taking the place of another that has not left yet; callable from any thread."""
         return name in self._leaving
 
-    def _see_off(self) -> None:
+    def _release_replaced(self) -> None:
         """Let go of those that have left their place; kill one that hangs there."""
         for name, (child, since_s) in list(self._leaving.items()):
             hangs = child.code is None and time.monotonic() - since_s > TAKE_OVER_S
@@ -206,24 +206,24 @@ class Watch:
                 del self._leaving[name]
                 self._gone.append(child)
 
-    def _carry_out_orders(self) -> None:
-        while not self._orders.empty():
-            act, outcome = self._orders.get()
+    def _carry_out_requests(self) -> None:
+        while not self._requests.empty():
+            act, outcome = self._requests.get()
             if outcome.set_running_or_notify_cancel():
                 _settle(outcome, act)
 
-    def _refuse_orders(self) -> None:
-        while not self._orders.empty():
-            self._orders.get()[1].cancel()
+    def _cancel_requests(self) -> None:
+        while not self._requests.empty():
+            self._requests.get()[1].cancel()
 
-    def _on_exit(self, child: Member, world: Member) -> None:
-        """Do what on_death says of a role that ended while the world runs."""
+    def _on_exit(self, child: RunProcess, world: RunProcess) -> None:
+        """Apply on_death to a role that ended while the world runs."""
         if child.code in (0, SUPERSEDED):
             self._dead.add(child.name)
             if child.code == SUPERSEDED:
-                self._show.say(child.last_words())
+                self._show.say(child.last_log_line())
             return
-        what = on_death(self._given, child.name)
+        what = on_death(self._on_death, child.name)
         if child.code == USER_FAULT or (what == "restart" and self._too_often(child)):
             what = "end"
         self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; on_death: {what}")
@@ -234,10 +234,10 @@ class Watch:
         self._dead.add(child.name)
         if what == "end":
             self._fail(f"{child.name} ended: {child.outcome()}")
-            world.tell_stop(self._reason)
+            world.request_stop(self._reason)
 
-    def _too_often(self, child: Member) -> bool:
-        """Note a death; tell whether there were more of them in a row than a restart heals."""
+    def _too_often(self, child: RunProcess) -> bool:
+        """Count a death; return whether there were too many in a row for another restart."""
         deaths = self._deaths[child.name]
         deaths.append(time.monotonic())
         return len(deaths) > RESTARTS_MAX and deaths[-1] - deaths[0] < RESTART_WINDOW_S
@@ -249,7 +249,7 @@ class Watch:
         """Let everybody leave; the recorder leaves last, by itself."""
         for child in self.members:
             if self._failed or self._interrupted or child.role != "recorder":
-                child.tell_stop(self._reason)
+                child.request_stop(self._reason)
         for child in self.members:
             while not child.wait(min(POLL_S, self._left_s())) and self._left_s() > 0:
                 continue
@@ -266,14 +266,14 @@ class Watch:
 
 
 def _settle(outcome: Future[Any], act: Callable[[], Any]) -> None:
-    """Carry out an order; whatever goes wrong is told to who gave it, and the run goes on."""
+    """Carry out a request; whatever goes wrong goes to its future, and the run goes on."""
     try:
         outcome.set_result(act())
     except Exception as error:
         outcome.set_exception(error)
 
 
-def _close(members: Sequence[Member]) -> None:
+def _close(members: Sequence[RunProcess]) -> None:
     """End all of them at once: one that cannot be reached keeps nobody waiting."""
     with ThreadPoolExecutor(len(members)) as pool:
         for closed in [pool.submit(member.close) for member in members]:

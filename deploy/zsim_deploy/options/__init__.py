@@ -1,1 +1,1 @@
-"""Options that several commands share. Imports zsim alone."""
+"""Options that several commands share, and the terminal. Imports zsim alone."""

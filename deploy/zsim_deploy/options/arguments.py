@@ -1,4 +1,4 @@
-"""Options that several commands share."""
+"""Options that several commands share, and those by which a command connects to a world."""
 
 import math
 from pathlib import Path
@@ -8,10 +8,20 @@ import typer
 
 if TYPE_CHECKING:
     from zsim.transport.identity import Identity
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from zsim.transport.identity import Identity
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+CONSOLE_PORT = 8080  # of its page
 RUN, HOSTS = "Run", "On several machines"  # panels of the help
 REALTIME = "--realtime"  # of the world and the routers, whose lease it shortens
+LOOK_S = 5.0  # wall; for which a command that a person types waits for a world
+NAME = "reach"  # of the argument
 
 
 def positive(value: float | None) -> float | None:
@@ -43,7 +53,7 @@ Wait = Annotated[
 Launched = Annotated[str | None, typer.Option("--launched", hidden=True)]  # by `zsim run`, for the run of this id
 Tls = Annotated[Path | None, typer.Option("--tls", help="Folder of this process's certificate (zsim certs init).")]
 Access = Annotated[Path | None, typer.Option("--access", help="Zenoh's access control (zsim certs init).")]
-Host = Annotated[str | None, typer.Option("--host", help="Name of this host, as others are told.")]
+Host = Annotated[str | None, typer.Option("--host", help="Name of this host, as others see it.")]
 Insecure = Annotated[bool, typer.Option("--insecure", help="Without TLS, on a network that is nobody else's.")]
 
 
@@ -51,14 +61,14 @@ def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | 
     """Return who this process is on the network."""
     from zsim.transport.identity import Identity
 
-    found = Identity(tls=tls, access=access, insecure=insecure)
-    return found._replace(host=host) if host else found
+    plain = Identity(tls=tls, access=access, insecure=insecure)
+    return plain._replace(host=host) if host else plain
 
 
 def load_scenario(
     path: Path, overrides: list[str] | None, seed: int | None = None, duration: float | None = None
 ) -> Any:
-    """Return the scenario of a file with what the command line says of it, the classes that it names loaded."""
+    """Return the scenario of a file with the overrides of the command line."""
     from zsim.scenario import scenario_file
     from zsim_agents.hosting import check_classes
 
@@ -77,3 +87,68 @@ def mode_and_rate(realtime: bool, rate: float | None) -> tuple[str, float]:
 def pace_options(mode: str, rate: float) -> list[str]:
     """Return mode and pace as options of the world."""
     return [*([REALTIME] if mode == "realtime" else []), *(["--rate", str(rate)] if rate else [])]
+
+
+class WorldAccess(NamedTuple):
+    """Where a world is, and who comes.
+
+    Attributes:
+        endpoint: on which the world or a router listens.
+        federation: prefix of its keys.
+        wait_s: for a world; None for ever.
+        tls: folder of the process's certificate.
+        insecure: without TLS, on a network that is nobody else's.
+        host: its name, as others see it.
+        launched: run of which it is a part, of processes that a launcher starts.
+    """
+
+    endpoint: str
+    federation: str
+    wait_s: float | None
+    tls: Path | None
+    insecure: bool
+    host: str | None
+    launched: str | None = None
+
+    @property
+    def who(self) -> "Identity":
+        """Return who the process is on the network."""
+        return identity(self.host, self.tls, self.insecure)
+
+
+_OPTIONS: dict[str, tuple[Any, Any]] = {  # annotation and default, in the order of Reach
+    "connect": (Connect, DEFAULT_ENDPOINT),
+    "federation": (Federation, "zsim"),
+    "wait": (Wait, LOOK_S),
+    "tls": (Tls, None),
+    "insecure": (Insecure, False),
+    "host": (Host, None),
+}
+
+
+def observer_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command that a person types the options of its argument `reach`."""
+    return _with_options(command, _OPTIONS)
+
+
+def participant_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command that runs a process of a federation the options of its argument `reach`: it waits for a world."""
+    return _with_options(command, {**_OPTIONS, "wait": (Wait, None), "launched": (Launched, None)})
+
+
+def _with_options(command: Callable[..., None], options: dict[str, tuple[Any, Any]]) -> Callable[..., None]:
+    """Return the command as typer is to see it: the options in place of `reach`."""
+
+    @wraps(command)
+    def with_options(**values: Any) -> None:
+        reach = WorldAccess(*(values.pop(name, default) for name, (_, default) in options.items()))
+        command(**values, **{NAME: reach})
+
+    signature = inspect.signature(command, eval_str=True)
+    own = [each.replace(kind=each.KEYWORD_ONLY) for name, each in signature.parameters.items() if name != NAME]
+    more = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        for name, (annotation, default) in options.items()
+    ]
+    with_options.__signature__ = signature.replace(parameters=[*own, *more])  # type: ignore[attr-defined]
+    return with_options

@@ -1,1 +1,1 @@
-"""`zsim push`: wheels gathered here and installed on hosts that have no internet. Imports ssh and inventory."""
+"""`zsim push`: wheels gathered here and installed on hosts that have no internet. Imports ssh, inventory and roles."""

@@ -13,9 +13,8 @@ import asyncssh
 
 from zsim.errors import HostsError
 from zsim_deploy.push import on_host
-from zsim_deploy.ssh import shell
 from zsim_deploy.ssh.host_link import HostLink
-from zsim_deploy.ssh.json_answer import answer
+from zsim_deploy.ssh.ssh_connection import json_answer, shell_line
 
 START_S = 30.0  # wall time to start a Python on a small computer, over a poor link
 BEAT_S = 5.0  # how often the launcher shows that it lives
@@ -35,21 +34,21 @@ class Installer:
     def __init__(self, name: str, python: str, process: "asyncssh.SSHClientProcess[str]") -> None:
         self._name, self._python, self._process = name, python, process
 
-    async def lock(self, told: Callable[[str], None]) -> None:
+    async def lock(self, progress: Callable[[str], None]) -> None:
         """Wait until nobody else installs there.
 
         Args:
-            told: hears who does.
+            progress: takes a line on who does.
 
         Raises:
             HostsError: the folder cannot be used, or somebody installs for too long.
         """
-        said = await self._answer(START_S)
-        if holder := said.get("waits"):
-            told(f"waiting for the push of {holder}")
+        message = await self._answer(START_S)
+        if holder := message.get("waits"):
+            progress(f"waiting for the push of {holder}")
             advice = f"{holder} is pushing to it; wait for that to end, or end it there"
-            said = await self._answer(WAIT_S, advice)
-        if why := said.get("unwritable"):
+            message = await self._answer(WAIT_S, advice)
+        if why := message.get("unwritable"):
             raise HostsError(
                 f"{self._name}: its folder cannot be used ({why}); correct hosts.{self._name}.folder, or make it there"
             )
@@ -61,10 +60,10 @@ class Installer:
             HostsError: it failed, took longer, or the host is gone.
         """
         self._process.stdin.write(json.dumps({"act": act, **order}) + "\n")
-        said = await self._answer(timeout_s, f"to {act} took longer than {timeout_s:g} s; is it busy?")
-        if "error" in said:
-            raise HostsError(f"{self._name}: {said['error'][:300]}")
-        return said
+        message = await self._answer(timeout_s, f"to {act} took longer than {timeout_s:g} s; is it busy?")
+        if "error" in message:
+            raise HostsError(f"{self._name}: {message['error'][:300]}")
+        return message
 
     async def beat(self) -> None:
         """Show for ever that we live."""
@@ -77,22 +76,25 @@ class Installer:
         try:
             async with asyncio.timeout(timeout_s):
                 while line := await self._process.stdout.readline():  # a greeting of the login shell is passed over
-                    if said := answer([line]):
-                        return said
-                last = (await self._process.stderr.read()).strip().splitlines() or ["says nothing; does it run there?"]
+                    if message := json_answer([line]):
+                        return message
+                lines = (await self._process.stderr.read()).strip().splitlines()
         except TimeoutError as error:
             raise HostsError(f"{self._name}: {late or f'no answer within {timeout_s:g} s; is it busy?'}") from error
-        raise HostsError(f"{self._name}: {self._python} {last[-1][:200]}")
+        last = lines[-1] if lines else "printed nothing; does it run there?"
+        raise HostsError(f"{self._name}: {self._python} {last[:200]}")
 
 
 @contextlib.asynccontextmanager
-async def installer(link: HostLink, python: str, folder: str, told: Callable[[str], None]) -> AsyncIterator[Installer]:
+async def open_installer(
+    link: HostLink, python: str, folder: str, progress: Callable[[str], None]
+) -> AsyncIterator[Installer]:
     """Let the program run on a host as long as the block lasts; it alone installs there.
 
     Args:
         python: that runs it.
         folder: of zsim over there.
-        told: hears who is waited for.
+        progress: takes a line on who is waited for.
 
     Raises:
         HostsError: the host cannot be reached, its folder not be used, or the connection breaks.
@@ -100,7 +102,7 @@ async def installer(link: HostLink, python: str, folder: str, told: Callable[[st
     script = Path(on_host.__file__).read_bytes()
     start = f"import sys; exec(sys.stdin.buffer.read({len(script)}))"  # not to the end: that means to end
     who = f"{getpass.getuser()}@{socket.gethostname()}"
-    command = shell.line([python, "-P", "-c", start, folder, who, f"{SILENT_S:g}"])
+    command = shell_line([python, "-P", "-c", start, folder, who, f"{SILENT_S:g}"])
     try:
         async with link.channel() as connection:
             process = await connection.create_process(command, encoding="utf-8", errors="replace")
@@ -109,7 +111,7 @@ async def installer(link: HostLink, python: str, folder: str, told: Callable[[st
                 there = Installer(link.name, python, process)
                 beats = asyncio.create_task(there.beat())
                 try:
-                    await there.lock(told)
+                    await there.lock(progress)
                     yield there
                 finally:
                     beats.cancel()

@@ -5,10 +5,10 @@ When standard input ends, or nothing came for a while, not even an empty line, t
 gone: whatever is being done is ended.
 
 {"act": "look"}                      what decides which wheels fit, what is installed, wheels that are there
-{"act": "install", ...}              make FOLDER/venv what the order says
+{"act": "install", ...}              make FOLDER/venv what is wanted
 {"act": "warm_up", "module": NAME}   run a module of what is installed
 
-Only one of it works in a folder at a time; another one says who does, and waits.
+Only one of it works in a folder at a time; another one reports who does, and waits.
 """
 
 import contextlib
@@ -28,11 +28,11 @@ import venv
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-LOCK = "push.lock"  # in the folder: locked by who works in it, with a word on who that is
+LOCK = "push.lock"  # in the folder: locked by who works in it, with a line on who that is
 NOTE = "zsim-installed.json"  # in the environment: what was installed; missing while something is being changed
 
 
-def look(folder: Path) -> dict:
+def inspect_folder(folder: Path) -> dict:
     """Return what decides which wheels fit, and which are still needed."""
     return {
         "folder": str(folder),
@@ -60,11 +60,11 @@ def _sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-class Fault(Exception):  # noqa: N818
-    """What a command says is wrong."""
+class CommandError(Exception):
+    """The error line of a command that failed."""
 
 
-class Children:
+class CommandRunner:
     """Runs commands one after the other, until they are all ended."""
 
     def __init__(self) -> None:
@@ -86,7 +86,7 @@ class Children:
         if code := self._child.returncode:
             lines = (err.strip() or out.strip() or f"it ended with {code}").splitlines()
             errors = [line for line in lines if line.startswith("ERROR")] or lines
-            raise Fault(f"{' '.join(command[-2:])[-80:]}: {errors[-1]}")
+            raise CommandError(f"{' '.join(command[-2:])[-80:]}: {errors[-1]}")
 
     def end(self) -> None:
         """Kill the command that runs with all that it started; no other is started any more."""
@@ -97,7 +97,7 @@ class Children:
             self._child.wait()
 
 
-def install(folder: Path, order: dict, children: Children) -> None:
+def install(folder: Path, order: dict, children: CommandRunner) -> None:
     """Install wheels that lie in FOLDER/wheels, and nothing from anywhere else.
 
     Args:
@@ -153,53 +153,53 @@ def say(answer: dict) -> None:
     print(json.dumps(answer), flush=True)
 
 
-def obey(folder: Path, order: dict, children: Children) -> dict:
-    """Do what an order says and return the answer."""
+def execute(folder: Path, order: dict, children: CommandRunner) -> dict:
+    """Carry out a request and return the answer."""
     try:
         if order["act"] == "look":
-            return look(folder)
+            return inspect_folder(folder)
         if order["act"] == "install":
             install(folder, order, children)
         else:
             children.run([str(folder / "venv" / "bin" / "python"), "-P", "-m", order["module"]])
         return {"done": True}
     except Exception as error:
-        return {"error": str(error) if isinstance(error, (Fault, OSError)) else repr(error)}
+        return {"error": str(error) if isinstance(error, (CommandError, OSError)) else repr(error)}
 
 
-def listen(lines: Iterable, orders: queue.SimpleQueue, heard: threading.Event) -> None:
+def read_orders(lines: Iterable, orders: queue.SimpleQueue, received: threading.Event) -> None:
     """Pass on the orders that come, and note that something came."""
     for line in lines:
-        heard.set()
+        received.set()
         if line.strip():
             orders.put(json.loads(line))
 
 
-def leave(children: Children) -> None:
+def exit_now(children: CommandRunner) -> None:
     """End everything at once; a thread that reads standard input does not end otherwise."""
     children.end()
     os._exit(0)
 
 
-def wait_for_silence(heard: threading.Event, silent_s: float) -> None:
-    """Return when nothing was heard for so long."""
-    while heard.wait(silent_s):
-        heard.clear()
+def wait_for_silence(received: threading.Event, silent_s: float) -> None:
+    """Return when nothing was received for so long."""
+    while received.wait(silent_s):
+        received.clear()
 
 
 def main(folder: Path, who: str, silent_s: float) -> None:
     """Obey until standard input ends, or nothing has come on it for some seconds."""
-    orders, children, heard = queue.SimpleQueue(), Children(), threading.Event()
+    orders, children, received = queue.SimpleQueue(), CommandRunner(), threading.Event()
 
     def follow() -> None:
         try:
-            listen(sys.stdin.buffer, orders, heard)
+            read_orders(sys.stdin.buffer, orders, received)
         finally:
-            leave(children)
+            exit_now(children)
 
     def watch() -> None:
-        wait_for_silence(heard, silent_s)
-        leave(children)
+        wait_for_silence(received, silent_s)
+        exit_now(children)
 
     for each in (follow, watch):
         threading.Thread(target=each, daemon=True).start()
@@ -208,10 +208,10 @@ def main(folder: Path, who: str, silent_s: float) -> None:
             stack.enter_context(locked(folder, who))
         except OSError as error:
             say({"unwritable": f"{error.filename or folder}: {error.strerror}"})
-            leave(children)
+            exit_now(children)
         say({"locked": True})
         while True:
-            say(obey(folder, orders.get(), children))
+            say(execute(folder, orders.get(), children))
 
 
 if __name__ == "__main__":

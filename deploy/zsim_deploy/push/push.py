@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -9,34 +10,40 @@ from pathlib import Path
 from typing import Any
 
 import asyncssh
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 
 from zsim import __version__
 from zsim.errors import HostsError, InventoryError
-from zsim_deploy.inventory import extras
-from zsim_deploy.inventory.inventory import Host, Placed
-from zsim_deploy.push.installer import Installer, installer
-from zsim_deploy.push.target import chosen, interpreters, question, target
-from zsim_deploy.push.wheelhouse import House, Wheel, Wheelhouse
+from zsim_deploy.inventory.inventory import Host, InventoryFile
+from zsim_deploy.inventory.processes import MODULES, known_extras, needed_extras
+from zsim_deploy.push.installer import Installer, open_installer
+from zsim_deploy.push.package_index import choose_interpreter, interpreter_query, parse_interpreters, wheel_target
+from zsim_deploy.push.wheelhouse import Wheel, Wheelhouse, WheelSet
 from zsim_deploy.roles import warm_up
-from zsim_deploy.ssh import shell
 from zsim_deploy.ssh.host_link import HostLink
+from zsim_deploy.ssh.ssh_connection import shell_line
 
-LAUNCHER = "launcher"  # how this machine is called among the hosts, in what is told
+LAUNCHER = "launcher"  # name of this machine among the hosts, in progress lines
 ASK_S = 30.0  # wall time for a host to start a few Pythons; a small computer takes seconds
 INSTALL_S = 900.0  # wall time to unpack 100 MB of wheels on a slow memory card
 COMPILE_S = 900.0  # wall time to compile what flies; half a minute on a laptop's core
 COPIES = 4  # files under way to one host at a time
 
-Told = Callable[[str, str], None]  # host, what is being done there
+Progress = Callable[[str, str], None]  # host, what is being done there
 
 
-async def push(placed: Placed, names: Sequence[str], more: Iterable[str], told: Told, cache: Path) -> dict[str, bool]:
+async def push(
+    placed: InventoryFile, names: Sequence[str], more: Iterable[str], progress: Progress, cache: Path
+) -> dict[str, bool]:
     """Install on hosts what their roles need.
 
     Args:
         names: of the hosts; all of the inventory if empty.
         more: extras for each of them beside those of its roles.
-        told: hears what is being done.
+        progress: takes a host and what is being done there.
         cache: folder of the wheelhouse.
 
     Returns:
@@ -49,14 +56,14 @@ async def push(placed: Placed, names: Sequence[str], more: Iterable[str], told: 
     hosts = placed.inventory.hosts
     more = list(more)
     unknown = [f"--host {name}: must be one of {', '.join(hosts)}" for name in names if name not in hosts]
-    known = extras.known()
+    known = known_extras()
     unknown += [f"--extra {name}: must be one of {', '.join(known)}" for name in more if name not in known]
     if unknown:
         raise InventoryError(unknown)
-    wanted = extras.needed(placed.inventory, more)
-    house = Wheelhouse(cache, lambda text: told(LAUNCHER, text))
+    wanted = needed_extras(placed.inventory, more)
+    house = Wheelhouse(cache, lambda text: progress(LAUNCHER, text))
     chosen_names = list(dict.fromkeys(names)) or list(hosts)
-    work = [_one(name, hosts[name], placed.folder, wanted[name], house, told) for name in chosen_names]
+    work = [_one(name, hosts[name], placed.folder, wanted[name], house, progress) for name in chosen_names]
     results = await asyncio.gather(*work, return_exceptions=True)
     _raise_all(results)
     return {name: result is True for name, result in zip(chosen_names, results, strict=True)}
@@ -71,19 +78,21 @@ def _raise_all(results: Sequence[Any]) -> None:
         raise HostsError("\n".join(lines))
 
 
-async def _one(name: str, host: Host, base: Path, wanted: frozenset[str], house: Wheelhouse, told: Told) -> bool:
+async def _one(
+    name: str, host: Host, base: Path, wanted: frozenset[str], house: Wheelhouse, progress: Progress
+) -> bool:
     """Install on one host; return whether anything had to be done."""
     if host.python:
-        told(name, f"has zsim of its own in {host.python}")
+        progress(name, f"has zsim of its own in {host.python}")
         return False
     link = HostLink(name, host, base)
     try:
-        told(name, "looking what is there")
+        progress(name, "looking what is there")
         python = await _python(link)
-        async with installer(link, python, host.folder, partial(told, name)) as program:
-            return await _install(There(link, program), wanted, house, partial(told, name))
+        async with open_installer(link, python, host.folder, partial(progress, name)) as program:
+            return await _install(HostInstallation(link, program), wanted, house, partial(progress, name))
     except HostsError:
-        told(name, "failed")
+        progress(name, "failed")
         raise
     finally:
         await link.close()
@@ -91,77 +100,79 @@ async def _one(name: str, host: Host, base: Path, wanted: frozenset[str], house:
 
 async def _python(link: HostLink) -> str:
     """Return the Python of a host to install for."""
-    said = await link.run(shell.line(["sh", "-c", question()]), timeout_s=ASK_S)
-    return chosen(link.name, interpreters(said.decode(errors="replace")), sys.version_info[:2]).path
+    output = await link.run(shell_line(["sh", "-c", interpreter_query()]), timeout_s=ASK_S)
+    return choose_interpreter(link.name, parse_interpreters(output.decode(errors="replace")), sys.version_info[:2]).path
 
 
-async def _install(there: "There", wanted: frozenset[str], house: Wheelhouse, told: Callable[[str], None]) -> bool:
+async def _install(
+    there: "HostInstallation", wanted: frozenset[str], house: Wheelhouse, progress: Callable[[str], None]
+) -> bool:
     """Install what is wanted; return whether anything had to be done."""
     await there.look()
-    needed = await house.house(there.name, target(there.name, there.found), wanted)
+    needed = await house.wheel_set(there.name, wheel_target(there.name, there.facts), wanted)
     described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
-    if is_there(needed, there.found["installed"]):
-        told(f"{described} is there")
+    if is_installed(needed, there.facts["installed"]):
+        progress(f"{described} is there")
         return False
-    await there.copy(missing(needed, there.found), told)
-    told("installing")
+    await there.copy(missing(needed, there.facts), progress)
+    progress("installing")
     await there.install(needed)
     if any(wheel.path.name.startswith("numba-") for wheel in needed.others):
-        told("compiling what flies")
+        progress("compiling what flies")
         await there.warm_up()
-    told(f"{described} installed")
+    progress(f"{described} installed")
     return True
 
 
-def is_there(house: House, installed: dict[str, Any] | None) -> bool:
+def is_installed(house: WheelSet, installed: dict[str, Any] | None) -> bool:
     """Tell whether a host has what it needs, by the note of the last push: perhaps more, but nothing else."""
     if installed is None or installed["project"] != house.project.sha256:
         return False
     return set(house.extras) <= set(installed["extras"]) and not _new(house, installed)
 
 
-def _new(house: House, installed: dict[str, Any] | None) -> list[Wheel]:
+def _new(house: WheelSet, installed: dict[str, Any] | None) -> list[Wheel]:
     """Return the wheels of other projects that are not installed yet."""
     known = installed["wheels"] if installed else {}
     return [wheel for wheel in house.others if known.get(wheel.path.name) != wheel.sha256]
 
 
-def missing(house: House, found: dict[str, Any]) -> list[Wheel]:
+def missing(house: WheelSet, facts: dict[str, Any]) -> list[Wheel]:
     """Return the wheels that must be copied to a host, small ones last so that progress is smooth."""
-    needed = [house.project, house.pip, *_new(house, found["installed"])]
-    lacking = [wheel for wheel in needed if found["wheels"].get(wheel.path.name) != wheel.sha256]
+    needed = [house.project, house.pip, *_new(house, facts["installed"])]
+    lacking = [wheel for wheel in needed if facts["wheels"].get(wheel.path.name) != wheel.sha256]
     return sorted(lacking, key=lambda wheel: -wheel.size_bytes)
 
 
-class There:
+class HostInstallation:
     """What is on a host, and what is done to it."""
 
     def __init__(self, link: HostLink, program: Installer) -> None:
         self.name = link.name
         self._link, self._program = link, program
-        self.found: dict[str, Any] = {}
+        self.facts: dict[str, Any] = {}
 
     async def look(self) -> None:
         """Find what is installed."""
-        self.found = await self._program.ask("look", ASK_S)
+        self.facts = await self._program.ask("look", ASK_S)
 
-    async def install(self, house: House) -> None:
+    async def install(self, house: WheelSet) -> None:
         order = {
             "project": house.project.path.name,
             "pip": house.pip.path.name,
-            "wheels": [wheel.path.name for wheel in _new(house, self.found["installed"])],
+            "wheels": [wheel.path.name for wheel in _new(house, self.facts["installed"])],
             "extras": house.extras,
-            "modules": [extras.MODULES[extra] for extra in ("", *house.extras) if extra in extras.MODULES],
-            "note": house.note(),
+            "modules": [MODULES[extra] for extra in ("", *house.extras) if extra in MODULES],
+            "note": house.manifest(),
         }
         await self._program.ask("install", INSTALL_S, **order)
 
     async def warm_up(self) -> None:
         await self._program.ask("warm_up", COMPILE_S, module=warm_up.__name__)
 
-    async def copy(self, wheels: Sequence[Wheel], told: Callable[[str], None]) -> None:
+    async def copy(self, wheels: Sequence[Wheel], progress: Callable[[str], None]) -> None:
         """Copy wheels to the host; what broke off is not mistaken for a wheel."""
-        folder = f"{self.found['folder']}/wheels"
+        folder = f"{self.facts['folder']}/wheels"
         total, done = sum(wheel.size_bytes for wheel in wheels), 0
         gate = asyncio.Semaphore(COPIES)
 
@@ -169,13 +180,13 @@ class There:
             nonlocal done
             part, seen = f"{folder}/{wheel.path.name}.part", 0
 
-            def progress(_source: bytes, _target: bytes, copied: int, _size: int) -> None:
+            def on_copied(_source: bytes, _target: bytes, copied: int, _size: int) -> None:
                 nonlocal done, seen
                 done, seen = done + copied - seen, copied
-                told(f"copying {done / 1e6:.0f} of {total / 1e6:.0f} MB")
+                progress(f"copying {done / 1e6:.0f} of {total / 1e6:.0f} MB")
 
             async with gate:
-                await sftp.put(str(wheel.path), part, progress_handler=progress)
+                await sftp.put(str(wheel.path), part, progress_handler=on_copied)
                 await sftp.posix_rename(part, part.removesuffix(".part"))
 
         try:
@@ -191,3 +202,34 @@ class There:
 def default_cache() -> Path:
     """Return the folder of the wheelhouse on this machine (XDG Base Directory Specification)."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zsim"
+
+
+class PushProgress:
+    """Shows the stage of each host while it is entered."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console or Console(stderr=True)
+        self._now: dict[str, str] = {}
+        self._live = Live(console=self._console, get_renderable=self._table, refresh_per_second=5)
+
+    def __enter__(self) -> "PushProgress":
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+
+    def update(self, host: str, text: str) -> None:
+        """Show what is being done at a host."""
+        kind, last = (re.sub(r"\d+ of", "", each) for each in (text, self._now.get(host, "")))
+        self._now[host] = text
+        if not self._console.is_terminal and kind != last:
+            self._console.print(f"{host}: {text}", highlight=False, markup=False, soft_wrap=True)
+
+    def _table(self) -> Table:
+        table = Table.grid(padding=(0, 2))
+        for host, text in self._now.items():
+            table.add_row(Text(host, style="bold"), Text(text))
+        return table

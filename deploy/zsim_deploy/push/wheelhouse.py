@@ -23,8 +23,7 @@ from urllib.parse import urldefrag
 
 import zsim
 from zsim.errors import HostsError
-from zsim_deploy.push.package_index import PipError, Told, UnreachableError, gather, pip
-from zsim_deploy.push.target import Target
+from zsim_deploy.push.package_index import PipError, Progress, UnreachableError, WheelTarget, download_wheels, pip
 
 PROJECT = "zsim"
 KEY_DIGITS = 16  # 64 bits of a SHA-256; what one person builds never collides
@@ -37,7 +36,7 @@ class Wheel(NamedTuple):
     size_bytes: int
 
 
-class House(NamedTuple):
+class WheelSet(NamedTuple):
     """What one host needs."""
 
     project: Wheel
@@ -48,7 +47,7 @@ class House(NamedTuple):
     def wheels(self) -> tuple[Wheel, ...]:
         return (self.project, self.pip, *self.others)
 
-    def note(self) -> dict[str, Any]:
+    def manifest(self) -> dict[str, Any]:
         """Return what a host keeps of it."""
         wheels = {wheel.path.name: wheel.sha256 for wheel in self.others}
         return {"project": self.project.sha256, "extras": list(self.extras), "wheels": wheels}
@@ -59,18 +58,18 @@ class Wheelhouse:
 
     Args:
         folder: of the cache.
-        told: called with what is being done.
+        progress: called with what is being done.
     """
 
-    def __init__(self, folder: Path, told: Told) -> None:
-        self._folder, self._told = folder, told
+    def __init__(self, folder: Path, progress: Progress) -> None:
+        self._folder, self._progress = folder, progress
         self._unreachable = ""
         self._lock = asyncio.Lock()
         self._wheels = folder / "wheels"
         for made in (self._wheels, folder / "houses"):
             made.mkdir(parents=True, exist_ok=True)
 
-    async def house(self, host: str, target: Target, extras: Iterable[str]) -> House:
+    async def wheel_set(self, host: str, target: WheelTarget, extras: Iterable[str]) -> WheelSet:
         """Return what a host needs.
 
         Args:
@@ -95,7 +94,7 @@ class Wheelhouse:
                 raise HostsError(self._unreachable) from error
         wheels = [_wheel(self._wheels / name) for name in names]
         pip = next(wheel for wheel in wheels if wheel.path.name.startswith(f"{PIP}-"))
-        return House(_wheel(project), pip, tuple(wheel for wheel in wheels if wheel is not pip), wanted)
+        return WheelSet(_wheel(project), pip, tuple(wheel for wheel in wheels if wheel is not pip), wanted)
 
     async def _project(self) -> Path:
         """Return the wheel of this project: of the checkout, or of what is installed."""
@@ -103,10 +102,10 @@ class Wheelhouse:
         source = str(checkout) if checkout else requirement(importlib.metadata.distribution(PROJECT))
         folder = self._folder / PROJECT / _key(_sources(checkout) if checkout else source)
         if not folder.is_dir():
-            self._told(f"building the wheel of {PROJECT}")
+            self._progress(f"building the wheel of {PROJECT}")
             with tempfile.TemporaryDirectory(dir=self._folder) as made:
                 try:
-                    await pip("wheel", "--no-deps", "--wheel-dir", f"{made}/wheel", source, told=self._told)
+                    await pip("wheel", "--no-deps", "--wheel-dir", f"{made}/wheel", source, progress=self._progress)
                 except UnreachableError:
                     raise
                 except PipError as error:
@@ -121,12 +120,14 @@ class Wheelhouse:
         names = json.loads(note.read_text()) if note.exists() else []
         return names if all((self._wheels / name).exists() for name in names) else []
 
-    async def _gather(self, host: str, key: str, project: Path, extras: Sequence[str], target: Target) -> list[str]:
-        self._told(f"gathering the wheels for {target}" + (f" with {', '.join(extras)}" if extras else ""))
+    async def _gather(
+        self, host: str, key: str, project: Path, extras: Sequence[str], target: WheelTarget
+    ) -> list[str]:
+        self._progress(f"gathering the wheels for {target}" + (f" with {', '.join(extras)}" if extras else ""))
         wanted = f"{project}[{','.join(extras)}]" if extras else str(project)
         with tempfile.TemporaryDirectory(dir=self._folder) as made:
             try:
-                other_versions = await gather([wanted, PIP], target, Path(made), constraints(), self._told)
+                other_versions = await download_wheels([wanted, PIP], target, Path(made), constraints(), self._progress)
             except UnreachableError:
                 raise
             except PipError as error:
@@ -135,24 +136,24 @@ class Wheelhouse:
             for name in names:
                 os.replace(Path(made, name), self._wheels / name)
         if other_versions:
-            self._told(f"{host}: {target} gets other versions of packages than are here: not the same bits")
+            self._progress(f"{host}: {target} gets other versions of packages than are here: not the same bits")
         note = self._folder / "houses" / f"{key}.json"
         note.with_suffix(".part").write_text(json.dumps(names))
         os.replace(note.with_suffix(".part"), note)
         return names
 
 
-def _lacking(error: PipError, target: Target) -> str:
-    """Return in a line which wheel does not exist, from what pip says."""
-    found = re.search(r"satisfies the requirement ([\w.-]+)", str(error))
-    if found is None:
+def _lacking(error: PipError, target: WheelTarget) -> str:
+    """Return a line on the wheel that does not exist, from pip's error."""
+    match = re.search(r"satisfies the requirement ([\w.-]+)", str(error))
+    if match is None:
         return f"no wheels for {target}: {error}"
     other = "take another Python there, or build it there and give its folder to pip here (PIP_FIND_LINKS)"
-    return f"no wheel of {found[1]} for {target}; {other}"
+    return f"no wheel of {match[1]} for {target}; {other}"
 
 
 def requirements(project: Path) -> list[str]:
-    """Return what a wheel says that it requires, for all extras."""
+    """Return the requirements in a wheel's metadata, for all extras."""
     with zipfile.ZipFile(project) as archive:
         name = next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
         lines = archive.read(name).decode().partition("\n\n")[0].splitlines()
@@ -170,12 +171,12 @@ def requirement(installed: importlib.metadata.Distribution) -> str:
 @cache
 def constraints() -> list[str]:
     """Return the versions of what is installed here from an index."""
-    found = set()
+    versions = set()
     for each in importlib.metadata.distributions():
         name = each.metadata["Name"].lower()
         if name not in (PROJECT, PIP) and "+" not in each.version and not each.read_text("direct_url.json"):
-            found.add(f"{name}=={each.version}")
-    return sorted(found)
+            versions.add(f"{name}=={each.version}")
+    return sorted(versions)
 
 
 def _checkout() -> Path | None:

@@ -10,14 +10,11 @@ from zsim import __version__
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, WORLD
 from zsim.scenario.scenario import Scenario
-from zsim_deploy.inventory.inventory import Placed
-from zsim_deploy.launch.supervisor import RESTARTS_MAX
-from zsim_deploy.render import container
-from zsim_deploy.render.container import ACCESS, CACHE, CERTIFICATES, RUNS, SCENARIO, USER
-from zsim_deploy.render.rendered_process import (
+from zsim_deploy.inventory.inventory import InventoryFile
+from zsim_deploy.inventory.processes import (
     STOP_S,
-    Files,
-    Process,
+    PlannedProcess,
+    ProcessFiles,
     Rendered,
     access_file,
     command,
@@ -27,12 +24,24 @@ from zsim_deploy.render.rendered_process import (
     processes,
     used_hosts,
 )
-from zsim_deploy.render.yaml_text import document
+from zsim_deploy.launch.supervisor import RESTARTS_MAX
+from zsim_deploy.render.rendered_files import (
+    ACCESS,
+    CACHE,
+    CERTIFICATES,
+    ENVIRONMENT,
+    RUNS,
+    SCENARIO,
+    USER,
+    dockerfile,
+    document,
+    unused,
+)
 
 CACHE_VOLUME = "cache"
 
 
-def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
+def render(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
     """Return `HOST/compose.yaml`, `HOST/Dockerfile`, and the scenario for the world's host.
 
     Args:
@@ -43,30 +52,30 @@ def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = ()) -> Rend
     Raises:
         InventoryError: a process has no place, or nothing matches a pattern.
     """
-    found = processes(placed, scenario, pace)
+    planned = processes(placed, scenario, pace)
     texts: Rendered = {}
-    for host in used_hosts(found):
-        here = on_host(found, host)
+    for host in used_hosts(planned):
+        here = on_host(planned, host)
         texts[f"{host}/compose.yaml"] = document(_project(scenario, here), _remarks(placed, scenario, host))
-        texts[f"{host}/Dockerfile"] = container.dockerfile(extras([process.name for process in here]))
+        texts[f"{host}/Dockerfile"] = dockerfile(extras([process.name for process in here]))
         if any(process.name == WORLD for process in here):
             texts[f"{host}/scenario.yaml"] = scenario_file.to_text(scenario)
     return texts
 
 
-def _remarks(placed: Placed, scenario: Scenario, host: str) -> list[str]:
+def _remarks(placed: InventoryFile, scenario: Scenario, host: str) -> list[str]:
     return [
         "Rendered by `zsim render compose`; render again instead of editing.",
         "ZSIM_USER: user:group that owns the files beside this one. ZSIM_RUN: folder of the next record below runs/,",
         "a new name each time, as a record is never overwritten.",
         "Compose does not tell exit codes apart: a role whose name another process took is started again too,",
         f"{RESTARTS_MAX} times.",
-        *container.unused(placed, host),
+        *unused(placed, host),
         *own_programs(placed, scenario, host),
     ]
 
 
-def _project(scenario: Scenario, here: Sequence[Process]) -> dict[str, Any]:
+def _project(scenario: Scenario, here: Sequence[PlannedProcess]) -> dict[str, Any]:
     return {
         "name": scenario.federation.replace(".", "-").lstrip("-_") or "zsim",  # Compose takes a-z, 0-9, - and _
         "services": {process.name: _service(scenario, process) for process in here},
@@ -74,12 +83,12 @@ def _project(scenario: Scenario, here: Sequence[Process]) -> dict[str, Any]:
     }
 
 
-def _service(scenario: Scenario, process: Process) -> dict[str, Any]:
+def _service(scenario: Scenario, process: PlannedProcess) -> dict[str, Any]:
     return {
         "image": f"zsim:{__version__}-{process.host}",
         "build": ".",
         "command": _words(scenario, process),
-        "environment": dict(container.ENVIRONMENT),
+        "environment": dict(ENVIRONMENT),
         "network_mode": "host",
         "user": f"${{ZSIM_USER:-{USER}:{USER}}}",
         "init": True,
@@ -95,24 +104,24 @@ def _service(scenario: Scenario, process: Process) -> dict[str, Any]:
     }
 
 
-def _words(scenario: Scenario, process: Process) -> list[str]:
+def _words(scenario: Scenario, process: PlannedProcess) -> list[str]:
     """Return the command, `$` doubled where Compose is to leave it alone."""
     out = f"{RUNS}/${{ZSIM_RUN:-{scenario.name}}}"
-    words = command(process, Files(SCENARIO, CERTIFICATES, ACCESS, out))
+    words = command(process, ProcessFiles(SCENARIO, CERTIFICATES, ACCESS, out))
     return [word if word == out else word.replace("$", "$$") for word in words]
 
 
-def _volumes(process: Process) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = [{"type": "volume", "source": CACHE_VOLUME, "target": CACHE}]
+def _volumes(process: PlannedProcess) -> list[dict[str, Any]]:
+    volumes: list[dict[str, Any]] = [{"type": "volume", "source": CACHE_VOLUME, "target": CACHE}]
     if process.name == WORLD:
-        found.append(_bind("./scenario.yaml", SCENARIO))
+        volumes.append(_bind("./scenario.yaml", SCENARIO))
     if process.name == RECORDER:
-        found.append(_bind("./runs", RUNS, read_only=False))
+        volumes.append(_bind("./runs", RUNS, read_only=False))
     if process.secure:
-        found.append(_bind(f"./certs/{process.name}", CERTIFICATES))
+        volumes.append(_bind(f"./certs/{process.name}", CERTIFICATES))
     if process.secure and process.port is not None:
-        found.append(_bind(f"./certs/{access_file(process)}", ACCESS))
-    return found
+        volumes.append(_bind(f"./certs/{access_file(process)}", ACCESS))
+    return volumes
 
 
 def _bind(source: str, target: str, read_only: bool = True) -> dict[str, Any]:

@@ -13,12 +13,9 @@ from zsim.errors import InventoryError
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
-from zsim_deploy.inventory.inventory import Placed
-from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT
-from zsim_deploy.render import container, pod
-from zsim_deploy.render.container import RUNS
-from zsim_deploy.render.rendered_process import (
-    Process,
+from zsim_deploy.inventory.inventory import InventoryFile
+from zsim_deploy.inventory.processes import (
+    PlannedProcess,
     Rendered,
     access_file,
     extras,
@@ -26,7 +23,9 @@ from zsim_deploy.render.rendered_process import (
     processes,
     used_hosts,
 )
-from zsim_deploy.render.yaml_text import document, documents
+from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT
+from zsim_deploy.render import pod
+from zsim_deploy.render.rendered_files import RUNS, dockerfile, document, documents, unused
 
 IMAGE = f"zsim:{__version__}"
 CONFIG_BYTES_MAX = 1_048_576  # of a ConfigMap; Kubernetes, "ConfigMaps"
@@ -38,7 +37,7 @@ NAMESPACE_REMARKS = (
 )
 
 
-def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = (), image: str = IMAGE) -> Rendered:
+def render(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (), image: str = IMAGE) -> Rendered:
     """Return `namespace.yaml`, `secrets.sh`, `zsim.yaml`, `records.yaml` and a Dockerfile.
 
     Args:
@@ -50,30 +49,30 @@ def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = (), image: 
     Raises:
         InventoryError: a process has no place, a name is none that Kubernetes takes, or the scenario is too large.
     """
-    found = processes(placed, scenario, pace)
+    planned = processes(placed, scenario, pace)
     text = scenario_file.to_text(scenario)
-    _refuse(placed, found, text)
+    _refuse(placed, planned, text)
     space = pod.label(scenario.federation)
     texts = {
         "namespace.yaml": documents([_namespace(space), _records_claim(space)], NAMESPACE_REMARKS),
-        "zsim.yaml": documents(_run(space, scenario, text, found, image), _remarks(placed, scenario, found)),
+        "zsim.yaml": documents(_run(space, scenario, text, planned, image), _remarks(placed, scenario, planned)),
         "records.yaml": document(_records_pod(space, image), ["Mounts the records, for `kubectl cp`."]),
-        "Dockerfile": container.dockerfile(extras([process.name for process in found])),
+        "Dockerfile": dockerfile(extras([process.name for process in planned])),
     }
     if not placed.inventory.security.insecure:
-        texts["secrets.sh"] = _secrets(space, found)
+        texts["secrets.sh"] = _secrets(space, planned)
     return texts
 
 
-def _refuse(placed: Placed, found: Sequence[Process], text: str) -> None:
+def _refuse(placed: InventoryFile, planned: Sequence[PlannedProcess], text: str) -> None:
     """Raise an error with a line for everything that Kubernetes cannot do."""
     lines = [
         f"hosts.{host} is no name of a node; must be letters, digits, - and ., as `kubectl get nodes` says"
-        for host in used_hosts(found)
+        for host in used_hosts(planned)
         if not re.fullmatch(r"[a-z0-9]([a-z0-9.-]*[a-z0-9])?", host)
     ]
     first: dict[str, str] = {}
-    for process in found:
+    for process in planned:
         other = first.setdefault(pod.label(process.name), process.name)
         if other != process.name:
             lines.append(f"{process.name} and {other} have the same name in Kubernetes; rename a drone or cluster")
@@ -83,18 +82,18 @@ def _refuse(placed: Placed, found: Sequence[Process], text: str) -> None:
         raise InventoryError([f"{placed.source}: {line}" for line in lines])
 
 
-def _remarks(placed: Placed, scenario: Scenario, found: Sequence[Process]) -> list[str]:
+def _remarks(placed: InventoryFile, scenario: Scenario, planned: Sequence[PlannedProcess]) -> list[str]:
     return [
         "Rendered by `zsim render kubernetes`; render again instead of editing.",
         "A Job starts a dead role again after 10 s, then after 20 s, and so on; `zsim run` does so at once.",
-        *_service_remark(placed, found),
-        *(line for host in used_hosts(found) for line in container.unused(placed, host)),
+        *_service_remark(placed, planned),
+        *(line for host in used_hosts(planned) for line in unused(placed, host)),
         *own_programs(placed, scenario),
     ]
 
 
-def _service_remark(placed: Placed, found: Sequence[Process]) -> list[str]:
-    world = next(process for process in found if process.name == WORLD)
+def _service_remark(placed: InventoryFile, planned: Sequence[PlannedProcess]) -> list[str]:
+    world = next(process for process in planned if process.name == WORLD)
     address = placed.inventory.hosts[world.host].address
     certified = f"The world's certificate is for {address}: over TLS that is its name, and not the Service's."
     return [certified] if world.secure else []
@@ -117,7 +116,7 @@ def _records_claim(space: str) -> dict[str, Any]:
     }
 
 
-def _secrets(space: str, found: Sequence[Process]) -> str:
+def _secrets(space: str, planned: Sequence[PlannedProcess]) -> str:
     """Return a script that puts certificates from where `zsim certs init` left them into the cluster."""
     lines = [
         "#!/bin/sh",
@@ -128,7 +127,7 @@ def _secrets(space: str, found: Sequence[Process]) -> str:
         f'    kubectl -n {space} create secret generic "$@" --dry-run=client -o yaml | kubectl apply -f -',
         "}",
     ]
-    for process in found:
+    for process in planned:
         files = [f'--from-file="$certs/{process.host}/{process.name}"']
         if process.port is not None:
             files.append(f'--from-file=access.json="$certs/{process.host}/{access_file(process)}"')
@@ -158,11 +157,13 @@ def _records_pod(space: str, image: str) -> dict[str, Any]:
 # A run
 
 
-def _run(space: str, scenario: Scenario, text: str, found: Sequence[Process], image: str) -> list[dict[str, Any]]:
+def _run(
+    space: str, scenario: Scenario, text: str, planned: Sequence[PlannedProcess], image: str
+) -> list[dict[str, Any]]:
     return [
         _config(space, text),
-        *(_service(space, process) for process in found if process.name == WORLD),
-        *((_deployment if p.role == ROUTER else _job)(space, p, image) for p in found),
+        *(_service(space, process) for process in planned if process.name == WORLD),
+        *((_deployment if p.role == ROUTER else _job)(space, p, image) for p in planned),
     ]
 
 
@@ -171,7 +172,7 @@ def _config(space: str, text: str) -> dict[str, Any]:
     return {"apiVersion": "v1", "kind": "ConfigMap", "metadata": meta, "data": {"scenario.yaml": text}}
 
 
-def _service(space: str, world: Process) -> dict[str, Any]:
+def _service(space: str, world: PlannedProcess) -> dict[str, Any]:
     """Return the world's name in the cluster, for `zsim echo` and programs in Pods of their own."""
     port = {"name": "zenoh", "port": world.port, "targetPort": "zenoh", "protocol": "TCP"}
     return {
@@ -182,7 +183,7 @@ def _service(space: str, world: Process) -> dict[str, Any]:
     }
 
 
-def _job(space: str, process: Process, image: str) -> dict[str, Any]:
+def _job(space: str, process: PlannedProcess, image: str) -> dict[str, Any]:
     """Return a Job: a fault of the call, and a name that another has taken, are not healed by a new Pod."""
     codes = {"operator": "In", "values": [USER_FAULT, SUPERSEDED]}
     spec = {
@@ -194,7 +195,7 @@ def _job(space: str, process: Process, image: str) -> dict[str, Any]:
     return {"apiVersion": "batch/v1", "kind": "Job", "metadata": _meta(space, process), "spec": spec}
 
 
-def _deployment(space: str, process: Process, image: str) -> dict[str, Any]:
+def _deployment(space: str, process: PlannedProcess, image: str) -> dict[str, Any]:
     """Return a Deployment; the old Pod goes before the new one comes, they have the same port."""
     spec = {
         "replicas": 1,
@@ -205,5 +206,5 @@ def _deployment(space: str, process: Process, image: str) -> dict[str, Any]:
     return {"apiVersion": "apps/v1", "kind": "Deployment", "metadata": _meta(space, process), "spec": spec}
 
 
-def _meta(space: str, process: Process) -> dict[str, Any]:
+def _meta(space: str, process: PlannedProcess) -> dict[str, Any]:
     return {"name": pod.label(process.name), "namespace": space, "labels": pod.labels(process)}

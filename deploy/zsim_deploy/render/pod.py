@@ -6,8 +6,8 @@ from typing import Any
 
 from zsim.scenario.rights import RECORDER, WORLD
 from zsim.transport.identity import CERTIFICATES as IDENTITY_FILES
-from zsim_deploy.render.container import ACCESS, CACHE, CERTIFICATES, ENVIRONMENT, RUNS, SCENARIO, USER
-from zsim_deploy.render.rendered_process import STOP_S, Files, Process, command
+from zsim_deploy.inventory.processes import STOP_S, PlannedProcess, ProcessFiles, command
+from zsim_deploy.render.rendered_files import ACCESS, CACHE, CERTIFICATES, ENVIRONMENT, RUNS, SCENARIO, USER
 
 NAME_MAX = 63  # RFC 1123 label
 CPU = "250m"  # to find a node by; in lockstep a role takes what there is
@@ -20,7 +20,7 @@ def label(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name).strip("-")[:NAME_MAX].rstrip("-") or "zsim"
 
 
-def labels(process: Process) -> dict[str, str]:
+def labels(process: PlannedProcess) -> dict[str, str]:
     return {
         "app.kubernetes.io/name": "zsim",
         "app.kubernetes.io/component": process.role,
@@ -28,11 +28,11 @@ def labels(process: Process) -> dict[str, str]:
     }
 
 
-def secret(process: Process) -> str:
+def secret(process: PlannedProcess) -> str:
     return f"certs-{label(process.name)}"
 
 
-def template(process: Process, image: str, restart: str) -> dict[str, Any]:
+def template(process: PlannedProcess, image: str, restart: str) -> dict[str, Any]:
     spec = {
         "nodeSelector": {"kubernetes.io/hostname": process.host},
         "hostNetwork": True,
@@ -48,9 +48,9 @@ def template(process: Process, image: str, restart: str) -> dict[str, Any]:
     return {"metadata": {"labels": labels(process)}, "spec": spec}
 
 
-def _box(process: Process, image: str) -> dict[str, Any]:
+def _box(process: PlannedProcess, image: str) -> dict[str, Any]:
     name = {"name": "POD_NAME", "valueFrom": {"fieldRef": {"fieldPath": "metadata.name"}}}
-    files = Files(SCENARIO, CERTIFICATES, ACCESS, f"{RUNS}/$(POD_NAME)")
+    files = ProcessFiles(SCENARIO, CERTIFICATES, ACCESS, f"{RUNS}/$(POD_NAME)")
     box = {
         "name": process.role,
         "image": image,
@@ -81,33 +81,33 @@ def locked() -> dict[str, Any]:
     }
 
 
-def _mounts(process: Process) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = [{"name": "cache", "mountPath": CACHE}, {"name": "tmp", "mountPath": "/tmp"}]
+def _mounts(process: PlannedProcess) -> list[dict[str, Any]]:
+    mounts: list[dict[str, Any]] = [{"name": "cache", "mountPath": CACHE}, {"name": "tmp", "mountPath": "/tmp"}]
     if process.name == WORLD:
-        found.append({"name": "scenario", "mountPath": SCENARIO.rpartition("/")[0], "readOnly": True})
+        mounts.append({"name": "scenario", "mountPath": SCENARIO.rpartition("/")[0], "readOnly": True})
     if process.name == RECORDER:
-        found.append({"name": "runs", "mountPath": RUNS})
+        mounts.append({"name": "runs", "mountPath": RUNS})
     if process.secure:
-        found.append({"name": "certs", "mountPath": CERTIFICATES, "readOnly": True})
+        mounts.append({"name": "certs", "mountPath": CERTIFICATES, "readOnly": True})
     if process.secure and process.port is not None:
-        found.append({"name": "access", "mountPath": ACCESS.rpartition("/")[0], "readOnly": True})
-    return found
+        mounts.append({"name": "access", "mountPath": ACCESS.rpartition("/")[0], "readOnly": True})
+    return mounts
 
 
-def _volumes(process: Process) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = [{"name": "cache", "emptyDir": {}}, {"name": "tmp", "emptyDir": {}}]
+def _volumes(process: PlannedProcess) -> list[dict[str, Any]]:
+    volumes: list[dict[str, Any]] = [{"name": "cache", "emptyDir": {}}, {"name": "tmp", "emptyDir": {}}]
     if process.name == WORLD:
-        found.append({"name": "scenario", "configMap": {"name": "scenario"}})
+        volumes.append({"name": "scenario", "configMap": {"name": "scenario"}})
     if process.name == RECORDER:
-        found.append(runs_volume())
+        volumes.append(runs_volume())
     if process.secure:
-        found.append(_secret_volume("certs", process, IDENTITY_FILES))
+        volumes.append(_secret_volume("certs", process, IDENTITY_FILES))
     if process.secure and process.port is not None:
-        found.append(_secret_volume("access", process, ("access.json",)))
-    return found
+        volumes.append(_secret_volume("access", process, ("access.json",)))
+    return volumes
 
 
-def _secret_volume(name: str, process: Process, keys: Sequence[str]) -> dict[str, Any]:
+def _secret_volume(name: str, process: PlannedProcess, keys: Sequence[str]) -> dict[str, Any]:
     items = [{"key": key, "path": key} for key in keys]
     return {"name": name, "secret": {"secretName": secret(process), "defaultMode": 0o440, "items": items}}
 

@@ -12,14 +12,12 @@ from zsim.scenario import scenario_file
 from zsim.scenario.rights import ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.schema.checker import show
-from zsim_deploy.forkserver.role_launcher import SINGLE_THREADED
 from zsim_deploy.inventory import inventory as inv
-from zsim_deploy.inventory.inventory import Host, Placed
-from zsim_deploy.launch.supervisor import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED, USER_FAULT
-from zsim_deploy.render.rendered_process import (
+from zsim_deploy.inventory.inventory import Host, InventoryFile
+from zsim_deploy.inventory.processes import (
     STOP_S,
-    Files,
-    Process,
+    PlannedProcess,
+    ProcessFiles,
     Rendered,
     access_file,
     command,
@@ -28,6 +26,8 @@ from zsim_deploy.render.rendered_process import (
     processes,
     used_hosts,
 )
+from zsim_deploy.launch.role_launcher import SINGLE_THREADED
+from zsim_deploy.launch.supervisor import RESTART_WINDOW_S, RESTARTS_MAX, SUPERSEDED, USER_FAULT
 
 TARGET = "zsim.target"
 STATE = "/var/lib/zsim"  # StateDirectory=zsim
@@ -59,7 +59,7 @@ HARDENING = (
 )
 
 
-def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
+def render(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) -> Rendered:
     """Return `HOST/zsim-PROCESS.service`, `HOST/zsim.target`, and the scenario for the world's host.
 
     Args:
@@ -70,11 +70,11 @@ def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = ()) -> Rend
     Raises:
         InventoryError: a process has no place, or a host has no user or no absolute path to its interpreter.
     """
-    found = processes(placed, scenario, pace)
-    _refuse(placed, used_hosts(found))
+    planned = processes(placed, scenario, pace)
+    _refuse(placed, used_hosts(planned))
     texts: Rendered = {}
-    for host in used_hosts(found):
-        here = on_host(found, host)
+    for host in used_hosts(planned):
+        here = on_host(planned, host)
         for process in here:
             texts[f"{host}/{unit_name(process.name)}"] = _service(placed, scenario, process, here)
         texts[f"{host}/{TARGET}"] = _target(scenario, here, own_programs(placed, scenario, host))
@@ -83,7 +83,7 @@ def render(placed: Placed, scenario: Scenario, pace: Sequence[str] = ()) -> Rend
     return texts
 
 
-def _refuse(placed: Placed, hosts: Iterable[str]) -> None:
+def _refuse(placed: InventoryFile, hosts: Iterable[str]) -> None:
     """Raise an error with a line for everything that a unit needs and the inventory does not say."""
     lines = [f"{placed.source}: hosts.{name}.{text}" for name in hosts for text in _lacks(placed.inventory.hosts[name])]
     if lines:
@@ -123,7 +123,7 @@ def unit_name(process: str) -> str:
     return f"zsim-{process}.service"
 
 
-def _service(placed: Placed, scenario: Scenario, process: Process, here: Sequence[Process]) -> str:
+def _service(placed: InventoryFile, scenario: Scenario, process: PlannedProcess, here: Sequence[PlannedProcess]) -> str:
     host = placed.inventory.hosts[process.host]
     return _text(
         {
@@ -135,7 +135,7 @@ def _service(placed: Placed, scenario: Scenario, process: Process, here: Sequenc
     )
 
 
-def _unit(scenario: Scenario, process: Process, here: Sequence[Process]) -> list[str]:
+def _unit(scenario: Scenario, process: PlannedProcess, here: Sequence[PlannedProcess]) -> list[str]:
     """Return the order: what is started later is stopped first, so the world ends the run for all, routers go last."""
     order = ["network-online.target", *(unit_name(other.name) for other in here if _rank(other) < _rank(process))]
     return [
@@ -148,13 +148,13 @@ def _unit(scenario: Scenario, process: Process, here: Sequence[Process]) -> list
     ]
 
 
-def _rank(process: Process) -> int:
+def _rank(process: PlannedProcess) -> int:
     return {ROUTER: 0, WORLD: 2}.get(process.role, 1)
 
 
-def _run(scenario: Scenario, process: Process, host: Host) -> list[str]:
+def _run(scenario: Scenario, process: PlannedProcess, host: Host) -> list[str]:
     here = folder(host)
-    files = Files(
+    files = ProcessFiles(
         scenario=f"{here}/scenario.yaml",
         identity=f"{here}/certs/{process.name}",
         access=f"{here}/certs/{access_file(process)}",
@@ -182,7 +182,7 @@ def _word(text: str) -> str:
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
-def _life(process: Process) -> list[str]:
+def _life(process: PlannedProcess) -> list[str]:
     """Return when a process is started again, and how it is ended."""
     restart = "on-failure" if process.on_death == "restart" else "no"
     return [
@@ -193,7 +193,7 @@ def _life(process: Process) -> list[str]:
     ]
 
 
-def _target(scenario: Scenario, here: Sequence[Process], remarks: Sequence[str]) -> str:
+def _target(scenario: Scenario, here: Sequence[PlannedProcess], remarks: Sequence[str]) -> str:
     return _text(
         {
             "Unit": [
@@ -206,14 +206,14 @@ def _target(scenario: Scenario, here: Sequence[Process], remarks: Sequence[str])
     )
 
 
-def _remarks(process: Process, host: Host) -> list[str]:
+def _remarks(process: PlannedProcess, host: Host) -> list[str]:
     """Return what a reader has to know that the options do not say."""
-    found = []
+    remarks = []
     if not host.folder.startswith("/"):
-        found.append(f"folder {host.folder} is taken to be in {_home(host.user or '')}; else give an absolute folder")
+        remarks.append(f"folder {host.folder} is taken to be in {_home(host.user or '')}; else give an absolute folder")
     if process.on_death == "wait":
-        found.append("on_death is wait: systemd does not start it again, time stands still until somebody does")
-    return found
+        remarks.append("on_death is wait: systemd does not start it again, time stands still until somebody does")
+    return remarks
 
 
 def _text(sections: dict[str, list[str]], remarks: Sequence[str]) -> str:

@@ -1,1 +1,1 @@
-"""The roles as processes, and how they learn that they are to stop. Imports world, agents, bridges."""
+"""The roles as processes, and how they are stopped. Imports options, and the packages that hold what they run."""

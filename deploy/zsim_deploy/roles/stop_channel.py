@@ -1,42 +1,68 @@
-"""How a process learns that it is to stop: a signal, a word from its launcher, or the launcher's death.
+"""How a process is stopped: by a signal, by its launcher, or because the launcher has died.
 
 A launched process has a pipe from its launcher as standard input. The launcher writes "stop REASON"; when it dies,
 the pipe ends. So nothing outlives its launcher, on any system, also after kill -9. A launcher on another host writes
 "orphan-after SECONDS" and then a "beat" every second: a host that vanishes closes no pipe. A launched process that is
-sent SIGTERM instead ends well, too, but counts as dead: its launcher did not want it.
+sent SIGTERM instead ends in order, too, but counts as dead: its launcher did not ask for it.
+
+With the process ends the lease of the private key that `zsim up` has copied to its host.
 """
 
+import atexit
+import contextlib
 import os
 import signal
 import sys
 import threading
 import time
+from pathlib import Path
 
-from zsim_deploy.security.key_lease import Lent
-from zsim_deploy.terminal.interrupts import IMPATIENT, INTERRUPTED, REASONS
+from zsim.transport.identity import KEY, Identity
+from zsim_deploy.options.terminal import IMPATIENT, INTERRUPTED, REASONS
 
 TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it
-GRACE_S = 4.0  # a role that was told to stop and hangs is ended; the world waits 5 s for byes only if unstopped
+GRACE_S = 4.0  # a role that hangs after a request to stop is ended; the world waits 5 s for byes only if unstopped
+FOLDER = "identity"  # in the folder of a run on a host; the certificates of its processes are below
 
 
-class Leash:
+class KeyLease:
+    """A key that was copied to this host for this process; it is removed when the process ends, for whatever reason.
+
+    Args:
+        folder: with the key.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._key = folder / KEY
+        self._stamp = _stamp(self._key)
+        atexit.register(self.release)
+
+    def release(self) -> None:
+        """Remove the key, but not a newer one at its path: that is of the process that takes over."""
+        with contextlib.suppress(OSError):
+            if _stamp(self._key) == self._stamp:
+                self._key.unlink(missing_ok=True)
+
+
+class StopChannel:
     """The reason to stop, once there is one.
 
     Args:
-        launched: whether standard input is a launcher's pipe; then Ctrl-C is the launcher's business.
-        lent: key that goes back as soon as the launcher is gone.
+        launched: run of which the process is a part. Then standard input is its launcher's pipe, and Ctrl-C is left to
+            the launcher. None if it was started by hand.
+        identity: whose key is removed as soon as the launcher is gone, if it is leased.
     """
 
-    def __init__(self, launched: bool, lent: Lent | None = None) -> None:
-        self._lent = lent
+    def __init__(self, launched: str | None = None, identity: Identity | None = None) -> None:
+        self._lease = key_lease(identity, launched) if identity else None
         self._reason: str | None = None
-        self._deserted = self._terminated = False
-        self._heard_s = time.monotonic()
+        self._orphaned = self._terminated = False
+        self._last_line_s = time.monotonic()
         self._former = {number: signal.getsignal(number) for number in REASONS}
-        if launched:
+        if launched is not None:
             signal.signal(signal.SIGTERM, self._on_kill)
             signal.signal(signal.SIGINT, signal.SIG_IGN)
-            threading.Thread(target=self._listen, name="leash", daemon=True).start()
+            threading.Thread(target=self._read, name="stop channel", daemon=True).start()
         else:
             signal.signal(signal.SIGTERM, lambda *_: self._stop(REASONS[signal.SIGTERM]))
             signal.signal(signal.SIGINT, self._on_interrupt)
@@ -45,15 +71,15 @@ class Leash:
         """Return why to stop, None to go on."""
         return self._reason
 
-    def pulled(self) -> bool:
+    def stopped(self) -> bool:
         """Tell whether to stop."""
         return self._reason is not None
 
-    def deserted(self) -> bool:
+    def orphaned(self) -> bool:
         """Tell whether the launcher is gone, or does not want this end: for all others it is a death, no leave."""
-        return self._deserted
+        return self._orphaned
 
-    def account(self) -> None:
+    def exit_if_terminated(self) -> None:
         """Tell the launcher, by the exit code, that somebody else has ended this process; to be called last.
 
         Raises:
@@ -62,7 +88,7 @@ class Leash:
         if self._terminated:
             raise SystemExit(TERMINATED)
 
-    def let_go(self) -> None:
+    def restore_signals(self) -> None:
         """Take no signals any more: what is left to do may be interrupted as anything."""
         for number, handler in self._former.items():
             signal.signal(number, handler)
@@ -72,7 +98,7 @@ class Leash:
 
     def _on_kill(self, *_: object) -> None:
         if self._reason is None:
-            self._deserted = self._terminated = True
+            self._orphaned = self._terminated = True
         self._stop(REASONS[signal.SIGTERM])
 
     def _on_interrupt(self, *_: object) -> None:
@@ -81,9 +107,9 @@ class Leash:
             os._exit(INTERRUPTED)
         self._stop(REASONS[signal.SIGINT])
 
-    def _listen(self) -> None:
+    def _read(self) -> None:
         for line in sys.stdin:
-            self._heard_s = time.monotonic()
+            self._last_line_s = time.monotonic()
             word, _, rest = line.strip().partition(" ")
             if word == "stop":
                 self._stop(rest or "stopped by the launcher")
@@ -92,15 +118,32 @@ class Leash:
         self._leave("the launcher is gone")
 
     def _await_beats(self, limit_s: float) -> None:
-        """End this process when nothing has been heard for so long."""
-        while (left_s := self._heard_s + limit_s - time.monotonic()) > 0:
+        """End this process when nothing has come for so long."""
+        while (left_s := self._last_line_s + limit_s - time.monotonic()) > 0:
             time.sleep(left_s)
-        self._leave(f"nothing heard from the launcher for {limit_s:g} s")
+        self._leave(f"nothing came from the launcher for {limit_s:g} s")
 
     def _leave(self, reason: str) -> None:
-        self._deserted = True
-        if self._lent is not None:
-            self._lent.give_back()
+        self._orphaned = True
+        if self._lease is not None:
+            self._lease.release()
         self._stop(reason)
         time.sleep(GRACE_S)
         os._exit(1)
+
+
+def key_lease(identity: Identity, launched: str | None) -> KeyLease | None:
+    """Return the lease of the key that the launcher of a run has copied here; None if the key is this host's own."""
+    folder = identity.tls
+    if launched is None or folder is None or folder.parts[-3:-1] != (launched, FOLDER):
+        return None
+    return KeyLease(folder)
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """Return what distinguishes a file from a newer one at its path."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_ctime_ns

@@ -1,7 +1,7 @@
 """A small certificate authority: one for a federation, and a short-lived certificate for each process and host.
 
 certs/ca.pem, certs/ca.key                                 the authority; the key stays where it was made
-certs/HOST/PROCESS/ca.pem, certificate.pem, key.pem        what one process on one host is told with --tls
+certs/HOST/PROCESS/ca.pem, certificate.pem, key.pem        of one process on one host, the folder of --tls
 """
 
 import ipaddress
@@ -20,7 +20,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from zsim.errors import RunError
 from zsim.scenario.rights import OPERATOR
 from zsim.transport.identity import AUTHORITY, CERTIFICATE, CERTIFICATES, DAYS, KEY
-from zsim_deploy.security.enrolment import OPERATORS, Wanted
+from zsim_deploy.security.enrolment import OPERATORS, CertificateRequest
 
 AUTHORITY_DAYS = 1825  # 5 years; its key never leaves the machine that made it
 BACK = timedelta(days=1)  # hosts in the field have clocks that are hours off
@@ -32,7 +32,7 @@ Root = x509.Certificate
 """The certificate of an authority."""
 
 
-class Shown(NamedTuple):
+class CertificateStatus(NamedTuple):
     """A certificate that is there."""
 
     host: str
@@ -65,14 +65,14 @@ def authority(folder: Path, now: datetime, force: bool = False) -> Authority:
     if len(there) == 1:
         missing = next(path for path in paths if path not in there)
         raise RunError(f"{missing}: is missing beside {there[0].name}; bring it here, or --force makes a new authority")
-    found = _read_authority(*paths)
-    if now >= found.certificate.not_valid_after_utc:
-        day = found.certificate.not_valid_after_utc.date()
+    pair = _read_authority(*paths)
+    if now >= pair.certificate.not_valid_after_utc:
+        day = pair.certificate.not_valid_after_utc.date()
         raise RunError(f"{paths[0]}: the authority expired on {day}; --force makes a new one")
-    return found
+    return pair
 
 
-def issue(folder: Path, signer: Authority, wanted: Wanted, now: datetime, days: float = DAYS) -> Path:
+def issue(folder: Path, signer: Authority, wanted: CertificateRequest, now: datetime, days: float = DAYS) -> Path:
     """Make key and certificate of a process on a host; return the folder that they are in.
 
     Raises:
@@ -103,24 +103,24 @@ def root(folder: Path) -> Root:
     return _load(folder / AUTHORITY)
 
 
-def due(folder: Path, signer: Root, wanted: Wanted, now: datetime) -> str | None:
+def renewal_reason(folder: Path, signer: Root, wanted: CertificateRequest, now: datetime) -> str | None:
     """Return why a certificate has to be made, None if the one that is there will do, with its key."""
     place = folder / wanted.host / wanted.process
     if not all((place / name).exists() for name in CERTIFICATES):
         return "new"
     try:
-        found = x509.load_pem_x509_certificate((place / CERTIFICATE).read_bytes())
+        certificate = x509.load_pem_x509_certificate((place / CERTIFICATE).read_bytes())
     except (OSError, ValueError):
         return "cannot be read"
-    fault = _fault(place, found, signer, now)
+    fault = _fault(place, certificate, signer, now)
     if fault:
         return fault
-    if set(_addresses(found)) != {str(name.value) for name in _names(wanted.addresses)}:
+    if set(_addresses(certificate)) != {str(name.value) for name in _names(wanted.addresses)}:
         return "other addresses"
     return None
 
 
-def show(folder: Path, now: datetime) -> list[Shown]:
+def show(folder: Path, now: datetime) -> list[CertificateStatus]:
     """Return every certificate in a folder, with what is wrong with it."""
     paths = sorted(folder.glob(f"*/*/{CERTIFICATE}"))
     if not paths:
@@ -137,24 +137,26 @@ def operators(folder: Path, hosts: Iterable[str]) -> Iterator[str]:
             yield name if host == OPERATORS else f"{name}@{host}"
 
 
-def _shown(place: Path, signer: Root, now: datetime) -> Shown:
-    found = _load(place / CERTIFICATE)
-    fault = _fault(place, found, signer, now) or ""
-    return Shown(place.parent.name, place.name, _addresses(found), found.not_valid_after_utc, fault)
+def _shown(place: Path, signer: Root, now: datetime) -> CertificateStatus:
+    certificate = _load(place / CERTIFICATE)
+    fault = _fault(place, certificate, signer, now) or ""
+    return CertificateStatus(
+        place.parent.name, place.name, _addresses(certificate), certificate.not_valid_after_utc, fault
+    )
 
 
-def _fault(place: Path, found: x509.Certificate, signer: Root, now: datetime) -> str | None:
+def _fault(place: Path, certificate: x509.Certificate, signer: Root, now: datetime) -> str | None:
     """Return what is wrong with a certificate and the files beside it; who writes them may be stopped in between."""
     try:
         authority_there, key = (place / AUTHORITY).read_bytes(), (place / KEY).read_bytes()
         public = serialization.load_pem_private_key(key, password=None).public_key()
     except (OSError, ValueError, TypeError, UnsupportedAlgorithm):
         return "cannot be read"
-    if not _signed_by(found, signer) or authority_there != _pem(signer):
+    if not _signed_by(certificate, signer) or authority_there != _pem(signer):
         return "of another authority"
-    if public != found.public_key():
+    if public != certificate.public_key():
         return "without its key"
-    return f"{EXPIRED} {found.not_valid_after_utc.date()}" if now >= found.not_valid_after_utc else None
+    return f"{EXPIRED} {certificate.not_valid_after_utc.date()}" if now >= certificate.not_valid_after_utc else None
 
 
 def _make_authority(folder: Path, now: datetime) -> Authority:
@@ -190,10 +192,10 @@ def _read_authority(certificate: Path, key: Path) -> Authority:
         raise RunError(f"{key}: cannot be read ({error.strerror}); it belongs to who made it") from error
     except (ValueError, TypeError, UnsupportedAlgorithm) as error:
         raise RunError(f"{key}: is no private key; --force makes a new authority") from error
-    found = Authority(_load(certificate), read) if isinstance(read, ec.EllipticCurvePrivateKey) else None
-    if found is None or found.certificate.public_key() != found.key.public_key():
+    pair = Authority(_load(certificate), read) if isinstance(read, ec.EllipticCurvePrivateKey) else None
+    if pair is None or pair.certificate.public_key() != pair.key.public_key():
         raise RunError(f"{key}: is not the key of {certificate.name}; --force makes a new authority")
-    return found
+    return pair
 
 
 def _load(path: Path) -> x509.Certificate:
@@ -235,17 +237,17 @@ def _names(addresses: Iterable[str]) -> Iterator[x509.IPAddress | x509.DNSName]:
             yield x509.DNSName(address)
 
 
-def _addresses(found: x509.Certificate) -> tuple[str, ...]:
+def _addresses(certificate: x509.Certificate) -> tuple[str, ...]:
     try:
-        names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
         return ()
     return tuple(str(name.value) for name in names)
 
 
-def _signed_by(found: x509.Certificate, signer: Root) -> bool:
+def _signed_by(certificate: x509.Certificate, signer: Root) -> bool:
     try:
-        found.verify_directly_issued_by(signer)
+        certificate.verify_directly_issued_by(signer)
     except (InvalidSignature, ValueError, TypeError):
         return False
     return True

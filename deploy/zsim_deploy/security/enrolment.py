@@ -1,33 +1,54 @@
-"""Who needs a certificate, and whom each listening process lets in: from an inventory and a scenario. Pure."""
+"""Who needs a certificate, and which rights each listening process grants: from an inventory and a scenario. Pure.
+
+Zenoh judges at the process that listens (the world, a router), by the common name in the certificate of the other
+side, both ways: what comes in from it and what goes out to it. An expression is allowed if a rule's includes it.
+docs.rs/zenoh-config, AclConfig.
+"""
 
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from zsim.contract import keys
 from zsim.errors import InventoryError
-from zsim.scenario.rights import OPERATOR, ROUTER, WORLD
+from zsim.scenario import rights
+from zsim.scenario.rights import OPERATOR, ROUTER, WORLD, Rights
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.inventory import inventory as inv
-from zsim_deploy.inventory.inventory import Placed
-from zsim_deploy.security.access_control import access_control
+from zsim_deploy.inventory.inventory import InventoryFile
 
 OPERATORS = "operators"  # folder of the operators that are at no host of the inventory
+# (flow, messages, whose keys): what a right is on the wire, seen from the process that listens
+_WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
+    ("ingress", ("declare_subscriber",), "reads"),
+    ("egress", ("put",), "reads"),
+    ("ingress", ("put",), "writes"),
+    ("ingress", ("query",), "asks"),
+    ("egress", ("reply",), "asks"),
+    ("ingress", ("declare_queryable", "reply"), "answers"),
+    ("egress", ("query",), "answers"),
+    ("ingress", ("liveliness_token",), "tokens"),
+    ("ingress", ("liveliness_query", "declare_liveliness_subscriber"), "watches"),
+    ("egress", ("liveliness_token",), "watches"),
+)
+# Declarations go to all, for without them nothing is sent; they hold no payload.
+_DECLARATIONS = ("declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
+_MESSAGES = (*_DECLARATIONS, "put", "delete", "query", "reply", "liveliness_token")
 
 
-def folder_of(placed: Placed) -> Path:
+def folder_of(placed: InventoryFile) -> Path:
     """Return the folder of an inventory's certificates."""
     return placed.folder / Path(placed.inventory.security.certificates).expanduser()
 
 
-def init_command(placed: Placed, renew: bool = False) -> str:
-    """Return the command that makes an inventory's certificates, as a person is told to type it."""
+def init_command(placed: InventoryFile, renew: bool = False) -> str:
+    """Return the command that makes an inventory's certificates, as a person types it."""
     words = ["zsim", "certs", "init", str(placed.folder / placed.source)]
     return " ".join([shlex.join(words), "--scenario FILE", *(["--renew"] if renew else [])])
 
 
-class Wanted(NamedTuple):
+class CertificateRequest(NamedTuple):
     """A certificate that is to be there.
 
     Attributes:
@@ -55,19 +76,19 @@ class Enrolment:
         BadNameError: an operator's name is none of the contract.
     """
 
-    def __init__(self, placed: Placed, scenario: Scenario, operators: Sequence[str] = ()) -> None:
+    def __init__(self, placed: InventoryFile, scenario: Scenario, operators: Sequence[str] = ()) -> None:
         self._inventory = placed.inventory
         self._scenario = scenario
         self._places = inv.placement(placed, scenario)
         self._operators = list(dict.fromkeys(self._read_operator(text, placed.source) for text in operators))
 
-    def certificates(self) -> list[Wanted]:
+    def certificates(self) -> list[CertificateRequest]:
         """Return the certificates; a role has one for every host, so that it can be moved there during a run."""
         fixed = [(self._places[WORLD], WORLD)]
         fixed += [(router.host, f"{ROUTER}.{name}") for name, router in self._inventory.routers.items()]
         movable = [(host, name) for name in self._movable() for host in self._inventory.hosts]
         operators = [(host or OPERATORS, name) for name, host in self._operators]
-        return [Wanted(host, name, self._addresses(host)) for host, name in [*fixed, *movable, *operators]]
+        return [CertificateRequest(host, name, self._addresses(host)) for host, name in [*fixed, *movable, *operators]]
 
     def access(self) -> Iterator[tuple[str, str, dict[str, Any]]]:
         """Yield (host, process, access control) of every process that listens."""
@@ -112,3 +133,54 @@ class Enrolment:
     def _operators_at(self, router: str | None) -> list[str]:
         """Return the operators that come in at a router, or at the world."""
         return list(dict.fromkeys(name for name, host in self._operators if self._router_of(host) == router))
+
+
+def access_control(
+    scenario: Scenario, clients: Iterable[str], routers: Mapping[str, Iterable[str]], above: Iterable[str] = ()
+) -> dict[str, Any]:
+    """Return the `access_control` of a process that listens.
+
+    Args:
+        scenario: whose drones and clusters the rights are about.
+        clients: names of the processes that connect to it.
+        routers: names of the routers that connect to it, with the processes behind each.
+        above: what it connects to itself, the world or another router.
+
+    Returns:
+        the map of Zenoh's configuration; everything is denied that is not in it.
+    """
+    granted = {name: rights.of(name, scenario) for name in clients}
+    for name, behind in routers.items():
+        granted[name] = rights.union(rights.of(process, scenario) for process in behind)
+    granted |= dict.fromkeys(above, rights.ALL)
+    entries = [(name, list(_rules(name, right, scenario.federation))) for name, right in granted.items()]
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [rule for _, rules in entries for rule in rules],
+        "subjects": [{"id": name, "cert_common_names": [name]} for name, _ in entries],
+        "policies": [{"subjects": [name], "rules": [rule["id"] for rule in rules]} for name, rules in entries],
+    }
+
+
+def _rules(name: str, right: Rights, federation: str) -> Iterator[dict[str, Any]]:
+    if right == rights.ALL:
+        yield _rule(name, ("ingress", "egress"), _MESSAGES, rights.EVERYTHING, federation)
+        return
+    for flow, messages, field in _WIRE:
+        expressions = getattr(right, field)
+        if expressions:
+            yield _rule(name, (flow,), messages, expressions, federation)
+    yield _rule(name, ("egress",), _DECLARATIONS, rights.EVERYTHING, federation)
+
+
+def _rule(
+    name: str, flows: tuple[str, ...], messages: tuple[str, ...], expressions: Iterable[str], federation: str
+) -> dict[str, Any]:
+    return {
+        "id": f"{name} {' '.join(flows)} {' '.join(messages)}",
+        "permission": "allow",
+        "flows": list(flows),
+        "messages": list(messages),
+        "key_exprs": [f"{federation}/{expression}" for expression in expressions],
+    }

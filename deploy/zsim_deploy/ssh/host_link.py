@@ -19,8 +19,7 @@ import asyncssh
 
 from zsim.errors import HostsError
 from zsim_deploy.inventory.inventory import Host
-from zsim_deploy.ssh import shell
-from zsim_deploy.ssh.ssh import connect
+from zsim_deploy.ssh.ssh_connection import connect, shell_word
 
 ECHO_S = 0.5  # how often a word goes to the host and back
 RETRY_S = 0.5  # between two attempts to connect again
@@ -31,7 +30,7 @@ CHANNELS = 8  # kept open on one connection; sshd allows 10 (MaxSessions of sshd
 Result = TypeVar("Result")
 
 
-class Loop:
+class EventLoopThread:
     """An event loop in a thread."""
 
     def __init__(self) -> None:
@@ -56,7 +55,7 @@ class Loop:
         """Start a coroutine that nobody waits for; it can be cancelled."""
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
-    def tell(self, act: Any, *args: Any) -> None:
+    def call_soon(self, act: Any, *args: Any) -> None:
         """Call a plain function on the loop's thread."""
         self._loop.call_soon_threadsafe(act, *args)
 
@@ -77,7 +76,7 @@ class Loop:
 
 
 @dataclass
-class Line:
+class PooledConnection:
     """A connection, and how many of its channels are in use."""
 
     connection: asyncssh.SSHClientConnection
@@ -101,9 +100,9 @@ class HostLink:
         self.name = name
         self.host = host
         self.round_trip_s = 0.0
-        self.heard_s = 0.0
+        self.answered_s = 0.0
         self._base = base
-        self._lines: list[Line] = []
+        self._lines: list[PooledConnection] = []
         self._lock = asyncio.Lock()
 
     async def open(self) -> asyncssh.SSHClientConnection:
@@ -131,7 +130,7 @@ class HostLink:
         finally:
             line.channels -= 1
 
-    async def _reserved(self, patient: bool) -> Line:
+    async def _reserved(self, patient: bool) -> PooledConnection:
         while True:
             try:
                 async with self._lock:
@@ -143,39 +142,39 @@ class HostLink:
                     raise
             await asyncio.sleep(RETRY_S)
 
-    async def _with_room(self) -> Line:
+    async def _with_room(self) -> PooledConnection:
         self._lines = [line for line in self._lines if not line.connection.is_closed()]
         for line in self._lines:
             if line.channels < CHANNELS:
                 return line
-        self._lines.append(Line(await connect(self.name, self.host, self._base)))
+        self._lines.append(PooledConnection(await connect(self.name, self.host, self._base)))
         return self._lines[-1]
 
     async def run(
-        self, command: str, given: bytes = b"", timeout_s: float = ANSWER_S, what: str = "", patient: bool = False
+        self, command: str, stdin: bytes = b"", timeout_s: float = ANSWER_S, what: str = "", patient: bool = False
     ) -> bytes:
         """Return what a command prints.
 
         Args:
             command: line of a POSIX shell.
-            given: its standard input.
+            stdin: its standard input.
             timeout_s: how long it may take.
             what: it does, for errors; its first word if not given.
             patient: try until the host is there; the time counts from then.
 
         Raises:
-            HostsError: it failed, or took too long; with the last line that it said.
+            HostsError: it failed, or took too long; with the last line that it printed.
         """
         async with self.channel(patient) as connection:
             try:
-                done = await asyncio.wait_for(connection.run(command, input=given, encoding=None), timeout_s)
+                done = await asyncio.wait_for(connection.run(command, input=stdin, encoding=None), timeout_s)
             except TimeoutError as error:
-                said = what or repr(command[:60])
-                raise HostsError(f"{self.name}: no answer within {timeout_s:g} s to {said}") from error
+                act = what or repr(command[:60])
+                raise HostsError(f"{self.name}: no answer within {timeout_s:g} s to {act}") from error
             except (asyncssh.Error, OSError) as error:
                 raise HostsError(f"{self.name}: the connection broke ({error}); is the host up?") from error
         if done.exit_status != 0:
-            lines = _text(done.stderr).strip().splitlines() or ["it said nothing"]
+            lines = _text(done.stderr).strip().splitlines() or ["it printed nothing"]
             what = what or command.split(" ", 1)[0]
             raise HostsError(f"{self.name}: {what} failed ({done.exit_status}): {lines[-1][:200]}")
         return done.stdout if isinstance(done.stdout, bytes) else b""
@@ -195,14 +194,14 @@ class HostLink:
             HostsError: they could not be written.
         """
         content = archive(files)
-        into = shell.word(folder)
+        into = shell_word(folder)
         part = f"{into}/.part.$$"  # others may be writing there at the same time
         is_whole = f"[ $(wc -c < {part}) -eq {len(content)} ] || {{ echo it came in part >&2; false; }}"
         unpack = f"cat > {part} && {{ {is_whole}; }} && tar -xof {part} -C {into}"
         script = f"umask 077; mkdir -p {into} && {{ {unpack}; code=$?; rm -f {part}; exit $code; }}"
         await self.run(script, content, timeout_s, what=f"writing into {folder}", patient=patient)
 
-    async def echo(self) -> None:
+    async def measure_round_trips(self) -> None:
         """Send a word there and back for ever, so that a lost host is noticed within a second."""
         while True:
             with contextlib.suppress(HostsError, asyncssh.Error, OSError):
@@ -216,13 +215,13 @@ class HostLink:
             mirror.stdin.write(".\n")
             if not await mirror.stdout.readline():
                 return
-            self.heard_s = time.monotonic()
-            self.round_trip_s = self.heard_s - sent_s
+            self.answered_s = time.monotonic()
+            self.round_trip_s = self.answered_s - sent_s
             await asyncio.sleep(ECHO_S)
 
     def silent_s(self) -> float:
         """Return for how long the host has not answered."""
-        return max(0.0, time.monotonic() - self.heard_s - ECHO_S) if self.heard_s else 0.0
+        return max(0.0, time.monotonic() - self.answered_s - ECHO_S) if self.answered_s else 0.0
 
     async def close(self) -> None:
         """Close all connections; what still runs there on their pipes ends by itself."""

@@ -1,15 +1,22 @@
-"""The launcher's ways to all hosts of a run."""
+"""The ssh links to all hosts of a run, and a file copied from a host to here."""
 
 import asyncio
 from collections.abc import Callable, Coroutine, Iterable
+from pathlib import Path
 from typing import Any
 
+import asyncssh
+
 from zsim.errors import HostsError, ZsimError
-from zsim_deploy.inventory.inventory import Placed
-from zsim_deploy.ssh.host_link import CLOSE_S, HostLink, Loop
+from zsim_deploy.inventory.inventory import InventoryFile
+from zsim_deploy.ssh.host_link import CLOSE_S, EventLoopThread, HostLink
+
+OPEN_S = 10.0  # until the host lets us read; a few round trips of a poor link
+STALL_S = 20.0  # without anything more the host is taken for lost; TCP repeats within that what a poor link loses
+BLOCK_BYTES = 32_768  # asked for at once; even at 100 kbit/s one comes within 3 s
 
 
-class Links:
+class HostLinks:
     """A link to each host that takes part.
 
     Args:
@@ -21,7 +28,7 @@ class Links:
         by_name: the links; a new dictionary when there is one more, for others look at it meanwhile.
     """
 
-    def __init__(self, placed: Placed, names: Iterable[str], loop: Loop) -> None:
+    def __init__(self, placed: InventoryFile, names: Iterable[str], loop: EventLoopThread) -> None:
         self._placed = placed
         self._loop = loop
         self.by_name = {name: self.to(name) for name in names}
@@ -33,12 +40,12 @@ class Links:
     def add(self, link: HostLink) -> None:
         """Keep one more link."""
         self.by_name = {**self.by_name, link.name: link}
-        self._loop.spawn(link.echo())
+        self._loop.spawn(link.measure_round_trips())
 
     def listen(self) -> None:
         """Notice from now on when a host falls silent."""
         for link in self.by_name.values():
-            self._loop.spawn(link.echo())
+            self._loop.spawn(link.measure_round_trips())
 
     def on_all(self, work: Callable[[HostLink], Coroutine[Any, Any, Any]], within_s: float) -> dict[str, Any]:
         """Do the same on all hosts at once, and return what comes of it.
@@ -70,3 +77,49 @@ async def _bounded(link: HostLink, work: Callable[[HostLink], Coroutine[Any, Any
         return await asyncio.wait_for(work(link), within_s)
     except TimeoutError as error:
         raise HostsError(f"{link.name}: not done within {within_s:g} s; is the link slow, the host busy?") from error
+
+
+async def fetch(link: HostLink, source: str, into: Path) -> bool:
+    """Copy a file from a host, under its name only when it is whole; return False if there is none.
+
+    Args:
+        link: to the host.
+        source: path there; a leading ~/ is the home.
+        into: path here; beside it lies what has come, with .part at the end.
+
+    Raises:
+        HostsError: it cannot be read, the host does not answer, or nothing came any more.
+        OSError: it cannot be written here.
+    """
+    part = into.with_name(f"{into.name}.part")
+    try:
+        async with link.channel() as connection:
+            sftp = await asyncio.wait_for(connection.start_sftp_client(), OPEN_S)
+            try:
+                await _copy(sftp, source.removeprefix("~/"), part)
+            finally:
+                sftp.exit()  # not waited for: a link that is cut does not say that it has closed
+    except TimeoutError as error:
+        raise HostsError(f"{link.name}: no answer within {OPEN_S:g} s") from error
+    except asyncssh.SFTPNoSuchFile:
+        return False
+    except asyncssh.Error as error:
+        raise HostsError(f"{link.name}: {error}") from error
+    part.replace(into)
+    return True
+
+
+async def _copy(sftp: asyncssh.SFTPClient, source: str, into: Path) -> None:
+    moved = asyncio.Event()
+    copy = asyncio.create_task(
+        sftp.get(source, into, block_size=BLOCK_BYTES, progress_handler=lambda *_: moved.set()),
+    )
+    copy.add_done_callback(lambda task: task.cancelled() or task.exception())  # nobody else may ask for it
+    try:
+        while not (await asyncio.wait([copy], timeout=STALL_S))[0]:
+            if not moved.is_set():
+                raise HostsError(f"nothing came for {STALL_S:g} s; what did is {into}")
+            moved.clear()
+    finally:
+        copy.cancel()
+    copy.result()

@@ -10,8 +10,8 @@ import yaml
 from zsim.errors import HostsError, RunError
 from zsim.scenario import scenario_file
 from zsim_deploy.cli import hosts_commands
-from zsim_deploy.control.control_socket import Intercom
-from zsim_deploy.hosts.host_plan import Plan
+from zsim_deploy.hosts.control_socket import ControlSocket
+from zsim_deploy.hosts.host_plan import HostPlan
 from zsim_deploy.inventory import inventory
 from zsim_deploy.security import certificates
 from zsim_deploy.security.enrolment import Enrolment
@@ -42,18 +42,18 @@ def paths(tmp_path: Path) -> tuple[Path, Path]:
 
 
 @pytest.fixture
-def plan(paths: tuple[Path, Path]) -> Plan:
+def plan(paths: tuple[Path, Path]) -> HostPlan:
     scenario, hosts = paths
-    return Plan(inventory.load(hosts), scenario_file.load(scenario), "abc", ["--rate", "4"])
+    return HostPlan(inventory.load(hosts), scenario_file.load(scenario), "abc", ["--rate", "4"])
 
 
-def test_a_program_of_the_users_own_is_left_to_the_user(plan: Plan) -> None:
+def test_a_program_of_the_users_own_is_left_to_the_user(plan: HostPlan) -> None:
     assert list(plan.processes) == ["router.field", "world", "recorder", "estimator.drone1", "estimator.-d2"]
     assert plan.hosts() == ["h1"]
     assert [remark.split(":")[0] for remark in plan.remarks] == ["my.drone1 on h2 is a program of your own"]
 
 
-def test_the_command_line_of_a_process(plan: Plan) -> None:
+def test_the_command_line_of_a_process(plan: HostPlan) -> None:
     reach = ["--connect", "tls/127.0.0.1:7447", "--federation", "zsim", "--host", "h1"]
     tls = ["--tls", "/z/runs/abc/identity/estimator.-d2"]
     assert plan.arguments("estimator.-d2") == ["estimator", "--launched", "abc", *reach, *tls, "--", "-d2"]
@@ -63,7 +63,7 @@ def test_the_command_line_of_a_process(plan: Plan) -> None:
     assert world[world.index("--rate") + 1] == "4"
 
 
-def test_a_move_changes_one_place_and_keeps_the_others(plan: Plan) -> None:
+def test_a_move_changes_one_place_and_keeps_the_others(plan: HostPlan) -> None:
     moved = plan.moved("estimator.drone1", "h3").moved("estimator.-d2", "h2")
     assert {name: moved.host(name) for name in moved.processes} == {
         "router.field": "h1",
@@ -76,7 +76,7 @@ def test_a_move_changes_one_place_and_keeps_the_others(plan: Plan) -> None:
     assert plan.host("estimator.drone1") == "h1"
 
 
-def test_the_files_of_a_host(plan: Plan, tmp_path: Path) -> None:
+def test_the_files_of_a_host(plan: HostPlan, tmp_path: Path) -> None:
     for name in plan.processes:
         for file in ("ca.pem", "certificate.pem", "key.pem"):
             path = tmp_path / "certs" / "h1" / name / file
@@ -91,7 +91,7 @@ def test_the_files_of_a_host(plan: Plan, tmp_path: Path) -> None:
     assert plan.files("h3") == {}
 
 
-def test_a_certificate_that_is_not_there_is_a_line(plan: Plan) -> None:
+def test_a_certificate_that_is_not_there_is_a_line(plan: HostPlan) -> None:
     with pytest.raises(
         HostsError,
         match=r"certs/h3/estimator.drone1/ca.pem: cannot be read .* `zsim certs init \S*/hosts.yaml --scenario FILE`",
@@ -120,12 +120,12 @@ def test_a_federation_that_is_up_already_is_refused_before_any_host_is_asked(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     with (
-        Intercom("zsim", {}),
+        ControlSocket("zsim", {}),
         pytest.raises(RunError, match=r"federation 'zsim' is up already .* --set federation=NAME"),
     ):
         hosts_commands.up(*paths, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    with Intercom("zsim", {}), pytest.raises(HostsError, match="cannot be reached"):
+    with ControlSocket("zsim", {}), pytest.raises(HostsError, match="cannot be reached"):
         hosts_commands.up(*paths, out=tmp_path / "out", set_=["federation=other"], insecure=True)
 
 
@@ -154,11 +154,11 @@ def certify(paths: tuple[Path, Path], now: datetime) -> None:
 
 def test_without_tls_as_the_command_line_says_it(paths: tuple[Path, Path]) -> None:
     placed = inventory.insecure(inventory.load(paths[1]))
-    plan = Plan(placed, scenario_file.load(paths[0]), "abc")
+    plan = HostPlan(placed, scenario_file.load(paths[0]), "abc")
     assert "--insecure" in plan.arguments("world")
     assert "tcp/127.0.0.1:7447" in plan.arguments("estimator.drone1")
-    assert (plan.files("h1").keys(), plan.lacks(datetime.now(UTC))) == ({"scenario.yaml"}, [])
+    assert (plan.files("h1").keys(), plan.certificate_faults(datetime.now(UTC))) == ({"scenario.yaml"}, [])
 
 
-def test_the_ports_of_a_host(plan: Plan) -> None:
+def test_the_ports_of_a_host(plan: HostPlan) -> None:
     assert (sorted(plan.ports("h1")), plan.ports("h3")) == ([7447, 7448], [])

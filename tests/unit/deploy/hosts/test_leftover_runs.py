@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy.control.orders import _refuse_unless_able
-from zsim_deploy.hosts.leftover_runs import earlier, scp, told
-from zsim_deploy.inventory import ports
+from zsim_deploy.hosts.launcher_requests import _refuse_unless_able
+from zsim_deploy.hosts.leftover_runs import leftover_lines, leftovers, port_faults, scp
 from zsim_deploy.inventory.inventory import Host
 from zsim_deploy.ssh.host_link import HostLink
 
@@ -41,16 +40,16 @@ def run_of(folder: Path, run: str, *files: str) -> None:
 
 
 def test_a_host_on_which_nothing_ever_ran_has_nothing(tmp_path: Path) -> None:
-    assert asyncio.run(earlier(local(tmp_path / "not there"), tmp_path)) == []
+    assert asyncio.run(leftovers(local(tmp_path / "not there"), tmp_path)) == []
     run_of(tmp_path, "abc", "scenario.yaml", "identity/world/ca.pem")
-    assert asyncio.run(earlier(local(tmp_path), tmp_path)) == []
+    assert asyncio.run(leftovers(local(tmp_path), tmp_path)) == []
 
 
 def test_records_and_keys_are_told_in_a_line_each(tmp_path: Path) -> None:
     folder = tmp_path / "our zsim"
     run_of(folder, "abc", "run.mcap")
     run_of(folder, "def", "run.mcap", "identity/world/key.pem")
-    records, keys = asyncio.run(earlier(local(folder), Path("/inventory")))
+    records, keys = asyncio.run(leftovers(local(folder), Path("/inventory")))
     assert f"h1:{folder}/runs/abc/run.mcap, h1:{folder}/runs/def/run.mcap;" in records
     assert f"fetch with `scp -P 2222 'pi@127.0.0.1:{folder}/runs/abc/run.mcap' .`" in records
     assert keys.endswith(f"remove them there with `rm -r '{folder}/runs/def/identity'`")
@@ -63,16 +62,16 @@ def test_a_run_that_goes_on_is_no_earlier_one(tmp_path: Path) -> None:
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout
         process.stdout.readline()
-        assert asyncio.run(earlier(local(tmp_path), tmp_path)) == []
+        assert asyncio.run(leftovers(local(tmp_path), tmp_path)) == []
         process.communicate()
-    assert len(asyncio.run(earlier(local(tmp_path), tmp_path))) == 2
+    assert len(asyncio.run(leftovers(local(tmp_path), tmp_path))) == 2
 
 
 def test_the_way_of_a_copy_is_that_of_the_launcher() -> None:
     host = Host(address="::1", ssh="fe80::1", key="keys/a b", known_hosts="/etc/known")
     command = "scp -i '/lab/keys/a b' -o UserKnownHostsFile=/etc/known '[fe80::1]:.zsim/runs/1/run.mcap' ."
     assert scp(host, Path("/lab"), "~/.zsim/runs/1/run.mcap") == command
-    (line,) = told("h1", Host(address="h1"), Path(), ["run.mcap 1"])
+    (line,) = leftover_lines("h1", Host(address="h1"), Path(), ["run.mcap 1"])
     assert "h1:~/.zsim/runs/1/run.mcap; fetch with `scp h1:.zsim/runs/1/run.mcap .`" in line
 
 
@@ -81,10 +80,10 @@ def test_a_port_on_which_somebody_listens_is_a_line(free_ports: list[Any]) -> No
     link = local(Path("/z"))
     numbers = [found.getsockname()[1] for found in (taken, free)]
     free.close()
-    (line,) = asyncio.run(ports.faults(link, sys.executable, numbers))
+    (line,) = asyncio.run(port_faults(link, sys.executable, numbers))
     assert line.startswith(f"h1: port {numbers[0]} is in use there")
-    assert asyncio.run(ports.faults(link, sys.executable, numbers[1:])) == []
-    assert asyncio.run(ports.faults(link, "/no/python", [])) == []
+    assert asyncio.run(port_faults(link, sys.executable, numbers[1:])) == []
+    assert asyncio.run(port_faults(link, "/no/python", [])) == []
 
 
 @pytest.fixture

@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy.hosts.remote_process import LOST, Remote
-from zsim_deploy.ssh.host_link import Loop
-from zsim_deploy.ssh.remote_log import Log
+from zsim_deploy.hosts.remote_process import LOST, ProcessLog, RemoteProcess
+from zsim_deploy.ssh.host_link import EventLoopThread
 
 FILES = {"identity/estimator.d1/key.pem": b"secret"}
 PATIENCE_S = 20.0  # after which a test that waits for ever fails
@@ -85,16 +84,16 @@ class Absent(Link):
         yield self
 
 
-Start = Callable[..., Remote]
+Start = Callable[..., RemoteProcess]
 
 
 @pytest.fixture
 def started(tmp_path: Path) -> Iterator[Start]:
-    loop = Loop()
+    loop = EventLoopThread()
 
-    def start(link: Any, on_line: Any = None, log: Log | None = None) -> Remote:
-        log = log or Log(tmp_path / "estimator.d1.log", lambda text: None)
-        remote = Remote("estimator.d1", ["estimator"], link, "python3", loop, log, on_line, "/z/runs/1", FILES)
+    def start(link: Any, on_line: Any = None, log: ProcessLog | None = None) -> RemoteProcess:
+        log = log or ProcessLog(tmp_path / "estimator.d1.log", lambda text: None)
+        remote = RemoteProcess("estimator.d1", ["estimator"], link, "python3", loop, log, on_line, "/z/runs/1", FILES)
         remote.start()
         return remote
 
@@ -108,7 +107,7 @@ def test_what_a_process_says_is_kept_and_a_greeting_of_the_shell_is_not_its_id(s
     remote = started(link, said.append)
     assert remote.wait(PATIENCE_S)
     assert (remote.pid, remote.code, said) == (77, 0, ['{"say": 1}\n'])
-    assert remote.last_words() == "here"
+    assert remote.last_log_line() == "here"
     assert (tmp_path / "estimator.d1.log").read_text() == "here\n\n"
 
 
@@ -125,15 +124,15 @@ def test_a_fault_of_whoever_takes_its_lines_ends_it(started: Start) -> None:
 def test_a_link_that_breaks_is_said(started: Start) -> None:
     remote = started(Absent(HostsError("h1: gone")))
     assert remote.wait(PATIENCE_S)
-    assert remote.outcome() == remote.last_words() == "the connection to h1 broke (h1: gone)"
+    assert remote.outcome() == remote.last_log_line() == "the connection to h1 broke (h1: gone)"
 
 
 def test_a_log_that_cannot_be_written_is_said_once_and_the_process_goes_on(started: Start, tmp_path: Path) -> None:
     said: list[str] = []
-    log = Log(tmp_path / "gone" / "estimator.d1.log", said.append)
+    log = ProcessLog(tmp_path / "gone" / "estimator.d1.log", said.append)
     remote = started(Link(Process("zsim-pid 77\n", complains=("one\n", "two\n"))), log=log)
     assert remote.wait(PATIENCE_S)
-    assert (remote.code, remote.last_words()) == (0, "two")
+    assert (remote.code, remote.last_log_line()) == (0, "two")
     assert [text.split(": ", 1)[1] for text in said] == [
         "cannot be written (No such file or directory); what it would say there is lost"
     ]

@@ -10,7 +10,7 @@ from zsim.errors import InventoryError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_deploy.inventory import inventory
-from zsim_deploy.inventory.inventory import Placed
+from zsim_deploy.inventory.inventory import InventoryFile
 
 ROOT = Path(__file__).parents[4]
 HOSTS = {"lab": {"address": "192.168.1.10"}, "one": {"address": "192.168.1.21"}, "two": {"address": "192.168.1.22"}}
@@ -23,13 +23,13 @@ def step() -> Scenario:
     return scenario_file.load(ROOT / "scenarios/step.yaml")
 
 
-def load(folder: Path, document: Any) -> Placed:
+def load(folder: Path, document: Any) -> InventoryFile:
     path = folder / "hosts.yaml"
     path.write_text(document if isinstance(document, str) else yaml.safe_dump(document, sort_keys=False))
     return inventory.load(path)
 
 
-def placed(folder: Path, **fields: Any) -> Placed:
+def placed(folder: Path, **fields: Any) -> InventoryFile:
     return load(folder, {"hosts": HOSTS, "roles": ROLES, **fields})
 
 
@@ -135,24 +135,24 @@ SITES = {"site": {"host": "one", "port": 7448}, "yard": {"host": "two", "port": 
 
 
 @pytest.fixture
-def sites(tmp_path: Path) -> Placed:
+def sites(tmp_path: Path) -> InventoryFile:
     """Host two is behind its own router, which is behind host one's."""
     return placed(tmp_path, routers=SITES, hosts={**HOSTS, "two": {"address": "192.168.1.22", "router": "yard"}})
 
 
-def test_a_role_connects_to_the_world_or_to_its_host_s_router(sites: Placed, step: Scenario) -> None:
+def test_a_role_connects_to_the_world_or_to_its_host_s_router(sites: InventoryFile, step: Scenario) -> None:
     found = inventory.placement(sites, step)
     assert inventory.endpoint(sites, found, "one") == "tls/192.168.1.10:7447"
     assert inventory.endpoint(sites, found, "two") == "tls/192.168.1.22:7449"
 
 
-def test_a_router_connects_to_the_one_above_or_to_the_world(sites: Placed, step: Scenario) -> None:
+def test_a_router_connects_to_the_one_above_or_to_the_world(sites: InventoryFile, step: Scenario) -> None:
     found = inventory.placement(sites, step)
     assert inventory.upstream(sites, found, "yard") == "tls/192.168.1.21:7448"
     assert inventory.upstream(sites, found, "site") == "tls/192.168.1.10:7447"
 
 
-def test_who_connects_to_whom_across_hosts(sites: Placed, step: Scenario) -> None:
+def test_who_connects_to_whom_across_hosts(sites: InventoryFile, step: Scenario) -> None:
     """Estimators on one and two; two's go to the router on two, that to one's, that to the world."""
     found = inventory.placement(sites, step)
     assert inventory.connections(sites, found) == {("lab", 7447): {"one"}, ("one", 7448): {"two"}}

@@ -8,9 +8,9 @@ from synthetic_record import SCENARIOS
 
 from zsim.errors import RunError, SessionError
 from zsim.scenario import scenario_file
-from zsim_deploy.forkserver.role_launcher import Nursery
 from zsim_deploy.launch import run
-from zsim_deploy.launch.run import Options
+from zsim_deploy.launch.role_launcher import RoleLauncher
+from zsim_deploy.launch.run import RunOptions
 from zsim_deploy.launch.supervisor import Outcome
 
 TAKEN = "the world died: exit code 2: cannot listen on tcp/127.0.0.1:{port} (Address already in use)"
@@ -22,8 +22,8 @@ class Say:
     def say(self, text: str) -> None: ...
 
 
-class FakeWatch:
-    """A watch whose runs end as told; notes on which port each world was to listen."""
+class FakeSupervisor:
+    """A supervisor whose runs end as given; keeps on which port each world was to listen."""
 
     outcomes: ClassVar[list[str]] = []
     ports: ClassVar[list[int]] = []
@@ -31,9 +31,9 @@ class FakeWatch:
     def __init__(self, *_: Any) -> None:
         self.members: list[Any] = []
 
-    def take_line(self, text: str) -> None: ...
+    def handle_line(self, text: str) -> None: ...
 
-    def go(self) -> Outcome:
+    def run(self) -> Outcome:
         world = next(child for child in self.members if child.role == "world")
         endpoint = world._arguments[world._arguments.index("--listen") + 1]
         self.ports.append(int(endpoint.rsplit(":", 1)[1]))
@@ -41,30 +41,30 @@ class FakeWatch:
         return Outcome(reason, failed=reason != "ended")
 
 
-class NoNursery(Nursery):
-    """A nursery that starts nothing."""
+class NoRoleLauncher(RoleLauncher):
+    """A launcher that starts nothing."""
 
-    def __enter__(self) -> Nursery:
+    def __enter__(self) -> RoleLauncher:
         return self
 
     def __exit__(self, *_: object) -> None: ...
 
 
 @pytest.fixture
-def watched(monkeypatch: pytest.MonkeyPatch) -> type[FakeWatch]:
-    FakeWatch.outcomes, FakeWatch.ports = [], []
-    monkeypatch.setattr(run, "Nursery", NoNursery)
-    monkeypatch.setattr(run, "Watch", FakeWatch)
-    monkeypatch.setattr(run, "_is_free", lambda port: port == run.DEFAULT_PORT and not FakeWatch.ports)
-    return FakeWatch
+def watched(monkeypatch: pytest.MonkeyPatch) -> type[FakeSupervisor]:
+    FakeSupervisor.outcomes, FakeSupervisor.ports = [], []
+    monkeypatch.setattr(run, "RoleLauncher", NoRoleLauncher)
+    monkeypatch.setattr(run, "Supervisor", FakeSupervisor)
+    monkeypatch.setattr(run, "_is_free", lambda port: port == run.DEFAULT_PORT and not FakeSupervisor.ports)
+    return FakeSupervisor
 
 
-def options(out: Path, *overrides: str, **others: Any) -> Options:
+def options(out: Path, *overrides: str, **others: Any) -> RunOptions:
     out.mkdir(exist_ok=True)
-    return Options(scenario_file.load(SCENARIOS / "step.yaml", overrides), out, **others)
+    return RunOptions(scenario_file.load(SCENARIOS / "step.yaml", overrides), out, **others)
 
 
-def test_a_port_taken_in_between_is_another_port(watched: type[FakeWatch], tmp_path: Path):
+def test_a_port_taken_in_between_is_another_port(watched: type[FakeSupervisor], tmp_path: Path):
     watched.outcomes = [TAKEN, TAKEN, "ended"]
     outcome = run.run_processes(options(tmp_path), Say())  # type: ignore[arg-type]
     assert not outcome.failed
@@ -72,20 +72,20 @@ def test_a_port_taken_in_between_is_another_port(watched: type[FakeWatch], tmp_p
     assert len(set(watched.ports)) == 3
 
 
-def test_a_port_asked_for_is_tried_once(watched: type[FakeWatch], tmp_path: Path):
+def test_a_port_asked_for_is_tried_once(watched: type[FakeSupervisor], tmp_path: Path):
     watched.outcomes = [TAKEN]
     outcome = run.run_processes(options(tmp_path, listen="tcp/127.0.0.1:20001"), Say())  # type: ignore[arg-type]
     assert outcome.failed
     assert watched.ports == [20001]
 
 
-def test_another_end_is_the_end(watched: type[FakeWatch], tmp_path: Path):
+def test_another_end_is_the_end(watched: type[FakeSupervisor], tmp_path: Path):
     watched.outcomes = ["the world died: killed by signal 9"]
     assert run.run_processes(options(tmp_path), Say()).failed  # type: ignore[arg-type]
     assert len(watched.ports) == 1
 
 
-def test_trying_ports_has_an_end(watched: type[FakeWatch], tmp_path: Path):
+def test_trying_ports_has_an_end(watched: type[FakeSupervisor], tmp_path: Path):
     watched.outcomes = [TAKEN] * 100
     assert run.run_processes(options(tmp_path), Say()).failed  # type: ignore[arg-type]
     assert len(watched.ports) == run.PORTS_TRIED
@@ -93,7 +93,7 @@ def test_trying_ports_has_an_end(watched: type[FakeWatch], tmp_path: Path):
 
 def test_no_name_is_taken_for_an_option(tmp_path: Path):
     made = options(tmp_path, "drones.drone1.name=-._", "clusters.main.drones=[-._, drone2, drone3]")
-    children = run._children(made, "tcp/127.0.0.1:20001", FakeWatch(), NoNursery(print))  # type: ignore[arg-type]
+    children = run._children(made, "tcp/127.0.0.1:20001", FakeSupervisor(), NoRoleLauncher(print))  # type: ignore[arg-type]
     lines = [child._arguments for child in children]
     (line,) = (line for line in lines if "-._" in line)
     assert line[0] == "estimator"

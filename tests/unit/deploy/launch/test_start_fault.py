@@ -23,19 +23,16 @@ processes: {expect: []}
 """
 
 
-class NoLeash:
+class NoStopChannel:
     """Leaves the signals to pytest."""
-
-    def __init__(self, launched: bool) -> None:
-        return
 
     def reason(self) -> None:
         return
 
-    def pulled(self) -> bool:
+    def stopped(self) -> bool:
         return False
 
-    def let_go(self) -> None: ...
+    def restore_signals(self) -> None: ...
 
 
 def test_a_diverged_run_in_one_process_has_failed_and_has_its_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -47,13 +44,13 @@ def test_a_diverged_run_in_one_process_has_failed_and_has_its_record(tmp_path: P
         advance(fleet)
 
     monkeypatch.setattr(Fleet, "advance", diverge)
-    monkeypatch.setattr(run, "Leash", NoLeash)
-    options = run.Options(scenario_file.from_text(SCENARIO), tmp_path)
+    monkeypatch.setattr(run, "StopChannel", NoStopChannel)
+    options = run.RunOptions(scenario_file.from_text(SCENARIO), tmp_path)
     outcome = run.run_in_process(options, Screen(1.0, Console(file=io.StringIO())))
     assert outcome.failed
     assert outcome.reason.startswith("d1 at 0.120 s: the state is no longer finite")
     with RecordReader(tmp_path / "run.mcap") as reader:
-        said = [(m.key, messages.decode(m.key, m.payload)) for m in reader.messages()]
-    assert [event.kind for key, event in said if key == keys.EVENT] == ["diverged", "end"]
-    clocks = [clock for key, clock in said if key == keys.CLOCK]
+        recorded = [(m.key, messages.decode(m.key, m.payload)) for m in reader.messages()]
+    assert [event.kind for key, event in recorded if key == keys.EVENT] == ["diverged", "end"]
+    clocks = [clock for key, clock in recorded if key == keys.CLOCK]
     assert (clocks[-1].state, clocks[-1].t_ns) == ("stopped", 5 * GATE_NS)

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from zsim.errors import RunError
-from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT, Watch
+from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT, Supervisor
 
 
 class Show:
@@ -50,10 +50,10 @@ class Member:
     def outcome(self) -> str:
         return f"exit code {self.code}"
 
-    def last_words(self) -> str:
+    def last_log_line(self) -> str:
         return f"{self.name}: last words"
 
-    def tell_stop(self, reason: str) -> None:
+    def request_stop(self, reason: str) -> None:
         self.stopped_for = reason
 
     def kill(self) -> None:
@@ -70,7 +70,7 @@ class Team:
         self, *others: Member, looks: int = 20, on_death: dict[str, Any] | None = None, world: int = 0
     ) -> None:
         self.show = Show()
-        self.watch = Watch(on_death or {}, self.show)
+        self.watch = Supervisor(on_death or {}, self.show)
         self.world = Member("world", world, lives_for=looks)
         self.recorder = Member("recorder", 0, lives_for=looks + 1)
         self.others = others
@@ -83,7 +83,7 @@ class Team:
                 member.wait(0.0)
             look()
 
-        return self.watch.go(live)
+        return self.watch.run(live)
 
 
 def test_a_run_that_ends_well():
@@ -150,7 +150,7 @@ def test_an_interrupt_ends_everybody():
 def test_a_process_takes_the_place_of_another():
     old, new = Member("estimator.d1", SUPERSEDED, lives_for=1000), Member("estimator.d1")
     team = Team(old)
-    team.watch.order(lambda: team.watch.replace(new))
+    team.watch.submit(lambda: team.watch.replace(new))
     assert not team.go().failed
     assert new.restarts == 1
     assert old.closed
@@ -161,7 +161,7 @@ def test_a_process_takes_the_place_of_another():
 def test_the_second_of_two_restarts_at_once_is_refused_and_the_run_goes_on():
     first, second = Member("estimator.d1"), Member("estimator.d1")
     team = Team(Member("estimator.d1", SUPERSEDED, lives_for=1000))
-    orders = [team.watch.order(lambda new=new: team.watch.replace(new)) for new in (first, second)]
+    orders = [team.watch.submit(lambda new=new: team.watch.replace(new)) for new in (first, second)]
     assert not team.go().failed
     assert orders[0].exception() is None
     assert isinstance(orders[1].exception(), RunError)
@@ -181,7 +181,7 @@ def test_one_restart_after_another_takes_the_place_of_the_first():
                 member.wait(0.0)
         if team.watch.members[-1].code is not None or team.watch.members[-1] is old:
             new = next(news, None)
-            team.watch.order(lambda: team.watch.replace(new)) if new else None
+            team.watch.submit(lambda: team.watch.replace(new)) if new else None
 
     assert not team.go(look).failed
     assert second in team.watch.members
@@ -190,7 +190,7 @@ def test_one_restart_after_another_takes_the_place_of_the_first():
 
 def test_an_order_that_fails_is_told_to_who_gave_it_and_the_run_goes_on():
     team = Team(Member("estimator.d1"))
-    outcome = team.watch.order(lambda: [].index(1))
+    outcome = team.watch.submit(lambda: [].index(1))
     assert not team.go().failed
     assert isinstance(outcome.exception(), ValueError)
 
@@ -199,8 +199,8 @@ def test_an_order_that_comes_too_late_is_not_carried_out():
     team = Team(Member("estimator.d1"))
     done = []
     late = []
-    team.recorder.tell_stop = team.others[0].tell_stop = lambda reason: late.append(
-        team.watch.order(lambda: done.append(1))
+    team.recorder.request_stop = team.others[0].request_stop = lambda reason: late.append(
+        team.watch.submit(lambda: done.append(1))
     )  # type: ignore[method-assign]
     team.go(lambda: team.watch.interrupt("ended by zsim down"))
     assert late
@@ -212,7 +212,7 @@ def test_a_process_that_does_not_make_way_is_killed(monkeypatch):
     monkeypatch.setattr("zsim_deploy.launch.supervisor.TAKE_OVER_S", -1.0)
     old, new = Member("estimator.d1", lives_for=1000), Member("estimator.d1")
     team = Team(old)
-    team.watch.order(lambda: team.watch.replace(new))
+    team.watch.submit(lambda: team.watch.replace(new))
     assert not team.go().failed
     assert old.code == -signal.SIGKILL
     assert "estimator.d1 (pid 1) has not made way" in team.show.said[0]
@@ -223,7 +223,7 @@ def test_a_process_that_waits_for_its_host_is_given_up_when_another_takes_its_pl
     old.start = lambda: None  # type: ignore[method-assign]
     old.wait = lambda timeout_s: False  # type: ignore[method-assign]
     team = Team(old)
-    team.watch.order(lambda: team.watch.replace(new))
+    team.watch.submit(lambda: team.watch.replace(new))
     team.go()
     assert old.code == -signal.SIGKILL
 
@@ -253,5 +253,5 @@ def test_a_run_that_is_ended_before_it_starts_starts_nobody():
 @pytest.mark.parametrize("text", ["1234\n", "[1]\n", "null\n", "Welcome\n"])
 def test_what_is_no_progress_is_passed_over(text):
     team = Team()
-    team.watch.take_line(text)
+    team.watch.handle_line(text)
     assert team.show.said == []

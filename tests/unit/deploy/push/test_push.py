@@ -16,11 +16,11 @@ import pytest
 
 from zsim.errors import HostsError, InventoryError
 from zsim_deploy.inventory import inventory
-from zsim_deploy.inventory.inventory import Host, Inventory, Placed
+from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
 from zsim_deploy.push import on_host
-from zsim_deploy.push.installer import installer
-from zsim_deploy.push.push import ASK_S, is_there, missing, push
-from zsim_deploy.push.wheelhouse import House, Wheel
+from zsim_deploy.push.installer import open_installer
+from zsim_deploy.push.push import ASK_S, is_installed, missing, push
+from zsim_deploy.push.wheelhouse import Wheel, WheelSet
 from zsim_deploy.ssh.host_link import HostLink
 
 
@@ -28,24 +28,24 @@ def wheel(name: str, size_bytes: int = 1, sha256: str | None = None) -> Wheel:
     return Wheel(Path(f"/cache/{name}.whl"), sha256 or f"sha of {name}", size_bytes)
 
 
-HOUSE = House(wheel("zsim-1"), wheel("pip-26"), (wheel("numpy-2", 9), wheel("scipy-1", 5)), ("agents",))
-NOTE = HOUSE.note()
+HOUSE = WheelSet(wheel("zsim-1"), wheel("pip-26"), (wheel("numpy-2", 9), wheel("scipy-1", 5)), ("agents",))
+NOTE = HOUSE.manifest()
 
 
 def test_what_was_installed_last_is_there() -> None:
-    assert is_there(HOUSE, NOTE)
-    assert not is_there(HOUSE, None)
+    assert is_installed(HOUSE, NOTE)
+    assert not is_installed(HOUSE, None)
 
 
 def test_another_build_an_extra_or_another_version_of_a_package_is_not_there() -> None:
-    assert not is_there(HOUSE._replace(project=wheel("zsim-1", sha256="changed")), NOTE)
-    assert not is_there(HOUSE._replace(extras=("agents", "world")), NOTE)
-    assert not is_there(HOUSE._replace(others=(wheel("numpy-3"), wheel("scipy-1"))), NOTE)
+    assert not is_installed(HOUSE._replace(project=wheel("zsim-1", sha256="changed")), NOTE)
+    assert not is_installed(HOUSE._replace(extras=("agents", "world")), NOTE)
+    assert not is_installed(HOUSE._replace(others=(wheel("numpy-3"), wheel("scipy-1"))), NOTE)
 
 
 def test_more_than_is_needed_may_be_there() -> None:
-    assert is_there(HOUSE._replace(extras=(), others=(wheel("numpy-2"),)), NOTE)
-    assert is_there(HOUSE._replace(pip=wheel("pip-27")), NOTE)
+    assert is_installed(HOUSE._replace(extras=(), others=(wheel("numpy-2"),)), NOTE)
+    assert is_installed(HOUSE._replace(pip=wheel("pip-27")), NOTE)
 
 
 def names(wheels: list[Wheel]) -> list[str]:
@@ -125,7 +125,7 @@ def hush(_text: str) -> None:
 
 def test_a_greeting_of_the_login_shell_is_passed_over(tmp_path: Path) -> None:
     async def work() -> dict[str, Any]:
-        async with installer(Greeting(), sys.executable, str(tmp_path), hush) as program:
+        async with open_installer(Greeting(), sys.executable, str(tmp_path), hush) as program:
             return await program.ask("look", ASK_S)
 
     assert asyncio.run(work())["folder"] == str(tmp_path)
@@ -135,7 +135,7 @@ def refused(python: str, folder: Path) -> str:
     """Return what keeps an installer from starting."""
 
     async def work() -> None:
-        async with installer(Greeting(), python, str(folder), hush):
+        async with open_installer(Greeting(), python, str(folder), hush):
             pass
 
     with pytest.raises(HostsError) as caught:
@@ -145,7 +145,7 @@ def refused(python: str, folder: Path) -> str:
 
 def test_a_python_that_says_nothing_is_a_line(tmp_path: Path) -> None:
     silent = shutil.which("true") or ""
-    assert refused(silent, tmp_path) == f"h1: {silent} says nothing; does it run there?"
+    assert refused(silent, tmp_path) == f"h1: {silent} printed nothing; does it run there?"
 
 
 def test_a_folder_that_cannot_be_used_is_a_line_that_says_what_to_do(tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def test_what_is_being_installed_ends_with_the_channel(tmp_path: Path) -> None:
     order = write_pip(tmp_path, f"import signal; held = open({str(pipe)!r}, 'w'); signal.pause()")
 
     async def work() -> None:
-        async with installer(Greeting(), sys.executable, str(tmp_path), hush) as program:
+        async with open_installer(Greeting(), sys.executable, str(tmp_path), hush) as program:
             asked = asyncio.create_task(program.ask("install", ASK_S, **order))
             reading = await asyncio.to_thread(open, pipe)
             asked.cancel()
@@ -196,7 +196,7 @@ def test_a_launcher_that_lives_shows_it(tmp_path: Path, monkeypatch: pytest.Monk
 
     async def work() -> dict[str, Any]:
         host = Greeting()
-        async with installer(host, sys.executable, str(tmp_path), hush) as program:
+        async with open_installer(host, sys.executable, str(tmp_path), hush) as program:
             await host.processes[0].beaten.wait()
             return await program.ask("look", ASK_S)
 
@@ -207,7 +207,7 @@ def test_what_pip_says_is_a_line(tmp_path: Path) -> None:
     order = write_pip(tmp_path, "import sys; sys.exit('ERROR: No space left on device\\nnote: more')")
 
     async def work() -> None:
-        async with installer(Greeting(), sys.executable, str(tmp_path), hush) as program:
+        async with open_installer(Greeting(), sys.executable, str(tmp_path), hush) as program:
             await program.ask("install", ASK_S, **order)
 
     with pytest.raises(HostsError, match=r"^h1: [^\n]+: ERROR: No space left on device$"):
@@ -220,14 +220,14 @@ def test_a_second_push_says_whom_it_waits_for(tmp_path: Path) -> None:
             told.append(text)
             waits.set()
 
-        async with installer(Greeting(), sys.executable, str(tmp_path), tell) as program:
+        async with open_installer(Greeting(), sys.executable, str(tmp_path), tell) as program:
             return await program.ask("look", ASK_S)
 
     async def work() -> list[str]:
         told: list[str] = []
         waits = asyncio.Event()
         first = Greeting()
-        async with installer(first, sys.executable, str(tmp_path), hush):
+        async with open_installer(first, sys.executable, str(tmp_path), hush):
             waiting = asyncio.create_task(second(waits, told))
             await waits.wait()
             pid = first.processes[0].process.pid
@@ -242,7 +242,7 @@ def test_who_pushes_for_too_long_is_named(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr("zsim_deploy.push.installer.WAIT_S", 0.01)
 
     async def work() -> str:
-        async with installer(Greeting(), sys.executable, str(tmp_path), hush):
+        async with open_installer(Greeting(), sys.executable, str(tmp_path), hush):
             return await asyncio.to_thread(refused, sys.executable, tmp_path)
 
     said = asyncio.run(work())
@@ -250,11 +250,11 @@ def test_who_pushes_for_too_long_is_named(tmp_path: Path, monkeypatch: pytest.Mo
     assert said.endswith(" there) is pushing to it; wait for that to end, or end it there")
 
 
-def placed(**hosts: Host) -> Placed:
-    return Placed(Inventory(hosts=dict(hosts), roles={}), Path("/nowhere"), "hosts.yaml")
+def placed(**hosts: Host) -> InventoryFile:
+    return InventoryFile(Inventory(hosts=dict(hosts), roles={}), Path("/nowhere"), "hosts.yaml")
 
 
-def pushed(where: Placed, names: list[str], cache: Path) -> dict[str, bool]:
+def pushed(where: InventoryFile, names: list[str], cache: Path) -> dict[str, bool]:
     return asyncio.run(push(where, names, [], lambda host, text: None, cache))
 
 

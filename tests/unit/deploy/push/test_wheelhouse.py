@@ -16,9 +16,8 @@ import pytest
 
 from zsim.errors import HostsError
 from zsim_deploy.push import package_index, wheelhouse
-from zsim_deploy.push.package_index import PipError, gather, pip
-from zsim_deploy.push.target import Target, target
-from zsim_deploy.push.wheelhouse import House, Wheelhouse, requirement
+from zsim_deploy.push.package_index import PipError, WheelTarget, download_wheels, pip, wheel_target
+from zsim_deploy.push.wheelhouse import Wheelhouse, WheelSet, requirement
 
 BACKEND = """
 # A build backend without dependencies: a wheel with one module.
@@ -41,10 +40,10 @@ backend-path = ["."]
 packages = ["source"]
 """
 NEEDS = "Requires-Dist: gadget; extra == 'agents'\\nProvides-Extra: agents\\n"
-ELSEWHERE = Target((3, 12), "cp312", ("manylinux_2_31_aarch64", "linux_aarch64"))
+ELSEWHERE = WheelTarget((3, 12), "cp312", ("manylinux_2_31_aarch64", "linux_aarch64"))
 
 
-def here() -> Target:
+def here() -> WheelTarget:
     said = {
         "version": list(sys.version_info[:2]),
         "implementation": "cpython",
@@ -52,7 +51,7 @@ def here() -> Target:
         "platform": sysconfig.get_platform(),
         "libc": list(platform.libc_ver()),
     }
-    return target("here", said)
+    return wheel_target("here", said)
 
 
 def write_project(folder: Path, name: str, needs: str = "") -> Path:
@@ -98,25 +97,25 @@ def checkout(index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 def test_a_wheel_that_does_not_exist_is_what_pip_says(index: Path, tmp_path: Path) -> None:
     with pytest.raises(PipError, match="satisfies the requirement numpy"):
-        asyncio.run(gather(["numpy"], ELSEWHERE, tmp_path / "into", []))
+        asyncio.run(download_wheels(["numpy"], ELSEWHERE, tmp_path / "into", []))
 
 
 @pytest.mark.parametrize("aim", [here(), ELSEWHERE], ids=["here", "elsewhere"])
-def test_a_project_without_wheels_is_built_here_also_for_others(index: Path, tmp_path: Path, aim: Target) -> None:
+def test_a_project_without_wheels_is_built_here_also_for_others(index: Path, tmp_path: Path, aim: WheelTarget) -> None:
     into = tmp_path / "into"
-    assert not asyncio.run(gather(["gadget"], aim, into, []))
+    assert not asyncio.run(download_wheels(["gadget"], aim, into, []))
     assert [path.name for path in into.iterdir()] == ["gadget-1.0-py3-none-any.whl"]
 
 
 def test_versions_are_those_of_here_and_others_only_where_there_are_none(index: Path, tmp_path: Path) -> None:
-    assert not asyncio.run(gather(["gadget"], ELSEWHERE, tmp_path / "same", ["gadget==1.0"]))
-    assert asyncio.run(gather(["gadget"], ELSEWHERE, tmp_path / "other", ["gadget==0.9"]))
+    assert not asyncio.run(download_wheels(["gadget"], ELSEWHERE, tmp_path / "same", ["gadget==1.0"]))
+    assert asyncio.run(download_wheels(["gadget"], ELSEWHERE, tmp_path / "other", ["gadget==0.9"]))
 
 
-def house(folder: Path, extras: list[str], host: str = "h") -> tuple[House, list[str]]:
+def house(folder: Path, extras: list[str], host: str = "h") -> tuple[WheelSet, list[str]]:
     """Return a house of the wheelhouse in a folder, and what was said of it."""
     told: list[str] = []
-    return asyncio.run(Wheelhouse(folder, told.append).house(host, ELSEWHERE, extras)), told
+    return asyncio.run(Wheelhouse(folder, told.append).wheel_set(host, ELSEWHERE, extras)), told
 
 
 def test_a_house_holds_what_a_host_needs_and_is_gathered_once(checkout: Path, tmp_path: Path) -> None:
@@ -188,7 +187,7 @@ def test_an_index_that_cannot_be_reached_is_no_missing_wheel(
     kept = Wheelhouse(tmp_path / "cache", told.append)
     for _ in range(2):
         with pytest.raises(HostsError) as caught:
-            asyncio.run(kept.house("h", ELSEWHERE, ["agents"]))
+            asyncio.run(kept.wheel_set("h", ELSEWHERE, ["agents"]))
         assert str(caught.value) == (
             "launcher: the package index cannot be reached (Connection refused); connect this machine to it for the "
             "first push, or give pip a folder with all wheels (PIP_NO_INDEX=1 PIP_FIND_LINKS=FOLDER)"

@@ -16,12 +16,12 @@ from typer.testing import CliRunner
 from zsim.errors import InventoryError, RunError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim_deploy.cli import render_commands
+from zsim_deploy.cli import inventory_commands
 from zsim_deploy.cli.cli import app
 from zsim_deploy.inventory import inventory
-from zsim_deploy.inventory.inventory import Placed
+from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.render import compose, kubernetes, systemd
-from zsim_deploy.render.render_folder import write
+from zsim_deploy.render.rendered_files import write
 
 ROOT = Path(__file__).parents[4]
 STEP = ROOT / "scenarios/step.yaml"
@@ -49,7 +49,7 @@ TARGETS = {"systemd": systemd.render, "compose": compose.render, "kubernetes": k
 Words = dict[str, tuple[str, list[str]]]
 
 
-def placed(folder: Path, text: str = HOSTS) -> Placed:
+def placed(folder: Path, text: str = HOSTS) -> InventoryFile:
     (folder / "hosts.yaml").write_text(text)
     return inventory.load(folder / "hosts.yaml")
 
@@ -60,7 +60,7 @@ def step() -> Scenario:
 
 
 @pytest.fixture
-def hosts(tmp_path: Path) -> Placed:
+def hosts(tmp_path: Path) -> InventoryFile:
     return placed(tmp_path)
 
 
@@ -126,7 +126,7 @@ def option(words: list[str], name: str) -> str | None:
 
 
 @ALL
-def test_every_process_is_there_once_and_on_its_host(target: str, hosts: Placed, step: Scenario) -> None:
+def test_every_process_is_there_once_and_on_its_host(target: str, hosts: InventoryFile, step: Scenario) -> None:
     found = READ[target](TARGETS[target](hosts, step))
     assert {name: host for name, (host, _) in found.items()} == PLACES
     assert {name: option(words, "--host") for name, (_, words) in found.items()} == PLACES
@@ -145,7 +145,7 @@ def test_endpoints_are_the_inventory_s(target: str, insecure: bool, tmp_path: Pa
 
 
 @ALL
-def test_everybody_is_of_the_scenario_s_federation(target: str, hosts: Placed) -> None:
+def test_everybody_is_of_the_scenario_s_federation(target: str, hosts: InventoryFile) -> None:
     other = scenario_file.load(STEP, ["federation=lab.2"])
     found = READ[target](TARGETS[target](hosts, other))
     assert {option(words, "--federation") for name, (_, words) in found.items() if name != "world"} == {"lab.2"}
@@ -175,7 +175,7 @@ def parameters(words: list[str]) -> dict[str, Any]:
 
 @ALL
 def test_certificates_are_for_who_has_tls_and_access_control_for_who_listens(
-    target: str, hosts: Placed, tmp_path: Path, step: Scenario
+    target: str, hosts: InventoryFile, tmp_path: Path, step: Scenario
 ) -> None:
     found = READ[target](TARGETS[target](hosts, step))
     assert all("--tls" in words for _, words in found.values())
@@ -187,7 +187,9 @@ def test_certificates_are_for_who_has_tls_and_access_control_for_who_listens(
 
 
 @ALL
-def test_the_pace_is_the_world_s_and_routers_know_of_realtime(target: str, hosts: Placed, step: Scenario) -> None:
+def test_the_pace_is_the_world_s_and_routers_know_of_realtime(
+    target: str, hosts: InventoryFile, step: Scenario
+) -> None:
     found = READ[target](TARGETS[target](hosts, step, ["--realtime", "--rate", "2.0"]))
     assert {name for name, (_, words) in found.items() if "--realtime" in words} == {"world", "router.yard"}
     assert {name: option(words, "--rate") for name, (_, words) in found.items() if "--rate" in words} == {
@@ -196,7 +198,9 @@ def test_the_pace_is_the_world_s_and_routers_know_of_realtime(target: str, hosts
 
 
 @ALL
-def test_the_world_has_the_scenario_and_waits_for_the_recorder(target: str, hosts: Placed, step: Scenario) -> None:
+def test_the_world_has_the_scenario_and_waits_for_the_recorder(
+    target: str, hosts: InventoryFile, step: Scenario
+) -> None:
     texts = TARGETS[target](hosts, step)
     words = READ[target](texts)["world"][1]
     assert words[0] == "world"
@@ -258,7 +262,7 @@ def options_of(text: str) -> dict[str, list[str]]:
     return found
 
 
-def test_units_run_the_host_s_python_as_its_user(hosts: Placed, step: Scenario) -> None:
+def test_units_run_the_host_s_python_as_its_user(hosts: InventoryFile, step: Scenario) -> None:
     texts = systemd.render(hosts, step)
     for path, user, python in [
         ("lab/zsim-world.service", "lab", "/opt/zsim/venv/bin/python"),
@@ -270,7 +274,7 @@ def test_units_run_the_host_s_python_as_its_user(hosts: Placed, step: Scenario) 
         assert options["ExecStart"][0].split()[0] == python
 
 
-def test_units_read_certificates_and_write_nowhere_else(hosts: Placed, step: Scenario) -> None:
+def test_units_read_certificates_and_write_nowhere_else(hosts: InventoryFile, step: Scenario) -> None:
     texts = systemd.render(hosts, step)
     for path, text in texts.items():
         if not path.endswith(".service"):
@@ -288,12 +292,12 @@ def test_units_read_certificates_and_write_nowhere_else(hosts: Placed, step: Sce
     assert option(words["router.yard"][1], "--access") == "/home/pi/.zsim/certs/router.yard.access.json"
 
 
-def test_every_start_of_the_recorder_has_a_folder_of_its_own(hosts: Placed, step: Scenario) -> None:
+def test_every_start_of_the_recorder_has_a_folder_of_its_own(hosts: InventoryFile, step: Scenario) -> None:
     words = of_systemd(systemd.render(hosts, step))["recorder"][1]
     assert option(words, "--out") == "/var/lib/zsim/runs/step-${INVOCATION_ID}"
 
 
-def test_systemd_restarts_what_on_death_says(hosts: Placed) -> None:
+def test_systemd_restarts_what_on_death_says(hosts: InventoryFile) -> None:
     lines = ["processes.on_death={estimator: wait, estimator.drone3: restart, controller: end}"]
     texts = systemd.render(hosts, scenario_file.load(STEP, lines))
     restarts = {path.split("zsim-")[1]: options_of(text)["Restart"] for path, text in texts.items() if "zsim-" in path}
@@ -310,7 +314,7 @@ def test_systemd_restarts_what_on_death_says(hosts: Placed) -> None:
     assert "# on_death is wait: " not in texts["one/zsim-estimator.drone3.service"]
 
 
-def test_a_name_that_another_took_is_not_fought_for(hosts: Placed, step: Scenario) -> None:
+def test_a_name_that_another_took_is_not_fought_for(hosts: InventoryFile, step: Scenario) -> None:
     options = options_of(systemd.render(hosts, step)["one/zsim-estimator.drone1.service"])
     assert options["RestartPreventExitStatus"] == ["2 3"]
 
@@ -328,7 +332,7 @@ def test_the_world_is_stopped_first_and_a_router_last(tmp_path: Path, step: Scen
     assert {*others, "zsim-recorder.service", "zsim-router.yard.service"} <= set(order["zsim-world.service"])
 
 
-def test_the_target_wants_every_unit_of_its_host_and_they_stop_with_it(hosts: Placed, step: Scenario) -> None:
+def test_the_target_wants_every_unit_of_its_host_and_they_stop_with_it(hosts: InventoryFile, step: Scenario) -> None:
     texts = systemd.render(hosts, step)
     for host in ("lab", "one", "two"):
         units = {path.split("/")[1] for path in texts if path.startswith(f"{host}/") and path.endswith(".service")}
@@ -366,7 +370,7 @@ def test_no_line_of_an_inventory_becomes_an_option(field: str, tmp_path: Path, s
 # Compose
 
 
-def test_containers_may_write_records_and_nothing_else(hosts: Placed, step: Scenario) -> None:
+def test_containers_may_write_records_and_nothing_else(hosts: InventoryFile, step: Scenario) -> None:
     for path, project in projects(compose.render(hosts, step)).items():
         for name, service in project["services"].items():
             binds = {v["target"]: v["read_only"] for v in service["volumes"] if v["type"] == "bind"}
@@ -382,7 +386,7 @@ def test_containers_may_write_records_and_nothing_else(hosts: Placed, step: Scen
             assert service["security_opt"] == ["no-new-privileges:true"]
 
 
-def test_containers_use_the_host_s_network_and_end_as_roles_do(hosts: Placed, step: Scenario) -> None:
+def test_containers_use_the_host_s_network_and_end_as_roles_do(hosts: InventoryFile, step: Scenario) -> None:
     services = projects(compose.render(hosts, step))["one/compose.yaml"]["services"]
     for service in services.values():
         assert service["network_mode"] == "host"
@@ -393,7 +397,7 @@ def test_containers_use_the_host_s_network_and_end_as_roles_do(hosts: Placed, st
     assert world["restart"] == "no"
 
 
-def test_an_image_has_the_extras_that_its_host_needs(hosts: Placed, step: Scenario) -> None:
+def test_an_image_has_the_extras_that_its_host_needs(hosts: InventoryFile, step: Scenario) -> None:
     texts = compose.render(hosts, step)
     extras = {path.split("/")[0]: re.findall(r"whl\[(.*)\]", text) for path, text in texts.items() if "Docker" in path}
     assert extras == {"lab": ["record,world"], "one": ["agents"], "two": ["agents"]}
@@ -405,13 +409,13 @@ def test_an_image_for_a_router_alone_needs_no_extra(tmp_path: Path, step: Scenar
     assert "py3-none-any.whl\"" in texts["one/Dockerfile"]  # fmt: skip
 
 
-def test_extras_are_those_of_the_distribution(hosts: Placed, step: Scenario) -> None:
+def test_extras_are_those_of_the_distribution(hosts: InventoryFile, step: Scenario) -> None:
     given = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     (wanted,) = re.findall(r"whl\[(.*)\]", kubernetes.render(hosts, step)["Dockerfile"])
     assert set(wanted.split(",")) <= set(given)
 
 
-def test_what_containers_do_not_need_of_the_inventory_is_said(hosts: Placed, step: Scenario) -> None:
+def test_what_containers_do_not_need_of_the_inventory_is_said(hosts: InventoryFile, step: Scenario) -> None:
     texts = compose.render(hosts, step)
     assert "# hosts.two: python not used, the image has its own" in texts["two/compose.yaml"].splitlines()
     assert "not used" not in texts["one/compose.yaml"]
@@ -420,7 +424,7 @@ def test_what_containers_do_not_need_of_the_inventory_is_said(hosts: Placed, ste
 # Kubernetes
 
 
-def test_pods_are_locked_and_end_as_roles_do(hosts: Placed, step: Scenario) -> None:
+def test_pods_are_locked_and_end_as_roles_do(hosts: InventoryFile, step: Scenario) -> None:
     for one in pods(kubernetes.render(hosts, step)):
         (box,) = one["containers"]
         assert one["securityContext"]["runAsNonRoot"] is True
@@ -433,7 +437,7 @@ def test_pods_are_locked_and_end_as_roles_do(hosts: Placed, step: Scenario) -> N
         assert {"requests", "limits"} == set(box["resources"])
 
 
-def test_pods_have_their_own_certificate_read_only(hosts: Placed, step: Scenario) -> None:
+def test_pods_have_their_own_certificate_read_only(hosts: InventoryFile, step: Scenario) -> None:
     texts = kubernetes.render(hosts, step)
     seen = []
     for one in pods(texts):
@@ -452,7 +456,7 @@ def test_pods_have_their_own_certificate_read_only(hosts: Placed, step: Scenario
     assert {process: host for _, host, process in made} == PLACES
 
 
-def test_roles_are_jobs_and_routers_deployments(hosts: Placed, step: Scenario) -> None:
+def test_roles_are_jobs_and_routers_deployments(hosts: InventoryFile, step: Scenario) -> None:
     found = manifests(kubernetes.render(hosts, step))
     jobs = {one["metadata"]["name"]: one["spec"] for one in found if one["kind"] == "Job"}
     assert {name: spec["backoffLimit"] for name, spec in jobs.items()} == {
@@ -466,7 +470,7 @@ def test_roles_are_jobs_and_routers_deployments(hosts: Placed, step: Scenario) -
     assert [one["metadata"]["name"] for one in found if one["kind"] == "Deployment"] == ["router-yard"]
 
 
-def test_the_service_leads_to_the_world(hosts: Placed, step: Scenario) -> None:
+def test_the_service_leads_to_the_world(hosts: InventoryFile, step: Scenario) -> None:
     found = manifests(kubernetes.render(hosts, step))
     (service,) = [one for one in found if one["kind"] == "Service"]
     labels = {
@@ -479,7 +483,7 @@ def test_the_service_leads_to_the_world(hosts: Placed, step: Scenario) -> None:
     assert [port["port"] for port in service["spec"]["ports"]] == [7447]
 
 
-def test_everything_is_in_the_federation_s_namespace(hosts: Placed) -> None:
+def test_everything_is_in_the_federation_s_namespace(hosts: InventoryFile) -> None:
     found = manifests(kubernetes.render(hosts, scenario_file.load(STEP, ["federation=lab_2"])))
     assert {one["metadata"]["namespace"] for one in found if one["kind"] != "Namespace"} == {"lab-2"}
     assert [one["metadata"]["name"] for one in found if one["kind"] == "Namespace"] == ["lab-2"]
@@ -511,11 +515,11 @@ def test_a_scenario_beyond_a_config_map_is_refused(tmp_path: Path) -> None:
 
 def call(folder: Path, target: str, *options: str) -> Any:
     where = ["--hosts", str(folder / "hosts.yaml"), "--out", str(folder / "out")]
-    return CliRunner().invoke(render_commands.app, [target, str(STEP), *where, *options])
+    return CliRunner().invoke(inventory_commands.rendering, [target, str(STEP), *where, *options])
 
 
 @ALL
-def test_the_command_writes_what_is_rendered(target: str, hosts: Placed, step: Scenario, tmp_path: Path) -> None:
+def test_the_command_writes_what_is_rendered(target: str, hosts: InventoryFile, step: Scenario, tmp_path: Path) -> None:
     done = call(tmp_path, target)
     assert done.exit_code == 0, done.output
     texts = TARGETS[target](hosts, step)
@@ -531,7 +535,9 @@ def files(out: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("target", ["systemd", "compose"])
-def test_nothing_of_an_earlier_rendering_is_left(target: str, hosts: Placed, step: Scenario, tmp_path: Path) -> None:
+def test_nothing_of_an_earlier_rendering_is_left(
+    target: str, hosts: InventoryFile, step: Scenario, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     call(tmp_path, target)
     former = set(files(out))
@@ -545,7 +551,7 @@ def test_nothing_of_an_earlier_rendering_is_left(target: str, hosts: Placed, ste
     assert any(name.startswith("lab/") for name in gone)
 
 
-def test_what_somebody_else_put_there_stays(hosts: Placed, step: Scenario, tmp_path: Path) -> None:
+def test_what_somebody_else_put_there_stays(hosts: InventoryFile, step: Scenario, tmp_path: Path) -> None:
     """A file beside the rendered ones, one that has a rendered one's text, and the files of another target."""
     out = tmp_path / "out"
     call(tmp_path, "systemd")
@@ -559,7 +565,7 @@ def test_what_somebody_else_put_there_stays(hosts: Placed, step: Scenario, tmp_p
     assert set(files(out)) == kept | set(systemd.render(moved, step))
 
 
-def test_a_file_that_was_changed_is_not_removed(hosts: Placed, tmp_path: Path) -> None:
+def test_a_file_that_was_changed_is_not_removed(hosts: InventoryFile, tmp_path: Path) -> None:
     out = tmp_path / "out"
     call(tmp_path, "systemd")
     (out / "lab/zsim-world.service").write_text("mine now")
@@ -576,7 +582,7 @@ def test_a_file_that_was_changed_is_not_removed(hosts: Placed, tmp_path: Path) -
     assert call(tmp_path, "systemd").exit_code == 0
 
 
-def test_a_list_that_leads_out_of_the_folder_removes_nothing(hosts: Placed, tmp_path: Path) -> None:
+def test_a_list_that_leads_out_of_the_folder_removes_nothing(hosts: InventoryFile, tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     call(tmp_path, "systemd")
     (record,) = [path for path in (tmp_path / "out").iterdir() if path.is_file()]
@@ -592,7 +598,7 @@ def test_a_text_that_leads_out_of_the_folder_is_refused(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_command_takes_the_options_of_a_run(hosts: Placed, tmp_path: Path) -> None:
+def test_the_command_takes_the_options_of_a_run(hosts: InventoryFile, tmp_path: Path) -> None:
     options = ["--realtime", "--rate", "0.5", "--seed", "7", "--duration", "30", "--set", "federation=lab2"]
     done = call(tmp_path, "kubernetes", *options, "--image", "registry.example.org/zsim:7")
     assert done.exit_code == 0, done.output
@@ -606,14 +612,14 @@ def test_the_command_takes_the_options_of_a_run(hosts: Placed, tmp_path: Path) -
     assert {one["containers"][0]["image"] for one in pods(texts)} == {"registry.example.org/zsim:7"}
 
 
-def test_a_rate_that_is_none_is_refused(hosts: Placed, tmp_path: Path) -> None:
+def test_a_rate_that_is_none_is_refused(hosts: InventoryFile, tmp_path: Path) -> None:
     done = call(tmp_path, "systemd", "--rate", "0")
     assert done.exit_code == 2
     assert "must be > 0 and <= 1000" in done.output
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_that_cannot_be_written_is_a_line(hosts: Placed, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_a_line(hosts: InventoryFile, tmp_path: Path) -> None:
     (tmp_path / "out").write_text("a file")
     done = call(tmp_path, "compose")
     assert str(done.exception).endswith("cannot be written (Not a directory); give --out another folder")

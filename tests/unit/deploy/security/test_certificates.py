@@ -16,11 +16,11 @@ from zsim.errors import RunError
 from zsim.transport.identity import Identity
 from zsim.transport.tls import own_fault
 from zsim_deploy.security import certificates
-from zsim_deploy.security.certificates import DAYS, due, issue
-from zsim_deploy.security.enrolment import Wanted
+from zsim_deploy.security.certificates import DAYS, issue, renewal_reason
+from zsim_deploy.security.enrolment import CertificateRequest
 
 NOW = datetime(2026, 11, 1, 12, tzinfo=UTC)
-ESTIMATOR = Wanted("h1", "estimator.drone1", ("10.0.0.1",))
+ESTIMATOR = CertificateRequest("h1", "estimator.drone1", ("10.0.0.1",))
 
 
 @pytest.fixture
@@ -33,7 +33,9 @@ def read(path: Path) -> x509.Certificate:
 
 
 def test_a_certificate_names_process_and_addresses_and_is_good_for_a_month(tmp_path: Path, signer) -> None:
-    made = read(issue(tmp_path, signer, Wanted("h1", "world", ("10.0.0.1", "lab.local")), NOW) / "certificate.pem")
+    made = read(
+        issue(tmp_path, signer, CertificateRequest("h1", "world", ("10.0.0.1", "lab.local")), NOW) / "certificate.pem"
+    )
     names = made.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value == "world"
     assert [str(name) for name in names.get_values_for_type(x509.IPAddress)] == ["10.0.0.1", "127.0.0.1", "::1"]
@@ -51,7 +53,7 @@ def test_a_certificate_serves_both_ends_of_a_link_and_signs_nothing(tmp_path: Pa
 
 
 def test_keys_are_p256_their_owner_s_alone_and_never_shared(tmp_path: Path, signer) -> None:
-    places = [issue(tmp_path, signer, Wanted(host, "recorder"), NOW) for host in ("h1", "h2")]
+    places = [issue(tmp_path, signer, CertificateRequest(host, "recorder"), NOW) for host in ("h1", "h2")]
     keys = [serialization.load_pem_private_key((place / "key.pem").read_bytes(), None) for place in places]
     for path in (tmp_path / "ca.key", *(place / "key.pem" for place in places)):
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
@@ -64,10 +66,10 @@ def test_an_authority_is_kept_until_another_is_forced(tmp_path: Path, signer) ->
     issue(tmp_path, signer, ESTIMATOR, NOW)
     again = certificates.authority(tmp_path, NOW)
     assert again.certificate == signer.certificate
-    assert due(tmp_path, again.certificate, ESTIMATOR, NOW) is None
+    assert renewal_reason(tmp_path, again.certificate, ESTIMATOR, NOW) is None
     other = certificates.authority(tmp_path, NOW, force=True)
     assert other.certificate != signer.certificate
-    assert due(tmp_path, other.certificate, ESTIMATOR, NOW) == "of another authority"
+    assert renewal_reason(tmp_path, other.certificate, ESTIMATOR, NOW) == "of another authority"
 
 
 @pytest.mark.parametrize("missing", ["ca.pem", "ca.key"])
@@ -93,13 +95,18 @@ def test_an_authority_of_no_use_is_a_line(tmp_path: Path, signer) -> None:
 
 
 def test_a_certificate_is_made_anew_when_it_would_not_do(tmp_path: Path, signer) -> None:
-    assert due(tmp_path, signer.certificate, ESTIMATOR, NOW) == "new"
+    assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW) == "new"
     place = issue(tmp_path, signer, ESTIMATOR, NOW)
-    assert due(tmp_path, signer.certificate, ESTIMATOR, NOW) is None
-    assert due(tmp_path, signer.certificate, ESTIMATOR._replace(addresses=("10.0.0.2",)), NOW) == "other addresses"
-    assert due(tmp_path, signer.certificate, ESTIMATOR, NOW + timedelta(days=DAYS)) == "expired on 2026-12-01"
+    assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW) is None
+    assert (
+        renewal_reason(tmp_path, signer.certificate, ESTIMATOR._replace(addresses=("10.0.0.2",)), NOW)
+        == "other addresses"
+    )
+    assert (
+        renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW + timedelta(days=DAYS)) == "expired on 2026-12-01"
+    )
     (place / "certificate.pem").write_text("nothing")
-    assert due(tmp_path, signer.certificate, ESTIMATOR, NOW) == "cannot be read"
+    assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW) == "cannot be read"
 
 
 @pytest.mark.parametrize("left", ["ca.pem", "certificate.pem", "key.pem"])
@@ -108,20 +115,20 @@ def test_files_of_which_some_are_older_are_made_anew_and_shown(tmp_path: Path, s
     older = (issue(tmp_path, signer, ESTIMATOR, NOW) / left).read_bytes()
     other = certificates.authority(tmp_path, NOW, force=True)
     place = issue(tmp_path, other, ESTIMATOR, NOW)
-    assert due(tmp_path, other.certificate, ESTIMATOR, NOW) is None
+    assert renewal_reason(tmp_path, other.certificate, ESTIMATOR, NOW) is None
     (place / left).write_bytes(older)
     fault = "without its key" if left == "key.pem" else "of another authority"
-    assert due(tmp_path, other.certificate, ESTIMATOR, NOW) == fault
+    assert renewal_reason(tmp_path, other.certificate, ESTIMATOR, NOW) == fault
     assert [each.fault for each in certificates.show(tmp_path, NOW)] == [fault]
     issue(tmp_path, other, ESTIMATOR, NOW)
-    assert due(tmp_path, other.certificate, ESTIMATOR, NOW) is None
+    assert renewal_reason(tmp_path, other.certificate, ESTIMATOR, NOW) is None
 
 
 def test_a_certificate_and_the_key_of_another_one_are_made_anew(tmp_path: Path, signer) -> None:
     key = (issue(tmp_path, signer, ESTIMATOR, NOW) / "key.pem").read_bytes()
     place = issue(tmp_path, signer, ESTIMATOR, NOW)
     (place / "key.pem").write_bytes(key)
-    assert due(tmp_path, signer.certificate, ESTIMATOR, NOW) == "without its key"
+    assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW) == "without its key"
 
 
 def of_no_curve() -> str:
@@ -137,13 +144,13 @@ def of_no_curve() -> str:
 def test_a_key_that_is_none_is_made_anew(tmp_path: Path, signer, content: str) -> None:
     place = issue(tmp_path, signer, ESTIMATOR, NOW)
     (place / "key.pem").write_text(content)
-    assert due(tmp_path, signer.certificate, ESTIMATOR, NOW) == "cannot be read"
+    assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW) == "cannot be read"
     assert [each.fault for each in certificates.show(tmp_path, NOW)] == ["cannot be read"]
 
 
 def test_what_is_there_is_shown(tmp_path: Path, signer) -> None:
     issue(tmp_path, signer, ESTIMATOR, NOW)
-    issue(tmp_path, signer, Wanted("h1", "world"), NOW, days=-0.5)
+    issue(tmp_path, signer, CertificateRequest("h1", "world"), NOW, days=-0.5)
     shown = certificates.show(tmp_path, NOW)
     assert [(each.process, each.fault) for each in shown] == [
         ("estimator.drone1", ""),
@@ -170,6 +177,6 @@ def test_a_process_judges_the_time_of_its_own_certificate(
 ) -> None:
     now = datetime.now(UTC)
     signer = certificates.authority(tmp_path, now)
-    folder = issue(tmp_path, signer, Wanted("h1", "recorder"), now + timedelta(days=begin_days), days)
+    folder = issue(tmp_path, signer, CertificateRequest("h1", "recorder"), now + timedelta(days=begin_days), days)
     fault = own_fault(Identity("h1", folder))
     assert fault is None if says is None else str(fault).startswith(says)

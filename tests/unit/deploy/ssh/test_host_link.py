@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy.inventory.inventory import Host, Inventory, Placed
+from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
 from zsim_deploy.ssh import host_link
-from zsim_deploy.ssh.host_link import CHANNELS, HostLink, Loop
-from zsim_deploy.ssh.host_links import Links
+from zsim_deploy.ssh.host_link import CHANNELS, EventLoopThread, HostLink
+from zsim_deploy.ssh.host_links import HostLinks
 
 FILES = {"identity/world/key.pem": b"secret\n", "scenario.yaml": b"name: one\n" * 5000}
 
@@ -101,7 +101,7 @@ def test_of_files_that_come_in_part_none_is_seen(tmp_path: Path, takes: int) -> 
     assert [path.name for path in tmp_path.rglob("*")] == ["run"]
 
 
-class Told(HostLink):
+class Progress(HostLink):
     """A host that does nothing; it keeps the commands that it is given, each with its input."""
 
     async def run(self, command: str, given: bytes = b"", *_: Any, **__: Any) -> bytes:
@@ -110,7 +110,7 @@ class Told(HostLink):
 
 
 def test_two_that_write_into_one_folder_do_not_disturb_each_other(tmp_path: Path) -> None:
-    host = Told("h1", Host(address="127.0.0.1"), Path())
+    host = Progress("h1", Host(address="127.0.0.1"), Path())
     for name in ("one", "two"):
         asyncio.run(host.put_files(str(tmp_path / "run"), {name: name.encode() * 9000}))
     (one, first), (two, second) = host.commands
@@ -127,12 +127,12 @@ def test_two_that_write_into_one_folder_do_not_disturb_each_other(tmp_path: Path
 @pytest.fixture
 def links() -> Any:
     hosts = {name: Host(address="127.0.0.1") for name in ("h1", "h2", "h3")}
-    loop = Loop()
-    yield Links(Placed(Inventory(hosts=hosts, roles={}), Path(), "hosts.yaml"), hosts, loop)
+    loop = EventLoopThread()
+    yield HostLinks(InventoryFile(Inventory(hosts=hosts, roles={}), Path(), "hosts.yaml"), hosts, loop)
     loop.close()
 
 
-def test_every_host_that_is_late_or_fails_is_named(links: Links) -> None:
+def test_every_host_that_is_late_or_fails_is_named(links: HostLinks) -> None:
     async def work(host: HostLink) -> None:
         if host.name == "h1":
             await asyncio.Event().wait()
@@ -147,7 +147,7 @@ def test_every_host_that_is_late_or_fails_is_named(links: Links) -> None:
     ]
 
 
-def test_what_all_hosts_say_comes_back_by_name(links: Links) -> None:
+def test_what_all_hosts_say_comes_back_by_name(links: HostLinks) -> None:
     async def name(host: HostLink) -> str:
         return host.name
 

@@ -1,0 +1,278 @@
+"""The commands on a running federation: keys, echo, hz, pub, ask, and `zsim fault`."""
+
+import json
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from zsim_deploy.options.arguments import WorldAccess, observer_options, positive
+
+if TYPE_CHECKING:
+    from zsim.contract.messages import Info
+    from zsim.transport.session import Session
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from zsim.contract.messages import Fault
+    from zsim.scenario.fault_kinds import Kind
+    from zsim.transport.session import Session
+
+PANEL = "Look and poke"
+
+app = typer.Typer()
+faults = typer.Typer(
+    name="fault", help="Inject faults into a running federation, and clear them.", no_args_is_help=True
+)
+
+UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "": 1.0}  # s
+SOURCE = "zsim.fault"
+ALL = "all"
+GIVEN_BY = {"target": "the argument TARGET", "kind": "the argument KIND", "for_s": "--for", "at_s": "--at"}
+
+
+@app.command(rich_help_panel=PANEL)
+@observer_options
+def keys(
+    reach: WorldAccess,
+) -> None:
+    """List the keys that speak, with their message and how many came in a second."""
+    from zsim_deploy.cli import inspection
+
+    with connected(reach) as (link, _):
+        for key, kind, count in inspection.list_keys(link):
+            print(f"{key:<36} {kind:<14} {count:>6}")
+
+
+@app.command(rich_help_panel=PANEL)
+@observer_options
+def echo(
+    reach: WorldAccess,
+    key: Annotated[str, typer.Argument(help="Key or expression, e.g. drone/drone1/sensor/imu or 'drone/*/truth'.")],
+    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after so many messages.")] = None,
+    raw: Annotated[bool, typer.Option("--raw", help="Payload as hexadecimal digits.")] = False,
+) -> None:
+    """Print the messages on a key as JSON lines."""
+    from zsim_deploy.cli import inspection
+
+    def emit(name: str, message: Any) -> None:
+        print(json.dumps({"key": name, "message": message}), flush=True)
+
+    with connected(reach) as (link, _):
+        inspection.echo(link, key, count, emit, raw)
+
+
+@app.command(rich_help_panel=PANEL)
+@observer_options
+def hz(
+    reach: WorldAccess,
+    key: Annotated[str, typer.Argument(help="Key or expression.")],
+    window: Annotated[int, typer.Option(help="Messages that the rate is taken over.", min=2, max=1_000_000)] = 1000,
+    seconds: Annotated[float | None, typer.Option(callback=positive, help="Stop after so many seconds.")] = None,
+) -> None:
+    """Print how often messages come on a key, in wall and in simulated time."""
+    from zsim_deploy.cli import inspection
+
+    with connected(reach) as (link, _):
+        inspection.hz(link, key, window, seconds or math.inf, lambda line: print(line, flush=True))
+
+
+@app.command(rich_help_panel=PANEL)
+@observer_options
+def pub(
+    reach: WorldAccess,
+    key: Annotated[str, typer.Argument(help="Key, e.g. drone/drone1/cmd/velocity.")],
+    message: Annotated[str, typer.Argument(help='JSON, e.g. \'{"velocity_m_s": [1, 0, 0], "yaw_rate_rad_s": 0}\'.')],
+    count: Annotated[int, typer.Option("--count", "-n", min=1, help="How many times.")] = 1,
+    rate_hz: Annotated[float, typer.Option(callback=positive, max=1000, help="How often per wall second.")] = 10.0,
+) -> None:
+    """Send a command to a drone; t_ns, seq and source are filled in."""
+    from zsim_deploy.cli import inspection
+
+    with connected(reach) as (link, info):
+        sent = inspection.publish(link, info, key, message, count, rate_hz)
+    print(f"published {sent} on {key}")
+
+
+@app.command(rich_help_panel=PANEL)
+@observer_options
+def ask(
+    reach: WorldAccess,
+    key: Annotated[str, typer.Argument(help="world/control or cluster/NAME/control.")],
+    op: Annotated[str, typer.Argument(help="E.g. pause, resume, step, stop; engage, hold, land, target.")],
+    args: Annotated[str, typer.Argument(help="JSON map, e.g. '{\"gates\": 50}'.")] = "{}",
+) -> None:
+    """Send a request to the world or a controller and print the answer."""
+    from zsim_deploy.cli import inspection
+
+    with connected(reach) as (link, _):
+        result = inspection.ask(link, key, op, args)
+    print("ok" if result is None else json.dumps(result))
+
+
+@contextmanager
+def connected(reach: WorldAccess) -> Iterator[tuple["Session", "Info"]]:
+    """Yield a session to the federation's hub, and the `world/info` of its run."""
+    from zsim.transport.connection import find_world
+
+    say = partial(print, file=sys.stderr)
+    with find_world(reach.endpoint, reach.federation, reach.wait_s, say, reader=True, identity=reach.who) as found:
+        try:
+            yield found
+        except KeyboardInterrupt:  # the usual end of `zsim echo` and `zsim hz`
+            sys.exit(130)
+
+
+def seconds(text: str | None) -> float | None:
+    """Return the duration in a text such as 10s, 500ms or 2min."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(ms|s|min|)", text.strip())
+    if not match:
+        raise typer.BadParameter(f"is {text!r}; must be a duration such as 10s, 500ms or 2min")
+    return float(match[1]) * UNITS[match[2]]
+
+
+def _duration(text: str | None) -> str | None:
+    """Refuse a text that is no duration, with the name of its option."""
+    seconds(text)
+    return text
+
+
+For = Annotated[
+    str | None,
+    typer.Option("--for", callback=_duration, help="E.g. 10s, 500ms, 2min; until it is cleared if not given."),
+]
+At = Annotated[
+    str | None,
+    typer.Option("--at", callback=_duration, help="Simulated time when it begins, e.g. 40s; now if not given."),
+]
+
+
+@faults.command()
+@observer_options
+def add(
+    reach: WorldAccess,
+    target: Annotated[
+        str, typer.Argument(help="Drone, link (a/b), process, cluster, or world: as the kind asks.", show_default=False)
+    ],
+    kind: Annotated[str, typer.Argument(help="One of `zsim fault kinds`.", show_default=False)],
+    parameters: Annotated[
+        list[str] | None, typer.Argument(help="NAME=VALUE, e.g. factor=3 or 'value_m=[2, 0, 0]'.", show_default=False)
+    ] = None,
+    for_: For = None,
+    at: At = None,
+) -> None:
+    """Inject a fault, e.g. `zsim fault add drone2 gps_dropout --for 10s`."""
+    times = {"for_s": seconds(for_), "at_s": seconds(at)}
+    args = {"kind": kind, "target": target, **times, **_values(parameters or ())}
+    with connected(reach) as (link, _):
+        done = _ask(link, "fault_add", args)
+    until = "until it is cleared" if done["until_ns"] is None else f"to {done['until_ns'] / 1e9:.2f} s"
+    print(f"fault {done['id']}: {kind} of {target} from {done['from_ns'] / 1e9:.2f} s {until}")
+
+
+@faults.command()
+@observer_options
+def clear(
+    reach: WorldAccess,
+    which: Annotated[str, typer.Argument(help="Number, target or kind of faults, or all.")] = ALL,
+) -> None:
+    """End faults: all, or those of a number, a target or a kind."""
+    with connected(reach) as (link, _):
+        done = _ask(link, "fault_clear", selector(which))
+    print(f"cleared {', '.join(map(str, done['cleared'])) or 'nothing: no fault was planned or acting'}")
+
+
+@faults.command("list")
+@observer_options
+def list_(
+    reach: WorldAccess,
+) -> None:
+    """List the faults that are planned or act."""
+    from zsim.contract import keys, messages
+
+    with connected(reach) as (link, _):
+        now_ns = max((messages.decode(keys.CLOCK, s.payload).t_ns for s in link.get(keys.CLOCK)), default=0)
+        answers = [messages.decode(keys.FAULTS, sample.payload) for sample in link.get(keys.FAULTS)]
+    rows = [row(fault, now_ns) for message in answers for fault in message.faults if not _is_over(fault, now_ns)]
+    for cells in rows:
+        print("  ".join(cells))
+    if not rows:
+        print("no fault is planned or acts", file=sys.stderr)
+
+
+@faults.command()
+def kinds() -> None:
+    """List the kinds of faults: whom they strike, and their parameters."""
+    from zsim.scenario.fault_kinds import KINDS
+
+    for name, kind in KINDS.items():
+        print(f"{name:<17} {kind.strikes:<8} {'  '.join(_parameters(kind)) or '-'}")
+
+
+def selector(which: str) -> dict[str, Any]:
+    """Return the arguments of `fault_clear` that a word means."""
+    from zsim.scenario.fault_kinds import KINDS
+
+    if which == ALL:
+        return {}
+    if which.isdecimal():
+        return {"id": int(which)}
+    return {"kind" if which in KINDS else "target": which}
+
+
+def row(fault: "Fault", now_ns: int) -> tuple[str, ...]:
+    """Return the cells that a fault has in a list."""
+    until = "..." if fault.until_ns is None else f"{fault.until_ns / 1e9:.2f}"
+    state = "acts" if fault.from_ns <= now_ns else "planned"
+    parameters = " ".join(f"{name}={value}" for name, value in fault.parameters.items() if value is not None)
+    times = f"{fault.from_ns / 1e9:.2f} to {until} s"
+    return (f"{fault.id:>3}", f"{state:<7}", f"{fault.target:<16}", f"{fault.kind:<17}", f"{times:<20}", parameters)
+
+
+def _is_over(fault: "Fault", now_ns: int) -> bool:
+    return fault.until_ns is not None and fault.until_ns <= now_ns
+
+
+def _parameters(kind: "Kind") -> list[str]:
+    from zsim.scenario.fault_kinds import expected
+
+    parameters = [f"{p.name}: {expected(p)}{'' if p.required else ' (may be left out)'}" for p in kind.parameters]
+    return [*parameters, *(["--for is needed"] if kind.lasts == "ends" else [])]
+
+
+def _values(parameters: Sequence[str]) -> dict[str, Any]:
+    """Return the map that texts NAME=VALUE make; values are YAML."""
+    from zsim.schema import yaml_file
+
+    values: dict[str, Any] = {}
+    for text in parameters:
+        name, equals, value = text.partition("=")
+        if not equals or not re.fullmatch("[a-z][a-z0-9_]*", name):
+            raise typer.BadParameter(f"{text[:40]!r} is no parameter; must be NAME=VALUE, see `zsim fault kinds`")
+        if name in GIVEN_BY:
+            raise typer.BadParameter(f"{name} is no parameter of a kind; give it by {GIVEN_BY[name]}")
+        if name in values:
+            raise typer.BadParameter(f"{name} is given twice; must be given once")
+        try:
+            values[name] = yaml_file.value(value)
+        except ValueError as error:
+            raise typer.BadParameter(f"{name} {error}") from None
+    return values
+
+
+def _ask(link: "Session", op: str, args: dict[str, Any]) -> dict[str, Any]:
+    from zsim.contract import keys
+    from zsim.errors import RunError
+
+    answer = link.request(keys.CONTROL, op, SOURCE, {name: value for name, value in args.items() if value is not None})
+    if not answer.ok:
+        raise RunError(answer.error)
+    return answer.result

@@ -1,0 +1,120 @@
+"""The fork server: it has imported what roles need and loaded what is compiled, and forks a role for each request.
+
+Standard input is a socket of sequenced packets from the launcher. When all is loaded the fork server sends READY. From
+then on each packet from the launcher is the arguments of a `zsim` command as a JSON list, with four open files: the
+role's standard input, output and error, and one from which it reads a byte before it begins. The answer is the role's
+process number. The role is a child of the launcher, not of this process, which ends as soon as the launcher closes the
+socket, or dies. A role whose number has not reached the launcher never gets that byte, and ends too.
+"""
+
+import ctypes
+import gc
+import json
+import os
+import signal
+import socket
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+READY = b"ready"
+PACKET_MAX = 1 << 17  # bytes, of a command line
+FILES = 4  # standard input, output, error, and the byte to begin
+ARG_START, ARG_END = 47, 48  # fields of /proc/self/stat, proc(5), counted from 0
+PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15  # linux/prctl.h
+
+
+def main() -> int | None:
+    """Fork roles until the launcher has no more to ask; in a role, run it."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # not inherited by what is forked
+    _show_as("forkserver", [sys.executable, "-m", "zsim_deploy.cli.forkserver", *sys.argv[1:2]])
+    launcher = socket.socket(fileno=os.dup(0))
+    _prepare()
+    launcher.send(READY)
+    while True:
+        packet, files, _, _ = socket.recv_fds(launcher, PACKET_MAX, FILES)
+        if not packet:
+            return None
+        pid = _fork()
+        if not pid:
+            launcher.close()
+            return _run_role(json.loads(packet), files)
+        for file in files:
+            os.close(file)
+        launcher.send(str(pid).encode())
+
+
+def _prepare() -> None:
+    """Import what roles import, and load what they run; a role for which that fails reports it when it is started."""
+    with suppress(Exception):
+        import zsim_agents.recorder  # noqa: F401
+        from zsim_deploy.cli import cli
+        from zsim_deploy.roles import roles, warm_up  # noqa: F401
+
+        cli.command().commands["record"].make_context("record", [], resilient_parsing=True)
+        warm_up.main()
+    gc.collect()
+    gc.freeze()
+
+
+def _fork() -> int:
+    """Return the number of a new process whose parent is the launcher, and in that process 0.
+
+    The process between them ends at once; the launcher inherits its child (PR_SET_CHILD_SUBREAPER).
+    """
+    reader, writer = os.pipe()
+    intermediate = os.fork()
+    if intermediate:
+        os.close(writer)
+        os.waitpid(intermediate, 0)
+        with open(reader) as pid_pipe:
+            return int(pid_pipe.read())
+    pid = os.fork()
+    if pid:
+        os.write(writer, str(pid).encode())
+        os._exit(0)
+    os.close(reader)
+    os.close(writer)
+    return 0
+
+
+def _run_role(arguments: list[str], files: list[int]) -> int | None:
+    """Run the role, once the launcher has its number."""
+    *standard, go = files
+    if not os.read(go, 1):
+        return None
+    os.close(go)
+    os.setsid()
+    for number, file in enumerate(standard):
+        os.dup2(file, number)
+        os.close(file)
+    _renew_streams()
+    _show_as(arguments[0], [sys.executable, "-m", "zsim_deploy.cli", *arguments])
+    sys.argv = ["zsim", *arguments]
+    from zsim_deploy.cli import cli
+
+    return cli.main()
+
+
+def _renew_streams() -> None:
+    """Open Python's standard streams again: their files are others now."""
+    how: dict[str, Any] = {"encoding": sys.stdout.encoding, "closefd": False}
+    sys.stdin = os.fdopen(0, errors=sys.stdin.errors, **how)
+    sys.stdout = os.fdopen(1, "w", errors=sys.stdout.errors, **how)
+    sys.stderr = os.fdopen(2, "w", buffering=1, errors=sys.stderr.errors, **how)
+
+
+def _show_as(name: str, command: list[str]) -> None:
+    """Let `ps` and `pgrep -f` show a command line, cut to the length of the one of this process."""
+    with suppress(OSError, ValueError, IndexError):
+        fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+        start, end = (int(fields[i - 2]) for i in (ARG_START, ARG_END))
+        room = end - start
+        ctypes.memmove(start, b"\0".join(word.encode() for word in command)[: room - 1].ljust(room, b"\0"), room)
+    ctypes.CDLL(None).prctl(PR_SET_NAME, f"zsim {name}".encode()[:15])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,0 @@
-"""What looks at a running federation and pokes it: keys, echo, hz, pub, ask."""

@@ -1,1 +1,0 @@
-"""Roles forked from one process that has everything imported. Imports roles."""

@@ -1,0 +1,196 @@
+"""How `zsim ps`, `logs`, `restart`, `move` and `down` reach the `zsim up` that runs on this machine: a local socket.
+
+One request and one answer per connection, a JSON line each: {op, args} and {ok, error, result}.
+"""
+
+import contextlib
+import fcntl
+import inspect
+import json
+import os
+import socket
+import stat
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from zsim.errors import RunError, ZsimError
+
+REQUEST_S = 5.0  # from the same machine
+ANSWER_S = 150.0  # a move connects to a host, asks it about itself, and brings a certificate: 135 s at most (orders.py)
+LINE_MAX = 1_000_000  # bytes
+PATH_MAX = 107  # bytes of a socket's path; unix(7), without the last zero. macOS has 103, and its error says so
+
+Act = Callable[..., Any]
+
+
+def place(federation: str) -> Path:
+    """Return where the launcher of a federation listens; only its user may come in."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    folder = Path(runtime) / "zsim" if runtime else Path(tempfile.gettempdir()) / f"zsim-{os.getuid()}"
+    return folder / f"{federation}.sock"
+
+
+class ControlSocket:
+    """The launcher's end.
+
+    Args:
+        federation: whose launcher it is.
+        acts: by name; each is called in a thread, with the request's arguments, and returns what JSON can hold.
+
+    Raises:
+        RunError: another launcher of the federation runs on this machine, or there is no place to listen.
+    """
+
+    def __init__(self, federation: str, acts: dict[str, Act]) -> None:
+        self._acts = acts
+        self._path = place(federation)
+        _make_folder(self._path.parent)
+        self._lock = _lock(federation, self._path.with_suffix(".lock"))
+        self._socket = socket.socket(socket.AF_UNIX)
+        try:
+            self._path.unlink(missing_ok=True)  # of a launcher that was killed: its lock is ours
+            self._socket.bind(str(self._path))
+            self._socket.listen()
+        except OSError as error:
+            self._socket.close()
+            os.close(self._lock)
+            raise RunError(f"{self._path}: cannot listen there ({_reason(error, self._path)})") from error
+        self._thread = threading.Thread(target=self._serve, name="control socket", daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                connection, _ = self._socket.accept()
+            except OSError:
+                return
+            threading.Thread(target=self._answer, args=(connection,), name="control answer", daemon=True).start()
+
+    def _answer(self, connection: socket.socket) -> None:
+        with connection, contextlib.suppress(OSError):
+            connection.settimeout(REQUEST_S)
+            with connection.makefile("rb") as request:
+                line = request.readline(LINE_MAX)
+            connection.sendall(json.dumps(self._carry_out(line)).encode() + b"\n")
+
+    def _carry_out(self, line: bytes) -> dict[str, Any]:
+        try:
+            act, args = self._understood(line)
+        except (ValueError, KeyError, TypeError) as error:
+            return {"ok": False, "error": f"no request that is understood ({error}); is it another version of zsim?"}
+        try:
+            return {"ok": True, "result": act(**args)}
+        except (ZsimError, TimeoutError) as error:
+            return {"ok": False, "error": str(error) or "it took too long"}
+        except Exception as error:
+            return {"ok": False, "error": f"it failed in a way that nobody thought of: {error!r}"}
+
+    def _understood(self, line: bytes) -> tuple[Act, dict[str, Any]]:
+        """Return what is asked for, and the arguments, which fit."""
+        request = json.loads(line)
+        act, args = self._acts[request["op"]], request.get("args", {})
+        inspect.signature(act).bind(**args)
+        return act, args
+
+    def close(self) -> None:
+        """Answer nobody any more."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+        self._path.unlink(missing_ok=True)
+        self._thread.join(1.0)
+        os.close(self._lock)
+
+    def __enter__(self) -> "ControlSocket":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _make_folder(folder: Path) -> None:
+    """Make the folder in which launchers listen, or make sure that nobody else made it."""
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+    except OSError as error:
+        raise RunError(
+            f"{folder}: cannot be made ({error.strerror}); set XDG_RUNTIME_DIR to a folder of yours"
+        ) from error
+    _refuse_if_foreign(folder)
+
+
+def _refuse_if_foreign(folder: Path) -> None:
+    """Refuse a folder in which another user could listen in our place.
+
+    Raises:
+        RunError: it belongs to somebody else, others may write in it, or it is none.
+    """
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
+        raise RunError(
+            f"{folder}: is not a folder that is yours alone (owner {status.st_uid}, mode {status.st_mode & 0o777:o}); "
+            f"must be of user {os.getuid()} with mode 700; remove it, or set XDG_RUNTIME_DIR to a folder of yours"
+        )
+
+
+def _lock(federation: str, path: Path) -> int:
+    """Return the lock that one launcher of a federation holds for as long as it lives, however it ends."""
+    try:
+        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be made ({error.strerror}); set XDG_RUNTIME_DIR to another folder") from error
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(lock)
+        raise RunError(
+            f"federation {federation!r} is up already on this machine; end it with "
+            f"`zsim down --federation {federation}`, or fly in another one: --set federation=NAME"
+        ) from error
+    return lock
+
+
+def _reason(error: OSError, path: Path) -> str:
+    if len(os.fsencode(path)) > PATH_MAX:
+        return f"the path is longer than {PATH_MAX} bytes; set XDG_RUNTIME_DIR or TMPDIR to a shorter one"
+    return str(error.strerror or error)
+
+
+def ask(federation: str, op: str, **args: Any) -> Any:
+    """Ask the launcher of a federation on this machine.
+
+    Raises:
+        RunError: nobody is up, it does not answer, or it refuses; with its reason.
+    """
+    with _reached(federation) as line:
+        try:
+            line.sendall(json.dumps({"op": op, "args": args}).encode() + b"\n")
+            with line.makefile("rb") as stream:
+                answer = json.loads(stream.readline())
+        except TimeoutError as error:
+            raise RunError(f"`zsim up` has not answered {op} within {ANSWER_S:g} s; look at its terminal") from error
+        except (OSError, ValueError) as error:
+            raise RunError(f"`zsim up` ended before it answered {op}") from error
+    if not answer["ok"]:
+        raise RunError(answer["error"])
+    return answer["result"]
+
+
+def _reached(federation: str) -> socket.socket:
+    """Return a connection to the launcher."""
+    path, line = place(federation), socket.socket(socket.AF_UNIX)
+    line.settimeout(ANSWER_S)
+    try:
+        line.connect(str(path))
+    except OSError as error:
+        line.close()
+        raise RunError(f"no `zsim up` of federation {federation!r} runs on this machine; start one") from error
+    try:
+        _refuse_if_foreign(path.parent)
+    except RunError:
+        line.close()
+        raise
+    return line

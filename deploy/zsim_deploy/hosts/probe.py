@@ -1,0 +1,167 @@
+"""The facts of a host, and how well it reaches another: run there by `zsim doctor`, a JSON line each.
+
+python -m zsim_deploy.hosts.probe about FOLDER           then, for each line that comes, its clock
+python -m zsim_deploy.hosts.probe serve PORT             until standard input ends
+python -m zsim_deploy.hosts.probe reach ADDRESS PORT
+
+What is sent to a port: a size as 8 bytes, big-endian, and so many bytes; the answer is one byte when all are there.
+"""
+
+import errno
+import json
+import os
+import platform
+import select
+import shutil
+import socket
+import statistics
+import sys
+import time
+from pathlib import Path
+from typing import Any, TextIO
+
+from zsim import __version__
+from zsim.contract.fingerprint import fingerprint
+
+GOVERNORS = "/sys/devices/system/cpu"  # Linux, cpufreq
+PINGS = 9
+SIZE_BYTES = 8  # of the size that comes before what is sent
+BULKS_BYTES = tuple(16_384 << power for power in range(9))  # up to 4 MB, which take 0.3 s on a link of 100 Mbit/s
+BULK_S = 1.0  # a bulk that takes so long is long enough to measure the bandwidth
+CHUNK_BYTES = 65_536
+PATIENCE_S = 10.0  # wall time; the least bulk takes so long at 13 kbit/s, and no other is sent unless half took 1 s
+SERVE_S = 60.0  # a server that nobody needs any more ends by itself
+SHORTEST_S = 1e-4  # what remains of a bulk's time without the round trip is at least this; 4 MB in it are 300 Gbit/s
+DONE = b"."
+
+
+def about(folder: Path) -> dict[str, Any]:
+    """Return what matters for a run about this host, where a folder is to be written."""
+    there = _nearest(folder)
+    return {
+        "python": platform.python_version(),
+        "zsim": __version__,
+        "fingerprint": fingerprint(),
+        "cores": os.cpu_count() or 1,
+        "load": os.getloadavg()[0],
+        "governors": governors(Path(GOVERNORS)),
+        "free_bytes": shutil.disk_usage(there).free,
+        "unwritable": unwritable(folder),
+    }
+
+
+def unwritable(folder: Path) -> str | None:
+    """Return why a folder cannot be made or written, None if it can."""
+    there = _nearest(folder)
+    if not there.is_dir():
+        return f"{there} is no folder"
+    return None if os.access(there, os.W_OK | os.X_OK) else f"{there} may not be written"
+
+
+def _nearest(folder: Path) -> Path:
+    """Return a folder, or what there is of its path."""
+    return next(path for path in (folder, *folder.parents) if os.path.exists(path))
+
+
+def clock(requests: TextIO) -> None:
+    """Print the wall clock for each line that comes."""
+    for _ in requests:
+        print(json.dumps({"time_ns": time.time_ns()}), flush=True)
+
+
+def governors(folder: Path) -> list[str]:
+    """Return the CPU governors in use; none where the system does not show them."""
+    names = set()
+    for path in folder.glob("cpu[0-9]*/cpufreq/scaling_governor"):
+        try:
+            names.add(path.read_text().strip())
+        except OSError:
+            continue
+    return sorted(names)
+
+
+def serve(port: int) -> None:
+    """Answer on a port until standard input ends; say "ready" once it listens, or why it cannot."""
+    try:
+        server = listening(port)
+    except OSError as error:
+        why = os.strerror(error.errno) if error.errno else str(error)
+        print(json.dumps({"error": why, "taken": error.errno == errno.EADDRINUSE}))
+        return
+    with server:
+        print(json.dumps({"ready": port}), flush=True)
+        while server in (ready := select.select([server, sys.stdin], [], [], SERVE_S)[0]) and sys.stdin not in ready:
+            connection, _ = server.accept()
+            with connection:
+                answer(connection)
+
+
+def listening(port: int) -> socket.socket:
+    """Return a socket that listens on all addresses, of IPv6 too where the host has that."""
+    if socket.has_dualstack_ipv6():
+        return socket.create_server(("", port), family=socket.AF_INET6, dualstack_ipv6=True)
+    return socket.create_server(("", port))
+
+
+def answer(connection: socket.socket) -> None:
+    """Swallow what is sent, and say so each time."""
+    connection.settimeout(PATIENCE_S)
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    try:
+        with connection.makefile("rb") as came:
+            while size := came.read(SIZE_BYTES):
+                left = int.from_bytes(size, "big")
+                while left > 0 and (data := came.read(min(left, CHUNK_BYTES))):
+                    left -= len(data)
+                connection.sendall(DONE)
+    except OSError:
+        return
+
+
+def reach(address: str, port: int) -> dict[str, Any]:
+    """Return the round trip [s] and the bandwidth [bit/s] to a host that serves, or why there is none."""
+    try:
+        with socket.create_connection((address, port), PATIENCE_S) as link:
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            round_trip_s = statistics.median(_send_s(link, 0) for _ in range(PINGS))
+            return {"round_trip_s": round_trip_s, "bits_per_s": _bits_per_s(link, round_trip_s)}
+    except OSError as error:
+        return {"error": error.strerror or str(error)}
+
+
+def _bits_per_s(link: socket.socket, round_trip_s: float) -> float:
+    """Return the bandwidth by the first bulk that takes a while, so that a slow link is not kept busy for minutes."""
+    bits_per_s = 0.0
+    for size in BULKS_BYTES:
+        took_s = max(_send_s(link, size) - round_trip_s, SHORTEST_S)
+        bits_per_s = 8 * size / took_s
+        if took_s >= BULK_S:
+            break
+    return bits_per_s
+
+
+def _send_s(link: socket.socket, size: int) -> float:
+    """Return how long it takes to send so many bytes and to have them confirmed."""
+    start_s = time.monotonic()
+    link.sendall(size.to_bytes(SIZE_BYTES, "big") + bytes(size))
+    if not link.recv(len(DONE)):
+        raise ConnectionError("the other end closed the connection")
+    return time.monotonic() - start_s
+
+
+def main() -> None:
+    """Run the command of the command line."""
+    match sys.argv[1:]:
+        case ["about", folder]:
+            print(json.dumps(about(Path(folder).expanduser().absolute())), flush=True)
+            clock(sys.stdin)
+        case ["serve", port]:
+            serve(int(port))
+        case ["reach", address, port]:
+            print(json.dumps(reach(address, int(port))))
+        case _:
+            sys.exit(__doc__)
+
+
+if __name__ == "__main__":
+    main()

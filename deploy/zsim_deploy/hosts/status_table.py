@@ -1,0 +1,165 @@
+"""What `zsim up` shows and `zsim ps` prints: one table of all processes on all hosts, kept while the run goes on."""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from zsim.runtime.progress import Screen, describe
+from zsim_deploy.hosts.remote_process import RemoteProcess
+from zsim_deploy.ssh.host_link import HostLink
+
+FIRST_S = 1.0  # simulated; from then on it flies
+SILENT_S = 1.0  # a host that has not answered for so long is shown as silent; it is asked twice a second …
+ROUND_TRIPS = 2.0  # … and so many of its round trips more: over a slow link every answer takes long
+WAITED_S = 0.5  # a process that is waited for longer is shown so; waiting for less is what lockstep is
+STALE_S = 3.0  # health comes once a second; older figures say nothing of now
+COLUMNS = ("role", "host", "pid", "state", "lag", "messages/s", "round trip", "restarts")
+
+
+class StatusTable:
+    """Progress of a run on several hosts; a table on a terminal, lines elsewhere.
+
+    Attributes:
+        members: the processes; to be given before it is shown.
+        links: to the hosts.
+        stages_s: how long each step before the processes' start took.
+    """
+
+    def __init__(self, duration_s: float, console: Console | None = None) -> None:
+        self.console = console or Console(stderr=True)
+        self.members: Sequence[Any] = ()
+        self.links: dict[str, HostLink] = {}
+        self.stages_s: dict[str, float] = {}
+        self._duration_s = duration_s
+        self._begun_s = time.monotonic()
+        self._flies = False
+        self._plain = Screen(duration_s, self.console)
+        self._is_live = self.console.is_terminal
+        self._health: dict[str, dict[str, Any]] = {}
+        self._clock: dict[str, Any] | None = None
+        self._silent: set[str] = set()
+        self._live = Live(get_renderable=self._render, console=self.console, refresh_per_second=4, transient=True)
+
+    def __enter__(self) -> "StatusTable":
+        if self._is_live:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._is_live:
+            self._live.stop()
+
+    def say(self, text: str) -> None:
+        """Show a line that stays."""
+        if self.console.quiet:
+            self._live.stop()
+            self.console.quiet = False
+        self._plain.say(text)
+
+    def hang_up(self) -> None:
+        """Show lines only from now on, the terminal being gone; callable from a signal handler, which draws nothing."""
+        self._is_live = False
+        self.console.quiet = True
+
+    def clock(self, line: dict[str, Any]) -> None:
+        self._clock = {**line, "wall_s": time.monotonic()}
+        if line["t_s"] >= FIRST_S and not self._flies:
+            self._flies = True
+            self.say(self._start_up())
+        if not self._is_live:
+            self._plain.clock(line)
+
+    def _start_up(self) -> str:
+        """Return how long it took until simulated time went on, and where it went."""
+        took_s = time.monotonic() - self._begun_s
+        stages_s = {**self.stages_s, "processes": took_s - sum(self.stages_s.values())}
+        return f"flies after {took_s:.1f} s: " + ", ".join(f"{what} {s:.1f} s" for what, s in stages_s.items())
+
+    def event(self, line: dict[str, Any]) -> None:
+        self._plain.event(line)
+
+    def health(self, line: dict[str, Any]) -> None:
+        """Take a process's health; the messages that it has taken in since the last one give its rate."""
+        now_s = time.monotonic()
+        former = self._health.get(line["name"])
+        rate = None
+        if former is not None and now_s > former["wall_s"] and line["received"] >= former["received"]:
+            rate = (line["received"] - former["received"]) / (now_s - former["wall_s"])
+        self._health[line["name"]] = {**line, "wall_s": now_s, "per_s": rate}
+
+    def report_silent_hosts(self) -> None:
+        """Say once which host has fallen silent, and that it is back."""
+        for name, link in self.links.items():
+            silent_s = link.silent_s()
+            if _is_silent(link) and name not in self._silent:
+                self._silent.add(name)
+                roles = ", ".join(member.name for member in self.members if member.host == name)
+                self.say(f"host {name} does not answer (since {silent_s:.1f} s); on it: {roles or 'nothing'}")
+            elif silent_s == 0.0 and name in self._silent:
+                self._silent.discard(name)
+                self.say(f"host {name} answers again")
+
+    def clock_now(self) -> dict[str, Any] | None:
+        """Return the last clock of the world."""
+        return self._clock
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return one row per process, for the table and for `zsim ps`."""
+        return [self._row(member) for member in self.members]
+
+    def _row(self, member: RemoteProcess) -> dict[str, Any]:
+        link, health = self.links[member.host], self._health.get(member.name)
+        fresh = health is not None and time.monotonic() - health["wall_s"] < STALE_S
+        return {
+            "role": member.name,
+            "host": member.host,
+            "pid": member.pid or None,
+            "state": self._state(member, link),
+            "lag_ms": health["lag_ns"] / 1e6 if health and fresh else None,
+            "messages_per_s": health["per_s"] if health and fresh else None,
+            "round_trip_ms": 1e3 * link.round_trip_s if link.answered_s and not _is_silent(link) else None,
+            "restarts": member.restarts,
+        }
+
+    def _state(self, member: RemoteProcess, link: HostLink) -> str:
+        if member.state == "running" and _is_silent(link):
+            return f"host silent {link.silent_s():.0f} s"
+        waited = [w for w in (self._clock or {}).get("waiting_for", ()) if w["name"] == member.name]
+        if member.state == "running" and waited and waited[0]["since_wall_s"] > WAITED_S:
+            return f"waited for {waited[0]['since_wall_s']:.0f} s"
+        return f"ended ({member.outcome()})" if member.state == "ended" and member.code else member.state
+
+    def _render(self) -> Group:
+        clock = self._clock
+        head = Text(describe(clock, self._duration_s) if clock else "starting …")
+        return Group(head, table(self.rows()))
+
+
+def _is_silent(link: HostLink) -> bool:
+    return link.silent_s() > SILENT_S + ROUND_TRIPS * link.round_trip_s
+
+
+def table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Return the rows as a table for people."""
+    shown = Table(*COLUMNS, box=None, pad_edge=False)
+    for row in rows:
+        shown.add_row(
+            row["role"],
+            row["host"],
+            str(row["pid"] or "-"),
+            Text(row["state"]),  # it may hold output of a process, with brackets
+            _figure(row["lag_ms"], "{:.0f} ms"),
+            _figure(row["messages_per_s"], "{:.0f}"),
+            _figure(row["round_trip_ms"], "{:.1f} ms"),
+            str(row["restarts"]),
+        )
+    return shown
+
+
+def _figure(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)

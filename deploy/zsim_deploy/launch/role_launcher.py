@@ -1,0 +1,243 @@
+"""The roles of a run as child processes: forked from a process that has everything imported, which is far cheaper.
+
+Roles are children of this process either way. Only Linux can do it; elsewhere, and if the fork server is gone or does
+not answer, a role is started as any other program.
+"""
+
+import ctypes
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from types import TracebackType
+from typing import IO, NamedTuple, Protocol
+
+SINGLE_THREADED = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+}  # matrices of a dozen rows: threads only cost, and would compete with the other roles
+FORKSERVER = (sys.executable, "-m", "zsim_deploy.cli.forkserver")
+COMMAND = (sys.executable, "-m", "zsim_deploy.cli")
+ROOM = " " * 1024  # behind the fork server's command line: each role writes its own there
+PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # linux/prctl.h
+PACKET_MAX = 1 << 17  # bytes, of a command line; a thousand names of drones are half of it
+REPLY_MAX = 32  # bytes, of an answer: READY, or a process number
+ANSWER_S = 5.0  # the fork server answers within 20 ms, unless it is stopped
+PATIENCE_S = 3.0  # what is compiled is loaded within two, unless the machine is busy
+PATIENCE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
+POLL_S = 0.01  # how often one looks whether it has ended
+UNKNOWN = 0  # exit code, as of Popen, where somebody else has taken it
+
+
+class RoleProcess(Protocol):
+    """A role that was started, as of `subprocess.Popen`."""
+
+    pid: int
+    stdin: IO[str] | None
+    stdout: IO[str] | None
+
+    def poll(self) -> int | None: ...
+    def wait(self, timeout: float | None = None) -> int: ...
+    def kill(self) -> None: ...
+
+
+class ForkedProcess:
+    """A child of this process.
+
+    Args:
+        pid: its process number.
+        stdin, stdout: our ends of its pipes.
+    """
+
+    def __init__(self, pid: int, stdin: IO[str], stdout: IO[str] | None) -> None:
+        self.pid = pid
+        self.stdin: IO[str] | None = stdin
+        self.stdout = stdout
+        self._code: int | None = None
+        self._lock = threading.Lock()
+
+    def poll(self) -> int | None:
+        """Return its exit code, negative for a signal; None while it lives."""
+        with self._lock:
+            return self._poll()
+
+    def _poll(self) -> int | None:
+        if self._code is None:
+            try:
+                pid, status = os.waitpid(self.pid, os.WNOHANG)
+            except ChildProcessError:
+                self._code = UNKNOWN
+            else:
+                self._code = os.waitstatus_to_exitcode(status) if pid else None
+        return self._code
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Return its exit code when it has ended.
+
+        Raises:
+            subprocess.TimeoutExpired: it has not, within so many seconds.
+        """
+        until_s = None if timeout is None else time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            if until_s is not None and time.monotonic() >= until_s:
+                raise subprocess.TimeoutExpired(f"process {self.pid}", timeout or 0.0)
+            time.sleep(POLL_S)
+        return code
+
+    def kill(self) -> None:
+        """Send SIGKILL; harmless when it is gone."""
+        with self._lock, suppress(ProcessLookupError):
+            if self._poll() is None:
+                os.kill(self.pid, signal.SIGKILL)
+
+
+class _Pipe(NamedTuple):
+    """Both ends, as file numbers."""
+
+    read: int
+    write: int
+
+
+class RoleLauncher:
+    """Starts roles. To be entered by the main thread, which then waits until they can be started.
+
+    Args:
+        say: takes a line on what takes long.
+        run: what the run is known by, shown by `ps` for the fork server.
+    """
+
+    def __init__(self, say: Callable[[str], None], run: str = "") -> None:
+        self._say = say
+        self._run = run
+        self._forkserver: subprocess.Popen[bytes] | None = None
+        self._line: socket.socket | None = None
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> "RoleLauncher":
+        if sys.platform == "linux":
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # whoever started this may not have wanted to know exit codes
+            try:
+                self._start_forkserver()
+            except BaseException:  # Ctrl-C, too
+                self._stop_forkserver()
+                raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stop_forkserver()
+
+    def start(self, arguments: Sequence[str], log: IO[str], listened: bool) -> RoleProcess:
+        """Start a `zsim` command, its standard input a pipe.
+
+        Args:
+            arguments: of the command.
+            log: for what it prints on standard error.
+            listened: whether its standard output is a pipe too; else that goes to the log.
+        """
+        with self._lock:
+            return self._fork(arguments, log, listened) or _spawn(arguments, log, listened)
+
+    def _start_forkserver(self) -> None:
+        """Start the fork server, and wait until it has loaded everything."""
+        self._line, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with other:
+            quiet, environment = subprocess.DEVNULL, {**SINGLE_THREADED, **os.environ}
+            self._forkserver = subprocess.Popen(
+                [*FORKSERVER, self._run, ROOM], stdin=other.fileno(), stdout=quiet, stderr=quiet, env=environment,
+                start_new_session=True,
+            )  # fmt: skip
+        timer = threading.Timer(PATIENCE_S, self._say, args=(PATIENCE,))
+        timer.start()
+        try:
+            self._receive()
+        finally:
+            timer.cancel()
+
+    def _fork(self, arguments: Sequence[str], log: IO[str], listened: bool) -> ForkedProcess | None:
+        """Return None where the fork server cannot do it."""
+        packet = json.dumps(list(arguments)).encode()
+        if self._line is None or len(packet) > PACKET_MAX:
+            return None
+        go, stdin = _Pipe(*os.pipe()), _Pipe(*os.pipe())
+        stdout = _Pipe(*os.pipe()) if listened else None
+        theirs = [stdin.read, stdout.write if stdout else log.fileno(), log.fileno(), go.read]
+        pid = self._request_fork(packet, theirs)
+        _close(go.read, stdin.read, *([stdout.write] if stdout else []))
+        if pid is None:
+            _close(go.write, stdin.write, *([stdout.read] if stdout else []))
+            return None
+        with suppress(BrokenPipeError):  # killed already
+            os.write(go.write, b"!")
+        os.close(go.write)
+        return ForkedProcess(pid, os.fdopen(stdin.write, "w"), os.fdopen(stdout.read) if stdout else None)
+
+    def _request_fork(self, packet: bytes, files: Sequence[int]) -> int | None:
+        """Return the number of the process that was forked; it waits for a byte before it begins."""
+        assert self._line is not None
+        self._line.settimeout(ANSWER_S)
+        with _subreaper():
+            try:
+                socket.send_fds(self._line, [packet], files)
+            except OSError:
+                self._stop_forkserver()
+                return None
+            reply = self._receive()
+        return int(reply) if reply else None
+
+    def _receive(self) -> bytes:
+        """Return an answer; empty where the fork server is gone or silent, and then it is stopped."""
+        reply = b""
+        if self._line is not None:
+            with suppress(OSError):
+                reply = self._line.recv(REPLY_MAX)
+        if not reply:
+            self._stop_forkserver()
+        return reply
+
+    def _stop_forkserver(self) -> None:
+        """End the fork server; roles are started as programs from now on."""
+        if self._line is not None:
+            self._line.close()
+            self._line = None
+        if self._forkserver is not None:
+            self._forkserver.kill()  # it may be importing, or stopped
+            self._forkserver.wait()
+
+
+@contextmanager
+def _subreaper() -> Iterator[None]:
+    """Become, for as long as it takes, the parent of what descendants leave behind."""
+    libc, former = ctypes.CDLL(None), ctypes.c_int()
+    libc.prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(former), 0, 0, 0)
+    libc.prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    try:
+        yield
+    finally:
+        libc.prctl(PR_SET_CHILD_SUBREAPER, former.value, 0, 0, 0)
+
+
+def _close(*files: int) -> None:
+    for file in files:
+        os.close(file)
+
+
+def _spawn(arguments: Sequence[str], log: IO[str], listened: bool) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [*COMMAND, *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE if listened else log,
+        stderr=log,
+        text=True,
+        env={**SINGLE_THREADED, **os.environ},
+        start_new_session=True,
+    )

@@ -1,0 +1,116 @@
+"""The terminal of a command: signals that end it, a terminal that is closed, a report made under a progress line."""
+
+import contextlib
+import os
+import signal
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+REASONS: dict[int, str] = {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}
+INTERRUPTED = 130  # exit code of a shell for a program that Ctrl-C ended
+IMPATIENT = "interrupted twice, nobody was waited for"
+STREAMS = 1, 2  # standard output and error
+CLOSED = "the terminal was closed"
+Say = Callable[[str], None]
+
+
+@contextmanager
+def handled_by(handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Hand these signals to a function, and afterwards to whom they went before."""
+    former = {number: signal.signal(number, handler) for number in REASONS}
+    try:
+        yield
+    finally:
+        for number, before in former.items():
+            signal.signal(number, before)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Raise KeyboardInterrupt at these signals, also where a library in between loses it and fails in another way."""
+    asked = False
+
+    def on_signal(*_: object) -> None:
+        nonlocal asked
+        asked = True
+        raise KeyboardInterrupt
+
+    with handled_by(on_signal):
+        try:
+            yield
+        except Exception as error:
+            if asked:
+                raise KeyboardInterrupt from error
+            raise
+
+
+class EndSignals:
+    """Takes SIGTERM and SIGHUP for as long as it is entered; SIGHUP stays ignored under nohup.
+
+    Nothing is raised for a closed terminal, as shells send that signal more than once: `hung_up` is called, and output
+    goes to a file from then on.
+
+    Args:
+        log: that file; it is made when there is something to write.
+        hung_up: called in a signal handler when the terminal is closed.
+    """
+
+    def __init__(self, log: Path, hung_up: Callable[[], None]) -> None:
+        self._log = log
+        self._hung_up = hung_up
+
+    def __enter__(self) -> "EndSignals":
+        wanted = {signal.SIGTERM: signal.default_int_handler, signal.SIGHUP: self._on_hangup}
+        self._former = {number: signal.getsignal(number) for number in wanted}
+        for number, handler in wanted.items():
+            if self._former[number] is not signal.SIG_IGN:
+                signal.signal(number, handler)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._former.items():
+            signal.signal(number, handler)
+
+    def _on_hangup(self, *_: object) -> None:
+        redirect_output(self._log)
+        self._hung_up()
+
+
+def redirect_output(log: Path) -> None:
+    """Send to a file what is written from now on to a terminal or a pipe, which may take nothing any more."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
+    try:
+        into = os.open(log, flags, 0o644)
+    except OSError:
+        into = os.open(os.devnull, os.O_WRONLY)
+    for stream in STREAMS:
+        with contextlib.suppress(OSError):
+            if not stat.S_ISREG(os.fstat(stream).st_mode):
+                _announce(stream, log)
+                os.dup2(into, stream)
+    os.close(into)
+
+
+def _announce(stream: int, log: Path) -> None:
+    if stream == STREAMS[-1]:
+        with contextlib.suppress(OSError):
+            os.write(stream, f"{CLOSED}; what there is still to say is in {log}\n".encode())
+
+
+def show_report(folder: Path, reading: str, make: Callable[[Path, Say], Any], table: Callable[[Any], Any]) -> None:
+    """Make a folder's report, and print its table.
+
+    Args:
+        reading: shown at first.
+        make: makes report.html in the folder, and returns its figures.
+        table: of these figures, for a terminal.
+    """
+    from rich.console import Console
+
+    with Console(stderr=True).status(reading) as status:
+        figures = make(folder, lambda text: status.update(text))
+    Console().print(table(figures))
+    print(f"report: {folder / 'report.html'}")

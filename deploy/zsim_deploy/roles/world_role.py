@@ -1,0 +1,175 @@
+"""The process that holds the run: the world of a scenario, or a record played back in its place."""
+
+import gc
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import msgspec
+
+from zsim.contract import keys, messages
+from zsim.errors import RunError
+from zsim.runtime.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
+from zsim.scenario.scenario import Scenario
+from zsim.transport import session
+from zsim.transport.identity import Identity
+from zsim_deploy.roles.stop_channel import StopChannel
+
+if TYPE_CHECKING:
+    from zsim.record import RecordReader
+
+PATIENCE_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
+SHOWN_EVENTS = 2000  # events shown per run besides those below; all of them are in the record
+HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but anybody can publish more
+VITAL = frozenset({"death", "doubled", "end"})  # how a run ends, and why; and what is wrong with who takes part
+
+
+def world(
+    scenario: Scenario,
+    mode: str,
+    rate: float,
+    endpoints: list[str],
+    launched: str | None,
+    expect: list[str] | None,
+    identity: Identity,
+) -> None:
+    """Run the world of a scenario on the endpoints until the scenario ends or somebody stops it."""
+    from zsim_world.flight.world import World
+    from zsim_world.server.world_process import run
+
+    stop = StopChannel(launched, identity)
+    with _patience(Teller() if launched else None):
+        run_world = World(scenario, mode, rate, time.monotonic_ns, launched)
+    for name in expect or ():
+        run_world.barrier.expect(name)
+    gc.collect()
+    gc.freeze()
+    if launched:
+        run(run_world, endpoints, stop.reason, world_progress(Teller()), identity=identity)
+        stop.exit_if_terminated()
+        return
+    with Screen(scenario.duration_s) as screen:
+        listening = f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run"
+        run(run_world, endpoints, stop.reason, world_progress(screen), lambda: screen.say(listening), identity)
+        screen.say(f"ended: {run_world.ended}")
+
+
+@contextmanager
+def _patience(teller: Teller | None) -> Iterator[None]:
+    """Say what takes so long the first time that a machine runs the world."""
+    from zsim.math.compiled import is_kept
+    from zsim_world.fleet.kernel import advance
+
+    text = "compiling the world's kernel; later runs on this machine find it compiled"
+    if is_kept(advance):
+        text = "loading the world's kernel; this machine is busy"
+    timer = threading.Timer(PATIENCE_S, teller.say if teller else print, args=(text,))
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def world_progress(show: Show) -> Callable[[str, Any, str], None]:
+    """Return what the world calls with its clocks, its events, and what passes it."""
+    throttle, reasons = Throttle(), Reasons()
+    shown = [0]
+    healths: defaultdict[str, Throttle] = defaultdict(lambda: Throttle(HEALTH_PERIOD_S))
+
+    def show_line(kind: str, message: Any, about: str) -> None:
+        if kind == "clock" and (throttle.passes() or message.state == "stopped"):
+            show.clock(_clock_line(message, about))
+        elif kind == "state" and (line := reasons.line(about, message)):
+            show.say(line)
+        elif kind == "health" and healths[about].passes():
+            show.health({"name": about, "lag_ns": message.lag_ns, "received": message.received})
+        elif kind == "event" and (message.kind in VITAL or shown[0] < SHOWN_EVENTS):
+            shown[0] += message.kind not in QUIET
+            show.event(_event_line(message))
+
+    return show_line
+
+
+def _clock_line(clock: messages.Clock, phase: str) -> dict[str, Any]:
+    waiting = [{"name": w.name, "host": w.host, "since_wall_s": round(w.since_wall_s, 1)} for w in clock.waiting_for]
+    return {
+        "t_s": clock.t_ns / 1e9,
+        "rate": clock.rate,
+        "state": clock.state,
+        "phase": phase,
+        "waiting_for": waiting,
+    }
+
+
+def _event_line(event: messages.Event) -> dict[str, Any]:
+    data = event.data if event.kind in ("end", "death") else {}
+    return {
+        "t_s": event.t_ns / 1e9,
+        "kind": event.kind,
+        "subject": event.subject,
+        "text": event.text,
+        "data": data,
+    }
+
+
+class ReplayOptions(NamedTuple):
+    """How a record is to be played.
+
+    Attributes:
+        choice: what of it.
+        rate: simulated per wall seconds; 0 = as fast as possible.
+        expect: names of the processes that are waited for.
+        endpoints: on which others come in.
+        federation: None for that of the record.
+    """
+
+    choice: "PlaybackRange"
+    rate: float
+    expect: tuple[str, ...]
+    endpoints: tuple[str, ...]
+    federation: str | None = None
+
+
+def play(place: Path, options: ReplayOptions, who: Identity) -> None:
+    """Play a record until it is over or somebody stops it.
+
+    Raises:
+        RunError, RecordError: there is no record, or nothing in it to play.
+        SessionError: an endpoint is taken, a key is no expression, or the identity is of no use.
+    """
+    from zsim.record.run_folder import record_notes
+    from zsim_analysis.reading.recorded_run import open_run
+    from zsim_world.playback.playback import Playback
+    from zsim_world.server.world_process import run
+
+    for expression in options.choice.keys:
+        session.check_expression(expression)
+    stop = StopChannel()
+    with open_run(place) as (reader, info, scenario):
+        _check(options.choice.keys, reader)
+        if options.federation is not None:
+            federation = keys.name(options.federation, "federation")
+            scenario = msgspec.structs.replace(scenario, federation=federation)
+        playback = Playback(reader, scenario, info, options.choice, options.rate, time.monotonic_ns)
+        for name in options.expect:
+            playback.barrier.expect(name)
+        with Screen(scenario.duration_s) as screen:
+            where = f"{scenario.federation!r} on {', '.join(options.endpoints)}"
+            text = f"replay of run {info.run_id} as {where}; Ctrl-C ends it"
+            run(playback, options.endpoints, stop.reason, world_progress(screen), lambda: screen.say(text), who)
+            for note in record_notes(reader.complete, reader.damaged):
+                screen.say(note)
+            screen.say(f"ended: {playback.ended}")
+
+
+def _check(expressions: Sequence[str], reader: "RecordReader") -> None:
+    """Refuse to play nothing."""
+    on_record = reader.topics()
+    for expression in expressions:
+        if not any(keys.matches(expression, key) for key in on_record):
+            raise RunError(f"--keys is {expression!r}; must match a key on record: {', '.join(list(on_record)[:20])} …")

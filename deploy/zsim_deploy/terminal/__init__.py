@@ -1,1 +1,0 @@
-"""The terminal: interrupts and signals, and a report as it is made. Imports zsim alone."""

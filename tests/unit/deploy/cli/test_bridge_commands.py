@@ -1,0 +1,36 @@
+"""What `zsim ros2` does beside bridging: the ROS package of our own messages, and options that do not go together."""
+
+from pathlib import Path
+
+import pytest
+import typer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from zsim.errors import RunError
+from zsim_bridges.ros2.ros_types import MESSAGES, RosTypes
+from zsim_deploy.cli.bridge_commands import ros2
+
+
+def test_the_package_has_the_types_that_go_over_the_wire(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ros2(write_package=tmp_path)
+    package = tmp_path / "zsim_msgs"
+    assert capsys.readouterr().out == f"wrote {package}; build it with colcon in a ROS workspace\n"
+    store, types = get_typestore(Stores.ROS2_KILTED), RosTypes()
+    for path in package.glob("msg/*.msg"):
+        name = f"zsim_msgs/msg/{path.stem}"
+        store.register(get_types_from_msg(path.read_text(), name))
+        assert store.hash_rihs01(name) == types.hash(name)
+        assert f'"msg/{path.name}"' in (package / "CMakeLists.txt").read_text()
+    assert {f"zsim_msgs/msg/{path.stem}" for path in package.glob("msg/*.msg")} == MESSAGES.keys()
+    assert "<name>zsim_msgs</name>" in (package / "package.xml").read_text()
+
+
+def test_a_folder_that_cannot_be_written_is_a_line(tmp_path: Path) -> None:
+    (tmp_path / "zsim_msgs").write_text("a file is there")
+    with pytest.raises(RunError, match=r"cannot be written .*; give --write-package another folder"):
+        ros2(write_package=tmp_path)
+
+
+def test_a_secured_world_needs_a_router_for_ros(tmp_path: Path) -> None:
+    with pytest.raises(typer.BadParameter, match="--tls needs --router"):
+        ros2(tls=tmp_path)

@@ -1,0 +1,95 @@
+"""`zsim fault`: what a person types becomes a request, or a line."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import typer
+
+from zsim.contract import keys
+from zsim.contract.messages import Fault
+from zsim.errors import SessionError
+from zsim.scenario.fault_check import COMMON
+from zsim.scenario.fault_kinds import KINDS
+from zsim.transport.session import Session
+from zsim_deploy.cli import federation_commands
+from zsim_deploy.cli.federation_commands import row, seconds, selector
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("10s", 10.0), ("500ms", 0.5), ("2min", 120.0), ("3", 3.0), ("1.5 s", 1.5), (None, None)]
+)
+def test_durations(text: str | None, value: float | None):
+    assert seconds(text) == value
+
+
+@pytest.mark.parametrize("text", ["", "s", "-1s", "10h", "1e3s", "nan"])
+def test_what_is_no_duration(text: str):
+    with pytest.raises(typer.BadParameter, match="must be a duration such as 10s, 500ms or 2min"):
+        seconds(text)
+
+
+@pytest.mark.parametrize("name", sorted({each.name for kind in KINDS.values() for each in kind.parameters}))
+def test_every_parameter_of_every_kind_can_be_typed(name: str):
+    assert federation_commands._values([f"{name}=1"]) == {name: 1}
+
+
+def test_parameters():
+    given = ["factor=3", "value_m=[2, 0, -1]", "place={controller.main: d1}", "rotor=all", "one_way=true"]
+    assert federation_commands._values(given) == {
+        "factor": 3,
+        "value_m": [2, 0, -1],
+        "place": {"controller.main": "d1"},
+        "rotor": "all",
+        "one_way": True,
+    }
+
+
+@pytest.mark.parametrize("text", ["factor", "=3", "a b=3", "value=[1"])
+def test_what_is_no_parameter(text: str):
+    with pytest.raises(typer.BadParameter):
+        federation_commands._values([text])
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        (["target=drone2"], "target is no parameter of a kind; give it by the argument TARGET"),
+        (["kind=gps_stuck"], "kind is no parameter of a kind; give it by the argument KIND"),
+        (["for_s=2"], "for_s is no parameter of a kind; give it by --for"),
+        (["at_s=2"], "at_s is no parameter of a kind; give it by --at"),
+        (["factor=2", "factor=3"], "factor is given twice; must be given once"),
+    ],
+)
+def test_what_is_given_elsewhere_or_twice_is_no_parameter(given: list[str], line: str):
+    with pytest.raises(typer.BadParameter, match=line):
+        federation_commands._values(given)
+    assert set(federation_commands.GIVEN_BY) == set(COMMON)
+
+
+@pytest.mark.parametrize("value", [10**20, [0, 10**24], {10**20: 1}, "\udcff"], ids=ascii)
+def test_what_fits_into_no_message_is_refused_in_a_line(value: Any):
+    nowhere: Any = SimpleNamespace()
+    with pytest.raises(SessionError, match=r"world/control: fault_add cannot be sent .*must hold whole numbers"):
+        Session.request(nowhere, keys.CONTROL, "fault_add", "zsim.fault", {"value": value})
+
+
+@pytest.mark.parametrize(
+    ("which", "args"),
+    [("all", {}), ("3", {"id": 3}), ("drone2", {"target": "drone2"}), ("gps_dropout", {"kind": "gps_dropout"})],
+)
+def test_which_are_cleared(which: str, args: dict[str, object]):
+    assert selector(which) == args
+
+
+def test_a_row_says_when_and_what():
+    fault = Fault(1, "gps_dropout", "drone1", {"probability": 0.5}, 2_000_000_000, None, "me")
+    cells = [cell.strip() for cell in row(fault, 3_000_000_000)]
+    assert cells == ["1", "acts", "drone1", "gps_dropout", "2.00 to ... s", "probability=0.5"]
+    assert row(fault, 0)[1].strip() == "planned"
+
+
+def test_every_kind_is_listed(capsys: pytest.CaptureFixture[str]):
+    federation_commands.kinds()
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(KINDS)

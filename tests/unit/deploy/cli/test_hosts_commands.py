@@ -1,0 +1,80 @@
+"""`zsim logs`: which roles there are, and that following ends with the run."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from zsim.errors import RunError
+from zsim_deploy.cli import hosts_commands
+from zsim_deploy.cli.hosts_commands import logs
+from zsim_deploy.hosts.control_socket import ControlSocket
+
+ROLES = ["world", "recorder", "estimator.d1"]
+
+
+class Run:
+    """A run that is up until it is closed."""
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self.asked = threading.Event()
+        self.is_over = False
+        (out / "logs").mkdir(parents=True)
+        self.intercom = ControlSocket("zsim", {"where": self._where})
+
+    def _where(self) -> dict[str, object]:
+        self.asked.set()
+        return {"out": str(self.out), "roles": ROLES}
+
+    def end(self) -> None:
+        if not self.is_over:
+            self.is_over = True
+            self.intercom.close()
+
+    def write(self, text: str) -> None:
+        with (self.out / "logs" / "estimator.d1.log").open("a") as log:
+            log.write(text)
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(hosts_commands, "FOLLOW_S", 0.001)
+    made = Run(tmp_path / "out")
+    yield made
+    made.end()
+
+
+@pytest.mark.usefixtures("run")
+def test_an_unknown_role_is_refused_with_those_that_there_are() -> None:
+    with pytest.raises(RunError, match=r"^role is 'nobody'; must be one of world, recorder, estimator\.d1$"):
+        logs("nobody", federation="zsim")
+
+
+@pytest.mark.usefixtures("run")
+def test_who_has_said_nothing_is_no_fault(capsys: pytest.CaptureFixture[str]) -> None:
+    logs("estimator.d1", federation="zsim")
+    logs("world", federation="zsim")
+    silent, world = capsys.readouterr().err.splitlines()
+    assert silent.startswith("estimator.d1 ")
+    assert "its progress and events are shown by `zsim up`, and are in the record" in world
+
+
+def test_what_was_said_is_printed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    run.write("drone ä\n")
+    logs("estimator.d1", federation="zsim")
+    assert capsys.readouterr().out == "drone ä\n"
+
+
+def test_following_ends_with_the_run_and_prints_its_last_words(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    """The file comes only after the follower."""
+    follower = threading.Thread(target=logs, args=("estimator.d1", True, "zsim"), daemon=True)
+    follower.start()
+    assert run.asked.wait(20.0)
+    run.write("last words\n")
+    run.end()
+    follower.join(20.0)
+    assert not follower.is_alive()
+    assert capsys.readouterr().out == "last words\n"

@@ -1,0 +1,203 @@
+"""Keys inspected, and messages and requests sent by hand."""
+
+import json
+
+import msgspec
+import pytest
+from fake_link import BAD_UTF8, NESTED, FakeLink
+from synthetic_record import SCENARIOS, info
+
+from zsim.contract import keys, messages
+from zsim.contract.messages import ControlAnswer
+from zsim.errors import RunError, SessionError
+from zsim.scenario import scenario_file
+from zsim.transport.session import Sample
+from zsim_deploy.cli import inspection
+
+GARBAGE = [BAD_UTF8, NESTED, b"\xc1", b"\x91" * 5000]
+FOREIGN = [
+    ({"raw": b"\x01\x02"}, {"raw": "AQI="}),
+    ({7: "seven", 2.5: "half"}, {"7": "seven", "2.5": "half"}),
+    ({"deep": [{b"k": b""}]}, {"deep": [{"aw==": ""}]}),
+    ({None: 1}, "{None: 1}"),
+    ([{True: b"x"}], "[{True: b'x'}]"),
+]
+
+
+class Clock:
+    """Wall time that passes only while somebody sleeps; `due` are (time, key, payload) that arrive meanwhile."""
+
+    def __init__(self, link: FakeLink, due: list[tuple[float, str, bytes]]) -> None:
+        self.link, self.due, self.now_s = link, due, 0.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        until_s = self.now_s + seconds
+        while self.due and self.due[0][0] <= until_s:
+            self.now_s, key, payload = self.due.pop(0)
+            self.link.deliver(key, payload)
+        self.now_s = until_s
+
+
+def rates(monkeypatch: pytest.MonkeyPatch, due: list[tuple[float, str, bytes]], seconds: float) -> list[str]:
+    """Return the lines of `hz` while messages arrive."""
+    link, lines = FakeLink(), []
+    monkeypatch.setattr(inspection, "time", Clock(link, due))
+    inspection.hz(link, keys.CLOCK, 1000, seconds, lines.append)  # type: ignore[arg-type]
+    return lines
+
+
+@pytest.mark.parametrize("key", [keys.CLOCK, "of/somebody"])
+@pytest.mark.parametrize("payload", GARBAGE, ids=["utf8", "nested", "no", "deep"])
+def test_garbage_is_shown_as_refused(key: str, payload: bytes):
+    shown = inspection.readable(Sample(key, payload))
+    assert shown["bytes"] == len(payload)
+    assert shown["refused"].startswith(key)
+
+
+@pytest.mark.parametrize(("said", "shown"), FOREIGN, ids=["bytes", "numbers", "inside", "none", "flag"])
+def test_what_json_cannot_say_is_shown_all_the_same(said: object, shown: object):
+    assert inspection.readable(Sample("of/somebody", msgspec.msgpack.encode(said))) == shown
+    event = messages.Event(0, 0, "note", "eve", "drone1", "", {"said": said})
+    read = inspection.readable(Sample(keys.EVENT, messages.encode(event)))
+    assert json.loads(json.dumps(read)) == read
+
+
+@pytest.mark.parametrize("payload", GARBAGE, ids=["utf8", "nested", "no", "deep"])
+def test_garbage_counts_for_the_rate(payload: bytes, monkeypatch: pytest.MonkeyPatch):
+    assert rates(monkeypatch, [(0.01, keys.CLOCK, payload)], 0.05) == ["1 message"]
+
+
+def test_the_rate_is_told_once_a_second_and_at_the_end(monkeypatch: pytest.MonkeyPatch):
+    due = [(0.5, keys.CLOCK, b"\x80"), (1.2, keys.CLOCK, b"\x80")]
+    assert rates(monkeypatch, due, 1.5) == ["1 message", "1.4 Hz wall (gap 700.0 to 700.0 ms), 2 messages"]
+
+
+def test_the_gaps_are_those_of_the_messages(monkeypatch: pytest.MonkeyPatch):
+    due = [(0.02 * (k + 1), keys.CLOCK, msgspec.msgpack.encode({"t_ns": 20_000_000 * k})) for k in range(10)]
+    lines = rates(monkeypatch, due, 0.3)
+    assert lines == ["50.0 Hz wall (gap 20.0 to 20.0 ms), 50.0 Hz simulated, 10 messages"]
+
+
+def test_a_rate_of_what_is_no_key_is_refused():
+    with pytest.raises(SessionError, match="a//b"):
+        inspection.hz(FakeLink(), "a//b", 10, 0.05, print)  # type: ignore[arg-type]
+
+
+def test_a_key_that_fell_silent_is_told():
+    rate = inspection.MessageRate(10)
+    for number in range(5):
+        rate.add(10 + 0.02 * number, 20_000_000 * number)
+    assert rate.line(10.1).startswith("50.0 Hz wall (gap 20.0 to 20.0 ms), 50.0 Hz simulated")
+    assert rate.line(12.08) == "nothing for 2.0 s, 5 messages before"
+
+
+def test_a_key_that_speaks_seldom_is_not_called_silent():
+    rate = inspection.MessageRate(10)
+    for wall_s in (0.0, 3.0, 6.0):
+        rate.add(wall_s, None)
+    assert rate.line(11.0).startswith("0.3 Hz wall")
+
+
+INFO = info(scenario_file.load(SCENARIOS / "step.yaml"))
+MODE = "drone/drone1/cmd/mode"
+TAKEOFF = '{"mode": "takeoff"}'
+
+# name: (key, message, what the line must say)
+BAD = {
+    "a drone that is not there": ("drone/ghost/cmd/mode", TAKEOFF, "drone is 'ghost'; must be one of drone1, "),
+    "wildcards": ("drone/*/cmd/mode", TAKEOFF, "takes one key, without wildcards"),
+    "the world's": (keys.CLOCK, "{}", "clock: only the process that this is about speaks here"),
+    "a process's": ("process/world/bye", "{}", "only the process that this is about speaks here"),
+    "nobody's": ("drone/drone1/fly", "{}", "is no key of the contract"),
+    "no end": (MODE, "[" * 100_000, "the message is no JSON"),
+    "a huge number": (MODE, f'{{"mode": "land", "seq": {2**64}}}', "the message cannot be sent"),
+    "half a character": (MODE, '{"mode": "\\ud800"}', "the message cannot be sent"),
+    "too deep": (MODE, f'{{"mode": {"[" * 900}{"]" * 900}}}', MODE),
+    "another mode": (MODE, '{"mode": "x"}', "mode is 'x'; must be one of"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_message_that_cannot_be_meant_is_a_line(name: str):
+    key, text, says = BAD[name]
+    link = FakeLink()
+    with pytest.raises(RunError) as refused:
+        inspection.publish(link, INFO, key, text, 1, 1.0)  # type: ignore[arg-type]
+    assert says in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert link.published == []
+
+
+class Watch:
+    """A clock that only sleeping moves on, and every look at the simulated time by 4 ms."""
+
+    now_s = 100.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+def test_messages_keep_to_their_schedule(monkeypatch: pytest.MonkeyPatch):
+    watch, sent_s = Watch(), []
+    monkeypatch.setattr(inspection, "time", watch)
+    link = FakeLink()
+    link.last[keys.CLOCK] = messages.encode(messages.Clock(60_000_000, 3, "run", 3, "running", 1.0, ()))
+
+    def take(key: str, payload: bytes) -> None:
+        sent_s.append(watch.now_s)
+        watch.now_s += 0.004
+
+    link.on_publish = take
+    assert inspection.publish(link, INFO, MODE, TAKEOFF, 5, 10.0) == 5  # type: ignore[arg-type]
+    assert sent_s == pytest.approx([100.0, 100.1, 100.2, 100.3, 100.4])
+    first = messages.decode(MODE, link.published[0][1])
+    assert (first.t_ns, first.seq, first.source) == (60_000_000, 0, "zsim.pub")
+
+
+def test_time_goes_on_while_it_publishes():
+    link = FakeLink()
+    stamps = iter((20_000_000, 40_000_000))
+
+    def pass_time(key: str, payload: bytes) -> None:
+        link.deliver(keys.CLOCK, messages.Clock(next(stamps), 0, "run", 0, "running", 1.0, ()))
+
+    link.on_publish = pass_time
+    inspection.publish(link, INFO, MODE, TAKEOFF, 2, 1000.0)  # type: ignore[arg-type]
+    assert [messages.decode(key, payload).t_ns for key, payload in link.published] == [0, 20_000_000]
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "says"),
+    [
+        ("world/*", "{}", "takes one key, without wildcards"),
+        (keys.CONTROL, "{x", "step: args is no JSON"),
+        (keys.CONTROL, "3", "must be a map such as"),
+        (keys.CONTROL, f'{{"gates": {10**22}}}', "step: args cannot be sent"),
+        (keys.CONTROL, "{}", "nobody answered"),
+    ],
+)
+def test_a_request_that_cannot_be_meant_is_a_line(key: str, text: str, says: str):
+    with pytest.raises(RunError) as refused:
+        inspection.ask(FakeLink(), key, "step", text)  # type: ignore[arg-type]
+    assert says in str(refused.value)
+
+
+def test_arguments_may_be_named_like_anything():
+    link = FakeLink()
+    link.on_request = lambda key, args: ControlAnswer(ok=True, result=args)
+    args = {"source": "me", "key": 1, "op": 2, "timeout_s": 3}
+    assert inspection.ask(link, keys.CONTROL, "step", msgspec.json.encode(args).decode()) == args  # type: ignore[arg-type]
+
+
+def test_messages_in_an_answer_are_shown_as_messages():
+    link = FakeLink()
+    passed = [[keys.process("a.b", "bye"), messages.encode(messages.Bye(0, 0, "over"))]]
+    link.on_request = lambda key, args: ControlAnswer(ok=True, result=passed)
+    (shown,) = inspection.ask(link, keys.CONTROL, "replay", "{}")  # type: ignore[arg-type]
+    assert shown == {"key": "process/a.b/bye", "message": {"t_ns": 0, "seq": 0, "reason": "over"}}

@@ -1,0 +1,142 @@
+"""The socket on which `zsim ps`, `restart`, `move` and `down` reach the launcher."""
+
+import json
+import os
+import socket
+
+import pytest
+
+from zsim.errors import HostsError, RunError
+from zsim_deploy.hosts import control_socket
+from zsim_deploy.hosts.control_socket import ControlSocket
+
+
+@pytest.fixture(autouse=True)
+def own_place(tmp_path, monkeypatch):
+    monkeypatch.setattr(control_socket.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+
+
+@pytest.fixture
+def line():
+    def refuse() -> None:
+        raise RunError("host is 'h9'; must be one of h1")
+
+    def lack() -> None:
+        raise HostsError("certs/h3/x/key.pem: cannot be read")
+
+    def hang() -> None:
+        raise TimeoutError
+
+    acts = {"add": lambda a, b: a + b, "refuse": refuse, "lack": lack, "hang": hang, "fail": lambda: [].index(1)}
+    found = ControlSocket("zsim", acts)
+    yield found
+    found.close()
+
+
+@pytest.mark.usefixtures("line")
+def test_an_answer_comes_back():
+    assert control_socket.ask("zsim", "add", a=2, b=3) == 5
+
+
+@pytest.mark.usefixtures("line")
+@pytest.mark.parametrize(
+    ("op", "args", "says"),
+    [
+        ("refuse", {}, "host is 'h9'"),
+        ("lack", {}, "^certs/h3/x/key.pem: cannot be read$"),
+        ("hang", {}, "it took too long"),
+        ("fail", {}, "it failed in a way that nobody thought of: ValueError"),
+        ("dance", {}, "no request that is understood"),
+        ("add", {"a": 1}, "no request that is understood"),
+    ],
+)
+def test_what_is_refused_says_why(op, args, says):
+    with pytest.raises(RunError, match=says):
+        control_socket.ask("zsim", op, **args)
+
+
+@pytest.mark.usefixtures("line")
+def test_garbage_is_answered_and_the_next_one_served():
+    with socket.socket(socket.AF_UNIX) as raw:
+        raw.connect(str(control_socket.place("zsim")))
+        raw.sendall(b"\xff\n")
+        assert not json.loads(raw.makefile("rb").readline())["ok"]
+    assert control_socket.ask("zsim", "add", a=1, b=1) == 2
+
+
+@pytest.mark.usefixtures("line")
+def test_a_federation_is_up_only_once():
+    with pytest.raises(RunError, match=r"is up already .*`zsim down --federation zsim`.* --set federation=NAME$"):
+        ControlSocket("zsim", {})
+
+
+def test_nobody_is_up():
+    with pytest.raises(RunError, match="no `zsim up` of federation 'zsim' runs"):
+        control_socket.ask("zsim", "ps")
+
+
+def test_the_socket_of_a_killed_launcher_is_no_hindrance():
+    place = control_socket.place("zsim")
+    place.parent.mkdir(mode=0o700)
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(place))
+    found = ControlSocket("zsim", {"add": lambda a, b: a + b})
+    assert control_socket.ask("zsim", "add", a=1, b=2) == 3
+    found.close()
+    assert not place.exists()
+
+
+def test_only_its_user_may_come_in(line):
+    assert control_socket.place("zsim").parent.stat().st_mode & 0o077 == 0
+
+
+def test_a_launcher_that_does_not_answer_is_not_taken_for_none(monkeypatch):
+    monkeypatch.setattr(control_socket, "ANSWER_S", 0.05)
+    place = control_socket.place("zsim")
+    place.parent.mkdir(mode=0o700)
+    with socket.socket(socket.AF_UNIX) as busy:
+        busy.bind(str(place))
+        busy.listen()
+        with pytest.raises(RunError, match="`zsim up` has not answered ps within"):
+            control_socket.ask("zsim", "ps")
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o750])
+def test_a_folder_in_which_others_may_write_or_read_is_refused(mode):
+    folder = control_socket.place("zsim").parent
+    folder.mkdir()
+    folder.chmod(mode)
+    with pytest.raises(RunError, match=f"is not a folder that is yours alone .* mode {mode:o}"):
+        ControlSocket("zsim", {})
+
+
+def test_a_link_to_somewhere_else_is_refused(tmp_path):
+    (tmp_path / "elsewhere").mkdir(mode=0o700)
+    control_socket.place("zsim").parent.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(RunError, match="is not a folder that is yours alone"):
+        ControlSocket("zsim", {})
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
+def test_a_folder_of_another_user_is_refused():
+    folder = control_socket.place("zsim").parent
+    folder.mkdir(mode=0o700)
+    os.chown(folder, 12345, 12345)
+    with pytest.raises(RunError, match="owner 12345"):
+        ControlSocket("zsim", {})
+
+
+def test_a_path_that_is_too_long_is_a_line(tmp_path, monkeypatch):
+    long = tmp_path / ("x" * 120)
+    long.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(long))
+    with pytest.raises(RunError, match="longer than 107 bytes; set XDG_RUNTIME_DIR or TMPDIR"):
+        ControlSocket("zsim", {})
+    with pytest.raises(RunError, match="no `zsim up` of federation"):
+        control_socket.ask("zsim", "ps")
+
+
+def test_the_runtime_folder_is_preferred(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert control_socket.place("zsim") == tmp_path / "zsim" / "zsim.sock"

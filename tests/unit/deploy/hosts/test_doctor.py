@@ -1,0 +1,346 @@
+"""What `zsim doctor` makes of what hosts say; and the probe's round trip and bandwidth over loopback."""
+
+import asyncio
+import io
+import itertools
+import json
+import pathlib
+import platform
+import socket
+import threading
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from zsim import __version__
+from zsim.errors import HostsError
+from zsim_deploy.hosts import doctor, probe
+from zsim_deploy.hosts.doctor import HostReport, NetworkPath, compare_reports, path_faults
+from zsim_deploy.hosts.host_check import CheckResult, check_hosts
+from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
+from zsim_deploy.security import certificates
+from zsim_deploy.security.enrolment import CertificateRequest
+from zsim_deploy.ssh.host_link import HostLink
+
+SOUND = {
+    "python": platform.python_version(),
+    "zsim": __version__,
+    "fingerprint": "a" * 16,
+    "cores": 2,
+    "load": 0.1,
+    "governors": ["performance"],
+    "free_bytes": 50_000_000_000,
+    "unwritable": None,
+}
+
+
+def report(offset_s: float = 0.0, **changes) -> HostReport:
+    return HostReport({**SOUND, **changes}, round_trip_s=0.01, clock_offset_s=offset_s)
+
+
+def test_sound_hosts_raise_nothing():
+    assert compare_reports({"h1": report(), "h2": report()}) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"zsim": "0.0.1"}, f"h1: zsim is 0.0.1; must be {__version__} as here; run `zsim push --hosts "),
+        ({"python": "3.9.2"}, "h1: Python is 3.9.2; must be"),
+        (
+            {"unwritable": "/opt may not be written"},
+            "h1: its folder cannot be used (/opt may not be written); correct hosts.h1.folder, or make it there",
+        ),
+    ],
+)
+def test_another_version_or_a_folder_that_cannot_be_used_is_a_fault(changes, says):
+    faults, _ = compare_reports({"h1": report(**changes), "h2": report()})
+    assert [line.startswith(says) for line in faults] == [True]
+
+
+@pytest.mark.parametrize(
+    ("found", "says"),
+    [
+        (report(offset_s=3600.0), "h1: its clock is +3600.0 s off"),
+        (report(load=1.9), "h1: load is 1.9 on 2 cores"),
+        (report(governors=["powersave"]), "h1: the CPU governor is powersave"),
+        (report(free_bytes=10_000_000), "h1: 0.0 GB are free on its disk"),
+        (
+            report(fingerprint="b" * 16),
+            "the hosts compute with different numeric fingerprints (h1 bbbbbbbb, h2 aaaaaaaa)",
+        ),
+    ],
+)
+def test_what_slows_or_differs_is_a_warning(found, says):
+    faults, warnings = compare_reports({"h1": found, "h2": report()})
+    assert faults == []
+    assert [line.startswith(says) for line in warnings] == [True]
+
+
+def test_a_path_that_is_not_there_is_a_fault_and_a_slow_one_a_warning():
+    faults, slow = path_faults(
+        [
+            NetworkPath("h2", "h1", 7447, {"error": "Connection refused"}),
+            NetworkPath("h3", "h1", 7447, {"round_trip_s": 0.1, "bits_per_s": 2e6}),
+            NetworkPath("h4", "h1", 7447, {"round_trip_s": 0.001, "bits_per_s": 2e9}),
+        ]
+    )
+    assert len(faults) == 1
+    assert faults[0].startswith("h2: port 7447 of h1 cannot be reached (Connection refused)")
+    assert slow == ["h3 reaches h1 at 2.0 Mbit/s only"]
+
+
+@pytest.mark.parametrize(
+    ("found", "line"),
+    [
+        (
+            {"error": "Address already in use", "taken": True},
+            "h1: port 7447 is in use there, perhaps by another run; end that (`ss -ltnp` there shows it), "
+            "or give another port in the inventory",
+        ),
+        (
+            {"error": "Permission denied", "taken": False},
+            "h1: nothing may listen on port 7447 there (Permission denied); give another port in the inventory",
+        ),
+    ],
+)
+def test_a_port_on_which_nothing_can_listen_is_not_called_unreachable(found, line):
+    (path,) = asyncio.run(doctor.network_paths([Silent()], Silent(json.dumps(found) + "\n"), {"h1": "python"}, 7447))
+    assert path_faults([path]) == ([line], [])
+
+
+def checked_up(folder: pathlib.Path) -> CheckResult:
+    """Check up a host that does not answer, of an inventory in a folder."""
+    host = Host(address="127.0.0.1", port=1, user="nobody")  # tcpmux; nobody has it
+    return check_hosts(InventoryFile(Inventory(hosts={"h1": host}, roles={"world": "h1"}), folder, "lab.yaml"), None)
+
+
+def test_certificates_that_are_missing_or_expired_are_faults_and_open_keys_a_warning(tmp_path):
+    (fault, _) = checked_up(tmp_path).faults
+    assert fault.startswith(
+        f"{tmp_path}/certs: has no certificates; make them with `zsim certs init {tmp_path}/lab.yaml "
+    )
+    then = datetime.now(UTC) - timedelta(days=60)
+    signer = certificates.authority(tmp_path / "certs", then)
+    place = certificates.issue(tmp_path / "certs", signer, CertificateRequest("h1", "world", ("127.0.0.1",)), then)
+    (place.parent / "world.access.json").touch()
+    (place / "key.pem").chmod(0o644)
+    found = checked_up(tmp_path)
+    (fault, _) = found.faults
+    assert fault.startswith(f"{tmp_path}/certs: certificate expired on ")
+    assert fault.endswith(
+        f": world on h1; make them with `zsim certs init {tmp_path}/lab.yaml --scenario FILE --renew`"
+    )
+    (warning,) = found.warnings
+    assert warning.startswith(f"{place}/key.pem can be read by others on this machine; ")
+
+
+# Asking a host
+
+
+class Silent(HostLink):
+    """A host that takes commands and never says anything, or says some lines and ends with a code."""
+
+    def __init__(self, out: str | None = None, error: str = "", code: int = 1, python: str | None = None) -> None:
+        super().__init__("h1", Host(address="192.0.2.1", python=python), pathlib.Path())
+        self._said = (out, error)
+        self._code = code
+
+    async def open(self) -> Any:
+        return self
+
+    async def create_process(self, *_command, **_options):
+        streams = [asyncio.StreamReader(), asyncio.StreamReader()]
+        for stream, text in zip(streams, self._said, strict=True):
+            if text is not None:
+                stream.feed_data(text.encode())
+                stream.feed_eof()
+        return SimpleNamespace(
+            stdout=Text(streams[0]),
+            stderr=Text(streams[1]),
+            stdin=io.StringIO(),
+            close=lambda: None,
+            wait_closed=lambda: asyncio.sleep(0),
+            exit_status=self._code,
+        )
+
+
+class Text:
+    """The text of a stream of bytes, as asyncssh gives it."""
+
+    def __init__(self, stream: asyncio.StreamReader) -> None:
+        self._stream = stream
+
+    async def readline(self) -> str:
+        return (await self._stream.readline()).decode()
+
+    async def read(self) -> str:
+        return (await self._stream.read()).decode()
+
+
+def test_a_greeting_of_the_login_shell_is_passed_over():
+    clocks = [json.dumps({"time_ns": 10**18})] * doctor.OFFSET_ASKS
+    said = "\n".join(["Welcome to lab", "17", json.dumps(SOUND), *clocks, ""])
+    assert asyncio.run(doctor.host_report(Silent(said), "python")).facts == SOUND
+
+
+def test_a_host_that_says_nothing_is_a_line(monkeypatch):
+    monkeypatch.setattr(doctor, "ABOUT_S", 0.01)
+    monkeypatch.setattr(doctor, "READY_S", 0.01)
+    with pytest.raises(HostsError, match=r"^h1: no answer within 0\.01 s; "):
+        asyncio.run(doctor.host_report(Silent(), "python"))
+    (path,) = asyncio.run(doctor.network_paths([Silent()], Silent(), {"h1": "python"}, 7447))
+    assert path.figures["error"].startswith("h1: no answer within 0.01 s; ")
+
+
+PUSH = "run `zsim push --hosts lab.yaml`"
+OR_PUSH = f"leave hosts.h1.python out and {PUSH}"
+
+
+@pytest.mark.parametrize(
+    ("python", "code", "error", "line"),
+    [
+        (None, 1, "/usr/bin/python3: No module named zsim_deploy", f"PYTHON has no zsim {__version__}; {PUSH}"),
+        (None, 127, "bash: line 1: PYTHON: No such file or directory", f"has no zsim in .zsim; {PUSH}"),
+        (None, 1, "PYTHON: Command not found.", f"has no zsim in .zsim; {PUSH}"),
+        (
+            "PYTHON",
+            1,
+            "PYTHON: No module named zsim_deploy",
+            f"PYTHON has no zsim {__version__}; install it there, or {OR_PUSH}",
+        ),
+        (
+            "PYTHON",
+            126,
+            "bash: line 1: PYTHON: Is a directory",
+            "python PYTHON is no program there (bash: line 1: PYTHON: Is a directory); "
+            f"correct hosts.h1.python, or install it there, or {OR_PUSH}",
+        ),
+        (
+            None,
+            1,
+            "Traceback (most recent call last):\nMemoryError",
+            "PYTHON: the probe ended with code 1 (MemoryError); is it a Python that has zsim?",
+        ),
+        (None, 0, "", "PYTHON: the probe ended with code 0 (it printed nothing); is it a Python that has zsim?"),
+    ],
+)
+def test_a_host_without_zsim_is_told_from_one_with_another_fault(python, code, error, line):
+    with pytest.raises(HostsError) as caught:
+        asyncio.run(doctor.host_report(Silent("Welcome to lab\n", error, code, python), "PYTHON", "lab.yaml"))
+    assert str(caught.value) == f"h1: {line}"
+
+
+# The probe
+
+
+def test_the_clock_is_told_for_each_line(monkeypatch, capsys):
+    monkeypatch.setattr(probe.time, "time_ns", itertools.count(5).__next__)
+    probe.clock(io.StringIO("\n\n"))
+    assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == [{"time_ns": 5}, {"time_ns": 6}]
+
+
+@contextmanager
+def served():
+    """Let the probe answer one connection, and yield its port."""
+    with probe.listening(0) as server:
+
+        def answer() -> None:
+            with server.accept()[0] as connection:
+                probe.answer(connection)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        port = server.getsockname()[1]
+        yield port
+        socket.create_connection(("127.0.0.1", port)).close()  # whoever did not come is not waited for
+        thread.join()
+
+
+def has(address: str) -> bool:
+    try:
+        socket.create_server((address, 0), family=socket.AF_INET6).close()
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["127.0.0.1", pytest.param("::1", marks=pytest.mark.skipif(not has("::1"), reason="this machine has no IPv6"))],
+)
+def test_the_probe_measures_what_answers(address):
+    with served() as port:
+        found = probe.reach(address, port)
+    assert found["round_trip_s"] > 0.0
+    assert found["bits_per_s"] > 1e6
+
+
+class Slow:
+    """A link of some bandwidth and round trip, on a clock of its own; it gives up as sockets do."""
+
+    def __init__(self, bits_per_s: float, round_trip_s: float) -> None:
+        self._bits_per_s, self._round_trip_s, self.now_s = bits_per_s, round_trip_s, 0.0
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        return None
+
+    def setsockopt(self, *_):
+        return None
+
+    def sendall(self, data: bytes) -> None:
+        took_s = 8 * len(data) / self._bits_per_s
+        if took_s > probe.PATIENCE_S:
+            raise TimeoutError("timed out")
+        self.now_s += took_s
+
+    def recv(self, _size: int) -> bytes:
+        self.now_s += self._round_trip_s
+        return b"."
+
+
+@pytest.mark.parametrize("round_trip_s", [0.001, 0.6, 2.0])
+@pytest.mark.parametrize("bits_per_s", [50e3, 1e6, 4e6, 30e6, 1e9])
+def test_a_slow_link_is_measured_and_soon(monkeypatch, bits_per_s, round_trip_s):
+    link = Slow(bits_per_s, round_trip_s)
+    monkeypatch.setattr(probe.socket, "create_connection", lambda *_: link)
+    monkeypatch.setattr(probe.time, "monotonic", lambda: link.now_s)
+    found = probe.reach("h1", 7447)
+    assert found["round_trip_s"] == pytest.approx(round_trip_s, abs=0.002)
+    assert found["bits_per_s"] == pytest.approx(bits_per_s, rel=0.01)
+    assert link.now_s < doctor.REACH_S
+
+
+def test_the_probe_says_why_nothing_answers():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    assert "refused" in probe.reach("127.0.0.1", port)["error"]
+
+
+def test_governors_are_read_where_the_system_tells(tmp_path):
+    for cpu, text in (("cpu0", "powersave\n"), ("cpu1", "performance\n")):
+        folder = tmp_path / cpu / "cpufreq"
+        folder.mkdir(parents=True)
+        (folder / "scaling_governor").write_text(text)
+    assert probe.governors(tmp_path) == ["performance", "powersave"]
+    assert probe.governors(tmp_path / "nowhere") == []
+
+
+def test_a_port_that_is_taken_is_said(capsys):
+    with probe.listening(0) as taken:
+        probe.serve(taken.getsockname()[1])
+    assert json.loads(capsys.readouterr().out) == {"error": "Address already in use", "taken": True}
+
+
+def test_a_folder_is_asked_for_where_it_would_be_made(tmp_path, monkeypatch):
+    assert probe.unwritable(tmp_path / "zsim" / "runs") is None
+    (tmp_path / "file").touch()
+    assert probe.unwritable(tmp_path / "file" / "zsim") == f"{tmp_path}/file is no folder"
+    monkeypatch.setattr(probe.os, "access", lambda path, _mode: path != tmp_path)
+    assert probe.unwritable(tmp_path / "zsim") == f"{tmp_path} may not be written"

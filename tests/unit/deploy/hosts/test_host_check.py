@@ -1,0 +1,24 @@
+"""What hosts say is shown as it is in the tables of `zsim doctor`."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from zsim_deploy.hosts.doctor import HostReport, NetworkPath
+from zsim_deploy.hosts.host_check import _hosts_table, _paths_table
+
+SAID = {"python": "3.11.2", "zsim": "1", "fingerprint": "abc", "cores": 2, "load": 0.1, "governors": ["[/x]"]}
+
+
+@pytest.mark.parametrize(
+    ("table", "shows"),
+    [
+        (_paths_table([NetworkPath("h2", "h1", 7447, {"error": "cannot open [/tmp/x]"})]), "cannot open [/tmp/x]"),
+        (_hosts_table({"h1": HostReport(SAID, 0.001, 0.0)}), "[/x]"),
+    ],
+)
+def test_brackets_are_no_markup(table, shows):
+    console = Console(file=io.StringIO(), width=200)
+    console.print(table)
+    assert shows in console.file.getvalue()  # type: ignore[attr-defined]

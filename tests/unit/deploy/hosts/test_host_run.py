@@ -1,0 +1,127 @@
+"""How `zsim up` ends when nobody wants to wait for its record, and what is said of a record that there is not."""
+
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from rich.console import Console
+
+from zsim.errors import HostsError
+from zsim.scenario import scenario_file
+from zsim_deploy.hosts import host_run as module
+from zsim_deploy.hosts.host_run import HostRun, HostRunOptions
+from zsim_deploy.hosts.status_table import StatusTable
+from zsim_deploy.inventory import inventory
+from zsim_deploy.launch.supervisor import Outcome
+
+SCENARIO = "name: one\nduration_s: 1\ndrones: [{name: drone1, position_m: [0, 0, 0]}]\nprocesses: {expect: []}\n"
+HOSTS = {
+    "hosts": {"h1": {"address": "10.0.0.1", "user": "pi"}},
+    "roles": {"world": "h1"},
+    "security": {"insecure": True},
+}
+AT = r"h1:~/\.zsim/runs/abc/run\.mcap \(fetch it with `scp pi@10\.0\.0\.1:\.zsim/runs/abc/run\.mcap \.`\)"
+
+
+class Said(StatusTable):
+    """A board without a terminal."""
+
+    def __init__(self) -> None:
+        super().__init__(1.0, Console(file=io.StringIO(), width=500))
+
+    def text(self) -> str:
+        assert isinstance(self.console.file, io.StringIO)
+        return self.console.file.getvalue()
+
+
+@pytest.fixture
+def board() -> Said:
+    return Said()
+
+
+@pytest.fixture
+def up(board: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return a run whose host is never asked for."""
+    scenario, hosts = tmp_path / "one.yaml", tmp_path / "hosts.yaml"
+    scenario.write_text(SCENARIO)
+    hosts.write_text(yaml.safe_dump(HOSTS))
+    options = HostRunOptions(scenario_file.load(scenario), inventory.load(hosts), tmp_path / "out", run_id="abc")
+    found = HostRun(options, board)
+    monkeypatch.setattr(found._links, "listen", lambda: None)
+    yield found
+    found._loop.close()
+
+
+def fetching(found: Any) -> Any:
+    """Return a fetch that returns or raises."""
+
+    async def fetch(*_: Any) -> bool:
+        if isinstance(found, BaseException):
+            raise found
+        return found
+
+    return fetch
+
+
+def ends_as(up: Any, outcome: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(_: Any) -> Outcome:
+        if isinstance(outcome, BaseException):
+            raise outcome
+        return outcome
+
+    monkeypatch.setattr(up._supervisor, "run", run)
+
+
+@pytest.mark.parametrize("when", ["while the processes end", "while the record is fetched"])
+def test_a_second_ctrl_c_does_not_wait_and_says_where_the_record_is(
+    up: Any, board: Said, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    early = when == "while the processes end"
+    ends_as(up, KeyboardInterrupt() if early else Outcome("interrupted", interrupted=True), monkeypatch)
+    with monkeypatch.context() as patched:
+        patched.setattr(up._loop, "call", interrupting)
+        with pytest.raises(KeyboardInterrupt):
+            up._fly()
+    assert matches(rf"the record was not fetched; what there is of it is at {AT}", board)
+    assert ("fetching the record" in board.text()) is not early
+
+
+def interrupting(work: Any) -> None:
+    work.close()
+    raise KeyboardInterrupt
+
+
+def matches(pattern: str, board: Said) -> bool:
+    return re.search(pattern, board.text()) is not None
+
+
+def test_a_run_that_was_ended_before_it_flew_has_no_record(
+    up: Any, board: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends_as(up, Outcome("interrupted by Ctrl-C", interrupted=True), monkeypatch)
+    monkeypatch.setattr(module, "fetch", fetching(False))
+    assert up._fly() == Outcome("interrupted by Ctrl-C", interrupted=True)
+    assert board.text().endswith("nothing was recorded\n")
+    assert not up._record_stays
+
+
+def test_a_record_that_stays_away_fails_a_run_that_ended_well(
+    up: Any, board: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends_as(up, Outcome("duration"), monkeypatch)
+    monkeypatch.setattr(module, "fetch", fetching(HostsError("h1: it is gone")))
+    outcome = up._fly()
+    assert outcome.failed
+    assert outcome.reason.startswith("the record could not be fetched (h1: it is gone); what there is of it is at h1:")
+    assert up._record_stays
+
+
+def test_a_closed_terminal_ends_the_run_and_lines_are_shown_from_then_on(up: Any, board: Said) -> None:
+    with board:
+        up._hang_up()
+        assert up._supervisor.run().reason == "the terminal was closed"
+        board.say("fetching")
+    assert board.text() == "fetching\n"

@@ -1,0 +1,111 @@
+"""The table of `zsim up`: what a row says of a process, and which host is named as silent."""
+
+import io
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from zsim_deploy.hosts.status_table import StatusTable, table
+
+
+class Link:
+    def __init__(self) -> None:
+        self.round_trip_s, self.answered_s, self.silent = 0.004, 1.0, 0.0
+
+    def silent_s(self) -> float:
+        return self.silent
+
+
+@pytest.fixture
+def board():
+    made = StatusTable(10.0, Console(file=io.StringIO(), width=200))
+    member: Any = SimpleNamespace(
+        name="estimator.d1", host="h1", pid=7, state="running", code=None, restarts=1, outcome=lambda: "exit code 2"
+    )
+    made.members, made.links = [member], {"h1": Link()}  # type: ignore[dict-item]
+    return made
+
+
+def said(board: StatusTable) -> str:
+    return board.console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def clock(t_s: float, **more: Any) -> dict[str, Any]:
+    return {"t_s": t_s, "rate": 2.0, "state": "running", "phase": "", "waiting_for": [], **more}
+
+
+def test_a_row_says_where_and_how_a_process_is(board, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    board.health({"name": "estimator.d1", "lag_ns": 20_000_000, "received": 100})
+    now[0] = 101.0
+    board.health({"name": "estimator.d1", "lag_ns": 40_000_000, "received": 350})
+    row = board.rows()[0]
+    assert row == {
+        "role": "estimator.d1",
+        "host": "h1",
+        "pid": 7,
+        "state": "running",
+        "lag_ms": 40.0,
+        "messages_per_s": 250.0,
+        "round_trip_ms": 4.0,
+        "restarts": 1,
+    }
+    now[0] = 110.0
+    assert board.rows()[0]["lag_ms"] is None  # nobody knows by now
+
+
+def test_who_is_waited_for_is_said(board):
+    board.clock(clock(1.0, waiting_for=[{"name": "estimator.d1", "host": "h1", "since_wall_s": 3.2}]))
+    assert board.rows()[0]["state"] == "waited for 3 s"
+
+
+def test_a_silent_host_is_named_once_with_its_roles_and_once_when_it_is_back(board):
+    board.links["h1"].silent = 1.5
+    board.report_silent_hosts()
+    board.report_silent_hosts()
+    assert said(board).count("host h1 does not answer (since 1.5 s); on it: estimator.d1") == 1
+    assert board.rows()[0]["state"] == "host silent 2 s"
+    assert board.rows()[0]["round_trip_ms"] is None
+    board.links["h1"].silent = 0.0
+    board.report_silent_hosts()
+    assert said(board).count("host h1 answers again") == 1
+
+
+def test_what_always_answers_late_is_not_silent(board):
+    board.links["h1"].round_trip_s, board.links["h1"].silent = 1.2, 1.2
+    board.report_silent_hosts()
+    assert "does not answer" not in said(board)
+    assert board.rows()[0]["state"] == "running"
+    board.links["h1"].silent = 4.0
+    board.report_silent_hosts()
+    assert "host h1 does not answer (since 4.0 s)" in said(board)
+
+
+def test_the_start_is_told_with_where_the_time_went(board):
+    board.stages_s = {"connect": 0.25, "check": 0.5}
+    board.clock(clock(0.0, state="waiting"))
+    assert "flies after" not in said(board)
+    board.clock(clock(1.2))
+    board.clock(clock(2.4))
+    assert said(board).count("flies after") == 1
+    assert "connect 0.2 s, check 0.5 s, processes" in said(board)
+
+
+def test_an_ended_process_says_how(board):
+    board.members[0].state, board.members[0].code = "ended", 2
+    assert board.rows()[0]["state"] == "ended (exit code 2)"
+    console = Console(file=io.StringIO(), width=200)
+    console.print(table(board.rows()))
+    assert "ended (exit code 2)" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("said_last", ["cannot open [/tmp/x]", "[/]", "[red]no"])
+def test_what_a_process_said_is_shown_as_it_is(board, said_last):
+    board.members[0].state, board.members[0].code, board.members[0].outcome = "ended", 1, lambda: said_last
+    console = Console(file=io.StringIO(), width=200)
+    console.print(table(board.rows()))
+    assert f"ended ({said_last})" in console.file.getvalue()  # type: ignore[attr-defined]

@@ -1,0 +1,98 @@
+"""Signals that end a command, and a terminal that is closed."""
+
+import os
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from zsim_deploy.options.terminal import EndSignals, interruptible
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_interrupts(number: signal.Signals) -> None:
+    former = signal.getsignal(number)
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        signal.raise_signal(number)
+    assert signal.getsignal(number) is former
+
+
+def test_what_a_library_makes_of_it_is_an_interrupt_still() -> None:
+    def lose() -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        raise SystemError("returned NULL without setting an exception")
+
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        lose()
+
+
+def test_other_errors_are_what_they_are() -> None:
+    with pytest.raises(SystemError), interruptible():
+        raise SystemError("returned NULL without setting an exception")
+
+
+TALKS = """
+import signal, sys
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever runs the tests may be under nohup
+from pathlib import Path
+from zsim_deploy.options.terminal import EndSignals
+told = []
+with EndSignals(Path(sys.argv[1]), lambda: told.append(1)):
+    print("ready", flush=True)
+    while not told:
+        sys.stdin.readline()
+    print("fetching the record", flush=True)
+    print("ended", file=sys.stderr, flush=True)
+"""
+
+
+def test_who_loses_the_terminal_goes_on_and_what_it_says_is_in_a_file(tmp_path: Path) -> None:
+    master, slave = os.openpty()
+    command = [sys.executable, "-c", TALKS, str(tmp_path / "up.log")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=slave, stderr=slave, start_new_session=True) as talker:
+        os.close(slave)
+        said = b""
+        while not said.endswith(b"\n"):  # it may come in parts
+            said += os.read(master, 100)
+        assert said.strip() == b"ready"
+        os.close(master)
+        for _ in range(2):  # as the system and a shell do
+            talker.send_signal(signal.SIGHUP)
+        talker.communicate(b"\n", timeout=60.0)
+    assert talker.returncode == 0
+    assert (tmp_path / "up.log").read_text().splitlines() == ["fetching the record", "ended"]
+
+
+def test_a_terminal_that_is_there_still_is_told_where_the_rest_is(tmp_path: Path) -> None:
+    """A reader of a pipe may be gone a moment later, so nothing but that line is sent there."""
+    log = tmp_path / "up.log"
+    command = [sys.executable, "-c", TALKS, str(log)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, **pipes, text=True) as talker:  # type: ignore[call-overload]
+        assert talker.stdout
+        assert talker.stdout.readline() == "ready\n"
+        talker.send_signal(signal.SIGHUP)
+        said, complained = talker.communicate("\n", timeout=60.0)
+    assert (said, complained) == ("", f"the terminal was closed; what there is still to say is in {log}\n")
+    assert log.read_text().splitlines() == ["fetching the record", "ended"]
+
+
+def test_under_nohup_nothing_happens(tmp_path: Path) -> None:
+    former = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with EndSignals(tmp_path / "up.log", lambda: pytest.fail("hung up")):
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, former)
+
+
+def test_sigterm_is_as_ctrl_c_wherever_it_comes(tmp_path: Path) -> None:
+    former = signal.getsignal(signal.SIGTERM)
+    with EndSignals(tmp_path / "up.log", lambda: None), pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is former

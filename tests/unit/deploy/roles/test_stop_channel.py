@@ -1,0 +1,73 @@
+"""The private key that a launcher lends: it goes with the process, and not with the one before it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from zsim.transport.identity import Identity
+from zsim_deploy.roles.stop_channel import KeyLease, key_lease
+
+ROLE = """
+import os, sys, time
+from pathlib import Path
+from zsim.transport.identity import Identity
+from zsim_deploy.roles.stop_channel import StopChannel
+folder = Path(sys.argv[1])
+stop = StopChannel("run1", Identity(tls=folder))
+print("ready", flush=True)
+while not stop.stopped():
+    time.sleep(0.001)
+print(stop.orphaned(), (folder / "key.pem").exists(), flush=True)
+os._exit(0) if stop.orphaned() else sys.exit(0)
+"""
+
+
+@pytest.fixture
+def key(tmp_path: Path) -> Path:
+    path = tmp_path / "runs" / "run1" / "identity" / "estimator.d1" / "key.pem"
+    path.parent.mkdir(parents=True)
+    path.write_text("secret")
+    return path
+
+
+def role(key: Path, given: str) -> list[str]:
+    """Run a process that lives until it is stopped, or orphaned; return what it prints."""
+    command = [sys.executable, "-c", ROLE, str(key.parent)]
+    done = subprocess.run(command, input=given, capture_output=True, text=True, timeout=60.0, check=True)
+    return done.stdout.split()
+
+
+def test_a_deserted_process_has_given_its_key_back_before_it_does_anything_else(key: Path) -> None:
+    assert role(key, "") == ["ready", "True", "False"]
+
+
+def test_a_process_that_is_told_to_stop_keeps_its_key_to_its_end(key: Path) -> None:
+    command = [sys.executable, "-c", ROLE, str(key.parent)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin
+        assert process.stdout
+        process.stdin.write("stop enough\n")
+        process.stdin.flush()
+        assert process.stdout.read().split() == ["ready", "False", "True"]
+        process.wait(60.0)
+    assert not key.exists()
+
+
+def test_a_key_that_was_brought_for_a_successor_stays(key: Path) -> None:
+    old = KeyLease(key.parent)
+    key.unlink()
+    key.write_text("another")
+    old.release()
+    assert key.read_text() == "another"
+    KeyLease(key.parent).release()
+    assert not key.exists()
+    old.release()
+
+
+def test_a_key_of_the_hosts_own_is_not_lent(key: Path) -> None:
+    certs = Path("certs/h1/estimator.d1")
+    for tls, launched in ((None, "run1"), (key.parent, None), (key.parent, "run2"), (certs, "run1")):
+        assert key_lease(Identity(tls=tls), launched) is None
+    assert key_lease(Identity(tls=key.parent), "run1") is not None
