@@ -168,7 +168,7 @@ def ros2(
         return
     from zsim.transport.identity import Identity
     from zsim.transport.tls import is_tls
-    from zsim_bridges.ros2.bridge import serve
+    from zsim_bridges.ros2.bridge import RosNetwork, serve
     from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
 
     if reach.tls and router is None:

@@ -56,6 +56,7 @@ def export(
     record_at(run)
     check_installed(form)
     from zsim_analysis.export.make_export import export as write
+    from zsim_analysis.export.selection import MessageSelection
 
     console = Console(stderr=True)
     with interruptible(), Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
@@ -118,6 +119,7 @@ def replay(
     """Play a record back onto the keys: for a console, an estimator under test, any client; nobody can be flown."""
     _check("replay", REPLAY_NEEDS)
     from zsim_deploy.roles.world_role import ReplayOptions, play
+    from zsim_world.playback.playback import PlaybackRange
 
     if to is not None and to < from_:
         raise typer.BadParameter(f"--to is {to:g}, before --from {from_:g}; must be at or after it")

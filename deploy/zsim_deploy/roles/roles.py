@@ -85,12 +85,6 @@ def _also(made: Agent) -> str:
     return f", and stands for {', '.join(made.serves)}" if made.serves else ""
 
 
-def controller(cluster: str) -> Callable[[messages.Info, Scenario], Agent]:
-    from zsim_agents.formation.controller import Controller
-
-    return lambda info, scenario: Controller(info, scenario, cluster)
-
-
 def recorder(path: Path, reach: WorldAccess) -> None:
     """Record the run of a world into a file."""
     from zsim_agents.recorder import record
