@@ -21,6 +21,7 @@ from zsim_deploy.roles.stop_channel import StopChannel
 
 if TYPE_CHECKING:
     from zsim.record import RecordReader
+    from zsim_world.playback.playback import PlaybackRange
 
 PATIENCE_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
 SHOWN_EVENTS = 2000  # events shown per run besides those below; all of them are in the record
