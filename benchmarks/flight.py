@@ -38,7 +38,7 @@ def fly(drones: int, seconds: float) -> dict[str, float]:
             agents(world),
             time.monotonic_ns,
             lambda key, message: writer.add_message(key, message, time.time_ns()),
-            lambda bundle: writer.add_bundle(bundle, time.time_ns()),
+            lambda gate: writer.add_gate(gate, time.time_ns()),
         )
         bus.join()
         while world.now_ns < WARM_NS:

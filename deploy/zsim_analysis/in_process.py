@@ -10,7 +10,7 @@ from typing import Any
 from msgspec import Struct
 
 from zsim.contract import keys, messages
-from zsim.contract.bundle import Bundle
+from zsim.contract.framing import GateMessages
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
@@ -50,7 +50,7 @@ def fly(
     team = agents(world)  # may refuse the scenario; a record that was begun could not be begun again
     writer = RecordWriter(record) if record else None
     show = _Show(world, writer, screen)
-    bus = Bus(world, team, time.monotonic_ns, show.sink, show.whole)
+    bus = Bus(world, team, time.monotonic_ns, show.sink, show.gate_sink)
     try:
         show.sink(keys.INFO, world.info())
         bus.join()
@@ -75,7 +75,7 @@ class _Show:
     def __init__(self, world: World, writer: RecordWriter | None, screen: Screen | None) -> None:
         self._world = world
         self._add = writer.add_message if writer else None
-        self._add_bundle = writer.add_bundle if writer else None
+        self._add_gate = writer.add_gate if writer else None
         self._screen = screen
         self._throttle = Throttle()
         self._reasons = Reasons()
@@ -83,9 +83,9 @@ class _Show:
         self._watched = {keys.CLOCK, keys.EVENT, *states}
         self._phase = ""
 
-    def whole(self, bundle: Bundle) -> None:
-        if self._add_bundle is not None:
-            self._add_bundle(bundle, time_ns())
+    def gate_sink(self, gate: GateMessages) -> None:
+        if self._add_gate is not None:
+            self._add_gate(gate, time_ns())
 
     def sink(self, key: str, message: Any) -> None:
         if self._add is not None:

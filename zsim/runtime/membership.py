@@ -10,8 +10,9 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 from zsim import __version__
-from zsim.contract import batch, keys, messages
+from zsim.contract import keys, messages
 from zsim.contract.fingerprint import fingerprint
+from zsim.contract.framing import Pairs
 from zsim.contract.world_events import Entry
 from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
 from zsim.runtime.agent import Agent, Output
@@ -61,7 +62,7 @@ class Membership:
         self._done_key = keys.process(agent.name, "done")
         ahead = info.command_delay_ns // info.gate_ns
         self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
-        self._unsent: batch.Batch = []
+        self._unsent: Pairs = []
         self._must_rejoin = False
         self._unproved = 0
         self._proof_ns = 0

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 
-from zsim.contract import batch, keys
+from zsim.contract import keys
+from zsim.contract.framing import pairs_of
 from zsim.errors import DecodeError, NoWorldError
 from zsim.transport.session import Session
 
@@ -27,7 +28,7 @@ def replay(
         try:
             args = {"from_ns": from_ns, "keys": list(expressions), "page": page}
             answer = link.request(keys.replay(process), "replay", process, args, timeout_s)
-            passed = batch.of(answer.result) if answer.ok else []
+            passed = pairs_of(answer.result) if answer.ok else []
         except DecodeError as error:
             raise NoWorldError(f"{process}: the world's replay is of no use: {error}") from error
         if not answer.ok:

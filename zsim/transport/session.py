@@ -19,7 +19,7 @@ import zenoh
 import zenoh.ext
 from msgspec import Struct
 
-from zsim.contract import batch, messages
+from zsim.contract import keys, messages
 from zsim.contract.messages import ControlAnswer, ControlRequest
 from zsim.errors import SessionError
 from zsim.transport import tls, zenoh_settings
@@ -120,7 +120,7 @@ class Session:
 
     def _declare(self, key: str) -> zenoh.Publisher:
         view = key.startswith("view/")
-        drop = view or (self._realtime and ("/sensor/" in key or key.startswith(batch.GATE)))
+        drop = view or (self._realtime and keys.may_drop(key))
         control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
         # A queue of its own: in one with others, a view that the hub passes on would wait behind a put that blocks.
         priority = zenoh.Priority.DATA_LOW if view else zenoh.Priority.DATA

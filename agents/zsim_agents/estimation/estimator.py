@@ -3,16 +3,16 @@
 Order of this file: the agent, `receive` by key, `step`, warm start.
 """
 
-import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from zsim.contract import batch, keys, messages
-from zsim.contract.bundle import Bundle, Selection, table_of
+from zsim.contract import keys, messages
+from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.views import estimate_view
-from zsim.errors import DecodeError, RunError
+from zsim.errors import RunError
 from zsim.math.compiled import COMPILES
 from zsim.runtime.agent import Agent, Output
+from zsim.runtime.routing import Input
 from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.estimate import Estimate
 from zsim_agents.estimation.estimator_set import estimators
@@ -48,8 +48,7 @@ class Estimator(Agent):
         self._set = estimators(*self._settings)
         self._told: list[Estimate] = []
         self._view_key = keys.estimates_view(self.name)
-        self.takes_bundles = COMPILES
-        self._selection = Selection(self.reads)
+        self.takes_gates = COMPILES
         self._since_ns = 0
         self._take = {key: take for i, drone in enumerate(names) for key, take in self._takers(i, drone)}
 
@@ -69,26 +68,20 @@ class Estimator(Agent):
         }
         return [(keys.sensor(drone, kind), take) for kind, take in by_kind.items()]
 
-    def hear(self, t_ns: int, inputs: Sequence[tuple[str, Any]]) -> None:
+    def deliver(self, t_ns: int, inputs: Sequence[Input]) -> None:
         self._since_ns = t_ns - self.period_ns
-        super().hear(t_ns, inputs)
+        super().deliver(t_ns, inputs)
 
     def _arrived_s(self, message: Any) -> float:
         """Return when a reading came: as it says, or, when a slow link brings it, not before the last gate."""
         return max(message.t_ns, self._since_ns) * 1e-9
 
     def receive(self, key: str, message: Any) -> None:
-        if key == batch.GATE:
-            self._receive_bundle(message)
-        else:
-            self._take[key](message)
+        self._take[key](message)
 
-    def _receive_bundle(self, bundle: Bundle) -> None:
-        if self._set.bundle(bundle):
-            return
-        with contextlib.suppress(DecodeError):  # not the world's: it is as good as lost
-            for key, message in self._selection.of(bundle):
-                self._take[key](message)
+    def receive_gate(self, gate: GateMessages) -> None:
+        if not self._set.read_gate(gate):
+            super().receive_gate(gate)
 
     def step(self, t_ns: int) -> list[Output]:
         self._told = self._set.close(t_ns * 1e-9)
@@ -106,7 +99,7 @@ class Estimator(Agent):
         drones, place, _, gate_s = self._settings
         twin, still, sigma_m, fix = estimators(*self._settings), (0.0, 0.0, 0.0), 1.0, 3
         sample = messages.encode(messages.Imu(0, 0, 0, still, still))
-        twin.bundle(Bundle.of(0, 0, table_of(self.counted), [(keys.sensor(self.counted[0], "imu"), sample)]))
+        twin.read_gate(GateMessages.of(0, 0, key_table(self.counted), [(keys.sensor(self.counted[0], "imu"), sample)]))
         for gate in range(1, 4):
             t_s = gate * gate_s
             twin.imu(0, t_s, (0.0, 0.0, place.gravity_m_s2), still)

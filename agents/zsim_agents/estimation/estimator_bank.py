@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.contract.bundle import Bundle
+from zsim.contract.framing import GateMessages
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim_agents.estimation import estimator_rows as er
 from zsim_agents.estimation.aiding import PATIENCE_S, Aid, aids
@@ -88,11 +88,11 @@ class EstimatorBank:
         """Take a velocity in the heading frame; without quality, or before a heading is known, it is refused."""
         self._keep(i, er.FLOW, t_s, t_sample_s, *velocity_m_s, 0.0, 0.0, 0.0, quality, 0.0)
 
-    def bundle(self, bundle: Bundle) -> bool:
-        """Take all sensors in a bundle; False, and none, if one of its messages is not as the world writes it."""
-        while self._came + len(bundle) > len(self._readings):
+    def read_gate(self, gate: GateMessages) -> bool:
+        """Take all sensors of a gate; False, and none, if one of its messages is not as the world writes it."""
+        while self._came + len(gate) > len(self._readings):
             self._grow()
-        came = self._reader.take(bundle, self._readings, self._came)
+        came = self._reader.take(gate, self._readings, self._came)
         if came >= 0:
             self._came = came
         return came >= 0

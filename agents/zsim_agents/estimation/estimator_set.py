@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from zsim.contract.bundle import Bundle
+from zsim.contract.framing import GateMessages
 from zsim.math.compiled import COMPILES
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim_agents.estimation.estimate import Estimate
@@ -29,7 +29,7 @@ class EstimatorSet(Protocol):
 
     def flow(self, i: int, t_s: float, t_sample_s: float, velocity_m_s: Vector, quality: float) -> None: ...
 
-    def bundle(self, bundle: Bundle) -> bool: ...
+    def read_gate(self, gate: GateMessages) -> bool: ...
 
     def close(self, t_s: float) -> list[Estimate]: ...
 
@@ -75,7 +75,7 @@ class OneByOne:
     def flow(self, i: int, t_s: float, t_sample_s: float, velocity_m_s: Vector, quality: float) -> None:
         self._cores[i].flow(t_s, t_sample_s, velocity_m_s, quality)
 
-    def bundle(self, bundle: Bundle) -> bool:
+    def read_gate(self, gate: GateMessages) -> bool:
         return False
 
     def close(self, t_s: float) -> list[Estimate]:

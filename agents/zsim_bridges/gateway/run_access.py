@@ -6,11 +6,13 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from zsim.contract import batch, keys, messages
+from zsim.contract import keys, messages
+from zsim.contract.framing import GateMessages
 from zsim.contract.messages import ControlAnswer, Info
 from zsim.errors import DecodeError
 from zsim.scenario import rights, scenario_file
-from zsim.transport.session import Heard, Mailbox, Session, check_expression
+from zsim.transport.session import Heard, Session, check_expression
+from zsim.transport.traffic import Passed, Traffic
 from zsim_bridges.gateway.http.http_errors import ForbiddenError, TooManyError, UnknownError
 from zsim_bridges.gateway.key_policy import is_control, is_spoken, refuse_others
 from zsim_bridges.gateway.last_values import Values
@@ -47,7 +49,7 @@ class Flight:
         self._prefix = f"{link.federation}/"
         self._threads = ThreadPoolExecutor(ASKED_MAX, thread_name_prefix="ask")
         self._asked = 0
-        self._box: Mailbox | None = None
+        self._traffic: Traffic | None = None
         scenario = scenario_file.from_text(info.scenario)
         self._may_write = rights.of(presence.name, scenario).writes if secured else None
         self.served = [(name, name.partition(".")[2]) for name in scenario.expected()]
@@ -62,8 +64,8 @@ class Flight:
 
     def enter(self) -> None:
         """Begin to hear what passes the world, and take in what was said before."""
-        self._box = self.link.subscribe(batch.KEY)
-        self.link.hear("view/**", lambda heard: self.values.add(heard.key, heard.payload))  # views are in no batch
+        self._traffic = Traffic(self.link, [drone.name for drone in self.info.drones], self._count_refused)
+        self.link.hear("view/**", lambda heard: self.values.add(heard.key, heard.payload))  # they do not pass it
         for expression in rights.LAST_VALUES:
             for sample in self.link.get(expression):
                 self.values.add(sample.key, sample.payload)
@@ -72,25 +74,30 @@ class Flight:
 
     def follow(self, stopped: Callable[[], bool]) -> None:
         """Take in what passes the world until the run is over, or somebody says stop."""
-        assert self._box is not None
+        assert self._traffic is not None
         over = threading.Event()
-        ticker = threading.Thread(target=_tick, args=(self._box, over), name="tick", daemon=True)
+        ticker = threading.Thread(target=_tick, args=(self._traffic, over), name="tick", daemon=True)
         ticker.start()
         try:
             while not self._presence.over and not stopped():
-                sample = self._box.receive()
-                if sample is not None:
-                    self._take_in(sample.payload)
+                self._take_in(self._traffic.receive())
                 self._presence.tick()
         finally:
             over.set()
             ticker.join()
 
-    def _take_in(self, payload: bytes) -> None:
-        self._presence.health.received += 1
-        for key, said in self.values.add_batch(payload):
-            if key == keys.CLOCK:
-                self._presence.heed(said)
+    def _take_in(self, passed: Sequence[Passed]) -> None:
+        self._presence.health.received += bool(passed)
+        for entry in passed:
+            if isinstance(entry, GateMessages):
+                self.values.add_gate(entry)
+                continue
+            self.values.add_passed(entry.key, entry.payload)
+            if entry.key == keys.CLOCK:
+                self._presence.heed(entry.payload)
+
+    def _count_refused(self) -> None:
+        self._presence.health.refused += 1
 
     def close(self) -> None:
         """Wait for nobody any more."""
@@ -242,6 +249,6 @@ class Flight:
             self._asked -= 1
 
 
-def _tick(box: Mailbox, over: threading.Event) -> None:
+def _tick(traffic: Traffic, over: threading.Event) -> None:
     while not over.wait(TICK_S):
-        box.wake()
+        traffic.wake()

@@ -89,8 +89,8 @@ class Bridge:
             intake.close()
 
     async def _pass_on(self, intake: Intake) -> None:
-        for said in intake.batches():
-            for key, payload in said:
+        for arrived in intake.arrivals():
+            for key, payload in arrived:
                 self.hear(key, payload)
             await asyncio.sleep(0)  # let connections have their turn
 

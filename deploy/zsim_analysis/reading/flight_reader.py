@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct
 
 from zsim.contract import keys
-from zsim.contract.bundle import Bundle
+from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Bye, Event, Info, Join, Quaternion, Vector3
 from zsim.errors import ZsimError
 from zsim.record import Recorded, RecordReader
@@ -119,9 +119,9 @@ class Reading:
         if taker is not None:
             taker[1](_thing(key), message)
 
-    def keep_bundle(self, bundle: Bundle) -> None:
-        """Take what the world says at a gate."""
-        for key, payload in bundle.encoded:
+    def keep_gate(self, gate: GateMessages) -> None:
+        """Take the world's messages of a gate."""
+        for key, payload in gate.pairs:
             taker = self.taker(key)
             if taker is not None:
                 taker[1](_thing(key), taker[0].decode(payload))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from zsim.contract import keys, messages
-from zsim.contract.bundle import KINDS, Bundle
+from zsim.contract.framing import GateMessages
 from zsim.contract.messages import ControlRequest
 from zsim.errors import DecodeError, RunError
 from zsim.record import Recorded
@@ -20,7 +20,6 @@ from zsim_analysis.rerun.truth_comparison import Answers
 from zsim_world.flight.world import World
 
 STEERS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # requests that change a flight
-TRUTH = KINDS.index("truth")
 
 Requests = dict[int, list[tuple[str, ControlRequest]]]
 
@@ -95,14 +94,12 @@ class RerunBus(Bus):
         if isinstance(message, (*OUTPUTS, messages.Command)):
             self.answers.take(key, message)
 
-    def _note(self, bundle: Bundle) -> None:
-        places: list[int] = bundle.which.tolist()
-        truth = ((m, place) for m, place in enumerate(places) if place % len(KINDS) == TRUTH)
-        self.truth = {keys.thing(bundle.table[place]): bundle.payload(m) for m, place in truth}
+    def _note(self, gate: GateMessages) -> None:
+        self.truth = {keys.thing(key): payload for key, payload in gate.pairs if keys.leaf(key) == "truth"}
 
-    def _tell_faults(self, faults: messages.Faults) -> None:
+    def _update_faults(self, faults: messages.Faults) -> None:
         if self._played:  # alone, the world is fed with what came of them
-            super()._tell_faults(faults)
+            super()._update_faults(faults)
 
     # What is fed
 
@@ -132,7 +129,7 @@ class RerunBus(Bus):
         if source in self._played:
             self.answers.take(key, message)
             return
-        for inbox in self._way(key).inboxes:
+        for inbox in self._route(key).inboxes:
             inbox.put(key, message)
         self._world.output_of(source)
 

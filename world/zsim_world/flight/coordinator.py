@@ -21,7 +21,7 @@ from zsim_world.flight.control_requests import TimeRequests, brief
 from zsim_world.flight.refusal_log import Refusals
 from zsim_world.flight.run_statistics import Measurements
 
-Said = tuple[str, Any]  # key and message; or batch.GATE and the Bundle of what the drones say at a gate
+Said = tuple[str, Any]  # key and message; or keys.GATE and GateMessages
 
 
 class Hub(ABC):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from zsim import CONTRACT, __version__
-from zsim.contract import batch, keys, messages
+from zsim.contract import keys, messages
 from zsim.contract.fingerprint import fingerprint
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
@@ -140,7 +140,7 @@ class World(Hub):
 
     def _publish_gate(self, wall_ns: int) -> None:
         self._hash.add(self.now_ns, self.fleet.bodies.state)
-        self.outbox.append((batch.GATE, self._publication.gate(self.commanders.holders())))
+        self.outbox.append((keys.GATE, self._publication.gate(self.commanders.holders())))
         self._measured.gate(self.now_ns, wall_ns)
         self.tell_clock()
 

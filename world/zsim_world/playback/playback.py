@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from zsim.contract import batch, keys, messages
-from zsim.contract.bundle import KINDS, Bundle, table_of
-from zsim.contract.encoding import GAP
+from zsim.contract import keys, messages
+from zsim.contract.framing import KINDS, GateMessages, key_table
 from zsim.contract.messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
@@ -80,7 +79,7 @@ class Playback(Hub):
         self._choice = choice
         self._requests = _Requests(self)
         self.also_asked = tuple(keys.cluster_control(cluster.name) for cluster in scenario.clusters)
-        self._table = table_of(self.names)
+        self._table = key_table(self.names)
         self._place = {key: place for place, key in enumerate(self._table)}
         self._views = Views(self.names, [cluster.name for cluster in scenario.clusters])
         self._last: dict[str, bytes] = {}
@@ -180,7 +179,7 @@ class Playback(Hub):
         for recorded in faults:  # they are known before the gate
             self._say(recorded)
         if heard:
-            self.outbox.append((batch.GATE, self._bundle(gate.t_ns, heard)))
+            self.outbox.append((keys.GATE, self._gate_messages(gate.t_ns, heard)))
         self._measured.gate(gate.t_ns, wall_ns)
         self.tell_clock()
         for recorded in (m for m in gate.said if m.key not in self._place and m.key != keys.FAULTS):
@@ -205,7 +204,7 @@ class Playback(Hub):
         if event.kind != "end":  # the replay has an end of its own
             self.outbox.append((keys.EVENT, msgspec.structs.replace(event, seq=self._next_seq(keys.EVENT))))
 
-    def _bundle(self, t_ns: int, heard: list[Recorded]) -> Bundle:
+    def _gate_messages(self, t_ns: int, heard: list[Recorded]) -> GateMessages:
         """Return what the world said of its drones, as it said it: drone by drone, the status last."""
         heard.sort(key=lambda m: self._place[m.key] // len(KINDS))
         which = np.array([self._place[m.key] for m in heard])
@@ -213,10 +212,8 @@ class Playback(Hub):
         payloads = [m.payload for m in heard]
         if self._counts_again:
             _count(payloads, which.tolist(), first)
-        ends = np.cumsum([GAP + len(payload) for payload in payloads])
-        buffer = b"".join([bytes(GAP) + payload for payload in payloads])
-        stamps = np.array([m.t_ns for m in heard])
-        return Bundle(t_ns, t_ns // self.gate_ns, self._table, which, stamps, ends, buffer, first)
+        pairs = list(zip([m.key for m in heard], payloads, strict=True))
+        return GateMessages.of(t_ns, t_ns // self.gate_ns, self._table, pairs, [m.t_ns for m in heard], first)
 
     def views(self, seq: int) -> Sequence[Output]:
         live = {duty for p in self.barrier.participants.values() for duty in p.duties}

@@ -2,7 +2,8 @@
 
 from typing import Any, NamedTuple
 
-from zsim.contract import batch, messages
+from zsim.contract import messages
+from zsim.contract.framing import pairs_of
 from zsim.contract.messages import ClusterRequest, ClusterState, Command, Estimate
 from zsim.errors import DecodeError
 from zsim.transport.session import Sample
@@ -32,7 +33,7 @@ def unheard(kept: Any, done_ns: int, history: History) -> list[Sample]:
         DecodeError: the result is no list of [key, payload].
     """
     found: dict[_Mark | None, Sample] = {}
-    for key, payload in batch.of(kept):
+    for key, payload in pairs_of(kept):
         mark = _mark(key, payload)
         if mark is not None and mark.t_ns <= done_ns:
             found[mark] = Sample(key, payload)

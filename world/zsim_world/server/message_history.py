@@ -9,7 +9,7 @@ from collections.abc import Callable, Container, Iterator
 from typing import NamedTuple
 
 from zsim.contract import keys
-from zsim.contract.batch import Batch
+from zsim.contract.framing import Pairs
 
 KEEP_NS = 5_000_000_000  # simulated time that a replay reaches back
 KEEP_BYTES = 500_000_000  # payloads kept at most: 1000 drones say about 300 MB in KEEP_NS
@@ -34,7 +34,7 @@ class _Said(NamedTuple):
 
     now_ns: int
     t_ns: int
-    messages: Batch
+    messages: Pairs
     size: int
 
 
@@ -66,7 +66,7 @@ class History:
             self._last[key] = payload
         self._remember(_Said(self._now_ns, t_ns, [(key, payload)], len(payload)))
 
-    def add_all(self, said: Batch, t_ns: int) -> None:
+    def add_all(self, said: Pairs, t_ns: int) -> None:
         """Remember what the world itself says, all stamped t_ns, its newest gate."""
         self._now_ns = t_ns
         self._last.update(said)

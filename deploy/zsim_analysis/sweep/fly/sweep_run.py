@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 
 from zsim.contract import keys
-from zsim.contract.bundle import Bundle
 from zsim.contract.fingerprint import fingerprint
+from zsim.contract.framing import GateMessages
 from zsim.errors import RecordError, ZsimError
 from zsim.record import RecordWriter
 from zsim.runtime.bus import Bus
@@ -75,12 +75,12 @@ def flown(scenario: Scenario, writer: RecordWriter | None = None) -> tuple[Fligh
         if writer:
             writer.add_message(key, message, time.time_ns())
 
-    def whole(bundle: Bundle) -> None:
-        reading.keep_bundle(bundle)
+    def gate_sink(gate: GateMessages) -> None:
+        reading.keep_gate(gate)
         if writer:
-            writer.add_bundle(bundle, time.time_ns())
+            writer.add_gate(gate, time.time_ns())
 
-    bus = Bus(world, agents(world), time.monotonic_ns, sink, whole)
+    bus = Bus(world, agents(world), time.monotonic_ns, sink, gate_sink)
     sink(keys.INFO, world.info())
     bus.join()
     while bus.turn():
