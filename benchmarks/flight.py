@@ -4,6 +4,7 @@
 """
 
 import argparse
+import gc
 import json
 import tempfile
 import time
@@ -41,6 +42,8 @@ def fly(drones: int, seconds: float) -> dict[str, float]:
             lambda gate: writer.add_gate(gate, time.time_ns()),
         )
         bus.join()
+        gc.collect()
+        gc.freeze()  # as `zsim run --in-process` does
         while world.now_ns < WARM_NS:
             bus.turn()
         start_s, start_ns = time.process_time(), world.now_ns

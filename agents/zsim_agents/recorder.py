@@ -13,8 +13,8 @@ from pathlib import Path
 
 import msgspec
 
-from zsim import __version__
 from zsim.contract import keys, messages
+from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import GateMessages
 from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, SupersededError
 from zsim.record import RecordWriter
@@ -268,17 +268,8 @@ class Recorder:
             self._leavers.add(name)
 
     def _join(self) -> None:
-        join = messages.Join(
-            t_ns=0,
-            seq=self._next("join"),
-            run_id=self._info.run_id,
-            incarnation=secrets.randbits(62),
-            role=NAME,
-            host=self._link.host,
-            pid=os.getpid(),
-            period_ns=0,
-            version=__version__,
-        )
+        incarnation, run_id = secrets.randbits(62), self._info.run_id
+        join = join_of(self._name, self._link.host, run_id, incarnation, self._next("join"), calculates=False)
         self._say("join", join)
 
     def _bye(self, reason: str) -> None:

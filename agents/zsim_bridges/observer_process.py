@@ -1,11 +1,9 @@
 """A process that looks and commands without gating, among the others of a run: joins, tells of its health, says bye."""
 
-import os
 import secrets
 
-from zsim import __version__
 from zsim.contract import keys, messages
-from zsim.contract.fingerprint import fingerprint
+from zsim.contract.fingerprint import join_of
 from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
 from zsim.transport.session import Sample, Session
@@ -53,18 +51,8 @@ class Presence:
 
     def _join(self) -> None:
         self._joins += 1
-        join = messages.Join(
-            t_ns=self.now_ns,
-            seq=self._joins,
-            run_id=self._info.run_id,
-            incarnation=self._incarnation,
-            role=self.name.split(".", 1)[0],
-            host=self._link.host,
-            pid=os.getpid(),
-            period_ns=0,
-            version=__version__,
-            fingerprint=fingerprint(),
-        )
+        host, run_id = self._link.host, self._info.run_id
+        join = join_of(self.name, host, run_id, self._incarnation, self._joins, self.now_ns)
         self._link.put(keys.process(self.name, "join"), join)
 
     def heed(self, payload: bytes) -> messages.Clock | None:

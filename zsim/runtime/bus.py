@@ -3,16 +3,14 @@
 The agents get the same inputs in the same order as on Zenoh, and so give the same bits.
 """
 
-import os
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from msgspec import Struct
 
-from zsim import __version__
 from zsim.contract import keys, messages
-from zsim.contract.fingerprint import fingerprint
+from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import GateMessages
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
@@ -113,19 +111,8 @@ class Bus:
         """Let every agent make ready and join the run."""
         for agent, _ in self._agents:
             agent.rehearse()
-            join = messages.Join(
-                t_ns=0,
-                seq=agent.next_seq("join"),
-                run_id=self._coordinator.run_id,
-                incarnation=0,
-                role=agent.role,
-                host=socket.gethostname(),
-                pid=os.getpid(),
-                period_ns=agent.period_ns,
-                version=__version__,
-                fingerprint=fingerprint(),
-                serves=agent.serves,
-            )
+            seq, host, run_id = agent.next_seq("join"), socket.gethostname(), self._coordinator.run_id
+            join = join_of(agent.name, host, run_id, 0, seq, period_ns=agent.period_ns, serves=agent.serves)
             self._to_world(keys.process(agent.name, "join"), join)
 
     def turn(self) -> bool:

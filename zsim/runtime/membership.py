@@ -9,9 +9,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from zsim import __version__
 from zsim.contract import keys, messages
-from zsim.contract.fingerprint import fingerprint
+from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import Pairs
 from zsim.contract.world_events import Entry
 from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
@@ -125,20 +124,10 @@ class Membership:
         self._link.put(keys.process(self._agent.name, "bye"), bye)
 
     def _join(self) -> None:
-        join = messages.Join(
-            t_ns=max(0, self.done_ns),
-            seq=self._agent.next_seq("join"),
-            run_id=self._info.run_id,
-            incarnation=self._incarnation,
-            role=self._agent.role,
-            host=self._link.host,
-            pid=os.getpid(),
-            period_ns=self._agent.period_ns,
-            version=__version__,
-            fingerprint=fingerprint(),
-            serves=self._agent.serves,
-        )
-        self._link.put(keys.process(self._agent.name, "join"), join)
+        agent, seq, t_ns = self._agent, self._agent.next_seq("join"), max(0, self.done_ns)
+        host, run_id = self._link.host, self._info.run_id
+        join = join_of(agent.name, host, run_id, self._incarnation, seq, t_ns, agent.period_ns, agent.serves)
+        self._link.put(keys.process(agent.name, "join"), join)
 
     def _done(self, t_ns: int, sent: int) -> messages.Done:
         self.done_ns = max(self.done_ns, t_ns)

@@ -14,7 +14,7 @@ from zsim_analysis.reading.command_age import command_age_ms
 from zsim_analysis.reading.flight import Flight, Participant
 from zsim_analysis.reading.formation_errors import Errors, min_separation_m, window
 from zsim_analysis.reading.formation_variables import Formation
-from zsim_analysis.reading.recorded_truth import TruthHash, truth_hash
+from zsim_analysis.reading.recorded_truth import RecordedTruth, recorded_truth
 from zsim_analysis.report import paper
 
 EVENTS_PER_KIND = 100  # a flood of refusals must not push a restart out of the list
@@ -130,15 +130,15 @@ def summarise(flight: Flight, formations: list[Formation], record: Path) -> Summ
     )
 
 
-def _hash(flight: Flight, last_ns: int) -> TruthHash:
+def _hash(flight: Flight, last_ns: int) -> RecordedTruth:
     """Return the hash of truth; a flight has truth from 0 or the first gate on, a replay from where it was begun."""
     gate_ns = flight.info.gate_ns if flight.info else None
     first_ns = flight.first_ns if flight.replay_of else min(flight.first_ns, gate_ns or 0)
-    return truth_hash(flight.tracks, gate_ns, first_ns, last_ns)
+    return recorded_truth(flight.tracks, gate_ns, first_ns, last_ns)
 
 
 def _notes(
-    flight: Flight, found: TruthHash, formations: list[Formation], window_s: tuple[float, float], window_note: str
+    flight: Flight, found: RecordedTruth, formations: list[Formation], window_s: tuple[float, float], window_note: str
 ) -> list[str]:
     """Return what a reader has to know of the figures."""
     notes = [
@@ -206,7 +206,7 @@ def _record_notes(flight: Flight) -> list[str]:
     return notes
 
 
-def _truth_notes(found: TruthHash, said: str | None) -> list[str]:
+def _truth_notes(found: RecordedTruth, said: str | None) -> list[str]:
     notes = []
     if found.missing:
         notes.append(f"{found.missing} of {found.missing + found.instants} truth messages are not on record.")

@@ -9,12 +9,12 @@ from typing import Any
 from zsim import CONTRACT, __version__
 from zsim.contract import keys, messages
 from zsim.contract.fingerprint import fingerprint
+from zsim.contract.truth_hash import TruthHash
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_world.fleet.fleet import DivergedError, Fleet
 from zsim_world.fleet.publication import Publication
-from zsim_world.fleet.truth_hash import TruthHash
 from zsim_world.flight.command_intake import CommandDesk
 from zsim_world.flight.commander import Commanders
 from zsim_world.flight.control_requests import Requests
