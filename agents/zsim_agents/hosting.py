@@ -6,7 +6,7 @@ from fnmatch import fnmatchcase
 from zsim.contract.messages import Info
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent
-from zsim.runtime.group import Group
+from zsim.runtime.group import AgentGroup
 from zsim.scenario.scenario import Scenario
 
 NAMED_MAX = 10  # of the known names in a refusal
@@ -54,4 +54,4 @@ def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
     drones = [thing for role, _, thing in split if role == "estimator"]
     clusters = [thing for role, _, thing in split if role == "controller"]
     members: list[Agent] = [Estimator(info, scenario, drones)] if drones else []
-    return Group([*members, *(Controller(info, scenario, cluster) for cluster in clusters)])
+    return AgentGroup([*members, *(Controller(info, scenario, cluster) for cluster in clusters)])

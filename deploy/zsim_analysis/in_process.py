@@ -14,7 +14,7 @@ from zsim.contract.framing import GateMessages
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
-from zsim.runtime.progress import Reasons, Screen, Throttle
+from zsim.runtime.progress import HoldReasons, Screen, Throttle
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
 from zsim_world.flight.world import World
@@ -78,7 +78,7 @@ class _Show:
         self._add_gate = writer.add_gate if writer else None
         self._screen = screen
         self._throttle = Throttle()
-        self._reasons = Reasons()
+        self._reasons = HoldReasons()
         states = (keys.cluster_state(cluster.name) for cluster in world.scenario.clusters)
         self._watched = {keys.CLOCK, keys.EVENT, *states}
         self._phase = ""

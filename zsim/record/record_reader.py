@@ -15,8 +15,8 @@ from zsim.record.mcap_layout import (
     HEAD,
     MAGIC,
     MESSAGE,
-    Group,
-    Place,
+    RecordGroup,
+    RecordSpan,
     Source,
     chunk_head,
     content_of,
@@ -42,7 +42,7 @@ class Recorded(NamedTuple):
 
 
 class _Chunk(NamedTuple):
-    place: Place
+    place: RecordSpan
     first_ns: int
     last_ns: int
     channels: frozenset[int]
@@ -147,7 +147,7 @@ class RecordReader:
             head = chunk_head(self._source, group.place)
             yield _Chunk(group.place, head.first_ns, head.last_ns, known.setdefault(channels, channels))
 
-    def _counted(self, group: Group) -> dict[int, int]:
+    def _counted(self, group: RecordGroup) -> dict[int, int]:
         """Return the messages per channel of a chunk whose message indexes may have been cut."""
         content = content_of(self._source, group.place)
         if content is None:

@@ -21,7 +21,7 @@ from zsim.scenario.fault_kinds import PROCESS_KILL
 GATES_MAX = 10  # of the world in a row, where commands are delayed by as many
 
 
-class Coordinator(Protocol):
+class SteppedWorld(Protocol):
     """What the bus needs of a world."""
 
     run_id: str
@@ -89,7 +89,7 @@ class Bus:
 
     def __init__(
         self,
-        coordinator: Coordinator,
+        coordinator: SteppedWorld,
         agents: Sequence[Agent],
         wall_ns: Callable[[], int],
         sink: Sink = lambda key, message: None,

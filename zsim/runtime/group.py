@@ -1,6 +1,6 @@
 """Several agents as one: they share a process, its name, its join and its done, and get each other's outputs directly.
 
-    Group([estimators, controller])     sensors in, estimates and commands out
+    AgentGroup([estimators, controller])     sensors in, estimates and commands out
 
 A process costs more than the agents in it; three estimators and a controller in one are about twice as fast.
 """
@@ -16,7 +16,7 @@ from zsim.runtime.agent import Agent, Output
 from zsim.runtime.routing import GateRouter, Input, RoutingTable, in_order
 
 
-class Group(Agent):
+class AgentGroup(Agent):
     """Steps its members one after the other at each gate, each with what those before it have just said.
 
     It goes by the name of its last member, and all that its members publish has that source.

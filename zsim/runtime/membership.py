@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from zsim.contract import keys, messages
 from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import Pairs
-from zsim.contract.world_events import Entry
+from zsim.contract.world_events import ProcessEntry
 from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.replay import replay
@@ -141,7 +141,7 @@ class Membership:
         """Tell whether something was asked of the world that it has not answered yet."""
         return self._must_rejoin or self._unproved > 0 or self._missed_since_ns is not None
 
-    def taken_in(self, entry: Entry) -> None:
+    def taken_in(self, entry: ProcessEntry) -> None:
         """Take the news that this process came after one of its name, or that another came after this one."""
         if entry.incarnation == self._incarnation:
             self._unproved = 0

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from zsim.contract import keys, messages, world_events
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import ControlAnswer
-from zsim.contract.world_events import End, Entry, Notice
+from zsim.contract.world_events import ProcessEntry, RunEnd, WorldEvent
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.agent import Agent
 from zsim.runtime.health import HealthMeter
@@ -66,7 +66,7 @@ class Runner:
         self._expressions = RoutingTable([[expression] for expression in agent.reads])
         self._table = key_table([drone.name for drone in info.drones])
         self._gate_key = _gate_key(agent)
-        self._notices: deque[Notice] = deque()
+        self._notices: deque[WorldEvent] = deque()
         self._queries: deque[Query] = deque()
         self._links: deque[bool] = deque()
         self._fault_lists: deque[messages.Faults] = deque()
@@ -337,15 +337,15 @@ class Runner:
         if self._member.failure:
             self._leave = str(self._member.failure)
 
-    def _serve_notice(self, read: Notice) -> None:
-        if isinstance(read.data, End):
+    def _serve_notice(self, read: WorldEvent) -> None:
+        if isinstance(read.data, RunEnd):
             self._end_ns = read.data.last_ns
             self._end_wall_s = time.monotonic()
         elif read.kind in ("drop", "leave"):
             self._ignore_estimates(read.subject)
-        elif isinstance(read.data, Entry) and read.kind == "join":
+        elif isinstance(read.data, ProcessEntry) and read.kind == "join":
             self._expect_estimates(read.subject, read.data.from_ns)
-        elif isinstance(read.data, Entry) and read.subject == self._agent.name:
+        elif isinstance(read.data, ProcessEntry) and read.subject == self._agent.name:
             self._member.taken_in(read.data)
 
     def _ignore_estimates(self, process: str) -> None:

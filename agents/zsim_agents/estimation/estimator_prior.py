@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from zsim.scenario.scenario import Estimation, Imu
+from zsim.scenario.scenario import Estimation, ImuConfig
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 from zsim_agents.estimation.aiding import Aid
 from zsim_agents.estimation.dead_reckoning import ATTITUDE, POSITION, VELOCITY
@@ -28,19 +28,19 @@ ACCEL_SIGMA_MIN = 0.02  # m/s^2 per sample: what sampling and the trapezoidal ru
 GYRO_SIGMA_MIN = 2e-4  # rad/s per sample, likewise
 
 
-def accel_sigma(imu: Imu) -> float:
+def accel_sigma(imu: ImuConfig) -> float:
     """Return the accelerometer's white noise per sample [m/s^2]."""
     return max(white_sigma(imu.accel_m_s2, BOARD_RATE_HZ), ACCEL_SIGMA_MIN)
 
 
-def madgwick_beta(estimation: Estimation, imu: Imu, gravity: float) -> float:
+def madgwick_beta(estimation: Estimation, imu: ImuConfig, gravity: float) -> float:
     """Return the gain [rad/s]: the scenario's, or what levels in `LEVELLING_S` under the IMU's noise."""
     if estimation.madgwick_beta is not None:
         return estimation.madgwick_beta
     return beta_for(LEVELLING_S, accel_sigma(imu) / gravity)
 
 
-def process_noise(imu: Imu, beta: float, gravity: float) -> ProcessNoise:
+def process_noise(imu: ImuConfig, beta: float, gravity: float) -> ProcessNoise:
     """Return the noise of dead reckoning with an IMU and a Madgwick gain [rad/s]."""
     direction_sigma = accel_sigma(imu) / gravity
     return ProcessNoise(
@@ -64,7 +64,7 @@ def tilt_density(beta: float, direction_sigma: float, gravity: float, period_s: 
     return 2.0 * beta * beta * period_s + pull * pull * 2.0 * MANOEUVRE_S
 
 
-def bias_priors(imu: Imu, aids: Sequence[Aid]) -> dict[str, BiasPrior]:
+def bias_priors(imu: ImuConfig, aids: Sequence[Aid]) -> dict[str, BiasPrior]:
     """Return the bias states in their order: gyroscope, accelerometer, then the other sensors."""
     accel, gyro = imu.accel_m_s2, imu.gyro_deg_s
     sigma = max(math.radians(gyro.bias), GYRO_BIAS_MIN)

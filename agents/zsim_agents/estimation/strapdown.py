@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zsim.scenario.scenario import Imu
+from zsim.scenario.scenario import ImuConfig
 from zsim_agents.estimation.dead_reckoning import (
     ACCEL_BIAS,
     GYRO_BIAS,
@@ -61,7 +61,7 @@ class Strapdown:
     """
 
     def __init__(
-        self, imu: Imu, with_accel_bias: bool, accel_sigma: float, beta: float, gravity: float, gate_s: float
+        self, imu: ImuConfig, with_accel_bias: bool, accel_sigma: float, beta: float, gravity: float, gate_s: float
     ) -> None:
         self.t_s = 0.0
         self.state: Reckoning = (ZERO, ZERO, LEVEL, ZERO, ZERO, (0.0, 0.0, gravity))
@@ -188,7 +188,7 @@ class Strapdown:
         return plus(accel, arm_acceleration(w, self.state[4], self._arm, dt), -1.0), gyro
 
 
-def coast_after_s(imu: Imu, gate_s: float) -> float:
+def coast_after_s(imu: ImuConfig, gate_s: float) -> float:
     """Return after how long without an IMU dead reckoning goes on without one [s]."""
     return imu.latency_ms * 1e-3 + gate_s + 5.0 * (1.0 / imu.rate_hz)
 

@@ -11,7 +11,7 @@ from zsim.errors import DecodeError, RunError
 from zsim.record import Recorded
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus
-from zsim.runtime.group import Group
+from zsim.runtime.group import AgentGroup
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
 from zsim_analysis.rerun.participants import Cast
@@ -24,7 +24,7 @@ STEERS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # reques
 Requests = dict[int, list[tuple[str, ControlRequest]]]
 
 
-class AskedAgain(Group):
+class AskedAgain(AgentGroup):
     """Agents of one process, asked at each gate what they were asked on record.
 
     Args:

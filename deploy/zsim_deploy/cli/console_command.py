@@ -38,7 +38,7 @@ def console(
 ) -> None:
     """Show a run in the browser, and steer it: scene, plots, events, faults."""
     check()
-    from zsim.runtime.progress import Teller
+    from zsim.runtime.progress import JsonProgress
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.http.http_proxy import Place
     from zsim_deploy.roles.priority import give_way
@@ -47,7 +47,7 @@ def console(
 
     give_way(for_eyes=True)
     mine = named("console", name, reach.tls, "*")
-    say = Teller().say if reach.launched else speaker(False)
+    say = JsonProgress().say if reach.launched else speaker(False)
     shown = Console(Place(listen, port), mine.removesuffix(".*"), token, rate_hz, say)
     with shown.open():
         visit(mine, shown.serve, reach)

@@ -12,7 +12,7 @@ from zsim_deploy.options.reach import Reach, looks
 
 if TYPE_CHECKING:
     from zsim.contract.messages import Fault
-    from zsim.scenario.fault_kinds import Kind
+    from zsim.scenario.fault_kinds import FaultKind
     from zsim.transport.session import Session
 
 app = typer.Typer(name="fault", help="Inject faults into a running federation, and clear them.", no_args_is_help=True)
@@ -135,7 +135,7 @@ def _is_over(fault: "Fault", now_ns: int) -> bool:
     return fault.until_ns is not None and fault.until_ns <= now_ns
 
 
-def _parameters(kind: "Kind") -> list[str]:
+def _parameters(kind: "FaultKind") -> list[str]:
     from zsim.scenario.fault_kinds import expected
 
     told = [f"{p.name}: {expected(p)}{'' if p.required else ' (may be left out)'}" for p in kind.parameters]

@@ -15,7 +15,7 @@ from typing import Any
 from zsim.contract import messages
 from zsim.errors import RecordError, RunError, SessionError
 from zsim.runtime.agent import Agent
-from zsim.runtime.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
+from zsim.runtime.progress import QUIET, HoldReasons, JsonProgress, ProgressSink, Screen, Throttle
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
@@ -50,14 +50,14 @@ def world(
     from zsim_world.server.world_process import run
 
     leash = Leash(launched is not None, lent(identity, launched))
-    with _patience(Teller() if launched else None):
+    with _patience(JsonProgress() if launched else None):
         run_world = World(scenario, mode, rate, time.monotonic_ns, launched)
     for name in expect or ():
         run_world.barrier.expect(name)
     gc.collect()
     gc.freeze()
     if launched:
-        run(run_world, endpoints, leash.reason, told(Teller()), identity=identity)
+        run(run_world, endpoints, leash.reason, told(JsonProgress()), identity=identity)
         leash.account()
         return
     with Screen(scenario.duration_s) as screen:
@@ -67,7 +67,7 @@ def world(
 
 
 @contextmanager
-def _patience(teller: Teller | None) -> Iterator[None]:
+def _patience(teller: JsonProgress | None) -> Iterator[None]:
     """Say what takes so long the first time that a machine runs the world."""
     from zsim.math.compiled import is_kept
     from zsim_world.fleet.kernel import advance
@@ -83,9 +83,9 @@ def _patience(teller: Teller | None) -> Iterator[None]:
         timer.cancel()
 
 
-def told(show: Show) -> Callable[[str, Any, str], None]:
+def told(show: ProgressSink) -> Callable[[str, Any, str], None]:
     """Return what the world calls with its clocks, its events, and what passes it."""
-    throttle, reasons = Throttle(), Reasons()
+    throttle, reasons = Throttle(), HoldReasons()
     told = [0]
     healths: defaultdict[str, Throttle] = defaultdict(lambda: Throttle(HEALTH_PERIOD_S))
 

@@ -10,7 +10,7 @@ from numba.typed.typedlist import List
 from numpy.typing import NDArray
 
 from zsim.contract import encoding, messages
-from zsim.contract.encoding import GAP, Layouts, Program, Words
+from zsim.contract.encoding import GAP, Layouts, Program, TextTable
 from zsim.contract.framing import KINDS, GateMessages, key_table
 from zsim.math.compiled import compiled, inlined, kernel
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
@@ -79,7 +79,7 @@ class Fleetwide(NamedTuple):
 class Told(NamedTuple):
     """What `publish` works on from gate to gate."""
 
-    words: Words
+    words: TextTable
     seen: Seen
     wide: Fleetwide
     out: Written

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from zsim.scenario.scenario import Cluster, Group, Scenario, kinematics
+from zsim.scenario.scenario import Cluster, ClusterGroup, Scenario, kinematics
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, cluster_space
 from zsim_agents.formation.spaces.nested_cluster import NestedCluster
 from zsim_agents.formation.spaces.template_cluster import TemplateCluster
@@ -31,7 +31,7 @@ def scenario_space(scenario: Scenario, cluster: Cluster) -> ClusterSpace:
     return NestedCluster(_space(cluster, np.array(centres)), groups)
 
 
-def _space(spec: Cluster | Group, starts: Array) -> ClusterSpace:
+def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
     """Return the space of as many robots as there are starting places (n, 3)."""
     if kinematics(spec.space, len(starts), bool(spec.template_m)) == "template":
         return TemplateCluster(spec.template_m or starts)

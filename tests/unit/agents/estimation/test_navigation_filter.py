@@ -9,7 +9,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from zsim.scenario.scenario import ErrorModel, Imu
+from zsim.scenario.scenario import ErrorModel, ImuConfig
 from zsim_agents.estimation import aiding_models, dead_reckoning
 from zsim_agents.estimation.error_state import BiasPrior, ProcessNoise
 from zsim_agents.estimation.madgwick import LEVEL, rotation
@@ -47,7 +47,7 @@ def filter_of(biases: dict[str, BiasPrior] = GYRO) -> NavigationFilter:
 
 
 def level_at_rest(with_accel_bias: bool = False) -> Strapdown:
-    imu = Imu(rate_hz=200.0, accel_m_s2=ErrorModel(noise=0.35))
+    imu = ImuConfig(rate_hz=200.0, accel_m_s2=ErrorModel(noise=0.35))
     return Strapdown(imu, with_accel_bias, 0.35, 0.0, G, GATE_S)
 
 
