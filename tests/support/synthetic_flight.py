@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from zsim.math.random_streams import stream
 from zsim.scenario import scenario_file
-from zsim.scenario.random_streams import stream
 from zsim.scenario.scenario import ErrorModel, Scenario, Sensor
 from zsim_agents.estimation.drone_estimator import DroneEstimator, Estimate
 

@@ -413,6 +413,11 @@ class Faults(Message, frozen=True):
     faults: tuple[Fault, ...] = ()
 
 
+GATES_MAX = 1_000_000  # of one `step`: 5.5 hours at 20 ms
+RATE_MAX = 1000.0  # simulated per wall second; beyond it nothing paces
+PRIORITY_MAX = 100  # programs have 0, operators 10
+
+
 class ControlRequest(Struct, frozen=True):
     """What is asked of `world/control` and `cluster/{c}/control`."""
 

@@ -7,15 +7,14 @@ import os
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from zsim.contract import keys, messages
 from zsim.contract.fingerprint import join_of
-from zsim.contract.framing import Pairs
+from zsim.contract.framing import Pairs, pairs_of
 from zsim.contract.world_events import ProcessEntry
 from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.replay import replay
 from zsim.transport.connection import read_info
 from zsim.transport.session import Sample, Session
 
@@ -235,3 +234,34 @@ class Membership:
             return
         self._missed_since_ns = None
         self._asked += 1
+
+
+def replay(
+    link: Session, process: str, from_ns: int, expressions: Sequence[str], timeout_s: float
+) -> Iterator[tuple[str, bytes]]:
+    """Yield (key, payload), in the order in which they passed the world, of what is stamped after `from_ns`.
+
+    The world keeps the last seconds, and answers page by page.
+
+    Args:
+        link: an open session.
+        process: name of who asks.
+        from_ns: simulated time [ns]; -1 for everything that the world still has.
+        expressions: keys that are wanted.
+        timeout_s: how long each page is waited for.
+
+    Raises:
+        NoWorldError: the world does not answer, or not with a replay; what was yielded until then is good.
+    """
+    page: int | None = 0
+    while page is not None:
+        try:
+            args = {"from_ns": from_ns, "keys": list(expressions), "page": page}
+            answer = link.request(keys.replay(process), "replay", process, args, timeout_s)
+            passed = pairs_of(answer.result) if answer.ok else []
+        except DecodeError as error:
+            raise NoWorldError(f"{process}: the world's replay is of no use: {error}") from error
+        if not answer.ok:
+            raise NoWorldError(answer.error)
+        yield from passed
+        page = answer.more

@@ -23,7 +23,7 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import ControlAnswer, ControlRequest
 from zsim.errors import SessionError
 from zsim.transport import tls, zenoh_settings
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode, Settings
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from zsim.errors import SessionError
 from zsim.transport import tls
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 
 LEASE_LOCKSTEP_MS = 3_600_000  # a stopped or debugged process must not lose its link in lockstep
 LEASE_REALTIME_MS = 1_000

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from zsim.contract.messages import Info
-    from zsim.transport.identity import Identity
     from zsim.transport.session import Session
+    from zsim.transport.tls import Identity
 
 PANEL = "Others come in"
 TOKEN = "ZSIM_TOKEN"  # in the environment: a command line can be read by everybody on the machine

@@ -32,8 +32,7 @@ def ros2(
     if write_package is not None:
         _write_package(write_package / "zsim_msgs")
         return
-    from zsim.transport.identity import Identity
-    from zsim.transport.tls import is_tls
+    from zsim.transport.tls import Identity, is_tls
     from zsim_bridges.ros2.bridge import Door, serve
     from zsim_deploy.roles.priority import give_way
     from zsim_deploy.roles.service_loop import named, visit

@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Iterable
 from pathlib import Path
 
-from zsim.transport.identity import KEY
+from zsim.transport.tls import KEY
 from zsim_deploy.inventory.inventory import SSH_PORT, Host
 from zsim_deploy.security.key_lease import FOLDER
 from zsim_deploy.ssh import shell

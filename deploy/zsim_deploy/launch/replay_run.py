@@ -13,7 +13,7 @@ from zsim.record import RecordReader
 from zsim.record.run_folder import record_notes
 from zsim.runtime.progress import Screen
 from zsim.transport import session
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim_analysis.reading.recorded_run import opened
 from zsim_deploy.roles.roles import told
 from zsim_deploy.roles.stop_channel import Leash

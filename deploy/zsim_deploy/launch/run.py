@@ -13,7 +13,7 @@ from zsim.record import repair
 from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of
 from zsim_deploy.cli import console_command
 from zsim_deploy.forkserver.role_launcher import Nursery

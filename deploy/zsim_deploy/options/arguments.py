@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from zsim.transport.identity import Identity
+    from zsim.transport.tls import Identity
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 RUN, HOSTS = "Run", "On several machines"  # panels of the help
@@ -49,7 +49,7 @@ Insecure = Annotated[bool, typer.Option("--insecure", help="Without TLS, on a ne
 
 def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | None = None) -> "Identity":
     """Return who this process is on the network."""
-    from zsim.transport.identity import Identity
+    from zsim.transport.tls import Identity
 
     found = Identity(tls=tls, access=access, insecure=insecure)
     return found._replace(host=host) if host else found

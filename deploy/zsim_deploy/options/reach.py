@@ -19,7 +19,7 @@ from zsim_deploy.options.arguments import (
 )
 
 if TYPE_CHECKING:
-    from zsim.transport.identity import Identity
+    from zsim.transport.tls import Identity
 
 LOOK_S = 5.0  # wall; for which a command that a person types waits for a world
 NAME = "reach"  # of the argument

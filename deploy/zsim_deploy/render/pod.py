@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from zsim.scenario.rights import RECORDER, WORLD
-from zsim.transport.identity import CERTIFICATES as IDENTITY_FILES
+from zsim.transport.tls import CERTIFICATES as IDENTITY_FILES
 from zsim_deploy.render.container import ACCESS, CACHE, CERTIFICATES, ENVIRONMENT, RUNS, SCENARIO, USER
 from zsim_deploy.render.rendered_process import STOP_S, Files, Process, command
 

@@ -21,7 +21,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.transport import session, tls
 from zsim.transport.connection import find_world
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim_agents.hosting import chosen, hosted
 from zsim_deploy.options.reach import Reach
 from zsim_deploy.roles.priority import give_way

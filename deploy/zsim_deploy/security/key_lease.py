@@ -4,7 +4,7 @@ import atexit
 import contextlib
 from pathlib import Path
 
-from zsim.transport.identity import KEY, Identity
+from zsim.transport.tls import KEY, Identity
 
 FOLDER = "identity"  # in the folder of a run on a host; the certificates of its processes are below
 

@@ -7,7 +7,7 @@ import pytest
 from zsim.errors import RunError
 from zsim.runtime.group import AgentGroup
 from zsim.scenario import scenario_file
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of, chosen, hosted
 from zsim_deploy.roles import roles
 from zsim_world.flight.world import World

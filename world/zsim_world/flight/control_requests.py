@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from zsim.contract import keys
-from zsim.contract.control_limits import GATES_MAX, PRIORITY_MAX, RATE_MAX
-from zsim.contract.messages import ControlAnswer, ControlRequest
+from zsim.contract.messages import GATES_MAX, PRIORITY_MAX, RATE_MAX, ControlAnswer, ControlRequest
 
 if TYPE_CHECKING:
     from zsim_world.flight.coordinator import Hub

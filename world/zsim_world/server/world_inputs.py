@@ -2,10 +2,11 @@
 
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 
+from zsim.errors import SessionError
 from zsim.transport.session import Mailbox, Sample
-from zsim.transport.timed_mailbox import TimedMailbox
 
 TICK_S = 0.1  # how often a standing world looks at the wall clock
 
@@ -70,6 +71,42 @@ class Direct(Inputs):
 
     def wake(self) -> None:
         self._boxes[-1].wake()
+
+
+class TimedMailbox:
+    """A mailbox read by a thread that stamps every message with the wall time of its arrival.
+
+    Args:
+        mailbox: what to read.
+        fresh: set whenever something has arrived.
+    """
+
+    def __init__(self, mailbox: Mailbox, fresh: threading.Event) -> None:
+        self._mailbox = mailbox
+        self._fresh = fresh
+        self._arrived: deque[tuple[int, Sample]] = deque()
+        self._thread = threading.Thread(target=self._pump, name="mailbox", daemon=True)
+        self._thread.start()
+
+    def _pump(self) -> None:
+        while True:
+            try:
+                sample = self._mailbox.receive()
+            except SessionError:
+                return
+            if sample is not None:
+                self._arrived.append((time.monotonic_ns(), sample))
+                self._fresh.set()
+
+    def drain(self) -> Iterator[tuple[int, Sample]]:
+        """Yield (wall_ns of arrival, sample) of what has arrived."""
+        while self._arrived:
+            yield self._arrived.popleft()
+
+    def close(self) -> None:
+        """Stop the reading thread."""
+        self._mailbox.close()
+        self._thread.join(timeout=2.0)
 
 
 class Timed(Inputs):

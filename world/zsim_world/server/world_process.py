@@ -20,8 +20,8 @@ from zsim.runtime.health import HealthMeter
 from zsim.scenario import rights
 from zsim.scenario.rights import WORLD
 from zsim.transport import session
-from zsim.transport.identity import Identity
 from zsim.transport.session import Query, Sample, Session
+from zsim.transport.tls import Identity
 from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Hub
 from zsim_world.server import replay_answer

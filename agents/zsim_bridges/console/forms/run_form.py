@@ -2,7 +2,7 @@
 
 import viser
 
-from zsim.contract.control_limits import GATES_MAX, RATE_MAX
+from zsim.contract.messages import GATES_MAX, RATE_MAX
 from zsim.scenario.scenario import Scenario
 from zsim_bridges.console.command_client import Desk
 

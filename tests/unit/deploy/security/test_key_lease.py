@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim_deploy.security.key_lease import Lent, lent
 
 ROLE = """
 import os, sys, time
 from pathlib import Path
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim_deploy.roles.stop_channel import Leash
 from zsim_deploy.security.key_lease import lent
 folder = Path(sys.argv[1])

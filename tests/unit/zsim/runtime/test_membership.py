@@ -10,8 +10,7 @@ from zsim.contract.framing import decode_batch, pairs_of
 from zsim.contract.messages import ControlAnswer, Info, Origin
 from zsim.errors import DecodeError, NoWorldError
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.membership import RETRY_S, Membership
-from zsim.runtime.replay import replay
+from zsim.runtime.membership import RETRY_S, Membership, replay
 from zsim.transport.session import Sample
 
 GATE_NS = 20_000_000

@@ -15,7 +15,7 @@ import scipy.stats
 from rich.console import Console
 
 from zsim.errors import ReportError, RunError
-from zsim.scenario.random_streams import stream
+from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import Design
 from zsim_analysis.sweep.results import intervals, journal, sweep_table
 from zsim_analysis.sweep.results.make_sweep_report import make_sweep_report
