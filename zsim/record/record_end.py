@@ -204,6 +204,6 @@ def check_magic(source: Source, path: Path) -> None:
     Raises:
         RecordError: with what was found.
     """
-    found = source[: len(MAGIC)]
-    if not MAGIC.startswith(found):
-        raise RecordError(f"{path}: begins with {found!r}; is no MCAP record")
+    beginning = source[: len(MAGIC)]
+    if not MAGIC.startswith(beginning):
+        raise RecordError(f"{path}: begins with {beginning!r}; is no MCAP record")

@@ -64,7 +64,7 @@ def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
     return first == to and second in froms and not fault.parameters["one_way"]
 
 
-def heard(distance_m: float, range_m: float, spread_m: float) -> float:
+def reception_probability(distance_m: float, range_m: float, spread_m: float) -> float:
     """Return the probability that a message comes over a radio: 1 / (1 + exp((d - range) / spread))."""
     return 1.0 / (1.0 + math.exp(min((distance_m - range_m) / spread_m, 700.0)))  # exp(700) is the last finite one
 
@@ -93,7 +93,7 @@ def delay_ns(fault: Fault, draw: float, distance_m: float | None = None) -> int 
     if fault.kind == "link_loss":
         return NEVER if draw < p["probability"] else 0
     if fault.kind == "radio":
-        comes = distance_m is None or draw < heard(distance_m, p["range_m"], p["spread_m"])
+        comes = distance_m is None or draw < reception_probability(distance_m, p["range_m"], p["spread_m"])
         return 0 if comes else NEVER
     return NEVER  # link_cut
 

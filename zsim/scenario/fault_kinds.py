@@ -25,12 +25,12 @@ class FaultParameter(NamedTuple):
         above: whether `least` itself is not allowed.
         choices: of a word.
         default: where it is left out; `required` then says that it may not be.
-        said: what it is, for tables.
+        description: what it is, for tables.
     """
 
     name: str
     shape: Shape
-    said: str
+    description: str
     unit: str = ""
     least: float = -1e9
     most: float = 1e9
@@ -46,12 +46,12 @@ class FaultKind(NamedTuple):
     Attributes:
         strikes: what its target is: a drone; the world; a link "a/b" of two processes; the drones of a cluster, or of
             the world, on the radio; a process.
-        said: what it does, for tables.
+        description: what it does, for tables.
         lasts: "ends" needs `for_s`, "once" takes none, "any" takes it or lasts until it is cleared.
     """
 
     strikes: Target
-    said: str
+    description: str
     parameters: tuple[FaultParameter, ...] = ()
     lasts: Literal["any", "ends", "once"] = "any"
 

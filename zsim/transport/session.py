@@ -95,7 +95,7 @@ class Session:
             publisher = self._publishers.get(key) or self._declare(key)
             publisher.put(payload)
 
-    def heard(self, key: str) -> bool:
+    def has_readers(self, key: str) -> bool:
         """Tell whether anybody subscribes to a key of ours."""
         if key not in self._heard:
             self._listen_for_readers(key)
@@ -141,7 +141,7 @@ class Session:
         with _named(expression):
             return self._kept_box(Mailbox(self._raw, self._prefix, expression))
 
-    def overhear(self, without: tuple[str, ...]) -> "Mailbox":
+    def subscribe_others(self, without: tuple[str, ...]) -> "Mailbox":
         """Return a mailbox that takes everything that other sessions publish, but on keys that begin so.
 
         Nothing wakes who waits for it.

@@ -90,10 +90,10 @@ def own_fault(identity: Identity) -> str | None:
                 f"{', '.join(CERTIFICATES[:2])} and {CERTIFICATES[2]}, as zsim certs init makes"
             )
     try:
-        found = _read_own(identity)
+        certificate = _read_own(identity)
     except (ssl.SSLError, ValueError) as error:
         return f"{identity.tls}: certificate.pem, key.pem and ca.pem do not go together ({_reason(error)}); {MEND}"
-    return _date_fault(found)
+    return _date_fault(certificate)
 
 
 def no_link(identity: Identity, endpoint: str, error: str) -> str:
@@ -165,20 +165,21 @@ def _reason(error: Exception) -> str:
     return reason.lower().replace("_", " ")
 
 
-def _date_fault(found: dict[str, Any]) -> str | None:
+def _date_fault(certificate: dict[str, Any]) -> str | None:
     """Return whether a certificate's time is over, or not yet come."""
-    if not found:
+    if not certificate:
         return None
     now_s = time.time()
-    if now_s > ssl.cert_time_to_seconds(found["notAfter"]):
-        return f"the certificate of {_name(found)} expired on {_day(found['notAfter'])}; {RENEW}"
-    if now_s < ssl.cert_time_to_seconds(found["notBefore"]):
-        return f"the certificate of {_name(found)} is valid from {_day(found['notBefore'])}; set the clock of this host"
+    if now_s > ssl.cert_time_to_seconds(certificate["notAfter"]):
+        return f"the certificate of {_name(certificate)} expired on {_day(certificate['notAfter'])}; {RENEW}"
+    if now_s < ssl.cert_time_to_seconds(certificate["notBefore"]):
+        since = _day(certificate["notBefore"])
+        return f"the certificate of {_name(certificate)} is valid from {since}; set the clock of this host"
     return None
 
 
-def _name(found: dict[str, Any]) -> str:
-    names = dict(pair for part in found["subject"] for pair in part)
+def _name(certificate: dict[str, Any]) -> str:
+    names = dict(pair for part in certificate["subject"] for pair in part)
     return names.get("commonName", "nobody")
 
 

@@ -60,10 +60,10 @@ class Outgoing:
         """Keep the messages of a gate as one, of all drones and of each, where somebody reads it so."""
         whole = (keys.GATE, gate.pack())
         self._passed.append(whole)
-        if self._link.heard(keys.GATE):
+        if self._link.has_readers(keys.GATE):
             self._unsent.append(whole)
         for key, (first, last) in zip(self._gate_keys, pairwise(gate.first), strict=True):
-            if last > first and self._link.heard(key):
+            if last > first and self._link.has_readers(key):
                 self._unsent.append((key, gate.pack(first, last)))
 
     def send(self) -> None:
@@ -86,6 +86,6 @@ class Outgoing:
     def put_batch(self) -> None:
         """Hand what has passed to the recorders, if there are any."""
         passed, self._passed = self._passed, []
-        if self._link.heard(keys.BATCH):
+        if self._link.has_readers(keys.BATCH):
             for first in range(0, len(passed), BATCH_MAX):
                 self._link.put_raw(keys.BATCH, encode_batch(passed[first : first + BATCH_MAX]))

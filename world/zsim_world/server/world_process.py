@@ -103,7 +103,7 @@ class WorldProcess:
         Raises:
             DivergedError: the state of a drone was no longer finite; everybody has been told the end before.
         """
-        boxes = [self._link.overhear((PROCESSES, VIEWS)), self._link.subscribe(f"{PROCESSES}**")]
+        boxes = [self._link.subscribe_others((PROCESSES, VIEWS)), self._link.subscribe(f"{PROCESSES}**")]
         self._inputs: Inputs = Timed(boxes) if self._world.mode == "realtime" else Direct(boxes)
         self._announce()
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)

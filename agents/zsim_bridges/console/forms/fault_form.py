@@ -77,5 +77,5 @@ class FaultForm:
 def _help(kind: str) -> str:
     """Return what a kind does and takes."""
     found = KINDS[kind]
-    lines = [f"`{p.name}` {p.said}{f' [{p.unit}]' if p.unit else ''}" for p in found.parameters]
-    return f"<sub>{found.said}; strikes a {found.strikes}. {'; '.join(lines)}</sub>"
+    lines = [f"`{p.name}` {p.description}{f' [{p.unit}]' if p.unit else ''}" for p in found.parameters]
+    return f"<sub>{found.description}; strikes a {found.strikes}. {'; '.join(lines)}</sub>"

@@ -10,7 +10,7 @@ from zsim.contract import keys
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import ControlRequest, Estimate, Fault, Faults, Imu, Info, Mode, Status, encode
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.link_faults import LinkFaults, heard, place_of, senders, uniform
+from zsim.runtime.link_faults import LinkFaults, place_of, reception_probability, senders, uniform
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import planned
 from zsim_agents.formation.controller import TAKEN_MAX, Controller
@@ -196,7 +196,7 @@ def test_a_radio_loses_more_the_farther_it_reaches(distance_m: float):
     kept = len(gates(links(radio()), count, lambda gate: estimate(gate, (distance_m, 0.0, 0.0))))
     expected = 1 / (1 + math.exp((distance_m - 50) / 5))
     assert kept / count == pytest.approx(expected, abs=4 * math.sqrt(0.25 / count))
-    assert heard(distance_m, 50, 5) == pytest.approx(expected)
+    assert reception_probability(distance_m, 50, 5) == pytest.approx(expected)
 
 
 def test_a_radio_is_where_its_process_is():
