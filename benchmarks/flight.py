@@ -4,6 +4,7 @@
 """
 
 import argparse
+import gc
 import json
 import tempfile
 import time
@@ -38,9 +39,11 @@ def fly(drones: int, seconds: float) -> dict[str, float]:
             agents(world),
             time.monotonic_ns,
             lambda key, message: writer.add_message(key, message, time.time_ns()),
-            lambda bundle: writer.add_bundle(bundle, time.time_ns()),
+            lambda gate: writer.add_gate(gate, time.time_ns()),
         )
         bus.join()
+        gc.collect()
+        gc.freeze()  # as `zsim run --in-process` does
         while world.now_ns < WARM_NS:
             bus.turn()
         start_s, start_ns = time.process_time(), world.now_ns

@@ -6,7 +6,7 @@ from fnmatch import fnmatchcase
 from zsim.contract.messages import Info
 from zsim.errors import DocumentError, RunError, ScenarioError
 from zsim.runtime.agent import Agent
-from zsim.runtime.group import Group
+from zsim.runtime.group import AgentGroup
 from zsim.scenario.role_table import AGENTS, agent_names
 from zsim.scenario.scenario import Scenario
 from zsim.schema import plugin
@@ -67,7 +67,9 @@ def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:
     """
     split = [name.partition(".") for name in agents_of(scenario, patterns)]
     by_role = {role: [thing for each, _, thing in split if each == role] for role in AGENTS}
-    return Group([agent for role, names in by_role.items() if names for agent in made(role, info, scenario, names)])
+    return AgentGroup(
+        [agent for role, names in by_role.items() if names for agent in made(role, info, scenario, names)]
+    )
 
 
 def made(role: str, info: Info, scenario: Scenario, names: Sequence[str]) -> list[Agent]:

@@ -13,16 +13,17 @@ from pathlib import Path
 
 import msgspec
 
-from zsim import __version__
-from zsim.contract import batch, keys, messages
-from zsim.contract.bundle import Bundle, table_of, unpacked
+from zsim.contract import keys, messages
+from zsim.contract.fingerprint import join_of
+from zsim.contract.framing import GateMessages
 from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, SupersededError
 from zsim.record import RecordWriter
 from zsim.record.record_writer import CHANNELS_MAX
 from zsim.runtime.health import HealthMeter
-from zsim.runtime.replay import replay
+from zsim.runtime.membership import replay
 from zsim.transport.connection import read_info
-from zsim.transport.session import Sample, Session
+from zsim.transport.session import Session
+from zsim.transport.traffic import Passed, Traffic, samples
 
 NAME = "recorder"
 ANOTHER_RUN = "the world has begun another run"
@@ -77,7 +78,6 @@ class Recorder:
         self._link_lost = False
         self._must_look = False
         self._writer = RecordWriter(path)
-        self._table = table_of([drone.name for drone in info.drones])
         self._head = msgspec.msgpack.Decoder(_Head)
         self._clock = msgspec.msgpack.Decoder(messages.Clock)
         self._known: dict[tuple[str, bytes], None] = {}
@@ -94,7 +94,7 @@ class Recorder:
         self.health = HealthMeter(NAME, host=link.host)
 
     def run(self) -> str:
-        self._box = self._link.subscribe(batch.KEY)
+        self._traffic = Traffic(self._link, [drone.name for drone in self._info.drones], self._refuse)
         self._views = self._link.subscribe("view/**")
         self._link.declare_token(keys.token(self._name))
         self._link.on_link(self._on_link)
@@ -126,7 +126,7 @@ class Recorder:
 
     def _on_link(self, up: bool) -> None:
         self._links.append(up)
-        self._box.wake()
+        self._traffic.wake()
 
     def _is_another_run(self) -> bool:
         """Say what has become of the link; tell whether there is another run at its end when it is back."""
@@ -142,12 +142,11 @@ class Recorder:
 
     def _loop(self) -> str:
         while True:
-            sample = self._box.receive()
-            if sample is not None:
-                self._write_batch(sample)
+            for passed in self._traffic.receive():
+                self._write_passed(passed)
             time.sleep(PAUSE_S)
-            for sample in self._box.drain():
-                self._write_batch(sample)
+            for passed in self._traffic.drain():
+                self._write_passed(passed)
             for sample in self._views.drain():
                 self._write(sample.key, sample.payload)
             self._writer.tick(time.monotonic_ns())
@@ -200,31 +199,22 @@ class Recorder:
             self._know(key, payload)
 
     def _know(self, key: str, payload: bytes) -> None:
-        """Remember what the world has replayed: the newest of it comes in a batch too."""
+        """Remember what the world has replayed: the newest of it passes once more."""
         self._known[key, payload] = None
         if len(self._known) > KNOWN_MAX:
             del self._known[next(iter(self._known))]
 
-    def _write_batch(self, sample: Sample) -> None:
-        try:
-            for key, payload in batch.decode(sample.payload):
-                if key == batch.GATE:
-                    self._write_bundle(unpacked(payload, self._table))
-                else:
-                    self._write(key, payload)
-        except DecodeError:
-            self.health.refused += 1
+    def _refuse(self) -> None:
+        self.health.refused += 1
 
-    def _write_bundle(self, bundle: Bundle) -> None:
-        if not bundle.is_sound():
-            self.health.refused += 1
-        elif self._known:
-            for key, payload in bundle.encoded:
-                self._write(key, payload)
-        else:
-            self.health.received += len(bundle)
-            self._now_ns = bundle.t_ns
-            self._writer.add_bundle(bundle, time.time_ns())
+    def _write_passed(self, passed: Passed) -> None:
+        if isinstance(passed, GateMessages) and not self._known:
+            self.health.received += len(passed)
+            self._now_ns = passed.t_ns
+            self._writer.add_gate(passed, time.time_ns())
+            return
+        for key, payload in samples([passed]):
+            self._write(key, payload)
 
     def _write(self, key: str, payload: bytes) -> None:
         if self._known and (key, payload) in self._known:
@@ -278,17 +268,8 @@ class Recorder:
             self._leavers.add(name)
 
     def _join(self) -> None:
-        join = messages.Join(
-            t_ns=0,
-            seq=self._next("join"),
-            run_id=self._info.run_id,
-            incarnation=secrets.randbits(62),
-            role=NAME,
-            host=self._link.host,
-            pid=os.getpid(),
-            period_ns=0,
-            version=__version__,
-        )
+        incarnation, run_id = secrets.randbits(62), self._info.run_id
+        join = join_of(self._name, self._link.host, run_id, incarnation, self._next("join"), calculates=False)
         self._say("join", join)
 
     def _bye(self, reason: str) -> None:
@@ -303,6 +284,6 @@ class Recorder:
 
     def _tick(self) -> None:
         while not self._over.wait(TICK_S):
-            self._box.wake()
+            self._traffic.wake()
             if self.health.due():
                 self._say("health", self.health.message(self._now_ns, self._next("health")))

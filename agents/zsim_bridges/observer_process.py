@@ -1,11 +1,9 @@
 """A process of a run that shows and commands but never gates: its join, health and bye."""
 
-import os
 import secrets
 
-from zsim import __version__
 from zsim.contract import keys, messages
-from zsim.contract.fingerprint import fingerprint
+from zsim.contract.fingerprint import join_of
 from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
 from zsim.transport.session import Sample, Session
@@ -53,18 +51,8 @@ class ObserverProcess:
 
     def _join(self) -> None:
         self._join_seq += 1
-        join = messages.Join(
-            t_ns=self.now_ns,
-            seq=self._join_seq,
-            run_id=self._info.run_id,
-            incarnation=self._incarnation,
-            role=self.name.split(".", 1)[0],
-            host=self._link.host,
-            pid=os.getpid(),
-            period_ns=0,
-            version=__version__,
-            fingerprint=fingerprint(),
-        )
+        host, run_id = self._link.host, self._info.run_id
+        join = join_of(self.name, host, run_id, self._incarnation, self._join_seq, self.now_ns)
         self._link.put(keys.process(self.name, "join"), join)
 
     def update_clock(self, payload: bytes) -> messages.Clock | None:

@@ -3,7 +3,7 @@
 from contextlib import ExitStack
 
 from zsim.transport import session, zenoh_settings
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 
 import zenoh  # isort: skip  # zsim.transport.session chooses its runtime first
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 from zsim.transport import session, zenoh_settings
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 
 import zenoh  # isort: skip  # zsim.transport.session chooses its runtime first
 

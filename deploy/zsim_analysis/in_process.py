@@ -9,11 +9,11 @@ from typing import Any, Protocol
 from msgspec import Struct
 
 from zsim.contract import keys, messages
-from zsim.contract.bundle import Bundle
+from zsim.contract.framing import GateMessages
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
-from zsim.runtime.progress import Reasons, Screen, Throttle
+from zsim.runtime.progress import HoldReasons, Screen, Throttle
 from zsim.scenario.role_table import agent_names
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
@@ -27,7 +27,7 @@ class FlightObserver(Protocol):
         """Receive one message."""
         ...
 
-    def add_bundle(self, bundle: Bundle, wall_ns: int) -> None:
+    def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         """Receive the world's messages of a gate."""
         ...
 
@@ -67,12 +67,12 @@ class InProcessFlight:
             for observer in observers:
                 observer.add_message(key, message, wall_ns)
 
-        def add_bundle(bundle: Bundle) -> None:
+        def add_gate(gate: GateMessages) -> None:
             wall_ns = time.time_ns()
             for observer in observers:
-                observer.add_bundle(bundle, wall_ns)
+                observer.add_gate(gate, wall_ns)
 
-        bus = Bus(self.world, self._agents, time.monotonic_ns, add_message, add_bundle)
+        bus = Bus(self.world, self._agents, time.monotonic_ns, add_message, add_gate)
         add_message(keys.INFO, self.world.info())
         bus.join()
         gc.collect()
@@ -128,13 +128,13 @@ class _Progress:
     def __init__(self, scenario: Scenario, screen: Screen) -> None:
         self._screen = screen
         self._throttle = Throttle()
-        self._reasons = Reasons()
+        self._reasons = HoldReasons()
         states = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
         self._watched = {keys.CLOCK, keys.EVENT, *states}
         self._phase = ""
 
-    def add_bundle(self, bundle: Bundle, wall_ns: int) -> None:
-        """Show nothing: a bundle holds truth, status and sensors only."""
+    def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
+        """Show nothing: it holds truth, status and sensors only."""
 
     def add_message(self, key: str, message: Any, wall_ns: int) -> None:
         """Show a message of a key that is watched."""

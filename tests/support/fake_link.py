@@ -98,7 +98,7 @@ class FakeLink:
                 box.put(sample)
         return box
 
-    def overhear(self, without: tuple[str, ...]) -> FakeBox:
+    def subscribe_others(self, without: tuple[str, ...]) -> FakeBox:
         return self.subscribe("**", without)
 
     def on_message(self, expression: str, callback: Callable[[Sample], None]) -> None:
@@ -124,7 +124,7 @@ class FakeLink:
     def get(self, expression: str, timeout_s: float = 2.0) -> list[Sample]:
         return [Sample(key, payload) for key, payload in self.last.items() if keys.matches(expression, key)]
 
-    def heard(self, key: str) -> bool:
+    def has_readers(self, key: str) -> bool:
         return True
 
     def tokens(self, expression: str, timeout_s: float = 1.0) -> list[str]:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from zsim.scenario.random_streams import stream
+from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
 from zsim_analysis.sweep.sweep_row import Row, RunResult, make_row
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from zsim.contract import messages
+from zsim.math.random_streams import stream
 from zsim.scenario import scenario_file
-from zsim.scenario.random_streams import stream
 from zsim.scenario.scenario import ErrorModel, Scenario, Sensor
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.estimator_bank import EstimatorBank

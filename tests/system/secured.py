@@ -23,7 +23,7 @@ from wire import PATIENCE_S
 
 from zsim.scenario import scenario_file
 from zsim.transport import session
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim_deploy.security import certificates
 from zsim_deploy.security.enrolment import CertificateRequest, access_control
 

@@ -411,7 +411,7 @@ def rows(name: str) -> Iterator[list[str]]:
             yield [f"`{entry.name}`", unit(entry.name), default(name, entry), allowed(by_name[entry.name])]
 
 
-_SENSORS = ("Imu", "Gps", "Mag", "Baro", "Sonar", "Flow")
+_SENSORS = ("ImuConfig", "GpsConfig", "MagConfig", "BaroConfig", "SonarConfig", "FlowConfig")
 
 
 def unit(name: str) -> str:

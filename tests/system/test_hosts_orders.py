@@ -12,7 +12,7 @@ import yaml
 from lab import LAUNCHER, Lab
 from team import START_S, STEP, Team, closing, in_flight
 
-from zsim.transport.identity import KEY
+from zsim.transport.tls import KEY
 
 ROLES = {"world": "h1", "recorder": "h1", "controller.main": "h2", "estimator.*": ["h1", "h2"]}
 SPARE = "h3"

@@ -21,8 +21,7 @@ from wire import PATIENCE_S
 from zsim.scenario import rights, scenario_file
 from zsim.scenario.rights import permits
 from zsim.transport import session
-from zsim.transport.identity import Identity
-from zsim.transport.tls import peer_fault
+from zsim.transport.tls import Identity, peer_fault
 from zsim_deploy.security.enrolment import access_control
 
 WAYS = ("at the world", "through a router")

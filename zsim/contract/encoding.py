@@ -33,7 +33,7 @@ class Program(NamedTuple):
     literals: NDArray[np.uint8]
 
 
-class Words(NamedTuple):
+class TextTable(NamedTuple):
     """Texts that may stand in a message, by number."""
 
     data: NDArray[np.uint8]
@@ -65,7 +65,7 @@ class Layouts:
         ops, literals = np.array(self._ops, dtype=np.int64), np.frombuffer(bytes(self._literals), dtype=np.uint8)
         self.program = Program(ops, np.array(first), literals)
 
-    def room(self, words: Words) -> int:
+    def room(self, words: TextTable) -> int:
         """Return the bytes that a message can have at most, with GAP."""
         longest = int(np.diff(words.ends, prepend=0).max(initial=0))
         fixed = sum(size for op, _, size in self._ops if op == LITERAL)
@@ -125,13 +125,13 @@ def array_head(size: int) -> bytes:
     return packed([0] * size)[:-size]
 
 
-def words(texts: Iterable[str | None]) -> Words:
+def words(texts: Iterable[str | None]) -> TextTable:
     """Return texts as `write` reads them."""
     parts = [packed(text) for text in texts]
-    return Words(np.frombuffer(b"".join(parts), dtype=np.uint8), np.cumsum([len(part) for part in parts]))
+    return TextTable(np.frombuffer(b"".join(parts), dtype=np.uint8), np.cumsum([len(part) for part in parts]))
 
 
-def write(program: Program, words: Words, kind: int, ints: NDArray, bits: NDArray, out: NDArray, start: int) -> int:
+def write(program: Program, words: TextTable, kind: int, ints: NDArray, bits: NDArray, out: NDArray, start: int) -> int:
     """Write one message into `out` from `start` on; return where it ends. To be compiled.
 
     Args:

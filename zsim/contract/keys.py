@@ -19,6 +19,8 @@ EVENT = "world/event"
 FAULTS = "world/faults"
 CONTROL = "world/control"
 VIEW_DRONES = "view/drones"
+BATCH = "@batch"  # everything that passed the hub, see zsim.contract.framing
+GATE = "@gate"  # the world's messages about all drones at a gate
 
 
 def name(text: str, what: str = "name") -> str:
@@ -42,6 +44,11 @@ def sensors(drone: str) -> str:
 
 def status(drone: str) -> str:
     return f"drone/{drone}/sensor/status"
+
+
+def gate(drone: str) -> str:
+    """Return the key of the world's messages about one drone at a gate."""
+    return f"{GATE}/{drone}"
 
 
 def truth(drone: str) -> str:
@@ -103,6 +110,11 @@ def is_sensor(expression: str) -> bool:
     """Tell whether a key, or an expression, is about a drone's sensors."""
     parts = expression.split("/")
     return len(parts) == 4 and parts[0] == "drone" and parts[2] == "sensor"
+
+
+def may_drop(key: str) -> bool:
+    """Tell whether a full link may lose messages of a key in realtime, as it may sensors: newer ones come."""
+    return "/sensor/" in key or key.startswith(GATE)
 
 
 def is_status(key: str) -> bool:

@@ -413,6 +413,11 @@ class Faults(Message, frozen=True):
     faults: tuple[Fault, ...] = ()
 
 
+GATES_MAX = 1_000_000  # of one `step`: 5.5 hours at 20 ms
+RATE_MAX = 1000.0  # simulated per wall second; beyond it nothing paces
+PRIORITY_MAX = 100  # programs have 0, operators 10
+
+
 class ControlRequest(Struct, frozen=True):
     """What is asked of `world/control` and `cluster/{c}/control`."""
 
@@ -554,10 +559,10 @@ def _refusal(kind: type[Struct], payload: bytes, where: str, error: Exception) -
     if not isinstance(error, msgspec.MsgspecError):
         return DecodeError(f"{where}: {str(error) or type(error).__name__}")
     try:
-        found = first_fault(msgspec.msgpack.decode(payload), kind)
+        first = first_fault(msgspec.msgpack.decode(payload), kind)
     except REFUSALS as fault:
-        found = ("", f"({len(payload)} bytes) is not msgpack ({fault}); must be a map, the {kind.__name__}")
-    path, text = found or ("", f"is refused ({error}); must be the {kind.__name__}")
+        first = ("", f"({len(payload)} bytes) is not msgpack ({fault}); must be a map, the {kind.__name__}")
+    path, text = first or ("", f"is refused ({error}); must be the {kind.__name__}")
     return DecodeError(f"{where}: {path or 'the payload'} {text}")
 
 
@@ -578,8 +583,8 @@ def _answer_fault(answer: ControlAnswer) -> str | None:
 
 def _free_fault(field: str, value: Any) -> str | None:
     """Return the fault of a field whose content is free: only its numbers must be finite."""
-    found = next((number for number in _numbers(value) if not math.isfinite(number)), None)
-    return None if found is None else f"{field} holds {found}; must be finite numbers"
+    infinite = next((number for number in _numbers(value) if not math.isfinite(number)), None)
+    return None if infinite is None else f"{field} holds {infinite}; must be finite numbers"
 
 
 def _numbers(value: Any) -> Iterator[float]:
@@ -605,9 +610,9 @@ def _view_fault(view: ViewCluster) -> str | None:
 
 def _length_fault(message: Struct, names: tuple[str, ...], wanted: int) -> str | None:
     for name in names:
-        found = len(getattr(message, name))
-        if found != wanted:
-            return f"{name} has {found} entries; must have {wanted}"
+        length = len(getattr(message, name))
+        if length != wanted:
+            return f"{name} has {length} entries; must have {wanted}"
     return None
 
 

@@ -10,17 +10,17 @@ from zsim.contract.messages import REFUSALS, Count, Whole
 from zsim.errors import DecodeError
 
 
-class Nothing(Struct, frozen=True):
+class NoData(Struct, frozen=True):
     """Data of which nothing is used."""
 
 
-class End(Struct, frozen=True):
+class RunEnd(Struct, frozen=True):
     """The run is over; `last_ns` is its last gate."""
 
     last_ns: Count
 
 
-class Entry(Struct, frozen=True):
+class ProcessEntry(Struct, frozen=True):
     """A process has been taken in.
 
     Attributes:
@@ -37,7 +37,7 @@ class Entry(Struct, frozen=True):
     former_pid: int | None = None
 
 
-class Notice(NamedTuple):
+class WorldEvent(NamedTuple):
     """An event of a kind that processes act on."""
 
     kind: str
@@ -46,16 +46,16 @@ class Notice(NamedTuple):
 
 
 _DATA: dict[str, type[Struct]] = {
-    "end": End,
-    "join": Entry,
-    "restart": Entry,
-    "superseded": Entry,
-    "leave": Nothing,
-    "drop": Nothing,
+    "end": RunEnd,
+    "join": ProcessEntry,
+    "restart": ProcessEntry,
+    "superseded": ProcessEntry,
+    "leave": NoData,
+    "drop": NoData,
 }
 
 
-def read(payload: bytes) -> Notice | None:
+def read(payload: bytes) -> WorldEvent | None:
     """Return the notice in an event, None for an event of another kind.
 
     Raises:
@@ -66,6 +66,6 @@ def read(payload: bytes) -> Notice | None:
     if kind is None:
         return None
     try:
-        return Notice(event.kind, event.subject, msgspec.convert(event.data, kind))
+        return WorldEvent(event.kind, event.subject, msgspec.convert(event.data, kind))
     except REFUSALS as error:
         raise DecodeError(f"{keys.EVENT}: data of {event.kind!r} is refused ({error}); see docs/protocol.md") from error

@@ -29,7 +29,7 @@ def geodetic(position_m: Array, rows: Array, place_m: Array) -> Array:
         position_m: p_W, (n, 3).
         rows, place_m: what `anchor` returns.
     """
-    found = np.empty(position_m.shape)
+    coordinates = np.empty(position_m.shape)
     for i in range(position_m.shape[0]):
         e, n, u = position_m[i]
         x = place_m[0] + (e * rows[0, 0] + n * rows[1, 0] + u * rows[2, 0])
@@ -42,7 +42,7 @@ def geodetic(position_m: Array, rows: Array, place_m: Array) -> Array:
             s, c = math.sin(parametric), math.cos(parametric)
             lat = math.atan2(z + _CURVATURE_M * s * s * s, level - _E2 * WGS84_A_M * c * c * c)
         s = math.sin(lat)
-        found[i, 0] = math.degrees(lat)
-        found[i, 1] = math.degrees(math.atan2(y, x))
-        found[i, 2] = level * math.cos(lat) + z * s - WGS84_A_M * math.sqrt(1.0 - _E2 * s * s)
-    return found
+        coordinates[i, 0] = math.degrees(lat)
+        coordinates[i, 1] = math.degrees(math.atan2(y, x))
+        coordinates[i, 2] = level * math.cos(lat) + z * s - WGS84_A_M * math.sqrt(1.0 - _E2 * s * s)
+    return coordinates

@@ -58,7 +58,7 @@ def _decompressor() -> zstandard.ZstdDecompressor:
     return _own.decompressor
 
 
-class Place(NamedTuple):
+class RecordSpan(NamedTuple):
     """Where a whole record stands in the file, its head included."""
 
     opcode: int
@@ -89,10 +89,10 @@ class Index(NamedTuple):
     start: int  # of the message index record in the file
 
 
-class Group(NamedTuple):
+class RecordGroup(NamedTuple):
     """A record of the data section that matters, a chunk together with its message indexes."""
 
-    place: Place
+    place: RecordSpan
     indexes: tuple[Index, ...]
     end: int
 
@@ -109,7 +109,7 @@ def packed(record: McapRecord) -> bytes:
     return builder.end()
 
 
-def unpacked(kind: type[Known], source: Source, place: Place) -> Known:
+def unpacked(kind: type[Known], source: Source, place: RecordSpan) -> Known:
     """Return the schema or channel at a place.
 
     Raises:
@@ -122,7 +122,7 @@ def unpacked(kind: type[Known], source: Source, place: Place) -> Known:
         raise RecordError(f"{reason}; the record cannot be read") from error
 
 
-def places(source: Source) -> Iterator[Place]:
+def places(source: Source) -> Iterator[RecordSpan]:
     """Yield the whole records of a file up to its footer, its cut, or a length that cannot be right."""
     at, size = len(MAGIC), len(source)
     while at + HEAD.size <= size:
@@ -130,7 +130,7 @@ def places(source: Source) -> Iterator[Place]:
         end = at + HEAD.size + length
         if end > size or opcode not in _STANDARD or length < LEAST.get(opcode, 0):
             return
-        yield Place(opcode, at, end)
+        yield RecordSpan(opcode, at, end)
         if opcode == Opcode.FOOTER:
             return
         at = end
@@ -149,10 +149,10 @@ def is_cut(source: Source, at: int) -> bool:
         return False
     if opcode not in LEAST:
         return opcode in _ANY_SIZE or length <= SMALL_MAX
-    return left < CUT_HEAD or length == _length_inside(source, Place(opcode, at, len(source)))
+    return left < CUT_HEAD or length == _length_inside(source, RecordSpan(opcode, at, len(source)))
 
 
-def _length_inside(source: Source, place: Place) -> int | None:
+def _length_inside(source: Source, place: RecordSpan) -> int | None:
     """Return the length of a chunk or message index as it follows from what it says of its content."""
     if place.opcode == Opcode.MESSAGE_INDEX:
         return INDEX_HEAD.size + INDEX_HEAD.unpack_from(source, place.body)[1]
@@ -162,9 +162,9 @@ def _length_inside(source: Source, place: Place) -> int | None:
     return content - place.body + SIZE.unpack_from(source, content - SIZE.size)[0]
 
 
-def groups(source: Source) -> Iterator[Group]:
+def groups(source: Source) -> Iterator[RecordGroup]:
     """Yield schemas, channels and chunks of the data section in order."""
-    pending: list[Place] = []
+    pending: list[RecordSpan] = []
     for place in places(source):
         if place.opcode == Opcode.DATA_END:
             break
@@ -176,14 +176,14 @@ def groups(source: Source) -> Iterator[Group]:
     yield from _group(source, pending)
 
 
-def _group(source: Source, pending: list[Place]) -> Iterator[Group]:
+def _group(source: Source, pending: list[RecordSpan]) -> Iterator[RecordGroup]:
     if pending:
         place, *rest = pending
         indexes = tuple(_index(source, index) for index in rest)
-        yield Group(place, indexes, pending[-1].end)
+        yield RecordGroup(place, indexes, pending[-1].end)
 
 
-def _index(source: Source, place: Place) -> Index:
+def _index(source: Source, place: RecordSpan) -> Index:
     channel, size = INDEX_HEAD.unpack_from(source, place.body)
     return Index(channel, size // INDEX_ENTRY, place.start)
 
@@ -202,14 +202,14 @@ def chunk(content: bytes | memoryview, first_ns: int, last_ns: int) -> list[byte
     return [HEAD.pack(Opcode.CHUNK, length), head, ZSTD, SIZE.pack(len(data)), data]
 
 
-def chunk_head(source: Source, place: Place) -> ChunkHead:
+def chunk_head(source: Source, place: RecordSpan) -> ChunkHead:
     """Return the head of the chunk at a place."""
     first, last, size, crc, name = CHUNK_HEAD.unpack_from(source, place.body)
     at = place.body + CHUNK_HEAD.size
     return ChunkHead(first, last, size, crc, source[at : at + name].decode("utf-8", "replace"), at + name + SIZE.size)
 
 
-def content_of(source: Source, place: Place) -> bytes | None:
+def content_of(source: Source, place: RecordSpan) -> bytes | None:
     """Return the message records inside the chunk at a place, None if it is damaged.
 
     Raises:

@@ -7,7 +7,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from zsim.contract.bundle import Bundle
+from zsim.contract.framing import GateMessages
 from zsim.record.mcap_layout import HEAD, INDEX_ENTRY, INDEX_HEAD, MESSAGE
 
 _SEQUENCE_MASK = 2**32 - 1  # MCAP counts messages of a channel in 32 bits
@@ -62,17 +62,17 @@ class OpenChunk:
         self._log.append(t_ns)
         self._published.append(wall_ns)
 
-    def add_bundle(self, channels: bytes, bundle: Bundle, wall_ns: int) -> None:
-        """Take the messages of a bundle, in whose buffer there is room before each for its head.
+    def add_gate(self, channels: bytes, gate: GateMessages, wall_ns: int) -> None:
+        """Take the messages of a gate, in whose buffer there is room before each for its head.
 
         Args:
             channels: number of each message's, int64.
         """
         self._channels.frombytes(channels)
-        self._ends.frombytes((bundle.ends + self.size).tobytes())
-        self._log.frombytes(bundle.stamps.tobytes())
-        self._published.extend([wall_ns] * len(bundle))
-        self._put(self.size, bundle.buffer)
+        self._ends.frombytes((gate.ends + self.size).tobytes())
+        self._log.frombytes(gate.stamps.tobytes())
+        self._published.extend([wall_ns] * len(gate))
+        self._put(self.size, gate.buffer)
 
     def _put(self, start: int, data: bytes | bytearray) -> None:
         self.size = end = start + len(data)

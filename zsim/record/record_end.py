@@ -19,8 +19,8 @@ from mcap.records import Channel, ChunkIndex, DataEnd, Footer, Schema, Statistic
 from zsim.errors import RecordError
 from zsim.record.mcap_layout import (
     MAGIC,
-    Group,
-    Place,
+    RecordGroup,
+    RecordSpan,
     Source,
     chunk_head,
     content_of,
@@ -38,7 +38,7 @@ _FOOTER_CRC = struct.Struct("<BQQQ")  # the part of the footer that its check su
 _FOOTER_LENGTH = 20
 
 
-class Summary:
+class RecordSummary:
     """What the end of a record says about its data, taken in one chunk at a time."""
 
     def __init__(self) -> None:
@@ -55,15 +55,15 @@ class Summary:
         for group in groups(source):
             takers[Opcode(group.place.opcode)](source, group)
 
-    def _schema(self, source: Source, group: Group) -> None:
+    def _schema(self, source: Source, group: RecordGroup) -> None:
         unpacked(Schema, source, group.place).write(self.schemas)
         self.schema_count += 1
 
-    def _channel(self, source: Source, group: Group) -> None:
+    def _channel(self, source: Source, group: RecordGroup) -> None:
         unpacked(Channel, source, group.place).write(self.channels)
         self.channel_count += 1
 
-    def _chunk(self, source: Source, group: Group) -> None:
+    def _chunk(self, source: Source, group: RecordGroup) -> None:
         place, head = group.place, chunk_head(source, group.place)
         if head.content > place.end:
             return  # readers of the summary would be sent to what they cannot read
@@ -104,7 +104,7 @@ def finish(file: FileIO) -> None:
     Raises:
         OSError: no room.
     """
-    summary = Summary()
+    summary = RecordSummary()
     with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
         summary.take(source)
     data_end = packed(DataEnd(0))
@@ -129,7 +129,7 @@ def write_all(file: FileIO, data: bytes) -> None:
         view = view[file.write(view) or 0 :]
 
 
-def _ending(summary: Summary, start: int) -> Iterator[bytes]:
+def _ending(summary: RecordSummary, start: int) -> Iterator[bytes]:
     """Yield summary, summary offsets, footer and magic; `start` is where the first of it will stand."""
     groups = {
         Opcode.SCHEMA: summary.schemas.end(),
@@ -186,7 +186,7 @@ def _last_whole(source: Source) -> tuple[int, bytes]:
 
     A file cut before its first chunk ends after its header, and at 0 when even that is not whole.
     """
-    last: Place | None = None
+    last: RecordSpan | None = None
     for place in places(source):
         if place.opcode == Opcode.DATA_END:
             break
@@ -204,6 +204,6 @@ def check_magic(source: Source, path: Path) -> None:
     Raises:
         RecordError: with what was found.
     """
-    found = source[: len(MAGIC)]
-    if not MAGIC.startswith(found):
-        raise RecordError(f"{path}: begins with {found!r}; is no MCAP record")
+    beginning = source[: len(MAGIC)]
+    if not MAGIC.startswith(beginning):
+        raise RecordError(f"{path}: begins with {beginning!r}; is no MCAP record")

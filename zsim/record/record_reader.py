@@ -15,8 +15,8 @@ from zsim.record.mcap_layout import (
     HEAD,
     MAGIC,
     MESSAGE,
-    Group,
-    Place,
+    RecordGroup,
+    RecordSpan,
     Source,
     chunk_head,
     content_of,
@@ -42,7 +42,7 @@ class Recorded(NamedTuple):
 
 
 class _Chunk(NamedTuple):
-    place: Place
+    place: RecordSpan
     first_ns: int
     last_ns: int
     channels: frozenset[int]
@@ -111,8 +111,8 @@ class RecordReader:
         """Return the message of a key that was written last, None if there is none."""
         for number in (number for number, name in self._keys.items() if name == key):
             for chunk in reversed(self._chunks):
-                if number in chunk.channels and (found := list(self._as_written([chunk], {number: key}))):
-                    return found[-1]
+                if number in chunk.channels and (recorded := list(self._as_written([chunk], {number: key}))):
+                    return recorded[-1]
         return None
 
     def close(self) -> None:
@@ -138,16 +138,16 @@ class RecordReader:
 
     def _scan(self) -> Iterator[_Chunk]:
         known: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
-        found = [group for group in groups(self._source) if group.place.opcode == Opcode.CHUNK]
-        for group in found:
-            cut = group is found[-1] and not self.complete
+        chunk_groups = [group for group in groups(self._source) if group.place.opcode == Opcode.CHUNK]
+        for group in chunk_groups:
+            cut = group is chunk_groups[-1] and not self.complete
             counts = self._counted(group) if cut else {index.channel: index.messages for index in group.indexes}
             self._counts.update(counts)
             channels = frozenset(counts)
             head = chunk_head(self._source, group.place)
             yield _Chunk(group.place, head.first_ns, head.last_ns, known.setdefault(channels, channels))
 
-    def _counted(self, group: Group) -> dict[int, int]:
+    def _counted(self, group: RecordGroup) -> dict[int, int]:
         """Return the messages per channel of a chunk whose message indexes may have been cut."""
         content = content_of(self._source, group.place)
         if content is None:
@@ -172,8 +172,8 @@ class RecordReader:
             ready = next((i for i, (t_ns, _, _) in enumerate(held) if t_ns >= first_ns), len(held))
             yield from (message for _, _, message in held[:ready])
             del held[:ready]
-            found = self._as_written([chunks[number]], wanted)
-            held += [(m.t_ns, number, m) for m in found if m.t_ns >= floor_ns]
+            entries = self._as_written([chunks[number]], wanted)
+            held += [(m.t_ns, number, m) for m in entries if m.t_ns >= floor_ns]
         held.sort(key=itemgetter(0, 1))
         yield from (message for _, _, message in held)
 
@@ -189,10 +189,10 @@ class RecordReader:
             chunk = chunks[number]
             if chunk.first_ns >= chunks[number - 1].last_ns - OVERLAP_NS:
                 continue
-            found = [(m.t_ns, number, m) for m in self._as_written([chunk], wanted)]
-            floor_ns = _floor_ns([t_ns for t_ns, _, _ in found])
-            strays += (each for each in found if each[0] < floor_ns)
-            floors[number] = min((t_ns for t_ns, _, _ in found if t_ns >= floor_ns), default=chunk.first_ns)
+            entries = [(m.t_ns, number, m) for m in self._as_written([chunk], wanted)]
+            floor_ns = _floor_ns([t_ns for t_ns, _, _ in entries])
+            strays += (each for each in entries if each[0] < floor_ns)
+            floors[number] = min((t_ns for t_ns, _, _ in entries if t_ns >= floor_ns), default=chunk.first_ns)
         return strays, floors
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from zsim.contract import messages
-from zsim.contract.bundle import PATTERNS_MAX, Bundle
+from zsim.contract.framing import GateMessages
 from zsim.errors import RecordError
 from zsim.record.mcap_layout import chunk, opening, packed
 from zsim.record.open_chunk import OpenChunk
@@ -45,7 +45,7 @@ class RecordWriter:
         self.refused = 0
         self._channels: dict[str, int] = {}  # by key, counted from 1
         self._table: Sequence[str] = ()
-        self._patterns: dict[bytes, bytes] = {}  # channels of the bundles of a table
+        self._channel_of = np.zeros(0, dtype=np.int64)  # by the place of a key in the table, 0 where none is known yet
         self._schemas: dict[str, int] = {}
         self._ahead: list[bytes] = []  # schemas and channels that the open chunk is the first to use
         self._open = OpenChunk(CHUNK_BYTES + CHUNK_BYTES // 4)
@@ -88,18 +88,23 @@ class RecordWriter:
         self._open.add(channel, _encode(message), message.t_ns, wall_ns)
         self._took(1, wall_ns)
 
-    def add_bundle(self, bundle: Bundle, wall_ns: int) -> None:
-        """Take the messages of a bundle.
+    def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
+        """Take the messages of a gate, whose columns have been checked.
 
         Raises:
             RecordError: as `add`.
         """
-        channels = self._channels_of(bundle)
-        if channels is None:
-            self._add_each(bundle, wall_ns)
-            return
-        self._open.add_bundle(channels, bundle, wall_ns)
-        self._took(len(bundle), wall_ns)
+        if gate.table is not self._table:
+            self._table, self._channel_of = gate.table, np.zeros(len(gate.table), dtype=np.int64)
+        channels = self._channel_of[gate.which]
+        if not channels.all():
+            self._learn(gate)
+            channels = self._channel_of[gate.which]
+        if channels.all():
+            self._open.add_gate(channels.tobytes(), gate, wall_ns)
+            self._took(len(gate), wall_ns)
+        else:
+            self._add_each(gate, wall_ns)
 
     def _took(self, count: int, wall_ns: int) -> None:
         """Note that messages have come into the open chunk; end one that is large or old."""
@@ -107,26 +112,15 @@ class RecordWriter:
         if self._open.size >= CHUNK_BYTES or wall_ns - self._open.since_ns >= CHUNK_AGE_NS:
             self._end_chunk()
 
-    def _channels_of(self, bundle: Bundle) -> bytes | None:
-        """Return the channel of each message, None if there is none left for one."""
-        if bundle.table is not self._table:
-            self._table = bundle.table
-            self._patterns.clear()
-        pattern = bundle.which.tobytes()
-        channels = self._patterns.get(pattern)
-        if channels is None:
-            places: list[int] = bundle.which.tolist()
-            keys = [bundle.table[place] for place in places]
-            found = [self._channels.get(key) or self._register(key, messages.encoding(key)) for key in keys]
-            if not all(found):
-                return None
-            channels = np.array(found).tobytes()
-            if len(self._patterns) < PATTERNS_MAX:
-                self._patterns[pattern] = channels
-        return channels
+    def _learn(self, gate: GateMessages) -> None:
+        """Look up, or register, the channels of the keys on which messages have come."""
+        places: list[int] = gate.which[self._channel_of[gate.which] == 0].tolist()
+        for place in places:
+            key = gate.table[place]
+            self._channel_of[place] = self._channels.get(key) or self._register(key, messages.encoding(key))
 
-    def _add_each(self, bundle: Bundle, wall_ns: int) -> None:
-        for (key, payload), t_ns in zip(bundle.encoded, bundle.stamps.tolist(), strict=True):
+    def _add_each(self, gate: GateMessages, wall_ns: int) -> None:
+        for (key, payload), t_ns in zip(gate.pairs, gate.stamps.tolist(), strict=True):
             self.add(key, payload, messages.encoding(key), t_ns, wall_ns)
 
     def tick(self, wall_ns: int) -> None:

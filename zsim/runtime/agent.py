@@ -5,17 +5,23 @@
 
 Two runners drive it: `zsim.runtime.runner` as a process on Zenoh, `zsim.runtime.bus` on an in-memory bus. Both hand
 over the same inputs in the same order, so that the outputs are the same to the bit.
+
+The world's messages about its drones come as one GateMessages where the transport brings them so: `deliver` takes them
+apart, but for an agent that reads them as arrays (`takes_gates`, `receive_gate`).
 """
 
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 from msgspec import Struct
 
+from zsim.contract.framing import GateMessages
 from zsim.contract.messages import ControlAnswer, ControlRequest, Faults, Info
 from zsim.runtime.link_faults import LinkFaults
+from zsim.runtime.routing import GateRouter, Input, RoutingTable, one_by_one
 
 
 class Output(NamedTuple):
@@ -36,7 +42,7 @@ class Agent(ABC):
         counted: drones of which it reads all sensors, so that what their status counts is waited for.
         writes: keys that it publishes at every gate and that others of its process may read.
         serves: names of processes for which it stands beside its own.
-        takes_bundles: whether `receive` takes all that the world says at a gate as one (batch.GATE, Bundle).
+        takes_gates: whether `receive_gate` is to have the world's messages of a gate as columns and one buffer.
     """
 
     name: str
@@ -46,7 +52,7 @@ class Agent(ABC):
     counted: tuple[str, ...] = ()
     writes: tuple[str, ...] = ()
     serves: tuple[str, ...] = ()
-    takes_bundles: bool = False
+    takes_gates: bool = False
     _links: LinkFaults | None = None
 
     def __init__(self) -> None:
@@ -59,40 +65,54 @@ class Agent(ABC):
 
     @property
     def source(self) -> str:
-        """Name of the process that publishes what it says: its own, unless it shares one."""
+        """Name of the process that publishes its outputs: its own, unless it shares one."""
         return self._process or self.name
 
-    def speak_as(self, process: str) -> None:
-        """Share a process of this name."""
+    def share_process(self, process: str) -> None:
+        """Publish as a process of this name, together with other agents."""
         self._process = process
 
-    def heed(self, info: Info, faults: Faults) -> None:
-        """Learn which faults are injected into the run; called before the first gate in which one of them acts."""
+    def update_faults(self, info: Info, faults: Faults) -> None:
+        """Take the faults injected into the run; called before the first gate in which one of them acts."""
         if self._links is None and faults.faults:
             names, clusters = (self.name, *self.serves), {cluster.name: cluster.drones for cluster in info.clusters}
-            self._links = LinkFaults(names, self.reads, info.seed, info.gate_ns, clusters)
+            self._links = LinkFaults(names, info.seed, info.gate_ns, clusters)
         if self._links is not None:
-            self._links.heed(faults)
+            self._links.update(faults)
 
-    def hear(self, t_ns: int, inputs: Sequence[tuple[str, Any]]) -> None:
-        """Take the inputs of a gate, as far as faults of the links bring them."""
-        if self._links is not None:
-            inputs = self._links.through(t_ns, inputs)
+    def deliver(self, t_ns: int, inputs: Sequence[Input]) -> None:
+        """Take the inputs of a gate in canonical order, as far as faults of the links bring them."""
+        if self._links is not None and self._links.act_at(t_ns):
+            inputs = self._links.delivered(t_ns, one_by_one(inputs, self._router))
+        elif not self.takes_gates:
+            inputs = one_by_one(inputs, self._router)
         for key, message in inputs:
-            self.receive(key, message)
+            if type(message) is GateMessages:
+                self.receive_gate(message)
+            else:
+                self.receive(key, message)
+
+    @cached_property
+    def _router(self) -> GateRouter:
+        return GateRouter(RoutingTable([self.reads]))
 
     @abstractmethod
     def receive(self, key: str, message: Any) -> None:
         """Take one input; called in order of (t_ns, key, seq) just before `step`."""
+
+    def receive_gate(self, gate: GateMessages) -> None:
+        """Take the world's messages of a gate before its other inputs; only where it `takes_gates`."""
+        for _, key, message in self._router.split(gate):
+            self.receive(key, message)
 
     @abstractmethod
     def step(self, t_ns: int) -> Sequence[Output]:
         """Return the outputs of the gate t_ns."""
 
     def views(self, t_ns: int) -> Sequence[Output]:
-        """Return what eyes are shown on `view/**`, as of the gate t_ns, the last that it stepped.
+        """Return what is to be displayed, on `view/**`, as of the gate t_ns, the last that it stepped.
 
-        Asked after some gates only, as often as eyes can follow, and never where the agents share a process with the
+        Asked after some gates only, as often as people can follow, and never where the agents share a process with the
         world: nothing may depend on it.
         """
         return ()

@@ -3,26 +3,25 @@
 The agents get the same inputs in the same order as on Zenoh, and so give the same bits.
 """
 
-import os
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from msgspec import Struct
 
-from zsim import __version__
-from zsim.contract import batch, keys, messages
-from zsim.contract.bundle import Bundle, Selection
-from zsim.contract.fingerprint import fingerprint
+from zsim.contract import keys, messages
+from zsim.contract.fingerprint import join_of
+from zsim.contract.framing import GateMessages
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.inbox import Inbox
+from zsim.runtime.routing import RoutingTable
 from zsim.scenario.fault_kinds import PROCESS_KILL
 
 GATES_MAX = 10  # of the world in a row, where commands are delayed by as many
 
 
-class Hub(Protocol):
+class SteppedWorld(Protocol):
     """What the bus needs of a world."""
 
     run_id: str
@@ -32,7 +31,7 @@ class Hub(Protocol):
         ...
 
     def handle(self, key: str, message: Any, wall_ns: int) -> None:
-        """Take what a process says to the world: join, done, bye, a command."""
+        """Take a message to the world: join, done, bye, a command."""
         ...
 
     def count_output(self, source: str) -> None:
@@ -52,7 +51,7 @@ class Hub(Protocol):
         ...
 
     def take_outbox(self) -> Sequence[tuple[str, Any]]:
-        """Return keys and messages to be published, in order, and forget them; on batch.GATE a Bundle of many."""
+        """Return keys and messages to be published, in order, and forget them; on keys.GATE GateMessages."""
         ...
 
     def waiting_for(self, wall_ns: int) -> Sequence[messages.Waiting]:
@@ -66,42 +65,44 @@ class Hub(Protocol):
 
 
 Sink = Callable[[str, Any], None]
-OUTPUT, COMMAND = range(2)  # what an agent says: for whoever reads it, for the world
+GateSink = Callable[[GateMessages], None]
+OUTPUTS = ("/estimate", "/state", "/request")  # ends of the keys of what agents publish for others than the world
 
 
-class _Way(NamedTuple):
-    """Where the messages of a key go."""
+class _Route(NamedTuple):
+    """Where the messages of a key go: who reads them, and whether they are for others than the world."""
 
     inboxes: tuple[Inbox, ...]
-    kind: int
+    is_output: bool
 
 
 class Bus:
     """The keys of one process: every message goes to the sink, the world and the inboxes that read it.
 
     Args:
-        hub: the world.
+        coordinator: the world of the run.
         agents: in the order in which they are asked.
         wall_ns: monotonic wall time.
         sink: takes every message in order of publication.
-        whole: takes what the world says at a gate in place of the sink, which then need not be given objects of it.
+        gate_sink: takes the world's messages of a gate in place of the sink, which then is not given each one decoded.
     """
 
     def __init__(
         self,
-        hub: Hub,
+        coordinator: SteppedWorld,
         agents: Sequence[Agent],
         wall_ns: Callable[[], int],
         sink: Sink = lambda key, message: None,
-        whole: Callable[[Bundle], None] | None = None,
+        gate_sink: GateSink | None = None,
     ) -> None:
-        self._hub = hub
+        self._coordinator = coordinator
         self._wall_ns = wall_ns
         self._sink = sink
-        self._whole = whole
+        self._gate_sink = gate_sink or self._sink_each
         self._agents = [(agent, Inbox(agent.gate_keys, agent.counted)) for agent in agents]
-        self._selections = [Selection(agent.reads) for agent in agents]
-        self._ways: dict[str, _Way] = {}
+        self._readers = RoutingTable([agent.reads for agent in agents])
+        self._routes: dict[str, _Route] = {}
+        self._gate_route: tuple[Sequence[str], tuple[Inbox, ...]] = ((), ())  # a table of keys, and who reads of it
         self._done_keys = {agent.name: keys.process(agent.name, "done") for agent in agents}
         self._t_ns = 0
         self._info: messages.Info | None = None
@@ -110,36 +111,25 @@ class Bus:
         """Let every agent make ready and join the run."""
         for agent, _ in self._agents:
             agent.rehearse()
-            join = messages.Join(
-                t_ns=0,
-                seq=agent.next_seq("join"),
-                run_id=self._hub.run_id,
-                incarnation=0,
-                role=agent.role,
-                host=socket.gethostname(),
-                pid=os.getpid(),
-                period_ns=agent.period_ns,
-                version=__version__,
-                fingerprint=fingerprint(),
-                serves=agent.serves,
-            )
-            self._to_hub(keys.process(agent.name, "join"), join)
+            seq, host, run_id = agent.next_seq("join"), socket.gethostname(), self._coordinator.run_id
+            join = join_of(agent.name, host, run_id, 0, seq, period_ns=agent.period_ns, serves=agent.serves)
+            self._to_world(keys.process(agent.name, "join"), join)
 
     def turn(self) -> bool:
         """Let the world go as far as it may, and every agent answer; return whether the run goes on.
 
-        Several gates in a row of the world, of each agent, and of what they say, keep the code of each in the
+        Several gates in a row of the world, of each agent, and of their outputs, keep the code of each in the
         processor's caches.
 
         Raises:
             RunError: the world waits for somebody who is not on this bus.
         """
-        if not self._hub.may_advance():
+        if not self._coordinator.may_advance():
             self._refuse_to_wait()
             return False
         gates = 0
-        while gates < GATES_MAX and self._hub.may_advance():
-            self._hub.advance(self._wall_ns())
+        while gates < GATES_MAX and self._coordinator.may_advance():
+            self._coordinator.advance(self._wall_ns())
             gates += 1
         self._spread()
         while self._round():
@@ -147,41 +137,47 @@ class Bus:
         return True
 
     def _refuse_to_wait(self) -> None:
-        names = ", ".join(waiting.name for waiting in self._hub.waiting_for(self._wall_ns()))
-        if self._hub.ended is None and names:
+        names = ", ".join(waiting.name for waiting in self._coordinator.waiting_for(self._wall_ns()))
+        if self._coordinator.ended is None and names:
             raise RunError(f"the world waits for {names}, not run in-process; see `processes.expect`")
 
     def _round(self) -> bool:
-        """Let every agent take all its complete gates, then publish what it says; return whether any had one."""
+        """Let every agent take all its complete gates, then publish its outputs; return whether any had one."""
         stepped = False
         for agent, inbox in self._agents:
-            said = list(self._steps(agent, inbox))
-            for t_ns, outputs in said:
+            steps = list(self._steps(agent, inbox))
+            for t_ns, outputs in steps:
                 self._publish(agent, t_ns, outputs)
-            stepped = stepped or bool(said)
+            stepped = stepped or bool(steps)
         return stepped
 
     def end(self) -> None:
-        """Let every agent leave, and the world say its last words."""
-        self._hub.publish_end()
+        """Let every agent leave, and publish the world's last messages."""
+        self._coordinator.publish_end()
         self._spread()
         for agent, _ in self._agents:
             bye = messages.Bye(self._t_ns, agent.next_seq("bye"), "the run ended")
-            self._to_hub(keys.process(agent.name, "bye"), bye)
+            self._to_world(keys.process(agent.name, "bye"), bye)
         self._spread()
 
     def _spread(self) -> None:
-        for key, message in self._hub.take_outbox():
-            if key == batch.GATE:
-                self._hand_out(message)
+        for key, message in self._coordinator.take_outbox():
+            if type(message) is GateMessages:
+                self._gate_sink(message)
+                for inbox in self._gate_readers(message.table):
+                    inbox.put(key, message)
                 continue
             self._sink(key, message)
             if key == keys.FAULTS:
-                self._tell_faults(message)
-            for inbox in self._way(key).inboxes:
+                self._update_faults(message)
+            for inbox in self._route(key).inboxes:
                 inbox.put(key, message)
 
-    def _tell_faults(self, faults: messages.Faults) -> None:
+    def _sink_each(self, gate: GateMessages) -> None:
+        for key, message in gate.decoded():
+            self._sink(key, message)
+
+    def _update_faults(self, faults: messages.Faults) -> None:
         if not faults.faults and self._info is None:
             return
         for fault in faults.faults:
@@ -189,26 +185,16 @@ class Bus:
                 raise RunError(
                     f"{PROCESS_KILL} of {fault.target}: must be left out in-process, where nobody is a process"
                 )
-        info = self._info = self._info or self._hub.info()
+        info = self._info = self._info or self._coordinator.info()
         for agent, _ in self._agents:
-            agent.heed(info, faults)
-
-    def _hand_out(self, bundle: Bundle) -> None:
-        if self._whole:
-            self._whole(bundle)
-        else:
-            for each in bundle.messages():
-                self._sink(*each)
-        for (agent, inbox), selection in zip(self._agents, self._selections, strict=True):
-            for key, message in [(batch.GATE, bundle)] if agent.takes_bundles else selection.of(bundle):
-                inbox.put(key, message)
+            agent.update_faults(info, faults)
 
     def _steps(self, agent: Agent, inbox: Inbox) -> Iterator[tuple[int, Sequence[Output]]]:
-        """Hand an agent each complete gate; yield those at which it steps, with what it says."""
+        """Hand an agent each complete gate; yield those at which it steps, with its outputs."""
         t_ns = inbox.next_gate_ns()
         while t_ns is not None and inbox.missing(t_ns) is None:
             self._t_ns = t_ns
-            agent.hear(t_ns, inbox.take(t_ns))
+            agent.deliver(t_ns, inbox.take(t_ns))
             if t_ns % agent.period_ns == 0:
                 yield t_ns, agent.step(t_ns)
             t_ns = inbox.next_gate_ns()
@@ -216,27 +202,32 @@ class Bus:
     def _publish(self, agent: Agent, t_ns: int, outputs: Sequence[Output]) -> None:
         sent = 0
         for key, message in outputs:
-            inboxes, kind = self._way(key)
+            inboxes, is_output = self._route(key)
             sent += 1
             for inbox in inboxes:
                 inbox.put(key, message)
-            if kind == OUTPUT:
+            if is_output:
                 self._sink(key, message)
-                self._hub.count_output(agent.name)
+                self._coordinator.count_output(agent.name)
             else:
-                self._to_hub(key, message)
-        done = messages.Done(t_ns, agent.next_seq("done"), self._hub.run_id, 0, t_ns, sent)
-        self._to_hub(self._done_keys[agent.name], done)
+                self._to_world(key, message)
+        done = messages.Done(t_ns, agent.next_seq("done"), self._coordinator.run_id, 0, t_ns, sent)
+        self._to_world(self._done_keys[agent.name], done)
 
-    def _to_hub(self, key: str, message: Struct) -> None:
+    def _to_world(self, key: str, message: Struct) -> None:
         self._sink(key, message)
-        self._hub.handle(key, message, self._wall_ns())
+        self._coordinator.handle(key, message, self._wall_ns())
 
-    def _way(self, key: str) -> _Way:
-        way = self._ways.get(key)
-        if way is None:
-            readers = zip(self._agents, self._selections, strict=True)
-            inboxes = tuple(inbox for (_, inbox), taken in readers if taken.takes(key))
-            kind = OUTPUT if key.endswith(("/estimate", "/state", "/request")) else COMMAND
-            way = self._ways[key] = _Way(inboxes, kind)
-        return way
+    def _route(self, key: str) -> _Route:
+        route = self._routes.get(key)
+        if route is None:
+            inboxes = tuple(self._agents[reader][1] for reader in self._readers.readers(key))
+            route = self._routes[key] = _Route(inboxes, key.endswith(OUTPUTS))
+        return route
+
+    def _gate_readers(self, table: Sequence[str]) -> tuple[Inbox, ...]:
+        """Return the inboxes of those who read messages of gates with this table of keys."""
+        if table is not self._gate_route[0]:
+            readers = self._readers.readers_of_any(table)
+            self._gate_route = (table, tuple(self._agents[reader][1] for reader in readers))
+        return self._gate_route[1]

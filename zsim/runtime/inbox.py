@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from operator import itemgetter
 from typing import Any
 
-from zsim.contract import batch, keys
+from zsim.contract import keys
+from zsim.contract.framing import GateMessages
 
 GAP_MAX = 10  # gates lost in a row that are asked for again; the world runs ahead of nobody by more
 ALWAYS_NS = -1  # before every gate
@@ -34,7 +35,7 @@ class Inbox:
 
     def __init__(self, gate_keys: Sequence[str], counted: Sequence[str] = (), keep_late: bool = False) -> None:
         self._closing = dict.fromkeys(gate_keys)
-        self._beside = dict.fromkeys(key for key in gate_keys if not keys.is_status(key))  # what a bundle leaves open
+        self._beside = dict.fromkeys(key for key in gate_keys if not keys.is_status(key))  # not closed by GateMessages
         self._meters = {keys.status(drone): _Meter() for drone in counted}
         self._came_of: dict[str, list[int] | None] = {}
         self._waiting: dict[int, dict[tuple[str, int], tuple[str, Any]]] = {}
@@ -53,7 +54,7 @@ class Inbox:
         self.late = 0
 
     def put(self, key: str, message: Any) -> bool:
-        """Keep one message; return False for a duplicate or one that is too late."""
+        """Keep one message, or GateMessages on `keys.GATE`; return False for a duplicate or one that is too late."""
         t_ns = message.t_ns
         if t_ns <= self._taken_ns:
             self.late += 1
@@ -72,7 +73,7 @@ class Inbox:
             _insert(came, t_ns)
         if key in self._closing:
             self._close(key, message)
-        elif key == batch.GATE:
+        elif type(message) is GateMessages:
             self._close_all(message)
         return True
 
@@ -90,16 +91,16 @@ class Inbox:
         self._came_of[key] = came = meter.came if meter else None
         return came
 
-    def _close_all(self, bundle: Any) -> None:
-        """Take a bundle: all that its publisher says at a gate, whole by its nature."""
-        t_ns = bundle.t_ns
+    def _close_all(self, gate: GateMessages) -> None:
+        """Close a gate for the drones whose messages have come as one: none of them can be missing."""
+        t_ns = gate.t_ns
         if t_ns in self._lacking:
             self._lacking[t_ns] = {key: None for key in self._lacking[t_ns] if key in self._beside}
         else:
             self._lacking[t_ns] = self._beside.copy()
             _insert(self._gates, t_ns)
         if self._pulse is not None:
-            self._beats[t_ns] = bundle.seq
+            self._beats[t_ns] = gate.seq
 
     def _lacking_at(self, t_ns: int) -> dict[str, None]:
         lacking = self._lacking.get(t_ns)

@@ -12,10 +12,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from zsim.contract import batch, keys
-from zsim.contract.bundle import Selection
+from zsim.contract import keys
 from zsim.contract.messages import Estimate, Fault, Faults
-from zsim.errors import DecodeError
+from zsim.runtime.routing import Input, in_order
 from zsim.scenario import fault_kinds
 
 WORLD = "world"
@@ -65,7 +64,7 @@ def joins(fault: Fault, froms: Sequence[str], to: str) -> bool:
     return first == to and second in froms and not fault.parameters["one_way"]
 
 
-def heard(distance_m: float, range_m: float, spread_m: float) -> float:
+def reception_probability(distance_m: float, range_m: float, spread_m: float) -> float:
     """Return the probability that a message comes over a radio: 1 / (1 + exp((d - range) / spread))."""
     return 1.0 / (1.0 + math.exp(min((distance_m - range_m) / spread_m, 700.0)))  # exp(700) is the last finite one
 
@@ -94,7 +93,7 @@ def delay_ns(fault: Fault, draw: float, distance_m: float | None = None) -> int 
     if fault.kind == "link_loss":
         return NEVER if draw < p["probability"] else 0
     if fault.kind == "radio":
-        comes = distance_m is None or draw < heard(distance_m, p["range_m"], p["spread_m"])
+        comes = distance_m is None or draw < reception_probability(distance_m, p["range_m"], p["spread_m"])
         return 0 if comes else NEVER
     return NEVER  # link_cut
 
@@ -104,7 +103,6 @@ class LinkFaults:
 
     Args:
         names: of the receiver; an estimator of several drones has the name of each one's.
-        reads: its key expressions.
         seed: of the scenario.
         gate_ns: the interval of the gates.
         clusters: name and drones of each.
@@ -113,7 +111,6 @@ class LinkFaults:
     def __init__(
         self,
         names: Sequence[str],
-        reads: Sequence[str],
         seed: int,
         gate_ns: int,
         clusters: Mapping[str, Sequence[str]],
@@ -122,51 +119,41 @@ class LinkFaults:
         self._seed = seed
         self._gate_ns = gate_ns
         self._clusters = clusters
-        self._selection = Selection(reads)
         self._seq = -1
         self._faults: list[Fault] = []
         self._later: list[tuple[int, str, Any]] = []  # the gate at which it comes, key, message
         self._positions: dict[str, Point] = {}
 
-    def heed(self, told: Faults) -> None:
-        """Learn which faults there are; an older list than the last one says nothing."""
-        if told.seq <= self._seq:
+    def update(self, faults: Faults) -> None:
+        """Take the list of faults, unless a newer one has come before."""
+        if faults.seq <= self._seq:
             return
-        self._seq = told.seq
-        self._faults = [fault for fault in told.faults if fault.kind in KINDS and self._concerns(fault)]
+        self._seq = faults.seq
+        self._faults = [fault for fault in faults.faults if fault.kind in KINDS and self._concerns(fault)]
 
     def _concerns(self, fault: Fault) -> bool:
         return fault.kind == "radio" or any(name in fault.target.split("/") for name in self._names)
 
-    def through(self, t_ns: int, inputs: Sequence[tuple[str, Any]]) -> Sequence[tuple[str, Any]]:
-        """Return what the receiver is handed at the gate t_ns, in order of (t_ns, key, seq).
+    def act_at(self, t_ns: int) -> bool:
+        """Tell whether the inputs of a gate may be other ones than have come."""
+        return bool(self._later) or any(fault_kinds.acts(fault, t_ns) for fault in self._faults)
+
+    def delivered(self, t_ns: int, inputs: Sequence[Input]) -> list[Input]:
+        """Return what the receiver is handed at the gate t_ns, in canonical order.
 
         Args:
-            inputs: what has come for that gate, in the same order; a bundle only where it is read as one.
+            inputs: the messages that have come for that gate, one by one.
         """
         acting = [fault for fault in self._faults if fault_kinds.acts(fault, t_ns)]
-        if not acting and not self._later:
-            return inputs
         if acting:
-            inputs = self._unbundled(inputs)
             self._note_positions(inputs)
         coming = [entry for entry in self._later if entry[0] <= t_ns]
         self._later = [entry for entry in self._later if entry[0] > t_ns]
         handed = [(key, message) for _, key, message in coming]
         handed += [(key, message) for key, message in inputs if self._comes_now(t_ns, key, message, acting)]
-        return sorted(handed, key=lambda entry: (entry[1].t_ns, entry[0], entry[1].seq))
+        return in_order(handed)
 
-    def _unbundled(self, inputs: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
-        """Return all messages one by one, in canonical order within a gate."""
-        single: list[tuple[str, Any]] = []
-        for key, message in inputs:
-            try:
-                single += self._selection.of(message) if key == batch.GATE else [(key, message)]
-            except DecodeError:
-                continue  # not the world's: it is as good as lost
-        return single
-
-    def _note_positions(self, inputs: Sequence[tuple[str, Any]]) -> None:
+    def _note_positions(self, inputs: Sequence[Input]) -> None:
         for key, message in inputs:
             if type(message) is Estimate:
                 self._positions[keys.thing(key)] = message.position_m

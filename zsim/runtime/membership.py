@@ -7,15 +7,14 @@ import os
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
-from zsim import __version__
-from zsim.contract import batch, keys, messages
-from zsim.contract.fingerprint import fingerprint
-from zsim.contract.world_events import Entry
+from zsim.contract import keys, messages
+from zsim.contract.fingerprint import join_of
+from zsim.contract.framing import Pairs, pairs_of
+from zsim.contract.world_events import ProcessEntry
 from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.replay import replay
 from zsim.transport.connection import read_info
 from zsim.transport.session import Sample, Session
 
@@ -61,7 +60,7 @@ class Membership:
         self._done_key = keys.process(agent.name, "done")
         ahead = info.command_delay_ns // info.gate_ns
         self._kept: deque[tuple[int, Sequence[Output]]] = deque(maxlen=GATES_KEPT + ahead)
-        self._unsent: batch.Batch = []
+        self._unsent: Pairs = []
         self._must_rejoin = False
         self._unproved = 0
         self._proof_ns = 0
@@ -124,20 +123,10 @@ class Membership:
         self._link.put(keys.process(self._agent.name, "bye"), bye)
 
     def _join(self) -> None:
-        join = messages.Join(
-            t_ns=max(0, self.done_ns),
-            seq=self._agent.next_seq("join"),
-            run_id=self._info.run_id,
-            incarnation=self._incarnation,
-            role=self._agent.role,
-            host=self._link.host,
-            pid=os.getpid(),
-            period_ns=self._agent.period_ns,
-            version=__version__,
-            fingerprint=fingerprint(),
-            serves=self._agent.serves,
-        )
-        self._link.put(keys.process(self._agent.name, "join"), join)
+        agent, seq, t_ns = self._agent, self._agent.next_seq("join"), max(0, self.done_ns)
+        host, run_id = self._link.host, self._info.run_id
+        join = join_of(agent.name, host, run_id, self._incarnation, seq, t_ns, agent.period_ns, agent.serves)
+        self._link.put(keys.process(agent.name, "join"), join)
 
     def _done(self, t_ns: int, sent: int) -> messages.Done:
         self.done_ns = max(self.done_ns, t_ns)
@@ -151,7 +140,7 @@ class Membership:
         """Tell whether something was asked of the world that it has not answered yet."""
         return self._must_rejoin or self._unproved > 0 or self._missed_since_ns is not None
 
-    def taken_in(self, entry: Entry) -> None:
+    def taken_in(self, entry: ProcessEntry) -> None:
         """Take the news that this process came after one of its name, or that another came after this one."""
         if entry.incarnation == self._incarnation:
             self._unproved = 0
@@ -245,3 +234,34 @@ class Membership:
             return
         self._missed_since_ns = None
         self._asked += 1
+
+
+def replay(
+    link: Session, process: str, from_ns: int, expressions: Sequence[str], timeout_s: float
+) -> Iterator[tuple[str, bytes]]:
+    """Yield (key, payload), in the order in which they passed the world, of what is stamped after `from_ns`.
+
+    The world keeps the last seconds, and answers page by page.
+
+    Args:
+        link: an open session.
+        process: name of who asks.
+        from_ns: simulated time [ns]; -1 for everything that the world still has.
+        expressions: keys that are wanted.
+        timeout_s: how long each page is waited for.
+
+    Raises:
+        NoWorldError: the world does not answer, or not with a replay; what was yielded until then is good.
+    """
+    page: int | None = 0
+    while page is not None:
+        try:
+            args = {"from_ns": from_ns, "keys": list(expressions), "page": page}
+            answer = link.request(keys.replay(process), "replay", process, args, timeout_s)
+            passed = pairs_of(answer.result) if answer.ok else []
+        except DecodeError as error:
+            raise NoWorldError(f"{process}: the world's replay is of no use: {error}") from error
+        if not answer.ok:
+            raise NoWorldError(answer.error)
+        yield from passed
+        page = answer.more

@@ -21,7 +21,7 @@ _NUMBER = re.compile(r"-?[0-9][0-9.]*")
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
 
 
-class Show(Protocol):
+class ProgressSink(Protocol):
     """Whoever takes progress."""
 
     def clock(self, line: dict[str, Any]) -> None: ...
@@ -45,7 +45,7 @@ class Throttle:
         return True
 
 
-class Reasons:
+class HoldReasons:
     """What keeps clusters from going on, told once when it lasts."""
 
     def __init__(self) -> None:
@@ -65,7 +65,7 @@ class Reasons:
         return f"  {state.t_ns / 1e9:8.2f} s  {cluster}, {state.phase}: {state.reason}"
 
 
-class Teller:
+class JsonProgress:
     """Writes progress as JSON lines for a launcher."""
 
     def clock(self, line: dict[str, Any]) -> None:

@@ -9,15 +9,16 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from zsim.contract import batch, keys, messages, world_events
-from zsim.contract.bundle import Selection, table_of, unpacked
+from zsim.contract import keys, messages, world_events
+from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import ControlAnswer
-from zsim.contract.world_events import End, Entry, Notice
+from zsim.contract.world_events import ProcessEntry, RunEnd, WorldEvent
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.agent import Agent
 from zsim.runtime.health import HealthMeter
 from zsim.runtime.inbox import Inbox
 from zsim.runtime.membership import Membership
+from zsim.runtime.routing import RoutingTable
 from zsim.scenario.fault_kinds import PROCESS_KILL
 from zsim.transport.session import Mailbox, Query, Sample, Session
 
@@ -62,13 +63,13 @@ class Runner:
         self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}
         self._estimated_by: dict[str, str] = {}
         self._boxes: dict[str, Mailbox] = {}
-        self._selection = Selection(agent.reads)
-        self._table = table_of([drone.name for drone in info.drones])
-        self._gate_box = _gate_box(agent)
-        self._notices: deque[Notice] = deque()
+        self._expressions = RoutingTable([[expression] for expression in agent.reads])
+        self._table = key_table([drone.name for drone in info.drones])
+        self._gate_key = _gate_key(agent)
+        self._notices: deque[WorldEvent] = deque()
         self._queries: deque[Query] = deque()
         self._links: deque[bool] = deque()
-        self._told: deque[messages.Faults] = deque()
+        self._fault_lists: deque[messages.Faults] = deque()
         self._list_seq = -1
         self._kills: dict[int, messages.Fault] = {}  # by id
         self._lives_after_ns: int | None = None  # what was to die up to this gate was an earlier one of its name
@@ -144,19 +145,19 @@ class Runner:
                 self._open(sample)
 
     def _open(self, sample: Sample) -> None:
-        """Take in a message, or of many in one those that the agent reads."""
-        if sample.key != self._gate_box:
+        """Take in a message, or the messages of a gate."""
+        if sample.key != self._gate_key:
             self._take_in(sample)
             return
         try:
-            bundle = unpacked(sample.payload, self._table)
-            taken = [(batch.GATE, bundle)] if self._agent.takes_bundles else self._selection.of(bundle)
+            gate = GateMessages.unpack(sample.payload, self._table)
+            if not self._agent.takes_gates:
+                gate.check()
         except DecodeError as error:
             self._refuse(error)
             return
-        self.health.received += len(bundle)
-        for key, message in taken:
-            self._inbox.put(key, message)
+        self.health.received += len(gate)
+        self._inbox.put(keys.GATE, gate)
 
     def _take_in(self, sample: Sample) -> None:
         if sample.key == keys.FAULTS:
@@ -182,8 +183,8 @@ class Runner:
         t_ns = self._inbox.next_gate_ns()
         missing = self._inbox.missing_last(t_ns) if t_ns is not None else None
         wanted = missing or self._agent.gate_keys[-1]
-        expression = next(e for e in self._agent.reads if keys.matches(e, wanted))
-        return expression if expression in self._boxes else self._gate_box
+        expression = self._agent.reads[self._expressions.readers(wanted)[0]]
+        return expression if expression in self._boxes else self._gate_key
 
     def _ready_gate(self) -> int | None:
         """Return the gate to step now, None if it must be waited for."""
@@ -215,8 +216,8 @@ class Runner:
 
     def _step(self, t_ns: int) -> None:
         start_ns = time.perf_counter_ns()
-        self._heed_faults()
-        self._agent.hear(t_ns, self._inbox.take(t_ns))
+        self._update_faults()
+        self._agent.deliver(t_ns, self._inbox.take(t_ns))
         if t_ns % self._agent.period_ns:
             return
         outputs = self._agent.step(t_ns)
@@ -228,33 +229,33 @@ class Runner:
         self.health.lag_ns = newest_ns - t_ns if newest_ns is not None else 0
 
     def _show(self, t_ns: int) -> None:
-        """Publish what eyes are shown, as often as they can follow."""
+        """Publish what is to be displayed, as often as people can follow."""
         now_s = time.monotonic()
         if now_s - self._view_wall_s >= VIEW_PERIOD_S:
             self._view_wall_s = now_s
             for key, message in self._agent.views(t_ns):
                 self._link.put(key, message)
 
-    def _heed_faults(self) -> None:
-        """Learn of faults: what the world says of them before a gate has come before that gate."""
-        while self._told:
-            told = self._told.popleft()
-            self._agent.heed(self._info, told)
-            if told.seq > self._list_seq:
-                self._list_seq = told.seq
-                self._heed_kills(told)
+    def _update_faults(self) -> None:
+        """Take the lists of faults that have come: those that the world published before a gate come before it."""
+        while self._fault_lists:
+            faults = self._fault_lists.popleft()
+            self._agent.update_faults(self._info, faults)
+            if faults.seq > self._list_seq:
+                self._list_seq = faults.seq
+                self._update_kills(faults)
 
-    def _heed_kills(self, told: messages.Faults) -> None:
-        """Learn which kills are its own: a list may have forgotten one that a late process has still to die of.
+    def _update_kills(self, faults: messages.Faults) -> None:
+        """Note which kills are its own: a list may have forgotten one that a late process has still to die of.
 
-        One that has not begun when a list is said, and is not on it, is cleared.
+        One that has not begun when a list is published, and is not on it, is cleared.
         """
-        names = (self._agent.name, *self._agent.serves)
-        begun = {n: kill for n, kill in self._kills.items() if kill.until_ns is not None and kill.until_ns <= told.t_ns}
-        self._kills = begun | {f.id: f for f in told.faults if f.kind == PROCESS_KILL and f.target in names}
+        names, t_ns = (self._agent.name, *self._agent.serves), faults.t_ns
+        begun = {n: kill for n, kill in self._kills.items() if kill.until_ns is not None and kill.until_ns <= t_ns}
+        self._kills = begun | {f.id: f for f in faults.faults if f.kind == PROCESS_KILL and f.target in names}
 
     def _die(self, t_ns: int) -> None:
-        """End, if a fault wants it in the gates that it has lived; what was said of them still goes out."""
+        """End, if a fault wants it in the gates that it has lived; their outputs still go out."""
         if self._lives_after_ns is None:
             self._lives_after_ns = t_ns - self._agent.period_ns
         for fault in self._kills.values():
@@ -264,9 +265,9 @@ class Runner:
     # Beginning and end
 
     def _subscribe(self) -> None:
-        closing = [e for e in self._agent.reads if any(keys.matches(e, key) for key in self._agent.gate_keys)]
+        closing = [self._agent.reads[place] for place in self._expressions.readers_of_any(self._agent.gate_keys)]
         for expression in dict.fromkeys([*closing, *self._agent.reads]):
-            box = self._gate_box if self._gate_box and keys.is_sensor(expression) else expression
+            box = self._gate_key if self._gate_key and keys.is_sensor(expression) else expression
             if box not in self._boxes:
                 self._boxes[box] = self._link.subscribe(box)
         self._link.on_message(keys.EVENT, self._on_event)
@@ -299,7 +300,7 @@ class Runner:
 
     def _on_faults(self, sample: Sample) -> None:
         try:
-            self._told.append(messages.decode(keys.FAULTS, sample.payload))
+            self._fault_lists.append(messages.decode(keys.FAULTS, sample.payload))
         except DecodeError:
             self.health.refused += 1
 
@@ -336,15 +337,15 @@ class Runner:
         if self._member.failure:
             self._leave = str(self._member.failure)
 
-    def _serve_notice(self, read: Notice) -> None:
-        if isinstance(read.data, End):
+    def _serve_notice(self, read: WorldEvent) -> None:
+        if isinstance(read.data, RunEnd):
             self._end_ns = read.data.last_ns
             self._end_wall_s = time.monotonic()
         elif read.kind in ("drop", "leave"):
             self._ignore_estimates(read.subject)
-        elif isinstance(read.data, Entry) and read.kind == "join":
+        elif isinstance(read.data, ProcessEntry) and read.kind == "join":
             self._expect_estimates(read.subject, read.data.from_ns)
-        elif isinstance(read.data, Entry) and read.subject == self._agent.name:
+        elif isinstance(read.data, ProcessEntry) and read.subject == self._agent.name:
             self._member.taken_in(read.data)
 
     def _ignore_estimates(self, process: str) -> None:
@@ -378,8 +379,8 @@ class Runner:
         query.answer(answer)
 
 
-def _gate_box(agent: Agent) -> str:
-    """Return on which key an agent takes the sensors of a gate in one message; none for one that does not."""
+def _gate_key(agent: Agent) -> str:
+    """Return on which key an agent takes the sensors of a gate as GateMessages; none for one that does not."""
     if len(agent.counted) > 1:
-        return batch.GATE
-    return batch.gate(agent.counted[0]) if agent.counted and agent.takes_bundles else ""
+        return keys.GATE
+    return keys.gate(agent.counted[0]) if agent.counted and agent.takes_gates else ""

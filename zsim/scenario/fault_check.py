@@ -5,7 +5,7 @@ from difflib import SequenceMatcher
 from typing import Any, NamedTuple
 
 from zsim.contract import keys
-from zsim.scenario.fault_kinds import KINDS, Kind, Parameter, expected
+from zsim.scenario.fault_kinds import KINDS, FaultKind, FaultParameter, expected
 from zsim.scenario.role_table import AGENTS
 from zsim.schema.checker import Fault as Flaw
 from zsim.schema.checker import show
@@ -50,7 +50,7 @@ def _found(given: Mapping[str, Any], field: str) -> str:
     return f"is {show(given[field])}" if field in given else "is missing"
 
 
-def _target_flaws(given: Mapping[str, Any], name: str, kind: Kind, known: Known) -> Iterator[Flaw]:
+def _target_flaws(given: Mapping[str, Any], name: str, kind: FaultKind, known: Known) -> Iterator[Flaw]:
     found, target = _found(given, "target"), given.get("target")
     if kind.strikes == "link":
         yield from _link_flaws(found, target, given.get("one_way") is True, known)
@@ -115,7 +115,7 @@ def _listed(names: tuple[str, ...]) -> str:
     return ", ".join(names[:20]) + (f", … ({len(names)})" if len(names) > 20 else "")
 
 
-def _time_flaws(given: Mapping[str, Any], name: str, kind: Kind) -> Iterator[Flaw]:
+def _time_flaws(given: Mapping[str, Any], name: str, kind: FaultKind) -> Iterator[Flaw]:
     at_s, for_s = given.get("at_s"), given.get("for_s")
     if at_s is not None and not _within(at_s, 0.0, FOR_EVER_S):
         yield "at_s", f"is {show(at_s)}; must be from 0 to {FOR_EVER_S:g} s"
@@ -127,7 +127,7 @@ def _time_flaws(given: Mapping[str, Any], name: str, kind: Kind) -> Iterator[Fla
         yield "for_s", f"is {show(for_s)}; must be > 0 and <= {FOR_EVER_S:g} s"
 
 
-def _parameter_flaws(given: Mapping[str, Any], p: Parameter, known: Known) -> Iterator[Flaw]:
+def _parameter_flaws(given: Mapping[str, Any], p: FaultParameter, known: Known) -> Iterator[Flaw]:
     value = given.get(p.name)
     if value is None:
         if p.required:
@@ -148,7 +148,7 @@ def _parameter_flaws(given: Mapping[str, Any], p: Parameter, known: Known) -> It
         yield p.name, f"is {show(value)}; must be {expected(p)}"
 
 
-def _place_flaws(value: Any, p: Parameter, known: Known) -> Iterator[Flaw]:
+def _place_flaws(value: Any, p: FaultParameter, known: Known) -> Iterator[Flaw]:
     if not isinstance(value, Mapping):
         yield p.name, f"is {show(value)}; must be {expected(p)}"
         return

@@ -16,7 +16,7 @@ PROCESS_KILL = "process_kill"
 ORIGIN = (0.0, 0.0, 0.0)  # m in W: where a process is that no `place` names
 
 
-class Parameter(NamedTuple):
+class FaultParameter(NamedTuple):
     """One number, vector, word or map of a kind.
 
     Attributes:
@@ -25,12 +25,12 @@ class Parameter(NamedTuple):
         above: whether `least` itself is not allowed.
         choices: of a word.
         default: where it is left out; `required` then says that it may not be.
-        said: what it is, for tables.
+        description: what it is, for tables.
     """
 
     name: str
     shape: Shape
-    said: str
+    description: str
     unit: str = ""
     least: float = -1e9
     most: float = 1e9
@@ -40,34 +40,34 @@ class Parameter(NamedTuple):
     required: bool = True
 
 
-class Kind(NamedTuple):
+class FaultKind(NamedTuple):
     """One kind of fault.
 
     Attributes:
         strikes: what its target is: a drone; the world; a link "a/b" of two processes; the drones of a cluster, or of
             the world, on the radio; a process.
-        said: what it does, for tables.
+        description: what it does, for tables.
         lasts: "ends" needs `for_s`, "once" takes none, "any" takes it or lasts until it is cleared.
     """
 
     strikes: Target
-    said: str
-    parameters: tuple[Parameter, ...] = ()
+    description: str
+    parameters: tuple[FaultParameter, ...] = ()
     lasts: Literal["any", "ends", "once"] = "any"
 
 
-def _number(name: str, said: str, unit: str, least: float = -1e9, most: float = 1e9, **more: Any) -> Parameter:
-    return Parameter(name, "number", said, unit, least, most, **more)
+def _number(name: str, said: str, unit: str, least: float = -1e9, most: float = 1e9, **more: Any) -> FaultParameter:
+    return FaultParameter(name, "number", said, unit, least, most, **more)
 
 
-def _vector(name: str, said: str, unit: str, most: float) -> Parameter:
-    return Parameter(name, "vector", said, unit, -most, most)
+def _vector(name: str, said: str, unit: str, most: float) -> FaultParameter:
+    return FaultParameter(name, "vector", said, unit, -most, most)
 
 
-_PROBABILITY = Parameter("probability", "number", "of each sample", "", 0.0, 1.0, default=1.0, required=False)
+_PROBABILITY = FaultParameter("probability", "number", "of each sample", "", 0.0, 1.0, default=1.0, required=False)
 _FACTOR = _number("factor", "by which the standard deviation grows", "", 1.0, 1e6, above=True)
-_ROTOR = Parameter("rotor", "choice", "which", choices=(*ROTORS, "all"))
-_ONE_WAY = Parameter("one_way", "flag", "from the first to the second only", default=False, required=False)
+_ROTOR = FaultParameter("rotor", "choice", "which", choices=(*ROTORS, "all"))
+_ONE_WAY = FaultParameter("one_way", "flag", "from the first to the second only", default=False, required=False)
 _SENSORS = {
     "imu": "IMU",
     "gps": "GPS",
@@ -91,57 +91,59 @@ _NAMES = {"accel": "accelerometer", "gyro": "gyroscope", **_SENSORS}
 _RADIO = (
     _number("range_m", "distance at which every second message is lost", "m", 0.0, 1e6, above=True),
     _number("spread_m", "over which the loss grows", "m", 0.0, 1e6, above=True, default=5.0, required=False),
-    Parameter(
+    FaultParameter(
         "place", "places", "of processes: a drone, or [x, y, z]; else the origin", "m", default={}, required=False
     ),
 )
 
-KINDS: dict[str, Kind] = {
+KINDS: dict[str, FaultKind] = {
     **{
-        f"{sensor}_dropout": Kind("drone", f"samples of the {said} are lost", (_PROBABILITY,))
+        f"{sensor}_dropout": FaultKind("drone", f"samples of the {said} are lost", (_PROBABILITY,))
         for sensor, said in _SENSORS.items()
     },
     **{
-        f"{sensor}_stuck": Kind("drone", f"the {said} shows one sample again and again")
+        f"{sensor}_stuck": FaultKind("drone", f"the {said} shows one sample again and again")
         for sensor, said in _SENSORS.items()
     },
     **{
-        f"{name}_bias": Kind("drone", f"the {_NAMES[name]} has a constant error more", (value,))
+        f"{name}_bias": FaultKind("drone", f"the {_NAMES[name]} has a constant error more", (value,))
         for name, value in _BIASES.items()
     },
-    **{f"{name}_noise": Kind("drone", f"the {_NAMES[name]} has more white noise", (_FACTOR,)) for name in _BIASES},
-    "rotor_efficiency": Kind(
+    **{f"{name}_noise": FaultKind("drone", f"the {_NAMES[name]} has more white noise", (_FACTOR,)) for name in _BIASES},
+    "rotor_efficiency": FaultKind(
         "drone", "a rotor has lost thrust", (_ROTOR, _number("value", "share of the thrust that is left", "", 0.0, 1.0))
     ),
-    "rotor_stuck": Kind(
+    "rotor_stuck": FaultKind(
         "drone",
         "a rotor turns at one speed whatever it is told",
         (_ROTOR, _number("speed_rad_s", "as it turns at the start, if left out", "rad/s", 0.0, 1e4, required=False)),
     ),
-    "gust": Kind(
+    "gust": FaultKind(
         "world",
         "the wind swells and ebbs: (1 - cos) / 2",
         (_vector("velocity_m_s", "at its peak, in W", "m/s", 100.0),),
         "ends",
     ),
-    "link_delay": Kind(
+    "link_delay": FaultKind(
         "link",
         "messages come later",
         (_number("delay_ms", "after it, a message comes at the next gate", "ms", 0.0, 60_000.0, above=True), _ONE_WAY),
     ),
-    "link_jitter": Kind(
+    "link_jitter": FaultKind(
         "link",
         "messages come later, each by another time",
         (_number("jitter_ms", "most of it, evenly spread from 0", "ms", 0.0, 60_000.0, above=True), _ONE_WAY),
     ),
-    "link_loss": Kind("link", "messages are lost", (_number("probability", "of each message", "", 0.0, 1.0), _ONE_WAY)),
-    "link_cut": Kind("link", "no message comes", (_ONE_WAY,)),
-    "radio": Kind("radio", "messages between a drone and others are lost with distance", _RADIO),
-    PROCESS_KILL: Kind("process", "the process dies as by kill -9", lasts="once"),
+    "link_loss": FaultKind(
+        "link", "messages are lost", (_number("probability", "of each message", "", 0.0, 1.0), _ONE_WAY)
+    ),
+    "link_cut": FaultKind("link", "no message comes", (_ONE_WAY,)),
+    "radio": FaultKind("radio", "messages between a drone and others are lost with distance", _RADIO),
+    PROCESS_KILL: FaultKind("process", "the process dies as by kill -9", lasts="once"),
 }
 
 
-def expected(p: Parameter) -> str:
+def expected(p: FaultParameter) -> str:
     """Return in words what a parameter may be."""
     unit = f" {p.unit}" if p.unit else ""
     if p.shape == "choice":
@@ -174,7 +176,7 @@ def planned(given: Mapping[str, Any], number: int, source: str, now_ns: int, gat
     return Fault(number, given["kind"], given["target"], parameters, from_ns, until_ns, source)
 
 
-def _plain(value: Any, p: Parameter) -> Any:
+def _plain(value: Any, p: FaultParameter) -> Any:
     """Return a value as it goes onto the wire: numbers as floats, so that the same fault is the same text."""
     if value is None:
         return p.default

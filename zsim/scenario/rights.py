@@ -6,12 +6,12 @@ Zenoh's access control is made of it (deploy), and the world answers replays by 
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from zsim.contract import batch, keys
+from zsim.contract import keys
 from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import Scenario
 
 TOLD_TO_ALL = (keys.INFO, keys.CLOCK, keys.EVENT, keys.FAULTS)
-EVERYTHING = ("**", batch.KEY, batch.GATE, batch.gate("*"))  # no wildcard takes a key that begins with @
+EVERYTHING = ("**", keys.BATCH, keys.GATE, keys.gate("*"))  # no wildcard takes a key that begins with @
 LAST_VALUES = (
     keys.INFO,
     keys.CLOCK,
@@ -87,7 +87,7 @@ def _own(process: str) -> Rights:
     )
 
 
-_READER = Rights(reads=("**", batch.KEY), asks=LAST_VALUES, watches=(keys.token("*"),))
+_READER = Rights(reads=("**", keys.BATCH), asks=LAST_VALUES, watches=(keys.token("*"),))
 _OPERATOR = Rights(writes=(keys.command("*", "*"),), asks=(keys.CONTROL, keys.cluster_control("*")))
 
 
@@ -97,7 +97,7 @@ def _about_drone(thing: str, scenario: Scenario, role: str) -> Rights:
         return Rights()
     estimate = (keys.estimate(thing),)
     return Rights(
-        reads=(keys.sensors(thing), batch.gate(thing), *estimate),
+        reads=(keys.sensors(thing), keys.gate(thing), *estimate),
         writes=(*estimate, keys.estimates_view(f"{role}.{thing}")),
         asks=(keys.status(thing), *estimate),
     )

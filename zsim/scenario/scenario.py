@@ -66,31 +66,31 @@ class Sensor(Spec, frozen=True, kw_only=True):
     mount: Mount = Mount()
 
 
-class Imu(Sensor, frozen=True, kw_only=True):
+class ImuConfig(Sensor, frozen=True, kw_only=True):
     accel_m_s2: ErrorModel = ErrorModel()
     gyro_deg_s: ErrorModel = ErrorModel()
 
 
-class Gps(Sensor, frozen=True, kw_only=True):
+class GpsConfig(Sensor, frozen=True, kw_only=True):
     position_m: ErrorModel = ErrorModel()
     velocity_m_s: ErrorModel = ErrorModel()
 
 
-class Mag(Sensor, frozen=True, kw_only=True):
+class MagConfig(Sensor, frozen=True, kw_only=True):
     field_ut: ErrorModel = ErrorModel()
 
 
-class Baro(Sensor, frozen=True, kw_only=True):
+class BaroConfig(Sensor, frozen=True, kw_only=True):
     altitude_m: ErrorModel = ErrorModel()
 
 
-class Sonar(Sensor, frozen=True, kw_only=True):
+class SonarConfig(Sensor, frozen=True, kw_only=True):
     range_m: ErrorModel = ErrorModel()
     min_m: NonNegative = 0.03
     max_m: Positive = 6.0
 
 
-class Flow(Sensor, frozen=True, kw_only=True):
+class FlowConfig(Sensor, frozen=True, kw_only=True):
     velocity_m_s: ErrorModel = ErrorModel()
 
 
@@ -100,12 +100,12 @@ class Sensors(Spec, frozen=True, kw_only=True):
     preset: Literal["ardrone2", "paper"]
     as_printed: bool = False
     """With `paper`: accelerometer 0.35 g as the paper prints it, instead of 0.35 m/s^2."""
-    imu: Imu
-    gps: Gps
-    mag: Mag
-    baro: Baro
-    sonar: Sonar
-    flow: Flow
+    imu: ImuConfig
+    gps: GpsConfig
+    mag: MagConfig
+    baro: BaroConfig
+    sonar: SonarConfig
+    flow: FlowConfig
 
 
 class Limits(Spec, frozen=True, kw_only=True):
@@ -215,7 +215,7 @@ class Trajectory(Spec, frozen=True, kw_only=True):
     waypoints: list[Waypoint] = []
 
 
-class Plan(Spec, frozen=True, kw_only=True):
+class ClusterPlan(Spec, frozen=True, kw_only=True):
     """What the controller does by itself."""
 
     takeoff_s: NonNegative | None = None
@@ -235,7 +235,7 @@ LawName = Annotated[
 ]
 
 
-class Group(Spec, frozen=True, kw_only=True):
+class ClusterGroup(Spec, frozen=True, kw_only=True):
     """So many of a cluster's drones, the next ones in its order, that are one robot of it."""
 
     name: Name
@@ -247,7 +247,7 @@ class Group(Spec, frozen=True, kw_only=True):
 class Cluster(Spec, frozen=True, kw_only=True):
     name: Name
     drones: Annotated[list[Name], Meta(min_length=2, max_length=ROBOTS_MAX)]
-    groups: list[Group] = []
+    groups: list[ClusterGroup] = []
     """Empty: every drone is a robot of the cluster by itself."""
     space: SpaceName | None = None
     """None: see `space_name`."""
@@ -256,7 +256,7 @@ class Cluster(Spec, frozen=True, kw_only=True):
     law: LawName | UnsetType = UNSET
     """Unset: proportional. Left out of the resolved text then, which names the scenario by its hash."""
     gains: Gains = Gains()
-    plan: Plan = Plan()
+    plan: ClusterPlan = ClusterPlan()
 
 
 ESTIMATORS = ("ekf", "paper")  # of this product; the first flies unless a scenario chooses
@@ -285,7 +285,7 @@ class Processes(Spec, frozen=True, kw_only=True):
     on_death: dict[str, OnDeath] = {}
 
 
-class Time(Spec, frozen=True, kw_only=True):
+class TimeSteps(Spec, frozen=True, kw_only=True):
     """Steps of simulated time; all chosen."""
 
     gate_ms: Annotated[float, Meta(gt=0, le=1000)] = 20.0  # 50 Hz, against the formation loop's 1.7 s
@@ -307,7 +307,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
     federation: Name = "zsim"
     seed: Annotated[int, Meta(ge=0, le=2**62)] = 1
     duration_s: Annotated[float, Meta(gt=0, le=1e6)]
-    time: Time = Time()
+    time: TimeSteps = TimeSteps()
     environment: Environment = Environment()
     silence: Silence = Silence()
     drones: Annotated[list[Drone], Meta(min_length=1, max_length=DRONES_MAX)]

@@ -77,9 +77,9 @@ def _check_union(value: Any, info: types.UnionType, path: str) -> Iterator[Fault
     if value is None and info.includes_none:
         return
     others = [option for option in info.types if not isinstance(option, types.NoneType)]
-    found = [list(_check(value, option, path)) for option in others]
-    if all(found):
-        yield from min(found, key=len)
+    faults_of_each = [list(_check(value, option, path)) for option in others]
+    if all(faults_of_each):
+        yield from min(faults_of_each, key=len)
 
 
 def _check_struct(value: Any, info: types.StructType, path: str) -> Iterator[Fault]:

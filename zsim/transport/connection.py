@@ -9,8 +9,8 @@ from functools import partial
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError, NoWorldError, SessionError
 from zsim.transport import session
-from zsim.transport.identity import Identity
 from zsim.transport.session import Session
+from zsim.transport.tls import Identity
 
 ATTEMPT_S = 1.0  # one try to connect, so that waiting can be shown and interrupted
 PAUSE_S = 0.1  # between two questions to a hub where no world answers: another federation's, or one on its way up

@@ -19,11 +19,11 @@ import zenoh
 import zenoh.ext
 from msgspec import Struct
 
-from zsim.contract import batch, messages
+from zsim.contract import keys, messages
 from zsim.contract.messages import ControlAnswer, ControlRequest
 from zsim.errors import SessionError
 from zsim.transport import tls, zenoh_settings
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode, Settings
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -95,7 +95,7 @@ class Session:
             publisher = self._publishers.get(key) or self._declare(key)
             publisher.put(payload)
 
-    def heard(self, key: str) -> bool:
+    def has_readers(self, key: str) -> bool:
         """Tell whether anybody subscribes to a key of ours."""
         if key not in self._heard:
             self._listen_for_readers(key)
@@ -120,7 +120,7 @@ class Session:
 
     def _declare(self, key: str) -> zenoh.Publisher:
         view = key.startswith("view/")
-        drop = view or (self._realtime and ("/sensor/" in key or key.startswith(batch.GATE)))
+        drop = view or (self._realtime and keys.may_drop(key))
         control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
         # A queue of its own: in one with others, a view that the hub passes on would wait behind a put that blocks.
         priority = zenoh.Priority.DATA_LOW if view else zenoh.Priority.DATA
@@ -141,7 +141,7 @@ class Session:
         with _named(expression):
             return self._kept_box(Mailbox(self._raw, self._prefix, expression))
 
-    def overhear(self, without: tuple[str, ...]) -> "Mailbox":
+    def subscribe_others(self, without: tuple[str, ...]) -> "Mailbox":
         """Return a mailbox that takes everything that other sessions publish, but on keys that begin so.
 
         Nothing wakes who waits for it.

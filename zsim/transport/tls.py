@@ -1,4 +1,4 @@
-"""Why a TLS link does not come up, in words: Zenoh says no more than that it could not connect.
+"""Who a process is on the network, and why a TLS link does not come up: Zenoh says only that it could not connect.
 
 Python's ssl does the same handshake with the same files and is told the reason. Dates are left to this file, so that
 a certificate whose time is over can still be read and named.
@@ -10,10 +10,11 @@ import re
 import socket
 import ssl
 import time
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
-from zsim.transport.identity import CERTIFICATES, Identity
-
+CERTIFICATES = AUTHORITY, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"  # in a folder of `zsim certs init`
+DAYS = 30.0  # how long a certificate is good for, as it lies on its host
 PROBE_S = 2.0  # of one step of the handshake; a process that listens and is not frozen answers within milliseconds
 LATE_S = 1.0  # in TLS 1.3 a server judges the client's certificate after the client thinks that all is well
 NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME, openssl/x509_vfy.h
@@ -24,6 +25,39 @@ RENEW = f"{MEND} --renew"
 _ENDPOINT = re.compile(r"(?:tls|quic)/\[?(?P<host>[^\]]*?)\]?:(?P<port>\d+)(?:[?#].*)?")
 _UNRELATED = (18, 19, 20, 21)  # X509_V_ERR_ self-signed, self-signed in chain, no issuer here, signature unverified
 _MISNAMED = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
+
+
+class Identity(NamedTuple):
+    """Who a process is, as whoever starts it says: its host, its certificate, and whom it lets in.
+
+    Attributes:
+        host: the name that its messages give.
+        tls: folder with ca.pem, certificate.pem and key.pem; None goes without TLS.
+        access: file with Zenoh's access control, for a process that listens; None lets everybody in.
+        insecure: whether links may leave the machine without TLS.
+    """
+
+    host: str = socket.gethostname()
+    tls: Path | None = None
+    access: Path | None = None
+    insecure: bool = False
+
+    @property
+    def authority(self) -> Path:
+        """The certificate of the authority that signs for everybody."""
+        return self._file(AUTHORITY)
+
+    @property
+    def certificate(self) -> Path:
+        return self._file(CERTIFICATE)
+
+    @property
+    def key(self) -> Path:
+        return self._file(KEY)
+
+    def _file(self, name: str) -> Path:
+        assert self.tls is not None
+        return self.tls / name
 
 
 def is_tls(endpoint: str) -> bool:
@@ -56,10 +90,10 @@ def own_fault(identity: Identity) -> str | None:
                 f"{', '.join(CERTIFICATES[:2])} and {CERTIFICATES[2]}, as zsim certs init makes"
             )
     try:
-        found = _read_own(identity)
+        certificate = _read_own(identity)
     except (ssl.SSLError, ValueError) as error:
         return f"{identity.tls}: certificate.pem, key.pem and ca.pem do not go together ({_reason(error)}); {MEND}"
-    return _date_fault(found)
+    return _date_fault(certificate)
 
 
 def no_link(identity: Identity, endpoint: str, error: str) -> str:
@@ -131,20 +165,21 @@ def _reason(error: Exception) -> str:
     return reason.lower().replace("_", " ")
 
 
-def _date_fault(found: dict[str, Any]) -> str | None:
+def _date_fault(certificate: dict[str, Any]) -> str | None:
     """Return whether a certificate's time is over, or not yet come."""
-    if not found:
+    if not certificate:
         return None
     now_s = time.time()
-    if now_s > ssl.cert_time_to_seconds(found["notAfter"]):
-        return f"the certificate of {_name(found)} expired on {_day(found['notAfter'])}; {RENEW}"
-    if now_s < ssl.cert_time_to_seconds(found["notBefore"]):
-        return f"the certificate of {_name(found)} is valid from {_day(found['notBefore'])}; set the clock of this host"
+    if now_s > ssl.cert_time_to_seconds(certificate["notAfter"]):
+        return f"the certificate of {_name(certificate)} expired on {_day(certificate['notAfter'])}; {RENEW}"
+    if now_s < ssl.cert_time_to_seconds(certificate["notBefore"]):
+        since = _day(certificate["notBefore"])
+        return f"the certificate of {_name(certificate)} is valid from {since}; set the clock of this host"
     return None
 
 
-def _name(found: dict[str, Any]) -> str:
-    names = dict(pair for part in found["subject"] for pair in part)
+def _name(certificate: dict[str, Any]) -> str:
+    names = dict(pair for part in certificate["subject"] for pair in part)
     return names.get("commonName", "nobody")
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from zsim.errors import SessionError
 from zsim.transport import tls
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 
 LEASE_LOCKSTEP_MS = 3_600_000  # a stopped or debugged process must not lose its link in lockstep
 LEASE_REALTIME_MS = 1_000
@@ -103,19 +103,19 @@ def _security(identity: Identity, endpoints: Sequence[str], doing: str) -> Setti
         "connect_certificate": identity.certificate,
         "connect_private_key": identity.key,
     }
-    found = {f"{_TLS}/{name}": json.dumps(str(path.resolve())) for name, path in files.items()}
-    found[f"{_TLS}/enable_mtls"] = "true"
+    settings = {f"{_TLS}/{name}": json.dumps(str(path.resolve())) for name, path in files.items()}
+    settings[f"{_TLS}/enable_mtls"] = "true"
     if identity.access is not None:
-        found[ACCESS] = json.dumps(_read_access(identity))
-    return found
+        settings[ACCESS] = json.dumps(_read_access(identity))
+    return settings
 
 
 def refusal(path: str, value: str, identity: Identity) -> str:
     """Return what to say of a setting that Zenoh refuses: only endpoints and access control come from a person."""
     if path == ACCESS:
         return f"{identity.access}: is no access control of Zenoh's; must be an access.json of zsim certs init"
-    found = ", ".join(map(repr, json.loads(value)))
-    return f"endpoint is {found}; must be PROTOCOL/ADDRESS such as tcp/127.0.0.1:7447"
+    endpoints = ", ".join(map(repr, json.loads(value)))
+    return f"endpoint is {endpoints}; must be PROTOCOL/ADDRESS such as tcp/127.0.0.1:7447"
 
 
 def _agree(identity: Identity, endpoints: Sequence[str]) -> None:

@@ -106,7 +106,7 @@ class EstimatorSet:
         """Hand a message over to the estimator of drone i."""
         self._estimators[i].receive(sensor, message)
 
-    def receive_bundle(self, bundle: Any) -> bool:
+    def receive_gate(self, gate: Any) -> bool:
         """Refuse it: its messages are to be handed over one by one."""
         return False
 

@@ -1,17 +1,17 @@
 """The estimator of one drone, or of several, as an agent: sensors in, an estimate of each drone out at every gate."""
 
-import contextlib
 from collections.abc import Sequence
 from typing import Any
 
 from msgspec import Struct
 
-from zsim.contract import batch, keys, messages
-from zsim.contract.bundle import Bundle, Selection, table_of
+from zsim.contract import keys, messages
+from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.views import estimate_view
-from zsim.errors import DecodeError, RunError
+from zsim.errors import RunError
 from zsim.math.compiled import COMPILES
 from zsim.runtime.agent import Agent, Output
+from zsim.runtime.routing import Input
 from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.drone_estimator import EstimatorSet, estimator_class
 from zsim_agents.estimation.estimator_bank import EstimatorBank
@@ -50,30 +50,24 @@ class Estimator(Agent):
         self.reads = tuple(keys.sensors(drone) for drone in names) if make else _reads(names)
         self._last: list[messages.Estimate] = []
         self._view_key = keys.estimates_view(self.name)
-        self.takes_bundles = COMPILES and not make
-        self._selection = Selection(self.reads)
+        self.takes_gates = COMPILES and not make
         self._since_ns = 0
         self._index = {drone: i for i, drone in enumerate(names)}
 
-    def hear(self, t_ns: int, inputs: Sequence[tuple[str, Any]]) -> None:
+    def deliver(self, t_ns: int, inputs: Sequence[Input]) -> None:
         self._since_ns = t_ns - self.period_ns
-        super().hear(t_ns, inputs)
+        super().deliver(t_ns, inputs)
 
     def receive(self, key: str, message: Any) -> None:
-        if key == batch.GATE:
-            self._receive_bundle(message)
-        elif not isinstance(message, messages.Status):
+        if not isinstance(message, messages.Status):
             # what a slow link brings has not arrived before the last gate, whatever stamp it bears
             t_arrival_s = max(message.t_ns, self._since_ns) * 1e-9
             _, drone, what = keys.parts(key)
             self._estimators.receive(self._index[drone], what.removeprefix("sensor/"), message, t_arrival_s)
 
-    def _receive_bundle(self, bundle: Bundle) -> None:
-        if self._estimators.receive_bundle(bundle):
-            return
-        with contextlib.suppress(DecodeError):  # not the world's: it is as good as lost
-            for key, message in self._selection.of(bundle):
-                self.receive(key, message)
+    def receive_gate(self, gate: GateMessages) -> None:
+        if not self._estimators.receive_gate(gate):
+            super().receive_gate(gate)
 
     def step(self, t_ns: int) -> list[Output]:
         estimates = self._estimators.estimate(t_ns * 1e-9)
@@ -98,7 +92,7 @@ class Estimator(Agent):
             "baro": messages.Baro(t_ns, 0, t_ns, 101_325.0, 0.0),
         }
         payloads = [(keys.sensor(drone, sensor), messages.encode(message)) for sensor, message in readings.items()]
-        bank.receive_bundle(Bundle.of(t_ns, 0, table_of(self.counted), payloads))
+        bank.receive_gate(GateMessages.of(t_ns, 0, key_table(self.counted), payloads))
         bank.estimate(t_ns * 1e-9)
 
     def warm_start_keys(self) -> tuple[str, ...]:

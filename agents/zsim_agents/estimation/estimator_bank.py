@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.contract.bundle import Bundle
+from zsim.contract.framing import GateMessages
 from zsim.contract.keys import SENSORS
 from zsim.contract.messages import Estimate
 from zsim.math.compiled import portable
@@ -84,11 +84,11 @@ class EstimatorBank:
         _READING.pack_into(self._room, place, i, kind, t_sample_s if kind == IMU else t_arrival_s, t_sample_s, *values)
         self._count += 1
 
-    def receive_bundle(self, bundle: Bundle) -> bool:
-        """Take all sensors in a bundle; False, and none, if one of its messages is not as the world writes it."""
-        while self._count + len(bundle) > len(self._readings):
+    def receive_gate(self, gate: GateMessages) -> bool:
+        """Take all sensors of a gate; False, and none, if one of its messages is not as the world writes it."""
+        while self._count + len(gate) > len(self._readings):
             self._grow()
-        count = self._reader.take(bundle, self._readings, self._count)
+        count = self._reader.take(gate, self._readings, self._count)
         if count >= 0:
             self._count = count
         return count >= 0

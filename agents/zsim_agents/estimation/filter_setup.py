@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from zsim.contract.keys import SENSORS
-from zsim.scenario.scenario import Drone, Environment, ErrorModel, Estimation, Imu, Sensor, Sensors
+from zsim.scenario.scenario import Drone, Environment, ErrorModel, Estimation, ImuConfig, Sensor, Sensors
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 from zsim_agents.estimation.dead_reckoning import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
 from zsim_agents.estimation.filter_state import (
@@ -113,19 +113,19 @@ def has_bias(error: ErrorModel) -> bool:
     return error.bias > 0.0 or error.bias_walk > 0.0
 
 
-def accel_sigma(imu: Imu) -> float:
+def accel_sigma(imu: ImuConfig) -> float:
     """Return the accelerometer's white noise per sample [m/s^2]."""
     return max(white_sigma(imu.accel_m_s2, BOARD_RATE_HZ), ACCEL_SIGMA_MIN)
 
 
-def madgwick_beta(estimation: Estimation, imu: Imu, gravity: float) -> float:
+def madgwick_beta(estimation: Estimation, imu: ImuConfig, gravity: float) -> float:
     """Return the gain [rad/s]: the scenario's, or what levels in `LEVELLING_S` under the IMU's noise."""
     if estimation.madgwick_beta is not None:
         return estimation.madgwick_beta
     return beta_for(LEVELLING_S, accel_sigma(imu) / gravity)
 
 
-def process_noise(imu: Imu, beta: float, gravity: float) -> ProcessNoise:
+def process_noise(imu: ImuConfig, beta: float, gravity: float) -> ProcessNoise:
     """Return the noise of dead reckoning with an IMU and a Madgwick gain [rad/s]."""
     direction_sigma = accel_sigma(imu) / gravity
     return ProcessNoise(

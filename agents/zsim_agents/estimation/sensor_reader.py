@@ -1,4 +1,4 @@
-"""Reads the sensors of several drones out of a bundle, straight into the rows of an EstimatorBank."""
+"""Reads the sensors of several drones out of a gate's messages, straight into the rows of an EstimatorBank."""
 
 from collections.abc import Sequence
 
@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract import encoding, keys, messages
-from zsim.contract.bundle import Bundle
 from zsim.contract.encoding import GAP, Layouts, Program
+from zsim.contract.framing import GateMessages
 from zsim.contract.keys import SENSORS
 from zsim.math.compiled import portable
 from zsim_agents.estimation.filter_state import BARO, FLOW, GPS, IMU, READING, SIZES, SONAR, VALUES_MAX
@@ -41,19 +41,19 @@ class GateReader:
         self._floats = np.zeros(layouts.floats)
         self._bits = self._floats.view(np.uint64)
 
-    def take(self, bundle: Bundle, readings: NDArray[np.float64], count: int) -> int:
+    def take(self, gate: GateMessages, readings: NDArray[np.float64], count: int) -> int:
         """Write readings from row `count` on; return how many rows there are then, -1 if a message must be decoded.
 
         Args:
-            readings: (M, READING.size), with room for all messages of the bundle.
+            readings: (M, READING.size), with room for all messages of the gate.
         """
-        if bundle.table is not self._table:
-            self._learn(bundle.table)
-        data = np.frombuffer(bundle.buffer, dtype=np.uint8)
-        for array in (bundle.which, bundle.ends, data):
+        if gate.table is not self._table:
+            self._learn(gate.table)
+        data = np.frombuffer(gate.buffer, dtype=np.uint8)
+        for array in (gate.which, gate.ends, data):
             array.setflags(write=False)  # as off the wire: what may be written is compiled anew
         row = (self._ints, self._floats, self._bits)
-        return collect(self._program, self._owner, bundle.which, bundle.ends, data, row, readings, count)
+        return collect(self._program, self._owner, gate.which, gate.ends, data, row, readings, count)
 
     def _learn(self, table: Sequence[str]) -> None:
         self._table = table
@@ -71,7 +71,7 @@ def collect(
     readings: NDArray,
     count: int,
 ) -> int:
-    """Write what a bundle has of sensors as readings, of each drone by time and name; see GateReader.take."""
+    """Write what a gate has of sensors as readings, of each drone by time and name; see GateReader.take."""
     ints, floats, bits = row
     start, first = 0, count
     marks = np.empty(which.shape[0], np.int64)

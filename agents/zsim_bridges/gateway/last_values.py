@@ -4,9 +4,8 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 
-from zsim.contract import batch, keys, messages
-from zsim.contract.bundle import Bundle, table_of, unpacked
-from zsim.errors import DecodeError
+from zsim.contract import keys, messages
+from zsim.contract.framing import GateMessages, key_table
 
 WAITING_MAX = 256  # echoes of a key; a paused world returns none, and clients may go on
 DELETED = None
@@ -53,25 +52,21 @@ KEYS_MAX = 200_000  # kept; 1000 drones have about 12 000
 
 
 class LastValues:
-    """Filled by the batches that the world publishes; payloads are unpacked when they are read.
+    """Filled by the batches that the world publishes; payloads are GateMessages.unpack when they are read.
 
     Args:
         drones: their names, as `world/info` gives them.
-
-    Attributes:
-        refused: batches and bundles that were none.
     """
 
     def __init__(self, drones: Sequence[str]) -> None:
-        self._table = table_of(drones)
+        self._table = key_table(drones)
         self._indices = {key: index for index, key in enumerate(self._table)}
         self._payloads: dict[str, bytes] = {}
         self._own_bytes = 0
         self._lock = threading.Lock()  # clients' thread and the world's both add to what is counted
         self._encodings: dict[str, tuple[bytes, str]] = {}
         self._echoes = EchoFilter(KEYS_MAX)
-        self._bundled: dict[int, tuple[Bundle, int]] = {}
-        self.refused = 0
+        self._of_gates: dict[int, tuple[GateMessages, int]] = {}
 
     def add(self, key: str, payload: bytes, encoding: str = "") -> None:
         """Store a message; of an encoding that is not its key's where one is given."""
@@ -117,37 +112,16 @@ class LastValues:
         payload, encoding = self._encodings.get(key, (None, ""))
         return encoding if encoding and payload == self._payloads.get(key) else messages.encoding(key)
 
-    def add_batch(self, payload: bytes) -> list[tuple[str, bytes]]:
-        """Take everything that passed the world since the last time; return what came beside the drones' messages."""
-        try:
-            passed = batch.decode(payload)
-        except DecodeError:
-            self.refused += 1
-            return []
-        alone = [(key, said) for key, said in passed if key != batch.GATE]
-        for key, said in passed:
-            if key == batch.GATE:
-                self._add_bundle(said)
-            else:
-                self._add_received(key, said)
-        return alone
-
-    def _add_received(self, key: str, payload: bytes) -> None:
+    def add_passed(self, key: str, payload: bytes) -> None:
+        """Store one message that has passed the world."""
         with self._lock:
             if not self._echoes.is_stale(key, payload):
                 self._add(key, payload, "")
 
-    def _add_bundle(self, payload: bytes) -> None:
-        try:
-            bundle = unpacked(payload, self._table)
-        except DecodeError:
-            self.refused += 1
-            return
-        if not bundle.is_sound():
-            self.refused += 1
-            return
-        for m, place in enumerate(bundle.which.tolist()):
-            self._bundled[place] = (bundle, m)
+    def add_gate(self, gate: GateMessages) -> None:
+        """Store the world's messages of a gate, whose columns have been checked."""
+        for m, place in enumerate(gate.which.tolist()):
+            self._of_gates[place] = (gate, m)
 
     def matching(self, expression: str, prefix: str = "") -> list[tuple[str, bytes]]:
         """Return keys and payloads that an expression matches, in order of the keys.
@@ -160,10 +134,10 @@ class LastValues:
             key = expression.removeprefix(prefix)
             payload = self._payload(key) if expression.startswith(prefix) else None
             return [(key, payload)] if payload is not None else []
-        known = {*self._payloads, *(self._table[place] for place in list(self._bundled))}  # filled in another thread
+        known = {*self._payloads, *(self._table[place] for place in list(self._of_gates))}  # filled in another thread
         matching = sorted(key for key in known if keys.matches(expression, prefix + key))
         return [(key, payload) for key in matching if (payload := self._payload(key)) is not None]
 
     def _payload(self, key: str) -> bytes | None:
-        found = self._bundled.get(self._indices.get(key, -1))
-        return found[0].payload(found[1]) if found else self._payloads.get(key)
+        gate, m = self._of_gates.get(self._indices.get(key, -1), (None, 0))
+        return gate.payload(m) if gate else self._payloads.get(key)

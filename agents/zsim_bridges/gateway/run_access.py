@@ -6,11 +6,13 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from zsim.contract import batch, keys, messages
+from zsim.contract import keys, messages
+from zsim.contract.framing import GateMessages
 from zsim.contract.messages import ControlAnswer, Info
 from zsim.errors import DecodeError
 from zsim.scenario import rights, scenario_file
-from zsim.transport.session import Heard, Mailbox, Session, check_expression
+from zsim.transport.session import Heard, Session, check_expression
+from zsim.transport.traffic import Passed, Traffic
 from zsim_bridges.gateway.key_policy import (
     ForbiddenError,
     MessageDefaults,
@@ -53,7 +55,7 @@ class RunAccess:
         self._prefix = f"{link.federation}/"
         self._threads = ThreadPoolExecutor(REQUESTS_MAX, thread_name_prefix="ask")
         self._pending = 0
-        self._box: Mailbox | None = None
+        self._traffic: Traffic | None = None
         scenario = scenario_file.from_text(info.scenario)
         self._may_write = rights.of(observer.name, scenario).writes if secured else None
         self.required_processes = [(name, name.partition(".")[2]) for name in scenario.expected()]
@@ -68,8 +70,8 @@ class RunAccess:
 
     def open(self) -> None:
         """Subscribe to what passes the world, and read the last values of before."""
-        self._box = self.link.subscribe(batch.KEY)
-        self.link.hear("view/**", lambda sample: self.values.add(sample.key, sample.payload))  # views are in no batch
+        self._traffic = Traffic(self.link, [drone.name for drone in self.info.drones], self._count_refused)
+        self.link.hear("view/**", lambda sample: self.values.add(sample.key, sample.payload))  # they do not pass it
         for expression in rights.LAST_VALUES:
             for sample in self.link.get(expression):
                 self.values.add(sample.key, sample.payload)
@@ -78,25 +80,30 @@ class RunAccess:
 
     def receive_until_end(self, stopped: Callable[[], bool]) -> None:
         """Store what passes the world until the run is over or `stopped` returns true."""
-        assert self._box is not None
+        assert self._traffic is not None
         over = threading.Event()
-        ticker = threading.Thread(target=_tick, args=(self._box, over), name="tick", daemon=True)
+        ticker = threading.Thread(target=_tick, args=(self._traffic, over), name="tick", daemon=True)
         ticker.start()
         try:
             while not self._observer.end_reason and not stopped():
-                sample = self._box.receive()
-                if sample is not None:
-                    self._add_batch(sample.payload)
+                self._add_passed(self._traffic.receive())
                 self._observer.tick()
         finally:
             over.set()
             ticker.join()
 
-    def _add_batch(self, payload: bytes) -> None:
-        self._observer.health.received += 1
-        for key, said in self.values.add_batch(payload):
-            if key == keys.CLOCK:
-                self._observer.update_clock(said)
+    def _add_passed(self, passed: Sequence[Passed]) -> None:
+        self._observer.health.received += bool(passed)
+        for entry in passed:
+            if isinstance(entry, GateMessages):
+                self.values.add_gate(entry)
+                continue
+            self.values.add_passed(entry.key, entry.payload)
+            if entry.key == keys.CLOCK:
+                self._observer.update_clock(entry.payload)
+
+    def _count_refused(self) -> None:
+        self._observer.health.refused += 1
 
     def close(self) -> None:
         """Give up requests that wait."""
@@ -250,6 +257,6 @@ class RunAccess:
             self._pending -= 1
 
 
-def _tick(box: Mailbox, over: threading.Event) -> None:
+def _tick(traffic: Traffic, over: threading.Event) -> None:
     while not over.wait(TICK_S):
-        box.wake()
+        traffic.wake()

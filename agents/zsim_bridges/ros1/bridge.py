@@ -89,7 +89,7 @@ class Bridge:
             intake.close()
 
     async def _forward_all(self, intake: Intake) -> None:
-        for said in intake.batches():
+        for said in intake.arrivals():
             for key, payload in said:
                 self.forward(key, payload)
             await asyncio.sleep(0)  # let connections have their turn

@@ -15,8 +15,8 @@ from zsim.errors import SessionError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.transport import session
-from zsim.transport.identity import Identity
 from zsim.transport.session import Heard, Session
+from zsim.transport.tls import Identity
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
 from zsim_bridges.ros2.commands import RosCommands

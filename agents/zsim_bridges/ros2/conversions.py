@@ -147,7 +147,7 @@ def pressure(message: messages.Baro, frame: str) -> Any:
     return ros.sensor_msgs__msg__FluidPressure(header(message.t_sample_ns, frame), message.pressure_pa, 0.0)
 
 
-def sonar_range(message: messages.Sonar, frame: str, sonar: scenario.Sonar, variance: float) -> Any:
+def sonar_range(message: messages.Sonar, frame: str, sonar: scenario.SonarConfig, variance: float) -> Any:
     """Return a distance; without an echo it is +Inf (REP-117)."""
     return ros.sensor_msgs__msg__Range(
         header(message.t_sample_ns, frame),

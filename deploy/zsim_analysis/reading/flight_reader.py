@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct
 
 from zsim.contract import keys
-from zsim.contract.bundle import Bundle
+from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Bye, Event, Info, Join, Quaternion, Vector3
 from zsim.record import Recorded, RecordReader
 from zsim_analysis.reading.flight import TRUTH_WIDTH, ClusterStates, RecordedFlight, RunParticipant, Track
@@ -115,9 +115,9 @@ class FlightReader:
         if handler := self.handler(key):
             handler[1](_thing(key), message)
 
-    def add_bundle(self, bundle: Bundle, wall_ns: int) -> None:
+    def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         """Add the world's messages of a gate of a flight in this process."""
-        for key, payload in bundle.encoded:
+        for key, payload in gate.pairs:
             if handler := self.handler(key):
                 handler[1](_thing(key), handler[0].decode(payload))
 

@@ -1,21 +1,17 @@
 """The fingerprint of a flight, computed again from the record."""
 
-import hashlib
-
 import numpy as np
 from msgspec import Struct
 
+from zsim.contract.truth_hash import TruthHash
 from zsim_analysis.reading.flight import TRUTH_WIDTH, Track
 
-_ROW = np.dtype([("t", "<i8"), ("x", "<f8", TRUTH_WIDTH)])
 
-
-class TruthHash(Struct, frozen=True):
+class RecordedTruth(Struct, frozen=True):
     """SHA-256 of the truth on record, and how much of it that is.
 
     Attributes:
-        sha256: over t_ns, position, velocity, orientation, angular velocity of every truth message, by time,
-            then in the order of the drones; little-endian.
+        sha256: as TruthHash of every truth message, by time, then in the order of the drones.
         instants: truth messages that went into it.
         missing: truth messages that a whole run of this length would have besides.
     """
@@ -25,7 +21,7 @@ class TruthHash(Struct, frozen=True):
     missing: int
 
 
-def truth_hash(tracks: list[Track], gate_ns: int | None, first_ns: int, last_ns: int) -> TruthHash:
+def recorded_truth(tracks: list[Track], gate_ns: int | None, first_ns: int, last_ns: int) -> RecordedTruth:
     """Return the hash of the truth of drones in scenario order.
 
     Args:
@@ -34,18 +30,12 @@ def truth_hash(tracks: list[Track], gate_ns: int | None, first_ns: int, last_ns:
         first_ns: the first instant of the run.
         last_ns: the last instant of the run as far as it is known.
     """
-    rows = np.concatenate([_rows(track) for track in tracks] or [np.zeros(0, _ROW)])
+    t_ns = np.concatenate([track.t_ns for track in tracks] or [np.zeros(0, np.int64)])
+    states = np.concatenate([track.truth for track in tracks] or [np.zeros((0, TRUTH_WIDTH))])
     drone = np.repeat(np.arange(len(tracks)), [len(track.t_ns) for track in tracks])
-    ordered = rows[np.lexsort((drone, rows["t"]))]
-    return TruthHash(
-        hashlib.sha256(ordered.tobytes()).hexdigest(), len(rows), _missing(tracks, gate_ns, first_ns, last_ns)
-    )
-
-
-def _rows(track: Track) -> np.ndarray:
-    rows = np.zeros(len(track.t_ns), _ROW)
-    rows["t"], rows["x"] = track.t_ns, track.truth
-    return rows
+    order, truth = np.lexsort((drone, t_ns)), TruthHash(len(t_ns))
+    truth.add(t_ns[order], states[order])
+    return RecordedTruth(truth.hexdigest(), len(t_ns), _missing(tracks, gate_ns, first_ns, last_ns))
 
 
 def _missing(tracks: list[Track], gate_ns: int | None, first_ns: int, last_ns: int) -> int:

@@ -13,7 +13,7 @@ from zsim.record.run_folder import record_notes
 from zsim_analysis.reading.flight import RecordedFlight, RunParticipant
 from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m, window
 from zsim_analysis.reading.recorded_run import command_age_ms
-from zsim_analysis.reading.recorded_truth import TruthHash, truth_hash
+from zsim_analysis.reading.recorded_truth import RecordedTruth, recorded_truth
 
 # I. Mas, S. Curi, R. Sanchez Pena, Open-source Multi-UAV Simulator for the ROS Environment.
 # Table I: standard deviation of the formation parameters for Test 1 after steady state; m and rad.
@@ -150,16 +150,16 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
     )
 
 
-def _hash(flight: RecordedFlight, last_ns: int) -> TruthHash:
+def _hash(flight: RecordedFlight, last_ns: int) -> RecordedTruth:
     """Return the hash of truth; a flight has truth from 0 or the first gate on, a replay from where it was begun."""
     gate_ns = flight.info.gate_ns if flight.info else None
     first_ns = flight.first_ns if flight.replay_of else min(flight.first_ns, gate_ns or 0)
-    return truth_hash(flight.tracks, gate_ns, first_ns, last_ns)
+    return recorded_truth(flight.tracks, gate_ns, first_ns, last_ns)
 
 
 def _notes(
     flight: RecordedFlight,
-    truth: TruthHash,
+    truth: RecordedTruth,
     formations: list[Formation],
     window_s: tuple[float, float],
     window_note: str,
@@ -230,7 +230,7 @@ def _record_notes(flight: RecordedFlight) -> list[str]:
     return notes
 
 
-def _truth_notes(truth: TruthHash, reported: str | None) -> list[str]:
+def _truth_notes(truth: RecordedTruth, reported: str | None) -> list[str]:
     notes = []
     if truth.missing:
         notes.append(f"{truth.missing} of {truth.missing + truth.instants} truth messages are not on record.")

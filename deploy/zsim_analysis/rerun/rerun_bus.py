@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from zsim.contract import keys, messages
-from zsim.contract.bundle import KINDS, Bundle
+from zsim.contract.framing import GateMessages
 from zsim.contract.messages import ControlRequest
 from zsim.errors import RunError
 from zsim.record import Recorded
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus
-from zsim.runtime.group import Group
+from zsim.runtime.group import AgentGroup
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
 from zsim_analysis.reading.recorded_run import decode_or_none
@@ -20,12 +20,11 @@ from zsim_analysis.rerun.truth_comparison import OutputComparison
 from zsim_world.flight.world import World
 
 FLIGHT_REQUESTS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # requests that change a flight
-TRUTH = KINDS.index("truth")
 
 Requests = dict[int, list[tuple[str, ControlRequest]]]
 
 
-class AgentsWithRequests(Group):
+class AgentsWithRequests(AgentGroup):
     """Agents of one process that receive the recorded requests again.
 
     Args:
@@ -97,14 +96,12 @@ class RerunBus(Bus):
         if isinstance(message, (*OUTPUTS, messages.Command)):
             self.outputs.add(key, message)
 
-    def _keep_truth(self, bundle: Bundle) -> None:
-        places: list[int] = bundle.which.tolist()
-        truth = ((m, place) for m, place in enumerate(places) if place % len(KINDS) == TRUTH)
-        self.truth = {keys.thing(bundle.table[place]): bundle.payload(m) for m, place in truth}
+    def _keep_truth(self, gate: GateMessages) -> None:
+        self.truth = {keys.thing(key): payload for key, payload in gate.pairs if keys.leaf(key) == "truth"}
 
-    def _tell_faults(self, faults: messages.Faults) -> None:
+    def _update_faults(self, faults: messages.Faults) -> None:
         if self._rerun:  # alone, the world receives the commands that resulted from them
-            super()._tell_faults(faults)
+            super()._update_faults(faults)
 
     def _feed(self, recorded: Recorded) -> None:
         key, message = recorded.key, decode_or_none(recorded)
@@ -130,7 +127,7 @@ class RerunBus(Bus):
         if source in self._rerun:
             self.outputs.add(key, message)
             return
-        for inbox in self._way(key).inboxes:
+        for inbox in self._route(key).inboxes:
             inbox.put(key, message)
         self._world.count_output(source)
 

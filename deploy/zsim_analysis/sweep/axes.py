@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from msgspec import Struct
 
+from zsim.math.random_streams import stream
 from zsim.scenario.overrides import steps_of, whole_path
-from zsim.scenario.random_streams import stream
 from zsim.schema import yaml_file
 from zsim.schema.checker import show
 

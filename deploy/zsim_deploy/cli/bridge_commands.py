@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from zsim.contract.messages import Info
-    from zsim.transport.identity import Identity
     from zsim.transport.session import Session
+    from zsim.transport.tls import Identity
 import time
 from functools import partial
 
@@ -47,7 +47,7 @@ def console(
 ) -> None:
     """Show a run in the browser, and steer it: scene, plots, events, faults."""
     check_console_installed()
-    from zsim.runtime.progress import Teller
+    from zsim.runtime.progress import JsonProgress
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.http_proxy import ListenAddress
     from zsim_deploy.roles.roles import log_printer
@@ -55,7 +55,7 @@ def console(
 
     give_way(for_eyes=True)
     own_name = process_name("console", name, reach.tls, "*")
-    say = Teller().say if reach.launched else log_printer(None)
+    say = JsonProgress().say if reach.launched else log_printer(None)
     shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say)
     with shown.open():
         serve_runs(own_name, shown.serve, reach)
@@ -166,8 +166,7 @@ def ros2(
     if write_package is not None:
         _write_package(write_package / "zsim_msgs")
         return
-    from zsim.transport.identity import Identity
-    from zsim.transport.tls import is_tls
+    from zsim.transport.tls import Identity, is_tls
     from zsim_bridges.ros2.bridge import RosNetwork, serve
     from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
 

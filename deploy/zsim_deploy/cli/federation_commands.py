@@ -14,6 +14,7 @@ from zsim_deploy.options.arguments import WorldAccess, observer_options, positiv
 
 if TYPE_CHECKING:
     from zsim.contract.messages import Info
+    from zsim.scenario.fault_kinds import FaultKind
     from zsim.transport.session import Session
 import re
 from collections.abc import Sequence
@@ -21,7 +22,6 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from zsim.contract.messages import Fault
-    from zsim.scenario.fault_kinds import Kind
     from zsim.transport.session import Session
 
 PANEL = "Look and poke"
@@ -241,7 +241,7 @@ def _is_over(fault: "Fault", now_ns: int) -> bool:
     return fault.until_ns is not None and fault.until_ns <= now_ns
 
 
-def _parameters(kind: "Kind") -> list[str]:
+def _parameters(kind: "FaultKind") -> list[str]:
     from zsim.scenario.fault_kinds import expected
 
     parameters = [f"{p.name}: {expected(p)}{'' if p.required else ' (may be left out)'}" for p in kind.parameters]

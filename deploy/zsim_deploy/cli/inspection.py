@@ -10,7 +10,8 @@ from typing import Any
 
 import msgspec
 
-from zsim.contract import batch, keys, messages
+from zsim.contract import keys, messages
+from zsim.contract.framing import pairs_of
 from zsim.errors import DecodeError, RunError
 from zsim.transport.session import Mailbox, Sample, Session, check_expression
 
@@ -247,5 +248,5 @@ def ask(link: Session, key: str, op: str, text: str) -> Any:
     if not answer.ok:
         raise RunError(answer.error)
     with suppress(DecodeError):  # a replay is the only result that holds messages
-        return [{"key": name, "message": readable(Sample(name, payload))} for name, payload in batch.of(answer.result)]
+        return [{"key": name, "message": readable(Sample(name, payload))} for name, payload in pairs_of(answer.result)]
     return msgspec.to_builtins(answer.result, str_keys=True)

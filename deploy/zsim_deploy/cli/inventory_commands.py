@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsim.transport.identity import DAYS
+from zsim.transport.tls import DAYS
 from zsim_deploy.options.arguments import Set, load_scenario
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from zsim.errors import HostsError
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
-from zsim.transport.identity import CERTIFICATES
+from zsim.transport.tls import CERTIFICATES
 from zsim_deploy.hosts.leftover_runs import RECORD, runs_folder, scp
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import InventoryFile

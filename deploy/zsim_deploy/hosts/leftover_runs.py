@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from zsim.transport.identity import KEY
+from zsim.transport.tls import KEY
 from zsim_deploy.hosts.doctor import NetworkPath, path_faults
 from zsim_deploy.inventory.inventory import SSH_PORT, Host
 from zsim_deploy.roles.stop_channel import FOLDER

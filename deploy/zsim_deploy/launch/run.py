@@ -13,7 +13,7 @@ from zsim.record import repair
 from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of
 from zsim_deploy.launch.child_process import ChildProcess
 from zsim_deploy.launch.role_launcher import RoleLauncher

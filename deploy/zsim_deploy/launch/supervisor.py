@@ -14,7 +14,7 @@ from queue import SimpleQueue
 from typing import Any, Protocol
 
 from zsim.errors import RunError
-from zsim.runtime.progress import Show
+from zsim.runtime.progress import ProgressSink
 from zsim.scenario.role_table import on_death
 from zsim.scenario.scenario import OnDeath
 from zsim_deploy.options.terminal import IMPATIENT, REASONS, handled_by
@@ -71,7 +71,7 @@ class Supervisor:
         members: to be given before `go`; the world among them.
     """
 
-    def __init__(self, on_death: dict[str, OnDeath], show: Show) -> None:
+    def __init__(self, on_death: dict[str, OnDeath], show: ProgressSink) -> None:
         self.members: list[RunProcess] = []
         self._on_death = on_death
         self._show = show

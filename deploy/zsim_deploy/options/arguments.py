@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from zsim.transport.identity import Identity
+    from zsim.transport.tls import Identity
 import inspect
 from collections.abc import Callable
 from functools import wraps
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from zsim.transport.identity import Identity
+    from zsim.transport.tls import Identity
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 CONSOLE_PORT = 8080  # of its page
@@ -59,7 +59,7 @@ Insecure = Annotated[bool, typer.Option("--insecure", help="Without TLS, on a ne
 
 def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | None = None) -> "Identity":
     """Return who this process is on the network."""
-    from zsim.transport.identity import Identity
+    from zsim.transport.tls import Identity
 
     plain = Identity(tls=tls, access=access, insecure=insecure)
     return plain._replace(host=host) if host else plain

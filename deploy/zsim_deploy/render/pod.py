@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from zsim.scenario.rights import RECORDER, WORLD
-from zsim.transport.identity import CERTIFICATES as IDENTITY_FILES
+from zsim.transport.tls import CERTIFICATES as IDENTITY_FILES
 from zsim_deploy.inventory.processes import STOP_S, PlannedProcess, ProcessFiles, command
 from zsim_deploy.render.rendered_files import ACCESS, CACHE, CERTIFICATES, ENVIRONMENT, RUNS, SCENARIO, USER
 

@@ -11,14 +11,14 @@ from pathlib import Path
 from zsim.contract import messages
 from zsim.errors import RecordError, RunError, SessionError
 from zsim.runtime.agent import Agent
-from zsim.runtime.group import Group
+from zsim.runtime.group import AgentGroup
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
 from zsim.scenario.role_table import AGENTS, things
 from zsim.scenario.scenario import Scenario
 from zsim.transport import session, tls
 from zsim.transport.connection import find_world
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim_agents.hosting import agent_class, chosen, hosted, made
 from zsim_deploy.options.arguments import WorldAccess
 from zsim_deploy.roles.stop_channel import StopChannel
@@ -61,7 +61,7 @@ def agent_of(role: str, names: Sequence[str]) -> Callable[[messages.Info, Scenar
     def build(info: messages.Info, scenario: Scenario) -> Agent:
         wanted = chosen(f"{role}: {AGENTS[role].about}", names, things(role, scenario))
         agents = made(role, info, scenario, wanted)
-        return agents[0] if len(agents) == 1 else Group(agents)
+        return agents[0] if len(agents) == 1 else AgentGroup(agents)
 
     return build
 

@@ -17,7 +17,7 @@ import threading
 import time
 from pathlib import Path
 
-from zsim.transport.identity import KEY, Identity
+from zsim.transport.tls import KEY, Identity
 from zsim_deploy.options.terminal import IMPATIENT, INTERRUPTED, REASONS
 
 TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it

@@ -13,10 +13,10 @@ import msgspec
 
 from zsim.contract import keys, messages
 from zsim.errors import RunError
-from zsim.runtime.progress import QUIET, Reasons, Screen, Show, Teller, Throttle
+from zsim.runtime.progress import QUIET, HoldReasons, JsonProgress, ProgressSink, Screen, Throttle
 from zsim.scenario.scenario import Scenario
 from zsim.transport import session
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim_deploy.roles.stop_channel import StopChannel
 
 if TYPE_CHECKING:
@@ -43,14 +43,14 @@ def world(
     from zsim_world.server.world_process import run
 
     stop = StopChannel(launched, identity)
-    with _patience(Teller() if launched else None):
+    with _patience(JsonProgress() if launched else None):
         run_world = World(scenario, mode, rate, time.monotonic_ns, launched)
     for name in expect or ():
         run_world.barrier.expect(name)
     gc.collect()
     gc.freeze()
     if launched:
-        run(run_world, endpoints, stop.reason, world_progress(Teller()), identity=identity)
+        run(run_world, endpoints, stop.reason, world_progress(JsonProgress()), identity=identity)
         stop.exit_if_terminated()
         return
     with Screen(scenario.duration_s) as screen:
@@ -60,7 +60,7 @@ def world(
 
 
 @contextmanager
-def _patience(teller: Teller | None) -> Iterator[None]:
+def _patience(teller: JsonProgress | None) -> Iterator[None]:
     """Say what takes so long the first time that a machine runs the world."""
     from zsim.math.compiled import is_kept
     from zsim_world.fleet.kernel import advance
@@ -76,9 +76,9 @@ def _patience(teller: Teller | None) -> Iterator[None]:
         timer.cancel()
 
 
-def world_progress(show: Show) -> Callable[[str, Any, str], None]:
+def world_progress(show: ProgressSink) -> Callable[[str, Any, str], None]:
     """Return what the world calls with its clocks, its events, and what passes it."""
-    throttle, reasons = Throttle(), Reasons()
+    throttle, reasons = Throttle(), HoldReasons()
     shown = [0]
     healths: defaultdict[str, Throttle] = defaultdict(lambda: Throttle(HEALTH_PERIOD_S))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from zsim.errors import RunError
 from zsim.scenario.rights import ROUTER, WORLD
-from zsim.transport.identity import AUTHORITY, KEY
+from zsim.transport.tls import AUTHORITY, KEY
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.security import certificates

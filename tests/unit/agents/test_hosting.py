@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from zsim.errors import RunError
-from zsim.runtime.group import Group
+from zsim.runtime.group import AgentGroup
 from zsim.scenario import rights, scenario_file
 from zsim.scenario.role_table import AGENTS, Role
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of, chosen, hosted
 from zsim_deploy.roles import roles
 from zsim_world.flight.world import World
@@ -43,7 +43,7 @@ def test_of_many_names_a_refusal_lists_ten():
 
 def test_estimators_share_one_kernel_and_a_controller_comes_after_them():
     group = hosted(World(STEP).info(), STEP, ["*"])
-    assert isinstance(group, Group)
+    assert isinstance(group, AgentGroup)
     assert (group.name, group.serves) == ("controller.main", tuple(ESTIMATORS))
     assert group.gate_keys == tuple(f"drone/drone{i}/sensor/status" for i in (1, 2, 3))
 

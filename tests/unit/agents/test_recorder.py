@@ -9,8 +9,8 @@ import pytest
 from fake_link import BAD_UTF8, NESTED, UNANSWERED, FakeLink
 from msgspec import Struct
 
-from zsim.contract import batch, keys, messages
-from zsim.contract.bundle import Bundle, table_of
+from zsim.contract import keys, messages
+from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.contract.messages import Clock, ControlAnswer, DroneInfo, Faults, Imu, Info, Origin
 from zsim.record import RecordReader
 from zsim_agents import recorder
@@ -21,7 +21,7 @@ INFO = Info(
     0, 0, 1, "r", "zsim", "lockstep", 0.0, GATE_NS, 1, GATE_NS, 1, Origin(0.0, 0.0, 0.0), (DroneInfo("d1", "any"),), (),
     "", "", "", "",
 )  # fmt: skip
-TABLE = table_of(["d1"])
+TABLE = key_table(["d1"])
 IMU = keys.sensor("d1", "imu")
 Pair = tuple[str, bytes]
 
@@ -40,7 +40,7 @@ def imu(gate: int) -> Pair:
 
 def whole(gate: int) -> list[Pair]:
     """Return a gate as the world hands it over: its samples in one."""
-    return [(batch.GATE, Bundle.of(gate * GATE_NS, gate, TABLE, [imu(gate)]).packed()), clock(gate)]
+    return [(keys.GATE, GateMessages.of(gate * GATE_NS, gate, TABLE, [imu(gate)]).pack()), clock(gate)]
 
 
 def gates(*numbers: int) -> list[Pair]:
@@ -59,7 +59,7 @@ def recorded(
     link.last = last or {}
     link.on_request = lambda key, args: next(left)
     for passed in (*batches, [clock(99, "stopped")]):
-        link.deliver(batch.KEY, batch.encode(passed))
+        link.deliver(keys.BATCH, encode_batch(passed))
     assert record(link, INFO, path) == "the run ended"  # type: ignore[arg-type]
     assert next(left, None) is None
     with RecordReader(path) as reader:
@@ -105,7 +105,7 @@ def test_gates_in_one_are_recorded_message_by_message_and_once(tmp_path: Path):
 
 def test_a_gate_whose_columns_lead_outside_is_refused(tmp_path: Path):
     """Whoever may publish may send such a thing; the record stays whole."""
-    good = Bundle.of(GATE_NS, 1, TABLE, [imu(1), imu(2)])
+    good = GateMessages.of(GATE_NS, 1, TABLE, [imu(1), imu(2)])
     bad = [b"", b"\xc1"]
     for which, stamps_, ends in (
         (np.array([0, 8]), good.stamps, good.ends),
@@ -116,14 +116,14 @@ def test_a_gate_whose_columns_lead_outside_is_refused(tmp_path: Path):
         (good.which, good.stamps, np.array([5, good.ends[1]])),
         (good.which[:0], good.stamps[:0], good.ends[:0]),
     ):
-        bundle = Bundle(GATE_NS, 1, TABLE, which, stamps_, ends, good.buffer)
+        bundle = GateMessages(GATE_NS, 1, TABLE, which, stamps_, ends, good.buffer)
         bad.append(_packed(bundle))
-    batches = [[(batch.GATE, payload)] for payload in bad]
+    batches = [[(keys.GATE, payload)] for payload in bad]
     found = recorded(tmp_path / "run.mcap", [page(gates(0))], gates(1), *batches, gates(2), whole(3))
     assert stamps(found, IMU) == [0, 1, 2, 3]
 
 
-def _packed(b: Bundle) -> bytes:
+def _packed(b: GateMessages) -> bytes:
     columns = [column.astype("<i8").tobytes() for column in (b.which, b.stamps, b.ends)]
     return msgspec.msgpack.encode([b.t_ns, b.seq, *columns, bytes(b.buffer)])
 
@@ -156,7 +156,7 @@ def test_what_a_record_has_no_room_for_is_counted_and_told(tmp_path: Path, monke
     monkeypatch.setattr("zsim.record.record_writer.CHANNELS_MAX", 2)
     link, said = FakeLink(), []
     link.on_request = lambda key, args: page([])
-    link.deliver(batch.KEY, batch.encode([imu(1), clock(1), imu(2), clock(3, "stopped")]))
+    link.deliver(keys.BATCH, encode_batch([imu(1), clock(1), imu(2), clock(3, "stopped")]))
     link.deliver("view/drones", b"\x81\xa4t_ns\x01")
     made: Any = recorder.Recorder(link, INFO, tmp_path / "run.mcap", "recorder", lambda: False, said.append)  # type: ignore[arg-type]
     assert made.run() == "the run ended"
@@ -177,8 +177,8 @@ def test_what_has_no_time_is_recorded_at_the_worlds_whatever_strangers_stamp(tmp
 def test_a_batch_of_a_stranger_ends_nothing(tmp_path: Path, garbage: bytes):
     link = FakeLink()
     link.on_request = lambda key, args: page([])
-    for payload in (garbage, batch.encode([clock(3, "stopped")])):
-        link.deliver(batch.KEY, payload)
+    for payload in (garbage, encode_batch([clock(3, "stopped")])):
+        link.deliver(keys.BATCH, payload)
     made: Any = recorder.Recorder(link, INFO, tmp_path / "run.mcap", "recorder", lambda: False)  # type: ignore[arg-type]
     assert made.run() == "the run ended"
     assert made.health.refused == 1

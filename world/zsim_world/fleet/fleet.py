@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.messages import DroneState
 from zsim.errors import RunError
-from zsim.scenario.scenario import Gps, Scenario
+from zsim.scenario.scenario import GpsConfig, Scenario
 from zsim_world.fleet import kernel
 from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.fleet.initial_state import arrays
@@ -247,5 +247,5 @@ class Fleet:
             self.touching[np.argwhere(self.bodies.touched | self.bodies.touching).ravel()] = True
 
 
-def _gps_sigma(gps: Gps) -> float:
+def _gps_sigma(gps: GpsConfig) -> float:
     return sensor_set.noise_sigma(gps.position_m, gps.rate_hz)

@@ -10,8 +10,8 @@ from numba.typed.typedlist import List
 from numpy.typing import NDArray
 
 from zsim.contract import encoding, messages
-from zsim.contract.bundle import KINDS, Bundle, table_of
-from zsim.contract.encoding import GAP, Layouts, Program, Words
+from zsim.contract.encoding import GAP, Layouts, Program, TextTable
+from zsim.contract.framing import KINDS, GateMessages, key_table
 from zsim.math.compiled import compiled, inlined, kernel
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
 from zsim_world.fleet.kernel import hold
@@ -21,7 +21,7 @@ from zsim_world.sensors import sampler, sensor_set
 from zsim_world.sensors.sampler import Sampled
 from zsim_world.vehicles import firmware
 
-MESSAGES = (  # of the kinds of a bundle, in their order
+MESSAGES = (  # in the order of KINDS
     messages.Imu,
     messages.Gps,
     messages.Mag,
@@ -79,7 +79,7 @@ class Fleetwide(NamedTuple):
 class Told(NamedTuple):
     """What `publish` works on from gate to gate."""
 
-    words: Words
+    words: TextTable
     seen: Seen
     wide: Fleetwide
     out: Written
@@ -90,7 +90,7 @@ class Publication:
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        self.table = table_of(fleet.names)
+        self.table = key_table(fleet.names)
         bodies = fleet.bodies
         self._seen = Seen(bodies.state, bodies.accel, bodies.energy, bodies.vehicle, fleet.boards.memory)
         self._commanders: list[str | None] = []  # of the last gate
@@ -107,7 +107,7 @@ class Publication:
         uncounted = self._fleetwide._replace(counts=self._fleetwide.counts.copy())
         publish(hold(Told(self._words, self._seen, uncounted, self._written)), *self._fleet.sampled, 0)
 
-    def gate(self, commanders: list[str | None]) -> Bundle:
+    def gate(self, commanders: list[str | None]) -> GateMessages:
         """Return the messages of the gate that the fleet stands at; `commanders` are the names of who flies each."""
         fleet, wide = self._fleet, self._fleetwide
         count = len(fleet.sampled.whose) + 2 * fleet.count
@@ -121,7 +121,7 @@ class Publication:
         which, stamps, ends = out.columns[:, :count].copy()
         seq = int(wide.counts[0, STATUS]) - 1
         data = out.data[:size].tobytes()
-        return Bundle(fleet.t_ns, seq, self.table, which, stamps, ends, data, out.first.tolist())
+        return GateMessages(fleet.t_ns, seq, self.table, which, stamps, ends, data, out.first.tolist())
 
     def _number(self, commander: str | None) -> int:
         """Return the number of a word; a new one is learnt."""

@@ -3,9 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
-from zsim.contract.control_limits import GATES_MAX, RATE_MAX
-from zsim.contract.messages import ControlAnswer, ControlRequest
-from zsim.scenario.scenario import Time
+from zsim.contract.messages import GATES_MAX, RATE_MAX, ControlAnswer, ControlRequest
+from zsim.scenario.scenario import TimeSteps
 from zsim_world.flight.run_outbox import Refusal
 
 Operation = Callable[[ControlRequest], Refusal | ControlAnswer | None]
@@ -31,7 +30,7 @@ class RunClock:
         ended: why the run is over, None while it goes on.
     """
 
-    def __init__(self, time: Time, mode: str, rate: float) -> None:
+    def __init__(self, time: TimeSteps, mode: str, rate: float) -> None:
         self.mode = mode
         self.rate = rate
         self.gate_ns = round(time.gate_ms * 1e6)

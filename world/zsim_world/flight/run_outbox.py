@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from zsim.contract import keys, messages
 from zsim.scenario.rights import WORLD
 
-KeyedMessage = tuple[str, Any]  # key and message; or batch.GATE and the Bundle of what is published of drones at a gate
+KeyedMessage = tuple[str, Any]  # key and message; or keys.GATE and GateMessages at a gate
 EVENTS_MAX = 20  # events per source, subject and reason; further refusals are counted only
 REASONS_MAX = 10  # of a source and subject that are kept apart; all further ones count as one
 SUBJECTS_MAX = 10_000  # sources and subjects

@@ -7,14 +7,14 @@ from collections.abc import Callable
 from typing import Any
 
 from zsim import CONTRACT, __version__
-from zsim.contract import batch, keys, messages
+from zsim.contract import keys, messages
 from zsim.contract.fingerprint import fingerprint
+from zsim.contract.truth_hash import TruthHash
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_world.fleet.fleet import DivergedError, Fleet
 from zsim_world.fleet.publication import Publication
-from zsim_world.fleet.truth_hash import TruthHash
 from zsim_world.flight.command_intake import CommandIntake
 from zsim_world.flight.command_queue import CommandQueue
 from zsim_world.flight.coordinator import Coordinator
@@ -134,7 +134,7 @@ class World(Coordinator):
 
     def _publish_gate(self, wall_ns: int) -> None:
         self._hash.add(self.now_ns, self.fleet.bodies.state)
-        self.outbox.put(batch.GATE, self._publication.gate(self.queue.commanders()))
+        self.outbox.put(keys.GATE, self._publication.gate(self.queue.commanders()))
         self.statistics.gate(self.now_ns, wall_ns)
         self.publish_clock()
 

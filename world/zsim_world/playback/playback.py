@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from zsim.contract import batch, keys, messages
-from zsim.contract.bundle import KINDS, Bundle, table_of
-from zsim.contract.encoding import GAP
+from zsim.contract import keys, messages
+from zsim.contract.framing import KINDS, GateMessages, key_table
 from zsim.contract.messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
@@ -79,7 +78,7 @@ class Playback(Coordinator):
         self._played = played
         self._operations["seek"] = self._seek
         self.refused_queries = tuple(keys.cluster_control(cluster.name) for cluster in scenario.clusters)
-        self._table = table_of(self.names)
+        self._table = key_table(self.names)
         self._place = {key: place for place, key in enumerate(self._table)}
         self._views = PlaybackViews(self.names, [cluster.name for cluster in scenario.clusters])
         self._last: dict[str, bytes] = {}
@@ -182,7 +181,7 @@ class Playback(Coordinator):
         for recorded in faults:  # they are known before the gate
             self._publish(recorded)
         if of_drones:
-            self.outbox.put(batch.GATE, self._bundle(gate.t_ns, of_drones))
+            self.outbox.put(keys.GATE, self._gate_messages(gate.t_ns, of_drones))
         self.statistics.gate(gate.t_ns, wall_ns)
         self.publish_clock()
         for recorded in (m for m in gate.messages if m.key not in self._place and m.key != keys.FAULTS):
@@ -207,7 +206,7 @@ class Playback(Coordinator):
         if event.kind != "end":  # the replay has an end of its own
             self.outbox.put(keys.EVENT, msgspec.structs.replace(event, seq=self.outbox.next_seq(keys.EVENT)))
 
-    def _bundle(self, t_ns: int, of_drones: list[Recorded]) -> Bundle:
+    def _gate_messages(self, t_ns: int, of_drones: list[Recorded]) -> GateMessages:
         """Return what the world published of its drones, as it did: drone by drone, the status last."""
         of_drones.sort(key=lambda m: self._place[m.key] // len(KINDS))
         which = np.array([self._place[m.key] for m in of_drones])
@@ -215,10 +214,9 @@ class Playback(Coordinator):
         payloads = [m.payload for m in of_drones]
         if self._recounts:
             _recount(payloads, which.tolist(), first)
-        ends = np.cumsum([GAP + len(payload) for payload in payloads])
-        buffer = b"".join([bytes(GAP) + payload for payload in payloads])
-        stamps = np.array([m.t_ns for m in of_drones])
-        return Bundle(t_ns, t_ns // self.clock.gate_ns, self._table, which, stamps, ends, buffer, first)
+        pairs = list(zip([m.key for m in of_drones], payloads, strict=True))
+        stamps = [m.t_ns for m in of_drones]
+        return GateMessages.of(t_ns, t_ns // self.clock.gate_ns, self._table, pairs, stamps, first)
 
     def views(self, seq: int) -> Sequence[Output]:
         live = self._live()

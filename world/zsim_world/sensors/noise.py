@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from zsim.scenario.random_streams import stream
+from zsim.math.random_streams import stream
 from zsim.scenario.scenario import Scenario
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 from zsim_world.physics import normal_variates

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from zsim.math.frames import quaternion_from_rpy
-from zsim.scenario.scenario import ErrorModel, Mag, Scenario, Sensor, Sensors
+from zsim.scenario.scenario import ErrorModel, MagConfig, Scenario, Sensor, Sensors
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 
 SensorName = Literal["imu", "gps", "mag", "baro", "sonar", "flow"]
@@ -102,7 +102,7 @@ def schedule(scenario: Scenario) -> NDArray[np.int64]:
     return table
 
 
-def heading_sigma(mag: Mag, horizontal_ut: float) -> float:
+def heading_sigma(mag: MagConfig, horizontal_ut: float) -> float:
     """Return the standard deviation [rad] of a heading from one magnetometer sample."""
     model = mag.field_ut
     return math.hypot(noise_sigma(model, mag.rate_hz), model.quantum / math.sqrt(12.0)) / max(horizontal_ut, 1.0)

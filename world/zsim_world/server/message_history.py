@@ -9,8 +9,8 @@ from typing import Annotated, Any, NamedTuple
 
 import msgspec
 
-from zsim.contract import batch, keys, messages
-from zsim.contract.batch import Batch
+from zsim.contract import keys, messages
+from zsim.contract.framing import Pairs, pairs_of
 from zsim.contract.messages import REFUSALS, ClusterRequest, ClusterState, Command, ControlAnswer, Count, Estimate
 from zsim.errors import DecodeError
 from zsim.scenario import rights
@@ -36,7 +36,7 @@ class _Entry(NamedTuple):
 
     now_ns: int
     t_ns: int
-    messages: Batch
+    messages: Pairs
     size: int
 
 
@@ -68,7 +68,7 @@ class MessageHistory:
             self._last[key] = payload
         self._keep(_Entry(self._now_ns, t_ns, [(key, payload)], len(payload)))
 
-    def add_all(self, published: Batch, t_ns: int) -> None:
+    def add_all(self, published: Pairs, t_ns: int) -> None:
         """Keep what the world itself publishes, all stamped t_ns, its newest gate."""
         self._now_ns = t_ns
         self._last.update(published)
@@ -88,7 +88,7 @@ class MessageHistory:
             return [(expression, self._last[expression])]
         return [(key, payload) for key, payload in list(self._last.items()) if keys.matches(expression, key)]
 
-    def page(self, from_ns: int, wanted: Callable[[str], bool], start: int = 0) -> tuple[Batch, int | None]:
+    def page(self, from_ns: int, wanted: Callable[[str], bool], start: int = 0) -> tuple[Pairs, int | None]:
         """Return what is stamped after from_ns and on a key that is wanted, as far as a page holds it.
 
         Args:
@@ -151,7 +151,7 @@ class MessageHistory:
             DecodeError: the result is no list of [key, payload].
         """
         outputs: dict[Any, Sample] = {}
-        for key, payload in batch.of(kept):
+        for key, payload in pairs_of(kept):
             identity = _identity(key, payload)
             if identity is not None and identity[1] <= done_ns:
                 outputs[identity] = Sample(key, payload)

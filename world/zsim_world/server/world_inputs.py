@@ -4,7 +4,7 @@ import contextlib
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,11 +12,10 @@ from typing import Any
 import msgspec
 
 from zsim.contract import keys, messages
-from zsim.errors import DecodeError
+from zsim.errors import DecodeError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario.rights import WORLD
 from zsim.transport.session import Mailbox, Sample, Session
-from zsim.transport.timed_mailbox import TimedMailbox
 from zsim_world.flight.barrier import RunParticipant
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.server.liveliness import LivelinessMonitor
@@ -97,6 +96,42 @@ class DirectInputs(WorldInputs):
         self._boxes[-1].wake()
 
 
+class TimedMailbox:
+    """A mailbox read by a thread that stamps every message with the wall time of its arrival.
+
+    Args:
+        mailbox: what to read.
+        fresh: set whenever something has arrived.
+    """
+
+    def __init__(self, mailbox: Mailbox, fresh: threading.Event) -> None:
+        self._mailbox = mailbox
+        self._fresh = fresh
+        self._arrived: deque[tuple[int, Sample]] = deque()
+        self._thread = threading.Thread(target=self._pump, name="mailbox", daemon=True)
+        self._thread.start()
+
+    def _pump(self) -> None:
+        while True:
+            try:
+                sample = self._mailbox.receive()
+            except SessionError:
+                return
+            if sample is not None:
+                self._arrived.append((time.monotonic_ns(), sample))
+                self._fresh.set()
+
+    def drain(self) -> Iterator[tuple[int, Sample]]:
+        """Yield (wall_ns of arrival, sample) of what has arrived."""
+        while self._arrived:
+            yield self._arrived.popleft()
+
+    def close(self) -> None:
+        """Stop the reading thread."""
+        self._mailbox.close()
+        self._thread.join(timeout=2.0)
+
+
 class TimedInputs(WorldInputs):
     """Reads on threads of their own, so that arrivals are stamped while the loop waits for its next gate."""
 
@@ -125,7 +160,7 @@ def open_inputs(link: Session, realtime: bool) -> WorldInputs:
 
     Outputs are drained first, dones last: who publishes a done has published its outputs before, on the same link.
     """
-    boxes = [link.overhear((PROCESSES, VIEWS)), link.subscribe(f"{PROCESSES}**")]
+    boxes = [link.subscribe_others((PROCESSES, VIEWS)), link.subscribe(f"{PROCESSES}**")]
     return TimedInputs(boxes) if realtime else DirectInputs(boxes)
 
 

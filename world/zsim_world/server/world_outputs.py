@@ -4,8 +4,8 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
-from zsim.contract import batch, messages
-from zsim.contract.bundle import Bundle
+from zsim.contract import keys, messages
+from zsim.contract.framing import BATCH_MAX, GateMessages, Pairs, encode_batch
 from zsim.runtime.agent import Output
 from zsim.transport.session import Sample, Session
 from zsim_world.flight.coordinator import Coordinator
@@ -29,9 +29,9 @@ class WorldOutputs:
         self._world = world
         self._history = history
         self._on_message = on_message
-        self._unsent: batch.Batch = []
-        self._passed: batch.Batch = []
-        self._gate_keys = [batch.gate(name) for name in world.names]
+        self._unsent: Pairs = []
+        self._passed: Pairs = []
+        self._gate_keys = [keys.gate(name) for name in world.names]
 
     def flush(self) -> None:
         """Publish the outbox."""
@@ -43,11 +43,11 @@ class WorldOutputs:
         outbox = self._world.take_outbox()
         if not outbox:
             return
-        encoded: batch.Batch = []
+        encoded: Pairs = []
         for key, message in outbox:
-            if type(message) is Bundle:
-                self._gather_bundle(message)
-                encoded += message.encoded
+            if type(message) is GateMessages:
+                self._gather_gate(message)
+                encoded += message.pairs
             else:
                 pair = (key, messages.encode(message))
                 encoded.append(pair)
@@ -55,18 +55,18 @@ class WorldOutputs:
         self._unsent += encoded
         self._history.add_all(encoded, self._world.now_ns)
         for key, message in outbox:
-            if type(message) is not Bundle:
+            if type(message) is not GateMessages:
                 self._on_message(key, message)
 
-    def _gather_bundle(self, bundle: Bundle) -> None:
+    def _gather_gate(self, gate: GateMessages) -> None:
         """Keep the messages of a gate as one, of all drones and of each, where there is a subscriber to that."""
-        whole = (batch.GATE, bundle.packed())
+        whole = (keys.GATE, gate.pack())
         self._passed.append(whole)
-        if self._link.heard(batch.GATE):
+        if self._link.has_readers(keys.GATE):
             self._unsent.append(whole)
-        for key, (first, last) in zip(self._gate_keys, pairwise(bundle.first), strict=True):
-            if last > first and self._link.heard(key):
-                self._unsent.append((key, bundle.packed(first, last)))
+        for key, (first, last) in zip(self._gate_keys, pairwise(gate.first), strict=True):
+            if last > first and self._link.has_readers(key):
+                self._unsent.append((key, gate.pack(first, last)))
 
     def send(self) -> None:
         """Put what was gathered in one go: readers wake once, and the transport sends few packets."""
@@ -88,6 +88,6 @@ class WorldOutputs:
     def put_batch(self) -> None:
         """Hand what has passed to the recorders, if there are any."""
         passed, self._passed = self._passed, []
-        if self._link.heard(batch.KEY):
-            for first in range(0, len(passed), batch.MESSAGES_MAX):
-                self._link.put_raw(batch.KEY, batch.encode(passed[first : first + batch.MESSAGES_MAX]))
+        if self._link.has_readers(keys.BATCH):
+            for first in range(0, len(passed), BATCH_MAX):
+                self._link.put_raw(keys.BATCH, encode_batch(passed[first : first + BATCH_MAX]))

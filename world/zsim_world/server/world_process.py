@@ -17,8 +17,8 @@ from zsim.runtime.health import HealthMeter
 from zsim.scenario import rights
 from zsim.scenario.rights import WORLD
 from zsim.transport import session
-from zsim.transport.identity import Identity
 from zsim.transport.session import Query, Session
+from zsim.transport.tls import Identity
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory

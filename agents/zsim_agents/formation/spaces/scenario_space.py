@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from zsim.errors import DocumentError
-from zsim.scenario.scenario import ROBOTS_MAX, Cluster, Group, Scenario, space_name
+from zsim.scenario.scenario import ROBOTS_MAX, Cluster, ClusterGroup, Scenario, space_name
 from zsim.schema import plugin
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 from zsim_agents.formation.spaces.nested_cluster import NestedCluster
@@ -53,7 +53,7 @@ STOCK: dict[str, Callable[[Array], ClusterSpace]] = {
 }
 
 
-def _space(spec: Cluster | Group, starts: Array) -> ClusterSpace:
+def _space(spec: Cluster | ClusterGroup, starts: Array) -> ClusterSpace:
     """Return the space of as many robots as there are starting places (n, 3)."""
     places_m = np.array(spec.template_m or starts, dtype=float)
     name = space_name(spec.space, len(places_m), bool(spec.template_m))

@@ -5,7 +5,7 @@ from typing import Any
 
 import viser
 
-from zsim.contract.control_limits import GATES_MAX, RATE_MAX
+from zsim.contract.messages import GATES_MAX, RATE_MAX
 from zsim.scenario.fault_kinds import KINDS, PROCESS_KILL
 from zsim.scenario.scenario import Scenario
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
@@ -86,8 +86,8 @@ class FaultForm:
 def _help(kind: str) -> str:
     """Return a kind's effect and parameters."""
     fault = KINDS[kind]
-    lines = [f"`{p.name}` {p.said}{f' [{p.unit}]' if p.unit else ''}" for p in fault.parameters]
-    return f"<sub>{fault.said}; strikes a {fault.strikes}. {'; '.join(lines)}</sub>"
+    lines = [f"`{p.name}` {p.description}{f' [{p.unit}]' if p.unit else ''}" for p in fault.parameters]
+    return f"<sub>{fault.description}; strikes a {fault.strikes}. {'; '.join(lines)}</sub>"
 
 
 PINNED = """<style>

@@ -1,11 +1,11 @@
-"""Sensors read out of a bundle by compiled code are the readings that their messages make."""
+"""Sensors read out of a gate's messages by compiled code are the readings that their messages make."""
 
 import msgspec
 import numpy as np
 import pytest
 
-from zsim.contract import batch, keys
-from zsim.contract.bundle import Bundle
+from zsim.contract import keys
+from zsim.contract.framing import GateMessages
 from zsim.math.compiled import COMPILES
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
@@ -22,60 +22,60 @@ def scenario() -> Scenario:
 
 
 @pytest.fixture(scope="module")
-def flight() -> tuple[World, list[Bundle]]:
+def flight() -> tuple[World, list[GateMessages]]:
     world = World(scenario())
     world.clock.state = "running"
-    bundles = []
-    for gate in range(120):
-        if gate == 20:
+    gates = []
+    for number in range(120):
+        if number == 20:
             assert world.fleet.takeoff(0) is None
         world._publish_gate(0)
-        bundles += [message for key, message in world.take_outbox() if key == batch.GATE]
+        gates += [message for key, message in world.take_outbox() if key == keys.GATE]
         world.fleet.advance()
-    return world, bundles
+    return world, gates
 
 
-def estimates(agent: Estimator, bundles: list[Bundle], whole: bool) -> list[object]:
-    """Return what an estimator says of a flight, heard as bundles or as messages in the order of a runner."""
+def estimates(agent: Estimator, gates: list[GateMessages], whole: bool) -> list[object]:
+    """Return what an estimator says of a flight, handed over as gates or as messages in the order of a runner."""
     said = []
-    for bundle in bundles:
+    for gate in gates:
         if whole:
-            agent.receive(batch.GATE, bundle)
+            agent.receive_gate(gate)
         else:
-            heard = [(key, m) for key, m in bundle.messages() if keys.is_sensor(key)]
+            heard = [(key, m) for key, m in gate.decoded() if keys.is_sensor(key)]
             for key, message in sorted(heard, key=lambda entry: (entry[1].t_ns, entry[0], entry[1].seq)):
                 if keys.thing(key) in agent.counted:
                     agent.receive(key, message)
-        said += agent.step(bundle.t_ns)
+        said += agent.step(gate.t_ns)
     return said
 
 
-@pytest.mark.skipif(not COMPILES, reason="numba is not installed: bundles are taken apart")
+@pytest.mark.skipif(not COMPILES, reason="numba is not installed: gates are taken apart")
 @pytest.mark.parametrize("drones", [DRONES, ("d2",), ("d3", "d1")])
-def test_a_bundle_gives_the_estimates_of_its_messages(
-    flight: tuple[World, list[Bundle]], drones: tuple[str, ...]
+def test_a_gate_gives_the_estimates_of_its_messages(
+    flight: tuple[World, list[GateMessages]], drones: tuple[str, ...]
 ) -> None:
-    world, bundles = flight
+    world, gates = flight
     whole, each = (Estimator(world.info(), world.scenario, drones) for _ in range(2))
-    assert whole.takes_bundles
-    assert estimates(whole, bundles, whole=True) == estimates(each, bundles, whole=False)
+    assert whole.takes_gates
+    assert estimates(whole, gates, whole=True) == estimates(each, gates, whole=False)
 
 
-@pytest.mark.skipif(not COMPILES, reason="numba is not installed: bundles are taken apart")
+@pytest.mark.skipif(not COMPILES, reason="numba is not installed: gates are taken apart")
 def test_a_message_that_the_world_would_not_write_so_is_decoded_all_the_same(
-    flight: tuple[World, list[Bundle]],
+    flight: tuple[World, list[GateMessages]],
 ) -> None:
     """One whose floats are whole numbers on the wire: right, but not what the compiled reader knows."""
-    world, bundles = flight
-    gate = next(b for b in bundles if any(key.endswith("mag") for key, _ in b.encoded))
-    changed = [_with_whole_numbers(gate) if b is gate else b for b in bundles]
+    world, gates = flight
+    gate = next(b for b in gates if any(key.endswith("mag") for key, _ in b.pairs))
+    changed = [_with_whole_numbers(gate) if b is gate else b for b in gates]
     whole, each = (Estimator(world.info(), world.scenario, DRONES) for _ in range(2))
     assert estimates(whole, changed, whole=True) == estimates(each, changed, whole=False)
 
 
-def test_columns_that_lead_outside_are_not_followed(flight: tuple[World, list[Bundle]]) -> None:
-    world, bundles = flight
-    b, agent = bundles[0], Estimator(world.info(), world.scenario, DRONES)
+def test_columns_that_lead_outside_are_not_followed(flight: tuple[World, list[GateMessages]]) -> None:
+    world, gates = flight
+    b, agent = gates[0], Estimator(world.info(), world.scenario, DRONES)
     for which, ends in (
         (np.full(len(b), 10**9), b.ends),
         (np.full(len(b), -5), b.ends),
@@ -83,13 +83,13 @@ def test_columns_that_lead_outside_are_not_followed(flight: tuple[World, list[Bu
         (b.which, b.ends[::-1].copy()),
         (b.which, -b.ends),
     ):
-        agent.receive(batch.GATE, Bundle(b.t_ns, b.seq, b.table, which, b.stamps, ends, bytes(b.buffer)))
+        agent.receive_gate(GateMessages(b.t_ns, b.seq, b.table, which, b.stamps, ends, bytes(b.buffer)))
     assert len(agent.step(b.t_ns)) == len(DRONES)
 
 
-def _with_whole_numbers(bundle: Bundle) -> Bundle:
-    said = [(key, _rounded(payload) if key.endswith("/mag") else payload) for key, payload in bundle.encoded]
-    return Bundle.of(bundle.t_ns, bundle.seq, bundle.table, said)
+def _with_whole_numbers(gate: GateMessages) -> GateMessages:
+    said = [(key, _rounded(payload) if key.endswith("/mag") else payload) for key, payload in gate.pairs]
+    return GateMessages.of(gate.t_ns, gate.seq, gate.table, said)
 
 
 def _rounded(payload: bytes) -> bytes:

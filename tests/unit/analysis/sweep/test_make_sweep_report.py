@@ -11,7 +11,7 @@ from rich.console import Console
 from sweep_rows import made, plan, well
 
 from zsim.errors import ReportError
-from zsim.scenario.random_streams import stream
+from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
 from zsim_analysis.sweep.make_sweep_report import make_sweep_report
 from zsim_analysis.sweep.make_sweep_report import table as shown_table

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zsim.contract import batch, messages
-from zsim.contract.bundle import Bundle, table_of
+from zsim.contract import messages
+from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin, Status, Velocity
 from zsim.errors import DecodeError, NoWorldError
 from zsim.transport.session import Heard
@@ -116,15 +116,14 @@ def test_what_is_refused_takes_no_number():
 
 def test_last_values_are_the_newest_of_what_passed():
     drones = ("drone1", "drone2")
-    values, table = LastValues(drones), table_of(drones)
+    values, table = LastValues(drones), key_table(drones)
     said = [
         ("drone/drone1/sensor/imu", messages.encode(Imu(20, 1, 20, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0)))),
         ("drone/drone1/sensor/status", messages.encode(Status(20, 1, "landed", 99.0, False, None, 2))),
     ]
     values.add("drone/drone1/sensor/imu", b"old")
-    bundle = Bundle.of(20, 1, table, said)
-    alone = values.add_batch(batch.encode([("clock", b"now"), (batch.GATE, bundle.packed())]))
-    assert alone == [("clock", b"now")]
+    values.add_passed("clock", b"now")
+    values.add_gate(GateMessages.of(20, 1, table, said))
     assert values.matching("drone/drone1/sensor/*") == said
     assert values.matching("zsim/drone/*/sensor/imu", "zsim/") == said[:1]
     assert values.matching("other/clock", "zsim/") == []
@@ -148,7 +147,7 @@ def test_values_of_ones_own_have_a_bound_in_bytes(monkeypatch: pytest.MonkeyPatc
 
 def test_an_echo_does_not_undo_what_was_said_since():
     def heard(payload: bytes) -> list[bytes]:
-        values.add_batch(batch.encode([("my/own", payload)]))
+        values.add_passed("my/own", payload)
         return [said for _, said in values.matching("my/own")]
 
     values = LastValues(("drone1",))
@@ -169,8 +168,8 @@ def test_an_echo_that_never_came_is_forgotten_with_the_next():
     values = LastValues(("drone1",))
     for payload in (b"lost", b"1"):
         values.add_own("my/own", payload)
-    values.add_batch(batch.encode([("my/own", b"1")]))
-    values.add_batch(batch.encode([("my/own", b"lost")]))
+    values.add_passed("my/own", b"1")
+    values.add_passed("my/own", b"lost")
     assert values.matching("my/own") == [("my/own", b"lost")]
 
 
@@ -190,13 +189,6 @@ def test_echoes_of_more_keys_than_may_be_are_taken_as_news():
             echoes.add(key, payload)
     assert echoes.is_stale("a", b"1")
     assert not echoes.is_stale("b", b"1")
-
-
-def test_garbage_in_place_of_a_batch_is_counted():
-    values = LastValues(("drone1",))
-    assert values.add_batch(b"\xc1") == []
-    assert values.add_batch(batch.encode([(batch.GATE, b"\xc1")])) == []
-    assert values.refused == 2
 
 
 # Who may say what

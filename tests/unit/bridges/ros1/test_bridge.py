@@ -8,8 +8,8 @@ import msgspec
 import pytest
 from fake_link import FakeLink
 
-from zsim.contract import batch, keys, messages
-from zsim.contract.bundle import Bundle, table_of
+from zsim.contract import keys, messages
+from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.errors import RunError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
@@ -173,12 +173,12 @@ class Link:
         return []
 
     def subscribe(self, expression: str) -> "Link":
-        assert expression == batch.KEY
+        assert expression == keys.BATCH
         return self
 
     def receive(self) -> Sample:
         for payload in self._payloads:
-            return Sample(batch.KEY, payload)
+            return Sample(keys.BATCH, payload)
         self.emptied.set()
         self._closed.wait(10.0)
         raise SessionError("closed")
@@ -190,12 +190,12 @@ class Link:
 def test_who_is_too_slow_loses_the_oldest_gates(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(intake_module, "BACKLOG", 3)
     info: Any = type("Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")]})()
-    table = table_of(["drone1"])
+    table = key_table(["drone1"])
 
     def payload(gate: int) -> bytes:
         said = [(keys.status("drone1"), messages.encode(status(gate * GATE_NS)))]
-        bundle = Bundle.of(gate * GATE_NS, gate, table, said)
-        return batch.encode([(batch.GATE, bundle.packed()), (keys.CLOCK, b"clock %d" % gate)])
+        bundle = GateMessages.of(gate * GATE_NS, gate, table, said)
+        return encode_batch([(keys.GATE, bundle.pack()), (keys.CLOCK, b"clock %d" % gate)])
 
     link: Any = Link([payload(gate) for gate in range(5)] + [b"no batch"])
 
@@ -204,11 +204,11 @@ def test_who_is_too_slow_loses_the_oldest_gates(monkeypatch: pytest.MonkeyPatch)
         intake = Intake(link, info, health, asyncio.get_running_loop())
         await asyncio.to_thread(link.emptied.wait, 10.0)
         await asyncio.wait_for(intake.news.wait(), 10.0)
-        found = list(intake.batches())
+        found = list(intake.arrivals())
         intake.close()
         return found, health
 
     found, health = asyncio.run(run())
-    assert [[key for key, _ in said] for said in found] == [[keys.status("drone1"), keys.CLOCK]] * 2 + [[]]
-    assert [said[1][1] for said in found[:2]] == [b"clock 3", b"clock 4"]
-    assert (health.dropped, health.refused, health.received) == (3, 1, 6)
+    assert [[key for key, _ in said] for said in found] == [[keys.status("drone1"), keys.CLOCK]] * 3
+    assert [said[1][1] for said in found] == [b"clock 2", b"clock 3", b"clock 4"]
+    assert (health.dropped, health.refused, health.received) == (2, 1, 5)

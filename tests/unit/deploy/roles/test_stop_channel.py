@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim_deploy.roles.stop_channel import KeyLease, key_lease
 
 ROLE = """
 import os, sys, time
 from pathlib import Path
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 from zsim_deploy.roles.stop_channel import StopChannel
 folder = Path(sys.argv[1])
 stop = StopChannel("run1", Identity(tls=folder))

@@ -13,8 +13,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from zsim.errors import RunError
-from zsim.transport.identity import Identity
-from zsim.transport.tls import own_fault
+from zsim.transport.tls import Identity, own_fault
 from zsim_deploy.security import certificates
 from zsim_deploy.security.certificates import DAYS, issue, renewal_reason
 from zsim_deploy.security.enrolment import CertificateRequest

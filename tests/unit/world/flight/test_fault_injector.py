@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from refused import parts
 
-from zsim.contract import batch, keys
+from zsim.contract import keys
 from zsim.contract.messages import ControlAnswer, ControlRequest, Done, Event, Faults, Join, Velocity
 from zsim.scenario import scenario_file
 from zsim_world.flight.world import World
@@ -88,8 +88,8 @@ def test_a_requested_fault_is_published_before_the_gate_that_nobody_has_seen_yet
     made.take_outbox()
     assert add(made, for_s=0.04) == {"id": 1, "from_ns": 3 * GATE_NS, "until_ns": 5 * GATE_NS}
     go(made, 1)
-    published = [key for key, _ in made.take_outbox() if key in (keys.FAULTS, batch.GATE)]
-    assert published == [keys.FAULTS, batch.GATE]
+    published = [key for key, _ in made.take_outbox() if key in (keys.FAULTS, keys.GATE)]
+    assert published == [keys.FAULTS, keys.GATE]
 
 
 def test_what_has_ended_stays_on_the_list_while_somebody_may_work_on_its_gates():

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from zsim.contract.messages import ControlRequest
-from zsim.scenario.scenario import Time
+from zsim.scenario.scenario import TimeSteps
 from zsim_world.flight.run_clock import RunClock
 from zsim_world.flight.run_outbox import Refusal
 
@@ -14,7 +14,7 @@ GATE_NS = 20_000_000
 
 
 def clock(state: str = "running", mode: str = "lockstep") -> RunClock:
-    made = RunClock(Time(), mode, 0.0)
+    made = RunClock(TimeSteps(), mode, 0.0)
     made.state = state
     return made
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from zsim.scenario.random_streams import stream
+from zsim.math.random_streams import stream
 from zsim_world.physics import normal_variates
 
 

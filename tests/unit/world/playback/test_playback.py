@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from refused import parts
 
-from zsim.contract import batch, keys, messages
+from zsim.contract import keys, messages
 from zsim.contract.messages import (
     Bye,
     Clock,
@@ -119,7 +119,7 @@ def played(made: Playback) -> list[tuple[str, bytes]]:
     while made.may_advance():
         made.advance(0)
         for key, message in made.take_outbox():
-            published += message.encoded if key == batch.GATE else [(key, messages.encode(message))]
+            published += message.pairs if key == keys.GATE else [(key, messages.encode(message))]
     return published
 
 
@@ -244,16 +244,16 @@ def test_a_status_counts_what_is_played(flight: RecordReader):
     assert part == [msgspec.structs.replace(status, count=2) for status in whole]
 
 
-def test_bundles_are_as_the_world_makes_them(flight: RecordReader):
+def test_gates_are_as_the_world_makes_them(flight: RecordReader):
     made = playback(flight)
     made.advance(0)
     made.take_outbox()
     made.advance(0)
-    bundle = next(message for key, message in made.take_outbox() if key == batch.GATE)
-    assert bundle.is_sound()
-    assert (bundle.t_ns, bundle.seq, bundle.first) == (GATE_NS, 1, [0, 4, 8])
-    assert bundle.stamps.tolist() == [15_000_000, GATE_NS, GATE_NS, GATE_NS] * 2
-    assert [key for key, _ in bundle.encoded][3::4] == [keys.status("d1"), keys.status("d2")]
+    gate = next(message for key, message in made.take_outbox() if key == keys.GATE)
+    gate.check()
+    assert (gate.t_ns, gate.seq, gate.first) == (GATE_NS, 1, [0, 4, 8])
+    assert gate.stamps.tolist() == [15_000_000, GATE_NS, GATE_NS, GATE_NS] * 2
+    assert [key for key, _ in gate.pairs][3::4] == [keys.status("d1"), keys.status("d2")]
 
 
 def test_views_are_made_of_what_was_played(flight: RecordReader):
@@ -292,7 +292,7 @@ def test_who_takes_part_is_waited_for_and_replaces_its_record(flight: RecordRead
     for number in range(10):
         assert made.may_advance()
         made.advance(0)
-        published += [(key, message) for key, message in made.take_outbox() if key != batch.GATE]
+        published += [(key, message) for key, message in made.take_outbox() if key != keys.GATE]
         if 0 < number < 9:  # the replay is a gate ahead, as a world is
             assert not made.may_advance()
             done = Done(0, number, "replay", 5, (number - 1) * GATE_NS, 0)

@@ -7,7 +7,8 @@ import pytest
 from fake_link import BAD_UTF8, NESTED, UNANSWERED, FakeLink
 from refused import parts
 
-from zsim.contract import batch, keys, messages
+from zsim.contract import keys, messages
+from zsim.contract.framing import decode_batch
 from zsim.contract.messages import (
     ClusterState,
     ControlAnswer,
@@ -170,7 +171,7 @@ class Lossy(FakeLink):
 
     def recorded(self, key: str) -> list[int]:
         """Return the gates of the messages on a key in the order in which the recorder hears of them."""
-        passed = [pair for name, payload in self.published if name == batch.KEY for pair in batch.decode(payload)]
+        passed = [pair for name, payload in self.published if name == keys.BATCH for pair in decode_batch(payload)]
         return [messages.decode(name, payload).t_ns // GATE_NS for name, payload in passed if name == key]
 
 

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from zsim.contract import messages
 from zsim.errors import RecordError, ZsimError
 from zsim.record import Recorded, RecordReader, repair
-from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, MAGIC, Place, places
+from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, MAGIC, RecordSpan, places
 from zsim_analysis.export.make_export import export
 from zsim_analysis.export.output import Format
 from zsim_analysis.export.selection import MessageSelection
@@ -57,7 +57,7 @@ def test_the_record_has_every_kind_of_message(run: Path) -> None:
     assert kinds == {*messages.types_by_shape().values(), None}
 
 
-def chunks(data: bytes) -> list[Place]:
+def chunks(data: bytes) -> list[RecordSpan]:
     return [place for place in places(data) if place.opcode == Opcode.CHUNK]
 
 

@@ -9,7 +9,7 @@ from zsim.contract import keys
 from zsim.contract.messages import Bye, ControlAnswer, ControlRequest, Status
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.group import Group
+from zsim.runtime.group import AgentGroup
 
 GATE_NS = 20_000_000
 CLUSTER = keys.cluster_control("main")
@@ -58,12 +58,12 @@ def status(t_ns: int, seq: int = 0) -> Status:
     return Status(t_ns, seq, "flying", 50.0, False, None, 1)
 
 
-def team() -> tuple[Member, Member, Group]:
+def team() -> tuple[Member, Member, AgentGroup]:
     first = Member("estimator.d1", [keys.status("d1")], keys.estimate("d1"))
     first.serves = ("estimator.d2",)
     first.counted = ("d1",)
     last = Asked("controller.main", [keys.status("d1"), keys.estimate("d1")], keys.cluster_state("main"))
-    return first, last, Group([first, last])
+    return first, last, AgentGroup([first, last])
 
 
 def test_a_group_reads_what_its_members_do_not_tell_each_other():
@@ -130,9 +130,9 @@ def test_members_of_different_periods_are_refused():
     fast = Member("estimator.d1", [], "b")
     said = r"period_ns of a group's members is estimator\.d1 20000000, controller\.main 40000000; must be the same"
     with pytest.raises(RunError, match=said):
-        Group([fast, slow])
+        AgentGroup([fast, slow])
 
 
 def test_nobody_is_no_group():
     with pytest.raises(RunError, match="a group has no members; must have one at least"):
-        Group([])
+        AgentGroup([])

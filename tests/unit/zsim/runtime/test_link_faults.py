@@ -6,10 +6,11 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from zsim.contract import batch, keys
-from zsim.contract.bundle import Bundle, table_of
-from zsim.contract.messages import ControlRequest, Estimate, Fault, Faults, Imu, Mode, Status, encode
-from zsim.runtime.link_faults import LinkFaults, heard, place_of, senders, uniform
+from zsim.contract import keys
+from zsim.contract.framing import GateMessages, key_table
+from zsim.contract.messages import ControlRequest, Estimate, Fault, Faults, Imu, Info, Mode, Status, encode
+from zsim.runtime.agent import Agent, Output
+from zsim.runtime.link_faults import LinkFaults, place_of, reception_probability, senders, uniform
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import planned
 from zsim_agents.formation.controller import REQUESTS_MAX, Controller
@@ -34,9 +35,9 @@ def status(gate: int) -> Given:
     return STATUS, Status(gate * GATE_NS, gate, "flying", 90.0, False, None, 1)
 
 
-def links(*faults: Fault, names: tuple[str, ...] = (ME,), reads: tuple[str, ...] = (), seed: int = 1) -> LinkFaults:
-    made = LinkFaults(names, reads, seed, GATE_NS, {"main": ["d1", "d2"]})
-    made.heed(Faults(0, 0, faults))
+def links(*faults: Fault, names: tuple[str, ...] = (ME,), seed: int = 1) -> LinkFaults:
+    made = LinkFaults(names, seed, GATE_NS, {"main": ["d1", "d2"]})
+    made.update(Faults(0, 0, faults))
     return made
 
 
@@ -44,15 +45,19 @@ def fault(kind: str, target: str = f"{OTHER}/{ME}", number: int = 1, **given: An
     return planned({"kind": kind, "target": target, **given}, number, "test", 0, GATE_NS)
 
 
+def handed_over(made: LinkFaults, t_ns: int, inputs: list[Given]) -> list[Given]:
+    return made.delivered(t_ns, inputs) if made.act_at(t_ns) else inputs
+
+
 def gates(made: LinkFaults, last: int, given: Any = estimate) -> list[tuple[int, int]]:
     """Hand over a message per gate; return (gate of delivery, gate of the message)."""
-    handed = [(gate, made.through(gate * GATE_NS, [given(gate)])) for gate in range(1, last + 1)]
+    handed = [(gate, handed_over(made, gate * GATE_NS, [given(gate)])) for gate in range(1, last + 1)]
     return [(gate, message.t_ns // GATE_NS) for gate, some in handed for _, message in some]
 
 
 def test_without_a_fault_everything_passes_as_it_is():
     inputs = [estimate(1)]
-    assert links().through(GATE_NS, inputs) is inputs
+    assert handed_over(links(), GATE_NS, inputs) is inputs
 
 
 def test_a_cut_acts_in_the_gates_after_its_start_up_to_its_end():
@@ -82,7 +87,7 @@ def test_a_loss_loses_its_share_and_never_depends_on_the_order_of_arrival():
     kept = {gate for gate, _ in gates(links(fault("link_loss", probability=share)), count)}
     assert len(kept) / count == pytest.approx(1 - share, abs=4 * math.sqrt(share * (1 - share) / count))
     made = links(fault("link_loss", probability=share))
-    backwards = {gate for gate in range(count, 0, -1) if made.through(gate * GATE_NS, [estimate(gate)])}
+    backwards = {gate for gate in range(count, 0, -1) if made.delivered(gate * GATE_NS, [estimate(gate)])}
     assert backwards == kept
     other = {gate for gate, _ in gates(links(fault("link_loss", probability=share), seed=2), count)}
     assert other != kept
@@ -141,25 +146,42 @@ def test_who_sends():
 
 def test_an_older_list_says_nothing_and_a_newer_one_counts():
     made = links(fault("link_cut"))
-    made.heed(Faults(0, 0, ()))
+    made.update(Faults(0, 0, ()))
     assert gates(made, 1) == []
-    made.heed(Faults(0, 1, ()))
+    made.update(Faults(0, 1, ()))
     assert len(gates(made, 1)) == 1
 
 
-def test_an_estimator_of_several_drones_has_the_link_of_each():
-    table, bundle = table_of(["d1", "d2"]), []
-    for drone in ("d1", "d2"):
-        bundle.append((keys.sensor(drone, "imu"), encode(Imu(GATE_NS, 1, GATE_NS, ZEROS, ZEROS))))
-    whole = Bundle.of(GATE_NS, 1, table, bundle)
+class Both(Agent):
+    """Estimators of two drones that read whole gates, and note what they receive."""
+
+    name, serves, takes_gates = "estimator.d1", ("estimator.d2",), True
     reads = tuple(keys.sensors(drone) for drone in ("d1", "d2"))
-    made = links(fault("link_cut", "world/estimator.d2"), names=("estimator.d1", "estimator.d2"), reads=reads)
-    handed = made.through(GATE_NS, [(batch.GATE, whole)])
-    assert [key for key, _ in handed] == [keys.sensor("d1", "imu")]
-    later = made.through(2 * GATE_NS, [(batch.GATE, Bundle.of(2 * GATE_NS, 2, table, bundle))])
-    assert len(later) == 1
-    made.heed(Faults(0, 1, ()))
-    assert made.through(3 * GATE_NS, [(batch.GATE, whole)]) == [(batch.GATE, whole)]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.received: list[Any] = []
+
+    def receive(self, key: str, message: Any) -> None:
+        self.received.append(key)
+
+    def receive_gate(self, gate: GateMessages) -> None:
+        self.received.append(gate)
+
+    def step(self, t_ns: int) -> list[Output]:
+        return []
+
+
+def test_an_estimator_of_several_drones_has_the_link_of_each():
+    pairs = [(keys.sensor(drone, "imu"), encode(Imu(GATE_NS, 1, GATE_NS, ZEROS, ZEROS))) for drone in ("d1", "d2")]
+    gate = GateMessages.of(GATE_NS, 1, key_table(["d1", "d2"]), pairs)
+    made, inputs = Both(), [(keys.GATE, gate)]
+    made.update_faults(info(), Faults(0, 0, (fault("link_cut", "world/estimator.d2"),)))
+    made.deliver(GATE_NS, inputs)
+    assert made.received == [keys.sensor("d1", "imu")]
+    made.update_faults(info(), Faults(0, 1, ()))
+    made.deliver(2 * GATE_NS, inputs)
+    assert made.received[1:] == [gate]
 
 
 def radio(**place: Any) -> Fault:
@@ -174,7 +196,7 @@ def test_a_radio_loses_more_the_farther_it_reaches(distance_m: float):
     kept = len(gates(links(radio()), count, lambda gate: estimate(gate, (distance_m, 0.0, 0.0))))
     expected = 1 / (1 + math.exp((distance_m - 50) / 5))
     assert kept / count == pytest.approx(expected, abs=4 * math.sqrt(0.25 / count))
-    assert heard(distance_m, 50, 5) == pytest.approx(expected)
+    assert reception_probability(distance_m, 50, 5) == pytest.approx(expected)
 
 
 def test_a_radio_is_where_its_process_is():
@@ -182,9 +204,11 @@ def test_a_radio_is_where_its_process_is():
     assert gates(links(radio()), 5, lambda gate: estimate(gate, far)) == []
     assert len(gates(links(radio(controller_main=[990, 0, 0])), 5, lambda gate: estimate(gate, far))) == 5
     on_d2 = links(radio(controller_main="d2"))
-    beside = [on_d2.through(gate * GATE_NS, [estimate(gate, far), estimate(gate, far, drone="d2")]) for gate in (1, 2)]
+    beside = [
+        on_d2.delivered(gate * GATE_NS, [estimate(gate, far), estimate(gate, far, drone="d2")]) for gate in (1, 2)
+    ]
     assert [len(handed) for handed in beside] == [2, 2]
-    apart = [on_d2.through(gate * GATE_NS, [estimate(gate, far), estimate(gate, drone="d2")]) for gate in (3, 4)]
+    apart = [on_d2.delivered(gate * GATE_NS, [estimate(gate, far), estimate(gate, drone="d2")]) for gate in (3, 4)]
     assert [[message.position_m for _, message in handed] for handed in apart] == [[ZEROS], [ZEROS]]
 
 
@@ -208,18 +232,25 @@ def test_draws_are_even_and_their_own():
     assert uniform(1, ME, cut, ESTIMATE, GATE_NS, 1) == draws[1]
 
 
-def controller() -> Controller:
+def world() -> World:
     drones = [{"name": name, "position_m": [3 * k, 0, 0]} for k, name in enumerate(("d1", "d2"))]
     given = {"name": "t", "duration_s": 1, "drones": drones, "clusters": [{"name": "main", "drones": ["d1", "d2"]}]}
-    world = World(scenario_file.resolve(given))
-    return Controller(world.info(), world.scenario, "main")
+    return World(scenario_file.resolve(given))
+
+
+def info() -> Info:
+    return world().info()
+
+
+def controller() -> Controller:
+    return Controller(info(), world().scenario, "main")
 
 
 def test_a_controller_keeps_the_newest_state_of_a_drone():
     made = controller()
     newest = Status(3 * GATE_NS, 3, "landing", 90.0, False, None, 1)
-    made.hear(3 * GATE_NS, [(STATUS, newest)])
-    made.hear(4 * GATE_NS, [status(2)])
+    made.deliver(3 * GATE_NS, [(STATUS, newest)])
+    made.deliver(4 * GATE_NS, [status(2)])
     assert made._states == ["landing", "landed"]
 
 

@@ -5,12 +5,12 @@ from typing import Any
 import pytest
 from fake_link import UNANSWERED, FakeLink
 
-from zsim.contract import batch, keys
+from zsim.contract import keys
+from zsim.contract.framing import decode_batch, pairs_of
 from zsim.contract.messages import ControlAnswer, Info, Origin
 from zsim.errors import DecodeError, NoWorldError
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.membership import RETRY_S, Membership
-from zsim.runtime.replay import replay
+from zsim.runtime.membership import RETRY_S, Membership, replay
 from zsim.transport.session import Sample
 
 GATE_NS = 20_000_000
@@ -84,7 +84,7 @@ NO_PAIRS = [None, 7, "text", [1], [["a"]], [["a", "dGV4dA=="]], [["a", b"1", b"2
 @pytest.mark.parametrize("result", NO_PAIRS)
 def test_a_result_that_is_no_list_of_pairs_is_none(result: Any):
     with pytest.raises(DecodeError, match=r"^result: .*; must be a list of \[key, payload\]$"):
-        batch.of(result)
+        pairs_of(result)
     with pytest.raises(NoWorldError, match="replay is of no use"):
         pages(FakeLink(), ControlAnswer(True, result=result))
 
@@ -97,4 +97,4 @@ def test_no_answer_is_said():
 @pytest.mark.parametrize("payload", [b"\x91\x92\xa1\xff\xc4\x00", b"\x91" * 5000 + b"\xc0", b"\xc1", b""])
 def test_a_batch_that_is_none_is_refused(payload: bytes):
     with pytest.raises(DecodeError, match=r"^@batch: .*must be a list"):
-        batch.decode(payload)
+        decode_batch(payload)

@@ -1,7 +1,7 @@
 """What a person is told of a run: a reason that lasts, once."""
 
 from zsim.contract.messages import ClusterState
-from zsim.runtime.progress import REASON_NS, Reasons
+from zsim.runtime.progress import REASON_NS, HoldReasons
 
 GATE_NS = 20_000_000
 WAITS = "Follow of the plan waits: the reference is not allowed: p is -1; allowed: between 0 and inf"
@@ -11,33 +11,33 @@ def state(t_ns: int, reason: str) -> ClusterState:
     return ClusterState(t_ns, t_ns // GATE_NS, "engaged", (), (), (), (), (), None, 1.0, reason)
 
 
-def told(reasons: Reasons, reason: str, from_ns: int, to_ns: int) -> list[str]:
+def told(reasons: HoldReasons, reason: str, from_ns: int, to_ns: int) -> list[str]:
     lines = [reasons.line("main", state(t_ns, reason)) for t_ns in range(from_ns, to_ns, GATE_NS)]
     return [line for line in lines if line]
 
 
 def test_a_reason_that_lasts_is_told_once():
-    reasons = Reasons()
+    reasons = HoldReasons()
     assert told(reasons, WAITS, 0, REASON_NS) == []
     (line,) = told(reasons, WAITS, REASON_NS, 10 * REASON_NS)
     assert line == f"      5.00 s  main, engaged: {WAITS}"
 
 
 def test_a_reason_that_passes_is_not_told():
-    reasons = Reasons()
+    reasons = HoldReasons()
     for start_ns in range(0, 10 * REASON_NS, REASON_NS):
         assert told(reasons, WAITS, start_ns, start_ns + REASON_NS // 2) == []
         assert told(reasons, "", start_ns + REASON_NS // 2, start_ns + REASON_NS) == []
 
 
 def test_other_numbers_are_the_same_reason():
-    reasons, times = Reasons(), range(0, 2 * REASON_NS, GATE_NS)
+    reasons, times = HoldReasons(), range(0, 2 * REASON_NS, GATE_NS)
     lines = [reasons.line("main", state(t_ns, f"drone2 is at z = {t_ns / 1e12:.3f} m")) for t_ns in times]
     assert len([line for line in lines if line]) == 1
 
 
 def test_each_cluster_has_its_own():
-    reasons = Reasons()
+    reasons = HoldReasons()
     for t_ns in (0, REASON_NS):
         lines = [reasons.line(cluster, state(t_ns, WAITS)) for cluster in ("a", "b")]
     assert [line and line.split()[2] for line in lines] == ["a,", "b,"]

@@ -8,8 +8,8 @@ import pytest
 from fake_link import UNANSWERED, FakeLink
 from msgspec.structs import replace
 
-from zsim.contract import batch, keys, messages
-from zsim.contract.bundle import Bundle, table_of
+from zsim.contract import keys, messages
+from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import (
     ControlAnswer,
     Done,
@@ -187,10 +187,10 @@ class Swarm(Judge):
         self.counted = ("d1", "d2")
 
 
-def bundle_of(t_ns: int, seq: int, told: list[tuple[str, Any]]) -> Bundle:
+def bundle_of(t_ns: int, seq: int, told: list[tuple[str, Any]]) -> GateMessages:
     """Return messages on drones d1 to d3 as the world bundles them."""
-    table = table_of([drone.name for drone in DRONES])
-    return Bundle.of(t_ns, seq, table, [(key, messages.encode(message)) for key, message in told])
+    table = key_table([drone.name for drone in DRONES])
+    return GateMessages.of(t_ns, seq, table, [(key, messages.encode(message)) for key, message in told])
 
 
 class InOne(World):
@@ -205,7 +205,7 @@ class InOne(World):
             (keys.status("d3"), status(gate)),
         ]
         self._at.get(gate, lambda world: None)(self)
-        self.deliver(batch.GATE, bundle_of(t_ns, gate, told).packed())
+        self.deliver(keys.GATE, bundle_of(t_ns, gate, told).pack())
 
 
 def test_who_reads_several_drones_gets_a_gate_in_one_message():
@@ -218,7 +218,7 @@ def test_who_reads_several_drones_gets_a_gate_in_one_message():
 
 
 def test_garbage_in_place_of_a_gate_is_refused_and_changes_nothing():
-    runner = Runner(InOne({2: lambda world: world.deliver(batch.GATE, b"\xc1")}), info(), Swarm())  # type: ignore[arg-type]
+    runner = Runner(InOne({2: lambda world: world.deliver(keys.GATE, b"\xc1")}), info(), Swarm())  # type: ignore[arg-type]
     assert runner.run() == "the run ended"
     assert runner.health.refused == 1
 

@@ -10,7 +10,7 @@ import pytest
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_check import Known, flaws
-from zsim.scenario.fault_kinds import KINDS, Parameter, acts, expected, planned
+from zsim.scenario.fault_kinds import KINDS, FaultParameter, acts, expected, planned
 from zsim.scenario.scenario_file import resolve
 
 GATE_NS = 20_000_000
@@ -187,11 +187,11 @@ def test_the_table_of_kinds_in_the_documentation_says_what_the_code_says():
     assert table
     written = [[cell.strip() for cell in row.strip("|").split("|")] for row in table[1].splitlines()[2:]]
     assert written == [
-        [f"`{name}`", kind.strikes, kind.said, "<br>".join(map(told, kind.parameters)) or "–"]
+        [f"`{name}`", kind.strikes, kind.description, "<br>".join(map(told, kind.parameters)) or "–"]
         for name, kind in KINDS.items()
     ]
 
 
-def told(p: Parameter) -> str:
+def told(p: FaultParameter) -> str:
     standing = f"default {p.default:g}" if isinstance(p.default, float) else "may be left out"
-    return f"`{p.name}` {p.said}: {expected(p)}{'' if p.required else f'; {standing}'}"
+    return f"`{p.name}` {p.description}: {expected(p)}{'' if p.required else f'; {standing}'}"

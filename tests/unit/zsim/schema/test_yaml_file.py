@@ -1,4 +1,4 @@
-"""YAML that is read by libyaml means what it means read by Python."""
+"""YAML documents: what they mean, and what is refused."""
 
 from pathlib import Path
 
@@ -15,38 +15,26 @@ SCALARS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False)
 DOCUMENTS = st.recursive(
     SCALARS, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4)
 )
-slow = yaml_file._Loader
-
-
-@pytest.fixture(autouse=True)
-def _needs_libyaml() -> None:
-    if yaml_file._FastLoader is None:
-        pytest.skip("PyYAML is built without libyaml here")
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
-def test_both_read_our_files_alike(file: Path) -> None:
+def test_our_files_mean_what_plain_yaml_means(file: Path) -> None:
     text = file.read_text()
-    assert yaml_file._is_plain(text)
-    assert yaml_file.value(text) == yaml.load(text, Loader=slow)
+    assert yaml_file.value(text) == yaml.safe_load(text)
 
 
 @given(DOCUMENTS)
-def test_both_read_alike_what_was_written(document: object) -> None:
-    text = yaml_file.dump(document)
-    assert yaml_file.value(text) == yaml.load(text, Loader=slow) == document
-
-
-@pytest.mark.parametrize("text", ["a: 1e3", "a: 1e-3", "a: 012", "a: 0x1f", "a: yes", "a: 1_000", "a: .5", "a: 12:30"])
-def test_both_read_numbers_alike(text: str) -> None:
-    assert yaml_file.value(text) == yaml.load(text, Loader=slow)
+def test_what_was_written_is_read_again(document: object) -> None:
+    assert yaml_file.value(yaml_file.dump(document)) == document
 
 
 @pytest.mark.parametrize(
-    "text", ["a: 1\t", "a:\t1", "[a,\tb]", "[a?b]", "{a: b?}", "a: |#\n  x", "a: >-#\n  x", "\n\ufeffa: 1"]
+    ("text", "value"),
+    [("1e3", 1000.0), ("1e-3", 0.001), ("012", 10), ("0x1f", 31), ("yes", True), (".5", 0.5), (".inf", float("inf"))],
 )
-def test_where_they_differ_python_reads(text: str) -> None:
-    assert not yaml_file._is_plain(text)
+def test_numbers_are_those_of_yaml_and_floats_of_yaml_1_2(text: str, value: object) -> None:
+    read = yaml_file.value(f"a: {text}")["a"]
+    assert (type(read), read) == (type(value), value)
 
 
 @pytest.mark.parametrize(
@@ -57,15 +45,9 @@ def test_where_they_differ_python_reads(text: str) -> None:
         ("a: 1\na: 2", "line 2 .*key 'a' is given twice"),
         ("a: [1", "line 1 "),
         ("[" * 100_000, "nested too deep"),
-        ("[" * 60 + "1" + "]" * 60 + "]", "line 1 "),
+        ("[" * 40 + "1" + "]" * 40 + "]", "line 1 "),
     ],
 )
 def test_what_is_refused_says_where(text: str, fault: str) -> None:
     with pytest.raises(ValueError, match=fault):
         yaml_file.value(text)
-
-
-def test_what_is_deep_is_read_all_the_same() -> None:
-    depth = yaml_file.DEPTH_MAX + 5
-    found = yaml_file.value("[" * depth + "]" * depth)
-    assert isinstance(found, list)

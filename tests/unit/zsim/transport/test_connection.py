@@ -11,7 +11,7 @@ import pytest
 from zsim.errors import NoWorldError, SessionError
 from zsim.transport import session
 from zsim.transport.connection import find_world
-from zsim.transport.identity import Identity
+from zsim.transport.tls import Identity
 
 
 class Silent:

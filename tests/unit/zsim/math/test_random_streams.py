@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from zsim.scenario.random_streams import stream
+from zsim.math.random_streams import stream
 
 NAMES = [f"drone{n}/{sensor}" for n in (1, 2, 3) for sensor in ("imu", "gps", "mag", "wind")]
 

@@ -1,0 +1,214 @@
+"""How many messages travel in one payload: written, taken apart, and read without decoding each one.
+
+    @gate, @gate/{drone}   the world's messages about its drones at one gate           GateMessages
+    @batch                 [key, payload] of everything that passed the hub, in order  encode_batch, decode_batch
+
+Sent one by one, the messages of a gate cost each reader and the hub a piece of work and a wake-up each. These keys are
+outside of the contract and begin with `@`, which no wildcard of Zenoh matches: whoever subscribes to `**` gets the
+messages themselves, and not these.
+"""
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property, lru_cache
+from itertools import pairwise
+from operator import sub
+from typing import Any, NoReturn
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from zsim.contract import keys, messages
+from zsim.contract.encoding import GAP
+from zsim.contract.messages import REFUSALS, Count
+from zsim.errors import DecodeError
+
+KINDS = (*keys.SENSORS, "truth", "status")  # of the messages about a drone
+BATCH_MAX = 5_000  # messages of one batch; a flood of somebody's messages goes into several
+Pairs = list[tuple[str, bytes]]
+"""Keys and payloads, in the order in which they were published."""
+_INT = np.dtype("<i8")
+
+
+def key_table(drones: Sequence[str]) -> tuple[str, ...]:
+    """Return the keys of the world's messages about some drones, drone by drone in the order of KINDS."""
+    return tuple(keys.truth(d) if kind == "truth" else keys.sensor(d, kind) for d in drones for kind in KINDS)
+
+
+@lru_cache(maxsize=8)
+def _places(table: tuple[str, ...]) -> dict[str, int]:
+    return {key: place for place, key in enumerate(table)}
+
+
+class _PackedGate(Struct, array_like=True, gc=False):
+    """GateMessages on their way; whole numbers as little-endian int64."""
+
+    t_ns: Count
+    seq: Count
+    which: bytes
+    stamps: bytes
+    ends: bytes
+    buffer: bytes
+
+
+_encode = msgspec.msgpack.Encoder().encode
+_decode_gate = msgspec.msgpack.Decoder(_PackedGate).decode
+_decode_batch = msgspec.msgpack.Decoder(Pairs).decode
+
+
+class GateMessages:
+    """The world's messages about its drones at one gate, M of them in order of publication: columns and one buffer.
+
+    Message m is on the key table[which[m]], is stamped stamps[m], and its payload is
+    buffer[ends[m - 1] + GAP : ends[m]]. Columns that came over the wire may lead outside of table and buffer:
+    `check` them before they are followed, or compare as they are read.
+
+    Args:
+        t_ns: gate [ns].
+        seq: number of the gate.
+        table: keys; the same object at every gate.
+        which: the place of each message's key in the table, (M,).
+        stamps: t_ns of each [ns], (M,).
+        ends: where each ends in the buffer, (M,); GAP bytes before each payload are free.
+        buffer: owned by this object.
+        first: where the messages of each drone begin, and their end, (N + 1,); empty where that is not known.
+    """
+
+    def __init__(
+        self,
+        t_ns: int,
+        seq: int,
+        table: tuple[str, ...],
+        which: NDArray[np.int64],
+        stamps: NDArray[np.int64],
+        ends: NDArray[np.int64],
+        buffer: bytes | bytearray,
+        first: Sequence[int] = (),
+    ) -> None:
+        self.t_ns, self.seq = t_ns, seq
+        self.table = table
+        self.which = which
+        self.stamps = stamps
+        self.ends = ends
+        self.buffer = buffer
+        self.first = first
+
+    @classmethod
+    def of(
+        cls,
+        t_ns: int,
+        seq: int,
+        table: tuple[str, ...],
+        pairs: Sequence[tuple[str, bytes]],
+        stamps: Sequence[int] | None = None,
+        first: Sequence[int] = (),
+    ) -> "GateMessages":
+        """Return encoded messages as one object.
+
+        Args:
+            pairs: keys, which are in the table, and payloads.
+            stamps: t_ns of each [ns]; None stamps all with the gate.
+        """
+        places = _places(table)
+        which = np.array([places[key] for key, _ in pairs], dtype=np.int64)
+        ends = np.cumsum([GAP + len(payload) for _, payload in pairs])
+        buffer = b"".join([bytes(GAP) + payload for _, payload in pairs])
+        times = np.array([t_ns] * len(pairs) if stamps is None else stamps, dtype=np.int64)
+        return cls(t_ns, seq, table, which, times, ends, buffer, first)
+
+    @classmethod
+    def unpack(cls, payload: bytes, table: tuple[str, ...]) -> "GateMessages":
+        """Return what `pack` has packed; not checked yet.
+
+        Raises:
+            DecodeError: it is anything else.
+        """
+        try:
+            p = _decode_gate(payload)
+        except REFUSALS as error:
+            _refuse(str(error))
+        if not len(p.which) == len(p.stamps) == len(p.ends) or len(p.which) % _INT.itemsize:
+            _refuse("its columns differ in length")
+        which, stamps, ends = (np.frombuffer(column, _INT) for column in (p.which, p.stamps, p.ends))
+        return cls(p.t_ns, p.seq, table, which, stamps, ends, p.buffer)
+
+    def pack(self, first: int = 0, last: int | None = None) -> bytes:
+        """Return messages [first, last) as one payload."""
+        start = int(self.ends[first - 1]) if first else 0
+        ends = self.ends[first:last] - start
+        data = bytes(memoryview(self.buffer)[start : start + int(ends[-1])])
+        which, stamps = self.which[first:last].tobytes(), self.stamps[first:last].tobytes()
+        return _encode(_PackedGate(self.t_ns, self.seq, which, stamps, ends.tobytes(), data))
+
+    def __len__(self) -> int:
+        return len(self.which)
+
+    def check(self) -> None:
+        """Refuse columns that lead outside of table or buffer, and stamps that are no times.
+
+        Raises:
+            DecodeError: with what is wrong.
+        """
+        which, stamps, ends = self.which.tolist(), self.stamps.tolist(), self.ends.tolist()
+        if not ends or ends[-1] != len(self.buffer) or min(map(sub, ends, [0, *ends])) < GAP:
+            _refuse("its payloads are not one behind the other")
+        if min(which) < 0 or max(which) >= len(self.table):
+            _refuse("a key is not in its table")
+        if min(stamps) < 0:
+            _refuse("a stamp is below 0")
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        """Keys and payloads, as on the wire."""
+        data, table = bytes(self.buffer), self.table
+        places: list[int] = self.which.tolist()
+        bounds = pairwise([0, *self.ends.tolist()])
+        return [(table[p], data[start + GAP : end]) for p, (start, end) in zip(places, bounds, strict=True)]
+
+    def decoded(self) -> Iterator[tuple[str, Any]]:
+        """Yield keys and messages.
+
+        Raises:
+            DecodeError: one is no message of its key.
+        """
+        for key, payload in self.pairs:
+            yield key, messages.decode(key, payload)
+
+    def payload(self, m: int) -> bytes:
+        """Return the payload of one message."""
+        start = int(self.ends[m - 1]) if m else 0
+        return bytes(self.buffer[start + GAP : int(self.ends[m])])
+
+
+def _refuse(reason: str) -> NoReturn:
+    raise DecodeError(f"{keys.GATE}: {reason}; must be the messages of a gate")
+
+
+def encode_batch(passed: Pairs) -> bytes:
+    """Return the payload that carries (key, payload) in the order in which they passed."""
+    return _encode(passed)
+
+
+def decode_batch(payload: bytes) -> Pairs:
+    """Return what passed.
+
+    Raises:
+        DecodeError: it is no batch.
+    """
+    try:
+        return _decode_batch(payload)
+    except REFUSALS as error:
+        raise DecodeError(f"{keys.BATCH}: {error}; must be a list of [key, payload]") from error
+
+
+def pairs_of(result: Any) -> Pairs:
+    """Return the [key, payload] pairs in the result of an answer.
+
+    Raises:
+        DecodeError: it is anything else.
+    """
+    try:
+        return msgspec.convert(result, Pairs, builtin_types=(bytes,))  # or texts would pass as base64
+    except REFUSALS as error:
+        raise DecodeError(f"result: {error}; must be a list of [key, payload]") from error

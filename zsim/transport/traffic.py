@@ -1,0 +1,78 @@
+"""Everything that passes the hub, taken in by one subscription: batches are taken apart here and nowhere else.
+
+traffic = Traffic(link, drones)
+for entry in traffic.receive(): ...     Sample(key, payload), or GateMessages of the world's drones
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+
+from zsim.contract import keys
+from zsim.contract.framing import GateMessages, decode_batch, key_table
+from zsim.errors import DecodeError
+from zsim.transport.session import Sample, Session
+
+Passed = Sample | GateMessages
+
+
+class Traffic:
+    """What others and the world publish, in the order in which it passed the hub; views do not pass it.
+
+    Args:
+        link: an open session.
+        drones: their names, as `world/info` gives them.
+        refused: called for each batch, or part of one, that cannot be read.
+    """
+
+    def __init__(self, link: Session, drones: Sequence[str], refused: Callable[[], None] = lambda: None) -> None:
+        self._box = link.subscribe(keys.BATCH)
+        self._table = key_table(drones)
+        self._refused = refused
+
+    def wake(self) -> None:
+        """Let a waiting `receive` return; callable from any thread."""
+        self._box.wake()
+
+    def close(self) -> None:
+        """Take no more; a waiting `receive` raises SessionError."""
+        self._box.close()
+
+    def receive(self) -> list[Passed]:
+        """Wait for what passes next; nothing when woken by `wake`.
+
+        Raises:
+            SessionError: the session, or this mailbox, was closed meanwhile.
+        """
+        sample = self._box.receive()
+        return list(self._opened(sample.payload)) if sample is not None else []
+
+    def drain(self) -> Iterator[Passed]:
+        """Yield what has passed, without waiting."""
+        for sample in self._box.drain():
+            yield from self._opened(sample.payload)
+
+    def _opened(self, payload: bytes) -> Iterator[Passed]:
+        try:
+            passed = decode_batch(payload)
+        except DecodeError:
+            self._refused()
+            return
+        for key, message in passed:
+            if key != keys.GATE:
+                yield Sample(key, message)
+                continue
+            try:
+                gate = GateMessages.unpack(message, self._table)
+                gate.check()
+            except DecodeError:
+                self._refused()
+                continue
+            yield gate
+
+
+def samples(passed: Iterable[Passed]) -> Iterator[Sample]:
+    """Yield messages one by one."""
+    for entry in passed:
+        if isinstance(entry, GateMessages):
+            yield from (Sample(key, payload) for key, payload in entry.pairs)
+        else:
+            yield entry
