@@ -1,4 +1,4 @@
-"""Documents that people write, checked as a whole: YAML, and typed descriptions with every fault told.
+"""Documents that people write: YAML, every fault against a typed description, and the user's classes they name.
 
 Imports errors.
 """

@@ -1,0 +1,88 @@
+"""What a user's own package adds, named in a document: `package.module` or `package.module:Class`.
+
+A module is found as Python finds modules: installed beside zsim, or on PYTHONPATH. The folder of the document comes
+last, where `search` has named it: a module beside the scenario's file needs no installation on that machine. It hides
+nothing that is installed. On other hosts the module must be installed.
+
+Importing a module runs it: fly scenarios of others only if you trust what they name.
+"""
+
+import importlib
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any
+
+from msgspec import Meta
+
+from zsim.errors import DocumentError
+from zsim.schema.checker import show
+
+FOLDERS = "ZSIM_PLUGIN_PATH"  # environment variable, so that processes started from here search there too
+WHERE = "install it, or put it on PYTHONPATH or beside the scenario"
+
+ModuleName = Annotated[str, Meta(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*\Z")]
+ClassName = Annotated[str, Meta(pattern=r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*\Z")]
+
+
+def search(folder: Path) -> None:
+    """Let modules be found in a folder too, here and in processes that are started from here."""
+    folders = list(filter(None, os.environ.get(FOLDERS, "").split(os.pathsep)))
+    path = str(folder.resolve())
+    if path not in folders:
+        os.environ[FOLDERS] = os.pathsep.join([*folders, path])
+
+
+def load(name: str, where: str, kind: type) -> Callable[..., Any]:
+    """Return the class of a name `package.module:Class`.
+
+    Args:
+        name: the class.
+        where: file and path of the field that names it, for the fault.
+        kind: class or Protocol whose public methods it must have.
+
+    Raises:
+        DocumentError: no such module or class, or a method is missing; one line.
+    """
+    module_name, colon, class_name = name.partition(":")
+    if not (colon and module_name and class_name):
+        raise DocumentError([f"{where} is {show(name)}; must be package.module:Class"])
+    module = load_module(module_name, where)
+    loaded = getattr(module, class_name, None)
+    if not isinstance(loaded, type):
+        classes = ", ".join(_classes(module)) or "it has none"
+        raise DocumentError([f"{where} is {show(name)}; must be a class of {module_name}: {classes}"])
+    missing = [method for method in _methods(kind) if not callable(getattr(loaded, method, None))]
+    if missing:
+        lacks = f"{where} is {show(name)}, which has no {', '.join(missing)}()"
+        raise DocumentError([f"{lacks}; must have the methods of {kind.__name__}"])
+    return loaded
+
+
+def load_module(name: str, where: str) -> ModuleType:
+    """Return the module of a name `package.module`.
+
+    Raises:
+        DocumentError: it cannot be imported; one line.
+    """
+    for folder in filter(None, os.environ.get(FOLDERS, "").split(os.pathsep)):
+        if folder not in sys.path:
+            sys.path.append(folder)
+    try:
+        return importlib.import_module(name)
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise DocumentError([f"{where} is {show(name)}, which cannot be imported ({reason}); {WHERE}"]) from error
+
+
+def _classes(module: ModuleType) -> list[str]:
+    """Return the public classes that a module defines."""
+    own = (thing for thing in vars(module).values() if isinstance(thing, type) and thing.__module__ == module.__name__)
+    return sorted(thing.__name__ for thing in own if not thing.__name__.startswith("_"))
+
+
+def _methods(kind: type) -> list[str]:
+    """Return the public methods of a class or Protocol."""
+    return [name for name in dir(kind) if not name.startswith("_") and callable(getattr(kind, name))]
