@@ -7,7 +7,7 @@ row[STATE.p_WB : STATE.p_WB + 3]      row[STATE.energy]      np.zeros((count, ST
 from collections import namedtuple
 from collections.abc import Iterable
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, cast
 
 
 class Field(NamedTuple):
@@ -18,7 +18,13 @@ class Field(NamedTuple):
     width: int = 1
 
 
-def columns(name: str, fields: Iterable[Field]) -> Any:
+class Columns(Protocol):
+    """First columns by the names of their fields, and `size`."""
+
+    def __getattr__(self, name: str) -> int: ...
+
+
+def columns(name: str, fields: Iterable[Field]) -> Columns:
     """Return the first column of every field by its name, and the columns in all as `size`.
 
     It is a named tuple of integers: compiled code reads its attributes as constants.
@@ -28,4 +34,5 @@ def columns(name: str, fields: Iterable[Field]) -> Any:
     """
     listed = tuple(fields)
     first = [0, *accumulate(field.width for field in listed)]
-    return namedtuple(name, [*(field.name for field in listed), "size"])(*first)  # type: ignore[misc]
+    kind: Any = namedtuple(name, [*(field.name for field in listed), "size"])  # type: ignore[misc]
+    return cast(Columns, kind(*first))

@@ -13,8 +13,7 @@ from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_world.fleet.fleet import DivergedError, Fleet
-from zsim_world.fleet.publication import Publication
-from zsim_world.fleet.truth_hash import TruthHash
+from zsim_world.fleet.publication import Publication, TruthHash
 from zsim_world.flight.command_intake import CommandDesk
 from zsim_world.flight.commander import Commanders
 from zsim_world.flight.control_requests import Requests
@@ -164,7 +163,7 @@ class World(Hub):
         for i, name in enumerate(self.fleet.names):
             state, battery_percent, _ = self.fleet.status(i)
             pose = (tuple(truth.position_m[i].tolist()), tuple(truth.orientation_wxyz[i].tolist()))
-            rotors = tuple(truth.rotor_rad_s[i].tolist())
+            rotors = tuple(truth.rotor_rad_s[i, : self.fleet.rotors[i]].tolist())
             drones.append(messages.DroneView(name, *pose, rotors, state, battery_percent, commanders[i]))
         wind = tuple(tuple(row) for row in self.fleet.wind_m_s.tolist())
         return messages.ViewDrones(self.now_ns, seq, tuple(drones), wind)
