@@ -176,10 +176,8 @@ def _drive(lanes: NDArray, each: tuple[int, ...]) -> None:
     for k in range(LANES):
         own, attitude = lane_four(lanes, BOARD_LANES.own, k), lane_four(lanes, BOARD_LANES.q_WB, k)
         rate, z = lane_vector(lanes, BOARD_LANES.w_WB_B, k), lane_vector(lanes, BOARD_LANES.z_H, k)
-        gains = lane_four(lanes, BOARD_LANES.drive, k) + (
-            lanes[LANES * (BOARD_LANES.drive + 4) + k],
-            lanes[LANES * (BOARD_LANES.drive + 5) + k],
-        )
+        drive = BOARD_LANES.drive
+        gains = lane_vector(lanes, drive, k) + lane_vector(lanes, drive + 3, k)
         thrust, yaw_rate = lanes[LANES * BOARD_LANES.thrust + k], lanes[LANES * BOARD_LANES.yaw_rate + k]
         rotors, speeds = _rotors(lanes, BOARD_ROTORS.known, k, each), _rotors(lanes, BOARD_ROTORS.speed, k, each)
         commands, found = _rotors(lanes, BOARD_ROTORS.command, k, each), _rotors(lanes, BOARD_ROTORS.found, k, each)

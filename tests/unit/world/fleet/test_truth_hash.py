@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from zsim_world.fleet.truth_hash import TruthHash
+from zsim_world.fleet.publication import TruthHash
 
 DRONES = 3
 WIDTHS = (3, 3, 4, 3)
