@@ -61,7 +61,8 @@ def test_what_cannot_be_loaded_is_one_line(beside: Path, name: str, wrong: str) 
     with pytest.raises(DocumentError) as raised:
         plugin.load(name, "a.yaml: meter", Meter)
     (line,) = raised.value.faults
-    assert line.startswith("a.yaml: meter is ") and wrong in line
+    assert line.startswith("a.yaml: meter is ")
+    assert wrong in line
     assert "\n" not in line
 
 
