@@ -40,6 +40,7 @@ from msgspec import inspect as types
 
 from zsim.contract import messages
 from zsim.scenario import scenario, scenario_file, sensor_presets
+from zsim.schema import numbers
 from zsim_deploy.cli.cli import app
 from zsim_deploy.inventory import inventory
 
@@ -468,7 +469,7 @@ def allowed(info: types.Type) -> str:
 
 
 def _number(info: types.FloatType | types.IntType) -> str:
-    whole, large = isinstance(info, types.IntType), scenario.LARGE
+    whole, large = isinstance(info, types.IntType), numbers.LARGE
     low, least = (info.gt, ">") if info.ge is None else (info.ge, "≥")
     high, most = (info.lt, "<") if info.le is None else (info.le, "≤")
     limits = [f"{least} {low:g}"] if low is not None and abs(low) < large else []
@@ -496,7 +497,7 @@ def preset_rows() -> Iterator[list[str]]:
     printed = dict(_flat(sensor_presets.AS_PRINTED))
     paths = list(dict.fromkeys(path for values in flat.values() for path in values))
     for path in paths:
-        cells = [f"{flat[name][path]:g}" if path in flat[name] else "–" for name in ("ardrone2", "paper")]
+        cells = [f"{flat[name][path]:g}" if path in flat[name] else "–" for name in ("ardrone2", "paper", "crazyflie2")]
         if path in printed:
             cells[1] += f" (`as_printed`: {printed[path]:.4g})"
         yield [f"`{path}`", *cells]
