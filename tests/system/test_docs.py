@@ -41,6 +41,7 @@ from msgspec import inspect as types
 from zsim.contract import messages
 from zsim.scenario import scenario, scenario_file, sensor_presets
 from zsim.schema import numbers
+from zsim.vehicles import vehicle
 from zsim_deploy.cli.cli import app
 from zsim_deploy.inventory import inventory
 
@@ -363,8 +364,10 @@ _INFO: dict[str, Any] = {
 
 SECTIONS = {
     name: section
-    for name, section in vars(scenario).items()
-    if isinstance(section, type) and issubclass(section, scenario.Spec) and section is not scenario.Spec
+    for name, section in {**vars(scenario), "Limits": vehicle.Limits}.items()
+    if isinstance(section, type)
+    and issubclass(section, (scenario.Spec, vehicle.Limits))
+    and section is not scenario.Spec
 }
 UNITS = {
     "_kg_m2": "kg m²", "_kg_m3": "kg/m³", "_n_s_m": "N s/m", "_nm_s2": "N m s²", "_n_s2": "N s²", "_1_s2": "1/s²",
