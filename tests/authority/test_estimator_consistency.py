@@ -20,7 +20,7 @@ from zsim.math.frames import heading, wrap_angle
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.drone_estimator import DroneEstimator, Estimate
-from zsim_world.fleet.fleet import GPS_FIX, Fleet, Sample
+from zsim_world.fleet.fleet import GPS_FIX, Fleet, SensorSample
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "step.yaml"  # three drones, preset paper, gusts of 0.5 m/s
 SEEDS = range(1, 21)
@@ -84,7 +84,7 @@ def fly(scenario: Scenario) -> Runs:
     return Runs(*(np.stack(parts, 1) for parts in zip(*rows, strict=True)))
 
 
-def feed(core: DroneEstimator, sample: Sample, gps_sigma_m: float) -> None:
+def feed(core: DroneEstimator, sample: SensorSample, gps_sigma_m: float) -> None:
     t, t_sample, v = sample.t_ns * 1e-9, sample.t_sample_ns * 1e-9, sample.values
     match sample.sensor:
         case "imu":

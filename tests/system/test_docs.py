@@ -40,7 +40,7 @@ from msgspec import inspect as types
 
 from zsim.contract import messages
 from zsim.scenario import scenario, scenario_file, sensor_presets
-from zsim.schema import numbers
+from zsim.schema import quantities
 from zsim.vehicles import vehicle
 from zsim_deploy.cli.cli import app
 from zsim_deploy.inventory import inventory
@@ -472,7 +472,7 @@ def allowed(info: types.Type) -> str:
 
 
 def _number(info: types.FloatType | types.IntType) -> str:
-    whole, large = isinstance(info, types.IntType), numbers.LARGE
+    whole, large = isinstance(info, types.IntType), quantities.LARGE
     low, least = (info.gt, ">") if info.ge is None else (info.ge, "≥")
     high, most = (info.lt, "<") if info.le is None else (info.le, "≤")
     limits = [f"{least} {low:g}"] if low is not None and abs(low) < large else []

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, Struct, field
 
 from zsim.scenario.sensor_presets import G_M_S2, SEA_LEVEL_KG_M3
-from zsim.schema.numbers import Fraction, NonNegative, Positive, Real, Vector3
+from zsim.schema.quantities import Fraction, NonNegative, Positive, Real, Vector3
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import Arm, Limits, Mass, RotorLag, TakeoffHeight
 

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from msgspec import Meta, Struct
 
-from zsim.schema.numbers import Fraction, NonNegative, Positive, Real
+from zsim.schema.quantities import Fraction, NonNegative, Positive, Real
 
 ROTORS_MIN, ROTORS_MAX = 4, 8  # fewer cannot hold a hover at every heading; more do not go into a message
 BALANCE_MAX = 1e-6  # of the arm, by which the centre of the rotors may miss that of mass

@@ -22,10 +22,11 @@ from zsim_world.fleet.initial_state import arrays
 from zsim_world.physics.air import WIND
 from zsim_world.sensors import sensor_set
 from zsim_world.sensors.noise import NoiseTable
-from zsim_world.sensors.sampler import Sample, Sampled, Sampler
+from zsim_world.sensors.sampler import Sampled, Sampler, SensorSample
 from zsim_world.state.fleet_arrays import STATE, VEHICLE
 from zsim_world.vehicles import firmware
-from zsim_world.vehicles.firmware import MEMORY, SETPOINT, SETTING
+from zsim_world.vehicles.firmware import MEMORY, SETPOINT
+from zsim_world.vehicles.firmware_settings import SETTING
 from zsim_world.vehicles.observer import BELIEF
 
 GPS_FIX = 3  # NMEA: a three-dimensional fix
@@ -123,7 +124,7 @@ class Fleet:
         self._gates += 1
         self._integrate(self._ticks)
 
-    def samples(self) -> list[Sample]:
+    def samples(self) -> list[SensorSample]:
         """Return what fell due for publication in the last gate, in the order of (t_ns, drone, sensor)."""
         return self.sampled.each()
 

@@ -24,14 +24,14 @@ from zsim_world.state.fleet_arrays import (
     Arrays,
     Boards,
     Bodies,
+    KernelTime,
     NearPairs,
     NoiseRows,
     Senses,
-    Time,
     rotor_row,
     vehicle_row,
 )
-from zsim_world.vehicles import firmware, observer, observer_gains
+from zsim_world.vehicles import firmware, firmware_settings, observer, observer_gains
 from zsim_world.vehicles.observer import BELIEF, CALIBRATION, DEVICE
 from zsim_world.vehicles.simd_firmware import board_blocks, sound_actuators
 
@@ -44,7 +44,7 @@ def arrays(scenario: Scenario, vehicles: Sequence[Vehicle], noise: NoiseTable) -
     rotors = np.array([rotor_row(vehicle, drone, each) for vehicle, drone in zip(vehicles, drones, strict=True)])
     clock = np.zeros(CLOCK.size, dtype=np.int64)
     clock[CLOCK.ticks_per_step] = round(observer.STEP_S / dt)
-    time = Time(clock=clock, spans=np.array([dt, scenario.silence.hover_s, scenario.silence.land_s]))
+    time = KernelTime(clock=clock, spans=np.array([dt, scenario.silence.hover_s, scenario.silence.land_s]))
     numbers = NoiseRows(table=noise.table, at=noise.at, cursor=noise.cursor)
     bodies, boards = _bodies(scenario, row, rotors, dt), _boards(scenario, vehicles, row, rotors)
     return Arrays(time, bodies, boards, numbers, _senses(scenario, noise), _wind(scenario), noise.gust)
@@ -84,7 +84,7 @@ def near(n: int) -> NearPairs:
 def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, rotors: np.ndarray) -> Boards:
     drones, n, each = scenario.drones, len(scenario.drones), rotors.shape[1] // ROTOR.size
     both = list(zip(vehicles, drones, strict=True))
-    setting = np.array([firmware.settings(vehicle, drone) for vehicle, drone in both])
+    setting = np.array([firmware_settings.settings(vehicle, drone) for vehicle, drone in both])
     calibration = np.array([_calibration(drone, scenario) for drone in drones])
     mounts = calibration[:, CALIBRATION.imu_turn : CALIBRATION.imu_turn + 4]
     return Boards(

@@ -92,7 +92,7 @@ class PublicationState(NamedTuple):
     out: GateMessages
 
 
-class Publication:
+class GatePublication:
     """Writes the messages of each gate and counts them per key."""
 
     def __init__(self, fleet: Fleet) -> None:
@@ -245,7 +245,7 @@ def publish(held: List, whose: NDArray, values: NDArray, now_ns: int) -> int:
     return at
 
 
-class TruthHash:
+class TruthDigest:
     """SHA-256 over t_ns (int64), then position, velocity, orientation and angular velocity (float64).
 
     Little-endian, drone by drone in scenario order, instants in time order (contract, "Same bits").

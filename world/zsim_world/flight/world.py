@@ -13,7 +13,7 @@ from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_world.fleet.fleet import DivergedError, Fleet
-from zsim_world.fleet.publication import Publication, TruthHash
+from zsim_world.fleet.publication import GatePublication, TruthDigest
 from zsim_world.flight.command_intake import CommandDesk
 from zsim_world.flight.commander import Commanders
 from zsim_world.flight.control_requests import Requests
@@ -47,13 +47,13 @@ class World(Hub):
     ) -> None:
         super().__init__(scenario, mode, rate, wall_ns, run_id, scenario.expected())
         self.fleet = Fleet(scenario)
-        self._publication = Publication(self.fleet)
+        self._publication = GatePublication(self.fleet)
         self.index = {name: i for i, name in enumerate(self.names)}
         self.commanders = Commanders(self.names)
         self.faults = FaultDesk(self)
         self._desk = CommandDesk(self)
         self._requests = Requests(self)
-        self._hash = TruthHash(self.fleet.count)
+        self._hash = TruthDigest(self.fleet.count)
         self._measured.apart(self.fleet.closest_m())
 
     @property

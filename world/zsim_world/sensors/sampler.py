@@ -23,7 +23,7 @@ WHOSE = columns("WhoseColumns", (Field("sensor", "1"), Field("drone", "1"), Fiel
 VALUE_COLUMNS = 9  # of a GPS fix, with its place on the Earth
 
 
-class Sample(Struct, frozen=True, gc=False):
+class SensorSample(Struct, frozen=True, gc=False):
     """One measurement; `values` as above."""
 
     sensor: SensorName
@@ -39,10 +39,10 @@ class Sampled(NamedTuple):
     whose: NDArray[np.int64]  # (M, WHOSE.size)
     values: NDArray[np.float64]  # (M, VALUE_COLUMNS), the first ones of each kind's
 
-    def each(self) -> list[Sample]:
+    def each(self) -> list[SensorSample]:
         """Return them one by one."""
         rows = zip(self.whose.tolist(), self.values.tolist(), strict=True)
-        return [Sample(SENSORS[s], i, t, at, tuple(row[: SIZES[s]])) for (s, i, t, at), row in rows]
+        return [SensorSample(SENSORS[s], i, t, at, tuple(row[: SIZES[s]])) for (s, i, t, at), row in rows]
 
 
 SIZES = tuple(9 if name == "gps" else size for name, size in zip(SENSORS, VALUES, strict=True))

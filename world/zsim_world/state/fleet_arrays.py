@@ -79,7 +79,7 @@ STREAMS = columns("StreamColumns", (Field("sensors", "1", 6), Field("wind", "1")
 Row = NDArray[np.float64] | tuple[float, ...]  # of one drone: a view, or loaded
 
 
-class Time(NamedTuple):
+class KernelTime(NamedTuple):
     clock: NDArray  # int64 (CLOCK.size,)
     spans: NDArray  # (SPAN.size,)
 
@@ -117,7 +117,7 @@ class Bodies(NamedTuple):
 class Boards(NamedTuple):
     """N navigation boards with their firmware."""
 
-    setting: NDArray  # (N, firmware.SETTING.size)
+    setting: NDArray  # (N, firmware_settings.SETTING.size)
     gain: NDArray  # (N, observer_gains.GAIN.size)
     calibration: NDArray  # (N, observer.CALIBRATION.size)
     setpoint: NDArray  # (N, firmware.SETPOINT.size)
@@ -153,7 +153,7 @@ class Senses(NamedTuple):
 class Arrays(NamedTuple):
     """All that a fleet is."""
 
-    time: Time
+    time: KernelTime
     bodies: Bodies
     boards: Boards
     noise: NoiseRows

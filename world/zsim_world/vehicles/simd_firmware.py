@@ -23,10 +23,10 @@ from zsim_world.physics.simd import (
     put_lane_four,
     put_lane_vector,
 )
-from zsim_world.state.fleet_arrays import CLOCK, ROTOR, SPAN, VEHICLE, Boards, Bodies, PerRotor, Time, of, put_of
+from zsim_world.state.fleet_arrays import CLOCK, ROTOR, SPAN, VEHICLE, Boards, Bodies, KernelTime, PerRotor, of, put_of
 from zsim_world.vehicles import attitude_control, firmware, observer
 from zsim_world.vehicles.attitude_control import DRIVE
-from zsim_world.vehicles.firmware import SETTING
+from zsim_world.vehicles.firmware_settings import SETTING
 from zsim_world.vehicles.observer import BELIEF, DEVICE
 
 BOARD_LANES = columns(
@@ -54,7 +54,7 @@ BOARD_LANES = columns(
 )
 BOARD_ROTORS = columns(
     "BoardRotors",
-    (Field("known", "ROTOR", ROTOR.size), Field("speed", "rad/s"), Field("command", "rad/s"), Field("found", "rad/s")),
+    (Field("known", "ROTOR", ROTOR.size), Field("speed", "rad/s"), Field("command", "rad/s"), Field("drive", "rad/s")),
 )
 ACTUATOR = (
     columns(  # and by how much the speed of each rotor is less than commanded (R); the one at which it is held (R)
@@ -87,7 +87,7 @@ def _rotors(lanes: NDArray, group: int, k: int, each: tuple[int, ...]) -> PerRot
 
 
 @inlined
-def steer(time: Time, bodies: Bodies, boards: Boards) -> None:
+def steer(time: KernelTime, bodies: Bodies, boards: Boards) -> None:
     """Let the firmware of every drone see and act."""
     count, each = bodies.state.shape[0], bodies.each
     for first in range(0, count, LANES):
@@ -137,7 +137,7 @@ def _turn(lanes: NDArray, count: int) -> None:
 
 
 @inlined
-def _decide(time: Time, bodies: Bodies, boards: Boards, lanes: NDArray, i: int, k: int) -> bool:
+def _decide(time: KernelTime, bodies: Bodies, boards: Boards, lanes: NDArray, i: int, k: int) -> bool:
     """Let drone i see, and put what it wants into lane k; return whether the drive is to find its command."""
     each, memory, belief, row = bodies.each, boards.memory[i], boards.belief[i], bodies.vehicle[i]
     setting, heading = boards.setting[i], lanes[LANES * BOARD_LANES.heading + k]
@@ -180,12 +180,12 @@ def _drive(lanes: NDArray, each: tuple[int, ...]) -> None:
         gains = lane_vector(lanes, drive, k) + lane_vector(lanes, drive + 3, k)
         thrust, yaw_rate = lanes[LANES * BOARD_LANES.thrust + k], lanes[LANES * BOARD_LANES.yaw_rate + k]
         rotors, speeds = _rotors(lanes, BOARD_ROTORS.known, k, each), _rotors(lanes, BOARD_ROTORS.speed, k, each)
-        commands, found = _rotors(lanes, BOARD_ROTORS.command, k, each), _rotors(lanes, BOARD_ROTORS.found, k, each)
+        commands, wanted = _rotors(lanes, BOARD_ROTORS.command, k, each), _rotors(lanes, BOARD_ROTORS.drive, k, each)
         row = lane_row(lanes, k)
-        attitude_control.drive(row, rotors, gains, own, attitude, rate, speeds, z, thrust, yaw_rate, found)
+        attitude_control.drive(row, rotors, gains, own, attitude, rate, speeds, z, thrust, yaw_rate, wanted)
         driven = lanes[LANES * BOARD_LANES.driven + k] > 0.0
         for r in range(len(each)):
-            put_of(commands, r, of(found, 0, r) if driven else of(commands, 0, r))
+            put_of(commands, r, of(wanted, 0, r) if driven else of(commands, 0, r))
 
 
 @inlined

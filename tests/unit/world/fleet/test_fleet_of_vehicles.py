@@ -10,7 +10,7 @@ from zsim.math.frames import heading
 from zsim.scenario.scenario_file import resolve
 from zsim.vehicles import catalogue
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.fleet.publication import Publication
+from zsim_world.fleet.publication import GatePublication
 
 GATE_S = 0.02
 MODELS = [*catalogue.STOCK, "hexacopter"]
@@ -106,7 +106,7 @@ def test_a_quadrotor_flies_with_the_same_bits_beside_one_of_six_rotors():
 
 def test_truth_and_commands_have_a_number_for_each_rotor():
     flight = airborne("crazyflie2", "hexacopter")
-    bundle = Publication(flight).gate([None, None])
+    bundle = GatePublication(flight).gate([None, None])
     quad, hexa = (message.rotor_rad_s for key, message in bundle.messages() if key.endswith("truth"))
     np.testing.assert_array_equal(quad, flight.truth().rotor_rad_s[0, :4])
     np.testing.assert_array_equal(hexa, flight.truth().rotor_rad_s[1])

@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from zsim_world.fleet.publication import TruthHash
+from zsim_world.fleet.publication import TruthDigest
 
 DRONES = 3
 WIDTHS = (3, 3, 4, 3)
@@ -18,7 +18,7 @@ def instants(count: int) -> list[tuple[int, list[np.ndarray]]]:
 
 
 def digest(said: list[tuple[int, list[np.ndarray]]]) -> str:
-    truth = TruthHash(DRONES)
+    truth = TruthDigest(DRONES)
     for t_ns, arrays in said:
         truth.add(t_ns, np.hstack(arrays))
     return truth.hexdigest()
@@ -36,7 +36,7 @@ def test_the_bytes_are_the_contract_s():
 
 
 def test_nothing_flown_is_the_hash_of_nothing():
-    assert TruthHash(DRONES).hexdigest() == hashlib.sha256(b"").hexdigest()
+    assert TruthDigest(DRONES).hexdigest() == hashlib.sha256(b"").hexdigest()
 
 
 def test_layout_and_byte_order_of_the_arrays_do_not_matter():
@@ -66,7 +66,7 @@ def test_time_and_order_count():
 
 
 def test_the_hash_may_be_asked_on_the_way():
-    truth = TruthHash(DRONES)
+    truth = TruthDigest(DRONES)
     for t_ns, arrays in instants(4):
         truth.add(t_ns, np.hstack(arrays))
         truth.hexdigest()

@@ -19,7 +19,7 @@ NUMBER = st.floats(allow_nan=False, allow_infinity=False)
 TEXTS = ["landed", "flying", "", "controller.main", "ö" * 15, None]
 
 
-def written(kinds: list[type], rows: list[tuple[int, list[int], list[float]]]) -> list[bytes]:
+def written(kinds: list[Any], rows: list[tuple[int, list[int], list[float]]]) -> list[bytes]:
     """Return what is written of (kind, whole numbers, floats), having read again what can be."""
     layouts, texts = Layouts(kinds), words(TEXTS)
     found = []
