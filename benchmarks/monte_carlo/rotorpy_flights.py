@@ -29,8 +29,8 @@ from benchmarks.monte_carlo.worker import Flown, Fly, serve
 STEP_S = 0.01  # RotorPy's default
 START_S = 40.0  # of Test 1: the formation climbs and goes
 GUST_M_S = 0.5  # scenarios/step.yaml
-THRUST_N_S2, HOVER_RAD_S = 8.048e-6, 361.5  # zsim_world/vehicle.py; sqrt(m g / 4 k)
-ARM_XY_M = 0.1785 / np.sqrt(2.0)  # zsim_world/vehicle.py
+THRUST_N_S2, HOVER_RAD_S = 8.048e-6, 361.5  # zsim/vehicles/ardrone2.py; sqrt(m g / 4 k)
+ARM_XY_M = 0.1785 / np.sqrt(2.0)  # zsim/vehicles/ardrone2.py
 CORNERS = ((1, 1), (1, -1), (-1, -1), (-1, 1))  # in the order of RotorPy's rotors
 ROTOR_POS_M = {f"r{k}": ARM_XY_M * np.array([x, y, 0.0]) for k, (x, y) in enumerate(CORNERS, 1)}
 ARDRONE = {

@@ -11,9 +11,11 @@ import pytest
 from scipy.linalg import solve_continuous_lyapunov
 
 from zsim.scenario.scenario_file import resolve
+from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.vehicles import observer_gains
 from zsim_world.vehicles.attitude_control import loop_gains
+from zsim_world.vehicles.observer_gains import GAIN
 
 PROPORTIONAL, INTEGRAL = 0.6, 0.05  # 1/s, 1/s^2
 GUST, TAU_S = 0.5, 5.0  # m/s; 10 m over 2 m/s
@@ -37,13 +39,13 @@ def field(sensors, count, seed=1):
 def predicted(sensors):
     """Return the standard deviation of one horizontal axis [m] from the loops' linear model."""
     scenario = field(sensors, 1)
-    row = observer_gains.gain_row(scenario.drones[0], scenario.environment)
+    row = observer_gains.gain_row(ARDRONE2, scenario.drones[0], scenario.environment)
     imu, flow = scenario.drones[0].sensors.imu, scenario.drones[0].sensors.flow
     accel_gain, flow_gain = (
-        row[observer_gains.ACCEL_V : observer_gains.FLOW_V] * 200.0,
-        row[observer_gains.FLOW_V : observer_gains.LIFT_Z] * 15.0,
+        row[GAIN.accel_v : GAIN.flow_v] * 200.0,
+        row[GAIN.flow_v : GAIN.lift_z] * 15.0,
     )
-    k = loop_gains(0.03)[2]
+    k = loop_gains(ARDRONE2.firmware, 0.03)[2]
     place, total, v, a, u, own_v, own_u, tilt = range(8)
     m, b = np.zeros((8, 8)), np.zeros((8, 3))
     m[place, v] = m[total, place] = 1

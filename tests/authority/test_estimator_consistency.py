@@ -22,7 +22,7 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.estimator_bank import EstimatorBank
-from zsim_world.fleet.fleet import GPS_FIX, Fleet, Sample
+from zsim_world.fleet.fleet import GPS_FIX, Fleet, SensorSample
 
 SCENARIO = Path(__file__).parents[2] / "scenarios" / "step.yaml"  # three drones, preset paper, gusts of 0.5 m/s
 SEEDS = range(1, 21)
@@ -86,7 +86,7 @@ def fly(scenario: Scenario) -> Runs:
     return Runs(*(np.stack(parts, 1) for parts in zip(*rows, strict=True)))
 
 
-def feed(bank: EstimatorBank, sample: Sample, gps_sigma_m: float) -> None:
+def feed(bank: EstimatorBank, sample: SensorSample, gps_sigma_m: float) -> None:
     v: Any = sample.values
     stamps = (sample.t_ns, 0, sample.t_sample_ns)
     match sample.sensor:

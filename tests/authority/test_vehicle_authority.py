@@ -8,12 +8,14 @@ import math
 
 import numpy as np
 import pytest
+from vehicle_rows import rows_of
 
 from zsim.scenario.scenario_file import resolve
+from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.rotors import ground_effect
-from zsim_world.state import vehicle
+from zsim_world.state.fleet_arrays import STATE, VEHICLE
 
 
 def calm(count=1, gust=0.0, seed=1, sensors=None, **drone):
@@ -24,10 +26,6 @@ def calm(count=1, gust=0.0, seed=1, sensors=None, **drone):
 
 
 CALM = (0.0, 0.0, 0.0)
-
-
-def four(speed):
-    return (speed, speed, speed, speed)
 
 
 def hovering(scenario, seconds=8.0):
@@ -60,13 +58,13 @@ def test_hover_at_361_6_rad_s():
 def test_steady_speed_under_a_held_tilt(tilt_deg, speed):
     """m g tan(tilt) = D v: the table that follows from tum_ardrone's fitted drag."""
     scenario = calm(limits={"tilt_deg": tilt_deg, "altitude_m": 1000.0})
-    row = vehicle.parameters(scenario.drones[0], scenario.environment)
+    row, rotors = rows_of(scenario)
     tilt = math.radians(tilt_deg)
-    rotor = math.sqrt(row[vehicle.MASS] * row[vehicle.GRAVITY] / math.cos(tilt) / (4 * row[vehicle.THRUST]))
-    state = np.zeros(body.COLUMNS)
+    rotor = math.sqrt(row[VEHICLE.mass] * row[VEHICLE.gravity] / math.cos(tilt) / (4 * row[VEHICLE.thrust]))
+    state = np.zeros(STATE.size + 4)
     state[2], state[6], state[8], state[13:] = 1e4, math.cos(tilt / 2), math.sin(tilt / 2), rotor
     for _ in range(8000):
-        body.step(row, np.zeros((8, 2)), state, four(rotor), CALM, CALM, 0.0025)
+        body.step(row, rotors, np.zeros((8, 2)), state, np.full(4, rotor), CALM, CALM, 0.0025)
     assert state[3] == pytest.approx(speed, abs=0.06)  # the table has one decimal
     assert abs(state[5]) < 1e-6
     fleet = hovering(scenario)
@@ -89,21 +87,21 @@ def test_tilt_answers_a_command_at_least_as_fast_as_the_aircraft():
 def test_rotors_follow_with_their_time_constant():
     """30 ms from Li's motor constants, 31.6 ms from Paparazzi's actuator model."""
     scenario = calm()
-    row = vehicle.parameters(scenario.drones[0], scenario.environment)
-    state = np.zeros(body.COLUMNS)
+    row, rotors = rows_of(scenario)
+    state = np.zeros(STATE.size + 4)
     state[2], state[6], state[13:] = 100.0, 1.0, 200.0
     for _ in range(12):
-        body.step(row, np.zeros((8, 2)), state, four(300.0), CALM, CALM, 0.0025)
+        body.step(row, rotors, np.zeros((8, 2)), state, np.full(4, 300.0), CALM, CALM, 0.0025)
     assert (state[13] - 200.0) / 100.0 == pytest.approx(1 - math.exp(-1.0), rel=1e-9)
 
 
 def test_thrust_to_weight_of_the_rotor_set():
     """Rotors from 126 to 503 rad/s: 8.1 N at most, 1.93 of the weight."""
     scenario = calm()
-    row = vehicle.parameters(scenario.drones[0], scenario.environment)
-    most = 4 * row[vehicle.THRUST] * row[vehicle.ROTOR_MAX] ** 2
+    row, _ = rows_of(scenario)
+    most = 4 * row[VEHICLE.thrust] * row[VEHICLE.rotor_max] ** 2
     assert most == pytest.approx(8.1, abs=0.06)
-    assert most / (row[vehicle.MASS] * row[vehicle.GRAVITY]) == pytest.approx(1.93, abs=0.02)
+    assert most / (row[VEHICLE.mass] * row[VEHICLE.gravity]) == pytest.approx(1.93, abs=0.02)
 
 
 def test_endurance_in_hover_is_that_of_the_published_battery():
@@ -117,11 +115,11 @@ def test_endurance_in_hover_is_that_of_the_published_battery():
 
 def test_ground_effect_saves_power():
     """One rotor radius up, Cheeseman and Bennett give 16/15; hovering low needs slower rotors by its root."""
-    assert ground_effect(vehicle.ROTOR_RADIUS_M, vehicle.ROTOR_RADIUS_M) == pytest.approx(16 / 15)
+    assert ground_effect(ARDRONE2.rotor_radius_m, ARDRONE2.rotor_radius_m) == pytest.approx(16 / 15)
     fleet = hovering(calm(takeoff_height_m=0.3))
     speeds = []
     for _ in range(200):
         fleet.advance()
-        factor = ground_effect(fleet.truth().position_m[0, 2], vehicle.ROTOR_RADIUS_M)
+        factor = ground_effect(fleet.truth().position_m[0, 2], ARDRONE2.rotor_radius_m)
         speeds.append(np.sqrt((fleet.truth().rotor_rad_s[0] ** 2).mean() * factor))
     assert np.mean(speeds) == pytest.approx(361.6, abs=1.0)

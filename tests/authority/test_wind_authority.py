@@ -9,7 +9,8 @@ from scipy import signal
 
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.physics import wind
+from zsim_world.physics import air
+from zsim_world.physics.air import WIND
 from zsim_world.sensors.noise import NoiseTable
 
 TAU_S = 5.0  # L / V0 = 10 m / 2 m/s while the airspeed is below 2 m/s
@@ -31,16 +32,16 @@ def blown(row, common, own, start):
         shared = (common[k, 0], common[k, 1], common[k, 2])
         for i in range(own.shape[1]):
             mine = (own[k, i, 0], own[k, i, 1], own[k, i, 2])
-            wind.blow(row, (0.0, 0.0, 0.0), gust[i], shared, mine, DT)
+            air.blow(row, (0.0, 0.0, 0.0), gust[i], shared, mine, DT)
         out[k] = gust
     return out
 
 
 def gusts(seconds, seed=1, steady=(0.0, 0.0, 0.0)):
     """Return gusts at DRONES standing drones at 10 Hz, (samples, DRONES, 3), settled."""
-    row = np.zeros(wind.COLUMNS)
-    row[wind.STEADY : wind.STEADY + 3] = steady
-    row[wind.GUST], row[wind.LENGTH], row[wind.SPEED_MIN], row[wind.CORRELATION] = SIGMA, 10.0, 2.0, 0.5
+    row = np.zeros(WIND.size)
+    row[WIND.steady : WIND.steady + 3] = steady
+    row[WIND.gust], row[WIND.length], row[WIND.speed_min], row[WIND.correlation] = SIGMA, 10.0, 2.0, 0.5
     rng, count = np.random.default_rng(seed), round(seconds / DT)
     numbers = rng.standard_normal((count, 3)), rng.standard_normal((count, DRONES, 3))
     return blown(row, *numbers, np.zeros((DRONES, 3)))[1000:]
@@ -115,7 +116,7 @@ def test_a_fleet_blows_the_same_filter_every_5_ms():
     common, own = noise.table[2, at:].reshape(-1, 3)[:40], noise.table[:2, at:].reshape(2, -1, 3)[:, :40]
     for k in range(40):
         for i in range(2):
-            wind.blow(row, (0.0, 0.0, 0.0), gust[i], tuple(common[k]), tuple(own[i, k]), 0.005)
+            air.blow(row, (0.0, 0.0, 0.0), gust[i], tuple(common[k]), tuple(own[i, k]), 0.005)
     np.testing.assert_allclose(fleet.wind_m_s, gust, atol=1e-7)  # the standing drones sway by micrometres
 
 

@@ -40,6 +40,8 @@ from msgspec import inspect as types
 
 from zsim.contract import messages
 from zsim.scenario import scenario, scenario_file, sensor_presets
+from zsim.schema import quantities
+from zsim.vehicles import vehicle
 from zsim_deploy.cli.cli import app
 from zsim_deploy.inventory import inventory
 
@@ -363,8 +365,10 @@ _INFO: dict[str, Any] = {
 
 SECTIONS = {
     name: section
-    for name, section in vars(scenario).items()
-    if isinstance(section, type) and issubclass(section, scenario.Spec) and section is not scenario.Spec
+    for name, section in {**vars(scenario), "Limits": vehicle.Limits}.items()
+    if isinstance(section, type)
+    and issubclass(section, (scenario.Spec, vehicle.Limits))
+    and section is not scenario.Spec
 }
 UNITS = {
     "_kg_m2": "kg m²", "_kg_m3": "kg/m³", "_n_s_m": "N s/m", "_nm_s2": "N m s²", "_n_s2": "N s²", "_1_s2": "1/s²",
@@ -475,7 +479,7 @@ def allowed(info: types.Type) -> str:
 
 
 def _number(info: types.FloatType | types.IntType) -> str:
-    whole, large = isinstance(info, types.IntType), scenario.LARGE
+    whole, large = isinstance(info, types.IntType), quantities.LARGE
     low, least = (info.gt, ">") if info.ge is None else (info.ge, "≥")
     high, most = (info.lt, "<") if info.le is None else (info.le, "≤")
     limits = [f"{least} {low:g}"] if low is not None and abs(low) < large else []
@@ -503,7 +507,7 @@ def preset_rows() -> Iterator[list[str]]:
     printed = dict(_flat(sensor_presets.AS_PRINTED))
     paths = list(dict.fromkeys(path for values in flat.values() for path in values))
     for path in paths:
-        cells = [f"{flat[name][path]:g}" if path in flat[name] else "–" for name in ("ardrone2", "paper")]
+        cells = [f"{flat[name][path]:g}" if path in flat[name] else "–" for name in ("ardrone2", "paper", "crazyflie2")]
         if path in printed:
             cells[1] += f" (`as_printed`: {printed[path]:.4g})"
         yield [f"`{path}`", *cells]

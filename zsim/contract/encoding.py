@@ -47,20 +47,21 @@ class Layouts:
     in the order of its fields.
 
     Args:
-        kinds: of messages, in the order in which `write` counts them.
+        kinds: of messages, in the order in which `write` counts them; with the length of its array, where a kind has
+            one that may be of several lengths.
 
     Raises:
         TypeError: a field is of a type that has no place here.
     """
 
-    def __init__(self, kinds: Iterable[type[Struct]]) -> None:
+    def __init__(self, kinds: Iterable[type[Struct] | tuple[type[Struct], int]]) -> None:
         self._literals = bytearray()
         self._ops: list[tuple[int, int, int]] = []
         self.ints = self.floats = self._int = self._float = 0
         first = []
         for kind in kinds:
             first.append(len(self._ops))
-            self._add(kind)
+            self._add(*kind) if isinstance(kind, tuple) else self._add(kind)
         first.append(len(self._ops))
         ops, literals = np.array(self._ops, dtype=np.int64), np.frombuffer(bytes(self._literals), dtype=np.uint8)
         self.program = Program(ops, np.array(first), literals)
@@ -71,22 +72,25 @@ class Layouts:
         fixed = sum(size for op, _, size in self._ops if op == LITERAL)
         return GAP + fixed + self.floats * FLOAT_BYTES + self.ints * max(INT_BYTES_MAX, longest)
 
-    def _add(self, kind: type[Struct]) -> None:
+    def _add(self, kind: type[Struct], length: int = 0) -> None:
         fields: Any = kinds_of.type_info(kind)
         self._int = self._float = 0
         self._ops.append((LITERAL, len(self._literals), 0))
         self._literal(bytes([MAP | len(fields.fields)]))
         for field in fields.fields:
             self._literal(packed(field.encode_name))
-            self._value(field.type, f"{kind.__name__}: {field.encode_name}")
+            self._value(field.type, f"{kind.__name__}: {field.encode_name}", length)
         self.ints, self.floats = max(self.ints, self._int), max(self.floats, self._float)
 
-    def _value(self, kind: Any, where: str) -> None:
+    def _value(self, kind: Any, where: str, length: int) -> None:
         if isinstance(kind, kinds_of.FloatType):
             self._take_floats(1)
         elif isinstance(kind, kinds_of.TupleType):
             self._literal(array_head(len(kind.item_types)))
             self._take_floats(len(kind.item_types))
+        elif isinstance(kind, kinds_of.VarTupleType) and length:
+            self._literal(array_head(length))
+            self._take_floats(length)
         elif type(kind) in _WHOLE:
             self._take_int(_WHOLE[type(kind)])
         else:

@@ -4,7 +4,7 @@ Works on what is sound of a document (`faults.sound`): a check whose fields are 
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -17,25 +17,30 @@ from zsim.scenario.scenario import ESTIMATORS, SEA_HEIGHT_MAX_M, space_name
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 from zsim.schema.checker import Fault, show
 from zsim.schema.plugin import CLASS_NAME
+from zsim.vehicles.vehicle import Vehicle
 
-START_SEPARATION_MIN_M = 0.6  # m, two hulls of 0.515 m side by side (OpenMAS, weighed and measured)
-START_CLEARANCE_MIN_M = 0.3  # m, a hull's radius of 0.26 m, and room
 FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
 TEMPLATE_ROBOTS_MIN = 3  # fewer are in one line
 TEMPLATE_WIDTH_MIN_M = 0.1  # m, chosen: anything is; where a formation may fly, the controller asks for more
 LIFT_SHARE_MAX = 0.9  # of what the rotors lift; the rest is left for control
 
 
-def cross_faults(scenario: Any) -> Iterator[Fault]:
-    """Yield every fault between fields of a scenario, or of the sound parts of one."""
+def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
+    """Yield every fault between fields of a scenario, or of the sound parts of one.
+
+    Args:
+        scenario: as `checker.sound` gives it.
+        vehicles: by model; what depends on a vehicle that is not among them is left out.
+    """
     drones, clusters = _entries(scenario.drones), _entries(scenario.clusters)
     yield from _name_faults("drones", drones)
     yield from _name_faults("clusters", clusters)
     yield from _time_faults(scenario.time)
-    yield from _start_faults(drones)
-    yield from _obstacle_faults(_entries(scenario.environment and scenario.environment.obstacles), drones)
+    yield from _start_faults(drones, vehicles)
+    obstacles = _entries(scenario.environment and scenario.environment.obstacles)
+    yield from _obstacle_faults(obstacles, drones, vehicles)
     for index, drone in drones:
-        yield from ((f"drones[{index}].{path}", text) for path, text in _drone_faults(drone, scenario))
+        yield from ((f"drones[{index}].{path}", text) for path, text in _drone_faults(drone, scenario, vehicles))
     yield from _membership_faults(drones, clusters)
     for index, cluster in clusters:
         yield from ((f"clusters[{index}].{path}", text) for path, text in _plan_faults(cluster))
@@ -81,26 +86,35 @@ def _time_faults(time: Any) -> Iterator[Fault]:
         yield "time.physics_dt_ms", f"is {time.physics_dt_ms:g}; must divide {step_ms:g} (the firmware's step)"
 
 
-def _start_faults(drones: _Entries) -> Iterator[Fault]:
+def _clearance_m(drone: Any, vehicles: Mapping[str, Vehicle]) -> float:
+    """Return the free space that a drone needs about its centre at the start; 0 for one of an unknown vehicle."""
+    vehicle = vehicles.get(drone.model) if drone.model else None
+    return vehicle.airframe.clearance_m if vehicle else 0.0
+
+
+def _start_faults(drones: _Entries, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
     placed = [(index, drone) for index, drone in drones if drone.position_m is not None]
     positions = np.array([drone.position_m for _, drone in placed], dtype=float).reshape(-1, 3)
+    clearance = np.array([_clearance_m(drone, vehicles) for _, drone in placed])
     for place, (index, _) in enumerate(placed):
         if positions[place, 2] < 0:
             yield f"drones[{index}].position_m[2]", f"is {positions[place, 2]:g}; must be >= 0 (the ground)"
         distances = np.linalg.norm(positions[:place] - positions[place], axis=1)
-        if place and distances.min() < START_SEPARATION_MIN_M:
-            nearest, other = placed[int(distances.argmin())]
+        least = clearance[:place] + clearance[place]
+        if place and (distances < least).any():
+            worst = int((distances - least).argmin())
+            nearest, other = placed[worst]
             yield (
                 f"drones[{index}].position_m",
-                f"is {distances.min():.2f} m from {other.name or f'drones[{nearest}]'!r}; "
-                f"must be >= {START_SEPARATION_MIN_M} m",
+                f"is {distances[worst]:.2f} m from {other.name or f'drones[{nearest}]'!r}; "
+                f"must be >= {least[worst]:g} m",
             )
 
 
 _SIZES = {"box": ("size_m",), "cylinder": ("radius_m", "height_m"), "sphere": ("radius_m",)}
 
 
-def _obstacle_faults(obstacles: _Entries, drones: _Entries) -> Iterator[Fault]:
+def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
     """Yield what is wrong with obstacles: names, sizes, and drones that start in one."""
     yield from _name_faults("environment.obstacles", obstacles)
     names = _names(drones)
@@ -119,26 +133,27 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries) -> Iterator[Fault]:
             if name not in wanted:
                 yield f"{path}.{name}", f"is given; must be left out of a {obstacle.shape}"
         if sorted(given) == sorted(wanted) and _known(obstacle.position_m, obstacle.yaw_deg):
-            yield from _buried_faults(obstacle, drones)
+            yield from _buried_faults(obstacle, drones, vehicles)
 
 
-def _buried_faults(obstacle: Any, drones: _Entries) -> Iterator[Fault]:
+def _buried_faults(obstacle: Any, drones: _Entries, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
     row = row_of(obstacle)
     for index, drone in drones:
         if drone.position_m is not None:
-            distance = nearest(row, *drone.position_m)[0]
-            if distance < START_CLEARANCE_MIN_M:
+            distance, least = nearest(row, *drone.position_m)[0], _clearance_m(drone, vehicles)
+            if distance < least:
                 found = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
-                yield f"drones[{index}].position_m", f"{found}; must be >= {START_CLEARANCE_MIN_M} m"
+                yield f"drones[{index}].position_m", f"{found}; must be >= {least:g} m"
 
 
-def _drone_faults(drone: Any, scenario: Any) -> Iterator[Fault]:
+def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
     low, high = drone.rotor_min_rad_s, drone.rotor_max_rad_s
     if _known(low, high) and low >= high:
         yield "rotor_min_rad_s", f"is {low:g}; must be < rotor_max_rad_s ({high:g})"
     gravity = scenario.environment and scenario.environment.gravity_m_s2
-    if _known(drone.mass_kg, drone.thrust_n_s2, high, gravity):
-        most = LIFT_SHARE_MAX * 4 * drone.thrust_n_s2 * high**2 / gravity
+    vehicle = vehicles.get(drone.model) if drone.model else None
+    if vehicle and _known(drone.mass_kg, drone.thrust_n_s2, high, gravity):
+        most = LIFT_SHARE_MAX * len(vehicle.rotors) * drone.thrust_n_s2 * high**2 / gravity
         if drone.mass_kg >= most:
             yield (
                 "mass_kg",
@@ -161,7 +176,7 @@ def _height_faults(drone: Any, origin_m: float | None) -> Iterator[Fault]:
 
 
 def _sensor_faults(sensors: Any) -> Iterator[Fault]:
-    if sensors.as_printed and sensors.preset == "ardrone2":
+    if sensors.as_printed and sensors.preset not in (None, "paper"):
         yield "as_printed", "is true; must be false unless preset is paper"
     if sensors.imu and _known(sensors.imu.rate_hz) and sensors.imu.rate_hz > BOARD_RATE_HZ:
         most = f"{BOARD_RATE_HZ:g}, the rate of the navigation board"

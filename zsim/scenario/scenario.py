@@ -10,6 +10,9 @@ from msgspec import UNSET, Meta, Struct, UnsetType, field
 from zsim.scenario.role_table import OnDeath, agent_names
 from zsim.scenario.sensor_presets import G_M_S2, SEA_LEVEL_KG_M3
 from zsim.schema.plugin import CLASS_NAME
+from zsim.schema.quantities import Fraction, NonNegative, Positive, Real, Vector3
+from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
+from zsim.vehicles.vehicle import Arm, Limits, Mass, RotorLag, TakeoffHeight
 
 TEMPLATE_FROM = 5  # robots; below it the variables of the triad are fewer to name, and as well conditioned
 DRONES_MAX = 1000  # one world integrates them all
@@ -18,15 +21,8 @@ FAULTS_MAX = 1000  # injected ones, planned and active; each is looked at wherev
 ROBOTS_MAX = 64  # drones of a cluster; beyond it a dense Jacobian of 4n x 4n no longer fits a control gate of 20 ms
 SEA_HEIGHT_MAX_M = 11_000  # m above the sea: end of the layer whose pressure the barometer follows (ISO 2533)
 
-# LARGE keeps squares and products of what is given finite; it is beyond any quantity of a flight in SI units.
-LARGE = 1e9
 Name = Annotated[str, Meta(pattern=r"^[a-z0-9_.-]{1,32}\Z")]
-Real = Annotated[float, Meta(ge=-LARGE, le=LARGE)]
-Positive = Annotated[float, Meta(gt=0, le=LARGE)]
-NonNegative = Annotated[float, Meta(ge=0, le=LARGE)]
-Fraction = Annotated[float, Meta(ge=0, le=1)]
 Coordinate = Annotated[float, Meta(ge=-100_000, le=100_000)]  # m; beyond it a tangent plane is no map
-Vector3 = tuple[Real, Real, Real]
 Position = tuple[Coordinate, Coordinate, Coordinate]
 
 
@@ -97,7 +93,7 @@ class FlowConfig(Sensor, frozen=True, kw_only=True):
 class Sensors(Spec, frozen=True, kw_only=True):
     """The sensors of one drone, after preset and overrides."""
 
-    preset: Literal["ardrone2", "paper"]
+    preset: Literal["ardrone2", "paper", "crazyflie2"]
     as_printed: bool = False
     """With `paper`: accelerometer 0.35 g as the paper prints it, instead of 0.35 m/s^2."""
     imu: ImuConfig
@@ -108,36 +104,27 @@ class Sensors(Spec, frozen=True, kw_only=True):
     flow: FlowConfig
 
 
-class Limits(Spec, frozen=True, kw_only=True):
-    """What the firmware allows a commander; defaults and ranges of the SDK's outdoor set where it has them."""
-
-    tilt_deg: Annotated[float, Meta(gt=0, le=30)] = 20.0  # outdoor_euler_angle_max, 0.349 rad
-    horizontal_speed_m_s: Annotated[float, Meta(gt=0, le=10)] = 5.0  # chosen, the SDK has none; 20 deg hold 6 m/s
-    vertical_speed_m_s: Annotated[float, Meta(ge=0.2, le=2)] = 1.0  # outdoor_control_vz_max
-    yaw_rate_deg_s: Annotated[float, Meta(gt=0, le=350)] = 200.0  # outdoor_control_yaw, 3.49 rad/s
-    altitude_m: Positive = 100.0  # altitude_max: what it takes for no limit
-
-
 class Drone(Spec, frozen=True, kw_only=True):
-    """One aircraft; the defaults are the AR.Drone 2.0 (Li 2014 through AuRoRA, zsim_world/vehicle.py)."""
+    """One aircraft. What is not given of it is its model's (zsim/vehicles); the defaults here are the AR.Drone's."""
 
     name: Name
-    model: Literal["ardrone2"] = "ardrone2"
+    model: str = "ardrone2"
+    """A stock vehicle, or `package.module` of the user's that defines VEHICLE."""
     position_m: Position
     yaw_deg: Real = 0.0
-    mass_kg: Annotated[float, Meta(gt=0, le=100)] = 0.429
-    inertia_kg_m2: tuple[Positive, Positive, Positive] = (2.237568e-3, 2.985236e-3, 4.80374e-3)
-    arm_m: Annotated[float, Meta(gt=0, le=10)] = 0.1785
-    thrust_n_s2: Positive = 8.048e-6
-    torque_nm_s2: Positive = 2.423e-7
-    rotor_time_constant_s: Annotated[float, Meta(ge=0.005, le=1)] = 0.030
-    rotor_min_rad_s: NonNegative = 126.0
-    rotor_max_rad_s: Positive = 503.0
-    drag_n_s_m: NonNegative = 0.249
-    battery_mah: Positive = 1000.0
+    mass_kg: Mass = ARDRONE2.mass_kg
+    inertia_kg_m2: tuple[Positive, Positive, Positive] = ARDRONE2.inertia_kg_m2
+    arm_m: Arm = ARDRONE2.arm_m
+    thrust_n_s2: Positive = ARDRONE2.thrust_n_s2
+    torque_nm_s2: Positive = ARDRONE2.torque_nm_s2
+    rotor_time_constant_s: RotorLag = ARDRONE2.rotor_time_constant_s
+    rotor_min_rad_s: NonNegative = ARDRONE2.rotor_min_rad_s
+    rotor_max_rad_s: Positive = ARDRONE2.rotor_max_rad_s
+    drag_n_s_m: NonNegative = ARDRONE2.drag_n_s_m
+    battery_mah: Positive = ARDRONE2.battery_mah
     battery_percent: Annotated[float, Meta(ge=0, le=100)] = 100.0
-    takeoff_height_m: Annotated[float, Meta(ge=0.3, le=5)] = 1.0
-    limits: Limits = Limits()
+    takeoff_height_m: TakeoffHeight = ARDRONE2.takeoff_height_m
+    limits: Limits = ARDRONE2.limits
     sensors: Sensors
 
 

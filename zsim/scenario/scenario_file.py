@@ -8,13 +8,15 @@ from typing import Any
 
 import msgspec
 
-from zsim.errors import ScenarioError
+from zsim.errors import DocumentError, ScenarioError
 from zsim.scenario import overrides as override
 from zsim.scenario.consistency import cross_faults
 from zsim.scenario.scenario import DRONES_MAX, Document, Scenario, Sensors
 from zsim.scenario.sensor_presets import AS_PRINTED, PRESETS
 from zsim.schema import plugin, yaml_file
-from zsim.schema.checker import faults, sound
+from zsim.schema.checker import Fault, faults, sound
+from zsim.vehicles import catalogue
+from zsim.vehicles.vehicle import DEFAULTS, Vehicle
 
 EXAMPLE = "scenarios/step.yaml"  # named to whoever gives no scenario
 FAULTS_MAX = 100  # lines; what follows is counted
@@ -49,8 +51,9 @@ def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:
 
 
 def _resolve(document: dict[str, Any], source: str, lines: list[str]) -> Scenario:
-    document = _expand_presets(document)
-    found = [*faults(document, Document), *cross_faults(sound(document, Scenario))]
+    vehicles, unknown = _vehicles(document)
+    document = _expand_presets(document, vehicles)
+    found = [*faults(document, Document), *unknown, *cross_faults(sound(document, Scenario), vehicles)]
     lines += [f"{source}: {path} {text}{_whose(document, path)}" for path, text in found]
     if lines:
         raise ScenarioError(_shortened(lines))
@@ -78,7 +81,29 @@ def sha256(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _expand_presets(document: dict[str, Any]) -> dict[str, Any]:
+def _vehicles(document: dict[str, Any]) -> tuple[dict[str, Vehicle], list[Fault]]:
+    """Return the vehicles that drones of a document need, by model, and where a model is none.
+
+    A drone with all its numbers, as in a resolved scenario, needs no module of a user's: whoever reads `world/info`
+    imports nothing that it names.
+    """
+    vehicles, unknown = dict(catalogue.STOCK), []
+    drones = document.get("drones")
+    for index, drone in enumerate(drones if isinstance(drones, list) else ()):
+        model = drone.get("model") if isinstance(drone, dict) else None
+        if isinstance(model, str) and model not in vehicles and not _is_resolved(drone):
+            try:
+                vehicles[model] = catalogue.vehicle_of(model, "")
+            except DocumentError as error:
+                unknown += [(f"drones[{index}].model", line.strip()) for line in error.faults]
+    return vehicles, unknown
+
+
+def _is_resolved(drone: dict[str, Any]) -> bool:
+    return all(name in drone for name in (*DEFAULTS, "limits", "sensors"))
+
+
+def _expand_presets(document: dict[str, Any], vehicles: dict[str, Vehicle]) -> dict[str, Any]:
     """Put preset, the scenario's `sensors:` and the drone's `sensors:` together, the later ones winning.
 
     A faulty section of the scenario is not handed on to the drones: its faults are told once.
@@ -88,24 +113,35 @@ def _expand_presets(document: dict[str, Any]) -> dict[str, Any]:
     usable = {} if any(faults(document["sensors"], Sensors)) else shared
     drones = document.get("drones")
     if isinstance(drones, list) and len(drones) <= DRONES_MAX:
-        document["drones"] = [_expand_drone(drone, usable) for drone in drones]
+        document["drones"] = [_expand_drone(drone, usable, vehicles) for drone in drones]
     return document
 
 
-def _expand_drone(drone: Any, shared: dict[str, Any]) -> Any:
+def _expand_drone(drone: Any, shared: dict[str, Any], vehicles: dict[str, Vehicle]) -> Any:
+    """Put what a drone says on top of its vehicle's numbers and of the sensors that all share."""
     if not isinstance(drone, dict):
         return drone
+    model = drone.get("model", catalogue.DEFAULT)
+    vehicle = vehicles.get(model) if isinstance(model, str) else None
+    vehicle = vehicle or vehicles[catalogue.DEFAULT]
     own = drone.get("sensors")
     given = _merge(shared, own) if isinstance(own, dict) else shared if own is None else own
-    return {**drone, "sensors": _expanded(given)}
+    limits = _merge(msgspec.to_builtins(vehicle.limits), drone["limits"]) if _has_map(drone, "limits") else None
+    defaults = {name: getattr(vehicle, name) for name in DEFAULTS} | {"limits": msgspec.to_builtins(vehicle.limits)}
+    expanded = {**defaults, **drone, "sensors": _expanded(given, vehicle.sensor_preset)}
+    return expanded if limits is None else {**expanded, "limits": limits}
 
 
-def _expanded(given: Any) -> Any:
+def _has_map(section: dict[str, Any], name: str) -> bool:
+    return isinstance(section.get(name), dict)
+
+
+def _expanded(given: Any, default: str = catalogue.STOCK[catalogue.DEFAULT].sensor_preset) -> Any:
     """Return a `sensors:` section upon its preset."""
     if not isinstance(given, dict):
         return given
-    name = given.get("preset", "ardrone2")
-    preset = PRESETS.get(name, PRESETS["ardrone2"]) if isinstance(name, str) else PRESETS["ardrone2"]
+    name = given.get("preset", default)
+    preset = PRESETS.get(name, PRESETS[default]) if isinstance(name, str) else PRESETS[default]
     if given.get("as_printed") is True and name == "paper":
         preset = _merge(preset, AS_PRINTED)
     return _merge({"preset": name, **preset}, given)

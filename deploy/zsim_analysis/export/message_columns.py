@@ -50,7 +50,7 @@ class VectorColumns(FieldColumns):
     """The same number of numbers in every message."""
 
     def values(self, messages: Sequence[Any]) -> Values:
-        rows = [getattr(message, self.name) for message in messages]
+        rows = [getattr(message, self.name)[: len(self.columns)] for message in messages]
         return np.array(rows, np.float64).reshape(len(rows), len(self.columns))
 
 
@@ -215,12 +215,14 @@ def _components(name: str, info: inspect.Type) -> list[str]:
     """Return the columns of a field with a fixed number of numbers, none for any other field."""
     if isinstance(info, inspect.VarTupleType) and info.min_length == info.max_length == 36:
         return [f"{name}_{i}{j}" for i in range(6) for j in range(6)]
+    if isinstance(info, inspect.VarTupleType) and info.min_length == len(ROTORS):  # of more, the first four
+        return [f"{name}_{part}" for part in ROTORS]
     if not isinstance(info, inspect.TupleType) or not all(isinstance(each, _NUMERIC) for each in info.item_types):
         return []
     count = len(info.item_types)
     if name.endswith(QUATERNION):
         return [f"{name.removesuffix(QUATERNION)}_{part}" for part in "wxyz"]
-    parts = {3: XYZ, 4: ROTORS}.get(count) or [str(i) for i in range(count)]
+    parts = {3: XYZ}.get(count) or [str(i) for i in range(count)]
     return [f"{name}_{part}" for part in parts]
 
 

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from zsim.contract.messages import Fault
-from zsim.scenario.fault_kinds import ROTORS
-from zsim_world.physics import rigid_body, wind
+from zsim.vehicles.vehicle import Vehicle
+from zsim_world.physics.air import WIND
 from zsim_world.sensors import sensor_set as ss
-from zsim_world.state.fleet_arrays import Arrays
-from zsim_world.vehicles import simd_firmware
+from zsim_world.sensors.sensor_set import CONFIG, FAULT
+from zsim_world.state.fleet_arrays import STATE, Arrays
+from zsim_world.vehicles.simd_firmware import ACTUATOR, sound_actuators
 
 DEG = math.pi / 180.0  # rad
 # Of a kind's first word: sensor, first channel, channels, and what a unit of its bias is in that of the channel
@@ -33,15 +34,16 @@ class Impairment:
 
     Args:
         arrays: of the fleet, before its first gate.
-        drones: their names in scenario order.
+        drones, vehicles: their names and what they are, in scenario order.
     """
 
-    def __init__(self, arrays: Arrays, drones: Sequence[str]) -> None:
+    def __init__(self, arrays: Arrays, drones: Sequence[str], vehicles: Sequence[Vehicle]) -> None:
         self._w = arrays
         self._index = {name: i for i, name in enumerate(drones)}
         self._config = arrays.senses.config.copy()
-        self._steady = arrays.wind[wind.STEADY : wind.STEADY + 3].copy()
-        self._sound = simd_firmware.sound_actuators(len(drones))
+        self._steady = arrays.wind[WIND.steady : WIND.steady + 3].copy()
+        self._rotors = [[rotor.name for rotor in vehicle.rotors] for vehicle in vehicles]
+        self._sound = sound_actuators(len(drones), len(arrays.bodies.each))
         self._held: dict[int, tuple[float, ...]] = {}  # by fault: at which speed the rotors of its drone turned
         self._gusts: tuple[Fault, ...] = ()
         self._calm = True
@@ -50,7 +52,7 @@ class Impairment:
         """Let these faults act from now on, and no others; those that have acted before go on."""
         self._w.senses.config[:] = self._config
         self._w.boards.actuator[:] = self._sound
-        offsets = self._w.senses.fault[:, :, ss.OFFSET : ss.HOLD]
+        offsets = self._w.senses.fault[:, :, FAULT.offset : FAULT.hold]
         offsets[:] = 0.0
         stuck: set[tuple[int, int]] = set()
         self._held = {fault.id: self._held[fault.id] for fault in acting if fault.id in self._held}
@@ -65,7 +67,7 @@ class Impairment:
         if self._calm and not self._gusts:
             return
         at_ns = (from_ns + until_ns) // 2
-        steady = self._w.wind[wind.STEADY : wind.STEADY + 3]
+        steady = self._w.wind[WIND.steady : WIND.steady + 3]
         steady[:] = self._steady + sum((gust_m_s(fault, at_ns) for fault in self._gusts), np.zeros(3))
         self._calm = not self._gusts
 
@@ -77,43 +79,40 @@ class Impairment:
         s, first, count, unit = CHANNELS[what]
         row = self._w.senses.config[i, s]
         if how == "dropout":
-            row[ss.DROP] = dropped(row[ss.DROP], fault.parameters["probability"])
+            row[CONFIG.drop] = dropped(row[CONFIG.drop], fault.parameters["probability"])
         elif how == "noise":
-            row[ss.WHITE + first : ss.WHITE + first + count] *= fault.parameters["factor"]
+            row[CONFIG.white + first : CONFIG.white + first + count] *= fault.parameters["factor"]
         else:
-            row[ss.FAULTY] = 1.0
+            row[CONFIG.faulty] = 1.0
             if how == "stuck":
                 stuck.add((i, s))
             else:
                 bias = np.atleast_1d(_bias(fault)) * unit
-                self._w.senses.fault[i, s, ss.OFFSET + first : ss.OFFSET + first + len(bias)] += bias
+                self._w.senses.fault[i, s, FAULT.offset + first : FAULT.offset + first + len(bias)] += bias
 
     def _release(self, stuck: Iterable[tuple[int, int]]) -> None:
         """Let sensors that have just got stuck keep their next sample, and free those that are no longer."""
-        hold = self._w.senses.fault[:, :, ss.HOLD]
+        hold = self._w.senses.fault[:, :, FAULT.hold]
         kept = {(i, s) for i, s in stuck if hold[i, s] == ss.HOLDING}
         hold[:] = ss.FREE
         for place in stuck:
             hold[place] = ss.HOLDING if place in kept else ss.ARMED
 
     def _impair_rotors(self, fault: Fault, i: int, how: str) -> None:
-        row, which = self._w.boards.actuator[i], fault.parameters["rotor"]
-        row[simd_firmware.FAULTY] = 1.0
-        for k, name in enumerate(ROTORS):
+        row, which, count = self._w.boards.actuator[i], fault.parameters["rotor"], len(self._w.bodies.each)
+        row[ACTUATOR.faulty] = 1.0
+        for r, name in enumerate(self._rotors[i]):
             if which in (name, "all"):
-                if how == "efficiency":
-                    row[simd_firmware.FACTOR + k] *= math.sqrt(
-                        fault.parameters["value"]
-                    )  # thrust is as the speed squared
+                if how == "efficiency":  # thrust is as the speed squared
+                    row[ACTUATOR.size + r] *= math.sqrt(fault.parameters["value"])
                 else:
-                    row[simd_firmware.HELD + k] = self._held_speed(fault, i)[k]
+                    row[ACTUATOR.size + count + r] = self._held_speed(fault, i)[r]
 
     def _held_speed(self, fault: Fault, i: int) -> tuple[float, ...]:
-        """Return at which speed each rotor is held [rad/s]: as told, or as it turned when the fault began."""
+        """Return at which speed each rotor is held [rad/s]: as given, or as it turned when the fault began."""
         if fault.id not in self._held:
-            told = fault.parameters["speed_rad_s"]
-            turning = self._w.bodies.state[i, rigid_body.ROTOR : rigid_body.ROTOR + 4].tolist()
-            self._held[fault.id] = tuple(turning) if told is None else (told,) * 4
+            given, speeds = fault.parameters["speed_rad_s"], self._w.bodies.state[i, STATE.size :].tolist()
+            self._held[fault.id] = tuple(speeds) if given is None else (given,) * len(speeds)
         return self._held[fault.id]
 
 

@@ -13,20 +13,25 @@ from numpy.typing import NDArray
 
 from zsim.contract.messages import DroneState
 from zsim.errors import RunError
-from zsim.scenario.scenario import GpsConfig, Scenario
+from zsim.scenario.scenario import Drone, GpsConfig, Scenario
+from zsim.vehicles.catalogue import vehicle_of
+from zsim.vehicles.vehicle import Vehicle
 from zsim_world.fleet import kernel
 from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.fleet.initial_state import arrays
-from zsim_world.physics import wind
+from zsim_world.physics.air import WIND
 from zsim_world.sensors import sensor_set
 from zsim_world.sensors.noise import NoiseTable
-from zsim_world.sensors.sampler import Sample, Sampled, Sampler
-from zsim_world.state import vehicle
-from zsim_world.vehicles import firmware, observer
+from zsim_world.sensors.sampler import Sampled, Sampler, SensorSample
+from zsim_world.state.fleet_arrays import STATE, VEHICLE
+from zsim_world.vehicles import firmware
+from zsim_world.vehicles.firmware import MEMORY, SETPOINT
+from zsim_world.vehicles.firmware_settings import SETTING
+from zsim_world.vehicles.observer import BELIEF
 
 GPS_FIX = 3  # NMEA: a three-dimensional fix
 GPS_SATELLITES = 9  # as in a real navdata packet of the AR.Drone
-TAKEOFF_PERCENT_MIN = 2.0 * firmware.LOW_BATTERY_PERCENT  # %, below which it does not take off
+TAKEOFF_CHARGE = 2.0  # of the charge at which it lands: below, it does not take off
 UPRIGHT_COSINE = 0.87  # 30 deg, beyond which it does not take off
 QUATERNION_SQUARE_MIN = 1e-6  # shorter, a quaternion has no direction
 NOISE_GATES = 8  # gates between two refills of the noise: that of 100 drones then fits a cache of 1 MB
@@ -42,7 +47,7 @@ class DivergedError(RunError):
         self.drone = drone
 
 
-class Truth(NamedTuple):
+class TrueState(NamedTuple):
     """The true state of N drones, copied."""
 
     position_m: NDArray[np.float64]  # (N, 3), W
@@ -50,7 +55,7 @@ class Truth(NamedTuple):
     orientation_wxyz: NDArray[np.float64]  # (N, 4), B to W
     angular_velocity_rad_s: NDArray[np.float64]  # (N, 3), B
     accel_m_s2: NDArray[np.float64]  # (N, 3), W
-    rotor_rad_s: NDArray[np.float64]  # (N, 4)
+    rotor_rad_s: NDArray[np.float64]  # (N, R), 0 where a drone has fewer
 
 
 class Fleet:
@@ -58,6 +63,7 @@ class Fleet:
 
     Attributes:
         names: in scenario order, in which drones are counted.
+        rotors: how many each has.
         gps_sigma_m: of each drone's fixes.
         impairment: what faults do to it.
         bodies, boards: the arrays that the kernel works on; to be read only.
@@ -74,6 +80,8 @@ class Fleet:
             DivergedError: the scenario's numbers cannot be integrated.
         """
         self.names = [drone.name for drone in scenario.drones]
+        vehicles = [_vehicle(index, drone) for index, drone in enumerate(scenario.drones)]
+        self.rotors = [len(vehicle.rotors) for vehicle in vehicles]
         self.count = len(self.names)
         self.gps_sigma_m = [_gps_sigma(drone.sensors.gps) for drone in scenario.drones]
         self._tick_ns = round(scenario.time.physics_dt_ms * 1_000_000)
@@ -82,12 +90,12 @@ class Fleet:
         self._gates = 0
         self._sampler = Sampler(scenario)
         self._noise = NoiseTable(scenario, NOISE_GATES)
-        self._w = arrays(scenario, self._noise)
+        self._w = arrays(scenario, vehicles, self._noise)
         self._held = kernel.hold(self._w)
         self.bodies, self.boards = self._w.bodies, self._w.boards
-        self.impairment = Impairment(self._w, self.names)
+        self.impairment = Impairment(self._w, self.names, vehicles)
         self.touching = np.zeros(self.count, dtype=bool)
-        self._hull_m = float(self.bodies.vehicle[:, vehicle.HULL_RADIUS].max())
+        self._hull_m = float(self.bodies.vehicle[:, VEHICLE.hull_radius].max())
         self._integrate(0)
         self._rehearse()
 
@@ -103,7 +111,7 @@ class Fleet:
     @property
     def wind_m_s(self) -> NDArray[np.float64]:
         """Wind at each drone in W, steady and gusts, without the downwash of others; (N, 3)."""
-        return self._w.gust + self._w.wind[wind.STEADY : wind.STEADY + 3]
+        return self._w.gust + self._w.wind[WIND.steady : WIND.steady + 3]
 
     def advance(self) -> None:
         """Integrate one gate with the present setpoints.
@@ -116,18 +124,18 @@ class Fleet:
         self._gates += 1
         self._integrate(self._ticks)
 
-    def samples(self) -> list[Sample]:
+    def samples(self) -> list[SensorSample]:
         """Return what fell due for publication in the last gate, in the order of (t_ns, drone, sensor)."""
         return self.sampled.each()
 
-    def truth(self) -> Truth:
+    def truth(self) -> TrueState:
         """Return the true state now."""
-        s = self.bodies.state.copy()
-        return Truth(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], self.bodies.accel[:, 0:3].copy(), s[:, 13:17])
+        s, accel = self.bodies.state.copy(), self.bodies.accel[:, 0:3].copy()
+        return TrueState(s[:, 0:3], s[:, 3:6], s[:, 6:10], s[:, 10:13], accel, s[:, STATE.size :])
 
     def status(self, i: int) -> tuple[DroneState, float, bool]:
         """Return the firmware's mode, the charge [%], and whether the hull touched another in the last gate."""
-        charge = 100.0 * self.bodies.energy.item(i) / self.bodies.vehicle.item(i, vehicle.CAPACITY)
+        charge = 100.0 * self.bodies.energy.item(i) / self.bodies.vehicle.item(i, VEHICLE.capacity)
         return firmware.MODES[self._mode(i)], charge, bool(self.touching[i])
 
     def closest_m(self) -> float:
@@ -149,9 +157,10 @@ class Fleet:
         charge = self.status(i)[1]
         if self._mode(i) != firmware.LANDED:
             return self._not_while(i, "a take-off needs it landed")
-        if charge < TAKEOFF_PERCENT_MIN:
-            return f"{self.names[i]} has {charge:.1f} % of charge; a take-off needs {TAKEOFF_PERCENT_MIN:g} %"
-        x, y = self.boards.belief[i, observer.ATTITUDE + 1 : observer.ATTITUDE + 3]
+        least = TAKEOFF_CHARGE * self.boards.setting.item(i, SETTING.low_battery)
+        if charge < least:
+            return f"{self.names[i]} has {charge:.1f} % of charge; a take-off needs {least:g} %"
+        x, y = self.boards.belief[i, BELIEF.q_WB + 1 : BELIEF.q_WB + 3]
         if 1.0 - 2.0 * (x * x + y * y) < UPRIGHT_COSINE:
             return f"{self.names[i]} does not stand upright; a take-off needs it within 30 deg of level"
         self._enter(i, firmware.TAKING_OFF)
@@ -201,12 +210,14 @@ class Fleet:
         return self._set(i, firmware.ATTITUDE, (*q_WB, thrust_n, yaw_rate_rad_s))
 
     def set_rotors(self, i: int, speed_rad_s: Sequence[float]) -> str | None:
-        """Command four rotor speeds within the rotors' limits; return None, or why not."""
+        """Command the speeds of all rotors within their limits; return None, or why not."""
+        if len(speed_rad_s) != self.rotors[i]:
+            return f"{self.names[i]} was sent {len(speed_rad_s)} rotor speeds; it has {self.rotors[i]} rotors"
         return self._set(i, firmware.ROTORS, tuple(speed_rad_s))
 
     def release(self, i: int) -> None:
         """Let nobody fly the drone any more: it hovers."""
-        self.boards.setpoint[i, firmware.KIND] = firmware.NONE
+        self.boards.setpoint[i, SETPOINT.kind] = firmware.NONE
 
     def _set(self, i: int, kind: int, values: tuple[float, ...]) -> str | None:
         if self._mode(i) not in (firmware.HOVERING, firmware.FLYING):
@@ -214,13 +225,13 @@ class Fleet:
         if not math.isfinite(sum(values)):
             return f"{self.names[i]} was sent a setpoint with {list(values)}; must be finite"
         row = self.boards.setpoint[i]
-        row[firmware.KIND] = kind
-        row[firmware.VALUE : firmware.VALUE + len(values)] = values
+        row[SETPOINT.kind] = kind
+        row[SETPOINT.value : SETPOINT.value + len(values)] = values
         self.boards.set_tick[i] = self._tick
         return None
 
     def _mode(self, i: int) -> int:
-        return int(self.boards.memory.item(i, firmware.MODE))
+        return int(self.boards.memory.item(i, MEMORY.mode))
 
     def _not_while(self, i: int, need: str) -> str:
         return f"{self.names[i]} is {firmware.MODES[self._mode(i)]}; {need}"
@@ -249,3 +260,12 @@ class Fleet:
 
 def _gps_sigma(gps: GpsConfig) -> float:
     return sensor_set.noise_sigma(gps.position_m, gps.rate_hz)
+
+
+def _vehicle(index: int, drone: Drone) -> Vehicle:
+    """Return what a drone of a scenario is.
+
+    Raises:
+        DocumentError: its model is a module that is not installed here.
+    """
+    return vehicle_of(drone.model, f"drones[{index}].model")

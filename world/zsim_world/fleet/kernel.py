@@ -13,20 +13,31 @@ from numpy.typing import NDArray
 from zsim.math.compiled import apart, inlined, kernel
 from zsim.math.rotation import Vector, norm
 from zsim_world.physics import rigid_body as body
-from zsim_world.physics.battery import drained
-from zsim_world.physics.encounter import encounters
-from zsim_world.physics.obstacle_contact import bumps
+from zsim_world.physics.air import WIND, blow
+from zsim_world.physics.contacts import meet_drones, meet_obstacles
 from zsim_world.physics.rigid_body import four, put, put_four, vector
-from zsim_world.physics.simd_body import accelerate, line_up, move
-from zsim_world.physics.wind import STEADY, blow
+from zsim_world.physics.rotors import drained
+from zsim_world.physics.simd import accelerate, line_up, move
 from zsim_world.sensors import measurement
 from zsim_world.sensors import sensor_set as ss
-from zsim_world.state.fleet_arrays import DT, FIELD, ORIGIN_HEIGHT, TICK, TICKS_PER_STEP, Arrays, Bodies, Noise, Senses
-from zsim_world.state.vehicle import GRAVITY
-from zsim_world.vehicles import firmware, observer
+from zsim_world.sensors.sensor_set import CONFIG, FAULT, SCHEDULE
+from zsim_world.state.fleet_arrays import (
+    CLOCK,
+    PLACE,
+    SPAN,
+    STATE,
+    STREAMS,
+    VEHICLE,
+    Arrays,
+    Bodies,
+    NoiseRows,
+    PerRotor,
+    Senses,
+)
+from zsim_world.vehicles import firmware
+from zsim_world.vehicles.observer import DEVICE, STEP_S
 from zsim_world.vehicles.simd_firmware import steer
 
-WIND_STREAM = 6  # after the six sensors
 NEVER = 2**63 - 1  # a tick that does not come
 POSITION_MAX_M, RATE_MAX_RAD_S = 1e6, 1e4  # beyond, the integration has diverged
 
@@ -36,20 +47,20 @@ Pair = tuple[Vector, Vector]
 @inlined
 def _drain(bodies: Bodies) -> None:
     for i in range(bodies.state.shape[0]):
-        speed = four(bodies.state[i], body.ROTOR)
-        bodies.energy[i] = drained(bodies.vehicle[i], bodies.energy[i], speed, observer.STEP_S)
+        speeds = PerRotor(bodies.state[i], STATE.size, 1, bodies.each)
+        bodies.energy[i] = drained(bodies.vehicle[i], bodies.energy[i], speeds, STEP_S)
 
 
 @inlined
-def _gusts(wind: NDArray, gust: NDArray, state: NDArray, noise: Noise) -> None:
+def _gusts(wind: NDArray, gust: NDArray, state: NDArray, noise: NoiseRows) -> None:
     """Let the gusts of every drone move on by one step."""
     count = gust.shape[0]
-    at = noise.at[WIND_STREAM] + 3 * noise.cursor[count, WIND_STREAM]
+    at = noise.at[STREAMS.wind] + 3 * noise.cursor[count, STREAMS.wind]
     common, loaded = vector(noise.table[count], at), vector(wind, 0) + four(wind, 3)
     for i in range(count):
-        blow(loaded, vector(state[i], body.VELOCITY), gust[i], common, vector(noise.table[i], at), observer.STEP_S)
+        blow(loaded, vector(state[i], STATE.v_WB), gust[i], common, vector(noise.table[i], at), STEP_S)
     for i in range(count + 1):
-        noise.cursor[i, WIND_STREAM] += 1
+        noise.cursor[i, STREAMS.wind] += 1
 
 
 @inlined
@@ -57,30 +68,29 @@ def _meet(wind: NDArray, gust: NDArray, bodies: Bodies) -> float:
     """Set air and pushes for the next tick; return the least distance of two drones [m]."""
     for i in range(gust.shape[0]):
         for k in range(3):
-            bodies.air[i, k] = wind[STEADY + k] + gust[i, k]
+            bodies.air[i, k] = wind[WIND.steady + k] + gust[i, k]
             bodies.push[i, k] = 0.0
-    b = bodies
-    if b.obstacle.shape[0] > 0:
-        bumps(b.vehicle, b.state, b.push, b.obstacle, b.bumping, b.bumped)
-    return encounters(b.vehicle, b.state, b.air, b.push, b.touching, b.touched, b.near)
+    if bodies.obstacle.shape[0] > 0:
+        meet_obstacles(bodies)
+    return meet_drones(bodies)
 
 
 @inlined
 def _ideal(s: int, config: NDArray, state: NDArray, accel: NDArray, gravity: float, place: NDArray) -> Pair:
     """Return the errorless values of sensor s; unused places are zero."""
     p, v, q, rate = body.pose(state)
-    p_BS, q_BS = vector(config, ss.MOUNT), four(config, ss.TURN)
+    p_BS, q_BS = vector(config, CONFIG.p_BS), four(config, CONFIG.q_BS)
     none = (0.0, 0.0, 0.0)
     if s == ss.IMU:
         return measurement.imu(vector(accel, 0), q, rate, vector(accel, 3), gravity, p_BS, q_BS)
     if s == ss.GPS:
         return measurement.gps(p, v, q, rate, p_BS)
     if s == ss.MAG:
-        return measurement.mag(q, q_BS, vector(place, FIELD)), none
+        return measurement.mag(q, q_BS, vector(place, PLACE.field_W)), none
     if s == ss.BARO:
         return (measurement.height(p, q, p_BS), 0.0, 0.0), none
     if s == ss.SONAR:
-        distance, echo = measurement.sonar(p, q, p_BS, q_BS, config[ss.LIMIT_MAX])
+        distance, echo = measurement.sonar(p, q, p_BS, q_BS, config[CONFIG.limit_max])
         return (distance, 1.0 if echo else 0.0, 0.0), none
     velocity, quality = measurement.flow(v, q, rate, p_BS)
     return velocity, (quality, 0.0, 0.0)
@@ -91,30 +101,30 @@ def _read(s: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray
     """Turn errorless values into a reading, in place; return False if it is lost."""
     n = ss.CHANNELS[s]
     for k in range(n):
-        bias[k] += config[ss.WALK + k] * noise[at + n + k]
-        white = config[ss.WHITE + k] * noise[at + k]
-        value[k] = measurement.reading(value[k], bias[k], white, config[ss.QUANTUM + k])
+        bias[k] += config[CONFIG.walk + k] * noise[at + n + k]
+        white = config[CONFIG.white + k] * noise[at + k]
+        value[k] = measurement.reading(value[k], bias[k], white, config[CONFIG.quantum + k])
     if s == ss.SONAR:
         value[0] = max(value[0], 0.0)
-        if value[0] < config[ss.LIMIT_MIN] or value[0] > config[ss.LIMIT_MAX]:
+        if value[0] < config[CONFIG.limit_min] or value[0] > config[CONFIG.limit_max]:
             value[1] = 0.0
     elif s == ss.BARO:
         value[1] = value[0]
         value[0] = measurement.pressure(height + value[1])
-    return noise[at + 2 * n] >= config[ss.DROP]
+    return noise[at + 2 * n] >= config[CONFIG.drop]
 
 
 @inlined
-def _sample(s: int, i: int, bodies: Bodies, noise: Noise, senses: Senses, value: NDArray) -> bool:
+def _sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, value: NDArray) -> bool:
     """Write a reading of sensor s of drone i into value (6,); return False if it is lost."""
-    gravity, config = bodies.vehicle[i, GRAVITY], senses.config[i, s]
+    gravity, config = bodies.vehicle[i, VEHICLE.gravity], senses.config[i, s]
     first, second = _ideal(s, config, bodies.state[i], bodies.accel[i], gravity, senses.place)
     put(value, 0, first)
     put(value, 3, second)
     at = noise.at[s] + noise.cursor[i, s] * ss.NOISE_WIDTH[s]
     noise.cursor[i, s] += 1
-    height = senses.place[ORIGIN_HEIGHT]
-    if config[ss.FAULTY] != 0.0:
+    height = senses.place[PLACE.height]
+    if config[CONFIG.faulty] != 0.0:
         return _read_faulty(s, value, config, senses.bias[i, s], senses.fault[i, s], noise.table[i], at, height)
     return _read(s, value, config, senses.bias[i, s], noise.table[i], at, height)
 
@@ -135,52 +145,55 @@ def _read_faulty(
 def _displace(s: int, value: NDArray, fault: NDArray) -> None:
     """Add what a fault adds to the errorless values of a sensor, in place."""
     for k in range(ss.CHANNELS[s]):
-        value[k] += fault[ss.OFFSET + k]
+        value[k] += fault[FAULT.offset + k]
 
 
 @inlined
 def _hold(value: NDArray, fault: NDArray) -> None:
     """Keep a reading (6,) that is the first of a stuck sensor, or give the one kept, in place."""
-    if fault[ss.HOLD] == ss.ARMED:
-        fault[ss.HOLD] = ss.HOLDING
+    if fault[FAULT.hold] == ss.ARMED:
+        fault[FAULT.hold] = ss.HOLDING
         for k in range(ss.CHANNELS_MAX):
-            fault[ss.HELD + k] = value[k]
-    elif fault[ss.HOLD] == ss.HOLDING:
+            fault[FAULT.held + k] = value[k]
+    elif fault[FAULT.hold] == ss.HOLDING:
         for k in range(ss.CHANNELS_MAX):
-            value[k] = fault[ss.HELD + k]
+            value[k] = fault[FAULT.held + k]
 
 
 @inlined
 def _register(device: NDArray, s: int, value: NDArray) -> None:
     """Hand a sample to the firmware."""
     if s == ss.IMU:
-        put(device, observer.ACCEL, vector(value, 0))
-        put(device, observer.GYRO, vector(value, 3))
+        put(device, DEVICE.accel, vector(value, 0))
+        put(device, DEVICE.gyro, vector(value, 3))
     elif s == ss.MAG:
-        put(device, observer.MAG, vector(value, 0))
-        device[observer.NEW_MAG] = 1.0
+        put(device, DEVICE.mag, vector(value, 0))
+        device[DEVICE.new_mag] = 1.0
     elif s == ss.BARO:
-        device[observer.BARO], device[observer.NEW_BARO] = value[1], 1.0
+        device[DEVICE.baro], device[DEVICE.new_baro] = value[1], 1.0
     elif s == ss.SONAR:
-        device[observer.SONAR], device[observer.SONAR_VALID] = value[0], value[1]
-        device[observer.NEW_SONAR] = 1.0
+        device[DEVICE.sonar], device[DEVICE.sonar_valid] = value[0], value[1]
+        device[DEVICE.new_sonar] = 1.0
     elif s == ss.FLOW:
-        put_four(device, observer.FLOW, four(value, 0))
-        device[observer.NEW_FLOW] = 1.0
+        put_four(device, DEVICE.flow, four(value, 0))
+        device[DEVICE.new_flow] = 1.0
 
 
 @inlined
 def _due(plan: NDArray, tick: int) -> bool:
     """Return whether a sample is due, and plan the next one if so."""
-    if plan[ss.DUE] > tick:
+    if plan[SCHEDULE.due] > tick:
         return False
-    plan[ss.COUNT] += 1
-    plan[ss.DUE] = (plan[ss.COUNT] * plan[ss.NUMERATOR] + plan[ss.DENOMINATOR] - 1) // plan[ss.DENOMINATOR]
+    plan[SCHEDULE.count] += 1
+    per = plan[SCHEDULE.denominator]
+    plan[SCHEDULE.due] = (plan[SCHEDULE.count] * plan[SCHEDULE.numerator] + per - 1) // per
     return True
 
 
 @inlined
-def _sense(tick: int, step: bool, logged: int, bodies: Bodies, device: NDArray, noise: Noise, senses: Senses) -> int:
+def _sense(
+    tick: int, step: bool, logged: int, bodies: Bodies, device: NDArray, noise: NoiseRows, senses: Senses
+) -> int:
     """Let all sensors sample what is due at this tick; return the length of the log.
 
     The IMU samples in every step of the board, and what is due of it is published.
@@ -191,14 +204,16 @@ def _sense(tick: int, step: bool, logged: int, bodies: Bodies, device: NDArray, 
         if senses.soonest[i] <= tick:
             senses.soonest[i] = NEVER
             for s in range(ss.IMU + 1, len(ss.CHANNELS)):
-                while senses.schedule[i, s, ss.DUE] <= tick:
+                while senses.schedule[i, s, SCHEDULE.due] <= tick:
                     logged = _take(s, i, tick, logged, bodies, device[i], noise, senses)
-                senses.soonest[i] = min(senses.soonest[i], senses.schedule[i, s, ss.DUE])
+                senses.soonest[i] = min(senses.soonest[i], senses.schedule[i, s, SCHEDULE.due])
     return logged
 
 
 @inlined
-def _take(s: int, i: int, tick: int, logged: int, bodies: Bodies, device: NDArray, noise: Noise, senses: Senses) -> int:
+def _take(
+    s: int, i: int, tick: int, logged: int, bodies: Bodies, device: NDArray, noise: NoiseRows, senses: Senses
+) -> int:
     """Let sensor s of drone i sample, and the firmware see it; return the length of the log, with it if it is due."""
     value = senses.value[logged]
     kept = _sample(s, i, bodies, noise, senses, value)
@@ -221,7 +236,7 @@ def _diverged(state: NDArray) -> int:
     """Return the first drone whose state is no longer one, or -1."""
     for i in range(state.shape[0]):
         size = 0.0
-        for k in range(body.COLUMNS):
+        for k in range(state.shape[1]):
             size += abs(state[i, k])
         p, _, _, rate = body.pose(state[i])
         if not (math.isfinite(size) and norm(p) < POSITION_MAX_M and norm(rate) < RATE_MAX_RAD_S):
@@ -267,16 +282,16 @@ def _advance(w: Arrays, ticks: int) -> tuple[int, float, int]:
     line_up(bodies)
     for _ in range(max(ticks, 1)):
         if ticks > 0:
-            if clock[TICK] % clock[TICKS_PER_STEP] == 0:
+            if clock[CLOCK.tick] % clock[CLOCK.ticks_per_step] == 0:
                 steer(time, bodies, boards)
-            move(bodies, time.spans[DT])
-            clock[TICK] += 1
-        step = ticks == 0 or clock[TICK] % clock[TICKS_PER_STEP] == 0
+            move(bodies, time.spans[SPAN.dt])
+            clock[CLOCK.tick] += 1
+        step = ticks == 0 or clock[CLOCK.tick] % clock[CLOCK.ticks_per_step] == 0
         if step and ticks > 0:
             _gusts(wind, gust, bodies.state, noise)
             _drain(bodies)
         least = min(least, _meet(wind, gust, bodies))
         if step:
             accelerate(bodies)
-        logged = _sense(clock[TICK], step, logged, bodies, device, noise, senses)
+        logged = _sense(clock[CLOCK.tick], step, logged, bodies, device, noise, senses)
     return logged, least, _diverged(bodies.state)

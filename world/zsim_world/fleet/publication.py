@@ -1,4 +1,4 @@
-"""From the fleet's arrays to the encoded messages of a gate, in the contract's order.
+"""What leaves the fleet: the encoded messages of a gate, in the contract's order, and the fingerprint of a flight.
 
 Per drone: its samples in time order, truth, and status last, which counts them.
 """
@@ -13,13 +13,15 @@ from zsim.contract import encoding, messages
 from zsim.contract.encoding import GAP, Layouts, Program, TextTable
 from zsim.contract.framing import KINDS, GateMessages, key_table
 from zsim.math.compiled import compiled, inlined, kernel
+from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
 from zsim_world.fleet.kernel import hold
-from zsim_world.physics import rigid_body
-from zsim_world.physics.battery import percent
+from zsim_world.physics.rotors import charge_percent
 from zsim_world.sensors import sampler, sensor_set
-from zsim_world.sensors.sampler import Sampled
+from zsim_world.sensors.sampler import WHOSE, Sampled
+from zsim_world.state.fleet_arrays import STATE
 from zsim_world.vehicles import firmware
+from zsim_world.vehicles.firmware import MEMORY
 
 MESSAGES = (  # in the order of KINDS
     messages.Imu,
@@ -28,20 +30,23 @@ MESSAGES = (  # in the order of KINDS
     messages.Baro,
     messages.Sonar,
     messages.Flow,
-    messages.Truth,
+    (messages.Truth, ROTORS_MIN),
     messages.Status,
 )
 TRUTH, STATUS = 6, 7  # after the six sensors
 WHICH, STAMPS, ENDS = 0, 1, 2  # rows of `columns`
-LAYOUTS = Layouts(MESSAGES)
+OTHER_TRUTHS = tuple((messages.Truth, rotors) for rotors in range(ROTORS_MIN + 1, ROTORS_MAX + 1))
+LAYOUTS = Layouts((*MESSAGES, *OTHER_TRUTHS))
 INTS, FLOATS = LAYOUTS.ints, LAYOUTS.floats
 OPS, FIRST, LITERALS = LAYOUTS.program  # compiled in
 COMMANDER = len(firmware.MODES)  # the first commander among the words: nobody
 
+HASHED_BYTES = 16_384  # in one go, which takes as long as a few instants
+
 write = inlined(encoding.write)
 
 
-class Written(NamedTuple):
+class PublicationBuffers(NamedTuple):
     """M messages, and room for more."""
 
     columns: NDArray[np.int64]  # (3, M): WHICH, STAMPS, ENDS
@@ -49,7 +54,7 @@ class Written(NamedTuple):
     data: NDArray[np.uint8]
 
 
-class Row(NamedTuple):
+class MessageRow(NamedTuple):
     """What one message is made of."""
 
     ints: NDArray[np.int64]
@@ -57,8 +62,8 @@ class Row(NamedTuple):
     bits: NDArray[np.uint64]  # the same floats
 
 
-class Seen(NamedTuple):
-    """The arrays of a fleet that are told, see `zsim_world.state.fleet_arrays`."""
+class PublishedArrays(NamedTuple):
+    """The arrays of a fleet that messages are made of, see `zsim_world.state.fleet_arrays`."""
 
     state: NDArray[np.float64]
     accel: NDArray[np.float64]
@@ -67,36 +72,38 @@ class Seen(NamedTuple):
     memory: NDArray[np.float64]
 
 
-class Fleetwide(NamedTuple):
-    """What the messages tell of N drones beside their arrays."""
+class PublishedState(NamedTuple):
+    """What messages are made of beside these arrays, of N drones."""
 
     touching: NDArray[np.bool_]  # (N,), whether a hull touched another in this gate
     sigma_m: NDArray[np.float64]  # (N,), of each one's GPS
     commanders: NDArray[np.int64]  # (N,), number of the word that names each one's
     counts: NDArray[np.int64]  # (N, kinds), messages that each key has had
+    rotors: NDArray[np.int64]  # (N,), of each
 
 
-class Told(NamedTuple):
+class PublicationState(NamedTuple):
     """What `publish` works on from gate to gate."""
 
     words: TextTable
-    seen: Seen
-    wide: Fleetwide
-    out: Written
+    seen: PublishedArrays
+    wide: PublishedState
+    out: PublicationBuffers
 
 
-class Publication:
+class GatePublication:
     """Writes the messages of each gate and counts them per key."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self.table = key_table(fleet.names)
         bodies = fleet.bodies
-        self._seen = Seen(bodies.state, bodies.accel, bodies.energy, bodies.vehicle, fleet.boards.memory)
+        self._seen = PublishedArrays(bodies.state, bodies.accel, bodies.energy, bodies.vehicle, fleet.boards.memory)
         self._commanders: list[str | None] = []  # of the last gate
         commanders = np.zeros(fleet.count, dtype=np.int64)
         counts = np.zeros((fleet.count, len(KINDS)), dtype=np.int64)
-        self._fleetwide = Fleetwide(fleet.touching, np.array(fleet.gps_sigma_m), commanders, counts)
+        rotors = np.array(fleet.rotors, dtype=np.int64)
+        self._fleetwide = PublishedState(fleet.touching, np.array(fleet.gps_sigma_m), commanders, counts, rotors)
         self._known: dict[str | None, int] = {None: COMMANDER}
         self._words = encoding.words((*firmware.MODES, None))
         self._make_room(16 * fleet.count)
@@ -105,7 +112,7 @@ class Publication:
     def _rehearse(self) -> None:
         """Load or compile what the first gate needs."""
         uncounted = self._fleetwide._replace(counts=self._fleetwide.counts.copy())
-        publish(hold(Told(self._words, self._seen, uncounted, self._written)), *self._fleet.sampled, 0)
+        publish(hold(PublicationState(self._words, self._seen, uncounted, self._written)), *self._fleet.sampled, 0)
 
     def gate(self, commanders: list[str | None]) -> GateMessages:
         """Return the messages of the gate that the fleet stands at; `commanders` are the names of who flies each."""
@@ -133,15 +140,15 @@ class Publication:
 
     def _make_room(self, count: int) -> None:
         columns, first = np.zeros((3, count), dtype=np.int64), np.zeros(self._fleet.count + 1, dtype=np.int64)
-        self._written = Written(columns, first, np.zeros(count * LAYOUTS.room(self._words), dtype=np.uint8))
-        self._held = hold(Told(self._words, self._seen, self._fleetwide, self._written))
+        self._written = PublicationBuffers(columns, first, np.zeros(count * LAYOUTS.room(self._words), dtype=np.uint8))
+        self._held = hold(PublicationState(self._words, self._seen, self._fleetwide, self._written))
 
 
 @inlined
-def _fill_sample(row: Row, sampled: Sampled, m: int, sigma_m: float) -> None:
+def _fill_sample(row: MessageRow, sampled: Sampled, m: int, sigma_m: float) -> None:
     """Put sample m of a gate into a row."""
-    s, ints, floats = sampled.whose[m, sampler.SENSOR], row.ints, row.floats
-    ints[0], ints[2] = sampled.whose[m, sampler.STAMP], sampled.whose[m, sampler.SAMPLED]
+    s, ints, floats = sampled.whose[m, WHOSE.sensor], row.ints, row.floats
+    ints[0], ints[2] = sampled.whose[m, WHOSE.t], sampled.whose[m, WHOSE.t_sample]
     for k in range(sampler.VALUE_COLUMNS):
         floats[k] = sampled.values[m, k]
     if s == sensor_set.GPS:
@@ -151,13 +158,13 @@ def _fill_sample(row: Row, sampled: Sampled, m: int, sigma_m: float) -> None:
 
 
 @inlined
-def _fill_truth(row: Row, state: NDArray, accel: NDArray) -> None:
-    for k in range(rigid_body.ROTOR):
+def _fill_truth(row: MessageRow, state: NDArray, accel: NDArray, rotors: int) -> None:
+    for k in range(STATE.size):
         row.floats[k] = state[k]
     for k in range(3):
-        row.floats[rigid_body.ROTOR + k] = accel[k]
-    for k in range(4):
-        row.floats[rigid_body.ROTOR + 3 + k] = state[rigid_body.ROTOR + k]
+        row.floats[STATE.size + k] = accel[k]
+    for r in range(rotors):
+        row.floats[STATE.size + 3 + r] = state[STATE.size + r]
 
 
 @compiled
@@ -165,7 +172,7 @@ def _by_drone(whose: NDArray, first: NDArray) -> None:
     """Set where the messages of each drone begin, (N + 1,): its samples, truth and status."""
     first[:] = 0
     for m in range(whose.shape[0]):
-        first[whose[m, sampler.DRONE] + 1] += 1
+        first[whose[m, WHOSE.drone] + 1] += 1
     for i in range(len(first) - 1):
         first[i + 1] += first[i] + 2
 
@@ -176,7 +183,7 @@ def _in_order(whose: NDArray, first: NDArray) -> NDArray:
     drones = len(first) - 1
     order, free = np.empty(first[drones], np.int64), first.copy()
     for m in range(whose.shape[0]):
-        i = whose[m, sampler.DRONE]
+        i = whose[m, WHOSE.drone]
         order[free[i]] = m
         free[i] += 1
     for i in range(drones):
@@ -185,18 +192,27 @@ def _in_order(whose: NDArray, first: NDArray) -> NDArray:
 
 
 @inlined
-def _fill(row: Row, m: int, i: int, sampled: Sampled, seen: Seen, wide: Fleetwide, now_ns: int, count: int) -> int:
+def _fill(
+    row: MessageRow,
+    m: int,
+    i: int,
+    sampled: Sampled,
+    seen: PublishedArrays,
+    wide: PublishedState,
+    now_ns: int,
+    count: int,
+) -> int:
     """Put sample m of drone i, its truth or its status into a row, and count it; return its kind."""
-    kind = sampled.whose[m, sampler.SENSOR] if m >= 0 else TRUTH if m == -1 else STATUS
+    kind = sampled.whose[m, WHOSE.sensor] if m >= 0 else TRUTH if m == -1 else STATUS
     row.ints[0], row.ints[1] = now_ns, wide.counts[i, kind]
     if m >= 0:
         _fill_sample(row, sampled, m, wide.sigma_m[i])
     elif kind == TRUTH:
-        _fill_truth(row, seen.state[i], seen.accel[i])
+        _fill_truth(row, seen.state[i], seen.accel[i], wide.rotors[i])
     else:
-        row.ints[2], row.ints[3] = int(seen.memory[i, firmware.MODE]), wide.touching[i]
+        row.ints[2], row.ints[3] = int(seen.memory[i, MEMORY.mode]), wide.touching[i]
         row.ints[4], row.ints[5] = wide.commanders[i], count
-        row.floats[0] = percent(seen.vehicle[i], seen.energy[i])
+        row.floats[0] = charge_percent(seen.vehicle[i], seen.energy[i])
     wide.counts[i, kind] += 1
     return kind
 
@@ -206,13 +222,13 @@ def publish(held: List, whose: NDArray, values: NDArray, now_ns: int) -> int:
     """Write the messages of a gate, drone by drone, and count them; return how many bytes that were.
 
     Args:
-        held: a Told, by `hold`.
+        held: a PublicationState, by `hold`.
         whose, values: of Sampled.
     """
     words, seen, wide, out = held[0]
     sampled = Sampled(whose, values)
     floats = np.zeros(FLOATS)
-    row, program = Row(np.zeros(INTS, np.int64), floats, floats.view(np.uint64)), Program(OPS, FIRST, LITERALS)
+    row, program = MessageRow(np.zeros(INTS, np.int64), floats, floats.view(np.uint64)), Program(OPS, FIRST, LITERALS)
     drones, kinds = wide.counts.shape
     first, columns, at = out.first, out.columns, 0
     _by_drone(whose, first)
@@ -220,6 +236,9 @@ def publish(held: List, whose: NDArray, values: NDArray, now_ns: int) -> int:
     for i in range(drones):
         for place in range(first[i], first[i + 1]):
             kind = _fill(row, order[place], i, sampled, seen, wide, now_ns, first[i + 1] - first[i] - 1)
-            at = write(program, words, kind, row.ints, row.bits, out.data, at + GAP)
+            layout = kind
+            if kind == TRUTH and wide.rotors[i] > ROTORS_MIN:
+                layout = STATUS + wide.rotors[i] - ROTORS_MIN
+            at = write(program, words, layout, row.ints, row.bits, out.data, at + GAP)
             columns[WHICH, place], columns[STAMPS, place], columns[ENDS, place] = i * kinds + kind, row.ints[0], at
     return at

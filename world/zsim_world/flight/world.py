@@ -14,7 +14,7 @@ from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_world.fleet.fleet import DivergedError, Fleet
-from zsim_world.fleet.publication import Publication
+from zsim_world.fleet.publication import GatePublication
 from zsim_world.flight.command_intake import CommandIntake
 from zsim_world.flight.command_queue import CommandQueue
 from zsim_world.flight.coordinator import Coordinator
@@ -53,7 +53,7 @@ class World(Coordinator):
         self.faults = FaultInjector(scenario, clock, barrier, outbox, self.fleet.impairment)
         self._intake = CommandIntake(scenario, clock, barrier, outbox, self.queue, self.fleet, self.faults.of_links)
         self._operations |= {**self._intake.operations(), **self.faults.operations()}
-        self._publication = Publication(self.fleet)
+        self._publication = GatePublication(self.fleet)
         self._hash = TruthHash(self.fleet.count)
         self._last_ns = round(scenario.duration_s * 1e9) // clock.gate_ns * clock.gate_ns
         self.statistics.separation(self.fleet.closest_m())
@@ -158,7 +158,7 @@ class World(Coordinator):
         for i, name in enumerate(self.names):
             state, battery_percent, _ = self.fleet.status(i)
             pose = (tuple(truth.position_m[i].tolist()), tuple(truth.orientation_wxyz[i].tolist()))
-            rotors = tuple(truth.rotor_rad_s[i].tolist())
+            rotors = tuple(truth.rotor_rad_s[i, : self.fleet.rotors[i]].tolist())
             drones.append(messages.DroneView(name, *pose, rotors, state, battery_percent, commanders[i]))
         wind = tuple(tuple(row) for row in self.fleet.wind_m_s.tolist())
         return messages.ViewDrones(self.now_ns, seq, tuple(drones), wind)

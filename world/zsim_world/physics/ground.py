@@ -5,37 +5,41 @@ The anchor stays still within a step and moves after it, so that a step is a smo
 """
 
 import math
+from typing import Any, cast
 
+import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, add, cross, rotate, rotate_back
-from zsim_world.state.vehicle import (
-    CONTACT_POINTS_B,
-    CONTACT_REACH_M,
-    FOOT_DAMPING,
-    FOOT_STIFFNESS,
-    FRICTION,
-    SIZE,
-    Row,
-)
+from zsim_world.state.fleet_arrays import VEHICLE, Row
 
 Pair = tuple[float, float]
 
 
+POINTS = 8  # under which there may be ground: four feet, four corners of the hull's rim
+
+
 @inlined
 def _point(row: Row, k: int) -> Vector:
-    s = row[SIZE]
-    return (s * CONTACT_POINTS_B[k, 0], s * CONTACT_POINTS_B[k, 1], s * CONTACT_POINTS_B[k, 2])
+    """Return contact point k in B [m]: front left, front right, rear right, rear left; first the feet."""
+    foot, x, y = k < 4, 1.0 if k % 4 < 2 else -1.0, 1.0 if k % 4 in (0, 3) else -1.0
+    xy = row[VEHICLE.foot_xy] if foot else row[VEHICLE.rim_xy]
+    return (x * xy, y * xy, -row[VEHICLE.foot_depth] if foot else row[VEHICLE.rim_height])
+
+
+def contact_points(row: NDArray) -> np.ndarray:
+    """Return all contact points in B [m], (POINTS, 3)."""
+    return np.array([[float(x) for x in cast(Any, _point).py_func(row, k)] for k in range(POINTS)])
 
 
 @inlined
 def _tangential(row: Row, normal: float, gap: Pair, speed: Pair) -> Pair:
     """Return the friction force [N] of one point, within the cone."""
-    fx = -row[FOOT_STIFFNESS] * gap[0] - row[FOOT_DAMPING] * speed[0]
-    fy = -row[FOOT_STIFFNESS] * gap[1] - row[FOOT_DAMPING] * speed[1]
+    fx = -row[VEHICLE.foot_stiffness] * gap[0] - row[VEHICLE.foot_damping] * speed[0]
+    fy = -row[VEHICLE.foot_stiffness] * gap[1] - row[VEHICLE.foot_damping] * speed[1]
     size = math.sqrt(fx * fx + fy * fy)
-    limit = FRICTION * normal
+    limit = row[VEHICLE.friction] * normal
     if size <= limit:
         return fx, fy
     return fx * limit / size, fy * limit / size
@@ -48,20 +52,20 @@ def contact(
     """Return force in W [N] and moment in B [N m] of the ground on one drone.
 
     Args:
-        row: the drone's parameters (vehicle.py).
+        row: the drone's parameters.
         anchor: (8, 2) anchors of the contact points on the ground [m].
         p_WB, v_WB, q_WB, w_WB_B: state of the drone [m, m/s, -, rad/s].
     """
     force, moment = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    if p_WB[2] > CONTACT_REACH_M * row[SIZE]:
+    if p_WB[2] > row[VEHICLE.contact_reach]:
         return force, moment
-    for k in range(CONTACT_POINTS_B.shape[0]):
+    for k in range(POINTS):
         r_B = _point(row, k)
         r_W = rotate(q_WB, r_B)
         depth = -(p_WB[2] + r_W[2])
         if depth > 0.0:
             v = add(v_WB, rotate(q_WB, cross(w_WB_B, r_B)))
-            normal = max(row[FOOT_STIFFNESS] * depth - row[FOOT_DAMPING] * v[2], 0.0)
+            normal = max(row[VEHICLE.foot_stiffness] * depth - row[VEHICLE.foot_damping] * v[2], 0.0)
             gap = (p_WB[0] + r_W[0] - anchor[k, 0], p_WB[1] + r_W[1] - anchor[k, 1])
             fx, fy = _tangential(row, normal, gap, (v[0], v[1]))
             f_W = (fx, fy, normal)
@@ -73,13 +77,13 @@ def contact(
 @inlined
 def drag_anchors(row: NDArray, anchor: NDArray, p_WB: Vector, q_WB: Quaternion) -> None:
     """Move the anchors after a step: to the point itself in the air, along with it where it slides."""
-    for k in range(CONTACT_POINTS_B.shape[0]):
+    for k in range(POINTS):
         r_W = rotate(q_WB, _point(row, k))
         x, y = p_WB[0] + r_W[0], p_WB[1] + r_W[1]
         depth = -(p_WB[2] + r_W[2])
         gx, gy = x - anchor[k, 0], y - anchor[k, 1]
         size = math.sqrt(gx * gx + gy * gy)
-        limit = FRICTION * max(depth, 0.0)
+        limit = row[VEHICLE.friction] * max(depth, 0.0)
         if size > limit:
             keep = 0.0 if size == 0.0 else limit / size
             anchor[k, 0], anchor[k, 1] = x - gx * keep, y - gy * keep

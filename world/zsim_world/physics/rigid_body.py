@@ -8,23 +8,8 @@ from zsim.math import rotation as rot
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, add, axpy
 from zsim_world.physics.ground import contact
-from zsim_world.physics.rotors import Four, lagged, wrench
-from zsim_world.state.vehicle import (
-    CONTACT_REACH_M,
-    DRAG,
-    GRAVITY,
-    INERTIA_X,
-    INERTIA_Y,
-    INERTIA_Z,
-    MASS,
-    ROTOR_LAG,
-    SIZE,
-    Row,
-)
-
-# Columns of the state, one row per drone
-POSITION, VELOCITY, ATTITUDE, RATE, ROTOR = 0, 3, 6, 10, 13  # m, m/s, quaternion, rad/s in B, rad/s
-COLUMNS = 17
+from zsim_world.physics.rotors import lagged, wrench
+from zsim_world.state.fleet_arrays import STATE, VEHICLE, PerRotor, Row, of, put_of
 
 NOTHING = (0.0, 0.0, 0.0)  # N or N m
 
@@ -36,7 +21,7 @@ def vector(row: Row, at: int) -> Vector:
 
 
 @inlined
-def four(row: Row, at: int) -> Four:
+def four(row: Row, at: int) -> Quaternion:
     """Return four numbers of a row."""
     return (row[at], row[at + 1], row[at + 2], row[at + 3])
 
@@ -48,7 +33,7 @@ def put(row: NDArray, at: int, a: Vector) -> None:
 
 
 @inlined
-def put_four(row: NDArray, at: int, a: Four) -> None:
+def put_four(row: NDArray, at: int, a: Quaternion) -> None:
     """Write four numbers into a row."""
     row[at], row[at + 1], row[at + 2], row[at + 3] = a
 
@@ -56,32 +41,22 @@ def put_four(row: NDArray, at: int, a: Four) -> None:
 @inlined
 def pose(state: NDArray) -> tuple[Vector, Vector, Quaternion, Vector]:
     """Return p_WB, v_WB, q_WB, w_WB_B of one drone's state."""
-    return vector(state, POSITION), vector(state, VELOCITY), four(state, ATTITUDE), vector(state, RATE)
-
-
-@inlined
-def slew(row: Row, speed: Four, command: Four) -> Four:
-    """Return the rotors' accelerations [rad/s^2] under their first-order lag."""
-    s = 1.0 / row[ROTOR_LAG]
-    return (
-        (command[0] - speed[0]) * s,
-        (command[1] - speed[1]) * s,
-        (command[2] - speed[2]) * s,
-        (command[3] - speed[3]) * s,
-    )
+    return vector(state, STATE.p_WB), vector(state, STATE.v_WB), four(state, STATE.q_WB), vector(state, STATE.w_WB_B)
 
 
 @inlined
 def accelerations(
     grounded: bool,
     row: Row,
+    rotors: PerRotor,
     anchor: NDArray,
     p_WB: Vector,
     v_WB: Vector,
     q_WB: Quaternion,
     w_WB_B: Vector,
-    speed: Four,
-    command: Four,
+    speeds: PerRotor,
+    commands: PerRotor,
+    decay: float | None,
     air_W: Vector,
     push_W: Vector,
 ) -> tuple[Vector, Vector]:
@@ -92,23 +67,23 @@ def accelerations(
 
     Args:
         grounded: a constant where it is called. False leaves the ground out, and then the result holds only where
-            the ground is out of reach; so there is no branch in it, and several drones go at once (lanes.py).
-        row: parameters (vehicle.py); anchor: of its contact points (ground.py).
-        p_WB, v_WB, q_WB, w_WB_B, speed: state; command: rotor speeds wanted [rad/s].
+            the ground is out of reach; so there is no branch in it, and several drones go at once (simd.py).
+        row, rotors: parameters; anchor: of its contact points (ground.py).
+        p_WB, v_WB, q_WB, w_WB_B: state; speeds, commands, decay: of the rotors, as for `rotors.wrench`.
         air_W: velocity of the air at the drone [m/s]; push_W: force of other drones [N].
     """
     ground = NOTHING, NOTHING
     if grounded:
         ground = contact(row, anchor, p_WB, v_WB, q_WB, w_WB_B)
-    ix, iy, iz = row[INERTIA_X], row[INERTIA_Y], row[INERTIA_Z]
-    thrust, moment = wrench(row, q_WB, p_WB[2], w_WB_B, speed, slew(row, speed, command))
+    ix, iy, iz = vector(row, VEHICLE.inertia)
+    thrust, moment = wrench(row, rotors, q_WB, p_WB[2], w_WB_B, speeds, commands, decay)
     moment = add(moment, ground[1])
     force = add(add(ground[0], push_W), rot.rotate(q_WB, (0.0, 0.0, thrust)))
-    force = axpy(force, -row[DRAG], axpy(v_WB, -1.0, air_W))
-    inv = 1.0 / row[MASS]
+    force = axpy(force, -row[VEHICLE.drag], axpy(v_WB, -1.0, air_W))
+    inv = 1.0 / row[VEHICLE.mass]
     wx, wy, wz = w_WB_B
     return (
-        (force[0] * inv, force[1] * inv, force[2] * inv - row[GRAVITY]),
+        (force[0] * inv, force[1] * inv, force[2] * inv - row[VEHICLE.gravity]),
         (
             (moment[0] - (iz - iy) * wy * wz) / ix,
             (moment[1] - (ix - iz) * wz * wx) / iy,
@@ -135,20 +110,35 @@ def _mean(a: Vector, b: Vector, c: Vector, d: Vector) -> Vector:
 
 @inlined
 def step(
-    row: NDArray, anchor: NDArray, state: NDArray, command: Four, air_W: Vector, push_W: Vector, dt: float
+    row: NDArray,
+    rotors: PerRotor,
+    anchor: NDArray,
+    state: NDArray,
+    command: NDArray,
+    air_W: Vector,
+    push_W: Vector,
+    dt: float,
 ) -> None:
-    """Advance one drone's state (COLUMNS,) by dt [s] in place.
+    """Advance one drone's state (STATE.size + R,) by dt [s] in place, under a command (R,) [rad/s] to its rotors.
 
     The rotors' lag is integrated exactly, also inside the step; air and pushes of others are held over it.
     """
-    decay = half_decay(row[ROTOR_LAG], dt)
+    decay = half_decay(row[VEHICLE.rotor_lag], dt)
+    speeds, commands = PerRotor(state, STATE.size, 1, rotors.each), PerRotor(command, 0, 1, rotors.each)
     p, v, q, w = pose(state)
-    p, v, q, w, speed, _ = stepped(True, row, anchor, p, v, q, w, four(state, ROTOR), command, air_W, push_W, decay, dt)
-    put(state, POSITION, p)
-    put(state, VELOCITY, v)
-    put_four(state, ATTITUDE, q)
-    put(state, RATE, w)
-    put_four(state, ROTOR, speed)
+    p, v, q, w, _ = stepped(True, row, rotors, anchor, p, v, q, w, speeds, commands, decay, air_W, push_W, dt)
+    put(state, STATE.p_WB, p)
+    put(state, STATE.v_WB, v)
+    put_four(state, STATE.q_WB, q)
+    put(state, STATE.w_WB_B, w)
+    lag(speeds, commands, decay * decay)
+
+
+@inlined
+def lag(speeds: PerRotor, commands: PerRotor, decay: float) -> None:
+    """Advance rotor speeds [rad/s] in place until `decay` is left of their lag."""
+    for r in range(len(speeds.each)):
+        put_of(speeds, r, lagged(of(speeds, 0, r), of(commands, 0, r), decay))
 
 
 @inlined
@@ -161,38 +151,39 @@ def half_decay(lag_s: float, dt: float) -> float:
 def stepped(
     grounded: bool,
     row: Row,
+    rotors: PerRotor,
     anchor: NDArray,
     p: Vector,
     v: Vector,
     q: Quaternion,
     w: Vector,
-    r0: Four,
-    command: Four,
+    speeds: PerRotor,
+    commands: PerRotor,
+    decay: float,
     air_W: Vector,
     push_W: Vector,
-    decay: float,
     dt: float,
-) -> tuple[Vector, Vector, Quaternion, Vector, Four, bool]:
-    """Return p_WB, v_WB, q_WB, w_WB_B and rotor speeds after dt [s], and whether the ground was out of reach.
+) -> tuple[Vector, Vector, Quaternion, Vector, bool]:
+    """Return p_WB, v_WB, q_WB, w_WB_B after dt [s], and whether the ground was out of reach; speeds stay.
 
     Args:
-        grounded, row, anchor, command, air_W, push_W: as for `accelerations`.
-        p, v, q, w, r0: state; decay: of the rotors' lag, see `half_decay`.
+        grounded, row, rotors, anchor, air_W, push_W: as for `accelerations`.
+        p, v, q, w: state; speeds, commands: of the rotors at the start; decay: of their lag, see `half_decay`.
     """
-    h, reach = 0.5 * dt, CONTACT_REACH_M * row[SIZE]
-    r1 = lagged(r0, command, decay)
-    r2 = lagged(r0, command, decay * decay)
+    h, reach = 0.5 * dt, row[VEHICLE.contact_reach]
 
-    a1, b1 = accelerations(grounded, row, anchor, p, v, q, w, r0, command, air_W, push_W)
+    a1, b1 = accelerations(grounded, row, rotors, anchor, p, v, q, w, speeds, commands, None, air_W, push_W)
     d1 = rot.rate(q, w)
     p2, v2, w2, q2 = axpy(p, h, v), axpy(v, h, a1), axpy(w, h, b1), _turned(q, h, d1)
-    a2, b2 = accelerations(grounded, row, anchor, p2, v2, q2, w2, r1, command, air_W, push_W)
+    a2, b2 = accelerations(grounded, row, rotors, anchor, p2, v2, q2, w2, speeds, commands, decay, air_W, push_W)
     d2 = rot.rate(q2, w2)
     p3, v3, w3, q3 = axpy(p, h, v2), axpy(v, h, a2), axpy(w, h, b2), _turned(q, h, d2)
-    a3, b3 = accelerations(grounded, row, anchor, p3, v3, q3, w3, r1, command, air_W, push_W)
+    a3, b3 = accelerations(grounded, row, rotors, anchor, p3, v3, q3, w3, speeds, commands, decay, air_W, push_W)
     d3 = rot.rate(q3, w3)
     p4, v4, w4, q4 = axpy(p, dt, v3), axpy(v, dt, a3), axpy(w, dt, b3), _turned(q, dt, d3)
-    a4, b4 = accelerations(grounded, row, anchor, p4, v4, q4, w4, r2, command, air_W, push_W)
+    a4, b4 = accelerations(
+        grounded, row, rotors, anchor, p4, v4, q4, w4, speeds, commands, decay * decay, air_W, push_W
+    )
     d4 = rot.rate(q4, w4)
 
     s = dt / 6.0
@@ -201,6 +192,5 @@ def stepped(
         axpy(v, dt, _mean(a1, a2, a3, a4)),
         rot.normalised(_turned(_turned(_turned(_turned(q, s, d1), 2.0 * s, d2), 2.0 * s, d3), s, d4)),
         axpy(w, dt, _mean(b1, b2, b3, b4)),
-        r2,
         (p[2] > reach) & (p2[2] > reach) & (p3[2] > reach) & (p4[2] > reach),
     )

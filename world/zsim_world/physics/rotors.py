@@ -1,4 +1,8 @@
-"""Four rotors: lag, thrust, torque, and the mixer that finds speeds for a wanted thrust and torque."""
+"""The rotors of a vehicle: lag, thrust, torque, power; the mixer that finds speeds for thrust and torque; the battery.
+
+Rotor r stands at (x, y) rotor_unit in B; seen from above it turns clockwise where its `turn` is 1. Groups of numbers
+per rotor, `PerRotor`, are in the order of state/fleet_arrays.ROTOR.
+"""
 
 import math
 
@@ -6,25 +10,15 @@ from numpy.typing import NDArray
 
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, rotate
-from zsim_world.state.vehicle import ROTOR_INERTIA, ROTOR_MAX, ROTOR_MIN, ROTOR_RADIUS, ROTOR_XY, THRUST, TORQUE, Row
+from zsim_world.state.fleet_arrays import ROTOR, VEHICLE, PerRotor, Row, of, put_of
 
-Four = tuple[float, float, float, float]
-# Rotor i stands at (SIDE_X[i], SIDE_Y[i]) * ROTOR_XY; TURN is the sign of its drag torque on the body about z.
-SIDE_X = (1.0, 1.0, -1.0, -1.0)
-SIDE_Y = (1.0, -1.0, -1.0, 1.0)
-TURN = (1.0, -1.0, 1.0, -1.0)
 GROUND_CLEARANCE_MIN = 0.5  # radii, the formula below is not meant for less
 
 
 @inlined
-def lagged(speed: Four, command: Four, decay: float) -> Four:
-    """Return rotor speeds [rad/s] after a first-order lag has decayed to the fraction `decay` = exp(-t / lag)."""
-    return (
-        command[0] + (speed[0] - command[0]) * decay,
-        command[1] + (speed[1] - command[1]) * decay,
-        command[2] + (speed[2] - command[2]) * decay,
-        command[3] + (speed[3] - command[3]) * decay,
-    )
+def lagged(speed: float, command: float, decay: float) -> float:
+    """Return a rotor's speed [rad/s] after a first-order lag has decayed to the fraction `decay` = exp(-t / lag)."""
+    return command + (speed - command) * decay
 
 
 @inlined
@@ -40,65 +34,99 @@ def ground_effect(height_m: float, radius_m: float) -> float:
 
 @inlined
 def wrench(
-    row: Row, q_WB: Quaternion, height_m: float, w_WB_B: Vector, speed: Four, slew: Four
+    row: Row,
+    rotors: PerRotor,
+    q_WB: Quaternion,
+    height_m: float,
+    w_WB_B: Vector,
+    speeds: PerRotor,
+    commands: PerRotor,
+    decay: float | None,
 ) -> tuple[float, Vector]:
-    """Return thrust along z_B [N] and moment in B [N m] of the four rotors.
+    """Return thrust along z_B [N] and moment in B [N m] of the rotors.
 
     Moment: arms × thrusts, drag torque k_M w^2, reaction to the rotors' own acceleration J dw/dt, and the
     gyroscopic moment of their spin when the body turns.
 
     Args:
-        row: the drone's parameters (vehicle.py).
+        row, rotors: the drone's parameters.
         q_WB, height_m: attitude, and height of the centre of mass over the ground.
         w_WB_B: body rate [rad/s].
-        speed, slew: rotor speeds [rad/s] and their derivatives [rad/s^2].
+        speeds, commands: of the rotors [rad/s] at the start of the step; decay: what is left of their lag since, or
+            None at the start.
     """
-    arm, radius, inertia = row[ROTOR_XY], row[ROTOR_RADIUS], row[ROTOR_INERTIA]
-    ex, ey = rotate(q_WB, (arm, 0.0, 0.0))[2], rotate(q_WB, (0.0, arm, 0.0))[2]
+    unit, radius, inertia = row[VEHICLE.rotor_unit], row[VEHICLE.rotor_radius], row[VEHICLE.rotor_inertia]
+    ex, ey = rotate(q_WB, (unit, 0.0, 0.0))[2], rotate(q_WB, (0.0, unit, 0.0))[2]
+    slew = 1.0 / row[VEHICLE.rotor_lag]
     total, mx, my, mz, spin = 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(4):
-        square = speed[k] * speed[k]
-        force = row[THRUST] * square * ground_effect(height_m + SIDE_X[k] * ex + SIDE_Y[k] * ey, radius)
+    for r in range(len(rotors.each)):
+        x, y, turn = of(rotors, ROTOR.x, r), of(rotors, ROTOR.y, r), of(rotors, ROTOR.turn, r)
+        speed, command = of(speeds, 0, r), of(commands, 0, r)
+        if decay is not None:
+            speed = lagged(speed, command, decay)
+        square = speed * speed
+        force = row[VEHICLE.thrust] * square * ground_effect(height_m + x * ex + y * ey, radius)
         total += force
-        mx += SIDE_Y[k] * arm * force
-        my -= SIDE_X[k] * arm * force
-        mz += TURN[k] * (row[TORQUE] * square + inertia * slew[k])
-        spin += TURN[k] * inertia * speed[k]
+        mx += y * unit * force
+        my -= x * unit * force
+        mz += turn * (row[VEHICLE.torque] * square + inertia * ((command - speed) * slew))
+        spin += turn * inertia * speed
     return total, (mx + w_WB_B[1] * spin, my - w_WB_B[0] * spin, mz)
 
 
 @inlined
-def shaft_power(row: NDArray, speed: Four) -> float:
-    """Return the mechanical power of the four rotors [W]: sum of k_M w^3."""
-    s = 0.0
-    for k in range(4):
-        s += speed[k] * speed[k] * speed[k]
-    return row[TORQUE] * s
+def free_thrust(row: Row, speeds: PerRotor) -> float:
+    """Return the thrust [N] far from the ground."""
+    squares = 0.0
+    for r in range(len(speeds.each)):
+        squares += of(speeds, 0, r) * of(speeds, 0, r)
+    return row[VEHICLE.thrust] * squares
 
 
 @inlined
-def mix(row: Row, thrust_n: float, moment: Vector) -> Four:
-    """Return rotor speeds [rad/s] for a thrust [N] and a moment in B [N m] within the rotors' limits.
+def mix(row: Row, rotors: PerRotor, thrust_n: float, moment: Vector, speeds: PerRotor) -> None:
+    """Set rotor speeds [rad/s] that give a thrust [N] and a moment in B [N m] within the rotors' limits.
 
     What cannot be had is given up in this order: yaw first, then thrust, tilt last.
     """
-    low = row[THRUST] * row[ROTOR_MIN] * row[ROTOR_MIN]
-    high = row[THRUST] * row[ROTOR_MAX] * row[ROTOR_MAX]
-    roll, pitch = 0.25 * moment[0] / row[ROTOR_XY], 0.25 * moment[1] / row[ROTOR_XY]
-    reach = abs(roll) + abs(pitch)
+    thrust = row[VEHICLE.thrust]
+    low = thrust * row[VEHICLE.rotor_min] * row[VEHICLE.rotor_min]
+    high = thrust * row[VEHICLE.rotor_max] * row[VEHICLE.rotor_max]
+    roll, pitch = moment[0] / row[VEHICLE.rotor_unit], moment[1] / row[VEHICLE.rotor_unit]
+    reach = 0.0
+    for r in range(len(rotors.each)):
+        reach = max(reach, abs(of(rotors, ROTOR.roll, r) * roll + of(rotors, ROTOR.pitch, r) * pitch))
     scale = (high - low) / (2.0 * reach) if 2.0 * reach > high - low else 1.0
     roll, pitch, reach = roll * scale, pitch * scale, reach * scale
-    mean = min(max(0.25 * thrust_n, low + reach), high - reach)
-    yaw = 0.25 * moment[2] * row[THRUST] / row[TORQUE]
-    f0, f1 = mean + roll - pitch, mean - roll - pitch
-    f2, f3 = mean - roll + pitch, mean + roll + pitch
-    if yaw >= 0.0:
-        yaw = min(yaw, high - max(f0, f2), min(f1, f3) - low)
-    else:
-        yaw = -min(-yaw, high - max(f1, f3), min(f0, f2) - low)
-    return (
-        math.sqrt(max(f0 + yaw, low) / row[THRUST]),
-        math.sqrt(max(f1 - yaw, low) / row[THRUST]),
-        math.sqrt(max(f2 + yaw, low) / row[THRUST]),
-        math.sqrt(max(f3 - yaw, low) / row[THRUST]),
-    )
+    mean = min(max(row[VEHICLE.rotor_share] * thrust_n, low + reach), high - reach)
+    yaw = moment[2] * thrust / row[VEHICLE.torque]
+    sign, most = (1.0 if yaw >= 0.0 else -1.0), abs(yaw)
+    for r in range(len(rotors.each)):
+        force = mean + of(rotors, ROTOR.roll, r) * roll + of(rotors, ROTOR.pitch, r) * pitch
+        share = sign * of(rotors, ROTOR.yaw, r)
+        most = min(most, (high - force if share > 0.0 else low - force) / share if share != 0.0 else most)
+    for r in range(len(rotors.each)):
+        force = mean + of(rotors, ROTOR.roll, r) * roll + of(rotors, ROTOR.pitch, r) * pitch
+        put_of(speeds, r, math.sqrt(max(force + sign * of(rotors, ROTOR.yaw, r) * most, low) / thrust))
+
+
+@inlined
+def power(row: NDArray, speeds: PerRotor) -> float:
+    """Return the electric power [W] at these rotor speeds [rad/s]: of the shafts, sum of k_M w^3, and of the board."""
+    cubes = 0.0
+    for r in range(len(speeds.each)):
+        speed = of(speeds, 0, r)
+        cubes += speed * speed * speed
+    return row[VEHICLE.torque] * cubes / row[VEHICLE.efficiency] + row[VEHICLE.electronics]
+
+
+@inlined
+def drained(row: NDArray, energy_j: float, speeds: PerRotor, dt: float) -> float:
+    """Return the energy of the battery left [J] after dt [s], never below zero."""
+    return max(energy_j - power(row, speeds) * dt, 0.0)
+
+
+@inlined
+def charge_percent(row: NDArray, energy_j: float) -> float:
+    """Return the charge in percent of a full battery."""
+    return 100.0 * energy_j / row[VEHICLE.capacity]

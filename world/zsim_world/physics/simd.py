@@ -1,64 +1,258 @@
-"""A block: numbers of eight drones side by side, so that an instruction works on all of them.
+"""Bodies in blocks of eight: one instruction of the processor works on eight drones at once.
 
-It is one array; `block[LANES * column + k]` is drone k's. Its length and columns are constants, so that the compiler
-needs neither a check of overlaps nor a rest. What it makes of a loop over the lanes are the operations of one drone, in
-their order: the results are the same to the last bit.
+Modern processors add or multiply eight numbers with one instruction (SIMD: single instruction, multiple data) if the
+eight stand side by side in memory. So the drones are divided into blocks of LANES; a block is one array in which each
+column holds that column's number of all its drones, `block[LANES * column + lane]` being that of one of them. A loop
+over the lanes of a block, whose body has no branch, is turned into such instructions by the compiler: its length and
+its columns are constants, so that neither a check of overlaps nor a rest is needed. They are the operations of one
+drone in their order, so that the results are the same to the last bit, whatever the block.
+
+Equations that branch, as those of contact with the ground, are done for each drone by itself: a block is stepped as
+in free air, and drones that had the ground in reach take their step again with it.
 """
+
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector
-from zsim_world.state.vehicle import Row
+from zsim_world.physics import rigid_body as body
+from zsim_world.physics.ground import drag_anchors
+from zsim_world.physics.rigid_body import four, put, vector
+from zsim_world.state.fleet_arrays import ROTOR, STATE, VEHICLE, Bodies, PerRotor, Row
 
 LANES = 8  # doubles in a register of 512 bit, or in two of 256
-# Every block begins with the parameters of its drones (vehicle.py)
+
+# Every block begins with the parameters of its drones. This one ends with groups of numbers per rotor.
+BODY_LANES = columns(
+    "BodyLanes",
+    (
+        Field("vehicle", "VEHICLE", VEHICLE.size),
+        Field("decay", "1"),  # of a rotor's lag in half a tick
+        Field("state", "STATE", STATE.size),
+        Field("air", "m/s", 3),
+        Field("push", "N", 3),
+        Field("accel", "m/s^2, rad/s^2", 6),  # in W; angular, in B
+        Field("clear", "1"),  # 1 if the ground was out of reach in the whole step, so that its result holds
+    ),
+)
+BODY_ROTORS = columns(
+    "BodyRotors", (Field("known", "ROTOR", ROTOR.size), Field("speed", "rad/s"), Field("command", "rad/s"))
+)
 
 
-def blocks(columns: int, *constants: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the blocks of N drones, (blocks, LANES * columns), with what does not change; all else is 0.
+def blocks(count: int, parts: Iterable[tuple[int, NDArray[np.float64]]]) -> NDArray[np.float64]:
+    """Return the blocks of N drones, (blocks, LANES * count), with what does not change; all else is 0.
 
     Args:
-        columns: of a block.
-        constants: (N, any), side by side from column 0 on. Lanes without a drone get those of the last one.
+        count: of a block's columns.
+        parts: first column, and numbers (N, any) from there on. Lanes without a drone get those of the last one.
     """
-    known = np.concatenate(constants, axis=1)
-    count = -(-len(known) // LANES)
-    drone = np.minimum(np.arange(count * LANES), len(known) - 1).reshape(count, LANES)
-    made = np.zeros((count, columns, LANES))
-    made[:, : known.shape[1]] = known[drone].swapaxes(1, 2)
-    return made.reshape(count, -1)
+    listed = list(parts)
+    drones = len(listed[0][1])
+    number = -(-drones // LANES)
+    drone = np.minimum(np.arange(number * LANES), drones - 1).reshape(number, LANES)
+    made = np.zeros((number, count, LANES))
+    for first, known in listed:
+        made[:, first : first + known.shape[1]] = known[drone].swapaxes(1, 2)
+    return made.reshape(number, -1)
+
+
+def body_blocks(row: NDArray, rotors: NDArray, decay: NDArray) -> NDArray[np.float64]:
+    """Return the blocks of N bodies: parameters, those of their rotors, and the lag of these in half a tick (N, 1)."""
+    each = rotors.shape[1] // ROTOR.size
+    known = BODY_LANES.size + BODY_ROTORS.known * each
+    parts = ((BODY_LANES.vehicle, row), (BODY_LANES.decay, decay), (known, rotors))
+    return blocks(BODY_LANES.size + BODY_ROTORS.size * each, parts)
 
 
 @inlined
-def row(block: NDArray, k: int) -> Row:
-    """Return the parameters of the drone in lane k."""
-    a, b, c, d = four(block, 0, k), four(block, 4, k), four(block, 8, k), four(block, 12, k)
-    return a + b + c + d + four(block, 16, k) + vector(block, 20, k)
+def lane_row(block: NDArray, k: int) -> Row:
+    """Return the parameters of the drone in lane k, VEHICLE.size of them."""
+    a, b, c, d = lane_four(block, 0, k), lane_four(block, 4, k), lane_four(block, 8, k), lane_four(block, 12, k)
+    e, f, g, h = lane_four(block, 16, k), lane_four(block, 20, k), lane_four(block, 24, k), lane_four(block, 28, k)
+    return a + b + c + d + e + f + g + h
 
 
 @inlined
-def vector(block: NDArray, at: int, k: int) -> Vector:
+def lane_vector(block: NDArray, at: int, k: int) -> Vector:
     """Return three numbers of the drone in lane k, from column `at` on."""
     return (block[LANES * at + k], block[LANES * (at + 1) + k], block[LANES * (at + 2) + k])
 
 
 @inlined
-def four(block: NDArray, at: int, k: int) -> Quaternion:
+def lane_four(block: NDArray, at: int, k: int) -> Quaternion:
     """Return four numbers of the drone in lane k."""
-    a, b, c = vector(block, at, k)
+    a, b, c = lane_vector(block, at, k)
     return (a, b, c, block[LANES * (at + 3) + k])
 
 
 @inlined
-def put(block: NDArray, at: int, k: int, a: Vector) -> None:
+def put_lane_vector(block: NDArray, at: int, k: int, a: Vector) -> None:
     """Write three numbers of the drone in lane k."""
     block[LANES * at + k], block[LANES * (at + 1) + k], block[LANES * (at + 2) + k] = a
 
 
 @inlined
-def put_four(block: NDArray, at: int, k: int, a: Quaternion) -> None:
+def put_lane_four(block: NDArray, at: int, k: int, a: Quaternion) -> None:
     """Write four numbers of the drone in lane k."""
-    put(block, at, k, (a[0], a[1], a[2]))
+    put_lane_vector(block, at, k, (a[0], a[1], a[2]))
     block[LANES * (at + 3) + k] = a[3]
+
+
+@inlined
+def lane_rotors(block: NDArray, at: int, k: int, each: tuple[int, ...]) -> PerRotor:
+    """Return the groups of numbers per rotor of the drone in lane k, from column `at` on."""
+    return PerRotor(block, LANES * at + k, LANES, each)
+
+
+@inlined
+def _group(group: int, each: tuple[int, ...]) -> int:
+    """Return the first column of a group in a block of bodies."""
+    return BODY_LANES.size + group * len(each)
+
+
+@inlined
+def move(bodies: Bodies, dt: float) -> None:
+    """Integrate every drone over one tick of dt [s]."""
+    count = bodies.state.shape[0]
+    for first in range(0, count, LANES):
+        lanes = bodies.lanes[first // LANES]
+        if _load(bodies, lanes, first):
+            _step_block(lanes, bodies.each, bodies.anchor[0], dt)
+        else:
+            for k in range(LANES):
+                lanes[LANES * BODY_LANES.clear + k] = 0.0
+        for i in range(first, min(first + LANES, count)):
+            _take_over(bodies, lanes, i, i - first, dt)
+
+
+@inlined
+def accelerate(bodies: Bodies) -> None:
+    """Note the accelerations of every drone in its present state."""
+    count = bodies.state.shape[0]
+    for first in range(0, count, LANES):
+        lanes = bodies.lanes[first // LANES]
+        if _load(bodies, lanes, first):
+            _accelerate_block(lanes, bodies.each, bodies.anchor[0])
+        for i in range(first, min(first + LANES, count)):
+            if _in_reach(bodies, i):
+                _accelerate_low(bodies, i)
+            else:
+                for c in range(6):
+                    bodies.accel[i, c] = lanes[LANES * (BODY_LANES.accel + c) + i - first]
+
+
+@inlined
+def line_up(bodies: Bodies) -> None:
+    """Copy the state of all drones into the blocks, which keep it from then on."""
+    for i in range(bodies.state.shape[0]):
+        _put_state(bodies.lanes[i // LANES], i % LANES, bodies.state[i], bodies.each)
+
+
+@inlined
+def _put_state(lanes: NDArray, k: int, state: NDArray, each: tuple[int, ...]) -> None:
+    for c in range(STATE.size):
+        lanes[LANES * (BODY_LANES.state + c) + k] = state[c]
+    for r in range(len(each)):
+        lanes[LANES * (_group(BODY_ROTORS.speed, each) + r) + k] = state[STATE.size + r]
+
+
+@inlined
+def _load(bodies: Bodies, lanes: NDArray, first: int) -> bool:
+    """Give the drones from `first` on their commands, air and pushes; return whether any is out of the ground's reach.
+
+    In a lane without a drone numbers mean nothing, and nobody looks at what becomes of them.
+    """
+    airborne, at = False, _group(BODY_ROTORS.command, bodies.each)
+    for i in range(first, min(first + LANES, bodies.state.shape[0])):
+        k = i - first
+        for r in range(len(bodies.each)):
+            lanes[LANES * (at + r) + k] = bodies.command[i, r]
+        put_lane_vector(lanes, BODY_LANES.air, k, vector(bodies.air[i], 0))
+        put_lane_vector(lanes, BODY_LANES.push, k, vector(bodies.push[i], 0))
+        airborne |= not _in_reach(bodies, i)
+    return airborne
+
+
+@inlined
+def _pose(lanes: NDArray, k: int) -> tuple[Vector, Vector, Quaternion, Vector]:
+    """Return p_WB, v_WB, q_WB, w_WB_B of the drone in lane k."""
+    at = BODY_LANES.state
+    p, v = lane_vector(lanes, at + STATE.p_WB, k), lane_vector(lanes, at + STATE.v_WB, k)
+    return p, v, lane_four(lanes, at + STATE.q_WB, k), lane_vector(lanes, at + STATE.w_WB_B, k)
+
+
+@inlined
+def _step_block(lanes: NDArray, each: tuple[int, ...], anchor: NDArray, dt: float) -> None:
+    """Take a step of dt [s] with all drones of the block, as in free air."""
+    for k in range(LANES):
+        p, v, q, w = _pose(lanes, k)
+        rotors = lane_rotors(lanes, _group(BODY_ROTORS.known, each), k, each)
+        speeds = lane_rotors(lanes, _group(BODY_ROTORS.speed, each), k, each)
+        commands = lane_rotors(lanes, _group(BODY_ROTORS.command, each), k, each)
+        air, push = lane_vector(lanes, BODY_LANES.air, k), lane_vector(lanes, BODY_LANES.push, k)
+        decay, row = lanes[LANES * BODY_LANES.decay + k], lane_row(lanes, k)
+        p, v, q, w, clear = body.stepped(False, row, rotors, anchor, p, v, q, w, speeds, commands, decay, air, push, dt)
+        put_lane_vector(lanes, BODY_LANES.state + STATE.p_WB, k, p)
+        put_lane_vector(lanes, BODY_LANES.state + STATE.v_WB, k, v)
+        put_lane_four(lanes, BODY_LANES.state + STATE.q_WB, k, q)
+        put_lane_vector(lanes, BODY_LANES.state + STATE.w_WB_B, k, w)
+        body.lag(speeds, commands, decay * decay)
+        lanes[LANES * BODY_LANES.clear + k] = 1.0 if clear else 0.0
+
+
+@inlined
+def _accelerate_block(lanes: NDArray, each: tuple[int, ...], anchor: NDArray) -> None:
+    """Find the accelerations of all drones of the block, as in free air."""
+    for k in range(LANES):
+        p, v, q, w = _pose(lanes, k)
+        rotors = lane_rotors(lanes, _group(BODY_ROTORS.known, each), k, each)
+        speeds = lane_rotors(lanes, _group(BODY_ROTORS.speed, each), k, each)
+        commands = lane_rotors(lanes, _group(BODY_ROTORS.command, each), k, each)
+        air, push = lane_vector(lanes, BODY_LANES.air, k), lane_vector(lanes, BODY_LANES.push, k)
+        row = lane_row(lanes, k)
+        a, alpha = body.accelerations(False, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push)
+        put_lane_vector(lanes, BODY_LANES.accel, k, a)
+        put_lane_vector(lanes, BODY_LANES.accel + 3, k, alpha)
+
+
+@inlined
+def _accelerate_low(bodies: Bodies, i: int) -> None:
+    """Note the accelerations of a drone that has the ground in reach."""
+    each, row, anchor = bodies.each, bodies.vehicle[i], bodies.anchor[i]
+    p, v, q, w = body.pose(bodies.state[i])
+    rotors, speeds = PerRotor(bodies.rotors[i], 0, 1, each), PerRotor(bodies.state[i], STATE.size, 1, each)
+    commands, air, push = PerRotor(bodies.command[i], 0, 1, each), vector(bodies.air[i], 0), vector(bodies.push[i], 0)
+    a, alpha = body.accelerations(True, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push)
+    put(bodies.accel[i], 0, a)
+    put(bodies.accel[i], 3, alpha)
+
+
+@inlined
+def _take_over(bodies: Bodies, lanes: NDArray, i: int, k: int, dt: float) -> None:
+    """Take over what became of drone i in lane k; where the ground was in reach, let it take its step again with it."""
+    row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
+    if lanes[LANES * BODY_LANES.clear + k] > 0.0:
+        for c in range(STATE.size):
+            state[c] = lanes[LANES * (BODY_LANES.state + c) + k]
+        for r in range(len(bodies.each)):
+            state[STATE.size + r] = lanes[LANES * (_group(BODY_ROTORS.speed, bodies.each) + r) + k]
+    else:
+        if not _in_reach(bodies, i):  # the anchors were not moved while it was high
+            drag_anchors(row, anchor, vector(state, STATE.p_WB), four(state, STATE.q_WB))
+        rotors = PerRotor(bodies.rotors[i], 0, 1, bodies.each)
+        air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
+        body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt)
+        _put_state(lanes, k, state, bodies.each)
+    if _in_reach(bodies, i):
+        drag_anchors(row, anchor, vector(state, STATE.p_WB), four(state, STATE.q_WB))
+
+
+@inlined
+def _in_reach(bodies: Bodies, i: int) -> bool:
+    """Return whether drone i is so low that it could touch the ground."""
+    return not bodies.state[i, STATE.p_WB + 2] > bodies.vehicle[i, VEHICLE.contact_reach]

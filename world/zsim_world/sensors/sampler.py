@@ -12,17 +12,18 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from zsim.math import geodetic
+from zsim.math.columns import Field, columns
 from zsim.math.compiled import kernel
 from zsim.scenario.scenario import Scenario
 from zsim_world.sensors import sensor_set
 from zsim_world.sensors.sensor_set import SENSORS, VALUES, SensorName
 from zsim_world.state.fleet_arrays import Senses
 
-SENSOR, DRONE, STAMP, SAMPLED, INDEX_COLUMNS = 0, 1, 2, 3, 4  # of `whose`; the latter two t_ns and t_sample_ns
+WHOSE = columns("WhoseColumns", (Field("sensor", "1"), Field("drone", "1"), Field("t", "ns"), Field("t_sample", "ns")))
 VALUE_COLUMNS = 9  # of a GPS fix, with its place on the Earth
 
 
-class Sample(Struct, frozen=True, gc=False):
+class SensorSample(Struct, frozen=True, gc=False):
     """One measurement; `values` as above."""
 
     sensor: SensorName
@@ -35,17 +36,17 @@ class Sample(Struct, frozen=True, gc=False):
 class Sampled(NamedTuple):
     """Measurements in the order of (t_ns, drone, sensor)."""
 
-    whose: NDArray[np.int64]  # (M, INDEX_COLUMNS)
+    whose: NDArray[np.int64]  # (M, WHOSE.size)
     values: NDArray[np.float64]  # (M, VALUE_COLUMNS), the first ones of each kind's
 
-    def each(self) -> list[Sample]:
+    def each(self) -> list[SensorSample]:
         """Return them one by one."""
         rows = zip(self.whose.tolist(), self.values.tolist(), strict=True)
-        return [Sample(SENSORS[s], i, t, at, tuple(row[: SIZES[s]])) for (s, i, t, at), row in rows]
+        return [SensorSample(SENSORS[s], i, t, at, tuple(row[: SIZES[s]])) for (s, i, t, at), row in rows]
 
 
 SIZES = tuple(9 if name == "gps" else size for name, size in zip(SENSORS, VALUES, strict=True))
-NONE = Sampled(np.empty((0, INDEX_COLUMNS), dtype=np.int64), np.empty((0, VALUE_COLUMNS)))
+NONE = Sampled(np.empty((0, WHOSE.size), dtype=np.int64), np.empty((0, VALUE_COLUMNS)))
 
 
 class Sampler:
@@ -69,10 +70,10 @@ class Sampler:
     def _sort_out(self, fresh: Sampled, now_ns: int) -> Sampled:
         index = np.concatenate((self._later.whose, fresh.whose))
         values = np.concatenate((self._later.values, fresh.values))
-        late = index[:, STAMP] > now_ns
-        self._later, due, told = Sampled(index[late], values[late]), index[~late], values[~late]
-        order = np.lexsort((due[:, SENSOR], due[:, DRONE], due[:, STAMP]))
-        return Sampled(due[order], told[order])
+        late = index[:, WHOSE.t] > now_ns
+        self._later, due, due_values = Sampled(index[late], values[late]), index[~late], values[~late]
+        order = np.lexsort((due[:, WHOSE.sensor], due[:, WHOSE.drone], due[:, WHOSE.t]))
+        return Sampled(due[order], due_values[order])
 
 
 @kernel()
@@ -81,11 +82,11 @@ def stamped(
 ) -> tuple[NDArray, NDArray]:
     """Return index and values of what the kernel logged as (sensor, drone, tick); see Sampled and geodetic.anchor."""
     count = whose.shape[0]
-    index, values = np.empty((count, INDEX_COLUMNS), np.int64), np.empty((count, VALUE_COLUMNS))
+    index, values = np.empty((count, WHOSE.size), np.int64), np.empty((count, VALUE_COLUMNS))
     for m in range(count):
         s, i, first = whose[m, 0], whose[m, 1], 0
-        index[m, SENSOR], index[m, DRONE], index[m, SAMPLED] = s, i, whose[m, 2] * tick_ns
-        index[m, STAMP] = index[m, SAMPLED] + latency_ns[i, s]
+        index[m, WHOSE.sensor], index[m, WHOSE.drone], index[m, WHOSE.t_sample] = s, i, whose[m, 2] * tick_ns
+        index[m, WHOSE.t] = index[m, WHOSE.t_sample] + latency_ns[i, s]
         if s == sensor_set.GPS:
             values[m, 0:3] = geodetic.geodetic(value[m : m + 1, 0:3], rows, place)[0]
             first = 3

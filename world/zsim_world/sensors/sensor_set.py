@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from zsim.math.columns import Field, columns
 from zsim.math.frames import quaternion_from_rpy
 from zsim.scenario.scenario import ErrorModel, MagConfig, Scenario, Sensor, Sensors
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
@@ -20,23 +21,33 @@ VALUES = (6, 6, 3, 2, 2, 4)  # numbers of a sample as the kernel gives it (press
 CHANNELS_MAX = 6
 NOISE_WIDTH = tuple(2 * n + 1 for n in CHANNELS)  # per sample: white, walk of the bias, and one for drop-out
 
-# Columns of `config[drone, sensor]`
-WHITE, WALK, QUANTUM = 0, 6, 12  # per channel: std per sample, std of the bias's step per sample, step
-MOUNT, TURN = 18, 21  # p_BS [m] (3), q_BS (4)
-DROP = 25  # a sample is lost when its standard normal number is below this
-LIMIT_MIN, LIMIT_MAX = 26, 27  # sonar [m]
-FAULTY = 28  # 0: the fault row below has no say
-COLUMNS = 29
-
-# Columns of `fault[drone, sensor]`: what is added to the errorless values; whether the next sample is kept, or given
-# again and again; that sample
-OFFSET, HOLD, HELD = 0, 6, 7
-FAULT_COLUMNS = 13
-FREE, ARMED, HOLDING = 0.0, 1.0, 2.0  # values of HOLD
-
-# Columns of `schedule[drone, sensor]`: sample n falls due at the first physics tick >= n * NUMERATOR / DENOMINATOR
-NUMERATOR, DENOMINATOR, COUNT, DUE = 0, 1, 2, 3
-DENOMINATOR_MAX = 1000  # of a rate in Hz: any is met within 0.05 %, and n * NUMERATOR stays below 2^63
+CONFIG = columns(  # of each drone and sensor
+    "SensorColumns",
+    (
+        Field("white", "channel's", CHANNELS_MAX),  # standard deviation per sample
+        Field("walk", "channel's", CHANNELS_MAX),  # standard deviation of the bias's step per sample
+        Field("quantum", "channel's", CHANNELS_MAX),
+        Field("p_BS", "m", 3),
+        Field("q_BS", "1", 4),
+        Field("drop", "1"),  # a sample is lost when its standard normal number is below this
+        Field("limit_min", "m"),  # of the sonar
+        Field("limit_max", "m"),
+        Field("faulty", "1"),  # 0: the fault row below has no say
+    ),
+)
+FAULT = columns(  # of each drone and sensor
+    "SensorFaultColumns",
+    (
+        Field("offset", "channel's", CHANNELS_MAX),  # added to the errorless values
+        Field("hold", "1"),  # FREE; ARMED: the next sample is kept; HOLDING: it is given again and again
+        Field("held", "channel's", CHANNELS_MAX),
+    ),
+)
+FREE, ARMED, HOLDING = 0.0, 1.0, 2.0
+SCHEDULE = columns(  # sample n falls due at the first physics tick >= n * numerator / denominator
+    "ScheduleColumns", (Field("numerator", "1"), Field("denominator", "1"), Field("count", "1"), Field("due", "tick"))
+)
+DENOMINATOR_MAX = 1000  # of a rate in Hz: any is met within 0.05 %, and n * numerator stays below 2^63
 
 
 def rate_of(sensor: Sensor, name: str) -> float:
@@ -68,8 +79,8 @@ def noise_sigma(model: ErrorModel, rate_hz: float) -> float:
 
 
 def config(scenario: Scenario) -> NDArray[np.float64]:
-    """Return errors and mounts of all sensors, shape (N, 6, COLUMNS)."""
-    table = np.zeros((len(scenario.drones), len(SENSORS), COLUMNS))
+    """Return errors and mounts of all sensors, shape (N, 6, CONFIG.size)."""
+    table = np.zeros((len(scenario.drones), len(SENSORS), CONFIG.size))
     for i, drone in enumerate(scenario.drones):
         for s, name in enumerate(SENSORS):
             _fill(table[i, s], drone.sensors, name)
@@ -80,25 +91,25 @@ def _fill(row: NDArray[np.float64], sensors: Sensors, name: str) -> None:
     sensor: Sensor = getattr(sensors, name)
     rate = rate_of(sensor, name)
     for k, model in enumerate(channels(sensors, name)):
-        row[WHITE + k] = noise_sigma(model, rate)
-        row[WALK + k] = model.bias_walk / math.sqrt(rate)
-        row[QUANTUM + k] = model.quantum
-    row[MOUNT : MOUNT + 3] = sensor.mount.position_m
-    row[TURN : TURN + 4] = quaternion_from_rpy(np.radians(sensor.mount.rpy_deg))
-    row[DROP] = ndtri(sensor.dropout)
-    row[LIMIT_MIN], row[LIMIT_MAX] = sensors.sonar.min_m, sensors.sonar.max_m
+        row[CONFIG.white + k] = noise_sigma(model, rate)
+        row[CONFIG.walk + k] = model.bias_walk / math.sqrt(rate)
+        row[CONFIG.quantum + k] = model.quantum
+    row[CONFIG.p_BS : CONFIG.p_BS + 3] = sensor.mount.position_m
+    row[CONFIG.q_BS : CONFIG.q_BS + 4] = quaternion_from_rpy(np.radians(sensor.mount.rpy_deg))
+    row[CONFIG.drop] = ndtri(sensor.dropout)
+    row[CONFIG.limit_min], row[CONFIG.limit_max] = sensors.sonar.min_m, sensors.sonar.max_m
 
 
 def schedule(scenario: Scenario) -> NDArray[np.int64]:
-    """Return the time tables of all published sensors, shape (N, 6, 4), with sample 0 due at tick 0."""
-    table = np.zeros((len(scenario.drones), len(SENSORS), 4), dtype=np.int64)
+    """Return the time tables of all published sensors, shape (N, 6, SCHEDULE.size), with sample 0 due at tick 0."""
+    table = np.zeros((len(scenario.drones), len(SENSORS), SCHEDULE.size), dtype=np.int64)
     tick_us = round(scenario.time.physics_dt_ms * 1000)
     for i, drone in enumerate(scenario.drones):
         for s, name in enumerate(SENSORS):
             sensor: Sensor = getattr(drone.sensors, name)
             rate = Fraction(sensor.rate_hz).limit_denominator(DENOMINATOR_MAX)
             period = 1_000_000 / rate / tick_us  # in ticks
-            table[i, s, NUMERATOR], table[i, s, DENOMINATOR] = period.numerator, period.denominator
+            table[i, s, SCHEDULE.numerator], table[i, s, SCHEDULE.denominator] = period.numerator, period.denominator
     return table
 
 

@@ -1,80 +1,149 @@
-"""The arrays that a fleet is made of: what the kernel reads and writes. N drones, a row each.
+"""The arrays that a fleet is made of: what the kernel reads and writes. N drones, a row each; R rotors.
 
-The columns are told where they are used: vehicle.py, rigid_body.py, firmware.py, observer.py, gains.py, sensor_set.py.
+R is the largest number of rotors in the fleet. Numbers per rotor stand after the columns of a row, R for each group of
+them; a drone with fewer rotors has some that do not exist, whose speeds and limits are zero. `each`, a tuple of R
+numbers, tells compiled code how many there are: it is compiled for each R, and its loops over rotors are unrolled.
 """
 
+import math
 from typing import NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
-TICK, TICKS_PER_STEP = 0, 1  # of `clock`: present physics tick, ticks per 5 ms
-DT, SILENCE_HOVER, SILENCE_LAND = 0, 1, 2  # of `spans`: physics tick, firmware's patience [s]
-FIELD, ORIGIN_HEIGHT = 0, 3  # columns of `place`: magnetic field in W [uT] (3), height above sea level [m]
+from zsim.math.columns import Field, columns
+from zsim.math.compiled import inlined
+from zsim.scenario.scenario import Drone, Environment
+from zsim.scenario.sensor_presets import SEA_LEVEL_KG_M3
+from zsim.vehicles.vehicle import Vehicle, allocation, mixing
+
+REFERENCE_DENSITY_KG_M3 = SEA_LEVEL_KG_M3  # thrust, torque and drag of a vehicle hold there
+COULOMB_PER_MAH = 3.6  # C per mAh: 3600 s to the hour
+
+VEHICLE = columns(
+    "VehicleColumns",
+    (
+        Field("mass", "kg"),
+        Field("inertia", "kg m^2", 3),
+        Field("rotor_unit", "m"),  # unit of the rotors' positions: arm / sqrt(2)
+        Field("thrust", "N s^2"),  # at the field's air density, as torque and drag
+        Field("torque", "N m s^2"),
+        Field("rotor_lag", "s"),
+        Field("rotor_min", "rad/s"),
+        Field("rotor_max", "rad/s"),
+        Field("drag", "N s/m"),
+        Field("gravity", "m/s^2"),
+        Field("air_density", "kg/m^3"),
+        Field("rotor_radius", "m"),
+        Field("rotor_inertia", "kg m^2"),
+        Field("rotor_count", "1"),
+        Field("rotor_share", "1"),  # 1 / rotor_count
+        Field("contact_reach", "m"),  # farther than any contact point from the centre of mass
+        Field("stand_height", "m"),  # of the centre of mass of a standing drone
+        Field("foot_stiffness", "N/m"),  # per contact point
+        Field("foot_damping", "N s/m"),
+        Field("foot_xy", "m"),
+        Field("foot_depth", "m"),
+        Field("rim_xy", "m"),
+        Field("rim_height", "m"),
+        Field("friction", "1"),
+        Field("hull_radius", "m"),
+        Field("hull_stiffness", "N/m"),  # between two hulls, of this drone's mass
+        Field("hull_damping", "N s/m"),
+        Field("capacity", "J"),  # of a full battery
+        Field("efficiency", "1"),  # electric to shaft power
+        Field("electronics", "W"),
+    ),
+)
+ROTOR = columns(  # groups of what is known of each rotor
+    "RotorGroups",
+    (
+        Field("x", "rotor_unit"),
+        Field("y", "rotor_unit"),
+        Field("turn", "1"),  # sign of its drag torque on the body about z; 0 where there is no rotor
+        Field("low", "rad/s"),  # limits of its speed
+        Field("high", "rad/s"),
+        Field("roll", "1"),  # thrust per moment over rotor_unit
+        Field("pitch", "1"),
+        Field("yaw", "1"),  # thrust per moment over torque per thrust
+    ),
+)
+STATE = columns(  # and R speeds [rad/s]
+    "StateColumns", (Field("p_WB", "m", 3), Field("v_WB", "m/s", 3), Field("q_WB", "1", 4), Field("w_WB_B", "rad/s", 3))
+)
+CLOCK = columns("ClockColumns", (Field("tick", "1"), Field("ticks_per_step", "1")))  # present one; of the board's step
+SPAN = columns("SpanColumns", (Field("dt", "s"), Field("hover", "s"), Field("land", "s")))  # tick; patience in silence
+PLACE = columns("PlaceColumns", (Field("field_W", "uT", 3), Field("height", "m")))  # height of W above the sea
+STREAMS = columns("StreamColumns", (Field("sensors", "1", 6), Field("wind", "1")))
+
+Row = NDArray[np.float64] | tuple[float, ...]  # of one drone: a view, or loaded
 
 
-class Time(NamedTuple):
-    clock: NDArray  # int64 (2,), as above
-    spans: NDArray  # (3,), s, as above
+class KernelTime(NamedTuple):
+    clock: NDArray  # int64 (CLOCK.size,)
+    spans: NDArray  # (SPAN.size,)
 
 
-class Near(NamedTuple):
-    """Pairs of drones that can matter to each other, and for which places that was found (encounter.py)."""
+class NearPairs(NamedTuple):
+    """Pairs of drones that can matter to each other, and for which places that was found (contacts.py)."""
 
     pair: NDArray  # int32 (N (N - 1) / 2, 2), i < j, ascending
-    noted: NDArray  # int64 (1,), how many pairs
+    number: NDArray  # int64 (1,), how many pairs
     origin: NDArray  # (N, 3), m
 
 
 class Bodies(NamedTuple):
     """N aircraft, as physics has them."""
 
-    vehicle: NDArray  # (N, vehicle.COLUMNS)
-    state: NDArray  # (N, rigid_body.COLUMNS)
+    each: tuple[int, ...]  # R numbers
+    vehicle: NDArray  # (N, VEHICLE.size)
+    rotors: NDArray  # (N, ROTOR.size * R)
+    state: NDArray  # (N, STATE.size + R)
     accel: NDArray  # (N, 6), acceleration in W and angular acceleration in B
     anchor: NDArray  # (N, 8, 2), m
-    command: NDArray  # (N, 4), rad/s
+    command: NDArray  # (N, R), rad/s
     energy: NDArray  # (N,), J
     air: NDArray  # (N, 3), m/s
     push: NDArray  # (N, 3), N
     touching: NDArray  # int8 (N, N)
     touched: NDArray  # int8 (N, N), contacts that began in this gate
-    near: Near
+    near: NearPairs
     obstacle: NDArray  # (M, obstacle.COLUMNS)
     bumping: NDArray  # int8 (N, M), whose hull touches which obstacle
     bumped: NDArray  # int8 (N, M), contacts that began in this gate
-    lanes: NDArray  # (blocks, block.LANES * lanes.COLUMNS), where they are side by side
+    lanes: NDArray  # (blocks, columns of a block), see physics/simd.py
 
 
 class Boards(NamedTuple):
     """N navigation boards with their firmware."""
 
-    setting: NDArray  # (N, firmware.SETTING_COLUMNS)
-    gain: NDArray  # (N, gains.COLUMNS)
-    calibration: NDArray  # (N, observer.CALIBRATION)
-    setpoint: NDArray  # (N, firmware.SETPOINT_COLUMNS)
+    setting: NDArray  # (N, firmware_settings.SETTING.size)
+    gain: NDArray  # (N, observer_gains.GAIN.size)
+    calibration: NDArray  # (N, observer.CALIBRATION.size)
+    setpoint: NDArray  # (N, firmware.SETPOINT.size)
     set_tick: NDArray  # int64 (N,), when the setpoint was sent
-    memory: NDArray  # (N, firmware.MEMORY_COLUMNS)
-    belief: NDArray  # (N, observer.COLUMNS)
-    actuator: NDArray  # (N, steering.ACTUATOR_COLUMNS), what faults make of the commands to the rotors
-    device: NDArray  # (N, observer.REGISTERS)
-    lanes: NDArray  # (blocks, block.LANES * steering.COLUMNS), where they are side by side
+    memory: NDArray  # (N, firmware.MEMORY.size)
+    belief: NDArray  # (N, observer.BELIEF.size + R)
+    actuator: NDArray  # (N, simd_firmware.ACTUATOR.size + 2 R), what faults make of the commands to the rotors
+    device: NDArray  # (N, observer.DEVICE.size)
+    lanes: NDArray  # (blocks, columns of a block), see simd_firmware.py
 
 
-class Noise(NamedTuple):
+class NoiseRows(NamedTuple):
     """Standard normal numbers, a row per drone; the last row holds the wind that all share."""
 
     table: NDArray  # (N + 1, all streams)
-    at: NDArray  # int64 (7,), where each stream begins in a row
-    cursor: NDArray  # int64 (N + 1, 7), how much of each stream is used
+    at: NDArray  # int64 (STREAMS.size,), where each stream begins in a row
+    cursor: NDArray  # int64 (N + 1, STREAMS.size), how much of each stream is used
 
 
 class Senses(NamedTuple):
     """N sets of six sensors, and the log of what they sampled in a gate."""
 
-    place: NDArray  # (4,), as above
-    config: NDArray  # (N, 6, sensor_set.COLUMNS)
-    fault: NDArray  # (N, 6, sensor_set.FAULT_COLUMNS)
-    schedule: NDArray  # int64 (N, 6, 4)
+    place: NDArray  # (PLACE.size,)
+    config: NDArray  # (N, 6, sensor_set.CONFIG.size)
+    fault: NDArray  # (N, 6, sensor_set.FAULT.size)
+    schedule: NDArray  # int64 (N, 6, sensor_set.SCHEDULE.size)
     soonest: NDArray  # int64 (N,), tick at which one of the sensors but the IMU falls due
     bias: NDArray  # (N, 6, 6)
     whose: NDArray  # int64 (samples, 3): sensor, drone, tick
@@ -84,10 +153,74 @@ class Senses(NamedTuple):
 class Arrays(NamedTuple):
     """All that a fleet is."""
 
-    time: Time
+    time: KernelTime
     bodies: Bodies
     boards: Boards
-    noise: Noise
+    noise: NoiseRows
     senses: Senses
-    wind: NDArray  # (wind.COLUMNS,)
+    wind: NDArray  # (air.WIND.size,)
     gust: NDArray  # (N, 3), m/s
+
+
+class PerRotor(NamedTuple):
+    """Groups of numbers per rotor of one drone, in a row or in a block of drones: `of` reads them."""
+
+    numbers: NDArray
+    first: int
+    step: int
+    each: tuple[int, ...]
+
+
+@inlined
+def of(rotors: PerRotor, group: int, r: int) -> float:
+    """Return the number of rotor r in a group of groups."""
+    return rotors.numbers[rotors.first + rotors.step * (group * len(rotors.each) + r)]
+
+
+@inlined
+def put_of(rotors: PerRotor, r: int, value: float) -> None:
+    """Set the number of rotor r in the first group."""
+    rotors.numbers[rotors.first + rotors.step * r] = value
+
+
+def vehicle_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> NDArray[np.float64]:
+    """Return the parameters of one drone, (VEHICLE.size,): its vehicle's, with what the scenario says of it."""
+    row, frame = np.empty(VEHICLE.size), vehicle.airframe
+    density = environment.air_density_kg_m3 / REFERENCE_DENSITY_KG_M3
+    size = drone.arm_m / vehicle.arm_m
+    row[VEHICLE.mass] = drone.mass_kg
+    row[VEHICLE.inertia : VEHICLE.inertia + 3] = drone.inertia_kg_m2
+    row[VEHICLE.rotor_unit] = drone.arm_m / math.sqrt(2.0)
+    row[VEHICLE.thrust], row[VEHICLE.torque] = drone.thrust_n_s2 * density, drone.torque_nm_s2 * density
+    row[VEHICLE.rotor_lag] = drone.rotor_time_constant_s
+    row[VEHICLE.rotor_min], row[VEHICLE.rotor_max] = drone.rotor_min_rad_s, drone.rotor_max_rad_s
+    row[VEHICLE.drag] = drone.drag_n_s_m * density
+    row[VEHICLE.gravity], row[VEHICLE.air_density] = environment.gravity_m_s2, environment.air_density_kg_m3
+    row[VEHICLE.rotor_radius] = vehicle.rotor_radius_m * (drone.thrust_n_s2 / vehicle.thrust_n_s2) ** 0.25
+    row[VEHICLE.rotor_inertia] = vehicle.rotor_inertia_kg_m2 * drone.torque_nm_s2 / vehicle.torque_nm_s2
+    row[VEHICLE.rotor_count], row[VEHICLE.rotor_share] = len(vehicle.rotors), 1.0 / len(vehicle.rotors)
+    row[VEHICLE.contact_reach] = frame.reach_m * size
+    row[VEHICLE.stand_height] = size * (frame.foot_depth_m - frame.foot_sag_m)
+    stiffness = drone.mass_kg * environment.gravity_m_s2 / (4.0 * size * frame.foot_sag_m)
+    row[VEHICLE.foot_stiffness] = stiffness
+    row[VEHICLE.foot_damping] = 2.0 * frame.foot_damping_ratio * math.sqrt(stiffness * drone.mass_kg / 4.0)
+    row[VEHICLE.foot_xy], row[VEHICLE.foot_depth] = size * frame.foot_xy_m, size * frame.foot_depth_m
+    row[VEHICLE.rim_xy], row[VEHICLE.rim_height] = size * frame.rim_xy_m, size * frame.rim_height_m
+    row[VEHICLE.friction] = frame.friction
+    reduced = drone.mass_kg / 2.0
+    row[VEHICLE.hull_radius] = size * frame.hull_radius_m
+    row[VEHICLE.hull_stiffness] = reduced * frame.hull_frequency_rad_s**2
+    row[VEHICLE.hull_damping] = 2.0 * frame.hull_damping_ratio * reduced * frame.hull_frequency_rad_s
+    row[VEHICLE.capacity] = drone.battery_mah * COULOMB_PER_MAH * vehicle.battery.voltage_v
+    row[VEHICLE.efficiency], row[VEHICLE.electronics] = vehicle.battery.efficiency, vehicle.battery.electronics_w
+    return row
+
+
+def rotor_row(vehicle: Vehicle, drone: Drone, rotors: int) -> NDArray[np.float64]:
+    """Return what is known of each rotor of one drone, (ROTOR.size * rotors,)."""
+    groups, count = np.zeros((ROTOR.size, rotors)), len(vehicle.rotors)
+    roll, minus_pitch, turn = allocation(vehicle)
+    groups[ROTOR.x, :count], groups[ROTOR.y, :count], groups[ROTOR.turn, :count] = -minus_pitch, roll, turn
+    groups[ROTOR.low, :count], groups[ROTOR.high, :count] = drone.rotor_min_rad_s, drone.rotor_max_rad_s
+    groups[ROTOR.roll : ROTOR.yaw + 1, :count] = mixing(vehicle).T
+    return groups.ravel()

@@ -1,188 +1,151 @@
 """The firmware of one drone at 200 Hz: modes, velocity, attitude and rate loops, on its own belief alone.
 
-Loops from inside out, each about three times slower than the one it contains:
-    rotors   overdriven so that their lag halves (15 ms for the AR.Drone)
+Loops from inside out, each about three times slower than the one it contains, with the AR.Drone's figures:
+    rotors   overdriven so that their lag halves (15 ms)
     rate     dw/dt = 28 (w_des - w)
     tilt     w_des = 9 (z_B × z_des): closed loop about 0.12 s, inside the 0.143 s that tum_ardrone fitted
     velocity a_des = 3 (v_des - v), vertically 4, disturbance and drag of the belief cancelled
     hold     v_des = 0.8 (p_hold - p), height 1.5
 A velocity in the heading frame is held towards its own instant: while the drone yaws at r, it lags by r v / 3 across.
-The inner gains follow from the rotors' lag, so that another aircraft flies too.
+The gains follow from the rotors' lag and the design of `zsim.vehicles.vehicle.Firmware`, so that others fly too.
 """
 
 import math
 from typing import NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.messages import DroneState
 from zsim.math import rotation as rot
+from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, axpy
-from zsim.scenario.scenario import Drone
+from zsim.vehicles.vehicle import ROTORS_MAX
 from zsim_world.physics.rigid_body import four, vector
-from zsim_world.physics.rotors import Four
-from zsim_world.state.vehicle import DRAG, GRAVITY, MASS, ROTOR_MIN, STAND_HEIGHT
-from zsim_world.vehicles import observer as ob
-from zsim_world.vehicles.attitude_control import (
-    K_RATE,
-    K_TILT,
-    OVERDRIVE,
-    ROTOR_DECAY,
-    SLOPE,
-    clipped,
-    lag_shares,
-    loop_gains,
-)
-from zsim_world.vehicles.observer import STEP_S
+from zsim_world.state.fleet_arrays import ROTOR, VEHICLE, PerRotor, of, put_of
+from zsim_world.vehicles.attitude_control import DRIVE, clipped
+from zsim_world.vehicles.firmware_settings import SETTING
+from zsim_world.vehicles.observer import BELIEF, STEP_S, STILL_STEPS_MIN, lift
 
 LANDED, TAKING_OFF, HOVERING, FLYING, LANDING, EMERGENCY = range(6)
 MODES: tuple[DroneState, ...] = ("landed", "taking_off", "hovering", "flying", "landing", "emergency")
 
 NONE, VELOCITY, VELOCITY_WORLD, ARDRONE, HOVER, ATTITUDE, ROTORS = range(7)  # kinds of setpoint
-# Columns of the setpoint: kind, then
+# Values of a setpoint by its kind:
 #   velocity: vx, vy, vz [m/s], yaw rate [rad/s]; ardrone: forward, left, up, yaw_left in [-1, 1];
-#   attitude: w, x, y, z, thrust [N], yaw rate [rad/s]; rotors: four speeds [rad/s]
-KIND, VALUE = 0, 1
-SETPOINT_COLUMNS = 7
+#   attitude: w, x, y, z, thrust [N], yaw rate [rad/s]; rotors: their speeds [rad/s]
+SETPOINT = columns("SetpointColumns", (Field("kind", "1"), Field("value", "see above", ROTORS_MAX)))
 
-# Columns of the memory, one row per drone
-MODE, STEPS, HOLD_XY, HOLD_Z, HOLDS_XY, HOLDS_Z, TOUCH = 0, 1, 2, 4, 5, 6, 7
-MEMORY_COLUMNS = 8
-RISING, HOLDING = 1.0, 2.0  # values of HOLDS_Z: the height held rises to that of the take-off, or stays
-
-# Columns of the settings: limits of what a commander may ask, and the loop gains
-SPEED, CLIMB, YAW_RATE, ALTITUDE, TAKEOFF_HEIGHT = 1, 2, 3, 4, 5  # m/s, m/s, rad/s, m, m
-K_VELOCITY, K_CLIMB = 8, 9  # 1/s; drive.py has the others
-SETTING_COLUMNS = 12
-
-CLIMB_SHARE = 1 / 7  # of the rate gain, 4 1/s: thrust needs no tilt first
-K_HOLD = 0.8  # 1/s, position on the own odometry
-K_HEIGHT = 1.5  # 1/s
-BRAKE_S = 0.6  # s, where a hold begins: about the stopping distance over speed
-TILT_CUT_COSINE = 0.25  # beyond 75 deg the motors are cut, as the aircraft does when it is overturned
-LIFT_SHARE_MIN = 0.15  # of the weight: thrust never asked below
-SPIN_UP_S = 0.5  # s, rotors at their least before the climb
-CLIMB_M_S = 0.6  # m/s, of a take-off
-TAKEOFF_S_MAX = 20.0  # s, then it hovers where it is
-ARRIVED_M, ARRIVED_M_S = 0.08, 0.2  # m, m/s: a take-off is over
-DESCENT_M_S = 0.4  # m/s, of a landing near the ground
-DESCENT_FAR_1_S = 0.3  # 1/s, faster by this per metre over FLARE_M
-FLARE_M = 2.0  # m
-TOUCH_SHARE = 0.6  # of the weight: the thrust has fallen below although the descent has stopped
-TOUCH_M_S = 0.15  # m/s, a descent that has stopped
-TOUCH_S = 0.25  # s, for which both hold before the rotors stop
-LOW_BATTERY_PERCENT = 5.0  # %, lands; about half a minute of hover remains
+MEMORY = columns(
+    "MemoryColumns",
+    (
+        Field("mode", "1"),
+        Field("steps", "1"),  # in this mode
+        Field("hold_xy", "m", 2),
+        Field("hold_z", "m"),
+        Field("holds_xy", "1"),
+        Field("holds_z", "1"),  # or RISING: the height held rises to that of the take-off, or HOLDING: it stays
+        Field("touch", "1"),  # steps for which the ground has borne the weight
+    ),
+)
+RISING, HOLDING = 1.0, 2.0
 
 
-def settings(drone: Drone) -> NDArray[np.float64]:
-    """Return limits and loop gains of one drone, shape (SETTING_COLUMNS,)."""
-    limits = drone.limits
-    row = np.empty(SETTING_COLUMNS)
-    row[SLOPE], row[YAW_RATE] = math.tan(math.radians(limits.tilt_deg)), math.radians(limits.yaw_rate_deg_s)
-    row[SPEED], row[CLIMB] = limits.horizontal_speed_m_s, limits.vertical_speed_m_s
-    row[ALTITUDE], row[TAKEOFF_HEIGHT] = limits.altitude_m, min(drone.takeoff_height_m, limits.altitude_m)
-    row[K_RATE], row[K_TILT], row[K_VELOCITY] = loop_gains(drone.rotor_time_constant_s)
-    row[K_CLIMB] = CLIMB_SHARE * row[K_RATE]
-    row[ROTOR_DECAY], row[OVERDRIVE] = lag_shares(drone.rotor_time_constant_s)
-    return row
-
-
-class Wish(NamedTuple):
+class Decision(NamedTuple):
     """What the firmware has decided on for the next 5 ms."""
 
-    driven: bool  # True: the drive is to find the command for the last three; False: it is given
-    command: Four  # rad/s
+    driven: bool  # True: the drive is to find the command from the last three; False: it is set
     z_H: Vector  # along the body's z wanted, in the heading frame
     thrust_n: float
     yaw_rate: float  # rad/s
 
 
-@inlined
-def _commanded(command: Four) -> Wish:
-    """Return the wish that the rotors turn at these speeds [rad/s]."""
-    return Wish(False, command, (0.0, 0.0, 1.0), 0.0, 0.0)
+COMMAND_IS_SET = Decision(False, (0.0, 0.0, 1.0), 0.0, 0.0)
 
 
 @inlined
 def decide(
+    commands: PerRotor,
     memory: NDArray,
     belief: NDArray,
     own: Quaternion,
     row: NDArray,
+    rotors: PerRotor,
     setting: NDArray,
     setpoint: NDArray,
     silence_s: float,
     hover_s: float,
     land_s: float,
     charge_percent: float,
-) -> Wish:
-    """Return what the rotors are to do in the next 5 ms.
+) -> Decision:
+    """Decide what the rotors are to do in the next 5 ms: set commands [rad/s], or return what they are to give.
 
     Args:
+        commands: of the rotors, set where the drive need not find them.
         memory: modes and holds, in place; belief: observer.py.
         own: the heading frame in W of the attitude believed.
-        row: the aircraft (vehicle.py); setting: limits and gains; setpoint: the commander's wish, cleared on landing.
+        row, rotors: parameters; setting: limits and gains; setpoint: the commander's, cleared on landing.
         silence_s: time since the setpoint was sent; hover_s: hover after so much, and land land_s later.
         charge_percent: of the battery.
     """
-    _change_mode(memory, belief, setpoint, silence_s, hover_s, land_s, charge_percent)
-    mode = int(memory[MODE])
-    wish = _commanded((0.0, 0.0, 0.0, 0.0))
+    _change_mode(memory, belief, setting, setpoint, silence_s, hover_s, land_s, charge_percent)
+    mode, decision = int(memory[MEMORY.mode]), COMMAND_IS_SET
+    for r in range(len(commands.each)):
+        put_of(commands, r, 0.0)
     if mode in (TAKING_OFF, HOVERING, FLYING, LANDING):
-        wish = _fly(mode, memory, belief, own, row, setting, setpoint)
-    memory[STEPS] += 1.0
-    return wish
+        decision = _fly(commands, mode, memory, belief, own, row, rotors, setting, setpoint)
+    memory[MEMORY.steps] += 1.0
+    return decision
 
 
 @inlined
-def stands(memory: NDArray) -> bool:
+def stands(memory: NDArray, setting: NDArray) -> bool:
     """Return whether the firmware knows that it stands on the ground: landed, or spinning up."""
-    spinning_up = memory[MODE] == TAKING_OFF and memory[STEPS] * STEP_S < SPIN_UP_S
-    return memory[MODE] == LANDED or spinning_up
+    spinning_up = memory[MEMORY.mode] == TAKING_OFF and memory[MEMORY.steps] * STEP_S < setting[SETTING.spin_up]
+    return memory[MEMORY.mode] == LANDED or spinning_up
 
 
 @inlined
 def enter(memory: NDArray, belief: NDArray, mode: int) -> None:
     """Change the mode and forget the holds."""
-    memory[MODE], memory[STEPS], memory[TOUCH] = mode, 0.0, 0.0
-    memory[HOLDS_XY], memory[HOLDS_Z] = 0.0, 0.0
+    memory[MEMORY.mode], memory[MEMORY.steps], memory[MEMORY.touch] = mode, 0.0, 0.0
+    memory[MEMORY.holds_xy], memory[MEMORY.holds_z] = 0.0, 0.0
     if mode == LANDED:
-        belief[ob.STILL_STEPS] = ob.STILL_STEPS_MIN
+        belief[BELIEF.still_steps] = STILL_STEPS_MIN
 
 
 @inlined
 def _change_mode(
     memory: NDArray,
     belief: NDArray,
+    setting: NDArray,
     setpoint: NDArray,
     silence_s: float,
     hover_s: float,
     land_s: float,
     charge_percent: float,
 ) -> None:
-    mode = int(memory[MODE])
+    mode = int(memory[MEMORY.mode])
     if mode in (LANDED, EMERGENCY):
-        setpoint[KIND] = NONE
+        setpoint[SETPOINT.kind] = NONE
         return
-    if rot.z_axis(four(belief, ob.ATTITUDE))[2] < TILT_CUT_COSINE:
+    if rot.z_axis(four(belief, BELIEF.q_WB))[2] < setting[SETTING.tilt_cut]:
         enter(memory, belief, EMERGENCY)
-    elif mode != LANDING and charge_percent < LOW_BATTERY_PERCENT:
+    elif mode != LANDING and charge_percent < setting[SETTING.low_battery]:
         enter(memory, belief, LANDING)
     elif mode in (HOVERING, FLYING):
-        wanted = _wanted(int(setpoint[KIND]), silence_s, hover_s, land_s)
+        wanted = _wanted(int(setpoint[SETPOINT.kind]), silence_s, hover_s, land_s)
         if wanted != mode:
             enter(memory, belief, wanted)
     elif mode == TAKING_OFF:
-        if _arrived(memory, belief):
-            height = memory[HOLD_Z]
+        if _arrived(memory, belief, setting):
+            height = memory[MEMORY.hold_z]
             enter(memory, belief, HOVERING)
-            memory[HOLD_Z], memory[HOLDS_Z] = height, HOLDING
-    elif memory[TOUCH] > TOUCH_S / STEP_S:
+            memory[MEMORY.hold_z], memory[MEMORY.holds_z] = height, HOLDING
+    elif memory[MEMORY.touch] > setting[SETTING.touch] / STEP_S:
         enter(memory, belief, LANDED)
-    if memory[MODE] not in (HOVERING, FLYING):
-        setpoint[KIND] = NONE
+    if memory[MEMORY.mode] not in (HOVERING, FLYING):
+        setpoint[SETPOINT.kind] = NONE
 
 
 @inlined
@@ -196,48 +159,54 @@ def _wanted(kind: int, silence_s: float, hover_s: float, land_s: float) -> int:
 
 
 @inlined
-def _arrived(memory: NDArray, belief: NDArray) -> bool:
-    if memory[STEPS] * STEP_S > TAKEOFF_S_MAX:
+def _arrived(memory: NDArray, belief: NDArray, setting: NDArray) -> bool:
+    if memory[MEMORY.steps] * STEP_S > setting[SETTING.ascent_max]:
         return True
-    near = memory[HOLDS_Z] == HOLDING and abs(memory[HOLD_Z] - belief[ob.HEIGHT]) < ARRIVED_M
-    return near and abs(belief[ob.VELOCITY + 2]) < ARRIVED_M_S
+    off = abs(memory[MEMORY.hold_z] - belief[BELIEF.height])
+    near = memory[MEMORY.holds_z] == HOLDING and off < setting[SETTING.arrived]
+    return near and abs(belief[BELIEF.v_H + 2]) < setting[SETTING.arrived_speed]
 
 
 @inlined
 def _fly(
+    commands: PerRotor,
     mode: int,
     memory: NDArray,
     belief: NDArray,
     own: Quaternion,
     row: NDArray,
+    rotors: PerRotor,
     setting: NDArray,
     setpoint: NDArray,
-) -> Wish:
-    """Return what the rotors are to do in the air, or on the way there."""
-    kind = int(setpoint[KIND])
+) -> Decision:
+    """Decide what the rotors are to do in the air, or on the way there."""
+    kind = int(setpoint[SETPOINT.kind])
     if mode == FLYING and kind == ROTORS:
-        return _commanded(clipped(row, four(setpoint, VALUE)))
-    if stands(memory):
-        low = row[ROTOR_MIN]
-        return _commanded((low, low, low, low))
+        for r in range(len(rotors.each)):
+            put_of(commands, r, clipped(rotors, r, setpoint[SETPOINT.value + r]))
+        return COMMAND_IS_SET
+    if stands(memory, setting):
+        for r in range(len(rotors.each)):
+            put_of(commands, r, of(rotors, ROTOR.low, r))
+        return COMMAND_IS_SET
     if mode == FLYING and kind == ATTITUDE:
-        z_des, lift, yaw_rate = _attitude_wish(own, setting, setpoint)
+        z_des, lift, yaw_rate = _from_attitude(own, setting, setpoint)
     else:
-        z_des, lift, yaw_rate = _velocity_wish(mode, kind, memory, belief, own, row, setting, setpoint)
-    return Wish(True, (0.0, 0.0, 0.0, 0.0), z_des, lift, yaw_rate)
+        z_des, lift, yaw_rate = _from_velocity(mode, kind, memory, belief, own, row, setting, setpoint, rotors.each)
+    return Decision(True, z_des, lift, yaw_rate)
 
 
 @inlined
-def _attitude_wish(own: Quaternion, setting: NDArray, setpoint: NDArray) -> tuple[Vector, float, float]:
+def _from_attitude(own: Quaternion, setting: NDArray, setpoint: NDArray) -> tuple[Vector, float, float]:
     """Return wanted z_B in the heading frame, thrust [N] and yaw rate of an attitude setpoint."""
-    q = rot.normalised(four(setpoint, VALUE))
+    q = rot.normalised(four(setpoint, SETPOINT.value))
     z_des = rot.rotate_back(own, rot.z_axis(q))
-    yaw_rate = _clip(setpoint[VALUE + 5], setting[YAW_RATE])
-    return z_des, setpoint[VALUE + 4], yaw_rate
+    yaw_rate = _clip(setpoint[SETPOINT.value + 5], setting[SETTING.yaw_rate])
+    return z_des, setpoint[SETPOINT.value + 4], yaw_rate
 
 
 @inlined
-def _velocity_wish(
+def _from_velocity(
     mode: int,
     kind: int,
     memory: NDArray,
@@ -246,93 +215,105 @@ def _velocity_wish(
     row: NDArray,
     setting: NDArray,
     setpoint: NDArray,
+    each: tuple[int, ...],
 ) -> tuple[Vector, float, float]:
     """Return wanted z_B in the heading frame, thrust [N] and yaw rate of all modes that fly by velocity."""
-    v = vector(belief, ob.VELOCITY)
-    wish, yaw_rate = (0.0, 0.0, 0.0), 0.0
+    v = vector(belief, BELIEF.v_H)
+    v_des, yaw_rate = (0.0, 0.0, 0.0), 0.0
     if mode == FLYING:
-        wish, yaw_rate = _asked_velocity(kind, own, setting, setpoint)
+        v_des, yaw_rate = _asked_velocity(kind, own, setting, setpoint)
     else:
-        wish = _held(memory, belief, own, wish)
-    wish = (wish[0], wish[1], _climb(mode, wish[2], memory, belief, row, setting))
+        v_des = _held(memory, belief, own, setting, v_des)
+    v_des = (v_des[0], v_des[1], _climb(mode, v_des[2], memory, belief, row, setting, each))
     # what the thrust must give: the acceleration wanted, less disturbance and drag, plus the weight
-    f = axpy(vector(belief, ob.DISTURBANCE), -row[DRAG] / row[MASS], v)
-    up = max(setting[K_CLIMB] * (wish[2] - v[2]) - f[2] + row[GRAVITY], LIFT_SHARE_MIN * row[GRAVITY])
+    f = axpy(vector(belief, BELIEF.disturbance), -row[VEHICLE.drag] / row[VEHICLE.mass], v)
+    gravity, gain = row[VEHICLE.gravity], setting[SETTING.k_velocity]
+    up = max(setting[SETTING.k_climb] * (v_des[2] - v[2]) - f[2] + gravity, setting[SETTING.lift_min] * gravity)
     if mode == FLYING and kind == ARDRONE:
-        across = setting[SLOPE]
-        z = (across * _clip(setpoint[VALUE], 1.0), across * _clip(setpoint[VALUE + 1], 1.0), 1.0)
+        across = setting[SETTING.drive + DRIVE.slope]
+        z = (across * _clip(setpoint[SETPOINT.value], 1.0), across * _clip(setpoint[SETPOINT.value + 1], 1.0), 1.0)
     else:
-        z = (setting[K_VELOCITY] * (wish[0] - v[0]) - f[0], setting[K_VELOCITY] * (wish[1] - v[1]) - f[1], up)
-    true_z = rot.z_axis(four(belief, ob.ATTITUDE))[2]
-    return z, row[MASS] * up / max(true_z, 0.5), yaw_rate
+        z = (gain * (v_des[0] - v[0]) - f[0], gain * (v_des[1] - v[1]) - f[1], up)
+    true_z = rot.z_axis(four(belief, BELIEF.q_WB))[2]
+    return z, row[VEHICLE.mass] * up / max(true_z, 0.5), yaw_rate
 
 
 @inlined
 def _asked_velocity(kind: int, own: Quaternion, setting: NDArray, setpoint: NDArray) -> tuple[Vector, float]:
     """Return the commander's velocity in the heading frame [m/s] and yaw rate [rad/s], within the limits."""
     if kind == ARDRONE:
-        climb = setting[CLIMB] * _clip(setpoint[VALUE + 2], 1.0)
-        return (0.0, 0.0, climb), setting[YAW_RATE] * _clip(setpoint[VALUE + 3], 1.0)
-    v = vector(setpoint, VALUE)
+        climb = setting[SETTING.climb] * _clip(setpoint[SETPOINT.value + 2], 1.0)
+        return (0.0, 0.0, climb), setting[SETTING.yaw_rate] * _clip(setpoint[SETPOINT.value + 3], 1.0)
+    v = vector(setpoint, SETPOINT.value)
     if kind == VELOCITY_WORLD:
         v = rot.rotate_back(own, v)
     speed = math.sqrt(v[0] * v[0] + v[1] * v[1])
-    s = 1.0 if speed <= setting[SPEED] else setting[SPEED] / speed
-    return (s * v[0], s * v[1], _clip(v[2], setting[CLIMB])), _clip(setpoint[VALUE + 3], setting[YAW_RATE])
+    s = 1.0 if speed <= setting[SETTING.speed] else setting[SETTING.speed] / speed
+    yaw_rate = _clip(setpoint[SETPOINT.value + 3], setting[SETTING.yaw_rate])
+    return (s * v[0], s * v[1], _clip(v[2], setting[SETTING.climb])), yaw_rate
 
 
 @inlined
-def _held(memory: NDArray, belief: NDArray, own: Quaternion, wish: Vector) -> Vector:
-    """Return the wish with the horizontal velocity that holds the place of the own odometry."""
-    v_W = rot.rotate(own, vector(belief, ob.VELOCITY))
+def _held(memory: NDArray, belief: NDArray, own: Quaternion, setting: NDArray, v_des: Vector) -> Vector:
+    """Return the v_des with the horizontal velocity that holds the place of the own odometry."""
+    v_W = rot.rotate(own, vector(belief, BELIEF.v_H))
     for k in range(2):
-        if memory[HOLDS_XY] == 0.0:
-            memory[HOLD_XY + k] = belief[ob.ODOMETRY + k] + BRAKE_S * v_W[k]
-    memory[HOLDS_XY] = 1.0
-    ex = memory[HOLD_XY] - belief[ob.ODOMETRY]
-    ey = memory[HOLD_XY + 1] - belief[ob.ODOMETRY + 1]
-    v = rot.rotate_back(own, (K_HOLD * ex, K_HOLD * ey, 0.0))
-    return (v[0], v[1], wish[2])
+        if memory[MEMORY.holds_xy] == 0.0:
+            memory[MEMORY.hold_xy + k] = belief[BELIEF.odometry + k] + setting[SETTING.brake] * v_W[k]
+    memory[MEMORY.holds_xy] = 1.0
+    ex = memory[MEMORY.hold_xy] - belief[BELIEF.odometry]
+    ey = memory[MEMORY.hold_xy + 1] - belief[BELIEF.odometry + 1]
+    v = rot.rotate_back(own, (setting[SETTING.k_hold] * ex, setting[SETTING.k_hold] * ey, 0.0))
+    return (v[0], v[1], v_des[2])
 
 
 @inlined
-def _climb(mode: int, asked: float, memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) -> float:
+def _climb(
+    mode: int,
+    asked: float,
+    memory: NDArray,
+    belief: NDArray,
+    row: NDArray,
+    setting: NDArray,
+    each: tuple[int, ...],
+) -> float:
     """Return the wanted vertical velocity [m/s]: take-off, landing, height hold, or what is asked."""
-    height = belief[ob.HEIGHT]
+    height = belief[BELIEF.height]
     if mode == LANDING:
-        return -_descent(memory, belief, row, setting)
+        return -_descent(memory, belief, row, setting, each)
     if mode == TAKING_OFF:
         return _ascent(memory, row, setting, height)
     if asked != 0.0:
-        memory[HOLDS_Z] = 0.0
-        return min(asked, K_HEIGHT * (setting[ALTITUDE] - height))
-    if memory[HOLDS_Z] != HOLDING:
-        ahead = height + belief[ob.VELOCITY + 2] / setting[K_CLIMB]
-        memory[HOLD_Z], memory[HOLDS_Z] = max(ahead, 2.0 * row[STAND_HEIGHT]), HOLDING
-    return _clip(K_HEIGHT * (memory[HOLD_Z] - height), setting[CLIMB])
+        memory[MEMORY.holds_z] = 0.0
+        return min(asked, setting[SETTING.k_height] * (setting[SETTING.altitude] - height))
+    if memory[MEMORY.holds_z] != HOLDING:
+        ahead = height + belief[BELIEF.v_H + 2] / setting[SETTING.k_climb]
+        memory[MEMORY.hold_z], memory[MEMORY.holds_z] = max(ahead, 2.0 * row[VEHICLE.stand_height]), HOLDING
+    return _clip(setting[SETTING.k_height] * (memory[MEMORY.hold_z] - height), setting[SETTING.climb])
 
 
 @inlined
 def _ascent(memory: NDArray, row: NDArray, setting: NDArray, height: float) -> float:
     """Return the vertical velocity of a take-off [m/s]: along a height that rises evenly."""
-    if memory[HOLDS_Z] == 0.0:
-        memory[HOLD_Z], memory[HOLDS_Z] = row[STAND_HEIGHT], RISING
+    if memory[MEMORY.holds_z] == 0.0:
+        memory[MEMORY.hold_z], memory[MEMORY.holds_z] = row[VEHICLE.stand_height], RISING
     rising = 0.0
-    if memory[HOLDS_Z] == RISING:
-        rising = CLIMB_M_S
-        memory[HOLD_Z] += rising * STEP_S
-        if memory[HOLD_Z] >= setting[TAKEOFF_HEIGHT]:
-            memory[HOLD_Z], memory[HOLDS_Z] = setting[TAKEOFF_HEIGHT], HOLDING
-    return rising + _clip(K_HEIGHT * (memory[HOLD_Z] - height), setting[CLIMB])
+    if memory[MEMORY.holds_z] == RISING:
+        rising = setting[SETTING.ascent]
+        memory[MEMORY.hold_z] += rising * STEP_S
+        if memory[MEMORY.hold_z] >= setting[SETTING.takeoff_height]:
+            memory[MEMORY.hold_z], memory[MEMORY.holds_z] = setting[SETTING.takeoff_height], HOLDING
+    return rising + _clip(setting[SETTING.k_height] * (memory[MEMORY.hold_z] - height), setting[SETTING.climb])
 
 
 @inlined
-def _descent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray) -> float:
+def _descent(memory: NDArray, belief: NDArray, row: NDArray, setting: NDArray, each: tuple[int, ...]) -> float:
     """Return the speed of descent [m/s], and count how long the ground has borne the weight."""
-    borne = ob.lift(belief, row) < TOUCH_SHARE * row[GRAVITY] and belief[ob.VELOCITY + 2] > -TOUCH_M_S
-    memory[TOUCH] = memory[TOUCH] + 1.0 if borne else 0.0
-    faster = DESCENT_FAR_1_S * max(belief[ob.HEIGHT] - FLARE_M, 0.0)
-    return min(DESCENT_M_S + faster, max(setting[CLIMB], DESCENT_M_S))
+    weak = lift(belief, row, each) < setting[SETTING.touch_share] * row[VEHICLE.gravity]
+    borne = weak and belief[BELIEF.v_H + 2] > -setting[SETTING.touch_speed]
+    memory[MEMORY.touch] = memory[MEMORY.touch] + 1.0 if borne else 0.0
+    faster = setting[SETTING.descent_far] * max(belief[BELIEF.height] - setting[SETTING.flare], 0.0)
+    return min(setting[SETTING.descent] + faster, max(setting[SETTING.climb], setting[SETTING.descent]))
 
 
 @inlined

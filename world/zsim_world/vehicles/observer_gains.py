@@ -17,18 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from zsim.math.columns import Field, columns
 from zsim.scenario.scenario import Drone, Environment, ErrorModel, Sensor
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
+from zsim.vehicles.vehicle import Vehicle
 from zsim_world.sensors.sensor_set import heading_sigma, noise_sigma, radians
-from zsim_world.state.vehicle import REFERENCE_DENSITY_KG_M3
+from zsim_world.state.fleet_arrays import REFERENCE_DENSITY_KG_M3
 
 Array = NDArray[np.float64]
 
-DISTURBANCE_WALK = 0.2  # m/s^2/sqrt(s): gusts of 0.5 m/s over 5 s on a drag of 0.58 1/s give 0.18
-LIFT_WALK = 0.4  # m/s^2/sqrt(s): ground effect and downwash come faster than gusts
-TILT_WALK = 6e-4  # rad/sqrt(s), least: vibration, rounding, and what a turn leaves
-BIAS_WALK = 2e-5  # rad/s/sqrt(s), least: a bias of 0.1 deg/s is found within a minute
-LIFT_BIAS_WALK = 3e-3  # m/s^2/sqrt(s), least: what the board's temperature does to its accelerometer
 # Least and largest standard deviation of a sample that the design counts with: none is trusted blindly, and beyond the
 # largest a meter is as good as none
 SIGMAS = {
@@ -40,24 +37,32 @@ SIGMAS = {
     "mag": (0.01, 3.0),  # rad
 }
 DOUBLINGS = 24  # 2^24 steps of 5 ms are a day
-HEARD_MIN_HZ = 0.1  # Hz, a meter is not counted with less often
+SAMPLE_RATE_MIN_HZ = 0.1  # Hz, a meter is not counted with less often
 
-# Columns of the gain row: innovation -> state
-ACCEL_V, ACCEL_TILT, ACCEL_RATE, ACCEL_U = 0, 1, 2, 3
-FLOW_V, FLOW_TILT, FLOW_RATE, FLOW_U = 4, 5, 6, 7
-LIFT_Z, LIFT_V, LIFT_U, LIFT_BIAS = 8, 9, 10, 11  # accelerometer, vertical
-CLIMB_Z, CLIMB_V, CLIMB_U, CLIMB_BIAS = 12, 13, 14, 15  # flow, vertical
-BARO_Z = 16  # and three more, as above
-SONAR_Z = 20  # and three more
-BARO_ZERO = 24
-MAG_PSI, MAG_RATE = 25, 26
-COLUMNS = 27
-
-
+GAIN = columns(  # innovation -> state, in the units of the states over that of the innovation
+    "GainColumns",
+    (
+        Field("accel_v", ""),
+        Field("accel_tilt", ""),
+        Field("accel_rate", ""),
+        Field("accel_u", ""),
+        Field("flow_v", ""),
+        Field("flow_tilt", ""),
+        Field("flow_rate", ""),
+        Field("flow_u", ""),
+        Field("lift_z", "", 4),  # accelerometer, vertical: height, climb, disturbance, bias
+        Field("climb_z", "", 4),  # flow, vertical, as above
+        Field("baro_z", "", 4),
+        Field("sonar_z", "", 4),
+        Field("baro_zero", ""),
+        Field("mag_psi", ""),
+        Field("mag_rate", ""),
+    ),
+)
 Meter = tuple[float, float]  # standard deviation of a sample, samples per second
 
 
-class Design(NamedTuple):
+class ObserverDesign(NamedTuple):
     """What the gains of one drone follow from."""
 
     drag_1_s: float
@@ -70,31 +75,35 @@ class Design(NamedTuple):
     baro: Meter  # m
     sonar: Meter  # m
     mag: Meter  # rad
+    disturbance_walk: float  # m/s^2/sqrt(s)
+    lift_walk: float  # m/s^2/sqrt(s)
 
 
-def gain_row(drone: Drone, environment: Environment) -> Array:
-    """Return the gains of one drone, shape (COLUMNS,)."""
-    s = drone.sensors
+def gain_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> Array:
+    """Return the gains of one drone, shape (GAIN.size,)."""
+    s, walks = drone.sensors, vehicle.firmware
     field = math.hypot(*environment.magnetic_field_ut[:2])
     gyro = _sigma(radians(s.imu.gyro_deg_s), BOARD_RATE_HZ, "gyro")
-    design = Design(
+    design = ObserverDesign(
         drag_1_s=drone.drag_n_s_m * environment.air_density_kg_m3 / REFERENCE_DENSITY_KG_M3 / drone.mass_kg,
         gravity_m_s2=environment.gravity_m_s2,
         accel=(_sigma(s.imu.accel_m_s2, BOARD_RATE_HZ, "accel"), BOARD_RATE_HZ),
-        accel_walk=max(s.imu.accel_m_s2.bias_walk, LIFT_BIAS_WALK),
-        tilt_walk=math.hypot(gyro / math.sqrt(BOARD_RATE_HZ), TILT_WALK),
-        gyro_walk=max(radians(s.imu.gyro_deg_s).bias_walk, BIAS_WALK),
-        flow=(_sigma(s.flow.velocity_m_s, s.flow.rate_hz, "flow"), heard(s.flow)),
-        baro=(_sigma(s.baro.altitude_m, s.baro.rate_hz, "baro"), heard(s.baro)),
-        sonar=(_sigma(s.sonar.range_m, s.sonar.rate_hz, "sonar"), heard(s.sonar)),
-        mag=(_within(heading_sigma(s.mag, field), "mag"), heard(s.mag)),
+        accel_walk=max(s.imu.accel_m_s2.bias_walk, walks.lift_bias_walk),
+        tilt_walk=math.hypot(gyro / math.sqrt(BOARD_RATE_HZ), walks.tilt_walk),
+        gyro_walk=max(radians(s.imu.gyro_deg_s).bias_walk, walks.bias_walk),
+        flow=(_sigma(s.flow.velocity_m_s, s.flow.rate_hz, "flow"), sample_rate(s.flow)),
+        baro=(_sigma(s.baro.altitude_m, s.baro.rate_hz, "baro"), sample_rate(s.baro)),
+        sonar=(_sigma(s.sonar.range_m, s.sonar.rate_hz, "sonar"), sample_rate(s.sonar)),
+        mag=(_within(heading_sigma(s.mag, field), "mag"), sample_rate(s.mag)),
+        disturbance_walk=walks.disturbance_walk,
+        lift_walk=walks.lift_walk,
     )
     return _gains(design)
 
 
-def heard(sensor: Sensor) -> float:
+def sample_rate(sensor: Sensor) -> float:
     """Return the rate [Hz] at which samples really come."""
-    return max(sensor.rate_hz * (1.0 - sensor.dropout), HEARD_MIN_HZ)
+    return max(sensor.rate_hz * (1.0 - sensor.dropout), SAMPLE_RATE_MIN_HZ)
 
 
 def _sigma(model: ErrorModel, rate_hz: float, name: str) -> float:
@@ -107,35 +116,35 @@ def _within(sigma: float, name: str) -> float:
 
 
 @lru_cache(maxsize=256)
-def _gains(d: Design) -> Array:
-    row = np.empty(COLUMNS)
-    row[ACCEL_V : FLOW_U + 1] = _across(d).ravel()
-    row[LIFT_Z:SONAR_Z] = _upwards(d, d.baro).ravel()
-    row[SONAR_Z:BARO_ZERO] = _upwards(d, d.sonar)[2]
-    row[BARO_ZERO] = 1.0 / (10.0 * d.baro[1])  # ten seconds
-    row[MAG_PSI : MAG_RATE + 1] = _turning(d)[0]
+def _gains(d: ObserverDesign) -> Array:
+    row = np.empty(GAIN.size)
+    row[GAIN.accel_v : GAIN.lift_z] = _across(d).ravel()
+    row[GAIN.lift_z : GAIN.sonar_z] = _upwards(d, d.baro).ravel()
+    row[GAIN.sonar_z : GAIN.baro_zero] = _upwards(d, d.sonar)[2]
+    row[GAIN.baro_zero] = 1.0 / (10.0 * d.baro[1])  # ten seconds
+    row[GAIN.mag_psi : GAIN.mag_rate + 1] = _turning(d)[0]
     row = np.array([float(f"{x:.9g}") for x in row])  # nine digits: the same bits whatever the BLAS
     row.setflags(write=False)
     return row
 
 
-def _across(d: Design) -> Array:
+def _across(d: ObserverDesign) -> Array:
     c = d.drag_1_s
     a = np.array([[-c, d.gravity_m_s2, 0, 1], [0, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
-    walks = np.array([0.0, d.tilt_walk, d.gyro_walk, DISTURBANCE_WALK])
+    walks = np.array([0.0, d.tilt_walk, d.gyro_walk, d.disturbance_walk])
     return steady_gains(a, walks, [([-c, 0, 0, 1], *d.accel), ([1, 0, 0, 0], *d.flow)])
 
 
-def _upwards(d: Design, height: Meter) -> Array:
+def _upwards(d: ObserverDesign, height: Meter) -> Array:
     """Return the gains of accelerometer, flow and a meter of the height."""
     c = d.drag_1_s
     a = np.array([[0, 1, 0, 0], [0, -c, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]], dtype=float)
-    walks = np.array([0.0, 0.0, LIFT_WALK, d.accel_walk])
+    walks = np.array([0.0, 0.0, d.lift_walk, d.accel_walk])
     moving = [([0, -c, 1, 1], *d.accel), ([0, 1, 0, 0], *d.flow)]
     return steady_gains(a, walks, [*moving, ([1, 0, 0, 0], *height)])
 
 
-def _turning(d: Design) -> Array:
+def _turning(d: ObserverDesign) -> Array:
     a = np.array([[0, 1], [0, 0]], dtype=float)
     return steady_gains(a, np.array([d.tilt_walk, d.gyro_walk]), [([1, 0], *d.mag)])
 

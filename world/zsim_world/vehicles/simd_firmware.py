@@ -1,4 +1,7 @@
-"""The boards' step: every drone's firmware sees and decides alone, then eight drives go side by side (block.py)."""
+"""The boards' step: every drone's firmware sees and decides alone; what has no branch goes for eight drones at once.
+
+How blocks of eight work is in physics/simd.py.
+"""
 
 import math
 
@@ -6,46 +9,87 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math import rotation as rot
+from zsim.math.columns import Field, columns
 from zsim.math.compiled import apart, inlined
-from zsim_world.physics import simd
-from zsim_world.physics.battery import percent
 from zsim_world.physics.rigid_body import four, put, put_four, vector
-from zsim_world.physics.rotors import Four
-from zsim_world.physics.simd import LANES
-from zsim_world.state.fleet_arrays import DT, SILENCE_HOVER, SILENCE_LAND, TICK, Boards, Bodies, Time
-from zsim_world.state.vehicle import COLUMNS as PARAMETERS
+from zsim_world.physics.rotors import charge_percent
+from zsim_world.physics.simd import (
+    LANES,
+    blocks,
+    lane_four,
+    lane_rotors,
+    lane_row,
+    lane_vector,
+    put_lane_four,
+    put_lane_vector,
+)
+from zsim_world.state.fleet_arrays import CLOCK, ROTOR, SPAN, VEHICLE, Boards, Bodies, KernelTime, PerRotor, of, put_of
 from zsim_world.vehicles import attitude_control, firmware, observer
+from zsim_world.vehicles.attitude_control import DRIVE
+from zsim_world.vehicles.firmware_settings import SETTING
+from zsim_world.vehicles.observer import BELIEF, DEVICE
 
-# Columns of a block
-GAINS, MOUNT = PARAMETERS, PARAMETERS + 4  # of the drive (4); of the gyro (4)
-GYRO, BIAS = MOUNT + 4, MOUNT + 7  # rad/s: the newest sample (3), and what is believed to be its bias (3)
-ATTITUDE, BODY_RATE, ROTOR = BIAS + 3, BIAS + 7, BIAS + 10  # of the belief (4, 3, 4)
-ANGLE, SINE, COSINE = ROTOR + 4, ROTOR + 5, ROTOR + 6  # of the step's turn [rad], and of half of it
-NORTH, EAST, HEADING = COSINE + 1, COSINE + 2, COSINE + 3  # where the nose points, and the angle of that [rad]
-OWN = HEADING + 1  # heading frame in W (4)
-UPWARDS, LIFT, YAW_RATE = OWN + 4, OWN + 7, OWN + 8  # wanted: z_B in the heading frame (3), N, rad/s
-DRIVEN, COMMAND = YAW_RATE + 1, YAW_RATE + 2  # 0 if the firmware itself has set the command [rad/s] (4)
-COLUMNS = COMMAND + 4
-STILL = (0.0, 0.0, 0.0, 0.0)  # rad/s
-
-# Columns of the actuators, a row per drone: 0 where all is sound; by how much the speed of each rotor is less than
-# commanded (4); the speed at which it turns whatever is commanded [rad/s] (4), below 0 for none
-FAULTY, FACTOR, HELD = 0, 1, 5
-ACTUATOR_COLUMNS = 9
+BOARD_LANES = columns(
+    "BoardLanes",
+    (
+        Field("vehicle", "VEHICLE", VEHICLE.size),
+        Field("drive", "DRIVE", DRIVE.size),
+        Field("mount", "1", 4),  # q_BS of the gyro
+        Field("gyro", "rad/s", 3),  # the newest sample
+        Field("bias", "rad/s", 3),  # what is believed to be its bias
+        Field("q_WB", "1", 4),  # of the belief, as the next
+        Field("w_WB_B", "rad/s", 3),
+        Field("angle", "rad"),  # of the step's turn
+        Field("sine", "1"),  # of half of it
+        Field("cosine", "1"),
+        Field("north", "1"),  # where the nose points
+        Field("east", "1"),
+        Field("heading", "rad"),
+        Field("own", "1", 4),  # heading frame in W
+        Field("z_H", "1", 3),  # wanted: z_B in the heading frame
+        Field("thrust", "N"),
+        Field("yaw_rate", "rad/s"),
+        Field("driven", "1"),  # 0 if the firmware itself has set the command
+    ),
+)
+BOARD_ROTORS = columns(
+    "BoardRotors",
+    (Field("known", "ROTOR", ROTOR.size), Field("speed", "rad/s"), Field("command", "rad/s"), Field("drive", "rad/s")),
+)
+ACTUATOR = (
+    columns(  # and by how much the speed of each rotor is less than commanded (R); the one at which it is held (R)
+        "ActuatorColumns", (Field("faulty", "1"),)
+    )
+)
 FOLLOWS = -1.0  # rad/s, of a rotor that is not held
 
 
-def sound_actuators(n: int) -> NDArray[np.float64]:
-    """Return the rows of n drones whose rotors turn as commanded, (n, ACTUATOR_COLUMNS)."""
-    rows = np.ones((n, ACTUATOR_COLUMNS))
-    rows[:, FAULTY], rows[:, HELD:] = 0.0, FOLLOWS
+def sound_actuators(drones: int, rotors: int) -> NDArray[np.float64]:
+    """Return the rows of drones whose rotors turn as commanded, (drones, ACTUATOR.size + 2 rotors)."""
+    rows = np.ones((drones, ACTUATOR.size + 2 * rotors))
+    rows[:, ACTUATOR.faulty], rows[:, ACTUATOR.size + rotors :] = 0.0, FOLLOWS
     return rows
 
 
+def board_blocks(row: NDArray, rotors: NDArray, setting: NDArray, mounts: NDArray) -> NDArray[np.float64]:
+    """Return the blocks of N boards: parameters, those of their rotors, settings and mounts of the gyro (N, 4)."""
+    each = rotors.shape[1] // ROTOR.size
+    drive = setting[:, SETTING.drive : SETTING.drive + DRIVE.size]
+    known = BOARD_LANES.size + BOARD_ROTORS.known * each
+    parts = ((BOARD_LANES.vehicle, row), (BOARD_LANES.drive, drive), (BOARD_LANES.mount, mounts), (known, rotors))
+    return blocks(BOARD_LANES.size + BOARD_ROTORS.size * each, parts)
+
+
 @inlined
-def steer(time: Time, bodies: Bodies, boards: Boards) -> None:
+def _rotors(lanes: NDArray, group: int, k: int, each: tuple[int, ...]) -> PerRotor:
+    """Return a group of numbers per rotor of the drone in lane k, and those after it."""
+    return lane_rotors(lanes, BOARD_LANES.size + group * len(each), k, each)
+
+
+@inlined
+def steer(time: KernelTime, bodies: Bodies, boards: Boards) -> None:
     """Let the firmware of every drone see and act."""
-    count = bodies.state.shape[0]
+    count, each = bodies.state.shape[0], bodies.each
     for first in range(0, count, LANES):
         lanes, last, driven = boards.lanes[first // LANES], min(first + LANES, count), False
         for i in range(first, last):
@@ -54,95 +98,111 @@ def steer(time: Time, bodies: Bodies, boards: Boards) -> None:
         for i in range(first, last):
             driven |= _decide(time, bodies, boards, lanes, i, i - first)
         if driven:
-            _drive(lanes)
+            _drive(lanes, each)
         for i in range(first, last):
-            _command(bodies, boards, i, simd.four(lanes, COMMAND, i - first))
+            _command(bodies, boards, i, _rotors(lanes, BOARD_ROTORS.command, i - first, each))
 
 
 @inlined
 def _line_up(boards: Boards, lanes: NDArray, i: int, k: int) -> None:
     """Put into lane k what drone i's attitude follows from."""
     belief = boards.belief[i]
-    simd.put(lanes, GYRO, k, vector(boards.device[i], observer.GYRO))
-    simd.put(lanes, BIAS, k, vector(belief, observer.GYRO_BIAS))
-    simd.put_four(lanes, ATTITUDE, k, four(belief, observer.ATTITUDE))
+    put_lane_vector(lanes, BOARD_LANES.gyro, k, vector(boards.device[i], DEVICE.gyro))
+    put_lane_vector(lanes, BOARD_LANES.bias, k, vector(belief, BELIEF.gyro_bias))
+    put_lane_four(lanes, BOARD_LANES.q_WB, k, four(belief, BELIEF.q_WB))
 
 
 @inlined
 def _turn(lanes: NDArray, count: int) -> None:
     """Turn the attitudes by what the gyros show; `count` lanes have a drone."""
     for k in range(LANES):
-        mount, gyro, bias = simd.four(lanes, MOUNT, k), simd.vector(lanes, GYRO, k), simd.vector(lanes, BIAS, k)
+        mount, gyro = lane_four(lanes, BOARD_LANES.mount, k), lane_vector(lanes, BOARD_LANES.gyro, k)
+        bias = lane_vector(lanes, BOARD_LANES.bias, k)
         w = observer.body_rate(mount, gyro, bias)
-        simd.put(lanes, BODY_RATE, k, w)
-        lanes[LANES * ANGLE + k] = rot.norm(observer.step_turn(w))
+        put_lane_vector(lanes, BOARD_LANES.w_WB_B, k, w)
+        lanes[LANES * BOARD_LANES.angle + k] = rot.norm(observer.step_turn(w))
     for k in range(count):
-        half = 0.5 * lanes[LANES * ANGLE + k]
-        lanes[LANES * SINE + k], lanes[LANES * COSINE + k] = math.sin(half), math.cos(half)
+        half = 0.5 * lanes[LANES * BOARD_LANES.angle + k]
+        lanes[LANES * BOARD_LANES.sine + k], lanes[LANES * BOARD_LANES.cosine + k] = math.sin(half), math.cos(half)
     for k in range(LANES):
-        r, angle = observer.step_turn(simd.vector(lanes, BODY_RATE, k)), lanes[LANES * ANGLE + k]
-        turn = rot.turn_about(r, angle, lanes[LANES * SINE + k], lanes[LANES * COSINE + k])
-        q = rot.normalised(rot.multiply(simd.four(lanes, ATTITUDE, k), turn))
-        simd.put_four(lanes, ATTITUDE, k, q)
-        lanes[LANES * NORTH + k], lanes[LANES * EAST + k] = rot.forwards(q)
+        r, angle = observer.step_turn(lane_vector(lanes, BOARD_LANES.w_WB_B, k)), lanes[LANES * BOARD_LANES.angle + k]
+        turn = rot.turn_about(r, angle, lanes[LANES * BOARD_LANES.sine + k], lanes[LANES * BOARD_LANES.cosine + k])
+        q = rot.normalised(rot.multiply(lane_four(lanes, BOARD_LANES.q_WB, k), turn))
+        put_lane_four(lanes, BOARD_LANES.q_WB, k, q)
+        lanes[LANES * BOARD_LANES.north + k], lanes[LANES * BOARD_LANES.east + k] = rot.forwards(q)
     for k in range(count):
-        heading = math.atan2(lanes[LANES * NORTH + k], lanes[LANES * EAST + k])
-        lanes[LANES * HEADING + k] = heading
-        simd.put_four(lanes, OWN, k, rot.about_z(heading))
+        heading = math.atan2(lanes[LANES * BOARD_LANES.north + k], lanes[LANES * BOARD_LANES.east + k])
+        lanes[LANES * BOARD_LANES.heading + k] = heading
+        put_lane_four(lanes, BOARD_LANES.own, k, rot.about_z(heading))
 
 
 @inlined
-def _decide(time: Time, bodies: Bodies, boards: Boards, lanes: NDArray, i: int, k: int) -> bool:
+def _decide(time: KernelTime, bodies: Bodies, boards: Boards, lanes: NDArray, i: int, k: int) -> bool:
     """Let drone i see, and put what it wants into lane k; return whether the drive is to find its command."""
-    memory, belief, row, setting = boards.memory[i], boards.belief[i], bodies.vehicle[i], boards.setting[i]
-    own, turned = simd.four(lanes, OWN, k), lanes[LANES * HEADING + k] - belief[observer.HEADING]
-    belief[observer.HEADING] = lanes[LANES * HEADING + k]
-    put_four(belief, observer.ATTITUDE, simd.four(lanes, ATTITUDE, k))
-    put(belief, observer.BODY_RATE, simd.vector(lanes, BODY_RATE, k))
-    on_ground = firmware.stands(memory)
+    each, memory, belief, row = bodies.each, boards.memory[i], boards.belief[i], bodies.vehicle[i]
+    setting, heading = boards.setting[i], lanes[LANES * BOARD_LANES.heading + k]
+    own, turned = lane_four(lanes, BOARD_LANES.own, k), heading - belief[BELIEF.heading]
+    belief[BELIEF.heading] = heading
+    put_four(belief, BELIEF.q_WB, lane_four(lanes, BOARD_LANES.q_WB, k))
+    put(belief, BELIEF.w_WB_B, lane_vector(lanes, BOARD_LANES.w_WB_B, k))
+    on_ground = firmware.stands(memory, setting)
     gain, device, board = boards.gain[i], boards.device[i], boards.calibration[i]
-    own = observer.observe(belief, own, turned, row, gain, device, board, on_ground)
-    silence = (time.clock[TICK] - boards.set_tick[i]) * time.spans[DT]
-    hover_s, land_s = time.spans[SILENCE_HOVER], time.spans[SILENCE_LAND]
-    charge = percent(row, bodies.energy[i])
-    wish = firmware.decide(memory, belief, own, row, setting, boards.setpoint[i], silence, hover_s, land_s, charge)
-
-    simd.put_four(lanes, OWN, k, own)
-    simd.put_four(lanes, ATTITUDE, k, four(belief, observer.ATTITUDE))
-    simd.put_four(lanes, ROTOR, k, four(belief, observer.ROTOR))
-    simd.put(lanes, UPWARDS, k, wish.z_H)
-    lanes[LANES * LIFT + k], lanes[LANES * YAW_RATE + k] = wish.thrust_n, wish.yaw_rate
-    lanes[LANES * DRIVEN + k] = 1.0 if wish.driven else 0.0
-    simd.put_four(lanes, COMMAND, k, wish.command)
-    return wish.driven
+    own = observer.observe(belief, own, turned, row, gain, device, board, on_ground, each)
+    silence = (time.clock[CLOCK.tick] - boards.set_tick[i]) * time.spans[SPAN.dt]
+    hover_s, land_s = time.spans[SPAN.hover], time.spans[SPAN.land]
+    charge = charge_percent(row, bodies.energy[i])
+    rotors, commands = PerRotor(bodies.rotors[i], 0, 1, each), _rotors(lanes, BOARD_ROTORS.command, k, each)
+    setpoint = boards.setpoint[i]
+    decision = firmware.decide(
+        commands, memory, belief, own, row, rotors, setting, setpoint, silence, hover_s, land_s, charge
+    )
+    put_lane_four(lanes, BOARD_LANES.own, k, own)
+    put_lane_four(lanes, BOARD_LANES.q_WB, k, four(belief, BELIEF.q_WB))
+    speeds = _rotors(lanes, BOARD_ROTORS.speed, k, each)
+    for r in range(len(each)):
+        put_of(speeds, r, belief[BELIEF.size + r])
+    put_lane_vector(lanes, BOARD_LANES.z_H, k, decision.z_H)
+    lanes[LANES * BOARD_LANES.thrust + k], lanes[LANES * BOARD_LANES.yaw_rate + k] = (
+        decision.thrust_n,
+        decision.yaw_rate,
+    )
+    lanes[LANES * BOARD_LANES.driven + k] = 1.0 if decision.driven else 0.0
+    return decision.driven
 
 
 @inlined
-def _drive(lanes: NDArray) -> None:
+def _drive(lanes: NDArray, each: tuple[int, ...]) -> None:
     """Find the commands of all drones of the block whose firmware has not set them itself."""
     for k in range(LANES):
-        own, attitude = simd.four(lanes, OWN, k), simd.four(lanes, ATTITUDE, k)
-        rate = simd.vector(lanes, BODY_RATE, k)
-        rotor, gains, z = simd.four(lanes, ROTOR, k), simd.four(lanes, GAINS, k), simd.vector(lanes, UPWARDS, k)
-        thrust, yaw_rate = lanes[LANES * LIFT + k], lanes[LANES * YAW_RATE + k]
-        found = attitude_control.drive(simd.row(lanes, k), gains, own, attitude, rate, rotor, z, thrust, yaw_rate)
-        set_itself, driven = simd.four(lanes, COMMAND, k), lanes[LANES * DRIVEN + k] > 0.0
-        simd.put_four(lanes, COMMAND, k, found if driven else set_itself)
+        own, attitude = lane_four(lanes, BOARD_LANES.own, k), lane_four(lanes, BOARD_LANES.q_WB, k)
+        rate, z = lane_vector(lanes, BOARD_LANES.w_WB_B, k), lane_vector(lanes, BOARD_LANES.z_H, k)
+        drive = BOARD_LANES.drive
+        gains = lane_vector(lanes, drive, k) + lane_vector(lanes, drive + 3, k)
+        thrust, yaw_rate = lanes[LANES * BOARD_LANES.thrust + k], lanes[LANES * BOARD_LANES.yaw_rate + k]
+        rotors, speeds = _rotors(lanes, BOARD_ROTORS.known, k, each), _rotors(lanes, BOARD_ROTORS.speed, k, each)
+        commands, wanted = _rotors(lanes, BOARD_ROTORS.command, k, each), _rotors(lanes, BOARD_ROTORS.drive, k, each)
+        row = lane_row(lanes, k)
+        attitude_control.drive(row, rotors, gains, own, attitude, rate, speeds, z, thrust, yaw_rate, wanted)
+        driven = lanes[LANES * BOARD_LANES.driven + k] > 0.0
+        for r in range(len(each)):
+            put_of(commands, r, of(wanted, 0, r) if driven else of(commands, 0, r))
 
 
 @inlined
-def _command(bodies: Bodies, boards: Boards, i: int, command: Four) -> None:
+def _command(bodies: Bodies, boards: Boards, i: int, commands: PerRotor) -> None:
     """Give the rotors of drone i their command, if there is charge for it, and let its firmware count on it."""
-    observer.model_rotors(boards.belief[i], boards.setting[i, attitude_control.ROTOR_DECAY], command)
-    charge = percent(bodies.vehicle[i], bodies.energy[i])
-    put_four(bodies.command[i], 0, command if charge > 0.0 else STILL)
-    if boards.actuator[i, FAULTY] != 0.0 and charge > 0.0:
+    observer.model_rotors(boards.belief[i], boards.setting[i, SETTING.rotor_decay], commands)
+    charged = charge_percent(bodies.vehicle[i], bodies.energy[i]) > 0.0
+    for r in range(len(commands.each)):
+        bodies.command[i, r] = of(commands, 0, r) if charged else 0.0
+    if boards.actuator[i, ACTUATOR.faulty] != 0.0 and charged:
         _weaken(bodies.command[i], boards.actuator[i])
 
 
 @apart
 def _weaken(command: NDArray, actuator: NDArray) -> None:
-    """Make of a command to the rotors [rad/s] (4,), in place, what faulty ones do of it."""
-    for k in range(4):
-        held = actuator[HELD + k]
-        command[k] = held if held >= 0.0 else actuator[FACTOR + k] * command[k]
+    """Make of a command to the rotors [rad/s] (R,), in place, what faulty ones do of it."""
+    count = command.shape[0]
+    for r in range(count):
+        held = actuator[ACTUATOR.size + count + r]
+        command[r] = held if held >= 0.0 else actuator[ACTUATOR.size + r] * command[r]

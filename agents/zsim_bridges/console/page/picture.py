@@ -22,7 +22,7 @@ SIGMAS = 2.0  # of an ellipsoid
 SHARE_WITHIN = 1 - math.erfc(SIGMAS / math.sqrt(2)) - math.sqrt(2 / math.pi) * SIGMAS * math.exp(-(SIGMAS**2) / 2)
 """Of a Gaussian in three dimensions, within 2 sigma: chi-squared of three degrees of freedom at 4, 0.739."""
 RADIUS_MAX_M = 60.0  # of an ellipsoid: before the first fix nothing is known, and the page would be inside of it
-SPIN = np.array([-1.0, 1.0, -1.0, 1.0])  # against the drag torque of each rotor, zsim_world/rotors.py
+SPIN = np.array([-1.0, 1.0, -1.0, 1.0])  # against the drag torque of each rotor, as zsim.vehicles.vehicle.cross_layout
 SHAPED_PHASES = frozenset({"assembling", "engaged", "held"})  # phases in which a formation has somewhere to be
 CORNER_SHARE = (
     0.25  # of the way from a corner to the opposite side; there its angle is written, clear of names and sides
@@ -79,7 +79,7 @@ def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
     for drone in view.drones:
         i = indices.get(drone.name)
         if i is not None:
-            p_W[i], q_WB[i], rotor[i] = drone.position_m, drone.orientation_wxyz, drone.rotor_rad_s
+            p_W[i], q_WB[i], rotor[i] = drone.position_m, drone.orientation_wxyz, drone.rotor_rad_s[:4]
     wind = np.mean(view.wind_m_s, axis=0) if view.wind_m_s else np.zeros(3)
     return DronePoses(view.t_ns, tuple(names), p_W, q_WB, rotor, wind)
 

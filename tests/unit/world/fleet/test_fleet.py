@@ -11,7 +11,7 @@ from zsim.contract import messages
 from zsim.math.frames import geodetic_to_enu
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, DivergedError, Fleet
-from zsim_world.fleet.publication import Publication
+from zsim_world.fleet.publication import GatePublication
 from zsim_world.sensors.sensor_set import SENSORS, schedule
 
 GATE_NS = 20_000_000
@@ -126,7 +126,7 @@ def test_the_sigma_that_a_gps_tells_is_that_of_its_errors():
     """noise 3 m and density 2 m/sqrt(Hz) at 4 Hz: 5 m."""
     gps = {"rate_hz": 4, "position_m": {"noise": 3.0, "density": 2.0}}
     fleet = Fleet(scenario(1, sensors={"preset": "paper", "gps": gps}))
-    told = [m for _, m in Publication(fleet).gate([None]).decoded() if isinstance(m, messages.Gps)]
+    told = [m for _, m in GatePublication(fleet).gate([None]).decoded() if isinstance(m, messages.Gps)]
     assert [(m.sigma_m, m.fix, m.satellites) for m in told] == [(5.0, GPS_FIX, GPS_SATELLITES)]
 
 

@@ -4,38 +4,42 @@ import math
 
 import numpy as np
 import pytest
+from vehicle_rows import one_drone, per_rotor
 
-from zsim.scenario.scenario_file import resolve
-from zsim_world.physics import battery
-from zsim_world.state import vehicle
+from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
+from zsim_world.physics import rotors
+from zsim_world.state.fleet_arrays import VEHICLE
 
 
 @pytest.fixture(scope="module")
 def row():
-    scenario = resolve({"name": "t", "duration_s": 1, "drones": [{"name": "a", "position_m": [0, 0, 0]}]})
-    return vehicle.parameters(scenario.drones[0], scenario.environment)
+    return one_drone()[0]
 
 
 def hover(row):
-    speed = math.sqrt(row[vehicle.MASS] * row[vehicle.GRAVITY] / (4 * row[vehicle.THRUST]))
-    return (speed, speed, speed, speed)
+    speed = math.sqrt(row[VEHICLE.mass] * row[VEHICLE.gravity] / (4 * row[VEHICLE.thrust]))
+    return per_rotor([speed] * 4)
 
 
 def test_a_full_battery_hovers_for_twelve_minutes(row):
-    minutes = row[vehicle.CAPACITY] / battery.power(row, hover(row)) / 60.0
+    minutes = row[VEHICLE.capacity] / rotors.power(row, hover(row)) / 60.0
     assert abs(minutes - 12.0) < 0.2
 
 
 def test_power_is_torque_times_speed_over_efficiency_and_the_board(row):
     speeds = (200.0, 300.0, 400.0, 500.0)
-    shaft = sum(row[vehicle.TORQUE] * s**2 * s for s in speeds)
-    assert math.isclose(battery.power(row, speeds), shaft / vehicle.EFFICIENCY + vehicle.BOARD_W, rel_tol=1e-12)
+    shaft = sum(row[VEHICLE.torque] * s**2 * s for s in speeds)
+    assert math.isclose(
+        rotors.power(row, per_rotor(speeds)),
+        shaft / ARDRONE2.battery.efficiency + ARDRONE2.battery.electronics_w,
+        rel_tol=1e-12,
+    )
 
 
 def test_energy_is_drained_and_ends_at_zero(row):
-    full = row[vehicle.CAPACITY]
+    full = row[VEHICLE.capacity]
     assert math.isclose(full, 1.0 * 3600 * 11.1, rel_tol=1e-12)  # 1 Ah at 11.1 V
-    left = battery.drained(row, full, (0.0, 0.0, 0.0, 0.0), 100.0)
-    assert math.isclose(left, full - 100.0 * vehicle.BOARD_W, rel_tol=1e-12)
-    assert battery.drained(row, 1.0, hover(row), 1.0) == 0.0
-    np.testing.assert_allclose(battery.percent(row, full / 4), 25.0)
+    left = rotors.drained(row, full, per_rotor([0.0] * 4), 100.0)
+    assert math.isclose(left, full - 100.0 * ARDRONE2.battery.electronics_w, rel_tol=1e-12)
+    assert rotors.drained(row, 1.0, hover(row), 1.0) == 0.0
+    np.testing.assert_allclose(rotors.charge_percent(row, full / 4), 25.0)

@@ -5,40 +5,39 @@ import math
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from vehicle_rows import one_drone
 
-from zsim.scenario.scenario_file import resolve
 from zsim_world.physics import rigid_body as body
-from zsim_world.state import vehicle
+from zsim_world.state.fleet_arrays import STATE, VEHICLE
 
 OFF = (0.0, 0.0, 0.0, 0.0)
+ROTORS = one_drone()[1]
 CALM = NOBODY = (0.0, 0.0, 0.0)
 DT = 0.0025
 
 
 @pytest.fixture
 def row():
-    document = {"name": "t", "duration_s": 1, "drones": [{"name": "a", "position_m": [0, 0, 0]}]}
-    scenario = resolve(document)
-    return vehicle.parameters(scenario.drones[0], scenario.environment)
+    return one_drone()[0]
 
 
 @pytest.fixture
 def state():
-    state = np.zeros(body.COLUMNS)
+    state = np.zeros(STATE.size + 4)
     state[2] = 1e4
-    state[body.ATTITUDE] = 1.0
+    state[STATE.q_WB] = 1.0
     return state
 
 
 def fly(row, state, seconds, command=OFF, air=CALM, push=NOBODY, dt=DT):
-    anchor = np.zeros((len(vehicle.CONTACT_POINTS_B), 2))
+    anchor, command = np.zeros((8, 2)), np.array(command)
     for _ in range(round(seconds / dt)):
-        body.step(row, anchor, state, command, air, push, dt)
+        body.step(row, ROTORS, anchor, state, command, air, push, dt)
     return state
 
 
 def test_free_fall_with_linear_drag(row, state):
-    tau, g = row[vehicle.MASS] / row[vehicle.DRAG], row[vehicle.GRAVITY]
+    tau, g = row[VEHICLE.mass] / row[VEHICLE.drag], row[VEHICLE.gravity]
     state[3] = 4.0
     fly(row, state, 3.0)
     decay = math.exp(-3.0 / tau)
@@ -49,18 +48,18 @@ def test_free_fall_with_linear_drag(row, state):
 
 def test_wind_carries_a_falling_body_along(row, state):
     fly(row, state, 30.0, air=(3.0, -2.0, 0.0))
-    terminal = row[vehicle.MASS] * row[vehicle.GRAVITY] / row[vehicle.DRAG]
+    terminal = row[VEHICLE.mass] * row[VEHICLE.gravity] / row[VEHICLE.drag]
     np.testing.assert_allclose(state[3:6], (3.0, -2.0, -terminal), rtol=1e-6)
 
 
 def test_push_of_another_is_a_force(row, state):
-    row[vehicle.DRAG] = 0.0
+    row[VEHICLE.drag] = 0.0
     fly(row, state, 1.0, push=(0.429, 0.0, 0.0))
-    np.testing.assert_allclose(state[3:6], (1.0, 0.0, -row[vehicle.GRAVITY]), rtol=1e-9)
+    np.testing.assert_allclose(state[3:6], (1.0, 0.0, -row[VEHICLE.gravity]), rtol=1e-9)
 
 
 def test_torque_free_motion_keeps_energy_and_angular_momentum(row, state):
-    inertia = row[vehicle.INERTIA_X : vehicle.INERTIA_Z + 1]
+    inertia = row[VEHICLE.inertia : VEHICLE.inertia + 3]
     state[10:13] = (3.0, 5.0, -4.0)
     turn = Rotation.from_quat(state[6:10], scalar_first=True)
     momentum, energy = turn.apply(inertia * state[10:13]), inertia @ state[10:13] ** 2
@@ -72,7 +71,7 @@ def test_torque_free_motion_keeps_energy_and_angular_momentum(row, state):
 
 def test_symmetric_top_precesses_at_its_rate(row, state):
     ix, iz = 2e-3, 5e-3
-    row[vehicle.INERTIA_X : vehicle.INERTIA_Z + 1] = (ix, ix, iz)
+    row[VEHICLE.inertia : VEHICLE.inertia + 3] = (ix, ix, iz)
     wz, across, t = 6.0, 1.0, 2.0
     state[10:13] = (across, 0.0, wz)
     fly(row, state, t)
@@ -83,8 +82,8 @@ def test_symmetric_top_precesses_at_its_rate(row, state):
 
 def test_step_is_of_fourth_order(row):
     def end(dt):
-        state = np.zeros(body.COLUMNS)
-        state[2], state[body.ATTITUDE] = 100.0, 1.0
+        state = np.zeros(STATE.size + 4)
+        state[2], state[STATE.q_WB] = 100.0, 1.0
         state[10:13], state[13:17] = (4.0, -3.0, 8.0), (400.0, 350.0, 300.0, 380.0)
         return fly(row, state, 0.64, (200.0, 480.0, 300.0, 400.0), dt=dt)
 
@@ -94,7 +93,7 @@ def test_step_is_of_fourth_order(row):
 
 
 def test_hover_speed_carries_the_weight(row, state):
-    speed = math.sqrt(row[vehicle.MASS] * row[vehicle.GRAVITY] / (4 * row[vehicle.THRUST]))
+    speed = math.sqrt(row[VEHICLE.mass] * row[VEHICLE.gravity] / (4 * row[VEHICLE.thrust]))
     state[13:17] = speed
     fly(row, state, 2.0, (speed,) * 4)
     np.testing.assert_allclose(state[3:6], 0.0, atol=1e-9)
@@ -102,7 +101,7 @@ def test_hover_speed_carries_the_weight(row, state):
 
 
 def test_rotor_step_response_is_exact_at_any_step(row, state):
-    lag = row[vehicle.ROTOR_LAG]
+    lag = row[VEHICLE.rotor_lag]
     for dt in (0.0025, 0.02):
         state[13:17] = 200.0
         fly(row, state, 0.06, (400.0,) * 4, dt=dt)

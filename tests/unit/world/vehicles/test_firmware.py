@@ -8,7 +8,7 @@ import pytest
 from zsim.math.frames import heading, quaternion_from_rpy
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.vehicles import observer
+from zsim_world.vehicles.observer import BELIEF
 
 PRESETS = [
     {"preset": "paper"},
@@ -359,12 +359,12 @@ def test_belief_agrees_with_truth(sensors):
     for i in range(3):
         belief = flight.boards.belief[i]
         q = truth.orientation_wxyz[i]
-        own = belief[observer.ATTITUDE : observer.ATTITUDE + 4]
+        own = belief[BELIEF.q_WB : BELIEF.q_WB + 4]
         z, z_own = (np.array([2 * (a[1] * a[3] + a[0] * a[2]), 2 * (a[2] * a[3] - a[0] * a[1])]) for a in (q, own))
         turn = heading(own) - heading(q)  # tilt is compared in each one's own heading
         rotated = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ z
         assert np.linalg.norm(rotated - z_own) < math.radians(1.5)
         assert abs((turn + math.pi) % (2 * math.pi) - math.pi) < math.radians(3.0)
-        believed = belief[observer.VELOCITY : observer.VELOCITY + 3]
+        believed = belief[BELIEF.v_H : BELIEF.v_H + 3]
         np.testing.assert_allclose(believed, in_heading_frame(truth, i), atol=0.3)
-        assert abs(belief[observer.HEIGHT] - truth.position_m[i, 2]) < 0.3
+        assert abs(belief[BELIEF.height] - truth.position_m[i, 2]) < 0.3

@@ -8,7 +8,9 @@ import pytest
 from scipy.linalg import expm, solve_discrete_are
 
 from zsim.scenario.scenario_file import resolve
+from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim_world.vehicles import observer_gains
+from zsim_world.vehicles.observer_gains import GAIN
 
 PRESETS = [{"preset": "paper"}, {"preset": "paper", "as_printed": True}, {"preset": "ardrone2"}]
 NAMES = ["paper", "as_printed", "ardrone2"]
@@ -17,7 +19,7 @@ NAMES = ["paper", "as_printed", "ardrone2"]
 def row_of(sensors, **drone):
     drones = [{"name": "a", "position_m": [0, 0, 0], **drone}]
     scenario = resolve({"name": "t", "duration_s": 1, "sensors": sensors, "drones": drones})
-    return observer_gains.gain_row(scenario.drones[0], scenario.environment)
+    return observer_gains.gain_row(ARDRONE2, scenario.drones[0], scenario.environment)
 
 
 @pytest.mark.parametrize("sensors", PRESETS, ids=NAMES)
@@ -26,8 +28,8 @@ def test_observer_gains_make_a_stable_filter_over_its_true_schedule(sensors):
     row = row_of(sensors)
     c, g = 0.249 / 0.429, 9.80665
     step = np.eye(4) + 0.005 * np.array([[-c, g, 0, 1], [0, 0, 1, 0], [0, 0, 0, 0], [0, 0, 0, 0]])
-    accel = np.eye(4) - np.outer(row[observer_gains.ACCEL_V : observer_gains.ACCEL_U + 1], [-c, 0, 0, 1])
-    flow = np.eye(4) - np.outer(row[observer_gains.FLOW_V : observer_gains.FLOW_U + 1], [1, 0, 0, 0])
+    accel = np.eye(4) - np.outer(row[GAIN.accel_v : GAIN.accel_u + 1], [-c, 0, 0, 1])
+    flow = np.eye(4) - np.outer(row[GAIN.flow_v : GAIN.flow_u + 1], [1, 0, 0, 0])
     second = np.eye(4)
     for k in range(200):
         second = accel @ step @ second
@@ -69,9 +71,4 @@ def test_gains_are_finite_for_absurd_sensors(accel, flow, rate, drag):
     }
     row = row_of(sensors, drag_n_s_m=drag)
     assert np.isfinite(row).all()
-    assert (
-        np.abs(
-            row[[observer_gains.FLOW_V, observer_gains.BARO_Z, observer_gains.SONAR_Z, observer_gains.MAG_PSI]]
-        ).max()
-        <= 1.0
-    )
+    assert np.abs(row[[GAIN.flow_v, GAIN.baro_z, GAIN.sonar_z, GAIN.mag_psi]]).max() <= 1.0

@@ -8,8 +8,11 @@ from zsim.math import rotation
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics.simd import LANES
-from zsim_world.state.vehicle import COLUMNS as PARAMETERS
-from zsim_world.vehicles import attitude_control, observer, simd_firmware
+from zsim_world.state.fleet_arrays import ROTOR, VEHICLE, PerRotor
+from zsim_world.vehicles import attitude_control, observer
+from zsim_world.vehicles.attitude_control import DRIVE
+from zsim_world.vehicles.observer import BELIEF
+from zsim_world.vehicles.simd_firmware import BOARD_LANES, BOARD_ROTORS
 
 COUNT = 11  # a whole block and a part of one
 STEP_TICKS = 2  # of 2.5 ms
@@ -47,6 +50,11 @@ def lane(table, i, at, count):
     return tuple(table[i // LANES].reshape(-1, LANES)[at : at + count, i % LANES].tolist())
 
 
+def rotors_of(table, i, group, count):
+    """Return groups of numbers per rotor of drone i."""
+    return PerRotor(np.array(lane(table, i, BOARD_LANES.size + 4 * group, 4 * count)), 0, 1, (0, 1, 2, 3))
+
+
 def test_a_block_turns_and_drives_with_the_bits_of_each_drone():
     fleet, driven = flying(), 0
     boards, lanes = fleet.boards, fleet.boards.lanes
@@ -55,26 +63,22 @@ def test_a_block_turns_and_drives_with_the_bits_of_each_drone():
         before = boards.belief.copy()
         fleet._integrate(STEP_TICKS)
         for i in range(COUNT):
-            w = lane(lanes, i, simd_firmware.BODY_RATE, 3)
+            w = lane(lanes, i, BOARD_LANES.w_WB_B, 3)
             turn = rotation.from_rotation_vector(observer.step_turn(w))
-            q = rotation.normalised(
-                rotation.multiply(tuple(before[i, observer.ATTITUDE : observer.ATTITUDE + 4]), turn)
-            )
-            assert lane(lanes, i, simd_firmware.HEADING, 1) == (rotation.heading(q),)
-            if lane(lanes, i, simd_firmware.DRIVEN, 1) == (0.0,):
+            q = rotation.normalised(rotation.multiply(tuple(before[i, BELIEF.q_WB : BELIEF.q_WB + 4]), turn))
+            assert lane(lanes, i, BOARD_LANES.heading, 1) == (rotation.heading(q),)
+            if lane(lanes, i, BOARD_LANES.driven, 1) == (0.0,):
                 continue
             driven += 1
-            sizes = {
-                simd_firmware.OWN: 4,
-                simd_firmware.ATTITUDE: 4,
-                simd_firmware.BODY_RATE: 3,
-                simd_firmware.ROTOR: 4,
-                simd_firmware.UPWARDS: 3,
-            }
-            own, believed, rate, rotor, z = (lane(lanes, i, at, size) for at, size in sizes.items())
-            thrust, yaw_rate = lane(lanes, i, simd_firmware.LIFT, 2)
-            row, gains = lane(lanes, i, 0, PARAMETERS), lane(lanes, i, simd_firmware.GAINS, 4)
-            found = attitude_control.drive(row, gains, own, believed, rate, rotor, z, thrust, yaw_rate)
-            assert lane(lanes, i, simd_firmware.COMMAND, 4) == found
+            sizes = {BOARD_LANES.own: 4, BOARD_LANES.q_WB: 4, BOARD_LANES.w_WB_B: 3, BOARD_LANES.z_H: 3}
+            own, believed, rate, z = (lane(lanes, i, at, size) for at, size in sizes.items())
+            thrust, yaw_rate = lane(lanes, i, BOARD_LANES.thrust, 2)
+            row, gains = lane(lanes, i, 0, VEHICLE.size), lane(lanes, i, BOARD_LANES.drive, DRIVE.size)
+            known, speeds = (
+                rotors_of(lanes, i, group, size) for group, size in ((0, ROTOR.size), (BOARD_ROTORS.speed, 1))
+            )
+            commands = PerRotor(np.zeros(4), 0, 1, (0, 1, 2, 3))
+            attitude_control.drive(row, known, gains, own, believed, rate, speeds, z, thrust, yaw_rate, commands)
+            assert tuple(rotors_of(lanes, i, BOARD_ROTORS.command, 1).numbers) == tuple(commands.numbers)
     assert driven == 60 * (COUNT - 2)
-    np.testing.assert_array_equal(lane(lanes, 2, simd_firmware.COMMAND, 4), fleet.bodies.command[2])
+    np.testing.assert_array_equal(rotors_of(lanes, 2, BOARD_ROTORS.command, 1).numbers, fleet.bodies.command[2])

@@ -10,7 +10,7 @@ from zsim.errors import DecodeError
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.fleet.publication import Publication
+from zsim_world.fleet.publication import GatePublication
 
 DRONES = ["d1", "d2", "d3"]
 
@@ -21,7 +21,7 @@ def said() -> list[GateMessages]:
     places = [{"name": name, "position_m": [3 * i, 0, 0]} for i, name in enumerate(DRONES)]
     latency = {"gps": {"latency_ms": 35.0}, "baro": {"latency_ms": 12.5}}
     fleet = Fleet(scenario_file.resolve({"name": "gate", "duration_s": 5, "drones": places, "sensors": latency}))
-    publication, gates = Publication(fleet), []
+    publication, gates = GatePublication(fleet), []
     for gate in range(100):
         fleet.advance()
         gates.append(publication.gate([None, "pilot.one" if gate > 50 else None, *[None] * (fleet.count - 2)]))

@@ -35,7 +35,7 @@ def test_the_sources_of_a_kernel_are_all_that_its_module_imports():
         "compiled",
     }
     assert flown <= names("zsim_world.fleet.kernel")
-    assert "kernel" not in names("zsim_world.physics.normal_variates")
+    assert "kernel" not in names("zsim_world.sensors.noise")
 
 
 def test_the_digest_changes_with_each_file(tmp_path: Path):

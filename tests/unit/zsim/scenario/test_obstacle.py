@@ -11,9 +11,9 @@ from zsim.errors import ScenarioError
 from zsim.scenario.obstacle import nearest, row_of
 from zsim.scenario.scenario import Obstacle, Scenario
 from zsim.scenario.scenario_file import resolve
+from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.flight.world import World
-from zsim_world.state.vehicle import HULL_RADIUS_M
 
 BOX = {"name": "wall", "shape": "box", "position_m": [4, 0, 0], "size_m": [1, 6, 5]}
 PILLAR = {"name": "pillar", "shape": "cylinder", "position_m": [4, 0.1, 0], "radius_m": 0.5, "height_m": 5}
@@ -90,7 +90,7 @@ def test_a_drone_that_flies_into_an_obstacle_does_not_get_through(given: dict[st
             fleet.set_velocity(0, (1.0, 0.0, 0.0), 0.0, "world")
         fleet.advance()
         began += fleet.bumps()
-        depths.append(HULL_RADIUS_M - nearest(solid, *fleet.truth().position_m[0])[0])
+        depths.append(ARDRONE2.airframe.hull_radius_m - nearest(solid, *fleet.truth().position_m[0])[0])
     assert began[0] == (0, 0)
     assert 0.0 < max(depths) < 0.1  # of the hull's 0.26 m
     assert fleet.touching.tolist() == [bool(depths[-1] > 0), False]

@@ -482,8 +482,14 @@ def test_huge_whole_numbers_are_a_fault_and_no_crash(digits: int):
         ({"drones": [7]}, "step.yaml: drones[0] is 7; must be a map"),
         ({"clusters": 5}, "step.yaml: clusters is 5; must be a list"),
         ({"sensors": 5}, "step.yaml: sensors is 5; must be a map"),
-        ({"sensors": {"preset": "best"}}, "step.yaml: sensors.preset is 'best'; must be one of ardrone2, paper"),
-        ({"sensors": {"preset": ["paper"]}}, "step.yaml: sensors.preset is ['paper']; must be one of ardrone2, paper"),
+        (
+            {"sensors": {"preset": "best"}},
+            "step.yaml: sensors.preset is 'best'; must be one of ardrone2, crazyflie2, paper",
+        ),
+        (
+            {"sensors": {"preset": ["paper"]}},
+            "step.yaml: sensors.preset is ['paper']; must be one of ardrone2, crazyflie2, paper",
+        ),
         ({"sensors": {"lidar": {}}}, "step.yaml: sensors.lidar is not known; allowed: as_printed, baro,"),
         ({"sensors": {"imu": 3}}, "step.yaml: sensors.imu is 3; must be a map"),
         ({"drones": [drone("a", sensors=3)]}, "step.yaml: drones[0].sensors is 3; must be a map (drone 'a')"),

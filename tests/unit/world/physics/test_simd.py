@@ -9,9 +9,10 @@ from zsim.math.compiled import inlined
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.physics import rigid_body as body
-from zsim_world.physics import simd_body
+from zsim_world.physics import simd
 from zsim_world.physics.ground import drag_anchors
 from zsim_world.physics.rigid_body import four, put, vector
+from zsim_world.state.fleet_arrays import STATE, PerRotor
 
 DT = 0.0025  # s
 COUNT = 11  # a whole block and a part of one
@@ -22,9 +23,13 @@ def each(bodies, dt):
     """Integrate one drone after the other, the ground always with it."""
     for i in range(bodies.state.shape[0]):
         row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
-        air, push, command = vector(bodies.air[i], 0), vector(bodies.push[i], 0), four(bodies.command[i], 0)
-        body.step(row, anchor, state, command, air, push, dt)
-        drag_anchors(row, anchor, vector(state, body.POSITION), four(state, body.ATTITUDE))
+        rotors, air, push = (
+            PerRotor(bodies.rotors[i], 0, 1, bodies.each),
+            vector(bodies.air[i], 0),
+            vector(bodies.push[i], 0),
+        )
+        body.step(row, rotors, anchor, state, bodies.command[i], air, push, dt)
+        drag_anchors(row, anchor, vector(state, STATE.p_WB), four(state, STATE.q_WB))
 
 
 @inlined
@@ -32,9 +37,14 @@ def accelerate_each(bodies):
     """Note the accelerations of one drone after the other, the ground always with it."""
     for i in range(bodies.state.shape[0]):
         row, state, anchor = bodies.vehicle[i], bodies.state[i], bodies.anchor[i]
-        (p, v, q, w), speed, command = body.pose(state), four(state, body.ROTOR), four(bodies.command[i], 0)
-        air, push = vector(bodies.air[i], 0), vector(bodies.push[i], 0)
-        a, alpha = body.accelerations(True, row, anchor, p, v, q, w, speed, command, air, push)
+        (p, v, q, w), each = body.pose(state), bodies.each
+        rotors, speeds = PerRotor(bodies.rotors[i], 0, 1, each), PerRotor(state, STATE.size, 1, each)
+        commands, air, push = (
+            PerRotor(bodies.command[i], 0, 1, each),
+            vector(bodies.air[i], 0),
+            vector(bodies.push[i], 0),
+        )
+        a, alpha = body.accelerations(True, row, rotors, anchor, p, v, q, w, speeds, commands, None, air, push)
         put(bodies.accel[i], 0, a)
         put(bodies.accel[i], 3, alpha)
 
@@ -47,17 +57,22 @@ def bodies_in_motion(rng, height_m, count=COUNT):
     ]
     bodies = Fleet(resolve({"name": "t", "duration_s": 1, "drones": drones})).bodies
     state = bodies.state
-    state[:, body.VELOCITY : body.VELOCITY + 3] = rng.normal(0.0, 4.0, (count, 3))
+    state[:, STATE.v_WB : STATE.v_WB + 3] = rng.normal(0.0, 4.0, (count, 3))
     turned = rng.normal((1.0, 0.0, 0.0, 0.0), 0.4, (count, 4))
-    state[:, body.ATTITUDE : body.ATTITUDE + 4] = turned / np.linalg.norm(turned, axis=1)[:, None]
-    state[:, body.RATE : body.RATE + 3] = rng.normal(0.0, 2.0, (count, 3))
-    state[:, body.ROTOR :], bodies.command[:] = rng.uniform(200.0, 500.0, (2, count, 4))
+    state[:, STATE.q_WB : STATE.q_WB + 4] = turned / np.linalg.norm(turned, axis=1)[:, None]
+    state[:, STATE.w_WB_B : STATE.w_WB_B + 3] = rng.normal(0.0, 2.0, (count, 3))
+    state[:, STATE.size :], bodies.command[:] = rng.uniform(200.0, 500.0, (2, count, 4))
     bodies.air[:], bodies.push[:] = rng.normal(0.0, 1.0, (2, count, 3))
     return bodies
 
 
 def copied(bodies):
-    return type(bodies)(*(type(x)(*(y.copy() for y in x)) if isinstance(x, tuple) else x.copy() for x in bodies))
+    return type(bodies)(
+        *(
+            type(x)(*(y.copy() for y in x)) if hasattr(x, "_fields") else x if isinstance(x, tuple) else x.copy()
+            for x in bodies
+        )
+    )
 
 
 @pytest.mark.parametrize("count", [1, 8, COUNT])
@@ -65,12 +80,12 @@ def copied(bodies):
 def test_a_block_gives_the_bits_of_each_drone(height_m, count):
     one = bodies_in_motion(np.random.default_rng(3), height_m, count)
     other, least_m = copied(one), np.inf
-    simd_body.line_up(one)
+    simd.line_up(one)
     for _ in range(400):
-        simd_body.move(one, DT)
+        simd.move(one, DT)
         each(other, DT)
         np.testing.assert_array_equal(one.state, other.state)
-        simd_body.accelerate(one)
+        simd.accelerate(one)
         accelerate_each(other)
         np.testing.assert_array_equal(one.accel, other.accel)
         least_m = min(least_m, one.state[:, 2].min())

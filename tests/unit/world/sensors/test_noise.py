@@ -1,0 +1,41 @@
+"""The kernel's normal numbers are those of numpy's generators."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from zsim.math.random_streams import stream
+from zsim.scenario.scenario_file import resolve
+from zsim_world.sensors.noise import WIDTHS, NoiseTable
+from zsim_world.sensors.sensor_set import CHANNELS, SENSORS
+
+IMU = 0
+
+
+def noise(gates: int) -> NoiseTable:
+    drones: list[dict[str, Any]] = [{"name": name, "position_m": [3 * k, 0, 0]} for k, name in enumerate("ab")]
+    return NoiseTable(resolve({"name": "t", "duration_s": 1, "seed": 3, "drones": drones}), gates)
+
+
+@pytest.mark.parametrize("used", [0, 1, 7])
+def test_a_stream_goes_on_where_it_was_left(used: int):
+    table = noise(gates=2)
+    rng = stream(3, "b/imu")
+    rng.standard_normal(CHANNELS[IMU])  # the bias at the start
+    width = WIDTHS[IMU]
+    rows = (table.at[IMU + 1] - table.at[IMU]) // width
+    expected = rng.standard_normal((rows + used, width))
+    np.testing.assert_array_equal(table.table[1, : rows * width], expected[:rows].ravel())
+    table.cursor[:-1, IMU] = used
+    table.refill()
+    assert not table.cursor.any()
+    np.testing.assert_array_equal(table.table[1, : rows * width], expected[used:].ravel())
+
+
+def test_all_drones_share_one_wind():
+    table = noise(gates=2)
+    rng = stream(3, "wind")
+    rng.standard_normal(3)  # the gust at the start
+    at = table.at[len(SENSORS)]
+    np.testing.assert_array_equal(table.table[-1, at:], rng.standard_normal(table.table.shape[1] - at))

@@ -1,0 +1,112 @@
+"""Vehicles as data: stock ones are sound, and what is none is refused with one line."""
+
+import re
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from zsim.errors import DocumentError, ScenarioError
+from zsim.scenario import scenario_file
+from zsim.vehicles import ardrone2, catalogue
+from zsim.vehicles.vehicle import DEFAULTS, Rotor, Vehicle, allocation, cross_layout, mixing
+
+
+def document(**drone: Any) -> dict[str, Any]:
+    return {"name": "t", "duration_s": 1, "drones": [{"name": "a", "position_m": [0, 0, 0], **drone}]}
+
+
+def fault_of(**drone: Any) -> str:
+    with pytest.raises(ScenarioError) as raised:
+        scenario_file.resolve(document(**drone))
+    (line,) = raised.value.faults
+    return line
+
+
+@pytest.mark.parametrize("model", catalogue.STOCK)
+def test_a_stock_vehicle_gives_a_drone_its_numbers(model: str):
+    vehicle = catalogue.vehicle_of(model)
+    drone = scenario_file.resolve(document(model=model)).drones[0]
+    assert {name: getattr(drone, name) for name in DEFAULTS} == {name: getattr(vehicle, name) for name in DEFAULTS}
+    assert drone.limits == vehicle.limits
+    assert drone.sensors.preset == vehicle.sensor_preset
+
+
+@pytest.mark.parametrize("model", catalogue.STOCK)
+def test_every_number_of_a_stock_vehicle_has_its_source_or_reason(model: str):
+    text = Path(str(getattr(catalogue, model).__file__)).read_text()
+    numbers = [line for line in text.splitlines() if re.match(r"\s+\w+=\(?-?[\d.]", line)]
+    assert len(numbers) > 50
+    assert [line for line in numbers if "#" not in line] == []
+
+
+def test_a_drone_overrides_its_vehicle_field_by_field():
+    drone = scenario_file.resolve(document(model="crazyflie2", mass_kg=0.035, limits={"tilt_deg": 12})).drones[0]
+    assert (drone.mass_kg, drone.arm_m) == (0.035, 0.0397)
+    assert (drone.limits.tilt_deg, drone.limits.horizontal_speed_m_s) == (12.0, 2.0)
+
+
+def test_a_module_of_the_users_is_a_model():
+    drone = scenario_file.resolve(document(model="hexacopter")).drones[0]
+    assert drone.thrust_n_s2 == pytest.approx(8.048e-6 * 2 / 3)
+
+
+def test_a_resolved_scenario_names_a_module_that_nobody_imports():
+    text = scenario_file.to_text(scenario_file.resolve(document(model="hexacopter")))
+    other = scenario_file.from_text(text.replace("hexacopter", "not_here.at_all"))
+    assert other.drones[0].model == "not_here.at_all"
+
+
+@pytest.mark.parametrize("model", ["ardrone", "no_such.module", "3d", "a/b"])
+def test_an_unknown_model_is_a_line_with_drone_value_and_what_is_allowed(model: str):
+    line = fault_of(model=model)
+    for part in ("drones[0].model", repr(model), "ardrone2, crazyflie2", "(drone 'a')"):
+        assert part in line
+
+
+@pytest.mark.parametrize(("value", "found"), [(None, "no VEHICLE"), (3, "'int'")])
+def test_a_module_without_a_vehicle_is_refused(monkeypatch: pytest.MonkeyPatch, value: Any, found: str):
+    module = ModuleType("my_plane")
+    if value is not None:
+        module.__dict__["VEHICLE"] = value
+    monkeypatch.setitem(__import__("sys").modules, "my_plane", module)
+    assert found in fault_of(model="my_plane")
+
+
+def test_faulty_parameters_are_named(monkeypatch: pytest.MonkeyPatch):
+    module = ModuleType("my_brick")
+    module.__dict__["VEHICLE"] = replace(ardrone2.VEHICLE, mass_kg=-1.0)
+    monkeypatch.setitem(__import__("sys").modules, "my_brick", module)
+    with pytest.raises(DocumentError) as raised:
+        catalogue.vehicle_of("my_brick", "a.yaml: drones[0].model")
+    (line,) = raised.value.faults
+    assert line.startswith("a.yaml: drones[0].model is 'my_brick'")
+    assert "VEHICLE.mass_kg is -1.0" in line
+
+
+def with_rotors(*rotors: Rotor) -> Vehicle:
+    return replace(ardrone2.VEHICLE, rotors=rotors)
+
+
+@pytest.mark.parametrize(
+    "rotors",
+    [
+        cross_layout(0.2)[:3],
+        (*cross_layout(0.2)[:3], cross_layout(0.2)[0]),
+        (*cross_layout(0.2)[:3], replace(cross_layout(0.2)[3], x_m=0.5)),
+        tuple(replace(rotor, y_m=0.0) for rotor in cross_layout(0.2)),
+    ],
+    ids=["three", "one twice", "off the centre", "in a line"],
+)
+def test_rotors_that_cannot_hold_it_level_are_refused(rotors: tuple[Rotor, ...]):
+    with pytest.raises(ValueError, match="rotors"):
+        with_rotors(*rotors)
+
+
+def test_mixing_inverts_the_allocation_and_adds_no_thrust():
+    for vehicle in (*catalogue.STOCK.values(), catalogue.vehicle_of("hexacopter")):
+        np.testing.assert_allclose(allocation(vehicle) @ mixing(vehicle), np.eye(3), atol=1e-9)
+        np.testing.assert_allclose(mixing(vehicle).sum(axis=0), 0.0, atol=1e-9)

@@ -1,0 +1,230 @@
+"""The parameters of a vehicle: what a scenario may override for one drone, and what it is silent about.
+
+Geometry in B: x forward, y left, z up, origin at the centre of mass. Thrust, torque and drag hold at an air density of
+1.225 kg/m^3. A drone whose `arm_m`, `thrust_n_s2` or `torque_nm_s2` is overridden is taken as similar in shape: lengths
+of the airframe grow with the arm, a rotor's radius with the fourth root of its thrust coefficient, its inertia with
+its torque coefficient.
+"""
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+from msgspec import Meta, Struct
+
+from zsim.schema.quantities import Fraction, NonNegative, Positive, Real
+
+ROTORS_MIN, ROTORS_MAX = 4, 8  # fewer cannot hold a hover at every heading; more do not go into a message
+BALANCE_MAX = 1e-6  # of the arm, by which the centre of the rotors may miss that of mass
+RANK_MIN = 1e-3  # least share that one of roll, pitch and yaw may have of the strongest
+
+Mass = Annotated[float, Meta(gt=0, le=100)]
+Arm = Annotated[float, Meta(gt=0, le=10)]
+RotorLag = Annotated[float, Meta(ge=0.005, le=1)]
+TakeoffHeight = Annotated[float, Meta(ge=0.3, le=5)]
+
+
+class Limits(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the firmware allows a commander; defaults and ranges of the AR.Drone SDK's outdoor set where it has them."""
+
+    tilt_deg: Annotated[float, Meta(gt=0, le=30)] = 20.0  # outdoor_euler_angle_max, 0.349 rad
+    horizontal_speed_m_s: Annotated[float, Meta(gt=0, le=10)] = 5.0  # chosen, the SDK has none; 20 deg hold 6 m/s
+    vertical_speed_m_s: Annotated[float, Meta(ge=0.2, le=2)] = 1.0  # outdoor_control_vz_max
+    yaw_rate_deg_s: Annotated[float, Meta(gt=0, le=350)] = 200.0  # outdoor_control_yaw, 3.49 rad/s
+    altitude_m: Positive = 100.0  # altitude_max: what it takes for no limit
+
+
+class Rotor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One rotor; `turn` is 1 if it turns clockwise seen from above: the sign of its drag torque about z."""
+
+    name: str
+    x_m: Real
+    y_m: Real
+    turn: Literal[-1, 1]
+
+
+class Airframe(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What touches the ground and others: four feet, four points of the hull's rim, and the hull as a sphere."""
+
+    hull_radius_m: Positive
+    foot_xy_m: Positive
+    """|x| and |y| of a foot."""
+    foot_depth_m: Positive
+    """Below the centre of mass."""
+    foot_sag_m: Positive
+    """By which the feet give under the weight; sets their stiffness."""
+    foot_damping_ratio: NonNegative
+    """Of critical, of the aircraft bouncing on its four feet."""
+    friction: NonNegative
+    rim_xy_m: Positive
+    """|x| and |y| of the upper corners."""
+    rim_height_m: Real
+    """Of the upper corners above the centre of mass."""
+    reach_m: Positive
+    """Farther than any of these points from the centre of mass."""
+    hull_frequency_rad_s: Positive
+    """Of two equal drones pressed together."""
+    hull_damping_ratio: NonNegative
+    """Of critical, of two equal drones pressed together."""
+    clearance_m: Positive
+    """Free space about its centre at the start: hull and room."""
+
+
+class Battery(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The energy that rotors and electronics draw."""
+
+    voltage_v: Positive
+    efficiency: Annotated[float, Meta(gt=0, le=1)]
+    """Electric to shaft power."""
+    electronics_w: NonNegative
+
+
+class Firmware(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the firmware's loops, sequences and observer are designed with.
+
+    The gains of rate, tilt and velocity loop follow from the rotors' lag: rate_per_lag over the overdriven lag, and
+    each outer loop slower than the one in it by `loop_ratio`.
+    """
+
+    lag_lead: Annotated[float, Meta(gt=0, le=1)]
+    """The motors are overdriven so that this share of their lag is left."""
+    rate_per_lag: Positive
+    """Rate gain times the overdriven lag."""
+    lag_min_s: Positive
+    """Faster rotors do not make a faster loop."""
+    loop_ratio: Positive
+    yaw_share: Positive
+    """Of the rate gain, about the vertical."""
+    body_rate_max_rad_s: Positive
+    """Wanted of the tilt loop."""
+    climb_share: Positive
+    """Vertical velocity gain over the rate gain."""
+    hold_1_s: Positive
+    """Position gain on the own odometry."""
+    height_1_s: Positive
+    brake_s: NonNegative
+    """Where a hold begins: about the stopping distance over speed."""
+    tilt_cut_cosine: Annotated[float, Meta(ge=-1, le=1)]
+    """Of the tilt beyond which the motors are cut."""
+    lift_share_min: Fraction
+    """Of the weight: thrust never asked below."""
+    spin_up_s: NonNegative
+    """Rotors at their least before the climb."""
+    takeoff_m_s: Positive
+    takeoff_s_max: Positive
+    """Then it hovers where it is."""
+    arrived_m: Positive
+    arrived_m_s: Positive
+    """A take-off is over, with the height within arrived_m."""
+    descent_m_s: Positive
+    """Of a landing near the ground."""
+    descent_far_1_s: NonNegative
+    """Faster by this per metre over flare_m."""
+    flare_m: NonNegative
+    touch_share: Fraction
+    """Of the weight: below, thrust that does not descend stands on the ground."""
+    touch_m_s: Positive
+    """A descent that has stopped."""
+    touch_s: NonNegative
+    """For which both hold before the rotors stop."""
+    low_battery_percent: Annotated[float, Meta(ge=0, le=50)]
+    """It lands; below twice as much it does not take off."""
+    disturbance_walk: Positive
+    """Horizontal disturbance, m/s^2/sqrt(s)."""
+    lift_walk: Positive
+    """Vertical disturbance, m/s^2/sqrt(s)."""
+    tilt_walk: Positive
+    """Of the attitude, least, rad/sqrt(s)."""
+    bias_walk: Positive
+    """Of the gyro, least, rad/s/sqrt(s)."""
+    lift_bias_walk: Positive
+    """Of the vertical accelerometer, least, m/s^2/sqrt(s)."""
+
+
+class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A multirotor. The first block of fields are defaults of a scenario's drone.
+
+    Raises:
+        ValueError: the rotors cannot hold it level, in one line.
+    """
+
+    mass_kg: Mass
+    inertia_kg_m2: tuple[Positive, Positive, Positive]
+    arm_m: Arm
+    """Centre to rotor, the size of the airframe."""
+    thrust_n_s2: Positive
+    torque_nm_s2: Positive
+    rotor_time_constant_s: RotorLag
+    rotor_min_rad_s: NonNegative
+    rotor_max_rad_s: Positive
+    drag_n_s_m: NonNegative
+    battery_mah: Positive
+    takeoff_height_m: TakeoffHeight
+    limits: Limits = Limits()
+    sensor_preset: str = "ardrone2"
+
+    rotors: tuple[Rotor, ...]
+    rotor_radius_m: Positive
+    rotor_inertia_kg_m2: Positive
+    airframe: Airframe
+    battery: Battery
+    firmware: Firmware
+
+    def __post_init__(self) -> None:
+        count, names = len(self.rotors), [rotor.name for rotor in self.rotors]
+        if not ROTORS_MIN <= count <= ROTORS_MAX:
+            raise ValueError(f"rotors has {count} entries; must have {ROTORS_MIN} to {ROTORS_MAX}")
+        if len(set(names)) < count:
+            raise ValueError(f"rotors has the names {', '.join(names)}; must be distinct")
+        layout = allocation(self)
+        off = np.abs(layout.sum(axis=1)).max()
+        if not off <= BALANCE_MAX * count:
+            raise ValueError(f"rotors pull off the centre by {off:.3g} arms; positions and turns must sum to zero")
+        strengths = np.linalg.svd(layout, compute_uv=False)
+        if strengths[-1] < RANK_MIN * strengths[0]:
+            raise ValueError(
+                "rotors cannot give roll, pitch and yaw apart from each other; place them about the centre"
+            )
+
+
+DEFAULTS = (
+    "mass_kg",
+    "inertia_kg_m2",
+    "arm_m",
+    "thrust_n_s2",
+    "torque_nm_s2",
+    "rotor_time_constant_s",
+    "rotor_min_rad_s",
+    "rotor_max_rad_s",
+    "drag_n_s_m",
+    "battery_mah",
+    "takeoff_height_m",
+)
+
+
+def cross_layout(arm_m: float) -> tuple[Rotor, ...]:
+    """Return four rotors in a cross, the first and third clockwise: front left, front right, rear right, rear left."""
+    xy = arm_m / math.sqrt(2.0)
+    corners = {"front_left": (xy, xy), "front_right": (xy, -xy), "rear_right": (-xy, -xy), "rear_left": (-xy, xy)}
+    turns: tuple[Literal[-1, 1], ...] = (1, -1, 1, -1)
+    return tuple(
+        Rotor(name=name, x_m=x, y_m=y, turn=turn) for (name, (x, y)), turn in zip(corners.items(), turns, strict=True)
+    )
+
+
+def allocation(vehicle: Vehicle) -> np.ndarray:
+    """Return what each rotor's thrust gives of roll, pitch and yaw, (3, R).
+
+    Roll and pitch in units of arm_m / sqrt(2), yaw in units of the torque per thrust.
+    """
+    unit = vehicle.arm_m / math.sqrt(2.0)
+    x, y = (np.array([getattr(rotor, axis) / unit for rotor in vehicle.rotors]) for axis in ("x_m", "y_m"))
+    return np.array([y, -x, [float(rotor.turn) for rotor in vehicle.rotors]])
+
+
+def mixing(vehicle: Vehicle) -> np.ndarray:
+    """Return the thrust of each rotor for a unit of roll, pitch and yaw, (R, 3): the pseudo-inverse of `allocation`.
+
+    Rounded to twelve digits, so that the numbers do not depend on the library of linear algebra.
+    """
+    return np.array([[float(f"{x:.12g}") for x in row] for row in np.linalg.pinv(allocation(vehicle))])
