@@ -73,7 +73,7 @@ def in_process(path: Path, radius_m: float, duration_s: float) -> None:
 
 def on_zenoh(endpoint: str, radius_m: float) -> None:
     with find_world(endpoint, "zsim", wait_s=60.0, say=print) as (link, info):
-        link.on_message(keys.EVENT, lambda sample: say(sample.key, messages.decode(sample.key, sample.payload)))
+        link.declare_subscriber(keys.EVENT, lambda sample: say(sample.key, messages.decode(sample.key, sample.payload)))
         print(Runner(link, info, Geofence(info, radius_m), say=print).run())
 
 

@@ -6,7 +6,8 @@ from zsim.contract import keys, messages
 from zsim.contract.fingerprint import join_of
 from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
-from zsim.transport.session import Sample, Session
+from zsim.transport.samples import RawSample
+from zsim.transport.session import Session
 
 JOIN_EVENTS = ("join", "restart", "superseded")  # kinds of events that report a process that joined
 
@@ -40,7 +41,7 @@ class ObserverProcess:
 
     def announce(self) -> None:
         """Join the run."""
-        self._link.on_message(keys.EVENT, self._on_event)
+        self._link.declare_subscriber(keys.EVENT, self._on_event)
         self._link.on_link(self._on_link)
         self._link.declare_token(keys.token(self.name))
         self._join()
@@ -90,7 +91,7 @@ class ObserverProcess:
         if not self._superseded:
             self._link.put(keys.process(self.name, "bye"), messages.Bye(self.now_ns, 0, reason))
 
-    def _on_event(self, sample: Sample) -> None:
+    def _on_event(self, sample: RawSample) -> None:
         try:
             event = messages.decode(keys.EVENT, sample.payload)
         except DecodeError:

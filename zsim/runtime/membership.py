@@ -16,7 +16,8 @@ from zsim.contract.world_events import ProcessEntry
 from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
 from zsim.runtime.agent import Agent, Output
 from zsim.transport.connection import read_info
-from zsim.transport.session import Sample, Session
+from zsim.transport.samples import ReceivedSample
+from zsim.transport.session import Session
 
 REPLAY_S = 2.0  # a hub answers a replay within milliseconds; a lost link does not
 REJOINS_MAX = 6  # times that a return is said before it is taken for granted; a router forwards nothing at first
@@ -46,7 +47,7 @@ class Membership:
         link: Session,
         info: messages.Info,
         agent: Agent,
-        take_in: Callable[[Sample], None],
+        take_in: Callable[[ReceivedSample], None],
         say: Callable[[str], None],
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -229,7 +230,7 @@ class Membership:
         self.ask_faults()
         try:
             for key, payload in replay(self._link, self._agent.name, since_ns, self._agent.reads, REPLAY_S):
-                self._take_in(Sample(key, payload))
+                self._take_in(ReceivedSample(key, payload))
         except NoWorldError:
             return
         self._missed_since_ns = None

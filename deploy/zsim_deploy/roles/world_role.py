@@ -15,7 +15,7 @@ from zsim.contract import keys, messages
 from zsim.errors import RunError
 from zsim.runtime.progress import QUIET, HoldReasons, JsonProgress, ProgressSink, Screen, Throttle
 from zsim.scenario.scenario import Scenario
-from zsim.transport import session
+from zsim.transport.samples import check_expression
 from zsim.transport.tls import Identity
 from zsim_deploy.roles.stop_channel import StopChannel
 
@@ -149,7 +149,7 @@ def play(place: Path, options: ReplayOptions, who: Identity) -> None:
     from zsim_world.server.world_process import run
 
     for expression in options.choice.keys:
-        session.check_expression(expression)
+        check_expression(expression)
     stop = StopChannel()
     with open_run(place) as (reader, info, scenario):
         _check(options.choice.keys, reader)

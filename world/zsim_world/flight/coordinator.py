@@ -19,7 +19,7 @@ from zsim.runtime.agent import Output
 from zsim.scenario.rights import WORLD
 from zsim.scenario.role_table import on_death
 from zsim.scenario.scenario import Scenario
-from zsim_world.flight.barrier import Barrier, RunParticipant
+from zsim_world.flight.barrier import Barrier, Participant
 from zsim_world.flight.run_clock import Operation, RunClock, number
 from zsim_world.flight.run_outbox import KeyedMessage, Refusal, RunOutbox
 from zsim_world.flight.run_statistics import RunStatistics
@@ -144,7 +144,7 @@ class Coordinator(ABC):
             self._release_drones(dead.name)
         self._warn_of(joined)
 
-    def _warn_of(self, joined: RunParticipant) -> None:
+    def _warn_of(self, joined: Participant) -> None:
         """Publish that a newcomer computes with other bits, or does the work of others too."""
         name, join, own = joined.name, joined.join, fingerprint()
         if join.fingerprint and join.fingerprint != own:
@@ -166,7 +166,7 @@ class Coordinator(ABC):
                     self.barrier.expect(each)
         self._after_bye(participant, message.reason)
 
-    def _after_bye(self, participant: RunParticipant, reason: str) -> None:
+    def _after_bye(self, participant: Participant, reason: str) -> None:
         """Do what the leave of a process means for the run."""
         if participant.join.role == "recorder":
             self.clock.stop(f"the recorder left: {reason}")
@@ -191,7 +191,7 @@ class Coordinator(ABC):
         if action == "end":
             self.clock.stop(f"{name} died")
 
-    def _on_death(self, participant: RunParticipant) -> str:
+    def _on_death(self, participant: Participant) -> str:
         """Return the action when a process has died."""
         return on_death(self.scenario.processes.on_death, participant.name, participant.join.role)
 
@@ -234,7 +234,7 @@ class Coordinator(ABC):
             return not self.barrier.absent()
         return clock.mode == "realtime" or not self.barrier.blocking(clock.required_ns)
 
-    def blocking(self, ahead_ns: int = 0) -> list[RunParticipant]:
+    def blocking(self, ahead_ns: int = 0) -> list[Participant]:
         """Return whose dones are missing for the next gate, or for one that comes so much later."""
         return self.barrier.blocking(self.clock.required_ns + ahead_ns)
 

@@ -18,7 +18,7 @@ from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
 from zsim.runtime.agent import Output
 from zsim.scenario.scenario import Scenario
-from zsim_world.flight.barrier import RunParticipant
+from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.flight.run_clock import number, refused_argument
 from zsim_world.flight.run_outbox import Refusal
@@ -242,10 +242,10 @@ class Playback(Coordinator):
     def refusal_at(self, key: str) -> str | None:
         return None if f"controller.{keys.thing(key)}" in self._live() else NOT_FLYABLE
 
-    def _after_bye(self, participant: RunParticipant, reason: str) -> None:
+    def _after_bye(self, participant: Participant, reason: str) -> None:
         """Go on: the record is there already."""
 
-    def _on_death(self, participant: RunParticipant) -> str:
+    def _on_death(self, participant: Participant) -> str:
         return "drop"
 
 

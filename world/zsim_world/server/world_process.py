@@ -16,9 +16,11 @@ from zsim.runtime.agent import Output
 from zsim.runtime.health import HealthMeter
 from zsim.scenario import rights
 from zsim.scenario.rights import WORLD
-from zsim.transport import session
-from zsim.transport.session import Query, Session
+from zsim.transport import connection
+from zsim.transport.declarations import Query
+from zsim.transport.session import Session
 from zsim.transport.tls import Identity
+from zsim.transport.zenoh_settings import Mode
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
@@ -96,7 +98,7 @@ class WorldProcess:
         self._outputs.publish(Output(keys.INFO, self._world.info()))
         answered = (*rights.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self._world.refused_queries)
         for expression in answered:
-            self._link.answer(expression, self._on_query)
+            self._link.declare_queryable(expression, self._on_query)
         self._link.on_token("process/*", self._on_token)
         self._link.declare_token(keys.token(WORLD))
 
@@ -277,7 +279,7 @@ def run(
     Raises:
         SessionError: an endpoint is taken, or the identity is of no use.
     """
-    mode: session.Mode = "lockstep" if world.clock.mode == "lockstep" else "realtime"
-    with session.listen(endpoints, world.scenario.federation, mode, identity) as link:
+    mode: Mode = "lockstep" if world.clock.mode == "lockstep" else "realtime"
+    with connection.listen(endpoints, world.scenario.federation, mode, identity) as link:
         ready()
         WorldProcess(link, world, stopped, progress).run()

@@ -50,11 +50,11 @@ class Link:
         self.tell: Callable[[Any], None] = lambda _: None
         self.asked: list[tuple[str, str, dict[str, Any]]] = []
 
-    def hear(self, expression: str, callback: Callable[[Any], None]) -> None:
-        self.say = callback
-
-    def on_message(self, expression: str, callback: Callable[[Any], None]) -> None:
-        self.tell = callback
+    def declare_subscriber(self, expression: str, callback: Callable[[Any], None]) -> None:
+        if expression == keys.EVENT:
+            self.tell = callback
+        else:
+            self.say = callback
 
     def get(self, expression: str, timeout_s: float = 2.0) -> list[Any]:
         return []

@@ -51,11 +51,11 @@ class Link:
         self.asked += 1
         return [] if self.now is None else [sample(keys.CLOCK, self.now)]
 
-    def hear(self, expression: str, callback: Callable[[Any], None]) -> None:
-        self.say = callback
-
-    def on_message(self, expression: str, callback: Callable[[Any], None]) -> None:
-        self.tell = callback
+    def declare_subscriber(self, expression: str, callback: Callable[[Any], None]) -> None:
+        if expression == keys.EVENT:
+            self.tell = callback
+        else:
+            self.say = callback
 
 
 class Ears:

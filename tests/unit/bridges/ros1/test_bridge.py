@@ -14,7 +14,7 @@ from zsim.errors import RunError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim.transport.session import Sample
+from zsim.transport.samples import ReceivedSample
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import intake as intake_module
 from zsim_bridges.ros1 import tcpros
@@ -176,9 +176,9 @@ class Link:
         assert expression == keys.BATCH
         return self
 
-    def receive(self) -> Sample:
+    def receive(self) -> ReceivedSample:
         for payload in self._payloads:
-            return Sample(keys.BATCH, payload)
+            return ReceivedSample(keys.BATCH, payload)
         self.emptied.set()
         self._closed.wait(10.0)
         raise SessionError("closed")

@@ -11,7 +11,7 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import ControlAnswer
 from zsim.errors import RunError, SessionError
 from zsim.scenario import scenario_file
-from zsim.transport.session import Sample
+from zsim.transport.samples import ReceivedSample
 from zsim_deploy.cli import inspection
 
 GARBAGE = [BAD_UTF8, NESTED, b"\xc1", b"\x91" * 5000]
@@ -52,16 +52,16 @@ def rates(monkeypatch: pytest.MonkeyPatch, due: list[tuple[float, str, bytes]], 
 @pytest.mark.parametrize("key", [keys.CLOCK, "of/somebody"])
 @pytest.mark.parametrize("payload", GARBAGE, ids=["utf8", "nested", "no", "deep"])
 def test_garbage_is_shown_as_refused(key: str, payload: bytes):
-    shown = inspection.readable(Sample(key, payload))
+    shown = inspection.readable(ReceivedSample(key, payload))
     assert shown["bytes"] == len(payload)
     assert shown["refused"].startswith(key)
 
 
 @pytest.mark.parametrize(("said", "shown"), FOREIGN, ids=["bytes", "numbers", "inside", "none", "flag"])
 def test_what_json_cannot_say_is_shown_all_the_same(said: object, shown: object):
-    assert inspection.readable(Sample("of/somebody", msgspec.msgpack.encode(said))) == shown
+    assert inspection.readable(ReceivedSample("of/somebody", msgspec.msgpack.encode(said))) == shown
     event = messages.Event(0, 0, "note", "eve", "drone1", "", {"said": said})
-    read = inspection.readable(Sample(keys.EVENT, messages.encode(event)))
+    read = inspection.readable(ReceivedSample(keys.EVENT, messages.encode(event)))
     assert json.loads(json.dumps(read)) == read
 
 

@@ -11,7 +11,7 @@ from zsim.contract.messages import ControlAnswer, Info, Origin
 from zsim.errors import DecodeError, NoWorldError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.membership import RETRY_S, Membership, replay
-from zsim.transport.session import Sample
+from zsim.transport.samples import ReceivedSample
 
 GATE_NS = 20_000_000
 INFO = Info(
@@ -48,7 +48,7 @@ def test_what_is_not_answered_is_asked_for_again_after_a_while():
         wall.now_s += RETRY_S
     link.on_request = lambda key, args: ControlAnswer(True, result=[["drone/d1/truth", b"x"]])
     member.settle()
-    assert came == [Sample("drone/d1/truth", b"x")]
+    assert came == [ReceivedSample("drone/d1/truth", b"x")]
     assert not member.owes
 
 
