@@ -10,7 +10,7 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages
 from zsim.transport.connection import find_world
 from zsim.transport.declarations import Subscription
 from zsim.transport.session import Session
@@ -40,7 +40,7 @@ def waypoints() -> list[dict[str, Any]]:
     return [{"at_s": i * LEG_S, "values": {"x_c": x, "y_c": y, "z_c": HEIGHT_M}} for i, (x, y) in enumerate(CORNERS)]
 
 
-def states(subscription: Subscription) -> Iterator[messages.ClusterState]:
+def states(subscription: Subscription) -> Iterator[flight_messages.ClusterState]:
     """Yield the controller's states as they come."""
     while True:
         sample = subscription.receive()
@@ -48,14 +48,14 @@ def states(subscription: Subscription) -> Iterator[messages.ClusterState]:
             yield messages.decode(sample.key, sample.payload)
 
 
-def newest(subscription: Subscription) -> messages.ClusterState:
+def newest(subscription: Subscription) -> flight_messages.ClusterState:
     """Return a state that has not come yet, and forget those before."""
     for _ in subscription.drain():
         pass
     return next(states(subscription))
 
 
-def until(subscription: Subscription, phase: str) -> messages.ClusterState:
+def until(subscription: Subscription, phase: str) -> flight_messages.ClusterState:
     """Return the first state in a phase."""
     return next(state for state in states(subscription) if state.phase == phase)
 

@@ -2,7 +2,7 @@
 
 import secrets
 
-from zsim.contract import keys, messages
+from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
 from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
@@ -56,10 +56,10 @@ class ObserverProcess:
         join = join_of(self.name, host, run_id, self._incarnation, self._join_seq, self.now_ns)
         self._link.put(keys.process(self.name, "join"), join)
 
-    def update_clock(self, payload: bytes) -> messages.Clock | None:
+    def update_clock(self, payload: bytes) -> run_messages.Clock | None:
         """Follow the run by a message on `clock`; return it, None where it cannot be decoded."""
         try:
-            clock: messages.Clock = messages.decode(keys.CLOCK, payload)
+            clock: run_messages.Clock = messages.decode(keys.CLOCK, payload)
         except DecodeError:
             self.health.refused += 1
             return None
@@ -89,7 +89,7 @@ class ObserverProcess:
     def leave(self, reason: str) -> None:
         """Publish bye, unless another process has taken over the name."""
         if not self._superseded:
-            self._link.put(keys.process(self.name, "bye"), messages.Bye(self.now_ns, 0, reason))
+            self._link.put(keys.process(self.name, "bye"), run_messages.Bye(self.now_ns, 0, reason))
 
     def _on_event(self, sample: RawSample) -> None:
         try:

@@ -7,7 +7,7 @@ from typing import Any
 from msgspec import Struct
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import ControlAnswer
+from zsim.contract.run_messages import ControlAnswer
 from zsim.transport.samples import RawSample, ReceivedSample
 
 PATIENCE_S = 20.0  # after which a test that waits for ever fails

@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 
-from zsim.contract import keys, messages
+from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import Pairs, pairs_of
 from zsim.contract.world_events import ProcessEntry
@@ -120,7 +120,7 @@ class Membership:
 
     def leave(self, reason: str) -> None:
         """Say bye."""
-        bye = messages.Bye(max(0, self.done_ns), self._agent.next_seq("bye"), reason)
+        bye = run_messages.Bye(max(0, self.done_ns), self._agent.next_seq("bye"), reason)
         self._link.put(keys.process(self._agent.name, "bye"), bye)
 
     def _join(self) -> None:
@@ -129,10 +129,10 @@ class Membership:
         join = join_of(agent.name, host, run_id, self._incarnation, seq, t_ns, agent.period_ns, agent.serves)
         self._link.put(keys.process(agent.name, "join"), join)
 
-    def _done(self, t_ns: int, sent: int) -> messages.Done:
+    def _done(self, t_ns: int, sent: int) -> run_messages.Done:
         self.done_ns = max(self.done_ns, t_ns)
         seq = self._agent.next_seq("done")
-        return messages.Done(t_ns, seq, self._info.run_id, self._incarnation, t_ns, sent)
+        return run_messages.Done(t_ns, seq, self._info.run_id, self._incarnation, t_ns, sent)
 
     # Catching up and coming back
 

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from zsim.contract.messages import ClusterState
+from zsim.contract.flight_messages import ClusterState
 
 PERIOD_S = 0.2  # wall time between two updates
 REASON_NS = 5_000_000_000  # simulated time; a take-off gives one reason for 3 s

@@ -9,9 +9,9 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from zsim.contract import keys, messages, world_events
+from zsim.contract import flight_messages, keys, messages, run_messages, world_events
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import ControlAnswer
+from zsim.contract.run_messages import ControlAnswer
 from zsim.contract.world_events import ProcessEntry, RunEnd, WorldEvent
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.agent import Agent
@@ -71,9 +71,9 @@ class Runner:
         self._notices: deque[WorldEvent] = deque()
         self._queries: deque[Query] = deque()
         self._links: deque[bool] = deque()
-        self._fault_lists: deque[messages.Faults] = deque()
+        self._fault_lists: deque[run_messages.Faults] = deque()
         self._list_seq = -1
-        self._kills: dict[int, messages.Fault] = {}  # by id
+        self._kills: dict[int, run_messages.Fault] = {}  # by id
         self._lives_after_ns: int | None = None  # what was to die up to this gate was an earlier one of its name
         self._lacks = False
         self._view_wall_s = 0.0
@@ -171,7 +171,7 @@ class Runner:
         except DecodeError as error:
             self._refuse(error)
             return
-        if type(message) is messages.Estimate:
+        if type(message) is flight_messages.Estimate:
             self._estimated_by[sample.key] = message.source
         self._inbox.put(sample.key, message)
 
@@ -247,7 +247,7 @@ class Runner:
                 self._list_seq = faults.seq
                 self._update_kills(faults)
 
-    def _update_kills(self, faults: messages.Faults) -> None:
+    def _update_kills(self, faults: run_messages.Faults) -> None:
         """Note which kills are its own: a list may have forgotten one that a late process has still to die of.
 
         One that has not begun when a list is published, and is not on it, is cleared.

@@ -6,7 +6,7 @@ A fault is given as a map: `kind`, `target`, `at_s`, `for_s`, and the parameters
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
-from zsim.contract.messages import Fault
+from zsim.contract.run_messages import Fault
 
 Target = Literal["drone", "world", "link", "radio", "process"]
 Shape = Literal["number", "vector", "choice", "flag", "places"]

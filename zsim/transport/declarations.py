@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import zenoh
 
 from zsim.contract import messages
-from zsim.contract.messages import ControlAnswer, ControlRequest
+from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import SessionError
 from zsim.transport.samples import ReceivedSample
 

@@ -13,7 +13,7 @@ import zenoh.ext
 from msgspec import Struct
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import ControlAnswer, ControlRequest
+from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import SessionError
 from zsim.transport.declarations import Query, Subscription
 from zsim.transport.samples import RawSample, ReceivedSample, key_errors, raw_reply, raw_sample

@@ -6,8 +6,10 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from zsim.contract import keys, messages
-from zsim.contract.messages import EstimateView, Event, Fault, Health, Info, ViewCluster, ViewDrones, ViewEstimates
+from zsim.contract import keys, messages, run_messages
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import Event, Fault, Health
+from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError
 from zsim.transport.samples import RawSample
 from zsim.transport.session import Session
@@ -148,7 +150,7 @@ class ViewBuffer:
             self.estimators[key.rpartition("/")[2]] = message
         elif isinstance(message, Health):
             self.healths[keys.thing(key)] = message
-        elif isinstance(message, messages.Faults):
+        elif isinstance(message, run_messages.Faults):
             self.faults = message.faults
 
     def _store_cluster(self, cluster: str, view: ViewCluster) -> None:

@@ -22,7 +22,8 @@ import msgspec
 from aiohttp import web
 
 from zsim.contract import messages
-from zsim.contract.messages import REFUSALS, ControlRequest
+from zsim.contract.messages import REFUSALS
+from zsim.contract.run_messages import ControlRequest
 from zsim.errors import DecodeError
 from zsim.transport.samples import RawSample, check_expression
 from zsim_bridges.gateway.access_check import error_response

@@ -8,7 +8,8 @@ from typing import Any
 
 from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages
-from zsim.contract.messages import ControlAnswer, Info
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
 from zsim.scenario import rights, scenario_file
 from zsim.transport.samples import RawSample, check_expression

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from zsim.contract.messages import Fault
+from zsim.contract.run_messages import Fault
 from zsim.scenario.fault_kinds import ROTORS
 from zsim_world.physics import rigid_body, wind
 from zsim_world.sensors import sensor_set as ss

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from zsim.contract import keys
-from zsim.contract.messages import Done, Join, Waiting
+from zsim.contract.run_messages import Done, Join, Waiting
 from zsim.scenario.rights import WORLD
 from zsim_world.flight.run_outbox import Refusal
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import msgspec
 
-from zsim.contract import keys, messages
+from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import fingerprint
-from zsim.contract.messages import ControlAnswer, ControlRequest
+from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import RunError
 from zsim.runtime.agent import Output
 from zsim.scenario.rights import WORLD
@@ -124,12 +124,12 @@ class Coordinator(ABC):
         """Count an output (estimate, cluster state) of a participant."""
         self.barrier.count_output(source)
 
-    def _handle_done(self, name: str, message: messages.Done, wall_ns: int) -> None:
+    def _handle_done(self, name: str, message: run_messages.Done, wall_ns: int) -> None:
         refusal = self.barrier.done(name, message, self.now_ns, wall_ns)
         if refusal:
             self.outbox.refuse(name, f"process/{name}/done", refusal)
 
-    def _handle_join(self, name: str, message: messages.Join, wall_ns: int) -> None:
+    def _handle_join(self, name: str, message: run_messages.Join, wall_ns: int) -> None:
         former, replaced = self.barrier.participants.get(name), self.barrier.replaced(name, message)
         refusal = self.barrier.join(name, message, self.clock.next_ns, wall_ns)
         if refusal:
@@ -154,7 +154,7 @@ class Coordinator(ABC):
             text = f"{name} and {other} both do the work of {', '.join(sorted(both))}; end one of them"
             self.outbox.event("doubled", name, text, {"other": other})
 
-    def _handle_bye(self, name: str, message: messages.Bye) -> None:
+    def _handle_bye(self, name: str, message: run_messages.Bye) -> None:
         participant = self.barrier.remove(name)
         if participant is None:
             return
@@ -238,7 +238,7 @@ class Coordinator(ABC):
         """Return whose dones are missing for the next gate, or for one that comes so much later."""
         return self.barrier.blocking(self.clock.required_ns + ahead_ns)
 
-    def waiting_for(self, wall_ns: int) -> tuple[messages.Waiting, ...]:
+    def waiting_for(self, wall_ns: int) -> tuple[run_messages.Waiting, ...]:
         """Return whom the world waits for now."""
         if self.clock.mode == "realtime" and self.clock.state != "waiting":
             return tuple(p.waiting(wall_ns) for p in self.barrier.participants.values() if not p.alive)
@@ -246,9 +246,9 @@ class Coordinator(ABC):
 
     # Publication
 
-    def publish_clock(self, waiting_for: tuple[messages.Waiting, ...] = ()) -> None:
+    def publish_clock(self, waiting_for: tuple[run_messages.Waiting, ...] = ()) -> None:
         """Put a `clock` into the outbox."""
-        clock = messages.Clock(
+        clock = run_messages.Clock(
             t_ns=self.now_ns,
             seq=self.outbox.next_seq(keys.CLOCK),
             run_id=self.run_id,

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from zsim.contract import keys
-from zsim.contract.messages import ControlAnswer, ControlRequest, Fault, Faults
+from zsim.contract.run_messages import ControlAnswer, ControlRequest, Fault, Faults
 from zsim.runtime.link_faults import KINDS as LINK_KINDS
 from zsim.scenario import fault_kinds
 from zsim.scenario.fault_check import Known, flaws

@@ -10,10 +10,13 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 
 from zsim.contract import keys, messages
+from zsim.contract.flight_messages import ClusterState, Command, Estimate
 from zsim.contract.framing import Pairs, pairs_of
-from zsim.contract.messages import REFUSALS, ClusterRequest, ClusterState, Command, ControlAnswer, Count, Estimate
+from zsim.contract.messages import REFUSALS
+from zsim.contract.run_messages import ClusterRequest, ControlAnswer
 from zsim.errors import DecodeError
 from zsim.scenario import rights
+from zsim.schema.message import Count
 from zsim.transport.samples import ReceivedSample
 
 KEEP_NS = 5_000_000_000  # simulated time that a replay reaches back

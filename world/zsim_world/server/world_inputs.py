@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario.rights import WORLD
@@ -28,7 +28,7 @@ TICK_S = 0.1  # how often a standing world looks at the wall clock
 RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
 REJOINED_NS = 10_000_000_000  # wall time after a rejoin in which it may take until a process can be asked
 PHASE_EVERY = 10  # states of a cluster between two of which the phase is read for the display
-RELAYED = (messages.Estimate, messages.ClusterState, messages.ClusterRequest)
+RELAYED = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest)
 PROCESSES, VIEWS = "process/", "view/"  # the last are nothing to the world
 OWN = keys.process(WORLD, "")
 
@@ -218,10 +218,10 @@ class MessageIntake:
         """Hand the world a message that it acts on."""
         message = messages.decode(key, payload)
         self.history.add(key, payload, message.t_ns)
-        if type(message) is messages.Join:
+        if type(message) is run_messages.Join:
             self.liveliness.before_join(keys.thing(key), message)
         self.world.handle(key, message, wall_ns)
-        if type(message) is messages.Health:
+        if type(message) is run_messages.Health:
             self.liveliness.health_received(keys.thing(key))
             self.progress("health", message, keys.thing(key))
 
@@ -242,15 +242,15 @@ class MessageIntake:
             raise DecodeError(f"{key}: t_ns is {head.t_ns}; must be <= {self.world.now_ns}, the newest gate")
         self.history.add(key, payload, head.t_ns)
         kind = messages.type_of(key)
-        if kind is messages.ClusterState:
+        if kind is flight_messages.ClusterState:
             self._read_phase(key, payload)
-        role = "estimator" if kind is messages.Estimate else "controller"
-        source = head.controller if kind is messages.ClusterRequest else head.source
+        role = "estimator" if kind is flight_messages.Estimate else "controller"
+        source = head.controller if kind is run_messages.ClusterRequest else head.source
         self.world.count_output(source or f"{role}.{keys.thing(key)}")
 
     def _read_phase(self, key: str, payload: bytes) -> None:
         if self._states[key] % PHASE_EVERY == 0:
-            state: messages.ClusterState = messages.decode_as(messages.ClusterState, payload, key)
+            state: flight_messages.ClusterState = messages.decode_as(flight_messages.ClusterState, payload, key)
             self.phase = state.phase
             self.progress("state", state, keys.thing(key))
         self._states[key] += 1

@@ -9,8 +9,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from zsim.contract import keys, messages
-from zsim.contract.messages import ControlAnswer
+from zsim.contract import keys, run_messages
+from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
 from zsim.runtime.agent import Output
 from zsim.runtime.health import HealthMeter
@@ -188,7 +188,7 @@ class WorldProcess:
         readers = [p.name for p in list(self._world.barrier.participants.values()) if not p.gating]
         who = ", ".join([*readers, "a program that only subscribes"])
         text = f"nothing can be published for {since_s:.1f} s: a reader takes nothing; one of {who}"
-        event = messages.Event(self._world.now_ns, 0, "stuck", WORLD, WORLD, text)
+        event = run_messages.Event(self._world.now_ns, 0, "stuck", WORLD, WORLD, text)
         self._progress("event", event, self._intake.phase)
 
     def _serve_others(self) -> None:
@@ -229,7 +229,7 @@ class WorldProcess:
         else:
             query.answer(ControlAnswer(ok=False, error=reason))
 
-    def _answer(self, request: messages.ControlRequest, process: str | None) -> ControlAnswer:
+    def _answer(self, request: run_messages.ControlRequest, process: str | None) -> ControlAnswer:
         """Answer a request on `world/control`, or of a process, whose name access control knows, on its own key."""
         if request.op == "replay":
             return self._history.replay(request.args, self._readable_by(process))

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.contract.messages import DroneState
+from zsim.contract.flight_messages import DroneState
 from zsim.math import rotation as rot
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, axpy

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import ControlAnswer, DroneView, EstimateView, Event, ViewCluster, ViewDrones, ViewEstimates
+from zsim.contract.run_messages import ControlAnswer, Event
+from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome

@@ -7,17 +7,8 @@ from typing import Any
 import pytest
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import (
-    Clock,
-    DroneView,
-    EstimateView,
-    Event,
-    Fault,
-    Faults,
-    Health,
-    ViewDrones,
-    ViewEstimates,
-)
+from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health
+from zsim.contract.views import DroneView, EstimateView, ViewDrones, ViewEstimates
 from zsim_bridges.console import html_tables
 from zsim_bridges.console.table_rows import TableRows, console_state, sigma_m
 from zsim_bridges.console.time_monitor import SILENT_S, TimeMonitor

@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zsim.contract import messages
+from zsim.contract.flight_messages import Status, Velocity
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin, Status, Velocity
+from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin
 from zsim.errors import DecodeError, NoWorldError
 from zsim.transport.samples import RawSample
 from zsim_bridges.gateway import last_values as values_module

@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 from federation import PAIR
 
-from zsim.contract import keys, messages
-from zsim.contract.messages import ClusterInfo, ControlAnswer, DroneInfo, Info, Origin
+from zsim.contract import flight_messages, keys, messages, run_messages
+from zsim.contract.messages import ClusterInfo, DroneInfo, Info, Origin
+from zsim.contract.run_messages import ControlAnswer
 from zsim.scenario import scenario_file
 from zsim.transport.samples import RawSample, ReceivedSample
 from zsim.transport.zenoh_settings import Mode
@@ -221,7 +222,7 @@ def test_names_that_ros_does_not_take_are_told() -> None:
 
 def test_a_twist_becomes_a_velocity_in_the_heading_frame_at_the_newest_gate() -> None:
     bench = Bench()
-    clock = messages.Clock(4_000_000_000, 0, "run", 200, "running", 1.0)
+    clock = run_messages.Clock(4_000_000_000, 0, "run", 200, "running", 1.0)
     bench.link.deliver(keys.CLOCK, messages.encode(clock))
     bench.turn()
     for speed in (1.0, 0.5):
@@ -240,7 +241,7 @@ def test_modes_and_the_emergency_button() -> None:
     bench.publish("/drone_1/land", EMPTY, empty)
     bench.publish("/drone_1/reset", EMPTY, empty)  # nobody tells the state: neither
     for state in ("flying", "emergency"):
-        bench.link.last[status] = messages.encode(messages.Status(0, 0, state, 50.0, False, None, 1))
+        bench.link.last[status] = messages.encode(flight_messages.Status(0, 0, state, 50.0, False, None, 1))
         bench.publish("/drone_1/reset", EMPTY, empty)
     assert [(m.mode, m.seq) for _, m in bench.link.said] == [
         ("takeoff", 0),
@@ -276,7 +277,9 @@ def test_what_does_not_fit_a_ros_type_is_refused() -> None:
     bench, key = Bench(), keys.sensor("drone-1", "baro")
     bench.reader("/drone_1/navdata", "zsim_msgs/msg/Navdata")
     bench.link.deliver(key, messages.encode(messages.Baro(0, 0, 0, 1e300, 0.0)))
-    bench.link.deliver(keys.status("drone-1"), messages.encode(messages.Status(0, 0, "flying", 50.0, False, None, 1)))
+    bench.link.deliver(
+        keys.status("drone-1"), messages.encode(flight_messages.Status(0, 0, "flying", 50.0, False, None, 1))
+    )
     bench.link.deliver(key, b"garbage")
     bench.turn()
     assert bench.link.sent == []
@@ -311,7 +314,7 @@ def test_a_summary_of_a_gate_has_what_was_told_up_to_it() -> None:
     for gate in range(3):
         t_ns, accel = gate * 20_000_000, (0.0, 0.0, 9.80665 * gate)
         bench.link.deliver(imu_key, messages.encode(messages.Imu(t_ns, 0, t_ns, accel, (0.0, 0.0, 0.0))))
-        status = messages.Status(t_ns, 0, "flying", 50.0, False, None, 1)
+        status = flight_messages.Status(t_ns, 0, "flying", 50.0, False, None, 1)
         bench.link.deliver(status_key, messages.encode(status))
     bench.turn()
     navdata = [payload for key, payload, _ in bench.link.sent if "Navdata" in key]

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim.contract.messages import Done, Join, Waiting
+from zsim.contract.run_messages import Done, Join, Waiting
 from zsim_world.flight.barrier import Barrier, Participant
 
 RUN = "run1"

@@ -4,7 +4,8 @@ import pytest
 from msgspec import Struct
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import Done, Velocity
+from zsim.contract.flight_messages import Velocity
+from zsim.contract.run_messages import Done
 from zsim.transport.samples import ReceivedSample
 from zsim_world.server.message_history import KEEP_NS, MessageHistory
 

@@ -7,7 +7,8 @@ from fake_link import UNANSWERED, FakeLink
 
 from zsim.contract import keys
 from zsim.contract.framing import decode_batch, pairs_of
-from zsim.contract.messages import ControlAnswer, Info, Origin
+from zsim.contract.messages import Info, Origin
+from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError, NoWorldError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.membership import RETRY_S, Membership, replay
