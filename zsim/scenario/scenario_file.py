@@ -50,8 +50,8 @@ def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:
 
 def _resolve(document: dict[str, Any], source: str, lines: list[str]) -> Scenario:
     document = _expand_presets(document)
-    found = [*faults(document, Document), *cross_faults(sound(document, Scenario))]
-    lines += [f"{source}: {path} {text}{_whose(document, path)}" for path, text in found]
+    flaws = [*faults(document, Document), *cross_faults(sound(document, Scenario))]
+    lines += [f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws]
     if lines:
         raise ScenarioError(_shortened(lines))
     del document["sensors"]
@@ -96,19 +96,19 @@ def _expand_drone(drone: Any, shared: dict[str, Any]) -> Any:
     if not isinstance(drone, dict):
         return drone
     own = drone.get("sensors")
-    given = _merge(shared, own) if isinstance(own, dict) else shared if own is None else own
-    return {**drone, "sensors": _expanded(given)}
+    own_sensors = _merge(shared, own) if isinstance(own, dict) else shared if own is None else own
+    return {**drone, "sensors": _expanded(own_sensors)}
 
 
-def _expanded(given: Any) -> Any:
+def _expanded(sensors: Any) -> Any:
     """Return a `sensors:` section upon its preset."""
-    if not isinstance(given, dict):
-        return given
-    name = given.get("preset", "ardrone2")
+    if not isinstance(sensors, dict):
+        return sensors
+    name = sensors.get("preset", "ardrone2")
     preset = PRESETS.get(name, PRESETS["ardrone2"]) if isinstance(name, str) else PRESETS["ardrone2"]
-    if given.get("as_printed") is True and name == "paper":
+    if sensors.get("as_printed") is True and name == "paper":
         preset = _merge(preset, AS_PRINTED)
-    return _merge({"preset": name, **preset}, given)
+    return _merge({"preset": name, **preset}, sensors)
 
 
 def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
