@@ -31,7 +31,7 @@ from benchmarks.progress import Progress
 from benchmarks.sheet import Sheet
 from benchmarks.table import figure, spread, table
 from zsim.contract import keys, messages
-from zsim.transport import session as zenoh_session
+from zsim.transport import connection
 from zsim.transport.session import Session
 from zsim_bridges.console.page_rights import Camera
 
@@ -198,7 +198,7 @@ def _measure_factors(sheet: Sheet, folder: Path, count: int) -> str:
     endpoint = f"tcp/127.0.0.1:{world}"
     grid.write(scenario, count, FLIGHT_S)
     run = ("run", str(scenario), "--listen", endpoint, "--hosted", "--no-report", "--out", str(folder / f"out{world}"))
-    with _started(*run), zenoh_session.connect(endpoint, "zsim", wait_s=TIMEOUT_S, reader=True) as link:
+    with _started(*run), connection.connect(endpoint, "zsim", wait_s=TIMEOUT_S, reader=True) as link:
         _await(lambda: _now_s(link) > 1.0, "the run")
         before = _factor(link)
         for _ in range(PAIRS):

@@ -10,7 +10,7 @@ import msgspec
 import psutil
 
 from benchmarks.child import RefusedError
-from zsim.contract import messages
+from zsim.contract import run_messages
 from zsim.record import RecordReader
 
 CLI = (sys.executable, "-m", "zsim_deploy.cli")
@@ -45,7 +45,7 @@ def fly(scenario: Path, seconds: float, *options: str) -> tuple[dict[str, float]
 
 def _end_event(folder: Path) -> dict[str, float]:
     records = RecordReader(folder / "run.mcap").messages(keys=["world/event"])
-    events = [msgspec.msgpack.decode(record.payload, type=messages.Event) for record in records]
+    events = [msgspec.msgpack.decode(record.payload, type=run_messages.Event) for record in records]
     return next(event.data for event in events if event.kind == "end")
 
 

@@ -10,9 +10,10 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages
 from zsim.transport.connection import find_world
-from zsim.transport.session import Mailbox, Session
+from zsim.transport.declarations import Subscription
+from zsim.transport.session import Session
 
 CLUSTER = "main"
 ME = "square.main"
@@ -21,14 +22,14 @@ PATIENCE_S = 30
 CORNERS = ((0.0, 0.0), (SIDE_M, 0.0), (SIDE_M, SIDE_M), (0.0, SIDE_M), (0.0, 0.0))
 
 
-def ask(link: Session, box: Mailbox, op: str, **args: Any) -> None:
+def ask(link: Session, subscription: Subscription, op: str, **args: Any) -> None:
     """Send a request until the controller grants it; end with its reason after PATIENCE_S of simulated time."""
     until_ns = None
     while True:
         answer = link.request(keys.cluster_control(CLUSTER), op, ME, args)
         if answer.ok:
             return
-        t_ns = newest(box).t_ns
+        t_ns = newest(subscription).t_ns
         until_ns = until_ns or t_ns + PATIENCE_S * 10**9
         if t_ns > until_ns:
             raise SystemExit(f"{op}: {answer.error}")
@@ -39,40 +40,40 @@ def waypoints() -> list[dict[str, Any]]:
     return [{"at_s": i * LEG_S, "values": {"x_c": x, "y_c": y, "z_c": HEIGHT_M}} for i, (x, y) in enumerate(CORNERS)]
 
 
-def states(box: Mailbox) -> Iterator[messages.ClusterState]:
+def states(subscription: Subscription) -> Iterator[flight_messages.ClusterState]:
     """Yield the controller's states as they come."""
     while True:
-        sample = box.receive()
+        sample = subscription.receive()
         if sample is not None:
             yield messages.decode(sample.key, sample.payload)
 
 
-def newest(box: Mailbox) -> messages.ClusterState:
+def newest(subscription: Subscription) -> flight_messages.ClusterState:
     """Return a state that has not come yet, and forget those before."""
-    for _ in box.drain():
+    for _ in subscription.drain():
         pass
-    return next(states(box))
+    return next(states(subscription))
 
 
-def until(box: Mailbox, phase: str) -> messages.ClusterState:
+def until(subscription: Subscription, phase: str) -> flight_messages.ClusterState:
     """Return the first state in a phase."""
-    return next(state for state in states(box) if state.phase == phase)
+    return next(state for state in states(subscription) if state.phase == phase)
 
 
 def fly(link: Session) -> None:
-    box = link.subscribe(keys.cluster_state(CLUSTER))
-    ask(link, box, "takeoff")  # granted once the estimates are good enough
-    ask(link, box, "engage")  # granted once all drones have climbed to 1.5 m
-    ask(link, box, "trajectory", waypoints=waypoints())
-    show(box)
-    ask(link, box, "land")
-    print(f"landed at t = {until(box, 'idle').t_ns / 1e9:.1f} s")
+    subscription = link.subscribe(keys.cluster_state(CLUSTER))
+    ask(link, subscription, "takeoff")  # granted once the estimates are good enough
+    ask(link, subscription, "engage")  # granted once all drones have climbed to 1.5 m
+    ask(link, subscription, "trajectory", waypoints=waypoints())
+    show(subscription)
+    ask(link, subscription, "land")
+    print(f"landed at t = {until(subscription, 'idle').t_ns / 1e9:.1f} s")
 
 
-def show(box: Mailbox) -> None:
+def show(subscription: Subscription) -> None:
     """Print where the formation is at every corner; return at the last, when the trajectory ends."""
     due_s = 0.0
-    for state in states(box):
+    for state in states(subscription):
         t_s = state.trajectory_t_s
         at_end = t_s is None and due_s > 0.0
         if at_end or (t_s is not None and t_s >= due_s):

@@ -12,7 +12,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus
 from zsim.runtime.runner import Runner
@@ -37,7 +37,7 @@ class Geofence(Agent):
         self._outside: set[str] = set()
 
     def receive(self, key: str, message: Any) -> None:
-        if isinstance(message, messages.Status):
+        if isinstance(message, flight_messages.Status):
             _put_in(self._flying, keys.thing(key), message.state in ("hovering", "flying"))
         else:
             _put_in(self._outside, keys.thing(key), math.hypot(*message.position_m[:2]) > self._radius_m)
@@ -47,7 +47,7 @@ class Geofence(Agent):
 
     def _land(self, t_ns: int, drone: str) -> Output:
         key = keys.command(drone, "mode")
-        return Output(key, messages.Mode(t_ns, self.next_seq(key), self.name, "land"))
+        return Output(key, flight_messages.Mode(t_ns, self.next_seq(key), self.name, "land"))
 
 
 def _put_in(group: set[str], name: str, belongs: bool) -> None:
@@ -58,7 +58,7 @@ def _put_in(group: set[str], name: str, belongs: bool) -> None:
 
 
 def say(key: str, message: Struct) -> None:
-    if isinstance(message, messages.Event) and message.kind in ("mode", "refused"):
+    if isinstance(message, run_messages.Event) and message.kind in ("mode", "refused"):
         print(f"{message.t_ns / 1e9:8.2f} s  {message.text}", flush=True)
 
 
@@ -73,7 +73,7 @@ def in_process(path: Path, radius_m: float, duration_s: float) -> None:
 
 def on_zenoh(endpoint: str, radius_m: float) -> None:
     with find_world(endpoint, "zsim", wait_s=60.0, say=print) as (link, info):
-        link.on_message(keys.EVENT, lambda sample: say(sample.key, messages.decode(sample.key, sample.payload)))
+        link.declare_subscriber(keys.EVENT, lambda sample: say(sample.key, messages.decode(sample.key, sample.payload)))
         print(Runner(link, info, Geofence(info, radius_m), say=print).run())
 
 

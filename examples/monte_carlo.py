@@ -13,7 +13,7 @@ from pathlib import Path
 from msgspec import Struct
 from msgspec.structs import replace
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys
 from zsim.runtime.bus import Bus
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import ESTIMATORS, Scenario
@@ -29,13 +29,13 @@ class Errors:
     """Takes every message of a run; keeps the horizontal error of one drone's estimate at every gate."""
 
     def __init__(self) -> None:
-        self._truth: dict[int, messages.Truth] = {}
+        self._truth: dict[int, flight_messages.Truth] = {}
         self.squares: list[float] = []
 
     def __call__(self, key: str, message: Struct) -> None:
-        if isinstance(message, messages.Truth) and key == keys.truth(DRONE):
+        if isinstance(message, flight_messages.Truth) and key == keys.truth(DRONE):
             self._truth[message.t_ns] = message
-        elif isinstance(message, messages.Estimate) and key == keys.estimate(DRONE):
+        elif isinstance(message, flight_messages.Estimate) and key == keys.estimate(DRONE):
             truth = self._truth.pop(message.t_ns)
             if message.t_ns > SETTLED_S * 1e9:
                 self.squares.append(math.dist(message.position_m[:2], truth.position_m[:2]) ** 2)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from zsim.contract import keys, messages
+from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import GateMessages
 from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, SupersededError
@@ -21,6 +21,7 @@ from zsim.record import RecordWriter
 from zsim.record.record_writer import CHANNELS_MAX
 from zsim.runtime.health import HealthMeter
 from zsim.runtime.membership import replay
+from zsim.schema.message import Message
 from zsim.transport.connection import read_info
 from zsim.transport.session import Session
 from zsim.transport.traffic import Passed, Traffic, samples
@@ -79,7 +80,7 @@ class Recorder:
         self._must_look = False
         self._writer = RecordWriter(path)
         self._head = msgspec.msgpack.Decoder(_Head)
-        self._clock = msgspec.msgpack.Decoder(messages.Clock)
+        self._clock = msgspec.msgpack.Decoder(run_messages.Clock)
         self._known: dict[tuple[str, bytes], None] = {}
         self._caught_up = False
         self._over = threading.Event()
@@ -273,9 +274,9 @@ class Recorder:
         self._say("join", join)
 
     def _bye(self, reason: str) -> None:
-        self._say("bye", messages.Bye(self._now_ns, self._next("bye"), reason))
+        self._say("bye", run_messages.Bye(self._now_ns, self._next("bye"), reason))
 
-    def _say(self, what: str, message: messages.Message) -> None:
+    def _say(self, what: str, message: Message) -> None:
         self._link.put(keys.process(self._name, what), message)
 
     def _next(self, what: str) -> int:

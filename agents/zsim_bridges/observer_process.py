@@ -2,11 +2,12 @@
 
 import secrets
 
-from zsim.contract import keys, messages
+from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
 from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
-from zsim.transport.session import Sample, Session
+from zsim.transport.samples import RawSample
+from zsim.transport.session import Session
 
 JOIN_EVENTS = ("join", "restart", "superseded")  # kinds of events that report a process that joined
 
@@ -40,7 +41,7 @@ class ObserverProcess:
 
     def announce(self) -> None:
         """Join the run."""
-        self._link.on_message(keys.EVENT, self._on_event)
+        self._link.declare_subscriber(keys.EVENT, self._on_event)
         self._link.on_link(self._on_link)
         self._link.declare_token(keys.token(self.name))
         self._join()
@@ -55,10 +56,10 @@ class ObserverProcess:
         join = join_of(self.name, host, run_id, self._incarnation, self._join_seq, self.now_ns)
         self._link.put(keys.process(self.name, "join"), join)
 
-    def update_clock(self, payload: bytes) -> messages.Clock | None:
+    def update_clock(self, payload: bytes) -> run_messages.Clock | None:
         """Follow the run by a message on `clock`; return it, None where it cannot be decoded."""
         try:
-            clock: messages.Clock = messages.decode(keys.CLOCK, payload)
+            clock: run_messages.Clock = messages.decode(keys.CLOCK, payload)
         except DecodeError:
             self.health.refused += 1
             return None
@@ -88,9 +89,9 @@ class ObserverProcess:
     def leave(self, reason: str) -> None:
         """Publish bye, unless another process has taken over the name."""
         if not self._superseded:
-            self._link.put(keys.process(self.name, "bye"), messages.Bye(self.now_ns, 0, reason))
+            self._link.put(keys.process(self.name, "bye"), run_messages.Bye(self.now_ns, 0, reason))
 
-    def _on_event(self, sample: Sample) -> None:
+    def _on_event(self, sample: RawSample) -> None:
         try:
             event = messages.decode(keys.EVENT, sample.payload)
         except DecodeError:

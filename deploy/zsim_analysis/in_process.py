@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from msgspec import Struct
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, run_messages
 from zsim.contract.framing import GateMessages
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
@@ -142,12 +142,12 @@ class _Progress:
             self._show(key, message)
 
     def _show(self, key: str, message: Struct) -> None:
-        if isinstance(message, messages.ClusterState):
+        if isinstance(message, flight_messages.ClusterState):
             self._phase = message.phase
             if line := self._reasons.line(keys.thing(key), message):
                 self._screen.say(line)
-        elif isinstance(message, messages.Event):
+        elif isinstance(message, run_messages.Event):
             self._screen.event({"t_s": message.t_ns / 1e9, "kind": message.kind, "text": message.text})
-        elif isinstance(message, messages.Clock) and self._throttle.passes():
+        elif isinstance(message, run_messages.Clock) and self._throttle.passes():
             line = {"t_s": message.t_ns / 1e9, "rate": message.rate, "state": message.state, "phase": self._phase}
             self._screen.clock({**line, "waiting_for": []})

@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 from msgspec import Struct
 
-from zsim.contract import keys, messages
-from zsim.contract.messages import ControlAnswer, ControlRequest, Info
+from zsim.contract import flight_messages, keys, messages, run_messages
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import ControlAnswer, ControlRequest
+from zsim.contract.views import ViewCluster, ViewEstimates
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.inbox import Inbox
@@ -167,7 +169,7 @@ class Flight:
         t_s = gate * GATE_NS * 1e-9
         state = "landed" if t_s < LIFTOFF_S else "taking_off" if t_s < AIRBORNE_S else "flying"
         key = keys.status(drone)
-        return key, messages.Status(gate * GATE_NS, self._next(key), state, 90.0, False, None, count)
+        return key, flight_messages.Status(gate * GATE_NS, self._next(key), state, 90.0, False, None, count)
 
     def _estimate(self, drone: str, gate: int, start_m: tuple[float, float, float]) -> tuple[str, Any]:
         t_ns, key = gate * GATE_NS, keys.estimate(drone)
@@ -177,7 +179,7 @@ class Flight:
         turn = (float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2)))
         covariance = tuple((0.01 * np.eye(6)).ravel().tolist())
         seq = self._next(key)
-        return key, messages.Estimate(
+        return key, flight_messages.Estimate(
             t_ns,
             seq,
             position,
@@ -286,13 +288,13 @@ def test_it_shows_eyes_what_it_said_last(name: str):
     (shown,) = agent.views(t_ns)
     assert messages.type_of(shown.key) is type(shown.message)
     assert messages.decode(shown.key, messages.encode(shown.message)) == shown.message
-    if isinstance(shown.message, messages.ViewCluster):
+    if isinstance(shown.message, ViewCluster):
         state = next(message for key, message in said if key.endswith("/state"))
-        assert isinstance(state, messages.ClusterState)
+        assert isinstance(state, flight_messages.ClusterState)
         assert shown.key == f"view/cluster/{name.partition('.')[2]}"
         assert (shown.message.value, shown.message.desired) == (state.value, state.desired)
     else:
-        assert isinstance(shown.message, messages.ViewEstimates)
+        assert isinstance(shown.message, ViewEstimates)
         assert shown.key == f"view/estimates/{name}"
         told: dict[str, Any] = {keys.thing(key): message for key, message in said}
         assert [e.name for e in shown.message.estimates] == list(told)
@@ -475,7 +477,7 @@ def test_a_refused_request_changes_no_bit(name: str):
         for key, message in inbox.take(t_ns):
             agent.receive(key, message)
         told = agent.step(t_ns)
-        asked = [output.message for output in told if isinstance(output.message, messages.ClusterRequest)]
+        asked = [output.message for output in told if isinstance(output.message, run_messages.ClusterRequest)]
         assert [(a.t_ns, a.op, a.ok, a.controller) for a in asked] == [
             (t_ns, "target", False, name) for _ in agent.control_keys()
         ]

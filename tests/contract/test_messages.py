@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import inspect as types
 
-from zsim.contract import messages
+from zsim.contract import messages, run_messages
 from zsim.errors import DecodeError
 
 # Fields besides t_ns and seq, in the contract's order.
@@ -414,7 +414,7 @@ def test_a_number_that_is_not_finite_is_refused_in_free_content(number: float, w
     assert_names(refusal("world/event", pack(plain)), "world/event", "data")
     request = pack({"op": "acquire", "args": {"some": wrap(number)}})
     with pytest.raises(DecodeError, match=r"^here: args holds .*; must be finite numbers$"):
-        messages.decode_as(messages.ControlRequest, request, "here")
+        messages.decode_as(run_messages.ControlRequest, request, "here")
 
 
 @every_message
@@ -555,30 +555,30 @@ def judge(shape: str, payload: bytes) -> None:
 @settings(max_examples=50, deadline=None)
 @given(op=text, args=st.dictionaries(text, free, max_size=3), source=text)
 def test_requests_survive_the_wire(op: str, args: dict[str, Any], source: str):
-    request = messages.ControlRequest(op, args, source)
-    assert messages.decode_as(messages.ControlRequest, messages.encode(request), "k") == request
+    request = run_messages.ControlRequest(op, args, source)
+    assert messages.decode_as(run_messages.ControlRequest, messages.encode(request), "k") == request
 
 
 @settings(max_examples=50, deadline=None)
 @given(ok=st.booleans(), error=text, result=free, more=st.none() | st.integers(0, 2**63 - 1))
 def test_answers_survive_the_wire(ok: bool, error: str, result: Any, more: int | None):
-    answer = messages.ControlAnswer(ok, error, result, more)
-    assert messages.decode_as(messages.ControlAnswer, messages.encode(answer), "k") == answer
+    answer = run_messages.ControlAnswer(ok, error, result, more)
+    assert messages.decode_as(run_messages.ControlAnswer, messages.encode(answer), "k") == answer
 
 
 def test_a_request_needs_no_more_than_its_op():
-    request = messages.decode_as(messages.ControlRequest, pack({"op": "pause"}), "world/control")
+    request = messages.decode_as(run_messages.ControlRequest, pack({"op": "pause"}), "world/control")
     assert (request.op, request.args, request.source) == ("pause", {}, "")
 
 
 @pytest.mark.parametrize("plain", [{}, {"op": 1}, {"op": "x", "args": []}, {"op": "x", "source": None}, [], "pause"])
 def test_a_malformed_request_is_refused(plain: Any):
     with pytest.raises(DecodeError, match=r"^world/control: .*must be"):
-        messages.decode_as(messages.ControlRequest, pack(plain), "world/control")
+        messages.decode_as(run_messages.ControlRequest, pack(plain), "world/control")
 
 
 @settings(max_examples=300, deadline=None)
 @given(payload=st.binary(max_size=60))
 def test_a_random_request_is_a_request_or_refused(payload: bytes):
-    request = decoded_or_refused(messages.ControlRequest, payload, "world/control")
-    assert request is None or isinstance(request, messages.ControlRequest)
+    request = decoded_or_refused(run_messages.ControlRequest, payload, "world/control")
+    assert request is None or isinstance(request, run_messages.ControlRequest)

@@ -10,8 +10,8 @@ import pytest
 import yaml
 from federation import PAIR, PAIR_ROLES, Federation
 
-from zsim.contract import keys, messages
-from zsim.contract.messages import ControlRequest, Event
+from zsim.contract import flight_messages, keys
+from zsim.contract.run_messages import ControlRequest, Event
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
@@ -73,9 +73,9 @@ class Flight(NamedTuple):
 
     sha256: str
     events: list[Event]
-    states: list[messages.ClusterState]
-    estimates: list[messages.Estimate]
-    statuses: list[messages.Status]
+    states: list[flight_messages.ClusterState]
+    estimates: list[flight_messages.Estimate]
+    statuses: list[flight_messages.Status]
 
     def events_of(self, *kinds: str) -> list[Event]:
         return [event for event in self.events if event.kind in kinds]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from federation import Federation
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys
 from zsim.runtime.bus import Bus
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
@@ -39,7 +39,7 @@ class Flight:
     """What a run in this process left: the states of its cluster, and where its drones truly were, by instant."""
 
     scenario: Scenario
-    states: list[messages.ClusterState] = field(default_factory=list)
+    states: list[flight_messages.ClusterState] = field(default_factory=list)
     truth: dict[int, dict[str, tuple[float, float, float]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -47,12 +47,12 @@ class Flight:
         self.space = scenario_space(self.scenario, self.cluster)
 
     def sink(self, key: str, message: Any) -> None:
-        if isinstance(message, messages.ClusterState):
+        if isinstance(message, flight_messages.ClusterState):
             self.states.append(message)
-        elif isinstance(message, messages.Truth):
+        elif isinstance(message, flight_messages.Truth):
             self.truth.setdefault(message.t_ns, {})[keys.thing(key)] = message.position_m
 
-    def p_W(self, state: messages.ClusterState) -> Array:
+    def p_W(self, state: flight_messages.ClusterState) -> Array:
         """Return where the drones truly were (n, 3)."""
         return np.array([self.truth[state.t_ns][name] for name in self.cluster.drones])
 
@@ -68,7 +68,7 @@ class Flight:
         flown = [state for state in self.states if state.phase not in ("idle", "taking_off", "landing")]
         return min(closest_pair(self.p_W(state))[0] for state in flown[::5])
 
-    def first(self, phase: str) -> messages.ClusterState:
+    def first(self, phase: str) -> flight_messages.ClusterState:
         return next(state for state in self.states if state.phase == phase)
 
 

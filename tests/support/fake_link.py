@@ -1,4 +1,4 @@
-"""A session without Zenoh: mailboxes that a test fills, requests that a test answers, everything published kept."""
+"""A session without Zenoh: subscriptions that a test fills, requests that a test answers, everything published kept."""
 
 import queue
 from collections.abc import Callable, Iterator, Sequence
@@ -7,8 +7,8 @@ from typing import Any
 from msgspec import Struct
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import ControlAnswer
-from zsim.transport.session import Sample
+from zsim.contract.run_messages import ControlAnswer
+from zsim.transport.samples import RawSample, ReceivedSample
 
 PATIENCE_S = 20.0  # after which a test that waits for ever fails
 UNANSWERED = ControlAnswer(False, "nobody answered")
@@ -17,22 +17,22 @@ NESTED = b"\x83\xa4t_ns\x00\xa3seq\x00\xa1x" + b"\x91" * 5000 + b"\xc0"
 """A map with t_ns, seq and a field that nobody knows, of 5000 lists in each other."""
 
 
-class FakeBox:
-    """A mailbox."""
+class FakeSubscription:
+    """A subscription."""
 
     def __init__(self, expression: str, without: tuple[str, ...] = ()) -> None:
         self.expression = expression
         self._without = without
-        self._arrived: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
+        self._arrived: queue.SimpleQueue[ReceivedSample | None] = queue.SimpleQueue()
 
-    def put(self, sample: Sample | None) -> None:
+    def put(self, sample: ReceivedSample | None) -> None:
         if sample is None or not (self._without and sample.key.startswith(self._without)):
             self._arrived.put(sample)
 
-    def receive(self) -> Sample | None:
+    def receive(self) -> ReceivedSample | None:
         return self._arrived.get(timeout=PATIENCE_S)
 
-    def drain(self) -> Iterator[Sample]:
+    def drain(self) -> Iterator[ReceivedSample]:
         while not self._arrived.empty():
             sample = self._arrived.get()
             if sample is not None:
@@ -62,23 +62,23 @@ class FakeLink:
         self.on_request: Callable[[str, dict[str, Any]], ControlAnswer] = lambda key, args: UNANSWERED
         self.requests: list[tuple[str, dict[str, Any]]] = []
         self.last: dict[str, bytes] = {}
-        self._boxes: list[FakeBox] = []
-        self._early: list[Sample] = []
-        self._callbacks: list[tuple[str, Callable[[Sample], None]]] = []
+        self._subscriptions: list[FakeSubscription] = []
+        self._early: list[ReceivedSample] = []
+        self._callbacks: list[tuple[str, Callable[[RawSample], None]]] = []
         self._on_link: Callable[[bool], None] = lambda up: None
 
     # What a test does
 
     def deliver(self, key: str, message: Struct | bytes) -> None:
         """Let something arrive, at subscribers to come as well."""
-        sample = Sample(key, message if isinstance(message, bytes) else messages.encode(message))
+        sample = ReceivedSample(key, message if isinstance(message, bytes) else messages.encode(message))
         self._early.append(sample)
-        for box in self._boxes:
-            if keys.matches(box.expression, key):
-                box.put(sample)
+        for subscription in self._subscriptions:
+            if keys.matches(subscription.expression, key):
+                subscription.put(sample)
         for expression, callback in self._callbacks:
             if keys.matches(expression, key):
-                callback(sample)
+                callback(RawSample("PUT", sample.key, sample.payload, "", None))
 
     def cut(self, up: bool) -> None:
         """Let the link come (True) or go."""
@@ -90,18 +90,18 @@ class FakeLink:
 
     # What a session does
 
-    def subscribe(self, expression: str, without: tuple[str, ...] = ()) -> FakeBox:
-        box = FakeBox(expression, without)
-        self._boxes.append(box)
+    def subscribe(self, expression: str, without: tuple[str, ...] = ()) -> FakeSubscription:
+        subscription = FakeSubscription(expression, without)
+        self._subscriptions.append(subscription)
         for sample in self._early:
             if keys.matches(expression, sample.key):
-                box.put(sample)
-        return box
+                subscription.put(sample)
+        return subscription
 
-    def subscribe_others(self, without: tuple[str, ...]) -> FakeBox:
+    def subscribe_remote(self, without: tuple[str, ...]) -> FakeSubscription:
         return self.subscribe("**", without)
 
-    def on_message(self, expression: str, callback: Callable[[Sample], None]) -> None:
+    def declare_subscriber(self, expression: str, callback: Callable[[RawSample], None]) -> None:
         self._callbacks.append((expression, callback))
 
     def put(self, key: str, message: Struct) -> None:
@@ -121,10 +121,10 @@ class FakeLink:
         self.requests.append((key, args or {}))
         return self.on_request(key, args or {})
 
-    def get(self, expression: str, timeout_s: float = 2.0) -> list[Sample]:
-        return [Sample(key, payload) for key, payload in self.last.items() if keys.matches(expression, key)]
+    def get(self, expression: str, timeout_s: float = 2.0) -> list[ReceivedSample]:
+        return [ReceivedSample(key, payload) for key, payload in self.last.items() if keys.matches(expression, key)]
 
-    def has_readers(self, key: str) -> bool:
+    def has_subscribers(self, key: str) -> bool:
         return True
 
     def tokens(self, expression: str, timeout_s: float = 1.0) -> list[str]:
@@ -136,7 +136,7 @@ class FakeLink:
     def on_token(self, expression: str, callback: Callable[[str, bool], None]) -> None:
         return
 
-    def answer(self, expression: str, callback: Callable[[Any], None]) -> None:
+    def declare_queryable(self, expression: str, callback: Callable[[Any], None]) -> None:
         return
 
     def declare_token(self, key: str) -> None:

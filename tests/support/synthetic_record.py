@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.record import RecordWriter
 from zsim.scenario import scenario_file
+from zsim.schema.message import Message
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 
 GATE_NS = 20_000_000
@@ -42,7 +43,7 @@ class Flown:
     noise: float = 0.0
     other_traffic: bool = False
     end: dict[str, Any] | None = field(default_factory=lambda: {"reason": "duration reached"})
-    events: tuple[messages.Event, ...] = ()
+    events: tuple[run_messages.Event, ...] = ()
 
 
 def write(path: Path, flown: Flown) -> None:
@@ -52,12 +53,12 @@ def write(path: Path, flown: Flown) -> None:
             writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
 
 
-def traffic(flown: Flown) -> Iterator[tuple[str, messages.Message, int]]:
+def traffic(flown: Flown) -> Iterator[tuple[str, Message, int]]:
     """Yield key, message and wall time of everything that a run puts on the wire."""
     scenario = scenario_file.load(SCENARIOS / f"{flown.scenario}.yaml", flown.overrides)
     yield keys.INFO, info(scenario), 0
     for seq, name in enumerate(["estimator.drone1", "controller.main"]):
-        join = messages.Join(0, seq, "run", 7, name.split(".")[0], "host-a", 100 + seq, GATE_NS, "0.1.0", "f" * 16)
+        join = run_messages.Join(0, seq, "run", 7, name.split(".")[0], "host-a", 100 + seq, GATE_NS, "0.1.0", "f" * 16)
         yield keys.process(name, "join"), join, 0
     rng = np.random.default_rng(1)
     last = round(flown.duration_s * 1e9) // GATE_NS
@@ -67,7 +68,7 @@ def traffic(flown: Flown) -> Iterator[tuple[str, messages.Message, int]]:
     for event in flown.events:
         yield keys.EVENT, event, 1_000_000 * last
     if flown.end is not None:
-        event = messages.Event(last * GATE_NS, 99, "end", "world", "world", "the end", flown.end)
+        event = run_messages.Event(last * GATE_NS, 99, "end", "world", "world", "the end", flown.end)
         yield keys.EVENT, event, 1_000_000 * last
 
 
@@ -110,7 +111,7 @@ def true_at(flown: Flown, t_s: float) -> np.ndarray:
     return desired_at(flown, t_s) + flown.offset + flown.amplitude * wave
 
 
-def _gate(flown: Flown, scenario, k: int, rng: np.random.Generator) -> Iterator[tuple[str, messages.Message]]:
+def _gate(flown: Flown, scenario, k: int, rng: np.random.Generator) -> Iterator[tuple[str, Message]]:
     t_ns, t_s = k * GATE_NS, k * GATE_NS / 1e9
     space = cluster_space(3)
     desired = desired_at(flown, t_s)
@@ -121,13 +122,13 @@ def _gate(flown: Flown, scenario, k: int, rng: np.random.Generator) -> Iterator[
             yield from _sensors(drone.name, t_ns, k, rng)
         yield keys.truth(drone.name), _truth(t_ns, k, p_W[i], yaw[i])
         state = "landed" if t_s < 0.1 * flown.climb_s else "taking_off" if t_s < 0.2 * flown.climb_s else "flying"
-        yield keys.status(drone.name), messages.Status(t_ns, k, state, 100 - t_s / 20 - i, False, None, 5)
+        yield keys.status(drone.name), flight_messages.Status(t_ns, k, state, 100 - t_s / 20 - i, False, None, 5)
         if flown.other_traffic:
             yield from _answers(drone.name, t_ns, k, p_W[i].tolist(), rng)
-    yield keys.CLOCK, messages.Clock(t_ns, k, "run", k, "running", 1.0)
+    yield keys.CLOCK, run_messages.Clock(t_ns, k, "run", k, "running", 1.0)
     if scenario.clusters:
         value = space.wrapped(desired + flown.est_amplitude * wave + flown.noise * rng.standard_normal(12))
-        state = messages.ClusterState(
+        state = flight_messages.ClusterState(
             t_ns=t_ns,
             seq=k,
             phase="engaged",
@@ -143,15 +144,15 @@ def _gate(flown: Flown, scenario, k: int, rng: np.random.Generator) -> Iterator[
         yield keys.cluster_state("main"), state
 
 
-def _truth(t_ns: int, seq: int, p_W: np.ndarray, yaw: float) -> messages.Truth:
+def _truth(t_ns: int, seq: int, p_W: np.ndarray, yaw: float) -> flight_messages.Truth:
     x, y, z = p_W.tolist()
     q_WB = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
-    return messages.Truth(
+    return flight_messages.Truth(
         t_ns, seq, (x, y, z), (0.1, 0.2, 0.3), q_WB, (0.4, 0.5, 0.6), (0.0, 0.0, 0.0), (3.0, 3.0, 3.0, 3.0)
     )
 
 
-def _sensors(name: str, t_ns: int, k: int, rng: np.random.Generator) -> Iterator[tuple[str, messages.Message]]:
+def _sensors(name: str, t_ns: int, k: int, rng: np.random.Generator) -> Iterator[tuple[str, Message]]:
     """Yield 200 Hz of IMU and 25 Hz of the slow sensors, about as many messages as a real run has."""
     for part in range(4):
         a, b, c, d, e, f = rng.standard_normal(6).tolist()
@@ -167,14 +168,12 @@ def _sensors(name: str, t_ns: int, k: int, rng: np.random.Generator) -> Iterator
         )
 
 
-def _answers(
-    name: str, t_ns: int, k: int, p_W: list[float], rng: np.random.Generator
-) -> Iterator[tuple[str, messages.Message]]:
+def _answers(name: str, t_ns: int, k: int, p_W: list[float], rng: np.random.Generator) -> Iterator[tuple[str, Message]]:
     x, y, z = p_W
     covariance = tuple(rng.standard_normal(36).tolist())
     yield (
         keys.estimate(name),
-        messages.Estimate(
+        flight_messages.Estimate(
             t_ns,
             k,
             (x, y, z),
@@ -187,5 +186,5 @@ def _answers(
             {},
         ),
     )
-    yield keys.command(name, "velocity"), messages.Velocity(t_ns, k, "controller.main", (0.1, 0.2, 0.3), 0.0)
-    yield keys.process(f"estimator.{name}", "done"), messages.Done(t_ns, k, "run", 7, t_ns, 1)
+    yield keys.command(name, "velocity"), flight_messages.Velocity(t_ns, k, "controller.main", (0.1, 0.2, 0.3), 0.0)
+    yield keys.process(f"estimator.{name}", "done"), run_messages.Done(t_ns, k, "run", 7, t_ns, 1)

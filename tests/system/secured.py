@@ -22,7 +22,7 @@ from rights_table import ROLES, SCENARIO
 from wire import PATIENCE_S
 
 from zsim.scenario import scenario_file
-from zsim.transport import session
+from zsim.transport import connection
 from zsim.transport.tls import Identity
 from zsim_deploy.security import certificates
 from zsim_deploy.security.enrolment import CertificateRequest, access_control
@@ -66,7 +66,7 @@ def hub(made: Certificates, clients: Iterable[str] = ROLES, behind: Iterable[str
     """Yield the endpoint and the session of a listening world that lets in some clients, and a router's."""
     rules = access_control(scenario_file.from_text(SCENARIO), clients, {SITE: behind} if behind else {})
     endpoint = tls_endpoint()
-    with session.listen([endpoint], "zsim", "lockstep", made.identity("world", rules)) as link:
+    with connection.listen([endpoint], "zsim", "lockstep", made.identity("world", rules)) as link:
         yield endpoint, link
 
 
@@ -75,7 +75,7 @@ def site(made: Certificates, upstream: str, clients: Iterable[str] = ROLES) -> I
     """Yield the endpoint of a router that leads to a world, once it does."""
     rules = access_control(scenario_file.from_text(SCENARIO), clients, {}, ["world"])
     endpoint = tls_endpoint()
-    with session.route(endpoint, upstream, "zsim", "lockstep", made.identity(SITE, rules)) as link:
+    with connection.route(endpoint, upstream, "zsim", "lockstep", made.identity(SITE, rules)) as link:
         up: queue.SimpleQueue[bool] = queue.SimpleQueue()
         link.on_link(up.put)
         assert up.get(timeout=PATIENCE_S)

@@ -20,7 +20,7 @@ from wire import PATIENCE_S
 
 from zsim.scenario import rights, scenario_file
 from zsim.scenario.rights import permits
-from zsim.transport import session
+from zsim.transport import connection
 from zsim.transport.tls import Identity, peer_fault
 from zsim_deploy.security.enrolment import access_control
 
@@ -40,7 +40,7 @@ def reached(made: Certificates, role: str, way: str) -> Iterator[tuple[Tryer, An
     with ExitStack() as stack:
         direct = way == WAYS[0]
         endpoint, link = stack.enter_context(hub(made, [role] if direct else [], [] if direct else [role]))
-        link.answer("clock", lambda query: answer_once(query, "clock"))
+        link.declare_queryable("clock", lambda query: answer_once(query, "clock"))
         if not direct:
             endpoint = stack.enter_context(site(made, endpoint, [role]))
         tryer = stack.enter_context(Tryer(endpoint, made.of(role)))
@@ -69,7 +69,9 @@ def test_what_a_role_may_publish(made: Certificates, role: str, way: str) -> Non
     with reached(made, role, way) as (tryer, link):
         heard, ready = Heard(), Heard()
         for expression in ("@batch", "**"):
-            link.on_message(expression, lambda sample: (ready if sample.payload == READY else heard).take(sample.key))
+            link.declare_subscriber(
+                expression, lambda sample: (ready if sample.payload == READY else heard).take(sample.key)
+            )
         tryer.until_heard(fence, ready)
         for act in (tryer.put, tryer.publish):
             for key in KEYS:
@@ -126,7 +128,7 @@ def test_what_a_role_may_get(made: Certificates, role: str, way: str) -> None:
             answer_once(query, query.expression)
 
         for expression in ("@batch", "**"):
-            link.answer(expression, answer)
+            link.declare_queryable(expression, answer)
         tryer.until_answered(fence)
         asked = Heard()
         for key in KEYS:
@@ -180,7 +182,7 @@ def test_a_router_s_own_certificate_opens_no_more_than_its_clients_have(made: Ce
     fence = "process/estimator.drone1/health"
     with hub(made, [], ["estimator.drone1"]) as (endpoint, link), Tryer(endpoint, made.of(SITE)) as tryer:
         heard = Heard()
-        link.on_message("**", lambda sample: heard.take(sample.key))
+        link.declare_subscriber("**", lambda sample: heard.take(sample.key))
         for key in KEYS:
             if key != fence:
                 tryer.put(key)
@@ -197,7 +199,7 @@ OUTSIDERS = ("no certificate", "another authority", "plaintext", "plaintext with
 def test_an_outsider_gets_nothing(made: Certificates, tmp_path: Path, who: str) -> None:
     with hub(made) as (endpoint, link):
         heard = Heard()
-        link.on_message("**", lambda sample: heard.take(sample.key))
+        link.declare_subscriber("**", lambda sample: heard.take(sample.key))
         place, folder = outsider(who, made, tmp_path, endpoint)
         with pytest.raises(zenoh.ZError), Tryer(place, folder, SHORT_S) as tryer:
             tryer.put("drone/drone1/cmd/mode")
@@ -226,7 +228,7 @@ def outsider(who: str, made: Certificates, tmp_path: Path, endpoint: str) -> tup
 def test_a_certificate_without_rights_gets_nothing(made: Certificates) -> None:
     with hub(made, ["operator.main"]) as (endpoint, link):
         heard, got, links = Heard(), Heard(b"world"), Heard()
-        link.on_message("**", lambda sample: sample.payload != b"world" and heard.take(sample.key))
+        link.declare_subscriber("**", lambda sample: sample.payload != b"world" and heard.take(sample.key))
         link.on_link(lambda up: links.take("up" if up else "down"))
         with Tryer(endpoint, made.of("estimator.drone1")) as stranger:
             links.until_fence("up")
@@ -349,7 +351,7 @@ def test_options_that_do_not_go_together_are_a_line(made: Certificates, tmp_path
 
 def test_who_listens_elsewhere_than_its_certificate_says(made: Certificates) -> None:
     endpoint = tls_endpoint("127.0.0.2")
-    with session.listen([endpoint], "zsim", "lockstep", made.identity("world")):
+    with connection.listen([endpoint], "zsim", "lockstep", made.identity("world")):
         said = refused("keys", "--connect", endpoint, "--tls", str(made.of("operator.main")))
     assert "the certificate of who listens there is not for 127.0.0.2; name it in the hosts file" in said
 

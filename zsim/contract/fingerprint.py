@@ -11,7 +11,7 @@ import platform
 from functools import cache
 
 from zsim import __version__
-from zsim.contract.messages import Join
+from zsim.contract.run_messages import Join
 
 PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "filterpy")
 

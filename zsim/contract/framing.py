@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from zsim.contract import keys, messages
 from zsim.contract.encoding import GAP
-from zsim.contract.messages import REFUSALS, Count
+from zsim.contract.messages import REFUSALS
 from zsim.errors import DecodeError
+from zsim.schema.message import Count
 
 KINDS = (*keys.SENSORS, "truth", "status")  # of the messages about a drone
 BATCH_MAX = 5_000  # messages of one batch; a flood of somebody's messages goes into several

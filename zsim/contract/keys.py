@@ -72,7 +72,7 @@ def cluster_control(cluster: str) -> str:
 
 
 def cluster_request(cluster: str) -> str:
-    """Return the key on which a controller tells the requests that it took."""
+    """Return the key on which a controller publishes the requests that it took."""
     return f"cluster/{cluster}/request"
 
 
@@ -81,7 +81,7 @@ def cluster_view(cluster: str) -> str:
 
 
 def estimates_view(process_name: str) -> str:
-    """Return the key on which an estimator shows eyes what it believes of all its drones."""
+    """Return the key on which an estimator publishes its estimates for displays."""
     return f"view/estimates/{process_name}"
 
 

@@ -5,9 +5,10 @@ from typing import NamedTuple
 import msgspec
 from msgspec import Struct
 
-from zsim.contract import keys, messages
-from zsim.contract.messages import REFUSALS, Count, Whole
+from zsim.contract import keys, messages, run_messages
+from zsim.contract.messages import REFUSALS
 from zsim.errors import DecodeError
+from zsim.schema.message import Count, Whole
 
 
 class NoData(Struct, frozen=True):
@@ -61,7 +62,7 @@ def read(payload: bytes) -> WorldEvent | None:
     Raises:
         DecodeError: it is no event, or its data is not what its kind has.
     """
-    event: messages.Event = messages.decode(keys.EVENT, payload)
+    event: run_messages.Event = messages.decode(keys.EVENT, payload)
     kind = _DATA.get(event.kind)
     if kind is None:
         return None

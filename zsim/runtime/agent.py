@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 from msgspec import Struct
 
 from zsim.contract.framing import GateMessages
-from zsim.contract.messages import ControlAnswer, ControlRequest, Faults, Info
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import ControlAnswer, ControlRequest, Faults
 from zsim.runtime.link_faults import LinkFaults
 from zsim.runtime.routing import GateRouter, Input, RoutingTable, one_by_one
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 from msgspec import Struct
 
-from zsim.contract import keys, messages
+from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import GateMessages
 from zsim.errors import RunError
@@ -54,7 +54,7 @@ class SteppedWorld(Protocol):
         """Return keys and messages to be published, in order, and forget them; on keys.GATE GateMessages."""
         ...
 
-    def waiting_for(self, wall_ns: int) -> Sequence[messages.Waiting]:
+    def waiting_for(self, wall_ns: int) -> Sequence[run_messages.Waiting]:
         """Return whom the world waits for."""
         ...
 
@@ -156,7 +156,7 @@ class Bus:
         self._coordinator.publish_end()
         self._spread()
         for agent, _ in self._agents:
-            bye = messages.Bye(self._t_ns, agent.next_seq("bye"), "the run ended")
+            bye = run_messages.Bye(self._t_ns, agent.next_seq("bye"), "the run ended")
             self._to_world(keys.process(agent.name, "bye"), bye)
         self._spread()
 
@@ -177,7 +177,7 @@ class Bus:
         for key, message in gate.decoded():
             self._sink(key, message)
 
-    def _update_faults(self, faults: messages.Faults) -> None:
+    def _update_faults(self, faults: run_messages.Faults) -> None:
         if not faults.faults and self._info is None:
             return
         for fault in faults.faults:
@@ -211,7 +211,7 @@ class Bus:
                 self._coordinator.count_output(agent.name)
             else:
                 self._to_world(key, message)
-        done = messages.Done(t_ns, agent.next_seq("done"), self._coordinator.run_id, 0, t_ns, sent)
+        done = run_messages.Done(t_ns, agent.next_seq("done"), self._coordinator.run_id, 0, t_ns, sent)
         self._to_world(self._done_keys[agent.name], done)
 
     def _to_world(self, key: str, message: Struct) -> None:

@@ -10,7 +10,8 @@ from typing import Any
 
 from zsim.contract import keys
 from zsim.contract.framing import GateMessages
-from zsim.contract.messages import ControlAnswer, ControlRequest, Faults, Info
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import ControlAnswer, ControlRequest, Faults
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.routing import GateRouter, Input, RoutingTable, in_order

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 
-from zsim.contract.messages import Health
+from zsim.contract.run_messages import Health
 
 PERIOD_S = 1.0  # contract: 1 Hz wall
 STEPS_KEPT = 1000

@@ -13,7 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from zsim.contract import keys
-from zsim.contract.messages import Estimate, Fault, Faults
+from zsim.contract.flight_messages import Estimate
+from zsim.contract.run_messages import Fault, Faults
 from zsim.runtime.routing import Input, in_order
 from zsim.scenario import fault_kinds
 

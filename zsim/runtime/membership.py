@@ -9,14 +9,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 
-from zsim.contract import keys, messages
+from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
 from zsim.contract.framing import Pairs, pairs_of
 from zsim.contract.world_events import ProcessEntry
 from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
 from zsim.runtime.agent import Agent, Output
 from zsim.transport.connection import read_info
-from zsim.transport.session import Sample, Session
+from zsim.transport.samples import ReceivedSample
+from zsim.transport.session import Session
 
 REPLAY_S = 2.0  # a hub answers a replay within milliseconds; a lost link does not
 REJOINS_MAX = 6  # times that a return is said before it is taken for granted; a router forwards nothing at first
@@ -46,7 +47,7 @@ class Membership:
         link: Session,
         info: messages.Info,
         agent: Agent,
-        take_in: Callable[[Sample], None],
+        take_in: Callable[[ReceivedSample], None],
         say: Callable[[str], None],
         wall_s: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -119,7 +120,7 @@ class Membership:
 
     def leave(self, reason: str) -> None:
         """Say bye."""
-        bye = messages.Bye(max(0, self.done_ns), self._agent.next_seq("bye"), reason)
+        bye = run_messages.Bye(max(0, self.done_ns), self._agent.next_seq("bye"), reason)
         self._link.put(keys.process(self._agent.name, "bye"), bye)
 
     def _join(self) -> None:
@@ -128,10 +129,10 @@ class Membership:
         join = join_of(agent.name, host, run_id, self._incarnation, seq, t_ns, agent.period_ns, agent.serves)
         self._link.put(keys.process(agent.name, "join"), join)
 
-    def _done(self, t_ns: int, sent: int) -> messages.Done:
+    def _done(self, t_ns: int, sent: int) -> run_messages.Done:
         self.done_ns = max(self.done_ns, t_ns)
         seq = self._agent.next_seq("done")
-        return messages.Done(t_ns, seq, self._info.run_id, self._incarnation, t_ns, sent)
+        return run_messages.Done(t_ns, seq, self._info.run_id, self._incarnation, t_ns, sent)
 
     # Catching up and coming back
 
@@ -229,7 +230,7 @@ class Membership:
         self.ask_faults()
         try:
             for key, payload in replay(self._link, self._agent.name, since_ns, self._agent.reads, REPLAY_S):
-                self._take_in(Sample(key, payload))
+                self._take_in(ReceivedSample(key, payload))
         except NoWorldError:
             return
         self._missed_since_ns = None

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from zsim.contract.messages import ClusterState
+from zsim.contract.flight_messages import ClusterState
 
 PERIOD_S = 0.2  # wall time between two updates
 REASON_NS = 5_000_000_000  # simulated time; a take-off gives one reason for 3 s
@@ -50,7 +50,7 @@ class HoldReasons:
 
     def __init__(self) -> None:
         self._since: dict[str, tuple[str, int]] = {}
-        self._told: set[tuple[str, str]] = set()
+        self._shown: set[tuple[str, str]] = set()
 
     def line(self, cluster: str, state: ClusterState) -> str | None:
         """Return what to say of a state: its reason if that has been the same, but for its numbers, for REASON_NS."""
@@ -59,9 +59,9 @@ class HoldReasons:
         if shape != former:
             self._since[cluster] = (shape, state.t_ns)
             return None
-        if not shape or state.t_ns - since_ns < REASON_NS or (cluster, shape) in self._told:
+        if not shape or state.t_ns - since_ns < REASON_NS or (cluster, shape) in self._shown:
             return None
-        self._told.add((cluster, shape))
+        self._shown.add((cluster, shape))
         return f"  {state.t_ns / 1e9:8.2f} s  {cluster}, {state.phase}: {state.reason}"
 
 

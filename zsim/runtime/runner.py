@@ -9,9 +9,9 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from zsim.contract import keys, messages, world_events
+from zsim.contract import flight_messages, keys, messages, run_messages, world_events
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import ControlAnswer
+from zsim.contract.run_messages import ControlAnswer
 from zsim.contract.world_events import ProcessEntry, RunEnd, WorldEvent
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.agent import Agent
@@ -20,7 +20,9 @@ from zsim.runtime.inbox import Inbox
 from zsim.runtime.membership import Membership
 from zsim.runtime.routing import RoutingTable
 from zsim.scenario.fault_kinds import PROCESS_KILL
-from zsim.transport.session import Mailbox, Query, Sample, Session
+from zsim.transport.declarations import Query, Subscription
+from zsim.transport.samples import RawSample, ReceivedSample
+from zsim.transport.session import Session
 
 TICK_S = 0.1  # how often a stop, and what the world has not answered, is looked for while nothing arrives
 DRAIN_S = 1.0  # how long the last gates are waited for once the run has ended
@@ -62,16 +64,16 @@ class Runner:
         estimates = (key for key in agent.gate_keys if key.endswith("/estimate"))
         self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}
         self._estimated_by: dict[str, str] = {}
-        self._boxes: dict[str, Mailbox] = {}
+        self._subscriptions: dict[str, Subscription] = {}
         self._expressions = RoutingTable([[expression] for expression in agent.reads])
         self._table = key_table([drone.name for drone in info.drones])
         self._gate_key = _gate_key(agent)
         self._notices: deque[WorldEvent] = deque()
         self._queries: deque[Query] = deque()
         self._links: deque[bool] = deque()
-        self._fault_lists: deque[messages.Faults] = deque()
+        self._fault_lists: deque[run_messages.Faults] = deque()
         self._list_seq = -1
-        self._kills: dict[int, messages.Fault] = {}  # by id
+        self._kills: dict[int, run_messages.Fault] = {}  # by id
         self._lives_after_ns: int | None = None  # what was to die up to this gate was an earlier one of its name
         self._lacks = False
         self._view_wall_s = 0.0
@@ -129,9 +131,9 @@ class Runner:
             self._wait()
 
     def _wait(self) -> None:
-        box = self._boxes[self._blocking_expression()]
+        subscription = self._subscriptions[self._blocking_expression()]
         try:
-            sample = box.receive()
+            sample = subscription.receive()
         except SessionError:
             self._leave = self._leave or "session closed"
             return
@@ -140,11 +142,11 @@ class Runner:
 
     def _take_in_all(self) -> None:
         """Take in what has arrived: first what closes a gate, so that what came before it is found too."""
-        for box in self._boxes.values():
-            for sample in box.drain():
+        for subscription in self._subscriptions.values():
+            for sample in subscription.drain():
                 self._open(sample)
 
-    def _open(self, sample: Sample) -> None:
+    def _open(self, sample: ReceivedSample) -> None:
         """Take in a message, or the messages of a gate."""
         if sample.key != self._gate_key:
             self._take_in(sample)
@@ -159,9 +161,9 @@ class Runner:
         self.health.received += len(gate)
         self._inbox.put(keys.GATE, gate)
 
-    def _take_in(self, sample: Sample) -> None:
+    def _take_in(self, sample: ReceivedSample) -> None:
         if sample.key == keys.FAULTS:
-            self._on_faults(sample)
+            self._on_faults(sample.payload)
             return
         self.health.received += 1
         try:
@@ -169,7 +171,7 @@ class Runner:
         except DecodeError as error:
             self._refuse(error)
             return
-        if type(message) is messages.Estimate:
+        if type(message) is flight_messages.Estimate:
             self._estimated_by[sample.key] = message.source
         self._inbox.put(sample.key, message)
 
@@ -184,7 +186,7 @@ class Runner:
         missing = self._inbox.missing_last(t_ns) if t_ns is not None else None
         wanted = missing or self._agent.gate_keys[-1]
         expression = self._agent.reads[self._expressions.readers(wanted)[0]]
-        return expression if expression in self._boxes else self._gate_key
+        return expression if expression in self._subscriptions else self._gate_key
 
     def _ready_gate(self) -> int | None:
         """Return the gate to step now, None if it must be waited for."""
@@ -245,7 +247,7 @@ class Runner:
                 self._list_seq = faults.seq
                 self._update_kills(faults)
 
-    def _update_kills(self, faults: messages.Faults) -> None:
+    def _update_kills(self, faults: run_messages.Faults) -> None:
         """Note which kills are its own: a list may have forgotten one that a late process has still to die of.
 
         One that has not begun when a list is published, and is not on it, is cleared.
@@ -267,15 +269,15 @@ class Runner:
     def _subscribe(self) -> None:
         closing = [self._agent.reads[place] for place in self._expressions.readers_of_any(self._agent.gate_keys)]
         for expression in dict.fromkeys([*closing, *self._agent.reads]):
-            box = self._gate_key if self._gate_key and keys.is_sensor(expression) else expression
-            if box not in self._boxes:
-                self._boxes[box] = self._link.subscribe(box)
-        self._link.on_message(keys.EVENT, self._on_event)
-        self._link.on_message(keys.FAULTS, self._on_faults)
+            subscription = self._gate_key if self._gate_key and keys.is_sensor(expression) else expression
+            if subscription not in self._subscriptions:
+                self._subscriptions[subscription] = self._link.subscribe(subscription)
+        self._link.declare_subscriber(keys.EVENT, self._on_event)
+        self._link.declare_subscriber(keys.FAULTS, lambda sample: self._on_faults(sample.payload))
         self._link.on_link(self._on_link)
         for key in self._agent.control_keys():
-            self._link.answer(key, self._on_query)
-        self._link.answer(keys.process(self._agent.name, "outputs"), self._on_query)
+            self._link.declare_queryable(key, self._on_query)
+        self._link.declare_queryable(keys.process(self._agent.name, "outputs"), self._on_query)
         self._link.declare_token(keys.token(self._agent.name))
 
     def _look_for_end(self) -> None:
@@ -288,7 +290,7 @@ class Runner:
 
     # What arrives rarely, from other threads
 
-    def _on_event(self, sample: Sample) -> None:
+    def _on_event(self, sample: RawSample) -> None:
         try:
             read = world_events.read(sample.payload)
         except DecodeError:
@@ -298,9 +300,9 @@ class Runner:
             self._notices.append(read)
             self._wake()
 
-    def _on_faults(self, sample: Sample) -> None:
+    def _on_faults(self, payload: bytes) -> None:
         try:
-            self._fault_lists.append(messages.decode(keys.FAULTS, sample.payload))
+            self._fault_lists.append(messages.decode(keys.FAULTS, payload))
         except DecodeError:
             self.health.refused += 1
 
@@ -322,8 +324,8 @@ class Runner:
                 self._link.put(keys.process(self._agent.name, "health"), health)
 
     def _wake(self) -> None:
-        for box in list(self._boxes.values()):
-            box.wake()
+        for subscription in list(self._subscriptions.values()):
+            subscription.wake()
 
     def _serve_rare(self) -> None:
         while self._notices:

@@ -1,9 +1,8 @@
 """What no single field of a scenario can know: names that must agree, distances, times that must divide.
 
-Works on what is sound of a document (`faults.sound`): a check whose fields are missing or faulty is left out.
+Works on what is sound of a document (`checker.sound`): a check whose fields are missing or faulty is left out.
 """
 
-import re
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import Any
@@ -13,10 +12,9 @@ import numpy as np
 from zsim.scenario import fault_check
 from zsim.scenario.obstacle import nearest, row_of
 from zsim.scenario.role_table import AGENTS
-from zsim.scenario.scenario import ESTIMATORS, SEA_HEIGHT_MAX_M, space_name
+from zsim.scenario.scenario import SEA_HEIGHT_MAX_M, space_name
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 from zsim.schema.checker import Fault, show
-from zsim.schema.plugin import CLASS_NAME
 from zsim.vehicles.vehicle import Vehicle
 
 FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
@@ -46,7 +44,6 @@ def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fau
         yield from ((f"clusters[{index}].{path}", text) for path, text in _plan_faults(cluster))
     for index, cluster in clusters:
         yield from ((f"clusters[{index}].{path}", text) for path, text in _shape_faults(cluster, drones))
-    yield from _algorithm_faults(scenario.estimation)
     yield from _process_faults(scenario.processes, drones, clusters)
     yield from _injected_faults(scenario, drones, clusters)
     yield from _window_faults(scenario.report)
@@ -125,14 +122,14 @@ def _obstacle_faults(obstacles: _Entries, drones: _Entries, vehicles: Mapping[st
         wanted = _SIZES.get(obstacle.shape)
         if wanted is None:
             continue
-        given = [name for name in ("size_m", "radius_m", "height_m") if getattr(obstacle, name) is not None]
+        fields = [name for name in ("size_m", "radius_m", "height_m") if getattr(obstacle, name) is not None]
         for name in wanted:
-            if name not in given:
+            if name not in fields:
                 yield f"{path}.{name}", f"is missing; must be given for a {obstacle.shape}"
-        for name in given:
+        for name in fields:
             if name not in wanted:
                 yield f"{path}.{name}", f"is given; must be left out of a {obstacle.shape}"
-        if sorted(given) == sorted(wanted) and _known(obstacle.position_m, obstacle.yaw_deg):
+        if sorted(fields) == sorted(wanted) and _known(obstacle.position_m, obstacle.yaw_deg):
             yield from _buried_faults(obstacle, drones, vehicles)
 
 
@@ -142,8 +139,8 @@ def _buried_faults(obstacle: Any, drones: _Entries, vehicles: Mapping[str, Vehic
         if drone.position_m is not None:
             distance, least = nearest(row, *drone.position_m)[0], _clearance_m(drone, vehicles)
             if distance < least:
-                found = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
-                yield f"drones[{index}].position_m", f"{found}; must be >= {least:g} m"
+                place = f"is {distance:.2f} m from {obstacle.name or 'an obstacle'!r}"
+                yield f"drones[{index}].position_m", f"{place}; must be >= {least:g} m"
 
 
 def _drone_faults(drone: Any, scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fault]:
@@ -197,12 +194,8 @@ def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
             if name in owner:
                 yield path, f"is {name!r}, which {owner[name]!r} flies already; a drone is in one cluster"
             elif judged and name not in known:
-                yield path, f"is {name!r}; must be one of the drones {_listed(list(dict.fromkeys(known)))}"
+                yield path, f"is {name!r}; must be one of the drones {fault_check.listed(list(dict.fromkeys(known)))}"
             owner.setdefault(name, called)
-
-
-def _listed(names: list[str]) -> str:
-    return ", ".join(names[:20]) + (f", … ({len(names)})" if len(names) > 20 else "")
 
 
 def _shape_faults(cluster: Any, drones: _Entries) -> Iterator[Fault]:
@@ -235,23 +228,23 @@ def _group_faults(cluster: Any, groups: _Entries) -> Iterator[Fault]:
 
 def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Fault]:
     """Yield what is wrong with a formation of so many robots, or with where they stand at the start."""
-    given = spec.template_m
-    if given is None or robots < 2:
+    template = spec.template_m
+    if template is None or robots < 2:
         return
-    space = space_name(spec.space, robots, bool(given))
+    space = space_name(spec.space, robots, bool(template))
     if space == "triad":
-        if given:
+        if template:
             yield "template_m", "is given; must be left out where space is triad"
     elif space == "template" and robots < TEMPLATE_ROBOTS_MIN:
         path = "space" if spec.space else "template_m"
         yield path, f"asks for a template of {robots} robots; must be {TEMPLATE_ROBOTS_MIN} or more"
-    elif given and len(given) != robots:
-        yield "template_m", f"has {len(given)} places; must have {robots}, one for each robot"
+    elif template and len(template) != robots:
+        yield "template_m", f"has {len(template)} places; must have {robots}, one for each robot"
     elif space != "template":
         return  # a class of the user's own judges its template itself
-    elif given and _known(*given) and _in_line(given):
+    elif template and _known(*template) and _in_line(template):
         yield "template_m", f"is in one line, within {TEMPLATE_WIDTH_MIN_M:g} m; must span a plane or space"
-    elif not given and len(starts) == robots and _known(*starts) and _in_line(starts):
+    elif not template and len(starts) == robots and _known(*starts) and _in_line(starts):
         yield "template_m", "is missing, and the robots start in one line; must be given, or space must be triad"
 
 
@@ -275,12 +268,6 @@ def _plan_faults(cluster: Any) -> Iterator[Fault]:
             yield path, f"is {after.at_s:g}; must be > {before.at_s:g}, the one before"
 
 
-def _algorithm_faults(estimation: Any) -> Iterator[Fault]:
-    name = estimation and estimation.algorithm
-    if name and name not in ESTIMATORS and not re.search(CLASS_NAME, name):
-        yield "estimation.algorithm", f"is {show(name)}; must be {', '.join(ESTIMATORS)} or package.module:Class"
-
-
 def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
     first: dict[str, int] = {}
     things = {role: (each.about, drones if each.about == "drone" else clusters) for role, each in AGENTS.items()}
@@ -291,7 +278,7 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
         kind, entries = things.get(role, ("", []))
         known = _names(entries)
         if kind and thing not in known and len(known) == len(entries):
-            named = _listed(known) or f"a {kind}, and there is none"
+            named = fault_check.listed(known) or f"a {kind}, and there is none"
             allowed = f"must be {role}.NAME of {named}, or a name of your own"
             yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
 
@@ -303,8 +290,8 @@ def _injected_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Ite
     expected = scenario.processes and scenario.processes.expect
     processes = tuple(name for name in expected or () if name is not None)
     known = fault_check.Known(tuple(_names(drones)), tuple(_names(clusters)), processes)
-    for index, given in _entries(scenario.faults):
-        for path, text in fault_check.flaws(given, known):
+    for index, fault in _entries(scenario.faults):
+        for path, text in fault_check.flaws(fault, known):
             yield f"faults[{index}]{f'.{path}' if path else ''}", text
 
 

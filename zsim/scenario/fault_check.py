@@ -1,6 +1,6 @@
-"""What is wrong with a fault as somebody gives it: by the same tables in scenarios, requests and commands. Pure."""
+"""What is wrong with the description of a fault: by the same tables in scenarios, requests and commands. Pure."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from difflib import SequenceMatcher
 from typing import Any, NamedTuple
 
@@ -11,9 +11,9 @@ from zsim.schema.checker import Fault as Flaw
 from zsim.schema.checker import show
 
 FOR_EVER_S = 1e6  # s, as the longest scenario
-DEAF = ("world", "recorder", "console", "gateway", "router")  # roles that no gate waits for: none hears of a kill
+UNGATED = ("world", "recorder", "console", "gateway", "router")  # roles that no gate waits for: they ignore faults
 ALIKE = 0.85  # of difflib, chosen: from here on, words as long as "controller" differ by a slip of the hand
-COMMON = ("kind", "target", "at_s", "for_s")  # what every fault may say; the rest are parameters
+COMMON = ("kind", "target", "at_s", "for_s")  # what every fault may have; the rest are parameters
 
 
 class Known(NamedTuple):
@@ -24,61 +24,64 @@ class Known(NamedTuple):
     processes: tuple[str, ...] = ()
 
 
-def flaws(given: Any, known: Known) -> Iterator[Flaw]:
-    """Yield the path and what is wrong of everything in a fault as it is given; nothing where it is sound."""
-    if not isinstance(given, Mapping):
-        yield "", f"is {show(given)}; must be a map with kind and target"
+def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
+    """Yield path and text of every flaw of a fault as it stands in a scenario or request; nothing where it is sound."""
+    if not isinstance(fault, Mapping):
+        yield "", f"is {show(fault)}; must be a map with kind and target"
         return
-    name = given.get("kind")
+    name = fault.get("kind")
     kind = KINDS.get(name) if isinstance(name, str) else None
     if kind is None or not isinstance(name, str):
-        yield "kind", f"{_found(given, 'kind')}; must be one of {', '.join(KINDS)}"
+        yield "kind", f"{_actual(fault, 'kind')}; must be one of {', '.join(KINDS)}"
         return
     of = {parameter.name: parameter for parameter in kind.parameters}
-    for field in given:
+    for field in fault:
         if field not in COMMON and field not in of:
             allowed = ", ".join([*COMMON, *of])
             yield str(field)[:40], f"is not known; allowed: {allowed} ({name})"
-    found = [*_target_flaws(given, name, kind, known), *_time_flaws(given, name, kind)]
+    faults = [*_target_flaws(fault, name, kind, known), *_time_flaws(fault, name, kind)]
     for parameter in kind.parameters:
-        found += _parameter_flaws(given, parameter, known)
-    for path, text in found:
+        faults += _parameter_flaws(fault, parameter, known)
+    for path, text in faults:
         yield path, text if text.endswith(f"({name})") else f"{text} ({name})"
 
 
-def _found(given: Mapping[str, Any], field: str) -> str:
-    return f"is {show(given[field])}" if field in given else "is missing"
+def _actual(fault: Mapping[str, Any], field: str) -> str:
+    return f"is {show(fault[field])}" if field in fault else "is missing"
 
 
-def _target_flaws(given: Mapping[str, Any], name: str, kind: FaultKind, known: Known) -> Iterator[Flaw]:
-    found, target = _found(given, "target"), given.get("target")
+def _target_flaws(fault: Mapping[str, Any], name: str, kind: FaultKind, known: Known) -> Iterator[Flaw]:
+    actual, target = _actual(fault, "target"), fault.get("target")
     if kind.strikes == "link":
-        yield from _link_flaws(found, target, given.get("one_way") is True, known)
+        yield from _link_flaws(actual, target, fault.get("one_way") is True, known)
     elif kind.strikes == "process":
         if not isinstance(target, str) or not _takes_part(target, known):
-            yield "target", f"{found}; must be a process that takes part, as {_example(known)}"
-        elif target.partition(".")[0] in DEAF:
-            yield "target", f"{found}, outside of the lockstep; must be a process that takes part, as {_example(known)}"
+            yield "target", f"{actual}; must be a process that takes part, as {_example(known)}"
+        elif target.partition(".")[0] in UNGATED:
+            yield (
+                "target",
+                f"{actual}, outside of the lockstep; must be a process that takes part, as {_example(known)}",
+            )
     else:
         allowed = {"drone": known.drones, "world": ("world",), "radio": ("world", *known.clusters)}[kind.strikes]
         if target not in allowed:
-            yield "target", f"{found}; must be {'one of ' if len(allowed) > 1 else ''}{_listed(allowed)}"
+            yield "target", f"{actual}; must be {'one of ' if len(allowed) > 1 else ''}{listed(allowed)}"
 
 
-def _link_flaws(found: str, target: Any, one_way: bool, known: Known) -> Iterator[Flaw]:
+def _link_flaws(actual: str, target: Any, one_way: bool, known: Known) -> Iterator[Flaw]:
     names = target.split("/") if isinstance(target, str) else []
     if len(names) != 2 or names[0] == names[1]:
-        yield "target", f"{found}; must be two processes, as world/{_example(known)}"
+        yield "target", f"{actual}; must be two processes, as world/{_example(known)}"
         return
     for name in names:
         allowed = _allowed_instead(name, known)
         if allowed:
-            yield "target", f"{found}; {name[:48]!r} must be {allowed}"
-    heeds = f"the world or a process that takes part, as {_example(known)}"
+            yield "target", f"{actual}; {name[:48]!r} must be {allowed}"
+    receiver = f"the world or a process that takes part, as {_example(known)}"
     if not any(name == "world" or _takes_part(name, known) for name in names):
-        yield "target", f"{found}; one of them must be {heeds}"
-    elif one_way and names[1] != "world" and names[1].partition(".")[0] in DEAF:
-        yield "target", f"{found}, one way, and {names[1]!r} is outside of the lockstep; the second must be {heeds}"
+        yield "target", f"{actual}; one of them must be {receiver}"
+    elif one_way and names[1] != "world" and names[1].partition(".")[0] in UNGATED:
+        yield "target", f"{actual}, one way, and {names[1]!r} is outside of the lockstep; the second must be {receiver}"
 
 
 def _allowed_instead(name: str, known: Known) -> str | None:
@@ -90,7 +93,7 @@ def _allowed_instead(name: str, known: Known) -> str | None:
     role, dot, thing = name.partition(".")
     things = _things(known)
     if role in things and thing not in things[role]:
-        return f"{role}.NAME of {_listed(things[role])}"
+        return f"{role}.NAME of {listed(things[role])}"
     for ours, there in {**things, "world": ("",)}.items():
         if thing in there and ours not in role and SequenceMatcher(None, role, ours).ratio() >= ALIKE:
             return f"{ours}{dot}{thing}, or a name less like it"
@@ -111,12 +114,13 @@ def _example(known: Known) -> str:
     return f"estimator.{known.drones[0]}" if known.drones else "estimator.drone1"
 
 
-def _listed(names: tuple[str, ...]) -> str:
+def listed(names: Sequence[str]) -> str:
+    """Return names for an error, the first 20 of them."""
     return ", ".join(names[:20]) + (f", … ({len(names)})" if len(names) > 20 else "")
 
 
-def _time_flaws(given: Mapping[str, Any], name: str, kind: FaultKind) -> Iterator[Flaw]:
-    at_s, for_s = given.get("at_s"), given.get("for_s")
+def _time_flaws(fault: Mapping[str, Any], name: str, kind: FaultKind) -> Iterator[Flaw]:
+    at_s, for_s = fault.get("at_s"), fault.get("for_s")
     if at_s is not None and not _within(at_s, 0.0, FOR_EVER_S):
         yield "at_s", f"is {show(at_s)}; must be from 0 to {FOR_EVER_S:g} s"
     if kind.lasts == "once" and for_s is not None:
@@ -127,8 +131,8 @@ def _time_flaws(given: Mapping[str, Any], name: str, kind: FaultKind) -> Iterato
         yield "for_s", f"is {show(for_s)}; must be > 0 and <= {FOR_EVER_S:g} s"
 
 
-def _parameter_flaws(given: Mapping[str, Any], p: FaultParameter, known: Known) -> Iterator[Flaw]:
-    value = given.get(p.name)
+def _parameter_flaws(fault: Mapping[str, Any], p: FaultParameter, known: Known) -> Iterator[Flaw]:
+    value = fault.get(p.name)
     if value is None:
         if p.required:
             yield p.name, f"is missing; must be {expected(p)}"

@@ -6,7 +6,7 @@ A fault is given as a map: `kind`, `target`, `at_s`, `for_s`, and the parameters
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
-from zsim.contract.messages import Fault
+from zsim.contract.run_messages import Fault
 
 Target = Literal["drone", "world", "link", "radio", "process"]
 Shape = Literal["number", "vector", "choice", "flag", "places"]
@@ -56,12 +56,14 @@ class FaultKind(NamedTuple):
     lasts: Literal["any", "ends", "once"] = "any"
 
 
-def _number(name: str, said: str, unit: str, least: float = -1e9, most: float = 1e9, **more: Any) -> FaultParameter:
-    return FaultParameter(name, "number", said, unit, least, most, **more)
+def _number(
+    name: str, description: str, unit: str, least: float = -1e9, most: float = 1e9, **more: Any
+) -> FaultParameter:
+    return FaultParameter(name, "number", description, unit, least, most, **more)
 
 
-def _vector(name: str, said: str, unit: str, most: float) -> FaultParameter:
-    return FaultParameter(name, "vector", said, unit, -most, most)
+def _vector(name: str, description: str, unit: str, most: float) -> FaultParameter:
+    return FaultParameter(name, "vector", description, unit, -most, most)
 
 
 _PROBABILITY = FaultParameter("probability", "number", "of each sample", "", 0.0, 1.0, default=1.0, required=False)
@@ -98,12 +100,12 @@ _RADIO = (
 
 KINDS: dict[str, FaultKind] = {
     **{
-        f"{sensor}_dropout": FaultKind("drone", f"samples of the {said} are lost", (_PROBABILITY,))
-        for sensor, said in _SENSORS.items()
+        f"{sensor}_dropout": FaultKind("drone", f"samples of the {sensor_name} are lost", (_PROBABILITY,))
+        for sensor, sensor_name in _SENSORS.items()
     },
     **{
-        f"{sensor}_stuck": FaultKind("drone", f"the {said} shows one sample again and again")
-        for sensor, said in _SENSORS.items()
+        f"{sensor}_stuck": FaultKind("drone", f"the {sensor_name} shows one sample again and again")
+        for sensor, sensor_name in _SENSORS.items()
     },
     **{
         f"{name}_bias": FaultKind("drone", f"the {_NAMES[name]} has a constant error more", (value,))
@@ -156,24 +158,24 @@ def expected(p: FaultParameter) -> str:
     return f"[x, y, z], each {limits}{unit}" if p.shape == "vector" else f"{limits}{unit}"
 
 
-def planned(given: Mapping[str, Any], number: int, source: str, now_ns: int, gate_ns: int) -> Fault:
+def planned(description: Mapping[str, Any], number: int, source: str, now_ns: int, gate_ns: int) -> Fault:
     """Return the fault that a sound map asks for, in whole gates and with every parameter.
 
     It acts in the gates after `from_ns` up to `until_ns`: on what happens between these instants, and on messages that
     belong to those gates.
 
     Args:
-        given: without flaws.
+        description: without flaws.
         number: its id.
         now_ns: when it begins where `at_s` is left out.
     """
-    kind, at_s, for_s = KINDS[given["kind"]], given.get("at_s"), given.get("for_s")
+    kind, at_s, for_s = KINDS[description["kind"]], description.get("at_s"), description.get("for_s")
     from_ns = now_ns if at_s is None else round(at_s * 1e9 / gate_ns) * gate_ns
     until_ns = None if for_s is None else from_ns + max(1, round(for_s * 1e9 / gate_ns)) * gate_ns
     if kind.lasts == "once":
         until_ns = from_ns + gate_ns
-    parameters = {p.name: _plain(given.get(p.name), p) for p in kind.parameters}
-    return Fault(number, given["kind"], given["target"], parameters, from_ns, until_ns, source)
+    parameters = {p.name: _plain(description.get(p.name), p) for p in kind.parameters}
+    return Fault(number, description["kind"], description["target"], parameters, from_ns, until_ns, source)
 
 
 def _plain(value: Any, p: FaultParameter) -> Any:

@@ -23,11 +23,11 @@ def apply(document: dict[str, Any], text: str, parse: Callable[[str], Any]) -> s
         text: as given, e.g. "drones[2].yaw_deg=90".
         parse: turns the text of a value into the value; its ValueError says what is wrong.
     """
-    path, equals, given = text.partition("=")
+    path, equals, value_text = text.partition("=")
     if not equals or not _PATH.fullmatch(path):
         return f"{_name(text)}: is no assignment; must be {SYNTAX}"
     try:
-        _assign(document, steps_of(path), parse(given))
+        _assign(document, steps_of(path), parse(value_text))
     except ValueError as error:
         return f"{_name(text)}: {error}"
     return None

@@ -47,14 +47,14 @@ def agent_names(scenario: Any) -> list[str]:
     return [f"{role}.{thing}" for role in AGENTS for thing in things(role, scenario)]
 
 
-def on_death(given: Mapping[str, OnDeath], name: str, role: str | None = None) -> OnDeath:
+def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None) -> OnDeath:
     """Return what is to be done when a process dies: what is said of it, else of its role, else the default.
 
     Args:
-        given: of the scenario, by process name or role.
+        actions: of the scenario, by process name or role.
         name: of the process.
         role: that it says it has; else what its name begins with.
     """
     role = role or name.partition(".")[0]
     default = ROLES[role].on_death if role in ROLES else "drop"
-    return given.get(name) or given.get(role) or default
+    return actions.get(name) or actions.get(role) or default

@@ -1,4 +1,4 @@
-"""What a scenario says: typed, immutable, every quantity with its unit in its name.
+"""The scenario: typed, immutable, every quantity with its unit in its name.
 
 A file is read by `scenario_file.load`; the limits written here are the ones that its faults quote.
 """
@@ -174,7 +174,7 @@ class Silence(Spec, frozen=True, kw_only=True):
 
 
 class Gains(Spec, frozen=True, kw_only=True):
-    """Of the cluster controller; see zsim_agents/formation.py.
+    """Of the cluster controller; see zsim_agents.formation.control_law.
 
     All chosen. The loop is unstable from a proportional gain of about 2 1/s on, and answers well from 0.5 to 0.8.
     """
@@ -247,13 +247,20 @@ class Cluster(Spec, frozen=True, kw_only=True):
 
 
 ESTIMATORS = ("ekf", "paper")  # of this product; the first flies unless a scenario chooses
+AlgorithmName = Annotated[
+    str,
+    Meta(
+        pattern=rf"^({'|'.join(ESTIMATORS)})\Z|{CLASS_NAME}",
+        description=f"one of {', '.join(ESTIMATORS)}, or package.module:Class",
+    ),
+]
 
 
 class Estimation(Spec, frozen=True, kw_only=True):
     """Settings of the estimators; noise figures come from the drone's own sensors."""
 
-    algorithm: str | UnsetType = UNSET
-    """One of ESTIMATORS, or `package.module:Class`. Unset it stands in no resolved scenario."""
+    algorithm: AlgorithmName | UnsetType = UNSET
+    """Unset it stands in no resolved scenario."""
     madgwick_beta: Annotated[float, Meta(ge=0, le=1)] | None = None
     """rad/s; None: chosen from the accelerometer's noise."""
     gate_probability: Annotated[float, Meta(gt=0.5, lt=1)] = 0.9999
@@ -302,7 +309,7 @@ class Scenario(Spec, frozen=True, kw_only=True):
     estimation: Estimation = Estimation()
     processes: Processes = Processes()
     faults: Annotated[list[dict[str, Any]], Meta(max_length=FAULTS_MAX)] = []
-    """Faults to inject, each a map; `fault_flaws` says what they may be."""
+    """Faults to inject, each a map; `fault_check.flaws` judges them."""
     report: Figures = field(default_factory=Figures)
 
     def drone(self, name: str) -> Drone:

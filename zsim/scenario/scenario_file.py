@@ -53,8 +53,8 @@ def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:
 def _resolve(document: dict[str, Any], source: str, lines: list[str]) -> Scenario:
     vehicles, unknown = _vehicles(document)
     document = _expand_presets(document, vehicles)
-    found = [*faults(document, Document), *unknown, *cross_faults(sound(document, Scenario), vehicles)]
-    lines += [f"{source}: {path} {text}{_whose(document, path)}" for path, text in found]
+    flaws = [*faults(document, Document), *unknown, *cross_faults(sound(document, Scenario), vehicles)]
+    lines += [f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws]
     if lines:
         raise ScenarioError(_shortened(lines))
     del document["sensors"]
@@ -125,10 +125,10 @@ def _expand_drone(drone: Any, shared: dict[str, Any], vehicles: dict[str, Vehicl
     vehicle = vehicles.get(model) if isinstance(model, str) else None
     vehicle = vehicle or vehicles[catalogue.DEFAULT]
     own = drone.get("sensors")
-    given = _merge(shared, own) if isinstance(own, dict) else shared if own is None else own
+    own_sensors = _merge(shared, own) if isinstance(own, dict) else shared if own is None else own
     limits = _merge(msgspec.to_builtins(vehicle.limits), drone["limits"]) if _has_map(drone, "limits") else None
     defaults = {name: getattr(vehicle, name) for name in DEFAULTS} | {"limits": msgspec.to_builtins(vehicle.limits)}
-    expanded = {**defaults, **drone, "sensors": _expanded(given, vehicle.sensor_preset)}
+    expanded = {**defaults, **drone, "sensors": _expanded(own_sensors, vehicle.sensor_preset)}
     return expanded if limits is None else {**expanded, "limits": limits}
 
 
@@ -136,15 +136,15 @@ def _has_map(section: dict[str, Any], name: str) -> bool:
     return isinstance(section.get(name), dict)
 
 
-def _expanded(given: Any, default: str = catalogue.STOCK[catalogue.DEFAULT].sensor_preset) -> Any:
+def _expanded(sensors: Any, default: str = catalogue.STOCK[catalogue.DEFAULT].sensor_preset) -> Any:
     """Return a `sensors:` section upon its preset."""
-    if not isinstance(given, dict):
-        return given
-    name = given.get("preset", default)
+    if not isinstance(sensors, dict):
+        return sensors
+    name = sensors.get("preset", default)
     preset = PRESETS.get(name, PRESETS[default]) if isinstance(name, str) else PRESETS[default]
-    if given.get("as_printed") is True and name == "paper":
+    if sensors.get("as_printed") is True and name == "paper":
         preset = _merge(preset, AS_PRINTED)
-    return _merge({"preset": name, **preset}, given)
+    return _merge({"preset": name, **preset}, sensors)
 
 
 def _merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:

@@ -203,8 +203,8 @@ def _expected(info: types.Type) -> str:
 
 def _limits(info: types.FloatType | types.IntType) -> str:
     signs = ((">", info.gt), (">=", info.ge), ("<", info.lt), ("<=", info.le))
-    given = [(sign, limit) for sign, limit in signs if limit is not None and limit not in NO_LIMITS]
-    limits = [f"{sign} {_plain(limit)}" for sign, limit in given]
+    stated = [(sign, limit) for sign, limit in signs if limit is not None and limit not in NO_LIMITS]
+    limits = [f"{sign} {_plain(limit)}" for sign, limit in stated]
     return " and ".join(limits)
 
 

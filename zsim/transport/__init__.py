@@ -1,4 +1,10 @@
-"""Zenoh: sessions, their settings, TLS, and how a process finds the world.
+"""Zenoh: sessions, their settings, TLS, how a process finds the world, and the messages that pass the hub as batches.
 
-`session` alone imports zenoh. Imports scenario.
+Only `samples`, `declarations`, `session` and `connection` import zenoh. Imports scenario and what that stands on.
 """
+
+import os
+
+# Zenoh reads these when it is loaded; reasons in docs/decisions/0002-zenoh-settings.md.
+os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1))")
+os.environ.setdefault("RUST_LOG", "error")

@@ -1,20 +1,134 @@
-"""Finding the world: connect, read `world/info`, wait with progress when there is none yet."""
+"""How a process comes into a federation: the hub listens, a router passes on, everybody else connects to one of them.
+
+`find_world` connects, reads `world/info`, and waits with progress while there is no world yet.
+"""
 
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 
+import zenoh
+
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError, NoWorldError, SessionError
-from zsim.transport import session
+from zsim.transport import tls, zenoh_settings
+from zsim.transport.samples import first_sentence
 from zsim.transport.session import Session
 from zsim.transport.tls import Identity
+from zsim.transport.zenoh_settings import Mode, Settings
 
 ATTEMPT_S = 1.0  # one try to connect, so that waiting can be shown and interrupted
 PAUSE_S = 0.1  # between two questions to a hub where no world answers: another federation's, or one on its way up
 ANSWER_S = 1.0  # a hub that is there answers within milliseconds, unless it still compiles
+
+
+@contextmanager
+def listen(
+    endpoints: Sequence[str], federation: str, mode: Mode, identity: Identity | None = None
+) -> Iterator[Session]:
+    """Open the hub: a router that listens, to which every other role is a client.
+
+    A peer would do for clients, but carries nothing between two routers that both connect to it.
+
+    Raises:
+        SessionError: an endpoint is taken or malformed, or the identity is of no use.
+    """
+    with _listening(endpoints, federation, mode, identity or Identity(), zenoh_settings.hub()) as session:
+        session.use(mode)
+        yield session
+
+
+@contextmanager
+def route(
+    endpoint: str, upstream: str, federation: str, mode: Mode = "lockstep", identity: Identity | None = None
+) -> Iterator[Session]:
+    """Open a router: it listens on an endpoint, and tries for ever to reach the world, or another router, upstream.
+
+    Raises:
+        SessionError: an endpoint is taken or malformed, or the identity is of no use.
+    """
+    identity = identity or Identity()
+    with _listening([endpoint], federation, mode, identity, zenoh_settings.upstream(upstream, identity)) as session:
+        yield session
+
+
+@contextmanager
+def connect(
+    endpoint: str,
+    federation: str,
+    mode: Mode = "lockstep",
+    wait_s: float | None = None,
+    reader: bool = False,
+    identity: Identity | None = None,
+) -> Iterator[Session]:
+    """Open a client of the hub (or of a router).
+
+    Args:
+        endpoint: e.g. "tcp/192.168.1.2:7447".
+        federation: prefix of all keys.
+        mode: of the run, where it is known already.
+        wait_s: how long to try; None tries once.
+        reader: it does not gate; in lockstep too, a silence of LEASE_READER_MS is its death.
+        identity: host and certificate; without, this host's name and no TLS.
+
+    Raises:
+        SessionError: nobody listens there within `wait_s`, or a certificate, here or there, is refused.
+    """
+    identity = identity or Identity()
+    client = zenoh_settings.connecting(endpoint, identity, wait_s or 0.5)
+    settings = zenoh_settings.common("client", mode, reader) | client
+    with _open(settings, federation, identity, partial(tls.no_link, identity, endpoint)) as session:
+        yield session
+
+
+def check_listening(endpoints: Sequence[str], identity: Identity | None = None) -> None:
+    """Refuse endpoints on which nobody can listen, without listening.
+
+    Raises:
+        SessionError: one is malformed, or identity and endpoints do not go together.
+    """
+    if any(endpoint.endswith(":0") for endpoint in endpoints):
+        raise SessionError(f"cannot listen on {', '.join(endpoints)}: port 0 is no port that others could be told")
+    identity = identity or Identity()
+    _config(zenoh_settings.listening(endpoints, identity), identity)
+
+
+@contextmanager
+def _listening(
+    endpoints: Sequence[str], federation: str, mode: Mode, identity: Identity, others: Settings
+) -> Iterator[Session]:
+    check_listening(endpoints, identity)
+    settings = zenoh_settings.common("router", mode) | zenoh_settings.listening(endpoints, identity) | others
+    shown = ", ".join(endpoints)
+    with _open(settings, federation, identity, lambda error: f"cannot listen on {shown} ({error})") as session:
+        yield session
+
+
+@contextmanager
+def _open(settings: Settings, federation: str, identity: Identity, explain: Callable[[str], str]) -> Iterator[Session]:
+    config = _config(settings, identity)
+    try:
+        raw = zenoh.open(config)
+    except zenoh.ZError as error:
+        raise SessionError(explain(first_sentence(error))) from error
+    session = Session(raw, federation, identity)
+    try:
+        yield session
+    finally:
+        session.undeclare_all()
+        raw.close()
+
+
+def _config(settings: Settings, identity: Identity) -> zenoh.Config:
+    config = zenoh.Config()
+    for path, value in settings.items():
+        try:
+            config.insert_json5(path, value)
+        except zenoh.ZError as error:
+            raise SessionError(zenoh_settings.refusal(path, value, identity)) from error
+    return config
 
 
 @contextmanager
@@ -34,11 +148,11 @@ def find_world(
         endpoint: where the world (or a router) listens.
         federation: its name.
         wait_s: how long to wait for a world; None waits for ever.
-        say: told at growing intervals whom it waits for.
+        say: called at growing intervals with whom it waits for.
         stopped: asked while waiting.
-        reader: it does not gate; see `session.connect`.
+        reader: it does not gate; see `connect`.
         run_id: of the only run to take part in; None takes any.
-        identity: see `session.connect`.
+        identity: see `connect`.
 
     Raises:
         NoWorldError: no world answered within `wait_s`, or `stopped` said so.
@@ -47,7 +161,7 @@ def find_world(
     """
     keys.name(federation, "federation")
     with ExitStack() as stack:
-        dial = partial(session.connect, endpoint, federation, reader=reader, identity=identity)
+        dial = partial(connect, endpoint, federation, reader=reader, identity=identity)
         link, info = _search(stack, dial, endpoint, federation, wait_s, say, stopped, run_id, identity)
         if info.mode == "realtime":
             stack.pop_all().close()

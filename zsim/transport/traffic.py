@@ -1,7 +1,7 @@
 """Everything that passes the hub, taken in by one subscription: batches are taken apart here and nowhere else.
 
 traffic = Traffic(link, drones)
-for entry in traffic.receive(): ...     Sample(key, payload), or GateMessages of the world's drones
+for entry in traffic.receive(): ...     ReceivedSample(key, payload), or GateMessages of the world's drones
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from zsim.contract import keys
 from zsim.contract.framing import GateMessages, decode_batch, key_table
 from zsim.errors import DecodeError
-from zsim.transport.session import Sample, Session
+from zsim.transport.session import ReceivedSample, Session
 
-Passed = Sample | GateMessages
+Passed = ReceivedSample | GateMessages
 
 
 class Traffic:
@@ -24,30 +24,30 @@ class Traffic:
     """
 
     def __init__(self, link: Session, drones: Sequence[str], refused: Callable[[], None] = lambda: None) -> None:
-        self._box = link.subscribe(keys.BATCH)
+        self._subscription = link.subscribe(keys.BATCH)
         self._table = key_table(drones)
         self._refused = refused
 
     def wake(self) -> None:
         """Let a waiting `receive` return; callable from any thread."""
-        self._box.wake()
+        self._subscription.wake()
 
     def close(self) -> None:
         """Take no more; a waiting `receive` raises SessionError."""
-        self._box.close()
+        self._subscription.undeclare()
 
     def receive(self) -> list[Passed]:
         """Wait for what passes next; nothing when woken by `wake`.
 
         Raises:
-            SessionError: the session, or this mailbox, was closed meanwhile.
+            SessionError: the session, or this subscription, was closed meanwhile.
         """
-        sample = self._box.receive()
+        sample = self._subscription.receive()
         return list(self._opened(sample.payload)) if sample is not None else []
 
     def drain(self) -> Iterator[Passed]:
         """Yield what has passed, without waiting."""
-        for sample in self._box.drain():
+        for sample in self._subscription.drain():
             yield from self._opened(sample.payload)
 
     def _opened(self, payload: bytes) -> Iterator[Passed]:
@@ -58,7 +58,7 @@ class Traffic:
             return
         for key, message in passed:
             if key != keys.GATE:
-                yield Sample(key, message)
+                yield ReceivedSample(key, message)
                 continue
             try:
                 gate = GateMessages.unpack(message, self._table)
@@ -69,10 +69,10 @@ class Traffic:
             yield gate
 
 
-def samples(passed: Iterable[Passed]) -> Iterator[Sample]:
+def samples(passed: Iterable[Passed]) -> Iterator[ReceivedSample]:
     """Yield messages one by one."""
     for entry in passed:
         if isinstance(entry, GateMessages):
-            yield from (Sample(key, payload) for key, payload in entry.pairs)
+            yield from (ReceivedSample(key, payload) for key, payload in entry.pairs)
         else:
             yield entry

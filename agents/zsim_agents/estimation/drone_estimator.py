@@ -45,7 +45,7 @@ class DroneEstimator(Protocol):
     """Estimates the state of one drone.
 
     A class may have a method more, `warm_start(self, last)`: it is called before everything else where the process
-    takes over from one that died, with the last `zsim.contract.messages.Estimate` that this one published.
+    takes over from one that died, with the last `zsim.contract.flight_messages.Estimate` that this one published.
 
     Args:
         drone: its sensors, their mounts, rates and error models; where it was set down.

@@ -5,9 +5,9 @@ from typing import Any
 
 from msgspec import Struct
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.views import estimate_view
+from zsim.contract.views import ViewEstimates, estimate_view
 from zsim.errors import RunError
 from zsim.math.compiled import COMPILES
 from zsim.runtime.agent import Agent, Output
@@ -48,7 +48,7 @@ class Estimator(Agent):
         self._estimators = EstimatorSet(make, *settings) if make else EstimatorBank(*settings)
         self._settings = None if make else settings
         self.reads = tuple(keys.sensors(drone) for drone in names) if make else _reads(names)
-        self._last: list[messages.Estimate] = []
+        self._last: list[flight_messages.Estimate] = []
         self._view_key = keys.estimates_view(self.name)
         self.takes_gates = COMPILES and not make
         self._since_ns = 0
@@ -59,7 +59,7 @@ class Estimator(Agent):
         super().deliver(t_ns, inputs)
 
     def receive(self, key: str, message: Any) -> None:
-        if not isinstance(message, messages.Status):
+        if not isinstance(message, flight_messages.Status):
             # what a slow link brings has not arrived before the last gate, whatever stamp it bears
             t_arrival_s = max(message.t_ns, self._since_ns) * 1e-9
             _, drone, what = keys.parts(key)
@@ -74,12 +74,12 @@ class Estimator(Agent):
         self._last = [self._message(t_ns, key, each) for key, each in zip(self.writes, estimates, strict=True)]
         return list(map(Output, self.writes, self._last))
 
-    def _message(self, t_ns: int, key: str, estimate: Any) -> messages.Estimate:
-        return messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.source)
+    def _message(self, t_ns: int, key: str, estimate: Any) -> flight_messages.Estimate:
+        return flight_messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.source)
 
     def views(self, t_ns: int) -> list[Output]:
         shown = tuple(map(estimate_view, self.counted, self._last))
-        return [Output(self._view_key, messages.ViewEstimates(t_ns, self.next_seq(self._view_key), shown))]
+        return [Output(self._view_key, ViewEstimates(t_ns, self.next_seq(self._view_key), shown))]
 
     def rehearse(self) -> None:
         if self._settings is None:
@@ -98,7 +98,7 @@ class Estimator(Agent):
     def warm_start_keys(self) -> tuple[str, ...]:
         return self.writes
 
-    def warm_start(self, key: str, message: messages.Estimate) -> None:
+    def warm_start(self, key: str, message: flight_messages.Estimate) -> None:
         self._estimators.warm_start(self.writes.index(key), message)
 
 

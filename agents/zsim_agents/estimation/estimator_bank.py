@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.contract.flight_messages import Estimate
 from zsim.contract.framing import GateMessages
 from zsim.contract.keys import SENSORS
-from zsim.contract.messages import Estimate
 from zsim.math.compiled import portable
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim_agents.estimation import measurement_update, strapdown

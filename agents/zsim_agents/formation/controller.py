@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from zsim.contract import keys, messages
-from zsim.contract.messages import ControlAnswer, ControlRequest
+from zsim.contract import flight_messages, keys, messages, run_messages
+from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.contract.views import cluster_view
 from zsim.errors import DocumentError, RunError
 from zsim.runtime.agent import Agent, Output
@@ -86,13 +86,13 @@ class Controller(Agent):
         self._states: list[str] = ["landed"] * len(spec.drones)
         self._status_ns = [0] * len(spec.drones)
         self._engagement = engagement_of(scenario, spec)
-        self._last_state: messages.ClusterState | None = None
+        self._last_state: flight_messages.ClusterState | None = None
         self._request_key = keys.cluster_request(cluster)
         self._answered: list[tuple[ControlRequest, ControlAnswer]] = []  # since the last gate
 
     def receive(self, key: str, message: Any) -> None:
         place = self._place[key]
-        if type(message) is messages.Estimate:
+        if type(message) is flight_messages.Estimate:
             former = self._estimates[place]
             if former is _UNKNOWN or message.t_ns >= former.t_ns:  # in realtime an older one may come later
                 self._estimates[place] = message
@@ -111,7 +111,7 @@ class Controller(Agent):
         return [
             Output(
                 key,
-                messages.ClusterRequest(
+                run_messages.ClusterRequest(
                     t_ns, self.next_seq(key), request.op, request.args, request.source, answer.ok, answer.error, by
                 ),
             )
@@ -136,7 +136,7 @@ class Controller(Agent):
         outputs = []
         for drone, mode in output.modes:
             key = keys.command(drone, "mode")
-            outputs.append(Output(key, messages.Mode(t_ns, self.next_seq(key), self.source, mode)))  # type: ignore[arg-type]
+            outputs.append(Output(key, flight_messages.Mode(t_ns, self.next_seq(key), self.source, mode)))  # type: ignore[arg-type]
         return outputs
 
     def _velocities(self, t_ns: int, output: GateOutput) -> list[Output]:
@@ -145,14 +145,14 @@ class Controller(Agent):
             if setpoint is None or estimate is _UNKNOWN:
                 continue
             velocity = in_heading(setpoint.v_W, estimate.yaw_rad)
-            message = messages.Velocity(t_ns, self.next_seq(key), source, velocity, setpoint.yaw_rate)
+            message = flight_messages.Velocity(t_ns, self.next_seq(key), source, velocity, setpoint.yaw_rate)
             outputs.append(Output(key, message))
         return outputs
 
     def _state(self, t_ns: int, output: GateOutput) -> list[Output]:
         names = self._engagement.space.names
         value, desired = _finite(output.value), _finite(output.desired)
-        state = messages.ClusterState(
+        state = flight_messages.ClusterState(
             t_ns=t_ns,
             seq=self.next_seq(self._state_key),
             phase=output.phase,  # type: ignore[arg-type]
@@ -194,11 +194,11 @@ class Controller(Agent):
     def warm_start_keys(self) -> tuple[str, ...]:
         return (self._state_key,)
 
-    def warm_start(self, key: str, message: messages.ClusterState) -> None:
+    def warm_start(self, key: str, message: flight_messages.ClusterState) -> None:
         self._engagement.warm_start(message.phase, np.array(message.desired), message.plan_step)
 
 
-_UNKNOWN = messages.Estimate(
+_UNKNOWN = flight_messages.Estimate(
     0,
     0,
     (math.nan, math.nan, math.nan),

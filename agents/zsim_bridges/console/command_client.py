@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys
 from zsim.errors import ZsimError
 from zsim.transport.session import Session
 from zsim_bridges.console.view_buffer import ViewBuffer
@@ -220,7 +220,7 @@ class CommandClient:
             overtaken = stops is not None and self._emergencies[drone] > stops
             if not overtaken:
                 seq, self._seqs[drone] = self._seqs[drone], self._seqs[drone] + 1
-                message = messages.Mode(now_ns, seq, self._name, mode)  # type: ignore[arg-type]
+                message = flight_messages.Mode(now_ns, seq, self._name, mode)  # type: ignore[arg-type]
                 self._link.put(keys.command(drone, "mode"), message)
         with suppress(RuntimeError):  # closed: who leaves a run gives back what it has
             self._releases.submit(self._release, drone, before)

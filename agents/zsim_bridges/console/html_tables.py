@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
 
-from zsim.contract.messages import Clock, Event
+from zsim.contract.run_messages import Clock, Event
 
 LATE_MS = 200.0  # of an estimator: ten gates of 20 ms
 LOW_PERCENT = 20.0  # of a battery; the AR.Drone warns there

@@ -7,7 +7,8 @@ import msgspec
 import viser
 from msgspec import Meta, Struct
 
-from zsim.contract import messages
+from zsim.contract import flight_messages
+from zsim.schema.message import Number, Vector3
 from zsim_bridges.web_server import check_token, is_loopback_authority, tokens_match
 
 OPERATOR, VIEWER = "operator", "viewer"
@@ -16,7 +17,7 @@ MESSAGE_MAX = 100_000  # bytes of one message of a page
 VALUE_MAX = 2_000  # characters of a control's text: expressions of twelve variables, a line each
 EXACT_MAX = 2**53  # a page's numbers are exact up to it; a larger one fits no message
 
-Value = bool | messages.Number | Annotated[str, Meta(max_length=VALUE_MAX)]
+Value = bool | Number | Annotated[str, Meta(max_length=VALUE_MAX)]
 
 
 class PageRequest(NamedTuple):
@@ -98,15 +99,15 @@ def _is_from_own_page(request: PageRequest) -> bool:
 class Camera(Struct, tag_field="type", tag="ViewerCameraMessage"):
     """Every page sends where its camera is."""
 
-    wxyz: messages.Quaternion
-    position: messages.Vector3
-    fov: messages.Number
-    near: messages.Number
-    far: messages.Number
-    image_height: messages.Number
-    image_width: messages.Number
-    look_at: messages.Vector3
-    up_direction: messages.Vector3
+    wxyz: flight_messages.Quaternion
+    position: Vector3
+    fov: Number
+    near: Number
+    far: Number
+    image_height: Number
+    image_width: Number
+    look_at: Vector3
+    up_direction: Vector3
 
 
 class ControlUpdate(Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import viser
 
-from zsim.contract.messages import Event, Info, ViewDrones
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import Event
+from zsim.contract.views import ViewDrones
 from zsim.errors import RunError
 from zsim.math import frames
 from zsim.scenario import scenario_file

@@ -4,7 +4,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from zsim.contract.messages import EstimateView, Fault, ViewCluster, ViewDrones
+from zsim.contract.run_messages import Fault
+from zsim.contract.views import EstimateView, ViewCluster, ViewDrones
 from zsim_bridges.console import html_tables
 from zsim_bridges.console.page.picture import FormationShape
 from zsim_bridges.console.time_monitor import TimeMonitor

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from zsim.contract import keys
-from zsim.contract.messages import Clock
+from zsim.contract.run_messages import Clock
 from zsim.errors import ZsimError
 from zsim.transport.session import Session
 from zsim_bridges.observer_process import ObserverProcess

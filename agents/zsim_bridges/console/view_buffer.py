@@ -6,10 +6,13 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from zsim.contract import keys, messages
-from zsim.contract.messages import EstimateView, Event, Fault, Health, Info, ViewCluster, ViewDrones, ViewEstimates
+from zsim.contract import keys, messages, run_messages
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import Event, Fault, Health
+from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError
-from zsim.transport.session import Heard, Sample, Session
+from zsim.transport.samples import RawSample
+from zsim.transport.session import Session
 from zsim_bridges.observer_process import ObserverProcess
 
 EVENTS_KEPT = 200
@@ -82,8 +85,8 @@ class ViewBuffer:
     def open(self) -> None:
         """Subscribe, and read the last values of before."""
         for expression in ("view/**", keys.FAULTS, "process/*/health"):
-            self._link.hear(expression, self._on_publication)
-        self._link.on_message(keys.EVENT, self._on_event)
+            self._link.declare_subscriber(expression, self._on_publication)
+        self._link.declare_subscriber(keys.EVENT, self._on_event)
         samples = self._link.get(keys.FAULTS)
         with self._lock:
             for sample in samples:
@@ -132,7 +135,7 @@ class ViewBuffer:
         """Add an event of the console's own."""
         self.events.appendleft(event)
 
-    def _on_publication(self, sample: Heard) -> None:
+    def _on_publication(self, sample: RawSample) -> None:
         self._observer.health.received += 1
         with self._lock:
             self._new[sample.key] = sample.payload
@@ -147,7 +150,7 @@ class ViewBuffer:
             self.estimators[key.rpartition("/")[2]] = message
         elif isinstance(message, Health):
             self.healths[keys.thing(key)] = message
-        elif isinstance(message, messages.Faults):
+        elif isinstance(message, run_messages.Faults):
             self.faults = message.faults
 
     def _store_cluster(self, cluster: str, view: ViewCluster) -> None:
@@ -157,7 +160,7 @@ class ViewBuffer:
         else:
             self._observer.health.refused += 1
 
-    def _on_event(self, sample: Sample) -> None:
+    def _on_event(self, sample: RawSample) -> None:
         try:
             event = messages.decode(keys.EVENT, sample.payload)
         except DecodeError:

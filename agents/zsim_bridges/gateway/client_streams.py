@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import msgspec
 from aiohttp import WSMsgType, web
 
-from zsim.transport.session import Heard
+from zsim.transport.samples import RawSample
 from zsim_bridges.gateway.subscriptions import SharedSubscriptions
 
 OUTBOX_BYTES_MAX = 4_000_000  # about 20 s of a drone's sensors as JSON
@@ -32,7 +32,7 @@ _SOCKET_OPTIONS = (
 )
 
 Half = Coroutine[Any, Any, None]
-EventOf = Callable[[Heard], bytes]
+EventOf = Callable[[RawSample], bytes]
 """Makes the event of a publication."""
 
 

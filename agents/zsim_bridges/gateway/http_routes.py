@@ -9,7 +9,7 @@ from aiohttp import web
 
 from zsim import __version__
 from zsim.contract import messages
-from zsim.contract.messages import ControlAnswer, ControlRequest
+from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim_bridges.gateway.access_check import AccessCheck
 from zsim_bridges.gateway.client_streams import LINE_MAX, ClientFactory, serve_websocket
 from zsim_bridges.gateway.http_trees import JSON_PREFIX, JsonTree, RestTree

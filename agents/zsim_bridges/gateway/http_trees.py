@@ -22,9 +22,10 @@ import msgspec
 from aiohttp import web
 
 from zsim.contract import messages
-from zsim.contract.messages import REFUSALS, ControlRequest
+from zsim.contract.messages import REFUSALS
+from zsim.contract.run_messages import ControlRequest
 from zsim.errors import DecodeError
-from zsim.transport.session import Heard, check_expression
+from zsim.transport.samples import RawSample, check_expression
 from zsim_bridges.gateway.access_check import error_response
 from zsim_bridges.gateway.client_streams import event_bytes, stream_events
 from zsim_bridges.gateway.key_policy import MethodError, is_control_key, is_reserved
@@ -76,7 +77,7 @@ class RestTree:
         self._run().delete_full_key(_key_of(request, "/"))
         return web.Response()
 
-    async def _query(self, request: web.Request, expression: str) -> list[Heard]:
+    async def _query(self, request: web.Request, expression: str) -> list[RawSample]:
         body, run = await request.read(), self._run()
         stored = [] if body else run.last_samples(expression)
         if stored and "*" not in expression:
@@ -206,13 +207,13 @@ def _decode_body(key: str, body: bytes) -> Any:
 # Responses
 
 
-def described_sample(sample: Heard) -> dict[str, Any]:
+def described_sample(sample: RawSample) -> dict[str, Any]:
     """Return an answer or a publication as the plugin describes it."""
     key = "ERROR" if sample.kind == "ERROR" else sample.key
     return {"key": key, "value": _plugin_value(sample), "encoding": sample.encoding, "timestamp": sample.timestamp}
 
 
-def _plugin_value(sample: Heard) -> Any:
+def _plugin_value(sample: RawSample) -> Any:
     if not sample.payload:
         return None
     kind = sample.encoding.partition(";")[0]
@@ -227,12 +228,12 @@ def _plugin_value(sample: Heard) -> Any:
 
 
 @lru_cache(maxsize=CACHED_VALUES)
-def _sample_event(sample: Heard) -> bytes:
+def _sample_event(sample: RawSample) -> bytes:
     return event_bytes(sample.kind, json.dumps(described_sample(sample)).encode())
 
 
 @lru_cache(maxsize=CACHED_VALUES)
-def _value_event(sample: Heard) -> bytes:
+def _value_event(sample: RawSample) -> bytes:
     deleted = {"key": sample.key, "value": None}
     value = json_entry(sample.key, sample.payload, sample.encoding) if sample.payload else deleted
     return event_bytes(sample.kind, _encode(value))
@@ -242,13 +243,13 @@ def _as_json(value: Any) -> web.Response:
     return web.Response(body=_encode(value), content_type="application/json")
 
 
-def _as_raw(samples: list[Heard]) -> web.Response:
+def _as_raw(samples: list[RawSample]) -> web.Response:
     if not samples:
         return web.Response()
     return web.Response(body=samples[0].payload, headers={"Content-Type": samples[0].encoding})
 
 
-def _as_html(samples: Iterable[Heard]) -> str:
+def _as_html(samples: Iterable[RawSample]) -> str:
     texts = ((sample.key or "ERROR", sample.payload.decode(errors="replace")) for sample in samples)
     items = "\n".join(f"<dt>{html.escape(key)}</dt>\n<dd>{html.escape(text)}</dd>\n" for key, text in texts)
     return f"<dl>\n{items}\n</dl>\n"

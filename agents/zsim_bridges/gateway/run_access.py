@@ -8,10 +8,12 @@ from typing import Any
 
 from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages
-from zsim.contract.messages import ControlAnswer, Info
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
 from zsim.scenario import rights, scenario_file
-from zsim.transport.session import Heard, Session, check_expression
+from zsim.transport.samples import RawSample, check_expression
+from zsim.transport.session import Session
 from zsim.transport.traffic import Passed, Traffic
 from zsim_bridges.gateway.key_policy import (
     ForbiddenError,
@@ -50,7 +52,7 @@ class RunAccess:
         self.info = info
         self.values = LastValues([drone.name for drone in info.drones])
         self.defaults = MessageDefaults(observer.name)
-        self.bare_link = link.bare()
+        self.bare_link = link.unprefixed()
         self._observer = observer
         self._prefix = f"{link.federation}/"
         self._threads = ThreadPoolExecutor(REQUESTS_MAX, thread_name_prefix="ask")
@@ -71,7 +73,8 @@ class RunAccess:
     def open(self) -> None:
         """Subscribe to what passes the world, and read the last values of before."""
         self._traffic = Traffic(self.link, [drone.name for drone in self.info.drones], self._count_refused)
-        self.link.hear("view/**", lambda sample: self.values.add(sample.key, sample.payload))  # they do not pass it
+        # Views do not pass the world.
+        self.link.declare_subscriber("view/**", lambda sample: self.values.add(sample.key, sample.payload))
         for expression in rights.LAST_VALUES:
             for sample in self.link.get(expression):
                 self.values.add(sample.key, sample.payload)
@@ -128,7 +131,7 @@ class RunAccess:
     def publish(self, checked: Sequence[tuple[str, bytes]]) -> None:
         """Publish payloads that have been checked."""
         for key, payload in checked:
-            self.link.put_as(key, payload, messages.encoding(key))
+            self.link.put_sample(key, payload, messages.encoding(key))
             self.values.add_own(key, payload)
 
     def encode(self, key: str, value: Any) -> bytes:
@@ -189,21 +192,21 @@ class RunAccess:
 
     # By full keys, with the federation's name; keys of other federations too
 
-    def last_samples(self, expression: str) -> list[Heard]:
+    def last_samples(self, expression: str) -> list[RawSample]:
         """Return the last values that a full expression matches."""
         return [
-            Heard("PUT", f"{self._prefix}{key}", payload, self.values.encoding(key), None)
+            RawSample("PUT", f"{self._prefix}{key}", payload, self.values.encoding(key), None)
             for key, payload in self.values.matching(expression, self._prefix)
         ]
 
-    async def query(self, expression: str, parameters: str, payload: bytes, encoding: str) -> list[Heard]:
+    async def query(self, expression: str, parameters: str, payload: bytes, encoding: str) -> list[RawSample]:
         """Return the answers to a Zenoh get on a full expression.
 
         Raises:
             SessionError: it is no key expression.
             TooManyError: REQUESTS_MAX others wait already.
         """
-        return await self._in_thread(self.bare_link.inquire, expression, parameters, payload, encoding)
+        return await self._in_thread(self.bare_link.query, expression, parameters, payload, encoding)
 
     def put_full_key(self, key: str, payload: bytes, encoding: str) -> None:
         """Publish a payload on a full key.
@@ -216,7 +219,7 @@ class RunAccess:
         own = self._federation_key(key)
         if own is not None and messages.type_of(own) is not None:
             messages.decode(own, payload)
-        self.bare_link.put_as(key, payload, encoding)
+        self.bare_link.put_sample(key, payload, encoding)
         if own is not None:
             self.values.add_own(own, payload, encoding)
 

@@ -8,7 +8,7 @@ import msgspec
 
 from zsim.contract import keys
 from zsim.errors import DecodeError, NoWorldError, ZsimError
-from zsim.transport.session import Heard, check_expression
+from zsim.transport.samples import RawSample, check_expression
 from zsim_bridges.gateway import stream_requests
 from zsim_bridges.gateway.access_check import TokenBucket
 from zsim_bridges.gateway.client_streams import OUTBOX_BYTES_MAX, Outbox
@@ -243,7 +243,7 @@ class Client:
             self._subscriptions[request.key] = self._gateway.subscriptions.subscribe(request.key, self._on_value)
         self.send({"op": "subscribe", "key": request.key}, request)
 
-    def _on_value(self, sample: Heard) -> None:
+    def _on_value(self, sample: RawSample) -> None:
         self._outbox.put(value_line(sample), droppable=True)
 
     def _unsubscribe(self, request: stream_requests.UnsubscribeRequest) -> None:

@@ -4,11 +4,12 @@ import asyncio
 from collections import deque
 from collections.abc import Callable
 
-from zsim.transport.session import Heard, Session, check_expression
+from zsim.transport.samples import RawSample, check_expression
+from zsim.transport.session import Session
 from zsim_bridges.gateway.access_check import ConnectionLimit
 from zsim_bridges.gateway.key_policy import TooManyError
 
-Subscriber = Callable[[Heard], None]
+Subscriber = Callable[[RawSample], None]
 WAITING_MAX = 50_000  # messages of an expression that wait for the loop; then the oldest go
 DELIVER_MAX = 500  # messages delivered before the other tasks of the loop run
 EXPRESSIONS_MAX = 2_000  # of all clients together; each is a subscription that the world's session checks
@@ -32,7 +33,7 @@ class SharedSubscriptions:
         """Subscribe on a session."""
         self._link = link
         for expression, shared in self._by_expression.items():
-            shared.undeclare = link.hear(expression, shared.on_publication)
+            shared.undeclare = link.declare_subscriber(expression, shared.on_publication)
 
     def detach(self) -> None:
         """Receive nothing until the next `attach`: the session closes."""
@@ -54,7 +55,7 @@ class SharedSubscriptions:
                 raise TooManyError(f"subscribe: there are {EXPRESSIONS_MAX} expressions already; take one of them")
             shared = self._by_expression[expression] = _SharedSubscription(self._loop)
             if self._link is not None:
-                shared.undeclare = self._link.hear(expression, shared.on_publication)
+                shared.undeclare = self._link.declare_subscriber(expression, shared.on_publication)
         shared.subscribers[subscriber] = None
         return lambda: self._unsubscribe(expression, subscriber)
 
@@ -93,12 +94,12 @@ class _SharedSubscription:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
-        self._waiting: deque[Heard] = deque(maxlen=WAITING_MAX)
+        self._waiting: deque[RawSample] = deque(maxlen=WAITING_MAX)
         self._scheduled = False
         self.subscribers: dict[Subscriber, None] = {}
         self.undeclare: Callable[[], None] = _do_nothing
 
-    def on_publication(self, sample: Heard) -> None:
+    def on_publication(self, sample: RawSample) -> None:
         """Store a publication, in a thread of Zenoh's."""
         self._waiting.append(sample)
         if not self._scheduled:

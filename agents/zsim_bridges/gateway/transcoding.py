@@ -8,7 +8,7 @@ import msgspec
 
 from zsim.contract import messages
 from zsim.errors import DecodeError
-from zsim.transport.session import Heard
+from zsim.transport.samples import RawSample
 
 CACHED_VALUES = 256  # values; one goes to many clients, and is encoded once
 INTEGER_MAX = 2.0**63  # a double above it is no integer of 64 bits
@@ -103,7 +103,7 @@ def json_entry(key: str, payload: bytes, encoding: str = "") -> dict[str, Any]:
 
 
 @lru_cache(maxsize=CACHED_VALUES)
-def value_line(sample: Heard) -> bytes:
+def value_line(sample: RawSample) -> bytes:
     """Return the line of a value for a client; null for a key that was deleted."""
     value = payload_to_json(sample.key, sample.payload, sample.encoding) if sample.payload else b"null"
     return b'{"op":"value","key":%b,"value":%b}\n' % (_to_json(sample.key), value)

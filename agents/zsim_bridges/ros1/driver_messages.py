@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from zsim.contract import messages
+from zsim.contract import flight_messages, messages, run_messages
 from zsim.scenario.sensor_presets import G_M_S2
 from zsim_bridges import ros_frames
 from zsim_bridges.ros1.onboard import OnboardState
@@ -63,7 +63,7 @@ def header(seq: int, t_ns: int, frame: str) -> Any:
     return Header(seq, ros_time(t_ns), frame)
 
 
-def clock(message: messages.Clock) -> Any:
+def clock(message: run_messages.Clock) -> Any:
     """Return the time of `/clock`."""
     return Clock(clock=ros_time(message.t_ns))
 
@@ -164,7 +164,7 @@ def odometry(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
     return _odometry(head, frames.base, state.position_m, state.attitude, velocity, rate)
 
 
-def ground_truth(seq: int, truth: messages.Truth, frames: DriverFrames) -> Any:
+def ground_truth(seq: int, truth: flight_messages.Truth, frames: DriverFrames) -> Any:
     """Return the true state as Gazebo's p3d plugin does, which hector_quadrotor and tum_simulator use: all in W."""
     q, rate = truth.orientation_wxyz, ros_frames.rotated(truth.orientation_wxyz, truth.angular_velocity_rad_s)
     head = header(seq, truth.t_ns, WORLD)

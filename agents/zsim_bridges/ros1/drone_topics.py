@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages
 from zsim.scenario.scenario import Drone
 from zsim_bridges import ros_frames
 from zsim_bridges.ros1 import driver_messages
@@ -50,7 +50,7 @@ class DriverCommands:
         self._seq = {self._tilt_key: 0, self._mode_key: 0}
         self._tilt: TiltCommand | None = None
         self._sent_ns: int | None = None
-        self._status: messages.Status | None = None
+        self._status: flight_messages.Status | None = None
 
     def on_cmd_vel(self, twist: Any) -> None:
         """Fly a geometry_msgs/Twist from the next gate on.
@@ -79,7 +79,7 @@ class DriverCommands:
         state = self._status.state if self._status else "not there yet"
         return None if state == "landed" else f"the drone is {state}; must be landed"
 
-    def on_status(self, status: messages.Status) -> None:
+    def on_status(self, status: flight_messages.Status) -> None:
         """Send the command that is due at a gate."""
         self._status = status
         if status.state not in COMMANDABLE:
@@ -88,11 +88,11 @@ class DriverCommands:
         if self._tilt is not None and late and status.state in AIRBORNE:
             self._sent_ns = status.t_ns
             seq = self._next_seq(self._tilt_key)
-            self._put(self._tilt_key, messages.Ardrone(status.t_ns, seq, self._source, *self._tilt))
+            self._put(self._tilt_key, flight_messages.Ardrone(status.t_ns, seq, self._source, *self._tilt))
 
     def _send_mode(self, mode: Any) -> None:
         t_ns = self._status.t_ns if self._status else 0
-        self._put(self._mode_key, messages.Mode(t_ns, self._next_seq(self._mode_key), self._source, mode))
+        self._put(self._mode_key, flight_messages.Mode(t_ns, self._next_seq(self._mode_key), self._source, mode))
 
     def _next_seq(self, key: str) -> int:
         self._seq[key] += 1
@@ -168,12 +168,12 @@ class DroneTopics:
                 self._mag.publish(partial(driver_messages.mag, sample=message, frames=frames))
             case messages.Gps():
                 self._fix.publish(partial(driver_messages.fix, sample=message, frames=frames))
-            case messages.Truth():
+            case flight_messages.Truth():
                 self._truth.publish(partial(driver_messages.ground_truth, truth=message, frames=frames))
-            case messages.Status():
+            case flight_messages.Status():
                 self._publish_status(message)
 
-    def _publish_status(self, status: messages.Status) -> None:
+    def _publish_status(self, status: flight_messages.Status) -> None:
         state, frames = self._state, self._frames
         self._commands.on_status(status)
         self._navdata.publish(partial(driver_messages.navdata, state=state, frames=frames))

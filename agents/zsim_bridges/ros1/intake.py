@@ -10,7 +10,8 @@ from zsim.contract import keys
 from zsim.contract.messages import Info
 from zsim.errors import SessionError
 from zsim.runtime.health import HealthMeter
-from zsim.transport.session import Sample, Session
+from zsim.transport.samples import ReceivedSample
+from zsim.transport.session import Session
 from zsim.transport.traffic import Passed, Traffic, samples
 
 BACKLOG = 250  # times that something arrived, some seconds of realtime
@@ -46,7 +47,7 @@ class Intake:
         self._traffic.close()
         self._thread.join(1.0)
 
-    def arrivals(self) -> Iterator[list[Sample]]:
+    def arrivals(self) -> Iterator[list[ReceivedSample]]:
         """Yield what has come until now, in the parts in which it came."""
         self.news.clear()
         for _ in range(len(self._backlog)):

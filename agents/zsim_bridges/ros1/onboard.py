@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from zsim.contract import messages
+from zsim.contract import flight_messages, messages
 from zsim.scenario.scenario import Mount
 from zsim_agents.estimation.madgwick import LEVEL, Rotation, madgwick_step, rpy_rotation, turn
 from zsim_bridges import ros_frames
@@ -47,8 +47,8 @@ class OnboardState:
         self.mag: messages.Mag | None = None
         self.baro: messages.Baro | None = None
         self.flow: messages.Flow | None = None
-        self.status: messages.Status | None = None
-        self.estimate: messages.Estimate | None = None
+        self.status: flight_messages.Status | None = None
+        self.estimate: flight_messages.Estimate | None = None
         self.attitude = LEVEL
         self.altitude_m = 0.0
         self._ground_baro_m: float | None = None
@@ -100,7 +100,7 @@ class OnboardState:
         self._x_m += dt * (vx * math.cos(yaw) - vy * math.sin(yaw))
         self._y_m += dt * (vx * math.sin(yaw) + vy * math.cos(yaw))
 
-    def _on_estimate(self, estimate: messages.Estimate) -> None:
+    def _on_estimate(self, estimate: flight_messages.Estimate) -> None:
         if abs(math.hypot(*estimate.orientation_wxyz) - 1.0) < UNIT_SLACK:
             self.estimate = estimate
             self.attitude = estimate.orientation_wxyz
@@ -109,7 +109,7 @@ class OnboardState:
             x, y, z = estimate.position_m
             self.origin_m = (x - position[0], y - position[1], z - position[2])
 
-    def _on_status(self, status: messages.Status) -> None:
+    def _on_status(self, status: flight_messages.Status) -> None:
         self.status = status
         self._positions.append((status.t_ns, self.position_m))
 
@@ -119,8 +119,8 @@ class OnboardState:
         messages.Baro: _on_baro,
         messages.Sonar: _on_sonar,
         messages.Flow: _on_flow,
-        messages.Estimate: _on_estimate,
-        messages.Status: _on_status,
+        flight_messages.Estimate: _on_estimate,
+        flight_messages.Status: _on_status,
     }
 
 

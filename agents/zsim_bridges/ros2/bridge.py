@@ -14,8 +14,9 @@ from zsim.contract.messages import Info
 from zsim.errors import SessionError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim.transport import session
-from zsim.transport.session import Heard, Session
+from zsim.transport import connection
+from zsim.transport.samples import RawSample
+from zsim.transport.session import Session
 from zsim.transport.tls import Identity
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
@@ -77,9 +78,9 @@ class Bridge:
             ros_names((drone.name for drone in info.drones), "drone"),
             ros_names((cluster.name for cluster in info.clusters), "cluster"),
         )
-        self._cleanups.append(link.hear(keys.CLOCK, self._on_clock))
+        self._cleanups.append(link.declare_subscriber(keys.CLOCK, self._on_clock))
 
-    def _on_clock(self, sample: Heard) -> None:
+    def _on_clock(self, sample: RawSample) -> None:
         self._queue.add_task(partial(self._observer.update_clock, sample.payload))
 
     def process(self, within_s: float) -> None:
@@ -209,7 +210,7 @@ def serve(
     """
     bridge = Bridge(link, info, observer, say, wall_ns)
     with ExitStack() as stack, closing(bridge):
-        ros_link = link.bare() if network.router is None else None
+        ros_link = link.unprefixed() if network.router is None else None
         entered = False
         while not observer.end_reason and not stopped():
             ros_link = ros_link or _connect(stack, network, bridge)
@@ -225,7 +226,7 @@ def _connect(stack: ExitStack, network: RosNetwork, bridge: Bridge) -> Session |
     assert network.router is not None
     try:
         return stack.enter_context(
-            session.connect(network.router, "", wait_s=ATTEMPT_S, reader=True, identity=network.identity)
+            connection.connect(network.router, "", wait_s=ATTEMPT_S, reader=True, identity=network.identity)
         )
     except SessionError as error:
         if "nobody listens" not in str(error):

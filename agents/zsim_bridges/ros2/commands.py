@@ -5,7 +5,7 @@ from threading import Lock
 from typing import Any
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import Mode, Velocity
+from zsim.contract.flight_messages import Mode, Velocity
 from zsim.errors import DecodeError
 from zsim.transport.session import Session
 from zsim_bridges.observer_process import ObserverProcess

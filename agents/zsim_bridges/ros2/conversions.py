@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys.stores import ros2_jazzy as ros
 
-from zsim.contract import messages
-from zsim.contract.messages import Quaternion, Vector3
+from zsim.contract import flight_messages, messages, run_messages
+from zsim.contract.flight_messages import Quaternion
 from zsim.math.frames import quaternion_from_rpy, quaternion_multiply
 from zsim.scenario import scenario
 from zsim.scenario.scenario import Mount, Sensors
+from zsim.schema.message import Vector3
 from zsim_bridges import ros_frames
 
 MAP = "map"
@@ -100,7 +101,7 @@ def header(t_ns: int, frame: str) -> Any:
     return Header(stamp(t_ns), frame)
 
 
-def clock(message: messages.Clock) -> Any:
+def clock(message: run_messages.Clock) -> Any:
     return ros.rosgraph_msgs__msg__Clock(stamp(message.t_ns))
 
 
@@ -160,7 +161,7 @@ def sonar_range(message: messages.Sonar, frame: str, sonar: scenario.SonarConfig
     )
 
 
-def battery(message: messages.Status, frame: str) -> Any:
+def battery(message: flight_messages.Status, frame: str) -> Any:
     return ros.sensor_msgs__msg__BatteryState(
         header(message.t_ns, frame),
         NAN, NAN, NAN, NAN, NAN, NAN,
@@ -170,11 +171,11 @@ def battery(message: messages.Status, frame: str) -> Any:
     )  # fmt: skip
 
 
-def state(message: messages.Status) -> Any:
+def state(message: flight_messages.Status) -> Any:
     return ros.std_msgs__msg__String(message.state)
 
 
-def true_odometry(message: messages.Truth, frame: str, child: str) -> Any:
+def true_odometry(message: flight_messages.Truth, frame: str, child: str) -> Any:
     """Return the true state; twist in the body, without any uncertainty."""
     q = message.orientation_wxyz
     nothing = np.zeros(36)
@@ -186,7 +187,7 @@ def true_odometry(message: messages.Truth, frame: str, child: str) -> Any:
     )
 
 
-def odometry(message: messages.Estimate, frame: str, child: str, w_WB_B: Vector3) -> Any:
+def odometry(message: flight_messages.Estimate, frame: str, child: str, w_WB_B: Vector3) -> Any:
     """Return an estimate; twist in the body. Of the attitude only the heading has an uncertainty."""
     P = np.array(message.covariance).reshape(6, 6)
     R = np.array(ros_frames.rotation_rows(message.orientation_wxyz))
@@ -225,7 +226,7 @@ def transforms(t_ns: int, poses: list[FramePose]) -> Any:
     return ros.tf2_msgs__msg__TFMessage([transform(t_ns, each) for each in poses])
 
 
-def cluster_pose(message: messages.ClusterState, parent: str, name: str) -> FramePose:
+def cluster_pose(message: flight_messages.ClusterState, parent: str, name: str) -> FramePose:
     """Return the pose of the cluster frame C by the estimates; a pair has no roll."""
     values = dict(zip(message.names, message.value, strict=True))
     x, y, z, roll, pitch, yaw = (values.get(each, 0.0) for each in ("x_c", "y_c", "z_c", "roll", "pitch", "yaw"))
@@ -239,7 +240,7 @@ def pose_stamped(t_ns: int, pose: FramePose) -> Any:
     return ros.geometry_msgs__msg__PoseStamped(header(t_ns, pose.parent), message)
 
 
-def cluster_state(kind: Any, message: messages.ClusterState, frame: str) -> Any:
+def cluster_state(kind: Any, message: flight_messages.ClusterState, frame: str) -> Any:
     """Return a zsim_msgs/ClusterState; `kind` is its class."""
     return kind(
         header=header(message.t_ns, frame),

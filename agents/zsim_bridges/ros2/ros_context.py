@@ -4,7 +4,9 @@ from collections.abc import Callable
 from itertools import count
 from typing import Any
 
-from zsim.transport.session import Heard, Query, Session
+from zsim.transport.declarations import Query
+from zsim.transport.samples import RawSample
+from zsim.transport.session import Session
 from zsim_bridges.ros2 import rmw_zenoh
 from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId, Qos
 from zsim_bridges.ros2.ros_types import RosTypes, service_parts
@@ -69,14 +71,14 @@ class Ros2Node:
         context = self._context
         endpoint, token = self._endpoint("MS", topic, kind, qos)
 
-        def on_publication(sample: Heard) -> None:
+        def on_publication(sample: RawSample) -> None:
             try:
                 rmw_zenoh.attachment_of(sample.attachment)
                 callback(context.types.decode(sample.payload, kind))
             except ValueError as error:
                 context.refuse(topic, str(error))
 
-        undeclare = context.link.hear(endpoint.key(context.domain), on_publication)
+        undeclare = context.link.declare_subscriber(endpoint.key(context.domain), on_publication)
         self._declare(token)
         return undeclare
 
@@ -95,9 +97,9 @@ class Ros2Node:
                 context.refuse(name, str(error))
                 return
             attachment = Attachment(received.sequence, context.wall_ns(), received.gid)
-            query.reply_as(key, context.types.encode(response, response_type), attachment.packed())
+            query.reply_raw(key, context.types.encode(response, response_type), attachment.packed())
 
-        context.link.answer(key, reply, complete=True)
+        context.link.declare_queryable(key, reply, complete=True)
         self._declare(token)
 
     def _endpoint(self, how: rmw_zenoh.Kind, name: str, kind: str, qos: Qos) -> tuple[Endpoint, str]:
@@ -125,7 +127,9 @@ class Publisher:
         self._sent = 0
         self.key = endpoint.key(context.domain)
         kept = qos.transient_local
-        self._write = _transient_writer(context.link, self.key) if kept else context.link.writer(self.key, CDR)
+        self._write = (
+            _transient_publisher(context.link, self.key) if kept else context.link.declare_publisher(self.key, CDR)
+        )
 
     def publish(self, message: Any) -> None:
         """Send a message; a subscriber that is too slow loses it, the publisher never waits.
@@ -140,6 +144,6 @@ class Publisher:
         self._write(payload, attachment)
 
 
-def _transient_writer(link: Session, key: str) -> Callable[[bytes, bytes], None]:
-    """Return a writer whose last message later subscribers receive, too."""
-    return lambda payload, attachment: link.put_kept(key, payload, CDR, attachment)
+def _transient_publisher(link: Session, key: str) -> Callable[[bytes, bytes], None]:
+    """Return what publishes on a key, so that later subscribers receive the last message, too."""
+    return lambda payload, attachment: link.put_cached(key, payload, CDR, attachment)

@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError
-from zsim.transport.session import Heard, Mailbox, Sample, Session
+from zsim.transport.declarations import Subscription
+from zsim.transport.samples import RawSample, ReceivedSample
+from zsim.transport.session import Session
 from zsim_bridges.ros2.ros_context import Publisher
 from zsim_bridges.ros2.topics import Topic
 
@@ -75,11 +77,11 @@ class BridgedTopic:
 
 
 class SourceSubscription(NamedTuple):
-    """The subscription to a key, and its topics; without a mailbox each sample is queued as it comes."""
+    """The subscription to a key, and its topics; each sample is queued as it comes unless it is polled."""
 
     readers: list[BridgedTopic]
     close: Callable[[], None]
-    mailbox: Mailbox | None = None
+    polled: Subscription | None = None
 
 
 class SourceSubscriptions:
@@ -87,7 +89,7 @@ class SourceSubscriptions:
 
     Args:
         link: to the world.
-        queue: of samples without a mailbox.
+        queue: of samples that are not polled.
         refuse: called with (name, reason) of a message that cannot be converted.
         prompt: whether estimates and cluster states are converted as they come, rather than with the next clock: a
             turn for each of them costs more than to convert it, and only in realtime is a gate a long time.
@@ -114,11 +116,11 @@ class SourceSubscriptions:
     def _open_source(self, key: str) -> SourceSubscription:
         """Subscribe to a key: the world's messages are there when its clock comes, those of others come at any time."""
         if self._prompt and keys.leaf(key) in ("estimate", "state"):
-            return SourceSubscription([], self._link.hear(key, self._on_sample))
-        box = self._link.subscribe(key)
-        return SourceSubscription([], box.close, box)
+            return SourceSubscription([], self._link.declare_subscriber(key, self._on_sample))
+        subscription = self._link.subscribe(key)
+        return SourceSubscription([], subscription.undeclare, subscription)
 
-    def _on_sample(self, sample: Heard) -> None:
+    def _on_sample(self, sample: RawSample) -> None:
         if sample.payload:
             self._queue.add_sample(sample.key, sample.payload)
 
@@ -137,17 +139,17 @@ class SourceSubscriptions:
             source.close()
 
     def convert_all(self, samples: Sequence[tuple[str, bytes]]) -> int:
-        """Convert and publish samples and those in the mailboxes, in order of time; return how many they were."""
-        boxes = [source.mailbox for source in self._by_key.values() if source.mailbox]
-        arrived = [*samples, *(sample for box in boxes for sample in self._newest(box))]
+        """Convert and publish queued and polled samples in order of time; return how many they were."""
+        polled = [source.polled for source in self._by_key.values() if source.polled]
+        arrived = [*samples, *(sample for subscription in polled for sample in self._newest(subscription))]
         for key, message in sorted(self._decoded(arrived), key=_gate_order):
             for publication in self._by_key[key].readers:
                 self._publish(publication, key, message)
         return len(arrived)
 
-    def _newest(self, box: Mailbox) -> list[Sample]:
-        """Return the samples in a mailbox, the newest of them if there are too many."""
-        samples = list(box.drain())
+    def _newest(self, subscription: Subscription) -> list[ReceivedSample]:
+        """Return the samples that have arrived, the newest of them if there are too many."""
+        samples = list(subscription.drain())
         self.dropped += max(0, len(samples) - SAMPLES_MAX)
         return samples[-SAMPLES_MAX:]
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zsim.contract import keys
-from zsim.contract.messages import ClusterState, Estimate, Status
+from zsim.contract.flight_messages import ClusterState, Estimate, Status
 from zsim.math.frames import rpy_from_quaternion
 from zsim.scenario.scenario import Sensors
 from zsim.scenario.sensor_presets import G_M_S2

@@ -23,7 +23,9 @@ from foxglove.messages import (
     PointCloud,
 )
 
-from zsim.contract.messages import Estimate, Event, Gps, Status, Truth
+from zsim.contract.flight_messages import Estimate, Status, Truth
+from zsim.contract.messages import Gps
+from zsim.contract.run_messages import Event
 from zsim.math.frames import heading, quaternion_from_rpy
 from zsim_analysis.export.foxglove_scene import (
     WORLD,

@@ -29,7 +29,9 @@ from foxglove.messages import (
 )
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import ClusterState, Estimate, Event, Gps, Info, Status, Truth
+from zsim.contract.flight_messages import ClusterState, Estimate, Status, Truth
+from zsim.contract.messages import Gps, Info
+from zsim.contract.run_messages import Event
 from zsim.math.frames import principal_axes
 from zsim.record import Recorded
 from zsim_analysis.export.message_columns import Values

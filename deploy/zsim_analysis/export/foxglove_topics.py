@@ -19,7 +19,7 @@ from foxglove.channels import (
 )
 from foxglove.messages import PoseInFrame
 
-from zsim.contract.messages import ClusterState, Status
+from zsim.contract.flight_messages import ClusterState, Status
 from zsim.math.frames import heading
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 from zsim_analysis.export import foxglove_messages, foxglove_scene

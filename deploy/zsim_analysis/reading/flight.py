@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.contract.messages import Event, Info
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import Event
 from zsim.scenario.scenario import Scenario
 
 Array = NDArray[np.float64]

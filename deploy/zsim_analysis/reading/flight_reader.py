@@ -10,9 +10,12 @@ import numpy as np
 from msgspec import Struct
 
 from zsim.contract import keys
+from zsim.contract.flight_messages import Quaternion
 from zsim.contract.framing import GateMessages
-from zsim.contract.messages import Bye, Event, Info, Join, Quaternion, Vector3
+from zsim.contract.messages import Info
+from zsim.contract.run_messages import Bye, Event, Join
 from zsim.record import Recorded, RecordReader
+from zsim.schema.message import Vector3
 from zsim_analysis.reading.flight import TRUTH_WIDTH, ClusterStates, RecordedFlight, RunParticipant, Track
 from zsim_analysis.reading.recorded_run import scenario_of
 

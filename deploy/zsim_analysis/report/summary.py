@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Struct
 
 from zsim import __version__
-from zsim.contract.messages import Event
+from zsim.contract.run_messages import Event
 from zsim.record.run_folder import record_notes
 from zsim_analysis.reading.flight import RecordedFlight, RunParticipant
 from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m, window

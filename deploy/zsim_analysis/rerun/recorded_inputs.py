@@ -7,7 +7,7 @@ received before that gate was integrated.
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.record import Recorded, RecordReader
 from zsim.scenario.fault_kinds import PROCESS_KILL
 from zsim.scenario.role_table import AGENTS
@@ -24,7 +24,7 @@ ABSENCES = (
     "leave",
 )  # events of a process that did not take part all the time
 PROCESS_MESSAGES = ("join", "done", "bye")  # from processes to the world
-OUTPUTS = (messages.Estimate, messages.ClusterState, messages.ClusterRequest)
+OUTPUTS = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest)
 
 
 class AgentProcess(NamedTuple):
@@ -51,7 +51,7 @@ class RecordedAgents(NamedTuple):
 
     processes: tuple[AgentProcess, ...]
     why_not: str
-    requests: tuple[tuple[str, messages.ClusterRequest], ...]
+    requests: tuple[tuple[str, run_messages.ClusterRequest], ...]
     fingerprints: frozenset[str]
     truth_sha256: str | None
 
@@ -71,7 +71,7 @@ def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenari
         sorted(unsorted, key=lambda process: ([*AGENTS].index(process.name.partition(".")[0]), process.name))
     )
     names = frozenset(name for process in processes for name in process.members)
-    events: list[messages.Event] = [event for _, event in _read(reader, keys.EVENT)]
+    events: list[run_messages.Event] = [event for _, event in _read(reader, keys.EVENT)]
     why_not = _reason(info, scenario, events, names)
     requests = tuple(_read(reader, "cluster/*/request"))
     fingerprints = frozenset(join.fingerprint for _, join in ours)
@@ -83,12 +83,14 @@ def _by_role(process: AgentProcess) -> tuple[int, str]:
     return [*AGENTS].index(process.name.partition(".")[0]), process.name
 
 
-def _is_ours(name: str, join: messages.Join, known: set[str]) -> bool:
+def _is_ours(name: str, join: run_messages.Join, known: set[str]) -> bool:
     """Return whether a process was one of zsim's agents: others do not announce a numeric fingerprint."""
     return bool(join.version and join.fingerprint) and {name, *join.serves} <= known
 
 
-def _reason(info: messages.Info, scenario: Scenario, events: Sequence[messages.Event], names: frozenset[str]) -> str:
+def _reason(
+    info: messages.Info, scenario: Scenario, events: Sequence[run_messages.Event], names: frozenset[str]
+) -> str:
     """Return why the agents are not run again, empty if they can be."""
     if info.mode == "realtime":
         return "in realtime it is not in the scenario when they answered"
@@ -110,7 +112,7 @@ def _reason(info: messages.Info, scenario: Scenario, events: Sequence[messages.E
     return ""
 
 
-def _is_kill_request(event: messages.Event) -> bool:
+def _is_kill_request(event: run_messages.Event) -> bool:
     args = event.data.get("args")
     return event.subject == "fault_add" and isinstance(args, dict) and args.get("kind") == PROCESS_KILL
 

@@ -4,9 +4,9 @@ from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.framing import GateMessages
-from zsim.contract.messages import ControlRequest
+from zsim.contract.run_messages import ControlRequest
 from zsim.errors import RunError
 from zsim.record import Recorded
 from zsim.runtime.agent import Agent, Output
@@ -93,13 +93,13 @@ class RerunBus(Bus):
             raise RunError(f"flown again, the run ends at {self._world.now_ns / 1e9:.2f} s: {reason}")
 
     def _compare_output(self, key: str, message: Any) -> None:
-        if isinstance(message, (*OUTPUTS, messages.Command)):
+        if isinstance(message, (*OUTPUTS, flight_messages.Command)):
             self.outputs.add(key, message)
 
     def _keep_truth(self, gate: GateMessages) -> None:
         self.truth = {keys.thing(key): payload for key, payload in gate.pairs if keys.leaf(key) == "truth"}
 
-    def _update_faults(self, faults: messages.Faults) -> None:
+    def _update_faults(self, faults: run_messages.Faults) -> None:
         if self._rerun:  # alone, the world receives the commands that resulted from them
             super()._update_faults(faults)
 
@@ -111,7 +111,7 @@ class RerunBus(Bus):
             self._feed_event(message)
         elif isinstance(message, OUTPUTS):
             self._feed_output(key, message)
-        elif isinstance(message, messages.Command):
+        elif isinstance(message, flight_messages.Command):
             if message.source in self._rerun:
                 self.outputs.add(key, message)
             else:
@@ -121,8 +121,8 @@ class RerunBus(Bus):
 
     def _feed_output(self, key: str, message: Any) -> None:
         """Pass the estimate, or the output about a cluster, of another process to the agents that read it."""
-        role = "estimator" if isinstance(message, messages.Estimate) else "controller"
-        is_request = isinstance(message, messages.ClusterRequest)
+        role = "estimator" if isinstance(message, flight_messages.Estimate) else "controller"
+        is_request = isinstance(message, run_messages.ClusterRequest)
         source = (message.controller if is_request else message.source) or f"{role}.{keys.thing(key)}"
         if source in self._rerun:
             self.outputs.add(key, message)
@@ -131,7 +131,7 @@ class RerunBus(Bus):
             inbox.put(key, message)
         self._world.count_output(source)
 
-    def _feed_event(self, event: messages.Event) -> None:
+    def _feed_event(self, event: run_messages.Event) -> None:
         """Repeat what reached the world other than as a message: deaths, and requests."""
         if event.kind == "death" and event.subject not in self._rerun:
             self._world.handle_death(event.subject, 0)
@@ -143,7 +143,7 @@ class RerunBus(Bus):
                 self.refused.append(f"{event.subject} at {event.t_ns / 1e9:.2f} s: {answer.error}")
 
 
-def _by_gate(requests: Sequence[tuple[str, messages.ClusterRequest]]) -> Requests:
+def _by_gate(requests: Sequence[tuple[str, run_messages.ClusterRequest]]) -> Requests:
     by_gate: defaultdict[int, list[tuple[str, ControlRequest]]] = defaultdict(list)
     for key, request in requests:
         control = keys.cluster_control(keys.thing(key))

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from zsim.contract.messages import Fault
+    from zsim.contract.run_messages import Fault
     from zsim.transport.session import Session
 
 PANEL = "Look and poke"

@@ -13,10 +13,12 @@ import msgspec
 from zsim.contract import keys, messages
 from zsim.contract.framing import pairs_of
 from zsim.errors import DecodeError, RunError
-from zsim.transport.session import Mailbox, Sample, Session, check_expression
+from zsim.transport.declarations import Subscription
+from zsim.transport.samples import RawSample, ReceivedSample, check_expression
+from zsim.transport.session import Session
 
 LISTEN_S = 1.0  # wall time that `keys` listens: every live key of the contract has a message at least once a second
-PACKET_S = 0.05  # wait between two looks into an empty mailbox
+PACKET_S = 0.05  # wait between two looks into an empty subscription
 LINE_S = 1.0  # between two lines of `hz`
 SILENCE_S = 1.0  # after which a key with messages is reported as silent; later where its own gaps are longer
 PUB, ASK = "zsim.pub", "zsim.ask"
@@ -28,22 +30,22 @@ def list_keys(link: Session, listen_s: float = LISTEN_S) -> list[tuple[str, str,
     counts: Counter[str] = Counter()
     for expression in (keys.INFO, keys.CLOCK, "drone/*/truth", "drone/*/estimate", "cluster/*/state"):
         counts.update({sample.key: 0 for sample in link.get(expression)})
-    box = link.subscribe("**")
-    for sample in _samples(box, time.monotonic() + listen_s):
+    subscription = link.subscribe("**")
+    for sample in _samples(subscription, time.monotonic() + listen_s):
         counts[sample.key] += 1
     return [(key, _kind(key), count) for key, count in sorted(counts.items())]
 
 
 def echo(link: Session, expression: str, count: int | None, emit: Callable[[str, Any], None], raw: bool) -> None:
     """Hand every message on an expression to `emit` until `count` have come."""
-    box = link.subscribe(expression)
-    for number, sample in enumerate(_samples(box, math.inf), start=1):
+    subscription = link.subscribe(expression)
+    for number, sample in enumerate(_samples(subscription, math.inf), start=1):
         emit(sample.key, sample.payload.hex() if raw else readable(sample))
         if number == count:
             return
 
 
-def readable(sample: Sample) -> Any:
+def readable(sample: ReceivedSample) -> Any:
     """Return a message as JSON can say it; what is not of the contract is decoded as far as it goes."""
     try:
         return _plain(messages.decode(sample.key, sample.payload))
@@ -101,11 +103,11 @@ def hz(link: Session, expression: str, window: int, seconds: float, emit: Callab
     check_expression(expression)
     arrived: deque[tuple[float, bytes]] = deque()
 
-    def arrive(sample: Sample) -> None:  # in Zenoh's thread, so that a gap is one between messages
+    def arrive(sample: RawSample) -> None:  # in Zenoh's thread, so that a gap is one between messages
         if sample.payload:  # empty: a deletion
             arrived.append((time.monotonic(), sample.payload))
 
-    link.on_message(expression, arrive)
+    link.declare_subscriber(expression, arrive)
     rate, head = MessageRate(window), msgspec.msgpack.Decoder(_Stamp)
     until_s = time.monotonic() + seconds
     while (now_s := time.monotonic()) < until_s:
@@ -133,11 +135,11 @@ def _kind(key: str) -> str:
     return kind.__name__ if kind else "not of the contract"
 
 
-def _samples(box: Mailbox, until_s: float) -> Iterator[Sample]:
+def _samples(subscription: Subscription, until_s: float) -> Iterator[ReceivedSample]:
     """Yield what arrives until a wall time; wakes to look at the clock and to let Ctrl-C in."""
     while time.monotonic() < until_s:
         arrived = False
-        for sample in box.drain():
+        for sample in subscription.drain():
             arrived = True
             yield sample
             if time.monotonic() >= until_s:
@@ -172,12 +174,12 @@ class _Now:
     """The simulated time, as a sender that takes part in nothing knows it."""
 
     def __init__(self, link: Session) -> None:
-        self._box = link.subscribe(keys.CLOCK)
+        self._subscription = link.subscribe(keys.CLOCK)
         self._newest = next(iter(link.get(keys.CLOCK)), None)
 
     def t_ns(self) -> int:
         """Return the time of the newest clock, 0 where no world answers."""
-        for sample in self._box.drain():
+        for sample in self._subscription.drain():
             self._newest = sample
         return messages.decode(keys.CLOCK, self._newest.payload).t_ns if self._newest else 0
 
@@ -248,5 +250,6 @@ def ask(link: Session, key: str, op: str, text: str) -> Any:
     if not answer.ok:
         raise RunError(answer.error)
     with suppress(DecodeError):  # a replay is the only result that holds messages
-        return [{"key": name, "message": readable(Sample(name, payload))} for name, payload in pairs_of(answer.result)]
+        pairs = pairs_of(answer.result)
+        return [{"key": key, "message": readable(ReceivedSample(key, payload))} for key, payload in pairs]
     return msgspec.to_builtins(answer.result, str_keys=True)

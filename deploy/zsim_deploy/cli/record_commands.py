@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsim.contract.messages import RATE_MAX
+from zsim.contract.run_messages import RATE_MAX
 from zsim.errors import RunError
 from zsim_analysis.export.output import Format
 from zsim_deploy.options.arguments import DEFAULT_ENDPOINT, RUN, Access, Host, Insecure, Tls, identity, not_negative

@@ -81,7 +81,7 @@ def check_endpoint(endpoint: str | None, insecure: bool) -> None:
     """
     if endpoint is None:
         return
-    from zsim.transport.session import check_listening
+    from zsim.transport.connection import check_listening
 
     check_listening([endpoint], Identity(insecure=insecure))
     if endpoint.startswith("tcp/") and not re.fullmatch(r"tcp/.+:[0-9]{1,5}", endpoint):

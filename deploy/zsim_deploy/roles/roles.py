@@ -16,9 +16,10 @@ from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
 from zsim.scenario.role_table import AGENTS, things
 from zsim.scenario.scenario import Scenario
-from zsim.transport import session, tls
-from zsim.transport.connection import find_world
+from zsim.transport import tls
+from zsim.transport.connection import find_world, route
 from zsim.transport.tls import Identity
+from zsim.transport.zenoh_settings import Mode
 from zsim_agents.hosting import agent_class, chosen, hosted, made
 from zsim_deploy.options.arguments import WorldAccess
 from zsim_deploy.roles.stop_channel import StopChannel
@@ -109,7 +110,7 @@ def router(
     endpoint: str,
     upstream: str,
     federation: str,
-    mode: session.Mode,
+    mode: Mode,
     launched: str | None,
     identity: Identity,
 ) -> None:
@@ -120,7 +121,7 @@ def router(
     """
     stop = StopChannel(launched, identity)
     say = log_printer(launched)
-    with session.route(endpoint, upstream, federation, mode, identity) as link:
+    with route(endpoint, upstream, federation, mode, identity) as link:
         say(f"router.{name}: {endpoint} leads to {upstream}")
         probe_s = 0.0
         while not stop.stopped():

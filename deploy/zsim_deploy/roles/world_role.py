@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
-from zsim.contract import keys, messages
+from zsim.contract import keys, run_messages
 from zsim.errors import RunError
 from zsim.runtime.progress import QUIET, HoldReasons, JsonProgress, ProgressSink, Screen, Throttle
 from zsim.scenario.scenario import Scenario
-from zsim.transport import session
+from zsim.transport.samples import check_expression
 from zsim.transport.tls import Identity
 from zsim_deploy.roles.stop_channel import StopChannel
 
@@ -96,7 +96,7 @@ def world_progress(show: ProgressSink) -> Callable[[str, Any, str], None]:
     return show_line
 
 
-def _clock_line(clock: messages.Clock, phase: str) -> dict[str, Any]:
+def _clock_line(clock: run_messages.Clock, phase: str) -> dict[str, Any]:
     waiting = [{"name": w.name, "host": w.host, "since_wall_s": round(w.since_wall_s, 1)} for w in clock.waiting_for]
     return {
         "t_s": clock.t_ns / 1e9,
@@ -107,7 +107,7 @@ def _clock_line(clock: messages.Clock, phase: str) -> dict[str, Any]:
     }
 
 
-def _event_line(event: messages.Event) -> dict[str, Any]:
+def _event_line(event: run_messages.Event) -> dict[str, Any]:
     data = event.data if event.kind in ("end", "death") else {}
     return {
         "t_s": event.t_ns / 1e9,
@@ -149,7 +149,7 @@ def play(place: Path, options: ReplayOptions, who: Identity) -> None:
     from zsim_world.server.world_process import run
 
     for expression in options.choice.keys:
-        session.check_expression(expression)
+        check_expression(expression)
     stop = StopChannel()
     with open_run(place) as (reader, info, scenario):
         _check(options.choice.keys, reader)

@@ -11,7 +11,8 @@ from msgspec import Struct
 
 from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages, encode_batch, key_table
-from zsim.contract.messages import Clock, ControlAnswer, DroneInfo, Faults, Imu, Info, Origin
+from zsim.contract.messages import DroneInfo, Imu, Info, Origin
+from zsim.contract.run_messages import Clock, ControlAnswer, Faults
 from zsim.record import RecordReader
 from zsim_agents import recorder
 from zsim_agents.recorder import record

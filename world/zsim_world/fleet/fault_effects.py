@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from zsim.contract.messages import Fault
+from zsim.contract.run_messages import Fault
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.physics.air import WIND
 from zsim_world.sensors import sensor_set as ss

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.contract.messages import DroneState
+from zsim.contract.flight_messages import DroneState
 from zsim.errors import RunError
 from zsim.scenario.scenario import Drone, GpsConfig, Scenario
 from zsim.vehicles.catalogue import vehicle_of

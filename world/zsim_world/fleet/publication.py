@@ -9,7 +9,7 @@ import numpy as np
 from numba.typed.typedlist import List
 from numpy.typing import NDArray
 
-from zsim.contract import encoding, messages
+from zsim.contract import encoding, flight_messages, messages
 from zsim.contract.encoding import GAP, Layouts, Program, TextTable
 from zsim.contract.framing import KINDS, GateMessages, key_table
 from zsim.math.compiled import compiled, inlined, kernel
@@ -30,12 +30,12 @@ MESSAGES = (  # in the order of KINDS
     messages.Baro,
     messages.Sonar,
     messages.Flow,
-    (messages.Truth, ROTORS_MIN),
-    messages.Status,
+    (flight_messages.Truth, ROTORS_MIN),
+    flight_messages.Status,
 )
 TRUTH, STATUS = 6, 7  # after the six sensors
 WHICH, STAMPS, ENDS = 0, 1, 2  # rows of `columns`
-OTHER_TRUTHS = tuple((messages.Truth, rotors) for rotors in range(ROTORS_MIN + 1, ROTORS_MAX + 1))
+OTHER_TRUTHS = tuple((flight_messages.Truth, rotors) for rotors in range(ROTORS_MIN + 1, ROTORS_MAX + 1))
 LAYOUTS = Layouts((*MESSAGES, *OTHER_TRUTHS))
 INTS, FLOATS = LAYOUTS.ints, LAYOUTS.floats
 OPS, FIRST, LITERALS = LAYOUTS.program  # compiled in

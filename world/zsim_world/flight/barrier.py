@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from zsim.contract import keys
-from zsim.contract.messages import Done, Join, Waiting
+from zsim.contract.run_messages import Done, Join, Waiting
 from zsim.scenario.rights import WORLD
 from zsim_world.flight.run_outbox import Refusal
 
 
 @dataclass
-class RunParticipant:
+class Participant:
     """One process that has joined, by its newest incarnation.
 
     Attributes:
@@ -135,7 +135,7 @@ class Barrier:
         self._run_id = run_id
         self._gate_ns = gate_ns
         self._expected = dict.fromkeys(expected, 0)
-        self.participants: dict[str, RunParticipant] = {}
+        self.participants: dict[str, Participant] = {}
 
     def expect(self, name: str) -> None:
         """Do not start without this one either."""
@@ -157,7 +157,7 @@ class Barrier:
         for dead in replaced:
             del self.participants[dead.name]
         predecessors = [*([former] if former else []), *replaced]
-        self.participants[name] = RunParticipant(
+        self.participants[name] = Participant(
             name=name,
             join=message,
             from_ns=min((each.from_ns for each in predecessors if each.gating), default=next_gate_ns),
@@ -170,7 +170,7 @@ class Barrier:
         )
         return None
 
-    def replaced(self, name: str, message: Join) -> list[RunParticipant]:
+    def replaced(self, name: str, message: Join) -> list[Participant]:
         """Return the dead whose work a newcomer of another name is to do."""
         served = {name, *message.serves}
         return [p for p in self.participants.values() if not p.alive and p.name != name and p.served_names <= served]
@@ -217,7 +217,7 @@ class Barrier:
         participant = self.participants.get(name)
         return participant is not None and participant.gating
 
-    def mark_dead(self, name: str, wall_ns: int) -> RunParticipant | None:
+    def mark_dead(self, name: str, wall_ns: int) -> Participant | None:
         """Mark a participant as dead; it stays in the barrier until it is removed or rejoins."""
         participant = self.participants.get(name)
         if participant is None or not participant.alive:
@@ -226,7 +226,7 @@ class Barrier:
         participant.since_wall_ns = wall_ns
         return participant
 
-    def substitute(self, name: str) -> RunParticipant | None:
+    def substitute(self, name: str) -> Participant | None:
         """Return who lives and does all the work of a participant beside its own."""
         served = self.participants[name].served_names
         others = (p for p in self.participants.values() if p.name != name and p.alive)
@@ -238,7 +238,7 @@ class Barrier:
         others = (p for p in self.participants.values() if p.name != name and p.alive)
         return {p.name: both for p in others if (both := served & p.served_names)}
 
-    def remove(self, name: str) -> RunParticipant | None:
+    def remove(self, name: str) -> Participant | None:
         """Take a participant out: it published bye or is dropped."""
         removed = self.participants.pop(name, None)
         for expected in (name, *(removed.join.serves if removed else ())):
@@ -250,11 +250,11 @@ class Barrier:
         present = {name for p in self.participants.values() for name in p.served_names}
         return [name for name in self._expected if name not in present]
 
-    def blocking(self, need_ns: int) -> list[RunParticipant]:
+    def blocking(self, need_ns: int) -> list[Participant]:
         """Return whose done for `need_ns` is not in yet."""
         return [p for p in self.participants.values() if p.blocks(need_ns)]
 
-    def incomplete(self) -> list[RunParticipant]:
+    def incomplete(self) -> list[Participant]:
         """Return of whom outputs or a done were lost, or are still on their way."""
         return [p for p in self.participants.values() if p.incomplete]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import PRIORITY_MAX, ControlRequest, Fault
+from zsim.contract.run_messages import PRIORITY_MAX, ControlRequest, Fault
 from zsim.runtime import link_faults
 from zsim.runtime.link_faults import NEVER, WORLD, uniform
 from zsim.scenario.scenario import Scenario

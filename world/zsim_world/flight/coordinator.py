@@ -11,15 +11,15 @@ from typing import Any
 
 import msgspec
 
-from zsim.contract import keys, messages
+from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import fingerprint
-from zsim.contract.messages import ControlAnswer, ControlRequest
+from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import RunError
 from zsim.runtime.agent import Output
 from zsim.scenario.rights import WORLD
 from zsim.scenario.role_table import on_death
 from zsim.scenario.scenario import Scenario
-from zsim_world.flight.barrier import Barrier, RunParticipant
+from zsim_world.flight.barrier import Barrier, Participant
 from zsim_world.flight.run_clock import Operation, RunClock, number
 from zsim_world.flight.run_outbox import KeyedMessage, Refusal, RunOutbox
 from zsim_world.flight.run_statistics import RunStatistics
@@ -124,12 +124,12 @@ class Coordinator(ABC):
         """Count an output (estimate, cluster state) of a participant."""
         self.barrier.count_output(source)
 
-    def _handle_done(self, name: str, message: messages.Done, wall_ns: int) -> None:
+    def _handle_done(self, name: str, message: run_messages.Done, wall_ns: int) -> None:
         refusal = self.barrier.done(name, message, self.now_ns, wall_ns)
         if refusal:
             self.outbox.refuse(name, f"process/{name}/done", refusal)
 
-    def _handle_join(self, name: str, message: messages.Join, wall_ns: int) -> None:
+    def _handle_join(self, name: str, message: run_messages.Join, wall_ns: int) -> None:
         former, replaced = self.barrier.participants.get(name), self.barrier.replaced(name, message)
         refusal = self.barrier.join(name, message, self.clock.next_ns, wall_ns)
         if refusal:
@@ -144,7 +144,7 @@ class Coordinator(ABC):
             self._release_drones(dead.name)
         self._warn_of(joined)
 
-    def _warn_of(self, joined: RunParticipant) -> None:
+    def _warn_of(self, joined: Participant) -> None:
         """Publish that a newcomer computes with other bits, or does the work of others too."""
         name, join, own = joined.name, joined.join, fingerprint()
         if join.fingerprint and join.fingerprint != own:
@@ -154,7 +154,7 @@ class Coordinator(ABC):
             text = f"{name} and {other} both do the work of {', '.join(sorted(both))}; end one of them"
             self.outbox.event("doubled", name, text, {"other": other})
 
-    def _handle_bye(self, name: str, message: messages.Bye) -> None:
+    def _handle_bye(self, name: str, message: run_messages.Bye) -> None:
         participant = self.barrier.remove(name)
         if participant is None:
             return
@@ -166,7 +166,7 @@ class Coordinator(ABC):
                     self.barrier.expect(each)
         self._after_bye(participant, message.reason)
 
-    def _after_bye(self, participant: RunParticipant, reason: str) -> None:
+    def _after_bye(self, participant: Participant, reason: str) -> None:
         """Do what the leave of a process means for the run."""
         if participant.join.role == "recorder":
             self.clock.stop(f"the recorder left: {reason}")
@@ -191,7 +191,7 @@ class Coordinator(ABC):
         if action == "end":
             self.clock.stop(f"{name} died")
 
-    def _on_death(self, participant: RunParticipant) -> str:
+    def _on_death(self, participant: Participant) -> str:
         """Return the action when a process has died."""
         return on_death(self.scenario.processes.on_death, participant.name, participant.join.role)
 
@@ -234,11 +234,11 @@ class Coordinator(ABC):
             return not self.barrier.absent()
         return clock.mode == "realtime" or not self.barrier.blocking(clock.required_ns)
 
-    def blocking(self, ahead_ns: int = 0) -> list[RunParticipant]:
+    def blocking(self, ahead_ns: int = 0) -> list[Participant]:
         """Return whose dones are missing for the next gate, or for one that comes so much later."""
         return self.barrier.blocking(self.clock.required_ns + ahead_ns)
 
-    def waiting_for(self, wall_ns: int) -> tuple[messages.Waiting, ...]:
+    def waiting_for(self, wall_ns: int) -> tuple[run_messages.Waiting, ...]:
         """Return whom the world waits for now."""
         if self.clock.mode == "realtime" and self.clock.state != "waiting":
             return tuple(p.waiting(wall_ns) for p in self.barrier.participants.values() if not p.alive)
@@ -246,9 +246,9 @@ class Coordinator(ABC):
 
     # Publication
 
-    def publish_clock(self, waiting_for: tuple[messages.Waiting, ...] = ()) -> None:
+    def publish_clock(self, waiting_for: tuple[run_messages.Waiting, ...] = ()) -> None:
         """Put a `clock` into the outbox."""
-        clock = messages.Clock(
+        clock = run_messages.Clock(
             t_ns=self.now_ns,
             seq=self.outbox.next_seq(keys.CLOCK),
             run_id=self.run_id,

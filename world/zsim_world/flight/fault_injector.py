@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from zsim.contract import keys
-from zsim.contract.messages import ControlAnswer, ControlRequest, Fault, Faults
+from zsim.contract.run_messages import ControlAnswer, ControlRequest, Fault, Faults
 from zsim.runtime.link_faults import KINDS as LINK_KINDS
 from zsim.scenario import fault_kinds
 from zsim.scenario.fault_check import Known, flaws
@@ -139,7 +139,7 @@ class FaultInjector:
         return {"fault_add": self._add, "fault_clear": self._clear}
 
     def _add(self, request: ControlRequest) -> ControlAnswer:
-        args = _given(request)
+        args = _arguments(request)
         refusal = self._refusal(args)
         if refusal:
             return ControlAnswer(False, str(refusal))
@@ -150,7 +150,7 @@ class FaultInjector:
 
     def _clear(self, request: ControlRequest) -> ControlAnswer | Refusal:
         """End the faults of an id, a target or a kind, or all."""
-        args = _given(request)
+        args = _arguments(request)
         unknown = [name for name in args if name not in SELECTORS]
         if unknown:
             return Refusal(unknown[0][:40], "not known", f"allowed: {', '.join(SELECTORS)}, or nothing")
@@ -235,7 +235,7 @@ class FaultInjector:
         self._outbox.event(kind, fault.target, text, msgspec.structs.asdict(fault), source)
 
 
-def _given(request: ControlRequest) -> dict[str, Any]:
+def _arguments(request: ControlRequest) -> dict[str, Any]:
     return {name: value for name, value in request.args.items() if value is not None}
 
 

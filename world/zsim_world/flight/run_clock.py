@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from zsim.contract.messages import GATES_MAX, RATE_MAX, ControlAnswer, ControlRequest
+from zsim.contract.run_messages import GATES_MAX, RATE_MAX, ControlAnswer, ControlRequest
 from zsim.scenario.scenario import TimeSteps
 from zsim_world.flight.run_outbox import Refusal
 

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from zsim.contract import keys, messages
+from zsim.contract import keys, run_messages
 from zsim.scenario.rights import WORLD
 
 KeyedMessage = tuple[str, Any]  # key and message; or keys.GATE and GateMessages at a gate
@@ -98,7 +98,7 @@ class RunOutbox:
     ) -> None:
         """Add an event."""
         seq = self.next_seq(keys.EVENT)
-        self.put(keys.EVENT, messages.Event(self._now_ns(), seq, kind, source, subject, text, dict(data or {})))
+        self.put(keys.EVENT, run_messages.Event(self._now_ns(), seq, kind, source, subject, text, dict(data or {})))
 
     def refuse(self, source: str, subject: str, reason: Refusal | str) -> None:
         """Count a refusal, and add an event of it unless there have been too many like it."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from zsim_world.flight.barrier import RunParticipant
+from zsim_world.flight.barrier import Participant
 
 GATES_KEPT = 256  # gates whose publication time is remembered for the age of commands; 5 s, older ones are refused
 AGES_KEPT = 1_000_000  # for the percentiles; 8 MB
@@ -116,14 +116,14 @@ class RunStatistics:
         """Note the least distance between two drones in a gate [m]."""
         self.closest_m = min(self.closest_m, closest_m)
 
-    def deadlines(self, participants: Iterable[RunParticipant], need_ns: int) -> None:
+    def deadlines(self, participants: Iterable[Participant], need_ns: int) -> None:
         """Count whose done for need_ns was due, and whose is missing."""
         for participant in participants:
             if participant.required_ns(need_ns) is not None:
                 self._deadline_count += 1
                 participant.deadline_misses += participant.blocks(need_ns)
 
-    def result(self, participants: Iterable[RunParticipant]) -> dict[str, Any]:
+    def result(self, participants: Iterable[Participant]) -> dict[str, Any]:
         """Return the figures of the run as far as it got."""
         by_name = {p.name: p.deadline_misses for p in participants if p.gating}
         sim_s, wall_s = self.rate.sim_s, self.rate.wall_s

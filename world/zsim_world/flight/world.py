@@ -10,6 +10,7 @@ from zsim import CONTRACT, __version__
 from zsim.contract import keys, messages
 from zsim.contract.fingerprint import fingerprint
 from zsim.contract.truth_hash import TruthHash
+from zsim.contract.views import DroneView, ViewDrones
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
@@ -151,7 +152,7 @@ class World(Coordinator):
     def views(self, seq: int) -> list[Output]:
         return [Output(keys.VIEW_DRONES, self.view(seq))]
 
-    def view(self, seq: int) -> messages.ViewDrones:
+    def view(self, seq: int) -> ViewDrones:
         """Return the compact state of all drones."""
         truth = self.fleet.truth()
         drones, commanders = [], self.queue.commanders()
@@ -159,6 +160,6 @@ class World(Coordinator):
             state, battery_percent, _ = self.fleet.status(i)
             pose = (tuple(truth.position_m[i].tolist()), tuple(truth.orientation_wxyz[i].tolist()))
             rotors = tuple(truth.rotor_rad_s[i, : self.fleet.rotors[i]].tolist())
-            drones.append(messages.DroneView(name, *pose, rotors, state, battery_percent, commanders[i]))
+            drones.append(DroneView(name, *pose, rotors, state, battery_percent, commanders[i]))
         wind = tuple(tuple(row) for row in self.fleet.wind_m_s.tolist())
-        return messages.ViewDrones(self.now_ns, seq, tuple(drones), wind)
+        return ViewDrones(self.now_ns, seq, tuple(drones), wind)

@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.framing import KINDS, GateMessages, key_table
-from zsim.contract.messages import ControlAnswer, ControlRequest
+from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
 from zsim.runtime.agent import Output
 from zsim.scenario.scenario import Scenario
-from zsim_world.flight.barrier import RunParticipant
+from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.flight.run_clock import number, refused_argument
 from zsim_world.flight.run_outbox import Refusal
@@ -148,7 +148,7 @@ class Playback(Coordinator):
         self._last.clear()
         self.statistics.rate.jump()
         if self._plays_faults and self._pending_faults is None:
-            none = messages.encode(messages.Faults(t_ns, 0, ()))
+            none = messages.encode(run_messages.Faults(t_ns, 0, ()))
             self._pending_faults = Recorded(keys.FAULTS, none, t_ns, 0)
 
     def _wind(self, from_ns: int) -> None:
@@ -200,7 +200,7 @@ class Playback(Coordinator):
 
     def _publish_event(self, payload: bytes) -> None:
         try:
-            event: messages.Event = messages.decode(keys.EVENT, payload)
+            event: run_messages.Event = messages.decode(keys.EVENT, payload)
         except DecodeError:
             return
         if event.kind != "end":  # the replay has an end of its own
@@ -242,10 +242,10 @@ class Playback(Coordinator):
     def refusal_at(self, key: str) -> str | None:
         return None if f"controller.{keys.thing(key)}" in self._live() else NOT_FLYABLE
 
-    def _after_bye(self, participant: RunParticipant, reason: str) -> None:
+    def _after_bye(self, participant: Participant, reason: str) -> None:
         """Go on: the record is there already."""
 
-    def _on_death(self, participant: RunParticipant) -> str:
+    def _on_death(self, participant: Participant) -> str:
         return "drop"
 
 
@@ -262,6 +262,6 @@ def _recount(payloads: list[bytes], which: list[int], first: list[int]) -> None:
         kinds = [place % len(KINDS) for place in which[begin:end]]
         for m, kind in enumerate(kinds, begin):
             if kind == status:
-                message = messages.decode_as(messages.Status, payloads[m], "status")
+                message = messages.decode_as(flight_messages.Status, payloads[m], "status")
                 count = sum(kind != truth for kind in kinds)
                 payloads[m] = messages.encode(msgspec.structs.replace(message, count=count))

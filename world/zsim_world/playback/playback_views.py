@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from zsim.contract import keys, messages
-from zsim.contract.views import cluster_view, estimate_view
+from zsim.contract.views import DroneView, EstimateView, ViewDrones, ViewEstimates, cluster_view, estimate_view
 from zsim.errors import DecodeError
 from zsim.runtime.agent import Output
 
@@ -31,24 +31,24 @@ class PlaybackViews:
         if drones:
             wind = _read(last, keys.VIEW_DRONES)
             wind_m_s = wind.wind_m_s if wind is not None and len(wind.wind_m_s) == len(drones) else ()
-            yield Output(keys.VIEW_DRONES, messages.ViewDrones(t_ns, seq, drones, wind_m_s))
+            yield Output(keys.VIEW_DRONES, ViewDrones(t_ns, seq, drones, wind_m_s))
         for cluster in self._clusters:
             state = _read(last, keys.cluster_state(cluster))
             if state is not None:
                 yield Output(keys.cluster_view(cluster), cluster_view(state, t_ns, seq))
         for process, estimates in self._estimates(last).items():
-            yield Output(keys.estimates_view(process), messages.ViewEstimates(t_ns, seq, tuple(estimates)))
+            yield Output(keys.estimates_view(process), ViewEstimates(t_ns, seq, tuple(estimates)))
 
-    def _drone_views(self, last: Mapping[str, bytes]) -> Iterator[messages.DroneView]:
+    def _drone_views(self, last: Mapping[str, bytes]) -> Iterator[DroneView]:
         for drone in self._drones:
             truth, status = _read(last, keys.truth(drone)), _read(last, keys.status(drone))
             if truth is not None and status is not None:
                 pose = (truth.position_m, truth.orientation_wxyz, truth.rotor_rad_s)
-                yield messages.DroneView(drone, *pose, status.state, status.battery_percent, status.commander)
+                yield DroneView(drone, *pose, status.state, status.battery_percent, status.commander)
 
-    def _estimates(self, last: Mapping[str, bytes]) -> dict[str, list[messages.EstimateView]]:
+    def _estimates(self, last: Mapping[str, bytes]) -> dict[str, list[EstimateView]]:
         """Return the estimates by the estimator of each drone."""
-        estimates: defaultdict[str, list[messages.EstimateView]] = defaultdict(list)
+        estimates: defaultdict[str, list[EstimateView]] = defaultdict(list)
         for drone in self._drones:
             estimate = _read(last, keys.estimate(drone))
             if estimate is not None:

@@ -6,14 +6,15 @@ from typing import NamedTuple
 
 import msgspec
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.messages import REFUSALS
+from zsim.contract.views import ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError
 from zsim.record import Recorded, RecordReader
 from zsim.scenario import rights
 from zsim.scenario.fault_kinds import PROCESS_KILL
 
-VIEWS = (messages.ViewDrones, messages.ViewCluster, messages.ViewEstimates)  # made anew, as often as they are shown
+VIEWS = (ViewDrones, ViewCluster, ViewEstimates)  # made anew, as often as they are shown
 
 
 class Gate(NamedTuple):
@@ -112,11 +113,11 @@ def is_played(key: str, expressions: Sequence[str]) -> bool:
 def author(recorded: Recorded) -> str:
     """Return the process that published a message beside the world, empty where it was none of a known role."""
     kind = messages.type_of(recorded.key)
-    if kind is messages.Estimate:
+    if kind is flight_messages.Estimate:
         return f"estimator.{keys.thing(recorded.key)}"
-    if kind in (messages.ClusterState, messages.ClusterRequest):
+    if kind in (flight_messages.ClusterState, run_messages.ClusterRequest):
         return f"controller.{keys.thing(recorded.key)}"
-    if kind is None or not issubclass(kind, messages.Command):
+    if kind is None or not issubclass(kind, flight_messages.Command):
         return ""
     try:
         return _decode_sourced(recorded.payload).source
@@ -127,7 +128,7 @@ def author(recorded: Recorded) -> str:
 def without_kills(payload: bytes) -> bytes:
     """Return a list of faults without those of which a process dies: who takes part now is not who was meant."""
     try:
-        listed: messages.Faults = messages.decode(keys.FAULTS, payload)
+        listed: run_messages.Faults = messages.decode(keys.FAULTS, payload)
     except DecodeError:
         return payload
     others = tuple(fault for fault in listed.faults if fault.kind != PROCESS_KILL)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from zsim.contract import keys
-from zsim.contract.messages import Join
+from zsim.contract.run_messages import Join
 from zsim.transport.session import Session
 from zsim_world.flight.barrier import Barrier
 

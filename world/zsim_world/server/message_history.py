@@ -10,11 +10,14 @@ from typing import Annotated, Any, NamedTuple
 import msgspec
 
 from zsim.contract import keys, messages
+from zsim.contract.flight_messages import ClusterState, Command, Estimate
 from zsim.contract.framing import Pairs, pairs_of
-from zsim.contract.messages import REFUSALS, ClusterRequest, ClusterState, Command, ControlAnswer, Count, Estimate
+from zsim.contract.messages import REFUSALS
+from zsim.contract.run_messages import ClusterRequest, ControlAnswer
 from zsim.errors import DecodeError
 from zsim.scenario import rights
-from zsim.transport.session import Sample
+from zsim.schema.message import Count
+from zsim.transport.samples import ReceivedSample
 
 KEEP_NS = 5_000_000_000  # simulated time that a replay reaches back
 KEEP_BYTES = 500_000_000  # payloads kept at most: those of 1000 drones are about 300 MB in KEEP_NS
@@ -138,7 +141,7 @@ class MessageHistory:
         )
         return ControlAnswer(True, result=passed, more=more)
 
-    def lost_outputs(self, kept: Any, done_ns: int) -> list[Sample]:
+    def lost_outputs(self, kept: Any, done_ns: int) -> list[ReceivedSample]:
         """Return those of the outputs that a participant kept that have not come, each once, as after a cut link.
 
         What it kept of gates later than its newest done is left out: that is on its way, or its done will count it.
@@ -150,11 +153,11 @@ class MessageHistory:
         Raises:
             DecodeError: the result is no list of [key, payload].
         """
-        outputs: dict[Any, Sample] = {}
+        outputs: dict[Any, ReceivedSample] = {}
         for key, payload in pairs_of(kept):
             identity = _identity(key, payload)
             if identity is not None and identity[1] <= done_ns:
-                outputs[identity] = Sample(key, payload)
+                outputs[identity] = ReceivedSample(key, payload)
         stamps = {(key, t_ns) for key, t_ns, _, _ in outputs}
         for t_ns, key, payload in self._each():
             if (key, t_ns) in stamps:

@@ -5,7 +5,7 @@ caught up; then gates follow one another until its done is required again. No ag
 these gates comes while agents still work on the last ones before it.
 """
 
-from zsim_world.flight.barrier import RunParticipant
+from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.flight.run_clock import RunClock
 
@@ -81,6 +81,6 @@ class Pipelining:
         if self._continues:
             self._continues, self._delayed_wall_ns = False, wall_ns
 
-    def blocking(self) -> list[RunParticipant]:
+    def blocking(self) -> list[Participant]:
         """Return whose dones are waited for: those without which time stands, or else those that delay it."""
         return self._world.blocking() or self._world.blocking(self._ahead_ns)

@@ -1,4 +1,4 @@
-"""What reaches the world: read from its mailboxes, checked, counted, kept, and requested again where it was lost."""
+"""What reaches the world: received, checked, counted, kept, and requested again where it was lost."""
 
 import contextlib
 import threading
@@ -11,12 +11,14 @@ from typing import Any
 
 import msgspec
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario.rights import WORLD
-from zsim.transport.session import Mailbox, Sample, Session
-from zsim_world.flight.barrier import RunParticipant
+from zsim.transport.declarations import Subscription
+from zsim.transport.samples import ReceivedSample
+from zsim.transport.session import Session
+from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
@@ -26,7 +28,7 @@ TICK_S = 0.1  # how often a standing world looks at the wall clock
 RECOVERY_S = 1.0  # a publisher that lives answers a get for its outputs within milliseconds
 REJOINED_NS = 10_000_000_000  # wall time after a rejoin in which it may take until a process can be asked
 PHASE_EVERY = 10  # states of a cluster between two of which the phase is read for the display
-RELAYED = (messages.Estimate, messages.ClusterState, messages.ClusterRequest)
+RELAYED = (flight_messages.Estimate, flight_messages.ClusterState, run_messages.ClusterRequest)
 PROCESSES, VIEWS = "process/", "view/"  # the last are nothing to the world
 OWN = keys.process(WORLD, "")
 
@@ -36,7 +38,7 @@ ProgressCallback = Callable[[str, Any, str], None]
 
 
 class WorldInputs(ABC):
-    """Mailboxes of the world: waited for with a limit or without, drained with the wall time of arrival."""
+    """The world's subscriptions: waited for with a limit or without, drained with the wall time of arrival."""
 
     @abstractmethod
     def wait(self, timeout_s: float | None) -> None:
@@ -47,7 +49,7 @@ class WorldInputs(ABC):
         self.wait(None)
 
     @abstractmethod
-    def drain(self) -> Iterator[tuple[int, Sample]]:
+    def drain(self) -> Iterator[tuple[int, ReceivedSample]]:
         """Yield what has come, with the monotonic wall time of its arrival [ns]."""
 
     @abstractmethod
@@ -59,23 +61,23 @@ class WorldInputs(ABC):
 
 
 class DirectInputs(WorldInputs):
-    """Reads on the loop's own thread, waiting for the last box: fastest where nothing hangs on the wall clock."""
+    """Reads on the loop's own thread, waiting for the last subscription: fastest without a wall clock."""
 
-    def __init__(self, boxes: Sequence[Mailbox]) -> None:
-        self._boxes = boxes
-        self._received: list[Sample] = []
+    def __init__(self, subscriptions: Sequence[Subscription]) -> None:
+        self._subscriptions = subscriptions
+        self._received: list[ReceivedSample] = []
 
     def wait(self, timeout_s: float | None) -> None:
         if timeout_s is not None and timeout_s < TICK_S:
             time.sleep(timeout_s)
             return
-        sample = self._boxes[-1].receive()
+        sample = self._subscriptions[-1].receive()
         if sample is not None:
             self._received.append(sample)
 
     def wait_for(self, wanted: set[str]) -> None:
         while True:
-            sample = self._boxes[-1].receive()
+            sample = self._subscriptions[-1].receive()
             if sample is None:
                 return
             self._received.append(sample)
@@ -83,76 +85,76 @@ class DirectInputs(WorldInputs):
             if not wanted or not sample.key.endswith("/done"):
                 return
 
-    def drain(self) -> Iterator[tuple[int, Sample]]:
-        last, self._received = [*self._received, *self._boxes[-1].drain()], []
+    def drain(self) -> Iterator[tuple[int, ReceivedSample]]:
+        last, self._received = [*self._received, *self._subscriptions[-1].drain()], []
         wall_ns = time.monotonic_ns()
-        for box in self._boxes[:-1]:
-            for sample in box.drain():
+        for subscription in self._subscriptions[:-1]:
+            for sample in subscription.drain():
                 yield wall_ns, sample
         for sample in last:
             yield wall_ns, sample
 
     def wake(self) -> None:
-        self._boxes[-1].wake()
+        self._subscriptions[-1].wake()
 
 
-class TimedMailbox:
-    """A mailbox read by a thread that stamps every message with the wall time of its arrival.
+class TimedSubscription:
+    """A subscription read by a thread that stamps every message with the wall time of its arrival.
 
     Args:
-        mailbox: what to read.
+        subscription: what to read.
         fresh: set whenever something has arrived.
     """
 
-    def __init__(self, mailbox: Mailbox, fresh: threading.Event) -> None:
-        self._mailbox = mailbox
+    def __init__(self, subscription: Subscription, fresh: threading.Event) -> None:
+        self._subscription = subscription
         self._fresh = fresh
-        self._arrived: deque[tuple[int, Sample]] = deque()
-        self._thread = threading.Thread(target=self._pump, name="mailbox", daemon=True)
+        self._arrived: deque[tuple[int, ReceivedSample]] = deque()
+        self._thread = threading.Thread(target=self._pump, name="subscription", daemon=True)
         self._thread.start()
 
     def _pump(self) -> None:
         while True:
             try:
-                sample = self._mailbox.receive()
+                sample = self._subscription.receive()
             except SessionError:
                 return
             if sample is not None:
                 self._arrived.append((time.monotonic_ns(), sample))
                 self._fresh.set()
 
-    def drain(self) -> Iterator[tuple[int, Sample]]:
+    def drain(self) -> Iterator[tuple[int, ReceivedSample]]:
         """Yield (wall_ns of arrival, sample) of what has arrived."""
         while self._arrived:
             yield self._arrived.popleft()
 
     def close(self) -> None:
         """Stop the reading thread."""
-        self._mailbox.close()
+        self._subscription.undeclare()
         self._thread.join(timeout=2.0)
 
 
 class TimedInputs(WorldInputs):
     """Reads on threads of their own, so that arrivals are stamped while the loop waits for its next gate."""
 
-    def __init__(self, boxes: Sequence[Mailbox]) -> None:
+    def __init__(self, subscriptions: Sequence[Subscription]) -> None:
         self._fresh = threading.Event()
-        self._boxes = [TimedMailbox(box, self._fresh) for box in boxes]
+        self._subscriptions = [TimedSubscription(subscription, self._fresh) for subscription in subscriptions]
 
     def wait(self, timeout_s: float | None) -> None:
         self._fresh.wait(TICK_S if timeout_s is None else timeout_s)
         self._fresh.clear()
 
-    def drain(self) -> Iterator[tuple[int, Sample]]:
-        for box in self._boxes:
-            yield from box.drain()
+    def drain(self) -> Iterator[tuple[int, ReceivedSample]]:
+        for subscription in self._subscriptions:
+            yield from subscription.drain()
 
     def wake(self) -> None:
         self._fresh.set()
 
     def close(self) -> None:
-        for box in self._boxes:
-            box.close()
+        for subscription in self._subscriptions:
+            subscription.close()
 
 
 def open_inputs(link: Session, realtime: bool) -> WorldInputs:
@@ -160,8 +162,8 @@ def open_inputs(link: Session, realtime: bool) -> WorldInputs:
 
     Outputs are drained first, dones last: who publishes a done has published its outputs before, on the same link.
     """
-    boxes = [link.subscribe_others((PROCESSES, VIEWS)), link.subscribe(f"{PROCESSES}**")]
-    return TimedInputs(boxes) if realtime else DirectInputs(boxes)
+    subscriptions = [link.subscribe_remote((PROCESSES, VIEWS)), link.subscribe(f"{PROCESSES}**")]
+    return TimedInputs(subscriptions) if realtime else DirectInputs(subscriptions)
 
 
 class _Head(msgspec.Struct):
@@ -190,7 +192,7 @@ class MessageIntake:
     phase: str = ""  # of the cluster whose state was read last
     _states: Counter[str] = field(default_factory=Counter[str])
 
-    def take(self, wall_ns: int, sample: Sample) -> None:
+    def take(self, wall_ns: int, sample: ReceivedSample) -> None:
         """Take one message, or refuse it."""
         key = sample.key
         if key.startswith(OWN):
@@ -216,10 +218,10 @@ class MessageIntake:
         """Hand the world a message that it acts on."""
         message = messages.decode(key, payload)
         self.history.add(key, payload, message.t_ns)
-        if type(message) is messages.Join:
+        if type(message) is run_messages.Join:
             self.liveliness.before_join(keys.thing(key), message)
         self.world.handle(key, message, wall_ns)
-        if type(message) is messages.Health:
+        if type(message) is run_messages.Health:
             self.liveliness.health_received(keys.thing(key))
             self.progress("health", message, keys.thing(key))
 
@@ -227,7 +229,7 @@ class MessageIntake:
         self.health.refused += 1
         self.world.outbox.refuse(source, subject, str(error))
 
-    def _count_refused(self, sample: Sample) -> None:
+    def _count_refused(self, sample: ReceivedSample) -> None:
         """Count an output that was refused, so that its sender's done is not taken to be short of it."""
         with contextlib.suppress(DecodeError):  # of an unknown sender
             head = _head(sample.key, sample.payload)
@@ -240,15 +242,15 @@ class MessageIntake:
             raise DecodeError(f"{key}: t_ns is {head.t_ns}; must be <= {self.world.now_ns}, the newest gate")
         self.history.add(key, payload, head.t_ns)
         kind = messages.type_of(key)
-        if kind is messages.ClusterState:
+        if kind is flight_messages.ClusterState:
             self._read_phase(key, payload)
-        role = "estimator" if kind is messages.Estimate else "controller"
-        source = head.controller if kind is messages.ClusterRequest else head.source
+        role = "estimator" if kind is flight_messages.Estimate else "controller"
+        source = head.controller if kind is run_messages.ClusterRequest else head.source
         self.world.count_output(source or f"{role}.{keys.thing(key)}")
 
     def _read_phase(self, key: str, payload: bytes) -> None:
         if self._states[key] % PHASE_EVERY == 0:
-            state: messages.ClusterState = messages.decode_as(messages.ClusterState, payload, key)
+            state: flight_messages.ClusterState = messages.decode_as(flight_messages.ClusterState, payload, key)
             self.phase = state.phase
             self.progress("state", state, keys.thing(key))
         self._states[key] += 1
@@ -272,7 +274,7 @@ class MessageIntake:
                 text = f"{participant.name}: {missing} of its outputs did not come"
                 self.world.outbox.event("outputs_missing", participant.name, text, {"missing": missing})
 
-    def _lost_outputs(self, participant: RunParticipant) -> list[Sample] | None:
+    def _lost_outputs(self, participant: Participant) -> list[ReceivedSample] | None:
         """Return what a participant has kept of its outputs and that has not come; None if it does not answer."""
         key = keys.process(participant.name, "outputs")
         try:

@@ -7,7 +7,8 @@ from typing import Any
 from zsim.contract import keys, messages
 from zsim.contract.framing import BATCH_MAX, GateMessages, Pairs, encode_batch
 from zsim.runtime.agent import Output
-from zsim.transport.session import Sample, Session
+from zsim.transport.samples import ReceivedSample
+from zsim.transport.session import Session
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.server.message_history import MessageHistory
 
@@ -62,10 +63,10 @@ class WorldOutputs:
         """Keep the messages of a gate as one, of all drones and of each, where there is a subscriber to that."""
         whole = (keys.GATE, gate.pack())
         self._passed.append(whole)
-        if self._link.has_readers(keys.GATE):
+        if self._link.has_subscribers(keys.GATE):
             self._unsent.append(whole)
         for key, (first, last) in zip(self._gate_keys, pairwise(gate.first), strict=True):
-            if last > first and self._link.has_readers(key):
+            if last > first and self._link.has_subscribers(key):
                 self._unsent.append((key, gate.pack(first, last)))
 
     def send(self) -> None:
@@ -81,13 +82,13 @@ class WorldOutputs:
         self._history.add(output.key, payload, self._world.now_ns)
         self._link.put_raw(output.key, payload)
 
-    def passed(self, sample: Sample) -> None:
+    def passed(self, sample: ReceivedSample) -> None:
         """Note a message that a participant or anyone else has published."""
         self._passed.append(sample)
 
     def put_batch(self) -> None:
         """Hand what has passed to the recorders, if there are any."""
         passed, self._passed = self._passed, []
-        if self._link.has_readers(keys.BATCH):
+        if self._link.has_subscribers(keys.BATCH):
             for first in range(0, len(passed), BATCH_MAX):
                 self._link.put_raw(keys.BATCH, encode_batch(passed[first : first + BATCH_MAX]))

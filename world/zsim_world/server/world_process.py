@@ -9,16 +9,18 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from zsim.contract import keys, messages
-from zsim.contract.messages import ControlAnswer
+from zsim.contract import keys, run_messages
+from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
 from zsim.runtime.agent import Output
 from zsim.runtime.health import HealthMeter
 from zsim.scenario import rights
 from zsim.scenario.rights import WORLD
-from zsim.transport import session
-from zsim.transport.session import Query, Session
+from zsim.transport import connection
+from zsim.transport.declarations import Query
+from zsim.transport.session import Session
 from zsim.transport.tls import Identity
+from zsim.transport.zenoh_settings import Mode
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
@@ -96,7 +98,7 @@ class WorldProcess:
         self._outputs.publish(Output(keys.INFO, self._world.info()))
         answered = (*rights.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self._world.refused_queries)
         for expression in answered:
-            self._link.answer(expression, self._on_query)
+            self._link.declare_queryable(expression, self._on_query)
         self._link.on_token("process/*", self._on_token)
         self._link.declare_token(keys.token(WORLD))
 
@@ -186,7 +188,7 @@ class WorldProcess:
         readers = [p.name for p in list(self._world.barrier.participants.values()) if not p.gating]
         who = ", ".join([*readers, "a program that only subscribes"])
         text = f"nothing can be published for {since_s:.1f} s: a reader takes nothing; one of {who}"
-        event = messages.Event(self._world.now_ns, 0, "stuck", WORLD, WORLD, text)
+        event = run_messages.Event(self._world.now_ns, 0, "stuck", WORLD, WORLD, text)
         self._progress("event", event, self._intake.phase)
 
     def _serve_others(self) -> None:
@@ -227,7 +229,7 @@ class WorldProcess:
         else:
             query.answer(ControlAnswer(ok=False, error=reason))
 
-    def _answer(self, request: messages.ControlRequest, process: str | None) -> ControlAnswer:
+    def _answer(self, request: run_messages.ControlRequest, process: str | None) -> ControlAnswer:
         """Answer a request on `world/control`, or of a process, whose name access control knows, on its own key."""
         if request.op == "replay":
             return self._history.replay(request.args, self._readable_by(process))
@@ -277,7 +279,7 @@ def run(
     Raises:
         SessionError: an endpoint is taken, or the identity is of no use.
     """
-    mode: session.Mode = "lockstep" if world.clock.mode == "lockstep" else "realtime"
-    with session.listen(endpoints, world.scenario.federation, mode, identity) as link:
+    mode: Mode = "lockstep" if world.clock.mode == "lockstep" else "realtime"
+    with connection.listen(endpoints, world.scenario.federation, mode, identity) as link:
         ready()
         WorldProcess(link, world, stopped, progress).run()

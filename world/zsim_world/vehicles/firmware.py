@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from numpy.typing import NDArray
 
-from zsim.contract.messages import DroneState
+from zsim.contract.flight_messages import DroneState
 from zsim.math import rotation as rot
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined

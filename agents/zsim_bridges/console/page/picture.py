@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zsim.contract.messages import EstimateView, ViewCluster, ViewDrones
+from zsim.contract.views import EstimateView, ViewCluster, ViewDrones
 from zsim.math import frames
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import viser
 
-from zsim.contract.messages import GATES_MAX, RATE_MAX
+from zsim.contract.run_messages import GATES_MAX, RATE_MAX
 from zsim.scenario.fault_kinds import KINDS, PROCESS_KILL
 from zsim.scenario.scenario import Scenario
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome

@@ -19,7 +19,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import ClusterState
+from zsim.contract.flight_messages import ClusterState
 from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.record import RecordReader
 from zsim_agents.formation.spaces.cluster_space import SingularClusterError

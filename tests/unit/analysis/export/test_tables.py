@@ -22,7 +22,7 @@ import recorded_run
 import scipy.io
 from typer.testing import CliRunner
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages
 from zsim.errors import ReportError, RunError
 from zsim.record import RecordReader, RecordWriter
 from zsim_analysis.export import matlab, output
@@ -207,7 +207,7 @@ def test_what_a_message_does_not_have_is_empty(tmp_path: Path) -> None:
         for k, drones in enumerate([("a", "b"), ("c",)]):
             names = ("x_c", "y_c", "z_c", "yaw", "pitch", "phi_1", "phi_2", "p")[: 4 * len(drones)]
             values = (1.5,) * len(names)
-            state = messages.ClusterState(k, 0, "engaged", drones, names, values, values, values, None, 1.0, "")
+            state = flight_messages.ClusterState(k, 0, "engaged", drones, names, values, values, values, None, 1.0, "")
             key = keys.cluster_state(f"of_{len(drones)}")
             writer.add(key, messages.encode(state), messages.encoding(key), k, k)
     export(tmp_path, Format.CSV)
@@ -385,7 +385,9 @@ def long_record(path: Path, gates: int) -> None:
             for name in ("a", "b", "c", "d"):
                 v = (0.1 * k, 0.2, 0.3)
                 counts = {"gps": (k, 0), "imu": (k, k)}
-                estimate = messages.Estimate(t_ns, k, v, v, (1.0, 0.0, 0.0, 0.0), 0.1, covariance, 0.1, v, counts)
+                estimate = flight_messages.Estimate(
+                    t_ns, k, v, v, (1.0, 0.0, 0.0, 0.0), 0.1, covariance, 0.1, v, counts
+                )
                 key = keys.estimate(name)
                 writer.add(key, messages.encode(estimate), messages.encoding(key), t_ns, t_ns)
 

@@ -17,7 +17,7 @@ import synthetic_record
 from rich.console import Console
 from synthetic_record import GATE_NS, SCENARIOS, Flown
 
-from zsim.contract import keys, messages
+from zsim.contract import keys, messages, run_messages
 from zsim.errors import RecordError, ReportError
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
@@ -78,7 +78,7 @@ def run(tmp_path_factory):
         "command_age_ms": {"p50": 1.0, "p99": 2.0, "max": 3.0},
         "truth_sha256": "0" * 64,
     }
-    script = messages.Event(GATE_NS, 0, "refused", "eve", "drone1", "<script>alert(1)</script>", {})
+    script = run_messages.Event(GATE_NS, 0, "refused", "eve", "drone1", "<script>alert(1)</script>", {})
     synthetic_record.write(directory / "run.mcap", flown(end=end, events=(script,)))
     steps: list[str] = []
     summary = make_report(directory, steps.append)
@@ -289,8 +289,8 @@ def test_garbage_on_the_keys_is_counted_and_passed_over(tmp_path):
 
 
 def test_a_flood_of_events_does_not_hide_a_restart(tmp_path):
-    flood = [messages.Event(GATE_NS, i, "refused", "eve", "drone1", f"refused {i}", {}) for i in range(5000)]
-    restart = messages.Event(2 * GATE_NS, 0, "restart", "world", "estimator.drone1", "restarted", {})
+    flood = [run_messages.Event(GATE_NS, i, "refused", "eve", "drone1", f"refused {i}", {}) for i in range(5000)]
+    restart = run_messages.Event(2 * GATE_NS, 0, "restart", "world", "estimator.drone1", "restarted", {})
     summary = report_of(tmp_path, flown(events=(*flood, restart)))
     assert [event.kind for event in summary.events].count("restart") == 1
     assert summary.events_left_out == {"refused": 4900}

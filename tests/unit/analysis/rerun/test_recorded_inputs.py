@@ -9,9 +9,11 @@ import pytest
 
 from zsim import __version__
 from zsim.contract import keys, messages
-from zsim.contract.messages import Bye, Clock, ClusterRequest, Estimate, Event, Health, Join, Message, Mode, Truth
+from zsim.contract.flight_messages import Estimate, Mode, Truth
+from zsim.contract.run_messages import Bye, Clock, ClusterRequest, Event, Health, Join
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
+from zsim.schema.message import Message
 from zsim_analysis.rerun.recorded_inputs import AgentProcess, RecordedAgents, gates, recorded_agents
 from zsim_world.flight.world import World
 

@@ -7,7 +7,8 @@ import msgspec
 import pytest
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import Message, Mode, Truth
+from zsim.contract.flight_messages import Mode, Truth
+from zsim.schema.message import Message
 from zsim_analysis.rerun.truth_comparison import OutputComparison, TruthComparison, difference
 
 GATE_NS = 20_000_000

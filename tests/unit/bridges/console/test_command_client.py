@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from zsim.contract.messages import ControlAnswer
+from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import SessionError
 from zsim_bridges.console.command_client import (
     OVERTAKEN,

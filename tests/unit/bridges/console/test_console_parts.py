@@ -10,7 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from zsim.contract.messages import Clock, DroneView, EstimateView, Event, ViewCluster, ViewDrones, Waiting
+from zsim.contract.run_messages import Clock, Event, Waiting
+from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones
 from zsim.errors import RunError
 from zsim.math import frames
 from zsim.scenario import scenario_file

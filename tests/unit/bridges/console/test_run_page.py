@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import ControlAnswer, DroneView, EstimateView, Event, ViewCluster, ViewDrones, ViewEstimates
+from zsim.contract.run_messages import ControlAnswer, Event
+from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console.command_client import RequestOutcome
@@ -50,11 +51,11 @@ class Link:
         self.tell: Callable[[Any], None] = lambda _: None
         self.asked: list[tuple[str, str, dict[str, Any]]] = []
 
-    def hear(self, expression: str, callback: Callable[[Any], None]) -> None:
-        self.say = callback
-
-    def on_message(self, expression: str, callback: Callable[[Any], None]) -> None:
-        self.tell = callback
+    def declare_subscriber(self, expression: str, callback: Callable[[Any], None]) -> None:
+        if expression == keys.EVENT:
+            self.tell = callback
+        else:
+            self.say = callback
 
     def get(self, expression: str, timeout_s: float = 2.0) -> list[Any]:
         return []

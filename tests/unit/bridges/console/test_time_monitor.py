@@ -7,17 +7,8 @@ from typing import Any
 import pytest
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import (
-    Clock,
-    DroneView,
-    EstimateView,
-    Event,
-    Fault,
-    Faults,
-    Health,
-    ViewDrones,
-    ViewEstimates,
-)
+from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health
+from zsim.contract.views import DroneView, EstimateView, ViewDrones, ViewEstimates
 from zsim_bridges.console import html_tables
 from zsim_bridges.console.table_rows import TableRows, console_state, sigma_m
 from zsim_bridges.console.time_monitor import SILENT_S, TimeMonitor
@@ -51,11 +42,11 @@ class Link:
         self.asked += 1
         return [] if self.now is None else [sample(keys.CLOCK, self.now)]
 
-    def hear(self, expression: str, callback: Callable[[Any], None]) -> None:
-        self.say = callback
-
-    def on_message(self, expression: str, callback: Callable[[Any], None]) -> None:
-        self.tell = callback
+    def declare_subscriber(self, expression: str, callback: Callable[[Any], None]) -> None:
+        if expression == keys.EVENT:
+            self.tell = callback
+        else:
+            self.say = callback
 
 
 class Ears:

@@ -12,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zsim.contract import messages
+from zsim.contract.flight_messages import Status, Velocity
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin, Status, Velocity
+from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin
 from zsim.errors import DecodeError, NoWorldError
-from zsim.transport.session import Heard
+from zsim.transport.samples import RawSample
 from zsim_bridges.gateway import last_values as values_module
 from zsim_bridges.gateway import stream_requests
 from zsim_bridges.gateway.access_check import ConnectionLimit, TokenBucket
@@ -85,7 +86,7 @@ def test_results_that_json_cannot_say_are_base64():
 
 
 def test_a_deleted_key_has_the_value_null():
-    line = value_line(Heard("DELETE", "my/key", b"", "zenoh/bytes", None))
+    line = value_line(RawSample("DELETE", "my/key", b"", "zenoh/bytes", None))
     assert json.loads(line) == {"op": "value", "key": "my/key", "value": None}
 
 
@@ -427,12 +428,12 @@ def test_an_invalid_join_is_refused_by_its_field(given: dict[str, Any], field: s
     ],
 )
 def test_values_are_described_as_the_plugin_does(encoding: str, payload: bytes, value: Any):
-    said = described_sample(Heard("PUT", "zsim/a", payload, encoding, None))
+    said = described_sample(RawSample("PUT", "zsim/a", payload, encoding, None))
     assert said == {"key": "zsim/a", "value": value, "encoding": encoding, "timestamp": None}
 
 
 def test_a_refusal_of_zenohs_has_the_key_error():
-    assert described_sample(Heard("ERROR", "", b"no", "zenoh/string", None))["key"] == "ERROR"
+    assert described_sample(RawSample("ERROR", "", b"no", "zenoh/string", None))["key"] == "ERROR"
 
 
 def test_the_description_has_every_message_and_where_clients_speak():

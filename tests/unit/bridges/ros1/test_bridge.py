@@ -8,13 +8,13 @@ import msgspec
 import pytest
 from fake_link import FakeLink
 
-from zsim.contract import keys, messages
+from zsim.contract import flight_messages, keys, messages
 from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.errors import RunError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim.transport.session import Sample
+from zsim.transport.samples import ReceivedSample
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import intake as intake_module
 from zsim_bridges.ros1 import tcpros
@@ -68,12 +68,14 @@ class Drone:
             self.topics.publish(message)
 
 
-def status(t_ns: int) -> messages.Status:
-    return messages.Status(t_ns, 0, "hovering", 90.0, False, None, 1)
+def status(t_ns: int) -> flight_messages.Status:
+    return flight_messages.Status(t_ns, 0, "hovering", 90.0, False, None, 1)
 
 
-def truth(t_ns: int) -> messages.Truth:
-    return messages.Truth(t_ns, 0, (1e3, 2e3, 3e3), (4.0, 5.0, 6.0), (0.0, 1.0, 0.0, 0.0), (7.0, 8.0, 9.0), ZERO, STILL)
+def truth(t_ns: int) -> flight_messages.Truth:
+    return flight_messages.Truth(
+        t_ns, 0, (1e3, 2e3, 3e3), (4.0, 5.0, 6.0), (0.0, 1.0, 0.0, 0.0), (7.0, 8.0, 9.0), ZERO, STILL
+    )
 
 
 def test_the_namespace_is_the_drone_s_name_as_ros_can_write_it():
@@ -162,7 +164,7 @@ def test_numbers_beyond_the_fields_of_ros_are_refused_and_told_once_and_the_next
 
 
 class Link:
-    """A session whose only mailbox holds some payloads, and then waits to be closed."""
+    """A session whose only subscription holds some payloads, and then waits to be closed."""
 
     def __init__(self, payloads: list[bytes]) -> None:
         self._payloads = iter(payloads)
@@ -176,14 +178,14 @@ class Link:
         assert expression == keys.BATCH
         return self
 
-    def receive(self) -> Sample:
+    def receive(self) -> ReceivedSample:
         for payload in self._payloads:
-            return Sample(keys.BATCH, payload)
+            return ReceivedSample(keys.BATCH, payload)
         self.emptied.set()
         self._closed.wait(10.0)
         raise SessionError("closed")
 
-    def close(self) -> None:
+    def undeclare(self) -> None:
         self._closed.set()
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from zsim.contract import messages
+from zsim.contract import flight_messages, messages, run_messages
 from zsim_bridges.ros1 import driver_messages, tcpros
 from zsim_bridges.ros1.driver_messages import DriverFrames
 from zsim_bridges.ros1.onboard import OnboardState
@@ -17,7 +17,7 @@ FRAMES = DriverFrames("drone1")
 ZERO, STILL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
 
 
-def attitude(roll_deg: float = 0.0, pitch_deg: float = 0.0, yaw_deg: float = 0.0) -> messages.Quaternion:
+def attitude(roll_deg: float = 0.0, pitch_deg: float = 0.0, yaw_deg: float = 0.0) -> flight_messages.Quaternion:
     w, x, y, z = Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_quat(scalar_first=True)
     return float(w), float(x), float(y), float(z)
 
@@ -26,7 +26,7 @@ def aircraft(state: Any = "hovering", **angles: float) -> OnboardState:
     """An aircraft 1.234 m over the ground, on its way forward, left and up."""
     own = OnboardState()
     own.update(
-        messages.Estimate(
+        flight_messages.Estimate(
             T_NS, 0, (5.0, 6.0, 7.0), ZERO, attitude(**angles), 0.0, (0.0,) * 36, 0.0, ZERO, {}
         )
     )  # fmt: skip
@@ -37,7 +37,7 @@ def aircraft(state: Any = "hovering", **angles: float) -> OnboardState:
     own.update(messages.Mag(T_NS, 0, T_NS, (3.0, 0.0, -4.0)))
     own.update(messages.Baro(T_NS, 0, T_NS, 101_325.4, 0.0))
     own.update(messages.Flow(T_NS, 0, T_NS, (1.0, 0.25, 0.5), 1.0))
-    own.update(messages.Status(T_NS, 0, state, 87.5, False, None, 1))
+    own.update(flight_messages.Status(T_NS, 0, state, 87.5, False, None, 1))
     return own
 
 
@@ -86,7 +86,7 @@ def test_states_have_the_numbers_of_the_sdk(state, number):
 
 def test_an_aircraft_that_has_said_little_has_navdata_too():
     own = OnboardState()
-    own.update(messages.Status(0, 0, "landed", 100.0, False, None, 1))
+    own.update(flight_messages.Status(0, 0, "landed", 100.0, False, None, 1))
     said = driver_messages.navdata(0, own, FRAMES)
     assert (said.altd, said.vx, said.pressure, said.az) == (0, 0.0, 0, 0.0)
     tcpros.serialize("ardrone_autonomy/Navdata", said)
@@ -140,7 +140,7 @@ def test_odometry_is_the_aircraft_s_own():
 
 
 def test_ground_truth_is_in_the_world():
-    truth = messages.Truth(
+    truth = flight_messages.Truth(
         T_NS, 0, (1.0, 2.0, 3.0), (0.0, 4.0, 0.0), attitude(yaw_deg=90.0), (1.0, 0.0, 0.5), ZERO, STILL
     )  # fmt: skip
     said = driver_messages.ground_truth(0, truth, FRAMES)
@@ -153,7 +153,7 @@ def test_ground_truth_is_in_the_world():
 
 def test_transforms_lead_from_the_world_to_where_the_estimator_believes_it_to_be():
     own = aircraft(yaw_deg=30.0)
-    own.update(messages.Estimate(T_NS, 1, (5.0, 6.0, 7.0), ZERO, attitude(yaw_deg=30.0), 0.0, (0.0,) * 36, 0.0, ZERO, {}))  # fmt: skip
+    own.update(flight_messages.Estimate(T_NS, 1, (5.0, 6.0, 7.0), ZERO, attitude(yaw_deg=30.0), 0.0, (0.0,) * 36, 0.0, ZERO, {}))  # fmt: skip
     to_base, to_odom = driver_messages.transforms(0, own, FRAMES).transforms
     assert (to_odom.header.frame_id, to_odom.child_frame_id) == ("world", "drone1/odom")
     assert (to_base.header.frame_id, to_base.child_frame_id) == ("drone1/odom", "drone1/ardrone_base_link")
@@ -164,11 +164,11 @@ def test_transforms_lead_from_the_world_to_where_the_estimator_believes_it_to_be
 
 def test_transforms_without_an_estimator_end_at_odom():
     own = OnboardState()
-    own.update(messages.Status(0, 0, "landed", 100.0, False, None, 1))
+    own.update(flight_messages.Status(0, 0, "landed", 100.0, False, None, 1))
     (only,) = driver_messages.transforms(0, own, FRAMES).transforms
     assert only.header.frame_id == "drone1/odom"
 
 
 def test_the_clock_is_simulated_time():
-    said = driver_messages.clock(messages.Clock(T_NS, 0, "run", 3052, "running", 1.0))
+    said = driver_messages.clock(run_messages.Clock(T_NS, 0, "run", 3052, "running", 1.0))
     assert (said.clock.sec, said.clock.nanosec) == (61, 40_000_000)

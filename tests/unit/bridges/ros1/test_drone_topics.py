@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from zsim.contract import messages
+from zsim.contract import flight_messages
 from zsim_bridges.ros1 import tcpros
 from zsim_bridges.ros1.drone_topics import REPEAT_NS, DriverCommands, TiltCommand, tilt_of
 
@@ -17,8 +17,8 @@ def twist(*, x: float = 0.0, y: float = 0.0, z: float = 0.0, wx: float = 0.0, wy
     return tcpros.message_class("geometry_msgs/Twist")(linear=Vector3(x, y, z), angular=Vector3(wx, wy, wz))
 
 
-def status(state: Any, gate: int) -> messages.Status:
-    return messages.Status(gate * GATE_NS, gate, state, 100.0, False, None, 1)
+def status(state: Any, gate: int) -> flight_messages.Status:
+    return flight_messages.Status(gate * GATE_NS, gate, state, 100.0, False, None, 1)
 
 
 class Drone:

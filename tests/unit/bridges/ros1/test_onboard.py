@@ -5,7 +5,7 @@ import math
 import msgspec
 import pytest
 
-from zsim.contract import messages
+from zsim.contract import flight_messages, messages
 from zsim.scenario.scenario import Mount
 from zsim_bridges import ros_frames
 from zsim_bridges.ros1.onboard import OnboardState
@@ -30,15 +30,15 @@ def baro(altitude_m: float) -> messages.Baro:
     return messages.Baro(0, 0, 0, 101_325.0, altitude_m)
 
 
-def estimate(t_ns: int, position, yaw_rad: float = 0.0) -> messages.Estimate:
+def estimate(t_ns: int, position, yaw_rad: float = 0.0) -> flight_messages.Estimate:
     q = (math.cos(yaw_rad / 2), 0.0, 0.0, math.sin(yaw_rad / 2))
-    return messages.Estimate(
+    return flight_messages.Estimate(
         t_ns, 0, position, (0.0, 0.0, 0.0), q, yaw_rad, (0.0,) * 36, 0.01, (0.0, 0.0, 0.0), {}
     )  # fmt: skip
 
 
-def status(t_ns: int) -> messages.Status:
-    return messages.Status(t_ns, 0, "flying", 90.0, False, None, 1)
+def status(t_ns: int) -> flight_messages.Status:
+    return flight_messages.Status(t_ns, 0, "flying", 90.0, False, None, 1)
 
 
 def test_own_velocity_integrates_along_the_heading():

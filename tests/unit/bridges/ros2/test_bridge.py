@@ -7,10 +7,11 @@ from typing import Any
 import pytest
 from federation import PAIR
 
-from zsim.contract import keys, messages
-from zsim.contract.messages import ClusterInfo, ControlAnswer, DroneInfo, Info, Origin
+from zsim.contract import flight_messages, keys, messages, run_messages
+from zsim.contract.messages import ClusterInfo, DroneInfo, Info, Origin
+from zsim.contract.run_messages import ControlAnswer
 from zsim.scenario import scenario_file
-from zsim.transport.session import Heard, Sample
+from zsim.transport.samples import RawSample, ReceivedSample
 from zsim.transport.zenoh_settings import Mode
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import rmw_zenoh
@@ -41,7 +42,7 @@ class Link:
         self.said: list[tuple[str, Any]] = []
         self.sent: list[tuple[str, bytes, bytes]] = []
         self.kept: list[tuple[str, bytes, bytes]] = []
-        self.hearing: dict[str, list[Callable[[Heard], None]]] = {}
+        self.hearing: dict[str, list[Callable[[RawSample], None]]] = {}
         self.tokens: list[str] = []
         self.services: dict[str, Callable[[Any], None]] = {}
         self.asked: list[tuple[str, str, str, dict[str, Any]]] = []
@@ -50,25 +51,25 @@ class Link:
 
     def deliver(self, key: str, payload: bytes, attachment: bytes = b"") -> None:
         for callback in list(self.hearing.get(key, [])):
-            callback(Heard("PUT", key, payload, "", None, attachment))
+            callback(RawSample("PUT", key, payload, "", None, attachment))
 
     def zid(self) -> str:
         return "f00d"
 
-    def subscribe(self, key: str) -> "Box":
-        return Box(self, key)
+    def subscribe(self, key: str) -> "FakeSubscription":
+        return FakeSubscription(self, key)
 
-    def hear(self, key: str, callback: Callable[[Heard], None]) -> Callable[[], None]:
+    def declare_subscriber(self, key: str, callback: Callable[[RawSample], None]) -> Callable[[], None]:
         self.hearing.setdefault(key, []).append(callback)
         return lambda: self.hearing[key].remove(callback)
 
     def put(self, key: str, message: Any) -> None:
         self.said.append((key, message))
 
-    def writer(self, key: str, encoding: str) -> Callable[[bytes, bytes], None]:
+    def declare_publisher(self, key: str, encoding: str) -> Callable[[bytes, bytes], None]:
         return lambda payload, attachment: self.sent.append((key, payload, attachment))
 
-    def put_kept(self, key: str, payload: bytes, encoding: str, attachment: bytes) -> None:
+    def put_cached(self, key: str, payload: bytes, encoding: str, attachment: bytes) -> None:
         self.kept.append((key, payload, attachment))
 
     def declare_token(self, key: str) -> None:
@@ -77,10 +78,7 @@ class Link:
     def on_token(self, expression: str, callback: Callable[[str, bool], None]) -> None:
         self.on_token_of = callback
 
-    def on_message(self, expression: str, callback: Any) -> None:
-        return
-
-    def answer(self, key: str, callback: Callable[[Any], None], complete: bool) -> None:
+    def declare_queryable(self, key: str, callback: Callable[[Any], None], complete: bool) -> None:
         assert complete
         self.services[key] = callback
 
@@ -88,18 +86,20 @@ class Link:
         self.asked.append((key, op, source, args))
         return ControlAnswer(False, "phase is idle; possible when engaged")
 
-    def get(self, key: str, timeout_s: float) -> list[Sample]:
-        return [Sample(key, self.last[key])] if key in self.last else []
+    def get(self, key: str, timeout_s: float) -> list[ReceivedSample]:
+        return [ReceivedSample(key, self.last[key])] if key in self.last else []
 
 
-class Box:
-    """A mailbox."""
+class FakeSubscription:
+    """A subscription."""
 
     def __init__(self, link: Link, key: str) -> None:
-        self._arrived: list[Sample] = []
-        self.close = link.hear(key, lambda heard: self._arrived.append(Sample(heard.key, heard.payload)))
+        self._arrived: list[ReceivedSample] = []
+        self.undeclare = link.declare_subscriber(
+            key, lambda raw: self._arrived.append(ReceivedSample(raw.key, raw.payload))
+        )
 
-    def drain(self) -> list[Sample]:
+    def drain(self) -> list[ReceivedSample]:
         arrived, self._arrived = self._arrived, []
         return arrived
 
@@ -112,7 +112,7 @@ class Query:
         self.replies: list[tuple[str, bytes, bytes]] = []
         self.ended = False
 
-    def reply_as(self, key: str, payload: bytes, attachment: bytes) -> None:
+    def reply_raw(self, key: str, payload: bytes, attachment: bytes) -> None:
         self.replies.append((key, payload, attachment))
 
     def end(self) -> None:
@@ -222,7 +222,7 @@ def test_names_that_ros_does_not_take_are_told() -> None:
 
 def test_a_twist_becomes_a_velocity_in_the_heading_frame_at_the_newest_gate() -> None:
     bench = Bench()
-    clock = messages.Clock(4_000_000_000, 0, "run", 200, "running", 1.0)
+    clock = run_messages.Clock(4_000_000_000, 0, "run", 200, "running", 1.0)
     bench.link.deliver(keys.CLOCK, messages.encode(clock))
     bench.turn()
     for speed in (1.0, 0.5):
@@ -241,7 +241,7 @@ def test_modes_and_the_emergency_button() -> None:
     bench.publish("/drone_1/land", EMPTY, empty)
     bench.publish("/drone_1/reset", EMPTY, empty)  # nobody tells the state: neither
     for state in ("flying", "emergency"):
-        bench.link.last[status] = messages.encode(messages.Status(0, 0, state, 50.0, False, None, 1))
+        bench.link.last[status] = messages.encode(flight_messages.Status(0, 0, state, 50.0, False, None, 1))
         bench.publish("/drone_1/reset", EMPTY, empty)
     assert [(m.mode, m.seq) for _, m in bench.link.said] == [
         ("takeoff", 0),
@@ -277,7 +277,9 @@ def test_what_does_not_fit_a_ros_type_is_refused() -> None:
     bench, key = Bench(), keys.sensor("drone-1", "baro")
     bench.reader("/drone_1/navdata", "zsim_msgs/msg/Navdata")
     bench.link.deliver(key, messages.encode(messages.Baro(0, 0, 0, 1e300, 0.0)))
-    bench.link.deliver(keys.status("drone-1"), messages.encode(messages.Status(0, 0, "flying", 50.0, False, None, 1)))
+    bench.link.deliver(
+        keys.status("drone-1"), messages.encode(flight_messages.Status(0, 0, "flying", 50.0, False, None, 1))
+    )
     bench.link.deliver(key, b"garbage")
     bench.turn()
     assert bench.link.sent == []
@@ -312,7 +314,7 @@ def test_a_summary_of_a_gate_has_what_was_told_up_to_it() -> None:
     for gate in range(3):
         t_ns, accel = gate * 20_000_000, (0.0, 0.0, 9.80665 * gate)
         bench.link.deliver(imu_key, messages.encode(messages.Imu(t_ns, 0, t_ns, accel, (0.0, 0.0, 0.0))))
-        status = messages.Status(t_ns, 0, "flying", 50.0, False, None, 1)
+        status = flight_messages.Status(t_ns, 0, "flying", 50.0, False, None, 1)
         bench.link.deliver(status_key, messages.encode(status))
     bench.turn()
     navdata = [payload for key, payload, _ in bench.link.sent if "Navdata" in key]

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from federation import ONE
 
-from zsim.contract import messages
-from zsim.contract.messages import Quaternion, Vector3
+from zsim.contract import flight_messages, messages
+from zsim.contract.flight_messages import Quaternion
 from zsim.math.frames import quaternion_from_rpy, rotate
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import ErrorModel, Mount, Sensors
+from zsim.schema.message import Vector3
 from zsim_bridges import ros_frames
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
 from zsim_bridges.ros2.ros_types import RosTypes
@@ -29,7 +30,7 @@ def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
     return w, x, y, z
 
 
-def estimate(t_ns: int, q: Quaternion, **others: Any) -> messages.Estimate:
+def estimate(t_ns: int, q: Quaternion, **others: Any) -> flight_messages.Estimate:
     fields: dict[str, Any] = {
         "position_m": (1.0, 2.0, 3.0),
         "velocity_m_s": (0.0, 2.0, 0.5),
@@ -39,7 +40,7 @@ def estimate(t_ns: int, q: Quaternion, **others: Any) -> messages.Estimate:
         "gyro_bias_rad_s": (0.0, 0.0, 0.0),
         "sensors": {},
     }
-    return messages.Estimate(t_ns, 0, orientation_wxyz=q, **{**fields, **others})
+    return flight_messages.Estimate(t_ns, 0, orientation_wxyz=q, **{**fields, **others})
 
 
 def xyz(vector: Any) -> list[float]:
@@ -100,7 +101,7 @@ def test_field_is_in_tesla_and_range_without_echo_infinite() -> None:
 def test_true_twist_is_in_the_body() -> None:
     """A drone that heads north and flies north and up flies ahead and up."""
     still, rotors = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
-    truth = messages.Truth(T_NS, 0, (1.0, 2.0, 3.0), (0.0, 2.0, 0.5), NORTH, (0.1, 0.2, 0.3), still, rotors)
+    truth = flight_messages.Truth(T_NS, 0, (1.0, 2.0, 3.0), (0.0, 2.0, 0.5), NORTH, (0.1, 0.2, 0.3), still, rotors)
     odometry = convert("/drone1/ground_truth", truth)
     assert xyz(odometry.twist.twist.linear) == pytest.approx([2.0, 0.0, 0.5])
     assert xyz(odometry.twist.twist.angular) == [0.1, 0.2, 0.3]
@@ -167,11 +168,11 @@ def test_tf_goes_from_odom_to_base_and_from_map_to_the_cluster() -> None:
     assert (placed.header.frame_id, placed.child_frame_id) == ("map", "cluster/main")
 
 
-def cluster_state(**others: Any) -> messages.ClusterState:
+def cluster_state(**others: Any) -> flight_messages.ClusterState:
     names = ("x_c", "y_c", "z_c", "pitch", "yaw", "phi_1", "phi_2", "p")
     fields: dict[str, Any] = {"trajectory_t_s": None, "margin": 4.0, "reason": ""}
     value = (1.0, 2.0, 3.0, 0.0, math.pi / 2, 0.0, 0.0, 4.0)
-    return messages.ClusterState(
+    return flight_messages.ClusterState(
         T_NS, 0, "engaged", ("a", "b"), names, value, value, (0.0,) * 8, **{**fields, **others}
     )
 
@@ -186,8 +187,8 @@ def test_cluster_pose_and_state() -> None:
     assert convert("/cluster/main/state", cluster_state(trajectory_t_s=1.5)).trajectory_time == 1.5
 
 
-def status(t_ns: int, state: messages.DroneState = "flying") -> messages.Status:
-    return messages.Status(t_ns, 0, state, 62.5, False, None, 1)
+def status(t_ns: int, state: flight_messages.DroneState = "flying") -> flight_messages.Status:
+    return flight_messages.Status(t_ns, 0, state, 62.5, False, None, 1)
 
 
 def test_battery_comes_each_second_and_state_when_it_changes_too() -> None:

@@ -7,7 +7,7 @@ import pytest
 import typer
 
 from zsim.contract import keys
-from zsim.contract.messages import Fault
+from zsim.contract.run_messages import Fault
 from zsim.errors import SessionError
 from zsim.scenario.fault_check import COMMON
 from zsim.scenario.fault_kinds import KINDS

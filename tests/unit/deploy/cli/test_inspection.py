@@ -7,11 +7,11 @@ import pytest
 from fake_link import BAD_UTF8, NESTED, FakeLink
 from synthetic_record import SCENARIOS, info
 
-from zsim.contract import keys, messages
-from zsim.contract.messages import ControlAnswer
+from zsim.contract import keys, messages, run_messages
+from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import RunError, SessionError
 from zsim.scenario import scenario_file
-from zsim.transport.session import Sample
+from zsim.transport.samples import ReceivedSample
 from zsim_deploy.cli import inspection
 
 GARBAGE = [BAD_UTF8, NESTED, b"\xc1", b"\x91" * 5000]
@@ -52,16 +52,16 @@ def rates(monkeypatch: pytest.MonkeyPatch, due: list[tuple[float, str, bytes]], 
 @pytest.mark.parametrize("key", [keys.CLOCK, "of/somebody"])
 @pytest.mark.parametrize("payload", GARBAGE, ids=["utf8", "nested", "no", "deep"])
 def test_garbage_is_shown_as_refused(key: str, payload: bytes):
-    shown = inspection.readable(Sample(key, payload))
+    shown = inspection.readable(ReceivedSample(key, payload))
     assert shown["bytes"] == len(payload)
     assert shown["refused"].startswith(key)
 
 
 @pytest.mark.parametrize(("said", "shown"), FOREIGN, ids=["bytes", "numbers", "inside", "none", "flag"])
 def test_what_json_cannot_say_is_shown_all_the_same(said: object, shown: object):
-    assert inspection.readable(Sample("of/somebody", msgspec.msgpack.encode(said))) == shown
-    event = messages.Event(0, 0, "note", "eve", "drone1", "", {"said": said})
-    read = inspection.readable(Sample(keys.EVENT, messages.encode(event)))
+    assert inspection.readable(ReceivedSample("of/somebody", msgspec.msgpack.encode(said))) == shown
+    event = run_messages.Event(0, 0, "note", "eve", "drone1", "", {"said": said})
+    read = inspection.readable(ReceivedSample(keys.EVENT, messages.encode(event)))
     assert json.loads(json.dumps(read)) == read
 
 
@@ -147,7 +147,7 @@ def test_messages_keep_to_their_schedule(monkeypatch: pytest.MonkeyPatch):
     watch, sent_s = Watch(), []
     monkeypatch.setattr(inspection, "time", watch)
     link = FakeLink()
-    link.last[keys.CLOCK] = messages.encode(messages.Clock(60_000_000, 3, "run", 3, "running", 1.0, ()))
+    link.last[keys.CLOCK] = messages.encode(run_messages.Clock(60_000_000, 3, "run", 3, "running", 1.0, ()))
 
     def take(key: str, payload: bytes) -> None:
         sent_s.append(watch.now_s)
@@ -165,7 +165,7 @@ def test_time_goes_on_while_it_publishes():
     stamps = iter((20_000_000, 40_000_000))
 
     def pass_time(key: str, payload: bytes) -> None:
-        link.deliver(keys.CLOCK, messages.Clock(next(stamps), 0, "run", 0, "running", 1.0, ()))
+        link.deliver(keys.CLOCK, run_messages.Clock(next(stamps), 0, "run", 0, "running", 1.0, ()))
 
     link.on_publish = pass_time
     inspection.publish(link, INFO, MODE, TAKEOFF, 2, 1000.0)  # type: ignore[arg-type]
@@ -197,7 +197,7 @@ def test_arguments_may_be_named_like_anything():
 
 def test_messages_in_an_answer_are_shown_as_messages():
     link = FakeLink()
-    passed = [[keys.process("a.b", "bye"), messages.encode(messages.Bye(0, 0, "over"))]]
+    passed = [[keys.process("a.b", "bye"), messages.encode(run_messages.Bye(0, 0, "over"))]]
     link.on_request = lambda key, args: ControlAnswer(ok=True, result=passed)
     (shown,) = inspection.ask(link, keys.CONTROL, "replay", "{}")  # type: ignore[arg-type]
     assert shown == {"key": "process/a.b/bye", "message": {"t_ns": 0, "seq": 0, "reason": "over"}}

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zsim.contract.messages import Fault
+from zsim.contract.run_messages import Fault
 from zsim.scenario.fault_kinds import ROTORS, planned
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fault_effects import gust_m_s

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim.contract.messages import Done, Join, Waiting
-from zsim_world.flight.barrier import Barrier, RunParticipant
+from zsim.contract.run_messages import Done, Join, Waiting
+from zsim_world.flight.barrier import Barrier, Participant
 
 RUN = "run1"
 GATE_NS = 20_000_000
@@ -28,7 +28,7 @@ def barrier(*names: str, expected: list[str] | None = None, period_ns: int = GAT
     return made
 
 
-def names(participants: list[RunParticipant]) -> list[str]:
+def names(participants: list[Participant]) -> list[str]:
     return [participant.name for participant in participants]
 
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim.contract.messages import Mode, Velocity
+from zsim.contract.flight_messages import Mode, Velocity
 from zsim_world.flight.command_queue import PROGRAM, RECENT_PER_DRONE, CommandQueue, QueuedCommand
 from zsim_world.flight.run_outbox import Refusal
 

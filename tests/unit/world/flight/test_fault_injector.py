@@ -6,7 +6,8 @@ import pytest
 from refused import parts
 
 from zsim.contract import keys
-from zsim.contract.messages import ControlAnswer, ControlRequest, Done, Event, Faults, Join, Velocity
+from zsim.contract.flight_messages import Velocity
+from zsim.contract.run_messages import ControlAnswer, ControlRequest, Done, Event, Faults, Join
 from zsim.scenario import scenario_file
 from zsim_world.flight.world import World
 

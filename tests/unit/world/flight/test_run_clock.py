@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from zsim.contract.messages import ControlRequest
+from zsim.contract.run_messages import ControlRequest
 from zsim.scenario.scenario import TimeSteps
 from zsim_world.flight.run_clock import RunClock
 from zsim_world.flight.run_outbox import Refusal

@@ -9,28 +9,14 @@ import pytest
 from refused import parts
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import (
-    Bye,
-    Clock,
-    ClusterState,
-    ControlRequest,
-    Done,
-    Estimate,
-    Event,
-    Fault,
-    Faults,
-    Gps,
-    Imu,
-    Join,
-    Message,
-    Status,
-    Truth,
-    Velocity,
-    ViewDrones,
-)
+from zsim.contract.flight_messages import ClusterState, Estimate, Status, Truth, Velocity
+from zsim.contract.messages import Gps, Imu
+from zsim.contract.run_messages import Bye, Clock, ControlRequest, Done, Event, Fault, Faults, Join
+from zsim.contract.views import ViewDrones
 from zsim.errors import RecordError
 from zsim.record import Recorded, RecordReader, RecordWriter
 from zsim.scenario import scenario_file
+from zsim.schema.message import Message
 from zsim_world.flight.world import World
 from zsim_world.playback.playback import NOT_FLYABLE, Playback, PlaybackRange
 from zsim_world.playback.recorded_gates import RecordedGates

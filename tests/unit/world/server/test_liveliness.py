@@ -7,7 +7,7 @@ import pytest
 from fake_link import FakeLink
 
 from zsim.contract import keys
-from zsim.contract.messages import Join
+from zsim.contract.run_messages import Join
 from zsim.scenario import scenario_file
 from zsim_world.flight.world import World
 from zsim_world.server.liveliness import SILENT_S, LivelinessMonitor

@@ -4,8 +4,9 @@ import pytest
 from msgspec import Struct
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import Done, Velocity
-from zsim.transport.session import Sample
+from zsim.contract.flight_messages import Velocity
+from zsim.contract.run_messages import Done
+from zsim.transport.samples import ReceivedSample
 from zsim_world.server.message_history import KEEP_NS, MessageHistory
 
 SECOND_NS = 1_000_000_000
@@ -149,8 +150,8 @@ def history_of(*came: Velocity) -> MessageHistory:
     return made
 
 
-def samples(*outputs: Velocity) -> list[Sample]:
-    return [Sample(VELOCITY, messages.encode(output)) for output in outputs]
+def samples(*outputs: Velocity) -> list[ReceivedSample]:
+    return [ReceivedSample(VELOCITY, messages.encode(output)) for output in outputs]
 
 
 def test_what_has_not_come_is_found():

@@ -7,19 +7,10 @@ import pytest
 from fake_link import BAD_UTF8, NESTED, UNANSWERED, FakeLink
 from refused import parts
 
-from zsim.contract import keys, messages
+from zsim.contract import keys, messages, run_messages
+from zsim.contract.flight_messages import ClusterState, Estimate, Velocity
 from zsim.contract.framing import decode_batch
-from zsim.contract.messages import (
-    ClusterState,
-    ControlAnswer,
-    ControlRequest,
-    Done,
-    Estimate,
-    Event,
-    Health,
-    Join,
-    Velocity,
-)
+from zsim.contract.run_messages import ControlAnswer, ControlRequest, Done, Event, Health, Join
 from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
@@ -154,7 +145,7 @@ class Lossy(FakeLink):
                 self._say(self._gate)
                 self._gate += 1
         elif key == keys.EVENT and messages.decode(key, payload).kind == "end":
-            self.deliver(keys.process(ME, "bye"), messages.Bye(0, 0, "over"))
+            self.deliver(keys.process(ME, "bye"), run_messages.Bye(0, 0, "over"))
 
     def _say(self, gate: int) -> None:
         for key, message in ((ESTIMATE, estimate(gate)), (STATE, state(gate))):

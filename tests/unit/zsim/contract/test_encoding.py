@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from zsim.contract import messages
+from zsim.contract import flight_messages, messages
 from zsim.contract.encoding import BOOL, FLOATS, INT, TEXT, Layouts, read, words, write
 
 EDGES = (0, 127, 128, 255, 256, 65535, 65536, 2**32 - 1, 2**32, 2**63 - 1, -1, -32, -33, -128, -129, -32768, -32769)
@@ -77,18 +77,21 @@ def test_any_numbers_give_the_encoders_bytes(data: st.DataObject) -> None:
             [t_ns, seq, sample_ns, count, 9],
         ),
         (messages.Sonar(t_ns, seq, sample_ns, real[0], flag), [t_ns, seq, sample_ns, flag]),
-        (messages.Status(t_ns, seq, state, real[0], flag, TEXTS[name], count), [t_ns, seq, text, flag, name, count]),
+        (
+            flight_messages.Status(t_ns, seq, state, real[0], flag, TEXTS[name], count),
+            [t_ns, seq, text, flag, name, count],
+        ),
     ]
     rows = [(k, whole, real) for k, (_, whole) in enumerate(cases)]
     found = written([type(message) for message, _ in cases], rows)
     assert found == [messages.encode(message) for message, _ in cases]
 
 
-@pytest.mark.parametrize("kind", [messages.Mag, messages.Baro, messages.Flow, messages.Truth])
+@pytest.mark.parametrize("kind", [messages.Mag, messages.Baro, messages.Flow, flight_messages.Truth])
 def test_every_kind_that_a_world_says_has_a_layout(kind: type) -> None:
     values = [0.5 * k for k in range(20)]
-    whole = [7, 300] if kind is messages.Truth else [7, 300, -5]
-    laid_out = (kind, 4) if kind is messages.Truth else kind
+    whole = [7, 300] if kind is flight_messages.Truth else [7, 300, -5]
+    laid_out = (kind, 4) if kind is flight_messages.Truth else kind
     (payload,) = written([laid_out], [(0, whole, values)])
     message: Any = messages.decode_as(kind, payload, "here")
     assert (message.t_ns, message.seq) == (7, 300)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from zsim.contract import messages
+from zsim.contract import flight_messages, messages
 from zsim.scenario import scenario_file
 from zsim_agents.formation.controller import Controller
 
@@ -26,12 +26,14 @@ def controller() -> Controller:
     return Controller(info, scenario, "c")
 
 
-def estimate(t_ns: int, drone: int) -> messages.Estimate:
+def estimate(t_ns: int, drone: int) -> flight_messages.Estimate:
     """Return an estimate of which each number tells drone and place."""
     first = 100.0 * drone
     covariance = tuple((first + i) ** 2 for i in range(36))
     p, v = (first + 1, first + 2, first + 3), (first + 4, first + 5, first + 6)
-    return messages.Estimate(t_ns, 0, p, v, (1.0, 0.0, 0.0, 0.0), first + 7, covariance, 0.1, (0.0, 0.0, 0.0), {})
+    return flight_messages.Estimate(
+        t_ns, 0, p, v, (1.0, 0.0, 0.0, 0.0), first + 7, covariance, 0.1, (0.0, 0.0, 0.0), {}
+    )
 
 
 def test_each_number_is_where_it_belongs(controller):

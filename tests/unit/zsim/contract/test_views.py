@@ -1,8 +1,8 @@
-"""What eyes are shown of an estimate and of a formation."""
+"""What displays are sent of an estimate and of a formation."""
 
 import numpy as np
 
-from zsim.contract.messages import ClusterState, Estimate
+from zsim.contract.flight_messages import ClusterState, Estimate
 from zsim.contract.views import cluster_view, estimate_view
 
 

@@ -16,7 +16,8 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import Clock, Imu
+from zsim.contract.messages import Imu
+from zsim.contract.run_messages import Clock
 from zsim.errors import RecordError
 from zsim.record import Recorded, RecordReader, RecordWriter, repair
 from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, places

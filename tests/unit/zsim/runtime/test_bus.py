@@ -8,19 +8,10 @@ import pytest
 from msgspec import Struct
 
 from zsim.contract import keys
-from zsim.contract.messages import (
-    Bye,
-    ClusterState,
-    Done,
-    Estimate,
-    Imu,
-    Info,
-    Join,
-    Status,
-    Velocity,
-    ViewCluster,
-    Waiting,
-)
+from zsim.contract.flight_messages import ClusterState, Estimate, Status, Velocity
+from zsim.contract.messages import Imu, Info
+from zsim.contract.run_messages import Bye, Done, Join, Waiting
+from zsim.contract.views import ViewCluster
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.bus import Bus

@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from zsim.contract import keys
-from zsim.contract.messages import Bye, ControlAnswer, ControlRequest, Status
+from zsim.contract.flight_messages import Status
+from zsim.contract.run_messages import Bye, ControlAnswer, ControlRequest
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.group import AgentGroup

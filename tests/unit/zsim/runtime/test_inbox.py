@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsim.contract import keys
-from zsim.contract.messages import Baro, Estimate, Imu, Status
+from zsim.contract.flight_messages import Estimate, Status
+from zsim.contract.messages import Baro, Imu
 from zsim.runtime.inbox import GAP_MAX, Inbox
 
 GATE_NS = 20_000_000

@@ -7,8 +7,10 @@ import pytest
 from msgspec.structs import replace
 
 from zsim.contract import keys
+from zsim.contract.flight_messages import Estimate, Mode, Status
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import ControlRequest, Estimate, Fault, Faults, Imu, Info, Mode, Status, encode
+from zsim.contract.messages import Imu, Info, encode
+from zsim.contract.run_messages import ControlRequest, Fault, Faults
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.link_faults import LinkFaults, place_of, reception_probability, senders, uniform
 from zsim.scenario import scenario_file

@@ -7,11 +7,12 @@ from fake_link import UNANSWERED, FakeLink
 
 from zsim.contract import keys
 from zsim.contract.framing import decode_batch, pairs_of
-from zsim.contract.messages import ControlAnswer, Info, Origin
+from zsim.contract.messages import Info, Origin
+from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError, NoWorldError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.membership import RETRY_S, Membership, replay
-from zsim.transport.session import Sample
+from zsim.transport.samples import ReceivedSample
 
 GATE_NS = 20_000_000
 INFO = Info(
@@ -48,7 +49,7 @@ def test_what_is_not_answered_is_asked_for_again_after_a_while():
         wall.now_s += RETRY_S
     link.on_request = lambda key, args: ControlAnswer(True, result=[["drone/d1/truth", b"x"]])
     member.settle()
-    assert came == [Sample("drone/d1/truth", b"x")]
+    assert came == [ReceivedSample("drone/d1/truth", b"x")]
     assert not member.owes
 
 

@@ -1,6 +1,6 @@
 """What a person is told of a run: a reason that lasts, once."""
 
-from zsim.contract.messages import ClusterState
+from zsim.contract.flight_messages import ClusterState
 from zsim.runtime.progress import REASON_NS, HoldReasons
 
 GATE_NS = 20_000_000

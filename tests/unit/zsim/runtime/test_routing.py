@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zsim.contract import keys
+from zsim.contract.flight_messages import Status
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import Baro, Status, encode
+from zsim.contract.messages import Baro, encode
 from zsim.runtime.routing import GateRouter, RoutingTable, one_by_one
 
 GATE_NS = 20_000_000

@@ -9,21 +9,10 @@ from fake_link import UNANSWERED, FakeLink
 from msgspec.structs import replace
 
 from zsim.contract import keys, messages
+from zsim.contract.flight_messages import Estimate, Status
 from zsim.contract.framing import GateMessages, key_table
-from zsim.contract.messages import (
-    ControlAnswer,
-    Done,
-    DroneInfo,
-    Estimate,
-    Event,
-    Fault,
-    Faults,
-    Info,
-    Mag,
-    Origin,
-    Status,
-    encode,
-)
+from zsim.contract.messages import DroneInfo, Info, Mag, Origin, encode
+from zsim.contract.run_messages import ControlAnswer, Done, Event, Fault, Faults
 from zsim.errors import BehindError, RunError, SupersededError
 from zsim.runtime import membership
 from zsim.runtime.agent import Agent, Output

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from zsim.errors import NoWorldError, SessionError
-from zsim.transport import session
+from zsim.transport import connection
 from zsim.transport.connection import find_world
 from zsim.transport.tls import Identity
 
@@ -39,7 +39,7 @@ def said(endpoint: str, identity: Identity | None = None) -> str:
 
 
 def test_who_is_not_let_in_is_told_that_it_may_be_that(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "connect", silent)
+    monkeypatch.setattr(connection, "connect", silent)
     text = said("tls/127.0.0.1:7447", Identity("h1", Path("certs/h1/operator.eve")))
     assert "but somebody listens there: another federation" in text
     assert "or we are refused or not allowed here; correct --federation" in text
@@ -47,14 +47,14 @@ def test_who_is_not_let_in_is_told_that_it_may_be_that(monkeypatch: pytest.Monke
 
 
 def test_without_certificates_nobody_is_told_of_rights(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "connect", silent)
+    monkeypatch.setattr(connection, "connect", silent)
     text = said("tcp/127.0.0.1:7447")
     assert "but somebody listens there: another federation" in text
     assert "allowed" not in text
 
 
 def test_a_port_that_opens_to_who_is_refused_may_be_one_with_tls(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "connect", nobody)
+    monkeypatch.setattr(connection, "connect", nobody)
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         text = said(f"tcp/127.0.0.1:{port}")
@@ -66,5 +66,5 @@ def test_a_port_that_opens_to_who_is_refused_may_be_one_with_tls(monkeypatch: py
 def test_an_endpoint_that_cannot_be_tried_is_one_where_nobody_listens(
     monkeypatch: pytest.MonkeyPatch, endpoint: str
 ) -> None:
-    monkeypatch.setattr(session, "connect", nobody)
+    monkeypatch.setattr(connection, "connect", nobody)
     assert said(endpoint) == "; start one with `zsim world`"

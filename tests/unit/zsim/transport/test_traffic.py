@@ -7,7 +7,7 @@ from fake_link import FakeLink
 
 from zsim.contract import keys
 from zsim.contract.framing import GateMessages, encode_batch, key_table
-from zsim.transport.session import Sample
+from zsim.transport.samples import ReceivedSample
 from zsim.transport.traffic import Traffic, samples
 
 DRONES = ["d1"]
@@ -26,7 +26,7 @@ def passed(*payloads: bytes) -> tuple[list[Any], int]:
 
 def test_messages_and_gates_come_in_the_order_in_which_they_passed() -> None:
     arrived, refused = passed(encode_batch([("clock", b"1"), (keys.GATE, GATE.pack()), ("my/own", b"2")]))
-    assert arrived[0] == Sample("clock", b"1")
+    assert arrived[0] == ReceivedSample("clock", b"1")
     assert arrived[1].pairs == GATE.pairs
     assert list(samples(arrived))[1:] == [*GATE.pairs, ("my/own", b"2")]
     assert refused == 0
@@ -35,7 +35,7 @@ def test_messages_and_gates_come_in_the_order_in_which_they_passed() -> None:
 @pytest.mark.parametrize("garbage", [b"", b"\xc1", encode_batch([(keys.GATE, b"\xc1")])])
 def test_what_cannot_be_read_is_counted_and_the_rest_comes(garbage: bytes) -> None:
     arrived, refused = passed(garbage, encode_batch([("clock", b"1")]))
-    assert (arrived, refused) == ([Sample("clock", b"1")], 1)
+    assert (arrived, refused) == ([ReceivedSample("clock", b"1")], 1)
 
 
 def test_a_reader_can_be_woken() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from zsim.contract.messages import ViewCluster
+from zsim.contract.views import ViewCluster
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import KINDS
 from zsim.scenario.scenario import Scenario

@@ -1,0 +1,138 @@
+"""Messages of a flight: drones' state, truth and commands, estimates, and formations. The contract, version 1."""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from zsim.schema.message import Count, Message, Number, Vector3
+
+Quaternion = tuple[Number, Number, Number, Number]
+Rotors = Annotated[tuple[Number, ...], Meta(min_length=4, max_length=8)]
+Covariance = Annotated[tuple[Number, ...], Meta(min_length=36, max_length=36)]
+DroneState = Literal["landed", "taking_off", "hovering", "flying", "landing", "emergency"]
+Phase = Literal["idle", "taking_off", "assembling", "engaged", "landing", "held"]
+
+
+class Status(Message, frozen=True):
+    """The state of a drone, last in every gate.
+
+    `commander` is who flies it; `count` is how many messages on its `sensor/*` have come since the last status, this
+    one included.
+    """
+
+    state: DroneState
+    battery_percent: Number
+    collision: bool
+    commander: str | None
+    count: Count
+
+
+class Truth(Message, frozen=True):
+    """The true state of a drone: position, velocity, acceleration in W, attitude B to W, rate in B, rotor speeds."""
+
+    position_m: Vector3
+    velocity_m_s: Vector3
+    orientation_wxyz: Quaternion
+    angular_velocity_rad_s: Vector3
+    accel_m_s2: Vector3
+    rotor_rad_s: Rotors
+
+
+class Command(Message, frozen=True):
+    """Base of what is sent to a drone; `source` is the sender's process name."""
+
+    source: str
+
+
+class Velocity(Command, frozen=True):
+    """Fly a velocity [m/s] and turn at a rate [rad/s], counter-clockwise from above.
+
+    `frame`: "heading", x forward and y left by the sender's idea of the yaw; "world", W by the firmware's own.
+    """
+
+    velocity_m_s: Vector3
+    yaw_rate_rad_s: Number
+    frame: Literal["heading", "world"] = "heading"
+
+
+class Ardrone(Command, frozen=True):
+    """Fly as the aircraft's own commands do: tilt forward and left, climb, yaw rate, each in [-1, 1] of its limit."""
+
+    forward: Number
+    left: Number
+    up: Number
+    yaw_left: Number
+    hover: bool = False
+
+
+class Attitude(Command, frozen=True):
+    """Hold the tilt of an orientation B to W, whose heading is not used, with a thrust [N] and a yaw rate."""
+
+    orientation_wxyz: Quaternion
+    thrust_n: Number
+    yaw_rate_rad_s: Number
+
+
+class RotorSpeeds(Command, frozen=True):
+    """Turn the rotors at these speeds: front left, front right, rear right, rear left."""
+
+    speed_rad_s: Rotors
+
+
+class Mode(Command, frozen=True):
+    """Take off, land, stop the rotors at once, or leave the emergency; open to all with the commander's priority."""
+
+    mode: Literal["takeoff", "land", "emergency", "reset"]
+
+
+class Estimate(Message, frozen=True):
+    """Where an estimator believes its drone to be: position and velocity in W, attitude B to W.
+
+    `covariance` is that of position and velocity, 6 x 6, row-major, SI units; `gyro_bias_rad_s` is in B; `sensors` has
+    by name how many readings were used and refused.
+    """
+
+    position_m: Vector3
+    velocity_m_s: Vector3
+    orientation_wxyz: Quaternion
+    yaw_rad: Number
+    covariance: Covariance
+    yaw_sigma_rad: Number
+    gyro_bias_rad_s: Vector3
+    sensors: dict[str, tuple[Count, Count]]
+    source: str = ""
+
+
+class ClusterState(Message, frozen=True):
+    """Where a formation is, by the estimates, and where it is to be.
+
+    `names` are the 4n cluster variables of n drones, in the order of `value`, `desired` [m, rad] and `desired_rate`
+    [m/s, rad/s]. `trajectory_t_s` is the trajectory's own time, None where none runs; `margin` is the distance to a
+    singularity in the measure of the cluster space; `reason` is why it waits or is held. `plan_step` is how many steps
+    of the scenario's plan a restarted controller leaves out.
+    """
+
+    phase: Phase
+    drones: tuple[str, ...]
+    names: tuple[str, ...]
+    value: tuple[Number, ...]
+    desired: tuple[Number, ...]
+    desired_rate: tuple[Number, ...]
+    trajectory_t_s: Number | None
+    margin: Number
+    reason: str
+    source: str = ""
+    plan_step: Count = 0
+
+    def fault(self) -> str | None:
+        """Return what the types do not say."""
+        return length_fault(self, ("names", "value", "desired", "desired_rate"), 4 * len(self.drones))
+
+
+def length_fault(message: Struct, names: tuple[str, ...], length: int) -> str | None:
+    """Return the fault of the first of some fields that has not that many entries."""
+    for name in names:
+        entries = len(getattr(message, name))
+        if entries != length:
+            return f"{name} has {entries} entries; must have {length}"
+    return None

@@ -1,0 +1,174 @@
+"""Messages about the run: time, events, who takes part, injected faults, and requests. The contract, version 1."""
+
+import math
+from collections.abc import Iterator
+from typing import Any, Literal
+
+from msgspec import Struct, field
+
+from zsim.schema.message import Count, Message, Number, Whole
+
+GATES_MAX = 1_000_000  # of one `step`: 5.5 hours at 20 ms
+RATE_MAX = 1000.0  # simulated per wall second; beyond it nothing paces
+PRIORITY_MAX = 100  # programs have 0, operators 10
+
+
+class Waiting(Struct, frozen=True):
+    """A process that the world waits for, its host, and the wall time since when [s]."""
+
+    name: str
+    host: str
+    since_wall_s: Number
+
+
+class Clock(Message, frozen=True):
+    """The gate that the world has published; its `rate` is measured. `waiting_for` is filled while time stands."""
+
+    run_id: str
+    step: Count
+    state: Literal["waiting", "running", "paused", "stopped"]
+    rate: Number
+    waiting_for: tuple[Waiting, ...] = ()
+
+
+class Event(Message, frozen=True):
+    """Something that happened once: what, by whom, about whom, in words, and in figures."""
+
+    kind: str
+    source: str
+    subject: str
+    text: str
+    data: dict[str, Any] = field(default_factory=dict)
+
+    def fault(self) -> str | None:
+        """Return what the types do not say."""
+        return _infinite_fault("data", self.data)
+
+
+class Join(Message, frozen=True):
+    """A process takes part from now on; the newest of several random incarnations counts.
+
+    `period_ns` is how often it publishes done: a multiple of the gate, 0 for never. `serves` names processes that need
+    not join, since this one does what they would.
+    """
+
+    run_id: str
+    incarnation: int
+    role: str
+    host: str
+    pid: int
+    period_ns: Whole
+    version: str = ""
+    fingerprint: str = ""
+    serves: tuple[str, ...] = ()
+
+
+class Done(Message, frozen=True):
+    """Everything stamped up to `done_ns` is handled and answered; `sent` outputs were sent since the last done."""
+
+    run_id: str
+    incarnation: int
+    done_ns: Whole
+    sent: Count
+
+
+class Bye(Message, frozen=True):
+    """A process leaves of its own will."""
+
+    reason: str
+
+
+class Health(Message, frozen=True):
+    role: str
+    host: str
+    pid: int
+    step_us: dict[str, Number]
+    lag_ns: Whole
+    dropped: Count
+    refused: Count
+    rss_bytes: Count
+    received: Count = 0
+
+
+class Fault(Struct, frozen=True):
+    """An injected fault: a kind and parameters of docs/faults.md, a drone, link, cluster or process as its target.
+
+    It acts in the gates after `from_ns` up to `until_ns`, or until it is cleared. `source` is "scenario", or who asked.
+    `rank` counts those of the same kind, target and start before it: each of them has a stream of its own.
+    """
+
+    id: Count
+    kind: str
+    target: str
+    parameters: dict[str, Any]
+    from_ns: Count
+    until_ns: Count | None = None
+    source: str = ""
+    rank: Count = 0
+
+
+class Faults(Message, frozen=True):
+    """The faults that are planned or act, in the order of their ids; published before the gate that a change is in."""
+
+    faults: tuple[Fault, ...] = ()
+
+
+class ControlRequest(Struct, frozen=True):
+    """What is asked of `world/control` and `cluster/{c}/control`."""
+
+    op: str
+    args: dict[str, Any] = {}
+    source: str = ""
+
+    def fault(self) -> str | None:
+        """Return what the types do not say."""
+        return _infinite_fault("args", self.args)
+
+
+class ControlAnswer(Struct, frozen=True):
+    """Whether a request was done; if not, why; and what it asked for."""
+
+    ok: bool
+    error: str = ""
+    result: Any = None
+    more: Count | None = None
+
+    def fault(self) -> str | None:
+        """Return what the types do not say."""
+        return _infinite_fault("result", self.result)
+
+
+class ClusterRequest(Message, frozen=True):
+    """A request on `cluster/{c}/control` as the controller took it, before its outputs of the gate `t_ns`.
+
+    `source` is who asked; `error` is why it is refused. `controller` is the process that answered.
+    """
+
+    op: str
+    args: dict[str, Any]
+    source: str
+    ok: bool
+    error: str = ""
+    controller: str = ""
+
+    def fault(self) -> str | None:
+        """Return what the types do not say."""
+        return _infinite_fault("args", self.args)
+
+
+def _infinite_fault(field: str, value: Any) -> str | None:
+    """Return the fault of a field whose content is free: only its numbers must be finite."""
+    infinite = next((number for number in _numbers(value) if not math.isfinite(number)), None)
+    return None if infinite is None else f"{field} holds {infinite}; must be finite numbers"
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            yield from _numbers(key)
+            yield from _numbers(item)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _numbers(item)
