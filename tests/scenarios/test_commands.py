@@ -48,7 +48,7 @@ def test_the_first_who_sends_flies(federation: Federation) -> None:
     step.answer(step.me.done_ns + 3 * GATE_NS)
     assert refusal(step, VELOCITY) == ("drone1", f"flown by '{ME}' (priority 0)")
 
-    answer = step.client.ask("world/control", "acquire", source="tester.two", drone="drone1", priority=10)
+    answer = step.client.request("world/control", "acquire", source="tester.two", drone="drone1", priority=10)
     assert answer["ok"]
     step.client.put(VELOCITY, t_ns=0, source="tester.two", **BACK)
     step.event("command", "drone1")
@@ -56,12 +56,12 @@ def test_the_first_who_sends_flies(federation: Federation) -> None:
     step.answer(step.me.done_ns + 3 * GATE_NS)
     assert refusal(step, VELOCITY) == ("drone1", "flown by 'tester.two' (priority 10)")
     assert step.status()["commander"] == "tester.two"
-    no = step.client.ask("world/control", "acquire", source=ME, drone="drone1", priority=10)
+    no = step.client.request("world/control", "acquire", source=ME, drone="drone1", priority=10)
     assert parts(no["error"]) == ("drone1", "flown by 'tester.two' with priority 10")
-    no = step.client.ask("world/control", "release", source=ME, drone="drone1")
+    no = step.client.request("world/control", "release", source=ME, drone="drone1")
     assert parts(no["error"]) == ("drone1", "flown by 'tester.two', not by 'tester.one'")
 
-    assert step.client.ask("world/control", "release", source="tester.two", drone="drone1")["ok"]
+    assert step.client.request("world/control", "release", source="tester.two", drone="drone1")["ok"]
     step.answer(step.me.done_ns + 3 * GATE_NS)
     assert step.status()["commander"] is None
     step.put(VELOCITY, **FORWARD)

@@ -238,17 +238,17 @@ def test_by_command_on_a_running_federation(federation: Federation) -> None:
     client = federation.client()
     clock = client.watch("clock")
     clock.until(lambda m: m["t_ns"] > 5.5e9)
-    client.ask("world/control", "pause")
+    client.request("world/control", "pause")
     printed = [
         fault(federation, "add", "drone1", "gps_bias", "value_m=[2, 0, 0]"),
         fault(federation, "add", LINK, "link_jitter", "jitter_ms=90", "--for", "1500ms"),
         fault(federation, "add", "world", "gust", "velocity_m_s=[2, 1, 0]", "--for", "1s", "--at", "11s"),
         fault(federation, "list"),
     ]
-    client.ask("world/control", "step", gates=50)
+    client.request("world/control", "step", gates=50)
     clock.until(lambda m: m["t_ns"] > 6.5e9)
     printed.append(fault(federation, "clear", "drone1"))
-    client.ask("world/control", "resume")
+    client.request("world/control", "resume")
     run.ends(with_code=0)
     assert "fault 1: gps_bias of drone1 from" in printed[0]
     assert "until it is cleared" in printed[0]

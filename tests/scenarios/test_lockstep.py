@@ -245,18 +245,18 @@ def test_pause_step_resume(federation: Federation) -> None:
     step = Lockstep(federation)
     step.answer(5 * GATE_NS)
     step.stands_at(7 * GATE_NS)
-    assert step.client.ask("world/control", "pause")["ok"]
-    refused = step.client.ask("world/control", "pause")
+    assert step.client.request("world/control", "pause")["ok"]
+    refused = step.client.request("world/control", "pause")
     assert parts(refused["error"]) == ("the run", "paused")
     for gate in (6, 7):
         step.me.done(gate * GATE_NS)
     paused = step.clock.until(lambda m: m["state"] == "paused")
     assert paused.message["t_ns"] == 7 * GATE_NS
-    assert step.client.ask("world/control", "step", gates=2)["ok"]
+    assert step.client.request("world/control", "step", gates=2)["ok"]
     standing = step.clock.until(lambda m: m["state"] == "paused" and m["t_ns"] == 9 * GATE_NS)
     again = step.clock.until(lambda m: m["state"] == "paused" and m["step"] >= 9)
     assert again.message["t_ns"] == standing.message["t_ns"] == 9 * GATE_NS
-    assert step.client.ask("world/control", "resume")["ok"]
+    assert step.client.request("world/control", "resume")["ok"]
     step.me.done_ns = 7 * GATE_NS
     step.answer(8 * GATE_NS)
     step.stands_at(10 * GATE_NS)
@@ -274,7 +274,7 @@ def test_nobody_expected_and_a_stop(federation: Federation) -> None:
     client = federation.client()
     clock, events = client.watch("clock"), client.watch("world/event")
     clock.until(lambda m: m["t_ns"] > 0)
-    assert client.ask("world/control", "stop", source="operator.1", reason="lunch")["ok"]
+    assert client.request("world/control", "stop", source="operator.1", reason="lunch")["ok"]
     assert events.until(lambda m: m["kind"] == "end").message["data"]["reason"] == "stopped by operator.1: lunch"
     assert clock.until(lambda m: m["state"] == "stopped")
     world.ends(with_code=0)

@@ -65,24 +65,24 @@ def steered(federation: Federation) -> Federation:
     client = federation.client()
     clock, states = client.watch("clock"), client.watch("cluster/main/state")
     states.until(lambda m: m["phase"] == "engaged")
-    answer = client.ask("cluster/main/control", "target", source=PILOT, values={"z_c": 4.0})
+    answer = client.request("cluster/main/control", "target", source=PILOT, values={"z_c": 4.0})
     assert answer["ok"], answer
-    assert not client.ask("cluster/main/control", "target", source=PILOT, values={"nothing": 1.0})["ok"]
+    assert not client.request("cluster/main/control", "target", source=PILOT, values={"nothing": 1.0})["ok"]
     clock.until(lambda m: m["t_ns"] > 7e9)
     ask = {"source": PILOT, "kind": "gps_dropout", "target": "drone1", "for_s": 1.0}
-    assert client.ask("world/control", "fault_add", **ask)["ok"]
-    assert client.ask("world/control", "acquire", source=PILOT, drone="drone2", priority=10)["ok"]
+    assert client.request("world/control", "fault_add", **ask)["ok"]
+    assert client.request("world/control", "acquire", source=PILOT, drone="drone2", priority=10)["ok"]
     velocity = {"t_ns": 0, "source": PILOT, "velocity_m_s": [0.4, 0.1, 0.0], "yaw_rate_rad_s": 0.3}
     for until_ns in (7.3e9, 7.6e9, 7.9e9):
         client.put("drone/drone2/cmd/velocity", **velocity)
         clock.until(lambda m, until_ns=until_ns: m["t_ns"] > until_ns)
-    assert client.ask("world/control", "pause", source=PILOT)["ok"]
+    assert client.request("world/control", "pause", source=PILOT)["ok"]
     events = client.watch("world/event")
     client.put("drone/drone2/cmd/mode", t_ns=0, source=PILOT, mode="land")
     events.until(lambda m: m["kind"] == "command")
-    assert client.ask("world/control", "step", source=PILOT, gates=5)["ok"]
-    assert client.ask("world/control", "release", source=PILOT, drone="drone2")["ok"]
-    assert client.ask("world/control", "resume", source=PILOT)["ok"]
+    assert client.request("world/control", "step", source=PILOT, gates=5)["ok"]
+    assert client.request("world/control", "release", source=PILOT, drone="drone2")["ok"]
+    assert client.request("world/control", "resume", source=PILOT)["ok"]
     run.ends(with_code=0)
     return federation
 

@@ -92,7 +92,7 @@ def test_a_foreign_estimator_takes_over_in_flight(federation: Federation) -> Non
 
 def answer_from(client: Client, participant: Participant, truth: Watch, from_ns: int) -> None:
     """Catch up by replay, then answer every gate to the end."""
-    replayed = client.ask("world/control", "replay", from_ns=from_ns - 1, keys=["drone/drone2/truth"])["result"]
+    replayed = client.request("world/control", "replay", from_ns=from_ns - 1, keys=["drone/drone2/truth"])["result"]
     known = {m["t_ns"]: m for m in (msgpack.unpackb(payload) for _, payload in replayed)}
     for t_ns in range(from_ns, PAIR_DURATION_S * 10**9 + 1, GATE_NS):
         while t_ns not in known:
@@ -125,11 +125,11 @@ def test_what_the_world_answers(federation: Federation) -> None:
         for expression in ("world/info", "clock", "drone/*/sensor/status", "drone/*/truth", "cluster/*/state"):
             assert other.get(expression), expression
         assert other.get("drone/drone1/estimate")["drone/drone1/estimate"]["position_m"] == truth["position_m"]
-        replay = other.ask("world/control", "replay", from_ns=3 * GATE_NS, keys=["drone/*/truth", "clock"])
+        replay = other.request("world/control", "replay", from_ns=3 * GATE_NS, keys=["drone/*/truth", "clock"])
     stamps = [(key, msgpack.unpackb(payload)["t_ns"]) for key, payload in replay["result"]]
     assert [t for key, t in stamps if key == "drone/drone1/truth"][:3] == [4 * GATE_NS, 5 * GATE_NS, 6 * GATE_NS]
     assert stamps[:2] == [("drone/drone1/truth", 4 * GATE_NS), ("clock", 4 * GATE_NS)]
-    step.client.ask("world/control", "stop")
+    step.client.request("world/control", "stop")
     step.world.ends(with_code=0)
 
 
@@ -155,7 +155,7 @@ def test_requests_that_are_refused(federation: Federation) -> None:
     step = Lockstep(federation)
     step.answer(2 * GATE_NS)
     for op, args, refused in BAD_REQUESTS:
-        answer = step.client.ask("world/control", op, **args)
+        answer = step.client.request("world/control", op, **args)
         assert answer["ok"] is False
         assert refused is None or parts(answer["error"]) == refused, (op, args, answer)
     for payload in (b"", b"\xc1garbage", msgpack.packb(["list"]), msgpack.packb({"op": 7})):
@@ -174,16 +174,16 @@ def test_the_outputs_of_a_role(federation: Federation) -> None:
     run = federation.run(PAIR, "--rate", "10", "--duration", "600")
     client = federation.client()
     client.watch("clock").until(lambda m: m["t_ns"] > 6e9)
-    assert client.ask("world/control", "pause")["ok"]
+    assert client.request("world/control", "pause")["ok"]
     for name in PAIR_ROLES:
-        answer = client.ask(f"process/{name}/outputs", "outputs")
+        answer = client.request(f"process/{name}/outputs", "outputs")
         assert answer["ok"]
         outputs = [(key, msgpack.unpackb(payload)["t_ns"]) for key, payload in answer["result"]]
         stamps = sorted({t_ns for _, t_ns in outputs})
         assert len(stamps) >= 2
         assert {b - a for a, b in pairwise(stamps)} == {GATE_NS}
         assert ("cluster/main/state" if name == "controller.main" else "estimate") in " ".join(k for k, _ in outputs)
-    client.ask("world/control", "stop")
+    client.request("world/control", "stop")
     run.ends(with_code=0)
 
 
@@ -199,7 +199,7 @@ def twice(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> list[dict
                 step.put("drone/drone1/cmd/velocity", velocity_m_s=[math.sin(gate), 0.3, 0.1], yaw_rate_rad_s=0.2)
                 step.answer(step.me.done_ns + GATE_NS)
             step.stands_at(step.me.done_ns + DELAY_NS + GATE_NS)
-            step.client.ask("world/control", "stop")
+            step.client.request("world/control", "stop")
             hashes.append(step.event("end", "world").message["data"])
             step.me.bye(step.now_ns)
             step.world.ends(with_code=0)

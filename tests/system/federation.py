@@ -28,10 +28,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
+import forked_roles
 import msgpack
 import numpy as np
 import pytest
-import warm
 from wire import PATIENCE_S, Client
 
 from zsim.record import RecordReader, repair
@@ -93,7 +93,7 @@ class Role:
         self._news = threading.Condition()
         self._closed = False
         given = {"COLUMNS": "200", **(env or {})}
-        started = None if prefix else warm.start(arguments, str(ROOT), given)
+        started = None if prefix else forked_roles.start(arguments, str(ROOT), given)
         self.process, self._output = started or self._start_cold([*prefix, *ZSIM, *arguments], given)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()

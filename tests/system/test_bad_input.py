@@ -188,7 +188,7 @@ def world(federation: Federation) -> Iterator[Client]:
     client.watch("clock").until(lambda m: m["t_ns"] > 0)
     yield client
     assert client.get("clock")["clock"]["state"] == "running"
-    client.ask("world/control", "stop")
+    client.request("world/control", "stop")
     role.ends(with_code=0)
 
 

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from door import Door
 from fake_gateway import HELLO, FakeGateway
 from federation import ONE, ROOT, Federation
+from gateway_process import GatewayProcess
 from wire import PATIENCE_S
 
 HERE = ROOT / "clients" / "c"
@@ -455,10 +455,10 @@ def flown(federation: Federation, program: Path, *options: str, stop: bool = Fal
     federation.role("estimator", "drone1")
     client = federation.client()
     events = client.watch("world/event")
-    door = Door(federation)
-    said = output(program, "127.0.0.1", door.lines_port)
+    gateway = GatewayProcess(federation)
+    said = output(program, "127.0.0.1", gateway.lines_port)
     if stop:
-        client.ask("world/control", "stop")
+        client.request("world/control", "stop")
     corners = [
         [float(n) for n in re.findall(r"-?\d+\.\d+", line)[:4]] for line in said.splitlines() if "corner" in line
     ]
@@ -499,12 +499,12 @@ def test_it_flies_a_square_in_realtime(build: Build, federation: Federation) -> 
 
 def test_the_real_gateway_and_every_call(talk: Talk, federation: Federation) -> None:
     federation.world(ONE, "--rate", "4", "--duration", "600")
-    door = Door(federation, "--token", "secret")
+    gateway = GatewayProcess(federation, "--token", "secret")
     assert (
-        talk.does(f"connect {door.lines_port} 5 me wrong")
+        talk.does(f"connect {gateway.lines_port} 5 me wrong")
         == "-1 hello: no token, or a wrong one; ask whoever started the gateway for it"
     )
-    assert re.match(r"1 client\.me \w+ lockstep 0\.02 \d+", talk.does(f"connect {door.lines_port} 60 me secret"))
+    assert re.match(r"1 client\.me \w+ lockstep 0\.02 \d+", talk.does(f"connect {gateway.lines_port} 60 me secret"))
     assert talk.does("subscribe drone/*/sensor/status") == "1"
     assert re.match(r'1 drone/drone1/sensor/status \{.*"state":"landed".* lost 0', talk.does("next 60"))
     assert talk.does("unsubscribe drone/*/sensor/status") == "1"
@@ -527,6 +527,6 @@ def test_the_first_program_of_the_docs(build: Build, federation: Federation, tmp
     program = tmp_path / "first.c"
     lines = re.findall(r"^    (#include \"zsim.h\"\n(?:(?:    .*)?\n)*?    })\n\n", page, flags=re.MULTILINE)
     federation.world(ONE, "--duration", "600", "--rate", "4")
-    door = Door(federation)
-    program.write_text(textwrap.dedent(f"    {lines[0]}\n").replace("ZSIM_PORT", str(door.lines_port)))
+    gateway = GatewayProcess(federation)
+    program.write_text(textwrap.dedent(f"    {lines[0]}\n").replace("ZSIM_PORT", str(gateway.lines_port)))
     assert output(build(str(program))) == "it hovers\n"

@@ -154,7 +154,7 @@ def test_bad_commands(federation: Federation) -> None:
         said = Terminal(federation)(*arguments, code=2)
         assert reason in said
         assert len([line for line in said.splitlines() if not line.startswith("waiting for a world of")]) == 1
-    federation.client().ask("world/control", "stop")
+    federation.client().request("world/control", "stop")
     world.ends(with_code=0)
 
 

@@ -350,7 +350,7 @@ def test_an_emergency_stops_a_drone_that_another_operator_flies(
     shown(address, lambda state: states(state) == ["landed"] * 3)
     page.put("Take off", True)
     shown(address, lambda state: states(state) == ["flying"] * 3)
-    assert federation.client().ask("world/control", "acquire", drone="drone1", priority=10)["ok"]
+    assert federation.client().request("world/control", "acquire", drone="drone1", priority=10)["ok"]
     page.put("EMERGENCY – all rotors stop", True)
     shown(address, lambda state: states(state) == ["emergency"] * 3)
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from door import Door
 from federation import ONE, ROOT, Federation, free_port
+from gateway_process import GatewayProcess
 from wire import PATIENCE_S
 
 NODE = shutil.which("node")
@@ -46,8 +46,8 @@ def test_the_module_against_a_played_gateway() -> None:
 def test_a_script_flies_a_square_in_lockstep(federation: Federation) -> None:
     world = federation.world(SQUARE, "--duration", "24")
     federation.role("estimator", "drone1")
-    door = Door(federation)
-    said = node("examples/js/fly.mjs", f"tcp://127.0.0.1:{door.lines_port}")
+    gateway = GatewayProcess(federation)
+    said = node("examples/js/fly.mjs", f"tcp://127.0.0.1:{gateway.lines_port}")
     corners = [
         [float(n) for n in re.findall(r"-?\d+\.\d+", line)[:4]] for line in said.splitlines() if "corner" in line
     ]
@@ -73,9 +73,9 @@ def test_the_first_program_of_the_docs(federation: Federation, tmp_path: Path) -
     page = (ROOT / "docs" / "clients-js.md").read_text()
     lines = re.findall(r"^    (import \{ connect \} .*\n(?:(?:    .*)?\n)*?    \}\);)\n\n", page, flags=re.MULTILINE)
     federation.world(ONE, "--duration", "600", "--rate", "4")
-    door = Door(federation)
+    gateway = GatewayProcess(federation)
     script = tmp_path / "first.mjs"
-    text = textwrap.dedent(f"    {lines[0]}\n").replace("7470", str(door.lines_port))
+    text = textwrap.dedent(f"    {lines[0]}\n").replace("7470", str(gateway.lines_port))
     script.write_text(text.replace('"./clients', f'"{ROOT}/clients'))
     assert node(script) == "it hovers\n"
 
@@ -147,10 +147,10 @@ def opened(browser: Any, served: str) -> Iterator[Callable[..., Watched]]:
     """Open the page on a gateway."""
     with ExitStack() as stack:
 
-        def open_it(door: Door, query: str = "") -> Watched:
+        def open_it(gateway: GatewayProcess, query: str = "") -> Watched:
             context = browser.new_context(viewport={"width": 1000, "height": 700})
             stack.callback(context.close)
-            return Watched(context.new_page(), f"{served}?gateway=ws://127.0.0.1:{door.http_port}/stream{query}")
+            return Watched(context.new_page(), f"{served}?gateway=ws://127.0.0.1:{gateway.http_port}/stream{query}")
 
         yield open_it
 
@@ -158,11 +158,11 @@ def opened(browser: Any, served: str) -> Iterator[Callable[..., Watched]]:
 @needs_browser
 def test_the_page_shows_a_drone_and_flies_it(federation: Federation, opened: Callable[..., Watched]) -> None:
     federation.world(ONE, "--rate", "1", "--duration", "600")
-    door = Door(federation)
+    gateway = GatewayProcess(federation)
     other = federation.client()
     states = other.watch("drone/drone1/sensor/status")
     events = other.watch("world/event")
-    seen = opened(door)
+    seen = opened(gateway)
     seen.says(r"run \w+, lockstep, as client\.page-\w+")
     seen.says(r"^landed$")
     on_the_ground = seen.map()
@@ -205,8 +205,8 @@ def test_the_page_lives_through_the_end_of_its_gateway_and_of_its_run(
     federation: Federation, opened: Callable[..., Watched]
 ) -> None:
     world = federation.world(ONE, "--rate", "2", "--duration", "600")
-    door = Door(federation)
-    seen = opened(door)
+    gateway = GatewayProcess(federation)
+    seen = opened(gateway)
     seen.says(r"^run \w+, lockstep")
     world.signal(2)
     world.ends(with_code=0)
@@ -214,7 +214,7 @@ def test_the_page_lives_through_the_end_of_its_gateway_and_of_its_run(
     federation.world(ONE, "--rate", "2", "--duration", "600")
     seen.says(r"^run \w+, lockstep")
     seen.says(r"^landed$")
-    door.role.signal(15)
+    gateway.role.signal(15)
     seen.says(r"hung up|no gateway answers")
 
 
@@ -222,7 +222,7 @@ def test_the_page_lives_through_the_end_of_its_gateway_and_of_its_run(
 def test_the_page_is_refused_a_command_in_words(federation: Federation, opened: Callable[..., Watched]) -> None:
     """A landed drone cannot be held: the page says what the world said, and stays."""
     federation.world(ONE, "--rate", "2", "--duration", "600")
-    seen = opened(Door(federation))
+    seen = opened(GatewayProcess(federation))
     seen.says(r"^landed$")
     seen.press("Hold drone1")
     seen.says("is landed; a setpoint needs it hovering or flying")
@@ -232,6 +232,6 @@ def test_the_page_is_refused_a_command_in_words(federation: Federation, opened: 
 @needs_browser
 def test_the_page_shows_a_token_where_one_is_asked_for(federation: Federation, opened: Callable[..., Watched]) -> None:
     federation.world(ONE, "--rate", "2", "--duration", "600")
-    door = Door(federation, "--token", "secret")
-    opened(door).says("no gateway answers there, or it wants a token")
-    opened(door, "&token=secret").says(r"^landed$")
+    gateway = GatewayProcess(federation, "--token", "secret")
+    opened(gateway).says("no gateway answers there, or it wants a token")
+    opened(gateway, "&token=secret").says(r"^landed$")

@@ -47,7 +47,7 @@ def test_it_flies_and_holds_time(federation: Federation, request: pytest.Fixture
     program: subprocess.Popen[str] = request.getfixturevalue("plain_client")
     joined = events.until(lambda m: (m["kind"], m["subject"]) == ("join", NAME))
     assert joined.message["data"]["from_ns"] > 0
-    assert client.ask("world/control", "rate", value=4)["ok"]
+    assert client.request("world/control", "rate", value=4)["ok"]
     commander = events.until(lambda m: m["kind"] == "commander")
     assert commander.message["source"] == NAME
 

@@ -90,7 +90,7 @@ def test_old_commands_are_refused_by_age(federation: Federation) -> None:
     now_ns = client.get("clock")["clock"]["t_ns"]
     client.put("drone/drone1/cmd/mode", t_ns=now_ns, source="tester.new", mode="takeoff")
     assert events.until(lambda m: m["kind"] == "mode").message["source"] == "tester.new"
-    client.ask("world/control", "stop")
+    client.request("world/control", "stop")
     world.ends(with_code=0)
 
 
@@ -99,19 +99,19 @@ def test_pause_and_resume(federation: Federation) -> None:
     client = federation.client()
     clock = client.watch("clock")
     clock.until(lambda m: m["t_ns"] > 1e9)
-    assert client.ask("world/control", "pause")["ok"]
+    assert client.request("world/control", "pause")["ok"]
     first = clock.until(lambda m: m["state"] == "paused")
     later = clock.until(lambda m: m["state"] == "paused")
     assert later.wall_s - first.wall_s > 0.5
     assert later.message["t_ns"] == first.message["t_ns"]
-    assert client.ask("world/control", "step", gates=3)["ok"]
+    assert client.request("world/control", "step", gates=3)["ok"]
     clock.until(lambda m: m["state"] == "paused" and m["t_ns"] == first.message["t_ns"] + 3 * GATE_NS)
-    assert client.ask("world/control", "resume")["ok"]
+    assert client.request("world/control", "resume")["ok"]
     resumed = clock.until(lambda m: m["state"] == "running")
     second = clock.until(lambda m: m["t_ns"] >= resumed.message["t_ns"] + 5e9)
     assert second.wall_s - resumed.wall_s > 0.7  # of 1 s: no burst makes up for the pause
-    assert client.ask("world/control", "rate", value=0)["error"].startswith("value is 0; must be from 0 (")
-    assert client.ask("world/control", "rate", value=50)["ok"]
+    assert client.request("world/control", "rate", value=0)["error"].startswith("value is 0; must be from 0 (")
+    assert client.request("world/control", "rate", value=50)["ok"]
     clock.until(lambda m: m["t_ns"] >= second.message["t_ns"] + 20e9)
-    client.ask("world/control", "stop")
+    client.request("world/control", "stop")
     world.ends(with_code=0)

@@ -57,7 +57,7 @@ def matches(expression: str, key: str) -> bool:
 
 
 def resume(client: Client) -> None:
-    assert client.ask("world/control", "resume")["ok"]
+    assert client.request("world/control", "resume")["ok"]
 
 
 def without_source(payload: bytes) -> dict[str, Any]:
@@ -190,30 +190,30 @@ def test_what_may_be_asked(federation: Federation, flown: Path) -> None:
     client = federation.client()
     clock, events = client.watch("clock"), client.watch("world/event")
     clock.until(lambda m: m["t_ns"] > 0)
-    assert client.ask("world/control", "pause")["ok"]
+    assert client.request("world/control", "pause")["ok"]
     stood_ns = clock.until(lambda m: m["state"] == "paused").message["t_ns"]
-    assert client.ask("world/control", "step", gates=3)["ok"]
+    assert client.request("world/control", "step", gates=3)["ok"]
     assert clock.until(lambda m: m["t_ns"] > stood_ns + 2 * GATE_NS).message["t_ns"] == stood_ns + 3 * GATE_NS
-    assert client.ask("world/control", "seek", t_s=8)["ok"]
-    assert client.ask("world/control", "step")["ok"]
+    assert client.request("world/control", "seek", t_s=8)["ok"]
+    assert client.request("world/control", "step")["ok"]
     clock.until(lambda m: m["t_ns"] == 8_000_000_000)
     assert client.get("drone/drone1/truth")["drone/drone1/truth"]["t_ns"] == 8_000_000_000
     for t_s in (99, "noon"):
-        assert parts(client.ask("world/control", "seek", t_s=t_s)["error"]) == ("t_s", repr(t_s))
+        assert parts(client.request("world/control", "seek", t_s=t_s)["error"]) == ("t_s", repr(t_s))
     for key, op, args in (
         ("world/control", "acquire", {"drone": "drone1", "priority": 10}),
         ("world/control", "fault_add", {"kind": "gps_dropout", "target": "drone1"}),
         ("cluster/main/control", "takeoff", {}),
     ):
-        assert client.ask(key, op, **args)["error"] == "a replay: nobody can be flown"
+        assert client.request(key, op, **args)["error"] == "a replay: nobody can be flown"
     client.put("drone/drone1/cmd/mode", t_ns=0, source="tester.one", mode="land")
     refused = events.until(lambda m: m["kind"] == "refused" and m["source"] == "tester.one").message
     assert refused["data"]["reason"] == "a replay: nobody can be flown"
-    assert client.ask("world/control", "seek", t_s=2)["ok"]
-    assert client.ask("world/control", "rate", value=3)["ok"]
+    assert client.request("world/control", "seek", t_s=2)["ok"]
+    assert client.request("world/control", "rate", value=3)["ok"]
     resume(client)
     clock.until(lambda m: 2_000_000_000 < m["t_ns"] < 3_000_000_000)
-    assert client.ask("world/control", "stop", reason="seen enough")["ok"]
+    assert client.request("world/control", "stop", reason="seen enough")["ok"]
     assert events.until(lambda m: m["kind"] == "end").message["data"]["replay_of"]
     role.ends(with_code=0)
 
@@ -227,7 +227,7 @@ def test_a_recorder_that_comes_late(federation: Federation, flown: Path) -> None
     client = federation.client()
     clock, events = client.watch("clock"), client.watch("world/event")
     clock.until(lambda m: m["state"] == "paused")
-    assert client.ask("world/control", "step", gates=300)["ok"]
+    assert client.request("world/control", "step", gates=300)["ok"]
     clock.until(lambda m: m["t_ns"] == 8_000_000_000)
     recorder = federation.role("record", "--out", str(federation.out))
     events.until(lambda m: m["kind"] == "join" and m["subject"] == "recorder")

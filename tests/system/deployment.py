@@ -29,7 +29,7 @@ DISK_BYTES = 1_500_000  # room for what a host needs and a few seconds of a reco
 GONE_S = 15.0  # wall time within which nobody may be left on any host after its launcher is gone
 
 
-class Team:
+class Deployment:
     """One lab with certificates, and the `zsim` commands that run in its launcher's namespace."""
 
     def __init__(self, lab: Lab, roles: dict[str, Any], secure: bool = True, **more: Any) -> None:
@@ -98,20 +98,20 @@ class Team:
 
 
 @contextmanager
-def closing(team: Team) -> Iterator[Team]:
+def closing(deployment: Deployment) -> Iterator[Deployment]:
     """End what a test has started, and fail if anything of it stays."""
     try:
-        yield team
+        yield deployment
     finally:
-        team.close()
-        for name in list(team.cut_off):
-            team.heal(name)
-    team.nobody_left()
+        deployment.close()
+        for name in list(deployment.cut_off):
+            deployment.heal(name)
+    deployment.nobody_left()
 
 
 @pytest.fixture
-def team(lab: Lab) -> Iterator[Team]:
-    with closing(Team(lab, ROLES)) as made:
+def deployment(lab: Lab) -> Iterator[Deployment]:
+    with closing(Deployment(lab, ROLES)) as made:
         yield made
 
 
