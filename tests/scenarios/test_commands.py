@@ -6,7 +6,7 @@ import pytest
 from federation import ONE, Federation
 from lockstep import DELAY_NS, GATE_NS, ME, Lockstep
 from refused import parts
-from wire import Heard
+from wire import Received
 
 VELOCITY = "drone/drone1/cmd/velocity"
 MODE = "drone/drone1/cmd/mode"
@@ -83,7 +83,7 @@ def test_the_instant_of_a_command(federation: Federation) -> None:
     step.put(MODE, mode="takeoff")
     step.answer(12 * GATE_NS)
     assert step.event("mode", "drone1").message["t_ns"] == 10 * GATE_NS + DELAY_NS
-    assert "command" not in [heard.message["kind"] for heard in step.events.now()]
+    assert "command" not in [received.message["kind"] for received in step.events.now()]
     step.stands_at(14 * GATE_NS)
     step.client.put(MODE, t_ns=0, source="tester.two", mode="emergency")
     apply_ns = step.event("command", "drone1").message["data"]["apply_t_ns"]
@@ -126,7 +126,7 @@ def test_silence(federation: Federation) -> None:
     Expected: hover after 0.5 s of simulated time, landing 2 s later, whatever the wall clock does.
     """
     step = Lockstep(federation, "--duration", "60")
-    states = step.client.watch("drone/drone1/sensor/status")
+    states = step.client.subscribe("drone/drone1/sensor/status")
     step.fly()
     step.put(VELOCITY, **FORWARD)
     sent_ns = step.me.done_ns + GATE_NS
@@ -140,10 +140,10 @@ def test_silence(federation: Federation) -> None:
     assert "landed" in changes
 
 
-def changes_of(heard: list[Heard]) -> dict[str, int]:
+def changes_of(received: list[Received]) -> dict[str, int]:
     """Return when each state was entered last."""
     changes, former = {}, ""
-    for _, _, status in heard:
+    for _, _, status in received:
         if status["state"] != former:
             former = status["state"]
             changes[former] = status["t_ns"]

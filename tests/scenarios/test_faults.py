@@ -236,7 +236,7 @@ def test_by_command_on_a_running_federation(federation: Federation) -> None:
     """
     run = federation.run(yaml.safe_dump(document([], duration_s=12.0)), "--rate", "2")
     client = federation.client()
-    clock = client.watch("clock")
+    clock = client.subscribe("clock")
     clock.until(lambda m: m["t_ns"] > 5.5e9)
     client.request("world/control", "pause")
     printed = [

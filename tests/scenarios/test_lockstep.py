@@ -272,7 +272,7 @@ def test_nobody_expected_and_a_stop(federation: Federation) -> None:
     """
     world = federation.world(ONE, "--rate", "1", "--duration", "1000")
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["t_ns"] > 0)
     assert client.request("world/control", "stop", source="operator.1", reason="lunch")["ok"]
     assert events.until(lambda m: m["kind"] == "end").message["data"]["reason"] == "stopped by operator.1: lunch"

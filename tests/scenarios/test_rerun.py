@@ -8,7 +8,8 @@ from pathlib import Path
 
 import msgpack
 import pytest
-from federation import ONE, PAIR, ROOT, Federation, Role
+from federation import ONE, PAIR, Federation, Role
+from forked_commands import ROOT
 from mcap.opcode import Opcode
 from wire import PATIENCE_S
 
@@ -63,7 +64,7 @@ def steered(federation: Federation) -> Federation:
     """
     run = federation.run(PAIR, "--rate", "2")
     client = federation.client()
-    clock, states = client.watch("clock"), client.watch("cluster/main/state")
+    clock, states = client.subscribe("clock"), client.subscribe("cluster/main/state")
     states.until(lambda m: m["phase"] == "engaged")
     answer = client.request("cluster/main/control", "target", source=PILOT, values={"z_c": 4.0})
     assert answer["ok"], answer
@@ -77,7 +78,7 @@ def steered(federation: Federation) -> Federation:
         client.put("drone/drone2/cmd/velocity", **velocity)
         clock.until(lambda m, until_ns=until_ns: m["t_ns"] > until_ns)
     assert client.request("world/control", "pause", source=PILOT)["ok"]
-    events = client.watch("world/event")
+    events = client.subscribe("world/event")
     client.put("drone/drone2/cmd/mode", t_ns=0, source=PILOT, mode="land")
     events.until(lambda m: m["kind"] == "command")
     assert client.request("world/control", "step", source=PILOT, gates=5)["ok"]
@@ -162,7 +163,7 @@ def test_an_estimator_that_was_killed(federation: Federation) -> None:
     Expected: a line says that agents are not run again, and why; the world alone gives the same hash.
     """
     run = federation.run(PAIR, "--rate", "3")
-    federation.client().watch("clock").until(lambda m: m["t_ns"] > 6e9)
+    federation.client().subscribe("clock").until(lambda m: m["t_ns"] > 6e9)
     federation.kill("estimator.drone2")
     run.ends(with_code=0)
     role = rerun(federation)

@@ -9,7 +9,7 @@ import pytest
 from federation import PAIR, PAIR_ROLES, Federation
 from lockstep import DELAY_NS, GATE_NS, ME, Lockstep
 from refused import parts
-from wire import Client, Participant, Watch
+from wire import Client, Participant, Subscription
 
 PAIR_DURATION_S = 12
 
@@ -20,8 +20,8 @@ class ForeignEstimator:
     def __init__(self, client: Client, name: str = "estimator.drone2") -> None:
         self._client = client
         info = client.info()
-        self._truth: Watch = client.watch("drone/drone2/truth")
-        self._status: Watch = client.watch("drone/drone2/sensor/status")
+        self._truth: Subscription = client.subscribe("drone/drone2/truth")
+        self._status: Subscription = client.subscribe("drone/drone2/sensor/status")
         self.participant = client.join(name, info, info["gate_ns"])
         self.last_ns = round(PAIR_DURATION_S * 1e9)
 
@@ -55,7 +55,7 @@ def test_a_foreign_estimator(federation: Federation) -> None:
     """
     roles = [federation.world(PAIR), federation.role("estimator", "drone1"), federation.role("controller", "main")]
     client = federation.client()
-    phases = client.watch("cluster/main/state")
+    phases = client.subscribe("cluster/main/state")
     ForeignEstimator(client).fly()
     for role in roles:
         role.ends(with_code=0)
@@ -74,9 +74,9 @@ def test_a_foreign_estimator_takes_over_in_flight(federation: Federation) -> Non
     """
     run = federation.run(PAIR, "--rate", "3")
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["t_ns"] > 6e9)
-    truth = client.watch("drone/drone2/truth")
+    truth = client.subscribe("drone/drone2/truth")
     former_pid = federation.pid("estimator.drone2")
     foreign = client.join("estimator.drone2", client.info(), GATE_NS)
     taken = events.until(lambda m: m["kind"] == "superseded").message["data"]
@@ -90,7 +90,7 @@ def test_a_foreign_estimator_takes_over_in_flight(federation: Federation) -> Non
     assert record.all("cluster/main/state")[-1]["phase"] == "engaged"
 
 
-def answer_from(client: Client, participant: Participant, truth: Watch, from_ns: int) -> None:
+def answer_from(client: Client, participant: Participant, truth: Subscription, from_ns: int) -> None:
     """Catch up by replay, then answer every gate to the end."""
     replayed = client.request("world/control", "replay", from_ns=from_ns - 1, keys=["drone/drone2/truth"])["result"]
     known = {m["t_ns"]: m for m in (msgpack.unpackb(payload) for _, payload in replayed)}
@@ -173,7 +173,7 @@ def test_the_outputs_of_a_role(federation: Federation) -> None:
     """
     run = federation.run(PAIR, "--rate", "10", "--duration", "600")
     client = federation.client()
-    client.watch("clock").until(lambda m: m["t_ns"] > 6e9)
+    client.subscribe("clock").until(lambda m: m["t_ns"] > 6e9)
     assert client.request("world/control", "pause")["ok"]
     for name in PAIR_ROLES:
         answer = client.request(f"process/{name}/outputs", "outputs")

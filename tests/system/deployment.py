@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from federation import ROOT, Record, Role
+from federation import Record, Role
+from forked_commands import ROOT
 from lab import LAUNCHER, Lab
 
 from zsim.record import RecordReader, repair

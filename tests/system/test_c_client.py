@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 from fake_gateway import HELLO, FakeGateway
-from federation import ONE, ROOT, Federation
+from federation import ONE, Federation
+from forked_commands import ROOT
 from gateway_process import GatewayProcess
 from wire import PATIENCE_S
 
@@ -454,7 +455,7 @@ def flown(federation: Federation, program: Path, *options: str, stop: bool = Fal
     world = federation.world(SQUARE, *options)
     federation.role("estimator", "drone1")
     client = federation.client()
-    events = client.watch("world/event")
+    events = client.subscribe("world/event")
     gateway = GatewayProcess(federation)
     said = output(program, "127.0.0.1", gateway.lines_port)
     if stop:

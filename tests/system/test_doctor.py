@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import yaml
-from federation import ZSIM
+from forked_commands import ZSIM
 from lab import LAUNCHER, Lab
 
 ROOT = Path(__file__).parents[2]

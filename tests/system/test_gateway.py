@@ -392,7 +392,7 @@ def test_a_gate_of_a_former_seat_is_nobodys(federation):
 
 def test_the_world_names_a_client_that_hung_up_and_takes_it_back(federation):
     federation.world(STANDING.replace("processes: {", "processes: {on_death: {client: wait}, "))
-    gateway, events = GatewayProcess(federation).in_run(), federation.client().watch("world/event")
+    gateway, events = GatewayProcess(federation).in_run(), federation.client().subscribe("world/event")
     with gateway.connect() as stream:
         stream.request("join", name="pilot", period_s=0.02, reads=["drone/drone1/truth"])
         stream.next("gate")
@@ -467,7 +467,7 @@ def test_a_killed_world_is_told_of(federation):
 
 def test_ctrl_c_ends_it_with_a_bye(federation):
     federation.world(STANDING)
-    gateway, byes = GatewayProcess(federation).in_run(), federation.client().watch("process/gateway.main/bye")
+    gateway, byes = GatewayProcess(federation).in_run(), federation.client().subscribe("process/gateway.main/bye")
     with gateway.connect() as stream:
         stream.request("join", name="pilot", period_s=0.02, reads=["drone/drone1/truth"])
         stream.next("gate")

@@ -31,7 +31,7 @@ def fly_with_clients(federation: Federation, clients: int, values: int) -> dict[
     run = federation.run(TRIO, "--realtime", "--hosted")
     gateway = GatewayProcess(federation).in_run()
     client = federation.client()
-    client.watch("clock").until(lambda clock: clock["t_ns"] >= 1e9)
+    client.subscribe("clock").until(lambda clock: clock["t_ns"] >= 1e9)
     numbers = map(str, (gateway.http_port, gateway.lines_port, clients, values))
     command = ["nice", "-n", "10", sys.executable, str(LOAD), *numbers]
     done = subprocess.run(command, capture_output=True, text=True, timeout=HANGS_S)

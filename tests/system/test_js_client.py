@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from federation import ONE, ROOT, Federation, free_port
+from federation import ONE, Federation, free_port
+from forked_commands import ROOT
 from gateway_process import GatewayProcess
 from wire import PATIENCE_S
 
@@ -160,8 +161,8 @@ def test_the_page_shows_a_drone_and_flies_it(federation: Federation, opened: Cal
     federation.world(ONE, "--rate", "1", "--duration", "600")
     gateway = GatewayProcess(federation)
     other = federation.client()
-    states = other.watch("drone/drone1/sensor/status")
-    events = other.watch("world/event")
+    states = other.subscribe("drone/drone1/sensor/status")
+    events = other.subscribe("world/event")
     seen = opened(gateway)
     seen.says(r"run \w+, lockstep, as client\.page-\w+")
     seen.says(r"^landed$")
@@ -183,7 +184,7 @@ def test_the_page_shows_a_drone_and_flies_it(federation: Federation, opened: Cal
     page = states.until(lambda m: (m["commander"] or "").startswith("client.page-")).message["commander"]
     held_from_ns = states.now()[-1].message["t_ns"]
     states.until(lambda m: m["t_ns"] > held_from_ns + 4e9)  # longer than silence is suffered
-    assert states.heard[-1].message["state"] == "flying"
+    assert states.received[-1].message["state"] == "flying"
     other.put("drone/drone1/cmd/velocity", t_ns=t_ns, **velocity)
     assert page in events.until(lambda m: m["kind"] == "refused").message["text"]
     seen.says("is flown by 'client.page-")  # people are told too

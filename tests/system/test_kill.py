@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from federation import PAIR, Federation, Record, Role
-from wire import Client, Heard, Watch
+from wire import Client, Received, Subscription
 
 SAID_WITHIN_S = 2.0  # wall time from the kill until the rest says so
 INTERRUPTED_WITHIN_S = 3.0  # wall time from Ctrl-C until the whole run has ended
@@ -34,14 +34,14 @@ class Flight:
     def __init__(self, federation: Federation, *options: str) -> None:
         self.run: Role = federation.run(PAIR, "--rate", "4", *options)
         self.client: Client = federation.client()
-        self.clock: Watch = self.client.watch("clock")
-        self.events: Watch = self.client.watch("world/event")
+        self.clock: Subscription = self.client.subscribe("clock")
+        self.events: Subscription = self.client.subscribe("world/event")
         self.clock.until(lambda m: m["t_ns"] >= ENGAGED_NS)
 
-    def event(self, kind: str, subject: str) -> Heard:
+    def event(self, kind: str, subject: str) -> Received:
         return self.events.until(lambda m: (m["kind"], m["subject"]) == (kind, subject))
 
-    def stands_for(self, name: str) -> Heard:
+    def stands_for(self, name: str) -> Received:
         return self.clock.until(lambda m: name in [w["name"] for w in m["waiting_for"]])
 
 
@@ -140,12 +140,12 @@ def test_who_is_terminated_has_died(federation: Federation) -> None:
 def test_a_stopped_reader(federation: Federation) -> None:
     """Whoever only listens and takes nothing loses its link; the terminal says meanwhile why nothing moves."""
     run = federation.run(PAIR, "--duration", "100000")
-    clock = federation.client().watch("clock")
+    clock = federation.client().subscribe("clock")
     reader = federation.role("echo", "**")
     reader.line("clock")
     reader.signal(signal.SIGSTOP)
     stuck = run.line("stuck: nothing can be published for .*; one of recorder, ")
-    clock.until(lambda _: clock.heard[-1].wall_s > stuck.wall_s + 1.0)
+    clock.until(lambda _: clock.received[-1].wall_s > stuck.wall_s + 1.0)
     run.signal(signal.SIGINT)
     run.ends(with_code=130)
 
@@ -154,8 +154,8 @@ def test_a_stopped_reader(federation: Federation) -> None:
 def test_a_stopped_recorder(federation: Federation) -> None:
     """A recorder that takes nothing for long is as good as dead, whether or not a put has waited for it before."""
     flight = Flight(federation, "--rate", "1000", "--duration", "100000")
-    engaged_s = flight.clock.heard[-1].wall_s
-    flight.clock.until(lambda _: flight.clock.heard[-1].wall_s > engaged_s + UNWRITTEN_S)
+    engaged_s = flight.clock.received[-1].wall_s
+    flight.clock.until(lambda _: flight.clock.received[-1].wall_s > engaged_s + UNWRITTEN_S)
     federation.kill("recorder", signal.SIGSTOP)
     flight.run.line("death: recorder .*; on_death: end")
     flight.run.ends(with_code=1)

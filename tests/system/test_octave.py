@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from federation import ONE, ROOT, Federation
+from federation import ONE, Federation
+from forked_commands import ROOT
 from gateway_process import GatewayProcess
 from octave import CLIENT, command, needs_octave, run
 from wire import PATIENCE_S
@@ -143,7 +144,7 @@ def test_the_lockstep_of_the_page(federation: Federation) -> None:
         ONE.replace("expect: []", "expect: [client.myctrl]").replace("duration_s: 10", "duration_s: 14")
     )
     watcher = federation.client()
-    truth, events = watcher.watch("drone/drone1/truth"), watcher.watch("world/event")
+    truth, events = watcher.subscribe("drone/drone1/truth"), watcher.subscribe("world/event")
     port = GatewayProcess(federation).in_run().lines_port
     code, _ = page_blocks("In the lockstep")
     run(code.replace("'127.0.0.1'", f"'127.0.0.1', 'Port', {port}").replace("gate.t_s < 60", "gate.t_s < 12"))
@@ -166,7 +167,7 @@ def test_the_page_names_methods_that_there_are() -> None:
 def test_the_first_example(federation: Federation) -> None:
     """examples/matlab/fly_square.m flies its corners; the world waits for it from the start, and goes on after it."""
     world = federation.world(SQUARE)
-    events = federation.client().watch("world/event")
+    events = federation.client().subscribe("world/event")
     gateway = GatewayProcess(federation).in_run()
     corners = run(f"fly_square('127.0.0.1', 'Port', {gateway.lines_port})").splitlines()
     assert len(corners) == 5
@@ -236,7 +237,7 @@ def test_the_controller_is_killed_and_started_again(federation: Federation) -> N
     """
     flight = federation.run(MATLAB, "--duration", "32")
     watcher = federation.client()
-    state, clock = watcher.watch("cluster/main/state"), watcher.watch("clock")
+    state, clock = watcher.subscribe("cluster/main/state"), watcher.subscribe("clock")
     port = GatewayProcess(federation).in_run().lines_port
     code = f"cluster_controller('127.0.0.1', 'Port', {port})"
     with octave(code) as first:

@@ -7,7 +7,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from deployment import ROLES, START_S, STEP, Deployment, closing, in_process
-from federation import ROOT, Federation
+from federation import Federation
+from forked_commands import ROOT
 from lab import Lab
 
 EXAMPLES = str(ROOT / "examples")

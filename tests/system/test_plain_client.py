@@ -9,7 +9,8 @@ import sys
 from collections.abc import Iterator
 
 import pytest
-from federation import ONE, ROOT, Federation
+from federation import ONE, Federation
+from forked_commands import ROOT
 from wire import PATIENCE_S
 
 PROGRAM = ROOT / "examples" / "plain_client.py"
@@ -42,7 +43,7 @@ def test_it_is_a_page_of_zenoh_and_msgpack() -> None:
 def test_it_flies_and_holds_time(federation: Federation, request: pytest.FixtureRequest) -> None:
     world = federation.world(ONE, "--rate", "0.25", "--duration", "11", "--set", "processes.expect=[]")
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["t_ns"] > 0)  # nobody is expected: time runs
     program: subprocess.Popen[str] = request.getfixturevalue("plain_client")
     joined = events.until(lambda m: (m["kind"], m["subject"]) == ("join", NAME))

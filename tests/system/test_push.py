@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from federation import ZSIM
+from forked_commands import ZSIM
 from lab import LAUNCHER, Lab
 
 from zsim import __version__

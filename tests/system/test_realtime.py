@@ -34,7 +34,7 @@ def test_it_keeps_pace(federation: Federation, rate: int) -> None:
 def test_nobody_is_waited_for(federation: Federation) -> None:
     """A stopped estimator does not hold time; it is a deadline missed at every gate."""
     run = federation.run(PAIR, "--realtime", "--rate", "2")
-    clock = federation.client().watch("clock")
+    clock = federation.client().subscribe("clock")
     clock.until(lambda m: m["t_ns"] > 2e9)
     federation.kill("estimator.drone1", signal.SIGSTOP)
     clock.until(lambda m: m["t_ns"] > 8e9)
@@ -49,14 +49,14 @@ def test_a_dead_controller_means_hover(federation: Federation) -> None:
     """The dead fly no drone any more, and a drone that nobody flies hovers."""
     run = federation.run(PAIR, "--realtime", "--rate", "3", "--duration", "16", "--set", NOBODY_FLIES)
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
-    states = client.watch("drone/drone1/sensor/status")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
+    states = client.subscribe("drone/drone1/sensor/status")
     clock.until(lambda m: m["t_ns"] > 6e9)
     federation.kill("controller.main")
     events.until(lambda m: (m["kind"], m["subject"]) == ("release", "drone1"))
     events.until(lambda m: (m["kind"], m["subject"]) == ("drop", "controller.main"))
     run.ends(with_code=0)
-    seen = [heard.message["state"] for heard in states.now() if heard.message["t_ns"] > 6e9]
+    seen = [received.message["state"] for received in states.now() if received.message["t_ns"] > 6e9]
     assert list(dict.fromkeys(seen)) == ["flying", "hovering"]
     assert federation.record().end()["last_ns"] == 16 * 10**9
 
@@ -65,7 +65,7 @@ def test_a_silent_commander_means_hover_then_land(federation: Federation) -> Non
     """A controller that hangs still holds its drones: the firmware's watchdog lands them."""
     run = federation.run(PAIR, "--realtime", "--rate", "3", "--duration", "18")
     client = federation.client()
-    states, clock = client.watch("drone/drone1/sensor/status"), client.watch("clock")
+    states, clock = client.subscribe("drone/drone1/sensor/status"), client.subscribe("clock")
     clock.until(lambda m: m["t_ns"] > 6e9)
     federation.kill("controller.main", signal.SIGSTOP)
     states.until(lambda m: m["state"] == "hovering" and m["t_ns"] > 6e9)
@@ -73,15 +73,15 @@ def test_a_silent_commander_means_hover_then_land(federation: Federation) -> Non
     states.until(lambda m: m["state"] == "landed")
     federation.kill("controller.main", signal.SIGCONT)
     run.ends(with_code=0)
-    flown_ns = max(h.message["t_ns"] for h in states.heard if h.message["state"] == "flying")
-    hovering_ns = next(h.message["t_ns"] for h in states.heard if h.message["t_ns"] > flown_ns)
+    flown_ns = max(h.message["t_ns"] for h in states.received if h.message["state"] == "flying")
+    hovering_ns = next(h.message["t_ns"] for h in states.received if h.message["t_ns"] > flown_ns)
     assert landing.message["t_ns"] - hovering_ns == pytest.approx(2e9, abs=GATE_NS)
 
 
 def test_old_commands_are_refused_by_age(federation: Federation) -> None:
     world = federation.world(ONE, "--realtime", "--rate", "0.5", "--duration", "30")
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["t_ns"] > 1e9)
     client.put("drone/drone1/cmd/mode", t_ns=0, source="tester.old", mode="takeoff")
     refused = events.until(lambda m: m["kind"] == "refused")
@@ -97,7 +97,7 @@ def test_old_commands_are_refused_by_age(federation: Federation) -> None:
 def test_pause_and_resume(federation: Federation) -> None:
     world = federation.world(ONE, "--realtime", "--rate", "5", "--duration", "1000")
     client = federation.client()
-    clock = client.watch("clock")
+    clock = client.subscribe("clock")
     clock.until(lambda m: m["t_ns"] > 1e9)
     assert client.request("world/control", "pause")["ok"]
     first = clock.until(lambda m: m["state"] == "paused")

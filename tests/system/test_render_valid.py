@@ -19,7 +19,8 @@ from typing import NamedTuple
 import kubernetes_validate
 import pytest
 import yaml
-from federation import PAIR, ZSIM, free_port
+from federation import PAIR, free_port
+from forked_commands import ZSIM
 from wire import PATIENCE_S
 
 from zsim.record import RecordReader

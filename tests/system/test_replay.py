@@ -36,11 +36,11 @@ class Ear:
     """Keeps the payloads of some keys, byte by byte."""
 
     def __init__(self, client: Client, *expressions: str) -> None:
-        self.heard: defaultdict[str, list[bytes]] = defaultdict(list)
+        self.received: defaultdict[str, list[bytes]] = defaultdict(list)
         self._kept = [client.session.declare_subscriber(f"zsim/{each}", self._take) for each in expressions]
 
     def _take(self, sample: zenoh.Sample) -> None:
-        self.heard[str(sample.key_expr).removeprefix("zsim/")].append(sample.payload.to_bytes())
+        self.received[str(sample.key_expr).removeprefix("zsim/")].append(sample.payload.to_bytes())
 
 
 def recorded(folder: Path, *expressions: str) -> dict[str, list[bytes]]:
@@ -79,7 +79,7 @@ def test_the_same_payloads(federation: Federation, flown: Path) -> None:
     """
     role = replay(federation, flown, "--rate", "0", "--paused")
     client = federation.client()
-    ear, clock, views = Ear(client, *RESAID), client.watch("clock"), client.watch("view/**")
+    ear, clock, views = Ear(client, *RESAID), client.subscribe("clock"), client.subscribe("view/**")
     info = client.info()
     original = msgpack.unpackb(recorded(flown, "world/info")["world/info"][0])
     assert info["replay_of"] == original["run_id"] != info["run_id"]
@@ -92,7 +92,7 @@ def test_the_same_payloads(federation: Federation, flown: Path) -> None:
     assert "ended: the record is over" in role.text()
     for key, payloads in first.items():
         rest = [payload for payload in payloads if msgpack.unpackb(payload)["t_ns"] > 0]
-        said = [payload for payload in ear.heard[key] if msgpack.unpackb(payload)["t_ns"] > 0]
+        said = [payload for payload in ear.received[key] if msgpack.unpackb(payload)["t_ns"] > 0]
         assert said == rest, key
     assert {view.key for view in views.now()} >= {"view/drones", "view/cluster/main"}
 
@@ -106,7 +106,7 @@ def test_a_part_of_it(federation: Federation, flown: Path) -> None:
     options = [part for key in keys for part in ("--keys", key)]
     role = replay(federation, flown, "--from", "5", "--to", "6", "--rate", "4", "--paused", *options)
     client = federation.client()
-    ear, clock = Ear(client, "drone/**", "cluster/**"), client.watch("clock")
+    ear, clock = Ear(client, "drone/**", "cluster/**"), client.subscribe("clock")
     stood = clock.until(lambda m: m["state"] == "paused")
     assert stood.message["t_ns"] == 5_000_000_000
     assert client.get("drone/drone1/truth")["drone/drone1/truth"]["t_ns"] == 5_000_000_000
@@ -115,9 +115,9 @@ def test_a_part_of_it(federation: Federation, flown: Path) -> None:
     role.ends(with_code=0)
     assert "ended: played to 6 s" in role.text()
     assert over.wall_s - stood.wall_s > 0.24  # 1 s at 4, but for the gate that time stood at
-    assert {key.split("/", 2)[2] for key in ear.heard} == {"truth", "sensor/gps"}
+    assert {key.split("/", 2)[2] for key in ear.received} == {"truth", "sensor/gps"}
     wanted = recorded(flown, *keys)
-    for key, payloads in ear.heard.items():
+    for key, payloads in ear.received.items():
         in_time = [p for p in wanted[key] if 5_000_000_000 < msgpack.unpackb(p)["t_ns"] <= 6_000_000_000]
         assert [p for p in payloads if msgpack.unpackb(p)["t_ns"] > 5_000_000_000] == in_time
 
@@ -168,7 +168,7 @@ def test_an_estimator_without_gps(federation: Federation, flown: Path) -> None:
     kinds = [part for kind in ("imu", "mag", "baro", "flow", "status") for part in ("--keys", f"drone/*/sensor/{kind}")]
     role = replay(federation, flown, "--rate", "0", "--expect", "estimator.drone1", "--to", "4", *kinds)
     client = federation.client()
-    estimates = client.watch("drone/drone1/estimate")
+    estimates = client.subscribe("drone/drone1/estimate")
     federation.role("estimator", "drone1").ends(with_code=0)
     role.ends(with_code=0)
     last = estimates.until(lambda m: m["t_ns"] == 4_000_000_000).message
@@ -188,7 +188,7 @@ def test_what_may_be_asked(federation: Federation, flown: Path) -> None:
     """
     role = replay(federation, flown, "--rate", "2")
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["t_ns"] > 0)
     assert client.request("world/control", "pause")["ok"]
     stood_ns = clock.until(lambda m: m["state"] == "paused").message["t_ns"]
@@ -225,7 +225,7 @@ def test_a_recorder_that_comes_late(federation: Federation, flown: Path) -> None
     """
     role = replay(federation, flown, "--from", "2", "--to", "9", "--rate", "0", "--paused")
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["state"] == "paused")
     assert client.request("world/control", "step", gates=300)["ok"]
     clock.until(lambda m: m["t_ns"] == 8_000_000_000)
@@ -253,14 +253,14 @@ def test_all_roles_beside_a_replay(federation: Federation, flown: Path) -> None:
     role = replay(federation, flown, "--rate", "0", "--to", "6", *expect)
     client = federation.client()
     answers = ("cluster/main/state", "drone/drone1/estimate", "drone/drone2/estimate")
-    watches = {key: client.watch(key) for key in answers}
+    watches = {key: client.subscribe(key) for key in answers}
     split = [name.split(".") for name in PAIR_ROLES]
     others = [federation.role(role_, thing) for role_, thing in split]
     for each in (role, *others):
         each.ends(with_code=0)
     for key, watch in watches.items():
         watch.until(lambda m: m["t_ns"] == 6_000_000_000)
-        said = [unsigned(heard.message) for heard in watch.heard]
+        said = [unsigned(received.message) for received in watch.received]
         assert said == [*map(without_source, recorded(flown, key)[key][:301])]
 
 

@@ -111,7 +111,7 @@ def yaw(odometry: dict[str, Any]) -> float:
 def test_two_participants_find_and_hear_every_topic_and_ask(federation: Federation, ros: ROS) -> None:
     """One is there before the bridge, one comes after it; all values are checked against physics."""
     federation.run(PAIR.replace("duration_s: 12", "duration_s: 1000"), "--rate", "2")
-    federation.client().watch("clock").until(lambda m: m["t_ns"] >= 0)
+    federation.client().subscribe("clock").until(lambda m: m["t_ns"] >= 0)
     peer, _ = ros
     topics = expected()
     told = {topic: kind for topic, (kind,) in topics.items() if topic.rsplit("/", 1)[1] not in TAKEN}
@@ -202,7 +202,7 @@ def test_a_node_flies_a_drone(federation: Federation, ros: ROS) -> None:
     federation.world(ONE.replace("duration_s: 10", "duration_s: 1000"), "--rate", "4")
     first = bridge(federation)
     node = ros[0](port_of(federation.endpoint))
-    events = federation.client().watch("world/event")
+    events = federation.client().subscribe("world/event")
     for topic, kind in {"ground_truth": "nav_msgs/msg/Odometry", "state": "std_msgs/msg/String"}.items():
         node.ask("subscribe", topic=f"/drone1/{topic}", kind=kind)
     node.hear("/drone1/state", lambda m: m["data"] == "landed")
@@ -273,11 +273,11 @@ def test_wire_of_what_we_send_and_what_we_refuse(federation: Federation, ros: RO
     beside = rmw_zenoh.Attachment(1, 1, bytes(16)).packed()
     for payload, attachment in ((b"\x00\x01\x00\x00garbage", beside), (good, b""), (good, beside[:-1]), (bad, beside)):
         raw.session.put(key, payload, attachment=attachment)
-    raw.watch("process/ros2.main/health").until(lambda m: m["refused"] >= 4)
+    raw.subscribe("process/ros2.main/health").until(lambda m: m["refused"] >= 4)
     assert started.text().count("/drone1/cmd_vel: refused") == 1
     service = rmw_zenoh.data_key(0, "/drone1/release", rmw_zenoh.dds_name(TRIGGER["kind"]), types.hash(TRIGGER["kind"]))
     assert list(raw.session.get(service, payload=b"\x00\x01\x00\x00", attachment=beside)) == []
-    raw.watch("process/ros2.main/health").until(lambda m: m["refused"] >= 5)
+    raw.subscribe("process/ros2.main/health").until(lambda m: m["refused"] >= 5)
     assert raw.get("drone/drone1/sensor/status")["drone/drone1/sensor/status"]["commander"] is None
     assert node.ask("call", service="/drone1/release", **TRIGGER)["success"] is False
 
@@ -288,7 +288,7 @@ def test_wire_of_what_we_send_and_what_we_refuse(federation: Federation, ros: RO
         received.append(health["received"])
         return received[-1] == received[-2]
 
-    raw.watch("process/ros2.main/health").until(stands)  # nobody subscribes any more: nothing is read
+    raw.subscribe("process/ros2.main/health").until(stands)  # nobody subscribes any more: nothing is read
     assert received[-1] > 0
 
 
@@ -325,7 +325,7 @@ def test_either_side_may_restart(federation: Federation, ros: ROS) -> None:
     other.ask("publish", topic="/chatter", kind="std_msgs/msg/String", fields={"data": "hello"})
     one.until("topics", lambda found: "/chatter" in found)  # with a router of ROS, ROS nodes find each other
 
-    clock = federation.client().watch("clock")
+    clock = federation.client().subscribe("clock")
 
     def now_s() -> float:
         return 1e-9 * clock.now()[-1].message["t_ns"]
