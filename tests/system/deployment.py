@@ -24,10 +24,10 @@ from zsim_analysis.in_process import fly
 STEP = ROOT / "scenarios" / "step.yaml"
 ROLES = {"world": "h1", "controller.main": "h2", "estimator.*": ["h1", "h2", "h3"]}
 FAKETIME = next(map(str, Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1")), None)
-START_S = 60.0  # wall time until something of a run is seen on a machine that does other things too
+START_S = 120.0  # wall time until something of a run is seen on a machine that does other things too
 NAMED_AFTER_S = 2.0  # a host that is cut off for longer is named
 DISK_BYTES = 1_500_000  # room for what a host needs and a few seconds of a record
-GONE_S = 15.0  # wall time within which nobody may be left on any host after its launcher is gone
+GONE_S = 120.0  # wall time within which nobody may be left on any host after its launcher is gone
 
 
 class Deployment:

@@ -38,7 +38,6 @@ from zsim.record import RecordReader, repair
 
 PORTS = range(20_000, 30_000)  # below the range from which systems take ports for outgoing connections
 COMPILES_S = 600.0  # wall time that compiling takes at most
-LEFT_WITHIN_S = 3.0  # after the end of a run, until nobody may be left
 
 ONE = """
 name: one
@@ -226,7 +225,7 @@ class Federation:
         """Return the commands of this federation's processes that are there now."""
         return [" ".join(command) for _, command in self._processes()]
 
-    def nobody_left(self, within_s: float = LEFT_WITHIN_S) -> None:
+    def nobody_left(self, within_s: float = PATIENCE_S) -> None:
         """Fail if any process of this federation is still there after a while."""
         pids = [pid for pid, _ in self._processes()]
         until_s = time.monotonic() + within_s

@@ -45,6 +45,7 @@ table bridge lab {
   }
 }
 """
+RUN_S = 120.0  # wall time for a command on a host
 _counter = itertools.count()
 
 
@@ -115,7 +116,7 @@ class Lab:
 
     def run(self, name: str, *command: str, **options: Any) -> subprocess.CompletedProcess[str]:
         """Run a command on a host (or the launcher) to its end; options as of `subprocess.run`."""
-        given = {"text": True, "capture_output": True, "timeout": 60.0, "cwd": ROOT} | options
+        given = {"text": True, "capture_output": True, "timeout": RUN_S, "cwd": ROOT} | options
         return subprocess.run(self._inside(name, command), **{**given, "env": self._env(name, options.get("env"))})
 
     def popen(self, name: str, *command: str, **options: Any) -> subprocess.Popen[str]:

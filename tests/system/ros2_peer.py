@@ -76,7 +76,7 @@ class Peer:
 
     def call(self, service: str, kind: str, request: str, response: str, fields: dict[str, Any]) -> Any:
         client = ROS2ServiceClient(
-            service, kind, request_definition=request, response_definition=response, timeout=60.0, **self._where
+            service, kind, request_definition=request, response_definition=response, timeout=120.0, **self._where
         )
         try:
             return plain(client.call(**fields))

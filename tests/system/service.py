@@ -5,7 +5,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-READY_S = 60.0  # wall time to come up on a loaded machine
+READY_S = 120.0  # wall time to come up on a loaded machine
 
 
 class Service:

