@@ -16,10 +16,12 @@ from deployment import DISK_BYTES, NAMED_AFTER_S, ROLES, START_S, Deployment, cl
 from lab import Lab
 
 DRONES = ("drone1", "drone2", "drone3")
+FLIGHT_S = 15.0  # simulated, of Test 1
 GATES_PER_S = 50  # of Test 1
 CUT_IN_REALTIME_S = 5.0  # longer than the firmware's patience (0.5 s until it hovers, 2 s more until it lands)
 
 
+@pytest.mark.soak  # with a cut in it, below
 def test_three_hosts_give_the_bits_of_one_process(deployment: Deployment, tmp_path: Path) -> None:
     run = deployment.up("--duration", "20")
     run.ends(with_code=0, within_s=START_S)
@@ -68,7 +70,7 @@ def test_a_killed_role_is_started_again(deployment: Deployment, role: str) -> No
 
 def test_a_broken_ssh_session_is_the_death_of_its_roles(deployment: Deployment) -> None:
     """They end, since their launcher is gone; time stands still until there are new ones."""
-    run = deployment.up("--rate", "8", "--duration", "30")
+    run = deployment.up("--rate", "8", "--duration", "20")
     in_flight(run)
     for pid, line in namespaces.members(deployment.lab.namespace("h2")):
         if re.match(r"sshd(-session)?: \w+@notty", line):
@@ -92,7 +94,7 @@ def test_without_world_or_recorder_the_run_ends(deployment: Deployment, role: st
 
 @pytest.mark.parametrize("cut_s", [1.0, *(pytest.param(cut_s, marks=pytest.mark.soak) for cut_s in (5.0, 20.0))])
 def test_time_stands_still_while_a_host_is_cut_off(deployment: Deployment, tmp_path: Path, cut_s: float) -> None:
-    run = deployment.up("--rate", "5", "--duration", "25")
+    run = deployment.up("--rate", "5", "--duration", f"{FLIGHT_S:g}")
     in_flight(run)
     cut_at_s = deployment.cut("h3")
     if cut_s > NAMED_AFTER_S:
@@ -104,7 +106,8 @@ def test_time_stands_still_while_a_host_is_cut_off(deployment: Deployment, tmp_p
         run.line("host h3 answers again", START_S)
     run.ends(with_code=0, within_s=START_S)
     record = deployment.record()
-    assert record.sha256() == in_process(tmp_path, 25.0)
+    assert record.sha256() == in_process(tmp_path, FLIGHT_S)
+    assert {event["data"]["host"] for event in record.events("join")} == {"h1", "h2", "h3"}
     assert any(is_named(clock, "estimator.drone3", "h3") for clock in record.all("clock")) or cut_s < NAMED_AFTER_S
 
 

@@ -14,8 +14,6 @@ ENGAGED_NS = 6_000_000_000
 UNWRITTEN_NS = 5_000_000_000  # simulated, at four times real time: what comes waits half a second or more in a recorder
 UNWRITTEN_S = 3.0  # wall time: the same for a run as fast as it goes, in which that half second can be twenty simulated
 
-pytestmark = pytest.mark.xdist_group("serial")
-
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> dict[str, np.ndarray]:

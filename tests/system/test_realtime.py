@@ -7,8 +7,6 @@ from federation import ONE, PAIR, PAIR_ROLES, Federation, Role
 from refused import parts
 from wire import Client
 
-pytestmark = pytest.mark.xdist_group("serial")
-
 FOR_LONG = ("--duration", "3600")
 SLOW = 0.02  # rate at which 500 ms of simulated time are 25 s of wall time
 NOBODY_FLIES = "processes.on_death={controller: drop}"

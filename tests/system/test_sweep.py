@@ -18,7 +18,7 @@ from wire import PATIENCE_S
 
 from zsim_analysis.sweep.sweep_folder import load, locked
 
-pytestmark = pytest.mark.xdist_group("serial")
+pytestmark = pytest.mark.xdist_group("sweep")  # the undisturbed one is flown once
 
 GUST = "environment.wind.gust_m_s"
 DURATION_S = 12.0  # the time for a test to act before the next run is finished

@@ -3,6 +3,7 @@
 python warm_forkserver.py     standard input and the rest as of zsim_deploy.cli.forkserver
 
 What a run's fork server would import and load, it has already: that is half of the processor time of a short run.
+A world that stands publishes its clock more often than the contract wants, since tests wait for it.
 """
 
 import atexit
@@ -17,7 +18,9 @@ from typing import NoReturn
 
 from zsim_deploy.cli import forkserver
 from zsim_deploy.launch import role_launcher
+from zsim_world.server import world_process
 
+STANDING_NS = 100_000_000  # instead of a second
 FILES_MAX = 256  # more than a launcher has open before it starts a role
 
 
@@ -79,4 +82,5 @@ def _finish(code: object) -> NoReturn:
 
 if __name__ == "__main__":
     role_launcher.RoleLauncher._start_forkserver = start
+    world_process.CLOCK_STANDING_NS = STANDING_NS
     sys.exit(forkserver.main())
