@@ -337,7 +337,7 @@ def test_a_put_that_is_begun_and_not_ended_leaves_no_trace(talk: Talk, fake: Fak
     assert fake.hears("done")["outputs"] == [{"key": "my/key", "value": {"a": "b"}}]
 
 
-def test_a_seat_knows_nothing_of_the_seat_before(talk: Talk, fake: FakeGateway) -> None:
+def test_a_session_knows_nothing_of_the_one_before(talk: Talk, fake: FakeGateway) -> None:
     joined(talk, fake)
     assert (
         talk.does("join other 0.02 clock")
@@ -359,7 +359,7 @@ def test_a_seat_knows_nothing_of_the_seat_before(talk: Talk, fake: FakeGateway) 
     assert fake.hears("done")["t_ns"] == 40_000_000
 
 
-def test_a_lost_seat_and_a_run_that_ends_are_told(talk: Talk, fake: FakeGateway) -> None:
+def test_a_lost_session_and_a_run_that_ends_are_told(talk: Talk, fake: FakeGateway) -> None:
     joined(talk, fake)
     fake.says({"op": "left", "reason": "the run ended"}, {"op": "run", "state": "ended", "run_id": "r1"})
     assert talk.does("gate 60") == "-1 zsim: the seat is lost: the run ended"

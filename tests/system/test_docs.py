@@ -46,7 +46,7 @@ from zsim_deploy.inventory import inventory
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 RUN_S = 4.0  # simulated seconds of a run that has no other process to serve
-PATIENCE_S = 120  # wall seconds for one line on a machine that does other work as well
+PATIENCE_S = 600  # wall seconds for one block on a machine that does other work as well
 PROGRAMS = ("octave-cli", "gcc", "node", "zenoh-ros2", "rostopic")
 KINDS = (
     "bash run",
@@ -107,24 +107,24 @@ def test_every_block_is_of_a_known_kind(page: Path) -> None:
 @pytest.mark.parametrize("page", pages_with("bash run", "bash terminals"))
 def test_commands_run(page: Path, tmp_path: Path) -> None:
     missing: list[str] = []
-    with Desk(tmp_path) as desk:
+    with Checkout(tmp_path) as checkout:
         chapter = 0
         for block in blocks(page):
             if block.chapter != chapter:
-                desk.close_terminals()
+                checkout.close_terminals()
                 chapter = block.chapter
             program = block.kind.removeprefix("bash with ")
-            if program != block.kind and not desk.has(program):
+            if program != block.kind and not checkout.has(program):
                 missing.append(program)
             elif block.kind == "bash run" or program != block.kind:
-                desk.run(block, page)
+                checkout.run(block, page)
             elif block.kind == "bash terminals":
-                desk.open_terminals(block, page)
+                checkout.open_terminals(block, page)
     if missing:
         pytest.skip(f"{page.name}: all but the blocks with {', '.join(missing)}, which this machine does not have")
 
 
-class Desk:
+class Checkout:
     """A folder like a fresh checkout, free ports, and the terminals that are open."""
 
     def __init__(self, folder: Path) -> None:
@@ -137,7 +137,7 @@ class Desk:
         self._ports = tuple(free_port() for _ in PORTS)
         self._terminals: list[tuple[str, Path, subprocess.Popen[bytes]]] = []
 
-    def __enter__(self) -> "Desk":
+    def __enter__(self) -> "Checkout":
         return self
 
     def __exit__(self, failed: object, *rest: object) -> None:
@@ -167,12 +167,12 @@ class Desk:
             text=True,
         )
         try:
-            said, _ = script.communicate(timeout=PATIENCE_S)
+            output, _ = script.communicate(timeout=PATIENCE_S)
         except subprocess.TimeoutExpired:
             os.killpg(script.pid, signal.SIGKILL)
-            said = f"{script.communicate()[0]}\nnot done after {PATIENCE_S} s"
+            output = f"{script.communicate()[0]}\nnot done after {PATIENCE_S} s"
         where = f"{page.name}:{block.line}"
-        assert script.returncode == 0, f"{where}: {text}\n{said}\n{self._said()}"
+        assert script.returncode == 0, f"{where}: {text}\n{output}\n{self._logs()}"
 
     def open_terminals(self, block: Block, page: Path) -> None:
         """Start every line of a block as a process; a world listens when this returns."""
@@ -202,7 +202,7 @@ class Desk:
             with suppress(OSError), urlopen(f"http://127.0.0.1:{port}/json/drone/drone1/estimate"):
                 return
             time.sleep(0.1)
-        raise AssertionError(f"the gateway tells of no estimate\n{self._said()}")
+        raise AssertionError(f"the gateway tells of no estimate\n{self._logs()}")
 
     def _wait_for_port(self, port: int) -> None:
         until_s = time.monotonic() + PATIENCE_S
@@ -211,7 +211,7 @@ class Desk:
                 if probe.connect_ex(("127.0.0.1", port)) == 0:
                     return
             time.sleep(0.05)
-        raise AssertionError(f"nobody listens\n{self._said()}")
+        raise AssertionError(f"nobody listens\n{self._logs()}")
 
     def close_terminals(self) -> None:
         """Press Ctrl-C where a run is led or routed; every process must leave well, the others by themselves."""
@@ -221,10 +221,10 @@ class Desk:
         for text, _, process in self._terminals:
             code = process.wait(timeout=PATIENCE_S)
             # −2: Ctrl-C met Python on its way out
-            assert code in (0, 130, -signal.SIGINT), f"{text}: exit code {code}\n{self._said()}"
+            assert code in (0, 130, -signal.SIGINT), f"{text}: exit code {code}\n{self._logs()}"
         self._terminals.clear()
 
-    def _said(self) -> str:
+    def _logs(self) -> str:
         return "\n".join(f"--- {text}\n{log.read_text()}" for text, log, _ in self._terminals)
 
 
@@ -254,6 +254,7 @@ def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
     line = re.sub(r"\bzsim (run)\b(?!.*--in-process)", rf"zsim \1 --listen {endpoint}", line)
     if longest_s is not None and re.search(r"\bzsim run\b", line):
         line = re.sub(r"--duration \S+", "", line).replace("zsim run", f"zsim run --duration {longest_s:g}")
+    line = re.sub(r"(\bzsim sweep\b.* --duration) \S+", rf"\1 {RUN_S:g}", line)
     line = re.sub(r"(examples/.* --duration) (\S+)", lambda m: f"{m[1]} {min(float(m[2]), EXAMPLE_S):g}", line)
     if " --out " not in line:
         line = re.sub(r"\bzsim run\b", "zsim run --no-report", line)

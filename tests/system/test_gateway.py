@@ -1,4 +1,4 @@
-"""The gateway as its clients meet it: streams, seats in the lockstep, both HTTP trees, who is let in."""
+"""The gateway as its clients meet it: streams, lockstep sessions, both HTTP trees, who is let in."""
 
 import asyncio
 import base64
@@ -11,11 +11,12 @@ import msgpack
 import pytest
 from federation import ONE, Federation
 from gateway_process import GatewayProcess, LineConnection
+from refused import missing, parts
 
 GATE_NS = 20_000_000
 PILOT = "client.pilot"
 FLOWN = ONE.replace("expect: []", f"expect: [{PILOT}]").replace("duration_s: 10", "duration_s: 4")
-"""A drone that a client flies from a seat: time waits for it from the start."""
+"""A drone that a client flies in a lockstep session: time waits for it from the start."""
 STANDING = FLOWN.replace("duration_s: 4", "duration_s: 3600")
 
 
@@ -44,7 +45,7 @@ def stream(gateway: GatewayProcess) -> Iterator[LineConnection]:
 # Streams
 
 
-def test_a_client_says_who_it_is_and_is_told_of_the_run(stream):
+def test_a_client_says_who_it_is_and_is_informed_of_the_run(stream):
     said = stream.request("hello", name="laptop")
     assert (said["name"], said["mode"], said["gate_s"], said["drones"]) == (
         "client.laptop",
@@ -95,46 +96,48 @@ def _until(stream: LineConnection, field: str, wanted: set[Any]) -> None:
 
 
 def test_the_world_and_controllers_answer_requests(stream):
-    assert stream.request("ask", key="world/control", request="nope")["error"].startswith(
-        "op is 'nope'; must be one of"
-    )
+    assert parts(stream.request("ask", key="world/control", request="nope")["error"]) == ("op", "'nope'")
     answer = stream.request("ask", key="world/control", request="acquire", args={"drone": "drone1", "priority": 0})
     assert answer["ok"], answer
     assert stream.request("ask", key="world/control", request="release", args={"drone": "drone1"})["ok"]
-    assert "cluster is 'main'" in stream.request("ask", key="cluster/main/control", request="hold")["error"]
+    error = stream.request("ask", key="cluster/main/control", request="hold")["error"]
+    assert parts(error) == ("cluster", "'main'")
 
 
-REFUSED = {
-    b'{"op": "nope"}': "Invalid value 'nope'",
-    b'{"op": "put", "key": "drone/drone1/cmd/mode", "value": {"mode": "up"}}': "mode is 'up'; must be one of",
-    b'{"op": "put", "key": "drone/drone1/cmd/velocity", "value": {"velocity_m_s": [1, 0], "yaw_rate_rad_s": 0}}': "must be a list of 3",
-    b'{"op": "put", "key": "drone/ghost/cmd/mode", "value": {"mode": "land"}}': "drone is 'ghost'; must be one of drone1",
-    b'{"op": "put", "key": "drone/drone1/sensor/imu", "value": {}}': "only the process that this is about speaks here",
-    b'{"op": "put", "key": "process/world/bye", "value": {"reason": "x"}}': "only the process that this is about speaks here",
-    b'{"op": "put", "key": "@batch", "value": 1}': "only the process that this is about speaks here",
-    b'{"op": "put", "key": "a/*", "value": 1}': "is no key",
-    b'{"op": "put", "key": "a//b", "value": 1}': "must be a/b",
-    b'{"op": "put", "key": "mine", "value": 36893488147419103232}': "64 bits",
-    b'{"op": "subscribe", "key": "a//b"}': "must be a/b",
-    b'{"op": "unsubscribe", "key": "clock"}': "is not subscribed to",
-    b'{"op": "join", "name": "a", "period_s": 0.021}': "must be a multiple of 0.02",
-    b'{"op": "join", "name": "A b", "period_s": 0.02}': "at most 48",
-    b'{"op": "join", "name": "a", "period_s": 0.02, "gates": ["drone/*/truth"]}': "has a wildcard",
-    b'{"op": "done", "t_ns": 0}': "must say join first",
-    b'{"op": "leave"}': "nothing to leave",
-    b'{"op": "hello", "nmae": "x"}': "nmae",
-    b"[" * 2000: "request:",
-    b'{"op": "put", "key": "drone/drone1/cmd/mode", "value": {"mode": "land", "t_ns": NaN}}': "request:",
+# a request, and what the line of its refusal must show
+REFUSED: dict[bytes, tuple[str, ...]] = {
+    b'{"op": "nope"}': ("'nope'", "$.op"),
+    b'{"op": "put", "key": "drone/drone1/cmd/mode", "value": {"mode": "up"}}': ("mode is 'up'", "takeoff"),
+    b'{"op": "put", "key": "drone/drone1/cmd/velocity", "value": {"velocity_m_s": [1, 0], "yaw_rate_rad_s": 0}}': (
+        "velocity_m_s is [1, 0]",
+    ),
+    b'{"op": "put", "key": "drone/ghost/cmd/mode", "value": {"mode": "land"}}': ("drone is 'ghost'", "drone1"),
+    b'{"op": "put", "key": "drone/drone1/sensor/imu", "value": {}}': ("drone/drone1/sensor/imu: ", "drone/…/cmd/…"),
+    b'{"op": "put", "key": "process/world/bye", "value": {"reason": "x"}}': ("process/world/bye: ", "drone/…/cmd/…"),
+    b'{"op": "put", "key": "@batch", "value": 1}': ("@batch: ", "drone/…/cmd/…"),
+    b'{"op": "put", "key": "a/*", "value": 1}': ("'a/*'",),
+    b'{"op": "put", "key": "a//b", "value": 1}': ("key is 'a//b'", "must be a/b"),
+    b'{"op": "put", "key": "mine", "value": 36893488147419103232}': ("mine: ", "64 bits"),
+    b'{"op": "subscribe", "key": "a//b"}': ("key is 'a//b'", "must be a/b"),
+    b'{"op": "unsubscribe", "key": "clock"}': ("unsubscribe: ", "'clock'"),
+    b'{"op": "join", "name": "a", "period_s": 0.021}': ("join: period_s is 0.021", "0.02"),
+    b'{"op": "join", "name": "A b", "period_s": 0.02}': ("name is 'A b'", "48"),
+    b'{"op": "join", "name": "a", "period_s": 0.02, "gates": ["drone/*/truth"]}': ("join: gates ", "wildcard"),
+    b'{"op": "done", "t_ns": 0}': ("done: ", "join"),
+    b'{"op": "leave"}': ("leave: ",),
+    b'{"op": "hello", "nmae": "x"}': ("nmae",),
+    b"[" * 2000: ("request: ",),
+    b'{"op": "put", "key": "drone/drone1/cmd/mode", "value": {"mode": "land", "t_ns": NaN}}': ("request: ",),
 }
 
 
 @pytest.mark.parametrize("line", REFUSED)
-def test_what_is_no_request_is_refused_in_a_line_and_the_stream_goes_on(stream, line):
+def test_what_is_no_request_is_refused_in_a_line_and_the_connection_goes_on(stream, line):
     stream.request("hello")
     stream.send_line(line)
-    said = stream.next("error")["error"]
-    assert REFUSED[line] in said
-    assert "\n" not in said
+    error = stream.next("error")["error"]
+    assert missing(error, *REFUSED[line]) == []
+    assert "\n" not in error
     assert stream.request("hello")["op"] == "hello"
 
 
@@ -143,7 +146,7 @@ def test_what_is_no_json_at_first_is_no_client(gateway):
         stream.send_line(
             b"POST / HTTP/1.1\r\n\r\n" + b'{"op": "put", "key": "drone/drone1/cmd/mode", "value": {"mode": "takeoff"}}'
         )
-        assert "no JSON object" in stream.next("error")["error"]
+        assert "JSON" in stream.next("error")["error"]
         assert stream.is_at_end()
 
 
@@ -154,7 +157,7 @@ def test_a_line_without_end_ends_the_connection(gateway):
         assert stream.is_at_end()
 
 
-def test_a_client_that_does_not_read_loses_the_oldest_and_is_told(gateway):
+def test_a_client_that_does_not_read_loses_the_oldest_and_is_informed(gateway):
     with gateway.connect() as slow, gateway.connect() as other:
         assert slow.request("subscribe", key="my/flood")["op"] == "subscribe"
         text = "x" * 500_000
@@ -271,7 +274,7 @@ def test_a_command_through_the_zenoh_tree_is_checked(gateway):
     kind = {"Content-Type": "application/msgpack;Mode"}
     assert gateway.http("PUT", "/zsim/drone/drone1/cmd/mode", msgpack.packb(mode), kind).status == 200
     refused = gateway.http("PUT", "/zsim/drone/drone1/cmd/mode", msgpack.packb({**mode, "mode": "up"}), kind)
-    assert (refused.status, "must be one of" in refused.json()["error"]) == (400, True)
+    assert (refused.status, parts(refused.json()["error"])) == (400, ("mode", "'up'"))
     assert gateway.http("DELETE", "/zsim/clock").status == 403
     assert gateway.http("PUT", "/zsim/world/info", b"x").status == 403
 
@@ -310,11 +313,11 @@ def test_pages_of_other_sites_may_not_ask(gateway, headers, status):
     assert gateway.http("GET", "/json/clock", headers=headers).status == status
 
 
-# Seats
+# Lockstep sessions
 
 
 def fly(gateway: GatewayProcess, between: Callable[[], None] = lambda: None) -> int:
-    """Take off and climb from a seat until the run ends; return how many gates there were.
+    """Take off and climb in a lockstep session until the run ends; return how many gates there were.
 
     Args:
         gateway: of the gateway.
@@ -339,7 +342,7 @@ def fly(gateway: GatewayProcess, between: Callable[[], None] = lambda: None) -> 
     return gates
 
 
-def test_a_seat_keeps_the_lockstep_and_flies_with_the_same_bits(tmp_path):
+def test_a_session_keeps_the_lockstep_and_flies_with_the_same_bits(tmp_path):
     hashes = []
     for number in range(2):
         with Federation(tmp_path / str(number)) as federation:
@@ -367,7 +370,7 @@ def test_a_refused_done_leaves_the_gate_open(federation):
             {"key": "drone/drone1/cmd/mode", "value": {"mode": "takeoff"}},
             {"key": "drone/drone1/cmd/mode", "value": {"mode": "up"}},
         ]
-        assert "must be one of" in stream.request("done", t_ns=first["t_ns"], outputs=bad)["error"]
+        assert parts(stream.request("done", t_ns=first["t_ns"], outputs=bad)["error"]) == ("mode", "'up'")
         for key in ("drone/drone1/cmd/foo", "my//bad"):
             outputs = [{"key": "my/ok", "value": 1}, {"key": key, "value": {}}]
             assert "error" in stream.request("done", t_ns=first["t_ns"], outputs=outputs)
@@ -378,7 +381,7 @@ def test_a_refused_done_leaves_the_gate_open(federation):
         assert stream.next("gate")["t_ns"] == GATE_NS
 
 
-def test_a_gate_of_a_former_seat_is_nobodys(federation):
+def test_a_gate_of_a_former_session_is_nobodys(federation):
     federation.world(STANDING)
     gateway = GatewayProcess(federation).in_run()
     with gateway.connect() as stream:
@@ -387,7 +390,8 @@ def test_a_gate_of_a_former_seat_is_nobodys(federation):
             gate = stream.next("gate")
             stream.send("done", t_ns=gate["t_ns"])
             assert stream.request("leave")["op"] == "leave"
-            assert "must say join first" in stream.request("done", t_ns=gate["t_ns"] + GATE_NS)["error"]
+            refused = stream.request("done", t_ns=gate["t_ns"] + GATE_NS)
+            assert missing(refused["error"], "done: ", "join") == []
 
 
 def test_the_world_names_a_client_that_hung_up_and_takes_it_back(federation):
@@ -413,7 +417,7 @@ def test_clients_stay_while_runs_come_and_go(federation):
     gateway = GatewayProcess(federation)
     with gateway.connect() as stream:
         assert stream.request("hello", name="patient")["run_id"] is None
-        assert "no run now" in stream.request("latest", key="clock")["error"]
+        assert "error" in stream.request("latest", key="clock")
         assert gateway.http("GET", "/json/clock").status == 503
         stream.send("subscribe", key="clock")
         for _ in range(2):
@@ -427,7 +431,7 @@ def test_clients_stay_while_runs_come_and_go(federation):
 
 
 @pytest.mark.soak
-def test_a_seat_ends_with_its_run_though_a_gate_was_never_answered(federation):
+def test_a_session_ends_with_its_run_though_a_gate_was_never_answered(federation):
     world = federation.world(STANDING)
     gateway = GatewayProcess(federation).in_run()
     with gateway.connect() as stream:
@@ -435,21 +439,21 @@ def test_a_seat_ends_with_its_run_though_a_gate_was_never_answered(federation):
             assert stream.request("join", name="pilot", period_s=0.02, reads=["drone/drone1/truth"])["op"] == "join"
             stream.next("gate")
             stream.send("ask", key="world/control", request="stop")
-            assert stream.next("left")["reason"] == "the run ended"
+            assert "ended" in stream.next("left")["reason"]
             world.ends(with_code=0)
             world = federation.world(STANDING)
             while stream.next("run")["state"] != "begun":
                 pass
 
 
-def test_of_two_seats_of_a_name_the_first_is_told(federation):
+def test_of_two_sessions_of_a_name_the_first_is_told(federation):
     federation.world(STANDING)
     gateway = GatewayProcess(federation).in_run()
     with gateway.connect() as first, gateway.connect() as second:
         for stream in (first, second):
             assert stream.request("join", name="pilot", period_s=0.02, reads=["drone/drone1/truth"])["op"] == "join"
             stream.next("gate")
-        assert first.next("left")["reason"] == "another client took the name"
+        assert "another" in first.next("left")["reason"]
         assert "is 'gateway.main'" in first.request("join", name="gateway.main", period_s=0.02)["error"]
 
 
@@ -472,7 +476,7 @@ def test_ctrl_c_ends_it_with_a_bye(federation):
         stream.request("join", name="pilot", period_s=0.02, reads=["drone/drone1/truth"])
         stream.next("gate")
         gateway.role.signal(signal.SIGINT)
-        assert byes.until(lambda bye: True).message["reason"] == "interrupted by Ctrl-C"
+        assert "Ctrl-C" in byes.until(lambda bye: True).message["reason"]
         gateway.role.ends(with_code=0)
         assert stream.is_at_end()
 
@@ -482,14 +486,14 @@ def test_a_second_gateway_of_the_same_name_takes_over(federation):
     first = GatewayProcess(federation).in_run()
     GatewayProcess(federation).in_run()
     first.role.ends(with_code=3)
-    assert "another process of this name joined" in first.role.text()
+    assert "gateway.main: another" in first.role.text()
 
 
 def test_a_taken_port_is_a_line(federation):
     gateway = GatewayProcess(federation)
     second = federation.role("gateway", "--http", str(gateway.http_port), "--lines", str(gateway.lines_port))
     second.ends(with_code=2)
-    assert second.text().endswith("say --http and --lines")
+    assert missing(second.text(), str(gateway.http_port), "--http", "--lines") == []
 
 
 # Who is let in
@@ -498,18 +502,17 @@ def test_a_taken_port_is_a_line(federation):
 def test_an_empty_token_is_none(federation):
     refused = federation.role("gateway", "--token", "")
     refused.ends(with_code=2)
-    assert "the token is empty" in refused.text()
+    assert missing(refused.text(), "token", "empty") == []
 
 
 def test_off_loopback_it_wants_a_token(federation):
     refused = federation.role("gateway", "--listen", "0.0.0.0")
     refused.ends(with_code=2)
-    assert refused.text().splitlines() == [
-        "gateway: 0.0.0.0 can be reached by others; give it a --token, or --listen 127.0.0.1"
-    ]
+    (line,) = refused.text().splitlines()
+    assert missing(line, "gateway: ", "0.0.0.0", "--token", "--listen 127.0.0.1") == []
 
 
-def test_a_token_is_asked_for_at_every_door(federation):
+def test_a_token_is_required_on_every_port(federation):
     federation.world(STANDING)
     gateway = GatewayProcess(federation, "--listen", "0.0.0.0", "--token", "open sesame").in_run()
     assert gateway.http("GET", "/json/clock").status == 401
@@ -521,14 +524,14 @@ def test_a_token_is_asked_for_at_every_door(federation):
     )
     assert gateway.http("OPTIONS", "/json/clock", headers={"Origin": "http://page.example"}).status == 204
     with gateway.connect() as stream:
-        assert "a token is asked for" in stream.request("latest", key="clock")["error"]
+        assert "token" in stream.request("latest", key="clock")["error"]
         assert stream.request("hello", token="open sesame")["op"] == "hello"
         assert stream.request("latest", key="clock")["op"] == "latest"
     with gateway.connect() as stream:
-        assert "wrong one" in stream.request("hello", token="x")["error"]
+        assert "token" in stream.request("hello", token="x")["error"]
         assert stream.is_at_end()
     with gateway.connect() as stream:
-        assert "none came with the token in time" in stream.next("error")["error"]
+        assert "token" in stream.next("error")["error"]
         assert stream.is_at_end()
 
 
