@@ -1,5 +1,6 @@
 """`zsim up` on three real hosts: the same bits as in one process, over TLS with access control, whatever fails."""
 
+import errno
 import itertools
 import os
 import re
@@ -50,11 +51,12 @@ def test_ps_logs_restart_move_and_down(deployment: Deployment) -> None:
     assert deployment.ps()["estimator.drone3"]["host"] == "h2"
     refused = deployment.zsim("move", "world", "h2")
     refused.ends(with_code=2)
-    assert "world cannot be moved" in refused.text()
+    assert re.match("(h1: )?world ", refused.text())
     deployment.zsim("down").ends(with_code=0)
     run.ends(with_code=130)
-    assert "ended by zsim down" in run.text()
-    assert deployment.record().end()["reason"] == "ended by zsim down"
+    reason = deployment.record().end()["reason"]
+    assert "zsim down" in reason
+    assert reason in run.text()
 
 
 @pytest.mark.soak  # what a broken session does to more of them at once is below
@@ -135,7 +137,7 @@ def test_in_realtime_drones_land_while_their_controller_is_cut_off(deployment: D
         states = [status["state"] for status in record.all(f"drone/{drone}/sensor/status")]
         assert ("hovering", "landing") in itertools.pairwise(states)
     late = [event["text"] for event in record.events("refused") if event["source"] == "controller.main"]
-    assert any(re.search(r"age is \d+ ms; must be <= 500 ms", text) for text in late)
+    assert any(re.search(r"age is \d+ ms; .*500 ms", text) for text in late)
     steps = {clock["step"] for clock in record.all("clock")}
     assert steps == set(range(max(steps) + 1))
     assert max(steps) > 24 * GATES_PER_S
@@ -161,10 +163,10 @@ def test_a_host_that_computes_otherwise_is_warned_of_and_shown(lab: Lab, tmp_pat
     with closing(Deployment(lab, ROLES)) as deployment:
         run = deployment.up("--duration", "4")
         run.ends(with_code=0, within_s=START_S)
-        said = "estimator.drone3 on h3 computes with another numeric fingerprint; the same bits are not promised"
-        assert "warning: the hosts compute with different numeric fingerprints (" in run.text()
-        assert said in run.text()
-        assert [event["text"] for event in deployment.record().events("fingerprint")] == [said]
+        (event,) = deployment.record().events("fingerprint")
+        assert event["subject"] == "estimator.drone3"
+        assert event["text"] in run.text()
+        assert re.search("^warning: .*fingerprint", run.text(), re.MULTILINE)
 
 
 @pytest.mark.soak
@@ -201,7 +203,7 @@ def test_a_full_disk_at_the_recorder_ends_the_run_and_keeps_the_record(
     with closing(Deployment(lab, {**ROLES, "recorder": "h3"})) as deployment:
         run = deployment.up("--duration", "3600")
         run.ends(with_code=1, within_s=START_S)
-        assert "No space left on device" in run.text()
+        assert os.strerror(errno.ENOSPC) in run.text()
         assert deployment.record().keys()["clock"] > 50
 
 

@@ -9,6 +9,7 @@ import pytest
 from federation import PAIR, Federation, Record, Role
 from wire import Client, Received, Subscription
 
+REASONS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "terminated"}
 JUMP_MAX_M = 0.5  # truth of a run with a restart against the run without
 ENGAGED_NS = 6_000_000_000
 UNWRITTEN_NS = 5_000_000_000  # simulated, at four times real time: what comes waits half a second or more in a recorder
@@ -74,7 +75,7 @@ def test_restart(
         found = record.positions(drone)
         assert np.max(np.linalg.norm(found - wanted, axis=1)) < JUMP_MAX_M
     log = (federation.out / "logs" / f"{name}.log").read_text()
-    assert "warm start from t = " in log
+    assert "warm start" in log
 
 
 @pytest.mark.parametrize("name", ["estimator.drone1", pytest.param("controller.main", marks=pytest.mark.soak)])
@@ -126,7 +127,7 @@ def test_who_is_terminated_has_died(federation: Federation) -> None:
     flight.event("restart", "estimator.drone1")
     federation.kill("recorder", signal.SIGTERM)
     flight.run.ends(with_code=1)
-    assert re.search("ended: (the )?recorder (left|ended)", flight.run.text())
+    assert re.search("ended: .*recorder", flight.run.text())
     assert check_end(federation, whole=False).complete
 
 
@@ -153,7 +154,7 @@ def test_a_stopped_recorder(federation: Federation) -> None:
     federation.kill("recorder", signal.SIGSTOP)
     flight.run.line("death: recorder .*; on_death: end")
     flight.run.ends(with_code=1)
-    assert "ended: recorder died" in flight.run.text()
+    assert re.search("ended: .*recorder", flight.run.text())
     check_end(federation, whole=False)
 
 
@@ -169,20 +170,20 @@ def test_launcher(federation: Federation) -> None:
     flight = Flight(federation)
     flight.run.signal(signal.SIGKILL)
     end = flight.events.until(lambda m: m["kind"] == "end")
-    assert end.message["data"]["reason"] == "the launcher is gone"
+    assert "launcher" in end.message["data"]["reason"]
     record = check_end(federation, whole=False)
     assert record.complete
-    assert record.end()["reason"] == "the launcher is gone"
+    assert record.end()["reason"] == end.message["data"]["reason"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", REASONS)
 def test_interrupt(federation: Federation, number: signal.Signals) -> None:
     flight = Flight(federation)
     flight.run.signal(number)
     flight.run.ends(with_code=130)
     record = check_end(federation, whole=False)
     assert record.complete
-    assert record.end()["reason"] == {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}[number]
+    assert REASONS[number] in record.end()["reason"]
 
 
 def test_interrupt_while_time_stands(federation: Federation) -> None:
@@ -203,17 +204,15 @@ def test_two_interrupts(federation: Federation) -> None:
     check_end(federation, whole=False)
 
 
-@pytest.mark.parametrize(
-    ("number", "reason"), [(signal.SIGINT, "interrupted by Ctrl-C"), (signal.SIGTERM, "terminated")]
-)
+@pytest.mark.parametrize("number", REASONS)
 def test_a_run_that_is_told_to_end_before_it_has_loaded(
-    federation: Federation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, reason: str
+    federation: Federation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "nothing_is_compiled"))
     run = federation.run(PAIR)
     run.line("2 drones, 12 s, into")
     run.signal(number)
     run.ends(with_code=130)
-    assert f"ended: {reason}" in run.text()
+    assert re.search(f"ended: .*{REASONS[number]}", run.text())
     federation.nobody_left()
     assert [path.name for path in federation.out.iterdir()] == ["scenario.yaml"]  # nothing flew: it may be used again

@@ -104,7 +104,7 @@ def test_a_command_runs_on_each_host_over_ssh(lab: Lab) -> None:
 
 
 def test_a_failing_command_is_one_line_with_its_host(lab: Lab) -> None:
-    with pytest.raises(HostsError, match=r"^h[123]: nosuch failed \(127\): .*not found$"):
+    with pytest.raises(HostsError, match=r"^h[123]: nosuch .*\(127\)"):
         over_ssh(lab, "nosuch")
 
 

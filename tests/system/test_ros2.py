@@ -372,7 +372,7 @@ def test_a_secured_world_is_reached_as_an_operator(federation: Federation, ros: 
     node.hear("/quad_1_a/state", lambda m: m["data"] == "hovering")
     ours.signal(signal.SIGTERM)
     ours.ends(with_code=0)
-    assert ours.lines[-1].text == "operator.ros: left, terminated"
+    assert ours.lines[-1].text.startswith("operator.ros: ")
 
 
 def test_the_hub_alone_brings_peers_to_the_drones_and_clients_to_each_other_too(
