@@ -31,7 +31,7 @@ def test_three_hosts_give_the_bits_of_one_process(deployment: Deployment, tmp_pa
 
 
 def test_ps_logs_restart_move_and_down(deployment: Deployment) -> None:
-    run = deployment.up("--rate", "4", "--duration", "3600")
+    run = deployment.up("--rate", "1", "--duration", "3600")
     in_flight(run)
     rows = deployment.ps()
     assert {role: row["host"] for role, row in rows.items()} == {
@@ -154,6 +154,7 @@ def test_a_host_whose_clock_is_an_hour_off_takes_part(lab: Lab, faketime: str, t
         assert deployment.record().sha256() == in_process(tmp_path, 10.0)
 
 
+@pytest.mark.soak
 def test_a_host_that_computes_otherwise_is_warned_of_and_shown(lab: Lab, tmp_path: Path) -> None:
     """To the processes of one host another version of a numeric package seems to be installed."""
     other = tmp_path / "filterpy-99.dist-info"

@@ -103,7 +103,7 @@ def test_a_closed_terminal_ends_the_run_as_ctrl_c_does(lab: Lab) -> None:
 def test_a_killed_launcher_leaves_a_record_and_no_key(lab: Lab) -> None:
     """Whoever flies next is told of the record and how to fetch it; a second that cannot be fetched fails its run."""
     with closing(Deployment(lab, ROLES)) as deployment:
-        run = deployment.up("--rate", "4", "--duration", "3600")
+        run = deployment.up("--rate", "1", "--duration", "3600")
         in_flight(run)
         run.signal(signal.SIGKILL)
         deployment.nobody_left()

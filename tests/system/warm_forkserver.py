@@ -16,6 +16,8 @@ import traceback
 from contextlib import suppress
 from typing import NoReturn
 
+import zsim_bridges.console.console_server
+import zsim_bridges.gateway.gateway_server  # noqa: F401  (what bridges import, too)
 from zsim_deploy.cli import forkserver
 from zsim_deploy.launch import role_launcher
 from zsim_world.server import world_process
