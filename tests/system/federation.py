@@ -319,14 +319,14 @@ class Record:
 
     def recomputed_sha256(self, drones: list[str]) -> str:
         """Return the hash of the truth as docs/protocol.md defines it, from the messages on record."""
-        said = hashlib.sha256()
+        digest = hashlib.sha256()
         for instant in zip(*(self.all(f"drone/{drone}/truth") for drone in drones), strict=True):
             for truth in instant:
-                said.update(struct.pack("<q", truth["t_ns"]))
+                digest.update(struct.pack("<q", truth["t_ns"]))
                 parts = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")
                 numbers = [number for part in parts for number in truth[part]]
-                said.update(struct.pack("<13d", *numbers))
-        return said.hexdigest()
+                digest.update(struct.pack("<13d", *numbers))
+        return digest.hexdigest()
 
     def positions(self, drone: str) -> np.ndarray:
         """Return the true positions [m; W; (gates, 3)] of a drone."""

@@ -1,4 +1,4 @@
-"""A ROS 2 participant of somebody else's making (PyPI zenoh-ros2-sdk) as a process of its own, told what to do by lines.
+"""A ROS 2 participant of somebody else's making (PyPI zenoh-ros2-sdk) as a process of its own, which takes requests as lines.
 
     python ros2_peer.py PORT FOLDER        FOLDER has PACKAGE/msg/NAME.msg of every type
 

@@ -1,6 +1,6 @@
 """A secured federation on loopback: certificates, a hub that judges, and programs that try everything.
 
-Nothing is told to who is refused, so what was allowed is read off at the other end: every attempt ends with
+Who is refused gets no error, so what was allowed is read off at the other end: every attempt ends with
 something that is allowed (a fence), and what came before it came.
 """
 
@@ -30,7 +30,7 @@ from zsim_deploy.security.enrolment import CertificateRequest, access_control
 HOST = "lab"
 SITE = "router.site"
 PREFIX = "zsim/"
-READY = b"ready"  # what is published to learn whether anybody hears it
+READY = b"ready"  # what is published to learn whether anybody receives it
 SHORT_S = 1.0  # for a link that is to be refused
 
 _numbers = itertools.count()
@@ -167,7 +167,7 @@ class RawClient:
         """Publish until it is received: through a router a new subscriber is not always known at once."""
         until_s = time.monotonic() + PATIENCE_S
         while not received.take_one(within_s=0.1):
-            assert time.monotonic() < until_s, f"nobody hears {key}"
+            assert time.monotonic() < until_s, f"nobody receives {key}"
             self.session.put(PREFIX + key, READY, congestion_control=zenoh.CongestionControl.BLOCK)
 
 

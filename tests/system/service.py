@@ -1,4 +1,4 @@
-"""A process in the background that says when it is ready; all that it says is kept in a file."""
+"""A process in the background that prints when it is ready; all that it prints is kept in a file."""
 
 import subprocess
 import threading
@@ -12,7 +12,7 @@ class Service:
     """A started process, ready to serve.
 
     Args:
-        ready: what it says when it is.
+        ready: what it prints when it is.
         log: file for its output.
 
     Raises:
@@ -43,8 +43,8 @@ class Service:
 
     def _read(self) -> None:
         assert self._process.stdout
-        with self._process.stdout as said, self._log.open("a") as kept:
-            for line in said:
+        with self._process.stdout as printed, self._log.open("a") as kept:
+            for line in printed:
                 kept.write(line)
                 kept.flush()
                 if self._ready in line:

@@ -91,14 +91,14 @@ def test_the_reader(build: Build) -> None:
 
 @pytest.mark.parametrize("name", LOCALES, ids=LOCALES.get)
 def test_the_reader_where_people_write_numbers_otherwise(build: Build, locales: dict[str, str], name: str) -> None:
-    said = output(build("clients/c/tests/json_test.c", *SANITIZED), f"{name}.UTF-8", env=locales)
-    assert re.fullmatch(r"decimal point [^.]+, 0 failures\n", said)
+    printed = output(build("clients/c/tests/json_test.c", *SANITIZED), f"{name}.UTF-8", env=locales)
+    assert re.fullmatch(r"decimal point [^.]+, 0 failures\n", printed)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_reader_takes_any_bytes(build: Build, seed: int) -> None:
-    said = output(build("clients/c/tests/json_fuzz.c", *SANITIZED), seed, 5_000, input=json.dumps(ESTIMATE))
-    lines, valid, values = map(int, re.findall(r"\d+", said))
+    printed = output(build("clients/c/tests/json_fuzz.c", *SANITIZED), seed, 5_000, input=json.dumps(ESTIMATE))
+    lines, valid, values = map(int, re.findall(r"\d+", printed))
     assert lines == 5_000
     assert 50 < valid < 4_500  # it was neither all spoilt nor left as it was
     assert values > 5_000
@@ -161,10 +161,10 @@ class Talk:
     def ends(self) -> None:
         """Let it end, well."""
         try:
-            _, said = self._process.communicate(timeout=PATIENCE_S)
+            _, printed = self._process.communicate(timeout=PATIENCE_S)
         finally:
             self._process.kill()
-        assert self._process.returncode == 0, said
+        assert self._process.returncode == 0, printed
 
 
 @pytest.fixture
@@ -415,14 +415,14 @@ def test_a_gateway_that_raves_does_no_harm(talk: Talk, fake: FakeGateway, seed: 
     """Lines that were spoilt at random, to any call: it returns, and nothing is read or written that should not be."""
     rng = random.Random(seed)
     joined(talk, fake)
-    said = [
+    printed = [
         ESTIMATE,
         HELLO,
         {"op": "latest", "values": [{"key": "a", "value": 1}], "id": 5},
         {"op": "left", "reason": "x"},
     ]
     for _ in range(30):
-        line = bytearray(json.dumps(rng.choice(said)).encode())
+        line = bytearray(json.dumps(rng.choice(printed)).encode())
         for _ in range(rng.randrange(3)):
             line[rng.randrange(len(line))] = rng.choice(b'{}[]",:0123456789.eE+-\\u \xff\x00\n')
         fake.send(bytes(line) + b"\n")
@@ -455,14 +455,14 @@ def flown(federation: Federation, program: Path, *options: str, stop: bool = Fal
     client = federation.client()
     events = client.subscribe("world/event")
     gateway = GatewayProcess(federation)
-    said = output(program, "127.0.0.1", gateway.lines_port)
+    printed = output(program, "127.0.0.1", gateway.lines_port)
     if stop:
         client.request("world/control", "stop")
     corners = [
-        [float(n) for n in re.findall(r"-?\d+\.\d+", line)[:4]] for line in said.splitlines() if "corner" in line
+        [float(n) for n in re.findall(r"-?\d+\.\d+", line)[:4]] for line in printed.splitlines() if "corner" in line
     ]
-    assert re.search(r"landed at t = \d+\.\d\d s\n$", said), said
-    assert len(corners) == 5, said
+    assert re.search(r"landed at t = \d+\.\d\d s\n$", printed), printed
+    assert len(corners) == 5, printed
     end = events.until(lambda m: m["kind"] == "end").message["data"]
     world.ends(with_code=0)
     return corners, end["truth_sha256"]

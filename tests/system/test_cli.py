@@ -177,8 +177,8 @@ def test_validate_prints_what_a_scenario_resolves_to(tmp_path: Path) -> None:
 
 def test_report_of_a_run(federation: Federation) -> None:
     federation.run(PAIR, "--in-process", "--duration", "8").ends(with_code=0)
-    said = zsim("report", str(federation.out)).stdout
-    assert f"report: {federation.out / 'report.html'}" in said
+    output = zsim("report", str(federation.out)).stdout
+    assert f"report: {federation.out / 'report.html'}" in output
     summary = json.loads((federation.out / "summary.json").read_text())
     assert summary["truth_sha256"] == federation.record().sha256()
     assert summary["seed"] == 3

@@ -13,7 +13,7 @@ How a fenced block is marked, in the line that opens it:
     text, json          output and drawings, not checked
 
 A block of any other kind is a fault, so nothing is left out without a word. What `adapted` changes is all that
-differs from what is printed: endpoints, shorter durations, and no report where nobody asks for its folder.
+differs from what is printed: endpoints, shorter durations, a faster pace in realtime, and no report where nobody asks for its folder.
 """
 
 import os
@@ -258,6 +258,7 @@ def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
     line = re.sub(r"(examples/.* --duration) (\S+)", lambda m: f"{m[1]} {min(float(m[2]), EXAMPLE_S):g}", line)
     if " --out " not in line:
         line = re.sub(r"\bzsim run\b", "zsim run --no-report", line)
+    line = re.sub(r"--realtime\b", "--realtime --rate 2", line)
     if not own:
         line = re.sub(r"\bzsim (world|replay)\b", rf"zsim \1 --listen {endpoint}", line)
         line = re.sub(rf"\bzsim ({'|'.join(ANSWERED)})\b", rf"zsim \1 --connect {endpoint}", line)

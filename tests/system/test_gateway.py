@@ -46,8 +46,8 @@ def stream(gateway: GatewayProcess) -> Iterator[LineConnection]:
 
 
 def test_a_client_says_who_it_is_and_is_informed_of_the_run(stream):
-    said = stream.request("hello", name="laptop")
-    assert (said["name"], said["mode"], said["gate_s"], said["drones"]) == (
+    response = stream.request("hello", name="laptop")
+    assert (response["name"], response["mode"], response["gate_s"], response["drones"]) == (
         "client.laptop",
         "realtime",
         0.02,

@@ -81,13 +81,13 @@ def test_a_closed_terminal_ends_the_run_as_ctrl_c_does(lab: Lab) -> None:
         follower = deployment.zsim("logs", "estimator.drone2", "--follow")
         follower.line("estimator.drone2: in run")
         others = {"is up already .* --set federation=NAME": (), "h1: port 7447 is in use there": ("other",)}
-        for says, federation in others.items():
+        for pattern, federation in others.items():
             options = [f"--set=federation={name}" for name in federation]
             other = deployment.zsim(
                 "up", str(STEP), "--hosts", deployment.hosts, "--out", str(lab.folder / "other"), *options
             )
             other.ends(with_code=2, within_s=START_S)
-            assert re.search(says, other.text())
+            assert re.search(pattern, other.text())
             assert not (lab.folder / "other").exists()
         goes_on(deployment)
         run.signal(signal.SIGHUP)

@@ -131,10 +131,10 @@ def strike(deployment: Deployment, run: Role, kind: str, chance: random.Random) 
 def cut_off(deployment: Deployment, run: Role, host: str, for_s: float) -> float | None:
     """Cut a host off for so long; return the wall time [s] until its line."""
     at_s = deployment.cut(host)
-    said = run.line(f"host {host} does not answer", START_S).wall_s - at_s if for_s > NAMED_AFTER_S else None
+    output = run.line(f"host {host} does not answer", START_S).wall_s - at_s if for_s > NAMED_AFTER_S else None
     threading.Event().wait(at_s + for_s - time.monotonic())
     deployment.heal(host)
-    return said
+    return output
 
 
 def judge(deployment: Deployment, run: Role, kind: str) -> None:

@@ -56,10 +56,10 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GatewayProcess
 
 
 def test_it_knows_the_run(gateway: GatewayProcess) -> None:
-    said = client(
+    output = client(
         gateway, "printf('%s %s %s %g %s', c.name, c.run.federation, c.run.mode, c.run.gate_s, c.run.drones{:});"
     )
-    assert said == ["client.octave zsim realtime 0.02 drone1"]
+    assert output == ["client.octave zsim realtime 0.02 drone1"]
 
 
 def test_last_values(gateway: GatewayProcess) -> None:
@@ -134,9 +134,9 @@ def page_blocks(heading: str) -> list[str]:
 
 def test_the_first_flight_of_the_page(gateway: GatewayProcess) -> None:
     (code,) = page_blocks("A first flight")
-    said = run(code.replace("'127.0.0.1'", f"'127.0.0.1', 'Port', {gateway.lines_port}"))
-    assert "accel_m_s2 =" in said
-    assert len(re.findall(r"-?\d+\.\d+", said.splitlines()[-1])) == 3
+    output = run(code.replace("'127.0.0.1'", f"'127.0.0.1', 'Port', {gateway.lines_port}"))
+    assert "accel_m_s2 =" in output
+    assert len(re.findall(r"-?\d+\.\d+", output.splitlines()[-1])) == 3
 
 
 def test_the_lockstep_of_the_page(federation: Federation) -> None:
@@ -184,10 +184,10 @@ def fly(federation: Federation, duration_s: float, within_s: float = PATIENCE_S)
     flight = federation.start("run", federation.write(MATLAB), *where, "--duration", str(duration_s))
     gateway = GatewayProcess(federation).in_run()
     with octave(f"cluster_controller('127.0.0.1', 'Port', {gateway.lines_port})") as controller:
-        said, _ = controller.communicate(timeout=within_s)
-    assert controller.returncode == 0, said
+        output, _ = controller.communicate(timeout=within_s)
+    assert controller.returncode == 0, output
     flight.ends(with_code=0, within_s=within_s)
-    return said
+    return output
 
 
 @contextmanager
@@ -214,8 +214,8 @@ def test_the_controller_flies_as_ours_does(federation: Federation, tmp_path_fact
 
     world ── estimators ── zsim gateway ── octave (matlab.main)        world, estimators, controller.main
     """
-    said = fly(federation, SHORT_S)
-    assert re.search(r"24\.\d\d s  engaged\nmatlab\.main: the run ended", said), said
+    output = fly(federation, SHORT_S)
+    assert re.search(r"24\.\d\d s  engaged\nmatlab\.main: the run ended", output), output
     theirs = states(federation)
     events = federation.record().events("death", "drop", "refused")
     assert events == []
@@ -246,8 +246,8 @@ def test_the_controller_is_killed_and_started_again(federation: Federation) -> N
         first.kill()
     stands = clock.until(lambda m: [w["name"] for w in m["waiting_for"]] == ["matlab.main"]).message["t_ns"]
     with octave(code) as second:
-        said, _ = second.communicate(timeout=TEST_1_S)
-    assert re.search(r"assembling\n.*engaged\nmatlab\.main: the run ended", said), said
+        output, _ = second.communicate(timeout=TEST_1_S)
+    assert re.search(r"assembling\n.*engaged\nmatlab\.main: the run ended", output), output
     flight.ends(with_code=0)
     record = federation.record()
     assert [e["subject"] for e in record.events("death")] == ["matlab.main"]

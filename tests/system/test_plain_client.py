@@ -60,9 +60,9 @@ def test_it_flies_and_holds_time(federation: Federation, request: pytest.Fixture
     assert entry["since_wall_s"] > 0.9
     os.kill(program.pid, signal.SIGCONT)
 
-    said, _ = program.communicate(timeout=PATIENCE_S)
-    assert program.returncode == 0, said
-    assert re.fullmatch(r"t = 10\.0\d s, flying, accelerometer \[.*\]\n", said)
+    output, _ = program.communicate(timeout=PATIENCE_S)
+    assert program.returncode == 0, output
+    assert re.fullmatch(r"t = 10\.0\d s, flying, accelerometer \[.*\]\n", output)
     east, north, _ = client.get("drone/drone1/truth")["drone/drone1/truth"]["velocity_m_s"]
     assert north == pytest.approx(0.5, abs=0.3)  # m/s forward, the drone looks north
     assert east == pytest.approx(0.0, abs=0.3)

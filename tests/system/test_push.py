@@ -78,11 +78,11 @@ def gather(lab: Lab, hosts: Path, *names: str) -> dict[str, WheelSet]:
     wanted = processes.needed_extras(inventory.load(hosts).inventory)
     found = parse_interpreters(over_ssh(lab, hosts, names[0], "sh", "-c", interpreter_query()))
     python = choose_interpreter(names[0], found, sys.version_info[:2]).path
-    said = look(lab, hosts, names[0], python)
+    printed = look(lab, hosts, names[0], python)
     wheelhouse = Wheelhouse(CACHE / "zsim", print)
 
     async def work() -> dict[str, WheelSet]:
-        return {name: await wheelhouse.wheel_set(name, wheel_target(name, said), wanted[name]) for name in names}
+        return {name: await wheelhouse.wheel_set(name, wheel_target(name, printed), wanted[name]) for name in names}
 
     return asyncio.run(work())
 
@@ -139,9 +139,9 @@ def test_a_push_that_is_interrupted_does_not_disturb_the_next_one(lab: Lab, host
         assert first.stderr is not None
         assert any(line == "h2: installing\n" for line in first.stderr)
         first.send_signal(signal.SIGINT)
-        said = first.communicate(timeout=PUSH_S)[1]
+        printed = first.communicate(timeout=PUSH_S)[1]
     assert first.returncode == 130
-    assert "Traceback" not in said
+    assert "Traceback" not in printed
     second = push(lab, hosts, "--host", "h2")
     assert second.returncode == 0, second.stderr
     assert "1 of 1" in second.stdout
@@ -183,12 +183,12 @@ def test_another_build_of_the_same_version_takes_the_place_of_the_first(lab: Lab
         order = {"project": write_wheel(tmp_path / "wheels", text), "pip": pip.name, "wheels": [], "extras": []}
         shutil.copy(pip, tmp_path / "wheels")
         on_host.install(tmp_path, {**order, "modules": ["zsim"], "note": {"project": text}}, on_host.CommandRunner())
-        said = subprocess.run(
+        printed = subprocess.run(
             [tmp_path / "venv/bin/python", "-c", "import zsim; print(zsim.__file__, zsim.BUILD)"],
             cwd=tmp_path, capture_output=True, text=True, check=True,
         )  # fmt: skip
-        assert said.stdout.startswith(str(tmp_path / "venv"))
-        assert said.stdout.endswith(f"{text[-1]}\n")
+        assert printed.stdout.startswith(str(tmp_path / "venv"))
+        assert printed.stdout.endswith(f"{text[-1]}\n")
     found = on_host.inspect_folder(tmp_path)
     assert found["installed"]["project"] == "BUILD = 2"
     assert found["wheels"] == {}

@@ -45,12 +45,12 @@ class Ear:
 
 
 def recorded(folder: Path, *expressions: str) -> dict[str, list[bytes]]:
-    said: defaultdict[str, list[bytes]] = defaultdict(list)
+    output: defaultdict[str, list[bytes]] = defaultdict(list)
     with RecordReader(folder / "run.mcap") as reader:
         wanted = [key for key in reader.topics() if any(matches(each, key) for each in expressions)]
         for m in reader.messages(wanted):
-            said[m.key].append(m.payload)
-    return dict(said)
+            output[m.key].append(m.payload)
+    return dict(output)
 
 
 def matches(expression: str, key: str) -> bool:
@@ -93,8 +93,8 @@ def test_the_same_payloads(federation: Federation, flown: Path) -> None:
     assert re.search("^ended: .*record", role.text(), re.MULTILINE)
     for key, payloads in first.items():
         rest = [payload for payload in payloads if msgpack.unpackb(payload)["t_ns"] > 0]
-        said = [payload for payload in ear.received[key] if msgpack.unpackb(payload)["t_ns"] > 0]
-        assert said == rest, key
+        output = [payload for payload in ear.received[key] if msgpack.unpackb(payload)["t_ns"] > 0]
+        assert output == rest, key
     assert {view.key for view in views.now()} >= {"view/drones", "view/cluster/main"}
 
 
@@ -132,9 +132,9 @@ def test_echo(federation: Federation, flown: Path) -> None:
     echo = federation.role("echo", "drone/drone2/sensor/imu", "--raw", "-n", "20")
     echo.ends(with_code=0)
     on_record = {payload.hex() for payload in recorded(flown, "drone/drone2/sensor/imu")["drone/drone2/sensor/imu"]}
-    said = [line.text.split('"message": "')[1].rstrip('"}') for line in echo.lines if '"message"' in line.text]
-    assert len(said) == 20
-    assert set(said) <= on_record
+    output = [line.text.split('"message": "')[1].rstrip('"}') for line in echo.lines if '"message"' in line.text]
+    assert len(output) == 20
+    assert set(output) <= on_record
 
 
 def test_an_estimator_under_test(federation: Federation, flown: Path) -> None:
@@ -261,8 +261,8 @@ def test_all_roles_beside_a_replay(federation: Federation, flown: Path) -> None:
         each.ends(with_code=0)
     for key, watch in watches.items():
         watch.until(lambda m: m["t_ns"] == 6_000_000_000)
-        said = [unsigned(received.message) for received in watch.received]
-        assert said == [*map(without_source, recorded(flown, key)[key][:301])]
+        output = [unsigned(received.message) for received in watch.received]
+        assert output == [*map(without_source, recorded(flown, key)[key][:301])]
 
 
 def test_a_record_that_was_cut(federation: Federation, flown: Path) -> None:

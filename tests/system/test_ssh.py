@@ -24,8 +24,8 @@ def refusal(lab: Lab, base: Path, host: Host) -> str:
 
 def given(lab: Lab, **changed: str | int) -> Host:
     """Return a host of the lab with some of its fields changed."""
-    told = {"address": lab.address("h1"), "user": "root", "key": "keys/client", "known_hosts": "keys/known_hosts"}
-    return Host(**{**told, **changed})  # pyright: ignore[reportArgumentType]
+    fields = {"address": lab.address("h1"), "user": "root", "key": "keys/client", "known_hosts": "keys/known_hosts"}
+    return Host(**{**fields, **changed})  # pyright: ignore[reportArgumentType]
 
 
 def test_each_refusal_is_a_line(lab: Lab, tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ def test_a_host_key_that_changed_is_not_called_unknown(lab: Lab, tmp_path: Path,
     at, known = lab.address("h1"), tmp_path / "known_hosts"
     checked(["ssh-keygen", "-q", "-t", kind, "-N", "", "-C", "", "-f", str(tmp_path / "former")])
     known.write_text(f"{at} {(tmp_path / 'former.pub').read_text()}")
-    said = refusal(lab, lab.folder, given(lab, known_hosts=str(known)))
-    assert missing(said, "h1: ", f"{at} port 22", str(known), f"ssh-keygen -f {known} -R {at}") == []
-    assert "ssh-keyscan" not in said
-    assert "\n" not in said
+    output = refusal(lab, lab.folder, given(lab, known_hosts=str(known)))
+    assert missing(output, "h1: ", f"{at} port 22", str(known), f"ssh-keygen -f {known} -R {at}") == []
+    assert "ssh-keyscan" not in output
+    assert "\n" not in output

@@ -224,10 +224,10 @@ def hosts(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
     pytest.importorskip("distributed", reason="the extra `dask` is not installed")
     from distributed import Client
 
-    dask, said = [sys.executable, "-m", "dask"], tmp_path / "dask.log"
+    dask, output = [sys.executable, "-m", "dask"], tmp_path / "dask.log"
     address = f"tcp://127.0.0.1:{free_port()}"
     where = ("--no-dashboard", "--host", "127.0.0.1")
-    with said.open("w") as log:
+    with output.open("w") as log:
         scheduler = subprocess.Popen([*dask, "scheduler", *where, "--port", address.rpartition(":")[2]], stderr=log)
         worker = subprocess.Popen([*dask, "worker", address, *where, "--nthreads", "1", "--no-nanny"], stderr=log)
     try:
