@@ -26,7 +26,7 @@ USER_FAULT = 2  # exit code of what a person has to put right
 WAITING = "waiting for a world of"  # begins the lines of a command that has not found one yet
 FORKSERVER = Path(__file__).with_name("warm_forkserver.py")
 COLUMNS = {"COLUMNS": "200"}  # of the terminal
-COLD = ("sweep", "up", "push", "doctor", "restart", "move", "down", "ps", "logs", "fetch", "certs", "rerun", "export")
+COLD = ("sweep", "up", "push", "doctor", "restart", "move", "down", "ps", "logs", "fetch", "certs")
 LIMITS = (resource.RLIMIT_NOFILE, resource.RLIMIT_FSIZE, resource.RLIMIT_AS)
 
 

@@ -72,13 +72,16 @@ def test_a_killed_role_is_started_again(deployment: Deployment, role: str) -> No
 
 def test_a_broken_ssh_session_is_the_death_of_its_roles(deployment: Deployment) -> None:
     """They end, since their launcher is gone; time stands still until there are new ones."""
-    run = deployment.up("--rate", "8", "--duration", "20")
+    run = deployment.up("--rate", "4", "--duration", "3600")
     in_flight(run)
     for pid, line in namespaces.members(deployment.lab.namespace("h2")):
         if re.match(r"sshd(-session)?: \w+@notty", line):
             os.kill(pid, signal.SIGKILL)
     run.line(r"controller.main .* ended: .*connection to h2 broke.*; on_death: restart", START_S)
-    run.ends(with_code=0, within_s=START_S)
+    for role in ("controller.main", "estimator.drone2"):
+        run.line(f"(restart|superseded): {role} on h2", START_S)
+    run.signal(signal.SIGINT)
+    run.ends(with_code=130, within_s=START_S)
     record = deployment.record()
     assert {event["subject"] for event in record.events("death")} == {"controller.main", "estimator.drone2"}
 
