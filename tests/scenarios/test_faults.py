@@ -23,6 +23,7 @@ from zsim_agents.formation.controller import Controller
 from zsim_analysis.in_process import agents
 from zsim_world.flight.world import World
 
+GATE_NS = 20_000_000
 AT_S, FOR_S, DURATION_S = 6.0, 2.0, 9.0  # the formation of PAIR is engaged from 5 s on
 Document = dict[str, Any]
 LINK = "estimator.drone1/controller.main"
@@ -235,11 +236,15 @@ def test_by_command_on_a_running_federation(federation: Federation) -> None:
 
     Expected: the lines that the commands print; the same hash.
     """
-    run = federation.run(yaml.safe_dump(document([], duration_s=12.0)), "--rate", "2")
+    run = federation.run(yaml.safe_dump(document([], duration_s=12.0)), "--rate", "1")
     client = federation.client()
     clock = client.subscribe("clock")
-    clock.until(lambda m: m["t_ns"] > 5.5e9)
+    clock.until(lambda m: m["t_ns"] > 0)
     client.request("world/control", "pause")
+    paused = clock.until(lambda m: m["state"] == "paused").message
+    client.request("world/control", "rate", value=4)
+    client.request("world/control", "step", gates=round(5.5e9 - paused["t_ns"]) // GATE_NS)
+    clock.until(lambda m: m["state"] == "paused" and m["t_ns"] == 5.5e9)
     printed = [
         fault(federation, "add", "drone1", "gps_bias", "value_m=[2, 0, 0]"),
         fault(federation, "add", LINK, "link_jitter", "jitter_ms=90", "--for", "1500ms"),
@@ -247,7 +252,7 @@ def test_by_command_on_a_running_federation(federation: Federation) -> None:
         fault(federation, "list"),
     ]
     client.request("world/control", "step", gates=50)
-    clock.until(lambda m: m["t_ns"] > 6.5e9)
+    clock.until(lambda m: m["t_ns"] == 6.5e9)
     printed.append(fault(federation, "clear", "drone1"))
     client.request("world/control", "resume")
     run.ends(with_code=0)

@@ -76,11 +76,13 @@ def test_a_foreign_estimator_takes_over_in_flight(federation: Federation) -> Non
     client = federation.client()
     clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["t_ns"] > 6e9)
+    assert client.request("world/control", "rate", value=0.2)["ok"]  # time enough to take over
     truth = client.subscribe("drone/drone2/truth")
     former_pid = federation.pid("estimator.drone2")
     foreign = client.join("estimator.drone2", client.info(), GATE_NS)
     taken = events.until(lambda m: m["kind"] == "superseded").message["data"]
     assert taken["former_pid"] == former_pid
+    assert client.request("world/control", "rate", value=10)["ok"]
     run.line("estimator.drone2: another process of this name joined from elsewhere")
     answer_from(client, foreign, truth, taken["done_ns"] + GATE_NS)
     run.ends(with_code=0)
