@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SCENARIO ?= scenarios/step.yaml
 PARTS ?=
-WORKERS ?= 3
+WORKERS ?= 4
 
 .PHONY: run test setup lint soak bench clean help
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from federation import PAIR, PAIR_ROLES, Federation
+from refused import missing
 
 from zsim.contract import flight_messages, keys
 from zsim.contract.run_messages import ControlRequest, Event
@@ -22,6 +23,7 @@ from zsim_agents.formation.controller import Controller
 from zsim_analysis.in_process import agents
 from zsim_world.flight.world import World
 
+GATE_NS = 20_000_000
 AT_S, FOR_S, DURATION_S = 6.0, 2.0, 9.0  # the formation of PAIR is engaged from 5 s on
 Document = dict[str, Any]
 LINK = "estimator.drone1/controller.main"
@@ -234,26 +236,29 @@ def test_by_command_on_a_running_federation(federation: Federation) -> None:
 
     Expected: the lines that the commands print; the same hash.
     """
-    run = federation.run(yaml.safe_dump(document([], duration_s=12.0)), "--rate", "2")
+    run = federation.run(yaml.safe_dump(document([], duration_s=12.0)), "--rate", "1")
     client = federation.client()
-    clock = client.watch("clock")
-    clock.until(lambda m: m["t_ns"] > 5.5e9)
-    client.ask("world/control", "pause")
+    clock = client.subscribe("clock")
+    clock.until(lambda m: m["t_ns"] > 0)
+    client.request("world/control", "pause")
+    paused = clock.until(lambda m: m["state"] == "paused").message
+    client.request("world/control", "rate", value=4)
+    client.request("world/control", "step", gates=round(5.5e9 - paused["t_ns"]) // GATE_NS)
+    clock.until(lambda m: m["state"] == "paused" and m["t_ns"] == 5.5e9)
     printed = [
         fault(federation, "add", "drone1", "gps_bias", "value_m=[2, 0, 0]"),
         fault(federation, "add", LINK, "link_jitter", "jitter_ms=90", "--for", "1500ms"),
         fault(federation, "add", "world", "gust", "velocity_m_s=[2, 1, 0]", "--for", "1s", "--at", "11s"),
         fault(federation, "list"),
     ]
-    client.ask("world/control", "step", gates=50)
-    clock.until(lambda m: m["t_ns"] > 6.5e9)
+    client.request("world/control", "step", gates=50)
+    clock.until(lambda m: m["t_ns"] == 6.5e9)
     printed.append(fault(federation, "clear", "drone1"))
-    client.ask("world/control", "resume")
+    client.request("world/control", "resume")
     run.ends(with_code=0)
-    assert "fault 1: gps_bias of drone1 from" in printed[0]
-    assert "until it is cleared" in printed[0]
-    assert "fault 2: link_jitter" in printed[1]
-    assert "fault 3: gust of world from 11.00 s to 12.00 s" in printed[2]
+    assert missing(printed[0], "1: gps_bias", "drone1", "cleared") == []
+    assert "2: link_jitter" in printed[1]
+    assert missing(printed[2], "3: gust", "world", "11.00 s", "12.00 s") == []
     assert [line.split()[:2] for line in printed[3].splitlines()] == [["1", "acts"], ["2", "acts"], ["3", "planned"]]
     assert "cleared 1" in printed[4]
     record = federation.record()
@@ -294,13 +299,13 @@ def test_a_killed_process_is_started_again_and_gives_the_same_bits(federation: F
         assert {event["data"]["on_death"] for event in record.events("death")} <= {"restart"}
         assert f"{record.events('fault')[0]['subject']}" == victim
         log = (federation.out / "logs" / f"{victim}.log").read_text()
-        assert "warm start from t = 6.02 s" in log
+        assert missing(log, "warm start", "6.02 s") == []
         hashes.append(record.sha256())
     assert hashes[0] == hashes[1] != fly([]).sha256
 
 
 def test_no_process_dies_where_none_is() -> None:
-    with pytest.raises(RunError, match=r"process_kill of estimator\.drone1: must be left out in-process"):
+    with pytest.raises(RunError, match=r"process_kill of estimator\.drone1: "):
         fly([{"kind": KILL, "target": "estimator.drone1", "at_s": 1}])
 
 
@@ -321,7 +326,7 @@ def test_an_estimator_without_sensors_says_how_little_it_knows() -> None:
     assert sigmas[-1].min() > 2.0
     last = flight.states[-1]
     assert last.phase == "held"
-    assert "the position of drone1 has a sigma of" in last.reason
+    assert missing(last.reason, "drone1", "sigma") == []
 
 
 @pytest.mark.parametrize("kind", ["link_cut", "link_loss"])
@@ -334,7 +339,7 @@ def test_a_controller_without_an_estimate_holds_and_says_so(kind: str) -> None:
     flight = fly([{**given, "probability": 1} if kind == "link_loss" else given])
     held = [state for state in flight.states if state.phase == "held"]
     assert held[0].t_ns / 1e9 == pytest.approx(AT_S + 0.5, abs=0.05)
-    assert "the estimate of drone1 is" in held[0].reason
+    assert missing(held[0].reason, "estimate", "drone1") == []
     assert flight.states[-1].phase == "engaged"
 
 

@@ -2,7 +2,7 @@
 
 from federation import ONE, Federation
 from lockstep import DELAY_NS, GATE_NS, ME, Lockstep
-from refused import parts
+from refused import missing, parts
 
 
 def refusal(step: Lockstep, key: str) -> tuple[str, str]:
@@ -171,9 +171,9 @@ def test_two_that_do_the_same_work(federation: Federation) -> None:
     step.answer(5 * GATE_NS)
     step.stands_at(7 * GATE_NS)
     two = step.client.join("tester.two", step.info, GATE_NS, (ME,))
-    assert "both do the work of tester.one" in step.event("doubled", "tester.two").message["text"]
+    assert ME in step.event("doubled", "tester.two").message["text"]
     step.me.die()
-    assert step.event("death", ME).message["text"].endswith("tester.two does its work")
+    assert "tester.two" in step.event("death", ME).message["text"]
     step.me, two.done_ns = two, 7 * GATE_NS
     step.answer(8 * GATE_NS)
     step.stands_at(10 * GATE_NS, "tester.two")
@@ -245,18 +245,18 @@ def test_pause_step_resume(federation: Federation) -> None:
     step = Lockstep(federation)
     step.answer(5 * GATE_NS)
     step.stands_at(7 * GATE_NS)
-    assert step.client.ask("world/control", "pause")["ok"]
-    refused = step.client.ask("world/control", "pause")
+    assert step.client.request("world/control", "pause")["ok"]
+    refused = step.client.request("world/control", "pause")
     assert parts(refused["error"]) == ("the run", "paused")
     for gate in (6, 7):
         step.me.done(gate * GATE_NS)
     paused = step.clock.until(lambda m: m["state"] == "paused")
     assert paused.message["t_ns"] == 7 * GATE_NS
-    assert step.client.ask("world/control", "step", gates=2)["ok"]
+    assert step.client.request("world/control", "step", gates=2)["ok"]
     standing = step.clock.until(lambda m: m["state"] == "paused" and m["t_ns"] == 9 * GATE_NS)
     again = step.clock.until(lambda m: m["state"] == "paused" and m["step"] >= 9)
     assert again.message["t_ns"] == standing.message["t_ns"] == 9 * GATE_NS
-    assert step.client.ask("world/control", "resume")["ok"]
+    assert step.client.request("world/control", "resume")["ok"]
     step.me.done_ns = 7 * GATE_NS
     step.answer(8 * GATE_NS)
     step.stands_at(10 * GATE_NS)
@@ -272,10 +272,11 @@ def test_nobody_expected_and_a_stop(federation: Federation) -> None:
     """
     world = federation.world(ONE, "--rate", "1", "--duration", "1000")
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["t_ns"] > 0)
-    assert client.ask("world/control", "stop", source="operator.1", reason="lunch")["ok"]
-    assert events.until(lambda m: m["kind"] == "end").message["data"]["reason"] == "stopped by operator.1: lunch"
+    assert client.request("world/control", "stop", source="operator.1", reason="lunch")["ok"]
+    reason = events.until(lambda m: m["kind"] == "end").message["data"]["reason"]
+    assert missing(reason, "operator.1", "lunch") == []
     assert clock.until(lambda m: m["state"] == "stopped")
     world.ends(with_code=0)
-    world.line("ended: stopped by operator.1: lunch")
+    world.line(f"ended: {reason}")

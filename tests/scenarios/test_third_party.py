@@ -9,7 +9,7 @@ import pytest
 from federation import PAIR, PAIR_ROLES, Federation
 from lockstep import DELAY_NS, GATE_NS, ME, Lockstep
 from refused import parts
-from wire import Client, Participant, Watch
+from wire import Client, Participant, Subscription
 
 PAIR_DURATION_S = 12
 
@@ -20,8 +20,8 @@ class ForeignEstimator:
     def __init__(self, client: Client, name: str = "estimator.drone2") -> None:
         self._client = client
         info = client.info()
-        self._truth: Watch = client.watch("drone/drone2/truth")
-        self._status: Watch = client.watch("drone/drone2/sensor/status")
+        self._truth: Subscription = client.subscribe("drone/drone2/truth")
+        self._status: Subscription = client.subscribe("drone/drone2/sensor/status")
         self.participant = client.join(name, info, info["gate_ns"])
         self.last_ns = round(PAIR_DURATION_S * 1e9)
 
@@ -55,7 +55,7 @@ def test_a_foreign_estimator(federation: Federation) -> None:
     """
     roles = [federation.world(PAIR), federation.role("estimator", "drone1"), federation.role("controller", "main")]
     client = federation.client()
-    phases = client.watch("cluster/main/state")
+    phases = client.subscribe("cluster/main/state")
     ForeignEstimator(client).fly()
     for role in roles:
         role.ends(with_code=0)
@@ -74,13 +74,15 @@ def test_a_foreign_estimator_takes_over_in_flight(federation: Federation) -> Non
     """
     run = federation.run(PAIR, "--rate", "3")
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["t_ns"] > 6e9)
-    truth = client.watch("drone/drone2/truth")
+    assert client.request("world/control", "rate", value=0.2)["ok"]  # time enough to take over
+    truth = client.subscribe("drone/drone2/truth")
     former_pid = federation.pid("estimator.drone2")
     foreign = client.join("estimator.drone2", client.info(), GATE_NS)
     taken = events.until(lambda m: m["kind"] == "superseded").message["data"]
     assert taken["former_pid"] == former_pid
+    assert client.request("world/control", "rate", value=10)["ok"]
     run.line("estimator.drone2: another process of this name joined from elsewhere")
     answer_from(client, foreign, truth, taken["done_ns"] + GATE_NS)
     run.ends(with_code=0)
@@ -90,9 +92,9 @@ def test_a_foreign_estimator_takes_over_in_flight(federation: Federation) -> Non
     assert record.all("cluster/main/state")[-1]["phase"] == "engaged"
 
 
-def answer_from(client: Client, participant: Participant, truth: Watch, from_ns: int) -> None:
+def answer_from(client: Client, participant: Participant, truth: Subscription, from_ns: int) -> None:
     """Catch up by replay, then answer every gate to the end."""
-    replayed = client.ask("world/control", "replay", from_ns=from_ns - 1, keys=["drone/drone2/truth"])["result"]
+    replayed = client.request("world/control", "replay", from_ns=from_ns - 1, keys=["drone/drone2/truth"])["result"]
     known = {m["t_ns"]: m for m in (msgpack.unpackb(payload) for _, payload in replayed)}
     for t_ns in range(from_ns, PAIR_DURATION_S * 10**9 + 1, GATE_NS):
         while t_ns not in known:
@@ -125,11 +127,11 @@ def test_what_the_world_answers(federation: Federation) -> None:
         for expression in ("world/info", "clock", "drone/*/sensor/status", "drone/*/truth", "cluster/*/state"):
             assert other.get(expression), expression
         assert other.get("drone/drone1/estimate")["drone/drone1/estimate"]["position_m"] == truth["position_m"]
-        replay = other.ask("world/control", "replay", from_ns=3 * GATE_NS, keys=["drone/*/truth", "clock"])
+        replay = other.request("world/control", "replay", from_ns=3 * GATE_NS, keys=["drone/*/truth", "clock"])
     stamps = [(key, msgpack.unpackb(payload)["t_ns"]) for key, payload in replay["result"]]
     assert [t for key, t in stamps if key == "drone/drone1/truth"][:3] == [4 * GATE_NS, 5 * GATE_NS, 6 * GATE_NS]
     assert stamps[:2] == [("drone/drone1/truth", 4 * GATE_NS), ("clock", 4 * GATE_NS)]
-    step.client.ask("world/control", "stop")
+    step.client.request("world/control", "stop")
     step.world.ends(with_code=0)
 
 
@@ -155,7 +157,7 @@ def test_requests_that_are_refused(federation: Federation) -> None:
     step = Lockstep(federation)
     step.answer(2 * GATE_NS)
     for op, args, refused in BAD_REQUESTS:
-        answer = step.client.ask("world/control", op, **args)
+        answer = step.client.request("world/control", op, **args)
         assert answer["ok"] is False
         assert refused is None or parts(answer["error"]) == refused, (op, args, answer)
     for payload in (b"", b"\xc1garbage", msgpack.packb(["list"]), msgpack.packb({"op": 7})):
@@ -173,17 +175,17 @@ def test_the_outputs_of_a_role(federation: Federation) -> None:
     """
     run = federation.run(PAIR, "--rate", "10", "--duration", "600")
     client = federation.client()
-    client.watch("clock").until(lambda m: m["t_ns"] > 6e9)
-    assert client.ask("world/control", "pause")["ok"]
+    client.subscribe("clock").until(lambda m: m["t_ns"] > 6e9)
+    assert client.request("world/control", "pause")["ok"]
     for name in PAIR_ROLES:
-        answer = client.ask(f"process/{name}/outputs", "outputs")
+        answer = client.request(f"process/{name}/outputs", "outputs")
         assert answer["ok"]
         outputs = [(key, msgpack.unpackb(payload)["t_ns"]) for key, payload in answer["result"]]
         stamps = sorted({t_ns for _, t_ns in outputs})
         assert len(stamps) >= 2
         assert {b - a for a, b in pairwise(stamps)} == {GATE_NS}
         assert ("cluster/main/state" if name == "controller.main" else "estimate") in " ".join(k for k, _ in outputs)
-    client.ask("world/control", "stop")
+    client.request("world/control", "stop")
     run.ends(with_code=0)
 
 
@@ -199,7 +201,7 @@ def twice(tmp_path_factory: pytest.TempPathFactory, compiled: None) -> list[dict
                 step.put("drone/drone1/cmd/velocity", velocity_m_s=[math.sin(gate), 0.3, 0.1], yaw_rate_rad_s=0.2)
                 step.answer(step.me.done_ns + GATE_NS)
             step.stands_at(step.me.done_ns + DELAY_NS + GATE_NS)
-            step.client.ask("world/control", "stop")
+            step.client.request("world/control", "stop")
             hashes.append(step.event("end", "world").message["data"])
             step.me.bye(step.now_ns)
             step.world.ends(with_code=0)

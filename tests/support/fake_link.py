@@ -10,7 +10,7 @@ from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlAnswer
 from zsim.transport.samples import RawSample, ReceivedSample
 
-PATIENCE_S = 20.0  # after which a test that waits for ever fails
+PATIENCE_S = 120.0  # after which a test that waits for ever fails
 UNANSWERED = ControlAnswer(False, "nobody answered")
 BAD_UTF8 = b"\x83\xa4t_ns\x00\xa3seq\x00\xa6source\xa1\xff"
 NESTED = b"\x83\xa4t_ns\x00\xa3seq\x00\xa1x" + b"\x91" * 5000 + b"\xc0"

@@ -1,7 +1,7 @@
 """Fixtures of the tests that start processes."""
 
+from deployment import deployment, faketime, small_disk
 from federation import compiled, federation
 from lab import lab
-from team import faketime, small_disk, team
 
-__all__ = ["compiled", "faketime", "federation", "lab", "small_disk", "team"]
+__all__ = ["compiled", "deployment", "faketime", "federation", "lab", "small_disk"]

@@ -1,10 +1,10 @@
-"""A gateway that is played: says what the test says, line by line.
+"""A gateway that sends what the test sends, line by line.
 
 with FakeGateway() as fake:
     ...  # a program connects to fake.port
-    fake.greets()
-    fake.answers(fake.hears("subscribe"))
-    fake.says({"op": "value", "key": "clock", "value": 1})
+    fake.welcome()
+    fake.answer(fake.receive("subscribe"))
+    fake.send({"op": "value", "key": "clock", "value": 1})
 """
 
 import json
@@ -20,47 +20,47 @@ HELLO = {
 
 
 class FakeGateway:
-    """One that says what the test says; it serves one connection."""
+    """Sends what the test sends; it serves one connection."""
 
     def __init__(self) -> None:
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._listener.settimeout(PATIENCE_S)
         self._peer: socket.socket | None = None
-        self._heard = b""
+        self._received = b""
         self.port: int = self._listener.getsockname()[1]
 
     def __enter__(self) -> "FakeGateway":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.hang_up()
+        self.disconnect()
         self._listener.close()
 
-    def hears(self, op: str) -> dict[str, Any]:
+    def receive(self, op: str) -> dict[str, Any]:
         """Return the next request, which must be of a kind."""
-        while b"\n" not in self._heard:
+        while b"\n" not in self._received:
             received = self._connection().recv(65536)
             assert received, f"hung up before {op}"
-            self._heard += received
-        line, _, self._heard = self._heard.partition(b"\n")
+            self._received += received
+        line, _, self._received = self._received.partition(b"\n")
         request = json.loads(line)
         assert request["op"] == op, request
         return request
 
-    def answers(self, request: dict[str, Any], **fields: Any) -> None:
+    def answer(self, request: dict[str, Any], **fields: Any) -> None:
         """Answer a request."""
-        self.says({"op": request["op"], **fields, "id": request["id"]})
+        self.send({"op": request["op"], **fields, "id": request["id"]})
 
-    def says(self, *messages: dict[str, Any] | bytes) -> None:
+    def send(self, *messages: dict[str, Any] | bytes) -> None:
         """Send messages, each a line; bytes go as they are."""
         lines = [each if isinstance(each, bytes) else json.dumps(each).encode() + b"\n" for each in messages]
         self._connection().sendall(b"".join(lines))
 
-    def greets(self) -> None:
+    def welcome(self) -> None:
         """Answer hello with a run."""
-        self.says({**HELLO, "id": self.hears("hello")["id"]})
+        self.send({**HELLO, "id": self.receive("hello")["id"]})
 
-    def hang_up(self) -> None:
+    def disconnect(self) -> None:
         """End the connection."""
         if self._peer is not None:
             self._peer.close()

@@ -19,28 +19,25 @@ import signal
 import socket
 import struct
 import subprocess
-import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import forked_commands
 import msgpack
 import numpy as np
 import pytest
-import warm
+from forked_commands import COLUMNS, ZSIM
 from wire import PATIENCE_S, Client
 
 from zsim.record import RecordReader, repair
-from zsim_deploy.launch.role_launcher import RoleProcess
 
-ROOT = Path(__file__).parents[2]
-ZSIM = (sys.executable, "-m", "zsim_deploy.cli")
 PORTS = range(20_000, 30_000)  # below the range from which systems take ports for outgoing connections
-LEFT_WITHIN_S = 3.0  # after the end of a run, until nobody may be left
+COMPILES_S = 600.0  # wall time that compiling takes at most
 
 ONE = """
 name: one
@@ -92,25 +89,13 @@ class Role:
         self.lines: list[Line] = []
         self._news = threading.Condition()
         self._closed = False
-        given = {"COLUMNS": "200", **(env or {})}
-        started = None if prefix else warm.start(arguments, str(ROOT), given)
-        self.process, self._output = started or self._start_cold([*prefix, *ZSIM, *arguments], given)
+        if prefix:
+            command = [*prefix, *ZSIM, *arguments]
+            self.process, self._output = forked_commands.start_program(command, {**COLUMNS, **(env or {})})
+        else:
+            self.process, self._output = forked_commands.start(arguments, env or {})
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-
-    def _start_cold(self, command: list[str], environment: dict[str, str]) -> tuple[RoleProcess, IO[str]]:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            cwd=ROOT,
-            env={**os.environ, **environment},
-            start_new_session=True,
-        )
-        assert process.stdout is not None
-        return process, process.stdout
 
     def _read(self) -> None:
         for text in self._output:
@@ -240,7 +225,7 @@ class Federation:
         """Return the commands of this federation's processes that are there now."""
         return [" ".join(command) for _, command in self._processes()]
 
-    def nobody_left(self, within_s: float = LEFT_WITHIN_S) -> None:
+    def nobody_left(self, within_s: float = PATIENCE_S) -> None:
         """Fail if any process of this federation is still there after a while."""
         pids = [pid for pid, _ in self._processes()]
         until_s = time.monotonic() + within_s
@@ -334,14 +319,14 @@ class Record:
 
     def recomputed_sha256(self, drones: list[str]) -> str:
         """Return the hash of the truth as docs/protocol.md defines it, from the messages on record."""
-        said = hashlib.sha256()
+        digest = hashlib.sha256()
         for instant in zip(*(self.all(f"drone/{drone}/truth") for drone in drones), strict=True):
             for truth in instant:
-                said.update(struct.pack("<q", truth["t_ns"]))
+                digest.update(struct.pack("<q", truth["t_ns"]))
                 parts = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")
                 numbers = [number for part in parts for number in truth[part]]
-                said.update(struct.pack("<13d", *numbers))
-        return said.hexdigest()
+                digest.update(struct.pack("<13d", *numbers))
+        return digest.hexdigest()
 
     def positions(self, drone: str) -> np.ndarray:
         """Return the true positions [m; W; (gates, 3)] of a drone."""
@@ -357,7 +342,7 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
     flight = ["run", str(scenario), "--in-process", "--duration", "8", "--no-report", "--out", str(folder / "run")]
     with open(Path(tempfile.gettempdir()) / "zsim-tests-compile.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        subprocess.run([*ZSIM, *flight], cwd=ROOT, check=True, timeout=600, capture_output=True)
+        assert forked_commands.run(*flight, hangs_s=COMPILES_S).code == 0
 
 
 @pytest.fixture

@@ -45,6 +45,7 @@ table bridge lab {
   }
 }
 """
+RUN_S = 120.0  # wall time for a command on a host
 _counter = itertools.count()
 
 
@@ -63,7 +64,7 @@ class Lab:
         self._addresses = {LAUNCHER: f"{NETWORK}1"} | {name: f"{NETWORK}{11 + i}" for i, name in enumerate(names)}
         self._variables: dict[str, dict[str, str]] = {}
         self._sshd: dict[str, Service] = {}
-        self._radios: dict[str, Service] = {}
+        self._emulators: dict[str, Service] = {}
         self._past: list[Service] = []
         try:
             self._connect()
@@ -115,7 +116,7 @@ class Lab:
 
     def run(self, name: str, *command: str, **options: Any) -> subprocess.CompletedProcess[str]:
         """Run a command on a host (or the launcher) to its end; options as of `subprocess.run`."""
-        given = {"text": True, "capture_output": True, "timeout": 60.0, "cwd": ROOT} | options
+        given = {"text": True, "capture_output": True, "timeout": RUN_S, "cwd": ROOT} | options
         return subprocess.run(self._inside(name, command), **{**given, "env": self._env(name, options.get("env"))})
 
     def popen(self, name: str, *command: str, **options: Any) -> subprocess.Popen[str]:
@@ -164,13 +165,13 @@ class Lab:
             switches = itertools.chain.from_iterable((offload, "off") for offload in OFFLOADS)
             checked(self._inside(place, ["ethtool", "-K", interface, *switches]))
         figures = map(str, (delay_ms, jitter_ms, loss, seed))
-        radio = [sys.executable, str(Path(__file__).parent / "radio.py"), name, far, *figures]
-        self._radios[name] = self._service("net", radio, "carrying", self.folder / name / "radio.log")
+        emulator = [sys.executable, str(Path(__file__).parent / "link_emulator.py"), name, far, *figures]
+        self._emulators[name] = self._service("net", emulator, "carrying", self.folder / name / "link.log")
 
     def _fast(self, name: str) -> None:
         """Take the slow link away, if there is one."""
-        if radio := self._radios.pop(name, None):
-            self._retire(radio)
+        if emulator := self._emulators.pop(name, None):
+            self._retire(emulator)
             near = self._ports(name)[1]
             self._ip("net", f"link del dev {near}", f"link set dev {name} master bridge")
 
@@ -182,7 +183,7 @@ class Lab:
         """End every process of the lab and take its namespaces away."""
         for namespace in self.namespaces():
             namespaces.remove(namespace)
-        for service in (*self._past, *self._sshd.values(), *self._radios.values()):
+        for service in (*self._past, *self._sshd.values(), *self._emulators.values()):
             service.finish()
 
     def __enter__(self) -> "Lab":

@@ -3,7 +3,7 @@
 from typing import Any
 
 from federation import ONE, Federation, Role
-from wire import Client, Heard, Participant, Watch
+from wire import Client, Participant, Received, Subscription
 
 GATE_NS = 20_000_000
 DELAY_NS = GATE_NS  # command delay of the scenarios here, one gate
@@ -17,8 +17,8 @@ class Lockstep:
     def __init__(self, federation: Federation, *options: str, scenario: str = ONE, period_ns: int = GATE_NS) -> None:
         self.world: Role = federation.world(scenario, "--expect", ME, *options)
         self.client: Client = federation.client()
-        self.clock: Watch = self.client.watch("clock")
-        self.events: Watch = self.client.watch("world/event")
+        self.clock: Subscription = self.client.subscribe("clock")
+        self.events: Subscription = self.client.subscribe("world/event")
         self.info = self.client.info()
         self.me: Participant = self.client.join(ME, self.info, period_ns)
         self.now_ns = -1
@@ -32,18 +32,18 @@ class Lockstep:
     def see(self, gate_ns: int) -> None:
         """Wait for a gate."""
         while self.now_ns < gate_ns:
-            heard = self.clock.until(lambda m: m["state"] == "running")
-            self.now_ns = heard.message["t_ns"]
+            received = self.clock.until(lambda m: m["state"] == "running")
+            self.now_ns = received.message["t_ns"]
 
-    def stands_at(self, t_ns: int, *names: str) -> Heard:
+    def stands_at(self, t_ns: int, *names: str) -> Received:
         """Wait until time stands; check that it does at t_ns and that these processes are waited for."""
-        heard = self.clock.until(lambda m: m["state"] == "running" and m["waiting_for"])
-        assert heard.message["t_ns"] == t_ns
-        assert {w["name"] for w in heard.message["waiting_for"]} == (set(names) or {ME})
+        received = self.clock.until(lambda m: m["state"] == "running" and m["waiting_for"])
+        assert received.message["t_ns"] == t_ns
+        assert {w["name"] for w in received.message["waiting_for"]} == (set(names) or {ME})
         self.now_ns = t_ns
-        return heard
+        return received
 
-    def event(self, kind: str, subject: str) -> Heard:
+    def event(self, kind: str, subject: str) -> Received:
         return self.events.until(lambda m: (m["kind"], m["subject"]) == (kind, subject))
 
     def leave(self) -> None:

@@ -13,7 +13,7 @@ from federation import wait_gone
 
 FOLDER = Path("/run/netns")  # where iproute2 keeps them
 CLONE_NEWNET = 0x40000000  # linux/sched.h
-GONE_S = 5.0  # wall time for a killed process to vanish
+GONE_S = 120.0  # wall time for a killed process to vanish, on a machine that does other things too
 SBIN = "/usr/sbin:/sbin"  # often missing in a PATH
 
 
@@ -24,7 +24,7 @@ def environment() -> dict[str, str]:
 
 def checked(command: Sequence[str], stdin: str = "") -> str:
     """Run a command that must succeed and return what it prints."""
-    done = subprocess.run(command, input=stdin, text=True, capture_output=True, timeout=60.0, env=environment())
+    done = subprocess.run(command, input=stdin, text=True, capture_output=True, timeout=GONE_S, env=environment())
     if done.returncode:
         raise OSError(f"{' '.join(command)} failed: {done.stderr.strip()}")
     return done.stdout

@@ -5,6 +5,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from wire import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 CLIENT = ROOT / "clients" / "matlab"
@@ -22,7 +23,7 @@ def command(code: str) -> list[str]:
     return [OCTAVE, "--no-gui", "--no-window-system", "--norc", "-q", "--eval", f"addpath({paths}); {code}"]
 
 
-def run(code: str, within_s: float = 60.0) -> str:
+def run(code: str, within_s: float = PATIENCE_S) -> str:
     """Run code to its end; return what it prints. Fails with its error, or with its warnings if there are any."""
     done = subprocess.run(command(code), cwd=ROOT, capture_output=True, text=True, timeout=within_s)
     assert done.returncode == 0, done.stderr

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from xmlrpc.client import ServerProxy
 
 import pytest
 from federation import free_port
@@ -15,6 +16,7 @@ from wire import PATIENCE_S
 
 TOOLS = ("roscore", "rosmaster", "rosparam", "rostopic", "rosnode", "rosservice")
 MODULES = ("rospy", "std_msgs", "std_srvs", "geometry_msgs", "sensor_msgs", "nav_msgs", "rosgraph_msgs", "genpy")
+POLL_S = 0.05  # between two attempts to reach a master on its way up
 PYTHON = "/usr/bin/python3"  # the one that Debian's packages are for
 RELAY = "/usr/lib/topic_tools/relay"
 GENERATOR = Path("/usr/lib/genpy/genmsg_py.py")
@@ -108,8 +110,18 @@ class RosGraph:
         """Start roscore, or another master, and wait until it answers; simulated time is what nodes are to use."""
         self._master = self.start(*(master or ("roscore",)), "-p", str(self.port))
         until_s = time.monotonic() + PATIENCE_S
-        while self._call("rosparam", "set", "/use_sim_time", "true").returncode:
+        while not self._set_simulated_time():
             assert time.monotonic() < until_s, self._master.lines
+            threading.Event().wait(POLL_S)
+
+    def _set_simulated_time(self) -> bool:
+        """Do what `rosparam set /use_sim_time true` does; return whether the master answers."""
+        try:
+            with ServerProxy(self.uri) as master:
+                master.setParam("/tests", "/use_sim_time", True)
+        except OSError:
+            return False
+        return True
 
     def stop_master(self) -> None:
         """Let the master die; not for roscore, which must be let end those that it has started."""

@@ -47,7 +47,7 @@ def write_definitions(folder: Path) -> Path:
 
 
 class Child:
-    """A process that speaks in lines."""
+    """A process that takes requests and prints messages as lines."""
 
     def __init__(self, *command: str, **env: str) -> None:
         self.process = subprocess.Popen(
@@ -76,7 +76,7 @@ class Child:
         assert self.process.stderr is not None
         self._errors.extend(self.process.stderr)
 
-    def tell(self, text: str) -> None:
+    def write_line(self, text: str) -> None:
         assert self.process.stdin is not None
         self.process.stdin.write(text + "\n")
         self.process.stdin.flush()
@@ -122,20 +122,20 @@ class Peer(Child):
     """A participant, see ros2_peer.py; a peer of Zenoh's as ROS nodes are by default, or a client.
 
     Attributes:
-        heard: messages by topic, as they came.
+        received: messages by topic, as they came.
     """
 
     def __init__(self, port: int, definitions: Path, mode: str) -> None:
         override = f'mode="{mode}"' + (";listen/endpoints=[]" if mode == "client" else "")
         super().__init__(str(HERE / "ros2_peer.py"), str(port), str(definitions), ZENOH_CONFIG_OVERRIDE=override)
-        self.heard: dict[str, list[Any]] = {}
+        self.received: dict[str, list[Any]] = {}
         self._results: list[Any] = []
         self._seen = 0
         self._result("ready")
 
-    def ask(self, op: str, **args: Any) -> Any:
+    def request(self, op: str, **args: Any) -> Any:
         """Have it do something, and return the result."""
-        self.tell(json.dumps({"op": op, **args}))
+        self.write_line(json.dumps({"op": op, **args}))
         return self._result(op)
 
     def _result(self, op: str) -> Any:
@@ -147,29 +147,29 @@ class Peer(Child):
 
     def _sort(self) -> None:
         for line in self.lines[self._seen :]:
-            said = json.loads(line)
-            if "op" in said:
-                self._results.append(said)
+            message = json.loads(line)
+            if "op" in message:
+                self._results.append(message)
             else:
-                self.heard.setdefault(said["topic"], []).append(said["message"])
+                self.received.setdefault(message["topic"], []).append(message["message"])
         self._seen = len(self.lines)
 
-    def hear(self, topic: str, met: Callable[[Any], bool] = lambda message: True, fresh: bool = True) -> Any:
+    def receive(self, topic: str, met: Callable[[Any], bool] = lambda message: True, fresh: bool = True) -> Any:
         """Return the first message on a topic that meets a condition, of those to come if it is to be fresh."""
         with self.news:
             self._sort()
-            first = len(self.heard.get(topic, [])) if fresh else 0
+            first = len(self.received.get(topic, [])) if fresh else 0
 
         def found() -> Any:
             self._sort()
-            return next((message for message in self.heard.get(topic, [])[first:] if met(message)), None)
+            return next((message for message in self.received.get(topic, [])[first:] if met(message)), None)
 
         return self.wait(found, topic)
 
     def until(self, op: str, met: Callable[[Any], bool], **args: Any) -> Any:
         """Ask until the answer meets a condition."""
         until_s = time.monotonic() + PATIENCE_S
-        while not met(answer := self.ask(op, **args)):
+        while not met(answer := self.request(op, **args)):
             if time.monotonic() > until_s:
                 pytest.fail(f"{op}: {answer}")
         return answer

@@ -1,4 +1,4 @@
-"""A ROS 2 participant of somebody else's making (PyPI zenoh-ros2-sdk) as a process of its own, told what to do by lines.
+"""A ROS 2 participant of somebody else's making (PyPI zenoh-ros2-sdk) as a process of its own, which takes requests as lines.
 
     python ros2_peer.py PORT FOLDER        FOLDER has PACKAGE/msg/NAME.msg of every type
 
@@ -76,7 +76,7 @@ class Peer:
 
     def call(self, service: str, kind: str, request: str, response: str, fields: dict[str, Any]) -> Any:
         client = ROS2ServiceClient(
-            service, kind, request_definition=request, response_definition=response, timeout=60.0, **self._where
+            service, kind, request_definition=request, response_definition=response, timeout=120.0, **self._where
         )
         try:
             return plain(client.call(**fields))

@@ -1,6 +1,6 @@
 """A secured federation on loopback: certificates, a hub that judges, and programs that try everything.
 
-Nothing is told to who is refused, so what was allowed is read off at the other end: every attempt ends with
+Who is refused gets no error, so what was allowed is read off at the other end: every attempt ends with
 something that is allowed (a fence), and what came before it came.
 """
 
@@ -30,7 +30,7 @@ from zsim_deploy.security.enrolment import CertificateRequest, access_control
 HOST = "lab"
 SITE = "router.site"
 PREFIX = "zsim/"
-READY = b"ready"  # what is published to learn whether anybody hears it
+READY = b"ready"  # what is published to learn whether anybody receives it
 SHORT_S = 1.0  # for a link that is to be refused
 
 _numbers = itertools.count()
@@ -82,7 +82,7 @@ def site(made: Certificates, upstream: str, clients: Iterable[str] = ROLES) -> I
         yield endpoint
 
 
-class Tryer:
+class RawClient:
     """A program with some certificate, or none, that uses Zenoh as it likes."""
 
     def __init__(self, endpoint: str, tls: Path | None, within_s: float = PATIENCE_S) -> None:
@@ -108,7 +108,7 @@ class Tryer:
             settings["connect_private_key"] = str(folder / "key.pem")
         return settings
 
-    def __enter__(self) -> "Tryer":
+    def __enter__(self) -> "RawClient":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -123,13 +123,13 @@ class Tryer:
         self._kept.append(publisher)
         publisher.put(key.encode())
 
-    def subscribe(self, expression: str, heard: "Heard") -> None:
-        callback = zenoh.handlers.Callback(heard.sample, indirect=False)
+    def subscribe(self, expression: str, received: "KeyLog") -> None:
+        callback = zenoh.handlers.Callback(received.sample, indirect=False)
         self._kept.append(self.session.declare_subscriber(PREFIX + expression, callback))
 
-    def ask(self, key: str, heard: "Heard") -> None:
+    def ask(self, key: str, received: "KeyLog") -> None:
         """Get without waiting for an answer."""
-        callback = zenoh.handlers.Callback(heard.reply, indirect=False)
+        callback = zenoh.handlers.Callback(received.reply, indirect=False)
         self.session.get(PREFIX + key, callback, timeout=PATIENCE_S)
 
     def answer(self, key: str) -> None:
@@ -142,13 +142,13 @@ class Tryer:
     def token(self, key: str) -> None:
         self._kept.append(self.session.liveliness().declare_token(PREFIX + key))
 
-    def watch(self, expression: str, heard: "Heard") -> None:
-        callback = zenoh.handlers.Callback(heard.sample, indirect=False)
+    def subscribe_tokens(self, expression: str, received: "KeyLog") -> None:
+        callback = zenoh.handlers.Callback(received.sample, indirect=False)
         self._kept.append(self.session.liveliness().declare_subscriber(PREFIX + expression, callback, history=True))
 
     def request(self, key: str, op: str, **args: Any) -> dict[str, Any]:
         """Return the answer to a request; fail when nobody answers."""
-        payload = bytes(msgpack.packb({"op": op, "args": args, "source": "tryer"}) or b"")
+        payload = bytes(msgpack.packb({"op": op, "args": args, "source": "client"}) or b"")
         replies = self.session.get(PREFIX + key, payload=payload, timeout=PATIENCE_S)
         return msgpack.unpackb(next(reply.ok for reply in replies if reply.ok is not None).payload.to_bytes())
 
@@ -163,15 +163,15 @@ class Tryer:
         while not any(reply.ok is not None for reply in self.session.get(PREFIX + key, timeout=1.0)):
             assert time.monotonic() < until_s, f"nobody answers on {key}"
 
-    def until_heard(self, key: str, heard: "Heard") -> None:
-        """Publish until it is heard: through a router a new subscriber is not always known at once."""
+    def publish_until_received(self, key: str, received: "KeyLog") -> None:
+        """Publish until it is received: through a router a new subscriber is not always known at once."""
         until_s = time.monotonic() + PATIENCE_S
-        while not heard.something(within_s=0.1):
-            assert time.monotonic() < until_s, f"nobody hears {key}"
+        while not received.take_one(within_s=0.1):
+            assert time.monotonic() < until_s, f"nobody receives {key}"
             self.session.put(PREFIX + key, READY, congestion_control=zenoh.CongestionControl.BLOCK)
 
 
-class Heard:
+class KeyLog:
     """Keys in the order in which they came.
 
     Args:
@@ -193,7 +193,7 @@ class Heard:
         if reply.ok is not None:
             self.sample(reply.ok)
 
-    def something(self, within_s: float) -> bool:
+    def take_one(self, within_s: float) -> bool:
         """Take one key; tell whether one came in time."""
         try:
             self._queue.get(timeout=within_s)

@@ -1,18 +1,18 @@
-"""A process in the background that says when it is ready; all that it says is kept in a file."""
+"""A process in the background that prints when it is ready; all that it prints is kept in a file."""
 
 import subprocess
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-READY_S = 60.0  # wall time to come up on a loaded machine
+READY_S = 120.0  # wall time to come up on a loaded machine
 
 
 class Service:
     """A started process, ready to serve.
 
     Args:
-        ready: what it says when it is.
+        ready: what it prints when it is.
         log: file for its output.
 
     Raises:
@@ -43,8 +43,8 @@ class Service:
 
     def _read(self) -> None:
         assert self._process.stdout
-        with self._process.stdout as said, self._log.open("a") as kept:
-            for line in said:
+        with self._process.stdout as printed, self._log.open("a") as kept:
+            for line in printed:
                 kept.write(line)
                 kept.flush()
                 if self._ready in line:

@@ -1,132 +1,123 @@
 """Bad input: for each a clear line and an exit code, or a counted refusal; nothing lost, nothing hanging."""
 
+import errno
 import os
+import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
+import forked_commands
 import pytest
-from federation import ONE, PAIR, ROOT, ZSIM, Federation, free_port
+from federation import ONE, PAIR, Federation, free_port
+from forked_commands import ROOT, USER_FAULT, ZSIM, refusal
+from refused import missing, parts
 from wire import PATIENCE_S, Client
 
-USER_FAULT, SUPERSEDED = 2, 3  # exit codes
+SUPERSEDED = 3  # exit code
 FOR_LONG = ("--rate", "1", "--duration", "600")
 ON_THE_DRONE = "yaw_deg: 90"
 NO_DRONES = ONE.split("drones:")[0]
 
-# name: (the scenario, what the line must say)
-SCENARIOS = {
-    "unknown key": (ONE + "wings: 2\n", "wings is not known; allowed: "),
-    "unknown key of a drone": (ONE.replace("yaw_deg", "yaw"), "drones[0].yaw is not known; allowed: arm_m"),
-    "wrong type": (ONE.replace("seed: 3", "seed: soon"), "seed is 'soon'; must be a whole number"),
-    "text for a number": (ONE.replace("duration_s: 10", "duration_s: long"), "duration_s is 'long'; must be a finite"),
-    "a list for a map": (ONE.replace("{expect: []}", "[]"), "processes is []; must be a map"),
-    "not a number": (ONE.replace("gust_m_s: 0.3", "gust_m_s: .nan"), "gust_m_s is nan; must be a finite number >= 0"),
-    "infinite": (ONE.replace("duration_s: 10", "duration_s: .inf"), "duration_s is inf; must be a finite number > 0"),
-    "absurd duration": (ONE.replace("duration_s: 10", "duration_s: 1e30"), "must be > 0 and <= 1e+06"),
-    "absurd place": (ONE.replace("[0, 0, 0]", "[1e9, 0, 0]"), "position_m[0] is 1000000000.0; must be"),
-    "under the ground": (ONE.replace("[0, 0, 0]", "[0, 0, -1]"), "position_m[2] is -1; must be >= 0"),
-    "negative mass": (ONE.replace(ON_THE_DRONE, "mass_kg: -1.4"), "mass_kg is -1.4; must be > 0 and <= 100"),
-    "mass of a man": (ONE.replace(ON_THE_DRONE, "mass_kg: 90"), "mass_kg is 90; must be < 0."),
-    "gate of no time": (ONE + "time: {gate_ms: 0}\n", "time.gate_ms is 0; must be > 0 and <= 1000"),
-    "drones missing": (NO_DRONES, "drones is missing; must be a list"),
-    "no drones": (NO_DRONES + "drones: []\n", "drones has 0 entries; must have 1 to 1000"),
-    "too many drones": (NO_DRONES + f"drones: [{'{},' * 1001}]\n", "drones has 1001 entries; must have 1 to 1000"),
-    "a name with a slash": (ONE.replace("name: drone1", "name: a/b"), "drones[0].name is 'a/b'; must match"),
-    "two of one name": (PAIR.replace("drone2", "drone1", 1).split("clusters")[0], "drones[1].name is 'drone1'"),
-    "two in one place": (PAIR.replace("[-2, 0, 0]", "[2, 0, 0]"), "is 0.00 m from 'drone1'; must be >="),
-    "a cluster of strangers": (PAIR.replace("[drone1,", "[drone7,"), "is 'drone7'; must be one of the drones"),
-    "bad on_death": (ONE.replace("expect: []", "on_death: {world: sing}"), "is 'sing'; must be one of"),
-    "not yaml": ("name: [\n", "is not YAML"),
-    "no map": ("- 1\n", "must be a map as in"),
-    "empty": ("", "is empty; must be a map"),
-    "a key twice": (ONE + "seed: 4\n", "key 'seed' is given twice"),
-    "an alias bomb": ("a: &a [1]\nb: [*a, *a]\n", "aliases are not allowed"),
+# name: (the scenario, what the line must show)
+SCENARIOS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "unknown key": (ONE + "wings: 2\n", ("wings", "drones")),
+    "unknown key of a drone": (ONE.replace("yaw_deg", "yaw"), ("drones[0].yaw", "arm_m")),
+    "wrong type": (ONE.replace("seed: 3", "seed: soon"), ("seed is 'soon'",)),
+    "text for a number": (ONE.replace("duration_s: 10", "duration_s: long"), ("duration_s is 'long'",)),
+    "a list for a map": (ONE.replace("{expect: []}", "[]"), ("processes is []",)),
+    "not a number": (ONE.replace("gust_m_s: 0.3", "gust_m_s: .nan"), ("gust_m_s is nan", ">= 0")),
+    "infinite": (ONE.replace("duration_s: 10", "duration_s: .inf"), ("duration_s is inf", "> 0")),
+    "absurd duration": (ONE.replace("duration_s: 10", "duration_s: 1e30"), ("duration_s is 1e+30", "<= 1e+06")),
+    "absurd place": (ONE.replace("[0, 0, 0]", "[1e9, 0, 0]"), ("position_m[0] is 1000000000.0",)),
+    "under the ground": (ONE.replace("[0, 0, 0]", "[0, 0, -1]"), ("position_m[2] is -1", ">= 0")),
+    "negative mass": (ONE.replace(ON_THE_DRONE, "mass_kg: -1.4"), ("mass_kg is -1.4", "<= 100")),
+    "mass of a man": (ONE.replace(ON_THE_DRONE, "mass_kg: 90"), ("mass_kg is 90", "< 0.")),
+    "gate of no time": (ONE + "time: {gate_ms: 0}\n", ("time.gate_ms is 0", "<= 1000")),
+    "drones missing": (NO_DRONES, ("drones is missing",)),
+    "no drones": (NO_DRONES + "drones: []\n", ("drones", "0", "1000")),
+    "too many drones": (NO_DRONES + f"drones: [{'{},' * 1001}]\n", ("drones", "1001", "1000")),
+    "a name with a slash": (ONE.replace("name: drone1", "name: a/b"), ("drones[0].name is 'a/b'",)),
+    "two of one name": (PAIR.replace("drone2", "drone1", 1).split("clusters")[0], ("drones[1].name is 'drone1'",)),
+    "two in one place": (PAIR.replace("[-2, 0, 0]", "[2, 0, 0]"), ("is 0.00 m", "'drone1'", ">=")),
+    "a cluster of strangers": (PAIR.replace("[drone1,", "[drone7,"), ("is 'drone7'",)),
+    "bad on_death": (ONE.replace("expect: []", "on_death: {world: sing}"), ("world is 'sing'", "restart")),
+    "not yaml": ("name: [\n", ("YAML",)),
+    "no map": ("- 1\n", ("map",)),
+    "empty": ("", ("empty", "map")),
+    "a key twice": (ONE + "seed: 4\n", ("'seed'", "twice")),
+    "an alias bomb": ("a: &a [1]\nb: [*a, *a]\n", ("aliases",)),
 }
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_a_bad_scenario_is_a_line(tmp_path: Path, name: str) -> None:
-    text, says = SCENARIOS[name]
+    text, tokens = SCENARIOS[name]
     path = tmp_path / "bad.yaml"
     path.write_text(text)
-    said = refused("run", str(path), "--out", str(tmp_path / "out"))
-    assert says in said
-    assert said.startswith("bad.yaml: ")
+    line = refusal("run", str(path), "--out", str(tmp_path / "out"))
+    assert missing(line, *tokens) == [], line
+    assert line.startswith("bad.yaml: ")
     assert not (tmp_path / "out").exists()
 
 
-def refused(*arguments: str) -> str:
-    """Run a command that must be refused; return its one line."""
-    done = subprocess.run(
-        [*ZSIM, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
-    assert done.returncode == USER_FAULT, done.stderr
-    assert "Traceback" not in done.stderr
-    assert done.stdout == ""
-    lines = [line for line in done.stderr.splitlines() if not line.startswith("waiting for a world of")]
-    assert len(lines) == 1, done.stderr
-    return lines[0]
-
-
-def test_all_faults_of_a_scenario_are_told_at_once(tmp_path: Path) -> None:
+def test_all_faults_of_a_scenario_are_reported_at_once(tmp_path: Path) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text(ONE.replace("seed: 3", "seed: -1").replace(ON_THE_DRONE, "mass_kg: 0") + "wings: 3\n")
-    done = subprocess.run([*ZSIM, "validate", str(path)], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == USER_FAULT
-    assert len(done.stderr.splitlines()) == 3
-    assert "mass_kg is 0; must be > 0 and <= 100 (drone 'drone1')" in done.stderr
+    done = forked_commands.run("validate", str(path))
+    assert done.code == USER_FAULT
+    assert sorted(parts(line)[0] for line in done.stderr.splitlines()) == ["drones[0].mass_kg", "seed", "wings"]
 
 
-# name: (arguments, what the line must say); {free} is an endpoint where nobody listens
-COMMANDS = {
-    "no file": (("run", "nowhere.yaml"), "nowhere.yaml: cannot be read (No such file or directory)"),
-    "a folder": (("validate", "/"), "cannot be read (Is a directory)"),
-    "set without value": (("run", "{one}", "--set", "seed"), "--set seed: is no assignment; must be a.b.c=value"),
-    "set of an unknown key": (("run", "{one}", "--set", "wings.gust=1"), "wings is not known"),
-    "set of an unknown drone": (("run", "{one}", "--set", "drones.drone9.mass_kg=1"), "drone9 is not in drones"),
-    "set of a bad value": (("run", "{one}", "--set", "seed=[1"), "is not YAML"),
-    "negative duration": (("run", "{one}", "--duration", "-1"), "duration_s is -1.0; must be > 0"),
-    "no world": (("estimator", "drone1", "--connect", "{free}", "--wait", "0.5"), "within 0.5 s"),
-    "no world to look at": (("keys", "--connect", "{free}", "--wait", "0.5"), "no world of federation 'zsim'"),
-    "no world to record": (("record", "--connect", "{free}", "--wait", "0.5"), "no world of federation 'zsim'"),
-    "malformed endpoint": (("world", "{one}", "--listen", "nonsense"), "endpoint is 'nonsense'; must be"),
-    "malformed connect": (("keys", "--connect", "nonsense"), "endpoint is 'nonsense'; must be"),
-    "unknown transport": (("world", "{one}", "--listen", "pigeon/1"), "cannot listen on pigeon/1"),
+# name: (arguments, what the line must show); {free} is an endpoint where nobody listens
+COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "no file": (("run", "nowhere.yaml"), ("nowhere.yaml: ", "No such file")),
+    "a folder": (("validate", "/"), ("/: ", "Is a directory")),
+    "set without value": (("run", "{one}", "--set", "seed"), ("--set seed: ", "a.b.c=value")),
+    "set of an unknown key": (("run", "{one}", "--set", "wings.gust=1"), ("wings ",)),
+    "set of an unknown drone": (("run", "{one}", "--set", "drones.drone9.mass_kg=1"), ("drone9 ", "drones")),
+    "set of a bad value": (("run", "{one}", "--set", "seed=[1"), ("YAML",)),
+    "negative duration": (("run", "{one}", "--duration", "-1"), ("duration_s is -1.0", "> 0")),
+    "no world": (("estimator", "drone1", "--connect", "{free}", "--wait", "0.5"), ("'zsim'", "0.5 s", "`zsim world`")),
+    "no world to look at": (("keys", "--connect", "{free}", "--wait", "0.5"), ("'zsim'", "0.5 s", "`zsim world`")),
+    "no world to record": (("record", "--connect", "{free}", "--wait", "0.5"), ("'zsim'", "0.5 s", "`zsim world`")),
+    "malformed endpoint": (("world", "{one}", "--listen", "nonsense"), ("endpoint is 'nonsense'",)),
+    "malformed connect": (("keys", "--connect", "nonsense"), ("endpoint is 'nonsense'",)),
+    "unknown transport": (("world", "{one}", "--listen", "pigeon/1"), ("pigeon/1",)),
     "address of others": (
         ("world", "{one}", "--listen", "tcp/192.0.2.1:7000", "--insecure"),
-        "cannot listen on tcp/192.0.2.1:7000",
+        ("tcp/192.0.2.1:7000",),
     ),
-    "open to a network": (("world", "{one}", "--listen", "tcp/0.0.0.0:7000"), "is not encrypted and leaves this"),
-    "a run open to it": (("run", "{one}", "--listen", "tcp/[::]:7000"), "or --insecure on a network that is nobody"),
+    "open to a network": (("world", "{one}", "--listen", "tcp/0.0.0.0:7000"), ("tcp/0.0.0.0:7000", "--insecure")),
+    "a run open to it": (("run", "{one}", "--listen", "tcp/[::]:7000"), ("tcp/[::]:7000", "--insecure")),
     "in the clear": (
         ("estimator", "drone1", "--connect", "tcp/192.0.2.1:7000"),
-        "not encrypted and leaves this machine",
+        ("tcp/192.0.2.1:7000", "--insecure"),
     ),
-    "port 0": (("world", "{one}", "--listen", "tcp/127.0.0.1:0"), "port 0 is no port that others could be told"),
-    "no federation": (("keys", "--connect", "{free}", "--federation", "a/b"), "federation is 'a/b'; must be 1 to 32"),
-    "no record": (("report", "{folder}"), "holds no run.mcap"),
-    "an empty record": (("report", "{folder}/cut"), "cut/run.mcap: holds no message; there is nothing to report"),
-    "no such option": (("estimator", "-._"), "zsim estimator: no such option: -; see `zsim estimator --help`"),
-    "no such command": (("fly",), "zsim: no such command 'fly'"),
-    "no scenario": (("run",), "zsim run: missing argument"),
-    "no number": (("run", "{one}", "--seed", "x"), "invalid value for '--seed'"),
-    "in-process at a pace": (("run", "{one}", "--in-process", "--rate", "3"), "--in-process is lockstep, unpaced"),
-    "in-process, listening": (("run", "{one}", "--in-process", "--listen", "tcp/[::1]:20000"), "leave out --listen"),
-    "a run on no endpoint": (("run", "{one}", "--listen", "bogus"), "endpoint is 'bogus'; must be"),
-    "a run on no port": (("run", "{one}", "--listen", "tcp/127.0.0.1"), "must be tcp/ADDRESS:PORT such as"),
-    "a run on port 0": (("run", "{one}", "--listen", "tcp/127.0.0.1:0"), "port 0 is no port"),
-    "a folder of no files": (("run", "{one}", "--out", "/proc"), "/proc: cannot be written"),
-    "such a folder, in-process": (("run", "{one}", "--in-process", "--out", "/proc"), "/proc: cannot be written"),
-    "negative wait": (("keys", "--wait", "-1"), "is -1; must be a finite number >= 0"),
-    "wait of no length": (("keys", "--wait", "nan"), "is nan; must be a finite number >= 0"),
-    "hz for no time": (("hz", "clock", "--seconds", "0"), "is 0; must be a finite number > 0"),
-    "echo of nothing": (("echo", "clock", "-n", "0"), "'--count'"),
-    "pub at no rate": (("pub", "clock", "{{}}", "--rate-hz", "nan"), "'--rate-hz'"),
-    "expecting a ghost": (("run", "{one}", "--set", "processes.expect=[estimator.ghost]"), "no drone is 'ghost'"),
-    "unwritable out": (("run", "{one}", "--out", "/proc/zsim"), "/proc/zsim: cannot be made"),
-    "out is a file": (("run", "{one}", "--out", "{one}"), "cannot be made"),
-    "a bad plan": (("run", "{bad}", "--in-process", "--out", "{folder}/e"), "x_c"),
+    "port 0": (("world", "{one}", "--listen", "tcp/127.0.0.1:0"), ("tcp/127.0.0.1:0", "port 0")),
+    "no federation": (("keys", "--connect", "{free}", "--federation", "a/b"), ("federation is 'a/b'",)),
+    "no record": (("report", "{folder}"), ("run.mcap",)),
+    "an empty record": (("report", "{folder}/cut"), ("cut/run.mcap: ",)),
+    "no such option": (("estimator", "-._"), ("zsim estimator: ", "option: -", "`zsim estimator --help`")),
+    "no such command": (("fly",), ("zsim: ", "'fly'", "`zsim --help`")),
+    "no scenario": (("run",), ("zsim run: ", "`zsim run --help`")),
+    "no number": (("run", "{one}", "--seed", "x"), ("'--seed'", "integer")),
+    "in-process at a pace": (("run", "{one}", "--in-process", "--rate", "3"), ("--in-process", "--rate")),
+    "in-process, listening": (("run", "{one}", "--in-process", "--listen", "tcp/[::1]:20000"), ("--listen",)),
+    "a run on no endpoint": (("run", "{one}", "--listen", "bogus"), ("endpoint is 'bogus'",)),
+    "a run on no port": (("run", "{one}", "--listen", "tcp/127.0.0.1"), ("tcp/127.0.0.1", "tcp/ADDRESS:PORT")),
+    "a run on port 0": (("run", "{one}", "--listen", "tcp/127.0.0.1:0"), ("port 0",)),
+    "a folder of no files": (("run", "{one}", "--out", "/proc"), ("/proc: ",)),
+    "such a folder, in-process": (("run", "{one}", "--in-process", "--out", "/proc"), ("/proc: ",)),
+    "negative wait": (("keys", "--wait", "-1"), ("is -1; ", ">= 0")),
+    "wait of no length": (("keys", "--wait", "nan"), ("is nan; ", ">= 0")),
+    "hz for no time": (("hz", "clock", "--seconds", "0"), ("is 0; ", "> 0")),
+    "echo of nothing": (("echo", "clock", "-n", "0"), ("'--count'",)),
+    "pub at no rate": (("pub", "clock", "{{}}", "--rate-hz", "nan"), ("'--rate-hz'",)),
+    "expecting a ghost": (("run", "{one}", "--set", "processes.expect=[estimator.ghost]"), ("'ghost'",)),
+    "unwritable out": (("run", "{one}", "--out", "/proc/zsim"), ("/proc/zsim: ",)),
+    "out is a file": (("run", "{one}", "--out", "{one}"), ("one.yaml: ",)),
+    "a bad plan": (("run", "{bad}", "--in-process", "--out", "{folder}/e"), ("x_c",)),
 }
 
 
@@ -136,10 +127,10 @@ def test_a_bad_command_is_a_line(tmp_path: Path, compiled: None, name: str) -> N
     (tmp_path / "bad.yaml").write_text(with_expression("sin("))
     (tmp_path / "cut").mkdir()
     (tmp_path / "cut" / "run.mcap").write_bytes(b"")
-    arguments, says = COMMANDS[name]
+    arguments, tokens = COMMANDS[name]
     places = {"one": tmp_path / "one.yaml", "bad": tmp_path / "bad.yaml", "folder": tmp_path}
-    said = refused(*(argument.format(**places, free=f"tcp/127.0.0.1:{free_port()}") for argument in arguments))
-    assert says in said
+    line = refusal(*(argument.format(**places, free=f"tcp/127.0.0.1:{free_port()}") for argument in arguments))
+    assert missing(line, *tokens) == [], line
 
 
 def with_expression(text: str) -> str:
@@ -148,7 +139,7 @@ def with_expression(text: str) -> str:
     return PAIR.replace("{takeoff_s: 0.5}", plan)
 
 
-# name: (expression of x_c, what the line must say)
+# name: (expression of x_c, what the line must show)
 EXPRESSIONS = {
     "not closed": ("sin(", "x_c"),
     "unknown name": ("2*omega*t", "omega"),
@@ -159,23 +150,23 @@ EXPRESSIONS = {
 
 @pytest.mark.parametrize("name", EXPRESSIONS)
 def test_a_plan_that_can_never_be_flown_ends_the_run(federation: Federation, name: str) -> None:
-    text, says = EXPRESSIONS[name]
+    text, token = EXPRESSIONS[name]
     run = federation.run(with_expression(text), *(() if name == "not closed" else ("--in-process",)))
     assert run.process.wait(PATIENCE_S) != 0
     run.close()
-    assert says in run.text()
+    assert token in run.text()
     assert "Traceback" not in run.text()
     federation.nobody_left()
 
 
-# name: (arguments of a role, what the line must say)
+# name: (arguments of a role, what the line must show)
 ROLES = {
     "wrong federation": (
         ("estimator", "drone1", "--federation", "other", "--wait", "1"),
-        "no world of federation 'other'",
+        "'other'",
     ),
-    "unknown drone": (("estimator", "drone9"), "drone is 'drone9'; must be one of drone1"),
-    "unknown cluster": (("controller", "nobody"), "cluster is 'nobody'; must be one of"),
+    "unknown drone": (("estimator", "drone9"), "drone is 'drone9'"),
+    "unknown cluster": (("controller", "nobody"), "cluster is 'nobody'"),
     "unwritable record": (("record", "--out", "/proc/zsim"), "/proc/zsim"),
 }
 
@@ -185,10 +176,10 @@ def world(federation: Federation) -> Iterator[Client]:
     """A world at real time that waits for nobody, and must live through the test."""
     role = federation.world(ONE, *FOR_LONG)
     client = federation.client()
-    client.watch("clock").until(lambda m: m["t_ns"] > 0)
+    client.subscribe("clock").until(lambda m: m["t_ns"] > 0)
     yield client
     assert client.get("clock")["clock"]["state"] == "running"
-    client.ask("world/control", "stop")
+    client.request("world/control", "stop")
     role.ends(with_code=0)
 
 
@@ -206,18 +197,18 @@ def test_a_port_in_use(federation: Federation) -> None:
     """Neither a world nor a whole run takes it, and no role of that run strays into the world that has it."""
     second = federation.world(ONE)
     second.ends(with_code=USER_FAULT)
-    assert f"cannot listen on {federation.endpoint}" in second.text()
-    events = federation.client().watch("world/event")
+    assert federation.endpoint in second.text()
+    events = federation.client().subscribe("world/event")
     run = federation.run(ONE)
     run.ends(with_code=1)
-    assert f"cannot listen on {federation.endpoint}" in run.text()
+    assert federation.endpoint in run.text()
     assert "Traceback" not in run.text() + second.text()
     assert events.now() == []
 
 
 @pytest.mark.parametrize("name", ["estimator.drone1", "recorder"])
 def test_of_two_processes_of_one_name_the_older_ends(federation: Federation, world: Client, name: str) -> None:
-    events = world.watch("world/event")
+    events = world.subscribe("world/event")
     arguments = [("estimator", "drone1")] * 2
     if name == "recorder":
         arguments = [("record", "--out", str(federation.folder / place)) for place in "ab"]
@@ -225,7 +216,7 @@ def test_of_two_processes_of_one_name_the_older_ends(federation: Federation, wor
     events.until(lambda m: (m["kind"], m["subject"]) == ("join", name))
     newer = federation.role(*arguments[1])
     older.ends(with_code=SUPERSEDED)
-    assert f"{name}: another process of this name joined from" in older.text()
+    assert re.search(rf"^{name}: ", older.text(), re.MULTILINE)
     assert newer.process.poll() is None
 
 
@@ -234,7 +225,7 @@ def test_a_run_is_never_written_over(federation: Federation) -> None:
     (federation.out / "run.mcap").write_bytes(b"precious")
     role = federation.run(ONE)
     role.ends(with_code=USER_FAULT)
-    assert "holds a run already; give --out another folder" in role.text()
+    assert missing(role.text(), str(federation.out), "--out") == []
     assert (federation.out / "run.mcap").read_bytes() == b"precious"
 
 
@@ -254,7 +245,7 @@ def test_a_full_disk_ends_the_run_and_keeps_the_record(federation: Federation, s
     federation.out = small_disk / "run"
     role = federation.run(PAIR, "--duration", "600")
     role.ends(with_code=1)
-    assert "No space left on device" in role.text()
+    assert os.strerror(errno.ENOSPC) in role.text()
     assert federation.record().keys()["clock"] > 50
     federation.nobody_left()
 
@@ -266,14 +257,14 @@ def test_a_record_that_may_not_grow(federation: Federation) -> None:
     limited = ["bash", "-c", 'trap "" XFSZ; ulimit -f 300; exec "$@"', "bash", *command]  # KiB
     done = subprocess.run(limited, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == USER_FAULT, done.stderr
-    assert "File too large" in done.stderr
+    assert os.strerror(errno.EFBIG) in done.stderr
     assert "Traceback" not in done.stderr
     world.ends(with_code=0)
-    assert "ended: the recorder left: " in world.text()
+    assert re.search(r"^ended: .*recorder", world.text(), re.MULTILINE)
     assert federation.record().keys()["clock"] > 50
 
 
-GARBAGE = 100_000  # messages
+GARBAGE = 30_000  # messages
 GARBAGE_KEYS = (
     "drone/drone1/cmd/velocity",
     "drone/drone2/cmd/mode",
@@ -300,9 +291,9 @@ def test_garbage_is_counted_and_changes_nothing(federation: Federation) -> None:
     with Federation(folder) as calm:
         calm.run(PAIR, "--in-process", "--duration", "8").ends(with_code=0)
         undisturbed = calm.record().sha256()
-    role = federation.run(PAIR, "--duration", "8", "--rate", "2")
+    role = federation.run(PAIR, "--duration", "8", "--rate", "1")
     client = federation.client()
-    client.watch("clock").until(lambda m: m.get("step", 0) > 5)
+    client.subscribe("clock").until(lambda m: m.get("step", 0) > 5)
     payloads = (
         b"\xc1",
         b"garbage",

@@ -13,7 +13,7 @@ How a fenced block is marked, in the line that opens it:
     text, json          output and drawings, not checked
 
 A block of any other kind is a fault, so nothing is left out without a word. What `adapted` changes is all that
-differs from what is printed: endpoints, shorter durations, and no report where nobody asks for its folder.
+differs from what is printed: endpoints, shorter durations, a faster pace in realtime, and no report where nobody asks for its folder.
 """
 
 import os
@@ -48,7 +48,7 @@ from zsim_deploy.inventory import inventory
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 RUN_S = 4.0  # simulated seconds of a run that has no other process to serve
-PATIENCE_S = 120  # wall seconds for one line on a machine that does other work as well
+PATIENCE_S = 600  # wall seconds for one block on a machine that does other work as well
 PROGRAMS = ("octave-cli", "gcc", "node", "zenoh-ros2", "rostopic")
 KINDS = (
     "bash run",
@@ -109,24 +109,24 @@ def test_every_block_is_of_a_known_kind(page: Path) -> None:
 @pytest.mark.parametrize("page", pages_with("bash run", "bash terminals"))
 def test_commands_run(page: Path, tmp_path: Path) -> None:
     missing: list[str] = []
-    with Desk(tmp_path) as desk:
+    with Checkout(tmp_path) as checkout:
         chapter = 0
         for block in blocks(page):
             if block.chapter != chapter:
-                desk.close_terminals()
+                checkout.close_terminals()
                 chapter = block.chapter
             program = block.kind.removeprefix("bash with ")
-            if program != block.kind and not desk.has(program):
+            if program != block.kind and not checkout.has(program):
                 missing.append(program)
             elif block.kind == "bash run" or program != block.kind:
-                desk.run(block, page)
+                checkout.run(block, page)
             elif block.kind == "bash terminals":
-                desk.open_terminals(block, page)
+                checkout.open_terminals(block, page)
     if missing:
         pytest.skip(f"{page.name}: all but the blocks with {', '.join(missing)}, which this machine does not have")
 
 
-class Desk:
+class Checkout:
     """A folder like a fresh checkout, free ports, and the terminals that are open."""
 
     def __init__(self, folder: Path) -> None:
@@ -139,7 +139,7 @@ class Desk:
         self._ports = tuple(free_port() for _ in PORTS)
         self._terminals: list[tuple[str, Path, subprocess.Popen[bytes]]] = []
 
-    def __enter__(self) -> "Desk":
+    def __enter__(self) -> "Checkout":
         return self
 
     def __exit__(self, failed: object, *rest: object) -> None:
@@ -169,12 +169,12 @@ class Desk:
             text=True,
         )
         try:
-            said, _ = script.communicate(timeout=PATIENCE_S)
+            output, _ = script.communicate(timeout=PATIENCE_S)
         except subprocess.TimeoutExpired:
             os.killpg(script.pid, signal.SIGKILL)
-            said = f"{script.communicate()[0]}\nnot done after {PATIENCE_S} s"
+            output = f"{script.communicate()[0]}\nnot done after {PATIENCE_S} s"
         where = f"{page.name}:{block.line}"
-        assert script.returncode == 0, f"{where}: {text}\n{said}\n{self._said()}"
+        assert script.returncode == 0, f"{where}: {text}\n{output}\n{self._logs()}"
 
     def open_terminals(self, block: Block, page: Path) -> None:
         """Start every line of a block as a process; a world listens when this returns."""
@@ -204,7 +204,7 @@ class Desk:
             with suppress(OSError), urlopen(f"http://127.0.0.1:{port}/json/drone/drone1/estimate"):
                 return
             time.sleep(0.1)
-        raise AssertionError(f"the gateway tells of no estimate\n{self._said()}")
+        raise AssertionError(f"the gateway tells of no estimate\n{self._logs()}")
 
     def _wait_for_port(self, port: int) -> None:
         until_s = time.monotonic() + PATIENCE_S
@@ -213,7 +213,7 @@ class Desk:
                 if probe.connect_ex(("127.0.0.1", port)) == 0:
                     return
             time.sleep(0.05)
-        raise AssertionError(f"nobody listens\n{self._said()}")
+        raise AssertionError(f"nobody listens\n{self._logs()}")
 
     def close_terminals(self) -> None:
         """Press Ctrl-C where a run is led or routed; every process must leave well, the others by themselves."""
@@ -223,10 +223,10 @@ class Desk:
         for text, _, process in self._terminals:
             code = process.wait(timeout=PATIENCE_S)
             # −2: Ctrl-C met Python on its way out
-            assert code in (0, 130, -signal.SIGINT), f"{text}: exit code {code}\n{self._said()}"
+            assert code in (0, 130, -signal.SIGINT), f"{text}: exit code {code}\n{self._logs()}"
         self._terminals.clear()
 
-    def _said(self) -> str:
+    def _logs(self) -> str:
         return "\n".join(f"--- {text}\n{log.read_text()}" for text, log, _ in self._terminals)
 
 
@@ -256,9 +256,11 @@ def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
     line = re.sub(r"\bzsim (run)\b(?!.*--in-process)", rf"zsim \1 --listen {endpoint}", line)
     if longest_s is not None and re.search(r"\bzsim run\b", line):
         line = re.sub(r"--duration \S+", "", line).replace("zsim run", f"zsim run --duration {longest_s:g}")
+    line = re.sub(r"(\bzsim sweep\b.* --duration) \S+", rf"\1 {RUN_S:g}", line)
     line = re.sub(r"(examples/.* --duration) (\S+)", lambda m: f"{m[1]} {min(float(m[2]), EXAMPLE_S):g}", line)
     if " --out " not in line:
         line = re.sub(r"\bzsim run\b", "zsim run --no-report", line)
+    line = re.sub(r"--realtime\b", "--realtime --rate 2", line)
     if not own:
         line = re.sub(r"\bzsim (world|replay)\b", rf"zsim \1 --listen {endpoint}", line)
         line = re.sub(rf"\bzsim ({'|'.join(ANSWERED)})\b", rf"zsim \1 --connect {endpoint}", line)

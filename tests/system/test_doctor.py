@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 import yaml
-from federation import ZSIM
+from forked_commands import ZSIM
 from lab import LAUNCHER, Lab
+from refused import missing
 
 ROOT = Path(__file__).parents[2]
 STEP = ROOT / "scenarios/step.yaml"
@@ -42,7 +43,7 @@ def test_a_host_with_a_router_only_is_measured_and_a_greeting_is_passed_over(lab
     routers: dict[str, dict[str, Any]] = {"field": {"host": "h3"}}
     done = doctor(lab, lab.inventory(ROLES, routers=routers, through={"h2": "field"}, insecure=True))
     assert done.returncode == 0, done.stderr
-    assert done.stdout.endswith("all hosts are ready\n")
+    assert "ready" in done.stdout.splitlines()[-1]
     assert set(rows(done.stdout)) == {("h2", "h3", "7448"), ("h3", "h1", "7447")}
 
 
@@ -62,7 +63,7 @@ def test_a_port_that_is_taken_is_a_line(lab: Lab) -> None:
         done = doctor(lab, lab.inventory(ROLES, insecure=True))
     assert done.returncode == 2
     (line,) = faults(done)
-    assert line.startswith("h1: port 7447 is in use there, perhaps by another run; end that ")
+    assert missing(line, "h1: ", "7447") == []
 
 
 def test_what_a_host_lacks_is_a_line_with_what_to_do(lab: Lab) -> None:
@@ -75,28 +76,20 @@ def test_what_a_host_lacks_is_a_line_with_what_to_do(lab: Lab) -> None:
     done = doctor(lab, hosts)
     assert done.returncode == 2
     h1, h2, h3 = faults(done)
-    assert h1 == f"h1: has no zsim in {lab.host_folder('h1')}; run `zsim push --hosts {hosts}`"
-    assert h2.startswith("h2: python /tmp is no program there (")
-    assert h2.endswith(
-        f"); correct hosts.h2.python, or install it there, or leave hosts.h2.python out and run `zsim push --hosts {hosts}`"
-    )
-    assert (
-        h3
-        == f"h3: its folder cannot be used ({lab.host_folder('h3')} is no folder); correct hosts.h3.folder, or make it there"
-    )
+    assert missing(h1, "h1: ", str(lab.host_folder("h1")), f"`zsim push --hosts {hosts}`") == []
+    assert missing(h2, "h2: ", "/tmp", "hosts.h2.python", f"`zsim push --hosts {hosts}`") == []
+    assert missing(h3, "h3: ", str(lab.host_folder("h3")), "hosts.h3.folder") == []
 
 
 def test_hosts_without_certificates_are_not_ready(lab: Lab) -> None:
     hosts = lab.inventory(ROLES)
     done = doctor(lab, hosts)
-    assert (done.returncode, faults(done)) == (
-        2,
-        [
-            f"{lab.folder}/certs: has no certificates; make them with `zsim certs init {hosts} --scenario FILE`, "
-            "or set security.insecure on a network of your own"
-        ],
+    assert done.returncode == 2
+    (line,) = faults(done)
+    assert (
+        missing(line, f"{lab.folder}/certs: ", f"`zsim certs init {hosts} --scenario FILE`", "security.insecure") == []
     )
-    assert "all hosts are ready" not in done.stdout
+    assert "ready" not in done.stdout
     assert lab.run(LAUNCHER, *ZSIM, "certs", "init", str(hosts), "--scenario", str(STEP)).returncode == 0
     done = doctor(lab, hosts)
     assert done.returncode == 0, done.stderr

@@ -16,13 +16,13 @@ def test_ctrl_c_while_it_loads_is_a_line(loaded: str) -> None:
     command = [*LOADS, "keys", "--wait", "60", "--connect", f"tcp/127.0.0.1:{free_port()}"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     assert process.stderr is not None
-    said = []
+    output = []
     with process.stderr:
         for line in process.stderr:
-            said.append(line)
+            output.append(line)
             if line.endswith(f" {loaded}\n"):
                 os.kill(process.pid, signal.SIGINT)
-    assert process.wait() == 130, said[-5:]
-    told = [line for line in said if not line.startswith("import time:")]
-    assert told[-1:] == ["interrupted\n"]
-    assert "Traceback" not in "".join(told)
+    assert process.wait() == 130, output[-5:]
+    lines = [line for line in output if not line.startswith("import time:")]
+    assert lines[-1:] == ["interrupted\n"]
+    assert "Traceback" not in "".join(lines)

@@ -1,5 +1,6 @@
 """`zsim up` on three real hosts: the same bits as in one process, over TLS with access control, whatever fails."""
 
+import errno
 import itertools
 import os
 import re
@@ -12,25 +13,27 @@ from typing import Any
 
 import namespaces
 import pytest
+from deployment import DISK_BYTES, NAMED_AFTER_S, ROLES, START_S, Deployment, closing, in_flight, in_process
 from lab import Lab
-from team import DISK_BYTES, NAMED_AFTER_S, ROLES, START_S, Team, closing, in_flight, in_process
 
 DRONES = ("drone1", "drone2", "drone3")
+FLIGHT_S = 15.0  # simulated, of Test 1
 GATES_PER_S = 50  # of Test 1
 CUT_IN_REALTIME_S = 5.0  # longer than the firmware's patience (0.5 s until it hovers, 2 s more until it lands)
 
 
-def test_three_hosts_give_the_bits_of_one_process(team: Team, tmp_path: Path) -> None:
-    run = team.up("--duration", "20")
+@pytest.mark.soak  # with a cut in it, below
+def test_three_hosts_give_the_bits_of_one_process(deployment: Deployment, tmp_path: Path) -> None:
+    run = deployment.up("--duration", "20")
     run.ends(with_code=0, within_s=START_S)
-    assert team.record().sha256() == in_process(tmp_path, 20.0)
-    assert {event["data"]["host"] for event in team.record().events("join")} == {"h1", "h2", "h3"}
+    assert deployment.record().sha256() == in_process(tmp_path, 20.0)
+    assert {event["data"]["host"] for event in deployment.record().events("join")} == {"h1", "h2", "h3"}
 
 
-def test_ps_logs_restart_move_and_down(team: Team) -> None:
-    run = team.up("--rate", "4", "--duration", "3600")
+def test_ps_logs_restart_move_and_down(deployment: Deployment) -> None:
+    run = deployment.up("--rate", "1", "--duration", "3600")
     in_flight(run)
-    rows = team.ps()
+    rows = deployment.ps()
     assert {role: row["host"] for role, row in rows.items()} == {
         "world": "h1",
         "recorder": "h1",
@@ -40,71 +43,76 @@ def test_ps_logs_restart_move_and_down(team: Team) -> None:
         "controller.main": "h2",
     }
     assert all(row["pid"] for row in rows.values())
-    team.zsim("logs", "estimator.drone3").line("estimator.drone3: in run")
-    team.zsim("restart", "estimator.drone3").ends(with_code=0)
+    deployment.zsim("logs", "estimator.drone3").line("estimator.drone3: in run")
+    deployment.zsim("restart", "estimator.drone3").ends(with_code=0)
     run.line("restart: estimator.drone3 on h3|superseded: estimator.drone3 on h3", START_S)
-    team.zsim("move", "estimator.drone3", "h2").ends(with_code=0)
+    deployment.zsim("move", "estimator.drone3", "h2").ends(with_code=0)
     run.line("superseded: estimator.drone3 on h2", START_S)
-    assert team.ps()["estimator.drone3"]["host"] == "h2"
-    refused = team.zsim("move", "world", "h2")
+    assert deployment.ps()["estimator.drone3"]["host"] == "h2"
+    refused = deployment.zsim("move", "world", "h2")
     refused.ends(with_code=2)
-    assert "world cannot be moved" in refused.text()
-    team.zsim("down").ends(with_code=0)
+    assert re.match("(h1: )?world ", refused.text())
+    deployment.zsim("down").ends(with_code=0)
     run.ends(with_code=130)
-    assert "ended by zsim down" in run.text()
-    assert team.record().end()["reason"] == "ended by zsim down"
+    reason = deployment.record().end()["reason"]
+    assert "zsim down" in reason
+    assert reason in run.text()
 
 
 @pytest.mark.soak  # what a broken session does to more of them at once is below
 @pytest.mark.parametrize("role", ["estimator.drone2", "controller.main"])
-def test_a_killed_role_is_started_again(team: Team, role: str) -> None:
-    run = team.up("--rate", "8", "--duration", "30")
+def test_a_killed_role_is_started_again(deployment: Deployment, role: str) -> None:
+    run = deployment.up("--rate", "8", "--duration", "30")
     in_flight(run)
-    team.kill(role)
+    deployment.kill(role)
     run.line(rf"{role} .* ended: killed by signal 9; on_death: restart", START_S)
     run.ends(with_code=0, within_s=START_S)
-    assert [event["subject"] for event in team.record().events("restart")] == [role]
+    assert [event["subject"] for event in deployment.record().events("restart")] == [role]
 
 
-def test_a_broken_ssh_session_is_the_death_of_its_roles(team: Team) -> None:
+def test_a_broken_ssh_session_is_the_death_of_its_roles(deployment: Deployment) -> None:
     """They end, since their launcher is gone; time stands still until there are new ones."""
-    run = team.up("--rate", "8", "--duration", "30")
+    run = deployment.up("--rate", "4", "--duration", "3600")
     in_flight(run)
-    for pid, line in namespaces.members(team.lab.namespace("h2")):
+    for pid, line in namespaces.members(deployment.lab.namespace("h2")):
         if re.match(r"sshd(-session)?: \w+@notty", line):
             os.kill(pid, signal.SIGKILL)
     run.line(r"controller.main .* ended: .*connection to h2 broke.*; on_death: restart", START_S)
-    run.ends(with_code=0, within_s=START_S)
-    record = team.record()
+    for role in ("controller.main", "estimator.drone2"):
+        run.line(f"(restart|superseded): {role} on h2", START_S)
+    run.signal(signal.SIGINT)
+    run.ends(with_code=130, within_s=START_S)
+    record = deployment.record()
     assert {event["subject"] for event in record.events("death")} == {"controller.main", "estimator.drone2"}
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("role", ["world", pytest.param("recorder", marks=pytest.mark.soak)])
-def test_without_world_or_recorder_the_run_ends(team: Team, role: str) -> None:
-    run = team.up("--rate", "4", "--duration", "3600")
+def test_without_world_or_recorder_the_run_ends(deployment: Deployment, role: str) -> None:
+    run = deployment.up("--rate", "4", "--duration", "3600")
     in_flight(run)
-    team.kill(role)
+    deployment.kill(role)
     run.ends(with_code=1, within_s=START_S)
     assert f"{role} " in run.text()
-    assert team.record().keys()["clock"] > 10
+    assert deployment.record().keys()["clock"] > 10
 
 
 @pytest.mark.parametrize("cut_s", [1.0, *(pytest.param(cut_s, marks=pytest.mark.soak) for cut_s in (5.0, 20.0))])
-def test_time_stands_still_while_a_host_is_cut_off(team: Team, tmp_path: Path, cut_s: float) -> None:
-    run = team.up("--rate", "5", "--duration", "25")
+def test_time_stands_still_while_a_host_is_cut_off(deployment: Deployment, tmp_path: Path, cut_s: float) -> None:
+    run = deployment.up("--rate", "5", "--duration", f"{FLIGHT_S:g}")
     in_flight(run)
-    cut_at_s = team.cut("h3")
+    cut_at_s = deployment.cut("h3")
     if cut_s > NAMED_AFTER_S:
         run.line("host h3 does not answer", START_S)
         run.line(r"waiting for estimator.drone3 on h3", START_S)
     threading.Event().wait(cut_at_s + cut_s - time.monotonic())
-    team.heal("h3")
+    deployment.heal("h3")
     if cut_s > NAMED_AFTER_S:
         run.line("host h3 answers again", START_S)
     run.ends(with_code=0, within_s=START_S)
-    record = team.record()
-    assert record.sha256() == in_process(tmp_path, 25.0)
+    record = deployment.record()
+    assert record.sha256() == in_process(tmp_path, FLIGHT_S)
+    assert {event["data"]["host"] for event in record.events("join")} == {"h1", "h2", "h3"}
     assert any(is_named(clock, "estimator.drone3", "h3") for clock in record.all("clock")) or cut_s < NAMED_AFTER_S
 
 
@@ -114,25 +122,25 @@ def is_named(clock: dict[str, Any], role: str, host: str) -> bool:
 
 
 @pytest.mark.soak
-def test_in_realtime_drones_land_while_their_controller_is_cut_off(team: Team) -> None:
+def test_in_realtime_drones_land_while_their_controller_is_cut_off(deployment: Deployment) -> None:
     """The firmware's watchdog lands them; what the controller says too late is refused; the world has it all.
 
     world, recorder, estimator.drone1 ─── h1        h2 ─── controller.main, estimator.drone2
                                              cut 5 s
     """
-    run = team.up("--realtime", "--duration", "28", "--set", "clusters.main.plan.takeoff_s=1")
+    run = deployment.up("--realtime", "--duration", "28", "--set", "clusters.main.plan.takeoff_s=1")
     run.line("real time  (assembling|engaged)", START_S)
-    cut_at_s = team.cut("h2")
+    cut_at_s = deployment.cut("h2")
     run.line("waiting for controller.main on h2|host h2 does not answer", START_S)
     threading.Event().wait(cut_at_s + CUT_IN_REALTIME_S - time.monotonic())
-    team.heal("h2")
+    deployment.heal("h2")
     run.ends(with_code=0, within_s=28.0 + START_S)
-    record = team.record()
+    record = deployment.record()
     for drone in DRONES:
         states = [status["state"] for status in record.all(f"drone/{drone}/sensor/status")]
         assert ("hovering", "landing") in itertools.pairwise(states)
     late = [event["text"] for event in record.events("refused") if event["source"] == "controller.main"]
-    assert any(re.search(r"age is \d+ ms; must be <= 500 ms", text) for text in late)
+    assert any(re.search(r"age is \d+ ms; .*500 ms", text) for text in late)
     steps = {clock["step"] for clock in record.all("clock")}
     assert steps == set(range(max(steps) + 1))
     assert max(steps) > 24 * GATES_PER_S
@@ -142,39 +150,40 @@ def test_in_realtime_drones_land_while_their_controller_is_cut_off(team: Team) -
 def test_a_host_whose_clock_is_an_hour_off_takes_part(lab: Lab, faketime: str, tmp_path: Path) -> None:
     """Certificates are back-dated by a day; nothing on the wire is wall time."""
     lab.environment("h3", LD_PRELOAD=faketime, FAKETIME="-1h", FAKETIME_DONT_FAKE_MONOTONIC="1")
-    with closing(Team(lab, ROLES)) as team:
-        run = team.up("--duration", "10")
+    with closing(Deployment(lab, ROLES)) as deployment:
+        run = deployment.up("--duration", "10")
         run.ends(with_code=0, within_s=START_S)
         assert re.search(r"warning: h3: its clock is -3[56]\d\d\.\d s off", run.text())
-        assert team.record().sha256() == in_process(tmp_path, 10.0)
+        assert deployment.record().sha256() == in_process(tmp_path, 10.0)
 
 
+@pytest.mark.soak
 def test_a_host_that_computes_otherwise_is_warned_of_and_shown(lab: Lab, tmp_path: Path) -> None:
     """To the processes of one host another version of a numeric package seems to be installed."""
     other = tmp_path / "filterpy-99.dist-info"
     other.mkdir()
     (other / "METADATA").write_text("Metadata-Version: 2.1\nName: filterpy\nVersion: 99\n")
     lab.environment("h3", PYTHONPATH=str(tmp_path))
-    with closing(Team(lab, ROLES)) as team:
-        run = team.up("--duration", "4")
+    with closing(Deployment(lab, ROLES)) as deployment:
+        run = deployment.up("--duration", "4")
         run.ends(with_code=0, within_s=START_S)
-        said = "estimator.drone3 on h3 computes with another numeric fingerprint; the same bits are not promised"
-        assert "warning: the hosts compute with different numeric fingerprints (" in run.text()
-        assert said in run.text()
-        assert [event["text"] for event in team.record().events("fingerprint")] == [said]
+        (event,) = deployment.record().events("fingerprint")
+        assert event["subject"] == "estimator.drone3"
+        assert event["text"] in run.text()
+        assert re.search("^warning: .*fingerprint", run.text(), re.MULTILINE)
 
 
 @pytest.mark.soak
 def test_a_killed_router_is_started_again(lab: Lab, tmp_path: Path) -> None:
     """Two hosts behind a router: what it had on the way when it died is fetched again."""
     routers = {"field": {"host": "h2"}}
-    with closing(Team(lab, ROLES, routers=routers, through={"h2": "field", "h3": "field"})) as team:
-        run = team.up("--rate", "8", "--duration", "30")
+    with closing(Deployment(lab, ROLES, routers=routers, through={"h2": "field", "h3": "field"})) as deployment:
+        run = deployment.up("--rate", "8", "--duration", "30")
         in_flight(run)
-        team.kill("router.field")
+        deployment.kill("router.field")
         run.line("router.field .* ended: killed by signal 9; on_death: restart", START_S)
         run.ends(with_code=0, within_s=START_S)
-        assert team.record().sha256() == in_process(tmp_path, 30.0)
+        assert deployment.record().sha256() == in_process(tmp_path, 30.0)
 
 
 def test_a_router_per_site_each_at_the_world(lab: Lab, tmp_path: Path) -> None:
@@ -183,10 +192,10 @@ def test_a_router_per_site_each_at_the_world(lab: Lab, tmp_path: Path) -> None:
     estimator.drone2, controller.main ─── router.a ─── world ─── router.b ─── estimator.drone3
     """
     routers = {"a": {"host": "h2"}, "b": {"host": "h3"}}
-    with closing(Team(lab, ROLES, routers=routers, through={"h2": "a", "h3": "b"})) as team:
-        run = team.up("--duration", "10")
+    with closing(Deployment(lab, ROLES, routers=routers, through={"h2": "a", "h3": "b"})) as deployment:
+        run = deployment.up("--duration", "10")
         run.ends(with_code=0, within_s=START_S)
-        assert team.record().sha256() == in_process(tmp_path, 10.0)
+        assert deployment.record().sha256() == in_process(tmp_path, 10.0)
 
 
 @pytest.mark.soak
@@ -195,21 +204,21 @@ def test_a_full_disk_at_the_recorder_ends_the_run_and_keeps_the_record(
 ) -> None:
     small_disk(lab.host_folder("h3"), DISK_BYTES)
     lab.environment("h3")  # a new sshd, which sees the new disk
-    with closing(Team(lab, {**ROLES, "recorder": "h3"})) as team:
-        run = team.up("--duration", "3600")
+    with closing(Deployment(lab, {**ROLES, "recorder": "h3"})) as deployment:
+        run = deployment.up("--duration", "3600")
         run.ends(with_code=1, within_s=START_S)
-        assert "No space left on device" in run.text()
-        assert team.record().keys()["clock"] > 50
+        assert os.strerror(errno.ENOSPC) in run.text()
+        assert deployment.record().keys()["clock"] > 50
 
 
 @pytest.mark.soak
 def test_over_a_poor_link_it_flies_in_realtime(lab: Lab) -> None:
     """50 ± 10 ms and 2 % loss each way to the host of an estimator."""
     lab.slow("h3", 50, 10, 0.02)
-    with closing(Team(lab, ROLES)) as team:
-        run = team.up("--realtime", "--duration", "18", "--set", "clusters.main.plan.takeoff_s=2")
+    with closing(Deployment(lab, ROLES)) as deployment:
+        run = deployment.up("--realtime", "--duration", "18", "--set", "clusters.main.plan.takeoff_s=2")
         run.ends(with_code=0, within_s=18.0 + START_S)
-        record = team.record()
+        record = deployment.record()
         assert record.all("cluster/main/state")[-1]["phase"] == "engaged"
         for drone in DRONES:
             assert record.all(f"drone/{drone}/sensor/status")[-1]["state"] in ("flying", "hovering")

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from deployment import DISK_BYTES, NAMED_AFTER_S, ROLES, START_S, Deployment, closing, in_flight, in_process
 from federation import Role
 from lab import Lab
-from team import DISK_BYTES, NAMED_AFTER_S, ROLES, START_S, Team, closing, in_flight, in_process
 
 pytestmark = pytest.mark.soak
 
@@ -85,62 +85,62 @@ def test_a_fault_at_a_random_time(
     repetition: int,
 ) -> None:
     chance = random.Random(f"{kind} {repetition}")
-    team = prepared(lab, kind, chance, small_disk, faketime)
+    deployment = prepared(lab, kind, chance, small_disk, faketime)
     tally.outcomes.append(Outcome(kind, False, None))
-    with closing(team):
-        run = team.up("--rate", str(RATE), "--duration", str(DURATION_S))
+    with closing(deployment):
+        run = deployment.up("--rate", str(RATE), "--duration", str(DURATION_S))
         in_flight(run)
         threading.Event().wait(chance.uniform(0.0, LATEST_S) / RATE)
-        named_after_s = strike(team, run, kind, chance)
+        named_after_s = strike(deployment, run, kind, chance)
         if kind != LAUNCHER:
-            judge(team, run, kind)
+            judge(deployment, run, kind)
     tally.outcomes[-1] = Outcome(kind, True, named_after_s)
 
 
 def prepared(
     lab: Lab, kind: str, chance: random.Random, small_disk: Callable[[Path, int], None], faketime: str
-) -> Team:
+) -> Deployment:
     """Return a lab in which a fault of this kind can come, or is there from the start."""
     if kind == ROUTER:
-        return Team(lab, ROLES, routers={"field": {"host": "h2"}}, through={"h2": "field", "h3": "field"})
+        return Deployment(lab, ROLES, routers={"field": {"host": "h2"}}, through={"h2": "field", "h3": "field"})
     if kind == CLOCK:
         offset = chance.choice(("-1h", "+1h"))
         lab.environment("h3", LD_PRELOAD=faketime, FAKETIME=offset, FAKETIME_DONT_FAKE_MONOTONIC="1")
     if kind == DISK:
         small_disk(lab.host_folder("h3"), round(DISK_BYTES * chance.uniform(1.0, 3.0)))
         lab.environment("h3")  # a new sshd, which sees the new disk
-        return Team(lab, {**ROLES, "recorder": "h3"})
-    return Team(lab, ROLES)
+        return Deployment(lab, {**ROLES, "recorder": "h3"})
+    return Deployment(lab, ROLES)
 
 
-def strike(team: Team, run: Role, kind: str, chance: random.Random) -> float | None:
+def strike(deployment: Deployment, run: Role, kind: str, chance: random.Random) -> float | None:
     """Let a fault happen; return the wall time [s] until a line names it."""
     if kind in (CLOCK, DISK):
         return None
     at_s = time.monotonic()
     if kind in CUTS_S:
         host = chance.choice(("h2", "h3"))
-        return cut_off(team, run, host, CUTS_S[kind])
+        return cut_off(deployment, run, host, CUTS_S[kind])
     if kind == LAUNCHER:
         run.signal(signal.SIGKILL)
         return None
-    team.kill(kind)
+    deployment.kill(kind)
     return run.line(rf"{kind} .*(killed by signal 9)", START_S).wall_s - at_s
 
 
-def cut_off(team: Team, run: Role, host: str, for_s: float) -> float | None:
+def cut_off(deployment: Deployment, run: Role, host: str, for_s: float) -> float | None:
     """Cut a host off for so long; return the wall time [s] until its line."""
-    at_s = team.cut(host)
-    said = run.line(f"host {host} does not answer", START_S).wall_s - at_s if for_s > NAMED_AFTER_S else None
+    at_s = deployment.cut(host)
+    output = run.line(f"host {host} does not answer", START_S).wall_s - at_s if for_s > NAMED_AFTER_S else None
     threading.Event().wait(at_s + for_s - time.monotonic())
-    team.heal(host)
-    return said
+    deployment.heal(host)
+    return output
 
 
-def judge(team: Team, run: Role, kind: str) -> None:
+def judge(deployment: Deployment, run: Role, kind: str) -> None:
     """Fail unless the run has ended as it must after a fault of this kind, with all that was recorded."""
     run.ends(with_code=1 if kind in (*ENDING, DISK) else 0, within_s=START_S + CUTS_S.get(kind, 0.0))
-    record = team.record()
+    record = deployment.record()
     assert record.keys()["clock"] > 1
     if kind in LOSING:
         assert [event["subject"] for event in record.events("restart")] == [kind]

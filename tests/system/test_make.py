@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-MARKED = "tests/system/test_kill.py"  # holds a group, soaks and others
+MARKED = "tests/system/test_sweep.py"  # holds a group, soaks and others
 
 
 @pytest.mark.parametrize("target", ["test", "soak"])
@@ -15,7 +15,7 @@ def test_its_tests_are_found(target: str) -> None:
     printed = subprocess.run(
         ["make", "-n", "--no-print-directory", target], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout
-    command = [*shlex.split(printed.splitlines()[-1]), "--collect-only", "-q", MARKED]
+    command = [*shlex.split(printed.splitlines()[-1]), "--collect-only", "-q", "-n", "0", MARKED]
     found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert found.returncode == 0, found.stdout[-2000:]
     assert f"{MARKED}::" in found.stdout

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from federation import PAIR, ROOT, Federation
+from federation import PAIR, Federation
+from forked_commands import ROOT
 
 MINE = "my_estimator:MyEstimator"
 CHOSEN = ("--set", f"estimation.algorithm={MINE}")

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from federation import ROOT, Federation
+from deployment import ROLES, START_S, STEP, Deployment, closing, in_process
+from federation import Federation
+from forked_commands import ROOT
 from lab import Lab
-from team import ROLES, START_S, STEP, Team, closing, in_process
 
 EXAMPLES = str(ROOT / "examples")
 SPACE = "clusters.main.space=leader_cluster:LeaderCluster"
@@ -76,7 +77,7 @@ def test_it_flies_on_several_hosts(lab: Lab, tmp_path: Path, monkeypatch: pytest
     """The module need be only where the controller is."""
     monkeypatch.syspath_prepend(EXAMPLES)
     lab.environment("h2", PYTHONPATH=EXAMPLES)
-    with closing(Team(lab, ROLES)) as team:
-        team.up(*options(SPACE, LAW)).ends(with_code=0, within_s=START_S)
-        assert team.record().all("cluster/main/state")[-1]["phase"] == "engaged"
-        assert team.record().sha256() == in_process(tmp_path, DURATION_S, [*FLIGHT, SPACE, LAW])
+    with closing(Deployment(lab, ROLES)) as deployment:
+        deployment.up(*options(SPACE, LAW)).ends(with_code=0, within_s=START_S)
+        assert deployment.record().all("cluster/main/state")[-1]["phase"] == "engaged"
+        assert deployment.record().sha256() == in_process(tmp_path, DURATION_S, [*FLIGHT, SPACE, LAW])

@@ -9,7 +9,8 @@ import sys
 from collections.abc import Iterator
 
 import pytest
-from federation import ONE, ROOT, Federation
+from federation import ONE, Federation
+from forked_commands import ROOT
 from wire import PATIENCE_S
 
 PROGRAM = ROOT / "examples" / "plain_client.py"
@@ -42,12 +43,12 @@ def test_it_is_a_page_of_zenoh_and_msgpack() -> None:
 def test_it_flies_and_holds_time(federation: Federation, request: pytest.FixtureRequest) -> None:
     world = federation.world(ONE, "--rate", "0.25", "--duration", "11", "--set", "processes.expect=[]")
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["t_ns"] > 0)  # nobody is expected: time runs
     program: subprocess.Popen[str] = request.getfixturevalue("plain_client")
     joined = events.until(lambda m: (m["kind"], m["subject"]) == ("join", NAME))
     assert joined.message["data"]["from_ns"] > 0
-    assert client.ask("world/control", "rate", value=4)["ok"]
+    assert client.request("world/control", "rate", value=4)["ok"]
     commander = events.until(lambda m: m["kind"] == "commander")
     assert commander.message["source"] == NAME
 
@@ -59,9 +60,9 @@ def test_it_flies_and_holds_time(federation: Federation, request: pytest.Fixture
     assert entry["since_wall_s"] > 0.9
     os.kill(program.pid, signal.SIGCONT)
 
-    said, _ = program.communicate(timeout=PATIENCE_S)
-    assert program.returncode == 0, said
-    assert re.fullmatch(r"t = 10\.0\d s, flying, accelerometer \[.*\]\n", said)
+    output, _ = program.communicate(timeout=PATIENCE_S)
+    assert program.returncode == 0, output
+    assert re.fullmatch(r"t = 10\.0\d s, flying, accelerometer \[.*\]\n", output)
     east, north, _ = client.get("drone/drone1/truth")["drone/drone1/truth"]["velocity_m_s"]
     assert north == pytest.approx(0.5, abs=0.3)  # m/s forward, the drone looks north
     assert east == pytest.approx(0.0, abs=0.3)

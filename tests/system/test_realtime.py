@@ -3,12 +3,20 @@
 import signal
 
 import pytest
-from federation import ONE, PAIR, PAIR_ROLES, Federation
+from federation import ONE, PAIR, PAIR_ROLES, Federation, Role
+from refused import parts
+from wire import Client
 
-pytestmark = pytest.mark.xdist_group("serial")
-
+FOR_LONG = ("--duration", "3600")
+SLOW = 0.02  # rate at which 500 ms of simulated time are 25 s of wall time
 NOBODY_FLIES = "processes.on_death={controller: drop}"
 GATE_NS = 20_000_000
+
+
+def stop(client: Client, role: Role) -> None:
+    """End a run by request."""
+    assert client.request("world/control", "stop")["ok"]
+    role.ends(with_code=0)
 
 
 @pytest.mark.parametrize("rate", [1, pytest.param(5, marks=pytest.mark.soak)])
@@ -19,8 +27,8 @@ def test_it_keeps_pace(federation: Federation, rate: int) -> None:
     record = federation.record()
     end = record.end()
     assert end["last_ns"] == duration_s * 10**9
-    assert end["wall_s"] == pytest.approx(duration_s / rate, rel=0.2)
-    # What a loaded machine may miss is no matter here; that it is measured and reported is.
+    # How late a loaded machine is, is no matter here; that nothing is early, and that it is measured and reported, is.
+    assert end["wall_s"] > 0.99 * duration_s / rate
     assert end["deadlines"] >= 3 * (duration_s * 50 - 3)
     assert 0 <= end["deadline_misses"] <= end["deadlines"] + duration_s * 50
     assert end["deadline_misses"] == sum(end["deadline_misses_by"].values())
@@ -33,85 +41,83 @@ def test_it_keeps_pace(federation: Federation, rate: int) -> None:
 
 def test_nobody_is_waited_for(federation: Federation) -> None:
     """A stopped estimator does not hold time; it is a deadline missed at every gate."""
-    run = federation.run(PAIR, "--realtime", "--rate", "2")
-    clock = federation.client().watch("clock")
+    run = federation.run(PAIR, "--realtime", "--rate", "2", *FOR_LONG)
+    client = federation.client()
+    clock = client.subscribe("clock")
     clock.until(lambda m: m["t_ns"] > 2e9)
     federation.kill("estimator.drone1", signal.SIGSTOP)
-    clock.until(lambda m: m["t_ns"] > 8e9)
+    stopped_ns = client.get("clock")["clock"]["t_ns"]
+    clock.until(lambda m: m["t_ns"] > stopped_ns + 4e9)
     federation.kill("estimator.drone1", signal.SIGCONT)
-    run.ends(with_code=0)
+    stop(client, run)
     end = federation.record().end()
-    assert end["last_ns"] == 12 * 10**9
-    assert end["deadline_misses_by"]["estimator.drone1"] > 100  # of the 300 gates that it slept through
+    assert end["deadline_misses_by"]["estimator.drone1"] >= 150  # of the 200 gates that it slept through
 
 
 def test_a_dead_controller_means_hover(federation: Federation) -> None:
     """The dead fly no drone any more, and a drone that nobody flies hovers."""
-    run = federation.run(PAIR, "--realtime", "--rate", "3", "--duration", "16", "--set", NOBODY_FLIES)
+    run = federation.run(PAIR, "--realtime", "--rate", "3", *FOR_LONG, "--set", NOBODY_FLIES)
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
-    states = client.watch("drone/drone1/sensor/status")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
+    states = client.subscribe("drone/drone1/sensor/status")
     clock.until(lambda m: m["t_ns"] > 6e9)
     federation.kill("controller.main")
     events.until(lambda m: (m["kind"], m["subject"]) == ("release", "drone1"))
     events.until(lambda m: (m["kind"], m["subject"]) == ("drop", "controller.main"))
-    run.ends(with_code=0)
-    seen = [heard.message["state"] for heard in states.now() if heard.message["t_ns"] > 6e9]
+    states.until(lambda m: m["state"] == "hovering" and m["t_ns"] > 6e9)
+    stop(client, run)
+    seen = [received.message["state"] for received in states.now() if received.message["t_ns"] > 6e9]
     assert list(dict.fromkeys(seen)) == ["flying", "hovering"]
-    assert federation.record().end()["last_ns"] == 16 * 10**9
 
 
 def test_a_silent_commander_means_hover_then_land(federation: Federation) -> None:
     """A controller that hangs still holds its drones: the firmware's watchdog lands them."""
-    run = federation.run(PAIR, "--realtime", "--rate", "3", "--duration", "18")
+    run = federation.run(PAIR, "--realtime", "--rate", "3", *FOR_LONG)
     client = federation.client()
-    states, clock = client.watch("drone/drone1/sensor/status"), client.watch("clock")
+    states, clock = client.subscribe("drone/drone1/sensor/status"), client.subscribe("clock")
     clock.until(lambda m: m["t_ns"] > 6e9)
     federation.kill("controller.main", signal.SIGSTOP)
     states.until(lambda m: m["state"] == "hovering" and m["t_ns"] > 6e9)
     landing = states.until(lambda m: m["state"] == "landing")
     states.until(lambda m: m["state"] == "landed")
     federation.kill("controller.main", signal.SIGCONT)
-    run.ends(with_code=0)
-    flown_ns = max(h.message["t_ns"] for h in states.heard if h.message["state"] == "flying")
-    hovering_ns = next(h.message["t_ns"] for h in states.heard if h.message["t_ns"] > flown_ns)
+    stop(client, run)
+    flown_ns = max(h.message["t_ns"] for h in states.received if h.message["state"] == "flying")
+    hovering_ns = next(h.message["t_ns"] for h in states.received if h.message["t_ns"] > flown_ns)
     assert landing.message["t_ns"] - hovering_ns == pytest.approx(2e9, abs=GATE_NS)
 
 
 def test_old_commands_are_refused_by_age(federation: Federation) -> None:
-    world = federation.world(ONE, "--realtime", "--rate", "0.5", "--duration", "30")
+    world = federation.world(ONE, "--realtime", "--rate", "1", *FOR_LONG)
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["t_ns"] > 1e9)
     client.put("drone/drone1/cmd/mode", t_ns=0, source="tester.old", mode="takeoff")
     refused = events.until(lambda m: m["kind"] == "refused")
     assert refused.message["source"] == "tester.old"
-    assert "must be <= 500 ms" in refused.message["data"]["reason"]
+    assert "500 ms" in refused.message["data"]["reason"]
+    assert client.request("world/control", "rate", value=SLOW)["ok"]
     now_ns = client.get("clock")["clock"]["t_ns"]
     client.put("drone/drone1/cmd/mode", t_ns=now_ns, source="tester.new", mode="takeoff")
+    assert client.request("world/control", "rate", value=5)["ok"]
     assert events.until(lambda m: m["kind"] == "mode").message["source"] == "tester.new"
-    client.ask("world/control", "stop")
-    world.ends(with_code=0)
+    stop(client, world)
 
 
 def test_pause_and_resume(federation: Federation) -> None:
     world = federation.world(ONE, "--realtime", "--rate", "5", "--duration", "1000")
     client = federation.client()
-    clock = client.watch("clock")
+    clock = client.subscribe("clock")
     clock.until(lambda m: m["t_ns"] > 1e9)
-    assert client.ask("world/control", "pause")["ok"]
+    assert client.request("world/control", "pause")["ok"]
     first = clock.until(lambda m: m["state"] == "paused")
     later = clock.until(lambda m: m["state"] == "paused")
-    assert later.wall_s - first.wall_s > 0.5
     assert later.message["t_ns"] == first.message["t_ns"]
-    assert client.ask("world/control", "step", gates=3)["ok"]
+    assert client.request("world/control", "step", gates=3)["ok"]
     clock.until(lambda m: m["state"] == "paused" and m["t_ns"] == first.message["t_ns"] + 3 * GATE_NS)
-    assert client.ask("world/control", "resume")["ok"]
+    assert client.request("world/control", "resume")["ok"]
     resumed = clock.until(lambda m: m["state"] == "running")
-    second = clock.until(lambda m: m["t_ns"] >= resumed.message["t_ns"] + 5e9)
-    assert second.wall_s - resumed.wall_s > 0.7  # of 1 s: no burst makes up for the pause
-    assert client.ask("world/control", "rate", value=0)["error"].startswith("value is 0; must be from 0 (")
-    assert client.ask("world/control", "rate", value=50)["ok"]
-    clock.until(lambda m: m["t_ns"] >= second.message["t_ns"] + 20e9)
-    client.ask("world/control", "stop")
-    world.ends(with_code=0)
+    assert parts(client.request("world/control", "rate", value=0)["error"]) == ("value", "0")
+    assert client.request("world/control", "rate", value=50)["ok"]
+    clock.until(lambda m: m["t_ns"] >= resumed.message["t_ns"] + 20e9)
+    stop(client, world)

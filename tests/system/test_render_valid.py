@@ -19,7 +19,8 @@ from typing import NamedTuple
 import kubernetes_validate
 import pytest
 import yaml
-from federation import PAIR, ZSIM, free_port
+from federation import PAIR, free_port
+from forked_commands import ZSIM
 from wire import PATIENCE_S
 
 from zsim.record import RecordReader
@@ -78,19 +79,19 @@ def test_units_are_verified(tmp_path: Path, host: str, insecure: bool) -> None:
 
 @needs_systemd
 @pytest.mark.parametrize(
-    ("right", "wrong", "told"),
+    ("right", "wrong", "message"),
     [
         ("ProtectSystem=strict", "ProtectSystem=strickt", "Failed to parse"),
         ("Restart=on-failure", "Restrat=on-failure", "Unknown key"),
         (f"ExecStart={sys.executable}", "ExecStart=python", "python"),
     ],
 )
-def test_a_fault_in_a_unit_is_found(tmp_path: Path, right: str, wrong: str, told: str) -> None:
+def test_a_fault_in_a_unit_is_found(tmp_path: Path, right: str, wrong: str, message: str) -> None:
     host = rendered(tmp_path, "systemd") / "two"
     unit = host / "zsim-controller.main.service"
     assert right in unit.read_text()
     unit.write_text(unit.read_text().replace(right, wrong).replace("ExecStart=python ", "ExecStart=/no/such/python "))
-    assert told in verify(host)
+    assert message in verify(host)
 
 
 # Compose and Kubernetes
@@ -135,7 +136,7 @@ def test_a_fault_in_a_manifest_is_found(tmp_path: Path) -> None:
 
 
 def test_the_secrets_are_made_from_the_files_of_certs_init(tmp_path: Path) -> None:
-    """The script is run with a kubectl that looks whether the files are there and does what it is told of them."""
+    """The script is run with a kubectl that looks whether the files are there and does what it is message of them."""
     out = rendered(tmp_path, "kubernetes")
     certs(tmp_path, STEP)
     (tmp_path / "kubectl").write_text(f"""#!{sys.executable}
@@ -242,21 +243,21 @@ def test_a_unit_s_command_is_one_that_the_role_takes(tmp_path: Path, name: str, 
     """Nobody listens there, and the role says so, which it does when it is content with its options."""
     unit = laid_out(tmp_path, PAIR, insecure)[name]
     with started(unit("--wait", "0.1")) as role:
-        said, _ = role.communicate(timeout=PATIENCE_S)
+        printed, _ = role.communicate(timeout=PATIENCE_S)
     endpoint = unit.words[unit.words.index("--connect") + 1]
-    assert role.returncode == 2, said
+    assert role.returncode == 2, printed
     expected = f"no world of federation 'zsim' on {endpoint} within 0.1 s; start one with `zsim world`"
-    assert said.splitlines()[-1] == expected
+    assert printed.splitlines()[-1] == expected
 
 
 def test_a_certificate_that_is_not_there_is_a_line(tmp_path: Path) -> None:
     unit = laid_out(tmp_path, PAIR, insecure=False)["estimator.drone1"]
     (tmp_path / "one/certs/estimator.drone1/key.pem").unlink()
     with started(unit("--wait", "0.1")) as role:
-        said, _ = role.communicate(timeout=PATIENCE_S)
-    assert role.returncode == 2, said
-    assert "key.pem" in said
-    assert "Traceback" not in said
+        printed, _ = role.communicate(timeout=PATIENCE_S)
+    assert role.returncode == 2, printed
+    assert "key.pem" in printed
+    assert "Traceback" not in printed
 
 
 @SECURITY
@@ -274,10 +275,12 @@ def test_the_units_of_three_hosts_fly(tmp_path: Path, insecure: bool) -> None:
     }
     with ExitStack() as stack:
         roles = {name: stack.enter_context(started(unit())) for name, unit in sorted(found.items())}
-        said = {name: role.communicate(timeout=PATIENCE_S)[0] for name, role in roles.items() if name != "router.yard"}
+        printed = {
+            name: role.communicate(timeout=PATIENCE_S)[0] for name, role in roles.items() if name != "router.yard"
+        }
         roles["router.yard"].terminate()
-        said["router.yard"] = roles["router.yard"].communicate(timeout=PATIENCE_S)[0]
-        assert {name: role.returncode for name, role in roles.items()} == dict.fromkeys(found, 0), said
+        printed["router.yard"] = roles["router.yard"].communicate(timeout=PATIENCE_S)[0]
+        assert {name: role.returncode for name, role in roles.items()} == dict.fromkeys(found, 0), printed
     with RecordReader(tmp_path / "state/runs/pair-f00d/run.mcap") as record:
         assert record.complete
         assert record.topics()["drone/drone2/estimate"] >= 300
@@ -290,7 +293,7 @@ def test_a_world_ends_by_the_signal_of_its_unit(tmp_path: Path) -> None:
     assert "KillSignal=SIGTERM" in text
     with started(found["world"]()) as world:
         assert world.stdout is not None
-        assert any("world of 'zsim' on tcp/127.0.0.1:" in line for line in world.stdout)
+        assert any("tcp/127.0.0.1:" in line for line in world.stdout)
         world.terminate()
         assert "ended: terminated" in world.stdout.read()
         assert world.wait(systemd.STOP_S) == 0

@@ -1,5 +1,6 @@
 """A record played back onto the keys: the same bytes, for whoever would listen to a flight."""
 
+import re
 import shutil
 from collections import defaultdict
 from pathlib import Path
@@ -36,20 +37,20 @@ class Ear:
     """Keeps the payloads of some keys, byte by byte."""
 
     def __init__(self, client: Client, *expressions: str) -> None:
-        self.heard: defaultdict[str, list[bytes]] = defaultdict(list)
+        self.received: defaultdict[str, list[bytes]] = defaultdict(list)
         self._kept = [client.session.declare_subscriber(f"zsim/{each}", self._take) for each in expressions]
 
     def _take(self, sample: zenoh.Sample) -> None:
-        self.heard[str(sample.key_expr).removeprefix("zsim/")].append(sample.payload.to_bytes())
+        self.received[str(sample.key_expr).removeprefix("zsim/")].append(sample.payload.to_bytes())
 
 
 def recorded(folder: Path, *expressions: str) -> dict[str, list[bytes]]:
-    said: defaultdict[str, list[bytes]] = defaultdict(list)
+    output: defaultdict[str, list[bytes]] = defaultdict(list)
     with RecordReader(folder / "run.mcap") as reader:
         wanted = [key for key in reader.topics() if any(matches(each, key) for each in expressions)]
         for m in reader.messages(wanted):
-            said[m.key].append(m.payload)
-    return dict(said)
+            output[m.key].append(m.payload)
+    return dict(output)
 
 
 def matches(expression: str, key: str) -> bool:
@@ -57,7 +58,7 @@ def matches(expression: str, key: str) -> bool:
 
 
 def resume(client: Client) -> None:
-    assert client.ask("world/control", "resume")["ok"]
+    assert client.request("world/control", "resume")["ok"]
 
 
 def without_source(payload: bytes) -> dict[str, Any]:
@@ -79,7 +80,7 @@ def test_the_same_payloads(federation: Federation, flown: Path) -> None:
     """
     role = replay(federation, flown, "--rate", "0", "--paused")
     client = federation.client()
-    ear, clock, views = Ear(client, *RESAID), client.watch("clock"), client.watch("view/**")
+    ear, clock, views = Ear(client, *RESAID), client.subscribe("clock"), client.subscribe("view/**")
     info = client.info()
     original = msgpack.unpackb(recorded(flown, "world/info")["world/info"][0])
     assert info["replay_of"] == original["run_id"] != info["run_id"]
@@ -89,11 +90,11 @@ def test_the_same_payloads(federation: Federation, flown: Path) -> None:
     resume(client)
     clock.until(lambda m: m["state"] == "stopped")
     role.ends(with_code=0)
-    assert "ended: the record is over" in role.text()
+    assert re.search("^ended: .*record", role.text(), re.MULTILINE)
     for key, payloads in first.items():
         rest = [payload for payload in payloads if msgpack.unpackb(payload)["t_ns"] > 0]
-        said = [payload for payload in ear.heard[key] if msgpack.unpackb(payload)["t_ns"] > 0]
-        assert said == rest, key
+        output = [payload for payload in ear.received[key] if msgpack.unpackb(payload)["t_ns"] > 0]
+        assert output == rest, key
     assert {view.key for view in views.now()} >= {"view/drones", "view/cluster/main"}
 
 
@@ -106,18 +107,18 @@ def test_a_part_of_it(federation: Federation, flown: Path) -> None:
     options = [part for key in keys for part in ("--keys", key)]
     role = replay(federation, flown, "--from", "5", "--to", "6", "--rate", "4", "--paused", *options)
     client = federation.client()
-    ear, clock = Ear(client, "drone/**", "cluster/**"), client.watch("clock")
+    ear, clock = Ear(client, "drone/**", "cluster/**"), client.subscribe("clock")
     stood = clock.until(lambda m: m["state"] == "paused")
     assert stood.message["t_ns"] == 5_000_000_000
     assert client.get("drone/drone1/truth")["drone/drone1/truth"]["t_ns"] == 5_000_000_000
     resume(client)
     over = clock.until(lambda m: m["state"] == "stopped")
     role.ends(with_code=0)
-    assert "ended: played to 6 s" in role.text()
+    assert re.search("^ended: .*6 s", role.text(), re.MULTILINE)
     assert over.wall_s - stood.wall_s > 0.24  # 1 s at 4, but for the gate that time stood at
-    assert {key.split("/", 2)[2] for key in ear.heard} == {"truth", "sensor/gps"}
+    assert {key.split("/", 2)[2] for key in ear.received} == {"truth", "sensor/gps"}
     wanted = recorded(flown, *keys)
-    for key, payloads in ear.heard.items():
+    for key, payloads in ear.received.items():
         in_time = [p for p in wanted[key] if 5_000_000_000 < msgpack.unpackb(p)["t_ns"] <= 6_000_000_000]
         assert [p for p in payloads if msgpack.unpackb(p)["t_ns"] > 5_000_000_000] == in_time
 
@@ -131,9 +132,9 @@ def test_echo(federation: Federation, flown: Path) -> None:
     echo = federation.role("echo", "drone/drone2/sensor/imu", "--raw", "-n", "20")
     echo.ends(with_code=0)
     on_record = {payload.hex() for payload in recorded(flown, "drone/drone2/sensor/imu")["drone/drone2/sensor/imu"]}
-    said = [line.text.split('"message": "')[1].rstrip('"}') for line in echo.lines if '"message"' in line.text]
-    assert len(said) == 20
-    assert set(said) <= on_record
+    output = [line.text.split('"message": "')[1].rstrip('"}') for line in echo.lines if '"message"' in line.text]
+    assert len(output) == 20
+    assert set(output) <= on_record
 
 
 def test_an_estimator_under_test(federation: Federation, flown: Path) -> None:
@@ -168,7 +169,7 @@ def test_an_estimator_without_gps(federation: Federation, flown: Path) -> None:
     kinds = [part for kind in ("imu", "mag", "baro", "flow", "status") for part in ("--keys", f"drone/*/sensor/{kind}")]
     role = replay(federation, flown, "--rate", "0", "--expect", "estimator.drone1", "--to", "4", *kinds)
     client = federation.client()
-    estimates = client.watch("drone/drone1/estimate")
+    estimates = client.subscribe("drone/drone1/estimate")
     federation.role("estimator", "drone1").ends(with_code=0)
     role.ends(with_code=0)
     last = estimates.until(lambda m: m["t_ns"] == 4_000_000_000).message
@@ -188,32 +189,32 @@ def test_what_may_be_asked(federation: Federation, flown: Path) -> None:
     """
     role = replay(federation, flown, "--rate", "2")
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["t_ns"] > 0)
-    assert client.ask("world/control", "pause")["ok"]
+    assert client.request("world/control", "pause")["ok"]
     stood_ns = clock.until(lambda m: m["state"] == "paused").message["t_ns"]
-    assert client.ask("world/control", "step", gates=3)["ok"]
+    assert client.request("world/control", "step", gates=3)["ok"]
     assert clock.until(lambda m: m["t_ns"] > stood_ns + 2 * GATE_NS).message["t_ns"] == stood_ns + 3 * GATE_NS
-    assert client.ask("world/control", "seek", t_s=8)["ok"]
-    assert client.ask("world/control", "step")["ok"]
+    assert client.request("world/control", "seek", t_s=8)["ok"]
+    assert client.request("world/control", "step")["ok"]
     clock.until(lambda m: m["t_ns"] == 8_000_000_000)
     assert client.get("drone/drone1/truth")["drone/drone1/truth"]["t_ns"] == 8_000_000_000
     for t_s in (99, "noon"):
-        assert parts(client.ask("world/control", "seek", t_s=t_s)["error"]) == ("t_s", repr(t_s))
+        assert parts(client.request("world/control", "seek", t_s=t_s)["error"]) == ("t_s", repr(t_s))
     for key, op, args in (
         ("world/control", "acquire", {"drone": "drone1", "priority": 10}),
         ("world/control", "fault_add", {"kind": "gps_dropout", "target": "drone1"}),
         ("cluster/main/control", "takeoff", {}),
     ):
-        assert client.ask(key, op, **args)["error"] == "a replay: nobody can be flown"
+        assert "replay" in client.request(key, op, **args)["error"]
     client.put("drone/drone1/cmd/mode", t_ns=0, source="tester.one", mode="land")
     refused = events.until(lambda m: m["kind"] == "refused" and m["source"] == "tester.one").message
-    assert refused["data"]["reason"] == "a replay: nobody can be flown"
-    assert client.ask("world/control", "seek", t_s=2)["ok"]
-    assert client.ask("world/control", "rate", value=3)["ok"]
+    assert "replay" in refused["data"]["reason"]
+    assert client.request("world/control", "seek", t_s=2)["ok"]
+    assert client.request("world/control", "rate", value=3)["ok"]
     resume(client)
     clock.until(lambda m: 2_000_000_000 < m["t_ns"] < 3_000_000_000)
-    assert client.ask("world/control", "stop", reason="seen enough")["ok"]
+    assert client.request("world/control", "stop", reason="seen enough")["ok"]
     assert events.until(lambda m: m["kind"] == "end").message["data"]["replay_of"]
     role.ends(with_code=0)
 
@@ -225,9 +226,9 @@ def test_a_recorder_that_comes_late(federation: Federation, flown: Path) -> None
     """
     role = replay(federation, flown, "--from", "2", "--to", "9", "--rate", "0", "--paused")
     client = federation.client()
-    clock, events = client.watch("clock"), client.watch("world/event")
+    clock, events = client.subscribe("clock"), client.subscribe("world/event")
     clock.until(lambda m: m["state"] == "paused")
-    assert client.ask("world/control", "step", gates=300)["ok"]
+    assert client.request("world/control", "step", gates=300)["ok"]
     clock.until(lambda m: m["t_ns"] == 8_000_000_000)
     recorder = federation.role("record", "--out", str(federation.out))
     events.until(lambda m: m["kind"] == "join" and m["subject"] == "recorder")
@@ -253,15 +254,15 @@ def test_all_roles_beside_a_replay(federation: Federation, flown: Path) -> None:
     role = replay(federation, flown, "--rate", "0", "--to", "6", *expect)
     client = federation.client()
     answers = ("cluster/main/state", "drone/drone1/estimate", "drone/drone2/estimate")
-    watches = {key: client.watch(key) for key in answers}
+    watches = {key: client.subscribe(key) for key in answers}
     split = [name.split(".") for name in PAIR_ROLES]
     others = [federation.role(role_, thing) for role_, thing in split]
     for each in (role, *others):
         each.ends(with_code=0)
     for key, watch in watches.items():
         watch.until(lambda m: m["t_ns"] == 6_000_000_000)
-        said = [unsigned(heard.message) for heard in watch.heard]
-        assert said == [*map(without_source, recorded(flown, key)[key][:301])]
+        output = [unsigned(received.message) for received in watch.received]
+        assert output == [*map(without_source, recorded(flown, key)[key][:301])]
 
 
 def test_a_record_that_was_cut(federation: Federation, flown: Path) -> None:
@@ -275,7 +276,7 @@ def test_a_record_that_was_cut(federation: Federation, flown: Path) -> None:
     (cut / "run.mcap").write_bytes(whole[: len(whole) // 2])
     role = replay(federation, cut, "--rate", "0")
     role.ends(with_code=0)
-    assert "ended: the record is over" in role.text()
+    assert re.search("^ended: .*record", role.text(), re.MULTILINE)
     for folder, options, text in (
         (federation.folder, [], "holds no run.mcap"),
         (flown, ["--from", "100"], "holds no gate from 100 s on; nothing can be played"),

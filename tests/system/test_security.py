@@ -4,19 +4,20 @@ import contextlib
 import re
 import signal
 import socket
-import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import forked_commands
 import pytest
 import zenoh
-from federation import ONE, PAIR, PAIR_ROLES, ROOT, ZSIM, Federation, Role
+from federation import ONE, PAIR, PAIR_ROLES, Federation, Role
+from forked_commands import USER_FAULT, refusal
+from refused import missing, parts
 from rights_table import KEYS, ROLES, SCENARIO, keys_of
-from secured import HOST, PREFIX, READY, SHORT_S, SITE, Certificates, Heard, Tryer, hub, site, tls_endpoint
-from wire import PATIENCE_S
+from secured import HOST, PREFIX, READY, SHORT_S, SITE, Certificates, KeyLog, RawClient, hub, site, tls_endpoint
 
 from zsim.scenario import rights, scenario_file
 from zsim.scenario.rights import permits
@@ -26,7 +27,6 @@ from zsim_deploy.security.enrolment import access_control
 
 WAYS = ("at the world", "through a router")
 TOKENS = tuple(key for key in KEYS if key.startswith("process/") and key.count("/") == 1)
-USER_FAULT = 2  # exit code
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
 
 
 @contextmanager
-def reached(made: Certificates, role: str, way: str) -> Iterator[tuple[Tryer, Any]]:
+def reached(made: Certificates, role: str, way: str) -> Iterator[tuple[RawClient, Any]]:
     """Yield a program with the certificate of a role, and the session of the world that it reaches one way."""
     with ExitStack() as stack:
         direct = way == WAYS[0]
@@ -43,9 +43,9 @@ def reached(made: Certificates, role: str, way: str) -> Iterator[tuple[Tryer, An
         link.declare_queryable("clock", lambda query: answer_once(query, "clock"))
         if not direct:
             endpoint = stack.enter_context(site(made, endpoint, [role]))
-        tryer = stack.enter_context(Tryer(endpoint, made.of(role)))
-        tryer.settle()
-        yield tryer, link
+        client = stack.enter_context(RawClient(endpoint, made.of(role)))
+        client.settle()
+        yield client, link
 
 
 def answer_once(query: Any, key: str) -> None:
@@ -66,62 +66,62 @@ def tell_last(link: Any, key: str) -> None:
 @pytest.mark.parametrize("role", ROLES)
 def test_what_a_role_may_publish(made: Certificates, role: str, way: str) -> None:
     fence = f"process/{role}/health"
-    with reached(made, role, way) as (tryer, link):
-        heard, ready = Heard(), Heard()
+    with reached(made, role, way) as (client, link):
+        received, ready = KeyLog(), KeyLog()
         for expression in ("@batch", "**"):
             link.declare_subscriber(
-                expression, lambda sample: (ready if sample.payload == READY else heard).take(sample.key)
+                expression, lambda sample: (ready if sample.payload == READY else received).take(sample.key)
             )
-        tryer.until_heard(fence, ready)
-        for act in (tryer.put, tryer.publish):
+        client.publish_until_received(fence, ready)
+        for act in (client.put, client.publish):
             for key in KEYS:
                 if key != fence:
                     act(key)
             act(fence)
-            assert heard.until_fence(fence) == keys_of(role, "p")
+            assert received.until_fence(fence) == keys_of(role, "p")
 
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
 def test_what_a_role_may_read(made: Certificates, role: str, way: str) -> None:
     fence = "world/event"
-    with reached(made, role, way) as (tryer, link):
-        heard = Heard()
+    with reached(made, role, way) as (client, link):
+        received = KeyLog()
         for key in KEYS:
-            tryer.subscribe(key, heard)
+            client.subscribe(key, received)
         for expression in ("**", "@batch", "drone/*/truth", "drone/**", "*/*/*/*"):
-            tryer.subscribe(expression, Heard())
-        tryer.settle()
+            client.subscribe(expression, KeyLog())
+        client.settle()
         for key in KEYS:
             if key != fence:
                 link.put_raw(key, key.encode())
         tell_last(link, fence)
-        assert heard.until_fence(fence) == keys_of(role, "r")
+        assert received.until_fence(fence) == keys_of(role, "r")
 
 
 @pytest.mark.parametrize("role", ROLES)
 def test_a_wildcard_brings_no_more_than_its_parts(made: Certificates, role: str) -> None:
-    with reached(made, role, WAYS[0]) as (tryer, link):
-        heard, fence = Heard(), Heard()
+    with reached(made, role, WAYS[0]) as (client, link):
+        received, fence = KeyLog(), KeyLog()
         for expression in ("**", "@batch", "drone/**", "drone/*/*", "process/**", "*"):
-            tryer.subscribe(expression, heard)
-        tryer.subscribe("world/event", fence)
-        tryer.settle()
+            client.subscribe(expression, received)
+        client.subscribe("world/event", fence)
+        client.settle()
         for key in KEYS:
             if key != "world/event":
                 link.put_raw(key, key.encode())
         tell_last(link, "world/event")
         fence.until_fence("world/event")
-        heard.take("the end")
-        assert heard.until_fence("the end") - {"the end"} <= keys_of(role, "r")
+        received.take("the end")
+        assert received.until_fence("the end") - {"the end"} <= keys_of(role, "r")
 
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
 def test_what_a_role_may_get(made: Certificates, role: str, way: str) -> None:
     fence = f"process/{role}/replay"
-    with reached(made, role, way) as (tryer, link):
-        asked, answered = Heard(), Heard()
+    with reached(made, role, way) as (client, link):
+        asked, answered = KeyLog(), KeyLog()
 
         def answer(query: Any) -> None:
             asked.take(query.expression)
@@ -129,12 +129,12 @@ def test_what_a_role_may_get(made: Certificates, role: str, way: str) -> None:
 
         for expression in ("@batch", "**"):
             link.declare_queryable(expression, answer)
-        tryer.until_answered(fence)
-        asked = Heard()
+        client.until_answered(fence)
+        asked = KeyLog()
         for key in KEYS:
             if key != fence:
-                tryer.ask(key, answered)
-        tryer.ask(fence, answered)
+                client.ask(key, answered)
+        client.ask(fence, answered)
         assert asked.until_fence(fence) == keys_of(role, "g")
         assert answered.until(lambda came: came >= keys_of(role, "g")) == keys_of(role, "g")
 
@@ -142,52 +142,52 @@ def test_what_a_role_may_get(made: Certificates, role: str, way: str) -> None:
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
 def test_what_a_role_may_answer(made: Certificates, role: str, way: str) -> None:
-    with reached(made, role, way) as (tryer, link):
+    with reached(made, role, way) as (client, link):
         for key in KEYS:
             if key != "clock":
-                tryer.answer(key)
-        tryer.settle()
+                client.answer(key)
+        client.settle()
         assert {sample.key for key in KEYS if key != "clock" for sample in link.get(key)} == keys_of(role, "a")
 
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("role", ROLES)
 def test_whose_life_a_role_may_show(made: Certificates, role: str, way: str) -> None:
-    with reached(made, role, way) as (tryer, link):
-        heard = Heard()
-        link.on_token("process/*", lambda key, alive: heard.take(key))
+    with reached(made, role, way) as (client, link):
+        received = KeyLog()
+        link.on_token("process/*", lambda key, alive: received.take(key))
         for key in sorted(TOKENS, key=lambda key: key in keys_of(role, "t")):
-            tryer.token(key)
-        assert heard.until(lambda came: came >= keys_of(role, "t")) == keys_of(role, "t")
+            client.token(key)
+        assert received.until(lambda came: came >= keys_of(role, "t")) == keys_of(role, "t")
 
 
 @pytest.mark.parametrize("role", ROLES)
 def test_whose_life_a_role_may_see(made: Certificates, role: str) -> None:
-    with reached(made, role, WAYS[0]) as (tryer, link):
-        heard, fence = Heard(), Heard()
-        tryer.watch("process/*", heard)
-        tryer.subscribe("world/event", fence)
-        tryer.settle()
+    with reached(made, role, WAYS[0]) as (client, link):
+        received, fence = KeyLog(), KeyLog()
+        client.subscribe_tokens("process/*", received)
+        client.subscribe("world/event", fence)
+        client.settle()
         for key in TOKENS:
             link.declare_token(key)
         link.put_raw("world/event", b"event")
         fence.until_fence("world/event")
         if keys_of(role, "w"):
-            assert heard.until(lambda came: came >= keys_of(role, "w")) == keys_of(role, "w")
-        heard.take("the end")
-        assert heard.until_fence("the end") == {"the end"}
+            assert received.until(lambda came: came >= keys_of(role, "w")) == keys_of(role, "w")
+        received.take("the end")
+        assert received.until_fence("the end") == {"the end"}
 
 
 def test_a_router_s_own_certificate_opens_no_more_than_its_clients_have(made: Certificates) -> None:
     fence = "process/estimator.drone1/health"
-    with hub(made, [], ["estimator.drone1"]) as (endpoint, link), Tryer(endpoint, made.of(SITE)) as tryer:
-        heard = Heard()
-        link.declare_subscriber("**", lambda sample: heard.take(sample.key))
+    with hub(made, [], ["estimator.drone1"]) as (endpoint, link), RawClient(endpoint, made.of(SITE)) as client:
+        received = KeyLog()
+        link.declare_subscriber("**", lambda sample: received.take(sample.key))
         for key in KEYS:
             if key != fence:
-                tryer.put(key)
-        tryer.put(fence)
-        assert heard.until_fence(fence) == keys_of("estimator.drone1", "p")
+                client.put(key)
+        client.put(fence)
+        assert received.until_fence(fence) == keys_of("estimator.drone1", "p")
 
 
 # Who is let in at all
@@ -198,14 +198,14 @@ OUTSIDERS = ("no certificate", "another authority", "plaintext", "plaintext with
 @pytest.mark.parametrize("who", OUTSIDERS)
 def test_an_outsider_gets_nothing(made: Certificates, tmp_path: Path, who: str) -> None:
     with hub(made) as (endpoint, link):
-        heard = Heard()
-        link.declare_subscriber("**", lambda sample: heard.take(sample.key))
+        received = KeyLog()
+        link.declare_subscriber("**", lambda sample: received.take(sample.key))
         place, folder = outsider(who, made, tmp_path, endpoint)
-        with pytest.raises(zenoh.ZError), Tryer(place, folder, SHORT_S) as tryer:
-            tryer.put("drone/drone1/cmd/mode")
-        with Tryer(endpoint, made.of("operator.main")) as tryer:
-            tryer.put("process/operator.main/health")
-            assert heard.until_fence("process/operator.main/health") == {"process/operator.main/health"}
+        with pytest.raises(zenoh.ZError), RawClient(place, folder, SHORT_S) as client:
+            client.put("drone/drone1/cmd/mode")
+        with RawClient(endpoint, made.of("operator.main")) as client:
+            client.put("process/operator.main/health")
+            assert received.until_fence("process/operator.main/health") == {"process/operator.main/health"}
 
 
 def outsider(who: str, made: Certificates, tmp_path: Path, endpoint: str) -> tuple[str, Path | None]:
@@ -227,10 +227,10 @@ def outsider(who: str, made: Certificates, tmp_path: Path, endpoint: str) -> tup
 
 def test_a_certificate_without_rights_gets_nothing(made: Certificates) -> None:
     with hub(made, ["operator.main"]) as (endpoint, link):
-        heard, got, links = Heard(), Heard(b"world"), Heard()
-        link.declare_subscriber("**", lambda sample: sample.payload != b"world" and heard.take(sample.key))
+        received, got, links = KeyLog(), KeyLog(b"world"), KeyLog()
+        link.declare_subscriber("**", lambda sample: sample.payload != b"world" and received.take(sample.key))
         link.on_link(lambda up: links.take("up" if up else "down"))
-        with Tryer(endpoint, made.of("estimator.drone1")) as stranger:
+        with RawClient(endpoint, made.of("estimator.drone1")) as stranger:
             links.until_fence("up")
             for expression in (*KEYS, "**"):
                 stranger.subscribe(expression, got)
@@ -238,83 +238,63 @@ def test_a_certificate_without_rights_gets_nothing(made: Certificates) -> None:
                 stranger.put(key)
                 link.put_raw(key, b"world")
         links.until_fence("down")  # the world has taken all that came on the link
-        heard.take("the end")
+        received.take("the end")
         got.take("the end")
-        assert heard.until_fence("the end") == {"the end"}
+        assert received.until_fence("the end") == {"the end"}
         assert got.until_fence("the end") == {"the end"}
 
 
 # What a bad certificate says
 
 
-def refused(*arguments: str) -> str:
-    """Run a command that must be refused at once; return its one line."""
-    done = subprocess.run(
-        [*ZSIM, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
-    assert done.returncode == USER_FAULT, done.stderr
-    assert done.stdout == ""
-    lines = [line for line in done.stderr.splitlines() if not line.startswith("waiting for a world of")]
-    assert len(lines) == 1, done.stderr
-    return lines[0]
-
-
 def test_a_certificate_whose_time_is_over_says_so(made: Certificates) -> None:
     folder = made.of("estimator.drone1", days=-0.5, host="past")
     with hub(made) as (endpoint, _):
-        said = refused("estimator", "drone1", "--connect", endpoint, "--tls", str(folder))
-    assert re.fullmatch(
-        rf"cannot connect to {endpoint}: the certificate of estimator.drone1 expired on \d{{4}}-\d\d-\d\d; "
-        "make new ones with zsim certs init --renew",
-        said,
-    )
+        line = refusal("estimator", "drone1", "--connect", endpoint, "--tls", str(folder))
+    assert missing(line, endpoint, "estimator.drone1", "certs init --renew") == []
+    assert re.search(r"\d{4}-\d\d-\d\d", line)
 
 
 def test_a_world_whose_time_is_over_says_so(made: Certificates, tmp_path: Path) -> None:
     (tmp_path / "scenario.yaml").write_text(SCENARIO)
     folder = made.of("world", days=-0.5, host="past")
-    said = refused("world", str(tmp_path / "scenario.yaml"), "--listen", tls_endpoint(), "--tls", str(folder))
-    assert "the certificate of world expired on " in said
+    line = refusal("world", str(tmp_path / "scenario.yaml"), "--listen", tls_endpoint(), "--tls", str(folder))
+    assert missing(line, "world", "certs init --renew") == []
 
 
 @pytest.mark.parametrize("role", [("estimator", "drone1"), ("controller",), ("record",), ("keys",)])
 def test_a_foreign_certificate_is_a_line_at_once(made: Certificates, tmp_path: Path, role: tuple[str, ...]) -> None:
     folder = Certificates(tmp_path).of("estimator.drone1")
     with hub(made) as (endpoint, _):
-        said = refused(*role, "--connect", endpoint, "--tls", str(folder))
-    assert said == (
-        f"cannot connect to {endpoint}: the certificate of who listens there is of another authority than ours; "
-        "make new ones with zsim certs init and use one set"
-    )
+        line = refusal(*role, "--connect", endpoint, "--tls", str(folder))
+    assert missing(line, endpoint, "authority", "certs init") == []
 
 
 def test_a_router_that_is_refused_upstream_ends(made: Certificates, tmp_path: Path) -> None:
     folder = Certificates(tmp_path).of(SITE)
     with hub(made) as (endpoint, _):
         arguments = ("router", "site", "--listen", tls_endpoint(), "--connect", endpoint, "--tls", str(folder))
-        done = subprocess.run(
-            [*ZSIM, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-        )
-    assert done.returncode == USER_FAULT
-    assert done.stderr.splitlines()[-1].startswith(f"cannot connect to {endpoint}: the certificate of who listens")
+        done = forked_commands.run(*arguments)
+    assert done.code == USER_FAULT
+    assert missing(done.stderr.splitlines()[-1], endpoint, "authority") == []
 
 
-# name: (folder's content changed how, what the line must say)
-FILES = {
-    "no folder": (lambda folder: [path.unlink() for path in folder.iterdir()], "ca.pem: cannot be read (No such file"),
-    "no key": (lambda folder: (folder / "key.pem").unlink(), "key.pem: cannot be read (No such file or directory)"),
+# name: (folder's content changed how, what the line must show)
+FILES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
+    "no folder": (lambda folder: [path.unlink() for path in folder.iterdir()], ("ca.pem: ", "No such file")),
+    "no key": (lambda folder: (folder / "key.pem").unlink(), ("key.pem: ", "No such file")),
     "a key that is a folder": (
         lambda folder: ((folder / "key.pem").unlink(), (folder / "key.pem").mkdir()),
-        "key.pem: cannot be read (Is a directory)",
+        ("key.pem: ", "Is a directory"),
     ),
     "another key": (
         lambda folder: (folder / "key.pem").write_bytes((folder.parent / "world" / "key.pem").read_bytes()),
-        "do not go together (key values mismatch)",
+        ("key values mismatch",),
     ),
-    "no certificate": (lambda folder: (folder / "certificate.pem").write_text("nothing"), "do not go together"),
+    "no certificate": (lambda folder: (folder / "certificate.pem").write_text("nothing"), ("certificate.pem",)),
     "another authority's": (
         lambda folder: (folder / "ca.pem").write_bytes((folder.parent / "stranger.pem").read_bytes()),
-        "do not go together (certificate verify failed)",
+        ("certificate verify failed",),
     ),
 }
 
@@ -326,12 +306,11 @@ def test_files_of_no_use_are_a_line(tmp_path: Path, name: str) -> None:
     folder = made.of("recorder")
     Certificates(tmp_path / "strange")
     (folder.parent / "stranger.pem").write_bytes((tmp_path / "strange" / "ca.pem").read_bytes())
-    change, says = FILES[name]
+    change, tokens = FILES[name]
     change(folder)
     endpoint = tls_endpoint()
-    said = refused("keys", "--connect", endpoint, "--tls", str(folder))
-    assert said.startswith(f"cannot connect to {endpoint}: {folder}")
-    assert says in said
+    line = refusal("keys", "--connect", endpoint, "--tls", str(folder))
+    assert missing(line, endpoint, str(folder), *tokens) == [], line
 
 
 def test_options_that_do_not_go_together_are_a_line(made: Certificates, tmp_path: Path) -> None:
@@ -339,29 +318,28 @@ def test_options_that_do_not_go_together_are_a_line(made: Certificates, tmp_path
     (tmp_path / "scenario.yaml").write_text(SCENARIO)
     world = ("world", str(tmp_path / "scenario.yaml"), "--listen", tls_endpoint(), "--access", str(access))
     tls = ("--tls", str(made.of("world")))
-    assert "is not encrypted; with --tls it must be tls/" in refused("keys", "--tls", str(folder))
-    assert "needs a certificate; give --tls" in refused("keys", "--connect", tls_endpoint())
-    assert "access control goes by certificate; give --tls too" in refused(*world[:2], "--access", str(access))
-    assert "access.json: cannot be read (No such file" in refused(*world, *tls)
-    access.write_text("{")
-    assert "access.json: is not JSON" in refused(*world, *tls)
-    access.write_text('{"rules": 3}')
-    assert "access.json: is no access control of Zenoh's" in refused(*world, *tls)
+    assert missing(refusal("keys", "--tls", str(folder)), "--tls", "tls/") == []
+    assert missing(refusal("keys", "--connect", tls_endpoint()), "--tls") == []
+    assert missing(refusal(*world[:2], "--access", str(access)), "--tls") == []
+    assert missing(refusal(*world, *tls), "access.json: ", "No such file") == []
+    for text, token in (("{", "JSON"), ('{"rules": 3}', "Zenoh")):
+        access.write_text(text)
+        assert missing(refusal(*world, *tls), "access.json: ", token) == []
 
 
 def test_who_listens_elsewhere_than_its_certificate_says(made: Certificates) -> None:
     endpoint = tls_endpoint("127.0.0.2")
-    with connection.listen([endpoint], "zsim", "lockstep", made.identity("world")):
-        said = refused("keys", "--connect", endpoint, "--tls", str(made.of("operator.main")))
-    assert "the certificate of who listens there is not for 127.0.0.2; name it in the hosts file" in said
+    with session.listen([endpoint], "zsim", "lockstep", made.identity("world")):
+        line = refusal("keys", "--connect", endpoint, "--tls", str(made.of("operator.main")))
+    assert missing(line, endpoint, "127.0.0.2;") == []
 
 
 def test_who_listens_without_tls(made: Certificates) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         endpoint = f"tls/127.0.0.1:{server.getsockname()[1]}"
         threading.Thread(target=answer_plainly, args=(server,), daemon=True).start()
-        said = refused("keys", "--connect", endpoint, "--tls", str(made.of("operator.main")))
-    assert "who listens there speaks no TLS" in said
+        line = refusal("keys", "--connect", endpoint, "--tls", str(made.of("operator.main")))
+    assert missing(line, endpoint, "TLS") == []
 
 
 def answer_plainly(server: socket.socket) -> None:
@@ -379,8 +357,8 @@ def test_what_the_listener_thinks_of_our_certificate(made: Certificates, tmp_pat
     (foreign / "ca.pem").write_bytes((made.folder / "ca.pem").read_bytes())
     with hub(made) as (endpoint, _):
         assert peer_fault(Identity(HOST, made.of("recorder")), endpoint) is None
-        assert "our certificate has expired by the clock of who listens" in str(peer_fault(past, endpoint))
-        assert "our certificate is of another authority" in str(peer_fault(Identity(HOST, foreign), endpoint))
+        assert "expired" in str(peer_fault(past, endpoint))
+        assert "authority" in str(peer_fault(Identity(HOST, foreign), endpoint))
     assert peer_fault(Identity(HOST, made.of("recorder")), endpoint) is None  # nobody listens: it may come
 
 
@@ -393,10 +371,10 @@ def test_a_replay_brings_what_its_asker_may_read(federation: Federation, made: C
     secured = ("--listen", endpoint, "--tls", str(world.tls), "--access", str(world.access))
     federation.start("world", federation.write(ONE), "--rate", "1", "--duration", "600", *secured)
     with (
-        Tryer(endpoint, made.of("estimator.drone1")) as estimator,
-        Tryer(endpoint, made.of("operator.main")) as operator,
+        RawClient(endpoint, made.of("estimator.drone1")) as estimator,
+        RawClient(endpoint, made.of("operator.main")) as operator,
     ):
-        status = Heard()
+        status = KeyLog()
         estimator.subscribe("drone/drone1/sensor/status", status)
         status.until_fence("drone/drone1/sensor/status")
         mine = estimator.request("process/estimator.drone1/replay", "replay", from_ns=-1, keys=["**"])
@@ -408,7 +386,7 @@ def test_a_replay_brings_what_its_asker_may_read(federation: Federation, made: C
             permits(rights.of("estimator.drone1", scenario_file.from_text(ONE)).reads, key) for key in keys_of_mine
         )
         refusal = estimator.request("process/estimator.drone1/replay", "stop")
-        assert (refusal["ok"], refusal["error"]) == (False, "op is 'stop'; must be replay")
+        assert (refusal["ok"], parts(refusal["error"])) == (False, ("op", "'stop'"))
         assert operator.request("world/control", "stop")["ok"]
 
 

@@ -1,7 +1,7 @@
 """A program beside zsim: zenoh and msgpack alone, by docs/protocol.md.
 
 with Client(endpoint) as client:
-    clock = client.watch("clock")
+    clock = client.subscribe("clock")
     clock.until(lambda m: m["t_ns"] >= 2e9)          waits for a message, never for a time
     me = client.join("tester.one", period_ns=20_000_000)
 """
@@ -17,11 +17,11 @@ import msgpack
 import pytest
 import zenoh
 
-PATIENCE_S = 60.0  # how long anything may take on a loaded machine before the test gives up
+PATIENCE_S = 120.0  # how long anything may take on a loaded machine before the test gives up
 SHOWN = 6  # messages told when a wait was in vain
 
 
-class Heard(NamedTuple):
+class Received(NamedTuple):
     """One message as it came: wall time (monotonic), key without the federation, content."""
 
     wall_s: float
@@ -32,37 +32,37 @@ class Heard(NamedTuple):
 Wanted = Callable[[dict[str, Any]], Any]
 
 
-class Watch:
+class Subscription:
     """What comes on one expression, in order."""
 
     def __init__(self) -> None:
-        self._queue: queue.SimpleQueue[Heard] = queue.SimpleQueue()
-        self.heard: list[Heard] = []
+        self._queue: queue.SimpleQueue[Received] = queue.SimpleQueue()
+        self.received: list[Received] = []
 
     def take(self, sample: zenoh.Sample, prefix: str) -> None:
         """Keep a message; called by Zenoh."""
         key = str(sample.key_expr).removeprefix(prefix)
-        self._queue.put(Heard(time.monotonic(), key, read(sample.payload.to_bytes())))
+        self._queue.put(Received(time.monotonic(), key, read(sample.payload.to_bytes())))
 
-    def until(self, wanted: Wanted, within_s: float = PATIENCE_S) -> Heard:
+    def until(self, wanted: Wanted, within_s: float = PATIENCE_S) -> Received:
         """Return the next message that is wanted; fail when none comes."""
         until_s = time.monotonic() + within_s
         while (left_s := until_s - time.monotonic()) > 0:
             try:
-                heard = self._queue.get(timeout=left_s)
+                received = self._queue.get(timeout=left_s)
             except queue.Empty:
                 break
-            self.heard.append(heard)
-            if wanted(heard.message):
-                return heard
-        last = "\n".join(str(heard)[:300] for heard in self.heard[-SHOWN:])
+            self.received.append(received)
+            if wanted(received.message):
+                return received
+        last = "\n".join(str(received)[:300] for received in self.received[-SHOWN:])
         return pytest.fail(f"no such message within {within_s:g} s; the last ones were\n{last}")
 
-    def now(self) -> list[Heard]:
-        """Return everything heard so far."""
+    def now(self) -> list[Received]:
+        """Return everything received so far."""
         while not self._queue.empty():
-            self.heard.append(self._queue.get())
-        return self.heard
+            self.received.append(self._queue.get())
+        return self.received
 
 
 class Client:
@@ -87,14 +87,14 @@ class Client:
     def __exit__(self, *_: object) -> None:
         self.session.close()
 
-    def watch(self, expression: str) -> Watch:
+    def subscribe(self, expression: str) -> Subscription:
         """Listen on an expression."""
-        watch = Watch()
+        subscription = Subscription()
         subscriber = self.session.declare_subscriber(
-            self._prefix + expression, lambda sample: watch.take(sample, self._prefix)
+            self._prefix + expression, lambda sample: subscription.take(sample, self._prefix)
         )
         self._kept.append(subscriber)
-        return watch
+        return subscription
 
     def get(self, expression: str, payload: bytes | None = None) -> dict[str, Any]:
         """Return the last values that are answered on an expression, by key."""
@@ -104,14 +104,14 @@ class Client:
 
     def info(self) -> dict[str, Any]:
         """Return `world/info`, of a world that may still be on its way up."""
-        clock = self.watch("clock")
+        clock = self.subscribe("clock")
         found = self.get("world/info")
         if not found:
             clock.until(lambda _: True)  # a world that stands tells its clock once a second
             found = self.get("world/info")
         return found["world/info"]
 
-    def ask(self, key: str, op: str, source: str = "tester", **args: Any) -> dict[str, Any]:
+    def request(self, key: str, op: str, source: str = "tester", **args: Any) -> dict[str, Any]:
         """Send a request and return its answer."""
         request = msgpack.packb({"op": op, "args": args, "source": source})
         return self.get(key, payload=request)[key]
@@ -128,14 +128,14 @@ class Client:
 
     def answer(self, key: str, answer: dict[str, Any]) -> list[bytes]:
         """Answer every get on a key; return the list that its payloads are put into."""
-        asked: list[bytes] = []
+        payloads: list[bytes] = []
 
         def reply(query: zenoh.Query) -> None:
-            asked.append(query.payload.to_bytes() if query.payload is not None else b"")
+            payloads.append(query.payload.to_bytes() if query.payload is not None else b"")
             query.reply(self._prefix + key, msgpack.packb(answer))
 
         self._kept.append(self.session.declare_queryable(self._prefix + key, reply))
-        return asked
+        return payloads
 
     @staticmethod
     def pack(fields: dict[str, Any]) -> bytes:
@@ -195,6 +195,6 @@ def read(payload: bytes) -> dict[str, Any]:
         return {"unreadable": payload}
 
 
-def kinds(heard: list[Heard]) -> Iterator[str]:
-    """Yield the kinds of the events heard."""
-    return (event.message["kind"] for event in heard)
+def kinds(received: list[Received]) -> Iterator[str]:
+    """Yield the kinds of the events received."""
+    return (event.message["kind"] for event in received)

@@ -115,8 +115,8 @@ def _candidates(text: str) -> Iterator[str]:
 
 
 def digest(files: Iterable[Path]) -> str:
-    """Return what changes with the text of any of the files."""
-    return hashlib.sha256(b"".join(map(_text, sorted(files)))).hexdigest()[:12]
+    """Return what changes with the text of any of the files, and not with the folders that they lie in."""
+    return hashlib.sha256(b"".join(sorted(map(_text, files)))).hexdigest()[:12]
 
 
 @cache

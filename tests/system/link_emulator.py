@@ -1,6 +1,6 @@
 """A link with delay, jitter and loss: a process that carries Ethernet frames between two interfaces.
 
-    python radio.py INTERFACE INTERFACE DELAY_MS JITTER_MS LOSS SEED
+    python link_emulator.py INTERFACE INTERFACE DELAY_MS JITTER_MS LOSS SEED
 
 Each direction delays by DELAY_MS ± JITTER_MS and loses the share LOSS of its frames. The delay wanders between draws
 that are PERIOD_NS apart, so that frames keep their order, as on a radio link, which retransmits before it hands on.

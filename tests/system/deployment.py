@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from federation import ROOT, Record, Role
+from federation import Record, Role
+from forked_commands import ROOT
 from lab import LAUNCHER, Lab
 
 from zsim.record import RecordReader, repair
@@ -23,13 +24,13 @@ from zsim_analysis.in_process import fly
 STEP = ROOT / "scenarios" / "step.yaml"
 ROLES = {"world": "h1", "controller.main": "h2", "estimator.*": ["h1", "h2", "h3"]}
 FAKETIME = next(map(str, Path("/usr/lib").glob("*/faketime/libfaketimeMT.so.1")), None)
-START_S = 60.0  # wall time until something of a run is seen on a machine that does other things too
+START_S = 120.0  # wall time until something of a run is seen on a machine that does other things too
 NAMED_AFTER_S = 2.0  # a host that is cut off for longer is named
 DISK_BYTES = 1_500_000  # room for what a host needs and a few seconds of a record
-GONE_S = 15.0  # wall time within which nobody may be left on any host after its launcher is gone
+GONE_S = 120.0  # wall time within which nobody may be left on any host after its launcher is gone
 
 
-class Team:
+class Deployment:
     """One lab with certificates, and the `zsim` commands that run in its launcher's namespace."""
 
     def __init__(self, lab: Lab, roles: dict[str, Any], secure: bool = True, **more: Any) -> None:
@@ -98,20 +99,20 @@ class Team:
 
 
 @contextmanager
-def closing(team: Team) -> Iterator[Team]:
+def closing(deployment: Deployment) -> Iterator[Deployment]:
     """End what a test has started, and fail if anything of it stays."""
     try:
-        yield team
+        yield deployment
     finally:
-        team.close()
-        for name in list(team.cut_off):
-            team.heal(name)
-    team.nobody_left()
+        deployment.close()
+        for name in list(deployment.cut_off):
+            deployment.heal(name)
+    deployment.nobody_left()
 
 
 @pytest.fixture
-def team(lab: Lab) -> Iterator[Team]:
-    with closing(Team(lab, ROLES)) as made:
+def deployment(lab: Lab) -> Iterator[Deployment]:
+    with closing(Deployment(lab, ROLES)) as made:
         yield made
 
 

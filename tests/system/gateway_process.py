@@ -1,4 +1,4 @@
-"""The gateway's doors as a program meets them: sockets and HTTP of the standard library, nothing of zsim."""
+"""A gateway in a process of its own, and its clients: sockets and HTTP of the standard library, nothing of zsim."""
 
 import http.client
 import json
@@ -11,8 +11,8 @@ from federation import Federation, Role, free_port
 from wire import PATIENCE_S
 
 
-class Answer(NamedTuple):
-    """What HTTP answered."""
+class Response(NamedTuple):
+    """An HTTP response."""
 
     status: int
     headers: dict[str, str]
@@ -22,19 +22,20 @@ class Answer(NamedTuple):
         return json.loads(self.body)
 
 
-class Stream:
-    """A connection to the lines door."""
+class LineConnection:
+    """A connection to the port for lines of JSON."""
 
     def __init__(self, port: int) -> None:
         self._socket = socket.create_connection(("127.0.0.1", port), PATIENCE_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._file = self._socket.makefile("rb")
 
-    def send(self, line: bytes) -> None:
+    def send_line(self, line: bytes) -> None:
         self._socket.sendall(line + b"\n")
 
-    def tell(self, op: str, **fields: Any) -> None:
-        self.send(json.dumps({"op": op, **fields}).encode())
+    def send(self, op: str, **fields: Any) -> None:
+        """Send a request without waiting for its response."""
+        self.send_line(json.dumps({"op": op, **fields}).encode())
 
     def next(self, *ops: str) -> dict[str, Any]:
         """Return the next message, of some kinds; fail when the connection ends."""
@@ -45,14 +46,14 @@ class Stream:
             if not ops or message["op"] in ops:
                 return message
 
-    def ask(self, op: str, **fields: Any) -> dict[str, Any]:
-        """Return the answer to a request: what has its id."""
-        self.tell(op, id="asked", **fields)
-        while (message := self.next()).get("id") != "asked":
+    def request(self, op: str, **fields: Any) -> dict[str, Any]:
+        """Send a request and return the response: the message that has its id."""
+        self.send(op, id="requested", **fields)
+        while (message := self.next()).get("id") != "requested":
             pass
         return message
 
-    def is_closed(self) -> bool:
+    def is_at_end(self) -> bool:
         """Read to the end of the connection."""
         while self._file.readline():
             pass
@@ -62,14 +63,14 @@ class Stream:
         self._file.close()
         self._socket.close()
 
-    def __enter__(self) -> "Stream":
+    def __enter__(self) -> "LineConnection":
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
 
-class Door:
+class GatewayProcess:
     """A gateway as a process.
 
     Args:
@@ -84,7 +85,7 @@ class Door:
         self.role: Role = federation.role("gateway", *ports, *options)
         self.role.line("HTTP and WebSocket on")
 
-    def in_run(self) -> "Door":
+    def in_run(self) -> "GatewayProcess":
         """Wait until it is in a run."""
         self.role.line("let into run")
         return self
@@ -93,19 +94,18 @@ class Door:
     def url(self) -> str:
         return f"http://127.0.0.1:{self.http_port}"
 
-    def stream(self) -> Stream:
-        return Stream(self.lines_port)
+    def connect(self) -> LineConnection:
+        return LineConnection(self.lines_port)
 
-    def http(self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None) -> Answer:
-        """Return what is answered to a request; what is no bytes is sent as JSON."""
+    def http(self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None) -> Response:
+        """Return the response to a request; a body that is not bytes is sent as JSON."""
         connection = http.client.HTTPConnection("127.0.0.1", self.http_port, timeout=PATIENCE_S)
         data = body if isinstance(body, bytes) or body is None else json.dumps(body).encode()
         try:
             connection.request(method, path, data, headers or {})
             response = connection.getresponse()
-            return Answer(
-                response.status, {name.lower(): value for name, value in response.getheaders()}, response.read()
-            )
+            names = {name.lower(): value for name, value in response.getheaders()}
+            return Response(response.status, names, response.read())
         finally:
             connection.close()
 
@@ -123,10 +123,10 @@ class Door:
 
 
 def _events(response: http.client.HTTPResponse) -> Iterator[tuple[str, Any]]:
-    kind = ""
+    event = ""
     for line in response:
         name, _, text = line.decode().rstrip("\n").partition(": ")
         if name == "event":
-            kind = text
+            event = text
         elif name == "data":
-            yield kind, json.loads(text)
+            yield event, json.loads(text)

@@ -1,0 +1,88 @@
+"""The fork server of `zsim run`, for tests: a run that it forks has a fork server that is forked too.
+
+python warm_forkserver.py     standard input and the rest as of zsim_deploy.cli.forkserver
+
+What a run's fork server would import and load, it has already: that is half of the processor time of a short run.
+A world that stands publishes its clock more often than the contract wants, since tests wait for it.
+"""
+
+import atexit
+import os
+import signal
+import socket
+import sys
+import threading
+import traceback
+from contextlib import suppress
+from typing import NoReturn
+
+import zsim_bridges.console.console_server
+import zsim_bridges.gateway.gateway_server  # noqa: F401  (what bridges import, too)
+from zsim_deploy.cli import forkserver
+from zsim_deploy.launch import role_launcher
+from zsim_world.server import world_process
+
+STANDING_NS = 100_000_000  # instead of a second
+FILES_MAX = 256  # more than a launcher has open before it starts a role
+
+
+class ForkedServer:
+    """A fork server that this process has forked, as of `subprocess.Popen`."""
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+
+    def kill(self) -> None:
+        with suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+
+    def wait(self) -> None:
+        with suppress(ChildProcessError):
+            os.waitpid(self.pid, 0)
+
+
+def start(self: role_launcher.RoleLauncher) -> None:
+    """Do what `RoleLauncher._start_forkserver` does, without a new program."""
+    self._line, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with other:
+        pid = os.fork()
+        if not pid:
+            serve(other.fileno(), self._run)
+    self._forkserver = ForkedServer(pid)  # type: ignore[assignment]
+    self._receive()
+
+
+def serve(line: int, run: str) -> NoReturn:
+    """Be a fork server, or a role that it has forked, to the end of this process."""
+    code: object = 1
+    try:
+        os.setsid()
+        os.dup2(line, 0)
+        for number in (1, 2):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+        os.closerange(3, FILES_MAX)
+        sys.argv = ["forkserver", run]
+        forkserver._prepare = lambda: None  # it is
+        code = forkserver.main()
+    except SystemExit as end:
+        code = end.code
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        _finish(code)
+
+
+def _finish(code: object) -> NoReturn:
+    """End as an interpreter does, without the frames of the launcher that this process was forked in."""
+    with suppress(BaseException):
+        threading._shutdown()  # type: ignore[attr-defined]
+        atexit._run_exitfuncs()
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(code if isinstance(code, int) else 0 if code is None else 1)
+
+
+if __name__ == "__main__":
+    role_launcher.RoleLauncher._start_forkserver = start
+    world_process.CLOCK_STANDING_NS = STANDING_NS
+    sys.exit(forkserver.main())
