@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import inspect as types
+from refused import has_terms, refused
 
 from zsim.contract import messages
 from zsim.errors import DecodeError
@@ -282,7 +283,7 @@ def test_encoding_names_the_message(shape: str):
 def test_other_keys_have_no_message(key: str):
     assert messages.type_of(key) is None
     assert messages.encoding(key) == "application/msgpack"
-    with pytest.raises(DecodeError, match="is no key of the contract") as caught:
+    with refused(DecodeError, "no key") as caught:
         messages.decode(key, b"\x80")
     assert len(str(caught.value)) < 200
 
@@ -413,7 +414,7 @@ def test_a_number_that_is_not_finite_is_refused_in_free_content(number: float, w
     plain = {**example("world/event"), "data": {"some": wrap(number)}}
     assert_names(refusal("world/event", pack(plain)), "world/event", "data")
     request = pack({"op": "acquire", "args": {"some": wrap(number)}})
-    with pytest.raises(DecodeError, match=r"^here: args holds .*; must be finite numbers$"):
+    with refused(DecodeError, "here", "args", "finite"):
         messages.decode_as(messages.ControlRequest, request, "here")
 
 
@@ -437,7 +438,7 @@ def test_a_cluster_state_has_four_values_per_drone(name: str):
     plain = example("cluster/*/state")
     assert len(plain["drones"]) == 2
     said = refusal("cluster/*/state", pack({**plain, name: plain[name][:-1]}))
-    assert said == f"cluster/drone1/state: {name} has 7 entries; must have 8"
+    assert has_terms(said, "cluster/drone1/state", name, "7", "8")
 
 
 @every_message
@@ -492,7 +493,7 @@ def test_a_promise_of_four_billion_entries_is_refused(shape: str, header: bytes)
 
 def test_a_payload_beyond_the_limit_is_refused_unread():
     payload = b"\x80" * (messages.PAYLOAD_MAX + 1)
-    assert "must have at most 16000000" in refusal("clock", payload)
+    assert has_terms(refusal("clock", payload), "clock", str(len(payload)), str(messages.PAYLOAD_MAX))
 
 
 def test_nesting_without_end_in_free_content_is_refused():
@@ -571,9 +572,19 @@ def test_a_request_needs_no_more_than_its_op():
     assert (request.op, request.args, request.source) == ("pause", {}, "")
 
 
-@pytest.mark.parametrize("plain", [{}, {"op": 1}, {"op": "x", "args": []}, {"op": "x", "source": None}, [], "pause"])
-def test_a_malformed_request_is_refused(plain: Any):
-    with pytest.raises(DecodeError, match=r"^world/control: .*must be"):
+@pytest.mark.parametrize(
+    ("plain", "terms"),
+    [
+        ({}, ("op", "missing")),
+        ({"op": 1}, ("op", "1")),
+        ({"op": "x", "args": []}, ("args", "[]")),
+        ({"op": "x", "source": None}, ("source", "null")),
+        ([], ("[]",)),
+        ("pause", ("'pause'",)),
+    ],
+)
+def test_a_malformed_request_is_refused(plain: Any, terms: tuple[str, ...]):
+    with refused(DecodeError, "world/control", *terms):
         messages.decode_as(messages.ControlRequest, pack(plain), "world/control")
 
 

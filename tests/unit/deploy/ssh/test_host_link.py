@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from refused import refused
 
 from zsim.errors import HostsError
 from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
@@ -96,7 +97,7 @@ def test_files_come_below_a_folder_and_are_their_owners_alone(tmp_path: Path) ->
 
 @pytest.mark.parametrize("takes", [0, 600, 20_000])
 def test_of_files_that_come_in_part_none_is_seen(tmp_path: Path, takes: int) -> None:
-    with pytest.raises(HostsError, match=r"writing into .*: it came in part"):
+    with refused(HostsError, "writing", "in part"):
         asyncio.run(local(takes).put_files(str(tmp_path / "run"), FILES))
     assert [path.name for path in tmp_path.rglob("*")] == ["run"]
 
