@@ -27,7 +27,7 @@ def sheet() -> Sheet:
         made.add("zsim", 1, ours)
         made.add("other", 1, theirs)
     made.add("zsim", 10, 7.0)
-    made.refused = {"absent": "pip: no such thing", "other@10": "not through after 60 s"}
+    made.refused = {"absent": "pip: none", "other@10": "not through after 60 s"}
     return made
 
 
@@ -76,7 +76,7 @@ def test_who_has_no_figure_is_a_row_that_says_why() -> None:
     assert rows[2] == ["zsim [steps/s]", "40 (30 to 50)", "7 (7 to 7)"]
     assert rows[3][:2] == ["the other", "0.25 (0.2 to 0.667)"]
     assert has_terms(rows[3][2], "60 s")
-    assert has_terms(rows[4][1], "pip: no such thing")
+    assert has_terms(rows[4][1], "pip: none")
     assert rows[4][0] == "the absent"
     assert spread(None) == "–"
 

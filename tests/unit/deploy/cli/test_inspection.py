@@ -182,7 +182,7 @@ def test_time_goes_on_while_it_publishes():
         (keys.CONTROL, "{x", ("step", "args", "JSON")),
         (keys.CONTROL, "3", ("step", "args", "'3'", "map")),
         (keys.CONTROL, f'{{"gates": {10**22}}}', ("step", "args", "sent")),
-        (keys.CONTROL, "{}", ("nobody", "answered")),
+        (keys.CONTROL, "{}", ("nobody answered",)),
     ],
 )
 def test_a_request_that_cannot_be_meant_is_a_line(key: str, text: str, terms: tuple[str, ...]):

@@ -112,10 +112,10 @@ def test_a_record_that_stays_away_fails_a_run_that_ended_well(
     up: Any, board: Said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ends_as(up, Outcome("duration"), monkeypatch)
-    monkeypatch.setattr(module, "fetch", fetching(HostsError("h1: it is gone")))
+    monkeypatch.setattr(module, "fetch", fetching(HostsError("h1: gone")))
     outcome = up._fly()
     assert outcome.failed
-    assert has_terms(outcome.reason, "record", "h1: it is gone", "h1:…")
+    assert has_terms(outcome.reason, "record", "h1: gone", "h1:…")
     assert up._record_stays
 
 

@@ -124,11 +124,9 @@ def test_what_has_no_place_and_what_places_nobody_are_told_at_once(tmp_path: Pat
     with pytest.raises(InventoryError) as caught:
         places(tmp_path, step, {"world": "lab", "estimator.drone1": "one", "estimater.*": "two"})
     lines = caught.value.faults
-    assert lines[:3] == [
-        f"hosts.yaml: roles has no place for {name}; add {name!r}"
-        for name in ("estimator.drone2", "estimator.drone3", "controller.main")
-    ]
     assert len(lines) == 4
+    for name, line in zip(("estimator.drone2", "estimator.drone3", "controller.main"), lines, strict=False):
+        assert has_terms(line, "hosts.yaml", "roles", "no place", name, repr(name))
     assert has_terms(lines[3], "hosts.yaml", "roles.estimater.*", "'step'", "world", "recorder")
 
 

@@ -420,7 +420,7 @@ def test_extras_are_those_of_the_distribution(hosts: InventoryFile, step: Scenar
 
 def test_what_containers_do_not_need_of_the_inventory_is_said(hosts: InventoryFile, step: Scenario) -> None:
     texts = compose.render(hosts, step)
-    assert has_terms(texts["two/compose.yaml"], "# hosts.two", "python not used")
+    assert has_terms(texts["two/compose.yaml"], "# hosts.two", "python", "not used")
     assert "not used" not in texts["one/compose.yaml"]
 
 
