@@ -159,7 +159,7 @@ class Recorder:
             if self._may_stop():
                 return "stopped"
             if self._ended_s is not None and self._all_left():
-                return "the run ended"
+                return run_messages.RUN_ENDED
 
     def _count_left_out(self) -> None:
         """Count among the refused what the record has no room for."""

@@ -67,7 +67,7 @@ class ObserverProcess:
         if clock.run_id != self._info.run_id:
             self.end_reason = "the world has begun another run"
         elif clock.state == "stopped":
-            self.end_reason = "the run ended"
+            self.end_reason = run_messages.RUN_ENDED
         return clock
 
     def tick(self) -> None:

@@ -7,6 +7,7 @@ code fails against it.
 import copy
 import math
 from collections.abc import Iterator
+from itertools import product
 from typing import Any
 
 import msgpack
@@ -15,6 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import inspect as types
+from refused import has_terms, refused
 
 from zsim.contract import messages, run_messages
 from zsim.errors import DecodeError
@@ -282,7 +284,7 @@ def test_encoding_names_the_message(shape: str):
 def test_other_keys_have_no_message(key: str):
     assert messages.type_of(key) is None
     assert messages.encoding(key) == "application/msgpack"
-    with pytest.raises(DecodeError, match="is no key of the contract") as caught:
+    with refused(DecodeError, "no key") as caught:
         messages.decode(key, b"\x80")
     assert len(str(caught.value)) < 200
 
@@ -356,12 +358,13 @@ def test_a_missing_field_is_refused(shape: str):
         plain = example(shape)
         del plain[field.name]
         if field.required:
-            assert_names(refusal(shape, pack(plain)), shape, f"{field.name} is missing")
+            assert has_terms(refusal(shape, pack(plain)), key_of(shape), field.name, "missing")
         else:
             messages.decode(key_of(shape), pack(plain))
 
 
 WRONG = [None, True, 3, 1.5, "text", [1.0, 2.0], {"a": 1}, b"\x00"]
+NOT_FINITE = [math.nan, math.inf, -math.inf]
 
 
 def fits(value: Any, wrong: Any) -> bool:
@@ -372,15 +375,14 @@ def fits(value: Any, wrong: Any) -> bool:
 
 
 @every_message
-@pytest.mark.parametrize("wrong", WRONG, ids=repr)
-def test_a_wrong_type_is_refused(shape: str, wrong: Any):
+def test_a_wrong_type_is_refused(shape: str):
     plain = example(shape)
-    for path, value in leaves(plain):
+    for (path, value), wrong in product(leaves(plain), WRONG):
         empty_allowed = path[-1] in ("commander", "trajectory_t_s", "until_ns") and wrong is None
         if fits(value, wrong) or empty_allowed:
             continue
-        said = refusal(shape, pack(replaced(plain, path, wrong)))
-        assert_names(said, shape, str(path[0]))
+        line = refusal(shape, pack(replaced(plain, path, wrong)))
+        assert_names(line, shape, str(path[0]))
 
 
 @every_message
@@ -390,30 +392,27 @@ def test_a_word_outside_the_list_is_refused(shape: str):
     assert isinstance(info, types.StructType)
     for field in info.fields:
         if isinstance(field.type, types.LiteralType):
-            said = refusal(shape, pack({**plain, field.name: "sideways"}))
-            assert_names(said, shape, f"{field.name} is 'sideways'")
-            assert all(str(word) in said for word in field.type.values)
+            line = refusal(shape, pack({**plain, field.name: "sideways"}))
+            assert has_terms(line, key_of(shape), field.name, "'sideways'", *map(str, field.type.values))
 
 
 @every_message
-@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf], ids=repr)
-@pytest.mark.parametrize("single", [False, True])
-def test_a_number_that_is_not_finite_is_refused(shape: str, number: float, single: bool):
+def test_a_number_that_is_not_finite_is_refused(shape: str):
     plain = example(shape)
-    for path, value in leaves(plain):
-        if isinstance(value, float):
-            said = refusal(shape, pack(replaced(plain, path, number), use_single_float=single))
-            assert_names(said, shape, str(path[0]))
-            assert repr(number) in said
+    floats = [path for path, value in leaves(plain) if isinstance(value, float)]
+    for path, number, single in product(floats, NOT_FINITE, (False, True)):
+        line = refusal(shape, pack(replaced(plain, path, number), use_single_float=single))
+        assert_names(line, shape, str(path[0]))
+        assert repr(number) in line
 
 
-@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf], ids=repr)
+@pytest.mark.parametrize("number", NOT_FINITE, ids=repr)
 @pytest.mark.parametrize("wrap", [lambda x: x, lambda x: [1, [x]], lambda x: {"a": {"b": x}}, lambda x: {x: 1}])
 def test_a_number_that_is_not_finite_is_refused_in_free_content(number: float, wrap: Any):
     plain = {**example("world/event"), "data": {"some": wrap(number)}}
     assert_names(refusal("world/event", pack(plain)), "world/event", "data")
     request = pack({"op": "acquire", "args": {"some": wrap(number)}})
-    with pytest.raises(DecodeError, match=r"^here: args holds .*; must be finite numbers$"):
+    with refused(DecodeError, "here", "args", "finite"):
         messages.decode_as(run_messages.ControlRequest, request, "here")
 
 
@@ -428,63 +427,59 @@ def test_a_wrong_shape_is_refused(shape: str):
         if not fixed or path[0] in FREE:
             continue
         for wrong in (value[:-1], [*value, value[-1]], []):
-            said = refusal(shape, pack(replaced(plain, path, wrong)))
-            assert_names(said, shape, str(path[0]))
+            line = refusal(shape, pack(replaced(plain, path, wrong)))
+            assert_names(line, shape, str(path[0]))
 
 
 @pytest.mark.parametrize("name", ["names", "value", "desired", "desired_rate"])
 def test_a_cluster_state_has_four_values_per_drone(name: str):
     plain = example("cluster/*/state")
     assert len(plain["drones"]) == 2
-    said = refusal("cluster/*/state", pack({**plain, name: plain[name][:-1]}))
-    assert said == f"cluster/drone1/state: {name} has 7 entries; must have 8"
+    line = refusal("cluster/*/state", pack({**plain, name: plain[name][:-1]}))
+    assert has_terms(line, "cluster/drone1/state", name, "7", "8")
 
 
 @every_message
-@pytest.mark.parametrize("name", ["t_ns", "seq"])
-@pytest.mark.parametrize("wrong", [-1, -(2**63), 2**63, 2**64 - 1, 0.0])
-def test_stamps_are_whole_and_not_negative(shape: str, name: str, wrong: Any):
-    said = refusal(shape, pack({**example(shape), name: wrong}))
-    assert_names(said, shape, f"{name} is {wrong}")
+def test_stamps_are_whole_and_not_negative(shape: str):
+    for name, wrong in product(("t_ns", "seq"), (-1, -(2**63), 2**63, 2**64 - 1, 0.0)):
+        line = refusal(shape, pack({**example(shape), name: wrong}))
+        assert has_terms(line, key_of(shape), name, str(wrong))
+
+
+GARBAGE = [
+    b"",
+    b"\xc1",
+    b"\x80",
+    b"\x90",
+    b"\xc0",
+    b"hello",
+    b"\x82\xa4t_ns",
+    b"\xdd\xff\xff\xff\xff",
+    b"\xdf\xff\xff\xff\xff",
+    b"\xc6\xff\xff\xff\xff",
+    b"\xdb\xff\xff\xff\xff",
+    b"\x81\xa4t_ns\xdd\xff\xff\xff\xff",
+    b"\x91" * 100_000,
+    b"\x81\xa1x" * 100_000,
+    b"\x81\xa4\xff\xff\xff\xff\x01",
+    b"\x81\x90\x01",
+]
 
 
 @every_message
-@pytest.mark.parametrize(
-    "payload",
-    [
-        b"",
-        b"\xc1",
-        b"\x80",
-        b"\x90",
-        b"\xc0",
-        b"hello",
-        b"\x82\xa4t_ns",
-        b"\xdd\xff\xff\xff\xff",
-        b"\xdf\xff\xff\xff\xff",
-        b"\xc6\xff\xff\xff\xff",
-        b"\xdb\xff\xff\xff\xff",
-        b"\x81\xa4t_ns\xdd\xff\xff\xff\xff",
-        b"\x91" * 100_000,
-        b"\x81\xa1x" * 100_000,
-        b"\x81\xa4\xff\xff\xff\xff\x01",
-        b"\x81\x90\x01",
-    ],
-    ids=lambda payload: payload[:8].hex() or "empty",
-)
-def test_garbage_is_refused(shape: str, payload: bytes):
-    said = refusal(shape, payload)
-    assert said.startswith(f"{key_of(shape)}: ")
-    assert len(said) < 400
+def test_garbage_is_refused(shape: str):
+    for payload in GARBAGE:
+        line = refusal(shape, payload)
+        assert line.startswith(f"{key_of(shape)}: ")
+        assert len(line) < 400
 
 
 @every_message
-@pytest.mark.parametrize(
-    "header", [b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xdc\xff\xff", b"\xc6\xff\xff\xff\xff"]
-)
-def test_a_promise_of_four_billion_entries_is_refused(shape: str, header: bytes):
+def test_a_promise_of_four_billion_entries_is_refused(shape: str):
     plain = example(shape)
     packed = pack(plain)
-    for name in plain:
+    headers = (b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xdc\xff\xff", b"\xc6\xff\xff\xff\xff")
+    for name, header in product(plain, headers):
         marker = pack(name)
         place = packed.index(marker) + len(marker)
         refusal(shape, packed[:place] + header)
@@ -492,7 +487,7 @@ def test_a_promise_of_four_billion_entries_is_refused(shape: str, header: bytes)
 
 def test_a_payload_beyond_the_limit_is_refused_unread():
     payload = b"\x80" * (messages.PAYLOAD_MAX + 1)
-    assert "must have at most 16000000" in refusal("clock", payload)
+    assert has_terms(refusal("clock", payload), "clock", str(len(payload)), str(messages.PAYLOAD_MAX))
 
 
 def test_nesting_without_end_in_free_content_is_refused():
@@ -571,9 +566,19 @@ def test_a_request_needs_no_more_than_its_op():
     assert (request.op, request.args, request.source) == ("pause", {}, "")
 
 
-@pytest.mark.parametrize("plain", [{}, {"op": 1}, {"op": "x", "args": []}, {"op": "x", "source": None}, [], "pause"])
-def test_a_malformed_request_is_refused(plain: Any):
-    with pytest.raises(DecodeError, match=r"^world/control: .*must be"):
+@pytest.mark.parametrize(
+    ("plain", "terms"),
+    [
+        ({}, ("op", "missing")),
+        ({"op": 1}, ("op", "1")),
+        ({"op": "x", "args": []}, ("args", "[]")),
+        ({"op": "x", "source": None}, ("source", "null")),
+        ([], ("[]",)),
+        ("pause", ("'pause'",)),
+    ],
+)
+def test_a_malformed_request_is_refused(plain: Any, terms: tuple[str, ...]):
+    with refused(DecodeError, "world/control", *terms):
         messages.decode_as(run_messages.ControlRequest, pack(plain), "world/control")
 
 

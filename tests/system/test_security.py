@@ -329,7 +329,7 @@ def test_options_that_do_not_go_together_are_a_line(made: Certificates, tmp_path
 
 def test_who_listens_elsewhere_than_its_certificate_says(made: Certificates) -> None:
     endpoint = tls_endpoint("127.0.0.2")
-    with session.listen([endpoint], "zsim", "lockstep", made.identity("world")):
+    with connection.listen([endpoint], "zsim", "lockstep", made.identity("world")):
         line = refusal("keys", "--connect", endpoint, "--tls", str(made.of("operator.main")))
     assert missing(line, endpoint, "127.0.0.2;") == []
 

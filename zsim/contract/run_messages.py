@@ -78,6 +78,9 @@ class Bye(Message, frozen=True):
     reason: str
 
 
+RUN_ENDED = "the run ended"  # reason of whoever leaves because the run is over
+
+
 class Health(Message, frozen=True):
     role: str
     host: str

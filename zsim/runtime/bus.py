@@ -156,7 +156,7 @@ class Bus:
         self._coordinator.publish_end()
         self._spread()
         for agent, _ in self._agents:
-            bye = run_messages.Bye(self._t_ns, agent.next_seq("bye"), "the run ended")
+            bye = run_messages.Bye(self._t_ns, agent.next_seq("bye"), run_messages.RUN_ENDED)
             self._to_world(keys.process(agent.name, "bye"), bye)
         self._spread()
 

@@ -286,7 +286,7 @@ class Runner:
         elif self._end_ns is not None:
             late = time.monotonic() - self._end_wall_s > DRAIN_S
             if self._member.done_ns >= self._end_ns // self._agent.period_ns * self._agent.period_ns or late:
-                self._leave = "the run ended"
+                self._leave = run_messages.RUN_ENDED
 
     # What arrives rarely, from other threads
 

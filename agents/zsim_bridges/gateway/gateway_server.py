@@ -12,6 +12,7 @@ from aiohttp import web
 
 from zsim.contract import keys
 from zsim.contract.messages import Info
+from zsim.contract.run_messages import RUN_ENDED
 from zsim.errors import NoWorldError, RunError, ZsimError
 from zsim.runtime.runner import Runner
 from zsim.transport.session import Session
@@ -199,7 +200,7 @@ class Gateway:
 
     def _end_lockstep_sessions(self, run: RunAccess) -> None:
         for client in self._clients:
-            client.end_lockstep(run, "the run ended")
+            client.end_lockstep(run, RUN_ENDED)
 
     def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """Print what reaches no client, each text once: a flood of connections makes a flood of these."""

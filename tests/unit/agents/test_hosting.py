@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from refused import refused
 
 from zsim.errors import RunError
 from zsim.runtime.group import AgentGroup
@@ -37,7 +38,7 @@ def test_a_pattern_that_matches_nobody_is_refused():
 
 
 def test_of_many_names_a_refusal_lists_ten():
-    with pytest.raises(RunError, match=r"d0, d1, d2, d3, d4, d5, d6, d7, d8, d9, and 90 more$"):
+    with refused(RunError, "d0", "d1", "d2", "d3", "d4", "d5", "d6", "d7", "d8", "d9", "90"):
         chosen("estimator: drone", ["x"], [f"d{i}" for i in range(100)])
 
 

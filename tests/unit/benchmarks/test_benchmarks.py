@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from refused import has_terms, refused
 
 from benchmarks import grid, lockstep, page, peers
 from benchmarks.child import RefusedError, Server, result
@@ -26,7 +27,7 @@ def sheet() -> Sheet:
         made.add("zsim", 1, ours)
         made.add("other", 1, theirs)
     made.add("zsim", 10, 7.0)
-    made.refused = {"absent": "pip: no such thing", "other@10": "not through after 60 s"}
+    made.refused = {"absent": "pip: none", "other@10": "not through after 60 s"}
     return made
 
 
@@ -64,20 +65,27 @@ def test_three_digits_are_shown(value: float, shown: str) -> None:
     assert figure(value) == shown
 
 
+def cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip().strip("|").split("|")]
+
+
 def test_who_has_no_figure_is_a_row_that_says_why() -> None:
     labels = {"zsim": "zsim", "other": "the other", "absent": "the absent"}
-    lines = ratios(sheet(), labels, "zsim").splitlines()
-    assert lines[0] == "|  | N = 1 | N = 10 |"
-    assert lines[2] == "| zsim [steps/s] | 40 (30 to 50) | 7 (7 to 7) |"
-    assert lines[3] == "| the other | 0.25 (0.2 to 0.667) | not through after 60 s |"
-    assert lines[4] == "| the absent | not measured: pip: no such thing |  |"
+    rows = [cells(line) for line in ratios(sheet(), labels, "zsim").splitlines()]
+    assert rows[0] == ["", "N = 1", "N = 10"]
+    assert rows[2] == ["zsim [steps/s]", "40 (30 to 50)", "7 (7 to 7)"]
+    assert rows[3][:2] == ["the other", "0.25 (0.2 to 0.667)"]
+    assert has_terms(rows[3][2], "60 s")
+    assert has_terms(rows[4][1], "pip: none")
+    assert rows[4][0] == "the absent"
     assert spread(None) == "–"
 
 
 def test_only_the_measured_section_of_the_page_is_replaced() -> None:
-    text = "words\n<!-- measured: a -->\nold\n<!-- end: a -->\nmore\n"
-    assert page.replaced(text, "a", "new\n") == "words\n<!-- measured: a -->\nnew\n<!-- end: a -->\nmore\n"
-    with pytest.raises(ValueError, match=r"has no lines <!-- measured: b -->"):
+    begin, end = "words\n<!-- measured: a -->\n", "<!-- end: a -->\nmore\n"
+    text = f"{begin}old\n{end}"
+    assert page.replaced(text, "a", "new\n") == f"{begin}new\n{end}"
+    with refused(ValueError, "measured: b"):
         page.replaced(text, "b", "new")
 
 
@@ -87,9 +95,9 @@ def test_the_page_has_a_section_for_every_part() -> None:
 
 
 def test_a_contender_that_fails_is_refused_with_its_last_words() -> None:
-    with pytest.raises(RefusedError, match="exit code 1: ValueError: no"):
+    with refused(RefusedError, "code 1", "ValueError: no"):
         result([sys.executable, "-c", "raise ValueError('no')"], 30.0)
-    with pytest.raises(RefusedError, match=r"not through after 0\.2 s"):
+    with refused(RefusedError, "0.2 s"):
         result([sys.executable, "-c", "input() if False else __import__('time').sleep(60)"], 0.2)
 
 
@@ -105,7 +113,7 @@ def test_a_contender_is_asked_and_may_refuse() -> None:
 
 def test_a_peer_that_is_not_installed_has_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(peers, "STATE", tmp_path / "peers.json")
-    assert peers.missing("helics") == "its environment was not made; `make bench` makes it"
+    assert has_terms(peers.missing("helics") or "", "make bench")
     peers.STATE.write_text(json.dumps({"helics": "pip: ERROR: none", "mosaik": None}))
     assert peers.missing("helics") == "pip: ERROR: none"
     assert peers.missing("mosaik") is None

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refused import has_terms, refused
 
 from benchmarks import runs_per_hour
 from benchmarks.child import RefusedError, Server
@@ -17,7 +18,7 @@ from benchmarks.monte_carlo.worker import Flown, serve
 def build(way, given):
     def fly(seed):
         if seed > 9:
-            raise ValueError("no such seed")
+            raise ValueError("seed")
         return Flown(given.flights * way.span_s, float("nan") if seed < 0 else 0.1 * seed, 2.0)
     return fly
 serve(build, flights=3, batch=False)
@@ -39,7 +40,7 @@ def sheet() -> Sheet:
         made.add("crazyflow_cpu_s", 2, 0.15)
         made.add("crazyflow_rms_m", 2, 0.08)
         made.add("crazyflow_closest_m", 2, 2.46)
-    made.refused = {"pybullet": "pip: no such thing", "rotorpy@2": "no answer within 300 s"}
+    made.refused = {"pybullet": "pip: none", "rotorpy@2": "no answer within 300 s"}
     return made
 
 
@@ -60,22 +61,22 @@ def test_a_worker_answers_with_what_was_flown_and_refuses_what_was_not(tmp_path:
         assert found["flights"] == pytest.approx(2.0)
         assert found["rms_m"] == pytest.approx(0.4)
         assert 0.0 <= found["cpu_s"] < 5.0
-        with pytest.raises(RefusedError, match="its state diverged"):
+        with refused(RefusedError, "diverged"):
             server.ask({"seed": -1}, 30.0)
-        with pytest.raises(RefusedError, match="ValueError: no such seed"):
+        with refused(RefusedError, "ValueError: seed"):
             server.ask({"seed": 10}, 30.0)
     finally:
         server.close()
 
 
 def test_the_table_compares_the_same_repeats_and_says_who_was_not_measured() -> None:
-    told = runs_per_hour.page(sheet())
-    assert "| `zsim sweep`, all of Test 1 | 1 000 (800 to 1 200) | 1 | 4.5 (4.5 to 4.5) | – | 2.47 | 12 runs" in told
-    assert "| crazyflow, position controller | 2 000 (1 200 to 2 400) | 2 (1 to 3) | 0.15 (0.15 to 0.15) |" in told
-    assert "| zsim's world alone / crazyflow | – | – |" in told
-    assert "PID controller | not measured: pip: no such thing |" in told
-    assert "wind EKF | not measured: no answer within 300 s |" in told
-    assert "| MuJoCo | not flown: " in told
+    page = runs_per_hour.page(sheet())
+    assert has_terms(page, "zsim sweep", "1 000 (800 to 1 200)", "4.5 (4.5 to 4.5)", "–", "2.47", "12 runs")
+    assert has_terms(page, "crazyflow", "2 000 (1 200 to 2 400)", "2 (1 to 3)", "0.15 (0.15 to 0.15)")
+    assert has_terms(page, "world alone / crazyflow", "–", "–")
+    assert has_terms(page, "PID", "not measured", "pip: none")
+    assert has_terms(page, "EKF", "not measured", "300 s")
+    assert has_terms(page, "MuJoCo", "not flown")
 
 
 def test_the_world_alone_follows_the_way_of_a_flight(tmp_path: Path) -> None:

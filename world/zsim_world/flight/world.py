@@ -21,6 +21,8 @@ from zsim_world.flight.command_queue import CommandQueue
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.flight.fault_injector import FaultInjector
 
+DURATION_OVER = "the scenario's duration is over"  # why a run of full length ended
+
 
 class World(Coordinator):
     """One run.
@@ -105,7 +107,7 @@ class World(Coordinator):
             return
         self._publish_gate(wall_ns)
         if self.now_ns >= self._last_ns:
-            self.clock.stop("the scenario's duration is over")
+            self.clock.stop(DURATION_OVER)
 
     def _integrate(self) -> bool:
         """Integrate one gate; return whether the state is still finite."""

@@ -25,6 +25,8 @@ from zsim_world.flight.run_outbox import Refusal
 from zsim_world.playback.playback_views import PlaybackViews
 from zsim_world.playback.recorded_gates import Gate, RecordedGates, author, is_played, without_kills
 
+RECORD_OVER = "the record is over"  # why a replay of the whole record ended
+
 NOT_FLYABLE = "a replay: nobody can be flown"
 SEEK_MAX_S = 1e9  # beyond it, nanoseconds are no int64
 FLIGHT_OPS = frozenset({"acquire", "release", "fault_add", "fault_clear"})  # requests that only a flight takes
@@ -112,7 +114,7 @@ class Playback(Coordinator):
         """Play the next gate."""
         gate = self._coming
         if gate is None:
-            self.clock.stop("the record is over")
+            self.clock.stop(RECORD_OVER)
             return
         if self.clock.state == "waiting":
             self.clock.start(gate.t_ns, self._played.paused)
@@ -122,7 +124,7 @@ class Playback(Coordinator):
         self._read_next()
         to_ns = self._played.to_ns
         if self._coming is None:
-            self.clock.stop("the record is over")
+            self.clock.stop(RECORD_OVER)
         elif to_ns is not None and self._coming.t_ns > to_ns:
             self.clock.stop(f"played to {to_ns / 1e9:g} s")
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refused import has_terms, refused
 
 from zsim_agents.formation import guidance
 from zsim_agents.formation.control_law import ProportionalLaw
@@ -128,12 +129,12 @@ def engaged_fleet(noise_m=0.0):
     return fleet
 
 
-def request_is_refused(fleet, request, *parts):
+def assert_refused(fleet, request, *terms):
     """Assert the refusal and that nothing changes by it."""
     before = fleet.engagement.guidance.value(fleet.t_s)
     reason = fleet.engagement.request(request)
     assert reason is not None
-    assert all(part in reason for part in parts), reason
+    assert has_terms(reason, *terms)
     assert "\n" not in reason
     after = fleet.engagement.guidance.value(fleet.t_s)
     assert np.array_equal(before, after)
@@ -166,7 +167,7 @@ def test_drones_climb_straight_up_until_they_are_engaged():
     fleet.fly_until("assembling")
     fleet.fly(10.0)
     assert fleet.output.phase == "assembling"
-    assert fleet.output.reason == "ready to engage"
+    assert has_terms(fleet.output.reason, "ready")
     assert np.array_equal(fleet.p_W[:, :2], GROUND[:, :2])
     assert fleet.p_W[:, 2] == pytest.approx(np.full(3, 1.5), abs=0.01)
 
@@ -251,65 +252,65 @@ def test_waypoints_end_and_the_formation_stays():
 
 
 @pytest.mark.parametrize(
-    ("request_", "parts"),
+    ("request_", "terms"),
     [
-        (MoveTo({"x": 3.0}), ("'x' is unknown", "x_c, y_c")),
+        (MoveTo({"x": 3.0}), ("'x'", "unknown", "x_c", "y_c")),
         (MoveTo({}), ("no values",)),
-        (MoveTo({"x_c": math.nan}), ("x_c is nan", "finite")),
-        (MoveTo({"beta": 0.05}), ("sin(beta) min(p, q) is 0.1", "above 1 m")),
-        (MoveTo({"p": 2.0, "q": 2.0, "beta": 0.9}), ("robots 2 and 3 are 1.740 m apart", "2 m or more")),
-        (MoveTo({"p": 20.0, "q": 20.0, "beta": 3.0}), ("condition number of J^-1 is 1", "below 20")),
-        (MoveTo({"pitch": 1.0}), ("pitch of the formation is 57.3 deg", "below 30 deg")),
-        (MoveTo({"z_c": -2.0}), ("at z = -2.00 m",)),
-        (MoveTo({"z_c": 10.0}, over_s=1.0), ("over_s is 1 s", "allowed")),
-        (MoveTo({"x_c": 1e7}), ("x_c is 1e+07",)),
-        (MoveTo({"x_c": 9e5}), ("not reached within 3600 s",)),
-        (Follow({"x_c": "foo(t)"}), ("calls 'foo'", "sin")),
-        (Follow({"x_c": "1/t"}), ("no value at t = 0 s",)),
-        (Follow({"x_c": "30*sin(t)"}), ("of its limits",)),
+        (MoveTo({"x_c": math.nan}), ("x_c", "nan", "finite")),
+        (MoveTo({"beta": 0.05}), ("sin(beta)", "min(p, q)", "0.1…", "above", "1")),
+        (MoveTo({"p": 2.0, "q": 2.0, "beta": 0.9}), ("robots", "2", "3", "1.740", "2")),
+        (MoveTo({"p": 20.0, "q": 20.0, "beta": 3.0}), ("J^-1", "1…", "below", "20")),
+        (MoveTo({"pitch": 1.0}), ("pitch", "57.3", "below", "30")),
+        (MoveTo({"z_c": -2.0}), ("z", "-2.00")),
+        (MoveTo({"z_c": 10.0}, over_s=1.0), ("over_s", "1", "allowed")),
+        (MoveTo({"x_c": 1e7}), ("x_c", "1e+07")),
+        (MoveTo({"x_c": 9e5}), ("reached", "3600")),
+        (Follow({"x_c": "foo(t)"}), ("x_c", "'foo'", "sin")),
+        (Follow({"x_c": "1/t"}), ("x_c", "value", "0")),
+        (Follow({"x_c": "30*sin(t)"}), ("limits",)),
         (Follow({"beta": "0.9 - 0.01*t"}), ("apart",)),
-        (Follow({"x_c": "t/10"}, start_s=math.inf), ("start_s is inf",)),
+        (Follow({"x_c": "t/10"}, start_s=math.inf), ("start_s", "inf")),
         (Follow(), ("neither",)),
         (Follow({"x_c": "t"}, waypoints=[{"at_s": 0, "values": {}}]), ("both",)),
-        (Follow(waypoints=[{"at_s": 0, "values": {"u": 1}}]), ("'u' is unknown",)),
-        (TakeOff(), ("phase is engaged",)),
-        (Engage(), ("phase is engaged",)),
+        (Follow(waypoints=[{"at_s": 0, "values": {"u": 1}}]), ("'u'", "unknown")),
+        (TakeOff(), ("phase", "engaged")),
+        (Engage(), ("phase", "engaged")),
     ],
 )
-def test_bad_requests_are_refused_with_a_reason_and_change_nothing(request_, parts):
-    request_is_refused(engaged_fleet(), request_, *parts)
+def test_bad_requests_are_refused_with_a_reason_and_change_nothing(request_, terms):
+    assert_refused(engaged_fleet(), request_, *terms)
 
 
 def test_requests_that_do_not_fit_the_phase_are_refused():
     fleet = Fleet(Engagement(SPACE, DRONES))
     assert "no gate" in (fleet.engagement.request(TakeOff()) or "")
     fleet.fly(0.1)
-    request_is_refused(fleet, Engage(), "phase is idle")
-    request_is_refused(fleet, MoveTo({"z_c": 5.0}), "phase is idle", "engaged")
-    request_is_refused(fleet, Pause(), "phase is idle")
-    request_is_refused(fleet, Land(), "on the ground")
+    assert_refused(fleet, Engage(), "phase", "idle")
+    assert_refused(fleet, MoveTo({"z_c": 5.0}), "phase", "idle", "engaged")
+    assert_refused(fleet, Pause(), "phase", "idle")
+    assert_refused(fleet, Land(), "ground")
 
 
 @pytest.mark.parametrize(
-    ("spoil", "parts"),
+    ("spoil", "terms"),
     [
-        ({"sigma_m": np.full((3, 3), 1.5)}, ("drone1", "sigma of 1.50 m", "1 m")),
-        ({"age_s": np.array([0.0, 0.6, 0.0])}, ("drone2", "0.60 s old", "0.5 s")),
-        ({"age_s": np.array([0.0, 0.0, math.inf])}, ("drone3", "inf s old")),
-        ({"p_W": np.full((3, 3), math.nan)}, ("drone1", "not finite")),
+        ({"sigma_m": np.full((3, 3), 1.5)}, ("drone1", "sigma", "1.50", "1")),
+        ({"age_s": np.array([0.0, 0.6, 0.0])}, ("drone2", "0.60", "old", "0.5")),
+        ({"age_s": np.array([0.0, 0.0, math.inf])}, ("drone3", "inf", "old")),
+        ({"p_W": np.full((3, 3), math.nan)}, ("drone1", "finite")),
         ({"states": ("landed", "landed", "emergency")}, ("drone3", "emergency")),
-        ({"p_W": GROUND[[0, 2, 1]]}, ("roll of the formation is", "180.0 deg")),
+        ({"p_W": GROUND[[0, 2, 1]]}, ("roll", "180.0")),
         ({"p_W": GROUND * (1.0, 0.0, 1.0)}, ("in line",)),
-        ({"p_W": GROUND * 0.6}, ("1.80 m apart",)),
-        ({"p_W": GROUND * (0.2, 1.0, 1.0)}, ("sin(beta) min(p, q) is 0.60 m", "above 1 m")),
+        ({"p_W": GROUND * 0.6}, ("1.80", "apart")),
+        ({"p_W": GROUND * (0.2, 1.0, 1.0)}, ("sin(beta)", "min(p, q)", "0.60", "above", "1")),
     ],
     ids=["sigma", "old", "none", "nan", "emergency", "mirrored", "line", "near", "narrow"],
 )
-def test_take_off_is_refused_from_a_bad_start(spoil, parts):
+def test_take_off_is_refused_from_a_bad_start(spoil, terms):
     fleet = Fleet(Engagement(SPACE, DRONES))
     fleet.spoil = spoil
     fleet.fly(0.1)
-    request_is_refused(fleet, TakeOff(), *parts)
+    assert_refused(fleet, TakeOff(), *terms)
     fleet.spoil = {}
     fleet.fly(0.1)
     assert fleet.engagement.request(TakeOff()) is None
@@ -320,8 +321,8 @@ def test_engagement_waits_for_height_and_says_so():
     fleet.fly(0.1)
     fleet.engagement.request(TakeOff())
     output = fleet.fly_until("assembling")
-    assert "drone1 is at z = 0.8" in output.reason
-    request_is_refused(fleet, Engage(), "at z = 0.8", "1.20 m or more")
+    assert has_terms(output.reason, "drone1", "z", "0.8…")
+    assert_refused(fleet, Engage(), "drone1", "z", "0.8…", "1.20")
 
 
 def test_a_take_off_command_that_was_lost_is_sent_again():
@@ -337,19 +338,19 @@ def test_a_take_off_command_that_was_lost_is_sent_again():
 
 
 @pytest.mark.parametrize(
-    ("spoil", "part"),
+    ("spoil", "terms"),
     [
-        ({"age_s": np.array([0.0, 0.0, 0.52])}, "drone3 is 0.52 s old"),
-        ({"p_W": np.full((3, 3), math.nan)}, "not finite"),
-        ({"yaw": np.array([0.0, math.inf, 0.0])}, "estimate of drone2 is not finite"),
-        ({"sigma_m": np.full((3, 3), 2.5)}, "sigma of 2.50 m"),
-        ({"states": ("flying", "emergency", "flying")}, "drone2 is in state emergency"),
-        ({"p_W": GROUND * (1.0, 0.0, 1.0) + (0, 0, 5.0)}, "in line"),
-        ({"p_W": GROUND * (0.2, 1.0, 1.0) + (0, 0, 5.0)}, "sin(beta) min(p, q) is 0.60 m"),
+        ({"age_s": np.array([0.0, 0.0, 0.52])}, ("drone3", "0.52", "old")),
+        ({"p_W": np.full((3, 3), math.nan)}, ("drone1", "finite")),
+        ({"yaw": np.array([0.0, math.inf, 0.0])}, ("drone2", "finite")),
+        ({"sigma_m": np.full((3, 3), 2.5)}, ("drone1", "sigma", "2.50")),
+        ({"states": ("flying", "emergency", "flying")}, ("drone2", "emergency")),
+        ({"p_W": GROUND * (1.0, 0.0, 1.0) + (0, 0, 5.0)}, ("in line",)),
+        ({"p_W": GROUND * (0.2, 1.0, 1.0) + (0, 0, 5.0)}, ("sin(beta)", "min(p, q)", "0.60")),
     ],
     ids=["old", "nan", "inf", "sigma", "emergency", "line", "narrow"],
 )
-def test_a_fault_in_flight_holds_the_formation_and_it_goes_on_without_a_bump(spoil, part):
+def test_a_fault_in_flight_holds_the_formation_and_it_goes_on_without_a_bump(spoil, terms):
     fleet = engaged_fleet()
     assert fleet.engagement.request(MoveTo({"z_c": 12.0, "x_c": 5.0})) is None
     fleet.fly(8.0)
@@ -357,7 +358,7 @@ def test_a_fault_in_flight_holds_the_formation_and_it_goes_on_without_a_bump(spo
     held = fleet.fly(3.0)
     for output in held:
         assert output.phase == "held"
-        assert part in output.reason
+        assert has_terms(output.reason, *terms)
         moving = [s for s in output.setpoints if s is not None and np.linalg.norm(s.v_W) > 0.9]
         assert not moving
         assert np.isfinite(output.value).all()
@@ -396,8 +397,8 @@ def test_requests_are_refused_while_a_fault_holds_the_formation():
     fleet = engaged_fleet()
     fleet.spoil = {"age_s": np.full(3, 2.0)}
     fleet.fly(0.1)
-    request_is_refused(fleet, MoveTo({"z_c": 5.0}), "2.00 s old")
-    request_is_refused(fleet, Engage(), "phase is held")
+    assert_refused(fleet, MoveTo({"z_c": 5.0}), "drone1", "2.00", "old")
+    assert_refused(fleet, Engage(), "phase", "held")
     assert fleet.engagement.request(Land()) is None
 
 
@@ -423,7 +424,7 @@ def test_robots_that_are_driven_together_are_parted_and_reported():
     output = fleet.step()
     assert output.alarmed == ((1, 2),)
     assert "ALARM" in output.reason
-    assert "drone2 and drone3" in output.reason
+    assert has_terms(output.reason, "drone2", "drone3")
     fleet.fly(8.0)
     assert closest_pair(fleet.p_W)[0] > 2.0
     assert fleet.output.phase == "engaged"
@@ -437,9 +438,9 @@ def test_a_reference_that_fails_after_its_check_holds_the_formation(monkeypatch)
     assert fleet.engagement.request(Follow(shape)) is None
     fleet.fly(40.0)
     assert fleet.output.phase == "engaged"
-    assert "reference: robots 2 and 3 are 1.99" in fleet.fly_until("held").reason
+    assert has_terms(fleet.fly_until("held").reason, "reference", "robots", "2", "3", "1.99…")
     fleet.fly(20.0)
-    assert "cannot go on: the reference is not allowed" in fleet.output.reason
+    assert has_terms(fleet.output.reason, "reference", "allowed")
     assert fleet.closest_m > 1.9
 
 
@@ -454,7 +455,7 @@ def test_hold_stops_the_formation_where_it_is_and_engage_resumes():
     fleet.fly(6.0)
     height = fleet.p_W[0, 2]
     assert fleet.output.phase == "held"
-    assert fleet.output.reason == "held on request"
+    assert has_terms(fleet.output.reason, "held", "request")
     fleet.p_W += (0.5, 0.0, 0.0)  # a push: held formations keep their place
     fleet.fly(15.0)
     assert fleet.p_W[:, 0].mean() == pytest.approx(0.0, abs=0.05)
@@ -477,7 +478,8 @@ def test_a_hold_is_kept_through_a_fault():
     fleet.fly(2.0)
     fleet.spoil = {}
     fleet.fly(20.0)
-    assert (fleet.output.phase, fleet.output.reason) == ("held", "held on request")
+    assert fleet.output.phase == "held"
+    assert has_terms(fleet.output.reason, "held", "request")
     assert fleet.p_W[0, 2] == pytest.approx(height, abs=0.02)
 
 
@@ -547,8 +549,7 @@ def test_a_land_of_the_plan_drops_what_still_waits():
     fleet = Fleet(Engagement(SPACE, DRONES, plan=plan))
     fleet.fly(14.0)
     assert fleet.output.phase == "engaged"
-    assert "target of the plan waits" in fleet.output.reason
-    assert "sin(beta)" in fleet.output.reason
+    assert has_terms(fleet.output.reason, "target", "plan", "sin(beta)")
     fleet.fly(2.0)
     assert fleet.output.phase == "landing"
     fleet.fly_until("idle")
@@ -631,24 +632,24 @@ def test_a_restart_does_not_undo_what_was_asked_after_the_plan(request_, height_
 
 
 @pytest.mark.parametrize(
-    ("plan", "finding"),
+    ("plan", "terms"),
     [
-        ([Scheduled(1.0, MoveTo({"u": 1.0}))], "plan step 1: .*'u'"),
-        ([Scheduled(1.0, TakeOff()), Scheduled(1.0, Follow({"x_c": "u"}))], "plan step 2: .*'u'"),
+        ([Scheduled(1.0, MoveTo({"u": 1.0}))], ("step 1", "'u'")),
+        ([Scheduled(1.0, TakeOff()), Scheduled(1.0, Follow({"x_c": "u"}))], ("step 2", "'u'")),
         (
             [Scheduled(2.0, TakeOff()), Scheduled(1.0, Engage())],
-            "plan step 2: at_s is 1; allowed: 2 s or later",
+            ("step 2", "at_s", "1", "2"),
         ),
-        ([Scheduled(math.nan, TakeOff())], "plan step 1: at_s is nan"),
+        ([Scheduled(math.nan, TakeOff())], ("step 1", "at_s", "nan")),
     ],
 )
-def test_plans_that_can_never_be_flown_are_refused_at_once(plan, finding):
-    with pytest.raises(ValueError, match=finding):
+def test_plans_that_can_never_be_flown_are_refused_at_once(plan, terms):
+    with refused(ValueError, *terms):
         Engagement(SPACE, DRONES, plan=plan)
 
 
 def test_names_must_fit_the_cluster():
-    with pytest.raises(ValueError, match="2 drones; allowed: 3"):
+    with refused(ValueError, "2", "drones", "3"):
         Engagement(SPACE, DRONES[:2])
 
 
@@ -699,21 +700,21 @@ def test_requests_are_read_from_the_wire():
 
 
 @pytest.mark.parametrize(
-    ("op", "args", "finding"),
+    ("op", "args", "terms"),
     [
-        ("fly", {}, "op 'fly' is unknown; allowed: takeoff, engage"),
-        (["land"], {}, r"op .* is unknown"),
-        (None, {}, "op 'None' is unknown"),
-        ("land", {"now": True}, "land: field 'now' is unknown; allowed: none"),
-        ("land", [1], "land: args is list"),
-        ("target", {"values": [1]}, "target: values is"),
-        ("target", {"values": {}, "over_s": "5"}, "target: over_s is '5'; allowed: a number of seconds"),
-        ("trajectory", {"waypoints": "x"}, "trajectory: waypoints is 'x'"),
-        ("trajectory", {"duration_s": math.inf}, "trajectory: duration_s is 'inf'"),
+        ("fly", {}, ("op", "'fly'", "unknown", "takeoff", "engage")),
+        (["land"], {}, ("op", "unknown")),
+        (None, {}, ("op", "'None'", "unknown")),
+        ("land", {"now": True}, ("land", "'now'", "unknown", "none")),
+        ("land", [1], ("land", "args", "list")),
+        ("target", {"values": [1]}, ("target", "values", "'[1]'")),
+        ("target", {"values": {}, "over_s": "5"}, ("target", "over_s", "'5'", "seconds")),
+        ("trajectory", {"waypoints": "x"}, ("trajectory", "waypoints", "'x'")),
+        ("trajectory", {"duration_s": math.inf}, ("trajectory", "duration_s", "'inf'")),
     ],
 )
-def test_requests_that_cannot_be_read_are_refused(op, args, finding):
-    with pytest.raises(RequestError, match=finding):
+def test_requests_that_cannot_be_read_are_refused(op, args, terms):
+    with refused(RequestError, *terms):
         read_request(op, args)
 
 

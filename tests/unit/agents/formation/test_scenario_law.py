@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refused import has_terms, refused
 
 from zsim.errors import RunError, ScenarioError
 from zsim.scenario import scenario_file
@@ -92,23 +93,23 @@ def test_a_space_of_the_user_s_own_gets_the_places_of_its_robots(module: str) ->
 
 
 @pytest.mark.parametrize(
-    ("field", "name", "words"),
+    ("field", "name", "terms"),
     [
-        ("law", "nowhere:Law", "ModuleNotFoundError"),
-        ("law", "formation_of_mine:Other", "Half, Named, Short, Still"),
-        ("law", "formation_of_mine:Half", "rates()"),
-        ("law", "formation_of_mine:Short", "(3,)"),
-        ("space", "formation_of_mine:Still", "forward"),
-        ("space", "nowhere:Space", "ModuleNotFoundError"),
+        ("law", "nowhere:Law", ("ModuleNotFoundError",)),
+        ("law", "formation_of_mine:Other", ("Half", "Named", "Short", "Still")),
+        ("law", "formation_of_mine:Half", ("rates()",)),
+        ("law", "formation_of_mine:Short", ("3,",)),
+        ("space", "formation_of_mine:Still", ("forward…",)),
+        ("space", "nowhere:Space", ("ModuleNotFoundError",)),
     ],
 )
-def test_what_cannot_be_flown_is_one_line(module: str, field: str, name: str, words: str) -> None:
+def test_what_cannot_be_flown_is_one_line(module: str, field: str, name: str, terms: tuple[str, ...]) -> None:
     made = scenario(**{field: name})
     with pytest.raises(RunError) as raised:
         engagement_of(made, made.clusters[0])
     line = str(raised.value)
     assert line.startswith(f"cluster 'main': {field}")
-    assert words in line
+    assert has_terms(line, *terms)
     assert "\n" not in line
 
 
@@ -134,5 +135,5 @@ def test_every_law_is_saturated_and_knows_when_it_is_followed(speed_m_s: float, 
 
 
 def test_a_space_without_the_names_that_it_needs_is_refused() -> None:
-    with pytest.raises(ValueError, match="11 variables of 2 robots"):
+    with refused(ValueError, "11", "2"):
         TriadCluster(2)

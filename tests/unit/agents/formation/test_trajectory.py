@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refused import has_terms, refused
 
 from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.expression import Expression, ExpressionError
@@ -85,42 +86,42 @@ def test_rates_of_nested_expressions_agree_with_finite_differences(t, w):
 
 
 @pytest.mark.parametrize(
-    ("text", "finding"),
+    ("text", "terms"),
     [
-        ("5*foo(t)", "calls 'foo'"),
-        ("2*g", "uses 'g'"),
-        ("__import__('os').system('true')", "calls"),
-        ("t.real", "contains 't.real'"),
-        ("(lambda: 1)()", "calls"),
-        ("[t]", r"contains '\[t\]'"),
-        ("t if t else 1", "contains"),
-        ("t > 1", "contains 't > 1'"),
-        ("2^t", r"contains '2\^t'.*\*\*"),
-        ("'a'", "contains 'a'"),
-        ("True", "contains 'True'"),
-        ("1j", "contains '1j'"),
-        ("t = 3", "cannot be read"),
-        ("", "cannot be read"),
-        ("sin(t", "cannot be read"),
-        ("sin()", "0 arguments; allowed: 1"),
-        ("min(t)", "1 arguments; allowed: 2 to 16"),
-        ("sin(x=t)", "calls 'sin'"),
-        ("sin(*t)", "contains"),
-        ("1/0", "constant part without a value"),
-        ("sqrt(-1)*t", "constant part without a value"),
-        ("9**9**9**9", "constant part without a value"),
-        ("1e400", "contains 'inf'"),
-        ("1e308*10", "constant part of value inf"),
-        ("9" * 400, "contains '999"),
-        ("t+" * 600 + "t", "1201 characters; allowed: 1000"),
-        ("-" * 990 + "t", "nested deeper than 100|cannot be read"),
-        ("(" * 300 + "t" + ")" * 300, "cannot be read"),
-        ("not " * 240 + "t", "contains"),
-        ("t\0", "cannot be read"),
+        ("5*foo(t)", ("calls", "'foo'")),
+        ("2*g", ("uses", "'g'")),
+        ("__import__('os').system('true')", ("calls",)),
+        ("t.real", ("contains", "'t.real'")),
+        ("(lambda: 1)()", ("calls",)),
+        ("[t]", ("contains", "'[t]'")),
+        ("t if t else 1", ("contains",)),
+        ("t > 1", ("contains", "'t > 1'")),
+        ("2^t", ("contains", "'2^t'", "**")),
+        ("'a'", ("contains", "'a'")),
+        ("True", ("contains", "'True'")),
+        ("1j", ("contains", "'1j'")),
+        ("t = 3", ("read",)),
+        ("", ("read",)),
+        ("sin(t", ("read",)),
+        ("sin()", ("0", "arguments", "1")),
+        ("min(t)", ("1", "arguments", "2", "16")),
+        ("sin(x=t)", ("calls", "'sin'")),
+        ("sin(*t)", ("contains",)),
+        ("1/0", ("without", "value")),
+        ("sqrt(-1)*t", ("without", "value")),
+        ("9**9**9**9", ("without", "value")),
+        ("1e400", ("contains", "'inf'")),
+        ("1e308*10", ("value", "inf")),
+        ("9" * 400, ("contains", "'999…")),
+        ("t+" * 600 + "t", ("1201", "1000")),
+        ("-" * 990 + "t", ()),  # too deep for Python's parser or for ours
+        ("(" * 300 + "t" + ")" * 300, ("read",)),
+        ("not " * 240 + "t", ("contains",)),
+        ("t\0", ("read",)),
     ],
 )
-def test_what_is_no_allowed_expression_is_refused_in_one_line(text, finding):
-    with pytest.raises(ExpressionError, match=finding) as caught:
+def test_what_is_no_allowed_expression_is_refused_in_one_line(text, terms):
+    with refused(ExpressionError, *terms) as caught:
         Expression("x_c", text)
     assert str(caught.value).startswith("x_c: ")
     assert "\n" not in str(caught.value)
@@ -135,25 +136,25 @@ def test_a_long_sum_is_still_allowed():
     [("1/(t - 1)", 1.0), ("log(5 - t)", 6.0), ("exp(t)", 1e4), ("sqrt(t)", 0.0), ("t*1e308", 100)],
 )
 def test_an_expression_without_a_finite_value_says_when(text, t):
-    with pytest.raises(ExpressionError, match=rf"x_c: .* at t = {t:g} s"):
+    with refused(ExpressionError, "x_c", f"{t:g}"):
         Expression("x_c", text)(t)
 
 
 @pytest.mark.parametrize(
-    ("constants", "finding"),
+    ("constants", "terms"),
     [
-        ({"t": 1.0}, "constant 't'"),
-        ({"pi": 3.0}, "constant 'pi'"),
-        ({"sin": 3.0}, "constant 'sin'"),
-        ({"a b": 3.0}, "constant 'a b'"),
-        ({"f": math.nan}, "constant f: found 'nan'"),
-        ({"f": "0.01"}, "constant f: found '0.01'"),
-        ({"f": True}, "constant f"),
-        ({"f": 10**400}, "constant f"),
+        ({"t": 1.0}, ("constant", "'t'")),
+        ({"pi": 3.0}, ("constant", "'pi'")),
+        ({"sin": 3.0}, ("constant", "'sin'")),
+        ({"a b": 3.0}, ("constant", "'a b'")),
+        ({"f": math.nan}, ("constant f", "'nan'")),
+        ({"f": "0.01"}, ("constant f", "'0.01'")),
+        ({"f": True}, ("constant f", "'True'")),
+        ({"f": 10**400}, ("constant f", "'1000…")),
     ],
 )
-def test_bad_constants_are_refused(constants, finding):
-    with pytest.raises(ExpressionError, match=finding):
+def test_bad_constants_are_refused(constants, terms):
+    with refused(ExpressionError, *terms):
         Expression("x_c", "t", constants)
 
 
@@ -177,15 +178,15 @@ def test_an_expression_trajectory_stands_still_outside_its_time():
 
 
 @pytest.mark.parametrize(
-    ("expressions", "finding"),
+    ("expressions", "terms"),
     [
-        ({"x": "t"}, "expressions: variable 'x' is unknown.*x_c"),
-        ({"p": math.inf}, "p: found"),
-        ({"p": [1]}, "p: found"),
+        ({"x": "t"}, ("'x'", "unknown", "x_c")),
+        ({"p": math.inf}, ("p", "'inf'")),
+        ({"p": [1]}, ("p", "'[1]'")),
     ],
 )
-def test_bad_expression_trajectories_are_refused(expressions, finding):
-    with pytest.raises(ValueError, match=finding):
+def test_bad_expression_trajectories_are_refused(expressions, terms):
+    with refused(ValueError, *terms):
         ExpressionTrajectory(SPACE, expressions, ZERO)
 
 
@@ -243,24 +244,24 @@ def test_one_waypoint_is_a_place():
 
 
 @pytest.mark.parametrize(
-    ("points", "finding"),
+    ("points", "terms"),
     [
-        ([], "0 waypoints"),
-        (waypoints((0, {"x_c": 0})) * 10_001, "10001 waypoints"),
-        (waypoints((1, {"x_c": 0}), (1, {"x_c": 1})), "waypoint 2: at_s is 1; allowed: .* above 1"),
-        (waypoints((-1, {})), "waypoint 1: at_s is -1"),
-        (waypoints((math.nan, {})), "waypoint 1: at_s is nan"),
-        (waypoints((0, {"u": 0})), "waypoint 1: variable 'u' is unknown"),
-        (waypoints((0, {"x_c": math.nan})), "waypoint 1: x_c is nan"),
-        (waypoints((0, {"x_c": "1"})), "waypoint 1: x_c is 1"),
-        (waypoints((0, 5)), "waypoint 1: found '5'"),
-        ([{"values": {}}], "waypoint 1: at_s is None"),
-        ([{"at_s": 0, "x_c": 1}], "waypoint 1: field 'x_c' is unknown"),
-        ([7], "waypoint 1: at_s is 7"),
+        ([], ("0", "waypoints")),
+        (waypoints((0, {"x_c": 0})) * 10_001, ("10001", "waypoints")),
+        (waypoints((1, {"x_c": 0}), (1, {"x_c": 1})), ("waypoint 2", "at_s", "1", "above", "1")),
+        (waypoints((-1, {})), ("waypoint 1", "at_s", "-1")),
+        (waypoints((math.nan, {})), ("waypoint 1", "at_s", "nan")),
+        (waypoints((0, {"u": 0})), ("waypoint 1", "'u'", "unknown")),
+        (waypoints((0, {"x_c": math.nan})), ("waypoint 1", "x_c", "nan")),
+        (waypoints((0, {"x_c": "1"})), ("waypoint 1", "x_c", "1")),
+        (waypoints((0, 5)), ("waypoint 1", "'5'")),
+        ([{"values": {}}], ("waypoint 1", "at_s", "None")),
+        ([{"at_s": 0, "x_c": 1}], ("waypoint 1", "'x_c'", "unknown")),
+        ([7], ("waypoint 1", "at_s", "7")),
     ],
 )
-def test_bad_waypoints_are_refused(points, finding):
-    with pytest.raises(TrajectoryError, match=finding):
+def test_bad_waypoints_are_refused(points, terms):
+    with refused(TrajectoryError, *terms):
         WaypointTrajectory(SPACE, points, ZERO)
 
 
@@ -310,29 +311,29 @@ def test_a_planned_ramp_uses_the_speed_that_it_may_and_no_more():
 
 
 @pytest.mark.parametrize(
-    ("changes", "over_s", "finding"),
+    ("changes", "over_s", "terms"),
     [
-        ({}, 1.0, "over_s is 1 s; allowed.*: 2"),
-        ({}, math.nan, "over_s is nan s"),
-        ({}, 1e9, "over_s is 1e\\+09 s"),
-        ({"x_c": 5e5}, None, "not reached within 3600 s"),
-        ({"x_c": 1e300}, None, "not reached|x_c is 1e"),
-        ({"beta": 0.1}, None, r"sin\(beta\) min\(p, q\) is 0"),
-        ({"beta": -0.8}, None, "beta is"),
-        ({"p": 0.0}, None, "p is 0; allowed: between 0 and inf"),
-        ({"p": 2.2, "q": 2.2}, None, "robots 2 and 3 are 1.* m apart; allowed: 2 m or more"),
-        ({"roll": 0.7}, None, "roll of the formation is 40.1 deg; allowed: below 30 deg"),
-        ({"pitch": -0.7}, None, "pitch of the formation is -40.1 deg"),
-        ({"z_c": -3.0}, None, "robot . is at z = .* m; allowed: 0.5 m"),
+        ({}, 1.0, ("over_s", "1", "2…")),
+        ({}, math.nan, ("over_s", "nan")),
+        ({}, 1e9, ("over_s", "1e+09")),
+        ({"x_c": 5e5}, None, ("reached", "3600")),
+        ({"x_c": 1e300}, None, ("x_c", "1e+300")),
+        ({"beta": 0.1}, None, ("sin(beta)", "min(p, q)", "0…")),
+        ({"beta": -0.8}, None, ("beta", "-0.8")),
+        ({"p": 0.0}, None, ("p", "0", "between", "0", "inf")),
+        ({"p": 2.2, "q": 2.2}, None, ("robots", "2", "3", "1…", "2")),
+        ({"roll": 0.7}, None, ("roll", "40.1", "below", "30")),
+        ({"pitch": -0.7}, None, ("pitch", "-40.1")),
+        ({"z_c": -3.0}, None, ("robot", "z", "0.5")),
     ],
 )
-def test_ramps_that_lead_to_a_bad_place_are_refused(changes, over_s, finding):
+def test_ramps_that_lead_to_a_bad_place_are_refused(changes, over_s, terms):
     start = GOAL.copy()
     start[2] = 5.0
     goal = GOAL.copy()
     for name, value in changes.items():
         goal[SPACE.index(name)] = value
-    with pytest.raises(TrajectoryError, match=finding):
+    with refused(TrajectoryError, *terms):
         plan_ramp(SPACE, (start, ZERO), Hold(goal), 0.0, FormationGains(), ShapeLimits(), over_s)
 
 
@@ -344,7 +345,7 @@ def test_a_way_that_passes_a_bad_place_is_refused_although_its_end_is_good():
     goal[14] = math.pi
     for end in (start, goal):
         assert reference_fault(space, Hold(end), 0.0, 1.0, FormationGains(), ShapeLimits()) is None
-    with pytest.raises(TrajectoryError, match=r"the way .* robots 2 and 4 are .* m apart"):
+    with refused(TrajectoryError, "robots", "2", "4", "apart"):
         plan_ramp(space, (start, np.zeros(16)), Hold(goal), 0.0, FormationGains(), ShapeLimits())
 
 
@@ -352,4 +353,4 @@ def test_a_trajectory_faster_than_the_robots_is_refused():
     onto = ExpressionTrajectory(SPACE, {"x_c": "5*sin(t)"}, GOAL)
     fault = reference_fault(SPACE, onto, 0.0, 60.0, FormationGains(), ShapeLimits())
     assert fault is not None
-    assert "of its limits; allowed: 0.8" in fault
+    assert has_terms(fault, "limits", "0.8")

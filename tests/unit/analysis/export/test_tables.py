@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 import pytest
 import recorded_run
 import scipy.io
+from refused import has_terms, refused
 from typer.testing import CliRunner
 
 from zsim.contract import flight_messages, keys, messages
@@ -186,9 +187,7 @@ def test_matlab_names_are_valid_and_never_the_same() -> None:
 
 def test_a_variable_that_matlab_would_not_load_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(matlab, "VARIABLE_MAX", 100_000)
-    with pytest.raises(
-        ReportError, match=r"^\w+: would have .* GB, and MATLAB loads .*; choose --keys, .*parquetread$"
-    ):
+    with refused(ReportError, "imu", "GB", "MATLAB", "GB", "--keys"):
         export(run, Format.MAT, run / "large.mat")
     assert not list(run.glob("large*"))
 
@@ -196,7 +195,7 @@ def test_a_variable_that_matlab_would_not_load_is_refused(run: Path, monkeypatch
 def test_times_make_a_variable_small_enough(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(matlab, "VARIABLE_MAX", 100_000)
     estimates = MessageSelection(("drone/*/estimate",))
-    with pytest.raises(ReportError, match=r"^estimate: would have .*; choose --keys, --from and --to"):
+    with refused(ReportError, "estimate", "GB", "--keys", "--from", "--to"):
         export(run, Format.MAT, tmp_path / "all.mat", estimates)
     done = export(run, Format.MAT, tmp_path / "some.mat", estimates._replace(from_s=1.0, to_s=1.1))
     assert done.tables == {"estimate": 3 * 6}
@@ -233,7 +232,7 @@ def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
     assert done.tables == {"cluster_state.parquet": 51, "truth.parquet": 153}
     times = parquet(tmp_path / "some" / "truth.parquet")["t_ns"]
     assert (times.min(), times.max()) == (1_000_000_000, 2_000_000_000)
-    with pytest.raises(ReportError, match=r"run\.mcap: .* drone/nobody/\*\* .*\d+ messages"):
+    with refused(ReportError, "run.mcap", "drone/nobody/**", "messages"):
         export(run, Format.CSV, tmp_path / "none", MessageSelection(("drone/nobody/**",)))
     assert not (tmp_path / "none").exists()
 
@@ -241,17 +240,17 @@ def test_keys_and_times_choose(run: Path, tmp_path: Path) -> None:
 def test_nothing_is_overwritten_without_force(run: Path, tmp_path: Path) -> None:
     some = MessageSelection(("clock",))
     export(run, Format.CSV, tmp_path / "out", some)
-    with pytest.raises(ReportError, match=r"out: .*--out .*--force"):
+    with refused(ReportError, str(tmp_path / "out"), "--out", "--force"):
         export(run, Format.CSV, tmp_path / "out", some)
     export(run, Format.CSV, tmp_path / "out", MessageSelection(("world/info",)), force=True)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"info.csv", "export.json"}
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("precious")
-    with pytest.raises(ReportError, match="folder of something else"):
+    with refused(ReportError, str(tmp_path / "home"), "folder", "else"):
         export(run, Format.CSV, tmp_path / "home", some, force=True)
-    with pytest.raises(ReportError, match="is the record itself"):
+    with refused(ReportError, str(run / "run.mcap"), "record", "itself"):
         export(run, Format.MAT, run / "run.mcap", some, force=True)
-    with pytest.raises(ReportError, match="file of something else"):
+    with refused(ReportError, str(tmp_path / "home" / "thesis.tex"), "file", "else"):
         export(run, Format.MAT, tmp_path / "home" / "thesis.tex", some, force=True)
     assert (tmp_path / "home" / "thesis.tex").read_text() == "precious"
     (tmp_path / "home" / "export.json").write_text("[]")
@@ -276,7 +275,7 @@ def test_force_does_not_replace_files_that_are_not_of_an_export(run: Path, tmp_p
     (tmp_path / "own.mat").write_bytes(b"MATLAB 5.0 MAT-file, Platform: GLNXA64, Created on: Sun Nov 22".ljust(128))
     for name in ("flight1.mcap", "own.mat"):
         before = (tmp_path / name).read_bytes()
-        with pytest.raises(ReportError, match="file of something else"):
+        with refused(ReportError, str(tmp_path / name), "file", "else"):
             export(run, Format.FOXGLOVE, tmp_path / name, MessageSelection(("clock",)), force=True)
         assert (tmp_path / name).read_bytes() == before
 
@@ -328,7 +327,8 @@ def test_garbage_on_record_is_left_out_and_told(run: Path, tmp_path: Path) -> No
         huge = {**msgspec.to_builtins(said(run, "process/controller.main/join")[0]), "incarnation": 2**63}
         writer.add("process/controller.main/join", msgspec.msgpack.encode(huge), "", 5, 5)
     done = export(tmp_path, Format.PARQUET)
-    assert done.notes == ["3 messages on record are not what their key promises and were left out"]
+    (note,) = done.notes
+    assert has_terms(note, "3", "messages", "left out")
     assert done.tables["truth.parquet"] == counts(run)["truth"]
     assert parquet(tmp_path / "parquet" / "join.parquet")["incarnation"].isna().sum() == 1
 
@@ -346,7 +346,7 @@ def test_nothing_to_export_is_one_line(tmp_path: Path) -> None:
 def test_what_is_not_installed_is_named(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(output, "find_spec", lambda module: None if module == "foxglove" else module)
     done = CliRunner().invoke(app, ["export", str(run), "--format", "foxglove"])
-    assert str(done.exception) == "zsim export: foxglove is not installed; install zsim[export]"
+    assert has_terms(str(done.exception), "foxglove", "zsim[export]")
 
 
 def test_the_command_line_starts_without_what_exports_need() -> None:
@@ -434,6 +434,6 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(run: Path, tmp_path: Path) -
         done = subprocess.run(command, capture_output=True, text=True, timeout=120, preexec_fn=limited)
         assert done.returncode == 2, done.stderr
         assert done.stderr.strip().count("\n") == 0, done.stderr
-        assert done.stderr.endswith("; make room and export again\n")
         assert done.stderr.startswith(str(tmp_path))
+        assert has_terms(done.stderr, "room")
         assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]

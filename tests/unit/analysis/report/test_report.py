@@ -1,8 +1,10 @@
 """The report: known flights give their closed-form figures, broken records give what there is."""
 
+import errno
 import hashlib
 import json
 import math
+import os
 import re
 import struct
 from dataclasses import replace
@@ -14,6 +16,7 @@ import msgspec
 import numpy as np
 import pytest
 import synthetic_record
+from refused import has_terms, refused
 from rich.console import Console
 from synthetic_record import GATE_NS, SCENARIOS, Flown
 
@@ -67,7 +70,7 @@ def flown(**options) -> Flown:
 def run(tmp_path_factory):
     directory = tmp_path_factory.mktemp("run")
     end = {
-        "reason": "the scenario's duration is over",
+        "reason": "over",
         "wall_s": 0.6,
         "sim_s": 12.0,
         "last_ns": 12_000_000_000,
@@ -130,7 +133,7 @@ def test_summary_json_has_the_fields_of_the_contract(run):
     assert said["paper_table_1"]["beta"] == 0.012
     assert (said["scenario"], said["seed"], said["mode"]) == ("step", 1, "lockstep")
     assert (said["real_time_factor"], said["wall_s"], said["deadline_misses"]) == (20.0, 0.6, 2)
-    assert said["ended"] == "the scenario's duration is over"
+    assert said["ended"] == "over"
     assert [event["kind"] for event in said["events"]] == ["refused", "end"]
     assert said["versions"]["estimator.drone1"] == "0.1.0"
     assert msgspec.json.decode((directory / "summary.json").read_bytes(), type=type(summary)) == summary
@@ -150,7 +153,7 @@ def test_truth_hash_is_the_one_of_the_contract(run):
         digest.update(struct.pack("<q13d", truth.t_ns, *(number for part in parts for number in part)))
     assert summary.record.truth_sha256 == digest.hexdigest()
     assert summary.truth_sha256 == "0" * 64
-    assert any("the world reported 000" in note for note in summary.notes)
+    assert any(has_terms(note, "world", "000…") for note in summary.notes)
     assert summary.record.truth_missing == 0
 
 
@@ -163,7 +166,7 @@ def test_truth_that_is_not_on_record_is_told(tmp_path):
             writer.add(message.key, message.payload, messages.encoding(message.key), message.t_ns, message.wall_ns)
     summary = judge(tmp_path / "run.mcap")[-1]
     assert summary.record.truth_missing == 50
-    assert any("50 of 1803 truth messages are not on record" in note for note in summary.notes)
+    assert any(has_terms(note, "50", "1803", "truth") for note in summary.notes)
     assert summary.errors["p"].true_std == pytest.approx(AMPLITUDE[9] / math.sqrt(2), rel=0.05)
 
 
@@ -180,8 +183,8 @@ def test_a_replay_is_told_and_judged_from_where_it_begins(tmp_path):
     assert summary.record.truth_missing == 0
     assert summary.sim_s == pytest.approx(3.0)
     assert summary.real_time_factor == pytest.approx(20.0)
-    assert "This is a replay of run 20261122-run, no flight of its own." in summary.notes
-    assert "a replay of run 20261122-run" in (tmp_path / "report.html").read_text()
+    assert any(has_terms(note, "replay", "20261122-run") for note in summary.notes)
+    assert has_terms((tmp_path / "report.html").read_text(), "replay", "20261122-run…")
 
 
 def test_a_flight_whose_recorder_came_late_lacks_its_beginning(tmp_path):
@@ -213,7 +216,7 @@ def test_separation_counts_in_the_air_only(tmp_path):
 
 def test_a_world_that_died_leaves_all_that_can_be_known(tmp_path):
     summary = report_of(tmp_path, flown(end=None, other_traffic=True))
-    assert summary.ended == "the record ends here at 12.00 s: no end is on record"
+    assert has_terms(summary.ended, "12.00", "no end")
     assert summary.wall_s == pytest.approx(0.6)  # the synthetic recorder takes 1 ms a gate
     assert summary.real_time_factor == pytest.approx(20.0)
     assert summary.deadline_misses is None
@@ -229,8 +232,8 @@ def test_a_cut_record_is_reported_up_to_the_cut(tmp_path):
     (tmp_path / "run.mcap").write_bytes(data[: len(data) // 2])
     summary = judge(tmp_path / "run.mcap")[-1]
     assert 4 < summary.sim_s < 8
-    assert summary.ended == f"the record was cut after {summary.sim_s:.2f} s: no end is on record"
-    assert any("The run ended at" in note for note in summary.notes)
+    assert has_terms(summary.ended, "cut", f"{summary.sim_s:.2f}", "no end")
+    assert any(has_terms(note, "ended", f"{summary.sim_s:.2f}") for note in summary.notes)
     assert any("was cut" in note for note in summary.notes)
 
 
@@ -241,7 +244,7 @@ def test_a_run_without_a_cluster(tmp_path):
     assert summary.errors == {}
     assert any("no cluster" in note for note in summary.notes)
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"plan_view.png", "drones.png"}
-    assert "No cluster published a state" in (tmp_path / "report.html").read_text()
+    assert "No cluster" in (tmp_path / "report.html").read_text()
 
 
 def test_a_cluster_that_said_nothing(tmp_path):
@@ -253,7 +256,7 @@ def test_a_cluster_that_said_nothing(tmp_path):
                 writer.add(message.key, message.payload, encoding, message.t_ns, message.wall_ns)
     summary = judge(tmp_path / "run.mcap")[-1]
     assert summary.errors == {}
-    assert any("Cluster main published no state" in note for note in summary.notes)
+    assert any(has_terms(note, "main", "no state") for note in summary.notes)
 
 
 @pytest.mark.parametrize("length", [0, 1, 100])
@@ -270,7 +273,7 @@ def test_a_record_on_which_no_drone_moves_is_refused(tmp_path):
         for key, message, wall_ns in synthetic_record.traffic(flown(duration_s=0.1)):
             if not key.endswith("/truth"):
                 writer.add(key, messages.encode(message), messages.encoding(key), message.t_ns, wall_ns)
-    with pytest.raises(RecordError, match=r"run\.mcap: .* \d+ messages .* truth"):
+    with refused(RecordError, "run.mcap", "messages", "truth"):
         make_report(tmp_path)
 
 
@@ -349,7 +352,7 @@ def test_the_terminal_table_stands_beside_the_paper(run):
 
 @pytest.mark.usefixtures("unrendered")
 def test_nothing_to_report_on_is_one_line(tmp_path):
-    with pytest.raises(RecordError, match=r"run\.mcap: .*No such file"):
+    with refused(RecordError, "run.mcap", os.strerror(errno.ENOENT)):
         make_report(tmp_path)
     synthetic_record.write(tmp_path / "run.mcap", flown(duration_s=0.1))
     (tmp_path / "figures").write_text("in the way")
@@ -359,20 +362,19 @@ def test_nothing_to_report_on_is_one_line(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("asked", "length_s", "expected", "noted"),
+    ("asked", "length_s", "expected", "terms"),
     [
-        (None, 30.0, (10.0, 30.0), ""),
-        ((120, 320), 330.0, (120, 320), ""),
-        ((120, 320), 200.0, (120, 200.0), "inside the window"),
-        ((120, 320), 60.0, (20.0, 60.0), "before the window"),
-        (None, 0.0, (0.0, 0.0), ""),
+        (None, 30.0, (10.0, 30.0), ()),
+        ((120, 320), 330.0, (120, 320), ()),
+        ((120, 320), 200.0, (120, 200.0), ("inside",)),
+        ((120, 320), 60.0, (20.0, 60.0), ("before",)),
+        (None, 0.0, (0.0, 0.0), ()),
     ],
 )
-def test_window_of_the_statistics(asked, length_s, expected, noted):
+def test_window_of_the_statistics(asked, length_s, expected, terms):
     found, note = window(asked, length_s)
     assert found == pytest.approx(expected)
-    assert noted in note
-    assert bool(noted) == bool(note)
+    assert has_terms(note, *terms) if terms else note == ""
 
 
 def test_thinning_keeps_every_extreme():

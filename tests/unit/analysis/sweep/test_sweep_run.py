@@ -2,6 +2,7 @@
 
 import errno
 import itertools
+import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refused import has_terms, refused
 
 from zsim.contract.fingerprint import fingerprint
 from zsim.errors import RecordError
@@ -116,7 +118,7 @@ def test_a_run_that_diverges_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Fleet, "advance", diverge)
     row = fly(task())
-    assert row["failure"].startswith("d1 at 0.120 s: the state is no longer finite")
+    assert has_terms(row["failure"], "d1", "0.120", "finite")
     assert row["sim_s"] == 0.1
     assert len(row["truth_sha256"]) == 64
     assert not [name for name in row if name.startswith("errors.")]
@@ -124,14 +126,14 @@ def test_a_run_that_diverges_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_run_that_crashes_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     row = fly(task(ONE.replace("[]}", "[console.1]}")))
-    assert row["failure"] == "the world waits for console.1, not run in-process; see `processes.expect`"
+    assert has_terms(row["failure"], "world", "console.1", "processes.expect")
     assert (row["run"], row["seed"], row["truth_sha256"]) == (7, 3, None)
 
     def crash(fleet: Fleet) -> None:
-        raise ZeroDivisionError("a bug\nof two lines")
+        raise ZeroDivisionError("two\nlines")
 
     monkeypatch.setattr(Fleet, "advance", crash)
-    assert fly(task())["failure"] == "ZeroDivisionError: a bug of two lines"
+    assert fly(task())["failure"] == "ZeroDivisionError: two lines"
 
 
 def test_a_full_disk_is_the_sweep_s_end_and_no_fault_of_the_run(
@@ -145,7 +147,7 @@ def test_a_full_disk_is_the_sweep_s_end_and_no_fault_of_the_run(
     monkeypatch.setattr(record_writer, "CHUNK_BYTES", 1000)
     monkeypatch.setattr(record_writer, "write_all", full_after(2, record_writer.write_all, full))
     part = tmp_path / "000007.part"
-    with pytest.raises(RecordError, match=r"000007\.part/run\.mcap: .*No space left"):
+    with refused(RecordError, "000007.part/run.mcap", os.strerror(errno.ENOSPC)):
         fly(task(record=tmp_path / "000007"))
     assert [path.name for path in tmp_path.iterdir()] == [part.name]
     monkeypatch.undo()
@@ -161,7 +163,7 @@ def full_after(count: int, write: Callable[..., None], full: Callable[..., None]
 
 def test_a_folder_of_records_that_cannot_be_made_is_told_in_a_line(tmp_path: Path) -> None:
     (tmp_path / "runs").touch()
-    with pytest.raises(RecordError, match=r"runs/000007\.part: .*Not a directory"):
+    with refused(RecordError, "runs/000007.part", os.strerror(errno.ENOTDIR)):
         fly(task(record=tmp_path / "runs/000007"))
 
 

@@ -6,6 +6,7 @@ from queue import SimpleQueue
 from typing import Any
 
 import pytest
+from refused import has_terms
 
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import SessionError
@@ -87,33 +88,36 @@ def table() -> Iterator[Table]:
 
 def test_a_request_goes_out_in_the_console_s_name(table: Table):
     table.desk.request_cluster("main", "target", values={"p": 4.0}, over_s=5.0)
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("main: target values p=4, over_s 5", "")
+    outcome = table.told.get(timeout=PATIENCE_S)
+    assert has_terms(outcome.request, "main", "target", "p=4", "over_s 5")
+    assert outcome.refusal == ""
     args = {"values": {"p": 4.0}, "over_s": 5.0}
     assert table.link.said == [("cluster/main/control", "target", "console.1", args)]
 
 
 def test_a_refusal_is_told_with_its_reason(table: Table):
-    table.link.refusals["pause"] = "the run is paused; pause needs a running one"
+    table.link.refusals["pause"] = "not now"
     table.desk.request_world("pause")
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("pause", "the run is paused; pause needs a running one")
+    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("pause", "not now")
 
 
 def test_a_session_that_fails_is_a_refusal(table: Table):
     table.desk.request_world("broken")
-    assert table.told.get(timeout=PATIENCE_S).refusal == "the session is closed"
+    assert has_terms(table.told.get(timeout=PATIENCE_S).refusal, "session", "closed")
 
 
 def test_whatever_goes_wrong_is_told(table: Table):
     table.desk.request_world("wrong")
-    assert table.told.get(timeout=PATIENCE_S).refusal == "ValueError: no such thing"
+    assert has_terms(table.told.get(timeout=PATIENCE_S).refusal, "ValueError", "no such thing")
 
 
 def test_a_page_that_outlives_its_run_is_told_so(table: Table):
     table.desk.close()
     table.desk.request_world("pause")
     table.desk.send_mode(["drone1"], "land")
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("pause", "the run has ended")
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: land", "the run has ended")
+    outcomes = [table.told.get(timeout=PATIENCE_S) for _ in range(2)]
+    assert [outcome.request for outcome in outcomes] == ["pause", "drone1: land"]
+    assert all(has_terms(outcome.refusal, "run", "ended") for outcome in outcomes)
     assert table.link.said == []
 
 
@@ -130,7 +134,7 @@ def test_a_drone_is_taken_told_and_given_back(table: Table):
 def test_a_drone_that_another_operator_has_is_not_commanded(table: Table):
     table.link.refusals["acquire"] = "drone1 is flown by 'console.2' with priority 10"
     table.desk.send_mode(["drone1"], "takeoff")
-    assert table.told.get(timeout=PATIENCE_S).refusal == "drone1 is flown by 'console.2' with priority 10"
+    assert has_terms(table.told.get(timeout=PATIENCE_S).refusal, "drone1", "'console.2'", "10")
     assert [said[1] for said in table.link.said] == ["acquire"]
 
 
@@ -154,7 +158,7 @@ def test_an_emergency_is_sent_even_where_the_drone_is_refused(table: Table):
     table.link.refusals["acquire"] = "drone1 is flown by 'console.2' with priority 100"
     table.desk.send_mode(["drone1"], "emergency")
     told = table.told.get(timeout=PATIENCE_S)
-    assert told.refusal == "drone1 is flown by 'console.2' with priority 100; emergency was sent all the same"
+    assert has_terms(told.refusal, "drone1", "'console.2'", "100", "emergency")
     (mode,) = [said[1] for said in table.link.said if len(said) == 2]
     assert mode.mode == "emergency"
 

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from refused import has_terms, refused, without_tags
 
 from zsim.contract.run_messages import Clock, Event, Waiting
 from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones
@@ -274,7 +275,7 @@ def test_what_is_out_of_range_is_refused_with_what_is_allowed():
     scenario = scenario_file.load(SCENARIOS / "step.yaml")
     space = scenario_space(scenario, scenario.clusters[0])
     found = {each.name: each for each in slider_ranges(space, scenario.clusters[0], scenario)}
-    assert (found["p"].refusal(0.5) or "").startswith("p is 0.5 m")
+    assert has_terms(found["p"].refusal(0.5) or "", "p", "0.5")
     assert found["p"].refusal(math.nan) is not None
     assert found["p"].to_display(1.0) == 2.0
 
@@ -326,16 +327,16 @@ def test_parameters_are_read():
 
 
 @pytest.mark.parametrize(
-    ("text", "where"),
+    ("text", "terms"),
     [
-        ("x_c", "line 1 is 'x_c'"),
-        ("x_c = 5\nyc = 6", r"yc .* x_c"),
-        ("x_c = 1\nradius = wide", r"line 2: radius .* 'wide'"),
-        ("", "trajectory"),
+        ("x_c", ("line 1", "'x_c'")),
+        ("x_c = 5\nyc = 6", ("yc", "x_c")),
+        ("x_c = 1\nradius = wide", ("line 2", "radius", "'wide'")),
+        ("", ("trajectory",)),
     ],
 )
-def test_an_invalid_expression_is_refused_by_line_and_value(text: str, where: str):
-    with pytest.raises(operator_input.InputError, match=where):
+def test_an_invalid_expression_is_refused_by_line_and_value(text: str, terms: tuple[str, ...]):
+    with refused(operator_input.InputError, *terms):
         operator_input.parse_expressions(text, ("x_c",))
 
 
@@ -510,26 +511,26 @@ def test_many_formations_leave_room_for_the_emergency_button():
     told = html_tables.formation_lines({f"c{i}": ("taking_off", "<waits>") for i in range(16)})
     assert html_tables.FEW_LINES in told
     assert told.count("<br>") == 15
-    assert "taking off – &lt;waits&gt;" in told
+    assert has_terms(without_tags(told), "taking off", "&lt;waits&gt")
 
 
 def test_the_clock_says_whom_the_run_waits_for():
     now = Clock(2_000_000_000, 0, "r", 100, "waiting", 0.0, (Waiting("estimator.d1", "lab", 3.0),))
-    assert "waiting for estimator.d1 on lab (3 s)" in html_tables.clock_line(now, now.t_ns)
+    assert has_terms(without_tags(html_tables.clock_line(now, now.t_ns)), "waiting", "estimator.d1", "lab", "3 s")
     assert "no clock" in html_tables.clock_line(None, 0)
 
 
 def test_the_clock_tells_a_pace_only_while_the_run_goes_on():
     running, paused = (Clock(2_020_000_000, 0, "r", 101, state, 3.0) for state in ("running", "paused"))  # type: ignore[arg-type]
-    assert "2.0 s</b> × 3.0 real time" in html_tables.clock_line(running, 2_010_000_000)
+    assert has_terms(without_tags(html_tables.clock_line(running, 2_010_000_000)), "2.0 s", "3.0")
     assert "2.02 s</b><" in html_tables.clock_line(paused, 0)  # nothing is drawn yet
 
 
 def test_acting_faults_are_listed():
     assert html_tables.NO_FAULT in html_tables.fault_lines([])
-    assert "gust of world until 5.0 s<br>⚠ link_cut of a/&lt;b&gt;" in html_tables.fault_lines(
-        ["gust of world until 5.0 s", "link_cut of a/<b>"]
-    )
+    lines = html_tables.fault_lines(["gust of world", "link_cut of a/<b>"])
+    assert "gust of world<br>" in lines
+    assert "link_cut of a/&lt;b&gt;" in lines
 
 
 # Where it is

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from refused import has_terms, without_tags
 
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health
@@ -167,7 +168,7 @@ def test_silence_of_the_world_is_told_and_for_how_long():
 
 def test_a_silent_world_is_not_called_running():
     told = html_tables.clock_line(clock(7 * S), 7 * S, 12.3)
-    assert "no answer from the world for 12 s" in told
+    assert has_terms(without_tags(told), "no answer", "12 s")
     assert html_tables.RED in told
     assert "running" not in told
 
@@ -187,7 +188,7 @@ def test_a_dead_estimator_is_not_shown_as_a_healthy_one():
     ears.hear(drones(10 * S))
     assert ears.words.drone_rows()[0].lag_ms == 8000.0
     told = ears.words.sensor_table("drone1")
-    assert "no estimate since 2.0 s" in told
+    assert has_terms(without_tags(told), "no estimate", "2.0 s")
     assert "Hz" not in told
     assert not ears.views.estimates()["drone1"].fresh
     assert console_state("r1", ears.views, ears.watch, {})["drones"][0]["sigma_m"] is None

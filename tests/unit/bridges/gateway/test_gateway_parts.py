@@ -10,6 +10,7 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refused import refused
 
 from zsim.contract import messages
 from zsim.contract.flight_messages import Status, Velocity
@@ -63,7 +64,7 @@ def test_whole_numbers_may_come_as_doubles_but_not_as_fractions():
     assert messages.decode(VELOCITY, json_to_payload(VELOCITY, value)).t_ns == 20_000_000
     with pytest.raises(DecodeError, match=r"t_ns is 0\.5"):
         json_to_payload(VELOCITY, {**value, "t_ns": 0.5})
-    with pytest.raises(DecodeError, match="t_ns is 1e"):
+    with refused(DecodeError, "t_ns", "1e…"):
         json_to_payload(VELOCITY, {**value, "t_ns": 1e30})
 
 
@@ -397,17 +398,17 @@ def test_in_realtime_a_late_gate_goes_with_a_newer_one():
 
 
 @pytest.mark.parametrize(
-    ("given", "field"),
+    ("given", "terms"),
     [
-        ({"name": "nodot"}, "name is 'nodot'"),
-        ({"name": "A.b"}, "name is 'A.b'"),
-        ({"period_ns": GATE_NS + 1}, "period_s is 0.02"),
-        ({"period_ns": 0}, "period_s is 0"),
-        ({"gates": ["drone/*/truth"]}, "gates"),
+        ({"name": "nodot"}, ("name", "'nodot'")),
+        ({"name": "A.b"}, ("name", "'A.b'")),
+        ({"period_ns": GATE_NS + 1}, ("period_s", "0.02…")),
+        ({"period_ns": 0}, ("period_s", "0…")),
+        ({"gates": ["drone/*/truth"]}, ("gates…",)),
     ],
 )
-def test_an_invalid_join_is_refused_by_its_field(given: dict[str, Any], field: str):
-    with pytest.raises(DecodeError, match=field):
+def test_an_invalid_join_is_refused_by_its_field(given: dict[str, Any], terms: tuple[str, ...]):
+    with refused(DecodeError, *terms):
         lockstep_agent(**given)
 
 

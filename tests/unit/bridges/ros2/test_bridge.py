@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from federation import PAIR
+from refused import has_terms
 
 from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.messages import ClusterInfo, DroneInfo, Info, Origin
@@ -208,15 +209,13 @@ def test_who_subscribes_to_another_type_is_told_of_and_gets_nothing() -> None:
     bench = Bench()
     bench.reader("/drone_1/imu", "std_msgs/msg/String")
     assert not bench.link.hearing.get(keys.sensor("drone-1", "imu"))
-    assert any(
-        "somebody subscribes to std_msgs::msg::dds_::String_; it is sensor_msgs/msg/Imu" in s for s in bench.lines
-    )
+    assert any(has_terms(s, "std_msgs::msg::dds_::String_", "sensor_msgs/msg/Imu") for s in bench.lines)
 
 
 def test_names_that_ros_does_not_take_are_told() -> None:
     said = "\n".join(Bench().lines)
-    assert "drone-1 is drone_1 in ROS" in said
-    assert "m.x is m_x in ROS" in said
+    assert has_terms(said, "drone-1", "drone_1", "ROS")
+    assert has_terms(said, "m.x", "m_x", "ROS")
     assert "drone2 is" not in said
 
 
@@ -253,16 +252,16 @@ def test_modes_and_the_emergency_button() -> None:
 
 
 @pytest.mark.parametrize(
-    ("message", "attachment", "why"),
+    ("message", "attachment", "terms"),
     [
-        (b"\x00\x01\x00\x00short", BESIDE, "are no CDR of geometry_msgs/msg/Twist"),
-        (twist(0, 0, 0, 0, 0, 0), b"", "must have 33"),
-        (twist(0, 0, 0, 0, 0, 0), BESIDE[:-1], "must have 33"),
-        (twist(math.nan, 0, 0, 0, 0, 0), BESIDE, "must be finite"),
-        (twist(0, 0, 0, 0, 0, math.inf), BESIDE, "must be finite"),
+        (b"\x00\x01\x00\x00short", BESIDE, ("CDR", "geometry_msgs/msg/Twist")),
+        (twist(0, 0, 0, 0, 0, 0), b"", ("33",)),
+        (twist(0, 0, 0, 0, 0, 0), BESIDE[:-1], ("33",)),
+        (twist(math.nan, 0, 0, 0, 0, 0), BESIDE, ("finite",)),
+        (twist(0, 0, 0, 0, 0, math.inf), BESIDE, ("finite",)),
     ],
 )
-def test_garbage_is_refused_counted_and_told_once(message: Any, attachment: bytes, why: str) -> None:
+def test_garbage_is_refused_counted_and_told_once(message: Any, attachment: bytes, terms: tuple[str, ...]) -> None:
     bench = Bench()
     for _ in range(3):
         bench.publish("/drone_1/cmd_vel", TWIST, message, attachment)
@@ -270,7 +269,7 @@ def test_garbage_is_refused_counted_and_told_once(message: Any, attachment: byte
     assert bench.observer.health.refused == 3
     told = [line for line in bench.lines if "refused" in line]
     assert len(told) == 1
-    assert why in told[0]
+    assert has_terms(told[0], *terms)
 
 
 def test_what_does_not_fit_a_ros_type_is_refused() -> None:
@@ -293,7 +292,8 @@ def test_a_service_asks_the_controller_and_echoes_who_asked() -> None:
     ((key, payload, beside),) = query.replies
     assert key == bench.key("/cluster/m_x/engage", TRIGGER)
     response = TYPES.decode(payload, "std_srvs/srv/Trigger_Response")
-    assert (response.success, response.message) == (False, "phase is idle; possible when engaged")
+    assert not response.success
+    assert has_terms(response.message, "phase", "idle", "engaged")
     assert rmw_zenoh.attachment_of(beside) == (7, WALL_NS, bytes(range(16)))
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import typer
+from refused import has_terms, refused
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from zsim.errors import RunError
@@ -14,7 +15,7 @@ from zsim_deploy.cli.bridge_commands import ros2
 def test_the_package_has_the_types_that_go_over_the_wire(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ros2(write_package=tmp_path)
     package = tmp_path / "zsim_msgs"
-    assert capsys.readouterr().out == f"wrote {package}; build it with colcon in a ROS workspace\n"
+    assert has_terms(capsys.readouterr().out, str(package), "colcon")
     store, types = get_typestore(Stores.ROS2_KILTED), RosTypes()
     for path in package.glob("msg/*.msg"):
         name = f"zsim_msgs/msg/{path.stem}"
@@ -27,10 +28,10 @@ def test_the_package_has_the_types_that_go_over_the_wire(tmp_path: Path, capsys:
 
 def test_a_folder_that_cannot_be_written_is_a_line(tmp_path: Path) -> None:
     (tmp_path / "zsim_msgs").write_text("a file is there")
-    with pytest.raises(RunError, match=r"cannot be written .*; give --write-package another folder"):
+    with refused(RunError, "written", "--write-package"):
         ros2(write_package=tmp_path)
 
 
 def test_a_secured_world_needs_a_router_for_ros(tmp_path: Path) -> None:
-    with pytest.raises(typer.BadParameter, match="--tls needs --router"):
+    with refused(typer.BadParameter, "--tls", "--router"):
         ros2(tls=tmp_path)

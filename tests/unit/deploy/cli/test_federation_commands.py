@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import typer
+from refused import refused
 
 from zsim.contract import keys
 from zsim.contract.run_messages import Fault
@@ -25,7 +26,7 @@ def test_durations(text: str | None, value: float | None):
 
 @pytest.mark.parametrize("text", ["", "s", "-1s", "10h", "1e3s", "nan"])
 def test_what_is_no_duration(text: str):
-    with pytest.raises(typer.BadParameter, match="must be a duration such as 10s, 500ms or 2min"):
+    with refused(typer.BadParameter, "10s", "500ms", "2min"):
         seconds(text)
 
 
@@ -52,17 +53,17 @@ def test_what_is_no_parameter(text: str):
 
 
 @pytest.mark.parametrize(
-    ("given", "line"),
+    ("given", "terms"),
     [
-        (["target=drone2"], "target is no parameter of a kind; give it by the argument TARGET"),
-        (["kind=gps_stuck"], "kind is no parameter of a kind; give it by the argument KIND"),
-        (["for_s=2"], "for_s is no parameter of a kind; give it by --for"),
-        (["at_s=2"], "at_s is no parameter of a kind; give it by --at"),
-        (["factor=2", "factor=3"], "factor is given twice; must be given once"),
+        (["target=drone2"], ("target", "TARGET")),
+        (["kind=gps_stuck"], ("kind", "KIND")),
+        (["for_s=2"], ("for_s", "--for")),
+        (["at_s=2"], ("at_s", "--at")),
+        (["factor=2", "factor=3"], ("factor", "twice", "once")),
     ],
 )
-def test_what_is_given_elsewhere_or_twice_is_no_parameter(given: list[str], line: str):
-    with pytest.raises(typer.BadParameter, match=line):
+def test_what_is_given_elsewhere_or_twice_is_no_parameter(given: list[str], terms: tuple[str, ...]):
+    with refused(typer.BadParameter, *terms):
         federation_commands._values(given)
     assert set(federation_commands.GIVEN_BY) == set(COMMON)
 
@@ -70,7 +71,7 @@ def test_what_is_given_elsewhere_or_twice_is_no_parameter(given: list[str], line
 @pytest.mark.parametrize("value", [10**20, [0, 10**24], {10**20: 1}, "\udcff"], ids=ascii)
 def test_what_fits_into_no_message_is_refused_in_a_line(value: Any):
     nowhere: Any = SimpleNamespace()
-    with pytest.raises(SessionError, match=r"world/control: fault_add cannot be sent .*must hold whole numbers"):
+    with refused(SessionError, "world/control", "fault_add", "whole"):
         Session.request(nowhere, keys.CONTROL, "fault_add", "zsim.fault", {"value": value})
 
 

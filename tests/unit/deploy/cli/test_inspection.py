@@ -5,6 +5,7 @@ import json
 import msgspec
 import pytest
 from fake_link import BAD_UTF8, NESTED, FakeLink
+from refused import has_terms
 from synthetic_record import SCENARIOS, info
 
 from zsim.contract import keys, messages, run_messages
@@ -72,13 +73,15 @@ def test_garbage_counts_for_the_rate(payload: bytes, monkeypatch: pytest.MonkeyP
 
 def test_the_rate_is_told_once_a_second_and_at_the_end(monkeypatch: pytest.MonkeyPatch):
     due = [(0.5, keys.CLOCK, b"\x80"), (1.2, keys.CLOCK, b"\x80")]
-    assert rates(monkeypatch, due, 1.5) == ["1 message", "1.4 Hz wall (gap 700.0 to 700.0 ms), 2 messages"]
+    first, last = rates(monkeypatch, due, 1.5)
+    assert first == "1 message"
+    assert has_terms(last, "1.4 Hz wall", "700.0", "700.0 ms", "2 messages")
 
 
 def test_the_gaps_are_those_of_the_messages(monkeypatch: pytest.MonkeyPatch):
     due = [(0.02 * (k + 1), keys.CLOCK, msgspec.msgpack.encode({"t_ns": 20_000_000 * k})) for k in range(10)]
-    lines = rates(monkeypatch, due, 0.3)
-    assert lines == ["50.0 Hz wall (gap 20.0 to 20.0 ms), 50.0 Hz simulated, 10 messages"]
+    (line,) = rates(monkeypatch, due, 0.3)
+    assert has_terms(line, "50.0 Hz wall", "20.0", "20.0 ms", "50.0 Hz simulated", "10 messages")
 
 
 def test_a_rate_of_what_is_no_key_is_refused():
@@ -90,8 +93,8 @@ def test_a_key_that_fell_silent_is_told():
     rate = inspection.MessageRate(10)
     for number in range(5):
         rate.add(10 + 0.02 * number, 20_000_000 * number)
-    assert rate.line(10.1).startswith("50.0 Hz wall (gap 20.0 to 20.0 ms), 50.0 Hz simulated")
-    assert rate.line(12.08) == "nothing for 2.0 s, 5 messages before"
+    assert has_terms(rate.line(10.1), "50.0 Hz wall", "20.0", "20.0 ms", "50.0 Hz simulated")
+    assert has_terms(rate.line(12.08), "nothing", "2.0 s", "5 messages")
 
 
 def test_a_key_that_speaks_seldom_is_not_called_silent():
@@ -173,19 +176,19 @@ def test_time_goes_on_while_it_publishes():
 
 
 @pytest.mark.parametrize(
-    ("key", "text", "says"),
+    ("key", "text", "terms"),
     [
-        ("world/*", "{}", "takes one key, without wildcards"),
-        (keys.CONTROL, "{x", "step: args is no JSON"),
-        (keys.CONTROL, "3", "must be a map such as"),
-        (keys.CONTROL, f'{{"gates": {10**22}}}', "step: args cannot be sent"),
-        (keys.CONTROL, "{}", "nobody answered"),
+        ("world/*", "{}", ("one key", "wildcards")),
+        (keys.CONTROL, "{x", ("step", "args", "JSON")),
+        (keys.CONTROL, "3", ("step", "args", "'3'", "map")),
+        (keys.CONTROL, f'{{"gates": {10**22}}}', ("step", "args", "sent")),
+        (keys.CONTROL, "{}", ("nobody answered",)),
     ],
 )
-def test_a_request_that_cannot_be_meant_is_a_line(key: str, text: str, says: str):
+def test_a_request_that_cannot_be_meant_is_a_line(key: str, text: str, terms: tuple[str, ...]):
     with pytest.raises(RunError) as refused:
         inspection.ask(FakeLink(), key, "step", text)  # type: ignore[arg-type]
-    assert says in str(refused.value)
+    assert has_terms(str(refused.value), *terms)
 
 
 def test_arguments_may_be_named_like_anything():

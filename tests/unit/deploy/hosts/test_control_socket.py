@@ -5,6 +5,7 @@ import os
 import socket
 
 import pytest
+from refused import refused
 
 from zsim.errors import HostsError, RunError
 from zsim_deploy.hosts import control_socket
@@ -41,18 +42,18 @@ def test_an_answer_comes_back():
 
 @pytest.mark.usefixtures("line")
 @pytest.mark.parametrize(
-    ("op", "args", "says"),
+    ("op", "args", "terms"),
     [
-        ("refuse", {}, "host is 'h9'"),
-        ("lack", {}, "^certs/h3/x/key.pem: cannot be read$"),
-        ("hang", {}, "it took too long"),
-        ("fail", {}, "it failed in a way that nobody thought of: ValueError"),
-        ("dance", {}, "no request that is understood"),
-        ("add", {"a": 1}, "no request that is understood"),
+        ("refuse", {}, ("host", "'h9'")),
+        ("lack", {}, ("certs/h3/x/key.pem", "read")),
+        ("hang", {}, ("too long",)),
+        ("fail", {}, ("failed", "ValueError('1…")),
+        ("dance", {}, ("no request",)),
+        ("add", {"a": 1}, ("no request",)),
     ],
 )
-def test_what_is_refused_says_why(op, args, says):
-    with pytest.raises(RunError, match=says):
+def test_what_is_refused_says_why(op, args, terms):
+    with refused(RunError, *terms):
         control_socket.ask("zsim", op, **args)
 
 
@@ -67,12 +68,12 @@ def test_garbage_is_answered_and_the_next_one_served():
 
 @pytest.mark.usefixtures("line")
 def test_a_federation_is_up_only_once():
-    with pytest.raises(RunError, match=r"is up already .*`zsim down --federation zsim`.* --set federation=NAME$"):
+    with refused(RunError, "up already", "zsim down --federation zsim", "--set federation=NAME"):
         ControlSocket("zsim", {})
 
 
 def test_nobody_is_up():
-    with pytest.raises(RunError, match="no `zsim up` of federation 'zsim' runs"):
+    with refused(RunError, "no", "zsim up", "'zsim'"):
         control_socket.ask("zsim", "ps")
 
 
@@ -98,7 +99,7 @@ def test_a_launcher_that_does_not_answer_is_not_taken_for_none(monkeypatch):
     with socket.socket(socket.AF_UNIX) as busy:
         busy.bind(str(place))
         busy.listen()
-        with pytest.raises(RunError, match="`zsim up` has not answered ps within"):
+        with refused(RunError, "zsim up", "not answered", "ps"):
             control_socket.ask("zsim", "ps")
 
 
@@ -107,14 +108,14 @@ def test_a_folder_in_which_others_may_write_or_read_is_refused(mode):
     folder = control_socket.place("zsim").parent
     folder.mkdir()
     folder.chmod(mode)
-    with pytest.raises(RunError, match=f"is not a folder that is yours alone .* mode {mode:o}"):
+    with refused(RunError, "yours alone", f"mode {mode:o}"):
         ControlSocket("zsim", {})
 
 
 def test_a_link_to_somewhere_else_is_refused(tmp_path):
     (tmp_path / "elsewhere").mkdir(mode=0o700)
     control_socket.place("zsim").parent.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(RunError, match="is not a folder that is yours alone"):
+    with refused(RunError, "yours alone"):
         ControlSocket("zsim", {})
 
 
@@ -131,9 +132,9 @@ def test_a_path_that_is_too_long_is_a_line(tmp_path, monkeypatch):
     long = tmp_path / ("x" * 120)
     long.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(long))
-    with pytest.raises(RunError, match="longer than 107 bytes; set XDG_RUNTIME_DIR or TMPDIR"):
+    with refused(RunError, "107 bytes", "XDG_RUNTIME_DIR", "TMPDIR"):
         ControlSocket("zsim", {})
-    with pytest.raises(RunError, match="no `zsim up` of federation"):
+    with refused(RunError, "no", "zsim up", "'zsim'"):
         control_socket.ask("zsim", "ps")
 
 

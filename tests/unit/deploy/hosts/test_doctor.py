@@ -1,9 +1,11 @@
 """What `zsim doctor` makes of what hosts say; and the probe's round trip and bandwidth over loopback."""
 
 import asyncio
+import errno
 import io
 import itertools
 import json
+import os
 import pathlib
 import platform
 import socket
@@ -14,6 +16,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from refused import has_terms, refused
 
 from zsim import __version__
 from zsim.errors import HostsError
@@ -46,38 +49,35 @@ def test_sound_hosts_raise_nothing():
 
 
 @pytest.mark.parametrize(
-    ("changes", "says"),
+    ("changes", "terms"),
     [
-        ({"zsim": "0.0.1"}, f"h1: zsim is 0.0.1; must be {__version__} as here; run `zsim push --hosts "),
-        ({"python": "3.9.2"}, "h1: Python is 3.9.2; must be"),
-        (
-            {"unwritable": "/opt may not be written"},
-            "h1: its folder cannot be used (/opt may not be written); correct hosts.h1.folder, or make it there",
-        ),
+        ({"zsim": "0.0.1"}, ("h1", "zsim", "0.0.1", __version__, "zsim push --hosts")),
+        ({"python": "3.9.2"}, ("h1", "Python", "3.9.2")),
+        ({"unwritable": "/opt"}, ("h1", "folder", "/opt", "hosts.h1.folder")),
     ],
 )
-def test_another_version_or_a_folder_that_cannot_be_used_is_a_fault(changes, says):
+def test_another_version_or_a_folder_that_cannot_be_used_is_a_fault(changes, terms):
     faults, _ = compare_reports({"h1": report(**changes), "h2": report()})
-    assert [line.startswith(says) for line in faults] == [True]
+    assert [has_terms(line, *terms) for line in faults] == [True]
 
 
 @pytest.mark.parametrize(
-    ("found", "says"),
+    ("found", "terms"),
     [
-        (report(offset_s=3600.0), "h1: its clock is +3600.0 s off"),
-        (report(load=1.9), "h1: load is 1.9 on 2 cores"),
-        (report(governors=["powersave"]), "h1: the CPU governor is powersave"),
-        (report(free_bytes=10_000_000), "h1: 0.0 GB are free on its disk"),
+        (report(offset_s=3600.0), ("h1", "clock", "+3600.0 s")),
+        (report(load=1.9), ("h1", "load", "1.9", "2 cores")),
+        (report(governors=["powersave"]), ("h1", "governor", "powersave")),
+        (report(free_bytes=10_000_000), ("h1", "0.0 GB", "disk")),
         (
             report(fingerprint="b" * 16),
-            "the hosts compute with different numeric fingerprints (h1 bbbbbbbb, h2 aaaaaaaa)",
+            ("fingerprints", "h1 bbbbbbbb", "h2 aaaaaaaa"),
         ),
     ],
 )
-def test_what_slows_or_differs_is_a_warning(found, says):
+def test_what_slows_or_differs_is_a_warning(found, terms):
     faults, warnings = compare_reports({"h1": found, "h2": report()})
     assert faults == []
-    assert [line.startswith(says) for line in warnings] == [True]
+    assert [has_terms(line, *terms) for line in warnings] == [True]
 
 
 def test_a_path_that_is_not_there_is_a_fault_and_a_slow_one_a_warning():
@@ -89,27 +89,26 @@ def test_a_path_that_is_not_there_is_a_fault_and_a_slow_one_a_warning():
         ]
     )
     assert len(faults) == 1
-    assert faults[0].startswith("h2: port 7447 of h1 cannot be reached (Connection refused)")
-    assert slow == ["h3 reaches h1 at 2.0 Mbit/s only"]
+    assert has_terms(faults[0], "h2", "port 7447", "h1", os.strerror(errno.ECONNREFUSED))
+    (line,) = slow
+    assert has_terms(line, "h3", "h1", "2.0 Mbit/s")
 
 
 @pytest.mark.parametrize(
-    ("found", "line"),
+    ("found", "terms"),
     [
+        ({"error": os.strerror(errno.EADDRINUSE), "taken": True}, ("h1", "port 7447", "in use", "ss -ltnp", "port")),
         (
-            {"error": "Address already in use", "taken": True},
-            "h1: port 7447 is in use there, perhaps by another run; end that (`ss -ltnp` there shows it), "
-            "or give another port in the inventory",
-        ),
-        (
-            {"error": "Permission denied", "taken": False},
-            "h1: nothing may listen on port 7447 there (Permission denied); give another port in the inventory",
+            {"error": os.strerror(errno.EACCES), "taken": False},
+            ("h1", "port 7447", os.strerror(errno.EACCES), "another port"),
         ),
     ],
 )
-def test_a_port_on_which_nothing_can_listen_is_not_called_unreachable(found, line):
+def test_a_port_on_which_nothing_can_listen_is_not_called_unreachable(found, terms):
     (path,) = asyncio.run(doctor.network_paths([Silent()], Silent(json.dumps(found) + "\n"), {"h1": "python"}, 7447))
-    assert path_faults([path]) == ([line], [])
+    (line,), warnings = path_faults([path])
+    assert has_terms(line, *terms)
+    assert warnings == []
 
 
 def checked_up(folder: pathlib.Path) -> CheckResult:
@@ -120,9 +119,7 @@ def checked_up(folder: pathlib.Path) -> CheckResult:
 
 def test_certificates_that_are_missing_or_expired_are_faults_and_open_keys_a_warning(tmp_path):
     (fault, _) = checked_up(tmp_path).faults
-    assert fault.startswith(
-        f"{tmp_path}/certs: has no certificates; make them with `zsim certs init {tmp_path}/lab.yaml "
-    )
+    assert has_terms(fault, f"{tmp_path}/certs", "no certificates", f"zsim certs init {tmp_path}/lab.yaml")
     then = datetime.now(UTC) - timedelta(days=60)
     signer = certificates.authority(tmp_path / "certs", then)
     place = certificates.issue(tmp_path / "certs", signer, CertificateRequest("h1", "world", ("127.0.0.1",)), then)
@@ -130,12 +127,10 @@ def test_certificates_that_are_missing_or_expired_are_faults_and_open_keys_a_war
     (place / "key.pem").chmod(0o644)
     found = checked_up(tmp_path)
     (fault, _) = found.faults
-    assert fault.startswith(f"{tmp_path}/certs: certificate expired on ")
-    assert fault.endswith(
-        f": world on h1; make them with `zsim certs init {tmp_path}/lab.yaml --scenario FILE --renew`"
-    )
+    renew = f"zsim certs init {tmp_path}/lab.yaml --scenario FILE --renew"
+    assert has_terms(fault, f"{tmp_path}/certs", "expired", "world", "h1", renew)
     (warning,) = found.warnings
-    assert warning.startswith(f"{place}/key.pem can be read by others on this machine; ")
+    assert has_terms(warning, f"{place}/key.pem", "read")
 
 
 # Asking a host
@@ -190,48 +185,40 @@ def test_a_greeting_of_the_login_shell_is_passed_over():
 def test_a_host_that_says_nothing_is_a_line(monkeypatch):
     monkeypatch.setattr(doctor, "ABOUT_S", 0.01)
     monkeypatch.setattr(doctor, "READY_S", 0.01)
-    with pytest.raises(HostsError, match=r"^h1: no answer within 0\.01 s; "):
+    with refused(HostsError, "h1", "no answer", "0.01 s"):
         asyncio.run(doctor.host_report(Silent(), "python"))
     (path,) = asyncio.run(doctor.network_paths([Silent()], Silent(), {"h1": "python"}, 7447))
-    assert path.figures["error"].startswith("h1: no answer within 0.01 s; ")
+    assert has_terms(path.figures["error"], "h1", "no answer", "0.01 s")
 
 
-PUSH = "run `zsim push --hosts lab.yaml`"
-OR_PUSH = f"leave hosts.h1.python out and {PUSH}"
+PUSH = "zsim push --hosts lab.yaml"
 
 
 @pytest.mark.parametrize(
-    ("python", "code", "error", "line"),
+    ("python", "code", "error", "terms"),
     [
-        (None, 1, "/usr/bin/python3: No module named zsim_deploy", f"PYTHON has no zsim {__version__}; {PUSH}"),
-        (None, 127, "bash: line 1: PYTHON: No such file or directory", f"has no zsim in .zsim; {PUSH}"),
-        (None, 1, "PYTHON: Command not found.", f"has no zsim in .zsim; {PUSH}"),
+        (None, 1, "/usr/bin/python3: No module named zsim_deploy", ("PYTHON", "no zsim", __version__, PUSH)),
+        (None, 127, "bash: line 1: PYTHON: No such file or directory", ("no zsim", ".zsim", PUSH)),
+        (None, 1, "PYTHON: Command not found.", ("no zsim", ".zsim", PUSH)),
         (
             "PYTHON",
             1,
             "PYTHON: No module named zsim_deploy",
-            f"PYTHON has no zsim {__version__}; install it there, or {OR_PUSH}",
+            ("PYTHON", "no zsim", __version__, "install", "hosts.h1.python", PUSH),
         ),
         (
             "PYTHON",
             126,
             "bash: line 1: PYTHON: Is a directory",
-            "python PYTHON is no program there (bash: line 1: PYTHON: Is a directory); "
-            f"correct hosts.h1.python, or install it there, or {OR_PUSH}",
+            ("PYTHON", "no program", "PYTHON", os.strerror(errno.EISDIR), "hosts.h1.python", "install", PUSH),
         ),
-        (
-            None,
-            1,
-            "Traceback (most recent call last):\nMemoryError",
-            "PYTHON: the probe ended with code 1 (MemoryError); is it a Python that has zsim?",
-        ),
-        (None, 0, "", "PYTHON: the probe ended with code 0 (it printed nothing); is it a Python that has zsim?"),
+        (None, 1, "Traceback (most recent call last):\nMemoryError", ("PYTHON", "code 1", "MemoryError")),
+        (None, 0, "", ("PYTHON", "code 0", "nothing")),
     ],
 )
-def test_a_host_without_zsim_is_told_from_one_with_another_fault(python, code, error, line):
-    with pytest.raises(HostsError) as caught:
+def test_a_host_without_zsim_is_told_from_one_with_another_fault(python, code, error, terms):
+    with refused(HostsError, "h1", *terms):
         asyncio.run(doctor.host_report(Silent("Welcome to lab\n", error, code, python), "PYTHON", "lab.yaml"))
-    assert str(caught.value) == f"h1: {line}"
 
 
 # The probe
@@ -335,12 +322,12 @@ def test_governors_are_read_where_the_system_tells(tmp_path):
 def test_a_port_that_is_taken_is_said(capsys):
     with probe.listening(0) as taken:
         probe.serve(taken.getsockname()[1])
-    assert json.loads(capsys.readouterr().out) == {"error": "Address already in use", "taken": True}
+    assert json.loads(capsys.readouterr().out) == {"error": os.strerror(errno.EADDRINUSE), "taken": True}
 
 
 def test_a_folder_is_asked_for_where_it_would_be_made(tmp_path, monkeypatch):
     assert probe.unwritable(tmp_path / "zsim" / "runs") is None
     (tmp_path / "file").touch()
-    assert probe.unwritable(tmp_path / "file" / "zsim") == f"{tmp_path}/file is no folder"
+    assert has_terms(probe.unwritable(tmp_path / "file" / "zsim"), f"{tmp_path}/file", "no folder")
     monkeypatch.setattr(probe.os, "access", lambda path, _mode: path != tmp_path)
-    assert probe.unwritable(tmp_path / "zsim") == f"{tmp_path} may not be written"
+    assert has_terms(probe.unwritable(tmp_path / "zsim"), str(tmp_path), "written")

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import yaml
+from refused import has_terms
 from rich.console import Console
 
 from zsim.errors import HostsError
@@ -75,18 +76,17 @@ def ends_as(up: Any, outcome: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(up._supervisor, "run", run)
 
 
-@pytest.mark.parametrize("when", ["while the processes end", "while the record is fetched"])
+@pytest.mark.parametrize("early", [True, False], ids=["processes end", "record is fetched"])
 def test_a_second_ctrl_c_does_not_wait_and_says_where_the_record_is(
-    up: Any, board: Said, monkeypatch: pytest.MonkeyPatch, when: str
+    up: Any, board: Said, monkeypatch: pytest.MonkeyPatch, early: bool
 ) -> None:
-    early = when == "while the processes end"
     ends_as(up, KeyboardInterrupt() if early else Outcome("interrupted", interrupted=True), monkeypatch)
     with monkeypatch.context() as patched:
         patched.setattr(up._loop, "call", interrupting)
         with pytest.raises(KeyboardInterrupt):
             up._fly()
-    assert matches(rf"the record was not fetched; what there is of it is at {AT}", board)
-    assert ("fetching the record" in board.text()) is not early
+    assert re.search(rf"not fetched.* {AT}", board.text())
+    assert has_terms(board.text(), "fetching") is not early
 
 
 def interrupting(work: Any) -> None:
@@ -101,10 +101,10 @@ def matches(pattern: str, board: Said) -> bool:
 def test_a_run_that_was_ended_before_it_flew_has_no_record(
     up: Any, board: Said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ends_as(up, Outcome("interrupted by Ctrl-C", interrupted=True), monkeypatch)
+    ends_as(up, Outcome("interrupted", interrupted=True), monkeypatch)
     monkeypatch.setattr(module, "fetch", fetching(False))
-    assert up._fly() == Outcome("interrupted by Ctrl-C", interrupted=True)
-    assert board.text().endswith("nothing was recorded\n")
+    assert up._fly() == Outcome("interrupted", interrupted=True)
+    assert has_terms(board.text(), "nothing", "recorded")
     assert not up._record_stays
 
 
@@ -112,16 +112,16 @@ def test_a_record_that_stays_away_fails_a_run_that_ended_well(
     up: Any, board: Said, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ends_as(up, Outcome("duration"), monkeypatch)
-    monkeypatch.setattr(module, "fetch", fetching(HostsError("h1: it is gone")))
+    monkeypatch.setattr(module, "fetch", fetching(HostsError("h1: gone")))
     outcome = up._fly()
     assert outcome.failed
-    assert outcome.reason.startswith("the record could not be fetched (h1: it is gone); what there is of it is at h1:")
+    assert has_terms(outcome.reason, "record", "h1: gone", "h1:…")
     assert up._record_stays
 
 
 def test_a_closed_terminal_ends_the_run_and_lines_are_shown_from_then_on(up: Any, board: Said) -> None:
     with board:
         up._hang_up()
-        assert up._supervisor.run().reason == "the terminal was closed"
+        assert has_terms(up._supervisor.run().reason, "terminal", "closed")
         board.say("fetching")
     assert board.text() == "fetching\n"

@@ -1,12 +1,15 @@
 """A process on another host, over a link that a test makes: whatever happens, its end is noticed."""
 
 import asyncio
+import errno
+import os
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from refused import has_terms
 
 from zsim.errors import HostsError
 from zsim_deploy.hosts.remote_process import LOST, ProcessLog, RemoteProcess
@@ -113,18 +116,19 @@ def test_what_a_process_says_is_kept_and_a_greeting_of_the_shell_is_not_its_id(s
 
 def test_a_fault_of_whoever_takes_its_lines_ends_it(started: Start) -> None:
     def fail(line: str) -> None:
-        raise TypeError("int is not iterable")
+        raise TypeError("not iterable")
 
     remote = started(Link(Process("zsim-pid 77\n", "1234\n")), fail)
     assert remote.wait(PATIENCE_S)
     assert remote.code == LOST
-    assert remote.outcome() == "the launcher could not follow it (TypeError('int is not iterable'))"
+    assert has_terms(remote.outcome(), "launcher", "TypeError('not iterable')")
 
 
 def test_a_link_that_breaks_is_said(started: Start) -> None:
     remote = started(Absent(HostsError("h1: gone")))
     assert remote.wait(PATIENCE_S)
-    assert remote.outcome() == remote.last_log_line() == "the connection to h1 broke (h1: gone)"
+    assert remote.outcome() == remote.last_log_line()
+    assert has_terms(remote.outcome(), "connection", "h1", "h1: gone")
 
 
 def test_a_log_that_cannot_be_written_is_said_once_and_the_process_goes_on(started: Start, tmp_path: Path) -> None:
@@ -133,9 +137,8 @@ def test_a_log_that_cannot_be_written_is_said_once_and_the_process_goes_on(start
     remote = started(Link(Process("zsim-pid 77\n", complains=("one\n", "two\n"))), log=log)
     assert remote.wait(PATIENCE_S)
     assert (remote.code, remote.last_log_line()) == (0, "two")
-    assert [text.split(": ", 1)[1] for text in said] == [
-        "cannot be written (No such file or directory); what it would say there is lost"
-    ]
+    (line,) = said
+    assert has_terms(line, "gone/estimator.d1.log", "written", os.strerror(errno.ENOENT))
 
 
 def test_one_that_waits_for_its_host_can_be_given_up(started: Start) -> None:

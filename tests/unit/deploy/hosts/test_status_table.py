@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from refused import has_terms
 from rich.console import Console
 
 from zsim_deploy.hosts.status_table import StatusTable, table
@@ -60,29 +61,31 @@ def test_a_row_says_where_and_how_a_process_is(board, monkeypatch):
 
 def test_who_is_waited_for_is_said(board):
     board.clock(clock(1.0, waiting_for=[{"name": "estimator.d1", "host": "h1", "since_wall_s": 3.2}]))
-    assert board.rows()[0]["state"] == "waited for 3 s"
+    assert has_terms(board.rows()[0]["state"], "waited for", "3 s")
 
 
 def test_a_silent_host_is_named_once_with_its_roles_and_once_when_it_is_back(board):
     board.links["h1"].silent = 1.5
     board.report_silent_hosts()
     board.report_silent_hosts()
-    assert said(board).count("host h1 does not answer (since 1.5 s); on it: estimator.d1") == 1
-    assert board.rows()[0]["state"] == "host silent 2 s"
+    (line,) = said(board).splitlines()
+    assert has_terms(line, "h1", "not answer", "1.5 s", "estimator.d1")
+    assert has_terms(board.rows()[0]["state"], "silent", "2 s")
     assert board.rows()[0]["round_trip_ms"] is None
     board.links["h1"].silent = 0.0
     board.report_silent_hosts()
-    assert said(board).count("host h1 answers again") == 1
+    (_, line) = said(board).splitlines()
+    assert has_terms(line, "h1", "again")
 
 
 def test_what_always_answers_late_is_not_silent(board):
     board.links["h1"].round_trip_s, board.links["h1"].silent = 1.2, 1.2
     board.report_silent_hosts()
-    assert "does not answer" not in said(board)
+    assert said(board) == ""
     assert board.rows()[0]["state"] == "running"
     board.links["h1"].silent = 4.0
     board.report_silent_hosts()
-    assert "host h1 does not answer (since 4.0 s)" in said(board)
+    assert has_terms(said(board), "h1", "not answer", "4.0 s")
 
 
 def test_the_start_is_told_with_where_the_time_went(board):
@@ -92,15 +95,15 @@ def test_the_start_is_told_with_where_the_time_went(board):
     board.clock(clock(1.2))
     board.clock(clock(2.4))
     assert said(board).count("flies after") == 1
-    assert "connect 0.2 s, check 0.5 s, processes" in said(board)
+    assert has_terms(said(board), "connect 0.2 s", "check 0.5 s", "processes")
 
 
 def test_an_ended_process_says_how(board):
     board.members[0].state, board.members[0].code = "ended", 2
-    assert board.rows()[0]["state"] == "ended (exit code 2)"
+    assert has_terms(board.rows()[0]["state"], "ended", "code 2")
     console = Console(file=io.StringIO(), width=200)
     console.print(table(board.rows()))
-    assert "ended (exit code 2)" in console.file.getvalue()  # type: ignore[attr-defined]
+    assert has_terms(console.file.getvalue(), "ended", "code 2")  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("said_last", ["cannot open [/tmp/x]", "[/]", "[red]no"])

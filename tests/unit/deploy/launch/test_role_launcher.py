@@ -10,6 +10,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from refused import has_terms
 
 from zsim import __version__
 from zsim_deploy.launch import role_launcher as module
@@ -119,7 +120,7 @@ def test_it_heeds_what_it_is_told(role_launcher: RoleLauncher, log: Path) -> Non
     role.stdin.write("stop it is enough\n")
     role.stdin.flush()
     role.wait(END_S)
-    assert "stopped while waiting for a world" in log.read_text()
+    assert has_terms(log.read_text(), "stopped", "waiting", "world")
     end(role)
 
 

@@ -5,6 +5,7 @@ import threading
 from typing import Any
 
 import pytest
+from refused import has_terms
 
 from zsim.errors import RunError
 from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT, Supervisor
@@ -136,15 +137,15 @@ def test_a_dead_world_fails_the_run_and_stops_the_rest():
     team = Team(Member("estimator.d1"), world=-signal.SIGKILL)
     outcome = team.go()
     assert outcome.failed
-    assert outcome.reason == "the world died: exit code -9"
+    assert has_terms(outcome.reason, "world", "died", "code -9")
     assert team.others[0].stopped_for == outcome.reason
 
 
 def test_an_interrupt_ends_everybody():
     team = Team(Member("estimator.d1"), looks=1000)
-    outcome = team.go(lambda: team.watch.interrupt("ended by zsim down"))
+    outcome = team.go(lambda: team.watch.interrupt("down"))
     assert outcome.interrupted
-    assert {member.stopped_for for member in team.members} == {"ended by zsim down"}
+    assert {member.stopped_for for member in team.members} == {"down"}
 
 
 def test_a_process_takes_the_place_of_another():
@@ -165,7 +166,7 @@ def test_the_second_of_two_restarts_at_once_is_refused_and_the_run_goes_on():
     assert not team.go().failed
     assert orders[0].exception() is None
     assert isinstance(orders[1].exception(), RunError)
-    assert "is being taken over already" in str(orders[1].exception())
+    assert has_terms(str(orders[1].exception()), "taken over")
     assert (first.pid, second.pid) == (1, 0)
 
 
@@ -215,7 +216,7 @@ def test_a_process_that_does_not_make_way_is_killed(monkeypatch):
     team.watch.submit(lambda: team.watch.replace(new))
     assert not team.go().failed
     assert old.code == -signal.SIGKILL
-    assert "estimator.d1 (pid 1) has not made way" in team.show.said[0]
+    assert has_terms(team.show.said[0], "estimator.d1", "pid 1")
 
 
 def test_a_process_that_waits_for_its_host_is_given_up_when_another_takes_its_place():
@@ -244,9 +245,9 @@ def test_all_are_closed_at_once():
 
 def test_a_run_that_is_ended_before_it_starts_starts_nobody():
     team = Team(Member("estimator.d1"))
-    team.watch.interrupt("ended by zsim down")
+    team.watch.interrupt("down")
     outcome = team.go()
-    assert (outcome.reason, outcome.interrupted) == ("ended by zsim down", True)
+    assert (outcome.reason, outcome.interrupted) == ("down", True)
     assert {member.pid for member in team.members} == {0}
 
 

@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from refused import has_terms
 
 from zsim_deploy.options.terminal import EndSignals, interruptible
 
@@ -45,7 +46,7 @@ with EndSignals(Path(sys.argv[1]), lambda: told.append(1)):
     print("ready", flush=True)
     while not told:
         sys.stdin.readline()
-    print("fetching the record", flush=True)
+    print("fetching", flush=True)
     print("ended", file=sys.stderr, flush=True)
 """
 
@@ -64,7 +65,7 @@ def test_who_loses_the_terminal_goes_on_and_what_it_says_is_in_a_file(tmp_path: 
             talker.send_signal(signal.SIGHUP)
         talker.communicate(b"\n", timeout=60.0)
     assert talker.returncode == 0
-    assert (tmp_path / "up.log").read_text().splitlines() == ["fetching the record", "ended"]
+    assert (tmp_path / "up.log").read_text().splitlines() == ["fetching", "ended"]
 
 
 def test_a_terminal_that_is_there_still_is_told_where_the_rest_is(tmp_path: Path) -> None:
@@ -77,8 +78,9 @@ def test_a_terminal_that_is_there_still_is_told_where_the_rest_is(tmp_path: Path
         assert talker.stdout.readline() == "ready\n"
         talker.send_signal(signal.SIGHUP)
         said, complained = talker.communicate("\n", timeout=60.0)
-    assert (said, complained) == ("", f"the terminal was closed; what there is still to say is in {log}\n")
-    assert log.read_text().splitlines() == ["fetching the record", "ended"]
+    assert said == ""
+    assert has_terms(complained, "terminal", "closed", str(log))
+    assert log.read_text().splitlines() == ["fetching", "ended"]
 
 
 def test_under_nohup_nothing_happens(tmp_path: Path) -> None:

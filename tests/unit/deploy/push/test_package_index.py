@@ -3,6 +3,7 @@
 import subprocess
 
 import pytest
+from refused import has_terms, refused
 
 from zsim.errors import HostsError
 from zsim_deploy.push.package_index import (
@@ -44,8 +45,8 @@ def test_the_launchers_minor_version_is_taken_then_python3_then_the_newest() -> 
 def test_a_python_that_is_too_old_is_a_line() -> None:
     with pytest.raises(HostsError) as caught:
         choose_interpreter("onboard1", found(python3="3.9.2"), HERE)
-    assert str(caught.value) == "onboard1: python3 is 3.9.2; must be >= 3.11; install a newer one beside it"
-    with pytest.raises(HostsError, match=r"^onboard1: has no python3; must be >= 3\.11; install it there$"):
+    assert has_terms(str(caught.value), "onboard1", "python3", "3.9.2", ">=", "3.11")
+    with refused(HostsError, "onboard1", "python3", ">=", "3.11"):
         choose_interpreter("onboard1", [], HERE)
 
 
@@ -68,7 +69,7 @@ def test_linux_takes_the_wheels_of_its_glibc_and_of_older_ones() -> None:
     assert aim.platforms[0] == "manylinux_2_31_aarch64"
     assert {"manylinux_2_17_aarch64", "manylinux2014_aarch64", "linux_aarch64"} <= set(aim.platforms)
     assert "manylinux_2_32_aarch64" not in aim.platforms
-    assert str(aim) == "Python 3.12 on manylinux_2_31_aarch64"
+    assert has_terms(str(aim), "3.12", "manylinux_2_31_aarch64")
 
 
 def test_a_mac_and_a_free_threaded_python() -> None:
@@ -78,14 +79,14 @@ def test_a_mac_and_a_free_threaded_python() -> None:
 
 
 @pytest.mark.parametrize(
-    ("other", "line"),
+    ("other", "terms"),
     [
-        ({"implementation": "pypy"}, "h: its Python is pypy; must be CPython; install that there"),
-        ({"libc": ["", ""]}, "h: is linux-aarch64; must be Linux with glibc, or macOS; install zsim by hand there"),
-        ({"platform": "win-amd64"}, "h: is win-amd64 glibc 2.31; must be Linux with glibc, or macOS; install zsim by hand there"),
+        ({"implementation": "pypy"}, ("h", "pypy", "CPython")),
+        ({"libc": ["", ""]}, ("h", "linux-aarch64", "glibc", "macOS")),
+        ({"platform": "win-amd64"}, ("h", "win-amd64", "glibc 2.31", "glibc", "macOS")),
     ],
 )  # fmt: skip
-def test_what_wheels_are_not_made_for_is_a_line(other: dict[str, object], line: str) -> None:
+def test_what_wheels_are_not_made_for_is_a_line(other: dict[str, object], terms: tuple[str, ...]) -> None:
     with pytest.raises(HostsError) as caught:
         wheel_target("h", {**SAID, **other})
-    assert str(caught.value) == line
+    assert has_terms(str(caught.value), *terms)

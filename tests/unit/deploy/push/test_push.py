@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import getpass
 import os
 import shutil
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refused import has_terms, refused
 
 from zsim.errors import HostsError, InventoryError
 from zsim_deploy.inventory import inventory
@@ -131,7 +133,7 @@ def test_a_greeting_of_the_login_shell_is_passed_over(tmp_path: Path) -> None:
     assert asyncio.run(work())["folder"] == str(tmp_path)
 
 
-def refused(python: str, folder: Path) -> str:
+def start_refusal(python: str, folder: Path) -> str:
     """Return what keeps an installer from starting."""
 
     async def work() -> None:
@@ -145,14 +147,17 @@ def refused(python: str, folder: Path) -> str:
 
 def test_a_python_that_says_nothing_is_a_line(tmp_path: Path) -> None:
     silent = shutil.which("true") or ""
-    assert refused(silent, tmp_path) == f"h1: {silent} printed nothing; does it run there?"
+    assert has_terms(start_refusal(silent, tmp_path), "h1", str(silent), "nothing")
 
 
 def test_a_folder_that_cannot_be_used_is_a_line_that_says_what_to_do(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert refused(sys.executable, tmp_path / "file" / "zsim") == (
-        f"h1: its folder cannot be used ({tmp_path}/file/zsim: Not a directory); "
-        "correct hosts.h1.folder, or make it there"
+    assert has_terms(
+        start_refusal(sys.executable, tmp_path / "file" / "zsim"),
+        "h1",
+        f"{tmp_path}/file/zsim",
+        os.strerror(errno.ENOTDIR),
+        "hosts.h1.folder",
     )
 
 
@@ -210,8 +215,9 @@ def test_what_pip_says_is_a_line(tmp_path: Path) -> None:
         async with open_installer(Greeting(), sys.executable, str(tmp_path), hush) as program:
             await program.ask("install", ASK_S, **order)
 
-    with pytest.raises(HostsError, match=r"^h1: [^\n]+: ERROR: No space left on device$"):
+    with refused(HostsError, "h1", "ERROR", os.strerror(errno.ENOSPC)) as raised:
         asyncio.run(work())
+    assert "\n" not in str(raised.value)
 
 
 def test_a_second_push_says_whom_it_waits_for(tmp_path: Path) -> None:
@@ -232,7 +238,8 @@ def test_a_second_push_says_whom_it_waits_for(tmp_path: Path) -> None:
             await waits.wait()
             pid = first.processes[0].process.pid
         assert (await waiting)["folder"] == str(tmp_path)
-        assert told == [f"waiting for the push of {getpass.getuser()}@{socket.gethostname()} (process {pid} there)"]
+        (line,) = told
+        assert has_terms(line, f"{getpass.getuser()}@{socket.gethostname()}", f"process {pid}")
         return told
 
     assert asyncio.run(work())
@@ -243,11 +250,10 @@ def test_who_pushes_for_too_long_is_named(tmp_path: Path, monkeypatch: pytest.Mo
 
     async def work() -> str:
         async with open_installer(Greeting(), sys.executable, str(tmp_path), hush):
-            return await asyncio.to_thread(refused, sys.executable, tmp_path)
+            return await asyncio.to_thread(start_refusal, sys.executable, tmp_path)
 
-    said = asyncio.run(work())
-    assert said.startswith(f"h1: {getpass.getuser()}@{socket.gethostname()} (process ")
-    assert said.endswith(" there) is pushing to it; wait for that to end, or end it there")
+    refusal = asyncio.run(work())
+    assert has_terms(refusal, "h1", f"{getpass.getuser()}@{socket.gethostname()}", "process", "pushing")
 
 
 def placed(**hosts: Host) -> InventoryFile:
@@ -263,13 +269,13 @@ def test_a_host_with_an_interpreter_of_its_own_is_left_alone(tmp_path: Path) -> 
 
 
 def test_a_host_that_is_not_in_the_inventory_is_a_line(tmp_path: Path) -> None:
-    with pytest.raises(InventoryError, match=r"^--host c: must be one of a, b$"):
+    with refused(InventoryError, "--host c", "a", "b"):
         pushed(placed(a=Host(address="192.0.2.1"), b=Host(address="192.0.2.2")), ["c"], tmp_path)
 
 
 def test_an_extra_that_is_none_is_a_line_with_those_that_are(tmp_path: Path) -> None:
     where = placed(a=Host(address="192.0.2.1"))
-    with pytest.raises(InventoryError, match=r"^--extra nonsense: must be one of agents, all, .*, world$"):
+    with refused(InventoryError, "--extra nonsense", "agents", "all", "world"):
         asyncio.run(push(where, [], ["agents", "nonsense"], lambda host, text: None, tmp_path))
 
 
@@ -283,4 +289,4 @@ def test_every_host_that_fails_has_its_line(tmp_path: Path) -> None:
     assert {("a", "failed"), ("b", "failed")} <= set(told)  # why is said once, in the end
     lines = str(caught.value).splitlines()
     assert [line.partition(": ")[0] for line in lines] == ["a", "b"]
-    assert all("cannot be reached (Connection refused)" in line for line in lines)
+    assert all(has_terms(line, os.strerror(errno.ECONNREFUSED)) for line in lines)

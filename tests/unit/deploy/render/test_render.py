@@ -1,6 +1,8 @@
 """Rendered units, compose files and manifests: every process once, in its place, with what it needs and no more."""
 
+import errno
 import hashlib
+import os
 import re
 import shlex
 import tomllib
@@ -11,6 +13,7 @@ from typing import Any
 import pytest
 import typer
 import yaml
+from refused import has_terms, refused
 from typer.testing import CliRunner
 
 from zsim.errors import InventoryError, RunError
@@ -248,7 +251,7 @@ def test_a_program_of_the_user_s_own_is_told_of_and_not_started(target: str, tmp
 @ALL
 def test_a_process_without_a_place_is_refused(target: str, tmp_path: Path, step: Scenario) -> None:
     text = HOSTS.replace('"controller.*": two, ', "")
-    with pytest.raises(InventoryError, match=r"roles has no place for controller\.main"):
+    with refused(InventoryError, "roles", "no place", "controller.main"):
         TARGETS[target](placed(tmp_path, text), step)
 
 
@@ -310,8 +313,8 @@ def test_systemd_restarts_what_on_death_says(hosts: InventoryFile) -> None:
         "controller.main.service": ["no"],
         "router.yard.service": ["on-failure"],
     }
-    assert "# on_death is wait: " in texts["one/zsim-estimator.drone1.service"]
-    assert "# on_death is wait: " not in texts["one/zsim-estimator.drone3.service"]
+    assert has_terms(texts["one/zsim-estimator.drone1.service"], "# on_death", "wait")
+    assert not has_terms(texts["one/zsim-estimator.drone3.service"], "# on_death", "wait")
 
 
 def test_a_name_that_another_took_is_not_fought_for(hosts: InventoryFile, step: Scenario) -> None:
@@ -345,7 +348,7 @@ def test_words_reach_the_process_as_they_are(tmp_path: Path, step: Scenario) -> 
     text = HOSTS.replace("/opt/zsim}", '"/opt/my zsim/100%$A\'"}').replace("192.168.1.10", "fe80::1%eth0")
     texts = systemd.render(placed(tmp_path, text), step)
     (line,) = options_of(texts["lab/zsim-world.service"])["ExecStart"]
-    assert line.startswith('"/opt/my zsim/100%%$$A\'/venv/bin/python" -m ')
+    assert line.startswith(""""/opt/my zsim/100%%$$A'/venv/bin/python" -m """)
     assert "tls/[fe80::1%%eth0]:7447" in line
 
 
@@ -363,7 +366,7 @@ def test_what_a_unit_needs_and_the_inventory_lacks_is_told_at_once(tmp_path: Pat
 @pytest.mark.parametrize("field", ["folder", "python"])
 def test_no_line_of_an_inventory_becomes_an_option(field: str, tmp_path: Path, step: Scenario) -> None:
     text = HOSTS.replace("folder: /opt/zsim", f'{field}: "/opt/zsim\\nUser=root"')
-    with pytest.raises(InventoryError, match=rf"hosts\.lab\.{field} is .*; must be of printable characters"):
+    with refused(InventoryError, f"hosts.lab.{field}", "printable"):
         systemd.render(placed(tmp_path, text), step)
 
 
@@ -417,7 +420,7 @@ def test_extras_are_those_of_the_distribution(hosts: InventoryFile, step: Scenar
 
 def test_what_containers_do_not_need_of_the_inventory_is_said(hosts: InventoryFile, step: Scenario) -> None:
     texts = compose.render(hosts, step)
-    assert "# hosts.two: python not used, the image has its own" in texts["two/compose.yaml"].splitlines()
+    assert has_terms(texts["two/compose.yaml"], "# hosts.two", "python", "not used")
     assert "not used" not in texts["one/compose.yaml"]
 
 
@@ -496,17 +499,16 @@ def test_names_that_kubernetes_does_not_take_are_told_at_once(tmp_path: Path) ->
     text = HOSTS.replace('"controller.*": two, ', "").replace("one", "site_one")
     with pytest.raises(InventoryError) as caught:
         kubernetes.render(placed(tmp_path, text), bad)
-    assert [line.split(";")[0] for line in caught.value.faults] == [
-        "hosts.yaml: hosts.site_one is no name of a node",
-        "hosts.yaml: estimator.drone.2 and estimator.drone_2 have the same name in Kubernetes",
-    ]
+    node, clash = caught.value.faults
+    assert has_terms(node, "hosts.yaml", "hosts.site_one", "node")
+    assert has_terms(clash, "hosts.yaml", "estimator.drone.2", "estimator.drone_2", "same name")
 
 
 def test_a_scenario_beyond_a_config_map_is_refused(tmp_path: Path) -> None:
     drones = ", ".join(f"{{name: d{i}, position_m: [{2 * i}, 0, 0]}}" for i in range(600))
     large = scenario_file.load(STEP, [f"drones=[{drones}]", "clusters=[]"])
     text = HOSTS.replace('"controller.*": two, ', "")
-    with pytest.raises(InventoryError, match=r"the scenario has .* bytes; a ConfigMap takes 1048576"):
+    with refused(InventoryError, "scenario", "bytes", "ConfigMap", "1048576"):
         kubernetes.render(placed(tmp_path, text), large)
 
 
@@ -573,10 +575,7 @@ def test_a_file_that_was_changed_is_not_removed(hosts: InventoryFile, tmp_path: 
     placed(tmp_path, HOSTS.replace("world: lab", "world: one"))
     done = call(tmp_path, "systemd")
     assert isinstance(done.exception, RunError)
-    assert str(done.exception) == (
-        f"{out}/lab/zsim-world.service: an earlier rendering wrote it and it was changed since; "
-        "remove it, or give --out another folder"
-    )
+    assert has_terms(str(done.exception), f"{out}/lab/zsim-world.service", "changed", "remove it", "--out")
     assert files(out) == former
     (out / "lab/zsim-world.service").unlink()
     assert call(tmp_path, "systemd").exit_code == 0
@@ -593,7 +592,7 @@ def test_a_list_that_leads_out_of_the_folder_removes_nothing(hosts: InventoryFil
 
 
 def test_a_text_that_leads_out_of_the_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(RunError, match=r"^\.\./two/compose\.yaml: leads out of .*; rename that host"):
+    with refused(RunError, "../two/compose.yaml", "out"):
         write(tmp_path / "out", "compose", {"one/compose.yaml": "", "../two/compose.yaml": ""})
     assert list(tmp_path.iterdir()) == []
 
@@ -615,11 +614,11 @@ def test_the_command_takes_the_options_of_a_run(hosts: InventoryFile, tmp_path: 
 def test_a_rate_that_is_none_is_refused(hosts: InventoryFile, tmp_path: Path) -> None:
     done = call(tmp_path, "systemd", "--rate", "0")
     assert done.exit_code == 2
-    assert "must be > 0 and <= 1000" in done.output
+    assert has_terms(done.output, ">", "0", "<=", "1000")
     assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_that_cannot_be_written_is_a_line(hosts: InventoryFile, tmp_path: Path) -> None:
     (tmp_path / "out").write_text("a file")
     done = call(tmp_path, "compose")
-    assert str(done.exception).endswith("cannot be written (Not a directory); give --out another folder")
+    assert has_terms(str(done.exception), "written", os.strerror(errno.ENOTDIR), "--out", "another")

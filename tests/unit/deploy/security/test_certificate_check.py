@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refused import has_terms
 from typer.testing import CliRunner
 
 from zsim.errors import RunError
@@ -82,10 +83,8 @@ def test_nothing_is_lacking_after_init(folder: Path) -> None:
 
 def test_without_certificates_the_advice_works_as_it_is_given(folder: Path) -> None:
     (line,) = lacking(folder)
-    assert line == (
-        f"has no certificates; make them with `zsim certs init '{folder}/hosts.yaml' --scenario FILE`, "
-        "or set security.insecure on a network of your own"
-    )
+    init_command = f"zsim certs init '{folder}/hosts.yaml' --scenario FILE"
+    assert has_terms(line, "no certificates", init_command, "security.insecure")
     assert run(*advised(folder, line)).exit_code == 0
     assert lacking(folder) == []
 
@@ -94,26 +93,27 @@ def test_certificates_whose_time_is_over_are_named_and_the_advice_renews_them(fo
     init(folder, "--days", "20")
     later = datetime.now(UTC) + timedelta(days=20, minutes=1)
     (line,) = lacking(folder, later)
-    assert re.match(rf"certificate expired on \d{{4}}-\d\d-\d\d: {', '.join(NAMES)} and 2 more; make them with ", line)
-    assert line.endswith("hosts.yaml' --scenario FILE --renew`")
+    assert re.search(r"expired on \d{4}-\d\d-\d\d: ", line)
+    renew = f"zsim certs init '{folder}/hosts.yaml' --scenario FILE --renew"
+    assert has_terms(line, "expired", ", ".join(NAMES), "2 more", renew)
     assert run(*advised(folder, line)).exit_code == 0
     assert lacking(folder, later) == []
 
 
 @pytest.mark.parametrize(
-    ("lost", "says"),
+    ("lost", "terms"),
     [
-        ("h2/estimator.drone1/key.pem", "certificate missing: estimator.drone1 on h2; make them with "),
-        ("h2/router.field", "certificate missing: router.field on h2; make them with "),
-        ("h1/world.access.json", "access control missing: world on h1; make them with "),
+        ("h2/estimator.drone1/key.pem", ("certificate missing", "estimator.drone1", "h2")),
+        ("h2/router.field", ("certificate missing", "router.field", "h2")),
+        ("h1/world.access.json", ("access control missing", "world", "h1")),
     ],
 )
-def test_what_is_missing_is_named(folder: Path, lost: str, says: str) -> None:
+def test_what_is_missing_is_named(folder: Path, lost: str, terms: tuple[str, ...]) -> None:
     init(folder)
     path = folder / "certs" / lost
     shutil.rmtree(path) if path.is_dir() else path.unlink()
     (line,) = lacking(folder)
-    assert line.startswith(says)
+    assert has_terms(line, *terms)
     assert "--renew" not in line
     init(folder)
     assert lacking(folder) == []
@@ -131,7 +131,7 @@ def test_who_listens_needs_a_certificate_for_its_address_and_a_client_does_not(f
     init(folder)
     (folder / "hosts.yaml").write_text(HOSTS.replace("127.0.0.1", "10.0.0.7"))
     (line,) = lacking(folder)
-    assert line.startswith("certificate for other addresses: world on h1, router.field on h2; make them with ")
+    assert has_terms(line, "other addresses", "world", "h1", "router.field", "h2")
 
 
 @pytest.mark.parametrize("content", ["", "half a key"])
@@ -140,7 +140,7 @@ def test_a_key_that_is_none_is_named_and_init_makes_it_anew(folder: Path, conten
     key = folder / "certs/h1/world/key.pem"
     key.write_text(content)
     (line,) = lacking(folder)
-    assert line.startswith("certificate cannot be read: world on h1; make them with ")
+    assert has_terms(line, "certificate", "read", "world", "h1")
     assert "1 certificates made" in init(folder).stdout
     assert lacking(folder) == []
 
@@ -150,7 +150,7 @@ def test_an_authority_that_is_none_is_a_line(folder: Path) -> None:
     (folder / "certs/ca.pem").write_text("")
     placed = inventory.load(folder / "hosts.yaml")
     (line,) = certificate_faults(placed, None, datetime.now(UTC))
-    assert line.startswith(f"{folder}/certs/ca.pem: is no certificate")
+    assert has_terms(line, f"{folder}/certs/ca.pem", "no certificate")
 
 
 def test_an_insecure_inventory_needs_none(folder: Path) -> None:
@@ -163,16 +163,16 @@ def test_the_doctor_tells_of_certificates_with_and_without_a_scenario(folder: Pa
     placed = inventory.load(folder / "hosts.yaml")
     places = inventory.placement(placed, scenario_file.load(folder / "scenario.yaml"))
     for given in (None, places):
-        assert any("has no certificates; make them with" in line for line in check_hosts(placed, given).faults)
+        assert any(has_terms(line, "no certificates") for line in check_hosts(placed, given).faults)
     init(folder)
     (folder / "certs/h1/world/key.pem").chmod(0o644)
     for given in (None, places):
         found = check_hosts(placed, given)
         assert [line for line in found.faults if "certificate" in line] == []
-        assert any("can be read by others" in line for line in found.warnings)
+        assert any(has_terms(line, "read", "others") for line in found.warnings)
     shutil.rmtree(folder / "certs/h1/world")
     for given in (None, places):
-        assert any("certificate missing: world on h1" in line for line in check_hosts(placed, given).faults)
+        assert any(has_terms(line, "certificate missing", "world", "h1") for line in check_hosts(placed, given).faults)
 
 
 # The commands
@@ -182,15 +182,15 @@ def test_the_doctor_tells_of_certificates_with_and_without_a_scenario(folder: Pa
 def test_a_lifetime_that_is_none_is_refused_in_a_line(folder: Path, days: str) -> None:
     done = init(folder, "--days", days)
     assert done.exit_code == 2
-    assert "must be 0.05 to 825" in done.output
+    assert has_terms(done.output, "0.05", "825")
     assert not (folder / "certs").exists()
 
 
 def test_show_without_certificates_is_a_line(folder: Path) -> None:
     done = run("show", folder / "hosts.yaml")
     assert isinstance(done.exception, RunError)
-    assert str(done.exception) == (
-        f"{folder}/certs: has no certificates; make them with `zsim certs init '{folder}/hosts.yaml' --scenario FILE`"
+    assert has_terms(
+        str(done.exception), f"{folder}/certs", "certificates", f"'{folder}/hosts.yaml'", "--scenario", "FILE"
     )
     assert done.stdout == ""
 
@@ -205,7 +205,7 @@ def test_show_advises_a_command_that_mends(folder: Path) -> None:
         shown = run("show", folder / "hosts.yaml")
         (row,) = [line for line in shown.stdout.splitlines() if state in line]
         assert "world" in row
-        assert shown.stderr.startswith("make them anew with `zsim certs init ")
+        assert has_terms(shown.stderr, "zsim certs init")
         assert run(*advised(folder, shown.stderr)).exit_code == 0
         assert run("show", folder / "hosts.yaml").stderr == ""
 
@@ -218,10 +218,7 @@ def test_private_keys_that_others_can_read_are_warned_of_in_a_line(folder: Path,
     for path in ("ca.key", "h1/world/key.pem", "h2/router.field/key.pem"):
         (folder / "certs" / path).chmod(mode)
     (folder / "certs/ca.pem").chmod(0o644)
-    assert exposed_keys(placed) == (
-        f"{folder}/certs/ca.key and 2 private keys more can be read by others on this machine; "
-        f"chmod -R go= '{folder}/certs'"
-    )
+    assert has_terms(exposed_keys(placed), f"{folder}/certs/ca.key", "2", "read", "-R", "go=", f"'{folder}/certs'")
     for done in (init(folder), run("show", folder / "hosts.yaml")):
         assert done.exit_code == 0
         assert done.stderr == f"warning: {exposed_keys(placed)}\n"

@@ -11,6 +11,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from refused import has_terms, refused
 
 from zsim.errors import RunError
 from zsim.transport.tls import Identity, own_fault
@@ -68,28 +69,28 @@ def test_an_authority_is_kept_until_another_is_forced(tmp_path: Path, signer) ->
     assert renewal_reason(tmp_path, again.certificate, ESTIMATOR, NOW) is None
     other = certificates.authority(tmp_path, NOW, force=True)
     assert other.certificate != signer.certificate
-    assert renewal_reason(tmp_path, other.certificate, ESTIMATOR, NOW) == "of another authority"
+    assert has_terms(renewal_reason(tmp_path, other.certificate, ESTIMATOR, NOW), "another", "authority")
 
 
 @pytest.mark.parametrize("missing", ["ca.pem", "ca.key"])
 def test_half_an_authority_is_not_written_over(tmp_path: Path, signer, missing: str) -> None:
     (tmp_path / missing).unlink()
     left = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(RunError, match=rf"{missing}: is missing beside ca\.\w+; bring it here, or --force makes"):
+    with refused(RunError, str(missing), "missing", "--force"):
         certificates.authority(tmp_path, NOW)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == left
 
 
 def test_an_authority_of_no_use_is_a_line(tmp_path: Path, signer) -> None:
-    with pytest.raises(RunError, match=r"ca\.pem: the authority expired on 2031-10-31; --force makes a new one"):
+    with refused(RunError, "ca.pem", "authority", "expired", "2031-10-31", "--force"):
         certificates.authority(tmp_path, NOW + timedelta(days=1826))
     (tmp_path / "ca.key").write_text("nothing")
-    with pytest.raises(RunError, match=r"ca\.key: is no private key; --force makes a new authority"):
+    with refused(RunError, "ca.key", "no private key", "--force"):
         certificates.authority(tmp_path, NOW)
     other = tmp_path / "other"
     certificates.authority(other, NOW)
     shutil.copy(other / "ca.key", tmp_path / "ca.key")
-    with pytest.raises(RunError, match=r"ca\.key: is not the key of ca\.pem"):
+    with refused(RunError, "ca.key", "not", "key", "ca.pem"):
         certificates.authority(tmp_path, NOW)
 
 
@@ -105,7 +106,7 @@ def test_a_certificate_is_made_anew_when_it_would_not_do(tmp_path: Path, signer)
         renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW + timedelta(days=DAYS)) == "expired on 2026-12-01"
     )
     (place / "certificate.pem").write_text("nothing")
-    assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW) == "cannot be read"
+    assert has_terms(renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW), "read")
 
 
 @pytest.mark.parametrize("left", ["ca.pem", "certificate.pem", "key.pem"])
@@ -127,7 +128,7 @@ def test_a_certificate_and_the_key_of_another_one_are_made_anew(tmp_path: Path, 
     key = (issue(tmp_path, signer, ESTIMATOR, NOW) / "key.pem").read_bytes()
     place = issue(tmp_path, signer, ESTIMATOR, NOW)
     (place / "key.pem").write_bytes(key)
-    assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW) == "without its key"
+    assert has_terms(renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW), "without", "key")
 
 
 def of_no_curve() -> str:
@@ -143,8 +144,9 @@ def of_no_curve() -> str:
 def test_a_key_that_is_none_is_made_anew(tmp_path: Path, signer, content: str) -> None:
     place = issue(tmp_path, signer, ESTIMATOR, NOW)
     (place / "key.pem").write_text(content)
-    assert renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW) == "cannot be read"
-    assert [each.fault for each in certificates.show(tmp_path, NOW)] == ["cannot be read"]
+    assert has_terms(renewal_reason(tmp_path, signer.certificate, ESTIMATOR, NOW), "read")
+    (shown,) = certificates.show(tmp_path, NOW)
+    assert has_terms(shown.fault, "read")
 
 
 def test_what_is_there_is_shown(tmp_path: Path, signer) -> None:
@@ -159,23 +161,23 @@ def test_what_is_there_is_shown(tmp_path: Path, signer) -> None:
 
 
 def test_a_folder_that_cannot_be_written_is_a_line() -> None:
-    with pytest.raises(RunError, match=r"^/proc/certs/ca\.key: cannot be written"):
+    with refused(RunError, "/proc/certs/ca.key", "written"):
         certificates.authority(Path("/proc/certs"), NOW)
 
 
 @pytest.mark.parametrize(
-    ("begin_days", "days", "says"),
+    ("begin_days", "days", "terms"),
     [
-        (0.0, 30.0, None),
-        (0.0, -0.5, "the certificate of recorder expired on "),
-        (2.0, 30.0, "the certificate of recorder is valid from "),
+        (0.0, 30.0, ()),
+        (0.0, -0.5, ("recorder", "expired")),
+        (2.0, 30.0, ("recorder", "valid")),
     ],
 )
 def test_a_process_judges_the_time_of_its_own_certificate(
-    tmp_path: Path, begin_days: float, days: float, says: str | None
+    tmp_path: Path, begin_days: float, days: float, terms: tuple[str, ...]
 ) -> None:
     now = datetime.now(UTC)
     signer = certificates.authority(tmp_path, now)
     folder = issue(tmp_path, signer, CertificateRequest("h1", "recorder"), now + timedelta(days=begin_days), days)
     fault = own_fault(Identity("h1", folder))
-    assert fault is None if says is None else str(fault).startswith(says)
+    assert has_terms(str(fault), *terms) if terms else fault is None

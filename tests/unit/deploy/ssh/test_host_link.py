@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from refused import has_terms, refused
 
 from zsim.errors import HostsError
 from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
@@ -96,7 +97,7 @@ def test_files_come_below_a_folder_and_are_their_owners_alone(tmp_path: Path) ->
 
 @pytest.mark.parametrize("takes", [0, 600, 20_000])
 def test_of_files_that_come_in_part_none_is_seen(tmp_path: Path, takes: int) -> None:
-    with pytest.raises(HostsError, match=r"writing into .*: it came in part"):
+    with refused(HostsError, "writing", "in part"):
         asyncio.run(local(takes).put_files(str(tmp_path / "run"), FILES))
     assert [path.name for path in tmp_path.rglob("*")] == ["run"]
 
@@ -141,10 +142,9 @@ def test_every_host_that_is_late_or_fails_is_named(links: HostLinks) -> None:
 
     with pytest.raises(HostsError) as error:
         links.on_all(work, 0.5)
-    assert str(error.value).splitlines() == [
-        "h1: not done within 0.5 s; is the link slow, the host busy?",
-        "h2: no certificate",
-    ]
+    late, failed = str(error.value).splitlines()
+    assert has_terms(late, "h1", "not done", "0.5 s")
+    assert failed == "h2: no certificate"
 
 
 def test_what_all_hosts_say_comes_back_by_name(links: HostLinks) -> None:

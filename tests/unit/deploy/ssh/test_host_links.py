@@ -1,6 +1,8 @@
 """A record brought home: under its name only when it is whole, and nobody waits for a host that is gone."""
 
 import asyncio
+import errno
+import os
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -8,6 +10,7 @@ from typing import Any
 
 import asyncssh
 import pytest
+from refused import refused
 
 from zsim.errors import HostsError
 from zsim_deploy.ssh import host_links as module
@@ -79,7 +82,7 @@ def test_a_file_comes_under_its_name(tmp_path: Path) -> None:
 
 def test_a_host_from_which_nothing_comes_any_more_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "STALL_S", 0.05)
-    with pytest.raises(HostsError, match=r"nothing came for 0\.05 s"):
+    with refused(HostsError, "nothing", "0.05 s"):
         fetched(for_ever, tmp_path / "run.mcap")
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap.part"]
 
@@ -93,12 +96,12 @@ def test_a_file_may_take_longer_than_a_stall(tmp_path: Path, monkeypatch: pytest
 
 def test_a_host_that_does_not_let_us_in_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "OPEN_S", 0.05)
-    with pytest.raises(HostsError, match=r"h2: no answer within 0\.05 s"):
+    with refused(HostsError, "h2", "no answer", "0.05 s"):
         fetched(None, tmp_path / "run.mcap")
 
 
 def test_a_file_that_is_not_there_is_told_from_one_that_cannot_be_read(tmp_path: Path) -> None:
     fetched(none_there, tmp_path / "run.mcap", there=False)
-    with pytest.raises(HostsError, match="h2: Permission denied"):
+    with refused(HostsError, "h2", os.strerror(errno.EACCES)):
         fetched(not_readable, tmp_path / "run.mcap")
     assert list(tmp_path.iterdir()) == []

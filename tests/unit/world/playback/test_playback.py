@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from refused import parts
+from refused import has_terms, parts, refused
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import ClusterState, Estimate, Status, Truth, Velocity
@@ -18,7 +18,7 @@ from zsim.record import Recorded, RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim.schema.message import Message
 from zsim_world.flight.world import World
-from zsim_world.playback.playback import NOT_FLYABLE, Playback, PlaybackRange
+from zsim_world.playback.playback import NOT_FLYABLE, RECORD_OVER, Playback, PlaybackRange
 from zsim_world.playback.recorded_gates import RecordedGates
 
 GATE_NS = 20_000_000
@@ -206,7 +206,8 @@ def test_the_end_names_the_run_that_was_played(flight: RecordReader):
     (_, end), (_, last) = made.take_outbox()
     assert (end.kind, end.data["replay_of"], end.data["last_ns"]) == ("end", "flown", 5 * GATE_NS)
     assert end.seq == 1  # after the recorded join
-    assert (last.state, made.ended) == ("stopped", "played to 0.1 s")
+    assert last.state == "stopped"
+    assert has_terms(made.ended or "", "0.1")
 
 
 def test_a_part_is_played(flight: RecordReader):
@@ -295,7 +296,7 @@ def test_who_dies_or_leaves_does_not_end_it(flight: RecordReader):
     made.handle_death("estimator.d1", 0)
     made.handle(keys.process("recorder", "bye"), Bye(0, 0, "enough"), 0)
     assert len(on(keys.CLOCK, played(made))) == 10
-    assert made.ended == "the record is over"
+    assert made.ended == RECORD_OVER
 
 
 def test_nobody_can_be_flown(flight: RecordReader):
@@ -324,7 +325,7 @@ def test_seek(flight: RecordReader):
     assert made.control(ControlRequest("seek", {"t_s": 0})).ok
     assert made.clock.next_ns == 0
     join(made, "estimator.d1")
-    assert parts(made.control(ControlRequest("seek", {"t_s": 0.1})).error) == ("estimator.d1", "in the lockstep")
+    assert has_terms(made.control(ControlRequest("seek", {"t_s": 0.1})).error, "estimator.d1", "lockstep")
 
 
 def faults_message(number: int, *kinds: str) -> KeyedMessage:
@@ -378,12 +379,12 @@ def test_a_replay_measures_what_it_plays(flight: RecordReader):
 
 @pytest.mark.parametrize(("from_ns", "to_ns"), [(GATE_NS + 1, GATE_NS + 2), (0, -1)])
 def test_what_holds_no_gate_is_not_played(flight: RecordReader, from_ns: int, to_ns: int):
-    with pytest.raises(RecordError, match=r"run\.mcap: holds no gate from [\d.]+ s to -?[\d.e-]+ s; nothing"):
+    with refused(RecordError, "run.mcap", "gate", f"{from_ns / 1e9:.12g}", f"{to_ns / 1e9:.12g}"):
         playback(flight, from_ns=from_ns, to_ns=to_ns)
 
 
 def test_a_record_without_a_gate_cannot_be_played(flight: RecordReader):
-    with pytest.raises(RecordError, match=r"run\.mcap: holds no gate from 7 s on; nothing can be played"):
+    with refused(RecordError, "run.mcap", "gate", "7"):
         playback(flight, from_ns=7_000_000_000)
 
 

@@ -1,5 +1,7 @@
 """The record: what goes in comes out, whatever is cut off the file, and other MCAP tools agree."""
 
+import errno
+import os
 import random
 import subprocess
 import sys
@@ -14,6 +16,7 @@ from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
+from refused import has_terms, refused
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import Imu
@@ -272,7 +275,7 @@ def test_a_damaged_schema_or_channel_is_one_line(tmp_path, opcode):
     at = place.body + (2 if opcode == Opcode.SCHEMA else 4)  # the length of its name
     data[at : at + 4] = b"\xff\xff\xff\x7f"
     path.write_bytes(data[:-1])  # cut, so that there is something to repair
-    with pytest.raises(RecordError, match=r"^.* at byte \d+ is damaged .*; the record cannot be read$"):
+    with refused(RecordError, str(opcode.name).lower(), f"byte {place.start}", "damaged"):
         repair(path)
 
 
@@ -294,19 +297,19 @@ def test_whatever_is_overwritten_it_is_read_or_refused(tmp_path_factory, seed):
 def test_what_is_no_record_is_refused_in_one_line(tmp_path):
     path = tmp_path / "run.mcap"
     for read_or_repair in (RecordReader, repair):
-        with pytest.raises(RecordError, match=r"run\.mcap: cannot be .*No such file"):
+        with refused(RecordError, "run.mcap", os.strerror(errno.ENOENT)):
             read_or_repair(path)
     path.write_text("name: step\n")
     for read_or_repair in (RecordReader, repair):
-        with pytest.raises(RecordError, match=r"begins with b'name: st'; is no MCAP record"):
+        with refused(RecordError, "run.mcap", "b'name: st'", "MCAP"):
             read_or_repair(path)
 
 
 def test_a_record_is_never_overwritten(tmp_path):
     (tmp_path / "run.mcap").write_bytes(b"precious")
-    with pytest.raises(RecordError, match="exists; a record is never overwritten"):
+    with refused(RecordError, "run.mcap", "exists"):
         RecordWriter(tmp_path / "run.mcap")
-    with pytest.raises(RecordError, match="cannot be written"):
+    with refused(RecordError, "nowhere/run.mcap", "written"):
         RecordWriter(tmp_path / "nowhere" / "run.mcap")
 
 
@@ -417,7 +420,7 @@ def test_a_full_disk_is_one_line_and_leaves_a_readable_record(tmp_path, limit):
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 3, done.stderr
     assert done.stdout.count("\n") == 1
-    assert "run.mcap: cannot be written any further (File too large)" in done.stdout
+    assert has_terms(done.stdout, "run.mcap", "written", os.strerror(errno.EFBIG))
     assert path.stat().st_size <= limit
     with RecordReader(path) as reader:
         found = [message.t_ns for message in reader]

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from msgspec import Struct
+from refused import refused
 
 from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Estimate, Status, Velocity
@@ -230,5 +231,5 @@ def test_everybody_says_bye_after_the_world_s_last_words():
 
 def test_waiting_for_somebody_who_is_not_there_is_an_error_and_no_endless_loop():
     bus = Bus(Hub(3, waits_for=["estimator.d9", "console.1"]), team(), lambda: 0)
-    with pytest.raises(RunError, match=r"waits for estimator\.d9, console\.1"):
+    with refused(RunError, "waits", "estimator.d9", "console.1"):
         bus.turn()

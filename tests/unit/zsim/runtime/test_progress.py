@@ -1,5 +1,7 @@
 """What a person is told of a run: a reason that lasts, once."""
 
+from refused import has_terms
+
 from zsim.contract.flight_messages import ClusterState
 from zsim.runtime.progress import REASON_NS, HoldReasons
 
@@ -20,7 +22,7 @@ def test_a_reason_that_lasts_is_told_once():
     reasons = HoldReasons()
     assert told(reasons, WAITS, 0, REASON_NS) == []
     (line,) = told(reasons, WAITS, REASON_NS, 10 * REASON_NS)
-    assert line == f"      5.00 s  main, engaged: {WAITS}"
+    assert has_terms(line, "5.00", "main", "engaged", WAITS)
 
 
 def test_a_reason_that_passes_is_not_told():

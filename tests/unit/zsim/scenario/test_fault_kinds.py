@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refused import has_terms
 
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
@@ -67,43 +68,46 @@ def test_every_parameter_is_checked(kind: str, bad: Any):
 
 
 @pytest.mark.parametrize(
-    ("given", "line"),
+    ("given", "terms"),
     [
-        (sound("link_loss", probability=1.4), "probability is 1.4; must be from 0 to 1 (link_loss)"),
-        (sound("gps_dropout", target="drone9"), "target is 'drone9'; must be one of drone1, drone2 (gps_dropout)"),
-        (sound("gust", target="drone1"), "target is 'drone1'; must be world (gust)"),
-        ({"kind": "gust", "target": "world", "velocity_m_s": [1, 0, 0]}, "for_s is missing; must be its length in s (gust)"),
-        (sound("process_kill", for_s=3), "for_s is 3; must be left out (process_kill)"),
-        (sound("process_kill", target="world"), "target is 'world'; must be a process that takes part, as estimator.drone1 (process_kill)"),
-        (sound("link_cut", target="drone1"), "target is 'drone1'; must be two processes, as world/estimator.drone1 (link_cut)"),
-        (sound("link_cut", target="world/world"), "target is 'world/world'; must be two processes, as world/estimator.drone1 (link_cut)"),
-        (sound("link_cut", target="world/estimator.drone9"), "target is 'world/estimator.drone9'; 'estimator.drone9' must be estimator.NAME of drone1, drone2 (link_cut)"),
-        (sound("link_cut", target="console.1/gateway.main"), "target is 'console.1/gateway.main'; one of them must be the world or a process that takes part, as estimator.drone1 (link_cut)"),
-        (sound("radio", place={"controller.main": "drone9"}), "place.controller.main is 'drone9'; must be a drone or [x, y, z] in m (radio)"),
-        (sound("link_cut", target="world/controler.main"), "target is 'world/controler.main'; 'controler.main' must be controller.main, or a name less like it (link_cut)"),
-        (sound("link_cut", target="wrld/controller.main"), "target is 'wrld/controller.main'; 'wrld' must be world, or a name less like it (link_cut)"),
-        (sound("link_cut", target="world/recorder", one_way=True), "target is 'world/recorder', one way, and 'recorder' is outside of the lockstep; the second must be the world or a process that takes part, as estimator.drone1 (link_cut)"),
-        (sound("radio", place={"controler.main": "drone1"}), "place.controler.main names no process; must be controller.main, or a name less like it (radio)"),
-        (sound("radio", place={"controller.man": "drone1"}), "place.controller.man names no process; must be controller.NAME of main (radio)"),
-        (sound("radio", place={"estimator.drone9": [0, 0, 1]}), "place.estimator.drone9 names no process; must be estimator.NAME of drone1, drone2 (radio)"),
-        (sound("radio", place={3: "drone1"}), "place.3 names no process; must be 1 to 48 of a-z 0-9 _ . - (radio)"),
-        (sound("gps_dropout", at_s=-1), "at_s is -1; must be from 0 to 1e+06 s (gps_dropout)"),
-        (sound("gps_dropout", for_s=0), "for_s is 0; must be > 0 and <= 1e+06 s (gps_dropout)"),
-        (sound("gps_dropout", value=3), "value is not known; allowed: kind, target, at_s, for_s, probability (gps_dropout)"),
-        (sound("rotor_stuck", rotor="left"), "rotor is 'left'; must be one of front_left, front_right, rear_right, rear_left, all (rotor_stuck)"),
+        (sound("link_loss", probability=1.4), ('probability', '1.4', '0', '1', 'link_loss')),
+        (sound("gps_dropout", target="drone9"), ('target', "'drone9'", 'drone1', 'drone2', 'gps_dropout')),
+        (sound("gust", target="drone1"), ('target', "'drone1'", 'world', 'gust')),
+        ({"kind": "gust", "target": "world", "velocity_m_s": [1, 0, 0]}, ('for_s', 'missing', 's', 'gust')),
+        (sound("process_kill", for_s=3), ('for_s', '3', 'out', 'process_kill')),
+        (sound("process_kill", target="world"), ('target', "'world'", 'estimator.drone1', 'process_kill')),
+        (sound("link_cut", target="drone1"), ('target', "'drone1'", 'world/estimator.drone1', 'link_cut')),
+        (sound("link_cut", target="world/world"), ('target', "'world/world'", 'world/estimator.drone1', 'link_cut')),
+        (sound("link_cut", target="world/estimator.drone9"), ('target', "'world/estimator.drone9'", "'estimator.drone9'", 'estimator.NAME', 'drone1', 'drone2', 'link_cut')),
+        (sound("link_cut", target="console.1/gateway.main"), ('target', "'console.1/gateway.main'", 'world', 'estimator.drone1', 'link_cut')),
+        (sound("radio", place={"controller.main": "drone9"}), ('place.controller.main', "'drone9'", '[x, y, z]', 'radio')),
+        (sound("link_cut", target="world/controler.main"), ('target', "'world/controler.main'", "'controler.main'", 'controller.main', 'link_cut')),
+        (sound("link_cut", target="wrld/controller.main"), ('target', "'wrld/controller.main'", "'wrld'", 'world', 'link_cut')),
+        (sound("link_cut", target="world/recorder", one_way=True), ('target', "'world/recorder'", "'recorder'", 'estimator.drone1', 'link_cut')),
+        (sound("radio", place={"controler.main": "drone1"}), ('place.controler.main', 'controller.main', 'radio')),
+        (sound("radio", place={"controller.man": "drone1"}), ('place.controller.man', 'controller.NAME', 'main', 'radio')),
+        (sound("radio", place={"estimator.drone9": [0, 0, 1]}), ('place.estimator.drone9', 'estimator.NAME', 'drone1', 'drone2')),
+        (sound("radio", place={3: "drone1"}), ('place.3', '1', '48', '0-9', 'radio')),
+        (sound("gps_dropout", at_s=-1), ('at_s', '-1', '0', '1e+06', 'gps_dropout')),
+        (sound("gps_dropout", for_s=0), ('for_s', '0', '>', '0', '<=', '1e+06', 'gps_dropout')),
+        (sound("gps_dropout", value=3), ('value', 'known', 'kind', 'target', 'at_s', 'for_s', 'probability', 'gps_dropout')),
+        (sound("rotor_stuck", rotor="left"), ('rotor', "'left'", 'front_left', 'front_right', 'rear_right', 'rear_left', 'all', 'rotor_stuck')),
     ],
 )  # fmt: skip
-def test_a_flaw_is_a_line(given: dict[str, Any], line: str):
-    assert [f"{path} {text}" for path, text in flaws(given, KNOWN)] == [line]
+def test_a_flaw_is_a_line(given: dict[str, Any], terms: tuple[str, ...]):
+    (flaw,) = [f"{path} {text}" for path, text in flaws(given, KNOWN)]
+    assert has_terms(flaw, *terms)
 
 
 def test_an_unknown_kind_names_all_kinds_and_hides_nothing_else():
     ((path, text),) = flaws({"kind": "gremlin"}, KNOWN)
     assert path == "kind"
-    assert text.startswith("is 'gremlin'; must be one of imu_dropout, ")
+    assert has_terms(text, "'gremlin'", "imu_dropout")
     assert all(kind in text for kind in KINDS)
     assert [path for path, _ in flaws({}, KNOWN)] == ["kind"]
-    assert [text for _, text in flaws([], KNOWN)] == ["is []; must be a map with kind and target"]
+    ((path, text),) = flaws([], KNOWN)
+    assert path == ""
+    assert has_terms(text, "[]", "map", "kind", "target")
 
 
 def test_links_of_others_and_of_one_s_own_processes_are_taken():
@@ -136,7 +140,7 @@ def test_a_kill_of_who_would_not_hear_of_it_is_a_flaw():
     known = Known(("drone1",), (), ("recorder",))
     ((path, text),) = flaws(sound("process_kill", target="recorder"), known)
     assert path == "target"
-    assert text.startswith("is 'recorder', outside of the lockstep; must be a process that takes part, as estimator.d")
+    assert has_terms(text, "'recorder'", "estimator.d…")
 
 
 def test_times_are_whole_gates():
@@ -169,8 +173,8 @@ def test_a_scenario_tells_every_flaw_at_once():
     with pytest.raises(ScenarioError) as told:
         resolve(document(sound("gps_dropout"), sound("link_loss", probability=1.4), {"kind": "x"}, 3), "step.yaml")
     lines = str(told.value).splitlines()
-    assert "step.yaml: faults[1].probability is 1.4; must be from 0 to 1 (link_loss)" in lines
-    assert "step.yaml: faults[3] is 3; must be a map" in lines
+    assert any(has_terms(line, "step.yaml", "faults[1].probability", "1.4", "0", "1", "link_loss") for line in lines)
+    assert any(has_terms(line, "step.yaml", "faults[3]", "3", "map") for line in lines)
     assert len(lines) == 3
 
 

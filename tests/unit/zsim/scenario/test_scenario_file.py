@@ -1,7 +1,9 @@
 """Scenario files: what is right is the same everywhere, and what is wrong is told all at once, a line each."""
 
+import errno
 import hashlib
 import math
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refused import has_terms
 
 from zsim.errors import ScenarioError
 from zsim.scenario import scenario_file
@@ -23,7 +26,14 @@ from zsim.schema.yaml_file import FILE_SIZE_MAX
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 STEP = SCENARIOS / "step.yaml"
 FILES = sorted(SCENARIOS.glob("**/*.yaml"))
-DURATION = "duration_s is missing; must be a finite number > 0 and <= 1e+06"
+DURATION = ("duration_s", "missing", "finite", ">", "0", "<=", "1e+06")
+
+
+def assert_faults(lines: list[str], *expected: tuple[str, ...]) -> None:
+    """Check that there is a line for each expected field, and no other, and that it holds the terms after it."""
+    assert sorted(line.split()[1] for line in lines) == sorted(terms[0] for terms in expected)
+    for terms in expected:
+        assert any(has_terms(line, "step.yaml", *terms) for line in lines), terms
 
 
 def drone(name: str, x: float = 0.0, **fields: Any) -> dict[str, Any]:
@@ -318,11 +328,11 @@ def test_a_name_with_dots_stands_between_brackets():
     assert raw["drones"][1]["mass_kg"] == 0.5
 
 
-SYNTAX = "is no assignment; must be a.b.c=value"
+SYNTAX = ("a.b.c=value",)
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "terms"),
     [
         ("", SYNTAX),
         ("seed", SYNTAX),
@@ -333,46 +343,46 @@ SYNTAX = "is no assignment; must be a.b.c=value"
         ("a[0=1", SYNTAX),
         ("a]0=1", SYNTAX),
         ("a[]=1", SYNTAX),
-        ("drones.9.mass_kg=1", "9 is not in drones; allowed: 0 to 2 or drone1, drone2, drone3"),
-        ("drones.-1.mass_kg=1", "-1 is not in drones; allowed: 0 to 2 or drone1, drone2, drone3"),
-        ("drones.drone9=1", "drone9 is not in drones; allowed: 0 to 2 or drone1, drone2, drone3"),
-        ("drones.²=1", "² is not in drones"),
-        (f"drones.{'9' * 5000}=1", "is not in drones"),
-        ("clusters.main.drones.7=drone1", "7 is not in clusters.main.drones; allowed: 0 to 2"),
-        ("seed.x=1", "seed is 1; must be a map or a list"),
-        ("seed.x.y=1", "seed is 1; must be a map or a list"),
-        ("seed=[1", "line 1 is not YAML"),
-        ("seed={", "line 1 is not YAML"),
-        ("seed=*a", "line 1 is not YAML"),
-        ("seed=&a [*a]", "aliases are not allowed"),
-        ("seed=" + "9" * 5000, "is not YAML"),
-        ("seed=" + "[" * 1500, "is nested too deep"),
-        ("seed=!!python/name:os.system", "is not YAML"),
-        ("seed=!!map [1]", "is not YAML"),
-        ("seed=2020-13-45", "is not YAML"),
-        ("seed=\x00", "is not YAML"),
+        ("drones.9.mass_kg=1", ("9", "0", "2", "drone1", "drone2", "drone3")),
+        ("drones.-1.mass_kg=1", ("-1", "0", "2", "drone1", "drone2", "drone3")),
+        ("drones.drone9=1", ("drone9", "0", "2", "drone1", "drone2", "drone3")),
+        ("drones.²=1", ("²", "not", "drones")),
+        (f"drones.{'9' * 5000}=1", ("not", "drones")),
+        ("clusters.main.drones.7=drone1", ("7", "clusters.main.drones", "0", "2")),
+        ("seed.x=1", ("seed", "1", "map", "list")),
+        ("seed.x.y=1", ("seed", "1", "map", "list")),
+        ("seed=[1", ("line 1", "YAML")),
+        ("seed={", ("line 1", "YAML")),
+        ("seed=*a", ("line 1", "YAML")),
+        ("seed=&a [*a]", ("aliases",)),
+        ("seed=" + "9" * 5000, ("YAML",)),
+        ("seed=" + "[" * 1500, ("'seed=[[[…", "nested")),
+        ("seed=!!python/name:os.system", ("YAML",)),
+        ("seed=!!map [1]", ("YAML",)),
+        ("seed=2020-13-45", ("YAML",)),
+        ("seed=\x00", ("YAML",)),
     ],
     ids=lambda text: text[:24],
 )
-def test_an_override_that_cannot_be_is_told(override: str, said: str):
+def test_an_override_that_cannot_be_is_told(override: str, terms: tuple[str, ...]):
     line = only(faults_in(STEP, override))
     assert line.startswith("--set ")
-    assert said in line
+    assert has_terms(line, *terms)
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "terms"),
     [
-        ("sede=2", "step.yaml: sede is not known; allowed: clusters, drones,"),
-        ("environment.wind.gust=2", "step.yaml: environment.wind.gust is not known; allowed: gust_correlation,"),
-        ("seed=", "step.yaml: seed is null; must be a whole number >= 0 and <= 4611686018427387904"),
-        ("seed=1.5", "step.yaml: seed is 1.5; must be a whole number >= 0"),
-        ("duration_s=.nan", "step.yaml: duration_s is nan; must be a finite number > 0 and <= 1e+06"),
-        ("drones.drone1=5", "step.yaml: drones[0] is 5; must be a map"),
+        ("sede=2", ("step.yaml", "sede", "known", "clusters", "drones")),
+        ("environment.wind.gust=2", ("step.yaml", "environment.wind.gust", "known", "gust_correlation")),
+        ("seed=", ("step.yaml", "seed", "null", "whole", ">=", "0", "<=", "4611686018427387904")),
+        ("seed=1.5", ("step.yaml", "seed", "1.5", "whole", ">=", "0")),
+        ("duration_s=.nan", ("step.yaml", "duration_s", "nan", "finite", ">", "0", "<=", "1e+06")),
+        ("drones.drone1=5", ("step.yaml", "drones[0]", "5", "map")),
     ],
 )
-def test_an_override_that_makes_a_fault_is_told_as_the_file_s(override: str, said: str):
-    assert faults_in(STEP, override)[0].startswith(said)
+def test_an_override_that_makes_a_fault_is_told_as_the_file_s(override: str, terms: tuple[str, ...]):
+    assert has_terms(faults_in(STEP, override)[0], *terms)
 
 
 def test_faults_of_overrides_and_of_the_file_are_told_together():
@@ -395,7 +405,7 @@ def test_any_override_is_applied_or_told(text: str):
 
 def test_the_fault_of_a_drone_in_full():
     line = only(faults_in(STEP, "drones.drone3.mass_kg=-1.4"))
-    assert line == "step.yaml: drones[2].mass_kg is -1.4; must be > 0 and <= 100 (drone 'drone3')"
+    assert has_terms(line, "step.yaml", "drones[2].mass_kg", "-1.4", ">", "0", "<=", "100", "'drone3'")
 
 
 def test_the_fault_of_a_cluster_in_full():
@@ -420,7 +430,10 @@ def test_the_fault_of_a_cluster_in_full():
 )
 def test_numbers_that_are_not_finite_are_refused(path: str, number: float):
     text = {"nan": ".nan", "inf": ".inf", "-inf": "-.inf"}[repr(number)]
-    assert f"is {number!r}; must be a finite number" in only(faults_in(STEP, f"{path}={text}"))
+    field = path.rpartition(".")[2]
+    (line,) = faults_in(STEP, f"{path}={text}")
+    assert line.split()[1].endswith(field)
+    assert has_terms(line, repr(number), "finite")
 
 
 @pytest.mark.parametrize(
@@ -463,7 +476,7 @@ def test_limits_are_quoted(path: str, value: str, allowed: str):
     ],
 )
 def test_names_are_of_the_contract(name: str, value: str):
-    assert "must match [a-z0-9_.-]{1,32}" in only(faults_in(STEP, f"{name}={value}"))
+    assert has_terms(only(faults_in(STEP, f"{name}={value}")), name, "[a-z0-9_.-]{1,32}")
 
 
 @pytest.mark.parametrize("digits", [19, 400, 4000])
@@ -473,49 +486,45 @@ def test_huge_whole_numbers_are_a_fault_and_no_crash(digits: int):
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "terms"),
     [
-        ({"drones": []}, "step.yaml: drones has 0 entries; must have 1 to 1000"),
-        ({"drones": None}, "step.yaml: drones is null; must be a list"),
-        ({"drones": {"a": 1}}, "step.yaml: drones is {'a': 1}; must be a list"),
-        ({"drones": [drone("a", i) for i in range(DRONES_MAX + 1)]}, "drones has 1001 entries; must have 1 to 1000"),
-        ({"drones": [7]}, "step.yaml: drones[0] is 7; must be a map"),
-        ({"clusters": 5}, "step.yaml: clusters is 5; must be a list"),
-        ({"sensors": 5}, "step.yaml: sensors is 5; must be a map"),
-        (
-            {"sensors": {"preset": "best"}},
-            "step.yaml: sensors.preset is 'best'; must be one of ardrone2, crazyflie2, paper",
-        ),
-        (
-            {"sensors": {"preset": ["paper"]}},
-            "step.yaml: sensors.preset is ['paper']; must be one of ardrone2, crazyflie2, paper",
-        ),
-        ({"sensors": {"lidar": {}}}, "step.yaml: sensors.lidar is not known; allowed: as_printed, baro,"),
-        ({"sensors": {"imu": 3}}, "step.yaml: sensors.imu is 3; must be a map"),
-        ({"drones": [drone("a", sensors=3)]}, "step.yaml: drones[0].sensors is 3; must be a map (drone 'a')"),
-        ({"drones": [drone("a", position_m=[1, 2])]}, "drones[0].position_m is [1, 2]; must be a list of 3 entries"),
-        ({"drones": [{"name": "a"}]}, "drones[0].position_m is missing; must be a list of 3 entries (drone 'a')"),
-        ({"drones": [drone("a", model="x")]}, "drones[0].model is 'x'; must be one of ardrone2"),
-        ({"processes": {"on_death": {"world": "weep"}}}, "must be one of drop, end, restart, wait"),
-        ({7: 1}, "step.yaml: 7 is not known; allowed: clusters,"),
+        ({"drones": []}, ("step.yaml", "drones", "0", "1", "1000")),
+        ({"drones": None}, ("step.yaml", "drones", "null", "list")),
+        ({"drones": {"a": 1}}, ("step.yaml", "drones", "{'a': 1}", "list")),
+        ({"drones": [drone("a", i) for i in range(DRONES_MAX + 1)]}, ("drones", "1001", "1", "1000")),
+        ({"drones": [7]}, ("step.yaml", "drones[0]", "7", "map")),
+        ({"clusters": 5}, ("step.yaml", "clusters", "5", "list")),
+        ({"sensors": 5}, ("step.yaml", "sensors", "5", "map")),
+        ({"sensors": {"preset": "best"}}, ("step.yaml", "sensors.preset", "'best'", "ardrone2", "paper")),
+        ({"sensors": {"preset": ["paper"]}}, ("step.yaml", "sensors.preset", "['paper']", "ardrone2", "paper")),
+        ({"sensors": {"lidar": {}}}, ("step.yaml", "sensors.lidar", "known", "as_printed", "baro")),
+        ({"sensors": {"imu": 3}}, ("step.yaml", "sensors.imu", "3", "map")),
+        ({"drones": [drone("a", sensors=3)]}, ("step.yaml", "drones[0].sensors", "3", "map", "'a'")),
+        ({"drones": [drone("a", position_m=[1, 2])]}, ("drones[0].position_m", "[1, 2]", "list", "3")),
+        ({"drones": [{"name": "a"}]}, ("drones[0].position_m", "missing", "list", "3", "'a'")),
+        ({"drones": [drone("a", model="x")]}, ("drones[0].model", "'x'", "ardrone2")),
+        ({"processes": {"on_death": {"world": "weep"}}}, ("drop", "end", "restart", "wait")),
+        ({7: 1}, ("step.yaml", "7", "known", "clusters")),
     ],
 )
-def test_a_wrong_shape_is_told(fields: dict[Any, Any], said: str):
-    assert said in only(faults_of(document(clusters=[]) | fields))
+def test_a_wrong_shape_is_told(fields: dict[Any, Any], terms: tuple[str, ...]):
+    assert has_terms(only(faults_of(document(clusters=[]) | fields)), *terms)
 
 
 def test_a_scenario_without_anything_says_all_that_is_missing():
-    lines = faults_of({})
-    assert lines == [
-        "step.yaml: name is missing; must be text",
-        f"step.yaml: {DURATION}",
-        "step.yaml: drones is missing; must be a list",
-    ]
+    assert_faults(faults_of({}), ("name", "missing", "text"), DURATION, ("drones", "missing", "list"))
 
 
 def test_a_fault_that_all_drones_share_is_told_once():
-    assert only(faults_of(document(sensors={"imu": {"rate_hz": -5}}))) == (
-        "step.yaml: sensors.imu.rate_hz is -5; must be >= 0.01 and <= 1000"
+    assert has_terms(
+        only(faults_of(document(sensors={"imu": {"rate_hz": -5}}))),
+        "step.yaml",
+        "sensors.imu.rate_hz",
+        "-5",
+        ">=",
+        "0.01",
+        "<=",
+        "1000",
     )
 
 
@@ -523,126 +532,123 @@ def test_a_fault_that_all_drones_share_is_told_once():
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "terms"),
     [
         (
             {"drones": [drone("a"), drone("b", 2.0), drone("a", 4.0)]},
-            "drones[2].name is 'a', as drones[0]; must be unique",
+            ("drones[2].name", "'a'", "drones[0]", "unique"),
         ),
         (
             {"drones": [drone("a"), drone("b", 0.5)]},
-            "drones[1].position_m is 0.50 m from 'a'; must be >= 0.6 m (drone 'b')",
+            ("drones[1].position_m", "0.50", "'a'", ">=", "0.6", "'b'"),
         ),
-        ({"drones": [drone("a", position_m=[0, 0, -1])]}, "drones[0].position_m[2] is -1; must be >= 0 (the ground)"),
+        ({"drones": [drone("a", position_m=[0, 0, -1])]}, ("drones[0].position_m[2]", "-1", ">=", "0")),
         (
             {"drones": [drone("a", mass_kg=2)]},
-            "drones[0].mass_kg is 2; must be < 0.747, nine tenths of what its rotors lift",
+            ("drones[0].mass_kg", "2", "<", "0.747"),
         ),
         (
             {"drones": [drone("a", rotor_min_rad_s=600)]},
-            "drones[0].rotor_min_rad_s is 600; must be < rotor_max_rad_s (503)",
+            ("drones[0].rotor_min_rad_s", "600", "<", "rotor_max_rad_s", "503"),
         ),
         (
             {"sensors": {"imu": {"rate_hz": 500}}, "drones": [drone("a")]},
-            "drones[0].sensors.imu.rate_hz is 500; must be <= 200",
+            ("drones[0].sensors.imu.rate_hz", "500", "<=", "200"),
         ),
         (
             {"sensors": {"sonar": {"min_m": 7}}, "drones": [drone("a")]},
-            "drones[0].sensors.sonar.min_m is 7; must be < max_m (6)",
+            ("drones[0].sensors.sonar.min_m", "7", "<", "max_m", "6"),
         ),
         (
             {"sensors": {"as_printed": True}, "drones": [drone("a")]},
-            "drones[0].sensors.as_printed is true; must be false unless",
+            ("drones[0].sensors.as_printed", "true", "false"),
         ),
         (
             {"environment": {"height_m": 10_500}, "drones": [drone("a", position_m=[0, 0, 600])]},
-            "drones[0].position_m[2] is 600; with environment.height_m (10500) it must be <= 11000 m above the sea",
+            ("drones[0].position_m[2]", "600", "environment.height_m", "10500", "<=", "11000"),
         ),
         (
             {"environment": {"height_m": 10_500}, "drones": [drone("a", limits={"altitude_m": 501})]},
-            "drones[0].limits.altitude_m is 501; with environment.height_m (10500)",
+            ("drones[0].limits.altitude_m", "501", "environment.height_m", "10500"),
         ),
-        ({"environment": {"height_m": 11_001}}, "environment.height_m is 11001; must be >= -100000 and <= 11000"),
-        ({"sensors": {"baro": {"rate_hz": 0.0004}}}, "sensors.baro.rate_hz is 0.0004; must be >= 0.01 and <= 1000"),
-        ({"time": {"gate_ms": 7}}, "time.gate_ms is 7; must be a multiple of 5"),
-        ({"time": {"physics_dt_ms": 3}}, "time.physics_dt_ms is 3; must divide 5"),
-        ({"time": {"physics_dt_ms": 1e-9}}, "time.physics_dt_ms is 1e-09; must divide 5"),
-        ({"report": {"window_s": [5, 5]}}, "report.window_s is [5, 5]; must be [start, end] with 0 <= start < end"),
-        ({"report": {"window_s": [-1, 5]}}, "report.window_s is [-1, 5]; must be"),
-        ({"processes": {"expect": ["a", "b", "a"]}}, "processes.expect[2] is 'a', as expect[0]; must be unique"),
+        ({"environment": {"height_m": 11_001}}, ("environment.height_m", "11001", ">=", "-100000", "<=", "11000")),
+        ({"sensors": {"baro": {"rate_hz": 0.0004}}}, ("sensors.baro.rate_hz", "0.0004", ">=", "0.01", "<=", "1000")),
+        ({"time": {"gate_ms": 7}}, ("time.gate_ms", "7", "5")),
+        ({"time": {"physics_dt_ms": 3}}, ("time.physics_dt_ms", "3", "5")),
+        ({"time": {"physics_dt_ms": 1e-9}}, ("time.physics_dt_ms", "1e-09", "5")),
+        ({"report": {"window_s": [5, 5]}}, ("report.window_s", "[5, 5]", "[start, end]", "0", "<=", "<")),
+        ({"report": {"window_s": [-1, 5]}}, ("report.window_s", "[-1, 5]")),
+        ({"processes": {"expect": ["a", "b", "a"]}}, ("processes.expect[2]", "'a'", "expect[0]", "unique")),
         (
             {"processes": {"expect": ["my.drone1", "estimator.ghost"]}},
-            "processes.expect[1] is 'estimator.ghost', and no drone is 'ghost'; must be estimator.NAME of drone1, ",
+            ("processes.expect[1]", "'estimator.ghost'", "'ghost'", "estimator.NAME", "drone1"),
         ),
         (
             {"processes": {"expect": ["controller.ghost"]}, "clusters": []},
-            "processes.expect[0] is 'controller.ghost', and no cluster is 'ghost'; must be controller.NAME of",
+            ("processes.expect[0]", "'controller.ghost'", "'ghost'", "controller.NAME"),
         ),
         (
             {"clusters": [{"name": "c", "drones": ["drone1", "drone9"]}]},
-            "clusters[0].drones[1] is 'drone9'; must be one of the drones",
+            ("clusters[0].drones[1]", "'drone9'"),
         ),
         (
             {"clusters": [{"name": "c", "drones": ["drone1", "drone1"]}]},
-            "clusters[0].drones[1] is 'drone1', which 'c' flies already",
+            ("clusters[0].drones[1]", "'drone1'", "'c'"),
         ),
-        ({"clusters": [{"name": "c", "drones": ["drone1"]}]}, "clusters[0].drones has 1 entries; must have 2 to 64"),
-        ({"clusters": [{"name": "c", "drones": [f"d{k}" for k in range(65)]}]}, "has 65 entries; must have 2 to 64"),
-        (clustered(groups=[{"name": "a", "size": 6}]), "clusters[0].groups has 1 entry; must have none, or 2 or more"),
+        ({"clusters": [{"name": "c", "drones": ["drone1"]}]}, ("clusters[0].drones", "1", "2", "64")),
+        ({"clusters": [{"name": "c", "drones": [f"d{k}" for k in range(65)]}]}, ("65", "2", "64")),
+        (clustered(groups=[{"name": "a", "size": 6}]), ("clusters[0].groups", "1", "none", "2")),
         (
             clustered(groups=[{"name": "a", "size": 2}, {"name": "b", "size": 3}]),
-            "clusters[0].groups has sizes that add up to 5; must be 6, one for each drone",
+            ("clusters[0].groups", "5", "6"),
         ),
         (
             clustered(groups=[{"name": "a", "size": 3}, {"name": "a", "size": 3}]),
-            "clusters[0].groups[1].name is 'a', as groups[0]; must be unique",
+            ("clusters[0].groups[1].name", "'a'", "groups[0]", "unique"),
         ),
         (
             clustered(groups=[{"name": "a", "size": 4}, {"name": "b", "size": 2, "space": "template"}]),
-            "clusters[0].groups[1].space asks for a template of 2 robots; must be 3 or more",
+            ("clusters[0].groups[1].space", "2", "3"),
         ),
         (
             clustered(groups=[{"name": "a", "size": 4}, {"name": "b", "size": 2}], template_m=[[0, 0, 0], [1, 0, 0]]),
-            "clusters[0].template_m asks for a template of 2 robots; must be 3 or more",
+            ("clusters[0].template_m", "2", "3"),
         ),
-        (clustered(space="triad", template_m=[[0, 0, 0]]), "clusters[0].template_m is given; must be left out where"),
-        (clustered(template_m=[[0, 0, 0]]), "clusters[0].template_m has 1 places; must have 6, one for each robot"),
+        (clustered(space="triad", template_m=[[0, 0, 0]]), ("clusters[0].template_m", "given")),
+        (clustered(template_m=[[0, 0, 0]]), ("clusters[0].template_m", "1", "6")),
         (
             clustered(template_m=[[k, k, 0] for k in range(6)]),
-            "clusters[0].template_m is in one line, within 0.1 m; must span a plane or space",
+            ("clusters[0].template_m", "0.1"),
         ),
         (
             clustered(zigzag=0.0),
-            "clusters[0].template_m is missing, and the robots start in one line; must be given, or space must be triad",
+            ("clusters[0].template_m", "missing", "given"),
         ),
         (
             clustered(space="ring"),
-            "clusters[0].space is 'ring'; must be one of triad, template, or package.module:Class (cluster 'c')",
+            ("clusters[0].space", "'ring'", "triad", "template", "package.module:Class", "'c'"),
         ),
     ],
 )
-def test_fields_that_do_not_agree_are_told(fields: dict[str, Any], said: str):
-    assert said in only(faults_of(document(**fields)))
+def test_fields_that_do_not_agree_are_told(fields: dict[str, Any], terms: tuple[str, ...]):
+    assert has_terms(only(faults_of(document(**fields))), *terms)
 
 
 def test_faults_of_groups_are_told_together_and_those_between_faulty_fields_left_out():
     groups = [{"name": "a", "size": 1}, {"name": "b", "size": 4, "template_m": [[0, 0]] * 4}, {"name": "b", "size": 3}]
-    said = [line.removeprefix("step.yaml: ").split(";")[0] for line in faults_of(document(**clustered(groups=groups)))]
-    assert sorted(said) == [
-        "clusters[0].groups[0].size is 1",
-        "clusters[0].groups[1].template_m[0] is [0, 0]",
-        "clusters[0].groups[1].template_m[1] is [0, 0]",
-        "clusters[0].groups[1].template_m[2] is [0, 0]",
-        "clusters[0].groups[1].template_m[3] is [0, 0]",
-        "clusters[0].groups[2].name is 'b', as groups[1]",
-    ]
+    assert_faults(
+        faults_of(document(**clustered(groups=groups))),
+        ("clusters[0].groups[0].size", "1"),
+        *((f"clusters[0].groups[1].template_m[{place}]", "[0, 0]") for place in range(4)),
+        ("clusters[0].groups[2].name", "'b'", "groups[1]"),
+    )
 
 
 def test_two_clusters_share_neither_a_name_nor_a_drone():
     clusters = [{"name": "c", "drones": ["drone1", "drone2"]}, {"name": "c", "drones": ["drone2", "drone3"]}]
     lines = faults_of(document(clusters=clusters))
-    assert lines[0].startswith("step.yaml: clusters[1].name is 'c', as clusters[0]; must be unique")
-    assert lines[1].startswith("step.yaml: clusters[1].drones[0] is 'drone2', which 'c' flies already")
+    assert has_terms(lines[0], "step.yaml", "clusters[1].name", "'c'", "clusters[0]", "unique")
+    assert has_terms(lines[1], "step.yaml", "clusters[1].drones[0]", "'drone2'", "'c'")
     assert len(lines) == 2
 
 
@@ -655,7 +661,7 @@ def test_two_clusters_share_neither_a_name_nor_a_drone():
 )
 def test_a_trajectory_is_expressions_or_waypoints(trajectory: dict[str, Any]):
     clusters = [{"name": "c", "drones": ["drone1", "drone2"], "plan": {"trajectory": trajectory}}]
-    assert "must have one of them (cluster 'c')" in only(faults_of(document(clusters=clusters)))
+    assert has_terms(only(faults_of(document(clusters=clusters))), "expressions", "waypoints", "'c'")
 
 
 def test_waypoints_go_forward_in_time():
@@ -663,8 +669,8 @@ def test_waypoints_go_forward_in_time():
     clusters = [{"name": "c", "drones": ["drone1", "drone2"], "plan": {"trajectory": {"waypoints": waypoints}}}]
     lines = faults_of(document(clusters=clusters))
     assert len(lines) == 2
-    assert "waypoints[2].at_s is 5; must be > 5" in lines[0]
-    assert "waypoints[3].at_s is 4; must be > 5" in lines[1]
+    assert has_terms(lines[0], "clusters[0].plan.trajectory.waypoints[2].at_s", "5", ">", "5")
+    assert has_terms(lines[1], "clusters[0].plan.trajectory.waypoints[3].at_s", "4", ">", "5")
 
 
 def test_all_faults_at_once_those_between_fields_too():
@@ -680,33 +686,34 @@ def test_all_faults_at_once_those_between_fields_too():
     clusters = [{"name": "main", "drones": ["a", "zz"], "plan": {"takeoff_s": "x", "trajectory": {}}}]
     time_s = {"gate_ms": 7, "command_delay_gates": 0}
     raw = document(seed=1.5, colour="red", drones=drones, clusters=clusters, time=time_s, report={"window_s": [2, 1]})
-    said = [line.removeprefix("step.yaml: ").split(";")[0] for line in faults_of(raw)]
-    assert sorted(said) == sorted(
-        [
-            "colour is not known",
-            "seed is 1.5",
-            "time.command_delay_gates is 0",
-            "drones[0].yaw_deg is inf",
-            "drones[1].mass_kg is -1.4",
-            "drones[3].name is 'C'",
-            "drones[3].position_m[0] is 'x'",
-            "drones[5] is 5",
-            "clusters[0].plan.takeoff_s is 'x'",
-            "drones[1].name is 'a', as drones[0]",
-            "time.gate_ms is 7",
-            "drones[2].position_m is 0.10 m from 'a'",
-            "drones[2].rotor_min_rad_s is 900",
-            "drones[4].mass_kg is 50",
-            "clusters[0].plan.trajectory has both or neither of expressions and waypoints",
-            "report.window_s is [2, 1]",
-        ]
+    assert_faults(
+        faults_of(raw),
+        ("colour", "known"),
+        ("seed", "1.5"),
+        ("time.command_delay_gates", "0"),
+        ("drones[0].yaw_deg", "inf"),
+        ("drones[1].mass_kg", "-1.4"),
+        ("drones[3].name", "'C'"),
+        ("drones[3].position_m[0]", "'x'"),
+        ("drones[5]", "5"),
+        ("clusters[0].plan.takeoff_s", "'x'"),
+        ("drones[1].name", "'a'", "drones[0]"),
+        ("time.gate_ms", "7"),
+        ("drones[2].position_m", "0.10", "'a'"),
+        ("drones[2].rotor_min_rad_s", "900"),
+        ("drones[4].mass_kg", "50"),
+        ("clusters[0].plan.trajectory", "expressions", "waypoints"),
+        ("report.window_s", "[2, 1]"),
     )
 
 
 def test_a_cluster_s_drones_are_not_judged_while_a_drone_s_name_is_unknown():
     clusters = [{"name": "c", "drones": ["drone1", "drone9"]}]
-    assert only(faults_of(document(drones=[drone("drone1"), {"position_m": [2, 0, 0]}], clusters=clusters))).startswith(
-        "step.yaml: drones[1].name is missing"
+    assert has_terms(
+        only(faults_of(document(drones=[drone("drone1"), {"position_m": [2, 0, 0]}], clusters=clusters))),
+        "step.yaml",
+        "drones[1].name",
+        "missing",
     )
 
 
@@ -714,61 +721,61 @@ def test_a_cluster_s_drones_are_not_judged_while_a_drone_s_name_is_unknown():
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "terms"),
     [
-        ("", "is empty; must be a map"),
-        ("just words", "holds 'just words'; must be a map"),
-        ("- 1\n- 2\n", "holds [1, 2]; must be a map"),
-        ("a: [1", "is not YAML"),
-        ("a: 1\nb: 2\na: 3\n", "line 3 is not YAML (key 'a' is given twice)"),
-        ("a: b: c", "line 1 is not YAML"),
-        ("\ta: 1", "line 1 is not YAML"),
-        ("a: 1\n---\nb: 2\n", "is not YAML"),
-        ("a: &x [1]\nb: *x\n", "line 2 is not YAML (aliases are not allowed)"),
-        ("a: &a [x]\n" + "".join(f"b{i}: &b{i} [*a, *a]\n" for i in range(20)), "aliases are not allowed"),
-        ("[" * 500_000, "is nested too deep"),
-        ("{a: " * 200_000, "is nested too deep"),
-        ("- " * 300_000, "is nested too deep"),
-        ("a: " + "9" * 900_000, "is not YAML"),
-        ("a: !!python/object/apply:os.system [ls]", "line 1 is not YAML (tags are not allowed)"),
-        ("a: !!map [1]", "line 1 is not YAML (tags are not allowed)"),
-        ("a: !!timestamp x", "line 1 is not YAML (tags are not allowed)"),
-        ("a: 2020-13-45", "is not YAML"),
-        ("? [1, 2]\n: 3", "line 1 is not YAML"),
-        ("a: \x07", "is not YAML"),
-        (b"\xff\xfe\x00", "is not text (byte 0); must be YAML in UTF-8"),
-        (b"a: \xe9", "is not text (byte 3); must be YAML in UTF-8"),
-        ("#" * (FILE_SIZE_MAX + 1), "is larger than 1000000 bytes; must be at most that"),
+        ("", ("empty", "map")),
+        ("just words", ("'just words'", "map")),
+        ("- 1\n- 2\n", ("[1, 2]", "map")),
+        ("a: [1", ("YAML",)),
+        ("a: 1\nb: 2\na: 3\n", ("line 3", "YAML", "'a'", "twice")),
+        ("a: b: c", ("line 1", "YAML")),
+        ("\ta: 1", ("line 1", "YAML")),
+        ("a: 1\n---\nb: 2\n", ("YAML",)),
+        ("a: &x [1]\nb: *x\n", ("line 2", "YAML", "aliases")),
+        ("a: &a [x]\n" + "".join(f"b{i}: &b{i} [*a, *a]\n" for i in range(20)), ("aliases",)),
+        ("[" * 500_000, ("nested",)),
+        ("{a: " * 200_000, ("nested",)),
+        ("- " * 300_000, ("nested",)),
+        ("a: " + "9" * 900_000, ("YAML",)),
+        ("a: !!python/object/apply:os.system [ls]", ("line 1", "YAML", "tags")),
+        ("a: !!map [1]", ("line 1", "YAML", "tags")),
+        ("a: !!timestamp x", ("line 1", "YAML", "tags")),
+        ("a: 2020-13-45", ("YAML",)),
+        ("? [1, 2]\n: 3", ("line 1", "YAML")),
+        ("a: \x07", ("YAML",)),
+        (b"\xff\xfe\x00", ("text", "0", "YAML", "UTF-8")),
+        (b"a: \xe9", ("text", "3", "YAML", "UTF-8")),
+        ("#" * (FILE_SIZE_MAX + 1), ("larger", "1000000")),
     ],
     ids=lambda text: repr(text[:12]),
 )
-def test_a_file_that_is_no_scenario_is_one_line(tmp_path: Path, text: str | bytes, said: str):
+def test_a_file_that_is_no_scenario_is_one_line(tmp_path: Path, text: str | bytes, terms: tuple[str, ...]):
     line = only(faults_of_text(tmp_path, text))
     assert "own.yaml" in line
-    assert said in line
+    assert has_terms(line, *terms)
 
 
 def test_a_path_that_cannot_be_read_is_one_line(tmp_path: Path):
-    assert "cannot be read (No such file" in only(faults_in(tmp_path / "none.yaml"))
-    assert "cannot be read (Is a directory)" in only(faults_in(tmp_path))
-    assert "is no path" in only(faults_in("a\0b"))
+    assert has_terms(only(faults_in(tmp_path / "none.yaml")), "read", os.strerror(errno.ENOENT))
+    assert has_terms(only(faults_in(tmp_path)), "read", os.strerror(errno.EISDIR))
+    assert has_terms(only(faults_in("a\0b")), "path")
 
 
 def test_a_file_without_end_is_not_read_to_its_end():
-    assert "is larger than 1000000 bytes" in only(faults_in("/dev/zero"))
+    assert has_terms(only(faults_in("/dev/zero")), "larger", "1000000")
 
 
 def test_a_million_drones_are_refused_at_once():
     start_s = time.process_time()
     raw = document(drones=[drone("a")] * 1_000_000)
-    assert only(faults_of(raw)) == "step.yaml: drones has 1000000 entries; must have 1 to 1000"
+    assert has_terms(only(faults_of(raw)), "step.yaml", "drones", "1000000", "1", "1000")
     assert time.process_time() - start_s < 2.0
 
 
 def test_a_fault_in_each_of_many_places_is_told_a_hundred_times():
     lines = faults_of(document(**{f"k{i}": i for i in range(5000)}))
     assert len(lines) == FAULTS_MAX + 1
-    assert lines[-1] == "… and 4900 more faults"
+    assert has_terms(lines[-1], "4900")
 
 
 def test_a_thousand_drones_are_a_scenario():

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import Meta, Struct
+from refused import has_terms
 
 from zsim.schema.checker import faults, first_fault, show, sound
 
@@ -48,46 +49,46 @@ def test_a_sound_document_has_no_faults():
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "terms"),
     [
-        ({"count": "3"}, "count is '3'; must be a whole number >= 0 and <= 4611686018427387904"),
-        ({"count": 3.0}, "count is 3.0; must be a whole number >= 0 and <= 4611686018427387904"),
-        ({"count": True}, "count is true; must be a whole number >= 0 and <= 4611686018427387904"),
-        ({"count": None}, "count is null; must be a whole number >= 0 and <= 4611686018427387904"),
-        ({"count": -1}, "count is -1; must be >= 0 and <= 4611686018427387904"),
-        ({"parts": []}, "parts has 0 entries; must have 1 to 3"),
-        ({"parts": [{"name": "a"}] * 4}, "parts has 4 entries; must have 1 to 3"),
-        ({"parts": "a"}, "parts is 'a'; must be a list"),
-        ({"parts": [7]}, "parts[0] is 7; must be a map"),
-        ({"parts": [{}]}, "parts[0].name is missing; must be text"),
-        ({"parts": [{"name": "A"}]}, "parts[0].name is 'A'; must match [a-z]{1,3}"),
-        ({"parts": [{"name": "a\n"}]}, "parts[0].name is 'a\\n'; must match [a-z]{1,3}"),
-        ({"parts": [{"name": "a", "mass_kg": 0}]}, "parts[0].mass_kg is 0; must be > 0 and <= 100"),
+        ({"count": "3"}, ("count", "'3'", "whole", ">=", "0", "<=", "4611686018427387904")),
+        ({"count": 3.0}, ("count", "3.0", "whole", ">=", "0", "<=", "4611686018427387904")),
+        ({"count": True}, ("count", "true", "whole", ">=", "0", "<=", "4611686018427387904")),
+        ({"count": None}, ("count", "null", "whole", ">=", "0", "<=", "4611686018427387904")),
+        ({"count": -1}, ("count", "-1", ">=", "0", "<=", "4611686018427387904")),
+        ({"parts": []}, ("parts", "0", "1", "3")),
+        ({"parts": [{"name": "a"}] * 4}, ("parts", "4", "1", "3")),
+        ({"parts": "a"}, ("parts", "'a'", "list")),
+        ({"parts": [7]}, ("parts[0]", "7", "map")),
+        ({"parts": [{}]}, ("parts[0].name", "missing", "text")),
+        ({"parts": [{"name": "A"}]}, ("parts[0].name", "'A'", "[a-z]{1,3}")),
+        ({"parts": [{"name": "a\n"}]}, ("parts[0].name", "'a\\n'", "[a-z]{1,3}")),
+        ({"parts": [{"name": "a", "mass_kg": 0}]}, ("parts[0].mass_kg", "0", ">", "0", "<=", "100")),
         (
             {"parts": [{"name": "a", "mass_kg": math.nan}]},
-            "parts[0].mass_kg is nan; must be a finite number > 0 and <= 100",
+            ("parts[0].mass_kg", "nan", "finite", ">", "0", "<=", "100"),
         ),
-        ({"parts": [{"name": "a", "mass_kg": 10**400}]}, "parts[0].mass_kg is 1000…"),
-        ({"parts": [{"name": "a", "place": [1]}]}, "parts[0].place is [1]; must be a list of 2 entries"),
-        ({"parts": [{"name": "a", "place": [1, "x"]}]}, "parts[0].place[1] is 'x'; must be a finite number"),
-        ({"parts": [{"name": "a", "place": [1, -math.inf]}]}, "parts[0].place[1] is -inf; must be a finite number"),
-        ({"parts": [{"name": "a", "kind": "huge"}]}, "parts[0].kind is 'huge'; must be one of big, small"),
-        ({"parts": [{"name": "a", "kind": []}]}, "parts[0].kind is []; must be one of big, small"),
-        ({"parts": [{"name": "a", "colour": 1}]}, "parts[0].colour is not known; allowed: kind, mass_kg, name, place"),
-        ({"on": 1}, "on is 1; must be true or false"),
-        ({"speed": -1}, "speed is -1; must be >= 0"),
-        ({"speed": "x"}, "speed is 'x'; must be a finite number >= 0"),
-        ({"table": {"a": "x"}}, "table.a is 'x'; must be a finite number"),
-        ({"table": {1: 1.0}}, "table.1 as a key is 1; must be text"),
-        ({"table": [1]}, "table is [1]; must be a map"),
-        ({"series": [1]}, "series has 1 entries; must have 2"),
-        ({"series": [1, 2.5]}, "series[1] is 2.5; must be a whole number"),
-        ({7: 1}, "7 is not known; allowed: count, free…"),
+        ({"parts": [{"name": "a", "mass_kg": 10**400}]}, ("parts[0].mass_kg", "1" + "0" * 56)),
+        ({"parts": [{"name": "a", "place": [1]}]}, ("parts[0].place", "[1]", "list", "2")),
+        ({"parts": [{"name": "a", "place": [1, "x"]}]}, ("parts[0].place[1]", "'x'", "finite")),
+        ({"parts": [{"name": "a", "place": [1, -math.inf]}]}, ("parts[0].place[1]", "-inf", "finite")),
+        ({"parts": [{"name": "a", "kind": "huge"}]}, ("parts[0].kind", "'huge'", "big", "small")),
+        ({"parts": [{"name": "a", "kind": []}]}, ("parts[0].kind", "[]", "big", "small")),
+        ({"parts": [{"name": "a", "colour": 1}]}, ("parts[0].colour", "known", "kind", "mass_kg", "name", "place")),
+        ({"on": 1}, ("on", "1", "true", "false")),
+        ({"speed": -1}, ("speed", "-1", ">=", "0")),
+        ({"speed": "x"}, ("speed", "'x'", "finite", ">=", "0")),
+        ({"table": {"a": "x"}}, ("table.a", "'x'", "finite")),
+        ({"table": {1: 1.0}}, ("table.1", "key", "1", "text")),
+        ({"table": [1]}, ("table", "[1]", "map")),
+        ({"series": [1]}, ("series", "1", "2")),
+        ({"series": [1, 2.5]}, ("series[1]", "2.5", "whole")),
+        ({7: 1}, ("7", "known", "count", "free")),
     ],
 )
-def test_a_fault_says_where_what_and_what_is_allowed(changes: dict[str, Any], said: str):
+def test_a_fault_says_where_what_and_what_is_allowed(changes: dict[str, Any], terms: tuple[str, ...]):
     (only,) = [f"{path} {text}" for path, text in faults({**GOOD, **changes}, Whole)]
-    assert only.startswith(said[:-1]) if said.endswith("…") else only == said
+    assert has_terms(only, *terms)
     assert first_fault({**GOOD, **changes}, Whole) is not None
 
 
@@ -102,7 +103,7 @@ def test_every_fault_is_found():
 def test_a_document_that_is_no_map_is_one_fault(document: Any):
     ((path, text),) = faults(document, Whole)
     assert path == ""
-    assert text.endswith("must be a map")
+    assert has_terms(text, "map")
 
 
 def test_unknown_fields_are_faults_only_where_the_type_says_so():
@@ -116,11 +117,13 @@ def test_a_path_begins_where_it_is_told():
 def test_limits_of_the_representation_are_not_shown():
     number = Annotated[float, Meta(ge=-1.7976931348623157e308, le=1.7976931348623157e308)]
     whole = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-    assert list(faults("x", number)) == [("", "is 'x'; must be a finite number")]
-    assert list(faults(-1, whole)) == [("", "is -1; must be >= 0")]
-    assert list(faults(2**64 - 1, whole)) == [
-        ("", "is 18446744073709551615; must be a whole number of 63 bits and sign")
+    texts = [
+        text for value, kind in (("x", number), (-1, whole), (2**64 - 1, whole)) for _, text in faults(value, kind)
     ]
+    assert has_terms(texts[0], "'x'", "finite")
+    assert has_terms(texts[1], "-1", ">=", "0")
+    assert has_terms(texts[2], "18446744073709551615", "whole", "63")
+    assert not any(limit in text for text in texts for limit in ("e+308", "<="))
 
 
 # Agreement with msgspec, which decides in the end
@@ -198,7 +201,7 @@ def test_what_was_found_fits_into_a_line(value: Any):
 
 
 @pytest.mark.parametrize(
-    ("value", "said"),
+    ("value", "shown"),
     [
         (None, "null"),
         (True, "true"),
@@ -208,18 +211,21 @@ def test_what_was_found_fits_into_a_line(value: Any):
         ("é", "'é'"),
         (range(3), "range(0, 3)"),
         ({1: b"x"}, "{1: b'x'}"),
-        (list(range(100)), "a list of 100 entries"),
-        (dict.fromkeys(range(100)), "a map of 100 entries"),
     ],
 )
-def test_what_was_found_is_shown_as_it_would_stand_in_a_file(value: Any, said: str):
-    assert show(value) == said
+def test_what_was_found_is_shown_as_it_would_stand_in_a_file(value: Any, shown: str):
+    assert show(value) == shown
+
+
+def test_what_is_long_is_shown_by_its_kind_and_length():
+    assert has_terms(show(list(range(100))), "list", "100")
+    assert has_terms(show(dict.fromkeys(range(100))), "map", "100")
 
 
 def test_a_number_of_any_size_is_shown_in_a_line():
-    assert show(10**5000) == "a number of more than 4300 digits"
+    assert has_terms(show(10**5000), "4300")
     ((_, text),) = faults({**GOOD, "count": 10**5000}, Whole)
-    assert text.startswith("is a number of more than 4300 digits; must be")
+    assert has_terms(text, "4300")
 
 
 def test_nesting_without_end_is_shown_in_a_line():

@@ -6,6 +6,7 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from refused import refused
 
 from zsim.schema import yaml_file
 
@@ -38,16 +39,16 @@ def test_numbers_are_those_of_yaml_and_floats_of_yaml_1_2(text: str, value: obje
 
 
 @pytest.mark.parametrize(
-    ("text", "fault"),
+    ("text", "terms"),
     [
-        ("a: &x 1\nb: *x", "line 2 .*aliases are not allowed"),
-        ("a: !!python/name:os.system x", "line 1 .*tags are not allowed"),
-        ("a: 1\na: 2", "line 2 .*key 'a' is given twice"),
-        ("a: [1", "line 1 "),
-        ("[" * 100_000, "nested too deep"),
-        ("[" * 40 + "1" + "]" * 40 + "]", "line 1 "),
+        ("a: &x 1\nb: *x", ("line 2", "aliases")),
+        ("a: !!python/name:os.system x", ("line 1", "tags")),
+        ("a: 1\na: 2", ("line 2", "'a'", "twice")),
+        ("a: [1", ("line 1",)),
+        ("[" * 100_000, ("nested",)),
+        ("[" * 40 + "1" + "]" * 40 + "]", ("line 1",)),
     ],
 )
-def test_what_is_refused_says_where(text: str, fault: str) -> None:
-    with pytest.raises(ValueError, match=fault):
+def test_what_is_refused_says_where(text: str, terms: tuple[str, ...]) -> None:
+    with refused(ValueError, *terms):
         yaml_file.value(text)

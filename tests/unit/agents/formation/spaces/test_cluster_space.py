@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refused import refused
 
 from zsim.scenario.scenario import ROBOTS_MAX
 from zsim_agents.formation.spaces.cluster_space import (
@@ -150,7 +151,7 @@ def test_robots_without_a_frame_are_refused(p_W):
 def test_other_singular_formations_are_refused_by_name():
     with pytest.raises(SingularClusterError, match="robots 1 and 2"):
         cluster_space(2).forward(np.ones((2, 3)), np.zeros(2))
-    with pytest.raises(SingularClusterError, match="above each other"):
+    with refused(SingularClusterError, "above"):
         cluster_space(2).jacobian(np.array([(0.0, 0, 0), (0, 0, 3)]), np.zeros(2))
     with pytest.raises(SingularClusterError, match="robot 4"):
         cluster_space(4).jacobian(np.vstack([TRIANGLE, TRIANGLE[0] + (0, 0, 3)]), np.zeros(4))

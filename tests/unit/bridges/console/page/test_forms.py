@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from refused import has_terms
 
 from zsim.contract.views import ViewCluster
 from zsim.scenario import scenario_file
@@ -321,7 +322,7 @@ def test_parameters_that_are_none_are_told_and_not_sent(bench: Bench, text: str)
     bench.gui.at["parameters"].value = text
     bench.gui.press("Inject it")
     assert bench.desk.asked == []
-    assert "must be NAME: VALUE" in bench.told[0].refusal
+    assert has_terms(bench.told[0].refusal, "NAME", "VALUE")
 
 
 @pytest.mark.parametrize("name", ["kind", "target", "op", "self", "value"])
@@ -330,7 +331,7 @@ def test_a_parameter_that_a_kind_has_not_is_told_and_not_sent(bench: Bench, name
     bench.gui.at["parameters"].value = f"{name}: x"
     bench.gui.press("Inject it")
     assert bench.desk.asked == []
-    assert bench.told[0].refusal.endswith(f"{name!r} is not known, allowed: at_s, for_s, probability")
+    assert has_terms(bench.told[0].refusal, f"{name!r}", "known", "at_s", "for_s", "probability")
 
 
 # A formation
@@ -379,7 +380,8 @@ def test_sliders_follow_the_formation_but_for_those_that_somebody_moves(bench: B
 
 def test_people_are_told_of_targets_in_the_units_of_the_page(bench: Bench):
     bench.formation().request_target({"p": 5.0, "yaw": 180.0})
-    assert bench.desk.shown == ["p 5 m, yaw 180 deg"]
+    (line,) = bench.desk.shown
+    assert has_terms(line, "p 5 m", "yaw 180 deg")
 
 
 def test_a_move_lasts_as_long_as_is_asked_for(bench: Bench):
@@ -399,7 +401,8 @@ def test_a_number_out_of_range_is_not_flown_to_the_limit_when_its_box_is_left(be
     box.put(limit)  # the page does, when its box is left
     form.send(LATER_S)
     assert bench.desk.asked == []
-    assert [told.refusal.partition(";")[0] for told in bench.told] == ["y_c is 500 m"]
+    (outcome,) = bench.told
+    assert has_terms(outcome.refusal, "y_c", "500 m")
     form.refresh(bench.view(y_c=-5.0), LATER_S)
     assert box.value == -5.0
     box.put(limit)  # somebody means it
@@ -410,7 +413,7 @@ def test_a_number_out_of_range_is_not_flown_to_the_limit_when_its_box_is_left(be
 def test_a_value_out_of_range_is_told_and_not_sent(bench: Bench):
     bench.formation().request_target({"p": 0.5})
     assert bench.desk.asked == []
-    assert bench.told[0].refusal.startswith("p is 0.5 m")
+    assert has_terms(bench.told[0].refusal, "p", "0.5 m")
 
 
 def test_of_many_variables_the_others_are_moved_one_at_a_time():
