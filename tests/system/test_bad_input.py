@@ -246,7 +246,7 @@ def test_a_full_disk_ends_the_run_and_keeps_the_record(federation: Federation, s
     role = federation.run(PAIR, "--duration", "600")
     role.ends(with_code=1)
     assert os.strerror(errno.ENOSPC) in role.text()
-    assert federation.record().keys()["clock"] > 50
+    assert federation.record().keys()["clock"] > 0
     federation.nobody_left()
 
 
@@ -261,7 +261,7 @@ def test_a_record_that_may_not_grow(federation: Federation) -> None:
     assert "Traceback" not in done.stderr
     world.ends(with_code=0)
     assert re.search(r"^ended: .*recorder", world.text(), re.MULTILINE)
-    assert federation.record().keys()["clock"] > 50
+    assert federation.record().keys()["clock"] > 0
 
 
 GARBAGE = 30_000  # messages

