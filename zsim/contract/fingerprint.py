@@ -96,7 +96,8 @@ def _cpu_features() -> str:
 class TruthHash:
     """SHA-256 over all truth instants of a flight (contract, "Same bits").
 
-    Of each t_ns (int64), then position, velocity, orientation and angular velocity (float64); little-endian, drone by drone in scenario order, instants in time order.
+    Of each t_ns (int64), then position, velocity, orientation and angular velocity (float64); little-endian, drone by
+    drone in scenario order, instants in time order.
 
     Args:
         rows: of each `add`: the drones of an instant, or all rows of a flight at once.
