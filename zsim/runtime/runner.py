@@ -1,4 +1,4 @@
-"""Runs an agent as a process on Zenoh: joins the run, feeds the agent gate by gate, says done, leaves.
+"""Runs an agent as a process on Zenoh: joins the run, feeds the agent gate by gate, publishes done, leaves.
 
 Lockstep and realtime are one loop: in lockstep an incomplete gate is waited for, in realtime it is given up when
 the next one is there.
@@ -37,7 +37,7 @@ class Runner:
         info: of the run.
         agent: what to run.
         stopped: asked every TICK_S; True ends the process with a bye.
-        say: told what a person should know.
+        say: called with lines for the user.
         deserted: asked at the end; True leaves without a bye, as one that dies, so that the world waits for a new one.
 
     Attributes:
@@ -257,7 +257,7 @@ class Runner:
         self._kills = begun | {f.id: f for f in faults.faults if f.kind == PROCESS_KILL and f.target in names}
 
     def _die(self, t_ns: int) -> None:
-        """End, if a fault wants it in the gates that it has lived; their outputs still go out."""
+        """End, if a fault kills it in one of the gates that it has lived; their outputs still go out."""
         if self._lives_after_ns is None:
             self._lives_after_ns = t_ns - self._agent.period_ns
         for fault in self._kills.values():

@@ -24,7 +24,7 @@ class CommandLinks:
 
     scenario: Scenario
     gate_ns: int
-    barrier: Barrier  # knows which processes do the work of others
+    barrier: Barrier  # has which processes do the work of others
     faults_at: LinkFaultsAt
     position_m: Callable[[str], list[float] | None]  # where a drone truly is [m; W], None for an unknown one
 
@@ -72,7 +72,7 @@ class CommandIntake:
 
     scenario: Scenario
     clock: RunClock
-    barrier: Barrier  # knows which sources are in the lockstep
+    barrier: Barrier  # has which sources are in the lockstep
     outbox: RunOutbox
     queue: CommandQueue
     fleet: Fleet
