@@ -1,1 +1,4 @@
-"""The contract: keys, messages, their bytes, what a process may read of the world's events. Imports schema."""
+"""The contract: keys, messages by topic, their bytes one by one and many at once, and what makes runs comparable.
+
+Imports schema.
+"""

@@ -11,22 +11,7 @@ Array = NDArray[np.float64]
 
 WGS84_A_M = 6_378_137.0  # m, semi-major axis, WGS 84 (NIMA TR8350.2, table 3.1)
 WGS84_F = 1.0 / 298.257223563  # flattening, WGS 84 (NIMA TR8350.2, table 3.1)
-_A2 = WGS84_A_M**2
-_B_M = WGS84_A_M * (1.0 - WGS84_F)
 _E2 = WGS84_F * (2.0 - WGS84_F)
-_LATITUDE_STEPS = 4  # each step gains a factor of about 300: 1e-15 rad after four for heights below 1000 km
-
-
-def enu_to_geodetic(position_m: ArrayLike, origin: tuple[float, float, float]) -> Array:
-    """Return WGS 84 latitude [deg], longitude [deg] and ellipsoidal height [m] of points in W.
-
-    Args:
-        position_m: p_W, shape (..., 3).
-        origin: latitude_deg, longitude_deg, height_m of W's origin.
-    """
-    p = np.asarray(position_m, dtype=float)[..., :, None]
-    turned = (p * enu_rows(origin[0], origin[1])).sum(axis=-2)  # not matmul, whose bits depend on how many points
-    return ecef_to_geodetic(geodetic_to_ecef(origin) + turned)
 
 
 def geodetic_to_enu(geodetic: ArrayLike, origin: tuple[float, float, float]) -> Array:
@@ -43,25 +28,6 @@ def geodetic_to_ecef(geodetic: ArrayLike) -> Array:
     level = (normal + height) * np.cos(lat)
     up = (normal * (1.0 - _E2) + height) * np.sin(lat)
     return np.stack([level * np.cos(lon), level * np.sin(lon), up], axis=-1)
-
-
-def ecef_to_geodetic(ecef_m: ArrayLike) -> Array:
-    """Return latitude_deg, longitude_deg, height_m; Bowring's iteration on the parametric latitude.
-
-    Exact to 1e-9 m for heights between -10 km and 1000 km (Bowring, Survey Review 23 (1976) 323-327).
-    """
-    e = np.asarray(ecef_m, dtype=float)
-    level = np.hypot(e[..., 0], e[..., 1])
-    lat = np.arctan2(e[..., 2], level * (1.0 - _E2))
-    for _ in range(_LATITUDE_STEPS):
-        parametric = np.arctan2((1.0 - WGS84_F) * np.sin(lat), np.cos(lat))
-        lat = np.arctan2(
-            e[..., 2] + (_A2 - _B_M**2) / _B_M * np.sin(parametric) ** 3,
-            level - _E2 * WGS84_A_M * np.cos(parametric) ** 3,
-        )
-    sin, cos = np.sin(lat), np.cos(lat)
-    height = level * cos + e[..., 2] * sin - WGS84_A_M * np.sqrt(1.0 - _E2 * sin**2)
-    return np.stack([np.degrees(lat), np.degrees(np.arctan2(e[..., 1], e[..., 0])), height], axis=-1)
 
 
 def enu_rows(latitude_deg: float, longitude_deg: float) -> Array:
@@ -94,11 +60,6 @@ def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
         ],
         axis=-1,
     )
-
-
-def quaternion_conjugate(q: ArrayLike) -> Array:
-    """Return the inverse of unit quaternions."""
-    return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def rotation_matrix(q: ArrayLike) -> Array:

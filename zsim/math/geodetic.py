@@ -1,4 +1,4 @@
-"""Where GPS fixes lie on the Earth, compiled: `zsim.math.frames.enu_to_geodetic` for the few rows of a gate."""
+"""Where points of W lie on the Earth, compiled; the way back is `zsim.math.frames.geodetic_to_enu`."""
 
 import math
 
@@ -11,7 +11,7 @@ from zsim.math.frames import WGS84_A_M, WGS84_F, enu_rows, geodetic_to_ecef
 _E2 = WGS84_F * (2.0 - WGS84_F)
 _B_M = WGS84_A_M * (1.0 - WGS84_F)
 _CURVATURE_M = (WGS84_A_M**2 - _B_M**2) / _B_M
-_STEPS = 4  # of Bowring's iteration, as in zsim.math.frames
+_STEPS = 4  # each gains a factor of about 300: 1e-15 rad after four for heights below 1000 km
 
 Array = NDArray[np.float64]
 
@@ -24,6 +24,9 @@ def anchor(latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[
 @kernel()
 def geodetic(position_m: Array, rows: Array, place_m: Array) -> Array:
     """Return WGS 84 latitude [deg], longitude [deg] and ellipsoidal height [m] of points in W.
+
+    Bowring's iteration on the parametric latitude, exact to 1e-9 m for heights between -10 km and 1000 km (Bowring,
+    Survey Review 23 (1976) 323-327).
 
     Args:
         position_m: p_W, (n, 3).

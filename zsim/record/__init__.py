@@ -5,7 +5,7 @@
     repair(path)                    finishes a file whose writer died
 
 Topic = key without the federation's prefix, message encoding `msgpack`, log time = simulated time, publish
-time = wall clock of the recorder. Other MCAP tools open it.
+time = wall clock of the recorder. Other MCAP tools open it. Imports contract.
 """
 
 from zsim.record.record_end import repair

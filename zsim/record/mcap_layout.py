@@ -71,7 +71,7 @@ class RecordSpan(NamedTuple):
 
 
 class ChunkHead(NamedTuple):
-    """What a chunk says about itself before its content."""
+    """The head of a chunk, before its content."""
 
     first_ns: int
     last_ns: int
@@ -153,7 +153,7 @@ def is_cut(source: Source, at: int) -> bool:
 
 
 def _length_inside(source: Source, place: RecordSpan) -> int | None:
-    """Return the length of a chunk or message index as it follows from what it says of its content."""
+    """Return the length of a chunk or message index as it follows from the sizes inside it."""
     if place.opcode == Opcode.MESSAGE_INDEX:
         return INDEX_HEAD.size + INDEX_HEAD.unpack_from(source, place.body)[1]
     content = chunk_head(source, place).content

@@ -39,7 +39,7 @@ _FOOTER_LENGTH = 20
 
 
 class RecordSummary:
-    """What the end of a record says about its data, taken in one chunk at a time."""
+    """The summary at the end of a record, collected one chunk at a time."""
 
     def __init__(self) -> None:
         self.schemas = RecordBuilder()

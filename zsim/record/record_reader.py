@@ -1,4 +1,4 @@
-"""Reads a record, whole or cut at any byte."""
+"""Reads a record, whole or cut at any byte, from a file or the folder of a run."""
 
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -10,7 +10,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Channel
 
-from zsim.errors import RecordError
+from zsim.errors import RecordError, RunError
 from zsim.record.mcap_layout import (
     HEAD,
     MAGIC,
@@ -29,6 +29,7 @@ from zsim.record.mcap_layout import (
 )
 from zsim.record.record_end import check_magic
 
+RECORD = "run.mcap"  # in the folder of a run
 OVERLAP_NS = 1_000_000_000  # simulated time; a chunk begins less than that before the end of the one before it
 
 
@@ -224,3 +225,43 @@ def _mapped(path: Path) -> Source:
             return mmap(file.fileno(), 0, access=ACCESS_READ) if path.stat().st_size else b""
     except OSError as error:
         raise RecordError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def record_in(folder: Path) -> Path:
+    """Return the record in a run's folder.
+
+    Raises:
+        RunError: there is none.
+    """
+    record = folder / RECORD
+    if not record.is_file():
+        raise RunError(f"{folder}: holds no {RECORD}; give the folder of a run, as `zsim run` printed it")
+    return record
+
+
+def record_at(place: Path) -> Path:
+    """Return the record that is a file, or in a run's folder.
+
+    Raises:
+        RunError: there is none.
+    """
+    if place.is_file():
+        return place
+    if not (place / RECORD).is_file():
+        raise RunError(f"{place}: holds no {RECORD}; give the folder of a run, as `zsim run` printed it, or the file")
+    return place / RECORD
+
+
+def record_notes(complete: bool, damaged: int) -> list[str]:
+    """Return what a reader of a record has to know of its state, a line each.
+
+    Args:
+        complete: it was closed, not cut.
+        damaged: how many of its chunks cannot be read.
+    """
+    notes = []
+    if not complete:
+        notes.append("the record was cut: its writer did not close it; everything up to the cut was read")
+    if damaged:
+        notes.append(f"{damaged} chunks of the record are damaged and were passed over")
+    return notes

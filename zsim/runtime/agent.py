@@ -1,4 +1,4 @@
-"""An agent: a plain object, inputs in, outputs out, that knows neither Zenoh nor the wall clock.
+"""An agent: a plain object, inputs in, outputs out, without Zenoh and wall clock.
 
     runner ──receive(key, message)──▶ agent          every input of a gate, in canonical order
     runner ──step(t_ns)────────────▶ agent ──▶ [(key, message), …]
@@ -37,7 +37,7 @@ class Agent(ABC):
 
     Attributes:
         name: process name `role.thing`, e.g. `estimator.drone1`.
-        period_ns: how often it says done; a multiple of the gate.
+        period_ns: how often it publishes done; a multiple of the gate.
         reads: key expressions it subscribes to.
         gate_keys: keys of which one message stamped t closes the gate t, e.g. the drone's sensor/status.
         counted: drones of which it reads all sensors, so that what their status counts is waited for.
@@ -131,7 +131,7 @@ class Agent(ABC):
         return ControlAnswer(ok=False, error=f"{key}: {self.name} answers no requests")
 
     def warm_start_keys(self) -> tuple[str, ...]:
-        """Return the keys whose last values a restarted incarnation wants before anything else."""
+        """Return the keys whose last values a restarted incarnation takes over before anything else."""
         return ()
 
     def warm_start(self, key: str, message: Any) -> None:  # noqa: B027 - taking over nothing is a choice

@@ -1,4 +1,4 @@
-"""What a process says of itself once a wall second."""
+"""The health of a process: counters, published once a wall second."""
 
 import os
 import socket
@@ -20,7 +20,7 @@ class HealthMeter:
     Args:
         role: of the process.
         wall_s: monotonic wall time.
-        host: the name of its host; None asks the system.
+        host: the name of its host; None: as the system has it.
 
     Attributes:
         received, refused, dropped: messages taken in, not decodable, and gates given up.
@@ -71,7 +71,7 @@ class HealthMeter:
 
 
 def resident_bytes() -> int:
-    """Return the resident memory of this process; 0 where the system does not tell."""
+    """Return the resident memory of this process; 0 where the system does not give it."""
     if sys.platform == "linux":
         with suppress(OSError), open("/proc/self/statm", encoding="ascii") as statm:  # no file may be left to open
             return int(statm.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")

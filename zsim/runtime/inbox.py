@@ -23,7 +23,7 @@ class Inbox:
 
     Args:
         gate_keys: keys of which one message with t_ns == t closes the gate t. For a drone's sensor/status its
-            `count` is checked too, when `counted` says that all of that drone's sensors are read.
+            `count` is checked too, when all of that drone's sensors are read (`counted`).
         counted: drones of which all `sensor/*` keys are read.
         keep_late: hand out what comes after its gate was taken, once, with the next gate: in realtime an old input
             is better than none.
@@ -117,7 +117,7 @@ class Inbox:
             self._meters[key].count(message)
 
     def next_gate_ns(self) -> int | None:
-        """Return the earliest gate that is not taken, as far as closing messages tell."""
+        """Return the earliest gate that is not taken, judged by closing messages."""
         if not self._gates:
             return None
         skipped_ns = self._skipped_ns(self._gates[0])

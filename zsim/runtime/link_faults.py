@@ -9,7 +9,7 @@ of arrival nor a restart of the receiver changes a draw.
 
 import hashlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from zsim.contract import keys
@@ -18,8 +18,8 @@ from zsim.contract.run_messages import Fault, Faults
 from zsim.runtime.routing import Input, in_order
 from zsim.scenario import fault_kinds
 
-WORLD = "world"
-KINDS = frozenset(name for name, kind in fault_kinds.KINDS.items() if kind.strikes in ("link", "radio"))
+WORLD, RADIO = "world", "radio"
+KINDS = frozenset(name for name, kind in fault_kinds.KINDS.items() if kind.strikes in ("link", RADIO))
 NEVER = None  # as a delay: the message does not come
 Point = Sequence[float]
 Where = Callable[[str], Point | None]
@@ -93,10 +93,42 @@ def delay_ns(fault: Fault, draw: float, distance_m: float | None = None) -> int 
         return math.ceil(draw * p["jitter_ms"] * 1e6)
     if fault.kind == "link_loss":
         return NEVER if draw < p["probability"] else 0
-    if fault.kind == "radio":
+    if fault.kind == RADIO:
         comes = distance_m is None or draw < reception_probability(distance_m, p["range_m"], p["spread_m"])
         return 0 if comes else NEVER
     return NEVER  # link_cut
+
+
+def total_delay_ns(
+    faults: Iterable[Fault],
+    seed: int,
+    link: str,
+    key: str,
+    message: Any,
+    distance_m: Callable[[Fault], float | None] = lambda fault: None,
+) -> int | None:
+    """Return by how much a message comes later for several faults [ns]; NEVER if one of them loses it.
+
+    Args:
+        faults: that act on its link.
+        seed: of the scenario.
+        link: name of the link's stream: its receiver.
+        key, message: which is sent.
+        distance_m: returns that between sender and receiver for a radio, None where it is not known.
+    """
+    total_ns = 0
+    for fault in faults:
+        draw = uniform(seed, link, fault, key, message.t_ns, message.seq)
+        late_ns = delay_ns(fault, draw, distance_m(fault) if fault.kind == RADIO else None)
+        if late_ns is None:
+            return NEVER
+        total_ns += late_ns
+    return total_ns
+
+
+def distance_between(a: Point | None, b: Point | None) -> float | None:
+    """Return the distance of two points [m], None where one is not known."""
+    return math.dist(a, b) if a is not None and b is not None else None
 
 
 class LinkFaults:
@@ -133,7 +165,7 @@ class LinkFaults:
         self._faults = [fault for fault in faults.faults if fault.kind in KINDS and self._concerns(fault)]
 
     def _concerns(self, fault: Fault) -> bool:
-        return fault.kind == "radio" or any(name in fault.target.split("/") for name in self._names)
+        return fault.kind == RADIO or any(name in fault.target.split("/") for name in self._names)
 
     def act_at(self, t_ns: int) -> bool:
         """Tell whether the inputs of a gate may be other ones than have come."""
@@ -171,17 +203,9 @@ class LinkFaults:
         return False
 
     def _delay_ns(self, key: str, message: Any, acting: Sequence[Fault]) -> int | None:
-        froms, to, total_ns = senders(key, message), self._receiver(key), 0
-        for fault in acting:
-            radio = fault.kind == "radio"
-            if not (self._on_the_air(fault, key, to) if radio else joins(fault, froms, to)):
-                continue
-            draw = uniform(self._seed, to, fault, key, message.t_ns, message.seq)
-            late_ns = delay_ns(fault, draw, self._distance_m(fault, key, to) if radio else None)
-            if late_ns is None:
-                return NEVER
-            total_ns += late_ns
-        return total_ns
+        froms, to = senders(key, message), self._receiver(key)
+        faults = (f for f in acting if (self._on_the_air(f, key, to) if f.kind == RADIO else joins(f, froms, to)))
+        return total_delay_ns(faults, self._seed, to, key, message, lambda fault: self._distance_m(fault, key, to))
 
     def _receiver(self, key: str) -> str:
         """Return the name under which the receiver takes a key: of several estimators, that of the drone's."""
@@ -196,5 +220,4 @@ class LinkFaults:
 
     def _distance_m(self, fault: Fault, key: str, to: str) -> float | None:
         there = self._positions.get(keys.thing(key))
-        here = place_of(to, fault.parameters["place"], self._positions.get)
-        return math.dist(there, here) if there is not None and here is not None else None
+        return distance_between(there, place_of(to, fault.parameters["place"], self._positions.get))

@@ -1,4 +1,4 @@
-"""A process's place in a run: it joins, says what it is through with, catches up, and comes back after a lost link.
+"""A process's place in a run: it joins, publishes what it is done with, catches up, and rejoins after a lost link.
 
 What the world does not answer stays owed, and is asked for again until it does.
 """
@@ -20,7 +20,7 @@ from zsim.transport.samples import ReceivedSample
 from zsim.transport.session import Session
 
 REPLAY_S = 2.0  # a hub answers a replay within milliseconds; a lost link does not
-REJOINS_MAX = 6  # times that a return is said before it is taken for granted; a router forwards nothing at first
+REJOINS_MAX = 6  # times that a rejoin is published before it counts as received; a router forwards nothing at first
 RETRY_S = 0.5  # wall time between two attempts at what is owed
 ASKED_MAX = 10  # answers to what is lost that may lack it; the world answers from what it has on the way, too
 GATES_KEPT = 2  # gates of which the outputs are kept to answer a get, contract; more where the world runs ahead
@@ -34,7 +34,7 @@ class Membership:
         info: of the run.
         agent: whose name and sequence numbers it goes by.
         take_in: takes what a replay brings.
-        say: told what a person should know.
+        say: called with lines for the user.
         wall_s: monotonic wall time.
 
     Attributes:
@@ -119,7 +119,7 @@ class Membership:
         return [[key, messages.encode(message)] for _, outputs in self._kept for key, message in outputs]
 
     def leave(self, reason: str) -> None:
-        """Say bye."""
+        """Publish bye."""
         bye = run_messages.Bye(max(0, self.done_ns), self._agent.next_seq("bye"), reason)
         self._link.put(keys.process(self._agent.name, "bye"), bye)
 
@@ -193,7 +193,7 @@ class Membership:
         self._retry_s = self._wall_s() + RETRY_S
 
     def _rejoin(self) -> None:
-        """Join again, and say once more what may have been lost."""
+        """Join again, and publish once more what may have been lost."""
         info = read_info(self._link)
         if info is None:
             return
@@ -205,7 +205,7 @@ class Membership:
         self._say_again()
 
     def _insist(self) -> None:
-        """Say again what may not have got through, unless the world has gone on with what this process said."""
+        """Publish again what may have been lost, unless the world has gone on with what this process published."""
         self._unproved -= 1
         if self.done_ns > self._proof_ns:
             self._unproved = 0
@@ -246,7 +246,7 @@ def replay(
 
     Args:
         link: an open session.
-        process: name of who asks.
+        process: name of the one that asks.
         from_ns: simulated time [ns]; -1 for everything that the world still has.
         expressions: keys that are wanted.
         timeout_s: how long each page is waited for.

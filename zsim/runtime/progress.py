@@ -1,6 +1,6 @@
-"""What a person sees of a running federation: one live line, and lines for what happens.
+"""Progress of a run on a terminal: one live line, and a line for each event.
 
-The world tells it as JSON lines (`Teller`) when it is launched, or shows it itself (`Screen`).
+A world that a launcher started writes it as JSON lines (`JsonProgress`); otherwise it is shown on a `Screen`.
 """
 
 import json
@@ -46,14 +46,14 @@ class Throttle:
 
 
 class HoldReasons:
-    """What keeps clusters from going on, told once when it lasts."""
+    """Reasons for which clusters wait, each shown once when it lasts."""
 
     def __init__(self) -> None:
         self._since: dict[str, tuple[str, int]] = {}
         self._shown: set[tuple[str, str]] = set()
 
     def line(self, cluster: str, state: ClusterState) -> str | None:
-        """Return what to say of a state: its reason if that has been the same, but for its numbers, for REASON_NS."""
+        """Return the line for a state: its reason if that has been the same, but for its numbers, for REASON_NS."""
         shape = _NUMBER.sub("#", state.reason)
         former, since_ns = self._since.get(cluster, ("", 0))
         if shape != former:

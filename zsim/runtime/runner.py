@@ -1,4 +1,4 @@
-"""Runs an agent as a process on Zenoh: joins the run, feeds the agent gate by gate, says done, leaves.
+"""Runs an agent as a process on Zenoh: joins the run, feeds the agent gate by gate, publishes done, leaves.
 
 Lockstep and realtime are one loop: in lockstep an incomplete gate is waited for, in realtime it is given up when
 the next one is there.
@@ -6,22 +6,18 @@ the next one is there.
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 
-from zsim.contract import flight_messages, keys, messages, run_messages, world_events
-from zsim.contract.framing import GateMessages, key_table
+from zsim.contract import keys, messages, run_messages
 from zsim.contract.run_messages import ControlAnswer
 from zsim.contract.world_events import ProcessEntry, RunEnd, WorldEvent
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.agent import Agent
 from zsim.runtime.health import HealthMeter
-from zsim.runtime.inbox import Inbox
 from zsim.runtime.membership import Membership
-from zsim.runtime.routing import RoutingTable
+from zsim.runtime.runner_inputs import RunnerInputs
 from zsim.scenario.fault_kinds import PROCESS_KILL
-from zsim.transport.declarations import Query, Subscription
-from zsim.transport.samples import RawSample, ReceivedSample
+from zsim.transport.declarations import Query
 from zsim.transport.session import Session
 
 TICK_S = 0.1  # how often a stop, and what the world has not answered, is looked for while nothing arrives
@@ -37,7 +33,7 @@ class Runner:
         info: of the run.
         agent: what to run.
         stopped: asked every TICK_S; True ends the process with a bye.
-        say: told what a person should know.
+        say: called with lines for the user.
         deserted: asked at the end; True leaves without a bye, as one that dies, so that the world waits for a new one.
 
     Attributes:
@@ -59,19 +55,10 @@ class Runner:
         self._stopped = stopped
         self._say = say
         self._deserted = deserted
-        self._inbox = Inbox(agent.gate_keys, agent.counted, keep_late=info.mode == "realtime")
-        self._member = Membership(link, info, agent, self._take_in, say)
-        estimates = (key for key in agent.gate_keys if key.endswith("/estimate"))
-        self._stock = {key: f"estimator.{keys.thing(key)}" for key in estimates}
-        self._estimated_by: dict[str, str] = {}
-        self._subscriptions: dict[str, Subscription] = {}
-        self._expressions = RoutingTable([[expression] for expression in agent.reads])
-        self._table = key_table([drone.name for drone in info.drones])
-        self._gate_key = _gate_key(agent)
-        self._notices: deque[WorldEvent] = deque()
-        self._queries: deque[Query] = deque()
-        self._links: deque[bool] = deque()
-        self._fault_lists: deque[run_messages.Faults] = deque()
+        self.health = HealthMeter(agent.role, host=link.host)
+        self._inputs = RunnerInputs(link, info, agent, self.health, say)
+        self._inbox = self._inputs.inbox
+        self._member = Membership(link, info, agent, self._inputs.take_in, say)
         self._list_seq = -1
         self._kills: dict[int, run_messages.Fault] = {}  # by id
         self._lives_after_ns: int | None = None  # what was to die up to this gate was an earlier one of its name
@@ -82,7 +69,6 @@ class Runner:
         self._leave: str | None = None
         self._over = threading.Event()
         self.killed = False
-        self.health = HealthMeter(agent.role, host=link.host)
 
     def run(self) -> str:
         """Take part until the run ends; return why it left.
@@ -93,7 +79,7 @@ class Runner:
             BehindError: it lacks what the world does not keep any more.
         """
         self._agent.rehearse()
-        self._subscribe()
+        self._inputs.subscribe()
         self._member.ask_faults()
         last_ns = self._member.warm_start()
         if last_ns is not None:
@@ -119,7 +105,7 @@ class Runner:
     def _turn(self) -> None:
         """Take in what has arrived, step through every gate that is complete, and wait if there was none."""
         self._serve_rare()
-        self._take_in_all()
+        self._inputs.take_in_all()
         stepped = False
         while self._leave is None and (t_ns := self._ready_gate()) is not None:
             self._step(t_ns)
@@ -131,62 +117,10 @@ class Runner:
             self._wait()
 
     def _wait(self) -> None:
-        subscription = self._subscriptions[self._blocking_expression()]
         try:
-            sample = subscription.receive()
+            self._inputs.wait()
         except SessionError:
             self._leave = self._leave or "session closed"
-            return
-        if sample is not None:
-            self._open(sample)
-
-    def _take_in_all(self) -> None:
-        """Take in what has arrived: first what closes a gate, so that what came before it is found too."""
-        for subscription in self._subscriptions.values():
-            for sample in subscription.drain():
-                self._open(sample)
-
-    def _open(self, sample: ReceivedSample) -> None:
-        """Take in a message, or the messages of a gate."""
-        if sample.key != self._gate_key:
-            self._take_in(sample)
-            return
-        try:
-            gate = GateMessages.unpack(sample.payload, self._table)
-            if not self._agent.takes_gates:
-                gate.check()
-        except DecodeError as error:
-            self._refuse(error)
-            return
-        self.health.received += len(gate)
-        self._inbox.put(keys.GATE, gate)
-
-    def _take_in(self, sample: ReceivedSample) -> None:
-        if sample.key == keys.FAULTS:
-            self._on_faults(sample.payload)
-            return
-        self.health.received += 1
-        try:
-            message = messages.decode(sample.key, sample.payload)
-        except DecodeError as error:
-            self._refuse(error)
-            return
-        if type(message) is flight_messages.Estimate:
-            self._estimated_by[sample.key] = message.source
-        self._inbox.put(sample.key, message)
-
-    def _refuse(self, error: DecodeError) -> None:
-        self.health.refused += 1
-        if self.health.refused == 1:
-            self._say(str(error))
-
-    def _blocking_expression(self) -> str:
-        """Return the subscription from which the next missing message comes."""
-        t_ns = self._inbox.next_gate_ns()
-        missing = self._inbox.missing_last(t_ns) if t_ns is not None else None
-        wanted = missing or self._agent.gate_keys[-1]
-        expression = self._agent.reads[self._expressions.readers(wanted)[0]]
-        return expression if expression in self._subscriptions else self._gate_key
 
     def _ready_gate(self) -> int | None:
         """Return the gate to step now, None if it must be waited for."""
@@ -240,8 +174,8 @@ class Runner:
 
     def _update_faults(self) -> None:
         """Take the lists of faults that have come: those that the world published before a gate come before it."""
-        while self._fault_lists:
-            faults = self._fault_lists.popleft()
+        while self._inputs.fault_lists:
+            faults = self._inputs.fault_lists.popleft()
             self._agent.update_faults(self._info, faults)
             if faults.seq > self._list_seq:
                 self._list_seq = faults.seq
@@ -257,7 +191,7 @@ class Runner:
         self._kills = begun | {f.id: f for f in faults.faults if f.kind == PROCESS_KILL and f.target in names}
 
     def _die(self, t_ns: int) -> None:
-        """End, if a fault wants it in the gates that it has lived; their outputs still go out."""
+        """End, if a fault kills it in one of the gates that it has lived; their outputs still go out."""
         if self._lives_after_ns is None:
             self._lives_after_ns = t_ns - self._agent.period_ns
         for fault in self._kills.values():
@@ -265,20 +199,6 @@ class Runner:
                 self._leave, self.killed = f"killed by fault {fault.id}", True
 
     # Beginning and end
-
-    def _subscribe(self) -> None:
-        closing = [self._agent.reads[place] for place in self._expressions.readers_of_any(self._agent.gate_keys)]
-        for expression in dict.fromkeys([*closing, *self._agent.reads]):
-            subscription = self._gate_key if self._gate_key and keys.is_sensor(expression) else expression
-            if subscription not in self._subscriptions:
-                self._subscriptions[subscription] = self._link.subscribe(subscription)
-        self._link.declare_subscriber(keys.EVENT, self._on_event)
-        self._link.declare_subscriber(keys.FAULTS, lambda sample: self._on_faults(sample.payload))
-        self._link.on_link(self._on_link)
-        for key in self._agent.control_keys():
-            self._link.declare_queryable(key, self._on_query)
-        self._link.declare_queryable(keys.process(self._agent.name, "outputs"), self._on_query)
-        self._link.declare_token(keys.token(self._agent.name))
 
     def _look_for_end(self) -> None:
         if self._stopped():
@@ -288,52 +208,24 @@ class Runner:
             if self._member.done_ns >= self._end_ns // self._agent.period_ns * self._agent.period_ns or late:
                 self._leave = run_messages.RUN_ENDED
 
-    # What arrives rarely, from other threads
-
-    def _on_event(self, sample: RawSample) -> None:
-        try:
-            read = world_events.read(sample.payload)
-        except DecodeError:
-            self.health.refused += 1  # somebody else's; the world's own events can be read
-            return
-        if read is not None:
-            self._notices.append(read)
-            self._wake()
-
-    def _on_faults(self, payload: bytes) -> None:
-        try:
-            self._fault_lists.append(messages.decode(keys.FAULTS, payload))
-        except DecodeError:
-            self.health.refused += 1
-
-    def _on_link(self, up: bool) -> None:
-        self._links.append(up)
-        self._wake()
-
-    def _on_query(self, query: Query) -> None:
-        self._queries.append(query)
-        self._wake()
+    # What arrives rarely
 
     def _tick(self) -> None:
         while not self._over.wait(TICK_S):
             if self._stopped() or self._end_ns is not None or self._lacks or self._member.owes:
-                self._wake()
+                self._inputs.wake()
             if self.health.due():
                 seq = self._agent.next_seq("health")
                 health = self.health.message(max(0, self._member.done_ns), seq)
                 self._link.put(keys.process(self._agent.name, "health"), health)
 
-    def _wake(self) -> None:
-        for subscription in list(self._subscriptions.values()):
-            subscription.wake()
-
     def _serve_rare(self) -> None:
-        while self._notices:
-            self._serve_notice(self._notices.popleft())
-        while self._links:
-            self._serve_link(self._links.popleft())
-        while self._queries:
-            self._serve_query(self._queries.popleft())
+        while self._inputs.notices:
+            self._serve_notice(self._inputs.notices.popleft())
+        while self._inputs.links:
+            self._serve_link(self._inputs.links.popleft())
+        while self._inputs.queries:
+            self._serve_query(self._inputs.queries.popleft())
         if not self.health.link_lost:
             self._member.settle()
         if self._member.failure:
@@ -344,22 +236,11 @@ class Runner:
             self._end_ns = read.data.last_ns
             self._end_wall_s = time.monotonic()
         elif read.kind in ("drop", "leave"):
-            self._ignore_estimates(read.subject)
+            self._inputs.ignore_estimates(read.subject)
         elif isinstance(read.data, ProcessEntry) and read.kind == "join":
-            self._expect_estimates(read.subject, read.data.from_ns)
+            self._inputs.expect_estimates(read.subject, read.data.from_ns)
         elif isinstance(read.data, ProcessEntry) and read.subject == self._agent.name:
             self._member.taken_in(read.data)
-
-    def _ignore_estimates(self, process: str) -> None:
-        """Wait no longer for the estimates of a process: those that it published last, or has the name for."""
-        for key, stock in self._stock.items():
-            if process == (self._estimated_by.get(key) or stock):
-                self._inbox.ignore(key)
-
-    def _expect_estimates(self, process: str, from_ns: int) -> None:
-        for key, stock in self._stock.items():
-            if process in (self._estimated_by.get(key), stock):
-                self._inbox.expect(key, from_ns)
 
     def _serve_link(self, up: bool) -> None:
         if up and self.health.link_lost:
@@ -379,10 +260,3 @@ class Runner:
         except DecodeError as error:
             answer = ControlAnswer(ok=False, error=str(error))
         query.answer(answer)
-
-
-def _gate_key(agent: Agent) -> str:
-    """Return on which key an agent takes the sensors of a gate as GateMessages; none for one that does not."""
-    if len(agent.counted) > 1:
-        return keys.GATE
-    return keys.gate(agent.counted[0]) if agent.counted and agent.takes_gates else ""

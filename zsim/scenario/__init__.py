@@ -1,4 +1,4 @@
-"""What a scenario says, how its file is read, and what follows from it: rights, faults, streams.
+"""The scenario: its fields, how its file is read, and what follows from it: roles, rights, faults.
 
 Imports contract, schema.
 """

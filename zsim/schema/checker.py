@@ -1,6 +1,6 @@
 """Every fault of a document against a typed description, not only the first one.
 
-msgspec stops at the first fault; a user who mends a scenario wants them all at once.
+msgspec stops at the first fault; a user who corrects a scenario needs them all at once.
 """
 
 import math
@@ -65,7 +65,7 @@ def _check(value: Any, info: types.Type, path: str) -> Iterator[Fault]:
 
 
 def _check_described(value: Any, info: types.Metadata, path: str) -> Iterator[Fault]:
-    """Yield the faults of a type; its description, where it has one, says in words what is allowed."""
+    """Yield the faults of a type; its description, where it has one, is the text of what is allowed."""
     description = (info.extra_json_schema or {}).get("description")
     if description is None:
         yield from _check(value, info.type, path)

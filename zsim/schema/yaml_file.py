@@ -59,7 +59,7 @@ def dump(plain: Any) -> str:
 
 
 def value(text: str) -> Any:
-    """Return what a YAML text says; ValueError, a line long, if it says nothing."""
+    """Return the content of a YAML text; ValueError, a line long, if it is not YAML."""
     try:
         _check_events(text)
         return yaml.load(text, Loader=_Loader)
@@ -73,7 +73,7 @@ def value(text: str) -> Any:
 
 
 def _check_events(text: str) -> None:
-    """Refuse aliases, for a bomb is made of them, tags, and a depth for which C code has no limit of its own."""
+    """Refuse aliases, which can expand without end, tags, and a depth for which C code has no limit of its own."""
     depth = 0
     events: Iterable[Any] = yaml.parse(text, Loader=_Base)
     for event in events:

@@ -212,7 +212,7 @@ def _refuse_lasting(error: SessionError) -> None:
 
 
 def _no_answer(identity: Identity | None) -> str:
-    """Return why a hub that is there may not answer; Zenoh does not tell those whom it lets do nothing."""
+    """Return why a hub that is there may not answer; Zenoh gives no reason to a client that it refuses."""
     may_be = ", but somebody listens there: another federation, a world on its way up, a router without one"
     if identity is None or identity.tls is None:
         return f"{may_be}; correct --federation, or wait longer"
@@ -223,7 +223,7 @@ def _no_answer(identity: Identity | None) -> str:
 
 
 def _no_link(endpoint: str) -> str:
-    """Return why there is no session; a port that opens nevertheless is one of somebody who speaks otherwise."""
+    """Return why there is no session; a port that opens nevertheless speaks another protocol, or TLS."""
     if not _opens(endpoint):
         return "; start one with `zsim world`"
     return ", but who listens there refuses us; if it is a world with TLS, say tls/ and give --tls FOLDER"

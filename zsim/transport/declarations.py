@@ -75,7 +75,7 @@ class Query:
     """A query to be answered once.
 
     Attributes:
-        expression: that it asks for, without the prefix of the session.
+        expression: the keys that are queried, without the prefix of the session.
         payload, attachment: as sent; empty where nothing was.
     """
 

@@ -47,7 +47,7 @@ class Session:
         self._realtime = mode == "realtime"
 
     def unprefixed(self) -> "Session":
-        """Return the same session by whole keys, the federation's name included: for who passes on others' keys."""
+        """Return the same session by whole keys, the federation's name included, for bridges to other federations."""
         session = Session(self._raw, "", Identity(host=self.host))
         self._declared[id(session)] = session.undeclare_all
         return session
@@ -141,7 +141,7 @@ class Session:
         return lambda payload, attachment: publisher.put(payload, attachment=attachment)
 
     def put_cached(self, key: str, payload: bytes, encoding: str = "", attachment: bytes = b"") -> None:
-        """Publish a payload for those too who subscribe later, as far as they ask (Zenoh's advanced subscribers do).
+        """Publish a payload, and keep it for later subscribers that query it (Zenoh's advanced subscribers do).
 
         Raises:
             SessionError: it is no key.
@@ -236,7 +236,7 @@ class Session:
     def request(
         self, key: str, op: str, source: str, args: dict[str, Any] | None = None, timeout_s: float = 5.0
     ) -> ControlAnswer:
-        """Ask `key` to do something; an answer that never comes is an answer that says so.
+        """Send a request to `key` and return its answer; without one, an answer with the reason.
 
         Raises:
             SessionError: it is no key, or something among the arguments fits into no message.

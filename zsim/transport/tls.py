@@ -1,7 +1,7 @@
-"""Who a process is on the network, and why a TLS link does not come up: Zenoh says only that it could not connect.
+"""The identity of a process on the network, and why a TLS link fails: Zenoh reports only that it could not connect.
 
-Python's ssl does the same handshake with the same files and is told the reason. Dates are left to this file, so that
-a certificate whose time is over can still be read and named.
+Python's ssl does the same handshake with the same files and gets the reason. Dates are checked here, so that an expired
+certificate can still be read and named.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ _MISNAMED = (62, 64)  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISM
 
 
 class Identity(NamedTuple):
-    """Who a process is, as whoever starts it says: its host, its certificate, and whom it lets in.
+    """The identity that a process is started with: its host, its certificate, and whom it lets in.
 
     Attributes:
         host: the name that its messages give.
@@ -97,7 +97,7 @@ def own_fault(identity: Identity) -> str | None:
 
 
 def no_link(identity: Identity, endpoint: str, error: str) -> str:
-    """Return why a client did not come in, in a line; `error` is what Zenoh says."""
+    """Return why a client did not come in, in a line; `error` is Zenoh's text."""
     fault = peer_fault(identity, endpoint)
     if fault:
         return f"cannot connect to {endpoint}: {fault}"
@@ -188,7 +188,7 @@ def _day(text: str) -> str:
 
 
 def _read_own(identity: Identity) -> dict[str, Any]:
-    """Return what a process's own certificate says, by a handshake with itself in memory.
+    """Return the content of a process's own certificate, by a handshake with itself in memory.
 
     Raises:
         ssl.SSLError: key, certificate and authority do not belong together.

@@ -1,4 +1,4 @@
-"""What a session is configured with, as {path in Zenoh's configuration: JSON5}; reasons in docs/decisions/0002.
+"""Settings of a session, as {path in Zenoh's configuration: JSON5}; reasons in docs/decisions/0002.
 
 Order of this file: link and timing, TLS, access control.
 """
@@ -111,7 +111,7 @@ def _security(identity: Identity, endpoints: Sequence[str], doing: str) -> Setti
 
 
 def refusal(path: str, value: str, identity: Identity) -> str:
-    """Return what to say of a setting that Zenoh refuses: only endpoints and access control come from a person."""
+    """Return the error for a setting that Zenoh refuses: only endpoints and access control come from a person."""
     if path == ACCESS:
         return f"{identity.access}: is no access control of Zenoh's; must be an access.json of zsim certs init"
     endpoints = ", ".join(map(repr, json.loads(value)))

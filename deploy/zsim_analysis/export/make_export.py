@@ -9,7 +9,7 @@ import msgspec
 from zsim import __version__
 from zsim.errors import ReportError
 from zsim.record import RecordReader
-from zsim.record.run_folder import record_at, record_notes
+from zsim.record.record_reader import record_at, record_notes
 from zsim_analysis.export.output import DEFAULTS, MANIFEST, Format, check_free, placed
 from zsim_analysis.export.selection import DecodedMessages, MessageSelection, TableSurvey, batches
 

@@ -10,7 +10,7 @@ import numpy as np
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError, RecordError, ZsimError
 from zsim.record import Recorded, RecordReader
-from zsim.record.run_folder import record_at
+from zsim.record.record_reader import record_at
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 

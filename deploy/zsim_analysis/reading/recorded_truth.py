@@ -3,7 +3,7 @@
 import numpy as np
 from msgspec import Struct
 
-from zsim.contract.truth_hash import TruthHash
+from zsim.contract.fingerprint import TruthHash
 from zsim_analysis.reading.flight import TRUTH_WIDTH, Track
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from zsim.errors import ReportError
-from zsim.record.run_folder import RECORD
+from zsim.record.record_reader import RECORD
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.formation import ParameterErrors
 from zsim_analysis.report.comparison import (

@@ -13,7 +13,7 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Te
 from rich.table import Table
 
 from zsim.errors import RecordError, ReportError
-from zsim.record.run_folder import RECORD
+from zsim.record.record_reader import RECORD
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.flight import RecordedFlight
 from zsim_analysis.reading.flight_reader import read_flight

@@ -9,7 +9,7 @@ from msgspec import Struct
 
 from zsim import __version__
 from zsim.contract.run_messages import Event
-from zsim.record.run_folder import record_notes
+from zsim.record.record_reader import record_notes
 from zsim_analysis.reading.flight import RecordedFlight, RunParticipant
 from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m, window
 from zsim_analysis.reading.recorded_run import command_age_ms

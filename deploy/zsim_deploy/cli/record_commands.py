@@ -48,7 +48,7 @@ def export(
     from rich.console import Console
     from rich.progress import Progress
 
-    from zsim.record.run_folder import record_at
+    from zsim.record.record_reader import record_at
     from zsim_analysis.export.output import check_installed
 
     if from_ is not None and to is not None and to < from_:

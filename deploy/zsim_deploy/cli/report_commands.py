@@ -44,7 +44,7 @@ def report(
     ] = None,
 ) -> None:
     """Make summary.json, figures and report.html of a run from its record, or of a sweep; or compare several runs."""
-    from zsim.record.run_folder import record_in
+    from zsim.record.record_reader import record_in
     from zsim_analysis.sweep.design import is_sweep
 
     if len(directories) > 1:
@@ -82,7 +82,7 @@ def _report(directory: Path) -> None:
 def _compare(directories: list[Path], out: Path | None) -> None:
     from rich.console import Console
 
-    from zsim.record.run_folder import record_in
+    from zsim.record.record_reader import record_in
     from zsim_analysis.report.make_comparison import compare, comparison_path
     from zsim_analysis.sweep.design import is_sweep
 

@@ -143,7 +143,7 @@ def play(place: Path, options: ReplayOptions, who: Identity) -> None:
         RunError, RecordError: there is no record, or nothing in it to play.
         SessionError: an endpoint is taken, a key is no expression, or the identity is of no use.
     """
-    from zsim.record.run_folder import record_notes
+    from zsim.record.record_reader import record_notes
     from zsim_analysis.reading.recorded_run import open_run
     from zsim_world.playback.playback import Playback
     from zsim_world.server.world_process import run

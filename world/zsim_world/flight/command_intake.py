@@ -1,14 +1,12 @@
 """Commands from their arrival to the firmware: checked, delayed by their link, queued, applied, published as events."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import PRIORITY_MAX, ControlRequest, Fault
-from zsim.runtime import link_faults
-from zsim.runtime.link_faults import NEVER, WORLD, uniform
+from zsim.runtime.link_faults import NEVER, RADIO, WORLD, distance_between, joins, place_of, total_delay_ns
 from zsim.scenario.scenario import Scenario
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.flight.barrier import Barrier
@@ -16,7 +14,6 @@ from zsim_world.flight.command_queue import CommandQueue, QueuedCommand
 from zsim_world.flight.run_clock import Operation, RunClock, number, refused_argument
 from zsim_world.flight.run_outbox import Refusal, RunOutbox
 
-RADIO = "radio"
 LinkFaultsAt = Callable[[int], Sequence[Fault]]
 """Returns the faults of links and radios that act in a gate."""
 
@@ -27,7 +24,7 @@ class CommandLinks:
 
     scenario: Scenario
     gate_ns: int
-    barrier: Barrier  # knows which processes do the work of others
+    barrier: Barrier  # has which processes do the work of others
     faults_at: LinkFaultsAt
     position_m: Callable[[str], list[float] | None]  # where a drone truly is [m; W], None for an unknown one
 
@@ -40,34 +37,27 @@ class CommandLinks:
         Args:
             gate_ns: the gate that it belongs to.
         """
-        faults = self.faults_at(gate_ns)
+        faults = [fault for fault in self.faults_at(gate_ns) if fault.kind != RADIO]
         if not faults:
             return 0
-        senders, total_ns = (self._sender(drone, message.source),), 0
-        for fault in faults:
-            if fault.kind != RADIO and link_faults.joins(fault, senders, WORLD):
-                draw = uniform(self.scenario.seed, WORLD, fault, key, message.t_ns, message.seq)
-                late_ns = link_faults.delay_ns(fault, draw)
-                if late_ns is None:
-                    return NEVER
-                total_ns += late_ns
-        return -(-total_ns // self.gate_ns) * self.gate_ns
+        senders = (self._sender(drone, message.source),)
+        faults = [fault for fault in faults if joins(fault, senders, WORLD)]
+        late_ns = total_delay_ns(faults, self.scenario.seed, WORLD, key, message)
+        return NEVER if late_ns is None else -(-late_ns // self.gate_ns) * self.gate_ns
 
     def lost_by_radio(self, drone: str, command: QueuedCommand, gate_ns: int) -> bool:
         """Tell whether the radio loses a command that would take effect before a gate."""
-        faults = self.faults_at(gate_ns)
-        return any(fault.kind == RADIO and self._loses(fault, drone, command) for fault in faults)
-
-    def _loses(self, fault: Fault, drone: str, command: QueuedCommand) -> bool:
-        if fault.target not in (WORLD, self._cluster_of.get(drone)):
+        targets = (WORLD, self._cluster_of.get(drone))
+        radios = [fault for fault in self.faults_at(gate_ns) if fault.kind == RADIO and fault.target in targets]
+        if not radios:
             return False
-        sender = self._sender(drone, command.source)
-        there = self.position_m(drone)
-        here = link_faults.place_of(sender, fault.parameters["place"], self.position_m)
-        key, message = keys.command(drone, command.kind), command.message
-        draw = uniform(self.scenario.seed, WORLD, fault, key, message.t_ns, message.seq)
-        distance_m = math.dist(there, here) if there is not None and here is not None else None
-        return link_faults.delay_ns(fault, draw, distance_m) is NEVER
+        key, sender = keys.command(drone, command.kind), self._sender(drone, command.source)
+
+        def distance_m(fault: Fault) -> float | None:
+            place = place_of(sender, fault.parameters["place"], self.position_m)
+            return distance_between(self.position_m(drone), place)
+
+        return total_delay_ns(radios, self.scenario.seed, WORLD, key, command.message, distance_m) is NEVER
 
     def _sender(self, drone: str, source: str) -> str:
         """Return who has sent a command: of the controllers that share a process, that of the drone's cluster."""
@@ -82,7 +72,7 @@ class CommandIntake:
 
     scenario: Scenario
     clock: RunClock
-    barrier: Barrier  # knows which sources are in the lockstep
+    barrier: Barrier  # has which sources are in the lockstep
     outbox: RunOutbox
     queue: CommandQueue
     fleet: Fleet

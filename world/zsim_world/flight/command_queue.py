@@ -1,7 +1,7 @@
 """Which command takes effect when, and who is the commander of each drone.
 
 The first source that sends a setpoint to a drone without a commander is its commander, until it releases it,
-says bye or dies. Commands of one instant are ordered by (priority of the source, source, seq): the last wins.
+leaves or dies. Commands of one instant are ordered by (priority of the source, source, seq): the last wins.
 """
 
 from collections.abc import Callable

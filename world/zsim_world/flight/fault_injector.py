@@ -93,7 +93,7 @@ class FaultInjector:
         self._next_ns = self._next_change_ns()
 
     def _beginning(self, fault: Fault) -> str:
-        """Return what the event of its beginning says of a fault."""
+        """Return the text of a fault's state for the event of its beginning."""
         if not _is_instant(fault):
             return "begins"
         immune = self._immunity(fault.target)

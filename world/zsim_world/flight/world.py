@@ -8,8 +8,7 @@ from typing import Any
 
 from zsim import CONTRACT, __version__
 from zsim.contract import keys, messages
-from zsim.contract.fingerprint import fingerprint
-from zsim.contract.truth_hash import TruthHash
+from zsim.contract.fingerprint import TruthHash, fingerprint
 from zsim.contract.views import DroneView, ViewDrones
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file

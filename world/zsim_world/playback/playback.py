@@ -22,8 +22,7 @@ from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.flight.run_clock import number, refused_argument
 from zsim_world.flight.run_outbox import Refusal
-from zsim_world.playback.playback_views import PlaybackViews
-from zsim_world.playback.recorded_gates import Gate, RecordedGates, author, is_played, without_kills
+from zsim_world.playback.recorded_gates import Gate, PlaybackViews, RecordedGates, author, is_played, without_kills
 
 RECORD_OVER = "the record is over"  # why a replay of the whole record ended
 

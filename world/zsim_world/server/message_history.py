@@ -1,6 +1,6 @@
-"""Messages kept by the world: last values for queries, and the last seconds for who must catch up.
+"""Messages kept by the world: last values for queries, and the last seconds for processes that must catch up.
 
-Everything passes here, the world's own messages and those of the participants; it answers for dead publishers too.
+It keeps the world's own messages and those of the participants, those of dead ones too.
 """
 
 from collections import deque
@@ -96,7 +96,7 @@ class MessageHistory:
 
         Args:
             from_ns: simulated time [ns].
-            wanted: tells of a key whether it is.
+            wanted: returns whether a key is wanted.
             start: 0, or where the page before ended.
 
         Returns:

@@ -230,7 +230,7 @@ class WorldProcess:
             query.answer(ControlAnswer(ok=False, error=reason))
 
     def _answer(self, request: run_messages.ControlRequest, process: str | None) -> ControlAnswer:
-        """Answer a request on `world/control`, or of a process, whose name access control knows, on its own key."""
+        """Answer a request on `world/control`, or of a process on its own key, by which access control knows it."""
         if request.op == "replay":
             return self._history.replay(request.args, self._readable_by(process))
         if process is not None:

@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from zsim.contract.truth_hash import TruthHash
+from zsim.contract.fingerprint import TruthHash
 
 DRONES = 3
 WIDTHS = (3, 3, 4, 3)

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from zsim.math import frames
 
-ORIGIN = (-34.603, -58.368, 25.0)
 few = settings(max_examples=100, deadline=None)
 angle = st.floats(-math.pi, math.pi)
 
@@ -28,47 +27,6 @@ angle = st.floats(-math.pi, math.pi)
 )
 def test_earth_fixed_coordinates_of_known_places(geodetic, ecef):
     np.testing.assert_allclose(frames.geodetic_to_ecef(geodetic), ecef, atol=1e-6)
-
-
-@few
-@given(st.floats(-89.9, 89.9), st.floats(-179.9, 179.9), st.floats(-5e3, 1e5))
-def test_geodetic_round_trip_is_exact(latitude, longitude, height):
-    back = frames.ecef_to_geodetic(frames.geodetic_to_ecef((latitude, longitude, height)))
-    np.testing.assert_allclose(back[:2], (latitude, longitude), atol=2e-14 * 180)
-    assert abs(back[2] - height) < 1e-8
-
-
-@few
-@given(st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(-100.0, 1e4)))
-def test_tangent_plane_round_trip_is_exact(position):
-    geodetic = frames.enu_to_geodetic(position, ORIGIN)
-    np.testing.assert_allclose(frames.geodetic_to_enu(geodetic, ORIGIN), position, atol=1e-8)
-
-
-def test_origin_and_axes_of_the_tangent_plane():
-    np.testing.assert_allclose(frames.enu_to_geodetic((0, 0, 0), ORIGIN), ORIGIN, atol=1e-9)
-    up = frames.enu_to_geodetic((0, 0, 7.0), ORIGIN)
-    np.testing.assert_allclose(up, (ORIGIN[0], ORIGIN[1], 32.0), atol=1e-9)
-
-
-def test_small_steps_follow_the_radii_of_curvature():
-    # an independent formula: meridian radius M and normal radius N at the origin
-    lat = math.radians(ORIGIN[0])
-    e2 = frames.WGS84_F * (2 - frames.WGS84_F)
-    s = 1 - e2 * math.sin(lat) ** 2
-    meridian = frames.WGS84_A_M * (1 - e2) / s**1.5 + ORIGIN[2]
-    normal = frames.WGS84_A_M / math.sqrt(s) + ORIGIN[2]
-    north = frames.enu_to_geodetic((0, 1.0, 0), ORIGIN)
-    east = frames.enu_to_geodetic((1.0, 0, 0), ORIGIN)
-    assert math.isclose(math.radians(north[0] - ORIGIN[0]), 1 / meridian, rel_tol=1e-6)
-    assert math.isclose(math.radians(east[1] - ORIGIN[1]), 1 / (normal * math.cos(lat)), rel_tol=1e-6)
-
-
-def test_many_points_at_once_equal_one_by_one():
-    points = np.random.default_rng(1).normal(size=(5, 2, 3)) * 100
-    together = frames.enu_to_geodetic(points, ORIGIN)
-    assert together.shape == (5, 2, 3)
-    np.testing.assert_array_equal(together[3, 1], frames.enu_to_geodetic(points[3, 1], ORIGIN))
 
 
 @few
@@ -108,7 +66,7 @@ def test_products_and_inverses_over_leading_shapes():
     v = rng.normal(size=(4, 3))
     left = frames.rotate(frames.quaternion_multiply(p, q), v)
     np.testing.assert_allclose(left, frames.rotate(p, frames.rotate(q, v)), atol=1e-12)
-    np.testing.assert_allclose(frames.rotate(frames.quaternion_conjugate(p), frames.rotate(p, v)), v, atol=1e-12)
+    np.testing.assert_allclose(frames.rotate(p * (1.0, -1.0, -1.0, -1.0), frames.rotate(p, v)), v, atol=1e-12)
 
 
 def test_heading_is_counter_clockwise_from_east():

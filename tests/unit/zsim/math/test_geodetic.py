@@ -1,5 +1,6 @@
-"""The compiled way of a GPS fix to latitude and longitude, against the one of zsim.math.frames."""
+"""Points of W on the Earth, against the way back and against formulas of geodesy."""
 
+import math
 import os
 import shutil
 import subprocess
@@ -8,22 +9,59 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import zsim
 import zsim_world
-from zsim.math.frames import enu_to_geodetic
+from zsim.math.frames import WGS84_A_M, WGS84_F, geodetic_to_enu
 from zsim.math.geodetic import anchor, geodetic
+
+ORIGIN = (-34.603, -58.368, 25.0)
+few = settings(max_examples=100, deadline=None)
+
+
+def place_of(position, origin=ORIGIN):
+    """Return latitude, longitude and height of one point of W."""
+    return geodetic(np.array([position], dtype=float), *anchor(*origin))[0]
 
 
 @pytest.mark.parametrize(
     "origin", [(37.3, -121.9, 30.0), (-34.603, -58.381, 25.0), (0.0, 180.0, 0.0), (89.9, 0.0, 5e3)]
 )
-def test_it_agrees_with_frames(origin):
+def test_the_way_back_is_that_of_frames(origin):
     points = np.random.default_rng(2).normal(size=(50, 3)) * (1e3, 1e3, 1e2)
-    found = geodetic(points, *anchor(*origin))
-    wanted = enu_to_geodetic(points, origin)
-    np.testing.assert_allclose(found[:, :2], wanted[:, :2], rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(found[:, 2], wanted[:, 2], rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(geodetic_to_enu(geodetic(points, *anchor(*origin)), origin), points, atol=1e-7)
+
+
+@few
+@given(st.floats(-89.9, 89.9), st.floats(-179.9, 179.9), st.floats(-5e3, 1e5))
+def test_an_origin_is_where_it_is(latitude, longitude, height):
+    back = place_of((0.0, 0.0, 0.0), (latitude, longitude, height))
+    np.testing.assert_allclose(back[:2], (latitude, longitude), atol=2e-14 * 180)
+    assert abs(back[2] - height) < 1e-8
+
+
+@few
+@given(st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(-100.0, 1e4)))
+def test_tangent_plane_round_trip_is_exact(position):
+    np.testing.assert_allclose(geodetic_to_enu(place_of(position), ORIGIN), position, atol=1e-8)
+
+
+def test_up_is_height():
+    np.testing.assert_allclose(place_of((0, 0, 7.0)), (ORIGIN[0], ORIGIN[1], 32.0), atol=1e-9)
+
+
+def test_small_steps_follow_the_radii_of_curvature():
+    # an independent formula: meridian radius M and normal radius N at the origin
+    lat = math.radians(ORIGIN[0])
+    e2 = WGS84_F * (2 - WGS84_F)
+    s = 1 - e2 * math.sin(lat) ** 2
+    meridian = WGS84_A_M * (1 - e2) / s**1.5 + ORIGIN[2]
+    normal = WGS84_A_M / math.sqrt(s) + ORIGIN[2]
+    north, east = place_of((0, 1.0, 0)), place_of((1.0, 0, 0))
+    assert math.isclose(math.radians(north[0] - ORIGIN[0]), 1 / meridian, rel_tol=1e-6)
+    assert math.isclose(math.radians(east[1] - ORIGIN[1]), 1 / (normal * math.cos(lat)), rel_tol=1e-6)
 
 
 ASK = """
