@@ -8,7 +8,7 @@ from federation import PAIR, Federation
 from secured import Certificates, tls_endpoint
 
 from zsim.scenario import scenario_file
-from zsim_deploy.security.enrolment import access_control
+from zsim_deploy.inventory.enrolment import access_control
 
 SEATED = PAIR.replace("clusters:", "processes: {expect: [matlab.main]}\nclusters:").replace(
     "duration_s: 12", "duration_s: 2"

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsim_deploy.options.arguments import CONSOLE_PORT, LOOK_S, WorldAccess, participant_options, positive
+from zsim_deploy.arguments import CONSOLE_PORT, LOOK_S, WorldAccess, participant_options, positive
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager

@@ -12,16 +12,7 @@ from typer.main import get_command
 
 from zsim import __version__
 from zsim.errors import BehindError, SupersededError, ZsimError
-from zsim_deploy.cli import (
-    bridge_commands,
-    federation_commands,
-    hosts_commands,
-    inventory_commands,
-    record_commands,
-    report_commands,
-    role_commands,
-)
-from zsim_deploy.options.arguments import (
+from zsim_deploy.arguments import (
     HOSTS,
     RUN,
     Duration,
@@ -34,7 +25,16 @@ from zsim_deploy.options.arguments import (
     load_scenario,
     mode_and_rate,
 )
-from zsim_deploy.options.terminal import INTERRUPTED
+from zsim_deploy.cli import (
+    bridge_commands,
+    federation_commands,
+    hosts_commands,
+    inventory_commands,
+    record_commands,
+    report_commands,
+    role_commands,
+)
+from zsim_deploy.terminal import INTERRUPTED
 
 app = typer.Typer(
     name="zsim",
@@ -77,7 +77,7 @@ def run(
     from zsim.runtime.progress import Screen
     from zsim_deploy.launch.run import RunOptions, check_endpoint, make_directory, run_in_process, run_processes
     from zsim_deploy.launch.supervisor import Outcome
-    from zsim_deploy.options.terminal import REASONS
+    from zsim_deploy.terminal import REASONS
 
     if in_process:
         _refuse_with_others(realtime, rate, listen, hosted, console)

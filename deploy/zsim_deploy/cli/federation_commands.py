@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from zsim_deploy.options.arguments import WorldAccess, observer_options, positive
+from zsim_deploy.arguments import WorldAccess, observer_options, positive
 
 if TYPE_CHECKING:
     from zsim.contract.messages import Info

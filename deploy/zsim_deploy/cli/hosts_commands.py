@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from zsim_deploy.options.arguments import (
+from zsim_deploy.arguments import (
     HOSTS,
     Duration,
     Insecure,

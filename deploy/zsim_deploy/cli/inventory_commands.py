@@ -9,24 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from zsim.transport.tls import DAYS
-from zsim_deploy.options.arguments import Set, load_scenario
+from zsim_deploy.arguments import Set, load_scenario
 
 if TYPE_CHECKING:
+    from zsim_deploy.inventory.certificates import CertificateStatus
+    from zsim_deploy.inventory.enrolment import Enrolment
     from zsim_deploy.inventory.inventory import InventoryFile
-    from zsim_deploy.security.certificates import CertificateStatus
-    from zsim_deploy.security.enrolment import Enrolment
 from collections.abc import Mapping
 from typing import Any
 
-from zsim_deploy.options.arguments import (
-    Duration,
-    RateOption,
-    Realtime,
-    ScenarioPath,
-    Seed,
-    mode_and_rate,
-    pace_options,
-)
+from zsim_deploy.arguments import Duration, RateOption, Realtime, ScenarioPath, Seed, mode_and_rate, pace_options
 
 certs = typer.Typer(name="certs", help="Make and show the certificates of a federation.", no_args_is_help=True)
 
@@ -67,9 +59,8 @@ def init(
     force: Annotated[bool, typer.Option("--force", help="Make a new authority; nothing made before is good.")] = False,
 ) -> None:
     """Make what is missing: authority, certificates, and access control for the world and the routers."""
-    from zsim_deploy.inventory import inventory
-    from zsim_deploy.security import certificates
-    from zsim_deploy.security.enrolment import Enrolment, folder_of
+    from zsim_deploy.inventory import certificates, inventory
+    from zsim_deploy.inventory.enrolment import Enrolment, folder_of
 
     placed = inventory.load(hosts)
     folder = folder_of(placed)
@@ -87,9 +78,8 @@ def init(
 def show(hosts: Inventory) -> None:
     """List the certificates that are there: for whom, for which addresses, until when."""
     from zsim.errors import RunError
-    from zsim_deploy.inventory import inventory
-    from zsim_deploy.security import certificates
-    from zsim_deploy.security.enrolment import folder_of, init_command
+    from zsim_deploy.inventory import certificates, inventory
+    from zsim_deploy.inventory.enrolment import folder_of, init_command
 
     placed, now = inventory.load(hosts), datetime.now(UTC)
     folder = folder_of(placed)
@@ -109,7 +99,7 @@ def show(hosts: Inventory) -> None:
 
 def _issue_all(folder: Path, enrolment: "Enrolment", days: float, renew: bool, force: bool) -> tuple[int, int]:
     """Return how many certificates were made and how many kept."""
-    from zsim_deploy.security import certificates
+    from zsim_deploy.inventory import certificates
 
     now = datetime.now(UTC)
     signer = certificates.authority(folder, now, force)
@@ -126,7 +116,7 @@ def _soon(status: "CertificateStatus", now: datetime) -> str:
 
 def _warn(placed: "InventoryFile") -> None:
     """Say which private keys others can read."""
-    from zsim_deploy.security.certificate_check import exposed_keys
+    from zsim_deploy.inventory.certificate_check import exposed_keys
 
     if warning := exposed_keys(placed):
         print(f"warning: {warning}", file=sys.stderr)

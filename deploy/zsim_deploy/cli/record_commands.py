@@ -10,8 +10,8 @@ import typer
 from zsim.contract.messages import RATE_MAX
 from zsim.errors import RunError
 from zsim_analysis.export.output import Format
-from zsim_deploy.options.arguments import DEFAULT_ENDPOINT, RUN, Access, Host, Insecure, Tls, identity, not_negative
-from zsim_deploy.options.terminal import interruptible
+from zsim_deploy.arguments import DEFAULT_ENDPOINT, RUN, Access, Host, Insecure, Tls, identity, not_negative
+from zsim_deploy.terminal import interruptible
 
 if TYPE_CHECKING:
     from zsim_analysis.export.make_export import ExportResult

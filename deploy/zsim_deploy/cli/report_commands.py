@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from zsim.errors import ZsimError
-from zsim_deploy.options.arguments import RUN, Duration, ScenarioPath, Seed, Set
-from zsim_deploy.options.terminal import INTERRUPTED
+from zsim_deploy.arguments import RUN, Duration, ScenarioPath, Seed, Set
+from zsim_deploy.terminal import INTERRUPTED
 
 if TYPE_CHECKING:
     from zsim_analysis.sweep.design import SweepPlan
@@ -74,7 +74,7 @@ def _report_at_the_end(out: Path, failed: bool) -> None:
 
 def _report(directory: Path) -> None:
     from zsim_analysis.report.make_report import make_report, table
-    from zsim_deploy.options.terminal import show_report
+    from zsim_deploy.terminal import show_report
 
     show_report(directory, "reading the record …", make_report, table)
 
@@ -177,6 +177,6 @@ def _conclude(folder: Path, failures: list[str], runs: int, report: bool) -> Non
 def _report_on_sweep(folder: Path) -> None:
     """Make the report of a sweep, and show its table."""
     from zsim_analysis.sweep.make_sweep_report import make_sweep_report, table
-    from zsim_deploy.options.terminal import show_report
+    from zsim_deploy.terminal import show_report
 
     show_report(folder, "reading the table …", make_sweep_report, table)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from zsim_deploy.options.arguments import (
+from zsim_deploy.arguments import (
     DEFAULT_ENDPOINT,
     Access,
     Connect,

@@ -11,8 +11,8 @@ import asyncssh
 
 from zsim import __version__
 from zsim.errors import HostsError
-from zsim_deploy.ssh.host_link import HostLink
-from zsim_deploy.ssh.ssh_connection import json_answer, shell_line, shell_word
+from zsim_deploy.hosts.host_link import HostLink
+from zsim_deploy.hosts.ssh_connection import json_answer, shell_line, shell_word
 
 CLOCK_OFFSET_MAX_S = 1.0  # certificates are back-dated by a day and logs are compared; time on the wire is simulated
 LOAD_MAX = 0.5  # of the cores; what is busy already slows everybody in lockstep

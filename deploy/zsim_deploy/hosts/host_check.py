@@ -10,11 +10,11 @@ from rich.text import Text
 
 from zsim.errors import ZsimError
 from zsim_deploy.hosts import doctor
+from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.leftover_runs import leftovers
+from zsim_deploy.inventory import certificate_check
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import InventoryFile
-from zsim_deploy.security import certificate_check
-from zsim_deploy.ssh.host_link import HostLink
 
 
 class CheckResult(NamedTuple):

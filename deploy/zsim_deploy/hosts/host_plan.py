@@ -13,12 +13,12 @@ from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import CERTIFICATES
 from zsim_deploy.hosts.leftover_runs import RECORD, runs_folder, scp
+from zsim_deploy.inventory import certificate_check
 from zsim_deploy.inventory import inventory as inv
+from zsim_deploy.inventory.enrolment import folder_of, init_command
 from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.inventory.processes import MODULE, ProcessFiles, access_file, command, own_programs, processes
 from zsim_deploy.roles.stop_channel import FOLDER
-from zsim_deploy.security import certificate_check
-from zsim_deploy.security.enrolment import folder_of, init_command
 
 ACCESS = "access.json"
 

@@ -14,20 +14,20 @@ from zsim.record import repair
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, WORLD
 from zsim.scenario.scenario import Scenario
+from zsim_deploy.arguments import pace_options
 from zsim_deploy.hosts.control_socket import ControlSocket
 from zsim_deploy.hosts.doctor import HostReport, compare_reports, host_report
+from zsim_deploy.hosts.host_link import EventLoopThread, HostLink
+from zsim_deploy.hosts.host_links import HostLinks, fetch
 from zsim_deploy.hosts.host_plan import HostPlan
 from zsim_deploy.hosts.launcher_requests import LauncherRequests
 from zsim_deploy.hosts.leftover_runs import RECORD, leftovers, port_faults
 from zsim_deploy.hosts.remote_process import ProcessLog, RemoteProcess
+from zsim_deploy.hosts.ssh_connection import shell_word
 from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.launch.supervisor import Outcome, Supervisor
-from zsim_deploy.options.arguments import pace_options
-from zsim_deploy.options.terminal import CLOSED, EndSignals
-from zsim_deploy.ssh.host_link import EventLoopThread, HostLink
-from zsim_deploy.ssh.host_links import HostLinks, fetch
-from zsim_deploy.ssh.ssh_connection import shell_word
+from zsim_deploy.terminal import CLOSED, EndSignals
 
 CONNECT_S = 30.0  # how long all hosts together may take to let us in, …
 CHECK_S = 60.0  # … to be checked: a small computer takes 5 s to import numpy, a poor link adds a dozen round trips, …

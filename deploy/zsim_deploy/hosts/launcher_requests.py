@@ -11,14 +11,14 @@ from typing import Any
 from zsim.errors import HostsError, RunError
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim_deploy.hosts.doctor import compare_reports, host_report
+from zsim_deploy.hosts.host_link import EventLoopThread, HostLink
+from zsim_deploy.hosts.host_links import HostLinks
 from zsim_deploy.hosts.host_plan import HostPlan
 from zsim_deploy.hosts.remote_process import RemoteProcess
+from zsim_deploy.hosts.ssh_connection import shell_word
 from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory.processes import MODULES, extras
 from zsim_deploy.launch.supervisor import Supervisor
-from zsim_deploy.ssh.host_link import EventLoopThread, HostLink
-from zsim_deploy.ssh.host_links import HostLinks
-from zsim_deploy.ssh.ssh_connection import shell_word
 
 JOIN_S = 60.0  # until a host that was not used so far is connected and found to fit
 IMPORT_S = 20.0  # until a Python has shown that it can run a role; a small computer takes 5 s

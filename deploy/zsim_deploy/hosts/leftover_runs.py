@@ -6,10 +6,10 @@ from pathlib import Path
 
 from zsim.transport.tls import KEY
 from zsim_deploy.hosts.doctor import NetworkPath, path_faults
+from zsim_deploy.hosts.host_link import HostLink
+from zsim_deploy.hosts.ssh_connection import json_answer, shell_line, shell_word
 from zsim_deploy.inventory.inventory import SSH_PORT, Host
 from zsim_deploy.roles.stop_channel import FOLDER
-from zsim_deploy.ssh.host_link import HostLink
-from zsim_deploy.ssh.ssh_connection import json_answer, shell_line, shell_word
 
 RECORD = "run.mcap"
 RUNS = "runs"  # below the folder of zsim on a host: a folder per run

@@ -17,9 +17,9 @@ from typing import Any
 import asyncssh
 
 from zsim.errors import HostsError
+from zsim_deploy.hosts.host_link import EventLoopThread, HostLink
+from zsim_deploy.hosts.ssh_connection import shell_line
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED
-from zsim_deploy.ssh.host_link import EventLoopThread, HostLink
-from zsim_deploy.ssh.ssh_connection import shell_line
 
 BEAT_S = 1.0  # how often the launcher shows that it lives
 ORPHAN_S = 60.0  # without a beat a process ends itself; a link may be cut for shorter than that

@@ -10,8 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from zsim.runtime.progress import Screen, describe
+from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.remote_process import RemoteProcess
-from zsim_deploy.ssh.host_link import HostLink
 
 FIRST_S = 1.0  # simulated; from then on it flies
 SILENT_S = 1.0  # a host that has not answered for so long is shown as silent; it is asked twice a second …

@@ -7,9 +7,9 @@ from typing import NamedTuple
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.role_table import AGENTS, ROLES, agent_names, on_death
 from zsim.scenario.scenario import OnDeath, Scenario
+from zsim_deploy.arguments import REALTIME
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import Inventory, InventoryFile, hosts_of, spread
-from zsim_deploy.options.arguments import REALTIME
 
 MODULE = ("-m", "zsim_deploy.cli")  # after the interpreter
 STOP_S = 15  # a world that is stopped waits 5 s for byes, and a recorder may have a disk to wait for

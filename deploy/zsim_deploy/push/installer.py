@@ -12,9 +12,9 @@ from typing import Any
 import asyncssh
 
 from zsim.errors import HostsError
+from zsim_deploy.hosts.host_link import HostLink
+from zsim_deploy.hosts.ssh_connection import json_answer, shell_line
 from zsim_deploy.push import on_host
-from zsim_deploy.ssh.host_link import HostLink
-from zsim_deploy.ssh.ssh_connection import json_answer, shell_line
 
 START_S = 30.0  # wall time to start a Python on a small computer, over a poor link
 BEAT_S = 5.0  # how often the launcher shows that it lives

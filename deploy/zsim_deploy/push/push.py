@@ -17,14 +17,14 @@ from rich.text import Text
 
 from zsim import __version__
 from zsim.errors import HostsError, InventoryError
+from zsim_deploy.hosts.host_link import HostLink
+from zsim_deploy.hosts.ssh_connection import shell_line
 from zsim_deploy.inventory.inventory import Host, InventoryFile
 from zsim_deploy.inventory.processes import MODULES, known_extras, needed_extras
 from zsim_deploy.push.installer import Installer, open_installer
 from zsim_deploy.push.package_index import choose_interpreter, interpreter_query, parse_interpreters, wheel_target
 from zsim_deploy.push.wheelhouse import Wheel, Wheelhouse, WheelSet
 from zsim_deploy.roles import warm_up
-from zsim_deploy.ssh.host_link import HostLink
-from zsim_deploy.ssh.ssh_connection import shell_line
 
 LAUNCHER = "launcher"  # name of this machine among the hosts, in progress lines
 ASK_S = 30.0  # wall time for a host to start a few Pythons; a small computer takes seconds

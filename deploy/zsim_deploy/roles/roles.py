@@ -20,7 +20,7 @@ from zsim.transport import session, tls
 from zsim.transport.connection import find_world
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agent_class, chosen, hosted, made
-from zsim_deploy.options.arguments import WorldAccess
+from zsim_deploy.arguments import WorldAccess
 from zsim_deploy.roles.stop_channel import StopChannel
 
 TICK_S = 0.1  # how often a router looks for a stop

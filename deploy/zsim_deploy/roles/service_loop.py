@@ -14,7 +14,7 @@ from zsim.errors import NoWorldError, SupersededError
 from zsim.transport.connection import find_world
 from zsim.transport.session import Session
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_deploy.options.arguments import WorldAccess
+from zsim_deploy.arguments import WorldAccess
 from zsim_deploy.roles.roles import log_printer
 from zsim_deploy.roles.stop_channel import StopChannel
 

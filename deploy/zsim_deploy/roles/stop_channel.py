@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 
 from zsim.transport.tls import KEY, Identity
-from zsim_deploy.options.terminal import IMPATIENT, INTERRUPTED, REASONS
+from zsim_deploy.terminal import IMPATIENT, INTERRUPTED, REASONS
 
 TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it
 GRACE_S = 4.0  # a role that hangs after a request to stop is ended; the world waits 5 s for byes only if unstopped

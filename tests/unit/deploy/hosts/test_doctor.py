@@ -20,10 +20,10 @@ from zsim.errors import HostsError
 from zsim_deploy.hosts import doctor, probe
 from zsim_deploy.hosts.doctor import HostReport, NetworkPath, compare_reports, path_faults
 from zsim_deploy.hosts.host_check import CheckResult, check_hosts
+from zsim_deploy.hosts.host_link import HostLink
+from zsim_deploy.inventory import certificates
+from zsim_deploy.inventory.enrolment import CertificateRequest
 from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
-from zsim_deploy.security import certificates
-from zsim_deploy.security.enrolment import CertificateRequest
-from zsim_deploy.ssh.host_link import HostLink
 
 SOUND = {
     "python": platform.python_version(),

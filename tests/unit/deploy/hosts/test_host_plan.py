@@ -12,9 +12,8 @@ from zsim.scenario import scenario_file
 from zsim_deploy.cli import hosts_commands
 from zsim_deploy.hosts.control_socket import ControlSocket
 from zsim_deploy.hosts.host_plan import HostPlan
-from zsim_deploy.inventory import inventory
-from zsim_deploy.security import certificates
-from zsim_deploy.security.enrolment import Enrolment
+from zsim_deploy.inventory import certificates, inventory
+from zsim_deploy.inventory.enrolment import Enrolment
 
 SCENARIO = """
 name: pair

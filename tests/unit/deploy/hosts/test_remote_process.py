@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from zsim.errors import HostsError
+from zsim_deploy.hosts.host_link import EventLoopThread
 from zsim_deploy.hosts.remote_process import LOST, ProcessLog, RemoteProcess
-from zsim_deploy.ssh.host_link import EventLoopThread
 
 FILES = {"identity/estimator.d1/key.pem": b"secret"}
 PATIENCE_S = 20.0  # after which a test that waits for ever fails

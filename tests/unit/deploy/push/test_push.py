@@ -15,13 +15,13 @@ from typing import Any
 import pytest
 
 from zsim.errors import HostsError, InventoryError
+from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.inventory import inventory
 from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
 from zsim_deploy.push import on_host
 from zsim_deploy.push.installer import open_installer
 from zsim_deploy.push.push import ASK_S, is_installed, missing, push
 from zsim_deploy.push.wheelhouse import Wheel, WheelSet
-from zsim_deploy.ssh.host_link import HostLink
 
 
 def wheel(name: str, size_bytes: int = 1, sha256: str | None = None) -> Wheel:

@@ -18,8 +18,8 @@ from typing import Any, TypeVar
 import asyncssh
 
 from zsim.errors import HostsError
+from zsim_deploy.hosts.ssh_connection import connect, shell_word
 from zsim_deploy.inventory.inventory import Host
-from zsim_deploy.ssh.ssh_connection import connect, shell_word
 
 ECHO_S = 0.5  # how often a word goes to the host and back
 RETRY_S = 0.5  # between two attempts to connect again

@@ -9,10 +9,10 @@ from pathlib import Path
 from zsim.errors import RunError
 from zsim.scenario.rights import ROUTER, WORLD
 from zsim.transport.tls import AUTHORITY, KEY
+from zsim_deploy.inventory import certificates
 from zsim_deploy.inventory import inventory as inv
+from zsim_deploy.inventory.enrolment import CertificateRequest, folder_of, init_command
 from zsim_deploy.inventory.inventory import InventoryFile
-from zsim_deploy.security import certificates
-from zsim_deploy.security.enrolment import CertificateRequest, folder_of, init_command
 
 SHOWN_MAX = 4  # names in a line; all of them are missing together as a rule
 READABLE_BY_OTHERS = stat.S_IRGRP | stat.S_IROTH

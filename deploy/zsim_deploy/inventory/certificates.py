@@ -20,7 +20,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from zsim.errors import RunError
 from zsim.scenario.rights import OPERATOR
 from zsim.transport.tls import AUTHORITY, CERTIFICATE, CERTIFICATES, DAYS, KEY
-from zsim_deploy.security.enrolment import OPERATORS, CertificateRequest
+from zsim_deploy.inventory.enrolment import OPERATORS, CertificateRequest
 
 AUTHORITY_DAYS = 1825  # 5 years; its key never leaves the machine that made it
 BACK = timedelta(days=1)  # hosts in the field have clocks that are hours off

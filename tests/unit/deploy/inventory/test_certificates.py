@@ -14,9 +14,9 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from zsim.errors import RunError
 from zsim.transport.tls import Identity, own_fault
-from zsim_deploy.security import certificates
-from zsim_deploy.security.certificates import DAYS, issue, renewal_reason
-from zsim_deploy.security.enrolment import CertificateRequest
+from zsim_deploy.inventory import certificates
+from zsim_deploy.inventory.certificates import DAYS, issue, renewal_reason
+from zsim_deploy.inventory.enrolment import CertificateRequest
 
 NOW = datetime(2026, 11, 1, 12, tzinfo=UTC)
 ESTIMATOR = CertificateRequest("h1", "estimator.drone1", ("10.0.0.1",))

@@ -10,8 +10,8 @@ import asyncssh
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy.ssh import host_links as module
-from zsim_deploy.ssh.host_links import fetch
+from zsim_deploy.hosts import host_links as module
+from zsim_deploy.hosts.host_links import fetch
 
 Get = Callable[[Path, Callable[..., None]], Awaitable[None]]
 

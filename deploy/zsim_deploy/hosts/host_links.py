@@ -8,8 +8,8 @@ from typing import Any
 import asyncssh
 
 from zsim.errors import HostsError, ZsimError
+from zsim_deploy.hosts.host_link import CLOSE_S, EventLoopThread, HostLink
 from zsim_deploy.inventory.inventory import InventoryFile
-from zsim_deploy.ssh.host_link import CLOSE_S, EventLoopThread, HostLink
 
 OPEN_S = 10.0  # until the host lets us read; a few round trips of a poor link
 STALL_S = 20.0  # without anything more the host is taken for lost; TCP repeats within that what a poor link loses

@@ -14,11 +14,10 @@ from zsim.errors import RunError
 from zsim.scenario import scenario_file
 from zsim_deploy.cli.cli import app
 from zsim_deploy.hosts.host_check import check_hosts
-from zsim_deploy.inventory import inventory
-from zsim_deploy.security import certificates
-from zsim_deploy.security.certificate_check import certificate_faults, exposed_keys
-from zsim_deploy.security.certificates import issue
-from zsim_deploy.security.enrolment import CertificateRequest
+from zsim_deploy.inventory import certificates, inventory
+from zsim_deploy.inventory.certificate_check import certificate_faults, exposed_keys
+from zsim_deploy.inventory.certificates import issue
+from zsim_deploy.inventory.enrolment import CertificateRequest
 
 SCENARIO = """
 name: pair
