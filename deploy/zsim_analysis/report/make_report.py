@@ -15,8 +15,7 @@ from rich.table import Table
 from zsim.errors import RecordError, ReportError
 from zsim.record.run_folder import RECORD
 from zsim_agents.formation.spaces.cluster_space import unit
-from zsim_analysis.reading.flight import RecordedFlight
-from zsim_analysis.reading.flight_reader import read_flight
+from zsim_analysis.reading.flight import RecordedFlight, read_flight
 from zsim_analysis.reading.formation import Formation, ParameterErrors, formations_of
 from zsim_analysis.report.canvas import ReportFigure
 from zsim_analysis.report.report_figures import figures

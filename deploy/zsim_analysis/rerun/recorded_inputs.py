@@ -15,14 +15,8 @@ from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import agents_of
 from zsim_analysis.reading.recorded_run import decode_or_none
 
-ABSENCES = (
-    "death",
-    "restart",
-    "superseded",
-    "doubled",
-    "drop",
-    "leave",
-)  # events of a process that did not take part all the time
+# events of a process that did not take part all the time
+ABSENCES = ("death", "restart", "superseded", "doubled", "drop", "leave")
 PROCESS_MESSAGES = ("join", "done", "bye")  # from processes to the world
 OUTPUTS = (messages.Estimate, messages.ClusterState, messages.ClusterRequest)
 
@@ -67,9 +61,7 @@ def recorded_agents(reader: RecordReader, info: messages.Info, scenario: Scenari
     joins = [(keys.thing(key), join) for key, join in _read(reader, "process/*/join")]
     ours = [(name, join) for name, join in joins if _is_ours(name, join, known)]
     unsorted = [AgentProcess(name, (*join.serves, name)) for name, join in dict(ours).items()]
-    processes = tuple(
-        sorted(unsorted, key=lambda process: ([*AGENTS].index(process.name.partition(".")[0]), process.name))
-    )
+    processes = tuple(sorted(unsorted, key=_by_role))
     names = frozenset(name for process in processes for name in process.members)
     events: list[messages.Event] = [event for _, event in _read(reader, keys.EVENT)]
     why_not = _reason(info, scenario, events, names)

@@ -16,7 +16,7 @@ from multiprocessing import parent_process
 from multiprocessing.connection import Connection, wait
 
 from zsim.errors import RunError
-from zsim_analysis.sweep.sweep_row import Row, Task, failed_row
+from zsim_analysis.sweep.sweep_run import Row, Task, failed_row
 
 READY = "ready"
 DEATHS_MAX = 3  # of workers in one run, or one after the other before they are ready

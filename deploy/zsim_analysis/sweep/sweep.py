@@ -17,7 +17,7 @@ from zsim.runtime.progress import Throttle
 from zsim_analysis.sweep.design import SweepPlan
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
 from zsim_analysis.sweep.sweep_folder import SweepFolder, locked
-from zsim_analysis.sweep.sweep_row import Row, Task
+from zsim_analysis.sweep.sweep_run import Row, Task
 
 PLAIN_S = 10.0  # wall time between two lines where no terminal is
 BAR = 20  # characters

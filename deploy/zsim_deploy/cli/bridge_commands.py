@@ -50,8 +50,7 @@ def console(
     from zsim.runtime.progress import JsonProgress
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.http_proxy import ListenAddress
-    from zsim_deploy.roles.roles import log_printer
-    from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
+    from zsim_deploy.roles.roles import give_way, log_printer, process_name, serve_runs
 
     give_way(for_eyes=True)
     own_name = process_name("console", name, reach.tls, "*")
@@ -91,8 +90,7 @@ def gateway(
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
     from zsim.transport.connection import find_world
     from zsim_bridges.gateway.gateway_server import Gateway, GatewayPorts
-    from zsim_deploy.roles.roles import log_printer
-    from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
+    from zsim_deploy.roles.roles import give_way, log_printer, process_name, serve_runs
 
     give_way()
     who = reach.who
@@ -138,7 +136,7 @@ def ros1(
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
     from zsim_bridges.ros1.bridge import NodeShutdownError, serve
-    from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
+    from zsim_deploy.roles.roles import give_way, process_name, serve_runs
 
     give_way()
     own_name = process_name("ros1", name, reach.tls)
@@ -168,7 +166,7 @@ def ros2(
         return
     from zsim.transport.tls import Identity, is_tls
     from zsim_bridges.ros2.bridge import RosNetwork, serve
-    from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
+    from zsim_deploy.roles.roles import give_way, process_name, serve_runs
 
     if reach.tls and router is None:
         why = "the world's access control lets no ROS keys pass"

@@ -114,7 +114,7 @@ def record(
 ) -> None:
     """Record every message of a federation into run.mcap."""
     from zsim_deploy.roles import roles
-    from zsim_deploy.roles.service_loop import give_way
+    from zsim_deploy.roles.roles import give_way
 
     give_way()
     roles.recorder(out / "run.mcap", reach)

@@ -12,7 +12,7 @@ from zsim.errors import ZsimError
 from zsim_deploy.hosts import doctor
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.leftover_runs import leftovers
-from zsim_deploy.inventory import certificate_check
+from zsim_deploy.inventory import enrolment
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import InventoryFile
 
@@ -28,8 +28,8 @@ class CheckResult(NamedTuple):
 def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
     """Check certificates and hosts; with a placement also the paths to where the world and the routers listen."""
     result = asyncio.run(_check_up(placed, places))
-    lacks = certificate_check.certificate_faults(placed, places, datetime.now(UTC))
-    warning = certificate_check.exposed_keys(placed)
+    lacks = enrolment.certificate_faults(placed, places, datetime.now(UTC))
+    warning = enrolment.exposed_keys(placed)
     return result._replace(
         faults=[*lacks, *result.faults], warnings=[*result.warnings, *([warning] if warning else [])]
     )

@@ -13,7 +13,7 @@ from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import CERTIFICATES
 from zsim_deploy.hosts.leftover_runs import RECORD, runs_folder, scp
-from zsim_deploy.inventory import certificate_check
+from zsim_deploy.inventory import enrolment
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.enrolment import folder_of, init_command
 from zsim_deploy.inventory.inventory import InventoryFile
@@ -99,13 +99,11 @@ class HostPlan:
 
     def certificate_faults(self, now: datetime) -> list[str]:
         """Return what of the certificates is missing or of no use at a time, a line for each fault."""
-        return certificate_check.certificate_faults(
-            self._placed, {name: self.host(name) for name in self.processes}, now
-        )
+        return enrolment.certificate_faults(self._placed, {name: self.host(name) for name in self.processes}, now)
 
     def exposed_keys(self) -> str | None:
         """Return a warning of private keys here that others can read, if there are any."""
-        return certificate_check.exposed_keys(self._placed)
+        return enrolment.exposed_keys(self._placed)
 
     def python(self, host: str) -> str:
         """Return the interpreter of a host that has zsim."""
