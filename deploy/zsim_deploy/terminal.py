@@ -1,4 +1,4 @@
-"""The terminal of a command: signals that end it, a terminal that is closed, a report made under a progress line."""
+"""The terminal of a command: signals that end it, and a terminal that is closed."""
 
 import contextlib
 import os
@@ -14,7 +14,6 @@ INTERRUPTED = 130  # exit code of a shell for a program that Ctrl-C ended
 IMPATIENT = "interrupted twice, nobody was waited for"
 STREAMS = 1, 2  # standard output and error
 CLOSED = "the terminal was closed"
-Say = Callable[[str], None]
 
 
 @contextmanager
@@ -98,19 +97,3 @@ def _announce(stream: int, log: Path) -> None:
     if stream == STREAMS[-1]:
         with contextlib.suppress(OSError):
             os.write(stream, f"{CLOSED}; what there is still to say is in {log}\n".encode())
-
-
-def show_report(folder: Path, reading: str, make: Callable[[Path, Say], Any], table: Callable[[Any], Any]) -> None:
-    """Make a folder's report, and print its table.
-
-    Args:
-        reading: shown at first.
-        make: makes report.html in the folder, and returns its figures.
-        table: of these figures, for a terminal.
-    """
-    from rich.console import Console
-
-    with Console(stderr=True).status(reading) as status:
-        figures = make(folder, lambda text: status.update(text))
-    Console().print(table(figures))
-    print(f"report: {folder / 'report.html'}")

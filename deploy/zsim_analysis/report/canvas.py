@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from msgspec import Struct
 
+from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.flight import Array
 
 DPI = 120
@@ -21,6 +22,20 @@ DRONES = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 DESIRED: dict[str, Any] = {"color": BLACK, "lw": 1.2, "ls": (0, (5, 3)), "zorder": 4}
 MEASURED: dict[str, Any] = {"color": ORANGE, "lw": 0.8, "zorder": 3}
 TRUE: dict[str, Any] = {"color": BLUE, "lw": 1.1, "zorder": 2}
+
+
+SYMBOLS = {
+    "x_c": "$x_c$",
+    "y_c": "$y_c$",
+    "z_c": "$z_c$",
+    "roll": "roll",
+    "pitch": "pitch",
+    "yaw": "yaw",
+    "p": "$p$",
+    "q": "$q$",
+    "beta": "$\\beta$",
+}
+GREEK = {"phi": "\\phi", "rho": "\\rho"}
 
 
 class ReportFigure(Struct, frozen=True):
@@ -58,6 +73,13 @@ def label_time(axes: Iterable[Axes]) -> None:
     """Label the time axis of axes."""
     for each in axes:
         each.set_xlabel("simulated time (s)", fontsize=10)
+
+
+def label(name: str) -> str:
+    """Return the label of a parameter at an axis, with its unit."""
+    stem, _, number = name.partition("_")
+    greek = f"${GREEK[stem]}_{{{number}}}$" if stem in GREEK else name
+    return f"{SYMBOLS.get(name, greek)} ({unit(name)})"
 
 
 def line(axes: Axes, x: Array, y: Array, **style: Any) -> None:

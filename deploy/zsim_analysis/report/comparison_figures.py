@@ -13,6 +13,7 @@ from zsim_analysis.report.canvas import (
     ReportFigure,
     dress,
     drone_colour,
+    label,
     label_time,
     legend_above,
     line,
@@ -28,7 +29,6 @@ from zsim_analysis.report.report_figures import (
     draw_error,
     draw_path,
     drone_panel_heights,
-    label,
     name_states,
     parameter_groups,
 )

@@ -30,6 +30,7 @@ from zsim_analysis.report.canvas import (
     ReportFigure,
     dress,
     drone_colour,
+    label,
     label_time,
     legend_above,
     line,
@@ -39,25 +40,6 @@ from zsim_analysis.report.canvas import (
 POSITION = ("x_c", "y_c", "z_c")
 ORIENTATION = ("roll", "pitch", "yaw")
 ROWS_MAX = 24  # parameters in one figure; 6 drones
-SYMBOLS = {
-    "x_c": "$x_c$",
-    "y_c": "$y_c$",
-    "z_c": "$z_c$",
-    "roll": "roll",
-    "pitch": "pitch",
-    "yaw": "yaw",
-    "p": "$p$",
-    "q": "$q$",
-    "beta": "$\\beta$",
-}
-GREEK = {"phi": "\\phi", "rho": "\\rho"}
-
-
-def label(name: str) -> str:
-    """Return the label of a parameter at an axis, with its unit."""
-    stem, _, number = name.partition("_")
-    greek = f"${GREEK[stem]}_{{{number}}}$" if stem in GREEK else name
-    return f"{SYMBOLS.get(name, greek)} ({unit(name)})"
 
 
 def draw_errors(formation: Formation, window_s: tuple[float, float]) -> Figure:

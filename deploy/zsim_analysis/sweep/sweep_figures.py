@@ -16,10 +16,10 @@ from zsim_analysis.report.canvas import (
     VERMILION,
     ReportFigure,
     dress,
+    label,
     legend_above,
     new_figure,
 )
-from zsim_analysis.report.report_figures import label
 from zsim_analysis.report.summary import PAPER_TABLE_1
 from zsim_analysis.sweep.points import LEVEL, FormationParameter, SweepResults, mean_interval, share_interval
 

@@ -1,11 +1,15 @@
 """`zsim console`, `gateway`, `ros1` and `ros2`: the processes that show a run, and translate it for other programs."""
 
+import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsim_deploy.arguments import CONSOLE_PORT, LOOK_S, WorldAccess, participant_options, positive
+from zsim.errors import RunError, SessionError
+from zsim_bridges.ros1.master_api import DEFAULT_MASTER, own_address
+from zsim_deploy.arguments import CONSOLE_PORT, LOOK_S, WorldAccess, participant_options, positive, require
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -13,14 +17,12 @@ if TYPE_CHECKING:
     from zsim.contract.messages import Info
     from zsim.transport.session import Session
     from zsim.transport.tls import Identity
-import time
-from functools import partial
-
-from zsim_bridges.ros1.master_api import DEFAULT_MASTER, own_address
 
 OPERATE, TRANSLATE = "Watch and steer", "Others come in"  # panels of the help
 TOKEN = "ZSIM_TOKEN"  # in the environment: a command line can be read by everybody on the machine
 DOMAIN_MAX = 232  # the highest ROS_DOMAIN_ID that ROS 2 takes
+
+CONSOLE_NEEDS = {"console": ("aiohttp", "viser")}  # modules by extra
 
 app = typer.Typer()
 
@@ -46,7 +48,7 @@ def console(
     ] = "",
 ) -> None:
     """Show a run in the browser, and steer it: scene, plots, events, faults."""
-    check_console_installed()
+    require("console", CONSOLE_NEEDS)
     from zsim.runtime.progress import JsonProgress
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.http_proxy import ListenAddress
@@ -58,21 +60,6 @@ def console(
     shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say)
     with shown.open():
         serve_runs(own_name, shown.serve, reach)
-
-
-def check_console_installed() -> None:
-    """Refuse where what the page is made of is not installed.
-
-    Raises:
-        RunError: with what to install.
-    """
-    from importlib.util import find_spec
-
-    from zsim.errors import RunError
-
-    missing = [module for module in ("aiohttp", "viser") if find_spec(module) is None]
-    if missing:
-        raise RunError(f"console: {' and '.join(missing)} is not installed; pip install 'zsim[console]'")
 
 
 @app.command(rich_help_panel=TRANSLATE)
@@ -107,8 +94,6 @@ def gateway(
 
 def _of_seat(who: "Identity", process: str) -> "Identity":
     """Return who a client's seat is on the network: its certificate lies beside the gateway's."""
-    from zsim.errors import SessionError
-
     if who.tls is None:
         return who
     folder: Path = who.tls.parent / process
@@ -185,7 +170,6 @@ def _write_package(folder: Path) -> None:
     Raises:
         RunError: the folder cannot be written.
     """
-    from zsim.errors import RunError
     from zsim_bridges.ros2.ros_types import PACKAGE
 
     try:

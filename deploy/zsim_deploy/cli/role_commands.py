@@ -1,29 +1,27 @@
 """The commands that are one role of a federation each."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from zsim.scenario.role_table import AGENTS, Role
 from zsim_deploy.arguments import (
     DEFAULT_ENDPOINT,
     Access,
     Connect,
-    Duration,
     Federation,
+    FlightOptions,
     Host,
     Insecure,
     Launched,
-    RateOption,
     Realtime,
-    ScenarioPath,
-    Seed,
-    Set,
     Tls,
     Wait,
     WorldAccess,
+    flight_options,
     identity,
-    mode_and_rate,
     participant_options,
 )
 
@@ -33,16 +31,12 @@ app = typer.Typer()
 
 
 @app.command(rich_help_panel=ROLES)
+@flight_options
 def world(
-    scenario: ScenarioPath,
+    flight: FlightOptions,
     listen: Annotated[
         list[str] | None, typer.Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")
     ] = None,
-    seed: Seed = None,
-    duration: Duration = None,
-    realtime: Realtime = False,
-    rate: RateOption = None,
-    set_: Set = None,
     expect: Annotated[list[str] | None, typer.Option(help="Wait for this process too, e.g. recorder.")] = None,
     launched: Launched = None,
     tls: Tls = None,
@@ -54,37 +48,44 @@ def world(
     from zsim.scenario import scenario_file
     from zsim_deploy.roles import world_role
 
-    loaded = scenario_file.load(scenario, set_ or (), seed=seed, duration_s=duration)  # it needs no class of the agents
-    mode, pace = mode_and_rate(realtime, rate)
+    path, overrides = flight.path, flight.overrides or ()
+    loaded = scenario_file.load(path, overrides, seed=flight.seed, duration_s=flight.duration)  # needs no agent's class
+    mode, pace = flight.mode_and_rate()
     who = identity(host, tls, insecure, access)
     world_role.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who)
 
 
-@app.command(rich_help_panel=ROLES)
-@participant_options
-def estimator(
-    reach: WorldAccess,
-    drones: Annotated[
-        list[str],
-        typer.Argument(metavar="DRONE...", help="Drones, or patterns: 'drone*'.", show_default=False),
-    ],
-) -> None:
-    """Run the estimator of one drone, or of several in one process."""
-    from zsim_deploy.roles import roles
+def _agent_command(name: str, role: Role) -> Callable[..., None]:
+    """Return the command of a role that has agents, named after drones or clusters."""
+    about = str(role.about)
+    several_help = f"{about.capitalize()}s, or patterns: '{about}*'."
 
-    roles.agent(roles.agent_of("estimator", drones), reach)
+    def start(things: list[str], reach: WorldAccess) -> None:
+        from zsim_deploy.roles import roles
+
+        roles.agent(roles.agent_of(name, things), reach)
+
+    def several(
+        reach: WorldAccess,
+        things: Annotated[
+            list[str], typer.Argument(metavar=f"{about.upper()}...", help=several_help, show_default=False)
+        ],
+    ) -> None:
+        start(things, reach)
+
+    def one(
+        reach: WorldAccess,
+        thing: Annotated[str, typer.Argument(metavar=about.upper(), help=f"Name of the {about}.")] = "main",
+    ) -> None:
+        start([thing], reach)
+
+    return participant_options(several if role.joint else one)
 
 
-@app.command(rich_help_panel=ROLES)
-@participant_options
-def controller(
-    reach: WorldAccess,
-    cluster: Annotated[str, typer.Argument(help="Name of the cluster.")] = "main",
-) -> None:
-    """Run the cluster-space controller of one cluster."""
-    from zsim_deploy.roles import roles
-
-    roles.agent(roles.agent_of("controller", [cluster]), reach)
+for _name, _role in AGENTS.items():
+    _also = ", or of several in one process" if _role.joint else ""
+    _help = f"Run the {_name} of one {_role.about}{_also}."
+    app.command(_name, rich_help_panel=ROLES, help=_help)(_agent_command(_name, _role))
 
 
 @app.command("host", rich_help_panel=ROLES)
@@ -114,9 +115,8 @@ def record(
 ) -> None:
     """Record every message of a federation into run.mcap."""
     from zsim_deploy.roles import roles
-    from zsim_deploy.roles.roles import give_way
 
-    give_way()
+    roles.give_way()
     roles.recorder(out / "run.mcap", reach)
 
 

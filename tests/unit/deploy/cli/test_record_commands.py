@@ -7,7 +7,7 @@ import pytest
 import typer
 
 from zsim.errors import RecordError
-from zsim_deploy.cli import report_commands
+from zsim_deploy.cli import record_commands
 from zsim_deploy.launch.supervisor import Outcome
 
 INTERRUPTED = Outcome("interrupted by Ctrl-C", interrupted=True)
@@ -28,20 +28,20 @@ def raising(error: BaseException) -> Any:
 
 def test_ctrl_c_before_there_is_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit, match="130"):
-        report_commands.conclude(INTERRUPTED, tmp_path, True)
+        record_commands.conclude(INTERRUPTED, tmp_path, True)
     assert capsys.readouterr().err == "ended: interrupted by Ctrl-C\n"
 
 
 def test_ctrl_c_in_flight(recorded: Path, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit, match="130"):
-        report_commands.conclude(INTERRUPTED, recorded, True)
+        record_commands.conclude(INTERRUPTED, recorded, True)
     assert f"the record so far is {recorded / 'run.mcap'}" in capsys.readouterr().err
 
 
 def test_ctrl_c_in_the_report(recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(report_commands, "_report", raising(KeyboardInterrupt()))
+    monkeypatch.setattr(record_commands, "_report", raising(KeyboardInterrupt()))
     with pytest.raises(SystemExit, match="130"):
-        report_commands.conclude(Outcome("the scenario's duration is over"), recorded, True)
+        record_commands.conclude(Outcome("the scenario's duration is over"), recorded, True)
     said = capsys.readouterr().err
     assert said == f"interrupted; the record is complete, `zsim report {recorded}` makes its report\n"
 
@@ -49,10 +49,10 @@ def test_ctrl_c_in_the_report(recorded: Path, capsys: pytest.CaptureFixture[str]
 def test_a_failed_run_of_which_nothing_can_be_reported(
     recorded: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(report_commands, "_report", raising(RecordError("run.mcap: holds no message")))
+    monkeypatch.setattr(record_commands, "_report", raising(RecordError("run.mcap: holds no message")))
     with pytest.raises(typer.Exit) as ended:
-        report_commands.conclude(Outcome("the world died", failed=True), recorded, True)
+        record_commands.conclude(Outcome("the world died", failed=True), recorded, True)
     assert ended.value.exit_code == 1
     assert "ended: the world died\nrun.mcap: holds no message\n" in capsys.readouterr().err
     with pytest.raises(RecordError):
-        report_commands.conclude(Outcome("ended"), recorded, True)
+        record_commands.conclude(Outcome("ended"), recorded, True)
