@@ -25,7 +25,8 @@ from zsim.scenario import scenario_file
 from zsim.transport import session
 from zsim.transport.tls import Identity
 from zsim_deploy.inventory import certificates
-from zsim_deploy.inventory.enrolment import CertificateRequest, access_control
+from zsim_deploy.inventory.certificates import CertificateRequest
+from zsim_deploy.inventory.enrolment import access_control
 
 HOST = "lab"
 SITE = "router.site"

@@ -169,7 +169,7 @@ def doctor(
     from rich.console import Console
 
     from zsim.errors import HostsError
-    from zsim_deploy.hosts.host_check import check_hosts
+    from zsim_deploy.hosts.doctor import check_hosts
     from zsim_deploy.inventory import inventory
 
     placed = inventory.load(hosts)

@@ -1,4 +1,6 @@
-"""Who needs a certificate, and which rights each listening process grants: from an inventory and a scenario. Pure.
+"""Who needs a certificate, and which rights each listening process grants: from an inventory and a scenario.
+
+At the end, whether the certificates that a run needs are there and good, before anything is started with them.
 
 Zenoh judges at the process that listens (the world, a router), by the common name in the certificate of the other
 side, both ways: what comes in from it and what goes out to it. An expression is allowed if a rule's includes it.
@@ -10,7 +12,7 @@ import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from zsim.contract import keys
 from zsim.errors import InventoryError, RunError
@@ -20,9 +22,9 @@ from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import AUTHORITY, KEY
 from zsim_deploy.inventory import certificates
 from zsim_deploy.inventory import inventory as inv
+from zsim_deploy.inventory.certificates import OPERATORS, CertificateRequest
 from zsim_deploy.inventory.inventory import InventoryFile
 
-OPERATORS = "operators"  # folder of the operators that are at no host of the inventory
 # (flow, messages, whose keys): what a right is on the wire, seen from the process that listens
 _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("ingress", ("declare_subscriber",), "reads"),
@@ -50,20 +52,6 @@ def init_command(placed: InventoryFile, renew: bool = False) -> str:
     """Return the command that makes an inventory's certificates, as a person types it."""
     words = ["zsim", "certs", "init", str(placed.folder / placed.source)]
     return " ".join([shlex.join(words), "--scenario FILE", *(["--renew"] if renew else [])])
-
-
-class CertificateRequest(NamedTuple):
-    """A certificate that is to be there.
-
-    Attributes:
-        host: name of the host in the inventory; a folder.
-        process: name of the process; the common name.
-        addresses: of the host, IP or DNS.
-    """
-
-    host: str
-    process: str
-    addresses: tuple[str, ...] = ()
 
 
 class Enrolment:

@@ -21,8 +21,14 @@ from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.ssh_connection import shell_line
 from zsim_deploy.inventory.inventory import Host, InventoryFile
 from zsim_deploy.inventory.processes import MODULES, known_extras, needed_extras
-from zsim_deploy.push.installer import Installer, open_installer
-from zsim_deploy.push.package_index import choose_interpreter, interpreter_query, parse_interpreters, wheel_target
+from zsim_deploy.push.installer import (
+    Installer,
+    choose_interpreter,
+    interpreter_query,
+    open_installer,
+    parse_interpreters,
+    wheel_target,
+)
 from zsim_deploy.push.wheelhouse import Wheel, Wheelhouse, WheelSet
 from zsim_deploy.roles import warm_up
 

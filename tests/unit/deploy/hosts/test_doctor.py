@@ -8,7 +8,8 @@ import pathlib
 import platform
 import socket
 import threading
-from contextlib import contextmanager
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, contextmanager
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 from typing import Any
@@ -18,11 +19,10 @@ import pytest
 from zsim import __version__
 from zsim.errors import HostsError
 from zsim_deploy.hosts import doctor, probe
-from zsim_deploy.hosts.doctor import HostReport, NetworkPath, compare_reports, path_faults
-from zsim_deploy.hosts.host_check import CheckResult, check_hosts
+from zsim_deploy.hosts.doctor import CheckResult, HostReport, NetworkPath, check_hosts, compare_reports, path_faults
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.inventory import certificates
-from zsim_deploy.inventory.enrolment import CertificateRequest
+from zsim_deploy.inventory.certificates import CertificateRequest
 from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
 
 SOUND = {
@@ -149,8 +149,9 @@ class Silent(HostLink):
         self._said = (out, error)
         self._code = code
 
-    async def open(self) -> Any:
-        return self
+    @asynccontextmanager
+    async def channel(self, patient: bool = False) -> AsyncIterator[Any]:
+        yield self
 
     async def create_process(self, *_command, **_options):
         streams = [asyncio.StreamReader(), asyncio.StreamReader()]

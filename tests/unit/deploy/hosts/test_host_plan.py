@@ -109,7 +109,7 @@ def test_a_start_that_is_refused_leaves_no_folder(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     out: Any = Path(given) if given else None
     with pytest.raises(HostsError, match=r"h1: ssh at 127\.0\.0\.1 port 1 cannot be reached"):
-        hosts_commands.up(*paths, out=out, insecure=True)
+        hosts_commands.up(scenario=paths[0], hosts=paths[1], out=out, insecure=True)
     left = {path.name for path in (*tmp_path.glob("runs/*"), *tmp_path.glob("out"), *tmp_path.glob("there"))}
     assert left == {"there"}
 
@@ -122,10 +122,10 @@ def test_a_federation_that_is_up_already_is_refused_before_any_host_is_asked(
         ControlSocket("zsim", {}),
         pytest.raises(RunError, match=r"federation 'zsim' is up already .* --set federation=NAME"),
     ):
-        hosts_commands.up(*paths, out=tmp_path / "out")
+        hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
     with ControlSocket("zsim", {}), pytest.raises(HostsError, match="cannot be reached"):
-        hosts_commands.up(*paths, out=tmp_path / "out", set_=["federation=other"], insecure=True)
+        hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out", set_=["federation=other"], insecure=True)
 
 
 def test_certificates_that_are_missing_or_expired_are_told_before_any_host_is_asked(
@@ -133,10 +133,10 @@ def test_certificates_that_are_missing_or_expired_are_told_before_any_host_is_as
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     with pytest.raises(HostsError, match=r"^\S*/certs: has no certificates; .*certs init"):
-        hosts_commands.up(*paths, out=tmp_path / "out")
+        hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out")
     certify(paths, datetime.now(UTC) - timedelta(days=10))
     with pytest.raises(HostsError, match=r"expired on \S+: router\.field on h1, .*estimator.* --renew`$"):
-        hosts_commands.up(*paths, out=tmp_path / "out")
+        hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -80,6 +80,13 @@ class Local:
         assert self.process.stdin is not None
         self.process.stdin.close()
 
+    async def wait_closed(self) -> None:
+        await self.process.wait()
+
+    @property
+    def exit_status(self) -> int | None:
+        return self.process.returncode
+
 
 class Text:
     """The text of a stream of bytes."""

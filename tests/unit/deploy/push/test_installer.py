@@ -5,7 +5,7 @@ import subprocess
 import pytest
 
 from zsim.errors import HostsError
-from zsim_deploy.push.package_index import (
+from zsim_deploy.push.installer import (
     Interpreter,
     choose_interpreter,
     interpreter_query,
