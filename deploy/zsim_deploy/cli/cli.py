@@ -12,6 +12,7 @@ from typer.main import get_command
 
 from zsim import __version__
 from zsim.errors import BehindError, SupersededError, ZsimError
+from zsim_deploy import INTERRUPTED
 from zsim_deploy.arguments import (
     HOSTS,
     RUN,
@@ -31,7 +32,7 @@ from zsim_deploy.cli import (
     record_commands,
     role_commands,
 )
-from zsim_deploy.terminal import INTERRUPTED, REASONS
+from zsim_deploy.roles.stop_channel import REASONS
 
 app = typer.Typer(
     name="zsim",

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from zsim_deploy import INTERRUPTED
 from zsim_deploy.arguments import WorldAccess, observer_options, positive
-from zsim_deploy.terminal import INTERRUPTED
 
 if TYPE_CHECKING:
     from zsim.contract.messages import Fault, Info

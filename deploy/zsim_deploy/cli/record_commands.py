@@ -11,6 +11,7 @@ import typer
 from zsim.contract.messages import RATE_MAX
 from zsim.errors import ZsimError
 from zsim_analysis.export import Format
+from zsim_deploy import INTERRUPTED
 from zsim_deploy.arguments import (
     DEFAULT_ENDPOINT,
     RUN,
@@ -26,7 +27,7 @@ from zsim_deploy.arguments import (
     not_negative,
     require,
 )
-from zsim_deploy.terminal import INTERRUPTED, interruptible
+from zsim_deploy.roles.stop_channel import interruptible
 
 if TYPE_CHECKING:
     from zsim_analysis.export.make_export import ExportResult

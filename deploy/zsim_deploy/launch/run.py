@@ -19,8 +19,7 @@ from zsim_deploy.arguments import CONSOLE_PORT, pace_options
 from zsim_deploy.launch.child_process import ChildProcess
 from zsim_deploy.launch.role_launcher import RoleLauncher
 from zsim_deploy.launch.supervisor import Outcome, Supervisor
-from zsim_deploy.roles.stop_channel import StopChannel
-from zsim_deploy.terminal import REASONS, handled_by
+from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 
 DEFAULT_PORT = 7447  # Zenoh's own
 CONSOLE = "console.run"  # the one that a run starts: not to be taken over by the first that is started by hand

@@ -17,7 +17,7 @@ from zsim.errors import RunError
 from zsim.runtime.progress import ProgressSink
 from zsim.scenario.role_table import on_death
 from zsim.scenario.scenario import OnDeath
-from zsim_deploy.terminal import IMPATIENT, REASONS, handled_by
+from zsim_deploy.roles.stop_channel import IMPATIENT, REASONS, handled_by
 
 POLL_S = 0.05  # how often the processes are looked at
 END_S = 8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for
