@@ -8,7 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from zsim_analysis.reading.formation import Formation
-from zsim_analysis.report.canvas import (
+from zsim_analysis.report.comparison import ComparedRun, clusters, parameters
+from zsim_analysis.report.pages import (
     BLACK,
     ReportFigure,
     dress,
@@ -20,7 +21,6 @@ from zsim_analysis.report.canvas import (
     new_figure,
     run_style,
 )
-from zsim_analysis.report.comparison import ComparedRun, clusters, parameters
 from zsim_analysis.report.report_figures import (
     NAMED_MAX,
     ROWS_MAX,

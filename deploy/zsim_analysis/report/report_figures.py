@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.flight import Array, RecordedFlight, Track
 from zsim_analysis.reading.formation import Formation, common_instants
-from zsim_analysis.report.canvas import (
+from zsim_analysis.report.pages import (
     BLACK,
     BLUE,
     DARK,

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from zsim_analysis.report.canvas import (
+from zsim_analysis.report.pages import (
     BLACK,
     BLUE,
     GREEN,

@@ -127,7 +127,7 @@ def _compare(directories: list[Path], out: Path | None) -> None:
     from rich.console import Console
 
     from zsim.record.run_folder import record_in
-    from zsim_analysis.report.make_comparison import compare, comparison_path
+    from zsim_analysis.report.make_report import compare, comparison_path
     from zsim_analysis.sweep.design import is_sweep
 
     for directory in directories:
@@ -323,7 +323,7 @@ def rerun(
 ) -> None:
     """Fly the run of a record again, from its own inputs, and tell whether truth is the same; exit code 0 or 1."""
     require("rerun", RERUN_NEEDS)
-    from zsim_analysis.rerun.rerun import rerun_record
+    from zsim_analysis.rerun import rerun_record
 
     if not rerun_record(directory, commands_only, print, lambda text: print(text, file=sys.stderr)):
         raise typer.Exit(1)

@@ -12,7 +12,7 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import Bye, Clock, ClusterRequest, Estimate, Event, Health, Join, Message, Mode, Truth
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
-from zsim_analysis.rerun.recorded_inputs import AgentProcess, RecordedAgents, gates, recorded_agents
+from zsim_analysis.reading.recorded_run import AgentProcess, RecordedAgents, gates, recorded_agents
 from zsim_world.flight.world import World
 
 GATE_NS = 20_000_000

@@ -8,7 +8,7 @@ import pytest
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import Message, Mode, Truth
-from zsim_analysis.rerun.rerun_bus import OutputComparison, TruthComparison, difference
+from zsim_analysis.rerun_bus import OutputComparison, TruthComparison, difference
 
 GATE_NS = 20_000_000
 ZEROS = (0.0, 0.0, 0.0)

@@ -18,8 +18,7 @@ from zsim.runtime.bus import Bus
 from zsim.runtime.group import AgentGroup
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
-from zsim_analysis.reading.recorded_run import decode_or_none
-from zsim_analysis.rerun.recorded_inputs import OUTPUTS, GateInputs, RecordedAgents
+from zsim_analysis.reading.recorded_run import OUTPUTS, GateInputs, RecordedAgents, decode_or_none
 from zsim_world.flight.world import World
 
 COUNTED = ("position_m", "velocity_m_s", "orientation_wxyz", "angular_velocity_rad_s")  # of truth_sha256

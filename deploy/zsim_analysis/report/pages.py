@@ -1,14 +1,20 @@
-"""How all figures look: colours, axes, legends, the points of a line, and the file of a figure."""
+"""How all figures and pages look, and how they are written: colours, axes, legends, lines, templates, files."""
 
+import base64
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from msgspec import Struct
 
+from zsim.errors import ReportError
 from zsim_agents.formation.spaces.cluster_space import unit
 from zsim_analysis.reading.flight import Array
 
@@ -51,6 +57,9 @@ class ReportFigure(Struct, frozen=True):
         file = io.BytesIO()
         self.drawing.savefig(file, format="png")
         return file.getvalue()
+
+
+Picture = tuple[ReportFigure, bytes]  # a figure and its PNG file
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -143,3 +152,88 @@ def run_style(index: int) -> RunStyle:
     """Return how a run is drawn; from the seventh on colours repeat with other dashes."""
     repeats, place = divmod(index, len(STYLES))
     return STYLES[place]._replace(dashes=STYLES[(index + repeats) % len(STYLES)].dashes)
+
+
+def write_report(
+    directory: Path,
+    summary: bytes,
+    figures: Iterable[ReportFigure],
+    page: Callable[[Sequence[Picture]], str],
+    progress: Callable[[str], None],
+) -> None:
+    """Write DIR/summary.json, DIR/figures/*.png and DIR/report.html, all or none of them.
+
+    Args:
+        directory: of the run or the sweep.
+        summary: content of summary.json.
+        figures: drawn one by one.
+        page: makes the page of the pictures.
+        progress: called with a text at each step.
+
+    Raises:
+        ReportError: the directory cannot be written.
+    """
+    with _put_in_place(directory, directory) as new:
+        pictures = render(figures, progress)
+        progress("writing the page")
+        (new / "figures").mkdir()
+        for figure, png in pictures:
+            (new / "figures" / figure.name).write_bytes(png)
+        (new / "summary.json").write_bytes(summary)
+        (new / "report.html").write_text(page(pictures), encoding="utf-8")
+
+
+def write_page(
+    out: Path,
+    figures: Iterable[ReportFigure],
+    page: Callable[[Sequence[Picture]], str],
+    progress: Callable[[str], None],
+) -> None:
+    """Write one page; an earlier one is replaced when the new one is whole. Arguments and errors as `write_report`."""
+    with _put_in_place(out.parent, out) as new:
+        pictures = render(figures, progress)
+        progress("writing the page")
+        (new / out.name).write_text(page(pictures), encoding="utf-8")
+
+
+@contextmanager
+def _put_in_place(directory: Path, report: Path) -> Iterator[Path]:
+    """Yield a folder whose files come into a directory when all are made: a full disk or Ctrl-C leaves no half of them.
+
+    Raises:
+        ReportError: the directory cannot be written; the line begins with `report`.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=directory, prefix=".report-") as folder:
+            yield Path(folder)
+            for path in sorted(path for path in Path(folder).rglob("*") if path.is_file()):
+                target = directory / path.relative_to(folder)
+                target.parent.mkdir(exist_ok=True)
+                path.replace(target)
+    except OSError as error:
+        raise ReportError(f"{report}: the report cannot be written ({error.strerror})") from error
+
+
+def render(figures: Iterable[ReportFigure], progress: Callable[[str], None]) -> list[Picture]:
+    """Draw figures one by one; one that is rendered keeps no drawing in memory."""
+    pictures = []
+    for figure in figures:
+        progress(f"drawing {figure.name}")
+        pictures.append((figure, figure.png()))
+    return pictures
+
+
+def template(name: str, package: str = "zsim_analysis.report") -> Template:
+    """Return a page's template; what it includes may stand beside it or here."""
+    return Environment(
+        loader=ChoiceLoader([PackageLoader(package, "."), PackageLoader("zsim_analysis.report", ".")]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+    ).get_template(name)
+
+
+def sources(pictures: Iterable[Picture]) -> list[tuple[ReportFigure, str]]:
+    """Return each figure with its PNG file as a data URI, which needs no file beside the page."""
+    return [(figure, "data:image/png;base64," + base64.b64encode(png).decode()) for figure, png in pictures]
