@@ -52,6 +52,12 @@ def require(command: str, needs: Mapping[str, Sequence[str]]) -> None:
         raise RunError(f"{command}: {' and '.join(missing)} is not installed; pip install 'zsim[{extras}]'")
 
 
+def check_range(from_: float | None, to: float | None) -> None:
+    """Refuse `--to` before `--from`."""
+    if from_ is not None and to is not None and to < from_:
+        raise typer.BadParameter(f"--to is {to:g}, before --from {from_:g}; must be at or after it")
+
+
 ScenarioPath = Annotated[Path, typer.Argument(help="Scenario file (YAML).", show_default=False)]
 Set = Annotated[list[str] | None, typer.Option("--set", help="Override a field: a.b.c=value. Repeatable.")]
 Seed = Annotated[int | None, typer.Option(help="Seed instead of the scenario's.")]
@@ -69,6 +75,15 @@ Tls = Annotated[Path | None, typer.Option("--tls", help="Folder of this process'
 Access = Annotated[Path | None, typer.Option("--access", help="Zenoh's access control (zsim certs init).")]
 Host = Annotated[str | None, typer.Option("--host", help="Name of this host, as others see it.")]
 Insecure = Annotated[bool, typer.Option("--insecure", help="Without TLS, on a network that is nobody else's.")]
+
+
+Keys = Annotated[
+    list[str] | None, typer.Option(help="Only these keys, e.g. 'drone/*/truth'. Repeatable.", show_default=False)
+]
+From = Annotated[
+    float | None, typer.Option("--from", callback=not_negative, help="Simulated seconds of the first message.")
+]
+To = Annotated[float | None, typer.Option("--to", callback=not_negative, help="Simulated seconds of the last message.")]
 
 
 def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | None = None) -> "Identity":

@@ -1,4 +1,4 @@
-"""What is done with the records of runs: `zsim report`, `sweep`, `export`, `replay` and `rerun`; how a run ends."""
+"""What is done with the records of runs: `zsim report`, `sweep`, `export` and `rerun`; how a run ends."""
 
 import signal
 import sys
@@ -8,23 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from zsim.contract.messages import RATE_MAX
 from zsim.errors import ZsimError
 from zsim_analysis.export import Format
 from zsim_deploy import INTERRUPTED
 from zsim_deploy.arguments import (
-    DEFAULT_ENDPOINT,
     RUN,
-    Access,
     Duration,
-    Host,
-    Insecure,
+    From,
+    Keys,
     ScenarioPath,
     Seed,
     Set,
-    Tls,
-    identity,
-    not_negative,
+    To,
+    check_range,
     require,
 )
 from zsim_deploy.roles.stop_channel import interruptible
@@ -33,9 +29,7 @@ if TYPE_CHECKING:
     from zsim_analysis.export.make_export import ExportResult
     from zsim_analysis.sweep.design import SweepPlan
 
-# Modules by extra.
-REPLAY_NEEDS = {"record": ("mcap", "zstandard")}
-RERUN_NEEDS = {**REPLAY_NEEDS, "world": ("numba",), "agents": ("scipy", "filterpy")}
+RERUN_NEEDS = {"record": ("mcap", "zstandard"), "world": ("numba",), "agents": ("scipy", "filterpy")}
 REPORT_NEEDS = {"report": ("matplotlib", "jinja2", "mcap", "zstandard")}
 SWEEP_NEEDS = {"sweep": ("pyarrow", "numba", "filterpy", "mcap", "matplotlib", "jinja2")}
 DASK_NEEDS = {**SWEEP_NEEDS, "dask": ("distributed",)}
@@ -43,13 +37,6 @@ WRITERS = {Format.CSV: "pyarrow", Format.PARQUET: "pyarrow", Format.MAT: "scipy"
 
 app = typer.Typer()
 Place = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run, or its run.mcap.", show_default=False)]
-Keys = Annotated[
-    list[str] | None, typer.Option(help="Only these keys, e.g. 'drone/*/truth'. Repeatable.", show_default=False)
-]
-From = Annotated[
-    float | None, typer.Option("--from", callback=not_negative, help="Simulated seconds of the first message.")
-]
-To = Annotated[float | None, typer.Option("--to", callback=not_negative, help="Simulated seconds of the last message.")]
 
 
 def conclude(outcome: Any, out: Path, report: bool) -> None:
@@ -239,7 +226,7 @@ def export(
 
     from zsim.record.run_folder import record_at
 
-    _check_range(from_, to)
+    check_range(from_, to)
     record_at(run)
     require("export", {"export": ("mcap", "zstandard", WRITERS[form])})
     from zsim_analysis.export.make_export import export as write
@@ -259,59 +246,12 @@ def export(
     _show(done)
 
 
-def _check_range(from_: float | None, to: float | None) -> None:
-    if from_ is not None and to is not None and to < from_:
-        raise typer.BadParameter(f"--to is {to:g}, before --from {from_:g}; must be at or after it")
-
-
 def _show(done: "ExportResult") -> None:
     for note in done.notes:
         print(f"note: {note}", file=sys.stderr)
     for name, rows in done.tables.items():
         print(f"{name:<40} {rows:>10}")
     print("written: " + " ".join(map(str, done.paths)))
-
-
-def _rate(value: float) -> float:
-    """Return a pace that a replay can have."""
-    if not 0 <= value <= RATE_MAX:
-        raise typer.BadParameter(f"is {value:g}; must be >= 0 and <= {RATE_MAX:g}")
-    return value
-
-
-@app.command(rich_help_panel=RUN)
-def replay(
-    directory: Place,
-    rate: Annotated[
-        float, typer.Option(callback=_rate, help="Simulated per wall second; 0 = as fast as it goes.")
-    ] = 1.0,
-    from_: From = 0.0,
-    to: To = None,
-    keys: Keys = None,
-    expect: Annotated[
-        list[str] | None,
-        typer.Option(help="Begin when this process has joined, e.g. estimator.drone1, console.1. Repeatable."),
-    ] = None,
-    paused: Annotated[bool, typer.Option("--paused", help="Stand at the first gate until asked to resume.")] = False,
-    listen: Annotated[
-        list[str] | None, typer.Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")
-    ] = None,
-    federation: Annotated[str | None, typer.Option(help="Name of the federation (default the record's).")] = None,
-    tls: Tls = None,
-    access: Access = None,
-    insecure: Insecure = False,
-    host: Host = None,
-) -> None:
-    """Play a record back onto the keys: for a console, an estimator under test, any client; nobody can be flown."""
-    require("replay", REPLAY_NEEDS)
-    from zsim_deploy.roles.world_role import ReplayOptions, play
-    from zsim_world.playback.playback import PlaybackRange
-
-    _check_range(from_, to)
-    to_ns = None if to is None else round(to * 1e9)
-    choice = PlaybackRange(round((from_ or 0.0) * 1e9), to_ns, tuple(keys or ["**"]), paused)
-    options = ReplayOptions(choice, rate, tuple(expect or ()), tuple(listen or [DEFAULT_ENDPOINT]), federation)
-    play(directory, options, identity(host, tls, insecure, access))
 
 
 @app.command(rich_help_panel=RUN)

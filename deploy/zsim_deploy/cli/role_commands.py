@@ -1,4 +1,4 @@
-"""The commands that are one role of a federation each."""
+"""The commands that are one role of a federation each, and `zsim replay`, which stands in for the world."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,25 +6,33 @@ from typing import Annotated
 
 import typer
 
+from zsim.contract.messages import RATE_MAX
 from zsim.scenario.role_table import AGENTS, Role
 from zsim_deploy.arguments import (
     DEFAULT_ENDPOINT,
+    RUN,
     Access,
     Connect,
     Federation,
     FlightOptions,
+    From,
     Host,
     Insecure,
+    Keys,
     Launched,
     Realtime,
     Tls,
+    To,
     Wait,
     WorldAccess,
+    check_range,
     flight_options,
     identity,
     participant_options,
+    require,
 )
 
+REPLAY_NEEDS = {"record": ("mcap", "zstandard")}  # modules by extra
 ROLES = "Roles, started by hand, on any machine, in any order"
 
 app = typer.Typer()
@@ -138,3 +146,47 @@ def router(
 
     mode = "realtime" if realtime else "lockstep"
     roles.router(name, listen, connect, federation, mode, launched, identity(host, tls, insecure, access))
+
+
+def _rate(value: float) -> float:
+    """Return a pace that a replay can have."""
+    if not 0 <= value <= RATE_MAX:
+        raise typer.BadParameter(f"is {value:g}; must be >= 0 and <= {RATE_MAX:g}")
+    return value
+
+
+@app.command(rich_help_panel=RUN)
+def replay(
+    directory: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder of a run, or its run.mcap.", show_default=False)
+    ],
+    rate: Annotated[
+        float, typer.Option(callback=_rate, help="Simulated per wall second; 0 = as fast as it goes.")
+    ] = 1.0,
+    from_: From = 0.0,
+    to: To = None,
+    keys: Keys = None,
+    expect: Annotated[
+        list[str] | None,
+        typer.Option(help="Begin when this process has joined, e.g. estimator.drone1, console.1. Repeatable."),
+    ] = None,
+    paused: Annotated[bool, typer.Option("--paused", help="Stand at the first gate until asked to resume.")] = False,
+    listen: Annotated[
+        list[str] | None, typer.Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")
+    ] = None,
+    federation: Annotated[str | None, typer.Option(help="Name of the federation (default the record's).")] = None,
+    tls: Tls = None,
+    access: Access = None,
+    insecure: Insecure = False,
+    host: Host = None,
+) -> None:
+    """Play a record back onto the keys: for a console, an estimator under test, any client; nobody can be flown."""
+    require("replay", REPLAY_NEEDS)
+    from zsim_deploy.roles.world_role import ReplayOptions, play
+    from zsim_world.playback.playback import PlaybackRange
+
+    check_range(from_, to)
+    to_ns = None if to is None else round(to * 1e9)
+    choice = PlaybackRange(round((from_ or 0.0) * 1e9), to_ns, tuple(keys or ["**"]), paused)
+    options = ReplayOptions(choice, rate, tuple(expect or ()), tuple(listen or [DEFAULT_ENDPOINT]), federation)
+    play(directory, options, identity(host, tls, insecure, access))

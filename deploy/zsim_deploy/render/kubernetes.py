@@ -5,7 +5,7 @@ inventory, so Pods use the network of their node, and the names of the hosts are
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from zsim import __version__
@@ -42,6 +42,11 @@ from zsim_deploy.render.rendered_files import (
     unused,
 )
 
+NAME_MAX = 63  # RFC 1123 label
+CPU = "250m"  # to find a node by; in lockstep a role takes what there is
+# Measured with three drones and all extras installed: world 227, estimator 252, controller 232, recorder 86 MiB.
+MEMORY_MIB, MEMORY_MAX_MIB = 256, 1024
+RECORDS = {"persistentVolumeClaim": {"claimName": "records"}}
 IMAGE = f"zsim:{__version__}"
 CONFIG_BYTES_MAX = 1_048_576  # of a ConfigMap; Kubernetes, "ConfigMaps"
 RECORD_GIB = 10  # 186 runs of 330 s with three drones, 58 MB each
@@ -157,14 +162,14 @@ def _records_pod(space: str, image: str) -> dict[str, Any]:
         "command": ["sleep", "infinity"],
         "resources": {"requests": {"cpu": "10m", "memory": "16Mi"}, "limits": {"memory": "64Mi"}},
         "securityContext": _locked(),
-        "volumeMounts": [{"name": "runs", "mountPath": RUNS, "readOnly": True}],
+        "volumeMounts": [_mount("runs", RUNS, read_only=True)],
     }
     spec = {
         "automountServiceAccountToken": False,
         "securityContext": _user(),
         "terminationGracePeriodSeconds": 1,
         "containers": [box],
-        "volumes": [_runs_volume()],
+        "volumes": [{"name": "runs", **RECORDS}],
     }
     return {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "records", "namespace": space}, "spec": spec}
 
@@ -225,12 +230,6 @@ def _meta(space: str, process: PlannedProcess) -> dict[str, Any]:
     return {"name": _label(process.name), "namespace": space, "labels": _labels(process)}
 
 
-NAME_MAX = 63  # RFC 1123 label
-CPU = "250m"  # to find a node by; in lockstep a role takes what there is
-# Measured with three drones and all extras installed: world 227, estimator 252, controller 232, recorder 86 MiB.
-MEMORY_MIB, MEMORY_MAX_MIB = 256, 1024
-
-
 def _label(name: str) -> str:
     """Return a name as Kubernetes takes it (RFC 1123 label)."""
     return re.sub(r"[^a-z0-9]+", "-", name).strip("-")[:NAME_MAX].rstrip("-") or "zsim"
@@ -259,7 +258,7 @@ def _pod_template(process: PlannedProcess, image: str, restart: str) -> dict[str
         "enableServiceLinks": False,
         "securityContext": _user(),
         "containers": [_box(process, image)],
-        "volumes": _volumes(process),
+        "volumes": [{"name": name, **source} for name, _, _, source in _mounted(process)],
     }
     return {"metadata": {"labels": _labels(process)}, "spec": spec}
 
@@ -277,7 +276,7 @@ def _box(process: PlannedProcess, image: str) -> dict[str, Any]:
             "limits": {"memory": f"{MEMORY_MAX_MIB}Mi"},
         },
         "securityContext": _locked(),
-        "volumeMounts": _mounts(process),
+        "volumeMounts": [_mount(*mounted[:3]) for mounted in _mounted(process)],
     }
     if process.port is not None:
         box["ports"] = [{"name": "zenoh", "containerPort": process.port, "hostPort": process.port, "protocol": "TCP"}]
@@ -297,36 +296,24 @@ def _locked() -> dict[str, Any]:
     }
 
 
-def _mounts(process: PlannedProcess) -> list[dict[str, Any]]:
-    mounts: list[dict[str, Any]] = [{"name": "cache", "mountPath": CACHE}, {"name": "tmp", "mountPath": "/tmp"}]
+def _mounted(process: PlannedProcess) -> Iterator[tuple[str, str, bool, dict[str, Any]]]:
+    """Yield name, path, whether it is read only, and source of each volume of a process."""
+    yield "cache", CACHE, False, {"emptyDir": {}}
+    yield "tmp", "/tmp", False, {"emptyDir": {}}
     if process.name == WORLD:
-        mounts.append({"name": "scenario", "mountPath": SCENARIO.rpartition("/")[0], "readOnly": True})
+        yield "scenario", SCENARIO.rpartition("/")[0], True, {"configMap": {"name": "scenario"}}
     if process.name == RECORDER:
-        mounts.append({"name": "runs", "mountPath": RUNS})
+        yield "runs", RUNS, False, RECORDS
     if process.secure:
-        mounts.append({"name": "certs", "mountPath": CERTIFICATES, "readOnly": True})
+        yield "certs", CERTIFICATES, True, _secret(process, IDENTITY_FILES)
     if process.secure and process.port is not None:
-        mounts.append({"name": "access", "mountPath": ACCESS.rpartition("/")[0], "readOnly": True})
-    return mounts
+        yield "access", ACCESS.rpartition("/")[0], True, _secret(process, ("access.json",))
 
 
-def _volumes(process: PlannedProcess) -> list[dict[str, Any]]:
-    volumes: list[dict[str, Any]] = [{"name": "cache", "emptyDir": {}}, {"name": "tmp", "emptyDir": {}}]
-    if process.name == WORLD:
-        volumes.append({"name": "scenario", "configMap": {"name": "scenario"}})
-    if process.name == RECORDER:
-        volumes.append(_runs_volume())
-    if process.secure:
-        volumes.append(_secret_volume("certs", process, IDENTITY_FILES))
-    if process.secure and process.port is not None:
-        volumes.append(_secret_volume("access", process, ("access.json",)))
-    return volumes
+def _mount(name: str, path: str, read_only: bool) -> dict[str, Any]:
+    return {"name": name, "mountPath": path, **({"readOnly": True} if read_only else {})}
 
 
-def _secret_volume(name: str, process: PlannedProcess, keys: Sequence[str]) -> dict[str, Any]:
+def _secret(process: PlannedProcess, keys: Sequence[str]) -> dict[str, Any]:
     items = [{"key": key, "path": key} for key in keys]
-    return {"name": name, "secret": {"secretName": _secret_name(process), "defaultMode": 0o440, "items": items}}
-
-
-def _runs_volume() -> dict[str, Any]:
-    return {"name": "runs", "persistentVolumeClaim": {"claimName": "records"}}
+    return {"secret": {"secretName": _secret_name(process), "defaultMode": 0o440, "items": items}}

@@ -370,6 +370,7 @@ def test_the_command_prints_what_it_wrote(run: Path, tmp_path: Path) -> None:
 EXPORT = """
     import resource, sys
     from pathlib import Path
+    from zsim_analysis.export import Format
     from zsim_analysis.export.make_export import export
     print("begun", flush=True)
     export(Path(sys.argv[1]), Format(sys.argv[2]))
