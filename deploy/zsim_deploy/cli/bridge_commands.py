@@ -54,7 +54,7 @@ def console(
     from zsim_bridges.console.http_proxy import ListenAddress
     from zsim_deploy.roles.roles import give_way, log_printer, process_name, serve_runs
 
-    give_way(for_eyes=True)
+    give_way(only_viewed=True)
     own_name = process_name("console", name, reach.tls, "*")
     say = JsonProgress().say if reach.launched else log_printer(None)
     shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say)

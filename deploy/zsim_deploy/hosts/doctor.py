@@ -2,7 +2,6 @@
 
 import asyncio
 import platform
-import shlex
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractAsyncContextManager
@@ -214,10 +213,9 @@ def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckRe
 async def _check_up(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
     links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
     pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
-    hosts = shlex.quote(str(placed.folder / placed.source))
     try:
         results = await asyncio.gather(
-            *(host_report(link, pythons[name], hosts) for name, link in links.items()), return_exceptions=True
+            *(host_report(link, pythons[name], placed.word) for name, link in links.items()), return_exceptions=True
         )
         reports: dict[str, HostReport] = {}
         faults: list[str] = []

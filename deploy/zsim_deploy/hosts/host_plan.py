@@ -62,6 +62,7 @@ class HostPlan:
         pace: options of the world: `--realtime`, `--rate R`.
 
     Attributes:
+        placed: the inventory.
         processes: by name, the routers first, each after the one that it connects to.
         remarks: on programs of the user's own, which are not started.
 
@@ -70,7 +71,7 @@ class HostPlan:
     """
 
     def __init__(self, placed: InventoryFile, scenario: Scenario, run_id: str, pace: Sequence[str] = ()) -> None:
-        self._placed = placed
+        self.placed = placed
         self._scenario = scenario
         self._run_id = run_id
         self._pace = pace
@@ -80,13 +81,9 @@ class HostPlan:
 
     def moved(self, name: str, host: str) -> "HostPlan":
         """Return the same plan but for the host of one process."""
-        places = {**inv.placement(self._placed, self._scenario), name: host}
-        placed = self._placed._replace(inventory=msgspec.structs.replace(self._placed.inventory, roles=places))
+        places = {**inv.placement(self.placed, self._scenario), name: host}
+        placed = self.placed._replace(inventory=msgspec.structs.replace(self.placed.inventory, roles=places))
         return HostPlan(placed, self._scenario, self._run_id, self._pace)
-
-    def known_hosts(self) -> list[str]:
-        """Return the hosts of the inventory."""
-        return list(self._placed.inventory.hosts)
 
     def hosts(self) -> list[str]:
         """Return the hosts on which something runs."""
@@ -98,7 +95,7 @@ class HostPlan:
 
     def folder(self, host: str) -> str:
         """Return the folder of this run on a host."""
-        return f"{runs_folder(self._placed.inventory.hosts[host])}/{self._run_id}"
+        return f"{runs_folder(self.placed.inventory.hosts[host])}/{self._run_id}"
 
     def keys(self, host: str) -> str:
         """Return the folder in which the keys of this run's processes are on a host."""
@@ -111,16 +108,8 @@ class HostPlan:
     def way_to_record(self) -> str:
         """Return where the record is, and the command that fetches it."""
         name = self.host(RECORDER)
-        command = scp(self._placed.inventory.hosts[name], self._placed.folder, self.record())
+        command = scp(self.placed.inventory.hosts[name], self.placed.folder, self.record())
         return f"{name}:{self.record()} (fetch it with `{command}`)"
-
-    def source(self) -> str:
-        """Return the inventory's file as a word of a command."""
-        return shlex.quote(str(self._placed.folder / self._placed.source))
-
-    def base(self) -> Path:
-        """Return the folder of the inventory."""
-        return self._placed.folder
 
     def ports(self, host: str) -> list[int]:
         """Return the ports of a host on which processes of the run will listen."""
@@ -128,15 +117,11 @@ class HostPlan:
 
     def certificate_faults(self, now: datetime) -> list[str]:
         """Return what of the certificates is missing or of no use at a time, a line for each fault."""
-        return enrolment.certificate_faults(self._placed, {name: self.host(name) for name in self.processes}, now)
-
-    def exposed_keys(self) -> str | None:
-        """Return a warning of private keys here that others can read, if there are any."""
-        return enrolment.exposed_keys(self._placed)
+        return enrolment.certificate_faults(self.placed, {name: self.host(name) for name in self.processes}, now)
 
     def python(self, host: str) -> str:
         """Return the interpreter of a host that has zsim."""
-        return inv.python(self._placed.inventory.hosts[host])
+        return inv.python(self.placed.inventory.hosts[host])
 
     def arguments(self, name: str) -> list[str]:
         """Return the arguments of `zsim` that start a process."""
@@ -165,7 +150,7 @@ class HostPlan:
         process = self.processes[name]
         if not process.secure:
             return {}
-        source = folder_of(self._placed) / process.host
+        source = folder_of(self.placed) / process.host
         paths = {file: source / name / file for file in CERTIFICATES}
         if process.port is not None:
             paths[ACCESS] = source / access_file(process)
@@ -177,7 +162,7 @@ class HostPlan:
         except OSError as error:
             raise HostsError(
                 f"{path}: cannot be read ({error.strerror}); make certificates with "
-                f"`{init_command(self._placed)}`, or set security.insecure on a network of your own"
+                f"`{init_command(self.placed)}`, or set security.insecure on a network of your own"
             ) from error
 
 

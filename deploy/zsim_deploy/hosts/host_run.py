@@ -27,6 +27,7 @@ from zsim_deploy.hosts.launcher_requests import LauncherRequests
 from zsim_deploy.hosts.remote_process import ProcessLog, RemoteProcess
 from zsim_deploy.hosts.ssh_connection import shell_word
 from zsim_deploy.hosts.status_table import StatusTable
+from zsim_deploy.inventory.enrolment import exposed_keys
 from zsim_deploy.inventory.inventory import InventoryFile
 from zsim_deploy.launch.supervisor import Outcome, Supervisor
 
@@ -110,7 +111,7 @@ class HostRun:
     def _refuse_unless_certified(self) -> None:
         if faults := self._plan.certificate_faults(datetime.now(UTC)):
             raise HostsError("\n".join(faults))
-        if warning := self._plan.exposed_keys():
+        if warning := exposed_keys(self._options.placed):
             self._status.say(f"warning: {warning}")
 
     def _control_socket(self) -> ControlSocket:
@@ -134,9 +135,9 @@ class HostRun:
 
     async def _look(self, link: HostLink) -> HostInspection:
         python = self._plan.python(link.name)
-        report = await host_report(link, python, self._plan.source())
+        report = await host_report(link, python, self._options.placed.word)
         taken = await port_faults(link, python, self._plan.ports(link.name))
-        return HostInspection(report, taken, await leftovers(link, self._plan.base()))
+        return HostInspection(report, taken, await leftovers(link, self._options.placed.folder))
 
     async def _prepare(self, link: HostLink) -> None:
         """Put the scenario, and the certificates where there are any, on a host."""

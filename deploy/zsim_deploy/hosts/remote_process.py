@@ -8,7 +8,6 @@ import asyncio
 import contextlib
 import signal
 import threading
-import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
@@ -89,7 +88,6 @@ class RemoteProcess:
         self.role = name.split(".", 1)[0]
         self.host = link.name
         self.restarts = 0
-        self.started_s = 0.0
         self.pid = 0
         self._arguments = arguments
         self._link = link
@@ -123,7 +121,6 @@ class RemoteProcess:
         self._starts += 1
         self.pid, self._code, self._process, self._stop, self._fault = 0, None, None, None, ""
         self._ended.clear()
-        self.started_s = time.monotonic()
         self._life = self._loop.spawn(self._live())
 
     async def _live(self) -> None:

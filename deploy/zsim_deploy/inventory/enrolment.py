@@ -50,8 +50,7 @@ def folder_of(placed: InventoryFile) -> Path:
 
 def init_command(placed: InventoryFile, renew: bool = False) -> str:
     """Return the command that makes an inventory's certificates, as a person types it."""
-    words = ["zsim", "certs", "init", str(placed.folder / placed.source)]
-    return " ".join([shlex.join(words), "--scenario FILE", *(["--renew"] if renew else [])])
+    return f"zsim certs init {placed.word} --scenario FILE{' --renew' if renew else ''}"
 
 
 class Enrolment:

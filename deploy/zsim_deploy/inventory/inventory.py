@@ -4,6 +4,7 @@ Pure: reads a file and answers questions; nothing here opens a connection. docs/
 """
 
 import fnmatch
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -83,6 +84,11 @@ class InventoryFile(NamedTuple):
     inventory: Inventory
     folder: Path
     source: str
+
+    @property
+    def word(self) -> str:
+        """Return its path as a word of a command."""
+        return shlex.quote(str(self.folder / self.source))
 
 
 def load(path: Path) -> InventoryFile:

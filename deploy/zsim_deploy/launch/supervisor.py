@@ -1,6 +1,6 @@
 """The watch over the processes of a run: what is done when one of them ends, and how all of them end.
 
-Where a process runs, on this machine (child.py) or on another one (remote.py), makes no difference here.
+Where a process runs, on this machine (`ChildProcess`) or on another one (`RemoteProcess`), makes no difference here.
 """
 
 import json
@@ -36,7 +36,6 @@ class RunProcess(Protocol):
     name: str
     role: str
     restarts: int
-    started_s: float
 
     @property
     def pid(self) -> int: ...
@@ -68,7 +67,7 @@ class Supervisor:
         show: takes progress.
 
     Attributes:
-        members: to be given before `go`; the world among them.
+        members: to be given before `run`; the world among them.
     """
 
     def __init__(self, on_death: dict[str, OnDeath], show: ProgressSink) -> None:

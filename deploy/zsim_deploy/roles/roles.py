@@ -1,4 +1,7 @@
-"""The roles as processes: what `zsim estimator`, `controller`, `host`, `record` and `router` do."""
+"""The roles as processes: agents, recorder, router; and those that serve one run after the other, with their priority.
+
+The console and the gateway are of the latter kind.
+"""
 
 import gc
 import os
@@ -30,6 +33,18 @@ from zsim_deploy.roles.stop_channel import StopChannel
 
 TICK_S = 0.1  # how often a router looks for a stop
 PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
+ANY = "*"  # in a name, for a number
+PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits for byes
+
+Stopped = Callable[[], bool]
+Say = Callable[[str], None]
+Serve = Callable[[Session, Info, ObserverProcess, Stopped, Say], None]
+"""Serves one run with (session, info, presence, stopped, say), until its presence is over or it is stopped."""
+NICE = 5  # of processes for which no gate waits
+NICE_FOR_VIEWS = 10  # of those that only people look at: a picture may come later, a gate may not
+AUTOGROUP = Path("/proc/self/autogroup")  # sched(7)
+TRIES = 5
+AGAIN_S = 0.12  # the kernel lets ordinary users write there ten times a second, all of them together
 
 
 def agent(build: Callable[[messages.Info, Scenario], Agent], reach: WorldAccess) -> None:
@@ -153,20 +168,6 @@ def log_printer(launched: str | None) -> Callable[[str], None]:
     return say
 
 
-ANY = "*"  # in a name, for a number
-PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits for byes
-
-Stopped = Callable[[], bool]
-Say = Callable[[str], None]
-Serve = Callable[[Session, Info, ObserverProcess, Stopped, Say], None]
-"""Serves one run with (session, info, presence, stopped, say), until its presence is over or it is stopped."""
-NICE = 5  # of processes for which no gate waits
-NICE_FOR_EYES = 10  # of those that only people look at: a picture may come later, a gate may not
-AUTOGROUP = Path("/proc/self/autogroup")  # sched(7)
-TRIES = 5
-AGAIN_S = 0.12  # the kernel lets ordinary users write there ten times a second, all of them together
-
-
 def serve_runs(name: str, serve: Serve, reach: WorldAccess) -> None:
     """Serve one run after the other of the world on an endpoint, until it is stopped; launched, only one.
 
@@ -242,14 +243,14 @@ def _serve(serve: Serve, link: Session, presence: ObserverProcess, info: Info, s
     say(f"{presence.name}: left, {reason}")
 
 
-def give_way(for_eyes: bool = False) -> None:
+def give_way(only_viewed: bool = False) -> None:
     """Let the world go first. Threads to come, too.
 
     Args:
-        for_eyes: a person alone waits; then it does not interrupt others when it wakes up either (SCHED_BATCH).
+        only_viewed: only a person waits for it; then it does not interrupt others when it wakes up (SCHED_BATCH).
     """
-    lower(NICE_FOR_EYES if for_eyes else NICE)
-    if for_eyes and sys.platform == "linux":
+    lower(NICE_FOR_VIEWS if only_viewed else NICE)
+    if only_viewed and sys.platform == "linux":
         with suppress(OSError):  # it may be in a class from which one does not come back
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
@@ -272,6 +273,6 @@ def _lower_session(niceness: int) -> None:
         except BlockingIOError:
             time.sleep(AGAIN_S)
         except OSError:
-            return  # not shared that way here, or not for us to say
+            return  # not shared that way here, or not ours to set
         else:
             return
