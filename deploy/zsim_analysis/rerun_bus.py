@@ -72,11 +72,11 @@ class OutputComparison:
     """Compares what agents put out with what they put out on record; each may come before the other.
 
     Args:
-        patience_ns: simulated time after which the other comes no more.
+        match_within_ns: simulated time after which the other comes no more.
     """
 
-    def __init__(self, patience_ns: int) -> None:
-        self._patience_ns = patience_ns
+    def __init__(self, match_within_ns: int) -> None:
+        self._match_within_ns = match_within_ns
         self._unmatched: dict[tuple[str, int, int], Message] = {}
         self._different: list[tuple[int, str]] = []
 
@@ -99,7 +99,7 @@ class OutputComparison:
 
     def expire(self, t_ns: int) -> None:
         """Count those as different whose counterpart has not come within the patience before t_ns."""
-        for identity in [identity for identity in self._unmatched if identity[2] < t_ns - self._patience_ns]:
+        for identity in [identity for identity in self._unmatched if identity[2] < t_ns - self._match_within_ns]:
             del self._unmatched[identity]
             self._note(identity[0], identity[2])
 

@@ -52,7 +52,7 @@ def open_run(place: Path) -> Iterator[RecordedRun]:
 def _info(reader: RecordReader) -> messages.Info:
     recorded = reader.last(keys.INFO)
     if recorded is None:
-        raise RecordError(f"{reader.path}: has no world/info; it does not say which run it is of")
+        raise RecordError(f"{reader.path}: has no world/info; the run that it is of is not known")
     try:
         return messages.decode(keys.INFO, recorded.payload)
     except DecodeError as error:

@@ -52,9 +52,9 @@ def console(
     from zsim.runtime.progress import JsonProgress
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.http_proxy import ListenAddress
-    from zsim_deploy.roles.roles import give_way, log_printer, process_name, serve_runs
+    from zsim_deploy.roles.roles import log_printer, lower_priority, process_name, serve_runs
 
-    give_way(only_viewed=True)
+    lower_priority(only_viewed=True)
     own_name = process_name("console", name, reach.tls, "*")
     say = JsonProgress().say if reach.launched else log_printer(None)
     shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say)
@@ -77,23 +77,23 @@ def gateway(
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
     from zsim.transport.connection import find_world
     from zsim_bridges.gateway.gateway_server import Gateway, GatewayPorts
-    from zsim_deploy.roles.roles import give_way, log_printer, process_name, serve_runs
+    from zsim_deploy.roles.roles import log_printer, lower_priority, process_name, serve_runs
 
-    give_way()
+    lower_priority()
     who = reach.who
     own_name = process_name("gateway", name, reach.tls)
 
-    def dial(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
-        return find_world(reach.endpoint, reach.federation, LOOK_S, identity=_of_seat(who, process))
+    def connect_as(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
+        return find_world(reach.endpoint, reach.federation, LOOK_S, identity=_client_identity(who, process))
 
-    doors = GatewayPorts(listen, http, lines)
-    gate = Gateway(doors, own_name, token, dial, log_printer(reach.launched), secured=reach.tls is not None)
-    with gate.open():
-        serve_runs(own_name, gate.serve, reach)
+    ports = GatewayPorts(listen, http, lines)
+    served = Gateway(ports, own_name, token, connect_as, log_printer(reach.launched), secured=reach.tls is not None)
+    with served.open():
+        serve_runs(own_name, served.serve, reach)
 
 
-def _of_seat(who: "Identity", process: str) -> "Identity":
-    """Return who a client's seat is on the network: its certificate lies beside the gateway's."""
+def _client_identity(who: "Identity", process: str) -> "Identity":
+    """Return the identity of a gateway's client on the network: its certificate lies beside the gateway's."""
     if who.tls is None:
         return who
     folder: Path = who.tls.parent / process
@@ -121,9 +121,9 @@ def ros1(
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
     from zsim_bridges.ros1.bridge import NodeShutdownError, serve
-    from zsim_deploy.roles.roles import give_way, process_name, serve_runs
+    from zsim_deploy.roles.roles import lower_priority, process_name, serve_runs
 
-    give_way()
+    lower_priority()
     own_name = process_name("ros1", name, reach.tls)
     bridge = partial(serve, master_uri=master, host=ros_host or own_address(master))
     try:
@@ -151,12 +151,12 @@ def ros2(
         return
     from zsim.transport.tls import Identity, is_tls
     from zsim_bridges.ros2.bridge import RosNetwork, serve
-    from zsim_deploy.roles.roles import give_way, process_name, serve_runs
+    from zsim_deploy.roles.roles import lower_priority, process_name, serve_runs
 
     if reach.tls and router is None:
         why = "the world's access control lets no ROS keys pass"
         raise typer.BadParameter(f"--tls needs --router, the endpoint of a rmw_zenohd: {why}")
-    give_way()
+    lower_priority()
     who = reach.who
     to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
     network = RosNetwork(domain, router, to_router)

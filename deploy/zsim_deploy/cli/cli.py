@@ -145,7 +145,7 @@ def command() -> Any:
 
 def main() -> None:
     """Run the command line; a user's fault is a line, not a traceback."""
-    _say_anything()
+    _replace_unprintable()
     try:
         code = command()(standalone_mode=False, prog_name="zsim")
     except ZsimError as error:
@@ -161,8 +161,8 @@ def main() -> None:
     sys.exit(code)
 
 
-def _say_anything() -> None:
-    """Let a terminal that knows few letters show a question mark for the others, rather than end the command."""
+def _replace_unprintable() -> None:
+    """Print a question mark for a character that the terminal's encoding lacks, rather than end the command."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")

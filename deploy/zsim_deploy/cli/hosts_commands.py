@@ -49,7 +49,7 @@ def up(
 
 @contextlib.contextmanager
 def _folder(out: Path | None, scenario: Any) -> Iterator[Path]:
-    """Lend a folder for a run, which is taken away again if the run was refused and nothing is in it."""
+    """Yield a folder for a run, which is removed again if the run was refused and nothing is in it."""
     from zsim_deploy.launch.run import make_directory
 
     was_there = out is not None and out.exists()
@@ -133,7 +133,7 @@ def _silent(role: str) -> str:
 
 
 def _is_up(federation: str, out: str) -> bool:
-    """Tell whether the launcher of a federation still has the run of this folder."""
+    """Return whether the launcher of a federation still has the run of this folder."""
     from zsim.errors import RunError
     from zsim_deploy.hosts import control_socket
 

@@ -112,7 +112,7 @@ def _soon(status: "CertificateStatus", now: datetime) -> str:
 
 
 def _warn(placed: "InventoryFile") -> None:
-    """Say which private keys others can read."""
+    """Print which private keys others can read."""
     from zsim_deploy.inventory.enrolment import exposed_keys
 
     if warning := exposed_keys(placed):

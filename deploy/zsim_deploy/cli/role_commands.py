@@ -124,7 +124,7 @@ def record(
     """Record every message of a federation into run.mcap."""
     from zsim_deploy.roles import roles
 
-    roles.give_way()
+    roles.lower_priority()
     roles.recorder(out / "run.mcap", reach)
 
 

@@ -45,7 +45,7 @@ class HostLinks:
         self._loop.spawn(link.measure_round_trips())
 
     def listen(self) -> None:
-        """Notice from now on when a host falls silent."""
+        """Measure from now on whether each host answers."""
         for link in self.by_name.values():
             self._loop.spawn(link.measure_round_trips())
 

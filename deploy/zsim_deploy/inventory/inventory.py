@@ -139,7 +139,7 @@ def _map(document: dict[str, Any], name: str) -> list[tuple[Any, Any]]:
 
 def _unknown(path: str, name: Any, known: list[Any], what: str) -> Iterator[Fault]:
     if isinstance(name, str) and name not in known:
-        yield path, f"is {name!r}; must be one of {what}: {', '.join(map(str, known)) or 'none are given'}"
+        yield path, f"is {name!r}; must be one of {what}: {', '.join(map(str, known)) or 'there are none'}"
 
 
 def _circles(document: dict[str, Any]) -> Iterator[Fault]:

@@ -131,7 +131,7 @@ def used_hosts(planned: Sequence[PlannedProcess]) -> list[str]:
 
 
 def _known(name: str, scenario: Scenario) -> bool:
-    """Tell whether zsim has a command for a process."""
+    """Return whether zsim has a command for a process."""
     return name in (WORLD, RECORDER, *agent_names(scenario))
 
 
@@ -191,7 +191,7 @@ def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, f
 
 
 def _can_match(entry: str, kind: str) -> bool:
-    """Tell whether a pattern can match a name that begins so."""
+    """Return whether a pattern can match a name that begins so."""
     literal = entry[: min((entry.find(sign) for sign in "*?[" if sign in entry), default=len(entry))]
     wild = literal != entry
     return literal.startswith(kind) or (wild and kind.startswith(literal))

@@ -61,7 +61,7 @@ class ChildProcess:
         return self._process.poll() if self._process else None
 
     def outcome(self) -> str:
-        """Say in words how it ended."""
+        """Return how it ended, as text."""
         code = self.code
         if code is not None and code < 0:
             return f"killed by signal {-code}"

@@ -109,7 +109,7 @@ def _any_port() -> int:
 
 
 def free_port(screen: Screen) -> int:
-    """Return Zenoh's port, or another free one, and say so, where that is taken."""
+    """Return Zenoh's port, or another free one, shown on the screen, where that is taken."""
     if _is_free(DEFAULT_PORT):
         return DEFAULT_PORT
     port = _any_port()
@@ -143,7 +143,7 @@ def run_processes(options: RunOptions, screen: Screen) -> Outcome:
     """Run a scenario as real processes; the record is finished whatever happens.
 
     Raises:
-        KeyboardInterrupt: with the reason, where nothing flew yet, or somebody would not wait for the end.
+        KeyboardInterrupt: with the reason, where nothing flew yet, or Ctrl-C came twice.
     """
     try:
         with handled_by(_interrupt):
@@ -185,7 +185,7 @@ def _run_on_free_port(options: RunOptions, screen: Screen, launcher: RoleLaunche
 
 
 def _lost_port(outcome: Outcome, endpoint: str, port: int) -> bool:
-    """Tell whether somebody else took the port between our look at it and our world's start."""
+    """Return whether somebody else took the port between our look at it and our world's start."""
     return outcome.failed and f"cannot listen on {endpoint}" in outcome.reason and not _is_free(port)
 
 

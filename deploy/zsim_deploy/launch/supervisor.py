@@ -17,7 +17,7 @@ from zsim.errors import RunError
 from zsim.runtime.progress import ProgressSink
 from zsim.scenario.role_table import on_death
 from zsim.scenario.scenario import OnDeath
-from zsim_deploy.roles.stop_channel import IMPATIENT, REASONS, handled_by
+from zsim_deploy.roles.stop_channel import REASONS, TWICE_INTERRUPTED, handled_by
 
 POLL_S = 0.05  # how often the processes are looked at
 END_S = 8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for
@@ -108,7 +108,7 @@ class Supervisor:
 
         def on_signal(number: int, _: object) -> None:
             if self._interrupted:
-                raise KeyboardInterrupt(IMPATIENT)
+                raise KeyboardInterrupt(TWICE_INTERRUPTED)
             self._interrupted = REASONS[number]
 
         return handled_by(on_signal)
@@ -191,7 +191,7 @@ class Supervisor:
         new.start()
 
     def is_being_replaced(self, name: str) -> bool:
-        """Tell whether a process is taking the place of another that has not left yet; callable from any thread."""
+        """Return whether a process is taking the place of another that has not left yet; callable from any thread."""
         return name in self._leaving
 
     def _release_replaced(self) -> None:

@@ -38,7 +38,7 @@ LEGACY = {
 
 
 class Interpreter(NamedTuple):
-    """A Python that was found on a host."""
+    """A Python of a host."""
 
     command: str
     version: tuple[int, int, int]
@@ -67,12 +67,12 @@ class WheelTarget(NamedTuple):
 def interpreter_query() -> str:
     """Return a line of POSIX shell that prints command, version and path of every Python of a host."""
     names = [PLAIN, *(f"python3.{minor}" for minor in range(NEWEST_MINOR, OLDEST[1] - 1, -1))]
-    say = 'import sys; print("%d.%d.%d" % sys.version_info[:3], sys.executable)'
-    return f"for p in {' '.join(names)}; do found=$($p -c '{say}' 2>/dev/null) && echo $p $found; done; true"
+    code = 'import sys; print("%d.%d.%d" % sys.version_info[:3], sys.executable)'
+    return f"for p in {' '.join(names)}; do facts=$($p -c '{code}' 2>/dev/null) && echo $p $facts; done; true"
 
 
 def parse_interpreters(answer: str) -> list[Interpreter]:
-    """Return what `question` printed; a greeting of the login shell is passed over."""
+    """Return what `interpreter_query` printed; a greeting of the login shell is passed over."""
     matches = filter(None, map(ANSWER.fullmatch, answer.splitlines()))
     return [Interpreter(each[1], (int(each[2]), int(each[3]), int(each[4])), each[5]) for each in matches]
 

@@ -87,7 +87,7 @@ def render(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (), 
 def _refuse(placed: InventoryFile, planned: Sequence[PlannedProcess], text: str) -> None:
     """Raise an error with a line for everything that Kubernetes cannot do."""
     lines = [
-        f"hosts.{host} is no name of a node; must be letters, digits, - and ., as `kubectl get nodes` says"
+        f"hosts.{host} is no name of a node; must be letters, digits, - and ., as `kubectl get nodes` lists them"
         for host in used_hosts(planned)
         if not re.fullmatch(r"[a-z0-9]([a-z0-9.-]*[a-z0-9])?", host)
     ]

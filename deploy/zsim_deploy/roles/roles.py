@@ -243,7 +243,7 @@ def _serve(serve: Serve, link: Session, presence: ObserverProcess, info: Info, s
     say(f"{presence.name}: left, {reason}")
 
 
-def give_way(only_viewed: bool = False) -> None:
+def lower_priority(only_viewed: bool = False) -> None:
     """Let the world go first. Threads to come, too.
 
     Args:

@@ -150,7 +150,7 @@ class Silent(HostLink):
         self._code = code
 
     @asynccontextmanager
-    async def channel(self, patient: bool = False) -> AsyncIterator[Any]:
+    async def channel(self, retry: bool = False) -> AsyncIterator[Any]:
         yield self
 
     async def create_process(self, *_command, **_options):
@@ -297,7 +297,7 @@ class Slow:
 
     def sendall(self, data: bytes) -> None:
         took_s = 8 * len(data) / self._bits_per_s
-        if took_s > probe.PATIENCE_S:
+        if took_s > probe.TIMEOUT_S:
             raise TimeoutError("timed out")
         self.now_s += took_s
 

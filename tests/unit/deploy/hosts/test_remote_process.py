@@ -59,13 +59,13 @@ class Link:
         self._then = then
         self.brought: list[tuple[str, dict[str, bytes]]] = []
 
-    async def put_files(self, folder: str, files: dict[str, bytes], *_: Any, patient: bool) -> None:
-        assert patient
+    async def put_files(self, folder: str, files: dict[str, bytes], *_: Any, retry: bool) -> None:
+        assert retry
         self.brought.append((folder, files))
 
     @asynccontextmanager
-    async def channel(self, patient: bool = False) -> AsyncIterator["Link"]:
-        assert patient
+    async def channel(self, retry: bool = False) -> AsyncIterator["Link"]:
+        assert retry
         yield self
 
     def create_process(self, *_: Any, **__: Any) -> Process:
@@ -77,7 +77,7 @@ class Absent(Link):
     """A link to a host that is not there."""
 
     @asynccontextmanager
-    async def channel(self, patient: bool = False) -> AsyncIterator[Link]:
+    async def channel(self, retry: bool = False) -> AsyncIterator[Link]:
         if isinstance(self._then, Exception):
             raise self._then
         await asyncio.Event().wait()
@@ -134,7 +134,7 @@ def test_a_log_that_cannot_be_written_is_said_once_and_the_process_goes_on(start
     assert remote.wait(PATIENCE_S)
     assert (remote.code, remote.last_log_line()) == (0, "two")
     assert [text.split(": ", 1)[1] for text in said] == [
-        "cannot be written (No such file or directory); what it would say there is lost"
+        "cannot be written (No such file or directory); what it would have there is lost"
     ]
 
 

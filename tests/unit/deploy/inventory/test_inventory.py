@@ -229,7 +229,7 @@ def test_an_unknown_name_is_told_with_the_known_ones(tmp_path: Path) -> None:
     ]  # fmt: skip
     document = {"hosts": {**HOSTS, "two": {"address": "x", "router": "yard"}}, "roles": ROLES}
     assert faults(tmp_path, document) == [
-        "hosts.yaml: hosts.two.router is 'yard'; must be one of routers: none are given"
+        "hosts.yaml: hosts.two.router is 'yard'; must be one of routers: there are none"
     ]  # fmt: skip
 
 

@@ -110,7 +110,7 @@ class Greeting(HostLink):
         self.processes: list[Local] = []
 
     @contextlib.asynccontextmanager
-    async def channel(self, patient: bool = False) -> AsyncIterator[Any]:
+    async def channel(self, retry: bool = False) -> AsyncIterator[Any]:
         try:
             yield self
         finally:

@@ -12,8 +12,8 @@ NICEST = 19  # of what Linux knows
 PROGRAM = """
 import os
 from pathlib import Path
-from zsim_deploy.roles.roles import give_way
-give_way({only_viewed})
+from zsim_deploy.roles.roles import lower_priority
+lower_priority({only_viewed})
 print(os.nice(0), os.sched_getscheduler(0) == os.SCHED_BATCH, Path("/proc/self/autogroup").read_text().split()[-1])
 """
 
