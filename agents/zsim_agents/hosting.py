@@ -1,7 +1,9 @@
 """The agents of a process, made by the table of roles: names and patterns of a command line against a scenario's."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from fnmatch import fnmatchcase
+from functools import partial
+from typing import Any
 
 from zsim.contract.messages import Info
 from zsim.errors import DocumentError, RunError, ScenarioError
@@ -49,14 +51,37 @@ def check_classes(scenario: Scenario, source: str) -> None:
         source: opens the line of a fault: the name of its file.
 
     Raises:
-        ScenarioError: what is wrong with the name, or with the class; one line.
+        ScenarioError: what is wrong with each name, or with its class, a line each.
     """
     from zsim_agents.estimation.drone_estimator import estimator_class
 
+    loads = [partial(estimator_class, scenario.estimation.chosen(), f"{source}: estimation.algorithm")]
+    faults = [fault for load in [*loads, *_formation_classes(scenario, source)] for fault in _faults(load)]
+    if faults:
+        raise ScenarioError(faults)
+
+
+def _formation_classes(scenario: Scenario, source: str) -> Iterator[Callable[[], Any]]:
+    """Yield what loads each cluster space and control law that is a class of the user's own."""
+    for cluster in scenario.clusters:
+        where = f"{source}: cluster {cluster.name!r}"
+        for part, space in [(where, cluster.space), *((f"{where}, group {g.name!r}", g.space) for g in cluster.groups)]:
+            if space and ":" in space:
+                from zsim_agents.formation.spaces.cluster_space import ClusterSpace
+
+                yield partial(plugin.load, space, f"{part}: space", ClusterSpace)
+        if cluster.law and ":" in cluster.law:
+            from zsim_agents.formation.control_law import ControlLaw
+
+            yield partial(plugin.load, cluster.law, f"{where}: law", ControlLaw)
+
+
+def _faults(load: Callable[[], Any]) -> list[str]:
     try:
-        estimator_class(scenario.estimation.chosen(), f"{source}: estimation.algorithm")
+        load()
     except DocumentError as error:
-        raise ScenarioError(error.faults) from error
+        return error.faults
+    return []
 
 
 def hosted(info: Info, scenario: Scenario, patterns: Sequence[str]) -> Agent:

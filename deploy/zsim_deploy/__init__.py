@@ -1,6 +1,6 @@
 """The command line, and launching processes here and on other hosts.
 
-Floors from the ground: options, inventory, security, ssh, roles, launch, push, hosts, render, cli; a room imports those
+Floors from the ground: arguments, inventory, roles, launch, hosts, push, render, cli; a room imports those
 below it. cli/ has the commands, roles/ what each process of a run does, launch/ and hosts/ start and supervise them.
 """
 
@@ -8,3 +8,5 @@ import os
 
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # matrices of a dozen rows: threads only cost; read when numpy loads
+
+INTERRUPTED = 130  # exit code of a shell for a program that Ctrl-C ended

@@ -3,7 +3,7 @@
 import os
 import signal
 
-from zsim_deploy.options.terminal import INTERRUPTED
+from zsim_deploy import INTERRUPTED
 
 
 def main() -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
-from zsim_analysis.sweep.sweep_row import Row, RunResult, make_row
+from zsim_analysis.sweep.sweep_run import Row, RunResult, make_row
 
 NAMES = ("x_c", "y_c", "beta")
 

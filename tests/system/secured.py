@@ -24,8 +24,9 @@ from wire import PATIENCE_S
 from zsim.scenario import scenario_file
 from zsim.transport import connection
 from zsim.transport.tls import Identity
-from zsim_deploy.security import certificates
-from zsim_deploy.security.enrolment import CertificateRequest, access_control
+from zsim_deploy.inventory import certificates
+from zsim_deploy.inventory.certificates import CertificateRequest
+from zsim_deploy.inventory.enrolment import access_control
 
 HOST = "lab"
 SITE = "router.site"

@@ -18,13 +18,18 @@ from lab import LAUNCHER, Lab
 from refused import missing
 
 from zsim import __version__
+from zsim_deploy.hosts.host_link import HostLink
+from zsim_deploy.hosts.ssh_connection import shell_line
 from zsim_deploy.inventory import inventory, processes
 from zsim_deploy.push import on_host
-from zsim_deploy.push.installer import open_installer
-from zsim_deploy.push.package_index import choose_interpreter, interpreter_query, parse_interpreters, wheel_target
+from zsim_deploy.push.installer import (
+    choose_interpreter,
+    interpreter_query,
+    open_installer,
+    parse_interpreters,
+    wheel_target,
+)
 from zsim_deploy.push.wheelhouse import Wheelhouse, WheelSet
-from zsim_deploy.ssh.host_link import HostLink
-from zsim_deploy.ssh.ssh_connection import shell_line
 
 CACHE = Path(tempfile.gettempdir()) / "zsim-tests-cache"  # kept between runs, as a user's is
 PUSH_S = 180.0  # wall time for two installations on a loaded machine

@@ -10,9 +10,9 @@ from refused import missing
 from sshd import make_key
 
 from zsim.errors import HostsError
+from zsim_deploy.hosts import ssh_connection
 from zsim_deploy.inventory import inventory
 from zsim_deploy.inventory.inventory import Host
-from zsim_deploy.ssh import ssh_connection
 
 
 def refusal(lab: Lab, base: Path, host: Host) -> str:

@@ -1,1 +1,1 @@
-"""A record read as arrays: a flight, its formations, their errors. Imports zsim.record and the cluster spaces."""
+"""A record read: its messages, a flight as arrays, its formations and their errors. Imports zsim.record and agents."""

@@ -1,14 +1,25 @@
-"""A recorded flight as arrays."""
+"""A flight as arrays: read in one pass from its record, or from the messages themselves while it is flown here."""
 
+from array import array
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
+from zsim.contract import keys
+from zsim.contract.flight_messages import Quaternion
+from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info
-from zsim.contract.run_messages import Event
+from zsim.contract.run_messages import Bye, Event, Join
+from zsim.record import Recorded, RecordReader
 from zsim.scenario.scenario import Scenario
+from zsim.schema.message import Vector3
+from zsim_analysis.reading.recorded_run import scenario_of
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -60,7 +71,7 @@ class ClusterStates:
 
 
 @dataclass
-class RunParticipant:
+class RecordedProcess:
     """A process that joined."""
 
     name: str
@@ -90,7 +101,7 @@ class RecordedFlight:
     tracks: list[Track]
     clusters: list[ClusterStates]
     events: list[Event]
-    participants: list[RunParticipant]
+    processes: list[RecordedProcess]
     messages: int
     complete: bool
     wall_s: float
@@ -116,3 +127,182 @@ class RecordedFlight:
     def last_ns(self) -> int:
         """Return the last instant of truth."""
         return max((int(track.t_ns[-1]) for track in self.tracks if len(track.t_ns)), default=0)
+
+
+class _Truth(Struct):
+    """The part of a truth message that is needed here."""
+
+    t_ns: int
+    position_m: Vector3
+    velocity_m_s: Vector3
+    orientation_wxyz: Quaternion
+    angular_velocity_rad_s: Vector3
+
+
+class _Status(Struct):
+    t_ns: int
+    state: str
+    battery_percent: float
+
+
+class _State(Struct):
+    t_ns: int
+    phase: str
+    names: tuple[str, ...]
+    value: tuple[float, ...]
+    desired: tuple[float, ...]
+    drones: tuple[str, ...] = ()
+
+
+def read_flight(path: Path) -> RecordedFlight:
+    """Return the flight of a record.
+
+    Raises:
+        RecordError: no such record.
+    """
+    with RecordReader(path) as reader:
+        flight = FlightReader()
+        wanted = [key for key in reader.topics() if flight.handler(key)]
+        for message in reader.messages(wanted, by_time=False):
+            flight.add(message)
+        return flight.flight(sum(reader.topics().values()), reader.complete, reader.damaged)
+
+
+class FlightReader:
+    """The flight while its record is read, or while it is flown in this process, message by message."""
+
+    def __init__(self) -> None:
+        self._infos: list[Info] = []
+        self._events: list[Event] = []
+        self._truth: dict[str, tuple[array[int], array[float]]] = {}
+        self._status: dict[str, tuple[array[int], list[str], array[float]]] = {}
+        self._states: dict[str, list[_State]] = {}
+        self._processes: dict[str, RecordedProcess] = {}
+        self._first_wall_ns: int | None = None
+        self._last_wall_ns = 0
+        self._undecoded = 0
+        self._handlers: dict[str, _Handler | None] = {}
+
+    def handler(self, key: str) -> "_Handler | None":
+        """Return what decodes and stores the messages of a key, None when no report needs them."""
+        if key not in self._handlers:
+            group, _, what = keys.parts(key)
+            kinds: dict[str, tuple[type[Struct], Callable[[str, Any], None]]] = {
+                keys.INFO: (Info, lambda _, message: self._infos.append(message)),
+                keys.EVENT: (Event, lambda _, message: self._events.append(message)),
+                "process/join": (Join, self._store_process),
+                "process/bye": (Bye, self._store_process),
+                "drone/truth": (_Truth, self._store_truth),
+                "drone/sensor/status": (_Status, self._store_status),
+                "cluster/state": (_State, lambda name, message: self._states.setdefault(name, []).append(message)),
+            }
+            kind, store = kinds.get(f"{group}/{what}" if what else key, (None, None))
+            self._handlers[key] = (msgspec.msgpack.Decoder(kind), store) if kind and store else None
+        return self._handlers[key]
+
+    def add(self, recorded: Recorded) -> None:
+        """Add a message of a record; one that cannot be decoded is counted."""
+        handler = self.handler(recorded.key)
+        if handler is None:
+            return
+        decoder, store = handler
+        try:
+            message = decoder.decode(recorded.payload)
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+            self._undecoded += 1
+            return
+        if isinstance(message, _Truth):
+            if self._first_wall_ns is None:
+                self._first_wall_ns = recorded.wall_ns
+            self._last_wall_ns = recorded.wall_ns
+        store(keys.parts(recorded.key)[1], message)
+
+    def add_message(self, key: str, message: Any, wall_ns: int) -> None:
+        """Add a message of a flight in this process; it has not been encoded."""
+        if handler := self.handler(key):
+            handler[1](keys.parts(key)[1], message)
+
+    def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
+        """Add the world's messages of a gate of a flight in this process."""
+        for key, payload in gate.pairs:
+            if handler := self.handler(key):
+                handler[1](keys.parts(key)[1], handler[0].decode(payload))
+
+    def _store_truth(self, name: str, truth: _Truth) -> None:
+        times, values = self._truth.setdefault(name, (array("q"), array("d")))
+        times.append(truth.t_ns)
+        values.extend(truth.position_m)
+        values.extend(truth.velocity_m_s)
+        values.extend(truth.orientation_wxyz)
+        values.extend(truth.angular_velocity_rad_s)
+
+    def _store_status(self, name: str, status: _Status) -> None:
+        times, states, battery = self._status.setdefault(name, (array("q"), [], array("d")))
+        times.append(status.t_ns)
+        states.append(status.state)
+        battery.append(status.battery_percent)
+
+    def _store_process(self, name: str, message: Join | Bye) -> None:
+        process = self._processes.setdefault(name, RecordedProcess(name))
+        if isinstance(message, Bye):
+            process.left = message.reason
+            return
+        process.role, process.host, process.pid = message.role, message.host, message.pid
+        process.version, process.fingerprint = message.version, message.fingerprint
+        process.incarnations += 1
+        process.left = ""
+
+    def flight(self, messages: int = 0, complete: bool = True, damaged: int = 0) -> RecordedFlight:
+        """Return the flight when all messages are added; the arguments describe its record, if there is one."""
+        info = self._infos[-1] if self._infos else None
+        names = [drone.name for drone in info.drones] if info else sorted(self._truth)
+        members = {c.name: c.drones for c in info.clusters} if info else dict.fromkeys(self._states, ())
+        return RecordedFlight(
+            info=info,
+            scenario=scenario_of(info),
+            tracks=[self._track(name) for name in names],
+            clusters=[_states(name, drones, self._states.get(name, [])) for name, drones in members.items()],
+            events=sorted(self._events, key=lambda event: (event.t_ns, event.seq)),
+            processes=list(self._processes.values()),
+            messages=messages,
+            complete=complete,
+            wall_s=(self._last_wall_ns - (self._first_wall_ns or 0)) / 1e9,
+            undecoded=self._undecoded,
+            damaged=damaged,
+        )
+
+    def _track(self, name: str) -> Track:
+        times, values = self._truth.get(name, (array("q"), array("d")))
+        status_times, states, battery = self._status.get(name, (array("q"), [], array("d")))
+        t_ns, first = np.unique(np.array(times, np.int64), return_index=True)
+        status_t_ns, status_first = np.unique(np.array(status_times, np.int64), return_index=True)
+        return Track(
+            name=name,
+            t_ns=t_ns,
+            truth=np.array(values, np.float64).reshape(-1, TRUTH_WIDTH)[first],
+            status_t_ns=status_t_ns,
+            states=[states[i] for i in status_first],
+            battery_percent=np.array(battery, np.float64)[status_first],
+        )
+
+
+_Handler = tuple[msgspec.msgpack.Decoder[Any], Callable[[str, Any], None]]
+
+
+def _states(name: str, drones: tuple[str, ...], states: list[_State]) -> ClusterStates:
+    """Return the states of a cluster that have as many variables as the last one, by time."""
+    if not states:
+        return ClusterStates(name, drones)
+    names = states[-1].names
+    fit = [s for s in states if len(s.names) == len(s.value) == len(s.desired) == len(names) > 0]
+    by_time = {state.t_ns: state for state in sorted(fit, key=lambda state: state.t_ns)}
+    kept = list(by_time.values())
+    return ClusterStates(
+        name=name,
+        drones=drones or states[-1].drones,
+        names=names,
+        t_ns=np.array(list(by_time), np.int64),
+        value=np.array([state.value for state in kept]).reshape(-1, len(names)),
+        desired=np.array([state.desired for state in kept]).reshape(-1, len(names)),
+        phases=[state.phase for state in kept],
+    )

@@ -5,6 +5,7 @@
     compare(DIRS, OUT)   one page of several runs, side by side
     table(summary)       the formation's errors beside the paper's Table I, for the terminal
 
-`summary` computes; `canvas`, `report_figures` and `comparison_figures` draw; `make_report` and `make_comparison` write.
+`summary` and `comparison` compute; `report_figures` and `comparison_figures` draw; `make_report` puts together, on
+`pages` that look and are written alike.
 Imports zsim_analysis.reading, matplotlib and jinja2.
 """

@@ -5,15 +5,16 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 from msgspec import Struct
 
 from zsim import __version__
+from zsim.contract.fingerprint import TruthHash
 from zsim.contract.run_messages import Event
 from zsim.record.record_reader import record_notes
-from zsim_analysis.reading.flight import RecordedFlight, RunParticipant
+from zsim_analysis.reading.flight import TRUTH_WIDTH, RecordedFlight, RecordedProcess
 from zsim_analysis.reading.formation import Formation, ParameterErrors, min_separation_m, window
 from zsim_analysis.reading.recorded_run import command_age_ms
-from zsim_analysis.reading.recorded_truth import RecordedTruth, recorded_truth
 
 # I. Mas, S. Curi, R. Sanchez Pena, Open-source Multi-UAV Simulator for the ROS Environment.
 # Table I: standard deviation of the formation parameters for Test 1 after steady state; m and rad.
@@ -59,7 +60,14 @@ class ClusterErrors(Struct, frozen=True):
 
 
 class RecordFacts(Struct, frozen=True):
-    """What the report was made from."""
+    """What the report was made from.
+
+    Attributes:
+        undecoded: messages that are not of the type of their key.
+        truth_instants: truth messages that went into the hash.
+        truth_missing: truth messages that a whole run of this length would have besides.
+        truth_sha256: as TruthHash of every truth message, by time, then in the order of the drones.
+    """
 
     messages: int
     complete: bool
@@ -107,7 +115,7 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
     """Return the summary of a flight; what the world did not report before it ended is computed from the record."""
     end = flight.end or {}
     info = flight.info
-    truth = _hash(flight, end.get("last_ns", flight.last_ns))
+    record_facts = _record_facts(flight, end.get("last_ns", flight.last_ns))
     asked = flight.scenario.report.window_s if flight.scenario else None
     window_s, window_note = window(asked, flight.last_ns / 1e9)
     clusters = {f.name: ClusterErrors(f.drones, f.errors(window_s)) for f in formations}
@@ -136,30 +144,47 @@ def summarise(flight: RecordedFlight, formations: list[Formation], record: Path)
         paper_table_1=PAPER_TABLE_1,
         events=lines,
         events_left_out=left_out,
-        participants=[_participant(process) for process in flight.participants],
-        truth_sha256=end.get("truth_sha256", truth.sha256),
-        record=RecordFacts(
-            messages=flight.messages,
-            complete=flight.complete,
-            undecoded=flight.undecoded,
-            truth_instants=truth.instants,
-            truth_missing=truth.missing,
-            truth_sha256=truth.sha256,
-        ),
-        notes=_notes(flight, truth, formations, window_s, window_note),
+        participants=[_participant(process) for process in flight.processes],
+        truth_sha256=end.get("truth_sha256", record_facts.truth_sha256),
+        record=record_facts,
+        notes=_notes(flight, record_facts, formations, window_s, window_note),
     )
 
 
-def _hash(flight: RecordedFlight, last_ns: int) -> RecordedTruth:
-    """Return the hash of truth; a flight has truth from 0 or the first gate on, a replay from where it was begun."""
+def _record_facts(flight: RecordedFlight, last_ns: int) -> RecordFacts:
+    """Return what is on record of a flight whose last instant is at `last_ns` as far as it is known."""
+    tracks = flight.tracks
+    t_ns = np.concatenate([track.t_ns for track in tracks] or [np.zeros(0, np.int64)])
+    states = np.concatenate([track.truth for track in tracks] or [np.zeros((0, TRUTH_WIDTH))])
+    drone = np.repeat(np.arange(len(tracks)), [len(track.t_ns) for track in tracks])
+    order, truth = np.lexsort((drone, t_ns)), TruthHash(len(t_ns))
+    truth.add(t_ns[order], states[order])
+    return RecordFacts(
+        messages=flight.messages,
+        complete=flight.complete,
+        undecoded=flight.undecoded,
+        truth_instants=len(t_ns),
+        truth_missing=_missing(flight, last_ns),
+        truth_sha256=truth.hexdigest(),
+    )
+
+
+def _missing(flight: RecordedFlight, last_ns: int) -> int:
+    """Return how many truth messages there are not, every gate from the first one on to the last.
+
+    A flight has truth from 0 or the first gate on, a replay from where it was begun.
+    """
     gate_ns = flight.info.gate_ns if flight.info else None
-    first_ns = flight.first_ns if flight.replay_of else min(flight.first_ns, gate_ns or 0)
-    return recorded_truth(flight.tracks, gate_ns, first_ns, last_ns)
+    present = sum(len(track.t_ns) for track in flight.tracks)
+    if not gate_ns or not present:
+        return 0
+    first_ns = flight.first_ns if flight.replay_of else min(flight.first_ns, gate_ns)
+    return max(0, len(flight.tracks) * ((last_ns - first_ns) // gate_ns + 1) - present)
 
 
 def _notes(
     flight: RecordedFlight,
-    truth: RecordedTruth,
+    record: RecordFacts,
     formations: list[Formation],
     window_s: tuple[float, float],
     window_note: str,
@@ -167,7 +192,7 @@ def _notes(
     """Return what a reader has to know of the figures."""
     notes = [
         *_record_notes(flight),
-        *_truth_notes(truth, (flight.end or {}).get("truth_sha256")),
+        *_truth_notes(record, (flight.end or {}).get("truth_sha256")),
         window_note,
         *_formation_notes(flight, formations, window_s),
         *_fingerprint_notes(flight),
@@ -199,19 +224,12 @@ def _lines(events: list[Event]) -> tuple[list[EventLine], dict[str, int]]:
 
 def _versions(flight: RecordedFlight) -> dict[str, str]:
     world = {"world": flight.info.version} if flight.info else {}
-    own = {process.name: process.version for process in flight.participants if process.version}
+    own = {process.name: process.version for process in flight.processes if process.version}
     return {**world, **own, "report": __version__}
 
 
-def _participant(process: RunParticipant) -> dict[str, Any]:
-    return {
-        "name": process.name,
-        "role": process.role,
-        "host": process.host,
-        "pid": process.pid,
-        "incarnations": process.incarnations,
-        "left": process.left,
-    }
+def _participant(process: RecordedProcess) -> dict[str, Any]:
+    return {name: getattr(process, name) for name in ("name", "role", "host", "pid", "incarnations", "left")}
 
 
 def _record_notes(flight: RecordedFlight) -> list[str]:
@@ -230,12 +248,13 @@ def _record_notes(flight: RecordedFlight) -> list[str]:
     return notes
 
 
-def _truth_notes(truth: RecordedTruth, reported: str | None) -> list[str]:
+def _truth_notes(record: RecordFacts, reported: str | None) -> list[str]:
     notes = []
-    if truth.missing:
-        notes.append(f"{truth.missing} of {truth.missing + truth.instants} truth messages are not on record.")
-    if reported and reported != truth.sha256:
-        notes.append(f"The truth on record has the hash {truth.sha256}, the world reported {reported}.")
+    if record.truth_missing:
+        expected = record.truth_missing + record.truth_instants
+        notes.append(f"{record.truth_missing} of {expected} truth messages are not on record.")
+    if reported and reported != record.truth_sha256:
+        notes.append(f"The truth on record has the hash {record.truth_sha256}, the world reported {reported}.")
     return notes
 
 
@@ -259,6 +278,6 @@ def _formation_notes(flight: RecordedFlight, formations: list[Formation], window
 
 def _fingerprint_notes(flight: RecordedFlight) -> list[str]:
     own = flight.info.fingerprint if flight.info else ""
-    others = [p.name for p in flight.participants if own and p.fingerprint and p.fingerprint != own]
+    others = [p.name for p in flight.processes if own and p.fingerprint and p.fingerprint != own]
     text = "computed with another numeric fingerprint than the world; the same bits are not promised."
     return [f"{', '.join(others)} {text}"] if others else []

@@ -127,7 +127,7 @@ class SweepDesign:
         """Return the resolved scenario of a run.
 
         Raises:
-            ScenarioError: with every fault found, a line each.
+            ScenarioError: with every fault, a line each.
         """
         document = copy.deepcopy(self.plan.document)
         assigned = [_assign(document, path, value) for path, value in self.values(run).items()]

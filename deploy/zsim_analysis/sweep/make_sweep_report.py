@@ -9,7 +9,7 @@ from rich.table import Table
 
 from zsim.errors import ReportError
 from zsim_agents.formation.spaces.cluster_space import unit
-from zsim_analysis.report.make_report import Picture, sources, template, write_report
+from zsim_analysis.report.pages import Picture, sources, template, write_report
 from zsim_analysis.report.summary import PAPER_NOTE, PAPER_TABLE_1
 from zsim_analysis.sweep.points import (
     ConfidenceInterval,

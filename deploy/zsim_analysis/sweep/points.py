@@ -14,7 +14,7 @@ from scipy.special import betaincinv, stdtrit
 
 from zsim_analysis.sweep.axes import Draw, text_of
 from zsim_analysis.sweep.design import SweepDesign
-from zsim_analysis.sweep.sweep_row import FIXED, Row, engaged_column
+from zsim_analysis.sweep.sweep_run import FIXED, Row, engaged_column
 
 LEVEL = 0.95  # of all intervals of a report
 STATISTICS = ("est_std", "true_std", "true_rms", "true_mean")

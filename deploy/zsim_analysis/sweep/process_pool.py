@@ -4,6 +4,8 @@ A worker flies one run after the other, so that imports and kernels are loaded o
 it breaks as a whole when a worker dies, and does not show which run was fatal.
 """
 
+from __future__ import annotations
+
 import contextlib
 import multiprocessing
 import os
@@ -14,9 +16,12 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection, wait
+from typing import TYPE_CHECKING
 
 from zsim.errors import RunError
-from zsim_analysis.sweep.sweep_row import Row, Task, failed_row
+
+if TYPE_CHECKING:
+    from zsim_analysis.sweep.sweep_run import Row, Task
 
 READY = "ready"
 DEATHS_MAX = 3  # of workers in one run, or one after the other before they are ready
@@ -28,13 +33,11 @@ def work(link: Connection) -> None:
 
     An exception that is sent back is an error that every further run would have too.
     """
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C reaches every process of the terminal; the launcher acts on it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it reaches every process of the terminal; the launcher acts on it
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_exit_with_launcher, name="launcher-monitor", daemon=True).start()
     warnings.simplefilter("ignore", RuntimeWarning)  # a state that overflows is reported in the run's row
-    from zsim_analysis.sweep.sweep_run import fly
+    from zsim_analysis.sweep.sweep_run import fly  # not before the signals are set: it takes seconds
 
     link.send(READY)
     try:
@@ -168,7 +171,7 @@ class ProcessPool:
         self._deaths_at_start += not worker.ready
         if self._deaths_at_start >= DEATHS_MAX:
             raise RunError(
-                f"the sweep's workers die before they are ready ({worker.cause()}); see what they said above"
+                f"the sweep's workers die before they are ready ({worker.cause()}); see their messages above"
             )
         self._start()
         if worker.task is None:
@@ -179,4 +182,6 @@ class ProcessPool:
             self._say(f"the worker of run {run} died ({worker.cause()}); another one flies it again")
             self._again.append(worker.task)
         else:
+            from zsim_analysis.sweep.sweep_run import failed_row
+
             yield failed_row(worker.task, f"{DEATHS_MAX} workers died of it, the last one {worker.cause()}")

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Protocol
 
@@ -12,16 +11,14 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from zsim.errors import RunError
 from zsim.runtime.progress import Throttle
 from zsim_analysis.sweep.design import SweepPlan
 from zsim_analysis.sweep.process_pool import ProcessPool, cores
 from zsim_analysis.sweep.sweep_folder import SweepFolder, locked
-from zsim_analysis.sweep.sweep_row import Row, Task
+from zsim_analysis.sweep.sweep_run import Row, Task
 
 PLAIN_S = 10.0  # wall time between two lines where no terminal is
 BAR = 20  # characters
-NEEDED = {"sweep": ("pyarrow", "numba", "filterpy", "mcap", "matplotlib", "jinja2"), "dask": ("distributed",)}
 
 
 class SweepScreen:
@@ -116,18 +113,6 @@ class WorkerPool(Protocol):
     def rows(self, tasks: Iterator[Task]) -> Generator[Row]:
         """Yield the rows of tasks as they are finished; when closed, fly no further."""
         ...
-
-
-def check_installed(dask: bool) -> None:
-    """Refuse to begin what this installation cannot do.
-
-    Raises:
-        RunError: an extra is missing.
-    """
-    for extra, modules in NEEDED.items():
-        missing = [module for module in modules if find_spec(module) is None]
-        if missing and (extra == "sweep" or dask):
-            raise RunError(f"zsim sweep: {missing[0]} is not installed; install zsim[{extra}]")
 
 
 def sweep(request: SweepRequest) -> list[Row]:

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from zsim_analysis.report.canvas import (
+from zsim_analysis.report.pages import (
     BLACK,
     BLUE,
     GREEN,
@@ -16,10 +16,10 @@ from zsim_analysis.report.canvas import (
     VERMILION,
     ReportFigure,
     dress,
+    label,
     legend_above,
     new_figure,
 )
-from zsim_analysis.report.cluster_figures import label
 from zsim_analysis.report.summary import PAPER_TABLE_1
 from zsim_analysis.sweep.points import LEVEL, FormationParameter, SweepResults, mean_interval, share_interval
 

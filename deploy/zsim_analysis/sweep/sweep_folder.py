@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 from zsim.errors import ReportError, RunError
 from zsim_analysis.sweep.axes import SEED, Axis, Grid
 from zsim_analysis.sweep.design import PLAN, SweepDesign, SweepPlan, difference, is_sweep
-from zsim_analysis.sweep.sweep_row import FIXED, Row
+from zsim_analysis.sweep.sweep_run import FIXED, Row
 
 JOURNAL, TABLE, RUNS, LOCK = "journal.jsonl", "sweep.parquet", "runs", ".lock"
 PLAN_METADATA = b"zsim_sweep"  # key of the plan in the table's metadata

@@ -1,11 +1,15 @@
 """`zsim console`, `gateway`, `ros1` and `ros2`: the processes that show a run, and translate it for other programs."""
 
+import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from zsim_deploy.options.arguments import CONSOLE_PORT, LOOK_S, WorldAccess, participant_options, positive
+from zsim.errors import RunError, SessionError
+from zsim_bridges.ros1.master_api import DEFAULT_MASTER, own_address
+from zsim_deploy.arguments import CONSOLE_PORT, LOOK_S, WorldAccess, participant_options, positive, require
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -13,14 +17,12 @@ if TYPE_CHECKING:
     from zsim.contract.messages import Info
     from zsim.transport.session import Session
     from zsim.transport.tls import Identity
-import time
-from functools import partial
-
-from zsim_bridges.ros1.master_api import DEFAULT_MASTER, own_address
 
 OPERATE, TRANSLATE = "Watch and steer", "Others come in"  # panels of the help
 TOKEN = "ZSIM_TOKEN"  # in the environment: a command line can be read by everybody on the machine
 DOMAIN_MAX = 232  # the highest ROS_DOMAIN_ID that ROS 2 takes
+
+CONSOLE_NEEDS = {"console": ("aiohttp", "viser")}  # modules by extra
 
 app = typer.Typer()
 
@@ -46,34 +48,18 @@ def console(
     ] = "",
 ) -> None:
     """Show a run in the browser, and steer it: scene, plots, events, faults."""
-    check_console_installed()
+    require("console", CONSOLE_NEEDS)
     from zsim.runtime.progress import JsonProgress
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.http_proxy import ListenAddress
-    from zsim_deploy.roles.roles import log_printer
-    from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
+    from zsim_deploy.roles.roles import log_printer, lower_priority, process_name, serve_runs
 
-    give_way(for_eyes=True)
+    lower_priority(only_viewed=True)
     own_name = process_name("console", name, reach.tls, "*")
     say = JsonProgress().say if reach.launched else log_printer(None)
     shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say)
     with shown.open():
         serve_runs(own_name, shown.serve, reach)
-
-
-def check_console_installed() -> None:
-    """Refuse where what the page is made of is not installed.
-
-    Raises:
-        RunError: with what to install.
-    """
-    from importlib.util import find_spec
-
-    from zsim.errors import RunError
-
-    missing = [module for module in ("aiohttp", "viser") if find_spec(module) is None]
-    if missing:
-        raise RunError(f"console: {' and '.join(missing)} is not installed; pip install 'zsim[console]'")
 
 
 @app.command(rich_help_panel=TRANSLATE)
@@ -91,26 +77,23 @@ def gateway(
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
     from zsim.transport.connection import find_world
     from zsim_bridges.gateway.gateway_server import Gateway, GatewayPorts
-    from zsim_deploy.roles.roles import log_printer
-    from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
+    from zsim_deploy.roles.roles import log_printer, lower_priority, process_name, serve_runs
 
-    give_way()
+    lower_priority()
     who = reach.who
     own_name = process_name("gateway", name, reach.tls)
 
-    def dial(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
-        return find_world(reach.endpoint, reach.federation, LOOK_S, identity=_of_seat(who, process))
+    def connect_as(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
+        return find_world(reach.endpoint, reach.federation, LOOK_S, identity=_client_identity(who, process))
 
-    doors = GatewayPorts(listen, http, lines)
-    gate = Gateway(doors, own_name, token, dial, log_printer(reach.launched), secured=reach.tls is not None)
-    with gate.open():
-        serve_runs(own_name, gate.serve, reach)
+    ports = GatewayPorts(listen, http, lines)
+    served = Gateway(ports, own_name, token, connect_as, log_printer(reach.launched), secured=reach.tls is not None)
+    with served.open():
+        serve_runs(own_name, served.serve, reach)
 
 
-def _of_seat(who: "Identity", process: str) -> "Identity":
-    """Return who a client's seat is on the network: its certificate lies beside the gateway's."""
-    from zsim.errors import SessionError
-
+def _client_identity(who: "Identity", process: str) -> "Identity":
+    """Return the identity of a gateway's client on the network: its certificate lies beside the gateway's."""
     if who.tls is None:
         return who
     folder: Path = who.tls.parent / process
@@ -138,9 +121,9 @@ def ros1(
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
     from zsim_bridges.ros1.bridge import NodeShutdownError, serve
-    from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
+    from zsim_deploy.roles.roles import lower_priority, process_name, serve_runs
 
-    give_way()
+    lower_priority()
     own_name = process_name("ros1", name, reach.tls)
     bridge = partial(serve, master_uri=master, host=ros_host or own_address(master))
     try:
@@ -168,12 +151,12 @@ def ros2(
         return
     from zsim.transport.tls import Identity, is_tls
     from zsim_bridges.ros2.bridge import RosNetwork, serve
-    from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
+    from zsim_deploy.roles.roles import lower_priority, process_name, serve_runs
 
     if reach.tls and router is None:
         why = "the world's access control lets no ROS keys pass"
         raise typer.BadParameter(f"--tls needs --router, the endpoint of a rmw_zenohd: {why}")
-    give_way()
+    lower_priority()
     who = reach.who
     to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
     network = RosNetwork(domain, router, to_router)
@@ -187,7 +170,6 @@ def _write_package(folder: Path) -> None:
     Raises:
         RunError: the folder cannot be written.
     """
-    from zsim.errors import RunError
     from zsim_bridges.ros2.ros_types import PACKAGE
 
     try:

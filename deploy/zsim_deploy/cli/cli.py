@@ -12,29 +12,27 @@ from typer.main import get_command
 
 from zsim import __version__
 from zsim.errors import BehindError, SupersededError, ZsimError
+from zsim_deploy import INTERRUPTED
+from zsim_deploy.arguments import (
+    HOSTS,
+    RUN,
+    FlightOptions,
+    Insecure,
+    ScenarioPath,
+    Set,
+    flight_options,
+    load_scenario,
+    require,
+)
 from zsim_deploy.cli import (
     bridge_commands,
     federation_commands,
     hosts_commands,
     inventory_commands,
     record_commands,
-    report_commands,
     role_commands,
 )
-from zsim_deploy.options.arguments import (
-    HOSTS,
-    RUN,
-    Duration,
-    Insecure,
-    RateOption,
-    Realtime,
-    ScenarioPath,
-    Seed,
-    Set,
-    load_scenario,
-    mode_and_rate,
-)
-from zsim_deploy.options.terminal import INTERRUPTED
+from zsim_deploy.roles.stop_channel import REASONS
 
 app = typer.Typer(
     name="zsim",
@@ -47,21 +45,17 @@ app = typer.Typer(
 
 UsageError: Any = typer.BadParameter.__bases__[0]  # click's, or that of the click inside of newer typers
 USER_FAULT = 2  # exit code of whatever a person has to put right
-EXIT_CODES = {SupersededError: 3, BehindError: 1}  # of the faults after which somebody else goes on; see watch.py
+EXIT_CODES = {SupersededError: 3, BehindError: 1}  # of the faults after which somebody else goes on; see supervisor.py
 
 
 @app.command(rich_help_panel=RUN)
+@flight_options
 def run(
-    scenario: ScenarioPath,
+    flight: FlightOptions,
     out: Annotated[
         Path | None, typer.Option(help="Folder of the run (default runs/NAME-TIME).", show_default=False)
     ] = None,
-    seed: Seed = None,
-    duration: Duration = None,
     in_process: Annotated[bool, typer.Option("--in-process", help="Everything in this process, no Zenoh.")] = False,
-    realtime: Realtime = False,
-    rate: RateOption = None,
-    set_: Set = None,
     listen: Annotated[
         str | None, typer.Option(help="Endpoint of the world (default tcp/127.0.0.1:7447, or a free port).")
     ] = None,
@@ -77,15 +71,14 @@ def run(
     from zsim.runtime.progress import Screen
     from zsim_deploy.launch.run import RunOptions, check_endpoint, make_directory, run_in_process, run_processes
     from zsim_deploy.launch.supervisor import Outcome
-    from zsim_deploy.options.terminal import REASONS
 
     if in_process:
-        _refuse_with_others(realtime, rate, listen, hosted, console)
+        _refuse_with_others(flight, listen, hosted, console)
     if console:
-        bridge_commands.check_console_installed()
+        require("console", bridge_commands.CONSOLE_NEEDS)
     check_endpoint(listen, insecure)
-    loaded = load_scenario(scenario, set_, seed, duration)
-    mode, pace = mode_and_rate(realtime, rate)
+    loaded = flight.scenario()
+    mode, pace = flight.mode_and_rate()
     folder, first = make_directory(out, loaded), [name for name in order.split(",") if name]
     options = RunOptions(loaded, folder, mode, pace, listen, insecure, hosted, first, console)
     with Screen(loaded.duration_s) as screen:
@@ -93,14 +86,14 @@ def run(
             outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)
         except KeyboardInterrupt as error:
             outcome = Outcome(str(error) or REASONS[signal.SIGINT], interrupted=True)
-    report_commands.conclude(outcome, options.out, report)
+    record_commands.conclude(outcome, options.out, report)
 
 
-def _refuse_with_others(realtime: bool, rate: float | None, listen: str | None, hosted: bool, console: bool) -> None:
+def _refuse_with_others(flight: FlightOptions, listen: str | None, hosted: bool, console: bool) -> None:
     """Refuse options that have no meaning for a run in one process."""
     options = {
-        "--realtime": realtime,
-        "--rate": rate is not None,
+        "--realtime": flight.realtime,
+        "--rate": flight.rate is not None,
         "--listen": listen is not None,
         "--hosted": hosted,
         "--console": console,
@@ -125,10 +118,9 @@ def _version(wanted: bool) -> None:
 
 
 for family in (
-    report_commands,
+    record_commands,
     role_commands,
     hosts_commands,
-    record_commands,
     federation_commands,
     bridge_commands,
 ):
@@ -153,7 +145,7 @@ def command() -> Any:
 
 def main() -> None:
     """Run the command line; a user's fault is a line, not a traceback."""
-    _say_anything()
+    _replace_unprintable()
     try:
         code = command()(standalone_mode=False, prog_name="zsim")
     except ZsimError as error:
@@ -169,8 +161,8 @@ def main() -> None:
     sys.exit(code)
 
 
-def _say_anything() -> None:
-    """Let a terminal that knows few letters show a question mark for the others, rather than end the command."""
+def _replace_unprintable() -> None:
+    """Print a question mark for a character that the terminal's encoding lacks, rather than end the command."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")

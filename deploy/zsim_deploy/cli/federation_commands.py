@@ -2,26 +2,22 @@
 
 import json
 import math
+import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from zsim_deploy.options.arguments import WorldAccess, observer_options, positive
+from zsim_deploy import INTERRUPTED
+from zsim_deploy.arguments import WorldAccess, observer_options, positive
 
 if TYPE_CHECKING:
     from zsim.contract.messages import Info
-    from zsim.scenario.fault_kinds import FaultKind
-    from zsim.transport.session import Session
-import re
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
     from zsim.contract.run_messages import Fault
+    from zsim.scenario.fault_kinds import FaultKind
     from zsim.transport.session import Session
 
 PANEL = "Look and poke"
@@ -34,14 +30,12 @@ faults = typer.Typer(
 UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "": 1.0}  # s
 SOURCE = "zsim.fault"
 ALL = "all"
-GIVEN_BY = {"target": "the argument TARGET", "kind": "the argument KIND", "for_s": "--for", "at_s": "--at"}
+OPTION_OF = {"target": "the argument TARGET", "kind": "the argument KIND", "for_s": "--for", "at_s": "--at"}
 
 
 @app.command(rich_help_panel=PANEL)
 @observer_options
-def keys(
-    reach: WorldAccess,
-) -> None:
+def keys(reach: WorldAccess) -> None:
     """List the keys that speak, with their message and how many came in a second."""
     from zsim_deploy.cli import inspection
 
@@ -122,11 +116,14 @@ def connected(reach: WorldAccess) -> Iterator[tuple["Session", "Info"]]:
     from zsim.transport.connection import find_world
 
     say = partial(print, file=sys.stderr)
-    with find_world(reach.endpoint, reach.federation, reach.wait_s, say, reader=True, identity=reach.who) as found:
+    with find_world(reach.endpoint, reach.federation, reach.wait_s, say, reader=True, identity=reach.who) as (
+        link,
+        info,
+    ):
         try:
-            yield found
+            yield link, info
         except KeyboardInterrupt:  # the usual end of `zsim echo` and `zsim hz`
-            sys.exit(130)
+            sys.exit(INTERRUPTED)
 
 
 def seconds(text: str | None) -> float | None:
@@ -192,9 +189,7 @@ def clear(
 
 @faults.command("list")
 @observer_options
-def list_(
-    reach: WorldAccess,
-) -> None:
+def list_(reach: WorldAccess) -> None:
     """List the faults that are planned or act."""
     from zsim.contract import keys, messages
 
@@ -257,8 +252,8 @@ def _values(parameters: Sequence[str]) -> dict[str, Any]:
         name, equals, value = text.partition("=")
         if not equals or not re.fullmatch("[a-z][a-z0-9_]*", name):
             raise typer.BadParameter(f"{text[:40]!r} is no parameter; must be NAME=VALUE, see `zsim fault kinds`")
-        if name in GIVEN_BY:
-            raise typer.BadParameter(f"{name} is no parameter of a kind; give it by {GIVEN_BY[name]}")
+        if name in OPTION_OF:
+            raise typer.BadParameter(f"{name} is no parameter of a kind; give it by {OPTION_OF[name]}")
         if name in values:
             raise typer.BadParameter(f"{name} is given twice; must be given once")
         try:

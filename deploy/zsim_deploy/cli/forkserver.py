@@ -26,7 +26,7 @@ PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15  # linux/prctl.h
 
 
 def main() -> int | None:
-    """Fork roles until the launcher has no more to ask; in a role, run it."""
+    """Fork roles until the launcher closes the socket; in a role, run it."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # not inherited by what is forked
     _show_as("forkserver", [sys.executable, "-m", "zsim_deploy.cli.forkserver", *sys.argv[1:2]])

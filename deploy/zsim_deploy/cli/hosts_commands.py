@@ -11,18 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from zsim_deploy.options.arguments import (
-    HOSTS,
-    Duration,
-    Insecure,
-    RateOption,
-    Realtime,
-    ScenarioPath,
-    Seed,
-    Set,
-    load_scenario,
-    mode_and_rate,
-)
+from zsim_deploy.arguments import HOSTS, FlightOptions, Insecure, flight_options
 
 app = typer.Typer()
 
@@ -33,29 +22,25 @@ Federation = Annotated[str, typer.Option(help="Federation that is up.")]
 Role = Annotated[str, typer.Argument(help="Process name, e.g. estimator.drone2.", show_default=False)]
 
 
+@flight_options
 def up(
-    scenario: ScenarioPath,
+    flight: FlightOptions,
     hosts: Hosts,
     out: Annotated[Path | None, typer.Option(help="Folder of the run (default runs/NAME-TIME).")] = None,
-    seed: Seed = None,
-    duration: Duration = None,
-    realtime: Realtime = False,
-    rate: RateOption = None,
-    set_: Set = None,
     insecure: Insecure = False,
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
 ) -> None:
     """Fly a scenario on several hosts: check them, start every role over ssh, watch, record, end everything."""
-    from zsim_deploy.cli.report_commands import conclude
+    from zsim_deploy.cli.record_commands import conclude
     from zsim_deploy.hosts.host_run import HostRun, HostRunOptions
     from zsim_deploy.hosts.status_table import StatusTable
     from zsim_deploy.inventory import inventory
 
-    loaded = load_scenario(scenario, set_, seed, duration)
+    loaded = flight.scenario()
     placed = inventory.load(hosts)
     placed = inventory.insecure(placed) if insecure else placed
     inventory.placement(placed, loaded)
-    mode, pace = mode_and_rate(realtime, rate)
+    mode, pace = flight.mode_and_rate()
     with _folder(out, loaded) as folder:
         with StatusTable(loaded.duration_s) as status:
             outcome = HostRun(HostRunOptions(loaded, placed, folder, mode, pace), status).run()
@@ -64,7 +49,7 @@ def up(
 
 @contextlib.contextmanager
 def _folder(out: Path | None, scenario: Any) -> Iterator[Path]:
-    """Lend a folder for a run, which is taken away again if the run was refused and nothing is in it."""
+    """Yield a folder for a run, which is removed again if the run was refused and nothing is in it."""
     from zsim_deploy.launch.run import make_directory
 
     was_there = out is not None and out.exists()
@@ -148,7 +133,7 @@ def _silent(role: str) -> str:
 
 
 def _is_up(federation: str, out: str) -> bool:
-    """Tell whether the launcher of a federation still has the run of this folder."""
+    """Return whether the launcher of a federation still has the run of this folder."""
     from zsim.errors import RunError
     from zsim_deploy.hosts import control_socket
 
@@ -184,7 +169,7 @@ def doctor(
     from rich.console import Console
 
     from zsim.errors import HostsError
-    from zsim_deploy.hosts.host_check import check_hosts
+    from zsim_deploy.hosts.doctor import check_hosts
     from zsim_deploy.inventory import inventory
 
     placed = inventory.load(hosts)
@@ -207,7 +192,7 @@ def _placement(placed: Any, scenario: Path | None) -> dict[str, str] | None:
 
 
 def push(
-    hosts: Annotated[Path, typer.Option("--hosts", help="Inventory (YAML): which hosts, which role where.")],
+    hosts: Hosts,
     host: Annotated[list[str] | None, typer.Option("--host", help="Only this host. Repeatable.")] = None,
     extra: Annotated[
         list[str] | None, typer.Option("--extra", help="An extra beside those of the host's roles. Repeatable.")

@@ -46,7 +46,7 @@ def echo(link: Session, expression: str, count: int | None, emit: Callable[[str,
 
 
 def readable(sample: ReceivedSample) -> Any:
-    """Return a message as JSON can say it; what is not of the contract is decoded as far as it goes."""
+    """Return a message as JSON can hold it; what is not of the contract is decoded as far as it goes."""
     try:
         return _plain(messages.decode(sample.key, sample.payload))
     except DecodeError as error:
@@ -57,10 +57,10 @@ def readable(sample: ReceivedSample) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON can say it: bytes in base64, in Python's words what it has no form for."""
+    """Return a value as JSON can hold it: bytes in base64, as its repr what JSON has no form for."""
     try:
         return msgspec.to_builtins(value, str_keys=True, enc_hook=repr)
-    except messages.REFUSALS:  # a key that is neither text nor a number, say
+    except messages.REFUSALS:  # for instance a key that is neither text nor a number
         return repr(value)
 
 
@@ -79,7 +79,7 @@ class MessageRate:
             self._stamps.append(t_ns)
 
     def line(self, now_s: float) -> str:
-        """Return the rates in words, or since when nothing comes."""
+        """Return the rates as text, or since when nothing comes."""
         gaps = [b - a for a, b in zip(self._walls, list(self._walls)[1:], strict=False)]
         silent_s = now_s - self._walls[-1]
         if silent_s > max(SILENCE_S, 2 * max(gaps, default=0.0)):
@@ -95,7 +95,7 @@ class MessageRate:
 
 
 def hz(link: Session, expression: str, window: int, seconds: float, emit: Callable[[str], None]) -> None:
-    """Tell once a second, and at the end, how often messages come on an expression.
+    """Show once a second, and at the end, how often messages come on an expression.
 
     Raises:
         SessionError: it is no key expression.
@@ -240,7 +240,7 @@ def _example(kind: type[msgspec.Struct]) -> str:
 
 
 def ask(link: Session, key: str, op: str, text: str) -> Any:
-    """Send a request with the arguments in a JSON text; return its result as JSON can say it.
+    """Send a request with the arguments in a JSON text; return its result as JSON can hold it.
 
     Raises:
         RunError: no JSON, nobody answers, or the answer is a refusal.

@@ -2,31 +2,20 @@
 
 import json
 import sys
+from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from zsim.transport.tls import DAYS
-from zsim_deploy.options.arguments import Set, load_scenario
+from zsim_deploy.arguments import FlightOptions, Set, flight_options, load_scenario
 
 if TYPE_CHECKING:
+    from zsim_deploy.inventory.certificates import CertificateStatus
+    from zsim_deploy.inventory.enrolment import Enrolment
     from zsim_deploy.inventory.inventory import InventoryFile
-    from zsim_deploy.security.certificates import CertificateStatus
-    from zsim_deploy.security.enrolment import Enrolment
-from collections.abc import Mapping
-from typing import Any
-
-from zsim_deploy.options.arguments import (
-    Duration,
-    RateOption,
-    Realtime,
-    ScenarioPath,
-    Seed,
-    mode_and_rate,
-    pace_options,
-)
 
 certs = typer.Typer(name="certs", help="Make and show the certificates of a federation.", no_args_is_help=True)
 
@@ -67,9 +56,8 @@ def init(
     force: Annotated[bool, typer.Option("--force", help="Make a new authority; nothing made before is good.")] = False,
 ) -> None:
     """Make what is missing: authority, certificates, and access control for the world and the routers."""
-    from zsim_deploy.inventory import inventory
-    from zsim_deploy.security import certificates
-    from zsim_deploy.security.enrolment import Enrolment, folder_of
+    from zsim_deploy.inventory import certificates, inventory
+    from zsim_deploy.inventory.enrolment import Enrolment, folder_of
 
     placed = inventory.load(hosts)
     folder = folder_of(placed)
@@ -87,9 +75,8 @@ def init(
 def show(hosts: Inventory) -> None:
     """List the certificates that are there: for whom, for which addresses, until when."""
     from zsim.errors import RunError
-    from zsim_deploy.inventory import inventory
-    from zsim_deploy.security import certificates
-    from zsim_deploy.security.enrolment import folder_of, init_command
+    from zsim_deploy.inventory import certificates, inventory
+    from zsim_deploy.inventory.enrolment import folder_of, init_command
 
     placed, now = inventory.load(hosts), datetime.now(UTC)
     folder = folder_of(placed)
@@ -109,7 +96,7 @@ def show(hosts: Inventory) -> None:
 
 def _issue_all(folder: Path, enrolment: "Enrolment", days: float, renew: bool, force: bool) -> tuple[int, int]:
     """Return how many certificates were made and how many kept."""
-    from zsim_deploy.security import certificates
+    from zsim_deploy.inventory import certificates
 
     now = datetime.now(UTC)
     signer = certificates.authority(folder, now, force)
@@ -125,90 +112,60 @@ def _soon(status: "CertificateStatus", now: datetime) -> str:
 
 
 def _warn(placed: "InventoryFile") -> None:
-    """Say which private keys others can read."""
-    from zsim_deploy.security.certificate_check import exposed_keys
+    """Print which private keys others can read."""
+    from zsim_deploy.inventory.enrolment import exposed_keys
 
     if warning := exposed_keys(placed):
         print(f"warning: {warning}", file=sys.stderr)
 
 
 @rendering.command()
-def systemd(
-    scenario: ScenarioPath,
-    hosts: Hosts,
-    out: Out,
-    seed: Seed = None,
-    duration: Duration = None,
-    realtime: Realtime = False,
-    rate: RateOption = None,
-    set_: Set = None,
-) -> None:
+@flight_options
+def systemd(flight: FlightOptions, hosts: Hosts, out: Out) -> None:
     """Write HOST/zsim-PROCESS.service and HOST/zsim.target for every host."""
     from zsim_deploy.render.systemd import render
 
-    _write(out, "systemd", render(*_read(hosts, scenario, set_, seed, duration), _pace(realtime, rate)))
+    _write(out, "systemd", render(*_read(hosts, flight), flight.pace()))
 
 
 @rendering.command()
-def compose(
-    scenario: ScenarioPath,
-    hosts: Hosts,
-    out: Out,
-    seed: Seed = None,
-    duration: Duration = None,
-    realtime: Realtime = False,
-    rate: RateOption = None,
-    set_: Set = None,
-) -> None:
+@flight_options
+def compose(flight: FlightOptions, hosts: Hosts, out: Out) -> None:
     """Write HOST/compose.yaml and HOST/Dockerfile for every host."""
     from zsim_deploy.render.compose import render
 
-    _write(out, "compose", render(*_read(hosts, scenario, set_, seed, duration), _pace(realtime, rate)))
+    _write(out, "compose", render(*_read(hosts, flight), flight.pace()))
 
 
 @rendering.command()
+@flight_options
 def kubernetes(
-    scenario: ScenarioPath,
+    flight: FlightOptions,
     hosts: Hosts,
     out: Out,
     image: Annotated[str | None, typer.Option(help="Image as the nodes find it (default zsim:VERSION).")] = None,
-    seed: Seed = None,
-    duration: Duration = None,
-    realtime: Realtime = False,
-    rate: RateOption = None,
-    set_: Set = None,
 ) -> None:
     """Write the manifests of a run, a Dockerfile, and a script that makes the Secrets from the certificates."""
     from zsim_deploy.render.kubernetes import IMAGE, render
 
-    _write(
-        out, "kubernetes", render(*_read(hosts, scenario, set_, seed, duration), _pace(realtime, rate), image or IMAGE)
-    )
+    _write(out, "kubernetes", render(*_read(hosts, flight), flight.pace(), image or IMAGE))
 
 
-def _read(
-    hosts: Path, scenario: Path, overrides: list[str] | None, seed: int | None, duration: float | None
-) -> tuple[Any, Any]:
-    """Return the inventory and the scenario; say what has no command in them."""
+def _read(hosts: Path, flight: FlightOptions) -> tuple[Any, Any]:
+    """Return the inventory and the scenario; print what has no command in them."""
     from zsim_deploy.inventory import inventory
     from zsim_deploy.inventory.processes import own_programs
 
-    loaded = load_scenario(scenario, overrides, seed, duration)
+    loaded = flight.scenario()
     placed = inventory.load(hosts)
     for remark in own_programs(placed, loaded):
         print(remark, file=sys.stderr)
     return placed, loaded
 
 
-def _pace(realtime: bool, rate: float | None) -> list[str]:
-    """Return the world's options for that."""
-    return pace_options(*mode_and_rate(realtime, rate))
-
-
 def _write(out: Path, target: str, texts: Mapping[str, str]) -> None:
     from zsim_deploy.render.rendered_files import write
 
     removed = write(out, target, texts)
-    print(
-        f"{len(texts)} files in {out}" + (f"; removed of an earlier rendering: {', '.join(removed)}" if removed else "")
-    )
+    more = f"; removed of an earlier rendering: {', '.join(removed)}" if removed else ""
+    print(f"{len(texts)} files in {out}{more}")

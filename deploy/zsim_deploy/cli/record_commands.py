@@ -1,43 +1,219 @@
-"""`zsim replay`, `zsim rerun` and `zsim export`: a record played back onto the keys, flown again, or converted."""
+"""What is done with the records of runs: `zsim report`, `sweep`, `export` and `rerun`; how a run ends."""
 
+import signal
 import sys
-from importlib.util import find_spec
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from zsim.contract.run_messages import RATE_MAX
-from zsim.errors import RunError
-from zsim_analysis.export.output import Format
-from zsim_deploy.options.arguments import DEFAULT_ENDPOINT, RUN, Access, Host, Insecure, Tls, identity, not_negative
-from zsim_deploy.options.terminal import interruptible
+from zsim.errors import ZsimError
+from zsim_analysis.export import Format
+from zsim_deploy import INTERRUPTED
+from zsim_deploy.arguments import (
+    RUN,
+    Duration,
+    From,
+    Keys,
+    ScenarioPath,
+    Seed,
+    Set,
+    To,
+    check_range,
+    require,
+)
+from zsim_deploy.roles.stop_channel import interruptible
 
 if TYPE_CHECKING:
     from zsim_analysis.export.make_export import ExportResult
+    from zsim_analysis.sweep.design import SweepPlan
 
-REPLAY_NEEDS = {"mcap": "record", "zstandard": "record"}  # modules, and the extras that bring them
-RERUN_NEEDS = REPLAY_NEEDS | {"numba": "world", "scipy": "agents", "filterpy": "agents"}
+RERUN_NEEDS = {"record": ("mcap", "zstandard"), "world": ("numba",), "agents": ("scipy", "filterpy")}
+REPORT_NEEDS = {"report": ("matplotlib", "jinja2", "mcap", "zstandard")}
+SWEEP_NEEDS = {"sweep": ("pyarrow", "numba", "filterpy", "mcap", "matplotlib", "jinja2")}
+DASK_NEEDS = {**SWEEP_NEEDS, "dask": ("distributed",)}
+WRITERS = {Format.CSV: "pyarrow", Format.PARQUET: "pyarrow", Format.MAT: "scipy", Format.FOXGLOVE: "foxglove"}
 
 app = typer.Typer()
 Place = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run, or its run.mcap.", show_default=False)]
 
 
+def conclude(outcome: Any, out: Path, report: bool) -> None:
+    """Print how a run ended, make its report, and end with the exit code for it."""
+    if outcome.failed or outcome.interrupted:
+        print(f"ended: {outcome.reason}", file=sys.stderr)
+    recorded = (out / "run.mcap").exists()
+    if outcome.interrupted:
+        if recorded:
+            print(f"the record so far is {out / 'run.mcap'}; `zsim report {out}` makes its report", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    if report and recorded:
+        _report_at_the_end(out, outcome.failed)
+    if outcome.failed:
+        print(f"logs are in {out / 'logs'}", file=sys.stderr)
+        raise typer.Exit(1)
+
+
+def _report_at_the_end(out: Path, failed: bool) -> None:
+    try:
+        _report(out)
+    except ZsimError as error:
+        if not failed:
+            raise
+        print(error, file=sys.stderr)
+    except KeyboardInterrupt:
+        print(f"interrupted; the record is complete, `zsim report {out}` makes its report", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+
+
+@app.command(rich_help_panel=RUN)
+def report(
+    directories: Annotated[
+        list[Path], typer.Argument(metavar="DIR...", help="Folder of a run or a sweep; of several runs, to compare.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Page that compares (default compare-NAMES.html beside the first).")
+    ] = None,
+) -> None:
+    """Make summary.json, figures and report.html of a run from its record, or of a sweep; or compare several runs."""
+    from zsim.record.record_reader import record_in
+    from zsim_analysis.sweep.design import is_sweep
+
+    if len(directories) > 1:
+        _compare(directories, out)
+        return
+    directory = directories[0]
+    if out is not None:
+        raise typer.BadParameter("--out is for the page that compares several runs; leave it out")
+    if not is_sweep(directory):
+        record_in(directory)
+    _report(directory)
+
+
+def _report(folder: Path) -> None:
+    """Make the report of a run or of a sweep, and print its table."""
+    require("report", REPORT_NEEDS)
+    from rich.console import Console
+
+    from zsim_analysis.sweep.design import is_sweep
+
+    if is_sweep(folder):
+        from zsim_analysis.sweep.make_sweep_report import make_sweep_report as make
+        from zsim_analysis.sweep.make_sweep_report import table
+    else:
+        from zsim_analysis.report.make_report import make_report as make
+        from zsim_analysis.report.make_report import table
+    with Console(stderr=True).status("reading …") as status:
+        summary: Any = make(folder, lambda text: status.update(text))
+    Console().print(table(summary))
+    print(f"report: {folder / 'report.html'}")
+
+
+def _compare(directories: list[Path], out: Path | None) -> None:
+    from rich.console import Console
+
+    from zsim.record.record_reader import record_in
+    from zsim_analysis.report.make_report import compare, comparison_path
+    from zsim_analysis.sweep.design import is_sweep
+
+    for directory in directories:
+        if is_sweep(directory):
+            raise typer.BadParameter(f"{directory} is a sweep; runs can be compared, a sweep has a report of its own")
+        record_in(directory)
+    page = out or comparison_path(directories)
+    with Console(stderr=True).status("reading the records …") as status:
+        compare(directories, page, lambda text: status.update(text))
+    print(f"report: {page}")
+
+
+@app.command(rich_help_panel=RUN)
+def sweep(
+    scenario: ScenarioPath,
+    runs: Annotated[
+        int | None, typer.Option(min=1, help="How many runs (default: one per combination).", show_default=False)
+    ] = None,
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(help="seed, a.b.c=v1,v2,… or a.b.c=uniform(low,high) or a.b.c=normal(mean,std). Repeatable."),
+    ] = None,
+    set_: Set = None,
+    seed: Seed = None,
+    duration: Duration = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder (default runs/NAME-sweep-TIME); one that is not finished is gone on with."),
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Processes (default: one per core).")] = None,
+    dask: Annotated[str | None, typer.Option(help="Scheduler of a Dask cluster that flies the runs instead.")] = None,
+    keep_records: Annotated[bool, typer.Option("--keep-records", help="Keep the record of every run.")] = False,
+    report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
+) -> None:
+    """Fly a scenario many times, with other seeds and values of its fields: one table, one report."""
+    if dask is not None and (keep_records or workers is not None):
+        useless = "--keep-records" if keep_records else "--workers"
+        raise typer.BadParameter(f"{useless} is for processes of this host; leave it out, or --dask")
+    require("sweep", SWEEP_NEEDS if dask is None else DASK_NEEDS)
+    from zsim_analysis.sweep.sweep import SweepRequest
+    from zsim_analysis.sweep.sweep import sweep as fly
+
+    plan = _plan(scenario, vary or [], set_ or [], seed, duration, runs, keep_records)
+    folder = out or Path("runs") / f"{plan.document['name']}-sweep-{time.strftime('%Y%m%d-%H%M%S')}"
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        rows = fly(SweepRequest(plan, folder, workers, dask))
+    except KeyboardInterrupt:
+        print(f"interrupted; the same command with --out {folder} goes on, the table so far is in it", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    _conclude(folder, [row["failure"] for row in rows if row["failure"]], len(rows), report)
+
+
+def _plan(
+    path: Path,
+    vary: list[str],
+    overrides: list[str],
+    seed: int | None,
+    duration: float | None,
+    runs: int | None,
+    records: bool,
+) -> "SweepPlan":
+    from rich.console import Console
+
+    from zsim_analysis.sweep.design import make_plan, read_document
+
+    document, faults = read_document(path, overrides, seed=seed, duration_s=duration)
+    with Console(stderr=True).status("checking every combination …") as status:
+        return make_plan(
+            path.name,
+            document,
+            vary,
+            runs,
+            records,
+            lambda run, of: status.update(f"checking combination {run + 1} of {of}"),
+            faults,
+        )
+
+
+def _conclude(folder: Path, failures: list[str], runs: int, report: bool) -> None:
+    """Print what did not end well, make the report, and fail if no run ended well."""
+    for failure in sorted(set(failures), key=failures.count, reverse=True)[:5]:
+        print(f"{failures.count(failure)} of {runs} runs failed: {failure}", file=sys.stderr)
+    if report:
+        _report(folder)
+    print(f"table: {folder / 'sweep.parquet'}")
+    if len(failures) == runs:
+        raise typer.Exit(1)
+
+
 @app.command(rich_help_panel=RUN)
 def export(
-    run: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a run, or its record.", show_default=False)],
+    run: Place,
     form: Annotated[
         Format, typer.Option("--format", help="Tables (csv, parquet), a MATLAB file, or an MCAP file for Foxglove.")
     ],
-    keys: Annotated[
-        list[str] | None, typer.Option(help="Only these keys, e.g. 'drone/*/truth'. Repeatable.", show_default=False)
-    ] = None,
-    from_: Annotated[
-        float | None, typer.Option("--from", callback=not_negative, help="Simulated seconds of the first message.")
-    ] = None,
-    to: Annotated[
-        float | None, typer.Option("--to", callback=not_negative, help="Simulated seconds of the last message.")
-    ] = None,
+    keys: Keys = None,
+    from_: From = None,
+    to: To = None,
     out: Annotated[
         Path | None,
         typer.Option(help="Where (default DIR/csv, DIR/parquet, DIR/run.mat, DIR/foxglove.mcap).", show_default=False),
@@ -49,12 +225,10 @@ def export(
     from rich.progress import Progress
 
     from zsim.record.record_reader import record_at
-    from zsim_analysis.export.output import check_installed
 
-    if from_ is not None and to is not None and to < from_:
-        raise typer.BadParameter(f"--to is {to:g}, before --from {from_:g}; must be at or after it")
+    check_range(from_, to)
     record_at(run)
-    check_installed(form)
+    require("export", {"export": ("mcap", "zstandard", WRITERS[form])})
     from zsim_analysis.export.make_export import export as write
     from zsim_analysis.export.selection import MessageSelection
 
@@ -80,55 +254,6 @@ def _show(done: "ExportResult") -> None:
     print("written: " + " ".join(map(str, done.paths)))
 
 
-def _rate(value: float) -> float:
-    """Return a pace that a replay can have."""
-    if not 0 <= value <= RATE_MAX:
-        raise typer.BadParameter(f"is {value:g}; must be >= 0 and <= {RATE_MAX:g}")
-    return value
-
-
-@app.command(rich_help_panel=RUN)
-def replay(
-    directory: Place,
-    rate: Annotated[
-        float, typer.Option(callback=_rate, help="Simulated per wall second; 0 = as fast as it goes.")
-    ] = 1.0,
-    from_: Annotated[
-        float, typer.Option("--from", callback=not_negative, help="Simulated seconds of the first gate.")
-    ] = 0.0,
-    to: Annotated[
-        float | None, typer.Option("--to", callback=not_negative, help="Simulated seconds of the last gate.")
-    ] = None,
-    keys: Annotated[
-        list[str] | None, typer.Option(help="Only these keys, e.g. 'drone/*/sensor/*'. Repeatable.", show_default=False)
-    ] = None,
-    expect: Annotated[
-        list[str] | None,
-        typer.Option(help="Begin when this process has joined, e.g. estimator.drone1, console.1. Repeatable."),
-    ] = None,
-    paused: Annotated[bool, typer.Option("--paused", help="Stand at the first gate until asked to resume.")] = False,
-    listen: Annotated[
-        list[str] | None, typer.Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")
-    ] = None,
-    federation: Annotated[str | None, typer.Option(help="Name of the federation (default the record's).")] = None,
-    tls: Tls = None,
-    access: Access = None,
-    insecure: Insecure = False,
-    host: Host = None,
-) -> None:
-    """Play a record back onto the keys: for a console, an estimator under test, any client; nobody can be flown."""
-    _check("replay", REPLAY_NEEDS)
-    from zsim_deploy.roles.world_role import ReplayOptions, play
-    from zsim_world.playback.playback import PlaybackRange
-
-    if to is not None and to < from_:
-        raise typer.BadParameter(f"--to is {to:g}, before --from {from_:g}; must be at or after it")
-    to_ns = None if to is None else round(to * 1e9)
-    choice = PlaybackRange(round(from_ * 1e9), to_ns, tuple(keys or ["**"]), paused)
-    options = ReplayOptions(choice, rate, tuple(expect or ()), tuple(listen or [DEFAULT_ENDPOINT]), federation)
-    play(directory, options, identity(host, tls, insecure, access))
-
-
 @app.command(rich_help_panel=RUN)
 def rerun(
     directory: Place,
@@ -137,20 +262,8 @@ def rerun(
     ] = False,
 ) -> None:
     """Fly the run of a record again, from its own inputs, and tell whether truth is the same; exit code 0 or 1."""
-    _check("rerun", RERUN_NEEDS)
-    from zsim_analysis.rerun.rerun import rerun_record
+    require("rerun", RERUN_NEEDS)
+    from zsim_analysis.rerun import rerun_record
 
     if not rerun_record(directory, commands_only, print, lambda text: print(text, file=sys.stderr)):
         raise typer.Exit(1)
-
-
-def _check(command: str, needs: dict[str, str]) -> None:
-    """Refuse to begin without what is needed.
-
-    Raises:
-        RunError: with what to install.
-    """
-    missing = {module: extra for module, extra in needs.items() if find_spec(module) is None}
-    if missing:
-        extras = ",".join(sorted(set(missing.values())))
-        raise RunError(f"{command}: {' and '.join(missing)} is not installed; pip install 'zsim[{extras}]'")

@@ -1,48 +1,50 @@
-"""The commands that are one role of a federation each."""
+"""The commands that are one role of a federation each, and `zsim replay`, which stands in for the world."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from zsim_deploy.options.arguments import (
+from zsim.contract.run_messages import RATE_MAX
+from zsim.scenario.role_table import AGENTS, Role
+from zsim_deploy.arguments import (
     DEFAULT_ENDPOINT,
+    RUN,
     Access,
     Connect,
-    Duration,
     Federation,
+    FlightOptions,
+    From,
     Host,
     Insecure,
+    Keys,
     Launched,
-    RateOption,
     Realtime,
-    ScenarioPath,
-    Seed,
-    Set,
     Tls,
+    To,
     Wait,
     WorldAccess,
+    check_range,
+    flight_options,
     identity,
-    mode_and_rate,
     participant_options,
+    require,
 )
 
+REPLAY_NEEDS = {"record": ("mcap", "zstandard")}  # modules by extra
 ROLES = "Roles, started by hand, on any machine, in any order"
 
 app = typer.Typer()
 
 
 @app.command(rich_help_panel=ROLES)
+@flight_options
 def world(
-    scenario: ScenarioPath,
+    flight: FlightOptions,
     listen: Annotated[
         list[str] | None, typer.Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")
     ] = None,
-    seed: Seed = None,
-    duration: Duration = None,
-    realtime: Realtime = False,
-    rate: RateOption = None,
-    set_: Set = None,
     expect: Annotated[list[str] | None, typer.Option(help="Wait for this process too, e.g. recorder.")] = None,
     launched: Launched = None,
     tls: Tls = None,
@@ -54,37 +56,44 @@ def world(
     from zsim.scenario import scenario_file
     from zsim_deploy.roles import world_role
 
-    loaded = scenario_file.load(scenario, set_ or (), seed=seed, duration_s=duration)  # it needs no class of the agents
-    mode, pace = mode_and_rate(realtime, rate)
+    path, overrides = flight.path, flight.overrides or ()
+    loaded = scenario_file.load(path, overrides, seed=flight.seed, duration_s=flight.duration)  # needs no agent's class
+    mode, pace = flight.mode_and_rate()
     who = identity(host, tls, insecure, access)
     world_role.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who)
 
 
-@app.command(rich_help_panel=ROLES)
-@participant_options
-def estimator(
-    reach: WorldAccess,
-    drones: Annotated[
-        list[str],
-        typer.Argument(metavar="DRONE...", help="Drones, or patterns: 'drone*'.", show_default=False),
-    ],
-) -> None:
-    """Run the estimator of one drone, or of several in one process."""
-    from zsim_deploy.roles import roles
+def _agent_command(name: str, role: Role) -> Callable[..., None]:
+    """Return the command of a role that has agents, named after drones or clusters."""
+    about = str(role.about)
+    several_help = f"{about.capitalize()}s, or patterns: '{about}*'."
 
-    roles.agent(roles.agent_of("estimator", drones), reach)
+    def start(things: list[str], reach: WorldAccess) -> None:
+        from zsim_deploy.roles import roles
+
+        roles.agent(roles.agent_of(name, things), reach)
+
+    def several(
+        reach: WorldAccess,
+        things: Annotated[
+            list[str], typer.Argument(metavar=f"{about.upper()}...", help=several_help, show_default=False)
+        ],
+    ) -> None:
+        start(things, reach)
+
+    def one(
+        reach: WorldAccess,
+        thing: Annotated[str, typer.Argument(metavar=about.upper(), help=f"Name of the {about}.")] = "main",
+    ) -> None:
+        start([thing], reach)
+
+    return participant_options(several if role.joint else one)
 
 
-@app.command(rich_help_panel=ROLES)
-@participant_options
-def controller(
-    reach: WorldAccess,
-    cluster: Annotated[str, typer.Argument(help="Name of the cluster.")] = "main",
-) -> None:
-    """Run the cluster-space controller of one cluster."""
-    from zsim_deploy.roles import roles
-
-    roles.agent(roles.agent_of("controller", [cluster]), reach)
+for _name, _role in AGENTS.items():
+    _also = ", or of several in one process" if _role.joint else ""
+    _help = f"Run the {_name} of one {_role.about}{_also}."
+    app.command(_name, rich_help_panel=ROLES, help=_help)(_agent_command(_name, _role))
 
 
 @app.command("host", rich_help_panel=ROLES)
@@ -114,9 +123,8 @@ def record(
 ) -> None:
     """Record every message of a federation into run.mcap."""
     from zsim_deploy.roles import roles
-    from zsim_deploy.roles.service_loop import give_way
 
-    give_way()
+    roles.lower_priority()
     roles.recorder(out / "run.mcap", reach)
 
 
@@ -138,3 +146,47 @@ def router(
 
     mode = "realtime" if realtime else "lockstep"
     roles.router(name, listen, connect, federation, mode, launched, identity(host, tls, insecure, access))
+
+
+def _rate(value: float) -> float:
+    """Return a pace that a replay can have."""
+    if not 0 <= value <= RATE_MAX:
+        raise typer.BadParameter(f"is {value:g}; must be >= 0 and <= {RATE_MAX:g}")
+    return value
+
+
+@app.command(rich_help_panel=RUN)
+def replay(
+    directory: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder of a run, or its run.mcap.", show_default=False)
+    ],
+    rate: Annotated[
+        float, typer.Option(callback=_rate, help="Simulated per wall second; 0 = as fast as it goes.")
+    ] = 1.0,
+    from_: From = 0.0,
+    to: To = None,
+    keys: Keys = None,
+    expect: Annotated[
+        list[str] | None,
+        typer.Option(help="Begin when this process has joined, e.g. estimator.drone1, console.1. Repeatable."),
+    ] = None,
+    paused: Annotated[bool, typer.Option("--paused", help="Stand at the first gate until asked to resume.")] = False,
+    listen: Annotated[
+        list[str] | None, typer.Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")
+    ] = None,
+    federation: Annotated[str | None, typer.Option(help="Name of the federation (default the record's).")] = None,
+    tls: Tls = None,
+    access: Access = None,
+    insecure: Insecure = False,
+    host: Host = None,
+) -> None:
+    """Play a record back onto the keys: for a console, an estimator under test, any client; nobody can be flown."""
+    require("replay", REPLAY_NEEDS)
+    from zsim_deploy.roles.world_role import ReplayOptions, play
+    from zsim_world.playback.playback import PlaybackRange
+
+    check_range(from_, to)
+    to_ns = None if to is None else round(to * 1e9)
+    choice = PlaybackRange(round((from_ or 0.0) * 1e9), to_ns, tuple(keys or ["**"]), paused)
+    options = ReplayOptions(choice, rate, tuple(expect or ()), tuple(listen or [DEFAULT_ENDPOINT]), federation)
+    play(directory, options, identity(host, tls, insecure, access))

@@ -1,4 +1,4 @@
 """A run on several hosts: checked by `zsim doctor`, planned, started over ssh, watched, its record brought home.
 
-Imports launch, roles, ssh, security, inventory.
+`ssh_connection`, `host_link` and `host_links` reach the hosts, for `zsim push` too. Imports launch, roles, inventory.
 """

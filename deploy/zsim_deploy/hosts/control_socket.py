@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from zsim import __version__
 from zsim.errors import RunError, ZsimError
 
 REQUEST_S = 5.0  # from the same machine
@@ -27,7 +28,7 @@ Act = Callable[..., Any]
 
 
 def place(federation: str) -> Path:
-    """Return where the launcher of a federation listens; only its user may come in."""
+    """Return where the launcher of a federation listens; only its user may connect."""
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(runtime) / "zsim" if runtime else Path(tempfile.gettempdir()) / f"zsim-{os.getuid()}"
     return folder / f"{federation}.sock"
@@ -78,17 +79,20 @@ class ControlSocket:
 
     def _carry_out(self, line: bytes) -> dict[str, Any]:
         try:
-            act, args = self._understood(line)
+            act, args = self._parsed(line)
         except (ValueError, KeyError, TypeError) as error:
-            return {"ok": False, "error": f"no request that is understood ({error}); is it another version of zsim?"}
+            return {
+                "ok": False,
+                "error": f"it is no request of zsim {__version__} ({error}); is `zsim up` of another version?",
+            }
         try:
             return {"ok": True, "result": act(**args)}
         except (ZsimError, TimeoutError) as error:
             return {"ok": False, "error": str(error) or "it took too long"}
         except Exception as error:
-            return {"ok": False, "error": f"it failed in a way that nobody thought of: {error!r}"}
+            return {"ok": False, "error": f"it failed by a fault of zsim: {error!r}"}
 
-    def _understood(self, line: bytes) -> tuple[Act, dict[str, Any]]:
+    def _parsed(self, line: bytes) -> tuple[Act, dict[str, Any]]:
         """Return what is asked for, and the arguments, which fit."""
         request = json.loads(line)
         act, args = self._acts[request["op"]], request.get("args", {})
@@ -165,7 +169,7 @@ def ask(federation: str, op: str, **args: Any) -> Any:
     Raises:
         RunError: nobody is up, it does not answer, or it refuses; with its reason.
     """
-    with _reached(federation) as line:
+    with _connected(federation) as line:
         try:
             line.sendall(json.dumps({"op": op, "args": args}).encode() + b"\n")
             with line.makefile("rb") as stream:
@@ -179,7 +183,7 @@ def ask(federation: str, op: str, **args: Any) -> Any:
     return answer["result"]
 
 
-def _reached(federation: str) -> socket.socket:
+def _connected(federation: str) -> socket.socket:
     """Return a connection to the launcher."""
     path, line = place(federation), socket.socket(socket.AF_UNIX)
     line.settimeout(ANSWER_S)

@@ -1,29 +1,36 @@
-"""`zsim doctor`: whether the hosts of an inventory can fly together, before anything is started on them."""
+"""`zsim doctor`: whether the hosts of an inventory can fly together, before anything is started on them; as tables."""
 
 import asyncio
 import platform
 import time
-from collections.abc import AsyncIterator, Iterator, Sequence
-from contextlib import AsyncExitStack, asynccontextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractAsyncContextManager
+from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
-import asyncssh
+from rich.table import Table
+from rich.text import Text
 
 from zsim import __version__
-from zsim.errors import HostsError
-from zsim_deploy.ssh.host_link import HostLink
-from zsim_deploy.ssh.ssh_connection import json_answer, shell_line, shell_word
+from zsim.errors import HostsError, ZsimError
+from zsim_deploy.hosts.host_link import HostLink
+from zsim_deploy.hosts.host_links import ProgramEndedError, RemoteProgram, open_program
+from zsim_deploy.hosts.host_plan import leftovers, port_in_use
+from zsim_deploy.hosts.ssh_connection import shell_line, shell_word
+from zsim_deploy.inventory import enrolment
+from zsim_deploy.inventory import inventory as inv
+from zsim_deploy.inventory.inventory import InventoryFile
 
 CLOCK_OFFSET_MAX_S = 1.0  # certificates are back-dated by a day and logs are compared; time on the wire is simulated
 LOAD_MAX = 0.5  # of the cores; what is busy already slows everybody in lockstep
 FREE_MIN_BYTES = 1_000_000_000  # a run of an hour with three drones records about this
 BITS_PER_S_MIN = 10e6  # three drones in realtime send 2 Mbit/s to a recorder; lockstep goes as fast as the link
 PERFORMANCE = {"performance"}
-ABOUT_S = 20.0  # wall time to say everything; a small computer takes 5 s to import numpy
+ABOUT_S = 20.0  # wall time to answer; a small computer takes 5 s to import numpy
 READY_S = 20.0  # wall time to listen; as long as to import numpy
 REACH_S = 60.0  # wall time to measure a path; 9 pings and at most 9 bulks take 40 s at a round trip of 2 s
 NO_MODULE = "no module named"  # in Python's error, in lower case
-NO_PROGRAM = ("not found", "no such file")  # what shells say, in lower case …
+NO_PROGRAM = ("not found", "no such file")  # in the errors of shells, in lower case …
 NO_PROGRAM_CODES = (126, 127)  # … and the codes with which they end; POSIX, 2.8.2
 OFFSET_ASKS = 3  # the answer with the shortest round trip gives the clock's offset best
 
@@ -60,12 +67,11 @@ async def host_report(link: HostLink, python: str, hosts: str = "FILE") -> HostR
     """
     remedy = _remedy(link, hosts)
     try:
-        async with _within(link, ABOUT_S), _probe(link, python, "about", link.host.folder) as there:
-            facts = await there.answer()
+        async with _probe(link, python, "about", link.host.folder) as there:
+            facts = await there.answer(ABOUT_S)
             round_trip_s, offset_s = min([await _offset(there) for _ in range(OFFSET_ASKS)])
-    except _EndedError as error:
-        fault = _no_zsim(link, python, remedy, error) or f"{python}: {error}; is it a Python that has zsim?"
-        raise HostsError(f"{link.name}: {fault}") from error
+    except ProgramEndedError as error:
+        raise HostsError(f"{link.name}: {_probe_fault(link, python, remedy, error)}") from error
     return HostReport(facts, round_trip_s, offset_s, remedy)
 
 
@@ -75,92 +81,28 @@ def _remedy(link: HostLink, hosts: str) -> str:
     return f"install it there, or leave hosts.{link.name}.python out and {push}" if link.host.python else push
 
 
-def _no_zsim(link: HostLink, python: str, remedy: str, error: "_EndedError") -> str:
-    """Return what a host lacks, from how its probe ended; empty if it is something else."""
-    text = error.last.lower()
+def _probe_fault(link: HostLink, python: str, remedy: str, error: ProgramEndedError) -> str:
+    """Return what a host lacks, from how its probe ended."""
+    text, why = error.last.lower(), error.last or "it printed nothing"
     if NO_MODULE in text:
         return f"{python} has no zsim {__version__}; {remedy}"
     if error.status not in NO_PROGRAM_CODES and not any(sign in text for sign in NO_PROGRAM):
-        return ""
+        return f"{python}: the probe ended with code {error.status} ({why}); is it a Python that has zsim?"
     if link.host.python:
-        return f"python {python} is no program there ({error.last}); correct hosts.{link.name}.python, or {remedy}"
+        return f"python {python} is no program there ({why}); correct hosts.{link.name}.python, or {remedy}"
     return f"has no zsim in {link.host.folder}; {remedy}"
 
 
-class _EndedError(HostsError):
-    """A probe has ended without an answer.
-
-    Attributes:
-        status: exit code.
-        last: line that it printed.
-    """
-
-    def __init__(self, status: int | None, last: str) -> None:
-        super().__init__(f"the probe ended with code {status} ({last})")
-        self.status, self.last = status, last
+def _probe(link: HostLink, python: str, *words: str) -> AbstractAsyncContextManager[RemoteProgram]:
+    """Run a probe on a host as long as the block lasts."""
+    return open_program(link, f"{shell_word(python)} -m zsim_deploy.hosts.probe {shell_line(words)}")
 
 
-class _Probe:
-    """A probe that runs on a host, as a process there."""
-
-    def __init__(self, process: "asyncssh.SSHClientProcess[str]") -> None:
-        self._process = process
-
-    async def answer(self) -> dict[str, Any]:
-        """Return its next message; a greeting of the login shell is passed over.
-
-        Raises:
-            _EndedError: it has ended.
-        """
-        while line := await self._process.stdout.readline():
-            if message := json_answer([line]):
-                return message
-        last = (await self._process.stderr.read()).strip().splitlines() or ["it printed nothing"]
-        await self._process.wait_closed()
-        raise _EndedError(self._process.exit_status, last[-1][:200])
-
-    async def ask(self) -> dict[str, Any]:
-        """Send it a line and return its answer."""
-        self._process.stdin.write("\n")
-        return await self.answer()
-
-
-@asynccontextmanager
-async def _within(link: HostLink, limit_s: float) -> AsyncIterator[None]:
-    """Bound the time of a block in which a host is asked.
-
-    Raises:
-        HostsError: it took longer.
-    """
-    try:
-        async with asyncio.timeout(limit_s):
-            yield
-    except TimeoutError as error:
-        raise HostsError(f"{link.name}: no answer within {limit_s:g} s; is the link slow, the host busy?") from error
-
-
-@asynccontextmanager
-async def _probe(link: HostLink, python: str, *words: str) -> AsyncIterator[_Probe]:
-    """Run a probe on a host as long as the block lasts.
-
-    Raises:
-        HostsError: the host cannot be reached, or the connection breaks.
-    """
-    command = f"{shell_word(python)} -m zsim_deploy.hosts.probe {shell_line(words)}"
-    try:
-        process = await (await link.open()).create_process(command, encoding="utf-8", errors="replace")
-        try:
-            yield _Probe(process)
-        finally:
-            process.close()  # not waited for: on a link that is cut it would take a minute
-    except (asyncssh.Error, OSError) as error:
-        raise HostsError(f"{link.name}: the connection broke ({error}); is the host up?") from error
-
-
-async def _offset(probe: _Probe) -> tuple[float, float]:
-    """Return the round trip of a word and the clock's offset, in seconds."""
+async def _offset(probe: RemoteProgram) -> tuple[float, float]:
+    """Return the round trip of a line and the clock's offset, in seconds."""
     start_s, sent_s = time.time(), time.monotonic()
-    there_s = (await probe.ask())["time_ns"] / 1e9
+    probe.send("\n")
+    there_s = (await probe.answer(ABOUT_S))["time_ns"] / 1e9
     took_s = time.monotonic() - sent_s
     return took_s, there_s - (start_s + took_s / 2)
 
@@ -206,10 +148,8 @@ async def network_paths(
 ) -> list[NetworkPath]:
     """Return how the hosts reach a port of another, on which nothing else may listen."""
     try:
-        async with AsyncExitStack() as stack:
-            async with _within(target, READY_S):
-                server = await stack.enter_async_context(_probe(target, python[target.name], "serve", str(port)))
-                message = await server.answer()
+        async with _probe(target, python[target.name], "serve", str(port)) as server:
+            message = await server.answer(READY_S)
             if "error" in message:
                 return [NetworkPath(target.name, target.name, port, message)]
             return [
@@ -222,8 +162,8 @@ async def network_paths(
 async def _reach(link: HostLink, target: HostLink, python: dict[str, str], port: int) -> dict[str, Any]:
     words = ("reach", target.host.address, str(port))
     try:
-        async with _within(link, REACH_S), _probe(link, python[link.name], *words) as client:
-            return await client.answer()
+        async with _probe(link, python[link.name], *words) as client:
+            return await client.answer(REACH_S)
     except HostsError as error:
         return {"error": str(error)}
 
@@ -241,13 +181,103 @@ def path_faults(paths: Sequence[NetworkPath]) -> tuple[list[str], list[str]]:
 
 def _path_fault(path: NetworkPath) -> str:
     why = path.figures["error"]
-    another = "give another port in the inventory"
     match path.figures.get("taken"):
         case True:
-            what = f"in use there, perhaps by another run; end that (`ss -ltnp` there shows it), or {another}"
-            return f"{path.target}: port {path.port} is {what}"
+            return port_in_use(path.target, path.port)
         case False:
-            return f"{path.target}: nothing may listen on port {path.port} there ({why}); {another}"
+            what = f"nothing may listen on port {path.port} there ({why}); give another port in the inventory"
+            return f"{path.target}: {what}"
         case _:
-            what = f"cannot be reached ({why}); is it open in the firewall?"
-            return f"{path.source}: port {path.port} of {path.target} {what}"
+            what = f"port {path.port} of {path.target} cannot be reached ({why}); is it open in the firewall?"
+            return f"{path.source}: {what}"
+
+
+class CheckResult(NamedTuple):
+    """What is to be shown of the hosts, and what is wrong with them, a line each."""
+
+    tables: list[Table]
+    faults: list[str]
+    warnings: list[str]
+
+
+def check_hosts(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
+    """Check certificates and hosts; with a placement also the paths to where the world and the routers listen."""
+    result = asyncio.run(_check_up(placed, places))
+    lacks = enrolment.certificate_faults(placed, places, datetime.now(UTC))
+    warning = enrolment.exposed_keys(placed)
+    return result._replace(
+        faults=[*lacks, *result.faults], warnings=[*result.warnings, *([warning] if warning else [])]
+    )
+
+
+async def _check_up(placed: InventoryFile, places: dict[str, str] | None) -> CheckResult:
+    links = {name: HostLink(name, host, placed.folder) for name, host in placed.inventory.hosts.items()}
+    pythons = {name: inv.python(host) for name, host in placed.inventory.hosts.items()}
+    try:
+        results = await asyncio.gather(
+            *(host_report(link, pythons[name], placed.word) for name, link in links.items()), return_exceptions=True
+        )
+        reports: dict[str, HostReport] = {}
+        faults: list[str] = []
+        for name, result in zip(links, results, strict=True):
+            if isinstance(result, HostReport):
+                reports[name] = result
+            elif isinstance(result, ZsimError):
+                faults.append(str(result))
+            else:
+                raise result
+        wrong, warnings = compare_reports(reports)
+        paths = await _paths(placed, places, links, pythons, set(reports)) if places else []
+        cut, slow = path_faults(paths)
+        left = await asyncio.gather(*(leftovers(links[name], placed.folder) for name in reports))
+        tables = [_hosts_table(reports), *([_paths_table(paths)] if paths else [])]
+        return CheckResult(
+            tables, [*faults, *wrong, *cut], [*warnings, *slow, *(line for lines in left for line in lines)]
+        )
+    finally:
+        for link in links.values():
+            await link.close()
+
+
+async def _paths(
+    placed: InventoryFile, places: dict[str, str], links: dict[str, HostLink], pythons: dict[str, str], there: set[str]
+) -> list[NetworkPath]:
+    """Return how the hosts reach what their roles and routers connect to, one path after the other."""
+    paths: list[NetworkPath] = []
+    for (target, port), sources in inv.connections(placed, places).items():
+        if target in there:
+            chosen = [links[name] for name in sorted(sources & there)]
+            paths += await network_paths(chosen, links[target], pythons, port)
+    return paths
+
+
+def _hosts_table(reports: dict[str, HostReport]) -> Table:
+    shown = Table("host", "python", "zsim", "round trip", "clock", "load", "cores", "governor", "fingerprint", box=None)
+    for name, report in reports.items():
+        facts = report.facts
+        cells = (
+            name,
+            facts["python"],
+            facts["zsim"],
+            f"{1e3 * report.round_trip_s:.1f} ms",
+            f"{1e3 * report.clock_offset_s:+.1f} ms",
+            f"{facts['load']:.2f}",
+            str(facts["cores"]),
+            ", ".join(facts["governors"]) or "-",
+            facts["fingerprint"][:8],
+        )
+        shown.add_row(*map(Text, cells))  # a host's answer may have brackets
+    return shown
+
+
+def _paths_table(paths: list[NetworkPath]) -> Table:
+    shown = Table("from", "to", "port", "round trip", "bandwidth", box=None)
+    for path in paths:
+        shown.add_row(*map(Text, (path.source, path.target, str(path.port), *_path_figures(path.figures))))
+    return shown
+
+
+def _path_figures(figures: dict[str, Any]) -> tuple[str, str]:
+    if "error" in figures:
+        return figures["error"], "-"
+    return f"{1e3 * figures['round_trip_s']:.2f} ms", f"{figures['bits_per_s'] / 1e6:.0f} Mbit/s"

@@ -1,7 +1,7 @@
-"""What a run puts on each host: the processes with their command lines, and the files that they need there."""
+"""What a run puts on each host: processes with their command lines, files; and what other runs have left there."""
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
 
@@ -11,16 +11,45 @@ from zsim.errors import HostsError
 from zsim.scenario import scenario_file
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Scenario
-from zsim.transport.tls import CERTIFICATES
-from zsim_deploy.hosts.leftover_runs import RECORD, runs_folder, scp
+from zsim.transport.tls import CERTIFICATES, KEY
+from zsim_deploy.hosts.host_link import HostLink
+from zsim_deploy.hosts.ssh_connection import json_answer, shell_line, shell_word
+from zsim_deploy.inventory import enrolment
 from zsim_deploy.inventory import inventory as inv
-from zsim_deploy.inventory.inventory import InventoryFile
+from zsim_deploy.inventory.enrolment import folder_of, init_command
+from zsim_deploy.inventory.inventory import SSH_PORT, Host, InventoryFile
 from zsim_deploy.inventory.processes import MODULE, ProcessFiles, access_file, command, own_programs, processes
 from zsim_deploy.roles.stop_channel import FOLDER
-from zsim_deploy.security import certificate_check
-from zsim_deploy.security.enrolment import folder_of, init_command
 
 ACCESS = "access.json"
+RECORD = "run.mcap"
+RUNS = "runs"  # below the folder of zsim on a host: a folder per run
+# Whose processes still run is no earlier run; where there is no ps, nobody is known to.
+LIST_RUNS = f"""
+alive=$(ps -A -ww -o args 2>/dev/null || ps -A -o args 2>/dev/null)
+for run in *; do
+  case "$alive" in *"--launched $run "*) continue;; esac
+  [ -f "$run/{RECORD}" ] && echo "{RECORD} $run"
+  [ -n "$(find "$run/{FOLDER}" -name {KEY} 2>/dev/null)" ] && echo "{KEY} $run"
+done
+true
+"""
+# Run there by its Python: `- ADDRESS PORT...`. What else may be wrong with a port is in the log of its process.
+TRY_PORTS = """
+import errno, json, socket, sys
+address, taken = sys.argv[1], []
+for port in map(int, sys.argv[2:]):
+    family, kind, _, _, place = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)[0]
+    with socket.socket(family, kind) as tried:
+        tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            tried.bind(place)
+            tried.listen()
+        except OSError as error:
+            taken += [port] if error.errno == errno.EADDRINUSE else []
+print(json.dumps({"taken": taken}))
+"""
+TRY_PORTS_S = 20.0  # wall time to start Python on a small computer
 
 
 class HostPlan:
@@ -33,6 +62,7 @@ class HostPlan:
         pace: options of the world: `--realtime`, `--rate R`.
 
     Attributes:
+        placed: the inventory.
         processes: by name, the routers first, each after the one that it connects to.
         remarks: on programs of the user's own, which are not started.
 
@@ -41,7 +71,7 @@ class HostPlan:
     """
 
     def __init__(self, placed: InventoryFile, scenario: Scenario, run_id: str, pace: Sequence[str] = ()) -> None:
-        self._placed = placed
+        self.placed = placed
         self._scenario = scenario
         self._run_id = run_id
         self._pace = pace
@@ -51,13 +81,9 @@ class HostPlan:
 
     def moved(self, name: str, host: str) -> "HostPlan":
         """Return the same plan but for the host of one process."""
-        places = {**inv.placement(self._placed, self._scenario), name: host}
-        placed = self._placed._replace(inventory=msgspec.structs.replace(self._placed.inventory, roles=places))
+        places = {**inv.placement(self.placed, self._scenario), name: host}
+        placed = self.placed._replace(inventory=msgspec.structs.replace(self.placed.inventory, roles=places))
         return HostPlan(placed, self._scenario, self._run_id, self._pace)
-
-    def known_hosts(self) -> list[str]:
-        """Return the hosts of the inventory."""
-        return list(self._placed.inventory.hosts)
 
     def hosts(self) -> list[str]:
         """Return the hosts on which something runs."""
@@ -69,7 +95,7 @@ class HostPlan:
 
     def folder(self, host: str) -> str:
         """Return the folder of this run on a host."""
-        return f"{runs_folder(self._placed.inventory.hosts[host])}/{self._run_id}"
+        return f"{runs_folder(self.placed.inventory.hosts[host])}/{self._run_id}"
 
     def keys(self, host: str) -> str:
         """Return the folder in which the keys of this run's processes are on a host."""
@@ -82,16 +108,8 @@ class HostPlan:
     def way_to_record(self) -> str:
         """Return where the record is, and the command that fetches it."""
         name = self.host(RECORDER)
-        command = scp(self._placed.inventory.hosts[name], self._placed.folder, self.record())
+        command = scp(self.placed.inventory.hosts[name], self.placed.folder, self.record())
         return f"{name}:{self.record()} (fetch it with `{command}`)"
-
-    def source(self) -> str:
-        """Return the inventory's file as a word of a command."""
-        return shlex.quote(str(self._placed.folder / self._placed.source))
-
-    def base(self) -> Path:
-        """Return the folder of the inventory."""
-        return self._placed.folder
 
     def ports(self, host: str) -> list[int]:
         """Return the ports of a host on which processes of the run will listen."""
@@ -99,17 +117,11 @@ class HostPlan:
 
     def certificate_faults(self, now: datetime) -> list[str]:
         """Return what of the certificates is missing or of no use at a time, a line for each fault."""
-        return certificate_check.certificate_faults(
-            self._placed, {name: self.host(name) for name in self.processes}, now
-        )
-
-    def exposed_keys(self) -> str | None:
-        """Return a warning of private keys here that others can read, if there are any."""
-        return certificate_check.exposed_keys(self._placed)
+        return enrolment.certificate_faults(self.placed, {name: self.host(name) for name in self.processes}, now)
 
     def python(self, host: str) -> str:
         """Return the interpreter of a host that has zsim."""
-        return inv.python(self._placed.inventory.hosts[host])
+        return inv.python(self.placed.inventory.hosts[host])
 
     def arguments(self, name: str) -> list[str]:
         """Return the arguments of `zsim` that start a process."""
@@ -138,7 +150,7 @@ class HostPlan:
         process = self.processes[name]
         if not process.secure:
             return {}
-        source = folder_of(self._placed) / process.host
+        source = folder_of(self.placed) / process.host
         paths = {file: source / name / file for file in CERTIFICATES}
         if process.port is not None:
             paths[ACCESS] = source / access_file(process)
@@ -150,5 +162,78 @@ class HostPlan:
         except OSError as error:
             raise HostsError(
                 f"{path}: cannot be read ({error.strerror}); make certificates with "
-                f"`{init_command(self._placed)}`, or set security.insecure on a network of your own"
+                f"`{init_command(self.placed)}`, or set security.insecure on a network of your own"
             ) from error
+
+
+def runs_folder(host: Host) -> str:
+    """Return the folder of runs on a host, from its root or as ~/ from the home."""
+    home = "" if host.folder.startswith(("/", "~/")) else "~/"
+    return f"{home}{host.folder}/{RUNS}"
+
+
+async def leftovers(link: HostLink, base: Path) -> list[str]:
+    """Return what earlier runs have left on a host: at most a line on records, and one on private keys.
+
+    Args:
+        link: to the host.
+        base: folder of the inventory.
+
+    Raises:
+        HostsError: it could not be asked.
+    """
+    folder = runs_folder(link.host)
+    script = f"cd {shell_word(folder)} 2>/dev/null || exit 0{LIST_RUNS}"
+    output = (await link.run(script, what=f"looking into {folder}")).decode(errors="replace")
+    return leftover_lines(link.name, link.host, base, output.splitlines())
+
+
+def leftover_lines(name: str, host: Host, base: Path, output: Iterable[str]) -> list[str]:
+    """Return lines for a person from what LIST_RUNS prints; a greeting of the login shell is passed over."""
+    folder = runs_folder(host)
+    words = [line.split(" ", 1) for line in output]
+    runs = {kind: [word[1] for word in words if word[0] == kind and len(word) > 1] for kind in (RECORD, KEY)}
+    lines = []
+    if records := [f"{folder}/{run}/{RECORD}" for run in runs[RECORD]]:
+        lines.append(
+            f"{name}: records of earlier runs were not fetched: {', '.join(f'{name}:{path}' for path in records)}; "
+            f"fetch with `{scp(host, base, records[0])}`, then remove the folder of the run there"
+        )
+    if keys := [f"{folder}/{run}/{FOLDER}" for run in runs[KEY]]:
+        lines.append(
+            f"{name}: private keys of earlier runs were left: {', '.join(f'{name}:{path}' for path in keys)}; "
+            f"remove them there with `rm -r {shell_line(keys)}`"
+        )
+    return lines
+
+
+def scp(host: Host, base: Path, path: str) -> str:
+    """Return the command that copies a file from a host to here, as `zsim up` reaches the host."""
+    address = host.ssh or host.address
+    shown = f"[{address}]" if ":" in address else address
+    known = f"UserKnownHostsFile={base / Path(host.known_hosts).expanduser()}" if host.known_hosts else None
+    words = ["scp", *(["-P", str(host.port)] if host.port != SSH_PORT else [])]
+    words += ["-i", str(base / Path(host.key).expanduser())] if host.key else []
+    words += ["-o", known] if known else []
+    user = f"{host.user}@" if host.user else ""
+    return shlex.join([*words, f"{user}{shown}:{path.removeprefix('~/')}", "."])
+
+
+async def port_faults(link: HostLink, python: str, ports: Sequence[int]) -> list[str]:
+    """Return a line for each port of a host on which somebody else listens.
+
+    Raises:
+        HostsError: it could not be asked.
+    """
+    if not ports:
+        return []
+    command = f"{shell_word(python)} - {shell_line([link.host.address, *map(str, ports)])}"
+    output = await link.run(command, TRY_PORTS.encode(), TRY_PORTS_S, "looking for free ports")
+    taken = (json_answer(output.decode(errors="replace").splitlines()) or {}).get("taken", [])
+    return [port_in_use(link.name, port) for port in taken]
+
+
+def port_in_use(host: str, port: int) -> str:
+    """Return a line on a port of a host on which somebody else listens."""
+    remedy = "end that (`ss -ltnp` there shows it), or give another port in the inventory"
+    return f"{host}: port {port} is in use there, perhaps by another run; {remedy}"

@@ -11,16 +11,16 @@ from typing import Any
 from zsim.errors import HostsError, RunError
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim_deploy.hosts.doctor import compare_reports, host_report
+from zsim_deploy.hosts.host_link import EventLoopThread, HostLink
+from zsim_deploy.hosts.host_links import HostLinks
 from zsim_deploy.hosts.host_plan import HostPlan
 from zsim_deploy.hosts.remote_process import RemoteProcess
+from zsim_deploy.hosts.ssh_connection import shell_word
 from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory.processes import MODULES, extras
 from zsim_deploy.launch.supervisor import Supervisor
-from zsim_deploy.ssh.host_link import EventLoopThread, HostLink
-from zsim_deploy.ssh.host_links import HostLinks
-from zsim_deploy.ssh.ssh_connection import shell_word
 
-JOIN_S = 60.0  # until a host that was not used so far is connected and found to fit
+JOIN_S = 60.0  # until a host that was not used so far is connected and checked
 IMPORT_S = 20.0  # until a Python has shown that it can run a role; a small computer takes 5 s
 BRING_S = 30.0  # until a certificate is on a host
 LEAVE_S = 20.0  # until a process whose place was taken a moment ago has ended, which takes a second
@@ -86,8 +86,8 @@ class LauncherRequests:
         self._refuse_unless_runs(role)
         if role in (WORLD, RECORDER) or role.startswith(f"{ROUTER}."):
             raise RunError(f"{role} cannot be moved while the run goes on; change the inventory and run again")
-        if host not in self._plan.known_hosts():
-            raise RunError(f"host is {host!r}; must be one of {', '.join(self._plan.known_hosts())}")
+        if host not in (hosts := self._plan.placed.inventory.hosts):
+            raise RunError(f"host is {host!r}; must be one of {', '.join(hosts)}")
         with self._one_at_a_time:
             plan = self._plan.moved(role, host)
             if faults := plan.certificate_faults(datetime.now(UTC)):

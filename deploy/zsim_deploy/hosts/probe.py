@@ -29,7 +29,7 @@ SIZE_BYTES = 8  # of the size that comes before what is sent
 BULKS_BYTES = tuple(16_384 << power for power in range(9))  # up to 4 MB, which take 0.3 s on a link of 100 Mbit/s
 BULK_S = 1.0  # a bulk that takes so long is long enough to measure the bandwidth
 CHUNK_BYTES = 65_536
-PATIENCE_S = 10.0  # wall time; the least bulk takes so long at 13 kbit/s, and no other is sent unless half took 1 s
+TIMEOUT_S = 10.0  # wall time; the least bulk takes so long at 13 kbit/s, and no other is sent unless half took 1 s
 SERVE_S = 60.0  # a server that nobody needs any more ends by itself
 SHORTEST_S = 1e-4  # what remains of a bulk's time without the round trip is at least this; 4 MB in it are 300 Gbit/s
 DONE = b"."
@@ -81,7 +81,7 @@ def governors(folder: Path) -> list[str]:
 
 
 def serve(port: int) -> None:
-    """Answer on a port until standard input ends; say "ready" once it listens, or why it cannot."""
+    """Answer on a port until standard input ends; print "ready" once it listens, or why it cannot."""
     try:
         server = listening(port)
     except OSError as error:
@@ -104,8 +104,8 @@ def listening(port: int) -> socket.socket:
 
 
 def answer(connection: socket.socket) -> None:
-    """Swallow what is sent, and say so each time."""
-    connection.settimeout(PATIENCE_S)
+    """Read what is sent, and confirm that each time."""
+    connection.settimeout(TIMEOUT_S)
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     try:
         with connection.makefile("rb") as came:
@@ -121,7 +121,7 @@ def answer(connection: socket.socket) -> None:
 def reach(address: str, port: int) -> dict[str, Any]:
     """Return the round trip [s] and the bandwidth [bit/s] to a host that serves, or why there is none."""
     try:
-        with socket.create_connection((address, port), PATIENCE_S) as link:
+        with socket.create_connection((address, port), TIMEOUT_S) as link:
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             round_trip_s = statistics.median(_send_s(link, 0) for _ in range(PINGS))
             return {"round_trip_s": round_trip_s, "bits_per_s": _bits_per_s(link, round_trip_s)}

@@ -8,7 +8,6 @@ import asyncio
 import contextlib
 import signal
 import threading
-import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
@@ -17,16 +16,16 @@ from typing import Any
 import asyncssh
 
 from zsim.errors import HostsError
+from zsim_deploy.hosts.host_link import EventLoopThread, HostLink
+from zsim_deploy.hosts.ssh_connection import shell_line
 from zsim_deploy.launch.role_launcher import SINGLE_THREADED
-from zsim_deploy.ssh.host_link import EventLoopThread, HostLink
-from zsim_deploy.ssh.ssh_connection import shell_line
 
 BEAT_S = 1.0  # how often the launcher shows that it lives
 ORPHAN_S = 60.0  # without a beat a process ends itself; a link may be cut for shorter than that
 LEND_S = 60.0  # how long its files may take to reach the host again; as long as a link may be cut
 KILL_S = 5.0  # how long a kill may take to reach the host: a few round trips
-LOST = -1000  # code of a process of which nobody knows how it ended
-PID = "zsim-pid "  # begins the line with its process id; a login shell may say something before
+LOST = -1000  # code of a process whose end is not known
+PID = "zsim-pid "  # begins the line with its process id; a login shell may print something before
 
 
 class ProcessLog:
@@ -55,7 +54,7 @@ class ProcessLog:
         except OSError as error:
             if self._is_whole:
                 self._is_whole = False
-                self._say(f"{self._path}: cannot be written ({error.strerror}); what it would say there is lost")
+                self._say(f"{self._path}: cannot be written ({error.strerror}); what it would have there is lost")
 
 
 class RemoteProcess:
@@ -89,7 +88,6 @@ class RemoteProcess:
         self.role = name.split(".", 1)[0]
         self.host = link.name
         self.restarts = 0
-        self.started_s = 0.0
         self.pid = 0
         self._arguments = arguments
         self._link = link
@@ -123,7 +121,6 @@ class RemoteProcess:
         self._starts += 1
         self.pid, self._code, self._process, self._stop, self._fault = 0, None, None, None, ""
         self._ended.clear()
-        self.started_s = time.monotonic()
         self._life = self._loop.spawn(self._live())
 
     async def _live(self) -> None:
@@ -145,9 +142,9 @@ class RemoteProcess:
 
     async def _run(self) -> int:
         if self._starts > 1 and self._files:
-            await self._link.put_files(self._folder, self._files, LEND_S, patient=True)
+            await self._link.put_files(self._folder, self._files, LEND_S, retry=True)
         async with (
-            self._link.channel(patient=True) as connection,
+            self._link.channel(retry=True) as connection,
             connection.create_process(self._command(), encoding="utf-8", errors="replace") as process,
         ):
             self.pid = await _pid(process.stdout)
@@ -183,7 +180,7 @@ class RemoteProcess:
                 process.stdin.write("beat\n")
 
     def outcome(self) -> str:
-        """Say in words how it ended."""
+        """Return how it ended, as text."""
         code = self._code
         if code == LOST:
             return self._fault or f"the connection to {self.host} broke"

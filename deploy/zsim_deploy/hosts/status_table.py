@@ -10,14 +10,14 @@ from rich.table import Table
 from rich.text import Text
 
 from zsim.runtime.progress import Screen, describe
+from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.remote_process import RemoteProcess
-from zsim_deploy.ssh.host_link import HostLink
 
 FIRST_S = 1.0  # simulated; from then on it flies
 SILENT_S = 1.0  # a host that has not answered for so long is shown as silent; it is asked twice a second …
 ROUND_TRIPS = 2.0  # … and so many of its round trips more: over a slow link every answer takes long
 WAITED_S = 0.5  # a process that is waited for longer is shown so; waiting for less is what lockstep is
-STALE_S = 3.0  # health comes once a second; older figures say nothing of now
+STALE_S = 3.0  # health comes once a second; older figures are not shown
 COLUMNS = ("role", "host", "pid", "state", "lag", "messages/s", "round trip", "restarts")
 
 
@@ -93,7 +93,7 @@ class StatusTable:
         self._health[line["name"]] = {**line, "wall_s": now_s, "per_s": rate}
 
     def report_silent_hosts(self) -> None:
-        """Say once which host has fallen silent, and that it is back."""
+        """Show once which host does not answer any more, and that it is back."""
         for name, link in self.links.items():
             silent_s = link.silent_s()
             if _is_silent(link) and name not in self._silent:

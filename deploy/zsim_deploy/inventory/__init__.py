@@ -1,1 +1,4 @@
-"""The inventory: hosts, how to reach them, which process runs where and what it needs. Imports options."""
+"""The inventory: hosts and how to reach them, which process runs where, its command line, its certificate and rights.
+
+Imports arguments.
+"""

@@ -4,6 +4,7 @@ Pure: reads a file and answers questions; nothing here opens a connection. docs/
 """
 
 import fnmatch
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -84,6 +85,11 @@ class InventoryFile(NamedTuple):
     folder: Path
     source: str
 
+    @property
+    def word(self) -> str:
+        """Return its path as a word of a command."""
+        return shlex.quote(str(self.folder / self.source))
+
 
 def load(path: Path) -> InventoryFile:
     """Return the inventory of a YAML file.
@@ -133,7 +139,7 @@ def _map(document: dict[str, Any], name: str) -> list[tuple[Any, Any]]:
 
 def _unknown(path: str, name: Any, known: list[Any], what: str) -> Iterator[Fault]:
     if isinstance(name, str) and name not in known:
-        yield path, f"is {name!r}; must be one of {what}: {', '.join(map(str, known)) or 'none are given'}"
+        yield path, f"is {name!r}; must be one of {what}: {', '.join(map(str, known)) or 'there are none'}"
 
 
 def _circles(document: dict[str, Any]) -> Iterator[Fault]:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.role_table import AGENTS, ROLES, agent_names, on_death
 from zsim.scenario.scenario import OnDeath, Scenario
+from zsim_deploy.arguments import REALTIME
 from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.inventory import Inventory, InventoryFile, hosts_of, spread
-from zsim_deploy.options.arguments import REALTIME
 
 MODULE = ("-m", "zsim_deploy.cli")  # after the interpreter
 STOP_S = 15  # a world that is stopped waits 5 s for byes, and a recorder may have a disk to wait for
@@ -131,7 +131,7 @@ def used_hosts(planned: Sequence[PlannedProcess]) -> list[str]:
 
 
 def _known(name: str, scenario: Scenario) -> bool:
-    """Tell whether zsim has a command for a process."""
+    """Return whether zsim has a command for a process."""
     return name in (WORLD, RECORDER, *agent_names(scenario))
 
 
@@ -191,7 +191,7 @@ def needed_extras(inventory: Inventory, more: Iterable[str] = ()) -> dict[str, f
 
 
 def _can_match(entry: str, kind: str) -> bool:
-    """Tell whether a pattern can match a name that begins so."""
+    """Return whether a pattern can match a name that begins so."""
     literal = entry[: min((entry.find(sign) for sign in "*?[" if sign in entry), default=len(entry))]
     wild = literal != entry
     return literal.startswith(kind) or (wild and kind.startswith(literal))

@@ -2,7 +2,6 @@
 
 import subprocess
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,7 +30,6 @@ class ChildProcess:
         self.name = name
         self.role = name.split(".", 1)[0]
         self.restarts = 0
-        self.started_s = 0.0
         self._arguments = arguments
         self._log = logs / f"{name}.log"
         self._launcher = launcher
@@ -43,7 +41,6 @@ class ChildProcess:
         """Start it, or start it again."""
         with self._log.open("a") as log:
             self._process = self._launcher.start(self._arguments, log, listened=self._on_line is not None)
-        self.started_s = time.monotonic()
         if self._on_line:
             self._reader = threading.Thread(target=self._read, args=(self._process, self._on_line), daemon=True)
             self._reader.start()
@@ -64,7 +61,7 @@ class ChildProcess:
         return self._process.poll() if self._process else None
 
     def outcome(self) -> str:
-        """Say in words how it ended."""
+        """Return how it ended, as text."""
         code = self.code
         if code is not None and code < 0:
             return f"killed by signal {-code}"

@@ -31,8 +31,8 @@ PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # linux/prctl.h
 PACKET_MAX = 1 << 17  # bytes, of a command line; a thousand names of drones are half of it
 REPLY_MAX = 32  # bytes, of an answer: READY, or a process number
 ANSWER_S = 5.0  # the fork server answers within 20 ms, unless it is stopped
-PATIENCE_S = 3.0  # what is compiled is loaded within two, unless the machine is busy
-PATIENCE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
+SLOW_S = 3.0  # what is compiled is loaded within two, unless the machine is busy
+SLOW_NOTICE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
 POLL_S = 0.01  # how often one looks whether it has ended
 UNKNOWN = 0  # exit code, as of Popen, where somebody else has taken it
 
@@ -123,7 +123,7 @@ class RoleLauncher:
 
     def __enter__(self) -> "RoleLauncher":
         if sys.platform == "linux":
-            signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # whoever started this may not have wanted to know exit codes
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # whoever started this may have ignored it
             try:
                 self._start_forkserver()
             except BaseException:  # Ctrl-C, too
@@ -156,7 +156,7 @@ class RoleLauncher:
                 [*FORKSERVER, self._run, ROOM], stdin=other.fileno(), stdout=quiet, stderr=quiet, env=environment,
                 start_new_session=True,
             )  # fmt: skip
-        timer = threading.Timer(PATIENCE_S, self._say, args=(PATIENCE,))
+        timer = threading.Timer(SLOW_S, self._say, args=(SLOW_NOTICE,))
         timer.start()
         try:
             self._receive()

@@ -15,12 +15,11 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of
+from zsim_deploy.arguments import CONSOLE_PORT, pace_options
 from zsim_deploy.launch.child_process import ChildProcess
 from zsim_deploy.launch.role_launcher import RoleLauncher
 from zsim_deploy.launch.supervisor import Outcome, Supervisor
-from zsim_deploy.options.arguments import CONSOLE_PORT, pace_options
-from zsim_deploy.options.terminal import REASONS, handled_by
-from zsim_deploy.roles.stop_channel import StopChannel
+from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 
 DEFAULT_PORT = 7447  # Zenoh's own
 CONSOLE = "console.run"  # the one that a run starts: not to be taken over by the first that is started by hand
@@ -110,7 +109,7 @@ def _any_port() -> int:
 
 
 def free_port(screen: Screen) -> int:
-    """Return Zenoh's port, or another free one, and say so, where that is taken."""
+    """Return Zenoh's port, or another free one, shown on the screen, where that is taken."""
     if _is_free(DEFAULT_PORT):
         return DEFAULT_PORT
     port = _any_port()
@@ -144,7 +143,7 @@ def run_processes(options: RunOptions, screen: Screen) -> Outcome:
     """Run a scenario as real processes; the record is finished whatever happens.
 
     Raises:
-        KeyboardInterrupt: with the reason, where nothing flew yet, or somebody would not wait for the end.
+        KeyboardInterrupt: with the reason, where nothing flew yet, or Ctrl-C came twice.
     """
     try:
         with handled_by(_interrupt):
@@ -186,7 +185,7 @@ def _run_on_free_port(options: RunOptions, screen: Screen, launcher: RoleLaunche
 
 
 def _lost_port(outcome: Outcome, endpoint: str, port: int) -> bool:
-    """Tell whether somebody else took the port between our look at it and our world's start."""
+    """Return whether somebody else took the port between our look at it and our world's start."""
     return outcome.failed and f"cannot listen on {endpoint}" in outcome.reason and not _is_free(port)
 
 

@@ -1,6 +1,6 @@
 """The watch over the processes of a run: what is done when one of them ends, and how all of them end.
 
-Where a process runs, on this machine (child.py) or on another one (remote.py), makes no difference here.
+Where a process runs, on this machine (`ChildProcess`) or on another one (`RemoteProcess`), makes no difference here.
 """
 
 import json
@@ -17,7 +17,7 @@ from zsim.errors import RunError
 from zsim.runtime.progress import ProgressSink
 from zsim.scenario.role_table import on_death
 from zsim.scenario.scenario import OnDeath
-from zsim_deploy.options.terminal import IMPATIENT, REASONS, handled_by
+from zsim_deploy.roles.stop_channel import REASONS, TWICE_INTERRUPTED, handled_by
 
 POLL_S = 0.05  # how often the processes are looked at
 END_S = 8.0  # after the world has ended, how long the others may take; the recorder may have a disk to wait for
@@ -36,7 +36,6 @@ class RunProcess(Protocol):
     name: str
     role: str
     restarts: int
-    started_s: float
 
     @property
     def pid(self) -> int: ...
@@ -68,7 +67,7 @@ class Supervisor:
         show: takes progress.
 
     Attributes:
-        members: to be given before `go`; the world among them.
+        members: to be given before `run`; the world among them.
     """
 
     def __init__(self, on_death: dict[str, OnDeath], show: ProgressSink) -> None:
@@ -109,7 +108,7 @@ class Supervisor:
 
         def on_signal(number: int, _: object) -> None:
             if self._interrupted:
-                raise KeyboardInterrupt(IMPATIENT)
+                raise KeyboardInterrupt(TWICE_INTERRUPTED)
             self._interrupted = REASONS[number]
 
         return handled_by(on_signal)
@@ -192,7 +191,7 @@ class Supervisor:
         new.start()
 
     def is_being_replaced(self, name: str) -> bool:
-        """Tell whether a process is taking the place of another that has not left yet; callable from any thread."""
+        """Return whether a process is taking the place of another that has not left yet; callable from any thread."""
         return name in self._leaving
 
     def _release_replaced(self) -> None:

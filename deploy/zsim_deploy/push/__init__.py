@@ -1,1 +1,1 @@
-"""`zsim push`: wheels gathered here and installed on hosts that have no internet. Imports ssh, inventory and roles."""
+"""`zsim push`: wheels gathered here and installed on hosts that have no internet. Imports hosts, roles, inventory."""

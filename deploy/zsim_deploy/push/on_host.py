@@ -130,7 +130,7 @@ def install(folder: Path, order: dict, children: CommandRunner) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path, who: str) -> Iterator[None]:
-    """Work in a folder alone; while another does, say who, and wait.
+    """Work in a folder alone; while another does, report who, and wait.
 
     Raises:
         OSError: the folder cannot be made or written.

@@ -17,14 +17,20 @@ from rich.text import Text
 
 from zsim import __version__
 from zsim.errors import HostsError, InventoryError
+from zsim_deploy.hosts.host_link import HostLink
+from zsim_deploy.hosts.ssh_connection import shell_line
 from zsim_deploy.inventory.inventory import Host, InventoryFile
 from zsim_deploy.inventory.processes import MODULES, known_extras, needed_extras
-from zsim_deploy.push.installer import Installer, open_installer
-from zsim_deploy.push.package_index import choose_interpreter, interpreter_query, parse_interpreters, wheel_target
+from zsim_deploy.push.installer import (
+    Installer,
+    choose_interpreter,
+    interpreter_query,
+    open_installer,
+    parse_interpreters,
+    wheel_target,
+)
 from zsim_deploy.push.wheelhouse import Wheel, Wheelhouse, WheelSet
 from zsim_deploy.roles import warm_up
-from zsim_deploy.ssh.host_link import HostLink
-from zsim_deploy.ssh.ssh_connection import shell_line
 
 LAUNCHER = "launcher"  # name of this machine among the hosts, in progress lines
 ASK_S = 30.0  # wall time for a host to start a few Pythons; a small computer takes seconds
@@ -61,9 +67,9 @@ async def push(
     if unknown:
         raise InventoryError(unknown)
     wanted = needed_extras(placed.inventory, more)
-    house = Wheelhouse(cache, lambda text: progress(LAUNCHER, text))
+    wheelhouse = Wheelhouse(cache, lambda text: progress(LAUNCHER, text))
     chosen_names = list(dict.fromkeys(names)) or list(hosts)
-    work = [_one(name, hosts[name], placed.folder, wanted[name], house, progress) for name in chosen_names]
+    work = [_one(name, hosts[name], placed.folder, wanted[name], wheelhouse, progress) for name in chosen_names]
     results = await asyncio.gather(*work, return_exceptions=True)
     _raise_all(results)
     return {name: result is True for name, result in zip(chosen_names, results, strict=True)}
@@ -79,7 +85,7 @@ def _raise_all(results: Sequence[Any]) -> None:
 
 
 async def _one(
-    name: str, host: Host, base: Path, wanted: frozenset[str], house: Wheelhouse, progress: Progress
+    name: str, host: Host, base: Path, wanted: frozenset[str], wheelhouse: Wheelhouse, progress: Progress
 ) -> bool:
     """Install on one host; return whether anything had to be done."""
     if host.python:
@@ -90,7 +96,7 @@ async def _one(
         progress(name, "looking what is there")
         python = await _python(link)
         async with open_installer(link, python, host.folder, partial(progress, name)) as program:
-            return await _install(HostInstallation(link, program), wanted, house, partial(progress, name))
+            return await _install(HostInstallation(link, program), wanted, wheelhouse, partial(progress, name))
     except HostsError:
         progress(name, "failed")
         raise
@@ -105,11 +111,11 @@ async def _python(link: HostLink) -> str:
 
 
 async def _install(
-    there: "HostInstallation", wanted: frozenset[str], house: Wheelhouse, progress: Callable[[str], None]
+    there: "HostInstallation", wanted: frozenset[str], wheelhouse: Wheelhouse, progress: Callable[[str], None]
 ) -> bool:
     """Install what is wanted; return whether anything had to be done."""
     await there.look()
-    needed = await house.wheel_set(there.name, wheel_target(there.name, there.facts), wanted)
+    needed = await wheelhouse.wheel_set(there.name, wheel_target(there.name, there.facts), wanted)
     described = " ".join(("zsim", __version__, *(f"+{extra}" for extra in needed.extras)))
     if is_installed(needed, there.facts["installed"]):
         progress(f"{described} is there")
@@ -124,22 +130,22 @@ async def _install(
     return True
 
 
-def is_installed(house: WheelSet, installed: dict[str, Any] | None) -> bool:
-    """Tell whether a host has what it needs, by the note of the last push: perhaps more, but nothing else."""
-    if installed is None or installed["project"] != house.project.sha256:
+def is_installed(wanted: WheelSet, installed: dict[str, Any] | None) -> bool:
+    """Return whether a host has what it needs, by the note of the last push: perhaps more, but nothing else."""
+    if installed is None or installed["project"] != wanted.project.sha256:
         return False
-    return set(house.extras) <= set(installed["extras"]) and not _new(house, installed)
+    return set(wanted.extras) <= set(installed["extras"]) and not _new(wanted, installed)
 
 
-def _new(house: WheelSet, installed: dict[str, Any] | None) -> list[Wheel]:
+def _new(wanted: WheelSet, installed: dict[str, Any] | None) -> list[Wheel]:
     """Return the wheels of other projects that are not installed yet."""
     known = installed["wheels"] if installed else {}
-    return [wheel for wheel in house.others if known.get(wheel.path.name) != wheel.sha256]
+    return [wheel for wheel in wanted.others if known.get(wheel.path.name) != wheel.sha256]
 
 
-def missing(house: WheelSet, facts: dict[str, Any]) -> list[Wheel]:
+def missing(wanted: WheelSet, facts: dict[str, Any]) -> list[Wheel]:
     """Return the wheels that must be copied to a host, small ones last so that progress is smooth."""
-    needed = [house.project, house.pip, *_new(house, facts["installed"])]
+    needed = [wanted.project, wanted.pip, *_new(wanted, facts["installed"])]
     lacking = [wheel for wheel in needed if facts["wheels"].get(wheel.path.name) != wheel.sha256]
     return sorted(lacking, key=lambda wheel: -wheel.size_bytes)
 
@@ -156,14 +162,14 @@ class HostInstallation:
         """Find what is installed."""
         self.facts = await self._program.ask("look", ASK_S)
 
-    async def install(self, house: WheelSet) -> None:
+    async def install(self, wanted: WheelSet) -> None:
         order = {
-            "project": house.project.path.name,
-            "pip": house.pip.path.name,
-            "wheels": [wheel.path.name for wheel in _new(house, self.facts["installed"])],
-            "extras": house.extras,
-            "modules": [MODULES[extra] for extra in ("", *house.extras) if extra in MODULES],
-            "note": house.manifest(),
+            "project": wanted.project.path.name,
+            "pip": wanted.pip.path.name,
+            "wheels": [wheel.path.name for wheel in _new(wanted, self.facts["installed"])],
+            "extras": wanted.extras,
+            "modules": [MODULES[extra] for extra in ("", *wanted.extras) if extra in MODULES],
+            "note": wanted.manifest(),
         }
         await self._program.ask("install", INSTALL_S, **order)
 

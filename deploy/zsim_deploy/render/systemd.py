@@ -84,7 +84,7 @@ def render(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = ()) 
 
 
 def _refuse(placed: InventoryFile, hosts: Iterable[str]) -> None:
-    """Raise an error with a line for everything that a unit needs and the inventory does not say."""
+    """Raise an error with a line for everything that a unit needs and the inventory lacks."""
     lines = [f"{placed.source}: hosts.{name}.{text}" for name in hosts for text in _lacks(placed.inventory.hosts[name])]
     if lines:
         raise InventoryError(lines)
@@ -92,7 +92,7 @@ def _refuse(placed: InventoryFile, hosts: Iterable[str]) -> None:
 
 def _lacks(host: Host) -> Iterator[str]:
     if host.user is None:
-        yield "user is missing; a unit must say under which user it runs, add it"
+        yield "user is missing; a unit needs the user under which it runs; add it"
     elif not _home(host.user):
         yield f"user is {show(host.user)}; must be letters, digits, `_`, `-` and `.`, at most 31"
     for name, path in (("folder", host.folder), ("python", host.python or "/")):
@@ -207,7 +207,7 @@ def _target(scenario: Scenario, here: Sequence[PlannedProcess], remarks: Sequenc
 
 
 def _remarks(process: PlannedProcess, host: Host) -> list[str]:
-    """Return what a reader has to know that the options do not say."""
+    """Return what a reader has to know that the options do not show."""
     remarks = []
     if not host.folder.startswith("/"):
         remarks.append(f"folder {host.folder} is taken to be in {_home(host.user or '')}; else give an absolute folder")

@@ -15,14 +15,49 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from zsim.transport.tls import KEY, Identity
-from zsim_deploy.options.terminal import IMPATIENT, INTERRUPTED, REASONS
+from zsim_deploy import INTERRUPTED
 
+REASONS: dict[int, str] = {signal.SIGINT: "interrupted by Ctrl-C", signal.SIGTERM: "terminated"}
+TWICE_INTERRUPTED = "interrupted twice, nobody was waited for"
 TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it
 GRACE_S = 4.0  # a role that hangs after a request to stop is ended; the world waits 5 s for byes only if unstopped
 FOLDER = "identity"  # in the folder of a run on a host; the certificates of its processes are below
+
+
+@contextmanager
+def handled_by(handler: Callable[[int, Any], None]) -> Iterator[None]:
+    """Hand these signals to a function, and afterwards to whom they went before."""
+    former = {number: signal.signal(number, handler) for number in REASONS}
+    try:
+        yield
+    finally:
+        for number, before in former.items():
+            signal.signal(number, before)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Raise KeyboardInterrupt at these signals, also where a library in between loses it and fails in another way."""
+    asked = False
+
+    def on_signal(*_: object) -> None:
+        nonlocal asked
+        asked = True
+        raise KeyboardInterrupt
+
+    with handled_by(on_signal):
+        try:
+            yield
+        except Exception as error:
+            if asked:
+                raise KeyboardInterrupt from error
+            raise
 
 
 class KeyLease:
@@ -72,11 +107,11 @@ class StopChannel:
         return self._reason
 
     def stopped(self) -> bool:
-        """Tell whether to stop."""
+        """Return whether to stop."""
         return self._reason is not None
 
     def orphaned(self) -> bool:
-        """Tell whether the launcher is gone, or does not want this end: for all others it is a death, no leave."""
+        """Return whether the launcher is gone, or does not want this end: for all others it is a death, no leave."""
         return self._orphaned
 
     def exit_if_terminated(self) -> None:
@@ -103,7 +138,7 @@ class StopChannel:
 
     def _on_interrupt(self, *_: object) -> None:
         if self._reason is not None:
-            os.write(2, f"{IMPATIENT}\n".encode())
+            os.write(2, f"{TWICE_INTERRUPTED}\n".encode())
             os._exit(INTERRUPTED)
         self._stop(REASONS[signal.SIGINT])
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from zsim.record import RecordReader
     from zsim_world.playback.playback import PlaybackRange
 
-PATIENCE_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
+SLOW_S = 2.0  # a compiled kernel is loaded within a second, unless the machine is busy
 SHOWN_EVENTS = 2000  # events shown per run besides those below; all of them are in the record
 HEALTH_PERIOD_S = 0.5  # of one process; contract: 1 Hz, but anybody can publish more
 VITAL = frozenset({"death", "doubled", "end"})  # how a run ends, and why; and what is wrong with who takes part
@@ -43,7 +43,7 @@ def world(
     from zsim_world.server.world_process import run
 
     stop = StopChannel(launched, identity)
-    with _patience(JsonProgress() if launched else None):
+    with _slow_start_notice(JsonProgress() if launched else None):
         run_world = World(scenario, mode, rate, time.monotonic_ns, launched)
     for name in expect or ():
         run_world.barrier.expect(name)
@@ -60,15 +60,15 @@ def world(
 
 
 @contextmanager
-def _patience(teller: JsonProgress | None) -> Iterator[None]:
-    """Say what takes so long the first time that a machine runs the world."""
+def _slow_start_notice(progress: JsonProgress | None) -> Iterator[None]:
+    """Show what takes so long the first time that a machine runs the world."""
     from zsim.math.compiled import is_kept
     from zsim_world.fleet.kernel import advance
 
     text = "compiling the world's kernel; later runs on this machine find it compiled"
     if is_kept(advance):
         text = "loading the world's kernel; this machine is busy"
-    timer = threading.Timer(PATIENCE_S, teller.say if teller else print, args=(text,))
+    timer = threading.Timer(SLOW_S, progress.say if progress else print, args=(text,))
     timer.start()
     try:
         yield

@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 from refused import refused
 
-from zsim.errors import RunError
+from zsim.errors import RunError, ScenarioError
 from zsim.runtime.group import AgentGroup
 from zsim.scenario import rights, scenario_file
 from zsim.scenario.role_table import AGENTS, Role
 from zsim.transport.tls import Identity
-from zsim_agents.hosting import agents_of, chosen, hosted
+from zsim_agents.hosting import agents_of, check_classes, chosen, hosted
 from zsim_deploy.roles import roles
 from zsim_world.flight.world import World
 
@@ -94,3 +94,18 @@ def test_a_certificate_is_for_one_process(tmp_path: Path):
     with pytest.raises(RunError, match=said):
         roles.check_certificate(group, Identity(tls=tmp_path))
     roles.check_certificate(group, Identity())
+
+
+def test_every_class_that_a_scenario_names_is_loaded_before_it_flies():
+    names = {
+        "estimation.algorithm": "no.estimator:A",
+        "clusters.main.space": "no.space:B",
+        "clusters.main.law": "no.law:C",
+    }
+    overrides = [f"{path}={name}" for path, name in names.items()]
+    scenario = scenario_file.load(Path(__file__).parents[3] / "scenarios" / "step.yaml", overrides)
+    with pytest.raises(ScenarioError) as raised:
+        check_classes(scenario, "step.yaml")
+    lines = raised.value.faults
+    assert [next(name for name in names.values() if name in line) for line in lines] == list(names.values())
+    check_classes(STEP, "step.yaml")

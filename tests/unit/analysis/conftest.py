@@ -2,7 +2,7 @@
 
 import pytest
 
-from zsim_analysis.report.canvas import ReportFigure
+from zsim_analysis.report.pages import ReportFigure
 
 PNG = b"\x89PNG"
 

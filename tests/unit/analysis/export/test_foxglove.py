@@ -25,11 +25,11 @@ from zsim.math.frames import quaternion_from_rpy, rotation_matrix
 from zsim.record import RecordReader
 from zsim_agents.formation.spaces.cluster_space import SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import cluster_space
+from zsim_analysis.export import Format
 from zsim_analysis.export.foxglove_messages import NumericMessageType
 from zsim_analysis.export.foxglove_scene import Instant
 from zsim_analysis.export.foxglove_topics import FoxgloveFile
 from zsim_analysis.export.make_export import export
-from zsim_analysis.export.output import Format
 from zsim_analysis.export.selection import MessageSelection
 
 DRONES = ("drone1", "a-b.c", "end")

@@ -26,12 +26,12 @@ from typer.testing import CliRunner
 from zsim.contract import flight_messages, keys, messages
 from zsim.errors import ReportError, RunError
 from zsim.record import RecordReader, RecordWriter
-from zsim_analysis.export import matlab, output
-from zsim_analysis.export.make_export import export
+from zsim_analysis.export import Format, matlab
+from zsim_analysis.export.make_export import export, placed
 from zsim_analysis.export.matlab import matlab_names
 from zsim_analysis.export.message_columns import fields, table_name
-from zsim_analysis.export.output import Format, placed
 from zsim_analysis.export.selection import MessageSelection
+from zsim_deploy import arguments
 from zsim_deploy.cli.cli import app
 
 GATES = 301  # of six seconds
@@ -344,7 +344,7 @@ def test_nothing_to_export_is_one_line(tmp_path: Path) -> None:
 
 
 def test_what_is_not_installed_is_named(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(output, "find_spec", lambda module: None if module == "foxglove" else module)
+    monkeypatch.setattr(arguments, "find_spec", lambda module: None if module == "foxglove" else module)
     done = CliRunner().invoke(app, ["export", str(run), "--format", "foxglove"])
     assert has_terms(str(done.exception), "foxglove", "zsim[export]")
 
@@ -369,7 +369,8 @@ def test_the_command_prints_what_it_wrote(run: Path, tmp_path: Path) -> None:
 EXPORT = """
     import resource, sys
     from pathlib import Path
-    from zsim_analysis.export.make_export import Format, export
+    from zsim_analysis.export import Format
+    from zsim_analysis.export.make_export import export
     print("begun", flush=True)
     export(Path(sys.argv[1]), Format(sys.argv[2]))
     print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)

@@ -17,7 +17,6 @@ from synthetic_record import Flown
 from typer.testing import CliRunner
 
 from zsim.errors import RecordError, ReportError
-from zsim_analysis.report.canvas import STYLES, run_style
 from zsim_analysis.report.comparison import (
     ABSENT,
     THERE,
@@ -29,8 +28,8 @@ from zsim_analysis.report.comparison import (
     scenario_rows,
 )
 from zsim_analysis.report.comparison_figures import comparison_figures
-from zsim_analysis.report.make_comparison import STATISTICS, compare, comparison_path, fact_rows, statistics_rows
-from zsim_analysis.report.make_report import judge
+from zsim_analysis.report.make_report import STATISTICS, compare, comparison_path, fact_rows, judge, statistics_rows
+from zsim_analysis.report.pages import STYLES, run_style
 from zsim_deploy.cli.cli import app
 
 WINDOW = "report.window_s=[2, 9.98]"

@@ -25,8 +25,8 @@ from zsim.errors import RecordError, ReportError
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim_analysis.reading.formation import window
-from zsim_analysis.report.canvas import thinned
 from zsim_analysis.report.make_report import judge, make_report, page, table
+from zsim_analysis.report.pages import thinned
 
 NAMES = ["x_c", "y_c", "z_c", "roll", "pitch", "yaw", "phi_1", "phi_2", "phi_3", "p", "q", "beta"]
 AMPLITUDE = np.array([0.12, 0.13, 0.03, 0.02, 0.01, 0.07, 0.05, 0.06, 0.04, 0.28, 0.3, 0.08])

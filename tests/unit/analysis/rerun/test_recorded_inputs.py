@@ -15,7 +15,7 @@ from zsim.contract.run_messages import Bye, Clock, ClusterRequest, Event, Health
 from zsim.record import RecordReader, RecordWriter
 from zsim.scenario import scenario_file
 from zsim.schema.message import Message
-from zsim_analysis.rerun.recorded_inputs import AgentProcess, RecordedAgents, gates, recorded_agents
+from zsim_analysis.reading.recorded_run import AgentProcess, RecordedAgents, gates, recorded_agents
 from zsim_world.flight.world import World
 
 GATE_NS = 20_000_000

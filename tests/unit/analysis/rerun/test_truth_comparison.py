@@ -10,7 +10,7 @@ from refused import has_terms
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Mode, Truth
 from zsim.schema.message import Message
-from zsim_analysis.rerun.truth_comparison import OutputComparison, TruthComparison, difference
+from zsim_analysis.rerun_bus import OutputComparison, TruthComparison, difference
 
 GATE_NS = 20_000_000
 ZEROS = (0.0, 0.0, 0.0)

@@ -16,15 +16,10 @@ from zsim.math.random_streams import stream
 from zsim_analysis.sweep.design import SweepDesign, SweepPlan
 from zsim_analysis.sweep.make_sweep_report import make_sweep_report
 from zsim_analysis.sweep.make_sweep_report import table as shown_table
-from zsim_analysis.sweep.points import (
-    SweepResults,
-)
+from zsim_analysis.sweep.points import SweepResults
 from zsim_analysis.sweep.sweep_figures import slices
-from zsim_analysis.sweep.sweep_folder import (
-    locked,
-    read_table,
-)
-from zsim_analysis.sweep.sweep_row import Row
+from zsim_analysis.sweep.sweep_folder import locked, read_table
+from zsim_analysis.sweep.sweep_run import Row
 
 
 def report_of(tmp_path: Path, of: SweepPlan, rows: list[Row]) -> str:

@@ -11,7 +11,7 @@ from zsim.errors import RunError
 from zsim.scenario import scenario_file
 from zsim_analysis.sweep import process_pool
 from zsim_analysis.sweep.process_pool import READY
-from zsim_analysis.sweep.sweep_row import Row, Task
+from zsim_analysis.sweep.sweep_run import Row, Task
 
 ONE = """
 name: one

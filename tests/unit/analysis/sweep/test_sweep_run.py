@@ -19,8 +19,7 @@ from zsim.scenario import scenario_file
 from zsim_analysis import in_process
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.report.make_report import judge
-from zsim_analysis.sweep.sweep_row import Task
-from zsim_analysis.sweep.sweep_run import engaged_s, fly
+from zsim_analysis.sweep.sweep_run import Task, engaged_s, fly
 from zsim_world.fleet.fleet import DivergedError, Fleet
 
 GATE_NS = 20_000_000

@@ -65,7 +65,7 @@ def test_what_is_no_parameter(text: str):
 def test_what_is_given_elsewhere_or_twice_is_no_parameter(given: list[str], terms: tuple[str, ...]):
     with refused(typer.BadParameter, *terms):
         federation_commands._values(given)
-    assert set(federation_commands.GIVEN_BY) == set(COMMON)
+    assert set(federation_commands.OPTION_OF) == set(COMMON)
 
 
 @pytest.mark.parametrize("value", [10**20, [0, 10**24], {10**20: 1}, "\udcff"], ids=ascii)

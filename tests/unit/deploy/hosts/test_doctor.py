@@ -10,7 +10,8 @@ import pathlib
 import platform
 import socket
 import threading
-from contextlib import contextmanager
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, contextmanager
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 from typing import Any
@@ -21,12 +22,11 @@ from refused import has_terms, refused
 from zsim import __version__
 from zsim.errors import HostsError
 from zsim_deploy.hosts import doctor, probe
-from zsim_deploy.hosts.doctor import HostReport, NetworkPath, compare_reports, path_faults
-from zsim_deploy.hosts.host_check import CheckResult, check_hosts
+from zsim_deploy.hosts.doctor import CheckResult, HostReport, NetworkPath, check_hosts, compare_reports, path_faults
+from zsim_deploy.hosts.host_link import HostLink
+from zsim_deploy.inventory import certificates
+from zsim_deploy.inventory.certificates import CertificateRequest
 from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
-from zsim_deploy.security import certificates
-from zsim_deploy.security.enrolment import CertificateRequest
-from zsim_deploy.ssh.host_link import HostLink
 
 SOUND = {
     "python": platform.python_version(),
@@ -144,8 +144,9 @@ class Silent(HostLink):
         self._said = (out, error)
         self._code = code
 
-    async def open(self) -> Any:
-        return self
+    @asynccontextmanager
+    async def channel(self, retry: bool = False) -> AsyncIterator[Any]:
+        yield self
 
     async def create_process(self, *_command, **_options):
         streams = [asyncio.StreamReader(), asyncio.StreamReader()]
@@ -283,7 +284,7 @@ class Slow:
 
     def sendall(self, data: bytes) -> None:
         took_s = 8 * len(data) / self._bits_per_s
-        if took_s > probe.PATIENCE_S:
+        if took_s > probe.TIMEOUT_S:
             raise TimeoutError("timed out")
         self.now_s += took_s
 

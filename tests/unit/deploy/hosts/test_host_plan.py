@@ -13,9 +13,8 @@ from zsim.scenario import scenario_file
 from zsim_deploy.cli import hosts_commands
 from zsim_deploy.hosts.control_socket import ControlSocket
 from zsim_deploy.hosts.host_plan import HostPlan
-from zsim_deploy.inventory import inventory
-from zsim_deploy.security import certificates
-from zsim_deploy.security.enrolment import Enrolment
+from zsim_deploy.inventory import certificates, inventory
+from zsim_deploy.inventory.enrolment import Enrolment
 
 SCENARIO = """
 name: pair
@@ -123,7 +122,7 @@ def test_a_federation_that_is_up_already_is_refused_before_any_host_is_asked(
         ControlSocket("zsim", {}),
         refused(RunError, "'zsim'", "up already", "--set federation=NAME"),
     ):
-        hosts_commands.up(*paths, out=tmp_path / "out")
+        hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
     with ControlSocket("zsim", {}), refused(HostsError, "h1", "reached"):
         hosts_commands.up(*paths, out=tmp_path / "out", set_=["federation=other"], insecure=True)

@@ -11,10 +11,10 @@ import pytest
 from refused import has_terms
 
 from zsim.errors import HostsError
+from zsim_deploy.hosts.host_link import HostLink
+from zsim_deploy.hosts.host_plan import leftover_lines, leftovers, port_faults, scp
 from zsim_deploy.hosts.launcher_requests import _refuse_unless_able
-from zsim_deploy.hosts.leftover_runs import leftover_lines, leftovers, port_faults, scp
 from zsim_deploy.inventory.inventory import Host
-from zsim_deploy.ssh.host_link import HostLink
 
 WAITS = "import sys; print('there', flush=True); sys.stdin.read()"
 

@@ -12,8 +12,8 @@ import pytest
 from refused import has_terms
 
 from zsim.errors import HostsError
+from zsim_deploy.hosts.host_link import EventLoopThread
 from zsim_deploy.hosts.remote_process import LOST, ProcessLog, RemoteProcess
-from zsim_deploy.ssh.host_link import EventLoopThread
 
 FILES = {"identity/estimator.d1/key.pem": b"secret"}
 PATIENCE_S = 20.0  # after which a test that waits for ever fails
@@ -62,13 +62,13 @@ class Link:
         self._then = then
         self.brought: list[tuple[str, dict[str, bytes]]] = []
 
-    async def put_files(self, folder: str, files: dict[str, bytes], *_: Any, patient: bool) -> None:
-        assert patient
+    async def put_files(self, folder: str, files: dict[str, bytes], *_: Any, retry: bool) -> None:
+        assert retry
         self.brought.append((folder, files))
 
     @asynccontextmanager
-    async def channel(self, patient: bool = False) -> AsyncIterator["Link"]:
-        assert patient
+    async def channel(self, retry: bool = False) -> AsyncIterator["Link"]:
+        assert retry
         yield self
 
     def create_process(self, *_: Any, **__: Any) -> Process:
@@ -80,7 +80,7 @@ class Absent(Link):
     """A link to a host that is not there."""
 
     @asynccontextmanager
-    async def channel(self, patient: bool = False) -> AsyncIterator[Link]:
+    async def channel(self, retry: bool = False) -> AsyncIterator[Link]:
         if isinstance(self._then, Exception):
             raise self._then
         await asyncio.Event().wait()

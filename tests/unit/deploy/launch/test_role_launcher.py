@@ -196,9 +196,9 @@ def test_the_fork_server_ends_with_its_launcher() -> None:
 
 def test_what_takes_long_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
-    monkeypatch.setattr(module, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(module, "SLOW_S", 0.0)
     with RoleLauncher(said.append):
-        assert said == [module.PATIENCE] or sys.platform != "linux"
+        assert said == [module.SLOW_NOTICE] or sys.platform != "linux"
 
 
 @LINUX

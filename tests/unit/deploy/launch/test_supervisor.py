@@ -30,7 +30,7 @@ class Member:
 
     def __init__(self, name: str, *codes: int | None, lives_for: int = 0) -> None:
         self.name, self.role = name, name.split(".")[0]
-        self.restarts, self.started_s, self.pid = 0, 0.0, 0
+        self.restarts, self.pid = 0, 0
         self._codes, self._left, self._lives_for = list(codes), 0, lives_for
         self.code: int | None = None
         self.stopped_for: str | None = None

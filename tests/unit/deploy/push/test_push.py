@@ -17,13 +17,13 @@ import pytest
 from refused import has_terms, refused
 
 from zsim.errors import HostsError, InventoryError
+from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.inventory import inventory
 from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
 from zsim_deploy.push import on_host
 from zsim_deploy.push.installer import open_installer
 from zsim_deploy.push.push import ASK_S, is_installed, missing, push
 from zsim_deploy.push.wheelhouse import Wheel, WheelSet
-from zsim_deploy.ssh.host_link import HostLink
 
 
 def wheel(name: str, size_bytes: int = 1, sha256: str | None = None) -> Wheel:
@@ -82,6 +82,13 @@ class Local:
         assert self.process.stdin is not None
         self.process.stdin.close()
 
+    async def wait_closed(self) -> None:
+        await self.process.wait()
+
+    @property
+    def exit_status(self) -> int | None:
+        return self.process.returncode
+
 
 class Text:
     """The text of a stream of bytes."""
@@ -105,7 +112,7 @@ class Greeting(HostLink):
         self.processes: list[Local] = []
 
     @contextlib.asynccontextmanager
-    async def channel(self, patient: bool = False) -> AsyncIterator[Any]:
+    async def channel(self, retry: bool = False) -> AsyncIterator[Any]:
         try:
             yield self
         finally:

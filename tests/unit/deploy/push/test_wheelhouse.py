@@ -17,9 +17,9 @@ import pytest
 from refused import has_terms, refused
 
 from zsim.errors import HostsError
-from zsim_deploy.push import package_index, wheelhouse
-from zsim_deploy.push.package_index import PipError, WheelTarget, download_wheels, pip, wheel_target
-from zsim_deploy.push.wheelhouse import Wheelhouse, WheelSet, requirement
+from zsim_deploy.push import wheelhouse
+from zsim_deploy.push.installer import WheelTarget, wheel_target
+from zsim_deploy.push.wheelhouse import PipError, Wheelhouse, WheelSet, download_wheels, pip, requirement
 
 BACKEND = """
 # A build backend without dependencies: a wheel with one module.
@@ -99,19 +99,19 @@ def checkout(index: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 def test_a_wheel_that_does_not_exist_is_what_pip_says(index: Path, tmp_path: Path) -> None:
     with refused(PipError, "requirement numpy"):
-        asyncio.run(download_wheels(["numpy"], ELSEWHERE, tmp_path / "into", []))
+        asyncio.run(download_wheels(["numpy"], ELSEWHERE, tmp_path / "into", [], print))
 
 
 @pytest.mark.parametrize("aim", [here(), ELSEWHERE], ids=["here", "elsewhere"])
 def test_a_project_without_wheels_is_built_here_also_for_others(index: Path, tmp_path: Path, aim: WheelTarget) -> None:
     into = tmp_path / "into"
-    assert not asyncio.run(download_wheels(["gadget"], aim, into, []))
+    assert not asyncio.run(download_wheels(["gadget"], aim, into, [], print))
     assert [path.name for path in into.iterdir()] == ["gadget-1.0-py3-none-any.whl"]
 
 
 def test_versions_are_those_of_here_and_others_only_where_there_are_none(index: Path, tmp_path: Path) -> None:
-    assert not asyncio.run(download_wheels(["gadget"], ELSEWHERE, tmp_path / "same", ["gadget==1.0"]))
-    assert asyncio.run(download_wheels(["gadget"], ELSEWHERE, tmp_path / "other", ["gadget==0.9"]))
+    assert not asyncio.run(download_wheels(["gadget"], ELSEWHERE, tmp_path / "same", ["gadget==1.0"], print))
+    assert asyncio.run(download_wheels(["gadget"], ELSEWHERE, tmp_path / "other", ["gadget==0.9"], print))
 
 
 def house(folder: Path, extras: list[str], host: str = "h") -> tuple[WheelSet, list[str]]:
@@ -185,8 +185,7 @@ def test_an_index_that_cannot_be_reached_is_no_missing_wheel(
         calls.append(arguments)
         await pip(*arguments, **options)
 
-    for module in (wheelhouse, package_index):
-        monkeypatch.setattr(module, "pip", counted)
+    monkeypatch.setattr(wheelhouse, "pip", counted)
     told: list[str] = []
     kept = Wheelhouse(tmp_path / "cache", told.append)
     for _ in range(2):
@@ -211,7 +210,7 @@ def test_what_is_in_a_folder_needs_no_index(checkout: Path, no_index: None, tmp_
     ],
 )  # fmt: skip
 def test_why_an_index_does_not_answer_is_said_without_what_surrounds_it(shown: str, terms: tuple[str, ...]) -> None:
-    assert has_terms(package_index._reason(shown), *terms)
+    assert has_terms(wheelhouse._reason(shown), *terms)
 
 
 class Installed:

@@ -166,7 +166,7 @@ def test_names_that_begin_with_a_dash_are_names(target: str, tmp_path: Path) -> 
         read = parameters(words)
         assert read["host"] == host
         thing = name.partition(".")[2]
-        assert not thing or thing in (*read.get("drones", ()), read.get("cluster"), read.get("name"))
+        assert not thing or thing in (*read.get("things", ()), read.get("thing"), read.get("name"))
 
 
 def parameters(words: list[str]) -> dict[str, Any]:

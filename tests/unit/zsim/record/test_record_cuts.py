@@ -17,8 +17,8 @@ from zsim.contract import messages
 from zsim.errors import RecordError, ZsimError
 from zsim.record import Recorded, RecordReader, repair
 from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, MAGIC, RecordSpan, places
+from zsim_analysis.export import Format
 from zsim_analysis.export.make_export import export
-from zsim_analysis.export.output import Format
 from zsim_analysis.export.selection import MessageSelection
 from zsim_analysis.report.make_report import judge
 

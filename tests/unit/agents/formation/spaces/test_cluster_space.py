@@ -9,12 +9,7 @@ from hypothesis import strategies as st
 from refused import refused
 
 from zsim.scenario.scenario import ROBOTS_MAX
-from zsim_agents.formation.spaces.cluster_space import (
-    SingularClusterError,
-    closest_pair,
-    robot_rates,
-    unit,
-)
+from zsim_agents.formation.spaces.cluster_space import SingularClusterError, closest_pair, robot_rates, unit
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 
 SIZES = (2, 3, 4, 5, 8)

@@ -20,12 +20,26 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from zsim.errors import RunError
 from zsim.scenario.rights import OPERATOR
 from zsim.transport.tls import AUTHORITY, CERTIFICATE, CERTIFICATES, DAYS, KEY
-from zsim_deploy.security.enrolment import OPERATORS, CertificateRequest
 
 AUTHORITY_DAYS = 1825  # 5 years; its key never leaves the machine that made it
 BACK = timedelta(days=1)  # hosts in the field have clocks that are hours off
 EXPIRED = "expired on"  # a day
+OPERATORS = "operators"  # folder of the operators that are at no host of the inventory
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
+
+
+class CertificateRequest(NamedTuple):
+    """A certificate that is to be there.
+
+    Attributes:
+        host: name of the host in the inventory; a folder.
+        process: name of the process; the common name.
+        addresses: of the host, IP or DNS.
+    """
+
+    host: str
+    process: str
+    addresses: tuple[str, ...] = ()
 
 
 Root = x509.Certificate

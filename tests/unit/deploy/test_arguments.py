@@ -5,7 +5,7 @@ from typing import Any
 import typer
 from typer.testing import CliRunner
 
-from zsim_deploy.options.arguments import DEFAULT_ENDPOINT, LOOK_S, WorldAccess, observer_options, participant_options
+from zsim_deploy.arguments import DEFAULT_ENDPOINT, LOOK_S, WorldAccess, observer_options, participant_options
 
 
 def given(decorate: Any, *arguments: str) -> tuple[WorldAccess, str, int]:

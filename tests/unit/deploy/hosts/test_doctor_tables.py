@@ -6,8 +6,7 @@ import pytest
 from refused import has_terms
 from rich.console import Console
 
-from zsim_deploy.hosts.doctor import HostReport, NetworkPath
-from zsim_deploy.hosts.host_check import _hosts_table, _paths_table
+from zsim_deploy.hosts.doctor import HostReport, NetworkPath, _hosts_table, _paths_table
 
 SAID = {"python": "3.11.2", "zsim": "1", "fingerprint": "abc", "cores": 2, "load": 0.1, "governors": ["[/x]"]}
 

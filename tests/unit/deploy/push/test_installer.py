@@ -6,7 +6,7 @@ import pytest
 from refused import has_terms, refused
 
 from zsim.errors import HostsError
-from zsim_deploy.push.package_index import (
+from zsim_deploy.push.installer import (
     Interpreter,
     choose_interpreter,
     interpreter_query,

@@ -14,12 +14,10 @@ from typer.testing import CliRunner
 from zsim.errors import RunError
 from zsim.scenario import scenario_file
 from zsim_deploy.cli.cli import app
-from zsim_deploy.hosts.host_check import check_hosts
-from zsim_deploy.inventory import inventory
-from zsim_deploy.security import certificates
-from zsim_deploy.security.certificate_check import certificate_faults, exposed_keys
-from zsim_deploy.security.certificates import issue
-from zsim_deploy.security.enrolment import CertificateRequest
+from zsim_deploy.hosts.doctor import check_hosts
+from zsim_deploy.inventory import certificates, inventory
+from zsim_deploy.inventory.certificates import CertificateRequest, issue
+from zsim_deploy.inventory.enrolment import certificate_faults, exposed_keys
 
 SCENARIO = """
 name: pair

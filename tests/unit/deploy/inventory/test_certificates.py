@@ -15,9 +15,8 @@ from refused import has_terms, refused
 
 from zsim.errors import RunError
 from zsim.transport.tls import Identity, own_fault
-from zsim_deploy.security import certificates
-from zsim_deploy.security.certificates import DAYS, issue, renewal_reason
-from zsim_deploy.security.enrolment import CertificateRequest
+from zsim_deploy.inventory import certificates
+from zsim_deploy.inventory.certificates import DAYS, CertificateRequest, issue, renewal_reason
 
 NOW = datetime(2026, 11, 1, 12, tzinfo=UTC)
 ESTIMATOR = CertificateRequest("h1", "estimator.drone1", ("10.0.0.1",))

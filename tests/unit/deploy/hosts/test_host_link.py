@@ -12,10 +12,10 @@ import pytest
 from refused import has_terms, refused
 
 from zsim.errors import HostsError
+from zsim_deploy.hosts import host_link
+from zsim_deploy.hosts.host_link import CHANNELS, EventLoopThread, HostLink
+from zsim_deploy.hosts.host_links import HostLinks
 from zsim_deploy.inventory.inventory import Host, Inventory, InventoryFile
-from zsim_deploy.ssh import host_link
-from zsim_deploy.ssh.host_link import CHANNELS, EventLoopThread, HostLink
-from zsim_deploy.ssh.host_links import HostLinks
 
 FILES = {"identity/world/key.pem": b"secret\n", "scenario.yaml": b"name: one\n" * 5000}
 

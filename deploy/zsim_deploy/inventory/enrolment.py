@@ -1,4 +1,6 @@
-"""Who needs a certificate, and which rights each listening process grants: from an inventory and a scenario. Pure.
+"""Who needs a certificate, and which rights each listening process grants: from an inventory and a scenario.
+
+At the end, whether the certificates that a run needs are there and good, before anything is started with them.
 
 Zenoh judges at the process that listens (the world, a router), by the common name in the certificate of the other
 side, both ways: what comes in from it and what goes out to it. An expression is allowed if a rule's includes it.
@@ -6,19 +8,23 @@ docs.rs/zenoh-config, AclConfig.
 """
 
 import shlex
+import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from zsim.contract import keys
-from zsim.errors import InventoryError
+from zsim.errors import InventoryError, RunError
 from zsim.scenario import rights
 from zsim.scenario.rights import OPERATOR, ROUTER, WORLD, Rights
 from zsim.scenario.scenario import Scenario
+from zsim.transport.tls import AUTHORITY, KEY
+from zsim_deploy.inventory import certificates
 from zsim_deploy.inventory import inventory as inv
+from zsim_deploy.inventory.certificates import OPERATORS, CertificateRequest
 from zsim_deploy.inventory.inventory import InventoryFile
 
-OPERATORS = "operators"  # folder of the operators that are at no host of the inventory
 # (flow, messages, whose keys): what a right is on the wire, seen from the process that listens
 _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("ingress", ("declare_subscriber",), "reads"),
@@ -44,22 +50,7 @@ def folder_of(placed: InventoryFile) -> Path:
 
 def init_command(placed: InventoryFile, renew: bool = False) -> str:
     """Return the command that makes an inventory's certificates, as a person types it."""
-    words = ["zsim", "certs", "init", str(placed.folder / placed.source)]
-    return " ".join([shlex.join(words), "--scenario FILE", *(["--renew"] if renew else [])])
-
-
-class CertificateRequest(NamedTuple):
-    """A certificate that is to be there.
-
-    Attributes:
-        host: name of the host in the inventory; a folder.
-        process: name of the process; the common name.
-        addresses: of the host, IP or DNS.
-    """
-
-    host: str
-    process: str
-    addresses: tuple[str, ...] = ()
+    return f"zsim certs init {placed.word} --scenario FILE{' --renew' if renew else ''}"
 
 
 class Enrolment:
@@ -184,3 +175,88 @@ def _rule(
         "messages": list(messages),
         "key_exprs": [f"{federation}/{expression}" for expression in expressions],
     }
+
+
+SHOWN_MAX = 4  # names in a line; all of them are missing together as a rule
+READABLE_BY_OTHERS = stat.S_IRGRP | stat.S_IROTH
+
+
+def certificate_faults(placed: InventoryFile, places: Mapping[str, str] | None, now: datetime) -> list[str]:
+    """Return what of the certificates and access control of a run is missing or of no use, a line for each fault.
+
+    Args:
+        placed: the inventory.
+        places: host of each process that is to be started; its routers need not be among them. None takes the world.
+        now: wall time, with its zone.
+    """
+    if placed.inventory.security.insecure:
+        return []
+    folder = folder_of(placed)
+    try:
+        if not (folder / AUTHORITY).exists():
+            return [
+                f"{folder}: has no certificates; {_mend(placed)}, or set security.insecure on a network of your own"
+            ]
+        by_fault = _by_fault(placed, folder, places, now)
+    except RunError as error:
+        return [str(error)]
+    except OSError as error:
+        return [f"{folder}: cannot be read ({error.strerror}); it belongs to who made it"]
+    return [f"{folder}: {fault}: {_names(who)}; {_mend(placed, fault)}" for fault, who in by_fault.items()]
+
+
+def exposed_keys(placed: InventoryFile) -> str | None:
+    """Return a warning of private keys that others than their owner can read; None if there are none."""
+    if placed.inventory.security.insecure:
+        return None
+    folder = folder_of(placed)
+    keys = sorted(path for path in (folder / "ca.key", *folder.glob(f"*/*/{KEY}")) if _readable_by_others(path))
+    if not keys:
+        return None
+    more = f" and {len(keys) - 1} private keys more" if len(keys) > 1 else ""
+    return f"{keys[0]}{more} can be read by others on this machine; chmod -R go= {shlex.quote(str(folder))}"
+
+
+def _by_fault(
+    placed: InventoryFile, folder: Path, places: Mapping[str, str] | None, now: datetime
+) -> dict[str, list[str]]:
+    """Return what is wrong, and with whose certificates, `NAME on HOST`."""
+    places_or_world = inv.spread(placed.inventory.roles, [WORLD]) if places is None else places
+    routers = {f"{ROUTER}.{name}": router.host for name, router in placed.inventory.routers.items()}
+    root = certificates.root(folder)
+    names: dict[str, list[str]] = {}
+    for name, host in {**places_or_world, **routers}.items():
+        wanted = CertificateRequest(host, name, (placed.inventory.hosts[host].address,))
+        if fault := _fault(folder, root, wanted, now):
+            names.setdefault(fault, []).append(f"{name} on {host}")
+    return names
+
+
+def _fault(folder: Path, root: certificates.Root, wanted: CertificateRequest, now: datetime) -> str | None:
+    """Return what is wrong with a certificate, and with the access control beside it; None if nothing is."""
+    listens = wanted.process == WORLD or wanted.process.startswith(f"{ROUTER}.")
+    why = certificates.renewal_reason(folder, root, wanted, now)
+    if why == "new":
+        return "certificate missing"
+    if why == "other addresses":
+        return "certificate for other addresses" if listens else None  # nobody asks a client for its address
+    if why:
+        return f"certificate {why}"
+    there = (folder / wanted.host / f"{wanted.process}.access.json").exists()
+    return None if there or not listens else "access control missing"
+
+
+def _mend(placed: InventoryFile, fault: str = "") -> str:
+    return f"make them with `{init_command(placed, renew=certificates.EXPIRED in fault)}`"
+
+
+def _names(who: list[str]) -> str:
+    more = len(who) - SHOWN_MAX
+    return ", ".join(who[:SHOWN_MAX]) + (f" and {more} more" if more > 0 else "")
+
+
+def _readable_by_others(path: Path) -> bool:
+    try:
+        return bool(path.stat().st_mode & READABLE_BY_OTHERS)
+    except OSError:
+        return False

@@ -1,15 +1,17 @@
-"""The ssh links to all hosts of a run, and a file copied from a host to here."""
+"""The ssh links to all hosts of a run, a program of ours that runs on a host, and a file copied from there."""
 
 import asyncio
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import asyncssh
 
 from zsim.errors import HostsError, ZsimError
+from zsim_deploy.hosts.host_link import CLOSE_S, EventLoopThread, HostLink
+from zsim_deploy.hosts.ssh_connection import json_answer
 from zsim_deploy.inventory.inventory import InventoryFile
-from zsim_deploy.ssh.host_link import CLOSE_S, EventLoopThread, HostLink
 
 OPEN_S = 10.0  # until the host lets us read; a few round trips of a poor link
 STALL_S = 20.0  # without anything more the host is taken for lost; TCP repeats within that what a poor link loses
@@ -43,7 +45,7 @@ class HostLinks:
         self._loop.spawn(link.measure_round_trips())
 
     def listen(self) -> None:
-        """Notice from now on when a host falls silent."""
+        """Measure from now on whether each host answers."""
         for link in self.by_name.values():
             self._loop.spawn(link.measure_round_trips())
 
@@ -77,6 +79,77 @@ async def _bounded(link: HostLink, work: Callable[[HostLink], Coroutine[Any, Any
         return await asyncio.wait_for(work(link), within_s)
     except TimeoutError as error:
         raise HostsError(f"{link.name}: not done within {within_s:g} s; is the link slow, the host busy?") from error
+
+
+class ProgramEndedError(HostsError):
+    """A program on a host has ended without an answer.
+
+    Attributes:
+        status: exit code.
+        last: line that it printed on standard error; empty if it printed nothing.
+    """
+
+    def __init__(self, name: str, status: int | None, last: str) -> None:
+        super().__init__(f"{name}: it ended with code {status} ({last or 'it printed nothing'})")
+        self.status, self.last = status, last
+
+
+class RemoteProgram:
+    """A program of ours on a host, which reads lines and answers each with a line of JSON.
+
+    Args:
+        name: of the host, for errors.
+        process: over there.
+    """
+
+    def __init__(self, name: str, process: "asyncssh.SSHClientProcess[str]") -> None:
+        self._name = name
+        self._process = process
+
+    def send(self, text: str) -> None:
+        """Write to its standard input."""
+        self._process.stdin.write(text)
+
+    async def answer(self, within_s: float, late: str = "") -> dict[str, Any]:
+        """Return its next answer; a greeting of the login shell is passed over.
+
+        Args:
+            within_s: wall time that it may take.
+            late: text of the error if it takes longer, where there is more to tell.
+
+        Raises:
+            ProgramEndedError: it has ended.
+            HostsError: it took longer.
+        """
+        try:
+            async with asyncio.timeout(within_s):
+                while line := await self._process.stdout.readline():
+                    if message := json_answer([line]):
+                        return message
+                lines = (await self._process.stderr.read()).strip().splitlines()
+                await self._process.wait_closed()
+        except TimeoutError as error:
+            slow = f"no answer within {within_s:g} s; is the link slow, the host busy?"
+            raise HostsError(f"{self._name}: {late or slow}") from error
+        raise ProgramEndedError(self._name, self._process.exit_status, lines[-1][:200] if lines else "")
+
+
+@asynccontextmanager
+async def open_program(link: HostLink, command: str) -> AsyncIterator[RemoteProgram]:
+    """Run a program on a host as long as the block lasts.
+
+    Raises:
+        HostsError: the host cannot be reached, or the connection breaks.
+    """
+    try:
+        async with link.channel() as connection:
+            process = await connection.create_process(command, encoding="utf-8", errors="replace")
+            try:
+                yield RemoteProgram(link.name, process)
+            finally:
+                process.close()  # not waited for: on a link that is cut it would take a minute
+    except (asyncssh.Error, OSError) as error:
+        raise HostsError(f"{link.name}: the connection broke ({error}); is the host up?") from error
 
 
 async def fetch(link: HostLink, source: str, into: Path) -> bool:

@@ -18,7 +18,8 @@ from zsim.errors import BadNameError, InventoryError, RunError
 from zsim.scenario import rights, scenario_file
 from zsim_deploy.cli.cli import app
 from zsim_deploy.inventory import inventory
-from zsim_deploy.security.enrolment import CertificateRequest, Enrolment, access_control
+from zsim_deploy.inventory.certificates import CertificateRequest
+from zsim_deploy.inventory.enrolment import Enrolment, access_control
 
 SCENARIO = """
 name: enrolled

@@ -13,8 +13,8 @@ import pytest
 from refused import refused
 
 from zsim.errors import HostsError
-from zsim_deploy.ssh import host_links as module
-from zsim_deploy.ssh.host_links import fetch
+from zsim_deploy.hosts import host_links as module
+from zsim_deploy.hosts.host_links import fetch
 
 Get = Callable[[Path, Callable[..., None]], Awaitable[None]]
 

@@ -1,17 +1,16 @@
-"""Options that several commands share, and those by which a command connects to a world."""
+"""Options that several commands share: those of a flight, and those by which a command connects to a world."""
 
+import inspect
 import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-if TYPE_CHECKING:
-    from zsim.transport.tls import Identity
-import inspect
-from collections.abc import Callable
-from functools import wraps
-from typing import TYPE_CHECKING, NamedTuple
+from zsim.errors import RunError
 
 if TYPE_CHECKING:
     from zsim.transport.tls import Identity
@@ -21,7 +20,6 @@ CONSOLE_PORT = 8080  # of its page
 RUN, HOSTS = "Run", "On several machines"  # panels of the help
 REALTIME = "--realtime"  # of the world and the routers, whose lease it shortens
 LOOK_S = 5.0  # wall; for which a command that a person types waits for a world
-NAME = "reach"  # of the argument
 
 
 def positive(value: float | None) -> float | None:
@@ -36,6 +34,28 @@ def not_negative(value: float | None) -> float | None:
     if value is not None and not 0 <= value < math.inf:
         raise typer.BadParameter(f"is {value:g}; must be a finite number >= 0")
     return value
+
+
+def require(command: str, needs: Mapping[str, Sequence[str]]) -> None:
+    """Refuse to begin without what a command needs.
+
+    Args:
+        command: its name.
+        needs: modules, by the extra that brings them.
+
+    Raises:
+        RunError: with what to install.
+    """
+    missing = {module: extra for extra, modules in needs.items() for module in modules if find_spec(module) is None}
+    if missing:
+        extras = ",".join(sorted(set(missing.values())))
+        raise RunError(f"{command}: {' and '.join(missing)} is not installed; pip install 'zsim[{extras}]'")
+
+
+def check_range(from_: float | None, to: float | None) -> None:
+    """Refuse `--to` before `--from`."""
+    if from_ is not None and to is not None and to < from_:
+        raise typer.BadParameter(f"--to is {to:g}, before --from {from_:g}; must be at or after it")
 
 
 ScenarioPath = Annotated[Path, typer.Argument(help="Scenario file (YAML).", show_default=False)]
@@ -55,6 +75,15 @@ Tls = Annotated[Path | None, typer.Option("--tls", help="Folder of this process'
 Access = Annotated[Path | None, typer.Option("--access", help="Zenoh's access control (zsim certs init).")]
 Host = Annotated[str | None, typer.Option("--host", help="Name of this host, as others see it.")]
 Insecure = Annotated[bool, typer.Option("--insecure", help="Without TLS, on a network that is nobody else's.")]
+
+
+Keys = Annotated[
+    list[str] | None, typer.Option(help="Only these keys, e.g. 'drone/*/truth'. Repeatable.", show_default=False)
+]
+From = Annotated[
+    float | None, typer.Option("--from", callback=not_negative, help="Simulated seconds of the first message.")
+]
+To = Annotated[float | None, typer.Option("--to", callback=not_negative, help="Simulated seconds of the last message.")]
 
 
 def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | None = None) -> "Identity":
@@ -77,16 +106,42 @@ def load_scenario(
     return scenario
 
 
-def mode_and_rate(realtime: bool, rate: float | None) -> tuple[str, float]:
-    """Return the mode of a run, and its pace in simulated per wall seconds; 0 is as fast as it goes."""
-    if rate is not None and not 0 < rate <= 1000:
-        raise typer.BadParameter(f"--rate is {rate:g}; must be > 0 and <= 1000")
-    return ("realtime", rate or 1.0) if realtime else ("lockstep", rate or 0.0)
-
-
 def pace_options(mode: str, rate: float) -> list[str]:
     """Return mode and pace as options of the world."""
     return [*([REALTIME] if mode == "realtime" else []), *(["--rate", str(rate)] if rate else [])]
+
+
+class FlightOptions(NamedTuple):
+    """What is to be flown, and how fast.
+
+    Attributes:
+        path: of the scenario.
+        seed, duration: instead of the scenario's.
+        realtime: paced by the wall clock.
+        rate: simulated per wall second.
+        overrides: texts `a.b.c=value`.
+    """
+
+    path: Path
+    seed: int | None
+    duration: float | None
+    realtime: bool
+    rate: float | None
+    overrides: list[str] | None
+
+    def scenario(self) -> Any:
+        """Return the scenario, with every class that it names loaded here."""
+        return load_scenario(self.path, self.overrides, self.seed, self.duration)
+
+    def mode_and_rate(self) -> tuple[str, float]:
+        """Return the mode of a run, and its pace in simulated per wall seconds; 0 is as fast as it goes."""
+        if self.rate is not None and not 0 < self.rate <= 1000:
+            raise typer.BadParameter(f"--rate is {self.rate:g}; must be > 0 and <= 1000")
+        return ("realtime", self.rate or 1.0) if self.realtime else ("lockstep", self.rate or 0.0)
+
+    def pace(self) -> list[str]:
+        """Return mode and rate as options of the world."""
+        return pace_options(*self.mode_and_rate())
 
 
 class WorldAccess(NamedTuple):
@@ -116,7 +171,17 @@ class WorldAccess(NamedTuple):
         return identity(self.host, self.tls, self.insecure)
 
 
-_OPTIONS: dict[str, tuple[Any, Any]] = {  # annotation and default, in the order of Reach
+Options = Mapping[str, tuple[Any, Any]]
+"""Annotation and default of each option, in the order of the tuple that they make."""
+_FLIGHT: Options = {
+    "scenario": (ScenarioPath, inspect.Parameter.empty),
+    "seed": (Seed, None),
+    "duration": (Duration, None),
+    "realtime": (Realtime, False),
+    "rate": (RateOption, None),
+    "set_": (Set, None),
+}
+_WORLD: Options = {
     "connect": (Connect, DEFAULT_ENDPOINT),
     "federation": (Federation, "zsim"),
     "wait": (Wait, LOOK_S),
@@ -126,29 +191,38 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {  # annotation and default, in the order
 }
 
 
+def flight_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of its argument `flight`."""
+    return _with_options(command, "flight", FlightOptions, _FLIGHT)
+
+
 def observer_options(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command that a person types the options of its argument `reach`."""
-    return _with_options(command, _OPTIONS)
+    return _with_options(command, "reach", WorldAccess, _WORLD)
 
 
 def participant_options(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command that runs a process of a federation the options of its argument `reach`: it waits for a world."""
-    return _with_options(command, {**_OPTIONS, "wait": (Wait, None), "launched": (Launched, None)})
+    options = {**_WORLD, "wait": (Wait, None), "launched": (Launched, None)}
+    return _with_options(command, "reach", WorldAccess, options)
 
 
-def _with_options(command: Callable[..., None], options: dict[str, tuple[Any, Any]]) -> Callable[..., None]:
-    """Return the command as typer is to see it: the options in place of `reach`."""
+def _with_options(
+    command: Callable[..., None], name: str, make: Callable[..., Any], options: Options
+) -> Callable[..., None]:
+    """Return the command as typer is to see it: the options in place of the argument that is made of them."""
 
     @wraps(command)
     def with_options(**values: Any) -> None:
-        reach = WorldAccess(*(values.pop(name, default) for name, (_, default) in options.items()))
-        command(**values, **{NAME: reach})
+        made = make(*(values.pop(option, default) for option, (_, default) in options.items()))
+        command(**values, **{name: made})
 
-    signature = inspect.signature(command, eval_str=True)
-    own = [each.replace(kind=each.KEYWORD_ONLY) for name, each in signature.parameters.items() if name != NAME]
-    more = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-        for name, (annotation, default) in options.items()
+    parameters = [
+        inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        for option, (annotation, default) in options.items()
     ]
-    with_options.__signature__ = signature.replace(parameters=[*own, *more])  # type: ignore[attr-defined]
+    signature = inspect.signature(command, eval_str=True)
+    own = [each.replace(kind=each.KEYWORD_ONLY) for each in signature.parameters.values() if each.name != name]
+    together = [*parameters, *own] if make is FlightOptions else [*own, *parameters]
+    with_options.__signature__ = signature.replace(parameters=together)  # type: ignore[attr-defined]
     return with_options

@@ -1,6 +1,7 @@
-"""The launcher's way to one host: an ssh connection that comes back, commands on it, and how long a word takes.
+"""The launcher's way to one host: an ssh connection that is renewed, commands on it, and its round trip.
 
-All connections live on one event loop in a thread of its own (`Loop`), so that the watch over a run stays a plain loop.
+All connections live on one event loop in a thread of its own (`EventLoopThread`), so that the supervisor of a run stays
+a plain loop.
 """
 
 import asyncio
@@ -18,10 +19,10 @@ from typing import Any, TypeVar
 import asyncssh
 
 from zsim.errors import HostsError
+from zsim_deploy.hosts.ssh_connection import connect, shell_word
 from zsim_deploy.inventory.inventory import Host
-from zsim_deploy.ssh.ssh_connection import connect, shell_word
 
-ECHO_S = 0.5  # how often a word goes to the host and back
+ECHO_S = 0.5  # how often a line goes to the host and back
 RETRY_S = 0.5  # between two attempts to connect again
 CLOSE_S = 1.0  # how long a connection may take to close; a cut one never does
 ANSWER_S = 10.0  # how long a short command may take; a host on a poor link answers within a few round trips
@@ -92,8 +93,8 @@ class HostLink:
         base: folder of the inventory, from which relative paths count.
 
     Attributes:
-        round_trip_s: of the last word that came back.
-        heard_s: monotonic time of it; 0 before the first.
+        round_trip_s: of the last line that came back.
+        answered_s: monotonic time of it; 0 before the first.
     """
 
     def __init__(self, name: str, host: Host, base: Path) -> None:
@@ -115,22 +116,22 @@ class HostLink:
             return (await self._with_room()).connection
 
     @contextlib.asynccontextmanager
-    async def channel(self, patient: bool = False) -> AsyncIterator[asyncssh.SSHClientConnection]:
-        """Lend a connection for one channel.
+    async def channel(self, retry: bool = False) -> AsyncIterator[asyncssh.SSHClientConnection]:
+        """Yield a connection for one channel.
 
         Args:
-            patient: try until the host is there.
+            retry: try until the host is there.
 
         Raises:
-            HostsError: as `open`, if not patient.
+            HostsError: as `open`, if not retry.
         """
-        line = await self._reserved(patient)
+        line = await self._reserved(retry)
         try:
             yield line.connection
         finally:
             line.channels -= 1
 
-    async def _reserved(self, patient: bool) -> PooledConnection:
+    async def _reserved(self, retry: bool) -> PooledConnection:
         while True:
             try:
                 async with self._lock:
@@ -138,7 +139,7 @@ class HostLink:
                     line.channels += 1
                     return line
             except HostsError:
-                if not patient:
+                if not retry:
                     raise
             await asyncio.sleep(RETRY_S)
 
@@ -151,7 +152,7 @@ class HostLink:
         return self._lines[-1]
 
     async def run(
-        self, command: str, stdin: bytes = b"", timeout_s: float = ANSWER_S, what: str = "", patient: bool = False
+        self, command: str, stdin: bytes = b"", timeout_s: float = ANSWER_S, what: str = "", retry: bool = False
     ) -> bytes:
         """Return what a command prints.
 
@@ -160,12 +161,12 @@ class HostLink:
             stdin: its standard input.
             timeout_s: how long it may take.
             what: it does, for errors; its first word if not given.
-            patient: try until the host is there; the time counts from then.
+            retry: try until the host is there; the time counts from then.
 
         Raises:
             HostsError: it failed, or took too long; with the last line that it printed.
         """
-        async with self.channel(patient) as connection:
+        async with self.channel(retry) as connection:
             try:
                 done = await asyncio.wait_for(connection.run(command, input=stdin, encoding=None), timeout_s)
             except TimeoutError as error:
@@ -180,7 +181,7 @@ class HostLink:
         return done.stdout if isinstance(done.stdout, bytes) else b""
 
     async def put_files(
-        self, folder: str, files: Mapping[str, bytes], timeout_s: float = ANSWER_S, patient: bool = False
+        self, folder: str, files: Mapping[str, bytes], timeout_s: float = ANSWER_S, retry: bool = False
     ) -> None:
         """Write files below a folder of the host, readable by their owner alone: all, or none where the link breaks.
 
@@ -188,7 +189,7 @@ class HostLink:
             folder: made if it is not there.
             files: path below the folder to content.
             timeout_s: how long it may take.
-            patient: as `run`.
+            retry: as `run`.
 
         Raises:
             HostsError: they could not be written.
@@ -199,10 +200,10 @@ class HostLink:
         is_whole = f"[ $(wc -c < {part}) -eq {len(content)} ] || {{ echo it came in part >&2; false; }}"
         unpack = f"cat > {part} && {{ {is_whole}; }} && tar -xof {part} -C {into}"
         script = f"umask 077; mkdir -p {into} && {{ {unpack}; code=$?; rm -f {part}; exit $code; }}"
-        await self.run(script, content, timeout_s, what=f"writing into {folder}", patient=patient)
+        await self.run(script, content, timeout_s, what=f"writing into {folder}", retry=retry)
 
     async def measure_round_trips(self) -> None:
-        """Send a word there and back for ever, so that a lost host is noticed within a second."""
+        """Send a line there and back for ever, so that a lost host is noticed within a second."""
         while True:
             with contextlib.suppress(HostsError, asyncssh.Error, OSError):
                 async with self.channel() as connection, connection.create_process("cat", encoding="utf-8") as mirror:

@@ -17,10 +17,8 @@ from zsim.contract.fingerprint import fingerprint
 from zsim.errors import RecordError, RunError
 from zsim.record import RecordReader
 from zsim.runtime.progress import Screen, Throttle
-from zsim_analysis.reading.recorded_run import RecordedRun, open_run
-from zsim_analysis.rerun.recorded_inputs import GateInputs, RecordedAgents, gates, recorded_agents
-from zsim_analysis.rerun.rerun_bus import RerunBus
-from zsim_analysis.rerun.truth_comparison import TruthComparison
+from zsim_analysis.reading.recorded_run import GateInputs, RecordedAgents, RecordedRun, gates, open_run, recorded_agents
+from zsim_analysis.rerun_bus import RerunBus, TruthComparison
 from zsim_world.flight.world import World
 
 Say = Callable[[str], None]

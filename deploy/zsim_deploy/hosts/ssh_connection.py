@@ -116,7 +116,7 @@ def _changed(name: str, host: Host, base: Path, refused: Refused | None) -> str:
 
 
 def _is_known_otherwise(known: Path, refused: Refused) -> bool:
-    """Tell whether there are keys of a host among the known ones, and not this one."""
+    """Return whether there are keys of a host among the known ones, and not this one."""
     port = None if refused.port == SSH_PORT else refused.port
     try:
         keys = asyncssh.match_known_hosts(str(known.expanduser()), refused.host, refused.address, port)[0]

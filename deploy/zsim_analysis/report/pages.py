@@ -1,0 +1,239 @@
+"""How all figures and pages look, and how they are written: colours, axes, legends, lines, templates, files."""
+
+import base64
+import io
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import numpy as np
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from msgspec import Struct
+
+from zsim.errors import ReportError
+from zsim_agents.formation.spaces.cluster_space import unit
+from zsim_analysis.reading.flight import Array
+
+DPI = 120
+POINTS = 2000  # per line: more than a page has pixels
+# Okabe and Ito's colours, distinct with every kind of colour vision.
+BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
+BLUE, VERMILION, PURPLE = "#0072b2", "#d55e00", "#cc79a7"
+GREY, DARK = "#8c959f", "#444c56"
+DRONES = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
+DESIRED: dict[str, Any] = {"color": BLACK, "lw": 1.2, "ls": (0, (5, 3)), "zorder": 4}
+MEASURED: dict[str, Any] = {"color": ORANGE, "lw": 0.8, "zorder": 3}
+TRUE: dict[str, Any] = {"color": BLUE, "lw": 1.1, "zorder": 2}
+
+
+SYMBOLS = {
+    "x_c": "$x_c$",
+    "y_c": "$y_c$",
+    "z_c": "$z_c$",
+    "roll": "roll",
+    "pitch": "pitch",
+    "yaw": "yaw",
+    "p": "$p$",
+    "q": "$q$",
+    "beta": "$\\beta$",
+}
+GREEK = {"phi": "\\phi", "rho": "\\rho"}
+
+
+class ReportFigure(Struct, frozen=True):
+    """A figure with its file name, and its title and caption on the page."""
+
+    name: str
+    title: str
+    caption: str
+    drawing: Figure
+
+    def png(self) -> bytes:
+        """Return the figure as a PNG file."""
+        file = io.BytesIO()
+        self.drawing.savefig(file, format="png")
+        return file.getvalue()
+
+
+Picture = tuple[ReportFigure, bytes]  # a figure and its PNG file
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Return an empty figure that lays itself out; nothing of matplotlib's global state is used."""
+    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+
+
+def dress(axes: Axes, label: str = "") -> None:
+    """Give axes their grid and the label of their y axis."""
+    axes.grid(True, color="#d8dee4", lw=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=9)
+    axes.margins(x=0.01)
+    if label:
+        axes.set_ylabel(label, fontsize=10)
+
+
+def label_time(axes: Iterable[Axes]) -> None:
+    """Label the time axis of axes."""
+    for each in axes:
+        each.set_xlabel("simulated time (s)", fontsize=10)
+
+
+def label(name: str) -> str:
+    """Return the label of a parameter at an axis, with its unit."""
+    stem, _, number = name.partition("_")
+    greek = f"${GREEK[stem]}_{{{number}}}$" if stem in GREEK else name
+    return f"{SYMBOLS.get(name, greek)} ({unit(name)})"
+
+
+def line(axes: Axes, x: Array, y: Array, **style: Any) -> None:
+    """Draw a line with no more points than are visible."""
+    axes.plot(*thinned(x, y), **style)
+
+
+def legend_above(figure: Figure, axes: Axes, columns: int = 6) -> None:
+    """Put the legend of some axes above all axes of the figure, where it covers no data."""
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(
+            handles,
+            labels,
+            loc="outside upper center",
+            ncols=min(columns, len(handles)),
+            frameon=False,
+            fontsize=10,
+        )
+
+
+def thinned(x: Array, y: Array, points: int = POINTS) -> tuple[Array, Array]:
+    """Return a line of at most `points` points: the least and the greatest of each bin, no extreme lost."""
+    if len(x) <= points:
+        return x, y
+    size = -(-len(x) // (points // 2))
+    starts = range(0, len(x), size)
+    kept = np.unique([index for start in starts for index in _extremes(y[start : start + size], start)])
+    return x[kept], y[kept]
+
+
+def _extremes(y: Array, start: int) -> Sequence[int]:
+    if not np.isfinite(y).any():
+        return (start,)
+    return (start + int(np.nanargmin(y)), start + int(np.nanargmax(y)))
+
+
+def drone_colour(index: int) -> str:
+    return DRONES[index % len(DRONES)]
+
+
+class RunStyle(NamedTuple):
+    """Colour, dashes and mark of a run of a comparison: runs are distinct in black and white as well."""
+
+    color: str
+    dashes: Any
+    marker: str
+
+
+STYLES = (
+    RunStyle(BLUE, "-", "o"),
+    RunStyle(VERMILION, (0, (6, 2)), "s"),
+    RunStyle(GREEN, (0, (6, 2, 1.5, 2)), "^"),
+    RunStyle(PURPLE, (0, (2.5, 1.5)), "D"),
+    RunStyle(ORANGE, (0, (10, 3)), "v"),
+    RunStyle(SKY, (0, (6, 2, 1.5, 2, 1.5, 2)), "P"),
+)
+
+
+def run_style(index: int) -> RunStyle:
+    """Return how a run is drawn; from the seventh on colours repeat with other dashes."""
+    repeats, place = divmod(index, len(STYLES))
+    return STYLES[place]._replace(dashes=STYLES[(index + repeats) % len(STYLES)].dashes)
+
+
+def write_report(
+    directory: Path,
+    summary: bytes,
+    figures: Iterable[ReportFigure],
+    page: Callable[[Sequence[Picture]], str],
+    progress: Callable[[str], None],
+) -> None:
+    """Write DIR/summary.json, DIR/figures/*.png and DIR/report.html, all or none of them.
+
+    Args:
+        directory: of the run or the sweep.
+        summary: content of summary.json.
+        figures: drawn one by one.
+        page: makes the page of the pictures.
+        progress: called with a text at each step.
+
+    Raises:
+        ReportError: the directory cannot be written.
+    """
+    with _put_in_place(directory, directory) as new:
+        pictures = render(figures, progress)
+        progress("writing the page")
+        (new / "figures").mkdir()
+        for figure, png in pictures:
+            (new / "figures" / figure.name).write_bytes(png)
+        (new / "summary.json").write_bytes(summary)
+        (new / "report.html").write_text(page(pictures), encoding="utf-8")
+
+
+def write_page(
+    out: Path,
+    figures: Iterable[ReportFigure],
+    page: Callable[[Sequence[Picture]], str],
+    progress: Callable[[str], None],
+) -> None:
+    """Write one page; an earlier one is replaced when the new one is whole. Arguments and errors as `write_report`."""
+    with _put_in_place(out.parent, out) as new:
+        pictures = render(figures, progress)
+        progress("writing the page")
+        (new / out.name).write_text(page(pictures), encoding="utf-8")
+
+
+@contextmanager
+def _put_in_place(directory: Path, report: Path) -> Iterator[Path]:
+    """Yield a folder whose files come into a directory when all are made: a full disk or Ctrl-C leaves no half of them.
+
+    Raises:
+        ReportError: the directory cannot be written; the line begins with `report`.
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=directory, prefix=".report-") as folder:
+            yield Path(folder)
+            for path in sorted(path for path in Path(folder).rglob("*") if path.is_file()):
+                target = directory / path.relative_to(folder)
+                target.parent.mkdir(exist_ok=True)
+                path.replace(target)
+    except OSError as error:
+        raise ReportError(f"{report}: the report cannot be written ({error.strerror})") from error
+
+
+def render(figures: Iterable[ReportFigure], progress: Callable[[str], None]) -> list[Picture]:
+    """Draw figures one by one; one that is rendered keeps no drawing in memory."""
+    pictures = []
+    for figure in figures:
+        progress(f"drawing {figure.name}")
+        pictures.append((figure, figure.png()))
+    return pictures
+
+
+def template(name: str, package: str = "zsim_analysis.report") -> Template:
+    """Return a page's template; what it includes may stand beside it or here."""
+    return Environment(
+        loader=ChoiceLoader([PackageLoader(package, "."), PackageLoader("zsim_analysis.report", ".")]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+    ).get_template(name)
+
+
+def sources(pictures: Iterable[Picture]) -> list[tuple[ReportFigure, str]]:
+    """Return each figure with its PNG file as a data URI, which needs no file beside the page."""
+    return [(figure, "data:image/png;base64," + base64.b64encode(png).decode()) for figure, png in pictures]

@@ -1,1 +1,0 @@
-"""Certificates, keys and access control for each process and host. Imports inventory."""

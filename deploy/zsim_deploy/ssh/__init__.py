@@ -1,1 +1,0 @@
-"""Connections, commands and files on other hosts over ssh. Imports inventory."""
