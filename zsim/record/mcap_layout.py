@@ -27,7 +27,6 @@ from zsim.errors import RecordError
 
 HEAD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE = struct.Struct("<BQHIQQ")  # head, channel, sequence, log time, publish time; then the payload
-MESSAGE_FIXED = MESSAGE.size - HEAD.size  # bytes that a message's length counts beside its payload
 CHUNK_HEAD = struct.Struct("<QQQII")  # first, last log time, plain size, plain CRC, bytes of name
 SIZE = struct.Struct("<Q")  # of a chunk's content, behind the name
 ZSTD = b"zstd"  # the name of our compression
