@@ -20,14 +20,14 @@ def parts(line: str) -> tuple[str, str]:
     return where.rpartition(": ")[2], rest.partition("; ")[0]
 
 
-def has_terms(text: str, *terms: str) -> bool:
+def has_terms(text: str | None, *terms: str) -> bool:
     """Return whether one line of `text` holds all terms, each as whole words and in this order.
 
     A term is a field, a value, a bound, an option or a command. One that ends in `…` stands for all words that begin
     so, a relative path for any path that ends in it. Quotes belong to a value, punctuation and parentheses of the
-    sentence do not.
+    sentence do not. No text, as of a request that was granted, holds nothing.
     """
-    return any(_holds(_words(line), [_words(term) for term in terms]) for line in text.splitlines())
+    return text is not None and any(_holds(_words(line), [_words(term) for term in terms]) for line in text.splitlines())
 
 
 def without_tags(html: str) -> str:
