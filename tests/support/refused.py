@@ -27,7 +27,9 @@ def has_terms(text: str | None, *terms: str) -> bool:
     so, a relative path for any path that ends in it. Quotes belong to a value, punctuation and parentheses of the
     sentence do not. No text, as of a request that was granted, holds nothing.
     """
-    return text is not None and any(_holds(_words(line), [_words(term) for term in terms]) for line in text.splitlines())
+    return text is not None and any(
+        _holds(_words(line), [_words(term) for term in terms]) for line in text.splitlines()
+    )
 
 
 def without_tags(html: str) -> str:
