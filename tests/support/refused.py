@@ -25,7 +25,7 @@ def has_terms(text: str | None, *terms: str) -> bool:
 
     A term is a field, a value, a bound, an option or a command. One that ends in `…` stands for all words that begin
     so, a relative path for any path that ends in it. Quotes belong to a value, punctuation and parentheses of the
-    sentence do not.
+    sentence do not. No text, as of a request that was granted, holds nothing.
     """
     return any(_holds(_words(line), [_words(term) for term in terms]) for line in (text or "").splitlines())
 

@@ -91,7 +91,7 @@ expressions = st.lists(words | st.just("*") | st.just("**") | partly, min_size=1
 some_keys = st.lists(words, min_size=1, max_size=7).map("/".join)
 
 
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=500, deadline=None)
 @given(expression=expressions, key=some_keys)
 def test_matches_agrees_with_zenoh(expression: str, key: str):
     try:

@@ -2,6 +2,7 @@
 
 import math
 import re
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -55,15 +56,17 @@ def test_every_kind_is_taken_with_what_it_needs(kind: str):
         assert told == ([parameter.name] if parameter.required else [])
 
 
+BAD = [math.nan, math.inf, "x", True, [1, 2], {}, -1e12, 10**400, [math.nan, 0, 0]]
+
+
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("bad", [math.nan, math.inf, "x", True, [1, 2], {}, -1e12, 10**400, [math.nan, 0, 0]], ids=str)
-def test_every_parameter_is_checked(kind: str, bad: Any):
-    for parameter in KINDS[kind].parameters:
+def test_every_parameter_is_checked(kind: str):
+    for parameter, bad in product(KINDS[kind].parameters, BAD):
         if (parameter.shape == "flag" and bad is True) or (parameter.shape == "places" and bad == {}):
             continue
         ((path, text),) = flaws(sound(kind, **{parameter.name: bad}), KNOWN)
         assert path == parameter.name
-        assert text.endswith(f" ({kind})")
+        assert has_terms(text, kind)
         assert "; must be " in text
 
 

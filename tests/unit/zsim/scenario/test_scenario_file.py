@@ -217,7 +217,7 @@ texts = st.text(st.characters(codec="utf-8"), max_size=30) | st.sampled_from(
 )
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     expressions=st.dictionaries(texts, texts, min_size=1, max_size=3),
     numbers=st.lists(st.floats(-1e9, 1e9), min_size=4, max_size=4),
