@@ -36,10 +36,15 @@ class Lockstep:
             self.now_ns = received.message["t_ns"]
 
     def stands_at(self, t_ns: int, *names: str) -> Received:
-        """Wait until time stands; check that it does at t_ns and that these processes are waited for."""
-        received = self.clock.until(lambda m: m["state"] == "running" and m["waiting_for"])
+        """Wait until time stands for these processes; check that it does at t_ns. What was so before is passed over."""
+        expected = set(names) or {ME}
+        self.clock.now()
+        received = self.clock.until(
+            lambda m: (
+                m["state"] == "running" and {w["name"] for w in m["waiting_for"]} == expected and m["t_ns"] >= t_ns
+            )
+        )
         assert received.message["t_ns"] == t_ns
-        assert {w["name"] for w in received.message["waiting_for"]} == (set(names) or {ME})
         self.now_ns = t_ns
         return received
 
