@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from zsim.contract.keys import SENSORS
+from zsim.math.rotation import LEVEL, matrix_from_rpy
 from zsim.scenario.scenario import Drone, Environment, ErrorModel, Estimation, ImuConfig, Sensor, Sensors
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 from zsim_agents.estimation.dead_reckoning import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
@@ -31,7 +32,7 @@ from zsim_agents.estimation.filter_state import (
     Rows,
 )
 from zsim_agents.estimation.kalman_update import DOF_MAX
-from zsim_agents.estimation.madgwick import LEVEL, beta_for, levelling_time_s, rpy_rotation
+from zsim_agents.estimation.madgwick import beta_for, levelling_time_s
 from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD
 from zsim_agents.estimation.strapdown import MANOEUVRE_M_S2, MANOEUVRE_S, ZERO
 
@@ -276,8 +277,8 @@ def _sensor_setting(name: str, sensors: Sensors) -> list[float]:
             sigma = max(white_sigma(_error_model(sensors, channel), section.rate_hz), channel.sigma_min)
             variance += [sigma**2] * channel.axes
     variance += [0.0] * (VALUES_MAX - len(variance))
-    R_BS = rpy_rotation(section.mount.rpy_deg)
-    row = [*variance, *section.mount.position_m, *R_BS, -R_BS[2], -R_BS[5], -R_BS[8], PATIENCE_S.get(name, math.inf)]
+    R_BS = np.array(matrix_from_rpy(*map(math.radians, section.mount.rpy_deg)))
+    row = [*variance, *section.mount.position_m, *R_BS.flat, *-R_BS[:, 2], PATIENCE_S.get(name, math.inf)]
     assert len(row) == SENSOR.size
     return row
 

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from zsim.math.compiled import portable
+from zsim.math.rotation import Matrix, Vector, add, column, composed, cross, product, transposed
 from zsim_agents.estimation.dead_reckoning import (
     ATTITUDE,
     HORIZONTAL_MIN,
@@ -19,49 +20,41 @@ from zsim_agents.estimation.dead_reckoning import (
     heading_gradient,
     write_minus_cross,
 )
-from zsim_agents.estimation.madgwick import Rotation, Vector, compose, cross, turn, turn_back
 
 SIX = tuple[float, float, float, float, float, float]
 COSINE_MIN = 0.1  # of the sonar's ray to the vertical; flatter than 84 deg it does not hit the ground below
 
 
 @portable
-def write_gps(H: np.ndarray, i: int, p: Vector, v: Vector, R: Rotation, w: Vector, arm: Vector, lag: float) -> SIX:
+def write_gps(H: np.ndarray, i: int, p: Vector, v: Vector, R: Matrix, w: Vector, arm: Vector, lag: float) -> SIX:
     """Antenna at p_BS = `arm`: position p + R r [m], velocity v + R (w x r) [m/s]; six rows from `i`."""
-    offset = turn(R, arm)
-    swing = turn(R, cross(w, arm))
+    offset = product(R, arm)
+    swing = product(R, cross(w, arm))
     for k in range(3):
         H[i + k, POSITION + k] = 1.0
         H[i + k, VELOCITY + k] = -lag
         H[i + 3 + k, VELOCITY + k] = 1.0
     write_minus_cross(H, i, ATTITUDE, offset, 1.0)
     write_minus_cross(H, i + 3, ATTITUDE, swing, 1.0)
-    return (
-        p[0] + offset[0],
-        p[1] + offset[1],
-        p[2] + offset[2],
-        v[0] + swing[0],
-        v[1] + swing[1],
-        v[2] + swing[2],
-    )
+    return *add(p, offset), *add(v, swing)
 
 
 @portable
-def write_mag(H: np.ndarray, i: int, R: Rotation, R_BS: Rotation, field_W: Vector) -> Vector:
+def write_mag(H: np.ndarray, i: int, R: Matrix, R_BS: Matrix, field_W: Vector) -> Vector:
     """Magnetometer turned by R_BS in a known field: (R R_BS)^T m [uT]; three rows from `i`."""
-    R_WS = compose(R, R_BS)
+    R_WS = composed(R, R_BS)
     for k in range(3):
-        row = cross((R_WS[k], R_WS[3 + k], R_WS[6 + k]), field_W)
+        row = cross(column(R_WS, k), field_W)
         H[i + k, ATTITUDE] = row[0]
         H[i + k, ATTITUDE + 1] = row[1]
         H[i + k, ATTITUDE + 2] = row[2]
-    return turn_back(R_WS, field_W)
+    return product(transposed(R_WS), field_W)
 
 
 @portable
-def write_baro(H: np.ndarray, i: int, p: Vector, R: Rotation, arm: Vector, lag: float) -> float:
+def write_baro(H: np.ndarray, i: int, p: Vector, R: Matrix, arm: Vector, lag: float) -> float:
     """Barometer at p_BS = `arm`: its height [m]; one row."""
-    offset = turn(R, arm)
+    offset = product(R, arm)
     H[i, POSITION + 2] = 1.0
     H[i, VELOCITY + 2] = -lag
     H[i, ATTITUDE] = offset[1]
@@ -70,13 +63,13 @@ def write_baro(H: np.ndarray, i: int, p: Vector, R: Rotation, arm: Vector, lag: 
 
 
 @portable
-def write_sonar(H: np.ndarray, i: int, p: Vector, R: Rotation, arm: Vector, down_B: Vector, lag: float) -> float:
+def write_sonar(H: np.ndarray, i: int, p: Vector, R: Matrix, arm: Vector, down_B: Vector, lag: float) -> float:
     """Sonar at p_BS = `arm` that looks along `down_B` at the ground z_W = 0: height / cosine [m]; one row.
 
     Returns 0 with an empty row if the sonar does not look down.
     """
-    offset = turn(R, arm)
-    ray = turn(R, down_B)
+    offset = product(R, arm)
+    ray = product(R, down_B)
     cosine = -ray[2]
     if cosine < COSINE_MIN:
         return 0.0
@@ -90,12 +83,13 @@ def write_sonar(H: np.ndarray, i: int, p: Vector, R: Rotation, arm: Vector, down
 
 
 @portable
-def write_flow(H: np.ndarray, i: int, v: Vector, R: Rotation, w: Vector, arm: Vector) -> Vector:
+def write_flow(H: np.ndarray, i: int, v: Vector, R: Matrix, w: Vector, arm: Vector) -> Vector:
     """Velocity of the camera at p_BS = `arm` in the heading frame, Rz(yaw)^T (v + R (w x r)); three rows."""
-    swing = turn(R, cross(w, arm))
-    length = math.sqrt(max(R[0] * R[0] + R[3] * R[3], HORIZONTAL_MIN))
-    c, s = R[0] / length, R[3] / length
-    u_W = (v[0] + swing[0], v[1] + swing[1], v[2] + swing[2])
+    swing = product(R, cross(w, arm))
+    x, y, _ = column(R, 0)
+    length = math.sqrt(max(x * x + y * y, HORIZONTAL_MIN))
+    c, s = x / length, y / length
+    u_W = add(v, swing)
     u = (c * u_W[0] + s * u_W[1], c * u_W[1] - s * u_W[0], u_W[2])
     H[i, VELOCITY] = c
     H[i, VELOCITY + 1] = s
