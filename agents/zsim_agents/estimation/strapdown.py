@@ -4,13 +4,7 @@ import numpy as np
 
 from zsim.math.compiled import portable
 from zsim.math.rotation import Vector, about_z, add, axpy, multiply, normalised, product, scaled, subtract
-from zsim_agents.estimation.dead_reckoning import (
-    acceleration,
-    arm_acceleration,
-    corrected,
-    reckon,
-    write_prediction,
-)
+from zsim_agents.estimation.dead_reckoning import acceleration, arm_acceleration, corrected, reckon, write_prediction
 from zsim_agents.estimation.filter_state import (
     COUNT,
     IMU,

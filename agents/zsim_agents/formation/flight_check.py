@@ -9,12 +9,7 @@ import numpy as np
 from zsim.math.compiled import portable
 from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.flight_data import AIRBORNE, EngagementLimits, GateInput, ShapeLimits
-from zsim_agents.formation.spaces.cluster_space import (
-    Array,
-    ClusterSpace,
-    SingularClusterError,
-    closest_pair,
-)
+from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, closest_pair
 
 FAR = 1e6  # m or rad: beyond it a value is a slip
 VALID, STALE, NOT_FINITE, UNCERTAIN = range(4)  # state of an estimate

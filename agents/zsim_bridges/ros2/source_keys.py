@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError
 from zsim.transport.session import Heard, Mailbox, Sample, Session
-from zsim_bridges.ros2.ros_context import Publisher
+from zsim_bridges.ros2.rmw_zenoh import Publisher
 from zsim_bridges.ros2.topics import Topic
 
 QueuedTask = Callable[[], object]

@@ -137,7 +137,8 @@ def ros1(
     name: Annotated[str, typer.Option(help="Process name (default ros1.main, or the certificate's).")] = "",
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
-    from zsim_bridges.ros1.bridge import NodeShutdownError, serve
+    from zsim_bridges.ros1.ros1_bridge import NodeShutdownError, serve
+
     from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
 
     give_way()
@@ -166,8 +167,9 @@ def ros2(
     if write_package is not None:
         _write_package(write_package / "zsim_msgs")
         return
+    from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
+
     from zsim.transport.tls import Identity, is_tls
-    from zsim_bridges.ros2.bridge import RosNetwork, serve
     from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
 
     if reach.tls and router is None:

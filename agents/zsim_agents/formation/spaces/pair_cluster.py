@@ -8,14 +8,7 @@ import numpy as np
 
 from zsim.math.compiled import portable
 from zsim.math.rotation import column, matrix_from_rpy, norm, scaled, subtract
-from zsim_agents.formation.spaces.cluster_frame import (
-    LENGTH_MIN_M,
-    centroid,
-    pitch_yaw,
-    put,
-    row,
-    wrap_angle,
-)
+from zsim_agents.formation.spaces.cluster_frame import LENGTH_MIN_M, centroid, pitch_yaw, put, row, wrap_angle
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError
 
 

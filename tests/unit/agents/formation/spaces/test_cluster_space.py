@@ -8,12 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from zsim.scenario.scenario import ROBOTS_MAX
-from zsim_agents.formation.spaces.cluster_space import (
-    SingularClusterError,
-    closest_pair,
-    robot_rates,
-    unit,
-)
+from zsim_agents.formation.spaces.cluster_space import SingularClusterError, closest_pair, robot_rates, unit
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 
 SIZES = (2, 3, 4, 5, 8)
