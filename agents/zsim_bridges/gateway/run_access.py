@@ -13,7 +13,7 @@ from zsim.errors import DecodeError
 from zsim.scenario import rights, scenario_file
 from zsim.transport.session import Heard, Session, check_expression
 from zsim.transport.traffic import Passed, Traffic
-from zsim_bridges.gateway.key_policy import (
+from zsim_bridges.gateway.client_messages import (
     ForbiddenError,
     MessageDefaults,
     TooManyError,
@@ -21,9 +21,9 @@ from zsim_bridges.gateway.key_policy import (
     check_not_reserved,
     is_client_key,
     is_control_key,
+    json_to_payload,
 )
-from zsim_bridges.gateway.last_values import LastValues
-from zsim_bridges.gateway.transcoding import json_to_payload
+from zsim_bridges.gateway.publications import LastValues
 from zsim_bridges.observer_process import ObserverProcess
 
 TICK_S = 0.1  # how often health is published and a stop is noticed while nothing arrives
