@@ -18,10 +18,9 @@ from zsim.contract.messages import (
     ViewDrones,
     ViewEstimates,
 )
-from zsim_bridges.console import html_tables
-from zsim_bridges.console.table_rows import TableRows, console_state, sigma_m
-from zsim_bridges.console.time_monitor import SILENT_S, TimeMonitor
-from zsim_bridges.console.view_buffer import ViewBuffer
+from zsim_bridges.console import tables
+from zsim_bridges.console.tables import TableRows, console_state, sigma_m
+from zsim_bridges.console.view_buffer import SILENT_S, TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 
 S = 1_000_000_000  # ns
@@ -175,9 +174,9 @@ def test_silence_of_the_world_is_told_and_for_how_long():
 
 
 def test_a_silent_world_is_not_called_running():
-    told = html_tables.clock_line(clock(7 * S), 7 * S, 12.3)
+    told = tables.clock_line(clock(7 * S), 7 * S, 12.3)
     assert "no answer from the world for 12 s" in told
-    assert html_tables.RED in told
+    assert tables.RED in told
     assert "running" not in told
 
 
