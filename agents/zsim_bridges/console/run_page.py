@@ -20,7 +20,7 @@ from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.page.console_page import ConsolePage
 from zsim_bridges.console.page.picture import (
     DronePoses,
-    DroneTrails,
+    CanvasTrails,
     FormationShape,
     drone_poses,
     ellipsoids,
@@ -86,7 +86,7 @@ class RunPage:
         self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
         self._names = names
         self._members = {c.name: [names.index(d) for d in c.drones] for c in self._scenario.clusters}
-        self._trails = DroneTrails(len(names))
+        self._trails = CanvasTrails(len(names))
         self._table_rows = TableRows(self.views)
         self._shapes: dict[str, FormationShape | None] = {}
         self._drones: DronePoses | None = None

@@ -27,7 +27,7 @@ from zsim_bridges.console.page.picture import (
     POINTS_OF_ONE,
     SPACING_M,
     SPAN_S,
-    DroneTrails,
+    CanvasTrails,
     VariableHistory,
 )
 from zsim_bridges.console.view_buffer import SensorRates
@@ -156,7 +156,7 @@ def test_a_pair_has_one_side():
 
 
 def test_a_trail_grows_with_the_way_and_forgets_its_beginning():
-    trails = DroneTrails(2)
+    trails = CanvasTrails(2)
     for k in range(POINTS_OF_ONE + 50):
         trails.add(np.array([(k * 2 * SPACING_M, 0.0, 1.0), (5.0, 5.0, 1.0)]))
     now = np.array([(1000.0, 0.0, 1.0), (5.0, 5.0, 1.0)])
@@ -168,7 +168,7 @@ def test_a_trail_grows_with_the_way_and_forgets_its_beginning():
 
 
 def test_a_drone_that_is_not_there_leaves_no_trail():
-    trails = DroneTrails(2)
+    trails = CanvasTrails(2)
     nowhere = (np.nan, np.nan, np.nan)
     for k in range(5):
         trails.add(np.array([(float(k), 0.0, 1.0), nowhere]))
@@ -180,7 +180,7 @@ def test_a_drone_that_is_not_there_leaves_no_trail():
 
 
 def test_many_trails_are_short():
-    trails = DroneTrails(50)
+    trails = CanvasTrails(50)
     for k in range(1000):
         trails.add(np.full((50, 3), k * 1.0))
     assert len(trails.segments(np.zeros((50, 3)))[0]) <= 6000
