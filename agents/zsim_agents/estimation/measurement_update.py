@@ -36,8 +36,15 @@ from zsim_agents.estimation.filter_state import (
     quaternion,
     vector,
 )
-from zsim_agents.estimation.kalman_update import ROWS_MAX, stacked_update
-from zsim_agents.estimation.measurement_models import write_baro, write_flow, write_gps, write_mag, write_sonar
+from zsim_agents.estimation.kalman_update import (
+    ROWS_MAX,
+    stacked_update,
+    write_baro,
+    write_flow,
+    write_gps,
+    write_mag,
+    write_sonar,
+)
 
 YAW = ATTITUDE + 2  # place in the error state
 VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and squares of more would drown the rest
@@ -52,7 +59,7 @@ def accept(rows: Rows, i: int, reading: np.ndarray) -> bool:
     """Whether an aiding reading is to be used at the end of the gate.
 
     One that is out of order, too old or no number is counted as refused; a duplicate is not counted, nor is a sonar
-    without an echo, which says nothing.
+    without an echo, which has no information.
     """
     row, counts, setting, layout = rows.nominal[i], rows.counts[i], rows.setting[i], rows.layout[i]
     kind = int(reading[READING.sensor])

@@ -3,7 +3,7 @@
 I. Mas, S. Curi, R. Sánchez Peña, "Open-source Multi-UAV Simulator for the ROS Environment", section III: gyroscopes and
 accelerometers give the attitude by Madgwick's filter; the position is that of dead reckoning and a GPS receiver, fused
 by an extended Kalman filter "due to the non-linear dynamics". Nothing measures the heading: it begins with the one that
-the drone was set down with, and only a moving drone's fixes tell it again.
+the drone was set down with, and only the fixes of a moving drone correct it.
 
 Dead reckoning goes along the velocity u that the aircraft itself gives in its heading frame:
 

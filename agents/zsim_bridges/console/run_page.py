@@ -15,12 +15,13 @@ from zsim.math import frames
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_bridges.console import tables
+from zsim_bridges.console import console_tables
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.console_tables import TableRows, console_state
 from zsim_bridges.console.page.console_page import ConsolePage
 from zsim_bridges.console.page.picture import (
-    DronePoses,
     CanvasTrails,
+    DronePoses,
     FormationShape,
     drone_poses,
     ellipsoids,
@@ -28,7 +29,6 @@ from zsim_bridges.console.page.picture import (
     ghosts,
 )
 from zsim_bridges.console.page.scene_nodes import CameraFollow, SceneNodes
-from zsim_bridges.console.tables import TableRows, console_state
 from zsim_bridges.console.view_buffer import TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 
@@ -212,14 +212,16 @@ class RunPage:
 
     def _update_tables(self, wall_s: float) -> None:
         page = self._page
-        page.clock.content = tables.clock_line(
+        page.clock.content = console_tables.clock_line(
             self._time_monitor.clock, int(self._drawn_ns), self._time_monitor.silent_s
         )
-        page.phases.content = tables.formation_lines({n: (v.phase, v.reason) for n, v in self.views.clusters.items()})
-        page.drones.content = tables.drone_table(self._table_rows.drone_rows())
+        page.phases.content = console_tables.formation_lines(
+            {n: (v.phase, v.reason) for n, v in self.views.clusters.items()}
+        )
+        page.drones.content = console_tables.drone_table(self._table_rows.drone_rows())
         page.sensors.content = self._table_rows.sensor_table(page.drone_form.chosen)
-        page.faults.content = tables.fault_lines(self._table_rows.active_faults())
-        page.events.content = tables.event_table(list(self.views.events)[:EVENTS_SHOWN])
+        page.faults.content = console_tables.fault_lines(self._table_rows.active_faults())
+        page.events.content = console_tables.event_table(list(self.views.events)[:EVENTS_SHOWN])
         if page.chosen:
             page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
             page.plots[page.chosen].draw()

@@ -187,7 +187,7 @@ def json_to_payload(key: str, value: Any) -> bytes:
     Where a field is an integer, 20000000.0 will do: languages that have only doubles write it so.
 
     Raises:
-        DecodeError: names key, field, found and allowed; a key outside of the contract takes anything.
+        DecodeError: with key, field, value and what is allowed; a key outside of the contract takes anything.
     """
     if messages.type_of(key) is None:
         return _pack(key, value)

@@ -115,7 +115,7 @@ class RunAccess:
         """Publish plain data on a key, checked, with what it leaves out filled in.
 
         Raises:
-            DecodeError: names key, field, found and allowed.
+            DecodeError: with key, field, value and what is allowed.
             ForbiddenError: the key is reserved.
             UnknownError: the run has no such drone or cluster.
             SessionError: it is no key.
@@ -135,7 +135,7 @@ class RunAccess:
         """Return plain data as the payload of a key on which clients may publish.
 
         Raises:
-            DecodeError: names key, field, found and allowed.
+            DecodeError: with key, field, value and what is allowed.
             ForbiddenError: the key is reserved.
         """
         self._check_key(key)

@@ -138,7 +138,6 @@ def ros1(
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
     from zsim_bridges.ros1.ros1_bridge import NodeShutdownError, serve
-
     from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
 
     give_way()
@@ -167,9 +166,8 @@ def ros2(
     if write_package is not None:
         _write_package(write_package / "zsim_msgs")
         return
-    from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
-
     from zsim.transport.tls import Identity, is_tls
+    from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
     from zsim_deploy.roles.service_loop import give_way, process_name, serve_runs
 
     if reach.tls and router is None:

@@ -15,7 +15,7 @@ from zsim.errors import RunError
 from zsim.math import frames
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
-from zsim_bridges.console import tables
+from zsim_bridges.console import console_tables
 from zsim_bridges.console.console_server import Camera, PageControls, is_permitted
 from zsim_bridges.console.http_proxy import OPERATOR, VIEWER, ListenAddress, PageRequest, PageTokens
 from zsim_bridges.console.page import operator_input
@@ -485,40 +485,40 @@ def test_nobody_says_what_no_control_says(said: bytes):
 
 
 def test_tables_show_text_of_others_as_text():
-    row = tables.DroneRow("d1", "flying", 12.0, 400.0, "<script>", "3 / 1", ("gps_dropout",))
-    told = tables.drone_table([row])
+    row = console_tables.DroneRow("d1", "flying", 12.0, 400.0, "<script>", "3 / 1", ("gps_dropout",))
+    told = console_tables.drone_table([row])
     assert "<script>" not in told
     assert "&lt;script&gt;" in told
     assert "gps_dropout" in told
-    assert told.count(tables.AMBER) == 2  # late, and a fault
-    assert tables.RED in told  # the battery
-    events = tables.event_table([Event(1_500_000_000, 0, "refused", "x", "y", "<b>no</b>")])
+    assert told.count(console_tables.AMBER) == 2  # late, and a fault
+    assert console_tables.RED in told  # the battery
+    events = console_tables.event_table([Event(1_500_000_000, 0, "refused", "x", "y", "<b>no</b>")])
     assert "1.50" in events
     assert "&lt;b&gt;no" in events
 
 
 def test_many_formations_leave_room_for_the_emergency_button():
-    told = tables.formation_lines({f"c{i}": ("taking_off", "<waits>") for i in range(16)})
-    assert tables.FEW_LINES in told
+    told = console_tables.formation_lines({f"c{i}": ("taking_off", "<waits>") for i in range(16)})
+    assert console_tables.FEW_LINES in told
     assert told.count("<br>") == 15
     assert "taking off – &lt;waits&gt;" in told
 
 
 def test_the_clock_says_whom_the_run_waits_for():
     now = Clock(2_000_000_000, 0, "r", 100, "waiting", 0.0, (Waiting("estimator.d1", "lab", 3.0),))
-    assert "waiting for estimator.d1 on lab (3 s)" in tables.clock_line(now, now.t_ns)
-    assert "no clock" in tables.clock_line(None, 0)
+    assert "waiting for estimator.d1 on lab (3 s)" in console_tables.clock_line(now, now.t_ns)
+    assert "no clock" in console_tables.clock_line(None, 0)
 
 
 def test_the_clock_tells_a_pace_only_while_the_run_goes_on():
     running, paused = (Clock(2_020_000_000, 0, "r", 101, state, 3.0) for state in ("running", "paused"))  # type: ignore[arg-type]
-    assert "2.0 s</b> × 3.0 real time" in tables.clock_line(running, 2_010_000_000)
-    assert "2.02 s</b><" in tables.clock_line(paused, 0)  # nothing is drawn yet
+    assert "2.0 s</b> × 3.0 real time" in console_tables.clock_line(running, 2_010_000_000)
+    assert "2.02 s</b><" in console_tables.clock_line(paused, 0)  # nothing is drawn yet
 
 
 def test_acting_faults_are_listed():
-    assert tables.NO_FAULT in tables.fault_lines([])
-    assert "gust of world until 5.0 s<br>⚠ link_cut of a/&lt;b&gt;" in tables.fault_lines(
+    assert console_tables.NO_FAULT in console_tables.fault_lines([])
+    assert "gust of world until 5.0 s<br>⚠ link_cut of a/&lt;b&gt;" in console_tables.fault_lines(
         ["gust of world until 5.0 s", "link_cut of a/<b>"]
     )
 

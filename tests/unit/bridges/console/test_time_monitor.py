@@ -18,8 +18,8 @@ from zsim.contract.messages import (
     ViewDrones,
     ViewEstimates,
 )
-from zsim_bridges.console import tables
-from zsim_bridges.console.tables import TableRows, console_state, sigma_m
+from zsim_bridges.console import console_tables
+from zsim_bridges.console.console_tables import TableRows, console_state, sigma_m
 from zsim_bridges.console.view_buffer import SILENT_S, TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 
@@ -174,9 +174,9 @@ def test_silence_of_the_world_is_told_and_for_how_long():
 
 
 def test_a_silent_world_is_not_called_running():
-    told = tables.clock_line(clock(7 * S), 7 * S, 12.3)
+    told = console_tables.clock_line(clock(7 * S), 7 * S, 12.3)
     assert "no answer from the world for 12 s" in told
-    assert tables.RED in told
+    assert console_tables.RED in told
     assert "running" not in told
 
 
