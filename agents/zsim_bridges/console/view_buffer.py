@@ -9,17 +9,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
-from zsim.contract.messages import (
-    Clock,
-    EstimateView,
-    Event,
-    Fault,
-    Health,
-    Info,
-    ViewCluster,
-    ViewDrones,
-    ViewEstimates,
-)
+from zsim.contract.messages import EstimateView, Event, Fault, Health, Info, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError, ZsimError
 from zsim.transport.session import Heard, Sample, Session
 from zsim_bridges.observer_process import ObserverProcess
@@ -248,7 +238,7 @@ class TimeMonitor:
         self._is_polling = False
         self._answered_s = wall_s()
         self._known_s = -math.inf
-        self.clock: Clock | None = None
+        self.clock: messages.Clock | None = None
 
     @contextmanager
     def polling(self) -> Iterator[None]:
