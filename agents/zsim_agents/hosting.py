@@ -20,7 +20,7 @@ def chosen(what: str, patterns: Sequence[str], known: Sequence[str]) -> list[str
     """Return the known names that are named or that match a pattern such as `drone*`, in their own order.
 
     Raises:
-        RunError: a pattern matches none; `what` says in the message what was looked for.
+        RunError: a pattern matches none; `what` names in the message what was looked for.
     """
     for pattern in patterns:
         if not any(fnmatchcase(name, pattern) for name in known):

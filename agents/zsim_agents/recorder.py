@@ -21,7 +21,7 @@ from zsim.record import RecordWriter
 from zsim.record.record_writer import CHANNELS_MAX
 from zsim.runtime.health import HealthMeter
 from zsim.runtime.membership import replay
-from zsim.schema.message import Message
+from zsim.schema import message
 from zsim.transport.connection import read_info
 from zsim.transport.session import Session
 from zsim.transport.traffic import Passed, Traffic, samples
@@ -32,7 +32,7 @@ PAUSE_S = 0.01  # between two looks into the queue: nobody waits for the recorde
 TICK_S = 0.1  # how often the open chunk's age and a stop are looked at
 REPLAY_S = 5.0  # a hub answers within milliseconds
 DRAIN_S = 1.0  # after `stopped`, how long the byes of the others are waited for
-STOP_DRAIN_S = 0.5  # after it is told to stop, how long the end of the run is waited for: both may be stopped at once
+STOP_DRAIN_S = 0.5  # after a stop is requested, how long the end of the run is waited for: both may be stopped at once
 KNOWN_MAX = 1_000_000  # replayed messages remembered, so that none is written twice: 5 s of 1000 drones
 
 
@@ -74,7 +74,7 @@ class Recorder:
         self._info = info
         self._name = name
         self._stopped = stopped
-        self._say_line = say
+        self._print = say
         self._links: deque[bool] = deque()
         self._link_lost = False
         self._must_look = False
@@ -114,7 +114,7 @@ class Recorder:
             ticker.join()
         if self._left_out:
             why = f"a record holds {CHANNELS_MAX} keys, and theirs are further ones"
-            self._say_line(f"{self._name}: {self._left_out} messages are not on record: {why}")
+            self._print(f"{self._name}: {self._left_out} messages are not on record: {why}")
         if self._successor:
             raise SupersededError(
                 f"{self._name}: another process of this name joined from {self._successor}; this one ends, its record "
@@ -130,11 +130,11 @@ class Recorder:
         self._traffic.wake()
 
     def _is_another_run(self) -> bool:
-        """Say what has become of the link; tell whether there is another run at its end when it is back."""
+        """Print what has become of the link; return whether there is another run at its end when it is back."""
         while self._links:
             up = self._links.popleft()
             if not up:
-                self._say_line(f"{self._name}: lost the link to the world; waiting for it to come back")
+                self._print(f"{self._name}: lost the link to the world; waiting for it to come back")
             self._must_look = up and self._link_lost
             self._link_lost = not up
         info = read_info(self._link) if self._must_look else None
@@ -167,19 +167,19 @@ class Recorder:
         self._left_out = self._writer.refused
 
     def _may_stop(self) -> bool:
-        """Tell whether it was told to stop and the run does not end meanwhile."""
+        """Return whether a stop was requested and the run does not end meanwhile."""
         if not self._stopped() or self._ended_s is not None:
             return False
         self._stopped_s = self._stopped_s or time.monotonic()
         return time.monotonic() - self._stopped_s > STOP_DRAIN_S
 
     def _all_left(self) -> bool:
-        """Tell whether everybody has said bye, or has had the time to."""
+        """Return whether every process has published bye, or has had the time to."""
         late = time.monotonic() - (self._ended_s or 0.0) > DRAIN_S
         return late or self._joined <= self._leavers
 
     def _catch_up(self) -> None:
-        """Write what was said before this process came: the world keeps it for those who ask."""
+        """Write what was published before this process came: the world keeps it for a while."""
         self._write_lasting()
         while not self._caught_up and not self._stopped():
             try:
@@ -191,7 +191,7 @@ class Recorder:
                 self._over.wait(TICK_S)
 
     def _write_lasting(self) -> None:
-        """Write of what run this is, and the newest faults: said long ago, the replay has them no longer."""
+        """Write of what run this is, and the newest faults: published long ago, the replay has them no longer."""
         lasting = {keys.INFO: messages.encode(self._info)}
         for key in (keys.INFO, keys.FAULTS):
             lasting |= {sample.key: sample.payload for sample in self._link.get(key)}
@@ -271,12 +271,12 @@ class Recorder:
     def _join(self) -> None:
         incarnation, run_id = secrets.randbits(62), self._info.run_id
         join = join_of(self._name, self._link.host, run_id, incarnation, self._next("join"), calculates=False)
-        self._say("join", join)
+        self._publish("join", join)
 
     def _bye(self, reason: str) -> None:
-        self._say("bye", run_messages.Bye(self._now_ns, self._next("bye"), reason))
+        self._publish("bye", run_messages.Bye(self._now_ns, self._next("bye"), reason))
 
-    def _say(self, what: str, message: Message) -> None:
+    def _publish(self, what: str, message: message.Message) -> None:
         self._link.put(keys.process(self._name, what), message)
 
     def _next(self, what: str) -> int:
@@ -287,4 +287,4 @@ class Recorder:
         while not self._over.wait(TICK_S):
             self._traffic.wake()
             if self.health.due():
-                self._say("health", self.health.message(self._now_ns, self._next("health")))
+                self._publish("health", self.health.message(self._now_ns, self._next("health")))

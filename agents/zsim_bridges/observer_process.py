@@ -9,6 +9,7 @@ from zsim.runtime.health import HealthMeter
 from zsim.transport.samples import RawSample
 from zsim.transport.session import Session
 
+ANOTHER_RUN = "the world has begun another run"
 JOIN_EVENTS = ("join", "restart", "superseded")  # kinds of events that report a process that joined
 
 
@@ -65,7 +66,7 @@ class ObserverProcess:
             return None
         self.now_ns = clock.t_ns
         if clock.run_id != self._info.run_id:
-            self.end_reason = "the world has begun another run"
+            self.end_reason = ANOTHER_RUN
         elif clock.state == "stopped":
             self.end_reason = run_messages.RUN_ENDED
         return clock

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from zsim_agents.formation.control_law import FormationGains, ProportionalLaw
 from zsim_agents.formation.flight_data import ShapeLimits
-from zsim_agents.formation.guidance import plan_ramp
+from zsim_agents.formation.guidance import RampPlanner
 from zsim_agents.formation.spaces.cluster_space import Array, closest_pair
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.trajectory import ExpressionTrajectory, Hold, Reference
@@ -181,7 +181,7 @@ def from_the_ground_triangle(**kwargs) -> Flight:
     """Fly to equation (3) from where drones are assembled, on the ramp that the controller plans."""
     start = (TRIANGLE, np.zeros(3))
     c = SPACE.forward(*start)
-    ramp = plan_ramp(SPACE, (c, np.zeros(12)), Hold(C_DES), 0.0, FormationGains(), ShapeLimits())
+    ramp = RampPlanner(SPACE, FormationGains(), ShapeLimits()).ramp((c, np.zeros(12)), Hold(C_DES), 0.0)
     return fly(ramp, 100.0, start=start, **kwargs)
 
 

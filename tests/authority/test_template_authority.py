@@ -11,8 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from zsim_agents.formation.spaces.scenario_space import cluster_space
-from zsim_agents.formation.spaces.template_cluster import TemplateCluster, euler_angles
-from zsim_agents.formation.spaces.template_geometry import centred
+from zsim_agents.formation.spaces.template_cluster import TemplateCluster, centred, euler_angles
 
 N = 10
 RADIUS_M = 3.0

@@ -25,7 +25,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from wire import PATIENCE_S
 
-from zsim_bridges.console.page_rights import Camera
+from zsim_bridges.console.console_server import Camera
 
 CHROMIUM = shutil.which("chromium")
 FLAGS = (  # as root, without a screen and without a graphics card, in a container

@@ -62,6 +62,11 @@ def quaternion_multiply(p: ArrayLike, q: ArrayLike) -> Array:
     )
 
 
+def quaternion_conjugate(q: ArrayLike) -> Array:
+    """Return the inverse of unit quaternions."""
+    return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
+
+
 def rotation_matrix(q: ArrayLike) -> Array:
     """Return R of unit quaternions, shape (..., 3, 3): v_W = R v_B."""
     w, x, y, z = np.moveaxis(np.asarray(q, dtype=float), -1, 0)

@@ -1,14 +1,18 @@
 """Vectors and quaternions as tuples of floats, for compiled code: no allocation, a fixed order of operations.
 
-A vector is (x, y, z). A quaternion is Hamilton (w, x, y, z) and turns body components into world components.
+A vector is (x, y, z). A quaternion is Hamilton (w, x, y, z) and turns body components into world components, as does
+a rotation matrix, which is given by its rows.
 """
 
 import math
 
-from zsim.math.compiled import inlined
+from zsim.math.compiled import inlined, portable
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+Matrix = tuple[Vector, Vector, Vector]
+
+LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)  # no turn at all
 
 _SMALL_ANGLE = 1e-8  # rad; below it sin(x)/x is 1 to the last bit
 
@@ -17,6 +21,18 @@ _SMALL_ANGLE = 1e-8  # rad; below it sin(x)/x is 1 to the last bit
 def add(a: Vector, b: Vector) -> Vector:
     """Return a + b."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+@inlined
+def subtract(a: Vector, b: Vector) -> Vector:
+    """Return a - b."""
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+@inlined
+def scaled(a: Vector, s: float) -> Vector:
+    """Return s a."""
+    return (s * a[0], s * a[1], s * a[2])
 
 
 @inlined
@@ -141,3 +157,56 @@ def z_axis(q: Quaternion) -> Vector:
 def wrapped(angle: float) -> float:
     """Return the angle in [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@inlined
+def matrix(q: Quaternion) -> Matrix:
+    """Return R(q)."""
+    w, x, y, z = q
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+
+
+@portable
+def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Matrix:
+    """Return R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    sr, cr = math.sin(roll), math.cos(roll)
+    sp, cp = math.sin(pitch), math.cos(pitch)
+    sy, cy = math.sin(yaw), math.cos(yaw)
+    return (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        (-sp, cp * sr, cp * cr),
+    )
+
+
+@inlined
+def product(R: Matrix, a: Vector) -> Vector:
+    """Return R a."""
+    return (dot(R[0], a), dot(R[1], a), dot(R[2], a))
+
+
+@inlined
+def column(R: Matrix, k: int) -> Vector:
+    """Return a column of R: the k-th axis of the body in world components."""
+    return (R[0][k], R[1][k], R[2][k])
+
+
+@inlined
+def transposed(R: Matrix) -> Matrix:
+    """Return R^T, the inverse of a rotation."""
+    return (column(R, 0), column(R, 1), column(R, 2))
+
+
+@inlined
+def composed(A: Matrix, B: Matrix) -> Matrix:
+    """Return A B: first B, then A."""
+    x, y, z = transposed(B)
+    return (
+        (dot(A[0], x), dot(A[0], y), dot(A[0], z)),
+        (dot(A[1], x), dot(A[1], y), dot(A[1], z)),
+        (dot(A[2], x), dot(A[2], y), dot(A[2], z)),
+    )

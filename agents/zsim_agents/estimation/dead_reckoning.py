@@ -10,19 +10,23 @@ import math
 import numpy as np
 
 from zsim.math.compiled import portable
-from zsim_agents.estimation.madgwick import (
+from zsim.math.rotation import (
+    Matrix,
     Quaternion,
-    Rotation,
     Vector,
+    add,
+    axpy,
+    column,
     cross,
     heading,
-    madgwick_step,
+    matrix,
+    multiply,
     normalised,
     product,
-    rotation,
-    rotation_vector_quaternion,
-    turn,
+    scaled,
+    subtract,
 )
+from zsim_agents.estimation.madgwick import madgwick_step, rotation_vector_quaternion
 
 POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCEL_BIAS = 0, 3, 6, 9, 12  # first index of each in the error state
 
@@ -33,15 +37,15 @@ Reckoning = tuple[Vector, Vector, Quaternion, Vector, Vector, Vector]
 
 
 @portable
-def plus(a: Vector, b: Vector, scale: float) -> Vector:
-    """Return a + scale b."""
-    return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
+def vector(row: np.ndarray, at: int) -> Vector:
+    """Return three entries of an array."""
+    return float(row[at]), float(row[at + 1]), float(row[at + 2])
 
 
 @portable
 def acceleration(q: Quaternion, f_B: Vector, gravity: float) -> Vector:
     """Return R_WB f_B + g_W [m/s^2; W]."""
-    f_W = turn(rotation(q), f_B)
+    f_W = product(matrix(q), f_B)
     return f_W[0], f_W[1], f_W[2] - gravity
 
 
@@ -68,14 +72,13 @@ def reckon(
         dt: length of the step [s].
     """
     p, v, q, a_before, w_before, _ = state
-    w = plus(gyro, gyro_bias, -1.0)
-    f_B = plus(accel, accel_bias, -1.0)
-    w_mean = (0.5 * (w_before[0] + w[0]), 0.5 * (w_before[1] + w[1]), 0.5 * (w_before[2] + w[2]))
-    q = madgwick_step(q, w_mean, f_B, beta, dt)
+    w = subtract(gyro, gyro_bias)
+    f_B = subtract(accel, accel_bias)
+    q = madgwick_step(q, scaled(add(w_before, w), 0.5), f_B, beta, dt)
     a = acceleration(q, f_B, gravity)
     half = 0.5 * dt
-    v_new = plus(plus(v, a_before, half), a, half)
-    p_new = plus(plus(p, v, half), v_new, half)
+    v_new = axpy(axpy(v, half, a_before), half, a)
+    p_new = axpy(axpy(p, half, v), half, v_new)
     return p_new, v_new, q, a, w, f_B
 
 
@@ -90,12 +93,11 @@ def corrected(state: Reckoning, error: np.ndarray, with_accel_bias: bool, gravit
         gravity: [m/s^2].
     """
     p, v, q, _, w, f_B = state
-    p = (p[0] + float(error[0]), p[1] + float(error[1]), p[2] + float(error[2]))
-    v = (v[0] + float(error[3]), v[1] + float(error[4]), v[2] + float(error[5]))
-    q = normalised(product(rotation_vector_quaternion((float(error[6]), float(error[7]), float(error[8]))), q))
-    w = (w[0] - float(error[9]), w[1] - float(error[10]), w[2] - float(error[11]))
+    p, v = add(p, vector(error, POSITION)), add(v, vector(error, VELOCITY))
+    q = normalised(multiply(rotation_vector_quaternion(vector(error, ATTITUDE)), q))
+    w = subtract(w, vector(error, GYRO_BIAS))
     if with_accel_bias:
-        f_B = (f_B[0] - float(error[12]), f_B[1] - float(error[13]), f_B[2] - float(error[14]))
+        f_B = subtract(f_B, vector(error, ACCEL_BIAS))
     return p, v, q, acceleration(q, f_B, gravity), w, f_B
 
 
@@ -103,13 +105,7 @@ def corrected(state: Reckoning, error: np.ndarray, with_accel_bias: bool, gravit
 def arm_acceleration(w: Vector, w_before: Vector, arm: Vector, dt: float) -> Vector:
     """Return alpha x r + w x (w x r) [m/s^2; B], which a sensor at p_BS = `arm` feels beyond the centre."""
     alpha = ((w[0] - w_before[0]) / dt, (w[1] - w_before[1]) / dt, (w[2] - w_before[2]) / dt)
-    tangential = cross(alpha, arm)
-    centripetal = cross(w, cross(w, arm))
-    return (
-        tangential[0] + centripetal[0],
-        tangential[1] + centripetal[1],
-        tangential[2] + centripetal[2],
-    )
+    return add(cross(alpha, arm), cross(w, cross(w, arm)))
 
 
 @portable
@@ -124,16 +120,16 @@ def write_minus_cross(M: np.ndarray, row: int, column: int, a: Vector, scale: fl
 
 
 @portable
-def write_minus_rotation(M: np.ndarray, row: int, column: int, R: Rotation, scale: float) -> None:
+def write_minus_rotation(M: np.ndarray, row: int, column: int, R: Matrix, scale: float) -> None:
     """Write -scale R into a 3 x 3 block."""
     for i in range(3):
         for j in range(3):
-            M[row + i, column + j] = -scale * R[3 * i + j]
+            M[row + i, column + j] = -scale * R[i][j]
 
 
 @portable
 def write_transition(
-    F: np.ndarray, f_W: Vector, R_WB: Rotation, levelling_s: float, with_accel_bias: bool, dt: float
+    F: np.ndarray, f_W: Vector, R_WB: Matrix, levelling_s: float, with_accel_bias: bool, dt: float
 ) -> None:
     """Write the transition of the error state over `dt` into F, which starts as the identity.
 
@@ -205,21 +201,22 @@ def write_prediction(
         (v[1] - v_before[1]) / dt,
         (v[2] - v_before[2]) / dt + gravity,
     )
-    write_transition(F, f_W, rotation(state[2]), levelling_s, with_accel_bias, dt)
+    write_transition(F, f_W, matrix(state[2]), levelling_s, with_accel_bias, dt)
     write_process_noise(Q, walk, variances, dt)
 
 
 @portable
-def heading_gradient(R: Rotation) -> Vector:
+def heading_gradient(R: Matrix) -> Vector:
     """Return the derivative of the heading over a small world rotation; (0, 0, 1) when the nose is level."""
-    squared = max(R[0] * R[0] + R[3] * R[3], HORIZONTAL_MIN)
-    return -R[6] * R[0] / squared, -R[6] * R[3] / squared, 1.0
+    x = column(R, 0)
+    squared = max(x[0] * x[0] + x[1] * x[1], HORIZONTAL_MIN)
+    return -x[2] * x[0] / squared, -x[2] * x[1] / squared, 1.0
 
 
 @portable
 def heading_and_sigma(q: Quaternion, P: np.ndarray) -> tuple[float, float]:
     """Return the heading [rad] and its standard deviation [rad] under the covariance P of the error state."""
-    gradient = heading_gradient(rotation(q))
+    gradient = heading_gradient(matrix(q))
     variance = 0.0
     for i in range(3):
         for j in range(3):

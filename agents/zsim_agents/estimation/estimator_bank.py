@@ -15,9 +15,10 @@ from zsim.contract.flight_messages import Estimate
 from zsim.contract.framing import GateMessages
 from zsim.contract.keys import SENSORS
 from zsim.math.compiled import portable
+from zsim.math.rotation import axpy, multiply, normalised, scaled
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim_agents.estimation import measurement_update, strapdown
-from zsim_agents.estimation.dead_reckoning import acceleration, heading_and_sigma, plus
+from zsim_agents.estimation.dead_reckoning import acceleration, heading_and_sigma
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.filter_setup import initial_rows
 from zsim_agents.estimation.filter_state import (
@@ -34,7 +35,7 @@ from zsim_agents.estimation.filter_state import (
     reckoning,
     vector,
 )
-from zsim_agents.estimation.madgwick import normalised, product, rotation_vector_quaternion
+from zsim_agents.estimation.madgwick import rotation_vector_quaternion
 from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD, YAW, set_variance
 from zsim_agents.estimation.sensor_reader import GateReader
 
@@ -198,8 +199,8 @@ def _write_estimate(row: np.ndarray, P: np.ndarray, t_s: float, estimate: np.nda
     p, v, q, a_W, w, _ = reckoning(row)
     ahead = t_s - row[NOMINAL.t]
     if ahead > 1e-9:
-        p, v = plus(p, v, ahead), plus(v, a_W, ahead)
-        q = normalised(product(q, rotation_vector_quaternion((w[0] * ahead, w[1] * ahead, w[2] * ahead))))
+        p, v = axpy(p, ahead, v), axpy(v, ahead, a_W)
+        q = normalised(multiply(q, rotation_vector_quaternion(scaled(w, ahead))))
         P = P.copy()
         P[:3] += ahead * P[3:6]
         P[:, :3] += ahead * P[:, 3:6]

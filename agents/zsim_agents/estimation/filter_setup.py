@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from zsim.contract.keys import SENSORS
+from zsim.math.rotation import LEVEL, matrix_from_rpy
 from zsim.scenario.scenario import Drone, Environment, ErrorModel, Estimation, ImuConfig, Sensor, Sensors
 from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 from zsim_agents.estimation.dead_reckoning import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
@@ -31,7 +32,7 @@ from zsim_agents.estimation.filter_state import (
     Rows,
 )
 from zsim_agents.estimation.kalman_update import DOF_MAX
-from zsim_agents.estimation.madgwick import LEVEL, beta_for, levelling_time_s, rpy_rotation
+from zsim_agents.estimation.madgwick import beta_for, levelling_time_s
 from zsim_agents.estimation.measurement_update import HEADING_SIGMA_RAD
 from zsim_agents.estimation.strapdown import MANOEUVRE_M_S2, MANOEUVRE_S, ZERO
 
@@ -73,19 +74,6 @@ AIDING = (  # in the order of the values of a reading
 )
 
 
-class ProcessNoise(NamedTuple):
-    """What drives the error state between measurements."""
-
-    accel_sigma: float
-    """White noise of the accelerometer per sample [m/s^2]."""
-    gyro_sigma: float
-    """White noise of the gyroscope per sample [rad/s]."""
-    tilt_density: float
-    """What Madgwick's pull adds to the tilt [rad^2/s]."""
-    levelling_s: float
-    """Time constant of Madgwick's pull [s]."""
-
-
 class BiasPrior(NamedTuple):
     """Equal states of bias."""
 
@@ -123,17 +111,6 @@ def madgwick_beta(estimation: Estimation, imu: ImuConfig, gravity: float) -> flo
     if estimation.madgwick_beta is not None:
         return estimation.madgwick_beta
     return beta_for(LEVELLING_S, accel_sigma(imu) / gravity)
-
-
-def process_noise(imu: ImuConfig, beta: float, gravity: float) -> ProcessNoise:
-    """Return the noise of dead reckoning with an IMU and a Madgwick gain [rad/s]."""
-    direction_sigma = accel_sigma(imu) / gravity
-    return ProcessNoise(
-        accel_sigma=accel_sigma(imu),
-        gyro_sigma=max(math.radians(white_sigma(imu.gyro_deg_s, BOARD_RATE_HZ)), GYRO_SIGMA_MIN),
-        tilt_density=tilt_density(beta, direction_sigma, gravity, 1.0 / imu.rate_hz),
-        levelling_s=levelling_time_s(beta, direction_sigma),
-    )
 
 
 def tilt_density(beta: float, direction_sigma: float, gravity: float, period_s: float) -> float:
@@ -245,20 +222,20 @@ def _error_model(sensors: Sensors, channel: Channel) -> ErrorModel:
 def _setting(drone: Drone, environment: Environment, estimation: Estimation, gate_s: float) -> list[float]:
     """Return the columns SETTING of a drone."""
     imu, gravity = drone.sensors.imu, environment.gravity_m_s2
-    beta = madgwick_beta(estimation, imu, gravity)
-    noise = process_noise(imu, beta, gravity)
+    beta, direction_sigma = madgwick_beta(estimation, imu, gravity), accel_sigma(imu) / gravity
+    gyro_sigma = max(math.radians(white_sigma(imu.gyro_deg_s, BOARD_RATE_HZ)), GYRO_SIGMA_MIN)
     row = [
         gravity,
         beta,
         1.0 / imu.rate_hz,
         imu.latency_ms * 1e-3 + gate_s + 5.0 * (1.0 / imu.rate_hz),
-        max(JOLT_SIGMAS * noise.accel_sigma, JOLT_MIN_M_S2),
+        max(JOLT_SIGMAS * accel_sigma(imu), JOLT_MIN_M_S2),
         age_max_s(drone, gate_s),
         math.radians(drone.yaw_deg),
-        noise.accel_sigma**2,
-        noise.gyro_sigma**2,
-        noise.tilt_density,
-        noise.levelling_s,
+        accel_sigma(imu) ** 2,
+        gyro_sigma**2,
+        tilt_density(beta, direction_sigma, gravity, 1.0 / imu.rate_hz),
+        levelling_time_s(beta, direction_sigma),
         *environment.magnetic_field_ut,
     ]
     for name in SENSORS:
@@ -276,8 +253,8 @@ def _sensor_setting(name: str, sensors: Sensors) -> list[float]:
             sigma = max(white_sigma(_error_model(sensors, channel), section.rate_hz), channel.sigma_min)
             variance += [sigma**2] * channel.axes
     variance += [0.0] * (VALUES_MAX - len(variance))
-    R_BS = rpy_rotation(section.mount.rpy_deg)
-    row = [*variance, *section.mount.position_m, *R_BS, -R_BS[2], -R_BS[5], -R_BS[8], PATIENCE_S.get(name, math.inf)]
+    R_BS = np.array(matrix_from_rpy(*map(math.radians, section.mount.rpy_deg)))
+    row = [*variance, *section.mount.position_m, *R_BS.flat, *-R_BS[:, 2], PATIENCE_S.get(name, math.inf)]
     assert len(row) == SENSOR.size
     return row
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from zsim.contract.keys import SENSORS
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import portable
-from zsim_agents.estimation.dead_reckoning import Reckoning
-from zsim_agents.estimation.madgwick import Quaternion, Rotation, Vector
+from zsim.math.rotation import Matrix, Quaternion, Vector
+from zsim_agents.estimation.dead_reckoning import Reckoning, vector
 
 IMU, GPS, MAG, BARO, SONAR, FLOW = (SENSORS.index(name) for name in ("imu", "gps", "mag", "baro", "sonar", "flow"))
 SIZES = (6, 6, 3, 1, 1, 3)  # values of a reading of each sensor
@@ -159,19 +159,13 @@ class Rows(NamedTuple):
 
 
 @portable
-def vector(row: np.ndarray, at: int) -> Vector:
-    """Return three columns."""
-    return float(row[at]), float(row[at + 1]), float(row[at + 2])
-
-
-@portable
 def put(row: np.ndarray, at: int, a: Vector) -> None:
     """Write three columns."""
     row[at], row[at + 1], row[at + 2] = a[0], a[1], a[2]
 
 
 @portable
-def add(row: np.ndarray, at: int, more: np.ndarray, first: int) -> None:
+def increase(row: np.ndarray, at: int, more: np.ndarray, first: int) -> None:
     """Add three places of an array to three columns."""
     for k in range(3):
         row[at + k] += more[first + k]
@@ -190,13 +184,9 @@ def put_quaternion(row: np.ndarray, at: int, q: Quaternion) -> None:
 
 
 @portable
-def matrix(row: np.ndarray, at: int) -> Rotation:
-    """Return nine columns."""
-    return (
-        float(row[at]), float(row[at + 1]), float(row[at + 2]),
-        float(row[at + 3]), float(row[at + 4]), float(row[at + 5]),
-        float(row[at + 6]), float(row[at + 7]), float(row[at + 8]),
-    )  # fmt: skip
+def matrix_at(row: np.ndarray, at: int) -> Matrix:
+    """Return nine columns, row by row."""
+    return vector(row, at), vector(row, at + 3), vector(row, at + 6)
 
 
 @portable

@@ -8,32 +8,10 @@ Quaternions are Hamilton, w first, body to world; the world is z up, so a body a
 import math
 
 from zsim.math.compiled import portable
+from zsim.math.rotation import Quaternion, Vector, dot, multiply, norm, normalised, scaled
 
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-Rotation = tuple[float, float, float, float, float, float, float, float, float]
-
-LEVEL: Quaternion = (1.0, 0.0, 0.0, 0.0)
 # Mean of a unit vector in the plane along a small offset e under noise s per axis: slope * e/s.
 UNIT_VECTOR_SLOPE = math.sqrt(math.pi / 8)
-
-
-@portable
-def normalised(q: Quaternion) -> Quaternion:
-    """Return the quaternion scaled to length 1."""
-    scale = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    return q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale
-
-
-@portable
-def product(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Return the Hamilton product a b."""
-    return (
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    )
 
 
 @portable
@@ -42,89 +20,10 @@ def rotation_vector_quaternion(v: Vector) -> Quaternion:
 
     Gyroscope steps and filter corrections are far below that; the length is put right in every case.
     """
-    s = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    s = dot(v, v)
     cosine = 1.0 - s / 8.0 + s * s / 384.0 - s * s * s / 46080.0
     sine = 0.5 - s / 48.0 + s * s / 3840.0 - s * s * s / 645120.0
-    return normalised((cosine, sine * v[0], sine * v[1], sine * v[2]))
-
-
-@portable
-def rotation(q: Quaternion) -> Rotation:
-    """Return R_WB row by row."""
-    w, x, y, z = q
-    return (
-        1.0 - 2.0 * (y * y + z * z),
-        2.0 * (x * y - w * z),
-        2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z),
-        1.0 - 2.0 * (x * x + z * z),
-        2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y),
-        2.0 * (y * z + w * x),
-        1.0 - 2.0 * (x * x + y * y),
-    )
-
-
-@portable
-def turn(R: Rotation, v: Vector) -> Vector:
-    """Return R v."""
-    return (
-        R[0] * v[0] + R[1] * v[1] + R[2] * v[2],
-        R[3] * v[0] + R[4] * v[1] + R[5] * v[2],
-        R[6] * v[0] + R[7] * v[1] + R[8] * v[2],
-    )
-
-
-@portable
-def turn_back(R: Rotation, v: Vector) -> Vector:
-    """Return R^T v."""
-    return (
-        R[0] * v[0] + R[3] * v[1] + R[6] * v[2],
-        R[1] * v[0] + R[4] * v[1] + R[7] * v[2],
-        R[2] * v[0] + R[5] * v[1] + R[8] * v[2],
-    )
-
-
-def rpy_rotation(rpy_deg: Vector) -> Rotation:
-    """Return Rz(yaw) Ry(pitch) Rx(roll) row by row."""
-    roll, pitch, yaw = (math.radians(angle) for angle in rpy_deg)
-    sr, cr, sp, cp, sy, cy = (
-        math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch), math.sin(yaw), math.cos(yaw),
-    )  # fmt: skip
-    return (
-        cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr,
-        sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr,
-        -sp, cp * sr, cp * cr,
-    )  # fmt: skip
-
-
-@portable
-def compose(A: Rotation, B: Rotation) -> Rotation:
-    """Return the product A B."""
-    return (
-        A[0] * B[0] + A[1] * B[3] + A[2] * B[6],
-        A[0] * B[1] + A[1] * B[4] + A[2] * B[7],
-        A[0] * B[2] + A[1] * B[5] + A[2] * B[8],
-        A[3] * B[0] + A[4] * B[3] + A[5] * B[6],
-        A[3] * B[1] + A[4] * B[4] + A[5] * B[7],
-        A[3] * B[2] + A[4] * B[5] + A[5] * B[8],
-        A[6] * B[0] + A[7] * B[3] + A[8] * B[6],
-        A[6] * B[1] + A[7] * B[4] + A[8] * B[7],
-        A[6] * B[2] + A[7] * B[5] + A[8] * B[8],
-    )
-
-
-@portable
-def cross(a: Vector, b: Vector) -> Vector:
-    """Return a x b."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-@portable
-def heading(q: Quaternion) -> float:
-    """Return the yaw of the Z-Y-X Euler angles, atan2(R21, R11) [rad]."""
-    w, x, y, z = q
-    return math.atan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+    return normalised((cosine, *scaled(v, sine)))
 
 
 @portable
@@ -136,7 +35,7 @@ def gravity_gradient(q: Quaternion, f_B: Vector) -> Quaternion:
         f_B: specific force, any length above zero.
     """
     w, x, y, z = q
-    scale = 1.0 / math.sqrt(f_B[0] * f_B[0] + f_B[1] * f_B[1] + f_B[2] * f_B[2])
+    scale = 1.0 / norm(f_B)
     ex = 2.0 * (x * z - w * y) - f_B[0] * scale
     ey = 2.0 * (w * x + y * z) - f_B[1] * scale
     ez = 1.0 - 2.0 * (x * x + y * y) - f_B[2] * scale
@@ -159,7 +58,7 @@ def madgwick_step(q: Quaternion, w_WB_B: Vector, f_B: Vector, beta: float, dt: f
         beta: gain [rad/s]; turns the attitude towards gravity by at most 2 beta dt.
         dt: length of the step [s].
     """
-    turned = product(q, rotation_vector_quaternion((w_WB_B[0] * dt, w_WB_B[1] * dt, w_WB_B[2] * dt)))
+    turned = multiply(q, rotation_vector_quaternion(scaled(w_WB_B, dt)))
     if beta == 0.0 or f_B == (0.0, 0.0, 0.0):
         return normalised(turned)
     g = gravity_gradient(turned, f_B)

@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from zsim.math.compiled import portable
+from zsim.math.rotation import heading, matrix, product
 from zsim_agents.estimation import strapdown
 from zsim_agents.estimation.dead_reckoning import ATTITUDE, POSITION, VELOCITY
 from zsim_agents.estimation.filter_state import (
@@ -29,15 +30,21 @@ from zsim_agents.estimation.filter_state import (
     VALUES_MAX,
     Moment,
     Rows,
-    matrix,
+    matrix_at,
     moment,
     put,
     quaternion,
     vector,
 )
-from zsim_agents.estimation.kalman_update import ROWS_MAX, stacked_update
-from zsim_agents.estimation.madgwick import heading, rotation, turn
-from zsim_agents.estimation.measurement_models import write_baro, write_flow, write_gps, write_mag, write_sonar
+from zsim_agents.estimation.kalman_update import (
+    ROWS_MAX,
+    stacked_update,
+    write_baro,
+    write_flow,
+    write_gps,
+    write_mag,
+    write_sonar,
+)
 
 YAW = ATTITUDE + 2  # place in the error state
 VALUE_MAX = 1e7  # m, m/s or uT: no sensor reads more, and squares of more would drown the rest
@@ -52,7 +59,7 @@ def accept(rows: Rows, i: int, reading: np.ndarray) -> bool:
     """Whether an aiding reading is to be used at the end of the gate.
 
     One that is out of order, too old or no number is counted as refused; a duplicate is not counted, nor is a sonar
-    without an echo, which says nothing.
+    without an echo, which has no information.
     """
     row, counts, setting, layout = rows.nominal[i], rows.counts[i], rows.setting[i], rows.layout[i]
     kind = int(reading[READING.sensor])
@@ -96,8 +103,8 @@ def start_heading(
     at = first
     while at >= 0:
         if int(readings[at, READING.sensor]) == MAG:
-            R_BS = matrix(setting, SETTING.sensors + MAG * SENSOR.size + SENSOR.R_BS)
-            seen = turn(rotation(quaternion(row, NOMINAL.q_WB)), turn(R_BS, vector(readings[at], READING.values)))
+            R_BS = matrix_at(setting, SETTING.sensors + MAG * SENSOR.size + SENSOR.R_BS)
+            seen = product(matrix(quaternion(row, NOMINAL.q_WB)), product(R_BS, vector(readings[at], READING.values)))
             field = vector(setting, SETTING.field_W)
             angle = math.atan2(field[1], field[0]) - math.atan2(seen[1], seen[0])
             _turn_heading(row, counts, setting[SETTING.gravity], angle)  # its certainty comes from the update
@@ -121,13 +128,13 @@ def predict(H: np.ndarray, at: int, kind: int, setting: np.ndarray, past: Moment
     """Write what a sensor should read into out[at:], and its rows of H."""
     aid = SETTING.sensors + kind * SENSOR.size
     _, p, v, q, w, _, _ = past
-    R, arm = rotation(q), vector(setting, aid + SENSOR.p_BS)
+    R, arm = matrix(q), vector(setting, aid + SENSOR.p_BS)
     if kind == GPS:
         expected = write_gps(H, at, p, v, R, w, arm, lag)
         for k in range(6):
             out[at + k] = expected[k]
     elif kind == MAG:
-        field = write_mag(H, at, R, matrix(setting, aid + SENSOR.R_BS), vector(setting, SETTING.field_W))
+        field = write_mag(H, at, R, matrix_at(setting, aid + SENSOR.R_BS), vector(setting, SETTING.field_W))
         put(out, at, field)
     elif kind == BARO:
         out[at] = write_baro(H, at, p, R, arm, lag)

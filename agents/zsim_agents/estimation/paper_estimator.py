@@ -3,7 +3,7 @@
 I. Mas, S. Curi, R. Sánchez Peña, "Open-source Multi-UAV Simulator for the ROS Environment", section III: gyroscopes and
 accelerometers give the attitude by Madgwick's filter; the position is that of dead reckoning and a GPS receiver, fused
 by an extended Kalman filter "due to the non-linear dynamics". Nothing measures the heading: it begins with the one that
-the drone was set down with, and only a moving drone's fixes tell it again.
+the drone was set down with, and only the fixes of a moving drone correct it.
 
 Dead reckoning goes along the velocity u that the aircraft itself gives in its heading frame:
 
@@ -18,9 +18,11 @@ from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
 from zsim.contract.messages import Flow, Gps, Imu
+from zsim.math import frames
+from zsim.math.rotation import Quaternion, Vector
 from zsim.scenario.scenario import Drone, Environment, Estimation
 from zsim_agents.estimation.drone_estimator import StateEstimate
-from zsim_agents.estimation.madgwick import Quaternion, Vector, heading, madgwick_step, product, rpy_rotation, turn
+from zsim_agents.estimation.madgwick import madgwick_step
 
 YAW = 3  # place in the state
 POSITION_SIGMA_M = 100.0  # m: a start anywhere on the field
@@ -39,10 +41,10 @@ class PaperEstimator:
         self._imu_period_s = 1.0 / drone.sensors.imu.rate_hz
         beta = estimation.madgwick_beta
         self._beta = math.sqrt(0.75) * (self._gyro_sigma + self._gyro_bias) if beta is None else beta  # Madgwick (50)
-        self._R_BS = rpy_rotation(drone.sensors.imu.mount.rpy_deg)
+        self._q_BS = frames.quaternion_from_rpy(np.radians(drone.sensors.imu.mount.rpy_deg))
         self._speed_sigma, self._flow_period_s = flow.velocity_m_s.noise, 1.0 / flow.rate_hz
         yaw = math.radians(drone.yaw_deg)
-        self._q: Quaternion = _about_z(yaw)
+        self._q = _quaternion(frames.quaternion_from_heading(yaw))
         self._t_imu_s = math.nan
         self._velocity: Vector | None = None
         self._fix: Gps | None = None
@@ -65,18 +67,20 @@ class PaperEstimator:
         """Predict to the end of the gate, correct by a fix, and return the estimate."""
         dt = 0.0 if math.isnan(self._t_s) else t_s - self._t_s
         self._t_s = t_s
-        self._filter.reckon(self._velocity or (0.0, 0.0, 0.0), heading(self._q), self._process_noise(dt), dt)
+        yaw = float(frames.heading(self._q))
+        self._filter.reckon(self._velocity or (0.0, 0.0, 0.0), yaw, self._process_noise(dt), dt)
         if self._fix:
             self._filter.correct(self._fix)
             self._fix = None
+        turn = frames.quaternion_from_heading(self._filter.x[YAW] - yaw)
+        self._q = _quaternion(frames.quaternion_multiply(turn, self._q))
         yaw = float(self._filter.x[YAW])
-        self._q = product(_about_z(yaw - heading(self._q)), self._q)
         velocity = rotation_z(yaw) @ (self._velocity or (0.0, 0.0, 0.0))
         return StateEstimate(
             position_m=self._filter.x[:3],
             velocity_m_s=velocity,
             orientation_wxyz=self._q,
-            yaw_rad=heading(self._q),
+            yaw_rad=float(frames.heading(self._q)),
             covariance=self._covariance(),
             yaw_sigma_rad=math.sqrt(self._filter.P[YAW, YAW]),
             sensors={name: (count, 0) for name, count in self._used.items()},
@@ -91,8 +95,13 @@ class PaperEstimator:
         if not dt < IMU_GAP_MAX_S:
             dt = self._imu_period_s
         self._t_imu_s = t_s
-        rate, force = turn(self._R_BS, sample.gyro_rad_s), turn(self._R_BS, sample.accel_m_s2)
-        self._q = madgwick_step(self._q, rate, force, self._beta, dt)
+        self._q = madgwick_step(
+            self._q, self._in_body(sample.gyro_rad_s), self._in_body(sample.accel_m_s2), self._beta, dt
+        )
+
+    def _in_body(self, v_S: Vector) -> Vector:
+        x, y, z = frames.rotate(self._q_BS, v_S).tolist()
+        return x, y, z
 
     def _take_velocity(self, flow: Flow) -> None:
         self._velocity = flow.velocity_m_s if flow.quality > 0.0 else None
@@ -152,5 +161,6 @@ def rotation_z(yaw: float) -> NDArray[np.float64]:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _about_z(angle: float) -> Quaternion:
-    return (math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle))
+def _quaternion(q: NDArray[np.float64]) -> Quaternion:
+    w, x, y, z = q.tolist()
+    return w, x, y, z

@@ -1,18 +1,10 @@
 """The nominal state of a drone, a row: moved by every sample of its IMU, put right by the filter, and remembered."""
 
-import math
-
 import numpy as np
 
 from zsim.math.compiled import portable
-from zsim_agents.estimation.dead_reckoning import (
-    acceleration,
-    arm_acceleration,
-    corrected,
-    plus,
-    reckon,
-    write_prediction,
-)
+from zsim.math.rotation import Vector, about_z, add, axpy, multiply, normalised, product, scaled, subtract
+from zsim_agents.estimation.dead_reckoning import acceleration, arm_acceleration, corrected, reckon, write_prediction
 from zsim_agents.estimation.filter_state import (
     COUNT,
     IMU,
@@ -22,8 +14,8 @@ from zsim_agents.estimation.filter_state import (
     SETTING,
     Moment,
     Rows,
-    add,
-    matrix,
+    increase,
+    matrix_at,
     moment_at,
     put,
     put_moment,
@@ -34,7 +26,7 @@ from zsim_agents.estimation.filter_state import (
     vector,
 )
 from zsim_agents.estimation.kalman_update import predicted_covariance
-from zsim_agents.estimation.madgwick import Vector, normalised, product, rotation_vector_quaternion, turn
+from zsim_agents.estimation.madgwick import rotation_vector_quaternion
 
 ZERO: Vector = (0.0, 0.0, 0.0)
 ACCEL_MAX_M_S2 = 500.0  # m/s^2, 50 g: no MEMS accelerometer of a drone reads more
@@ -122,11 +114,11 @@ def _lose(row: np.ndarray, missing_s: float) -> None:
 def _of_body(row: np.ndarray, setting: np.ndarray, accel: Vector, gyro: Vector, dt: float) -> tuple[Vector, Vector]:
     """Return a sample of a turned or displaced IMU as one of the centre of mass, in body axes."""
     imu = SETTING.sensors + IMU * SENSOR.size
-    R_BS = matrix(setting, imu + SENSOR.R_BS)
-    accel, gyro = turn(R_BS, accel), turn(R_BS, gyro)
-    w = plus(gyro, vector(row, NOMINAL.gyro_bias), -1.0)
+    R_BS = matrix_at(setting, imu + SENSOR.R_BS)
+    accel, gyro = product(R_BS, accel), product(R_BS, gyro)
+    w = subtract(gyro, vector(row, NOMINAL.gyro_bias))
     swing = arm_acceleration(w, vector(row, NOMINAL.w_WB_B), vector(setting, imu + SENSOR.p_BS), dt)
-    return plus(accel, swing, -1.0), gyro
+    return subtract(accel, swing), gyro
 
 
 @portable
@@ -136,7 +128,7 @@ def coast(row: np.ndarray, setting: np.ndarray, t_s: float) -> None:
     if dt <= setting[SETTING.coast_after]:
         return
     p, v, q, _, _, f_B = reckoning(row)
-    put_reckoning(row, (plus(p, v, dt), v, q, ZERO, ZERO, f_B))
+    put_reckoning(row, (axpy(p, dt, v), v, q, ZERO, ZERO, f_B))
     row[NOMINAL.t] = t_s
     row[NOMINAL.lost_velocity] += COAST_VELOCITY_DENSITY * dt
     row[NOMINAL.lost_turn] += COAST_TURN_DENSITY * dt
@@ -174,17 +166,17 @@ def correct(row: np.ndarray, layout: np.ndarray, gravity: float, error: np.ndarr
     with_accel_bias = layout[LAYOUT.accel_bias] != 0
     put_reckoning(row, corrected(reckoning(row), error, with_accel_bias, gravity))
     put(row, NOMINAL.v_start, vector(row, NOMINAL.v_WB))
-    add(row, NOMINAL.p_corrected, error, 0)
-    add(row, NOMINAL.v_corrected, error, 3)
-    add(row, NOMINAL.gyro_bias, error, 9)
+    increase(row, NOMINAL.p_corrected, error, 0)
+    increase(row, NOMINAL.v_corrected, error, 3)
+    increase(row, NOMINAL.gyro_bias, error, 9)
     if with_accel_bias:
-        add(row, NOMINAL.accel_bias, error, 12)
+        increase(row, NOMINAL.accel_bias, error, 12)
 
 
 @portable
 def turn_heading(row: np.ndarray, gravity: float, angle: float) -> None:
     """Turn the attitude about the world's z axis."""
-    q = product((math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle)), quaternion(row, NOMINAL.q_WB))
+    q = multiply(about_z(angle), quaternion(row, NOMINAL.q_WB))
     put_quaternion(row, NOMINAL.q_WB, q)
     put(row, NOMINAL.a_WB, acceleration(q, vector(row, NOMINAL.f_B), gravity))
     put(row, NOMINAL.v_start, vector(row, NOMINAL.v_WB))
@@ -232,16 +224,16 @@ def recall(counts: np.ndarray, history: np.ndarray, longest: int, t_s: float, no
 @portable
 def _as_seen(past: Moment, now: Moment) -> Moment:
     """Return a past state with the corrections since then."""
-    p = plus(plus(past[1], now[5], 1.0), past[5], -1.0)
-    v = plus(plus(past[2], now[6], 1.0), past[6], -1.0)
+    p = subtract(add(past[1], now[5]), past[5])
+    v = subtract(add(past[2], now[6]), past[6])
     return past[0], p, v, past[3], past[4], now[5], now[6]
 
 
 @portable
 def _ahead(now: Moment, dt: float) -> Moment:
     t_s, p, v, q, w, p_corrected, v_corrected = now
-    turned = rotation_vector_quaternion((dt * w[0], dt * w[1], dt * w[2]))
-    return t_s + dt, plus(p, v, dt), v, product(q, turned), w, p_corrected, v_corrected
+    turned = multiply(q, rotation_vector_quaternion(scaled(w, dt)))
+    return t_s + dt, axpy(p, dt, v), v, turned, w, p_corrected, v_corrected
 
 
 @portable
@@ -260,4 +252,4 @@ def _between(a: Moment, b: Moment, t_s: float) -> Moment:
 
 @portable
 def _mix(a: Vector, b: Vector, part: float) -> Vector:
-    return a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1]), a[2] + part * (b[2] - a[2])
+    return axpy(a, part, subtract(b, a))

@@ -216,7 +216,7 @@ def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
     """Return the phase machine that one of a scenario's clusters asks for.
 
     Raises:
-        RunError: the plan can never be flown; the text says why.
+        RunError: the plan can never be flown, with the reason.
     """
     try:
         space, gains, law = scenario_space(scenario, cluster), gains_of(cluster.gains), law_of(cluster)

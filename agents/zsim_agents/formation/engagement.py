@@ -86,7 +86,7 @@ class Engagement:
         self._landing_s = -math.inf
         self._fault = ""  # why an engaged formation does not close its loop
         self._well_since_s = math.inf
-        self._checked = np.empty(0)  # the last reference found good; one at rest stays the same array
+        self._checked = np.empty(0)  # the last reference without a fault; one at rest stays the same array
         self._wrapped = self._checked, self._checked  # the last reference and the same with wrapped angles
 
     @property
@@ -117,7 +117,7 @@ class Engagement:
     def warm_start(self, phase: str, desired: Array, plan_step: int = 0) -> None:
         """Go on where a former process of this formation was: in its phase, at its reference (4n,).
 
-        Its plan goes on after the steps that the former one was through with, as `GateOutput.plan_step` said; what it
+        Its plan goes on after the steps that the former one was through with, as in its `GateOutput.plan_step`; what it
         flew by the plan (a target, a trajectory) is asked for again, from that reference.
         """
         self._phase = "engaged" if phase == "held" else phase

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import math
+import operator
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
@@ -196,55 +197,16 @@ def _power(a: Dual, b: Dual) -> Dual:
     return value, rate + value * math.log(base) * b[1] if b[1] else rate
 
 
-def _minus(a: Dual) -> Dual:
-    return -a[0], -a[1]
+def _unary(
+    function: Callable[[float], float], rate_of: Callable[[float, float, float], float]
+) -> Callable[[Dual], Dual]:
+    """Return a function of a dual number; `rate_of` takes argument, value and the argument's rate, where it has one."""
 
+    def apply(a: Dual) -> Dual:
+        value = function(a[0])
+        return value, rate_of(a[0], value, a[1]) if a[1] else 0.0
 
-def _plus(a: Dual) -> Dual:
-    return a
-
-
-def _sin(a: Dual) -> Dual:
-    return math.sin(a[0]), math.cos(a[0]) * a[1]
-
-
-def _cos(a: Dual) -> Dual:
-    return math.cos(a[0]), -math.sin(a[0]) * a[1]
-
-
-def _tan(a: Dual) -> Dual:
-    value = math.tan(a[0])
-    return value, (1 + value * value) * a[1]
-
-
-def _asin(a: Dual) -> Dual:
-    return math.asin(a[0]), _slope(a[1], math.sqrt(1 - a[0] * a[0]))
-
-
-def _acos(a: Dual) -> Dual:
-    return math.acos(a[0]), -_slope(a[1], math.sqrt(1 - a[0] * a[0]))
-
-
-def _atan(a: Dual) -> Dual:
-    return math.atan(a[0]), a[1] / (1 + a[0] * a[0])
-
-
-def _sqrt(a: Dual) -> Dual:
-    value = math.sqrt(a[0])
-    return value, _slope(a[1], 2 * value)
-
-
-def _exp(a: Dual) -> Dual:
-    value = math.exp(a[0])
-    return value, value * a[1]
-
-
-def _log(a: Dual) -> Dual:
-    return math.log(a[0]), a[1] / a[0]
-
-
-def _abs(a: Dual) -> Dual:
-    return abs(a[0]), (math.copysign(1.0, a[0]) if a[0] else 0.0) * a[1]
+    return apply
 
 
 def _min(*parts: Dual) -> Dual:
@@ -259,10 +221,6 @@ def _value(a: Dual) -> float:
     return a[0]
 
 
-def _slope(rate: float, divisor: float) -> float:
-    return rate / divisor if rate else 0.0
-
-
 _BINARY: dict[type[ast.operator], Callable[[Dual, Dual], Dual]] = {
     ast.Add: _add,
     ast.Sub: _subtract,
@@ -270,18 +228,21 @@ _BINARY: dict[type[ast.operator], Callable[[Dual, Dual], Dual]] = {
     ast.Div: _divide,
     ast.Pow: _power,
 }
-_UNARY: dict[type[ast.unaryop], Callable[[Dual], Dual]] = {ast.USub: _minus, ast.UAdd: _plus}
+_UNARY: dict[type[ast.unaryop], Callable[[Dual], Dual]] = {
+    ast.USub: _unary(operator.neg, lambda x, y, rate: -rate),
+    ast.UAdd: _unary(operator.pos, lambda x, y, rate: rate),
+}
 _FUNCTIONS: dict[str, tuple[Callable[..., Dual], int, int]] = {
-    "sin": (_sin, 1, 1),
-    "cos": (_cos, 1, 1),
-    "tan": (_tan, 1, 1),
-    "asin": (_asin, 1, 1),
-    "acos": (_acos, 1, 1),
-    "atan": (_atan, 1, 1),
-    "sqrt": (_sqrt, 1, 1),
-    "exp": (_exp, 1, 1),
-    "log": (_log, 1, 1),
-    "abs": (_abs, 1, 1),
+    "sin": (_unary(math.sin, lambda x, y, rate: math.cos(x) * rate), 1, 1),
+    "cos": (_unary(math.cos, lambda x, y, rate: -math.sin(x) * rate), 1, 1),
+    "tan": (_unary(math.tan, lambda x, y, rate: (1 + y * y) * rate), 1, 1),
+    "asin": (_unary(math.asin, lambda x, y, rate: rate / math.sqrt(1 - x * x)), 1, 1),
+    "acos": (_unary(math.acos, lambda x, y, rate: -rate / math.sqrt(1 - x * x)), 1, 1),
+    "atan": (_unary(math.atan, lambda x, y, rate: rate / (1 + x * x)), 1, 1),
+    "sqrt": (_unary(math.sqrt, lambda x, y, rate: rate / (2 * y)), 1, 1),
+    "exp": (_unary(math.exp, lambda x, y, rate: y * rate), 1, 1),
+    "log": (_unary(math.log, lambda x, y, rate: rate / x), 1, 1),
+    "abs": (_unary(abs, lambda x, y, rate: math.copysign(1.0, x) * rate if x else 0.0), 1, 1),
     "min": (_min, 2, 16),
     "max": (_max, 2, 16),
 }

@@ -120,7 +120,7 @@ class Scheduled:
 class FlightPlan:
     """Requests in their order; each waits for those before it, except Land, which drops them.
 
-    A restarted controller begins it where `resume_at` of the former one says.
+    A restarted controller begins it where `resume_at` of the former one was.
 
     Attributes:
         note: why the plan waits, empty where it does not.

@@ -1,6 +1,6 @@
 """Where a formation is to be at every instant: the reference, and the ramps by which requests change it smoothly.
 
-Order of this file: the reference in flight, the checks of what is to be flown, ramps within the robots' limits.
+Order of this file: the reference in flight, ramps within the robots' limits and their checks.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Guidance:
         self.space = space
         self.paused = False
         self._gains = gains
-        self._shape = shape
+        self._planner = RampPlanner(space, gains, shape)
         self._home: Reference = Hold(np.zeros(space.size))
         self._flown: Reference = self._home
         self._goal = np.zeros(space.size)
@@ -74,7 +74,7 @@ class Guidance:
         """Lead to a target."""
         goal = request.goal(self.space, self._base(t_s))
         home = Hold(goal)
-        self._flown = self._ramp(self.value(t_s), home, t_s, request.over_s)
+        self._flown = self._planner.ramp(self.value(t_s), home, t_s, request.over_s)
         self._home, self._goal, self.paused = home, goal, False
 
     def follow(self, request: Follow, t_s: float) -> None:
@@ -83,24 +83,24 @@ class Guidance:
         start_s = request.start_s
         if start_s is None:
             begin = Hold(trajectory.value(0.0)[0])
-            ramp = fastest_ramp(self.space, self.value(t_s), begin, t_s, self._gains, self._shape)
+            ramp = self._planner.fastest(self.value(t_s), begin, t_s)
             start_s = t_s + ramp.over_s
         home = Shifted(trajectory, start_s)
-        self._flown = self._ramp(self.value(t_s), home, t_s)
+        self._flown = self._planner.ramp(self.value(t_s), home, t_s)
         self._home, self.paused = home, False
 
     def pause(self, t_s: float) -> None:
         """Come to rest at the present reference; at once where there is no room to do so smoothly."""
         c, c_dot = self.value(t_s)
         try:
-            self._flown = self._ramp((c, c_dot), Hold(c), t_s)
+            self._flown = self._planner.ramp((c, c_dot), Hold(c), t_s)
         except TrajectoryError:
             self._flown = Hold(c)
         self.paused = True
 
     def resume(self, t_s: float) -> None:
         """Go on after a pause with what the formation was about."""
-        self._flown = self._ramp(self.value(t_s), self._home, t_s)
+        self._flown = self._planner.ramp(self.value(t_s), self._home, t_s)
         self.paused = False
 
     def rejoin(self, c: Array, t_s: float, shape: ShapeLimits) -> None:
@@ -110,116 +110,93 @@ class Guidance:
         """
         home = Hold(c) if self.paused else self._home
         start = (c, np.zeros_like(c))
-        self._flown = plan_ramp(self.space, start, home, t_s, self._gains, shape)
+        self._flown = RampPlanner(self.space, self._gains, shape).ramp(start, home, t_s)
 
     def _base(self, t_s: float) -> Array:
         return self._home.value(t_s)[0] if isinstance(self._home, Shifted) else self._goal
 
-    def _ramp(self, start: tuple[Array, Array], onto: Reference, t_s: float, over_s: float | None = None) -> Ramp:
-        return plan_ramp(self.space, start, onto, t_s, self._gains, self._shape, over_s)
 
+class RampPlanner:
+    """Plans the ways of a formation within limits of its shape and of its robots."""
 
-def reference_fault(
-    space: ClusterSpace,
-    reference: Reference,
-    from_s: float,
-    to_s: float,
-    gains: FormationGains,
-    limits: ShapeLimits,
-) -> str | None:
-    """Return why a reference may not be flown from from_s to to_s, or None; sampled 41 to 301 times."""
-    count = min(max(math.ceil((to_s - from_s) / SAMPLE_S) + 1, SAMPLES_MIN), SAMPLES_MAX)
-    count = count if to_s > from_s else 1
-    for t_s in np.linspace(from_s, to_s, count).tolist():
-        fault = _fault_at(space, *reference.value(t_s), gains, limits)
+    def __init__(self, space: ClusterSpace, gains: FormationGains, limits: ShapeLimits) -> None:
+        self._space = space
+        self._gains = gains
+        self._limits = limits
+
+    def ramp(self, start: tuple[Array, Array], onto: Reference, start_s: float, over_s: float | None = None) -> Ramp:
+        """Return the ramp from start (c, c_dot) onto a reference; without over_s as fast as the limits let it.
+
+        The ramp and what follows it (600 s of it at most) are checked.
+
+        Raises:
+            TrajectoryError: too fast, too far, or it leads through a place that is not allowed.
+        """
+        from_s = max(start_s, onto.start_s) if isinstance(onto, Shifted) else start_s
+        end_s = min(math.inf if onto.duration_s is None else onto.duration_s, from_s + HORIZON_S)
+        try:
+            fault = self.reference_fault(onto, from_s, max(from_s, end_s))
+            if fault:
+                raise TrajectoryError(f"the reference is not allowed: {fault}")
+            ramp = self.fastest(start, onto, start_s)
+            if over_s is not None:
+                ramp = self._ramp_over(start, onto, start_s, over_s, ramp.over_s)
+            fault = self.reference_fault(ramp, start_s, start_s + ramp.over_s)
+        except SingularClusterError as error:
+            raise TrajectoryError(f"the way is singular: {error}") from None
         if fault:
-            return f"{t_s - from_s:.1f} s after its start {fault}" if t_s > from_s else fault
-    return None
+            raise TrajectoryError(f"the way is not allowed: {fault}")
+        return ramp
 
+    def fastest(self, start: tuple[Array, Array], onto: Reference, start_s: float) -> Ramp:
+        """Return the ramp that uses the limits; its way is not checked.
 
-def plan_ramp(
-    space: ClusterSpace,
-    start: tuple[Array, Array],
-    onto: Reference,
-    start_s: float,
-    gains: FormationGains,
-    limits: ShapeLimits,
-    over_s: float | None = None,
-) -> Ramp:
-    """Return the ramp from start (c, c_dot) onto a reference; without over_s as fast as the limits let it.
+        Raises:
+            TrajectoryError: it would take longer than an hour.
+        """
+        over_s = RAMP_MIN_S
+        while over_s <= RAMP_MAX_S:
+            ramp = ramp_onto(self._space, *start, onto, start_s, over_s)
+            excess = self._peak_load(ramp) / self._limits.share
+            if excess <= LOAD_TOLERANCE:
+                return ramp
+            over_s *= max(min(excess, 10.0), RAMP_GROWTH)
+        limit = f"not reached within {RAMP_MAX_S:g} s at the robots' limits"
+        raise TrajectoryError(f"{limit}: too far, or it moves too fast")
 
-    The ramp and what follows it (600 s of it at most) are checked.
+    def _ramp_over(
+        self, start: tuple[Array, Array], onto: Reference, start_s: float, over_s: float, least_s: float
+    ) -> Ramp:
+        if 0.0 < over_s <= RAMP_MAX_S:
+            ramp = ramp_onto(self._space, *start, onto, start_s, over_s)
+            if self._peak_load(ramp) <= self._limits.share * LOAD_TOLERANCE:
+                return ramp
+        allowed = f"allowed at the robots' limits: {least_s:.1f} s to {RAMP_MAX_S:g} s"
+        raise TrajectoryError(f"over_s is {over_s:g} s; {allowed}")
 
-    Raises:
-        TrajectoryError: too fast, too far, or it leads through a place that is not allowed.
-    """
-    from_s = max(start_s, onto.start_s) if isinstance(onto, Shifted) else start_s
-    end_s = min(math.inf if onto.duration_s is None else onto.duration_s, from_s + HORIZON_S)
-    try:
-        fault = reference_fault(space, onto, from_s, max(from_s, end_s), gains, limits)
+    def _peak_load(self, ramp: Ramp) -> float:
+        times = np.linspace(ramp.start_s, ramp.start_s + ramp.over_s, RAMP_SAMPLES).tolist()
+        return max(self._load(*ramp.value(t_s)) for t_s in times)
+
+    def _load(self, c: Array, c_dot: Array) -> float:
+        return load(*robot_rates(self._space, c, c_dot), self._gains.limits)
+
+    def reference_fault(self, reference: Reference, from_s: float, to_s: float) -> str | None:
+        """Return why a reference may not be flown from from_s to to_s, or None; sampled 41 to 301 times."""
+        count = min(max(math.ceil((to_s - from_s) / SAMPLE_S) + 1, SAMPLES_MIN), SAMPLES_MAX)
+        count = count if to_s > from_s else 1
+        for t_s in np.linspace(from_s, to_s, count).tolist():
+            fault = self._fault_at(*reference.value(t_s))
+            if fault:
+                return f"{t_s - from_s:.1f} s after its start {fault}" if t_s > from_s else fault
+        return None
+
+    def _fault_at(self, c: Array, c_dot: Array) -> str | None:
+        space, limits = self._space, self._limits
+        fault = shape_fault(space, c, limits) or place_fault(space, c, self._gains, limits)
         if fault:
-            raise TrajectoryError(f"the reference is not allowed: {fault}")
-        ramp = fastest_ramp(space, start, onto, start_s, gains, limits)
-        if over_s is not None:
-            ramp = _ramp_over(space, start, onto, start_s, gains, limits, over_s, ramp.over_s)
-        fault = reference_fault(space, ramp, start_s, start_s + ramp.over_s, gains, limits)
-    except SingularClusterError as error:
-        raise TrajectoryError(f"the way is singular: {error}") from None
-    if fault:
-        raise TrajectoryError(f"the way is not allowed: {fault}")
-    return ramp
-
-
-def fastest_ramp(
-    space: ClusterSpace,
-    start: tuple[Array, Array],
-    onto: Reference,
-    start_s: float,
-    gains: FormationGains,
-    limits: ShapeLimits,
-) -> Ramp:
-    """Return the ramp that uses the limits; its way is not checked.
-
-    Raises:
-        TrajectoryError: it would take longer than an hour.
-    """
-    over_s = RAMP_MIN_S
-    while over_s <= RAMP_MAX_S:
-        ramp = ramp_onto(space, *start, onto, start_s, over_s)
-        excess = _peak_load(space, ramp, gains) / limits.share
-        if excess <= LOAD_TOLERANCE:
-            return ramp
-        over_s *= max(min(excess, 10.0), RAMP_GROWTH)
-    raise TrajectoryError(f"not reached within {RAMP_MAX_S:g} s at the robots' limits: too far, or it moves too fast")
-
-
-def _ramp_over(
-    space: ClusterSpace,
-    start: tuple[Array, Array],
-    onto: Reference,
-    start_s: float,
-    gains: FormationGains,
-    limits: ShapeLimits,
-    over_s: float,
-    least_s: float,
-) -> Ramp:
-    if 0.0 < over_s <= RAMP_MAX_S:
-        ramp = ramp_onto(space, *start, onto, start_s, over_s)
-        if _peak_load(space, ramp, gains) <= limits.share * LOAD_TOLERANCE:
-            return ramp
-    raise TrajectoryError(f"over_s is {over_s:g} s; allowed at the robots' limits: {least_s:.1f} s to {RAMP_MAX_S:g} s")
-
-
-def _peak_load(space: ClusterSpace, ramp: Ramp, gains: FormationGains) -> float:
-    times = np.linspace(ramp.start_s, ramp.start_s + ramp.over_s, RAMP_SAMPLES).tolist()
-    return max(load(*robot_rates(space, *ramp.value(t_s)), gains.limits) for t_s in times)
-
-
-def _fault_at(space: ClusterSpace, c: Array, c_dot: Array, gains: FormationGains, limits: ShapeLimits) -> str | None:
-    fault = shape_fault(space, c, limits) or place_fault(space, c, gains, limits)
-    if fault:
-        return fault
-    share = load(*robot_rates(space, c, c_dot), gains.limits)
-    if share > limits.share * LOAD_TOLERANCE:
-        return f"a robot moves at {share:.2f} of its limits; allowed: {limits.share:g}"
-    return None
+            return fault
+        share = self._load(c, c_dot)
+        if share > limits.share * LOAD_TOLERANCE:
+            return f"a robot moves at {share:.2f} of its limits; allowed: {limits.share:g}"
+        return None

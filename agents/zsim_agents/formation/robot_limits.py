@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.math.compiled import portable
-from zsim.math.rotation import Vector, dot, norm
-from zsim_agents.formation.spaces.cluster_frame import between, row
+from zsim.math.rotation import Vector, dot, norm, subtract
+from zsim_agents.formation.spaces.cluster_frame import row
 from zsim_agents.formation.spaces.cluster_space import Array
 
 Pairs = tuple[tuple[int, int], ...]
@@ -157,7 +157,7 @@ def note_alarms(p_W: Array, near: PairTable, separation_alarm_m: float, order: O
     alarms = 0
     for k in range(near.shape[0]):
         i, j = near[k, 0], near[k, 1]
-        if norm(between(row(p_W, i), row(p_W, j))) < separation_alarm_m:
+        if norm(subtract(row(p_W, j), row(p_W, i))) < separation_alarm_m:
             alarms += 1
             order[j, i] = alarms
     return alarms
@@ -166,7 +166,7 @@ def note_alarms(p_W: Array, near: PairTable, separation_alarm_m: float, order: O
 @portable
 def part(p_W: Array, v_W: Array, v_cmd_W: Array, i: int, j: int, limits: RobotLimits) -> bool:
     """Let robots i and j separate at their least rate, half of the change each; return whether they did not."""
-    line_W = between(row(p_W, i), row(p_W, j))
+    line_W = subtract(row(p_W, j), row(p_W, i))
     distance = norm(line_W)
     if distance >= reach(limits):
         return False
@@ -193,7 +193,7 @@ def reach(limits: RobotLimits) -> float:
 @portable
 def along(u_W: Vector, v_W: Array, i: int, j: int) -> float:
     """Return the rate at which j leaves i along their line [m/s]."""
-    return dot(u_W, between(row(v_W, i), row(v_W, j)))
+    return dot(u_W, subtract(row(v_W, j), row(v_W, i)))
 
 
 @portable

@@ -33,8 +33,8 @@ class DroneQueue:
         urgent: runs tasks that wait for no other.
     """
 
-    def __init__(self, hands: Executor, urgent: Executor) -> None:
-        self._pool = hands
+    def __init__(self, pool: Executor, urgent: Executor) -> None:
+        self._pool = pool
         self._urgent = urgent
         self._tasks: dict[str, _DroneTasks] = {}
         self._lock = threading.Lock()
@@ -74,14 +74,14 @@ class DroneQueue:
             raise RuntimeError("closed")
         return self._tasks.setdefault(name, _DroneTasks())
 
-    def _start(self, hands: Executor, name: str, act: Task) -> None:
+    def _start(self, pool: Executor, name: str, act: Task) -> None:
         def done() -> None:
             try:
                 act()
             finally:
                 self._end(name)
 
-        hands.submit(done)
+        pool.submit(done)
         self._tasks[name].busy += 1
 
     def _end(self, name: str) -> None:
@@ -150,8 +150,8 @@ class CommandClient:
     def close(self) -> None:
         """Give up requests that wait."""
         self._queue.close()
-        for hands in self._pools:
-            hands.shutdown(wait=False, cancel_futures=True)
+        for pool in self._pools:
+            pool.shutdown(wait=False, cancel_futures=True)
 
     def request_world(self, op: str, **args: Any) -> None:
         """Request an operation of the world."""

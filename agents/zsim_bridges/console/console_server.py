@@ -1,4 +1,7 @@
-"""The console: shows one run after the other on a viser server that only its own HTTP proxy can reach."""
+"""The console: shows one run after the other on a viser server that only its own HTTP proxy can reach.
+
+Order of this file: the viser server, which messages of a page may reach it, the console.
+"""
 
 import asyncio
 import contextlib
@@ -7,22 +10,40 @@ import io
 import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
+import msgspec
 import viser
 import viser.infra._infra
 import websockets.asyncio.server
+from msgspec import Meta, Struct
 from viser.infra._async_message_buffer import AsyncMessageBuffer
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from zsim.contract import flight_messages
 from zsim.contract.messages import Info
+from zsim.schema import message
 from zsim.transport.session import Session
-from zsim_bridges.console.http_proxy import BACKEND_HOST, SECRET_HEADER, HttpProxy, ListenAddress, ViserBackend
+from zsim_bridges.console.http_proxy import (
+    BACKEND_HOST,
+    MESSAGE_MAX,
+    OPERATOR,
+    SECRET_HEADER,
+    VIEWER,
+    HttpProxy,
+    ListenAddress,
+    ViserBackend,
+)
 from zsim_bridges.console.page.scene_nodes import CameraFollow
-from zsim_bridges.console.page_rights import OPERATOR, VIEWER, PageControls
 from zsim_bridges.console.run_page import RunPage
 from zsim_bridges.observer_process import ObserverProcess
+
+VALUE_MAX = 2_000  # characters of a control's text: expressions of twelve variables, a line each
+EXACT_MAX = 2**53  # a page's numbers are exact up to it; a larger one fits no message
+
+Value = bool | message.Number | Annotated[str, Meta(max_length=VALUE_MAX)]
 
 
 class AnyThreadEvent(asyncio.Event):
@@ -101,6 +122,92 @@ def _requiring_secret(secret: str) -> Iterator[None]:
         websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
+class Camera(Struct, tag_field="type", tag="ViewerCameraMessage"):
+    """Every page sends where its camera is."""
+
+    wxyz: flight_messages.Quaternion
+    position: message.Vector3
+    fov: message.Number
+    near: message.Number
+    far: message.Number
+    image_height: message.Number
+    image_width: message.Number
+    look_at: message.Vector3
+    up_direction: message.Vector3
+
+
+class ControlUpdate(Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):
+    """A page sends this when somebody uses a control."""
+
+    class Updates(Struct, forbid_unknown_fields=True):
+        """Only the value of a control."""
+
+        value: Value
+
+    uuid: str
+    updates: Updates
+
+
+_DECODER = msgspec.msgpack.Decoder(Camera | ControlUpdate)
+"""All other messages are refused, such as to show the page on the Internet, or to upload files."""
+
+
+class PageControls:
+    """The controls that viser knows, and the switches that each page has for itself.
+
+    Args:
+        gui: of all pages.
+        switches: ids of those of single pages.
+    """
+
+    def __init__(self, gui: viser.GuiApi, switches: set[str]) -> None:
+        self._gui = gui
+        self._switches = switches
+
+    def is_local(self, uuid: str) -> bool:
+        """Return whether a control changes nothing but its own page."""
+        return uuid in self._switches
+
+    def accepts(self, uuid: str, value: Value) -> bool:
+        """Return whether a control takes such a value: viser converts it to its type, and fails where it cannot."""
+        if uuid in self._switches:
+            return isinstance(value, bool)
+        handle: Any = self._gui._gui_input_handle_from_uuid.get(uuid)  # viser has no public way to a control by its id
+        return handle is not None and _accepts(handle, value)
+
+
+def _accepts(handle: Any, value: Value) -> bool:
+    options = getattr(handle, "options", None)
+    if options is not None:
+        return value in options
+    current = handle.value
+    if isinstance(current, bool) or isinstance(value, bool):
+        return isinstance(current, bool) and isinstance(value, bool)
+    if isinstance(current, str) or isinstance(value, str):
+        return isinstance(current, str) and isinstance(value, str)
+    return abs(value) <= EXACT_MAX
+
+
+def is_permitted(data: bytes, role: str, controls: PageControls) -> bool:
+    """Return whether a message of a page may reach the console.
+
+    Args:
+        data: one message of viser's: a msgpack map with its type.
+        role: of the page.
+        controls: of all pages.
+    """
+    if len(data) > MESSAGE_MAX:
+        return False
+    try:
+        message = _DECODER.decode(data)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return False
+    if isinstance(message, Camera):
+        return True
+    permitted = role == OPERATOR or controls.is_local(message.uuid)
+    return permitted and controls.accepts(message.uuid, message.updates.value)
+
+
 class Console:
     """One console.
 
@@ -126,7 +233,8 @@ class Console:
         self._camera_follow = CameraFollow(self._viser.server)
         _show_text(self._viser.server.gui, "waiting for a world")
         controls = PageControls(self._viser.server.gui, self._camera_follow.switches)
-        backend = ViserBackend(self._viser.port, self._viser.secret, self._state, controls)
+        permits = partial(is_permitted, controls=controls)
+        backend = ViserBackend(self._viser.port, self._viser.secret, self._state, permits)
         self._proxy = HttpProxy(address, token, backend)
 
     @contextmanager

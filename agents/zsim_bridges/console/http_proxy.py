@@ -1,4 +1,4 @@
-"""The console's HTTP server: serves the page, and relays what viser and the page send each other if it is permitted."""
+"""The console's HTTP server: serves the page to who may open it, and relays what viser and the page send each other."""
 
 import asyncio
 import gzip
@@ -9,24 +9,24 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 import msgspec
 from aiohttp import ClientError, ClientSession, WSMsgType, web
 
 from zsim.errors import RunError
-from zsim_bridges.console.page_rights import (
-    MESSAGE_MAX,
-    OPERATOR,
-    VIEW_PATH,
-    VIEWER,
-    PageControls,
-    PageRequest,
-    PageTokens,
-    is_permitted,
+from zsim_bridges.web_server import (
+    check_token,
+    is_loopback_authority,
+    open_on_thread,
+    start_site,
+    tokens_match,
+    url_host,
 )
-from zsim_bridges.web_server import open_on_thread, start_site, url_host
 
+OPERATOR, VIEWER = "operator", "viewer"
+VIEW_PATH = "/view"
+MESSAGE_MAX = 100_000  # bytes of one message of a page
 BACKEND_HOST = "127.0.0.1"  # where viser listens
 SECRET_HEADER = "X-Zsim-Console"  # which viser's server asks for
 ALL_ADDRESSES = ("0.0.0.0", "::")
@@ -45,6 +45,78 @@ VIEW_STYLE = (
     "background:#1971c2;color:#fff;font:600 13px sans-serif;padding:3px 14px;border-radius:10px}"
     ".mantine-Button-root,.mantine-Slider-root,.mantine-Input-input{pointer-events:none;opacity:.4}</style>"
 )
+
+
+class PageRequest(NamedTuple):
+    """An HTTP request, as far as it shows who sent it."""
+
+    path: str
+    host: str  # of its Host header
+    origin: str | None
+    token: str  # in its address; empty for none
+    cookies: dict[str, str]
+
+
+class PageTokens:
+    """Decides by tokens who may open pages.
+
+    Args:
+        listen: the address on which pages are served.
+        port: and the port.
+        operator, viewer: tokens; the first is None where only this machine can connect.
+
+    Raises:
+        RunError: others could reach it, and there is no token.
+    """
+
+    def __init__(self, listen: str, port: int, operator: str | None, viewer: str) -> None:
+        check_token("console", listen, operator)
+        self._tokens = {OPERATOR: operator, VIEWER: viewer}
+        self._port = port
+
+    def cookie(self, role: str) -> str:
+        """Return the name of a role's cookie: a browser keeps those of all ports of a host together."""
+        return f"zsim_{role}_{self._port}"
+
+    def role_of(self, request: PageRequest) -> str | None:
+        """Return the role in which the page of this path may be opened, None if it may not."""
+        role = VIEWER if request.path.startswith(VIEW_PATH) else OPERATOR
+        if self._tokens[OPERATOR] is None:
+            return role if _is_from_own_page(request) else None
+        if request.origin is not None and _origin_address(request.origin) != request.host:
+            return None
+        sufficient = (OPERATOR,) if role == OPERATOR else (VIEWER, OPERATOR)
+        return role if any(self._has_token(request, each) for each in sufficient) else None
+
+    def role_of_address(self, request: PageRequest) -> str | None:
+        """Return the role whose token stands in the address, None if none does: it is to become a cookie."""
+        roles = (role for role in (OPERATOR, VIEWER) if self._is_token(request.token, role))
+        return next(roles, None) if request.token else None
+
+    def _has_token(self, request: PageRequest, role: str) -> bool:
+        cookie = request.cookies.get(self.cookie(role), "")
+        return self._is_token(request.token, role) or self._is_token(cookie, role)
+
+    def _is_token(self, received: str, role: str) -> bool:
+        token = self._tokens[role]
+        return token is not None and tokens_match(received, token)
+
+
+def _origin_address(origin: str) -> str | None:
+    """Return host and port of an Origin header, None where it cannot be parsed."""
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:
+        return None
+
+
+def _is_from_own_page(request: PageRequest) -> bool:
+    """Return whether a request comes from the console's own page, by a name of this machine."""
+    own_page = request.origin is None or _origin_address(request.origin) == request.host
+    try:
+        return own_page and is_loopback_authority(request.host)
+    except ValueError:
+        return False
 
 
 class ListenAddress(NamedTuple):
@@ -67,13 +139,13 @@ class ViserBackend(NamedTuple):
         port: on BACKEND_HOST.
         secret: that it asks for in SECRET_HEADER.
         state: returns what the console shows, as plain data.
-        controls: of all pages.
+        permits: returns whether a message of a page may reach viser, by the page's role.
     """
 
     port: int
     secret: str
     state: Callable[[], dict[str, Any]]
-    controls: PageControls
+    permits: Callable[[bytes, str], bool]
 
 
 class HttpProxy:
@@ -198,7 +270,7 @@ class HttpProxy:
 
     async def _to_viser(self, page: web.WebSocketResponse, viser: Any, role: str) -> None:
         async for message in page:
-            if message.type is WSMsgType.BINARY and is_permitted(message.data, role, self._backend.controls):
+            if message.type is WSMsgType.BINARY and self._backend.permits(message.data, role):
                 await viser.send_bytes(message.data)
 
 

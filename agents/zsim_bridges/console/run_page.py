@@ -17,12 +17,13 @@ from zsim.math import frames
 from zsim.scenario import scenario_file
 from zsim.transport.session import Session
 from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_bridges.console import html_tables
+from zsim_bridges.console import console_tables
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
+from zsim_bridges.console.console_tables import TableRows, console_state
 from zsim_bridges.console.page.console_page import ConsolePage
 from zsim_bridges.console.page.picture import (
+    CanvasTrails,
     DronePoses,
-    DroneTrails,
     FormationShape,
     drone_poses,
     ellipsoids,
@@ -30,9 +31,7 @@ from zsim_bridges.console.page.picture import (
     ghosts,
 )
 from zsim_bridges.console.page.scene_nodes import CameraFollow, SceneNodes
-from zsim_bridges.console.table_rows import TableRows, console_state
-from zsim_bridges.console.time_monitor import TimeMonitor
-from zsim_bridges.console.view_buffer import ViewBuffer
+from zsim_bridges.console.view_buffer import TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 
 TABLE_S = 0.5  # wall; of tables, plots and trails: people read no faster
@@ -89,7 +88,7 @@ class RunPage:
         self._client = CommandClient(link, observer.name, self.views, self._time_monitor.now_ns, self._on_outcome)
         self._names = names
         self._members = {c.name: [names.index(d) for d in c.drones] for c in self._scenario.clusters}
-        self._trails = DroneTrails(len(names))
+        self._trails = CanvasTrails(len(names))
         self._table_rows = TableRows(self.views)
         self._shapes: dict[str, FormationShape | None] = {}
         self._drones: DronePoses | None = None
@@ -215,16 +214,16 @@ class RunPage:
 
     def _update_tables(self, wall_s: float) -> None:
         page = self._page
-        page.clock.content = html_tables.clock_line(
+        page.clock.content = console_tables.clock_line(
             self._time_monitor.clock, int(self._drawn_ns), self._time_monitor.silent_s
         )
-        page.phases.content = html_tables.formation_lines(
+        page.phases.content = console_tables.formation_lines(
             {n: (v.phase, v.reason) for n, v in self.views.clusters.items()}
         )
-        page.drones.content = html_tables.drone_table(self._table_rows.drone_rows())
+        page.drones.content = console_tables.drone_table(self._table_rows.drone_rows())
         page.sensors.content = self._table_rows.sensor_table(page.drone_form.chosen)
-        page.faults.content = html_tables.fault_lines(self._table_rows.active_faults())
-        page.events.content = html_tables.event_table(list(self.views.events)[:EVENTS_SHOWN])
+        page.faults.content = console_tables.fault_lines(self._table_rows.active_faults())
+        page.events.content = console_tables.event_table(list(self.views.events)[:EVENTS_SHOWN])
         if page.chosen:
             page.forms[page.chosen].refresh(self.views.clusters.get(page.chosen), wall_s)
             page.plots[page.chosen].draw()
@@ -240,7 +239,7 @@ class RunPage:
         kind, result = ("refused", outcome.refusal) if outcome.refusal else ("control", "done")
         if outcome.refusal or outcome.request.partition(":")[0] in self._spaces:
             text = f"{outcome.request}: {result}"
-            self.views.add_event(Event(self._observer.now_ns, 0, kind, self._observer.name, "", text))
+            self.views.events.appendleft(Event(self._observer.now_ns, 0, kind, self._observer.name, "", text))
         if outcome.refusal:
             self._notify(outcome.request, outcome.refusal)
 

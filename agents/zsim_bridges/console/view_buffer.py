@@ -1,23 +1,31 @@
-"""The newest views of a run, kept until the next picture is drawn."""
+"""The newest views of a run, kept until the next picture is drawn, and the run's clock, polled now and then."""
 
+import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event, Fault, Health
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
-from zsim.errors import DecodeError
+from zsim.errors import DecodeError, ZsimError
 from zsim.transport.samples import RawSample
 from zsim.transport.session import Session
 from zsim_bridges.observer_process import ObserverProcess
 
 EVENTS_KEPT = 200
-HIDDEN_EVENTS = frozenset({"command"})  # an event of a mode or of a refusal follows and says more
 FRESH_S = 1.0  # simulated, and wall; views come 20 times a wall second: of an older one the estimator is dead, or stuck
+POLL_S = 0.25  # wall; rarely, since a message of each gate costs the world time
+ANSWER_TIMEOUT_S = 1.0  # wall; the world answers within milliseconds
+SILENT_S = 2.0  # wall; without an answer for so long, what is shown may be long past
+SPAN_NS = 1_000_000_000  # simulated, over which at least a rate is taken
+
+Counts = Mapping[str, tuple[int, int]]
+"""Measurements (used, refused) by sensor."""
 
 
 class ReceivedEstimate(NamedTuple):
@@ -73,7 +81,6 @@ class ViewBuffer:
         self._received_s: dict[str, float] = {}  # wall time by key, of views of drones and estimators
         self._new: dict[str, bytes] = {}
         self._arrived = threading.Condition()
-        self._lock = threading.Lock()
         self._answers: Counter[str] = Counter()
         self.drones: ViewDrones | None = None
         self.clusters: dict[str, ViewCluster] = {}
@@ -88,13 +95,13 @@ class ViewBuffer:
             self._link.declare_subscriber(expression, self._on_publication)
         self._link.declare_subscriber(keys.EVENT, self._on_event)
         samples = self._link.get(keys.FAULTS)
-        with self._lock:
+        with self._arrived:
             for sample in samples:
                 self._new.setdefault(sample.key, sample.payload)  # what has arrived meanwhile is newer
 
     def update(self) -> bool:
         """Decode what has come since the last update; return whether there is a new view of the drones."""
-        with self._lock:
+        with self._arrived:
             new, self._new = self._new, {}
         for key, payload in new.items():
             try:
@@ -131,13 +138,9 @@ class ViewBuffer:
         with self._arrived:
             self._arrived.wait_for(lambda: self._answers[drone] > beyond, within_s)
 
-    def add_event(self, event: Event) -> None:
-        """Add an event of the console's own."""
-        self.events.appendleft(event)
-
     def _on_publication(self, sample: RawSample) -> None:
         self._observer.health.received += 1
-        with self._lock:
+        with self._arrived:
             self._new[sample.key] = sample.payload
 
     def _store(self, key: str, message: Any) -> None:
@@ -169,7 +172,7 @@ class ViewBuffer:
             with self._arrived:
                 self._answers[_drone(event)] += 1
                 self._arrived.notify_all()
-        if event.kind not in HIDDEN_EVENTS:
+        if event.kind != "command":  # an event of a mode or of a refusal follows, with more in it
             self.events.appendleft(event)
         if event.kind == "refused" and event.source == self._observer.name:
             self._refused(event)
@@ -178,3 +181,114 @@ class ViewBuffer:
 def _drone(event: Event) -> str:
     """Return the drone that a command was for: of a refused one, the subject is the key."""
     return keys.thing(event.subject) if event.kind == "refused" and "/" in event.subject else event.subject
+
+
+class SensorRates:
+    """Sensor rates of one drone at a time, from counts that are sampled now and then."""
+
+    def __init__(self) -> None:
+        self._drone = ""
+        self._samples: list[tuple[int, Counts]] = []
+
+    def update(self, drone: str, t_ns: int, counts: Counts) -> dict[str, float]:
+        """Add the counts (used, refused) of a drone's sensors at an instant; return the latest rates [Hz]."""
+        if drone != self._drone or self._has_restarted(t_ns, counts):
+            self._drone, self._samples = drone, []
+        if self._samples and self._samples[-1][0] == t_ns:
+            self._samples.pop()  # the run stands still
+        self._samples.append((t_ns, dict(counts)))
+        while len(self._samples) > 2 and t_ns - self._samples[1][0] >= SPAN_NS:
+            self._samples.pop(0)
+        since_ns, before = self._samples[0]
+        span_ns = t_ns - since_ns
+        if span_ns <= 0:
+            return {}
+        return {kind: (sum(now) - sum(before.get(kind, now))) * 1e9 / span_ns for kind, now in counts.items()}
+
+    def _has_restarted(self, t_ns: int, counts: Counts) -> bool:
+        """Return whether a replay has gone back, or an estimator has restarted."""
+        if not self._samples:
+            return False
+        last_ns, last = self._samples[-1]
+        return t_ns < last_ns or any(sum(counts.get(kind, (0, 0))) < sum(before) for kind, before in last.items())
+
+
+class TimeMonitor:
+    """Polls the run's clock, in a thread of its own: drawing waits for no answer.
+
+    Args:
+        link: an open session.
+        observer: of the console in the run; it follows the run's clock.
+        stamp_age_s: simulated; how old the time of a stamp may be.
+        wall_s: monotonic.
+
+    Attributes:
+        clock: the newest answer.
+    """
+
+    def __init__(
+        self,
+        link: Session,
+        observer: ObserverProcess,
+        stamp_age_s: float = math.inf,
+        wall_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._link = link
+        self._observer = observer
+        self._stamp_age_s = stamp_age_s
+        self._wall_s = wall_s
+        self._one = threading.RLock()
+        self._is_polling = False
+        self._answered_s = wall_s()
+        self._known_s = -math.inf
+        self.clock: run_messages.Clock | None = None
+
+    @contextmanager
+    def polling(self) -> Iterator[None]:
+        """Poll again and again meanwhile."""
+        over = threading.Event()
+        thread = threading.Thread(target=self._poll_repeatedly, args=(over,), name="watch", daemon=True)
+        self._answered_s, self._is_polling = self._wall_s(), True
+        thread.start()
+        try:
+            yield
+        finally:
+            self._is_polling = False
+            over.set()
+            thread.join(ANSWER_TIMEOUT_S)
+
+    def poll(self) -> None:
+        """Poll once; one poll runs at a time."""
+        with self._one:
+            start_s = self._wall_s()
+            try:
+                samples = self._link.get(keys.CLOCK, timeout_s=ANSWER_TIMEOUT_S)
+            except ZsimError:
+                return  # the link is lost, and comes back
+            for sample in samples:
+                clock = self._observer.update_clock(sample.payload)
+                if clock is not None:
+                    self.clock, self._known_s, self._answered_s = clock, start_s, self._wall_s()
+
+    def now_ns(self) -> int:
+        """Return simulated time for a stamp, polling where it may be too old; within 2 ANSWER_TIMEOUT_S."""
+        if self._is_old():
+            with self._one:
+                if self._is_old():  # no other thread has polled meanwhile
+                    self.poll()
+        return self._observer.now_ns
+
+    @property
+    def silent_s(self) -> float:
+        """For how long the world has not answered; 0 where that is not long [s, wall]."""
+        silent_s = self._wall_s() - self._answered_s
+        return silent_s if self._is_polling and silent_s >= SILENT_S else 0.0
+
+    def _poll_repeatedly(self, over: threading.Event) -> None:
+        while not over.is_set():
+            self.poll()
+            over.wait(POLL_S)
+
+    def _is_old(self) -> bool:
+        rate = max(1.0, self.clock.rate) if self.clock else 1.0  # as measured: of a run that has just begun, 0
+        return (self._wall_s() - self._known_s) * rate > self._stamp_age_s

@@ -14,7 +14,7 @@ import msgspec
 from aiohttp import WSMsgType, web
 
 from zsim.transport.samples import RawSample
-from zsim_bridges.gateway.subscriptions import SharedSubscriptions
+from zsim_bridges.gateway.publications import SharedSubscriptions
 
 OUTBOX_BYTES_MAX = 4_000_000  # about 20 s of a drone's sensors as JSON
 FLUSH_S = 2.0  # how long the rest may take to be sent to a client that closes its connection

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
 from typing import Any, NamedTuple
 
 from aiohttp import web
@@ -17,15 +18,15 @@ from zsim.errors import NoWorldError, RunError, ZsimError
 from zsim.runtime.runner import Runner
 from zsim.transport.session import Session
 from zsim_bridges.gateway.access_check import AccessCheck, ConnectionLimit, TokenBucket
+from zsim_bridges.gateway.client_messages import TooManyError
 from zsim_bridges.gateway.client_streams import LINE_MAX, LineServer, Outbox
 from zsim_bridges.gateway.http_routes import application
 from zsim_bridges.gateway.http_trees import JsonTree, RestTree
-from zsim_bridges.gateway.key_policy import TooManyError
-from zsim_bridges.gateway.lockstep_session import LockstepAgent
+from zsim_bridges.gateway.lockstep_session import LockstepSession
+from zsim_bridges.gateway.publications import SharedSubscriptions
 from zsim_bridges.gateway.run_access import RunAccess
 from zsim_bridges.gateway.stream_client import Client
-from zsim_bridges.gateway.subscriptions import SharedSubscriptions
-from zsim_bridges.observer_process import ObserverProcess
+from zsim_bridges.observer_process import ANOTHER_RUN, ObserverProcess
 from zsim_bridges.web_server import cancel_other_tasks, check_token, open_on_thread, start_site, url_host
 
 CLIENTS_MAX = 500  # streams at once
@@ -79,22 +80,18 @@ class Gateway:
         self.subscriptions = SharedSubscriptions(self.loop, self._client_limit)
         self._full_key_subscriptions = SharedSubscriptions(self.loop, self._client_limit)
         self._ports = ports
-        self._name = name
+        self.name = name
         self._access_check = AccessCheck(token, self.report)
         self._dial = dial
         self._secured = secured
         self._say = say
         self._run: RunAccess | None = None
+        self._link_lost = False
         self._reported_faults: set[str] = set()
         self._clients: set[Client] = set()
         self._lockstep_threads: set[threading.Thread] = set()
 
     # For clients
-
-    @property
-    def name(self) -> str:
-        """Its process name."""
-        return self._name
 
     def run(self) -> RunAccess:
         """Return the current run.
@@ -110,17 +107,17 @@ class Gateway:
         """Return whether a token is the right one."""
         return self._access_check.is_token(token)
 
-    def start_lockstep(self, agent: LockstepAgent, ended: Callable[[str], None]) -> None:
-        """Run an agent, on a session of its own, until it leaves; `ended` is called with the reason."""
+    def start_lockstep(self, session: LockstepSession, ended: Callable[[str], None]) -> None:
+        """Run a client's agent, on a link of its own, until it leaves; `ended` is called with the reason."""
         for client in self._clients:
-            client.lose_lockstep(agent.name, "another client took the name", but=agent)
-        thread = threading.Thread(target=self._run_lockstep, args=(agent, ended), name=agent.name, daemon=True)
+            client.lose_lockstep(session, "another client took the name")
+        thread = threading.Thread(target=self._run_lockstep, args=(session, ended), name=session.name, daemon=True)
         self._lockstep_threads.add(thread)
         thread.start()
 
     def report(self, text: str) -> None:
         """Print a fault of the gateway itself."""
-        self._say(f"{self._name}: {text}")
+        self._say(f"{self.name}: {text}")
 
     def remove(self, client: Client) -> None:
         """Forget a client that is gone, and release the drones that it commanded."""
@@ -142,19 +139,18 @@ class Gateway:
         self._client_limit.enter()
         self._unauthenticated_limit.leave()
 
-    def _run_lockstep(self, agent: LockstepAgent, ended: Callable[[str], None]) -> None:
+    def _run_lockstep(self, session: LockstepSession, ended: Callable[[str], None]) -> None:
         reason = "the gateway failed"
         try:
-            with self._dial(agent.name) as (link, info):
-                reason = Runner(
-                    link, info, agent, lambda: agent.has_left, self._say, lambda: agent.connection_lost
-                ).run()
+            with self._dial(session.name) as (link, info):
+                left, lost = (lambda: session.has_left), (lambda: session.connection_lost)
+                reason = Runner(link, info, session, left, self._say, lost).run()
         except ZsimError as error:
             reason = str(error)
         except Exception as error:  # a fault of the gateway: the client is not to wait for ever
-            self.report(f"{agent.name}: {error!r}")
+            self.report(f"{session.name}: {error!r}")
         finally:
-            self._say(f"{agent.name}: left, {'its client is gone' if agent.connection_lost else reason}")
+            self._say(f"{session.name}: left, {'its client is gone' if session.connection_lost else reason}")
             self._lockstep_threads.discard(threading.current_thread())
             with suppress(RuntimeError):  # the gateway has ended
                 self.loop.call_soon_threadsafe(ended, reason)
@@ -173,25 +169,27 @@ class Gateway:
         run = RunAccess(link, info, observer, self._secured)
         run.open()
         self._call_on_loop(self._begin, run)
-        say(f"{self._name}: clients are let into run {info.run_id}")
-        monitor = _LinkMonitor(lambda state: self.loop.call_soon_threadsafe(self._notify_link, state, run))
-        link.on_link(monitor.on_link)
+        self._observe_link(run)
+        say(f"{self.name}: clients are let into run {info.run_id}")
         try:
             run.receive_until_end(stopped)
         finally:
             if not observer.end_reason:  # the gateway goes, and the run goes on
                 for client in list(self._clients):
                     _release_drones(link, client.commanded)
-            self._call_on_loop(self._end, run)
+            self._call_on_loop(self._end, run, observer.end_reason == ANOTHER_RUN)
             run.close()
 
     def _begin(self, run: RunAccess) -> None:
-        self._run = run
+        self._run, self._link_lost = run, False
         self.subscriptions.attach(run.link)
         self._full_key_subscriptions.attach(run.bare_link)
         self._notify_clients("begun", run)
 
-    def _end(self, run: RunAccess) -> None:
+    def _end(self, run: RunAccess, another: bool = False) -> None:
+        """End a run for the clients; where the world has begun another one, the link is back, whoever reports it."""
+        if another:
+            self._notify_link(run, True)
         self._run = None
         self.subscriptions.detach()
         self._full_key_subscriptions.detach()
@@ -213,10 +211,21 @@ class Gateway:
         for client in self._clients:
             client.notify_run(state, run.info.run_id)
 
-    def _notify_link(self, state: str, run: RunAccess) -> None:
+    def _observe_link(self, run: RunAccess) -> None:
+        run.link.on_link(partial(self._on_link, run))
+        if not run.link.links():  # lost before anything was observed, so that no event follows
+            self._on_link(run, False)
+
+    def _on_link(self, run: RunAccess, up: bool) -> None:
+        """Take the state of a run's link, in a thread of Zenoh's."""
+        with suppress(RuntimeError):  # the gateway has ended
+            self.loop.call_soon_threadsafe(self._notify_link, run, up)
+
+    def _notify_link(self, run: RunAccess, up: bool) -> None:
         """Notify clients of a link that is lost or back, but not when the world goes after the end of its run."""
-        if run is self._run:
-            self._notify_clients(state, run)
+        if run is self._run and up == self._link_lost:
+            self._link_lost = not up
+            self._notify_clients("back" if up else "lost", run)
 
     def _call_on_loop(self, act: Callable[..., None], *args: Any) -> None:
         async def call() -> None:
@@ -239,8 +248,11 @@ class Gateway:
     async def _open(self) -> tuple[web.AppRunner, asyncio.Server]:
         host, http_port, lines_port = self._ports
         line_server = LineServer(self._new_client, authenticated=not self._access_check.needs_token)
+        rest = RestTree(self.run, self._full_key_subscriptions)
+        tree = JsonTree(self.run, self.subscriptions, self.name)
+        app = application(self._access_check, rest, tree, self._new_client)
         try:
-            site = await start_site(self._application(), host, http_port, shutdown_s=1.0)
+            site = await start_site(app, host, http_port, shutdown_s=1.0)
             try:
                 lines = await asyncio.start_server(line_server.serve, host, lines_port, limit=LINE_MAX)
             except OSError:
@@ -250,7 +262,7 @@ class Gateway:
             ports = f"{host}, ports {http_port} and {lines_port}"
             raise RunError(f"gateway: cannot listen on {ports} ({error.strerror}); say --http and --lines") from error
         address = f"http://{url_host(host)}:{http_port}"
-        self._say(f"{self._name}: HTTP and WebSocket on {address}, lines on port {lines_port}")
+        self._say(f"{self.name}: HTTP and WebSocket on {address}, lines on port {lines_port}")
         return site, lines
 
     async def _close(self, site: web.AppRunner, lines: asyncio.Server) -> None:
@@ -260,11 +272,6 @@ class Gateway:
         await asyncio.to_thread(_join_all, list(self._lockstep_threads), BYE_TIMEOUT_S)
         await cancel_other_tasks()
         await site.cleanup()
-
-    def _application(self) -> web.Application:
-        rest = RestTree(self.run, self._full_key_subscriptions)
-        tree = JsonTree(self.run, self.subscriptions, self._name)
-        return application(self._access_check, rest, tree, self._new_client)
 
     def _new_client(self, outbox: Outbox, authenticated: bool) -> Client:
         bucket = TokenBucket(STREAM_RATE_HZ, STREAM_BURST, time.monotonic)
@@ -278,26 +285,6 @@ class Gateway:
         if not authenticated:
             self.loop.call_later(HELLO_TIMEOUT_S, client.expire)
         return client
-
-
-class _LinkMonitor:
-    """Notices a link that is lost, and one that is back, but not the first one.
-
-    Args:
-        notify: called with `lost` or `back`.
-    """
-
-    def __init__(self, notify: Callable[[str], object]) -> None:
-        self._notify = notify
-        self._lost = False
-
-    def on_link(self, up: bool) -> None:
-        """Take the state of the session's link."""
-        if up != self._lost:
-            return
-        self._lost = not up
-        with suppress(RuntimeError):  # the gateway has ended
-            self._notify("back" if up else "lost")
 
 
 def _release_drones(link: Session, commanded: Iterable[tuple[str, str]]) -> None:

@@ -11,9 +11,9 @@ from zsim import __version__
 from zsim.contract import messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim_bridges.gateway.access_check import AccessCheck
+from zsim_bridges.gateway.client_messages import is_client_key
 from zsim_bridges.gateway.client_streams import LINE_MAX, ClientFactory, serve_websocket
 from zsim_bridges.gateway.http_trees import JSON_PREFIX, JsonTree, RestTree
-from zsim_bridges.gateway.key_policy import is_client_key
 
 DEFAULTED = ("t_ns", "seq", "source")  # fields that a client may leave out
 CONTROL_PATHS = ("world/control", "cluster/{cluster}/control")

@@ -27,11 +27,19 @@ from zsim.contract.run_messages import ControlRequest
 from zsim.errors import DecodeError
 from zsim.transport.samples import RawSample, check_expression
 from zsim_bridges.gateway.access_check import error_response
+from zsim_bridges.gateway.client_messages import (
+    CACHED_VALUES,
+    JSON,
+    TEXT,
+    MethodError,
+    is_control_key,
+    is_reserved,
+    json_entry,
+    json_value,
+)
 from zsim_bridges.gateway.client_streams import event_bytes, stream_events
-from zsim_bridges.gateway.key_policy import MethodError, is_control_key, is_reserved
+from zsim_bridges.gateway.publications import SharedSubscriptions
 from zsim_bridges.gateway.run_access import RunAccess
-from zsim_bridges.gateway.subscriptions import SharedSubscriptions
-from zsim_bridges.gateway.transcoding import CACHED_VALUES, JSON, TEXT, json_entry, json_value
 
 EVENT_STREAM = "text/event-stream"
 RAW, TOKEN = "_raw", "token"

@@ -14,76 +14,114 @@ from zsim.errors import DecodeError
 from zsim.runtime.agent import Agent, Output
 from zsim.transport.samples import check_expression
 from zsim_bridges.gateway import stream_requests
-from zsim_bridges.gateway.key_policy import MessageDefaults, is_counted_key
+from zsim_bridges.gateway.client_messages import MessageDefaults, is_counted_key
 from zsim_bridges.gateway.run_access import RunAccess
 
 ANSWER_TIMEOUT_S = 10.0  # wall time after which a client that answers nothing in realtime leaves the lockstep
 LATE_PERIODS = 2  # in realtime a gate that is older by so many is sent together with a newer one
+NO_GATE_NS = -1  # no gate waits for an answer
+_encode = msgspec.json.Encoder().encode
 
 
-class LockstepAgent(Agent):
-    """Sends the inputs of each gate to the client and waits for its outputs.
+class LockstepSession(Agent):
+    """A client's part in the lockstep, from its join until it leaves: sends each gate's inputs, waits for its outputs.
+
+    The runner's methods are called in a thread of its own, all others on the loop.
 
     Args:
-        name: of the participant, role.thing.
-        info: of the run.
-        period_ns: multiple of the gate.
-        reads: key expressions of its inputs.
-        gates: keys that close a gate; empty: all keys of `reads` that come at every gate.
-        send_inputs: called with (t_ns, inputs) at each period, in the thread that steps.
-        now_ns: newest gate of the run.
-        required: (process, drone or cluster that it serves) of those without which the run does not start.
+        name: process name of the participant, role.thing.
+        request: with which it joined.
+        run: that it joined.
+        loop: of the client.
+        send: sends the line of a gate; called on the loop.
 
     Attributes:
+        run: that it joined.
+        defaults: of its messages.
         has_left: whether it has ended.
         connection_lost: whether its client went without leaving, so that its process counts as dead.
 
     Raises:
         DecodeError: name, period or a gate key is invalid.
+        UnknownError: a gate key is about a drone or a cluster that the run does not have.
+        SessionError: an entry of `reads` is no key expression.
     """
 
     def __init__(
         self,
         name: str,
-        info: Info,
-        period_ns: int,
-        reads: Sequence[str],
-        gates: Sequence[str],
-        send_inputs: Callable[[int, list[tuple[str, Any]]], None],
-        now_ns: Callable[[], int],
-        required: Collection[tuple[str, str]],
+        request: stream_requests.JoinRequest,
+        run: RunAccess,
+        loop: asyncio.AbstractEventLoop,
+        send: Callable[[bytes], None],
     ) -> None:
         super().__init__()
-        _check(name, info, period_ns, gates)
+        info, reads = run.info, request.reads
+        for key in (*reads, *request.gates):
+            check_expression(key)
         self.name = name
-        self.period_ns = period_ns
-        self.gate_keys = tuple(gates) or gate_keys_of(info, reads, name, required)
+        self.period_ns = round(request.period_s * 1e9)
+        _check(name, info, self.period_ns, request.gates)
+        for key in request.gates:
+            run.check_known(key)
+        self.gate_keys = tuple(request.gates) or gate_keys_of(info, reads, name, run.required_processes)
         self.reads = _with_gate_keys(reads, self.gate_keys)
         self.counted = tuple(d.name for d in info.drones if any(_matches_sensors(each, d.name) for each in self.reads))
-        self._send_inputs = send_inputs
-        self._late_ns = LATE_PERIODS * period_ns if info.mode == "realtime" else None
-        self._now_ns = now_ns
+        self.run = run
+        self.defaults = MessageDefaults(name)
+        self.has_left = self.connection_lost = False
+        self._loop = loop
+        self._send = send
+        self._late_ns = LATE_PERIODS * self.period_ns if info.mode == "realtime" else None
         self._inputs: list[tuple[str, Any]] = []
         self._answers: queue.SimpleQueue[list[Output]] = queue.SimpleQueue()
-        self.has_left = self.connection_lost = False
+        self._gate_ns = NO_GATE_NS
 
     def receive(self, key: str, message: Any) -> None:
         self._inputs.append((key, message))
 
     def step(self, t_ns: int) -> list[Output]:
-        if self.has_left or (self._late_ns is not None and self._now_ns() - t_ns >= self._late_ns):
+        if self.has_left or (self._late_ns is not None and self.run.now_ns - t_ns >= self._late_ns):
             return []
         inputs, self._inputs = self._inputs, []
-        self._send_inputs(t_ns, inputs)
+        entries = [{"key": key, "value": message} for key, message in inputs]
+        line = _encode({"op": "gate", "t_ns": t_ns, "inputs": entries}) + b"\n"
+        with suppress(RuntimeError):  # the gateway has ended
+            self._loop.call_soon_threadsafe(self._send_gate, t_ns, line)
         try:
             return self._answers.get(timeout=ANSWER_TIMEOUT_S if self._late_ns is not None else None)
         except queue.Empty:
             self.leave(connection_lost=True)
             return []
 
-    def answer(self, outputs: list[Output]) -> None:
-        """Set the client's outputs for the gate that was sent last."""
-        self._answers.put(outputs)
+    def _send_gate(self, t_ns: int, line: bytes) -> None:
+        if not self.has_left:
+            self._gate_ns = t_ns
+            self._send(line)
+
+    def answer_gate(self, request: stream_requests.DoneRequest) -> None:
+        """Answer the gate that waits; an error changes nothing, and the gate goes on waiting.
+
+        Raises:
+            DecodeError: there is no such gate, or an output is no message of its key.
+            ForbiddenError: an output's key is reserved.
+        """
+        if self._gate_ns == NO_GATE_NS:
+            raise DecodeError("done: there is no gate to answer; wait for the next")
+        if request.t_ns != self._gate_ns:
+            raise DecodeError(f"done: t_ns is {request.t_ns}; must be {self._gate_ns}, the gate that came last")
+        with self.defaults.transaction():
+            payloads = [(each.key, self._payload(each)) for each in request.outputs]
+            counted = [Output(key, messages.decode(key, payload)) for key, payload in payloads if is_counted_key(key)]
+        self.run.publish([(key, payload) for key, payload in payloads if not is_counted_key(key)])
+        self._gate_ns = NO_GATE_NS
+        self._answers.put(counted)
+
+    def _payload(self, output: stream_requests.LockstepOutput) -> bytes:
+        """Return an output as a payload: what a done counts goes out by the runner, the rest by the gateway."""
+        if not is_counted_key(output.key):
+            self.run.check_writable(output.key)
+        return self.run.encode(output.key, self.defaults.fill(output.key, output.value, self._gate_ns))
 
     def leave(self, connection_lost: bool = False) -> None:
         """End a step that waits: the client is gone."""
@@ -122,94 +160,3 @@ def _check(name: str, info: Info, period_ns: int, gates: Sequence[str]) -> None:
         raise DecodeError(f"join: period_s is {period_ns / 1e9:g}; must be a multiple of {info.gate_ns / 1e9:g}")
     if any("*" in key for key in gates):
         raise DecodeError("join: gates has a wildcard; must be keys, of each of which a message comes at every gate")
-
-
-NO_GATE_NS = -1  # no gate waits for an answer
-_encode = msgspec.json.Encoder().encode
-
-
-class LockstepSession:
-    """A client's part in the lockstep, from its join until it leaves.
-
-    Args:
-        name: process name of the participant.
-        request: with which it joined.
-        run: that it joined.
-        loop: of the client.
-        send: sends the line of a gate; called on the loop.
-
-    Attributes:
-        run: that it joined.
-        agent: keeps the lockstep.
-        defaults: of its messages.
-
-    Raises:
-        DecodeError: name, period or a gate key is invalid.
-        UnknownError: a gate key is about a drone or a cluster that the run does not have.
-        SessionError: an entry of `reads` is no key expression.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        request: stream_requests.JoinRequest,
-        run: RunAccess,
-        loop: asyncio.AbstractEventLoop,
-        send: Callable[[bytes], None],
-    ) -> None:
-        for key in (*request.reads, *request.gates):
-            check_expression(key)
-        period_ns = round(request.period_s * 1e9)
-        self.agent = LockstepAgent(
-            name,
-            run.info,
-            period_ns,
-            request.reads,
-            request.gates,
-            send_inputs=self._send_inputs,
-            now_ns=lambda: run.now_ns,
-            required=run.required_processes,
-        )
-        for key in request.gates:
-            run.check_known(key)
-        self.defaults = MessageDefaults(name)
-        self.run = run
-        self._loop = loop
-        self._send = send
-        self._gate_ns = NO_GATE_NS
-
-    def _send_inputs(self, t_ns: int, inputs: list[tuple[str, Any]]) -> None:
-        """Send the inputs of a gate; in the agent's thread."""
-        entries = [{"key": key, "value": message} for key, message in inputs]
-        line = _encode({"op": "gate", "t_ns": t_ns, "inputs": entries}) + b"\n"
-        with suppress(RuntimeError):  # the gateway has ended
-            self._loop.call_soon_threadsafe(self._send_gate, t_ns, line)
-
-    def _send_gate(self, t_ns: int, line: bytes) -> None:
-        if not self.agent.has_left:
-            self._gate_ns = t_ns
-            self._send(line)
-
-    def answer_gate(self, request: stream_requests.DoneRequest) -> None:
-        """Answer the gate that waits; an error changes nothing, and the gate goes on waiting.
-
-        Raises:
-            DecodeError: there is no such gate, or an output is no message of its key.
-            ForbiddenError: an output's key is reserved.
-        """
-        if self._gate_ns == NO_GATE_NS:
-            raise DecodeError("done: there is no gate to answer; wait for the next")
-        if request.t_ns != self._gate_ns:
-            raise DecodeError(f"done: t_ns is {request.t_ns}; must be {self._gate_ns}, the gate that came last")
-        with self.defaults.transaction():
-            payloads = [(each.key, self._payload(each)) for each in request.outputs]
-            counted = [Output(key, messages.decode(key, payload)) for key, payload in payloads if is_counted_key(key)]
-        self.run.publish([(key, payload) for key, payload in payloads if not is_counted_key(key)])
-        self._gate_ns = NO_GATE_NS
-        self.agent.answer(counted)
-
-    def _payload(self, output: stream_requests.LockstepOutput) -> bytes:
-        """Return an output as a payload: what a done counts goes out by the agent, the rest by the gateway."""
-        if not is_counted_key(output.key):
-            self.run.check_writable(output.key)
-        return self.run.encode(output.key, self.defaults.fill(output.key, output.value, self._gate_ns))

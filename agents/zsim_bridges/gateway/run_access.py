@@ -15,7 +15,7 @@ from zsim.scenario import rights, scenario_file
 from zsim.transport.samples import RawSample, check_expression
 from zsim.transport.session import Session
 from zsim.transport.traffic import Passed, Traffic
-from zsim_bridges.gateway.key_policy import (
+from zsim_bridges.gateway.client_messages import (
     ForbiddenError,
     MessageDefaults,
     TooManyError,
@@ -23,9 +23,9 @@ from zsim_bridges.gateway.key_policy import (
     check_not_reserved,
     is_client_key,
     is_control_key,
+    json_to_payload,
 )
-from zsim_bridges.gateway.last_values import LastValues
-from zsim_bridges.gateway.transcoding import json_to_payload
+from zsim_bridges.gateway.publications import LastValues
 from zsim_bridges.observer_process import ObserverProcess
 
 TICK_S = 0.1  # how often health is published and a stop is noticed while nothing arrives
@@ -118,7 +118,7 @@ class RunAccess:
         """Publish plain data on a key, checked, with what it leaves out filled in.
 
         Raises:
-            DecodeError: names key, field, found and allowed.
+            DecodeError: with key, field, value and what is allowed.
             ForbiddenError: the key is reserved.
             UnknownError: the run has no such drone or cluster.
             SessionError: it is no key.
@@ -138,7 +138,7 @@ class RunAccess:
         """Return plain data as the payload of a key on which clients may publish.
 
         Raises:
-            DecodeError: names key, field, found and allowed.
+            DecodeError: with key, field, value and what is allowed.
             ForbiddenError: the key is reserved.
         """
         self._check_key(key)

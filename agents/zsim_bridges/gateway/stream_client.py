@@ -11,13 +11,19 @@ from zsim.errors import DecodeError, NoWorldError, ZsimError
 from zsim.transport.samples import RawSample, check_expression
 from zsim_bridges.gateway import stream_requests
 from zsim_bridges.gateway.access_check import TokenBucket
+from zsim_bridges.gateway.client_messages import (
+    ForbiddenError,
+    MessageDefaults,
+    TooManyError,
+    json_entry,
+    json_value,
+    value_line,
+)
 from zsim_bridges.gateway.client_streams import OUTBOX_BYTES_MAX, Outbox
-from zsim_bridges.gateway.key_policy import ForbiddenError, MessageDefaults, TooManyError
-from zsim_bridges.gateway.lockstep_session import LockstepAgent, LockstepSession
+from zsim_bridges.gateway.lockstep_session import LockstepSession
+from zsim_bridges.gateway.publications import SharedSubscriptions
 from zsim_bridges.gateway.run_access import RunAccess
 from zsim_bridges.gateway.stream_requests import StreamRequest
-from zsim_bridges.gateway.subscriptions import SharedSubscriptions
-from zsim_bridges.gateway.transcoding import json_entry, json_value, value_line
 
 SUBSCRIPTIONS_MAX = 100  # of one client; `drone/*/truth` is one
 ANSWER_MAX = OUTBOX_BYTES_MAX  # bytes of an answer
@@ -30,12 +36,8 @@ class GatewayApi(Protocol):
     """What a client needs of the gateway."""
 
     loop: asyncio.AbstractEventLoop
+    name: str  # of its process
     subscriptions: SharedSubscriptions
-
-    @property
-    def name(self) -> str:
-        """Process name of the gateway."""
-        ...
 
     def run(self) -> RunAccess:
         """Return the current run; NoWorldError where there is none."""
@@ -45,8 +47,8 @@ class GatewayApi(Protocol):
         """Return whether a token is the right one."""
         ...
 
-    def start_lockstep(self, agent: LockstepAgent, ended: Callable[[str], None]) -> None:
-        """Run an agent until it leaves; `ended` is called with the reason."""
+    def start_lockstep(self, session: LockstepSession, ended: Callable[[str], None]) -> None:
+        """Run a session until its client leaves; `ended` is called with the reason."""
         ...
 
     def report(self, text: str) -> None:
@@ -71,6 +73,11 @@ class Client:
         source: name under which it publishes until it gives its own.
         authenticated: whether it has shown the token already, or needs none.
         bucket: limits its requests.
+
+    Attributes:
+        source: name under which it publishes.
+        authenticated: whether it has shown the token, or needs none.
+        commanded: (source, drone) of the drones that it has commanded, outside of a lockstep session, in this run.
     """
 
     def __init__(
@@ -78,25 +85,15 @@ class Client:
     ) -> None:
         self._gateway = gateway
         self._outbox = outbox
-        self._authenticated = authenticated
+        self.authenticated = authenticated
         self._bucket = bucket
         self._defaults = MessageDefaults(source)
         self._subscriptions: dict[str, Callable[[], None]] = {}
-        self._commanded: set[tuple[str, str]] = set()
+        self.commanded: set[tuple[str, str]] = set()
         self._pending: set[asyncio.Task[None]] = set()
         self._session: LockstepSession | None = None
         self._closed = False
         self.source = source
-
-    @property
-    def authenticated(self) -> bool:
-        """Whether it has shown the token, or needs none."""
-        return self._authenticated
-
-    @property
-    def commanded(self) -> frozenset[tuple[str, str]]:
-        """(source, drone) of the drones that it has commanded, outside of a lockstep session, in this run."""
-        return frozenset(self._commanded)
 
     async def handle_line(self, line: bytes) -> None:
         """Execute the request in a line; an error is an answer."""
@@ -106,35 +103,14 @@ class Client:
             if line.isspace():
                 return
             request = stream_requests.decode_request(line)
-            if not self._authenticated and not isinstance(request, stream_requests.HelloRequest):
+            if not self.authenticated and not isinstance(request, stream_requests.HelloRequest):
                 raise ForbiddenError('a token is asked for here; begin with {"op": "hello", "token": "…"}')
-            self._handle(request)
+            getattr(self, f"_{request.__struct_config__.tag}")(request)  # the method that has the name of the op
         except ZsimError as error:
             self.refuse_line(str(error), request)
         except Exception as error:  # a fault of the gateway: this client and the others are served on
             self._gateway.report(f"{self.source}: {line[:80]!r}: {error!r}")
             self.refuse_line(f"the gateway failed ({type(error).__name__}); its terminal says more", request)
-
-    def _handle(self, request: StreamRequest) -> None:
-        match request:
-            case stream_requests.DoneRequest():
-                self._done(request)
-            case stream_requests.PutRequest():
-                self._put(request)
-            case stream_requests.LatestRequest():
-                self._latest(request)
-            case stream_requests.SubscribeRequest():
-                self._subscribe(request)
-            case stream_requests.UnsubscribeRequest():
-                self._unsubscribe(request)
-            case stream_requests.AskRequest():
-                self._ask(request)
-            case stream_requests.HelloRequest():
-                self._hello(request)
-            case stream_requests.JoinRequest():
-                self._join(request)
-            case stream_requests.LeaveRequest():
-                self._leave(request)
 
     def send(self, answer: dict[str, Any], request: StreamRequest | None = None) -> None:
         """Put an answer into the outbox, with the id of its request."""
@@ -151,13 +127,13 @@ class Client:
         self.send({"op": "error", "error": error}, request)
 
     def _hello(self, request: stream_requests.HelloRequest) -> None:
-        if not self._authenticated and not self._gateway.is_token(request.token):
+        if not self.authenticated and not self._gateway.is_token(request.token):
             self.refuse("hello: no token, or a wrong one; ask whoever started the gateway for it", request)
             return
         name = self._process_name(request.name) if request.name else self.source
-        if not self._authenticated:
+        if not self.authenticated:
             self._gateway.admit(self)
-            self._authenticated = True
+            self.authenticated = True
         if self._session is None and name != self.source:
             self.source, self._defaults = name, MessageDefaults(name)
         self.send({"op": "hello", "name": self.source, **self._run_fields()}, request)
@@ -169,7 +145,7 @@ class Client:
 
     def expire(self) -> None:
         """Close the connection of a client that has not shown the token."""
-        if not self._authenticated and not self._closed:
+        if not self.authenticated and not self._closed:
             self.refuse("hello: none came with the token in time")
 
     def _run_fields(self) -> dict[str, Any]:
@@ -197,7 +173,7 @@ class Client:
     def _put(self, request: stream_requests.PutRequest) -> None:
         self._gateway.run().put(request.key, request.value, self._defaults)
         if keys.matches(keys.command("*", "*"), request.key):
-            self._commanded.add((self.source, keys.thing(request.key)))
+            self.commanded.add((self.source, keys.thing(request.key)))
         if not request.quiet:
             self.send({"op": "put", "key": request.key}, request)
 
@@ -256,30 +232,30 @@ class Client:
 
     def _join(self, request: stream_requests.JoinRequest) -> None:
         if self._session is not None:
-            raise DecodeError(f"join: is {self._session.agent.name} already; leave first, or use another connection")
+            raise DecodeError(f"join: is {self._session.name} already; leave first, or use another connection")
         name = self._process_name(request.name)
         session = LockstepSession(name, request, self._gateway.run(), self._gateway.loop, self._outbox.put)
         self._session, self.source, self._defaults = session, name, session.defaults
-        self._gateway.start_lockstep(session.agent, lambda reason: self._on_session_ended(session, reason))
-        self.send({"op": "join", "name": name, "gates": session.agent.gate_keys}, request)
+        self._gateway.start_lockstep(session, lambda reason: self._on_session_ended(session, reason))
+        self.send({"op": "join", "name": name, "gates": session.gate_keys}, request)
 
     def _done(self, request: stream_requests.DoneRequest) -> None:
         if self._session is None:
             raise DecodeError("done: has not joined; must say join first")
         self._session.answer_gate(request)
 
-    def lose_lockstep(self, name: str, reason: str, but: LockstepAgent) -> None:
-        """End a session of this name, unless its agent is a certain one: another client has taken the name."""
+    def lose_lockstep(self, successor: LockstepSession, reason: str) -> None:
+        """End another session of the same name: its name has been taken."""
         session = self._session
-        if session is not None and session.agent.name == name and session.agent is not but:
-            session.agent.leave(connection_lost=True)
+        if session is not None and session.name == successor.name and session is not successor:
+            session.leave(connection_lost=True)
             self._on_session_ended(session, reason)
 
     def end_lockstep(self, run: RunAccess, reason: str) -> None:
         """End the session in a run that is over, answered or not."""
         session = self._session
         if session is not None and session.run is run:
-            session.agent.leave()
+            session.leave()
             self._on_session_ended(session, reason)
 
     def _on_session_ended(self, session: LockstepSession, reason: str) -> None:
@@ -290,7 +266,7 @@ class Client:
     def _leave(self, request: stream_requests.LeaveRequest) -> None:
         if self._session is None:
             raise DecodeError("leave: has not joined; there is nothing to leave")
-        self._session.agent.leave()
+        self._session.leave()
         self._session = None
         self.send({"op": "leave"}, request)
 
@@ -300,8 +276,8 @@ class Client:
         """Send that a run has begun or ended, or that the link to its world is lost or back."""
         if state == "begun":
             self._defaults = MessageDefaults(self.source)
-            self._commanded.clear()
-        if self._authenticated:
+            self.commanded.clear()
+        if self.authenticated:
             self.send({"op": "run", "state": state, "run_id": run_id})
 
     def close(self, connection_lost: bool = True) -> None:
@@ -318,6 +294,6 @@ class Client:
         for unsubscribe in self._subscriptions.values():
             unsubscribe()
         if self._session is not None:
-            self._session.agent.leave(connection_lost)
+            self._session.leave(connection_lost)
         self._outbox.close()
         self._gateway.remove(self)

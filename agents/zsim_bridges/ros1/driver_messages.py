@@ -1,47 +1,162 @@
 """Messages of the contract as those of ROS 1, with the units, signs and frames of ardrone_autonomy. Pure.
 
 Sources: ardrone_autonomy 1.4.1, src/ardrone_driver.cpp (PublishNavdata, PublishOdometry); REP 103 and 105.
+
+Order of this file: the state that the driver reports, its messages.
 """
 
 import math
+from collections import deque
 from typing import Any
 
+import msgspec
 import numpy as np
+from rosbags.typesys.stores import ros1_noetic as ros
 
 from zsim.contract import flight_messages, messages, run_messages
+from zsim.math import frames as rotations
+from zsim.math.rotation import LEVEL, Quaternion, Vector
+from zsim.scenario.scenario import Mount
 from zsim.scenario.sensor_presets import G_M_S2
-from zsim_bridges import ros_frames
-from zsim_bridges.ros1.onboard import OnboardState
+from zsim_agents.estimation.madgwick import madgwick_step
 from zsim_bridges.ros1.tcpros import message_class
-from zsim_bridges.ros_frames import Vector, Wxyz
+from zsim_bridges.ros_frames import NAVDATA_STATES, by_axis, xyzw
 
+BETA_RAD_S = 0.02  # of Madgwick's filter: levels within seconds, and is not led astray by a manoeuvre
+UNIT_SLACK = 0.01  # of a quaternion's length; an estimator of positions alone may publish zeros
+STEP_S_MAX = 0.1  # longer gaps in the IMU's samples are not integrated over
+POSITIONS_KEPT = 32  # gates for which the integrated position is remembered; an estimate is some gates late at most
 WORLD = "world"
 MAG_LSB_PER_UT = 1 / 0.3  # AK8975 datasheet, 0.3 uT per LSB: the AR.Drone 2.0's
 NO_FIX, FIX, GPS_SERVICE = -1, 0, 1  # sensor_msgs/NavSatStatus
 DIAGONAL_KNOWN = 2  # sensor_msgs/NavSatFix
 FIX_3D = 3  # as in NMEA: with a height
+NOT_SIMULATED = {  # fields of navdata: numbers, and lists of the tags that its camera recognises
+    **dict.fromkeys(("temp", "wind_speed", "wind_angle", "wind_comp_angle", "tags_count"), 0),
+    **dict.fromkeys(("motor1", "motor2", "motor3", "motor4"), 0),
+    **{f"tags_{what}": np.zeros(0, np.uint32) for what in ("type", "xc", "yc", "width", "height")},
+    **{f"tags_{what}": np.zeros(0, np.float32) for what in ("orientation", "distance")},
+}
+UNKNOWN_3X3, UNKNOWN_6X6 = np.zeros(9), np.zeros(36)  # zeros mean in ROS that the covariance is not known
 
-Time = message_class("builtin_interfaces/Time")
-Header = message_class("std_msgs/Header")
-Vector3 = message_class("geometry_msgs/Vector3")
-Vector3Stamped = message_class("geometry_msgs/Vector3Stamped")
-Point = message_class("geometry_msgs/Point")
-Quaternion = message_class("geometry_msgs/Quaternion")
-Pose = message_class("geometry_msgs/Pose")
-PoseWithCovariance = message_class("geometry_msgs/PoseWithCovariance")
-Twist = message_class("geometry_msgs/Twist")
-TwistWithCovariance = message_class("geometry_msgs/TwistWithCovariance")
-Transform = message_class("geometry_msgs/Transform")
-TransformStamped = message_class("geometry_msgs/TransformStamped")
+Vector3 = ros.geometry_msgs__msg__Vector3
 TFMessage = message_class("tf2_msgs/TFMessage")
-Imu = message_class("sensor_msgs/Imu")
-NavSatStatus = message_class("sensor_msgs/NavSatStatus")
-NavSatFix = message_class("sensor_msgs/NavSatFix")
-Odometry = message_class("nav_msgs/Odometry")
-Clock = message_class("rosgraph_msgs/Clock")
 Navdata = message_class("ardrone_autonomy/Navdata")
 
-UNKNOWN_3X3, UNKNOWN_6X6 = np.zeros(9), np.zeros(36)  # zeros mean in ROS that the covariance is not known
+
+class OnboardState:
+    """The state of one aircraft: newest sensor samples, attitude, altitude, odometry.
+
+    The attitude is that of the drone's estimator; where there is none, that of Madgwick's filter on the drone's own
+    IMU, whose heading is 0 where it begins, as that of the aircraft at power-on. The position is integrated from the
+    optical flow.
+
+    Args:
+        imu: pose of the IMU in the body.
+        mag: pose of the magnetometer.
+
+    Attributes:
+        imu, mag, baro, flow, status, estimate: newest, in the axes of the body; None before the first.
+        attitude: B to W.
+        altitude_m: over the ground, from the sonar; beyond its range, from the barometer since then.
+        position_m: integrated since the start, with the altitude.
+        origin_m: of the integrated position in W, by the estimator; None while there is no estimate.
+    """
+
+    def __init__(self, imu: Mount | None = None, mag: Mount | None = None) -> None:
+        mounts = {messages.Imu: imu, messages.Mag: mag}
+        self._q_BS = {
+            kind: rotations.quaternion_from_rpy(np.radians(mount.rpy_deg))
+            for kind, mount in mounts.items()
+            if mount and any(mount.rpy_deg)
+        }
+        self.imu: messages.Imu | None = None
+        self.mag: messages.Mag | None = None
+        self.baro: messages.Baro | None = None
+        self.flow: messages.Flow | None = None
+        self.status: flight_messages.Status | None = None
+        self.estimate: flight_messages.Estimate | None = None
+        self.attitude = LEVEL
+        self.altitude_m = 0.0
+        self._ground_baro_m: float | None = None
+        self._x_m = self._y_m = 0.0
+        self._positions: deque[tuple[int, Vector]] = deque(maxlen=POSITIONS_KEPT)
+        self.origin_m: Vector | None = None
+
+    def update(self, message: Any) -> Any:
+        """Update by a message of the drone or of its estimator; return it in the axes of the body."""
+        q_BS = self._q_BS.get(type(message))
+        message = message if q_BS is None else _rotated(message, q_BS)
+        match message:
+            case messages.Imu():
+                self._on_imu(message)
+            case messages.Mag():
+                self.mag = message
+            case messages.Baro():
+                self._on_baro(message)
+            case messages.Sonar():
+                self._on_sonar(message)
+            case messages.Flow():
+                self._on_flow(message)
+            case flight_messages.Estimate():
+                self._on_estimate(message)
+            case flight_messages.Status():
+                self.status = message
+                self._positions.append((message.t_ns, self.position_m))
+        return message
+
+    @property
+    def position_m(self) -> Vector:
+        return self._x_m, self._y_m, self.altitude_m
+
+    def _on_imu(self, imu: messages.Imu) -> None:
+        before, self.imu = self.imu, imu
+        if self.estimate is None and before is not None:
+            dt = (imu.t_sample_ns - before.t_sample_ns) * 1e-9
+            if 0.0 < dt < STEP_S_MAX:
+                self.attitude = madgwick_step(self.attitude, imu.gyro_rad_s, imu.accel_m_s2, BETA_RAD_S, dt)
+
+    def _on_baro(self, baro: messages.Baro) -> None:
+        self.baro = baro
+        if self._ground_baro_m is not None:
+            self.altitude_m = max(0.0, baro.altitude_m - self._ground_baro_m)
+
+    def _on_sonar(self, sonar: messages.Sonar) -> None:
+        if sonar.valid:
+            self.altitude_m = sonar.range_m * max(0.0, float(rotations.rotation_matrix(self.attitude)[2, 2]))
+            self._ground_baro_m = None
+        elif self._ground_baro_m is None and self.baro is not None:
+            self._ground_baro_m = self.baro.altitude_m - self.altitude_m
+
+    def _on_flow(self, flow: messages.Flow) -> None:
+        before, self.flow = self.flow, flow
+        if before is None:
+            return
+        dt = (flow.t_sample_ns - before.t_sample_ns) * 1e-9
+        yaw, (vx, vy, _) = float(rotations.heading(self.attitude)), flow.velocity_m_s
+        self._x_m += dt * (vx * math.cos(yaw) - vy * math.sin(yaw))
+        self._y_m += dt * (vx * math.sin(yaw) + vy * math.cos(yaw))
+
+    def _on_estimate(self, estimate: flight_messages.Estimate) -> None:
+        if abs(math.hypot(*estimate.orientation_wxyz) - 1.0) < UNIT_SLACK:
+            self.estimate = estimate
+            self.attitude = estimate.orientation_wxyz
+        position = next((position for t_ns, position in self._positions if t_ns == estimate.t_ns), None)
+        if position is not None:
+            x, y, z = estimate.position_m
+            self.origin_m = (x - position[0], y - position[1], z - position[2])
+
+
+def warm_up() -> None:
+    """Compile, or load, the kernels before the first gate."""
+    madgwick_step(LEVEL, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8), BETA_RAD_S, STEP_S_MAX)
+
+
+def _rotated(sample: Any, q_BS: np.ndarray) -> Any:
+    """Return a sample of the IMU or the magnetometer with its vectors in the axes of the body."""
+    names = [name for name in ("accel_m_s2", "gyro_rad_s", "field_ut") if hasattr(sample, name)]
+    vectors = {name: tuple(rotations.rotate(q_BS, getattr(sample, name)).tolist()) for name in names}
+    return msgspec.structs.replace(sample, **vectors)
 
 
 class DriverFrames:
@@ -54,18 +169,18 @@ class DriverFrames:
 
 
 def ros_time(t_ns: int) -> Any:
-    """Return simulated time [ns] as ROS writes it: seconds, and nanoseconds."""
-    return Time(*ros_frames.ros1_stamp(t_ns))
+    """Return simulated time [ns] as ROS writes it: seconds, and nanoseconds; ROS 1 has none before 0."""
+    return ros.builtin_interfaces__msg__Time(*divmod(max(t_ns, 0), 1_000_000_000))
 
 
 def header(seq: int, t_ns: int, frame: str) -> Any:
     """Return the header of a message about an instant of simulated time [ns], in a frame."""
-    return Header(seq, ros_time(t_ns), frame)
+    return ros.std_msgs__msg__Header(seq, ros_time(t_ns), frame)
 
 
 def clock(message: run_messages.Clock) -> Any:
     """Return the time of `/clock`."""
-    return Clock(clock=ros_time(message.t_ns))
+    return ros.rosgraph_msgs__msg__Clock(clock=ros_time(message.t_ns))
 
 
 def navdata(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
@@ -75,52 +190,28 @@ def navdata(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
     z up [mm/s]; accelerations [g], az 1 at rest; altd [mm]; tm since the start [us].
     """
     assert state.status is not None
-    roll, pitch, yaw = (math.degrees(angle) for angle in ros_frames.rpy(state.attitude))
+    rpy_deg = np.degrees(rotations.rpy_from_quaternion(state.attitude)).tolist()
     mag = [round(field * MAG_LSB_PER_UT) for field in state.mag.field_ut] if state.mag else [0, 0, 0]
     v = [1e3 * speed for speed in state.flow.velocity_m_s] if state.flow else [0.0, 0.0, 0.0]
     f = [accel / G_M_S2 for accel in state.imu.accel_m_s2] if state.imu else [0.0, 0.0, 0.0]
-    none = np.zeros(0, np.uint32)
     return Navdata(
         header=header(seq, state.status.t_ns, frames.base),
         batteryPercent=state.status.battery_percent,
-        state=ros_frames.NAVDATA_STATES[state.status.state],
-        magX=mag[0],
-        magY=mag[1],
-        magZ=mag[2],
+        state=NAVDATA_STATES[state.status.state],
+        **by_axis("mag{}", "XYZ", mag),
         pressure=round(state.baro.pressure_pa) if state.baro else 0,
-        temp=0,
-        wind_speed=0.0,
-        wind_angle=0.0,
-        wind_comp_angle=0.0,
-        rotX=roll,
-        rotY=pitch,
-        rotZ=yaw,
+        **by_axis("rot{}", "XYZ", rpy_deg),
         altd=round(1e3 * state.altitude_m),
-        vx=v[0],
-        vy=v[1],
-        vz=v[2],
-        ax=f[0],
-        ay=f[1],
-        az=f[2],
-        motor1=0,
-        motor2=0,
-        motor3=0,
-        motor4=0,
-        tags_count=0,
-        tags_type=none,
-        tags_xc=none,
-        tags_yc=none,
-        tags_width=none,
-        tags_height=none,
-        tags_orientation=np.zeros(0, np.float32),
-        tags_distance=np.zeros(0, np.float32),
+        **by_axis("v{}", "xyz", v),
+        **by_axis("a{}", "xyz", f),
+        **NOT_SIMULATED,
         tm=state.status.t_ns / 1e3,
     )
 
 
-def imu(seq: int, sample: messages.Imu, attitude: Wxyz, frames: DriverFrames) -> Any:
+def imu(seq: int, sample: messages.Imu, attitude: Quaternion, frames: DriverFrames) -> Any:
     """Return ardrone/imu: attitude, rate and specific force in B, (0, 0, 9.8) at rest."""
-    return Imu(
+    return ros.sensor_msgs__msg__Imu(
         header=header(seq, sample.t_sample_ns, frames.base),
         orientation=quaternion(attitude),
         orientation_covariance=UNKNOWN_3X3,
@@ -135,13 +226,15 @@ def mag(seq: int, sample: messages.Mag, frames: DriverFrames) -> Any:
     """Return ardrone/mag: the direction of the Earth's field in B, of length 1."""
     length = math.hypot(*sample.field_ut) or 1.0
     direction = [field / length for field in sample.field_ut]
-    return Vector3Stamped(header=header(seq, sample.t_sample_ns, frames.base), vector=Vector3(*direction))
+    return ros.geometry_msgs__msg__Vector3Stamped(
+        header=header(seq, sample.t_sample_ns, frames.base), vector=Vector3(*direction)
+    )
 
 
 def fix(seq: int, sample: messages.Gps, frames: DriverFrames) -> Any:
     """Return the GPS receiver's fix; the covariance is that of a white error, equal on all axes."""
-    status = NavSatStatus(status=FIX if sample.fix >= FIX_3D else NO_FIX, service=GPS_SERVICE)
-    return NavSatFix(
+    status = ros.sensor_msgs__msg__NavSatStatus(status=FIX if sample.fix >= FIX_3D else NO_FIX, service=GPS_SERVICE)
+    return ros.sensor_msgs__msg__NavSatFix(
         header=header(seq, sample.t_sample_ns, frames.gps),
         status=status,
         latitude=sample.latitude_deg,
@@ -166,19 +259,22 @@ def odometry(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
 
 def ground_truth(seq: int, truth: flight_messages.Truth, frames: DriverFrames) -> Any:
     """Return the true state as Gazebo's p3d plugin does, which hector_quadrotor and tum_simulator use: all in W."""
-    q, rate = truth.orientation_wxyz, ros_frames.rotated(truth.orientation_wxyz, truth.angular_velocity_rad_s)
+    q = truth.orientation_wxyz
+    rate = rotations.rotate(q, truth.angular_velocity_rad_s).tolist()
     head = header(seq, truth.t_ns, WORLD)
     return _odometry(head, frames.base, truth.position_m, q, truth.velocity_m_s, rate)
 
 
-def _odometry(head: Any, child: str, position: Vector, attitude: Wxyz, velocity: Vector, rate: Vector) -> Any:
-    pose = Pose(position=Point(*position), orientation=quaternion(attitude))
-    twist = Twist(linear=Vector3(*velocity), angular=Vector3(*rate))
-    return Odometry(
+def _odometry(head: Any, child: str, position: Vector, attitude: Quaternion, velocity: Vector, rate: Vector) -> Any:
+    pose = ros.geometry_msgs__msg__Pose(
+        position=ros.geometry_msgs__msg__Point(*position), orientation=quaternion(attitude)
+    )
+    twist = ros.geometry_msgs__msg__Twist(Vector3(*velocity), Vector3(*rate))
+    return ros.nav_msgs__msg__Odometry(
         header=head,
         child_frame_id=child,
-        pose=PoseWithCovariance(pose=pose, covariance=UNKNOWN_6X6),
-        twist=TwistWithCovariance(twist=twist, covariance=UNKNOWN_6X6),
+        pose=ros.geometry_msgs__msg__PoseWithCovariance(pose=pose, covariance=UNKNOWN_6X6),
+        twist=ros.geometry_msgs__msg__TwistWithCovariance(twist=twist, covariance=UNKNOWN_6X6),
     )
 
 
@@ -188,15 +284,17 @@ def transforms(seq: int, state: OnboardState, frames: DriverFrames) -> Any:
     t_ns = state.status.t_ns
     poses = [_transform(seq, t_ns, frames.odom, frames.base, state.position_m, state.attitude)]
     if state.origin_m is not None:
-        poses.append(_transform(seq, t_ns, WORLD, frames.odom, state.origin_m, (1.0, 0.0, 0.0, 0.0)))
+        poses.append(_transform(seq, t_ns, WORLD, frames.odom, state.origin_m, LEVEL))
     return TFMessage(transforms=poses)
 
 
-def _transform(seq: int, t_ns: int, parent: str, child: str, position: Vector, attitude: Wxyz) -> Any:
-    transform = Transform(translation=Vector3(*position), rotation=quaternion(attitude))
-    return TransformStamped(header=header(seq, t_ns, parent), child_frame_id=child, transform=transform)
+def _transform(seq: int, t_ns: int, parent: str, child: str, position: Vector, attitude: Quaternion) -> Any:
+    transform = ros.geometry_msgs__msg__Transform(translation=Vector3(*position), rotation=quaternion(attitude))
+    return ros.geometry_msgs__msg__TransformStamped(
+        header=header(seq, t_ns, parent), child_frame_id=child, transform=transform
+    )
 
 
-def quaternion(q_WB: Wxyz) -> Any:
+def quaternion(q_WB: Quaternion) -> Any:
     """Return an attitude, w first, as ROS has it: w last."""
-    return Quaternion(*ros_frames.xyzw(q_WB))
+    return ros.geometry_msgs__msg__Quaternion(*xyzw(q_WB))

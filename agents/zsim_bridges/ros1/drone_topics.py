@@ -11,12 +11,10 @@ from typing import Any, NamedTuple
 
 from zsim.contract import flight_messages, keys, messages
 from zsim.scenario.scenario import Drone
-from zsim_bridges import ros_frames
 from zsim_bridges.ros1 import driver_messages
 from zsim_bridges.ros1.connections import PublishedTopic
-from zsim_bridges.ros1.driver_messages import DriverFrames
+from zsim_bridges.ros1.driver_messages import DriverFrames, OnboardState
 from zsim_bridges.ros1.node import Ros1Node
-from zsim_bridges.ros1.onboard import OnboardState
 
 NEARLY_ZERO = 1e-6  # of a component of cmd_vel, _EPS of the driver
 REPEAT_NS = 100_000_000  # ns; a commander that is silent for 0.5 s counts as dead, scenario `silence.hover_s`
@@ -99,6 +97,11 @@ class DriverCommands:
         return self._seq[key] - 1
 
 
+def ros1_name(name: str) -> str:
+    """Return a name of the contract as a name of ROS, which has letters, digits and _ alone."""
+    return name.replace(".", "_").replace("-", "_")
+
+
 def tilt_of(twist: Any) -> TiltCommand:
     """Return the AR.Drone's command for a geometry_msgs/Twist.
 
@@ -135,7 +138,7 @@ class DroneTopics:
         self, node: Ros1Node, drone: Drone, source: str, put: Callable[[str, Any], None], tf: PublishedTopic
     ) -> None:
         self._tf = tf
-        name = ros_frames.ros1_name(drone.name)
+        name = ros1_name(drone.name)
         self._state, self._frames = OnboardState(drone.sensors.imu.mount, drone.sensors.mag.mount), DriverFrames(name)
         self._commands = DriverCommands(drone.name, source, put)
         self._advertise(node, f"/{name}")

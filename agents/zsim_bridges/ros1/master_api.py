@@ -39,7 +39,7 @@ def call_api(uri: str, method: str, *arguments: Any) -> Any:
     """Return the value that a master or a node answers.
 
     Raises:
-        one of FAULTS: it does not answer, or refuses.
+        one of CALL_ERRORS: it does not answer, or refuses.
     """
     with xmlrpc.client.ServerProxy(uri, transport=_Transport()) as proxy:
         answer: Any = getattr(proxy, method)(*arguments)

@@ -7,7 +7,7 @@ a sign for it.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,14 +16,14 @@ from rosbags.typesys.stores import ros2_jazzy as ros
 
 from zsim.contract import flight_messages, messages, run_messages
 from zsim.contract.flight_messages import Quaternion
-from zsim.math.frames import quaternion_from_rpy, quaternion_multiply
+from zsim.math.frames import quaternion_conjugate, quaternion_from_rpy, quaternion_multiply, rotate, rotation_matrix
+from zsim.math.rotation import LEVEL
 from zsim.scenario import scenario
 from zsim.scenario.scenario import Mount, Sensors
 from zsim.schema.message import Vector3
-from zsim_bridges import ros_frames
+from zsim_bridges.ros_frames import xyzw
 
 MAP = "map"
-UNTURNED: Quaternion = (1.0, 0.0, 0.0, 0.0)
 # A sonar looks along -z of its sensor frame; the x axis of a ROS range finder is its beam: turned by 90 deg about y.
 _ALONG_BEAM = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 
@@ -55,7 +55,7 @@ def cluster(name: str) -> str:
 
 def static_frames(drone: str, sensors: Sensors) -> Iterator[FramePose]:
     """Yield the frames of a drone that never move: its odom in map, its sensors in its body."""
-    yield FramePose(MAP, odom(drone), (0.0, 0.0, 0.0), UNTURNED)
+    yield FramePose(MAP, odom(drone), (0.0, 0.0, 0.0), LEVEL)
     for kind in ("imu", "gps", "mag", "baro"):
         mount: Mount = getattr(sensors, kind).mount
         yield FramePose(base(drone), sensor(drone, kind), mount.position_m, _mount_rotation(mount))
@@ -90,11 +90,12 @@ BEAM_RAD = 0.0  # the model's beam is a line
 DISCHARGING, GOOD, LIPO = 2, 1, 3  # sensor_msgs/BatteryState
 NO_CELLS = np.empty(0, dtype=np.float32)
 NAN = math.nan
+NS_PER_S = 1_000_000_000
 
 
 def stamp(t_ns: int) -> Any:
     """Return simulated time as ROS writes it."""
-    return Time(*divmod(t_ns, ros_frames.NS_PER_S))
+    return Time(*divmod(t_ns, NS_PER_S))
 
 
 def header(t_ns: int, frame: str) -> Any:
@@ -183,14 +184,14 @@ def true_odometry(message: flight_messages.Truth, frame: str, child: str) -> Any
         header(message.t_ns, frame),
         child,
         ros.geometry_msgs__msg__PoseWithCovariance(ros_pose(message.position_m, q), nothing),
-        _twist(ros_frames.into_body(q, message.velocity_m_s), message.angular_velocity_rad_s, nothing),
+        _twist(into_body(q, message.velocity_m_s), message.angular_velocity_rad_s, nothing),
     )
 
 
 def odometry(message: flight_messages.Estimate, frame: str, child: str, w_WB_B: Vector3) -> Any:
     """Return an estimate; twist in the body. Of the attitude only the heading has an uncertainty."""
     P = np.array(message.covariance).reshape(6, 6)
-    R = np.array(ros_frames.rotation_rows(message.orientation_wxyz))
+    R = rotation_matrix(message.orientation_wxyz)
     of_pose, of_twist = np.zeros((6, 6)), np.zeros((6, 6))
     of_pose[:3, :3], of_pose[5, 5] = P[:3, :3], message.yaw_sigma_rad**2
     of_twist[:3, :3] = R.T @ P[3:, 3:] @ R
@@ -199,11 +200,16 @@ def odometry(message: flight_messages.Estimate, frame: str, child: str, w_WB_B: 
         header(message.t_ns, frame),
         child,
         ros.geometry_msgs__msg__PoseWithCovariance(ros_pose(message.position_m, q), of_pose.ravel()),
-        _twist(ros_frames.into_body(q, message.velocity_m_s), w_WB_B, of_twist.ravel()),
+        _twist(into_body(q, message.velocity_m_s), w_WB_B, of_twist.ravel()),
     )
 
 
-def _twist(linear: Vector3, angular: Vector3, covariance: Array) -> Any:
+def into_body(q_WB: Quaternion, v_W: Vector3) -> list[float]:
+    """Return v_B = R_WB^T v_W."""
+    return rotate(quaternion_conjugate(q_WB), v_W).tolist()
+
+
+def _twist(linear: Sequence[float], angular: Vector3, covariance: Array) -> Any:
     twist = ros.geometry_msgs__msg__Twist(RosVector3(*linear), RosVector3(*angular))
     return ros.geometry_msgs__msg__TwistWithCovariance(twist, covariance)
 
@@ -214,7 +220,7 @@ def ros_pose(position_m: Vector3, q: Quaternion) -> Any:
 
 def ros_quaternion(q: Quaternion) -> Any:
     """Return a quaternion in ROS's order: w last."""
-    return RosQuaternion(*ros_frames.xyzw(q))
+    return RosQuaternion(*xyzw(q))
 
 
 def transform(t_ns: int, pose: FramePose) -> Any:
@@ -230,7 +236,7 @@ def cluster_pose(message: flight_messages.ClusterState, parent: str, name: str) 
     """Return the pose of the cluster frame C by the estimates; a pair has no roll."""
     values = dict(zip(message.names, message.value, strict=True))
     x, y, z, roll, pitch, yaw = (values.get(each, 0.0) for each in ("x_c", "y_c", "z_c", "roll", "pitch", "yaw"))
-    q = UNTURNED if not roll and not pitch and not yaw else tuple(quaternion_from_rpy((roll, pitch, yaw)).tolist())
+    q = LEVEL if not roll and not pitch and not yaw else tuple(quaternion_from_rpy((roll, pitch, yaw)).tolist())
     return FramePose(parent, cluster(name), (x, y, z), q)
 
 

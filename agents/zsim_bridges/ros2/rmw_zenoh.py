@@ -1,16 +1,26 @@
-"""The wire of rmw_zenoh: names, keys, liveliness tokens, quality of service, attachments, identities. Pure.
+"""A ROS 2 context on the wire of rmw_zenoh: names, keys, tokens, quality of service, attachments; nodes and endpoints.
 
 Of ros2/rmw_zenoh as Jazzy (from 0.2.4), Kilted and Rolling ship it: `liveliness_utils.cpp` for tokens and quality of
 service, `attachment_helpers.cpp` for attachments. Humble's has neither type hashes nor this attachment.
+
+Order of this file: the wire, which is pure; the context, whose nodes have publishers, subscriptions and services.
 """
 
 import re
 import struct
-from collections.abc import Iterable
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Iterable
+from itertools import count
+from typing import Any, Literal, NamedTuple
 
 import xxhash
 
+from zsim.transport.samples import RawSample
+from zsim.transport.session import Query, Session
+from zsim_bridges.ros2.ros_types import RosTypes, service_parts
+
+CDR = "application/cdr"
+OnRefused = Callable[[str, str], None]
+"""Called with (name, reason) of a message that is refused, in threads of Zenoh's."""
 _OTHERS = re.compile(r"[^a-z0-9]+")  # and no two underscores in a row, which ROS reserves
 
 
@@ -100,7 +110,7 @@ def data_key(domain: int, name: str, type_name: str, type_hash: str) -> str:
 
 def node_token(node: NodeId) -> str:
     """Return the token of a node."""
-    return f"{_token_head(node, node.number, 'NN')}"
+    return _token_head(node, node.number, "NN")
 
 
 def endpoint_token(node: NodeId, number: int, endpoint: Endpoint, qos: Qos) -> str:
@@ -159,3 +169,131 @@ def attachment_of(data: bytes) -> Attachment:
         raise ValueError(f"the attachment has {len(data)} bytes; must have {ATTACHMENT_BYTES}, of rmw_zenoh >= 0.2.4")
     sequence, wall_ns, _ = _HEAD.unpack_from(data)
     return Attachment(sequence, wall_ns, data[_HEAD.size :])
+
+
+class RosContext:
+    """A context in the sense of ROS: the nodes of one process.
+
+    Args:
+        link: a session by full keys, without a federation.
+        domain: ROS_DOMAIN_ID.
+        types: of messages and services.
+        wall_ns: time since 1970.
+        refuse: see OnRefused.
+    """
+
+    def __init__(
+        self, link: Session, domain: int, types: RosTypes, wall_ns: Callable[[], int], refuse: OnRefused
+    ) -> None:
+        self.link = link
+        self.domain = domain
+        self.types = types
+        self.wall_ns = wall_ns
+        self.refuse = refuse
+        self._numbers = count()
+        self._zid = link.zid()
+
+    def node(self, namespace: str, name: str) -> "Ros2Node":
+        """Return a new node, which other nodes see from now on."""
+        return Ros2Node(self, NodeId(self.domain, self._zid, self.number(), namespace, name))
+
+    def number(self) -> int:
+        """Return the number of a new node or endpoint."""
+        return next(self._numbers)
+
+    def on_subscription(self, callback: Callable[[str, bool], None]) -> None:
+        """Call back with (token, alive), in a thread of Zenoh's, for the subscriptions of all contexts."""
+        self.link.on_token(subscription_tokens(self.domain), callback)
+
+
+class Ros2Node:
+    """A node of a context."""
+
+    def __init__(self, context: RosContext, identity: NodeId) -> None:
+        self._context = context
+        self._identity = identity
+        context.link.declare_token(node_token(identity))
+
+    def publisher(self, topic: str, kind: str, qos: Qos) -> "Publisher":
+        """Return a publisher of a topic, given by its full name."""
+        endpoint, token = self._endpoint("MP", topic, kind, qos)
+        publisher = Publisher(self._context, endpoint, kind, qos, gid_of(token))
+        self._declare(token)
+        return publisher
+
+    def subscription(self, topic: str, kind: str, qos: Qos, callback: Callable[[Any], None]) -> Callable[[], None]:
+        """Call back with every message on a topic, in a thread of Zenoh's, until the returned function is called."""
+        context = self._context
+        endpoint, token = self._endpoint("MS", topic, kind, qos)
+
+        def on_publication(sample: RawSample) -> None:
+            try:
+                attachment_of(sample.attachment)
+                callback(context.types.decode(sample.payload, kind))
+            except ValueError as error:
+                context.refuse(topic, str(error))
+
+        undeclare = context.link.declare_subscriber(endpoint.key(context.domain), on_publication)
+        self._declare(token)
+        return undeclare
+
+    def service(self, name: str, kind: str, answer: Callable[[Any], Any]) -> None:
+        """Answer a service's requests, each with what `answer` returns, in a thread of Zenoh's."""
+        context = self._context
+        endpoint, token = self._endpoint("SS", name, kind, DEFAULT)
+        key, (request_type, response_type) = endpoint.key(context.domain), service_parts(kind)
+
+        def reply(query: Query) -> None:
+            try:
+                received = attachment_of(query.attachment)
+                response = answer(context.types.decode(query.payload, request_type))
+            except ValueError as error:
+                query.end()
+                context.refuse(name, str(error))
+                return
+            attachment = Attachment(received.sequence, context.wall_ns(), received.gid)
+            query.reply_raw(key, context.types.encode(response, response_type), attachment.packed())
+
+        context.link.declare_queryable(key, reply, complete=True)
+        self._declare(token)
+
+    def _endpoint(self, how: Kind, name: str, kind: str, qos: Qos) -> tuple[Endpoint, str]:
+        """Return a new endpoint and its token."""
+        context = self._context
+        endpoint = Endpoint(how, name, dds_name(kind), context.types.hash(kind))
+        return endpoint, endpoint_token(self._identity, context.number(), endpoint, qos)
+
+    def _declare(self, token: str) -> None:
+        """Declare an endpoint once it works: others may use it at once."""
+        self._context.link.declare_token(token)
+
+
+class Publisher:
+    """A publisher of a topic.
+
+    Attributes:
+        key: where its messages go.
+    """
+
+    def __init__(self, context: RosContext, endpoint: Endpoint, kind: str, qos: Qos, gid: bytes) -> None:
+        self._context = context
+        self._kind = kind
+        self._gid = gid
+        self._sent = 0
+        self.key = endpoint.key(context.domain)
+        if qos.transient_local:  # later subscribers receive the last message, too
+            self._write = lambda payload, attached: context.link.put_cached(self.key, payload, CDR, attached)
+        else:
+            self._write = context.link.declare_publisher(self.key, CDR)
+
+    def publish(self, message: Any) -> None:
+        """Send a message; a subscriber that is too slow loses it, the publisher never waits.
+
+        Raises:
+            ValueError: the message does not fit its type.
+        """
+        context = self._context
+        payload = context.types.encode(message, self._kind)
+        self._sent += 1
+        attachment = Attachment(self._sent, context.wall_ns(), self._gid).packed()
+        self._write(payload, attachment)

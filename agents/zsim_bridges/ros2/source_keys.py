@@ -11,7 +11,7 @@ from zsim.errors import DecodeError
 from zsim.transport.declarations import Subscription
 from zsim.transport.samples import RawSample, ReceivedSample
 from zsim.transport.session import Session
-from zsim_bridges.ros2.ros_context import Publisher
+from zsim_bridges.ros2.rmw_zenoh import Publisher
 from zsim_bridges.ros2.topics import Topic
 
 QueuedTask = Callable[[], object]

@@ -13,10 +13,10 @@ from zsim.math.frames import rpy_from_quaternion
 from zsim.scenario.scenario import Sensors
 from zsim.scenario.sensor_presets import G_M_S2
 from zsim_bridges.ros2 import conversions, rmw_zenoh
-from zsim_bridges.ros2.conversions import FramePose, header
+from zsim_bridges.ros2.conversions import NS_PER_S, FramePose, header
 from zsim_bridges.ros2.rmw_zenoh import Qos
 from zsim_bridges.ros2.ros_types import RosTypes
-from zsim_bridges.ros_frames import NAVDATA_STATES, NS_PER_S, mean_rate
+from zsim_bridges.ros_frames import NAVDATA_STATES, by_axis, mean_rate
 
 UNKNOWN_VECTOR = (math.nan, math.nan, math.nan)
 
@@ -44,12 +44,12 @@ class NavdataSummary:
             header=header(message.t_ns, self._frame),
             battery_percent=message.battery_percent,
             state=NAVDATA_STATES[message.state],
-            **_named("mag_{}", self._scaled("mag", "field_ut", 1.0)),
+            **by_axis("mag_{}", "xyz", self._scaled("mag", "field_ut", 1.0)),
             pressure=self._rounded("baro", "pressure_pa", 1.0),
-            **_named("rot_{}", self._attitude()),
+            **by_axis("rot_{}", "xyz", self._attitude()),
             altd=self._rounded("sonar", "range_m", 1000.0),
-            **_named("v{}", self._scaled("flow", "velocity_m_s", 1000.0)),
-            **_named("a{}", self._scaled("imu", "accel_m_s2", 1.0 / G_M_S2)),
+            **by_axis("v{}", "xyz", self._scaled("flow", "velocity_m_s", 1000.0)),
+            **by_axis("a{}", "xyz", self._scaled("imu", "accel_m_s2", 1.0 / G_M_S2)),
             tm=message.t_ns / 1000.0,
         )
 
@@ -63,10 +63,6 @@ class NavdataSummary:
     def _attitude(self) -> tuple[float, ...]:
         estimate = self._last.get("estimate")
         return tuple(np.degrees(rpy_from_quaternion(estimate.orientation_wxyz))) if estimate else UNKNOWN_VECTOR
-
-
-def _named(pattern: str, values: tuple[float, ...]) -> dict[str, float]:
-    return {pattern.format(axis): value for axis, value in zip("xyz", values, strict=True)}
 
 
 Conversion = Callable[[str, Any], Any | None]

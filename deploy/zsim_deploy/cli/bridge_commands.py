@@ -120,8 +120,8 @@ def ros1(
     name: Annotated[str, typer.Option(help="Process name (default ros1.main, or the certificate's).")] = "",
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
-    from zsim_bridges.ros1.bridge import NodeShutdownError, serve
-    from zsim_deploy.roles.roles import lower_priority, process_name, serve_runs
+    from zsim_bridges.ros1.ros1_bridge import NodeShutdownError, serve
+    from zsim_deploy.roles.roles import process_name, serve_runs
 
     lower_priority()
     own_name = process_name("ros1", name, reach.tls)
@@ -150,8 +150,8 @@ def ros2(
         _write_package(write_package / "zsim_msgs")
         return
     from zsim.transport.tls import Identity, is_tls
-    from zsim_bridges.ros2.bridge import RosNetwork, serve
-    from zsim_deploy.roles.roles import lower_priority, process_name, serve_runs
+    from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
+    from zsim_deploy.roles.roles import process_name, serve_runs
 
     if reach.tls and router is None:
         why = "the world's access control lets no ROS keys pass"

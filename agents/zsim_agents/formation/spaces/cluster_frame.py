@@ -7,10 +7,8 @@ import math
 import numpy as np
 
 from zsim.math.compiled import portable
-from zsim.math.rotation import Vector, add, cross, dot, norm
+from zsim.math.rotation import Matrix, Vector, add, cross, matrix_from_rpy, norm
 from zsim_agents.formation.spaces.cluster_space import TAU, Array, SingularClusterError
-
-Rows = tuple[Vector, Vector, Vector]  # of a matrix (3, 3)
 
 LENGTH_MIN_M = 1e-9  # a nanometre: below it a direction is rounding noise
 
@@ -22,27 +20,9 @@ def wrap_angle(angle: float) -> float:
 
 
 @portable
-def scaled(a: Vector, factor: float) -> Vector:
-    """Return factor a."""
-    return factor * a[0], factor * a[1], factor * a[2]
-
-
-@portable
 def row(table: Array, i: int) -> Vector:
     """Return row i of a table (n, 3)."""
     return float(table[i, 0]), float(table[i, 1]), float(table[i, 2])
-
-
-@portable
-def between(a: Vector, b: Vector) -> Vector:
-    """Return the vector from a to b."""
-    return b[0] - a[0], b[1] - a[1], b[2] - a[2]
-
-
-@portable
-def turned(R: Rows, v: Vector) -> Vector:
-    """Return R v."""
-    return dot(R[0], v), dot(R[1], v), dot(R[2], v)
 
 
 @portable
@@ -63,19 +43,6 @@ def centroid(p_W: Array) -> Vector:
 
 
 @portable
-def rotation_WC(roll: float, pitch: float, yaw: float) -> Rows:
-    """Return R_WC = Rz(yaw) Ry(pitch) Rx(roll), row by row."""
-    sr, cr = math.sin(roll), math.cos(roll)
-    sp, cp = math.sin(pitch), math.cos(pitch)
-    sy, cy = math.sin(yaw), math.cos(yaw)
-    return (
-        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        (-sp, cp * sr, cp * cr),
-    )
-
-
-@portable
 def pitch_yaw(x_W: Vector) -> tuple[float, float]:
     """Return pitch and yaw of a frame from its x axis in W."""
     flat = math.sqrt(x_W[0] * x_W[0] + x_W[1] * x_W[1])
@@ -83,7 +50,7 @@ def pitch_yaw(x_W: Vector) -> tuple[float, float]:
 
 
 @portable
-def euler_axes_C(roll: float, pitch: float) -> Rows:
+def euler_axes_C(roll: float, pitch: float) -> Matrix:
     """Return w_WC_C of a unit rate of roll, of pitch and of yaw."""
     sr, cr = math.sin(roll), math.cos(roll)
     sp, cp = math.sin(pitch), math.cos(pitch)
@@ -122,3 +89,51 @@ def triad_axes(d2: Vector, d3: Vector) -> tuple[Vector, Vector, Vector, float, f
     x = (-m[0] / h, -m[1] / h, -m[2] / h)
     z = (normal[0] / area, normal[1] / area, normal[2] / area)
     return x, cross(z, x), z, h, area
+
+
+@portable
+def inertia(S: Array) -> Array:
+    """Return tr(S) I - S (3, 3)."""
+    M = np.empty((3, 3))
+    trace = S[0, 0] + S[1, 1] + S[2, 2]
+    for i in range(3):
+        for j in range(3):
+            M[i, j] = (trace if i == j else 0.0) - S[i, j]
+    return M
+
+
+@portable
+def skew(a: Array) -> Array:
+    """Return the matrix (3, 3) of a x ."""
+    A = np.zeros((3, 3))
+    A[0, 1], A[0, 2] = -a[2], a[1]
+    A[1, 0], A[1, 2] = a[2], -a[0]
+    A[2, 0], A[2, 1] = -a[1], a[0]
+    return A
+
+
+def euler_angles(R_WC: Array) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of R_WC = Rz(yaw) Ry(pitch) Rx(roll)."""
+    pitch, yaw = pitch_yaw((R_WC[0, 0], R_WC[1, 0], R_WC[2, 0]))
+    return math.atan2(R_WC[2, 1], R_WC[2, 2]), pitch, yaw
+
+
+@portable
+def array_of(R: Matrix) -> Array:
+    """Return a matrix as an array (3, 3)."""
+    rows = np.empty((3, 3))
+    for i in range(3):
+        rows[i, 0], rows[i, 1], rows[i, 2] = R[i]
+    return rows
+
+
+@portable
+def rotation_of(c: Array) -> Array:
+    """Return R_WC (3, 3) of a cluster (4n,) with roll, pitch and yaw at 3, 4 and 5."""
+    return array_of(matrix_from_rpy(c[3], c[4], c[5]))
+
+
+@portable
+def euler_axes_of(c: Array) -> Array:
+    """Return w_WC_C of a unit rate of roll, of pitch and of yaw, row by row (3, 3)."""
+    return array_of(euler_axes_C(c[3], c[4]))

@@ -35,7 +35,7 @@ class ClusterSpace(ABC):
 
     Args:
         n: number of robots.
-        names: of the variables, 4 n, pitch among them. What a name begins with says what it is: p, q, rho are
+        names: of the variables, 4 n, pitch among them. The beginning of a name gives its kind: p, q, rho are
             lengths, w departures in metres, roll, yaw, phi, azimuth angles that wrap, pitch, beta, elevation angles
             that do not.
         spread_text: what `spread` measures, in words for messages.

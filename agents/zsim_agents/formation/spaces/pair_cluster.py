@@ -7,19 +7,8 @@ import math
 import numpy as np
 
 from zsim.math.compiled import portable
-from zsim.math.rotation import Vector, norm
-from zsim_agents.formation.spaces.cluster_frame import (
-    LENGTH_MIN_M,
-    Rows,
-    between,
-    centroid,
-    pitch_yaw,
-    put,
-    rotation_WC,
-    row,
-    scaled,
-    wrap_angle,
-)
+from zsim.math.rotation import column, matrix_from_rpy, norm, scaled, subtract
+from zsim_agents.formation.spaces.cluster_frame import LENGTH_MIN_M, centroid, pitch_yaw, put, row, wrap_angle
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError
 
 
@@ -45,7 +34,7 @@ class PairCluster(ClusterSpace):
         _, _, _, pitch, psi, _, _, p = self.forward(p_W, yaw).tolist()
         if math.cos(pitch) < LENGTH_MIN_M:
             raise SingularClusterError("the two robots are above each other: the formation has no yaw")
-        x, y, z = np.array(rotation_WC(0.0, pitch, psi)).T
+        x, y, z = np.array(matrix_from_rpy(0.0, pitch, psi)).T
         J = np.zeros((8, 2, 4))
         J[:3, :, :3] = np.eye(3)[:, None] / 2
         for k, axis in ((3, -z / p), (4, y / (p * math.cos(pitch))), (7, x)):
@@ -66,7 +55,7 @@ class PairCluster(ClusterSpace):
 @portable
 def pair_forward(p_W: Array, yaw: Array, c: Array) -> None:
     """Write c (8,); only its length p is right where that is zero."""
-    d_W = between(row(p_W, 1), row(p_W, 0))
+    d_W = subtract(row(p_W, 0), row(p_W, 1))
     c[0], c[1], c[2] = centroid(p_W)
     c[3], c[4] = pitch_yaw(d_W)
     c[5], c[6] = wrap_angle(yaw[0] - c[4]), wrap_angle(yaw[1] - c[4])
@@ -76,7 +65,7 @@ def pair_forward(p_W: Array, yaw: Array, c: Array) -> None:
 @portable
 def pair_inverse(c: Array, p_W: Array, yaw: Array) -> None:
     """Write positions (2, 3) and headings (2,)."""
-    half_W = scaled(axis_W(rotation_WC(0.0, c[3], c[4]), 0), c[7] / 2)
+    half_W = scaled(column(matrix_from_rpy(0.0, c[3], c[4]), 0), c[7] / 2)
     for k in range(3):
         p_W[0, k], p_W[1, k] = c[k] + half_W[k], c[k] - half_W[k]
     yaw[0], yaw[1] = wrap_angle(c[4] + c[5]), wrap_angle(c[4] + c[6])
@@ -85,8 +74,8 @@ def pair_inverse(c: Array, p_W: Array, yaw: Array) -> None:
 @portable
 def pair_inverse_jacobian(c: Array, J_inv: Array) -> None:
     """Write J^-1 (8, 8) into zeros."""
-    R_WC = rotation_WC(0.0, c[3], c[4])
-    x, y, z = axis_W(R_WC, 0), axis_W(R_WC, 1), axis_W(R_WC, 2)
+    R_WC = matrix_from_rpy(0.0, c[3], c[4])
+    x, y, z = column(R_WC, 0), column(R_WC, 1), column(R_WC, 2)
     for robot in range(2):
         first, half = 4 * robot, (0.5 - robot) * c[7]  # robot 1 is ahead, robot 2 behind
         for k in range(3):
@@ -95,9 +84,3 @@ def pair_inverse_jacobian(c: Array, J_inv: Array) -> None:
         put(J_inv, first, 4, scaled(y, half * math.cos(c[3])))
         put(J_inv, first, 7, scaled(x, 0.5 - robot))
         J_inv[first + 3, 4] = J_inv[first + 3, 5 + robot] = 1.0
-
-
-@portable
-def axis_W(R_WC: Rows, k: int) -> Vector:
-    """Return an axis of C in W: column k of R_WC."""
-    return R_WC[0][k], R_WC[1][k], R_WC[2][k]

@@ -6,8 +6,11 @@ C is the centroid, t_i the template's places, N a basis of the displacements tha
 rotation that brings the template nearest to the robots. No robot is privileged, and what one robot does changes the
 frame by its n-th part only.
 
-Attitudes by best fit: Kabsch 1976, Horn 1987; as a formation's frame: Belta and Kumar, Abstraction and control for
-groups of robots, IEEE Trans. Robotics 20 (2004).
+Attitudes by best fit: Horn, Closed-form solution of absolute orientation using unit quaternions, J. Opt. Soc. Am. A 4
+(1987), section 4; the same rotation as Kabsch's (1976), and never a reflection. As a formation's frame: Belta, Kumar,
+Abstraction and control for groups of robots, IEEE Trans. Robotics 20 (2004).
+
+Order of this file: the space, the rotation that fits points best, modes of shape.
 """
 
 from __future__ import annotations
@@ -17,7 +20,19 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from zsim_agents.formation.spaces.cluster_frame import LENGTH_MIN_M, euler_rates
+from zsim.math.compiled import portable
+from zsim.math.rotation import matrix
+from zsim_agents.formation.spaces.cluster_frame import (
+    LENGTH_MIN_M,
+    array_of,
+    euler_angles,
+    euler_axes_of,
+    euler_rates,
+    inertia,
+    rotation_of,
+    row,
+    skew,
+)
 from zsim_agents.formation.spaces.cluster_space import (
     CONDITION_LENGTH_M,
     TAU,
@@ -26,17 +41,9 @@ from zsim_agents.formation.spaces.cluster_space import (
     SingularClusterError,
     numbered,
 )
-from zsim_agents.formation.spaces.template_geometry import (
-    centred,
-    euler_angles,
-    euler_axes_of,
-    fitted_rotation,
-    inertia,
-    rotation_of,
-    shape_modes,
-    skew,
-)
 
+INDEPENDENT_MIN = 1e-6  # share of a direction that must be new; rounding leaves 1e-15
+PLANES = ((0, 1), (0, 2), (1, 2))
 NO_FRAME = "the robots are in one line or one place, or too far from the template: the formation has no frame"
 HEADING, TURN, BEND = 6, slice(0, 3), slice(3, 6)  # places in the small matrix of `condition`
 
@@ -190,3 +197,94 @@ def _root(E: Array, n: int) -> Array:
     """Return the symmetric root of E / n (3, 3), E without negative eigenvalues but for rounding."""
     values, vectors = np.linalg.eigh((E + E.T) / 2)
     return (vectors * np.sqrt(np.maximum(values, 0.0) / n)) @ vectors.T
+
+
+def fitted_rotation(H: Array) -> tuple[float, Array]:
+    """Return how well the rotation is defined, and the rotation R (3, 3) that maximises the sum of b_i . R t_i.
+
+    Args:
+        H: (3, 3), the sum of t_i b_i^T.
+
+    Returns:
+        The gap, half of the difference of the two greatest eigenvalues of Horn's matrix [unit of H]: the smallest
+        eigenvalue of tr(S) I - S, S = sum of R^T b_i t_i^T. It is zero where several rotations fit equally well, or
+        H is not finite.
+    """
+    K = np.empty((4, 4))
+    if not put_horn_matrix(H, K):
+        return 0.0, np.eye(3)
+    values, vectors = np.linalg.eigh(K)
+    return float(values[3] - values[2]) / 2.0, rotation_of_quaternion(vectors[:, 3])
+
+
+@portable
+def put_horn_matrix(H: Array, K: Array) -> bool:
+    """Write the symmetric (4, 4) whose greatest eigenvector is the quaternion, w first; return whether it is finite."""
+    xx, xy, xz = row(H, 0)
+    yx, yy, yz = row(H, 1)
+    zx, zy, zz = row(H, 2)
+    K[0, 0], K[0, 1], K[0, 2], K[0, 3] = xx + yy + zz, yz - zy, zx - xz, xy - yx
+    K[1, 0], K[1, 1], K[1, 2], K[1, 3] = yz - zy, xx - yy - zz, xy + yx, zx + xz
+    K[2, 0], K[2, 1], K[2, 2], K[2, 3] = zx - xz, xy + yx, -xx + yy - zz, yz + zy
+    K[3, 0], K[3, 1], K[3, 2], K[3, 3] = xy - yx, zx + xz, yz + zy, -xx - yy + zz
+    return math.isfinite(xx + xy + xz + yx + yy + yz + zx + zy + zz)
+
+
+@portable
+def rotation_of_quaternion(q: Array) -> Array:
+    """Return R (3, 3) of a unit quaternion (4,), w first."""
+    return array_of(matrix((q[0], q[1], q[2], q[3])))
+
+
+def centred(places: ArrayLike) -> Array:
+    """Return places (n, 3) about their mean."""
+    p = np.array(places, dtype=float).reshape(-1, 3)
+    return p - p.mean(axis=0)
+
+
+def turns(t: Array) -> Array:
+    """Return the motions e_k x t_i of centred points under a unit turn about each axis: (3, n, 3)."""
+    return np.array([np.cross(axis, t) for axis in np.eye(3)])
+
+
+def shape_modes(t: Array) -> Array:
+    """Return a basis (n, 3, 3n - 6) of the displacements that neither move nor turn centred points t (n, 3).
+
+    Each mode moves the points by 1 m in the root mean square, and all are orthogonal to each other: N^T N = n I. The
+    first are the homogeneous ones: growth, stretches along the axes and shears in their planes, as far as the points
+    have room for them; the others follow from moving single points, in their order.
+
+    Raises:
+        ValueError: the points are in one line, or in one place.
+    """
+    n = len(t)
+    rigid = _orthonormal([*np.repeat(np.eye(3)[:, None], n, axis=1), *turns(t)], [])
+    if len(rigid) < 6:
+        raise ValueError("template: all places are in one line; allowed: places that span a plane or space")
+    single = np.eye(3 * n).reshape(3 * n, n, 3)
+    stretches = [t * axis for axis in np.eye(3)]
+    basis = _orthonormal([t, *stretches, *_shears(t), *single], rigid)
+    return np.sqrt(n) * np.array(basis).T.reshape(n, 3, 3 * n - 6)
+
+
+def _shears(t: Array) -> list[Array]:
+    shears = []
+    for a, b in PLANES:
+        d = np.zeros_like(t)
+        d[:, a], d[:, b] = t[:, b], t[:, a]
+        shears.append(d)
+    return shears
+
+
+def _orthonormal(directions: list[Array], done: list[Array]) -> list[Array]:
+    """Return unit vectors (3n,) along what is new in each direction (n, 3), in their order, beside those done."""
+    basis: list[Array] = []
+    for direction in directions:
+        v = direction.ravel()
+        size = np.linalg.norm(v)
+        for _ in range(2):  # the second pass takes out what rounding left of the first
+            earlier = np.array([*done, *basis])
+            v = v - earlier.T @ (earlier @ v) if len(earlier) else v
+        if size > 0.0 and np.linalg.norm(v) > INDEPENDENT_MIN * size:
+            basis.append(v / np.linalg.norm(v))
+    return basis

@@ -13,20 +13,16 @@ import math
 import numpy as np
 
 from zsim.math.compiled import portable
-from zsim.math.rotation import Vector, cross, dot, norm
+from zsim.math.rotation import Matrix, Vector, cross, dot, matrix_from_rpy, norm, product, subtract
 from zsim_agents.formation.spaces.cluster_frame import (
     LENGTH_MIN_M,
-    Rows,
-    between,
     centroid,
     euler_axes_C,
     euler_rates,
     pitch_yaw,
     put,
-    rotation_WC,
     row,
     triad_axes,
-    turned,
     wrap_angle,
 )
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, numbered
@@ -103,7 +99,7 @@ def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
     n = yaw.size
     at = 6 + n  # place of p in c
     p_1 = row(p_W, 0)
-    d2, d3 = between(p_1, row(p_W, 1)), between(p_1, row(p_W, 2))
+    d2, d3 = subtract(row(p_W, 1), p_1), subtract(row(p_W, 2), p_1)
     x, y, z, h, area = triad_axes(d2, d3)
     if h == 0.0:
         return False
@@ -115,7 +111,7 @@ def triad_forward(p_W: Array, yaw: Array, c: Array) -> bool:
     c[at], c[at + 1], c[at + 2] = norm(d2), norm(d3), math.atan2(area, dot(d2, d3))
     for k in range(3, n):
         first = at + 3 * (k - 2)
-        c[first], c[first + 1], c[first + 2] = spherical(turned((x, y, z), between(p_1, row(p_W, k))))
+        c[first], c[first + 1], c[first + 2] = spherical(product((x, y, z), subtract(row(p_W, k), p_1)))
     return True
 
 
@@ -124,9 +120,9 @@ def triad_inverse(c: Array, p_W: Array, yaw: Array) -> bool:
     """Write positions (n, 3) and headings (n,); return whether the shape has an extent, else they mean nothing."""
     n = c.size // 4
     put_places_C(c, p_W)
-    R_WC = rotation_WC(c[3], c[4], c[5])
+    R_WC = matrix_from_rpy(c[3], c[4], c[5])
     for i in range(n):
-        d_W = turned(R_WC, row(p_W, i))
+        d_W = product(R_WC, row(p_W, i))
         for k in range(3):
             p_W[i, k] = c[k] + d_W[k]
         yaw[i] = wrap_angle(c[5] + c[6 + i])
@@ -143,32 +139,32 @@ def triad_inverse_jacobian(c: Array, J_inv: Array) -> bool:
     n = c.size // 4
     if not has_direction(c):
         return False
-    R_WC, axes_C, place_C = rotation_WC(c[3], c[4], c[5]), euler_axes_C(c[3], c[4]), np.empty((n, 3))
+    R_WC, axes_C, place_C = matrix_from_rpy(c[3], c[4], c[5]), euler_axes_C(c[3], c[4]), np.empty((n, 3))
     put_places_C(c, place_C)
     for i in range(n):
         first = 4 * i
         for k in range(3):
             J_inv[first + k, k] = 1.0
-            put(J_inv, first, 3 + k, turned(R_WC, cross(axes_C[k], row(place_C, i))))
+            put(J_inv, first, 3 + k, product(R_WC, cross(axes_C[k], row(place_C, i))))
         J_inv[first + 3, 5] = J_inv[first + 3, 6 + i] = 1.0
     put_shape_rates(J_inv, c, R_WC)
     return True
 
 
 @portable
-def put_shape_rates(J_inv: Array, c: Array, R_WC: Rows) -> None:
+def put_shape_rates(J_inv: Array, c: Array, R_WC: Matrix) -> None:
     """Write the columns of the shape variables into J^-1."""
     n = c.size // 4
     at = 6 + n
     triangle_C = triangle_rates(c[at], c[at + 1], c[at + 2])
     for robot in range(1, 3):
         for k in range(3):
-            add_rate(J_inv, robot, at + k, turned(R_WC, triangle_C[robot - 1][k]))
+            add_rate(J_inv, robot, at + k, product(R_WC, triangle_C[robot - 1][k]))
     for robot in range(3, n):
         first = at + 3 * (robot - 2)
         rates_C = spherical_rates(c[first], c[first + 1], c[first + 2])
         for k in range(3):
-            add_rate(J_inv, robot, first + k, turned(R_WC, rates_C[k]))
+            add_rate(J_inv, robot, first + k, product(R_WC, rates_C[k]))
 
 
 @portable
@@ -232,7 +228,7 @@ def split_beta(p: float, q: float, beta: float) -> tuple[float, float, float, fl
 
 
 @portable
-def triangle_rates(p: float, q: float, beta: float) -> tuple[Rows, Rows]:
+def triangle_rates(p: float, q: float, beta: float) -> tuple[Matrix, Matrix]:
     """Return the derivatives of robot 2 from robot 1, in C, by p, by q and by beta, and those of robot 3."""
     ca2, sa2, ca3, sa3, h = split_beta(p, q, beta)
     by_p, by_q = -sa2 / h, sa3 / h  # of the angle of robot 2; that of robot 3 turns the other way
@@ -264,7 +260,7 @@ def spherical_place(rho: float, azimuth: float, elevation: float) -> Vector:
 
 
 @portable
-def spherical_rates(rho: float, azimuth: float, elevation: float) -> Rows:
+def spherical_rates(rho: float, azimuth: float, elevation: float) -> Matrix:
     """Return the derivatives of (x, y, z) by distance, by azimuth and by elevation."""
     sa, ca, se, ce = math.sin(azimuth), math.cos(azimuth), math.sin(elevation), math.cos(elevation)
     return (

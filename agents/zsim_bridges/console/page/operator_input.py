@@ -88,14 +88,14 @@ def primary_variables(names: Sequence[str]) -> list[str]:
 
 
 class InputError(ValueError):
-    """A text of the operator that cannot be parsed; the message says where and what is allowed."""
+    """A text of the operator that cannot be parsed; the message has the line and what is allowed."""
 
 
 def parse_expressions(text: str, names: tuple[str, ...]) -> dict[str, Any]:
     """Return the arguments of a trajectory of lines `variable = expression`; other names are constants.
 
     Raises:
-        TypedError: a line is neither.
+        InputError: a line is neither.
     """
     by_variable: dict[str, str] = {}
     constants: dict[str, float] = {}
@@ -120,7 +120,7 @@ def parse_waypoints(text: str) -> dict[str, Any]:
     """Return the arguments of a trajectory of lines `seconds: variable = value, …`.
 
     Raises:
-        TypedError: a line is none.
+        InputError: a line is none.
     """
     points = []
     for number, line in _lines(text):
@@ -139,7 +139,7 @@ def parse_parameters(text: str, names: Collection[str]) -> dict[str, Any]:
     """Return a fault's own parameters, of `name: value, name: value`.
 
     Raises:
-        TypedError: it is no such list, or names something that is not among `names`.
+        InputError: it is no such list, or names something that is not among `names`.
     """
     where, allowed = f"parameters are {text[:40]!r}", "must be NAME: VALUE, NAME: VALUE, …"
     try:

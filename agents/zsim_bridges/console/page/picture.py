@@ -149,7 +149,7 @@ POINTS_OF_ONE = 300
 SPACING_M = 0.08  # of two points: a sixth of a hull
 
 
-class DroneTrails:
+class CanvasTrails:
     """The trails of N drones: the last stretch of each one's path.
 
     Args:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from zsim.math.rotation import LEVEL, matrix, subtract
 from zsim_agents.estimation import dead_reckoning
 from zsim_agents.estimation.kalman_update import predicted_covariance
-from zsim_agents.estimation.madgwick import LEVEL, rotation
 
 G = 9.80665  # m/s^2
 GATE_S = 0.02  # s
@@ -30,7 +30,7 @@ def test_the_transition_is_the_derivative_of_dead_reckoning():
         """One step of a drone whose state and biases are off by `error`."""
         w, x, y, z = (Rotation.from_rotvec(error[6:9]) * ATTITUDE).as_quat(scalar_first=True).tolist()
         gyro_bias, accel_bias = triple(error[9:12]), triple(error[12:15])
-        rate, force = dead_reckoning.plus(RATE, gyro_bias, -1.0), dead_reckoning.plus(f_B, accel_bias, -1.0)
+        rate, force = subtract(RATE, gyro_bias), subtract(f_B, accel_bias)
         a = dead_reckoning.acceleration((w, x, y, z), force, G)
         start = (triple(P_W + error[0:3]), triple(V_W + error[3:6]), (w, x, y, z), a, rate, force)
         return dead_reckoning.reckon(start, f_B, RATE, accel_bias, gyro_bias, 0.0, G, dt)
@@ -45,7 +45,7 @@ def test_the_transition_is_the_derivative_of_dead_reckoning():
     h = 1e-5
     numeric = np.stack([(off(h * e) - off(-h * e)) / (2.0 * h) for e in np.eye(15)], 1)
     F = np.eye(15)
-    R = rotation(nominal[2])
+    R = matrix(nominal[2])
     dead_reckoning.write_transition(F, triple(ATTITUDE.apply(f_B)), R, math.inf, True, dt)
     # The velocity's dependence on the gyroscope's bias is of second order in dt and left out.
     assert F[:9] == pytest.approx(numeric, abs=2e-4)
@@ -55,7 +55,7 @@ def test_the_transition_is_the_derivative_of_dead_reckoning():
 
 def test_madgwick_pull_shortens_tilt_but_not_heading_errors():
     F = np.eye(12)
-    dead_reckoning.write_transition(F, (0.0, 0.0, G), rotation(LEVEL), 2.0, False, 0.02)
+    dead_reckoning.write_transition(F, (0.0, 0.0, G), matrix(LEVEL), 2.0, False, 0.02)
     assert np.diag(F)[6:9] == pytest.approx([math.exp(-0.01), math.exp(-0.01), 1.0], abs=1e-4)
 
 

@@ -11,7 +11,7 @@ from refused import has_terms, refused
 from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.expression import Expression, ExpressionError
 from zsim_agents.formation.flight_data import ShapeLimits
-from zsim_agents.formation.guidance import plan_ramp, reference_fault
+from zsim_agents.formation.guidance import RampPlanner
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.trajectory import (
     ExpressionTrajectory,
@@ -304,7 +304,7 @@ def test_a_planned_ramp_uses_the_speed_that_it_may_and_no_more():
     gains, limits = FormationGains(), ShapeLimits()
     start = GOAL.copy()
     start[2] = 5.0
-    ramp = plan_ramp(SPACE, (start, ZERO), Hold(GOAL), 0.0, gains, limits)
+    ramp = RampPlanner(SPACE, gains, limits).ramp((start, ZERO), Hold(GOAL), 0.0)
     climb = max(ramp.value(t)[1][2] for t in np.linspace(0, ramp.over_s, 400))
     allowed = limits.share * gains.climb_max_m_s
     assert 0.9 * allowed < climb <= 1.03 * allowed
@@ -334,7 +334,7 @@ def test_ramps_that_lead_to_a_bad_place_are_refused(changes, over_s, terms):
     for name, value in changes.items():
         goal[SPACE.index(name)] = value
     with refused(TrajectoryError, *terms):
-        plan_ramp(SPACE, (start, ZERO), Hold(goal), 0.0, FormationGains(), ShapeLimits(), over_s)
+        RampPlanner(SPACE, FormationGains(), ShapeLimits()).ramp((start, ZERO), Hold(goal), 0.0, over_s)
 
 
 def test_a_way_that_passes_a_bad_place_is_refused_although_its_end_is_good():
@@ -344,13 +344,13 @@ def test_a_way_that_passes_a_bad_place_is_refused_although_its_end_is_good():
     goal = start.copy()
     goal[14] = math.pi
     for end in (start, goal):
-        assert reference_fault(space, Hold(end), 0.0, 1.0, FormationGains(), ShapeLimits()) is None
+        assert RampPlanner(space, FormationGains(), ShapeLimits()).reference_fault(Hold(end), 0.0, 1.0) is None
     with refused(TrajectoryError, "robots", "2", "4", "apart"):
-        plan_ramp(space, (start, np.zeros(16)), Hold(goal), 0.0, FormationGains(), ShapeLimits())
+        RampPlanner(space, FormationGains(), ShapeLimits()).ramp((start, np.zeros(16)), Hold(goal), 0.0)
 
 
 def test_a_trajectory_faster_than_the_robots_is_refused():
     onto = ExpressionTrajectory(SPACE, {"x_c": "5*sin(t)"}, GOAL)
-    fault = reference_fault(SPACE, onto, 0.0, 60.0, FormationGains(), ShapeLimits())
+    fault = RampPlanner(SPACE, FormationGains(), ShapeLimits()).reference_fault(onto, 0.0, 60.0)
     assert fault is not None
     assert has_terms(fault, "limits", "0.8")

@@ -17,8 +17,9 @@ from zsim.errors import RunError
 from zsim.math import frames
 from zsim.scenario import scenario_file
 from zsim_agents.formation.spaces.scenario_space import cluster_space, scenario_space
-from zsim_bridges.console import html_tables
-from zsim_bridges.console.http_proxy import ListenAddress
+from zsim_bridges.console import console_tables
+from zsim_bridges.console.console_server import Camera, PageControls, is_permitted
+from zsim_bridges.console.http_proxy import OPERATOR, VIEWER, ListenAddress, PageRequest, PageTokens
 from zsim_bridges.console.page import operator_input
 from zsim_bridges.console.page import picture as pic
 from zsim_bridges.console.page.operator_input import primary_variables, slider_ranges
@@ -28,19 +29,10 @@ from zsim_bridges.console.page.picture import (
     POINTS_OF_ONE,
     SPACING_M,
     SPAN_S,
-    DroneTrails,
+    CanvasTrails,
     VariableHistory,
 )
-from zsim_bridges.console.page_rights import (
-    OPERATOR,
-    VIEWER,
-    Camera,
-    PageControls,
-    PageRequest,
-    PageTokens,
-    is_permitted,
-)
-from zsim_bridges.console.table_rows import SensorRates
+from zsim_bridges.console.view_buffer import SensorRates
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -166,7 +158,7 @@ def test_a_pair_has_one_side():
 
 
 def test_a_trail_grows_with_the_way_and_forgets_its_beginning():
-    trails = DroneTrails(2)
+    trails = CanvasTrails(2)
     for k in range(POINTS_OF_ONE + 50):
         trails.add(np.array([(k * 2 * SPACING_M, 0.0, 1.0), (5.0, 5.0, 1.0)]))
     now = np.array([(1000.0, 0.0, 1.0), (5.0, 5.0, 1.0)])
@@ -178,7 +170,7 @@ def test_a_trail_grows_with_the_way_and_forgets_its_beginning():
 
 
 def test_a_drone_that_is_not_there_leaves_no_trail():
-    trails = DroneTrails(2)
+    trails = CanvasTrails(2)
     nowhere = (np.nan, np.nan, np.nan)
     for k in range(5):
         trails.add(np.array([(float(k), 0.0, 1.0), nowhere]))
@@ -190,7 +182,7 @@ def test_a_drone_that_is_not_there_leaves_no_trail():
 
 
 def test_many_trails_are_short():
-    trails = DroneTrails(50)
+    trails = CanvasTrails(50)
     for k in range(1000):
         trails.add(np.full((50, 3), k * 1.0))
     assert len(trails.segments(np.zeros((50, 3)))[0]) <= 6000
@@ -495,40 +487,40 @@ def test_nobody_says_what_no_control_says(said: bytes):
 
 
 def test_tables_show_text_of_others_as_text():
-    row = html_tables.DroneRow("d1", "flying", 12.0, 400.0, "<script>", "3 / 1", ("gps_dropout",))
-    told = html_tables.drone_table([row])
+    row = console_tables.DroneRow("d1", "flying", 12.0, 400.0, "<script>", "3 / 1", ("gps_dropout",))
+    told = console_tables.drone_table([row])
     assert "<script>" not in told
     assert "&lt;script&gt;" in told
     assert "gps_dropout" in told
-    assert told.count(html_tables.AMBER) == 2  # late, and a fault
-    assert html_tables.RED in told  # the battery
-    events = html_tables.event_table([Event(1_500_000_000, 0, "refused", "x", "y", "<b>no</b>")])
+    assert told.count(console_tables.AMBER) == 2  # late, and a fault
+    assert console_tables.RED in told  # the battery
+    events = console_tables.event_table([Event(1_500_000_000, 0, "refused", "x", "y", "<b>no</b>")])
     assert "1.50" in events
     assert "&lt;b&gt;no" in events
 
 
 def test_many_formations_leave_room_for_the_emergency_button():
-    told = html_tables.formation_lines({f"c{i}": ("taking_off", "<waits>") for i in range(16)})
-    assert html_tables.FEW_LINES in told
+    told = console_tables.formation_lines({f"c{i}": ("taking_off", "<waits>") for i in range(16)})
+    assert console_tables.FEW_LINES in told
     assert told.count("<br>") == 15
     assert has_terms(without_tags(told), "taking off", "&lt;waits&gt")
 
 
 def test_the_clock_says_whom_the_run_waits_for():
     now = Clock(2_000_000_000, 0, "r", 100, "waiting", 0.0, (Waiting("estimator.d1", "lab", 3.0),))
-    assert has_terms(without_tags(html_tables.clock_line(now, now.t_ns)), "waiting", "estimator.d1", "lab", "3 s")
-    assert "no clock" in html_tables.clock_line(None, 0)
+    assert has_terms(without_tags(console_tables.clock_line(now, now.t_ns)), "waiting", "estimator.d1", "lab", "3 s")
+    assert "no clock" in console_tables.clock_line(None, 0)
 
 
 def test_the_clock_tells_a_pace_only_while_the_run_goes_on():
     running, paused = (Clock(2_020_000_000, 0, "r", 101, state, 3.0) for state in ("running", "paused"))  # type: ignore[arg-type]
-    assert has_terms(without_tags(html_tables.clock_line(running, 2_010_000_000)), "2.0 s", "3.0")
-    assert "2.02 s</b><" in html_tables.clock_line(paused, 0)  # nothing is drawn yet
+    assert has_terms(without_tags(console_tables.clock_line(running, 2_010_000_000)), "2.0 s", "3.0")
+    assert "2.02 s</b><" in console_tables.clock_line(paused, 0)  # nothing is drawn yet
 
 
 def test_acting_faults_are_listed():
-    assert html_tables.NO_FAULT in html_tables.fault_lines([])
-    lines = html_tables.fault_lines(["gust of world", "link_cut of a/<b>"])
+    assert console_tables.NO_FAULT in console_tables.fault_lines([])
+    lines = console_tables.fault_lines(["gust of world", "link_cut of a/<b>"])
     assert "gust of world<br>" in lines
     assert "link_cut of a/&lt;b&gt;" in lines
 

@@ -20,7 +20,7 @@ from zsim_bridges.console.page import scene_nodes as stages
 from zsim_bridges.console.page.picture import drone_poses
 from zsim_bridges.console.page.scene_nodes import CameraFollow
 from zsim_bridges.console.run_page import RunPage, picture_rate_hz
-from zsim_bridges.console.time_monitor import TimeMonitor
+from zsim_bridges.console.view_buffer import TimeMonitor
 
 STEP = Path(__file__).parents[4] / "scenarios" / "step.yaml"
 SCENARIO = scenario_file.load(STEP)

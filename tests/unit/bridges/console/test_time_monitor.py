@@ -10,10 +10,9 @@ from refused import has_terms, without_tags
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import Clock, Event, Fault, Faults, Health
 from zsim.contract.views import DroneView, EstimateView, ViewDrones, ViewEstimates
-from zsim_bridges.console import html_tables
-from zsim_bridges.console.table_rows import TableRows, console_state, sigma_m
-from zsim_bridges.console.time_monitor import SILENT_S, TimeMonitor
-from zsim_bridges.console.view_buffer import ViewBuffer
+from zsim_bridges.console import console_tables
+from zsim_bridges.console.console_tables import TableRows, console_state, sigma_m
+from zsim_bridges.console.view_buffer import SILENT_S, TimeMonitor, ViewBuffer
 from zsim_bridges.observer_process import ObserverProcess
 
 S = 1_000_000_000  # ns
@@ -167,9 +166,9 @@ def test_silence_of_the_world_is_told_and_for_how_long():
 
 
 def test_a_silent_world_is_not_called_running():
-    told = html_tables.clock_line(clock(7 * S), 7 * S, 12.3)
+    told = console_tables.clock_line(clock(7 * S), 7 * S, 12.3)
     assert has_terms(without_tags(told), "no answer", "12 s")
-    assert html_tables.RED in told
+    assert console_tables.RED in told
     assert "running" not in told
 
 

@@ -4,6 +4,7 @@ import asyncio
 import json
 import sys
 from contextlib import suppress
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import msgspec
@@ -18,17 +19,24 @@ from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin
 from zsim.errors import DecodeError, NoWorldError
 from zsim.transport.samples import RawSample
-from zsim_bridges.gateway import last_values as values_module
-from zsim_bridges.gateway import stream_requests
+from zsim_bridges.gateway import publications, stream_requests
 from zsim_bridges.gateway.access_check import ConnectionLimit, TokenBucket
+from zsim_bridges.gateway.client_messages import (
+    MessageDefaults,
+    TooManyError,
+    is_control_key,
+    is_reserved,
+    json_to_payload,
+    json_value,
+    payload_to_json,
+    value_line,
+)
 from zsim_bridges.gateway.client_streams import Outbox
 from zsim_bridges.gateway.http_routes import description
 from zsim_bridges.gateway.http_trees import described_sample, methods_of
-from zsim_bridges.gateway.key_policy import MessageDefaults, TooManyError, is_control_key, is_reserved
-from zsim_bridges.gateway.last_values import EchoFilter, LastValues
-from zsim_bridges.gateway.lockstep_session import LockstepAgent, gate_keys_of
+from zsim_bridges.gateway.lockstep_session import LockstepSession, gate_keys_of
+from zsim_bridges.gateway.publications import EchoFilter, LastValues
 from zsim_bridges.gateway.stream_client import Client
-from zsim_bridges.gateway.transcoding import json_to_payload, json_value, payload_to_json, value_line
 
 VELOCITY = "drone/drone1/cmd/velocity"
 GATE_NS = 20_000_000
@@ -134,7 +142,7 @@ def test_last_values_are_the_newest_of_what_passed():
 
 
 def test_values_of_ones_own_have_a_bound_in_bytes(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(values_module, "OWN_BYTES_MAX", 10)
+    monkeypatch.setattr(publications, "OWN_BYTES_MAX", 10)
     values = LastValues(("drone1",))
     values.add("a", b"12345678")
     values.add("b", b"12", "text/plain")
@@ -337,20 +345,25 @@ def test_a_client_that_does_not_take_its_answers_is_cut_off():
 REQUIRED = (("estimator.drone1", "drone1"), ("estimator.drone2", "drone2"), ("matlab.main", "main"))
 
 
-def lockstep_agent(**given: Any) -> LockstepAgent:
-    handed: list[tuple[int, list[Any]]] = []
-    values = {
-        "name": "matlab.main",
-        "info": info(),
-        "period_ns": GATE_NS,
-        "reads": ["drone/*/estimate"],
-        "gates": (),
-        "now_ns": lambda: 0,
-        "required": REQUIRED,
-    }
-    made = LockstepAgent(**{**values, **given}, send_inputs=lambda t_ns, inputs: handed.append((t_ns, inputs)))
-    made.handed = handed  # type: ignore[attr-defined]
-    return made
+class LockstepLines(LockstepSession):
+    """A session in a run, whose loop is now; it keeps the lines that it sends."""
+
+    def __init__(
+        self,
+        name: str = "matlab.main",
+        mode: Literal["lockstep", "realtime"] = "lockstep",
+        period_s: float = 0.02,
+        **request: Any,
+    ) -> None:
+        self.lines: list[Any] = []
+        self.now_ns = 0
+        join = stream_requests.JoinRequest(name=name, period_s=period_s, **{"reads": ["drone/*/estimate"], **request})
+        run: Any = SimpleNamespace(info=info(mode), required_processes=REQUIRED, check_known=lambda key: None)
+        loop: Any = SimpleNamespace(call_soon_threadsafe=lambda act, *args: act(*args))
+        super().__init__(name, join, run, loop, lambda line: self.lines.append(json.loads(line)))
+
+    def answer(self, outputs: list[Any]) -> None:
+        self._answers.put(outputs)
 
 
 def test_what_closes_the_gates_of_a_session_comes_at_every_gate_and_is_not_its_own():
@@ -372,29 +385,33 @@ def test_what_closes_the_gates_of_a_session_comes_at_every_gate_and_is_not_its_o
 
 
 def test_an_agent_reads_what_closes_its_gates_and_counts_the_sensors_that_it_takes():
-    made = lockstep_agent(reads=["drone/drone1/sensor/*"], gates=["clock"])
-    assert (made.reads, made.counted) == (("drone/drone1/sensor/*", "clock"), ("drone1",))
+    session = LockstepLines(reads=["drone/drone1/sensor/*"], gates=["clock"])
+    assert (session.reads, session.counted) == (("drone/drone1/sensor/*", "clock"), ("drone1",))
 
 
 def test_a_step_hands_over_what_came_and_returns_the_answer():
-    made = lockstep_agent()
-    made.receive("drone/drone1/estimate", "e")
-    made.answer(["out"])  # type: ignore[list-item]
-    assert made.step(40) == ["out"]
-    assert made.handed == [(40, [("drone/drone1/estimate", "e")])]  # type: ignore[attr-defined]
-    made.leave()
-    assert made.step(60) == []
+    session = LockstepLines()
+    session.receive("drone/drone1/estimate", "e")
+    session.answer(["out"])
+    assert session.step(40) == ["out"]
+    assert session.lines == [{"op": "gate", "t_ns": 40, "inputs": [{"key": "drone/drone1/estimate", "value": "e"}]}]
+    session.leave()
+    assert session.step(60) == []
 
 
 def test_in_realtime_a_late_gate_goes_with_a_newer_one():
-    now = [10 * GATE_NS]
-    made = lockstep_agent(info=info("realtime"), now_ns=lambda: now[0])
-    made.receive("a", 1)
-    assert made.step(8 * GATE_NS) == []
-    made.receive("b", 2)
-    made.answer([])
-    made.step(9 * GATE_NS)
-    assert made.handed == [(9 * GATE_NS, [("a", 1), ("b", 2)])]  # type: ignore[attr-defined]
+    session = LockstepLines(mode="realtime")
+    session.run.now_ns = 10 * GATE_NS  # type: ignore[misc]
+    session.receive("a", 1)
+    assert session.step(8 * GATE_NS) == []
+    session.receive("b", 2)
+    session.answer([])
+    session.step(9 * GATE_NS)
+    (line,) = session.lines
+    assert (line["t_ns"], [(each["key"], each["value"]) for each in line["inputs"]]) == (
+        9 * GATE_NS,
+        [("a", 1), ("b", 2)],
+    )
 
 
 @pytest.mark.parametrize(
@@ -409,7 +426,7 @@ def test_in_realtime_a_late_gate_goes_with_a_newer_one():
 )
 def test_an_invalid_join_is_refused_by_its_field(given: dict[str, Any], terms: tuple[str, ...]):
     with refused(DecodeError, *terms):
-        lockstep_agent(**given)
+        LockstepLines(**given)
 
 
 # HTTP

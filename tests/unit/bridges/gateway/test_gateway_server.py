@@ -1,34 +1,48 @@
-"""What the gateway tells its clients of a run, by what its world and its link do."""
+"""Which states of a run the gateway sends to its clients, by what its world and its link do."""
 
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
+
+import pytest
 
 from zsim_bridges.gateway.gateway_server import Gateway, GatewayPorts
 
 
-class Ear:
-    """A client that keeps what it is told."""
+class StateLog:
+    """A client that keeps the states that it is sent."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[str, str]] = []
+        self.states: list[tuple[str, str]] = []
 
     def notify_run(self, state: str, run_id: str) -> None:
-        self.told.append((state, run_id))
+        self.states.append((state, run_id))
 
 
-def test_a_world_that_goes_after_the_end_of_its_run_is_not_lost() -> None:
-    ear, flight = Ear(), a_flight("first")
+@pytest.fixture
+def gateway() -> Iterator[Gateway]:
     gateway = Gateway(GatewayPorts("127.0.0.1", 0, 0), "gateway.main", None, dial=never, say=print)
-    gateway._clients.add(ear)  # type: ignore[arg-type]
-    gateway._begin(flight)
-    for state in ("lost", "back"):
-        gateway._notify_link(state, flight)
-    gateway._end(flight)
-    gateway._notify_link("lost", flight)
-    gateway._begin(a_flight("second"))
-    gateway._notify_link("lost", flight)
+    yield gateway
     gateway.loop.close()
-    assert ear.told == [
+
+
+@pytest.fixture
+def log(gateway: Gateway) -> StateLog:
+    log = StateLog()
+    gateway._clients.add(log)  # type: ignore[arg-type]
+    return log
+
+
+def test_a_world_that_goes_after_the_end_of_its_run_is_not_lost(gateway: Gateway, log: StateLog) -> None:
+    first = a_run("first")
+    gateway._begin(first)
+    for up in (True, False, True):  # the link is up at first, which is no news
+        gateway._notify_link(first, up)
+    gateway._end(first)
+    gateway._notify_link(first, False)
+    gateway._begin(a_run("second"))
+    gateway._notify_link(first, False)
+    assert log.states == [
         ("begun", "first"),
         ("lost", "first"),
         ("back", "first"),
@@ -37,8 +51,35 @@ def test_a_world_that_goes_after_the_end_of_its_run_is_not_lost() -> None:
     ]
 
 
-def a_flight(run_id: str) -> Any:
-    return SimpleNamespace(link=None, bare_link=None, info=SimpleNamespace(run_id=run_id))
+def test_a_link_is_back_before_its_run_ends_by_another_one(gateway: Gateway, log: StateLog) -> None:
+    first = a_run("first")
+    gateway._begin(first)
+    gateway._notify_link(first, False)
+    gateway._end(first, another=True)
+    gateway._notify_link(first, True)  # the link's own report, late
+    assert [state for state, _ in log.states] == ["begun", "lost", "back", "ended"]
+
+
+def test_a_link_that_was_lost_before_it_was_observed_is_reported(gateway: Gateway, log: StateLog) -> None:
+    """A world may die between the first words of a run and the first look at its link."""
+
+    class DeadLink:
+        def on_link(self, callback: Any) -> None:
+            pass  # there is no link, and so no event of it
+
+        def links(self) -> int:
+            return 0
+
+    run = a_run("first", link=DeadLink())
+    gateway._begin(run)
+    gateway._observe_link(run)
+    gateway.loop.call_soon(gateway.loop.stop)
+    gateway.loop.run_forever()
+    assert [state for state, _ in log.states] == ["begun", "lost"]
+
+
+def a_run(run_id: str, link: Any = None) -> Any:
+    return SimpleNamespace(link=link, bare_link=None, info=SimpleNamespace(run_id=run_id))
 
 
 def never(_: str) -> Any:

@@ -6,9 +6,9 @@ import msgspec
 import pytest
 
 from zsim.contract import flight_messages, messages
+from zsim.math.frames import heading, rpy_from_quaternion
 from zsim.scenario.scenario import Mount
-from zsim_bridges import ros_frames
-from zsim_bridges.ros1.onboard import OnboardState
+from zsim_bridges.ros1.driver_messages import OnboardState
 
 S = 1_000_000_000
 REST = (0.0, 0.0, 9.80665)
@@ -86,7 +86,7 @@ def test_without_an_estimator_its_own_gyroscope_tells_the_heading_since_power_on
     own = OnboardState()
     for n in range(401):
         own.update(imu(0.005 * n, gyro=(0.0, 0.0, 0.5)))
-    assert ros_frames.yaw(own.attitude) == pytest.approx(1.0, abs=0.01)
+    assert heading(own.attitude) == pytest.approx(1.0, abs=0.01)
 
 
 def test_without_an_estimator_its_own_accelerometer_tells_the_tilt():
@@ -94,7 +94,7 @@ def test_without_an_estimator_its_own_accelerometer_tells_the_tilt():
     roll = math.radians(5)
     for n in range(2000):
         own.update(imu(0.005 * n, accel=(0.0, 9.81 * math.sin(roll), 9.81 * math.cos(roll))))
-    assert ros_frames.rpy(own.attitude)[0] == pytest.approx(roll, abs=0.002)
+    assert rpy_from_quaternion(own.attitude)[0] == pytest.approx(roll, abs=0.002)
 
 
 def test_an_estimator_is_believed_from_its_first_word_on():
@@ -102,7 +102,7 @@ def test_an_estimator_is_believed_from_its_first_word_on():
     own.update(imu(0.0))
     own.update(estimate(0, (0.0, 0.0, 0.0), yaw_rad=1.0))
     own.update(imu(0.005, gyro=(0.0, 0.0, 3.0)))
-    assert ros_frames.yaw(own.attitude) == pytest.approx(1.0)
+    assert heading(own.attitude) == pytest.approx(1.0)
 
 
 def test_an_estimator_that_knows_no_attitude_is_believed_about_its_place_only():
@@ -111,7 +111,7 @@ def test_an_estimator_that_knows_no_attitude_is_believed_about_its_place_only():
     own.update(msgspec.structs.replace(estimate(S, (1.0, 2.0, 3.0)), orientation_wxyz=(0.0, 0.0, 0.0, 0.0)))
     own.update(imu(1.0))
     own.update(imu(1.05, gyro=(0.0, 0.0, 2.0)))
-    assert ros_frames.yaw(own.attitude) == pytest.approx(0.1, abs=1e-3)
+    assert heading(own.attitude) == pytest.approx(0.1, abs=1e-3)
     assert own.origin_m == pytest.approx((1.0, 2.0, 3.0))
 
 

@@ -14,7 +14,6 @@ from zsim.math.frames import quaternion_from_rpy, rotate
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import ErrorModel, Mount, Sensors
 from zsim.schema.message import Vector3
-from zsim_bridges import ros_frames
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
 from zsim_bridges.ros2.ros_types import RosTypes
 from zsim_bridges.ros2.topics import NavdataSummary
@@ -138,7 +137,7 @@ def test_odometry_turns_as_its_attitudes_do(rate: Vector3) -> None:
 
 def test_into_body_is_the_inverse_of_the_frames_rotation() -> None:
     q = quaternion(0.3, -0.4, 2.0)
-    assert rotate(q, ros_frames.into_body(q, (1.0, 2.0, 3.0))) == pytest.approx([1.0, 2.0, 3.0])
+    assert rotate(q, conversions.into_body(q, (1.0, 2.0, 3.0))) == pytest.approx([1.0, 2.0, 3.0])
 
 
 def test_sonar_frame_looks_along_the_beam_of_a_turned_mount() -> None:

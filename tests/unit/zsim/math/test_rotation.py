@@ -41,6 +41,26 @@ def test_product_turns_first_by_the_right_factor(p, q, v):
 
 
 @few
+@given(quaternions, quaternions, vectors)
+def test_matrices_agree_with_scipy(p, q, v):
+    p, q = unit(p), unit(q)
+    R, expected = rot.matrix(p), scipy_rotation(p)
+    np.testing.assert_allclose(R, expected.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rot.product(R, v), expected.apply(v), atol=1e-11)
+    np.testing.assert_allclose(rot.product(rot.transposed(R), v), expected.inv().apply(v), atol=1e-11)
+    np.testing.assert_allclose(rot.column(R, 1), expected.as_matrix()[:, 1], atol=1e-12)
+    both = (expected * scipy_rotation(q)).as_matrix()
+    np.testing.assert_allclose(rot.composed(R, rot.matrix(q)), both, atol=1e-12)
+
+
+@few
+@given(vectors)
+def test_a_matrix_of_euler_angles_turns_by_yaw_last(rpy):
+    expected = Rotation.from_euler("xyz", rpy).as_matrix()
+    np.testing.assert_allclose(rot.matrix_from_rpy(*rpy), expected, atol=1e-12)
+
+
+@few
 @given(vectors)
 def test_rotation_vector_agrees_with_scipy(r):
     expected = Rotation.from_rotvec(r).as_matrix()

@@ -18,7 +18,6 @@ MODULES = (
     "formation.spaces.pair_cluster",
     "formation.robot_limits",
     "formation.flight_data",
-    "formation.spaces.template_geometry",
     "formation.spaces.template_cluster",
     "formation.trajectory",
     "formation.spaces.triad_cluster",

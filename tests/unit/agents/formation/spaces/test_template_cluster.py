@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from zsim_agents.formation.spaces.cluster_space import SingularClusterError, robot_rates
-from zsim_agents.formation.spaces.template_cluster import TemplateCluster
-from zsim_agents.formation.spaces.template_geometry import centred, fitted_rotation, shape_modes, turns
+from zsim_agents.formation.spaces.template_cluster import TemplateCluster, centred, fitted_rotation, shape_modes, turns
 
 SIZES = (3, 5, 10, 30)
 RING = np.array([(6 * math.cos(k * math.pi / 5), 6 * math.sin(k * math.pi / 5), 0.0) for k in range(10)])

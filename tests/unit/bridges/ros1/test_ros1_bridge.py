@@ -16,12 +16,10 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.transport.samples import ReceivedSample
 from zsim_bridges.observer_process import ObserverProcess
-from zsim_bridges.ros1 import intake as intake_module
-from zsim_bridges.ros1 import tcpros
-from zsim_bridges.ros1.bridge import Bridge, check_names
+from zsim_bridges.ros1 import ros1_bridge, tcpros
 from zsim_bridges.ros1.drone_topics import DroneTopics
-from zsim_bridges.ros1.intake import Intake
 from zsim_bridges.ros1.node import Ros1Node
+from zsim_bridges.ros1.ros1_bridge import Intake, Ros1Bridge, check_names
 
 GATE_NS = 20_000_000
 SCENARIO = """
@@ -144,7 +142,7 @@ def test_numbers_beyond_the_fields_of_ros_are_refused_and_told_once_and_the_next
     )  # fmt: skip
     observer = ObserverProcess(cast(Any, FakeLink()), info, "ros1.main")
     node = Ros1Node("/zsim", "http://127.0.0.1:1", "127.0.0.1", said.append)
-    bridge = Bridge(cast(Any, FakeLink()), info, observer, node, said.append)
+    bridge = Ros1Bridge(cast(Any, FakeLink()), info, observer, node, said.append)
     navdata = Ear(node, "/quad_1/ardrone/navdata")
 
     def gate(n: int, range_m: float) -> None:
@@ -190,7 +188,7 @@ class Link:
 
 
 def test_who_is_too_slow_loses_the_oldest_gates(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(intake_module, "BACKLOG", 3)
+    monkeypatch.setattr(ros1_bridge, "BACKLOG", 3)
     info: Any = type("Info", (), {"drones": [messages.DroneInfo("drone1", "ardrone2")]})()
     table = key_table(["drone1"])
 

@@ -16,9 +16,8 @@ from zsim.transport.samples import RawSample, ReceivedSample
 from zsim.transport.zenoh_settings import Mode
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import rmw_zenoh
-from zsim_bridges.ros2.bridge import Bridge
-from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId
-from zsim_bridges.ros2.ros_context import RosContext
+from zsim_bridges.ros2.rmw_zenoh import Attachment, Endpoint, NodeId, RosContext
+from zsim_bridges.ros2.ros2_bridge import Ros2Bridge
 from zsim_bridges.ros2.ros_types import RosTypes
 from zsim_bridges.ros2.source_keys import SAMPLES_MAX, CallbackQueue
 
@@ -134,7 +133,7 @@ class Bench:
         self.link: Any = Link()
         self.lines: list[str] = []
         self.observer = ObserverProcess(self.link, self.info, "ros2.main")
-        self.bridge = Bridge(self.link, self.info, self.observer, self.lines.append, wall_ns)
+        self.bridge = Ros2Bridge(self.link, self.info, self.observer, self.lines.append, wall_ns)
         self.bridge.advertise_run(RosContext(self.link, 0, TYPES, wall_ns, self.bridge.count_refused))
 
     def turn(self) -> None:

@@ -2,22 +2,25 @@
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterable
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
-from zsim.errors import DecodeError, RunError
+from zsim.errors import DecodeError, RunError, SessionError
+from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
+from zsim.transport.samples import ReceivedSample
 from zsim.transport.session import Session
-from zsim_bridges import ros_frames
+from zsim.transport.traffic import Passed, Traffic, samples
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import driver_messages
-from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics
-from zsim_bridges.ros1.intake import Intake
+from zsim_bridges.ros1.drone_topics import QUEUE, DroneTopics, ros1_name
 from zsim_bridges.ros1.node import Ros1Node
-from zsim_bridges.ros1.onboard import warm_up
 
+BACKLOG = 250  # times that something arrived, some seconds of realtime
 POLL_S = 0.1  # how often a stop is looked for
 REPORTED_MAX = 1000  # texts remembered, so that each is printed once
 Say = Callable[[str], None]
@@ -25,6 +28,59 @@ Say = Callable[[str], None]
 
 class NodeShutdownError(RunError):
     """A ROS node, or the master, has asked this node to stop."""
+
+
+class Intake:
+    """Messages in the order in which they passed the world; a reader that is too slow loses the oldest gates.
+
+    Args:
+        link: an open session.
+        info: of the run.
+        health: counts what is lost or refused.
+        loop: of the reader.
+
+    Attributes:
+        news: set when there is something to read.
+    """
+
+    def __init__(self, link: Session, info: Info, health: HealthMeter, loop: asyncio.AbstractEventLoop) -> None:
+        self._traffic = Traffic(link, [drone.name for drone in info.drones], self._count_refused)
+        self._health = health
+        self._loop = loop
+        self._backlog: deque[Sequence[Passed]] = deque(maxlen=BACKLOG)
+        self._thread = threading.Thread(target=self._run, name="intake", daemon=True)
+        self.news = asyncio.Event()
+        for sample in link.get(keys.CLOCK):  # a world that stands, or has ended, publishes it no more
+            self._backlog.append([sample])
+        self.news.set()
+        self._thread.start()
+
+    def close(self) -> None:
+        """Take in no more."""
+        self._traffic.close()
+        self._thread.join(1.0)
+
+    def arrivals(self) -> Iterator[list[ReceivedSample]]:
+        """Yield what has come until now, in the parts in which it came."""
+        self.news.clear()
+        for _ in range(len(self._backlog)):
+            yield list(samples(self._backlog.popleft()))
+
+    def _run(self) -> None:
+        while True:
+            try:
+                passed = self._traffic.receive()
+            except SessionError:
+                return
+            if passed:
+                self._health.dropped += len(self._backlog) == BACKLOG
+                self._health.received += 1
+                self._backlog.append(passed)
+                with contextlib.suppress(RuntimeError):  # the reader is gone
+                    self._loop.call_soon_threadsafe(self.news.set)
+
+    def _count_refused(self) -> None:
+        self._health.refused += 1
 
 
 def serve(
@@ -51,15 +107,15 @@ def serve(
         NodeShutdownError: ROS asked this node to stop.
         RunError: two drones have the same name in ROS.
     """
-    warm_up()
-    node = Ros1Node(f"/{ros_frames.ros1_name(info.federation)}", master_uri, host, say)
-    asyncio.run(Bridge(link, info, observer, node, say).run(stopped))
+    driver_messages.warm_up()
+    node = Ros1Node(f"/{ros1_name(info.federation)}", master_uri, host, say)
+    asyncio.run(Ros1Bridge(link, info, observer, node, say).run(stopped))
     if node.shutdown_reason:
         observer.leave(node.shutdown_reason)
         raise NodeShutdownError(f"{observer.name}: {node.shutdown_reason}")
 
 
-class Bridge:
+class Ros1Bridge:
     """One run in one ROS graph."""
 
     def __init__(self, link: Session, info: Info, observer: ObserverProcess, node: Ros1Node, say: Say) -> None:
@@ -89,10 +145,10 @@ class Bridge:
             intake.close()
 
     async def _forward_all(self, intake: Intake) -> None:
-        for said in intake.arrivals():
-            for key, payload in said:
+        for arrived in intake.arrivals():
+            for key, payload in arrived:
                 self.forward(key, payload)
-            await asyncio.sleep(0)  # let connections have their turn
+            await asyncio.sleep(0)  # other tasks run
 
     def forward(self, key: str, payload: bytes) -> None:
         """Convert and publish a message that has passed the world."""
@@ -148,7 +204,7 @@ def check_names(drones: Iterable[str]) -> None:
     """
     drone_of: dict[str, str] = {}
     for drone in drones:
-        name = ros_frames.ros1_name(drone)
+        name = ros1_name(drone)
         if name in drone_of:
             raise RunError(f"drones {drone_of[name]!r} and {drone!r} are both {name!r} in ROS; rename one")
         drone_of[name] = drone

@@ -1,14 +1,26 @@
-"""The last value of every key that has passed the world, or was published by clients here. Pure."""
+"""What is published in a run, for clients: the last value of every key, and subscriptions that they share."""
 
+import asyncio
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages, key_table
+from zsim.transport.samples import RawSample, check_expression
+from zsim.transport.session import Session
+from zsim_bridges.gateway.access_check import ConnectionLimit
+from zsim_bridges.gateway.client_messages import TooManyError
 
-WAITING_MAX = 256  # echoes of a key; a paused world returns none, and clients may go on
+ECHOES_MAX = 256  # of a key; a paused world returns none, and clients may go on
 DELETED = None
+OWN_BYTES_MAX = 64_000_000  # of the values on clients' own keys
+KEYS_MAX = 200_000  # kept; 1000 drones have about 12 000
+WAITING_MAX = 50_000  # messages of an expression that wait for the loop; then the oldest go
+DELIVER_MAX = 500  # messages delivered before the other tasks of the loop run
+EXPRESSIONS_MAX = 2_000  # of all clients together; each is a subscription that the world's session checks
+
+Subscriber = Callable[[RawSample], None]
 
 
 class EchoFilter:
@@ -28,7 +40,7 @@ class EchoFilter:
     def add(self, key: str, payload: bytes) -> None:
         """Expect the echo of a payload that is on its way to the world."""
         if key in self._waiting or len(self._waiting) < self._keys_max:
-            self._waiting.setdefault(key, deque(maxlen=WAITING_MAX)).append(hash(payload))
+            self._waiting.setdefault(key, deque(maxlen=ECHOES_MAX)).append(hash(payload))
 
     def add_deletion(self, key: str) -> None:
         """Note that a key whose echoes are expected has no value any more."""
@@ -43,16 +55,12 @@ class EchoFilter:
         del self._waiting[key]
         newer = waiting[waiting.index(hash(payload)) + 1 :]
         if any(mark is not DELETED for mark in newer):
-            self._waiting[key] = deque(newer, maxlen=WAITING_MAX)
+            self._waiting[key] = deque(newer, maxlen=ECHOES_MAX)
         return bool(newer)
 
 
-OWN_BYTES_MAX = 64_000_000  # of the values on clients' own keys
-KEYS_MAX = 200_000  # kept; 1000 drones have about 12 000
-
-
 class LastValues:
-    """Filled by the batches that the world publishes; payloads are GateMessages.unpack when they are read.
+    """The last value of every key that has passed the world, or was published by clients here.
 
     Args:
         drones: their names, as `world/info` gives them.
@@ -141,3 +149,112 @@ class LastValues:
     def _payload(self, key: str) -> bytes | None:
         gate, m = self._of_gates.get(self._indices.get(key, -1), (None, 0))
         return gate.payload(m) if gate else self._payloads.get(key)
+
+
+class SharedSubscriptions:
+    """Subscriptions that clients share, and that outlast the session of a run.
+
+    Args:
+        loop: on which everything but Zenoh's callbacks is called.
+        limit: of connections, in which streams count that are nothing but one subscription.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, limit: ConnectionLimit) -> None:
+        self._loop = loop
+        self._limit = limit
+        self._link: Session | None = None
+        self._by_expression: dict[str, _SharedSubscription] = {}
+
+    def attach(self, link: Session) -> None:
+        """Subscribe on a session."""
+        self._link = link
+        for expression, shared in self._by_expression.items():
+            shared.undeclare = link.declare_subscriber(expression, shared.on_publication)
+
+    def detach(self) -> None:
+        """Receive nothing until the next `attach`: the session closes."""
+        self._link = None
+        for shared in self._by_expression.values():
+            shared.undeclare = _do_nothing
+
+    def subscribe(self, expression: str, subscriber: Subscriber) -> Callable[[], None]:
+        """Call a subscriber with every publication on an expression until the returned function is called.
+
+        Raises:
+            SessionError: it is no key expression.
+            TooManyError: there are EXPRESSIONS_MAX others.
+        """
+        shared = self._by_expression.get(expression)
+        if shared is None:
+            check_expression(expression)
+            if len(self._by_expression) >= EXPRESSIONS_MAX:
+                raise TooManyError(f"subscribe: there are {EXPRESSIONS_MAX} expressions already; take one of them")
+            shared = self._by_expression[expression] = _SharedSubscription(self._loop)
+            if self._link is not None:
+                shared.undeclare = self._link.declare_subscriber(expression, shared.on_publication)
+        shared.subscribers[subscriber] = None
+        return lambda: self._unsubscribe(expression, subscriber)
+
+    def subscribe_stream(self, expression: str, subscriber: Subscriber) -> Callable[[], None]:
+        """Subscribe for a connection that has nothing else, and count it among the clients.
+
+        Raises:
+            SessionError: it is no key expression.
+            TooManyError: the limit of clients or of expressions is reached.
+        """
+        self._limit.enter()
+        try:
+            unsubscribe = self.subscribe(expression, subscriber)
+        except BaseException:
+            self._limit.leave()
+            raise
+
+        def leave() -> None:
+            unsubscribe()
+            self._limit.leave()
+
+        return leave
+
+    def _unsubscribe(self, expression: str, subscriber: Subscriber) -> None:
+        shared = self._by_expression.get(expression)
+        if shared is None:
+            return
+        shared.subscribers.pop(subscriber, None)
+        if not shared.subscribers:
+            del self._by_expression[expression]
+            shared.undeclare()
+
+
+class _SharedSubscription:
+    """One subscription: publications that arrive close together are delivered together."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._waiting: deque[RawSample] = deque(maxlen=WAITING_MAX)
+        self._scheduled = False
+        self.subscribers: dict[Subscriber, None] = {}
+        self.undeclare: Callable[[], None] = _do_nothing
+
+    def on_publication(self, sample: RawSample) -> None:
+        """Store a publication, in a thread of Zenoh's."""
+        self._waiting.append(sample)
+        if not self._scheduled:
+            self._scheduled = True
+            try:
+                self._loop.call_soon_threadsafe(self._deliver)
+            except RuntimeError:
+                return  # the loop is closed
+
+    def _deliver(self) -> None:
+        self._scheduled = False
+        for _ in range(min(DELIVER_MAX, len(self._waiting))):
+            sample = self._waiting.popleft()
+            for subscriber in list(self.subscribers):
+                subscriber(sample)
+        if self._waiting and not self._scheduled:
+            self._scheduled = True
+            self._loop.call_soon(self._deliver)
+
+
+def _do_nothing() -> None:
+    return

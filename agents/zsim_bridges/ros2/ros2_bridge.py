@@ -4,14 +4,18 @@ A topic is converted only while a ROS node subscribes to it, and only then is it
 costs its clock alone. The bridge never makes the world wait.
 """
 
+import math
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from functools import partial
+from threading import Lock
 from typing import Any, NamedTuple
 
-from zsim.contract import keys
+from zsim.contract import keys, messages
+from zsim.contract.flight_messages import Mode, Velocity
 from zsim.contract.messages import Info
-from zsim.errors import SessionError
+from zsim.errors import DecodeError, SessionError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.transport import connection
@@ -20,15 +24,14 @@ from zsim.transport.session import Session
 from zsim.transport.tls import Identity
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
-from zsim_bridges.ros2.commands import RosCommands
-from zsim_bridges.ros2.rmw_zenoh import ros_names
-from zsim_bridges.ros2.ros_context import Ros2Node, RosContext
+from zsim_bridges.ros2.rmw_zenoh import Ros2Node, RosContext, ros_names
 from zsim_bridges.ros2.ros_types import RosTypes
 from zsim_bridges.ros2.source_keys import SAMPLES_MAX, BridgedTopic, CallbackQueue, SourceSubscriptions
 from zsim_bridges.ros2.topics import RosNames, Topic
 
 NODE = "zsim"
 POLL_S = 0.1  # how often a stop is checked
+STATUS_S = 1.0  # how long a drone's state is waited for
 ATTEMPT_S = 1.0  # of connecting to ROS's router
 TRIGGER = "std_srvs/srv/Trigger"
 CLUSTER_SERVICES = ("takeoff", "engage", "hold", "land")
@@ -49,7 +52,71 @@ class RosNetwork(NamedTuple):
     identity: Identity
 
 
-class Bridge:
+class RosCommands:
+    """Sends commands in the bridge's name; called in several threads.
+
+    Args:
+        link: to the world.
+        observer: for the name, and the time of the newest gate.
+        response: class of std_srvs/Trigger_Response.
+    """
+
+    def __init__(self, link: Session, observer: ObserverProcess, response: Any) -> None:
+        self._link = link
+        self._observer = observer
+        self._response = response
+        self._sent: Counter[str] = Counter()  # commands, by key
+        self._lock = Lock()
+
+    def send_velocity(self, drone: str, twist: Any) -> None:
+        """Fly a Twist: forward, left, up [m/s] in the heading frame, and counter-clockwise [rad/s].
+
+        Raises:
+            ValueError: a number is not finite.
+        """
+        linear, turn = twist.linear, twist.angular.z
+        v = float(linear.x), float(linear.y), float(linear.z)
+        if not all(map(math.isfinite, (*v, turn))):
+            raise ValueError(f"the velocity is {(*v, turn)}; must be finite")
+        key = keys.command(drone, "velocity")
+        with self._lock:
+            self._link.put(key, Velocity(*self._next_stamp(key), self._observer.name, v, float(turn)))
+
+    def send_mode(self, drone: str, mode: Any) -> None:
+        """Let a drone take off, land, stop at once or leave the emergency."""
+        key = keys.command(drone, "mode")
+        with self._lock:
+            self._link.put(key, Mode(*self._next_stamp(key), self._observer.name, mode))
+
+    def toggle_emergency(self, drone: str) -> None:
+        """Stop the rotors at once, or, where that has happened, make ready to fly: the aircraft's emergency button.
+
+        Raises:
+            ValueError: the drone's state is not known.
+        """
+        self.send_mode(drone, "reset" if self._state(drone) == "emergency" else "emergency")
+
+    def _state(self, drone: str) -> str:
+        key = keys.status(drone)
+        for sample in self._link.get(key, timeout_s=STATUS_S):
+            try:
+                return messages.decode(key, sample.payload).state
+            except DecodeError as error:
+                raise ValueError(str(error)) from error
+        raise ValueError(f"the state of {drone} is not known: the world does not answer")
+
+    def _next_stamp(self, key: str) -> tuple[int, int]:
+        """Return t_ns and seq of the next command on a key."""
+        self._sent[key] += 1
+        return self._observer.now_ns, self._sent[key] - 1
+
+    def request(self, key: str, op: str, args: dict[str, Any], _: Any) -> Any:
+        """Send a control request for a service whose own request is empty; return the response."""
+        answer = self._link.request(key, op, self._observer.name, args)
+        return self._response(answer.ok, answer.error)
+
+
+class Ros2Bridge:
     """The bridge of one run; everything but commands and services happens in the thread that calls `process`.
 
     Args:
@@ -135,7 +202,8 @@ class Bridge:
             node = ros.node(f"/cluster/{name}", NODE)
             self._advertise(node, topics.cluster_topics(cluster, name, types))
             for op in CLUSTER_SERVICES:
-                node.service(f"/cluster/{name}/{op}", TRIGGER, _empty_request(commands.request_cluster, cluster, op))
+                answer = partial(commands.request, keys.cluster_control(cluster), op, {})
+                node.service(f"/cluster/{name}/{op}", TRIGGER, answer)
         ros.on_subscription(lambda token, alive: self._queue.add_task(partial(self._on_subscription, token, alive)))
         self._report_names()
 
@@ -155,7 +223,7 @@ class Bridge:
         }
         for leaf, (kind, act) in callbacks.items():
             self._cleanups.append(node.subscription(f"/{name}/{leaf}", kind, rmw_zenoh.DEFAULT, act))
-        node.service(f"/{name}/release", TRIGGER, _empty_request(commands.release, drone))
+        node.service(f"/{name}/release", TRIGGER, partial(commands.request, keys.CONTROL, "release", {"drone": drone}))
 
     def _publish_static_frames(self, node: Ros2Node) -> None:
         """Publish the frames that never move, once for all, later subscribers too."""
@@ -189,11 +257,6 @@ class Bridge:
             (self._sources.add if readers else self._sources.remove)(publication)
 
 
-def _empty_request(act: Callable[..., Any], *args: str) -> Callable[[Any], Any]:
-    """Return the callback of a service without arguments."""
-    return lambda _: act(*args)
-
-
 def serve(
     link: Session,
     info: Info,
@@ -208,7 +271,7 @@ def serve(
     Raises:
         SessionError: the router's endpoint is malformed.
     """
-    bridge = Bridge(link, info, observer, say, wall_ns)
+    bridge = Ros2Bridge(link, info, observer, say, wall_ns)
     with ExitStack() as stack, closing(bridge):
         ros_link = link.unprefixed() if network.router is None else None
         entered = False
@@ -221,7 +284,7 @@ def serve(
             bridge.process(POLL_S)
 
 
-def _connect(stack: ExitStack, network: RosNetwork, bridge: Bridge) -> Session | None:
+def _connect(stack: ExitStack, network: RosNetwork, bridge: Ros2Bridge) -> Session | None:
     """Return a session with ROS's router, None where it does not listen yet."""
     assert network.router is not None
     try:

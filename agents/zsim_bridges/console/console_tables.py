@@ -1,0 +1,287 @@
+"""What the console shows of the newest views: tables as HTML, and plain data for programs.
+
+Order of this file: HTML, which is pure and in which all texts of other processes are escaped; rows; plain data.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any, NamedTuple
+
+from zsim.contract.run_messages import Clock, Event, Fault
+from zsim.contract.views import EstimateView, ViewCluster, ViewDrones
+from zsim_bridges.console.page.picture import FormationShape
+from zsim_bridges.console.view_buffer import Counts, ReceivedEstimate, SensorRates, TimeMonitor, ViewBuffer
+
+LATE_MS = 200.0  # of an estimator: ten gates of 20 ms
+LOW_PERCENT = 20.0  # of a battery; the AR.Drone warns there
+GREY, RED, AMBER, GREEN, BLUE = "#868e96", "#e03131", "#e8890c", "#2f9e44", "#1971c2"
+STATE_COLOURS = {
+    "landed": GREY,
+    "taking_off": BLUE,
+    "hovering": GREEN,
+    "flying": GREEN,
+    "landing": BLUE,
+    "emergency": RED,
+}
+EVENT_COLOURS = {
+    "refused": RED,
+    "death": RED,
+    "collision": RED,
+    "fault": AMBER,
+    "fault_end": AMBER,
+    "fault_clear": AMBER,
+}
+NO_FAULT = "no fault acts"
+FEW_LINES = "max-height:8em;overflow-y:auto"  # many formations must not push the emergency button off the page
+EVENTS_MAX = 20  # in the plain data
+SILENT = "silent"  # in place of the clock's state, where the world answers nothing
+STYLE = "font-size:12px;line-height:1.35;font-variant-numeric:tabular-nums"
+
+
+class DroneRow(NamedTuple):
+    """A drone's row in the table of drones."""
+
+    name: str
+    state: str
+    battery_percent: float
+    lag_ms: float | None
+    commander: str | None
+    gps: str
+    faults: tuple[str, ...]
+
+
+def drone_table(rows: Sequence[DroneRow]) -> str:
+    """Return the table of all drones."""
+    head = _head(
+        ("drone", ""),
+        ("state", "of its firmware"),
+        ("battery", ""),
+        ("lag", "how far its estimator is behind the run"),
+        ("GPS", "fixes that its estimator used / refused"),
+        ("flown by", "the process whose commands it obeys"),
+    )
+    return _table(head + "".join(map(_drone_cells, rows)))
+
+
+def _drone_cells(row: DroneRow) -> str:
+    state = _coloured(row.state.replace("_", " "), STATE_COLOURS.get(row.state, GREY))
+    battery = _coloured(f"{row.battery_percent:.0f} %", RED if row.battery_percent < LOW_PERCENT else "inherit")
+    lag = "–" if row.lag_ms is None else f"{row.lag_ms:.0f} ms"
+    late = row.lag_ms is not None and row.lag_ms > LATE_MS
+    cells = (escape(row.name), state, battery, _coloured(lag, AMBER if late else "inherit"), escape(row.gps))
+    line = _cells((*cells, escape(row.commander or "nobody")))
+    if row.faults:
+        faults = escape(", ".join(row.faults))
+        line += f"<tr><td colspan=6 style='color:{AMBER};padding:0 4px 2px 12px'>⚠ {faults}</td></tr>"
+    return line
+
+
+def sensor_table(name: str, counts: Counts, rates: Mapping[str, float], uncertainty: str) -> str:
+    """Return the table of one drone's sensors: measurements that its estimator used and refused, and rates [Hz]."""
+    lines = [
+        _row((kind, used, refused, f"{rates[kind]:.0f} Hz" if kind in rates else "–"))
+        for kind, (used, refused) in counts.items()
+    ]
+    title = f"<div style='{STYLE};padding:2px 0'><b>{escape(name)}</b>: {escape(uncertainty)}</div>"
+    head = _head(
+        ("sensor", "of the drone"),
+        ("used", "measurements that its estimator used"),
+        ("refused", "measurements that were too unlikely, or of no use"),
+        ("rate", "at which they come, in simulated time"),
+    )
+    return title + _table(head + "".join(lines))
+
+
+def formation_lines(states: Mapping[str, tuple[str, str]]) -> str:
+    """Return phase and reason of each formation by name."""
+    lines = [
+        f"<b>{escape(name)}</b>: {escape(phase.replace('_', ' '))}" + (f" – {escape(reason)}" if reason else "")
+        for name, (phase, reason) in states.items()
+    ]
+    return f"<div style='{STYLE};{FEW_LINES};padding:2px 4px'>{'<br>'.join(lines) or 'no formation'}</div>"
+
+
+def clock_line(now: Clock | None, t_ns: int, silent_s: float = 0.0) -> str:
+    """Return the run's time, and which processes it waits for; or for how long the world has been `silent_s`.
+
+    `t_ns` is the time of the picture, 0 before the first.
+    """
+    if silent_s:
+        text = _coloured(f"no answer from the world for {silent_s:.0f} s", RED)
+        return f"<div style='{STYLE};padding:2px 4px;font-size:14px'>{text}, last at <b>{t_ns / 1e9:.1f} s</b></div>"
+    if now is None:
+        return f"<div style='{STYLE};padding:2px 4px'>no clock yet</div>"
+    waiting = [w for w in now.waiting_for if now.state == "waiting" or w.since_wall_s > 0.5]
+    colour = {"running": GREEN, "paused": AMBER}.get(now.state, GREY)
+    t_s = (t_ns or now.t_ns) / 1e9
+    time, pace = (f"{t_s:.1f}", f" × {now.rate:.1f} real time") if now.state == "running" else (f"{t_s:.2f}", "")
+    text = f"{_coloured(now.state, colour)} <b>{time} s</b>{pace}"
+    if waiting:
+        names = ", ".join(f"{w.name} on {w.host} ({w.since_wall_s:.0f} s)" for w in waiting[:4])
+        text += f"<br>waiting for {escape(names)}"
+    return f"<div style='{STYLE};padding:2px 4px;font-size:14px'>{text}</div>"
+
+
+def event_table(newest_first: Iterable[Event]) -> str:
+    """Return the table of events, which are given newest first."""
+    lines = [
+        f"<tr><td style='text-align:right;color:{GREY}'>{event.t_ns / 1e9:.2f}</td>"
+        f"<td>{_coloured(event.kind, EVENT_COLOURS.get(event.kind, GREY))}</td><td>{escape(event.text)}</td></tr>"
+        for event in newest_first
+    ]
+    head = _head(("t [s]", "simulated time"), ("event", ""), ("newest first", ""))
+    return _table(head + "".join(lines), "overflow-wrap:anywhere")
+
+
+def fault_lines(faults: Sequence[str]) -> str:
+    """Return the active faults."""
+    lines = "<br>".join(f"⚠ {escape(fault)}" for fault in faults)
+    style = f"{STYLE};{FEW_LINES};padding:2px 4px;color:{AMBER if faults else GREY}"
+    return f"<div style='{style}'>{lines or NO_FAULT}</div>"
+
+
+def _table(body: str, wrap: str = "white-space:nowrap") -> str:
+    return f"<table style='{STYLE};{wrap};border-spacing:4px 1px;width:100%'>{body}</table>"
+
+
+def _head(*titles: tuple[str, str]) -> str:
+    """Return a row of titles, each with its tooltip."""
+    cells = (f"<th align=left title='{escape(tooltip)}'>{escape(title)}</th>" for title, tooltip in titles)
+    return f"<tr>{''.join(cells)}</tr>"
+
+
+def _row(cells: Iterable[object]) -> str:
+    return _cells(escape(str(cell)) for cell in cells)
+
+
+def _cells(cells: Iterable[str]) -> str:
+    return f"<tr>{''.join(f'<td align=left>{cell}</td>' for cell in cells)}</tr>"
+
+
+def _coloured(text: str, colour: str) -> str:
+    return f"<span style='color:{colour}'>{escape(text)}</span>"
+
+
+class TableRows:
+    """Makes rows of tables.
+
+    Args:
+        views: the newest ones.
+    """
+
+    def __init__(self, views: ViewBuffer) -> None:
+        self._views = views
+        self._rates = SensorRates()
+
+    def drone_rows(self) -> list[DroneRow]:
+        """Return a row for each drone."""
+        view, estimates, rows = self._views.drones, self._views.estimates(), []
+        if view is None:
+            return []
+        faults = self._active()
+        for drone in view.drones:
+            received = estimates.get(drone.name)
+            gps = received.estimate.sensors.get("gps") if received else None
+            own_faults = tuple(fault.kind for fault in faults if fault.target == drone.name)
+            fixes = "–" if gps is None else f"{gps[0]} / {gps[1]}"
+            lag = self._lag_ms(received, view.t_ns) if received else None
+            row = (drone.name, drone.state, drone.battery_percent, lag, drone.commander, fixes, own_faults)
+            rows.append(DroneRow(*row))
+        return rows
+
+    def active_faults(self) -> list[str]:
+        """Return kind and target of each active fault."""
+        return [f"{fault.kind} of {fault.target}{_end_text(fault)}" for fault in self._active()]
+
+    def _active(self) -> list[Fault]:
+        now_ns = self._views.drones.t_ns if self._views.drones else 0
+        return [fault for fault in self._views.faults if _is_active(fault, now_ns)]
+
+    def sensor_table(self, drone: str) -> str:
+        """Return the table of one drone's sensors."""
+        received = self._views.estimates().get(drone)
+        if received is None:
+            return sensor_table(drone, {}, {}, "no estimate yet")
+        estimate = received.estimate
+        rates = self._rates.update(drone, received.t_ns, estimate.sensors) if received.fresh else {}
+        return sensor_table(drone, estimate.sensors, rates, _uncertainty(received))
+
+    def _lag_ms(self, received: ReceivedEstimate, now_ns: int) -> float:
+        """Return how far an estimator is behind: by its health, or by its view where that is old."""
+        health = self._views.healths.get(received.process)
+        if health is not None and received.fresh:
+            return health.lag_ns / 1e6
+        return max(0, now_ns - received.t_ns) / 1e6
+
+
+def _is_active(fault: Fault, now_ns: int) -> bool:
+    return fault.from_ns <= now_ns and (fault.until_ns is None or fault.until_ns > now_ns)
+
+
+def _end_text(fault: Fault) -> str:
+    return "" if fault.until_ns is None else f" until {fault.until_ns / 1e9:.1f} s"
+
+
+def _uncertainty(received: ReceivedEstimate) -> str:
+    """Return an estimator's uncertainty in words."""
+    if not received.fresh:
+        return f"no estimate since {received.t_ns / 1e9:.1f} s"
+    heading_deg = math.degrees(received.estimate.yaw_sigma_rad)
+    return f"σ of position {sigma_m(received.estimate):.2f} m, of heading {heading_deg:.1f}°"
+
+
+def sigma_m(estimate: EstimateView) -> float:
+    """Return the root of the mean variance of the position over its axes; 0 where that is negative, so none."""
+    xx, _, _, yy, _, zz = estimate.covariance_m2
+    return math.sqrt(max(0.0, xx + yy + zz) / 3)
+
+
+def console_state(
+    run_id: str, views: ViewBuffer, time_monitor: TimeMonitor, shapes: Mapping[str, FormationShape | None]
+) -> dict[str, Any]:
+    """Return what is shown of a run, as plain data; called in another thread than that which draws.
+
+    Args:
+        run_id: of the run.
+        views: the newest ones.
+        time_monitor: of the run's clock.
+        shapes: the formations as they truly stand.
+    """
+    view, clock, clusters = views.drones, time_monitor.clock, dict(views.clusters)
+    silent_s = time_monitor.silent_s
+    return {
+        "run_id": run_id,
+        "t_s": view.t_ns / 1e9 if view else 0.0,
+        "clock": SILENT if silent_s else clock.state if clock else None,
+        "silent_s": silent_s,
+        "drones": _drones(view, views) if view else [],
+        "clusters": [_cluster(name, each, shapes.get(name)) for name, each in clusters.items()],
+        "faults": [_fault(fault) for fault in views.faults],
+        "events": [{"t_s": e.t_ns / 1e9, "kind": e.kind, "text": e.text} for e in list(views.events)[:EVENTS_MAX]],
+    }
+
+
+def _drones(view: ViewDrones, views: ViewBuffer) -> list[dict[str, Any]]:
+    sigmas = {name: sigma_m(received.estimate) for name, received in views.estimates().items() if received.fresh}
+    return [
+        {"name": d.name, "position_m": list(d.position_m), "state": d.state, "sigma_m": sigmas.get(d.name)}
+        for d in view.drones
+    ]
+
+
+def _fault(fault: Fault) -> dict[str, Any]:
+    until_s = None if fault.until_ns is None else fault.until_ns / 1e9
+    about = {"id": fault.id, "kind": fault.kind, "target": fault.target}
+    return {**about, "from_s": fault.from_ns / 1e9, "until_s": until_s}
+
+
+def _cluster(name: str, view: ViewCluster, true_shape: FormationShape | None) -> dict[str, Any]:
+    return {
+        "name": name,
+        "phase": view.phase,
+        "reason": view.reason,
+        "desired": dict(zip(view.names, view.desired, strict=True)),
+        "value": dict(zip(view.names, view.value, strict=True)),
+        "true": {} if true_shape is None else dict(zip(view.names, true_shape.c.tolist(), strict=True)),
+    }
