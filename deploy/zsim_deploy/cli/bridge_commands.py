@@ -121,7 +121,7 @@ def ros1(
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
     from zsim_bridges.ros1.ros1_bridge import NodeShutdownError, serve
-    from zsim_deploy.roles.roles import process_name, serve_runs
+    from zsim_deploy.roles.roles import lower_priority, process_name, serve_runs
 
     lower_priority()
     own_name = process_name("ros1", name, reach.tls)
@@ -151,7 +151,7 @@ def ros2(
         return
     from zsim.transport.tls import Identity, is_tls
     from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
-    from zsim_deploy.roles.roles import process_name, serve_runs
+    from zsim_deploy.roles.roles import lower_priority, process_name, serve_runs
 
     if reach.tls and router is None:
         why = "the world's access control lets no ROS keys pass"
