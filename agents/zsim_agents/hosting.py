@@ -43,12 +43,13 @@ def agents_of(scenario: Scenario, patterns: Sequence[str] = ("*",)) -> list[str]
     return chosen("host: process", patterns, agent_names(scenario))
 
 
-def check_classes(scenario: Scenario, source: str) -> None:
+def check_classes(scenario: Scenario, source: str, elsewhere: bool = False) -> None:
     """Refuse a scenario that names a class which cannot be loaded here.
 
     Args:
         scenario: resolved.
         source: opens the line of a fault: the name of its file.
+        elsewhere: the controllers may run on other hosts; spaces and laws need to be there alone.
 
     Raises:
         ScenarioError: what is wrong with each name, or with its class, a line each.
@@ -56,7 +57,11 @@ def check_classes(scenario: Scenario, source: str) -> None:
     from zsim_agents.estimation.drone_estimator import estimator_class
 
     loads = [partial(estimator_class, scenario.estimation.chosen(), f"{source}: estimation.algorithm")]
-    faults = [fault for load in [*loads, *_formation_classes(scenario, source)] for fault in _faults(load)]
+    faults = [
+        fault
+        for load in [*loads, *(() if elsewhere else _formation_classes(scenario, source))]
+        for fault in _faults(load)
+    ]
     if faults:
         raise ScenarioError(faults)
 

@@ -95,14 +95,18 @@ def identity(host: str | None, tls: Path | None, insecure: bool, access: Path | 
 
 
 def load_scenario(
-    path: Path, overrides: list[str] | None, seed: int | None = None, duration: float | None = None
+    path: Path,
+    overrides: list[str] | None,
+    seed: int | None = None,
+    duration: float | None = None,
+    elsewhere: bool = False,
 ) -> Any:
-    """Return the scenario of a file with the overrides of the command line."""
+    """Return the scenario of a file with the overrides of the command line; `elsewhere`: it flies on other hosts."""
     from zsim.scenario import scenario_file
     from zsim_agents.hosting import check_classes
 
     scenario = scenario_file.load(path, overrides or (), seed=seed, duration_s=duration)
-    check_classes(scenario, path.name)
+    check_classes(scenario, path.name, elsewhere)
     return scenario
 
 
@@ -129,9 +133,9 @@ class FlightOptions(NamedTuple):
     rate: float | None
     overrides: list[str] | None
 
-    def scenario(self) -> Any:
-        """Return the scenario, with every class that it names loaded here."""
-        return load_scenario(self.path, self.overrides, self.seed, self.duration)
+    def scenario(self, elsewhere: bool = False) -> Any:
+        """Return the scenario, the classes that it names loaded here; `elsewhere`: it flies on other hosts."""
+        return load_scenario(self.path, self.overrides, self.seed, self.duration, elsewhere)
 
     def mode_and_rate(self) -> tuple[str, float]:
         """Return the mode of a run, and its pace in simulated per wall seconds; 0 is as fast as it goes."""

@@ -36,7 +36,7 @@ def up(
     from zsim_deploy.hosts.status_table import StatusTable
     from zsim_deploy.inventory import inventory
 
-    loaded = flight.scenario()
+    loaded = flight.scenario(elsewhere=True)
     placed = inventory.load(hosts)
     placed = inventory.insecure(placed) if insecure else placed
     inventory.placement(placed, loaded)

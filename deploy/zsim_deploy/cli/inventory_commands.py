@@ -62,7 +62,7 @@ def init(
     placed = inventory.load(hosts)
     folder = folder_of(placed)
     operators = [*(operator or ()), *certificates.operators(folder, placed.inventory.hosts)] or [FIRST_OPERATOR]
-    enrolment = Enrolment(placed, load_scenario(scenario, set_), operators)
+    enrolment = Enrolment(placed, load_scenario(scenario, set_, elsewhere=True), operators)
     made, kept = _issue_all(folder, enrolment, days, renew, force)
     for host, process, rules in enrolment.access():
         content = json.dumps(rules, indent=2) + "\n"
@@ -156,7 +156,7 @@ def _read(hosts: Path, flight: FlightOptions) -> tuple[Any, Any]:
     from zsim_deploy.inventory import inventory
     from zsim_deploy.inventory.processes import own_programs
 
-    loaded = flight.scenario()
+    loaded = flight.scenario(elsewhere=True)
     placed = inventory.load(hosts)
     for remark in own_programs(placed, loaded):
         print(remark, file=sys.stderr)
