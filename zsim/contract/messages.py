@@ -5,22 +5,26 @@ Every message is a msgpack map with exactly these field names, SI units and radi
 """
 
 import math
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache, lru_cache
 from typing import Annotated, Any, Literal, NoReturn
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType, field
 
+from zsim.contract import keys
 from zsim.errors import DecodeError
 from zsim.schema.checker import first_fault
+from zsim.schema.message import Count, Message, Number, Vector3, Whole
+from zsim.sensors.baro import Baro as Baro
+from zsim.sensors.catalogue import STOCK
+from zsim.sensors.flow import Flow as Flow
+from zsim.sensors.gps import Gps as Gps
+from zsim.sensors.imu import Imu as Imu
+from zsim.sensors.mag import Mag as Mag
+from zsim.sensors.sensor import FieldName, FieldType, MessageName, Sample, message_type
+from zsim.sensors.sonar import Sonar as Sonar
 
-# Limits that every finite number keeps and that NaN and infinities break: msgspec compares while it decodes.
-Number = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
-Whole = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-Vector3 = tuple[Number, Number, Number]
 Quaternion = tuple[Number, Number, Number, Number]
 Rotors = Annotated[tuple[Number, ...], Meta(min_length=4, max_length=8)]
 Covariance = Annotated[tuple[Number, ...], Meta(min_length=36, max_length=36)]
@@ -29,13 +33,6 @@ Phase = Literal["idle", "taking_off", "assembling", "engaged", "landing", "held"
 PAYLOAD_MAX = 16_000_000  # bytes; a scenario of 1000 drones in world/info is below this
 REFUSALS = (ValueError, TypeError, RecursionError, OverflowError, MemoryError, msgspec.MsgspecError)
 """Whatever a decoder raises for a payload that somebody else wrote: wrong types, bad UTF-8, maps without end."""
-
-
-class Message(Struct, frozen=True, gc=False):
-    """What every message starts with: simulated time of publication, and a count per key from 0."""
-
-    t_ns: Count
-    seq: Count
 
 
 class Origin(Struct, frozen=True):
@@ -60,11 +57,24 @@ class ClusterInfo(Struct, frozen=True):
     drones: tuple[str, ...]
 
 
+class SensorInfo(Struct, frozen=True):
+    """A sensor of a user's own: what `drone/{d}/sensor/{name}` carries after `t_ns`, `seq` and `t_sample_ns`.
+
+    `message` is the name of the message; `fields` has by name the type of each: number, number[n] for n of them,
+    whole, or flag.
+    """
+
+    name: FieldName
+    message: MessageName
+    fields: dict[FieldName, FieldType]
+
+
 class Info(Message, frozen=True):
     """What a process needs to take part: the resolved scenario and how its time runs, `world/info`.
 
     `rate` is simulated per wall seconds, 0 for as fast as possible; `scenario` is YAML text. `replay_of` is the
-    run_id of the run that is played back; empty for a flight.
+    run_id of the run that is played back; empty for a flight. `sensors` is left out where all sensors are the
+    contract's. Wherever an Info is made or decoded, the messages of its sensors can be encoded and decoded.
     """
 
     contract: Count
@@ -84,6 +94,15 @@ class Info(Message, frozen=True):
     version: str
     fingerprint: str
     replay_of: str = ""
+    sensors: tuple[SensorInfo, ...] | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        register_sensors(self.own_sensors)
+
+    @property
+    def own_sensors(self) -> tuple[SensorInfo, ...]:
+        """The sensors beside the contract's, in the order of their messages."""
+        return () if self.sensors is UNSET else self.sensors
 
 
 class Waiting(Struct, frozen=True):
@@ -111,63 +130,7 @@ class Event(Message, frozen=True):
     source: str
     subject: str
     text: str
-    data: dict[str, Any] = {}
-
-
-class Imu(Message, frozen=True):
-    """Specific force [m/s^2] and body rate [rad/s] at the sensor, in its own axes; at rest and level (0, 0, +9.81)."""
-
-    t_sample_ns: Whole
-    accel_m_s2: Vector3
-    gyro_rad_s: Vector3
-
-
-class Gps(Message, frozen=True):
-    """A fix of the antenna: WGS 84 (deg, m), the same in W [m], velocity in W [m/s].
-
-    `sigma_m` is the standard deviation of the position per axis; `fix` as in NMEA, 3 for three dimensions.
-    """
-
-    t_sample_ns: Whole
-    latitude_deg: Number
-    longitude_deg: Number
-    altitude_m: Number
-    position_m: Vector3
-    velocity_m_s: Vector3
-    sigma_m: Number
-    fix: Count
-    satellites: Count
-
-
-class Mag(Message, frozen=True):
-    """The Earth's field in the axes of the sensor [uT]."""
-
-    t_sample_ns: Whole
-    field_ut: Vector3
-
-
-class Baro(Message, frozen=True):
-    """Static pressure [Pa], and the height over the origin of W that it stands for [m]."""
-
-    t_sample_ns: Whole
-    pressure_pa: Number
-    altitude_m: Number
-
-
-class Sonar(Message, frozen=True):
-    """Distance to the ground along the beam [m]; without an echo it is not `valid`."""
-
-    t_sample_ns: Whole
-    range_m: Number
-    valid: bool
-
-
-class Flow(Message, frozen=True):
-    """Velocity over the ground in the heading frame [m/s], and in [0, 1] how much of the picture is ground."""
-
-    t_sample_ns: Whole
-    velocity_m_s: Vector3
-    quality: Number
+    data: dict[str, Any] = field(default_factory=dict)
 
 
 class Status(Message, frozen=True):
@@ -443,12 +406,7 @@ _FIXED: dict[str, type[Struct]] = {
     "view/drones": ViewDrones,
 }
 _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
-    ("drone", "sensor/imu"): Imu,
-    ("drone", "sensor/gps"): Gps,
-    ("drone", "sensor/mag"): Mag,
-    ("drone", "sensor/baro"): Baro,
-    ("drone", "sensor/sonar"): Sonar,
-    ("drone", "sensor/flow"): Flow,
+    **{("drone", f"sensor/{name}"): kind.message for name, kind in STOCK.items()},
     ("drone", "sensor/status"): Status,
     ("drone", "truth"): Truth,
     ("drone", "cmd/velocity"): Velocity,
@@ -464,6 +422,7 @@ _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
     ("process", "bye"): Bye,
     ("process", "health"): Health,
 }
+_OWN_SENSORS: dict[str, type[Sample]] = {}  # of users, by name, as the newest Info has them
 _VIEWS: dict[str, type[Struct]] = {"view/cluster/": ViewCluster, "view/estimates/": ViewEstimates}
 KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
 
@@ -477,12 +436,22 @@ def type_of(key: str) -> type[Struct] | None:
     for start, message in _VIEWS.items():
         if key.startswith(start):
             return message
-    parts = key.split("/", 2)
-    return _FIXED.get(key) or (_BY_SHAPE.get((parts[0], parts[2])) if len(parts) == 3 else None)
+    kind, _, what = keys.parts(key)
+    own = _OWN_SENSORS.get(what.removeprefix("sensor/")) if kind == "drone" and what.startswith("sensor/") else None
+    return _FIXED.get(key) or _BY_SHAPE.get((kind, what)) or own
+
+
+def register_sensors(sensors: Iterable[SensorInfo]) -> None:
+    """Know the messages of a run's own sensors from now on, by the name of the sensor."""
+    types = {sensor.name: message_type(sensor.message, sensor.fields) for sensor in sensors}
+    if any(_OWN_SENSORS.get(name) is not kind for name, kind in types.items()):
+        _OWN_SENSORS.update(types)
+        for known in (type_of, encoding, _reader_of):
+            known.cache_clear()
 
 
 def types_by_shape() -> dict[str, type[Struct]]:
-    """Return all message types by the shape of their key, for documentation and for tests."""
+    """Return the contract's message types by the shape of their key, for documentation and for tests."""
     shapes = {f"{kind}/*/{rest}": message for (kind, rest), message in _BY_SHAPE.items()}
     return {**_FIXED, **shapes, **{f"{start}*": message for start, message in _VIEWS.items()}}
 

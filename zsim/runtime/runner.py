@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable
 
 from zsim.contract import keys, messages, world_events
-from zsim.contract.framing import GateMessages, key_table
+from zsim.contract.framing import GateMessages, run_key_table
 from zsim.contract.messages import ControlAnswer
 from zsim.contract.world_events import ProcessEntry, RunEnd, WorldEvent
 from zsim.errors import DecodeError, SessionError
@@ -64,7 +64,7 @@ class Runner:
         self._estimated_by: dict[str, str] = {}
         self._boxes: dict[str, Mailbox] = {}
         self._expressions = RoutingTable([[expression] for expression in agent.reads])
-        self._table = key_table([drone.name for drone in info.drones])
+        self._table = run_key_table(info)
         self._gate_key = _gate_key(agent)
         self._notices: deque[WorldEvent] = deque()
         self._queries: deque[Query] = deque()

@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from zsim.scenario import fault_check
+from zsim.scenario.fault_kinds import kinds_of
 from zsim.scenario.obstacle import nearest, row_of
 from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import ESTIMATORS, SEA_HEIGHT_MAX_M, space_name
-from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 from zsim.schema.checker import Fault, show
 from zsim.schema.plugin import CLASS_NAME
+from zsim.sensors.catalogue import MODULE, declarations, own_sections
+from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim.vehicles.vehicle import Vehicle
 
 FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
@@ -41,6 +43,7 @@ def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fau
     yield from _obstacle_faults(obstacles, drones, vehicles)
     for index, drone in drones:
         yield from ((f"drones[{index}].{path}", text) for path, text in _drone_faults(drone, scenario, vehicles))
+    yield from _own_sensor_faults(drones)
     yield from _membership_faults(drones, clusters)
     for index, cluster in clusters:
         yield from ((f"clusters[{index}].{path}", text) for path, text in _plan_faults(cluster))
@@ -186,6 +189,17 @@ def _sensor_faults(sensors: Any) -> Iterator[Fault]:
         yield "sonar.min_m", f"is {sonar.min_m:g}; must be < max_m ({sonar.max_m:g})"
 
 
+def _own_sensor_faults(drones: _Entries) -> Iterator[Fault]:
+    """Yield where a sensor of one name has messages of two kinds."""
+    first: dict[str, tuple[int, str]] = {}
+    for index, drone in drones:
+        for name, section in own_sections(drone).items():
+            other, module = first.setdefault(name, (index, section[MODULE]))
+            if module != section[MODULE]:
+                found = f"is {show(section[MODULE])}, and {show(module)} in drones[{other}]"
+                yield f"drones[{index}].sensors.{name}.{MODULE}", f"{found}; must be one for all drones"
+
+
 def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
     known = _names(drones)
     judged = len(known) == len(drones) and bool(drones)
@@ -302,7 +316,8 @@ def _injected_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Ite
         return
     expected = scenario.processes and scenario.processes.expect
     processes = tuple(name for name in expected or () if name is not None)
-    known = fault_check.Known(tuple(_names(drones)), tuple(_names(clusters)), processes)
+    kinds = kinds_of(declarations([drone for _, drone in drones]))
+    known = fault_check.Known(tuple(_names(drones)), tuple(_names(clusters)), processes, kinds)
     for index, given in _entries(scenario.faults):
         for path, text in fault_check.flaws(given, known):
             yield f"faults[{index}]{f'.{path}' if path else ''}", text

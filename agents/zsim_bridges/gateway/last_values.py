@@ -2,10 +2,9 @@
 
 import threading
 from collections import deque
-from collections.abc import Sequence
 
 from zsim.contract import keys, messages
-from zsim.contract.framing import GateMessages, key_table
+from zsim.contract.framing import GateMessages
 
 WAITING_MAX = 256  # echoes of a key; a paused world returns none, and clients may go on
 DELETED = None
@@ -55,11 +54,11 @@ class LastValues:
     """Filled by the batches that the world publishes; payloads are GateMessages.unpack when they are read.
 
     Args:
-        drones: their names, as `world/info` gives them.
+        table: keys of the world's messages about the drones of the run, see `run_key_table`.
     """
 
-    def __init__(self, drones: Sequence[str]) -> None:
-        self._table = key_table(drones)
+    def __init__(self, table: tuple[str, ...]) -> None:
+        self._table = table
         self._indices = {key: index for index, key in enumerate(self._table)}
         self._payloads: dict[str, bytes] = {}
         self._own_bytes = 0

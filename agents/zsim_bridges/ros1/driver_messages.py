@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from zsim.contract import messages
-from zsim.scenario.sensor_presets import G_M_S2
+from zsim.schema.quantities import G_M_S2
 from zsim_bridges import ros_frames
 from zsim_bridges.ros1.onboard import OnboardState
 from zsim_bridges.ros1.tcpros import message_class

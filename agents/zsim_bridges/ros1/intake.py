@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 
 from zsim.contract import keys
+from zsim.contract.framing import run_key_table
 from zsim.contract.messages import Info
 from zsim.errors import SessionError
 from zsim.runtime.health import HealthMeter
@@ -30,7 +31,7 @@ class Intake:
     """
 
     def __init__(self, link: Session, info: Info, health: HealthMeter, loop: asyncio.AbstractEventLoop) -> None:
-        self._traffic = Traffic(link, [drone.name for drone in info.drones], self._refuse)
+        self._traffic = Traffic(link, run_key_table(info), self._refuse)
         self._health = health
         self._loop = loop
         self._backlog: deque[Sequence[Passed]] = deque(maxlen=BACKLOG)

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from zsim.contract import messages
-from zsim.scenario.scenario import Mount
+from zsim.sensors.sensor import Mount
 from zsim_agents.estimation.madgwick import LEVEL, Rotation, madgwick_step, rpy_rotation, turn
 from zsim_bridges import ros_frames
 from zsim_bridges.ros_frames import Vector

@@ -17,8 +17,9 @@ from rosbags.typesys.stores import ros2_jazzy as ros
 from zsim.contract import messages
 from zsim.contract.messages import Quaternion, Vector3
 from zsim.math.frames import quaternion_from_rpy, quaternion_multiply
-from zsim.scenario import scenario
-from zsim.scenario.scenario import Mount, Sensors
+from zsim.sensors.catalogue import Sensors
+from zsim.sensors.sensor import ErrorModel, Mount
+from zsim.sensors.sonar import SonarConfig
 from zsim_bridges import ros_frames
 
 MAP = "map"
@@ -147,7 +148,7 @@ def pressure(message: messages.Baro, frame: str) -> Any:
     return ros.sensor_msgs__msg__FluidPressure(header(message.t_sample_ns, frame), message.pressure_pa, 0.0)
 
 
-def sonar_range(message: messages.Sonar, frame: str, sonar: scenario.SonarConfig, variance: float) -> Any:
+def sonar_range(message: messages.Sonar, frame: str, sonar: SonarConfig, variance: float) -> Any:
     """Return a distance; without an echo it is +Inf (REP-117)."""
     return ros.sensor_msgs__msg__Range(
         header(message.t_sample_ns, frame),
@@ -255,7 +256,7 @@ def cluster_state(kind: Any, message: messages.ClusterState, frame: str) -> Any:
     )
 
 
-def variance(error: scenario.ErrorModel, rate_hz: float) -> float:
+def variance(error: ErrorModel, rate_hz: float) -> float:
     """Return the variance of one sample about its bias, in the unit of the error squared."""
     return error.noise**2 + error.density**2 * rate_hz + error.quantum**2 / 12.0  # a step's rounding is uniform
 

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from zsim.contract import messages
-from zsim.scenario.scenario import Mount
+from zsim.sensors.sensor import Mount
 from zsim_bridges import ros_frames
 from zsim_bridges.ros1.onboard import OnboardState
 

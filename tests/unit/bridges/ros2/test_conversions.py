@@ -12,7 +12,8 @@ from zsim.contract import messages
 from zsim.contract.messages import Quaternion, Vector3
 from zsim.math.frames import quaternion_from_rpy, rotate
 from zsim.scenario import scenario_file
-from zsim.scenario.scenario import ErrorModel, Mount, Sensors
+from zsim.sensors.catalogue import Sensors
+from zsim.sensors.sensor import ErrorModel, Mount
 from zsim_bridges import ros_frames
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
 from zsim_bridges.ros2.ros_types import RosTypes
