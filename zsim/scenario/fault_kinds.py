@@ -3,6 +3,7 @@
 A fault is given as a map: `kind`, `target`, `at_s`, `for_s`, and the parameters of its kind.
 """
 
+import re
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
@@ -139,8 +140,8 @@ def _sensor_kinds(sensors: Mapping[str, Declared]) -> dict[str, FaultKind]:
 
 def _bias(channel: Channel) -> FaultParameter:
     """Return the parameter of a constant error in a channel."""
-    unit = "" if channel.unit == "1" else f"_{channel.unit.lower().replace('/', '_').replace('^', '')}"
-    most, name = channel.bias_max, f"value{unit}"
+    unit = "" if channel.unit == "1" else re.sub(r"[^a-z0-9]+", "_", channel.unit.lower().replace("^", ""))
+    most, name = channel.bias_max, f"value_{unit}".strip("_")
     if channel.width == VECTOR_SIZE:
         return _vector(name, channel.axes, channel.unit, most)
     return _number(name, channel.axes, channel.unit, -most, most)

@@ -79,8 +79,8 @@ class Impairment:
             row[CONFIG.white + first : CONFIG.white + first + part.width] *= fault.parameters["factor"]
         else:
             row[CONFIG.faulty] = 1.0
-            bias = np.atleast_1d(_bias(fault)) * part.channel.to_si
-            self._w.senses.fault[i, s, FAULT.offset + first : FAULT.offset + first + len(bias)] += bias
+            offset = self._w.senses.fault[i, s, FAULT.offset + first : FAULT.offset + first + part.channel.width]
+            offset += np.multiply(_bias(fault), part.channel.to_si)
 
     def _impair_sensor(self, fault: Fault, i: int, s: int, stuck: set[tuple[int, int]]) -> None:
         """Let a sensor lose samples, or get stuck."""

@@ -188,7 +188,7 @@ class UserMessages:
             seq[i, s] += 1
             payloads.append(messages.encode(self._message(s, i, (t_ns, number, t_sample_ns), values[m])))
             sizes[m] = len(payloads[-1])
-        return UserPayloads(np.frombuffer(b"".join(payloads), dtype=np.uint8), np.cumsum(sizes))
+        return UserPayloads(np.frombuffer(bytearray(b"".join(payloads)), dtype=np.uint8), np.cumsum(sizes))
 
     def _message(self, s: int, i: int, stamps: tuple[int, int, int], values: NDArray[np.float64]) -> Sample:
         """Return the message of a reading.
