@@ -17,7 +17,7 @@ from zsim.sensors.flow import FlowConfig
 from zsim.sensors.gps import GpsConfig
 from zsim.sensors.imu import ImuConfig
 from zsim.sensors.mag import MagConfig
-from zsim.sensors.sensor import VALUES_MAX, Declaration, Sensor, SensorType, as_fields
+from zsim.sensors.sensor import VALUES_MAX, Declaration, Sample, Sensor, SensorType, as_fields
 from zsim.sensors.sonar import SonarConfig
 
 STOCK: dict[str, SensorType] = {
@@ -100,6 +100,10 @@ def sensor_type(module_name: str, where: str = "module") -> SensorType:
 
 def _check(sensor: SensorType) -> None:
     """Refuse a sensor whose parts do not fit."""
+    for part, base in (("message", Sample), ("settings", Sensor)):
+        kind = getattr(sensor, part)
+        if not (isinstance(kind, type) and issubclass(kind, base)):
+            raise TypeError(f"{part} is {show(str(kind))}; must be a subclass of {base.__name__}")
     fields = Declaration.of(sensor).fields
     if sensor.equation is None:
         raise ValueError("equation is missing; must be a function of truth, settings and environment")
@@ -112,7 +116,10 @@ def _check(sensor: SensorType) -> None:
         if channel.part:
             raise ValueError(f"channels[{place}].part is {channel.part!r}; must be left out of a sensor of your own")
     if sensor.convert is None:
-        as_fields([0.0] * sensor.values, fields)
+        try:
+            as_fields([0.0] * sensor.values, fields)
+        except ValueError as error:
+            raise ValueError(f"message {error}, or `convert` must be given") from error
 
 
 def separate(section: dict[str, Any]) -> OwnSections:
@@ -127,7 +134,7 @@ def separate(section: dict[str, Any]) -> OwnSections:
         if name in FIELDS:
             continue
         if not (isinstance(value, dict) and MODULE in value):
-            allowed = f"allowed: {', '.join(FIELDS)}, or a sensor of your own with its module"
+            allowed = f"allowed: {', '.join(sorted(FIELDS))}, or a sensor of your own with its module"
             wrong.append((f"{name}"[:40], f"is not known; {allowed}"))
             continue
         found = [*_name_faults(name)] or [*_section_faults(name, value)]

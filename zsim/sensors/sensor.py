@@ -262,7 +262,7 @@ def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:
         at += len(taken)
         values.append(_value(word, taken) if len(taken) == count else None)
     if at != len(numbers) or None in values:
-        raise ValueError(f"has {len(numbers)} numbers; must have those of {', '.join(fields)}")
+        raise ValueError(f"is given {len(numbers)} numbers; must be given those of {', '.join(fields)}")
     return values
 
 
