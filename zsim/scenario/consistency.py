@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from zsim.contract import messages
 from zsim.scenario import fault_check
 from zsim.scenario.fault_kinds import kinds_of
 from zsim.scenario.obstacle import nearest, row_of
@@ -17,7 +18,7 @@ from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import ESTIMATORS, SEA_HEIGHT_MAX_M, space_name
 from zsim.schema.checker import Fault, show
 from zsim.schema.plugin import CLASS_NAME
-from zsim.sensors.catalogue import MODULE, declarations, own_sections
+from zsim.sensors.catalogue import DECLARED, MODULE, declarations, own_sections
 from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim.vehicles.vehicle import Vehicle
 
@@ -190,10 +191,15 @@ def _sensor_faults(sensors: Any) -> Iterator[Fault]:
 
 
 def _own_sensor_faults(drones: _Entries) -> Iterator[Fault]:
-    """Yield where a sensor of one name has messages of two kinds."""
+    """Yield where a sensor of one name has messages of two kinds, or its message the name of another."""
     first: dict[str, tuple[int, str]] = {}
+    taken = {kind.__name__ for kind in messages.types_by_shape().values()}
     for index, drone in drones:
         for name, section in own_sections(drone).items():
+            message = section[DECLARED]["message"]
+            if message in taken:
+                path = f"drones[{index}].sensors.{name}.{DECLARED}.message"
+                yield path, f"is {show(message)}, which is a message of the contract; must be another"
             other, module = first.setdefault(name, (index, section[MODULE]))
             if module != section[MODULE]:
                 found = f"is {show(section[MODULE])}, and {show(module)} in drones[{other}]"
