@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -22,7 +22,9 @@ from zsim.schema.quantities import Fraction, NonNegative, Vector3
 
 VALUES_MAX = 6  # numbers of one reading
 RateHz = Annotated[float, Meta(ge=0.01, le=1000)]
-FieldType = Annotated[str, Meta(pattern=rf"^(number|whole|flag|number\[[1-{VALUES_MAX}]\])\Z")]
+FieldType = Literal[
+    "number", "whole", "flag", "number[1]", "number[2]", "number[3]", "number[4]", "number[5]", "number[6]"
+]
 """Type of a message's field: a finite number, some of them, a whole number, or true and false."""
 FieldName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,31}\Z")]
 MessageName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}\Z")]
@@ -213,7 +215,7 @@ _WORDS = {types.FloatType: "number", types.IntType: "whole", types.BoolType: "fl
 _TYPES: dict[str, Any] = {"number": Number, "whole": Whole, "flag": bool}
 
 
-def field_types(message: type[Sample]) -> dict[str, str]:
+def field_types(message: type[Sample]) -> dict[FieldName, FieldType]:
     """Return the types of a message's own fields.
 
     Raises:
@@ -224,7 +226,7 @@ def field_types(message: type[Sample]) -> dict[str, str]:
     return {field.name: _word(field.type, f"{message.__name__}.{field.name}") for field in info.fields[known:]}
 
 
-def _word(info: types.Type, where: str) -> str:
+def _word(info: types.Type, where: str) -> Any:
     if isinstance(info, types.TupleType) and all(isinstance(item, types.FloatType) for item in info.item_types):
         return f"number[{len(info.item_types)}]"
     if type(info) not in _WORDS:
