@@ -62,7 +62,7 @@ def wxyz(rotation):
 def body(p=(0, 0, 0), v=(0, 0, 0), attitude=None, w=(0, 0, 0), a=(0, 0, 0), alpha=(0, 0, 0)):
     """Return the truth of a drone as compiled code has it."""
     q = wxyz(attitude or Rotation.identity())
-    p, v, w, a, alpha = (tuple(map(float, each)) for each in (p, v, w, a, alpha))
+    p, v, w, a, alpha = ((float(each[0]), float(each[1]), float(each[2])) for each in (p, v, w, a, alpha))
     return BodyTruth(p, v, q, w, a, alpha)
 
 

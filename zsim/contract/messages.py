@@ -5,6 +5,7 @@ Every message is a msgpack map with exactly these field names, SI units and radi
 """
 
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator
 from functools import cache, lru_cache
 from typing import Annotated, Any, Literal, NoReturn
@@ -22,7 +23,7 @@ from zsim.sensors.flow import Flow as Flow
 from zsim.sensors.gps import Gps as Gps
 from zsim.sensors.imu import Imu as Imu
 from zsim.sensors.mag import Mag as Mag
-from zsim.sensors.sensor import FieldName, FieldType, MessageName, Sample, message_type
+from zsim.sensors.sensor import FieldType, Sample, message_type
 from zsim.sensors.sonar import Sonar as Sonar
 
 Quaternion = tuple[Number, Number, Number, Number]
@@ -64,9 +65,9 @@ class SensorInfo(Struct, frozen=True):
     whole, or flag.
     """
 
-    name: FieldName
-    message: MessageName
-    fields: dict[FieldName, FieldType]
+    name: str
+    message: str
+    fields: dict[str, FieldType]
 
 
 class Info(Message, frozen=True):
@@ -422,6 +423,7 @@ _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
     ("process", "bye"): Bye,
     ("process", "health"): Health,
 }
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _OWN_SENSORS: dict[str, type[Sample]] = {}  # of users, by name, as the newest Info has them
 _VIEWS: dict[str, type[Struct]] = {"view/cluster/": ViewCluster, "view/estimates/": ViewEstimates}
 KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
@@ -442,12 +444,16 @@ def type_of(key: str) -> type[Struct] | None:
 
 
 def register_sensors(sensors: Iterable[SensorInfo]) -> None:
-    """Know the messages of a run's own sensors from now on, by the name of the sensor."""
-    types = {sensor.name: message_type(sensor.message, sensor.fields) for sensor in sensors}
+    """Know the messages of a run's own sensors from now on, by the name of the sensor.
+
+    A sensor with a name that no sensor, message or field has is left out: its messages are a stranger's.
+    """
+    known = [each for each in sensors if all(map(_NAME.fullmatch, (each.name, each.message.lower(), *each.fields)))]
+    types = {sensor.name: message_type(sensor.message, sensor.fields) for sensor in known}
     if any(_OWN_SENSORS.get(name) is not kind for name, kind in types.items()):
         _OWN_SENSORS.update(types)
-        for known in (type_of, encoding, _reader_of):
-            known.cache_clear()
+        for by_key in (type_of, encoding, _reader_of):
+            by_key.cache_clear()
 
 
 def types_by_shape() -> dict[str, type[Struct]]:

@@ -1,6 +1,7 @@
 """Each sensor's truth to measurement, with lever arms and turned mounts."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,12 +22,12 @@ STRAIGHT = (1.0, 0.0, 0.0, 0.0)
 
 def body(p=NOWHERE, v=STILL, q=STRAIGHT, w=STILL, a=STILL, alpha=STILL):
     """Return the truth of a drone; whole numbers as floats, as compiled code has them."""
-    vectors = [tuple(map(float, each)) for each in (p, v, q, w, a, alpha)]
+    vectors: Any = [tuple(map(float, each)) for each in (p, v, q, w, a, alpha)]
     return BodyTruth(*vectors)
 
 
 def mounted(p=NOWHERE, q=STRAIGHT, range_max=6.0):
-    return MountedSensor(tuple(map(float, p)), q, range_max)
+    return MountedSensor((float(p[0]), float(p[1]), float(p[2])), q, range_max)
 
 
 SITE = Site(9.8, (0.0, 20.0, -10.0))

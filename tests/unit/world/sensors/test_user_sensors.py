@@ -1,5 +1,6 @@
 """Users' sensors in the world: equations with lever arms, statistics of the errors, faults, and what else stays as it is."""
 
+import importlib
 import math
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,7 @@ def test_the_sensors_motion_is_that_of_its_point():
         R_WB = rotation_matrix(quaternion_from_rpy((0.3, 0.0, 0.0))) @ rotation_matrix(
             quaternion_from_rpy((0, 0, angle))
         )
-        spin = {"w_WB_B": np.array([0, 0, rate + speeding * t]), "alpha_B": np.array([0, 0, speeding])}
+        spin: dict[str, Any] = {"w_WB_B": np.array([0, 0, rate + speeding * t]), "alpha_B": np.array([0, 0, speeding])}
         return truth(R_WB=R_WB, p_WB=np.array([1.0, 2.0 * t, 0.0]), v_WB=np.array([0, 2.0, 0]), **spin)
 
     h = 1e-4
@@ -82,8 +83,7 @@ def test_a_standing_drones_range_is_that_of_its_antenna():
 
 
 def test_airspeed_is_that_of_the_air_against_the_tube():
-    import airspeed  # found by the fixture
-
+    airspeed = importlib.import_module("airspeed")  # found by the fixture
     site = scenario().environment
     wind, spin = np.array([4.0, -3.0, 0.5]), np.array([0.0, 0.0, 2.0])
     mounted = truth(v_WB=np.array([1.0, 0, 0]), w_WB_B=spin, air_W=wind)

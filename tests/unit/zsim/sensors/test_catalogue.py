@@ -52,6 +52,8 @@ def test_the_stock_sensors_are_those_of_a_scenario():
 
 def test_a_section_is_resolved_with_the_defaults_of_its_module():
     made = scenario(my_uwb=UWB, second={"my_uwb": {"rate_hz": 5, "range_m": {"bias": 0.3}}})
+    first: dict[str, Any]
+    second: dict[str, Any]
     first, second = ({name: settings for name, _, settings in d.sensors.sections()} for d in made.drones)
     assert (first["my_uwb"].rate_hz, second["my_uwb"].rate_hz) == (10.0, 5.0)
     assert first["my_uwb"].anchor_m == second["my_uwb"].anchor_m == (1.0, 2.0, 3.0)
