@@ -74,7 +74,7 @@ class Info(Message, frozen=True):
     """What a process needs to take part: the resolved scenario and how its time runs, `world/info`.
 
     `rate` is simulated per wall seconds, 0 for as fast as possible; `scenario` is YAML text. `replay_of` is the
-    run_id of the run that is played back; empty for a flight. `sensors` is left out where all sensors are the
+    run_id of the run that is played back; empty for a flight. `user_sensors` is left out where all sensors are the
     contract's. Wherever an Info is made or decoded, the messages of its sensors can be encoded and decoded.
     """
 
@@ -95,7 +95,7 @@ class Info(Message, frozen=True):
     version: str
     fingerprint: str
     replay_of: str = ""
-    sensors: tuple[SensorInfo, ...] | UnsetType = UNSET
+    user_sensors: tuple[SensorInfo, ...] | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         register_sensors(self.own_sensors)
@@ -103,7 +103,7 @@ class Info(Message, frozen=True):
     @property
     def own_sensors(self) -> tuple[SensorInfo, ...]:
         """The sensors beside the contract's, in the order of their messages."""
-        return () if self.sensors is UNSET else self.sensors
+        return () if self.user_sensors is UNSET else self.user_sensors
 
 
 class Waiting(Struct, frozen=True):

@@ -84,7 +84,7 @@ class World(Coordinator):
             scenario_sha256=scenario_file.sha256(text),
             version=__version__,
             fingerprint=fingerprint(),
-            sensors=_own_sensors(s) or UNSET,
+            user_sensors=_own_sensors(s) or UNSET,
         )
 
     # What arrives
