@@ -114,7 +114,7 @@ def test_faults_of_a_users_sensor_have_its_unit():
 
 
 def test_messages_are_known_wherever_the_info_of_the_run_is():
-    fields = {"range_m": "number", "place_m": "number[3]", "hits": "whole", "line_of_sight": "flag"}
+    fields: dict[str, Any] = {"range_m": "number", "place_m": "number[3]", "hits": "whole", "line_of_sight": "flag"}
     key = keys.sensor("d1", "test_ranger")
     assert messages.type_of(key) is None
     messages.register_sensors([messages.SensorInfo("test_ranger", "Ranged", fields)])
