@@ -15,7 +15,7 @@ import msgspec
 
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
-from zsim.contract.framing import GateMessages
+from zsim.contract.framing import GateMessages, run_key_table
 from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, SupersededError
 from zsim.record import RecordWriter
 from zsim.record.record_writer import CHANNELS_MAX
@@ -95,7 +95,7 @@ class Recorder:
         self.health = HealthMeter(NAME, host=link.host)
 
     def run(self) -> str:
-        self._traffic = Traffic(self._link, [drone.name for drone in self._info.drones], self._refuse)
+        self._traffic = Traffic(self._link, run_key_table(self._info), self._refuse)
         self._views = self._link.subscribe("view/**")
         self._link.declare_token(keys.token(self._name))
         self._link.on_link(self._on_link)

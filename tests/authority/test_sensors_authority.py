@@ -12,13 +12,19 @@ from scipy.spatial.transform import Rotation
 
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.sensors import measurement
+from zsim_world.sensors.exposure import BodyTruth, MountedSensor, Site
+from zsim_world.sensors.flow import flow
+from zsim_world.sensors.gps import gps
+from zsim_world.sensors.imu import imu
+from zsim_world.sensors.mag import mag
 from zsim_world.sensors.sensor_set import SENSORS
+from zsim_world.sensors.sonar import sonar
 
 P_BS = (0.11, -0.07, 0.05)
 RPY_BS_DEG = (12.0, -25.0, 140.0)
 G = 9.80665
 FIELD_W = np.array([-2.8, 17.8, 14.0])
+SITE = Site(G, tuple(FIELD_W.tolist()))
 
 
 def pose(t):
@@ -53,6 +59,17 @@ def wxyz(rotation):
     return tuple(rotation.as_quat(scalar_first=True).tolist())
 
 
+def body(p=(0, 0, 0), v=(0, 0, 0), attitude=None, w=(0, 0, 0), a=(0, 0, 0), alpha=(0, 0, 0)):
+    """Return the truth of a drone as compiled code has it."""
+    q = wxyz(attitude or Rotation.identity())
+    p, v, w, a, alpha = ((float(each[0]), float(each[1]), float(each[2])) for each in (p, v, w, a, alpha))
+    return BodyTruth(p, v, q, w, a, alpha)
+
+
+def mounted(turned, range_max=0.0):
+    return MountedSensor(P_BS, wxyz(turned), range_max)
+
+
 @pytest.mark.parametrize("t", [0.0, 0.7, 2.2, 5.9])
 def test_imu_is_what_the_sensor_itself_moves_like(t):
     """Specific force and rate from differences of the sensor's own pose; the kernel's formula knows only the body."""
@@ -64,8 +81,7 @@ def test_imu_is_what_the_sensor_itself_moves_like(t):
     expected_force = own_attitude.inv().apply(own_accel + np.array([0, 0, G]))
     turned = [(own_attitude.inv() * sensor_pose(t + s * 1e-4)[1]).as_rotvec() for s in (-1, 1)]
     expected_rate = (turned[1] - turned[0]) / 2e-4
-    arguments = (tuple(accel), wxyz(attitude), tuple(rate), tuple(angular))
-    force, gyro = measurement.imu(*arguments, G, P_BS, wxyz(mount()))
+    force, gyro = imu(body(attitude=attitude, w=rate, a=accel, alpha=angular), mounted(mount()), SITE)
     np.testing.assert_allclose(force, expected_force, atol=2e-4)
     np.testing.assert_allclose(gyro, expected_rate, atol=2e-6)
     assert np.linalg.norm(np.cross(rate, np.cross(rate, P_BS))) > 0.01  # the lever arm matters here
@@ -77,25 +93,25 @@ def test_gps_flow_and_sonar_are_those_of_the_sensors_point(t):
     p, velocity, _, attitude, rate, _ = derivatives(t)
     h = 1e-5
     own_velocity = (sensor_pose(t + h)[0] - sensor_pose(t - h)[0]) / (2 * h)
-    q = wxyz(attitude)
-    place, moving = measurement.gps(tuple(p), tuple(velocity), q, tuple(rate), P_BS)
+    x = body(p, velocity, attitude, rate)
+    place, moving = gps(x, mounted(mount()), SITE)
     np.testing.assert_allclose(place, sensor_pose(t)[0], atol=1e-12)
     np.testing.assert_allclose(moving, own_velocity, atol=1e-5)
     forward = attitude.apply([1, 0, 0])
     to_heading = Rotation.from_euler("z", -math.atan2(forward[1], forward[0]))
-    flow, _ = measurement.flow(tuple(velocity), q, tuple(rate), P_BS)
-    np.testing.assert_allclose(flow, to_heading.apply(own_velocity), atol=1e-5)
+    over_ground, _ = flow(x, mounted(mount()), SITE)
+    np.testing.assert_allclose(over_ground, to_heading.apply(own_velocity), atol=1e-5)
     small = Rotation.from_euler("ZYX", (40.0, 8.0, -11.0), degrees=True)
     beam = (attitude * small).apply([0, 0, -1.0])
-    distance, echo = measurement.sonar(tuple(p), q, P_BS, wxyz(small), 50.0)
-    assert echo
+    (distance, echo, _), _ = sonar(x, mounted(small, 50.0), SITE)
+    assert echo == 1.0
     assert sensor_pose(t)[0][2] + distance * beam[2] == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("t", [0.0, 2.2])
 def test_magnetometer_shows_the_field_in_its_own_axes(t):
     attitude = pose(t)[1]
-    field = measurement.mag(wxyz(attitude), wxyz(mount()), tuple(FIELD_W))
+    field, _ = mag(body(attitude=attitude), mounted(mount()), SITE)
     np.testing.assert_allclose(field, sensor_pose(t)[1].inv().apply(FIELD_W), atol=1e-12)
 
 

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from zsim.contract import messages
 from zsim.math.random_streams import stream
 from zsim.scenario import scenario_file
-from zsim.scenario.scenario import ErrorModel, Scenario, Sensor
+from zsim.scenario.scenario import Scenario
+from zsim.sensors.sensor import ErrorModel, Sensor
 from zsim_agents.estimation.drone_estimator import StateEstimate
 from zsim_agents.estimation.estimator_bank import EstimatorBank
 

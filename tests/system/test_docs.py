@@ -39,8 +39,10 @@ from federation import free_port
 from msgspec import inspect as types
 
 from zsim.contract import messages
-from zsim.scenario import scenario, scenario_file, sensor_presets
+from zsim.scenario import scenario, scenario_file
 from zsim.schema import quantities
+from zsim.sensors.catalogue import AS_PRINTED, PRESETS, STOCK, Sensors
+from zsim.sensors.sensor import ErrorModel, Mount, Sensor
 from zsim.vehicles import vehicle
 from zsim_deploy.cli.cli import app
 from zsim_deploy.inventory import inventory
@@ -371,6 +373,9 @@ SECTIONS = {
     if isinstance(section, type)
     and issubclass(section, (scenario.Spec, vehicle.Limits))
     and section is not scenario.Spec
+} | {
+    section.__name__: section
+    for section in (Sensors, Sensor, Mount, ErrorModel, *(kind.settings for kind in STOCK.values()))
 }
 UNITS = {
     "_kg_m2": "kg m²", "_kg_m3": "kg/m³", "_n_s_m": "N s/m", "_nm_s2": "N m s²", "_n_s2": "N s²", "_1_s2": "1/s²",
@@ -408,16 +413,16 @@ def test_the_table_of_a_section_says_what_the_code_says(name: str) -> None:
 def rows(name: str) -> Iterator[list[str]]:
     """Yield field, unit, default and limits of a section, as the reference is to show them."""
     section = SECTIONS[name]
-    inherited = {f.name for f in msgspec.structs.fields(scenario.Sensor)} if name in _SENSORS else set()
+    inherited = {f.name for f in msgspec.structs.fields(Sensor)} if name in _SENSORS else set()
     infos = types.type_info(section)
     assert isinstance(infos, types.StructType)
     by_name = {f.name: f.type for f in infos.fields}
     for entry in msgspec.structs.fields(section):
-        if entry.name not in inherited:
+        if entry.name not in inherited and (name, entry.name) != ("Sensors", "own"):  # which a file has by name
             yield [f"`{entry.name}`", unit(entry.name), default(name, entry), allowed(by_name[entry.name])]
 
 
-_SENSORS = ("ImuConfig", "GpsConfig", "MagConfig", "BaroConfig", "SonarConfig", "FlowConfig")
+_SENSORS = tuple(kind.settings.__name__ for kind in STOCK.values())
 
 
 def unit(name: str) -> str:
@@ -505,8 +510,8 @@ def test_the_presets_are_written_as_they_are() -> None:
 
 def preset_rows() -> Iterator[list[str]]:
     """Yield every value that a preset sets: path, then the value in each preset, – where it keeps the default."""
-    flat = {name: dict(_flat(preset)) for name, preset in sensor_presets.PRESETS.items()}
-    printed = dict(_flat(sensor_presets.AS_PRINTED))
+    flat = {name: dict(_flat(preset)) for name, preset in PRESETS.items()}
+    printed = dict(_flat(AS_PRINTED))
     paths = list(dict.fromkeys(path for values in flat.values() for path in values))
     for path in paths:
         cells = [f"{flat[name][path]:g}" if path in flat[name] else "–" for name in ("ardrone2", "paper", "crazyflie2")]

@@ -32,9 +32,20 @@ Pairs = list[tuple[str, bytes]]
 _INT = np.dtype("<i8")
 
 
-def key_table(drones: Sequence[str]) -> tuple[str, ...]:
-    """Return the keys of the world's messages about some drones, drone by drone in the order of KINDS."""
-    return tuple(keys.truth(d) if kind == "truth" else keys.sensor(d, kind) for d in drones for kind in KINDS)
+def key_table(drones: Sequence[str], own: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the keys of the world's messages about some drones, drone by drone in the order of KINDS.
+
+    Args:
+        drones: their names.
+        own: names of the users' sensors of the run; their keys follow those of KINDS.
+    """
+    kinds = (*KINDS, *own)
+    return tuple(keys.truth(d) if kind == "truth" else keys.sensor(d, kind) for d in drones for kind in kinds)
+
+
+def run_key_table(info: messages.Info) -> tuple[str, ...]:
+    """Return the keys of the world's messages about the drones of a run."""
+    return key_table([drone.name for drone in info.drones], [sensor.name for sensor in info.own_sensors])
 
 
 @lru_cache(maxsize=8)

@@ -8,10 +8,11 @@ from functools import lru_cache
 from itertools import groupby
 
 from zsim.errors import BadNameError
+from zsim.sensors.catalogue import STOCK
 
 NAME = re.compile(r"[a-z0-9_.-]{1,32}")
 PROCESS_NAME = re.compile(r"[a-z0-9_.-]{1,48}")  # a role, a dot, and a thing of up to 32
-SENSORS = ("imu", "gps", "mag", "baro", "sonar", "flow")
+SENSORS = tuple(STOCK)
 
 INFO = "world/info"
 CLOCK = "clock"

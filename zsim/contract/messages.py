@@ -4,17 +4,26 @@ Every message is a msgpack map with exactly these field names, SI units and radi
 `encode` and `decode` are the only way onto and off the wire; `decode` checks types, shapes and finite numbers.
 """
 
+import re
 from collections.abc import Callable, Iterable
 from functools import cache, lru_cache
 from typing import Any, Literal, NoReturn
 
 import msgspec
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
 
-from zsim.contract import flight_messages, run_messages, views
+from zsim.contract import flight_messages, keys, run_messages, views
 from zsim.errors import DecodeError
 from zsim.schema.checker import first_fault
-from zsim.schema.message import Count, Message, Number, Vector3, Whole
+from zsim.schema.message import Count, Message, Number
+from zsim.sensors.baro import Baro as Baro
+from zsim.sensors.catalogue import STOCK
+from zsim.sensors.flow import Flow as Flow
+from zsim.sensors.gps import Gps as Gps
+from zsim.sensors.imu import Imu as Imu
+from zsim.sensors.mag import Mag as Mag
+from zsim.sensors.sensor import FieldType, Sample, message_type
+from zsim.sensors.sonar import Sonar as Sonar
 
 PAYLOAD_MAX = 16_000_000  # bytes; a scenario of 1000 drones in world/info is below this
 REFUSALS = (ValueError, TypeError, RecursionError, OverflowError, MemoryError, msgspec.MsgspecError)
@@ -43,11 +52,24 @@ class ClusterInfo(Struct, frozen=True):
     drones: tuple[str, ...]
 
 
+class SensorInfo(Struct, frozen=True):
+    """A sensor of a user's own: what `drone/{d}/sensor/{name}` carries after `t_ns`, `seq` and `t_sample_ns`.
+
+    `message` is the name of the message; `fields` has by name the type of each: number, number[n] for n of them,
+    whole, or flag.
+    """
+
+    name: str
+    message: str
+    fields: dict[str, FieldType]
+
+
 class Info(Message, frozen=True):
     """What a process needs to take part: the resolved scenario and how its time runs, `world/info`.
 
     `rate` is simulated per wall seconds, 0 for as fast as possible; `scenario` is YAML text. `replay_of` is the
-    run_id of the run that is played back; empty for a flight.
+    run_id of the run that is played back; empty for a flight. `user_sensors` is left out where all sensors are the
+    contract's. Wherever an Info is made or decoded, the messages of its sensors can be encoded and decoded.
     """
 
     contract: Count
@@ -67,62 +89,15 @@ class Info(Message, frozen=True):
     version: str
     fingerprint: str
     replay_of: str = ""
+    user_sensors: tuple[SensorInfo, ...] | UnsetType = UNSET
 
+    def __post_init__(self) -> None:
+        register_sensors(self.own_sensors)
 
-class Imu(Message, frozen=True):
-    """Specific force [m/s^2] and body rate [rad/s] at the sensor, in its own axes; at rest and level (0, 0, +9.81)."""
-
-    t_sample_ns: Whole
-    accel_m_s2: Vector3
-    gyro_rad_s: Vector3
-
-
-class Gps(Message, frozen=True):
-    """A fix of the antenna: WGS 84 (deg, m), the same in W [m], velocity in W [m/s].
-
-    `sigma_m` is the standard deviation of the position per axis; `fix` as in NMEA, 3 for three dimensions.
-    """
-
-    t_sample_ns: Whole
-    latitude_deg: Number
-    longitude_deg: Number
-    altitude_m: Number
-    position_m: Vector3
-    velocity_m_s: Vector3
-    sigma_m: Number
-    fix: Count
-    satellites: Count
-
-
-class Mag(Message, frozen=True):
-    """The Earth's field in the axes of the sensor [uT]."""
-
-    t_sample_ns: Whole
-    field_ut: Vector3
-
-
-class Baro(Message, frozen=True):
-    """Static pressure [Pa], and the height over the origin of W that it stands for [m]."""
-
-    t_sample_ns: Whole
-    pressure_pa: Number
-    altitude_m: Number
-
-
-class Sonar(Message, frozen=True):
-    """Distance to the ground along the beam [m]; without an echo it is not `valid`."""
-
-    t_sample_ns: Whole
-    range_m: Number
-    valid: bool
-
-
-class Flow(Message, frozen=True):
-    """Velocity over the ground in the heading frame [m/s], and in [0, 1] how much of the picture is ground."""
-
-    t_sample_ns: Whole
-    velocity_m_s: Vector3
-    quality: Number
+    @property
+    def own_sensors(self) -> tuple[SensorInfo, ...]:
+        """The sensors beside the contract's, in the order of their messages."""
+        return () if self.user_sensors is UNSET else self.user_sensors
 
 
 _FIXED: dict[str, type[Struct]] = {
@@ -133,12 +108,7 @@ _FIXED: dict[str, type[Struct]] = {
     "view/drones": views.ViewDrones,
 }
 _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
-    ("drone", "sensor/imu"): Imu,
-    ("drone", "sensor/gps"): Gps,
-    ("drone", "sensor/mag"): Mag,
-    ("drone", "sensor/baro"): Baro,
-    ("drone", "sensor/sonar"): Sonar,
-    ("drone", "sensor/flow"): Flow,
+    **{("drone", f"sensor/{name}"): kind.message for name, kind in STOCK.items()},
     ("drone", "sensor/status"): flight_messages.Status,
     ("drone", "truth"): flight_messages.Truth,
     ("drone", "cmd/velocity"): flight_messages.Velocity,
@@ -154,6 +124,8 @@ _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
     ("process", "bye"): run_messages.Bye,
     ("process", "health"): run_messages.Health,
 }
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+_OWN_SENSORS: dict[str, type[Sample]] = {}  # of users, by name, as the newest Info has them
 _VIEWS: dict[str, type[Struct]] = {"view/cluster/": views.ViewCluster, "view/estimates/": views.ViewEstimates}
 KEYS_KEPT = 65_536  # keys whose type is remembered; 1000 drones have 15 000, garbage keys push each other out
 
@@ -167,12 +139,26 @@ def type_of(key: str) -> type[Struct] | None:
     for start, message in _VIEWS.items():
         if key.startswith(start):
             return message
-    parts = key.split("/", 2)
-    return _FIXED.get(key) or (_BY_SHAPE.get((parts[0], parts[2])) if len(parts) == 3 else None)
+    kind, _, what = keys.parts(key)
+    own = _OWN_SENSORS.get(what.removeprefix("sensor/")) if kind == "drone" and what.startswith("sensor/") else None
+    return _FIXED.get(key) or _BY_SHAPE.get((kind, what)) or own
+
+
+def register_sensors(sensors: Iterable[SensorInfo]) -> None:
+    """Know the messages of a run's own sensors from now on, by the name of the sensor.
+
+    A sensor with a name that no sensor, message or field has is left out: its messages are a stranger's.
+    """
+    known = [each for each in sensors if all(map(_NAME.fullmatch, (each.name, each.message.lower(), *each.fields)))]
+    types = {sensor.name: message_type(sensor.message, sensor.fields) for sensor in known}
+    if any(_OWN_SENSORS.get(name) is not kind for name, kind in types.items()):
+        _OWN_SENSORS.update(types)
+        for by_key in (type_of, encoding, _reader_of):
+            by_key.cache_clear()
 
 
 def types_by_shape() -> dict[str, type[Struct]]:
-    """Return all message types by the shape of their key, for documentation and for tests."""
+    """Return the contract's message types by the shape of their key, for documentation and for tests."""
     shapes = {f"{kind}/*/{rest}": message for (kind, rest), message in _BY_SHAPE.items()}
     return {**_FIXED, **shapes, **{f"{start}*": message for start, message in _VIEWS.items()}}
 

@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Callable
 
 from zsim.contract import flight_messages, keys, messages, run_messages, world_events
-from zsim.contract.framing import GateMessages, key_table
+from zsim.contract.framing import GateMessages, run_key_table
 from zsim.contract.world_events import WorldEvent
 from zsim.errors import DecodeError
 from zsim.runtime.agent import Agent
@@ -44,7 +44,7 @@ class RunnerInputs:
         self._estimated_by: dict[str, str] = {}
         self._subscriptions: dict[str, Subscription] = {}
         self._expressions = RoutingTable([[expression] for expression in agent.reads])
-        self._table = key_table([drone.name for drone in info.drones])
+        self._table = run_key_table(info)
         self._gate_key = _gate_key(agent)
         self.notices: deque[WorldEvent] = deque()
         self.queries: deque[Query] = deque()

@@ -9,12 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from zsim.contract import messages
 from zsim.scenario import fault_check
+from zsim.scenario.fault_kinds import kinds_of
 from zsim.scenario.obstacle import nearest, row_of
 from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import SEA_HEIGHT_MAX_M, space_name
-from zsim.scenario.sensor_presets import BOARD_RATE_HZ
 from zsim.schema.checker import Fault, show
+from zsim.sensors.catalogue import DECLARED, MODULE, declarations, own_sections
+from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim.vehicles.vehicle import Vehicle
 
 FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step
@@ -39,6 +42,7 @@ def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fau
     yield from _obstacle_faults(obstacles, drones, vehicles)
     for index, drone in drones:
         yield from ((f"drones[{index}].{path}", text) for path, text in _drone_faults(drone, scenario, vehicles))
+    yield from _own_sensor_faults(drones)
     yield from _membership_faults(drones, clusters)
     for index, cluster in clusters:
         yield from ((f"clusters[{index}].{path}", text) for path, text in _plan_faults(cluster))
@@ -183,6 +187,22 @@ def _sensor_faults(sensors: Any) -> Iterator[Fault]:
         yield "sonar.min_m", f"is {sonar.min_m:g}; must be < max_m ({sonar.max_m:g})"
 
 
+def _own_sensor_faults(drones: _Entries) -> Iterator[Fault]:
+    """Yield where a sensor of one name has messages of two kinds, or its message the name of another."""
+    first: dict[str, tuple[int, str]] = {}
+    taken = {kind.__name__ for kind in messages.types_by_shape().values()}
+    for index, drone in drones:
+        for name, section in own_sections(drone).items():
+            message = section[DECLARED]["message"]
+            if message in taken:
+                path = f"drones[{index}].sensors.{name}.{DECLARED}.message"
+                yield path, f"is {show(message)}, which is a message of the contract; must be another"
+            other, module = first.setdefault(name, (index, section[MODULE]))
+            if module != section[MODULE]:
+                found = f"is {show(section[MODULE])}, and {show(module)} in drones[{other}]"
+                yield f"drones[{index}].sensors.{name}.{MODULE}", f"{found}; must be one for all drones"
+
+
 def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
     known = _names(drones)
     judged = len(known) == len(drones) and bool(drones)
@@ -289,7 +309,8 @@ def _injected_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Ite
         return
     expected = scenario.processes and scenario.processes.expect
     processes = tuple(name for name in expected or () if name is not None)
-    known = fault_check.Known(tuple(_names(drones)), tuple(_names(clusters)), processes)
+    kinds = kinds_of(declarations([drone for _, drone in drones]))
+    known = fault_check.Known(tuple(_names(drones)), tuple(_names(clusters)), processes, kinds)
     for index, fault in _entries(scenario.faults):
         for path, text in fault_check.flaws(fault, known):
             yield f"faults[{index}]{f'.{path}' if path else ''}", text

@@ -17,11 +17,15 @@ COMMON = ("kind", "target", "at_s", "for_s")  # what every fault may have; the r
 
 
 class Known(NamedTuple):
-    """Names that a target may have; `processes` are those that take part, beside estimators and controllers."""
+    """Names that a target may have, and the kinds of faults of the run.
+
+    `processes` are those that take part, beside estimators and controllers.
+    """
 
     drones: tuple[str, ...]
     clusters: tuple[str, ...]
     processes: tuple[str, ...] = ()
+    kinds: Mapping[str, FaultKind] = KINDS
 
 
 def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
@@ -30,9 +34,9 @@ def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
         yield "", f"is {show(fault)}; must be a map with kind and target"
         return
     name = fault.get("kind")
-    kind = KINDS.get(name) if isinstance(name, str) else None
+    kind = known.kinds.get(name) if isinstance(name, str) else None
     if kind is None or not isinstance(name, str):
-        yield "kind", f"{_actual(fault, 'kind')}; must be one of {', '.join(KINDS)}"
+        yield "kind", f"{_actual(fault, 'kind')}; must be one of {', '.join(known.kinds)}"
         return
     of = {parameter.name: parameter for parameter in kind.parameters}
     for field in fault:

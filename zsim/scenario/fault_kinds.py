@@ -3,16 +3,20 @@
 A fault is given as a map: `kind`, `target`, `at_s`, `for_s`, and the parameters of its kind.
 """
 
+import re
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 from zsim.contract.run_messages import Fault
+from zsim.sensors.catalogue import STOCK
+from zsim.sensors.sensor import Channel, Declaration, SensorType
 
 Target = Literal["drone", "world", "link", "radio", "process"]
 Shape = Literal["number", "vector", "choice", "flag", "places"]
 
 ROTORS = ("front_left", "front_right", "rear_right", "rear_left")  # in the order of truth's rotor_rad_s
 PROCESS_KILL = "process_kill"
+VECTOR_SIZE = 3  # numbers of a bias that is given as a list
 ORIGIN = (0.0, 0.0, 0.0)  # m in W: where a process is that no `place` names
 
 
@@ -70,25 +74,6 @@ _PROBABILITY = FaultParameter("probability", "number", "of each sample", "", 0.0
 _FACTOR = _number("factor", "by which the standard deviation grows", "", 1.0, 1e6, above=True)
 _ROTOR = FaultParameter("rotor", "choice", "which", choices=(*ROTORS, "all"))
 _ONE_WAY = FaultParameter("one_way", "flag", "from the first to the second only", default=False, required=False)
-_SENSORS = {
-    "imu": "IMU",
-    "gps": "GPS",
-    "mag": "magnetometer",
-    "baro": "barometer",
-    "sonar": "sonar",
-    "flow": "optical flow",
-}
-# The greatest values are chosen: about ten times what any such sensor can show, so that only slips are refused.
-_BIASES = {
-    "accel": _vector("value_m_s2", "in the sensor's axes", "m/s^2", 500.0),
-    "gyro": _vector("value_deg_s", "in the sensor's axes", "deg/s", 5700.0),
-    "gps": _vector("value_m", "east, north, up", "m", 1e5),
-    "mag": _vector("value_ut", "in the sensor's axes", "uT", 1e4),
-    "baro": _number("value_m", "of height", "m", -1e4, 1e4),
-    "sonar": _number("value_m", "of range", "m", -1e4, 1e4),
-    "flow": _vector("value_m_s", "forward, left, up", "m/s", 1e3),
-}
-_NAMES = {"accel": "accelerometer", "gyro": "gyroscope", **_SENSORS}
 
 _RADIO = (
     _number("range_m", "distance at which every second message is lost", "m", 0.0, 1e6, above=True),
@@ -98,20 +83,74 @@ _RADIO = (
     ),
 )
 
+
+class SensorPart(NamedTuple):
+    """Numbers of a sensor that a fault strikes together.
+
+    Attributes:
+        sensor: its name.
+        label: what the part is called.
+        channel: that of its first numbers, which a bias is added to.
+        first, width: place of its numbers among those of the sensor.
+    """
+
+    sensor: str
+    label: str
+    channel: Channel
+    first: int
+    width: int
+
+
+Declared = SensorType | Declaration
+
+
+def sensor_parts(sensors: Mapping[str, Declared]) -> dict[str, SensorPart]:
+    """Return the parts of sensors by the first word of their fault kinds: accel and gyro of an IMU, else a whole one.
+
+    Args:
+        sensors: by name.
+    """
+    parts: dict[str, SensorPart] = {}
+    for name, sensor in sensors.items():
+        first = 0
+        for channel in sensor.channels:
+            part = channel.part or name
+            label = channel.label or sensor.label or name
+            before = parts.get(part, SensorPart(name, label, channel, first, 0))
+            parts[part] = before._replace(width=before.width + channel.width)
+            first += channel.width
+    return parts
+
+
+def _sensor_kinds(sensors: Mapping[str, Declared]) -> dict[str, FaultKind]:
+    """Return the kinds of faults that sensors have."""
+    labels = {name: sensor.label or name for name, sensor in sensors.items()}
+    parts = sensor_parts(sensors)
+    return {
+        **{f"{n}_dropout": FaultKind("drone", f"samples of the {labels[n]} are lost", (_PROBABILITY,)) for n in labels},
+        **{f"{n}_stuck": FaultKind("drone", f"the {labels[n]} shows one sample again and again") for n in labels},
+        **{
+            f"{part}_bias": FaultKind("drone", f"the {of.label} has a constant error more", (_bias(of.channel),))
+            for part, of in parts.items()
+        },
+        **{
+            f"{n}_noise": FaultKind("drone", f"the {of.label} has more white noise", (_FACTOR,))
+            for n, of in parts.items()
+        },
+    }
+
+
+def _bias(channel: Channel) -> FaultParameter:
+    """Return the parameter of a constant error in a channel."""
+    unit = "" if channel.unit == "1" else re.sub(r"[^a-z0-9]+", "_", channel.unit.lower().replace("^", ""))
+    most, name = channel.bias_max, f"value_{unit}".strip("_")
+    if channel.width == VECTOR_SIZE:
+        return _vector(name, channel.axes, channel.unit, most)
+    return _number(name, channel.axes, channel.unit, -most, most)
+
+
 KINDS: dict[str, FaultKind] = {
-    **{
-        f"{sensor}_dropout": FaultKind("drone", f"samples of the {sensor_name} are lost", (_PROBABILITY,))
-        for sensor, sensor_name in _SENSORS.items()
-    },
-    **{
-        f"{sensor}_stuck": FaultKind("drone", f"the {sensor_name} shows one sample again and again")
-        for sensor, sensor_name in _SENSORS.items()
-    },
-    **{
-        f"{name}_bias": FaultKind("drone", f"the {_NAMES[name]} has a constant error more", (value,))
-        for name, value in _BIASES.items()
-    },
-    **{f"{name}_noise": FaultKind("drone", f"the {_NAMES[name]} has more white noise", (_FACTOR,)) for name in _BIASES},
+    **_sensor_kinds(STOCK),
     "rotor_efficiency": FaultKind(
         "drone", "a rotor has lost thrust", (_ROTOR, _number("value", "share of the thrust that is left", "", 0.0, 1.0))
     ),
@@ -145,6 +184,11 @@ KINDS: dict[str, FaultKind] = {
 }
 
 
+def kinds_of(own: Mapping[str, Declaration]) -> dict[str, FaultKind]:
+    """Return the kinds of faults of a run: KINDS, and those of its users' sensors."""
+    return {**KINDS, **_sensor_kinds(own)} if own else KINDS
+
+
 def expected(p: FaultParameter) -> str:
     """Return in words what a parameter may be."""
     unit = f" {p.unit}" if p.unit else ""
@@ -158,7 +202,14 @@ def expected(p: FaultParameter) -> str:
     return f"[x, y, z], each {limits}{unit}" if p.shape == "vector" else f"{limits}{unit}"
 
 
-def planned(description: Mapping[str, Any], number: int, source: str, now_ns: int, gate_ns: int) -> Fault:
+def planned(
+    description: Mapping[str, Any],
+    number: int,
+    source: str,
+    now_ns: int,
+    gate_ns: int,
+    kinds: Mapping[str, FaultKind] = KINDS,
+) -> Fault:
     """Return the fault that a sound map asks for, in whole gates and with every parameter.
 
     It acts in the gates after `from_ns` up to `until_ns`: on what happens between these instants, and on messages that
@@ -168,8 +219,9 @@ def planned(description: Mapping[str, Any], number: int, source: str, now_ns: in
         description: without flaws.
         number: its id.
         now_ns: when it begins where `at_s` is left out.
+        kinds: of the run.
     """
-    kind, at_s, for_s = KINDS[description["kind"]], description.get("at_s"), description.get("for_s")
+    kind, at_s, for_s = kinds[description["kind"]], description.get("at_s"), description.get("for_s")
     from_ns = now_ns if at_s is None else round(at_s * 1e9 / gate_ns) * gate_ns
     until_ns = None if for_s is None else from_ns + max(1, round(for_s * 1e9 / gate_ns)) * gate_ns
     if kind.lasts == "once":

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
 from zsim.scenario.role_table import OnDeath, agent_names
-from zsim.scenario.sensor_presets import G_M_S2, SEA_LEVEL_KG_M3
 from zsim.schema.plugin import CLASS_NAME
-from zsim.schema.quantities import Fraction, NonNegative, Positive, Real, Vector3
+from zsim.schema.quantities import G_M_S2, SEA_LEVEL_KG_M3, Fraction, NonNegative, Positive, Real, Vector3
+from zsim.sensors.catalogue import Sensors
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import Arm, Limits, Mass, RotorLag, TakeoffHeight
 
@@ -28,80 +28,6 @@ Position = tuple[Coordinate, Coordinate, Coordinate]
 
 class Spec(Struct, frozen=True, forbid_unknown_fields=True):
     """Base of every section: unknown keys are faults, not surprises."""
-
-
-class ErrorModel(Spec, frozen=True, kw_only=True):
-    """Error of one channel, in the channel's unit."""
-
-    noise: NonNegative = 0.0
-    """White, standard deviation per sample."""
-    density: NonNegative = 0.0
-    """White, per sqrt(Hz): adds density * sqrt(rate) in quadrature to `noise`."""
-    bias: NonNegative = 0.0
-    """Constant over a run, standard deviation over runs, per axis."""
-    bias_walk: NonNegative = 0.0
-    """Random walk of the bias, per sqrt(s)."""
-    quantum: NonNegative = 0.0
-    """Step of the converter; 0 = none."""
-
-
-class Mount(Spec, frozen=True, kw_only=True):
-    """Pose of the sensor in the body, X_BS."""
-
-    position_m: Vector3 = (0.0, 0.0, 0.0)
-    rpy_deg: Vector3 = (0.0, 0.0, 0.0)
-
-
-class Sensor(Spec, frozen=True, kw_only=True):
-    """What all sensors share."""
-
-    rate_hz: Annotated[float, Meta(ge=0.01, le=1000)]
-    latency_ms: Annotated[float, Meta(ge=0, le=10_000)] = 0.0
-    dropout: Fraction = 0.0
-    """Probability that a sample is lost, independent per sample."""
-    mount: Mount = Mount()
-
-
-class ImuConfig(Sensor, frozen=True, kw_only=True):
-    accel_m_s2: ErrorModel = ErrorModel()
-    gyro_deg_s: ErrorModel = ErrorModel()
-
-
-class GpsConfig(Sensor, frozen=True, kw_only=True):
-    position_m: ErrorModel = ErrorModel()
-    velocity_m_s: ErrorModel = ErrorModel()
-
-
-class MagConfig(Sensor, frozen=True, kw_only=True):
-    field_ut: ErrorModel = ErrorModel()
-
-
-class BaroConfig(Sensor, frozen=True, kw_only=True):
-    altitude_m: ErrorModel = ErrorModel()
-
-
-class SonarConfig(Sensor, frozen=True, kw_only=True):
-    range_m: ErrorModel = ErrorModel()
-    min_m: NonNegative = 0.03
-    max_m: Positive = 6.0
-
-
-class FlowConfig(Sensor, frozen=True, kw_only=True):
-    velocity_m_s: ErrorModel = ErrorModel()
-
-
-class Sensors(Spec, frozen=True, kw_only=True):
-    """The sensors of one drone, after preset and overrides."""
-
-    preset: Literal["ardrone2", "paper", "crazyflie2"]
-    as_printed: bool = False
-    """With `paper`: accelerometer 0.35 g as the paper prints it, instead of 0.35 m/s^2."""
-    imu: ImuConfig
-    gps: GpsConfig
-    mag: MagConfig
-    baro: BaroConfig
-    sonar: SonarConfig
-    flow: FlowConfig
 
 
 class Drone(Spec, frozen=True, kw_only=True):

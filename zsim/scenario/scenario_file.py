@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,10 @@ import msgspec
 from zsim.errors import DocumentError, ScenarioError
 from zsim.scenario import overrides as override
 from zsim.scenario.consistency import cross_faults
-from zsim.scenario.scenario import DRONES_MAX, Document, Scenario, Sensors
-from zsim.scenario.sensor_presets import AS_PRINTED, PRESETS
+from zsim.scenario.scenario import DRONES_MAX, Document, Scenario
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import Fault, faults, sound
+from zsim.sensors.catalogue import AS_PRINTED, PRESETS, Sensors, flattened, separate
 from zsim.vehicles import catalogue
 from zsim.vehicles.vehicle import DEFAULTS, Vehicle
 
@@ -52,8 +52,8 @@ def resolve(document: dict[str, Any], source: str = "scenario") -> Scenario:
 
 def _resolve(document: dict[str, Any], source: str, lines: list[str]) -> Scenario:
     vehicles, unknown = _vehicles(document)
-    document = _expand_presets(document, vehicles)
-    flaws = [*faults(document, Document), *unknown, *cross_faults(sound(document, Scenario), vehicles)]
+    document, unsound = _separate_sensors(_expand_presets(document, vehicles))
+    flaws = [*faults(document, Document), *unknown, *unsound, *cross_faults(sound(document, Scenario), vehicles)]
     lines += [f"{source}: {path} {text}{_whose(document, path)}" for path, text in flaws]
     if lines:
         raise ScenarioError(_shortened(lines))
@@ -73,7 +73,10 @@ def from_text(text: str) -> Scenario:
 
 def to_text(scenario: Scenario) -> str:
     """Return the resolved scenario as YAML text; the same scenario gives the same text."""
-    return yaml_file.dump(msgspec.to_builtins(scenario))
+    document = msgspec.to_builtins(scenario)
+    for drone in document["drones"]:
+        drone["sensors"] = flattened(drone["sensors"])
+    return yaml_file.dump(document)
 
 
 def sha256(text: str) -> str:
@@ -106,15 +109,49 @@ def _is_resolved(drone: dict[str, Any]) -> bool:
 def _expand_presets(document: dict[str, Any], vehicles: dict[str, Vehicle]) -> dict[str, Any]:
     """Put preset, the scenario's `sensors:` and the drone's `sensors:` together, the later ones winning.
 
-    A faulty section of the scenario is not handed on to the drones: its faults are told once.
+    A faulty part of the scenario's is not handed on to the drones: its faults are told once.
     """
     shared = document.get("sensors") or {}
     document = {**document, "sensors": _expanded(shared)}
-    usable = {} if any(faults(document["sensors"], Sensors)) else shared
+    faulty = {path.partition(".")[0] for path, _ in _sensor_faults(document["sensors"])}
+    usable = {} if "" in faulty else {name: value for name, value in shared.items() if name not in faulty}
     drones = document.get("drones")
     if isinstance(drones, list) and len(drones) <= DRONES_MAX:
         document["drones"] = [_expand_drone(drone, usable, vehicles) for drone in drones]
     return document
+
+
+def _sensor_faults(section: Any) -> Iterator[Fault]:
+    """Yield the faults of an expanded `sensors:` section."""
+    if isinstance(section, dict):
+        rest, _, unsound = separate(section)
+        yield from unsound
+        section = rest
+    yield from faults(section, Sensors)
+
+
+def _separate_sensors(document: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
+    """Return a document with the users' sensors apart from the stock ones, and what is wrong with them."""
+    unsound: list[Fault] = []
+    section = _separated(document["sensors"], "sensors", unsound)
+    drones = document.get("drones")
+    if isinstance(drones, list) and len(drones) <= DRONES_MAX:
+        drones = [
+            {**drone, "sensors": _separated(drone["sensors"], f"drones[{index}].sensors", unsound)}
+            if isinstance(drone, dict)
+            else drone
+            for index, drone in enumerate(drones)
+        ]
+        return {**document, "sensors": section, "drones": drones}, unsound
+    return {**document, "sensors": section}, unsound
+
+
+def _separated(section: Any, where: str, unsound: list[Fault]) -> Any:
+    if not isinstance(section, dict):
+        return section
+    rest, own, wrong = separate(section)
+    unsound += [(f"{where}.{path}", text) for path, text in wrong]
+    return {**rest, "own": own} if own else rest
 
 
 def _expand_drone(drone: Any, shared: dict[str, Any], vehicles: dict[str, Vehicle]) -> Any:

@@ -1,4 +1,4 @@
-"""The numbers that typed documents hold, with their limits."""
+"""The numbers that typed documents hold, with their limits, and constants of nature by which they are given."""
 
 from typing import Annotated
 
@@ -11,3 +11,6 @@ Positive = Annotated[float, Meta(gt=0, le=LARGE)]
 NonNegative = Annotated[float, Meta(ge=0, le=LARGE)]
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 Vector3 = tuple[Real, Real, Real]
+
+G_M_S2 = 9.80665  # m/s^2, standard gravity, ISO 80000-3
+SEA_LEVEL_KG_M3 = 1.225  # kg/m^3, density of the standard atmosphere at sea level and 15 deg C, ISO 2533

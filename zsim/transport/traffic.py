@@ -1,13 +1,13 @@
 """Everything that passes the hub, taken in by one subscription: batches are taken apart here and nowhere else.
 
-traffic = Traffic(link, drones)
+traffic = Traffic(link, run_key_table(info))
 for entry in traffic.receive(): ...     ReceivedSample(key, payload), or GateMessages of the world's drones
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 
 from zsim.contract import keys
-from zsim.contract.framing import GateMessages, decode_batch, key_table
+from zsim.contract.framing import GateMessages, decode_batch
 from zsim.errors import DecodeError
 from zsim.transport.session import ReceivedSample, Session
 
@@ -19,13 +19,13 @@ class Traffic:
 
     Args:
         link: an open session.
-        drones: their names, as `world/info` gives them.
+        table: keys of the world's messages about the drones of the run, see `run_key_table`.
         refused: called for each batch, or part of one, that cannot be read.
     """
 
-    def __init__(self, link: Session, drones: Sequence[str], refused: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, link: Session, table: tuple[str, ...], refused: Callable[[], None] = lambda: None) -> None:
         self._subscription = link.subscribe(keys.BATCH)
-        self._table = key_table(drones)
+        self._table = table
         self._refused = refused
 
     def wake(self) -> None:

@@ -47,7 +47,11 @@ class Estimator(Agent):
         make = estimator_class(scenario.estimation.chosen(), "world/info: estimation.algorithm")
         self._estimators = EstimatorSet(make, *settings) if make else EstimatorBank(*settings)
         self._settings = None if make else settings
-        self.reads = tuple(keys.sensors(drone) for drone in names) if make else _reads(names)
+        self.reads = (
+            tuple(keys.sensors(drone) for drone in names)
+            if make
+            else _reads(names, [sensor.name for sensor in info.own_sensors])
+        )
         self._last: list[flight_messages.Estimate] = []
         self._view_key = keys.estimates_view(self.name)
         self.takes_gates = COMPILES and not make
@@ -102,9 +106,12 @@ class Estimator(Agent):
         self._estimators.warm_start(self.writes.index(key), message)
 
 
-def _reads(drones: Sequence[str]) -> tuple[str, ...]:
-    """One subscription per sensor: the process sleeps until status, the last of a gate, and wakes once."""
-    return tuple(keys.sensor(drone, kind) for drone in drones for kind in (*keys.SENSORS, "status"))
+def _reads(drones: Sequence[str], own: Sequence[str]) -> tuple[str, ...]:
+    """One subscription per sensor: the process sleeps until status, the last of a gate, and wakes once.
+
+    Users' sensors are read since status counts them.
+    """
+    return tuple(keys.sensor(drone, kind) for drone in drones for kind in (*keys.SENSORS, *own, "status"))
 
 
 def _check(names: Sequence[str], scenario: Scenario) -> None:

@@ -15,8 +15,10 @@ from scipy.special import chdtri
 
 from zsim.contract.keys import SENSORS
 from zsim.math.rotation import LEVEL, matrix_from_rpy
-from zsim.scenario.scenario import Drone, Environment, ErrorModel, Estimation, ImuConfig, Sensor, Sensors
-from zsim.scenario.sensor_presets import BOARD_RATE_HZ
+from zsim.scenario.scenario import Drone, Environment, Estimation
+from zsim.sensors.catalogue import Sensors
+from zsim.sensors.imu import BOARD_RATE_HZ, ImuConfig
+from zsim.sensors.sensor import ErrorModel, Sensor
 from zsim_agents.estimation.dead_reckoning import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
 from zsim_agents.estimation.filter_state import (
     BIAS,

@@ -3,10 +3,10 @@
 import asyncio
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from zsim.contract import keys, messages
-from zsim.contract.framing import GateMessages, key_table
+from zsim.contract.framing import GateMessages
 from zsim.transport.samples import RawSample, check_expression
 from zsim.transport.session import Session
 from zsim_bridges.gateway.access_check import ConnectionLimit
@@ -63,11 +63,11 @@ class LastValues:
     """The last value of every key that has passed the world, or was published by clients here.
 
     Args:
-        drones: their names, as `world/info` gives them.
+        table: keys of the world's messages about the drones of the run, see `run_key_table`.
     """
 
-    def __init__(self, drones: Sequence[str]) -> None:
-        self._table = key_table(drones)
+    def __init__(self, table: tuple[str, ...]) -> None:
+        self._table = table
         self._indices = {key: index for index, key in enumerate(self._table)}
         self._payloads: dict[str, bytes] = {}
         self._own_bytes = 0

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from zsim.contract import keys, messages
-from zsim.contract.framing import GateMessages
+from zsim.contract.framing import GateMessages, run_key_table
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
@@ -50,7 +50,7 @@ class RunAccess:
     def __init__(self, link: Session, info: Info, observer: ObserverProcess, secured: bool) -> None:
         self.link = link
         self.info = info
-        self.values = LastValues([drone.name for drone in info.drones])
+        self.values = LastValues(run_key_table(info))
         self.defaults = MessageDefaults(observer.name)
         self.bare_link = link.unprefixed()
         self._observer = observer
@@ -72,7 +72,7 @@ class RunAccess:
 
     def open(self) -> None:
         """Subscribe to what passes the world, and read the last values of before."""
-        self._traffic = Traffic(self.link, [drone.name for drone in self.info.drones], self._count_refused)
+        self._traffic = Traffic(self.link, run_key_table(self.info), self._count_refused)
         # Views do not pass the world.
         self.link.declare_subscriber("view/**", lambda sample: self.values.add(sample.key, sample.payload))
         for expression in rights.LAST_VALUES:

@@ -16,8 +16,8 @@ from rosbags.typesys.stores import ros1_noetic as ros
 from zsim.contract import flight_messages, messages, run_messages
 from zsim.math import frames as rotations
 from zsim.math.rotation import LEVEL, Quaternion, Vector
-from zsim.scenario.scenario import Mount
-from zsim.scenario.sensor_presets import G_M_S2
+from zsim.schema.quantities import G_M_S2
+from zsim.sensors.sensor import Mount
 from zsim_agents.estimation.madgwick import madgwick_step
 from zsim_bridges.ros1.tcpros import message_class
 from zsim_bridges.ros_frames import NAVDATA_STATES, by_axis, xyzw

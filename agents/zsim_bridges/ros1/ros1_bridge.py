@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from zsim.contract import keys, messages
+from zsim.contract.framing import run_key_table
 from zsim.contract.messages import Info
 from zsim.errors import DecodeError, RunError, SessionError
 from zsim.runtime.health import HealthMeter
@@ -44,7 +45,7 @@ class Intake:
     """
 
     def __init__(self, link: Session, info: Info, health: HealthMeter, loop: asyncio.AbstractEventLoop) -> None:
-        self._traffic = Traffic(link, [drone.name for drone in info.drones], self._count_refused)
+        self._traffic = Traffic(link, run_key_table(info), self._count_refused)
         self._health = health
         self._loop = loop
         self._backlog: deque[Sequence[Passed]] = deque(maxlen=BACKLOG)

@@ -18,9 +18,10 @@ from zsim.contract import flight_messages, messages, run_messages
 from zsim.contract.flight_messages import Quaternion
 from zsim.math.frames import quaternion_conjugate, quaternion_from_rpy, quaternion_multiply, rotate, rotation_matrix
 from zsim.math.rotation import LEVEL
-from zsim.scenario import scenario
-from zsim.scenario.scenario import Mount, Sensors
 from zsim.schema.message import Vector3
+from zsim.sensors.catalogue import Sensors
+from zsim.sensors.sensor import ErrorModel, Mount
+from zsim.sensors.sonar import SonarConfig
 from zsim_bridges.ros_frames import xyzw
 
 MAP = "map"
@@ -149,7 +150,7 @@ def pressure(message: messages.Baro, frame: str) -> Any:
     return ros.sensor_msgs__msg__FluidPressure(header(message.t_sample_ns, frame), message.pressure_pa, 0.0)
 
 
-def sonar_range(message: messages.Sonar, frame: str, sonar: scenario.SonarConfig, variance: float) -> Any:
+def sonar_range(message: messages.Sonar, frame: str, sonar: SonarConfig, variance: float) -> Any:
     """Return a distance; without an echo it is +Inf (REP-117)."""
     return ros.sensor_msgs__msg__Range(
         header(message.t_sample_ns, frame),
@@ -262,7 +263,7 @@ def cluster_state(kind: Any, message: flight_messages.ClusterState, frame: str) 
     )
 
 
-def variance(error: scenario.ErrorModel, rate_hz: float) -> float:
+def variance(error: ErrorModel, rate_hz: float) -> float:
     """Return the variance of one sample about its bias, in the unit of the error squared."""
     return error.noise**2 + error.density**2 * rate_hz + error.quantum**2 / 12.0  # a step's rounding is uniform
 

@@ -83,6 +83,8 @@ class TableSurvey:
         self._reader = reader
         self._selection = selection
         self.wanted = selection.keys(reader)
+        if (info := reader.last(keys.INFO)) is not None:
+            decode_or_none(info)  # from here on the messages of users' sensors are known
         self.kinds = {key: kind for key in self.wanted if (kind := messages.type_of(key))}
         counts = reader.topics()
         self.rows: Counter[type[Struct] | None] = Counter()

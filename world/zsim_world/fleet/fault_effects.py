@@ -8,25 +8,13 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from zsim.contract.run_messages import Fault
+from zsim.scenario.fault_kinds import sensor_parts
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.physics.air import WIND
 from zsim_world.sensors import sensor_set as ss
-from zsim_world.sensors.sensor_set import CONFIG, FAULT
+from zsim_world.sensors.sensor_set import CONFIG, FAULT, FleetSensors
 from zsim_world.state.fleet_arrays import STATE, Arrays
 from zsim_world.vehicles.simd_firmware import ACTUATOR, sound_actuators
-
-DEG = math.pi / 180.0  # rad
-# Of a kind's first word: sensor, first channel, channels, and what a unit of its bias is in that of the channel
-CHANNELS: dict[str, tuple[int, int, int, float]] = {
-    "imu": (ss.IMU, 0, 6, 1.0),
-    "accel": (ss.IMU, 0, 3, 1.0),
-    "gyro": (ss.IMU, 3, 3, DEG),
-    "gps": (ss.GPS, 0, 6, 1.0),
-    "mag": (ss.MAG, 0, 3, 1.0),
-    "baro": (ss.BARO, 0, 1, 1.0),
-    "sonar": (ss.SONAR, 0, 1, 1.0),
-    "flow": (ss.FLOW, 0, 3, 1.0),
-}
 
 
 class Impairment:
@@ -35,10 +23,15 @@ class Impairment:
     Args:
         arrays: of the fleet, before its first gate.
         drones, vehicles: their names and what they are, in scenario order.
+        sensors: of the drones.
     """
 
-    def __init__(self, arrays: Arrays, drones: Sequence[str], vehicles: Sequence[Vehicle]) -> None:
+    def __init__(
+        self, arrays: Arrays, drones: Sequence[str], vehicles: Sequence[Vehicle], sensors: FleetSensors
+    ) -> None:
         self._w = arrays
+        self._sensor = {name: s for s, name in enumerate(sensors.names)}
+        self._parts = sensor_parts(dict(zip(sensors.names, sensors.types, strict=True)))
         self._index = {name: i for i, name in enumerate(drones)}
         self._config = arrays.senses.config.copy()
         self._steady = arrays.wind[WIND.steady : WIND.steady + 3].copy()
@@ -76,19 +69,27 @@ class Impairment:
         if what == "rotor":
             self._impair_rotors(fault, i, how)
             return
-        s, first, count, unit = CHANNELS[what]
-        row = self._w.senses.config[i, s]
-        if how == "dropout":
-            row[CONFIG.drop] = dropped(row[CONFIG.drop], fault.parameters["probability"])
-        elif how == "noise":
-            row[CONFIG.white + first : CONFIG.white + first + count] *= fault.parameters["factor"]
+        if how in ("dropout", "stuck"):
+            self._impair_sensor(fault, i, self._sensor[what], stuck)
+            return
+        part = self._parts[what]
+        s = self._sensor[part.sensor]
+        row, first = self._w.senses.config[i, s], part.first
+        if how == "noise":
+            row[CONFIG.white + first : CONFIG.white + first + part.width] *= fault.parameters["factor"]
         else:
             row[CONFIG.faulty] = 1.0
-            if how == "stuck":
-                stuck.add((i, s))
-            else:
-                bias = np.atleast_1d(_bias(fault)) * unit
-                self._w.senses.fault[i, s, FAULT.offset + first : FAULT.offset + first + len(bias)] += bias
+            offset = self._w.senses.fault[i, s, FAULT.offset + first : FAULT.offset + first + part.channel.width]
+            offset += np.multiply(_bias(fault), part.channel.to_si)
+
+    def _impair_sensor(self, fault: Fault, i: int, s: int, stuck: set[tuple[int, int]]) -> None:
+        """Let a sensor lose samples, or get stuck."""
+        row = self._w.senses.config[i, s]
+        if fault.kind.endswith("_stuck"):
+            row[CONFIG.faulty] = 1.0
+            stuck.add((i, s))
+        else:
+            row[CONFIG.drop] = dropped(row[CONFIG.drop], fault.parameters["probability"])
 
     def _release(self, stuck: Iterable[tuple[int, int]]) -> None:
         """Let sensors that have just got stuck keep their next sample, and free those that are no longer."""

@@ -13,16 +13,18 @@ from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState
 from zsim.errors import RunError
-from zsim.scenario.scenario import Drone, GpsConfig, Scenario
+from zsim.scenario.scenario import Drone, Scenario
+from zsim.sensors.gps import GpsConfig
+from zsim.sensors.sensor import noise_sigma
 from zsim.vehicles.catalogue import vehicle_of
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.fleet import kernel
 from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.fleet.initial_state import arrays
 from zsim_world.physics.air import WIND
-from zsim_world.sensors import sensor_set
 from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sampler import Sampled, Sampler, SensorSample
+from zsim_world.sensors.sensor_set import fleet_sensors
 from zsim_world.state.fleet_arrays import STATE, VEHICLE
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY, SETPOINT
@@ -64,6 +66,8 @@ class Fleet:
     Attributes:
         names: in scenario order, in which drones are counted.
         rotors: how many each has.
+        sensors: of each.
+        environment: of the scenario.
         gps_sigma_m: of each drone's fixes.
         impairment: what faults do to it.
         bodies, boards: the arrays that the kernel works on; to be read only.
@@ -88,12 +92,14 @@ class Fleet:
         self._ticks = round(scenario.time.gate_ms / scenario.time.physics_dt_ms)
         self._tick = 0
         self._gates = 0
-        self._sampler = Sampler(scenario)
+        self.sensors = fleet_sensors(scenario)
+        self.environment = scenario.environment
         self._noise = NoiseTable(scenario, NOISE_GATES)
-        self._w = arrays(scenario, vehicles, self._noise)
+        self._w = arrays(scenario, vehicles, self.sensors, self._noise)
+        self._sampler = Sampler(scenario, self.sensors, self._w.senses)
         self._held = kernel.hold(self._w)
         self.bodies, self.boards = self._w.bodies, self._w.boards
-        self.impairment = Impairment(self._w, self.names, vehicles)
+        self.impairment = Impairment(self._w, self.names, vehicles, self.sensors)
         self.touching = np.zeros(self.count, dtype=bool)
         self._hull_m = float(self.bodies.vehicle[:, VEHICLE.hull_radius].max())
         self._integrate(0)
@@ -126,7 +132,7 @@ class Fleet:
 
     def samples(self) -> list[SensorSample]:
         """Return what fell due for publication in the last gate, in the order of (t_ns, drone, sensor)."""
-        return self.sampled.each()
+        return self.sampled.each(self.sensors)
 
     def truth(self) -> TrueState:
         """Return the true state now."""
@@ -246,7 +252,7 @@ class Fleet:
         self._tick += ticks
         self._least = least
         self._meet(least)
-        self.sampled = self._sampler.due(self._w.senses, logged, self.t_ns)
+        self.sampled = self._sampler.due(logged, self.t_ns)
 
     def _meet(self, least: float) -> None:
         self._began: list[tuple[int, int]] = []
@@ -259,7 +265,7 @@ class Fleet:
 
 
 def _gps_sigma(gps: GpsConfig) -> float:
-    return sensor_set.noise_sigma(gps.position_m, gps.rate_hz)
+    return noise_sigma(gps.position_m, gps.rate_hz)
 
 
 def _vehicle(index: int, drone: Drone) -> Vehicle:

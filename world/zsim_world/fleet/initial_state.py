@@ -15,9 +15,11 @@ from zsim_world.physics.contacts import obstacle_rows
 from zsim_world.physics.ground import contact_points
 from zsim_world.physics.simd import body_blocks
 from zsim_world.sensors import sensor_set
-from zsim_world.sensors.noise import NoiseTable, samples_per_gate
+from zsim_world.sensors.noise import NoiseTable
+from zsim_world.sensors.sensor_set import FleetSensors
 from zsim_world.state.fleet_arrays import (
     CLOCK,
+    EXPOSED,
     ROTOR,
     STATE,
     VEHICLE,
@@ -36,8 +38,8 @@ from zsim_world.vehicles.observer import BELIEF, CALIBRATION, DEVICE
 from zsim_world.vehicles.simd_firmware import board_blocks, sound_actuators
 
 
-def arrays(scenario: Scenario, vehicles: Sequence[Vehicle], noise: NoiseTable) -> Arrays:
-    """Return the arrays of the kernel for a scenario whose drones are these vehicles."""
+def arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensors, noise: NoiseTable) -> Arrays:
+    """Return the arrays of the kernel for a scenario whose drones are these vehicles with these sensors."""
     dt, drones, place = scenario.time.physics_dt_ms / 1000.0, scenario.drones, scenario.environment
     each = max(len(vehicle.rotors) for vehicle in vehicles)
     row = np.array([vehicle_row(vehicle, drone, place) for vehicle, drone in zip(vehicles, drones, strict=True)])
@@ -47,7 +49,8 @@ def arrays(scenario: Scenario, vehicles: Sequence[Vehicle], noise: NoiseTable) -
     time = KernelTime(clock=clock, spans=np.array([dt, scenario.silence.hover_s, scenario.silence.land_s]))
     numbers = NoiseRows(table=noise.table, at=noise.at, cursor=noise.cursor)
     bodies, boards = _bodies(scenario, row, rotors, dt), _boards(scenario, vehicles, row, rotors)
-    return Arrays(time, bodies, boards, numbers, _senses(scenario, noise), _wind(scenario), noise.gust)
+    senses = _senses(scenario, sensors, noise)
+    return Arrays(time, bodies, boards, numbers, senses, _wind(scenario), noise.gust)
 
 
 def _bodies(scenario: Scenario, row: np.ndarray, rotors: np.ndarray, dt: float) -> Bodies:
@@ -101,17 +104,22 @@ def _boards(scenario: Scenario, vehicles: Sequence[Vehicle], row: np.ndarray, ro
     )
 
 
-def _senses(scenario: Scenario, noise: NoiseTable) -> Senses:
-    field, log = scenario.environment, samples_per_gate(scenario) + 1
+def _senses(scenario: Scenario, sensors: FleetSensors, noise: NoiseTable) -> Senses:
+    field, log = scenario.environment, sensor_set.samples_per_gate(sensors, scenario.time.gate_ms) + 1
+    kinds = len(sensors.names)
+    exposures = log if kinds > len(sensor_set.SENSORS) else 1
     return Senses(
         place=np.array([*field.magnetic_field_ut, field.height_m]),
-        config=sensor_set.config(scenario),
-        fault=np.zeros((len(scenario.drones), len(sensor_set.SENSORS), sensor_set.FAULT.size)),
-        schedule=sensor_set.schedule(scenario),
+        config=sensor_set.config(sensors),
+        fault=np.zeros((len(scenario.drones), kinds, sensor_set.FAULT.size)),
+        schedule=sensor_set.schedule(sensors, scenario.time.physics_dt_ms),
         soonest=np.zeros(len(scenario.drones), dtype=np.int64),
         bias=noise.bias,
         whose=np.zeros((log, 3), dtype=np.int64),
         value=np.zeros((log, 6)),
+        exposed_count=np.zeros(1, dtype=np.int64),
+        exposed_whose=np.zeros((exposures, 3), dtype=np.int64),
+        exposed=np.zeros((exposures, EXPOSED.size)),
     )
 
 

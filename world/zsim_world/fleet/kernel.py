@@ -11,18 +11,26 @@ from numba.typed.typedlist import List
 from numpy.typing import NDArray
 
 from zsim.math.compiled import apart, inlined, kernel
-from zsim.math.rotation import Vector, norm
+from zsim.math.rotation import norm
 from zsim_world.physics import rigid_body as body
 from zsim_world.physics.air import WIND, blow
 from zsim_world.physics.contacts import meet_drones, meet_obstacles
 from zsim_world.physics.rigid_body import four, put, put_four, vector
 from zsim_world.physics.rotors import drained
 from zsim_world.physics.simd import accelerate, line_up, move
-from zsim_world.sensors import measurement
 from zsim_world.sensors import sensor_set as ss
-from zsim_world.sensors.sensor_set import CONFIG, FAULT, SCHEDULE
+from zsim_world.sensors.baro import baro, pressure
+from zsim_world.sensors.exposure import BodyTruth, MountedSensor, Site, Values
+from zsim_world.sensors.flow import flow
+from zsim_world.sensors.gps import gps
+from zsim_world.sensors.imu import imu
+from zsim_world.sensors.mag import mag
+from zsim_world.sensors.reading import add_errors, displace, hold_reading
+from zsim_world.sensors.sensor_set import CONFIG, NEVER, SCHEDULE
+from zsim_world.sensors.sonar import sonar
 from zsim_world.state.fleet_arrays import (
     CLOCK,
+    EXPOSED,
     PLACE,
     SPAN,
     STATE,
@@ -38,10 +46,7 @@ from zsim_world.vehicles import firmware
 from zsim_world.vehicles.observer import DEVICE, STEP_S
 from zsim_world.vehicles.simd_firmware import steer
 
-NEVER = 2**63 - 1  # a tick that does not come
 POSITION_MAX_M, RATE_MAX_RAD_S = 1e6, 1e4  # beyond, the integration has diverged
-
-Pair = tuple[Vector, Vector]
 
 
 @inlined
@@ -76,49 +81,45 @@ def _meet(wind: NDArray, gust: NDArray, bodies: Bodies) -> float:
 
 
 @inlined
-def _ideal(s: int, config: NDArray, state: NDArray, accel: NDArray, gravity: float, place: NDArray) -> Pair:
-    """Return the errorless values of sensor s; unused places are zero."""
-    p, v, q, rate = body.pose(state)
-    p_BS, q_BS = vector(config, CONFIG.p_BS), four(config, CONFIG.q_BS)
-    none = (0.0, 0.0, 0.0)
+def _ideal(s: int, x: BodyTruth, mounted: MountedSensor, site: Site) -> Values:
+    """Return the errorless values of stock sensor s: the only place that tells them apart by their numbers."""
     if s == ss.IMU:
-        return measurement.imu(vector(accel, 0), q, rate, vector(accel, 3), gravity, p_BS, q_BS)
+        return imu(x, mounted, site)
     if s == ss.GPS:
-        return measurement.gps(p, v, q, rate, p_BS)
+        return gps(x, mounted, site)
     if s == ss.MAG:
-        return measurement.mag(q, q_BS, vector(place, PLACE.field_W)), none
+        return mag(x, mounted, site)
     if s == ss.BARO:
-        return (measurement.height(p, q, p_BS), 0.0, 0.0), none
+        return baro(x, mounted, site)
     if s == ss.SONAR:
-        distance, echo = measurement.sonar(p, q, p_BS, q_BS, config[CONFIG.limit_max])
-        return (distance, 1.0 if echo else 0.0, 0.0), none
-    velocity, quality = measurement.flow(v, q, rate, p_BS)
-    return velocity, (quality, 0.0, 0.0)
+        return sonar(x, mounted, site)
+    return flow(x, mounted, site)
 
 
 @inlined
 def _read(s: int, value: NDArray, config: NDArray, bias: NDArray, noise: NDArray, at: int, height: float) -> bool:
     """Turn errorless values into a reading, in place; return False if it is lost."""
     n = ss.CHANNELS[s]
-    for k in range(n):
-        bias[k] += config[CONFIG.walk + k] * noise[at + n + k]
-        white = config[CONFIG.white + k] * noise[at + k]
-        value[k] = measurement.reading(value[k], bias[k], white, config[CONFIG.quantum + k])
+    add_errors(n, value, config, bias, noise, at)
     if s == ss.SONAR:
         value[0] = max(value[0], 0.0)
         if value[0] < config[CONFIG.limit_min] or value[0] > config[CONFIG.limit_max]:
             value[1] = 0.0
     elif s == ss.BARO:
         value[1] = value[0]
-        value[0] = measurement.pressure(height + value[1])
+        value[0] = pressure(height + value[1])
     return noise[at + 2 * n] >= config[CONFIG.drop]
 
 
 @inlined
 def _sample(s: int, i: int, bodies: Bodies, noise: NoiseRows, senses: Senses, value: NDArray) -> bool:
     """Write a reading of sensor s of drone i into value (6,); return False if it is lost."""
-    gravity, config = bodies.vehicle[i, VEHICLE.gravity], senses.config[i, s]
-    first, second = _ideal(s, config, bodies.state[i], bodies.accel[i], gravity, senses.place)
+    config, accel = senses.config[i, s], bodies.accel[i]
+    p, v, q, rate = body.pose(bodies.state[i])
+    x = BodyTruth(p, v, q, rate, vector(accel, 0), vector(accel, 3))
+    mounted = MountedSensor(vector(config, CONFIG.p_BS), four(config, CONFIG.q_BS), config[CONFIG.limit_max])
+    site = Site(bodies.vehicle[i, VEHICLE.gravity], vector(senses.place, PLACE.field_W))
+    first, second = _ideal(s, x, mounted, site)
     put(value, 0, first)
     put(value, 3, second)
     at = noise.at[s] + noise.cursor[i, s] * ss.NOISE_WIDTH[s]
@@ -134,30 +135,11 @@ def _read_faulty(
     s: int, value: NDArray, config: NDArray, bias: NDArray, fault: NDArray, noise: NDArray, at: int, height: float
 ) -> bool:
     """Do as `_read`, with what faults add to the errorless values and what they hold of the readings."""
-    _displace(s, value, fault)
+    displace(ss.CHANNELS[s], value, fault)
     kept = _read(s, value, config, bias, noise, at, height)
     if kept:
-        _hold(value, fault)
+        hold_reading(value, fault)
     return kept
-
-
-@inlined
-def _displace(s: int, value: NDArray, fault: NDArray) -> None:
-    """Add what a fault adds to the errorless values of a sensor, in place."""
-    for k in range(ss.CHANNELS[s]):
-        value[k] += fault[FAULT.offset + k]
-
-
-@inlined
-def _hold(value: NDArray, fault: NDArray) -> None:
-    """Keep a reading (6,) that is the first of a stuck sensor, or give the one kept, in place."""
-    if fault[FAULT.hold] == ss.ARMED:
-        fault[FAULT.hold] = ss.HOLDING
-        for k in range(ss.CHANNELS_MAX):
-            fault[FAULT.held + k] = value[k]
-    elif fault[FAULT.hold] == ss.HOLDING:
-        for k in range(ss.CHANNELS_MAX):
-            value[k] = fault[FAULT.held + k]
 
 
 @inlined
@@ -207,7 +189,26 @@ def _sense(
                 while senses.schedule[i, s, SCHEDULE.due] <= tick:
                     logged = _take(s, i, tick, logged, bodies, device[i], noise, senses)
                 senses.soonest[i] = min(senses.soonest[i], senses.schedule[i, s, SCHEDULE.due])
+            for s in range(len(ss.CHANNELS), senses.schedule.shape[1]):
+                while _due(senses.schedule[i, s], tick):
+                    _expose(s, i, tick, bodies, senses)
+                senses.soonest[i] = min(senses.soonest[i], senses.schedule[i, s, SCHEDULE.due])
     return logged
+
+
+@inlined
+def _expose(s: int, i: int, tick: int, bodies: Bodies, senses: Senses) -> None:
+    """Log what a user's sensor is exposed to: its equation is applied after the gate."""
+    place = senses.exposed_count[0]
+    row = senses.exposed[place]
+    _note(senses.exposed_whose[place], s, i, tick)
+    for k in range(STATE.size):
+        row[EXPOSED.state + k] = bodies.state[i, k]
+    for k in range(6):
+        row[EXPOSED.accel + k] = bodies.accel[i, k]
+    for k in range(3):
+        row[EXPOSED.air + k] = bodies.air[i, k]
+    senses.exposed_count[0] += 1
 
 
 @inlined
@@ -279,6 +280,7 @@ def _advance(w: Arrays, ticks: int) -> tuple[int, float, int]:
     logged, least = 0, math.inf
     bodies.touched.fill(0)
     bodies.bumped.fill(0)
+    senses.exposed_count[0] = 0
     line_up(bodies)
     for _ in range(max(ticks, 1)):
         if ticks > 0:

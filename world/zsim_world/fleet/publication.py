@@ -3,6 +3,7 @@
 Per drone: its samples in time order, truth, and status last, which counts them.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +12,11 @@ from numpy.typing import NDArray
 
 from zsim.contract import encoding, flight_messages, messages
 from zsim.contract.encoding import GAP, Layouts, Program, TextTable
-from zsim.contract.framing import KINDS, GateMessages, key_table
+from zsim.contract.framing import GateMessages, key_table
+from zsim.errors import RunError
 from zsim.math.compiled import compiled, inlined, kernel
+from zsim.sensors.catalogue import STOCK
+from zsim.sensors.sensor import Sample, as_fields, field_types, message_type
 from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
 from zsim_world.fleet.kernel import hold
@@ -24,16 +28,12 @@ from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY
 
 MESSAGES = (  # in the order of KINDS
-    messages.Imu,
-    messages.Gps,
-    messages.Mag,
-    messages.Baro,
-    messages.Sonar,
-    messages.Flow,
+    *(kind.message for kind in STOCK.values()),
     (flight_messages.Truth, ROTORS_MIN),
     flight_messages.Status,
 )
-TRUTH, STATUS = 6, 7  # after the six sensors
+STOCK_SENSORS = len(STOCK)
+TRUTH, STATUS = STOCK_SENSORS, STOCK_SENSORS + 1
 WHICH, STAMPS, ENDS = 0, 1, 2  # rows of `columns`
 OTHER_TRUTHS = tuple((flight_messages.Truth, rotors) for rotors in range(ROTORS_MIN + 1, ROTORS_MAX + 1))
 LAYOUTS = Layouts((*MESSAGES, *OTHER_TRUTHS))
@@ -82,6 +82,16 @@ class PublishedState(NamedTuple):
     rotors: NDArray[np.int64]  # (N,), of each
 
 
+class UserPayloads(NamedTuple):
+    """Messages of users' sensors among the M samples of a gate, one behind the other."""
+
+    data: NDArray[np.uint8]
+    ends: NDArray[np.int64]  # (M,), where that of each sample ends, those of stock sensors being empty
+
+
+NO_PAYLOADS = UserPayloads(np.empty(0, dtype=np.uint8), np.empty(0, dtype=np.int64))
+
+
 class PublicationState(NamedTuple):
     """What `publish` works on from gate to gate."""
 
@@ -96,39 +106,48 @@ class GatePublication:
 
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
-        self.table = key_table(fleet.names)
+        self._encoder = UserMessages(fleet) if len(fleet.sensors.names) > STOCK_SENSORS else None
+        self.table = key_table(fleet.names, fleet.sensors.names[STOCK_SENSORS:])
         bodies = fleet.bodies
         self._seen = PublishedArrays(bodies.state, bodies.accel, bodies.energy, bodies.vehicle, fleet.boards.memory)
         self._commanders: list[str | None] = []  # of the last gate
         commanders = np.zeros(fleet.count, dtype=np.int64)
-        counts = np.zeros((fleet.count, len(KINDS)), dtype=np.int64)
+        counts = np.zeros((fleet.count, len(self.table) // fleet.count), dtype=np.int64)
         rotors = np.array(fleet.rotors, dtype=np.int64)
         self._fleetwide = PublishedState(fleet.touching, np.array(fleet.gps_sigma_m), commanders, counts, rotors)
         self._known: dict[str | None, int] = {None: COMMANDER}
         self._words = encoding.words((*firmware.MODES, None))
+        self._room_beside = 0  # bytes of users' messages
         self._make_room(16 * fleet.count)
         self._rehearse()
 
     def _rehearse(self) -> None:
         """Load or compile what the first gate needs."""
         uncounted = self._fleetwide._replace(counts=self._fleetwide.counts.copy())
-        publish(hold(PublicationState(self._words, self._seen, uncounted, self._written)), *self._fleet.sampled, 0)
+        state = PublicationState(self._words, self._seen, uncounted, self._written)
+        publish(hold(state), *self._fleet.sampled, *self._payloads(), 0)
 
     def gate(self, commanders: list[str | None]) -> GateMessages:
         """Return the messages of the gate that the fleet stands at; `commanders` are the names of who flies each."""
         fleet, wide = self._fleet, self._fleetwide
         count = len(fleet.sampled.whose) + 2 * fleet.count
-        if count > self._written.columns.shape[1]:
+        payloads = self._payloads()
+        if count > self._written.columns.shape[1] or len(payloads.data) > self._room_beside:
+            self._room_beside = 2 * len(payloads.data)
             self._make_room(2 * count)
         if commanders != self._commanders:
             wide.commanders[:] = [self._number(commander) for commander in commanders]
             self._commanders = commanders
         out = self._written
-        size = publish(self._held, *fleet.sampled, fleet.t_ns)
+        size = publish(self._held, *fleet.sampled, *payloads, fleet.t_ns)
         which, stamps, ends = out.columns[:, :count].copy()
         seq = int(wide.counts[0, STATUS]) - 1
         data = out.data[:size].tobytes()
         return GateMessages(fleet.t_ns, seq, self.table, which, stamps, ends, data, out.first.tolist())
+
+    def _payloads(self) -> "UserPayloads":
+        """Return what is written already of this gate: the messages of the users' sensors."""
+        return self._encoder.encoded(self._fleetwide.counts) if self._encoder else NO_PAYLOADS
 
     def _number(self, commander: str | None) -> int:
         """Return the number of a word; a new one is learnt."""
@@ -140,8 +159,56 @@ class GatePublication:
 
     def _make_room(self, count: int) -> None:
         columns, first = np.zeros((3, count), dtype=np.int64), np.zeros(self._fleet.count + 1, dtype=np.int64)
-        self._written = PublicationBuffers(columns, first, np.zeros(count * LAYOUTS.room(self._words), dtype=np.uint8))
+        size = count * LAYOUTS.room(self._words) + self._room_beside
+        self._written = PublicationBuffers(columns, first, np.zeros(size, dtype=np.uint8))
         self._held = hold(PublicationState(self._words, self._seen, self._fleetwide, self._written))
+
+
+class UserMessages:
+    """Encodes what users' sensors have sampled."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._fleet = fleet
+        self._fields = [field_types(kind.message) for kind in fleet.sensors.types[STOCK_SENSORS:]]
+        kinds = zip(fleet.sensors.types[STOCK_SENSORS:], self._fields, strict=True)
+        self._messages = [message_type(kind.message.__name__, fields) for kind, fields in kinds]
+
+    def encoded(self, counts: NDArray[np.int64]) -> UserPayloads:
+        """Return the messages of a gate.
+
+        Args:
+            counts: (N, kinds), messages that each key has had.
+        """
+        whose, values = self._fleet.sampled
+        sizes, payloads = np.zeros(len(whose), dtype=np.int64), []
+        seq: dict[tuple[int, int], int] = {}
+        for m in np.flatnonzero(whose[:, WHOSE.sensor] >= STOCK_SENSORS).tolist():
+            s, i, t_ns, t_sample_ns = whose[m].tolist()
+            number = seq.setdefault((i, s), int(counts[i, s + 2]))
+            seq[i, s] += 1
+            payloads.append(messages.encode(self._message(s, i, (t_ns, number, t_sample_ns), values[m])))
+            sizes[m] = len(payloads[-1])
+        return UserPayloads(np.frombuffer(bytearray(b"".join(payloads)), dtype=np.uint8), np.cumsum(sizes))
+
+    def _message(self, s: int, i: int, stamps: tuple[int, int, int], values: NDArray[np.float64]) -> Sample:
+        """Return the message of a reading.
+
+        Raises:
+            RunError: the sensor's conversion fails, or returns what the message has no place for.
+        """
+        kind, settings = self._fleet.sensors.types[s], self._fleet.sensors.settings[i][s]
+        numbers = values[: kind.values].tolist()
+        try:
+            if kind.convert is not None:
+                numbers = kind.convert(numbers, settings, self._fleet.environment)
+            fields = as_fields(numbers, self._fields[s - STOCK_SENSORS])
+            if not all(map(math.isfinite, numbers)):
+                raise ValueError(f"is {list(numbers)}; must be finite")
+        except Exception as error:
+            what = f"{self._fleet.names[i]}: sensors.{self._fleet.sensors.names[s]} at {stamps[0] / 1e9:g} s"
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise RunError(f"{what}: its reading makes no {kind.message.__name__} ({reason})") from error
+        return self._messages[s - STOCK_SENSORS](*stamps, *fields)
 
 
 @inlined
@@ -192,6 +259,21 @@ def _in_order(whose: NDArray, first: NDArray) -> NDArray:
 
 
 @inlined
+def _kind(sensor: int) -> int:
+    """Return the number of a sensor's messages among the kinds: a user's sensors stand behind the status."""
+    return sensor if sensor < STOCK_SENSORS else sensor + 2
+
+
+@inlined
+def _copy(user: UserPayloads, m: int, out: NDArray, start: int) -> int:
+    """Write the message of sample m of a user's sensor, which is encoded already; return where it ends."""
+    begin = user.ends[m - 1] if m > 0 else 0
+    for k in range(user.ends[m] - begin):
+        out[start + k] = user.data[begin + k]
+    return start + user.ends[m] - begin
+
+
+@inlined
 def _fill(
     row: MessageRow,
     m: int,
@@ -203,7 +285,7 @@ def _fill(
     count: int,
 ) -> int:
     """Put sample m of drone i, its truth or its status into a row, and count it; return its kind."""
-    kind = sampled.whose[m, WHOSE.sensor] if m >= 0 else TRUTH if m == -1 else STATUS
+    kind = _kind(sampled.whose[m, WHOSE.sensor]) if m >= 0 else TRUTH if m == -1 else STATUS
     row.ints[0], row.ints[1] = now_ns, wide.counts[i, kind]
     if m >= 0:
         _fill_sample(row, sampled, m, wide.sigma_m[i])
@@ -218,15 +300,16 @@ def _fill(
 
 
 @kernel()
-def publish(held: List, whose: NDArray, values: NDArray, now_ns: int) -> int:
+def publish(held: List, whose: NDArray, values: NDArray, data: NDArray, ends: NDArray, now_ns: int) -> int:
     """Write the messages of a gate, drone by drone, and count them; return how many bytes that were.
 
     Args:
         held: a PublicationState, by `hold`.
         whose, values: of Sampled.
+        data, ends: of UserPayloads.
     """
     words, seen, wide, out = held[0]
-    sampled = Sampled(whose, values)
+    sampled, user = Sampled(whose, values), UserPayloads(data, ends)
     floats = np.zeros(FLOATS)
     row, program = MessageRow(np.zeros(INTS, np.int64), floats, floats.view(np.uint64)), Program(OPS, FIRST, LITERALS)
     drones, kinds = wide.counts.shape
@@ -239,6 +322,9 @@ def publish(held: List, whose: NDArray, values: NDArray, now_ns: int) -> int:
             layout = kind
             if kind == TRUTH and wide.rotors[i] > ROTORS_MIN:
                 layout = STATUS + wide.rotors[i] - ROTORS_MIN
-            at = write(program, words, layout, row.ints, row.bits, out.data, at + GAP)
+            if kind <= STATUS:
+                at = write(program, words, layout, row.ints, row.bits, out.data, at + GAP)
+            else:
+                at = _copy(user, order[place], out.data, at + GAP)
             columns[WHICH, place], columns[STAMPS, place], columns[ENDS, place] = i * kinds + kind, row.ints[0], at
     return at

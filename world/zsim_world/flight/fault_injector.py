@@ -15,6 +15,7 @@ from zsim.scenario.fault_kinds import PROCESS_KILL
 from zsim.scenario.rights import WORLD
 from zsim.scenario.scenario import FAULTS_MAX, Scenario
 from zsim.schema.checker import show
+from zsim.sensors.catalogue import declarations
 from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.flight.barrier import Barrier
 from zsim_world.flight.run_clock import Operation, RunClock
@@ -39,6 +40,7 @@ class FaultInjector:
     ) -> None:
         self._scenario, self._clock, self._barrier, self._outbox = scenario, clock, barrier, outbox
         self._effects = effects
+        self._kinds = fault_kinds.kinds_of(declarations(scenario.drones))
         self._faults: dict[int, Fault] = {}
         self._begun: set[int] = set()
         self._over: set[int] = set()  # ended or cleared, kept for those who still work on gates in which it acted
@@ -184,7 +186,7 @@ class FaultInjector:
         drones = tuple(drone.name for drone in scenario.drones)
         clusters = tuple(cluster.name for cluster in scenario.clusters)
         gating = (p.name for p in self._barrier.participants.values() if p.gating)
-        for path, text in flaws(args, Known(drones, clusters, (*scenario.expected(), *gating))):
+        for path, text in flaws(args, Known(drones, clusters, (*scenario.expected(), *gating), self._kinds)):
             return f"{path or 'args'} {text}"
         immune = self._immunity(args["target"]) if args["kind"] == PROCESS_KILL else None
         if immune:
@@ -205,7 +207,7 @@ class FaultInjector:
 
     def _plan(self, args: Mapping[str, Any], source: str) -> Fault:
         self._count += 1
-        fault = fault_kinds.planned(args, self._count, source, self._clock.now_ns, self._clock.gate_ns)
+        fault = fault_kinds.planned(args, self._count, source, self._clock.now_ns, self._clock.gate_ns, self._kinds)
         self._faults[fault.id] = fault
         return fault
 
@@ -241,7 +243,8 @@ def _arguments(request: ControlRequest) -> dict[str, Any]:
 
 def _is_instant(fault: Fault) -> bool:
     """Tell whether a fault is over as soon as it has begun."""
-    return fault_kinds.KINDS[fault.kind].lasts == "once"
+    kind = fault_kinds.KINDS.get(fault.kind)
+    return kind is not None and kind.lasts == "once"
 
 
 def _end_ns(fault: Fault) -> int:

@@ -6,6 +6,8 @@ What it shares with a replay, first of all who takes part and who is waited for,
 from collections.abc import Callable
 from typing import Any
 
+from msgspec import UNSET
+
 from zsim import CONTRACT, __version__
 from zsim.contract import keys, messages
 from zsim.contract.fingerprint import TruthHash, fingerprint
@@ -13,6 +15,7 @@ from zsim.contract.views import DroneView, ViewDrones
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
+from zsim.sensors.catalogue import declarations
 from zsim_world.fleet.fleet import DivergedError, Fleet
 from zsim_world.fleet.publication import GatePublication
 from zsim_world.flight.command_intake import CommandIntake
@@ -83,6 +86,7 @@ class World(Coordinator):
             scenario_sha256=scenario_file.sha256(text),
             version=__version__,
             fingerprint=fingerprint(),
+            user_sensors=_own_sensors(s) or UNSET,
         )
 
     # What arrives
@@ -164,3 +168,9 @@ class World(Coordinator):
             drones.append(DroneView(name, *pose, rotors, state, battery_percent, commanders[i]))
         wind = tuple(tuple(row) for row in self.fleet.wind_m_s.tolist())
         return ViewDrones(self.now_ns, seq, tuple(drones), wind)
+
+
+def _own_sensors(scenario: Scenario) -> tuple[messages.SensorInfo, ...]:
+    """Return what `world/info` says of the users' sensors."""
+    declared = declarations(scenario.drones)
+    return tuple(messages.SensorInfo(name, each.message, each.fields) for name, each in declared.items())

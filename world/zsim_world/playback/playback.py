@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from zsim.contract import flight_messages, keys, messages, run_messages
-from zsim.contract.framing import KINDS, GateMessages, key_table
+from zsim.contract.framing import KINDS, GateMessages, run_key_table
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import DecodeError, RecordError
 from zsim.record import Recorded, RecordReader
@@ -79,7 +79,8 @@ class Playback(Coordinator):
         self._played = played
         self._operations["seek"] = self._seek
         self.refused_queries = tuple(keys.cluster_control(cluster.name) for cluster in scenario.clusters)
-        self._table = key_table(self.names)
+        self._table = run_key_table(info)
+        self._kinds = len(self._table) // len(self.names)  # of messages about a drone
         self._place = {key: place for place, key in enumerate(self._table)}
         self._views = PlaybackViews(self.names, [cluster.name for cluster in scenario.clusters])
         self._last: dict[str, bytes] = {}
@@ -209,12 +210,12 @@ class Playback(Coordinator):
 
     def _gate_messages(self, t_ns: int, of_drones: list[Recorded]) -> GateMessages:
         """Return what the world published of its drones, as it did: drone by drone, the status last."""
-        of_drones.sort(key=lambda m: self._place[m.key] // len(KINDS))
+        of_drones.sort(key=lambda m: self._place[m.key] // self._kinds)
         which = np.array([self._place[m.key] for m in of_drones])
-        first = np.searchsorted(which // len(KINDS), np.arange(len(self.names) + 1)).tolist()
+        first = np.searchsorted(which // self._kinds, np.arange(len(self.names) + 1)).tolist()
         payloads = [m.payload for m in of_drones]
         if self._recounts:
-            _recount(payloads, which.tolist(), first)
+            _recount(payloads, (which % self._kinds).tolist(), first)
         pairs = list(zip([m.key for m in of_drones], payloads, strict=True))
         stamps = [m.t_ns for m in of_drones]
         return GateMessages.of(t_ns, t_ns // self.clock.gate_ns, self._table, pairs, stamps, first)
@@ -256,13 +257,12 @@ def _is_of(view: str, live: set[str]) -> bool:
     return (kind == "cluster" and f"controller.{whose}" in live) or (kind == "estimates" and whose in live)
 
 
-def _recount(payloads: list[bytes], which: list[int], first: list[int]) -> None:
+def _recount(payloads: list[bytes], kinds: list[int], first: list[int]) -> None:
     """Let each status count what is played of its drone's sensors: what is left out would be waited for."""
     truth, status = KINDS.index("truth"), KINDS.index("status")
     for begin, end in pairwise(first):
-        kinds = [place % len(KINDS) for place in which[begin:end]]
-        for m, kind in enumerate(kinds, begin):
-            if kind == status:
+        for m in range(begin, end):
+            if kinds[m] == status:
                 message = messages.decode_as(flight_messages.Status, payloads[m], "status")
-                count = sum(kind != truth for kind in kinds)
+                count = sum(kind != truth for kind in kinds[begin:end])
                 payloads[m] = messages.encode(msgspec.structs.replace(message, count=count))

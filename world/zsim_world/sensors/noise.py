@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from zsim.math.compiled import compiled, kernel
 from zsim.math.random_streams import stream
 from zsim.scenario.scenario import Scenario
-from zsim.scenario.sensor_presets import BOARD_RATE_HZ
+from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim_world.sensors.sensor_set import CHANNELS, CHANNELS_MAX, NOISE_WIDTH, SENSORS, channels, rate_of
 
 WIDTHS = (*NOISE_WIDTH, 3)  # numbers per row: of a sample, of a gust
@@ -118,13 +118,3 @@ def _rows(scenario: Scenario, gates: int) -> list[int]:
     span = gates * scenario.time.gate_ms / 1000.0
     rates = [max(rate_of(getattr(d.sensors, name), name) for d in scenario.drones) for name in SENSORS]
     return [math.ceil(span * rate) + 2 for rate in (*rates, BOARD_RATE_HZ)]
-
-
-def samples_per_gate(scenario: Scenario) -> int:
-    """Return the most samples that all drones together take in one gate."""
-    span = scenario.time.gate_ms / 1000.0
-    return sum(
-        math.ceil(span * rate_of(getattr(drone.sensors, name), name)) + 1
-        for drone in scenario.drones
-        for name in SENSORS
-    )

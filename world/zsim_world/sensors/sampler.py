@@ -2,7 +2,7 @@
 
 Values in the contract's order of fields. imu: ax, ay, az [m/s^2], gx, gy, gz [rad/s]; gps: latitude, longitude [deg],
 altitude [m], e, n, u [m], ve, vn, vu [m/s]; mag: x, y, z [uT]; baro: pressure [Pa], altitude [m]; sonar: range [m],
-valid 0 or 1; flow: forward, left, up [m/s], quality.
+valid 0 or 1; flow: forward, left, up [m/s], quality. A user's sensor: the numbers of its reading.
 """
 
 from typing import NamedTuple
@@ -15,8 +15,10 @@ from zsim.math import geodetic
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import kernel
 from zsim.scenario.scenario import Scenario
+from zsim.sensors.sensor import SensorType
 from zsim_world.sensors import sensor_set
-from zsim_world.sensors.sensor_set import SENSORS, VALUES, SensorName
+from zsim_world.sensors.sensor_set import SENSORS, FleetSensors
+from zsim_world.sensors.user_sensors import UserSensors
 from zsim_world.state.fleet_arrays import Senses
 
 WHOSE = columns("WhoseColumns", (Field("sensor", "1"), Field("drone", "1"), Field("t", "ns"), Field("t_sample", "ns")))
@@ -26,7 +28,7 @@ VALUE_COLUMNS = 9  # of a GPS fix, with its place on the Earth
 class SensorSample(Struct, frozen=True, gc=False):
     """One measurement; `values` as above."""
 
-    sensor: SensorName
+    sensor: str
     drone: int
     t_ns: int
     t_sample_ns: int
@@ -39,33 +41,53 @@ class Sampled(NamedTuple):
     whose: NDArray[np.int64]  # (M, WHOSE.size)
     values: NDArray[np.float64]  # (M, VALUE_COLUMNS), the first ones of each kind's
 
-    def each(self) -> list[SensorSample]:
+    def each(self, sensors: FleetSensors) -> list[SensorSample]:
         """Return them one by one."""
+        names, sizes = sensors.names, [_size(s, kind) for s, kind in enumerate(sensors.types)]
         rows = zip(self.whose.tolist(), self.values.tolist(), strict=True)
-        return [SensorSample(SENSORS[s], i, t, at, tuple(row[: SIZES[s]])) for (s, i, t, at), row in rows]
+        return [SensorSample(names[s], i, t, at, tuple(row[: sizes[s]])) for (s, i, t, at), row in rows]
 
 
-SIZES = tuple(9 if name == "gps" else size for name, size in zip(SENSORS, VALUES, strict=True))
+def _size(s: int, kind: SensorType) -> int:
+    return VALUE_COLUMNS if s == sensor_set.GPS else kind.values
+
+
 NONE = Sampled(np.empty((0, WHOSE.size), dtype=np.int64), np.empty((0, VALUE_COLUMNS)))
 
 
 class Sampler:
-    """Makes samples of what the kernel logged, and keeps back those that are delayed."""
+    """Makes samples of what the kernel logged, and keeps back those that are delayed.
 
-    def __init__(self, scenario: Scenario) -> None:
+    Args:
+        scenario: resolved.
+        sensors: of its drones.
+        senses: of the kernel.
+    """
+
+    def __init__(self, scenario: Scenario, sensors: FleetSensors, senses: Senses) -> None:
         place = scenario.environment
         self._anchor = geodetic.anchor(place.latitude_deg, place.longitude_deg, place.height_m)
-        self._latency_ns = _latencies(scenario)
-        self._delayed = bool(self._latency_ns.any())
+        self._latency_ns = sensor_set.latencies(sensors)
         self._tick_ns = round(scenario.time.physics_dt_ms * 1_000_000)
+        self._senses = senses
+        own = len(sensors.names) > len(SENSORS)
+        self._user_sensors = UserSensors(scenario, sensors, senses) if own else None
+        self._in_order = not (own or self._latency_ns.any())
         self._later = NONE
 
-    def due(self, senses: Senses, logged: int, now_ns: int) -> Sampled:
-        """Return what falls due up to now of what was logged and of what waits."""
+    def due(self, logged: int, now_ns: int) -> Sampled:
+        """Return what falls due up to now of what was logged and of what waits.
+
+        Raises:
+            RunError: the equation of a user's sensor fails.
+        """
         rows, place = self._anchor
-        whose, value = senses.whose[:logged], senses.value[:logged]
+        whose, value = self._senses.whose[:logged], self._senses.value[:logged]
+        if self._user_sensors is not None:
+            user_whose, user_value = self._user_sensors.readings()
+            whose, value = np.concatenate((whose, user_whose)), np.concatenate((value, user_value))
         fresh = Sampled(*stamped(whose, value, self._latency_ns, self._tick_ns, rows, place))
-        return self._sort_out(fresh, now_ns) if self._delayed else fresh
+        return fresh if self._in_order else self._sort_out(fresh, now_ns)
 
     def _sort_out(self, fresh: Sampled, now_ns: int) -> Sampled:
         index = np.concatenate((self._later.whose, fresh.whose))
@@ -93,9 +115,3 @@ def stamped(
         for k in range(sensor_set.CHANNELS_MAX):
             values[m, first + k] = value[m, k]
     return index, values
-
-
-def _latencies(scenario: Scenario) -> NDArray[np.int64]:
-    """Return t_ns - t_sample_ns of each drone and sensor [ns], (N, 6)."""
-    sensors = [drone.sensors for drone in scenario.drones]
-    return np.array([[round(getattr(each, name).latency_ms * 1_000_000) for name in SENSORS] for each in sensors])

@@ -2,7 +2,7 @@
 
 import math
 from fractions import Fraction
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,16 +10,20 @@ from scipy.special import ndtri
 
 from zsim.math.columns import Field, columns
 from zsim.math.frames import quaternion_from_rpy
-from zsim.scenario.scenario import ErrorModel, MagConfig, Scenario, Sensor, Sensors
-from zsim.scenario.sensor_presets import BOARD_RATE_HZ
+from zsim.scenario.scenario import Scenario
+from zsim.sensors.catalogue import STOCK, Sensors
+from zsim.sensors.imu import BOARD_RATE_HZ
+from zsim.sensors.mag import MagConfig
+from zsim.sensors.sensor import VALUES_MAX, ErrorModel, Sensor, SensorType, noise_sigma
+from zsim.sensors.sonar import SonarConfig
 
-SensorName = Literal["imu", "gps", "mag", "baro", "sonar", "flow"]
-SENSORS: tuple[SensorName, ...] = ("imu", "gps", "mag", "baro", "sonar", "flow")  # the contract's order
-IMU, GPS, MAG, BARO, SONAR, FLOW = range(6)
-CHANNELS = (6, 6, 3, 1, 1, 3)  # numbers with an error of their own
-VALUES = (6, 6, 3, 2, 2, 4)  # numbers of a sample as the kernel gives it (pressure, validity, quality added)
-CHANNELS_MAX = 6
+SENSORS = tuple(STOCK)  # the contract's order; a user's own count on from there
+IMU, GPS, MAG, BARO, SONAR, FLOW = range(len(SENSORS))
+CHANNELS = tuple(kind.width for kind in STOCK.values())  # numbers with an error of their own
+VALUES = tuple(kind.values for kind in STOCK.values())  # numbers of a sample as the kernel gives it
+CHANNELS_MAX = VALUES_MAX
 NOISE_WIDTH = tuple(2 * n + 1 for n in CHANNELS)  # per sample: white, walk of the bias, and one for drop-out
+NEVER = 2**63 - 1  # a tick that does not come
 
 CONFIG = columns(  # of each drone and sensor
     "SensorColumns",
@@ -50,67 +54,90 @@ SCHEDULE = columns(  # sample n falls due at the first physics tick >= n * numer
 DENOMINATOR_MAX = 1000  # of a rate in Hz: any is met within 0.05 %, and n * numerator stays below 2^63
 
 
+class FleetSensors(NamedTuple):
+    """The sensors of all drones: stock ones, then the users' own by name."""
+
+    names: tuple[str, ...]
+    types: tuple[SensorType, ...]
+    settings: list[list[Sensor | None]]  # of each drone, in the order of the names; None: it has no such sensor
+
+
+def fleet_sensors(scenario: Scenario) -> FleetSensors:
+    """Return the sensors of a scenario's drones.
+
+    Raises:
+        DocumentError: a user's module is not there, or is not what the scenario was resolved with.
+    """
+    sections = [list(drone.sensors.sections()) for drone in scenario.drones]
+    kinds = {name: kind for of_drone in sections for name, kind, _ in of_drone if name not in STOCK}
+    names = (*SENSORS, *sorted(kinds))
+    own = [{name: settings for name, _, settings in of_drone} for of_drone in sections]
+    types = STOCK | kinds
+    return FleetSensors(names, tuple(types[n] for n in names), [[each.get(n) for n in names] for each in own])
+
+
 def rate_of(sensor: Sensor, name: str) -> float:
     """Return the rate [Hz] at which the device samples: the IMU always at the board's."""
     return BOARD_RATE_HZ if name == "imu" else sensor.rate_hz
 
 
 def channels(sensors: Sensors, name: str) -> list[ErrorModel]:
-    """Return the error models of the channels of one sensor, in the order of its values and in SI units."""
-    if name == "imu":
-        return [sensors.imu.accel_m_s2] * 3 + [radians(sensors.imu.gyro_deg_s)] * 3
-    if name == "gps":
-        return [sensors.gps.position_m] * 3 + [sensors.gps.velocity_m_s] * 3
-    if name == "mag":
-        return [sensors.mag.field_ut] * 3
-    if name == "flow":
-        return [sensors.flow.velocity_m_s] * 3
-    return [sensors.baro.altitude_m] if name == "baro" else [sensors.sonar.range_m]
+    """Return the error models of the channels of a stock sensor, in the order of its values and in SI units."""
+    return STOCK[name].errors(getattr(sensors, name))
 
 
-def radians(model: ErrorModel) -> ErrorModel:
-    """Return an error model given in degrees as one in radians."""
-    return ErrorModel(**{field: math.radians(getattr(model, field)) for field in ErrorModel.__struct_fields__})
-
-
-def noise_sigma(model: ErrorModel, rate_hz: float) -> float:
-    """Return the standard deviation of a sample's white noise: noise, and density over the device's rate."""
-    return math.hypot(model.noise, model.density * math.sqrt(rate_hz))
-
-
-def config(scenario: Scenario) -> NDArray[np.float64]:
-    """Return errors and mounts of all sensors, shape (N, 6, CONFIG.size)."""
-    table = np.zeros((len(scenario.drones), len(SENSORS), CONFIG.size))
-    for i, drone in enumerate(scenario.drones):
-        for s, name in enumerate(SENSORS):
-            _fill(table[i, s], drone.sensors, name)
+def config(sensors: FleetSensors) -> NDArray[np.float64]:
+    """Return errors and mounts of all sensors, shape (N, S, CONFIG.size)."""
+    table = np.zeros((len(sensors.settings), len(sensors.names), CONFIG.size))
+    for row, own in zip(table, sensors.settings, strict=True):
+        for s, settings in enumerate(own):
+            if settings is not None:
+                _fill(row[s], sensors.names[s], sensors.types[s], settings)
     return table
 
 
-def _fill(row: NDArray[np.float64], sensors: Sensors, name: str) -> None:
-    sensor: Sensor = getattr(sensors, name)
-    rate = rate_of(sensor, name)
-    for k, model in enumerate(channels(sensors, name)):
+def _fill(row: NDArray[np.float64], name: str, kind: SensorType, settings: Sensor) -> None:
+    rate = rate_of(settings, name)
+    for k, model in enumerate(kind.errors(settings)):
         row[CONFIG.white + k] = noise_sigma(model, rate)
         row[CONFIG.walk + k] = model.bias_walk / math.sqrt(rate)
         row[CONFIG.quantum + k] = model.quantum
-    row[CONFIG.p_BS : CONFIG.p_BS + 3] = sensor.mount.position_m
-    row[CONFIG.q_BS : CONFIG.q_BS + 4] = quaternion_from_rpy(np.radians(sensor.mount.rpy_deg))
-    row[CONFIG.drop] = ndtri(sensor.dropout)
-    row[CONFIG.limit_min], row[CONFIG.limit_max] = sensors.sonar.min_m, sensors.sonar.max_m
+    row[CONFIG.p_BS : CONFIG.p_BS + 3] = settings.mount.position_m
+    row[CONFIG.q_BS : CONFIG.q_BS + 4] = quaternion_from_rpy(np.radians(settings.mount.rpy_deg))
+    row[CONFIG.drop] = ndtri(settings.dropout)
+    if isinstance(settings, SonarConfig):
+        row[CONFIG.limit_min], row[CONFIG.limit_max] = settings.min_m, settings.max_m
 
 
-def schedule(scenario: Scenario) -> NDArray[np.int64]:
-    """Return the time tables of all published sensors, shape (N, 6, SCHEDULE.size), with sample 0 due at tick 0."""
-    table = np.zeros((len(scenario.drones), len(SENSORS), SCHEDULE.size), dtype=np.int64)
-    tick_us = round(scenario.time.physics_dt_ms * 1000)
-    for i, drone in enumerate(scenario.drones):
-        for s, name in enumerate(SENSORS):
-            sensor: Sensor = getattr(drone.sensors, name)
-            rate = Fraction(sensor.rate_hz).limit_denominator(DENOMINATOR_MAX)
-            period = 1_000_000 / rate / tick_us  # in ticks
-            table[i, s, SCHEDULE.numerator], table[i, s, SCHEDULE.denominator] = period.numerator, period.denominator
+def schedule(sensors: FleetSensors, tick_ms: float) -> NDArray[np.int64]:
+    """Return the time tables of all published sensors, shape (N, S, SCHEDULE.size), with sample 0 due at tick 0."""
+    table = np.zeros((len(sensors.settings), len(sensors.names), SCHEDULE.size), dtype=np.int64)
+    table[:, :, SCHEDULE.due] = NEVER
+    tick_us = round(tick_ms * 1000)
+    for row, own in zip(table, sensors.settings, strict=True):
+        for s, settings in enumerate(own):
+            if settings is not None:
+                rate = Fraction(settings.rate_hz).limit_denominator(DENOMINATOR_MAX)
+                period = 1_000_000 / rate / tick_us  # in ticks
+                row[s] = (period.numerator, period.denominator, 0, 0)
     return table
+
+
+def latencies(sensors: FleetSensors) -> NDArray[np.int64]:
+    """Return t_ns - t_sample_ns of each drone and sensor [ns], (N, S)."""
+    ms = [[0.0 if settings is None else settings.latency_ms for settings in own] for own in sensors.settings]
+    return np.array([[round(latency * 1_000_000) for latency in own] for own in ms])
+
+
+def samples_per_gate(sensors: FleetSensors, gate_ms: float) -> int:
+    """Return the most samples that all drones together take in one gate."""
+    rates = [
+        rate_of(settings, name)
+        for own in sensors.settings
+        for name, settings in zip(sensors.names, own, strict=True)
+        if settings is not None
+    ]
+    return sum(math.ceil(gate_ms / 1000.0 * rate) + 1 for rate in rates)
 
 
 def heading_sigma(mag: MagConfig, horizontal_ut: float) -> float:

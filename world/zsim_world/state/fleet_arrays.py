@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined
 from zsim.scenario.scenario import Drone, Environment
-from zsim.scenario.sensor_presets import SEA_LEVEL_KG_M3
+from zsim.schema.quantities import SEA_LEVEL_KG_M3
 from zsim.vehicles.vehicle import Vehicle, allocation, mixing
 
 REFERENCE_DENSITY_KG_M3 = SEA_LEVEL_KG_M3  # thrust, torque and drag of a vehicle hold there
@@ -74,6 +74,9 @@ STATE = columns(  # and R speeds [rad/s]
 CLOCK = columns("ClockColumns", (Field("tick", "1"), Field("ticks_per_step", "1")))  # present one; of the board's step
 SPAN = columns("SpanColumns", (Field("dt", "s"), Field("hover", "s"), Field("land", "s")))  # tick; patience in silence
 PLACE = columns("PlaceColumns", (Field("field_W", "uT", 3), Field("height", "m")))  # height of W above the sea
+EXPOSED = columns(  # what a user's sensor is exposed to; accel as in Bodies
+    "ExposedColumns", (Field("state", "STATE", 13), Field("accel", "m/s^2, rad/s^2", 6), Field("air", "m/s", 3))
+)
 STREAMS = columns("StreamColumns", (Field("sensors", "1", 6), Field("wind", "1")))
 
 Row = NDArray[np.float64] | tuple[float, ...]  # of one drone: a view, or loaded
@@ -138,16 +141,19 @@ class NoiseRows(NamedTuple):
 
 
 class Senses(NamedTuple):
-    """N sets of six sensors, and the log of what they sampled in a gate."""
+    """N sets of S sensors, the six stock ones first, and the log of what they sampled in a gate."""
 
     place: NDArray  # (PLACE.size,)
-    config: NDArray  # (N, 6, sensor_set.CONFIG.size)
-    fault: NDArray  # (N, 6, sensor_set.FAULT.size)
-    schedule: NDArray  # int64 (N, 6, sensor_set.SCHEDULE.size)
+    config: NDArray  # (N, S, sensor_set.CONFIG.size)
+    fault: NDArray  # (N, S, sensor_set.FAULT.size)
+    schedule: NDArray  # int64 (N, S, sensor_set.SCHEDULE.size)
     soonest: NDArray  # int64 (N,), tick at which one of the sensors but the IMU falls due
     bias: NDArray  # (N, 6, 6)
     whose: NDArray  # int64 (samples, 3): sensor, drone, tick
     value: NDArray  # (samples, 6)
+    exposed_count: NDArray  # int64 (1,), samples of users' sensors that are to be made of this gate
+    exposed_whose: NDArray  # int64 (user samples, 3), as whose
+    exposed: NDArray  # (user samples, EXPOSED.size)
 
 
 class Arrays(NamedTuple):

@@ -12,7 +12,7 @@ from zsim.math import rotation as rot
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, axpy
-from zsim.scenario.sensor_presets import BOARD_RATE_HZ
+from zsim.sensors.imu import BOARD_RATE_HZ
 from zsim_world.physics.rigid_body import four, put, put_four, vector
 from zsim_world.physics.rotors import free_thrust, lagged
 from zsim_world.state.fleet_arrays import VEHICLE, PerRotor, of, put_of

@@ -18,13 +18,16 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from zsim.math.columns import Field, columns
-from zsim.scenario.scenario import Drone, Environment, ErrorModel, Sensor
-from zsim.scenario.sensor_presets import BOARD_RATE_HZ
+from zsim.scenario.scenario import Drone, Environment
+from zsim.sensors.imu import BOARD_RATE_HZ
+from zsim.sensors.sensor import ErrorModel, Sensor, noise_sigma, scaled
 from zsim.vehicles.vehicle import Vehicle
-from zsim_world.sensors.sensor_set import heading_sigma, noise_sigma, radians
+from zsim_world.sensors.sensor_set import heading_sigma
 from zsim_world.state.fleet_arrays import REFERENCE_DENSITY_KG_M3
 
 Array = NDArray[np.float64]
+
+DEG = math.pi / 180.0  # rad
 
 # Least and largest standard deviation of a sample that the design counts with: none is trusted blindly, and beyond the
 # largest a meter is as good as none
@@ -83,14 +86,14 @@ def gain_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> Array:
     """Return the gains of one drone, shape (GAIN.size,)."""
     s, walks = drone.sensors, vehicle.firmware
     field = math.hypot(*environment.magnetic_field_ut[:2])
-    gyro = _sigma(radians(s.imu.gyro_deg_s), BOARD_RATE_HZ, "gyro")
+    gyro = _sigma(scaled(s.imu.gyro_deg_s, DEG), BOARD_RATE_HZ, "gyro")
     design = ObserverDesign(
         drag_1_s=drone.drag_n_s_m * environment.air_density_kg_m3 / REFERENCE_DENSITY_KG_M3 / drone.mass_kg,
         gravity_m_s2=environment.gravity_m_s2,
         accel=(_sigma(s.imu.accel_m_s2, BOARD_RATE_HZ, "accel"), BOARD_RATE_HZ),
         accel_walk=max(s.imu.accel_m_s2.bias_walk, walks.lift_bias_walk),
         tilt_walk=math.hypot(gyro / math.sqrt(BOARD_RATE_HZ), walks.tilt_walk),
-        gyro_walk=max(radians(s.imu.gyro_deg_s).bias_walk, walks.bias_walk),
+        gyro_walk=max(scaled(s.imu.gyro_deg_s, DEG).bias_walk, walks.bias_walk),
         flow=(_sigma(s.flow.velocity_m_s, s.flow.rate_hz, "flow"), sample_rate(s.flow)),
         baro=(_sigma(s.baro.altitude_m, s.baro.rate_hz, "baro"), sample_rate(s.baro)),
         sonar=(_sigma(s.sonar.range_m, s.sonar.rate_hz, "sonar"), sample_rate(s.sonar)),

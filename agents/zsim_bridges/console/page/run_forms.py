@@ -6,8 +6,9 @@ from typing import Any
 import viser
 
 from zsim.contract.run_messages import GATES_MAX, RATE_MAX
-from zsim.scenario.fault_kinds import KINDS, PROCESS_KILL
+from zsim.scenario.fault_kinds import PROCESS_KILL, FaultKind, kinds_of
 from zsim.scenario.scenario import Scenario
+from zsim.sensors.catalogue import declarations
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.page import operator_input
 
@@ -33,6 +34,7 @@ class FaultForm:
     ) -> None:
         self._client = client
         self._report = report
+        self._kinds = kinds_of(declarations(scenario.drones))
         names = [drone.name for drone in scenario.drones]
         self._drone = gui.add_dropdown("drone", names)
         self._for = gui.add_number("for [s]", DURATION_S, min=0.0, max=1e5, step=1.0, hint="0: until it is cleared")
@@ -58,16 +60,18 @@ class FaultForm:
         self._add(kind, self._drone.value, **parameters)
 
     def _add(self, kind: str, target: str, **parameters: Any) -> None:
-        duration = {"for_s": float(self._for.value)} if self._for.value > 0 and KINDS[kind].lasts != "once" else {}
+        duration = (
+            {"for_s": float(self._for.value)} if self._for.value > 0 and self._kinds[kind].lasts != "once" else {}
+        )
         self._client.request_world("fault_add", kind=kind, target=target, **{**duration, **parameters})
 
     def _any_fault(self, gui: viser.GuiApi, names: list[str]) -> None:
         with gui.add_folder("Any fault", expand_by_default=False):
-            kind = gui.add_dropdown("kind", list(KINDS))
+            kind = gui.add_dropdown("kind", list(self._kinds))
             target = gui.add_text("target", names[0], hint="drone, world, process, or link A/B")
-            help_ = gui.add_markdown(_help(kind.value))
+            help_ = gui.add_markdown(_help(self._kinds[kind.value]))
             text = gui.add_text("parameters", "", hint="NAME: VALUE, NAME: VALUE, …; at_s and for_s too")
-            kind.on_update(lambda _: setattr(help_, "content", _help(kind.value)))
+            kind.on_update(lambda _: setattr(help_, "content", _help(self._kinds[kind.value])))
             gui.add_button("Inject it", color="orange").on_click(
                 lambda _: self._inject(kind.value, target.value, text.value)
             )
@@ -75,7 +79,7 @@ class FaultForm:
     def _inject(self, kind: str, target: str, text: str) -> None:
         try:
             parameters = operator_input.parse_parameters(
-                text, [*TIME_PARAMETERS, *(p.name for p in KINDS[kind].parameters)]
+                text, [*TIME_PARAMETERS, *(p.name for p in self._kinds[kind].parameters)]
             )
         except operator_input.InputError as error:
             self._report(RequestOutcome("fault_add", str(error)))
@@ -83,9 +87,8 @@ class FaultForm:
         self._add(kind, target.strip(), **parameters)
 
 
-def _help(kind: str) -> str:
+def _help(fault: FaultKind) -> str:
     """Return a kind's effect and parameters."""
-    fault = KINDS[kind]
     lines = [f"`{p.name}` {p.description}{f' [{p.unit}]' if p.unit else ''}" for p in fault.parameters]
     return f"<sub>{fault.description}; strikes a {fault.strikes}. {'; '.join(lines)}</sub>"
 

@@ -126,7 +126,7 @@ def test_what_is_refused_takes_no_number():
 
 def test_last_values_are_the_newest_of_what_passed():
     drones = ("drone1", "drone2")
-    values, table = LastValues(drones), key_table(drones)
+    values, table = LastValues(key_table(drones)), key_table(drones)
     said = [
         ("drone/drone1/sensor/imu", messages.encode(Imu(20, 1, 20, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0)))),
         ("drone/drone1/sensor/status", messages.encode(Status(20, 1, "landed", 99.0, False, None, 2))),
@@ -143,7 +143,7 @@ def test_last_values_are_the_newest_of_what_passed():
 
 def test_values_of_ones_own_have_a_bound_in_bytes(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(publications, "OWN_BYTES_MAX", 10)
-    values = LastValues(("drone1",))
+    values = LastValues(key_table(("drone1",)))
     values.add("a", b"12345678")
     values.add("b", b"12", "text/plain")
     values.add("c", b"1")
@@ -160,7 +160,7 @@ def test_an_echo_does_not_undo_what_was_said_since():
         values.add_passed("my/own", payload)
         return [said for _, said in values.matching("my/own")]
 
-    values = LastValues(("drone1",))
+    values = LastValues(key_table(("drone1",)))
     values.add_own("my/own", b"1", "text/plain")
     values.add_own("my/own", b"2", "text/plain")
     assert (heard(b"1"), values.encoding("my/own")) == ([b"2"], "text/plain")
@@ -175,7 +175,7 @@ def test_an_echo_does_not_undo_what_was_said_since():
 
 
 def test_an_echo_that_never_came_is_forgotten_with_the_next():
-    values = LastValues(("drone1",))
+    values = LastValues(key_table(("drone1",)))
     for payload in (b"lost", b"1"):
         values.add_own("my/own", payload)
     values.add_passed("my/own", b"1")

@@ -7,7 +7,7 @@ import pytest
 
 from zsim.contract import flight_messages, messages
 from zsim.math.frames import heading, rpy_from_quaternion
-from zsim.scenario.scenario import Mount
+from zsim.sensors.sensor import Mount
 from zsim_bridges.ros1.driver_messages import OnboardState
 
 S = 1_000_000_000

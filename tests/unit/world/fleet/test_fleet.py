@@ -13,7 +13,7 @@ from zsim.math.frames import geodetic_to_enu
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, DivergedError, Fleet
 from zsim_world.fleet.publication import GatePublication
-from zsim_world.sensors.sensor_set import SENSORS, schedule
+from zsim_world.sensors.sensor_set import SENSORS, fleet_sensors, schedule
 
 GATE_NS = 20_000_000
 WIDTH = {"imu": 6, "gps": 9, "mag": 3, "baro": 2, "sonar": 2, "flow": 4}
@@ -133,7 +133,8 @@ def test_the_sigma_that_a_gps_tells_is_that_of_its_errors():
 
 @pytest.mark.parametrize("rate_hz", [0.01, 0.0137, 999.9])
 def test_rates_from_the_least_to_the_largest_are_kept(rate_hz):
-    numerator, denominator = schedule(scenario(1, sensors={"preset": "paper", "baro": {"rate_hz": rate_hz}}))[0, 3, :2]
+    sensors = fleet_sensors(scenario(1, sensors={"preset": "paper", "baro": {"rate_hz": rate_hz}}))
+    numerator, denominator = schedule(sensors, 2.5)[0, 3, :2]
     tick_s = 0.0025
     assert denominator / numerator / tick_s == pytest.approx(rate_hz, rel=5e-4)
 

@@ -31,7 +31,7 @@ def test_the_sources_of_a_kernel_are_all_that_its_module_imports():
         "rotation",
         "vehicle",
         "obstacle",
-        "sensor_presets",
+        "sensor_set",
         "compiled",
     }
     assert flown <= names("zsim_world.fleet.kernel")

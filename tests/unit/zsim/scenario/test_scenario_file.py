@@ -20,8 +20,9 @@ from zsim.scenario import scenario_file
 from zsim.scenario.overrides import whole_path
 from zsim.scenario.scenario import DRONES_MAX, Scenario
 from zsim.scenario.scenario_file import FAULTS_MAX
-from zsim.scenario.sensor_presets import G_M_S2, PRESETS
+from zsim.schema.quantities import G_M_S2
 from zsim.schema.yaml_file import FILE_SIZE_MAX
+from zsim.sensors.catalogue import PRESETS
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 STEP = SCENARIOS / "step.yaml"

@@ -18,7 +18,7 @@ def passed(*payloads: bytes) -> tuple[list[Any], int]:
     """Return what arrives of some batches, and how often something was refused."""
     refusals: list[None] = []
     link: Any = FakeLink()
-    traffic = Traffic(link, DRONES, lambda: refusals.append(None))
+    traffic = Traffic(link, key_table(DRONES), lambda: refusals.append(None))
     for payload in payloads:
         link.deliver(keys.BATCH, payload)
     return list(traffic.drain()), len(refusals)
@@ -40,6 +40,6 @@ def test_what_cannot_be_read_is_counted_and_the_rest_comes(garbage: bytes) -> No
 
 def test_a_reader_can_be_woken() -> None:
     link: Any = FakeLink()
-    traffic = Traffic(link, DRONES)
+    traffic = Traffic(link, key_table(DRONES))
     traffic.wake()
     assert traffic.receive() == []

@@ -1,0 +1,119 @@
+"""Sensors of a user's own, out of examples/, however a scenario is flown: a line of the scenario, and a module."""
+
+import csv
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from deployment import ROLES, START_S, STEP, Deployment, closing
+from federation import PAIR, Federation, Record
+from forked_commands import ROOT
+from lab import Lab
+
+from zsim.record import RecordReader
+from zsim.scenario import scenario_file
+from zsim_analysis.in_process import fly
+
+EXAMPLES = str(ROOT / "examples")
+SENSORS = (
+    "sensors.my_uwb={module: uwb_range, anchor_m: [0, 0, 2], range_m: {noise: 0.05}}",
+    "sensors.pitot={module: airspeed, latency_ms: 30, mount: {position_m: [0.15, 0, 0]}}",
+)
+DURATION_S = 4.0
+KEYS = ("drone/drone1/sensor/my_uwb", "drone/drone2/sensor/my_uwb", "drone/drone1/sensor/pitot")
+
+
+def options(*fields: str) -> list[str]:
+    return ["--duration", str(DURATION_S), *(word for field in (*SENSORS, *fields) for word in ("--set", field))]
+
+
+@pytest.fixture
+def examples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let modules of examples/ be found, here and in what is started from here."""
+    monkeypatch.setenv("PYTHONPATH", EXAMPLES)
+    monkeypatch.syspath_prepend(EXAMPLES)
+
+
+def check_ranges(record: Record) -> None:
+    """Hold the ranges on record against the truth."""
+    truths = {truth["t_ns"]: truth["position_m"] for truth in record.all("drone/drone1/truth")}
+    ranges = [m for m in record.all(KEYS[0]) if m["t_sample_ns"] in truths]
+    off = [m["range_m"] - np.linalg.norm(np.subtract(truths[m["t_sample_ns"]], (0, 0, 2))) for m in ranges]
+    assert len(off) >= 10 * DURATION_S
+    assert 0.03 < np.std(off) < 0.08
+
+
+def same_samples(first: Record, second: Record) -> bool:
+    return all(first.all(key) and first.all(key) == second.all(key) for key in KEYS)
+
+
+def test_processes_give_the_samples_of_one_process(federation: Federation) -> None:
+    """With modules beside the scenario; exported and flown again where only Python's path has them, or none."""
+    for name in ("uwb_range.py", "airspeed.py"):
+        shutil.copy(ROOT / "examples" / name, federation.folder)
+    federation.run(PAIR, *options()).ends(with_code=0)
+    record = federation.record()
+    check_ranges(record)
+    one = federation.folder / "one"
+    path = federation.write(PAIR)
+    federation.start("run", path, *options(), "--in-process", "--no-report", "--out", str(one)).ends(with_code=0)
+    with RecordReader(one / "run.mcap") as reader:
+        assert same_samples(record, Record(reader))
+        assert Record(reader).sha256() == record.sha256()
+    tables = federation.folder / "tables"
+    federation.start("export", str(one), "--format", "csv", "--out", str(tables)).ends(with_code=0)
+    with (tables / "uwb_range.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == sum(len(record.all(key)) for key in KEYS if key.endswith("my_uwb"))
+    assert float(rows[0]["range_m"]) > 0
+
+
+@pytest.mark.usefixtures("examples")
+def test_a_record_is_flown_again(federation: Federation) -> None:
+    out = federation.folder / "one"
+    path = federation.write(PAIR)
+    federation.start("run", path, *options(), "--in-process", "--no-report", "--out", str(out)).ends(with_code=0)
+    federation.start("rerun", str(out)).ends(with_code=0)
+
+
+@pytest.mark.usefixtures("examples")
+def test_a_sweep_varies_it_and_no_truth_changes(federation: Federation) -> None:
+    path, out = federation.write(PAIR, "pair.yaml"), federation.folder / "sweep"
+    plan = ("--vary", "sensors.my_uwb.range_m.noise=0.1,0.5", "--workers", "1", "--no-report")
+    federation.start("sweep", path, *plan, "--out", str(out), *options()).ends(with_code=0)
+    rows = pq.read_table(out / "sweep.parquet").to_pylist()
+    assert [row["failure"] for row in rows] == [None, None]
+    assert len({row["truth_sha256"] for row in rows}) == 1
+
+
+@pytest.mark.parametrize(
+    ("field", "where"),
+    [
+        ("sensors.my_uwb.module=nowhere.at_all", "sensors.my_uwb.module"),
+        ("sensors.my_uwb.rate_hz=5000", "sensors.my_uwb.rate_hz"),
+    ],
+)
+@pytest.mark.usefixtures("examples")
+def test_a_faulty_one_is_a_line(federation: Federation, field: str, where: str) -> None:
+    run = federation.start("validate", federation.write(PAIR, "pair.yaml"), *options(field)[2:])
+    run.ends(with_code=2)
+    (line,) = [line.text for line in run.lines if line.text.strip()]
+    assert f"pair.yaml: {where} is" in line
+
+
+def test_it_flies_on_several_hosts(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The modules need be only where the scenario is read, and where the world is."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    monkeypatch.setenv("PYTHONPATH", EXAMPLES)
+    lab.environment("h1", PYTHONPATH=EXAMPLES)
+    for host in ("h2", "h3"):
+        lab.environment(host, PYTHONPATH="")
+    alone = tmp_path / "alone.mcap"
+    fly(scenario_file.load(STEP, SENSORS, duration_s=DURATION_S), alone)
+    with closing(Deployment(lab, ROLES)) as deployment, RecordReader(alone) as reader:
+        deployment.up(*options()).ends(with_code=0, within_s=START_S)
+        check_ranges(deployment.record())
+        assert same_samples(deployment.record(), Record(reader))
+        assert deployment.record().sha256() == Record(reader).sha256()

@@ -1,0 +1,142 @@
+"""Declarations of sensors: the stock ones agree with the scenario, a user's own become sections, messages and faults."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zsim.contract import keys, messages
+from zsim.contract.framing import key_table
+from zsim.errors import DecodeError, DocumentError, ScenarioError
+from zsim.scenario import scenario_file
+from zsim.scenario.fault_kinds import kinds_of
+from zsim.scenario.scenario import Scenario
+from zsim.sensors import catalogue
+from zsim.sensors.catalogue import FIELDS, PRESETS, STOCK, declarations
+from zsim.sensors.sensor import as_fields, field_types, message_type
+
+EXAMPLES = Path(__file__).parents[4] / "examples"
+UWB: dict[str, Any] = {"module": "uwb_range", "anchor_m": [1, 2, 3]}
+
+
+@pytest.fixture(autouse=True)
+def examples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+
+
+def scenario(
+    faults: list[dict[str, Any]] | None = None, second: dict[str, Any] | None = None, **sensors: Any
+) -> Scenario:
+    drones: list[dict[str, Any]] = [
+        {"name": "d1", "position_m": [0, 0, 0]},
+        {"name": "d2", "position_m": [3, 0, 0], "sensors": second or {}},
+    ]
+    document = {"name": "t", "duration_s": 1, "drones": drones, "faults": faults or [], "sensors": sensors}
+    return scenario_file.resolve(document)
+
+
+def paths(**given: Any) -> list[str]:
+    """Return where the faults of a scenario are."""
+    with pytest.raises(ScenarioError) as refused:
+        scenario(**given)
+    return [line.removeprefix("scenario: ").split(" ")[0] for line in refused.value.faults]
+
+
+def test_the_stock_sensors_are_those_of_a_scenario():
+    assert tuple(STOCK) == FIELDS[2:] == keys.SENSORS
+    for name, kind in STOCK.items():
+        assert messages.type_of(keys.sensor("d1", name)) is kind.message
+        assert {channel.settings for channel in kind.channels} < set(kind.settings.__struct_fields__)
+        assert kind.presets.keys() == PRESETS.keys()
+
+
+def test_a_section_is_resolved_with_the_defaults_of_its_module():
+    made = scenario(my_uwb=UWB, second={"my_uwb": {"rate_hz": 5, "range_m": {"bias": 0.3}}})
+    first: dict[str, Any]
+    second: dict[str, Any]
+    first, second = ({name: settings for name, _, settings in d.sensors.sections()} for d in made.drones)
+    assert (first["my_uwb"].rate_hz, second["my_uwb"].rate_hz) == (10.0, 5.0)
+    assert first["my_uwb"].anchor_m == second["my_uwb"].anchor_m == (1.0, 2.0, 3.0)
+    assert (second["my_uwb"].range_m.noise, second["my_uwb"].range_m.bias) == (0.0, 0.3)
+
+
+def test_the_resolved_text_is_read_without_the_module(monkeypatch: pytest.MonkeyPatch):
+    made = scenario(my_uwb=UWB, pitot={"module": "airspeed"})
+    text = scenario_file.to_text(made)
+    monkeypatch.setattr(catalogue, "sensor_type", None)
+    again = scenario_file.from_text(text)
+    assert again == made
+    assert scenario_file.to_text(again) == text
+    assert list(declarations(again.drones)) == ["my_uwb", "pitot"]
+
+
+def test_a_module_that_declares_another_message_than_the_scenario_is_refused():
+    text = scenario_file.to_text(scenario(my_uwb=UWB)).replace("range_m: number", "distance_m: number")
+    read = scenario_file.from_text(text)
+    with pytest.raises(DocumentError, match=r"sensors\.my_uwb\.declared"):
+        list(read.drones[0].sensors.sections())
+
+
+@pytest.mark.parametrize(
+    ("sensors", "where"),
+    [
+        ({"lidar": {"rate_hz": 5}}, "sensors.lidar"),
+        ({"own": {"rate_hz": 5}}, "sensors.own"),
+        ({"Uwb": UWB}, "sensors.Uwb"),
+        ({"status": UWB}, "sensors.status"),
+        ({"a": {"module": "nowhere.at_all"}}, "sensors.a.module"),
+        ({"a": {"module": "math"}}, "sensors.a.module"),
+        ({"a": {"module": 5}}, "sensors.a.module"),
+        ({"a": UWB | {"anchor_m": [1, 2]}}, "sensors.a.anchor_m"),
+        ({"a": UWB | {"rate_hz": 5000}}, "sensors.a.rate_hz"),
+        ({"a": UWB | {"range_m": {"noise": -1}}}, "sensors.a.range_m.noise"),
+        ({"a": UWB | {"colour": 1}}, "sensors.a.colour"),
+    ],
+)
+def test_a_faulty_section_is_named_once(sensors: dict[str, Any], where: str):
+    assert paths(**sensors) == [where]
+
+
+def test_one_name_is_one_kind_of_message():
+    assert paths(a=UWB, second={"a": {"module": "airspeed"}})[0].startswith("drones[1].sensors.a")
+
+
+def test_faults_of_a_users_sensor_have_its_unit():
+    kinds = kinds_of(declarations(scenario(my_uwb=UWB, pitot={"module": "airspeed"}).drones))
+    (bias,) = kinds["my_uwb_bias"].parameters
+    assert (bias.name, bias.unit, bias.shape) == ("value_m", "m", "number")
+    assert kinds["pitot_bias"].parameters[0].name == "value_pa"
+    assert {f"my_uwb_{how}" for how in ("dropout", "stuck", "noise")} < kinds.keys()
+    sound = {"kind": "my_uwb_bias", "target": "d1", "at_s": 0.5, "value_m": 2.0}
+    assert scenario([sound], my_uwb=UWB).faults == [sound]
+    assert paths(faults=[{**sound, "kind": "my_uwb_drift"}], my_uwb=UWB) == ["faults[0].kind"]
+    assert paths(faults=[{**sound, "value_m": "far"}], my_uwb=UWB) == ["faults[0].value_m"]
+
+
+def test_messages_are_known_wherever_the_info_of_the_run_is():
+    fields: dict[str, Any] = {"range_m": "number", "place_m": "number[3]", "hits": "whole", "line_of_sight": "flag"}
+    key = keys.sensor("d1", "test_ranger")
+    assert messages.type_of(key) is None
+    messages.register_sensors([messages.SensorInfo("test_ranger", "Ranged", fields)])
+    kind: Any = messages.type_of(key)
+    assert field_types(kind) == fields
+    sent = kind(1, 0, 1, *as_fields([1.5, 1, 2, 3, 7, 1], fields))
+    assert messages.decode(key, messages.encode(sent)) == sent
+    assert (sent.place_m, sent.hits, sent.line_of_sight) == ((1.0, 2.0, 3.0), 7, True)
+    assert messages.encoding(key) == "application/msgpack;Ranged"
+    with pytest.raises(DecodeError, match="range_m"):
+        messages.decode(key, messages.encode(kind(1, 0, 1, float("nan"), (1.0, 2.0, 3.0), 7, True)))
+    assert message_type("Ranged", fields) is kind
+    assert "drone/*/sensor/test_ranger" not in messages.types_by_shape()
+
+
+def test_keys_of_users_sensors_follow_those_of_their_drone():
+    table = key_table(["d1", "d2"], ["my_uwb"])
+    assert len(table) == 2 * 9
+    assert table.index("drone/d1/sensor/my_uwb") == 8
+
+
+@pytest.mark.parametrize("numbers", [[], [1.0], [1.0, 2.0, 3.0, 4.0, 5.0]])
+def test_a_reading_of_another_length_makes_no_message(numbers: list[float]):
+    with pytest.raises(ValueError, match="place_m"):
+        as_fields(numbers, {"range_m": "number", "place_m": "number[3]"})

@@ -1,0 +1,222 @@
+"""The sensors of a drone: the stock ones in the contract's order, and a user's own by the modules that define them."""
+
+import re
+from collections.abc import Iterator
+from functools import cache
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+from msgspec import UNSET, Struct, UnsetType
+
+from zsim.errors import DocumentError
+from zsim.schema import plugin
+from zsim.schema.checker import Fault, faults, show
+from zsim.sensors import baro, flow, gps, imu, mag, sonar
+from zsim.sensors.baro import BaroConfig
+from zsim.sensors.flow import FlowConfig
+from zsim.sensors.gps import GpsConfig
+from zsim.sensors.imu import ImuConfig
+from zsim.sensors.mag import MagConfig
+from zsim.sensors.sensor import VALUES_MAX, Declaration, Sample, Sensor, SensorType, as_fields
+from zsim.sensors.sonar import SonarConfig
+
+STOCK: dict[str, SensorType] = {
+    "imu": imu.SENSOR,
+    "gps": gps.SENSOR,
+    "mag": mag.SENSOR,
+    "baro": baro.SENSOR,
+    "sonar": sonar.SENSOR,
+    "flow": flow.SENSOR,
+}
+
+
+class Sensors(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The sensors of one drone, after preset and overrides."""
+
+    preset: Literal["ardrone2", "paper", "crazyflie2"]
+    as_printed: bool = False
+    """With `paper`: accelerometer 0.35 g as the paper prints it, instead of 0.35 m/s^2."""
+    imu: ImuConfig
+    gps: GpsConfig
+    mag: MagConfig
+    baro: BaroConfig
+    sonar: SonarConfig
+    flow: FlowConfig
+    own: dict[str, dict[str, Any]] | UnsetType = UNSET
+    """A user's sensors, by name: settings with every field, `module` and `declared`. A file has them beside the
+    others, see `flattened`."""
+
+    def sections(self) -> Iterator[tuple[str, SensorType, Sensor]]:
+        """Yield name, type and settings of every sensor; a user's module is imported.
+
+        Raises:
+            DocumentError: a module is not there, or is not what the scenario was resolved with.
+        """
+        for name, kind in STOCK.items():
+            yield name, kind, getattr(self, name)
+        for name, section in ({} if self.own is UNSET else self.own).items():
+            yield name, *_typed(name, section)
+
+
+PRESETS = {
+    preset: {name: kind.presets[preset] for name, kind in STOCK.items()}
+    for preset in ("ardrone2", "paper", "crazyflie2")
+}
+AS_PRINTED = {"imu": imu.AS_PRINTED}
+
+MODULE, DECLARED = "module", "declared"  # what the section of a user's sensor says beside its settings
+FIELDS = tuple(name for name in Sensors.__struct_fields__ if name != "own")
+RESERVED = ("status", "truth", "own", "accel", "gyro", "rotor", "link", "process")  # of keys and of faults' kinds
+NAME = r"[a-z][a-z0-9_]{0,31}"
+NAME_ALLOWED = f"a letter and up to 31 of a-z 0-9 _, none of {', '.join(RESERVED)}"
+
+
+class OwnSections(NamedTuple):
+    """The user's sensors of a `sensors:` section, apart from the rest of it."""
+
+    rest: dict[str, Any]
+    own: dict[str, dict[str, Any]]
+    faults: list[Fault]
+
+
+@cache
+def sensor_type(module_name: str, where: str = "module") -> SensorType:
+    """Return the SENSOR of a user's module.
+
+    Raises:
+        DocumentError: there is none, or it contradicts itself; one line.
+    """
+    sensor = getattr(plugin.load_module(module_name, where), "SENSOR", None)
+    what = f"{where} is {show(module_name)}"
+    if not isinstance(sensor, SensorType):
+        holds = f"whose SENSOR is {show(type(sensor).__name__)}" if sensor else "which defines no SENSOR"
+        raise DocumentError([f"{what}, {holds}; must be a zsim.sensors.sensor.SensorType"])
+    try:
+        _check(sensor)
+    except (TypeError, ValueError) as error:
+        raise DocumentError([f"{what}: SENSOR.{error}"]) from error
+    return sensor
+
+
+def _check(sensor: SensorType) -> None:
+    """Refuse a sensor whose parts do not fit."""
+    for part, base in (("message", Sample), ("settings", Sensor)):
+        kind = getattr(sensor, part)
+        if not (isinstance(kind, type) and issubclass(kind, base)):
+            raise TypeError(f"{part} is {show(str(kind))}; must be a subclass of {base.__name__}")
+    fields = Declaration.of(sensor).fields
+    if sensor.equation is None:
+        raise ValueError("equation is missing; must be a function of truth, settings and environment")
+    if not 1 <= sensor.values <= VALUES_MAX:
+        raise ValueError(f"channels have {sensor.values} numbers with the exact ones; must have 1 to {VALUES_MAX}")
+    for place, channel in enumerate(sensor.channels):
+        if channel.settings not in sensor.settings.__struct_fields__:
+            allowed = f"must be a field of {sensor.settings.__name__}"
+            raise ValueError(f"channels[{place}].settings is {channel.settings!r}; {allowed}")
+        if channel.part:
+            raise ValueError(f"channels[{place}].part is {channel.part!r}; must be left out of a sensor of your own")
+    if sensor.convert is None:
+        try:
+            as_fields([0.0] * sensor.values, fields)
+        except ValueError as error:
+            raise ValueError(f"message {error}, or `convert` must be given") from error
+
+
+def separate(section: dict[str, Any]) -> OwnSections:
+    """Take the user's sensors out of a `sensors:` section, each resolved with all its settings.
+
+    One that is resolved already is taken as it is: whoever reads `world/info` imports nothing that it names.
+    """
+    rest = {name: value for name, value in section.items() if name in FIELDS}
+    own: dict[str, dict[str, Any]] = {}
+    wrong: list[Fault] = []
+    for name, value in section.items():
+        if name in FIELDS:
+            continue
+        if not (isinstance(value, dict) and MODULE in value):
+            allowed = f"allowed: {', '.join(sorted(FIELDS))}, or a sensor of your own with its module"
+            wrong.append((f"{name}"[:40], f"is not known; {allowed}"))
+            continue
+        found = [*_name_faults(name)] or [*_section_faults(name, value)]
+        wrong += found
+        if not found:
+            own[name] = _resolved(value)
+    return OwnSections(rest, dict(sorted(own.items())), wrong)
+
+
+def flattened(sensors: dict[str, Any]) -> dict[str, Any]:
+    """Return a resolved `sensors:` section as a file has it: the user's sensors beside the others."""
+    rest = {name: value for name, value in sensors.items() if name != "own"}
+    return rest | sensors.get("own", {})
+
+
+def declarations(drones: Any) -> dict[str, Declaration]:
+    """Return what is declared of the users' sensors of a scenario's drones, by name, sorted."""
+    sections: dict[str, dict[str, Any]] = {}
+    for drone in drones:
+        sections = own_sections(drone) | sections
+    return {name: msgspec.convert(sections[name][DECLARED], Declaration) for name in sorted(sections)}
+
+
+def own_sections(drone: Any) -> dict[str, dict[str, Any]]:
+    """Return the sections of the users' sensors of a drone, as far as they are sound."""
+    own = drone.sensors.own if drone.sensors is not None else None
+    return own if isinstance(own, dict) else {}
+
+
+def _name_faults(name: str) -> Iterator[Fault]:
+    if not re.fullmatch(NAME, name) or name in RESERVED:
+        yield f"{name}"[:40], f"is no name of a sensor; must be {NAME_ALLOWED}"
+
+
+def _settings_of(section: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in section.items() if name not in (MODULE, DECLARED)}
+
+
+def _section_faults(name: str, section: dict[str, Any]) -> Iterator[Fault]:
+    if DECLARED in section:
+        yield from faults(section[DECLARED], Declaration, f"{name}.{DECLARED}")
+        return
+    module = section[MODULE]
+    if not isinstance(module, str) or not re.fullmatch(plugin.MODULE_NAME, module):
+        yield f"{name}.{MODULE}", f"is {show(module)}; must be package.module"
+        return
+    try:
+        kind = sensor_type(module, f"{name}.{MODULE}")
+    except DocumentError as error:
+        for line in error.faults:
+            path, _, text = line.partition(" ")
+            yield path, text
+        return
+    yield from faults(_settings_of(section), kind.settings, name)
+
+
+def _resolved(section: dict[str, Any]) -> dict[str, Any]:
+    """Return a sound section with every setting, and with what readers need to know of the sensor."""
+    if DECLARED in section:
+        return section
+    kind = sensor_type(section[MODULE])
+    settings = msgspec.convert(_settings_of(section), kind.settings)
+    return {MODULE: section[MODULE], DECLARED: _plain(Declaration.of(kind)), **_plain(settings)}
+
+
+def _plain(value: Struct) -> dict[str, Any]:
+    """Return a struct as a file holds it: maps, lists, texts and numbers."""
+    return msgspec.json.decode(msgspec.json.encode(value))
+
+
+def _typed(name: str, section: dict[str, Any]) -> tuple[SensorType, Sensor]:
+    """Return type and settings of a user's sensor.
+
+    Raises:
+        DocumentError: see `Sensors.sections`.
+    """
+    where = f"sensors.{name}"
+    kind = sensor_type(section[MODULE], f"{where}.{MODULE}")
+    wrong = [f"{path} {text}" for path, text in faults(_settings_of(section), kind.settings, where)]
+    if section[DECLARED] != _plain(Declaration.of(kind)):
+        what = f"{where}.{DECLARED} is not what {section[MODULE]} declares here"
+        wrong.append(f"{what}; the scenario must be resolved with the same version of the module")
+    if wrong:
+        raise DocumentError(wrong)
+    return kind, msgspec.convert(_settings_of(section), kind.settings)

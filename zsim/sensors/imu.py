@@ -1,0 +1,73 @@
+"""The inertial measurement unit: accelerometer and gyroscope of the navigation board."""
+
+import math
+
+from zsim.schema.message import Vector3
+from zsim.schema.quantities import G_M_S2
+from zsim.sensors.sensor import Channel, ErrorModel, Sample, Sensor, SensorType
+
+BOARD_RATE_HZ = 200.0  # Hz, navigation board of the AR.Drone 2.0: its IMU samples and its firmware steps
+
+
+class Imu(Sample, frozen=True):
+    """Specific force [m/s^2] and body rate [rad/s] at the sensor, in its own axes; at rest and level (0, 0, +9.81)."""
+
+    accel_m_s2: Vector3
+    gyro_rad_s: Vector3
+
+
+class ImuConfig(Sensor, frozen=True, kw_only=True):
+    accel_m_s2: ErrorModel = ErrorModel()
+    gyro_deg_s: ErrorModel = ErrorModel()
+
+
+PRESETS = {
+    "ardrone2": {
+        "rate_hz": BOARD_RATE_HZ,
+        "accel_m_s2": {
+            "noise": 0.031,  # m/s^2, mean of three axes over 1200 s static
+            "bias": 0.05,  # m/s^2, left after six-position calibration: 2 to 3 LSB of 19 mm/s^2
+            "bias_walk": 0.0005,  # m/s^2/sqrt(s), from an Allan minimum of 0.003-0.005 m/s^2 at 10-30 s
+            "quantum": 0.019,  # m/s^2 per LSB, 12 bits
+        },
+        "gyro_deg_s": {
+            "noise": 0.06,  # deg/s at 200 Hz, 100 s static
+            "bias": 0.1,  # deg/s, left after the drone's own offset removal at start
+            "bias_walk": 0.003,  # deg/s/sqrt(s), from an Allan minimum of 0.003-0.006 deg/s at 3-5 s
+            "quantum": 0.061,  # deg/s per LSB: 16.4 LSB/(deg/s)
+        },
+    },
+    "paper": {
+        "rate_hz": BOARD_RATE_HZ,
+        "accel_m_s2": {"noise": 0.35},  # m/s^2, default of the paper's base simulator (tum_simulator)
+        "gyro_deg_s": {"noise": 0.01},  # deg/s, section VI
+    },
+    "crazyflie2": {
+        "rate_hz": BOARD_RATE_HZ,
+        "accel_m_s2": {
+            "density": 0.0017,  # m/s^2/sqrt(Hz), 175 ug/sqrt(Hz) of the BMI088
+            "bias": 0.05,  # m/s^2, left after calibration; chosen as the AR.Drone's
+            "bias_walk": 0.0005,  # m/s^2/sqrt(s), chosen as the AR.Drone's
+            "quantum": 0.0072,  # m/s^2 per LSB: 24 g in 16 bits
+        },
+        "gyro_deg_s": {
+            "density": 0.014,  # deg/s/sqrt(Hz), BMI088
+            "bias": 0.1,  # deg/s, left after the firmware's own calibration at start; chosen as the AR.Drone's
+            "bias_walk": 0.003,  # deg/s/sqrt(s), chosen as the AR.Drone's
+            "quantum": 0.061,  # deg/s per LSB: 2000 deg/s in 16 bits
+        },
+    },
+}
+AS_PRINTED = {"accel_m_s2": {"noise": 0.35 * G_M_S2}}  # m/s^2, section VI: "std errors 0.35 g"
+
+# The greatest biases are chosen: about ten times what any such sensor can show, so that only slips are refused.
+SENSOR = SensorType(
+    label="IMU",
+    message=Imu,
+    settings=ImuConfig,
+    channels=(
+        Channel("accel_m_s2", "m/s^2", 3, 1.0, "accel", "accelerometer", "in the sensor's axes", 500.0),
+        Channel("gyro_deg_s", "deg/s", 3, math.pi / 180.0, "gyro", "gyroscope", "in the sensor's axes", 5700.0),
+    ),
+    presets=PRESETS,
+)

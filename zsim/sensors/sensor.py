@@ -1,0 +1,276 @@
+"""What a sensor is: its message, its settings, its channels with errors, and for a user's own one its equation.
+
+    SENSOR = SensorType(message=Airspeed, settings=AirspeedConfig, channels=(...), equation=dynamic_pressure)
+
+The scenario's section, validation, defaults, latency, noise, faults, key, schema, record and counts follow from it.
+"""
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+from msgspec import inspect as types
+from numpy.typing import NDArray
+
+from zsim.schema.message import Message, Number, Whole
+from zsim.schema.quantities import Fraction, NonNegative, Vector3
+
+VALUES_MAX = 6  # numbers of one reading
+RateHz = Annotated[float, Meta(ge=0.01, le=1000)]
+FieldType = Literal[
+    "number", "whole", "flag", "number[1]", "number[2]", "number[3]", "number[4]", "number[5]", "number[6]"
+]
+"""Type of a message's field: a finite number, some of them, a whole number, or true and false."""
+FieldName = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,31}\Z")]
+MessageName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,31}\Z")]
+
+
+class ErrorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Error of one channel, in the channel's unit."""
+
+    noise: NonNegative = 0.0
+    """White, standard deviation per sample."""
+    density: NonNegative = 0.0
+    """White, per sqrt(Hz): adds density * sqrt(rate) in quadrature to `noise`."""
+    bias: NonNegative = 0.0
+    """Constant over a run, standard deviation over runs, per axis."""
+    bias_walk: NonNegative = 0.0
+    """Random walk of the bias, per sqrt(s)."""
+    quantum: NonNegative = 0.0
+    """Step of the converter; 0 = none."""
+
+
+class Mount(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Pose of the sensor in the body, X_BS."""
+
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    rpy_deg: Vector3 = (0.0, 0.0, 0.0)
+
+
+class Sensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Settings that all sensors share."""
+
+    rate_hz: RateHz
+    latency_ms: Annotated[float, Meta(ge=0, le=10_000)] = 0.0
+    dropout: Fraction = 0.0
+    """Probability that a sample is lost, independent per sample."""
+    mount: Mount = Mount()
+
+
+class Sample(Message, frozen=True):
+    """What every sensor's message starts with; `t_sample_ns` is the instant of the measurement."""
+
+    t_sample_ns: Whole
+
+
+class Channel(Struct, frozen=True, omit_defaults=True):
+    """Numbers of a reading that share an ErrorModel.
+
+    Attributes:
+        settings: field of the settings that has the ErrorModel.
+        unit: of the ErrorModel, and of a bias that a fault adds.
+        width: how many numbers.
+        to_si: what a unit is in that of the equation's values.
+        part: first word of its fault kinds; empty for the sensor as a whole.
+        label: what the part is called.
+        axes: what the bias of a fault is along, or of.
+        bias_max: largest that a fault may add, in each number.
+    """
+
+    settings: FieldName
+    unit: str = "1"
+    width: Annotated[int, Meta(ge=1, le=VALUES_MAX)] = 1
+    to_si: float = 1.0
+    part: str = ""
+    label: str = ""
+    axes: str = "of each number"
+    bias_max: float = 1e6
+
+
+class SensorTruth(Struct, frozen=True):
+    """What a sensor is exposed to at one instant. W: world (east, north, up); B: body; S: sensor.
+
+    Attributes:
+        t_s: simulated time [s].
+        p_WB, v_WB, a_WB: position [m], velocity [m/s], acceleration [m/s^2] of the centre of mass in W, (3,).
+            The acceleration is that of the board's last step, at most 5 ms old.
+        R_WB: rotation, body components to world components, (3, 3).
+        w_WB_B, alpha_B: body rate [rad/s] and its derivative [rad/s^2] in B, (3,).
+        air_W: velocity of the air at the drone in W, steady wind, gusts and the wash of others [m/s], (3,).
+        p_BS, R_BS: pose of the sensor in the body, [m] and sensor components to body components.
+    """
+
+    t_s: float
+    p_WB: NDArray[np.float64]
+    v_WB: NDArray[np.float64]
+    a_WB: NDArray[np.float64]
+    R_WB: NDArray[np.float64]
+    w_WB_B: NDArray[np.float64]
+    alpha_B: NDArray[np.float64]
+    air_W: NDArray[np.float64]
+    p_BS: NDArray[np.float64]
+    R_BS: NDArray[np.float64]
+
+    @property
+    def p_WS(self) -> NDArray[np.float64]:
+        """Position of the sensor in W [m]: p_WB + R_WB p_BS."""
+        return self.p_WB + self.R_WB @ self.p_BS
+
+    @property
+    def v_WS(self) -> NDArray[np.float64]:
+        """Velocity of the sensor in W [m/s]: v_WB + R_WB (w × p_BS)."""
+        return self.v_WB + self.R_WB @ np.cross(self.w_WB_B, self.p_BS)
+
+    @property
+    def a_WS(self) -> NDArray[np.float64]:
+        """Acceleration of the sensor in W [m/s^2]: a_WB + R_WB (alpha × p_BS + w × (w × p_BS))."""
+        turning = np.cross(self.w_WB_B, np.cross(self.w_WB_B, self.p_BS))
+        return self.a_WB + self.R_WB @ (np.cross(self.alpha_B, self.p_BS) + turning)
+
+    @property
+    def R_WS(self) -> NDArray[np.float64]:
+        """Rotation, sensor components to world components, (3, 3)."""
+        return self.R_WB @ self.R_BS
+
+
+Equation = Callable[[SensorTruth, Any, Any], Sequence[float]]
+"""(truth, settings, environment of the scenario) -> the values of all channels in order, then those without error."""
+Conversion = Callable[[Sequence[float], Any, Any], Sequence[Any]]
+"""(reading, settings, environment) -> the numbers of the message's fields in order."""
+
+
+class SensorType(Struct, frozen=True, kw_only=True):
+    """A kind of sensor.
+
+    Attributes:
+        message: subclass of Sample; its own fields are numbers, tuples of numbers, whole numbers, or true and false.
+        settings: subclass of Sensor, with an ErrorModel for each channel.
+        channels: in the order of the equation's values.
+        exact: values after those of the channels, without an error of their own.
+        label: what the sensor is called in tables; empty for its name in the scenario.
+        equation: of a user's sensor. Those of the stock ones are compiled in zsim_world.sensors.
+        convert: of a user's sensor, from the reading to the message; None: the values are the message's numbers.
+        presets: of a stock sensor, its section by the name of the preset.
+    """
+
+    message: type[Sample]
+    settings: type[Sensor]
+    channels: tuple[Channel, ...]
+    exact: int = 0
+    label: str = ""
+    equation: Equation | None = None
+    convert: Conversion | None = None
+    presets: dict[str, dict[str, Any]] = {}
+
+    @property
+    def width(self) -> int:
+        """Numbers with an error of their own."""
+        return sum(channel.width for channel in self.channels)
+
+    @property
+    def values(self) -> int:
+        """Numbers of a reading."""
+        return self.width + self.exact
+
+    def errors(self, settings: Sensor) -> list[ErrorModel]:
+        """Return the error model of every number that has one, in SI units."""
+        models = [scaled(getattr(settings, channel.settings), channel.to_si) for channel in self.channels]
+        return [model for model, channel in zip(models, self.channels, strict=True) for _ in range(channel.width)]
+
+
+class Declaration(Struct, frozen=True, omit_defaults=True):
+    """What readers of a run need to know of a user's sensor, without its module: it stands in the resolved scenario."""
+
+    message: MessageName
+    fields: dict[FieldName, FieldType]
+    channels: tuple[Channel, ...]
+    label: str = ""
+
+    @classmethod
+    def of(cls, kind: SensorType) -> "Declaration":
+        """Return what is to be known of a sensor."""
+        return cls(kind.message.__name__, field_types(kind.message), kind.channels, kind.label)
+
+
+def scaled(model: ErrorModel, to_si: float) -> ErrorModel:
+    """Return an error model in SI units, given what its unit is in them."""
+    if to_si == 1.0:
+        return model
+    return ErrorModel(**{field: getattr(model, field) * to_si for field in ErrorModel.__struct_fields__})
+
+
+def noise_sigma(model: ErrorModel, rate_hz: float) -> float:
+    """Return the standard deviation of a sample's white noise: noise, and density over the device's rate."""
+    return math.hypot(model.noise, model.density * math.sqrt(rate_hz))
+
+
+# Messages by the types of their fields
+
+_WORDS = {types.FloatType: "number", types.IntType: "whole", types.BoolType: "flag"}
+_TYPES: dict[str, Any] = {"number": Number, "whole": Whole, "flag": bool}
+
+
+def field_types(message: type[Sample]) -> dict[FieldName, FieldType]:
+    """Return the types of a message's own fields.
+
+    Raises:
+        TypeError: a field is of a type that no sensor's message has.
+    """
+    info: Any = types.type_info(message)
+    known = len(Sample.__struct_fields__)
+    return {field.name: _word(field.type, f"{message.__name__}.{field.name}") for field in info.fields[known:]}
+
+
+def _word(info: types.Type, where: str) -> Any:
+    if isinstance(info, types.TupleType) and all(isinstance(item, types.FloatType) for item in info.item_types):
+        return f"number[{len(info.item_types)}]"
+    if type(info) not in _WORDS:
+        raise TypeError(f"{where} is of another type; must be a number, a tuple of numbers, a whole number or a bool")
+    return _WORDS[type(info)]
+
+
+def message_type(name: str, fields: Mapping[str, str]) -> type[Sample]:
+    """Return the message with these fields: the same class for the same name and fields."""
+    return _message_type(name, tuple(fields.items()))
+
+
+@cache
+def _message_type(name: str, fields: tuple[tuple[str, str], ...]) -> type[Sample]:
+    own: Any = [(field, _annotation(word)) for field, word in fields]
+    made: Any = msgspec.defstruct(name, own, bases=(Sample,), frozen=True, gc=False)
+    return made
+
+
+def _annotation(word: str) -> Any:
+    count = re.fullmatch(r"number\[(\d)\]", word)
+    return tuple[(Number,) * int(count[1])] if count else _TYPES[word]  # type: ignore[misc]
+
+
+def as_fields(numbers: Sequence[Any], fields: Mapping[str, str]) -> list[Any]:
+    """Return numbers, one behind the other, as the values of a message's fields.
+
+    Raises:
+        ValueError: they are more or fewer than the fields have.
+    """
+    values, at = [], 0
+    for word in fields.values():
+        count = int(word[7:-1]) if word.startswith("number[") else 1
+        taken = numbers[at : at + count]
+        at += len(taken)
+        values.append(_value(word, taken) if len(taken) == count else None)
+    if at != len(numbers) or None in values:
+        raise ValueError(f"is given {len(numbers)} numbers; must be given those of {', '.join(fields)}")
+    return values
+
+
+def _value(word: str, taken: Sequence[Any]) -> Any:
+    if word == "flag":
+        return bool(taken[0])
+    if word == "whole":
+        return int(taken[0])
+    return float(taken[0]) if word == "number" else tuple(map(float, taken))
