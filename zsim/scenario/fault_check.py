@@ -5,7 +5,7 @@ from difflib import SequenceMatcher
 from typing import Any, NamedTuple
 
 from zsim.contract import keys
-from zsim.scenario.fault_kinds import KINDS, FaultKind, FaultParameter, expected
+from zsim.scenario.fault_kinds import KINDS, ROTOR, FaultKind, FaultParameter, expected
 from zsim.scenario.role_table import AGENTS
 from zsim.schema.checker import Fault as Flaw
 from zsim.schema.checker import show
@@ -17,11 +17,15 @@ COMMON = ("kind", "target", "at_s", "for_s")  # what every fault may say; the re
 
 
 class Known(NamedTuple):
-    """Names that a target may have; `processes` are those that take part, beside estimators and controllers."""
+    """Names that a target may have; `processes` are those that take part, beside estimators and controllers.
+
+    `rotors` are those of each drone; none of one whose vehicle is a module that is not read here.
+    """
 
     drones: tuple[str, ...]
     clusters: tuple[str, ...]
     processes: tuple[str, ...] = ()
+    rotors: Mapping[str, tuple[str, ...]] = {}
 
 
 def flaws(given: Any, known: Known) -> Iterator[Flaw]:
@@ -41,7 +45,7 @@ def flaws(given: Any, known: Known) -> Iterator[Flaw]:
             yield str(field)[:40], f"is not known; allowed: {allowed} ({name})"
     found = [*_target_flaws(given, name, kind, known), *_time_flaws(given, name, kind)]
     for parameter in kind.parameters:
-        found += _parameter_flaws(given, parameter, known)
+        found += _parameter_flaws(given, _of_target(parameter, given.get("target"), known), known)
     for path, text in found:
         yield path, text if text.endswith(f"({name})") else f"{text} ({name})"
 
@@ -127,6 +131,14 @@ def _time_flaws(given: Mapping[str, Any], name: str, kind: FaultKind) -> Iterato
         yield "for_s", f"is {show(for_s)}; must be > 0 and <= {FOR_EVER_S:g} s"
 
 
+def _of_target(p: FaultParameter, target: Any, known: Known) -> FaultParameter:
+    """Return a parameter as a target has it: its rotors are those of its vehicle, or have any name."""
+    rotors = known.rotors.get(target) if p is ROTOR and isinstance(target, str) else None
+    if rotors is None:
+        return p
+    return p._replace(choices=(*rotors, "all")) if rotors else p._replace(shape="word")
+
+
 def _parameter_flaws(given: Mapping[str, Any], p: FaultParameter, known: Known) -> Iterator[Flaw]:
     value = given.get(p.name)
     if value is None:
@@ -137,6 +149,8 @@ def _parameter_flaws(given: Mapping[str, Any], p: FaultParameter, known: Known) 
         sound = isinstance(value, list | tuple) and len(value) == 3 and all(_within(x, p.least, p.most) for x in value)
     elif p.shape == "choice":
         sound = value in p.choices
+    elif p.shape == "word":
+        sound = isinstance(value, str)
     elif p.shape == "flag":
         sound = isinstance(value, bool)
     elif p.shape == "places":

@@ -2,7 +2,7 @@
 
 `ardrone2` is measured on a real AR.Drone 2.0 standing still unless said otherwise; `paper` is the set-up of
 Mas, Curi and Sánchez Peña, "Open-source Multi-UAV Simulator for the ROS Environment", section VI; `crazyflie2` is a
-Crazyflie 2.1 with its flow deck, in a room with Bitcraze's radio positioning in place of GPS.
+Crazyflie 2.1 with its flow deck and the magnetometer of the 2.0, in a room with radio positioning in place of GPS.
 """
 
 from typing import Any
@@ -76,29 +76,30 @@ PRESETS: dict[str, dict[str, Any]] = {
         "imu": {
             "rate_hz": BOARD_RATE_HZ,
             "accel_m_s2": {
-                "density": 0.0017,  # m/s^2/sqrt(Hz), 175 ug/sqrt(Hz) of the BMI088
+                "density": 0.0017,  # m/s^2/sqrt(Hz), 175 ug/sqrt(Hz) (data sheet of the BMI088)
                 "bias": 0.05,  # m/s^2, left after calibration; chosen as the AR.Drone's
                 "bias_walk": 0.0005,  # m/s^2/sqrt(s), chosen as the AR.Drone's
-                "quantum": 0.0072,  # m/s^2 per LSB: 24 g in 16 bits
+                "quantum": 0.0072,  # m/s^2 per LSB: 24 g in 16 bits (crazyflie-firmware, sensors_bmi088_bmp3xx.c)
             },
             "gyro_deg_s": {
-                "density": 0.014,  # deg/s/sqrt(Hz), BMI088
+                "density": 0.014,  # deg/s/sqrt(Hz) (data sheet of the BMI088)
                 "bias": 0.1,  # deg/s, left after the firmware's own calibration at start; chosen as the AR.Drone's
                 "bias_walk": 0.003,  # deg/s/sqrt(s), chosen as the AR.Drone's
-                "quantum": 0.061,  # deg/s per LSB: 2000 deg/s in 16 bits
+                "quantum": 0.061,  # deg/s per LSB: 2000 deg/s in 16 bits (crazyflie-firmware, likewise)
             },
         },
         "gps": {
-            "rate_hz": 10.0,  # Hz, chosen: what the firmware's filter of a loco positioning deck is read at
-            "position_m": {"noise": 0.1},  # m, Bitcraze: accuracy of loco positioning about 10 cm
-            "velocity_m_s": {"noise": 0.2},  # m/s, chosen: its filter's
+            "rate_hz": 10.0,  # Hz, chosen
+            "position_m": {"noise": 0.1},  # m, chosen: what ultra-wideband ranging to anchors in a room usually reaches
+            "velocity_m_s": {"noise": 0.2},  # m/s, chosen
         },
-        "mag": {"rate_hz": SLOW_RATE_HZ, "field_ut": {"noise": 0.3, "quantum": 0.15}},  # AK8963: 0.15 uT per LSB
+        # 0.15 uT per LSB: AK8963 of the Crazyflie 2.0; the 2.1 has no magnetometer (crazyflie-firmware, issue 701)
+        "mag": {"rate_hz": SLOW_RATE_HZ, "field_ut": {"noise": 0.3, "quantum": 0.15}},  # noise: chosen as the AK8975's
         "baro": BARO,
         "sonar": {
             "rate_hz": 25.0,  # Hz, chosen as the AR.Drone's
-            "range_m": {"noise": 0.02},  # m, VL53L1x of the flow deck: ranging error 20 mm
-            "max_m": 4.0,  # m, likewise
+            "range_m": {"noise": 0.02},  # m, chosen, with floor and tilt; crazyflie-firmware, zranger2.c, has 2.5 mm
+            "max_m": 4.0,  # m, VL53L1x; at 4 m zranger2.c has 0.2 m
         },
         "flow": {"rate_hz": 25.0, "velocity_m_s": {"noise": 0.1}},  # chosen; nothing is published for the deck
     },

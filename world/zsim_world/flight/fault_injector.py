@@ -184,7 +184,8 @@ class FaultInjector:
         drones = tuple(drone.name for drone in scenario.drones)
         clusters = tuple(cluster.name for cluster in scenario.clusters)
         gating = (p.name for p in self._barrier.participants.values() if p.gating)
-        for path, text in flaws(args, Known(drones, clusters, (*scenario.expected(), *gating))):
+        known = Known(drones, clusters, (*scenario.expected(), *gating), rotors=self._effects.rotors)
+        for path, text in flaws(args, known):
             return f"{path or 'args'} {text}"
         immune = self._immunity(args["target"]) if args["kind"] == PROCESS_KILL else None
         if immune:

@@ -69,7 +69,7 @@ def wrench(
         total += force
         mx += y * unit * force
         my -= x * unit * force
-        mz += turn * (row[VEHICLE.torque] * square + inertia * ((command - speed) * slew))
+        mz += (turn * row[VEHICLE.torque]) * square + (turn * inertia) * ((command - speed) * slew)
         spin += turn * inertia * speed
     return total, (mx + w_WB_B[1] * spin, my - w_WB_B[0] * spin, mz)
 
@@ -104,7 +104,8 @@ def mix(row: Row, rotors: PerRotor, thrust_n: float, moment: Vector, speeds: Per
     for r in range(len(rotors.each)):
         force = mean + of(rotors, ROTOR.roll, r) * roll + of(rotors, ROTOR.pitch, r) * pitch
         share = sign * of(rotors, ROTOR.yaw, r)
-        most = min(most, (high - force if share > 0.0 else low - force) / share if share != 0.0 else most)
+        room = (high - force if share > 0.0 else low - force) * (sign * of(rotors, ROTOR.yaw_inverse, r))
+        most = min(most, room if share != 0.0 else most)
     for r in range(len(rotors.each)):
         force = mean + of(rotors, ROTOR.roll, r) * roll + of(rotors, ROTOR.pitch, r) * pitch
         put_of(speeds, r, math.sqrt(max(force + sign * of(rotors, ROTOR.yaw, r) * most, low) / thrust))

@@ -36,8 +36,8 @@ VEHICLE = columns(
         Field("air_density", "kg/m^3"),
         Field("rotor_radius", "m"),
         Field("rotor_inertia", "kg m^2"),
-        Field("rotor_count", "1"),
-        Field("rotor_share", "1"),  # 1 / rotor_count
+        Field("rotor_share", "1"),  # 1 / number of its rotors
+        Field("jet_start", "m"),  # width of the jet where it leaves the rotors
         Field("contact_reach", "m"),  # farther than any contact point from the centre of mass
         Field("stand_height", "m"),  # of the centre of mass of a standing drone
         Field("foot_stiffness", "N/m"),  # per contact point
@@ -66,6 +66,7 @@ ROTOR = columns(  # groups of what is known of each rotor
         Field("roll", "1"),  # thrust per moment over rotor_unit
         Field("pitch", "1"),
         Field("yaw", "1"),  # thrust per moment over torque per thrust
+        Field("yaw_inverse", "1"),  # 0 where yaw is
     ),
 )
 STATE = columns(  # and R speeds [rad/s]
@@ -198,7 +199,8 @@ def vehicle_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> NDA
     row[VEHICLE.gravity], row[VEHICLE.air_density] = environment.gravity_m_s2, environment.air_density_kg_m3
     row[VEHICLE.rotor_radius] = vehicle.rotor_radius_m * (drone.thrust_n_s2 / vehicle.thrust_n_s2) ** 0.25
     row[VEHICLE.rotor_inertia] = vehicle.rotor_inertia_kg_m2 * drone.torque_nm_s2 / vehicle.torque_nm_s2
-    row[VEHICLE.rotor_count], row[VEHICLE.rotor_share] = len(vehicle.rotors), 1.0 / len(vehicle.rotors)
+    row[VEHICLE.rotor_share] = 1.0 / len(vehicle.rotors)
+    row[VEHICLE.jet_start] = math.sqrt(len(vehicle.rotors)) * row[VEHICLE.rotor_radius]
     row[VEHICLE.contact_reach] = frame.reach_m * size
     row[VEHICLE.stand_height] = size * (frame.foot_depth_m - frame.foot_sag_m)
     stiffness = drone.mass_kg * environment.gravity_m_s2 / (4.0 * size * frame.foot_sag_m)
@@ -223,4 +225,6 @@ def rotor_row(vehicle: Vehicle, drone: Drone, rotors: int) -> NDArray[np.float64
     groups[ROTOR.x, :count], groups[ROTOR.y, :count], groups[ROTOR.turn, :count] = -minus_pitch, roll, turn
     groups[ROTOR.low, :count], groups[ROTOR.high, :count] = drone.rotor_min_rad_s, drone.rotor_max_rad_s
     groups[ROTOR.roll : ROTOR.yaw + 1, :count] = mixing(vehicle).T
+    yaw = groups[ROTOR.yaw]
+    groups[ROTOR.yaw_inverse] = np.divide(1.0, yaw, out=np.zeros(rotors), where=yaw != 0.0)
     return groups.ravel()

@@ -14,7 +14,7 @@ from zsim.scenario.fault_kinds import KINDS, FaultParameter, acts, expected, pla
 from zsim.scenario.scenario_file import resolve
 
 GATE_NS = 20_000_000
-KNOWN = Known(("drone1", "drone2"), ("main",), ("my.filter",))
+KNOWN = Known(("drone1", "drone2"), ("main",), ("my.filter",), {"drone2": ("r1", "r2")})
 TARGETS = {
     "drone": "drone1",
     "world": "world",
@@ -90,6 +90,7 @@ def test_every_parameter_is_checked(kind: str, bad: Any):
         (sound("gps_dropout", at_s=-1), "at_s is -1; must be from 0 to 1e+06 s (gps_dropout)"),
         (sound("gps_dropout", for_s=0), "for_s is 0; must be > 0 and <= 1e+06 s (gps_dropout)"),
         (sound("gps_dropout", value=3), "value is not known; allowed: kind, target, at_s, for_s, probability (gps_dropout)"),
+        (sound("rotor_stuck", target="drone2", rotor="front_left"), "rotor is 'front_left'; must be one of r1, r2, all (rotor_stuck)"),
         (sound("rotor_stuck", rotor="left"), "rotor is 'left'; must be one of front_left, front_right, rear_right, rear_left, all (rotor_stuck)"),
     ],
 )  # fmt: skip
