@@ -71,7 +71,7 @@ def test_crazyflies_fly_test_1_at_the_size_of_a_room(federation: Federation) -> 
     """By the end of its report's window the triangle stands: within some centimetres, and within a degree or two."""
     path = str(ROOT / "scenarios/crazyflie.yaml")
     out = federation.folder / "crazyflie"
-    federation.start("run", path, "--in-process", "--no-report", "--out", str(out)).ends(with_code=0)
+    federation.start("run", path, "--in-process", "--out", str(out)).ends(with_code=0)
     errors = json.loads((out / "summary.json").read_text())["errors"]
     for name in ("x_c", "y_c", "z_c", "p", "q"):
         assert errors[name]["true_rms"] < 0.2 * SCALE, name

@@ -86,7 +86,7 @@ class Seen:
         self.observer: Any = SimpleNamespace(
             name="console.1", now_ns=0, end_reason="", health=health, update_clock=lambda _: None, tick=lambda: None
         )
-        drones = [SimpleNamespace(name=name) for name in NAMES]
+        drones = DRONES
         scenario = STEP.read_text()
         info: Any = SimpleNamespace(run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario)
         server.get_clients = lambda: {0: None} if watched else {}
