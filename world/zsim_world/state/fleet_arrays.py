@@ -3,9 +3,12 @@
 R is the largest number of rotors in the fleet. Numbers per rotor stand after the columns of a row, R for each group of
 them; a drone with fewer rotors has some that do not exist, whose speeds and limits are zero. `each`, a tuple of R
 numbers, tells compiled code how many there are: it is compiled for each R, and its loops over rotors are unrolled.
+R is four only where all are crosses of four, whose places and mixing are then constants of the code: with a vehicle
+whose four rotors stand elsewhere, R is five.
 """
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -78,6 +81,10 @@ PLACE = columns("PlaceColumns", (Field("field_W", "uT", 3), Field("height", "m")
 STREAMS = columns("StreamColumns", (Field("sensors", "1", 6), Field("wind", "1")))
 
 Row = NDArray[np.float64] | tuple[float, ...]  # of one drone: a view, or loaded
+CROSS_ROTORS = 4
+# Of a cross of four (zsim.vehicles.vehicle.cross_layout), as in ROTOR
+_X, _Y, _TURN = (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0)
+_ROLL, _PITCH, _YAW = (0.25, -0.25, -0.25, 0.25), (-0.25, -0.25, 0.25, 0.25), (0.25, -0.25, 0.25, -0.25)
 
 
 class KernelTime(NamedTuple):
@@ -179,9 +186,37 @@ def of(rotors: PerRotor, group: int, r: int) -> float:
 
 
 @inlined
+def place(rotors: PerRotor, r: int) -> tuple[float, float, float]:
+    """Return x, y [rotor_unit] and turn of rotor r, `rotors` being its parameters."""
+    if len(rotors.each) == CROSS_ROTORS:
+        return _X[r], _Y[r], _TURN[r]
+    return of(rotors, ROTOR.x, r), of(rotors, ROTOR.y, r), of(rotors, ROTOR.turn, r)
+
+
+@inlined
+def mixed(rotors: PerRotor, r: int) -> tuple[float, float, float, float]:
+    """Return roll, pitch, yaw of rotor r and the inverse of yaw, `rotors` being its parameters."""
+    if len(rotors.each) == CROSS_ROTORS:
+        return _ROLL[r], _PITCH[r], _YAW[r], 1.0 / _YAW[r]
+    inverse = of(rotors, ROTOR.yaw_inverse, r)
+    return of(rotors, ROTOR.roll, r), of(rotors, ROTOR.pitch, r), of(rotors, ROTOR.yaw, r), inverse
+
+
+@inlined
 def put_of(rotors: PerRotor, r: int, value: float) -> None:
     """Set the number of rotor r in the first group."""
     rotors.numbers[rotors.first + rotors.step * r] = value
+
+
+def rotor_slots(vehicles: Iterable[Vehicle]) -> int:
+    """Return R of a fleet."""
+    slots = CROSS_ROTORS
+    for vehicle in vehicles:
+        cross = len(vehicle.rotors) == CROSS_ROTORS and np.array_equal(
+            allocation(vehicle), (_Y, np.negative(_X), _TURN)
+        )
+        slots = max(slots, len(vehicle.rotors) if cross else max(len(vehicle.rotors), CROSS_ROTORS + 1))
+    return slots
 
 
 def vehicle_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> NDArray[np.float64]:
