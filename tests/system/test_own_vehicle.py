@@ -17,7 +17,6 @@ EXAMPLES = str(ROOT / "examples")
 MODEL = "drones.drone1.model=larger_battery"
 TAKEOFF = "clusters.main.plan.takeoff_s=1"
 DURATION_S = 10.0
-SCALE = 3 / 8  # of Test 1, at which the Crazyflies fly
 
 
 @pytest.fixture
@@ -39,7 +38,7 @@ def test_processes_give_the_bits_of_one_process(federation: Federation) -> None:
     federation.run(PAIR, "--set", MODEL).ends(with_code=0)
     record = federation.record()
     ratio = hover_squares(record, "drone1") / hover_squares(record, "drone2")
-    assert ratio == pytest.approx(0.48 / 0.429, rel=0.03)
+    assert ratio == pytest.approx(0.48 / 0.429, rel=0.05)
     one = federation.folder / "one"
     options = ("--set", MODEL, "--in-process", "--out", str(one))
     federation.start("run", federation.write(PAIR), *options).ends(with_code=0)
@@ -68,14 +67,13 @@ def test_it_flies_on_several_hosts(lab: Lab, tmp_path: Path, monkeypatch: pytest
 
 
 def test_crazyflies_fly_test_1_at_the_size_of_a_room(federation: Federation) -> None:
-    """By the end of its report's window the triangle stands: within some centimetres, and within a degree or two."""
+    """In the window of its report the triangle stands where it is to, as well as its positioning of 10 cm allows."""
     path = str(ROOT / "scenarios/crazyflie.yaml")
     out = federation.folder / "crazyflie"
     federation.start("run", path, "--in-process", "--out", str(out)).ends(with_code=0)
     errors = json.loads((out / "summary.json").read_text())["errors"]
-    for name in ("x_c", "y_c", "z_c", "p", "q"):
-        assert errors[name]["true_rms"] < 0.2 * SCALE, name
-    assert errors["beta"]["true_rms"] < np.radians(5.0)
+    for name, limit in {"x_c": 0.06, "y_c": 0.06, "z_c": 0.03, "p": 0.15, "q": 0.15, "beta": 0.1}.items():  # m, rad
+        assert errors[name]["true_rms"] < limit, name
 
 
 @pytest.mark.usefixtures("examples")
