@@ -38,11 +38,25 @@ class Origin(Struct, frozen=True):
     height_m: Number
 
 
+class RotorInfo(Struct, frozen=True):
+    """A rotor: its place in B and its radius [m]; `turn` is 1 if it turns clockwise seen from above, else -1."""
+
+    name: str
+    x_m: Number
+    y_m: Number
+    turn: Literal[-1, 1]
+    radius_m: Number
+
+
 class DroneInfo(Struct, frozen=True):
-    """A drone of the run and the model of its aircraft."""
+    """A drone of the run, the model of its aircraft, and its rotors in the order of `rotor_rad_s`.
+
+    Records of before vehicles could differ name no rotors.
+    """
 
     name: str
     model: str
+    rotors: tuple[RotorInfo, ...] = ()
 
 
 class ClusterInfo(Struct, frozen=True):

@@ -49,7 +49,7 @@ def cross_faults(scenario: Any, vehicles: Mapping[str, Vehicle]) -> Iterator[Fau
     for index, cluster in clusters:
         yield from ((f"clusters[{index}].{path}", text) for path, text in _shape_faults(cluster, drones))
     yield from _process_faults(scenario.processes, drones, clusters)
-    yield from _injected_faults(scenario, drones, clusters)
+    yield from _injected_faults(scenario, drones, clusters, vehicles)
     yield from _window_faults(scenario.report)
 
 
@@ -303,14 +303,17 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
             yield f"processes.expect[{index}]", f"is {name!r}, and no {kind} is {thing!r}; {allowed}"
 
 
-def _injected_faults(scenario: Any, drones: _Entries, clusters: _Entries) -> Iterator[Fault]:
+def _injected_faults(
+    scenario: Any, drones: _Entries, clusters: _Entries, vehicles: Mapping[str, Vehicle]
+) -> Iterator[Fault]:
     """Yield what is wrong with the faults that a scenario injects, if it is known who could be their targets."""
     if any(item.name is None for _, item in [*drones, *clusters]) or not drones:
         return
     expected = scenario.processes and scenario.processes.expect
     processes = tuple(name for name in expected or () if name is not None)
     kinds = kinds_of(declarations([drone for _, drone in drones]))
-    known = fault_check.Known(tuple(_names(drones)), tuple(_names(clusters)), processes, kinds)
+    rotors = {drone.name: vehicles[drone.model].rotor_names if drone.model in vehicles else () for _, drone in drones}
+    known = fault_check.Known(tuple(_names(drones)), tuple(_names(clusters)), processes, kinds, rotors)
     for index, fault in _entries(scenario.faults):
         for path, text in fault_check.flaws(fault, known):
             yield f"faults[{index}]{f'.{path}' if path else ''}", text

@@ -5,7 +5,7 @@ from difflib import SequenceMatcher
 from typing import Any, NamedTuple
 
 from zsim.contract import keys
-from zsim.scenario.fault_kinds import KINDS, FaultKind, FaultParameter, expected
+from zsim.scenario.fault_kinds import KINDS, ROTOR, FaultKind, FaultParameter, expected
 from zsim.scenario.role_table import AGENTS
 from zsim.schema.checker import Fault as Flaw
 from zsim.schema.checker import show
@@ -19,13 +19,15 @@ COMMON = ("kind", "target", "at_s", "for_s")  # what every fault may have; the r
 class Known(NamedTuple):
     """Names that a target may have, and the kinds of faults of the run.
 
-    `processes` are those that take part, beside estimators and controllers.
+    `processes` are those that take part, beside estimators and controllers. `rotors` are those of each drone; none of
+    one whose vehicle is a module that is not read here.
     """
 
     drones: tuple[str, ...]
     clusters: tuple[str, ...]
     processes: tuple[str, ...] = ()
     kinds: Mapping[str, FaultKind] = KINDS
+    rotors: Mapping[str, tuple[str, ...]] = {}
 
 
 def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
@@ -45,7 +47,7 @@ def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
             yield str(field)[:40], f"is not known; allowed: {allowed} ({name})"
     faults = [*_target_flaws(fault, name, kind, known), *_time_flaws(fault, name, kind)]
     for parameter in kind.parameters:
-        faults += _parameter_flaws(fault, parameter, known)
+        faults += _parameter_flaws(fault, _of_target(parameter, fault.get("target"), known), known)
     for path, text in faults:
         yield path, text if text.endswith(f"({name})") else f"{text} ({name})"
 
@@ -135,6 +137,14 @@ def _time_flaws(fault: Mapping[str, Any], name: str, kind: FaultKind) -> Iterato
         yield "for_s", f"is {show(for_s)}; must be > 0 and <= {FOR_EVER_S:g} s"
 
 
+def _of_target(p: FaultParameter, target: Any, known: Known) -> FaultParameter:
+    """Return a parameter as a target has it: its rotors are those of its vehicle, or have any name."""
+    rotors = known.rotors.get(target) if p is ROTOR and isinstance(target, str) else None
+    if rotors is None:
+        return p
+    return p._replace(choices=(*rotors, "all")) if rotors else p._replace(shape="word")
+
+
 def _parameter_flaws(fault: Mapping[str, Any], p: FaultParameter, known: Known) -> Iterator[Flaw]:
     value = fault.get(p.name)
     if value is None:
@@ -145,6 +155,8 @@ def _parameter_flaws(fault: Mapping[str, Any], p: FaultParameter, known: Known) 
         sound = isinstance(value, list | tuple) and len(value) == 3 and all(_within(x, p.least, p.most) for x in value)
     elif p.shape == "choice":
         sound = value in p.choices
+    elif p.shape == "word":
+        sound = isinstance(value, str)
     elif p.shape == "flag":
         sound = isinstance(value, bool)
     elif p.shape == "places":

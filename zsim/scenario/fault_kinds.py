@@ -12,7 +12,7 @@ from zsim.sensors.catalogue import STOCK
 from zsim.sensors.sensor import Channel, Declaration, SensorType
 
 Target = Literal["drone", "world", "link", "radio", "process"]
-Shape = Literal["number", "vector", "choice", "flag", "places"]
+Shape = Literal["number", "vector", "choice", "word", "flag", "places"]
 
 ROTORS = ("front_left", "front_right", "rear_right", "rear_left")  # in the order of truth's rotor_rad_s
 PROCESS_KILL = "process_kill"
@@ -72,7 +72,7 @@ def _vector(name: str, description: str, unit: str, most: float) -> FaultParamet
 
 _PROBABILITY = FaultParameter("probability", "number", "of each sample", "", 0.0, 1.0, default=1.0, required=False)
 _FACTOR = _number("factor", "by which the standard deviation grows", "", 1.0, 1e6, above=True)
-_ROTOR = FaultParameter("rotor", "choice", "which", choices=(*ROTORS, "all"))
+ROTOR = FaultParameter("rotor", "choice", "which", choices=(*ROTORS, "all"))  # of a vehicle: its own names, and all
 _ONE_WAY = FaultParameter("one_way", "flag", "from the first to the second only", default=False, required=False)
 
 _RADIO = (
@@ -152,12 +152,12 @@ def _bias(channel: Channel) -> FaultParameter:
 KINDS: dict[str, FaultKind] = {
     **_sensor_kinds(STOCK),
     "rotor_efficiency": FaultKind(
-        "drone", "a rotor has lost thrust", (_ROTOR, _number("value", "share of the thrust that is left", "", 0.0, 1.0))
+        "drone", "a rotor has lost thrust", (ROTOR, _number("value", "share of the thrust that is left", "", 0.0, 1.0))
     ),
     "rotor_stuck": FaultKind(
         "drone",
         "a rotor turns at one speed whatever it is told",
-        (_ROTOR, _number("speed_rad_s", "as it turns at the start, if left out", "rad/s", 0.0, 1e4, required=False)),
+        (ROTOR, _number("speed_rad_s", "as it turns at the start, if left out", "rad/s", 0.0, 1e4, required=False)),
     ),
     "gust": FaultKind(
         "world",
@@ -194,6 +194,8 @@ def expected(p: FaultParameter) -> str:
     unit = f" {p.unit}" if p.unit else ""
     if p.shape == "choice":
         return f"one of {', '.join(p.choices)}"
+    if p.shape == "word":
+        return "a name"
     if p.shape == "flag":
         return "true or false"
     if p.shape == "places":

@@ -41,9 +41,9 @@ PRESETS = {
         "velocity_m_s": SPEED_NOISE,
     },
     "crazyflie2": {
-        "rate_hz": 10.0,  # Hz, chosen: what the firmware's filter of a loco positioning deck is read at
-        "position_m": {"noise": 0.1},  # m, Bitcraze: accuracy of loco positioning about 10 cm
-        "velocity_m_s": {"noise": 0.2},  # m/s, chosen: its filter's
+        "rate_hz": 10.0,  # Hz, chosen
+        "position_m": {"noise": 0.1},  # m, chosen: what ultra-wideband ranging to anchors in a room usually reaches
+        "velocity_m_s": {"noise": 0.2},  # m/s, chosen
     },
 }
 

@@ -45,16 +45,16 @@ PRESETS = {
     "crazyflie2": {
         "rate_hz": BOARD_RATE_HZ,
         "accel_m_s2": {
-            "density": 0.0017,  # m/s^2/sqrt(Hz), 175 ug/sqrt(Hz) of the BMI088
+            "density": 0.0017,  # m/s^2/sqrt(Hz), 175 ug/sqrt(Hz) (data sheet of the BMI088)
             "bias": 0.05,  # m/s^2, left after calibration; chosen as the AR.Drone's
             "bias_walk": 0.0005,  # m/s^2/sqrt(s), chosen as the AR.Drone's
-            "quantum": 0.0072,  # m/s^2 per LSB: 24 g in 16 bits
+            "quantum": 0.0072,  # m/s^2 per LSB: 24 g in 16 bits (crazyflie-firmware, sensors_bmi088_bmp3xx.c)
         },
         "gyro_deg_s": {
-            "density": 0.014,  # deg/s/sqrt(Hz), BMI088
+            "density": 0.014,  # deg/s/sqrt(Hz) (data sheet of the BMI088)
             "bias": 0.1,  # deg/s, left after the firmware's own calibration at start; chosen as the AR.Drone's
             "bias_walk": 0.003,  # deg/s/sqrt(s), chosen as the AR.Drone's
-            "quantum": 0.061,  # deg/s per LSB: 2000 deg/s in 16 bits
+            "quantum": 0.061,  # deg/s per LSB: 2000 deg/s in 16 bits (crazyflie-firmware, likewise)
         },
     },
 }

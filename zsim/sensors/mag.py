@@ -20,7 +20,10 @@ PRESETS = {
     "ardrone2": {"rate_hz": RATE_HZ, "field_ut": {"noise": 0.3, "quantum": 0.3}},  # AK8975: 0.3 uT per LSB
     # 0.94 uT: 3 deg of a horizontal field of 18 uT; chosen, the paper is silent
     "paper": {"rate_hz": RATE_HZ, "field_ut": {"noise": 0.94}},
-    "crazyflie2": {"rate_hz": RATE_HZ, "field_ut": {"noise": 0.3, "quantum": 0.15}},  # AK8963: 0.15 uT per LSB
+    "crazyflie2": {
+        "rate_hz": RATE_HZ,
+        "field_ut": {"noise": 0.3, "quantum": 0.15},
+    },  # AK8963 of the 2.0, 0.15 uT per LSB; the 2.1 has none (crazyflie-firmware, issue 701)
 }
 
 SENSOR = SensorType(

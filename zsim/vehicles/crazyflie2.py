@@ -1,7 +1,9 @@
 """Bitcraze Crazyflie 2.x, 27 g, brushed motors, as delivered.
 
 Sources:
-    Förster    J. Förster, System Identification of the Crazyflie 2.0 Nano Quadrocopter, BSc thesis, ETH Zürich 2015
+    Förster    J. Förster, System Identification of the Crazyflie 2.0 Nano Quadrocopter, BSc thesis, ETH Zürich 2015,
+               by the firmware that quotes it: crazyflie-firmware, src/modules/src, controller_lee.c (inertia) and
+               power_distribution_quadrotor.c (torque); M. Hamer's physical_constants.c (height of the centre of mass)
     cf2x       gym-pybullet-drones (J. Panerati et al., IROS 2021), assets/cf2x.urdf, after Landry (MIT 2015)
     RotorPy    S. Folk et al. 2023, rotorpy/vehicles/crazyflie_params.py
     Bitcraze   data sheet of the Crazyflie 2.1, and "Measuring propeller RPM: part 3" (2015)
@@ -10,26 +12,26 @@ Its firmware has the structure of the AR.Drone's here; the gains follow from the
 
 from zsim.vehicles.vehicle import Airframe, Battery, Firmware, Limits, Vehicle, cross_layout
 
-ARM_M = 0.0397  # m, centre to rotor (cf2x)
-THRUST_N_S2 = 2.8815e-8  # N s^2: 3.16e-10 N per (rev/min)^2 (cf2x)
+ARM_M = 0.0397  # m, centre to rotor (cf2x); 92 mm over all are with the motor mounts (Bitcraze)
+THRUST_N_S2 = 2.8816e-8  # N s^2: 3.16e-10 N per (rev/min)^2 (cf2x)
 
 VEHICLE = Vehicle(
     mass_kg=0.027,  # kg (cf2x, Bitcraze)
-    inertia_kg_m2=(16.57e-6, 16.66e-6, 29.26e-6),  # kg m^2, about x, y, z; products up to 1.8e-6 left out (Förster)
+    inertia_kg_m2=(16.571710e-6, 16.655602e-6, 29.261652e-6),  # kg m^2; products up to 1.8e-6 left out (Förster)
     arm_m=ARM_M,
     thrust_n_s2=THRUST_N_S2,
     torque_nm_s2=0.005964552 * THRUST_N_S2,  # N m s^2: 5.96 mm of torque per thrust (Förster)
     rotor_time_constant_s=0.072,  # s (RotorPy); 0 to 25 000 rev/min within about 0.18 s (Bitcraze)
     rotor_min_rad_s=300.0,  # rad/s, chosen: a twenty-fifth of the hover's thrust
     rotor_max_rad_s=2273.0,  # rad/s: thrust over weight 2.25 (cf2x)
-    drag_n_s_m=6.2e-3,  # N s/m: 1.025e-6 kg per rad and rotor (RotorPy) at the four rotors' 1516 rad/s of hover
+    drag_n_s_m=6.2e-3,  # N s/m: 1.025e-6 kg/rad (RotorPy, after Förster) at the four rotors' 1516 rad/s of hover
     battery_mah=250.0,  # mAh (Bitcraze)
     takeoff_height_m=0.5,  # m, as Bitcraze's examples
     limits=Limits(horizontal_speed_m_s=2.0),  # m/s, chosen: a room's size; the others as the AR.Drone's
     sensor_preset="crazyflie2",
     rotors=cross_layout(ARM_M),
-    rotor_radius_m=0.0225,  # m, 45 mm propeller (Bitcraze)
-    rotor_inertia_kg_m2=5e-8,  # kg m^2, a rod of 45 mm and 0.3 g; estimated
+    rotor_radius_m=0.0231,  # m (cf2x, 2.31348e-2 in its later versions)
+    rotor_inertia_kg_m2=5e-8,  # kg m^2, a rod of 46 mm and 0.3 g; estimated
     airframe=Airframe(
         hull_radius_m=0.062,  # m, arm and propeller; the collision cylinder of cf2x has 0.06 m
         foot_xy_m=0.028,  # m, legs under the motors

@@ -170,8 +170,13 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     battery: Battery
     firmware: Firmware
 
+    @property
+    def rotor_names(self) -> tuple[str, ...]:
+        """Return the names of the rotors, in their order."""
+        return tuple(rotor.name for rotor in self.rotors)
+
     def __post_init__(self) -> None:
-        count, names = len(self.rotors), [rotor.name for rotor in self.rotors]
+        count, names = len(self.rotors), self.rotor_names
         if not ROTORS_MIN <= count <= ROTORS_MAX:
             raise ValueError(f"rotors has {count} entries; must have {ROTORS_MIN} to {ROTORS_MAX}")
         if len(set(names)) < count:

@@ -95,11 +95,12 @@ class RunPage:
         self._drawn_ghosts: dict[str, Any] = {}
         self._drawn_ns = self._table_s = 0.0
         robots = sum(space.n for space in self._spaces.values())
-        self._scene = SceneNodes(server, names, robots, len(self._spaces))
+        arms_m = [drone.arm_m for drone in self._scenario.drones]
+        self._scene = SceneNodes(server, info.drones, arms_m, robots, len(self._spaces))
         self._scene.obstacles(self._scenario.environment.obstacles)
         show = self._scene.show
         self._page = ConsolePage(
-            server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate
+            server.gui, self._scenario, self._spaces, self._client, self._on_outcome, show, info.rate, info.drones
         )
 
     def close(self) -> None:

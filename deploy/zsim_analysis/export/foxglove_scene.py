@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from foxglove.messages import (
@@ -47,8 +47,15 @@ TRAIL_S = 20.0  # s of simulated time that a trail is long
 TRAIL_STEP_NS = 500_000_000  # between two points of a trail, and two messages of trails
 SIGMAS = 2.0  # half axes of an estimate's ellipsoid in standard deviations
 LINE_PX = 2.0  # width of lines on the screen
-ROTOR_RADIUS = 0.57  # of the arm: 0.102 m at the AR.Drone's 0.1785 m
 GROUND_M, GROUND_STEP_M = 50, 5  # half width of the grid on the ground, and its spacing
+
+
+class RotorDisc(NamedTuple):
+    """A rotor as it is drawn: its place in B, and its radius."""
+
+    x_m: float
+    y_m: float
+    radius_m: float
 
 
 @dataclass
@@ -137,13 +144,16 @@ def frame(drone: str) -> str:
     return f"drone/{drone}"
 
 
-def drones(t_ns: int, arms_m: Mapping[str, float]) -> SceneUpdate:
-    """Return the drones, each in its own frame, written once, as their frames move; arms_m: centre to rotor [m]."""
-    entities = [_drone(timestamp(t_ns), name, arm_m, drone_colour(i)) for i, (name, arm_m) in enumerate(arms_m.items())]
-    return SceneUpdate(entities=entities)
+def drones(t_ns: int, rotors: Mapping[str, Sequence[RotorDisc]]) -> SceneUpdate:
+    """Return the drones, each in its own frame, written once, as their frames move; `rotors` are theirs, by name."""
+    at = timestamp(t_ns)
+    return SceneUpdate(
+        entities=[_drone(at, name, discs, drone_colour(i)) for i, (name, discs) in enumerate(rotors.items())]
+    )
 
 
-def _drone(at: Timestamp, name: str, arm_m: float, mark: str) -> SceneEntity:
+def _drone(at: Timestamp, name: str, discs: Sequence[RotorDisc], mark: str) -> SceneEntity:
+    arm_m = max(math.hypot(disc.x_m, disc.y_m) for disc in discs)
     label = TextPrimitive(
         pose=pose((0, 0, 2 * arm_m)),
         billboard=True,
@@ -157,8 +167,8 @@ def _drone(at: Timestamp, name: str, arm_m: float, mark: str) -> SceneEntity:
         name,
         frame(name),
         cubes=_hull(arm_m),
-        cylinders=_rotors(arm_m, mark),
-        lines=[_arms(arm_m)],
+        cylinders=[_rotor(disc, arm_m, mark) for disc in discs],
+        lines=[_arms(discs, arm_m)],
         texts=[label],
         frame_locked=True,
     )
@@ -174,34 +184,25 @@ def _hull(arm_m: float) -> list[CubePrimitive]:
     return [hull, nose]
 
 
-def _rotors(arm_m: float, mark: str) -> list[CylinderPrimitive]:
-    return [
-        CylinderPrimitive(
-            pose=pose((x, y, 0.2 * arm_m)),
-            size=vector((2 * ROTOR_RADIUS * arm_m, 2 * ROTOR_RADIUS * arm_m, 0.03 * arm_m)),
-            bottom_scale=1.0,
-            top_scale=1.0,
-            color=colour(mark, 0.5),
-        )
-        for x, y in _corners(arm_m)
-    ]
+def _rotor(disc: RotorDisc, arm_m: float, mark: str) -> CylinderPrimitive:
+    return CylinderPrimitive(
+        pose=pose((disc.x_m, disc.y_m, 0.2 * arm_m)),
+        size=vector((2 * disc.radius_m, 2 * disc.radius_m, 0.03 * arm_m)),
+        bottom_scale=1.0,
+        top_scale=1.0,
+        color=colour(mark, 0.5),
+    )
 
 
-def _arms(arm_m: float) -> LinePrimitive:
-    front_left, front_right, rear_right, rear_left = _corners(arm_m)
+def _arms(discs: Sequence[RotorDisc], arm_m: float) -> LinePrimitive:
+    ends = [((0.0, 0.0, 0.0), (disc.x_m, disc.y_m, 0.0)) for disc in discs]
     return LinePrimitive(
         type=LinePrimitiveLineType.LineList,
         pose=pose((0, 0, 0)),
         thickness=0.1 * arm_m,
-        points=[point((x, y, 0)) for x, y in (front_left, rear_right, front_right, rear_left)],
+        points=[point(end) for pair in ends for end in pair],
         color=colour(DARK),
     )
-
-
-def _corners(arm_m: float) -> list[tuple[float, float]]:
-    """Return x and y in B of the rotors, in the contract's order."""
-    side = arm_m / math.sqrt(2.0)
-    return [(x * side, y * side) for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
 
 
 def ground(t_ns: int) -> SceneUpdate:

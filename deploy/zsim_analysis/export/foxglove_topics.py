@@ -24,7 +24,7 @@ from zsim.math.frames import heading
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 from zsim_analysis.export import foxglove_messages, foxglove_scene
 from zsim_analysis.export.foxglove_messages import NumericMessageType
-from zsim_analysis.export.foxglove_scene import MAGENTA, Instant, drone_colour, pose, timestamp
+from zsim_analysis.export.foxglove_scene import MAGENTA, Instant, RotorDisc, drone_colour, pose, timestamp
 
 TF, LOG, DRONES, GROUND, TRAILS = "/tf", "/log", "/scene/drones", "/scene/ground", "/scene/trails"
 FORMATIONS, ESTIMATES = "/scene/formations", "/scene/estimates"
@@ -100,20 +100,22 @@ class FoxgloveFile:
 
     Args:
         path: of the file, new.
-        arms_m: by drone, in the order of the scenario, the distance from its centre to a rotor [m].
+        rotors: by drone, in the order of the scenario, what it is drawn with.
         spaces: the cluster space of each cluster that has one.
 
     Attributes:
         counts: messages by topic.
     """
 
-    def __init__(self, path: Path, arms_m: Mapping[str, float], spaces: Mapping[str, ClusterSpace]) -> None:
+    def __init__(
+        self, path: Path, rotors: Mapping[str, Sequence[RotorDisc]], spaces: Mapping[str, ClusterSpace]
+    ) -> None:
         self._context = foxglove.Context()
         self._checked_file = CheckedFile(path)
         self._file = foxglove.open_mcap(self._checked_file, context=self._context)
-        self._arms_m = arms_m
+        self._rotors = rotors
         self._spaces = spaces
-        self._order = {name: i for i, name in enumerate(arms_m)}
+        self._order = {name: i for i, name in enumerate(rotors)}
         self._channels: dict[str, Any] = {}
         self._variables: dict[str, NumericMessageType] = {}
         self._drone = NumericMessageType("Drone", foxglove_messages.DRONE_NUMBERS, ("state",))
@@ -145,7 +147,7 @@ class FoxgloveFile:
         self._checked_file.check()
         self._status.update(instant.status)
         if not self._has_static_scene and instant.truth:
-            self._log(DRONES, SceneUpdateChannel, foxglove_scene.drones(instant.t_ns, self._arms_m), instant.t_ns)
+            self._log(DRONES, SceneUpdateChannel, foxglove_scene.drones(instant.t_ns, self._rotors), instant.t_ns)
             self._log(GROUND, SceneUpdateChannel, foxglove_scene.ground(instant.t_ns), instant.t_ns)
             self._has_static_scene = True
         self._write_frames(instant)

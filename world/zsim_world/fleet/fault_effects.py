@@ -24,6 +24,9 @@ class Impairment:
         arrays: of the fleet, before its first gate.
         drones, vehicles: their names and what they are, in scenario order.
         sensors: of the drones.
+
+    Attributes:
+        rotors: names of the rotors of each drone.
     """
 
     def __init__(
@@ -35,7 +38,7 @@ class Impairment:
         self._index = {name: i for i, name in enumerate(drones)}
         self._config = arrays.senses.config.copy()
         self._steady = arrays.wind[WIND.steady : WIND.steady + 3].copy()
-        self._rotors = [[rotor.name for rotor in vehicle.rotors] for vehicle in vehicles]
+        self.rotors = {name: vehicle.rotor_names for name, vehicle in zip(drones, vehicles, strict=True)}
         self._sound = sound_actuators(len(drones), len(arrays.bodies.each))
         self._held: dict[int, tuple[float, ...]] = {}  # by fault: at which speed the rotors of its drone turned
         self._gusts: tuple[Fault, ...] = ()
@@ -102,7 +105,7 @@ class Impairment:
     def _impair_rotors(self, fault: Fault, i: int, how: str) -> None:
         row, which, count = self._w.boards.actuator[i], fault.parameters["rotor"], len(self._w.bodies.each)
         row[ACTUATOR.faulty] = 1.0
-        for r, name in enumerate(self._rotors[i]):
+        for r, name in enumerate(self.rotors[fault.target]):
             if which in (name, "all"):
                 if how == "efficiency":  # thrust is as the speed squared
                     row[ACTUATOR.size + r] *= math.sqrt(fault.parameters["value"])

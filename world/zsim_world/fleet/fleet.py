@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState
+from zsim.contract.messages import RotorInfo
 from zsim.errors import RunError
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.sensors.gps import GpsConfig
@@ -25,7 +26,7 @@ from zsim_world.physics.air import WIND
 from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sampler import Sampled, Sampler, SensorSample
 from zsim_world.sensors.sensor_set import fleet_sensors
-from zsim_world.state.fleet_arrays import STATE, VEHICLE
+from zsim_world.state.fleet_arrays import ROTOR, STATE, VEHICLE
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY, SETPOINT
 from zsim_world.vehicles.firmware_settings import SETTING
@@ -113,6 +114,15 @@ class Fleet:
     def t_ns(self) -> int:
         """Simulated time of the present state."""
         return self._tick * self._tick_ns
+
+    def rotor_info(self, i: int) -> tuple[RotorInfo, ...]:
+        """Return the rotors of a drone as `world/info` names them."""
+        row, groups = self.bodies.vehicle[i], self.bodies.rotors[i].reshape(ROTOR.size, -1)
+        unit, radius = row[VEHICLE.rotor_unit], float(row[VEHICLE.rotor_radius])
+        x, y = (unit * groups[ROTOR.x]).tolist(), (unit * groups[ROTOR.y]).tolist()
+        turns = groups[ROTOR.turn].tolist()
+        named = enumerate(self.impairment.rotors[self.names[i]])
+        return tuple(RotorInfo(name, x[r], y[r], 1 if turns[r] > 0.0 else -1, radius) for r, name in named)
 
     @property
     def wind_m_s(self) -> NDArray[np.float64]:

@@ -31,6 +31,7 @@ from zsim_world.state.fleet_arrays import (
     NoiseRows,
     Senses,
     rotor_row,
+    rotor_slots,
     vehicle_row,
 )
 from zsim_world.vehicles import firmware, firmware_settings, observer, observer_gains
@@ -41,7 +42,7 @@ from zsim_world.vehicles.simd_firmware import board_blocks, sound_actuators
 def arrays(scenario: Scenario, vehicles: Sequence[Vehicle], sensors: FleetSensors, noise: NoiseTable) -> Arrays:
     """Return the arrays of the kernel for a scenario whose drones are these vehicles with these sensors."""
     dt, drones, place = scenario.time.physics_dt_ms / 1000.0, scenario.drones, scenario.environment
-    each = max(len(vehicle.rotors) for vehicle in vehicles)
+    each = rotor_slots(vehicles)
     row = np.array([vehicle_row(vehicle, drone, place) for vehicle, drone in zip(vehicles, drones, strict=True)])
     rotors = np.array([rotor_row(vehicle, drone, each) for vehicle, drone in zip(vehicles, drones, strict=True)])
     clock = np.zeros(CLOCK.size, dtype=np.int64)

@@ -186,7 +186,8 @@ class FaultInjector:
         drones = tuple(drone.name for drone in scenario.drones)
         clusters = tuple(cluster.name for cluster in scenario.clusters)
         gating = (p.name for p in self._barrier.participants.values() if p.gating)
-        for path, text in flaws(args, Known(drones, clusters, (*scenario.expected(), *gating), self._kinds)):
+        processes = (*scenario.expected(), *gating)
+        for path, text in flaws(args, Known(drones, clusters, processes, self._kinds, self._effects.rotors)):
             return f"{path or 'args'} {text}"
         immune = self._immunity(args["target"]) if args["kind"] == PROCESS_KILL else None
         if immune:

@@ -59,33 +59,26 @@ def blow(wind: Row, v_WB: Vector, gust: NDArray, common: Vector, own: Vector, dt
 
 
 @inlined
-def jet_start(rotors: float, radius_m: float) -> float:
-    """Return the width [m] at which a Gaussian jet of speed 2 v_h carries the thrust of so many rotors."""
-    return math.sqrt(rotors) * radius_m
-
-
-@inlined
 def jet_reach(start_m: float, below_m: float) -> float:
     """Return how far aside [m] of a drone its jet of this width at the start blows, so much below it."""
     return JET_WIDTHS * (start_m + JET_SPREAD * below_m)
 
 
 @inlined
-def downwash(thrust_n: float, density: float, rotors: float, radius_m: float, below_m: float, aside_m: float) -> float:
+def downwash(thrust_n: float, density: float, start_m: float, below_m: float, aside_m: float) -> float:
     """Return the downward speed [m/s] of the air below a hovering drone.
 
     The far wake of momentum theory, 2 v_h = 2 sqrt(T / (2 rho A)), as a turbulent round jet that keeps its momentum:
-    w = 2 v_h (b0 / b) exp(-(r / b)^2), b = b0 + 0.107 z, b0 = sqrt(n) R.
+    w = 2 v_h (b0 / b) exp(-(r / b)^2), b = b0 + 0.107 z, A = pi b0^2, b0 = sqrt(n) R for n rotors of radius R.
 
     Args:
-        thrust_n: of the drone above; density: of the air [kg/m^3]; rotors, radius_m: how many it has, and of each.
+        thrust_n: of the drone above; density: of the air [kg/m^3]; start_m: b0 of the drone above.
         below_m, aside_m: where, from the drone above, both >= 0.
     """
-    start = jet_start(rotors, radius_m)
-    width = start + JET_SPREAD * below_m
+    width = start_m + JET_SPREAD * below_m
     if aside_m > JET_WIDTHS * width or thrust_n <= 0.0:
         return 0.0
-    disc = rotors * math.pi * radius_m * radius_m
-    core = 2.0 * math.sqrt(thrust_n / (2.0 * density * disc)) * start / width
+    disc = math.pi * start_m * start_m
+    core = 2.0 * math.sqrt(thrust_n / (2.0 * density * disc)) * start_m / width
     ratio = aside_m / width
     return core * math.exp(-ratio * ratio)

@@ -10,12 +10,13 @@ from zsim.math.compiled import apart, inlined
 from zsim.math.rotation import Vector, z_axis
 from zsim.scenario import obstacle
 from zsim.scenario.scenario import Environment
-from zsim_world.physics.air import downwash, jet_reach, jet_start
+from zsim_world.physics.air import downwash, jet_reach
 from zsim_world.physics.rigid_body import four
 from zsim_world.physics.rotors import free_thrust
 from zsim_world.state.fleet_arrays import STATE, VEHICLE, Bodies, NearPairs, PerRotor
 
 DISTANCE_MIN_M = 1e-9  # m, so that two drones in one place have a direction
+CLOSE = 1.0 + 1e-9  # of the square of a distance: more than rounding can make of it
 STRAY_M = 0.25  # m, by which each drone may move before near pairs are found anew: 0.4 s at 0.6 m/s
 APPROACH_M = 0.501  # m, by which a pair's distance may have changed by then: twice as much, and room for rounding
 
@@ -42,16 +43,10 @@ def _apart(state: NDArray, i: int, j: int) -> Vector:
 
 
 @inlined
-def _jet_start(vehicle: NDArray, i: int) -> float:
-    return jet_start(vehicle[i, VEHICLE.rotor_count], vehicle[i, VEHICLE.rotor_radius])
-
-
-@inlined
 def _blow(bodies: Bodies, above: int, below: int, aside: float, drop: float) -> None:
     row, state = bodies.vehicle[above], bodies.state[above]
     thrust = free_thrust(row, PerRotor(state, STATE.size, 1, bodies.each)) * z_axis(four(state, STATE.q_WB))[2]
-    count, radius = row[VEHICLE.rotor_count], row[VEHICLE.rotor_radius]
-    bodies.air[below, 2] -= downwash(thrust, row[VEHICLE.air_density], count, radius, drop, aside)
+    bodies.air[below, 2] -= downwash(thrust, row[VEHICLE.air_density], row[VEHICLE.jet_start], drop, aside)
 
 
 @inlined
@@ -72,22 +67,25 @@ def _touch(bodies: Bodies, i: int, j: int, d: Vector, distance: float) -> None:
 
 @inlined
 def _meet(bodies: Bodies, i: int, j: int) -> float:
-    """Let drones i < j act on each other; return their distance [m]."""
+    """Let drones i < j act on each other; return the square of their distance [m^2]."""
     vehicle = bodies.vehicle
     dx, dy, dz = _apart(bodies.state, i, j)
     aside2 = dx * dx + dy * dy
-    distance = max(math.sqrt(aside2 + dz * dz), DISTANCE_MIN_M)
-    contact = distance < vehicle[i, VEHICLE.hull_radius] + vehicle[j, VEHICLE.hull_radius]
+    square = aside2 + dz * dz
+    distance, hulls = math.inf, vehicle[i, VEHICLE.hull_radius] + vehicle[j, VEHICLE.hull_radius]
+    if square < CLOSE * hulls * hulls:  # the root takes long, and most pairs are farther
+        distance = max(math.sqrt(square), DISTANCE_MIN_M)
+    contact = distance < hulls
     if contact:
         _touch(bodies, i, j, (dx, dy, dz), distance)
         if bodies.touching[i, j] == 0:
             bodies.touched[i, j] = 1
     bodies.touching[i, j] = 1 if contact else 0
     above = j if dz > 0.0 else i
-    reach = jet_reach(_jet_start(vehicle, above), abs(dz))
+    reach = jet_reach(vehicle[above, VEHICLE.jet_start], abs(dz))
     if aside2 < reach * reach:
         _blow(bodies, above, i + j - above, math.sqrt(aside2), abs(dz))
-    return distance
+    return square
 
 
 @inlined
@@ -116,7 +114,7 @@ def _find_near(vehicle: NDArray, state: NDArray, touching: NDArray, near: NearPa
             least = min(least, distance)
             hulls = vehicle[i, VEHICLE.hull_radius] + vehicle[j, VEHICLE.hull_radius]
             closest = max(least + APPROACH_M, hulls) + APPROACH_M
-            start = max(_jet_start(vehicle, i), _jet_start(vehicle, j))
+            start = max(vehicle[i, VEHICLE.jet_start], vehicle[j, VEHICLE.jet_start])
             jet = jet_reach(start, abs(dz) + APPROACH_M) + APPROACH_M
             if distance > closest and aside > jet:
                 touching[i, j] = 0
@@ -140,7 +138,7 @@ def meet_drones(bodies: Bodies) -> float:
     least = math.inf
     for n in range(near.number[0]):
         least = min(least, _meet(bodies, near.pair[n, 0], near.pair[n, 1]))
-    return least
+    return max(math.sqrt(least), DISTANCE_MIN_M)
 
 
 def obstacle_rows(environment: Environment) -> NDArray[np.float64]:

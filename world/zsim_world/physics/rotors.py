@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from zsim.math.compiled import inlined
 from zsim.math.rotation import Quaternion, Vector, rotate
-from zsim_world.state.fleet_arrays import ROTOR, VEHICLE, PerRotor, Row, of, put_of
+from zsim_world.state.fleet_arrays import VEHICLE, PerRotor, Row, mixed, of, place, put_of
 
 GROUND_CLEARANCE_MIN = 0.5  # radii, the formula below is not meant for less
 
@@ -60,7 +60,7 @@ def wrench(
     slew = 1.0 / row[VEHICLE.rotor_lag]
     total, mx, my, mz, spin = 0.0, 0.0, 0.0, 0.0, 0.0
     for r in range(len(rotors.each)):
-        x, y, turn = of(rotors, ROTOR.x, r), of(rotors, ROTOR.y, r), of(rotors, ROTOR.turn, r)
+        x, y, turn = place(rotors, r)
         speed, command = of(speeds, 0, r), of(commands, 0, r)
         if decay is not None:
             speed = lagged(speed, command, decay)
@@ -69,7 +69,7 @@ def wrench(
         total += force
         mx += y * unit * force
         my -= x * unit * force
-        mz += turn * (row[VEHICLE.torque] * square + inertia * ((command - speed) * slew))
+        mz += (turn * row[VEHICLE.torque]) * square + (turn * inertia) * ((command - speed) * slew)
         spin += turn * inertia * speed
     return total, (mx + w_WB_B[1] * spin, my - w_WB_B[0] * spin, mz)
 
@@ -95,19 +95,22 @@ def mix(row: Row, rotors: PerRotor, thrust_n: float, moment: Vector, speeds: Per
     roll, pitch = moment[0] / row[VEHICLE.rotor_unit], moment[1] / row[VEHICLE.rotor_unit]
     reach = 0.0
     for r in range(len(rotors.each)):
-        reach = max(reach, abs(of(rotors, ROTOR.roll, r) * roll + of(rotors, ROTOR.pitch, r) * pitch))
+        by_roll, by_pitch, _, _ = mixed(rotors, r)
+        reach = max(reach, abs(by_roll * roll + by_pitch * pitch))
     scale = (high - low) / (2.0 * reach) if 2.0 * reach > high - low else 1.0
     roll, pitch, reach = roll * scale, pitch * scale, reach * scale
     mean = min(max(row[VEHICLE.rotor_share] * thrust_n, low + reach), high - reach)
     yaw = moment[2] * thrust / row[VEHICLE.torque]
     sign, most = (1.0 if yaw >= 0.0 else -1.0), abs(yaw)
     for r in range(len(rotors.each)):
-        force = mean + of(rotors, ROTOR.roll, r) * roll + of(rotors, ROTOR.pitch, r) * pitch
-        share = sign * of(rotors, ROTOR.yaw, r)
-        most = min(most, (high - force if share > 0.0 else low - force) / share if share != 0.0 else most)
+        by_roll, by_pitch, by_yaw, inverse = mixed(rotors, r)
+        force, share = mean + by_roll * roll + by_pitch * pitch, sign * by_yaw
+        room = (high - force if share > 0.0 else low - force) * (sign * inverse)
+        most = min(most, room if share != 0.0 else most)
     for r in range(len(rotors.each)):
-        force = mean + of(rotors, ROTOR.roll, r) * roll + of(rotors, ROTOR.pitch, r) * pitch
-        put_of(speeds, r, math.sqrt(max(force + sign * of(rotors, ROTOR.yaw, r) * most, low) / thrust))
+        by_roll, by_pitch, by_yaw, _ = mixed(rotors, r)
+        force = mean + by_roll * roll + by_pitch * pitch
+        put_of(speeds, r, math.sqrt(max(force + sign * by_yaw * most, low) / thrust))
 
 
 @inlined

@@ -3,9 +3,12 @@
 R is the largest number of rotors in the fleet. Numbers per rotor stand after the columns of a row, R for each group of
 them; a drone with fewer rotors has some that do not exist, whose speeds and limits are zero. `each`, a tuple of R
 numbers, tells compiled code how many there are: it is compiled for each R, and its loops over rotors are unrolled.
+R is four only where all are crosses of four, whose places and mixing are then constants of the code: with a vehicle
+whose four rotors stand elsewhere, R is five.
 """
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -36,8 +39,8 @@ VEHICLE = columns(
         Field("air_density", "kg/m^3"),
         Field("rotor_radius", "m"),
         Field("rotor_inertia", "kg m^2"),
-        Field("rotor_count", "1"),
-        Field("rotor_share", "1"),  # 1 / rotor_count
+        Field("rotor_share", "1"),  # 1 / number of its rotors
+        Field("jet_start", "m"),  # width of the jet where it leaves the rotors
         Field("contact_reach", "m"),  # farther than any contact point from the centre of mass
         Field("stand_height", "m"),  # of the centre of mass of a standing drone
         Field("foot_stiffness", "N/m"),  # per contact point
@@ -66,6 +69,7 @@ ROTOR = columns(  # groups of what is known of each rotor
         Field("roll", "1"),  # thrust per moment over rotor_unit
         Field("pitch", "1"),
         Field("yaw", "1"),  # thrust per moment over torque per thrust
+        Field("yaw_inverse", "1"),  # 0 where yaw is
     ),
 )
 STATE = columns(  # and R speeds [rad/s]
@@ -80,6 +84,10 @@ EXPOSED = columns(  # what a user's sensor is exposed to; accel as in Bodies
 STREAMS = columns("StreamColumns", (Field("sensors", "1", 6), Field("wind", "1")))
 
 Row = NDArray[np.float64] | tuple[float, ...]  # of one drone: a view, or loaded
+CROSS_ROTORS = 4
+# Of a cross of four (zsim.vehicles.vehicle.cross_layout), as in ROTOR
+_X, _Y, _TURN = (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, -1.0, 1.0), (1.0, -1.0, 1.0, -1.0)
+_ROLL, _PITCH, _YAW = (0.25, -0.25, -0.25, 0.25), (-0.25, -0.25, 0.25, 0.25), (0.25, -0.25, 0.25, -0.25)
 
 
 class KernelTime(NamedTuple):
@@ -184,9 +192,37 @@ def of(rotors: PerRotor, group: int, r: int) -> float:
 
 
 @inlined
+def place(rotors: PerRotor, r: int) -> tuple[float, float, float]:
+    """Return x, y [rotor_unit] and turn of rotor r, `rotors` being its parameters."""
+    if len(rotors.each) == CROSS_ROTORS:
+        return _X[r], _Y[r], _TURN[r]
+    return of(rotors, ROTOR.x, r), of(rotors, ROTOR.y, r), of(rotors, ROTOR.turn, r)
+
+
+@inlined
+def mixed(rotors: PerRotor, r: int) -> tuple[float, float, float, float]:
+    """Return roll, pitch, yaw of rotor r and the inverse of yaw, `rotors` being its parameters."""
+    if len(rotors.each) == CROSS_ROTORS:
+        return _ROLL[r], _PITCH[r], _YAW[r], 1.0 / _YAW[r]
+    inverse = of(rotors, ROTOR.yaw_inverse, r)
+    return of(rotors, ROTOR.roll, r), of(rotors, ROTOR.pitch, r), of(rotors, ROTOR.yaw, r), inverse
+
+
+@inlined
 def put_of(rotors: PerRotor, r: int, value: float) -> None:
     """Set the number of rotor r in the first group."""
     rotors.numbers[rotors.first + rotors.step * r] = value
+
+
+def rotor_slots(vehicles: Iterable[Vehicle]) -> int:
+    """Return R of a fleet."""
+    slots = CROSS_ROTORS
+    for vehicle in vehicles:
+        cross = len(vehicle.rotors) == CROSS_ROTORS and np.array_equal(
+            allocation(vehicle), (_Y, np.negative(_X), _TURN)
+        )
+        slots = max(slots, len(vehicle.rotors) if cross else max(len(vehicle.rotors), CROSS_ROTORS + 1))
+    return slots
 
 
 def vehicle_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> NDArray[np.float64]:
@@ -204,7 +240,8 @@ def vehicle_row(vehicle: Vehicle, drone: Drone, environment: Environment) -> NDA
     row[VEHICLE.gravity], row[VEHICLE.air_density] = environment.gravity_m_s2, environment.air_density_kg_m3
     row[VEHICLE.rotor_radius] = vehicle.rotor_radius_m * (drone.thrust_n_s2 / vehicle.thrust_n_s2) ** 0.25
     row[VEHICLE.rotor_inertia] = vehicle.rotor_inertia_kg_m2 * drone.torque_nm_s2 / vehicle.torque_nm_s2
-    row[VEHICLE.rotor_count], row[VEHICLE.rotor_share] = len(vehicle.rotors), 1.0 / len(vehicle.rotors)
+    row[VEHICLE.rotor_share] = 1.0 / len(vehicle.rotors)
+    row[VEHICLE.jet_start] = math.sqrt(len(vehicle.rotors)) * row[VEHICLE.rotor_radius]
     row[VEHICLE.contact_reach] = frame.reach_m * size
     row[VEHICLE.stand_height] = size * (frame.foot_depth_m - frame.foot_sag_m)
     stiffness = drone.mass_kg * environment.gravity_m_s2 / (4.0 * size * frame.foot_sag_m)
@@ -229,4 +266,6 @@ def rotor_row(vehicle: Vehicle, drone: Drone, rotors: int) -> NDArray[np.float64
     groups[ROTOR.x, :count], groups[ROTOR.y, :count], groups[ROTOR.turn, :count] = -minus_pitch, roll, turn
     groups[ROTOR.low, :count], groups[ROTOR.high, :count] = drone.rotor_min_rad_s, drone.rotor_max_rad_s
     groups[ROTOR.roll : ROTOR.yaw + 1, :count] = mixing(vehicle).T
+    yaw = groups[ROTOR.yaw]
+    groups[ROTOR.yaw_inverse] = np.divide(1.0, yaw, out=np.zeros(rotors), where=yaw != 0.0)
     return groups.ravel()

@@ -191,10 +191,10 @@ def _drive(lanes: NDArray, each: tuple[int, ...]) -> None:
 @inlined
 def _command(bodies: Bodies, boards: Boards, i: int, commands: PerRotor) -> None:
     """Give the rotors of drone i their command, if there is charge for it, and let its firmware count on it."""
+    charged, command = bodies.energy[i] > 0.0, bodies.command[i]
     observer.model_rotors(boards.belief[i], boards.setting[i, SETTING.rotor_decay], commands)
-    charged = charge_percent(bodies.vehicle[i], bodies.energy[i]) > 0.0
     for r in range(len(commands.each)):
-        bodies.command[i, r] = of(commands, 0, r) if charged else 0.0
+        command[r] = of(commands, 0, r) if charged else 0.0
     if boards.actuator[i, ACTUATOR.faulty] != 0.0 and charged:
         _weaken(bodies.command[i], boards.actuator[i])
 

@@ -1,6 +1,7 @@
-"""The AR.Drone as meshes, made of simple solids; B is x ahead, y left, z up, its origin at the centre of mass.
+"""Multirotors as meshes, made of simple solids; B is x ahead, y left, z up, its origin at the centre of mass.
 
-Lengths are in metres; those that have no name are chosen for the looks, and used in no computation.
+They look like the AR.Drone, as large as their arms are long and with the rotors that they have. Lengths are in metres;
+those that have no name are the AR.Drone's, chosen for the looks, and used in no computation.
 """
 
 import math
@@ -14,13 +15,13 @@ from trimesh.creation import annulus, box, capsule, cone, cylinder, icosphere
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-HULL_M = 0.515  # over all with the indoor hull, as weighed and measured by OpenMAS
+from zsim.contract.messages import DroneInfo
+from zsim.vehicles.vehicle import cross_layout
+
 ARM_M = 0.1785  # from the centre to a rotor's axis
 ROTOR_RADIUS_M = 0.10  # 8 inch propellers of the AR.Drone
-HUB_M = ARM_M / math.sqrt(2)
-HUBS_B = np.array([(HUB_M, HUB_M), (HUB_M, -HUB_M), (-HUB_M, -HUB_M), (-HUB_M, HUB_M)])  # fl, fr, rr, rl
+RING = 1.31  # rotor radii, outer radius of a hull ring: half of the 0.515 m of the hull, less 0.126 m to its centre
 ROTOR_Z_M = 0.030  # of the rotors over the centre of mass; drawn
-RING_M = HULL_M / 2 - HUB_M  # outer radius of a hull ring
 COLOURS = {  # sRGB, 0 to 255
     "cross": (42, 44, 48),
     "hull": (74, 78, 86),
@@ -37,11 +38,31 @@ class Mesh(NamedTuple):
     faces: NDArray[np.uint32]
 
 
+class Airframe(NamedTuple):
+    """What a drone looks like: its rotors' axes (x, y) and their radius [m]."""
+
+    hubs_B: tuple[tuple[float, float], ...]
+    radius_m: float
+
+    @property
+    def size(self) -> float:
+        """Return how much larger it is than the AR.Drone, by the longest arm."""
+        return max(math.hypot(x, y) for x, y in self.hubs_B) / ARM_M
+
+
+def airframe_of(drone: DroneInfo, arm_m: float) -> Airframe:
+    """Return what a drone looks like; one whose rotors are not named has four, in a cross of this arm [m]."""
+    if not drone.rotors:
+        hubs = tuple((rotor.x_m, rotor.y_m) for rotor in cross_layout(arm_m))
+        return Airframe(hubs, ROTOR_RADIUS_M * arm_m / ARM_M)
+    return Airframe(tuple((rotor.x_m, rotor.y_m) for rotor in drone.rotors), drone.rotors[0].radius_m)
+
+
 @cache
-def coloured() -> bytes:
+def coloured(airframe: Airframe) -> bytes:
     """Return a drone without its rotors as GLB: what has a colour of its own is a surface of its own."""
     scene = trimesh.Scene()
-    for name, solids in _solids().items():
+    for name, solids in _solids(airframe).items():
         solid = _joined(solids)
         solid.unmerge_vertices()  # else light would run round the edges
         look = PBRMaterial(baseColorFactor=(*COLOURS[name], 255), metallicFactor=0.0, roughnessFactor=0.75)
@@ -51,18 +72,24 @@ def coloured() -> bytes:
 
 
 @cache
-def whole() -> Mesh:
+def whole(airframe: Airframe) -> Mesh:
     """Return a drone as one surface."""
-    return _mesh([solid for solids in _solids().values() for solid in solids])
+    return _mesh([solid for solids in _solids(airframe).values() for solid in solids])
 
 
-def _solids() -> dict[str, list[trimesh.Trimesh]]:
-    return {
-        "cross": [*_arms(), *_motors(), *_feet(), _lens()],
-        "hull": [*_rings(), _body()],
+def _solids(airframe: Airframe) -> dict[str, list[trimesh.Trimesh]]:
+    """Return the solids of a drone by their colour: drawn as large as the AR.Drone, then scaled."""
+    hubs = [(x / airframe.size, y / airframe.size) for x, y in airframe.hubs_B]
+    radius = airframe.radius_m / airframe.size
+    solids = {
+        "cross": [*map(_arm, hubs), *map(_motor, hubs), *map(_foot, hubs), _lens()],
+        "hull": [*(_ring(hub, RING * radius) for hub in hubs), _body()],
         "nose": [_nose()],
         "hat": _hat(),
     }
+    for solid in (solid for of_one in solids.values() for solid in of_one):
+        solid.apply_scale(airframe.size)
+    return solids
 
 
 @cache
@@ -97,22 +124,23 @@ def _moved(solid: trimesh.Trimesh, by_m: tuple[float, float, float], yaw: float 
     return solid
 
 
-def _arms() -> list[trimesh.Trimesh]:
-    """The carbon cross under 45 degrees."""
-    return [_moved(box((2 * ARM_M, 0.014, 0.012)), (0, 0, 0.004), turn) for turn in (math.pi / 4, -math.pi / 4)]
+def _arm(hub: tuple[float, float]) -> trimesh.Trimesh:
+    """The carbon beam from the centre to a rotor."""
+    x, y = hub
+    return _moved(box((math.hypot(x, y), 0.014, 0.012)), (x / 2, y / 2, 0.004), math.atan2(y, x))
 
 
-def _motors() -> list[trimesh.Trimesh]:
-    return [_moved(cylinder(0.017, 0.034, sections=12), (x, y, ROTOR_Z_M / 2)) for x, y in HUBS_B]
+def _motor(hub: tuple[float, float]) -> trimesh.Trimesh:
+    return _moved(cylinder(0.017, 0.034, sections=12), (*hub, ROTOR_Z_M / 2))
 
 
-def _feet() -> list[trimesh.Trimesh]:
-    return [_moved(cylinder(0.006, 0.058, sections=8), (0.92 * x, 0.92 * y, -0.029)) for x, y in HUBS_B]
+def _foot(hub: tuple[float, float]) -> trimesh.Trimesh:
+    return _moved(cylinder(0.006, 0.058, sections=8), (0.92 * hub[0], 0.92 * hub[1], -0.029))
 
 
-def _rings() -> list[trimesh.Trimesh]:
-    """The foam rings of the indoor hull about the rotors."""
-    return [_moved(annulus(RING_M - 0.016, RING_M, 0.042, sections=28), (x, y, 0.022)) for x, y in HUBS_B]
+def _ring(hub: tuple[float, float], radius: float) -> trimesh.Trimesh:
+    """The foam ring of the indoor hull about a rotor."""
+    return _moved(annulus(radius - 0.016, radius, 0.042, sections=28), (*hub, 0.022))
 
 
 def _body() -> trimesh.Trimesh:

@@ -1,12 +1,13 @@
 """The page's panels: plots, forms and tables of one run."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import viser
 from viser import uplot
 
+from zsim.contract.messages import DroneInfo
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
@@ -104,6 +105,7 @@ class ConsolePage:
         report: called with requests that are refused without being sent.
         show: shows or hides one of `SWITCHES` in the scene.
         rate: that the run was started with.
+        drones: of the run, with their rotors.
 
     Attributes:
         clock, phases, drones, sensors, faults, events: the tables.
@@ -121,6 +123,7 @@ class ConsolePage:
         report: Callable[[RequestOutcome], None],
         show: Callable[[str, bool], None],
         rate: float,
+        drones: Sequence[DroneInfo] = (),
     ) -> None:
         self._scenario = scenario
         self._spaces = spaces
@@ -128,6 +131,7 @@ class ConsolePage:
         self._report = report
         self._show = show
         self._rate = rate
+        self._drones = drones
         self.forms: dict[str, FormationForm] = {}
         self.plots: dict[str, VariablePlots] = {}
         self.chosen = next(iter(spaces), "")
@@ -155,7 +159,7 @@ class ConsolePage:
             self._formation_tabs(gui, tabs)
         with tabs.add_tab("Faults"):
             self.faults = gui.add_html("")
-            FaultForm(gui, self._client, self._report, self._scenario)
+            FaultForm(gui, self._client, self._report, self._scenario, self._drones)
         with tabs.add_tab("Run"):
             RunForm(gui, self._client, self._rate)
             self._switches(gui)

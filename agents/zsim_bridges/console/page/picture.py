@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones
 from zsim.math import frames
+from zsim.vehicles.vehicle import ROTORS_MAX
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace, SingularClusterError
 
 Array = NDArray[np.float64]
@@ -22,7 +23,6 @@ SIGMAS = 2.0  # of an ellipsoid
 SHARE_WITHIN = 1 - math.erfc(SIGMAS / math.sqrt(2)) - math.sqrt(2 / math.pi) * SIGMAS * math.exp(-(SIGMAS**2) / 2)
 """Of a Gaussian in three dimensions, within 2 sigma: chi-squared of three degrees of freedom at 4, 0.739."""
 RADIUS_MAX_M = 60.0  # of an ellipsoid: before the first fix nothing is known, and the page would be inside of it
-SPIN = np.array([-1.0, 1.0, -1.0, 1.0])  # against the drag torque of each rotor, as zsim.vehicles.vehicle.cross_layout
 SHAPED_PHASES = frozenset({"assembling", "engaged", "held"})  # phases in which a formation has somewhere to be
 CORNER_SHARE = (
     0.25  # of the way from a corner to the opposite side; there its angle is written, clear of names and sides
@@ -37,7 +37,7 @@ class DronePoses(NamedTuple):
     names: tuple[str, ...]
     p_W: Array  # (N, 3) m; NaN of a drone that is not in the view
     q_WB: Array  # (N, 4)
-    rotor: Array  # (N, 4) rad/s
+    rotor: Array  # (N, ROTORS_MAX) rad/s; 0 where a drone has fewer
     wind_W: Array  # (3,) m/s, the mean over the drones
 
     @property
@@ -74,35 +74,39 @@ class FormationShape(NamedTuple):
 def drone_poses(view: ViewDrones, names: Sequence[str]) -> DronePoses:
     """Return a view as arrays of the drones of those names, which may not all be in it: a replay has some alone."""
     count = len(names)
-    p_W, q_WB, rotor = np.full((count, 3), np.nan), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1)), np.zeros((count, 4))
+    p_W, q_WB = np.full((count, 3), np.nan), np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
+    rotor = np.zeros((count, ROTORS_MAX))
     indices = {name: i for i, name in enumerate(names)}
     for drone in view.drones:
         i = indices.get(drone.name)
         if i is not None:
-            p_W[i], q_WB[i], rotor[i] = drone.position_m, drone.orientation_wxyz, drone.rotor_rad_s[:4]
+            p_W[i], q_WB[i] = drone.position_m, drone.orientation_wxyz
+            rotor[i, : len(drone.rotor_rad_s)] = drone.rotor_rad_s
     wind = np.mean(view.wind_m_s, axis=0) if view.wind_m_s else np.zeros(3)
     return DronePoses(view.t_ns, tuple(names), p_W, q_WB, rotor, wind)
 
 
-def rotor_angles(angles: Array, rotor: Array, dt_s: float) -> Array:
-    """Return the angles (N, 4) [rad] to which rotors are drawn dt_s later: slowed down to be visible."""
-    return (angles + SPIN * rotor * (dt_s / ROTOR_SLOWDOWN)) % math.tau
-
-
-def rotor_poses(drones: DronePoses, hubs_B: Array, angles: Array) -> tuple[Array, Array]:
-    """Return centres (4N, 3) and quaternions (4N, 4) of the rotors.
+def rotor_angles(angles: Array, speeds: Array, turns: Array, dt_s: float) -> Array:
+    """Return the angles [rad] to which rotors are drawn dt_s later: slowed down to be visible.
 
     Args:
-        drones: N of them.
-        hubs_B: (4, 3) m.
-        angles: (N, 4) rad.
+        angles, speeds: (M,) rad, rad/s; turns: (M,), 1 of a rotor that turns clockwise seen from above, else -1.
     """
-    R_WB = frames.rotation_matrix(drones.q_WB)
-    p = drones.p_W[:, None] + np.einsum("nij,kj->nki", R_WB, hubs_B)
-    w, x, y, z = (part[:, None] for part in drones.q_WB.T)
+    return (angles - turns * speeds * (dt_s / ROTOR_SLOWDOWN)) % math.tau
+
+
+def rotor_poses(p_W: Array, q_WB: Array, hubs_B: Array, angles: Array) -> tuple[Array, Array]:
+    """Return centres (M, 3) [m] and quaternions (M, 4) of M rotors.
+
+    Args:
+        p_W, q_WB: of the drone of each, (M, 3) m and (M, 4).
+        hubs_B: (M, 3) m.
+        angles: (M,) rad.
+    """
+    p = p_W + np.einsum("mij,mj->mi", frames.rotation_matrix(q_WB), hubs_B)
+    w, x, y, z = q_WB.T
     c, s = np.cos(angles / 2), np.sin(angles / 2)
-    q = np.stack((w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s), axis=-1)
-    return p.reshape(-1, 3), q.reshape(-1, 4)
+    return p, np.column_stack((w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s))
 
 
 def ellipsoids(estimates: Sequence[EstimateView]) -> Ellipsoids:

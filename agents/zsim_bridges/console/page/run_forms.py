@@ -1,12 +1,13 @@
 """Controls of the run's time, of drones one by one or all together, and of injected faults."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import viser
 
+from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import GATES_MAX, RATE_MAX
-from zsim.scenario.fault_kinds import PROCESS_KILL, FaultKind, kinds_of
+from zsim.scenario.fault_kinds import PROCESS_KILL, ROTORS, FaultKind, kinds_of
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.catalogue import declarations
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
@@ -27,11 +28,18 @@ class FaultForm:
         client: sends requests.
         report: called with requests that are refused without being sent.
         scenario: has the drones and processes.
+        drones: of the run, with the names of their rotors; the AR.Drone's hold where there are none.
     """
 
     def __init__(
-        self, gui: viser.GuiApi, client: CommandClient, report: Callable[[RequestOutcome], None], scenario: Scenario
+        self,
+        gui: viser.GuiApi,
+        client: CommandClient,
+        report: Callable[[RequestOutcome], None],
+        scenario: Scenario,
+        drones: Sequence[DroneInfo] = (),
     ) -> None:
+        self._rotors = {drone.name: [rotor.name for rotor in drone.rotors] for drone in drones}
         self._client = client
         self._report = report
         self._kinds = kinds_of(declarations(scenario.drones))
@@ -39,9 +47,7 @@ class FaultForm:
         self._drone = gui.add_dropdown("drone", names)
         self._for = gui.add_number("for [s]", DURATION_S, min=0.0, max=1e5, step=1.0, hint="0: until it is cleared")
         self._button(gui, "GPS lost", lambda: self._on_drone("gps_dropout"))
-        self._button(
-            gui, "Motor weak", lambda: self._on_drone("rotor_efficiency", rotor="front_left", value=WEAK_THRUST_SHARE)
-        )
+        self._button(gui, "Motor weak", self._weaken)
         self._button(gui, "Gust", lambda: self._add("gust", "world", velocity_m_s=list(GUST_M_S)))
         self._button(
             gui, "Link loss", lambda: self._add("link_loss", f"world/{self._estimator()}", probability=LOSS_PROBABILITY)
@@ -55,6 +61,10 @@ class FaultForm:
 
     def _estimator(self) -> str:
         return f"estimator.{self._drone.value}"
+
+    def _weaken(self) -> None:
+        rotors = self._rotors.get(self._drone.value) or ROTORS
+        self._on_drone("rotor_efficiency", rotor=rotors[0], value=WEAK_THRUST_SHARE)
 
     def _on_drone(self, kind: str, **parameters: Any) -> None:
         self._add(kind, self._drone.value, **parameters)

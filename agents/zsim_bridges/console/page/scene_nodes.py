@@ -9,7 +9,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from zsim.contract.messages import DroneInfo
 from zsim.scenario.scenario import Obstacle
+from zsim.vehicles.vehicle import cross_layout
 from zsim_bridges.console.page import airframe
 from zsim_bridges.console.page.picture import Array, DronePoses, Ellipsoids, FormationShape, rotor_angles, rotor_poses
 
@@ -123,26 +125,34 @@ class SceneNodes:
 
     Args:
         server: viser's; what another run has left on it is removed.
-        names: of the drones.
+        drones: of the run.
+        arms_m: centre to rotor, of each.
         robots: how many drones are in formations, and so have a ghost.
         clusters: how many formations there are.
     """
 
-    def __init__(self, server: viser.ViserServer, names: tuple[str, ...], robots: int, clusters: int) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        drones: Sequence[DroneInfo],
+        arms_m: Sequence[float],
+        robots: int,
+        clusters: int,
+    ) -> None:
         self._server = server
         self._scene = server.scene
-        self._count = len(names)
-        self._angles = np.zeros((len(names), 4))
-        self._hubs_B = np.column_stack((airframe.HUBS_B, np.full(4, airframe.ROTOR_Z_M)))
+        self._count = len(drones)
+        names = tuple(drone.name for drone in drones)
         self._trail_node: Any = None
         self._trails_shown = True
         server.scene.reset()
         server.scene.set_up_direction("+z")
         self._ground()
-        p, q, _ = _padded(len(names), np.zeros((0, 3)), np.zeros((0, 4)))
-        self._airframes: Any = self._scene.add_batched_glb("/drones", airframe.coloured(), q, p, lod="off")
-        self._rotors = self._batch("/rotors", airframe.rotor(), 4 * len(names), airframe.COLOURS["rotor"])
-        self._ghosts = self._batch("/ghosts", airframe.whole(), robots, GHOST, opacity=0.5) if robots else None
+        looks = [airframe.airframe_of(*each) for each in zip(drones, arms_m, strict=True)]
+        self._airframes = _AirframeNodes(self._scene, looks)
+        self._rotors = _RotorNodes(drones, looks, self._batch)
+        ghost = airframe.whole(looks[0])
+        self._ghosts = self._batch("/ghosts", ghost, robots, GHOST, opacity=0.5) if robots else None
         self._ellipsoids = self._batch("/estimates", airframe.ball(), len(names), ELLIPSOID, opacity=0.35)
         self._names = self._labels(names)
         self._wind = self._scene.add_arrows(
@@ -171,9 +181,8 @@ class SceneNodes:
     def drones(self, drones: DronePoses, dt_s: float) -> None:
         """Move the drones; their rotors have turned for dt_s."""
         drones = drones._replace(p_W=np.where(drones.present[:, None], drones.p_W, HIDDEN))
-        self._airframes.batched_positions, self._airframes.batched_wxyzs = drones.p_W, drones.q_WB
-        self._angles = rotor_angles(self._angles, drones.rotor, dt_s)
-        self._rotors.batched_positions, self._rotors.batched_wxyzs = rotor_poses(drones, self._hubs_B, self._angles)
+        self._airframes.move(drones)
+        self._rotors.move(drones, dt_s)
         for label, p_W in zip(self._names, drones.p_W, strict=False):
             label.position = p_W + LABEL_B
 
@@ -252,6 +261,44 @@ class SceneNodes:
         if len(names) > NAMED_MAX:
             return []
         return [self._scene.add_label(f"/names/{name}", name, anchor="bottom-center") for name in names]
+
+
+class _AirframeNodes:
+    """The drones without their rotors: a node for all that look alike."""
+
+    def __init__(self, scene: viser.SceneApi, looks: Sequence[airframe.Airframe]) -> None:
+        self._nodes: list[tuple[NDArray[np.int64], Any]] = []
+        for k, look in enumerate(dict.fromkeys(looks)):
+            owners = np.array([i for i, other in enumerate(looks) if other == look])
+            p, q, _ = _padded(len(owners), np.zeros((0, 3)), np.zeros((0, 4)))
+            name = f"/drones/{k}" if k else "/drones"
+            self._nodes.append((owners, scene.add_batched_glb(name, airframe.coloured(look), q, p, lod="off")))
+
+    def move(self, drones: DronePoses) -> None:
+        for owners, node in self._nodes:
+            node.batched_positions, node.batched_wxyzs = drones.p_W[owners], drones.q_WB[owners]
+
+
+class _RotorNodes:
+    """The rotors of all drones, as one node; each is as large as it is."""
+
+    def __init__(self, drones: Sequence[DroneInfo], looks: Sequence[airframe.Airframe], batch: Any) -> None:
+        self._owners = np.repeat(np.arange(len(looks)), [len(look.hubs_B) for look in looks])
+        self._places = np.concatenate([np.arange(len(look.hubs_B)) for look in looks])
+        hubs = [(x, y, airframe.ROTOR_Z_M * look.size) for look in looks for x, y in look.hubs_B]
+        rotors = [drone.rotors or cross_layout(airframe.ARM_M) for drone in drones]
+        self._turns = np.array([float(rotor.turn) for of_one in rotors for rotor in of_one])
+        self._hubs_B, self._angles = np.array(hubs), np.zeros(len(hubs))
+        self._node = batch("/rotors", airframe.rotor(), len(hubs), airframe.COLOURS["rotor"])
+        scales = [look.radius_m / airframe.ROTOR_RADIUS_M for look in looks]
+        self._node.batched_scales = np.tile(np.array(scales)[self._owners, None], (1, 3))
+
+    def move(self, drones: DronePoses, dt_s: float) -> None:
+        """Move the rotors, which have turned for dt_s."""
+        speeds = drones.rotor[self._owners, self._places]
+        self._angles = rotor_angles(self._angles, speeds, self._turns, dt_s)
+        p_W, q_WB = drones.p_W[self._owners], drones.q_WB[self._owners]
+        self._node.batched_positions, self._node.batched_wxyzs = rotor_poses(p_W, q_WB, self._hubs_B, self._angles)
 
 
 class _FormationNodes:

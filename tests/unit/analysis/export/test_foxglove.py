@@ -27,7 +27,7 @@ from zsim_agents.formation.spaces.cluster_space import SingularClusterError
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_analysis.export import Format
 from zsim_analysis.export.foxglove_messages import NumericMessageType
-from zsim_analysis.export.foxglove_scene import Instant
+from zsim_analysis.export.foxglove_scene import Instant, RotorDisc
 from zsim_analysis.export.foxglove_topics import FoxgloveFile
 from zsim_analysis.export.make_export import export
 from zsim_analysis.export.selection import MessageSelection
@@ -202,7 +202,9 @@ def test_a_formation_that_cannot_be_has_no_ghosts(tmp_path: Path) -> None:
         space.inverse(np.array(desired))
     some = tuple(desired)
     state = ClusterState(0, 0, "engaged", DRONES, space.names, some, some, some, None, 0.0, "")
-    file = FoxgloveFile(tmp_path / "some.mcap", dict.fromkeys(DRONES, 0.2), {"main": space})
+    file = FoxgloveFile(
+        tmp_path / "some.mcap", {drone: [RotorDisc(0.2, 0.0, 0.1)] for drone in DRONES}, {"main": space}
+    )
     file.write(Instant(0, states={"main": state}))
     file.close()
     assert file.counts["/scene/formations"] == file.counts["/cluster/main/variables"] == 1

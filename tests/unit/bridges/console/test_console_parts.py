@@ -58,7 +58,7 @@ def test_a_view_becomes_arrays():
     assert found.t_ns == 7
     assert found.names == ("d0", "d1")
     assert found.p_W.tolist() == [[0, 2, 3], [1, 2, 3]]
-    assert found.rotor.tolist() == [[1, 2, 3, 4]] * 2
+    assert found.rotor.tolist() == [[1, 2, 3, 4, 0, 0, 0, 0]] * 2
     assert found.wind_W.tolist() == [2, 0, 0]
 
 
@@ -77,7 +77,8 @@ def test_rotors_stand_on_their_drone_and_turn_about_its_axis():
     hubs = np.array([(0.1, 0.1, 0.03), (0.1, -0.1, 0.03), (-0.1, -0.1, 0.03), (-0.1, 0.1, 0.03)])
     q = some_attitudes(5)
     p = RNG.normal(size=(5, 3))
-    places, turns = pic.rotor_poses(drones(p, q), hubs, RNG.uniform(0, 6, (5, 4)))
+    owners = np.repeat(np.arange(5), 4)
+    places, turns = pic.rotor_poses(p[owners], q[owners], np.tile(hubs, (5, 1)), RNG.uniform(0, 6, 20))
     R = frames.rotation_matrix(q)
     for n in range(5):
         for k in range(4):
@@ -86,12 +87,12 @@ def test_rotors_stand_on_their_drone_and_turn_about_its_axis():
 
 
 def test_rotors_turn_so_slowly_that_eyes_see_which_way():
-    fastest = np.full((1, 4), 503.0)  # rad/s, of the AR.Drone
-    turned = pic.rotor_angles(np.zeros((1, 4)), fastest, 0.1)  # ten pictures a second, the fewest
+    fastest, ways = np.full(4, 503.0), np.array([1.0, -1.0, 1.0, -1.0])  # rad/s, of the AR.Drone
+    turned = pic.rotor_angles(np.zeros(4), fastest, ways, 0.1)  # ten pictures a second, the fewest
     steps = np.abs((turned + math.pi) % math.tau - math.pi)
     assert (steps > 0.1).all()
     assert (steps < math.pi / 2).all()  # a propeller of two blades looks the same after half a turn
-    assert pic.rotor_angles(turned, fastest, 0.0) == pytest.approx(turned)
+    assert pic.rotor_angles(turned, fastest, ways, 0.0) == pytest.approx(turned)
 
 
 def test_an_ellipsoid_is_the_covariance_at_two_sigma():

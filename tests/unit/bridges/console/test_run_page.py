@@ -1,5 +1,6 @@
 """One run on the page, drawn by a viser of its own that nobody looks at but the test."""
 
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ import pytest
 from refused import has_terms, without_tags
 
 from zsim.contract import keys, messages
+from zsim.contract.messages import DroneInfo, RotorInfo
 from zsim.contract.run_messages import ControlAnswer, Event
 from zsim.contract.views import DroneView, EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.scenario import scenario_file
@@ -29,6 +31,8 @@ CLUSTER = SCENARIO.clusters[0].name
 SPACE = scenario_space(SCENARIO, SCENARIO.clusters[0])
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 ROTORS = (300.0, 300.0, 300.0, 300.0)  # rad/s
+ARMS_M = (0.1785,) * 3
+DRONES = tuple(DroneInfo(name, "ardrone2") for name in NAMES)
 ORIGIN = (0.0, 0.0, 0.0)
 OBSTACLES = """
 name: field
@@ -75,7 +79,7 @@ class Seen:
         self.observer: Any = SimpleNamespace(
             name="console.1", now_ns=0, end_reason="", health=health, update_clock=lambda _: None, tick=lambda: None
         )
-        drones = [SimpleNamespace(name=name) for name in NAMES]
+        drones = DRONES
         scenario = STEP.read_text()
         info: Any = SimpleNamespace(run_id="r1", rate=1.0, mode="lockstep", drones=drones, scenario=scenario)
         server.get_clients = lambda: {0: None} if watched else {}
@@ -154,17 +158,31 @@ def test_a_run_that_nobody_watched_leaves_its_last_picture(viser: PrivateViser):
 
 
 def test_a_drone_that_is_missing_is_hidden_and_the_others_keep_their_places(viser: PrivateViser):
-    stage = stages.SceneNodes(viser.server, NAMES, 3, 1)
+    stage = stages.SceneNodes(viser.server, DRONES, ARMS_M, 3, 1)
     found = drone_poses(drones(NAMES[2])[1], NAMES)
     stage.drones(found, 0.05)
     stage.wind(found)
-    p_W = np.asarray(stage._airframes.batched_positions)
+    ((_, frames),) = stage._airframes._nodes
+    p_W = np.asarray(frames.batched_positions)
     assert p_W[2].tolist() == [0.0, 3.0, 2.0]
     assert p_W[0].tolist() == p_W[1].tolist() == list(stages.HIDDEN)
-    assert np.isfinite(stage._rotors.batched_positions).all()
+    assert np.isfinite(stage._rotors._node.batched_positions).all()
     assert stage._wind.visible
     stage.wind(drone_poses(drones()[1], NAMES))
     assert not stage._wind.visible
+
+
+def test_each_drone_is_drawn_with_the_rotors_that_it_has(viser: PrivateViser):
+    """Beside two of an old record, which names none, one of six rotors, half as large."""
+    ends = [(0.09 * math.cos(k), 0.09 * math.sin(k)) for k in np.arange(6) * math.pi / 3]
+    six = DroneInfo(NAMES[2], "mine", tuple(RotorInfo(f"r{k}", x, y, 1, 0.05) for k, (x, y) in enumerate(ends)))
+    stage = stages.SceneNodes(viser.server, (*DRONES[:2], six), ARMS_M, 3, 1)
+    stage.drones(drone_poses(drones(*NAMES)[1], NAMES), 0.05)
+    assert [owners.tolist() for owners, _ in stage._airframes._nodes] == [[0, 1], [2]]
+    places = np.asarray(stage._rotors._node.batched_positions)
+    assert len(places) == 4 + 4 + 6
+    np.testing.assert_allclose(places[8:, :2] - (0.0, 3.0), ends, atol=1e-6)
+    np.testing.assert_allclose(stage._rotors._node.batched_scales[:, 0], [1.0] * 8 + [0.5] * 6)
 
 
 def test_views_of_another_controller_are_left_out(seen: Seen):
@@ -184,7 +202,7 @@ def test_estimates_of_strangers_are_left_out(seen: Seen):
 
 
 def test_trails_go_when_a_replay_goes_back(viser: PrivateViser):
-    stage = stages.SceneNodes(viser.server, NAMES, 3, 1)
+    stage = stages.SceneNodes(viser.server, DRONES, ARMS_M, 3, 1)
     stage.trails(np.ones((2, 2, 3)), np.array([0, 1]))
     stage.trails(np.zeros((0, 2, 3)), np.zeros(0, dtype=np.int64))
     assert (np.asarray(stage._trail_node.points)[..., 2] < -100.0).all()
@@ -229,7 +247,7 @@ def test_obstacles_stand_where_the_scenario_says(viser: PrivateViser):
     obstacles = scenario_file.from_text(OBSTACLES).environment.obstacles
     added: dict[str, Any] = {}
     scene: Any = viser.server.scene
-    stage = stages.SceneNodes(viser.server, NAMES, 3, 1)
+    stage = stages.SceneNodes(viser.server, DRONES, ARMS_M, 3, 1)
     for shape in ("box", "cylinder", "icosphere"):
         setattr(scene, f"add_{shape}", lambda name, **look: added.update({name: look["position"]}))
     try:

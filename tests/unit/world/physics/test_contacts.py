@@ -83,14 +83,14 @@ def test_two_drones_in_one_place_give_no_nan():
 def test_downwash_carries_the_thrust(below):
     """The momentum of the jet, integrated over a plane below, is the thrust at every depth."""
     radii = np.linspace(0.0, 4.0, 20001)
-    speed = np.array([downwash(4.2, 1.225, 4.0, 0.1, below, r) for r in radii])
+    speed = np.array([downwash(4.2, 1.225, 0.2, below, r) for r in radii])
     flux = np.trapezoid(1.225 * speed**2 * 2 * np.pi * radii, radii)
     assert math.isclose(flux, 4.2, rel_tol=1e-3)
 
 
 def test_downwash_at_the_disc_is_twice_the_induced_speed():
     induced = math.sqrt(4.2 / (2 * 1.225 * 4 * math.pi * 0.1**2))
-    assert math.isclose(downwash(4.2, 1.225, 4.0, 0.1, 0.0, 0.0), 2 * induced, rel_tol=1e-12)
+    assert math.isclose(downwash(4.2, 1.225, 0.2, 0.0, 0.0), 2 * induced, rel_tol=1e-12)
 
 
 def test_downwash_blows_on_the_lower_drone_only():
@@ -100,7 +100,7 @@ def test_downwash_blows_on_the_lower_drone_only():
 
 
 def test_downwash_ends_beside_the_jet():
-    assert downwash(4.2, 1.225, 4.0, 0.1, 2.0, JET_WIDTHS * 0.43) == 0.0
+    assert downwash(4.2, 1.225, 0.2, 2.0, JET_WIDTHS * 0.43) == 0.0
 
 
 def all_pairs(state):

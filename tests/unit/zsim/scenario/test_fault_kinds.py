@@ -16,7 +16,7 @@ from zsim.scenario.fault_kinds import KINDS, FaultParameter, acts, expected, pla
 from zsim.scenario.scenario_file import resolve
 
 GATE_NS = 20_000_000
-KNOWN = Known(("drone1", "drone2"), ("main",), ("my.filter",))
+KNOWN = Known(("drone1", "drone2"), ("main",), ("my.filter",), rotors={"drone2": ("r1", "r2")})
 TARGETS = {
     "drone": "drone1",
     "world": "world",
@@ -94,6 +94,7 @@ def test_every_parameter_is_checked(kind: str):
         (sound("gps_dropout", at_s=-1), ('at_s', '-1', '0', '1e+06', 'gps_dropout')),
         (sound("gps_dropout", for_s=0), ('for_s', '0', '>', '0', '<=', '1e+06', 'gps_dropout')),
         (sound("gps_dropout", value=3), ('value', 'known', 'kind', 'target', 'at_s', 'for_s', 'probability', 'gps_dropout')),
+        (sound("rotor_stuck", target="drone2", rotor="front_left"), ('rotor', "'front_left'", 'r1', 'r2', 'all', 'rotor_stuck')),
         (sound("rotor_stuck", rotor="left"), ('rotor', "'left'", 'front_left', 'front_right', 'rear_right', 'rear_left', 'all', 'rotor_stuck')),
     ],
 )  # fmt: skip

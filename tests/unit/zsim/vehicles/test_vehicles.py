@@ -60,6 +60,20 @@ def test_a_resolved_scenario_names_a_module_that_nobody_imports():
     assert other.drones[0].model == "not_here.at_all"
 
 
+def test_a_fault_names_a_rotor_that_the_vehicle_has():
+    fault = {"kind": "rotor_stuck", "target": "a", "at_s": 1, "rotor": "rotor3"}
+    assert scenario_file.resolve(document(model="hexacopter") | {"faults": [fault]}).faults
+    resolved = scenario_file.to_text(scenario_file.resolve(document(model="hexacopter") | {"faults": [fault]}))
+    assert scenario_file.from_text(resolved.replace("hexacopter", "not_here.at_all")).faults  # by an agent
+    for model, rotor in (("hexacopter", "front_left"), ("ardrone2", "rotor3"), ("crazyflie2", "rotor3")):
+        with pytest.raises(ScenarioError) as error:
+            scenario_file.resolve(document(model=model) | {"faults": [fault | {"rotor": rotor}]})
+        (line,) = error.value.faults
+        names = catalogue.vehicle_of(model).rotor_names
+        for part in ("faults[0].rotor", repr(rotor), ", ".join((*names, "all"))):
+            assert part in line
+
+
 @pytest.mark.parametrize("model", ["ardrone", "no_such.module", "3d", "a/b"])
 def test_an_unknown_model_is_a_line_with_drone_value_and_what_is_allowed(model: str):
     line = fault_of(model=model)

@@ -1,4 +1,4 @@
-"""A user's vehicle: the AR.Drone's body with six rotors of two thirds of the thrust each, flat."""
+"""A vehicle of six rotors, `model: hexacopter`: the AR.Drone's body, with two thirds of the thrust in each rotor."""
 
 import math
 from typing import Literal

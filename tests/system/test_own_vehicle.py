@@ -1,0 +1,88 @@
+"""Vehicles by their model: a user's own out of examples/, and the Crazyflie, however a scenario is flown."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from deployment import ROLES, START_S, Deployment, closing, in_process
+from federation import PAIR, Federation
+from forked_commands import ROOT
+from lab import Lab
+
+from zsim.vehicles import catalogue
+
+EXAMPLES = str(ROOT / "examples")
+MODEL = "drones.drone1.model=larger_battery"
+TAKEOFF = "clusters.main.plan.takeoff_s=1"
+DURATION_S = 10.0
+
+
+@pytest.fixture
+def examples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let modules of examples/ be found, here and in what is started from here."""
+    monkeypatch.setenv("PYTHONPATH", EXAMPLES)
+    monkeypatch.syspath_prepend(EXAMPLES)
+
+
+def hover_squares(record: Any, drone: str) -> float:
+    """Return the mean of the squares of a drone's rotor speeds in the last two seconds [rad^2/s^2]."""
+    last = record.all(f"drone/{drone}/truth")[-100:]
+    return float(np.mean(np.square([truth["rotor_rad_s"] for truth in last])))
+
+
+@pytest.mark.usefixtures("examples")
+def test_processes_give_the_bits_of_one_process(federation: Federation) -> None:
+    """The heavier aircraft hovers on more thrust, by its weight."""
+    federation.run(PAIR, "--set", MODEL).ends(with_code=0)
+    record = federation.record()
+    ratio = hover_squares(record, "drone1") / hover_squares(record, "drone2")
+    assert ratio == pytest.approx(0.48 / 0.429, rel=0.05)
+    one = federation.folder / "one"
+    options = ("--set", MODEL, "--in-process", "--out", str(one))
+    federation.start("run", federation.write(PAIR), *options).ends(with_code=0)
+    assert json.loads((one / "summary.json").read_text())["truth_sha256"] == record.sha256()
+
+
+@pytest.mark.usefixtures("examples")
+def test_a_sweep_compares_vehicles(federation: Federation) -> None:
+    path, out = federation.write(PAIR), federation.folder / "sweep"
+    vary = ("--vary", "drones.drone1.model=ardrone2,crazyflie2,larger_battery", "--workers", "1", "--no-report")
+    federation.start("sweep", path, *vary, "--out", str(out)).ends(with_code=0)
+    rows = pq.read_table(out / "sweep.parquet").to_pylist()
+    assert [row["failure"] for row in rows] == [None] * 3
+    assert len({row["truth_sha256"] for row in rows}) == 3
+
+
+def test_it_flies_on_several_hosts(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The module need be only where the scenario is read and where the world is."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    monkeypatch.setenv("PYTHONPATH", EXAMPLES)
+    lab.environment("h1", PYTHONPATH=EXAMPLES)
+    options = ("--duration", str(DURATION_S), "--set", MODEL, "--set", TAKEOFF)
+    with closing(Deployment(lab, ROLES)) as deployment:
+        deployment.up(*options).ends(with_code=0, within_s=START_S)
+        assert deployment.record().sha256() == in_process(tmp_path, DURATION_S, [MODEL, TAKEOFF])
+
+
+def test_crazyflies_fly_test_1_at_the_size_of_a_room(federation: Federation) -> None:
+    """In the window of its report the triangle stands where it is to, as well as its positioning of 10 cm allows."""
+    path = str(ROOT / "scenarios/crazyflie.yaml")
+    out = federation.folder / "crazyflie"
+    federation.start("run", path, "--in-process", "--out", str(out)).ends(with_code=0)
+    errors = json.loads((out / "summary.json").read_text())["errors"]
+    for name, limit in {"x_c": 0.06, "y_c": 0.06, "z_c": 0.03, "p": 0.15, "q": 0.15, "beta": 0.1}.items():  # m, rad
+        assert errors[name]["true_rms"] < limit, name
+
+
+@pytest.mark.usefixtures("examples")
+@pytest.mark.parametrize(("model", "rotor"), [("larger_battery", "rotor7"), ("hexacopter", "front_left")])
+def test_a_fault_of_a_rotor_that_is_not_there_is_one_line(federation: Federation, model: str, rotor: str) -> None:
+    fault = f"faults=[{{kind: rotor_stuck, target: drone1, at_s: 1, rotor: {rotor}}}]"
+    role = federation.start("validate", federation.write(PAIR), "--set", f"drones.drone1.model={model}", "--set", fault)
+    role.ends(with_code=2)
+    (line,) = [line.text for line in role.lines if line.text.strip()]
+    for part in ("faults[0].rotor", repr(rotor), *catalogue.vehicle_of(model).rotor_names):
+        assert part in line
