@@ -51,7 +51,7 @@ class RotorInfo(Struct, frozen=True):
 class DroneInfo(Struct, frozen=True):
     """A drone of the run, the model of its aircraft, and its rotors in the order of `rotor_rad_s`.
 
-    Records of before vehicles could differ name no rotors.
+    Records of older versions name no rotors.
     """
 
     name: str

@@ -216,11 +216,9 @@ def put_of(rotors: PerRotor, r: int, value: float) -> None:
 
 def rotor_slots(vehicles: Iterable[Vehicle]) -> int:
     """Return R of a fleet."""
-    slots = CROSS_ROTORS
+    slots, of_cross = CROSS_ROTORS, np.array((_Y, [-x for x in _X], _TURN))
     for vehicle in vehicles:
-        cross = len(vehicle.rotors) == CROSS_ROTORS and np.array_equal(
-            allocation(vehicle), (_Y, np.negative(_X), _TURN)
-        )
+        cross = np.array_equal(allocation(vehicle), of_cross)
         slots = max(slots, len(vehicle.rotors) if cross else max(len(vehicle.rotors), CROSS_ROTORS + 1))
     return slots
 

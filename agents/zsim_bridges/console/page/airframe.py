@@ -38,7 +38,7 @@ class Mesh(NamedTuple):
     faces: NDArray[np.uint32]
 
 
-class Airframe(NamedTuple):
+class DroneShape(NamedTuple):
     """What a drone looks like: its rotors' axes (x, y) and their radius [m]."""
 
     hubs_B: tuple[tuple[float, float], ...]
@@ -50,19 +50,19 @@ class Airframe(NamedTuple):
         return max(math.hypot(x, y) for x, y in self.hubs_B) / ARM_M
 
 
-def airframe_of(drone: DroneInfo, arm_m: float) -> Airframe:
+def shape_of(drone: DroneInfo, arm_m: float) -> DroneShape:
     """Return what a drone looks like; one whose rotors are not named has four, in a cross of this arm [m]."""
     if not drone.rotors:
         hubs = tuple((rotor.x_m, rotor.y_m) for rotor in cross_layout(arm_m))
-        return Airframe(hubs, ROTOR_RADIUS_M * arm_m / ARM_M)
-    return Airframe(tuple((rotor.x_m, rotor.y_m) for rotor in drone.rotors), drone.rotors[0].radius_m)
+        return DroneShape(hubs, ROTOR_RADIUS_M * arm_m / ARM_M)
+    return DroneShape(tuple((rotor.x_m, rotor.y_m) for rotor in drone.rotors), drone.rotors[0].radius_m)
 
 
 @cache
-def coloured(airframe: Airframe) -> bytes:
+def coloured(shape: DroneShape) -> bytes:
     """Return a drone without its rotors as GLB: what has a colour of its own is a surface of its own."""
     scene = trimesh.Scene()
-    for name, solids in _solids(airframe).items():
+    for name, solids in _solids(shape).items():
         solid = _joined(solids)
         solid.unmerge_vertices()  # else light would run round the edges
         look = PBRMaterial(baseColorFactor=(*COLOURS[name], 255), metallicFactor=0.0, roughnessFactor=0.75)
@@ -72,15 +72,15 @@ def coloured(airframe: Airframe) -> bytes:
 
 
 @cache
-def whole(airframe: Airframe) -> Mesh:
+def whole(shape: DroneShape) -> Mesh:
     """Return a drone as one surface."""
-    return _mesh([solid for solids in _solids(airframe).values() for solid in solids])
+    return _mesh([solid for solids in _solids(shape).values() for solid in solids])
 
 
-def _solids(airframe: Airframe) -> dict[str, list[trimesh.Trimesh]]:
+def _solids(shape: DroneShape) -> dict[str, list[trimesh.Trimesh]]:
     """Return the solids of a drone by their colour: drawn as large as the AR.Drone, then scaled."""
-    hubs = [(x / airframe.size, y / airframe.size) for x, y in airframe.hubs_B]
-    radius = airframe.radius_m / airframe.size
+    hubs = [(x / shape.size, y / shape.size) for x, y in shape.hubs_B]
+    radius = shape.radius_m / shape.size
     solids = {
         "cross": [*map(_arm, hubs), *map(_motor, hubs), *map(_foot, hubs), _lens()],
         "hull": [*(_ring(hub, RING * radius) for hub in hubs), _body()],
@@ -88,7 +88,7 @@ def _solids(airframe: Airframe) -> dict[str, list[trimesh.Trimesh]]:
         "hat": _hat(),
     }
     for solid in (solid for of_one in solids.values() for solid in of_one):
-        solid.apply_scale(airframe.size)
+        solid.apply_scale(shape.size)
     return solids
 
 

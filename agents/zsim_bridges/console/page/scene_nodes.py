@@ -148,7 +148,7 @@ class SceneNodes:
         server.scene.reset()
         server.scene.set_up_direction("+z")
         self._ground()
-        looks = [airframe.airframe_of(*each) for each in zip(drones, arms_m, strict=True)]
+        looks = [airframe.shape_of(*each) for each in zip(drones, arms_m, strict=True)]
         self._airframes = _AirframeNodes(self._scene, looks)
         self._rotors = _RotorNodes(drones, looks, self._batch)
         ghost = airframe.whole(looks[0])
@@ -266,7 +266,7 @@ class SceneNodes:
 class _AirframeNodes:
     """The drones without their rotors: a node for all that look alike."""
 
-    def __init__(self, scene: viser.SceneApi, looks: Sequence[airframe.Airframe]) -> None:
+    def __init__(self, scene: viser.SceneApi, looks: Sequence[airframe.DroneShape]) -> None:
         self._nodes: list[tuple[NDArray[np.int64], Any]] = []
         for k, look in enumerate(dict.fromkeys(looks)):
             owners = np.array([i for i, other in enumerate(looks) if other == look])
@@ -282,7 +282,7 @@ class _AirframeNodes:
 class _RotorNodes:
     """The rotors of all drones, as one node; each is as large as it is."""
 
-    def __init__(self, drones: Sequence[DroneInfo], looks: Sequence[airframe.Airframe], batch: Any) -> None:
+    def __init__(self, drones: Sequence[DroneInfo], looks: Sequence[airframe.DroneShape], batch: Any) -> None:
         self._owners = np.repeat(np.arange(len(looks)), [len(look.hubs_B) for look in looks])
         self._places = np.concatenate([np.arange(len(look.hubs_B)) for look in looks])
         hubs = [(x, y, airframe.ROTOR_Z_M * look.size) for look in looks for x, y in look.hubs_B]
