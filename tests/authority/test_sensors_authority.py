@@ -12,13 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from zsim.scenario.scenario_file import resolve
 from zsim_world.fleet.fleet import Fleet
-from zsim_world.sensors.exposure import BodyTruth, MountedSensor, Site
-from zsim_world.sensors.flow import flow
-from zsim_world.sensors.gps import gps
-from zsim_world.sensors.imu import imu
-from zsim_world.sensors.mag import mag
+from zsim_world.sensors.equations import BodyTruth, MountedSensor, Site, flow, gps, imu, mag, sonar
 from zsim_world.sensors.sensor_set import SENSORS
-from zsim_world.sensors.sonar import sonar
 
 P_BS = (0.11, -0.07, 0.05)
 RPY_BS_DEG = (12.0, -25.0, 140.0)

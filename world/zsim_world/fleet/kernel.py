@@ -19,15 +19,21 @@ from zsim_world.physics.rigid_body import four, put, put_four, vector
 from zsim_world.physics.rotors import drained
 from zsim_world.physics.simd import accelerate, line_up, move
 from zsim_world.sensors import sensor_set as ss
-from zsim_world.sensors.baro import baro, pressure
-from zsim_world.sensors.exposure import BodyTruth, MountedSensor, Site, Values
-from zsim_world.sensors.flow import flow
-from zsim_world.sensors.gps import gps
-from zsim_world.sensors.imu import imu
-from zsim_world.sensors.mag import mag
+from zsim_world.sensors.equations import (
+    BodyTruth,
+    MountedSensor,
+    Site,
+    Values,
+    baro,
+    flow,
+    gps,
+    imu,
+    mag,
+    pressure,
+    sonar,
+)
 from zsim_world.sensors.reading import add_errors, displace, hold_reading
 from zsim_world.sensors.sensor_set import CONFIG, NEVER, SCHEDULE
-from zsim_world.sensors.sonar import sonar
 from zsim_world.state.fleet_arrays import (
     CLOCK,
     EXPOSED,

@@ -7,14 +7,8 @@ import numpy as np
 import pytest
 
 from zsim.math.frames import quaternion_from_rpy
-from zsim_world.sensors.baro import baro, pressure
-from zsim_world.sensors.exposure import BodyTruth, MountedSensor, Site
-from zsim_world.sensors.flow import flow
-from zsim_world.sensors.gps import gps
-from zsim_world.sensors.imu import imu
-from zsim_world.sensors.mag import mag
+from zsim_world.sensors.equations import BodyTruth, MountedSensor, Site, baro, flow, gps, imu, mag, pressure, sonar
 from zsim_world.sensors.reading import rounded
-from zsim_world.sensors.sonar import sonar
 
 NOWHERE, STILL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
 STRAIGHT = (1.0, 0.0, 0.0, 0.0)
