@@ -41,8 +41,8 @@ from msgspec import inspect as types
 from zsim.contract import messages
 from zsim.scenario import scenario, scenario_file
 from zsim.schema import quantities
-from zsim.sensors.catalogue import AS_PRINTED, PRESETS, STOCK, Sensors
 from zsim.sensors.sensor import ErrorModel, Mount, Sensor
+from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, STOCK, Sensors
 from zsim.vehicles import vehicle
 from zsim_deploy.cli.cli import app
 from zsim_deploy.inventory import inventory

@@ -12,7 +12,7 @@ from federation import PAIR, Federation
 from forked_commands import ROOT
 from lab import Lab
 
-from zsim.vehicles import catalogue
+from zsim.vehicles import vehicle_catalogue
 
 EXAMPLES = str(ROOT / "examples")
 MODEL = "drones.drone1.model=larger_battery"
@@ -84,5 +84,5 @@ def test_a_fault_of_a_rotor_that_is_not_there_is_one_line(federation: Federation
     role = federation.start("validate", federation.write(PAIR), "--set", f"drones.drone1.model={model}", "--set", fault)
     role.ends(with_code=2)
     (line,) = [line.text for line in role.lines if line.text.strip()]
-    for part in ("faults[0].rotor", repr(rotor), *catalogue.vehicle_of(model).rotor_names):
+    for part in ("faults[0].rotor", repr(rotor), *vehicle_catalogue.vehicle_of(model).rotor_names):
         assert part in line

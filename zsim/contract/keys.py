@@ -8,7 +8,7 @@ from functools import lru_cache
 from itertools import groupby
 
 from zsim.errors import BadNameError
-from zsim.sensors.catalogue import STOCK
+from zsim.sensors.sensor_catalogue import STOCK
 
 NAME = re.compile(r"[a-z0-9_.-]{1,32}")
 PROCESS_NAME = re.compile(r"[a-z0-9_.-]{1,48}")  # a role, a dot, and a thing of up to 32

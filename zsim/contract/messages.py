@@ -17,12 +17,12 @@ from zsim.errors import DecodeError
 from zsim.schema.checker import first_fault
 from zsim.schema.message import Count, Message, Number
 from zsim.sensors.baro import Baro as Baro
-from zsim.sensors.catalogue import STOCK
 from zsim.sensors.flow import Flow as Flow
 from zsim.sensors.gps import Gps as Gps
 from zsim.sensors.imu import Imu as Imu
 from zsim.sensors.mag import Mag as Mag
 from zsim.sensors.sensor import FieldType, Sample, message_type
+from zsim.sensors.sensor_catalogue import STOCK
 from zsim.sensors.sonar import Sonar as Sonar
 
 PAYLOAD_MAX = 16_000_000  # bytes; a scenario of 1000 drones in world/info is below this

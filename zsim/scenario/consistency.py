@@ -16,8 +16,8 @@ from zsim.scenario.obstacle import nearest, row_of
 from zsim.scenario.role_table import AGENTS
 from zsim.scenario.scenario import SEA_HEIGHT_MAX_M, space_name
 from zsim.schema.checker import Fault, show
-from zsim.sensors.catalogue import DECLARED, MODULE, declarations, own_sections
 from zsim.sensors.imu import BOARD_RATE_HZ
+from zsim.sensors.sensor_catalogue import DECLARED, MODULE, declarations, own_sections
 from zsim.vehicles.vehicle import Vehicle
 
 FIRMWARE_STEP_US = round(1e6 / BOARD_RATE_HZ)  # us, the firmware's own step

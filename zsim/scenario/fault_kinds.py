@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 from zsim.contract.run_messages import Fault
-from zsim.sensors.catalogue import STOCK
 from zsim.sensors.sensor import Channel, Declaration, SensorType
+from zsim.sensors.sensor_catalogue import STOCK
 
 Target = Literal["drone", "world", "link", "radio", "process"]
 Shape = Literal["number", "vector", "choice", "word", "flag", "places"]

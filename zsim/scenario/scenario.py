@@ -10,7 +10,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType, field
 from zsim.scenario.role_table import OnDeath, agent_names
 from zsim.schema.plugin import CLASS_NAME
 from zsim.schema.quantities import G_M_S2, SEA_LEVEL_KG_M3, Fraction, NonNegative, Positive, Real, Vector3
-from zsim.sensors.catalogue import Sensors
+from zsim.sensors.sensor_catalogue import Sensors
 from zsim.vehicles.ardrone2 import VEHICLE as ARDRONE2
 from zsim.vehicles.vehicle import Arm, Limits, Mass, RotorLag, TakeoffHeight
 

@@ -14,8 +14,8 @@ from zsim.scenario.consistency import cross_faults
 from zsim.scenario.scenario import DRONES_MAX, Document, Scenario
 from zsim.schema import plugin, yaml_file
 from zsim.schema.checker import Fault, faults, sound
-from zsim.sensors.catalogue import AS_PRINTED, PRESETS, Sensors, flattened, separate
-from zsim.vehicles import catalogue
+from zsim.sensors.sensor_catalogue import AS_PRINTED, PRESETS, Sensors, flattened, separate
+from zsim.vehicles import vehicle_catalogue
 from zsim.vehicles.vehicle import DEFAULTS, Vehicle
 
 EXAMPLE = "scenarios/step.yaml"  # named to whoever gives no scenario
@@ -90,13 +90,13 @@ def _vehicles(document: dict[str, Any]) -> tuple[dict[str, Vehicle], list[Fault]
     A drone with all its numbers, as in a resolved scenario, needs no module of a user's: whoever reads `world/info`
     imports nothing that it names.
     """
-    vehicles, unknown = dict(catalogue.STOCK), []
+    vehicles, unknown = dict(vehicle_catalogue.STOCK), []
     drones = document.get("drones")
     for index, drone in enumerate(drones if isinstance(drones, list) else ()):
         model = drone.get("model") if isinstance(drone, dict) else None
         if isinstance(model, str) and model not in vehicles and not _is_resolved(drone):
             try:
-                vehicles[model] = catalogue.vehicle_of(model, "")
+                vehicles[model] = vehicle_catalogue.vehicle_of(model, "")
             except DocumentError as error:
                 unknown += [(f"drones[{index}].model", line.strip()) for line in error.faults]
     return vehicles, unknown
@@ -158,9 +158,9 @@ def _expand_drone(drone: Any, shared: dict[str, Any], vehicles: dict[str, Vehicl
     """Put what a drone says on top of its vehicle's numbers and of the sensors that all share."""
     if not isinstance(drone, dict):
         return drone
-    model = drone.get("model", catalogue.DEFAULT)
+    model = drone.get("model", vehicle_catalogue.DEFAULT)
     vehicle = vehicles.get(model) if isinstance(model, str) else None
-    vehicle = vehicle or vehicles[catalogue.DEFAULT]
+    vehicle = vehicle or vehicles[vehicle_catalogue.DEFAULT]
     own = drone.get("sensors")
     own_sensors = _merge(shared, own) if isinstance(own, dict) else shared if own is None else own
     limits = _merge(msgspec.to_builtins(vehicle.limits), drone["limits"]) if _has_map(drone, "limits") else None
@@ -173,7 +173,7 @@ def _has_map(section: dict[str, Any], name: str) -> bool:
     return isinstance(section.get(name), dict)
 
 
-def _expanded(sensors: Any, default: str = catalogue.STOCK[catalogue.DEFAULT].sensor_preset) -> Any:
+def _expanded(sensors: Any, default: str = vehicle_catalogue.STOCK[vehicle_catalogue.DEFAULT].sensor_preset) -> Any:
     """Return a `sensors:` section upon its preset."""
     if not isinstance(sensors, dict):
         return sensors

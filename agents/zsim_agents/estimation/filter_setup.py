@@ -16,9 +16,9 @@ from scipy.special import chdtri
 from zsim.contract.keys import SENSORS
 from zsim.math.rotation import LEVEL, matrix_from_rpy
 from zsim.scenario.scenario import Drone, Environment, Estimation
-from zsim.sensors.catalogue import Sensors
 from zsim.sensors.imu import BOARD_RATE_HZ, ImuConfig
 from zsim.sensors.sensor import ErrorModel, Sensor
+from zsim.sensors.sensor_catalogue import Sensors
 from zsim_agents.estimation.dead_reckoning import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
 from zsim_agents.estimation.filter_state import (
     BIAS,
@@ -55,7 +55,7 @@ JOLT_MIN_M_S2 = 1.0  # m/s^2 from one sample to the next, beyond the rotors in f
 PATIENCE_S = {"gps": 10.0, "mag": 10.0, "baro": 5.0, "sonar": math.inf, "flow": 1.0}
 
 
-class Channel(NamedTuple):
+class UpdateChannel(NamedTuple):
     """A quantity that an aiding sensor measures."""
 
     sensor: str
@@ -67,12 +67,12 @@ class Channel(NamedTuple):
 
 
 AIDING = (  # in the order of the values of a reading
-    Channel("gps", "position_m", 3, 0.01),  # m: interpolation of the past state
-    Channel("gps", "velocity_m_s", 3, 0.01),  # m/s, likewise
-    Channel("mag", "field_ut", 3, 0.02),  # uT: 1 mrad of an 18 uT horizontal field
-    Channel("baro", "altitude_m", 1, 0.005),  # m
-    Channel("sonar", "range_m", 1, 0.003),  # m
-    Channel("flow", "velocity_m_s", 3, 0.005),  # m/s
+    UpdateChannel("gps", "position_m", 3, 0.01),  # m: interpolation of the past state
+    UpdateChannel("gps", "velocity_m_s", 3, 0.01),  # m/s, likewise
+    UpdateChannel("mag", "field_ut", 3, 0.02),  # uT: 1 mrad of an 18 uT horizontal field
+    UpdateChannel("baro", "altitude_m", 1, 0.005),  # m
+    UpdateChannel("sonar", "range_m", 1, 0.003),  # m
+    UpdateChannel("flow", "velocity_m_s", 3, 0.005),  # m/s
 )
 
 
@@ -86,7 +86,7 @@ class BiasPrior(NamedTuple):
     """Random walk, per sqrt(s)."""
 
 
-BiasPriors = dict[Channel | str, BiasPrior]
+BiasPriors = dict[UpdateChannel | str, BiasPrior]
 """In the order of the error state: "gyro", "accel" if present, then aiding channels."""
 
 
@@ -154,7 +154,7 @@ class ErrorState:
     """
 
     def __init__(self, priors: BiasPriors) -> None:
-        self.first: dict[Channel | str, int] = {}
+        self.first: dict[UpdateChannel | str, int] = {}
         self.size = GYRO_BIAS
         for name, prior in priors.items():
             self.first[name] = self.size
@@ -217,7 +217,7 @@ def _section(sensors: Sensors, name: str) -> Sensor:
     return getattr(sensors, name)
 
 
-def _error_model(sensors: Sensors, channel: Channel) -> ErrorModel:
+def _error_model(sensors: Sensors, channel: UpdateChannel) -> ErrorModel:
     return getattr(_section(sensors, channel.sensor), channel.field)
 
 
@@ -266,7 +266,7 @@ def _layout(drone: Drone, estimation: Estimation, gate_s: float, states: ErrorSt
     mount = drone.sensors.imu.mount
     entries = int(age_max_s(drone, gate_s) / gate_s) + 3
     displaced = mount.rpy_deg != ZERO or mount.position_m != ZERO
-    aiding = any(isinstance(name, Channel) for name in states.first)
+    aiding = any(isinstance(name, UpdateChannel) for name in states.first)
     flags = (displaced, "accel" in states.first, aiding, estimation.magnetometer, estimation.flow)
     row = [states.size, entries, *map(int, flags)]
     for name in SENSORS:

@@ -19,8 +19,8 @@ from zsim.contract.flight_messages import Quaternion
 from zsim.math.frames import quaternion_conjugate, quaternion_from_rpy, quaternion_multiply, rotate, rotation_matrix
 from zsim.math.rotation import LEVEL
 from zsim.schema.message import Vector3
-from zsim.sensors.catalogue import Sensors
 from zsim.sensors.sensor import ErrorModel, Mount
+from zsim.sensors.sensor_catalogue import Sensors
 from zsim.sensors.sonar import SonarConfig
 from zsim_bridges.ros_frames import xyzw
 

@@ -11,7 +11,7 @@ from zsim.contract import keys
 from zsim.contract.flight_messages import ClusterState, Estimate, Status
 from zsim.math.frames import rpy_from_quaternion
 from zsim.schema.quantities import G_M_S2
-from zsim.sensors.catalogue import Sensors
+from zsim.sensors.sensor_catalogue import Sensors
 from zsim_bridges.ros2 import conversions, rmw_zenoh
 from zsim_bridges.ros2.conversions import NS_PER_S, FramePose, header
 from zsim_bridges.ros2.rmw_zenoh import Qos

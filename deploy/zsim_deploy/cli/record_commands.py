@@ -11,18 +11,7 @@ import typer
 from zsim.errors import ZsimError
 from zsim_analysis.export import Format
 from zsim_deploy import INTERRUPTED
-from zsim_deploy.arguments import (
-    RUN,
-    Duration,
-    From,
-    Keys,
-    ScenarioPath,
-    Seed,
-    Set,
-    To,
-    check_range,
-    require,
-)
+from zsim_deploy.arguments import RUN, Duration, From, Keys, ScenarioPath, Seed, Set, To, check_range, require
 from zsim_deploy.roles.stop_channel import interruptible
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from zsim.errors import RunError
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.sensors.gps import GpsConfig
 from zsim.sensors.sensor import noise_sigma
-from zsim.vehicles.catalogue import vehicle_of
 from zsim.vehicles.vehicle import Vehicle
+from zsim.vehicles.vehicle_catalogue import vehicle_of
 from zsim_world.fleet import kernel
 from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.fleet.initial_state import arrays

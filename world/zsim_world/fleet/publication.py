@@ -15,8 +15,8 @@ from zsim.contract.encoding import GAP, Layouts, Program, TextTable
 from zsim.contract.framing import GateMessages, key_table
 from zsim.errors import RunError
 from zsim.math.compiled import compiled, inlined, kernel
-from zsim.sensors.catalogue import STOCK
 from zsim.sensors.sensor import Sample, as_fields, field_types, message_type
+from zsim.sensors.sensor_catalogue import STOCK
 from zsim.vehicles.vehicle import ROTORS_MAX, ROTORS_MIN
 from zsim_world.fleet.fleet import GPS_FIX, GPS_SATELLITES, Fleet
 from zsim_world.fleet.kernel import hold

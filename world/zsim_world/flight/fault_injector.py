@@ -15,7 +15,7 @@ from zsim.scenario.fault_kinds import PROCESS_KILL
 from zsim.scenario.rights import WORLD
 from zsim.scenario.scenario import FAULTS_MAX, Scenario
 from zsim.schema.checker import show
-from zsim.sensors.catalogue import declarations
+from zsim.sensors.sensor_catalogue import declarations
 from zsim_world.fleet.fault_effects import Impairment
 from zsim_world.flight.barrier import Barrier
 from zsim_world.flight.run_clock import Operation, RunClock

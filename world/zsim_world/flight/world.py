@@ -15,7 +15,7 @@ from zsim.contract.views import DroneView, ViewDrones
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim.sensors.catalogue import declarations
+from zsim.sensors.sensor_catalogue import declarations
 from zsim_world.fleet.fleet import DivergedError, Fleet
 from zsim_world.fleet.publication import GatePublication
 from zsim_world.flight.command_intake import CommandIntake

@@ -9,7 +9,7 @@ from zsim.contract.messages import DroneInfo
 from zsim.contract.run_messages import GATES_MAX, RATE_MAX
 from zsim.scenario.fault_kinds import PROCESS_KILL, ROTORS, FaultKind, kinds_of
 from zsim.scenario.scenario import Scenario
-from zsim.sensors.catalogue import declarations
+from zsim.sensors.sensor_catalogue import declarations
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
 from zsim_bridges.console.page import operator_input
 

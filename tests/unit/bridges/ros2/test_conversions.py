@@ -13,8 +13,8 @@ from zsim.contract.flight_messages import Quaternion
 from zsim.math.frames import quaternion_from_rpy, rotate
 from zsim.scenario import scenario_file
 from zsim.schema.message import Vector3
-from zsim.sensors.catalogue import Sensors
 from zsim.sensors.sensor import ErrorModel, Mount
+from zsim.sensors.sensor_catalogue import Sensors
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics
 from zsim_bridges.ros2.ros_types import RosTypes
 from zsim_bridges.ros2.topics import NavdataSummary

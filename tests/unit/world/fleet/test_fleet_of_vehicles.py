@@ -8,12 +8,12 @@ import pytest
 
 from zsim.math.frames import heading
 from zsim.scenario.scenario_file import resolve
-from zsim.vehicles import catalogue
+from zsim.vehicles import vehicle_catalogue
 from zsim_world.fleet.fleet import Fleet
 from zsim_world.fleet.publication import GatePublication
 
 GATE_S = 0.02
-MODELS = [*catalogue.STOCK, "hexacopter"]
+MODELS = [*vehicle_catalogue.STOCK, "hexacopter"]
 
 
 def fleet(*models: str, **environment: Any) -> Fleet:
@@ -51,7 +51,7 @@ def velocity_ahead(flight: Fleet, i: int) -> np.ndarray:
 @pytest.mark.parametrize("model", MODELS)
 def test_every_vehicle_takes_off_hovers_flies_a_velocity_and_lands(model: str):
     flight = airborne(model)
-    height = catalogue.vehicle_of(model).takeoff_height_m
+    height = vehicle_catalogue.vehicle_of(model).takeoff_height_m
     start = flight.truth().position_m[0]
     fly(flight, 10.0)
     away = flight.truth().position_m[0] - start
@@ -77,7 +77,7 @@ def test_hover_thrust_is_the_weight_shared_by_all_rotors(model: str):
     for _ in range(200):
         flight.advance()
         speeds.append((flight.truth().rotor_rad_s[0] ** 2).mean())
-    vehicle = catalogue.vehicle_of(model)
+    vehicle = vehicle_catalogue.vehicle_of(model)
     weight = vehicle.mass_kg * 9.80665
     lift = len(vehicle.rotors) * vehicle.thrust_n_s2 * np.mean(speeds)
     assert lift == pytest.approx(weight, rel=0.02)

@@ -7,8 +7,8 @@ import pytest
 from msgspec.structs import replace
 from vehicle_rows import one_drone
 
-from zsim.vehicles.catalogue import STOCK, vehicle_of
 from zsim.vehicles.vehicle import Rotor, Vehicle
+from zsim.vehicles.vehicle_catalogue import STOCK, vehicle_of
 from zsim_world.state.fleet_arrays import CROSS_ROTORS, ROTOR, mixed, of, place, rotor_slots
 
 

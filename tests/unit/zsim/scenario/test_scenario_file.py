@@ -22,7 +22,7 @@ from zsim.scenario.scenario import DRONES_MAX, Scenario
 from zsim.scenario.scenario_file import FAULTS_MAX
 from zsim.schema.quantities import G_M_S2
 from zsim.schema.yaml_file import FILE_SIZE_MAX
-from zsim.sensors.catalogue import PRESETS
+from zsim.sensors.sensor_catalogue import PRESETS
 
 SCENARIOS = Path(__file__).parents[4] / "scenarios"
 STEP = SCENARIOS / "step.yaml"

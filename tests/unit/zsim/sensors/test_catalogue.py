@@ -11,9 +11,9 @@ from zsim.errors import DecodeError, DocumentError, ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.fault_kinds import kinds_of
 from zsim.scenario.scenario import Scenario
-from zsim.sensors import catalogue
-from zsim.sensors.catalogue import FIELDS, PRESETS, STOCK, declarations
+from zsim.sensors import sensor_catalogue
 from zsim.sensors.sensor import as_fields, field_types, message_type
+from zsim.sensors.sensor_catalogue import FIELDS, PRESETS, STOCK, declarations
 
 EXAMPLES = Path(__file__).parents[4] / "examples"
 UWB: dict[str, Any] = {"module": "uwb_range", "anchor_m": [1, 2, 3]}
@@ -63,7 +63,7 @@ def test_a_section_is_resolved_with_the_defaults_of_its_module():
 def test_the_resolved_text_is_read_without_the_module(monkeypatch: pytest.MonkeyPatch):
     made = scenario(my_uwb=UWB, pitot={"module": "airspeed"})
     text = scenario_file.to_text(made)
-    monkeypatch.setattr(catalogue, "sensor_type", None)
+    monkeypatch.setattr(sensor_catalogue, "sensor_type", None)
     again = scenario_file.from_text(text)
     assert again == made
     assert scenario_file.to_text(again) == text

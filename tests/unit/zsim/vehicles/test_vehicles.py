@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from zsim.errors import DocumentError, ScenarioError
 from zsim.scenario import scenario_file
-from zsim.vehicles import ardrone2, catalogue
+from zsim.vehicles import ardrone2, vehicle_catalogue
 from zsim.vehicles.vehicle import DEFAULTS, Rotor, Vehicle, allocation, cross_layout, mixing
 
 
@@ -26,18 +26,18 @@ def fault_of(**drone: Any) -> str:
     return line
 
 
-@pytest.mark.parametrize("model", catalogue.STOCK)
+@pytest.mark.parametrize("model", vehicle_catalogue.STOCK)
 def test_a_stock_vehicle_gives_a_drone_its_numbers(model: str):
-    vehicle = catalogue.vehicle_of(model)
+    vehicle = vehicle_catalogue.vehicle_of(model)
     drone = scenario_file.resolve(document(model=model)).drones[0]
     assert {name: getattr(drone, name) for name in DEFAULTS} == {name: getattr(vehicle, name) for name in DEFAULTS}
     assert drone.limits == vehicle.limits
     assert drone.sensors.preset == vehicle.sensor_preset
 
 
-@pytest.mark.parametrize("model", catalogue.STOCK)
+@pytest.mark.parametrize("model", vehicle_catalogue.STOCK)
 def test_every_number_of_a_stock_vehicle_has_its_source_or_reason(model: str):
-    text = Path(str(getattr(catalogue, model).__file__)).read_text()
+    text = Path(str(getattr(vehicle_catalogue, model).__file__)).read_text()
     numbers = [line for line in text.splitlines() if re.match(r"\s+\w+=\(?-?[\d.]", line)]
     assert len(numbers) > 50
     assert [line for line in numbers if "#" not in line] == []
@@ -69,7 +69,7 @@ def test_a_fault_names_a_rotor_that_the_vehicle_has():
         with pytest.raises(ScenarioError) as error:
             scenario_file.resolve(document(model=model) | {"faults": [fault | {"rotor": rotor}]})
         (line,) = error.value.faults
-        names = catalogue.vehicle_of(model).rotor_names
+        names = vehicle_catalogue.vehicle_of(model).rotor_names
         for part in ("faults[0].rotor", repr(rotor), ", ".join((*names, "all"))):
             assert part in line
 
@@ -95,7 +95,7 @@ def test_faulty_parameters_are_named(monkeypatch: pytest.MonkeyPatch):
     module.__dict__["VEHICLE"] = replace(ardrone2.VEHICLE, mass_kg=-1.0)
     monkeypatch.setitem(__import__("sys").modules, "my_brick", module)
     with pytest.raises(DocumentError) as raised:
-        catalogue.vehicle_of("my_brick", "a.yaml: drones[0].model")
+        vehicle_catalogue.vehicle_of("my_brick", "a.yaml: drones[0].model")
     (line,) = raised.value.faults
     assert line.startswith("a.yaml: drones[0].model is 'my_brick'")
     assert "VEHICLE.mass_kg is -1.0" in line
@@ -121,6 +121,6 @@ def test_rotors_that_cannot_hold_it_level_are_refused(rotors: tuple[Rotor, ...])
 
 
 def test_mixing_inverts_the_allocation_and_adds_no_thrust():
-    for vehicle in (*catalogue.STOCK.values(), catalogue.vehicle_of("hexacopter")):
+    for vehicle in (*vehicle_catalogue.STOCK.values(), vehicle_catalogue.vehicle_of("hexacopter")):
         np.testing.assert_allclose(allocation(vehicle) @ mixing(vehicle), np.eye(3), atol=1e-9)
         np.testing.assert_allclose(mixing(vehicle).sum(axis=0), 0.0, atol=1e-9)
