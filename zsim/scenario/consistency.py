@@ -199,8 +199,8 @@ def _own_sensor_faults(drones: _Entries) -> Iterator[Fault]:
                 yield path, f"is {show(message)}, which is a message of the contract; must be another"
             other, module = first.setdefault(name, (index, section[MODULE]))
             if module != section[MODULE]:
-                found = f"is {show(section[MODULE])}, and {show(module)} in drones[{other}]"
-                yield f"drones[{index}].sensors.{name}.{MODULE}", f"{found}; must be one for all drones"
+                difference = f"is {show(section[MODULE])}, and {show(module)} in drones[{other}]"
+                yield f"drones[{index}].sensors.{name}.{MODULE}", f"{difference}; must be one for all drones"
 
 
 def _membership_faults(drones: _Entries, clusters: _Entries) -> Iterator[Fault]:

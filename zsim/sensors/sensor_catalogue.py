@@ -137,9 +137,9 @@ def separate(section: dict[str, Any]) -> OwnSections:
             allowed = f"allowed: {', '.join(sorted(FIELDS))}, or a sensor of your own with its module"
             wrong.append((f"{name}"[:40], f"is not known; {allowed}"))
             continue
-        found = [*_name_faults(name)] or [*_section_faults(name, value)]
-        wrong += found
-        if not found:
+        section_faults = [*_name_faults(name)] or [*_section_faults(name, value)]
+        wrong += section_faults
+        if not section_faults:
             own[name] = _resolved(value)
     return OwnSections(rest, dict(sorted(own.items())), wrong)
 

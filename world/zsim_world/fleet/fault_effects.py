@@ -113,10 +113,10 @@ class Impairment:
                     row[ACTUATOR.size + count + r] = self._held_speed(fault, i)[r]
 
     def _held_speed(self, fault: Fault, i: int) -> tuple[float, ...]:
-        """Return at which speed each rotor is held [rad/s]: as given, or as it turned when the fault began."""
+        """Return at which speed each rotor is held [rad/s]: as speed_rad_s, or as it turned when the fault began."""
         if fault.id not in self._held:
-            given, speeds = fault.parameters["speed_rad_s"], self._w.bodies.state[i, STATE.size :].tolist()
-            self._held[fault.id] = tuple(speeds) if given is None else (given,) * len(speeds)
+            speed_rad_s, speeds = fault.parameters["speed_rad_s"], self._w.bodies.state[i, STATE.size :].tolist()
+            self._held[fault.id] = tuple(speeds) if speed_rad_s is None else (speed_rad_s,) * len(speeds)
         return self._held[fault.id]
 
 

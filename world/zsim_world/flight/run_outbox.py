@@ -20,16 +20,16 @@ class Refusal(NamedTuple):
 
     Attributes:
         where: the field or thing at fault.
-        found: its value or state, as text.
+        actual: its value or state, as text.
         allowed: what is allowed, or what to do.
     """
 
     where: str
-    found: str
+    actual: str
     allowed: str
 
     def __str__(self) -> str:
-        return f"{self.where} is {self.found}; {self.allowed}"
+        return f"{self.where} is {self.actual}; {self.allowed}"
 
 
 class RefusalLog:

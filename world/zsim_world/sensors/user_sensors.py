@@ -94,8 +94,8 @@ class _UserSensor:
                 f"{self._what} at {truth.t_s:g} s: its equation gives no {count} numbers ({reason})"
             ) from error
         if not np.isfinite(values).all():
-            found = [float(value) for value in values[:count]]
-            raise RunError(f"{self._what} at {truth.t_s:g} s: its equation gives {found}; must be finite")
+            numbers = [float(value) for value in values[:count]]
+            raise RunError(f"{self._what} at {truth.t_s:g} s: its equation gives {numbers}; must be finite")
 
     def numbers(self) -> NDArray[np.float64]:
         """Return the standard normal numbers of one sample: white, walk of the bias, and one for drop-out."""
