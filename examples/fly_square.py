@@ -12,8 +12,7 @@ from typing import Any
 
 from zsim.contract import flight_messages, keys, messages
 from zsim.transport.connection import find_world
-from zsim.transport.declarations import Subscription
-from zsim.transport.session import Session
+from zsim.transport.session import Session, Subscription
 
 CLUSTER = "main"
 ME = "square.main"

@@ -6,8 +6,7 @@ from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
 from zsim.errors import DecodeError
 from zsim.runtime.health import HealthMeter
-from zsim.transport.samples import RawSample
-from zsim.transport.session import Session
+from zsim.transport.session import RawSample, Session
 
 ANOTHER_RUN = "the world has begun another run"
 JOIN_EVENTS = ("join", "restart", "superseded")  # kinds of events that report a process that joined

@@ -2,7 +2,7 @@
 
 from contextlib import ExitStack
 
-from zsim.transport import declarations, zenoh_settings
+from zsim.transport import session, zenoh_settings
 from zsim.transport.tls import Identity
 
 import zenoh  # isort: skip  # zsim.transport chooses its runtime first
@@ -32,7 +32,7 @@ def world(count: int, seconds: float, receive: str, express: bool, low_latency: 
     chosen = zenoh_settings.common("router", "lockstep") | zenoh_settings.listening([endpoint], Identity())
     with ExitStack() as stack:
         link = stack.enter_context(zenoh.open(config(chosen, low_latency)))
-        subscriber = link.declare_subscriber("bench/up/*", zenoh.handlers.FifoChannel(declarations.QUEUE_MAX))
+        subscriber = link.declare_subscriber("bench/up/*", zenoh.handlers.FifoChannel(session.QUEUE_MAX))
         handler = subscriber.handler
         stack.enter_context(agents("benchmarks.exchange.bare_zenoh", count, *options))
         for _ in range(count):
@@ -64,7 +64,7 @@ def agent(number: int, endpoint: str, express: bool, low_latency: bool) -> None:
     """Say that it is there, then answer everything until the stop."""
     chosen = zenoh_settings.common("client", "lockstep") | zenoh_settings.connecting(endpoint, Identity(), 10.0)
     with zenoh.open(config(chosen, low_latency)) as link:
-        subscriber = link.declare_subscriber(f"bench/down/{number}", zenoh.handlers.FifoChannel(declarations.QUEUE_MAX))
+        subscriber = link.declare_subscriber(f"bench/down/{number}", zenoh.handlers.FifoChannel(session.QUEUE_MAX))
         publisher = _publisher(link, f"bench/up/{number}", express)
         publisher.put(PAYLOAD)
         while subscriber.handler.recv().payload.to_bytes() != STOP:

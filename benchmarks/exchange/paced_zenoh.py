@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
-from zsim.transport import declarations, zenoh_settings
+from zsim.transport import session, zenoh_settings
 from zsim.transport.tls import Identity
 
 import zenoh  # isort: skip  # zsim.transport chooses its runtime first
@@ -79,7 +79,7 @@ def hub(count: int, seconds: float, path: str) -> None:
 def client(number: int, endpoint: str, where: str) -> None:
     """Answer every step on `bench/{where}/{number}`."""
     with _connected(endpoint) as link:
-        subscriber = link.declare_subscriber(f"bench/down/{number}", zenoh.handlers.FifoChannel(declarations.QUEUE_MAX))
+        subscriber = link.declare_subscriber(f"bench/down/{number}", zenoh.handlers.FifoChannel(session.QUEUE_MAX))
         link.put(f"bench/up/{number}", _message(STOP))
         publisher = link.declare_publisher(f"bench/{where}/{number}")
         while (step := _step(subscriber.handler.recv())) != STOP:
@@ -90,7 +90,7 @@ def client(number: int, endpoint: str, where: str) -> None:
 def gatherer(count: int, endpoint: str) -> None:
     """Wait for all clients of a step, then answer for all."""
     with _connected(endpoint) as link:
-        subscriber = link.declare_subscriber("bench/mid/*", zenoh.handlers.FifoChannel(declarations.QUEUE_MAX))
+        subscriber = link.declare_subscriber("bench/mid/*", zenoh.handlers.FifoChannel(session.QUEUE_MAX))
         link.put("bench/up/gatherer", _message(STOP))
         publishers = [link.declare_publisher(f"bench/up/{number}") for number in range(count)]
         came: dict[int, int] = {}
@@ -108,7 +108,7 @@ def gatherer(count: int, endpoint: str) -> None:
 @contextmanager
 def _reader(link: zenoh.Session, expression: str, take: Take) -> Iterator[None]:
     """Hand every message to `take`, in a thread."""
-    subscriber = link.declare_subscriber(expression, zenoh.handlers.FifoChannel(declarations.QUEUE_MAX))
+    subscriber = link.declare_subscriber(expression, zenoh.handlers.FifoChannel(session.QUEUE_MAX))
     handler = subscriber.handler
 
     def read() -> None:

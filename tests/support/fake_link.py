@@ -8,7 +8,7 @@ from msgspec import Struct
 
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlAnswer
-from zsim.transport.samples import RawSample, ReceivedSample
+from zsim.transport.session import RawSample, ReceivedSample
 
 PATIENCE_S = 120.0  # after which a test that waits for ever fails
 UNANSWERED = ControlAnswer(False, "nobody answered")

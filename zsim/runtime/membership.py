@@ -16,8 +16,7 @@ from zsim.contract.world_events import ProcessEntry
 from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
 from zsim.runtime.agent import Agent, Output
 from zsim.transport.connection import read_info
-from zsim.transport.samples import ReceivedSample
-from zsim.transport.session import Session
+from zsim.transport.session import ReceivedSample, Session
 
 REPLAY_S = 2.0  # a hub answers a replay within milliseconds; a lost link does not
 REJOINS_MAX = 6  # times that a rejoin is published before it counts as received; a router forwards nothing at first

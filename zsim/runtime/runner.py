@@ -17,8 +17,7 @@ from zsim.runtime.health import HealthMeter
 from zsim.runtime.membership import Membership
 from zsim.runtime.runner_inputs import RunnerInputs
 from zsim.scenario.fault_kinds import PROCESS_KILL
-from zsim.transport.declarations import Query
-from zsim.transport.session import Session
+from zsim.transport.session import Query, Session
 
 TICK_S = 0.1  # how often a stop, and what the world has not answered, is looked for while nothing arrives
 DRAIN_S = 1.0  # how long the last gates are waited for once the run has ended

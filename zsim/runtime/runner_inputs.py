@@ -11,9 +11,7 @@ from zsim.runtime.agent import Agent
 from zsim.runtime.health import HealthMeter
 from zsim.runtime.inbox import Inbox
 from zsim.runtime.routing import RoutingTable
-from zsim.transport.declarations import Query, Subscription
-from zsim.transport.samples import RawSample, ReceivedSample
-from zsim.transport.session import Session
+from zsim.transport.session import Query, RawSample, ReceivedSample, Session, Subscription
 
 
 class RunnerInputs:

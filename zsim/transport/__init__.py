@@ -1,6 +1,6 @@
 """Zenoh: sessions, their settings, TLS, how a process finds the world, and the messages that pass the hub as batches.
 
-Only `samples`, `declarations`, `session` and `connection` import zenoh. Imports contract.
+Only `session` imports zenoh. Imports contract.
 """
 
 import os

@@ -9,13 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 
-import zenoh
-
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError, NoWorldError, SessionError
 from zsim.transport import tls, zenoh_settings
-from zsim.transport.samples import first_sentence
-from zsim.transport.session import Session
+from zsim.transport.session import Session, config_of, open_session
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode, Settings
 
@@ -79,7 +76,7 @@ def connect(
     identity = identity or Identity()
     client = zenoh_settings.connecting(endpoint, identity, wait_s or 0.5)
     settings = zenoh_settings.common("client", mode, reader) | client
-    with _open(settings, federation, identity, partial(tls.no_link, identity, endpoint)) as session:
+    with open_session(settings, federation, identity, partial(tls.no_link, identity, endpoint)) as session:
         yield session
 
 
@@ -92,7 +89,7 @@ def check_listening(endpoints: Sequence[str], identity: Identity | None = None) 
     if any(endpoint.endswith(":0") for endpoint in endpoints):
         raise SessionError(f"cannot listen on {', '.join(endpoints)}: port 0 is no port that others could be told")
     identity = identity or Identity()
-    _config(zenoh_settings.listening(endpoints, identity), identity)
+    config_of(zenoh_settings.listening(endpoints, identity), identity)
 
 
 @contextmanager
@@ -102,33 +99,8 @@ def _listening(
     check_listening(endpoints, identity)
     settings = zenoh_settings.common("router", mode) | zenoh_settings.listening(endpoints, identity) | others
     shown = ", ".join(endpoints)
-    with _open(settings, federation, identity, lambda error: f"cannot listen on {shown} ({error})") as session:
+    with open_session(settings, federation, identity, lambda error: f"cannot listen on {shown} ({error})") as session:
         yield session
-
-
-@contextmanager
-def _open(settings: Settings, federation: str, identity: Identity, explain: Callable[[str], str]) -> Iterator[Session]:
-    config = _config(settings, identity)
-    try:
-        raw = zenoh.open(config)
-    except zenoh.ZError as error:
-        raise SessionError(explain(first_sentence(error))) from error
-    session = Session(raw, federation, identity)
-    try:
-        yield session
-    finally:
-        session.undeclare_all()
-        raw.close()
-
-
-def _config(settings: Settings, identity: Identity) -> zenoh.Config:
-    config = zenoh.Config()
-    for path, value in settings.items():
-        try:
-            config.insert_json5(path, value)
-        except zenoh.ZError as error:
-            raise SessionError(zenoh_settings.refusal(path, value, identity)) from error
-    return config
 
 
 @contextmanager

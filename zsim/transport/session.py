@@ -1,12 +1,14 @@
 """One process's access to a federation: what it publishes, subscribes to, queries, answers, and its liveliness.
 
-Keys are given without the federation's prefix; the session adds and removes it.
+Keys are given without the federation's prefix; the session adds and removes it. This is the only file that imports
+zenoh, which is why it is as long as it is.
 """
 
+import re
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Any, NamedTuple
 
 import zenoh
 import zenoh.ext
@@ -15,10 +17,188 @@ from msgspec import Struct
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import SessionError
-from zsim.transport.declarations import Query, Subscription
-from zsim.transport.samples import RawSample, ReceivedSample, key_errors, raw_reply, raw_sample
+from zsim.transport import zenoh_settings
 from zsim.transport.tls import Identity
-from zsim.transport.zenoh_settings import Mode
+from zsim.transport.zenoh_settings import Mode, Settings
+
+QUEUE_MAX = 1_000_000  # messages; a subscription that is not read blocks the whole link once it is full
+
+
+class ReceivedSample(NamedTuple):
+    """One message off the wire, not decoded; its key is without the federation's prefix."""
+
+    key: str
+    payload: bytes
+
+
+class RawSample(NamedTuple):
+    """A publication, or a reply to a query, with all that Zenoh knows of it.
+
+    Attributes:
+        kind: "PUT" or "DELETE"; "ERROR" for a reply that refuses, which has no key.
+        key: without the prefix of the session that received it.
+        payload: as sent.
+        encoding: Zenoh's text of it, e.g. "application/msgpack;Imu".
+        timestamp: of Zenoh, as text; None where nobody stamped it.
+        attachment: what was sent beside the payload; empty where nothing was.
+    """
+
+    kind: str
+    key: str
+    payload: bytes
+    encoding: str
+    timestamp: str | None
+    attachment: bytes = b""
+
+
+def raw_sample(sample: zenoh.Sample, prefix: str) -> RawSample:
+    """Return a sample of Zenoh's; `prefix` is taken off its key."""
+    return RawSample(
+        kind="PUT" if sample.kind == zenoh.SampleKind.PUT else "DELETE",
+        key=str(sample.key_expr).removeprefix(prefix),
+        payload=sample.payload.to_bytes(),
+        encoding=str(sample.encoding),
+        timestamp=str(sample.timestamp) if sample.timestamp is not None else None,
+        attachment=sample.attachment.to_bytes() if sample.attachment is not None else b"",
+    )
+
+
+def raw_reply(reply: zenoh.Reply, prefix: str) -> RawSample:
+    """Return the sample in a reply, or its refusal; `prefix` is taken off its key."""
+    if reply.ok is not None:
+        return raw_sample(reply.ok, prefix)
+    assert reply.err is not None
+    return RawSample("ERROR", "", reply.err.payload.to_bytes(), str(reply.err.encoding), None)
+
+
+def check_expression(expression: str) -> None:
+    """Refuse what is no key expression.
+
+    Raises:
+        SessionError: with what was found and what is allowed.
+    """
+    with key_errors(expression):
+        zenoh.KeyExpr(expression)
+
+
+@contextmanager
+def key_errors(expression: str) -> Iterator[None]:
+    """Turn Zenoh's refusal of a key into a SessionError in the contract's words."""
+    try:
+        yield
+    except zenoh.ZError as error:
+        stripped = re.sub("//+", "/", expression.strip("/"))
+        allowed = "must be names with / between them, * for any name, ** for any number of them"
+        instead = f"must be {stripped}, without / at its ends" if stripped not in (expression, "") else allowed
+        raise SessionError(f"key is {expression!r} ({first_sentence(error).split('`: ')[-1]}); {instead}") from error
+
+
+def first_sentence(error: Exception) -> str:
+    """Return the first sentence of a Zenoh error without its source location."""
+    return str(error).split(" at ", 1)[0].split("\n", 1)[0][:160]
+
+
+class Subscription:
+    """Everything that others publish on one expression, in the order of its arrival on this session.
+
+    Args:
+        raw: the session.
+        prefix: of its keys.
+        expression: what to take.
+        without: beginnings of keys to leave out; then what this session itself publishes is left out too.
+    """
+
+    def __init__(self, raw: zenoh.Session, prefix: str, expression: str, without: tuple[str, ...] = ()) -> None:
+        self._raw = raw
+        self._without = without
+        self._cut = len(prefix)
+        self._key = None if "*" in expression else expression
+        self.expression = expression
+        self._wake_key = prefix + expression.replace("**", "wake").replace("*", "wake")
+        origin = zenoh.Locality.REMOTE if without else zenoh.Locality.ANY
+        channel = zenoh.handlers.FifoChannel(QUEUE_MAX)
+        self._subscriber = raw.declare_subscriber(prefix + expression, channel, allowed_origin=origin)
+        self._handler = self._subscriber.handler
+
+    def receive(self) -> ReceivedSample | None:
+        """Wait for one message; None when woken by `wake`.
+
+        Raises:
+            SessionError: the session, or the subscription, was closed meanwhile.
+        """
+        try:
+            return self._take(self._handler.recv())
+        except zenoh.ZError as error:
+            raise SessionError(f"{self.expression}: is closed") from error
+
+    def drain(self) -> Iterator[ReceivedSample]:
+        """Yield what has arrived, without waiting."""
+        while (raw := self._handler.try_recv()) is not None:
+            sample = self._take(raw)
+            if sample is not None:
+                yield sample
+
+    def wake(self) -> None:
+        """Let a waiting `receive` return None; callable from any thread."""
+        try:
+            self._raw.put(self._wake_key, b"", allowed_destination=zenoh.Locality.SESSION_LOCAL)
+        except zenoh.ZError:
+            return  # closed: nobody waits any more
+
+    def undeclare(self) -> None:
+        """Take no more; a waiting `receive` raises SessionError."""
+        self._subscriber.undeclare()
+
+    def _take(self, raw: zenoh.Sample) -> ReceivedSample | None:
+        key = self._key or str(raw.key_expr)[self._cut :]
+        if self._without and key.startswith(self._without):
+            return None
+        payload = raw.payload.to_bytes()
+        return ReceivedSample(key, payload) if payload else None  # empty: a wake, or a deletion; no message is
+
+
+class Query:
+    """A query to be answered once.
+
+    Attributes:
+        expression: the keys that are queried, without the prefix of the session.
+        payload, attachment: as sent; empty where nothing was.
+    """
+
+    def __init__(self, raw: zenoh.Query, prefix: str) -> None:
+        self._raw: zenoh.Query | None = raw
+        self._prefix = prefix
+        self.expression = str(raw.key_expr).removeprefix(prefix)
+        self.payload = raw.payload.to_bytes() if raw.payload is not None else b""
+        self.attachment = raw.attachment.to_bytes() if raw.attachment is not None else b""
+
+    def request(self) -> ControlRequest:
+        """Return the request in it; DecodeError if it is none."""
+        return messages.decode_as(ControlRequest, self.payload, self.expression)
+
+    def reply(self, key: str, payload: bytes) -> None:
+        """Add one reply."""
+        if self._raw is not None:
+            self._raw.reply(self._prefix + key, payload, encoding=zenoh.Encoding(messages.encoding(key)))
+
+    def reply_raw(self, key: str, payload: bytes, attachment: bytes) -> None:
+        """Reply with a payload that is no message of the contract, and end the query."""
+        if self._raw is not None:
+            self._raw.reply(self._prefix + key, payload, attachment=attachment)
+        self.end()
+
+    def answer(self, answer: ControlAnswer) -> None:
+        """Reply to a request and end it."""
+        if self._raw is not None:
+            encoding = zenoh.Encoding("application/msgpack;ControlAnswer")
+            self._raw.reply(self._prefix + self.expression, messages.encode(answer), encoding=encoding)
+        self.end()
+
+    def end(self) -> None:
+        """End the query; Zenoh lets its sender know when the last reference goes."""
+        if self._raw is not None:
+            self._raw.drop()
+            self._raw = None
 
 
 class Session:
@@ -298,3 +478,43 @@ class Session:
     def links(self) -> int:
         """Return how many other processes this one has a transport to."""
         return len(self._raw.info.peers_zid()) + len(self._raw.info.routers_zid())
+
+
+@contextmanager
+def open_session(
+    settings: Settings, federation: str, identity: Identity, explain: Callable[[str], str]
+) -> Iterator[Session]:
+    """Open a session of Zenoh, and close it with everything that it has declared.
+
+    Args:
+        explain: makes of Zenoh's error the line that the user reads.
+
+    Raises:
+        SessionError: it cannot be opened.
+    """
+    config = config_of(settings, identity)
+    try:
+        raw = zenoh.open(config)
+    except zenoh.ZError as error:
+        raise SessionError(explain(first_sentence(error))) from error
+    session = Session(raw, federation, identity)
+    try:
+        yield session
+    finally:
+        session.undeclare_all()
+        raw.close()
+
+
+def config_of(settings: Settings, identity: Identity) -> zenoh.Config:
+    """Return the configuration of a session.
+
+    Raises:
+        SessionError: Zenoh refuses a setting.
+    """
+    config = zenoh.Config()
+    for path, value in settings.items():
+        try:
+            config.insert_json5(path, value)
+        except zenoh.ZError as error:
+            raise SessionError(zenoh_settings.refusal(path, value, identity)) from error
+    return config

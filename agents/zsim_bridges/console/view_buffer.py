@@ -13,8 +13,7 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import Event, Fault, Health
 from zsim.contract.views import EstimateView, ViewCluster, ViewDrones, ViewEstimates
 from zsim.errors import DecodeError, ZsimError
-from zsim.transport.samples import RawSample
-from zsim.transport.session import Session
+from zsim.transport.session import RawSample, Session
 from zsim_bridges.observer_process import ObserverProcess
 
 EVENTS_KEPT = 200

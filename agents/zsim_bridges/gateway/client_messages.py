@@ -14,7 +14,7 @@ import msgspec
 
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError, ZsimError
-from zsim.transport.samples import RawSample
+from zsim.transport.session import RawSample
 
 COUNTED_KEYS = (keys.command("*", "*"), keys.estimate("*"), keys.cluster_state("*"))  # contract: `sent` of a done
 CLIENT_KEYS = (*COUNTED_KEYS, keys.cluster_view("*"), keys.estimates_view("*"))

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import msgspec
 from aiohttp import WSMsgType, web
 
-from zsim.transport.samples import RawSample
+from zsim.transport.session import RawSample
 from zsim_bridges.gateway.publications import SharedSubscriptions
 
 OUTBOX_BYTES_MAX = 4_000_000  # about 20 s of a drone's sensors as JSON

@@ -25,7 +25,7 @@ from zsim.contract import messages
 from zsim.contract.messages import REFUSALS
 from zsim.contract.run_messages import ControlRequest
 from zsim.errors import DecodeError
-from zsim.transport.samples import RawSample, check_expression
+from zsim.transport.session import RawSample, check_expression
 from zsim_bridges.gateway.access_check import error_response
 from zsim_bridges.gateway.client_messages import (
     CACHED_VALUES,

@@ -12,7 +12,7 @@ from zsim.contract import keys, messages
 from zsim.contract.messages import Info
 from zsim.errors import DecodeError
 from zsim.runtime.agent import Agent, Output
-from zsim.transport.samples import check_expression
+from zsim.transport.session import check_expression
 from zsim_bridges.gateway import stream_requests
 from zsim_bridges.gateway.client_messages import MessageDefaults, is_counted_key
 from zsim_bridges.gateway.run_access import RunAccess

@@ -7,8 +7,7 @@ from collections.abc import Callable
 
 from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages
-from zsim.transport.samples import RawSample, check_expression
-from zsim.transport.session import Session
+from zsim.transport.session import RawSample, Session, check_expression
 from zsim_bridges.gateway.access_check import ConnectionLimit
 from zsim_bridges.gateway.client_messages import TooManyError
 

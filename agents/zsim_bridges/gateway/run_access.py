@@ -12,8 +12,7 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
 from zsim.scenario import rights, scenario_file
-from zsim.transport.samples import RawSample, check_expression
-from zsim.transport.session import Session
+from zsim.transport.session import RawSample, Session, check_expression
 from zsim.transport.traffic import Passed, Traffic
 from zsim_bridges.gateway.client_messages import (
     ForbiddenError,

@@ -8,7 +8,7 @@ import msgspec
 
 from zsim.contract import keys
 from zsim.errors import DecodeError, NoWorldError, ZsimError
-from zsim.transport.samples import RawSample, check_expression
+from zsim.transport.session import RawSample, check_expression
 from zsim_bridges.gateway import stream_requests
 from zsim_bridges.gateway.access_check import TokenBucket
 from zsim_bridges.gateway.client_messages import (

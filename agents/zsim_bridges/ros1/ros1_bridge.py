@@ -13,8 +13,7 @@ from zsim.contract.messages import Info
 from zsim.errors import DecodeError, RunError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
-from zsim.transport.samples import ReceivedSample
-from zsim.transport.session import Session
+from zsim.transport.session import ReceivedSample, Session
 from zsim.transport.traffic import Passed, Traffic, samples
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import driver_messages

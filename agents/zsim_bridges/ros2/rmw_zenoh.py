@@ -14,8 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 import xxhash
 
-from zsim.transport.samples import RawSample
-from zsim.transport.session import Query, Session
+from zsim.transport.session import Query, RawSample, Session
 from zsim_bridges.ros2.ros_types import RosTypes, service_parts
 
 CDR = "application/cdr"

@@ -19,8 +19,7 @@ from zsim.errors import DecodeError, SessionError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.transport import connection
-from zsim.transport.samples import RawSample
-from zsim.transport.session import Session
+from zsim.transport.session import RawSample, Session
 from zsim.transport.tls import Identity
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import conversions, rmw_zenoh, topics

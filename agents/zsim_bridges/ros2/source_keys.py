@@ -8,9 +8,7 @@ from typing import Any, NamedTuple
 
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError
-from zsim.transport.declarations import Subscription
-from zsim.transport.samples import RawSample, ReceivedSample
-from zsim.transport.session import Session
+from zsim.transport.session import RawSample, ReceivedSample, Session, Subscription
 from zsim_bridges.ros2.rmw_zenoh import Publisher
 from zsim_bridges.ros2.topics import Topic
 

@@ -13,9 +13,7 @@ import msgspec
 from zsim.contract import keys, messages
 from zsim.contract.framing import pairs_of
 from zsim.errors import DecodeError, RunError
-from zsim.transport.declarations import Subscription
-from zsim.transport.samples import RawSample, ReceivedSample, check_expression
-from zsim.transport.session import Session
+from zsim.transport.session import RawSample, ReceivedSample, Session, Subscription, check_expression
 
 LISTEN_S = 1.0  # wall time that `keys` listens: every live key of the contract has a message at least once a second
 PACKET_S = 0.05  # wait between two looks into an empty subscription

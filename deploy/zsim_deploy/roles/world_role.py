@@ -15,7 +15,7 @@ from zsim.contract import keys, run_messages
 from zsim.errors import RunError
 from zsim.runtime.progress import QUIET, HoldReasons, JsonProgress, ProgressSink, Screen, Throttle
 from zsim.scenario.scenario import Scenario
-from zsim.transport.samples import check_expression
+from zsim.transport.session import check_expression
 from zsim.transport.tls import Identity
 from zsim_deploy.roles.stop_channel import StopChannel
 

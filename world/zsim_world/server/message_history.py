@@ -17,7 +17,7 @@ from zsim.contract.run_messages import ClusterRequest, ControlAnswer
 from zsim.errors import DecodeError
 from zsim.scenario import rights
 from zsim.schema.message import Count
-from zsim.transport.samples import ReceivedSample
+from zsim.transport.session import ReceivedSample
 
 KEEP_NS = 5_000_000_000  # simulated time that a replay reaches back
 KEEP_BYTES = 500_000_000  # payloads kept at most: those of 1000 drones are about 300 MB in KEEP_NS

@@ -15,9 +15,7 @@ from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.errors import DecodeError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario.rights import WORLD
-from zsim.transport.declarations import Subscription
-from zsim.transport.samples import ReceivedSample
-from zsim.transport.session import Session
+from zsim.transport.session import ReceivedSample, Session, Subscription
 from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.server.liveliness import LivelinessMonitor

@@ -7,8 +7,7 @@ from typing import Any
 from zsim.contract import keys, messages
 from zsim.contract.framing import BATCH_MAX, GateMessages, Pairs, encode_batch
 from zsim.runtime.agent import Output
-from zsim.transport.samples import ReceivedSample
-from zsim.transport.session import Session
+from zsim.transport.session import ReceivedSample, Session
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.server.message_history import MessageHistory
 

@@ -17,8 +17,7 @@ from zsim.runtime.health import HealthMeter
 from zsim.scenario import rights
 from zsim.scenario.rights import WORLD
 from zsim.transport import connection
-from zsim.transport.declarations import Query
-from zsim.transport.session import Session
+from zsim.transport.session import Query, Session
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_world.flight.coordinator import Coordinator

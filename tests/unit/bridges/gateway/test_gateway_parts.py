@@ -18,7 +18,7 @@ from zsim.contract.flight_messages import Status, Velocity
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import ClusterInfo, DroneInfo, Imu, Info, Origin
 from zsim.errors import DecodeError, NoWorldError
-from zsim.transport.samples import RawSample
+from zsim.transport.session import RawSample
 from zsim_bridges.gateway import publications, stream_requests
 from zsim_bridges.gateway.access_check import ConnectionLimit, TokenBucket
 from zsim_bridges.gateway.client_messages import (

@@ -14,7 +14,7 @@ from zsim.errors import RunError, SessionError
 from zsim.runtime.health import HealthMeter
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
-from zsim.transport.samples import ReceivedSample
+from zsim.transport.session import ReceivedSample
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros1 import ros1_bridge, tcpros
 from zsim_bridges.ros1.drone_topics import DroneTopics

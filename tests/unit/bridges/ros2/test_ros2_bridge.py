@@ -12,7 +12,7 @@ from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.messages import ClusterInfo, DroneInfo, Info, Origin
 from zsim.contract.run_messages import ControlAnswer
 from zsim.scenario import scenario_file
-from zsim.transport.samples import RawSample, ReceivedSample
+from zsim.transport.session import RawSample, ReceivedSample
 from zsim.transport.zenoh_settings import Mode
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_bridges.ros2 import rmw_zenoh

@@ -12,7 +12,7 @@ from zsim.contract import keys, messages, run_messages
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import RunError, SessionError
 from zsim.scenario import scenario_file
-from zsim.transport.samples import ReceivedSample
+from zsim.transport.session import ReceivedSample
 from zsim_deploy.cli import inspection
 
 GARBAGE = [BAD_UTF8, NESTED, b"\xc1", b"\x91" * 5000]

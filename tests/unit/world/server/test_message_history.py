@@ -6,7 +6,7 @@ from msgspec import Struct
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import Done
-from zsim.transport.samples import ReceivedSample
+from zsim.transport.session import ReceivedSample
 from zsim_world.server.message_history import KEEP_NS, MessageHistory
 
 SECOND_NS = 1_000_000_000

@@ -13,7 +13,7 @@ from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError, NoWorldError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.membership import RETRY_S, Membership, replay
-from zsim.transport.samples import ReceivedSample
+from zsim.transport.session import ReceivedSample
 
 GATE_NS = 20_000_000
 INFO = Info(

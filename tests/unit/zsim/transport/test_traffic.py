@@ -7,7 +7,7 @@ from fake_link import FakeLink
 
 from zsim.contract import keys
 from zsim.contract.framing import GateMessages, encode_batch, key_table
-from zsim.transport.samples import ReceivedSample
+from zsim.transport.session import ReceivedSample
 from zsim.transport.traffic import Traffic, samples
 
 DRONES = ["d1"]
