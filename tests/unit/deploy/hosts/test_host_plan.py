@@ -109,7 +109,7 @@ def test_a_start_that_is_refused_leaves_no_folder(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     out: Any = Path(given) if given else None
     with refused(HostsError, "h1", "ssh", "127.0.0.1", "port 1", "reached"):
-        hosts_commands.up(*paths, out=out, insecure=True)
+        hosts_commands.up(scenario=paths[0], hosts=paths[1], out=out, insecure=True)
     left = {path.name for path in (*tmp_path.glob("runs/*"), *tmp_path.glob("out"), *tmp_path.glob("there"))}
     assert left == {"there"}
 
@@ -125,7 +125,7 @@ def test_a_federation_that_is_up_already_is_refused_before_any_host_is_asked(
         hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
     with ControlSocket("zsim", {}), refused(HostsError, "h1", "reached"):
-        hosts_commands.up(*paths, out=tmp_path / "out", set_=["federation=other"], insecure=True)
+        hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out", set_=["federation=other"], insecure=True)
 
 
 def test_certificates_that_are_missing_or_expired_are_told_before_any_host_is_asked(
@@ -133,10 +133,10 @@ def test_certificates_that_are_missing_or_expired_are_told_before_any_host_is_as
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     with refused(HostsError, "certs", "no certificates", "zsim certs init"):
-        hosts_commands.up(*paths, out=tmp_path / "out")
+        hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out")
     certify(paths, datetime.now(UTC) - timedelta(days=10))
     with refused(HostsError, "expired", "router.field", "h1", "estimator.drone1", "--renew"):
-        hosts_commands.up(*paths, out=tmp_path / "out")
+        hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
