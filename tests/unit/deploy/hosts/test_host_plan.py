@@ -125,7 +125,9 @@ def test_a_federation_that_is_up_already_is_refused_before_any_host_is_asked(
         hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
     with ControlSocket("zsim", {}), refused(HostsError, "h1", "reached"):
-        hosts_commands.up(scenario=paths[0], hosts=paths[1], out=tmp_path / "out", set_=["federation=other"], insecure=True)
+        hosts_commands.up(
+            scenario=paths[0], hosts=paths[1], out=tmp_path / "out", set_=["federation=other"], insecure=True
+        )
 
 
 def test_certificates_that_are_missing_or_expired_are_told_before_any_host_is_asked(
