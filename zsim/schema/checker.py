@@ -90,12 +90,12 @@ def _check_struct(value: Any, info: types.StructType, path: str) -> Iterator[Fau
     if info.forbid_unknown_fields:
         for key in value:
             if key not in names:
-                yield _join(path, key), f"is not known; allowed: {', '.join(sorted(names))}"
+                yield field_path(path, key), f"is not known; allowed: {', '.join(sorted(names))}"
     for name, entry in names.items():
         if name in value:
-            yield from _check(value[name], entry.type, _join(path, name))
+            yield from _check(value[name], entry.type, field_path(path, name))
         elif entry.required:
-            yield _join(path, name), f"is missing; must be {_expected(entry.type)}"
+            yield field_path(path, name), f"is missing; must be {_expected(entry.type)}"
 
 
 def _check_list(value: Any, info: types.ListType | types.VarTupleType, path: str) -> Iterator[Fault]:
@@ -130,7 +130,7 @@ def _check_dict(value: Any, info: types.DictType, path: str) -> Iterator[Fault]:
         yield path, f"is {show(value)}; must be a map"
         return
     for key, item in value.items():
-        where = _join(path, key)
+        where = field_path(path, key)
         yield from ((at, f"as a key {text}") for at, text in _check(key, info.key_type, where))
         yield from _check(item, info.value_type, where)
 
@@ -240,7 +240,8 @@ def _sound_field(value: dict[str, Any], entry: types.Field) -> Any:
     return None if entry.default is msgspec.NODEFAULT else entry.default
 
 
-def _join(path: str, name: Any) -> str:
+def field_path(path: str, name: Any) -> str:
+    """Return the path of a field below another, on one printable line whatever the name is."""
     text = str(name)
     text = text if text.isprintable() and len(text) <= SHOWN_MAX else show(text)
     return f"{path}.{text}" if path else text

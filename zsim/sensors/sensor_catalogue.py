@@ -10,7 +10,7 @@ from msgspec import UNSET, Struct, UnsetType
 
 from zsim.errors import DocumentError
 from zsim.schema import plugin
-from zsim.schema.checker import Fault, faults, show
+from zsim.schema.checker import Fault, faults, field_path, show
 from zsim.sensors import baro, flow, gps, imu, mag, sonar
 from zsim.sensors.baro import BaroConfig
 from zsim.sensors.flow import FlowConfig
@@ -135,7 +135,7 @@ def separate(section: dict[str, Any]) -> OwnSections:
             continue
         if not (isinstance(value, dict) and MODULE in value):
             allowed = f"allowed: {', '.join(sorted(FIELDS))}, or a sensor of your own with its module"
-            wrong.append((f"{name}"[:40], f"is not known; {allowed}"))
+            wrong.append((field_path("", name), f"is not known; {allowed}"))
             continue
         section_faults = [*_name_faults(name)] or [*_section_faults(name, value)]
         wrong += section_faults
@@ -164,9 +164,9 @@ def own_sections(drone: Any) -> dict[str, dict[str, Any]]:
     return own if isinstance(own, dict) else {}
 
 
-def _name_faults(name: str) -> Iterator[Fault]:
-    if not re.fullmatch(NAME, name) or name in RESERVED:
-        yield f"{name}"[:40], f"is no name of a sensor; must be {NAME_ALLOWED}"
+def _name_faults(name: Any) -> Iterator[Fault]:
+    if not isinstance(name, str) or not re.fullmatch(NAME, name) or name in RESERVED:
+        yield field_path("", name), f"is no name of a sensor; must be {NAME_ALLOWED}"
 
 
 def _settings_of(section: dict[str, Any]) -> dict[str, Any]:

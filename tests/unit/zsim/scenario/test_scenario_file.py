@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from refused import has_terms
 
@@ -796,6 +796,7 @@ places = st.lists(
 )
 
 
+@example(changes=[(["sensors"], {"\U000101fe": None, 7: {"module": "x"}})])
 @settings(max_examples=100, deadline=None)
 @given(changes=st.lists(st.tuples(places, values), min_size=1, max_size=3))
 def test_any_document_is_a_scenario_or_told(changes: list[tuple[list[Any], Any]]):
