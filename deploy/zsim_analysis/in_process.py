@@ -62,15 +62,18 @@ class InProcessFlight:
             stop_reason: called at every gate; a text ends the run.
         """
 
+        takes_message = [observer.add_message for observer in observers]
+        takes_gate = [observer.add_gate for observer in observers]
+
         def add_message(key: str, message: Any) -> None:
             wall_ns = time.time_ns()
-            for observer in observers:
-                observer.add_message(key, message, wall_ns)
+            for take in takes_message:
+                take(key, message, wall_ns)
 
         def add_gate(gate: GateMessages) -> None:
             wall_ns = time.time_ns()
-            for observer in observers:
-                observer.add_gate(gate, wall_ns)
+            for take in takes_gate:
+                take(gate, wall_ns)
 
         bus = Bus(self.world, self._agents, time.monotonic_ns, add_message, add_gate)
         add_message(keys.INFO, self.world.info())

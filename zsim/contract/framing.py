@@ -8,11 +8,11 @@ outside of the contract and begin with `@`, which no wildcard of Zenoh matches: 
 messages themselves, and not these.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from operator import sub
-from typing import Any, NoReturn
+from typing import Any, Generic, NoReturn, TypeVar
 
 import msgspec
 import numpy as np
@@ -30,6 +30,8 @@ BATCH_MAX = 5_000  # messages of one batch; a flood of somebody's messages goes 
 Pairs = list[tuple[str, bytes]]
 """Keys and payloads, in the order in which they were published."""
 _INT = np.dtype("<i8")
+PATTERNS_MAX = 64  # of keys of a gate, remembered by a reader; sensors of six rates have fewer
+T = TypeVar("T")
 
 
 def key_table(drones: Sequence[str], own: Sequence[str] = ()) -> tuple[str, ...]:
@@ -189,8 +191,34 @@ class GateMessages:
 
     def payload(self, m: int) -> bytes:
         """Return the payload of one message."""
-        start = int(self.ends[m - 1]) if m else 0
-        return bytes(self.buffer[start + GAP : int(self.ends[m])])
+        start: int = self.ends.item(m - 1) if m else 0
+        return bytes(self.buffer[start + GAP : self.ends.item(m)])
+
+
+class PerPattern(Generic[T]):
+    """What a reader looks up of a gate by its keys alone, kept: the same keys come again and again.
+
+    Args:
+        learn: looks it up.
+    """
+
+    def __init__(self, learn: Callable[[GateMessages], T]) -> None:
+        self._learn = learn
+        self._table: Sequence[str] = ()
+        self._known: dict[bytes, T] = {}
+
+    def of(self, gate: GateMessages) -> T:
+        """Return what `learn` returned for a gate with this table and these keys."""
+        if gate.table is not self._table:
+            self._table = gate.table
+            self._known.clear()
+        pattern = gate.which.tobytes()
+        known = self._known.get(pattern)
+        if known is None:
+            known = self._learn(gate)
+            if len(self._known) < PATTERNS_MAX:
+                self._known[pattern] = known
+        return known
 
 
 def _refuse(reason: str) -> NoReturn:

@@ -1,6 +1,6 @@
 """Writes a record while a run goes on."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from io import FileIO
 from pathlib import Path
 from typing import Any, NoReturn
@@ -10,7 +10,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from zsim.contract import messages
-from zsim.contract.framing import GateMessages
+from zsim.contract.framing import GateMessages, PerPattern
 from zsim.errors import RecordError
 from zsim.record.mcap_layout import chunk, opening, packed
 from zsim.record.open_chunk import OpenChunk
@@ -44,8 +44,7 @@ class RecordWriter:
         self.messages = 0
         self.refused = 0
         self._channels: dict[str, int] = {}  # by key, counted from 1
-        self._table: Sequence[str] = ()
-        self._channel_of = np.zeros(0, dtype=np.int64)  # by the place of a key in the table, 0 where none is known yet
+        self._gate_channels = PerPattern(self._channels_of)
         self._schemas: dict[str, int] = {}
         self._ahead: list[bytes] = []  # schemas and channels that the open chunk is the first to use
         self._open = OpenChunk(CHUNK_BYTES + CHUNK_BYTES // 4)
@@ -94,14 +93,9 @@ class RecordWriter:
         Raises:
             RecordError: as `add`.
         """
-        if gate.table is not self._table:
-            self._table, self._channel_of = gate.table, np.zeros(len(gate.table), dtype=np.int64)
-        channels = self._channel_of[gate.which]
-        if not channels.all():
-            self._learn(gate)
-            channels = self._channel_of[gate.which]
-        if channels.all():
-            self._open.add_gate(channels.tobytes(), gate, wall_ns)
+        channels = self._gate_channels.of(gate)
+        if channels:
+            self._open.add_gate(channels, gate, wall_ns)
             self._took(len(gate), wall_ns)
         else:
             self._add_each(gate, wall_ns)
@@ -112,12 +106,11 @@ class RecordWriter:
         if self._open.size >= CHUNK_BYTES or wall_ns - self._open.since_ns >= CHUNK_AGE_NS:
             self._end_chunk()
 
-    def _learn(self, gate: GateMessages) -> None:
-        """Look up, or register, the channels of the keys on which messages have come."""
-        places: list[int] = gate.which[self._channel_of[gate.which] == 0].tolist()
-        for place in places:
-            key = gate.table[place]
-            self._channel_of[place] = self._channels.get(key) or self._register(key, messages.encoding(key))
+    def _channels_of(self, gate: GateMessages) -> bytes:
+        """Return the channel of each message, int64; nothing if there is none left for one."""
+        names = [gate.table[place] for place in gate.which.tolist()]
+        channels = [self._channels.get(key) or self._register(key, messages.encoding(key)) for key in names]
+        return np.array(channels, dtype=np.int64).tobytes() if all(channels) else b""
 
     def _add_each(self, gate: GateMessages, wall_ns: int) -> None:
         for (key, payload), t_ns in zip(gate.pairs, gate.stamps.tolist(), strict=True):

@@ -10,16 +10,15 @@ putting the wildcards into the key, and only those with `**` or `$*` are compare
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from operator import itemgetter
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from zsim.contract import keys, messages
-from zsim.contract.framing import GateMessages
+from zsim.contract.framing import GateMessages, PerPattern
 from zsim.errors import DecodeError
 
 KEYS_MAX = 200_000  # whose readers are remembered; 1000 drones have about 15 000, other processes may make up any
+_message = itemgetter(1)  # of an input
 Input = tuple[str, Any]
 """A key and a message; or `keys.GATE` and a GateMessages."""
 
@@ -75,12 +74,12 @@ class RoutingTable:
                 yield reader
 
 
-class Routed(NamedTuple):
-    """A message of a gate, and the places of those who read it."""
+class _Read(NamedTuple):
+    """Who reads a message of a gate, its key, and its place there."""
 
     readers: tuple[int, ...]
     key: str
-    message: Any
+    place: int
 
 
 class GateRouter:
@@ -94,35 +93,29 @@ class GateRouter:
     def __init__(self, routes: RoutingTable, without: Sequence[int] = ()) -> None:
         self._routes = routes
         self._without = frozenset(without)
-        self._table: Sequence[str] = ()
-        self._readers: list[tuple[int, ...]] = []
-        self._is_read: NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
+        self._read = PerPattern(self._read_of)
 
-    def split(self, gate: GateMessages) -> Iterator[Routed]:
-        """Yield the messages that are read, in order of publication; one that is no message of its key is left out.
+    def split(self, gate: GateMessages) -> Iterator[tuple[tuple[int, ...], str, Any]]:
+        """Yield the readers, key and message of what is read, in order of publication.
 
-        So is a gate whose columns lead outside of its table.
+        A message that is none of its key is left out, and so is a gate whose columns lead outside of its table.
         """
-        if gate.table is not self._table:
-            self._learn(gate.table)
-        if not len(gate) or not 0 <= int(gate.which.min()) <= int(gate.which.max()) < len(self._readers):
-            return
-        read = np.flatnonzero(self._is_read[gate.which])
-        places: list[int] = gate.which[read].tolist()
-        for m, place in zip(read.tolist(), places, strict=True):
-            key = gate.table[place]
+        for readers, key, place in self._read.of(gate):
             try:
-                message = messages.decode(key, gate.payload(m))
+                message = messages.decode(key, gate.payload(place))
             except DecodeError:
                 continue  # not written by the world: as good as lost
-            yield Routed(self._readers[place], key, message)
+            yield readers, key, message
 
-    def _learn(self, table: Sequence[str]) -> None:
-        """Look up once who reads which key of a table."""
-        self._table = table
-        readers = [self._routes.readers(key) for key in table]
-        self._readers = [tuple(r for r in each if r not in self._without) for each in readers]
-        self._is_read = np.array([bool(each) for each in self._readers], dtype=np.bool_)
+    def _read_of(self, gate: GateMessages) -> list[_Read]:
+        which, table = gate.which.tolist(), gate.table
+        if not which or min(which) < 0 or max(which) >= len(table):
+            return []
+        each = [_Read(self._readers(table[key]), table[key], place) for place, key in enumerate(which)]
+        return [read for read in each if read.readers]
+
+    def _readers(self, key: str) -> tuple[int, ...]:
+        return tuple(reader for reader in self._routes.readers(key) if reader not in self._without)
 
 
 def in_order(inputs: Sequence[Input]) -> list[Input]:
@@ -132,12 +125,12 @@ def in_order(inputs: Sequence[Input]) -> list[Input]:
 
 def one_by_one(inputs: Sequence[Input], router: GateRouter) -> Sequence[Input]:
     """Return inputs with the messages of gates one by one, as far as they are read, in canonical order."""
-    if not any(type(message) is GateMessages for _, message in inputs):
+    if GateMessages not in map(type, map(_message, inputs)):
         return inputs
     single: list[Input] = []
     for key, message in inputs:
         if type(message) is GateMessages:
-            single += [(routed.key, routed.message) for routed in router.split(message)]
+            single += [(name, each) for _, name, each in router.split(message)]
         else:
             single.append((key, message))
     return in_order(single)
