@@ -34,6 +34,7 @@ class OpenChunk:
 
     Attributes:
         size: bytes of its records.
+        since_ns: wall clock of the first of its messages.
     """
 
     def __init__(self, room: int) -> None:
@@ -45,17 +46,14 @@ class OpenChunk:
     def _begin(self) -> None:
         if len(self._data) > 2 * self._room:
             self._data = bytearray(self._room)
-        self.size = 0
+        self.size, self.since_ns = 0, 0
         self._channels, self._ends = array("q"), array("q")
         self._log, self._published = array("Q"), array("Q")
 
-    @property
-    def since_ns(self) -> int:
-        """Return when the first of its messages came; there must be one."""
-        return self._published[0]
-
     def add(self, channel: int, payload: bytes, t_ns: int, wall_ns: int) -> None:
         """Take one message; its times are such as MCAP can hold."""
+        if not self.size:
+            self.since_ns = wall_ns
         self._put(self.size + MESSAGE.size, payload)
         self._channels.append(channel)
         self._ends.append(self.size)
@@ -68,6 +66,8 @@ class OpenChunk:
         Args:
             channels: number of each message's, int64.
         """
+        if not self.size:
+            self.since_ns = wall_ns
         self._channels.frombytes(channels)
         self._ends.frombytes((gate.ends + self.size).tobytes())
         self._log.frombytes(gate.stamps.tobytes())

@@ -70,7 +70,7 @@ class Agent(ABC):
         return self._process or self.name
 
     def share_process(self, process: str) -> None:
-        """Publish as a process of this name, together with other agents."""
+        """Publish as a process of this name, in a group, which takes gates apart for those who do not `takes_gates`."""
         self._process = process
 
     def update_faults(self, info: Info, faults: Faults) -> None:
@@ -85,7 +85,7 @@ class Agent(ABC):
         """Take the inputs of a gate in canonical order, as far as faults of the links bring them."""
         if self._links is not None and self._links.act_at(t_ns):
             inputs = self._links.delivered(t_ns, one_by_one(inputs, self._router))
-        elif not self.takes_gates:
+        elif not self.takes_gates and not self._process:
             inputs = one_by_one(inputs, self._router)
         for key, message in inputs:
             if type(message) is GateMessages:

@@ -14,7 +14,7 @@ from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Faults
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
-from zsim.runtime.routing import GateRouter, Input, RoutingTable, in_order
+from zsim.runtime.routing import GateRouter, Input, RoutingTable, canonical
 
 
 class AgentGroup(Agent):
@@ -82,7 +82,9 @@ class AgentGroup(Agent):
     def _take(self, place: int) -> list[Input]:
         """Return what a member is to receive, in the order in which a runner would hand it over."""
         inputs, self._waiting[place] = self._waiting[place], []
-        return in_order(inputs) if len(inputs) > 1 else inputs
+        if len(inputs) > 1:
+            inputs.sort(key=canonical)
+        return inputs
 
     def rehearse(self) -> None:
         for member in self._members:

@@ -15,7 +15,7 @@ from typing import Any
 from zsim.contract import keys
 from zsim.contract.flight_messages import Estimate
 from zsim.contract.run_messages import Fault, Faults
-from zsim.runtime.routing import Input, in_order
+from zsim.runtime.routing import Input, canonical
 from zsim.scenario import fault_kinds
 
 WORLD, RADIO = "world", "radio"
@@ -184,7 +184,7 @@ class LinkFaults:
         self._later = [entry for entry in self._later if entry[0] > t_ns]
         handed = [(key, message) for _, key, message in coming]
         handed += [(key, message) for key, message in inputs if self._comes_now(t_ns, key, message, acting)]
-        return in_order(handed)
+        return sorted(handed, key=canonical)
 
     def _note_positions(self, inputs: Sequence[Input]) -> None:
         for key, message in inputs:

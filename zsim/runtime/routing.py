@@ -118,9 +118,10 @@ class GateRouter:
         return tuple(reader for reader in self._routes.readers(key) if reader not in self._without)
 
 
-def in_order(inputs: Sequence[Input]) -> list[Input]:
-    """Return inputs in canonical order: by time, key and number."""
-    return sorted(inputs, key=lambda entry: (entry[1].t_ns, entry[0], entry[1].seq))
+def canonical(entry: Input) -> tuple[int, str, int]:
+    """Return what inputs are sorted by: time, key and number."""
+    key, message = entry
+    return message.t_ns, key, message.seq
 
 
 def one_by_one(inputs: Sequence[Input], router: GateRouter) -> Sequence[Input]:
@@ -133,4 +134,4 @@ def one_by_one(inputs: Sequence[Input], router: GateRouter) -> Sequence[Input]:
             single += [(name, each) for _, name, each in router.split(message)]
         else:
             single.append((key, message))
-    return in_order(single)
+    return sorted(single, key=canonical)

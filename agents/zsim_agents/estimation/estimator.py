@@ -75,11 +75,11 @@ class Estimator(Agent):
 
     def step(self, t_ns: int) -> list[Output]:
         estimates = self._estimators.estimate(t_ns * 1e-9)
-        self._last = [self._message(t_ns, key, each) for key, each in zip(self.writes, estimates, strict=True)]
+        self._last = [
+            flight_messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.source)
+            for key, estimate in zip(self.writes, estimates, strict=True)
+        ]
         return list(map(Output, self.writes, self._last))
-
-    def _message(self, t_ns: int, key: str, estimate: Any) -> flight_messages.Estimate:
-        return flight_messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.source)
 
     def views(self, t_ns: int) -> list[Output]:
         shown = tuple(map(estimate_view, self.counted, self._last))

@@ -6,6 +6,7 @@ Readings are only written down when they come. At the end of the gate every dron
 
 import struct
 from collections.abc import Callable, Sequence
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,12 @@ from zsim_agents.estimation.sensor_reader import GateReader
 
 _READING = struct.Struct(f"{READING.size}d")
 _ROOM = 256  # readings of a gate, at first
+_YAW, _YAW_SIGMA = ESTIMATE.yaw, ESTIMATE.yaw_sigma
+_COVARIANCE = slice(ESTIMATE.covariance, ESTIMATE.covariance + 36)
+_p_WB, _v_WB, _gyro_bias = (
+    itemgetter(first, first + 1, first + 2) for first in (ESTIMATE.p_WB, ESTIMATE.v_WB, ESTIMATE.gyro_bias)
+)
+_q_WB = itemgetter(*range(ESTIMATE.q_WB, ESTIMATE.q_WB + 4))
 _COUNTED = [*[*enumerate(SENSORS)][1:], (IMU, "imu")]  # in the order in which they are published
 
 _VALUES: dict[str, Callable[[Any], tuple[float, ...]]] = {  # values and extra of a reading
@@ -137,13 +144,13 @@ def _estimate(row: list[float], count: list[int]) -> StateEstimate:
     """Return a row of estimates and its drone's (used, refused) by sensor as what is published."""
     half = len(SENSORS)
     return StateEstimate(
-        (row[0], row[1], row[2]),
-        (row[3], row[4], row[5]),
-        (row[6], row[7], row[8], row[9]),
-        row[ESTIMATE.yaw],
-        tuple(row[ESTIMATE.covariance : ESTIMATE.yaw_sigma]),
-        row[ESTIMATE.yaw_sigma],
-        (row[ESTIMATE.gyro_bias], row[ESTIMATE.gyro_bias + 1], row[ESTIMATE.gyro_bias + 2]),
+        _p_WB(row),
+        _v_WB(row),
+        _q_WB(row),
+        row[_YAW],
+        tuple(row[_COVARIANCE]),
+        row[_YAW_SIGMA],
+        _gyro_bias(row),
         {name: (count[k], count[half + k]) for k, name in _COUNTED},
     )
 

@@ -91,13 +91,6 @@ class Participant:
         if self.done_seq is not None and seq == self.done_seq + 1:
             self.done_seq = seq
 
-    def note_output(self) -> None:
-        """Count an output that has come in."""
-        if self.missing:
-            self.missing -= 1
-        else:
-            self.surplus += 1
-
     def reset_counts(self) -> int:
         """Start counting outputs anew, once they were requested again; return how many are missing for good.
 
@@ -209,8 +202,12 @@ class Barrier:
     def count_output(self, name: str) -> None:
         """Count one output of a participant that has come in."""
         participant = self.participants.get(name)
-        if participant is not None:
-            participant.note_output()
+        if participant is None:
+            return
+        if participant.missing:
+            participant.missing -= 1
+        else:
+            participant.surplus += 1
 
     def is_gating(self, name: str) -> bool:
         """Tell whether a process is waited for, also one that seems dead: its outputs may come before its return."""
