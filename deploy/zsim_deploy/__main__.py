@@ -6,7 +6,6 @@ import signal
 
 from zsim_deploy import INTERRUPTED
 
-
 GARBAGE_OBJECTS = 10_000  # made before cycles are searched for; at Python's 700 that is a tenth of the start
 
 

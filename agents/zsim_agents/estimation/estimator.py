@@ -74,7 +74,7 @@ class Estimator(Agent):
             super().receive_gate(gate)
 
     def step(self, t_ns: int) -> list[Output]:
-        estimates = self._estimators.estimate(t_ns * 1e-9)
+        estimates: Sequence[Any] = self._estimators.estimate(t_ns * 1e-9)
         self._last = [
             flight_messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.source)
             for key, estimate in zip(self.writes, estimates, strict=True)
