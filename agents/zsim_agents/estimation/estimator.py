@@ -1,7 +1,7 @@
 """The estimator of one drone, or of several, as an agent: sensors in, an estimate of each drone out at every gate."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 from msgspec import Struct
 
@@ -74,7 +74,7 @@ class Estimator(Agent):
             super().receive_gate(gate)
 
     def step(self, t_ns: int) -> list[Output]:
-        estimates: Sequence[Any] = self._estimators.estimate(t_ns * 1e-9)
+        estimates = cast("list[Any]", self._estimators.estimate(t_ns * 1e-9))
         self._last = [
             flight_messages.Estimate(t_ns, self.next_seq(key), *estimate, source=self.source)
             for key, estimate in zip(self.writes, estimates, strict=True)
