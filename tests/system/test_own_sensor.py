@@ -70,6 +70,37 @@ def test_processes_give_the_samples_of_one_process(federation: Federation) -> No
     assert float(rows[0]["range_m"]) > 0
 
 
+RANGED = """
+from my_estimator import MyEstimator
+
+
+class Ranged(MyEstimator):
+    def __init__(self, *settings):
+        super().__init__(*settings)
+        self._used["my_uwb"] = 0
+
+    def _on_my_uwb(self, m):
+        self._p[2] += 1e-3 * (m.range_m - 2.0)
+"""
+
+
+def test_an_estimator_of_the_user_s_own_receives_it(federation: Federation) -> None:
+    for name in ("uwb_range.py", "airspeed.py", "my_estimator.py"):
+        shutil.copy(ROOT / "examples" / name, federation.folder)
+    (federation.folder / "ranged.py").write_text(RANGED)
+    chosen = options("estimation.algorithm=ranged:Ranged")
+    federation.run(PAIR, *chosen).ends(with_code=0)
+    record, one = federation.record(), federation.folder / "one"
+    estimates = record.all("drone/drone1/estimate")
+    assert estimates[-1]["sensors"]["my_uwb"][0] >= 10 * DURATION_S - 2  # Hz; the last ones are on their way
+    path = federation.write(PAIR)
+    federation.start("run", path, *chosen, "--in-process", "--no-report", "--out", str(one)).ends(with_code=0)
+    with RecordReader(one / "run.mcap") as reader:
+        alone = Record(reader)
+        assert [e["position_m"] for e in alone.all("drone/drone1/estimate")] == [e["position_m"] for e in estimates]
+        assert alone.sha256() == record.sha256()
+
+
 @pytest.mark.usefixtures("examples")
 def test_a_record_is_flown_again(federation: Federation) -> None:
     out = federation.folder / "one"
