@@ -164,6 +164,11 @@ def own_sections(drone: Any) -> dict[str, dict[str, Any]]:
     return own if isinstance(own, dict) else {}
 
 
+def own_rates(drone: Any) -> dict[str, float]:
+    """Return the rates of the users' sensors of a drone [Hz], by name."""
+    return {name: section["rate_hz"] for name, section in own_sections(drone).items()}
+
+
 def _name_faults(name: Any) -> Iterator[Fault]:
     if not isinstance(name, str) or not re.fullmatch(NAME, name) or name in RESERVED:
         yield field_path("", name), f"is no name of a sensor; must be {NAME_ALLOWED}"

@@ -77,11 +77,30 @@ def _drone_cells(row: DroneRow) -> str:
     return line
 
 
-def sensor_table(name: str, counts: Counts, rates: Mapping[str, float], uncertainty: str) -> str:
-    """Return the table of one drone's sensors: measurements that its estimator used and refused, and rates [Hz]."""
+def sensor_table(
+    name: str,
+    counts: Counts,
+    rates: Mapping[str, float],
+    uncertainty: str,
+    own_rates: Mapping[str, float] | None = None,
+) -> str:
+    """Return the table of one drone's sensors.
+
+    Args:
+        name: of the drone.
+        counts: measurements that its estimator used and refused, by sensor.
+        rates: at which they come [Hz].
+        uncertainty: of the estimate, in words.
+        own_rates: of the user's sensors, as set [Hz]; those that are not counted have a row, too.
+    """
     lines = [
         _row((kind, used, refused, f"{rates[kind]:.0f} Hz" if kind in rates else "–"))
         for kind, (used, refused) in counts.items()
+    ]
+    lines += [
+        _row((kind, "–", "–", f"{rate:.0f} Hz as set"))
+        for kind, rate in (own_rates or {}).items()
+        if kind not in counts
     ]
     title = f"<div style='{STYLE};padding:2px 0'><b>{escape(name)}</b>: {escape(uncertainty)}</div>"
     head = _head(
@@ -168,10 +187,12 @@ class TableRows:
 
     Args:
         views: the newest ones.
+        own_rates: of the user's sensors of each drone [Hz], by drone and sensor.
     """
 
-    def __init__(self, views: ViewBuffer) -> None:
+    def __init__(self, views: ViewBuffer, own_rates: Mapping[str, Mapping[str, float]] | None = None) -> None:
         self._views = views
+        self._own_rates = own_rates or {}
         self._rates = SensorRates()
 
     def drone_rows(self) -> list[DroneRow]:
@@ -200,12 +221,12 @@ class TableRows:
 
     def sensor_table(self, drone: str) -> str:
         """Return the table of one drone's sensors."""
-        received = self._views.estimates().get(drone)
+        received, own_rates = self._views.estimates().get(drone), self._own_rates.get(drone)
         if received is None:
-            return sensor_table(drone, {}, {}, "no estimate yet")
+            return sensor_table(drone, {}, {}, "no estimate yet", own_rates)
         estimate = received.estimate
         rates = self._rates.update(drone, received.t_ns, estimate.sensors) if received.fresh else {}
-        return sensor_table(drone, estimate.sensors, rates, _uncertainty(received))
+        return sensor_table(drone, estimate.sensors, rates, _uncertainty(received), own_rates)
 
     def _lag_ms(self, received: ReceivedEstimate, now_ns: int) -> float:
         """Return how far an estimator is behind: by its health, or by its view where that is old."""

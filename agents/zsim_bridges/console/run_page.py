@@ -15,6 +15,7 @@ from zsim.contract.views import ViewDrones
 from zsim.errors import RunError
 from zsim.math import frames
 from zsim.scenario import scenario_file
+from zsim.sensors.sensor_catalogue import own_rates
 from zsim.transport.session import Session
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
@@ -89,7 +90,7 @@ class RunPage:
         self._names = names
         self._members = {c.name: [names.index(d) for d in c.drones] for c in self._scenario.clusters}
         self._trails = CanvasTrails(len(names))
-        self._table_rows = TableRows(self.views)
+        self._table_rows = TableRows(self.views, {drone.name: own_rates(drone) for drone in self._scenario.drones})
         self._shapes: dict[str, FormationShape | None] = {}
         self._drones: DronePoses | None = None
         self._drawn_ghosts: dict[str, Any] = {}

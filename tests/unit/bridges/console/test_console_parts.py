@@ -236,6 +236,14 @@ def test_a_run_that_stands_still_adds_nothing_to_the_rates():
     assert len(rates._samples) == 2
 
 
+def test_a_sensor_of_the_user_s_has_a_row_counted_or_not():
+    """The stock estimator counts none; an estimator of the user's own may."""
+    own = {"pitot": 20.0, "my_uwb": 10.0}
+    table = console_tables.sensor_table("drone1", {"gps": (5, 0), "my_uwb": (7, 1)}, {}, "", own)
+    rows = [without_tags(row.replace("</td>", " ")).split() for row in table.split("<tr>")[2:]]
+    assert rows == [["gps", "5", "0", "–"], ["my_uwb", "7", "1", "–"], ["pitot", "–", "–", "20", "Hz", "as", "set"]]
+
+
 def test_rates_begin_anew_with_a_fresh_estimator():
     rates = SensorRates()
     rates.update("d1", 0, {"gps": (100, 0), "imu": (9, 0)})
