@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -204,23 +205,29 @@ def list_(reach: WorldAccess) -> None:
 
 
 @faults.command()
-def kinds() -> None:
+def kinds(
+    scenario: Annotated[
+        Path | None, typer.Argument(help="A scenario, for the kinds of its users' sensors too.", show_default=False)
+    ] = None,
+) -> None:
     """List the kinds of faults: whom they strike, and their parameters."""
-    from zsim.scenario.fault_kinds import KINDS
+    from zsim.scenario import fault_kinds, scenario_file
+    from zsim.sensors.sensor_catalogue import declarations
 
-    for name, kind in KINDS.items():
+    own = declarations(scenario_file.load(scenario).drones) if scenario else {}
+    for name, kind in fault_kinds.kinds_of(own).items():
         print(f"{name:<17} {kind.strikes:<8} {'  '.join(_parameters(kind)) or '-'}")
 
 
 def selector(which: str) -> dict[str, Any]:
     """Return the arguments of `fault_clear` that a word means."""
-    from zsim.scenario.fault_kinds import KINDS
+    from zsim.scenario.fault_kinds import is_kind
 
     if which == ALL:
         return {}
     if which.isdecimal():
         return {"id": int(which)}
-    return {"kind" if which in KINDS else "target": which}
+    return {"kind" if is_kind(which) else "target": which}
 
 
 def row(fault: "Fault", now_ns: int) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """`zsim fault`: what a person types becomes a request, or a line."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,10 +12,12 @@ from zsim.contract import keys
 from zsim.contract.run_messages import Fault
 from zsim.errors import SessionError
 from zsim.scenario.fault_check import COMMON
-from zsim.scenario.fault_kinds import KINDS
+from zsim.scenario.fault_kinds import KINDS, SENSOR_FAULTS
 from zsim.transport.session import Session
 from zsim_deploy.cli import federation_commands
 from zsim_deploy.cli.federation_commands import row, seconds, selector
+
+EXAMPLES = Path(__file__).parents[4] / "examples"
 
 
 @pytest.mark.parametrize(
@@ -77,7 +80,13 @@ def test_what_fits_into_no_message_is_refused_in_a_line(value: Any):
 
 @pytest.mark.parametrize(
     ("which", "args"),
-    [("all", {}), ("3", {"id": 3}), ("drone2", {"target": "drone2"}), ("gps_dropout", {"kind": "gps_dropout"})],
+    [
+        ("all", {}),
+        ("3", {"id": 3}),
+        ("drone2", {"target": "drone2"}),
+        ("gps_dropout", {"kind": "gps_dropout"}),
+        ("my_uwb_bias", {"kind": "my_uwb_bias"}),
+    ],
 )
 def test_which_are_cleared(which: str, args: dict[str, object]):
     assert selector(which) == args
@@ -94,3 +103,16 @@ def test_every_kind_is_listed(capsys: pytest.CaptureFixture[str]):
     federation_commands.kinds()
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == list(KINDS)
+
+
+def test_with_a_scenario_those_of_its_users_sensors_are_listed(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    path = tmp_path / "mine.yaml"
+    path.write_text("name: t\nduration_s: 1\nsensors: {tag: {module: uwb_range}}\ndrones: [{name: d1, position_m: [0, 0, 0]}]\n")
+    federation_commands.kinds(path)
+    listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    own = [kind for kind in listed if kind not in KINDS]
+    assert own == [f"tag_{fault}" for fault in SENSOR_FAULTS]
+    assert set(KINDS) < set(listed)
