@@ -78,30 +78,17 @@ def _drone_cells(row: DroneRow) -> str:
 
 
 def sensor_table(
-    name: str,
-    counts: Counts,
-    rates: Mapping[str, float],
-    uncertainty: str,
-    own_rates: Mapping[str, float] | None = None,
+    name: str, counts: Counts, rates: Mapping[str, float], uncertainty: str, own_rates: Mapping[str, float]
 ) -> str:
-    """Return the table of one drone's sensors.
+    """Return the table of one drone's sensors: measurements that its estimator used and refused, and rates [Hz].
 
-    Args:
-        name: of the drone.
-        counts: measurements that its estimator used and refused, by sensor.
-        rates: at which they come [Hz].
-        uncertainty: of the estimate, in words.
-        own_rates: of the user's sensors, as set [Hz]; those that are not counted have a row, too.
+    `own_rates` are those of the user's sensors, as set [Hz]; one that is not counted has a row, too.
     """
-    lines = [
-        _row((kind, used, refused, f"{rates[kind]:.0f} Hz" if kind in rates else "–"))
+    counted = [
+        (kind, used, refused, f"{rates[kind]:.0f} Hz" if kind in rates else "–")
         for kind, (used, refused) in counts.items()
     ]
-    lines += [
-        _row((kind, "–", "–", f"{rate:.0f} Hz as set"))
-        for kind, rate in (own_rates or {}).items()
-        if kind not in counts
-    ]
+    others = [(kind, "–", "–", f"{rate:.0f} Hz as set") for kind, rate in own_rates.items() if kind not in counts]
     title = f"<div style='{STYLE};padding:2px 0'><b>{escape(name)}</b>: {escape(uncertainty)}</div>"
     head = _head(
         ("sensor", "of the drone"),
@@ -109,7 +96,7 @@ def sensor_table(
         ("refused", "measurements that were too unlikely, or of no use"),
         ("rate", "at which they come, in simulated time"),
     )
-    return title + _table(head + "".join(lines))
+    return title + _table(head + "".join(map(_row, [*counted, *others])))
 
 
 def formation_lines(states: Mapping[str, tuple[str, str]]) -> str:
@@ -190,9 +177,9 @@ class TableRows:
         own_rates: of the user's sensors of each drone [Hz], by drone and sensor.
     """
 
-    def __init__(self, views: ViewBuffer, own_rates: Mapping[str, Mapping[str, float]] | None = None) -> None:
+    def __init__(self, views: ViewBuffer, own_rates: Mapping[str, Mapping[str, float]]) -> None:
         self._views = views
-        self._own_rates = own_rates or {}
+        self._own_rates = own_rates
         self._rates = SensorRates()
 
     def drone_rows(self) -> list[DroneRow]:
@@ -221,7 +208,7 @@ class TableRows:
 
     def sensor_table(self, drone: str) -> str:
         """Return the table of one drone's sensors."""
-        received, own_rates = self._views.estimates().get(drone), self._own_rates.get(drone)
+        received, own_rates = self._views.estimates().get(drone), self._own_rates.get(drone, {})
         if received is None:
             return sensor_table(drone, {}, {}, "no estimate yet", own_rates)
         estimate = received.estimate

@@ -61,7 +61,7 @@ class Ears:
         self.observer = ObserverProcess(self.link, info, "console.1")
         self.watch = TimeMonitor(self.link, self.observer, stamp_age_s, lambda: self.wall_s)
         self.views = ViewBuffer(self.link, info, self.observer, {}, self.refused.append, lambda: self.wall_s)
-        self.words = TableRows(self.views)
+        self.words = TableRows(self.views, {})
         self.views.open()
 
     def hear(self, *said: tuple[str, Any]) -> None:

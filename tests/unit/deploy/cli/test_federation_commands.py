@@ -110,7 +110,9 @@ def test_with_a_scenario_those_of_its_users_sensors_are_listed(
 ):
     monkeypatch.syspath_prepend(str(EXAMPLES))
     path = tmp_path / "mine.yaml"
-    path.write_text("name: t\nduration_s: 1\nsensors: {tag: {module: uwb_range}}\ndrones: [{name: d1, position_m: [0, 0, 0]}]\n")
+    path.write_text(
+        "name: t\nduration_s: 1\nsensors: {tag: {module: uwb_range}}\ndrones: [{name: d1, position_m: [0, 0, 0]}]\n"
+    )
     federation_commands.kinds(path)
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
     own = [kind for kind in listed if kind not in KINDS]
