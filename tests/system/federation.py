@@ -31,7 +31,7 @@ import forked_commands
 import msgpack
 import numpy as np
 import pytest
-from forked_commands import COLUMNS, ZSIM
+from forked_commands import COLUMNS, ROOT, ZSIM
 from wire import PATIENCE_S, Client
 
 from zsim.record import RecordReader, repair
@@ -340,7 +340,8 @@ def compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
     scenario = folder / "pair.yaml"
     scenario.write_text(PAIR)
     flight = ["run", str(scenario), "--in-process", "--duration", "8", "--no-report", "--out", str(folder / "run")]
-    with open(Path(tempfile.gettempdir()) / "zsim-tests-compile.lock", "w") as lock:
+    checkout = hashlib.sha256(str(ROOT).encode()).hexdigest()[:12]
+    with open(Path(tempfile.gettempdir()) / f"zsim-tests-compile-{checkout}.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert forked_commands.run(*flight, hangs_s=COMPILES_S).code == 0
 

@@ -64,7 +64,7 @@ def test_processes_give_the_samples_of_one_process(federation: Federation) -> No
         assert Record(reader).sha256() == record.sha256()
     tables = federation.folder / "tables"
     federation.start("export", str(one), "--format", "csv", "--out", str(tables)).ends(with_code=0)
-    with (tables / "uwb_range.csv").open(newline="") as file:
+    with (tables / "sensor_my_uwb.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == sum(len(record.all(key)) for key in KEYS if key.endswith("my_uwb"))
     assert float(rows[0]["range_m"]) > 0

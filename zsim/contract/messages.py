@@ -164,7 +164,7 @@ def register_sensors(sensors: Iterable[SensorInfo]) -> None:
     A sensor with a name that no sensor, message or field has is left out: its messages are a stranger's.
     """
     known = [each for each in sensors if all(map(_NAME.fullmatch, (each.name, each.message.lower(), *each.fields)))]
-    types = {sensor.name: message_type(sensor.message, sensor.fields) for sensor in known}
+    types = {sensor.name: message_type(sensor.message, sensor.fields, sensor.name) for sensor in known}
     if any(_OWN_SENSORS.get(name) is not kind for name, kind in types.items()):
         _OWN_SENSORS.update(types)
         for by_key in (type_of, encoding, _reader_of):

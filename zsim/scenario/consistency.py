@@ -190,13 +190,16 @@ def _sensor_faults(sensors: Any) -> Iterator[Fault]:
 def _own_sensor_faults(drones: _Entries) -> Iterator[Fault]:
     """Yield where a sensor of one name has messages of two kinds, or its message the name of another."""
     first: dict[str, tuple[int, str]] = {}
+    fields_of: dict[str, dict[str, str]] = {}
     taken = {kind.__name__ for kind in messages.types_by_shape().values()}
     for index, drone in drones:
         for name, section in own_sections(drone).items():
             message = section[DECLARED]["message"]
+            path = f"drones[{index}].sensors.{name}.{DECLARED}.message"
             if message in taken:
-                path = f"drones[{index}].sensors.{name}.{DECLARED}.message"
                 yield path, f"is {show(message)}, which is a message of the contract; must be another"
+            elif fields_of.setdefault(message, section[DECLARED]["fields"]) != section[DECLARED]["fields"]:
+                yield path, f"is {show(message)}, which another sensor has with other fields; must be a name of its own"
             other, module = first.setdefault(name, (index, section[MODULE]))
             if module != section[MODULE]:
                 difference = f"is {show(section[MODULE])}, and {show(module)} in drones[{other}]"

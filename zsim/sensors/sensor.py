@@ -22,6 +22,7 @@ from zsim.schema.quantities import Fraction, NonNegative, Vector3
 
 VALUES_MAX = 6  # numbers of one reading
 RateHz = Annotated[float, Meta(ge=0.01, le=1000)]
+LatencyMs = Annotated[float, Meta(ge=0, le=10_000)]
 FieldType = Literal[
     "number", "whole", "flag", "number[1]", "number[2]", "number[3]", "number[4]", "number[5]", "number[6]"
 ]
@@ -56,7 +57,7 @@ class Sensor(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Settings that all sensors share."""
 
     rate_hz: RateHz
-    latency_ms: Annotated[float, Meta(ge=0, le=10_000)] = 0.0
+    latency_ms: LatencyMs = 0.0
     dropout: Fraction = 0.0
     """Probability that a sample is lost, independent per sample."""
     mount: Mount = Mount()
@@ -75,7 +76,8 @@ class Channel(Struct, frozen=True, omit_defaults=True):
         settings: field of the settings that has the ErrorModel.
         unit: of the ErrorModel, and of a bias that a fault adds.
         width: how many numbers.
-        to_si: what a unit is in that of the equation's values.
+        to_si: what a unit is in that of the equation's values, e.g. pi / 180 where settings are in deg/s and values
+            in rad/s.
         part: first word of its fault kinds; empty for the sensor as a whole.
         label: what the part is called.
         axes: what the bias of a fault is along, or of.
@@ -234,15 +236,20 @@ def _word(info: types.Type, where: str) -> Any:
     return _WORDS[type(info)]
 
 
-def message_type(name: str, fields: Mapping[str, str]) -> type[Sample]:
-    """Return the message with these fields: the same class for the same name and fields."""
-    return _message_type(name, tuple(fields.items()))
+def message_type(name: str, fields: Mapping[str, str], sensor: str = "") -> type[Sample]:
+    """Return the message with these fields, of a user's sensor: the same class for the same three."""
+    return _message_type(name, tuple(fields.items()), sensor)
+
+
+def sensor_of(message: type[Struct]) -> str:
+    """Return the name of the user's sensor whose message this is; empty for any other."""
+    return getattr(message, "__sensor__", "")
 
 
 @cache
-def _message_type(name: str, fields: tuple[tuple[str, str], ...]) -> type[Sample]:
+def _message_type(name: str, fields: tuple[tuple[str, str], ...], sensor: str) -> type[Sample]:
     own: Any = [(field, _annotation(word)) for field, word in fields]
-    made: Any = msgspec.defstruct(name, own, bases=(Sample,), frozen=True, gc=False)
+    made: Any = msgspec.defstruct(name, own, bases=(Sample,), namespace={"__sensor__": sensor}, frozen=True, gc=False)
     return made
 
 

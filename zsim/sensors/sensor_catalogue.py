@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_type_hints
 
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
@@ -104,6 +104,7 @@ def _check(sensor: SensorType) -> None:
         kind = getattr(sensor, part)
         if not (isinstance(kind, type) and issubclass(kind, base)):
             raise TypeError(f"{part} is {show(str(kind))}; must be a subclass of {base.__name__}")
+    _check_settings(sensor.settings)
     fields = Declaration.of(sensor).fields
     if sensor.equation is None:
         raise ValueError("equation is missing; must be a function of truth, settings and environment")
@@ -120,6 +121,15 @@ def _check(sensor: SensorType) -> None:
             as_fields([0.0] * sensor.values, fields)
         except ValueError as error:
             raise ValueError(f"message {error}, or `convert` must be given") from error
+
+
+def _check_settings(settings: type[Sensor]) -> None:
+    """Refuse settings that all sensors share under another type: their limits would be lost."""
+    shared, own = (get_type_hints(kind, include_extras=True) for kind in (Sensor, settings))
+    for name, kind in shared.items():
+        if own[name] != kind:
+            what = f"settings: {settings.__name__}.{name} has a type of its own"
+            raise TypeError(f"{what}; must have that of zsim.sensors.sensor.Sensor, e.g. RateHz, LatencyMs")
 
 
 def separate(section: dict[str, Any]) -> OwnSections:

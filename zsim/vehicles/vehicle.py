@@ -15,6 +15,7 @@ from msgspec import Meta, Struct
 from zsim.schema.quantities import Fraction, NonNegative, Positive, Real
 
 ROTORS_MIN, ROTORS_MAX = 4, 8  # fewer cannot hold a hover at every heading; more do not go into a message
+ARM_MISS_MAX = 0.01  # of the arm, chosen: what rounding of a drawing leaves
 BALANCE_MAX = 1e-6  # of the arm, by which the centre of the rotors may miss that of mass
 RANK_MIN = 1e-3  # least share that one of roll, pitch and yaw may have of the strongest
 
@@ -151,7 +152,7 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     mass_kg: Mass
     inertia_kg_m2: tuple[Positive, Positive, Positive]
     arm_m: Arm
-    """Centre to rotor, the size of the airframe."""
+    """Centre to the farthest rotor, the size of the airframe."""
     thrust_n_s2: Positive
     torque_nm_s2: Positive
     rotor_time_constant_s: RotorLag
@@ -181,6 +182,10 @@ class Vehicle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             raise ValueError(f"rotors has {count} entries; must have {ROTORS_MIN} to {ROTORS_MAX}")
         if len(set(names)) < count:
             raise ValueError(f"rotors has the names {', '.join(names)}; must be distinct")
+        farthest = max(math.hypot(rotor.x_m, rotor.y_m) for rotor in self.rotors)
+        if not math.isclose(self.arm_m, farthest, rel_tol=ARM_MISS_MAX):
+            what = f"arm_m is {self.arm_m:g}, but the farthest of rotors is {farthest:.4g} m from the centre"
+            raise ValueError(f"{what}; must be the same: give both, and airframe and rotor_radius_m that fit")
         layout = allocation(self)
         off = np.abs(layout.sum(axis=1)).max()
         if not off <= BALANCE_MAX * count:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.messages import REFUSALS
 from zsim.scenario.fault_kinds import ROTORS
+from zsim.sensors.sensor import sensor_of
 
 Kind = Literal["whole", "number", "flag", "text"]
 Values = NDArray[Any] | list[Any]
@@ -146,7 +147,9 @@ def fields(kind: type[Struct], names: dict[str, Sequence[str]]) -> tuple[FieldCo
 
 
 def table_name(kind: type[Struct]) -> str:
-    """Return the name of a message's table: ClusterState is cluster_state."""
+    """Return the name of a message's table: ClusterState is cluster_state, of a user's sensor it is sensor_NAME."""
+    if sensor := sensor_of(kind):
+        return f"sensor_{sensor}"
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind.__name__).lower()
 
 

@@ -26,6 +26,7 @@ from typer.testing import CliRunner
 from zsim.contract import flight_messages, keys, messages
 from zsim.errors import ReportError, RunError
 from zsim.record import RecordReader, RecordWriter
+from zsim.sensors.sensor import message_type
 from zsim_analysis.export import Format, matlab
 from zsim_analysis.export.make_export import export, placed
 from zsim_analysis.export.matlab import matlab_names
@@ -438,3 +439,8 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(run: Path, tmp_path: Path) -
         assert done.stderr.startswith(str(tmp_path))
         assert has_terms(done.stderr, "room")
         assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+
+
+def test_two_sensors_of_one_module_have_a_table_each():
+    left, right = (message_type("Ranged", {"range_m": "number"}, name) for name in ("left", "right"))
+    assert [table_name(left), table_name(right)] == ["sensor_left", "sensor_right"]

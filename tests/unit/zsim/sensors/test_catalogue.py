@@ -101,6 +101,47 @@ def test_one_name_is_one_kind_of_message():
     assert paths(a=UWB, second={"a": {"module": "airspeed"}})[0].startswith("drones[1].sensors.a")
 
 
+def module(path: Path, name: str, text: str) -> dict[str, str]:
+    """Write a module with a sensor of one number; return its section."""
+    head = """
+from zsim.schema.message import Number
+from zsim.sensors.sensor import Channel, ErrorModel, LatencyMs, RateHz, Sample, Sensor, SensorType
+"""
+    tail = """
+SENSOR = SensorType(
+    label="x", message=Mine, settings=Config, channels=(Channel("x"),), equation=lambda truth, settings, environment: [0.0]
+)
+"""
+    (path / f"{name}.py").write_text(head + text + tail)
+    return {"module": name}
+
+
+CONFIG = (
+    "class Config(Sensor, frozen=True, kw_only=True):\n    x: ErrorModel = ErrorModel()\n    rate_hz: RateHz = 5.0\n"
+)
+MINE = "class Mine(Sample, frozen=True):\n    {}: Number\n"
+
+
+def test_two_messages_of_one_name_have_the_same_fields(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    one, other = (module(tmp_path, f"named_{x}", MINE.format(x) + CONFIG) for x in "ab")
+    assert scenario(p=one, q=one).drones[0].sensors is not None
+    assert paths(p=one, q=other) == [f"drones[{drone}].sensors.q.declared.message" for drone in (0, 1)]
+
+
+@pytest.mark.parametrize(("field", "is_sound"), [("latency_ms: LatencyMs", True), ("latency_ms: float", False)])
+def test_settings_that_all_sensors_share_keep_their_limits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field: str, is_sound: bool
+):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    name = f"with_latency_{is_sound}".lower()
+    mine = module(tmp_path, name, MINE.format("a") + CONFIG + f"    {field} = 40.0\n")
+    if is_sound:
+        assert paths(p={**mine, "latency_ms": -50}) == ["sensors.p.latency_ms"]
+    else:
+        assert paths(p=mine) == ["sensors.p.module"]
+
+
 def test_faults_of_a_users_sensor_have_its_unit():
     kinds = kinds_of(declarations(scenario(my_uwb=UWB, pitot={"module": "airspeed"}).drones))
     (bias,) = kinds["my_uwb_bias"].parameters
@@ -126,7 +167,7 @@ def test_messages_are_known_wherever_the_info_of_the_run_is():
     assert messages.encoding(key) == "application/msgpack;Ranged"
     with pytest.raises(DecodeError, match="range_m"):
         messages.decode(key, messages.encode(kind(1, 0, 1, float("nan"), (1.0, 2.0, 3.0), 7, True)))
-    assert message_type("Ranged", fields) is kind
+    assert message_type("Ranged", fields, "test_ranger") is kind
     assert "drone/*/sensor/test_ranger" not in messages.types_by_shape()
 
 

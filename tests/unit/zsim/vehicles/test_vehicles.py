@@ -1,5 +1,6 @@
 """Vehicles as data: stock ones are sound, and what is none is refused with one line."""
 
+import math
 import re
 from pathlib import Path
 from types import ModuleType
@@ -102,7 +103,13 @@ def test_faulty_parameters_are_named(monkeypatch: pytest.MonkeyPatch):
 
 
 def with_rotors(*rotors: Rotor) -> Vehicle:
-    return replace(ardrone2.VEHICLE, rotors=rotors)
+    arm_m = max(math.hypot(rotor.x_m, rotor.y_m) for rotor in rotors)
+    return replace(ardrone2.VEHICLE, arm_m=arm_m, rotors=rotors)
+
+
+def test_an_arm_that_is_not_that_of_the_rotors_is_refused():
+    with pytest.raises(ValueError, match=r"arm_m is 0\.25\b.* 0\.1785 m"):
+        replace(ardrone2.VEHICLE, arm_m=0.25)
 
 
 @pytest.mark.parametrize(
