@@ -13,7 +13,7 @@ from zsim.contract.framing import GateMessages
 from zsim.record import RecordWriter
 from zsim.runtime.agent import Agent
 from zsim.runtime.bus import Bus
-from zsim.runtime.progress import HoldReasons, Screen, Throttle
+from zsim.runtime.progress import HoldReasons, Screen, SlowStart, Throttle
 from zsim.scenario.role_table import agent_names
 from zsim.scenario.scenario import Scenario
 from zsim_agents.hosting import hosted
@@ -108,18 +108,15 @@ def fly(
     Raises:
         DivergedError: the state of a drone was no longer finite; the record is complete to its end.
     """
-    flight = InProcessFlight(
-        scenario, run_id
-    )  # first: a refused scenario must leave no record, which would be in the way
+    flight = InProcessFlight(scenario, run_id)  # first: a refused scenario leaves no record, which would be in the way
     writer = RecordWriter(record) if record else None
-    observers: list[FlightObserver] = [writer] if writer else []
-    if screen:
-        observers.append(_Progress(scenario, screen))
+    progress = _Progress(scenario, screen) if screen else None
     try:
-        flight.run(observers, stop_reason)
+        flight.run([each for each in (writer, progress) if each], stop_reason)
     finally:
-        if writer:
-            writer.close()
+        for each in (progress, writer):
+            if each:
+                each.close()
     if flight.world.diverged:
         raise flight.world.diverged
     return flight.world.ended or "ended"
@@ -135,6 +132,11 @@ class _Progress:
         states = (keys.cluster_state(cluster.name) for cluster in scenario.clusters)
         self._watched = {keys.CLOCK, keys.EVENT, *states}
         self._phase = ""
+        self._start = SlowStart(screen.say)
+
+    def close(self) -> None:
+        """Show nothing any more."""
+        self._start.over()
 
     def add_gate(self, gate: GateMessages, wall_ns: int) -> None:
         """Show nothing: it holds truth, status and sensors only."""
@@ -152,5 +154,6 @@ class _Progress:
         elif isinstance(message, run_messages.Event):
             self._screen.event({"t_s": message.t_ns / 1e9, "kind": message.kind, "text": message.text})
         elif isinstance(message, run_messages.Clock) and self._throttle.passes():
+            self._start.over()
             line = {"t_s": message.t_ns / 1e9, "rate": message.rate, "state": message.state, "phase": self._phase}
             self._screen.clock({**line, "waiting_for": []})

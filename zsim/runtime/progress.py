@@ -6,7 +6,9 @@ A world that a launcher started writes it as JSON lines (`JsonProgress`); otherw
 import json
 import re
 import sys
+import threading
 import time
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from rich.console import Console
@@ -16,6 +18,8 @@ from rich.text import Text
 from zsim.contract.flight_messages import ClusterState
 
 PERIOD_S = 0.2  # wall time between two updates
+SLOW_S = 3.0  # wall time; what is compiled is loaded within two, unless the machine is busy
+SLOW_NOTICE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
 REASON_NS = 5_000_000_000  # simulated time; a take-off gives one reason for 3 s
 _NUMBER = re.compile(r"-?[0-9][0-9.]*")
 QUIET = frozenset({"join", "leave", "command", "control", "mode", "commander", "release", "refused", "end"})
@@ -28,6 +32,23 @@ class ProgressSink(Protocol):
     def event(self, line: dict[str, Any]) -> None: ...
     def health(self, line: dict[str, Any]) -> None: ...
     def say(self, text: str) -> None: ...
+
+
+class SlowStart:
+    """Shows a line when a start takes long, which nearly always is because something is compiled.
+
+    Args:
+        say: shows it, from a thread of its own.
+    """
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._timer = threading.Timer(SLOW_S, say, args=(SLOW_NOTICE,))
+        self._timer.daemon = True
+        self._timer.start()
+
+    def over(self) -> None:
+        """Say nothing any more: it has started, or will not."""
+        self._timer.cancel()
 
 
 class Throttle:

@@ -18,6 +18,8 @@ from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import IO, NamedTuple, Protocol
 
+from zsim.runtime.progress import SlowStart
+
 SINGLE_THREADED = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
@@ -31,8 +33,6 @@ PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # linux/prctl.h
 PACKET_MAX = 1 << 17  # bytes, of a command line; a thousand names of drones are half of it
 REPLY_MAX = 32  # bytes, of an answer: READY, or a process number
 ANSWER_S = 5.0  # the fork server answers within 20 ms, unless it is stopped
-SLOW_S = 3.0  # what is compiled is loaded within two, unless the machine is busy
-SLOW_NOTICE = "loading what is compiled, or compiling it: once on a machine, that takes a minute"
 POLL_S = 0.01  # how often one looks whether it has ended
 UNKNOWN = 0  # exit code, as of Popen, where somebody else has taken it
 
@@ -156,12 +156,11 @@ class RoleLauncher:
                 [*FORKSERVER, self._run, ROOM], stdin=other.fileno(), stdout=quiet, stderr=quiet, env=environment,
                 start_new_session=True,
             )  # fmt: skip
-        timer = threading.Timer(SLOW_S, self._say, args=(SLOW_NOTICE,))
-        timer.start()
+        start = SlowStart(self._say)
         try:
             self._receive()
         finally:
-            timer.cancel()
+            start.over()
 
     def _fork(self, arguments: Sequence[str], log: IO[str], listened: bool) -> ForkedProcess | None:
         """Return None where the fork server cannot do it."""

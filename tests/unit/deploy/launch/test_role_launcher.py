@@ -13,6 +13,7 @@ import pytest
 from refused import has_terms
 
 from zsim import __version__
+from zsim.runtime import progress
 from zsim_deploy.launch import role_launcher as module
 from zsim_deploy.launch.role_launcher import ForkedProcess, RoleLauncher, RoleProcess
 
@@ -195,10 +196,10 @@ def test_the_fork_server_ends_with_its_launcher() -> None:
 
 
 def test_what_takes_long_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    monkeypatch.setattr(module, "SLOW_S", 0.0)
-    with RoleLauncher(said.append):
-        assert said == [module.SLOW_NOTICE] or sys.platform != "linux"
+    shown: list[str] = []
+    monkeypatch.setattr(progress, "SLOW_S", 0.0)
+    with RoleLauncher(shown.append):
+        assert shown == [progress.SLOW_NOTICE] or sys.platform != "linux"
 
 
 @LINUX

@@ -1,8 +1,10 @@
 """What a person is told of a run: a reason that lasts, once."""
 
+import pytest
 from refused import has_terms
 
 from zsim.contract.flight_messages import ClusterState
+from zsim.runtime import progress
 from zsim.runtime.progress import REASON_NS, HoldReasons
 
 GATE_NS = 20_000_000
@@ -43,3 +45,15 @@ def test_each_cluster_has_its_own():
     for t_ns in (0, REASON_NS):
         lines = [reasons.line(cluster, state(t_ns, WAITS)) for cluster in ("a", "b")]
     assert [line and line.split()[2] for line in lines] == ["a,", "b,"]
+
+
+@pytest.mark.parametrize("is_slow", [True, False])
+def test_a_start_that_takes_long_is_explained(monkeypatch: pytest.MonkeyPatch, is_slow: bool):
+    monkeypatch.setattr(progress, "SLOW_S", 0.0 if is_slow else 600.0)
+    shown: list[str] = []
+    start = progress.SlowStart(shown.append)
+    if is_slow:
+        start._timer.join()
+    start.over()
+    start._timer.join()
+    assert shown == [progress.SLOW_NOTICE] * is_slow
