@@ -96,7 +96,7 @@ class CommandIntake:
             self.outbox.refuse("somebody", f"drone/{drone[:40]}/cmd/{kind}", refusal)
             return True
         index = self._index.get(drone)
-        refusal = self._no_drone(drone) if index is None else self._age_refusal(message, gating)
+        refusal = self._no_drone(drone) if index is None else self._stamp_refusal(message, gating)
         if index is None or refusal:
             self.outbox.refuse(source, f"drone/{drone[:40]}/cmd/{kind}", refusal or "")
             return True
@@ -112,7 +112,7 @@ class CommandIntake:
     def _no_drone(self, name: str) -> Refusal:
         return Refusal("drone", repr(name[:40]), "must be one of `drones` in world/info")
 
-    def _age_refusal(self, message: Any, gating: bool) -> Refusal | None:
+    def _stamp_refusal(self, message: Any, gating: bool) -> Refusal | None:
         now_ns = self.clock.now_ns
         if self.clock.mode == "realtime":
             age_ms, max_age_ms = (now_ns - message.t_ns) / 1e6, self.scenario.time.max_command_age_ms
