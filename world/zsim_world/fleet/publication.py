@@ -41,8 +41,6 @@ INTS, FLOATS = LAYOUTS.ints, LAYOUTS.floats
 OPS, FIRST, LITERALS = LAYOUTS.program  # compiled in
 COMMANDER = len(firmware.MODES)  # the first commander among the words: nobody
 
-HASHED_BYTES = 16_384  # in one go, which takes as long as a few instants
-
 write = inlined(encoding.write)
 
 

@@ -110,7 +110,7 @@ def _is_gate(payload: bytes) -> bool:
 
 
 def is_played(key: str, expressions: Sequence[str]) -> bool:
-    """Tell whether what stands on a key is played: not what is made anew, nor what absent processes said of themselves.
+    """Return whether the messages of a key are played: not what is made anew, nor what absent processes sent of themselves.
 
     Args:
         expressions: that the user wants to be played.

@@ -6,20 +6,13 @@ from typing import Any
 
 import pytest
 from refused import has_terms, refused
+from short_flight import ONE
 
 from zsim.errors import RunError
 from zsim.scenario import scenario_file
 from zsim_analysis.sweep import process_pool
 from zsim_analysis.sweep.process_pool import READY
 from zsim_analysis.sweep.sweep_run import Row, Task
-
-ONE = """
-name: one
-seed: 3
-duration_s: 0.5
-drones: [{name: d1, position_m: [0, 0, 0]}]
-processes: {expect: []}
-"""
 
 
 def task(run: int) -> Task:
