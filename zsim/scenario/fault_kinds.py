@@ -156,7 +156,7 @@ KINDS: dict[str, FaultKind] = {
     ),
     "rotor_stuck": FaultKind(
         "drone",
-        "a rotor turns at one speed whatever it is told",
+        "a rotor turns at one speed whatever its command",
         (ROTOR, _number("speed_rad_s", "as it turns at the start, if left out", "rad/s", 0.0, 1e4, required=False)),
     ),
     "gust": FaultKind(

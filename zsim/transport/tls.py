@@ -156,7 +156,7 @@ def _words(error: ssl.SSLError, host: str, endpoint: str) -> str | None:
     if "ALERT" in reason:
         return f"who listens there refuses our certificate ({_reason(error)}); {MEND}"
     if "WRONG_VERSION" in reason or "RECORD_LAYER" in reason or "HTTP" in reason:
-        return f"who listens there speaks no TLS; start it with --tls, or say tcp/ instead of {endpoint.split('/')[0]}/"
+        return f"who listens there has no TLS; start it with --tls, or say tcp/ instead of {endpoint.split('/')[0]}/"
     return None
 
 

@@ -110,7 +110,7 @@ def _is_gate(payload: bytes) -> bool:
 
 
 def is_played(key: str, expressions: Sequence[str]) -> bool:
-    """Return whether the messages of a key are played: not what is made anew, nor what absent processes sent of themselves.
+    """Return whether the messages of a key are played: none that are made anew, or are about absent processes.
 
     Args:
         expressions: that the user wants to be played.
