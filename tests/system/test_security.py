@@ -281,17 +281,20 @@ def test_a_router_that_is_refused_upstream_ends(made: Certificates, tmp_path: Pa
 
 # name: (folder's content changed how, what the line must show)
 FILES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
-    "no folder": (lambda folder: [path.unlink() for path in folder.iterdir()], ("ca.pem: ", "No such file")),
-    "no key": (lambda folder: (folder / "key.pem").unlink(), ("key.pem: ", "No such file")),
+    "no folder": (lambda folder: [path.unlink() for path in folder.iterdir()], ("recorder/ca.pem", "No such file")),
+    "no key": (lambda folder: (folder / "key.pem").unlink(), ("recorder/key.pem", "No such file")),
     "a key that is a folder": (
         lambda folder: ((folder / "key.pem").unlink(), (folder / "key.pem").mkdir()),
-        ("key.pem: ", "Is a directory"),
+        ("recorder/key.pem", "Is a directory"),
     ),
     "another key": (
         lambda folder: (folder / "key.pem").write_bytes((folder.parent / "world" / "key.pem").read_bytes()),
         ("key values mismatch",),
     ),
-    "no certificate": (lambda folder: (folder / "certificate.pem").write_text("nothing"), ("certificate.pem",)),
+    "no certificate": (
+        lambda folder: (folder / "certificate.pem").write_text("nothing"),
+        ("certificate.pem",),
+    ),
     "another authority's": (
         lambda folder: (folder / "ca.pem").write_bytes((folder.parent / "stranger.pem").read_bytes()),
         ("certificate verify failed",),
@@ -310,7 +313,8 @@ def test_files_of_no_use_are_a_line(tmp_path: Path, name: str) -> None:
     change(folder)
     endpoint = tls_endpoint()
     line = refusal("keys", "--connect", endpoint, "--tls", str(folder))
-    assert has_terms(line, endpoint, str(folder), *tokens), line
+    assert str(folder) in line
+    assert has_terms(line, endpoint, *tokens), line
 
 
 def test_options_that_do_not_go_together_are_a_line(made: Certificates, tmp_path: Path) -> None:
@@ -318,11 +322,11 @@ def test_options_that_do_not_go_together_are_a_line(made: Certificates, tmp_path
     (tmp_path / "scenario.yaml").write_text(SCENARIO)
     world = ("world", str(tmp_path / "scenario.yaml"), "--listen", tls_endpoint(), "--access", str(access))
     tls = ("--tls", str(made.of("world")))
-    assert has_terms(refusal("keys", "--tls", str(folder)), "--tls", "tls/")
+    assert has_terms(refusal("keys", "--tls", str(folder)), "--tls", "tls/ADDRESS:PORT")
     assert has_terms(refusal("keys", "--connect", tls_endpoint()), "--tls")
     assert has_terms(refusal(*world[:2], "--access", str(access)), "--tls")
     assert has_terms(refusal(*world, *tls), "access.json: ", "No such file")
-    for text, token in (("{", "JSON"), ('{"rules": 3}', "Zenoh")):
+    for text, token in (("{", "JSON"), ('{"rules": 3}', "Zenoh's")):
         access.write_text(text)
         assert has_terms(refusal(*world, *tls), "access.json: ", token)
 

@@ -91,7 +91,7 @@ def _link_flaws(actual: str, target: Any, one_way: bool, known: Known) -> Iterat
 
 
 def _allowed_instead(name: str, known: Known) -> str | None:
-    """Return what must stand in place of a process's name, None if it may stand: most names may be somebody's own."""
+    """Return the text of what a process's name must be, None for a good one: most names may be of a user's process."""
     if not keys.PROCESS_NAME.fullmatch(name):
         return "1 to 48 of a-z 0-9 _ . -"
     if name in known.processes:

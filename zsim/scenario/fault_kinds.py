@@ -233,7 +233,7 @@ def planned(
 
 
 def _plain(value: Any, p: FaultParameter) -> Any:
-    """Return a value as it goes onto the wire: numbers as floats, so that the same fault is the same text."""
+    """Return a value as it is on the wire: numbers as floats, so that equal faults have equal texts."""
     if value is None:
         return p.default
     if p.shape == "number":

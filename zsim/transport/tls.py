@@ -61,12 +61,12 @@ class Identity(NamedTuple):
 
 
 def is_tls(endpoint: str) -> bool:
-    """Tell whether a link of an endpoint is encrypted."""
+    """Return whether a link of an endpoint is encrypted."""
     return endpoint.startswith(("tls/", "quic/"))
 
 
 def leaves_machine(endpoint: str) -> bool:
-    """Tell whether a link of an endpoint goes over a network; what is no endpoint does not."""
+    """Return whether a link of an endpoint goes over a network; False for a malformed endpoint."""
     protocol, _, place = endpoint.partition("/")
     host = (place.rpartition(":")[0] or place).strip("[]")
     if protocol not in NETWORKED or host == "localhost":

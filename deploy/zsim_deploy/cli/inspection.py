@@ -44,7 +44,7 @@ def echo(link: Session, expression: str, count: int | None, emit: Callable[[str,
 
 
 def readable(sample: ReceivedSample) -> Any:
-    """Return a message as JSON can hold it; what is not of the contract is decoded as far as it goes."""
+    """Return a message as values that JSON has; one outside of the contract is decoded as far as possible."""
     try:
         return _plain(messages.decode(sample.key, sample.payload))
     except DecodeError as error:

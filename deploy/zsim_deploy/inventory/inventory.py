@@ -143,7 +143,7 @@ def _unknown(path: str, name: Any, known: list[Any], what: str) -> Iterator[Faul
 
 
 def _circles(document: dict[str, Any]) -> Iterator[Fault]:
-    """Yield routers whose way up never comes to the world."""
+    """Yield routers whose chain of upstreams is a circle and never reaches the world."""
     above = {key: router.get("upstream") for key, router in _map(document, "routers") if isinstance(router, dict)}
     upstream = {key: above for key, above in above.items() if isinstance(above, str)}
     for start in upstream:

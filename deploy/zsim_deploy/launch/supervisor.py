@@ -265,7 +265,7 @@ class Supervisor:
 
 
 def _settle(outcome: Future[Any], act: Callable[[], Any]) -> None:
-    """Carry out a request; whatever goes wrong goes to its future, and the run goes on."""
+    """Carry out a request; its future gets any exception, and the run goes on."""
     try:
         outcome.set_result(act())
     except Exception as error:
@@ -273,7 +273,7 @@ def _settle(outcome: Future[Any], act: Callable[[], Any]) -> None:
 
 
 def _close(members: Sequence[RunProcess]) -> None:
-    """End all of them at once: one that cannot be reached keeps nobody waiting."""
+    """End all of them at once, so one that cannot be reached does not delay the others."""
     with ThreadPoolExecutor(len(members)) as pool:
         for closed in [pool.submit(member.close) for member in members]:
             closed.result()

@@ -135,7 +135,7 @@ def author(recorded: Recorded) -> str:
 
 
 def without_kills(payload: bytes) -> bytes:
-    """Return a list of faults without those of which a process dies: who takes part now is not who was meant."""
+    """Return a list of faults without those that kill a process: the participants of a replay are others."""
     try:
         listed: run_messages.Faults = messages.decode(keys.FAULTS, payload)
     except DecodeError:

@@ -195,10 +195,10 @@ def test_the_fork_server_ends_with_its_launcher() -> None:
 
 
 def test_what_takes_long_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
+    lines: list[str] = []
     monkeypatch.setattr(module, "SLOW_S", 0.0)
-    with RoleLauncher(said.append):
-        assert said == [module.SLOW_NOTICE] or sys.platform != "linux"
+    with RoleLauncher(lines.append):
+        assert lines == [module.SLOW_NOTICE] or sys.platform != "linux"
 
 
 @LINUX
