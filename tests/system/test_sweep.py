@@ -23,7 +23,7 @@ from zsim_analysis.sweep.sweep_folder import load, locked
 pytestmark = pytest.mark.xdist_group("sweep")  # the undisturbed one is flown once
 
 GUST = "environment.wind.gust_m_s"
-DURATION_S = 12.0  # the time for a test to act before the next run is finished
+DURATION_S = 40.0  # s: a run takes so long on the wall that a signal reaches it before it is over
 FLIGHT = ("--duration", str(DURATION_S), "--set", "drones.drone1.mass_kg=0.45")
 PLAN = ("--vary", "seed", "--vary", "wind.gust_m_s=0,1", *FLIGHT)
 RUNS = 4

@@ -222,16 +222,16 @@ class Supervisor:
             if child.code == SUPERSEDED:
                 self._show.say(child.last_log_line())
             return
-        what = on_death(self._on_death, child.name)
-        if child.code == USER_FAULT or (what == "restart" and self._too_often(child)):
-            what = "end"
-        self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; on_death: {what}")
-        if what == "restart":
+        policy = on_death(self._on_death, child.name)
+        if child.code == USER_FAULT or (policy == "restart" and self._too_often(child)):
+            policy = "end"
+        self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; on_death: {policy}")
+        if policy == "restart":
             child.restarts += 1
             child.start()
             return
         self._dead.add(child.name)
-        if what == "end":
+        if policy == "end":
             self._fail(f"{child.name} ended: {child.outcome()}")
             world.request_stop(self._reason)
 
