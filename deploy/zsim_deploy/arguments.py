@@ -149,7 +149,7 @@ class FlightOptions(NamedTuple):
 
 
 class WorldAccess(NamedTuple):
-    """Where a world is, and who comes.
+    """How to reach a world, and the identity of the process that connects.
 
     Attributes:
         endpoint: on which the world or a router listens.

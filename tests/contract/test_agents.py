@@ -37,7 +37,7 @@ AIRBORNE_S = 1.0  # and when they have got to their height
 HEIGHT_M = 2.0
 GRAVITY_M_S2 = 9.80665
 
-Said = list[tuple[str, Any]]
+KeyedMessages = list[tuple[str, Any]]
 Make = Callable[[Info, Scenario], Agent]
 
 AGENTS: dict[str, Make] = {
@@ -105,13 +105,13 @@ class Flight:
         self._rng = np.random.default_rng(1)
         self._seq: defaultdict[str, int] = defaultdict(int)
 
-    def gate(self, gate: int) -> Said:
-        said: Said = []
+    def gate(self, gate: int) -> KeyedMessages:
+        sent: KeyedMessages = []
         for drone in scenario().drones:
             mine = list(self._sensors(drone.name, gate, drone.position_m))
             mine.append(self._status(drone.name, gate, len(mine) + 1))
-            said += [*mine, self._estimate(drone.name, gate, drone.position_m)]
-        return said
+            sent += [*mine, self._estimate(drone.name, gate, drone.position_m)]
+        return sent
 
     def _next(self, key: str) -> int:
         self._seq[key] += 1
@@ -121,17 +121,17 @@ class Flight:
         x, y, z = self._rng.normal(0.0, sigma, 3).tolist()
         return (x, y, z)
 
-    def _sensors(self, drone: str, gate: int, start_m: tuple[float, float, float]) -> Said:
+    def _sensors(self, drone: str, gate: int, start_m: tuple[float, float, float]) -> KeyedMessages:
         t_ns = gate * GATE_NS
-        said = [self._imu(drone, at) for at in range(t_ns - GATE_NS + IMU_NS, t_ns + 1, IMU_NS) if at >= 0]
+        sent = [self._imu(drone, at) for at in range(t_ns - GATE_NS + IMU_NS, t_ns + 1, IMU_NS) if at >= 0]
         z = self._height_m(t_ns)
         if gate % 2 == 0:
-            said += [self._mag(drone, t_ns), self._baro(drone, t_ns, z), self._sonar(drone, t_ns, z)]
+            sent += [self._mag(drone, t_ns), self._baro(drone, t_ns, z), self._sonar(drone, t_ns, z)]
         if gate % 3 == 0:
-            said.append(self._flow(drone, t_ns))
+            sent.append(self._flow(drone, t_ns))
         if gate % 10 == 0:
-            said.append(self._gps(drone, t_ns, (start_m[0], start_m[1], z)))
-        return said
+            sent.append(self._gps(drone, t_ns, (start_m[0], start_m[1], z)))
+        return sent
 
     def _height_m(self, t_ns: int) -> float:
         return HEIGHT_M * min(1.0, max(0.0, (t_ns * 1e-9 - LIFTOFF_S) / (AIRBORNE_S - LIFTOFF_S)))
@@ -196,21 +196,21 @@ class Flight:
 
 @cache
 def flight() -> tuple[tuple[tuple[str, Any], ...], ...]:
-    said = Flight()
-    return tuple(tuple(said.gate(gate)) for gate in range(GATES))
+    sent = Flight()
+    return tuple(tuple(sent.gate(gate)) for gate in range(GATES))
 
 
-def inputs(agent: Agent) -> list[Said]:
+def inputs(agent: Agent) -> list[KeyedMessages]:
     """Return, by gate, what the agent reads of the flight."""
     return [[(key, m) for key, m in gate if any(keys.matches(e, key) for e in agent.reads)] for gate in flight()]
 
 
-def run(agent: Agent, gates: list[Said]) -> list[tuple[int, list[Output]]]:
+def run(agent: Agent, gates: list[KeyedMessages]) -> list[tuple[int, list[Output]]]:
     """Drive an agent as the runners do; return its outputs by gate."""
     inbox = Inbox(agent.gate_keys, agent.counted)
     outputs = []
-    for said in gates:
-        for key, message in said:
+    for sent in gates:
+        for key, message in sent:
             assert inbox.put(key, message)
         while (t_ns := inbox.next_gate_ns()) is not None and inbox.missing(t_ns) is None:
             for key, message in inbox.take(t_ns):
@@ -285,23 +285,23 @@ def test_it_answers_every_gate_of_its_period(name: str):
 def test_it_shows_eyes_what_it_said_last(name: str):
     agent = make(name)
     outputs = run(agent, inputs(agent))
-    t_ns, said = outputs[-1]
+    t_ns, sent = outputs[-1]
     (shown,) = agent.views(t_ns)
     assert messages.type_of(shown.key) is type(shown.message)
     assert messages.decode(shown.key, messages.encode(shown.message)) == shown.message
     if isinstance(shown.message, ViewCluster):
-        state = next(message for key, message in said if key.endswith("/state"))
+        state = next(message for key, message in sent if key.endswith("/state"))
         assert isinstance(state, flight_messages.ClusterState)
         assert shown.key == f"view/cluster/{name.partition('.')[2]}"
         assert (shown.message.value, shown.message.desired) == (state.value, state.desired)
     else:
         assert isinstance(shown.message, ViewEstimates)
         assert shown.key == f"view/estimates/{name}"
-        told: dict[str, Any] = {keys.thing(key): message for key, message in said}
-        assert [e.name for e in shown.message.estimates] == list(told)
+        estimates_sent: dict[str, Any] = {keys.thing(key): message for key, message in sent}
+        assert [e.name for e in shown.message.estimates] == list(estimates_sent)
         for estimate in shown.message.estimates:
-            P = np.reshape(told[estimate.name].covariance, (6, 6))[:3, :3]
-            assert estimate.position_m == told[estimate.name].position_m
+            P = np.reshape(estimates_sent[estimate.name].covariance, (6, 6))[:3, :3]
+            assert estimate.position_m == estimates_sent[estimate.name].position_m
             assert estimate.covariance_m2 == tuple(P[np.triu_indices(3)])
 
 
@@ -367,15 +367,15 @@ def test_the_order_of_arrival_changes_no_bit(name: str, seed: int):
     """Shuffled within each gate; the inbox puts it right."""
     agent, rng = make(name), random.Random(seed)
     gates = inputs(agent)
-    for said in gates:
-        rng.shuffle(said)
+    for sent in gates:
+        rng.shuffle(sent)
     assert wire(run(agent, gates)) == wire(flown(name))
 
 
 @every_agent
 def test_inputs_off_the_wire_give_the_same_bits(name: str):
     agent = make(name)
-    gates = [[(key, _again(key, message)) for key, message in said] for said in inputs(agent)]
+    gates = [[(key, _again(key, message)) for key, message in sent] for sent in inputs(agent)]
     assert wire(run(agent, gates)) == wire(flown(name))
 
 
@@ -389,11 +389,11 @@ def test_two_agents_of_one_process_do_not_touch_each_other(name: str):
     gates = inputs(first)
     both: list[list[tuple[int, list[Output]]]] = [[], []]
     inboxes = [Inbox(agent.gate_keys, agent.counted) for agent in (first, second)]
-    for said in gates:
+    for sent in gates:
         for agent, inbox, outputs in zip((first, second), inboxes, both, strict=True):
-            for key, message in said:
+            for key, message in sent:
                 inbox.put(key, message)
-            t_ns = said[-1][1].t_ns
+            t_ns = sent[-1][1].t_ns
             for key, message in inbox.take(t_ns):
                 agent.receive(key, message)
             outputs.append((t_ns, list(agent.step(t_ns))))
@@ -469,20 +469,20 @@ def test_a_refused_request_changes_no_bit(name: str):
     gates = inputs(agent)
     outputs = []
     inbox = Inbox(agent.gate_keys, agent.counted)
-    for said in gates:
+    for sent in gates:
         for key in agent.control_keys():
             agent.control(key, ControlRequest("target", {"values": {"no_such_variable": 1.0}}))
-        for key, message in said:
+        for key, message in sent:
             inbox.put(key, message)
-        t_ns = said[-1][1].t_ns
+        t_ns = sent[-1][1].t_ns
         for key, message in inbox.take(t_ns):
             agent.receive(key, message)
-        told = agent.step(t_ns)
-        asked = [output.message for output in told if isinstance(output.message, run_messages.ClusterRequest)]
+        estimates_sent = agent.step(t_ns)
+        asked = [output.message for output in estimates_sent if isinstance(output.message, run_messages.ClusterRequest)]
         assert [(a.t_ns, a.op, a.ok, a.controller) for a in asked] == [
             (t_ns, "target", False, name) for _ in agent.control_keys()
         ]
-        outputs.append((t_ns, [output for output in told if output.message not in asked]))
+        outputs.append((t_ns, [output for output in estimates_sent if output.message not in asked]))
     assert wire(outputs) == wire(flown(name))
 
 

@@ -209,12 +209,12 @@ def refusal(shape: str, payload: bytes) -> str:
     return str(caught.value)
 
 
-def assert_names(said: str, shape: str, field: str) -> None:
+def assert_names(error_text: str, shape: str, field: str) -> None:
     """Check that a refusal is one line that names key, field, found and allowed."""
-    assert said.startswith(f"{key_of(shape)}: "), said
-    assert field in said, said
-    assert "must" in said, said
-    assert said.isprintable(), said
+    assert error_text.startswith(f"{key_of(shape)}: "), error_text
+    assert field in error_text, error_text
+    assert "must" in error_text, error_text
+    assert error_text.isprintable(), error_text
 
 
 # The names
@@ -527,8 +527,8 @@ def decoded_or_refused(kind: type[msgspec.Struct], payload: bytes, key: str) -> 
     try:
         return messages.decode_as(kind, payload, key)
     except DecodeError as error:
-        said = str(error)
-    assert said.startswith(f"{key}: ")
+        error_text = str(error)
+    assert error_text.startswith(f"{key}: ")
     return None
 
 

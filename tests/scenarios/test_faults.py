@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from federation import PAIR, PAIR_ROLES, Federation
-from refused import missing
+from refused import has_terms
 
 from zsim.contract import flight_messages, keys
 from zsim.contract.run_messages import ControlRequest, Event
@@ -256,9 +256,9 @@ def test_by_command_on_a_running_federation(federation: Federation) -> None:
     printed.append(fault(federation, "clear", "drone1"))
     client.request("world/control", "resume")
     run.ends(with_code=0)
-    assert missing(printed[0], "1: gps_bias", "drone1", "cleared") == []
+    assert has_terms(printed[0], "1: gps_bias", "drone1", "cleared")
     assert "2: link_jitter" in printed[1]
-    assert missing(printed[2], "3: gust", "world", "11.00 s", "12.00 s") == []
+    assert has_terms(printed[2], "3: gust", "world", "11.00 s", "12.00 s")
     assert [line.split()[:2] for line in printed[3].splitlines()] == [["1", "acts"], ["2", "acts"], ["3", "planned"]]
     assert "cleared 1" in printed[4]
     record = federation.record()
@@ -299,7 +299,7 @@ def test_a_killed_process_is_started_again_and_gives_the_same_bits(federation: F
         assert {event["data"]["on_death"] for event in record.events("death")} <= {"restart"}
         assert f"{record.events('fault')[0]['subject']}" == victim
         log = (federation.out / "logs" / f"{victim}.log").read_text()
-        assert missing(log, "warm start", "6.02 s") == []
+        assert has_terms(log, "warm start", "6.02 s")
         hashes.append(record.sha256())
     assert hashes[0] == hashes[1] != fly([]).sha256
 
@@ -326,7 +326,7 @@ def test_an_estimator_without_sensors_says_how_little_it_knows() -> None:
     assert sigmas[-1].min() > 2.0
     last = flight.states[-1]
     assert last.phase == "held"
-    assert missing(last.reason, "drone1", "sigma") == []
+    assert has_terms(last.reason, "drone1", "sigma")
 
 
 @pytest.mark.parametrize("kind", ["link_cut", "link_loss"])
@@ -339,7 +339,7 @@ def test_a_controller_without_an_estimate_holds_and_says_so(kind: str) -> None:
     flight = fly([{**given, "probability": 1} if kind == "link_loss" else given])
     held = [state for state in flight.states if state.phase == "held"]
     assert held[0].t_ns / 1e9 == pytest.approx(AT_S + 0.5, abs=0.05)
-    assert missing(held[0].reason, "estimate", "drone1") == []
+    assert has_terms(held[0].reason, "estimate", "drone1")
     assert flight.states[-1].phase == "engaged"
 
 

@@ -76,8 +76,3 @@ def _bare(word: str) -> str:
         word = word.removeprefix("(") if word.count("(") > word.count(")") else word
         word = word.removesuffix(")") if word.count(")") > word.count("(") else word
     return word
-
-
-def missing(line: str, *tokens: str) -> list[str]:
-    """Return which of some fields, values, limits and remedies a line does not show, whatever sentence is around them."""
-    return [token for token in tokens if token not in line]

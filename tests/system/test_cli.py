@@ -8,7 +8,7 @@ import forked_commands
 import pytest
 from federation import ONE, PAIR, Federation, Role
 from forked_commands import Completed, refusal
-from refused import missing
+from refused import has_terms
 
 COMMANDS = (
     "run",
@@ -124,20 +124,20 @@ BAD_COMMANDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "no such mode": (("pub", "drone/drone1/cmd/mode", '{"mode": "x"}'), ("mode is 'x'", "takeoff")),
     "unknown key": (("pub", "drone/drone1/fly", "{}"), ("drone/drone1/fly",)),
     "no op": (("ask", "world/control", "jump"), ("op is 'jump'", "pause")),
-    "args no json": (("ask", "world/control", "step", "{x"), ("args ", "JSON")),
+    "args no json": (("ask", "world/control", "step", "{x"), ("args", "JSON")),
     "args no map": (("ask", "world/control", "step", "3"), ("map",)),
     "nobody answers": (("ask", "cluster/nobody/control", "land"), ("cluster/nobody/control",)),
-    "ask of several": (("ask", "world/*", "pause"), ("world/*", "wildcards")),
+    "ask of several": (("ask", "world/*", "pause"), ("'world/*'", "wildcards")),
     "ask as in ros2": (("ask", "/world/control", "pause"), ("'/world/control'", "must be world/control")),
     "ask of no key": (("ask", "world//control", "pause"), ("key is 'world//control'",)),
-    "a huge argument": (("ask", "world/control", "step", f'{{"gates": {10**22}}}'), ("args ",)),
+    "a huge argument": (("ask", "world/control", "step", f'{{"gates": {10**22}}}'), ("args",)),
     "a word of ours": (("ask", "world/control", "rate", '{"source": "me"}'), ("value is None", "0")),
     "echo as in ros2": (("echo", "/clock"), ("'/clock'", "must be clock")),
     "echo of nothing": (("echo", ""), ("key is ''",)),
     "echo of no key": (("echo", "drone/#$?/x"), ("key is 'drone/#$?/x'",)),
     "hz of no key": (("hz", "drone//x"), ("'drone//x'", "must be drone/x")),
     "pub to a ghost": (("pub", "drone/ghost/cmd/mode", '{"mode": "land"}'), ("'ghost'", "drone1")),
-    "pub to all": (("pub", "drone/*/cmd/mode", '{"mode": "land"}'), ("drone/*/cmd/mode", "wildcards")),
+    "pub to all": (("pub", "drone/*/cmd/mode", '{"mode": "land"}'), ("'drone/*/cmd/mode'", "wildcards")),
     "pub for the world": (("pub", "clock", "{}"), ("clock: ",)),
 }
 
@@ -147,7 +147,7 @@ def test_bad_commands(federation: Federation) -> None:
     federation.client().subscribe("clock").until(lambda m: m["t_ns"] > 0)
     for name, (arguments, tokens) in BAD_COMMANDS.items():
         line = refusal(*arguments, "--connect", federation.endpoint)
-        assert missing(line, *tokens) == [], (name, line)
+        assert has_terms(line, *tokens), (name, line)
     federation.client().request("world/control", "stop")
     world.ends(with_code=0)
 

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from forked_commands import ZSIM
 from lab import LAUNCHER, Lab
-from refused import missing
+from refused import has_terms
 
 ROOT = Path(__file__).parents[2]
 STEP = ROOT / "scenarios/step.yaml"
@@ -63,7 +63,7 @@ def test_a_port_that_is_taken_is_a_line(lab: Lab) -> None:
         done = doctor(lab, lab.inventory(ROLES, insecure=True))
     assert done.returncode == 2
     (line,) = faults(done)
-    assert missing(line, "h1: ", "7447") == []
+    assert has_terms(line, "h1: ", "7447")
 
 
 def test_what_a_host_lacks_is_a_line_with_what_to_do(lab: Lab) -> None:
@@ -76,9 +76,9 @@ def test_what_a_host_lacks_is_a_line_with_what_to_do(lab: Lab) -> None:
     done = doctor(lab, hosts)
     assert done.returncode == 2
     h1, h2, h3 = faults(done)
-    assert missing(h1, "h1: ", str(lab.host_folder("h1")), f"`zsim push --hosts {hosts}`") == []
-    assert missing(h2, "h2: ", "/tmp", "hosts.h2.python", f"`zsim push --hosts {hosts}`") == []
-    assert missing(h3, "h3: ", str(lab.host_folder("h3")), "hosts.h3.folder") == []
+    assert has_terms(h1, "h1: ", str(lab.host_folder("h1")), f"`zsim push --hosts {hosts}`")
+    assert has_terms(h2, "h2: ", "/tmp", "hosts.h2.python", f"`zsim push --hosts {hosts}`")
+    assert has_terms(h3, "h3: ", str(lab.host_folder("h3")), "hosts.h3.folder")
 
 
 def test_hosts_without_certificates_are_not_ready(lab: Lab) -> None:
@@ -86,9 +86,7 @@ def test_hosts_without_certificates_are_not_ready(lab: Lab) -> None:
     done = doctor(lab, hosts)
     assert done.returncode == 2
     (line,) = faults(done)
-    assert (
-        missing(line, f"{lab.folder}/certs: ", f"`zsim certs init {hosts} --scenario FILE`", "security.insecure") == []
-    )
+    assert has_terms(line, f"{lab.folder}/certs: ", f"`zsim certs init {hosts} --scenario FILE`", "security.insecure")
     assert "ready" not in done.stdout
     assert lab.run(LAUNCHER, *ZSIM, "certs", "init", str(hosts), "--scenario", str(STEP)).returncode == 0
     done = doctor(lab, hosts)

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from forked_commands import ZSIM
 from lab import LAUNCHER, Lab
-from refused import missing
+from refused import has_terms
 
 from zsim import __version__
 from zsim_deploy.hosts.host_link import HostLink
@@ -131,9 +131,9 @@ def test_each_host_that_cannot_have_it_is_a_line(lab: Lab, hosts: Path, tmp_path
     done = push(lab, hosts, "--host", "h1", "--host", "h2")
     assert done.returncode == 2
     h1, h2 = done.stderr.splitlines()[-2:]
-    assert missing(h1, "h1: python3 is 3.9.2", "3.11") == []
+    assert has_terms(h1, "h1: python3 is 3.9.2", "3.11")
     at = lab.address("h2")
-    assert missing(h2, "h2: ", at, str(known), f"ssh-keyscan -p 22 {at} >> {known}") == []
+    assert has_terms(h2, "h2: ", at, str(known), f"ssh-keyscan -p 22 {at} >> {known}")
 
 
 def test_a_push_that_is_interrupted_does_not_disturb_the_next_one(lab: Lab, hosts: Path) -> None:

@@ -15,7 +15,7 @@ import pytest
 import zenoh
 from federation import ONE, PAIR, PAIR_ROLES, Federation, Role
 from forked_commands import USER_FAULT, refusal
-from refused import missing, parts
+from refused import has_terms, parts
 from rights_table import KEYS, ROLES, SCENARIO, keys_of
 from secured import HOST, PREFIX, READY, SHORT_S, SITE, Certificates, KeyLog, RawClient, hub, site, tls_endpoint
 
@@ -251,7 +251,7 @@ def test_a_certificate_whose_time_is_over_says_so(made: Certificates) -> None:
     folder = made.of("estimator.drone1", days=-0.5, host="past")
     with hub(made) as (endpoint, _):
         line = refusal("estimator", "drone1", "--connect", endpoint, "--tls", str(folder))
-    assert missing(line, endpoint, "estimator.drone1", "certs init --renew") == []
+    assert has_terms(line, endpoint, "estimator.drone1", "certs init --renew")
     assert re.search(r"\d{4}-\d\d-\d\d", line)
 
 
@@ -259,7 +259,7 @@ def test_a_world_whose_time_is_over_says_so(made: Certificates, tmp_path: Path) 
     (tmp_path / "scenario.yaml").write_text(SCENARIO)
     folder = made.of("world", days=-0.5, host="past")
     line = refusal("world", str(tmp_path / "scenario.yaml"), "--listen", tls_endpoint(), "--tls", str(folder))
-    assert missing(line, "world", "certs init --renew") == []
+    assert has_terms(line, "world", "certs init --renew")
 
 
 @pytest.mark.parametrize("role", [("estimator", "drone1"), ("controller",), ("record",), ("keys",)])
@@ -267,7 +267,7 @@ def test_a_foreign_certificate_is_a_line_at_once(made: Certificates, tmp_path: P
     folder = Certificates(tmp_path).of("estimator.drone1")
     with hub(made) as (endpoint, _):
         line = refusal(*role, "--connect", endpoint, "--tls", str(folder))
-    assert missing(line, endpoint, "authority", "certs init") == []
+    assert has_terms(line, endpoint, "authority", "certs init")
 
 
 def test_a_router_that_is_refused_upstream_ends(made: Certificates, tmp_path: Path) -> None:
@@ -276,22 +276,25 @@ def test_a_router_that_is_refused_upstream_ends(made: Certificates, tmp_path: Pa
         arguments = ("router", "site", "--listen", tls_endpoint(), "--connect", endpoint, "--tls", str(folder))
         done = forked_commands.run(*arguments)
     assert done.code == USER_FAULT
-    assert missing(done.stderr.splitlines()[-1], endpoint, "authority") == []
+    assert has_terms(done.stderr.splitlines()[-1], endpoint, "authority")
 
 
 # name: (folder's content changed how, what the line must show)
 FILES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
-    "no folder": (lambda folder: [path.unlink() for path in folder.iterdir()], ("ca.pem: ", "No such file")),
-    "no key": (lambda folder: (folder / "key.pem").unlink(), ("key.pem: ", "No such file")),
+    "no folder": (lambda folder: [path.unlink() for path in folder.iterdir()], ("recorder/ca.pem", "No such file")),
+    "no key": (lambda folder: (folder / "key.pem").unlink(), ("recorder/key.pem", "No such file")),
     "a key that is a folder": (
         lambda folder: ((folder / "key.pem").unlink(), (folder / "key.pem").mkdir()),
-        ("key.pem: ", "Is a directory"),
+        ("recorder/key.pem", "Is a directory"),
     ),
     "another key": (
         lambda folder: (folder / "key.pem").write_bytes((folder.parent / "world" / "key.pem").read_bytes()),
         ("key values mismatch",),
     ),
-    "no certificate": (lambda folder: (folder / "certificate.pem").write_text("nothing"), ("certificate.pem",)),
+    "no certificate": (
+        lambda folder: (folder / "certificate.pem").write_text("nothing"),
+        ("certificate.pem",),
+    ),
     "another authority's": (
         lambda folder: (folder / "ca.pem").write_bytes((folder.parent / "stranger.pem").read_bytes()),
         ("certificate verify failed",),
@@ -310,7 +313,8 @@ def test_files_of_no_use_are_a_line(tmp_path: Path, name: str) -> None:
     change(folder)
     endpoint = tls_endpoint()
     line = refusal("keys", "--connect", endpoint, "--tls", str(folder))
-    assert missing(line, endpoint, str(folder), *tokens) == [], line
+    assert str(folder) in line
+    assert has_terms(line, endpoint, *tokens), line
 
 
 def test_options_that_do_not_go_together_are_a_line(made: Certificates, tmp_path: Path) -> None:
@@ -318,20 +322,20 @@ def test_options_that_do_not_go_together_are_a_line(made: Certificates, tmp_path
     (tmp_path / "scenario.yaml").write_text(SCENARIO)
     world = ("world", str(tmp_path / "scenario.yaml"), "--listen", tls_endpoint(), "--access", str(access))
     tls = ("--tls", str(made.of("world")))
-    assert missing(refusal("keys", "--tls", str(folder)), "--tls", "tls/") == []
-    assert missing(refusal("keys", "--connect", tls_endpoint()), "--tls") == []
-    assert missing(refusal(*world[:2], "--access", str(access)), "--tls") == []
-    assert missing(refusal(*world, *tls), "access.json: ", "No such file") == []
-    for text, token in (("{", "JSON"), ('{"rules": 3}', "Zenoh")):
+    assert has_terms(refusal("keys", "--tls", str(folder)), "--tls", "tls/ADDRESS:PORT")
+    assert has_terms(refusal("keys", "--connect", tls_endpoint()), "--tls")
+    assert has_terms(refusal(*world[:2], "--access", str(access)), "--tls")
+    assert has_terms(refusal(*world, *tls), "access.json: ", "No such file")
+    for text, token in (("{", "JSON"), ('{"rules": 3}', "Zenoh's")):
         access.write_text(text)
-        assert missing(refusal(*world, *tls), "access.json: ", token) == []
+        assert has_terms(refusal(*world, *tls), "access.json: ", token)
 
 
 def test_who_listens_elsewhere_than_its_certificate_says(made: Certificates) -> None:
     endpoint = tls_endpoint("127.0.0.2")
     with connection.listen([endpoint], "zsim", "lockstep", made.identity("world")):
         line = refusal("keys", "--connect", endpoint, "--tls", str(made.of("operator.main")))
-    assert missing(line, endpoint, "127.0.0.2;") == []
+    assert has_terms(line, endpoint, "127.0.0.2;")
 
 
 def test_who_listens_without_tls(made: Certificates) -> None:
@@ -339,7 +343,7 @@ def test_who_listens_without_tls(made: Certificates) -> None:
         endpoint = f"tls/127.0.0.1:{server.getsockname()[1]}"
         threading.Thread(target=answer_plainly, args=(server,), daemon=True).start()
         line = refusal("keys", "--connect", endpoint, "--tls", str(made.of("operator.main")))
-    assert missing(line, endpoint, "TLS") == []
+    assert has_terms(line, endpoint, "TLS")
 
 
 def answer_plainly(server: socket.socket) -> None:

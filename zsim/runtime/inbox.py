@@ -147,7 +147,7 @@ class Inbox:
         return None
 
     def missing_last(self, t_ns: int) -> str | None:
-        """Return the missing key that stands last among the closing keys: whoever sleeps until it comes wakes once."""
+        """Return the missing key that is last among the closing keys: a thread that waits for it wakes up once."""
         for key in reversed(self._lacking.get(t_ns, self._closing)):
             if self._expects(key, t_ns):
                 return key

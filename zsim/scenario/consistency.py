@@ -250,7 +250,7 @@ def _group_faults(cluster: Any, groups: _Entries) -> Iterator[Fault]:
 
 
 def _template_faults(spec: Any, starts: list[Any], robots: int) -> Iterator[Fault]:
-    """Yield what is wrong with a formation of so many robots, or with where they stand at the start."""
+    """Yield the faults of a formation of so many robots, and of their places at the start."""
     template = spec.template_m
     if template is None or robots < 2:
         return
@@ -309,7 +309,7 @@ def _process_faults(processes: Any, drones: _Entries, clusters: _Entries) -> Ite
 def _injected_faults(
     scenario: Any, drones: _Entries, clusters: _Entries, vehicles: Mapping[str, Vehicle]
 ) -> Iterator[Fault]:
-    """Yield what is wrong with the faults that a scenario injects, if it is known who could be their targets."""
+    """Yield what is wrong with the faults that a scenario injects, where their possible targets are known."""
     if any(item.name is None for _, item in [*drones, *clusters]) or not drones:
         return
     expected = scenario.processes and scenario.processes.expect

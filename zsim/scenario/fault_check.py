@@ -45,7 +45,7 @@ def flaws(fault: Any, known: Known) -> Iterator[Flaw]:
         if field not in COMMON and field not in of:
             allowed = ", ".join([*COMMON, *of])
             yield str(field)[:40], f"is not known; allowed: {allowed} ({name})"
-    faults = [*_target_flaws(fault, name, kind, known), *_time_flaws(fault, name, kind)]
+    faults = [*_target_flaws(fault, kind, known), *_time_flaws(fault, kind)]
     for parameter in kind.parameters:
         faults += _parameter_flaws(fault, _of_target(parameter, fault.get("target"), known), known)
     for path, text in faults:
@@ -56,7 +56,7 @@ def _actual(fault: Mapping[str, Any], field: str) -> str:
     return f"is {show(fault[field])}" if field in fault else "is missing"
 
 
-def _target_flaws(fault: Mapping[str, Any], name: str, kind: FaultKind, known: Known) -> Iterator[Flaw]:
+def _target_flaws(fault: Mapping[str, Any], kind: FaultKind, known: Known) -> Iterator[Flaw]:
     actual, target = _actual(fault, "target"), fault.get("target")
     if kind.strikes == "link":
         yield from _link_flaws(actual, target, fault.get("one_way") is True, known)
@@ -91,7 +91,7 @@ def _link_flaws(actual: str, target: Any, one_way: bool, known: Known) -> Iterat
 
 
 def _allowed_instead(name: str, known: Known) -> str | None:
-    """Return what must stand in place of a process's name, None if it may stand: most names may be somebody's own."""
+    """Return the text of what a process's name must be, None for a good one: most names may be of a user's process."""
     if not keys.PROCESS_NAME.fullmatch(name):
         return "1 to 48 of a-z 0-9 _ . -"
     if name in known.processes:
@@ -125,7 +125,7 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(names[:20]) + (f", … ({len(names)})" if len(names) > 20 else "")
 
 
-def _time_flaws(fault: Mapping[str, Any], name: str, kind: FaultKind) -> Iterator[Flaw]:
+def _time_flaws(fault: Mapping[str, Any], kind: FaultKind) -> Iterator[Flaw]:
     at_s, for_s = fault.get("at_s"), fault.get("for_s")
     if at_s is not None and not _within(at_s, 0.0, FOR_EVER_S):
         yield "at_s", f"is {show(at_s)}; must be from 0 to {FOR_EVER_S:g} s"

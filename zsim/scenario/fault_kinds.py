@@ -164,7 +164,7 @@ KINDS: dict[str, FaultKind] = {
     ),
     "rotor_stuck": FaultKind(
         "drone",
-        "a rotor turns at one speed whatever it is told",
+        "a rotor turns at one speed whatever its command",
         (ROTOR, _number("speed_rad_s", "as it turns at the start, if left out", "rad/s", 0.0, 1e4, required=False)),
     ),
     "gust": FaultKind(
@@ -241,7 +241,7 @@ def planned(
 
 
 def _plain(value: Any, p: FaultParameter) -> Any:
-    """Return a value as it goes onto the wire: numbers as floats, so that the same fault is the same text."""
+    """Return a value as it is on the wire: numbers as floats, so that equal faults have equal texts."""
     if value is None:
         return p.default
     if p.shape == "number":

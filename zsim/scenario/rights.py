@@ -51,7 +51,7 @@ def of(process: str, scenario: Scenario) -> Rights:
     """Return the rights of a process by its name, role.thing; there is one world and one recorder, without a thing.
 
     A role that is not zsim's and is about a drone may do what the estimator of that drone may, one that is about a
-    cluster what its controller may: it takes their place. One about neither takes part, and hears what all are told.
+    cluster what its controller may: it takes their place. One about neither takes part, and reads what all read.
     """
     role, _, thing = process.partition(".")
     if process == WORLD:

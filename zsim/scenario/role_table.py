@@ -48,7 +48,7 @@ def agent_names(scenario: Any) -> list[str]:
 
 
 def on_death(actions: Mapping[str, OnDeath], name: str, role: str | None = None) -> OnDeath:
-    """Return what is to be done when a process dies: what is said of it, else of its role, else the default.
+    """Return what is to be done when a process dies: what the scenario has for it, else for its role, else the default.
 
     Args:
         actions: of the scenario, by process name or role.

@@ -260,5 +260,5 @@ class Document(Scenario, frozen=True, kw_only=True):
 
 
 def space_name(space: str | None, robots: int, template: bool) -> str:
-    """Return the space of so many robots: as said, else a template where one is given or from five robots on."""
+    """Return the space of so many robots: the scenario's, else a template where one is given or from five robots on."""
     return space or ("template" if template or robots >= TEMPLATE_FROM else "triad")

@@ -109,7 +109,7 @@ def _is_resolved(drone: dict[str, Any]) -> bool:
 def _expand_presets(document: dict[str, Any], vehicles: dict[str, Vehicle]) -> dict[str, Any]:
     """Put preset, the scenario's `sensors:` and the drone's `sensors:` together, the later ones winning.
 
-    A faulty part of the scenario's is not handed on to the drones: its faults are told once.
+    A faulty part of the scenario's is not handed on to the drones: its faults are shown once.
     """
     shared = document.get("sensors") or {}
     document = {**document, "sensors": _expanded(shared)}

@@ -16,7 +16,7 @@ class FlowConfig(Sensor, frozen=True, kw_only=True):
 
 
 PRESET = {
-    "rate_hz": 15.0,  # Hz, of the reduced navdata in which the drone tells its velocity
+    "rate_hz": 15.0,  # Hz, of the reduced navdata in which the drone sends its velocity
     "velocity_m_s": {"noise": 0.1},  # m/s, chosen: nothing is published for the aircraft's flow
 }
 PRESETS = {

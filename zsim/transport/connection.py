@@ -87,7 +87,7 @@ def check_listening(endpoints: Sequence[str], identity: Identity | None = None) 
         SessionError: one is malformed, or identity and endpoints do not go together.
     """
     if any(endpoint.endswith(":0") for endpoint in endpoints):
-        raise SessionError(f"cannot listen on {', '.join(endpoints)}: port 0 is no port that others could be told")
+        raise SessionError(f"cannot listen on {', '.join(endpoints)}: port 0 is no port that others can connect to")
     identity = identity or Identity()
     config_of(zenoh_settings.listening(endpoints, identity), identity)
 
@@ -127,7 +127,7 @@ def find_world(
         identity: see `connect`.
 
     Raises:
-        NoWorldError: no world answered within `wait_s`, or `stopped` said so.
+        NoWorldError: no world answered within `wait_s`, or `stopped` returned true.
         SessionError: what no waiting mends: a malformed endpoint, a certificate that is refused.
         BadNameError: the federation's name is outside the contract.
     """
@@ -195,7 +195,7 @@ def _no_answer(identity: Identity | None) -> str:
 
 
 def _no_link(endpoint: str) -> str:
-    """Return why there is no session; a port that opens nevertheless speaks another protocol, or TLS."""
+    """Return why there is no session; a port that opens nevertheless has another protocol, or TLS."""
     if not _opens(endpoint):
         return "; start one with `zsim world`"
     return ", but who listens there refuses us; if it is a world with TLS, say tls/ and give --tls FOLDER"

@@ -61,12 +61,12 @@ class Identity(NamedTuple):
 
 
 def is_tls(endpoint: str) -> bool:
-    """Tell whether a link of an endpoint is encrypted."""
+    """Return whether a link of an endpoint is encrypted."""
     return endpoint.startswith(("tls/", "quic/"))
 
 
 def leaves_machine(endpoint: str) -> bool:
-    """Tell whether a link of an endpoint goes over a network; what is no endpoint does not."""
+    """Return whether a link of an endpoint goes over a network; False for a malformed endpoint."""
     protocol, _, place = endpoint.partition("/")
     host = (place.rpartition(":")[0] or place).strip("[]")
     if protocol not in NETWORKED or host == "localhost":
@@ -156,7 +156,7 @@ def _words(error: ssl.SSLError, host: str, endpoint: str) -> str | None:
     if "ALERT" in reason:
         return f"who listens there refuses our certificate ({_reason(error)}); {MEND}"
     if "WRONG_VERSION" in reason or "RECORD_LAYER" in reason or "HTTP" in reason:
-        return f"who listens there speaks no TLS; start it with --tls, or say tcp/ instead of {endpoint.split('/')[0]}/"
+        return f"who listens there has no TLS; start it with --tls, or say tcp/ instead of {endpoint.split('/')[0]}/"
     return None
 
 

@@ -19,20 +19,24 @@ SIZES = (6, 6, 3, 1, 1, 3)  # values of a reading of each sensor
 VALUES_MAX = max(SIZES)
 CHANNELS = 2  # of a sensor, at most, that have a bias of their own
 
-NOMINAL = columns(
+_MOMENT_FIELDS = (
+    Field("t", "s"),
+    Field("p_WB", "m", 3),
+    Field("v_WB", "m/s", 3),
+    Field("q_WB", "1", 4),
+    Field("w_WB_B", "rad/s", 3),  # of the last sample of the IMU, without its bias
+    Field("p_corrected", "m", 3),  # by the filter, in all
+    Field("v_corrected", "m/s", 3),
+)
+MOMENT = columns("Moment", _MOMENT_FIELDS)
+NOMINAL = columns(  # begins as a moment does, so one function reads both
     "Nominal",
     (
-        Field("t", "s"),
-        Field("p_WB", "m", 3),
-        Field("v_WB", "m/s", 3),
-        Field("q_WB", "1", 4),
+        *_MOMENT_FIELDS,
         Field("a_WB", "m/s^2", 3),
-        Field("w_WB_B", "rad/s", 3),  # of the last sample of the IMU, without its bias
-        Field("f_B", "m/s^2", 3),  # likewise
+        Field("f_B", "m/s^2", 3),  # of the last sample of the IMU, without its bias
         Field("gyro_bias", "rad/s", 3),
         Field("accel_bias", "m/s^2", 3),
-        Field("p_corrected", "m", 3),  # by the filter, in all
-        Field("v_corrected", "m/s", 3),
         Field("t_start", "s"),  # of the interval since the last gate, and what has happened in it
         Field("v_start", "m/s", 3),
         Field("dt_squared", "s^2"),  # sum of the squared steps of the IMU
@@ -99,19 +103,6 @@ COUNT = columns(
         Field("newest", "1"),  # of them
         Field("used", "1", len(SENSORS)),  # readings
         Field("refused", "1", len(SENSORS)),
-    ),
-)
-
-MOMENT = columns(
-    "Moment",
-    (
-        Field("t", "s"),
-        Field("p_WB", "m", 3),
-        Field("v_WB", "m/s", 3),
-        Field("q_WB", "1", 4),
-        Field("w_WB_B", "rad/s", 3),
-        Field("p_corrected", "m", 3),
-        Field("v_corrected", "m/s", 3),
     ),
 )
 
@@ -210,15 +201,6 @@ def put_reckoning(row: np.ndarray, state: Reckoning) -> None:
 
 
 @portable
-def moment(row: np.ndarray) -> Moment:
-    """Return the present instant of the nominal state."""
-    return (
-        float(row[NOMINAL.t]), vector(row, NOMINAL.p_WB), vector(row, NOMINAL.v_WB), quaternion(row, NOMINAL.q_WB),
-        vector(row, NOMINAL.w_WB_B), vector(row, NOMINAL.p_corrected), vector(row, NOMINAL.v_corrected),
-    )  # fmt: skip
-
-
-@portable
 def put_moment(row: np.ndarray, m: Moment) -> None:
     """Write a moment of the history."""
     row[MOMENT.t] = m[0]
@@ -231,8 +213,8 @@ def put_moment(row: np.ndarray, m: Moment) -> None:
 
 
 @portable
-def moment_at(row: np.ndarray) -> Moment:
-    """Return a moment of the history."""
+def moment(row: np.ndarray) -> Moment:
+    """Return a moment of the history, or the present one of the nominal state."""
     return (
         float(row[MOMENT.t]), vector(row, MOMENT.p_WB), vector(row, MOMENT.v_WB), quaternion(row, MOMENT.q_WB),
         vector(row, MOMENT.w_WB_B), vector(row, MOMENT.p_corrected), vector(row, MOMENT.v_corrected),

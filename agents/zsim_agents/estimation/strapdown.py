@@ -16,7 +16,7 @@ from zsim_agents.estimation.filter_state import (
     Rows,
     increase,
     matrix_at,
-    moment_at,
+    moment,
     put,
     put_moment,
     put_quaternion,
@@ -213,7 +213,7 @@ def recall(counts: np.ndarray, history: np.ndarray, longest: int, t_s: float, no
         return _ahead(now, t_s - now[0])
     later = now
     for back in range(counts[COUNT.kept]):
-        past = moment_at(history[(counts[COUNT.newest] - back + longest) % longest])
+        past = moment(history[(counts[COUNT.newest] - back + longest) % longest])
         if past[0] <= t_s:
             earlier = _as_seen(past, now)
             return earlier if past[0] == t_s else _between(earlier, _as_seen(later, now), t_s)

@@ -48,7 +48,7 @@ VIEW_STYLE = (
 
 
 class PageRequest(NamedTuple):
-    """An HTTP request, as far as it shows who sent it."""
+    """The fields of an HTTP request that identify its sender."""
 
     path: str
     host: str  # of its Host header

@@ -15,8 +15,10 @@ from zsim.contract.views import ViewDrones
 from zsim.errors import RunError
 from zsim.math import frames
 from zsim.scenario import scenario_file
+from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor_catalogue import own_rates
 from zsim.transport.session import Session
+from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import scenario_space
 from zsim_bridges.console import console_tables
 from zsim_bridges.console.command_client import CommandClient, RequestOutcome
@@ -49,6 +51,18 @@ def picture_rate_hz(drones: int, rate: float) -> float:
     return RATE_LOW_HZ if drones >= FEW_DRONES or rate >= FAST_RATE else RATE_HZ
 
 
+def _spaces(scenario: Scenario) -> dict[str, ClusterSpace]:
+    """Return the cluster spaces of a scenario by cluster.
+
+    Raises:
+        RunError: a space of the user's refuses its robots.
+    """
+    try:
+        return {cluster.name: scenario_space(scenario, cluster) for cluster in scenario.clusters}
+    except ValueError as error:
+        raise RunError(f"console: {error}") from error
+
+
 class RunPage:
     """The page of one run.
 
@@ -78,10 +92,7 @@ class RunPage:
         self._scenario = scenario_file.from_text(info.scenario)
         names = tuple(drone.name for drone in info.drones)
         self._rate_hz = rate_hz
-        try:
-            self._spaces = {c.name: scenario_space(self._scenario, c) for c in self._scenario.clusters}
-        except ValueError as error:
-            raise RunError(f"console: {error}") from error
+        self._spaces = _spaces(self._scenario)
         variables = {name: space.names for name, space in self._spaces.items()}
         age_s = self._scenario.time.max_command_age_ms / 1e3 / STAMPS_PER_AGE
         self._time_monitor = TimeMonitor(link, observer, age_s if info.mode == "realtime" else math.inf)

@@ -94,7 +94,7 @@ def check_not_reserved(key: str) -> None:
         raise DecodeError(f"{key[:80]!r}: is no key; must be names with / between them")
     if is_reserved(key):
         raise ForbiddenError(
-            f"{key[:80]}: only the process that this is about speaks here; a client may speak on "
+            f"{key[:80]}: only the process that this is about writes here; a client may write on "
             f"{', '.join(CLIENT_KEYS).replace('*', '…')} and keys of its own"
         )
 

@@ -159,7 +159,7 @@ class RunAccess:
         """
         if self._may_write is not None and not rights.permits(self._may_write, key):
             raise ForbiddenError(
-                f"{key[:80]}: the gateway's certificate lets it speak on {', '.join(self._may_write)} only"
+                f"{key[:80]}: the gateway's certificate lets it write on {', '.join(self._may_write)} only"
             )
 
     def check_known(self, key: str) -> None:

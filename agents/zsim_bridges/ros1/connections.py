@@ -169,7 +169,7 @@ class SubscribedTopic:
         answer = await asyncio.to_thread(master_api.call_api, uri, "requestTopic", *arguments)
         protocol, host, port = answer
         if protocol != "TCPROS":
-            raise RefusedError(f"speaks {str(protocol)[:20]!r}; must be TCPROS")
+            raise RefusedError(f"protocol is {str(protocol)[:20]!r}; must be TCPROS")
         reader, writer = await asyncio.wait_for(asyncio.open_connection(host, port), tcpros.HANDSHAKE_S)
         try:
             self.connected[uri] = await self._shake_hands(reader, writer)

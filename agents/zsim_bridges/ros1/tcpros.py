@@ -212,14 +212,14 @@ def message_class(kind: str) -> Callable[..., Any]:
     return _store.types[_full_name(kind)]
 
 
-def serialize(kind: str, what: Any) -> bytes:
+def serialize(kind: str, message: Any) -> bytes:
     """Return the bytes of a message.
 
     Raises:
         ValueError: a number does not go into its field.
     """
     try:
-        return bytes(_store.serialize_ros1(what, _full_name(kind)))
+        return bytes(_store.serialize_ros1(message, _full_name(kind)))
     except Exception as error:  # the generated writer raises anything for invalid numbers
         raise ValueError(f"is no {kind}: {error}") from error
 

@@ -104,9 +104,6 @@ ament_package()
 }
 
 
-MEMBERLESS = "structure_needs_at_least_one_member"  # what an empty message has in its place, a uint8
-
-
 class RosTypes:
     """The types of one ROS distribution; those used here are the same from Iron to Lyrical."""
 

@@ -75,7 +75,7 @@ class BridgedTopic:
 
 
 class SourceSubscription(NamedTuple):
-    """The subscription to a key, and its topics; each sample is queued as it comes unless it is polled."""
+    """The subscription to a key, and its topics; samples are queued unless they are polled."""
 
     readers: list[BridgedTopic]
     close: Callable[[], None]

@@ -234,7 +234,7 @@ def _beside(target: Path) -> Iterator[Path]:
 
 
 def _put_in_place(written: Sequence[Path], targets: Sequence[Path]) -> None:
-    """Put all files or folders in place; when that fails, or Ctrl-C comes, all is as it was before."""
+    """Put all files or folders in place; after a failure or Ctrl-C the old ones are back."""
     olds = [new.with_name(f"{new.name}.old") for new in written]
     try:
         for new, target, old in zip(written, targets, olds, strict=True):

@@ -37,7 +37,7 @@ OPTION_OF = {"target": "the argument TARGET", "kind": "the argument KIND", "for_
 @app.command(rich_help_panel=PANEL)
 @observer_options
 def keys(reach: WorldAccess) -> None:
-    """List the keys that speak, with their message and how many came in a second."""
+    """List the keys in use, with their message and how many came in a second."""
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):

@@ -107,7 +107,7 @@ def logs(
 
 
 def _written(path: Path, follow: bool, goes_on: Callable[[], bool]) -> Iterator[str]:
-    """Yield what is in a file, and what is added to it for as long as something goes on; it may not be there yet."""
+    """Yield the content of a file, which may not exist yet, and what is appended while the run goes on."""
     done, last = 0, not follow
     decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
     while True:

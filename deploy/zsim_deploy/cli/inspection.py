@@ -44,7 +44,7 @@ def echo(link: Session, expression: str, count: int | None, emit: Callable[[str,
 
 
 def readable(sample: ReceivedSample) -> Any:
-    """Return a message as JSON can hold it; what is not of the contract is decoded as far as it goes."""
+    """Return a message as values that JSON has; one outside of the contract is decoded as far as possible."""
     try:
         return _plain(messages.decode(sample.key, sample.payload))
     except DecodeError as error:
@@ -113,7 +113,7 @@ def hz(link: Session, expression: str, window: int, seconds: float, emit: Callab
         for _ in range(len(arrived)):
             wall_s, payload = arrived.popleft()
             rate.add(wall_s, _stamp(head, payload))
-        nothing = f"no message on {expression} yet; `zsim keys` lists what speaks"
+        nothing = f"no message on {expression} yet; `zsim keys` lists the keys in use"
         emit(rate.line(time.monotonic()) if rate.total else nothing)
 
 
@@ -187,9 +187,9 @@ def _command_key(key: str, info: messages.Info) -> str:
     _refuse_wildcards(key, "pub")
     kind = messages.type_of(key)
     if kind is None:
-        raise RunError(f"{key}: is no key of the contract; `zsim keys` lists what speaks, docs/protocol.md all of them")
+        raise RunError(f"{key}: is no key of the contract; `zsim keys` lists those in use, docs/protocol.md all")
     if not keys.matches(COMMANDS, key):
-        raise RunError(f"{key}: only the process that this is about speaks here; must be {COMMANDS.replace('*', '…')}")
+        raise RunError(f"{key}: only the process that this is about writes here; must be {COMMANDS.replace('*', '…')}")
     drones = [drone.name for drone in info.drones]
     if keys.thing(key) not in drones:
         raise RunError(f"{key}: drone is {keys.thing(key)!r}; must be one of {', '.join(drones)}")

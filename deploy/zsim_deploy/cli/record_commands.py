@@ -250,7 +250,7 @@ def rerun(
         bool, typer.Option("--commands-only", help="Feed the world all recorded commands; run no agents.")
     ] = False,
 ) -> None:
-    """Fly the run of a record again, from its own inputs, and tell whether truth is the same; exit code 0 or 1."""
+    """Fly the run of a record again, from its own inputs, and print whether truth is the same; exit code 0 or 1."""
     require("rerun", RERUN_NEEDS)
     from zsim_analysis.rerun import rerun_record
 

@@ -20,7 +20,7 @@ from zsim import __version__
 from zsim.errors import RunError, ZsimError
 
 REQUEST_S = 5.0  # from the same machine
-ANSWER_S = 150.0  # a move connects to a host, asks it about itself, and brings a certificate: 135 s at most (orders.py)
+ANSWER_S = 150.0  # a move connects to a host, asks it about itself, and brings a certificate: 135 s at most
 LINE_MAX = 1_000_000  # bytes
 PATH_MAX = 107  # bytes of a socket's path; unix(7), without the last zero. macOS has 103, and its error says so
 

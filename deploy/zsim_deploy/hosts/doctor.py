@@ -185,11 +185,11 @@ def _path_fault(path: NetworkPath) -> str:
         case True:
             return port_in_use(path.target, path.port)
         case False:
-            what = f"nothing may listen on port {path.port} there ({why}); give another port in the inventory"
-            return f"{path.target}: {what}"
+            fault = f"nothing may listen on port {path.port} there ({why}); give another port in the inventory"
+            return f"{path.target}: {fault}"
         case _:
-            what = f"port {path.port} of {path.target} cannot be reached ({why}); is it open in the firewall?"
-            return f"{path.source}: {what}"
+            fault = f"port {path.port} of {path.target} cannot be reached ({why}); is it open in the firewall?"
+            return f"{path.source}: {fault}"
 
 
 class CheckResult(NamedTuple):

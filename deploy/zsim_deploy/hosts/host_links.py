@@ -115,7 +115,7 @@ class RemoteProgram:
 
         Args:
             within_s: wall time that it may take.
-            late: text of the error if it takes longer, where there is more to tell.
+            late: text of the error if it takes longer; empty for the usual one.
 
         Raises:
             ProgramEndedError: it has ended.

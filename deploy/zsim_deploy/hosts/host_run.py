@@ -206,7 +206,7 @@ class HostRun:
             except HostsError as error:
                 self._status.say(f"{error}\nkeys of this run may be left there; remove its folder")
             except KeyboardInterrupt:
-                self._status.say("keys of this run may be left on its hosts; the next `zsim up` or `zsim doctor` tells")
+                self._status.say("keys of this run may be left on its hosts; `zsim up` or `zsim doctor` lists them")
                 raise
 
     async def _clean(self, link: HostLink) -> None:

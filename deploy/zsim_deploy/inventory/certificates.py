@@ -160,7 +160,7 @@ def _shown(place: Path, signer: Root, now: datetime) -> CertificateStatus:
 
 
 def _fault(place: Path, certificate: x509.Certificate, signer: Root, now: datetime) -> str | None:
-    """Return what is wrong with a certificate and the files beside it; who writes them may be stopped in between."""
+    """Return the fault of a certificate or of the files beside it; `certs init` may have been interrupted."""
     try:
         authority_there, key = (place / AUTHORITY).read_bytes(), (place / KEY).read_bytes()
         public = serialization.load_pem_private_key(key, password=None).public_key()

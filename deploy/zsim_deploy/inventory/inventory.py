@@ -17,7 +17,7 @@ from zsim.errors import InventoryError
 from zsim.scenario.rights import RECORDER, ROUTER, WORLD
 from zsim.scenario.scenario import Name, Scenario, Spec
 from zsim.schema import yaml_file
-from zsim.schema.checker import Fault, faults, sound
+from zsim.schema.checker import Fault, faults
 
 EXAMPLE = "examples/hosts.yaml"  # named to whoever gives no inventory
 ZENOH_PORT = 7447  # Zenoh's own
@@ -98,7 +98,7 @@ def load(path: Path) -> InventoryFile:
         InventoryError: with every fault, a line each.
     """
     document = yaml_file.read(path, EXAMPLE, InventoryError)
-    lines = [*faults(document, Inventory), *_cross_faults(sound(document, Inventory), document)]
+    lines = [*faults(document, Inventory), *_cross_faults(document)]
     if lines:
         raise InventoryError([f"{path.name}: {where} {text}" for where, text in lines])
     return InventoryFile(msgspec.convert(document, Inventory), path.resolve().parent, path.name)
@@ -110,7 +110,7 @@ def insecure(placed: InventoryFile) -> InventoryFile:
     return placed._replace(inventory=msgspec.structs.replace(placed.inventory, security=security))
 
 
-def _cross_faults(inventory: Any, document: dict[str, Any]) -> Iterator[Fault]:
+def _cross_faults(document: dict[str, Any]) -> Iterator[Fault]:
     """Yield the faults between fields: names that must be those of hosts and routers."""
     hosts, routers = ([key for key, _ in _map(document, name)] for name in ("hosts", "routers"))
     for key, wanted in _map(document, "roles"):
@@ -143,7 +143,7 @@ def _unknown(path: str, name: Any, known: list[Any], what: str) -> Iterator[Faul
 
 
 def _circles(document: dict[str, Any]) -> Iterator[Fault]:
-    """Yield routers whose way up never comes to the world."""
+    """Yield routers whose chain of upstreams is a circle and never reaches the world."""
     above = {key: router.get("upstream") for key, router in _map(document, "routers") if isinstance(router, dict)}
     upstream = {key: above for key, above in above.items() if isinstance(above, str)}
     for start in upstream:

@@ -185,7 +185,7 @@ def _run_on_free_port(options: RunOptions, screen: Screen, launcher: RoleLaunche
 
 
 def _lost_port(outcome: Outcome, endpoint: str, port: int) -> bool:
-    """Return whether somebody else took the port between our look at it and our world's start."""
+    """Return whether another process took the port between our check of it and the start of our world."""
     return outcome.failed and f"cannot listen on {endpoint}" in outcome.reason and not _is_free(port)
 
 

@@ -222,16 +222,16 @@ class Supervisor:
             if child.code == SUPERSEDED:
                 self._show.say(child.last_log_line())
             return
-        what = on_death(self._on_death, child.name)
-        if child.code == USER_FAULT or (what == "restart" and self._too_often(child)):
-            what = "end"
-        self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; on_death: {what}")
-        if what == "restart":
+        policy = on_death(self._on_death, child.name)
+        if child.code == USER_FAULT or (policy == "restart" and self._too_often(child)):
+            policy = "end"
+        self._show.say(f"{child.name} (pid {child.pid}) ended: {child.outcome()}; on_death: {policy}")
+        if policy == "restart":
             child.restarts += 1
             child.start()
             return
         self._dead.add(child.name)
-        if what == "end":
+        if policy == "end":
             self._fail(f"{child.name} ended: {child.outcome()}")
             world.request_stop(self._reason)
 
@@ -265,7 +265,7 @@ class Supervisor:
 
 
 def _settle(outcome: Future[Any], act: Callable[[], Any]) -> None:
-    """Carry out a request; whatever goes wrong goes to its future, and the run goes on."""
+    """Carry out a request; its future gets any exception, and the run goes on."""
     try:
         outcome.set_result(act())
     except Exception as error:
@@ -273,7 +273,7 @@ def _settle(outcome: Future[Any], act: Callable[[], Any]) -> None:
 
 
 def _close(members: Sequence[RunProcess]) -> None:
-    """End all of them at once: one that cannot be reached keeps nobody waiting."""
+    """End all of them at once, so one that cannot be reached does not delay the others."""
     with ThreadPoolExecutor(len(members)) as pool:
         for closed in [pool.submit(member.close) for member in members]:
             closed.result()

@@ -68,7 +68,7 @@ def _remarks(placed: InventoryFile, scenario: Scenario, host: str) -> list[str]:
         "Rendered by `zsim render compose`; render again instead of editing.",
         "ZSIM_USER: user:group that owns the files beside this one. ZSIM_RUN: folder of the next record below runs/,",
         "a new name each time, as a record is never overwritten.",
-        "Compose does not tell exit codes apart: a role whose name another process took is started again too,",
+        "Compose does not distinguish exit codes: a role whose name another process took is started again too,",
         f"{RESTARTS_MAX} times.",
         *unused(placed, host),
         *own_programs(placed, scenario, host),

@@ -75,7 +75,7 @@ def render(placed: InventoryFile, scenario: Scenario, pace: Sequence[str] = (), 
     space = _label(scenario.federation)
     texts = {
         "namespace.yaml": documents([_namespace(space), _records_claim(space)], NAMESPACE_REMARKS),
-        "zsim.yaml": documents(_run(space, scenario, text, planned, image), _remarks(placed, scenario, planned)),
+        "zsim.yaml": documents(_run(space, text, planned, image), _remarks(placed, scenario, planned)),
         "records.yaml": document(_records_pod(space, image), ["Mounts the records, for `kubectl cp`."]),
         "Dockerfile": dockerfile(extras([process.name for process in planned])),
     }
@@ -177,9 +177,7 @@ def _records_pod(space: str, image: str) -> dict[str, Any]:
 # A run
 
 
-def _run(
-    space: str, scenario: Scenario, text: str, planned: Sequence[PlannedProcess], image: str
-) -> list[dict[str, Any]]:
+def _run(space: str, text: str, planned: Sequence[PlannedProcess], image: str) -> list[dict[str, Any]]:
     return [
         _config(space, text),
         *(_service(space, process) for process in planned if process.name == WORLD),

@@ -32,8 +32,8 @@ def test_names_and_patterns(patterns: list[str], wanted: list[str]):
 
 
 def test_a_pattern_that_matches_nobody_is_refused():
-    said = r"estimator: drone is 'dorne\*'; must match one of drone1, drone2, drone3$"
-    with pytest.raises(RunError, match=said):
+    pattern = r"estimator: drone is 'dorne\*'; must match one of drone1, drone2, drone3$"
+    with pytest.raises(RunError, match=pattern):
         chosen("estimator: drone", ["drone1", "dorne*"], ["drone1", "drone2", "drone3"])
 
 
@@ -88,10 +88,10 @@ class Altimeter(Agent):
 
 def test_a_certificate_is_for_one_process(tmp_path: Path):
     group = hosted(World(STEP).info(), STEP, ["*"])
-    said = (
+    pattern = (
         r"controller\.main: a certificate is for one process, and this one stands for estimator\.drone1, .*; run each"
     )
-    with pytest.raises(RunError, match=said):
+    with pytest.raises(RunError, match=pattern):
         roles.check_certificate(group, Identity(tls=tmp_path))
     roles.check_certificate(group, Identity())
 

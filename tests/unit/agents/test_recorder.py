@@ -1,4 +1,4 @@
-"""The recorder: what was said before it came, once and without a gap, and garbage as it came."""
+"""The recorder: what was sent before it came, once and without a gap, and garbage as it came."""
 
 from pathlib import Path
 from typing import Any
@@ -83,9 +83,9 @@ def test_a_late_recorder_writes_what_it_hears_twice_once(tmp_path: Path):
 @pytest.mark.parametrize("kept", [True, False])
 def test_which_run_it_is_is_on_record_however_late_the_recorder_comes(tmp_path: Path, kept: bool):
     """The replay has lost the world's first words; what the hub still answers comes as it is, once."""
-    told = pair(keys.INFO, INFO)
-    found = recorded(tmp_path / "run.mcap", [page(gates(7))], gates(8), last=dict([told] if kept else []))
-    assert found[0] == told
+    info_entry = pair(keys.INFO, INFO)
+    found = recorded(tmp_path / "run.mcap", [page(gates(7))], gates(8), last=dict([info_entry] if kept else []))
+    assert found[0] == info_entry
     assert [key for key, _ in found].count(keys.INFO) == 1
 
 
@@ -156,14 +156,14 @@ def test_garbage_is_recorded_as_it_came(tmp_path: Path, key: str, payload: bytes
 
 def test_what_a_record_has_no_room_for_is_counted_and_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("zsim.record.record_writer.CHANNELS_MAX", 2)
-    link, said = FakeLink(), []
+    link, lines = FakeLink(), []
     link.on_request = lambda key, args: page([])
     link.deliver(keys.BATCH, encode_batch([imu(1), clock(1), imu(2), clock(3, "stopped")]))
     link.deliver("view/drones", b"\x81\xa4t_ns\x01")
-    made: Any = recorder.Recorder(link, INFO, tmp_path / "run.mcap", "recorder", lambda: False, said.append)  # type: ignore[arg-type]
+    made: Any = recorder.Recorder(link, INFO, tmp_path / "run.mcap", "recorder", lambda: False, lines.append)  # type: ignore[arg-type]
     assert made.run() == RUN_ENDED
     assert made.health.refused == 3
-    (line,) = said
+    (line,) = lines
     assert has_terms(line, "recorder", "3", "65535", "keys")
 
 

@@ -17,8 +17,8 @@ RUN = {
     "run_id": "abc", "federation": "zsim", "mode": "lockstep", "gate_s": 0.02, "t_ns": 0,
     "drones": ["drone1"], "clusters": [{"name": "main", "drones": ["drone1"]}],
 }  # fmt: skip
-Said = dict[str, Any]
-Answer = Callable[[Said], list[Said | bytes]]
+JsonMap = dict[str, Any]
+Answer = Callable[[JsonMap], list[JsonMap | bytes]]
 
 
 class FakeGateway:
@@ -27,36 +27,36 @@ class FakeGateway:
     def __init__(self, answer: Answer, hello: Answer | None = None) -> None:
         self._answer = answer
         self._hello = hello or (lambda asked: [{"op": "hello", "name": "client.test", **RUN}])
-        self._door = socket.create_server(("127.0.0.1", 0))
-        self._door.settimeout(PATIENCE_S)
-        self.port = self._door.getsockname()[1]
-        self.heard: list[Said] = []
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._listener.settimeout(PATIENCE_S)
+        self.port = self._listener.getsockname()[1]
+        self.requests: list[JsonMap] = []
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
     def _serve(self) -> None:
-        link, _ = self._door.accept()
+        link, _ = self._listener.accept()
         with link, link.makefile("rb") as lines:
             link.settimeout(PATIENCE_S)
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             for line in lines:
                 asked = json.loads(line)
-                self.heard.append(asked)
+                self.requests.append(asked)
                 answers = (self._hello if asked["op"] == "hello" else self._answer)(asked)
                 if not answers:
                     return
-                for said in answers:
-                    link.sendall(said if isinstance(said, bytes) else _line(said, asked))
+                for reply in answers:
+                    link.sendall(reply if isinstance(reply, bytes) else _line(reply, asked))
 
     def close(self) -> None:
         self._thread.join(PATIENCE_S)
-        self._door.close()
+        self._listener.close()
 
 
-def _line(said: Said, asked: Said) -> bytes:
+def _line(reply: JsonMap, asked: JsonMap) -> bytes:
     """Return a line; what is no message of itself answers what was asked."""
-    answered = {} if said["op"] in ("value", "gate", "left", "lost", "run") else {"id": asked.get("id")}
-    return json.dumps({**said, **answered}, separators=(",", ":"), ensure_ascii=False).encode() + b"\n"
+    answered = {} if reply["op"] in ("value", "gate", "left", "lost", "run") else {"id": asked.get("id")}
+    return json.dumps({**reply, **answered}, separators=(",", ":"), ensure_ascii=False).encode() + b"\n"
 
 
 @contextmanager
@@ -68,12 +68,12 @@ def gateway(answer: Answer, hello: Answer | None = None) -> Iterator[FakeGateway
         made.close()
 
 
-def said(port: int, code: str) -> list[str]:
+def reply(port: int, code: str) -> list[str]:
     """Return the lines that code prints with `c`, a client of this port."""
     return run(f"c = zsim.Client('127.0.0.1', 'Port', {port}, 'Timeout', 5); {code} c.delete();").splitlines()
 
 
-def echo(asked: Said) -> list[Said | bytes]:
+def echo(asked: JsonMap) -> list[JsonMap | bytes]:
     return [{"op": asked["op"], "key": asked.get("key")}]
 
 
@@ -87,8 +87,8 @@ def test_requests_as_the_gateway_wants_them() -> None:
     c.subscribe('drone/*/truth'); c.unsubscribe('drone/*/truth');
     """
     with gateway(echo) as fake:
-        said(fake.port, code)
-    (hello, *rest) = [{k: v for k, v in asked.items() if k != "id"} for asked in fake.heard]
+        reply(fake.port, code)
+    (hello, *rest) = [{k: v for k, v in asked.items() if k != "id"} for asked in fake.requests]
     assert (hello["op"], hello["name"]) == ("hello", "")
     assert rest == [
         {"op": "put", "key": "any/key", "value": {"t_ns": 330000000000, "list": ["one"]}},
@@ -117,12 +117,12 @@ def test_requests_of_the_world_and_of_a_cluster() -> None:
     c.acquire('drone1', 10); r = c.ask('world/control', 'step', struct('gates', 1)); disp(r.at);
     """
 
-    def answer(asked: Said) -> list[Said | bytes]:
+    def answer(asked: JsonMap) -> list[JsonMap | bytes]:
         return [{"op": "answer", "ok": True, "error": "", "result": {"at": [1, 2, 3]}}]
 
     with gateway(answer) as fake:
-        assert said(fake.port, code) == ["   1   2   3"]
-    asked = [(a["key"], a["request"], a["args"]) for a in fake.heard[1:]]
+        assert reply(fake.port, code) == ["   1   2   3"]
+    asked = [(a["key"], a["request"], a["args"]) for a in fake.requests[1:]]
     assert asked == [
         ("world/control", "pause", {}),
         ("world/control", "step", {"gates": 3}),
@@ -139,7 +139,7 @@ def test_requests_of_the_world_and_of_a_cluster() -> None:
 def test_lines_however_they_are_cut() -> None:
     """An answer of 1 MB in pieces, an answer byte by byte within a letter, and many lines in one piece."""
 
-    def answer(asked: Said) -> list[Said | bytes]:
+    def answer(asked: JsonMap) -> list[JsonMap | bytes]:
         value = {"text": "ü" * 500_000 if asked["key"] == "long" else "grün", "v": [1, 2, 3]}
         entry = {"key": asked["key"], "value": value}
         line = _line({"op": "latest", "values": [entry]}, asked)
@@ -156,13 +156,13 @@ def test_lines_however_they_are_cut() -> None:
     end
     """
     with gateway(answer) as fake:
-        assert said(fake.port, code) == ["1000000 grün 3"]
+        assert reply(fake.port, code) == ["1000000 grün 3"]
 
 
 def test_nothing_is_there_yet() -> None:
     """No value, no values and no news are empty, not errors."""
 
-    def answer(asked: Said) -> list[Said | bytes]:
+    def answer(asked: JsonMap) -> list[JsonMap | bytes]:
         return [{"op": "latest", "values": []}]
 
     code = """
@@ -170,7 +170,7 @@ def test_nothing_is_there_yet() -> None:
     [value, key] = c.next(0.05); disp(isempty(value) && isempty(key));
     """
     with gateway(answer) as fake:
-        assert said(fake.port, code) == ["1", "   0   0", "1"]
+        assert reply(fake.port, code) == ["1", "   0   0", "1"]
 
 
 FAILS = "try, {code} catch e, printf('%s %s\\n', e.identifier, e.message); end;"
@@ -179,7 +179,7 @@ FAILS = "try, {code} catch e, printf('%s %s\\n', e.identifier, e.message); end;"
 def test_refusals_and_ends() -> None:
     """A refusal is an error and the client goes on; an end of the connection is another."""
 
-    def answer(asked: Said) -> list[Said | bytes]:
+    def answer(asked: JsonMap) -> list[JsonMap | bytes]:
         if asked["op"] == "put":
             return [{"op": "error", "error": "drone/drone9: drone is 'drone9'; must be one of drone1"}]
         if asked["op"] == "ask":
@@ -199,7 +199,7 @@ def test_refusals_and_ends() -> None:
         )
     )
     with gateway(answer) as fake:
-        lines = said(fake.port, code)
+        lines = reply(fake.port, code)
     terms_of_each = [
         ("zsim:refused", "drone/drone9", "'drone9'", "drone1"),
         ("zsim:refused", "cluster/main/control land", "phase is idle"),
@@ -217,7 +217,7 @@ def test_no_answer_and_a_late_one() -> None:
     """A request without an answer ends after the timeout; its late refusal does not concern the next."""
     first: list[int] = []
 
-    def answer(asked: Said) -> list[Said | bytes]:
+    def answer(asked: JsonMap) -> list[JsonMap | bytes]:
         if not first:
             first.append(asked["id"])
             return [b"\n"]
@@ -234,9 +234,9 @@ def test_no_answer_and_a_late_one() -> None:
 
 def test_a_run_that_begins_later() -> None:
     """Until a run begins the client waits, so long as its option says; then it knows the drones."""
-    asked_before: list[Said] = []
+    asked_before: list[JsonMap] = []
 
-    def hello(asked: Said) -> list[Said | bytes]:
+    def hello(asked: JsonMap) -> list[JsonMap | bytes]:
         asked_before.append(asked)
         if len(asked_before) == 1:
             return [
@@ -246,10 +246,10 @@ def test_a_run_that_begins_later() -> None:
         return [{"op": "hello", "name": "client.test", **RUN}]
 
     with gateway(echo, hello) as fake:
-        lines = said(fake.port, "disp(c.run.run_id); disp(c.run.drones{1}); disp(c.run.clusters(1).name);")
+        lines = reply(fake.port, "disp(c.run.run_id); disp(c.run.drones{1}); disp(c.run.clusters(1).name);")
         assert lines == ["abc", "drone1", "main"]
 
-    def never(asked: Said) -> list[Said | bytes]:
+    def never(asked: JsonMap) -> list[JsonMap | bytes]:
         return [{"op": "hello", "name": "client.test", "run_id": None}]
 
     with gateway(echo, never) as fake:
@@ -258,10 +258,10 @@ def test_a_run_that_begins_later() -> None:
 
 
 def test_the_lockstep() -> None:
-    """What is said in a gate is its answer; a refused answer leaves it open; `left` ends it."""
+    """What is sent in a gate is its answer; a refused answer leaves it open; `left` ends it."""
     gates = iter(range(1, 10))
 
-    def answer(asked: Said) -> list[Said | bytes]:
+    def answer(asked: JsonMap) -> list[JsonMap | bytes]:
         gate = {"op": "gate", "t_ns": 20_000_000 * next(gates), "inputs": []}
         entry = {"key": "drone/drone1/estimate", "value": {"position_m": [1, 2, 3]}}
         match asked["op"]:
@@ -289,8 +289,8 @@ def test_the_lockstep() -> None:
     disp(c.left);
     """
     with gateway(answer) as fake:
-        assert said(fake.port, code) == ["clock", "0 3", "zsim:refused done: 'bad'", "over"]
-    join, *dones = [asked for asked in fake.heard if asked["op"] in ("join", "done")]
+        assert reply(fake.port, code) == ["clock", "0 3", "zsim:refused done: 'bad'", "over"]
+    join, *dones = [asked for asked in fake.requests if asked["op"] in ("join", "done")]
     assert join["reads"] == ["drone/drone1/estimate"]
     velocity = {"velocity_m_s": [1, 0, 0], "yaw_rate_rad_s": 0}
     assert [output["key"] for output in dones[0]["outputs"]] == ["drone/drone1/cmd/velocity", "k", "l"]

@@ -102,7 +102,7 @@ class Air:
 
 
 def flight() -> tuple[list[dict[str, Any]], list[GateOutput]]:
-    """Fly the Python controller; return what it was given and what it said, gate by gate."""
+    """Fly the Python controller; return its inputs and outputs, gate by gate."""
     plan = [
         Scheduled(5.0, TakeOff()),
         Scheduled(5.0, Engage()),
@@ -129,7 +129,7 @@ def target(from_s: float, values: dict[str, float]) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def figures(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The cases, what Python makes of them and what Octave does."""
     maps = random_maps(200)
     gates, outputs = flight()
@@ -143,10 +143,10 @@ def near(found: Any, wanted: Any) -> bool:
     return bool(np.allclose(np.array(found, float), np.array(wanted, float), rtol=NEAR, atol=NEAR))
 
 
-def test_the_mathematics(said: dict[str, Any]) -> None:
+def test_the_mathematics(figures: dict[str, Any]) -> None:
     """Forward and inverse kinematics, both Jacobians, the condition number and the law, on random robots."""
     guarded = []
-    for case, found in zip(said["maps"], said["octave"]["maps"], strict=True):
+    for case, found in zip(figures["maps"], figures["octave"]["maps"], strict=True):
         p_W, yaw, v_W = (np.array(case[name]) for name in ("p_W", "yaw", "v_W"))
         c = SPACE.forward(p_W, yaw)
         J, J_inv = SPACE.jacobian(p_W, yaw), SPACE.inverse_jacobian(c)
@@ -169,10 +169,10 @@ def test_the_mathematics(said: dict[str, Any]) -> None:
     assert set(guarded) == {(False, False), (False, True), (True, False), (True, True)}
 
 
-def test_the_phases(said: dict[str, Any]) -> None:
+def test_the_phases(figures: dict[str, Any]) -> None:
     """A flight with take-off, engagement, two targets, a lost position and landing: the same at every gate."""
-    (found,) = said["octave"]["flights"]
-    for wanted, step in zip(said["outputs"], found, strict=True):
+    (found,) = figures["octave"]["flights"]
+    for wanted, step in zip(figures["outputs"], found, strict=True):
         assert step["phase"] == wanted.phase
         sent = {command.drone: command.mode for command in wanted.modes}
         assert [("", "takeoff", "land")[round(m)] for m in step["modes"]] == [sent.get(d, "") for d in DRONES]
@@ -188,7 +188,7 @@ def test_the_phases(said: dict[str, Any]) -> None:
         assert step["factor"] == pytest.approx(wanted.factor, rel=NEAR)
 
 
-def test_the_flight_goes_through_every_phase(said: dict[str, Any]) -> None:
-    phases = list(dict.fromkeys(output.phase for output in said["outputs"]))
+def test_the_flight_goes_through_every_phase(figures: dict[str, Any]) -> None:
+    phases = list(dict.fromkeys(output.phase for output in figures["outputs"]))
     assert phases == ["idle", "taking_off", "assembling", "engaged", "held", "landing"]
-    assert said["outputs"][-1].phase == "idle"
+    assert figures["outputs"][-1].phase == "idle"

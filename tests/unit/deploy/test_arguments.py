@@ -33,8 +33,8 @@ def test_a_command_that_looks_waits_a_little_and_one_that_takes_part_for_ever():
 
 
 def test_options_reach_the_command_beside_its_own():
-    told = ("--connect", "tcp/h:1", "--federation", "f", "--wait", "2", "--insecure", "--host", "lab")
-    reach, key, count = given(participant_options, "clock", *told, "--launched", "r1", "--count", "2")
+    options = ("--connect", "tcp/h:1", "--federation", "f", "--wait", "2", "--insecure", "--host", "lab")
+    reach, key, count = given(participant_options, "clock", *options, "--launched", "r1", "--count", "2")
     assert reach == WorldAccess("tcp/h:1", "f", 2.0, None, True, "lab", "r1")
     assert (key, count) == ("clock", 2)
     assert (reach.who.host, reach.who.insecure) == ("lab", True)

@@ -88,7 +88,7 @@ def _meet(wind: NDArray, gust: NDArray, bodies: Bodies) -> float:
 
 @inlined
 def _ideal(s: int, x: BodyTruth, mounted: MountedSensor, site: Site) -> Values:
-    """Return the errorless values of stock sensor s: the only place that tells them apart by their numbers."""
+    """Return the errorless values of stock sensor s: the only place that distinguishes them by their numbers."""
     if s == ss.IMU:
         return imu(x, mounted, site)
     if s == ss.GPS:

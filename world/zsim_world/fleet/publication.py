@@ -41,8 +41,6 @@ INTS, FLOATS = LAYOUTS.ints, LAYOUTS.floats
 OPS, FIRST, LITERALS = LAYOUTS.program  # compiled in
 COMMANDER = len(firmware.MODES)  # the first commander among the words: nobody
 
-HASHED_BYTES = 16_384  # in one go, which takes as long as a few instants
-
 write = inlined(encoding.write)
 
 
@@ -128,7 +126,7 @@ class GatePublication:
         publish(hold(state), *self._fleet.sampled, *self._payloads(), 0)
 
     def gate(self, commanders: list[str | None]) -> GateMessages:
-        """Return the messages of the gate that the fleet stands at; `commanders` are the names of who flies each."""
+        """Return the messages of the present gate; `commanders` are those of the drones, None for none."""
         fleet, wide = self._fleet, self._fleetwide
         count = len(fleet.sampled.whose) + 2 * fleet.count
         payloads = self._payloads()

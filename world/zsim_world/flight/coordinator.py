@@ -235,7 +235,7 @@ class Coordinator(ABC):
         return clock.mode == "realtime" or not self.barrier.blocking(clock.required_ns)
 
     def blocking(self, ahead_ns: int = 0) -> list[Participant]:
-        """Return whose dones are missing for the next gate, or for one that comes so much later."""
+        """Return the participants whose dones are missing for the next gate, or for one so much later."""
         return self.barrier.blocking(self.clock.required_ns + ahead_ns)
 
     def waiting_for(self, wall_ns: int) -> tuple[run_messages.Waiting, ...]:

@@ -258,7 +258,7 @@ def _is_of(view: str, live: set[str]) -> bool:
 
 
 def _recount(payloads: list[bytes], kinds: list[int], first: list[int]) -> None:
-    """Let each status count what is played of its drone's sensors: what is left out would be waited for."""
+    """Let each status count the sensor messages that are played; agents would wait for those that are left out."""
     truth, status = KINDS.index("truth"), KINDS.index("status")
     for begin, end in pairwise(first):
         for m in range(begin, end):

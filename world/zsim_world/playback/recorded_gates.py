@@ -110,7 +110,7 @@ def _is_gate(payload: bytes) -> bool:
 
 
 def is_played(key: str, expressions: Sequence[str]) -> bool:
-    """Tell whether what stands on a key is played: not what is made anew, nor what absent processes said of themselves.
+    """Return whether the messages of a key are played: none that are made anew, or are about absent processes.
 
     Args:
         expressions: that the user wants to be played.
@@ -135,7 +135,7 @@ def author(recorded: Recorded) -> str:
 
 
 def without_kills(payload: bytes) -> bytes:
-    """Return a list of faults without those of which a process dies: who takes part now is not who was meant."""
+    """Return a list of faults without those that kill a process: the participants of a replay are others."""
     try:
         listed: run_messages.Faults = messages.decode(keys.FAULTS, payload)
     except DecodeError:

@@ -20,7 +20,6 @@ from zsim.sensors.sonar import SonarConfig
 SENSORS = tuple(STOCK)  # the contract's order; a user's own count on from there
 IMU, GPS, MAG, BARO, SONAR, FLOW = range(len(SENSORS))
 CHANNELS = tuple(kind.width for kind in STOCK.values())  # numbers with an error of their own
-VALUES = tuple(kind.values for kind in STOCK.values())  # numbers of a sample as the kernel gives it
 CHANNELS_MAX = VALUES_MAX
 NOISE_WIDTH = tuple(2 * n + 1 for n in CHANNELS)  # per sample: white, walk of the bias, and one for drop-out
 NEVER = 2**63 - 1  # a tick that does not come

@@ -2,7 +2,7 @@
 
 R is the largest number of rotors in the fleet. Numbers per rotor stand after the columns of a row, R for each group of
 them; a drone with fewer rotors has some that do not exist, whose speeds and limits are zero. `each`, a tuple of R
-numbers, tells compiled code how many there are: it is compiled for each R, and its loops over rotors are unrolled.
+numbers, gives compiled code their number: it is compiled for each R, and its loops over rotors are unrolled.
 R is four only where all are crosses of four, whose places and mixing are then constants of the code: with a vehicle
 whose four rotors stand elsewhere, R is five.
 """

@@ -68,7 +68,7 @@ CALIBRATION = columns(  # what the board knows of its own mounts and of the plac
 
 STILL_STEPS_MIN = 50.0  # what knowing a floor to be level to 0.05 rad is worth, at an accelerometer noise of 0.35 g
 STILL_STEPS_SWAY = 400.0  # the gyro's bias is averaged slower: in a wind a standing drone sways on its feet
-STILL_STEPS_MAX = 4000.0  # 20 s: the bias walks on, so older samples tell less
+STILL_STEPS_MAX = 4000.0  # 20 s: the bias walks on, so older samples have less weight
 FLOW_QUALITY_MIN = 0.3  # below, the picture shows more horizon than ground
 SONAR_AGE_MAX = 100.0  # steps, 0.5 s without echo: heights come from the barometer
 MAG_MIN_UT = 1.0  # uT, a horizontal field that still gives a heading

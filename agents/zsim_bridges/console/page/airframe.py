@@ -60,7 +60,7 @@ def shape_of(drone: DroneInfo, arm_m: float) -> DroneShape:
 
 @cache
 def coloured(shape: DroneShape) -> bytes:
-    """Return a drone without its rotors as GLB: what has a colour of its own is a surface of its own."""
+    """Return a drone without its rotors as GLB, with one surface for each colour."""
     scene = trimesh.Scene()
     for name, solids in _solids(shape).items():
         solid = _joined(solids)

@@ -37,17 +37,17 @@ def flight() -> tuple[World, list[GateMessages]]:
 
 def estimates(agent: Estimator, gates: list[GateMessages], whole: bool) -> list[object]:
     """Return what an estimator says of a flight, handed over as gates or as messages in the order of a runner."""
-    said = []
+    outputs = []
     for gate in gates:
         if whole:
             agent.receive_gate(gate)
         else:
-            heard = [(key, m) for key, m in gate.decoded() if keys.is_sensor(key)]
-            for key, message in sorted(heard, key=lambda entry: (entry[1].t_ns, entry[0], entry[1].seq)):
+            readings = [(key, m) for key, m in gate.decoded() if keys.is_sensor(key)]
+            for key, message in sorted(readings, key=lambda entry: (entry[1].t_ns, entry[0], entry[1].seq)):
                 if keys.thing(key) in agent.counted:
                     agent.receive(key, message)
-        said += agent.step(gate.t_ns)
-    return said
+        outputs += agent.step(gate.t_ns)
+    return outputs
 
 
 @pytest.mark.skipif(not COMPILES, reason="numba is not installed: gates are taken apart")
@@ -88,8 +88,8 @@ def test_columns_that_lead_outside_are_not_followed(flight: tuple[World, list[Ga
 
 
 def _with_whole_numbers(gate: GateMessages) -> GateMessages:
-    said = [(key, _rounded(payload) if key.endswith("/mag") else payload) for key, payload in gate.pairs]
-    return GateMessages.of(gate.t_ns, gate.seq, gate.table, said)
+    outputs = [(key, _rounded(payload) if key.endswith("/mag") else payload) for key, payload in gate.pairs]
+    return GateMessages.of(gate.t_ns, gate.seq, gate.table, outputs)
 
 
 def _rounded(payload: bytes) -> bytes:

@@ -77,7 +77,7 @@ def protobuf_type(data: bytes, name: str) -> Any:
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
 
 
-def said(run: Path, key: str) -> list[Any]:
+def messages_on(run: Path, key: str) -> list[Any]:
     with RecordReader(run / "run.mcap") as reader:
         return [messages.decode(key, message.payload) for message in reader.messages({key})]
 
@@ -94,7 +94,7 @@ def wxyz(q: Any) -> tuple[float, float, float, float]:
 def test_poses_are_those_on_record(run: Path, drone: str) -> None:
     topics = shown(run / "foxglove.mcap")
     for topic, key in ((f"/drone/{drone}/pose", keys.truth(drone)), (f"/drone/{drone}/estimate", keys.estimate(drone))):
-        recorded = said(run, key)
+        recorded = messages_on(run, key)
         assert len(recorded) == GATES
         assert [t_ns for t_ns, _ in topics[topic]] == [message.t_ns for message in recorded]
         for (t_ns, pose), message in zip(topics[topic], recorded, strict=True):
@@ -112,10 +112,10 @@ def test_frames_are_where_truth_estimate_and_cluster_are(run: Path) -> None:
             frames[transform.child_frame_id][t_ns] = transform
     for drone in DRONES:
         for name, key in ((f"drone/{drone}", keys.truth(drone)), (f"drone/{drone}/estimate", keys.estimate(drone))):
-            for message in said(run, key):
+            for message in messages_on(run, key):
                 assert xyz(frames[name][message.t_ns].translation) == message.position_m
                 assert wxyz(frames[name][message.t_ns].rotation) == message.orientation_wxyz
-    for state in said(run, keys.cluster_state("main")):
+    for state in messages_on(run, keys.cluster_state("main")):
         for name, values in (("cluster/main", state.value), ("cluster/main/desired", state.desired)):
             assert xyz(frames[name][state.t_ns].translation) == values[:3]
             turned = wxyz(frames[name][state.t_ns].rotation)
@@ -124,8 +124,8 @@ def test_frames_are_where_truth_estimate_and_cluster_are(run: Path) -> None:
 
 def test_the_numbers_of_a_cluster_are_desired_estimated_and_true(run: Path) -> None:
     space = cluster_space(3)
-    truths = {drone: {truth.t_ns: truth for truth in said(run, keys.truth(drone))} for drone in DRONES}
-    states = said(run, keys.cluster_state("main"))
+    truths = {drone: {truth.t_ns: truth for truth in messages_on(run, keys.truth(drone))} for drone in DRONES}
+    states = messages_on(run, keys.cluster_state("main"))
     numbers = shown(run / "foxglove.mcap")["/cluster/main/variables"]
     for (t_ns, message), state in zip(numbers, states, strict=True):
         assert t_ns == state.t_ns
@@ -144,9 +144,9 @@ def test_the_numbers_of_a_drone(run: Path) -> None:
     for drone in DRONES:
         found = zip(
             topics[f"/drone/{drone}/numbers"],
-            said(run, keys.truth(drone)),
-            said(run, keys.estimate(drone)),
-            said(run, keys.status(drone)),
+            messages_on(run, keys.truth(drone)),
+            messages_on(run, keys.estimate(drone)),
+            messages_on(run, keys.status(drone)),
             strict=True,
         )
         for (_, message), truth, estimate, status in found:
@@ -159,10 +159,12 @@ def test_the_numbers_of_a_drone(run: Path) -> None:
 def test_fixes_and_events(run: Path) -> None:
     topics = shown(run / "foxglove.mcap")
     for drone in DRONES:
-        for (_, fix), gps in zip(topics[f"/drone/{drone}/gps"], said(run, keys.sensor(drone, "gps")), strict=True):
+        for (_, fix), gps in zip(
+            topics[f"/drone/{drone}/gps"], messages_on(run, keys.sensor(drone, "gps")), strict=True
+        ):
             assert (fix.latitude, fix.longitude, fix.altitude) == (gps.latitude_deg, gps.longitude_deg, gps.altitude_m)
             assert fix.position_covariance[0] == gps.sigma_m**2
-    events = said(run, keys.EVENT)
+    events = messages_on(run, keys.EVENT)
     assert [line.message for _, line in topics["/log"]] == [f"{event.kind}: {event.text}" for event in events]
     assert [line.name for _, line in topics["/log"]] == [event.source for event in events]
 
@@ -172,13 +174,13 @@ def test_the_scene_shows_what_is_there(run: Path) -> None:
     ((_, drones),) = topics["/scene/drones"]
     assert {entity.frame_id for entity in drones.entities} == {f"drone/{drone}" for drone in DRONES}
     assert all(entity.frame_locked and entity.cubes and entity.cylinders for entity in drones.entities)
-    truths = {drone: {truth.t_ns: truth for truth in said(run, keys.truth(drone))} for drone in DRONES}
+    truths = {drone: {truth.t_ns: truth for truth in messages_on(run, keys.truth(drone))} for drone in DRONES}
     for t_ns, update in topics["/scene/formations"]:
         (entity,) = update.entities
         outline = [xyz(corner) for corner in entity.lines[0].points]
         assert outline == [truths[drone][t_ns].position_m for drone in DRONES]
         assert len(entity.spheres) == 3
-    estimates = {drone: {each.t_ns: each for each in said(run, keys.estimate(drone))} for drone in DRONES}
+    estimates = {drone: {each.t_ns: each for each in messages_on(run, keys.estimate(drone))} for drone in DRONES}
     for t_ns, update in topics["/scene/estimates"]:
         for entity in update.entities:
             (sphere,) = entity.spheres
@@ -323,4 +325,4 @@ def test_rerun_has_what_is_drawn_and_plotted_at_every_instant(run: Path, convert
 def test_rerun_has_the_values_and_times_on_record(run: Path, converted: Path) -> None:
     printed = rerun(run / "home", "rrd", "print", "-vvv", str(converted), "--entity", "/drone/end/pose")
     times = re.findall(r"1970-01-01T00:00:0(\d\.\d+|\d)", printed)
-    assert {float(each) for each in times} >= {truth.t_ns / 1e9 for truth in said(run, keys.truth("end"))}
+    assert {float(each) for each in times} >= {truth.t_ns / 1e9 for truth in messages_on(run, keys.truth("end"))}

@@ -48,7 +48,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def said(run: Path, key: str) -> list[Any]:
+def messages_on(run: Path, key: str) -> list[Any]:
     """Return the messages of a key on record."""
     with RecordReader(run / "run.mcap") as reader:
         return [messages.decode(key, message.payload) for message in reader.messages({key})]
@@ -84,7 +84,7 @@ def test_every_message_is_a_row_of_its_table(run: Path, suffix: str) -> None:
 
 @pytest.mark.parametrize("drone", ["drone1", "a-b.c", "end"])
 def test_truth_is_the_same_to_the_bit(run: Path, drone: str) -> None:
-    truths = said(run, keys.truth(drone))
+    truths = messages_on(run, keys.truth(drone))
     for table in (csv(run, "truth"), parquet(run / "parquet" / "truth.parquet")):
         mine = table[table["name"] == drone]
         assert len(mine) == GATES
@@ -101,13 +101,13 @@ def test_truth_is_the_same_to_the_bit(run: Path, drone: str) -> None:
 
 
 def test_covariances_sensors_and_variables_have_a_column_each(run: Path) -> None:
-    table, estimates = csv(run, "estimate"), said(run, keys.estimate("end"))
+    table, estimates = csv(run, "estimate"), messages_on(run, keys.estimate("end"))
     mine = table[table["name"] == "end"]
     assert mine["covariance_01"].tolist() == [estimate.covariance[1] for estimate in estimates]
     assert mine["covariance_55"].tolist() == [estimate.covariance[35] for estimate in estimates]
     used = [estimate.sensors.get("gps", (np.nan, np.nan))[0] for estimate in estimates]
     np.testing.assert_array_equal(mine["sensors_gps_used"], used)
-    states, table = said(run, keys.cluster_state("main")), csv(run, "cluster_state")
+    states, table = messages_on(run, keys.cluster_state("main")), csv(run, "cluster_state")
     assert table["desired_beta"].tolist() == [state.desired[state.names.index("beta")] for state in states]
     assert table["phase"].tolist() == [state.phase for state in states]
     assert table["trajectory_t_s"].isna().all()
@@ -120,22 +120,22 @@ def test_flags_are_numbers_in_csv_and_flags_in_parquet(run: Path) -> None:
 
 def test_what_has_no_columns_is_json(run: Path) -> None:
     events = csv(run, "event")
-    recorded = said(run, keys.EVENT)
+    recorded = messages_on(run, keys.EVENT)
     assert [json.loads(text) for text in events["data"]] == [msgspec.to_builtins(event.data) for event in recorded]
     foreign = csv(run, "foreign")
     assert json.loads(foreign["content"][0])["x"] == [1, 2]
     assert json.loads(foreign["content"][1]) == {"hexadecimal": "c100"}
     info = csv(run, "info")
     assert json.loads(info["drones"][0])[1]["name"] == "a-b.c"
-    assert info["origin_latitude_deg"][0] == said(run, keys.INFO)[0].origin.latitude_deg
+    assert info["origin_latitude_deg"][0] == messages_on(run, keys.INFO)[0].origin.latitude_deg
 
 
 def test_the_manifest_tells_what_the_tables_are(run: Path) -> None:
     manifest = json.loads((run / "csv" / "export.json").read_bytes())
     assert manifest["complete"] is True
     assert manifest["notes"] == []
-    told = {file.removesuffix(".csv"): table["rows"] for file, table in manifest["tables"].items()}
-    assert told == counts(run)
+    row_counts = {file.removesuffix(".csv"): table["rows"] for file, table in manifest["tables"].items()}
+    assert row_counts == counts(run)
     for file, table in manifest["tables"].items():
         assert (run / "csv" / file).read_text().splitlines()[0] == ",".join(f'"{name}"' for name in table["columns"])
 
@@ -150,16 +150,16 @@ def test_a_matlab_file_has_a_struct_per_drone(run: Path) -> None:
     loaded = scipy.io.loadmat(run / "run.mat", simplify_cells=True)
     assert set(loaded["truth"]) == {"drone1", "a_b_c", "xend"}
     for drone, valid in {"drone1": "drone1", "a-b.c": "a_b_c", "end": "xend"}.items():
-        truths, struct = said(run, keys.truth(drone)), loaded["truth"][valid]
+        truths, struct = messages_on(run, keys.truth(drone)), loaded["truth"][valid]
         assert struct["name"] == drone
         assert struct["t_ns"].dtype == np.int64
         np.testing.assert_array_equal(struct["position_m"], [truth.position_m for truth in truths])
         np.testing.assert_array_equal(struct["orientation_wxyz"], [truth.orientation_wxyz for truth in truths])
-    estimate = said(run, keys.estimate("drone1"))
+    estimate = messages_on(run, keys.estimate("drone1"))
     struct = loaded["estimate"]["drone1"]
     assert struct["covariance"].shape == (GATES, 36)
     np.testing.assert_array_equal(struct["sensors"]["gps"][-1], estimate[-1].sensors["gps"])
-    states = said(run, keys.cluster_state("main"))
+    states = messages_on(run, keys.cluster_state("main"))
     struct = loaded["cluster_state"]["main"]
     assert struct["names"].tolist() == list(states[0].names)
     np.testing.assert_array_equal(struct["desired"], [state.desired for state in states])
@@ -173,8 +173,8 @@ def test_octave_loads_it(run: Path) -> None:
         "cellstr(status.xend.state){end}, cluster_state.main.names{1});"
     )
     done = subprocess.run(["octave-cli", "--norc", "--eval", script], capture_output=True, text=True, timeout=120)
-    z = said(run, keys.truth("a-b.c"))[-1].position_m[2]
-    state = said(run, keys.status("end"))[-1].state
+    z = messages_on(run, keys.truth("a-b.c"))[-1].position_m[2]
+    state = messages_on(run, keys.status("end"))[-1].state
     assert done.stdout.split() == [str(GATES), "3", f"{z:.17g}", "int64", state, "x_c"], done.stderr
 
 
@@ -325,7 +325,7 @@ def test_garbage_on_record_is_left_out_and_told(run: Path, tmp_path: Path) -> No
             writer.add(message.key, message.payload, messages.encoding(message.key), message.t_ns, message.wall_ns)
         for payload in (b"", b"\xff", msgspec.msgpack.encode({"t_ns": "soon"})):
             writer.add(keys.truth("drone1"), payload, "", 5, 5)
-        huge = {**msgspec.to_builtins(said(run, "process/controller.main/join")[0]), "incarnation": 2**63}
+        huge = {**msgspec.to_builtins(messages_on(run, "process/controller.main/join")[0]), "incarnation": 2**63}
         writer.add("process/controller.main/join", msgspec.msgpack.encode(huge), "", 5, 5)
     done = export(tmp_path, Format.PARQUET)
     (note,) = done.notes

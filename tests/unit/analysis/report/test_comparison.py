@@ -115,12 +115,12 @@ def test_what_one_run_has_and_another_has_not_is_said(runs: list[Path], tmp_path
     data = (runs[0] / "run.mcap").read_bytes()
     (tmp_path / "cut").mkdir()
     (tmp_path / "cut" / "run.mcap").write_bytes(data[: len(data) // 2])
-    said = notes(judged([*runs, end, tmp_path / "cut"]))
-    assert has_terms("\n".join(said), "main", "calm", "rough", "short", "cut")
-    assert has_terms("\n".join(said), "windows", "calm", "2", "9.98")
-    assert has_terms("\n".join(said), "short", "end")
-    assert has_terms("\n".join(said), "cut", "record", "cut")
-    assert not has_terms("\n".join(said), "same bits")
+    note_lines = notes(judged([*runs, end, tmp_path / "cut"]))
+    assert has_terms("\n".join(note_lines), "main", "calm", "rough", "short", "cut")
+    assert has_terms("\n".join(note_lines), "windows", "calm", "2", "9.98")
+    assert has_terms("\n".join(note_lines), "short", "end")
+    assert has_terms("\n".join(note_lines), "cut", "record", "cut")
+    assert not has_terms("\n".join(note_lines), "same bits")
     assert has_terms("\n".join(notes(twins(tmp_path, runs[0]))), "a/calm", "b/calm", "same bits")
 
 
@@ -138,9 +138,9 @@ def test_other_drones_and_variables_are_said(runs: list[Path], tmp_path: Path) -
     members = "clusters.main.drones=[drone1, x, y]"
     record(tmp_path / "others", Flown(duration_s=4.0, overrides=(other, members)))
     both = judged([runs[0], tmp_path / "others"])
-    said = notes(both)
-    assert has_terms("\n".join(said), "drone2", "drone3", "calm only")
-    assert has_terms("\n".join(said), "x", "y", "others only")
+    note_lines = notes(both)
+    assert has_terms("\n".join(note_lines), "drone2", "drone3", "calm only")
+    assert has_terms("\n".join(note_lines), "x", "y", "others only")
     names = {row.name for row in scenario_rows(both)}
     assert {"drones.drone2", "drones.x"} <= names
     assert not any(name.startswith("drones.x.") for name in names)

@@ -119,9 +119,9 @@ def test_angles_wrap_the_short_way(tmp_path):
 
 def test_summary_json_has_the_fields_of_the_contract(run):
     directory, summary = run
-    said = json.loads((directory / "summary.json").read_bytes())
-    assert said.keys() >= CONTRACT_FIELDS
-    assert said["errors"]["p"].keys() == {
+    summary_json = json.loads((directory / "summary.json").read_bytes())
+    assert summary_json.keys() >= CONTRACT_FIELDS
+    assert summary_json["errors"]["p"].keys() == {
         "est_std",
         "est_rms",
         "est_mean",
@@ -129,13 +129,13 @@ def test_summary_json_has_the_fields_of_the_contract(run):
         "true_rms",
         "true_mean",
     }
-    assert said["clusters"]["main"]["errors"] == said["errors"]
-    assert said["paper_table_1"]["beta"] == 0.012
-    assert (said["scenario"], said["seed"], said["mode"]) == ("step", 1, "lockstep")
-    assert (said["real_time_factor"], said["wall_s"], said["deadline_misses"]) == (20.0, 0.6, 2)
-    assert said["ended"] == "over"
-    assert [event["kind"] for event in said["events"]] == ["refused", "end"]
-    assert said["versions"]["estimator.drone1"] == "0.1.0"
+    assert summary_json["clusters"]["main"]["errors"] == summary_json["errors"]
+    assert summary_json["paper_table_1"]["beta"] == 0.012
+    assert (summary_json["scenario"], summary_json["seed"], summary_json["mode"]) == ("step", 1, "lockstep")
+    assert (summary_json["real_time_factor"], summary_json["wall_s"], summary_json["deadline_misses"]) == (20.0, 0.6, 2)
+    assert summary_json["ended"] == "over"
+    assert [event["kind"] for event in summary_json["events"]] == ["refused", "end"]
+    assert summary_json["versions"]["estimator.drone1"] == "0.1.0"
     assert msgspec.json.decode((directory / "summary.json").read_bytes(), type=type(summary)) == summary
 
 

@@ -31,25 +31,27 @@ clusters: [{name: main, drones: [d1, d2]}]
 SCENARIO = scenario_file.from_text(TEXT)
 INFO = World(SCENARIO, run_id="flown").info()
 KILL = {"kind": "process_kill", "target": "estimator.d1"}
-Said = tuple[str, Message]
+RecordedEntry = tuple[str, Message]
 
 
-def join(name: str, fingerprint: str = PRINT, serves: tuple[str, ...] = (), version: str = __version__) -> Said:
+def join(
+    name: str, fingerprint: str = PRINT, serves: tuple[str, ...] = (), version: str = __version__
+) -> RecordedEntry:
     role = name.partition(".")[0]
     message = Join(0, 0, "flown", 1, role, "h", 1, GATE_NS, version, fingerprint, serves)
     return keys.process(name, "join"), message
 
 
-def event(kind: str, subject: str, gate: int = 5, **data: Any) -> Said:
+def event(kind: str, subject: str, gate: int = 5, **data: Any) -> RecordedEntry:
     return keys.EVENT, Event(gate * GATE_NS, 0, kind, "world", subject, kind, data)
 
 
-def truth(gate: int, drone: str, x: float = 0.0) -> Said:
+def truth(gate: int, drone: str, x: float = 0.0) -> RecordedEntry:
     message = Truth(gate * GATE_NS, gate, (x, 0.0, 1.0), ZEROS, (1.0, *ZEROS), ZEROS, ZEROS, (9.0, 9.0, 9.0, 9.0))
     return keys.truth(drone), message
 
 
-def clock(gate: int, state: Any = "running") -> Said:
+def clock(gate: int, state: Any = "running") -> RecordedEntry:
     return keys.CLOCK, Clock(gate * GATE_NS, gate, "flown", gate, state, 1.0)
 
 
@@ -57,10 +59,10 @@ def clock(gate: int, state: Any = "running") -> Said:
 def write(tmp_path: Path) -> Iterator[Any]:
     readers: list[RecordReader] = []
 
-    def write(*said: Said) -> RecordReader:
+    def write(*entries: RecordedEntry) -> RecordReader:
         path = tmp_path / f"{len(readers)}.mcap"
         with RecordWriter(path) as writer:
-            for place, (key, message) in enumerate(said):
+            for place, (key, message) in enumerate(entries):
                 writer.add_message(key, message, place)
         readers.append(RecordReader(path))
         return readers[-1]
@@ -98,13 +100,13 @@ def test_who_served_others_does_so_again(write: Any):
 
 
 @pytest.mark.parametrize("foreign", [join("estimator.d2", ""), join("estimator.d2", PRINT, version="")])
-def test_others_under_our_names_are_not(write: Any, foreign: Said):
+def test_others_under_our_names_are_not(write: Any, foreign: RecordedEntry):
     found = agents(write(join("estimator.d1"), foreign, join("matlab.main"), join("controller.other")))
     assert [process.name for process in found.processes] == ["estimator.d1"]
 
 
 @pytest.mark.parametrize(
-    ("said", "terms"),
+    ("entries", "terms"),
     [
         (event("death", "estimator.d1"), ("death", "estimator.d1", "0.10")),
         (event("superseded", "controller.main"), ("superseded", "controller.main", "0.10")),
@@ -114,14 +116,14 @@ def test_others_under_our_names_are_not(write: Any, foreign: Said):
         (event("control", "fault_add", ok=True, args=KILL), ("process_kill", "asked", "0.10")),
     ],
 )
-def test_why_agents_are_not_run_again(write: Any, said: Said, terms: tuple[str, ...]):
-    found = agents(write(*OURS, said, event("end", "world", gate=9)))
+def test_why_agents_are_not_run_again(write: Any, entries: RecordedEntry, terms: tuple[str, ...]):
+    found = agents(write(*OURS, entries, event("end", "world", gate=9)))
     assert found.processes == ()
     assert has_terms(found.why_not, *terms)
 
 
 @pytest.mark.parametrize(
-    "said",
+    "entries",
     [
         event("death", "operator.pilot"),
         event("leave", "matlab.main"),
@@ -129,9 +131,10 @@ def test_why_agents_are_not_run_again(write: Any, said: Said, terms: tuple[str, 
         event("control", "fault_add", ok=False, args=KILL),
     ],
 )
-def test_what_is_no_reason(write: Any, said: Said):
+def test_what_is_no_reason(write: Any, entries: RecordedEntry):
     assert (
-        agents(write(*OURS, said, event("end", "world", gate=9), event("leave", "estimator.d1", gate=9))).why_not == ""
+        agents(write(*OURS, entries, event("end", "world", gate=9), event("leave", "estimator.d1", gate=9))).why_not
+        == ""
     )
 
 

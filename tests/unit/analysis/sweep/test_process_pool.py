@@ -6,20 +6,13 @@ from typing import Any
 
 import pytest
 from refused import has_terms, refused
+from short_flight import ONE
 
 from zsim.errors import RunError
 from zsim.scenario import scenario_file
 from zsim_analysis.sweep import process_pool
 from zsim_analysis.sweep.process_pool import READY
 from zsim_analysis.sweep.sweep_run import Row, Task
-
-ONE = """
-name: one
-seed: 3
-duration_s: 0.5
-drones: [{name: d1, position_m: [0, 0, 0]}]
-processes: {expect: []}
-"""
 
 
 def task(run: int) -> Task:
@@ -83,33 +76,33 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     assert FakeWorker.alive == set()
 
 
-def rows(count: int, said: list[str], workers: int = 2) -> list[Row]:
-    return list(process_pool.ProcessPool(workers, said.append).rows(task(run=run) for run in range(count)))
+def rows(count: int, lines: list[str], workers: int = 2) -> list[Row]:
+    return list(process_pool.ProcessPool(workers, lines.append).rows(task(run=run) for run in range(count)))
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
 def test_every_run_is_flown_once(workers: int) -> None:
-    said: list[str] = []
-    found = rows(9, said, workers)
+    lines: list[str] = []
+    found = rows(9, lines, workers)
     assert sorted(row["run"] for row in found) == sorted(FakeWorker.flown) == list(range(9))
-    assert said == []
+    assert lines == []
 
 
 def test_the_run_of_a_dead_worker_is_flown_again() -> None:
-    said: list[str] = []
+    lines: list[str] = []
     FakeWorker.dies_of = {0: 1, 4: 2}
-    found = rows(6, said)
+    found = rows(6, lines)
     assert sorted(FakeWorker.flown) == list(range(6))
     assert [row["failure"] for row in found] == [None] * 6
-    assert len(said) == 3
-    for run, line in zip((0, 4), sorted(set(said)), strict=True):
+    assert len(lines) == 3
+    for run, line in zip((0, 4), sorted(set(lines)), strict=True):
         assert has_terms(line, f"run {run}", "died", "SIGKILL")
 
 
 def test_a_run_that_is_fatal_to_every_worker_is_a_row() -> None:
-    said: list[str] = []
+    lines: list[str] = []
     FakeWorker.dies_of = {2: 99}
-    found = {row["run"]: row["failure"] for row in rows(5, said)}
+    found = {row["run"]: row["failure"] for row in rows(5, lines)}
     assert has_terms(found.pop(2), "3", "died", "killed", "SIGKILL")
     assert found == dict.fromkeys((0, 1, 3, 4))
 

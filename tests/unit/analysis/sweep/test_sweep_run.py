@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from refused import has_terms, refused
+from short_flight import ONE, diverge
 
 from zsim.contract.fingerprint import fingerprint
 from zsim.errors import RecordError
@@ -20,16 +21,8 @@ from zsim_analysis import in_process
 from zsim_analysis.reading.formation import Formation
 from zsim_analysis.report.make_report import judge
 from zsim_analysis.sweep.sweep_run import Task, engaged_s, fly
-from zsim_world.fleet.fleet import DivergedError, Fleet
+from zsim_world.fleet.fleet import Fleet
 
-GATE_NS = 20_000_000
-ONE = """
-name: one
-seed: 3
-duration_s: 0.5
-drones: [{name: d1, position_m: [0, 0, 0]}]
-processes: {expect: []}
-"""
 PAIR = """
 name: pair
 seed: 3
@@ -108,14 +101,7 @@ def test_a_task_can_be_sent() -> None:
 
 
 def test_a_run_that_diverges_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    advance = Fleet.advance
-
-    def diverge(fleet: Fleet) -> None:
-        if fleet.t_ns == 5 * GATE_NS:
-            raise DivergedError("d1", 0.12)
-        advance(fleet)
-
-    monkeypatch.setattr(Fleet, "advance", diverge)
+    diverge(monkeypatch)
     row = fly(task())
     assert has_terms(row["failure"], "d1", "0.120", "finite")
     assert row["sim_s"] == 0.1

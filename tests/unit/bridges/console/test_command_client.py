@@ -1,4 +1,4 @@
-"""The console's desk: what is asked in whose name, in what order, and what is told of a refusal."""
+"""The console's command client: what it sends, under which name and in what order, and the outcomes it reports."""
 
 import threading
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ class Link:
     """A session that notes what is asked of it."""
 
     def __init__(self) -> None:
-        self.said: list[tuple[Any, ...]] = []
+        self.sent: list[tuple[Any, ...]] = []
         self.refusals: dict[str, str] = {}
         self.given_back = threading.Event()
         self.answers = threading.Event()  # whether anybody answers those who ask for what never ends
@@ -36,10 +36,10 @@ class Link:
     @property
     def modes(self) -> list[str]:
         """What has been sent, in order."""
-        return [said[1].mode for said in self.said if len(said) == 2]
+        return [entry[1].mode for entry in self.sent if len(entry) == 2]
 
     def request(self, key: str, op: str, source: str, args: dict[str, Any], timeout_s: float) -> ControlAnswer:
-        self.said.append((key, op, source, args))
+        self.sent.append((key, op, source, args))
         if op == "broken":
             raise SessionError("the session is closed")
         if op == "wrong":
@@ -56,7 +56,7 @@ class Link:
         return ControlAnswer(ok=not refusal, error=refusal)
 
     def put(self, key: str, message: Any) -> None:
-        self.said.append((key, message))
+        self.sent.append((key, message))
 
 
 class FakeViewBuffer:
@@ -70,62 +70,62 @@ class FakeViewBuffer:
 
 
 class Table:
-    """A desk, what it said, and what it told."""
+    """A command client, what it sent, and the outcomes that it reported."""
 
     def __init__(self) -> None:
         self.link = Link()
-        self.told: SimpleQueue[RequestOutcome] = SimpleQueue()
-        self.eyes = FakeViewBuffer()
-        self.desk = CommandClient(self.link, "console.1", self.eyes, lambda: 7, self.told.put)  # type: ignore[arg-type]
+        self.outcomes: SimpleQueue[RequestOutcome] = SimpleQueue()
+        self.views = FakeViewBuffer()
+        self.client = CommandClient(self.link, "console.1", self.views, lambda: 7, self.outcomes.put)  # type: ignore[arg-type]
 
 
 @pytest.fixture
 def table() -> Iterator[Table]:
     made = Table()
     yield made
-    made.desk.close()
+    made.client.close()
 
 
 def test_a_request_goes_out_in_the_console_s_name(table: Table):
-    table.desk.request_cluster("main", "target", values={"p": 4.0}, over_s=5.0)
-    outcome = table.told.get(timeout=PATIENCE_S)
+    table.client.request_cluster("main", "target", values={"p": 4.0}, over_s=5.0)
+    outcome = table.outcomes.get(timeout=PATIENCE_S)
     assert has_terms(outcome.request, "main", "target", "p=4", "over_s 5")
     assert outcome.refusal == ""
     args = {"values": {"p": 4.0}, "over_s": 5.0}
-    assert table.link.said == [("cluster/main/control", "target", "console.1", args)]
+    assert table.link.sent == [("cluster/main/control", "target", "console.1", args)]
 
 
 def test_a_refusal_is_told_with_its_reason(table: Table):
     table.link.refusals["pause"] = "not now"
-    table.desk.request_world("pause")
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("pause", "not now")
+    table.client.request_world("pause")
+    assert table.outcomes.get(timeout=PATIENCE_S) == RequestOutcome("pause", "not now")
 
 
 def test_a_session_that_fails_is_a_refusal(table: Table):
-    table.desk.request_world("broken")
-    assert has_terms(table.told.get(timeout=PATIENCE_S).refusal, "session", "closed")
+    table.client.request_world("broken")
+    assert has_terms(table.outcomes.get(timeout=PATIENCE_S).refusal, "session", "closed")
 
 
 def test_whatever_goes_wrong_is_told(table: Table):
-    table.desk.request_world("wrong")
-    assert has_terms(table.told.get(timeout=PATIENCE_S).refusal, "ValueError", "no such thing")
+    table.client.request_world("wrong")
+    assert has_terms(table.outcomes.get(timeout=PATIENCE_S).refusal, "ValueError", "no such thing")
 
 
 def test_a_page_that_outlives_its_run_is_told_so(table: Table):
-    table.desk.close()
-    table.desk.request_world("pause")
-    table.desk.send_mode(["drone1"], "land")
-    outcomes = [table.told.get(timeout=PATIENCE_S) for _ in range(2)]
+    table.client.close()
+    table.client.request_world("pause")
+    table.client.send_mode(["drone1"], "land")
+    outcomes = [table.outcomes.get(timeout=PATIENCE_S) for _ in range(2)]
     assert [outcome.request for outcome in outcomes] == ["pause", "drone1: land"]
     assert all(has_terms(outcome.refusal, "run", "ended") for outcome in outcomes)
-    assert table.link.said == []
+    assert table.link.sent == []
 
 
 def test_a_drone_is_taken_told_and_given_back(table: Table):
-    table.desk.send_mode(["drone1"], "land")
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: land", "")
+    table.client.send_mode(["drone1"], "land")
+    assert table.outcomes.get(timeout=PATIENCE_S) == RequestOutcome("drone1: land", "")
     assert table.link.given_back.wait(PATIENCE_S)
-    acquire, (key, mode), release = table.link.said
+    acquire, (key, mode), release = table.link.sent
     assert acquire == ("world/control", "acquire", "console.1", {"drone": "drone1", "priority": PRIORITY})
     assert (key, mode.mode, mode.source, mode.t_ns, mode.seq) == ("drone/drone1/cmd/mode", "land", "console.1", 7, 0)
     assert release == ("world/control", "release", "console.1", {"drone": "drone1"})
@@ -133,101 +133,101 @@ def test_a_drone_is_taken_told_and_given_back(table: Table):
 
 def test_a_drone_that_another_operator_has_is_not_commanded(table: Table):
     table.link.refusals["acquire"] = "drone1 is flown by 'console.2' with priority 10"
-    table.desk.send_mode(["drone1"], "takeoff")
-    assert has_terms(table.told.get(timeout=PATIENCE_S).refusal, "drone1", "'console.2'", "10")
-    assert [said[1] for said in table.link.said] == ["acquire"]
+    table.client.send_mode(["drone1"], "takeoff")
+    assert has_terms(table.outcomes.get(timeout=PATIENCE_S).refusal, "drone1", "'console.2'", "10")
+    assert [entry[1] for entry in table.link.sent] == ["acquire"]
 
 
 def test_an_emergency_reaches_every_drone(table: Table):
     names = [f"drone{i}" for i in range(30)]
-    table.desk.send_mode(names, "emergency")
-    told = {table.told.get(timeout=PATIENCE_S) for _ in names}
-    assert told == {RequestOutcome(f"{name}: emergency", "") for name in names}
-    modes = [said for said in table.link.said if len(said) == 2]
+    table.client.send_mode(names, "emergency")
+    outcomes = {table.outcomes.get(timeout=PATIENCE_S) for _ in names}
+    assert outcomes == {RequestOutcome(f"{name}: emergency", "") for name in names}
+    modes = [entry for entry in table.link.sent if len(entry) == 2]
     assert {key for key, _ in modes} == {f"drone/{name}/cmd/mode" for name in names}
 
 
 def test_an_emergency_comes_before_whoever_flies(table: Table):
-    table.desk.send_mode(["drone1"], "emergency")
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: emergency", "")
+    table.client.send_mode(["drone1"], "emergency")
+    assert table.outcomes.get(timeout=PATIENCE_S) == RequestOutcome("drone1: emergency", "")
     args = {"drone": "drone1", "priority": PRIORITY_EMERGENCY}
-    assert table.link.said[0] == ("world/control", "acquire", "console.1", args)
+    assert table.link.sent[0] == ("world/control", "acquire", "console.1", args)
 
 
 def test_an_emergency_is_sent_even_where_the_drone_is_refused(table: Table):
     table.link.refusals["acquire"] = "drone1 is flown by 'console.2' with priority 100"
-    table.desk.send_mode(["drone1"], "emergency")
-    told = table.told.get(timeout=PATIENCE_S)
-    assert has_terms(told.refusal, "drone1", "'console.2'", "100", "emergency")
-    (mode,) = [said[1] for said in table.link.said if len(said) == 2]
+    table.client.send_mode(["drone1"], "emergency")
+    outcome = table.outcomes.get(timeout=PATIENCE_S)
+    assert has_terms(outcome.refusal, "drone1", "'console.2'", "100", "emergency")
+    (mode,) = [entry[1] for entry in table.link.sent if len(entry) == 2]
     assert mode.mode == "emergency"
 
 
 def test_an_emergency_does_not_wait_for_those_who_do_not_answer(table: Table):
     for _ in range(3 * THREADS_PER_POOL):
-        table.desk.request_cluster("main", "hangs")
-    table.desk.send_mode(["drone1"], "emergency")
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: emergency", "")
+        table.client.request_cluster("main", "hangs")
+    table.client.send_mode(["drone1"], "emergency")
+    assert table.outcomes.get(timeout=PATIENCE_S) == RequestOutcome("drone1: emergency", "")
     assert not table.link.answers.is_set()
     table.link.answers.set()
 
 
 def test_what_is_given_back_keeps_no_emergency_waiting(table: Table):
-    heard = threading.Event()
-    table.eyes.await_answer = lambda *_: heard.wait(PATIENCE_S)  # type: ignore[method-assign, assignment]
+    answered = threading.Event()
+    table.views.await_answer = lambda *_: answered.wait(PATIENCE_S)  # type: ignore[method-assign, assignment]
     names = [f"drone{i}" for i in range(3 * THREADS_PER_POOL)]
-    table.desk.send_mode(names, "land")
-    assert {table.told.get(timeout=PATIENCE_S).request for _ in names} == {f"{name}: land" for name in names}
-    table.desk.send_mode(names, "emergency")
-    assert {table.told.get(timeout=PATIENCE_S).request for _ in names} == {f"{name}: emergency" for name in names}
-    heard.set()
+    table.client.send_mode(names, "land")
+    assert {table.outcomes.get(timeout=PATIENCE_S).request for _ in names} == {f"{name}: land" for name in names}
+    table.client.send_mode(names, "emergency")
+    assert {table.outcomes.get(timeout=PATIENCE_S).request for _ in names} == {f"{name}: emergency" for name in names}
+    answered.set()
 
 
 def test_modes_of_one_drone_go_out_in_the_order_of_the_clicks(table: Table):
     table.link.held[PRIORITY] = threading.Event()
     for mode in ("reset", "takeoff", "land"):
-        table.desk.send_mode(["drone1"], mode)
+        table.client.send_mode(["drone1"], mode)
     assert table.link.acquiring.get(timeout=PATIENCE_S) == PRIORITY
-    table.desk.send_mode(["drone2"], "land")
+    table.client.send_mode(["drone2"], "land")
     table.link.acquiring.get(timeout=PATIENCE_S)
-    assert [said[3]["drone"] for said in table.link.said] == ["drone1", "drone2"]
+    assert [entry[3]["drone"] for entry in table.link.sent] == ["drone1", "drone2"]
     table.link.held[PRIORITY].set()
-    told = [table.told.get(timeout=PATIENCE_S).request for _ in range(4)]
-    assert [what for what in told if "drone1" in what] == ["drone1: reset", "drone1: takeoff", "drone1: land"]
-    sent = [said[1].mode for said in table.link.said if said[0] == "drone/drone1/cmd/mode"]
+    requests = [table.outcomes.get(timeout=PATIENCE_S).request for _ in range(4)]
+    assert [what for what in requests if "drone1" in what] == ["drone1: reset", "drone1: takeoff", "drone1: land"]
+    sent = [entry[1].mode for entry in table.link.sent if entry[0] == "drone/drone1/cmd/mode"]
     assert sent == ["reset", "takeoff", "land"]
 
 
 def test_nothing_that_was_asked_for_before_an_emergency_is_sent_after_it(table: Table):
     table.link.held[PRIORITY] = threading.Event()
-    table.desk.send_mode(["drone1"], "takeoff")
+    table.client.send_mode(["drone1"], "takeoff")
     assert table.link.acquiring.get(timeout=PATIENCE_S) == PRIORITY
-    table.desk.send_mode(["drone1"], "land")
-    table.desk.send_mode(["drone1"], "emergency")
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: emergency", "")
+    table.client.send_mode(["drone1"], "land")
+    table.client.send_mode(["drone1"], "emergency")
+    assert table.outcomes.get(timeout=PATIENCE_S) == RequestOutcome("drone1: emergency", "")
     table.link.held[PRIORITY].set()
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: takeoff", OVERTAKEN)
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: land", OVERTAKEN)
+    assert table.outcomes.get(timeout=PATIENCE_S) == RequestOutcome("drone1: takeoff", OVERTAKEN)
+    assert table.outcomes.get(timeout=PATIENCE_S) == RequestOutcome("drone1: land", OVERTAKEN)
     assert table.link.modes == ["emergency"]
 
 
 def test_the_end_of_an_emergency_comes_after_it(table: Table):
     table.link.held[PRIORITY_EMERGENCY] = threading.Event()
-    table.desk.send_mode(["drone1"], "emergency")
+    table.client.send_mode(["drone1"], "emergency")
     assert table.link.acquiring.get(timeout=PATIENCE_S) == PRIORITY_EMERGENCY
-    table.desk.send_mode(["drone1"], "reset")
-    table.desk.send_mode(["drone2"], "land")
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone2: land", "")
+    table.client.send_mode(["drone1"], "reset")
+    table.client.send_mode(["drone2"], "land")
+    assert table.outcomes.get(timeout=PATIENCE_S) == RequestOutcome("drone2: land", "")
     table.link.held[PRIORITY_EMERGENCY].set()
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: emergency", "")
-    assert table.told.get(timeout=PATIENCE_S) == RequestOutcome("drone1: reset", "")
+    assert table.outcomes.get(timeout=PATIENCE_S) == RequestOutcome("drone1: emergency", "")
+    assert table.outcomes.get(timeout=PATIENCE_S) == RequestOutcome("drone1: reset", "")
     assert table.link.modes == ["land", "emergency", "reset"]
 
 
 def test_who_presses_emergency_again_and_again_does_not_keep_it_from_being_sent(table: Table):
     table.link.held[PRIORITY_EMERGENCY] = threading.Event()
     for _ in range(3):
-        table.desk.send_mode(["drone1"], "emergency")
+        table.client.send_mode(["drone1"], "emergency")
     table.link.held[PRIORITY_EMERGENCY].set()
-    assert {table.told.get(timeout=PATIENCE_S) for _ in range(3)} == {RequestOutcome("drone1: emergency", "")}
+    assert {table.outcomes.get(timeout=PATIENCE_S) for _ in range(3)} == {RequestOutcome("drone1: emergency", "")}
     assert table.link.modes == ["emergency"] * 3

@@ -1,4 +1,4 @@
-"""The console's pure parts: what is drawn, how far a slider goes, what is typed, who may pass, what is said in words."""
+"""The console's pure parts: what is drawn, how far a slider goes, what is typed, who may pass, the texts."""
 
 import math
 import socket
@@ -461,15 +461,15 @@ def controls(switches: set[str] | None = None, **values: Any) -> PageControls:
 )
 def test_a_control_takes_what_its_page_could_put_into_it(now: Any, good: list[Any], bad: list[Any]):
     there = controls(a=now)
-    said = {value: msgspec.msgpack.encode({**UPDATE, "updates": {"value": value}}) for value in good}
-    assert all(is_permitted(said[value], OPERATOR, there) for value in good)
+    change = {value: msgspec.msgpack.encode({**UPDATE, "updates": {"value": value}}) for value in good}
+    assert all(is_permitted(change[value], OPERATOR, there) for value in good)
     for value in bad:
         assert not is_permitted(msgspec.msgpack.encode({**UPDATE, "updates": {"value": value}}), OPERATOR, there)
-    assert not is_permitted(said[good[0]], OPERATOR, controls(b=now))
+    assert not is_permitted(change[good[0]], OPERATOR, controls(b=now))
 
 
 @pytest.mark.parametrize(
-    "said",
+    "change",
     [
         msgspec.msgpack.encode({"type": "ShareUrlRequest"}),  # would show the page on the Internet
         msgspec.msgpack.encode({"type": "FileTransferStartUpload"}),
@@ -488,8 +488,8 @@ def test_a_control_takes_what_its_page_could_put_into_it(now: Any, good: list[An
         msgspec.msgpack.encode({**UPDATE, "updates": {"value": "x" * 200_000}}),
     ],
 )
-def test_nobody_says_what_no_control_says(said: bytes):
-    assert not is_permitted(said, OPERATOR, controls(a=True))
+def test_nobody_says_what_no_control_says(change: bytes):
+    assert not is_permitted(change, OPERATOR, controls(a=True))
 
 
 # In words
@@ -497,22 +497,22 @@ def test_nobody_says_what_no_control_says(said: bytes):
 
 def test_tables_show_text_of_others_as_text():
     row = console_tables.DroneRow("d1", "flying", 12.0, 400.0, "<script>", "3 / 1", ("gps_dropout",))
-    told = console_tables.drone_table([row])
-    assert "<script>" not in told
-    assert "&lt;script&gt;" in told
-    assert "gps_dropout" in told
-    assert told.count(console_tables.AMBER) == 2  # late, and a fault
-    assert console_tables.RED in told  # the battery
+    html = console_tables.drone_table([row])
+    assert "<script>" not in html
+    assert "&lt;script&gt;" in html
+    assert "gps_dropout" in html
+    assert html.count(console_tables.AMBER) == 2  # late, and a fault
+    assert console_tables.RED in html  # the battery
     events = console_tables.event_table([Event(1_500_000_000, 0, "refused", "x", "y", "<b>no</b>")])
     assert "1.50" in events
     assert "&lt;b&gt;no" in events
 
 
 def test_many_formations_leave_room_for_the_emergency_button():
-    told = console_tables.formation_lines({f"c{i}": ("taking_off", "<waits>") for i in range(16)})
-    assert console_tables.FEW_LINES in told
-    assert told.count("<br>") == 15
-    assert has_terms(without_tags(told), "taking off", "&lt;waits&gt")
+    html = console_tables.formation_lines({f"c{i}": ("taking_off", "<waits>") for i in range(16)})
+    assert console_tables.FEW_LINES in html
+    assert html.count("<br>") == 15
+    assert has_terms(without_tags(html), "taking off", "&lt;waits&gt")
 
 
 def test_the_clock_says_whom_the_run_waits_for():

@@ -71,7 +71,7 @@ class Link:
 
 
 class Seen:
-    """A run on a page: what is said of it, a picture after the other."""
+    """A run on a page: its messages, a picture after the other."""
 
     def __init__(self, server: Any, watched: bool) -> None:
         self.link: Any = Link()
@@ -85,13 +85,13 @@ class Seen:
         server.get_clients = lambda: {0: None} if watched else {}
         self.show = RunPage(server, self.link, info, self.observer, CameraFollow(server), 1000.0)
 
-    def draw(self, *said: tuple[str, Any]) -> dict[str, Any]:
+    def draw(self, *samples: tuple[str, Any]) -> dict[str, Any]:
         """Say something, draw a picture, and return what is shown."""
         turns = iter((False, True))
 
         def stopped() -> bool:
             over = next(turns)
-            for key, message in () if over else said:
+            for key, message in () if over else samples:
                 self.link.say(SimpleNamespace(key=key, payload=messages.encode(message)))
             return over
 
@@ -335,12 +335,12 @@ def test_cameras_follow_where_their_page_says_so():
 
 def test_what_formations_were_asked_for_is_among_the_events_and_refusals_on_every_page(seen: Seen):
     seen.show._server.get_clients = dict  # type: ignore[assignment]  # nobody looks
-    for told in (
+    for outcome in (
         RequestOutcome("main: takeoff", ""),
         RequestOutcome("rate value 2", ""),
         RequestOutcome("main", "not yet"),
     ):
-        seen.show._on_outcome(told)
+        seen.show._on_outcome(outcome)
     found = [(event.kind, event.text) for event in seen.show.views.events]
     assert [kind for kind, _ in found] == ["refused", "control"]
     assert found[0][1] == "main: not yet"

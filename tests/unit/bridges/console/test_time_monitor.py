@@ -1,4 +1,4 @@
-"""What the console hears of a run: its time, or silence; estimators, alive or dead; faults; what is said of them."""
+"""What the console receives of a run: its time, or silence; estimators, alive or dead; faults; the texts on them."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -49,8 +49,8 @@ class Link:
             self.say = callback
 
 
-class Ears:
-    """Eyes and a watch on a run of two drones, and a wall clock that only the test moves."""
+class MonitoredRun:
+    """View buffer and time monitor of a run of two drones, and a wall clock that only the test moves."""
 
     def __init__(self, stamp_age_s: float = 0.1) -> None:
         self.wall_s = 100.0
@@ -59,13 +59,13 @@ class Ears:
         names = ("drone1", "drone2")
         info: Any = SimpleNamespace(run_id="r1", drones=[SimpleNamespace(name=name) for name in names])
         self.observer = ObserverProcess(self.link, info, "console.1")
-        self.watch = TimeMonitor(self.link, self.observer, stamp_age_s, lambda: self.wall_s)
+        self.monitor = TimeMonitor(self.link, self.observer, stamp_age_s, lambda: self.wall_s)
         self.views = ViewBuffer(self.link, info, self.observer, {}, self.refused.append, lambda: self.wall_s)
         self.words = TableRows(self.views, {})
         self.views.open()
 
-    def hear(self, *said: tuple[str, Any]) -> None:
-        for key, message in said:
+    def deliver(self, *samples: tuple[str, Any]) -> None:
+        for key, message in samples:
             self.link.say(sample(key, message))
         self.views.update()
 
@@ -96,137 +96,139 @@ def health(process: str = "estimator.drone1", lag_ns: int = 0) -> tuple[str, Hea
 
 
 def test_a_stamp_is_of_the_present_however_fast_the_run():
-    ears = Ears(stamp_age_s=0.1)
-    ears.link.now = clock(1 * S, rate=4.0)
-    assert ears.watch.now_ns() == 1 * S
-    ears.link.now = clock(2 * S, rate=4.0)
-    ears.wall_s += 0.02  # 80 ms of the run
-    assert ears.watch.now_ns() == 1 * S
-    ears.wall_s += 0.01
-    assert ears.watch.now_ns() == 2 * S
-    assert ears.link.asked == 2
+    monitored = MonitoredRun(stamp_age_s=0.1)
+    monitored.link.now = clock(1 * S, rate=4.0)
+    assert monitored.monitor.now_ns() == 1 * S
+    monitored.link.now = clock(2 * S, rate=4.0)
+    monitored.wall_s += 0.02  # 80 ms of the run
+    assert monitored.monitor.now_ns() == 1 * S
+    monitored.wall_s += 0.01
+    assert monitored.monitor.now_ns() == 2 * S
+    assert monitored.link.asked == 2
 
 
 def test_where_no_stamp_is_too_old_nobody_is_asked():
-    ears = Ears(stamp_age_s=float("inf"))
-    ears.wall_s += 1000.0
-    assert ears.watch.now_ns() == 0
-    assert ears.link.asked == 0
+    monitored = MonitoredRun(stamp_age_s=float("inf"))
+    monitored.wall_s += 1000.0
+    assert monitored.monitor.now_ns() == 0
+    assert monitored.link.asked == 0
 
 
 def test_a_stamp_is_given_also_where_the_world_answers_nothing():
-    ears = Ears()
-    ears.link.now = clock(1 * S)
-    ears.watch.poll()
-    ears.link.now = None
-    ears.wall_s += 60.0
-    assert ears.watch.now_ns() == 1 * S
+    monitored = MonitoredRun()
+    monitored.link.now = clock(1 * S)
+    monitored.monitor.poll()
+    monitored.link.now = None
+    monitored.wall_s += 60.0
+    assert monitored.monitor.now_ns() == 1 * S
 
 
 @pytest.mark.parametrize("garbage", [b"", b"\xc1", b"\x80", messages.encode(drones(0)[1])])
 def test_a_foreign_answer_is_no_clock(garbage: bytes):
-    ears = Ears()
-    ears.link.now = garbage
-    ears.watch.poll()
-    assert ears.watch.clock is None
-    assert ears.observer.health.refused == 1
-    ears.link.now = clock(3 * S)
-    ears.watch.poll()
-    ears.link.now = garbage
-    ears.watch.poll()
-    assert ears.watch.clock == clock(3 * S)
+    monitored = MonitoredRun()
+    monitored.link.now = garbage
+    monitored.monitor.poll()
+    assert monitored.monitor.clock is None
+    assert monitored.observer.health.refused == 1
+    monitored.link.now = clock(3 * S)
+    monitored.monitor.poll()
+    monitored.link.now = garbage
+    monitored.monitor.poll()
+    assert monitored.monitor.clock == clock(3 * S)
 
 
 def test_the_end_of_a_run_is_heard():
     for now, over in ((clock(0, run_id="r2"), "another run"), (clock(0, state="stopped"), "the run ended")):
-        ears = Ears()
-        ears.link.now = now
-        ears.watch.poll()
-        assert over in ears.observer.end_reason
+        monitored = MonitoredRun()
+        monitored.link.now = now
+        monitored.monitor.poll()
+        assert over in monitored.observer.end_reason
 
 
 def test_silence_of_the_world_is_told_and_for_how_long():
-    ears = Ears()
-    with ears.watch.polling():
-        ears.wall_s += SILENT_S - 0.1
-        assert ears.watch.silent_s == 0.0
-        ears.wall_s += 10.0
-        assert ears.watch.silent_s == pytest.approx(SILENT_S + 9.9)
-        ears.link.now = clock(1 * S)
-        ears.watch.poll()
-        assert ears.watch.silent_s == 0.0
-        ears.link.now = None
-        ears.watch.poll()
-        ears.wall_s += 5.0
-        told = console_state("r1", ears.views, ears.watch, {})
-        assert told["clock"] == "silent"
-        assert told["silent_s"] >= 5.0
-    assert ears.watch.silent_s == 0.0  # nobody is asked any more
-    assert console_state("r1", ears.views, ears.watch, {})["clock"] == "running"
+    monitored = MonitoredRun()
+    with monitored.monitor.polling():
+        monitored.wall_s += SILENT_S - 0.1
+        assert monitored.monitor.silent_s == 0.0
+        monitored.wall_s += 10.0
+        assert monitored.monitor.silent_s == pytest.approx(SILENT_S + 9.9)
+        monitored.link.now = clock(1 * S)
+        monitored.monitor.poll()
+        assert monitored.monitor.silent_s == 0.0
+        monitored.link.now = None
+        monitored.monitor.poll()
+        monitored.wall_s += 5.0
+        shown = console_state("r1", monitored.views, monitored.monitor, {})
+        assert shown["clock"] == "silent"
+        assert shown["silent_s"] >= 5.0
+    assert monitored.monitor.silent_s == 0.0  # nobody is asked any more
+    assert console_state("r1", monitored.views, monitored.monitor, {})["clock"] == "running"
 
 
 def test_a_silent_world_is_not_called_running():
-    told = console_tables.clock_line(clock(7 * S), 7 * S, 12.3)
-    assert has_terms(without_tags(told), "no answer", "12 s")
-    assert console_tables.RED in told
-    assert "running" not in told
+    shown = console_tables.clock_line(clock(7 * S), 7 * S, 12.3)
+    assert has_terms(without_tags(shown), "no answer", "12 s")
+    assert console_tables.RED in shown
+    assert "running" not in shown
 
 
 # Estimators
 
 
 def test_a_dead_estimator_is_not_shown_as_a_healthy_one():
-    ears = Ears()
+    monitored = MonitoredRun()
     for second in range(3):
-        ears.hear(drones(second * S), estimate(second * S, used=5 * second), health())
-        ears.words.sensor_table("drone1")
-        ears.wall_s += 1.0
-    assert "5 Hz" in ears.words.sensor_table("drone1")
-    assert ears.words.drone_rows()[0].lag_ms == 0.0
-    ears.wall_s += 8.0
-    ears.hear(drones(10 * S))
-    assert ears.words.drone_rows()[0].lag_ms == 8000.0
-    told = ears.words.sensor_table("drone1")
-    assert has_terms(without_tags(told), "no estimate", "2.0 s")
-    assert "Hz" not in told
-    assert not ears.views.estimates()["drone1"].fresh
-    assert console_state("r1", ears.views, ears.watch, {})["drones"][0]["sigma_m"] is None
+        monitored.deliver(drones(second * S), estimate(second * S, used=5 * second), health())
+        monitored.words.sensor_table("drone1")
+        monitored.wall_s += 1.0
+    assert "5 Hz" in monitored.words.sensor_table("drone1")
+    assert monitored.words.drone_rows()[0].lag_ms == 0.0
+    monitored.wall_s += 8.0
+    monitored.deliver(drones(10 * S))
+    assert monitored.words.drone_rows()[0].lag_ms == 8000.0
+    shown = monitored.words.sensor_table("drone1")
+    assert has_terms(without_tags(shown), "no estimate", "2.0 s")
+    assert "Hz" not in shown
+    assert not monitored.views.estimates()["drone1"].fresh
+    assert console_state("r1", monitored.views, monitored.monitor, {})["drones"][0]["sigma_m"] is None
 
 
 def test_in_a_fast_run_a_view_may_be_seconds_older_than_another():
-    ears = Ears()
-    ears.hear(estimate(1 * S), health())
-    ears.wall_s += 0.05
-    ears.hear(drones(9 * S))
-    assert ears.views.estimates()["drone1"].fresh
-    assert ears.words.drone_rows()[0].lag_ms == 0.0
+    monitored = MonitoredRun()
+    monitored.deliver(estimate(1 * S), health())
+    monitored.wall_s += 0.05
+    monitored.deliver(drones(9 * S))
+    assert monitored.views.estimates()["drone1"].fresh
+    assert monitored.words.drone_rows()[0].lag_ms == 0.0
 
 
 def test_in_a_slow_run_a_view_may_be_seconds_old():
-    ears = Ears()
-    ears.hear(estimate(1 * S))
-    ears.wall_s += 9.0
-    ears.hear(drones(1 * S + S // 2))
-    assert ears.views.estimates()["drone1"].fresh
+    monitored = MonitoredRun()
+    monitored.deliver(estimate(1 * S))
+    monitored.wall_s += 9.0
+    monitored.deliver(drones(1 * S + S // 2))
+    assert monitored.views.estimates()["drone1"].fresh
 
 
 def test_what_was_believed_before_a_replay_went_back_is_left_out():
-    ears = Ears()
-    ears.hear(drones(60 * S), estimate(60 * S))
-    ears.wall_s += 5.0
-    ears.hear(drones(10 * S))
-    assert ears.views.estimates() == {}
+    monitored = MonitoredRun()
+    monitored.deliver(drones(60 * S), estimate(60 * S))
+    monitored.wall_s += 5.0
+    monitored.deliver(drones(10 * S))
+    assert monitored.views.estimates() == {}
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_of_two_estimators_of_one_drone_the_later_is_shown(order: tuple[int, int]):
-    ears = Ears()
-    said = (estimate(1 * S, "estimator.old", used=1), estimate(2 * S, "estimator.new", used=2))
-    ears.hear(drones(2 * S), *(said[i] for i in order), health("estimator.new", 3_000_000), health("estimator.old"))
-    assert ears.views.estimates()["drone1"].process == "estimator.new"
-    assert ears.words.drone_rows()[0].gps == "2 / 0"
-    assert ears.words.drone_rows()[0].lag_ms == 3.0
-    assert "<td align=left>2</td>" in ears.words.sensor_table("drone1")
+    monitored = MonitoredRun()
+    samples = (estimate(1 * S, "estimator.old", used=1), estimate(2 * S, "estimator.new", used=2))
+    monitored.deliver(
+        drones(2 * S), *(samples[i] for i in order), health("estimator.new", 3_000_000), health("estimator.old")
+    )
+    assert monitored.views.estimates()["drone1"].process == "estimator.new"
+    assert monitored.words.drone_rows()[0].gps == "2 / 0"
+    assert monitored.words.drone_rows()[0].lag_ms == 3.0
+    assert "<td align=left>2</td>" in monitored.words.sensor_table("drone1")
 
 
 def test_a_covariance_that_is_none_has_no_sigma():
@@ -240,27 +242,27 @@ def test_faults_are_shown_on_a_drone_while_they_act():
     planned = Fault(1, "gps_bias", "drone1", {}, 20 * S)
     acting = Fault(2, "gps_dropout", "drone1", {}, 5 * S, 15 * S)
     ended = Fault(3, "motor", "drone1", {}, 0, 10 * S)
-    ears = Ears()
-    ears.hear(drones(10 * S), (keys.FAULTS, Faults(0, 0, (planned, acting, ended))))
-    assert ears.words.drone_rows()[0].faults == ("gps_dropout",)
-    assert ears.words.drone_rows()[1].faults == ()
-    told = console_state("r1", ears.views, ears.watch, {})["faults"]
-    assert [(fault["from_s"], fault["until_s"]) for fault in told] == [(20.0, None), (5.0, 15.0), (0.0, 10.0)]
+    monitored = MonitoredRun()
+    monitored.deliver(drones(10 * S), (keys.FAULTS, Faults(0, 0, (planned, acting, ended))))
+    assert monitored.words.drone_rows()[0].faults == ("gps_dropout",)
+    assert monitored.words.drone_rows()[1].faults == ()
+    shown = console_state("r1", monitored.views, monitored.monitor, {})["faults"]
+    assert [(fault["from_s"], fault["until_s"]) for fault in shown] == [(20.0, None), (5.0, 15.0), (0.0, 10.0)]
 
 
 def test_faults_that_were_heard_are_not_replaced_by_an_older_answer():
-    ears = Ears()
+    monitored = MonitoredRun()
     newer = Fault(2, "gps_dropout", "drone1", {}, 0)
-    ears.link.last, ears.link.meanwhile = Faults(0, 0, ()), Faults(0, 1, (newer,))
-    ears.views.open()
-    ears.views.update()
-    assert ears.views.faults == (newer,)
+    monitored.link.last, monitored.link.meanwhile = Faults(0, 0, ()), Faults(0, 1, (newer,))
+    monitored.views.open()
+    monitored.views.update()
+    assert monitored.views.faults == (newer,)
 
 
 def test_the_console_hears_what_is_refused_of_its_own():
-    ears = Ears()
+    monitored = MonitoredRun()
     for kind, source in (("refused", "console.2"), ("command", "console.1"), ("refused", "console.1")):
         event = Event(0, 0, kind, source, "drone/drone1/cmd/mode", "no")
-        ears.link.tell(sample(keys.EVENT, event))
-    assert [(event.kind, event.source) for event in ears.refused] == [("refused", "console.1")]
-    assert ears.views.answered_commands("drone1") == 2
+        monitored.link.tell(sample(keys.EVENT, event))
+    assert [(event.kind, event.source) for event in monitored.refused] == [("refused", "console.1")]
+    assert monitored.views.answered_commands("drone1") == 2

@@ -127,18 +127,18 @@ def test_what_is_refused_takes_no_number():
 def test_last_values_are_the_newest_of_what_passed():
     drones = ("drone1", "drone2")
     values, table = LastValues(key_table(drones)), key_table(drones)
-    said = [
+    entries = [
         ("drone/drone1/sensor/imu", messages.encode(Imu(20, 1, 20, (0.0, 0.0, 9.8), (0.0, 0.0, 0.0)))),
         ("drone/drone1/sensor/status", messages.encode(Status(20, 1, "landed", 99.0, False, None, 2))),
     ]
     values.add("drone/drone1/sensor/imu", b"old")
     values.add_passed("clock", b"now")
-    values.add_gate(GateMessages.of(20, 1, table, said))
-    assert values.matching("drone/drone1/sensor/*") == said
-    assert values.matching("zsim/drone/*/sensor/imu", "zsim/") == said[:1]
+    values.add_gate(GateMessages.of(20, 1, table, entries))
+    assert values.matching("drone/drone1/sensor/*") == entries
+    assert values.matching("zsim/drone/*/sensor/imu", "zsim/") == entries[:1]
     assert values.matching("other/clock", "zsim/") == []
     assert values.matching("drone/drone2/**") == []
-    assert [key for key, _ in values.matching("**")] == ["clock", *(key for key, _ in said)]
+    assert [key for key, _ in values.matching("**")] == ["clock", *(key for key, _ in entries)]
 
 
 def test_values_of_ones_own_have_a_bound_in_bytes(monkeypatch: pytest.MonkeyPatch):
@@ -156,22 +156,22 @@ def test_values_of_ones_own_have_a_bound_in_bytes(monkeypatch: pytest.MonkeyPatc
 
 
 def test_an_echo_does_not_undo_what_was_said_since():
-    def heard(payload: bytes) -> list[bytes]:
+    def echoed(payload: bytes) -> list[bytes]:
         values.add_passed("my/own", payload)
-        return [said for _, said in values.matching("my/own")]
+        return [entries for _, entries in values.matching("my/own")]
 
     values = LastValues(key_table(("drone1",)))
     values.add_own("my/own", b"1", "text/plain")
     values.add_own("my/own", b"2", "text/plain")
-    assert (heard(b"1"), values.encoding("my/own")) == ([b"2"], "text/plain")
-    assert heard(b"other") == [b"other"]  # it came to the world before ours
-    assert heard(b"2") == [b"2"]
+    assert (echoed(b"1"), values.encoding("my/own")) == ([b"2"], "text/plain")
+    assert echoed(b"other") == [b"other"]  # it came to the world before ours
+    assert echoed(b"2") == [b"2"]
     values.add_own("my/own", b"3")
     values.drop("my/own")
-    assert heard(b"3") == []
-    assert heard(b"3") == [b"3"]  # somebody else's
+    assert echoed(b"3") == []
+    assert echoed(b"3") == [b"3"]  # somebody else's
     values.drop("my/own")
-    assert heard(b"3") == [b"3"]
+    assert echoed(b"3") == [b"3"]
 
 
 def test_an_echo_that_never_came_is_forgotten_with_the_next():
@@ -300,9 +300,9 @@ def test_a_client_that_floods_is_slowed_down_and_told():
             await client.handle_line(b'{"op": "hello"}')
         return await outbox.take()
 
-    said = [json.loads(line) for line in asyncio.run(flood())]
-    assert [message["op"] for message in said] == ["hello"] * 3 + ["error"]
-    assert "1.000 s" in said[-1]["error"]
+    entries = [json.loads(line) for line in asyncio.run(flood())]
+    assert [message["op"] for message in entries] == ["hello"] * 3 + ["error"]
+    assert "1.000 s" in entries[-1]["error"]
 
 
 def test_a_fault_of_ours_is_an_answer_and_a_line_for_a_person():
@@ -446,8 +446,8 @@ def test_an_invalid_join_is_refused_by_its_field(given: dict[str, Any], terms: t
     ],
 )
 def test_values_are_described_as_the_plugin_does(encoding: str, payload: bytes, value: Any):
-    said = described_sample(RawSample("PUT", "zsim/a", payload, encoding, None))
-    assert said == {"key": "zsim/a", "value": value, "encoding": encoding, "timestamp": None}
+    entries = described_sample(RawSample("PUT", "zsim/a", payload, encoding, None))
+    assert entries == {"key": "zsim/a", "value": value, "encoding": encoding, "timestamp": None}
 
 
 def test_a_refusal_of_zenohs_has_the_key_error():

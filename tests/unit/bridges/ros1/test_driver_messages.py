@@ -48,18 +48,18 @@ def navdata(state: Any = "hovering", **angles: float) -> Any:
 
 
 def test_navdata_has_the_units_of_the_driver():
-    said = navdata()
-    assert said.batteryPercent == 87.5
-    assert said.altd == 1234  # mm
-    assert (said.vx, said.vy, said.vz) == (1000.0, 250.0, 500.0)  # mm/s, forward, left, up
-    assert (said.ax, said.ay, said.az) == (0.0, 0.0, 1.0)  # g
-    assert said.pressure == 101_325  # Pa
-    assert (said.magX, said.magY, said.magZ) == (10, 0, -13)  # 0.3 uT each
-    assert said.tm == pytest.approx(61_040_000.0)  # us
-    assert said.tags_count == 0
-    assert (said.header.stamp.sec, said.header.stamp.nanosec) == (61, 40_000_000)
-    assert said.header.frame_id == "drone1/ardrone_base_link"
-    assert said.header.seq == 3
+    message = navdata()
+    assert message.batteryPercent == 87.5
+    assert message.altd == 1234  # mm
+    assert (message.vx, message.vy, message.vz) == (1000.0, 250.0, 500.0)  # mm/s, forward, left, up
+    assert (message.ax, message.ay, message.az) == (0.0, 0.0, 1.0)  # g
+    assert message.pressure == 101_325  # Pa
+    assert (message.magX, message.magY, message.magZ) == (10, 0, -13)  # 0.3 uT each
+    assert message.tm == pytest.approx(61_040_000.0)  # us
+    assert message.tags_count == 0
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (61, 40_000_000)
+    assert message.header.frame_id == "drone1/ardrone_base_link"
+    assert message.header.seq == 3
 
 
 def test_rolling_to_the_right_is_positive():
@@ -86,30 +86,30 @@ def test_states_have_the_numbers_of_the_sdk(state, number):
 def test_an_aircraft_that_has_said_little_has_navdata_too():
     own = OnboardState()
     own.update(flight_messages.Status(0, 0, "landed", 100.0, False, None, 1))
-    said = driver_messages.navdata(0, own, FRAMES)
-    assert (said.altd, said.vx, said.pressure, said.az) == (0, 0.0, 0, 0.0)
-    tcpros.serialize("ardrone_autonomy/Navdata", said)
+    message = driver_messages.navdata(0, own, FRAMES)
+    assert (message.altd, message.vx, message.pressure, message.az) == (0, 0.0, 0, 0.0)
+    tcpros.serialize("ardrone_autonomy/Navdata", message)
 
 
 def test_an_imu_tells_specific_force_rate_and_attitude():
     own = aircraft(yaw_deg=90.0)
     assert own.imu is not None
-    said = driver_messages.imu(0, own.imu, own.attitude, FRAMES)
-    assert said.linear_acceleration.z == pytest.approx(9.80665)
-    assert (said.angular_velocity.x, said.angular_velocity.y, said.angular_velocity.z) == (0.1, 0.2, 0.3)
-    assert (said.orientation.w, said.orientation.z) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
-    assert tcpros.serialize("sensor_msgs/Imu", said)
+    message = driver_messages.imu(0, own.imu, own.attitude, FRAMES)
+    assert message.linear_acceleration.z == pytest.approx(9.80665)
+    assert (message.angular_velocity.x, message.angular_velocity.y, message.angular_velocity.z) == (0.1, 0.2, 0.3)
+    assert (message.orientation.w, message.orientation.z) == pytest.approx((math.sqrt(0.5), math.sqrt(0.5)))
+    assert tcpros.serialize("sensor_msgs/Imu", message)
 
 
 def test_the_magnetic_field_is_a_direction():
-    said = driver_messages.mag(0, messages.Mag(T_NS, 0, T_NS - 5_000_000, (3.0, 0.0, -4.0)), FRAMES)
-    assert (said.vector.x, said.vector.y, said.vector.z) == pytest.approx((0.6, 0.0, -0.8))
-    assert said.header.stamp.nanosec == 35_000_000  # of the sample, not of its arrival
+    message = driver_messages.mag(0, messages.Mag(T_NS, 0, T_NS - 5_000_000, (3.0, 0.0, -4.0)), FRAMES)
+    assert (message.vector.x, message.vector.y, message.vector.z) == pytest.approx((0.6, 0.0, -0.8))
+    assert message.header.stamp.nanosec == 35_000_000  # of the sample, not of its arrival
 
 
 def test_no_magnetic_field_is_no_direction():
-    said = driver_messages.mag(0, messages.Mag(0, 0, 0, (0.0, 0.0, 0.0)), FRAMES)
-    assert (said.vector.x, said.vector.y, said.vector.z) == (0.0, 0.0, 0.0)
+    message = driver_messages.mag(0, messages.Mag(0, 0, 0, (0.0, 0.0, 0.0)), FRAMES)
+    assert (message.vector.x, message.vector.y, message.vector.z) == (0.0, 0.0, 0.0)
 
 
 def gps(fix: int) -> messages.Gps:
@@ -119,11 +119,11 @@ def gps(fix: int) -> messages.Gps:
 
 
 def test_a_fix_is_where_and_how_well():
-    said = driver_messages.fix(0, gps(3), FRAMES)
-    assert (said.latitude, said.longitude, said.altitude) == (-34.6, -58.4, 31.0)
-    assert said.status.status == 0
-    assert said.position_covariance.tolist() == [4.0, 0, 0, 0, 4.0, 0, 0, 0, 4.0]
-    assert tcpros.serialize("sensor_msgs/NavSatFix", said)
+    message = driver_messages.fix(0, gps(3), FRAMES)
+    assert (message.latitude, message.longitude, message.altitude) == (-34.6, -58.4, 31.0)
+    assert message.status.status == 0
+    assert message.position_covariance.tolist() == [4.0, 0, 0, 0, 4.0, 0, 0, 0, 4.0]
+    assert tcpros.serialize("sensor_msgs/NavSatFix", message)
 
 
 def test_no_fix_is_said():
@@ -131,22 +131,22 @@ def test_no_fix_is_said():
 
 
 def test_odometry_is_the_aircraft_s_own():
-    said = driver_messages.odometry(0, aircraft(), FRAMES)
-    assert (said.header.frame_id, said.child_frame_id) == ("drone1/odom", "drone1/ardrone_base_link")
-    assert said.pose.pose.position.z == pytest.approx(1.234)
-    assert (said.twist.twist.linear.x, said.twist.twist.linear.y) == (1.0, 0.25)
-    assert tcpros.serialize("nav_msgs/Odometry", said)
+    message = driver_messages.odometry(0, aircraft(), FRAMES)
+    assert (message.header.frame_id, message.child_frame_id) == ("drone1/odom", "drone1/ardrone_base_link")
+    assert message.pose.pose.position.z == pytest.approx(1.234)
+    assert (message.twist.twist.linear.x, message.twist.twist.linear.y) == (1.0, 0.25)
+    assert tcpros.serialize("nav_msgs/Odometry", message)
 
 
 def test_ground_truth_is_in_the_world():
     truth = flight_messages.Truth(
         T_NS, 0, (1.0, 2.0, 3.0), (0.0, 4.0, 0.0), attitude(yaw_deg=90.0), (1.0, 0.0, 0.5), ZERO, STILL
     )  # fmt: skip
-    said = driver_messages.ground_truth(0, truth, FRAMES)
-    assert said.header.frame_id == "world"
-    assert (said.pose.pose.position.x, said.pose.pose.position.y, said.pose.pose.position.z) == (1.0, 2.0, 3.0)
-    assert (said.twist.twist.linear.x, said.twist.twist.linear.y) == (0.0, 4.0)
-    rate = said.twist.twist.angular  # rolling about the nose, which points north
+    message = driver_messages.ground_truth(0, truth, FRAMES)
+    assert message.header.frame_id == "world"
+    assert (message.pose.pose.position.x, message.pose.pose.position.y, message.pose.pose.position.z) == (1.0, 2.0, 3.0)
+    assert (message.twist.twist.linear.x, message.twist.twist.linear.y) == (0.0, 4.0)
+    rate = message.twist.twist.angular  # rolling about the nose, which points north
     assert (rate.x, rate.y, rate.z) == pytest.approx((0.0, 1.0, 0.5))
 
 
@@ -169,5 +169,5 @@ def test_transforms_without_an_estimator_end_at_odom():
 
 
 def test_the_clock_is_simulated_time():
-    said = driver_messages.clock(run_messages.Clock(T_NS, 0, "run", 3052, "running", 1.0))
-    assert (said.clock.sec, said.clock.nanosec) == (61, 40_000_000)
+    message = driver_messages.clock(run_messages.Clock(T_NS, 0, "run", 3052, "running", 1.0))
+    assert (message.clock.sec, message.clock.nanosec) == (61, 40_000_000)

@@ -29,10 +29,10 @@ class Graph:
 
     def __init__(self) -> None:
         self.master = Master()
-        self.said: list[str] = []
+        self.lines: list[str] = []
 
     def node(self, name: str) -> Ros1Node:
-        return Ros1Node(name, self.master.uri, "127.0.0.1", self.said.append)
+        return Ros1Node(name, self.master.uri, "127.0.0.1", self.lines.append)
 
     def restart(self) -> None:
         """Let the master forget everything."""
@@ -46,12 +46,12 @@ class Graph:
 
     async def port(self, topic: str) -> int:
         """Return where a topic is to be had."""
-        code, _, door = await call(await self.uri(topic), "requestTopic", topic, [["TCPROS"]])
-        assert (code, door[:2]) == (1, ["TCPROS", "127.0.0.1"])
-        return door[2]
+        code, _, address = await call(await self.uri(topic), "requestTopic", topic, [["TCPROS"]])
+        assert (code, address[:2]) == (1, ["TCPROS", "127.0.0.1"])
+        return address[2]
 
-    def told(self, what: str) -> bool:
-        return any(what in line for line in self.said)
+    def has_line(self, what: str) -> bool:
+        return any(what in line for line in self.lines)
 
 
 async def call(uri: str, method: str, *arguments: Any) -> Any:
@@ -91,16 +91,16 @@ def subscriber(topic: str, md5: str = "*") -> dict[str, str]:
 
 def test_what_one_publishes_the_other_takes(graph):
     async def run() -> list[float]:
-        heard: list[float] = []
+        received: list[float] = []
         a, b = graph.node("/a"), graph.node("/b")
-        b.subscribe("/t", TWIST, lambda message: heard.append(message.linear.x))
+        b.subscribe("/t", TWIST, lambda message: received.append(message.linear.x))
         topic = a.publish("/t", TWIST, 10)
         async with b.running(), a.running():
             await until(lambda: len(topic.links) == 1)
             for n in range(5):
                 topic.publish(lambda _, n=n: twist(float(n)))
-            await until(lambda: len(heard) == 5)
-        return heard
+            await until(lambda: len(received) == 5)
+        return received
 
     assert asyncio.run(run()) == [0.0, 1.0, 2.0, 3.0, 4.0]
     assert graph.master.graph.publishers["/t"] == []
@@ -219,12 +219,12 @@ def test_a_subscriber_that_does_not_read_loses_the_oldest_and_holds_up_nobody(gr
 
 def test_a_publisher_that_sends_garbage_is_told_of_once_and_heard_again(graph):
     async def run() -> list[Any]:
-        heard: list[Any] = []
+        received: list[Any] = []
 
         def take(message: Any) -> None:
             if message.linear.x < 0:
                 raise ValueError("negative")
-            heard.append(message.linear.x)
+            received.append(message.linear.x)
 
         node, server = graph.node("/b"), None
         node.subscribe("/t", TWIST, take)
@@ -244,13 +244,13 @@ def test_a_publisher_that_sends_garbage_is_told_of_once_and_heard_again(graph):
         with Slave(port) as uri:
             graph.master.graph.publishers["/t"].append(uri)
             async with node.running():
-                await until(lambda: heard == [5.0])
+                await until(lambda: received == [5.0])
         server.close()
-        return graph.said
+        return graph.lines
 
-    said = [line for line in asyncio.run(run()) if "is refused" in line]
-    assert len(said) == 1
-    assert "/bad" in said[0]
+    lines = [line for line in asyncio.run(run()) if "is refused" in line]
+    assert len(lines) == 1
+    assert "/bad" in lines[0]
 
 
 class Slave(Master):
@@ -270,10 +270,10 @@ def test_another_type_under_the_same_name_is_refused_and_told(graph):
         a.publish("/t", EMPTY, 10)
         b.subscribe("/t", TWIST, lambda _: pytest.fail("taken"))
         async with a.running(), b.running():
-            await until(lambda: graph.told("/t: what"))
+            await until(lambda: graph.has_line("/t: what"))
 
     asyncio.run(run())
-    assert graph.told("datatype/md5sum")
+    assert graph.has_line("datatype/md5sum")
 
 
 def test_a_node_waits_for_its_master_and_registers_again_with_one_that_forgot(graph):
@@ -282,12 +282,12 @@ def test_a_node_waits_for_its_master_and_registers_again_with_one_that_forgot(gr
         node.publish("/t", TWIST, 10)
         graph.master.stop()
         async with node.running():
-            await until(lambda: graph.told("waiting for a ROS master"))
+            await until(lambda: graph.has_line("waiting for a ROS master"))
             graph.master = Master(graph.master.port)
             await until(lambda: "/a" in graph.master.graph.nodes)
-            await until(lambda: graph.told("/a: registered with"))
+            await until(lambda: graph.has_line("/a: registered with"))
             graph.restart()
-            await until(lambda: graph.told("/a: registered again"))
+            await until(lambda: graph.has_line("/a: registered again"))
             assert len(graph.master.graph.publishers["/t"]) == 1
 
     asyncio.run(run())
@@ -295,16 +295,16 @@ def test_a_node_waits_for_its_master_and_registers_again_with_one_that_forgot(gr
 
 def test_connections_outlive_a_master(graph):
     async def run() -> None:
-        heard: list[float] = []
+        received: list[float] = []
         a, b = graph.node("/a"), graph.node("/b")
         topic = a.publish("/t", TWIST, 10)
-        b.subscribe("/t", TWIST, lambda message: heard.append(message.linear.x))
+        b.subscribe("/t", TWIST, lambda message: received.append(message.linear.x))
         async with a.running(), b.running():
             await until(lambda: len(topic.links) == 1)
             graph.restart()
-            await until(lambda: sum("registered again" in line for line in graph.said) == 2)
+            await until(lambda: sum("registered again" in line for line in graph.lines) == 2)
             topic.publish(lambda _: twist(1.0))
-            await until(lambda: heard == [1.0])
+            await until(lambda: received == [1.0])
             assert len(topic.links) == 1
 
     asyncio.run(run())
@@ -312,9 +312,9 @@ def test_connections_outlive_a_master(graph):
 
 def test_a_publisher_that_went_and_came_back_is_heard_again(graph):
     async def run() -> None:
-        heard: list[float] = []
+        received: list[float] = []
         b = graph.node("/b")
-        b.subscribe("/t", TWIST, lambda message: heard.append(message.linear.x))
+        b.subscribe("/t", TWIST, lambda message: received.append(message.linear.x))
         async with b.running():
             for n in range(2):
                 a = graph.node("/a")
@@ -322,7 +322,7 @@ def test_a_publisher_that_went_and_came_back_is_heard_again(graph):
                 async with a.running():
                     await until(lambda topic=topic: len(topic.links) == 1)
                     topic.publish(lambda _, n=n: twist(float(n)))
-                    await until(lambda n=n: len(heard) == n + 1)
+                    await until(lambda n=n: len(received) == n + 1)
 
     asyncio.run(run())
 
@@ -331,9 +331,9 @@ def test_what_a_node_said_just_before_it_left_is_heard(graph):
     """A node that publishes a landing and ends has left the graph before its bytes have been read."""
 
     async def run() -> None:
-        heard: list[float] = []
+        received: list[float] = []
         node = graph.node("/b")
-        node.subscribe("/t", TWIST, lambda message: heard.append(message.linear.x))
+        node.subscribe("/t", TWIST, lambda message: received.append(message.linear.x))
         left = asyncio.Event()
 
         async def publish(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -351,7 +351,7 @@ def test_what_a_node_said_just_before_it_left_is_heard(graph):
                 await until(lambda: subscription.connected != {})
                 await call(graph.master.graph.nodes["/b"], "publisherUpdate", "/t", [])
                 left.set()
-                await until(lambda: heard == [3.0])
+                await until(lambda: received == [3.0])
                 await until(lambda: subscription._tasks == {})
         server.close()
 

@@ -117,8 +117,8 @@ def test_an_estimator_that_knows_no_attitude_is_believed_about_its_place_only():
 
 def test_samples_of_a_turned_sensor_are_in_the_axes_of_the_body():
     own = OnboardState(imu=Mount(rpy_deg=(0.0, 0.0, 90.0)), mag=Mount(rpy_deg=(180.0, 0.0, 0.0)))
-    heard = own.update(imu(0.0, gyro=(1.0, 0.0, 0.0)))  # about the sensor's x, which is the body's y
-    assert heard.gyro_rad_s == pytest.approx((0.0, 1.0, 0.0))
+    sample = own.update(imu(0.0, gyro=(1.0, 0.0, 0.0)))  # about the sensor's x, which is the body's y
+    assert sample.gyro_rad_s == pytest.approx((0.0, 1.0, 0.0))
     assert own.imu is not None
     assert own.imu.gyro_rad_s == pytest.approx((0.0, 1.0, 0.0))
     assert own.update(messages.Mag(0, 0, 0, (1.0, 2.0, 3.0))).field_ut == pytest.approx((1.0, -2.0, -3.0))

@@ -35,17 +35,17 @@ def scenario() -> Scenario:
     return scenario_file.resolve(msgspec.yaml.decode(SCENARIO.encode()))
 
 
-class Ear:
+class Subscriber:
     """A subscriber that keeps what is published, as messages."""
 
     def __init__(self, node: Ros1Node, topic: str) -> None:
         published = node._published[topic]
         self._kind = published.topic_type.type
-        self.heard: list[Any] = []
+        self.ros_messages: list[Any] = []
         published.links.append(cast(Any, self))
 
     def put(self, framed: bytes) -> None:
-        self.heard.append(tcpros.deserialize(self._kind, framed[4:]))
+        self.ros_messages.append(tcpros.deserialize(self._kind, framed[4:]))
 
 
 class Drone:
@@ -56,13 +56,15 @@ class Drone:
         self.sent: list[tuple[str, Any]] = []
         (drone,) = scenario().drones
         tf = self.node.publish("/tf", "tf2_msgs/TFMessage", 10)
-        self.topics = DroneTopics(self.node, drone, "ros1.main", lambda key, said: self.sent.append((key, said)), tf)
+        self.topics = DroneTopics(
+            self.node, drone, "ros1.main", lambda key, command: self.sent.append((key, command)), tf
+        )
 
-    def ear(self, topic: str) -> Ear:
-        return Ear(self.node, topic)
+    def subscriber(self, topic: str) -> Subscriber:
+        return Subscriber(self.node, topic)
 
-    def hear(self, *said: Any) -> None:
-        for message in said:
+    def deliver(self, *command: Any) -> None:
+        for message in command:
             self.topics.publish(message)
 
 
@@ -86,46 +88,46 @@ def test_the_namespace_is_the_drone_s_name_as_ros_can_write_it():
 
 def test_a_gate_is_navdata_odometry_and_transforms():
     drone = Drone()
-    ears = [drone.ear(topic) for topic in ("/quad_1/ardrone/navdata", "/quad_1/ardrone/odometry", "/tf")]
+    subscribers = [drone.subscriber(topic) for topic in ("/quad_1/ardrone/navdata", "/quad_1/ardrone/odometry", "/tf")]
     for gate in range(3):
-        drone.hear(status(gate * GATE_NS))
-    assert [len(ear.heard) for ear in ears] == [3, 3, 3]
-    assert [message.header.seq for message in ears[0].heard] == [0, 1, 2]
+        drone.deliver(status(gate * GATE_NS))
+    assert [len(subscriber.ros_messages) for subscriber in subscribers] == [3, 3, 3]
+    assert [message.header.seq for message in subscribers[0].ros_messages] == [0, 1, 2]
 
 
 def test_truth_is_on_ground_truth_alone():
     """Whatever the truth says, nothing else that is published changes with it."""
     topics = ["navdata", "odometry", "imu", "mag"]
-    heard: list[list[Any]] = []
+    ros_messages: list[list[Any]] = []
     for whole in (False, True):
         drone = Drone()
-        ears = [
-            *(drone.ear(f"/quad_1/ardrone/{topic}") for topic in topics),
-            drone.ear("/tf"),
-            drone.ear("/quad_1/fix"),
+        subscribers = [
+            *(drone.subscriber(f"/quad_1/ardrone/{topic}") for topic in topics),
+            drone.subscriber("/tf"),
+            drone.subscriber("/quad_1/fix"),
         ]
-        ground_truth = drone.ear("/quad_1/ground_truth/state")
+        ground_truth = drone.subscriber("/quad_1/ground_truth/state")
         for gate in range(1, 5):
             t_ns = gate * GATE_NS
-            drone.hear(messages.Imu(t_ns, gate, t_ns, (0.0, 0.0, 9.8), (0.1, 0.0, 0.0)))
-            drone.hear(messages.Mag(t_ns, gate, t_ns, (1.0, 2.0, 3.0)))
-            drone.hear(messages.Flow(t_ns, gate, t_ns, (1.0, 0.0, 0.0), 1.0))
+            drone.deliver(messages.Imu(t_ns, gate, t_ns, (0.0, 0.0, 9.8), (0.1, 0.0, 0.0)))
+            drone.deliver(messages.Mag(t_ns, gate, t_ns, (1.0, 2.0, 3.0)))
+            drone.deliver(messages.Flow(t_ns, gate, t_ns, (1.0, 0.0, 0.0), 1.0))
             if whole:
-                drone.hear(truth(t_ns))
-            drone.hear(status(t_ns))
-        assert len(ground_truth.heard) == (4 if whole else 0)
-        heard.append([repr(ear.heard) for ear in ears])
-    assert heard[0] == heard[1]
+                drone.deliver(truth(t_ns))
+            drone.deliver(status(t_ns))
+        assert len(ground_truth.ros_messages) == (4 if whole else 0)
+        ros_messages.append([repr(subscriber.ros_messages) for subscriber in subscribers])
+    assert ros_messages[0] == ros_messages[1]
 
 
 def test_a_take_off_that_a_node_publishes_is_sent_to_the_drone():
     drone = Drone()
-    drone.hear(status(GATE_NS))
+    drone.deliver(status(GATE_NS))
     drone.node._subscribed["/quad_1/ardrone/takeoff"]._callback(tcpros.message_class("std_msgs/Empty")())
-    ((key, said),) = drone.sent
+    ((key, command),) = drone.sent
     assert key == "drone/quad-1/cmd/mode"
-    assert (said.mode, said.source, said.t_ns) == ("takeoff", "ros1.main", GATE_NS)
-    messages.decode(key, messages.encode(said))
+    assert (command.mode, command.source, command.t_ns) == ("takeoff", "ros1.main", GATE_NS)
+    messages.decode(key, messages.encode(command))
 
 
 def test_drones_that_ros_cannot_tell_from_each_other_are_refused():
@@ -135,15 +137,15 @@ def test_drones_that_ros_cannot_tell_from_each_other_are_refused():
 
 
 def test_numbers_beyond_the_fields_of_ros_are_refused_and_told_once_and_the_next_are_passed_on():
-    said: list[str] = []
+    command: list[str] = []
     info: Any = messages.Info(
         0, 0, 1, "run", "zsim", "lockstep", 0.0, GATE_NS, 5_000_000, GATE_NS, 1, messages.Origin(0.0, 0.0, 0.0),
         (messages.DroneInfo("quad-1", "ardrone2"),), (), scenario_file.to_text(scenario()), "", "", "",
     )  # fmt: skip
     observer = ObserverProcess(cast(Any, FakeLink()), info, "ros1.main")
-    node = Ros1Node("/zsim", "http://127.0.0.1:1", "127.0.0.1", said.append)
-    bridge = Ros1Bridge(cast(Any, FakeLink()), info, observer, node, said.append)
-    navdata = Ear(node, "/quad_1/ardrone/navdata")
+    node = Ros1Node("/zsim", "http://127.0.0.1:1", "127.0.0.1", command.append)
+    bridge = Ros1Bridge(cast(Any, FakeLink()), info, observer, node, command.append)
+    navdata = Subscriber(node, "/quad_1/ardrone/navdata")
 
     def gate(n: int, range_m: float) -> None:
         t_ns = n * GATE_NS
@@ -155,10 +157,10 @@ def test_numbers_beyond_the_fields_of_ros_are_refused_and_told_once_and_the_next
     gate(2, 1e30)
     bridge.forward(keys.status("quad-1"), b"garbage")
     gate(3, 1.5)
-    assert [message.altd for message in navdata.heard] == [1500]
+    assert [message.altd for message in navdata.ros_messages] == [1500]
     assert observer.health.refused == 3
-    assert len(said) == 1
-    assert "drone/quad-1/sensor/status" in said[0]
+    assert len(command) == 1
+    assert "drone/quad-1/sensor/status" in command[0]
 
 
 class Link:
@@ -193,8 +195,8 @@ def test_who_is_too_slow_loses_the_oldest_gates(monkeypatch: pytest.MonkeyPatch)
     table = key_table(["drone1"])
 
     def payload(gate: int) -> bytes:
-        said = [(keys.status("drone1"), messages.encode(status(gate * GATE_NS)))]
-        bundle = GateMessages.of(gate * GATE_NS, gate, table, said)
+        command = [(keys.status("drone1"), messages.encode(status(gate * GATE_NS)))]
+        bundle = GateMessages.of(gate * GATE_NS, gate, table, command)
         return encode_batch([(keys.GATE, bundle.pack()), (keys.CLOCK, b"clock %d" % gate)])
 
     link: Any = Link([payload(gate) for gate in range(5)] + [b"no batch"])
@@ -209,6 +211,6 @@ def test_who_is_too_slow_loses_the_oldest_gates(monkeypatch: pytest.MonkeyPatch)
         return found, health
 
     found, health = asyncio.run(run())
-    assert [[key for key, _ in said] for said in found] == [[keys.status("drone1"), keys.CLOCK]] * 3
-    assert [said[1][1] for said in found] == [b"clock 2", b"clock 3", b"clock 4"]
+    assert [[key for key, _ in command] for command in found] == [[keys.status("drone1"), keys.CLOCK]] * 3
+    assert [command[1][1] for command in found] == [b"clock 2", b"clock 3", b"clock 4"]
     assert (health.dropped, health.refused, health.received) == (2, 1, 5)

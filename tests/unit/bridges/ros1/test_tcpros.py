@@ -57,10 +57,10 @@ def test_who_means_the_same_message_is_taken(md5):
 
 def test_who_means_another_message_is_told_both():
     header = {"callerid": "/me", "md5sum": "0" * 32, "type": "geometry_msgs/Pose"}
-    said = tcpros.mismatch(TWIST, header, "/zsim")
-    assert said is not None
-    assert "geometry_msgs/Pose" in said
-    assert "geometry_msgs/Twist" in said
+    error = tcpros.mismatch(TWIST, header, "/zsim")
+    assert error is not None
+    assert "geometry_msgs/Pose" in error
+    assert "geometry_msgs/Twist" in error
 
 
 @pytest.mark.parametrize("header", [{}, {"callerid": "/me"}, {"md5sum": "*"}])

@@ -196,22 +196,24 @@ def test_battery_comes_each_second_and_state_when_it_changes_too() -> None:
     battery, state = found["/drone1/battery"].convert, found["/drone1/state"].convert
     times = range(0, 2_000_000_000, 20_000_000)
     assert [t for t in times if battery("", status(t))] == [0, 1_000_000_000]
-    said = [(t, made.data) for t in times if (made := state("", status(t, "landed" if t < 500_000_000 else "flying")))]
-    assert said == [(0, "landed"), (500_000_000, "flying"), (1_000_000_000, "flying")]
+    states = [
+        (t, made.data) for t in times if (made := state("", status(t, "landed" if t < 500_000_000 else "flying")))
+    ]
+    assert states == [(0, "landed"), (500_000_000, "flying"), (1_000_000_000, "flying")]
     assert convert("/drone1/battery", status(0)).percentage == pytest.approx(0.625)
 
 
 def test_navdata_is_in_the_drivers_units_and_signs() -> None:
     """Right side down, nose down and counter-clockwise are positive; g, mm, mm/s, deg, Pa, us."""
     navdata = NavdataSummary(TYPES.message_class("zsim_msgs/msg/Navdata"), "base")
-    told: dict[str, Any] = {
+    converted: dict[str, Any] = {
         "imu": messages.Imu(T_NS, 0, T_NS, (0.0, -4.903325, 9.80665), (0.0, 0.0, 0.0)),
         "baro": messages.Baro(T_NS, 0, T_NS, 101_325.4, 0.0),
         "sonar": messages.Sonar(T_NS, 0, T_NS, 1.2346, True),
         "flow": messages.Flow(T_NS, 0, T_NS, (1.5, -0.5, 0.0), 1.0),
         "mag": messages.Mag(T_NS, 0, T_NS, (1.0, 2.0, 3.0)),
     }
-    for kind, message in told.items():
+    for kind, message in converted.items():
         assert navdata.update(f"drone/drone1/sensor/{kind}", message) is None
     navdata.update("drone/drone1/estimate", estimate(T_NS, quaternion(0.1, 0.2, 0.3)))
     made: Any = navdata.update("drone/drone1/sensor/status", status(T_NS))
@@ -235,7 +237,7 @@ def test_the_documents_table_has_every_topic() -> None:
     page = (Path(__file__).parents[4] / "docs" / "ros2.md").read_text()
     qos = {rmw_zenoh.SENSOR: "sensor", rmw_zenoh.DEFAULT: "default", rmw_zenoh.CLOCK: "clock", rmw_zenoh.TF: "tf"}
     rows = [[cell.strip().strip("`") for cell in line.split("|")[1:-1]] for line in page.splitlines() if "|" in line]
-    told = {row[0]: (row[1], row[3]) for row in rows if len(row) == 6 and row[0].startswith("/")}
-    assert told.pop("/tf_static") == ("tf2_msgs/msg/TFMessage", "static")
+    converted = {row[0]: (row[1], row[3]) for row in rows if len(row) == 6 and row[0].startswith("/")}
+    assert converted.pop("/tf_static") == ("tf2_msgs/msg/TFMessage", "static")
     found = {name.replace("drone1", "NAME").replace("main", "NAME"): topic for name, topic in all_topics().items()}
-    assert told == {name: (topic.kind, qos[topic.qos]) for name, topic in found.items()}
+    assert converted == {name: (topic.kind, qos[topic.qos]) for name, topic in found.items()}

@@ -39,7 +39,7 @@ class Link:
     host = "laptop"
 
     def __init__(self) -> None:
-        self.said: list[tuple[str, Any]] = []
+        self.published: list[tuple[str, Any]] = []
         self.sent: list[tuple[str, bytes, bytes]] = []
         self.kept: list[tuple[str, bytes, bytes]] = []
         self.hearing: dict[str, list[Callable[[RawSample], None]]] = {}
@@ -64,7 +64,7 @@ class Link:
         return lambda: self.hearing[key].remove(callback)
 
     def put(self, key: str, message: Any) -> None:
-        self.said.append((key, message))
+        self.published.append((key, message))
 
     def declare_publisher(self, key: str, encoding: str) -> Callable[[bytes, bytes], None]:
         return lambda payload, attachment: self.sent.append((key, payload, attachment))
@@ -212,10 +212,10 @@ def test_who_subscribes_to_another_type_is_told_of_and_gets_nothing() -> None:
 
 
 def test_names_that_ros_does_not_take_are_told() -> None:
-    said = "\n".join(Bench().lines)
-    assert has_terms(said, "drone-1", "drone_1", "ROS")
-    assert has_terms(said, "m.x", "m_x", "ROS")
-    assert "drone2 is" not in said
+    published = "\n".join(Bench().lines)
+    assert has_terms(published, "drone-1", "drone_1", "ROS")
+    assert has_terms(published, "m.x", "m_x", "ROS")
+    assert "drone2 is" not in published
 
 
 def test_a_twist_becomes_a_velocity_in_the_heading_frame_at_the_newest_gate() -> None:
@@ -225,7 +225,7 @@ def test_a_twist_becomes_a_velocity_in_the_heading_frame_at_the_newest_gate() ->
     bench.turn()
     for speed in (1.0, 0.5):
         bench.publish("/drone_1/cmd_vel", TWIST, twist(speed, -0.5, 0.25, 9.0, 9.0, 0.75))
-    (key, first), (_, second) = bench.link.said
+    (key, first), (_, second) = bench.link.published
     assert key == "drone/drone-1/cmd/velocity"
     assert (first.t_ns, first.seq, first.source, first.frame) == (4_000_000_000, 0, "ros2.main", "heading")
     assert (first.velocity_m_s, first.yaw_rate_rad_s) == ((1.0, -0.5, 0.25), 0.75)
@@ -241,7 +241,7 @@ def test_modes_and_the_emergency_button() -> None:
     for state in ("flying", "emergency"):
         bench.link.last[status] = messages.encode(flight_messages.Status(0, 0, state, 50.0, False, None, 1))
         bench.publish("/drone_1/reset", EMPTY, empty)
-    assert [(m.mode, m.seq) for _, m in bench.link.said] == [
+    assert [(m.mode, m.seq) for _, m in bench.link.published] == [
         ("takeoff", 0),
         ("land", 1),
         ("emergency", 2),
@@ -264,11 +264,11 @@ def test_garbage_is_refused_counted_and_told_once(message: Any, attachment: byte
     bench = Bench()
     for _ in range(3):
         bench.publish("/drone_1/cmd_vel", TWIST, message, attachment)
-    assert bench.link.said == []
+    assert bench.link.published == []
     assert bench.observer.health.refused == 3
-    told = [line for line in bench.lines if "refused" in line]
-    assert len(told) == 1
-    assert has_terms(told[0], *terms)
+    refusals = [line for line in bench.lines if "refused" in line]
+    assert len(refusals) == 1
+    assert has_terms(refusals[0], *terms)
 
 
 def test_what_does_not_fit_a_ros_type_is_refused() -> None:

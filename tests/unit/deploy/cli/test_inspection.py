@@ -5,7 +5,7 @@ import json
 import msgspec
 import pytest
 from fake_link import BAD_UTF8, NESTED, FakeLink
-from refused import has_terms
+from refused import has_terms, refused
 from synthetic_record import SCENARIOS, info
 
 from zsim.contract import keys, messages, run_messages
@@ -97,7 +97,7 @@ def test_a_key_that_fell_silent_is_told():
     assert has_terms(rate.line(12.08), "nothing", "2.0 s", "5 messages")
 
 
-def test_a_key_that_speaks_seldom_is_not_called_silent():
+def test_a_key_of_few_messages_is_not_called_silent():
     rate = inspection.MessageRate(10)
     for wall_s in (0.0, 3.0, 6.0):
         rate.add(wall_s, None)
@@ -108,29 +108,28 @@ INFO = info(scenario_file.load(SCENARIOS / "step.yaml"))
 MODE = "drone/drone1/cmd/mode"
 TAKEOFF = '{"mode": "takeoff"}'
 
-# name: (key, message, what the line must say)
+# name: (key, message, terms of the error)
 BAD = {
-    "a drone that is not there": ("drone/ghost/cmd/mode", TAKEOFF, "drone is 'ghost'; must be one of drone1, "),
-    "wildcards": ("drone/*/cmd/mode", TAKEOFF, "takes one key, without wildcards"),
-    "the world's": (keys.CLOCK, "{}", "clock: only the process that this is about speaks here"),
-    "a process's": ("process/world/bye", "{}", "only the process that this is about speaks here"),
-    "nobody's": ("drone/drone1/fly", "{}", "is no key of the contract"),
-    "no end": (MODE, "[" * 100_000, "the message is no JSON"),
-    "a huge number": (MODE, f'{{"mode": "land", "seq": {2**64}}}', "the message cannot be sent"),
-    "half a character": (MODE, '{"mode": "\\ud800"}', "the message cannot be sent"),
-    "too deep": (MODE, f'{{"mode": {"[" * 900}{"]" * 900}}}', MODE),
-    "another mode": (MODE, '{"mode": "x"}', "mode is 'x'; must be one of"),
+    "a drone that is not there": ("drone/ghost/cmd/mode", TAKEOFF, ("drone", "'ghost'", "drone1")),
+    "wildcards": ("drone/*/cmd/mode", TAKEOFF, ("one", "wildcards")),
+    "the world's": (keys.CLOCK, "{}", (keys.CLOCK, "drone/…/cmd/…")),
+    "a process's": ("process/world/bye", "{}", ("process/world/bye", "drone/…/cmd/…")),
+    "nobody's": ("drone/drone1/fly", "{}", ("drone/drone1/fly", "zsim keys", "docs/protocol.md")),
+    "no end": (MODE, "[" * 100_000, ("message", "JSON")),
+    "a huge number": (MODE, f'{{"mode": "land", "seq": {2**64}}}', (MODE, "sent")),
+    "half a character": (MODE, '{"mode": "\\ud800"}', (MODE, "sent")),
+    "too deep": (MODE, f'{{"mode": {"[" * 900}{"]" * 900}}}', (MODE,)),
+    "another mode": (MODE, '{"mode": "x"}', ("mode", "'x'", "takeoff")),
 }
 
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_message_that_cannot_be_meant_is_a_line(name: str):
-    key, text, says = BAD[name]
+    key, text, terms = BAD[name]
     link = FakeLink()
-    with pytest.raises(RunError) as refused:
+    with refused(RunError, *terms) as error:
         inspection.publish(link, INFO, key, text, 1, 1.0)  # type: ignore[arg-type]
-    assert says in str(refused.value)
-    assert "\n" not in str(refused.value)
+    assert "\n" not in str(error.value)
     assert link.published == []
 
 
@@ -186,9 +185,8 @@ def test_time_goes_on_while_it_publishes():
     ],
 )
 def test_a_request_that_cannot_be_meant_is_a_line(key: str, text: str, terms: tuple[str, ...]):
-    with pytest.raises(RunError) as refused:
+    with refused(RunError, *terms):
         inspection.ask(FakeLink(), key, "step", text)  # type: ignore[arg-type]
-    assert has_terms(str(refused.value), *terms)
 
 
 def test_arguments_may_be_named_like_anything():

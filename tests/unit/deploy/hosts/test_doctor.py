@@ -179,8 +179,8 @@ class Text:
 
 def test_a_greeting_of_the_login_shell_is_passed_over():
     clocks = [json.dumps({"time_ns": 10**18})] * doctor.OFFSET_ASKS
-    said = "\n".join(["Welcome to lab", "17", json.dumps(SOUND), *clocks, ""])
-    assert asyncio.run(doctor.host_report(Silent(said), "python")).facts == SOUND
+    output = "\n".join(["Welcome to lab", "17", json.dumps(SOUND), *clocks, ""])
+    assert asyncio.run(doctor.host_report(Silent(output), "python")).facts == SOUND
 
 
 def test_a_host_that_says_nothing_is_a_line(monkeypatch):

@@ -51,27 +51,27 @@ def fetched(get: Get | None, into: Path, there: bool = True) -> Link:
     return link
 
 
-async def whole(into: Path, told: Callable[..., None]) -> None:
+async def whole(into: Path, progress: Callable[..., None]) -> None:
     into.write_bytes(b"all of it")
 
 
-async def for_ever(into: Path, told: Callable[..., None]) -> None:
+async def for_ever(into: Path, progress: Callable[..., None]) -> None:
     into.write_bytes(b"some")
     await asyncio.Event().wait()
 
 
-async def slowly(into: Path, told: Callable[..., None]) -> None:
+async def slowly(into: Path, progress: Callable[..., None]) -> None:
     for _ in range(3):
         await asyncio.sleep(0.3)
-        told()
+        progress()
     into.write_bytes(b"all of it")
 
 
-async def none_there(into: Path, told: Callable[..., None]) -> None:
+async def none_there(into: Path, progress: Callable[..., None]) -> None:
     raise asyncssh.SFTPNoSuchFile("No such file")
 
 
-async def not_readable(into: Path, told: Callable[..., None]) -> None:
+async def not_readable(into: Path, progress: Callable[..., None]) -> None:
     raise asyncssh.SFTPPermissionDenied("Permission denied")
 
 

@@ -41,8 +41,8 @@ class Process:
 
     exit_signal, exit_status = None, 0
 
-    def __init__(self, *said: str, complains: tuple[str, ...] = ()) -> None:
-        self.stdin, self.stdout, self.stderr = Stream(), Stream(*said), Stream(*complains)
+    def __init__(self, *output: str, complains: tuple[str, ...] = ()) -> None:
+        self.stdin, self.stdout, self.stderr = Stream(), Stream(*output), Stream(*complains)
 
     async def wait(self) -> "Process":
         return self
@@ -105,11 +105,11 @@ def started(tmp_path: Path) -> Iterator[Start]:
 
 
 def test_what_a_process_says_is_kept_and_a_greeting_of_the_shell_is_not_its_id(started: Start, tmp_path: Path) -> None:
-    said: list[str] = []
+    output: list[str] = []
     link = Link(Process("Welcome to h1\n", "zsim-pid 77\n", '{"say": 1}\n', complains=("here\n", "\n")))
-    remote = started(link, said.append)
+    remote = started(link, output.append)
     assert remote.wait(PATIENCE_S)
-    assert (remote.pid, remote.code, said) == (77, 0, ['{"say": 1}\n'])
+    assert (remote.pid, remote.code, output) == (77, 0, ['{"say": 1}\n'])
     assert remote.last_log_line() == "here"
     assert (tmp_path / "estimator.d1.log").read_text() == "here\n\n"
 
@@ -132,12 +132,12 @@ def test_a_link_that_breaks_is_said(started: Start) -> None:
 
 
 def test_a_log_that_cannot_be_written_is_said_once_and_the_process_goes_on(started: Start, tmp_path: Path) -> None:
-    said: list[str] = []
-    log = ProcessLog(tmp_path / "gone" / "estimator.d1.log", said.append)
+    output: list[str] = []
+    log = ProcessLog(tmp_path / "gone" / "estimator.d1.log", output.append)
     remote = started(Link(Process("zsim-pid 77\n", complains=("one\n", "two\n"))), log=log)
     assert remote.wait(PATIENCE_S)
     assert (remote.code, remote.last_log_line()) == (0, "two")
-    (line,) = said
+    (line,) = output
     assert has_terms(line, "gone/estimator.d1.log", "written", os.strerror(errno.ENOENT))
 
 

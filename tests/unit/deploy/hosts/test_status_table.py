@@ -30,7 +30,7 @@ def board():
     return made
 
 
-def said(board: StatusTable) -> str:
+def printed(board: StatusTable) -> str:
     return board.console.file.getvalue()  # type: ignore[attr-defined]
 
 
@@ -68,34 +68,34 @@ def test_a_silent_host_is_named_once_with_its_roles_and_once_when_it_is_back(boa
     board.links["h1"].silent = 1.5
     board.report_silent_hosts()
     board.report_silent_hosts()
-    (line,) = said(board).splitlines()
+    (line,) = printed(board).splitlines()
     assert has_terms(line, "h1", "not answer", "1.5 s", "estimator.d1")
     assert has_terms(board.rows()[0]["state"], "silent", "2 s")
     assert board.rows()[0]["round_trip_ms"] is None
     board.links["h1"].silent = 0.0
     board.report_silent_hosts()
-    (_, line) = said(board).splitlines()
+    (_, line) = printed(board).splitlines()
     assert has_terms(line, "h1", "again")
 
 
 def test_what_always_answers_late_is_not_silent(board):
     board.links["h1"].round_trip_s, board.links["h1"].silent = 1.2, 1.2
     board.report_silent_hosts()
-    assert said(board) == ""
+    assert printed(board) == ""
     assert board.rows()[0]["state"] == "running"
     board.links["h1"].silent = 4.0
     board.report_silent_hosts()
-    assert has_terms(said(board), "h1", "not answer", "4.0 s")
+    assert has_terms(printed(board), "h1", "not answer", "4.0 s")
 
 
 def test_the_start_is_told_with_where_the_time_went(board):
     board.stages_s = {"connect": 0.25, "check": 0.5}
     board.clock(clock(0.0, state="waiting"))
-    assert "flies after" not in said(board)
+    assert "flies after" not in printed(board)
     board.clock(clock(1.2))
     board.clock(clock(2.4))
-    assert said(board).count("flies after") == 1
-    assert has_terms(said(board), "connect 0.2 s", "check 0.5 s", "processes")
+    assert printed(board).count("flies after") == 1
+    assert has_terms(printed(board), "connect 0.2 s", "check 0.5 s", "processes")
 
 
 def test_an_ended_process_says_how(board):
@@ -106,9 +106,9 @@ def test_an_ended_process_says_how(board):
     assert has_terms(console.file.getvalue(), "ended", "code 2")  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("said_last", ["cannot open [/tmp/x]", "[/]", "[red]no"])
-def test_what_a_process_said_is_shown_as_it_is(board, said_last):
-    board.members[0].state, board.members[0].code, board.members[0].outcome = "ended", 1, lambda: said_last
+@pytest.mark.parametrize("last_line", ["cannot open [/tmp/x]", "[/]", "[red]no"])
+def test_what_a_process_said_is_shown_as_it_is(board, last_line):
+    board.members[0].state, board.members[0].code, board.members[0].outcome = "ended", 1, lambda: last_line
     console = Console(file=io.StringIO(), width=200)
     console.print(table(board.rows()))
-    assert f"ended ({said_last})" in console.file.getvalue()  # type: ignore[attr-defined]
+    assert f"ended ({last_line})" in console.file.getvalue()  # type: ignore[attr-defined]

@@ -6,22 +6,13 @@ from pathlib import Path
 import pytest
 from refused import has_terms
 from rich.console import Console
+from short_flight import DIVERGED_NS, ONE, diverge
 
 from zsim.contract import keys, messages
 from zsim.record import RecordReader
 from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim_deploy.launch import run
-from zsim_world.fleet.fleet import DivergedError, Fleet
-
-GATE_NS = 20_000_000
-SCENARIO = """
-name: one
-seed: 3
-duration_s: 1
-drones: [{name: d1, position_m: [0, 0, 0]}]
-processes: {expect: []}
-"""
 
 
 class NoStopChannel:
@@ -37,16 +28,9 @@ class NoStopChannel:
 
 
 def test_a_diverged_run_in_one_process_has_failed_and_has_its_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    advance = Fleet.advance
-
-    def diverge(fleet: Fleet) -> None:
-        if fleet.t_ns == 5 * GATE_NS:
-            raise DivergedError("d1", 0.12)
-        advance(fleet)
-
-    monkeypatch.setattr(Fleet, "advance", diverge)
+    diverge(monkeypatch)
     monkeypatch.setattr(run, "StopChannel", NoStopChannel)
-    options = run.RunOptions(scenario_file.from_text(SCENARIO), tmp_path)
+    options = run.RunOptions(scenario_file.from_text(ONE), tmp_path)
     outcome = run.run_in_process(options, Screen(1.0, Console(file=io.StringIO())))
     assert outcome.failed
     assert has_terms(outcome.reason, "d1", "0.120", "finite")
@@ -54,4 +38,4 @@ def test_a_diverged_run_in_one_process_has_failed_and_has_its_record(tmp_path: P
         recorded = [(m.key, messages.decode(m.key, m.payload)) for m in reader.messages()]
     assert [event.kind for key, event in recorded if key == keys.EVENT] == ["diverged", "end"]
     clocks = [clock for key, clock in recorded if key == keys.CLOCK]
-    assert (clocks[-1].state, clocks[-1].t_ns) == ("stopped", 5 * GATE_NS)
+    assert (clocks[-1].state, clocks[-1].t_ns) == ("stopped", DIVERGED_NS)

@@ -12,17 +12,17 @@ from zsim_deploy.launch.supervisor import RESTARTS_MAX, SUPERSEDED, USER_FAULT, 
 
 
 class Show:
-    """Keeps what is said."""
+    """Keeps the lines shown."""
 
     def __init__(self) -> None:
-        self.said: list[str] = []
+        self.lines: list[str] = []
 
     def clock(self, line: dict[str, Any]) -> None: ...
     def event(self, line: dict[str, Any]) -> None: ...
     def health(self, line: dict[str, Any]) -> None: ...
 
     def say(self, text: str) -> None:
-        self.said.append(text)
+        self.lines.append(text)
 
 
 class Member:
@@ -98,7 +98,7 @@ def test_a_dead_estimator_is_started_again():
     team = Team(Member("estimator.d1", 1, None))
     assert not team.go().failed
     assert team.others[0].restarts == 1
-    assert "on_death: restart" in team.show.said[0]
+    assert "on_death: restart" in team.show.lines[0]
 
 
 def test_too_many_deaths_in_a_row_end_the_run():
@@ -216,7 +216,7 @@ def test_a_process_that_does_not_make_way_is_killed(monkeypatch):
     team.watch.submit(lambda: team.watch.replace(new))
     assert not team.go().failed
     assert old.code == -signal.SIGKILL
-    assert has_terms(team.show.said[0], "estimator.d1", "pid 1")
+    assert has_terms(team.show.lines[0], "estimator.d1", "pid 1")
 
 
 def test_a_process_that_waits_for_its_host_is_given_up_when_another_takes_its_place():
@@ -255,4 +255,4 @@ def test_a_run_that_is_ended_before_it_starts_starts_nobody():
 def test_what_is_no_progress_is_passed_over(text):
     team = Team()
     team.watch.handle_line(text)
-    assert team.show.said == []
+    assert team.show.lines == []

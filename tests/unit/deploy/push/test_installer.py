@@ -59,8 +59,8 @@ def test_the_question_finds_the_pythons_of_a_machine() -> None:
 
 
 def test_a_greeting_of_the_login_shell_is_no_python() -> None:
-    said = "Welcome to lab\nlast login 3.11.2 today\n\npython3 3.11.2 /usr/bin/python3\npython3.12 is here\n"
-    assert parse_interpreters(said) == [Interpreter("python3", (3, 11, 2), "/usr/bin/python3")]
+    output = "Welcome to lab\nlast login 3.11.2 today\n\npython3 3.11.2 /usr/bin/python3\npython3.12 is here\n"
+    assert parse_interpreters(output) == [Interpreter("python3", (3, 11, 2), "/usr/bin/python3")]
 
 
 def test_linux_takes_the_wheels_of_its_glibc_and_of_older_ones() -> None:

@@ -1,4 +1,4 @@
-"""What a push leaves alone, what it copies, and how the failures of several hosts are told."""
+"""What a push leaves alone, what it copies, and how the failures of several hosts are shown."""
 
 import asyncio
 import contextlib
@@ -228,26 +228,26 @@ def test_what_pip_says_is_a_line(tmp_path: Path) -> None:
 
 
 def test_a_second_push_says_whom_it_waits_for(tmp_path: Path) -> None:
-    async def second(waits: asyncio.Event, told: list[str]) -> dict[str, Any]:
+    async def second(waits: asyncio.Event, steps: list[str]) -> dict[str, Any]:
         def tell(text: str) -> None:
-            told.append(text)
+            steps.append(text)
             waits.set()
 
         async with open_installer(Greeting(), sys.executable, str(tmp_path), tell) as program:
             return await program.ask("look", ASK_S)
 
     async def work() -> list[str]:
-        told: list[str] = []
+        steps: list[str] = []
         waits = asyncio.Event()
         first = Greeting()
         async with open_installer(first, sys.executable, str(tmp_path), hush):
-            waiting = asyncio.create_task(second(waits, told))
+            waiting = asyncio.create_task(second(waits, steps))
             await waits.wait()
             pid = first.processes[0].process.pid
         assert (await waiting)["folder"] == str(tmp_path)
-        (line,) = told
+        (line,) = steps
         assert has_terms(line, f"{getpass.getuser()}@{socket.gethostname()}", f"process {pid}")
-        return told
+        return steps
 
     assert asyncio.run(work())
 
@@ -290,10 +290,10 @@ def test_every_host_that_fails_has_its_line(tmp_path: Path) -> None:
     port = inventory.SSH_PORT - 21  # tcpmux; nobody has it
     closed = Host(address="127.0.0.1", port=port)
     where = placed(a=closed, b=closed, c=Host(address="127.0.0.1", python="/opt/python"))
-    told: list[tuple[str, str]] = []
+    steps: list[tuple[str, str]] = []
     with pytest.raises(HostsError) as caught:
-        asyncio.run(push(where, [], [], lambda host, text: told.append((host, text)), tmp_path))
-    assert {("a", "failed"), ("b", "failed")} <= set(told)  # why is said once, in the end
+        asyncio.run(push(where, [], [], lambda host, text: steps.append((host, text)), tmp_path))
+    assert {("a", "failed"), ("b", "failed")} <= set(steps)  # why is said once, in the end
     lines = str(caught.value).splitlines()
     assert [line.partition(": ")[0] for line in lines] == ["a", "b"]
     assert all(has_terms(line, os.strerror(errno.ECONNREFUSED)) for line in lines)

@@ -46,14 +46,14 @@ ELSEWHERE = WheelTarget((3, 12), "cp312", ("manylinux_2_31_aarch64", "linux_aarc
 
 
 def here() -> WheelTarget:
-    said = {
+    facts = {
         "version": list(sys.version_info[:2]),
         "implementation": "cpython",
         "free_threaded": False,
         "platform": sysconfig.get_platform(),
         "libc": list(platform.libc_ver()),
     }
-    return wheel_target("here", said)
+    return wheel_target("here", facts)
 
 
 def write_project(folder: Path, name: str, needs: str = "") -> Path:
@@ -115,27 +115,27 @@ def test_versions_are_those_of_here_and_others_only_where_there_are_none(index: 
 
 
 def house(folder: Path, extras: list[str], host: str = "h") -> tuple[WheelSet, list[str]]:
-    """Return a house of the wheelhouse in a folder, and what was said of it."""
-    told: list[str] = []
-    return asyncio.run(Wheelhouse(folder, told.append).wheel_set(host, ELSEWHERE, extras)), told
+    """Return a house of the wheelhouse in a folder, and the lines printed on the way."""
+    lines: list[str] = []
+    return asyncio.run(Wheelhouse(folder, lines.append).wheel_set(host, ELSEWHERE, extras)), lines
 
 
 def test_a_house_holds_what_a_host_needs_and_is_gathered_once(checkout: Path, tmp_path: Path) -> None:
-    first, told = house(tmp_path / "cache", ["agents"])
+    first, lines = house(tmp_path / "cache", ["agents"])
     assert [wheel.path.name.partition("-")[0] for wheel in first.wheels()] == ["zsim", "pip", "gadget"]
     assert first.extras == ("agents",)
-    building, gathering = told
+    building, gathering = lines
     assert has_terms(building, "building", "zsim")
     assert has_terms(gathering, "gathering", str(ELSEWHERE), "agents")
-    again, told = house(tmp_path / "cache", ["agents"])
-    assert (again, told) == (first, [])
+    again, lines = house(tmp_path / "cache", ["agents"])
+    assert (again, lines) == (first, [])
 
 
 def test_a_changed_file_builds_the_project_and_nothing_else(checkout: Path, tmp_path: Path) -> None:
     first, _ = house(tmp_path / "cache", [])
     (checkout / "source/flight.py").write_text("height_m = 5\n")
-    second, told = house(tmp_path / "cache", [])
-    (line,) = told
+    second, lines = house(tmp_path / "cache", [])
+    (line,) = lines
     assert has_terms(line, "building", "zsim")
     assert second.project.path != first.project.path
     assert second.pip == first.pip
@@ -144,8 +144,8 @@ def test_a_changed_file_builds_the_project_and_nothing_else(checkout: Path, tmp_
 def test_a_wheel_that_was_lost_is_gathered_again(checkout: Path, tmp_path: Path) -> None:
     first, _ = house(tmp_path / "cache", ["agents"])
     first.others[0].path.unlink()
-    second, told = house(tmp_path / "cache", ["agents"])
-    (line,) = told
+    second, lines = house(tmp_path / "cache", ["agents"])
+    (line,) = lines
     assert has_terms(line, "gathering", str(ELSEWHERE), "agents")
     assert second.others[0].path.exists()
 
@@ -186,15 +186,15 @@ def test_an_index_that_cannot_be_reached_is_no_missing_wheel(
         await pip(*arguments, **options)
 
     monkeypatch.setattr(wheelhouse, "pip", counted)
-    told: list[str] = []
-    kept = Wheelhouse(tmp_path / "cache", told.append)
+    lines: list[str] = []
+    kept = Wheelhouse(tmp_path / "cache", lines.append)
     for _ in range(2):
         with pytest.raises(HostsError) as caught:
             asyncio.run(kept.wheel_set("h", ELSEWHERE, ["agents"]))
         remedy = "PIP_NO_INDEX=1", "PIP_FIND_LINKS=FOLDER"
         assert has_terms(str(caught.value), "launcher", "index", os.strerror(errno.ECONNREFUSED), *remedy)
     assert [arguments[0] for arguments in calls] == ["wheel", "download"]
-    assert has_terms(told[-1], "index", os.strerror(errno.ECONNREFUSED), "once more")
+    assert has_terms(lines[-1], "index", os.strerror(errno.ECONNREFUSED), "once more")
 
 
 def test_what_is_in_a_folder_needs_no_index(checkout: Path, no_index: None, tmp_path: Path) -> None:

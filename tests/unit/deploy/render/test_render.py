@@ -244,8 +244,10 @@ def test_a_program_of_the_user_s_own_is_told_of_and_not_started(target: str, tmp
     texts = TARGETS[target](placed(tmp_path, text), own)
     assert set(READ[target](texts)) == {"world", "recorder", "controller.main", "router.yard"}
     remark = "# my.drone1 on two is a program of your own: start it yourself, it connects to tls/192.168.1.21:7448"
-    told = [path for path, text in texts.items() if remark in text.splitlines()]
-    assert told == [{"systemd": "two/zsim.target", "compose": "two/compose.yaml", "kubernetes": "zsim.yaml"}[target]]
+    remarked = [path for path, text in texts.items() if remark in text.splitlines()]
+    assert remarked == [
+        {"systemd": "two/zsim.target", "compose": "two/compose.yaml", "kubernetes": "zsim.yaml"}[target]
+    ]
 
 
 @ALL

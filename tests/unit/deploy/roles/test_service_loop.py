@@ -25,6 +25,6 @@ def test_a_process_that_leads_its_session_lowers_all_of_it(only_viewed: bool, ni
     """As a role of a run does; in a terminal, where the session is the shell's, the shell keeps its place."""
     start = [sys.executable, "-c", PROGRAM.format(only_viewed=only_viewed)]
     shell = [] if leads else ["sh", "-c", '"$@"; exit $?', "sh"]
-    said = subprocess.run([*shell, *start], capture_output=True, text=True, check=True, start_new_session=True)
+    done = subprocess.run([*shell, *start], capture_output=True, text=True, check=True, start_new_session=True)
     own = min(NICEST, os.nice(0) + niceness)
-    assert said.stdout.split() == [str(own), str(only_viewed), str(niceness if leads else 0)]
+    assert done.stdout.split() == [str(own), str(only_viewed), str(niceness if leads else 0)]

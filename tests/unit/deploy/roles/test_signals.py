@@ -57,10 +57,10 @@ def test_who_loses_the_terminal_goes_on_and_what_it_says_is_in_a_file(tmp_path: 
     command = [sys.executable, "-c", TALKS, str(tmp_path / "up.log")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=slave, stderr=slave, start_new_session=True) as talker:
         os.close(slave)
-        said = b""
-        while not said.endswith(b"\n"):  # it may come in parts
-            said += os.read(master, 100)
-        assert said.strip() == b"ready"
+        output = b""
+        while not output.endswith(b"\n"):  # it may come in parts
+            output += os.read(master, 100)
+        assert output.strip() == b"ready"
         os.close(master)
         for _ in range(2):  # as the system and a shell do
             talker.send_signal(signal.SIGHUP)
@@ -78,8 +78,8 @@ def test_a_terminal_that_is_there_still_is_told_where_the_rest_is(tmp_path: Path
         assert talker.stdout
         assert talker.stdout.readline() == "ready\n"
         talker.send_signal(signal.SIGHUP)
-        said, complained = talker.communicate("\n", timeout=60.0)
-    assert said == ""
+        output, complained = talker.communicate("\n", timeout=60.0)
+    assert output == ""
     assert has_terms(complained, "terminal", "closed", str(log))
     assert log.read_text().splitlines() == ["fetching", "ended"]
 

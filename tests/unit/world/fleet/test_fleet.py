@@ -127,8 +127,8 @@ def test_the_sigma_that_a_gps_tells_is_that_of_its_errors():
     """noise 3 m and density 2 m/sqrt(Hz) at 4 Hz: 5 m."""
     gps = {"rate_hz": 4, "position_m": {"noise": 3.0, "density": 2.0}}
     fleet = Fleet(scenario(1, sensors={"preset": "paper", "gps": gps}))
-    told = [m for _, m in GatePublication(fleet).gate([None]).decoded() if isinstance(m, messages.Gps)]
-    assert [(m.sigma_m, m.fix, m.satellites) for m in told] == [(5.0, GPS_FIX, GPS_SATELLITES)]
+    fixes = [m for _, m in GatePublication(fleet).gate([None]).decoded() if isinstance(m, messages.Gps)]
+    assert [(m.sigma_m, m.fix, m.satellites) for m in fixes] == [(5.0, GPS_FIX, GPS_SATELLITES)]
 
 
 @pytest.mark.parametrize("rate_hz", [0.01, 0.0137, 999.9])

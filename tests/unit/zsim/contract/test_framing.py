@@ -17,7 +17,7 @@ DRONES = ["d1", "d2", "d3"]
 
 
 @pytest.fixture(scope="module")
-def said() -> list[GateMessages]:
+def flown() -> list[GateMessages]:
     """Two seconds of three drones, one of which is flown by somebody."""
     places = [{"name": name, "position_m": [3 * i, 0, 0]} for i, name in enumerate(DRONES)]
     latency = {"gps": {"latency_ms": 35.0}, "baro": {"latency_ms": 12.5}}
@@ -29,18 +29,18 @@ def said() -> list[GateMessages]:
     return gates
 
 
-def test_every_message_is_of_the_contract_and_to_the_byte_what_its_encoder_gives(said: list[GateMessages]) -> None:
-    heard = set()
-    for gate in said:
+def test_every_message_is_of_the_contract_and_to_the_byte_what_its_encoder_gives(flown: list[GateMessages]) -> None:
+    received = set()
+    for gate in flown:
         for key, payload in gate.pairs:
             assert messages.encode(messages.decode(key, payload)) == payload
-            heard.add(key)
-    assert heard == set(key_table(DRONES))
+            received.add(key)
+    assert received == set(key_table(DRONES))
 
 
-def test_numbers_count_on_per_key_and_status_counts_what_came(said: list[GateMessages]) -> None:
+def test_numbers_count_on_per_key_and_status_counts_what_came(flown: list[GateMessages]) -> None:
     seq = dict.fromkeys(key_table(DRONES), 0)
-    for gate in said:
+    for gate in flown:
         of_drone = dict.fromkeys(DRONES, 0)
         for key, message in gate.decoded():
             assert message.seq == seq[key]
@@ -52,23 +52,23 @@ def test_numbers_count_on_per_key_and_status_counts_what_came(said: list[GateMes
             assert gate.t_ns - 20_000_000 < message.t_ns <= gate.t_ns
 
 
-def test_a_commander_is_named(said: list[GateMessages]) -> None:
-    told = [message for key, message in said[-1].decoded() if keys.is_status(key)]
-    assert [status.commander for status in told] == [None, "pilot.one", None]
-    assert {status.state for status in told} == {"landed"}
+def test_a_commander_is_named(flown: list[GateMessages]) -> None:
+    statuses = [message for key, message in flown[-1].decoded() if keys.is_status(key)]
+    assert [status.commander for status in statuses] == [None, "pilot.one", None]
+    assert {status.state for status in statuses} == {"landed"}
 
 
-def test_samples_of_a_drone_come_in_the_order_of_their_stamps_and_none_is_lost(said: list[GateMessages]) -> None:
+def test_samples_of_a_drone_come_in_the_order_of_their_stamps_and_none_is_lost(flown: list[GateMessages]) -> None:
     for drone in DRONES:
-        samples = [m for gate in said for key, m in gate.decoded() if key == keys.sensor(drone, "gps")]
+        samples = [m for gate in flown for key, m in gate.decoded() if key == keys.sensor(drone, "gps")]
         assert [m.t_ns - m.t_sample_ns for m in samples] == [35_000_000] * len(samples)
         assert np.all(np.diff([m.t_sample_ns for m in samples]) > 0)
-        stamps = [[m.t_ns for key, m in b.decoded() if keys.is_sensor(key) and keys.thing(key) == drone] for b in said]
+        stamps = [[m.t_ns for key, m in b.decoded() if keys.is_sensor(key) and keys.thing(key) == drone] for b in flown]
         assert all(stamp == sorted(stamp) for stamp in stamps)
 
 
-def test_a_part_travels_and_comes_out_the_same(said: list[GateMessages]) -> None:
-    for gate in said[::10]:
+def test_a_part_travels_and_comes_out_the_same(flown: list[GateMessages]) -> None:
+    for gate in flown[::10]:
         whole = GateMessages.unpack(gate.pack(), gate.table)
         assert (whole.t_ns, whole.seq, whole.pairs) == (gate.t_ns, gate.seq, gate.pairs)
         first, last = gate.first[1], gate.first[2]
@@ -94,33 +94,33 @@ def test_what_is_no_gate_message_is_refused(payload: bytes) -> None:
 
 
 @pytest.mark.parametrize("place", [-1000, 24, 2**62])
-def test_keys_that_are_not_there_are_refused(said: list[GateMessages], place: int) -> None:
-    b = said[0]
+def test_keys_that_are_not_there_are_refused(flown: list[GateMessages], place: int) -> None:
+    b = flown[0]
     bad = GateMessages(b.t_ns, b.seq, b.table, np.full(len(b), place), b.stamps, b.ends, b.buffer)
     with pytest.raises(DecodeError, match="@gate: "):
         GateMessages.unpack(bad.pack(), b.table).check()
 
 
-def test_a_record_of_gates_is_that_of_their_messages(said: list[GateMessages], tmp_path) -> None:
+def test_a_record_of_gates_is_that_of_their_messages(flown: list[GateMessages], tmp_path) -> None:
     with RecordWriter(tmp_path / "whole.mcap") as writer:
-        for gate in said:
+        for gate in flown:
             copy = GateMessages(gate.t_ns, gate.seq, gate.table, gate.which, gate.stamps, gate.ends,
                           bytearray(gate.buffer))  # fmt: skip
             writer.add_gate(copy, 5)
     with RecordWriter(tmp_path / "each.mcap") as writer:
-        for gate in said:
+        for gate in flown:
             for (key, payload), t_ns in zip(gate.pairs, gate.stamps.tolist(), strict=True):
                 writer.add(key, payload, messages.encoding(key), t_ns, 5)
     whole, each = (list(RecordReader(tmp_path / f"{name}.mcap")) for name in ("whole", "each"))
     assert whole == each
-    assert len(whole) == sum(map(len, said))
+    assert len(whole) == sum(map(len, flown))
 
 
 def test_a_record_that_has_no_number_left_for_a_key_takes_the_others(
-    said: list[GateMessages], tmp_path, monkeypatch: pytest.MonkeyPatch
+    flown: list[GateMessages], tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("zsim.record.record_writer.CHANNELS_MAX", 2)
     with RecordWriter(tmp_path / "run.mcap") as writer:
-        writer.add_gate(said[0], 5)
-    assert writer.messages + writer.refused == len(said[0])
+        writer.add_gate(flown[0], 5)
+    assert writer.messages + writer.refused == len(flown[0])
     assert len({message.key for message in RecordReader(tmp_path / "run.mcap")}) == 2

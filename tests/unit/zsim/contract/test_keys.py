@@ -24,9 +24,9 @@ def test_names_of_the_contract_are_taken(name: str):
 def test_other_names_are_refused_with_what_is_allowed(name):
     with pytest.raises(BadNameError) as caught:
         keys.name(name, "federation")
-    said = str(caught.value)
-    assert has_terms(said, "federation", f"{name!r}", "1", "32", "a-z", "0-9", "_", ".", "-")
-    assert "\n" not in said
+    error = str(caught.value)
+    assert has_terms(error, "federation", f"{name!r}", "1", "32", "a-z", "0-9", "_", ".", "-")
+    assert "\n" not in error
 
 
 def test_keys_are_the_contract_s():

@@ -11,8 +11,8 @@ def test_an_estimate_is_shown_with_the_upper_triangle_of_its_position():
     P = half @ half.T
     level = (1.0, 0.0, 0.0, 0.0)
     position, velocity, bias = (1.0, 2.0, 3.0), (4.0, 5.0, 6.0), (7.0, 8.0, 9.0)
-    told = Estimate(0, 0, position, velocity, level, 0.4, tuple(P.ravel().tolist()), 0.1, bias, {"gps": (3, 1)})
-    shown = estimate_view("d1", told)
+    estimate = Estimate(0, 0, position, velocity, level, 0.4, tuple(P.ravel().tolist()), 0.1, bias, {"gps": (3, 1)})
+    shown = estimate_view("d1", estimate)
     assert (shown.name, shown.position_m, shown.yaw_rad, shown.yaw_sigma_rad) == ("d1", position, 0.4, 0.1)
     assert shown.covariance_m2 == tuple(P[:3, :3][np.triu_indices(3)])
     assert shown.sensors == {"gps": (3, 1)}

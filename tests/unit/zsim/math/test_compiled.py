@@ -62,13 +62,13 @@ def test_the_digest_does_not_change_with_the_folders(tmp_path: Path):
 
 ASK = """
 import numpy as np
-from zsim_agents.estimation.filter_state import moment_at
-print(moment_at(np.zeros(20))[:2])
+from zsim_agents.estimation.filter_state import moment
+print(moment(np.zeros(20))[:2])
 """
 
 
 def test_a_change_of_what_is_called_reaches_the_caller(tmp_path: Path):
-    """`filter_state.moment_at` calls `dead_reckoning.vector`: numba's own cache would go on with the old one."""
+    """`filter_state.moment` calls `dead_reckoning.vector`: numba's own cache would go on with the old one."""
     pytest.importorskip("numba")
     shutil.copytree(
         ROOT / "agents" / "zsim_agents", tmp_path / "zsim_agents", ignore=shutil.ignore_patterns("__pycache__")

@@ -197,12 +197,12 @@ def test_whatever_bits_are_turned_it_is_read_or_refused_in_one_line(
     data, rng, path = run.read_bytes(), random.Random(12), tmp_path / "run.mcap"
     for _ in range(times):
         path.write_bytes(turned(data, rng))
-        said = ""
+        error_line = ""
         try:
             work(path)
         except ZsimError as error:
-            said = str(error)
-        assert "\n" not in said
+            error_line = str(error)
+        assert "\n" not in error_line
 
 
 @pytest.mark.parametrize("work", [to_summary, to_csv, to_foxglove, to_mat])

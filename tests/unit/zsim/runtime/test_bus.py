@@ -19,7 +19,7 @@ from zsim.runtime.bus import Bus
 
 GATE_NS = 20_000_000
 DRONES = ("d1", "d2")
-Said = list[tuple[str, Any]]
+KeyedMessages = list[tuple[str, Any]]
 
 
 class Hub:
@@ -28,7 +28,7 @@ class Hub:
     run_id = "run1"
 
     def __init__(self, gates: int, waits_for: Sequence[str] = ()) -> None:
-        self.handled: Said = []
+        self.handled: KeyedMessages = []
         self.outputs: list[str] = []
         self._gates = gates
         self._waits_for = tuple(Waiting(name, "", 1.0) for name in waits_for)
@@ -127,22 +127,22 @@ class FakeController(Notes):
         return [Output("view/cluster/main", ViewCluster(t_ns, 0, "idle", (), (), (), ""))]
 
 
-def fly(gates: int, agents: list[Agent]) -> tuple[Hub, Said]:
-    hub, said = Hub(gates), []
-    bus = Bus(hub, agents, lambda: 0, lambda key, message: said.append((key, message)))
+def fly(gates: int, agents: list[Agent]) -> tuple[Hub, KeyedMessages]:
+    hub, published = Hub(gates), []
+    bus = Bus(hub, agents, lambda: 0, lambda key, message: published.append((key, message)))
     bus.join()
     while bus.turn():
         pass
     bus.end()
-    return hub, said
+    return hub, published
 
 
 def team() -> list[Agent]:
     return [FakeEstimator("d1"), FakeEstimator("d2"), FakeController()]
 
 
-def of(said: Said, kind: type) -> list[Any]:
-    return [message for _, message in said if type(message) is kind]
+def of(published: KeyedMessages, kind: type) -> list[Any]:
+    return [message for _, message in published if type(message) is kind]
 
 
 def test_everybody_joins_with_what_the_contract_asks_for():
@@ -182,14 +182,14 @@ def test_the_order_of_the_agents_does_not_matter(order: tuple[int, int, int]):
 
 
 def test_a_done_follows_its_outputs_and_counts_them_without_views():
-    hub, said = fly(2, team())
-    mine = [message for _, message in said if isinstance(message, Velocity | ClusterState | ViewCluster)]
+    hub, published = fly(2, team())
+    mine = [message for _, message in published if isinstance(message, Velocity | ClusterState | ViewCluster)]
     assert [type(message) for message in mine] == [Velocity, ClusterState] * 2
     dones = [m for key, m in hub.handled if isinstance(m, Done) and keys.thing(key) == "controller.main"]
     assert [(done.done_ns, done.sent, done.seq) for done in dones] == [(0, 2, 0), (GATE_NS, 2, 1)]
     for done in dones:
-        place = said.index(("process/controller.main/done", done))
-        assert [type(message) for _, message in said[place - 2 : place]] == [Velocity, ClusterState]
+        place = published.index(("process/controller.main/done", done))
+        assert [type(message) for _, message in published[place - 2 : place]] == [Velocity, ClusterState]
 
 
 def test_outputs_that_the_world_only_relays_are_counted_for_it():
@@ -206,11 +206,11 @@ def test_an_agent_of_a_longer_period_reads_every_gate_and_answers_its_own():
 
 
 def test_the_sink_takes_everything_but_views_in_order():
-    _, said = fly(2, team())
-    assert not [key for key, _ in said if key.startswith("view/")]
-    assert len(of(said, Imu)) == 4
-    assert len(of(said, Estimate)) == 4
-    first = [key for key, _ in said if keys.thing(f"{key}/") in ("d1", "estimator.d1")][:5]
+    _, published = fly(2, team())
+    assert not [key for key, _ in published if key.startswith("view/")]
+    assert len(of(published, Imu)) == 4
+    assert len(of(published, Estimate)) == 4
+    first = [key for key, _ in published if keys.thing(f"{key}/") in ("d1", "estimator.d1")][:5]
     assert first == [
         "process/estimator.d1/join",
         "drone/d1/sensor/imu",
@@ -221,10 +221,10 @@ def test_the_sink_takes_everything_but_views_in_order():
 
 
 def test_everybody_says_bye_after_the_world_s_last_words():
-    hub, said = fly(3, team())
-    byes = [(key, message) for key, message in said if isinstance(message, Bye)]
-    assert said[-3:] == byes
-    assert said[-4][0] == keys.EVENT
+    hub, published = fly(3, team())
+    byes = [(key, message) for key, message in published if isinstance(message, Bye)]
+    assert published[-3:] == byes
+    assert published[-4][0] == keys.EVENT
     assert [(message.t_ns, message.seq) for _, message in byes] == [(2 * GATE_NS, 0)] * 3
     assert hub.handled[-3:] == byes
 

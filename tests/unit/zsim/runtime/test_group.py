@@ -95,14 +95,14 @@ def test_inputs_come_in_the_order_of_time_key_and_number():
     for t_ns, seq in ((2 * GATE_NS, 3), (GATE_NS, 2), (GATE_NS, 1)):
         group.receive(keys.status("d1"), status(t_ns, seq))
     group.step(2 * GATE_NS)
-    heard = [note[1:] for note in last.notes if isinstance(note, tuple) and note[0] == keys.status("d1")]
-    assert heard == [(GATE_NS, 1), (GATE_NS, 2), (2 * GATE_NS, 3)]
+    statuses = [note[1:] for note in last.notes if isinstance(note, tuple) and note[0] == keys.status("d1")]
+    assert statuses == [(GATE_NS, 1), (GATE_NS, 2), (2 * GATE_NS, 3)]
 
 
 def test_what_members_say_has_the_source_of_the_process():
     _, _, group = team()
-    told: list[Any] = [message for _, message in group.step(GATE_NS)]
-    assert [message.reason for message in told] == [
+    decisions: list[Any] = [message for _, message in group.step(GATE_NS)]
+    assert [message.reason for message in decisions] == [
         "controller.main of estimator.d1",
         "controller.main of controller.main",
     ]
@@ -130,8 +130,8 @@ def test_everybody_rehearses():
 def test_members_of_different_periods_are_refused():
     slow = Member("controller.main", [], "a", 2 * GATE_NS)
     fast = Member("estimator.d1", [], "b")
-    said = r"period_ns of a group's members is estimator\.d1 20000000, controller\.main 40000000; must be the same"
-    with pytest.raises(RunError, match=said):
+    pattern = r"period_ns of a group's members is estimator\.d1 20000000, controller\.main 40000000; must be the same"
+    with pytest.raises(RunError, match=pattern):
         AgentGroup([fast, slow])
 
 

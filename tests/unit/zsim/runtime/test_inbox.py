@@ -35,21 +35,23 @@ def estimate(t_ns: int, seq: int) -> Estimate:
 def gate_of(drone: str, gate: int) -> list[Sent]:
     """Return what a drone says in a gate: four IMU samples, now and then a barometer's, and the status."""
     t_ns = gate * GATE_NS
-    said: list[Sent] = []
+    messages_sent: list[Sent] = []
     if gate:
         stamps = [t_ns - GATE_NS + STEP_NS * i for i in (1, 2, 3, 4)]
-        said = [(keys.sensor(drone, "imu"), imu(at, 4 * (gate - 1) + i)) for i, at in enumerate(stamps)]
+        messages_sent = [(keys.sensor(drone, "imu"), imu(at, 4 * (gate - 1) + i)) for i, at in enumerate(stamps)]
     if gate % 2:
-        said.append((keys.sensor(drone, "baro"), Baro(t_ns - STEP_NS, gate // 2, t_ns - STEP_NS, 101325.0, 1.0)))
-    return [*said, (keys.status(drone), status(t_ns, gate, len(said) + 1))]
+        messages_sent.append(
+            (keys.sensor(drone, "baro"), Baro(t_ns - STEP_NS, gate // 2, t_ns - STEP_NS, 101325.0, 1.0))
+        )
+    return [*messages_sent, (keys.status(drone), status(t_ns, gate, len(messages_sent) + 1))]
 
 
 def flight(drones: list[str], gates: int) -> list[list[Sent]]:
     return [[sent for drone in drones for sent in gate_of(drone, gate)] for gate in range(gates)]
 
 
-def canonical(said: list[Sent]) -> list[Sent]:
-    return sorted(said, key=lambda sent: (sent[1].t_ns, sent[0], sent[1].seq))
+def canonical(messages_sent: list[Sent]) -> list[Sent]:
+    return sorted(messages_sent, key=lambda sent: (sent[1].t_ns, sent[0], sent[1].seq))
 
 
 def ready(inbox: Inbox) -> list[tuple[int, list[Sent]]]:
@@ -70,7 +72,7 @@ def feed(inbox: Inbox, arrivals: list[Sent]) -> list[tuple[int, list[Sent]]]:
 
 
 def expected(gates: list[list[Sent]]) -> list[tuple[int, list[Sent]]]:
-    return [(gate * GATE_NS, canonical(said)) for gate, said in enumerate(gates)]
+    return [(gate * GATE_NS, canonical(messages_sent)) for gate, messages_sent in enumerate(gates)]
 
 
 def test_a_gate_is_handed_over_when_its_status_has_come():
@@ -90,13 +92,13 @@ def test_a_gate_is_handed_over_when_its_status_has_come():
 @given(seed=st.integers(0, 2**32), gates=st.integers(2, GAP_MAX), again=st.integers(0, 20))
 def test_any_order_of_arrival_gives_the_canonical_sequence(seed: int, gates: int, again: int):
     """Gate 0 in order, then everything else shuffled, some of it twice."""
-    said = flight(["d1", "d2"], gates)
-    rest = [sent for gate in said[1:] for sent in gate]
+    messages_sent = flight(["d1", "d2"], gates)
+    rest = [sent for gate in messages_sent[1:] for sent in gate]
     rng = random.Random(seed)
     arrivals = rest + rng.choices(rest, k=again)
     rng.shuffle(arrivals)
     inbox = Inbox([keys.status("d1"), keys.status("d2")], ["d1", "d2"])
-    assert feed(inbox, [*said[0], *arrivals]) == expected(said)
+    assert feed(inbox, [*messages_sent[0], *arrivals]) == expected(messages_sent)
     assert inbox.duplicates + inbox.late == again
 
 
@@ -106,13 +108,13 @@ def test_estimates_and_states_may_come_in_any_order(seed: int, gates: int):
     """A controller reads states and estimates of three drones; nothing of its inputs is counted."""
     drones = ["d1", "d2", "d3"]
     closing = [keys.status(d) for d in drones] + [keys.estimate(d) for d in drones]
-    said = [
+    messages_sent = [
         [(keys.status(d), status(t, gate, 9)) for d in drones] + [(keys.estimate(d), estimate(t, gate)) for d in drones]
         for gate, t in ((gate, gate * GATE_NS) for gate in range(gates))
     ]
-    arrivals = [sent for gate in said[1:] for sent in gate]
+    arrivals = [sent for gate in messages_sent[1:] for sent in gate]
     random.Random(seed).shuffle(arrivals)
-    assert feed(Inbox(closing), [*said[0], *arrivals]) == expected(said)
+    assert feed(Inbox(closing), [*messages_sent[0], *arrivals]) == expected(messages_sent)
 
 
 def test_a_sample_that_the_status_counts_is_waited_for():
@@ -165,32 +167,36 @@ def test_a_warm_start_counts_its_next_gate_in_full():
 
 def test_a_replay_fills_the_hole_and_brings_nothing_twice():
     inbox = Inbox([STATUS], ["d1"])
-    said = flight(["d1"], 6)
-    taken = feed(inbox, [*said[0], *said[1]])
-    taken += feed(inbox, [*said[2][:2], *said[5]])
+    messages_sent = flight(["d1"], 6)
+    taken = feed(inbox, [*messages_sent[0], *messages_sent[1]])
+    taken += feed(inbox, [*messages_sent[2][:2], *messages_sent[5]])
     assert inbox.next_gate_ns() == 2 * GATE_NS
-    taken += feed(inbox, [sent for gate in said[1:] for sent in gate])
-    assert taken == expected(said)
-    assert inbox.late == len(said[1]) + len(said[5])
+    taken += feed(inbox, [sent for gate in messages_sent[1:] for sent in gate])
+    assert taken == expected(messages_sent)
+    assert inbox.late == len(messages_sent[1]) + len(messages_sent[5])
     assert inbox.duplicates == 2
 
 
 def test_a_gate_of_which_nothing_came_is_known_by_its_gap():
     inbox = Inbox([STATUS], ["d1"])
-    said = flight(["d1"], 4)
-    feed(inbox, said[0])
-    assert feed(inbox, said[3]) == []
+    messages_sent = flight(["d1"], 4)
+    feed(inbox, messages_sent[0])
+    assert feed(inbox, messages_sent[3]) == []
     assert inbox.next_gate_ns() == GATE_NS
     assert inbox.latest_gate_ns() == 3 * GATE_NS
     assert inbox.missing(GATE_NS) == STATUS
     assert inbox.lost(GATE_NS) == STATUS
-    assert [t_ns for t_ns, _ in feed(inbox, [*said[2], *said[1]])] == [GATE_NS, 2 * GATE_NS, 3 * GATE_NS]
+    assert [t_ns for t_ns, _ in feed(inbox, [*messages_sent[2], *messages_sent[1]])] == [
+        GATE_NS,
+        2 * GATE_NS,
+        3 * GATE_NS,
+    ]
 
 
 def test_a_gap_that_is_given_up_is_passed_over():
     inbox = Inbox([STATUS], ["d1"])
-    said = flight(["d1"], 4)
-    feed(inbox, [*said[0], *said[3]])
+    messages_sent = flight(["d1"], 4)
+    feed(inbox, [*messages_sent[0], *messages_sent[3]])
     assert inbox.take(GATE_NS) == []
     assert inbox.next_gate_ns() == 3 * GATE_NS
 
@@ -240,12 +246,12 @@ def test_a_dropped_drone_s_samples_are_not_waited_for():
 
 def test_duplicates_and_latecomers_are_counted_and_refused():
     inbox = Inbox([STATUS], ["d1"])
-    said = gate_of("d1", 0)
-    assert inbox.put(*said[0])
-    assert not inbox.put(*said[0])
+    messages_sent = gate_of("d1", 0)
+    assert inbox.put(*messages_sent[0])
+    assert not inbox.put(*messages_sent[0])
     assert inbox.duplicates == 1
     inbox.take(0)
-    assert not inbox.put(*said[0])
+    assert not inbox.put(*messages_sent[0])
     assert inbox.late == 1
     assert inbox.next_gate_ns() is None
 
@@ -268,13 +274,13 @@ def test_messages_of_gates_to_come_stay():
 
 
 def test_a_long_backlog_is_worked_off_in_order():
-    said = flight(["d1"], 300)
+    messages_sent = flight(["d1"], 300)
     inbox = Inbox([STATUS], ["d1"])
-    for gate in said:
+    for gate in messages_sent:
         for key, message in gate:
             inbox.put(key, message)
     assert inbox.latest_gate_ns() == 299 * GATE_NS
-    assert ready(inbox) == expected(said)
+    assert ready(inbox) == expected(messages_sent)
 
 
 def test_in_realtime_a_late_message_comes_with_the_next_gate_once():

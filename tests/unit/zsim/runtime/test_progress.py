@@ -1,4 +1,4 @@
-"""What a person is told of a run: a reason that lasts, once."""
+"""The lines that a run shows: a reason that lasts, once."""
 
 import pytest
 from refused import has_terms
@@ -15,23 +15,23 @@ def state(t_ns: int, reason: str) -> ClusterState:
     return ClusterState(t_ns, t_ns // GATE_NS, "engaged", (), (), (), (), (), None, 1.0, reason)
 
 
-def told(reasons: HoldReasons, reason: str, from_ns: int, to_ns: int) -> list[str]:
+def lines_of(reasons: HoldReasons, reason: str, from_ns: int, to_ns: int) -> list[str]:
     lines = [reasons.line("main", state(t_ns, reason)) for t_ns in range(from_ns, to_ns, GATE_NS)]
     return [line for line in lines if line]
 
 
 def test_a_reason_that_lasts_is_told_once():
     reasons = HoldReasons()
-    assert told(reasons, WAITS, 0, REASON_NS) == []
-    (line,) = told(reasons, WAITS, REASON_NS, 10 * REASON_NS)
+    assert lines_of(reasons, WAITS, 0, REASON_NS) == []
+    (line,) = lines_of(reasons, WAITS, REASON_NS, 10 * REASON_NS)
     assert has_terms(line, "5.00", "main", "engaged", WAITS)
 
 
 def test_a_reason_that_passes_is_not_told():
     reasons = HoldReasons()
     for start_ns in range(0, 10 * REASON_NS, REASON_NS):
-        assert told(reasons, WAITS, start_ns, start_ns + REASON_NS // 2) == []
-        assert told(reasons, "", start_ns + REASON_NS // 2, start_ns + REASON_NS) == []
+        assert lines_of(reasons, WAITS, start_ns, start_ns + REASON_NS // 2) == []
+        assert lines_of(reasons, "", start_ns + REASON_NS // 2, start_ns + REASON_NS) == []
 
 
 def test_other_numbers_are_the_same_reason():

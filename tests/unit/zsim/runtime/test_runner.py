@@ -33,10 +33,10 @@ class Judge(Agent):
         super().__init__()
         self.name, self.period_ns = ME, GATE_NS
         self.gate_keys = self.reads = (keys.status("d1"), keys.estimate("d1"))
-        self.heard: list[tuple[str, int]] = []
+        self.received: list[tuple[str, int]] = []
 
     def receive(self, key: str, message: Any) -> None:
-        self.heard.append((keys.leaf(key), message.t_ns // GATE_NS))
+        self.received.append((keys.leaf(key), message.t_ns // GATE_NS))
 
     def step(self, t_ns: int) -> list[Output]:
         return []
@@ -177,10 +177,10 @@ class Swarm(Judge):
         self.counted = ("d1", "d2")
 
 
-def bundle_of(t_ns: int, seq: int, told: list[tuple[str, Any]]) -> GateMessages:
+def bundle_of(t_ns: int, seq: int, entries: list[tuple[str, Any]]) -> GateMessages:
     """Return messages on drones d1 to d3 as the world bundles them."""
     table = key_table([drone.name for drone in DRONES])
-    return GateMessages.of(t_ns, seq, table, [(key, messages.encode(message)) for key, message in told])
+    return GateMessages.of(t_ns, seq, table, [(key, messages.encode(message)) for key, message in entries])
 
 
 class InOne(World):
@@ -188,23 +188,23 @@ class InOne(World):
 
     def _gate(self, gate: int) -> None:
         t_ns, still = gate * GATE_NS, (0.0, 0.0, 0.0)
-        told = [
+        entries = [
             (keys.sensor("d1", "mag"), Mag(t_ns, gate, t_ns, still)),
             (keys.status("d1"), replace(status(gate), count=2)),
             (keys.status("d2"), status(gate)),
             (keys.status("d3"), status(gate)),
         ]
         self._at.get(gate, lambda world: None)(self)
-        self.deliver(keys.GATE, bundle_of(t_ns, gate, told).pack())
+        self.deliver(keys.GATE, bundle_of(t_ns, gate, entries).pack())
 
 
 def test_who_reads_several_drones_gets_a_gate_in_one_message():
     swarm, world = Swarm(), InOne({3: lambda world: world.deliver(keys.estimate("d3"), estimate(3))})
     Runner(world, info(), swarm).run()  # type: ignore[arg-type]
     assert world.gates_done() == list(range(END + 1))
-    assert swarm.heard[:3] == [("mag", 0), ("status", 0), ("status", 0)]
-    assert len([leaf for leaf, _ in swarm.heard if leaf == "status"]) == 2 * (END + 1)  # d3's are not asked for
-    assert ("estimate", 3) in swarm.heard
+    assert swarm.received[:3] == [("mag", 0), ("status", 0), ("status", 0)]
+    assert len([leaf for leaf, _ in swarm.received if leaf == "status"]) == 2 * (END + 1)  # d3's are not asked for
+    assert ("estimate", 3) in swarm.received
 
 
 def test_garbage_in_place_of_a_gate_is_refused_and_changes_nothing():
@@ -247,7 +247,7 @@ def test_a_gate_that_was_lost_is_asked_for_until_it_is_there(before: list[Contro
     world.on_request = answers(*before, replayed(2))
     judge = run(world)
     assert world.gates_done() == list(range(END + 1))
-    assert [gate for kind, gate in judge.heard if kind == "estimate"] == list(range(END + 1))
+    assert [gate for kind, gate in judge.received if kind == "estimate"] == list(range(END + 1))
     assert world.requests[0] == (REPLAY, {"from_ns": GATE_NS, "keys": list(judge.reads), "page": 0})
 
 
@@ -333,7 +333,7 @@ def test_after_a_lost_link_another_run_is_none_of_its_business():
 KILL = Fault(1, "process_kill", ME, {}, 2 * GATE_NS, 3 * GATE_NS, "tester.one")
 
 
-def told(gate: int, seq: int, *faults: Fault) -> Faults:
+def entries(gate: int, seq: int, *faults: Fault) -> Faults:
     return Faults(gate * GATE_NS, seq, faults)
 
 
@@ -354,26 +354,28 @@ def last_gate(before_gate: int, *lists: Faults) -> int:
 
 
 def test_a_kill_is_at_the_first_gate_in_which_it_acts():
-    assert last_gate(1, told(0, 0, KILL)) == 3
+    assert last_gate(1, entries(0, 0, KILL)) == 3
 
 
-@pytest.mark.parametrize("lists", [(told(2, 0, KILL), told(4, 1)), (told(4, 1), told(2, 0, KILL))], ids=["late", "old"])
+@pytest.mark.parametrize(
+    "lists", [(entries(2, 0, KILL), entries(4, 1)), (entries(4, 1), entries(2, 0, KILL))], ids=["late", "old"]
+)
 def test_what_was_forgotten_before_a_late_process_heard_of_it(lists: tuple[Faults, Faults]):
-    """Both lists are heard at once: one that names the kill, and the newer one, said when it was over."""
+    """Both lists arrive at once: one that names the kill, and the newer one, sent when it was over."""
     died = lists[0].faults != ()
     assert last_gate(2, *lists) == (3 if died else END)
 
 
 def test_a_kill_that_is_heard_of_too_late_still_kills():
-    assert last_gate(5, told(2, 0, KILL)) == 5
+    assert last_gate(5, entries(2, 0, KILL)) == 5
 
 
 def test_a_kill_that_is_cleared_kills_nobody():
-    assert last_gate(1, told(0, 0, KILL), told(1, 1)) == END
+    assert last_gate(1, entries(0, 0, KILL), entries(1, 1)) == END
 
 
 def test_an_older_list_does_not_take_a_kill_away():
-    assert last_gate(1, told(1, 1, KILL), told(0, 0)) == 3
+    assert last_gate(1, entries(1, 1, KILL), entries(0, 0)) == 3
 
 
 class Second(Judge):
@@ -388,7 +390,7 @@ def test_who_is_started_again_after_its_kill_lives(former_gate: int, killed: boo
     """The former process of its name got as far as a gate; the kill is of gate 3."""
     world = World(estimates(range(END + 1)))
     world.last[keys.estimate("d1")] = encode(estimate(former_gate))
-    world.last[keys.FAULTS] = encode(told(0, 0, KILL))
+    world.last[keys.FAULTS] = encode(entries(0, 0, KILL))
     runner = Runner(world, info(), Second())  # type: ignore[arg-type]
     runner.run()
     assert runner.killed == killed

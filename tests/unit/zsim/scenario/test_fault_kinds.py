@@ -52,8 +52,8 @@ def test_every_kind_is_taken_with_what_it_needs(kind: str):
     assert list(flaws(sound(kind), KNOWN)) == []
     for parameter in KINDS[kind].parameters:
         left_out = {name: value for name, value in sound(kind).items() if name != parameter.name}
-        told = [path for path, _ in flaws(left_out, KNOWN)]
-        assert told == ([parameter.name] if parameter.required else [])
+        paths = [path for path, _ in flaws(left_out, KNOWN)]
+        assert paths == ([parameter.name] if parameter.required else [])
 
 
 BAD = [math.nan, math.inf, "x", True, [1, 2], {}, -1e12, 10**400, [math.nan, 0, 0]]
@@ -162,8 +162,8 @@ def test_times_are_whole_gates():
 
 def test_every_parameter_is_told():
     assert planned(sound("link_cut"), 1, "me", 0, GATE_NS).parameters == {"one_way": False}
-    told = planned(sound("radio", place={"controller.main": [1, 2, 3]}), 1, "me", 0, GATE_NS).parameters
-    assert told == {"range_m": 30.0, "spread_m": 5.0, "place": {"controller.main": [1.0, 2.0, 3.0]}}
+    paths = planned(sound("radio", place={"controller.main": [1, 2, 3]}), 1, "me", 0, GATE_NS).parameters
+    assert paths == {"range_m": 30.0, "spread_m": 5.0, "place": {"controller.main": [1.0, 2.0, 3.0]}}
     assert planned(sound("rotor_stuck"), 1, "me", 0, GATE_NS).parameters == {"rotor": "front_left", "speed_rad_s": None}
 
 
@@ -174,9 +174,9 @@ def document(*given: Any) -> dict[str, Any]:
 
 
 def test_a_scenario_tells_every_flaw_at_once():
-    with pytest.raises(ScenarioError) as told:
+    with pytest.raises(ScenarioError) as paths:
         resolve(document(sound("gps_dropout"), sound("link_loss", probability=1.4), {"kind": "x"}, 3), "step.yaml")
-    lines = str(told.value).splitlines()
+    lines = str(paths.value).splitlines()
     assert any(has_terms(line, "step.yaml", "faults[1].probability", "1.4", "0", "1", "link_loss") for line in lines)
     assert any(has_terms(line, "step.yaml", "faults[3]", "3", "map") for line in lines)
     assert len(lines) == 3
@@ -195,11 +195,11 @@ def test_the_table_of_kinds_in_the_documentation_says_what_the_code_says():
     assert table
     written = [[cell.strip() for cell in row.strip("|").split("|")] for row in table[1].splitlines()[2:]]
     assert written == [
-        [f"`{name}`", kind.strikes, kind.description, "<br>".join(map(told, kind.parameters)) or "–"]
+        [f"`{name}`", kind.strikes, kind.description, "<br>".join(map(paths, kind.parameters)) or "–"]
         for name, kind in KINDS.items()
     ]
 
 
-def told(p: FaultParameter) -> str:
+def paths(p: FaultParameter) -> str:
     standing = f"default {p.default:g}" if isinstance(p.default, float) else "may be left out"
     return f"`{p.name}` {p.description}: {expected(p)}{'' if p.required else f'; {standing}'}"

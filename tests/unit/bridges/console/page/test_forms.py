@@ -155,12 +155,12 @@ class FakeCommandClient:
 
 
 class Bench:
-    """A page, its desk, and what was refused already here."""
+    """A page, its command client, and the outcomes of requests that were refused already here."""
 
     def __init__(self, scenario: str = "step") -> None:
         self.gui: Any = Gui()
-        self.desk: Any = FakeCommandClient()
-        self.told: list[RequestOutcome] = []
+        self.client: Any = FakeCommandClient()
+        self.outcomes: list[RequestOutcome] = []
         self.scenario = scenario_file.load(SCENARIOS / f"{scenario}.yaml")
         self.names = tuple(drone.name for drone in self.scenario.drones)
         self.cluster = self.scenario.clusters[0]
@@ -168,10 +168,10 @@ class Bench:
 
     def formation(self) -> FormationForm:
         found = slider_ranges(self.space, self.cluster, self.scenario)
-        return FormationForm(self.gui, self.desk, self.told.append, self.cluster, self.space, found)
+        return FormationForm(self.gui, self.client, self.outcomes.append, self.cluster, self.space, found)
 
     def faults(self) -> None:
-        FaultForm(self.gui, self.desk, self.told.append, self.scenario)
+        FaultForm(self.gui, self.client, self.outcomes.append, self.scenario)
 
     def view(self, **values: float) -> ViewCluster:
         c = [values.get(name, 0.0) for name in self.space.names]
@@ -196,11 +196,11 @@ def bench() -> Bench:
     ],
 )
 def test_the_run_is_asked_for_what_the_button_says(bench: Bench, label: str, asked: tuple[Any, ...]):
-    RunForm(bench.gui, bench.desk, 1.0)
+    RunForm(bench.gui, bench.client, 1.0)
     bench.gui.at["gates"].value, bench.gui.at["rate"].value = 7.0, 2.5
     bench.gui.press(label)
-    assert bench.desk.asked == [("world", *asked)]
-    assert all(isinstance(gates, int) for gates in bench.desk.asked[0][2].values() if asked[0] == "step")
+    assert bench.client.asked == [("world", *asked)]
+    assert all(isinstance(gates, int) for gates in bench.client.asked[0][2].values() if asked[0] == "step")
 
 
 @pytest.mark.parametrize(
@@ -213,28 +213,28 @@ def test_the_run_is_asked_for_what_the_button_says(bench: Bench, label: str, ask
     ],
 )
 def test_the_chosen_drone_alone_gets_its_mode(bench: Bench, label: str, mode: str):
-    form = DroneForm(bench.gui, bench.desk, bench.scenario)
+    form = DroneForm(bench.gui, bench.client, bench.scenario)
     bench.gui.at["drone"].value = bench.names[1]
     bench.gui.press(label)
     assert form.chosen == bench.names[1]
-    assert bench.desk.asked == [((bench.names[1],), mode)]
+    assert bench.client.asked == [((bench.names[1],), mode)]
 
 
 @pytest.mark.parametrize(("label", "what"), [("Take off all", "takeoff"), ("Land all", "land")])
 def test_all_formations_and_all_drones_of_none_take_off_and_land(bench: Bench, label: str, what: str):
-    FleetForm(bench.gui, bench.desk, mixed())
+    FleetForm(bench.gui, bench.client, mixed())
     bench.gui.at["all drones"].put(label)
-    assert bench.desk.asked == [("main", what, {}), ("other", what, {}), (("d5", "d6"), what)]
+    assert bench.client.asked == [("main", what, {}), ("other", what, {}), (("d5", "d6"), what)]
 
 
 @pytest.mark.parametrize("alone", [True, False])
 def test_all_drones_are_in_formations_or_none_is(bench: Bench, alone: bool):
     scenario = mixed()
     clusters, drones = ([], scenario.drones[4:]) if alone else (scenario.clusters, scenario.drones[:4])
-    FleetForm(bench.gui, bench.desk, msgspec.structs.replace(scenario, clusters=clusters, drones=drones))
+    FleetForm(bench.gui, bench.client, msgspec.structs.replace(scenario, clusters=clusters, drones=drones))
     bench.gui.at["all drones"].put("Land all")
     formations = [("main", "land", {}), ("other", "land", {})]
-    assert bench.desk.asked == ([(("d5", "d6"), "land")] if alone else formations)
+    assert bench.client.asked == ([(("d5", "d6"), "land")] if alone else formations)
 
 
 def mixed() -> Scenario:
@@ -278,7 +278,7 @@ def test_a_common_fault_strikes_the_chosen_drone(bench: Bench, label: str, asked
     bench.faults()
     bench.gui.at["drone"].value = "drone2"
     bench.gui.press(label)
-    assert bench.desk.asked == [("world", "fault_add", asked)]
+    assert bench.client.asked == [("world", "fault_add", asked)]
 
 
 def test_a_fault_of_no_duration_lasts_until_it_is_cleared(bench: Bench):
@@ -287,7 +287,7 @@ def test_a_fault_of_no_duration_lasts_until_it_is_cleared(bench: Bench):
     bench.gui.press("GPS lost")
     bench.gui.press("Clear all faults")
     lasting = {"kind": "gps_dropout", "target": bench.names[0]}
-    assert bench.desk.asked == [("world", "fault_add", lasting), ("world", "fault_clear", {})]
+    assert bench.client.asked == [("world", "fault_add", lasting), ("world", "fault_clear", {})]
 
 
 def test_any_fault_is_injected_with_what_was_typed(bench: Bench):
@@ -297,7 +297,7 @@ def test_any_fault_is_injected_with_what_was_typed(bench: Bench):
     bench.gui.at["parameters"].value = "value_m: 2.5"
     bench.gui.press("Inject it")
     asked = {"kind": "baro_bias", "target": "drone3", "for_s": DURATION_S, "value_m": 2.5}
-    assert bench.desk.asked == [("world", "fault_add", asked)]
+    assert bench.client.asked == [("world", "fault_add", asked)]
 
 
 def test_a_time_among_the_parameters_is_the_one_that_is_sent(bench: Bench):
@@ -305,7 +305,7 @@ def test_a_time_among_the_parameters_is_the_one_that_is_sent(bench: Bench):
     bench.gui.at["parameters"].value = "for_s: 5, at_s: 40"
     bench.gui.press("Inject it")
     asked = {"kind": next(iter(KINDS)), "target": bench.names[0], "for_s": 5, "at_s": 40}
-    assert bench.desk.asked == [("world", "fault_add", asked)]
+    assert bench.client.asked == [("world", "fault_add", asked)]
 
 
 def test_a_kill_by_its_kind_is_sent_without_a_duration(bench: Bench):
@@ -313,7 +313,7 @@ def test_a_kill_by_its_kind_is_sent_without_a_duration(bench: Bench):
     bench.gui.at["kind"].put("process_kill")
     bench.gui.at["target"].value = "estimator.drone1"
     bench.gui.press("Inject it")
-    assert bench.desk.asked == [("world", "fault_add", {"kind": "process_kill", "target": "estimator.drone1"})]
+    assert bench.client.asked == [("world", "fault_add", {"kind": "process_kill", "target": "estimator.drone1"})]
 
 
 @pytest.mark.parametrize("text", ["value", "a: 2024-13-45", "[" * 2000, "probability: 1, probability: 0"])
@@ -321,8 +321,8 @@ def test_parameters_that_are_none_are_told_and_not_sent(bench: Bench, text: str)
     bench.faults()
     bench.gui.at["parameters"].value = text
     bench.gui.press("Inject it")
-    assert bench.desk.asked == []
-    assert has_terms(bench.told[0].refusal, "NAME", "VALUE")
+    assert bench.client.asked == []
+    assert has_terms(bench.outcomes[0].refusal, "NAME", "VALUE")
 
 
 @pytest.mark.parametrize("name", ["kind", "target", "op", "self", "value"])
@@ -330,8 +330,8 @@ def test_a_parameter_that_a_kind_has_not_is_told_and_not_sent(bench: Bench, name
     bench.faults()
     bench.gui.at["parameters"].value = f"{name}: x"
     bench.gui.press("Inject it")
-    assert bench.desk.asked == []
-    assert has_terms(bench.told[0].refusal, f"{name!r}", "known", "at_s", "for_s", "probability")
+    assert bench.client.asked == []
+    assert has_terms(bench.outcomes[0].refusal, f"{name!r}", "known", "at_s", "for_s", "probability")
 
 
 # A formation
@@ -343,7 +343,7 @@ def test_a_parameter_that_a_kind_has_not_is_told_and_not_sent(bench: Bench, name
 def test_a_formation_is_asked_for_its_phase(bench: Bench, label: str, op: str):
     bench.formation()
     bench.gui.press(label)
-    assert bench.desk.asked == [(bench.cluster.name, op, {})]
+    assert bench.client.asked == [(bench.cluster.name, op, {})]
 
 
 def test_sliders_that_rest_are_sent_together_and_once(bench: Bench):
@@ -351,17 +351,17 @@ def test_sliders_that_rest_are_sent_together_and_once(bench: Bench):
     bench.gui.at["p [m]"].put(5.0)
     bench.gui.at["z_c [m]"].put(4.0)
     form.send(0.0)  # on the wall: no rest yet
-    assert bench.desk.asked == []
+    assert bench.client.asked == []
     form.send(LATER_S)
     form.send(LATER_S + REST_S)
-    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0, "z_c": 4.0}})]
+    assert bench.client.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0, "z_c": 4.0}})]
 
 
 def test_a_slider_that_the_console_moves_asks_for_nothing(bench: Bench):
     form = bench.formation()
     bench.gui.at["p [m]"].put(5.0, NOBODY)
     form.send(LATER_S)
-    assert bench.desk.asked == []
+    assert bench.client.asked == []
 
 
 def test_sliders_follow_the_formation_but_for_those_that_somebody_moves(bench: Bench):
@@ -380,7 +380,7 @@ def test_sliders_follow_the_formation_but_for_those_that_somebody_moves(bench: B
 
 def test_people_are_told_of_targets_in_the_units_of_the_page(bench: Bench):
     bench.formation().request_target({"p": 5.0, "yaw": 180.0})
-    (line,) = bench.desk.shown
+    (line,) = bench.client.shown
     assert has_terms(line, "p 5 m", "yaw 180 deg")
 
 
@@ -388,7 +388,7 @@ def test_a_move_lasts_as_long_as_is_asked_for(bench: Bench):
     form = bench.formation()
     bench.gui.at["over [s]"].value = 20.0
     form.request_target({"p": 5.0})
-    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0}, "over_s": 20.0})]
+    assert bench.client.asked == [(bench.cluster.name, "target", {"values": {"p": 5.0}, "over_s": 20.0})]
 
 
 @pytest.mark.parametrize("left_s", [0.0, LATER_S])
@@ -400,20 +400,20 @@ def test_a_number_out_of_range_is_not_flown_to_the_limit_when_its_box_is_left(be
     form.send(left_s)
     box.put(limit)  # the page does, when its box is left
     form.send(LATER_S)
-    assert bench.desk.asked == []
-    (outcome,) = bench.told
+    assert bench.client.asked == []
+    (outcome,) = bench.outcomes
     assert has_terms(outcome.refusal, "y_c", "500 m")
     form.refresh(bench.view(y_c=-5.0), LATER_S)
     assert box.value == -5.0
     box.put(limit)  # somebody means it
     form.send(LATER_S)
-    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {"y_c": limit}})]
+    assert bench.client.asked == [(bench.cluster.name, "target", {"values": {"y_c": limit}})]
 
 
 def test_a_value_out_of_range_is_told_and_not_sent(bench: Bench):
     bench.formation().request_target({"p": 0.5})
-    assert bench.desk.asked == []
-    assert has_terms(bench.told[0].refusal, "p", "0.5 m")
+    assert bench.client.asked == []
+    assert has_terms(bench.outcomes[0].refusal, "p", "0.5 m")
 
 
 def test_of_many_variables_the_others_are_moved_one_at_a_time():
@@ -423,7 +423,7 @@ def test_of_many_variables_the_others_are_moved_one_at_a_time():
     bench.gui.at["variable"].value = hidden
     bench.gui.at["value [m or deg]"].value = 0.5
     bench.gui.press("Move it")
-    assert bench.desk.asked == [(bench.cluster.name, "target", {"values": {hidden: 0.5}})]
+    assert bench.client.asked == [(bench.cluster.name, "target", {"values": {hidden: 0.5}})]
 
 
 def test_trajectories_are_flown_as_they_are_typed(bench: Bench):
@@ -433,7 +433,7 @@ def test_trajectories_are_flown_as_they_are_typed(bench: Bench):
     bench.gui.at["waypoints"].value = "20: x_c = 5"
     bench.gui.press("Fly the waypoints")
     name = bench.cluster.name
-    assert bench.desk.asked == [
+    assert bench.client.asked == [
         (name, "trajectory", {"expressions": {"x_c": "R*cos(0.1*t)"}, "constants": {"R": 5.0}}),
         (name, "trajectory", {"waypoints": [{"at_s": 20.0, "values": {"x_c": 5.0}}]}),
     ]
@@ -447,15 +447,15 @@ def test_the_trajectory_of_the_scenario_is_flown_as_it_stands_there():
     assert planned is not None
     asked = {"expressions": planned.expressions, "constants": planned.constants}
     assert planned.expressions
-    assert bench.desk.asked == [(bench.cluster.name, "trajectory", asked)]
+    assert bench.client.asked == [(bench.cluster.name, "trajectory", asked)]
 
 
 def test_a_trajectory_that_is_none_is_told_and_not_sent(bench: Bench):
     bench.formation()
     bench.gui.at["waypoints"].value = "soon"
     bench.gui.press("Fly the waypoints")
-    assert bench.desk.asked == []
-    assert bench.told[0].request == f"{bench.cluster.name}: trajectory"
+    assert bench.client.asked == []
+    assert bench.outcomes[0].request == f"{bench.cluster.name}: trajectory"
 
 
 # The page
@@ -465,10 +465,10 @@ def test_emergency_stops_everybody_and_switches_change_the_scene(bench: Bench):
     shown: list[tuple[str, bool]] = []
     spaces = {bench.cluster.name: bench.space}
     show = lambda *switched: shown.append(switched)  # noqa: E731
-    page = ConsolePage(bench.gui, bench.scenario, spaces, bench.desk, bench.told.append, show, 2.0)
+    page = ConsolePage(bench.gui, bench.scenario, spaces, bench.client, bench.outcomes.append, show, 2.0)
     assert bench.gui.at["rate"].value == 2.0
     bench.gui.press("EMERGENCY – all rotors stop")
-    assert bench.desk.asked == [(bench.names, "emergency")]
+    assert bench.client.asked == [(bench.names, "emergency")]
     assert page.chosen == bench.cluster.name
     for what, label in SWITCHES.items():
         bench.gui.at[label].put(False)
