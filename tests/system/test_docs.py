@@ -50,6 +50,13 @@ from zsim_deploy.inventory import inventory
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 RUN_S = 4.0  # simulated seconds of a run that has no other process to serve
+LONG = (
+    "deployment.md",
+    "estimation.md",
+    "extending.md",
+    "records.md",
+    "sweep.md",
+)  # what they show has tests of its own
 PATIENCE_S = 600  # wall seconds for one block on a machine that does other work as well
 PROGRAMS = ("octave-cli", "gcc", "node", "zenoh-ros2", "rostopic")
 KINDS = (
@@ -94,9 +101,10 @@ def blocks(page: Path) -> Iterator[Block]:
             chapter += 1
 
 
-def pages_with(*kinds: str) -> list[Any]:
-    """Return the pages that hold a block of one of the kinds."""
-    return [pytest.param(p, id=p.name) for p in PAGES if any(b.kind in kinds for b in blocks(p))]
+def pages_with(*kinds: str, long: tuple[str, ...] = ()) -> list[Any]:
+    """Return the pages that hold a block of one of the kinds; those of some names are for the soak."""
+    pages = [p for p in PAGES if any(b.kind in kinds for b in blocks(p))]
+    return [pytest.param(p, id=p.name, marks=[pytest.mark.soak] if p.name in long else []) for p in pages]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -108,7 +116,7 @@ def test_every_block_is_of_a_known_kind(page: Path) -> None:
 # Commands
 
 
-@pytest.mark.parametrize("page", pages_with("bash run", "bash terminals"))
+@pytest.mark.parametrize("page", pages_with("bash run", "bash terminals", long=LONG))
 def test_commands_run(page: Path, tmp_path: Path) -> None:
     missing: list[str] = []
     with Checkout(tmp_path) as checkout:
@@ -270,6 +278,16 @@ def adapted(line: str, ports: tuple[int, ...], longest_s: float | None) -> str:
         line = re.sub(rf"({'|'.join(map(re.escape, OURS))})", rf"\1 --connect {endpoint}", line)
     line = re.sub(r"\bzsim (keys|echo|hz|pub|ask|fault (?:add|clear|list))\b", rf"zsim \1 --wait {PATIENCE_S}", line)
     return re.sub(r"\bmake (\w+)", rf"make -n -C {ROOT} \1 >/dev/null", line)  # last: ROOT may end with zsim
+
+
+@pytest.mark.parametrize("page", pages_with("bash run", "bash terminals"))
+def test_commands_are_ones_that_exist(page: Path) -> None:
+    for block in blocks(page):
+        for line in lines(block) if block.kind in ("bash run", "bash terminals") else ():
+            words = [word for word in shlex.split(line) if not re.match(r"[A-Z_]+=", word)]
+            if words[:1] == ["zsim"]:
+                ends = [place for place, word in enumerate(words) if word in ("|", ">", "&&", "||", "&")]
+                assert parses(words[1 : min(ends, default=len(words))]), f"{page.name}:{block.line}: {line}"
 
 
 @pytest.mark.parametrize("page", pages_with("bash elsewhere"))

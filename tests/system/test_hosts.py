@@ -70,6 +70,7 @@ def test_a_killed_role_is_started_again(deployment: Deployment, role: str) -> No
     assert [event["subject"] for event in deployment.record().events("restart")] == [role]
 
 
+@pytest.mark.soak
 def test_a_broken_ssh_session_is_the_death_of_its_roles(deployment: Deployment) -> None:
     """They end, since their launcher is gone; time stands still until there are new ones."""
     run = deployment.up("--rate", "4", "--duration", "3600")
@@ -186,6 +187,7 @@ def test_a_killed_router_is_started_again(lab: Lab, tmp_path: Path) -> None:
         assert deployment.record().sha256() == in_process(tmp_path, 30.0)
 
 
+@pytest.mark.soak
 def test_a_router_per_site_each_at_the_world(lab: Lab, tmp_path: Path) -> None:
     """What an estimator of one site says reaches the controller of the other through the world.
 

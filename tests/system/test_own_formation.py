@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from deployment import ROLES, START_S, STEP, Deployment, closing, in_process
+from deployment import STEP, in_process
 from federation import Federation
 from forked_commands import ROOT
-from lab import Lab
 
 EXAMPLES = str(ROOT / "examples")
 SPACE = "clusters.main.space=leader_cluster:LeaderCluster"
@@ -71,13 +70,3 @@ def test_a_class_that_is_not_there_is_one_line(federation: Federation, field: st
     run.ends(with_code=2)
     assert "cluster 'main'" in run.line("nowhere.at_all:Missing").text
     assert "Traceback" not in run.text()
-
-
-def test_it_flies_on_several_hosts(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The module need be only where the controller is."""
-    monkeypatch.syspath_prepend(EXAMPLES)
-    lab.environment("h2", PYTHONPATH=EXAMPLES)
-    with closing(Deployment(lab, ROLES)) as deployment:
-        deployment.up(*options(SPACE, LAW)).ends(with_code=0, within_s=START_S)
-        assert deployment.record().all("cluster/main/state")[-1]["phase"] == "engaged"
-        assert deployment.record().sha256() == in_process(tmp_path, DURATION_S, [*FLIGHT, SPACE, LAW])

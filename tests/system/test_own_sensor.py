@@ -2,19 +2,14 @@
 
 import csv
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from deployment import ROLES, START_S, STEP, Deployment, closing
 from federation import PAIR, Federation, Record
 from forked_commands import ROOT
-from lab import Lab
 
 from zsim.record import RecordReader
-from zsim.scenario import scenario_file
-from zsim_analysis.in_process import fly
 
 EXAMPLES = str(ROOT / "examples")
 SENSORS = (
@@ -132,19 +127,3 @@ def test_a_faulty_one_is_a_line(federation: Federation, field: str, where: str) 
     run.ends(with_code=2)
     (line,) = [line.text for line in run.lines if line.text.strip()]
     assert f"pair.yaml: {where} is" in line
-
-
-def test_it_flies_on_several_hosts(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The modules need be only where the scenario is read, and where the world is."""
-    monkeypatch.syspath_prepend(EXAMPLES)
-    monkeypatch.setenv("PYTHONPATH", EXAMPLES)
-    lab.environment("h1", PYTHONPATH=EXAMPLES)
-    for host in ("h2", "h3"):
-        lab.environment(host, PYTHONPATH="")
-    alone = tmp_path / "alone.mcap"
-    fly(scenario_file.load(STEP, SENSORS, duration_s=DURATION_S), alone)
-    with closing(Deployment(lab, ROLES)) as deployment, RecordReader(alone) as reader:
-        deployment.up(*options()).ends(with_code=0, within_s=START_S)
-        check_ranges(deployment.record())
-        assert same_samples(deployment.record(), Record(reader))
-        assert deployment.record().sha256() == Record(reader).sha256()

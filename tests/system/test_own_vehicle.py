@@ -1,16 +1,13 @@
 """Vehicles by their model: a user's own out of examples/, and the Crazyflie, however a scenario is flown."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from deployment import ROLES, START_S, Deployment, closing, in_process
 from federation import PAIR, Federation
 from forked_commands import ROOT
-from lab import Lab
 
 from zsim.vehicles import vehicle_catalogue
 
@@ -54,17 +51,6 @@ def test_a_sweep_compares_vehicles(federation: Federation) -> None:
     rows = pq.read_table(out / "sweep.parquet").to_pylist()
     assert [row["failure"] for row in rows] == [None] * 3
     assert len({row["truth_sha256"] for row in rows}) == 3
-
-
-def test_it_flies_on_several_hosts(lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The module need be only where the scenario is read and where the world is."""
-    monkeypatch.syspath_prepend(EXAMPLES)
-    monkeypatch.setenv("PYTHONPATH", EXAMPLES)
-    lab.environment("h1", PYTHONPATH=EXAMPLES)
-    options = ("--duration", str(DURATION_S), "--set", MODEL, "--set", TAKEOFF)
-    with closing(Deployment(lab, ROLES)) as deployment:
-        deployment.up(*options).ends(with_code=0, within_s=START_S)
-        assert deployment.record().sha256() == in_process(tmp_path, DURATION_S, [MODEL, TAKEOFF])
 
 
 def test_crazyflies_fly_test_1_at_the_size_of_a_room(federation: Federation) -> None:

@@ -18,7 +18,7 @@ def complete(flown: Flown, seconds: float) -> None:
     assert flown.messages > SHARE * RATES_HZ * DRONES * seconds
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 def test_five_seconds_as_fast_as_they_go_are_recorded_without_a_gap(compiled: None) -> None:
     complete(fly(DRONES, 5.0), 5.0)
 

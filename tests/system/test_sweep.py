@@ -206,6 +206,7 @@ def cluster() -> Iterator[str]:
         yield local.scheduler_address
 
 
+@pytest.mark.soak
 def test_a_dask_cluster_flies_the_same_rows(federation: Federation, undisturbed: Path, cluster: str) -> None:
     """A cluster goes on with what other workers have begun."""
     out = federation.folder / "sweep"

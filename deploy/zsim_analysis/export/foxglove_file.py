@@ -4,7 +4,10 @@ Foxglove reads all of it. Rerun draws no scenes; it has the transforms, poses, p
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -51,13 +54,39 @@ def convert(
     drones = [subject(key) for key in wanted if key.startswith("drone/")]
     decoded = DecodedMessages(selection.messages(reader, wanted), _decode, lambda done: progress(done, total))
     file = FoxgloveFile(path, _rotors(info, scenario, dict.fromkeys(drones)), _spaces(scenario))
-    try:
-        for instant in instants(decoded):
-            file.write(instant)
-    finally:
-        file.close()
+    with deferred_signals() as check:
+        try:
+            for instant in instants(decoded):
+                file.write(instant)
+                check()
+        finally:
+            file.close()
+        check()
     layout_path.write_text(layout(file.counts, file.variables()) + "\n", encoding="utf-8")
     return dict(sorted(file.counts.items())), decoded.refused
+
+
+@contextmanager
+def deferred_signals() -> Iterator[Callable[[], None]]:
+    """Yield a function that handles the SIGINT or SIGTERM that has come since.
+
+    What their handlers raise would, within a call of the library, be printed there and lost.
+    """
+    came: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    former = {number: handler for number in numbers if callable(handler := signal.getsignal(number))}
+
+    def check() -> None:
+        if came:
+            former[signal.Signals(came[0])](came[0], None)
+
+    for number in former:
+        signal.signal(number, lambda signum, _: came.append(signum))
+    try:
+        yield check
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
 
 
 def _decode(recorded: Recorded) -> Any:

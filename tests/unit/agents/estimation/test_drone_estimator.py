@@ -69,15 +69,12 @@ def test_a_flight_is_followed_to_the_sensors_limits():
 @pytest.mark.parametrize(
     "sections",
     [
-        {},
-        {"sensors": {"as_printed": True}},
-        {"preset": "ardrone2"},
         {"estimation": {"madgwick_beta": 0.1}},
         {"estimation": {"madgwick_beta": 0.0}},
         {"estimation": {"flow": False}},
         {"estimation": {"magnetometer": False}},
     ],
-    ids=["paper", "as_printed", "ardrone2", "beta .1", "gyro alone", "no flow", "no magnetometer"],
+    ids=["beta .1", "gyro alone", "no flow", "no magnetometer"],
 )
 def test_the_covariance_tells_the_truth(sections):
     of = scenario(**sections, yaw_deg=0.0)

@@ -57,7 +57,7 @@ def test_a_flight_is_followed():
 
 def test_the_covariance_of_the_position_is_of_the_right_size():
     nees = []
-    for seed in range(8):
+    for seed in range(4):
         flight = Flight(seed)
         of = of_yaw(flight)
         estimates = fly(paper(of), readings(flight, of, seed, 40.0), 40.0)

@@ -13,6 +13,7 @@ from zsim_world.fleet.fleet import Fleet
 from zsim_world.fleet.publication import GatePublication
 
 GATE_S = 0.02
+pytestmark = pytest.mark.xdist_group("hexacopter")  # six rotors are compiled once
 MODELS = [*vehicle_catalogue.STOCK, "hexacopter"]
 
 
