@@ -54,6 +54,7 @@ LONG = (
     "deployment.md",
     "estimation.md",
     "extending.md",
+    "faults.md",
     "records.md",
     "sweep.md",
 )  # what they show has tests of its own

@@ -36,9 +36,10 @@ def fuzz(gateway: GatewayProcess, checks: str, mode: str, *options: str, example
     return done.stdout
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize(
     ("checks", "option"),
-    [(STRICT, "--exclude-path-regex"), pytest.param(CHECKS, "--include-path-regex", marks=pytest.mark.soak)],
+    [(STRICT, "--exclude-path-regex"), (CHECKS, "--include-path-regex")],
     ids=["what zsim answers", "own keys"],
 )
 def test_its_description_holds(federation: Federation, checks: str, option: str) -> None:

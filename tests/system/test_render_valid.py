@@ -260,7 +260,7 @@ def test_a_certificate_that_is_not_there_is_a_line(tmp_path: Path) -> None:
     assert "Traceback" not in printed
 
 
-@SECURITY
+@pytest.mark.parametrize("insecure", [False, pytest.param(True, marks=pytest.mark.soak)], ids=["tls", "insecure"])
 @pytest.mark.usefixtures("compiled")
 def test_the_units_of_three_hosts_fly(tmp_path: Path, insecure: bool) -> None:
     """All units at once, in whatever order they come up, until the world ends the run."""
