@@ -108,10 +108,11 @@ def fly(
     Raises:
         DivergedError: the state of a drone was no longer finite; the record is complete to its end.
     """
-    flight = InProcessFlight(scenario, run_id)  # first: a refused scenario leaves no record, which would be in the way
-    writer = RecordWriter(record) if record else None
     progress = _Progress(scenario, screen) if screen else None
+    writer = None
     try:
+        flight = InProcessFlight(scenario, run_id)
+        writer = RecordWriter(record) if record else None  # after it: a refused scenario leaves no record in the way
         flight.run([each for each in (writer, progress) if each], stop_reason)
     finally:
         for each in (progress, writer):

@@ -45,7 +45,7 @@ class AgentGroup(Agent):
         self._waiting: list[list[Input]] = [[] for _ in members]
         self._routes = RoutingTable([member.reads for member in members])
         self._whole = [place for place, member in enumerate(members) if member.takes_gates]
-        self._gates = GateRouter(self._routes, without=self._whole)
+        self._gates = GateRouter(RoutingTable([() if member.takes_gates else member.reads for member in members]))
         self.takes_gates = True  # and takes them apart for those of its members who do not
         for member in members:
             member.share_process(self.name)

@@ -87,12 +87,10 @@ class GateRouter:
 
     Args:
         routes: of the readers.
-        without: places of readers that take gates as a whole.
     """
 
-    def __init__(self, routes: RoutingTable, without: Sequence[int] = ()) -> None:
+    def __init__(self, routes: RoutingTable) -> None:
         self._routes = routes
-        self._without = frozenset(without)
         self._read = PerPattern(self._read_of)
 
     def split(self, gate: GateMessages) -> Iterator[tuple[tuple[int, ...], str, Any]]:
@@ -108,14 +106,11 @@ class GateRouter:
             yield readers, key, message
 
     def _read_of(self, gate: GateMessages) -> list[_Read]:
-        which, table = gate.which.tolist(), gate.table
-        if not which or min(which) < 0 or max(which) >= len(table):
+        which, readers_of = gate.which.tolist(), self._routes.readers
+        if not which or min(which) < 0 or max(which) >= len(gate.table):
             return []
-        each = [_Read(self._readers(table[key]), table[key], place) for place, key in enumerate(which)]
-        return [read for read in each if read.readers]
-
-    def _readers(self, key: str) -> tuple[int, ...]:
-        return tuple(reader for reader in self._routes.readers(key) if reader not in self._without)
+        keys_of = map(gate.table.__getitem__, which)
+        return [_Read(readers, key, m) for m, key in enumerate(keys_of) if (readers := readers_of(key))]
 
 
 def canonical(entry: Input) -> tuple[int, str, int]:

@@ -122,14 +122,6 @@ def sensor_parts(sensors: Mapping[str, Declared]) -> dict[str, SensorPart]:
     return parts
 
 
-SENSOR_FAULTS = ("dropout", "stuck", "bias", "noise")  # what the kinds of every sensor end in
-
-
-def is_kind(word: str) -> bool:
-    """Tell whether a word is a kind of faults, of the stock ones or, by its ending, of a user's sensor."""
-    return word in KINDS or word.rpartition("_")[2] in SENSOR_FAULTS
-
-
 def _sensor_kinds(sensors: Mapping[str, Declared]) -> dict[str, FaultKind]:
     """Return the kinds of faults that sensors have."""
     labels = {name: sensor.label or name for name, sensor in sensors.items()}

@@ -93,7 +93,7 @@ def sensor_type(module_name: str, where: str = "module") -> SensorType:
         raise DocumentError([f"{what}, {holds}; must be a zsim.sensors.sensor.SensorType"])
     try:
         _check(sensor)
-    except (TypeError, ValueError) as error:
+    except (NameError, TypeError, ValueError) as error:  # a name in an annotation that is nowhere at run time
         raise DocumentError([f"{what}: SENSOR.{error}"]) from error
     return sensor
 

@@ -43,7 +43,7 @@ from zsim_agents.estimation.sensor_reader import GateReader
 _READING = struct.Struct(f"{READING.size}d")
 _ROOM = 256  # readings of a gate, at first
 _YAW, _YAW_SIGMA = ESTIMATE.yaw, ESTIMATE.yaw_sigma
-_COVARIANCE = slice(ESTIMATE.covariance, ESTIMATE.covariance + 36)
+_COVARIANCE = slice(ESTIMATE.covariance, _YAW_SIGMA)  # which is the next field
 _p_WB, _v_WB, _gyro_bias = (
     itemgetter(first, first + 1, first + 2) for first in (ESTIMATE.p_WB, ESTIMATE.v_WB, ESTIMATE.gyro_bias)
 )

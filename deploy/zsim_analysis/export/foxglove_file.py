@@ -61,7 +61,6 @@ def convert(
                 check()
         finally:
             file.close()
-        check()
     layout_path.write_text(layout(file.counts, file.variables()) + "\n", encoding="utf-8")
     return dict(sorted(file.counts.items())), decoded.refused
 
@@ -78,7 +77,8 @@ def deferred_signals() -> Iterator[Callable[[], None]]:
 
     def check() -> None:
         if came:
-            former[signal.Signals(came[0])](came[0], None)
+            number = came.pop(0)
+            former[signal.Signals(number)](number, None)
 
     for number in former:
         signal.signal(number, lambda signum, _: came.append(signum))
@@ -87,6 +87,7 @@ def deferred_signals() -> Iterator[Callable[[], None]]:
     finally:
         for number, handler in former.items():
             signal.signal(number, handler)
+    check()
 
 
 def _decode(recorded: Recorded) -> Any:

@@ -183,8 +183,8 @@ def clear(
     which: Annotated[str, typer.Argument(help="Number, target or kind of faults, or all.")] = ALL,
 ) -> None:
     """End faults: all, or those of a number, a target or a kind."""
-    with connected(reach) as (link, _):
-        done = _ask(link, "fault_clear", selector(which))
+    with connected(reach) as (link, info):
+        done = _ask(link, "fault_clear", selector(which, info.scenario))
     print(f"cleared {', '.join(map(str, done['cleared'])) or 'nothing: no fault was planned or acting'}")
 
 
@@ -219,15 +219,17 @@ def kinds(
         print(f"{name:<17} {kind.strikes:<8} {'  '.join(_parameters(kind)) or '-'}")
 
 
-def selector(which: str) -> dict[str, Any]:
-    """Return the arguments of `fault_clear` that a word means."""
-    from zsim.scenario.fault_kinds import is_kind
+def selector(which: str, scenario: str) -> dict[str, Any]:
+    """Return the arguments of `fault_clear` that a word means in the run of a scenario, given as text."""
+    from zsim.scenario import fault_kinds, scenario_file
+    from zsim.sensors.sensor_catalogue import declarations
 
     if which == ALL:
         return {}
     if which.isdecimal():
         return {"id": int(which)}
-    return {"kind" if is_kind(which) else "target": which}
+    known = fault_kinds.kinds_of(declarations(scenario_file.from_text(scenario).drones))
+    return {"kind" if which in known else "target": which}
 
 
 def row(fault: "Fault", now_ns: int) -> tuple[str, ...]:

@@ -11,13 +11,24 @@ from refused import refused
 from zsim.contract import keys
 from zsim.contract.run_messages import Fault
 from zsim.errors import SessionError
+from zsim.scenario import scenario_file
 from zsim.scenario.fault_check import COMMON
-from zsim.scenario.fault_kinds import KINDS, SENSOR_FAULTS
+from zsim.scenario.fault_kinds import KINDS
 from zsim.transport.session import Session
 from zsim_deploy.cli import federation_commands
 from zsim_deploy.cli.federation_commands import row, seconds, selector
 
 EXAMPLES = Path(__file__).parents[4] / "examples"
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A scenario with a sensor of the user's."""
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    path = tmp_path / "mine.yaml"
+    sensors, drones = "{my_uwb: {module: uwb_range}}", "[{name: d1, position_m: [0, 0, 0]}]"
+    path.write_text(f"name: t\nduration_s: 1\nsensors: {sensors}\ndrones: {drones}\n")
+    return path
 
 
 @pytest.mark.parametrize(
@@ -86,10 +97,11 @@ def test_what_fits_into_no_message_is_refused_in_a_line(value: Any):
         ("drone2", {"target": "drone2"}),
         ("gps_dropout", {"kind": "gps_dropout"}),
         ("my_uwb_bias", {"kind": "my_uwb_bias"}),
+        ("other_bias", {"target": "other_bias"}),
     ],
 )
-def test_which_are_cleared(which: str, args: dict[str, object]):
-    assert selector(which) == args
+def test_which_are_cleared(mine: Path, which: str, args: dict[str, object]):
+    assert selector(which, scenario_file.to_text(scenario_file.load(mine))) == args
 
 
 def test_a_row_says_when_and_what():
@@ -105,16 +117,9 @@ def test_every_kind_is_listed(capsys: pytest.CaptureFixture[str]):
     assert [line.split()[0] for line in lines] == list(KINDS)
 
 
-def test_with_a_scenario_those_of_its_users_sensors_are_listed(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.syspath_prepend(str(EXAMPLES))
-    path = tmp_path / "mine.yaml"
-    path.write_text(
-        "name: t\nduration_s: 1\nsensors: {tag: {module: uwb_range}}\ndrones: [{name: d1, position_m: [0, 0, 0]}]\n"
-    )
-    federation_commands.kinds(path)
+def test_with_a_scenario_those_of_its_users_sensors_are_listed(mine: Path, capsys: pytest.CaptureFixture[str]):
+    federation_commands.kinds(mine)
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
     own = [kind for kind in listed if kind not in KINDS]
-    assert own == [f"tag_{fault}" for fault in SENSOR_FAULTS]
+    assert own == [f"my_uwb_{fault}" for fault in ("dropout", "stuck", "bias", "noise")]
     assert set(KINDS) < set(listed)
