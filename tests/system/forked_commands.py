@@ -74,8 +74,11 @@ def start_program(command: list[str], environment: dict[str, str]) -> tuple[Role
 
 def run(*arguments: str, hangs_s: float = PATIENCE_S) -> Completed:
     """Run a command to its end; it is killed when it hangs for so long."""
-    if not _can_fork(arguments):
-        return run_cold(*arguments)
+    return run_forked(*arguments, hangs_s=hangs_s) if _can_fork(arguments) else run_cold(*arguments)
+
+
+def run_forked(*arguments: str, hangs_s: float = PATIENCE_S) -> Completed:
+    """Run a command to its end that is refused before it would start another process in a way of its own."""
     read, write = os.pipe()
     with os.fdopen(write, "w") as log:
         process = _launcher(tuple(COLUMNS.items())).start(arguments, log, listened=True)

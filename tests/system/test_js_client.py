@@ -147,7 +147,8 @@ def opened(browser: Any, served: str) -> Iterator[Callable[..., Watched]]:
 
 @needs_browser
 def test_the_page_shows_a_drone_and_flies_it(federation: Federation, opened: Callable[..., Watched]) -> None:
-    federation.world(ONE, "--rate", "1", "--duration", "600")
+    patient = ["--set", "silence.hover_s=2", "--set", "silence.land_s=2"]  # with a page on a busy machine
+    federation.world(ONE, "--rate", "1", "--duration", "600", *patient)
     gateway = GatewayProcess(federation)
     other = federation.client()
     states = other.subscribe("drone/drone1/sensor/status")
@@ -164,7 +165,7 @@ def test_the_page_shows_a_drone_and_flies_it(federation: Federation, opened: Cal
 
     t_ns = other.get("clock")["clock"]["t_ns"]
     velocity = {"source": "other.one", "velocity_m_s": [2.0, 0.0, 0.0], "yaw_rate_rad_s": 0.0, "frame": "world"}
-    other.put("drone/drone1/cmd/velocity", t_ns=t_ns, **velocity)  # 0.5 s of it, then silence
+    other.put("drone/drone1/cmd/velocity", t_ns=t_ns, **velocity)  # 2 s of it, then silence
     seen.wait_for_text(EAST)
     assert seen.map() != on_the_ground
 
@@ -172,7 +173,7 @@ def test_the_page_shows_a_drone_and_flies_it(federation: Federation, opened: Cal
     seen.wait_for_text(r", held$")
     page = states.until(lambda m: (m["commander"] or "").startswith("client.page-")).message["commander"]
     held_from_ns = states.now()[-1].message["t_ns"]
-    states.until(lambda m: m["t_ns"] > held_from_ns + 4e9)  # longer than silence is suffered
+    states.until(lambda m: m["t_ns"] > held_from_ns + 5e9)  # longer than silence is suffered
     assert states.received[-1].message["state"] == "flying"
     other.put("drone/drone1/cmd/velocity", t_ns=t_ns, **velocity)
     assert page in events.until(lambda m: m["kind"] == "refused").message["text"]

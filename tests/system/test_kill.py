@@ -92,6 +92,7 @@ def test_restart(
 def test_wait(federation: Federation, name: str) -> None:
     flight = Flight(federation, "--set", f"processes.on_death={{{name}: wait}}")
     federation.kill(name)
+    flight.event("death", name)
     standing = flight.stands_for(name)
     entry = next(w for w in standing.message["waiting_for"] if w["name"] == name)
     assert entry["host"]

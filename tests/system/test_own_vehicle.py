@@ -30,6 +30,7 @@ def hover_squares(record: Any, drone: str) -> float:
     return float(np.mean(np.square([truth["rotor_rad_s"] for truth in last])))
 
 
+@pytest.mark.soak  # on hosts it flies with other parts of a user's own: test_own_parts_on_hosts.py
 @pytest.mark.usefixtures("examples")
 def test_processes_give_the_bits_of_one_process(federation: Federation) -> None:
     """The heavier aircraft hovers on more thrust, by its weight."""

@@ -27,11 +27,13 @@ static void told(int result)
 /* Print what stands at a path. */
 static void found(int result, zsim_json json, const char *path)
 {
-    zsim_json value = zsim_get(json, path);
-    if (result <= 0)
+    zsim_json value;
+    if (result <= 0) {
         told(result);
-    else
-        printf("1 %.*s\n", (int)value.length, value.length > 0 ? value.text : "");
+        return;
+    }
+    value = zsim_get(json, path);
+    printf("1 %.*s\n", (int)value.length, value.length > 0 ? value.text : "");
 }
 
 static void talk_of_values(char *word[WORDS])

@@ -1,4 +1,7 @@
-"""Vehicles fly by their parameters alone: each stock one, a fleet of several, and one of six rotors."""
+"""Vehicles fly by their parameters alone: each stock one, a fleet of several, and one of six rotors.
+
+What flies with six rotors is compiled for these tests alone, which takes longer than all others here: it is for the soak.
+"""
 
 import math
 from typing import Any
@@ -13,8 +16,8 @@ from zsim_world.fleet.fleet import Fleet
 from zsim_world.fleet.publication import GatePublication
 
 GATE_S = 0.02
-pytestmark = pytest.mark.xdist_group("hexacopter")  # six rotors are compiled once
-MODELS = [*vehicle_catalogue.STOCK, "hexacopter"]
+six_rotors = pytest.mark.soak
+MODELS = [*vehicle_catalogue.STOCK, pytest.param("hexacopter", marks=six_rotors)]
 
 
 def fleet(*models: str, **environment: Any) -> Fleet:
@@ -84,6 +87,7 @@ def test_hover_thrust_is_the_weight_shared_by_all_rotors(model: str):
     assert lift == pytest.approx(weight, rel=0.02)
 
 
+@six_rotors
 def test_vehicles_of_different_size_and_rotors_fly_side_by_side():
     flight = airborne("ardrone2", "crazyflie2", "hexacopter")
     closest = math.inf
@@ -97,6 +101,7 @@ def test_vehicles_of_different_size_and_rotors_fly_side_by_side():
     assert closest > 0.5
 
 
+@six_rotors
 def test_a_quadrotor_flies_with_the_same_bits_beside_one_of_six_rotors():
     alone, beside = airborne("ardrone2"), airborne("ardrone2", "hexacopter")
     for flight in (alone, beside):
@@ -105,6 +110,7 @@ def test_a_quadrotor_flies_with_the_same_bits_beside_one_of_six_rotors():
     np.testing.assert_array_equal(alone.truth().rotor_rad_s[0], beside.truth().rotor_rad_s[0, :4])
 
 
+@six_rotors
 def test_truth_and_commands_have_a_number_for_each_rotor():
     flight = airborne("crazyflie2", "hexacopter")
     bundle = GatePublication(flight).gate([None, None])
