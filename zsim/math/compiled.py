@@ -73,7 +73,7 @@ def _compile(function: Function, options: dict[str, Any]) -> Function:
 def _kept(function: Function, options: dict[str, Any]) -> Function:
     if njit is None:
         return function
-    function.__qualname__ = f"{function.__qualname__}_{digest(sources(function.__module__))}"
+    function.__qualname__ = f"{function.__qualname__}_{_version(function.__module__)}"
     try:
         made: Any = njit(**options, cache=True)(function)
     except RuntimeError:  # neither beside its file nor in the user's cache may anything be written
@@ -86,6 +86,12 @@ def is_kept(function: Callable[..., Any]) -> bool:
     stats = getattr(function, "stats", None)  # of numba's dispatcher
     folder = stats and stats.cache_path
     return bool(folder) and any(Path(folder).glob(f"*{function.__qualname__}*.nbc"))
+
+
+@cache
+def _version(module: str) -> str:
+    """Return what changes with the text of a module, or of one that it imports; asked when these are loaded."""
+    return digest(sources(module))
 
 
 def sources(module: str) -> frozenset[Path]:

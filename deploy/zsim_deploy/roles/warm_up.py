@@ -11,6 +11,7 @@ from typing import Any
 from zsim.scenario import scenario_file
 
 SIZES = {"pair": 2, "triad": 3, "template": 5}  # drones of the kinds of cluster: each has code of its own
+ALONE = {"name": "warm-up", "duration_s": 1, "drones": [{"name": "alone", "position_m": [0, 0, 0]}]}  # the world's code is the same for all
 NESTED = ("groups", 2, 3)  # name, groups, drones of each
 APART_M = 4.0  # on circles, so that no formation stands in a line
 
@@ -21,13 +22,12 @@ def main() -> None:
         return
     from zsim_world.flight.world import World
 
-    scenario = scenario_file.resolve(formations())
-    info = World(scenario, "lockstep", 0.0, time.monotonic_ns, None).info()
+    info = World(scenario_file.resolve(ALONE), "lockstep", 0.0, time.monotonic_ns, None).info()
     if not _has("filterpy"):
         return
     from zsim_agents.hosting import hosted
 
-    hosted(info, scenario, ["*"]).rehearse()
+    hosted(info, scenario_file.resolve(formations()), ["*"]).rehearse()
 
 
 def formations() -> dict[str, Any]:

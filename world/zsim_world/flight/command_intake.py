@@ -47,8 +47,9 @@ class CommandLinks:
 
     def lost_by_radio(self, drone: str, command: QueuedCommand, gate_ns: int) -> bool:
         """Tell whether the radio loses a command that would take effect before a gate."""
-        targets = (WORLD, self._cluster_of.get(drone))
-        radios = [fault for fault in self.faults_at(gate_ns) if fault.kind == RADIO and fault.target in targets]
+        faults = self.faults_at(gate_ns)
+        targets = (WORLD, self._cluster_of.get(drone)) if faults else ()
+        radios = [fault for fault in faults if fault.kind == RADIO and fault.target in targets]
         if not radios:
             return False
         key, sender = keys.command(drone, command.kind), self._sender(drone, command.source)
