@@ -20,11 +20,10 @@ from zsim.errors import DecodeError, NoWorldError, RecordError, RunError, Supers
 from zsim.record import RecordWriter
 from zsim.record.record_writer import CHANNELS_MAX
 from zsim.runtime.health import HealthMeter
-from zsim.runtime.membership import replay
 from zsim.schema import message
 from zsim.transport.connection import read_info
 from zsim.transport.session import Session
-from zsim.transport.traffic import Passed, Traffic, samples
+from zsim.transport.traffic import Passed, Traffic, replay, samples
 
 NAME = "recorder"
 ANOTHER_RUN = "the world has begun another run"

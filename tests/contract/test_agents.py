@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 from msgspec import Struct
+from msgspec.structs import replace
 from refused import refused
 
 from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
+from zsim.contract.snapshot import State, pack, unpack
 from zsim.contract.views import ViewCluster, ViewEstimates
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
@@ -26,8 +28,10 @@ from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_agents.estimation.estimator import Estimator
 from zsim_agents.formation.controller import Controller
+from zsim_agents.hosting import hosted
 
 STEP = Path(__file__).parents[2] / "scenarios" / "step.yaml"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 GATE_NS = 20_000_000
 IMU_NS = 5_000_000  # 200 Hz
 GATES = 150
@@ -205,9 +209,9 @@ def inputs(agent: Agent) -> list[KeyedMessages]:
     return [[(key, m) for key, m in gate if any(keys.matches(e, key) for e in agent.reads)] for gate in flight()]
 
 
-def run(agent: Agent, gates: list[KeyedMessages]) -> list[tuple[int, list[Output]]]:
+def run(agent: Agent, gates: list[KeyedMessages], inbox: Inbox | None = None) -> list[tuple[int, list[Output]]]:
     """Drive an agent as the runners do; return its outputs by gate."""
-    inbox = Inbox(agent.gate_keys, agent.counted)
+    inbox = inbox or Inbox(agent.gate_keys, agent.counted)
     outputs = []
     for sent in gates:
         for key, message in sent:
@@ -377,6 +381,59 @@ def test_inputs_off_the_wire_give_the_same_bits(name: str):
     agent = make(name)
     gates = [[(key, _again(key, message)) for key, message in sent] for sent in inputs(agent)]
     assert wire(run(agent, gates)) == wire(flown(name))
+
+
+def with_algorithm(algorithm: str) -> Make:
+    """Return what makes the estimator of a drone with a class of its own."""
+
+    def build(info: Info, scenario: Scenario) -> Agent:
+        estimation = replace(scenario.estimation, algorithm=algorithm)
+        return Estimator(info, replace(scenario, estimation=estimation), "drone1")
+
+    return build
+
+
+GOES_ON: dict[str, Make] = {
+    **AGENTS,
+    "paper": with_algorithm("paper"),
+    "of a user's own": with_algorithm("my_estimator:MyEstimator"),
+    "all in one": lambda info, scenario: hosted(info, scenario, ["*"]),
+}
+
+
+@pytest.mark.parametrize("gate", [0, 40, 77])
+@pytest.mark.parametrize("make_one", GOES_ON.values(), ids=GOES_ON)
+def test_another_one_goes_on_from_its_snapshot_to_the_same_bits(
+    make_one: Make, gate: int, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    first, second, third = (make_one(info(), scenario()) for _ in range(3))
+    gates = inputs(first)
+    wanted = wire(run(third, gates))
+    run(first, gates[: gate + 1])
+    second.resume(info(), taken(first))
+    run(first, gates[gate + 1 : gate + 3])  # which does not reach into what was taken
+    inbox = Inbox(second.gate_keys, second.counted)
+    inbox.start_after(gate * GATE_NS)
+    after = wire(run(second, gates[gate + 1 :], inbox))
+    assert after
+    assert after == [each for each in wanted if each[0] > gate * GATE_NS]
+
+
+@every_agent
+def test_a_snapshot_taken_over_is_the_same_snapshot(name: str):
+    agent, other = make(name), make(name)
+    run(agent, inputs(agent)[:50])
+    state = taken(agent)
+    other.resume(info(), state)
+    assert pack(other.checkpoint() or {}) == pack(state)
+
+
+def taken(agent: Agent) -> State:
+    """Return the checkpoint of an agent as it comes off the wire."""
+    state = agent.checkpoint()
+    assert state is not None
+    return unpack(pack(state))
 
 
 def _again(key: str, message: Struct) -> Any:

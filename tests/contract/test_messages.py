@@ -49,6 +49,7 @@ CONTRACT = {
     "cluster/*/request": "op args source ok",
     "process/*/join": "run_id incarnation role host pid period_ns version fingerprint",
     "process/*/done": "run_id incarnation done_ns sent",
+    "process/*/snapshot": "source version state",
     "process/*/bye": "reason",
     "process/*/health": "role host pid step_us lag_ns dropped refused rss_bytes",
     "view/drones": "",
@@ -120,6 +121,7 @@ def values(info: Any) -> st.SearchStrategy[Any]:
         types.FloatType: finite,
         types.StrType: text,
         types.BoolType: st.booleans(),
+        types.BytesType: st.binary(max_size=12),
         types.NoneType: st.none(),
         types.AnyType: free,
     }[type(info)]
@@ -168,7 +170,8 @@ def _filled(info: Any) -> Any:
         return {"gps": _filled(info.value_type)}
     if isinstance(info, types.LiteralType):
         return info.values[0]
-    return {types.IntType: 7, types.FloatType: 2.0, types.StrType: "abc", types.BoolType: True}.get(type(info), 1)
+    scalars = {types.IntType: 7, types.FloatType: 2.0, types.StrType: "abc", types.BoolType: True}
+    return {**scalars, types.BytesType: b"state"}.get(type(info), 1)
 
 
 Path = tuple[Any, ...]

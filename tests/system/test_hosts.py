@@ -30,7 +30,8 @@ def test_three_hosts_give_the_bits_of_one_process(deployment: Deployment, tmp_pa
     assert {event["data"]["host"] for event in deployment.record().events("join")} == {"h1", "h2", "h3"}
 
 
-def test_ps_logs_restart_move_and_down(deployment: Deployment) -> None:
+def test_ps_logs_restart_move_and_down(deployment: Deployment, tmp_path: Path) -> None:
+    """Who is restarted, or moved to another host, goes on from its snapshot: the bits are those of a quiet run."""
     run = deployment.up("--rate", "1", "--duration", "3600")
     in_flight(run)
     rows = deployment.ps()
@@ -54,9 +55,11 @@ def test_ps_logs_restart_move_and_down(deployment: Deployment) -> None:
     assert re.match("(h1: )?world ", refused.text())
     deployment.zsim("down").ends(with_code=0)
     run.ends(with_code=130)
-    reason = deployment.record().end()["reason"]
+    record = deployment.record()
+    reason = record.end()["reason"]
     assert "zsim down" in reason
     assert reason in run.text()
+    assert record.sha256() == in_process(tmp_path, record.end()["last_ns"] / 1e9)
 
 
 @pytest.mark.soak  # what a broken session does to more of them at once is below

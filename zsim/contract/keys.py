@@ -91,7 +91,7 @@ def token(process: str) -> str:
 
 
 def process(process_name: str, what: str) -> str:
-    """Return the key of `join`, `done`, `bye` or `health` of a process."""
+    """Return the key of `join`, `done`, `snapshot`, `bye` or `health` of a process."""
     return f"process/{process_name}/{what}"
 
 

@@ -135,6 +135,7 @@ _BY_SHAPE: dict[tuple[str, str], type[Struct]] = {
     ("cluster", "request"): run_messages.ClusterRequest,
     ("process", "join"): run_messages.Join,
     ("process", "done"): run_messages.Done,
+    ("process", "snapshot"): run_messages.Snapshot,
     ("process", "bye"): run_messages.Bye,
     ("process", "health"): run_messages.Health,
 }

@@ -72,6 +72,17 @@ class Done(Message, frozen=True):
     sent: Count
 
 
+class Snapshot(Message, frozen=True):
+    """The whole state of a participant after the gate `t_ns`, by which another incarnation of it can go on.
+
+    `version` is that of the layout of `state`, which only programs of its kind read.
+    """
+
+    source: str
+    version: Count
+    state: bytes
+
+
 class Bye(Message, frozen=True):
     """A process leaves of its own will."""
 

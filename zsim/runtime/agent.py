@@ -21,6 +21,7 @@ from msgspec import Struct
 from zsim.contract.framing import GateMessages
 from zsim.contract.messages import Info
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Faults
+from zsim.contract.snapshot import State
 from zsim.runtime.link_faults import LinkFaults
 from zsim.runtime.routing import GateRouter, Input, RoutingTable, one_by_one
 
@@ -44,6 +45,7 @@ class Agent(ABC):
         writes: keys that it publishes at every gate and that others of its process may read.
         serves: names of processes for which it stands beside its own.
         takes_gates: whether `receive_gate` is to have the world's messages of a gate as columns and one buffer.
+        repeats: keys of its outputs that carry what was requested of it, for `repeat`.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Agent(ABC):
     writes: tuple[str, ...] = ()
     serves: tuple[str, ...] = ()
     takes_gates: bool = False
+    repeats: tuple[str, ...] = ()
     _links: LinkFaults | None = None
 
     def __init__(self) -> None:
@@ -76,10 +79,13 @@ class Agent(ABC):
     def update_faults(self, info: Info, faults: Faults) -> None:
         """Take the faults injected into the run; called before the first gate in which one of them acts."""
         if self._links is None and faults.faults:
-            names, clusters = (self.name, *self.serves), {cluster.name: cluster.drones for cluster in info.clusters}
-            self._links = LinkFaults(names, info.seed, info.gate_ns, clusters)
+            self._links = self._link_faults(info)
         if self._links is not None:
             self._links.update(faults)
+
+    def _link_faults(self, info: Info) -> LinkFaults:
+        names, clusters = (self.name, *self.serves), {cluster.name: cluster.drones for cluster in info.clusters}
+        return LinkFaults(names, info.seed, info.gate_ns, clusters)
 
     def deliver(self, t_ns: int, inputs: Sequence[Input]) -> None:
         """Take the inputs of a gate in canonical order, as far as faults of the links bring them."""
@@ -136,6 +142,42 @@ class Agent(ABC):
 
     def warm_start(self, key: str, message: Any) -> None:  # noqa: B027 - taking over nothing is a choice
         """Take over the last value that the former incarnation published."""
+
+    def snapshot(self) -> State | None:
+        """Return the whole state after the gate that it stepped last, as plain values; None where it offers none.
+
+        An agent made anew, with what this returned handed to `restore`, goes on with the same outputs to the bit.
+        """
+        return None
+
+    def restore(self, state: State) -> None:  # noqa: B027 - an agent without a snapshot is never asked to
+        """Take over the state that another incarnation returned by `snapshot`.
+
+        Raises:
+            KeyError, TypeError, ValueError: the state is of another version of this agent.
+        """
+
+    def repeat(self, key: str, message: Any) -> None:  # noqa: B027 - most agents answer no requests
+        """Do again, before the gate of the message, what a former incarnation published on a key of `repeats`."""
+
+    def checkpoint(self) -> State | None:
+        """Return its snapshot with what every agent has beside it: the numbers of its keys, what links keep back."""
+        own = self.snapshot()
+        if own is None:
+            return None
+        return {"own": own, "seq": dict(self._seq), "links": self._links.snapshot() if self._links else None}
+
+    def resume(self, info: Info, checkpoint: State) -> None:
+        """Take over a checkpoint.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is of another version of this agent.
+        """
+        self.restore(checkpoint["own"])
+        self._seq = defaultdict(int, checkpoint["seq"])
+        if checkpoint["links"] is not None:
+            self._links = self._links or self._link_faults(info)
+            self._links.restore(checkpoint["links"])
 
     def next_seq(self, key: str) -> int:
         """Return the next sequence number of one of its keys, from 0."""

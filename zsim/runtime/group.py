@@ -10,8 +10,9 @@ from typing import Any
 
 from zsim.contract import keys
 from zsim.contract.framing import GateMessages
-from zsim.contract.messages import Info
+from zsim.contract.messages import Info, decode, encode
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Faults
+from zsim.contract.snapshot import State
 from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.routing import GateRouter, Input, RoutingTable, canonical
@@ -42,6 +43,7 @@ class AgentGroup(Agent):
         self.reads = tuple(key for key in _joined(member.reads for member in members) if key not in inner)
         self.gate_keys = tuple(key for key in _joined(member.gate_keys for member in members) if key not in inner)
         self.counted = _joined(member.counted for member in members)
+        self.repeats = _joined(member.repeats for member in members)
         self._waiting: list[list[Input]] = [[] for _ in members]
         self._routes = RoutingTable([member.reads for member in members])
         self._whole = [place for place, member in enumerate(members) if member.takes_gates]
@@ -104,6 +106,23 @@ class AgentGroup(Agent):
 
     def resume_seq(self, key: str, last: int) -> None:
         self._owner(key).resume_seq(key, last)
+
+    def snapshot(self) -> State | None:
+        members = [member.checkpoint() for member in self._members]
+        if None in members:
+            return None
+        waiting = [[[key, encode(message)] for key, message in inputs] for inputs in self._waiting]
+        return {"members": members, "waiting": waiting}
+
+    def resume(self, info: Info, checkpoint: State) -> None:
+        super().resume(info, checkpoint)
+        own = checkpoint["own"]
+        for member, its_own in zip(self._members, own["members"], strict=True):
+            member.resume(info, its_own)
+        self._waiting = [[(key, decode(key, payload)) for key, payload in inputs] for inputs in own["waiting"]]
+
+    def repeat(self, key: str, message: Any) -> None:
+        next(member for member in self._members if key in member.repeats).repeat(key, message)
 
     def _owner(self, key: str) -> Agent:
         """Return who takes over the last value of a key."""

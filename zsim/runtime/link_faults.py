@@ -12,9 +12,10 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from zsim.contract import keys
+from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Estimate
 from zsim.contract.run_messages import Fault, Faults
+from zsim.contract.snapshot import State
 from zsim.runtime.routing import Input, canonical
 from zsim.scenario import fault_kinds
 
@@ -152,16 +153,16 @@ class LinkFaults:
         self._seed = seed
         self._gate_ns = gate_ns
         self._clusters = clusters
-        self._seq = -1
+        self._list: Faults | None = None  # the newest
         self._faults: list[Fault] = []
         self._later: list[tuple[int, str, Any]] = []  # the gate at which it comes, key, message
         self._positions: dict[str, Point] = {}
 
     def update(self, faults: Faults) -> None:
         """Take the list of faults, unless a newer one has come before."""
-        if faults.seq <= self._seq:
+        if self._list and faults.seq <= self._list.seq:
             return
-        self._seq = faults.seq
+        self._list = faults
         self._faults = [fault for fault in faults.faults if fault.kind in KINDS and self._concerns(fault)]
 
     def _concerns(self, fault: Fault) -> bool:
@@ -185,6 +186,19 @@ class LinkFaults:
         handed = [(key, message) for _, key, message in coming]
         handed += [(key, message) for key, message in inputs if self._comes_now(t_ns, key, message, acting)]
         return sorted(handed, key=canonical)
+
+    def snapshot(self) -> State:
+        """Return its faults, what it keeps back, and where drones were."""
+        later = [[gate_ns, key, messages.encode(message)] for gate_ns, key, message in self._later]
+        positions = {drone: list(place) for drone, place in self._positions.items()}
+        return {"later": later, "positions": positions, "list": messages.encode(self._list) if self._list else None}
+
+    def restore(self, state: State) -> None:
+        """Take over what another incarnation of the receiver kept back."""
+        if state["list"]:
+            self.update(messages.decode(keys.FAULTS, state["list"]))
+        self._later = [(gate_ns, key, messages.decode(key, payload)) for gate_ns, key, payload in state["later"]]
+        self._positions = state["positions"]
 
     def _note_positions(self, inputs: Sequence[Input]) -> None:
         for key, message in inputs:

@@ -7,21 +7,24 @@ import os
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 from zsim.contract import keys, messages, run_messages
 from zsim.contract.fingerprint import join_of
-from zsim.contract.framing import Pairs, pairs_of
+from zsim.contract.framing import Pairs
+from zsim.contract.snapshot import VERSION, pack, unpack
 from zsim.contract.world_events import ProcessEntry
 from zsim.errors import BehindError, DecodeError, NoWorldError, RunError, SupersededError
 from zsim.runtime.agent import Agent, Output
 from zsim.transport.connection import read_info
 from zsim.transport.session import ReceivedSample, Session
+from zsim.transport.traffic import replay
 
 REPLAY_S = 2.0  # a hub answers a replay within milliseconds; a lost link does not
 REJOINS_MAX = 6  # times that a rejoin is published before it counts as received; a router forwards nothing at first
 RETRY_S = 0.5  # wall time between two attempts at what is owed
 ASKED_MAX = 10  # answers to what is lost that may lack it; the world answers from what it has on the way, too
+RESUME_NS = 4_000_000_000  # simulated time that a snapshot may be old: the world keeps 5 s of what has passed
 GATES_KEPT = 2  # gates of which the outputs are kept to answer a get, contract; more where the world runs ahead
 
 
@@ -38,6 +41,8 @@ class Membership:
 
     Attributes:
         done_ns: newest gate that it is through with, -1 before the first.
+        published_ns: gate up to which a former incarnation has published all outputs, which are not published again.
+        awaited: whether the world has still to say what that gate is, after a snapshot was taken over.
         failure: why it can take part no longer, None while it can.
     """
 
@@ -68,10 +73,36 @@ class Membership:
         self._asked_ns = -1
         self._asked = 0
         self._retry_s = 0.0
-        self.done_ns = -1
+        self.done_ns = self.published_ns = -1
+        self.awaited = False
         self.failure: RunError | None = None
 
     # Taking part
+
+    def resume(self) -> int | None:
+        """Hand the agent the newest snapshot of a former incarnation; return the time of it, None if none can be used.
+
+        The world's history must reach back to it: what came since is fetched and stepped through again.
+        """
+        for sample in self._link.get(keys.process(self._agent.name, "snapshot")):
+            try:
+                snapshot: run_messages.Snapshot = messages.decode(sample.key, sample.payload)
+                age_ns = self._world_ns() - snapshot.t_ns
+                if age_ns > RESUME_NS or snapshot.version != VERSION:
+                    raise DecodeError(f"of version {snapshot.version}, {age_ns / 1e9:.2f} s old")
+                self._agent.resume(self._info, unpack(snapshot.state))
+            except (DecodeError, LookupError, TypeError, ValueError) as error:
+                self._say(f"{self._agent.name}: its former snapshot is of no use: {error}")
+                continue
+            self._say(f"{self._agent.name}: goes on from its snapshot of t = {snapshot.t_ns / 1e9:.2f} s")
+            self.done_ns, self.awaited = snapshot.t_ns, True
+            return self.done_ns
+        return None
+
+    def _world_ns(self) -> int:
+        """Return the world's newest gate."""
+        clocks = [messages.decode(sample.key, sample.payload) for sample in self._link.get(keys.CLOCK)]
+        return clocks[0].t_ns if clocks else 0
 
     def warm_start(self) -> int | None:
         """Hand the agent what a former incarnation published last; return the time of it, None if there was none."""
@@ -96,16 +127,29 @@ class Membership:
     def enter(self) -> None:
         """Join; after a warm start, go on where the former incarnation was."""
         self._join()
-        if self.done_ns >= 0:
+        if self.awaited:
+            self._retry_s = self._wall_s() + RETRY_S
+        elif self.done_ns >= 0:
             self._link.put(self._done_key, self._done(self.done_ns, 0))
             self._catch_up(self.done_ns)
 
     def publish(self, t_ns: int, outputs: Sequence[Output]) -> None:
         """Encode the outputs of a gate and the done that counts them, for `send`."""
         self._kept.append((t_ns, outputs))
+        if t_ns <= self.published_ns:
+            self._done(t_ns, len(outputs))
+            return
         encoded = [(key, messages.encode(message)) for key, message in outputs]
         encoded.append((self._done_key, messages.encode(self._done(t_ns, len(outputs)))))
         self._unsent += encoded
+
+    def publish_snapshot(self, t_ns: int) -> None:
+        """Encode the whole state of the agent after a gate, for `send`; nothing where it offers none."""
+        state = self._agent.checkpoint()
+        if state is not None:
+            seq, name = self._agent.next_seq("snapshot"), self._agent.name
+            snapshot = run_messages.Snapshot(t_ns, seq, name, VERSION, pack(state))
+            self._unsent.append((keys.process(name, "snapshot"), messages.encode(snapshot)))
 
     def send(self) -> None:
         """Put what was published since the last time, in one go: many messages at once cost fewer wake-ups."""
@@ -138,13 +182,29 @@ class Membership:
     @property
     def owes(self) -> bool:
         """Tell whether something was asked of the world that it has not answered yet."""
-        return self._must_rejoin or self._unproved > 0 or self._missed_since_ns is not None
+        return self._must_rejoin or self._unproved > 0 or self._missed_since_ns is not None or self.awaited
+
+    @property
+    def is_fetching(self) -> bool:
+        """Tell whether what came since a snapshot is still to be fetched."""
+        return self.awaited or self._missed_since_ns is not None
+
+    def check_reach(self, t_ns: int, snapshot_ns: int) -> None:
+        """Fail if the first gate that the world brings again is not the one after a snapshot."""
+        if t_ns > snapshot_ns + self._info.gate_ns:
+            self.failure = BehindError(
+                f"{self._agent.name}: the gates after its snapshot of t = {snapshot_ns / 1e9:.2f} s are kept by nobody "
+                "any more; this one ends, start it again"
+            )
 
     def taken_in(self, entry: ProcessEntry) -> None:
         """Take the news that this process came after one of its name, or that another came after this one."""
         if entry.incarnation == self._incarnation:
             self._unproved = 0
-            if self.done_ns < 0:
+            if self.awaited:
+                self.awaited, self.published_ns = False, entry.done_ns
+                self._catch_up(self.done_ns)
+            elif self.done_ns < 0:
                 self._catch_up(max(entry.from_ns - 1, entry.done_ns))
         elif entry.former_pid == os.getpid() and entry.pid != os.getpid():
             self.failure = SupersededError(
@@ -185,6 +245,8 @@ class Membership:
             return
         if self._must_rejoin:
             self._rejoin()
+        elif self.awaited:
+            self._join()
         elif self._unproved:
             self._insist()
         if self._missed_since_ns is not None and not self._must_rejoin:
@@ -228,40 +290,10 @@ class Membership:
     def _fetch(self, since_ns: int) -> None:
         self.ask_faults()
         try:
-            for key, payload in replay(self._link, self._agent.name, since_ns, self._agent.reads, REPLAY_S):
+            wanted = (*self._agent.reads, *self._agent.repeats, keys.FAULTS)
+            for key, payload in replay(self._link, self._agent.name, since_ns, wanted, REPLAY_S):
                 self._take_in(ReceivedSample(key, payload))
         except NoWorldError:
             return
         self._missed_since_ns = None
         self._asked += 1
-
-
-def replay(
-    link: Session, process: str, from_ns: int, expressions: Sequence[str], timeout_s: float
-) -> Iterator[tuple[str, bytes]]:
-    """Yield (key, payload), in the order in which they passed the world, of what is stamped after `from_ns`.
-
-    The world keeps the last seconds, and answers page by page.
-
-    Args:
-        link: an open session.
-        process: name of the one that asks.
-        from_ns: simulated time [ns]; -1 for everything that the world still has.
-        expressions: keys that are wanted.
-        timeout_s: how long each page is waited for.
-
-    Raises:
-        NoWorldError: the world does not answer, or not with a replay; what was yielded until then is good.
-    """
-    page: int | None = 0
-    while page is not None:
-        try:
-            args = {"from_ns": from_ns, "keys": list(expressions), "page": page}
-            answer = link.request(keys.replay(process), "replay", process, args, timeout_s)
-            passed = pairs_of(answer.result) if answer.ok else []
-        except DecodeError as error:
-            raise NoWorldError(f"{process}: the world's replay is of no use: {error}") from error
-        if not answer.ok:
-            raise NoWorldError(answer.error)
-        yield from passed
-        page = answer.more

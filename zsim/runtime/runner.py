@@ -34,6 +34,7 @@ class Runner:
         stopped: asked every TICK_S; True ends the process with a bye.
         say: called with lines for the user.
         deserted: asked at the end; True leaves without a bye, as one that dies, so that the world waits for a new one.
+        snapshot_ns: simulated time between two snapshots of the agent; 0 for none.
 
     Attributes:
         killed: whether a fault has ended it, without a bye; its process is to die as well.
@@ -47,6 +48,7 @@ class Runner:
         stopped: Callable[[], bool] = lambda: False,
         say: Callable[[str], None] = lambda text: None,
         deserted: Callable[[], bool] = lambda: False,
+        snapshot_ns: int = 0,
     ) -> None:
         self._link = link
         self._info = info
@@ -58,6 +60,9 @@ class Runner:
         self._inputs = RunnerInputs(link, info, agent, self.health, say)
         self._inbox = self._inputs.inbox
         self._member = Membership(link, info, agent, self._inputs.take_in, say)
+        self._snapshot_ns = snapshot_ns
+        self._snapshot_due_ns = 0
+        self._resumed_ns: int | None = None
         self._list_seq = -1
         self._kills: dict[int, run_messages.Fault] = {}  # by id
         self._lives_after_ns: int | None = None  # what was to die up to this gate was an earlier one of its name
@@ -80,7 +85,8 @@ class Runner:
         self._agent.rehearse()
         self._inputs.subscribe()
         self._member.ask_faults()
-        last_ns = self._member.warm_start()
+        self._resumed_ns = self._member.resume()
+        last_ns = self._member.warm_start() if self._resumed_ns is None else self._resumed_ns
         if last_ns is not None:
             self._inbox.start_after(last_ns)
             self._lives_after_ns = last_ns
@@ -125,13 +131,25 @@ class Runner:
         """Return the gate to step now, None if it must be waited for."""
         t_ns = self._inbox.next_gate_ns()
         self._lacks = False
-        if t_ns is None:
+        if t_ns is None or not self._reaches_back(t_ns):
             return None
         if self._inbox.missing(t_ns) is None:
             return t_ns
         if self._info.mode == "realtime":
             return self._give_up(t_ns)
         return self._find_lost(t_ns)
+
+    def _reaches_back(self, t_ns: int) -> bool:
+        """Tell whether, after a snapshot, the gate that follows it is there, which the world brings again."""
+        if self._resumed_ns is None:
+            return True
+        if self._member.is_fetching:
+            return False
+        self._member.check_reach(t_ns, self._resumed_ns)
+        self._resumed_ns = None
+        if self._member.failure:
+            self._leave = str(self._member.failure)
+        return self._leave is None
 
     def _find_lost(self, t_ns: int) -> int | None:
         """Ask again for what will not come any more; return the gate if it is complete now."""
@@ -151,17 +169,25 @@ class Runner:
 
     def _step(self, t_ns: int) -> None:
         start_ns = time.perf_counter_ns()
-        self._update_faults()
+        self._update_faults(t_ns)
+        for key, request in self._inputs.repeated(t_ns):
+            self._agent.repeat(key, request)
         self._agent.deliver(t_ns, self._inbox.take(t_ns))
         if t_ns % self._agent.period_ns:
             return
         outputs = self._agent.step(t_ns)
         self._member.publish(t_ns, outputs)
+        self._take_snapshot(t_ns)
         self._show(t_ns)
         self._die(t_ns)
         self.health.step(time.perf_counter_ns() - start_ns)
         newest_ns = self._inbox.latest_gate_ns()
         self.health.lag_ns = newest_ns - t_ns if newest_ns is not None else 0
+
+    def _take_snapshot(self, t_ns: int) -> None:
+        if self._snapshot_ns and t_ns >= self._snapshot_due_ns and t_ns > self._member.published_ns:
+            self._snapshot_due_ns = t_ns + self._snapshot_ns
+            self._member.publish_snapshot(t_ns)
 
     def _show(self, t_ns: int) -> None:
         """Publish what is to be displayed, as often as people can follow."""
@@ -171,10 +197,9 @@ class Runner:
             for key, message in self._agent.views(t_ns):
                 self._link.put(key, message)
 
-    def _update_faults(self) -> None:
-        """Take the lists of faults that have come: those that the world published before a gate come before it."""
-        while self._inputs.fault_lists:
-            faults = self._inputs.fault_lists.popleft()
+    def _update_faults(self, t_ns: int) -> None:
+        """Take the lists of faults that the world published before a gate."""
+        for faults in self._inputs.fault_lists_before(t_ns):
             self._agent.update_faults(self._info, faults)
             if faults.seq > self._list_seq:
                 self._list_seq = faults.seq
@@ -193,8 +218,9 @@ class Runner:
         """End, if a fault kills it in one of the gates that it has lived; their outputs still go out."""
         if self._lives_after_ns is None:
             self._lives_after_ns = t_ns - self._agent.period_ns
+        lives_after_ns = max(self._lives_after_ns, self._member.published_ns)
         for fault in self._kills.values():
-            if self._lives_after_ns < fault.from_ns + self._info.gate_ns <= t_ns:
+            if lives_after_ns < fault.from_ns + self._info.gate_ns <= t_ns:
                 self._leave, self.killed = f"killed by fault {fault.id}", True
 
     # Beginning and end

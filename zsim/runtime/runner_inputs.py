@@ -1,7 +1,9 @@
 """What reaches an agent's process: subscriptions, taken apart into an inbox, and what other threads of Zenoh bring."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from operator import itemgetter
+from typing import Any
 
 from zsim.contract import flight_messages, keys, messages, run_messages, world_events
 from zsim.contract.framing import GateMessages, run_key_table
@@ -26,7 +28,7 @@ class RunnerInputs:
 
     Attributes:
         inbox: the agent's inputs, by gate.
-        notices, links, queries, fault_lists: what has come from other threads and is to be served in turn.
+        notices, links, queries: what has come from other threads and is to be served in turn.
     """
 
     def __init__(
@@ -47,7 +49,8 @@ class RunnerInputs:
         self.notices: deque[WorldEvent] = deque()
         self.queries: deque[Query] = deque()
         self.links: deque[bool] = deque()
-        self.fault_lists: deque[run_messages.Faults] = deque()
+        self._fault_lists: deque[run_messages.Faults] = deque()
+        self._repeated: dict[int, dict[tuple[str, int], Any]] = {}  # by gate, then by key and number
 
     def subscribe(self) -> None:
         """Subscribe to all that the agent reads, and answer its requests; show that the process lives."""
@@ -111,9 +114,26 @@ class RunnerInputs:
         except DecodeError as error:
             self._refuse(error)
             return
+        if sample.key in self._agent.repeats:
+            self._repeated.setdefault(message.t_ns, {})[sample.key, message.seq] = message
+            return
         if type(message) is flight_messages.Estimate:
             self._estimated_by[sample.key] = message.source
         self.inbox.put(sample.key, message)
+
+    def fault_lists_before(self, t_ns: int) -> list[run_messages.Faults]:
+        """Return the lists of faults that were published before a gate, and forget them; an older one is of no use."""
+        if not self._fault_lists:
+            return []
+        lists = [self._fault_lists.popleft() for _ in range(len(self._fault_lists))]
+        self._fault_lists.extend(faults for faults in lists if faults.t_ns >= t_ns)
+        return sorted((faults for faults in lists if faults.t_ns < t_ns), key=lambda faults: faults.seq)
+
+    def repeated(self, t_ns: int) -> Iterator[tuple[str, Any]]:
+        """Yield, and forget, the requests that a former incarnation took before a gate."""
+        if self._repeated:
+            for (key, _), request in sorted(self._repeated.pop(t_ns, {}).items(), key=itemgetter(0)):
+                yield key, request
 
     def _refuse(self, error: DecodeError) -> None:
         self._health.refused += 1
@@ -154,7 +174,7 @@ class RunnerInputs:
 
     def _on_faults(self, payload: bytes) -> None:
         try:
-            self.fault_lists.append(messages.decode(keys.FAULTS, payload))
+            self._fault_lists.append(messages.decode(keys.FAULTS, payload))
         except DecodeError:
             self._health.refused += 1
 

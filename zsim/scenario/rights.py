@@ -20,6 +20,7 @@ LAST_VALUES = (
     "drone/*/truth",
     "drone/*/estimate",
     "cluster/*/state",
+    "process/*/snapshot",
 )
 OPERATOR, RECORDER, WORLD, ROUTER = "operator", "recorder", "world", "router"
 
@@ -80,8 +81,8 @@ def _own(process: str) -> Rights:
     """Return what every process may do in its own name."""
     return Rights(
         reads=TOLD_TO_ALL,
-        writes=tuple(keys.process(process, what) for what in ("join", "done", "bye", "health")),
-        asks=(keys.INFO, keys.CLOCK, keys.FAULTS, keys.replay(process)),
+        writes=tuple(keys.process(process, what) for what in ("join", "done", "snapshot", "bye", "health")),
+        asks=(keys.INFO, keys.CLOCK, keys.FAULTS, keys.process(process, "snapshot"), keys.replay(process)),
         answers=(keys.process(process, "outputs"),),
         tokens=(keys.token(process),),
     )

@@ -203,6 +203,7 @@ class Processes(Spec, frozen=True, kw_only=True):
 
     expect: list[Name] | None = None
     on_death: dict[str, OnDeath] = {}
+    snapshot_s: Annotated[float, Meta(ge=0, le=3)] = 1.0  # simulated; 0: none. The world keeps 5 s for who goes on
 
 
 class TimeSteps(Spec, frozen=True, kw_only=True):

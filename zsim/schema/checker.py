@@ -143,6 +143,8 @@ def _scalar_fault(value: Any, info: types.Type) -> str | None:
     if isinstance(info, types.LiteralType):
         allowed = ", ".join(str(option) for option in info.values)
         return None if value in info.values else f"is {show(value)}; must be one of {allowed}"
+    if isinstance(info, types.BytesType):
+        return None if isinstance(value, bytes) else f"is {show(value)}; must be bytes"
     if isinstance(info, types.StrType):
         return _text_fault(value, info)
     return None
@@ -192,6 +194,7 @@ def _expected(info: types.Type) -> str:
         return f"one of {', '.join(str(option) for option in info.values)}"
     words = {
         types.StrType: "text",
+        types.BytesType: "bytes",
         types.BoolType: "true or false",
         types.ListType: "a list",
         types.VarTupleType: "a list",

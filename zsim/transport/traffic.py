@@ -1,14 +1,14 @@
-"""Everything that passes the hub, taken in by one subscription: batches are taken apart here and nowhere else.
+"""Everything that passes the hub, taken in by one subscription, or once more: batches are taken apart here alone.
 
 traffic = Traffic(link, run_key_table(info))
 for entry in traffic.receive(): ...     ReceivedSample(key, payload), or GateMessages of the world's drones
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from zsim.contract import keys
-from zsim.contract.framing import GateMessages, decode_batch
-from zsim.errors import DecodeError
+from zsim.contract.framing import GateMessages, decode_batch, pairs_of
+from zsim.errors import DecodeError, NoWorldError
 from zsim.transport.session import ReceivedSample, Session
 
 Passed = ReceivedSample | GateMessages
@@ -76,3 +76,34 @@ def samples(passed: Iterable[Passed]) -> Iterator[ReceivedSample]:
             yield from (ReceivedSample(key, payload) for key, payload in entry.pairs)
         else:
             yield entry
+
+
+def replay(
+    link: Session, process: str, from_ns: int, expressions: Sequence[str], timeout_s: float
+) -> Iterator[tuple[str, bytes]]:
+    """Yield (key, payload), in the order in which they passed the world, of what is stamped after `from_ns`.
+
+    The world keeps the last seconds, and answers page by page.
+
+    Args:
+        link: an open session.
+        process: name of the one that asks.
+        from_ns: simulated time [ns]; -1 for everything that the world still has.
+        expressions: keys that are wanted.
+        timeout_s: how long each page is waited for.
+
+    Raises:
+        NoWorldError: the world does not answer, or not with a replay; what was yielded until then is good.
+    """
+    page: int | None = 0
+    while page is not None:
+        try:
+            args = {"from_ns": from_ns, "keys": list(expressions), "page": page}
+            answer = link.request(keys.replay(process), "replay", process, args, timeout_s)
+            passed = pairs_of(answer.result) if answer.ok else []
+        except DecodeError as error:
+            raise NoWorldError(f"{process}: the world's replay is of no use: {error}") from error
+        if not answer.ok:
+            raise NoWorldError(answer.error)
+        yield from passed
+        page = answer.more

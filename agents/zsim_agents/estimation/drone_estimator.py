@@ -7,11 +7,12 @@ sections of the scenario, messages of the contract, and numbers. Where its modul
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.contract.snapshot import State
 from zsim.errors import RunError
 from zsim.scenario.scenario import ESTIMATORS, Drone, Environment, Estimation
 from zsim.schema import plugin
@@ -44,8 +45,10 @@ class StateEstimate(NamedTuple):
 class DroneEstimator(Protocol):
     """Estimates the state of one drone.
 
-    A class may have a method more, `warm_start(self, last)`: it is called before everything else where the process
-    takes over from one that died, with the last `zsim.contract.flight_messages.Estimate` that this one published.
+    A class may have three methods more, for a process that takes over from one that died. `snapshot(self)` returns all
+    that the estimator has come to know as a map of plain values and arrays (`zsim.contract.snapshot.State`), and
+    `restore(self, state)` takes it over in a new object, which then goes on to the same bits. Without them
+    `warm_start(self, last)` is called, with the last `zsim.contract.flight_messages.Estimate` that was published.
 
     Args:
         drone: its sensors, their mounts, rates and error models; where it was set down.
@@ -118,6 +121,17 @@ class EstimatorSet:
         """
         pairs = zip(self._drones, self._estimators, strict=True)
         return [_plain(each.estimate(t_s), f"estimator.{drone}, at {t_s:g} s") for drone, each in pairs]
+
+    def snapshot(self) -> State | None:
+        """Return the states of all of them, None if their class has no `snapshot`."""
+        if not all(hasattr(each, "snapshot") for each in self._estimators):
+            return None
+        return {"estimators": [each.snapshot() for each in cast("list[Any]", self._estimators)]}
+
+    def restore(self, state: State) -> None:
+        """Hand each of them the state of the one in its place."""
+        for each, own in zip(cast("list[Any]", self._estimators), state["estimators"], strict=True):
+            each.restore(own)
 
     def warm_start(self, i: int, last: Any) -> None:
         """Hand the last published estimate over to an estimator that can use it."""

@@ -7,6 +7,7 @@ from msgspec import Struct
 
 from zsim.contract import flight_messages, keys, messages
 from zsim.contract.framing import GateMessages, key_table
+from zsim.contract.snapshot import State
 from zsim.contract.views import ViewEstimates, estimate_view
 from zsim.errors import RunError
 from zsim.math.compiled import COMPILES
@@ -98,6 +99,12 @@ class Estimator(Agent):
         payloads = [(keys.sensor(drone, sensor), messages.encode(message)) for sensor, message in readings.items()]
         bank.receive_gate(GateMessages.of(t_ns, 0, key_table(self.counted), payloads))
         bank.estimate(t_ns * 1e-9)
+
+    def snapshot(self) -> State | None:
+        return self._estimators.snapshot()
+
+    def restore(self, state: State) -> None:
+        self._estimators.restore(state)
 
     def warm_start_keys(self) -> tuple[str, ...]:
         return self.writes

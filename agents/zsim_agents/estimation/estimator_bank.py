@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from zsim.contract.flight_messages import Estimate
 from zsim.contract.framing import GateMessages
 from zsim.contract.keys import SENSORS
+from zsim.contract.snapshot import State
 from zsim.math.compiled import portable
 from zsim.math.rotation import axpy, multiply, normalised, scaled
 from zsim.scenario.scenario import Drone, Environment, Estimation
@@ -30,6 +31,7 @@ from zsim_agents.estimation.filter_state import (
     NOMINAL,
     READING,
     SETTING,
+    STATES,
     Rows,
     put,
     put_quaternion,
@@ -129,6 +131,22 @@ class EstimatorBank:
         P[:6, :6] = np.reshape(last.covariance, (6, 6))
         set_variance(P, YAW, last.yaw_sigma_rad**2)
         self.rows.counts[i, COUNT.heading_known] = last.yaw_sigma_rad < HEADING_SIGMA_RAD
+
+    def snapshot(self) -> State:
+        """Return the rows as they are between two gates."""
+        return {name: getattr(self.rows, name) for name in STATES}
+
+    def restore(self, state: State) -> None:
+        """Take over the rows of another bank of the same drones and settings.
+
+        Raises:
+            KeyError, ValueError: they are of another shape.
+        """
+        for name in STATES:
+            rows = getattr(self.rows, name)
+            if state[name].shape != rows.shape:
+                raise ValueError(f"{name} is of shape {state[name].shape}; must be {rows.shape}")
+            rows[...] = state[name]
 
     def _grow(self) -> None:
         former = self._readings

@@ -149,6 +149,9 @@ class Rows(NamedTuple):
     limits: NDArray[np.float64]  # (7,), of the innovation gates by number of rows
 
 
+STATES = ("nominal", "counts", "covariance", "bias", "history")  # the rows that change; the others are settings
+
+
 @portable
 def put(row: np.ndarray, at: int, a: Vector) -> None:
     """Write three columns."""

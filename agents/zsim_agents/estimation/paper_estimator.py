@@ -18,6 +18,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
 from zsim.contract.messages import Flow, Gps, Imu
+from zsim.contract.snapshot import State
 from zsim.math import frames
 from zsim.math.rotation import Quaternion, Vector
 from zsim.scenario.scenario import Drone, Environment, Estimation
@@ -85,6 +86,19 @@ class PaperEstimator:
             yaw_sigma_rad=math.sqrt(self._filter.P[YAW, YAW]),
             sensors={name: (count, 0) for name, count in self._used.items()},
         )
+
+    def snapshot(self) -> State:
+        """Return all that changes; a fix is used at the end of its gate and not kept."""
+        filter_ = {"x": self._filter.x, "P": self._filter.P}
+        times = {"t_imu_s": self._t_imu_s, "t_s": self._t_s}
+        return {**filter_, **times, "q": self._q, "velocity": self._velocity, "used": self._used}
+
+    def restore(self, state: State) -> None:
+        """Take over the state of another estimator of this drone."""
+        self._filter.x, self._filter.P = state["x"], state["P"]
+        self._t_imu_s, self._t_s = state["t_imu_s"], state["t_s"]
+        self._q, self._velocity = tuple(state["q"]), state["velocity"] and tuple(state["velocity"])
+        self._used = state["used"]
 
     def _turn(self, sample: Imu) -> None:
         """Turn the attitude to the instant of a sample."""

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from msgspec import Struct
 
+from zsim.contract.snapshot import State
 from zsim.math.compiled import portable
 from zsim_agents.formation.robot_limits import Pairs, RobotLimits, limited, pairs_of
 from zsim_agents.formation.spaces.cluster_space import TAU, Array, ClusterSpace
@@ -69,7 +70,7 @@ class ControlLaw(ABC):
     """A law: what it asks of the robots is saturated and guarded here, for all laws alike.
 
     One factor for all robots keeps the direction in cluster space; the guard keeps the robots apart. A law of one's
-    own has `rates`, and `reset` and `followed` where it has a state.
+    own has `rates`, and where it has a state `reset`, `followed`, `snapshot` and `restore`.
 
     Args:
         space: cluster space of n robots.
@@ -98,6 +99,13 @@ class ControlLaw(ABC):
 
         It is not called otherwise, so that an integral that grows here does not wind up.
         """
+
+    def snapshot(self) -> State | None:
+        """Return all state as plain values and arrays, {} where there is none; None: it cannot be handed over."""
+        return {} if type(self).reset is ControlLaw.reset and type(self).followed is ControlLaw.followed else None
+
+    def restore(self, state: State) -> None:  # noqa: B027
+        """Take over what the law of another process returned by `snapshot`, to go on to the same bits."""
 
     def command(
         self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array, dt_s: float
@@ -136,6 +144,12 @@ class ProportionalLaw(ControlLaw):
 
     def reset(self) -> None:
         self.integral = np.zeros(self.space.size)
+
+    def snapshot(self) -> State:
+        return {"integral": self.integral}
+
+    def restore(self, state: State) -> None:
+        self.integral = state["integral"]
 
     def rates(self, c: Array, p_W: Array, v_W: Array, c_des: Array, c_dot_des: Array) -> Array:
         error, c_dot = self._error, self._c_dot

@@ -14,6 +14,7 @@ import numpy as np
 
 from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
+from zsim.contract.snapshot import State
 from zsim.contract.views import cluster_view
 from zsim.errors import DocumentError, RunError
 from zsim.runtime.agent import Agent, Output
@@ -87,7 +88,9 @@ class Controller(Agent):
         self._status_ns = [0] * len(spec.drones)
         self._engagement = engagement_of(scenario, spec)
         self._last_state: flight_messages.ClusterState | None = None
+        self._stepped_ns: int | None = None
         self._request_key = keys.cluster_request(cluster)
+        self.repeats = (self._request_key,)
         self._answered: list[tuple[ControlRequest, ControlAnswer]] = []  # since the last gate
 
     def receive(self, key: str, message: Any) -> None:
@@ -100,6 +103,7 @@ class Controller(Agent):
             self._states[place], self._status_ns[place] = message.state, message.t_ns
 
     def step(self, t_ns: int) -> list[Output]:
+        self._stepped_ns = t_ns
         output = self._engagement.step(self._gate(t_ns))
         commands = [*self._modes(t_ns, output), *self._velocities(t_ns, output)]
         return [*self._requests(t_ns), *commands, *self._state(t_ns, output)]
@@ -190,6 +194,29 @@ class Controller(Agent):
         answer = ControlAnswer(ok=refusal is None, error=refusal or "")
         self._answered.append((request, answer))
         return answer
+
+    def repeat(self, key: str, message: run_messages.ClusterRequest) -> None:
+        self.control(self._control_key, ControlRequest(message.op, message.args, message.source))
+
+    def snapshot(self) -> State | None:
+        engagement = self._engagement.snapshot()
+        if engagement is None:
+            return None
+        return {
+            "estimates": [None if e is _UNKNOWN else messages.encode(e) for e in self._estimates],
+            "states": self._states,
+            "status_ns": self._status_ns,
+            "stepped_ns": self._stepped_ns,
+            "engagement": engagement,
+        }
+
+    def restore(self, state: State) -> None:
+        pairs = zip(self.gate_keys[len(self.drones) :], state["estimates"], strict=True)
+        self._estimates = [messages.decode(key, payload) if payload else _UNKNOWN for key, payload in pairs]
+        self._states, self._status_ns = state["states"], state["status_ns"]
+        self._stepped_ns = state["stepped_ns"]
+        gate = None if self._stepped_ns is None else self._gate(self._stepped_ns)
+        self._engagement.restore(state["engagement"], gate)
 
     def warm_start_keys(self) -> tuple[str, ...]:
         return (self._state_key,)

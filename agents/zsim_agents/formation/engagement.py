@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from zsim.contract.snapshot import State
 from zsim_agents.formation.control_law import ControlLaw, FormationCommand, FormationGains, ProportionalLaw
 from zsim_agents.formation.flight_check import FlightCheck, place_fault
 from zsim_agents.formation.flight_data import (
@@ -124,6 +125,36 @@ class Engagement:
         if self._phase == "engaged":
             self.guidance.engage(desired)
         self.plan.start_at(plan_step)
+
+    def snapshot(self) -> State | None:
+        """Return all that it has come to know, but for the last gate, as plain values; None if the law has none."""
+        law = self.law.snapshot()
+        if law is None:
+            return None
+        return {
+            "phase": self._phase,
+            "landing_s": self._landing_s,
+            "fault": self._fault,
+            "well_since_s": self._well_since_s,
+            "modes": self._modes.sent_s,
+            "value": self.check.value,
+            "guidance": self.guidance.snapshot(),
+            "plan": self.plan.snapshot(),
+            "law": law,
+        }
+
+    def restore(self, state: State, gate: GateInput | None) -> None:
+        """Take over the snapshot of another process, and the gate that it stepped last."""
+        self._phase, self._landing_s = state["phase"], state["landing_s"]
+        self._fault, self._well_since_s = state["fault"], state["well_since_s"]
+        self._modes.sent_s = state["modes"]
+        self.check.value = state["value"]
+        self.guidance.restore(state["guidance"])
+        self.plan.restore(state["plan"])
+        self.law.restore(state["law"])
+        self._gate = gate
+        if gate:
+            self.check.observe(gate)
 
     def _try(self, request: FlightRequest) -> str | None:
         if self._gate is None:

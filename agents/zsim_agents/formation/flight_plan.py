@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from zsim.contract.snapshot import State
 from zsim.scenario.scenario import Cluster
 from zsim_agents.formation.expression import ExpressionError, finite_number
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError
@@ -157,6 +158,15 @@ class FlightPlan:
     def start_at(self, step: int) -> None:
         """Leave out so many steps: they were done before a restart."""
         self._go_to(min(step, len(self._steps)))
+
+    def snapshot(self) -> State:
+        """Return how far it is."""
+        return {"next": self._next, "flown": self._flown, "try_s": self._try_s, "note": self.note}
+
+    def restore(self, state: State) -> None:
+        """Go on where the same plan of another process is."""
+        self._next, self._flown = state["next"], state["flown"]
+        self._try_s, self.note = state["try_s"], state["note"]
 
     def overrule(self) -> None:
         """Note that the reference flown from now on is not the plan's."""

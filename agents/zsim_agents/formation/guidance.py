@@ -9,13 +9,23 @@ import math
 
 import numpy as np
 
+from zsim.contract.snapshot import State
 from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.flight_check import place_fault, shape_fault
 from zsim_agents.formation.flight_data import ShapeLimits
 from zsim_agents.formation.flight_plan import Follow, MoveTo
 from zsim_agents.formation.robot_limits import load
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace, SingularClusterError, robot_rates
-from zsim_agents.formation.trajectory import Hold, Ramp, Reference, Shifted, TrajectoryError, ramp_onto
+from zsim_agents.formation.trajectory import (
+    Hold,
+    Ramp,
+    Reference,
+    Shifted,
+    TrajectoryError,
+    ramp_onto,
+    reference_of,
+    state_of,
+)
 
 SAMPLE_S = 0.5  # at 2 m/s a robot moves 1 m between two samples
 SAMPLES_MIN, SAMPLES_MAX = 41, 301
@@ -111,6 +121,16 @@ class Guidance:
         home = Hold(c) if self.paused else self._home
         start = (c, np.zeros_like(c))
         self._flown = RampPlanner(self.space, self._gains, shape).ramp(start, home, t_s)
+
+    def snapshot(self) -> State:
+        """Return the reference, and what the formation is about, as plain values."""
+        home, flown = state_of(self._home), state_of(self._flown)
+        return {"home": home, "flown": flown, "goal": self._goal, "paused": self.paused}
+
+    def restore(self, state: State) -> None:
+        """Take over the reference of another process."""
+        self._home, self._flown = reference_of(self.space, state["home"]), reference_of(self.space, state["flown"])
+        self._goal, self.paused = state["goal"], state["paused"]
 
     def _base(self, t_s: float) -> Array:
         return self._home.value(t_s)[0] if isinstance(self._home, Shifted) else self._goal

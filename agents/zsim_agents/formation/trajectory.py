@@ -10,10 +10,11 @@ import bisect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from zsim.contract.snapshot import State
 from zsim.math.compiled import portable
 from zsim_agents.formation.expression import Expression, ExpressionError, finite_number
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
@@ -73,6 +74,9 @@ class ExpressionTrajectory:
         constants: user constants by name, e.g. {"f": 0.01}.
         duration_s: end of the motion, None for none.
 
+    Attributes:
+        arguments: of which it is made, by name, as plain values.
+
     Raises:
         ExpressionError, TrajectoryError: an unknown name, an expression or duration not allowed.
     """
@@ -97,6 +101,10 @@ class ExpressionTrajectory:
                 self._base[index] = expression(0.0)[0]
             else:
                 self._moving.append((index, expression))
+        self.arguments = {
+            "expressions": dict(expressions), "base": base.copy(), "constants": dict(constants or {}),
+            "duration_s": duration_s,
+        }  # fmt: skip
 
     def value(self, t_s: float) -> tuple[Array, Array]:
         end = math.inf if self.duration_s is None else self.duration_s
@@ -112,6 +120,9 @@ class WaypointTrajectory:
 
     A waypoint is {"at_s": 10.0, "values": {"x_c": 5.0, ...}}; what it does not name stays as in the one
     before (in the first: as in base). Angles that wrap turn the short way.
+
+    Attributes:
+        arguments: of which it is made, by name, as plain values.
 
     Raises:
         TrajectoryError: names the waypoint and what is wrong with it.
@@ -133,6 +144,7 @@ class WaypointTrajectory:
 
             self._slopes[1:-1] = PchipInterpolator(self._times, self._places)(self._times[1:-1], 1)
         self.duration_s: float | None = self._times[-1]
+        self.arguments = {"waypoints": [dict(waypoint) for waypoint in waypoints], "base": base.copy()}
 
     def value(self, t_s: float) -> tuple[Array, Array]:
         after = bisect.bisect_right(self._times, t_s)
@@ -211,6 +223,46 @@ def ramp_onto(space: ClusterSpace, c: Array, c_dot: Array, onto: Reference, star
     """Return the ramp from c, moving at c_dot, at start_s onto a reference after over_s; angles short."""
     c_onto, c_dot_onto = onto.value(start_s)
     return Ramp(onto, start_s, over_s, space.difference(c, c_onto), c_dot - c_dot_onto)
+
+
+def state_of(reference: Reference) -> State:
+    """Return what `reference_of` makes the reference of.
+
+    Raises:
+        TypeError: it is none of this module.
+    """
+    if isinstance(reference, Hold):
+        return {"kind": "hold", "c": reference.c, "duration_s": reference.duration_s}
+    if isinstance(reference, Shifted):
+        return {"kind": "shifted", "of": state_of(reference.reference), "start_s": reference.start_s}
+    if isinstance(reference, Ramp):
+        numbers = {name: getattr(reference, name) for name in _RAMP}
+        return {"kind": "ramp", "onto": state_of(reference.onto), **numbers}
+    if isinstance(reference, ExpressionTrajectory | WaypointTrajectory):
+        return {"kind": _KINDS[type(reference)], **reference.arguments}
+    raise TypeError(f"reference: {type(reference).__name__} has no state; must be one of this module")
+
+
+def reference_of(space: ClusterSpace, state: State) -> Reference:
+    """Return the reference that a state was returned for.
+
+    Raises:
+        KeyError, TypeError, ValueError: the state is not one of `state_of`.
+    """
+    arguments: dict[str, Any] = dict(state)
+    kind = arguments.pop("kind")
+    if kind == "hold":
+        return Hold(**arguments)
+    if kind == "shifted":
+        return Shifted(reference_of(space, arguments["of"]), arguments["start_s"])
+    if kind == "ramp":
+        return Ramp(reference_of(space, arguments.pop("onto")), **arguments)
+    return _TRAJECTORIES[kind](space, **arguments)
+
+
+_RAMP = ("start_s", "over_s", "offset", "offset_rate")
+_TRAJECTORIES: dict[str, Any] = {"expressions": ExpressionTrajectory, "waypoints": WaypointTrajectory}
+_KINDS = {made: kind for kind, made in _TRAJECTORIES.items()}
 
 
 def named_values(space: ClusterSpace, values: object, where: str, base: Array) -> Array:

@@ -57,12 +57,14 @@ def agent(build: Callable[[messages.Info, Scenario], Agent], reach: WorldAccess)
         reach.endpoint, reach.federation, reach.wait_s, say, stop.stopped, run_id=launched, identity=who
     )
     with connection as (link, info):
-        member = build(info, scenario_file.from_text(info.scenario))
+        scenario = scenario_file.from_text(info.scenario)
+        member = build(info, scenario)
         check_certificate(member, who)
         say(f"{member.name}: in run {info.run_id}{_also(member)}")
         gc.collect()
         gc.freeze()
-        runner = Runner(link, info, member, stop.stopped, say, stop.orphaned)
+        snapshot_ns = round(scenario.processes.snapshot_s * 1e9)
+        runner = Runner(link, info, member, stop.stopped, say, stop.orphaned, snapshot_ns)
         reason = runner.run()
     say(f"{member.name}: left, {reason}")
     if runner.killed:

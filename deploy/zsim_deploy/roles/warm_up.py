@@ -11,7 +11,7 @@ from typing import Any
 from zsim.scenario import scenario_file
 
 SIZES = {"pair": 2, "triad": 3, "template": 5}  # drones of the kinds of cluster: each has code of its own
-ALONE = {"name": "warm-up", "duration_s": 1, "drones": [{"name": "alone", "position_m": [0, 0, 0]}]}  # the world's code is the same for all
+ALONE = {"name": "warm-up", "duration_s": 1, "drones": [{"name": "alone", "position_m": [0, 0, 0]}]}  # as good as many
 NESTED = ("groups", 2, 3)  # name, groups, drones of each
 APART_M = 4.0  # on circles, so that no formation stands in a line
 

@@ -7,13 +7,24 @@ from typing import Any
 import pytest
 from fake_link import UNANSWERED, FakeLink
 from msgspec.structs import replace
-from refused import refused
+from refused import has_terms, refused
 
 from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Estimate, Status
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import DroneInfo, Info, Mag, Origin, encode
-from zsim.contract.run_messages import RUN_ENDED, ControlAnswer, Done, Event, Fault, Faults
+from zsim.contract.run_messages import (
+    RUN_ENDED,
+    Clock,
+    ClusterRequest,
+    ControlAnswer,
+    Done,
+    Event,
+    Fault,
+    Faults,
+    Snapshot,
+)
+from zsim.contract.snapshot import VERSION, State, pack, unpack
 from zsim.errors import BehindError, RunError, SupersededError
 from zsim.runtime import membership
 from zsim.runtime.agent import Agent, Output
@@ -248,7 +259,7 @@ def test_a_gate_that_was_lost_is_asked_for_until_it_is_there(before: list[Contro
     judge = run(world)
     assert world.gates_done() == list(range(END + 1))
     assert [gate for kind, gate in judge.received if kind == "estimate"] == list(range(END + 1))
-    assert world.requests[0] == (REPLAY, {"from_ns": GATE_NS, "keys": list(judge.reads), "page": 0})
+    assert world.requests[0] == (REPLAY, {"from_ns": GATE_NS, "keys": [*judge.reads, keys.FAULTS], "page": 0})
 
 
 @pytest.mark.usefixtures("quick")
@@ -362,8 +373,7 @@ def test_a_kill_is_at_the_first_gate_in_which_it_acts():
 )
 def test_what_was_forgotten_before_a_late_process_heard_of_it(lists: tuple[Faults, Faults]):
     """Both lists arrive at once: one that names the kill, and the newer one, sent when it was over."""
-    died = lists[0].faults != ()
-    assert last_gate(2, *lists) == (3 if died else END)
+    assert last_gate(2, *lists) == 3
 
 
 def test_a_kill_that_is_heard_of_too_late_still_kills():
@@ -395,3 +405,125 @@ def test_who_is_started_again_after_its_kill_lives(former_gate: int, killed: boo
     runner.run()
     assert runner.killed == killed
     assert world.gates_done()[-1] == (3 if killed else END)
+
+
+# A process that goes on from the snapshot of a former one of its name
+
+
+class Counter(Judge):
+    """A judge that publishes, as its estimate of d2, how many gates it and its former incarnations have stepped."""
+
+    repeats = (keys.cluster_request("main"),)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+        self.repeated: list[tuple[int, int]] = []  # count at that time, gate of the request
+
+    def step(self, t_ns: int) -> list[Output]:
+        self.count += 1
+        key = keys.estimate("d2")
+        return [Output(key, replace(estimate(t_ns // GATE_NS, ME), seq=self.next_seq(key), yaw_rad=float(self.count)))]
+
+    def repeat(self, key: str, message: Any) -> None:
+        self.repeated.append((self.count, message.t_ns // GATE_NS))
+
+    def snapshot(self) -> State:
+        return {"count": self.count}
+
+    def restore(self, state: State) -> None:
+        self.count = state["count"]
+
+    def warm_start_keys(self) -> tuple[str, ...]:
+        return (keys.estimate("d2"),)
+
+
+def snapshot_of(gate: int, version: int = VERSION, **checkpoint: Any) -> Snapshot:
+    """Return what a Counter that has stepped a gate publishes."""
+    seq = {keys.estimate("d2"): gate + 1, "done": gate + 1}
+    state = {"own": {"count": gate + 1}, "seq": seq, "links": None} | checkpoint
+    return Snapshot(gate * GATE_NS, 0, ME, version, pack(state))
+
+
+class Restarting(World):
+    """A world whose judge died when it had published what it has of the gates up to DIED; it has all in its history."""
+
+    DIED = 3
+
+    def __init__(self, snapshot: Snapshot, first_kept: int = 0) -> None:
+        self._joined = False
+        super().__init__(estimates(range(END + 1)))
+        self.last[keys.process(ME, "snapshot")] = messages.encode(snapshot)
+        self.last[keys.CLOCK] = messages.encode(Clock(self.DIED * GATE_NS, 0, "run1", self.DIED, "running", 1.0))
+        self.last[keys.estimate("d2")] = messages.encode(estimate(self.DIED, ME))
+        self._kept = range(first_kept, self.DIED + 2)
+        self.on_request = self._replay
+
+    def _replay(self, key: str, args: dict[str, Any]) -> ControlAnswer:
+        gates = [gate for gate in self._kept if gate * GATE_NS > args["from_ns"]]
+        request = ClusterRequest(3 * GATE_NS, 0, "hold", {}, "me.main", True)
+        answer = replayed(*gates)
+        return replace(answer, result=[*answer.result, [keys.cluster_request("main"), messages.encode(request)]])
+
+    def _answer(self, key: str, payload: bytes) -> None:
+        if key == keys.process(ME, "join"):
+            said, done_ns = messages.decode(key, payload), self.DIED * GATE_NS
+            entry = {"incarnation": said.incarnation, "host": "h", "pid": 1, "from_ns": 0, "done_ns": done_ns}
+            self._joined, self._next = True, self.DIED + 1
+            self.deliver(keys.EVENT, event("restart", ME, **entry, former_pid=2))
+        super()._answer(key, payload)
+
+    def _gate(self, gate: int) -> None:
+        if self._joined:
+            super()._gate(gate)
+
+
+def counts(world: World) -> list[tuple[int, float, int]]:
+    """Return gate, count and number of what a Counter has published."""
+    return [(each.t_ns // GATE_NS, each.yaw_rad, each.seq) for each in world.published_on(keys.estimate("d2"))]
+
+
+@pytest.mark.parametrize("gate", [0, 1, 3])
+def test_it_steps_again_what_came_since_its_snapshot_and_publishes_what_the_former_one_has_not(gate: int):
+    world, judge = Restarting(snapshot_of(gate)), Counter()
+    Runner(world, info(), judge).run()  # type: ignore[arg-type]
+    assert counts(world) == [(g, g + 1.0, g) for g in range(4, END + 1)]
+    assert world.gates_done() == list(range(4, END + 1))
+    assert [done.seq for done in world.published_on(keys.process(ME, "done"))] == list(range(4, END + 1))
+    assert judge.repeated == ([(3, 3)] if gate < 3 else [])
+    assert [g for kind, g in judge.received if kind == "status"] == list(range(gate + 1, END + 1))
+
+
+@pytest.mark.parametrize(
+    "useless",
+    [
+        snapshot_of(1, version=VERSION + 1),
+        snapshot_of(1, own={"counts": 2}),
+        Snapshot(GATE_NS, 0, ME, VERSION, b"\xc1"),
+        replace(snapshot_of(1), t_ns=-2 * membership.RESUME_NS),
+    ],
+    ids=["other version", "other state", "garbage", "old"],
+)
+def test_without_a_snapshot_of_use_it_starts_from_its_last_output(useless: Snapshot):
+    world, judge = Restarting(useless), Counter()
+    said: list[str] = []
+    Runner(world, info(), judge, say=said.append).run()  # type: ignore[arg-type]
+    assert [gate for gate, _, _ in counts(world)] == list(range(4, END + 1))
+    assert counts(world)[0][1] == 1.0
+    assert any(has_terms(line, ME, "snapshot") for line in said)
+
+
+def test_a_world_that_has_forgotten_what_came_since_ends_it():
+    with refused(BehindError, ME, "snapshot", "0.00"):
+        Runner(Restarting(snapshot_of(0), first_kept=3), info(), Counter()).run()  # type: ignore[arg-type]
+
+
+def test_it_publishes_a_snapshot_after_a_gate_at_intervals():
+    world = World(estimates(range(END + 1)))
+    Runner(world, info(), Counter(), snapshot_ns=3 * GATE_NS).run()  # type: ignore[arg-type]
+    taken: list[Snapshot] = world.published_on(keys.process(ME, "snapshot"))
+    assert [each.t_ns // GATE_NS for each in taken] == [0, 3, 6]
+    assert [each.seq for each in taken] == [0, 1, 2]
+    assert [unpack(each.state)["own"]["count"] for each in taken] == [1, 4, 7]
+    keys_of = [key for key, _ in world.published]
+    assert keys_of.index(keys.process(ME, "snapshot")) > keys_of.index(keys.process(ME, "done"))

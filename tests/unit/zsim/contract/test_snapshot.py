@@ -1,0 +1,69 @@
+"""The state of an agent as bytes."""
+
+import math
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from msgspec.msgpack import Ext
+from refused import refused
+
+from zsim.contract.snapshot import ARRAY, pack, unpack
+from zsim.errors import DecodeError
+
+
+@pytest.mark.parametrize(
+    "value",
+    [0, -(2**63), 0.1, -0.0, math.inf, "text", b"bytes", None, True, [1, [2.5, "x"]], {"a": {"b": 1}}],
+)
+def test_plain_values_come_back_as_they_were(value: Any):
+    assert repr(unpack(pack({"value": value}))) == repr({"value": value})
+
+
+def test_not_a_number_comes_back():
+    assert math.isnan(unpack(pack({"value": math.nan}))["value"])
+
+
+@pytest.mark.parametrize(
+    "array",
+    [np.array([[1.0, -0.0], [np.nan, np.inf]]), np.arange(6).reshape(1, 2, 3), np.array([True, False]), np.empty(0)],
+)
+def test_arrays_come_back_to_the_bit_and_may_be_written(array: np.ndarray):
+    again = unpack(pack({"rows": [array]}))["rows"][0]
+    assert (again.dtype, again.shape, again.tobytes()) == (array.dtype, array.shape, array.tobytes())
+    again[...] = 0
+
+
+def test_a_part_of_an_array_is_packed_as_it_reads():
+    rows = np.arange(12.0).reshape(3, 4)
+    assert np.array_equal(unpack(pack({"column": rows[:, 1]}))["column"], rows[:, 1])
+
+
+@pytest.mark.parametrize("value", [object(), {1, 2}.__iter__(), np.array(["text"]), np.array([1.0], dtype=np.float32)])
+def test_what_is_not_plain_is_refused(value: Any):
+    with refused(TypeError, "a state", type(value).__name__):
+        pack({"value": value})
+
+
+def array(kind: str, shape: list[int], numbers: bytes) -> bytes:
+    return msgspec.msgpack.encode({"rows": Ext(ARRAY, msgspec.msgpack.encode([kind, shape, numbers]))})
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xc1",
+        b"\x91\x01",
+        msgspec.msgpack.encode({"rows": Ext(ARRAY + 1, b"")}),
+        msgspec.msgpack.encode({"rows": Ext(ARRAY, b"\xc1")}),
+        array("<f8", [2], bytes(8)),
+        array("<f8", [-1, -1], bytes(8)),
+        array("|O", [1], bytes(8)),
+        array("|V8", [1], bytes(8)),
+    ],
+)
+def test_garbage_is_refused_in_a_line(payload: bytes):
+    with refused(DecodeError, "state"):
+        unpack(payload)
