@@ -30,10 +30,12 @@ MESSAGE = struct.Struct("<BQHIQQ")  # head, channel, sequence, log time, publish
 CHUNK_HEAD = struct.Struct("<QQQII")  # first, last log time, plain size, plain CRC, bytes of name
 SIZE = struct.Struct("<Q")  # of a chunk's content, behind the name
 ZSTD = b"zstd"  # the name of our compression
+SIZE_UNSTATED = -1  # as zstandard has it
 CUT_HEAD = CHUNK_HEAD.size + len(ZSTD) + SIZE.size  # bytes of a chunk before its content
 INDEX_HEAD = struct.Struct("<HI")  # channel, bytes of its entries
 INDEX_ENTRY = 16  # bytes: log time, place in the chunk
 FOOTER_SIZE = HEAD.size + 20
+CHUNK_MAX = 1 << 27  # bytes of a chunk's content; ours have a megabyte and a message, which has at most 16 on the wire
 SMALL_MAX = 1 << 20  # bytes of a schema, a channel or a part of the summary; statistics of 65 535 channels take 0.7 MB
 LEAST = {Opcode.CHUNK: CHUNK_HEAD.size + SIZE.size, Opcode.MESSAGE_INDEX: INDEX_HEAD.size}  # bytes that are always read
 
@@ -209,19 +211,21 @@ def chunk_head(source: Source, place: RecordSpan) -> ChunkHead:
 
 
 def content_of(source: Source, place: RecordSpan) -> bytes | None:
-    """Return the message records inside the chunk at a place, None if it is damaged.
+    """Return the message records inside the chunk at a place, None if it is damaged, or larger than any of ours.
 
     Raises:
         RecordError: compressed in a way that is not ours.
     """
     head = chunk_head(source, place)
-    if head.content > place.end:
+    if head.content > place.end or head.size > CHUNK_MAX:
         return None
     if head.compression not in ("zstd", ""):
         raise RecordError(f"a chunk is compressed with {head.compression[:20]!r}; allowed: zstd or none")
     content = source[head.content : place.end]
     if head.compression:
         try:
+            if zstandard.frame_content_size(content) not in (SIZE_UNSTATED, head.size):
+                return None  # whatever limit is given, the frame's own size would be made room for
             content = _decompressor().decompress(content, max_output_size=head.size)
         except (zstandard.ZstdError, MemoryError, OverflowError):  # the latter two of a damaged size
             return None

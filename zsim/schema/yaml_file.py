@@ -1,9 +1,10 @@
-"""YAML documents that people write: read with a limit, one line per fault, no aliases, no tags, YAML 1.2 floats."""
+"""YAML documents that people write: read with a limit, one line per fault, no aliases, no tags, words of YAML 1.2."""
 
 import re
 from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 from yaml.composer import ComposerError
@@ -94,7 +95,12 @@ _Base: Any = yaml.CSafeLoader if yaml.__with_libyaml__ else yaml.SafeLoader  # l
 
 
 class _Loader(_Base):
-    """Refuses keys that are given twice; reads YAML 1.2 floats (1e3 is a number)."""
+    """Refuses keys that are given twice; takes words for what YAML 1.2 says (its core schema, section 10.3.2).
+
+    So 1e3 and 010 are decimal numbers; 1:30, 1_000, yes, off, 2026-01-31 and the key << are text.
+    """
+
+    yaml_implicit_resolvers: ClassVar[dict[str | None, Any]] = {}
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -105,14 +111,24 @@ class _Loader(_Base):
             seen.add(key if isinstance(key, str) else None)
         return super().construct_mapping(node, deep)
 
+    def construct_whole(self, node: Any) -> int:
+        """Return a whole number: decimal, 0o for octal, 0x for hexadecimal."""
+        text = node.value
+        return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
+
 
 class _Dumper(yaml.SafeDumper):
     """Puts into quotes the texts that `_Loader` would read as numbers."""
 
 
-for _yaml in (_Loader, _Dumper):
-    _yaml.add_implicit_resolver(
-        "tag:yaml.org,2002:float",
-        re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|^[-+]?\.(inf|Inf)$|^\.(nan|NaN)$"),
-        list("-+0123456789."),
-    )
+_TAG = "tag:yaml.org,2002:"
+_FLOAT = r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf)$|^\.(nan|NaN)$"
+_WORDS = (  # the first that fits counts
+    ("null", r"^(~|null|Null|NULL|)$", [*"~nN", ""]),
+    ("bool", r"^(true|True|TRUE|false|False|FALSE)$", [*"tTfF"]),
+    ("int", r"^([-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$", [*"-+0123456789"]),
+    ("float", _FLOAT, [*"-+0123456789."]),
+)
+for _yaml, (_kind, _pattern, _first) in product((_Loader, _Dumper), _WORDS):
+    _yaml.add_implicit_resolver(f"{_TAG}{_kind}", re.compile(_pattern), _first)
+_Loader.add_constructor(f"{_TAG}int", _Loader.construct_whole)

@@ -1,5 +1,6 @@
 """YAML documents: what they mean, and what is refused."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,8 @@ from zsim.schema import yaml_file
 
 ROOT = Path(__file__).parents[4]
 FILES = sorted([*ROOT.glob("scenarios/**/*.yaml"), *ROOT.glob("examples/**/*.yaml")])
-SCALARS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=8)
+WORDS = st.sampled_from(["0o17", "0x1f", "012", "1:30", "1_0", "yes", "<<", "1e3", ".5", "~", "Null", "2026-01-31"])
+SCALARS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=8) | WORDS
 DOCUMENTS = st.recursive(
     SCALARS, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4)
 )
@@ -31,11 +33,31 @@ def test_what_was_written_is_read_again(document: object) -> None:
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("1e3", 1000.0), ("1e-3", 0.001), ("012", 10), ("0x1f", 31), ("yes", True), (".5", 0.5), (".inf", float("inf"))],
+    [
+        ("1e3", 1000.0),
+        ("1e-3", 0.001),
+        (".5", 0.5),
+        ("-.inf", -math.inf),
+        ("012", 12),
+        ("-7", -7),
+        ("0x1f", 31),
+        ("0o17", 15),
+        ("true", True),
+        ("~", None),
+        ("", None),
+        *[
+            (text, text)
+            for text in ("yes", "off", "1:30", "1:30:15.5", "1_000", "0b11", "2026-01-31", "<<", "=", "null_")
+        ],
+    ],
 )
-def test_numbers_are_those_of_yaml_and_floats_of_yaml_1_2(text: str, value: object) -> None:
+def test_words_mean_what_yaml_1_2_says(text: str, value: object) -> None:
     read = yaml_file.value(f"a: {text}")["a"]
     assert (type(read), read) == (type(value), value)
+
+
+def test_a_key_that_yaml_1_1_merges_is_a_key() -> None:
+    assert yaml_file.value("<<: {b: 1}\nb: 2") == {"<<": {"b": 1}, "b": 2}
 
 
 @pytest.mark.parametrize(
