@@ -1,6 +1,9 @@
-"""The recorder as a process: every message of every key into `run.mcap`; not gating, but never skipping.
+"""The recorder as a process: every message of every key into `run.mcap`.
 
-Order of this file: `record`, the process, what arrives.
+It gates nothing, but the world is never farther ahead of what is on disk than its history reaches back (SLACK_NS): a
+recorder that comes back, or that is started again in the place of one that died, goes on without a gap.
+
+Order of this file: `record`, the process, catching up, what arrives.
 """
 
 import os
@@ -24,6 +27,7 @@ from zsim.schema import message
 from zsim.transport.connection import read_info
 from zsim.transport.session import Session
 from zsim.transport.traffic import Passed, Traffic, replay, samples
+from zsim_agents.known_messages import KnownMessages, is_of_run
 
 NAME = "recorder"
 ANOTHER_RUN = "the world has begun another run"
@@ -32,7 +36,8 @@ TICK_S = 0.1  # how often the open chunk's age and a stop are looked at
 REPLAY_S = 5.0  # a hub answers within milliseconds
 DRAIN_S = 1.0  # after `stopped`, how long the byes of the others are waited for
 STOP_DRAIN_S = 0.5  # after a stop is requested, how long the end of the run is waited for: both may be stopped at once
-KNOWN_MAX = 1_000_000  # replayed messages remembered, so that none is written twice: 5 s of 1000 drones
+FLUSH_NS = 1_000_000_000  # simulated time after which what was taken is put on disk
+SLACK_NS = 4_000_000_000  # that the world may be ahead of it; its history has 5 s
 
 
 class _Head(msgspec.Struct):
@@ -46,15 +51,16 @@ def record(
     name: str = NAME,
     stopped: Callable[[], bool] = lambda: False,
     say: Callable[[str], None] = lambda text: None,
+    deserted: Callable[[], bool] = lambda: False,
 ) -> str:
-    """Record a run until it ends; return why it ended.
+    """Record a run until it ends; return why it ended. Who is `deserted` then leaves without a bye, as one that dies.
 
     Raises:
         RunError: the world has begun another run; the record is complete as far as it goes.
         RecordError: the disk is full or the file cannot be written; what was written before is readable.
         SupersededError: another recorder of this name has taken over.
     """
-    return Recorder(link, info, path, name, stopped, say).run()
+    return Recorder(link, info, path, name, stopped, say, deserted).run()
 
 
 class Recorder:
@@ -68,7 +74,9 @@ class Recorder:
         name: str,
         stopped: Callable[[], bool],
         say: Callable[[str], None] = lambda text: None,
+        deserted: Callable[[], bool] = lambda: False,
     ) -> None:
+        self._deserted = deserted
         self._link = link
         self._info = info
         self._name = name
@@ -77,17 +85,19 @@ class Recorder:
         self._links: deque[bool] = deque()
         self._link_lost = False
         self._must_look = False
-        self._writer = RecordWriter(path)
+        self._writer = RecordWriter(path, goes_on=is_of_run(path, info.run_id))
         self._head = msgspec.msgpack.Decoder(_Head)
         self._clock = msgspec.msgpack.Decoder(run_messages.Clock)
-        self._known: dict[tuple[str, bytes], None] = {}
+        self._known = KnownMessages()
         self._caught_up = False
         self._over = threading.Event()
         self._successor: str | None = None
         self._ended_s: float | None = None
         self._stopped_s: float | None = None
         self._now_ns = 0
-        self._seq = {"join": 0, "bye": 0, "health": 0}
+        self._on_disk_ns = 0  # when everything taken was put there last
+        self._incarnation = secrets.randbits(62)
+        self._seq = {"join": 0, "done": 0, "bye": 0, "health": 0}
         self._left_out = 0
         self._leavers: set[str] = set()
         self._joined: set[str] = set()
@@ -98,6 +108,11 @@ class Recorder:
         self._views = self._link.subscribe("view/**")
         self._link.declare_token(keys.token(self._name))
         self._link.on_link(self._on_link)
+        if self._writer.messages:
+            self._now_ns = self._known.add_tail(self._writer.path)
+            self._print(f"{self._name}: goes on with {self._writer.path} after t = {self._now_ns / 1e9:.2f} s")
+        else:
+            self._write_lasting()
         self._catch_up()
         self._join()
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
@@ -121,7 +136,8 @@ class Recorder:
             )
         if reason == ANOTHER_RUN:
             raise RunError(f"{self._name}: {reason}; the record {self._writer.path} is complete as far as it goes")
-        self._bye(reason)
+        if not self._deserted():
+            self._bye(reason)
         return reason
 
     def _on_link(self, up: bool) -> None:
@@ -129,7 +145,7 @@ class Recorder:
         self._traffic.wake()
 
     def _is_another_run(self) -> bool:
-        """Print what has become of the link; return whether there is another run at its end when it is back."""
+        """Return whether there is another run at the end of a link that is back; if not, fetch what was missed."""
         while self._links:
             up = self._links.popleft()
             if not up:
@@ -137,12 +153,24 @@ class Recorder:
             self._must_look = up and self._link_lost
             self._link_lost = not up
         info = read_info(self._link) if self._must_look else None
-        self._must_look = self._must_look and info is None
-        return info is not None and info.run_id != self._info.run_id
+        if info is None:
+            return False
+        self._must_look = False
+        if info.run_id != self._info.run_id:
+            return True
+        self._incarnation = secrets.randbits(62)
+        self._writer.flush()
+        self._known.add_tail(self._writer.path)
+        self._catch_up()
+        self._join()
+        return False
 
     def _loop(self) -> str:
         while True:
-            for passed in self._traffic.receive():
+            arrived = list(self._traffic.receive())
+            if self._is_another_run():  # before what has arrived: it may have passed after what was missed
+                return ANOTHER_RUN
+            for passed in arrived:
                 self._write_passed(passed)
             time.sleep(PAUSE_S)
             for passed in self._traffic.drain():
@@ -150,11 +178,11 @@ class Recorder:
             for sample in self._views.drain():
                 self._write(sample.key, sample.payload)
             self._writer.tick(time.monotonic_ns())
+            if self._now_ns - self._on_disk_ns >= FLUSH_NS:
+                self._put_on_disk()
             self._count_left_out()
             if self._successor:
                 return "superseded"
-            if self._is_another_run():
-                return ANOTHER_RUN
             if self._may_stop():
                 return "stopped"
             if self._ended_s is not None and self._all_left():
@@ -177,14 +205,23 @@ class Recorder:
         late = time.monotonic() - (self._ended_s or 0.0) > DRAIN_S
         return late or self._joined <= self._leavers
 
+    def _put_on_disk(self) -> None:
+        """Write out all that was taken, and let the world go on as far as its history then reaches back to it."""
+        self._writer.flush()
+        self._on_disk_ns = t_ns = self._now_ns
+        run_id, seq = self._info.run_id, self._next("done")
+        self._publish("done", run_messages.Done(t_ns, seq, run_id, self._incarnation, t_ns, 0))
+
+    # Catching up
+
     def _catch_up(self) -> None:
-        """Write what was published before this process came: the world keeps it for a while."""
-        self._write_lasting()
+        """Write what was published while this process was not there: the world keeps it for a while."""
+        self._caught_up = False
         while not self._caught_up and not self._stopped():
             try:
                 for key, payload in replay(self._link, self._name, -1, ["**"], REPLAY_S):
                     self._write(key, payload)
-                    self._know(key, payload)
+                    self._known.add(key, payload)
                 self._caught_up = True
             except NoWorldError:
                 self._over.wait(TICK_S)
@@ -196,13 +233,7 @@ class Recorder:
             lasting |= {sample.key: sample.payload for sample in self._link.get(key)}
         for key, payload in lasting.items():
             self._write(key, payload)
-            self._know(key, payload)
-
-    def _know(self, key: str, payload: bytes) -> None:
-        """Remember what the world has replayed: the newest of it passes once more."""
-        self._known[key, payload] = None
-        if len(self._known) > KNOWN_MAX:
-            del self._known[next(iter(self._known))]
+            self._known.add(key, payload)
 
     def _refuse(self) -> None:
         self.health.refused += 1
@@ -268,9 +299,11 @@ class Recorder:
             self._leavers.add(name)
 
     def _join(self) -> None:
-        incarnation, run_id = secrets.randbits(62), self._info.run_id
-        join = join_of(self._name, self._link.host, run_id, incarnation, self._next("join"), calculates=False)
+        """Join; who records already keeps the world from going on faster than it writes."""
+        name, host, run_id, seq = self._name, self._link.host, self._info.run_id, self._next("join")
+        join = join_of(name, host, run_id, self._incarnation, seq, self._now_ns, calculates=False, slack_ns=SLACK_NS)
         self._publish("join", join)
+        self._put_on_disk()
 
     def _bye(self, reason: str) -> None:
         self._publish("bye", run_messages.Bye(self._now_ns, self._next("bye"), reason))

@@ -68,4 +68,4 @@ def _some(info: inspect.Type) -> Any:
     if isinstance(info, inspect.UnionType):
         return _some(info.types[0])
     simple = {inspect.BoolType: True, inspect.StrType: "text", inspect.IntType: 7, inspect.FloatType: 1.5}
-    return simple.get(type(info), 7)
+    return {**simple, inspect.BytesType: b"state"}.get(type(info), 7)

@@ -10,11 +10,10 @@ from federation import PAIR, Federation, Record, Role
 from wire import Client, Received, Subscription
 
 REASONS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "terminated"}
-JUMP_MAX_M = 0.5  # truth of a run with a restart against the run without
 SEEN_DEAD = ("death", "superseded")  # the second where it is back before its death is noticed
+GATE_NS = 20_000_000
 ENGAGED_NS, END_NS = 6_000_000_000, 12_000_000_000
 UNWRITTEN_NS = 5_000_000_000  # simulated, at four times real time: what comes waits half a second or more in a recorder
-UNWRITTEN_S = 3.0  # wall time: the same for a run as fast as it goes, in which that half second can be twenty simulated
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +119,7 @@ def test_drop(federation: Federation, name: str) -> None:
     "name", [pytest.param("estimator.drone1", marks=pytest.mark.soak), "controller.main", "recorder"]
 )
 def test_end(federation: Federation, name: str) -> None:
-    own = [] if name == "recorder" else ["--set", f"processes.on_death={{{name}: end}}"]  # a recorder's death ends it
-    flight = Flight(federation, *own)
+    flight = Flight(federation, "--set", f"processes.on_death={{{name}: end}}")
     federation.kill(name)
     flight.event("death", name)
     flight.run.line(f"{name}.*(died|ended)")
@@ -137,9 +135,35 @@ def test_who_is_terminated_has_died(federation: Federation) -> None:
     assert flight.event("death", "estimator.drone1").message["data"]["on_death"] == "restart"
     flight.event("restart", "estimator.drone1")
     federation.kill("recorder", signal.SIGTERM)
-    flight.run.ends(with_code=1)
-    assert re.search("ended: .*recorder", flight.run.text())
-    assert check_end(federation, whole=False).complete
+    flight.event("restart", "recorder")
+    flight.finish()
+    check_whole(check_end(federation, whole=True))
+
+
+def check_whole(record: Record) -> None:
+    """Check that every gate is on record once, and of every key every message."""
+    t_ns = [message["t_ns"] for message in record.all("drone/drone1/truth")]
+    assert t_ns == list(range(0, record.end()["last_ns"] + 1, GATE_NS))
+    for key, count in record.keys().items():
+        if not key.startswith(("process/", "view/")):  # who is started again counts its own messages anew
+            assert [message["seq"] for message in record.all(key)] == list(range(count)), key
+
+
+@pytest.mark.parametrize("pace", [4, 1000])
+def test_a_recorder_that_is_killed_again_and_again_leaves_no_gap(
+    federation: Federation, undisturbed: dict[str, np.ndarray], pace: int
+) -> None:
+    flight = Flight(federation, "--rate", str(pace))
+    for kills in range(1, 4):
+        federation.kill("recorder")
+        flight.run.line(r"recorder .*(died|ended: killed by signal 9).*restart")
+        flight.events.until(lambda m: m["kind"] in ("restart", "superseded") and m["subject"] == "recorder")
+        assert flight.clock.until(lambda m: not m["waiting_for"]), kills
+    flight.finish()
+    record = check_end(federation, whole=True)
+    check_whole(record)
+    for drone, wanted in undisturbed.items():
+        assert np.array_equal(record.positions(drone)[: len(wanted)], wanted)
 
 
 @pytest.mark.soak
@@ -158,15 +182,14 @@ def test_a_stopped_reader(federation: Federation) -> None:
 
 @pytest.mark.soak
 def test_a_stopped_recorder(federation: Federation) -> None:
-    """A recorder that takes nothing for long is as good as dead, whether or not a put has waited for it before."""
+    """Time stands still for it, before the world has forgotten what it lacks."""
     flight = Flight(federation, "--rate", "1000")
-    engaged_s = flight.clock.received[-1].wall_s
-    flight.clock.until(lambda _: flight.clock.received[-1].wall_s > engaged_s + UNWRITTEN_S)
     federation.kill("recorder", signal.SIGSTOP)
-    flight.run.line("death: recorder .*; on_death: end")
-    flight.run.ends(with_code=1)
-    assert re.search("ended: .*recorder", flight.run.text())
-    check_end(federation, whole=False)
+    flight.stands_for("recorder")
+    federation.kill("recorder", signal.SIGCONT)
+    flight.clock.until(lambda m: not m["waiting_for"])
+    flight.finish()
+    check_whole(check_end(federation, whole=True))
 
 
 def test_world(federation: Federation) -> None:

@@ -52,6 +52,7 @@ def join_of(
     period_ns: int = 0,
     serves: tuple[str, ...] = (),
     calculates: bool = True,
+    slack_ns: int = 0,
 ) -> Join:
     """Return the message with which this process takes part in a run.
 
@@ -60,6 +61,7 @@ def join_of(
         period_ns: how often it says done; 0 for never.
         serves: names of processes whose work it does.
         calculates: whether its results depend on its arithmetic; else it states no fingerprint.
+        slack_ns: by how much the world may be ahead of the dones of one without a period; 0 for any.
     """
     return Join(
         t_ns=t_ns,
@@ -73,6 +75,7 @@ def join_of(
         version=__version__,
         fingerprint=fingerprint() if calculates else "",
         serves=serves,
+        slack_ns=slack_ns,
     )
 
 

@@ -49,7 +49,8 @@ class Join(Message, frozen=True):
     """A process takes part from now on; the newest of several random incarnations counts.
 
     `period_ns` is how often it publishes done: a multiple of the gate, 0 for never. `serves` names processes that need
-    not join, since this one does what they would.
+    not join, since this one does what they would. `slack_ns` is by how much the world may be ahead of the dones of one
+    that has no period, 0 for any.
     """
 
     run_id: str
@@ -61,6 +62,7 @@ class Join(Message, frozen=True):
     version: str = ""
     fingerprint: str = ""
     serves: tuple[str, ...] = ()
+    slack_ns: Count = 0
 
 
 class Done(Message, frozen=True):

@@ -1,7 +1,7 @@
 """The messages of a record that are not on disk yet: payloads one behind the other, the heads written all at once."""
 
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -31,14 +31,15 @@ class OpenChunk:
 
     Args:
         room: bytes that a chunk commonly has, with its last message.
+        counted: messages that each channel had in earlier chunks.
 
     Attributes:
         size: bytes of its records.
         since_ns: wall clock of the first of its messages.
     """
 
-    def __init__(self, room: int) -> None:
-        self._counted = np.zeros(1, dtype=np.int64)  # messages that each channel had in earlier chunks
+    def __init__(self, room: int, counted: Sequence[int] = (0,)) -> None:
+        self._counted = np.array(counted, dtype=np.int64)
         self._room = room
         self._data = bytearray(room)
         self._begin()

@@ -167,18 +167,30 @@ def repair(path: str | Path) -> bool:
 
 
 def _repair(file: FileIO, path: Path) -> bool:
-    end, indexes = 0, b""
     if file.seek(0, 2):
         with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
             if is_complete(source):
                 return False
+    cut_off(file, path)
+    finish(file)
+    return True
+
+
+def cut_off(file: FileIO, path: Path) -> None:
+    """Take off what stands behind the last whole chunk of a record, so that it can be written on from there.
+
+    Raises:
+        RecordError: no record.
+        OSError: it cannot be written.
+    """
+    end, indexes = 0, b""
+    if file.seek(0, 2):
+        with mmap(file.fileno(), 0, access=ACCESS_READ) as source:
             check_magic(source, path)
             end, indexes = _last_whole(source)
     file.truncate(end)
     file.seek(end)
     write_all(file, indexes if end else opening())
-    finish(file)
-    return True
 
 
 def _last_whole(source: Source) -> tuple[int, bytes]:

@@ -1,20 +1,23 @@
 """Writes a record while a run goes on."""
 
+from collections import Counter
 from collections.abc import Callable
 from io import FileIO
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, NoReturn
 
 import msgspec
 import numpy as np
+from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from zsim.contract import messages
 from zsim.contract.framing import GateMessages, PerPattern
 from zsim.errors import RecordError
-from zsim.record.mcap_layout import chunk, opening, packed
+from zsim.record.mcap_layout import chunk, groups, opening, packed, unpacked
 from zsim.record.open_chunk import OpenChunk
-from zsim.record.record_end import finish, finish_bare, write_all
+from zsim.record.record_end import cut_off, finish, finish_bare, write_all
 
 CHUNK_BYTES = 1024 * 1024  # not yet on disk at most, besides the last message
 CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s nothing waits longer than 0.5 s
@@ -24,7 +27,7 @@ _encode = messages.encode
 
 
 class RecordWriter:
-    """Appends messages to a new record; for one thread.
+    """Appends messages to a record; for one thread.
 
     What is in the file is readable at any moment, whatever happens to this process: a chunk and its indexes
     are one write. Memory holds the open chunk and the names of the keys, however long the run.
@@ -34,11 +37,11 @@ class RecordWriter:
         refused: messages on keys beyond the 65 535 that a record can hold.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        """Start the file; a record is never overwritten.
+    def __init__(self, path: str | Path, goes_on: bool = False) -> None:
+        """Start the file, or go on behind the last whole chunk of one whose writer died; none is overwritten.
 
         Raises:
-            RecordError: the file exists or cannot be written.
+            RecordError: the file exists, or is none that can be gone on with, or cannot be written.
         """
         self.path = Path(path)
         self.messages = 0
@@ -51,8 +54,37 @@ class RecordWriter:
         self._seen = (0, 0)  # where the file ended at a tick, and when that tick was
         self._end = 0  # of the last whole chunk
         self._error = ""
-        self._file = _new_file(self.path)
-        self._append(opening())
+        self._file = _opened(self.path, "r+" if goes_on else "x+")
+        if not goes_on:
+            self._append(opening())
+            return
+        try:
+            self._take_up()
+        except OSError as error:
+            self._file.close()
+            raise RecordError(f"{path}: cannot be gone on with ({error.strerror})") from error
+        except RecordError:
+            self._file.close()
+            raise
+
+    def _take_up(self) -> None:
+        """Learn the channels and schemas of the file as far as it is whole."""
+        cut_off(self._file, self.path)
+        counts: Counter[int] = Counter()
+        self._end = self._file.seek(0, 2)
+        with mmap(self._file.fileno(), 0, access=ACCESS_READ) as source:
+            for group in groups(source):
+                opcode = group.place.opcode
+                if opcode == Opcode.SCHEMA:
+                    schema = unpacked(Schema, source, group.place)
+                    self._schemas[schema.name] = schema.id
+                elif opcode == Opcode.CHANNEL:
+                    channel = unpacked(Channel, source, group.place)
+                    self._channels[channel.topic] = channel.id
+                counts.update({index.channel: index.messages for index in group.indexes})
+        self.messages = counts.total()
+        counted = [counts[number] for number in range(len(self._channels) + 1)]
+        self._open = OpenChunk(CHUNK_BYTES + CHUNK_BYTES // 4, counted)
 
     def add(self, key: str, payload: bytes, encoding: str, t_ns: int, wall_ns: int) -> None:
         """Take one message.
@@ -216,9 +248,9 @@ class RecordWriter:
         raise RecordError(self._error) from error
 
 
-def _new_file(path: Path) -> FileIO:
+def _opened(path: Path, mode: str) -> FileIO:
     try:
-        return FileIO(path, "x+")
+        return FileIO(path, mode)
     except FileExistsError as error:
         raise RecordError(f"{path}: exists; a record is never overwritten, name another place") from error
     except OSError as error:

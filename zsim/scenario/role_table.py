@@ -29,7 +29,7 @@ class Role(NamedTuple):
 
 ROLES = {
     "world": Role("world", "end"),
-    "recorder": Role("record", "end"),
+    "recorder": Role("record", "restart"),
     "estimator": Role("agents", "restart", "drone", "zsim_agents.estimation.estimator:Estimator", joint=True),
     "controller": Role("agents", "restart", "cluster", "zsim_agents.formation.controller:Controller"),
     "router": Role("", "restart"),

@@ -122,7 +122,7 @@ def recorder(path: Path, reach: WorldAccess) -> None:
     connection = find_world(reach.endpoint, reach.federation, reach.wait_s, say, stop.stopped, True, launched, who)
     with connection as (link, info):
         say(f"recorder: run {info.run_id} into {path}")
-        reason = record(link, info, path, stopped=stop.stopped, say=say)
+        reason = record(link, info, path, stopped=stop.stopped, say=say, deserted=stop.orphaned)
     say(f"recorder: {path} is complete, {reason}")
     stop.exit_if_terminated()
 

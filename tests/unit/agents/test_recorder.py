@@ -7,15 +7,19 @@ import msgspec
 import numpy as np
 import pytest
 from fake_link import BAD_UTF8, NESTED, UNANSWERED, FakeLink
+from mcap.opcode import Opcode
 from msgspec import Struct
-from refused import has_terms
+from msgspec.structs import replace
+from refused import has_terms, refused
 
 from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages, encode_batch, key_table
 from zsim.contract.messages import DroneInfo, Imu, Info, Origin
 from zsim.contract.run_messages import RUN_ENDED, Clock, ControlAnswer, Faults
-from zsim.record import RecordReader
-from zsim_agents import recorder
+from zsim.errors import RecordError
+from zsim.record import RecordReader, RecordWriter
+from zsim.record.mcap_layout import places
+from zsim_agents import known_messages, recorder
 from zsim_agents.recorder import record
 
 GATE_NS = 20_000_000
@@ -131,7 +135,7 @@ def _packed(b: GateMessages) -> bytes:
 
 
 def test_the_newest_of_a_long_replay_is_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(recorder, "KNOWN_MAX", 6)
+    monkeypatch.setattr(known_messages, "KNOWN_MAX", 6)
     found = recorded(tmp_path / "run.mcap", [page(gates(*range(10)))], gates(8, 9, 10))
     assert stamps(found, IMU) == list(range(11))
 
@@ -174,6 +178,95 @@ def test_what_has_no_time_is_recorded_at_the_worlds_whatever_strangers_stamp(tmp
     with RecordReader(path) as reader:
         times = {message.key: message.t_ns for message in reader.messages() if message.key.startswith("my/")}
     assert times == {"my/thing": 2**61, "my/raw": 4 * GATE_NS}
+
+
+# Without a gap
+
+
+def died(path: Path, passed: list[Pair], cut: int = 0) -> None:
+    """Leave what a recorder that was killed leaves: a record without an end, cut by some bytes."""
+    with RecordWriter(path) as writer:
+        for key, payload in passed:
+            writer.add(key, payload, messages.encoding(key), messages.decode(key, payload).t_ns, 1)
+    data = path.read_bytes()
+    end = next(place.start for place in places(data) if place.opcode == Opcode.DATA_END)
+    path.write_bytes(data[: end - cut])
+
+
+def test_one_that_is_started_again_goes_on_with_the_record(tmp_path: Path):
+    """It has the gates up to 4; the world replays the last of these and those that passed meanwhile."""
+    path = tmp_path / "run.mcap"
+    died(path, [pair(keys.INFO, INFO), *gates(0, 1, 2, 3, 4)])
+    found = recorded(path, [page(gates(2, 3, 4, 5, 6, 7))], gates(7), gates(8), whole(9))
+    assert stamps(found, IMU) == list(range(10))
+    assert stamps(found, keys.CLOCK) == [*range(10), 99]
+    assert [key for key, _ in found].count(keys.INFO) == 1
+
+
+@pytest.mark.parametrize("cut", [1, 40])
+def test_what_its_last_chunk_lacks_is_asked_for(tmp_path: Path, cut: int):
+    path = tmp_path / "run.mcap"
+    died(path, [pair(keys.INFO, INFO), *gates(0, 1, 2)], cut)
+    found = recorded(path, [page(gates(0, 1, 2, 3))], gates(4), last=dict([pair(keys.INFO, INFO)]))
+    assert stamps(found, IMU) == list(range(5))
+
+
+def test_the_record_of_another_run_is_left_alone(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    died(path, [pair(keys.INFO, replace(INFO, run_id="other")), *gates(0)])
+    before = path.read_bytes()
+    with refused(RecordError, "run.mcap", "exists"):
+        recorded(path, [])
+    assert path.read_bytes() == before
+
+
+def test_what_passed_while_its_link_was_lost_is_asked_for(tmp_path: Path):
+    """The link goes after gate 1 and comes back before gate 4."""
+    path, link = tmp_path / "run.mcap", FakeLink()
+    replays = iter([page(gates(0)), page(gates(0, 1, 2, 3))])
+
+    def answer(key: str, args: dict[str, Any]) -> ControlAnswer:
+        answered = next(replays)
+        if len(joins := link.published_on("process/recorder/join")):
+            link.deliver(keys.BATCH, encode_batch([*gates(3, 4), clock(99, "stopped")]))
+            assert len(joins) == 1
+        return answered
+
+    def cut(key: str, payload: bytes) -> None:
+        if key == "process/recorder/join" and len(link.published_on(key)) == 1:
+            link.deliver(keys.BATCH, encode_batch(gates(1)))
+            link.cut(False)
+            link.cut(True)
+
+    link.last = dict([pair(keys.INFO, INFO)])
+    link.on_request, link.on_publish = answer, cut
+    assert record(link, INFO, path) == RUN_ENDED  # type: ignore[arg-type]
+    with RecordReader(path) as reader:
+        found = [(message.key, message.payload) for message in reader.messages()]
+    assert stamps(found, IMU) == list(range(5))
+    assert stamps(found, keys.CLOCK) == [*range(5), 99]
+    first, second = link.published_on("process/recorder/join")
+    assert first.incarnation != second.incarnation
+
+
+def test_it_publishes_how_far_the_record_is_on_disk(tmp_path: Path):
+    path, link = tmp_path / "run.mcap", FakeLink()
+    on_disk: list[tuple[int, int]] = []
+
+    def look(key: str, payload: bytes) -> None:
+        if key == "process/recorder/done":
+            with RecordReader(path) as reader:
+                last = reader.last(keys.CLOCK)
+            on_disk.append((messages.decode(key, payload).done_ns, last.t_ns if last else 0))
+
+    link.on_publish = look
+    link.on_request = lambda key, args: page(gates(*range(60)))
+    link.deliver(keys.BATCH, encode_batch([*gates(*range(59, 130)), clock(131, "stopped")]))
+    assert record(link, INFO, path) == RUN_ENDED  # type: ignore[arg-type]
+    assert on_disk[0] == (59 * GATE_NS, 59 * GATE_NS)
+    assert all(done_ns == last_ns for done_ns, last_ns in on_disk)
+    (join,) = link.published_on("process/recorder/join")
+    assert join.period_ns == 0 < join.slack_ns
 
 
 @pytest.mark.parametrize("garbage", [b"\x91\x92\xa1\xff\xc4\x00", b"\x91" * 5000 + b"\xc0", b"\xc1"])

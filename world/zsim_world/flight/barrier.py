@@ -49,6 +49,10 @@ class Participant:
     def gating(self) -> bool:
         return self.join.period_ns > 0
 
+    @property
+    def is_waited_for(self) -> bool:
+        return self.gating or self.join.slack_ns > 0
+
     def is_process_of(self, join: Join) -> bool:
         """Tell whether another join comes from the same process."""
         return (self.join.host, self.join.pid) == (join.host, join.pid)
@@ -65,9 +69,12 @@ class Participant:
 
     def required_ns(self, need_ns: int) -> int | None:
         """Return the newest done required of it for `need_ns`, None if none is yet."""
-        if not self.gating:
+        if self.gating:
+            required = need_ns // self.join.period_ns * self.join.period_ns
+        elif self.join.slack_ns:
+            required = need_ns - self.join.slack_ns
+        else:
             return None
-        required = need_ns // self.join.period_ns * self.join.period_ns
         return required if required >= self.from_ns else None
 
     def blocks(self, need_ns: int) -> bool:
@@ -80,7 +87,7 @@ class Participant:
 
         More outputs than it counts belong to the next done.
         """
-        if self.done_seq is not None and message.seq > self.done_seq + 1:
+        if self.gating and self.done_seq is not None and message.seq > self.done_seq + 1:
             self.lost_done = True
         self.done_seq = message.seq if self.done_seq is None else max(message.seq, self.done_seq)
         balance = self.surplus - self.missing - message.sent
@@ -153,7 +160,7 @@ class Barrier:
         self.participants[name] = Participant(
             name=name,
             join=message,
-            from_ns=min((each.from_ns for each in predecessors if each.gating), default=next_gate_ns),
+            from_ns=min((each.from_ns for each in predecessors if each.is_waited_for), default=next_gate_ns),
             done_ns=min((each.done_ns for each in predecessors), default=-1),
             since_wall_ns=wall_ns,
             joined_wall_ns=wall_ns,

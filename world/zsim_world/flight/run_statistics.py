@@ -119,7 +119,7 @@ class RunStatistics:
     def deadlines(self, participants: Iterable[Participant], need_ns: int) -> None:
         """Count whose done for need_ns was due, and whose is missing."""
         for participant in participants:
-            if participant.required_ns(need_ns) is not None:
+            if participant.gating and participant.required_ns(need_ns) is not None:
                 self._deadline_count += 1
                 participant.deadline_misses += participant.blocks(need_ns)
 

@@ -71,6 +71,10 @@ class MessageHistory:
             self._last[key] = payload
         self._keep(_Entry(self._now_ns, t_ns, [(key, payload)], len(payload)))
 
+    def add_foreign(self, key: str, payload: bytes) -> None:
+        """Keep, for recorders, a message that is none of the contract or was refused; it is nobody's last value."""
+        self._keep(_Entry(self._now_ns, self._now_ns, [(key, payload)], len(payload)))
+
     def add_all(self, published: Pairs, t_ns: int) -> None:
         """Keep what the world itself publishes, all stamped t_ns, its newest gate."""
         self._now_ns = t_ns

@@ -206,9 +206,11 @@ class MessageIntake:
                 self._hand_over(key, sample.payload, wall_ns)
             elif kind is None:
                 self.outputs.passed(sample)  # a key outside of the contract
+                self.history.add_foreign(key, sample.payload)
             else:
                 raise DecodeError(f"{key}: only the world publishes here")
         except DecodeError as error:
+            self.history.add_foreign(key, sample.payload)
             self._refuse("somebody", key[:80], error)
             self._count_refused(sample)
 

@@ -4,19 +4,32 @@ import random
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
+from typing import IO
 
 import pytest
 import recorded_run
+import zstandard
 from mcap.opcode import Opcode
-from mcap.records import Chunk, MessageIndex
+from mcap.records import Chunk, Message, MessageIndex
 from mcap.stream_reader import StreamReader
-from refused import has_terms
+from refused import has_terms, refused
 from typer.testing import CliRunner
 
 from zsim.contract import messages
 from zsim.errors import RecordError, ZsimError
-from zsim.record import Recorded, RecordReader, repair
-from zsim.record.mcap_layout import CHUNK_HEAD, HEAD, MAGIC, RecordSpan, places
+from zsim.record import Recorded, RecordReader, RecordWriter, mcap_layout, repair
+from zsim.record.mcap_layout import (
+    CHUNK_HEAD,
+    CHUNK_MAX,
+    HEAD,
+    MAGIC,
+    SIZE,
+    ZSTD,
+    RecordSpan,
+    content_of,
+    opening,
+    places,
+)
 from zsim_analysis.export import Format
 from zsim_analysis.export.make_export import export
 from zsim_analysis.export.selection import MessageSelection
@@ -121,6 +134,63 @@ def test_a_cut_record_that_was_mended_is_the_same(run: Path, tmp_path: Path) -> 
         assert by_key(cut) == before
         with RecordReader(cut) as reader:
             assert reader.complete
+
+
+def test_whatever_is_cut_off_a_writer_goes_on_behind_the_rest(
+    run: Path, whole: dict[str, list[Recorded]], tmp_path: Path
+) -> None:
+    """A whole record, too: what is added comes behind, on keys that it has and on others."""
+    data, cut = run.read_bytes(), tmp_path / "cut.mcap"
+    added = [each._replace(wall_ns=7) for key in whole for each in whole[key][:2]]
+    added += [each._replace(key=f"{each.key}/again") for each in added]
+    for at in [*nasty(data), len(data)]:
+        cut.write_bytes(data[:at])
+        before = by_key(cut) if at else {}
+        with RecordWriter(cut, goes_on=True) as writer:
+            assert writer.messages == sum(map(len, before.values()))
+            for each in added:
+                writer.add(each.key, each.payload, messages.encoding(each.key), each.t_ns, each.wall_ns)
+        after = by_key(cut)
+        for key in {each.key for each in added}:
+            assert after[key] == [*before.get(key, []), *(each for each in added if each.key == key)], f"cut at {at}"
+        with RecordReader(cut) as reader:
+            assert reader.complete
+        with open(cut, "rb") as file:
+            numbers = by_channel(file)
+        assert all(seen == list(range(len(seen))) for seen in numbers.values()), f"cut at {at}"
+
+
+def by_channel(file: IO[bytes]) -> dict[int, list[int]]:
+    """Return the sequence numbers of the messages of each channel, as another reader finds them."""
+    numbers: dict[int, list[int]] = defaultdict(list)
+    for record in StreamReader(file).records:
+        if isinstance(record, Message):
+            numbers[record.channel_id].append(record.sequence)
+    return numbers
+
+
+@pytest.mark.parametrize("content", [b"something else", b"x"])
+def test_a_writer_does_not_go_on_with_another_file(tmp_path: Path, content: bytes) -> None:
+    other = tmp_path / "other.mcap"
+    other.write_bytes(content)
+    with refused(RecordError, "other.mcap", "MCAP"):
+        RecordWriter(other, goes_on=True)
+    assert other.read_bytes() == content
+
+
+@pytest.mark.parametrize("stated", [1000, CHUNK_MAX + 1])
+def test_a_chunk_that_would_grow_without_end_is_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stated: int
+) -> None:
+    """Its head states one size, its compressed frame has another; or both are beyond what anybody writes."""
+    path, data = tmp_path / "bomb.mcap", zstandard.compress(bytes(CHUNK_MAX + 1))
+    head = CHUNK_HEAD.pack(0, 1, stated, 0, len(ZSTD)) + ZSTD + SIZE.pack(len(data))
+    path.write_bytes(opening() + HEAD.pack(Opcode.CHUNK, len(head) + len(data)) + head + data)
+    monkeypatch.setattr(mcap_layout, "_decompressor", lambda: pytest.fail("it is decompressed"))
+    with RecordReader(path) as reader:
+        assert list(reader.messages()) == []
+        (place,) = chunks(path.read_bytes())
+        assert content_of(path.read_bytes(), place) is None
 
 
 def turned(data: bytes, rng: random.Random) -> bytes:
