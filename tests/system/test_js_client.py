@@ -145,6 +145,7 @@ def opened(browser: Any, served: str) -> Iterator[Callable[..., Watched]]:
         yield open_it
 
 
+@pytest.mark.soak  # a browser that is not given its time for seconds loses the drone that it flies
 @needs_browser
 def test_the_page_shows_a_drone_and_flies_it(federation: Federation, opened: Callable[..., Watched]) -> None:
     patient = ["--set", "silence.hover_s=2", "--set", "silence.land_s=2"]  # with a page on a busy machine

@@ -308,7 +308,7 @@ def test_systemd_restarts_what_on_death_says(hosts: InventoryFile) -> None:
     restarts = {path.split("zsim-")[1]: options_of(text)["Restart"] for path, text in texts.items() if "zsim-" in path}
     assert restarts == {
         "world.service": ["no"],
-        "recorder.service": ["no"],
+        "recorder.service": ["on-failure"],
         "estimator.drone1.service": ["no"],
         "estimator.drone2.service": ["no"],
         "estimator.drone3.service": ["on-failure"],
@@ -466,7 +466,7 @@ def test_roles_are_jobs_and_routers_deployments(hosts: InventoryFile, step: Scen
     jobs = {one["metadata"]["name"]: one["spec"] for one in found if one["kind"] == "Job"}
     assert {name: spec["backoffLimit"] for name, spec in jobs.items()} == {
         "world": 0,
-        "recorder": 0,
+        "recorder": 5,
         "estimator-drone1": 5,
         "estimator-drone2": 5,
         "estimator-drone3": 5,

@@ -316,7 +316,7 @@ def test_a_kill_by_its_kind_is_sent_without_a_duration(bench: Bench):
     assert bench.client.asked == [("world", "fault_add", {"kind": "process_kill", "target": "estimator.drone1"})]
 
 
-@pytest.mark.parametrize("text", ["value", "a: 2024-13-45", "[" * 2000, "probability: 1, probability: 0"])
+@pytest.mark.parametrize("text", ["value", "[" * 2000, "probability: 1, probability: 0"])
 def test_parameters_that_are_none_are_told_and_not_sent(bench: Bench, text: str):
     bench.faults()
     bench.gui.at["parameters"].value = text
