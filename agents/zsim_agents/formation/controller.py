@@ -4,7 +4,7 @@ Order of this file: the agent, `receive`, `step`, requests, warm start, pure par
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from operator import itemgetter
 from struct import Struct as Packing
@@ -16,22 +16,14 @@ from zsim.contract import flight_messages, keys, messages, run_messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.contract.snapshot import State
 from zsim.contract.views import cluster_view
-from zsim.errors import DocumentError, RunError
+from zsim.errors import RunError
 from zsim.runtime.agent import Agent, Output
-from zsim.scenario.scenario import Cluster, Gains, Scenario
-from zsim.schema import plugin
-from zsim_agents.formation.control_law import LAWS, ControlLaw, FormationGains, ProportionalLaw
-from zsim_agents.formation.engagement import Engagement
-from zsim_agents.formation.flight_check import all_near
+from zsim.scenario.scenario import Scenario
+from zsim_agents.formation.engagement_setup import engagement_of
 from zsim_agents.formation.flight_data import GateInput, GateOutput
-from zsim_agents.formation.flight_plan import RequestError, plan_of, read_request
-from zsim_agents.formation.robot_limits import guard, load
-from zsim_agents.formation.spaces.cluster_space import ClusterSpace, closest_pair, robot_rates
-from zsim_agents.formation.spaces.scenario_space import scenario_space
-from zsim_agents.formation.trajectory import Hold, ramp_onto
+from zsim_agents.formation.flight_plan import RequestError, read_request
 
 REQUESTS_MAX = 1000  # between two gates, as in a run that is paused; the next gate publishes them
-APART_M = 2.0  # of robots in a rehearsal, any distance well above zero
 
 variances_of = itemgetter(0, 7, 14)  # of the position, in the 6 x 6 covariance, row-major
 
@@ -237,63 +229,6 @@ _UNKNOWN = flight_messages.Estimate(
     (0.0, 0.0, 0.0),
     {},
 )
-
-
-def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
-    """Return the phase machine that one of a scenario's clusters asks for.
-
-    Raises:
-        RunError: the plan can never be flown, with the reason.
-    """
-    try:
-        space, gains, law = scenario_space(scenario, cluster), gains_of(cluster.gains), law_of(cluster)
-        rehearse(space, gains, law)
-        return Engagement(space, cluster.drones, gains, plan=plan_of(cluster), law=law)
-    except (ValueError, DocumentError) as error:
-        raise RunError(f"cluster {cluster.name!r}: {error}") from error
-
-
-def law_of(cluster: Cluster) -> Callable[[ClusterSpace, FormationGains], ControlLaw]:
-    """Return the class of the control law that a cluster names.
-
-    Raises:
-        DocumentError: a class of the user's own that cannot be loaded.
-    """
-    name = cluster.law or "proportional"
-    return LAWS.get(name) or plugin.load(name, "law", ControlLaw)
-
-
-def rehearse(
-    space: ClusterSpace,
-    gains: FormationGains,
-    law: Callable[[ClusterSpace, FormationGains], ControlLaw] = ProportionalLaw,
-) -> None:
-    """Fly a gate of a formation of its own: code is compiled, or loaded, here and not in flight."""
-    c = space.specimen(max(gains.separation_min_m, APART_M))
-    p_W, yaw = space.inverse(c)
-    c = space.forward(p_W, yaw)
-    none = np.zeros((space.n, 3))
-    rehearsal = Engagement(space, [str(i) for i in range(space.n)], gains, law=law)
-    rehearsal.warm_start("engaged", c)
-    rehearsal.step(GateInput(0.0, p_W, yaw, none, none, np.zeros(space.n), ("flying",) * space.n))
-    ramp_onto(space, c, c, Hold(c), 0.0, 2.0).value(1.0)
-    all_near(p_W, yaw)
-    closest_pair(p_W)
-    guard(p_W, none, none, gains.limits)
-    load(*robot_rates(space, c, c), gains.limits)
-
-
-def gains_of(gains: Gains) -> FormationGains:
-    """Return the control law's gains in SI units."""
-    return FormationGains(
-        k_1_s=gains.proportional_1_s,
-        integral_1_s2=gains.integral_1_s2,
-        speed_max_m_s=gains.horizontal_speed_m_s,
-        climb_max_m_s=gains.vertical_speed_m_s,
-        yaw_rate_max_rad_s=math.radians(gains.yaw_rate_deg_s),
-        separation_min_m=gains.separation_min_m,
-        separation_alarm_m=gains.separation_alarm_m,
-    )
 
 
 def in_heading(v_W: Sequence[float], yaw: float) -> tuple[float, float, float]:

@@ -11,7 +11,7 @@ from zsim.errors import RunError, ScenarioError
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim_agents.formation.control_law import ControlLaw, ProportionalLaw
-from zsim_agents.formation.controller import engagement_of
+from zsim_agents.formation.engagement_setup import engagement_of
 from zsim_agents.formation.spaces.cluster_space import Array, ClusterSpace
 from zsim_agents.formation.spaces.scenario_space import cluster_space
 from zsim_agents.formation.spaces.triad_cluster import TriadCluster

@@ -241,7 +241,7 @@ FLIGHT = """
 import sys
 import numpy as np
 from zsim_agents.formation.spaces.scenario_space import cluster_space
-from zsim_agents.formation.controller import rehearse
+from zsim_agents.formation.engagement_setup import rehearse
 from zsim_agents.formation.engagement import Engagement
 from zsim_agents.formation.flight_data import GateInput
 from zsim_agents.formation.flight_plan import MoveTo

@@ -8,7 +8,7 @@ from refused import refused
 
 from zsim.errors import RunError
 from zsim.scenario import scenario_file
-from zsim_agents.formation.controller import engagement_of
+from zsim_agents.formation.engagement_setup import engagement_of
 from zsim_agents.formation.spaces.cluster_space import ClusterSpace
 from zsim_agents.formation.spaces.nested_cluster import NestedCluster
 from zsim_agents.formation.spaces.pair_cluster import PairCluster

@@ -1,0 +1,78 @@
+"""The engagement that a scenario's cluster asks for: its space, gains, law and plan, rehearsed before the flight."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from zsim.errors import DocumentError, RunError
+from zsim.scenario.scenario import Cluster, Gains, Scenario
+from zsim.schema import plugin
+from zsim_agents.formation.control_law import LAWS, ControlLaw, FormationGains, ProportionalLaw
+from zsim_agents.formation.engagement import Engagement
+from zsim_agents.formation.flight_check import all_near
+from zsim_agents.formation.flight_data import GateInput
+from zsim_agents.formation.flight_plan import plan_of
+from zsim_agents.formation.robot_limits import guard, load
+from zsim_agents.formation.spaces.cluster_space import ClusterSpace, closest_pair, robot_rates
+from zsim_agents.formation.spaces.scenario_space import scenario_space
+from zsim_agents.formation.trajectory import Hold, ramp_onto
+
+APART_M = 2.0  # of robots in a rehearsal, any distance well above zero
+
+
+def engagement_of(scenario: Scenario, cluster: Cluster) -> Engagement:
+    """Return the phase machine that one of a scenario's clusters asks for.
+
+    Raises:
+        RunError: the plan can never be flown, with the reason.
+    """
+    try:
+        space, gains, law = scenario_space(scenario, cluster), gains_of(cluster.gains), law_of(cluster)
+        rehearse(space, gains, law)
+        return Engagement(space, cluster.drones, gains, plan=plan_of(cluster), law=law)
+    except (ValueError, DocumentError) as error:
+        raise RunError(f"cluster {cluster.name!r}: {error}") from error
+
+
+def law_of(cluster: Cluster) -> Callable[[ClusterSpace, FormationGains], ControlLaw]:
+    """Return the class of the control law that a cluster names.
+
+    Raises:
+        DocumentError: a class of the user's own that cannot be loaded.
+    """
+    name = cluster.law or "proportional"
+    return LAWS.get(name) or plugin.load(name, "law", ControlLaw)
+
+
+def rehearse(
+    space: ClusterSpace,
+    gains: FormationGains,
+    law: Callable[[ClusterSpace, FormationGains], ControlLaw] = ProportionalLaw,
+) -> None:
+    """Fly a gate of a formation of its own: code is compiled, or loaded, here and not in flight."""
+    c = space.specimen(max(gains.separation_min_m, APART_M))
+    p_W, yaw = space.inverse(c)
+    c = space.forward(p_W, yaw)
+    none = np.zeros((space.n, 3))
+    rehearsal = Engagement(space, [str(i) for i in range(space.n)], gains, law=law)
+    rehearsal.warm_start("engaged", c)
+    rehearsal.step(GateInput(0.0, p_W, yaw, none, none, np.zeros(space.n), ("flying",) * space.n))
+    ramp_onto(space, c, c, Hold(c), 0.0, 2.0).value(1.0)
+    all_near(p_W, yaw)
+    closest_pair(p_W)
+    guard(p_W, none, none, gains.limits)
+    load(*robot_rates(space, c, c), gains.limits)
+
+
+def gains_of(gains: Gains) -> FormationGains:
+    """Return the control law's gains in SI units."""
+    return FormationGains(
+        k_1_s=gains.proportional_1_s,
+        integral_1_s2=gains.integral_1_s2,
+        speed_max_m_s=gains.horizontal_speed_m_s,
+        climb_max_m_s=gains.vertical_speed_m_s,
+        yaw_rate_max_rad_s=math.radians(gains.yaw_rate_deg_s),
+        separation_min_m=gains.separation_min_m,
+        separation_alarm_m=gains.separation_alarm_m,
+    )
