@@ -3,6 +3,7 @@
 import re
 import signal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,8 +48,14 @@ class Flight:
         assert self.client.request("world/control", "stop")["ok"]
         self.run.ends(with_code=0)
 
-    def stands_for(self, name: str) -> Received:
-        return self.clock.until(lambda m: name in [w["name"] for w in m["waiting_for"]])
+    def stands_for(self, name: str, longer_than_s: float = -1) -> Received:
+        return self.clock.until(
+            lambda m: any(w["name"] == name and w["since_wall_s"] > longer_than_s for w in m["waiting_for"])
+        )
+
+
+def waiting_for(clock: Received, name: str) -> dict[str, Any]:
+    return next(entry for entry in clock.message["waiting_for"] if entry["name"] == name)
 
 
 def check_end(federation: Federation, whole: bool) -> Record:
@@ -92,12 +99,10 @@ def test_wait(federation: Federation, name: str) -> None:
     flight = Flight(federation, "--set", f"processes.on_death={{{name}: wait}}")
     federation.kill(name)
     flight.event("death", name)
-    standing = flight.stands_for(name)
-    entry = next(w for w in standing.message["waiting_for"] if w["name"] == name)
-    assert entry["host"]
-    later = flight.stands_for(name)
+    standing = flight.stands_for(name, longer_than_s=1)  # since the death: no gate of before took as long
+    later = flight.stands_for(name, longer_than_s=waiting_for(standing, name)["since_wall_s"])
+    assert waiting_for(later, name)["host"]
     assert later.message["t_ns"] == standing.message["t_ns"]
-    assert next(w for w in later.message["waiting_for"] if w["name"] == name)["since_wall_s"] > entry["since_wall_s"]
     role, thing = name.split(".")
     again = federation.role(role, thing)
     flight.finish()
