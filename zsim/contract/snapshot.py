@@ -44,7 +44,9 @@ def unpack(payload: bytes) -> State:
         raise DecodeError(f"state: {error}; must be as this version of zsim packs it") from error
 
 
-def _packed(value: Any) -> Ext:
+def _packed(value: Any) -> Any:
+    if isinstance(value, np.bool_ | np.integer | np.float64):
+        return value.item()
     if isinstance(value, np.ndarray) and value.dtype.str in TYPES:
         return Ext(ARRAY, _ENCODER.encode(_Array(value.dtype.str, value.shape, value.tobytes())))
     raise TypeError(f"a state holds {type(value).__name__}; must be numbers, texts, bytes, lists, maps or arrays")

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from io import FileIO
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -18,6 +19,11 @@ from zsim.errors import RecordError
 from zsim.record.mcap_layout import chunk, groups, opening, packed, unpacked
 from zsim.record.open_chunk import OpenChunk
 from zsim.record.record_end import cut_off, finish, finish_bare, write_all
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 CHUNK_BYTES = 1024 * 1024  # not yet on disk at most, besides the last message
 CHUNK_AGE_NS = 250_000_000  # wall time; with a tick every 0.1 s nothing waits longer than 0.5 s
@@ -249,12 +255,21 @@ class RecordWriter:
 
 
 def _opened(path: Path, mode: str) -> FileIO:
+    """Open a record for this process alone; the lock goes with the process, whatever ends it."""
     try:
-        return FileIO(path, mode)
+        file = FileIO(path, mode)
     except FileExistsError as error:
         raise RecordError(f"{path}: exists; a record is never overwritten, name another place") from error
     except OSError as error:
         raise RecordError(f"{path}: cannot be written ({error.strerror})") from error
+    if fcntl is not None:
+        with suppress(OSError):  # of a file system without locks
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                file.close()
+                raise RecordError(f"{path}: another process writes it; end that one, or name another place") from error
+    return file
 
 
 def _message_encoding(media: str) -> str:

@@ -151,11 +151,7 @@ class Agent(ABC):
         return None
 
     def restore(self, state: State) -> None:  # noqa: B027 - an agent without a snapshot is never asked to
-        """Take over the state that another incarnation returned by `snapshot`.
-
-        Raises:
-            KeyError, TypeError, ValueError: the state is of another version of this agent.
-        """
+        """Take over the state that another incarnation returned by `snapshot`; whatever is raised, it begins anew."""
 
     def repeat(self, key: str, message: Any) -> None:  # noqa: B027 - most agents answer no requests
         """Do again, before the gate of the message, what a former incarnation published on a key of `repeats`."""
@@ -168,11 +164,7 @@ class Agent(ABC):
         return {"own": own, "seq": dict(self._seq), "links": self._links.snapshot() if self._links else None}
 
     def resume(self, info: Info, checkpoint: State) -> None:
-        """Take over a checkpoint.
-
-        Raises:
-            KeyError, TypeError, ValueError: it is of another version of this agent.
-        """
+        """Take over a checkpoint; it raises anything for one of another version of this agent."""
         self.restore(checkpoint["own"])
         self._seq = defaultdict(int, checkpoint["seq"])
         if checkpoint["links"] is not None:

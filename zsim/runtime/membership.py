@@ -75,6 +75,7 @@ class Membership:
         self._retry_s = 0.0
         self.done_ns = self.published_ns = -1
         self.awaited = False
+        self._packs = True
         self.failure: RunError | None = None
 
     # Taking part
@@ -85,19 +86,26 @@ class Membership:
         The world's history must reach back to it: what came since is fetched and stepped through again.
         """
         for sample in self._link.get(keys.process(self._agent.name, "snapshot")):
+            fresh = self._agent.checkpoint()
             try:
                 snapshot: run_messages.Snapshot = messages.decode(sample.key, sample.payload)
-                age_ns = self._world_ns() - snapshot.t_ns
-                if age_ns > RESUME_NS or snapshot.version != VERSION:
-                    raise DecodeError(f"of version {snapshot.version}, {age_ns / 1e9:.2f} s old")
-                self._agent.resume(self._info, unpack(snapshot.state))
-            except (DecodeError, LookupError, TypeError, ValueError) as error:
-                self._say(f"{self._agent.name}: its former snapshot is of no use: {error}")
+                self._restore(snapshot)
+            except Exception as error:  # anybody may have written it, and a class of the user's own reads it
+                self._say(f"{self._agent.name}: its former snapshot is of no use: {error or type(error).__name__}")
+                if fresh is not None:
+                    self._agent.resume(self._info, fresh)  # not half of the former state
                 continue
             self._say(f"{self._agent.name}: goes on from its snapshot of t = {snapshot.t_ns / 1e9:.2f} s")
             self.done_ns, self.awaited = snapshot.t_ns, True
             return self.done_ns
         return None
+
+    def _restore(self, snapshot: run_messages.Snapshot) -> None:
+        age_ns = self._world_ns() - snapshot.t_ns
+        if not 0 <= age_ns <= RESUME_NS or snapshot.version != VERSION:
+            allowed = f"must be of version {VERSION}, and 0 to {RESUME_NS / 1e9:g} s old"
+            raise DecodeError(f"it is of version {snapshot.version}, and {age_ns / 1e9:.2f} s old; {allowed}")
+        self._agent.resume(self._info, unpack(snapshot.state))
 
     def _world_ns(self) -> int:
         """Return the world's newest gate."""
@@ -144,12 +152,18 @@ class Membership:
         self._unsent += encoded
 
     def publish_snapshot(self, t_ns: int) -> None:
-        """Encode the whole state of the agent after a gate, for `send`; nothing where it offers none."""
-        state = self._agent.checkpoint()
-        if state is not None:
-            seq, name = self._agent.next_seq("snapshot"), self._agent.name
-            snapshot = run_messages.Snapshot(t_ns, seq, name, VERSION, pack(state))
-            self._unsent.append((keys.process(name, "snapshot"), messages.encode(snapshot)))
+        """Encode the whole state of the agent after a gate, for `send`, if it offers one of plain values."""
+        state, name = self._agent.checkpoint(), self._agent.name
+        if state is None or not self._packs:
+            return
+        try:
+            packed = pack(state)
+        except TypeError as error:
+            self._packs = False
+            self._say(f"{name}: {error}; no snapshots are published, and a death costs what it has come to know")
+            return
+        snapshot = run_messages.Snapshot(t_ns, self._agent.next_seq("snapshot"), name, VERSION, packed)
+        self._unsent.append((keys.process(name, "snapshot"), messages.encode(snapshot)))
 
     def send(self) -> None:
         """Put what was published since the last time, in one go: many messages at once cost fewer wake-ups."""

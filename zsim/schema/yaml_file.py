@@ -122,7 +122,7 @@ class _Dumper(yaml.SafeDumper):
 
 
 _TAG = "tag:yaml.org,2002:"
-_FLOAT = r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf)$|^\.(nan|NaN)$"
+_FLOAT = r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?$|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"
 _WORDS = (  # the first that fits counts
     ("null", r"^(~|null|Null|NULL|)$", [*"~nN", ""]),
     ("bool", r"^(true|True|TRUE|false|False|FALSE)$", [*"tTfF"]),

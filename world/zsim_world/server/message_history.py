@@ -21,6 +21,7 @@ from zsim.transport.session import ReceivedSample
 
 KEEP_NS = 5_000_000_000  # simulated time that a replay reaches back
 KEEP_BYTES = 500_000_000  # payloads kept at most: those of 1000 drones are about 300 MB in KEEP_NS
+FOREIGN_BYTES = 50_000_000  # of these, of messages that are none of the contract
 LAST_MAX = 200_000  # keys of which the last value is kept: 1000 drones have about 12 000
 PAGE_BYTES = 8_000_000  # payloads of one answer; who lacks more requests the next page
 EXPRESSIONS_MAX = 1000  # of one replay; a controller of hundreds of drones reads two keys of each
@@ -35,12 +36,16 @@ class _ReplayArgs(msgspec.Struct):
 
 
 class _Entry(NamedTuple):
-    """Messages that passed together: the world's clock then, their stamp, keys and payloads, bytes of the latter."""
+    """Messages that passed together: the world's clock then, their stamp, keys and payloads, bytes of the latter.
+
+    `foreign` are those of strangers.
+    """
 
     now_ns: int
     t_ns: int
     messages: Pairs
     size: int
+    foreign: bool = False
 
 
 class MessageHistory:
@@ -55,7 +60,7 @@ class MessageHistory:
         self._last: dict[str, bytes] = {}
         self._recent: deque[_Entry] = deque()
         self._now_ns = 0
-        self._bytes = 0
+        self._bytes = self._foreign_bytes = 0
         self._keep_bytes = keep_bytes
         self._page_bytes = page_bytes
         self._forgotten = 0
@@ -72,8 +77,13 @@ class MessageHistory:
         self._keep(_Entry(self._now_ns, t_ns, [(key, payload)], len(payload)))
 
     def add_foreign(self, key: str, payload: bytes) -> None:
-        """Keep, for recorders, a message that is none of the contract or was refused; it is nobody's last value."""
-        self._keep(_Entry(self._now_ns, self._now_ns, [(key, payload)], len(payload)))
+        """Keep, for recorders, a message that is none of the contract or was refused; it is nobody's last value.
+
+        What is beyond FOREIGN_BYTES is not kept: strangers push nothing out that a participant may lack.
+        """
+        if self._foreign_bytes + len(payload) <= FOREIGN_BYTES:
+            self._foreign_bytes += len(payload)
+            self._keep(_Entry(self._now_ns, self._now_ns, [(key, payload)], len(payload), foreign=True))
 
     def add_all(self, published: Pairs, t_ns: int) -> None:
         """Keep what the world itself publishes, all stamped t_ns, its newest gate."""
@@ -87,6 +97,7 @@ class MessageHistory:
         while self._bytes > self._keep_bytes or self._recent[0].now_ns < self._now_ns - KEEP_NS:
             oldest = self._recent.popleft()
             self._bytes -= oldest.size
+            self._foreign_bytes -= oldest.size * oldest.foreign
             self._forgotten += len(oldest.messages)
 
     def last(self, expression: str) -> list[tuple[str, bytes]]:

@@ -120,6 +120,31 @@ def test_a_participant_that_does_not_gate_is_never_waited_for():
     assert not made.is_gating("recorder")
 
 
+def recorder_join(incarnation: int = 1, slack: int = 10) -> Join:
+    return msgspec.structs.replace(join(incarnation, period_ns=0), slack_ns=slack * GATE_NS)
+
+
+def test_one_with_slack_is_waited_for_when_it_is_further_behind():
+    made = Barrier(RUN, GATE_NS, ["recorder"])
+    assert made.join("recorder", recorder_join(), 0, 0) is None
+    assert not made.is_gating("recorder")
+    made.done("recorder", done(5), 15 * GATE_NS, 0)
+    assert blocked(made, 15) == []
+    assert blocked(made, 16) == ["recorder"]
+    made.done("recorder", done(9, seq=7), 16 * GATE_NS, 0)  # it sends one now and then, so a gap is no loss
+    assert blocked(made, 16) == made.incomplete() == []
+
+
+def test_one_with_slack_that_is_started_again_is_waited_for_from_where_the_former_was():
+    made = Barrier(RUN, GATE_NS, ["recorder"])
+    made.join("recorder", recorder_join(), 0, 0)
+    made.done("recorder", done(5), 8 * GATE_NS, 0)
+    made.mark_dead("recorder", WALL_NS)
+    assert made.join("recorder", recorder_join(incarnation=2), 15 * GATE_NS, WALL_NS) is None
+    assert blocked(made, 15) == []
+    assert blocked(made, 16) == ["recorder"]
+
+
 @pytest.mark.parametrize(("period", "need", "owed"), [(5, 4, 0), (5, 5, 5), (5, 9, 5), (2, 7, 6), (1, 7, 7)])
 def test_a_longer_period_owes_only_its_own_instants(period: int, need: int, owed: int):
     made = barrier("a", period_ns=period * GATE_NS)

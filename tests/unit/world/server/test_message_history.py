@@ -7,6 +7,7 @@ from zsim.contract import keys, messages
 from zsim.contract.flight_messages import Velocity
 from zsim.contract.run_messages import Done
 from zsim.transport.session import ReceivedSample
+from zsim_world.server import message_history
 from zsim_world.server.message_history import KEEP_NS, MessageHistory
 
 SECOND_NS = 1_000_000_000
@@ -100,6 +101,18 @@ def test_memory_is_bounded_while_time_stands_still():
     for number in range(100):
         history.add(IMU, b"%0100d" % number, 0)
     assert [int(payload) for _, payload in since(history, -1, [IMU])] == list(range(90, 100))
+
+
+def test_strangers_push_nothing_out_and_have_room_again_when_theirs_is_forgotten(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(message_history, "FOREIGN_BYTES", 250)
+    history = MessageHistory(keep_bytes=1000)
+    history.add(IMU, b"first", 0)
+    for number in range(100):
+        history.add_foreign("lab/camera", b"%0100d" % number)
+    assert [key for key, _ in since(history, -1, ["**"])] == [IMU, "lab/camera", "lab/camera"]
+    clock(history, 2 * KEEP_NS)
+    history.add_foreign("lab/camera", b"new")
+    assert since(history, -1, ["lab/**"]) == [("lab/camera", b"new")]
 
 
 def test_pages_bring_everything_once_and_in_order():

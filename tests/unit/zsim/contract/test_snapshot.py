@@ -26,6 +26,13 @@ def test_not_a_number_comes_back():
 
 
 @pytest.mark.parametrize(
+    ("value", "plain"), [(np.float64(0.1), 0.1), (np.int64(-3), -3), (np.uint8(7), 7), (np.bool_(True), True)]
+)
+def test_numbers_of_numpy_come_back_as_plain_ones(value: Any, plain: Any):
+    assert repr(unpack(pack({"value": value}))["value"]) == repr(plain)
+
+
+@pytest.mark.parametrize(
     "array",
     [np.array([[1.0, -0.0], [np.nan, np.inf]]), np.arange(6).reshape(1, 2, 3), np.array([True, False]), np.empty(0)],
 )

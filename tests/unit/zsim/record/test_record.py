@@ -313,6 +313,21 @@ def test_a_record_is_never_overwritten(tmp_path):
         RecordWriter(tmp_path / "nowhere" / "run.mcap")
 
 
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_what_another_process_writes_is_not_touched(tmp_path: Path, goes_on: bool):
+    path = tmp_path / "run.mcap"
+    with RecordWriter(path) as writer:
+        writer.add("clock", b"\x80", "", 0, 0)
+        writer.flush()
+        before = path.read_bytes()
+        with refused(RecordError, "run.mcap"):
+            RecordWriter(path, goes_on=goes_on)
+        assert path.read_bytes() == before
+    with RecordWriter(path, goes_on=True) as writer:
+        writer.add("clock", b"\x81", "", 1, 1)
+    assert [message.t_ns for message in read(path)] == [0, 1]
+
+
 def test_messages_reach_the_disk_within_half_a_second(tmp_path):
     path, tick_ns = tmp_path / "run.mcap", 100_000_000
     with RecordWriter(path) as writer:

@@ -433,6 +433,8 @@ class Counter(Judge):
 
     def restore(self, state: State) -> None:
         self.count = state["count"]
+        if state.get("raises"):
+            raise ZeroDivisionError
 
     def warm_start_keys(self) -> tuple[str, ...]:
         return (keys.estimate("d2"),)
@@ -499,10 +501,12 @@ def test_it_steps_again_what_came_since_its_snapshot_and_publishes_what_the_form
     [
         snapshot_of(1, version=VERSION + 1),
         snapshot_of(1, own={"counts": 2}),
+        snapshot_of(1, own={"count": 7, "raises": True}),
+        snapshot_of(Restarting.DIED + 1),
         Snapshot(GATE_NS, 0, ME, VERSION, b"\xc1"),
         replace(snapshot_of(1), t_ns=-2 * membership.RESUME_NS),
     ],
-    ids=["other version", "other state", "garbage", "old"],
+    ids=["other version", "other state", "half of it", "of the future", "garbage", "old"],
 )
 def test_without_a_snapshot_of_use_it_starts_from_its_last_output(useless: Snapshot):
     world, judge = Restarting(useless), Counter()
@@ -527,3 +531,19 @@ def test_it_publishes_a_snapshot_after_a_gate_at_intervals():
     assert [unpack(each.state)["own"]["count"] for each in taken] == [1, 4, 7]
     keys_of = [key for key, _ in world.published]
     assert keys_of.index(keys.process(ME, "snapshot")) > keys_of.index(keys.process(ME, "done"))
+
+
+class Opaque(Counter):
+    """A counter of which the state is none of plain values."""
+
+    def snapshot(self) -> State:
+        return {"count": object()}
+
+
+def test_one_whose_state_cannot_be_packed_says_so_once_and_goes_on():
+    world = World(estimates(range(END + 1)))
+    said: list[str] = []
+    Runner(world, info(), Opaque(), say=said.append, snapshot_ns=GATE_NS).run()  # type: ignore[arg-type]
+    assert world.published_on(keys.process(ME, "snapshot")) == []
+    assert world.gates_done()[-1] == END
+    assert len([line for line in said if has_terms(line, ME, "object", "snapshots")]) == 1

@@ -38,6 +38,7 @@ def test_what_was_written_is_read_again(document: object) -> None:
         ("1e-3", 0.001),
         (".5", 0.5),
         ("-.inf", -math.inf),
+        (".INF", math.inf),
         ("012", 12),
         ("-7", -7),
         ("0x1f", 31),
