@@ -16,6 +16,15 @@ ZsimError
 └── ReportError        a report that cannot be made or written
 """
 
+import re
+
+CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")  # C0, C1, bidirectional
+
+
+def printable(text: str) -> str:
+    """Return a text for a terminal: what comes over the network may hold codes that a terminal acts on."""
+    return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
+
 
 class ZsimError(Exception):
     """Base of everything that a user can cause; the command line prints it without a traceback."""

@@ -225,6 +225,22 @@ def test_interrupt(federation: Federation, number: signal.Signals) -> None:
     assert REASONS[number] in record.end()["reason"]
 
 
+@pytest.mark.parametrize("options", [("--in-process",), ()], ids=["one process", "processes"])
+def test_a_terminal_that_is_closed(federation: Federation, options: tuple[str, ...]) -> None:
+    where = options or ("--listen", federation.endpoint)
+    command = ["run", federation.write(PAIR), "--out", str(federation.out), "--duration", "100000", *where]
+    run = federation.start(*command, prefix=("env", "--default-signal=HUP"))  # the tests may run under nohup
+    run.line("10.* real time")
+    run.signal(signal.SIGHUP)
+    run.signal(signal.SIGHUP)  # shells send it more than once
+    run.ends(with_code=130)
+    federation.nobody_left()
+    record = federation.record()
+    assert record.complete
+    assert "closed" in record.end()["reason"]
+    assert re.search("ended: .*closed", (federation.out / "run.log").read_text())
+
+
 def test_interrupt_while_time_stands(federation: Federation) -> None:
     flight = Flight(federation)
     federation.kill("estimator.drone2", signal.SIGSTOP)

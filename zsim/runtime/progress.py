@@ -9,13 +9,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
 from zsim.contract.flight_messages import ClusterState
+from zsim.errors import printable
 
 PERIOD_S = 0.2  # wall time between two updates
 SLOW_S = 3.0  # wall time; what is compiled is loaded within two, unless the machine is busy
@@ -120,23 +121,30 @@ class Screen:
         self._next_plain_s = 0.0
         self._last_plain = ""
 
-    def __enter__(self) -> "Screen":
+    def __enter__(self) -> Self:
         if self._is_live:
             self._live.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._is_live:
-            self._live.stop()
+        self._live.stop()
 
     def say(self, text: str) -> None:
         """Show a line that stays."""
-        self.console.print(text, highlight=False, markup=False, soft_wrap=True)
+        if self.console.quiet:
+            self._live.stop()
+            self.console.quiet = False
+        self.console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
+
+    def hang_up(self) -> None:
+        """Show lines only from now on, the terminal being gone; callable from a signal handler, which draws nothing."""
+        self._is_live = False
+        self.console.quiet = True
 
     def clock(self, line: dict[str, Any]) -> None:
         text = describe(line, self._duration_s)
         if self._is_live:
-            self._live.update(Text(text))
+            self._live.update(Text(printable(text)))
             return
         waiting = bool(line["waiting_for"])
         if (line["t_s"] >= self._next_plain_s or waiting) and text != self._last_plain:

@@ -11,7 +11,7 @@ import typer
 from typer.main import get_command
 
 from zsim import __version__
-from zsim.errors import BehindError, SupersededError, ZsimError
+from zsim.errors import BehindError, SupersededError, ZsimError, printable
 from zsim_deploy import INTERRUPTED
 from zsim_deploy.arguments import (
     HOSTS,
@@ -149,7 +149,7 @@ def main() -> None:
     try:
         code = command()(standalone_mode=False, prog_name="zsim")
     except ZsimError as error:
-        print(error, file=sys.stderr)
+        print(printable(str(error)), file=sys.stderr)
         sys.exit(EXIT_CODES.get(type(error), USER_FAULT))
     except UsageError as error:
         _show_usage(error)

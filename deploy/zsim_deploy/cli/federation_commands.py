@@ -6,12 +6,12 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from zsim.errors import printable
 from zsim_deploy import INTERRUPTED
 from zsim_deploy.arguments import WorldAccess, observer_options, positive
 
@@ -42,7 +42,7 @@ def keys(reach: WorldAccess) -> None:
 
     with connected(reach) as (link, _):
         for key, kind, count in inspection.list_keys(link):
-            print(f"{key:<36} {kind:<14} {count:>6}")
+            print(f"{printable(key):<36} {kind:<14} {count:>6}")
 
 
 @app.command(rich_help_panel=PANEL)
@@ -75,7 +75,7 @@ def hz(
     from zsim_deploy.cli import inspection
 
     with connected(reach) as (link, _):
-        inspection.hz(link, key, window, seconds or math.inf, lambda line: print(line, flush=True))
+        inspection.hz(link, key, window, seconds or math.inf, lambda line: print(printable(line), flush=True))
 
 
 @app.command(rich_help_panel=PANEL)
@@ -116,7 +116,9 @@ def connected(reach: WorldAccess) -> Iterator[tuple["Session", "Info"]]:
     """Yield a session to the federation's hub, and the `world/info` of its run."""
     from zsim.transport.connection import find_world
 
-    say = partial(print, file=sys.stderr)
+    def say(text: str) -> None:
+        print(printable(text), file=sys.stderr)
+
     with find_world(reach.endpoint, reach.federation, reach.wait_s, say, reader=True, identity=reach.who) as (
         link,
         info,
@@ -199,7 +201,7 @@ def list_(reach: WorldAccess) -> None:
         answers = [messages.decode(keys.FAULTS, sample.payload) for sample in link.get(keys.FAULTS)]
     rows = [row(fault, now_ns) for message in answers for fault in message.faults if not _is_over(fault, now_ns)]
     for cells in rows:
-        print("  ".join(cells))
+        print(printable("  ".join(cells)))
     if not rows:
         print("no fault is planned or acts", file=sys.stderr)
 

@@ -92,7 +92,7 @@ def logs(
     federation: Federation = "zsim",
 ) -> None:
     """Print the log of a process of the run that is up; progress and events are shown by `zsim up` itself."""
-    from zsim.errors import RunError
+    from zsim.errors import RunError, printable
     from zsim_deploy.hosts import control_socket
 
     where = control_socket.ask(federation, "where")
@@ -102,7 +102,7 @@ def logs(
     if not path.exists():
         print(_silent(role), file=sys.stderr)
     for text in _written(path, follow, lambda: _is_up(federation, where["out"])):
-        sys.stdout.write(text)
+        sys.stdout.write(printable(text))
         sys.stdout.flush()
 
 

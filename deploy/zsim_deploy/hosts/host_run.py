@@ -1,9 +1,6 @@
 """A run on several hosts: checked, prepared, started over ssh, watched, ended, and its record brought home."""
 
 import contextlib
-import os
-import signal
-import stat
 import time
 import uuid
 from collections.abc import Callable
@@ -29,10 +26,9 @@ from zsim_deploy.hosts.ssh_connection import shell_word
 from zsim_deploy.hosts.status_table import StatusTable
 from zsim_deploy.inventory.enrolment import exposed_keys
 from zsim_deploy.inventory.inventory import InventoryFile
+from zsim_deploy.launch.end_signals import CLOSED, EndSignals
 from zsim_deploy.launch.supervisor import Outcome, Supervisor
 
-STREAMS = 1, 2  # standard output and error
-CLOSED = "the terminal was closed"
 CONNECT_S = 30.0  # how long all hosts together may take to let us in, …
 CHECK_S = 60.0  # … to be checked: a small computer takes 5 s to import numpy, a poor link adds a dozen round trips, …
 PREPARE_S = 30.0  # … and to take their files
@@ -215,56 +211,3 @@ class HostRun:
         if self._record_stays and link.name == self._plan.host(RECORDER):
             command = f"rm -rf {keys}; [ -e {shell_word(self._plan.record())} ] || {command}"
         await link.run(command, timeout_s=CLEAN_S, what=f"removing {self._plan.folder(link.name)}")
-
-
-class EndSignals:
-    """Takes SIGTERM and SIGHUP for as long as it is entered; SIGHUP stays ignored under nohup.
-
-    Nothing is raised for a closed terminal, as shells send that signal more than once: `hung_up` is called, and output
-    goes to a file from then on.
-
-    Args:
-        log: that file; it is made when there is something to write.
-        hung_up: called in a signal handler when the terminal is closed.
-    """
-
-    def __init__(self, log: Path, hung_up: Callable[[], None]) -> None:
-        self._log = log
-        self._hung_up = hung_up
-
-    def __enter__(self) -> "EndSignals":
-        wanted = {signal.SIGTERM: signal.default_int_handler, signal.SIGHUP: self._on_hangup}
-        self._former = {number: signal.getsignal(number) for number in wanted}
-        for number, handler in wanted.items():
-            if self._former[number] is not signal.SIG_IGN:
-                signal.signal(number, handler)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._former.items():
-            signal.signal(number, handler)
-
-    def _on_hangup(self, *_: object) -> None:
-        redirect_output(self._log)
-        self._hung_up()
-
-
-def redirect_output(log: Path) -> None:
-    """Send to a file what is written from now on to a terminal or a pipe, which may take nothing any more."""
-    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
-    try:
-        into = os.open(log, flags, 0o644)
-    except OSError:
-        into = os.open(os.devnull, os.O_WRONLY)
-    for stream in STREAMS:
-        with contextlib.suppress(OSError):
-            if not stat.S_ISREG(os.fstat(stream).st_mode):
-                _announce(stream, log)
-                os.dup2(into, stream)
-    os.close(into)
-
-
-def _announce(stream: int, log: Path) -> None:
-    if stream == STREAMS[-1]:
-        with contextlib.suppress(OSError):
-            os.write(stream, f"{CLOSED}; what there is still to say is in {log}\n".encode())

@@ -9,6 +9,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from zsim.errors import printable
 from zsim.runtime.progress import Screen, describe
 from zsim_deploy.hosts.host_link import HostLink
 from zsim_deploy.hosts.remote_process import RemoteProcess
@@ -21,7 +22,7 @@ STALE_S = 3.0  # health comes once a second; older figures are not shown
 COLUMNS = ("role", "host", "pid", "state", "lag", "messages/s", "round trip", "restarts")
 
 
-class StatusTable:
+class StatusTable(Screen):
     """Progress of a run on several hosts; a table on a terminal, lines elsewhere.
 
     Attributes:
@@ -31,40 +32,16 @@ class StatusTable:
     """
 
     def __init__(self, duration_s: float, console: Console | None = None) -> None:
-        self.console = console or Console(stderr=True)
+        super().__init__(duration_s, console)
         self.members: Sequence[Any] = ()
         self.links: dict[str, HostLink] = {}
         self.stages_s: dict[str, float] = {}
-        self._duration_s = duration_s
         self._begun_s = time.monotonic()
         self._flies = False
-        self._plain = Screen(duration_s, self.console)
-        self._is_live = self.console.is_terminal
         self._health: dict[str, dict[str, Any]] = {}
         self._clock: dict[str, Any] | None = None
         self._silent: set[str] = set()
         self._live = Live(get_renderable=self._render, console=self.console, refresh_per_second=4, transient=True)
-
-    def __enter__(self) -> "StatusTable":
-        if self._is_live:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._is_live:
-            self._live.stop()
-
-    def say(self, text: str) -> None:
-        """Show a line that stays."""
-        if self.console.quiet:
-            self._live.stop()
-            self.console.quiet = False
-        self._plain.say(text)
-
-    def hang_up(self) -> None:
-        """Show lines only from now on, the terminal being gone; callable from a signal handler, which draws nothing."""
-        self._is_live = False
-        self.console.quiet = True
 
     def clock(self, line: dict[str, Any]) -> None:
         self._clock = {**line, "wall_s": time.monotonic()}
@@ -72,16 +49,13 @@ class StatusTable:
             self._flies = True
             self.say(self._start_up())
         if not self._is_live:
-            self._plain.clock(line)
+            super().clock(line)
 
     def _start_up(self) -> str:
         """Return how long it took until simulated time went on, and where it went."""
         took_s = time.monotonic() - self._begun_s
         stages_s = {**self.stages_s, "processes": took_s - sum(self.stages_s.values())}
         return f"flies after {took_s:.1f} s: " + ", ".join(f"{what} {s:.1f} s" for what, s in stages_s.items())
-
-    def event(self, line: dict[str, Any]) -> None:
-        self._plain.event(line)
 
     def health(self, line: dict[str, Any]) -> None:
         """Take a process's health; the messages that it has taken in since the last one give its rate."""
@@ -136,7 +110,7 @@ class StatusTable:
 
     def _render(self) -> Group:
         clock = self._clock
-        head = Text(describe(clock, self._duration_s) if clock else "starting …")
+        head = Text(printable(describe(clock, self._duration_s)) if clock else "starting …")
         return Group(head, table(self.rows()))
 
 
@@ -152,7 +126,7 @@ def table(rows: Sequence[dict[str, Any]]) -> Table:
             row["role"],
             row["host"],
             str(row["pid"] or "-"),
-            Text(row["state"]),  # it may hold output of a process, with brackets
+            Text(printable(row["state"])),  # it may hold output of a process, with brackets
             _figure(row["lag_ms"], "{:.0f} ms"),
             _figure(row["messages_per_s"], "{:.0f}"),
             _figure(row["round_trip_ms"], "{:.1f} ms"),

@@ -17,6 +17,7 @@ from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of
 from zsim_deploy.arguments import CONSOLE_PORT, pace_options
 from zsim_deploy.launch.child_process import ChildProcess
+from zsim_deploy.launch.end_signals import CLOSED, EndSignals
 from zsim_deploy.launch.role_launcher import RoleLauncher
 from zsim_deploy.launch.supervisor import Outcome, Supervisor
 from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
@@ -145,42 +146,52 @@ def run_processes(options: RunOptions, screen: Screen) -> Outcome:
     Raises:
         KeyboardInterrupt: with the reason, where nothing flew yet, or Ctrl-C came twice.
     """
-    try:
-        with handled_by(_interrupt):
-            outcome = _run(options, screen)
-    except KeyboardInterrupt:
-        with contextlib.suppress(OSError):
-            (options.out / "logs").rmdir()  # nobody has written there: the folder may be used again
-        raise
-    with contextlib.suppress(RecordError):
-        repair(options.out / "run.mcap")
-    return outcome
+    with EndSignals(options.out / "run.log", screen.hang_up) as signals:
+        try:
+            with handled_by(_interrupt):
+                outcome = _run(options, screen, signals)
+        except KeyboardInterrupt:
+            with contextlib.suppress(OSError):
+                (options.out / "logs").rmdir()  # nobody has written there: the folder may be used again
+            raise
+        with contextlib.suppress(RecordError):
+            repair(options.out / "run.mcap")
+        return outcome
 
 
-def _run(options: RunOptions, screen: Screen) -> Outcome:
+def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
     scenario, listen = options.scenario, options.listen
     _write_scenario(options, logs=True)
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
     with RoleLauncher(screen.say, str(options.out)) as launcher:
-        return _run_on(options, listen, screen, launcher) if listen else _run_on_free_port(options, screen, launcher)
+        if listen:
+            return _run_on(options, listen, screen, launcher, signals)
+        return _run_on_free_port(options, screen, launcher, signals)
 
 
 def _interrupt(number: int, _: object) -> None:
     raise KeyboardInterrupt(REASONS[number])
 
 
-def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLauncher) -> Outcome:
+def _run_on(options: RunOptions, endpoint: str, screen: Screen, launcher: RoleLauncher, signals: EndSignals) -> Outcome:
     supervisor = Supervisor(options.scenario.processes.on_death, screen)
     supervisor.members = [*_children(options, endpoint, supervisor, launcher)]
-    return supervisor.run()
+
+    def end_with_terminal() -> None:
+        if signals.closed:
+            supervisor.interrupt(CLOSED)
+
+    return supervisor.run(end_with_terminal)
 
 
-def _run_on_free_port(options: RunOptions, screen: Screen, launcher: RoleLauncher, tries: int = PORTS_TRIED) -> Outcome:
+def _run_on_free_port(
+    options: RunOptions, screen: Screen, launcher: RoleLauncher, signals: EndSignals, tries: int = PORTS_TRIED
+) -> Outcome:
     port = free_port(screen)
     endpoint = f"tcp/127.0.0.1:{port}"
-    outcome = _run_on(options, endpoint, screen, launcher)
+    outcome = _run_on(options, endpoint, screen, launcher, signals)
     if tries > 1 and _lost_port(outcome, endpoint, port):
-        return _run_on_free_port(options, screen, launcher, tries - 1)
+        return _run_on_free_port(options, screen, launcher, signals, tries - 1)
     return outcome
 
 
@@ -209,11 +220,16 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
     from zsim_world.fleet.fleet import DivergedError
 
     _write_scenario(options, logs=False)
-    stop = StopChannel()
-    try:
-        reason = fly(options.scenario, options.out / "run.mcap", stop.reason, screen)
-    except DivergedError as error:
-        return Outcome(str(error), failed=True)
-    finally:
-        stop.restore_signals()
-    return Outcome(reason, interrupted=stop.stopped())
+    with EndSignals(options.out / "run.log", screen.hang_up) as signals:
+        stop = StopChannel()
+
+        def reason() -> str | None:
+            return CLOSED if signals.closed else stop.reason()
+
+        try:
+            ended = fly(options.scenario, options.out / "run.mcap", reason, screen)
+        except DivergedError as error:
+            return Outcome(str(error), failed=True)
+        finally:
+            stop.restore_signals()
+        return Outcome(ended, interrupted=reason() is not None)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
-from zsim.errors import NoWorldError, RecordError, RunError, SessionError, SupersededError
+from zsim.errors import NoWorldError, RecordError, RunError, SessionError, SupersededError, printable
 from zsim.runtime.agent import Agent
 from zsim.runtime.group import AgentGroup
 from zsim.runtime.runner import Runner
@@ -166,7 +166,7 @@ def log_printer(launched: str | None) -> Callable[[str], None]:
     def say(text: str) -> None:
         if launched is not None:
             text = f"{time.strftime('%H:%M:%S')} {text}"
-        print(text, file=sys.stderr, flush=True)
+        print(printable(text), file=sys.stderr, flush=True)
 
     return say
 

@@ -22,6 +22,8 @@ class Say:
 
     def say(self, text: str) -> None: ...
 
+    def hang_up(self) -> None: ...
+
 
 class FakeSupervisor:
     """A supervisor whose runs end as given; keeps on which port each world was to listen."""
@@ -34,7 +36,7 @@ class FakeSupervisor:
 
     def handle_line(self, text: str) -> None: ...
 
-    def run(self) -> Outcome:
+    def run(self, _: object) -> Outcome:
         world = next(child for child in self.members if child.role == "world")
         endpoint = world._arguments[world._arguments.index("--listen") + 1]
         self.ports.append(int(endpoint.rsplit(":", 1)[1]))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from refused import has_terms
 
-from zsim_deploy.hosts.host_run import EndSignals
+from zsim_deploy.launch.end_signals import EndSignals
 from zsim_deploy.roles.stop_channel import interruptible
 
 
@@ -41,7 +41,7 @@ TALKS = """
 import signal, sys
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever runs the tests may be under nohup
 from pathlib import Path
-from zsim_deploy.hosts.host_run import EndSignals
+from zsim_deploy.launch.end_signals import EndSignals
 told = []
 with EndSignals(Path(sys.argv[1]), lambda: told.append(1)):
     print("ready", flush=True)

@@ -1,9 +1,13 @@
 """The lines that a run shows: a reason that lasts, once."""
 
+import io
+
 import pytest
 from refused import has_terms
+from rich.console import Console
 
 from zsim.contract.flight_messages import ClusterState
+from zsim.errors import printable
 from zsim.runtime import progress
 from zsim.runtime.progress import REASON_NS, HoldReasons
 
@@ -45,6 +49,25 @@ def test_each_cluster_has_its_own():
     for t_ns in (0, REASON_NS):
         lines = [reasons.line(cluster, state(t_ns, WAITS)) for cluster in ("a", "b")]
     assert [line and line.split()[2] for line in lines] == ["a,", "b,"]
+
+
+ESCAPES = "\x1b]0;title\x07\x1b[2Ka\x9b1m\r\u202eb"
+
+
+def test_codes_that_a_terminal_acts_on_are_shown_and_not_sent():
+    output = io.StringIO()
+    screen = progress.Screen(10.0, Console(file=output))
+    screen.say(ESCAPES)
+    screen.event({"t_s": 1.0, "kind": "death", "text": f"estimator.d1 on {ESCAPES}"})
+    waiting = {"name": "a", "host": ESCAPES, "since_wall_s": 1.0}
+    screen.clock({"t_s": 1.0, "rate": 1.0, "state": "waiting", "waiting_for": [waiting]})
+    assert len(output.getvalue().splitlines()) == 3
+    assert output.getvalue().replace("\n", "").isprintable()
+    assert output.getvalue().count(r"\x1b]0;title\x07\x1b[2Ka\x9b1m\r\u202eb") == 3
+
+
+def test_tabs_lines_and_other_alphabets_are_left():
+    assert printable("one\n\ttwo: Zürich, 東京 ×") == "one\n\ttwo: Zürich, 東京 ×"
 
 
 @pytest.mark.parametrize("is_slow", [True, False])
