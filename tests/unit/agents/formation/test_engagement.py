@@ -1,5 +1,6 @@
 """The phase machine flown on ideal drones: phases, refusals, faults in flight, plans."""
 
+import copy
 import math
 
 import msgspec
@@ -9,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refused import has_terms, refused
 
+from zsim.contract.snapshot import pack, unpack
 from zsim_agents.formation import guidance
 from zsim_agents.formation.control_law import ProportionalLaw
 from zsim_agents.formation.engagement import Engagement
@@ -583,6 +585,73 @@ def restarted(fleet, plan):
 
 
 FLIGHT = [Scheduled(1.0, TakeOff()), Scheduled(1.0, Engage()), Scheduled(1.0, MoveTo({"z_c": 8.0}))]
+
+
+def restored(fleet, plan):
+    """Return a copy of the fleet whose engagement is another one with the snapshot of the former."""
+    copied = copy.deepcopy(fleet)
+    copied.engagement = Engagement(SPACE, DRONES, plan=plan)
+    copied.gate -= 1
+    last = copied._input()
+    copied.gate += 1
+    copied.engagement.restore(unpack(pack(fleet.engagement.snapshot())), last)
+    return copied
+
+
+def exact(output: GateOutput):
+    numbers = [array.tobytes() for array in (output.value, output.desired, output.desired_rate)]
+    setpoints = [setpoint and (tuple(setpoint.v_W), setpoint.yaw_rate) for setpoint in output.setpoints]
+    state = output.phase, output.trajectory_t_s, output.margin, output.reason, output.factor, output.plan_step
+    return *numbers, setpoints, output.modes, output.alarmed, state
+
+
+WAYPOINTS = [
+    {"at_s": 0.0, "values": {"z_c": 8.0}},
+    {"at_s": 20.0, "values": {"z_c": 6.0, "x_c": 3.0}},
+]
+ALL_PHASES = [*FLIGHT, Scheduled(12.0, Follow(expressions=PAPER_4, constants={"f": 0.01}, duration_s=15.0))]
+
+
+@pytest.mark.parametrize(
+    ("request_", "at_s"),
+    [
+        *[(None, at_s) for at_s in (0.2, 1.5, 3.0, 5.0, 9.0, 14.0, 20.0, 35.0)],
+        (Follow(waypoints=WAYPOINTS), 16.0),
+        (Pause(), 16.0),
+        (MoveTo({"z_c": 5.0}), 12.0),
+        (Land(), 12.0),
+    ],
+)
+def test_one_that_is_restored_goes_on_to_the_same_bits(request_, at_s):
+    fleet = Fleet(Engagement(SPACE, DRONES, plan=ALL_PHASES))
+    fleet.fly(at_s - 1.0 if request_ else at_s)
+    if request_:
+        assert fleet.engagement.request(request_) is None
+        fleet.fly(1.0)
+    copied = restored(fleet, ALL_PHASES)
+    for output, again in zip(fleet.fly(25.0), copied.fly(25.0), strict=True):
+        assert exact(again) == exact(output)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "at_s", "phase"),
+    [
+        ({"age_s": np.array([0.0, 5.0, 0.0])}, 15.0, "held"),
+        ({"states": ("landed",) * 3}, 0.9, "taking_off"),  # nobody obeys, so it commands again
+    ],
+)
+def test_one_that_is_restored_in_a_fault_goes_on_to_the_same_bits(spoil, at_s, phase):
+    fleet = Fleet(Engagement(SPACE, DRONES, plan=FLIGHT))
+    fleet.fly(at_s)
+    fleet.spoil = spoil
+    fleet.fly(0.5)
+    assert fleet.output.phase == phase
+    copied = restored(fleet, FLIGHT)
+    for seconds in (3.0, 20.0):
+        for output, again in zip(fleet.fly(seconds), copied.fly(seconds), strict=True):
+            assert exact(again) == exact(output)
+        fleet.spoil = copied.spoil = {}
+    assert fleet.modes == copied.modes
 
 
 @pytest.mark.parametrize("gate", [10, 100, 300, 400, 700])

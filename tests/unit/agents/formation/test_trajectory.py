@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refused import has_terms, refused
 
+from zsim.contract.snapshot import pack, unpack
 from zsim_agents.formation.control_law import FormationGains
 from zsim_agents.formation.expression import Expression, ExpressionError
 from zsim_agents.formation.flight_data import ShapeLimits
@@ -20,6 +21,8 @@ from zsim_agents.formation.trajectory import (
     TrajectoryError,
     WaypointTrajectory,
     ramp_onto,
+    reference_of,
+    state_of,
 )
 
 SPACE = cluster_space(3)
@@ -354,3 +357,37 @@ def test_a_trajectory_faster_than_the_robots_is_refused():
     fault = RampPlanner(SPACE, FormationGains(), ShapeLimits()).reference_fault(onto, 0.0, 60.0)
     assert fault is not None
     assert has_terms(fault, "limits", "0.8")
+
+
+# State
+
+
+FOLLOWED = ExpressionTrajectory(SPACE, PAPER_4, GOAL, {"f": 0.01}, 60.0)
+BETWEEN = WaypointTrajectory(SPACE, [{"at_s": t, "values": {"z_c": 5 + t}} for t in (0.0, 5.0, 9.0)], GOAL)
+
+
+@pytest.mark.parametrize(
+    "reference",
+    [
+        Hold(GOAL),
+        Hold(GOAL, None),
+        Shifted(Hold(GOAL, 3.0), 2.5),
+        FOLLOWED,
+        BETWEEN,
+        Shifted(BETWEEN, 1.25),
+        ramp_onto(SPACE, ZERO, 0.1 * GOAL, Shifted(FOLLOWED, 0.7), 1.0, 4.0),
+    ],
+    ids=lambda reference: type(reference).__name__,
+)
+def test_a_reference_made_of_its_state_has_the_same_bits(reference):
+    again = reference_of(SPACE, unpack(pack(state_of(reference))))
+    assert type(again) is type(reference)
+    assert again.duration_s == reference.duration_s
+    for t_s in np.linspace(0.0, 12.0, 49):
+        for part, same in zip(reference.value(t_s), again.value(t_s), strict=True):
+            assert np.array_equal(part, same)
+
+
+def test_only_references_of_this_module_have_a_state():
+    with refused(TypeError, "reference", "float"):
+        state_of(1.0)  # type: ignore[arg-type]

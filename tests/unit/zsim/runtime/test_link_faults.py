@@ -12,6 +12,7 @@ from zsim.contract.flight_messages import Estimate, Mode, Status
 from zsim.contract.framing import GateMessages, key_table
 from zsim.contract.messages import Imu, Info, encode
 from zsim.contract.run_messages import ControlRequest, Fault, Faults
+from zsim.contract.snapshot import pack, unpack
 from zsim.runtime.agent import Agent, Output
 from zsim.runtime.link_faults import LinkFaults, place_of, reception_probability, senders, uniform
 from zsim.scenario import scenario_file
@@ -267,3 +268,15 @@ def test_a_controller_takes_so_many_requests_between_two_gates():
     said = [output.key for output in made.step(GATE_NS)]
     assert said.count(keys.cluster_request("main")) == REQUESTS_MAX
     assert "wait for" not in made.control(key, ControlRequest("sing", {}, "op.1")).error
+
+
+def test_one_that_is_restored_hands_over_the_same_at_the_same_gates():
+    acting = fault("link_delay", delay_ms=100), fault("link_loss", number=2, probability=0.3)
+    made, again = links(*acting), LinkFaults((ME,), 1, GATE_NS, {"main": ["d1", "d2"]})
+    gates(made, 20)
+    again.restore(unpack(pack(made.snapshot())))
+    for gate in range(21, 60):
+        inputs = [estimate(gate), status(gate)]
+        handed = handed_over(made, gate * GATE_NS, inputs)
+        assert handed_over(again, gate * GATE_NS, inputs) == handed
+        assert handed
