@@ -16,6 +16,8 @@ Dual = tuple[float, float]
 
 TEXT_MAX = 1000  # characters
 DEPTH_MAX = 100  # nested operations
+CONSTANTS_MAX = 100  # of a user
+NAME_MAX = 40  # characters of a constant
 CONSTANTS = {"pi": math.pi, "e": math.e}
 
 
@@ -146,14 +148,16 @@ def checked_constants(constants: Mapping[str, float]) -> dict[str, float]:
     """Return the constants as floats.
 
     Raises:
-        ExpressionError: a name is taken or no identifier, or a value is not a finite number.
+        ExpressionError: there are too many; a name is taken, too long or no identifier; a value is no finite number.
     """
+    if len(constants) > CONSTANTS_MAX:
+        raise ExpressionError(f"constants: found {len(constants)}; allowed: at most {CONSTANTS_MAX}")
     for name, value in constants.items():
-        if not (isinstance(name, str) and name.isidentifier()) or name in {"t", *CONSTANTS, *_FUNCTIONS}:
+        is_name = isinstance(name, str) and len(name) <= NAME_MAX and name.isidentifier()
+        if not is_name or name in {"t", *CONSTANTS, *_FUNCTIONS}:
             taken = ", ".join(["t", *CONSTANTS, *_FUNCTIONS])
-            raise ExpressionError(
-                f"constant {str(name)[:40]!r}: not a free name; allowed: an identifier except {taken}"
-            )
+            allowed = f"an identifier of at most {NAME_MAX} characters except {taken}"
+            raise ExpressionError(f"constant {str(name)[:40]!r}: not a free name; allowed: {allowed}")
         if finite_number(value) is None:
             raise ExpressionError(f"constant {name}: found {str(value)[:40]!r}; allowed: a finite number")
     return {name: float(value) for name, value in constants.items()}

@@ -154,6 +154,8 @@ def test_an_expression_without_a_finite_value_says_when(text, t):
         ({"f": "0.01"}, ("constant f", "'0.01'")),
         ({"f": True}, ("constant f", "'True'")),
         ({"f": 10**400}, ("constant f", "'1000…")),
+        ({"f" * 41: 1.0}, ("constant", f"'{'f' * 40}'", "40")),
+        ({f"f{i}": 1.0 for i in range(101)}, ("constants", "101", "100")),
     ],
 )
 def test_bad_constants_are_refused(constants, terms):
