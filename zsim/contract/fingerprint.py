@@ -8,6 +8,7 @@ import hashlib
 import importlib.metadata
 import os
 import platform
+from collections.abc import Callable, Iterable
 from functools import cache
 
 import numpy as np
@@ -107,11 +108,19 @@ class TruthHash:
     """
 
     def __init__(self, rows: int) -> None:
+        self._copy: Callable[[memoryview], object] | None = None
         row = np.dtype([("t", "<i8"), ("x", "<f8", COLUMNS)])
         self._hash = hashlib.sha256()
         self._rows = np.zeros((max(1, HELD_BYTES // max(1, rows * row.itemsize)), rows), dtype=row)
         self._t, self._x = self._rows["t"], self._rows["x"]
         self._held = 0
+
+    def resume(self, hashed: Iterable[bytes], copy: Callable[[memoryview], object]) -> None:
+        """Start again from what `copy` was given, and give it what follows."""
+        self._hash, self._held = hashlib.sha256(), 0
+        for data in hashed:
+            self._hash.update(data)
+        self._copy = copy
 
     def add(self, t_ns: ArrayLike, state: NDArray[np.float64]) -> None:
         """Add rows.
@@ -124,13 +133,18 @@ class TruthHash:
         self._x[self._held] = state[:, :COLUMNS]
         self._held += 1
         if self._held == len(self._rows):
-            self._take_in()
+            self.flush()
 
-    def _take_in(self) -> None:
-        self._hash.update(self._rows[: self._held].data)
+    def flush(self) -> None:
+        """Take in the rows that were added."""
+        if not self._held:
+            return
+        self._hash.update(data := self._rows[: self._held].data)
+        if self._copy:
+            self._copy(data.cast("B"))
         self._held = 0
 
     def hexdigest(self) -> str:
         """Return the hash of all rows, as hexadecimal digits."""
-        self._take_in()
+        self.flush()
         return self._hash.hexdigest()

@@ -28,7 +28,7 @@ class Role(NamedTuple):
 
 
 ROLES = {
-    "world": Role("world", "end"),
+    "world": Role("world", "restart"),
     "recorder": Role("record", "restart"),
     "estimator": Role("agents", "restart", "drone", "zsim_agents.estimation.estimator:Estimator", joint=True),
     "controller": Role("agents", "restart", "cluster", "zsim_agents.formation.controller:Controller"),

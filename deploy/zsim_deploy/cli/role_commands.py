@@ -46,6 +46,9 @@ def world(
         list[str] | None, typer.Option(help=f"Endpoint, repeatable (default {DEFAULT_ENDPOINT}).")
     ] = None,
     expect: Annotated[list[str] | None, typer.Option(help="Wait for this process too, e.g. recorder.")] = None,
+    journal: Annotated[
+        Path | None, typer.Option(help="Folder of the run's journal: started again with it, it goes on.")
+    ] = None,
     launched: Launched = None,
     tls: Tls = None,
     access: Access = None,
@@ -60,7 +63,7 @@ def world(
     loaded = scenario_file.load(path, overrides, seed=flight.seed, duration_s=flight.duration)  # needs no agent's class
     mode, pace = flight.mode_and_rate()
     who = identity(host, tls, insecure, access)
-    world_role.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who)
+    world_role.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who, journal)
 
 
 def _agent_command(name: str, role: Role) -> Callable[..., None]:

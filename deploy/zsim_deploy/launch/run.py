@@ -23,6 +23,7 @@ from zsim_deploy.launch.supervisor import Outcome, Supervisor
 from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 
 DEFAULT_PORT = 7447  # Zenoh's own
+JOURNAL = "journal"  # of the world, in the folder of a run
 CONSOLE = "console.run"  # the one that a run starts: not to be taken over by the first that is started by hand
 PORTS_TRIED = 5  # when other runs that start at this moment take each before our world listens
 
@@ -51,6 +52,7 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
     reach = ["--connect", endpoint, "--federation", federation, *launched]
     pace = pace_options(options.mode, options.rate)
     world = ["world", str(file), "--listen", endpoint, "--expect", "recorder", *pace, *launched]
+    world += ["--journal", str(options.out / JOURNAL)]
     record = ["record", "--out", str(options.out), *reach]
     children = [
         ChildProcess("world", world, logs, launcher, supervisor.handle_line),

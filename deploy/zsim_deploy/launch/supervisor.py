@@ -76,6 +76,7 @@ class Supervisor:
         self._show = show
         self._reason = ""
         self._failed = False
+        self._flies = False
         self._interrupted: str | None = None
         self._until_s: float | None = None
         self._dead: set[str] = set()
@@ -122,6 +123,7 @@ class Supervisor:
         if not isinstance(line, dict):
             return  # a number that was printed is JSON too
         if "clock" in line:
+            self._flies = self._flies or line["clock"].get("state") == "running"
             self._show.clock(line["clock"])
         elif "event" in line:
             self._on_event(line["event"])
@@ -142,7 +144,7 @@ class Supervisor:
     def _watch(self, look: Callable[[], None]) -> None:
         """Return when the world has ended, or when it has to."""
         world = next(child for child in self.members if child.role == "world")
-        while world.code is None:
+        while world.code is None or self._restarts_world(world):
             if self._interrupted:
                 self._reason = self._interrupted
                 world.request_stop(self._reason)
@@ -157,6 +159,20 @@ class Supervisor:
             world.wait(POLL_S)
         if world.code != 0:
             self._fail(f"the world died: {world.outcome()}")
+
+    def _restarts_world(self, world: RunProcess) -> bool:
+        """Start a world again that died in its run; return whether that was so."""
+        code = world.code
+        flew = code is not None and code not in (0, USER_FAULT) and (self._flies or code < 0)
+        if not flew or self._reason or self._interrupted:
+            return False
+        policy = on_death(self._on_death, world.name)
+        if policy != "restart" or self._too_often(world):
+            return False
+        self._show.say(f"{world.name} (pid {world.pid}) ended: {world.outcome()}; on_death: {policy}")
+        world.restarts += 1
+        world.start()
+        return True
 
     def submit(self, act: Callable[[], Any]) -> Future[Any]:
         """Let the watch do something between two looks at the processes; callable from any thread.

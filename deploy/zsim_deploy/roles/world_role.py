@@ -14,6 +14,7 @@ import msgspec
 from zsim.contract import keys, run_messages
 from zsim.errors import RunError
 from zsim.runtime.progress import QUIET, HoldReasons, JsonProgress, ProgressSink, Screen, Throttle
+from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.transport.session import check_expression
 from zsim.transport.tls import Identity
@@ -37,25 +38,37 @@ def world(
     launched: str | None,
     expect: list[str] | None,
     identity: Identity,
+    journal: Path | None = None,
 ) -> None:
-    """Run the world of a scenario on the endpoints until the scenario ends or somebody stops it."""
+    """Run the world of a scenario on the endpoints until the scenario ends or somebody stops it.
+
+    Raises:
+        RunError: the journal is of another run.
+        SessionError: an endpoint is taken, or the identity is of no use.
+    """
     from zsim_world.flight.world import World
+    from zsim_world.server.run_journal import RunJournal, journaled_run
     from zsim_world.server.world_process import run
 
     stop = StopChannel(launched, identity)
     with _slow_start_notice(JsonProgress() if launched else None):
-        run_world = World(scenario, mode, rate, time.monotonic_ns, launched)
+        run_id = launched or (journaled_run(journal) if journal else None)
+        run_world = World(scenario, mode, rate, time.monotonic_ns, run_id)
     for name in expect or ():
         run_world.barrier.expect(name)
     gc.collect()
     gc.freeze()
+    sha256 = scenario_file.sha256(scenario_file.to_text(scenario))
     if launched:
-        run(run_world, endpoints, stop.reason, world_progress(JsonProgress()), identity=identity)
+        progress = JsonProgress()
+        kept = RunJournal(journal, run_world.run_id, sha256, progress.say)
+        run(run_world, endpoints, stop.reason, world_progress(progress), identity=identity, journal=kept)
         stop.exit_if_terminated()
         return
     with Screen(scenario.duration_s) as screen:
         listening = f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run"
-        run(run_world, endpoints, stop.reason, world_progress(screen), lambda: screen.say(listening), identity)
+        kept, progress = RunJournal(journal, run_world.run_id, sha256, screen.say), world_progress(screen)
+        run(run_world, endpoints, stop.reason, progress, lambda: screen.say(listening), identity, kept)
         screen.say(f"ended: {run_world.ended}")
 
 
@@ -89,6 +102,8 @@ def world_progress(show: ProgressSink) -> Callable[[str, Any, str], None]:
             show.say(line)
         elif kind == "health" and healths[about].passes():
             show.health({"name": about, "lag_ns": message.lag_ns, "received": message.received})
+        elif kind == "resumed":
+            show.say(f"{about}: goes on at t = {message / 1e9:.2f} s")
         elif kind == "event" and (message.kind in VITAL or shown[0] < SHOWN_EVENTS):
             shown[0] += message.kind not in QUIET
             show.event(_event_line(message))

@@ -1,13 +1,14 @@
 """What faults do to the arrays of a fleet: sensors, rotors and the air. Without any, the arrays are as at the start."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from zsim.contract.run_messages import Fault
+from zsim.contract.snapshot import State
 from zsim.scenario.fault_kinds import sensor_parts
 from zsim.vehicles.vehicle import Vehicle
 from zsim_world.physics.air import WIND
@@ -43,6 +44,16 @@ class Impairment:
         self._held: dict[int, tuple[float, ...]] = {}  # by fault: at which speed the rotors of its drone turned
         self._gusts: tuple[Fault, ...] = ()
         self._calm = True
+
+    def snapshot(self) -> State:
+        """Return what acts beside the arrays of the fleet."""
+        return {"held": self._held, "gusts": [fault.id for fault in self._gusts], "calm": self._calm}
+
+    def restore(self, state: State, faults: Mapping[int, Fault]) -> None:
+        """Take over what `snapshot` returned; `faults` are those of the run, by id."""
+        self._held = {number: tuple(speeds) for number, speeds in state["held"].items()}
+        self._gusts = tuple(faults[number] for number in state["gusts"])
+        self._calm = state["calm"]
 
     def strike(self, acting: Sequence[Fault]) -> None:
         """Let these faults act from now on, and no others; those that have acted before go on."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from zsim.contract.flight_messages import DroneState
 from zsim.contract.messages import RotorInfo
+from zsim.contract.snapshot import State
 from zsim.errors import RunError
 from zsim.scenario.scenario import Drone, Scenario
 from zsim.sensors.gps import GpsConfig
@@ -26,7 +27,7 @@ from zsim_world.physics.air import WIND
 from zsim_world.sensors.noise import NoiseTable
 from zsim_world.sensors.sampler import Sampled, Sampler, SensorSample
 from zsim_world.sensors.sensor_set import fleet_sensors
-from zsim_world.state.fleet_arrays import ROTOR, STATE, VEHICLE
+from zsim_world.state.fleet_arrays import ROTOR, STATE, VEHICLE, state_arrays
 from zsim_world.vehicles import firmware
 from zsim_world.vehicles.firmware import MEMORY, SETPOINT
 from zsim_world.vehicles.firmware_settings import SETTING
@@ -139,6 +140,32 @@ class Fleet:
             self._noise.refill()
         self._gates += 1
         self._integrate(self._ticks)
+
+    def snapshot(self) -> State:
+        """Return all from which the flight goes on to the same bits."""
+        return {
+            "tick": self._tick,
+            "gates": self._gates,
+            "least_m": self._least,
+            "touching": self.touching,
+            "arrays": list(state_arrays(self._w)),
+            "streams": self._noise.streams,
+            "sampler": self._sampler.snapshot(),
+        }
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` of a fleet of the same scenario returned.
+
+        Raises:
+            ValueError: it is of another scenario.
+        """
+        self._tick, self._gates, self._least = state["tick"], state["gates"], state["least_m"]
+        self.touching[:] = state["touching"]
+        for array, saved in zip(state_arrays(self._w), state["arrays"], strict=True):
+            array[...] = saved
+        self.bodies.near.origin.fill(math.inf)  # the near pairs are found anew
+        self._noise.streams[:] = state["streams"]
+        self._sampler.restore(state["sampler"])
 
     def samples(self) -> list[SensorSample]:
         """Return what fell due for publication in the last gate, in the order of (t_ns, drone, sensor)."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from zsim.contract import encoding, flight_messages, messages
 from zsim.contract.encoding import GAP, Layouts, Program, TextTable
 from zsim.contract.framing import GateMessages, key_table
+from zsim.contract.snapshot import State
 from zsim.errors import RunError
 from zsim.math.compiled import compiled, inlined, kernel
 from zsim.sensors.sensor import Sample, as_fields, field_types, message_type
@@ -124,6 +125,14 @@ class GatePublication:
         uncounted = self._fleetwide._replace(counts=self._fleetwide.counts.copy())
         state = PublicationState(self._words, self._seen, uncounted, self._written)
         publish(hold(state), *self._fleet.sampled, *self._payloads(), 0)
+
+    def snapshot(self) -> State:
+        """Return how many messages each key has had."""
+        return {"counts": self._fleetwide.counts}
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` returned."""
+        self._fleetwide.counts[:] = state["counts"]
 
     def gate(self, commanders: list[str | None]) -> GateMessages:
         """Return the messages of the present gate; `commanders` are those of the drones, None for none."""

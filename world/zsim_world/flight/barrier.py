@@ -7,8 +7,11 @@ every gating participant's done for t minus the command delay. That is the only 
 from dataclasses import dataclass
 from typing import Any
 
+import msgspec
+
 from zsim.contract import keys
 from zsim.contract.run_messages import Done, Join, Waiting
+from zsim.contract.snapshot import State
 from zsim.scenario.rights import WORLD
 from zsim_world.flight.run_outbox import Refusal
 
@@ -29,6 +32,7 @@ class Participant:
         since_wall_ns: when it last joined, sent a done or died.
         joined_wall_ns: when this incarnation joined.
         deadline_misses: dones that were late in realtime.
+        away: whether it has yet to come back to a world that was started again.
     """
 
     name: str
@@ -44,6 +48,7 @@ class Participant:
     since_wall_ns: int = 0
     joined_wall_ns: int = 0
     deadline_misses: int = 0
+    away: bool = False
 
     @property
     def gating(self) -> bool:
@@ -101,9 +106,11 @@ class Participant:
     def reset_counts(self) -> int:
         """Start counting outputs anew, once they were requested again; return how many are missing for good.
 
-        A surplus would hide the next loss: outputs that belong to the next done do not come while some are missing.
+        A surplus would hide the next loss: outputs that belong to the next done do not come while some are missing. Of
+        what is repeated after a rejoin, some was counted before it: that is not missing.
         """
-        missing, self.missing, self.surplus, self.lost_done = self.missing, 0, 0, False
+        missing = 0 if self.rejoined else self.missing
+        self.missing, self.surplus, self.lost_done, self.rejoined = 0, 0, False, False
         return missing
 
     def waiting(self, wall_ns: int) -> Waiting:
@@ -137,6 +144,20 @@ class Barrier:
         self._expected = dict.fromkeys(expected, 0)
         self.participants: dict[str, Participant] = {}
 
+    def snapshot(self) -> State:
+        """Return who takes part, and who is expected."""
+        return {
+            "expected": list(self._expected),
+            "participants": [msgspec.to_builtins(participant) for participant in self.participants.values()],
+        }
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` returned."""
+        self._expected = dict.fromkeys(state["expected"], 0)
+        each = msgspec.convert(state["participants"], list[Participant])
+        self.participants.clear()
+        self.participants.update({participant.name: participant for participant in each})
+
     def expect(self, name: str) -> None:
         """Do not start without this one either."""
         self._expected[name] = 0
@@ -152,6 +173,7 @@ class Barrier:
             return refusal
         former = self.participants.get(name)
         if former is not None and former.alive and former.join.incarnation == message.incarnation:
+            former.away = False
             return None
         replaced = self.replaced(name, message)
         for dead in replaced:
@@ -200,6 +222,7 @@ class Barrier:
             return Refusal("incarnation", str(message.incarnation), allowed)
         if message.done_ns > now_ns:
             return Refusal("done_ns", str(message.done_ns), f"must be <= {now_ns}, the newest gate")
+        participant.away = False
         if message.done_ns > participant.done_ns:
             participant.done_ns = message.done_ns
             participant.since_wall_ns = wall_ns
@@ -229,6 +252,16 @@ class Barrier:
         participant.alive = False
         participant.since_wall_ns = wall_ns
         return participant
+
+    def await_return(self, wall_ns: int) -> None:
+        """Wait for everybody who is waited for to come back to a world that was started again."""
+        for participant in self.participants.values():
+            participant.since_wall_ns = participant.joined_wall_ns = wall_ns
+            participant.away = participant.alive and participant.is_waited_for
+
+    def away(self) -> list[Participant]:
+        """Return who lives, and has not come back yet."""
+        return [p for p in self.participants.values() if p.away and p.alive]
 
     def substitute(self, name: str) -> Participant | None:
         """Return who lives and does all the work of a participant beside its own."""
@@ -269,5 +302,6 @@ class Barrier:
         """
         absent = [Waiting(name, "", (wall_ns - start_wall_ns) / 1e9) for name in self.absent()]
         rank = {name: place for place, name in enumerate(self._expected)}
-        late = sorted(self.blocking(need_ns), key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank))))
+        awaited = {p.name: p for p in (*self.away(), *self.blocking(need_ns))}.values()
+        late = sorted(awaited, key=lambda p: (p.alive, p.since_wall_ns, rank.get(p.name, len(rank))))
         return (*absent, *(p.waiting(wall_ns) for p in late))

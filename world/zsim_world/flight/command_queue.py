@@ -8,6 +8,8 @@ from collections.abc import Callable
 from operator import itemgetter
 from typing import Any, NamedTuple
 
+from zsim.contract import keys, messages
+from zsim.contract.snapshot import State
 from zsim_world.flight.run_outbox import Refusal
 
 PROGRAM = 0  # priority of a program, contract
@@ -50,6 +52,32 @@ class CommandQueue:
     def commanders(self) -> list[str | None]:
         """Return the name of each drone's commander."""
         return [commander.source if commander else None for commander in self._commanders]
+
+    def snapshot(self) -> State:
+        """Return what is queued, and who flies what."""
+        queued = [command for each in self._queued.values() for command in each]
+        recent = [[*mark, messages.encode(message)] for mark, message in self._recent.items()]
+        return {
+            "commanders": [commander and list(commander) for commander in self._commanders],
+            "priorities": [[*about, priority] for about, priority in self._priorities.items()],
+            "queued": [[*command[:-1], messages.encode(command.message)] for command in queued],
+            "recent": recent,
+        }
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` returned."""
+        self._commanders = [commander and Commander(*commander) for commander in state["commanders"]]
+        self._priorities = {(drone, source): priority for drone, source, priority in state["priorities"]}
+        self._queued = {}
+        for *fields, payload in state["queued"]:
+            command = QueuedCommand(*fields, message=None)
+            message = self._decoded(command.drone, command.kind, payload)
+            self._queued.setdefault(command.apply_ns, []).append(command._replace(message=message))
+        recent = ((tuple(mark), self._decoded(mark[0], mark[1], payload)) for *mark, payload in state["recent"])
+        self._recent = dict(recent)
+
+    def _decoded(self, drone: int, kind: str, payload: bytes) -> Any:
+        return messages.decode(keys.command(self._names[drone], kind), payload)
 
     def push(self, drone: int, kind: str, message: Any, apply_ns: int) -> bool:
         """Queue a command for its instant; return False for a duplicate."""

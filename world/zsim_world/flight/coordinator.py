@@ -124,6 +124,13 @@ class Coordinator(ABC):
         """Count an output (estimate, cluster state) of a participant."""
         self.barrier.count_output(source)
 
+    def give_up_outputs(self, name: str) -> None:
+        """Wait no longer for the outputs of a participant that are lost."""
+        missing = self.barrier.participants[name].reset_counts()
+        if missing:
+            text = f"{name}: {missing} of its outputs did not come"
+            self.outbox.event("outputs_missing", name, text, {"missing": missing})
+
     def _handle_done(self, name: str, message: run_messages.Done, wall_ns: int) -> None:
         refusal = self.barrier.done(name, message, self.now_ns, wall_ns)
         if refusal:
@@ -195,6 +202,11 @@ class Coordinator(ABC):
         """Return the action when a process has died."""
         return on_death(self.scenario.processes.on_death, participant.name, participant.join.role)
 
+    def await_return(self, wall_ns: int) -> None:
+        """Let time stand, in a world that was started again, until those who took part are back or dead."""
+        self.statistics.rate.stand_still(wall_ns)
+        self.barrier.await_return(wall_ns)
+
     # Requests
 
     def control(self, request: ControlRequest) -> ControlAnswer:
@@ -228,7 +240,7 @@ class Coordinator(ABC):
     def may_advance(self) -> bool:
         """Tell whether nothing but pacing keeps the world from the next gate."""
         clock = self.clock
-        if clock.is_halted:
+        if clock.is_halted or self.barrier.away():
             return False
         if clock.state == "waiting":
             return not self.barrier.absent()
@@ -241,14 +253,14 @@ class Coordinator(ABC):
     def waiting_for(self, wall_ns: int) -> tuple[run_messages.Waiting, ...]:
         """Return whom the world waits for now."""
         if self.clock.mode == "realtime" and self.clock.state != "waiting":
-            return tuple(p.waiting(wall_ns) for p in self.barrier.participants.values() if not p.alive)
+            return tuple(p.waiting(wall_ns) for p in self.barrier.participants.values() if p.away or not p.alive)
         return self.barrier.waiting_for(self.clock.required_ns, wall_ns, self._start_wall_ns)
 
     # Publication
 
-    def publish_clock(self, waiting_for: tuple[run_messages.Waiting, ...] = ()) -> None:
-        """Put a `clock` into the outbox."""
-        clock = run_messages.Clock(
+    def clock_message(self, waiting_for: tuple[run_messages.Waiting, ...] = ()) -> run_messages.Clock:
+        """Return the next message of `clock`."""
+        return run_messages.Clock(
             t_ns=self.now_ns,
             seq=self.outbox.next_seq(keys.CLOCK),
             run_id=self.run_id,
@@ -257,14 +269,13 @@ class Coordinator(ABC):
             rate=round(self.statistics.rate.now(), 3),
             waiting_for=waiting_for,
         )
-        self.outbox.put(keys.CLOCK, clock)
 
     def publish_end(self) -> None:
         """Put the end of the run into the outbox: event `end`, clock `stopped`."""
         self.clock.stop("ended")
         self.outbox.event("end", WORLD, self.ended or "", self.result())
         self.clock.state = "stopped"
-        self.publish_clock()
+        self.outbox.put(keys.CLOCK, self.clock_message())
 
     def take_outbox(self) -> list[KeyedMessage]:
         """Return what is to be published, in order, and forget it."""

@@ -8,6 +8,7 @@ import msgspec
 
 from zsim.contract import keys
 from zsim.contract.run_messages import ControlAnswer, ControlRequest, Fault, Faults
+from zsim.contract.snapshot import State
 from zsim.runtime.link_faults import KINDS as LINK_KINDS
 from zsim.scenario import fault_kinds
 from zsim.scenario.fault_check import Known, flaws
@@ -70,6 +71,26 @@ class FaultInjector:
             acting = tuple(fault for fault in self._of_links if fault_kinds.acts(fault, gate_ns))
             self._of_links_at[gate_ns] = acting
         return acting
+
+    def snapshot(self) -> State:
+        """Return what is planned and acts, and what acts on the fleet beside its arrays."""
+        return {
+            "faults": [msgspec.to_builtins(fault) for fault in self._faults.values()],
+            "begun": sorted(self._begun),
+            "over": sorted(self._over),
+            "count": self._count,
+            "seq": self._seq,
+            "next_ns": self._next_ns,
+            "effects": self._effects.snapshot(),
+        }
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` returned."""
+        self._faults = {fault.id: fault for fault in msgspec.convert(state["faults"], list[Fault])}
+        self._begun, self._over = set(state["begun"]), set(state["over"])
+        self._count, self._seq, self._next_ns = state["count"], state["seq"], state["next_ns"]
+        self._sort_links()
+        self._effects.restore(state["effects"], self._faults)
 
     # Time
 
@@ -217,10 +238,14 @@ class FaultInjector:
     def _publish(self) -> None:
         """Publish the list, before the next gate."""
         self._rank()
-        self._of_links = tuple(fault for fault in self.all if fault.kind in LINK_KINDS)
-        self._of_links_at.clear()
+        self._sort_links()
         self._outbox.put(keys.FAULTS, Faults(self._clock.now_ns, self._seq, self.all))
         self._seq += 1
+
+    def _sort_links(self) -> None:
+        """Note which faults are of links."""
+        self._of_links = tuple(fault for fault in self.all if fault.kind in LINK_KINDS)
+        self._of_links_at.clear()
 
     def _rank(self) -> None:
         """Number those that are equal but for their end, and have not begun: they begin together."""

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from zsim.contract.run_messages import GATES_MAX, RATE_MAX, ControlAnswer, ControlRequest
+from zsim.contract.snapshot import State
 from zsim.scenario.scenario import TimeSteps
 from zsim_world.flight.run_outbox import Refusal
 
@@ -28,6 +29,7 @@ class RunClock:
         steps_allowed: gates that may still come while the run is paused.
         jumps: how often time was moved otherwise than gate by gate.
         ended: why the run is over, None while it goes on.
+        is_complete: whether it is over by itself, so that nothing of it can be gone on with.
     """
 
     def __init__(self, time: TimeSteps, mode: str, rate: float) -> None:
@@ -39,6 +41,7 @@ class RunClock:
         self.state = "waiting"
         self.steps_allowed = self.jumps = 0
         self.ended: str | None = None
+        self.is_complete = False
 
     @property
     def required_ns(self) -> int:
@@ -63,6 +66,21 @@ class RunClock:
     def _set(self, t_ns: int) -> None:
         """Set the newest gate, and the one after it an interval later."""
         self.now_ns, self.next_ns = t_ns, t_ns + self.gate_ns
+
+    def snapshot(self) -> State:
+        """Return the state of a run that has not ended."""
+        names = ("rate", "now_ns", "next_ns", "state", "steps_allowed", "jumps")
+        return {name: getattr(self, name) for name in names}
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` returned."""
+        for name, value in state.items():
+            setattr(self, name, value)
+
+    def complete(self, reason: str) -> None:
+        """End the run, which comes to its end by itself."""
+        self.is_complete = self.ended is None
+        self.stop(reason)
 
     def stop(self, reason: str) -> None:
         """End the run after the present gate; of several reasons the first is kept."""

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from zsim.contract import keys, run_messages
+from zsim.contract.snapshot import State
 from zsim.scenario.rights import WORLD
 
 KeyedMessage = tuple[str, Any]  # key and message; or keys.GATE and GateMessages at a gate
@@ -60,6 +61,15 @@ class RefusalLog:
         last = " (further ones are counted only)" if former == EVENTS_MAX - 1 else ""
         return f"{subject}: {reason}{last}" if former < EVENTS_MAX else None
 
+    def snapshot(self) -> State:
+        """Return what was counted."""
+        return {"count": self.count, "counts": [[*about, counts] for about, counts in self._counts.items()]}
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` returned."""
+        self.count = state["count"]
+        self._counts = {(source, subject): counts for source, subject, counts in state["counts"]}
+
 
 class RunOutbox:
     """Messages of the world that are to be published.
@@ -77,6 +87,15 @@ class RunOutbox:
         self._next_seq: dict[str, int] = {}
         self.pending: list[KeyedMessage] = []
         self.refusals = RefusalLog()
+
+    def snapshot(self) -> State:
+        """Return the numbers of the keys, and what was refused."""
+        return {"next_seq": self._next_seq, "refusals": self.refusals.snapshot()}
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` returned; what is pending is forgotten."""
+        self._next_seq, self.pending = state["next_seq"], []
+        self.refusals.restore(state["refusals"])
 
     def put(self, key: str, message: Any) -> None:
         """Add a message."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from zsim.contract.snapshot import State
 from zsim_world.flight.barrier import Participant
 
 GATES_KEPT = 256  # gates whose publication time is remembered for the age of commands; 5 s, older ones are refused
@@ -22,6 +23,15 @@ class CommandAges:
         self._published: dict[int, int] = {}
         self._ages_ns = array("q")
         self._oldest = 0  # index of the oldest age once so many are kept
+
+    def snapshot(self) -> State:
+        """Return what was noted."""
+        return {"published": self._published, "ages": self._ages_ns.tobytes(), "oldest": self._oldest}
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` returned."""
+        self._published, self._oldest = state["published"], state["oldest"]
+        self._ages_ns = array("q", state["ages"])
 
     def gate(self, t_ns: int, wall_ns: int) -> None:
         """Note when the gate t_ns was published."""
@@ -59,6 +69,23 @@ class RealTimeFactor:
         self._start_wall_ns: int | None = None
         self._last = (0, 0)
         self._sim_ns = 0
+
+    def snapshot(self) -> State:
+        """Return what was noted."""
+        return {"start_wall_ns": self._start_wall_ns, "last": list(self._last), "sim_ns": self._sim_ns}
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` returned."""
+        self._marks.clear()
+        self._start_wall_ns, self._sim_ns = state["start_wall_ns"], state["sim_ns"]
+        self._last = tuple(state["last"])
+
+    def stand_still(self, wall_ns: int) -> None:
+        """Leave out of the wall time of the run what has passed since the last gate, until wall_ns."""
+        if self._start_wall_ns is not None:
+            self._start_wall_ns += wall_ns - self._last[1]
+            self._last = (self._last[0], wall_ns)
+        self._marks.clear()
 
     def gate(self, t_ns: int, wall_ns: int) -> None:
         """Note when the gate t_ns was published."""
@@ -106,6 +133,23 @@ class RunStatistics:
         self.world_misses = 0
         self.closest_m = math.inf
         self._deadline_count = 0
+
+    def snapshot(self) -> State:
+        """Return what was noted."""
+        return {
+            "ages": self.ages.snapshot(),
+            "rate": self.rate.snapshot(),
+            "world_misses": self.world_misses,
+            "closest_m": self.closest_m,
+            "deadline_count": self._deadline_count,
+        }
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` returned."""
+        self.ages.restore(state["ages"])
+        self.rate.restore(state["rate"])
+        self.world_misses, self.closest_m = state["world_misses"], state["closest_m"]
+        self._deadline_count = state["deadline_count"]
 
     def gate(self, t_ns: int, wall_ns: int) -> None:
         """Note when the gate t_ns was published."""

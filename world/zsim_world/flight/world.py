@@ -3,7 +3,7 @@
 What it shares with a replay, first of all who takes part and who is waited for, is in `zsim_world.flight.coordinator`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from msgspec import UNSET
@@ -11,6 +11,7 @@ from msgspec import UNSET
 from zsim import CONTRACT, __version__
 from zsim.contract import keys, messages
 from zsim.contract.fingerprint import TruthHash, fingerprint
+from zsim.contract.snapshot import State
 from zsim.contract.views import DroneView, ViewDrones
 from zsim.runtime.agent import Output
 from zsim.scenario import scenario_file
@@ -89,6 +90,38 @@ class World(Coordinator):
             user_sensors=_own_sensors(s) or UNSET,
         )
 
+    # To go on elsewhere
+
+    def snapshot(self) -> State:
+        """Return all from which the run goes on to the same bits; nothing is pending in the outbox."""
+        self._hash.flush()
+        return {name: part.snapshot() for name, part in self._parts().items()}
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` of a world of the same scenario returned, but the hash of its truth.
+
+        Raises:
+            ValueError: it is of another scenario.
+        """
+        for name, part in self._parts().items():
+            part.restore(state[name])
+
+    def _parts(self) -> dict[str, Any]:
+        return {
+            "clock": self.clock,
+            "outbox": self.outbox,
+            "barrier": self.barrier,
+            "statistics": self.statistics,
+            "fleet": self.fleet,
+            "queue": self.queue,
+            "faults": self.faults,
+            "publication": self._publication,
+        }
+
+    def keep_truth(self, copy: Callable[[memoryview], object], hashed: Iterable[bytes] = ()) -> None:
+        """Let `copy` take the bytes of the truth hash from now on; those before were `hashed`."""
+        self._hash.resume(hashed, copy)
+
     # What arrives
 
     def _handle_command(self, drone: str, kind: str, message: Any) -> bool:
@@ -110,7 +143,7 @@ class World(Coordinator):
             return
         self._publish_gate(wall_ns)
         if self.now_ns >= self._last_ns:
-            self.clock.stop(DURATION_OVER)
+            self.clock.complete(DURATION_OVER)
 
     def _integrate(self) -> bool:
         """Integrate one gate; return whether the state is still finite."""
@@ -123,7 +156,7 @@ class World(Coordinator):
         except DivergedError as error:
             self.diverged = error
             self.outbox.event("diverged", error.drone, str(error))
-            self.clock.stop(str(error))
+            self.clock.complete(str(error))
             return False
         self.clock.advance(self.fleet.t_ns)
         self.statistics.separation(self.fleet.closest_m())
@@ -142,7 +175,7 @@ class World(Coordinator):
         self._hash.add(self.now_ns, self.fleet.bodies.state)
         self.outbox.put(keys.GATE, self._publication.gate(self.queue.commanders()))
         self.statistics.gate(self.now_ns, wall_ns)
-        self.publish_clock()
+        self.outbox.put(keys.CLOCK, self.clock_message())
 
     def result(self) -> dict[str, Any]:
         """Return the figures of the run so far."""

@@ -10,6 +10,7 @@ numpy's own: so they are read from numpy's generator, whose state is set to give
 
 import math
 from bisect import bisect_left
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -83,6 +84,13 @@ def words(rng: np.random.Generator) -> list[int]:
         raise ValueError(f"numpy's generator is {held['bit_generator']}; must be PCG64")
     state, step = held["state"]["state"], held["state"]["inc"]
     return [state >> 64, state & (2**64 - 1), step >> 64, step & (2**64 - 1)]
+
+
+def place(rng: np.random.Generator, stream: Sequence[int]) -> None:
+    """Let numpy's generator stand where the words of a stream do, (WORDS.size,)."""
+    state = stream[WORDS.state] << 64 | stream[WORDS.state + 1]
+    step = stream[WORDS.step] << 64 | stream[WORDS.step + 1]
+    rng.bit_generator.state = {**rng.bit_generator.state, "state": {"state": state, "inc": step}}
 
 
 @inlined

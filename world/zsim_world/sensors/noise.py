@@ -20,7 +20,10 @@ WIDTHS = (*NOISE_WIDTH, 3)  # numbers per row: of a sample, of a gust
 
 
 class NoiseTable:
-    """Standard normal numbers for `gates` gates: `table` (N + 1, all streams), `at` and `cursor` for the kernel."""
+    """Standard normal numbers for `gates` gates: `table` (N + 1, all streams), `at` and `cursor` for the kernel.
+
+    `streams` has the words of the generators, uint64 (N + 1, S, WORDS.size).
+    """
 
     def __init__(self, scenario: Scenario, gates: int) -> None:
         names = [drone.name for drone in scenario.drones]
@@ -34,15 +37,15 @@ class NoiseTable:
         self.bias = np.zeros((len(names), len(SENSORS), CHANNELS_MAX))
         self.gust = np.zeros((len(names), 3))
         self._draw_start(scenario, streams, common)
-        self._streams = np.zeros((len(names) + 1, len(WIDTHS), WORDS.size), dtype=np.uint64)
-        self._streams[:-1] = [[words(rng) for rng in row] for row in streams]
-        self._streams[-1, -1] = words(common)
+        self.streams = np.zeros((len(names) + 1, len(WIDTHS), WORDS.size), dtype=np.uint64)
+        self.streams[:-1] = [[words(rng) for rng in row] for row in streams]
+        self.streams[-1, -1] = words(common)
         self.cursor[:-1], self.cursor[-1, -1] = self._rows, self._rows[-1]  # nothing drawn yet
         self.refill()
 
     def refill(self) -> None:
         """Draw as many rows as have been used."""
-        refill(self.table, self.at, self._rows, self._widths, self.cursor, self._streams)
+        refill(self.table, self.at, self._rows, self._widths, self.cursor, self.streams)
 
     def _draw_start(
         self, scenario: Scenario, streams: list[list[np.random.Generator]], shared: np.random.Generator

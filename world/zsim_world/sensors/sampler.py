@@ -11,6 +11,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from zsim.contract.snapshot import State
 from zsim.math import geodetic
 from zsim.math.columns import Field, columns
 from zsim.math.compiled import kernel
@@ -74,6 +75,17 @@ class Sampler:
         self._user_sensors = UserSensors(scenario, sensors, senses) if own else None
         self._in_order = not (own or self._latency_ns.any())
         self._later = NONE
+
+    def snapshot(self) -> State:
+        """Return what is on its way, and what the users' sensors have come to."""
+        own = self._user_sensors.snapshot() if self._user_sensors else []
+        return {"whose": self._later.whose, "values": self._later.values, "user_sensors": own}
+
+    def restore(self, state: State) -> None:
+        """Take over what `snapshot` returned."""
+        self._later = Sampled(state["whose"], state["values"])
+        if self._user_sensors:
+            self._user_sensors.restore(state["user_sensors"])
 
     def due(self, logged: int, now_ns: int) -> Sampled:
         """Return what falls due up to now of what was logged and of what waits.

@@ -3,11 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from zsim.contract.snapshot import State
 from zsim.errors import RunError
 from zsim.math.frames import rotation_matrix
 from zsim.math.random_streams import stream
 from zsim.scenario.scenario import Scenario
 from zsim.sensors.sensor import Sensor, SensorTruth, SensorType
+from zsim_world.physics.normal_variates import place, words
 from zsim_world.sensors.reading import read
 from zsim_world.sensors.sensor_set import CHANNELS_MAX, CONFIG, SENSORS, FleetSensors
 from zsim_world.state.fleet_arrays import EXPOSED, STATE, Senses
@@ -34,6 +36,15 @@ class UserSensors:
                     name, rng = sensors.names[s], stream(scenario.seed, f"{drone.name}/{sensors.names[s]}")
                     what = f"{drone.name}: sensors.{name}"
                     self._sensors[s, i] = _UserSensor(what, sensors.types[s], settings, rng, senses.config[i, s])
+
+    def snapshot(self) -> list[State]:
+        """Return bias and random stream of each."""
+        return [sensor.snapshot() for sensor in self._sensors.values()]
+
+    def restore(self, states: list[State]) -> None:
+        """Take over what `snapshot` returned."""
+        for sensor, state in zip(self._sensors.values(), states, strict=True):
+            sensor.restore(state)
 
     def readings(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return whose (M, 3) and values (M, 6) of what the kernel logged in a gate, without what is lost.
@@ -65,6 +76,13 @@ class _UserSensor:
         self.bias = np.array([model.bias for model in kind.errors(settings)]) * rng.standard_normal(self.width)
         self._p_BS = config[CONFIG.p_BS : CONFIG.p_BS + 3].copy()
         self._R_BS = rotation_matrix(config[CONFIG.q_BS : CONFIG.q_BS + 4])
+
+    def snapshot(self) -> State:
+        return {"bias": self.bias, "stream": words(self._rng)}
+
+    def restore(self, state: State) -> None:
+        self.bias[:] = state["bias"]
+        place(self._rng, state["stream"])
 
     def truth(self, row: NDArray[np.float64], t_s: float) -> SensorTruth:
         """Return what it is exposed to, by a row of EXPOSED."""

@@ -65,6 +65,14 @@ class MessageHistory:
         self._page_bytes = page_bytes
         self._forgotten = 0
 
+    def last_values(self) -> dict[str, bytes]:
+        """Return the last value of every key."""
+        return self._last
+
+    def restore(self, last: dict[str, bytes]) -> None:
+        """Begin with these last values."""
+        self._last = last
+
     def add(self, key: str, payload: bytes, t_ns: int) -> None:
         """Keep a message; t_ns is its stamp.
 

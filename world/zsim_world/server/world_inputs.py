@@ -20,6 +20,7 @@ from zsim_world.flight.barrier import Participant
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
+from zsim_world.server.run_journal import GivenUp, RunJournal, Taken
 from zsim_world.server.world_outputs import WorldOutputs
 
 TICK_S = 0.1  # how often a standing world looks at the wall clock
@@ -31,8 +32,8 @@ PROCESSES, VIEWS = "process/", "view/"  # the last are nothing to the world
 OWN = keys.process(WORLD, "")
 
 ProgressCallback = Callable[[str, Any, str], None]
-"""Called with ("clock" or "event", message, phase of the clusters), ("health", message, process), and every tenth
-("state", message, cluster); shows progress."""
+"""Called with ("clock" or "event", message, phase of the clusters), ("health", message, process), every tenth ("state",
+message, cluster), and ("resumed", simulated time in ns, process); shows progress."""
 
 
 class WorldInputs(ABC):
@@ -187,14 +188,31 @@ class MessageIntake:
     liveliness: LivelinessMonitor
     health: HealthMeter  # counts what is received and refused
     progress: ProgressCallback
+    journal: RunJournal
     phase: str = ""  # of the cluster whose state was read last
     _states: Counter[str] = field(default_factory=Counter[str])
 
     def take(self, wall_ns: int, sample: ReceivedSample) -> None:
-        """Take one message, or refuse it."""
+        """Take one message, or refuse it, and keep it in the journal."""
         key = sample.key
         if key.startswith(OWN):
             return  # the world's own health, kept when it was published
+        kind = messages.type_of(key)
+        if kind is run_messages.Join:
+            self._settle_former(key, sample.payload)
+        self.take_again(wall_ns, sample)
+        if self.world.ended is None:
+            self.journal.note(Taken(wall_ns, key, sample.payload))
+
+    def _settle_former(self, key: str, payload: bytes) -> None:
+        """Take the death of the process before that of a join first."""
+        with contextlib.suppress(DecodeError):
+            join: run_messages.Join = messages.decode(key, payload)
+            self.liveliness.before_join(keys.thing(key), join)
+
+    def take_again(self, wall_ns: int, sample: ReceivedSample) -> None:
+        """Take one message, or refuse it, as another incarnation of the world has."""
+        key = sample.key
         self.health.received += 1
         kind = messages.type_of(key)
         try:
@@ -218,8 +236,6 @@ class MessageIntake:
         """Hand the world a message that it acts on."""
         message = messages.decode(key, payload)
         self.history.add(key, payload, message.t_ns)
-        if type(message) is run_messages.Join:
-            self.liveliness.before_join(keys.thing(key), message)
         self.world.handle(key, message, wall_ns)
         if type(message) is run_messages.Health:
             self.liveliness.health_received(keys.thing(key))
@@ -260,6 +276,8 @@ class MessageIntake:
     def recover_lost(self) -> None:
         """Request outputs again that a participant counted and that did not come, as after a cut link."""
         for participant in self.world.barrier.incomplete():
+            if participant.away:
+                continue
             if self.world.clock.mode == "realtime":
                 participant.lost_done = False
                 continue
@@ -269,10 +287,8 @@ class MessageIntake:
                 continue
             for sample in samples or ():
                 self.take(time.monotonic_ns(), sample)
-            missing = participant.reset_counts()
-            if missing:
-                text = f"{participant.name}: {missing} of its outputs did not come"
-                self.world.outbox.event("outputs_missing", participant.name, text, {"missing": missing})
+            self.world.give_up_outputs(participant.name)
+            self.journal.note(GivenUp(participant.name))
 
     def _lost_outputs(self, participant: Participant) -> list[ReceivedSample] | None:
         """Return what a participant has kept of its outputs and that has not come; None if it does not answer."""

@@ -10,6 +10,7 @@ from zsim.runtime.agent import Output
 from zsim.transport.session import ReceivedSample, Session
 from zsim_world.flight.coordinator import Coordinator
 from zsim_world.server.message_history import MessageHistory
+from zsim_world.server.run_journal import Kept, RunJournal
 
 
 class WorldOutputs:
@@ -20,11 +21,18 @@ class WorldOutputs:
         world: whose outbox it is.
         history: keeps what is published.
         on_message: called with every key and message beside those of drones.
+        journal: is written before anything is published.
     """
 
     def __init__(
-        self, link: Session, world: Coordinator, history: MessageHistory, on_message: Callable[[str, Any], None]
+        self,
+        link: Session,
+        world: Coordinator,
+        history: MessageHistory,
+        on_message: Callable[[str, Any], None],
+        journal: RunJournal,
     ) -> None:
+        self._journal = journal
         self._link = link
         self._world = world
         self._history = history
@@ -70,6 +78,7 @@ class WorldOutputs:
 
     def send(self) -> None:
         """Put what was gathered in one go: readers wake once, and the transport sends few packets."""
+        self._journal.commit()
         unsent, self._unsent = self._unsent, []
         self._link.put_all(unsent)
         self.put_batch()
@@ -79,7 +88,14 @@ class WorldOutputs:
         payload = messages.encode(output.message)
         self._passed.append((output.key, payload))
         self._history.add(output.key, payload, self._world.now_ns)
+        self._journal.note(Kept(output.key, payload))
+        self._journal.commit()
         self._link.put_raw(output.key, payload)
+        self.put_batch()
+
+    def forget(self) -> None:
+        """Publish nothing of what was gathered: an incarnation of the world before has."""
+        self._unsent, self._passed = [], []
 
     def passed(self, sample: ReceivedSample) -> None:
         """Note a message that a participant or anyone else has published."""

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from zsim.contract import keys, run_messages
+from zsim.contract import keys, messages, run_messages
 from zsim.contract.run_messages import ControlAnswer
 from zsim.errors import DecodeError
 from zsim.runtime.agent import Output
@@ -21,15 +21,19 @@ from zsim.transport.session import Query, Session
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode
 from zsim_world.flight.coordinator import Coordinator
+from zsim_world.flight.world import World
 from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
 from zsim_world.server.pacing import Pacer, Pipelining
+from zsim_world.server.resumption import Resumption
+from zsim_world.server.run_journal import Advanced, Controlled, Died, RunJournal
 from zsim_world.server.world_inputs import TICK_S, MessageIntake, ProgressCallback, open_inputs
 from zsim_world.server.world_outputs import WorldOutputs
 
 STUCK_NS = 2_000_000_000  # wall time in one turn from which on it is an event; a turn takes milliseconds
 CLOCK_STANDING_NS = 1_000_000_000  # contract: clock once a wall second while time stands still
 VIEW_PERIOD_NS = 33_333_333  # contract: at most 30 Hz wall
+HEALTH = keys.process(WORLD, "health")
 BYE_S = 5.0  # contract: the world waits 5 s at most for byes
 
 
@@ -41,6 +45,7 @@ class WorldProcess:
         world: what to run.
         stopped: asked every TICK_S; a text ends the run with it as the reason.
         progress: shows progress.
+        journal: of the run; from the one that a world before has left, this one goes on.
         health: of this process.
     """
 
@@ -50,27 +55,31 @@ class WorldProcess:
         world: Coordinator,
         stopped: Callable[[], str | None] = lambda: None,
         progress: ProgressCallback = lambda kind, message, about: None,
+        journal: RunJournal | None = None,
         health: HealthMeter | None = None,
     ) -> None:
         self._link = link
         self._world = world
         self._clock = world.clock
         self._stopped = stopped
-        self._progress = progress
+        self._shown = progress
+        self._journal = journal or RunJournal(None)
         self.health = health or HealthMeter(WORLD, host=link.host)
         self._history = MessageHistory()
         self._pacer = Pacer(world.clock)
         self._pipelining = Pipelining(world)
-        self._outputs = WorldOutputs(link, world, self._history, self._on_message)
-        self._liveliness = LivelinessMonitor(link, world.barrier, world.handle_death, self._take_in)
-        self._intake = MessageIntake(link, world, self._outputs, self._history, self._liveliness, self.health, progress)
+        self._outputs = WorldOutputs(link, world, self._history, self._on_message, self._journal)
+        self._liveliness = LivelinessMonitor(link, world.barrier, self._handle_death, self._take_in)
+        self._intake = MessageIntake(
+            link, world, self._outputs, self._history, self._liveliness, self.health, self._progress, self._journal
+        )
         self._queries: deque[Query] = deque()
         self._over = threading.Event()
         self._clock_wall_ns = 0
         self._turn_wall_ns = 0  # when the present turn began; 0 when there is none
         self._view_wall_ns = 0
         self._view_seq = 0
-        self._health_seq = 0
+        self._resumes = False
 
     def run(self) -> None:
         """Run to the end: wait for the participants, integrate, publish the end.
@@ -79,6 +88,7 @@ class WorldProcess:
             DivergedError: the state of a drone was no longer finite; the end has been published before.
         """
         self._inputs = open_inputs(self._link, self._clock.mode == "realtime")
+        self._resume()
         self._announce()
         ticker = threading.Thread(target=self._tick, name="tick", daemon=True)
         ticker.start()
@@ -90,16 +100,43 @@ class WorldProcess:
             self._over.set()
             ticker.join()
             self._inputs.close()
+            self._journal.close()
+        if self._clock.is_complete:
+            self._journal.remove()
         if self._world.diverged:
             raise self._world.diverged
 
     def _announce(self) -> None:
-        self._outputs.publish(Output(keys.INFO, self._world.info()))
+        if not self._history.last(keys.INFO):
+            self._outputs.publish(Output(keys.INFO, self._world.info()))
         answered = (*rights.LAST_VALUES, keys.CONTROL, keys.replay("*"), *self._world.refused_queries)
         for expression in answered:
             self._link.declare_queryable(expression, self._on_query)
         self._link.on_token("process/*", self._on_token)
         self._link.declare_token(keys.token(WORLD))
+
+    # A world before this one
+
+    def _resume(self) -> None:
+        """Go on where the journal ends, once everybody is back."""
+        self._resumes = True
+        resumed = Resumption(self._world, self._journal, self._history, self._intake, self._outputs).run()
+        self._resumes = False
+        if resumed:
+            self._world.await_return(time.monotonic_ns())
+            self._liveliness.check_all()
+            self._shown("resumed", self._world.now_ns, WORLD)
+
+    def _handle_death(self, name: str, wall_ns: int) -> None:
+        self._world.handle_death(name, wall_ns)
+        if self._world.ended is None:
+            self._journal.note(Died(wall_ns, name))
+
+    def _add_checkpoint(self, wall_ns: int) -> None:
+        """Put the state of the run into the journal, now that nothing is pending."""
+        if isinstance(self._world, World) and self._journal.is_due(self._world.now_ns, wall_ns):
+            state = {"world": self._world.snapshot(), "last": self._history.last_values()}
+            self._journal.add_checkpoint(state, self._world.now_ns, wall_ns)
 
     # The loop
 
@@ -124,10 +161,13 @@ class WorldProcess:
             self._intake.take(wall_ns, sample)
 
     def _advance(self, wall_ns: int, late_ns: int) -> None:
-        if self._clock.mode == "realtime" and late_ns > self._clock.gate_ns / self._clock.rate:
-            self._world.statistics.world_misses += 1
+        late = self._clock.mode == "realtime" and late_ns > self._clock.gate_ns / self._clock.rate
+        self._world.statistics.world_misses += late
         self._world.advance(wall_ns)
+        if self._world.diverged is None:
+            self._journal.note(Advanced(wall_ns, late))
         self._outputs.gather()
+        self._add_checkpoint(wall_ns)
         if not self._pipelining.continues():
             self._outputs.send()
         if self._world.diverged is None:
@@ -139,8 +179,9 @@ class WorldProcess:
         self._outputs.flush()
         self._pipelining.pause(wall_ns)
         if wall_ns - self._clock_wall_ns >= CLOCK_STANDING_NS:
-            self._world.publish_clock(self._world.waiting_for(wall_ns))
-            self._outputs.flush()
+            clock = self._world.clock_message(self._world.waiting_for(wall_ns))
+            self._outputs.publish(Output(keys.CLOCK, clock))
+            self._on_message(keys.CLOCK, clock)
         self._inputs.wait_for(self._required_dones())
 
     def _required_dones(self) -> set[str]:
@@ -152,6 +193,7 @@ class WorldProcess:
     def _end(self) -> None:
         """Publish the end, then wait until every participant that lives has published bye."""
         self._turn_wall_ns = 0
+        self._await_return()
         self._world.publish_end()
         self._outputs.flush()
         until_s = time.monotonic() + BYE_S
@@ -161,6 +203,14 @@ class WorldProcess:
             self._serve_others()
             self._outputs.put_batch()
         self._outputs.flush()
+
+    def _await_return(self) -> None:
+        """Wait for who has yet to come back to a world that was started again as its run was over."""
+        while self._world.barrier.away() and self._stopped() is None:
+            self._inputs.wait(TICK_S)
+            self._take_in()
+            self._serve_others()
+            self._outputs.flush()
 
     # What other threads bring
 
@@ -213,6 +263,7 @@ class WorldProcess:
                 answer = self._answer(query.request(), replaying)
             except DecodeError as error:
                 answer = ControlAnswer(ok=False, error=str(error))
+            self._journal.commit()
             query.answer(answer)
             self._outputs.flush()
         else:
@@ -234,7 +285,10 @@ class WorldProcess:
             return self._history.replay(request.args, self._readable_by(process))
         if process is not None:
             return ControlAnswer(ok=False, error=f"op is {request.op[:40]!r}; must be replay")
-        return self._world.control(request)
+        answer = self._world.control(request)
+        if self._world.ended is None:
+            self._journal.note(Controlled(messages.encode(request)))
+        return answer
 
     def _readable_by(self, process: str | None) -> tuple[str, ...]:
         if process is None or not self._link.guarded:
@@ -242,6 +296,11 @@ class WorldProcess:
         return rights.of(process, self._world.scenario).reads
 
     # Publication
+
+    def _progress(self, kind: str, message: Any, about: str) -> None:
+        """Show progress, but not once more what a world before this one has shown."""
+        if not self._resumes:
+            self._shown(kind, message, about)
 
     def _on_message(self, key: str, message: Any) -> None:
         if key == keys.CLOCK:
@@ -251,9 +310,8 @@ class WorldProcess:
             self._progress("event", message, self._intake.phase)
 
     def _publish_health(self) -> None:
-        health = self.health.message(self._world.now_ns, self._health_seq)
-        self._health_seq += 1
-        self._outputs.publish(Output(keys.process(WORLD, "health"), health))
+        health = self.health.message(self._world.now_ns, self._world.outbox.next_seq(HEALTH))
+        self._outputs.publish(Output(HEALTH, health))
         self._progress("health", health, WORLD)
 
     def _publish_view(self, wall_ns: int) -> None:
@@ -272,8 +330,9 @@ def run(
     progress: ProgressCallback = lambda kind, message, about: None,
     ready: Callable[[], None] = lambda: None,
     identity: Identity | None = None,
+    journal: RunJournal | None = None,
 ) -> None:
-    """Listen on the endpoints, call `ready`, and run the world to its end.
+    """Listen on the endpoints, call `ready`, and run the world to its end, from where its journal ends.
 
     Raises:
         SessionError: an endpoint is taken, or the identity is of no use.
@@ -281,4 +340,4 @@ def run(
     mode: Mode = "lockstep" if world.clock.mode == "lockstep" else "realtime"
     with connection.listen(endpoints, world.scenario.federation, mode, identity) as link:
         ready()
-        WorldProcess(link, world, stopped, progress).run()
+        WorldProcess(link, world, stopped, progress, journal).run()

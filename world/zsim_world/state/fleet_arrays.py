@@ -8,7 +8,7 @@ whose four rotors stand elsewhere, R is five.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -174,6 +174,15 @@ class Arrays(NamedTuple):
     senses: Senses
     wind: NDArray  # (air.WIND.size,)
     gust: NDArray  # (N, 3), m/s
+
+
+def state_arrays(group: tuple[object, ...]) -> Iterator[NDArray]:
+    """Yield all arrays of a fleet but those that are found again: a flight goes on from their numbers alone."""
+    for member in group:
+        if isinstance(member, np.ndarray):
+            yield member
+        elif isinstance(member, tuple) and not isinstance(member, NearPairs):
+            yield from state_arrays(member)
 
 
 class PerRotor(NamedTuple):

@@ -1,0 +1,87 @@
+"""A world that goes on where another one died: from a checkpoint, by all that it was handed since."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from zsim.contract import keys, messages
+from zsim.contract.run_messages import ControlRequest
+from zsim.errors import RunError
+from zsim.transport.session import ReceivedSample
+from zsim_world.flight.coordinator import Coordinator
+from zsim_world.flight.world import World
+from zsim_world.server.message_history import MessageHistory
+from zsim_world.server.run_journal import (
+    Advanced,
+    Controlled,
+    Died,
+    Entry,
+    GivenUp,
+    Kept,
+    RunJournal,
+    Taken,
+)
+from zsim_world.server.world_inputs import MessageIntake
+from zsim_world.server.world_outputs import WorldOutputs
+
+
+@dataclass(eq=False)
+class Resumption:
+    """Brings a world that is new to where the journal ends; nothing of it is published again."""
+
+    world: Coordinator
+    journal: RunJournal
+    history: MessageHistory
+    intake: MessageIntake
+    outputs: WorldOutputs
+
+    def run(self) -> bool:
+        """Do it; return whether there was a journal to go on from.
+
+        Raises:
+            RunError: the journal is of another run, or its state does not fit the scenario.
+        """
+        checkpoint = self.journal.open()
+        world = self.world
+        if not isinstance(world, World):
+            return False
+        if checkpoint is None:
+            world.keep_truth(self.journal.keep_truth)
+            return False
+        world.keep_truth(self.journal.keep_truth, self.journal.truth(checkpoint.truth_bytes))
+        if checkpoint.state is not None:
+            self._restore(world, checkpoint.state)
+        for entry in self.journal.entries():
+            self._hand(entry)
+        self.outputs.gather()
+        self.outputs.forget()
+        return True
+
+    def _restore(self, world: World, state: dict[str, Any]) -> None:
+        try:
+            world.restore(state["world"])
+            self.history.restore(state["last"])
+        except (KeyError, TypeError, ValueError) as error:
+            text = f"the checkpoint does not fit this version of zsim ({type(error).__name__}: {error})"
+            raise RunError(f"{text}; fly the run again") from error
+
+    def _hand(self, entry: Entry) -> None:
+        """Hand the world once more what it was handed, and keep what follows from it."""
+        match entry:
+            case Taken(wall_ns, key, payload):
+                self.intake.take_again(wall_ns, ReceivedSample(key, payload))
+                return
+            case Advanced(wall_ns, late):
+                self.world.statistics.world_misses += late
+                self.world.advance(wall_ns)
+            case Died(wall_ns, name):
+                self.world.handle_death(name, wall_ns)
+            case Controlled(request):
+                self.world.control(messages.decode_as(ControlRequest, request, keys.CONTROL))
+            case GivenUp(name):
+                self.world.give_up_outputs(name)
+            case Kept(key, payload):
+                self.history.add(key, payload, self.world.now_ns)
+                self.world.outbox.next_seq(key)
+            case _:
+                raise AssertionError(entry)
+        self.outputs.gather()
