@@ -72,11 +72,12 @@ class RealTimeFactor:
 
     def snapshot(self) -> State:
         """Return what was noted."""
-        return {"start_wall_ns": self._start_wall_ns, "last": list(self._last), "sim_ns": self._sim_ns}
+        marks = [list(mark) for mark in self._marks]
+        return {"marks": marks, "start_wall_ns": self._start_wall_ns, "last": list(self._last), "sim_ns": self._sim_ns}
 
     def restore(self, state: State) -> None:
         """Take over what `snapshot` returned."""
-        self._marks.clear()
+        self._marks = deque(map(tuple, state["marks"]))
         self._start_wall_ns, self._sim_ns = state["start_wall_ns"], state["sim_ns"]
         self._last = tuple(state["last"])
 

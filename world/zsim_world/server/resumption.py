@@ -17,6 +17,7 @@ from zsim_world.server.run_journal import (
     Entry,
     GivenUp,
     Kept,
+    Resumed,
     RunJournal,
     Taken,
 )
@@ -79,6 +80,8 @@ class Resumption:
                 self.world.control(messages.decode_as(ControlRequest, request, keys.CONTROL))
             case GivenUp(name):
                 self.world.give_up_outputs(name)
+            case Resumed(wall_ns):
+                self.world.await_return(wall_ns)
             case Kept(key, payload):
                 self.history.add(key, payload, self.world.now_ns)
                 self.world.outbox.next_seq(key)

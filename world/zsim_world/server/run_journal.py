@@ -77,7 +77,13 @@ class Kept(Entry, tag=5):
     payload: bytes
 
 
-_Entry = Taken | Advanced | Died | Controlled | GivenUp | Kept
+class Resumed(Entry, tag=6):
+    """That another incarnation of the world went on here."""
+
+    wall_ns: int
+
+
+_Entry = Taken | Advanced | Died | Controlled | GivenUp | Kept | Resumed
 _encode = msgspec.msgpack.Encoder().encode
 _decode = msgspec.msgpack.Decoder(list[_Entry]).decode
 

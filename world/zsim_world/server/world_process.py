@@ -26,7 +26,7 @@ from zsim_world.server.liveliness import LivelinessMonitor
 from zsim_world.server.message_history import MessageHistory
 from zsim_world.server.pacing import Pacer, Pipelining
 from zsim_world.server.resumption import Resumption
-from zsim_world.server.run_journal import Advanced, Controlled, Died, RunJournal
+from zsim_world.server.run_journal import Advanced, Controlled, Died, Resumed, RunJournal
 from zsim_world.server.world_inputs import TICK_S, MessageIntake, ProgressCallback, open_inputs
 from zsim_world.server.world_outputs import WorldOutputs
 
@@ -123,7 +123,9 @@ class WorldProcess:
         resumed = Resumption(self._world, self._journal, self._history, self._intake, self._outputs).run()
         self._resumes = False
         if resumed:
-            self._world.await_return(time.monotonic_ns())
+            wall_ns = time.monotonic_ns()
+            self._world.await_return(wall_ns)
+            self._journal.note(Resumed(wall_ns))
             self._liveliness.check_all()
             self._shown("resumed", self._world.now_ns, WORLD)
 
