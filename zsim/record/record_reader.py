@@ -1,7 +1,7 @@
 """Reads a record, whole or cut at any byte, from a file or the folder of a run."""
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from mmap import ACCESS_READ, mmap
 from operator import itemgetter
 from pathlib import Path
@@ -114,6 +114,20 @@ class RecordReader:
             for chunk in reversed(self._chunks):
                 if number in chunk.channels and (recorded := list(self._as_written([chunk], {number: key}))):
                     return recorded[-1]
+        return None
+
+    def last_chunk(self, key: str, is_it: Callable[[bytes], bool]) -> tuple[int, list[Recorded]] | None:
+        """Return where the chunk with the last message of a key begins, and what stands in it before that message.
+
+        Args:
+            is_it: returns, by the payload, whether it is the one that is meant.
+        """
+        channels = {number for number, name in self._keys.items() if name == key}
+        for chunk in reversed([chunk for chunk in self._chunks if not chunk.channels.isdisjoint(channels)]):
+            written = list(self._as_written([chunk], self._keys))
+            places = [i for i, each in enumerate(written) if each.key == key and is_it(each.payload)]
+            if places:
+                return chunk.place.start, written[: places[-1]]
         return None
 
     def close(self) -> None:

@@ -65,23 +65,38 @@ def run(
     ] = False,
     console: Annotated[bool, typer.Option("--console", help="Show it in the browser, and steer it there.")] = False,
     report: Annotated[bool, typer.Option(help="Make the report at the end.")] = True,
+    continue_: Annotated[
+        bool, typer.Option("--continue", help="SCENARIO is the folder of a run that was interrupted: it goes on.")
+    ] = False,
     order: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
     """Fly a scenario: start every process, show progress, record, report."""
     from zsim.runtime.progress import Screen
-    from zsim_deploy.launch.run import RunOptions, check_endpoint, make_directory, run_in_process, run_processes
+    from zsim_deploy.launch.run import (
+        RunOptions,
+        check_endpoint,
+        make_directory,
+        options_of,
+        run_in_process,
+        run_processes,
+    )
     from zsim_deploy.launch.supervisor import Outcome
 
     if in_process:
         _refuse_with_others(flight, listen, hosted, console)
     if console:
         require("console", bridge_commands.CONSOLE_NEEDS)
-    check_endpoint(listen, insecure)
-    loaded = flight.scenario()
-    mode, pace = flight.mode_and_rate()
-    folder, first = make_directory(out, loaded), [name for name in order.split(",") if name]
-    options = RunOptions(loaded, folder, mode, pace, listen, insecure, hosted, first, console)
-    with Screen(loaded.duration_s) as screen:
+    if continue_:
+        _refuse_to_change(flight, out, in_process, listen, insecure, hosted)
+        options, in_process = options_of(flight.path)
+        options.console = console
+    else:
+        check_endpoint(listen, insecure)
+        loaded = flight.scenario()
+        mode, pace = flight.mode_and_rate()
+        folder, first = make_directory(out, loaded), [name for name in order.split(",") if name]
+        options = RunOptions(loaded, folder, mode, pace, listen, insecure, hosted, first, console)
+    with Screen(options.scenario.duration_s) as screen:
         try:
             outcome = run_in_process(options, screen) if in_process else run_processes(options, screen)
         except KeyboardInterrupt as error:
@@ -101,6 +116,27 @@ def _refuse_with_others(flight: FlightOptions, listen: str | None, hosted: bool,
     useless = " and ".join(name for name, is_given in options.items() if is_given)
     if useless:
         raise typer.BadParameter(f"--in-process is lockstep, unpaced, without Zenoh; leave out {useless}, or it")
+
+
+def _refuse_to_change(
+    flight: FlightOptions, out: Path | None, in_process: bool, listen: str | None, insecure: bool, hosted: bool
+) -> None:
+    """Refuse options that would make another run of one that goes on."""
+    given = {
+        "--seed": flight.seed,
+        "--duration": flight.duration,
+        "--realtime": flight.realtime or None,
+        "--rate": flight.rate,
+        "--set": flight.overrides or None,
+        "--out": out,
+        "--in-process": in_process or None,
+        "--listen": listen,
+        "--insecure": insecure or None,
+        "--hosted": hosted or None,
+    }
+    useless = " and ".join(name for name, value in given.items() if value is not None)
+    if useless:
+        raise typer.BadParameter(f"--continue goes on as the run was launched; leave out {useless}")
 
 
 @app.command(rich_help_panel=RUN)

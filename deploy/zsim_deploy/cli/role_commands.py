@@ -49,6 +49,7 @@ def world(
     journal: Annotated[
         Path | None, typer.Option(help="Folder of the run's journal: started again with it, it goes on.")
     ] = None,
+    all_died: Annotated[bool, typer.Option("--all-died", hidden=True)] = False,
     launched: Launched = None,
     tls: Tls = None,
     access: Access = None,
@@ -63,7 +64,7 @@ def world(
     loaded = scenario_file.load(path, overrides, seed=flight.seed, duration_s=flight.duration)  # needs no agent's class
     mode, pace = flight.mode_and_rate()
     who = identity(host, tls, insecure, access)
-    world_role.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who, journal)
+    world_role.world(loaded, mode, pace, listen or [DEFAULT_ENDPOINT], launched, expect, who, journal, all_died)
 
 
 def _agent_command(name: str, role: Role) -> Callable[..., None]:

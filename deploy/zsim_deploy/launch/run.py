@@ -10,27 +10,35 @@ from pathlib import Path
 
 from zsim.errors import RecordError, RunError, SessionError
 from zsim.record import repair
+from zsim.record.record_reader import RECORD
 from zsim.runtime.progress import Screen
 from zsim.scenario import scenario_file
 from zsim.scenario.scenario import Scenario
 from zsim.transport.tls import Identity
 from zsim_agents.hosting import agents_of
-from zsim_deploy.arguments import CONSOLE_PORT, pace_options
+from zsim_deploy.arguments import CONSOLE_PORT, load_scenario, pace_options
+from zsim_deploy.launch import interrupted_run
 from zsim_deploy.launch.child_process import ChildProcess
 from zsim_deploy.launch.end_signals import CLOSED, EndSignals
+from zsim_deploy.launch.interrupted_run import JOURNAL, Launch
 from zsim_deploy.launch.role_launcher import RoleLauncher
 from zsim_deploy.launch.supervisor import Outcome, Supervisor
 from zsim_deploy.roles.stop_channel import REASONS, StopChannel, handled_by
 
 DEFAULT_PORT = 7447  # Zenoh's own
-JOURNAL = "journal"  # of the world, in the folder of a run
 CONSOLE = "console.run"  # the one that a run starts: not to be taken over by the first that is started by hand
 PORTS_TRIED = 5  # when other runs that start at this moment take each before our world listens
 
 
 @dataclass
 class RunOptions:
-    """How to run a scenario."""
+    """How to run a scenario.
+
+    Attributes:
+        out: folder of the run.
+        order: names of processes in the order in which they are started.
+        continued: whether it goes on where an earlier launch of it was interrupted.
+    """
 
     scenario: Scenario
     out: Path
@@ -41,6 +49,8 @@ class RunOptions:
     hosted: bool = False
     order: list[str] = field(default_factory=list)
     console: bool = False
+    run_id: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
+    continued: bool = False
 
 
 def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launcher: RoleLauncher) -> list[ChildProcess]:
@@ -48,11 +58,11 @@ def _children(options: RunOptions, endpoint: str, supervisor: Supervisor, launch
     logs, file = options.out / "logs", options.out / "scenario.yaml"
     scenario, federation = options.scenario, options.scenario.federation
     # Another run's world may listen where ours could not: nobody of this run is to join that one.
-    launched = ["--launched", uuid.uuid4().hex[:12], *(["--insecure"] if options.insecure else [])]
+    launched = ["--launched", options.run_id, *(["--insecure"] if options.insecure else [])]
     reach = ["--connect", endpoint, "--federation", federation, *launched]
     pace = pace_options(options.mode, options.rate)
     world = ["world", str(file), "--listen", endpoint, "--expect", "recorder", *pace, *launched]
-    world += ["--journal", str(options.out / JOURNAL)]
+    world += ["--journal", str(options.out / JOURNAL), *(["--all-died"] if options.continued else [])]
     record = ["record", "--out", str(options.out), *reach]
     children = [
         ChildProcess("world", world, logs, launcher, supervisor.handle_line),
@@ -136,6 +146,23 @@ def make_directory(out: Path | None, scenario: Scenario) -> Path:
     return folder
 
 
+def options_of(folder: Path) -> tuple[RunOptions, bool]:
+    """Return how an interrupted run goes on, and whether in one process: then it is flown once more, as all of it.
+
+    Raises:
+        RunError, RecordError: nothing of it is left to fly, or it cannot be gone on with.
+    """
+    launch = interrupted_run.launch_of(folder)
+    if launch.in_process:
+        (folder / RECORD).unlink(missing_ok=True)
+    else:
+        interrupted_run.reopen_record(folder)
+    scenario = load_scenario(folder / "scenario.yaml", None)
+    pace = (launch.mode, launch.rate)
+    where = (launch.listen, launch.insecure, launch.hosted)
+    return RunOptions(scenario, folder, *pace, *where, run_id=launch.run_id, continued=True), launch.in_process
+
+
 def _fresh(folder: Path) -> Path:
     """Return a folder that is not there yet: two runs may start within one second."""
     names = [folder, *(folder.with_name(f"{folder.name}-{i}") for i in range(2, 1000))]
@@ -155,6 +182,7 @@ def run_processes(options: RunOptions, screen: Screen) -> Outcome:
         except KeyboardInterrupt:
             with contextlib.suppress(OSError):
                 (options.out / "logs").rmdir()  # nobody has written there: the folder may be used again
+                interrupted_run.forget(options.out)
             raise
         with contextlib.suppress(RecordError):
             repair(options.out / "run.mcap")
@@ -163,7 +191,8 @@ def run_processes(options: RunOptions, screen: Screen) -> Outcome:
 
 def _run(options: RunOptions, screen: Screen, signals: EndSignals) -> Outcome:
     scenario, listen = options.scenario, options.listen
-    _write_scenario(options, logs=True)
+    if not options.continued:
+        _write_scenario(options, in_process=False)
     screen.say(f"{scenario.name}: {len(scenario.drones)} drones, {scenario.duration_s:g} s, into {options.out}")
     with RoleLauncher(screen.say, str(options.out)) as launcher:
         if listen:
@@ -202,16 +231,19 @@ def _lost_port(outcome: Outcome, endpoint: str, port: int) -> bool:
     return outcome.failed and f"cannot listen on {endpoint}" in outcome.reason and not _is_free(port)
 
 
-def _write_scenario(options: RunOptions, logs: bool) -> None:
-    """Put what is to be flown into the run's folder.
+def _write_scenario(options: RunOptions, in_process: bool) -> None:
+    """Put what is to be flown, and how, into the run's folder.
 
     Raises:
         RunError: it cannot be written.
     """
+    pace = (options.mode, options.rate)
+    launch = Launch(options.run_id, *pace, in_process, options.hosted, options.insecure, options.listen)
     try:
-        if logs:
+        if not in_process:
             (options.out / "logs").mkdir()
         (options.out / "scenario.yaml").write_text(scenario_file.to_text(options.scenario))
+        interrupted_run.keep(options.out, launch)
     except OSError as error:
         raise RunError(f"{options.out}: cannot be written ({error.strerror}); give --out another folder") from error
 
@@ -221,7 +253,8 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
     from zsim_analysis.in_process import fly
     from zsim_world.fleet.fleet import DivergedError
 
-    _write_scenario(options, logs=False)
+    if not options.continued:
+        _write_scenario(options, in_process=True)
     with EndSignals(options.out / "run.log", screen.hang_up) as signals:
         stop = StopChannel()
 
@@ -234,4 +267,7 @@ def run_in_process(options: RunOptions, screen: Screen) -> Outcome:
             return Outcome(str(error), failed=True)
         finally:
             stop.restore_signals()
-        return Outcome(ended, interrupted=reason() is not None)
+        interrupted = reason() is not None
+        if not interrupted:
+            interrupted_run.forget(options.out)
+        return Outcome(ended, interrupted=interrupted)

@@ -39,8 +39,13 @@ def world(
     expect: list[str] | None,
     identity: Identity,
     journal: Path | None = None,
+    all_died: bool = False,
 ) -> None:
     """Run the world of a scenario on the endpoints until the scenario ends or somebody stops it.
+
+    Args:
+        journal: folder of it.
+        all_died: whether, when the run goes on from there, all who took part in it have to be started again.
 
     Raises:
         RunError: the journal is of another run.
@@ -61,13 +66,13 @@ def world(
     sha256 = scenario_file.sha256(scenario_file.to_text(scenario))
     if launched:
         progress = JsonProgress()
-        kept = RunJournal(journal, run_world.run_id, sha256, progress.say)
+        kept = RunJournal(journal, run_world.run_id, sha256, progress.say, all_died)
         run(run_world, endpoints, stop.reason, world_progress(progress), identity=identity, journal=kept)
         stop.exit_if_terminated()
         return
     with Screen(scenario.duration_s) as screen:
         listening = f"world of {scenario.federation!r} on {', '.join(endpoints)}; Ctrl-C ends the run"
-        kept, progress = RunJournal(journal, run_world.run_id, sha256, screen.say), world_progress(screen)
+        kept, progress = RunJournal(journal, run_world.run_id, sha256, screen.say, all_died), world_progress(screen)
         run(run_world, endpoints, stop.reason, progress, lambda: screen.say(listening), identity, kept)
         screen.say(f"ended: {run_world.ended}")
 

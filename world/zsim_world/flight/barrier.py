@@ -249,19 +249,20 @@ class Barrier:
         participant = self.participants.get(name)
         if participant is None or not participant.alive:
             return None
-        participant.alive = False
+        participant.alive = participant.away = False
         participant.since_wall_ns = wall_ns
         return participant
 
-    def await_return(self, wall_ns: int) -> None:
+    def await_return(self, wall_ns: int, all_died: bool) -> None:
         """Wait for everybody who is waited for to come back to a world that was started again."""
         for participant in self.participants.values():
             participant.since_wall_ns = participant.joined_wall_ns = wall_ns
-            participant.away = participant.alive and participant.is_waited_for
+            participant.alive = participant.alive and not all_died
+            participant.away = participant.is_waited_for and (participant.alive or all_died)
 
     def away(self) -> list[Participant]:
-        """Return who lives, and has not come back yet."""
-        return [p for p in self.participants.values() if p.away and p.alive]
+        """Return who has not come back yet."""
+        return [p for p in self.participants.values() if p.away]
 
     def substitute(self, name: str) -> Participant | None:
         """Return who lives and does all the work of a participant beside its own."""

@@ -202,10 +202,14 @@ class Coordinator(ABC):
         """Return the action when a process has died."""
         return on_death(self.scenario.processes.on_death, participant.name, participant.join.role)
 
-    def await_return(self, wall_ns: int) -> None:
-        """Let time stand, in a world that was started again, until those who took part are back or dead."""
+    def await_return(self, wall_ns: int, all_died: bool) -> None:
+        """Let time stand, in a world that was started again, until those who took part are back or dead.
+
+        Args:
+            all_died: whether they have to be started again, too.
+        """
         self.statistics.rate.stand_still(wall_ns)
-        self.barrier.await_return(wall_ns)
+        self.barrier.await_return(wall_ns, all_died)
 
     # Requests
 

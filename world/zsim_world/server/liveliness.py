@@ -12,6 +12,7 @@ from zsim_world.flight.barrier import Barrier
 
 BYE_NS = 100_000_000  # wall time by which a bye may come after the loss of its process's token
 RETURN_NS = 5_000_000_000  # wall time in which a process is back at a world that was started again; 1 s measured
+START_NS = 60_000_000_000  # wall time in which one that has to be started again is there; a small computer needs 20 s
 NEW_TOKEN_NS = 1_500_000_000  # wall time within which a router knows a new token; up to 1 s measured
 TOKENS_S = 1.0  # a router answers which tokens it knows within milliseconds
 SILENT_S = 10  # seconds of health in a row that one that only reads may leave out; its link is given up after as many
@@ -70,8 +71,10 @@ class LivelinessMonitor:
 
     def check_all(self) -> None:
         """Check, after the time that it takes to come back, everybody who took part before the world was restarted."""
-        due_ns = time.monotonic_ns() + RETURN_NS
-        self._checks |= {name: _Check(due_ns, again=False) for name, p in self._participants.items() if p.alive}
+        for name, participant in self._participants.items():
+            wait_ns = RETURN_NS if participant.alive else START_NS
+            if participant.away or participant.alive:
+                self._checks[name] = _Check(time.monotonic_ns() + wait_ns, again=False)
 
     def before_join(self, name: str, join: Join) -> None:
         """Prepare for a join: another process of that name whose token is lost has died before."""
@@ -102,8 +105,8 @@ class LivelinessMonitor:
         participant = self._participants.get(name)
         if participant is None:
             return
+        participant.away = False  # from here on it is dead, or one that does not join again
         if keys.token(name) in self._link.tokens(keys.token(name), timeout_s=TOKENS_S):
-            participant.away = False  # one that does not join again
             if check.again:  # a successor's, or one that Zenoh has not forgotten yet
                 self._checks[name] = _Check(now_ns + NEW_TOKEN_NS, again=False)
         elif now_ns - participant.joined_wall_ns < NEW_TOKEN_NS:  # a new token is not always found at once

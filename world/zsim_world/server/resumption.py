@@ -80,8 +80,8 @@ class Resumption:
                 self.world.control(messages.decode_as(ControlRequest, request, keys.CONTROL))
             case GivenUp(name):
                 self.world.give_up_outputs(name)
-            case Resumed(wall_ns):
-                self.world.await_return(wall_ns)
+            case Resumed(wall_ns, all_died):
+                self.world.await_return(wall_ns, all_died)
             case Kept(key, payload):
                 self.history.add(key, payload, self.world.now_ns)
                 self.world.outbox.next_seq(key)

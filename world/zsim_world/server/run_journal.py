@@ -24,6 +24,11 @@ from zsim.contract.messages import REFUSALS
 from zsim.contract.snapshot import State, pack, unpack
 from zsim.errors import DecodeError, RunError
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
 VERSION = 1  # of the files
 CHECKPOINT_NS = 5_000_000_000  # simulated time between two; the history that a replay refills reaches back as far
 CHECKPOINT_WALL_NS = 1_000_000_000  # wall time between two at least: a checkpoint of 1000 drones has 20 MB
@@ -81,6 +86,7 @@ class Resumed(Entry, tag=6):
     """That another incarnation of the world went on here."""
 
     wall_ns: int
+    all_died: bool
 
 
 _Entry = Taken | Advanced | Died | Controlled | GivenUp | Kept | Resumed
@@ -113,11 +119,18 @@ class RunJournal:
         folder: of this run alone; it is made.
         run_id, scenario_sha256: of the run.
         say: takes a line where the journal cannot be written any more.
+        all_died: whether all who took part in a run that goes on have to be started again.
     """
 
     def __init__(
-        self, folder: Path | None, run_id: str = "", scenario_sha256: str = "", say: Callable[[str], None] = print
+        self,
+        folder: Path | None,
+        run_id: str = "",
+        scenario_sha256: str = "",
+        say: Callable[[str], None] = print,
+        all_died: bool = False,
     ) -> None:
+        self.all_died = all_died
         self._folder = folder
         self._head = _Head(VERSION, run_id, scenario_sha256)
         self._say = say
@@ -243,11 +256,21 @@ class RunJournal:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             self._truth = os.open(self._folder / "truth", os.O_RDWR | os.O_CREAT, 0o644)
+            self._lock()
             found = self._newest()
             self._file = self._open_entries(self._number)
         except OSError as error:
             raise RunError(f"{self._folder}: no journal can be kept there ({error.strerror})") from error
         return found
+
+    def _lock(self) -> None:
+        """Keep others from this journal for as long as this process lives."""
+        if fcntl is None:
+            return
+        try:
+            fcntl.flock(self._truth, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RunError(f"{self._folder}: another world keeps its journal there; end that one") from error
 
     def _newest(self) -> Checkpoint | None:
         """Return the newest checkpoint but one: the history is refilled from there."""

@@ -124,8 +124,8 @@ class WorldProcess:
         self._resumes = False
         if resumed:
             wall_ns = time.monotonic_ns()
-            self._world.await_return(wall_ns)
-            self._journal.note(Resumed(wall_ns))
+            self._world.await_return(wall_ns, self._journal.all_died)
+            self._journal.note(Resumed(wall_ns, self._journal.all_died))
             self._liveliness.check_all()
             self._shown("resumed", self._world.now_ns, WORLD)
 

@@ -1,0 +1,77 @@
+"""A run that was interrupted: how it was launched, kept beside the journal of its world, and where it goes on."""
+
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+
+from zsim.contract import keys, messages
+from zsim.errors import DecodeError, RunError
+from zsim.record.record_cut import cut_at_last
+from zsim.record.record_reader import RECORD
+
+JOURNAL = "journal"  # in the folder of a run; what the world hands itself is there too
+LAUNCH = "launch.json"
+
+
+class Launch(msgspec.Struct, frozen=True):
+    """How a run was launched."""
+
+    run_id: str
+    mode: str = "lockstep"
+    rate: float = 0.0
+    in_process: bool = False
+    hosted: bool = False
+    insecure: bool = False
+    listen: str | None = None
+
+
+def keep(folder: Path, launch: Launch) -> None:
+    """Note how a run is launched.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    (folder / JOURNAL).mkdir(exist_ok=True)
+    (folder / JOURNAL / LAUNCH).write_bytes(msgspec.json.encode(launch))
+
+
+def forget(folder: Path) -> None:
+    """Remove the note: nothing flew, or all of it."""
+    with suppress(OSError):
+        (folder / JOURNAL / LAUNCH).unlink(missing_ok=True)
+        (folder / JOURNAL).rmdir()
+
+
+def launch_of(folder: Path) -> Launch:
+    """Return how a run was launched that is to go on.
+
+    Raises:
+        RunError: nothing is left of it to do, or it is no run.
+    """
+    place = folder / JOURNAL / LAUNCH
+    try:
+        return msgspec.json.decode(place.read_bytes(), type=Launch)
+    except FileNotFoundError as error:
+        state = "is over" if (folder / RECORD).exists() else "is not there"
+        raise RunError(f"{folder}: the run {state}; must be the folder of one that was interrupted") from error
+    except (OSError, msgspec.MsgspecError) as error:
+        raise RunError(f"{place}: cannot be read ({error}); must be as zsim run has left it") from error
+
+
+def reopen_record(folder: Path) -> None:
+    """Take the end of the interrupted run off its record.
+
+    Raises:
+        RecordError: it cannot be written, or another process writes it.
+    """
+    record = folder / RECORD
+    if record.exists():
+        cut_at_last(record, keys.EVENT, _is_end)
+
+
+def _is_end(payload: bytes) -> bool:
+    try:
+        return messages.decode(keys.EVENT, payload).kind == "end"
+    except DecodeError:
+        return False
