@@ -15,6 +15,7 @@ class KnownMessages:
 
     def __init__(self) -> None:
         self._known: dict[tuple[str, bytes], None] = {}
+        self._numbered = False  # whether all of them have numbers
 
     def __bool__(self) -> bool:
         return bool(self._known)
@@ -25,6 +26,7 @@ class KnownMessages:
     def add(self, key: str, payload: bytes) -> None:
         """Remember a message."""
         self._known[key, payload] = None
+        self._numbered = False
         if len(self._known) > KNOWN_MAX:
             del self._known[next(iter(self._known))]
 
@@ -36,6 +38,12 @@ class KnownMessages:
             for recorded in reader.messages(by_time=False, from_ns=max(0, last_ns - TAIL_NS)):
                 self.add(recorded.key, recorded.payload)
         return last_ns
+
+    def keep_numbered(self) -> None:
+        """Forget those that somebody may well publish once more: what is none of the contract has no numbers."""
+        if not self._numbered:
+            self._known = {entry: None for entry in self._known if messages.type_of(entry[0]) is not None}
+            self._numbered = True
 
     def clear(self) -> None:
         """Forget all of them: what passes from now on is new."""

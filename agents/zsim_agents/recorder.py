@@ -37,6 +37,7 @@ REPLAY_S = 5.0  # a hub answers within milliseconds
 DRAIN_S = 1.0  # after `stopped`, how long the byes of the others are waited for
 STOP_DRAIN_S = 0.5  # after a stop is requested, how long the end of the run is waited for: both may be stopped at once
 FLUSH_NS = 1_000_000_000  # simulated time after which what was taken is put on disk
+REPEATED_NS = 1_000_000_000  # simulated, after catching up, in which others may repeat what they had published before
 SLACK_NS = 4_000_000_000  # that the world may be ahead of it; its history has 5 s
 
 
@@ -90,6 +91,7 @@ class Recorder:
         self._clock = msgspec.msgpack.Decoder(run_messages.Clock)
         self._known = KnownMessages()
         self._caught_up = False
+        self._known_until_ns = 0
         self._over = threading.Event()
         self._successor: str | None = None
         self._ended_s: float | None = None
@@ -222,7 +224,7 @@ class Recorder:
                 for key, payload in replay(self._link, self._name, -1, ["**"], REPLAY_S):
                     self._write(key, payload)
                     self._known.add(key, payload)
-                self._caught_up = True
+                self._caught_up, self._known_until_ns = True, self._now_ns + REPEATED_NS
             except NoWorldError:
                 self._over.wait(TICK_S)
 
@@ -276,8 +278,10 @@ class Recorder:
             return  # garbage by somebody else on `clock`; recorded as it came
         if clock.state == "stopped" and clock.run_id == self._info.run_id and self._ended_s is None:
             self._ended_s = time.monotonic()
+        elif self._caught_up and clock.t_ns > self._known_until_ns:
+            self._known.clear()
         elif self._caught_up:
-            self._known.clear()  # whatever passed after a clock that was not replayed was not replayed either
+            self._known.keep_numbered()  # whatever passed after a clock that was not replayed was not replayed either
 
     def _on_event(self, payload: bytes) -> None:
         try:

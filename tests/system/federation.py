@@ -109,16 +109,14 @@ class Role:
                 self.lines.append(line)
             self._news.notify_all()
 
-    def line(self, pattern: str, within_s: float = PATIENCE_S) -> Line:
-        """Return the first line in which a pattern is found, waiting for it."""
+    def line(self, pattern: str, within_s: float = PATIENCE_S, number: int = 1) -> Line:
+        """Return the first line, or that of a number, in which a pattern is found, waiting for it."""
         until_s = time.monotonic() + within_s
-        seen = 0
         with self._news:
             while True:
-                for line in self.lines[seen:]:
-                    if re.search(pattern, line.text):
-                        return line
-                seen = len(self.lines)
+                matching = [line for line in self.lines if re.search(pattern, line.text)]
+                if len(matching) >= number:
+                    return matching[number - 1]
                 left_s = until_s - time.monotonic()
                 if self._closed or left_s <= 0:
                     break

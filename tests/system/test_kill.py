@@ -197,12 +197,56 @@ def test_a_stopped_recorder(federation: Federation) -> None:
     check_whole(check_end(federation, whole=True))
 
 
-def test_world(federation: Federation) -> None:
-    flight = Flight(federation)
+@pytest.mark.parametrize("options", [(), pytest.param(("--hosted",), marks=pytest.mark.soak)])
+def test_a_world_that_is_killed_again_and_again_costs_no_bit(
+    federation: Federation, undisturbed: dict[str, np.ndarray], options: tuple[str, ...]
+) -> None:
+    flight = Flight(federation, *options)
+    for kills in range(1, 4):
+        federation.kill("world")
+        flight.run.line(r"world .*ended: killed by signal 9; on_death: restart", number=kills)
+        flight.run.line(r"world: goes on at t = ", number=kills)
+        assert flight.clock.until(lambda m: not m["waiting_for"]), kills
+    flight.finish()
+    record = check_end(federation, whole=True)
+    check_whole(record)
+    assert record.events("death") == []
+    for drone, wanted in undisturbed.items():
+        assert np.array_equal(record.positions(drone)[: len(wanted)], wanted)
+    assert (federation.out / "journal").exists()  # it was stopped, and can go on
+
+
+def test_a_world_that_is_not_to_be_restarted(federation: Federation) -> None:
+    flight = Flight(federation, "--set", "processes.on_death={world: end}")
     federation.kill("world")
     flight.run.line("world .*signal 9")
     flight.run.ends(with_code=1)
     check_end(federation, whole=False)
+
+
+@pytest.mark.parametrize("how", ["Ctrl-C", "kill -9 of everything"])
+def test_an_interrupted_run_goes_on(federation: Federation, undisturbed: dict[str, np.ndarray], how: str) -> None:
+    flight = Flight(federation)
+    if how == "Ctrl-C":
+        flight.run.signal(signal.SIGINT)
+        flight.run.ends(with_code=130)
+    else:
+        for name in ("recorder", "world", "controller.main", "estimator.drone1", "estimator.drone2"):
+            federation.kill(name)
+        flight.run.signal(signal.SIGKILL)
+    federation.nobody_left()
+    reached_ns = federation.record().all("clock")[-1]["t_ns"]
+    again = federation.start("run", "--continue", str(federation.out), "--no-report")
+    client = federation.client()
+    clock = client.subscribe("clock")
+    clock.until(lambda m: m["t_ns"] >= max(END_NS, reached_ns + 1_000_000_000))
+    assert client.request("world/control", "stop")["ok"]
+    again.ends(with_code=0)
+    record = check_end(federation, whole=True)
+    check_whole(record)
+    assert len(record.events("end")) == 1
+    for drone, wanted in undisturbed.items():
+        assert np.array_equal(record.positions(drone)[: len(wanted)], wanted)
 
 
 def test_launcher(federation: Federation) -> None:
