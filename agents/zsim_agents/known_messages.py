@@ -3,9 +3,12 @@
 from pathlib import Path
 
 from zsim.contract import keys, messages
+from zsim.contract.flight_messages import ClusterState, Command, Estimate
+from zsim.contract.run_messages import ClusterRequest
 from zsim.errors import DecodeError
 from zsim.record import RecordReader
 
+OUTPUTS = (Command, Estimate, ClusterState, ClusterRequest)
 KNOWN_MAX = 2_000_000  # messages remembered: 7 s of 1000 drones
 TAIL_NS = 7_000_000_000  # simulated, at the end of a record; the world's history has 5 s
 
@@ -15,7 +18,7 @@ class KnownMessages:
 
     def __init__(self) -> None:
         self._known: dict[tuple[str, bytes], None] = {}
-        self._numbered = False  # whether all of them have numbers
+        self._outputs_only = False
 
     def __bool__(self) -> bool:
         return bool(self._known)
@@ -26,7 +29,7 @@ class KnownMessages:
     def add(self, key: str, payload: bytes) -> None:
         """Remember a message."""
         self._known[key, payload] = None
-        self._numbered = False
+        self._outputs_only = False
         if len(self._known) > KNOWN_MAX:
             del self._known[next(iter(self._known))]
 
@@ -39,15 +42,26 @@ class KnownMessages:
                 self.add(recorded.key, recorded.payload)
         return last_ns
 
-    def keep_numbered(self) -> None:
-        """Forget those that somebody may well publish once more: what is none of the contract has no numbers."""
-        if not self._numbered:
-            self._known = {entry: None for entry in self._known if messages.type_of(entry[0]) is not None}
-            self._numbered = True
+    def keep_outputs(self) -> None:
+        """Forget all but outputs of participants, who repeat them after a rejoin; anything else that comes is new."""
+        if not self._outputs_only:
+            self._known = {entry: None for entry in self._known if _is_output(*entry)}
+            self._outputs_only = True
 
     def clear(self) -> None:
         """Forget all of them: what passes from now on is new."""
         self._known.clear()
+
+
+def _is_output(key: str, payload: bytes) -> bool:
+    kind = messages.type_of(key)
+    if kind is None or not issubclass(kind, OUTPUTS):
+        return False
+    try:
+        messages.decode(key, payload)
+    except DecodeError:
+        return False
+    return True
 
 
 def is_of_run(path: Path, run_id: str) -> bool:

@@ -281,7 +281,7 @@ class Recorder:
         elif self._caught_up and clock.t_ns > self._known_until_ns:
             self._known.clear()
         elif self._caught_up:
-            self._known.keep_numbered()  # whatever passed after a clock that was not replayed was not replayed either
+            self._known.keep_outputs()  # whatever passed after a clock that was not replayed was not replayed either
 
     def _on_event(self, payload: bytes) -> None:
         try:
