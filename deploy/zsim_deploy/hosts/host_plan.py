@@ -19,6 +19,7 @@ from zsim_deploy.inventory import inventory as inv
 from zsim_deploy.inventory.enrolment import folder_of, init_command
 from zsim_deploy.inventory.inventory import SSH_PORT, Host, InventoryFile
 from zsim_deploy.inventory.processes import MODULE, ProcessFiles, access_file, command, own_programs, processes
+from zsim_deploy.launch.interrupted_run import JOURNAL
 from zsim_deploy.roles.stop_channel import FOLDER
 
 ACCESS = "access.json"
@@ -129,7 +130,8 @@ class HostPlan:
         identity = f"{self.keys(process.host)}/{name}"
         files = ProcessFiles(f"{folder}/scenario.yaml", identity, f"{identity}/{ACCESS}", folder)
         role, *options = command(process, files)[len(MODULE) :]
-        return [role, "--launched", self._run_id, *options]
+        journal = ["--journal", f"{folder}/{JOURNAL}"] if name == WORLD else []
+        return [role, "--launched", self._run_id, *journal, *options]
 
     def files(self, host: str) -> dict[str, bytes]:
         """Return what the processes of a host need in the run's folder, by path below it.
