@@ -262,9 +262,95 @@ def test_a_world_whose_time_is_over_says_so(made: Certificates, tmp_path: Path) 
     assert has_terms(line, "world", "certs init --renew")
 
 
-@pytest.mark.parametrize("role", [("estimator", "drone1"), ("controller",), ("record",), ("keys",)])
-def test_a_foreign_certificate_is_a_line_at_once(made: Certificates, tmp_path: Path, role: tuple[str, ...]) -> None:
-    folder = Certificates(tmp_path).of("estimator.drone1")
+@pytest.mark.parametrize(
+    ("role", "name"),
+    [
+        (("estimator", "drone2"), "estimator.drone2"),
+        (("estimator", "drone[2]"), "estimator.drone2"),
+        (("controller",), "controller.main"),
+        (("record",), "recorder"),
+        (("router", "site", "--listen", "{free}"), "router.site"),
+        (("ros1", "--name", "operator.ros"), "operator.ros"),
+    ],
+)
+def test_a_certificate_for_another_name_is_a_line_at_once(
+    federation: Federation, made: Certificates, role: tuple[str, ...], name: str
+) -> None:
+    """Also where the name is known from the world only, as by a pattern."""
+    world = made.identity("world", access_control(scenario_file.from_text(SCENARIO), ROLES, {}))
+    endpoint = tls_endpoint()
+    if "[" in role[-1]:
+        secured = ("--listen", endpoint, "--tls", str(world.tls), "--access", str(world.access))
+        federation.start("world", federation.write(SCENARIO), *secured)
+    folder = made.of("estimator.drone1")
+    line = refusal(*(part.format(free=tls_endpoint()) for part in role), "--connect", endpoint, "--tls", str(folder))
+    assert has_terms(line, str(folder), "estimator.drone1", name, "--tls")
+
+
+def test_a_world_with_the_certificate_of_another_is_a_line_before_it_compiles(
+    made: Certificates, tmp_path: Path
+) -> None:
+    (tmp_path / "scenario.yaml").write_text(SCENARIO)
+    folder = made.of("recorder")
+    line = refusal("world", str(tmp_path / "scenario.yaml"), "--listen", tls_endpoint(), "--tls", str(folder))
+    assert has_terms(line, str(folder), "recorder", "world", "--tls")
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("role", [("estimator", "drone1"), ("keys",), ("echo", "clock")])
+def test_who_is_not_let_in_is_told_so_at_once(made: Certificates, role: tuple[str, ...], way: str) -> None:
+    folder = made.of("estimator.drone1")
+    with ExitStack() as stack:
+        endpoint, _ = stack.enter_context(hub(made, ["recorder"], ["recorder"]))
+        if way != WAYS[0]:
+            endpoint = stack.enter_context(site(made, endpoint, ["recorder"]))
+        line = refusal(*role, "--connect", endpoint, "--tls", str(folder))
+    assert has_terms(line, "estimator.drone1", "world" if way == WAYS[0] else SITE, "recorder", "zsim certs init")
+
+
+# (command, what its line must show) with the certificate of estimator.drone1
+LACKING: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
+    (("keys",), ("read", "**", "world/info")),
+    (("echo", "drone/drone1/truth"), ("read", "drone/drone1/truth", "drone/drone1/sensor/*")),
+    (("hz", "drone/*/estimate"), ("read", "drone/*/estimate", "drone/drone1/estimate")),
+    (
+        ("pub", "drone/drone2/cmd/mode", '{"mode": "land"}'),
+        ("publish", "drone/drone2/cmd/mode", "drone/drone1/estimate"),
+    ),
+    (("ask", "world/control", "pause"), ("ask", "world/control", "world/info")),
+    (("ask", "cluster/main/control", "hold"), ("ask", "cluster/main/control", "world/info")),
+    (("fault", "add", "drone1", "gps_dropout"), ("ask", "world/control", "world/info")),
+    (("fault", "clear"), ("ask", "world/control", "world/info")),
+)
+
+
+def test_a_right_that_is_lacking_is_a_line(federation: Federation, made: Certificates) -> None:
+    rules = access_control(scenario_file.from_text(SCENARIO), ["estimator.drone1", "operator.main"], {})
+    endpoint, world = tls_endpoint(), made.identity("world", rules)
+    secured = ("--listen", endpoint, "--tls", str(world.tls), "--access", str(world.access))
+    federation.start("world", federation.write(SCENARIO), *secured)
+    own, operator = ("--connect", endpoint, "--tls", str(made.of("estimator.drone1"))), str(made.of("operator.main"))
+    for command, terms in LACKING:
+        assert has_terms(refusal(*command, *own), "estimator.drone1", *terms, "zsim certs init"), command
+    allowed = forked_commands.run("echo", "clock", "-n", "1", *own)
+    assert allowed.code == 0, allowed
+    stopped = forked_commands.run("ask", "world/control", "stop", "--connect", endpoint, "--tls", operator)
+    assert stopped.code == 0, stopped
+
+
+@pytest.mark.parametrize(
+    ("role", "name"),
+    [
+        (("estimator", "drone1"), "estimator.drone1"),
+        (("controller",), "controller.main"),
+        (("record",), "recorder"),
+        (("keys",), "operator.main"),
+    ],
+)
+def test_a_foreign_certificate_is_a_line_at_once(
+    made: Certificates, tmp_path: Path, role: tuple[str, ...], name: str
+) -> None:
+    folder = Certificates(tmp_path).of(name)
     with hub(made) as (endpoint, _):
         line = refusal(*role, "--connect", endpoint, "--tls", str(folder))
     assert has_terms(line, endpoint, "authority", "certs init")
@@ -335,7 +421,7 @@ def test_who_listens_elsewhere_than_its_certificate_says(made: Certificates) -> 
     endpoint = tls_endpoint("127.0.0.2")
     with connection.listen([endpoint], "zsim", "lockstep", made.identity("world")):
         line = refusal("keys", "--connect", endpoint, "--tls", str(made.of("operator.main")))
-    assert has_terms(line, endpoint, "127.0.0.2;")
+    assert has_terms(line, endpoint, "127.0.0.1", "127.0.0.2")
 
 
 def test_who_listens_without_tls(made: Certificates) -> None:

@@ -22,6 +22,7 @@ CONTROL = "world/control"
 VIEW_DRONES = "view/drones"
 BATCH = "@batch"  # everything that passed the hub, see zsim.contract.framing
 GATE = "@gate"  # the world's messages about all drones at a gate
+ACCESS = "@access"  # what access control lets a process do, see zsim.transport.permissions
 
 
 def name(text: str, what: str = "name") -> str:
@@ -105,6 +106,11 @@ def parts(key: str) -> tuple[str, str, str]:
 def replay(process_name: str) -> str:
     """Return the key on which the world answers a process for what it may read and missed."""
     return process(process_name, "replay")
+
+
+def access(process_name: str) -> str:
+    """Return the key on which whoever listens answers what the certificate of a process lets it do."""
+    return f"{ACCESS}/{process_name}"
 
 
 def is_sensor(expression: str) -> bool:

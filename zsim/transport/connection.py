@@ -12,7 +12,8 @@ from functools import partial
 from zsim.contract import keys, messages
 from zsim.errors import DecodeError, NoWorldError, SessionError
 from zsim.transport import tls, zenoh_settings
-from zsim.transport.session import Session, config_of, open_session
+from zsim.transport.permissions import Permissions, permissions_of
+from zsim.transport.session import Query, Session, config_of, open_session
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode, Settings
 
@@ -100,7 +101,22 @@ def _listening(
     settings = zenoh_settings.common("router", mode) | zenoh_settings.listening(endpoints, identity) | others
     shown = ", ".join(endpoints)
     with open_session(settings, federation, identity, lambda error: f"cannot listen on {shown} ({error})") as session:
+        if identity.access is not None:
+            _answer_permissions(session, identity)
         yield session
+
+
+def _answer_permissions(session: Session, identity: Identity) -> None:
+    """Answer everybody what its certificate lets it do here; a router answers for itself, not the world behind it."""
+    rules = zenoh_settings.read_access(identity)
+
+    def answer(query: Query) -> None:
+        process = keys.leaf(query.expression)
+        if keys.PROCESS_NAME.fullmatch(process):
+            query.reply(query.expression, messages.encode(permissions_of(rules, session.process, process)))
+        query.end()
+
+    session.declare_queryable(keys.access("*"), answer, complete=True)
 
 
 @contextmanager
@@ -128,7 +144,7 @@ def find_world(
 
     Raises:
         NoWorldError: no world answered within `wait_s`, or `stopped` returned true.
-        SessionError: what no waiting mends: a malformed endpoint, a certificate that is refused.
+        SessionError: what no waiting mends: a malformed endpoint, a certificate that is refused, or not let in.
         BadNameError: the federation's name is outside the contract.
     """
     keys.name(federation, "federation")
@@ -136,8 +152,10 @@ def find_world(
         dial = partial(connect, endpoint, federation, reader=reader, identity=identity)
         link, info = _search(stack, dial, endpoint, federation, wait_s, say, stopped, run_id, identity)
         if info.mode == "realtime":
+            permissions = link.permissions
             stack.pop_all().close()
             link = stack.enter_context(dial(mode="realtime", wait_s=5.0))
+            link.permissions = permissions
         link.use(info.mode)
         yield link, info
 
@@ -162,6 +180,8 @@ def _search(
             if link is None:
                 attempt_s = max(0.05, min(ATTEMPT_S, left_s))
                 link = stack.enter_context(dial(wait_s=attempt_s))
+            if link.process and link.permissions is None:
+                link.permissions = read_permissions(link)
             info = read_info(link)
             if info is not None and run_id in (None, info.run_id):
                 return link, info
@@ -169,7 +189,7 @@ def _search(
         except SessionError as error:
             _refuse_lasting(error)
         if waited_s >= (wait_s if wait_s is not None else float("inf")):
-            why = _no_answer(identity) if link is not None else _no_link(endpoint)
+            why = _no_answer(link, identity) if link is not None else _no_link(endpoint)
             raise NoWorldError(f"no world of federation {federation!r} on {endpoint} within {wait_s:g} s{why}")
         if waited_s >= next_say_s:
             next_say_s = max(2 * next_say_s, 1.0)
@@ -183,10 +203,10 @@ def _refuse_lasting(error: SessionError) -> None:
         raise error
 
 
-def _no_answer(identity: Identity | None) -> str:
-    """Return why a hub that is there may not answer; Zenoh gives no reason to a client that it refuses."""
+def _no_answer(link: Session, identity: Identity | None) -> str:
+    """Return why a hub that is there may not answer; one of another version or federation lets nobody ask for it."""
     may_be = ", but somebody listens there: another federation, a world on its way up, a router without one"
-    if identity is None or identity.tls is None:
+    if identity is None or identity.tls is None or link.permissions is not None:
         return f"{may_be}; correct --federation, or wait longer"
     return (
         f"{may_be}, or we are refused or not allowed here; correct --federation, wait longer, "
@@ -212,6 +232,20 @@ def _opens(endpoint: str) -> bool:
             return True
     except (OSError, OverflowError, ValueError):
         return False
+
+
+def read_permissions(link: Session) -> Permissions | None:
+    """Return what access control at the other end lets us do, None where nobody answers that.
+
+    Raises:
+        SessionError: it does not let us in.
+    """
+    for sample in link.get(keys.access(link.process), timeout_s=ANSWER_S):
+        permissions = messages.decode_as(Permissions, sample.payload, sample.key)
+        if refusal := permissions.refusal():
+            raise SessionError(refusal)
+        return permissions
+    return None
 
 
 def read_info(link: Session) -> messages.Info | None:

@@ -17,7 +17,8 @@ from msgspec import Struct
 from zsim.contract import keys, messages
 from zsim.contract.run_messages import ControlAnswer, ControlRequest
 from zsim.errors import SessionError
-from zsim.transport import zenoh_settings
+from zsim.transport import tls, zenoh_settings
+from zsim.transport.permissions import Act, Permissions
 from zsim.transport.tls import Identity
 from zsim.transport.zenoh_settings import Mode, Settings
 
@@ -207,14 +208,18 @@ class Session:
     Attributes:
         federation: prefix of all keys.
         host: the name of this process's host, as its messages give it.
+        process: the name in its certificate; empty without one.
         guarded: whether access control decides here who may do what.
+        permissions: what access control at the other end lets this process do; None where it has none, or is not asked.
     """
 
     def __init__(self, raw: zenoh.Session, federation: str, identity: Identity) -> None:
         self._raw = raw
         self.federation = federation
         self.host = identity.host
+        self.process = tls.own_name(identity) if identity.tls is not None else ""
         self.guarded = identity.access is not None
+        self.permissions: Permissions | None = None
         self._prefix = f"{federation}/" if federation else ""
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._cached_publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
@@ -247,10 +252,29 @@ class Session:
         self._declared[id(declared)] = declared.undeclare
         return declared
 
+    def _refusal(self, act: Act, expression: str) -> str | None:
+        """Return why access control at the other end would drop what we do, None if it would not."""
+        if self.permissions is None:
+            return None
+        wanted = zenoh.KeyExpr(self._prefix + expression)
+        if any(zenoh.KeyExpr(each).includes(wanted) for each in self.permissions.allowed.get(act, ())):
+            return None
+        return self.permissions.denial(act, expression, self._prefix)
+
+    def _check(self, act: Act, expression: str) -> None:
+        """Refuse what access control at the other end would drop without a reason."""
+        with key_errors(expression):
+            if fault := self._refusal(act, expression):
+                raise SessionError(fault)
+
     # Publishing
 
     def put(self, key: str, message: Struct) -> None:
-        """Publish a message on its key."""
+        """Publish a message on its key.
+
+        Raises:
+            SessionError: our certificate does not let us publish there.
+        """
         self.put_raw(key, messages.encode(message))
 
     def put_raw(self, key: str, payload: bytes) -> None:
@@ -265,6 +289,7 @@ class Session:
             publisher.put(payload)
 
     def _declare(self, key: str) -> zenoh.Publisher:
+        self._check("publish", key)
         view = key.startswith("view/")
         drop = view or (self._realtime and keys.may_drop(key))
         # A queue of its own: in one with others, a view that the hub passes on would wait behind a put that blocks.
@@ -310,8 +335,9 @@ class Session:
         """Return what publishes (payload, attachment) on one key, again and again; a full link loses it.
 
         Raises:
-            SessionError: it is no key.
+            SessionError: it is no key, or our certificate does not let us publish there.
         """
+        self._check("publish", key)
         whole_key, drop = self._prefix + key, zenoh.CongestionControl.DROP
         with key_errors(key):
             publisher = self._raw.declare_publisher(
@@ -358,8 +384,9 @@ class Session:
         """Return a subscription to everything that others publish on an expression, in order.
 
         Raises:
-            SessionError: it is no key expression.
+            SessionError: it is no key expression, or our certificate does not let us read it.
         """
+        self._check("read", expression)
         with key_errors(expression):
             return self._keep(Subscription(self._raw, self._prefix, expression))
 
@@ -374,8 +401,9 @@ class Session:
         """Call back, in a thread of Zenoh's, for everything on an expression until the returned function is called.
 
         Raises:
-            SessionError: it is no key expression.
+            SessionError: it is no key expression, or our certificate does not let us read it.
         """
+        self._check("read", expression)
         with key_errors(expression):
             subscriber = self._raw.declare_subscriber(
                 self._prefix + expression, lambda sample: callback(raw_sample(sample, self._prefix))
@@ -426,6 +454,9 @@ class Session:
         except (OverflowError, UnicodeEncodeError) as error:
             allowed = "must hold whole numbers of 64 bits, and text in UTF-8"
             raise SessionError(f"{key}: {op} cannot be sent ({error}); {allowed}") from error
+        with key_errors(key):
+            if fault := self._refusal("ask", key):
+                return ControlAnswer(ok=False, error=fault)
         start_s = time.monotonic()
         for reply in self.query(key, payload=payload, timeout_s=timeout_s):
             if reply.kind != "ERROR":

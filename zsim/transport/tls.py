@@ -21,6 +21,7 @@ NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME, openssl/x509_vfy.h
 NETWORKED = ("tcp", "udp", "ws")  # of what Zenoh's wheel has without encryption; the others stay on the machine
 MEND = "make new ones with zsim certs init"
 RENEW = f"{MEND} --renew"
+ADDRESS_MEND = f"name that in the hosts file and {MEND}, or connect to another address"
 
 _ENDPOINT = re.compile(r"(?:tls|quic)/\[?(?P<host>[^\]]*?)\]?:(?P<port>\d+)(?:[?#].*)?")
 _UNRELATED = (18, 19, 20, 21)  # X509_V_ERR_ self-signed, self-signed in chain, no issuer here, signature unverified
@@ -35,12 +36,14 @@ class Identity(NamedTuple):
         tls: folder with ca.pem, certificate.pem and key.pem; None goes without TLS.
         access: file with Zenoh's access control, for a process that listens; None lets everybody in.
         insecure: whether links may leave the machine without TLS.
+        process: name that the certificate must have; empty for any.
     """
 
     host: str = socket.gethostname()
     tls: Path | None = None
     access: Path | None = None
     insecure: bool = False
+    process: str = ""
 
     @property
     def authority(self) -> Path:
@@ -93,7 +96,20 @@ def own_fault(identity: Identity) -> str | None:
         certificate = _read_own(identity)
     except (ssl.SSLError, ValueError) as error:
         return f"{identity.tls}: certificate.pem, key.pem and ca.pem do not go together ({_reason(error)}); {MEND}"
-    return _date_fault(certificate)
+    return _date_fault(certificate) or _name_fault(identity, certificate)
+
+
+def own_name(identity: Identity) -> str:
+    """Return the name in a process's own certificate, of which `own_fault` has found nothing wrong."""
+    return _name(_read_own(identity))
+
+
+def _name_fault(identity: Identity, certificate: dict[str, Any]) -> str | None:
+    """Return whether a certificate is another process's: access control would drop whatever ours sends."""
+    found, wanted = _name(certificate), identity.process
+    if wanted in ("", found):
+        return None
+    return f"{identity.tls}: the certificate is for {found}; must be for {wanted}; give --tls the folder of that"
 
 
 def no_link(identity: Identity, endpoint: str, error: str) -> str:
@@ -113,23 +129,39 @@ def peer_fault(identity: Identity, endpoint: str) -> str | None:
     if identity.tls is None or place is None:
         return None
     try:
-        with socket.create_connection((place["host"], int(place["port"])), PROBE_S) as plain:
-            return _shake(_client(identity), plain, place["host"], endpoint)
+        with _dial(place) as plain:
+            return _shake(identity, plain, place, endpoint)
     except OSError:
         return None
 
 
-def _shake(context: ssl.SSLContext, plain: socket.socket, host: str, endpoint: str) -> str | None:
+def _dial(place: re.Match[str]) -> socket.socket:
+    return socket.create_connection((place["host"], int(place["port"])), PROBE_S)
+
+
+def _shake(identity: Identity, plain: socket.socket, place: re.Match[str], endpoint: str) -> str | None:
     try:
-        with context.wrap_socket(plain, server_hostname=host) as link:
+        with _client(identity).wrap_socket(plain, server_hostname=place["host"]) as link:
             fault = _date_fault(link.getpeercert() or {})
             if fault is None:
                 link.settimeout(LATE_S)
                 with contextlib.suppress(TimeoutError):
                     link.recv(1)
             return fault
+    except ssl.SSLCertVerificationError as error:
+        return _misnamed(identity, place) if error.verify_code in _MISNAMED else _unverified(error)
     except ssl.SSLError as error:
-        return _words(error, host, endpoint)
+        return _words(error, endpoint)
+
+
+def _misnamed(identity: Identity, place: re.Match[str]) -> str:
+    """Return for which addresses the certificate of who listens is, which is not the one that we connect to."""
+    context = _client(identity)
+    context.check_hostname = False
+    with _dial(place) as plain, context.wrap_socket(plain) as link:
+        there = (link.getpeercert() or {}).get("subjectAltName", ())
+    found = ", ".join(str(name) for _, name in there) or "no address"
+    return f"the certificate of who listens there is for {found}; must be for {place['host']}; {ADDRESS_MEND}"
 
 
 def _client(identity: Identity) -> ssl.SSLContext:
@@ -140,14 +172,15 @@ def _client(identity: Identity) -> ssl.SSLContext:
     return context
 
 
-def _words(error: ssl.SSLError, host: str, endpoint: str) -> str | None:
+def _unverified(error: ssl.SSLCertVerificationError) -> str:
+    """Return in words why we refuse the certificate of who listens."""
+    if error.verify_code in _UNRELATED:
+        return f"the certificate of who listens there is of another authority than ours; {MEND} and use one set"
+    return f"the certificate of who listens there is refused ({error.verify_message}); {MEND}"
+
+
+def _words(error: ssl.SSLError, endpoint: str) -> str | None:
     """Return an error of the handshake in words; None where it may be gone at the next try."""
-    if isinstance(error, ssl.SSLCertVerificationError):
-        if error.verify_code in _UNRELATED:
-            return f"the certificate of who listens there is of another authority than ours; {MEND} and use one set"
-        if error.verify_code in _MISNAMED:
-            return f"the certificate of who listens there is not for {host}; name it in the hosts file and {MEND}"
-        return f"the certificate of who listens there is refused ({error.verify_message}); {MEND}"
     reason = error.reason or ""
     if "EXPIRED" in reason:
         return f"our certificate has expired by the clock of who listens there; {RENEW}"

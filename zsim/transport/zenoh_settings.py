@@ -106,7 +106,7 @@ def _security(identity: Identity, endpoints: Sequence[str], doing: str) -> Setti
     settings = {f"{_TLS}/{name}": json.dumps(str(path.resolve())) for name, path in files.items()}
     settings[f"{_TLS}/enable_mtls"] = "true"
     if identity.access is not None:
-        settings[ACCESS] = json.dumps(_read_access(identity))
+        settings[ACCESS] = json.dumps(read_access(identity))
     return settings
 
 
@@ -135,8 +135,12 @@ def _agree(identity: Identity, endpoints: Sequence[str]) -> None:
         raise SessionError(f"{identity.access}: access control goes by certificate; give --tls too")
 
 
-def _read_access(identity: Identity) -> Any:
-    """Return the access control of a file; Zenoh judges its content."""
+def read_access(identity: Identity) -> Any:
+    """Return the access control of a file; Zenoh judges its content.
+
+    Raises:
+        SessionError: it cannot be read, or is not JSON.
+    """
     assert identity.access is not None
     try:
         return json.loads(identity.access.read_bytes())

@@ -4,9 +4,11 @@ import asyncio
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 
 from zsim.contract import keys, messages
 from zsim.contract.framing import GateMessages
+from zsim.errors import SessionError
 from zsim.transport.session import RawSample, Session, check_expression
 from zsim_bridges.gateway.access_check import ConnectionLimit
 from zsim_bridges.gateway.client_messages import TooManyError
@@ -168,7 +170,8 @@ class SharedSubscriptions:
         """Subscribe on a session."""
         self._link = link
         for expression, shared in self._by_expression.items():
-            shared.undeclare = link.declare_subscriber(expression, shared.on_publication)
+            with suppress(SessionError):  # no right to read it; as from keys without publishers, nothing comes
+                shared.undeclare = link.declare_subscriber(expression, shared.on_publication)
 
     def detach(self) -> None:
         """Receive nothing until the next `attach`: the session closes."""

@@ -55,7 +55,7 @@ def console(
     from zsim_deploy.roles.roles import log_printer, lower_priority, process_name, serve_runs
 
     lower_priority(only_viewed=True)
-    own_name = process_name("console", name, reach.tls, "*")
+    own_name = process_name("console", name, reach.who, "*")
     say = JsonProgress().say if reach.launched else log_printer(None)
     shown = Console(ListenAddress(listen, port), own_name.removesuffix(".*"), token, rate_hz, say)
     with shown.open():
@@ -81,7 +81,7 @@ def gateway(
 
     lower_priority()
     who = reach.who
-    own_name = process_name("gateway", name, reach.tls)
+    own_name = process_name("gateway", name, reach.who)
 
     def connect_as(process: str) -> "AbstractContextManager[tuple[Session, Info]]":
         return find_world(reach.endpoint, reach.federation, LOOK_S, identity=_client_identity(who, process))
@@ -101,7 +101,7 @@ def _client_identity(who: "Identity", process: str) -> "Identity":
         raise SessionError(
             f"{process}: has no certificate here ({folder}); name it in the scenario and in the inventory"
         )
-    return who._replace(tls=folder)
+    return who._replace(tls=folder, process=process)
 
 
 @app.command(rich_help_panel=TRANSLATE)
@@ -124,7 +124,7 @@ def ros1(
     from zsim_deploy.roles.roles import lower_priority, process_name, serve_runs
 
     lower_priority()
-    own_name = process_name("ros1", name, reach.tls)
+    own_name = process_name("ros1", name, reach.who)
     bridge = partial(serve, master_uri=master, host=ros_host or own_address(master))
     try:
         serve_runs(own_name, bridge, reach)
@@ -160,7 +160,7 @@ def ros2(
     who = reach.who
     to_router = who if router and is_tls(router) else Identity(host=who.host, insecure=reach.insecure)
     network = RosNetwork(domain, router, to_router)
-    own_name = process_name("ros2", name, reach.tls)
+    own_name = process_name("ros2", name, reach.who)
     serve_runs(own_name, partial(serve, network=network, wall_ns=time.time_ns), reach)
 
 

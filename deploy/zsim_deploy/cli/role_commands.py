@@ -75,7 +75,7 @@ def _agent_command(name: str, role: Role) -> Callable[..., None]:
     def start(things: list[str], reach: WorldAccess) -> None:
         from zsim_deploy.roles import roles
 
-        roles.agent(roles.agent_of(name, things), reach)
+        roles.agent(roles.agent_of(name, things), reach, roles.process_of(name, things))
 
     def several(
         reach: WorldAccess,

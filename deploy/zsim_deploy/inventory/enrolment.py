@@ -41,6 +41,9 @@ _WIRE: tuple[tuple[str, tuple[str, ...], str], ...] = (
 # Declarations go to all, for without them nothing is sent; they hold no payload.
 _DECLARATIONS = ("declare_subscriber", "declare_queryable", "liveliness_query", "declare_liveliness_subscriber")
 _MESSAGES = (*_DECLARATIONS, "put", "delete", "query", "reply", "liveliness_token")
+ANYONE = "anyone"  # with a certificate of the authority; a subject without conditions is everybody's
+# What anyone may do is to ask what it may do: zsim.transport.permissions.
+_ASKS_ACCESS = (("ingress", "query"), ("egress", "reply"))
 
 
 def folder_of(placed: InventoryFile) -> Path:
@@ -138,18 +141,22 @@ def access_control(
         above: what it connects to itself, the world or another router.
 
     Returns:
-        the map of Zenoh's configuration; everything is denied that is not in it.
+        the map of Zenoh's configuration; everything is denied that is not in it. Who is not named may ask that it is
+        not, and nothing else.
     """
     granted = {name: rights.of(name, scenario) for name in clients}
     for name, behind in routers.items():
         granted[name] = rights.union(rights.of(process, scenario) for process in behind)
     granted |= dict.fromkeys(above, rights.ALL)
     entries = [(name, list(_rules(name, right, scenario.federation))) for name, right in granted.items()]
+    asking = [_rule(ANYONE, (flow,), (act,), (keys.access("*"),), scenario.federation) for flow, act in _ASKS_ACCESS]
+    subjects = [{"id": name, "cert_common_names": [name]} for name, _ in entries]
+    entries.append((ANYONE, asking))
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": [rule for _, rules in entries for rule in rules],
-        "subjects": [{"id": name, "cert_common_names": [name]} for name, _ in entries],
+        "subjects": [*subjects, {"id": ANYONE}],
         "policies": [{"subjects": [name], "rules": [rule["id"] for rule in rules]} for name, rules in entries],
     }
 

@@ -20,6 +20,7 @@ from zsim.runtime.agent import Agent
 from zsim.runtime.group import AgentGroup
 from zsim.runtime.runner import Runner
 from zsim.scenario import scenario_file
+from zsim.scenario.rights import RECORDER, ROUTER
 from zsim.scenario.role_table import AGENTS, things
 from zsim.scenario.scenario import Scenario
 from zsim.transport import tls
@@ -35,6 +36,7 @@ from zsim_deploy.roles.stop_channel import StopChannel
 TICK_S = 0.1  # how often a router looks for a stop
 PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
 ANY = "*"  # in a name, for a number
+PATTERN = "*?["  # signs of a pattern; fnmatch
 PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits for byes
 
 Stopped = Callable[[], bool]
@@ -48,9 +50,15 @@ TRIES = 5
 AGAIN_S = 0.12  # the kernel lets ordinary users write there ten times a second, all of them together
 
 
-def agent(build: Callable[[messages.Info, Scenario], Agent], reach: WorldAccess) -> None:
-    """Run one agent against a world."""
-    launched, who = reach.launched, reach.who
+def agent(build: Callable[[messages.Info, Scenario], Agent], reach: WorldAccess, name: str = "") -> None:
+    """Run one agent against a world.
+
+    Args:
+        build: makes it.
+        reach: of the world.
+        name: of the process, where that is known before the world is.
+    """
+    launched, who = reach.launched, reach.who._replace(process=name)
     stop = StopChannel(launched, who)
     say = log_printer(launched)
     connection = find_world(
@@ -77,6 +85,11 @@ def _die() -> None:
     os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))  # Windows has no SIGKILL; there this is as hard
 
 
+def process_of(role: str, names: Sequence[str]) -> str:
+    """Return the name of the process that is the agent of one drone or cluster; empty for patterns, and for several."""
+    return f"{role}.{names[0]}" if len(names) == 1 and not set(names[0]) & set(PATTERN) else ""
+
+
 def agent_of(role: str, names: Sequence[str]) -> Callable[[messages.Info, Scenario], Agent]:
     """Return what builds the agent of a role for some drones or clusters, named or by patterns such as `drone*`."""
     agent_class(role)  # loaded while the world is not there yet
@@ -96,12 +109,16 @@ def host(names: Sequence[str]) -> Callable[[messages.Info, Scenario], Agent]:
 
 def check_certificate(made: Agent, identity: Identity) -> None:
     """Refuse to publish for other processes where access control would drop it without a word."""
-    if made.serves and identity.tls:
+    if not identity.tls:
+        return
+    if made.serves:
         others = ", ".join(made.serves)
         raise RunError(
             f"{made.name}: a certificate is for one process, and this one stands for {others} too; "
             "run each by itself, or without TLS"
         )
+    if fault := tls.own_fault(identity._replace(process=made.name)):
+        raise RunError(fault)
 
 
 def _also(made: Agent) -> str:
@@ -112,7 +129,7 @@ def recorder(path: Path, reach: WorldAccess) -> None:
     """Record the run of a world into a file."""
     from zsim_agents.recorder import record
 
-    launched, who = reach.launched, reach.who
+    launched, who = reach.launched, reach.who._replace(process=RECORDER)
     stop = StopChannel(launched, who)
     say = log_printer(launched)
     try:
@@ -141,6 +158,7 @@ def router(
     Raises:
         SessionError: the port is taken, or a certificate, here or upstream, is refused.
     """
+    identity = identity._replace(process=f"{ROUTER}.{name}")
     stop = StopChannel(launched, identity)
     say = log_printer(launched)
     with route(endpoint, upstream, federation, mode, identity) as link:
@@ -183,7 +201,8 @@ def serve_runs(name: str, serve: Serve, reach: WorldAccess) -> None:
         NoWorldError: there was no first world within `wait_s`.
         SupersededError: another process of the name that was given has taken over.
     """
-    launched, wait_s, who = reach.launched, reach.wait_s, reach.who
+    launched, wait_s = reach.launched, reach.wait_s
+    who = reach.who._replace(process="" if name.endswith(ANY) else name)
     stop = StopChannel(launched, who)
     say = log_printer(launched)
     own_name, served = name, ""
@@ -211,9 +230,17 @@ def serve_runs(name: str, serve: Serve, reach: WorldAccess) -> None:
             raise
 
 
-def process_name(role: str, name: str, tls: Path | None, thing: str = "main") -> str:
-    """Return a process's name: as given, or its certificate's, or the role's first."""
-    return name or (tls.name if tls else f"{role}.{thing}")
+def process_name(role: str, name: str, who: Identity, thing: str = "main") -> str:
+    """Return a process's name: as given, or its certificate's, or the role's first.
+
+    Raises:
+        SessionError: the certificate is of no use.
+    """
+    if name or who.tls is None:
+        return name or f"{role}.{thing}"
+    if fault := tls.own_fault(who):
+        raise SessionError(fault)
+    return tls.own_name(who)
 
 
 def _free(link: Session, name: str) -> str:

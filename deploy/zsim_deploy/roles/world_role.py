@@ -15,7 +15,9 @@ from zsim.contract import keys, run_messages
 from zsim.errors import RunError
 from zsim.runtime.progress import QUIET, HoldReasons, JsonProgress, ProgressSink, Screen, Throttle
 from zsim.scenario import scenario_file
+from zsim.scenario.rights import WORLD
 from zsim.scenario.scenario import Scenario
+from zsim.transport import connection
 from zsim.transport.session import check_expression
 from zsim.transport.tls import Identity
 from zsim_deploy.roles.stop_channel import StopChannel
@@ -55,6 +57,8 @@ def world(
     from zsim_world.server.run_journal import RunJournal, journaled_run
     from zsim_world.server.world_process import run
 
+    identity = identity._replace(process=WORLD)
+    connection.check_listening(endpoints, identity)  # before anything is compiled
     stop = StopChannel(launched, identity)
     with _slow_start_notice(JsonProgress() if launched else None):
         run_id = launched or (journaled_run(journal) if journal else None)

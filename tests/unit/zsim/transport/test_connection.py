@@ -18,6 +18,9 @@ from zsim.transport.tls import Identity
 class Silent:
     """A session to a hub that answers nothing."""
 
+    process = "operator.eve"
+    permissions = None
+
     def get(self, expression: str, timeout_s: float) -> list[Any]:
         return []
 
