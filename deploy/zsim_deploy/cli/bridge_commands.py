@@ -52,7 +52,8 @@ def console(
     from zsim.runtime.progress import JsonProgress
     from zsim_bridges.console.console_server import Console
     from zsim_bridges.console.http_proxy import ListenAddress
-    from zsim_deploy.roles.roles import log_printer, lower_priority, process_name, serve_runs
+    from zsim_deploy.roles.process_identity import process_name
+    from zsim_deploy.roles.roles import log_printer, lower_priority, serve_runs
 
     lower_priority(only_viewed=True)
     own_name = process_name("console", name, reach.who, "*")
@@ -77,7 +78,8 @@ def gateway(
     """Let in MATLAB, Octave, C, JavaScript, scripts: JSON lines, WebSocket, REST."""
     from zsim.transport.connection import find_world
     from zsim_bridges.gateway.gateway_server import Gateway, GatewayPorts
-    from zsim_deploy.roles.roles import log_printer, lower_priority, process_name, serve_runs
+    from zsim_deploy.roles.process_identity import process_name
+    from zsim_deploy.roles.roles import log_printer, lower_priority, serve_runs
 
     lower_priority()
     who = reach.who
@@ -121,7 +123,8 @@ def ros1(
 ) -> None:
     """Offer the drones to ROS 1 nodes as ardrone_autonomy does, without ROS here."""
     from zsim_bridges.ros1.ros1_bridge import NodeShutdownError, serve
-    from zsim_deploy.roles.roles import lower_priority, process_name, serve_runs
+    from zsim_deploy.roles.process_identity import process_name
+    from zsim_deploy.roles.roles import lower_priority, serve_runs
 
     lower_priority()
     own_name = process_name("ros1", name, reach.who)
@@ -151,7 +154,8 @@ def ros2(
         return
     from zsim.transport.tls import Identity, is_tls
     from zsim_bridges.ros2.ros2_bridge import RosNetwork, serve
-    from zsim_deploy.roles.roles import lower_priority, process_name, serve_runs
+    from zsim_deploy.roles.process_identity import process_name
+    from zsim_deploy.roles.roles import lower_priority, serve_runs
 
     if reach.tls and router is None:
         why = "the world's access control lets no ROS keys pass"

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from zsim.contract import keys, messages
 from zsim.contract.messages import Info
-from zsim.errors import NoWorldError, RecordError, RunError, SessionError, SupersededError, printable
+from zsim.errors import NoWorldError, RecordError, SessionError, SupersededError, printable
 from zsim.runtime.agent import Agent
 from zsim.runtime.group import AgentGroup
 from zsim.runtime.runner import Runner
@@ -31,12 +31,12 @@ from zsim.transport.zenoh_settings import Mode
 from zsim_agents.hosting import agent_class, chosen, hosted, made
 from zsim_bridges.observer_process import ObserverProcess
 from zsim_deploy.arguments import WorldAccess
+from zsim_deploy.roles.process_identity import check_certificate
 from zsim_deploy.roles.stop_channel import StopChannel
 
 TICK_S = 0.1  # how often a router looks for a stop
 PROBE_S = 1.0  # how often a router that reaches nobody upstream asks why
 ANY = "*"  # in a name, for a number
-PATTERN = "*?["  # signs of a pattern; fnmatch
 PAUSE_S = 0.2  # between two looks at a world whose run has ended and that waits for byes
 
 Stopped = Callable[[], bool]
@@ -85,11 +85,6 @@ def _die() -> None:
     os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))  # Windows has no SIGKILL; there this is as hard
 
 
-def process_of(role: str, names: Sequence[str]) -> str:
-    """Return the name of the process that is the agent of one drone or cluster; empty for patterns, and for several."""
-    return f"{role}.{names[0]}" if len(names) == 1 and not set(names[0]) & set(PATTERN) else ""
-
-
 def agent_of(role: str, names: Sequence[str]) -> Callable[[messages.Info, Scenario], Agent]:
     """Return what builds the agent of a role for some drones or clusters, named or by patterns such as `drone*`."""
     agent_class(role)  # loaded while the world is not there yet
@@ -105,20 +100,6 @@ def agent_of(role: str, names: Sequence[str]) -> Callable[[messages.Info, Scenar
 def host(names: Sequence[str]) -> Callable[[messages.Info, Scenario], Agent]:
     """Return what builds several estimators and controllers as one agent, named or by patterns."""
     return lambda info, scenario: hosted(info, scenario, names)
-
-
-def check_certificate(made: Agent, identity: Identity) -> None:
-    """Refuse to publish for other processes where access control would drop it without a word."""
-    if not identity.tls:
-        return
-    if made.serves:
-        others = ", ".join(made.serves)
-        raise RunError(
-            f"{made.name}: a certificate is for one process, and this one stands for {others} too; "
-            "run each by itself, or without TLS"
-        )
-    if fault := tls.own_fault(identity._replace(process=made.name)):
-        raise RunError(fault)
 
 
 def _also(made: Agent) -> str:
@@ -228,19 +209,6 @@ def serve_runs(name: str, serve: Serve, reach: WorldAccess) -> None:
     except NoWorldError:
         if not stop.stopped():
             raise
-
-
-def process_name(role: str, name: str, who: Identity, thing: str = "main") -> str:
-    """Return a process's name: as given, or its certificate's, or the role's first.
-
-    Raises:
-        SessionError: the certificate is of no use.
-    """
-    if name or who.tls is None:
-        return name or f"{role}.{thing}"
-    if fault := tls.own_fault(who):
-        raise SessionError(fault)
-    return tls.own_name(who)
 
 
 def _free(link: Session, name: str) -> str:
